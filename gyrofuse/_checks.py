@@ -1,0 +1,96 @@
+"""Checks at the door: shapes always, values once, in messages that say what to do."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+
+def check_floating(name: str, value: Tensor) -> Tensor:
+    """Return `value` when it is a real floating point tensor.
+
+    Raises:
+        TypeError: Not a tensor, or a tensor that is not float32 or float64.
+    """
+    if not isinstance(value, Tensor):
+        raise TypeError(
+            f"`{name}`: expected a torch tensor, got {type(value).__name__}; convert with torch.as_tensor(...)"
+        )
+    if not value.is_floating_point():
+        raise TypeError(
+            f"`{name}`: expected float32 or float64, got {value.dtype}; convert with .to(torch.float64)"
+        )
+    return value
+
+
+def check_signal(name: str, value: Tensor) -> Tensor:
+    """Return `value` when it is a floating point `(..., sensor, time)` tensor with at least one sensor.
+
+    Raises:
+        TypeError: Not a floating point tensor.
+        ValueError: Fewer than two dimensions, or no sensor.
+    """
+    check_floating(name, value)
+    if value.ndim < 2:
+        raise ValueError(
+            f"`{name}`: expected (..., sensor, time), got shape {tuple(value.shape)}; add a sensor dimension with .unsqueeze(-2)"
+        )
+    if value.shape[-2] == 0:
+        raise ValueError(f"`{name}`: expected at least one sensor, got shape {tuple(value.shape)}")
+    return value
+
+
+def largest_level(n_samples: int) -> int:
+    """Largest level J with `2**J <= n_samples`, 0 when there is none."""
+    return max(int(n_samples).bit_length() - 1, 0)
+
+
+def check_n_levels(n_levels: int | None, n_samples: int) -> int:
+    """Resolve the number of levels; `None` is the largest `J` with `2**J <= n_samples`.
+
+    Raises:
+        ValueError: `n_levels` below 1 or above what `n_samples` allow.
+    """
+    largest = largest_level(n_samples)
+    if largest < 1:
+        raise ValueError(f"`signal`: expected at least 2 samples for one wavelet level, got {n_samples}")
+    if n_levels is None:
+        return largest
+    n_levels = check_positive_integer("n_levels", n_levels)
+    if n_levels > largest:
+        raise ValueError(
+            f"`n_levels`: expected at most {largest} for {n_samples} samples (2**n_levels <= samples), got {n_levels}; "
+            "ask for fewer levels or give a longer signal"
+        )
+    return n_levels
+
+
+def check_positive_integer(name: str, value: int) -> int:
+    """Return `value` as an int when it is a whole number of at least 1."""
+    if isinstance(value, bool) or int(value) != value or value < 1:
+        raise ValueError(f"`{name}`: expected a whole number >= 1, got {value!r}")
+    return int(value)
+
+
+def check_positive(name: str, value: float) -> float:
+    """Return `value` as a float when it is finite and above zero."""
+    number = float(value)
+    if not (math.isfinite(number) and number > 0):
+        raise ValueError(f"`{name}`: expected a finite number > 0, got {value!r}")
+    return number
+
+
+def check_confidence_level(value: float) -> float:
+    """Return `value` when it lies strictly between 0 and 1."""
+    number = float(value)
+    if not 0 < number < 1:
+        raise ValueError(f"`confidence_level`: expected a number between 0 and 1 such as 0.95, got {value!r}")
+    return number
+
+
+def missing_to_nan(signal: Tensor) -> Tensor:
+    """Replace infinities by NaN, the one mark of a missing sample; no copy when there are none."""
+    infinite = torch.isinf(signal)
+    return torch.where(infinite, torch.nan, signal) if bool(infinite.any()) else signal
