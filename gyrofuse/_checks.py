@@ -19,9 +19,7 @@ def check_floating(name: str, value: Tensor) -> Tensor:
             f"`{name}`: expected a torch tensor, got {type(value).__name__}; convert with torch.as_tensor(...)"
         )
     if not value.is_floating_point():
-        raise TypeError(
-            f"`{name}`: expected float32 or float64, got {value.dtype}; convert with .to(torch.float64)"
-        )
+        raise TypeError(f"`{name}`: expected float32 or float64, got {value.dtype}; convert with .to(torch.float64)")
     return value
 
 
@@ -35,7 +33,8 @@ def check_signal(name: str, value: Tensor) -> Tensor:
     check_floating(name, value)
     if value.ndim < 2:
         raise ValueError(
-            f"`{name}`: expected (..., sensor, time), got shape {tuple(value.shape)}; add a sensor dimension with .unsqueeze(-2)"
+            f"`{name}`: expected (..., sensor, time), got shape {tuple(value.shape)}; "
+            "add a sensor dimension with .unsqueeze(-2)"
         )
     if value.shape[-2] == 0:
         raise ValueError(f"`{name}`: expected at least one sensor, got shape {tuple(value.shape)}")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
@@ -12,3 +13,20 @@ class ConfidenceInterval(NamedTuple):
 
     low: Tensor
     high: Tensor
+
+
+def numbered(n: int) -> tuple[str, ...]:
+    """Names `"1"` to `"n"` for sensors without any."""
+    return tuple(str(i + 1) for i in range(n))
+
+
+def listed(value: Tensor) -> Any:
+    """Nested lists of plain numbers, NaN and infinities as None, ready for JSON."""
+    plain = value.detach().cpu().tolist()
+
+    def clean(entry: Any) -> Any:
+        if isinstance(entry, list):
+            return [clean(e) for e in entry]
+        return entry if math.isfinite(entry) else None
+
+    return clean(plain)

@@ -1,0 +1,74 @@
+"""Linear algebra that says what is wrong with a covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+
+class SingularCovarianceError(ValueError):
+    """A covariance matrix of the array is not positive definite, so there are no optimal weights."""
+
+
+def check_positive_definite(name: str, matrix: Tensor, labels: Sequence[str] | None = None) -> None:
+    """Raise when any covariance of a batch is not positive definite, naming items, sensors and likely causes.
+
+    Args:
+        name: What the matrix is called in the message.
+        matrix: `(..., sensor, sensor)`.
+        labels: Names of the sensors, for the message.
+
+    Raises:
+        SingularCovarianceError: Non-finite entries, a sensor without variance, two equal sensors, or a smallest
+            eigenvalue of the correlation matrix that is zero to rounding or below.
+    """
+    matrix = matrix.detach()
+    n_sensors = matrix.shape[-1]
+    names = list(labels) if labels is not None else [str(i + 1) for i in range(n_sensors)]
+    variance = matrix.diagonal(dim1=-2, dim2=-1)
+    scale = torch.where(variance > 0, variance, 1.0).rsqrt()
+    correlation = scale[..., :, None] * matrix * scale[..., None, :]
+    finite = correlation.isfinite().all(-1).all(-1)
+    smallest = torch.linalg.eigvalsh(torch.where(finite[..., None, None], correlation, 0.0))[..., 0]
+    tolerance = 10 * n_sensors * torch.finfo(matrix.dtype).eps
+    bad = ~finite | (variance <= 0).any(-1) | (smallest <= tolerance)
+    if not bool(bad.any()):
+        return
+    where = ""
+    item: tuple[int, ...] = ()
+    if bad.ndim:
+        items = bad.nonzero()
+        shown = ", ".join(str(tuple(i)) for i in items[:5].tolist())
+        where = f" at batch item(s) {shown}{', ...' if len(items) > 5 else ''} ({len(items)} of {bad.numel()})"
+        item = tuple(items[0].tolist())
+    raise SingularCovarianceError(
+        f"{name} is not positive definite{where}: {_cause(matrix[item], correlation[item], names)}"
+    )
+
+
+def _cause(matrix: Tensor, correlation: Tensor, names: Sequence[str]) -> str:
+    missing = (~matrix.diagonal().isfinite()).nonzero().flatten().tolist()
+    if missing:
+        return (
+            f"sensor(s) {_join(names, missing)} have no complete window at some level; "
+            "leave them out or use fewer levels"
+        )
+    if not bool(matrix.isfinite().all()):
+        return "some sensors are never recorded together; leave one of them out"
+    dead = (matrix.diagonal() <= 0).nonzero().flatten().tolist()
+    if dead:
+        return f"sensor(s) {_join(names, dead)} never change (dead or stuck); leave them out"
+    equal = (correlation.abs() > 1 - 1e-9).triu(1).nonzero().tolist()
+    if equal:
+        pairs = ", ".join(f"{names[i]} and {names[k]}" for i, k in equal[:5])
+        return f"sensors {pairs} are copies of each other; keep one of each"
+    return (
+        "the sensors are linearly dependent, or the recording is too short for its number of sensors; "
+        "leave sensors out, use more scales, or record longer"
+    )
+
+
+def _join(names: Sequence[str], which: Sequence[int]) -> str:
+    return ", ".join(names[i] for i in which)

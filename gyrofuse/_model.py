@@ -1,0 +1,298 @@
+"""A noise model is a sum of independent processes; a process is a model of one."""
+
+from __future__ import annotations
+
+import numbers
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, fields
+from functools import reduce
+from operator import add
+from typing import Any, ClassVar, NamedTuple
+
+import torch
+from torch import Tensor
+
+from gyrofuse._checks import check_positive_integer
+from gyrofuse._paths import own_generator
+
+Parameter = float | Tensor | None
+
+
+class SpectralLine(NamedTuple):
+    """Power concentrated at one frequency.
+
+    Attributes:
+        frequency: `(...)`, cycles per sample, in `(0, 1/2]`.
+        power: `(...)`, signal^2, of the lines at plus and minus `frequency` together.
+    """
+
+    frequency: Tensor
+    power: Tensor
+
+
+class Model:
+    """Sum of independent noise processes, made with `+`, `sum` or `2 * AR1()`.
+
+    Parameters are numbers, tensors with batch dimensions `(...)`, or `None`: to be estimated. A process whose
+    copies cannot be told apart (two white noises are one white noise) may appear once.
+
+    Args:
+        models: Processes or models, flattened into `processes`.
+
+    Raises:
+        ValueError: No process, or one that may appear once appears again.
+        TypeError: Not a process or model.
+    """
+
+    def __init__(self, models: Iterable[Model]):
+        models = tuple(models)
+        for model in models:
+            if not isinstance(model, Model):
+                raise TypeError(f"`models`: expected processes such as AR1(), got {model!r}")
+        self._processes = tuple(process for model in models for process in model.processes)
+        if not self._processes:
+            raise ValueError("`models`: expected at least one process, got none")
+        for process in self._processes:
+            kind = type(process)
+            if not kind.repeatable and sum(isinstance(other, kind) for other in self._processes) > 1:
+                raise ValueError(
+                    f"`models`: {kind.__name__} appears more than once, and its copies cannot be told apart; "
+                    f"use one {kind.__name__} with the sum of the {fields(kind)[0].name}s"
+                )
+
+    @property
+    def processes(self) -> tuple[Process, ...]:
+        """The processes of the sum, in order."""
+        return self._processes
+
+    @property
+    def param_names(self) -> tuple[str, ...]:
+        """Names such as `white_noise.variance` and, for what may repeat, even once, `ar1_1.phi`."""
+        return tuple(name for name, _ in self._named())
+
+    @property
+    def params(self) -> Tensor:
+        """Parameters `(..., parameter)` in float64, in the order of `param_names`.
+
+        Raises:
+            ValueError: A parameter is to be estimated.
+        """
+        values = [column for _, columns in self._known() for column in columns.values()]
+        return torch.cat(torch.broadcast_tensors(*values), dim=-1)
+
+    def with_params(self, params: Tensor) -> Model:
+        """Return the same sum with parameters `(..., parameter)` in the order of `param_names`.
+
+        Raises:
+            ValueError: Wrong number of parameters, or a value outside its domain.
+        """
+        if params.ndim == 0 or params.shape[-1] != len(self.param_names):
+            raise ValueError(
+                f"`params`: expected (..., {len(self.param_names)}) for {', '.join(self.param_names)}, "
+                f"got shape {tuple(params.shape)}"
+            )
+        columns = iter(params.unbind(-1))
+        return Model([type(p)(**{name: next(columns) for name in p.parameters}) for p in self.processes])
+
+    def wavelet_variance(self, n_levels: int) -> Tensor:
+        """Theoretical Haar wavelet variance `(..., level)` of levels 1 to `n_levels`, signal^2, float64.
+
+        Differentiable in the parameters; a sum over the processes.
+
+        Raises:
+            ValueError: A parameter is to be estimated, or `n_levels` is below 1.
+        """
+        n_levels = check_positive_integer("n_levels", n_levels)
+        tau = 2.0 ** torch.arange(1, n_levels + 1, dtype=torch.float64, device=self._device())
+        return _sum([process._wavelet_variance(tau, **columns) for process, columns in self._known()])
+
+    def spectrum(self, f: Tensor | Sequence[float] | float) -> Tensor:
+        """Continuous part of the two-sided power spectral density per sample, float64.
+
+        Its integral over `(-1/2, 1/2)` is the variance where that is finite. A random walk has a
+        pseudo-spectrum, infinite at 0; a sinusoid has none and appears in `lines`; a drift is a mean, not
+        noise, and has none.
+
+        Args:
+            f: Frequencies `(frequency,)` or of any other shape, cycles per sample.
+
+        Returns:
+            `(..., frequency)`, signal^2 per (cycle per sample).
+
+        Raises:
+            ValueError: A parameter is to be estimated.
+        """
+        device = f.device if isinstance(f, Tensor) else self._device()
+        f = torch.as_tensor(f, dtype=torch.float64, device=device)
+        density = _sum([process._spectrum(f.flatten(), **columns) for process, columns in self._known(device)])
+        return density.reshape(density.shape[:-1] + f.shape)
+
+    @property
+    def lines(self) -> tuple[SpectralLine, ...]:
+        """Spectral lines, one per sinusoid.
+
+        Raises:
+            ValueError: A parameter is to be estimated.
+        """
+        return tuple(line for process, columns in self._known() for line in process._lines(**columns))
+
+    def simulate(
+        self,
+        n_samples: int,
+        *,
+        batch: Sequence[int] = (),
+        generator: torch.Generator | None = None,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str | None = None,
+    ) -> Tensor:
+        """Draw independent sample paths, differentiable in the parameters.
+
+        An AR(1) is stationary from its first sample on, a random walk starts with its first increment, a
+        drift is `slope * t` with `t = 1..n_samples`, a sinusoid has a uniform random phase per path.
+
+        Args:
+            n_samples: Samples of each path.
+            batch: Shape of the independent paths, ahead of the parameters' own batch dimensions.
+            generator: Source of randomness; by default a fresh one. The global one is never touched.
+            dtype: Of the result; the computation is in float64.
+            device: Of the result; by default that of `generator`, else that of the parameters.
+
+        Returns:
+            `(*batch, ..., time)`, signal.
+
+        Raises:
+            ValueError: A parameter is to be estimated, or `generator` lives on another device.
+        """
+        n_samples = check_positive_integer("n_samples", n_samples)
+        if device is None and generator is None:
+            device = self._device()
+        generator = own_generator(generator, device)
+        known = self._known(generator.device)
+        own = torch.broadcast_shapes(*(v.shape[:-1] for _, columns in known for v in columns.values()))
+        shape = torch.Size([*batch, *own])
+        return _sum([p._path(n_samples, shape, generator, **columns) for p, columns in known]).to(dtype)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain numbers and lists that `model_from_dict` reads back."""
+        return {
+            "processes": [
+                {"process": type(p).__name__, **{k: _plain(v) for k, v in p.parameters.items()}} for p in self.processes
+            ]
+        }
+
+    def __add__(self, other: Model) -> Model:
+        return Model([self, other]) if isinstance(other, Model) else NotImplemented
+
+    def __radd__(self, other: int) -> Model:
+        # sum([...]) starts with 0
+        return self if isinstance(other, int) and other == 0 else NotImplemented
+
+    def __mul__(self, times: int) -> Model:
+        return Model([self] * check_positive_integer("times", times)) if isinstance(times, int) else NotImplemented
+
+    __rmul__ = __mul__
+
+    def __repr__(self) -> str:
+        return " + ".join(map(repr, self.processes))
+
+    def _named(self) -> list[tuple[str, Parameter]]:
+        """Every parameter with its full name."""
+        named, seen = [], dict.fromkeys(map(type, self.processes), 0)
+        for process in self.processes:
+            seen[type(process)] += 1
+            prefix = f"{process.key}_{seen[type(process)]}" if process.repeatable else process.key
+            named += [(f"{prefix}.{name}", value) for name, value in process.parameters.items()]
+        return named
+
+    def _known(self, device: torch.device | None = None) -> list[tuple[Process, dict[str, Tensor]]]:
+        """Processes with their parameters as float64 columns `(..., 1)`."""
+        missing = [f"`{name}`" for name, value in self._named() if value is None]
+        if missing:
+            raise ValueError(
+                f"{', '.join(missing)}: expected a number, got a parameter to be estimated; "
+                "give its value or fit the model to data first"
+            )
+        device = device or self._device()
+        return [
+            (
+                process,
+                {
+                    name: torch.as_tensor(value, dtype=torch.float64, device=device)[..., None]
+                    for name, value in process.parameters.items()
+                },
+            )
+            for process in self.processes
+        ]
+
+    def _device(self) -> torch.device:
+        """Device of the parameters."""
+        devices = (v.device for p in self.processes for v in p.parameters.values() if isinstance(v, Tensor))
+        return next(devices, torch.device("cpu"))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Process(Model):
+    """One equation.
+
+    A subclass is a frozen dataclass whose fields are the parameters; a field's metadata is a `domain`. Its
+    formulas take the parameters as float64 columns `(..., 1)` and `tau = 2, 4, .. 2**n_levels` as `(level,)`.
+    """
+
+    key: ClassVar[str]  # first part of the parameter names
+    symbol: ClassVar[str]  # short name in model formulas
+    repeatable: ClassVar[bool] = False  # may several of them share a model
+
+    _wavelet_variance: ClassVar[Callable[..., Tensor]]
+    _spectrum: ClassVar[Callable[..., Tensor]]
+    _path: ClassVar[Callable[..., Tensor]]
+    _lines: ClassVar[Callable[..., tuple[SpectralLine, ...]]] = staticmethod(lambda **_: ())
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):
+            value = _checked(type(self), entry.name, getattr(self, entry.name), **entry.metadata)
+            object.__setattr__(self, entry.name, value)
+
+    @property
+    def processes(self) -> tuple[Process, ...]:
+        return (self,)
+
+    @property
+    def parameters(self) -> dict[str, Parameter]:
+        """Parameters by name, as given."""
+        return {entry.name: getattr(self, entry.name) for entry in fields(self)}
+
+    def __repr__(self) -> str:
+        known = [f"{name}={_text(value)}" for name, value in self.parameters.items() if value is not None]
+        return f"{type(self).__name__}({', '.join(known)})"
+
+
+def domain(expected: str, holds: Callable[[Tensor], Tensor]) -> dict[str, Any]:
+    """Domain of a parameter, in words and as an elementwise test."""
+    return {"expected": expected, "holds": holds}
+
+
+def _checked(kind: type, name: str, value: Parameter, *, expected: str, holds: Callable[[Tensor], Tensor]) -> Parameter:
+    if value is None:
+        return None
+    if isinstance(value, numbers.Real) and not isinstance(value, bool):
+        value = float(value)
+    elif not isinstance(value, Tensor) or not value.is_floating_point():
+        raise TypeError(f"`{name}` of {kind.__name__}: expected a number or a floating point tensor, got {value!r}")
+    given = torch.as_tensor(value, dtype=torch.float64).detach()
+    # In a batch NaN marks an item that could not be estimated, and it stays NaN.
+    fine = (holds(given) & given.isfinite()) | (given.isnan() & (given.ndim > 0))
+    if not bool(fine.all()):
+        raise ValueError(f"`{name}` of {kind.__name__}: expected {expected}, got {given[~fine][0].item():.9g}")
+    return value
+
+
+def _text(value: Parameter) -> str:
+    return f"<batch {tuple(value.shape)}>" if isinstance(value, Tensor) and value.ndim else str(_plain(value))
+
+
+def _plain(value: Parameter) -> Any:
+    return value.tolist() if isinstance(value, Tensor) else value
+
+
+def _sum(terms: list[Tensor]) -> Tensor:
+    return reduce(add, terms)

@@ -1,0 +1,212 @@
+"""Sums of wavelet products over long recordings, one cache-sized tile of time after another.
+
+The same pyramid as in `gyrofuse.haar`, arranged so that the data cross the memory bus about once: a tile of time
+passes through all levels while it is in cache, and the Gram product of its coefficients is taken there. What a
+level needs of the past (the last `h = 2**level` samples of its smooth) is kept from tile to tile, so that chunks of
+any length, and a whole recording in one go, add up to the same sums.
+
+Inside, time comes before sensor (`(item, time, sensor)`): a lag is then an offset in contiguous memory and the Gram
+product reads its operand once. The factor 1/2 of each level is left out until the end, where `4**-level` is exact.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import torch
+from torch import Tensor
+
+# Samples x sensors of one tile for each CPU thread: a tile and its coefficients take 2 MiB in float64, which stays in
+# cache; smaller ones would spend their time on calls instead.
+_CPU_TILE = 2**17
+_GPU_TILE = 2**24
+_SHORTEST_TILE = 16
+
+
+class WaveletProducts:
+    """Running sums `sum_t W_t W_t'` per level and how many products each holds, carried from chunk to chunk.
+
+    Args:
+        n_items: Independent recordings advanced together.
+        n_sensors: Sensors of each.
+        n_levels: Levels J.
+        length: Samples expected, where known; a short recording gets a short tile.
+        dtype: Dtype of the arithmetic; sums and counts are float64.
+        device: Where the tiles live.
+    """
+
+    def __init__(
+        self,
+        n_items: int,
+        n_sensors: int,
+        n_levels: int,
+        *,
+        dtype: torch.dtype,
+        device: torch.device,
+        length: int | None = None,
+    ) -> None:
+        self.n_levels = n_levels
+        self._shape = (n_items, n_sensors)
+        self._like = {"dtype": dtype, "device": device}
+        self._tile = tile_length(n_items * n_sensors, device, length)
+        # One product of this shape runs on one core: stripes of a tile keep the others busy.
+        threads = torch.get_num_threads() if device.type == "cpu" else 1
+        self._stripes = min(1 << (threads - 1).bit_length(), self._tile) if n_items < threads else 1
+        tile, margin = self._tile, self._tile // 2
+        self._buffer = self._empty(margin + tile)
+        self._staged = self._buffer[:, margin:]
+        self._coefficients = self._empty(tile)
+        self._products = torch.empty(n_levels, n_items, self._stripes, n_sensors, n_sensors, **self._like)
+        self._short = []
+        for level in range(min(n_levels, tile.bit_length() - 1)):
+            lag = 2**level
+            head, past = self._buffer[:, margin - lag : margin], self._buffer[:, margin - lag : margin - lag + tile]
+            self._short.append((head, past, self._staged[:, tile - lag :], self._empty(lag)))
+        self._queues: list[deque[Tensor]] = [deque() for _ in range(len(self._short), n_levels)]
+        self._spare: Tensor | None = None
+        self._offset: Tensor | None = None
+        self._n_staged = 0
+        self._time = 0  # samples before the staged ones
+        self._flawed = -1  # no sample after this one is missing, of those in finished tiles
+        self._sums = torch.zeros(n_levels, n_items, n_sensors, n_sensors, dtype=torch.float64, device=device)
+        self._counts = torch.zeros_like(self._sums)
+
+    @property
+    def n_samples(self) -> int:
+        """Samples taken in so far."""
+        return self._time + self._n_staged
+
+    @property
+    def device(self) -> torch.device:
+        """Where the tiles live."""
+        return self._sums.device
+
+    def update(self, chunk: Tensor) -> None:
+        """Take in the next samples `(item, sensor, time)`; non-finite ones are missing."""
+        if chunk.shape[-1] == 0:
+            return
+        if self._offset is None:
+            # Haar filters ignore a constant; removing one keeps the digits of what they do see.
+            first = chunk[..., : self._tile].to(self._like["dtype"])
+            mean = torch.where(first.isfinite(), first, torch.nan).nanmean(-1)
+            self._offset = mean.nan_to_num()[:, None, :]
+        taken = 0
+        while taken < chunk.shape[-1]:
+            n = min(self._tile - self._n_staged, chunk.shape[-1] - taken)
+            rows = chunk[..., taken : taken + n].transpose(-1, -2)  # (item, time, sensor)
+            staged = self._staged[:, self._n_staged : self._n_staged + n]
+            torch.sub(rows.to(self._like["dtype"]), self._offset, out=staged)
+            self._n_staged += n
+            taken += n
+            if self._n_staged == self._tile:
+                sums, counts, self._flawed = self._run(self._tile, keep=True)
+                self._sums += sums
+                self._counts += counts
+                self._time += self._tile
+                self._n_staged = 0
+
+    def totals(self) -> tuple[Tensor, Tensor]:
+        """Sums of products (unit of the signal squared) and their counts, `(level, item, sensor, sensor)`.
+
+        Includes the samples of the unfinished tile, which stays unfinished.
+        """
+        sums, counts = self._sums, self._counts
+        if self._n_staged:
+            extra_sums, extra_counts, _ = self._run(self._n_staged, keep=False)
+            sums, counts = sums + extra_sums, counts + extra_counts
+        levels = torch.arange(1, self.n_levels + 1, dtype=torch.float64, device=self.device)
+        return sums * torch.exp2(-2 * levels)[:, None, None, None], counts.clone()
+
+    def _empty(self, n: int) -> Tensor:
+        n_items, n_sensors = self._shape
+        return torch.empty(n_items, n, n_sensors, **self._like)
+
+    def _run(self, n: int, *, keep: bool) -> tuple[Tensor, Tensor, int]:
+        """Pass the first `n` staged samples through the levels; `keep` makes a full tile part of the past.
+
+        Returns the sums, the counts and the last sample before which one may be missing.
+        """
+        tile = self._tile
+        staged = None if keep else self._staged.clone()
+        smooth, coefficients = self._staged[:, :n], self._coefficients[:, :n]
+        # One look at each tile tells which levels have to mind missing samples.
+        flawed = self._flawed if bool(smooth.sum().isfinite()) else self._time + n - 1
+        self._products.zero_()
+        counts = torch.zeros_like(self._counts)
+        complete = [0] * self.n_levels
+        for level in range(self.n_levels):
+            lag = 2**level
+            if lag < tile:
+                # The past of a lag within the tile: what was kept of the tile before, put in front of this one.
+                head, past, tail, history = self._short[level]
+                head.copy_(history)
+                if keep:
+                    history.copy_(tail)
+                else:
+                    past = past[:, :n]
+            else:
+                # The past of a longer lag is a tile of its own, the oldest in a queue.
+                queue = self._queues[level - len(self._short)]
+                if keep:
+                    queue.append(smooth)
+                if len(queue) < lag // tile + keep:
+                    break
+                past = queue.popleft() if keep else queue[0][:, :n]
+            # The first window that lies wholly inside the recording ends at sample 2 * lag - 1.
+            first = max(0, 2 * lag - 1 - self._time)
+            if first >= n:
+                break
+            torch.sub(smooth, past, out=coefficients)
+            if flawed > self._time + first - 2 * lag:
+                known = coefficients[:, first:].isfinite()
+                self._multiply(torch.where(known, coefficients[:, first:], 0.0), level)
+                counts[level] = _gram(known.to(coefficients.dtype))
+            else:
+                self._multiply(coefficients if first == 0 else coefficients[:, first:], level)
+                complete[level] = n - first
+            if level + 1 == self.n_levels:
+                if keep and lag >= tile:
+                    self._spare = past
+            elif 2 * lag < tile:
+                # smooth + past = 2 smooth - coefficients, with the sign turned (no product minds): in place, so that
+                # one tile and its coefficients are all that has to stay in cache.
+                torch.sub(coefficients, smooth, alpha=2, out=smooth)
+            elif not keep:
+                smooth = smooth + past
+            elif lag < tile:
+                # The queues own their tiles: take the one that left the last queue, or a new one.
+                spare, self._spare = self._spare, None
+                smooth = torch.add(smooth, past, out=self._empty(tile) if spare is None else spare)
+            else:
+                smooth = past.add_(smooth)
+        if staged is not None:
+            self._staged.copy_(staged)
+        sums = self._products.sum(2, dtype=torch.float64)
+        counts += torch.tensor(complete, dtype=counts.dtype).to(counts.device)[:, None, None, None]
+        return sums, counts, flawed
+
+    def _multiply(self, coefficients: Tensor, level: int) -> None:
+        """Write the products of `(item, time, sensor)` coefficients of a level."""
+        n_items, n, n_sensors = coefficients.shape
+        products = self._products[level]  # (item, stripe, sensor, sensor)
+        if self._stripes > 1 and n_sensors > 1 and n % self._stripes == 0 and coefficients.is_contiguous():
+            striped = coefficients.view(n_items * self._stripes, -1, n_sensors)
+            torch.bmm(striped.transpose(1, 2), striped, out=products.view(-1, n_sensors, n_sensors))
+        else:
+            products[:, 0] = _gram(coefficients)
+
+
+def _gram(coefficients: Tensor) -> Tensor:
+    """`W' W` of `(item, time, sensor)`, `(item, sensor, sensor)`."""
+    if coefficients.shape[-1] == 1:
+        return torch.linalg.vector_norm(coefficients, dim=1).square()[..., None]
+    return torch.bmm(coefficients.transpose(1, 2), coefficients)
+
+
+def tile_length(n_series: int, device: torch.device, length: int | None) -> int:
+    """Samples of a tile: a power of two that fits the cache, no longer than the recording needs."""
+    budget = _CPU_TILE * torch.get_num_threads() if device.type == "cpu" else _GPU_TILE
+    tile = max(_SHORTEST_TILE, 1 << max(budget // n_series, 1).bit_length() - 1)
+    if length is not None:
+        tile = min(tile, max(_SHORTEST_TILE, 1 << (length - 1).bit_length()))
+    return tile

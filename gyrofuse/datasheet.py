@@ -1,0 +1,130 @@
+"""A fitted model in the units of a sensor's datasheet."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+
+from gyrofuse import units
+from gyrofuse._checks import check_positive
+from gyrofuse.processes import (
+    AR1,
+    Drift,
+    Model,
+    Process,
+    QuantizationNoise,
+    RandomWalk,
+    Sinusoid,
+    WhiteNoise,
+)
+
+_LEVELS = 40  # where the floor of the Allan deviation is looked for
+
+
+class DatasheetEntry(NamedTuple):
+    """One quantity of a datasheet."""
+
+    name: str
+    value: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Datasheet:
+    """A model's parameters in datasheet units.
+
+    Attributes:
+        rate: Hz.
+        unit: Rate unit of the model.
+        entries: Quantities in the order of the model's processes; one may appear in two units.
+    """
+
+    rate: float
+    unit: str
+    entries: tuple[DatasheetEntry, ...]
+
+    def summary(self) -> str:
+        """Return a table of fixed width."""
+        head = f"Datasheet at {self.rate:g} Hz, model in {self.unit}"
+        rows = [f"{e.name:<30}{e.value:>14.6g}  {e.unit}" for e in self.entries]
+        return "\n".join([head, *rows])
+
+    def __str__(self) -> str:
+        return self.summary()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain numbers and strings."""
+        return {"rate": self.rate, "unit": self.unit, "entries": [e._asdict() for e in self.entries]}
+
+
+def datasheet(model: Model, rate: float, unit: str) -> Datasheet:
+    """Translate a model into angle random walk, bias instability, rate random walk and the like.
+
+    Bias instability is the lowest local minimum of the Allan deviation, without tones and drifts, over 0.664,
+    on octave averaging times; a model whose Allan deviation has no such floor has none.
+
+    Args:
+        model: With scalar parameters.
+        rate: Sampling rate, Hz.
+        unit: Rate unit of the model: deg/s, mdeg/s, deg/h or rad/s.
+
+    Raises:
+        ValueError: A parameter is to be estimated or batched, or an unknown unit.
+
+    References:
+        IEEE Std 952, annex C.
+    """
+    rate = check_positive("rate", rate)
+    degrees = units.rate_unit_factor(unit, "deg/s")
+    if model.params.ndim > 1:
+        raise ValueError(
+            f"`model`: expected scalar parameters, got a batch of shape {tuple(model.params.shape[:-1])}; "
+            "pick one item with model.with_params(model.params[i])"
+        )
+    entries = [e for process in model.processes for e in _entries(process, rate, unit, degrees)]
+    return Datasheet(rate, unit, (*entries, *_floor(model, rate, degrees)))
+
+
+def _entries(process: Process, rate: float, unit: str, degrees: float) -> Iterator[DatasheetEntry]:
+    first, *rest = process.params.tolist()
+    hour = units.SECONDS_PER_HOUR
+    if isinstance(process, WhiteNoise):
+        density = units.angle_random_walk(first, rate)
+        yield DatasheetEntry("angle random walk N", units.per_sqrt_hour(density * degrees), "deg/sqrt(h)")
+        yield DatasheetEntry("angle random walk N", density, f"{unit}/sqrt(Hz)")
+    elif isinstance(process, QuantizationNoise):
+        angle = units.quantization(first, rate) * degrees * units.ARCSECONDS_PER_DEGREE
+        yield DatasheetEntry("quantization Q", angle, "arcsec")
+    elif isinstance(process, RandomWalk):
+        density = units.rate_random_walk(first, rate)
+        yield DatasheetEntry("rate random walk K", density * degrees * hour**1.5, "deg/h/sqrt(h)")
+        yield DatasheetEntry("rate random walk K", density, f"{unit}/s/sqrt(Hz)")
+    elif isinstance(process, Drift):
+        yield DatasheetEntry("rate ramp R", units.rate_ramp(first, rate) * degrees * hour**2, "deg/h/h")
+    elif isinstance(process, AR1):
+        phi, variance = first, *rest
+        if phi > 0:
+            yield DatasheetEntry("Gauss-Markov correlation time", units.correlation_time(phi, rate), "s")
+        deviation = (variance / ((1 - phi) * (1 + phi))) ** 0.5
+        yield DatasheetEntry("Gauss-Markov deviation", deviation * degrees * hour, "deg/h")
+    elif isinstance(process, Sinusoid):
+        amplitude, beta = first, *rest
+        yield DatasheetEntry("tone frequency", units.tone_frequency(beta, rate), "Hz")
+        yield DatasheetEntry("tone amplitude", amplitude, unit)
+
+
+def _floor(model: Model, rate: float, degrees: float) -> Iterator[DatasheetEntry]:
+    noise = [p for p in model.processes if not isinstance(p, (Sinusoid, Drift))]
+    if not noise:
+        return
+    deviation = (2 * Model(noise).wavelet_variance(_LEVELS)).sqrt()  # Allan, at 2**(level - 1) samples
+    inner = deviation[1:-1]
+    lowest = torch.where((inner < deviation[:-2]) & (inner < deviation[2:]), inner, torch.inf)
+    if torch.isfinite(lowest).any():
+        floor = float(lowest.min()) * degrees * units.SECONDS_PER_HOUR
+        yield DatasheetEntry("bias instability B", units.bias_instability(floor), "deg/h")
+        averaging = 2.0 ** (int(lowest.argmin()) + 1) / rate
+        yield DatasheetEntry("bias instability reached at", averaging, "s")

@@ -1,0 +1,248 @@
+"""Named arrays, as .mat, .h5 and .npz files hold them: which are gyros, where time runs, what belongs to them.
+
+`streams_from_arrays` takes `{"name": array, "group/name": array}` and understands
+
+- `gyro` (sensor, time) with `sensors`, `fs`, `unit`, `time`: the names of an .npz recording;
+- arrays whose names `gyrofuse.io.columns` recognises (`imu_gyr`, `imu1/gyro`, `gx`), in either orientation: the
+  longer dimension is time. Three rows are x, y, z; four of which the first or the last never decreases are a
+  clock and x, y, z; any other number are sensors. `sensors` names the rows whatever their number;
+- sampling rate and unit beside an array or in the groups around it, the nearest first. An attribute is handed
+  over as a member of what it describes: `imu1/fs`, `imu1/gyro/unit`;
+- every other array of the same length as a channel.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gyrofuse.io.columns import AXES, TICK, Column, canonical_unit, classify_columns, time_in_seconds
+from gyrofuse.io.stream import Array, RecordingError, Stream
+
+_RATE = ("fs", "rate", "samplingrate", "samplerate", "samplingfrequency", "samplefrequency", "samplefreq")
+_UNIT = ("unit", "units")
+_SENSORS = ("sensors", "sensornames")
+# By the group that holds it ("" is the file) and its name in lower case letters.
+_Settings = Mapping[tuple[str, str], Any]
+
+
+def streams_from_arrays(content: Mapping[str, Any], path: Path, *, key: str | None = None) -> list[Stream]:
+    """Build the streams of a file of named arrays.
+
+    Args:
+        content: Arrays, numbers and text by name. An array is anything with `shape` and `dtype` that NumPy
+            converts; it is read only when needed.
+        path: The file; its stem names a device that the arrays do not name.
+        key: The array that holds the gyros, whatever its name, or the group to look in.
+
+    Raises:
+        RecordingError: No gyro among the arrays, or nothing of the name `key`.
+    """
+    arrays = {name: value for name, value in content.items() if _length(value) > 1}
+    settings = settings_by_group({name: value for name, value in content.items() if name not in arrays})
+    columns = {column.name: column for column in classify_columns(list(arrays))}
+    if key is not None:
+        columns = _select(columns, key.strip("/"))
+
+    # Gyros of one length and one stated rate and unit share a clock and channels.
+    alike: dict[tuple[int, float | None, str], list[str]] = {}
+    for name, column in columns.items():
+        if column.kind == "gyro":
+            unit = column.unit or stated_unit(settings, name)
+            alike.setdefault((_length(arrays[name]), stated_rate(settings, name), unit), []).append(name)
+    if not alike:
+        found = ", ".join(f"{name} {tuple(value.shape)}" for name, value in arrays.items()) or "no array"
+        wanted = "an array with the name of a gyro (gyro, imu_gyr, gx)" + (f" in {key!r}" if key else "")
+        raise RecordingError(f"{path}: expected {wanted}, found {found}; say with `key` which array holds the gyros")
+    streams: list[Stream] = []
+    for (length, rate, unit), gyros in alike.items():
+        beside = [n for n, column in columns.items() if column.kind != "gyro" and _length(arrays[n]) == length]
+        rows = {name: _rows(arrays[name], length) for name in (*gyros, *beside)}
+        streams += _group(rows, columns, settings, path.stem, rate, unit)
+    return streams
+
+
+def _group(
+    rows: Mapping[str, Array],
+    columns: Mapping[str, Column],
+    settings: _Settings,
+    stem: str,
+    rate: float | None,
+    unit: str,
+) -> list[Stream]:
+    """Streams of arrays `(row, time)` of one length."""
+    gyro: dict[tuple[str, str], dict[str, Array]] = {}  # by device and sensor, then by axis
+    clocks: dict[str, tuple[Array, float | None, str]] = {}
+    beside: dict[str, Array] = {}
+    notes: list[str] = []
+    for name, values in rows.items():
+        column = columns[name]
+        if column.kind == "time" and len(values) == 1:
+            clocks.setdefault(column.device, _clock(column, values[0], rate, settings))
+            continue
+        if column.kind != "gyro":
+            beside[name] = values
+            continue
+        sensors = _texts(_nearest(settings, name, _SENSORS))
+        if len(values) == 4 and len(sensors) != 4 and (row := _clock_row(values)) is not None:
+            notes.append(f"row {row} of '{name}' never decreases and is read as its time")
+            clocks[column.device] = _clock(column, values[row], rate, settings)
+            values = np.delete(values, row, axis=0)
+        if len(values) == len(sensors):
+            gyro |= {(column.device, sensor): {"": row} for sensor, row in zip(sensors, values, strict=True)}
+        elif len(values) in (1, 3):
+            axes = AXES if len(values) == 3 else (column.axis,)
+            triad = gyro.setdefault((column.device, ""), {})
+            if not triad.keys().isdisjoint(axes):
+                notes.append(f"'{name}' repeats an axis of the same device and is left out")
+                continue
+            triad |= zip(axes, values, strict=True)
+        else:
+            label = column.device or stem
+            gyro |= {(column.device, f"{label}[{i}]"): {"": row} for i, row in enumerate(values)}
+
+    channels = _channels(beside, columns, settings, [device for device, _ in gyro])
+    no_clock: tuple[Array | None, float | None, str] = (None, None, "")
+    shared = clocks.get("") or (next(iter(clocks.values())) if len(clocks) == 1 else no_clock)
+    streams = []
+    for (device, sensor), rates in gyro.items():
+        time, period, guess = clocks.get(device) or shared
+        # A channel goes with the first sensor of its device.
+        of_device, units = channels.pop(device, ({}, {}))
+        streams.append(
+            Stream(
+                name=sensor or device or stem,
+                gyro=rates,
+                unit=unit,
+                time=time,
+                rate=rate,
+                clock_period=period,
+                channels=of_device,
+                channel_units=units,
+                notes=(*notes, *([guess] if guess else [])),
+            )
+        )
+    return streams
+
+
+def _channels(
+    beside: Mapping[str, Array], columns: Mapping[str, Column], settings: _Settings, devices: Sequence[str]
+) -> dict[str, tuple[dict[str, Array], dict[str, str]]]:
+    """Channels and their units by device; what belongs to no device with a gyro goes with the first."""
+    axes: dict[tuple[str, str], dict[str, str]] = {}
+    for name, values in beside.items():
+        if columns[name].axis and len(values) == 1:
+            axes.setdefault((columns[name].kind, columns[name].device), {})[columns[name].axis] = name
+    triads = {found["x"]: found for found in axes.values() if found.keys() >= set(AXES)}
+    merged = {found[axis] for found in triads.values() for axis in "yz"}
+
+    channels: dict[str, tuple[dict[str, Array], dict[str, str]]] = {}
+    for name, values in beside.items():
+        if name in merged:
+            continue
+        column = columns[name]
+        values = np.concatenate([beside[triads[name][axis]] for axis in AXES]) if name in triads else values
+        known = column.kind and len(values) == (1 if column.kind == "temperature" else 3)
+        label = column.kind if known else name.rpartition("/")[2]
+        owned, units = channels.setdefault(column.device if column.device in devices else devices[0], ({}, {}))
+        if label in owned:
+            label = name
+        owned[label] = values[0] if len(values) == 1 else values
+        if unit := column.unit or canonical_unit(_own_unit(settings, name)):
+            units[label] = unit
+    return channels
+
+
+def settings_by_group(values: Mapping[str, Any]) -> _Settings:
+    """Arrange numbers and text by the group that holds them and their name in lower case letters."""
+    settings = {}
+    for path, value in values.items():
+        group, _, name = path.rpartition("/")
+        settings[group, re.sub(r"[^a-z]", "", name.lower()).removesuffix("hz")] = value
+    return settings
+
+
+def stated_rate(settings: _Settings, name: str) -> float | None:
+    """Return the sampling rate in Hz that is stated nearest to the array `name`, `None` where there is none."""
+    value = _nearest(settings, name, _RATE)
+    try:
+        rate = float(_text(value) or np.asarray(value, dtype=np.float64).item())
+    except (TypeError, ValueError):
+        return None
+    return rate if math.isfinite(rate) and rate > 0 else None
+
+
+def stated_unit(settings: _Settings, name: str) -> str:
+    """Return the unit that is stated nearest to the array `name`, `"unknown"` where there is none."""
+    return canonical_unit(_text(_nearest(settings, name, _UNIT))) or "unknown"
+
+
+def _own_unit(settings: _Settings, name: str) -> str:
+    return next((_text(settings[name, s]) for s in _UNIT if (name, s) in settings), "")
+
+
+def _nearest(settings: _Settings, name: str, spellings: Sequence[str]) -> Any:
+    """The setting of the array itself, else of the groups around it, the innermost first."""
+    parts = name.split("/")
+    around = ["/".join(parts[:i]) for i in range(len(parts), 0, -1)] + [""]
+    return next((settings[group, s] for group in around for s in spellings if (group, s) in settings), None)
+
+
+def _texts(value: Any) -> list[str]:
+    flat = np.asarray(value).ravel()
+    if flat.dtype.kind not in "USO":
+        return []
+    words = [item.decode() if isinstance(item, bytes) else item for item in flat.tolist()]
+    return [word.strip() for word in words if isinstance(word, str)]
+
+
+def _text(value: Any) -> str:
+    return (*_texts(value), "")[0]
+
+
+def _select(columns: Mapping[str, Column], key: str) -> dict[str, Column]:
+    """Keep `key` as the only gyro, or what is in the group `key` and the clocks."""
+    if key in columns:
+        kept = {name: column for name, column in columns.items() if name == key or column.kind != "gyro"}
+        return kept | {key: replace(columns[key], kind="gyro")}
+    return {n: column for n, column in columns.items() if n.startswith(f"{key}/") or column.kind == "time"}
+
+
+def _dimensions(value: Any) -> tuple[int, ...]:
+    """Dimensions above one of a numeric array, none of anything else."""
+    if getattr(getattr(value, "dtype", None), "kind", "O") not in "biuf":
+        return ()
+    return tuple(size for size in value.shape if size != 1)
+
+
+def _length(value: Any) -> int:
+    """Number of samples of an array of one or two dimensions, 0 of anything else."""
+    dimensions = _dimensions(value)
+    return max(dimensions) if len(dimensions) in (1, 2) else 0
+
+
+def _rows(value: Any, length: int) -> Array:
+    """The array as `(row, time)`; of a square one the last dimension is time."""
+    values = np.asarray(value, dtype=np.float64).squeeze()
+    values = values[None] if values.ndim == 1 else values
+    return np.ascontiguousarray(values if values.shape[-1] == length else values.T)
+
+
+def _clock_row(rows: Array) -> int | None:
+    """First or last row when it advances and never decreases."""
+    return next((i for i in (0, 3) if rows[i, -1] > rows[i, 0] and np.all(np.diff(rows[i]) >= 0)), None)
+
+
+def _clock(column: Column, ticks: Array, rate: float | None, settings: _Settings) -> tuple[Array, float | None, str]:
+    """Seconds, wrapping period and guess of a clock, whose unit its attribute or the sampling rate may tell."""
+    unit = column.unit or _own_unit(settings, column.name)
+    step = float(np.median(np.diff(ticks)))
+    if unit not in TICK and rate is not None and step > 0:
+        unit = min(TICK, key=lambda name: abs(math.log(step * TICK[name] * rate)))
+    return time_in_seconds(replace(column, unit=unit if unit in TICK else ""), ticks)

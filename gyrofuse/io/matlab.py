@@ -1,0 +1,69 @@
+"""MATLAB files, version 5 to 7.3: arrays with the names of gyros, in structs too."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gyrofuse.io import hdf5
+from gyrofuse.io.arrays import streams_from_arrays
+from gyrofuse.io.stream import RecordingError, Stream
+
+_HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+_USER_BLOCK = 512  # MATLAB puts its own header before the HDF5 file
+
+
+def read(path: Path, *, key: str | None = None) -> list[Stream]:
+    """Read the gyros of a .mat file; `gyrofuse.io.arrays` says which names are understood.
+
+    Files of version 7.3 are HDF5 and are told apart by their content.
+
+    Args:
+        path: The file.
+        key: The array that holds the gyros (`"imu.gyr"` or `"imu/gyr"` in a struct), or the struct to look in.
+
+    Raises:
+        RecordingError: Not a MATLAB file, damaged, or without gyro data.
+        ImportError: Version 7.3 and h5py is not installed.
+    """
+    from scipy.io import loadmat
+
+    key = key.replace(".", "/") if key else key
+    try:
+        with path.open("rb") as file:
+            start = file.read(_USER_BLOCK + len(_HDF5_SIGNATURE))
+    except OSError as error:
+        raise RecordingError(f"{path}: expected a MATLAB file, found one that cannot be opened ({error})") from error
+    if start.startswith(_HDF5_SIGNATURE) or start.endswith(_HDF5_SIGNATURE):
+        return hdf5.read(path, key=key)
+    try:
+        variables = loadmat(path)
+    except Exception as error:  # a damaged file may fail anywhere in the parser
+        raise RecordingError(
+            f"{path}: expected a MATLAB file of version 5 to 7.3, found one that cannot be read ({error}); "
+            "save it again with save(..., '-v7')"
+        ) from error
+    content: dict[str, Any] = {}
+    for name, value in variables.items():
+        if not name.startswith("__"):
+            content |= _members(name, value)
+    return streams_from_arrays(content, path, key=key)
+
+
+def _members(name: str, value: Any) -> dict[str, Any]:
+    """The variable itself; of a struct its fields, `name/field`, and of an array of structs `name1/field`."""
+    if not isinstance(value, np.ndarray):  # sparse matrices, function handles
+        return {}
+    if value.dtype.names:
+        members: dict[str, Any] = {}
+        for number, struct in enumerate(value.ravel(), 1):
+            owner = name if value.size == 1 else f"{name}{number}"
+            for field in value.dtype.names:
+                members |= _members(f"{owner}/{field}", struct[field])
+        return members
+    if value.dtype.kind == "O":  # a cell array: only text in it is of use
+        cells = [cell for cell in value.ravel() if isinstance(cell, np.ndarray) and cell.dtype.kind == "U"]
+        return {name: [text for cell in cells for text in cell.ravel().tolist()]}
+    return {name: value}

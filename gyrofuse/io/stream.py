@@ -1,0 +1,49 @@
+"""What every log reader returns: the gyros of one device, as recorded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class RecordingError(ValueError):
+    """A log that cannot be read as a recording: says the file, what was expected, what was found, what to do."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stream:
+    """The gyros of one device that share one clock, exactly as the log holds them.
+
+    Nothing is repaired here: gaps, repeats, wraps and non-finite samples are kept for
+    `gyrofuse.recording` to find and report.
+
+    Attributes:
+        name: Device, topic instance, file stem or column the data come from.
+        gyro: Rate of each axis, `{"x": (time,), "y": ..., "z": ...}`; the key is "" where the log names no axis.
+        unit: `"deg/s"`, `"rad/s"`, `"counts"`, or `"unknown"` where the log does not say.
+        time: Clock reading of each sample in seconds (may wrap, repeat or jump), or `None`.
+        rate: Sampling rate that the log states in Hz, or `None`.
+        clock_period: Seconds after which the clock wraps (2**32 microseconds, say), or `None` when unknown.
+        channels: Auxiliary channels with time last: `temperature (time,)`, `acceleration (3, time)`.
+        channel_units: Unit of each auxiliary channel, where known.
+        notes: What the reader noticed (dropouts the logger reported, columns ignored), one sentence each.
+    """
+
+    name: str
+    gyro: dict[str, Array]
+    unit: str = "unknown"
+    time: Array | None = None
+    rate: float | None = None
+    clock_period: float | None = None
+    channels: dict[str, Array] = field(default_factory=dict)
+    channel_units: dict[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    @property
+    def n_samples(self) -> int:
+        """Number of samples as recorded."""
+        return next(iter(self.gyro.values())).shape[0]

@@ -1,0 +1,145 @@
+"""Models from text and from dictionaries."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from gyrofuse.processes import (
+    AR1,
+    Drift,
+    Model,
+    Process,
+    QuantizationNoise,
+    RandomWalk,
+    Sinusoid,
+    WhiteNoise,
+)
+from gyrofuse.simulate import ArrayModel
+
+# Every class has a constructor of its own, hence no common type to state.
+_PROCESSES: tuple[type[Any], ...] = (WhiteNoise, QuantizationNoise, AR1, RandomWalk, Drift, Sinusoid)
+_SPELLINGS: dict[str, type[Any]] = {
+    **{kind.__name__.lower(): kind for kind in _PROCESSES},
+    **{kind.symbol.lower(): kind for kind in _PROCESSES},
+    **{kind.key: kind for kind in _PROCESSES},
+    "gm": AR1,  # first-order Gauss-Markov
+}
+_KNOWN = ", ".join(f"{kind.symbol} ({kind.__name__})" for kind in _PROCESSES)
+
+
+def parse_model(formula: str) -> Model:
+    """Read a model such as `"WN + 2*AR1 + RW + SIN"` or `"WN(variance=1e-4) + AR1(phi=0.99, variance=1e-6)"`.
+
+    Names are WN, QN, AR1 (or GM, Gauss-Markov), RW, DR, SIN or the processes' full names, in either case.
+    What `str` prints of a model with scalar parameters is read back exactly.
+
+    Raises:
+        ValueError: Not a formula, an unknown name or parameter, a value outside its domain, or a repetition
+            of a process that may appear once.
+    """
+    text = " ".join(formula.split())
+    try:
+        tree = ast.parse(text, mode="eval").body
+    except (SyntaxError, ValueError) as error:
+        position = getattr(error, "offset", None) or len(text)
+        raise ValueError(
+            f"`formula`: cannot read {text!r} near character {position}; "
+            'expected processes joined by +, such as "WN + 2*AR1 + RW"'
+        ) from None
+    return _read(tree, text)
+
+
+def _read(node: ast.expr, text: str) -> Model:
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
+        return _read(node.left, text) + _read(node.right, text)
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mult):
+        times = _number(node.left, text)
+        if not isinstance(times, int) or times < 1:
+            raise _error(node.left, text, f"expected a whole number >= 1, got {times!r}")
+        return times * _read(node.right, text)
+    if isinstance(node, ast.Name):
+        return _kind(node, text)()
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+        return _process(node.func, node, text)
+    raise _error(node, text, f"expected processes joined by +, got {ast.unparse(node)!r}; known: {_KNOWN}")
+
+
+def _process(name: ast.Name, call: ast.Call, text: str) -> Process:
+    kind = _kind(name, text)
+    names = tuple(kind().parameters)
+    for node in call.args:
+        raise _error(node, text, f"expected `name=number` in {kind.__name__}({', '.join(names)})")
+    for keyword in call.keywords:
+        if keyword.arg not in names:
+            raise _error(
+                keyword.value,
+                text,
+                f"{kind.__name__} has no parameter `{keyword.arg}`; known: {', '.join(names)}",
+            )
+    return kind(**{str(keyword.arg): _number(keyword.value, text) for keyword in call.keywords})
+
+
+def _kind(node: ast.Name, text: str) -> type[Any]:
+    kind = _SPELLINGS.get(node.id.lower())
+    if kind is None:
+        raise _error(node, text, f"unknown process {node.id!r}; known: {_KNOWN}")
+    return kind
+
+
+def _number(node: ast.expr, text: str) -> Any:
+    try:
+        value = ast.literal_eval(node)
+    except ValueError:
+        value = None
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise _error(node, text, f"expected a number, got {ast.unparse(node)!r}")
+    return value
+
+
+def _error(node: ast.expr, text: str, message: str) -> ValueError:
+    return ValueError(f"`formula`: at character {node.col_offset + 1} of {text!r}: {message}")
+
+
+def model_from_dict(description: Mapping[str, Any]) -> Model | ArrayModel:
+    """Rebuild the `Model` or `ArrayModel` whose `to_dict` gave `description`.
+
+    Raises:
+        ValueError: Missing or unknown entries, or a value outside its domain.
+    """
+    if "components" in description:
+        return ArrayModel([_component(entry) for entry in description["components"]])
+    if "processes" not in description:
+        raise ValueError(
+            "`description`: expected the entry 'processes' of a model or 'components' of an array, "
+            f"got {sorted(description)}"
+        )
+    return Model([_process_from_dict(entry) for entry in description["processes"]])
+
+
+def _component(entry: Mapping[str, Any]) -> tuple[Process, Any]:
+    matrix = entry.get("covariance", entry.get("gains"))
+    if matrix is None or len(entry.get("processes", ())) != 1:
+        raise ValueError(
+            f"`description`: expected one process with a 'covariance' or 'gains' in every component, got {entry!r}"
+        )
+    return _process_from_dict(entry["processes"][0]), matrix
+
+
+def _process_from_dict(entry: Mapping[str, Any]) -> Process:
+    values = dict(entry)
+    name = values.pop("process", None)
+    kind = _SPELLINGS.get(str(name).lower())
+    if kind is None:
+        raise ValueError(f"`description`: unknown process {name!r} in {entry!r}; known: {_KNOWN}")
+    unknown = sorted(set(values) - set(kind().parameters))
+    if unknown:
+        raise ValueError(
+            f"`description`: {kind.__name__} has no parameter {', '.join(unknown)}; "
+            f"known: {', '.join(kind().parameters)}"
+        )
+    batched = {k: torch.tensor(v, dtype=torch.float64) for k, v in values.items() if isinstance(v, list)}
+    return kind(**{**values, **batched})

@@ -1,0 +1,375 @@
+"""Figures of arrays: Allan deviations, ratios, weights, signals.
+
+Every function draws into the axes it is given, or into new ones of `matplotlib.pyplot` that `plt.show()` displays;
+nothing else of matplotlib's state is touched. The colours are those of Okabe and Ito, which colour-blind readers and
+grey printers tell apart: the virtual gyro is a thick blue line, the plain mean dashed orange, the sensors grey.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
+
+Array = NDArray[np.float64]
+Numbers = ArrayLike | Tensor
+Limits = tuple[Numbers, Numbers]
+
+_BLUE, _ORANGE, _GREY, _INK, _FRAME, _GRID = "#0072b2", "#d55e00", "#969696", "#262626", "#8c8c8c", "#e3e3e3"
+_MEAN = {"color": _ORANGE, "linewidth": 1.5, "linestyle": (0, (5, 2))}
+_SHADE = {"color": _BLUE, "alpha": 0.18, "linewidth": 0}
+_LABEL, _TICK, _SMALL = 9.0, 8.0, 7.0  # font sizes in points
+_MOST_LABELS = 16  # sensors that still get a label each
+_LONGEST_NAME = 18  # characters
+_N_BLOCKS = 600  # of a signal, however long: more than a figure can show
+
+
+def plot_allan_deviation(
+    tau: Numbers,
+    wavelet_variance: Numbers,
+    *,
+    names: Sequence[str],
+    virtual: Numbers | None = None,
+    band: Limits | None = None,
+    equal: Numbers | None = None,
+    unit: str | None = None,
+    in_seconds: bool = True,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the Allan deviation `sqrt(2 nu)` of every sensor and, if given, of the plain mean and the virtual gyro.
+
+    Args:
+        tau: Averaging times `(level,)`, seconds or samples.
+        wavelet_variance: `nu` of every sensor, `(level, sensor)`, signal^2; NaN is left out.
+        names: Name of each sensor.
+        virtual: Wavelet variance of the virtual gyro, `(level,)`.
+        band: Lower and upper limits of `virtual`, `(level,)` each.
+        equal: Wavelet variance of the plain mean, `(level,)`.
+        unit: Unit of the signal.
+        in_seconds: Whether `tau` is in seconds, else in samples.
+        ax: Where to draw; new axes by default.
+
+    Returns:
+        The axes.
+    """
+    ax = ax if ax is not None else _new_axes()
+    times, sensors = _array(tau), _deviation(wavelet_variance)
+    handles = ax.plot(times, sensors, color=_GREY, linewidth=0.9, zorder=2)[:1]
+    labels = [f"sensor {_clean(names[0])}" if len(names) == 1 else f"{len(names)} sensors"]
+    if equal is not None:
+        handles += ax.plot(times, _deviation(equal), zorder=4, **_MEAN)
+        labels += ["plain mean"]
+    if virtual is not None:
+        handles += ax.plot(times, _deviation(virtual), color=_BLUE, linewidth=2.4, zorder=5)
+        labels += ["virtual gyro"]
+    if band is not None:
+        handles += [ax.fill_between(times, *map(_deviation, band), zorder=3, **_SHADE)]
+        labels += ["its confidence interval"]
+    ax.set_yscale("log")
+    ax.set_ylabel(f"Allan deviation ({unit})" if unit else "Allan deviation (signal unit)", parse_math=False)
+    _time_axis(ax, in_seconds)
+    _finish(ax, handles, labels)
+    if 1 < len(names) <= _MOST_LABELS:
+        _label_line_ends(ax, times, sensors, names)
+    return ax
+
+
+def plot_ratio(
+    tau: Numbers, ratio: Numbers, *, band: Limits | None = None, in_seconds: bool = True, ax: Axes | None = None
+) -> Axes:
+    """Draw the Allan deviation of the virtual gyro over that of the plain mean; below 1 the virtual gyro wins.
+
+    Args:
+        tau: Averaging times `(level,)`, seconds or samples.
+        ratio: `(level,)`.
+        band: Lower and upper limits of `ratio`, `(level,)` each.
+        in_seconds: Whether `tau` is in seconds, else in samples.
+        ax: Where to draw; new axes by default.
+
+    Returns:
+        The axes.
+    """
+    ax = ax if ax is not None else _new_axes()
+    times, ratios = _array(tau), _array(ratio)
+    ax.axhline(1, zorder=3, **_MEAN)
+    if band is not None:
+        ax.fill_between(times, *map(_array, band), zorder=2, **_SHADE)
+    known = np.isfinite(ratios)
+    if known.any():
+        # Shade along the line as drawn, straight in log tau, so that the shade ends where the line crosses 1.
+        log_times = np.log(times[known])
+        fine = np.linspace(log_times[0], log_times[-1], 1000)
+        drawn = np.interp(fine, log_times, ratios[known])
+        ax.fill_between(np.exp(fine), drawn, 1, where=drawn < 1, zorder=1, **_SHADE)
+    ax.plot(times, ratios, color=_BLUE, linewidth=2.0, marker="o", markersize=3.5, zorder=5)
+    ax.margins(y=0.12)
+    ax.set_ylabel("virtual / plain mean")
+    _time_axis(ax, in_seconds)
+    _finish(ax)
+    return ax
+
+
+def plot_weights(
+    weights: Numbers,
+    low: Numbers,
+    high: Numbers,
+    *,
+    names: Sequence[str],
+    equal: bool = True,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw weights with their intervals: full marks where the interval excludes 0, hollow ones where it does not.
+
+    Args:
+        weights: `(sensor,)`.
+        low: Lower limits `(sensor,)`, NaN where unknown.
+        high: Upper limits `(sensor,)`, NaN where unknown.
+        names: Name of each sensor.
+        equal: Whether to draw the weight `1 / sensors` of the plain mean.
+        ax: Where to draw; new axes by default.
+
+    Returns:
+        The axes.
+    """
+    from matplotlib.lines import Line2D
+
+    ax = ax if ax is not None else _new_axes()
+    lows, highs = _array(low), _array(high)
+    place = np.arange(len(names))
+    size = 5.5 if len(names) <= 2 * _MOST_LABELS else 3.5
+    mark = {"marker": "o", "markersize": size, "markeredgecolor": _BLUE, "linestyle": "none"}
+    unsure = (lows <= 0) & (highs >= 0)
+    ax.axhline(0, color=_FRAME, linewidth=0.8, zorder=1)
+    ax.vlines(place, lows, highs, color=_BLUE, linewidth=1.6, zorder=3)
+    ax.scatter(place, _array(weights), size**2, np.where(unsure, "white", _BLUE), edgecolors=_BLUE, zorder=4)
+    handles, labels = [], []
+    if np.isfinite(lows).any():
+        handles += [Line2D([], [], markerfacecolor=_BLUE, **mark), Line2D([], [], markerfacecolor="white", **mark)]
+        labels += ["interval excludes 0", "interval holds 0"]
+    if equal:
+        handles += [ax.axhline(1 / len(names), zorder=2, **_MEAN)]
+        labels += [f"plain mean (1/{len(names)})"]
+    ax.margins(y=0.12)
+    ax.set_xlim(-0.6, len(names) - 0.4)
+    ax.set_xlabel("sensor")
+    ax.set_ylabel("weight")
+    _name_ticks(ax, names)
+    _finish(ax, handles, labels)
+    ax.grid(visible=False, axis="x")
+    return ax
+
+
+def plot_signals(
+    time: Numbers | None,
+    virtual: Numbers,
+    mean: Numbers | None = None,
+    *,
+    unit: str | None = None,
+    in_seconds: bool = True,
+    figure: Figure | SubFigure | None = None,
+) -> Figure | SubFigure:
+    """Draw a virtual signal and what is left of it when noise is averaged away, beside that of the plain mean.
+
+    Signals of any length are reduced to 600 blocks: above, the range of the samples in each; below, their average.
+
+    Args:
+        time: Time of each sample `(time,)`, or `None` for their number.
+        virtual: Virtual signal `(time,)`; NaN is left out.
+        mean: Plain mean of the sensors, `(time,)`.
+        unit: Unit of the signals.
+        in_seconds: Whether `time` is in seconds, else in samples.
+        figure: Where to draw; a new figure, unknown to pyplot, by default.
+
+    Returns:
+        The figure.
+    """
+    figure = figure if figure is not None else _new_figure(7.0, 4.4)
+    values = _array(virtual)
+    times = np.arange(values.shape[-1], dtype=np.float64) if time is None else _array(time)
+    instants, low, high, average = _in_blocks(times, values)
+    top, bottom = figure.subplots(2, 1, sharex=True)
+    top.fill_between(instants, low, high, color=_BLUE, alpha=0.55, linewidth=0.4)
+    top.set_ylabel(f"range ({unit})" if unit else "range", parse_math=False)
+    handles = bottom.plot(instants, average - np.nanmean(average), color=_BLUE, linewidth=1.2, zorder=4)
+    labels = ["virtual gyro"]
+    if mean is not None:
+        average = _in_blocks(times, _array(mean))[-1]
+        handles += bottom.plot(instants, average - np.nanmean(average), zorder=3, **_MEAN | {"linewidth": 1.0})
+        labels += ["plain mean"]
+    bottom.set_ylabel(f"average ({unit})" if unit else "average", parse_math=False)
+    bottom.set_xlabel("time (s)" if in_seconds else "sample")
+    _finish(top)
+    _finish(bottom, handles, labels)
+    return figure
+
+
+def plot_fusion(
+    tau: Numbers,
+    wavelet_variance: Numbers,
+    weights: Numbers,
+    *,
+    names: Sequence[str],
+    virtual: Numbers,
+    equal: Numbers,
+    band: Limits | None = None,
+    interval: Limits | None = None,
+    unit: str | None = None,
+    in_seconds: bool = True,
+    figure: Figure | SubFigure | None = None,
+) -> Figure | SubFigure:
+    """Draw a fused array in one figure: the gain over the plain mean, the Allan deviations, and the weights.
+
+    Args:
+        tau: Averaging times `(level,)`, seconds or samples.
+        wavelet_variance: Of every sensor, `(level, sensor)`, signal^2.
+        weights: `(sensor,)`.
+        names: Name of each sensor.
+        virtual: Wavelet variance of the virtual gyro, `(level,)`.
+        equal: Wavelet variance of the plain mean, `(level,)`.
+        band: Lower and upper limits of `virtual`, `(level,)` each.
+        interval: Lower and upper limits of `weights`, `(sensor,)` each.
+        unit: Unit of the signal.
+        in_seconds: Whether `tau` is in seconds, else in samples.
+        figure: Where to draw; a new figure, unknown to pyplot, by default.
+
+    Returns:
+        The figure.
+
+    References:
+        Zhang et al., figures 9 and 10.
+    """
+    figure = figure if figure is not None else _new_figure(7.0, 8.0)
+    above, middle, below = figure.subplots(3, 1, height_ratios=[1.1, 2.6, 1.3])
+    above.sharex(middle)
+    plot_ratio(tau, _deviation(virtual) / _deviation(equal), in_seconds=in_seconds, ax=above)
+    above.set_xlabel("")
+    above.tick_params(labelbottom=False)
+    plot_allan_deviation(
+        tau,
+        wavelet_variance,
+        names=names,
+        virtual=virtual,
+        band=band,
+        equal=equal,
+        unit=unit,
+        in_seconds=in_seconds,
+        ax=middle,
+    )
+    unknown = np.full(len(names), np.nan)
+    low, high = interval if interval is not None else (unknown, unknown)
+    plot_weights(weights, low, high, names=names, ax=below)
+    return figure
+
+
+def _new_axes() -> Axes:
+    import matplotlib.pyplot as plt
+
+    return plt.subplots(figsize=(7.0, 4.6), layout="constrained")[1]
+
+
+def _new_figure(width: float, height: float) -> Figure:
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained", facecolor="white")
+
+
+def _array(value: Numbers) -> Array:
+    return torch.as_tensor(value).detach().cpu().double().numpy()
+
+
+def _deviation(variance: Numbers) -> Array:
+    """`sqrt(2 nu)`, NaN where a logarithmic axis has no place for it."""
+    values = _array(variance)
+    return np.sqrt(2 * np.where(values > 0, values, np.nan))
+
+
+def _in_blocks(times: Array, values: Array) -> tuple[Array, Array, Array, Array]:
+    """Instants, minima, maxima and averages of equal stretches of a signal; NaN where a stretch has no sample."""
+    n_blocks = min(_N_BLOCKS, len(values))
+    starts = np.linspace(0, len(values), n_blocks, endpoint=False).astype(int)
+    counts = np.add.reduceat(np.isfinite(values), starts, dtype=float)
+    sums = np.add.reduceat(np.where(np.isfinite(values), values, 0.0), starts)
+    average = np.divide(sums, counts, out=np.full(n_blocks, np.nan), where=counts > 0)
+    return times[starts], np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts), average
+
+
+def _time_axis(ax: Axes, in_seconds: bool) -> None:
+    ax.set_xscale("log")
+    ax.set_xlabel("averaging time (s)" if in_seconds else "averaging time (samples)")
+
+
+def _finish(ax: Axes, handles: Sequence[Any] = (), labels: Sequence[str] = ()) -> None:
+    """Give axes the common look, and a legend for `handles`."""
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.spines[["left", "bottom"]].set_color(_FRAME)
+    ax.tick_params(which="both", color=_FRAME, labelcolor=_INK, labelsize=_TICK)
+    for label in (ax.xaxis.label, ax.yaxis.label):
+        label.set(color=_INK, fontsize=_LABEL)
+    ax.grid(color=_GRID, linewidth=0.7)
+    ax.set_axisbelow(True)
+    if handles:
+        legend = ax.legend(handles, labels, fontsize=_TICK, labelcolor=_INK, frameon=True, framealpha=0.85)
+        legend.get_frame().set(edgecolor="none", facecolor="white")
+        for text in legend.get_texts():
+            text.set_parse_math(False)
+
+
+def _clean(name: str) -> str:
+    """A name that fits a figure: printable and not too long."""
+    text = "".join(c if c.isprintable() else "?" for c in name)
+    return text if len(text) <= _LONGEST_NAME else f"{text[: _LONGEST_NAME - 1]}…"
+
+
+def _name_ticks(ax: Axes, names: Sequence[str]) -> None:
+    """Name the places 0, 1, ... on the x axis; turned when they are long, every n-th when they are many."""
+    step = -(-len(names) // (2 * _MOST_LABELS))
+    shown = [_clean(name) for name in names]
+    turned = sum(map(len, shown[::step])) + len(shown[::step]) > 75
+    ax.set_xticks(
+        range(0, len(names), step), shown[::step], rotation=90 if turned else 0, fontsize=_TICK, parse_math=False
+    )
+
+
+def _label_line_ends(ax: Axes, times: Array, values: Array, names: Sequence[str]) -> None:
+    """Write each sensor's name behind the right end of its line, moved apart where they would overlap."""
+    known = [column for column in range(values.shape[1]) if np.isfinite(values[:, column]).any()]
+    last = {column: np.flatnonzero(np.isfinite(values[:, column]))[-1] for column in known}
+    order = sorted(known, key=lambda column: values[last[column], column])
+    bottom, top = np.log(ax.get_ylim())
+    ends = np.array([np.log(values[last[column], column]) for column in order])
+    height = ax.get_window_extent().height * 72 / ax.figure.dpi  # points
+    places = _spread((ends - bottom) / (top - bottom) * height, gap=1.25 * _SMALL)
+    for column, place in zip(order, places, strict=True):
+        ax.annotate(
+            _clean(names[column]),
+            xy=(times[last[column]], values[last[column], column]),
+            xytext=(1.015, place / height),
+            textcoords="axes fraction",
+            color="#6b6b6b",
+            fontsize=_SMALL,
+            va="center",
+            parse_math=False,
+            annotation_clip=False,
+            arrowprops={"arrowstyle": "-", "color": _GREY, "linewidth": 0.4, "shrinkA": 0, "shrinkB": 1},
+        )
+
+
+def _spread(places: Array, gap: float) -> Array:
+    """Move ascending places apart by at least `gap`, each as little as possible in least squares."""
+    offsets = gap * np.arange(len(places))
+    blocks: list[list[float]] = []  # isotonic regression of what remains: [mean, size] of neighbours that touch
+    for value in places - offsets:
+        blocks.append([value, 1])
+        while len(blocks) > 1 and blocks[-2][0] > blocks[-1][0]:
+            mean, size = blocks.pop()
+            before, n = blocks[-1]
+            blocks[-1] = [(before * n + mean * size) / (n + size), n + size]
+    return np.concatenate([np.full(int(size), mean) for mean, size in blocks] or [np.empty(0)]) + offsets

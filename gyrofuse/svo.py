@@ -1,0 +1,247 @@
+"""Scale-wise variance optimisation (SVO): one virtual gyro from an array, by closed-form optimal weights.
+
+The weights minimise the wavelet variance of the virtual signal, summed over levels with scale weights `omega_j`:
+
+    A = sum_j omega_j Gamma_j,   c = A^-1 1 / (1' A^-1 1)                                   [Z] equations (6), (7)
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from gyrofuse import uncertainty
+from gyrofuse._checks import (
+    check_confidence_level,
+    check_floating,
+    check_n_levels,
+    check_positive_integer,
+    check_signal,
+)
+from gyrofuse._linalg import check_positive_definite
+from gyrofuse._result import numbered
+from gyrofuse.competitors import equal_weights, inverse_variance_weights
+from gyrofuse.covariance import wavelet_products
+from gyrofuse.recording import Recording
+from gyrofuse.scale_weights import ScaleWeights, resolve_scale_weights
+from gyrofuse.svo_result import SVOResult, fuse
+
+METHODS = ("svo", "inverse_variance", "equal")
+COVARIANCES = ("model", "none")
+
+
+def svo_weights(wccv: Tensor, scale_weights: ScaleWeights = "flat") -> Tensor:
+    """Optimal weights of an array from its wavelet cross-covariance; differentiable.
+
+    Args:
+        wccv: `(..., level, sensor, sensor)`, signal^2.
+        scale_weights: `"flat"`, `"short"`, `"long"`, or one number >= 0 per level.
+
+    Returns:
+        `(..., sensor)`, sum 1, may be negative.
+
+    Raises:
+        TypeError: `wccv` is not a floating point tensor.
+        ValueError: Wrong shape or scale weights.
+        SingularCovarianceError: `A` is not positive definite (a dead or duplicated sensor, say).
+
+    References:
+        [Z] equation (7).
+    """
+    combined = _combine(wccv, scale_weights)
+    check_positive_definite("the wavelet cross-covariance combined over scales", combined)
+    return _optimal_weights(combined)
+
+
+def fit_svo(
+    signal: Tensor | Recording,
+    scale_weights: ScaleWeights = "flat",
+    *,
+    method: str = "svo",
+    confidence_level: float = 0.95,
+    covariance: str = "model",
+    n_levels: int | None = None,
+) -> SVOResult:
+    """Fuse an array of gyros into one virtual gyro of the smallest wavelet variance.
+
+    Bias does not matter (the wavelets difference it away), but the array has to be at rest or to turn at a constant
+    rate while it is fitted, for real motion is common to all sensors and is no error.
+
+    Args:
+        signal: `(..., sensor, time)` of at least two sensors, or a `Recording`; NaN = missing sample.
+        scale_weights: `"flat"`, `"short"`, `"long"`, or one number >= 0 per level.
+        method: `"svo"`; `"inverse_variance"` (ignores correlation) or `"equal"` for comparison.
+        confidence_level: Of every interval in the result.
+        covariance: `"model"` for Gaussian intervals on the safe side, or `"none"`.
+        n_levels: Number of levels J. By default as many as there are scale weights, else the largest at which
+            every pair of sensors has a complete window.
+
+    Returns:
+        The weights with their uncertainty, and the wavelet variances before and after.
+
+    Raises:
+        TypeError: `signal` is neither a floating point tensor nor a `Recording`.
+        ValueError: Fewer than two sensors, too few samples, a sensor without any sample, or bad options.
+        SingularCovarianceError: A dead, duplicated or linearly dependent sensor.
+
+    References:
+        [Z] section II and Theorem 2.
+
+    Example:
+        >>> result = fit_svo(signal, "long")
+        >>> virtual = result.virtual(signal)  # (..., time)
+    """
+    recording = signal if isinstance(signal, Recording) else None
+    if recording is not None:
+        signal = recording.signal
+    check_signal("signal", signal)
+    sensors = recording.sensors if recording is not None else numbered(signal.shape[-2])
+    _check_choice("method", method, METHODS)
+    _check_choice("covariance", covariance, COVARIANCES)
+    check_confidence_level(confidence_level)
+    if signal.shape[-2] < 2:
+        raise ValueError(
+            f"`signal`: expected at least 2 sensors to fuse, got {signal.shape[-2]}; give an array of gyros"
+        )
+    known = signal.isfinite().any(-1)
+    if not bool(known.all()):
+        empty = (~known).reshape(-1, signal.shape[-2]).any(0).nonzero().flatten().tolist()
+        raise ValueError(
+            f"`signal`: sensor(s) {', '.join(sensors[i] for i in empty)} have no finite sample; leave them out"
+        )
+    if n_levels is None and not isinstance(scale_weights, str):
+        n_levels = check_positive_integer("number of scale weights", len(scale_weights))
+    sums, counts = wavelet_products(signal.detach(), check_n_levels(n_levels, signal.shape[-1]))
+    fewest = counts.amin((-1, -2))  # (..., level)
+    if n_levels is None:
+        n_levels = int((fewest.reshape(-1, fewest.shape[-1]).amin(0) > 0).sum())
+        if n_levels == 0:
+            raise ValueError(
+                "`signal`: expected two samples in a row that all sensors have, found none; "
+                "the sensors are not recorded together"
+            )
+    omega = resolve_scale_weights(scale_weights, n_levels).to(sums)
+    sums, counts, fewest = sums[..., :n_levels, :, :], counts[..., :n_levels, :, :], fewest[..., :n_levels]
+    wccv = sums / counts
+    combined = torch.einsum("j,...jik->...ik", omega, torch.where(omega[:, None, None] > 0, wccv, 0.0))
+    check_positive_definite("the wavelet cross-covariance combined over scales", combined, sensors)
+    degrees = uncertainty.degrees_of_freedom(fewest)
+    if method == "svo":
+        weights = _optimal_weights(combined)
+        weights_cov = uncertainty.svo_weights_covariance(wccv, omega, weights, degrees)
+    elif method == "inverse_variance":
+        weights = inverse_variance_weights(wccv, omega)
+        weights_cov = uncertainty.inverse_variance_weights_covariance(wccv, omega, weights, degrees)
+    else:
+        weights = equal_weights(wccv)
+        weights_cov = torch.zeros_like(combined)
+    if covariance == "none":
+        weights_cov = torch.full_like(combined, torch.nan)
+    return SVOResult(
+        weights=weights.to(signal.dtype),
+        weights_cov=weights_cov.to(signal.dtype),
+        confidence_level=confidence_level,
+        wavelet_cross_covariance=wccv.to(signal.dtype),
+        scale_weights=omega.to(signal.dtype),
+        degrees_of_freedom=degrees,
+        method=method,
+        n_samples=signal.shape[-1],
+        sensors=tuple(sensors),
+        axes=recording.axes if recording is not None else (),
+        rate=recording.rate if recording is not None else None,
+        unit=recording.unit if recording is not None else None,
+    )
+
+
+class SVOWeights(nn.Module):
+    """`svo_weights` as a layer, without looking at values: `nn.Sequential(HaarFilterBank(J), CrossCovariance(),
+    SVOWeights("long"))` maps a signal to its weights, differentiable end to end.
+
+    Args:
+        scale_weights: `"flat"`, `"short"`, `"long"`, or one number >= 0 per level.
+    """
+
+    def __init__(self, scale_weights: ScaleWeights = "flat") -> None:
+        super().__init__()
+        self.scale_weights = scale_weights
+
+    def forward(self, wccv: Tensor) -> Tensor:
+        """Map `(..., level, sensor, sensor)` to `(..., sensor)`."""
+        return _optimal_weights(_combine(wccv, self.scale_weights))
+
+
+class SVO(nn.Module):
+    """A virtual gyro as a layer: `fit` chooses the weights and keeps them, `forward` fuses.
+
+    The weights are a buffer: they are saved in `state_dict`, follow `.to(...)`, and are not trained. `forward` has no
+    memory, so a stream may come in chunks of any length.
+
+    Args:
+        scale_weights: `"flat"`, `"short"`, `"long"`, or one number >= 0 per level.
+
+    Example:
+        >>> svo = SVO("long")
+        >>> result = svo.fit(calibration)  # (..., sensor, time)
+        >>> virtual = svo(signal)  # (..., time)
+    """
+
+    weights: Tensor
+
+    def __init__(self, scale_weights: ScaleWeights = "flat") -> None:
+        super().__init__()
+        self.scale_weights = scale_weights
+        self.register_buffer("weights", torch.empty(0, dtype=torch.float64))
+
+    def fit(self, signal: Tensor | Recording, **options: Any) -> SVOResult:
+        """Choose the weights from a recording at rest and keep them.
+
+        Args:
+            signal: `(..., sensor, time)` or a `Recording`.
+            **options: As for `fit_svo`.
+
+        Returns:
+            The result of `fit_svo`.
+
+        Raises:
+            TypeError, ValueError, SingularCovarianceError: As `fit_svo`; the weights then stay as they were.
+        """
+        result = fit_svo(signal, self.scale_weights, **options)
+        self.weights = result.weights.detach().clone()
+        return result
+
+    def forward(self, signal: Tensor) -> Tensor:
+        """Fuse `(..., sensor, time)` into `(..., time)`."""
+        if self.weights.numel() == 0:
+            raise RuntimeError("SVO has no weights yet: call fit(signal), or load a state_dict")
+        return fuse(self.weights.to(signal.dtype), signal)
+
+    def extra_repr(self) -> str:
+        """Show the scale weights."""
+        return f"scale_weights={self.scale_weights!r}"
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
+        # The number of sensors is known only from what is loaded.
+        loaded = state_dict.get(prefix + "weights")
+        if loaded is not None:
+            self.weights = torch.empty_like(loaded, device=self.weights.device)
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+
+def _combine(wccv: Tensor, scale_weights: ScaleWeights) -> Tensor:
+    check_floating("wccv", wccv)
+    if wccv.ndim < 3 or wccv.shape[-1] != wccv.shape[-2]:
+        raise ValueError(f"`wccv`: expected (..., level, sensor, sensor), got shape {tuple(wccv.shape)}")
+    omega = resolve_scale_weights(scale_weights, wccv.shape[-3]).to(wccv)
+    return torch.einsum("j,...jik->...ik", omega, wccv)
+
+
+def _optimal_weights(combined: Tensor) -> Tensor:
+    solved = torch.linalg.solve(combined, combined.new_ones(combined.shape[-1]).expand(combined.shape[:-1]))
+    return solved / solved.sum(-1, keepdim=True)
+
+
+def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"`{name}`: expected one of {', '.join(map(repr, choices))}, got {value!r}")

@@ -1,0 +1,201 @@
+"""A fitted virtual gyro: weights, what they gain, and how to apply them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from gyrofuse import uncertainty
+from gyrofuse._result import ConfidenceInterval, listed, numbered
+from gyrofuse.competitors import equal_weights
+from gyrofuse.recording import Recording
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+def fuse(weights: Tensor, signal: Tensor) -> Tensor:
+    """Weighted sum of the sensors: weights `(..., sensor)` and signal `(..., sensor, time)` to `(..., time)`."""
+    return (weights.unsqueeze(-2) @ signal).squeeze(-2)  # (..., 1, sensor) @ (..., sensor, time)
+
+
+@dataclass(frozen=True, eq=False)
+class SVOResult:
+    """A fitted virtual gyro. Batched over the leading dimensions of the signal; index it to get one item.
+
+    Attributes:
+        weights: `(..., sensor)`, sum 1, may be negative.
+        weights_cov: `(..., sensor, sensor)`, covariance of the estimated weights themselves; NaN when not asked for.
+        confidence_level: Of the intervals.
+        wavelet_cross_covariance: `(..., level, sensor, sensor)`, signal^2.
+        scale_weights: `(level,)`, sum 1.
+        degrees_of_freedom: `(..., level)`, independent observations that a level is taken to hold.
+        method: How the weights were chosen.
+        n_samples: Length of the signal.
+        sensors: Name of each sensor.
+        axes: Names along the leading dimension (`("x", "y", "z")`), empty when it has none.
+        rate: Sampling rate in Hz, when known.
+        unit: Unit of the signal, when known.
+    """
+
+    weights: Tensor
+    weights_cov: Tensor
+    confidence_level: float
+    wavelet_cross_covariance: Tensor
+    scale_weights: Tensor
+    degrees_of_freedom: Tensor
+    method: str
+    n_samples: int
+    sensors: tuple[str, ...]
+    axes: tuple[str, ...] = ()
+    rate: float | None = None
+    unit: str | None = None
+
+    @property
+    def confidence_interval(self) -> ConfidenceInterval:
+        """Limits `(..., sensor)` of the weights."""
+        return uncertainty.normal_interval(self.weights, self.weights_cov, self.confidence_level)
+
+    @property
+    def n_levels(self) -> int:
+        """Number of levels J."""
+        return self.scale_weights.shape[0]
+
+    @property
+    def tau(self) -> Tensor:
+        """Averaging time `2**(j-1)` of each level as in the Allan deviation; seconds, or samples without a rate."""
+        level = torch.arange(self.n_levels, dtype=torch.float64)
+        return torch.exp2(level) / (self.rate or 1.0)
+
+    @property
+    def wavelet_variance(self) -> Tensor:
+        """Wavelet variance of every sensor, `(..., level, sensor)`."""
+        return self.wavelet_cross_covariance.diagonal(dim1=-2, dim2=-1)
+
+    @property
+    def virtual_wavelet_variance(self) -> Tensor:
+        """Wavelet variance `c' Gamma_j c` of the virtual gyro, `(..., level)`."""
+        return self._variance_of(self.weights)
+
+    @property
+    def equal_wavelet_variance(self) -> Tensor:
+        """Wavelet variance of the plain mean of the sensors, `(..., level)`."""
+        return self._variance_of(equal_weights(self.wavelet_cross_covariance))
+
+    def interval_of(self, wavelet_variance: Tensor) -> ConfidenceInterval:
+        """Limits of wavelet variances `(..., level)` of this recording, of any sensor or combination."""
+        return uncertainty.chi_square_interval(wavelet_variance, self.degrees_of_freedom, self.confidence_level)
+
+    def virtual(self, signal: Tensor | Recording) -> Tensor:
+        """Fuse a signal with these weights: `(..., sensor, time)` to `(..., time)`.
+
+        A sample that any sensor lacks is NaN.
+        """
+        values = signal.signal if isinstance(signal, Recording) else signal
+        return fuse(self.weights.to(values), values)
+
+    def __getitem__(self, item: Any) -> SVOResult:
+        """One item, or some, of the leading batch dimensions."""
+        n_batch = self.weights.ndim - 1
+        index = item if isinstance(item, tuple) else (item,)
+        if len(index) > n_batch:
+            raise IndexError(f"expected at most {n_batch} indices for batch shape {tuple(self.weights.shape[:-1])}")
+        batched = ("weights", "weights_cov", "wavelet_cross_covariance", "degrees_of_freedom")
+        return replace(self, axes=(), **{name: getattr(self, name)[index] for name in batched})
+
+    def summary(self) -> str:
+        """The weights with their intervals and the gain over equal weights per level, as fixed-width text."""
+        if self.weights.ndim > 1:
+            names = self.axes or numbered(self.weights.shape[0])
+            parts = [f"[{name}]\n{self[i].summary()}" for i, name in enumerate(names[:8])]
+            if len(names) > 8:
+                parts.append(f"... and {len(names) - 8} more")
+            return "\n\n".join(parts)
+        unit, second = self.unit or "signal", "s" if self.rate else "samples"
+        rate = f", {self.rate:.6g} Hz" if self.rate else ""
+        low, high = self.confidence_interval
+        name = {"svo": "SVO"}.get(self.method, self.method.replace("_", " "))
+        width = max(6, *(len(sensor) for sensor in self.sensors))
+        lines = [
+            f"Virtual gyro ({name}) of {len(self.sensors)} sensors, {self.n_samples} samples{rate}",
+            "",
+            f"{'sensor':<{width}}  {'weight':>10}  {f'{100 * self.confidence_level:g} % interval':>24}",
+        ]
+        for i, sensor in enumerate(self.sensors):
+            interval = f"[{low[i].item():+.5f}, {high[i].item():+.5f}]" if not low[i].isnan() else "-"
+            lines.append(f"{sensor:<{width}}  {self.weights[i].item():>+10.5f}  {interval:>24}")
+        lines += [
+            "",
+            f"Allan deviation ({unit}) at averaging time tau",
+            f"{'level':>5}  {f'tau ({second})':>13}  {'weight':>7}  {'best sensor':>12}  {'equal':>12}  {'virtual':>12}"
+            f"  {'virtual/equal':>13}",
+        ]
+        best = (2 * self.wavelet_variance.amin(-1)).sqrt()
+        equal = (2 * self.equal_wavelet_variance).sqrt()
+        virtual = (2 * self.virtual_wavelet_variance).sqrt()
+        columns = (self.tau, self.scale_weights, best, equal, virtual, virtual / equal)
+        for j, row in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
+            tau, omega, *deviations, ratio = row
+            numbers = "  ".join(f"{value:>12.5g}" for value in deviations)
+            lines.append(f"{j + 1:>5}  {tau:>13.6g}  {omega:>7.4f}  {numbers}  {ratio:>13.4f}")
+        return "\n".join(lines)
+
+    def __str__(self) -> str:
+        return self.summary()
+
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Draw the Allan deviation of every sensor, the plain mean and the virtual gyro, with the latter's band.
+
+        Args:
+            ax: Where to draw; new axes by default.
+
+        Returns:
+            The axes.
+
+        Raises:
+            ValueError: The result holds a batch; index it first.
+        """
+        from gyrofuse import plotting
+
+        if self.weights.ndim > 1:
+            raise ValueError(f"expected one virtual gyro to plot, got {len(self.weights)}; index the result, result[0]")
+        return plotting.plot_allan_deviation(
+            self.tau,
+            self.wavelet_variance,
+            names=self.sensors,
+            virtual=self.virtual_wavelet_variance,
+            band=self.interval_of(self.virtual_wavelet_variance),
+            equal=self.equal_wavelet_variance,
+            unit=self.unit,
+            in_seconds=self.rate is not None,
+            ax=ax,
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain lists and numbers, ready for JSON (NaN as None)."""
+        low, high = self.confidence_interval
+        return {
+            "method": self.method,
+            "sensors": list(self.sensors),
+            "axes": list(self.axes),
+            "rate": self.rate,
+            "unit": self.unit,
+            "n_samples": self.n_samples,
+            "confidence_level": self.confidence_level,
+            "weights": listed(self.weights),
+            "weights_cov": listed(self.weights_cov),
+            "confidence_interval": {"low": listed(low), "high": listed(high)},
+            "scale_weights": listed(self.scale_weights),
+            "tau": listed(self.tau),
+            "degrees_of_freedom": listed(self.degrees_of_freedom),
+            "wavelet_cross_covariance": listed(self.wavelet_cross_covariance),
+            "wavelet_variance": listed(self.wavelet_variance),
+            "virtual_wavelet_variance": listed(self.virtual_wavelet_variance),
+            "equal_wavelet_variance": listed(self.equal_wavelet_variance),
+        }
+
+    def _variance_of(self, weights: Tensor) -> Tensor:
+        return torch.einsum("...i,...jik,...k->...j", weights, self.wavelet_cross_covariance, weights)

@@ -1,0 +1,137 @@
+"""How far estimated wavelet moments can be off.
+
+Until a model of the noise says more, a level with `M_j` coefficients of filter length `tau_j` is taken to hold
+
+    eta_j = max(1.9 M_j / tau_j, 1)
+
+independent observations: exact for a random walk, the slowest of the usual gyro errors, and on the safe side for
+faster ones (white noise has 3 M_j / tau_j, so that its intervals come out a quarter wider than they need be).
+Coefficients are taken to be Gaussian, and levels `j` and `k` to correlate as `2**-|j - k|`.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gyrofuse._result import ConfidenceInterval
+
+_RANDOM_WALK_DEGREES = 1.9
+_NEIGHBOUR_CORRELATION = 0.5
+
+
+def degrees_of_freedom(counts: Tensor) -> Tensor:
+    """Equivalent degrees of freedom of wavelet variances.
+
+    Args:
+        counts: `(..., level)` or `(..., level, ...)` with the level dimension given by `counts` of one recording;
+            number of coefficients `M_j` per level, level last.
+
+    Returns:
+        `(..., level)`, at least 1.
+    """
+    levels = torch.arange(1, counts.shape[-1] + 1, dtype=torch.float64, device=counts.device)
+    return (_RANDOM_WALK_DEGREES * counts * torch.exp2(-levels)).clamp(min=1.0)
+
+
+def chi_square_interval(variance: Tensor, degrees: Tensor, confidence_level: float = 0.95) -> ConfidenceInterval:
+    """Interval of a wavelet variance whose estimate follows a scaled chi-square law.
+
+    `[eta nu / q_{1 - a/2}, eta nu / q_{a/2}]` with the quantiles `q` of chi-square with `eta` degrees of freedom.
+
+    Args:
+        variance: Estimates, any shape.
+        degrees: Equivalent degrees of freedom, broadcastable to `variance`.
+        confidence_level: Probability that the interval holds the true value.
+
+    Returns:
+        Limits of the shape of `variance`.
+    """
+    from scipy import stats
+
+    eta = degrees.detach().cpu().numpy()
+    tail = (1 - confidence_level) / 2
+    low, high = (torch.as_tensor(stats.chi2.ppf(q, eta)).to(variance) for q in (1 - tail, tail))
+    scaled = degrees.to(variance) * variance
+    return ConfidenceInterval(scaled / low, scaled / high)
+
+
+def normal_interval(estimate: Tensor, covariance: Tensor, confidence_level: float = 0.95) -> ConfidenceInterval:
+    """Interval of each element of a vector with the given covariance of its estimate.
+
+    Args:
+        estimate: `(..., n)`.
+        covariance: `(..., n, n)` of the estimate itself.
+        confidence_level: Probability that the interval holds the true value.
+
+    Returns:
+        Limits `(..., n)`.
+    """
+    quantile = torch.special.ndtri(torch.tensor((1 + confidence_level) / 2, dtype=torch.float64)).item()
+    half = quantile * covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
+    return ConfidenceInterval(estimate - half, estimate + half)
+
+
+def svo_weights_covariance(wccv: Tensor, scale_weights: Tensor, weights: Tensor, degrees: Tensor) -> Tensor:
+    """Covariance of estimated SVO weights for Gaussian coefficients, by the delta method.
+
+    `dc = -B dA c` with `B = (I - c 1') A^-1`, and for `eta_j` Gaussian observations
+    `Cov(B dGamma_j c) = (B Gamma_j B' (c' Gamma_j c) + B Gamma_j c c' Gamma_j B') / eta_j`.
+
+    Args:
+        wccv: `(..., level, sensor, sensor)`.
+        scale_weights: `(level,)`.
+        weights: `(..., sensor)`, the SVO weights of these.
+        degrees: `(..., level)`, equivalent degrees of freedom.
+
+    Returns:
+        `(..., sensor, sensor)`, covariance of the weights themselves (already divided by the sample size).
+
+    References:
+        [Z] Theorem 2, with a Gaussian model in place of its resampled V.
+    """
+    combined = torch.einsum("j,...jik->...ik", scale_weights, wccv)
+    inverse = torch.linalg.inv(combined)
+    influence = inverse - weights[..., :, None] * inverse.sum(-2, keepdim=True)  # B: (..., sensor, sensor)
+    fused = torch.einsum("...jik,...k->...ji", wccv, weights)  # Gamma_j c: (..., level, sensor)
+    variance = torch.einsum("...i,...ji->...j", weights, fused).clamp(min=0)  # c' Gamma_j c
+    factor = torch.cat(
+        [variance.sqrt()[..., None, None] * _square_root(wccv), fused[..., None]], dim=-1
+    )  # (..., level, sensor, sensor + 1)
+    return _sum_over_levels(influence[..., None, :, :] @ factor, scale_weights, degrees)
+
+
+def inverse_variance_weights_covariance(
+    wccv: Tensor, scale_weights: Tensor, weights: Tensor, degrees: Tensor
+) -> Tensor:
+    """Covariance of estimated inverse-variance weights for Gaussian coefficients, by the delta method.
+
+    `dc_i = -c_i (dA_ii / A_ii - sum_k c_k dA_kk / A_kk)` and `Cov(gamma_ii,j, gamma_kk,j) = 2 gamma_ik,j^2 / eta_j`.
+
+    Args:
+        wccv: `(..., level, sensor, sensor)`.
+        scale_weights: `(level,)`.
+        weights: `(..., sensor)`, the inverse-variance weights of these.
+        degrees: `(..., level)`, equivalent degrees of freedom.
+
+    Returns:
+        `(..., sensor, sensor)`.
+    """
+    combined = torch.einsum("j,...jii->...i", scale_weights, wccv)
+    relative = weights / combined
+    influence = weights[..., :, None] * relative[..., None, :] - torch.diag_embed(relative)
+    return _sum_over_levels(influence[..., None, :, :] @ _square_root(2 * wccv.square()), scale_weights, degrees)
+
+
+def _sum_over_levels(factor: Tensor, scale_weights: Tensor, degrees: Tensor) -> Tensor:
+    """`sum_jk r_jk w_j w_k F_j F_k' / sqrt(eta_j eta_k)` for factors `(..., level, sensor, column)`."""
+    levels = torch.arange(factor.shape[-3], device=factor.device)
+    correlation = _NEIGHBOUR_CORRELATION ** (levels[:, None] - levels).abs().to(factor.dtype)
+    scaled = factor * (scale_weights / degrees.sqrt())[..., None, None]
+    return torch.einsum("jk,...jin,...kmn->...im", correlation, scaled, scaled)
+
+
+def _square_root(matrix: Tensor) -> Tensor:
+    """Symmetric square root of positive semi-definite matrices."""
+    values, vectors = torch.linalg.eigh(matrix)
+    return (vectors * values.clamp(min=0).sqrt()[..., None, :]) @ vectors.mT

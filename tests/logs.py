@@ -1,0 +1,211 @@
+"""Writers of small logs in every format, from made-up arrays of gyros.
+
+Every writer takes `gyro (device, 3, time)` in rad/s and, where the format has a clock, `stamps (time,)` in integer
+nanoseconds; device `i` is named `imu{i}` where the format can say so.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Stamps = NDArray[np.int64]
+
+MAT73_HEADER = b"MATLAB 7.3 MAT-file, Platform: GLNXA64, Created on: Mon Jan  1 00:00:00 2024 HDF5 schema 1.00 ."
+IMU = "sensor_msgs/msg/Imu"
+
+
+def made_up(n_devices: int = 2, n_samples: int = 60, seed: int = 0) -> Array:
+    """Return rates `(device, 3, time)` in rad/s."""
+    return 0.1 * np.random.default_rng(seed).standard_normal((n_devices, 3, n_samples))
+
+
+def regular_stamps(n_samples: int = 60, rate: float = 100.0, start: int = 1_700_000_000_123_456_789) -> Stamps:
+    """Return nanoseconds `(time,)` of a regular clock that counts since 1970."""
+    return start + np.rint(np.arange(n_samples) * (1e9 / rate)).astype(np.int64)
+
+
+def seconds(stamps: Stamps) -> Array:
+    """Return stamps as float64 seconds."""
+    return stamps // 10**9 + (stamps % 10**9) * 1e-9
+
+
+def write_ros1(path: Path, gyro: Array, stamps: Stamps, **options: Any) -> Path:
+    """Write a ROS 1 bag with topics `/imu{i}/data`; options as `_write_messages`."""
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with Writer(path) as bag:
+        _write_messages(bag, store, store.serialize_ros1, gyro, stamps, {"seq": 0}, **options)
+    return path
+
+
+def write_ros2(path: Path, gyro: Array, stamps: Stamps, *, mcap: bool = False, **options: Any) -> Path:
+    """Write a ROS 2 bag directory (sqlite3, or MCAP) with topics `/imu{i}/data`; options as `_write_messages`."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    plugin = StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3
+    with Writer(path, version=9, storage_plugin=plugin) as bag:
+        _write_messages(bag, store, store.serialize_cdr, gyro, stamps, {}, **options)
+    return path
+
+
+def _write_messages(
+    bag: Any,
+    store: Any,
+    serialize: Any,
+    gyro: Array,
+    stamps: Stamps,
+    header: dict[str, int],
+    *,
+    acceleration: Array | None = None,
+    stamped: bool = True,
+    measured: bool = True,
+    msgtype: str = IMU,
+) -> None:
+    """Write one message per device and sample; not `stamped`: headers of zero; not `measured`: covariance -1."""
+    types = store.types
+    vector, quaternion = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
+    absent = np.array([-1.0] + 8 * [0.0])
+    connections = [bag.add_connection(f"/imu{device}/data", msgtype, typestore=store) for device in range(len(gyro))]
+    for t, stamp in enumerate(stamps.tolist()):
+        sec, nanosec = divmod(stamp, 10**9) if stamped else (0, 0)
+        for device, connection in enumerate(connections):
+            accelerated = np.zeros(3) if acceleration is None else acceleration[device, :, t]
+            time = types["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec)
+            message: Any = types["std_msgs/msg/Header"](stamp=time, frame_id=f"imu{device}_link", **header)
+            if msgtype == IMU:
+                message = types[IMU](
+                    header=message,
+                    orientation=quaternion(x=0.0, y=0.0, z=0.0, w=1.0),
+                    orientation_covariance=absent,
+                    angular_velocity=vector(*gyro[device, :, t].tolist()),
+                    angular_velocity_covariance=np.zeros(9) if measured else absent,
+                    linear_acceleration=vector(*accelerated.tolist()),
+                    linear_acceleration_covariance=absent if acceleration is None else np.zeros(9),
+                )
+            bag.write(connection, stamp, serialize(message, msgtype))
+
+
+def write_ulog(
+    path: Path,
+    gyro: Array,
+    stamps: Stamps,
+    *,
+    temperature: Array | None = None,
+    combined: tuple[Array, Stamps] | None = None,
+    dropouts_ms: Sequence[int] = (),
+    other_topics: Sequence[str] = (),
+) -> Path:
+    """Write a PX4 ULog: `gyro` as instances of sensor_gyro, `combined` (axis, time) as sensor_combined.
+
+    Rates are stored in single precision and stamps in whole microseconds, as PX4 does; timestamp_sample is `stamps`
+    and timestamp 400 microseconds later.
+    """
+    temperature = np.full((len(gyro), gyro.shape[-1]), 25.0) if temperature is None else temperature
+    plain = "uint64_t timestamp;"
+    formats = {
+        "sensor_gyro": plain
+        + "uint64_t timestamp_sample;uint32_t device_id;float x;float y;float z;float temperature;",
+        "sensor_combined": plain + "float[3] gyro_rad;float[3] accelerometer_m_s2;",
+        **dict.fromkeys(other_topics, plain),
+    }
+    log = bytearray(b"\x55\x4c\x6f\x67\x01\x12\x35\x01" + struct.pack("<Q", 0))
+    log += _ulog_message("B", bytes(40))
+    for name, fields in formats.items():
+        log += _ulog_message("F", f"{name}:{fields}".encode())
+
+    packets = []
+    for device, (rates, warmth) in enumerate(zip(gyro, temperature, strict=True)):
+        log += _ulog_message("A", struct.pack("<BH", device, device) + b"sensor_gyro")
+        for stamp, rate, warm in zip((stamps // 1000).tolist(), rates.T.tolist(), warmth.tolist(), strict=True):
+            body = struct.pack("<HQQI4f", device, stamp + 400, stamp, 1000 + device, *rate, warm)
+            packets.append((stamp, body))
+    number = len(gyro)
+    if combined is not None:
+        log += _ulog_message("A", struct.pack("<BH", 0, number) + b"sensor_combined")
+        for stamp, rate in zip((combined[1] // 1000).tolist(), combined[0].T.tolist(), strict=True):
+            packets.append((stamp, struct.pack("<HQ6f", number, stamp, *rate, 0.0, 0.0, -9.75)))
+        number += 1
+    for identity, name in enumerate(other_topics, number):
+        log += _ulog_message("A", struct.pack("<BH", 0, identity) + name.encode())
+        packets.append((0, struct.pack("<HQ", identity, 0)))
+    for _, body in sorted(packets):
+        log += _ulog_message("D", body)
+    for duration in dropouts_ms:
+        log += _ulog_message("O", struct.pack("<H", duration))
+    path.write_bytes(log)
+    return path
+
+
+def _ulog_message(kind: str, body: bytes) -> bytes:
+    return struct.pack("<HB", len(body), ord(kind)) + body
+
+
+def write_parquet(path: Path, columns: dict[str, Any], metadata: dict[str, str] | None = None) -> Path:
+    """Write columns and the schema's metadata to a Parquet file."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    parquet.write_table(pa.table(columns).replace_schema_metadata(metadata), path)
+    return path
+
+
+def write_mat5(path: Path, content: dict[str, Any]) -> Path:
+    """Write a MATLAB v5 file; a dict inside `content` becomes a struct."""
+    from scipy.io import savemat
+
+    savemat(path, content)
+    return path
+
+
+def write_hdf5(path: Path, content: dict[str, Any], **attributes: Any) -> Path:
+    """Write an HDF5 file; a dict inside `content` becomes a group, a pair (array, dict) a dataset with attributes."""
+    import h5py
+
+    with h5py.File(path, "w") as file:
+        _fill_group(file, content)
+        file.attrs.update(attributes)
+    return path
+
+
+def write_mat73(path: Path, content: dict[str, Any]) -> Path:
+    """Write what MATLAB 7.3 does: HDF5 behind a 512 byte header, dimensions reversed, text as 16 bit codes."""
+    import h5py
+
+    with h5py.File(path, "w", userblock_size=512) as file:
+        _fill_group(file, _reversed(content))
+    with path.open("r+b") as raw:
+        raw.write(MAT73_HEADER.ljust(116, b" ") + bytes(8) + b"\x00\x02IM")
+    return path
+
+
+def _reversed(content: dict[str, Any]) -> dict[str, Any]:
+    stored: dict[str, Any] = {}
+    for name, value in content.items():
+        if isinstance(value, dict):
+            stored[name] = _reversed(value)
+        elif isinstance(value, str):
+            codes = np.frombuffer(value.encode("utf-16-le"), dtype=np.uint16)[:, None]
+            stored[name] = (codes, {"MATLAB_class": np.bytes_(b"char")})
+        else:
+            stored[name] = (np.atleast_2d(value).T, {"MATLAB_class": np.bytes_(b"double")})
+    return stored
+
+
+def _fill_group(group: Any, content: dict[str, Any]) -> None:
+    for name, value in content.items():
+        if isinstance(value, dict):
+            _fill_group(group.create_group(name), value)
+            continue
+        values, attributes = value if isinstance(value, tuple) else (value, {})
+        group.create_dataset(name, data=values).attrs.update(attributes)

@@ -1,0 +1,48 @@
+"""The examples run as printed and do what they say."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import gyrofuse as gf
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+
+
+def run(name: str, *arguments: object, cwd: Path) -> str:
+    command = [sys.executable, str(EXAMPLES / name), *map(str, arguments)]
+    return subprocess.run(command, check=True, capture_output=True, text=True, cwd=cwd).stdout
+
+
+def test_fuse_log(tmp_path: Path):
+    noise = gf.parse_model("WN(variance=1) + RW(variance=1e-4)")
+    signal = noise.simulate(4000, batch=(3,), generator=torch.Generator().manual_seed(0))
+    recording = gf.Recording(signal, rate=100.0, unit="deg/s")
+    recording.save(tmp_path / "log.npz")
+    out = run("fuse_log.py", "log.npz", cwd=tmp_path)
+    virtual = gf.read_recording(tmp_path / "virtual.npz")
+    expected = gf.fit_svo(recording, "long").virtual(recording)
+    torch.testing.assert_close(virtual.signal[0], expected)
+    assert virtual.unit == "deg/s"
+    assert "Virtual gyro (SVO) of 3 sensors" in out
+
+
+def test_pipeline(tmp_path: Path):
+    out = run("pipeline.py", "--arrays", 20, "--samples", 2048, cwd=tmp_path)
+    median, worst = (float(out.split(word)[1].split()[0].strip(",")) for word in ("median", "worst"))
+    assert median < 1  # the virtual gyro beats the plain mean where its scale weights look
+    assert worst < 1.05
+
+
+@pytest.mark.parametrize("chunk", [5000, 7777])
+def test_stream(tmp_path: Path, chunk: int):
+    noise = gf.parse_model("WN(variance=1) + RW(variance=1e-4)")
+    signal = noise.simulate(20_000, batch=(3,), generator=torch.Generator().manual_seed(0))
+    np.save(tmp_path / "log.npy", signal.numpy())
+    run("stream.py", "log.npy", "--levels", 10, "--chunk", chunk, "--out", "virtual.npy", cwd=tmp_path)
+    weights = gf.svo_weights(gf.wavelet_cross_covariance(signal, 10), "long")
+    np.testing.assert_allclose(np.load(tmp_path / "virtual.npy"), weights.numpy() @ signal.numpy(), rtol=1e-9, atol=1e-9)

@@ -1,0 +1,59 @@
+"""What the README promises: two commands at its beginning, and Python that runs."""
+
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+import gyrofuse as gf
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text()
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+
+
+def test_begins_with_one_sentence_and_two_commands():
+    first, second = (block.strip() for block in blocks("bash")[:2])
+    assert first.startswith("pip install ")
+    assert first.endswith("gyrofuse demo")
+    assert second.startswith("pip install ")
+    assert second.endswith("pytest")
+    before = README[: README.index("```bash")].strip().splitlines()
+    assert before[0] == "# gyrofuse"
+    assert before[2].count(". ") == 0
+    assert before[2].endswith(".")
+
+
+def test_the_continuous_integration_runs_the_test_command_of_the_readme():
+    script = (ROOT / ".ci" / "run").read_text()
+    pattern = re.search(r"sed -n 's/\^\\\((.*?)\\\)\$", script)
+    assert pattern
+    lines = [line for line in README.splitlines() if re.fullmatch(pattern.group(1), line)]
+    assert lines == [blocks("bash")[1].strip()]
+
+
+def test_commands_of_the_command_line_exist():
+    from typer.main import get_command
+
+    from gyrofuse.cli import app
+
+    known = get_command(app).commands
+    named = set(re.findall(r"^gyrofuse (\w+)", "\n".join(blocks("bash")), re.MULTILINE))
+    assert named
+    assert named <= set(known)
+
+
+def test_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    noise = gf.parse_model("WN(variance=1) + RW(variance=1e-4)")
+    signal = noise.simulate(2000, batch=(4,), generator=torch.Generator().manual_seed(0))
+    gf.Recording(signal, rate=100.0).save("array.npz")
+    scope: dict = {}
+    for block in blocks("python"):
+        exec(block, scope)
+    assert scope["weights"].sum().item() == pytest.approx(1)
+    assert scope["virtual"].shape == (4096,)
