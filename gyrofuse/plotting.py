@@ -62,7 +62,8 @@ def plot_allan_deviation(
     """
     ax = ax if ax is not None else _new_axes()
     times, sensors = _array(tau), _deviation(wavelet_variance)
-    handles = ax.plot(times, sensors, color=_GREY, linewidth=0.9, zorder=2)[:1]
+    thin = 0.9 if len(names) <= _MOST_LABELS else 0.5
+    handles = ax.plot(times, sensors, color=_GREY, linewidth=thin, zorder=2)[:1]
     labels = [f"sensor {_clean(names[0])}" if len(names) == 1 else f"{len(names)} sensors"]
     if equal is not None:
         handles += ax.plot(times, _deviation(equal), zorder=4, **_MEAN)
@@ -145,15 +146,17 @@ def plot_weights(
     lows, highs = _array(low), _array(high)
     place = np.arange(len(names))
     size = 5.5 if len(names) <= 2 * _MOST_LABELS else 3.5
-    mark = {"marker": "o", "markersize": size, "markeredgecolor": _BLUE, "linestyle": "none"}
     unsure = (lows <= 0) & (highs >= 0)
+    colors = np.where(unsure, "white", _BLUE)
     ax.axhline(0, color=_FRAME, linewidth=0.8, zorder=1)
     ax.vlines(place, lows, highs, color=_BLUE, linewidth=1.6, zorder=3)
-    ax.scatter(place, _array(weights), size**2, np.where(unsure, "white", _BLUE), edgecolors=_BLUE, zorder=4)
-    handles, labels = [], []
-    if np.isfinite(lows).any():
-        handles += [Line2D([], [], markerfacecolor=_BLUE, **mark), Line2D([], [], markerfacecolor="white", **mark)]
-        labels += ["interval excludes 0", "interval holds 0"]
+    ax.scatter(place, _array(weights), size**2, colors, edgecolors=_BLUE, zorder=4)
+    handles: list[Any] = []
+    labels = []
+    for color, label in ((_BLUE, "interval excludes 0"), ("white", "interval holds 0")):
+        if (np.isfinite(lows) & (colors == color)).any():
+            handles += [Line2D([], [], marker="o", markersize=size, color=_BLUE, markerfacecolor=color, linestyle="")]
+            labels += [label]
     if equal:
         handles += [ax.axhline(1 / len(names), zorder=2, **_MEAN)]
         labels += [f"plain mean (1/{len(names)})"]
@@ -162,7 +165,7 @@ def plot_weights(
     ax.set_xlabel("sensor")
     ax.set_ylabel("weight")
     _name_ticks(ax, names)
-    _finish(ax, handles, labels)
+    _finish(ax, handles, labels, loc="lower right", bbox_to_anchor=(1, 1), ncols=3, borderaxespad=0.2)
     ax.grid(visible=False, axis="x")
     return ax
 
@@ -197,17 +200,22 @@ def plot_signals(
     instants, low, high, average = _in_blocks(times, values)
     top, bottom = figure.subplots(2, 1, sharex=True)
     top.fill_between(instants, low, high, color=_BLUE, alpha=0.55, linewidth=0.4)
-    top.set_ylabel(f"range ({unit})" if unit else "range", parse_math=False)
+    label = f"signal ({unit})" if unit else "signal"
+    top.set_ylabel(label, parse_math=False)
+    top.set_title("Virtual gyro, range of the samples", loc="left", fontsize=_LABEL, color=_INK)
     handles = bottom.plot(instants, average - np.nanmean(average), color=_BLUE, linewidth=1.2, zorder=4)
     labels = ["virtual gyro"]
     if mean is not None:
         average = _in_blocks(times, _array(mean))[-1]
         handles += bottom.plot(instants, average - np.nanmean(average), zorder=3, **_MEAN | {"linewidth": 1.0})
         labels += ["plain mean"]
-    bottom.set_ylabel(f"average ({unit})" if unit else "average", parse_math=False)
+    block = f"{(times[-1] - times[0]) / len(instants):.3g} {'s' if in_seconds else 'samples'}"
+    bottom.set_title(f"Averages over {block}, each signal less its mean", loc="left", fontsize=_LABEL, color=_INK)
+    bottom.set_ylabel(label, parse_math=False)
     bottom.set_xlabel("time (s)" if in_seconds else "sample")
     _finish(top)
-    _finish(bottom, handles, labels)
+    _finish(bottom, handles, labels, loc="lower right", bbox_to_anchor=(1, 1), ncols=2, borderaxespad=0.2)
+    figure.align_ylabels()
     return figure
 
 
@@ -266,6 +274,7 @@ def plot_fusion(
     unknown = np.full(len(names), np.nan)
     low, high = interval if interval is not None else (unknown, unknown)
     plot_weights(weights, low, high, names=names, ax=below)
+    figure.align_ylabels()
     return figure
 
 
@@ -303,20 +312,22 @@ def _in_blocks(times: Array, values: Array) -> tuple[Array, Array, Array, Array]
 
 def _time_axis(ax: Axes, in_seconds: bool) -> None:
     ax.set_xscale("log")
+    ax.margins(x=0.02)
     ax.set_xlabel("averaging time (s)" if in_seconds else "averaging time (samples)")
 
 
-def _finish(ax: Axes, handles: Sequence[Any] = (), labels: Sequence[str] = ()) -> None:
-    """Give axes the common look, and a legend for `handles`."""
+def _finish(ax: Axes, handles: Sequence[Any] = (), labels: Sequence[str] = (), **place: Any) -> None:
+    """Give axes the common look, and a legend for `handles` at `place`."""
     ax.spines[["top", "right"]].set_visible(False)
     ax.spines[["left", "bottom"]].set_color(_FRAME)
     ax.tick_params(which="both", color=_FRAME, labelcolor=_INK, labelsize=_TICK)
-    for label in (ax.xaxis.label, ax.yaxis.label):
-        label.set(color=_INK, fontsize=_LABEL)
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.label.set(color=_INK, fontsize=_LABEL)
+        axis.get_offset_text().set(color=_INK, fontsize=_TICK)
     ax.grid(color=_GRID, linewidth=0.7)
     ax.set_axisbelow(True)
     if handles:
-        legend = ax.legend(handles, labels, fontsize=_TICK, labelcolor=_INK, frameon=True, framealpha=0.85)
+        legend = ax.legend(handles, labels, fontsize=_TICK, labelcolor=_INK, frameon=True, framealpha=0.85, **place)
         legend.get_frame().set(edgecolor="none", facecolor="white")
         for text in legend.get_texts():
             text.set_parse_math(False)
@@ -358,7 +369,8 @@ def _label_line_ends(ax: Axes, times: Array, values: Array, names: Sequence[str]
             va="center",
             parse_math=False,
             annotation_clip=False,
-            arrowprops={"arrowstyle": "-", "color": _GREY, "linewidth": 0.4, "shrinkA": 0, "shrinkB": 1},
+            arrowprops={"arrowstyle": "-", "color": _GREY, "linewidth": 0.4, "shrinkA": 0, "shrinkB": 1}
+            | {"relpos": (0, 0.5)},
         )
 
 

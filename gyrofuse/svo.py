@@ -125,15 +125,17 @@ def fit_svo(
     omega = resolve_scale_weights(scale_weights, n_levels).to(sums)
     sums, counts, fewest = sums[..., :n_levels, :, :], counts[..., :n_levels, :, :], fewest[..., :n_levels]
     wccv = sums / counts
-    combined = torch.einsum("j,...jik->...ik", omega, torch.where(omega[:, None, None] > 0, wccv, 0.0))
+    # A level that does not count may well be unknown.
+    counting = torch.where(omega[:, None, None] > 0, wccv, 0.0)
+    combined = torch.einsum("j,...jik->...ik", omega, counting)
     check_positive_definite("the wavelet cross-covariance combined over scales", combined, sensors)
     degrees = uncertainty.degrees_of_freedom(fewest)
     if method == "svo":
         weights = _optimal_weights(combined)
-        weights_cov = uncertainty.svo_weights_covariance(wccv, omega, weights, degrees)
+        weights_cov = uncertainty.svo_weights_covariance(counting, omega, weights, degrees)
     elif method == "inverse_variance":
-        weights = inverse_variance_weights(wccv, omega)
-        weights_cov = uncertainty.inverse_variance_weights_covariance(wccv, omega, weights, degrees)
+        weights = inverse_variance_weights(counting, omega)
+        weights_cov = uncertainty.inverse_variance_weights_covariance(counting, omega, weights, degrees)
     else:
         weights = equal_weights(wccv)
         weights_cov = torch.zeros_like(combined)
