@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from numbers import Real
 
 import torch
 from torch import Tensor
@@ -18,7 +19,7 @@ def check_floating(name: str, value: Tensor) -> Tensor:
         raise TypeError(
             f"`{name}`: expected a torch tensor, got {type(value).__name__}; convert with torch.as_tensor(...)"
         )
-    if not value.is_floating_point():
+    if value.dtype not in (torch.float32, torch.float64):
         raise TypeError(f"`{name}`: expected float32 or float64, got {value.dtype}; convert with .to(torch.float64)")
     return value
 
@@ -52,23 +53,22 @@ def check_n_levels(n_levels: int | None, n_samples: int) -> int:
     Raises:
         ValueError: `n_levels` below 1 or above what `n_samples` allow.
     """
-    largest = largest_level(n_samples)
-    if largest < 1:
+    if n_samples < 2:
         raise ValueError(f"`signal`: expected at least 2 samples for one wavelet level, got {n_samples}")
     if n_levels is None:
-        return largest
+        return largest_level(n_samples)
     n_levels = check_positive_integer("n_levels", n_levels)
-    if n_levels > largest:
+    if 2**n_levels > n_samples:
         raise ValueError(
-            f"`n_levels`: expected at most {largest} for {n_samples} samples (2**n_levels <= samples), got {n_levels}; "
-            "ask for fewer levels or give a longer signal"
+            f"`n_levels`: expected at most {largest_level(n_samples)} for {n_samples} samples "
+            f"(2**n_levels <= samples), got {n_levels}; ask for fewer levels or give a longer signal"
         )
     return n_levels
 
 
 def check_positive_integer(name: str, value: int) -> int:
     """Return `value` as an int when it is a whole number of at least 1."""
-    if isinstance(value, bool) or int(value) != value or value < 1:
+    if isinstance(value, bool) or not isinstance(value, Real) or value < 1 or value % 1 != 0:
         raise ValueError(f"`{name}`: expected a whole number >= 1, got {value!r}")
     return int(value)
 

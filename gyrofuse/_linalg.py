@@ -12,13 +12,16 @@ class SingularCovarianceError(ValueError):
     """A covariance matrix of the array is not positive definite, so there are no optimal weights."""
 
 
-def check_positive_definite(name: str, matrix: Tensor, labels: Sequence[str] | None = None) -> None:
+def check_positive_definite(
+    name: str, matrix: Tensor, labels: Sequence[str] | None = None, *, dtype: torch.dtype | None = None
+) -> None:
     """Raise when any covariance of a batch is not positive definite, naming items, sensors and likely causes.
 
     Args:
         name: What the matrix is called in the message.
         matrix: `(..., sensor, sensor)`.
         labels: Names of the sensors, for the message.
+        dtype: What the matrix was computed in, when that is less than its own.
 
     Raises:
         SingularCovarianceError: Non-finite entries, a sensor without variance, two equal sensors, or a smallest
@@ -32,7 +35,7 @@ def check_positive_definite(name: str, matrix: Tensor, labels: Sequence[str] | N
     correlation = scale[..., :, None] * matrix * scale[..., None, :]
     finite = correlation.isfinite().all(-1).all(-1)
     smallest = torch.linalg.eigvalsh(torch.where(finite[..., None, None], correlation, 0.0))[..., 0]
-    tolerance = 10 * n_sensors * torch.finfo(matrix.dtype).eps
+    tolerance = 10 * n_sensors * torch.finfo(dtype or matrix.dtype).eps
     bad = ~finite | (variance <= 0).any(-1) | (smallest <= tolerance)
     if not bool(bad.any()):
         return
@@ -44,11 +47,11 @@ def check_positive_definite(name: str, matrix: Tensor, labels: Sequence[str] | N
         where = f" at batch item(s) {shown}{', ...' if len(items) > 5 else ''} ({len(items)} of {bad.numel()})"
         item = tuple(items[0].tolist())
     raise SingularCovarianceError(
-        f"{name} is not positive definite{where}: {_cause(matrix[item], correlation[item], names)}"
+        f"{name} is not positive definite{where}: {_cause(matrix[item], correlation[item], names, tolerance)}"
     )
 
 
-def _cause(matrix: Tensor, correlation: Tensor, names: Sequence[str]) -> str:
+def _cause(matrix: Tensor, correlation: Tensor, names: Sequence[str], tolerance: float) -> str:
     missing = (~matrix.diagonal().isfinite()).nonzero().flatten().tolist()
     if missing:
         return (
@@ -60,7 +63,7 @@ def _cause(matrix: Tensor, correlation: Tensor, names: Sequence[str]) -> str:
     dead = (matrix.diagonal() <= 0).nonzero().flatten().tolist()
     if dead:
         return f"sensor(s) {_join(names, dead)} never change (dead or stuck); leave them out"
-    equal = (correlation.abs() > 1 - 1e-9).triu(1).nonzero().tolist()
+    equal = (correlation.abs() >= 1 - max(tolerance, 1e-9)).triu(1).nonzero().tolist()
     if equal:
         pairs = ", ".join(f"{names[i]} and {names[k]}" for i, k in equal[:5])
         return f"sensors {pairs} are copies of each other; keep one of each"

@@ -12,13 +12,14 @@ product reads its operand once. The factor 1/2 of each level is left out until t
 from __future__ import annotations
 
 from collections import deque
+from typing import Any
 
 import torch
 from torch import Tensor
 
-# Samples x sensors of one tile for each CPU thread: a tile and its coefficients take 2 MiB in float64, which stays in
-# cache; smaller ones would spend their time on calls instead.
-_CPU_TILE = 2**17
+# Samples x sensors of one tile for each CPU thread: a tile and its coefficients take 4 MiB in float64 and stay in the
+# last level of cache; smaller tiles fit closer to the core but spend more time on calls than they gain.
+_CPU_TILE = 2**18
 _GPU_TILE = 2**24
 _SHORTEST_TILE = 16
 
@@ -52,16 +53,11 @@ class WaveletProducts:
         # One product of this shape runs on one core: stripes of a tile keep the others busy.
         threads = torch.get_num_threads() if device.type == "cpu" else 1
         self._stripes = min(1 << (threads - 1).bit_length(), self._tile) if n_items < threads else 1
-        tile, margin = self._tile, self._tile // 2
-        self._buffer = self._empty(margin + tile)
-        self._staged = self._buffer[:, margin:]
-        self._coefficients = self._empty(tile)
+        self._buffer = self._empty(self._tile // 2 + self._tile)
+        self._coefficients = self._empty(self._tile)
         self._products = torch.empty(n_levels, n_items, self._stripes, n_sensors, n_sensors, **self._like)
-        self._short = []
-        for level in range(min(n_levels, tile.bit_length() - 1)):
-            lag = 2**level
-            head, past = self._buffer[:, margin - lag : margin], self._buffer[:, margin - lag : margin - lag + tile]
-            self._short.append((head, past, self._staged[:, tile - lag :], self._empty(lag)))
+        self._history = [self._empty(2**level) for level in range(min(n_levels, self._tile.bit_length() - 1))]
+        self._look_into_buffer()
         self._queues: list[deque[Tensor]] = [deque() for _ in range(len(self._short), n_levels)]
         self._spare: Tensor | None = None
         self._offset: Tensor | None = None
@@ -70,6 +66,24 @@ class WaveletProducts:
         self._flawed = -1  # no sample after this one is missing, of those in finished tiles
         self._sums = torch.zeros(n_levels, n_items, n_sensors, n_sensors, dtype=torch.float64, device=device)
         self._counts = torch.zeros_like(self._sums)
+
+    def _look_into_buffer(self) -> None:
+        """Views of the buffer: the tile, and for each lag within it the samples before, shifted and at its end."""
+        tile, margin = self._tile, self._tile // 2
+        self._staged = self._buffer[:, margin:]
+        self._short = []
+        for history in self._history:
+            start = margin - history.shape[1]
+            head, past = self._buffer[:, start:margin], self._buffer[:, start : start + tile]
+            self._short.append((head, past, self._buffer[:, start + tile :], history))
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A pickled view no longer shares its memory: make the views anew.
+        return {name: value for name, value in self.__dict__.items() if name not in ("_staged", "_short")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._look_into_buffer()
 
     @property
     def n_samples(self) -> int:
@@ -127,7 +141,7 @@ class WaveletProducts:
         Returns the sums, the counts and the last sample before which one may be missing.
         """
         tile = self._tile
-        staged = None if keep else self._staged.clone()
+        staged = None if keep else self._staged[:, :n].clone()
         smooth, coefficients = self._staged[:, :n], self._coefficients[:, :n]
         # One look at each tile tells which levels have to mind missing samples.
         flawed = self._flawed if bool(smooth.sum().isfinite()) else self._time + n - 1
@@ -180,7 +194,7 @@ class WaveletProducts:
             else:
                 smooth = past.add_(smooth)
         if staged is not None:
-            self._staged.copy_(staged)
+            self._staged[:, :n].copy_(staged)
         sums = self._products.sum(2, dtype=torch.float64)
         counts += torch.tensor(complete, dtype=counts.dtype).to(counts.device)[:, None, None, None]
         return sums, counts, flawed
@@ -206,7 +220,7 @@ def _gram(coefficients: Tensor) -> Tensor:
 def tile_length(n_series: int, device: torch.device, length: int | None) -> int:
     """Samples of a tile: a power of two that fits the cache, no longer than the recording needs."""
     budget = _CPU_TILE * torch.get_num_threads() if device.type == "cpu" else _GPU_TILE
-    tile = max(_SHORTEST_TILE, 1 << max(budget // n_series, 1).bit_length() - 1)
+    tile = max(_SHORTEST_TILE, 1 << max(budget // max(n_series, 1), 1).bit_length() - 1)
     if length is not None:
         tile = min(tile, max(_SHORTEST_TILE, 1 << (length - 1).bit_length()))
     return tile

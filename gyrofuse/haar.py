@@ -86,6 +86,6 @@ def _pyramid(signal: Tensor, kernel: Tensor, n_levels: int) -> list[Tensor]:
     coefficients = []
     for level in range(n_levels):
         both = functional.conv1d(smooth, kernel, dilation=2**level)  # (item, filter, time)
-        coefficients.append(both[:, 0].reshape(*leading, -1))
+        coefficients.append(both[:, 0].reshape(*leading, both.shape[-1]))
         smooth = both[:, 1:]
     return coefficients

@@ -7,7 +7,7 @@ grey printers tell apart: the virtual gyro is a thick blue line, the plain mean 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,8 +24,8 @@ Numbers = ArrayLike | Tensor
 Limits = tuple[Numbers, Numbers]
 
 _BLUE, _ORANGE, _GREY, _INK, _FRAME, _GRID = "#0072b2", "#d55e00", "#969696", "#262626", "#8c8c8c", "#e3e3e3"
-_MEAN = {"color": _ORANGE, "linewidth": 1.5, "linestyle": (0, (5, 2))}
-_SHADE = {"color": _BLUE, "alpha": 0.18, "linewidth": 0}
+_MEAN: dict[str, Any] = {"color": _ORANGE, "linewidth": 1.5, "linestyle": (0, (5, 2))}
+_SHADE: dict[str, Any] = {"color": _BLUE, "alpha": 0.18, "linewidth": 0}
 _LABEL, _TICK, _SMALL = 9.0, 8.0, 7.0  # font sizes in points
 _MOST_LABELS = 16  # sensors that still get a label each
 _LONGEST_NAME = 18  # characters
@@ -63,7 +63,7 @@ def plot_allan_deviation(
     ax = ax if ax is not None else _new_axes()
     times, sensors = _array(tau), _deviation(wavelet_variance)
     thin = 0.9 if len(names) <= _MOST_LABELS else 0.5
-    handles = ax.plot(times, sensors, color=_GREY, linewidth=thin, zorder=2)[:1]
+    handles: list[Any] = ax.plot(times, sensors, color=_GREY, linewidth=thin, zorder=2)[:1]
     labels = [f"sensor {_clean(names[0])}" if len(names) == 1 else f"{len(names)} sensors"]
     if equal is not None:
         handles += ax.plot(times, _deviation(equal), zorder=4, **_MEAN)
@@ -72,10 +72,11 @@ def plot_allan_deviation(
         handles += ax.plot(times, _deviation(virtual), color=_BLUE, linewidth=2.4, zorder=5)
         labels += ["virtual gyro"]
     if band is not None:
-        handles += [ax.fill_between(times, *map(_deviation, band), zorder=3, **_SHADE)]
+        low, high = band
+        handles += [ax.fill_between(times, _deviation(low), _deviation(high), zorder=3, **_SHADE)]
         labels += ["its confidence interval"]
     ax.set_yscale("log")
-    ax.set_ylabel(f"Allan deviation ({unit})" if unit else "Allan deviation (signal unit)", parse_math=False)
+    ax.set_ylabel(with_unit("Allan deviation", unit), parse_math=False)
     _time_axis(ax, in_seconds)
     _finish(ax, handles, labels)
     if 1 < len(names) <= _MOST_LABELS:
@@ -102,7 +103,8 @@ def plot_ratio(
     times, ratios = _array(tau), _array(ratio)
     ax.axhline(1, zorder=3, **_MEAN)
     if band is not None:
-        ax.fill_between(times, *map(_array, band), zorder=2, **_SHADE)
+        low, high = band
+        ax.fill_between(times, _array(low), _array(high), zorder=2, **_SHADE)
     known = np.isfinite(ratios)
     if known.any():
         # Shade along the line as drawn, straight in log tau, so that the shade ends where the line crosses 1.
@@ -171,55 +173,47 @@ def plot_weights(
 
 
 def plot_signals(
-    time: Numbers | None,
-    virtual: Numbers,
-    mean: Numbers | None = None,
+    figure: Figure | SubFigure,
+    time: Numbers,
+    signals: Mapping[str, Numbers],
     *,
     unit: str | None = None,
     in_seconds: bool = True,
-    figure: Figure | SubFigure | None = None,
-) -> Figure | SubFigure:
-    """Draw a virtual signal and what is left of it when noise is averaged away, beside that of the plain mean.
+) -> None:
+    """Draw a signal and what is left of it when noise is averaged away, beside that of another signal.
 
-    Signals of any length are reduced to 600 blocks: above, the range of the samples in each; below, their average.
+    Signals of any length are reduced to 600 blocks: above, the range of the first signal's samples in each; below,
+    the averages of all signals.
 
     Args:
-        time: Time of each sample `(time,)`, or `None` for their number.
-        virtual: Virtual signal `(time,)`; NaN is left out.
-        mean: Plain mean of the sensors, `(time,)`.
+        figure: Where to draw.
+        time: Time of each sample `(time,)`.
+        signals: One or two signals `(time,)` by name; NaN is left out.
         unit: Unit of the signals.
         in_seconds: Whether `time` is in seconds, else in samples.
-        figure: Where to draw; a new figure, unknown to pyplot, by default.
-
-    Returns:
-        The figure.
     """
-    figure = figure if figure is not None else _new_figure(7.0, 4.4)
-    values = _array(virtual)
-    times = np.arange(values.shape[-1], dtype=np.float64) if time is None else _array(time)
-    instants, low, high, average = _in_blocks(times, values)
     top, bottom = figure.subplots(2, 1, sharex=True)
-    top.fill_between(instants, low, high, color=_BLUE, alpha=0.55, linewidth=0.4)
-    label = f"signal ({unit})" if unit else "signal"
-    top.set_ylabel(label, parse_math=False)
-    top.set_title("Virtual gyro, range of the samples", loc="left", fontsize=_LABEL, color=_INK)
-    handles = bottom.plot(instants, average - np.nanmean(average), color=_BLUE, linewidth=1.2, zorder=4)
-    labels = ["virtual gyro"]
-    if mean is not None:
-        average = _in_blocks(times, _array(mean))[-1]
-        handles += bottom.plot(instants, average - np.nanmean(average), zorder=3, **_MEAN | {"linewidth": 1.0})
-        labels += ["plain mean"]
+    styles: tuple[dict[str, Any], ...] = ({"color": _BLUE, "linewidth": 1.2, "zorder": 4}, _MEAN | {"linewidth": 1.0})
+    times, handles = _array(time), []
+    for i, (values, style) in enumerate(zip(signals.values(), styles, strict=False)):
+        instants, low, high, average = _in_blocks(times, _array(values))
+        handles += bottom.plot(instants, average - np.nanmean(average), **style)
+        if i == 0:
+            top.fill_between(instants, low, high, color=_BLUE, alpha=0.55, linewidth=0.4)
+    names = list(signals)
     block = f"{(times[-1] - times[0]) / len(instants):.3g} {'s' if in_seconds else 'samples'}"
-    bottom.set_title(f"Averages over {block}, each signal less its mean", loc="left", fontsize=_LABEL, color=_INK)
-    bottom.set_ylabel(label, parse_math=False)
+    top.set_title(f"{names[0].capitalize()}, range of the samples", loc="left", fontsize=_LABEL, color=_INK)
+    bottom.set_title(f"Averages over {block}, less the mean", loc="left", fontsize=_LABEL, color=_INK)
+    for ax in (top, bottom):
+        ax.set_ylabel(with_unit("signal", unit), parse_math=False)
     bottom.set_xlabel("time (s)" if in_seconds else "sample")
     _finish(top)
-    _finish(bottom, handles, labels, loc="lower right", bbox_to_anchor=(1, 1), ncols=2, borderaxespad=0.2)
+    _finish(bottom, handles, names, loc="lower right", bbox_to_anchor=(1, 1), ncols=2, borderaxespad=0.2)
     figure.align_ylabels()
-    return figure
 
 
 def plot_fusion(
+    figure: Figure | SubFigure,
     tau: Numbers,
     wavelet_variance: Numbers,
     weights: Numbers,
@@ -231,11 +225,11 @@ def plot_fusion(
     interval: Limits | None = None,
     unit: str | None = None,
     in_seconds: bool = True,
-    figure: Figure | SubFigure | None = None,
-) -> Figure | SubFigure:
+) -> None:
     """Draw a fused array in one figure: the gain over the plain mean, the Allan deviations, and the weights.
 
     Args:
+        figure: Where to draw.
         tau: Averaging times `(level,)`, seconds or samples.
         wavelet_variance: Of every sensor, `(level, sensor)`, signal^2.
         weights: `(sensor,)`.
@@ -246,15 +240,10 @@ def plot_fusion(
         interval: Lower and upper limits of `weights`, `(sensor,)` each.
         unit: Unit of the signal.
         in_seconds: Whether `tau` is in seconds, else in samples.
-        figure: Where to draw; a new figure, unknown to pyplot, by default.
-
-    Returns:
-        The figure.
 
     References:
         Zhang et al., figures 9 and 10.
     """
-    figure = figure if figure is not None else _new_figure(7.0, 8.0)
     above, middle, below = figure.subplots(3, 1, height_ratios=[1.1, 2.6, 1.3])
     above.sharex(middle)
     plot_ratio(tau, _deviation(virtual) / _deviation(equal), in_seconds=in_seconds, ax=above)
@@ -275,19 +264,17 @@ def plot_fusion(
     low, high = interval if interval is not None else (unknown, unknown)
     plot_weights(weights, low, high, names=names, ax=below)
     figure.align_ylabels()
-    return figure
+
+
+def with_unit(label: str, unit: str | None) -> str:
+    """A label with its unit, where that is known."""
+    return f"{label} ({unit})" if unit and unit != "unknown" else label
 
 
 def _new_axes() -> Axes:
     import matplotlib.pyplot as plt
 
     return plt.subplots(figsize=(7.0, 4.6), layout="constrained")[1]
-
-
-def _new_figure(width: float, height: float) -> Figure:
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), layout="constrained", facecolor="white")
 
 
 def _array(value: Numbers) -> Array:
@@ -342,11 +329,10 @@ def _clean(name: str) -> str:
 def _name_ticks(ax: Axes, names: Sequence[str]) -> None:
     """Name the places 0, 1, ... on the x axis; turned when they are long, every n-th when they are many."""
     step = -(-len(names) // (2 * _MOST_LABELS))
-    shown = [_clean(name) for name in names]
-    turned = sum(map(len, shown[::step])) + len(shown[::step]) > 75
-    ax.set_xticks(
-        range(0, len(names), step), shown[::step], rotation=90 if turned else 0, fontsize=_TICK, parse_math=False
-    )
+    shown = [_clean(name) for name in names[::step]]
+    room = ax.get_window_extent().width * 72 / ax.figure.dpi / len(shown)  # points for each
+    turned = max(map(len, shown)) + 1 > room / (0.6 * _TICK)
+    ax.set_xticks(range(0, len(names), step), shown, rotation=90 if turned else 0, fontsize=_TICK, parse_math=False)
 
 
 def _label_line_ends(ax: Axes, times: Array, values: Array, names: Sequence[str]) -> None:

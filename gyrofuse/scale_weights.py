@@ -15,7 +15,7 @@ def resolve_scale_weights(scale_weights: ScaleWeights, n_levels: int) -> Tensor:
     """Turn a name or numbers into scale weights that sum to 1.
 
     `"flat"` weighs all levels alike. `"short"` is `1/(1 + exp(j - j0))` and `"long"` is `1/(1 + exp(j0 - j))`, the
-    logistic shapes of [Z] section V: `j0 = J // 2` for short; for long the papers' 13 at J = 19 and 16 at J = 21,
+    logistic shapes of [Z] section V: `j0 = J // 2` for short; for long the papers' 13 at J = 19 and 15 at J = 21,
     else two thirds of J, rounded up.
 
     Args:
@@ -26,6 +26,7 @@ def resolve_scale_weights(scale_weights: ScaleWeights, n_levels: int) -> Tensor:
         `(level,)`, float64, sum 1.
 
     Raises:
+        TypeError: Neither a name nor numbers.
         ValueError: An unknown name, another number of weights than levels, or weights that are negative, not
             finite or all zero.
     """
@@ -36,17 +37,39 @@ def resolve_scale_weights(scale_weights: ScaleWeights, n_levels: int) -> Tensor:
         elif scale_weights == "short":
             weights = torch.sigmoid(n_levels // 2 - level)
         elif scale_weights == "long":
-            weights = torch.sigmoid(level - {19: 13, 21: 16}.get(n_levels, math.ceil(2 * n_levels / 3)))
+            weights = torch.sigmoid(level - {19: 13, 21: 15}.get(n_levels, math.ceil(2 * n_levels / 3)))
         else:
             raise ValueError(
                 f"`scale_weights`: expected 'flat', 'short', 'long' or one number per level, got {scale_weights!r}"
             )
         return weights / weights.sum()
-    weights = torch.as_tensor(scale_weights, dtype=torch.float64)
-    if weights.shape != (n_levels,):
-        raise ValueError(
-            f"`scale_weights`: expected one number for each of {n_levels} levels, got shape {tuple(weights.shape)}"
-        )
+    weights = normalised(scale_weights)
+    if len(weights) != n_levels:
+        raise ValueError(f"`scale_weights`: expected one number for each of {n_levels} levels, got {len(weights)}")
+    return weights
+
+
+def normalised(scale_weights: Sequence[float] | Tensor) -> Tensor:
+    """Numbers as scale weights that sum to 1, one for each level.
+
+    Args:
+        scale_weights: `(level,)`, >= 0.
+
+    Returns:
+        `(level,)`, float64.
+
+    Raises:
+        TypeError: Not numbers.
+        ValueError: Not one number per level, or numbers that are negative, not finite or all zero.
+    """
+    try:
+        weights = torch.as_tensor(scale_weights, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError):
+        raise TypeError(
+            f"`scale_weights`: expected 'flat', 'short', 'long' or one number per level, got {scale_weights!r}"
+        ) from None
+    if weights.ndim != 1:
+        raise ValueError(f"`scale_weights`: expected one number per level, got shape {tuple(weights.shape)}")
     if not bool((weights.isfinite() & (weights >= 0)).all()) or not bool(weights.sum() > 0):
         raise ValueError(
             f"`scale_weights`: expected finite numbers >= 0, not all zero, got {weights.detach().tolist()}"

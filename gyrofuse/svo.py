@@ -17,7 +17,6 @@ from gyrofuse._checks import (
     check_confidence_level,
     check_floating,
     check_n_levels,
-    check_positive_integer,
     check_signal,
 )
 from gyrofuse._linalg import check_positive_definite
@@ -25,7 +24,7 @@ from gyrofuse._result import numbered
 from gyrofuse.competitors import equal_weights, inverse_variance_weights
 from gyrofuse.covariance import wavelet_products
 from gyrofuse.recording import Recording
-from gyrofuse.scale_weights import ScaleWeights, resolve_scale_weights
+from gyrofuse.scale_weights import ScaleWeights, normalised, resolve_scale_weights
 from gyrofuse.svo_result import SVOResult, fuse
 
 METHODS = ("svo", "inverse_variance", "equal")
@@ -50,7 +49,7 @@ def svo_weights(wccv: Tensor, scale_weights: ScaleWeights = "flat") -> Tensor:
     References:
         [Z] equation (7).
     """
-    combined = _combine(wccv, scale_weights)
+    combined = _combine(wccv, resolve_scale_weights(scale_weights, _check_levels(wccv)))
     check_positive_definite("the wavelet cross-covariance combined over scales", combined)
     return _optimal_weights(combined)
 
@@ -112,11 +111,11 @@ def fit_svo(
             f"`signal`: sensor(s) {', '.join(sensors[i] for i in empty)} have no finite sample; leave them out"
         )
     if n_levels is None and not isinstance(scale_weights, str):
-        n_levels = check_positive_integer("number of scale weights", len(scale_weights))
+        n_levels = len(normalised(scale_weights))
     sums, counts = wavelet_products(signal.detach(), check_n_levels(n_levels, signal.shape[-1]))
     fewest = counts.amin((-1, -2))  # (..., level)
     if n_levels is None:
-        n_levels = int((fewest.reshape(-1, fewest.shape[-1]).amin(0) > 0).sum())
+        n_levels = int((fewest > 0).reshape(-1, fewest.shape[-1]).all(0).sum())
         if n_levels == 0:
             raise ValueError(
                 "`signal`: expected two samples in a row that all sensors have, found none; "
@@ -128,7 +127,7 @@ def fit_svo(
     # A level that does not count may well be unknown.
     counting = torch.where(omega[:, None, None] > 0, wccv, 0.0)
     combined = torch.einsum("j,...jik->...ik", omega, counting)
-    check_positive_definite("the wavelet cross-covariance combined over scales", combined, sensors)
+    check_positive_definite("the wavelet cross-covariance combined over scales", combined, sensors, dtype=signal.dtype)
     degrees = uncertainty.degrees_of_freedom(fewest)
     if method == "svo":
         weights = _optimal_weights(combined)
@@ -168,10 +167,17 @@ class SVOWeights(nn.Module):
     def __init__(self, scale_weights: ScaleWeights = "flat") -> None:
         super().__init__()
         self.scale_weights = scale_weights
+        # The values of numbers are looked at here, once.
+        self._numbers = None if isinstance(scale_weights, str) else normalised(scale_weights)
 
     def forward(self, wccv: Tensor) -> Tensor:
         """Map `(..., level, sensor, sensor)` to `(..., sensor)`."""
-        return _optimal_weights(_combine(wccv, self.scale_weights))
+        n_levels, omega = _check_levels(wccv), self._numbers
+        if omega is None:
+            omega = resolve_scale_weights(self.scale_weights, n_levels)
+        elif len(omega) != n_levels:
+            raise ValueError(f"`wccv`: expected {len(omega)} levels, one for each scale weight, got {n_levels}")
+        return _optimal_weights(_combine(wccv, omega))
 
 
 class SVO(nn.Module):
@@ -231,12 +237,17 @@ class SVO(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
 
-def _combine(wccv: Tensor, scale_weights: ScaleWeights) -> Tensor:
+def _check_levels(wccv: Tensor) -> int:
     check_floating("wccv", wccv)
     if wccv.ndim < 3 or wccv.shape[-1] != wccv.shape[-2]:
         raise ValueError(f"`wccv`: expected (..., level, sensor, sensor), got shape {tuple(wccv.shape)}")
-    omega = resolve_scale_weights(scale_weights, wccv.shape[-3]).to(wccv)
-    return torch.einsum("j,...jik->...ik", omega, wccv)
+    return wccv.shape[-3]
+
+
+def _combine(wccv: Tensor, omega: Tensor) -> Tensor:
+    omega = omega.to(wccv)
+    # A level that does not count may well be unknown.
+    return torch.einsum("j,...jik->...ik", omega, torch.where(omega[:, None, None] > 0, wccv, 0.0))
 
 
 def _optimal_weights(combined: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse import uncertainty
+from gyrofuse._checks import check_signal
 from gyrofuse._result import ConfidenceInterval, listed, numbered
 from gyrofuse.competitors import equal_weights
 from gyrofuse.recording import Recording
@@ -18,7 +19,18 @@ if TYPE_CHECKING:
 
 
 def fuse(weights: Tensor, signal: Tensor) -> Tensor:
-    """Weighted sum of the sensors: weights `(..., sensor)` and signal `(..., sensor, time)` to `(..., time)`."""
+    """Weighted sum of the sensors: weights `(..., sensor)` and signal `(..., sensor, time)` to `(..., time)`.
+
+    Raises:
+        TypeError: `signal` is not a floating point tensor.
+        ValueError: `signal` does not have one row for each of the weights.
+    """
+    check_signal("signal", signal)
+    if signal.shape[-2] != weights.shape[-1]:
+        raise ValueError(
+            f"`signal`: expected (..., sensor, time) with the {weights.shape[-1]} sensors that the weights are for, "
+            f"got shape {tuple(signal.shape)}"
+        )
     return (weights.unsqueeze(-2) @ signal).squeeze(-2)  # (..., 1, sensor) @ (..., sensor, time)
 
 

@@ -2,10 +2,11 @@
 
 Until a model of the noise says more, a level with `M_j` coefficients of filter length `tau_j` is taken to hold
 
-    eta_j = max(1.9 M_j / tau_j, 1)
+    eta_j = max(k_j M_j / tau_j, 1),   k_1 = 4/3,   k_j = 280/151 = 1.85 for j >= 2
 
-independent observations: exact for a random walk, the slowest of the usual gyro errors, and on the safe side for
-faster ones (white noise has 3 M_j / tau_j, so that its intervals come out a quarter wider than they need be).
+independent observations: at level 1 what white noise has, which is less there than a random walk has; above, what a
+random walk has for large tau, the slowest of the usual gyro errors. That is on the safe side for faster ones (white
+noise comes to 3 M_j / tau_j, so that its intervals come out a quarter wider than they need be).
 Coefficients are taken to be Gaussian, and levels `j` and `k` to correlate as `2**-|j - k|`.
 """
 
@@ -16,7 +17,8 @@ from torch import Tensor
 
 from gyrofuse._result import ConfidenceInterval
 
-_RANDOM_WALK_DEGREES = 1.9
+_WHITE_NOISE_DEGREES_AT_LEVEL_1 = 4 / 3
+_RANDOM_WALK_DEGREES = 280 / 151
 _NEIGHBOUR_CORRELATION = 0.5
 
 
@@ -31,7 +33,8 @@ def degrees_of_freedom(counts: Tensor) -> Tensor:
         `(..., level)`, at least 1.
     """
     levels = torch.arange(1, counts.shape[-1] + 1, dtype=torch.float64, device=counts.device)
-    return (_RANDOM_WALK_DEGREES * counts * torch.exp2(-levels)).clamp(min=1.0)
+    factor = torch.where(levels == 1, _WHITE_NOISE_DEGREES_AT_LEVEL_1, _RANDOM_WALK_DEGREES)
+    return (factor * counts * torch.exp2(-levels)).clamp(min=1.0)
 
 
 def chi_square_interval(variance: Tensor, degrees: Tensor, confidence_level: float = 0.95) -> ConfidenceInterval:
@@ -117,10 +120,11 @@ def inverse_variance_weights_covariance(
     Returns:
         `(..., sensor, sensor)`.
     """
-    combined = torch.einsum("j,...jii->...i", scale_weights, wccv)
-    relative = weights / combined
-    influence = weights[..., :, None] * relative[..., None, :] - torch.diag_embed(relative)
-    return _sum_over_levels(influence[..., None, :, :] @ _square_root(2 * wccv.square()), scale_weights, degrees)
+    # In units of A_ii, so that the squares of small variances stay within the range of the floats.
+    unit = torch.einsum("j,...jii->...i", scale_weights, wccv).rsqrt()
+    relative = unit[..., None, :, None] * wccv * unit[..., None, None, :]
+    influence = weights[..., :, None] * weights[..., None, :] - torch.diag_embed(weights)
+    return _sum_over_levels(influence[..., None, :, :] @ _square_root(2 * relative.square()), scale_weights, degrees)
 
 
 def _sum_over_levels(factor: Tensor, scale_weights: Tensor, degrees: Tensor) -> Tensor:

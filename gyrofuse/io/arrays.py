@@ -57,8 +57,10 @@ def streams_from_arrays(content: Mapping[str, Any], path: Path, *, key: str | No
             unit = column.unit or stated_unit(settings, name)
             alike.setdefault((_length(arrays[name]), stated_rate(settings, name), unit), []).append(name)
     if not alike:
-        found = ", ".join(f"{name} {tuple(value.shape)}" for name, value in arrays.items()) or "no array"
-        wanted = "an array with the name of a gyro (gyro, imu_gyr, gx)" + (f" in {key!r}" if key else "")
+        shapes = {name: getattr(value, "shape", ()) for name, value in content.items()}
+        found = ", ".join(f"{name} {shape}" for name, shape in shapes.items() if set(shape) - {1}) or "no array"
+        wanted = "an array (sensor, time) with the name of a gyro (gyro, imu_gyr, gx)"
+        wanted += f" in {key!r}" if key else ""
         raise RecordingError(f"{path}: expected {wanted}, found {found}; say with `key` which array holds the gyros")
     streams: list[Stream] = []
     for (length, rate, unit), gyros in alike.items():
@@ -89,23 +91,27 @@ def _group(
         if column.kind != "gyro":
             beside[name] = values
             continue
-        sensors = _texts(_nearest(settings, name, _SENSORS))
+        sensors = list(dict.fromkeys(_texts(_nearest(settings, name, _SENSORS))))
         if len(values) == 4 and len(sensors) != 4 and (row := _clock_row(values)) is not None:
             notes.append(f"row {row} of '{name}' never decreases and is read as its time")
             clocks[column.device] = _clock(column, values[row], rate, settings)
             values = np.delete(values, row, axis=0)
+        found: dict[tuple[str, str], dict[str, Array]]
         if len(values) == len(sensors):
-            gyro |= {(column.device, sensor): {"": row} for sensor, row in zip(sensors, values, strict=True)}
+            found = {(column.device, sensor): {"": row} for sensor, row in zip(sensors, values, strict=True)}
         elif len(values) in (1, 3):
             axes = AXES if len(values) == 3 else (column.axis,)
-            triad = gyro.setdefault((column.device, ""), {})
-            if not triad.keys().isdisjoint(axes):
-                notes.append(f"'{name}' repeats an axis of the same device and is left out")
-                continue
-            triad |= zip(axes, values, strict=True)
+            found = {(column.device, ""): dict(zip(axes, values, strict=True))}
         else:
             label = column.device or stem
-            gyro |= {(column.device, f"{label}[{i}]"): {"": row} for i, row in enumerate(values)}
+            found = {(column.device, f"{label}[{i}]"): {"": row} for i, row in enumerate(values)}
+        if sensors and len(values) != len(sensors):
+            notes.append(f"{len(sensors)} sensor names do not fit the {len(values)} rows of '{name}'")
+        if any(not gyro.get(owner, {}).keys().isdisjoint(rates) for owner, rates in found.items()):
+            notes.append(f"'{name}' repeats an axis of the same device and is left out")
+            continue
+        for owner, rates in found.items():
+            gyro.setdefault(owner, {}).update(rates)
 
     channels = _channels(beside, columns, settings, [device for device, _ in gyro])
     no_clock: tuple[Array | None, float | None, str] = (None, None, "")
@@ -224,7 +230,7 @@ def _dimensions(value: Any) -> tuple[int, ...]:
 def _length(value: Any) -> int:
     """Number of samples of an array of one or two dimensions, 0 of anything else."""
     dimensions = _dimensions(value)
-    return max(dimensions) if len(dimensions) in (1, 2) else 0
+    return max(dimensions) if len(dimensions) in (1, 2) and 0 not in dimensions else 0
 
 
 def _rows(value: Any, length: int) -> Array:
@@ -236,13 +242,13 @@ def _rows(value: Any, length: int) -> Array:
 
 def _clock_row(rows: Array) -> int | None:
     """First or last row when it advances and never decreases."""
-    return next((i for i in (0, 3) if rows[i, -1] > rows[i, 0] and np.all(np.diff(rows[i]) >= 0)), None)
+    return next((i for i in (0, 3) if rows[i, -1] > rows[i, 0] and np.all(rows[i, 1:] >= rows[i, :-1])), None)
 
 
 def _clock(column: Column, ticks: Array, rate: float | None, settings: _Settings) -> tuple[Array, float | None, str]:
     """Seconds, wrapping period and guess of a clock, whose unit its attribute or the sampling rate may tell."""
     unit = column.unit or _own_unit(settings, column.name)
-    step = float(np.median(np.diff(ticks)))
+    step = float(np.median(np.diff(ticks[np.isfinite(ticks)]))) if np.isfinite(ticks).sum() > 1 else 0.0
     if unit not in TICK and rate is not None and step > 0:
         unit = min(TICK, key=lambda name: abs(math.log(step * TICK[name] * rate)))
     return time_in_seconds(replace(column, unit=unit if unit in TICK else ""), ticks)

@@ -45,9 +45,7 @@ _NOT_DATA = frozenset(
     "bias clipping clipped id count counter covariance cov std var variance integral dt delta relative error errors "
     "status samples norm noise scale offset range free movement valid quality".split()
 )
-_FILLERS = frozenset(
-    "raw data value values field buffer calibrated cal uncalibrated msg header sample sensor".split()
-)
+_FILLERS = frozenset("raw data value values field buffer calibrated cal uncalibrated msg header sample sensor".split())
 _UNIT_TOKENS = {
     "rad": "rad/s",
     "rads": "rad/s",
@@ -160,9 +158,7 @@ def _classify(name: str) -> Column:
         token, following = lower[position], lower[position + 1] if position + 1 < len(tokens) else ""
         position += 1
         if match := _WORD.fullmatch(token):
-            found = next(
-                k for k in ("gyro", "acceleration", "magnetic_field", "temperature") if match[k] is not None
-            )
+            found = next(k for k in ("gyro", "acceleration", "magnetic_field", "temperature") if match[k] is not None)
             kind = "temperature" if "temperature" in (kind, found) else kind or found
             axis = axis or match["before"] or match["after"] or ""
             numbers += [match["number"], match["last"]]
@@ -188,17 +184,13 @@ def _classify(name: str) -> Column:
         return Column(name, "time", unit="s")
     if not kind:
         return Column(name)
-    unit = (
-        canonical_unit(stated) if stated else next((_UNIT_TOKENS[t] for t in lower if t in _UNIT_TOKENS), "")
-    )
+    unit = canonical_unit(stated) if stated else next((_UNIT_TOKENS[t] for t in lower if t in _UNIT_TOKENS), "")
     drop = _UNIT_TOKENS.keys() | (_UNIT_LEFTOVERS if unit and not stated else frozenset())
     return Column(name, kind, _device(rest, numbers, drop), axis, unit)
 
 
 def _time_column(name: str, tail: list[str], stated: str, rest: list[str], numbers: list[str]) -> Column:
-    unit = _TIME_TOKENS.get(stated.lower(), "") or next(
-        (_TIME_TOKENS[t] for t in tail[1:] if t in _TIME_TOKENS), ""
-    )
+    unit = _TIME_TOKENS.get(stated.lower(), "") or next((_TIME_TOKENS[t] for t in tail[1:] if t in _TIME_TOKENS), "")
     return Column(name, "time", _device(rest, numbers, _TIME_TOKENS.keys()), "", unit)
 
 
@@ -233,9 +225,7 @@ def time_in_seconds(column: Column, values: NDArray[np.generic]) -> tuple[Array,
         else:
             unit = "ms" if step < 200 else "us" if step < 200e3 else "ns"
         if unit != "s" and not (fine and unit == "us"):
-            note = (
-                f"time column '{column.name}' states no unit: read as {unit} from its median step of {step:g}"
-            )
+            note = f"time column '{column.name}' states no unit: read as {unit} from its median step of {step:g}"
     return ticks * TICK[unit], WRAP_32_BIT * TICK[unit] if fine else None, note
 
 

@@ -32,7 +32,9 @@ def read(path: Path, *, key: str | None = None) -> list[Stream]:
         with h5py.File(path, "r") as file:
             # Datasets are read when needed: a file may hold much besides gyros.
             return streams_from_arrays(_content(file), path, key=key)
-    except (OSError, RuntimeError, KeyError) as error:
+    except RecordingError:
+        raise
+    except Exception as error:  # a damaged file may fail anywhere in the library
         raise RecordingError(
             f"{path}: expected an HDF5 file, found one that cannot be read ({error}); copy or export it again"
         ) from error

@@ -40,7 +40,7 @@ def read(path: Path, *, key: str | None = None) -> list[Stream]:
         return hdf5.read(path, key=key)
     try:
         variables = loadmat(path)
-    except Exception as error:  # a damaged file may fail anywhere in the parser
+    except Exception as error:  # a damaged file may fail anywhere in the library
         raise RecordingError(
             f"{path}: expected a MATLAB file of version 5 to 7.3, found one that cannot be read ({error}); "
             "save it again with save(..., '-v7')"

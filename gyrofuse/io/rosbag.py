@@ -51,7 +51,7 @@ def read(path: Path, *, key: str | None = None) -> list[Stream]:
                 messages.setdefault(connection.topic, _Messages()).append(message, arrival)
     except RecordingError:
         raise
-    except Exception as error:  # a damaged bag may fail anywhere in the parser
+    except Exception as error:  # a damaged bag may fail anywhere in the library
         raise RecordingError(
             f"{path}: expected an indexed ROS 1 or ROS 2 bag, found one that cannot be read ({error}); "
             "repair it with `rosbag reindex`, `ros2 bag reindex` or `mcap recover`, or record it again"

@@ -44,7 +44,7 @@ def read(path: Path, *, key: str | None = None) -> list[Stream]:
         # pyulog reports damage with print(); what it found is kept in `file_corruption`
         with path.open("rb") as file, contextlib.redirect_stdout(io.StringIO()):
             log = ULog(file)
-    except Exception as error:  # a damaged file may fail anywhere in the parser
+    except Exception as error:  # a damaged file may fail anywhere in the library
         raise RecordingError(
             f"{path}: expected a PX4 ULog file, found one that cannot be parsed ({error}); "
             "download the log from the vehicle again"

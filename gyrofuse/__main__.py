@@ -1,0 +1,5 @@
+"""`python -m gyrofuse`."""
+
+from gyrofuse.cli import main
+
+main()

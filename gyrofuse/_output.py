@@ -1,0 +1,121 @@
+"""Files and folders that appear whole or not at all: checked before the work, renamed into place at its end."""
+
+from __future__ import annotations
+
+import secrets
+import shutil
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+
+
+class Outputs:
+    """Files to be written together; `with Outputs(paths) as drafts` gives the path to write to for each of them.
+
+    When the block ends all take their names; when it fails none appears, and what was there stays.
+
+    Args:
+        paths: Where the files go.
+        force: Whether existing files may be replaced.
+        inputs: Files that must not be replaced in any case.
+
+    Raises:
+        FileNotFoundError: A folder does not exist.
+        FileExistsError: A file exists and `force` is not set.
+        OSError: A folder cannot be written to.
+        ValueError: A file is named twice, is one of `inputs`, or is not a file.
+    """
+
+    def __init__(self, paths: Iterable[Path], *, force: bool = False, inputs: Iterable[Path] = ()) -> None:
+        used = {path.resolve() for path in inputs}
+        self._drafts: dict[Path, Path] = {}
+        try:
+            for path in paths:
+                where = path.resolve()
+                if where in used:
+                    raise ValueError(f"{path}: is in use by the same command; choose another name")
+                if where.exists() and not where.is_file():
+                    raise ValueError(f"{path}: expected the name of a file, found something else; choose another name")
+                _check_absent(path, force)
+                used.add(where)
+                self._drafts[path] = _draft(path)
+                with _creating(path):
+                    self._drafts[path].touch(exist_ok=False)
+        except BaseException:
+            self._discard()
+            raise
+
+    def __enter__(self) -> dict[Path, Path]:
+        return self._drafts
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if kind is None:
+                for path, draft in self._drafts.items():
+                    draft.replace(path.resolve())
+        finally:
+            self._discard()
+
+    def _discard(self) -> None:
+        for draft in self._drafts.values():
+            draft.unlink(missing_ok=True)
+
+
+@contextmanager
+def output_folder(path: Path, *, own: Collection[str], force: bool = False) -> Iterator[Path]:
+    """Write a folder that appears whole or not at all.
+
+    Args:
+        path: The folder.
+        own: Names that it holds; an existing folder with anything else in it is never replaced.
+        force: Whether an existing folder may be replaced.
+
+    Yields:
+        The folder to write to, which takes its name when the block ends.
+
+    Raises:
+        FileNotFoundError: The folder around it does not exist.
+        FileExistsError: It exists and `force` is not set.
+        OSError: The folder around it cannot be written to.
+        ValueError: It holds anything else.
+    """
+    where = path.resolve()
+    _check_absent(path, force)
+    if where.exists():
+        others = sorted({entry.name for entry in where.iterdir()} - {*own}) if where.is_dir() else ["it is a file"]
+        if others:
+            raise ValueError(f"{path}: holds something else ({others[0]}) and is left alone; choose another folder")
+    draft, before = _draft(path), _draft(path)
+    with _creating(path):
+        draft.mkdir()
+    try:
+        yield draft
+        if where.exists():
+            where.rename(before)
+        draft.rename(where)
+        shutil.rmtree(before, ignore_errors=True)
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+def _draft(path: Path) -> Path:
+    """A name beside the file behind `path`, so that renaming it does not leave the file system."""
+    return path.resolve().with_name(f".{secrets.token_hex(8)}{path.suffix}")
+
+
+def _check_absent(path: Path, force: bool) -> None:
+    if path.exists() and not force:
+        raise FileExistsError(f"{path}: exists already; choose another name, or replace it with --force (`force`)")
+
+
+@contextmanager
+def _creating(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist; create it first") from None
+    except OSError as error:
+        raise OSError(f"{path}: cannot be written there ({error.strerror}); choose another place") from None

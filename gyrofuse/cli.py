@@ -1,0 +1,381 @@
+"""The command line: look into a log, fuse it, simulate an array, watch a demonstration.
+
+Bad input ends with one line on stderr and exit status 2, a defect of the program with one line and status 1; with
+`--debug` either shows its traceback. Files appear when everything has worked, or not at all.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import zipfile
+from collections.abc import Sequence
+from enum import Enum
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import typer
+
+from gyrofuse._console import Commands, progress, say, say_table, warn
+from gyrofuse._output import Outputs, output_folder
+from gyrofuse.demo import FILES, run_demo
+from gyrofuse.parsing import model_from_dict, parse_model
+from gyrofuse.processes import Model
+from gyrofuse.recording import Recording, read_recording
+from gyrofuse.report import (
+    fusion_figure,
+    fusion_report,
+    number,
+    recording_report,
+    save_figure,
+    sensor_rows,
+)
+from gyrofuse.simulate import ArrayModel
+from gyrofuse.svo import fit_svo
+
+_SUFFIXES = {
+    "out": (".npz", ".csv"),
+    "figure": (".png", ".svg", ".pdf"),
+    "json": (".json",),
+    "report": (".html",),
+}
+
+app = typer.Typer(
+    name="gyrofuse",
+    cls=Commands,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    no_args_is_help=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+class Method(str, Enum):
+    """How weights are chosen."""
+
+    svo = "svo"
+    inverse_variance = "inverse-variance"
+    equal = "equal"
+
+
+Logs = Annotated[
+    list[Path],
+    typer.Argument(metavar="LOG...", help="The recording. Several files are one array, aligned on their clocks."),
+]
+Axis = Annotated[str | None, typer.Option(metavar="x|y|z", help="Take this axis alone.")]
+Sensors = Annotated[str | None, typer.Option(metavar="A,B,...", help="Take these sensors alone.")]
+Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Sampling rate, where the log does not say.")]
+Unit = Annotated[str | None, typer.Option(metavar="UNIT", help="Unit of the rates, where the log does not say.")]
+Scale = Annotated[float | None, typer.Option(help="Factor that turns what is logged (counts) into the unit.")]
+Key = Annotated[str | None, typer.Option(metavar="NAME", help="Topic, array, group or column that holds the gyros.")]
+Mounting = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="JSON: for each device by name, the 3x3 matrix to the common frame."),
+]
+Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write what is found as JSON.")]
+Report = Annotated[Path | None, typer.Option(metavar="FILE", help="Write a report, one HTML page.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from gyrofuse import __version__
+
+        print(f"gyrofuse {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _common(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and leave.")
+    ] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> None:
+    """One virtual gyro from an array of gyros: better than the mean, and it says where and by how much."""
+
+
+@app.command()
+def info(
+    logs: Logs,
+    axis: Axis = None,
+    sensors: Sensors = None,
+    rate: Rate = None,
+    unit: Unit = None,
+    scale: Scale = None,
+    key: Key = None,
+    mounting: Mounting = None,
+    json_file: Json = None,
+    report: Report = None,
+    force: Force = False,
+) -> None:
+    """Show what is in a log: sensors, rate, gaps, units, channels."""
+    with _outputs(force, logs, json=json_file, report=report) as drafts:
+        recording = _read(logs, axis, sensors, rate, unit, scale, key, mounting)
+        if json_file:
+            _write_json(drafts[json_file], recording.to_dict())
+        if report:
+            with progress("drawing"):
+                page = recording_report(recording, title=f"What is in {_titled(logs)}")
+            drafts[report].write_text(page, encoding="utf-8")
+    _say_recording(recording)
+
+
+@app.command()
+def fuse(
+    logs: Logs,
+    scale_weights: Annotated[
+        str,
+        typer.Option(
+            metavar="flat|short|long|W1,W2,...",
+            help="Which averaging times count: all alike, the short, the long, or one number >= 0 for each level.",
+        ),
+    ] = "flat",
+    method: Annotated[Method, typer.Option(help="How the weights are chosen.")] = Method.svo,
+    levels: Annotated[
+        int | None, typer.Option(metavar="J", help="Number of levels; as many as fit by default.")
+    ] = None,
+    axis: Axis = None,
+    sensors: Sensors = None,
+    rate: Rate = None,
+    unit: Unit = None,
+    scale: Scale = None,
+    key: Key = None,
+    mounting: Mounting = None,
+    confidence_level: Annotated[float, typer.Option(metavar="P", help="Of all intervals.")] = 0.95,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the virtual gyro, .npz (with the weights) or .csv.")
+    ] = None,
+    figure: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw it, .png, .svg or .pdf.")] = None,
+    json_file: Json = None,
+    report: Report = None,
+    force: Force = False,
+) -> None:
+    """Fuse an array, recorded at rest, into one virtual gyro."""
+    weights = _scale_weights(scale_weights)
+    with _outputs(force, logs, out=out, figure=figure, json=json_file, report=report) as drafts:
+        recording = _read(logs, axis, sensors, rate, unit, scale, key, mounting)
+        with progress("fusing"):
+            result = fit_svo(
+                recording,
+                weights,
+                method=method.value.replace("-", "_"),
+                confidence_level=confidence_level,
+                n_levels=levels,
+            )
+            virtual = result.virtual(recording)
+        if out:
+            fused = Recording(
+                virtual.unsqueeze(-2),
+                rate=recording.rate,
+                unit=recording.unit,
+                sensors=("virtual",),
+                time=recording.time,
+                axes=recording.axes,
+            )
+            _save(fused, drafts[out], weights=result.weights.numpy())
+        with progress("drawing"):
+            if figure:
+                save_figure(fusion_figure(result), drafts[figure], figure.suffix[1:])
+            if report:
+                page = fusion_report(result, recording, virtual, title=f"Virtual gyro of {_titled(logs)}")
+                drafts[report].write_text(page, encoding="utf-8")
+        if json_file:
+            _write_json(drafts[json_file], result.to_dict())
+    for note in recording.notes:
+        if note.kind == "axes":
+            warn(str(note))
+    say(result.summary())
+    _say_notes(recording)
+
+
+@app.command()
+def simulate(
+    model: Annotated[
+        str,
+        typer.Argument(
+            metavar="MODEL", help='A model in JSON, or a formula such as "WN(variance=1) + RW(variance=1e-6)".'
+        ),
+    ],
+    samples: Annotated[int, typer.Option(metavar="N", help="Samples of each sensor.")],
+    rate: Annotated[float, typer.Option(metavar="HZ", help="Sampling rate.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Where the recording goes, .npz or .csv.")],
+    sensors: Annotated[
+        int | None, typer.Option(metavar="N", help="Independent sensors, for a model of one sensor.")
+    ] = None,
+    unit: Annotated[str, typer.Option(metavar="UNIT", help="Unit of the rates.")] = "deg/s",
+    seed: Annotated[int | None, typer.Option(metavar="S", help="The same seed gives the same recording.")] = None,
+    json_file: Json = None,
+    report: Report = None,
+    force: Force = False,
+) -> None:
+    """Simulate a recording from a noise model."""
+    source = [Path(model)] if model.lower().endswith(".json") else []
+    with _outputs(force, source, out=out, json=json_file, report=report) as drafts:
+        noise = _read_model(source[0]) if source else parse_model(model)
+        generator = torch.Generator()
+        seed = generator.seed() if seed is None else seed
+        generator.manual_seed(seed)
+        with progress("simulating"):
+            if isinstance(noise, ArrayModel):
+                if sensors is not None:
+                    raise ValueError(
+                        f"`--sensors`: {model} is a model of an array of {noise.n_sensors}; leave the option out"
+                    )
+                signal = noise.simulate(samples, generator=generator)
+            else:
+                signal = noise.simulate(samples, batch=(1 if sensors is None else sensors,), generator=generator)
+        recording = Recording(signal, rate=rate, unit=unit)
+        _save(recording, drafts[out])
+        if json_file:
+            settings = {"model": noise.to_dict(), "n_samples": samples, "rate": rate, "unit": unit, "seed": seed}
+            _write_json(drafts[json_file], settings)
+        if report:
+            page = recording_report(recording, title=f"A simulated recording of {_titled(source or [Path(model)])}")
+            drafts[report].write_text(page, encoding="utf-8")
+    say(f"{noise}\n{signal.shape[0]} x {samples} samples at {rate:g} Hz, seed {seed}, in {out}")
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write to.")] = Path("gyrofuse-demo"),
+    json_file: Json = None,
+    report: Report = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace files and an earlier demonstration.")] = False,
+) -> None:
+    """Tell the whole story on a simulated array: no file, no network, and the truth is known."""
+    with (
+        _outputs(force, json=json_file, report=report) as drafts,
+        output_folder(out, own=FILES, force=force) as folder,
+    ):
+        with progress("simulating, fusing and drawing"):
+            story = run_demo(folder)
+        for path, name in ((json_file, "result.json"), (report, "report.html")):
+            if path:
+                shutil.copyfile(folder / name, drafts[path])
+    say(f"{story}\n\nReport: {out / 'report.html'}\nFigures: {out / 'figures'}")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line and leave with its exit status."""
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):  # names in logs may hold what the terminal cannot show
+            stream.reconfigure(errors="replace")
+    app(arguments)
+
+
+def _read(
+    logs: Sequence[Path],
+    axis: str | None,
+    sensors: str | None,
+    rate: float | None,
+    unit: str | None,
+    scale: float | None,
+    key: str | None,
+    mounting: Path | None,
+) -> Recording:
+    with progress("reading"):
+        return read_recording(
+            logs,
+            axis=axis,
+            sensors=None if sensors is None else sensors.split(","),
+            rate=rate,
+            unit=unit,
+            scale=scale,
+            key=key,
+            mounting=mounting,
+        )
+
+
+def _read_model(path: Path) -> Model | ArrayModel:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return model_from_dict(content)
+    except (ValueError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path}: expected a model in JSON, as to_dict() of a model gives it: {error}") from None
+
+
+def _scale_weights(text: str) -> str | list[float]:
+    if text in ("flat", "short", "long"):
+        return text
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise ValueError(
+            f"`--scale-weights`: expected flat, short, long, or numbers separated by commas, got {text!r}"
+        ) from None
+
+
+def _outputs(force: bool, inputs: Sequence[Path] = (), **asked: Path | None) -> Outputs:
+    """Files to write, those asked for, by option."""
+    for option, path in asked.items():
+        if path is not None and path.suffix not in _SUFFIXES[option]:
+            raise ValueError(
+                f"`--{option}`: expected a name that ends in {' or '.join(_SUFFIXES[option])}, got {str(path)!r}"
+            )
+    return Outputs([path for path in asked.values() if path is not None], force=force, inputs=inputs)
+
+
+def _save(recording: Recording, path: Path, **arrays: np.ndarray[Any, Any]) -> None:
+    """Save a recording as .csv, or as .npz with further arrays."""
+    if path.suffix == ".csv":
+        names = [
+            f"{sensor}_gyro_{axis}".rstrip("_") for axis in recording.axes or ("",) for sensor in recording.sensors
+        ]
+        columns = torch.cat([recording.time[None], recording.signal.flatten(0, -2)]).T
+        unit = f" [{recording.unit}]" if recording.unit != "unknown" else ""
+        header = ",".join(["time [s]", *(name + unit for name in names)])
+        np.savetxt(path, columns.numpy(), fmt="%.17g", delimiter=",", header=header, comments="", encoding="utf-8")
+        return
+    recording.save(path, force=True)
+    with zipfile.ZipFile(path, "a") as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w") as file:
+                np.lib.format.write_array(file, array)
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    path.write_text(json.dumps(content, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _titled(logs: Sequence[Path]) -> str:
+    return logs[0].name if len(logs) == 1 else f"{logs[0].name} and {len(logs) - 1} more"
+
+
+def _say_recording(recording: Recording) -> None:
+    facts = [
+        ("source", ", ".join(recording.source)),
+        ("sensors", str(recording.n_sensors)),
+        ("axes", ", ".join(recording.axes) or "-"),
+        ("unit", recording.unit),
+        ("rate", f"{number(recording.rate, 8)} Hz"),
+        ("samples", str(recording.n_samples)),
+        ("duration", f"{number(recording.duration, 6)} s"),
+    ]
+    say_table((), facts)
+    head = ("sensor", "axis", "missing", "mean", "standard deviation")
+    rows = [
+        (
+            row["name"],
+            row["axis"] or "-",
+            f"{100 * row['missing']:.3g} %",
+            number(row["mean"]),
+            number(row["deviation"]),
+        )
+        for row in sensor_rows(recording)
+    ]
+    say_table(head, rows, right=(2, 3, 4))
+    if recording.channels:
+        rows = [(name, " x ".join(map(str, values.shape))) for name, values in recording.channels.items()]
+        say_table(("channel", "shape"), rows)
+    _say_notes(recording)
+
+
+def _say_notes(recording: Recording) -> None:
+    rows = [(note.kind.replace("_", " "), note.stream or "-", note.sentence) for note in recording.notes]
+    if rows:
+        say_table(("found", "where", "what"), rows)

@@ -1,0 +1,253 @@
+"""From the streams of one or several logs to the array of a recording."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gyrofuse.io import read_streams
+from gyrofuse.io.align import Placed, align
+from gyrofuse.io.clock import Grid, grid_of, regular_grid
+from gyrofuse.io.columns import AXES
+from gyrofuse.io.notes import Note
+from gyrofuse.io.stream import Array, RecordingError, Stream
+from gyrofuse.units import rate_unit_factor
+
+_UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True, eq=False)
+class Assembled:
+    """An array on a uniform grid: `signal` is `(sensor, time)`, or `(axis, sensor, time)` with named `axes`."""
+
+    signal: Array
+    rate: float
+    unit: str
+    sensors: tuple[str, ...]
+    axes: tuple[str, ...]
+    channels: dict[str, Array]
+    notes: tuple[Note, ...]
+
+
+def assemble(
+    paths: Sequence[Path],
+    *,
+    axis: str | None,
+    rate: float | None,
+    unit: str | None,
+    scale: float | None,
+    key: str | None,
+    mounting: Mapping[str, Any] | str | Path | None,
+) -> Assembled:
+    """Read the logs and put their devices on one grid; arguments and errors as `gyrofuse.read_recording`."""
+    source = ", ".join(str(path) for path in paths)
+    streams = _named([(path, read_streams(path, key=key)) for path in paths])
+    notes = [Note("reader", stream.name, sentence) for stream in streams for sentence in stream.notes]
+    streams = _mount(streams, mounting, source)
+    streams, axes, axis_notes = _choose_axes(streams, axis, source)
+    notes += axis_notes
+
+    grids = _grids(streams, rate, source)
+    for grid in dict.fromkeys(grids):
+        notes += grid.notes
+    placed, common_rate, align_notes = align(grids, [stream.name for stream in streams], source)
+    notes += align_notes
+
+    units, factors, unit_notes = _units(streams, unit, scale, source)
+    notes += unit_notes
+    devices = list(zip(streams, placed, factors, strict=True))
+    if axes:
+        signal = np.stack([np.stack([_clean(s, axis, p, f, notes) for s, p, f in devices]) for axis in axes])
+        sensors = tuple(stream.name for stream in streams)
+    else:
+        signal = np.stack([_clean(s, axis, p, f, notes) for s, p, f in devices for axis in s.gyro])
+        # The axes of a single device are its sensors.
+        sensors = tuple(axis if len(s.gyro) > 1 else s.name for s in streams for axis in s.gyro)
+    return Assembled(signal, common_rate, units, sensors, axes, _channels(streams, placed), tuple(notes))
+
+
+def _named(read: Sequence[tuple[Path, list[Stream]]]) -> list[Stream]:
+    """Streams of all files, with the file's stem in front of names that appear in several."""
+    names = Counter(stream.name for _, streams in read for stream in streams)
+    stems = Counter(path.stem for path, _ in read)
+    named = []
+    for position, (path, streams) in enumerate(read, 1):
+        stem = path.stem if stems[path.stem] == 1 else f"{path.stem}#{position}"
+        for stream in streams:
+            if names[stream.name] == 1:
+                named.append(stream)
+            else:
+                named.append(replace(stream, name=stem if len(streams) == 1 else f"{stem}/{stream.name}"))
+    return named
+
+
+def _mount(streams: list[Stream], mounting: Mapping[str, Any] | str | Path | None, source: str) -> list[Stream]:
+    """Turn each device's axes into those of the array."""
+    if mounting is None:
+        return streams
+    if isinstance(mounting, str | Path):
+        try:
+            mounting = json.loads(Path(mounting).read_text())
+        except (OSError, ValueError) as error:
+            raise ValueError(
+                f"`mounting`: expected a JSON file of {{device: 3 x 3 matrix}}, got {mounting}: {error}"
+            ) from error
+    if not isinstance(mounting, Mapping):
+        raise ValueError(f"`mounting`: expected {{device: 3 x 3 matrix}}, got {type(mounting).__name__}")
+    unknown = sorted(set(mounting) - {stream.name for stream in streams})
+    if unknown:
+        known = ", ".join(stream.name for stream in streams)
+        raise ValueError(f"`mounting`: no device {', '.join(unknown)} in {source}; there are {known}")
+    turned = []
+    for stream in streams:
+        if stream.name not in mounting:
+            turned.append(stream)
+            continue
+        try:
+            matrix = np.asarray(mounting[stream.name], dtype=np.float64)
+        except (TypeError, ValueError):
+            matrix = np.empty(0)
+        if matrix.shape != (3, 3) or not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6):
+            raise ValueError(
+                f"`mounting`: expected an orthogonal 3 x 3 matrix for {stream.name}, got {mounting[stream.name]}"
+            )
+        if set(stream.gyro) != set(AXES):
+            raise ValueError(
+                f"`mounting`: expected axes x, y, z in {stream.name}, found {', '.join(stream.gyro) or 'none'}"
+            )
+        rates = matrix @ np.stack([stream.gyro[a] for a in AXES])
+        channels = {
+            name: matrix @ values if values.ndim == 2 and len(values) == 3 else values
+            for name, values in stream.channels.items()
+        }
+        turned.append(replace(stream, gyro=dict(zip(AXES, rates, strict=True)), channels=channels))
+    return turned
+
+
+def _choose_axes(
+    streams: list[Stream], axis: str | None, source: str
+) -> tuple[list[Stream], tuple[str, ...], list[Note]]:
+    """Keep one axis, or say which axes lead the array."""
+    if axis is not None:
+        lacking = [stream for stream in streams if axis not in stream.gyro]
+        if lacking:
+            found = ", ".join(name for name in lacking[0].gyro if name) or "axes without names"
+            raise RecordingError(
+                f"{source}: expected axis {axis!r} in every device, found {found} in {lacking[0].name}; "
+                "choose one of those, or none"
+            )
+        return [replace(stream, gyro={axis: stream.gyro[axis]}) for stream in streams], (), []
+    sets = {tuple(sorted(stream.gyro)) for stream in streams}
+    if len(streams) == 1 and len(streams[0].gyro) > 1:
+        names = ", ".join(streams[0].gyro)
+        sentence = (
+            f"a single device: its axes {names} are taken as the sensors of one array, which makes sense only at rest; "
+            "choose files or a key with several devices to fuse each axis"
+        )
+        return streams, (), [Note("axes", streams[0].name, sentence)]
+    if len(sets) > 1:
+        found = "; ".join(f"{stream.name}: {', '.join(stream.gyro)}" for stream in streams[:4])
+        raise RecordingError(
+            f"{source}: expected the same axes in every device, found {found}; choose one with axis= (--axis z)"
+        )
+    (axes,) = sets
+    return streams, axes if len(axes) > 1 else (), []
+
+
+def _grids(streams: Sequence[Stream], rate: float | None, source: str) -> list[Grid]:
+    """The grid of each device; devices that share a clock share one."""
+    known: dict[tuple[Any, ...], Grid] = {}
+    grids = []
+    for stream in streams:
+        stated = rate if rate is not None else stream.rate
+        if stream.n_samples < 2:
+            raise RecordingError(f"{source}: expected at least 2 samples of {stream.name}, found {stream.n_samples}")
+        if stream.time is None and stated is None:
+            raise RecordingError(
+                f"{source}: expected timestamps or a sampling rate, found neither; give the rate with rate= (--rate HZ)"
+            )
+        if stream.time is None:
+            if not stated > 0:
+                raise RecordingError(
+                    f"{source}: expected a sampling rate above 0, found {stated!r}; give it with rate= (--rate HZ)"
+                )
+            identity: tuple[Any, ...] = (stream.n_samples, stated)
+            if identity not in known:
+                known[identity] = regular_grid(stream.n_samples, stated)
+        else:
+            identity = (id(stream.time), stream.time.size)
+            if identity not in known:
+                known[identity] = grid_of(
+                    stream.time, name=stream.name, source=source, clock_period=stream.clock_period, rate=rate
+                )
+        grids.append(known[identity])
+    return grids
+
+
+def _units(
+    streams: Sequence[Stream], unit: str | None, scale: float | None, source: str
+) -> tuple[str, list[float], list[Note]]:
+    """The common unit, the factor that brings each device to it, and what was assumed."""
+    if scale is not None:
+        name = unit or _UNKNOWN
+        return name, [scale] * len(streams), [Note("unit", "", f"numbers of the log times {scale:g} are {name}")]
+    stated = [stream.unit for stream in streams]
+    target = unit or next((u for u in stated if u != _UNKNOWN), _UNKNOWN)
+    factors, notes = [], []
+    for stream in streams:
+        if stream.unit in (_UNKNOWN, target):
+            factors.append(1.0)
+            if stream.unit != target:
+                notes.append(Note("unit", stream.name, f"the log states no unit; its numbers are taken as {target}"))
+            continue
+        try:
+            factors.append(rate_unit_factor(stream.unit, target))
+        except ValueError as error:
+            raise RecordingError(
+                f"{source}: expected one unit, found {stream.unit} in {stream.name}, which does not convert to {target}; "
+                "give the factor with scale= (--scale) and the unit with unit= (--unit)"
+            ) from error
+        notes.append(Note("unit", stream.name, f"converted from {stream.unit} to {target}"))
+    return target, factors, notes
+
+
+def _clean(stream: Stream, axis: str, place: Placed, factor: float, notes: list[Note]) -> Array:
+    """One gyro on the common grid in the common unit, non-finite samples as NaN."""
+    values = np.asarray(stream.gyro[axis], dtype=np.float64)
+    label = stream.name if len(stream.gyro) == 1 else f"{stream.name} {axis}"
+    missing = int((~np.isfinite(values)).sum())
+    if missing or _starts_from_zero(stream):
+        values = np.where(np.isfinite(values), values, np.nan)
+    if missing:
+        notes.append(
+            Note("non_finite", label, f"{missing} samples are not finite; they are NaN", {"samples": float(missing)})
+        )
+    if _starts_from_zero(stream):
+        values[0] = np.nan
+        notes.append(Note("startup", label, "the first sample is zero on every axis, as devices start up; it is NaN"))
+    placed = place.spread(values)
+    return placed * factor if factor != 1.0 else placed
+
+
+def _starts_from_zero(stream: Stream) -> bool:
+    """Whether a device that has measured something else reports a first row of zeros."""
+    rows = [values[:2] for values in stream.gyro.values()]
+    if "acceleration" in stream.channels:
+        rows += list(stream.channels["acceleration"][:, :2])
+    return len(rows) > 1 and all(row[0] == 0 for row in rows) and all(row[1] != 0 for row in rows)
+
+
+def _channels(streams: Sequence[Stream], placed: Sequence[Placed]) -> dict[str, Array]:
+    """Auxiliary channels on the common grid; of one device among several with its name."""
+    carriers = Counter(name for stream in streams for name in stream.channels)
+    return {
+        name if carriers[name] == 1 else f"{name}[{stream.name}]": place.spread(np.asarray(values, dtype=np.float64))
+        for stream, place in zip(streams, placed, strict=True)
+        for name, values in stream.channels.items()
+    }
