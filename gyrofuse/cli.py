@@ -19,6 +19,7 @@ import numpy as np
 import torch
 import typer
 
+from gyrofuse._checks import check_positive, check_positive_integer
 from gyrofuse._console import Commands, progress, say, say_table, warn
 from gyrofuse._output import Outputs, output_folder
 from gyrofuse.demo import FILES, run_demo
@@ -205,37 +206,39 @@ def simulate(
     rate: Annotated[float, typer.Option(metavar="HZ", help="Sampling rate.")],
     out: Annotated[Path, typer.Option(metavar="FILE", help="Where the recording goes, .npz or .csv.")],
     sensors: Annotated[
-        int | None, typer.Option(metavar="N", help="Independent sensors, for a model of one sensor.")
+        int | None,
+        typer.Option(metavar="N", help="How many independent sensors; 1 by default, unless MODEL is an array."),
     ] = None,
     unit: Annotated[str, typer.Option(metavar="UNIT", help="Unit of the rates.")] = "deg/s",
-    seed: Annotated[int | None, typer.Option(metavar="S", help="The same seed gives the same recording.")] = None,
+    seed: Annotated[
+        int | None, typer.Option(metavar="S", min=0, max=2**63 - 1, help="The same seed gives the same recording.")
+    ] = None,
     json_file: Json = None,
     report: Report = None,
     force: Force = False,
 ) -> None:
     """Simulate a recording from a noise model."""
+    check_positive("--rate", rate)
+    check_positive_integer("--samples", samples)
+    check_positive_integer("--sensors", 1 if sensors is None else sensors)
     source = [Path(model)] if model.lower().endswith(".json") else []
     with _outputs(force, source, out=out, json=json_file, report=report) as drafts:
         noise = _read_model(source[0]) if source else parse_model(model)
         generator = torch.Generator()
         seed = generator.seed() if seed is None else seed
         generator.manual_seed(seed)
+        if isinstance(noise, ArrayModel) and sensors is not None:
+            raise ValueError(f"`--sensors`: {model} is a model of {noise.n_sensors} sensors; leave the option out")
+        batch = () if isinstance(noise, ArrayModel) else (1 if sensors is None else sensors,)
         with progress("simulating"):
-            if isinstance(noise, ArrayModel):
-                if sensors is not None:
-                    raise ValueError(
-                        f"`--sensors`: {model} is a model of an array of {noise.n_sensors}; leave the option out"
-                    )
-                signal = noise.simulate(samples, generator=generator)
-            else:
-                signal = noise.simulate(samples, batch=(1 if sensors is None else sensors,), generator=generator)
+            signal = noise.simulate(samples, batch=batch, generator=generator).flatten(0, -2)
         recording = Recording(signal, rate=rate, unit=unit)
         _save(recording, drafts[out])
         if json_file:
             settings = {"model": noise.to_dict(), "n_samples": samples, "rate": rate, "unit": unit, "seed": seed}
             _write_json(drafts[json_file], settings)
         if report:
-            page = recording_report(recording, title=f"A simulated recording of {_titled(source or [Path(model)])}")
+            page = recording_report(recording, title=f"A simulated recording of {model}")
             drafts[report].write_text(page, encoding="utf-8")
     say(f"{noise}\n{signal.shape[0]} x {samples} samples at {rate:g} Hz, seed {seed}, in {out}")
 
@@ -247,7 +250,10 @@ def demo(
     report: Report = None,
     force: Annotated[bool, typer.Option("--force", help="Replace files and an earlier demonstration.")] = False,
 ) -> None:
-    """Tell the whole story on a simulated array: no file, no network, and the truth is known."""
+    """Watch it work on a simulated array.
+
+    Needs no file and no network. The truth is known, and what is found is held against it.
+    """
     with (
         _outputs(force, json=json_file, report=report) as drafts,
         output_folder(out, own=FILES, force=force) as folder,
@@ -323,9 +329,8 @@ def _outputs(force: bool, inputs: Sequence[Path] = (), **asked: Path | None) -> 
 def _save(recording: Recording, path: Path, **arrays: np.ndarray[Any, Any]) -> None:
     """Save a recording as .csv, or as .npz with further arrays."""
     if path.suffix == ".csv":
-        names = [
-            f"{sensor}_gyro_{axis}".rstrip("_") for axis in recording.axes or ("",) for sensor in recording.sensors
-        ]
+        ends = [f"_{axis}" for axis in recording.axes] or [""]
+        names = [f"{sensor}_gyro{end}" for end in ends for sensor in recording.sensors]
         columns = torch.cat([recording.time[None], recording.signal.flatten(0, -2)]).T
         unit = f" [{recording.unit}]" if recording.unit != "unknown" else ""
         header = ",".join(["time [s]", *(name + unit for name in names)])
@@ -357,8 +362,7 @@ def _say_recording(recording: Recording) -> None:
         ("duration", f"{number(recording.duration, 6)} s"),
     ]
     say_table((), facts)
-    head = ("sensor", "axis", "missing", "mean", "standard deviation")
-    rows = [
+    sensors = [
         (
             row["name"],
             row["axis"] or "-",
@@ -368,10 +372,10 @@ def _say_recording(recording: Recording) -> None:
         )
         for row in sensor_rows(recording)
     ]
-    say_table(head, rows, right=(2, 3, 4))
+    say_table(("sensor", "axis", "missing", "mean", "standard deviation"), sensors, right=(2, 3, 4))
     if recording.channels:
-        rows = [(name, " x ".join(map(str, values.shape))) for name, values in recording.channels.items()]
-        say_table(("channel", "shape"), rows)
+        channels = [(name, " x ".join(map(str, values.shape))) for name, values in recording.channels.items()]
+        say_table(("channel", "shape"), channels)
     _say_notes(recording)
 
 

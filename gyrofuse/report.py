@@ -265,8 +265,8 @@ def _where(result: SVOResult, difference: Tensor) -> str:
 
 
 def _percent(fraction: float) -> str:
-    percent = 100 * fraction
-    return f"{percent:.0f}\N{NO-BREAK SPACE}%" if percent >= 10 else f"{percent:.1f}\N{NO-BREAK SPACE}%"
+    percent = round(100 * fraction, 1)
+    return f"{percent:.{0 if percent >= 10 else 1}f}\N{NO-BREAK SPACE}%"
 
 
 def _time(result: SVOResult, level: int) -> str:

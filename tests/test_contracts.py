@@ -95,9 +95,7 @@ MEMBERS = [
     Member("HaarFilterBank", lambda: HaarFilterBank(LEVELS), differentiable=True, module=True, onnx=True),
     Member("wavelet_cross_covariance", lambda: lambda x: wavelet_cross_covariance(x, LEVELS), differentiable=True),
     Member("wavelet_variance", lambda: lambda x: wavelet_variance(x, LEVELS), differentiable=True),
-    Member(
-        "cross_covariance", lambda: lambda x: cross_covariance(haar_coefficients(x, LEVELS)), differentiable=True
-    ),
+    Member("cross_covariance", lambda: lambda x: cross_covariance(haar_coefficients(x, LEVELS)), differentiable=True),
     Member("CrossCovariance", moments, differentiable=True, module=True, onnx=True),
     Member("svo_weights", lambda: weights_of, differentiable=True, tolerance=1e-9),
     Member("SVOWeights", chain, differentiable=True, module=True, tolerance=1e-9),

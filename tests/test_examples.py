@@ -45,4 +45,6 @@ def test_stream(tmp_path: Path, chunk: int):
     np.save(tmp_path / "log.npy", signal.numpy())
     run("stream.py", "log.npy", "--levels", 10, "--chunk", chunk, "--out", "virtual.npy", cwd=tmp_path)
     weights = gf.svo_weights(gf.wavelet_cross_covariance(signal, 10), "long")
-    np.testing.assert_allclose(np.load(tmp_path / "virtual.npy"), weights.numpy() @ signal.numpy(), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(
+        np.load(tmp_path / "virtual.npy"), weights.numpy() @ signal.numpy(), rtol=1e-9, atol=1e-9
+    )

@@ -78,7 +78,7 @@ def test_allan_deviation_takes_tensors_and_needs_sensors_only():
     plotting.plot_allan_deviation(torch.tensor(TAU), nu, names=["a", "b"], in_seconds=False, ax=ax)
     np.testing.assert_allclose(np.stack(drawn(ax), -1), np.sqrt(2 * variances(2)))
     assert ax.get_xlabel() == "averaging time (samples)"
-    assert ax.get_ylabel() == "Allan deviation (signal unit)"
+    assert ax.get_ylabel() == "Allan deviation"
     assert legend_of(ax) == ["2 sensors"]
 
 

@@ -210,8 +210,8 @@ def _units(
             factors.append(rate_unit_factor(stream.unit, target))
         except ValueError as error:
             raise RecordingError(
-                f"{source}: expected one unit, found {stream.unit} in {stream.name}, which does not convert to {target}; "
-                "give the factor with scale= (--scale) and the unit with unit= (--unit)"
+                f"{source}: expected one unit, found {stream.unit} in {stream.name}, which does not convert to {target};"
+                " give the factor with scale= (--scale) and the unit with unit= (--unit)"
             ) from error
         notes.append(Note("unit", stream.name, f"converted from {stream.unit} to {target}"))
     return target, factors, notes

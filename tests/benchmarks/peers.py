@@ -52,7 +52,10 @@ def blocked_numpy_wccv(signal: np.ndarray, n_levels: int, block: int = 8192) -> 
         lag = 2**level
         longer = np.empty((n_sensors, v.shape[1] - lag))
         for start in range(0, v.shape[1] - lag, block):
-            now, past = v[:, lag + start : lag + start + block], v[:, start : start + block][:, : longer.shape[1] - start]
+            now, past = (
+                v[:, lag + start : lag + start + block],
+                v[:, start : start + block][:, : longer.shape[1] - start],
+            )
             w = now - past
             w *= 0.5
             np.add(now, past, out=longer[:, start : start + block])

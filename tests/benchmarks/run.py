@@ -69,7 +69,11 @@ def wccv_table(quick: bool) -> list[list[str]]:
     for name, call in other.items():
         rows.append([name, side_by_side(1, call=call)["call"]])
     return [
-        [f"WCCV 12 x {n_samples:,}, {n_levels} levels: {name}", f"{seconds:.3f} s", f"{seconds / times['gyrofuse']:.2f}"]
+        [
+            f"WCCV 12 x {n_samples:,}, {n_levels} levels: {name}",
+            f"{seconds:.3f} s",
+            f"{seconds / times['gyrofuse']:.2f}",
+        ]
         for name, seconds in rows
     ]
 
@@ -104,7 +108,9 @@ def scaling_table(quick: bool) -> list[list[str]]:
         for size in sizes:
             case = base | {name: size}
             signal = array(case["n_sensors"], case["n_samples"])
-            seconds = side_by_side(1 if quick else 3, call=lambda s=signal, c=case: gf.wavelet_cross_covariance(s, c["n_levels"]))
+            seconds = side_by_side(
+                1 if quick else 3, call=lambda s=signal, c=case: gf.wavelet_cross_covariance(s, c["n_levels"])
+            )
             work = case["n_samples"] * case["n_sensors"] * case["n_levels"]
             rows.append(
                 [

@@ -1,0 +1,93 @@
+"""Wavelet moments for arrays of inertial sensors in PyTorch.
+
+Names, dimensions and units, the same everywhere; `...` are batch dimensions:
+
+| name | dimensions | unit |
+|---|---|---|
+| `signal` | `(..., sensor, time)` | any rate unit, kept throughout; `Recording.unit` names it |
+| `rate` | scalar | Hz |
+| coefficients | list over level of `(..., sensor, time_j)`, `time_j = T - 2**j + 1` | as signal |
+| `wavelet_cross_covariance` (WCCV) | `(..., level, sensor, sensor)` | signal^2 |
+| `wavelet_variance` (WV) | `(..., level, sensor)` | signal^2 |
+| `scale_weights` | `(level,)`, >= 0, sum 1 | - |
+| `weights` | `(..., sensor)`, sum 1, may be negative | - |
+| virtual signal | `(..., time)` | as signal |
+
+Levels are `j = 1..J` with filters of length `2**j`; NaN is a missing sample. Formulas are numbered as in
+
+- [Z] Zhang, Cucci, Molinari, Guerrier, Scale-wise Variance Minimization for Optimal Virtual Signals: An Approach for
+  Redundant Gyroscopes, IEEE Transactions on Signal Processing 70, 2022.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from gyrofuse._linalg import SingularCovarianceError
+from gyrofuse._result import ConfidenceInterval
+from gyrofuse.competitors import equal_weights, inverse_variance_weights
+from gyrofuse.covariance import CrossCovariance, cross_covariance, wavelet_cross_covariance, wavelet_variance
+from gyrofuse.datasheet import Datasheet, datasheet
+from gyrofuse.haar import HaarFilterBank, haar_coefficients
+from gyrofuse.io.stream import RecordingError
+from gyrofuse.parsing import model_from_dict, parse_model
+from gyrofuse.processes import AR1, Drift, Model, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
+from gyrofuse.recording import Recording, read_recording
+from gyrofuse.scale_weights import resolve_scale_weights
+from gyrofuse.simulate import ArrayModel
+from gyrofuse.svo import SVO, SVOWeights, fit_svo, svo_weights
+from gyrofuse.svo_result import SVOResult
+
+if TYPE_CHECKING:
+    from gyrofuse.metric import WaveletCrossCovariance
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "AR1",
+    "SVO",
+    "ArrayModel",
+    "ConfidenceInterval",
+    "CrossCovariance",
+    "Datasheet",
+    "Drift",
+    "HaarFilterBank",
+    "Model",
+    "QuantizationNoise",
+    "RandomWalk",
+    "Recording",
+    "RecordingError",
+    "SVOResult",
+    "SVOWeights",
+    "SingularCovarianceError",
+    "Sinusoid",
+    "WaveletCrossCovariance",
+    "WhiteNoise",
+    "cross_covariance",
+    "datasheet",
+    "equal_weights",
+    "fit_svo",
+    "haar_coefficients",
+    "inverse_variance_weights",
+    "model_from_dict",
+    "parse_model",
+    "read_recording",
+    "resolve_scale_weights",
+    "svo_weights",
+    "wavelet_cross_covariance",
+    "wavelet_variance",
+]
+
+# Names whose modules load more than torch and numpy.
+_LAZY = {"WaveletCrossCovariance": "gyrofuse.metric"}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _LAZY:
+        value = getattr(import_module(_LAZY[name]), name)
+        globals()[name] = value
+        return value
+    raise AttributeError(f"module 'gyrofuse' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,0 +1,315 @@
+"""Reports: verdicts against numbers worked out by hand, and pages that hold together and let nothing in."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+import time
+from html.parser import HTMLParser
+
+import matplotlib
+import pytest
+import torch
+from matplotlib import pyplot as plt
+
+from gyrofuse import Recording, SVOResult, fit_svo
+from gyrofuse.io.notes import Note
+from gyrofuse.report import (
+    fusion_figure,
+    fusion_report,
+    new_figure,
+    number,
+    recording_report,
+    save_figure,
+    sensor_rows,
+    verdict,
+)
+
+SCRIPT, BOLD = '"><script>alert(1)</script>', "<b>x</b>.csv"
+
+
+class Page(HTMLParser):
+    """Elements, attributes and text of a page."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.links: list[str] = []
+        self.rows: list[list[str]] = []
+        self.text = ""
+        self.feed(html)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.links += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "action", "data")]
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th"):
+            self.rows[-1].append("")
+
+    def handle_endtag(self, tag: str) -> None:
+        self.tags.append(f"/{tag}")
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+        inside = [tag for tag in self.tags if tag in ("td", "th", "/td", "/th")]
+        if inside and not inside[-1].startswith("/"):
+            self.rows[-1][-1] += data
+
+
+def made_up(ratios: list[float], best: float = 0.9) -> SVOResult:
+    """A result whose Allan deviation is `ratios` times that of the plain mean, and sensor 2 is `best` times the virtual.
+
+    With weights (1, 0, 0), `nu_1 = 1` and independent sensors, the mean has `(1 + best^2 + nu_3) / 9 = 1 / ratio^2`.
+    """
+    third = [9 / r**2 - 1 - best**2 for r in ratios]
+    wccv = torch.stack([torch.tensor([1.0, best**2, v], dtype=torch.float64).diag() for v in third])
+    n_levels = len(ratios)
+    return SVOResult(
+        weights=torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64),
+        weights_cov=torch.diag(torch.tensor([1e-4, 1e-4, 1e-4], dtype=torch.float64)),
+        confidence_level=0.95,
+        wavelet_cross_covariance=wccv,
+        scale_weights=torch.full((n_levels,), 1 / n_levels, dtype=torch.float64),
+        degrees_of_freedom=torch.full((n_levels,), 100.0, dtype=torch.float64),
+        method="svo",
+        n_samples=1000,
+        sensors=("a", "b", "c"),
+        rate=100.0,
+        unit="deg/s",
+    )
+
+
+def noise(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def plain(sentences: list[str]) -> list[str]:
+    return [sentence.replace("\N{NO-BREAK SPACE}", " ") for sentence in sentences]
+
+
+@pytest.fixture(autouse=True)
+def _leaves_matplotlib_alone():
+    settings, open_figures = dict(matplotlib.rcParams), plt.get_fignums()
+    yield
+    assert dict(matplotlib.rcParams) == settings
+    assert plt.get_fignums() == open_figures
+
+
+def test_verdict_says_where_the_virtual_gyro_wins_and_where_it_loses():
+    carried, uncertain, against_mean, against_best = plain(verdict(made_up([0.5, 0.8, 1.2, 1.001, 0.7], best=2.0)))
+    assert carried == "Sensors that carry the virtual gyro, with weights whose 95 % intervals exclude 0: a (1.000)."
+    assert uncertain == "Sensors whose weights cannot be told from 0: b (0.000) and c (0.000)."
+    assert against_mean == (
+        "The Allan deviation of the virtual gyro is lower than that of the plain mean at averaging times of "
+        "0.01 to 0.02 s and 0.16 s, by up to 50 % (at 0.01 s). It is higher at 0.04 s, by 20 %."
+    )
+    assert (
+        against_best
+        == "The Allan deviation of the virtual gyro is that of the best single sensor within 0.5 % at every averaging time."
+    )
+
+
+def test_verdict_where_there_is_one_side_only():
+    *_, against_mean, against_best = plain(verdict(made_up([0.9, 0.96], best=0.8)))
+    assert against_mean.endswith(
+        "at averaging times of 0.01 to 0.02 s, by up to 10 % (at 0.01 s). It is nowhere higher."
+    )
+    assert against_best == (
+        "The Allan deviation of the virtual gyro is nowhere lower than that of the best single sensor; it is higher "
+        "at averaging times of 0.01 to 0.02 s, by up to 25 % (at 0.01 s)."
+    )
+
+
+def test_verdict_orders_carriers_by_size_and_explains_negative_weights():
+    result = dataclasses.replace(
+        made_up([0.9]),
+        weights=torch.tensor([0.3, -0.1, 0.8], dtype=torch.float64),
+        weights_cov=torch.diag(torch.tensor([1e-4, 1e-4, 1e-4], dtype=torch.float64)),
+    )
+    carried, negative, *_ = verdict(result)
+    assert carried.endswith(": c (0.800), a (0.300) and b (-0.100).")
+    assert negative.startswith("A negative weight subtracts")
+
+
+def test_verdict_without_any_certain_weight():
+    unsure = dataclasses.replace(made_up([0.9]), weights_cov=torch.eye(3, dtype=torch.float64), confidence_level=0.9)
+    assert verdict(unsure)[0] == "No sensor stands out: the 90 % interval of every weight holds 0."
+    unknown = dataclasses.replace(made_up([0.9]), weights_cov=torch.full((3, 3), math.nan, dtype=torch.float64))
+    assert verdict(unknown)[0].startswith("The largest weights are those of a (1.000)")
+
+
+def test_verdict_of_the_plain_mean():
+    result = fit_svo(noise(3, 1000), method="equal")
+    sentences = verdict(result)
+    assert sentences[0] == "Every sensor has the weight 1/3: this is the plain mean."
+    assert not any("than that of the plain mean" in sentence for sentence in sentences)
+
+
+def test_verdict_warns_where_observations_are_fewer_than_sensors():
+    result = made_up([0.9, 0.9, 0.9])
+    assert not any("fewer independent" in sentence for sentence in verdict(result))
+    few = dataclasses.replace(result, degrees_of_freedom=torch.tensor([30.0, 2.5, 1.2], dtype=torch.float64))
+    (warning,) = (sentence for sentence in verdict(few) if "fewer independent" in sentence)
+    assert warning.startswith("From 0.02 s on, the recording holds fewer independent observations (2.5 or less)")
+    unweighted = dataclasses.replace(few, scale_weights=torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64))
+    assert not any("fewer independent" in sentence for sentence in verdict(unweighted))
+
+
+def test_verdict_names_a_few_of_many_sensors():
+    sentences = verdict(fit_svo(noise(20, 4000), "flat"))
+    assert sentences[0].count("(") == 8
+    assert sentences[0].endswith("and 12 more.")
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "text"),
+    [
+        (None, 4, "-"),
+        (math.nan, 4, "-"),
+        (math.inf, 4, "-"),
+        (0.0, 4, "0"),
+        (26214.4, 4, "26210"),
+        (26214.4, 6, "26214.4"),
+        (0.1, 4, "0.1"),
+        (-0.0123456, 3, "-0.0123"),
+        (1.23456e-5, 4, "1.235e-05"),
+        (123456789.0, 4, "1.235e+08"),
+    ],
+)
+def test_numbers(value: float | None, digits: int, text: str):
+    assert number(value, digits) == text
+
+
+def test_page_holds_everything_and_needs_nothing():
+    recording = Recording(
+        noise(3, 5000),
+        rate=100.0,
+        unit="deg/s",
+        source=("log.csv",),
+        notes=(Note("gaps", "imu2", "3 gaps were found"),),
+    )
+    result = fit_svo(recording, "long")
+    html = fusion_report(result, recording, result.virtual(recording), title="The array", remarks=["A remark."])
+    page = Page(html)
+    assert html.startswith("<!DOCTYPE html>")
+    assert page.tags.count("img") == 2
+    assert all(link.startswith("data:image/svg+xml;base64,") for link in page.links)
+    assert "http" not in re.sub(r'src="data:[^"]*"', "", html)
+    assert not {"script", "link", "iframe", "object"} & {*page.tags}
+    for sentence in verdict(result):
+        assert html.index("Verdict") < html.index(sentence) < html.index("<figure>")
+    for text in ("The array", "A remark.", "log.csv", "3 gaps were found", "imu2", "5000 samples at 100 Hz"):
+        assert text in page.text
+    low, high = result.confidence_interval
+    for i, name in enumerate(result.sensors):
+        limits = [f"{value:+.4f}" for value in (result.weights[i], low[i], high[i])]
+        assert any(row[:4] == [name, *limits] for row in page.rows)
+    levels = [row for row in page.rows if len(row) == 10][1:]
+    assert len(levels) == result.n_levels
+    for j, row in enumerate(levels):
+        assert float(row[0]) == pytest.approx(0.01 * 2**j)
+        assert float(row[5]) == pytest.approx((2 * result.virtual_wavelet_variance[j]).sqrt().item(), rel=1e-3)
+        assert row[3] == result.sensors[result.wavelet_variance[j].argmin()]
+
+
+def test_every_axis_has_its_section():
+    recording = Recording(noise(3, 4, 3000), rate=50.0, axes=("x", "y", "z"))
+    result = fit_svo(recording)
+    html = fusion_report(result, recording, result.virtual(recording), title="Three axes")
+    assert Page(html).tags.count("img") == 6
+    assert [html.count(f"<h2>Axis {axis}</h2>") for axis in "xyz"] == [1, 1, 1]
+    assert [html.count(f"<h3>{axis}</h3>") for axis in "xyz"] == [1, 1, 1]
+    for i in range(3):
+        assert all(sentence in html for sentence in verdict(result[i]))
+    assert "unknown" not in html  # a unit that the log does not state is left out
+
+
+def test_markup_stays_text():
+    recording = Recording(
+        noise(2, 1000),
+        rate=50.0,
+        unit="<i>u</i>",
+        sensors=(SCRIPT, "{{ 7 * 7 }}"),
+        source=(BOLD,),
+        notes=(Note(SCRIPT, BOLD, BOLD),),
+    )
+    result = fit_svo(recording)
+    fused = fusion_report(result, recording, result.virtual(recording), title=SCRIPT, remarks=[SCRIPT])
+    for html in (fused, recording_report(recording, title=SCRIPT)):
+        page = Page(html)
+        assert not {"script", "b", "i"} & {*page.tags}
+        for text in (SCRIPT, BOLD, "{{ 7 * 7 }}", "<i>u</i>"):
+            assert text in page.text
+
+
+def test_missing_numbers_are_dashes():
+    result = fit_svo(noise(3, 1000), covariance="none")
+    page = Page(fusion_report(result, title="No intervals"))
+    assert "nan" not in page.text.lower()
+    for i, name in enumerate(result.sensors):
+        assert [name, f"{result.weights[i]:+.4f}", "-", "-", ""] in page.rows
+    assert "at 100 Hz" not in page.text
+    assert any(row[0] == "averaging time (samples)" for row in page.rows)
+
+
+def test_the_same_result_gives_the_same_page():
+    result = fit_svo(noise(3, 1000))
+    assert fusion_report(result, title="Twice") == fusion_report(result, title="Twice")
+
+
+def test_long_recordings_make_small_pages_quickly():
+    recording = Recording(noise(2, 1_000_000), rate=200.0)
+    result = fit_svo(recording)
+    start = time.perf_counter()
+    html = fusion_report(result, recording, result.virtual(recording), title="Long")
+    assert time.perf_counter() - start < 20
+    assert len(html) < 600_000
+
+
+def test_report_of_a_recording():
+    signal = noise(2, 3, 2000) + 5.0
+    signal[1, 2, :500] = math.nan
+    recording = Recording(signal, rate=100.0, unit="rad/s", axes=("x", "z"), source=("a.csv", "b.csv"))
+    html = recording_report(recording, title="What is in it")
+    page = Page(html)
+    assert page.tags.count("img") == 4
+    assert "a.csv, b.csv" in page.text
+    assert [
+        "3",
+        "z",
+        "25 %",
+        number(signal[1, 2].nanmean().item()),
+        number(signal[1, 2, 500:].std(correction=0).item()),
+    ] in page.rows
+    rows = sensor_rows(recording)
+    assert [(row["axis"], row["name"]) for row in rows] == [(a, s) for a in "xz" for s in "123"]
+    assert rows[-1]["missing"] == 0.25
+
+
+def test_figure_of_several_axes_and_formats(tmp_path):
+    result = fit_svo(Recording(noise(2, 3, 1000), rate=10.0, axes=("x", "y")))
+    figure = fusion_figure(result)
+    assert [part.get_suptitle() for part in figure.subfigs] == ["x", "y"]
+    for suffix, start in (("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")):
+        first, second = tmp_path / f"1.{suffix}", tmp_path / f"2.{suffix}"
+        for path in (first, second):
+            save_figure(fusion_figure(result), path, suffix)
+        assert first.read_bytes().startswith(start)
+        assert first.read_bytes() == second.read_bytes()
+
+
+def test_names_that_the_font_lacks_are_drawn_without_a_warning(tmp_path, recwarn):
+    figure = new_figure(3, 2)
+    figure.text(0.1, 0.5, "\u9640\u87ba")
+    save_figure(figure, tmp_path / "figure.png", "png")
+    assert not recwarn.list
+
+
+def test_more_than_one_batch_dimension_is_refused():
+    result = fit_svo(noise(2, 2, 3, 500))
+    with pytest.raises(ValueError, match=r"`result`: expected one array, or one per axis, got batch shape \(2, 2\)"):
+        fusion_report(result, title="Too many")
+    with pytest.raises(ValueError, match="`result`"):
+        fusion_figure(result)
