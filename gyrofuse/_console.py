@@ -75,7 +75,7 @@ def warn(text: str) -> None:
     _complain("warning", text)
 
 
-def _show_warning(message: Warning | str, *_: Any) -> None:
+def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
     warn(str(message))
 
 

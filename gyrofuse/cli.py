@@ -225,7 +225,7 @@ def simulate(
     with _outputs(force, source, out=out, json=json_file, report=report) as drafts:
         noise = _read_model(source[0]) if source else parse_model(model)
         generator = torch.Generator()
-        seed = generator.seed() if seed is None else seed
+        seed = generator.seed() % 2**32 if seed is None else seed
         generator.manual_seed(seed)
         if isinstance(noise, ArrayModel) and sensors is not None:
             raise ValueError(f"`--sensors`: {model} is a model of {noise.n_sensors} sensors; leave the option out")

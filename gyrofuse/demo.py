@@ -115,7 +115,7 @@ def _remarks(long: SVOResult, truth: Tensor) -> list[str]:
         f"The array is simulated: six gyros at {RATE:g} Hz for {number(hours, 3)} h ({long.n_samples} samples each) "
         "with white noise and three drifts that correlate between the sensors, as in Case 2 of Zhang, Cucci, Molinari "
         "and Guerrier (2022), section V-B. The fit is told nothing about the noise.",
-        f"The truth is therefore known. The best weights for long averaging times are "
+        f"The truth is known here: the best weights for long averaging times are "
         f"{', '.join(f'{weight:.3f}' for weight in best.tolist())}; the intervals hold {held} of {len(best)}. "
         f"With the true noise in place of this recording, the fitted weights make the Allan deviation at "
         f"{number(long.tau[-1].item())} s {fitted:.0f} % lower than that of the plain mean; the best possible is "
@@ -147,8 +147,8 @@ def _story(long: SVOResult, short: SVOResult, truth: Tensor, remarks: list[str])
     paragraphs = [
         fill(about, 110),
         "Weights for long averaging times:\n" + "\n".join(weights),
-        f"Allan deviation ({UNIT}) in this recording; long over mean in this recording, for the same weights and the "
-        "true noise,\nand for the best weights and the true noise:\n" + "\n".join(levels),
+        f"Allan deviation ({UNIT}) in this recording; then long over mean: in this recording, with the same weights\n"
+        "and the true noise (in truth), with the best weights and the true noise (possible):\n" + "\n".join(levels),
         "\n".join(fill(f"- {sentence}", 110, subsequent_indent="  ") for sentence in verdict(long)),
         fill(against_truth, 110),
     ]

@@ -139,7 +139,7 @@ def fusion_figure(result: SVOResult) -> Figure:
 
 
 def save_figure(figure: Figure, file: Path | IO[bytes], file_format: str, **options: Any) -> None:
-    """Save a figure; the same figure gives the same bytes.
+    """Save a figure.
 
     Args:
         figure: The figure.
@@ -147,13 +147,10 @@ def save_figure(figure: Figure, file: Path | IO[bytes], file_format: str, **opti
         file_format: `"png"`, `"svg"` or `"pdf"`.
         **options: As for `Figure.savefig`.
     """
-    from matplotlib import rc_context
-
-    dated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
-    with rc_context({"svg.hashsalt": "gyrofuse"}), warnings.catch_warnings():
+    with warnings.catch_warnings():
         # A name in a script that the font lacks is drawn as boxes, which shows by itself.
         warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)
-        figure.savefig(file, format=file_format, metadata=dated.get(file_format), **{"dpi": 200, **options})
+        figure.savefig(file, format=file_format, **{"dpi": 200, **options})
 
 
 def verdict(result: SVOResult) -> list[str]:
@@ -342,7 +339,10 @@ def _draw_fusion(figure: Figure | SubFigure, result: SVOResult) -> None:
 
 
 def _draw_sensors(figure: Figure, signal: Tensor, recording: Recording) -> None:
-    variance = wavelet_variance(signal)
+    with warnings.catch_warnings():
+        # A level without a complete window is a gap in the sensor's line.
+        warnings.filterwarnings("ignore", "no complete window", UserWarning)
+        variance = wavelet_variance(signal)
     tau = torch.exp2(torch.arange(len(variance))) / recording.rate
     plotting.plot_allan_deviation(tau, variance, names=recording.sensors, unit=recording.unit, ax=figure.subplots())
 

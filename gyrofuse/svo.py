@@ -7,6 +7,7 @@ The weights minimise the wavelet variance of the virtual signal, summed over lev
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -93,26 +94,71 @@ def fit_svo(
         >>> virtual = result.virtual(signal)  # (..., time)
     """
     recording = signal if isinstance(signal, Recording) else None
-    if recording is not None:
-        signal = recording.signal
-    check_signal("signal", signal)
-    sensors = recording.sensors if recording is not None else numbered(signal.shape[-2])
+    values = signal.signal if isinstance(signal, Recording) else signal
+    check_signal("signal", values)
+    sensors = recording.sensors if recording else numbered(values.shape[-2])
     _check_choice("method", method, METHODS)
     _check_choice("covariance", covariance, COVARIANCES)
     check_confidence_level(confidence_level)
-    if signal.shape[-2] < 2:
+    _check_array(values, sensors)
+    if n_levels is None and not isinstance(scale_weights, str):
+        n_levels = len(normalised(scale_weights))
+    wccv, n_products = _measure(values, n_levels)
+    omega = resolve_scale_weights(scale_weights, wccv.shape[-3]).to(wccv)
+    degrees = uncertainty.degrees_of_freedom(n_products)
+    # A level that does not count may well be unknown.
+    counting = torch.where(omega[:, None, None] > 0, wccv, 0.0)
+    combined = torch.einsum("j,...jik->...ik", omega, counting)
+    check_positive_definite("the wavelet cross-covariance combined over scales", combined, sensors, dtype=values.dtype)
+
+    weights_degrees = torch.full_like(combined[..., 0], torch.inf)
+    if method == "svo":
+        weights = _optimal_weights(combined)
+        weights_cov, weights_degrees = uncertainty.svo_weights_covariance(counting, omega, weights, degrees)
+    elif method == "inverse_variance":
+        weights = inverse_variance_weights(counting, omega)
+        weights_cov = uncertainty.inverse_variance_weights_covariance(counting, omega, weights, degrees)
+    else:
+        weights, weights_cov = equal_weights(wccv), torch.zeros_like(combined)
+    if covariance == "none":
+        weights_cov = torch.full_like(combined, torch.nan)
+    return SVOResult(
+        weights=weights.to(values.dtype),
+        weights_cov=weights_cov.to(values.dtype),
+        weights_degrees=weights_degrees,
+        confidence_level=confidence_level,
+        wavelet_cross_covariance=wccv.to(values.dtype),
+        scale_weights=omega.to(values.dtype),
+        degrees_of_freedom=degrees,
+        method=method,
+        n_samples=values.shape[-1],
+        sensors=tuple(sensors),
+        axes=recording.axes if recording else (),
+        rate=recording.rate if recording else None,
+        unit=recording.unit if recording and recording.unit != "unknown" else None,
+    )
+
+
+def _check_array(values: Tensor, sensors: Sequence[str]) -> None:
+    """At least two sensors, each with a sample."""
+    if values.shape[-2] < 2:
         raise ValueError(
-            f"`signal`: expected at least 2 sensors to fuse, got {signal.shape[-2]}; give an array of gyros"
+            f"`signal`: expected at least 2 sensors to fuse, got {values.shape[-2]}; give an array of gyros"
         )
-    known = signal.isfinite().any(-1)
+    known = values.isfinite().any(-1)
     if not bool(known.all()):
-        empty = (~known).reshape(-1, signal.shape[-2]).any(0).nonzero().flatten().tolist()
+        empty = (~known).reshape(-1, values.shape[-2]).any(0).nonzero().flatten().tolist()
         raise ValueError(
             f"`signal`: sensor(s) {', '.join(sensors[i] for i in empty)} have no finite sample; leave them out"
         )
-    if n_levels is None and not isinstance(scale_weights, str):
-        n_levels = len(normalised(scale_weights))
-    sums, counts = wavelet_products(signal.detach(), check_n_levels(n_levels, signal.shape[-1]))
+
+
+def _measure(values: Tensor, n_levels: int | None) -> tuple[Tensor, Tensor]:
+    """Wavelet cross-covariance in float64 and the number of products of the pair that has fewest, `(..., level)`.
+
+    Without `n_levels`, as many levels as all pairs have a complete window for.
+    """
+    sums, counts = wavelet_products(values.detach(), check_n_levels(n_levels, values.shape[-1]))
     fewest = counts.amin((-1, -2))  # (..., level)
     if n_levels is None:
         n_levels = int((fewest > 0).reshape(-1, fewest.shape[-1]).all(0).sum())
@@ -121,39 +167,7 @@ def fit_svo(
                 "`signal`: expected two samples in a row that all sensors have, found none; "
                 "the sensors are not recorded together"
             )
-    omega = resolve_scale_weights(scale_weights, n_levels).to(sums)
-    sums, counts, fewest = sums[..., :n_levels, :, :], counts[..., :n_levels, :, :], fewest[..., :n_levels]
-    wccv = sums / counts
-    # A level that does not count may well be unknown.
-    counting = torch.where(omega[:, None, None] > 0, wccv, 0.0)
-    combined = torch.einsum("j,...jik->...ik", omega, counting)
-    check_positive_definite("the wavelet cross-covariance combined over scales", combined, sensors, dtype=signal.dtype)
-    degrees = uncertainty.degrees_of_freedom(fewest)
-    if method == "svo":
-        weights = _optimal_weights(combined)
-        weights_cov = uncertainty.svo_weights_covariance(counting, omega, weights, degrees)
-    elif method == "inverse_variance":
-        weights = inverse_variance_weights(counting, omega)
-        weights_cov = uncertainty.inverse_variance_weights_covariance(counting, omega, weights, degrees)
-    else:
-        weights = equal_weights(wccv)
-        weights_cov = torch.zeros_like(combined)
-    if covariance == "none":
-        weights_cov = torch.full_like(combined, torch.nan)
-    return SVOResult(
-        weights=weights.to(signal.dtype),
-        weights_cov=weights_cov.to(signal.dtype),
-        confidence_level=confidence_level,
-        wavelet_cross_covariance=wccv.to(signal.dtype),
-        scale_weights=omega.to(signal.dtype),
-        degrees_of_freedom=degrees,
-        method=method,
-        n_samples=signal.shape[-1],
-        sensors=tuple(sensors),
-        axes=recording.axes if recording is not None else (),
-        rate=recording.rate if recording is not None else None,
-        unit=recording.unit if recording is not None else None,
-    )
+    return (sums / counts)[..., :n_levels, :, :], fewest[..., :n_levels]
 
 
 class SVOWeights(nn.Module):

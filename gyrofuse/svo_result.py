@@ -41,6 +41,7 @@ class SVOResult:
     Attributes:
         weights: `(..., sensor)`, sum 1, may be negative.
         weights_cov: `(..., sensor, sensor)`, covariance of the estimated weights themselves; NaN when not asked for.
+        weights_degrees: `(..., sensor)`, degrees of freedom of the variance of each weight.
         confidence_level: Of the intervals.
         wavelet_cross_covariance: `(..., level, sensor, sensor)`, signal^2.
         scale_weights: `(level,)`, sum 1.
@@ -55,6 +56,7 @@ class SVOResult:
 
     weights: Tensor
     weights_cov: Tensor
+    weights_degrees: Tensor
     confidence_level: float
     wavelet_cross_covariance: Tensor
     scale_weights: Tensor
@@ -69,7 +71,7 @@ class SVOResult:
     @property
     def confidence_interval(self) -> ConfidenceInterval:
         """Limits `(..., sensor)` of the weights."""
-        return uncertainty.normal_interval(self.weights, self.weights_cov, self.confidence_level)
+        return uncertainty.weights_interval(self.weights, self.weights_cov, self.weights_degrees, self.confidence_level)
 
     @property
     def n_levels(self) -> int:
@@ -115,7 +117,7 @@ class SVOResult:
         index = item if isinstance(item, tuple) else (item,)
         if len(index) > n_batch:
             raise IndexError(f"expected at most {n_batch} indices for batch shape {tuple(self.weights.shape[:-1])}")
-        batched = ("weights", "weights_cov", "wavelet_cross_covariance", "degrees_of_freedom")
+        batched = ("weights", "weights_cov", "weights_degrees", "wavelet_cross_covariance", "degrees_of_freedom")
         return replace(self, axes=(), **{name: getattr(self, name)[index] for name in batched})
 
     def summary(self) -> str:

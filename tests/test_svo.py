@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import warnings
 
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ from gyrofuse import (
     SVO,
     CrossCovariance,
     HaarFilterBank,
+    Recording,
     SingularCovarianceError,
     SVOWeights,
     equal_weights,
@@ -36,71 +36,6 @@ def array(n_sensors: int = 4, n_samples: int = 3000, seed: int = 0) -> torch.Ten
 @pytest.fixture(scope="module")
 def wccv() -> torch.Tensor:
     return wavelet_cross_covariance(array())
-
-
-# Scale weights
-
-
-@pytest.mark.parametrize("n_levels", [1, 2, 6, 12, 19, 21])
-@pytest.mark.parametrize("name", NAMES)
-def test_named_scale_weights_sum_to_one_and_lean_their_way(name, n_levels):
-    weights = resolve_scale_weights(name, n_levels)
-    assert weights.shape == (n_levels,)
-    assert weights.dtype == torch.float64
-    torch.testing.assert_close(weights.sum().item(), 1.0, rtol=0, atol=1e-15)
-    steps = weights.diff()
-    assert {"flat": steps == 0, "short": steps < 0, "long": steps > 0}[name].all()
-
-
-@pytest.mark.parametrize("n_levels", [19, 21])
-@pytest.mark.parametrize("name", NAMES)
-def test_named_scale_weights_are_the_papers(name, n_levels):
-    np.testing.assert_allclose(resolve_scale_weights(name, n_levels), naive.scale_weights(name, n_levels), rtol=1e-13)
-
-
-@pytest.mark.parametrize(
-    "numbers", [[1, 0, 3], (1, 0, 3), np.array([1.0, 0.0, 3.0]), torch.tensor([1, 0, 3]), [0.25, 0.0, 0.75]]
-)
-def test_numbers_are_normalised(numbers):
-    assert resolve_scale_weights(numbers, 3).tolist() == [0.25, 0.0, 0.75]
-
-
-@pytest.mark.parametrize(
-    ("scale_weights", "error", "message"),
-    [
-        ("medium", ValueError, "`scale_weights`: expected 'flat', 'short', 'long' or .* per level, got 'medium'"),
-        ([1.0, 1.0], ValueError, "`scale_weights`: expected one number for each of 3 levels, got 2"),
-        (torch.ones(3, 1), ValueError, r"`scale_weights`: expected one number per level, got shape \(3, 1\)"),
-        ([1.0, -1.0, 1.0], ValueError, r"`scale_weights`: expected finite numbers >= 0, not all zero, got \[1.0, -1.0"),
-        ([0.0, 0.0, 0.0], ValueError, "`scale_weights`: expected finite numbers >= 0, not all zero"),
-        ([1.0, float("nan"), 1.0], ValueError, "`scale_weights`: expected finite numbers >= 0"),
-        ([1.0, float("inf"), 1.0], ValueError, "`scale_weights`: expected finite numbers >= 0"),
-        (None, TypeError, "`scale_weights`: expected 'flat', 'short', 'long' or one number per level, got None"),
-        (["a", "b", "c"], TypeError, r"`scale_weights`: expected 'flat', .* got \['a', 'b', 'c'\]"),
-    ],
-)
-def test_bad_scale_weights_are_named(scale_weights, error, message):
-    three_levels = wavelet_cross_covariance(array(), 3)
-    for use in (
-        lambda: resolve_scale_weights(scale_weights, 3),
-        lambda: svo_weights(three_levels, scale_weights),
-        lambda: fit_svo(array(), scale_weights, n_levels=3),
-    ):
-        with pytest.raises(error, match=message):
-            use()
-
-
-def test_a_layer_looks_at_its_numbers_once():
-    with pytest.raises(ValueError, match="`scale_weights`: expected finite numbers >= 0"):
-        SVOWeights([1.0, -1.0])
-    with pytest.raises(TypeError, match="`scale_weights`: expected 'flat', 'short', 'long' or .*, got None"):
-        SVOWeights(None)
-    with pytest.raises(ValueError, match=r"`scale_weights`: expected one number per level, got shape \(\)"):
-        SVOWeights(3)
-    with pytest.raises(ValueError, match="`scale_weights`: expected 'flat', 'short', 'long' .*, got 'medium'"):
-        SVOWeights("medium")(torch.eye(2).expand(3, 2, 2))
-    with pytest.raises(ValueError, match="`wccv`: expected 2 levels, one for each scale weight, got 3"):
-        SVOWeights([1.0, 1.0])(torch.eye(2).expand(3, 2, 2))
 
 
 # Weights
@@ -358,6 +293,25 @@ def test_a_batch_without_items():
     assert result.weights_cov.shape == (0, 3, 3)
 
 
+@pytest.mark.parametrize("axes", [(), ("x", "y", "z")])
+def test_a_recording_brings_its_names_rate_and_unit(axes):
+    signal = array().expand(*[3] * bool(axes), 4, 3000).clone()
+    names = ("front left", "front right", "rear left", "rear right")
+    recording = Recording(signal, rate=100.0, unit="deg/s", sensors=names, axes=axes)
+    svo = SVO("long")
+    result = svo.fit(recording)
+    assert torch.equal(result.weights, fit_svo(signal, "long").weights)
+    assert (result.sensors, result.axes, result.rate, result.unit) == (names, axes, 100.0, "deg/s")
+    assert result.tau[:3].tolist() == [0.01, 0.02, 0.04]
+    assert torch.equal(result.virtual(recording), result.virtual(signal))
+    text = result.summary()
+    for part in (*names, *(f"[{axis}]" for axis in axes), "100 Hz", "Allan deviation (deg/s)", "tau (s)"):
+        assert part in text
+    signal[..., 2, :] = signal[..., 1, :]
+    with pytest.raises(SingularCovarianceError, match="sensors front right and rear left are copies"):
+        fit_svo(recording)
+
+
 # Layers
 
 
@@ -449,46 +403,3 @@ def test_other_signals_than_the_weights_are_for_are_named():
             fuse(array()[0])
         with pytest.raises(TypeError, match=r"`signal`: expected float32 or float64, got torch.int16"):
             fuse(array().to(torch.int16))
-
-
-# Result
-
-
-def test_summary_is_reproducible_and_fixed_in_width():
-    result = fit_svo(array(), "long")
-    text = result.summary()
-    assert text == str(result) == fit_svo(array(), "long").summary()
-    lines = text.splitlines()
-    assert lines[0] == "Virtual gyro (SVO) of 4 sensors, 3000 samples"
-    table = lines[lines.index("Allan deviation (signal) at averaging time tau") + 1 :]
-    assert len(table) == 1 + result.n_levels
-    assert len({len(line) for line in table}) == 1
-    assert max(map(len, lines)) <= 120
-
-
-def test_summary_of_a_batch_names_its_items():
-    signal = array().expand(3, 4, 3000)
-    assert fit_svo(signal).summary().count("Virtual gyro (SVO)") == 3
-    assert "... and 2 more" in fit_svo(array().expand(10, 4, 3000)).summary()
-
-
-def test_a_result_becomes_json():
-    result = fit_svo(array(), covariance="none")
-    values = json.loads(json.dumps(result.to_dict(), allow_nan=False))
-    assert values["weights"] == result.weights.tolist()
-    assert values["confidence_interval"]["low"] == [None] * 4
-    assert np.shape(values["wavelet_cross_covariance"]) == (result.n_levels, 4, 4)
-    assert values["tau"] == [2.0**j for j in range(result.n_levels)]
-
-
-def test_a_result_does_not_keep_the_recording_alive():
-    signal = array(n_samples=100_000)
-    result = fit_svo(signal)
-    size = sum(v.untyped_storage().nbytes() for v in vars(result).values() if isinstance(v, torch.Tensor))
-    assert size < 0.02 * signal.untyped_storage().nbytes()
-
-
-def test_nothing_warns_on_good_data():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        fit_svo(array()).summary()

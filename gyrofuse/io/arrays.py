@@ -25,7 +25,17 @@ import numpy as np
 from gyrofuse.io.columns import AXES, TICK, Column, canonical_unit, classify_columns, time_in_seconds
 from gyrofuse.io.stream import Array, RecordingError, Stream
 
-_RATE = ("fs", "rate", "samplingrate", "samplerate", "samplingfrequency", "samplefrequency", "samplefreq")
+_RATE = (
+    "fs",
+    "rate",
+    "samplingrate",
+    "samplerate",
+    "samplingfrequency",
+    "samplefrequency",
+    "samplefreq",
+    "outputrate",
+    "updaterate",
+)
 _UNIT = ("unit", "units")
 _SENSORS = ("sensors", "sensornames")
 # By the group that holds it ("" is the file) and its name in lower case letters.
@@ -86,7 +96,7 @@ def _group(
     for name, values in rows.items():
         column = columns[name]
         if column.kind == "time" and len(values) == 1:
-            clocks.setdefault(column.device, _clock(column, values[0], rate, settings))
+            clocks.setdefault(column.device, clock_in_seconds(column, values[0], rate, settings))
             continue
         if column.kind != "gyro":
             beside[name] = values
@@ -94,7 +104,7 @@ def _group(
         sensors = list(dict.fromkeys(_texts(_nearest(settings, name, _SENSORS))))
         if len(values) == 4 and len(sensors) != 4 and (row := _clock_row(values)) is not None:
             notes.append(f"row {row} of '{name}' never decreases and is read as its time")
-            clocks[column.device] = _clock(column, values[row], rate, settings)
+            clocks[column.device] = clock_in_seconds(column, values[row], rate, settings)
             values = np.delete(values, row, axis=0)
         found: dict[tuple[str, str], dict[str, Array]]
         if len(values) == len(sensors):
@@ -245,7 +255,9 @@ def _clock_row(rows: Array) -> int | None:
     return next((i for i in (0, 3) if rows[i, -1] > rows[i, 0] and np.all(rows[i, 1:] >= rows[i, :-1])), None)
 
 
-def _clock(column: Column, ticks: Array, rate: float | None, settings: _Settings) -> tuple[Array, float | None, str]:
+def clock_in_seconds(
+    column: Column, ticks: Array, rate: float | None, settings: _Settings
+) -> tuple[Array, float | None, str]:
     """Seconds, wrapping period and guess of a clock, whose unit its attribute or the sampling rate may tell."""
     unit = column.unit or _own_unit(settings, column.name)
     step = float(np.median(np.diff(ticks[np.isfinite(ticks)]))) if np.isfinite(ticks).sum() > 1 else 0.0

@@ -184,7 +184,12 @@ def _grids(streams: Sequence[Stream], rate: float | None, source: str) -> list[G
             identity = (id(stream.time), stream.time.size)
             if identity not in known:
                 known[identity] = grid_of(
-                    stream.time, name=stream.name, source=source, clock_period=stream.clock_period, rate=rate
+                    stream.time,
+                    name=stream.name,
+                    source=source,
+                    clock_period=stream.clock_period,
+                    rate=rate,
+                    nominal=stream.rate,
                 )
         grids.append(known[identity])
     return grids
@@ -210,8 +215,8 @@ def _units(
             factors.append(rate_unit_factor(stream.unit, target))
         except ValueError as error:
             raise RecordingError(
-                f"{source}: expected one unit, found {stream.unit} in {stream.name}, which does not convert to {target};"
-                " give the factor with scale= (--scale) and the unit with unit= (--unit)"
+                f"{source}: expected one unit, found {stream.unit} in {stream.name}, which is no {target}; "
+                "give the factor with scale= (--scale) and the unit with unit= (--unit)"
             ) from error
         notes.append(Note("unit", stream.name, f"converted from {stream.unit} to {target}"))
     return target, factors, notes

@@ -1,12 +1,9 @@
 """From timestamps to a uniform grid: the rate, and which slot of the grid each sample belongs to.
 
-Samples are never interpolated. Three ways to give each sample a slot are tried, and the first that leaves the fewest
-slots empty or taken twice is used:
-
-1. *grid*: the slot nearest to the timestamp, on a straight line through all timestamps; right for good clocks;
-2. *steps*: as many slots on from the sample before as the time between them says, rounded; right when the true rate
-   wanders, so that a straight line would slip;
-3. *order*: one slot a sample, when most timestamps say nothing (arrival times that come in bursts).
+Samples keep the order of the log and are never interpolated. With `u_n = t_n / step - n`, a missing sample raises `u`
+for good, while the jitter of a stamp, or a burst of late ones, comes back: how many samples are missing at a long step
+is read off the lower envelope of `u` after it, against its slowly followed level before it. Where most stamps say
+nothing (arrival times that come in bursts), samples take one slot each, at the long-run rate.
 """
 
 from __future__ import annotations
@@ -21,10 +18,12 @@ from gyrofuse.io.stream import Array, RecordingError
 
 Slots = NDArray[np.int64]
 
-# A clock is not trusted to tell where samples are missing when more of its steps than this are zero or long, or more of
-# its samples than this find no slot of their own in spite of it.
-_MOST_IRREGULAR = 0.1
-_MOST_MISPLACED = 0.02
+# A step that differs from the usual one by more than this part of it is looked at.
+_IRREGULAR = 0.55
+# Samples that the envelope looks ahead, and over which its level follows a wandering rate.
+_WINDOW, _MEMORY = 64, 1024
+# A clock that is behind for more samples than this was set back.
+_SET_BACK = 100
 # A grid with more slots a sample than this is a clock that jumps, not a recording.
 _SPARSEST = 20
 _TICKS = {"microsecond": 1e-6, "millisecond": 1e-3, "nanosecond": 1e-9}
@@ -62,7 +61,13 @@ class Grid:
 
 
 def grid_of(
-    time: Array, *, name: str, source: str, clock_period: float | None = None, rate: float | None = None
+    time: Array,
+    *,
+    name: str,
+    source: str,
+    clock_period: float | None = None,
+    rate: float | None = None,
+    nominal: float | None = None,
 ) -> Grid:
     """Find the uniform grid behind timestamps.
 
@@ -72,6 +77,7 @@ def grid_of(
         source: The file, for errors.
         clock_period: Seconds after which the clock wraps, when known.
         rate: Sampling rate in Hz that overrides the clock's.
+        nominal: Sampling rate in Hz that the log states beside the clock.
 
     Raises:
         RecordingError: Fewer than two usable timestamps, or none that advances.
@@ -84,6 +90,7 @@ def grid_of(
     t, n_wraps, period = _unwrap(time[kept], clock_period)
     if n_wraps:
         book.add("wraps", f"the clock wrapped {n_wraps} times, every {period:.6g} s; unwrapped", wraps=n_wraps)
+    t = _undo_set_backs(t, book)
     ahead = t >= np.maximum.accumulate(t)
     if not ahead.all():
         lost = int((~ahead).sum())
@@ -95,28 +102,21 @@ def grid_of(
             f"{source}: expected timestamps that advance, found {t.size} usable ones of {time.size} that do not; "
             "give the rate with rate= (--rate HZ) and a file without timestamps"
         )
-    step = float(np.median(steps[steps > 0])) if rate is None else 1 / rate
     repeats = int((steps == 0).sum())
-
-    candidates = [_on_line(t, step, fixed=rate is not None), _by_steps(t, step)]
-    slots, line = min(candidates, key=lambda candidate: _flaws(candidate[0]))
-    long = steps[steps > 1.5 * step]  # these explain empty slots
-    unexplained = _flaws(slots) - int(np.rint(long / step - 1).sum()) - repeats
-    trusted = repeats + long.size <= _MOST_IRREGULAR * t.size and unexplained <= max(_MOST_MISPLACED * t.size, 1)
-    if not trusted:
-        slots, line = np.arange(t.size), (float(t[0]), (t[-1] - t[0]) / (t.size - 1))
-        if not line[1] > 0:
-            raise RecordingError(
-                f"{source}: expected timestamps that advance from the first ({t[0]:.6g} s) to the last "
-                f"({t[-1]:.6g} s); give the rate with rate= (--rate HZ) and a file without timestamps"
-            )
+    step, regular = _typical_step(t)
+    trusted = not _in_bursts(t, step, regular, nominal or rate)
+    if trusted:
+        slots = _find_slots(t, step)
+        start, step = _fit_line(slots, t)
+    else:
+        slots, start, step = np.arange(t.size), float(t[0]), float((t[-1] - t[0]) / (t.size - 1))
         book.add(
             "jitter",
-            f"the timestamps are too irregular to place samples ({repeats} repeats, steps from {steps.min():.3g} to "
-            f"{steps.max():.3g} s, median {step:.3g} s): samples are taken in order, at the long-run rate",
+            f"the timestamps come in bursts ({repeats} repeats, steps from {steps.min():.3g} to {steps.max():.3g} s, "
+            f"{step:.3g} s in the long run): samples are taken in order, at the long-run rate",
             repeats=repeats,
         )
-    start, step = line
+    residual = t - (start + step * slots)
     if rate is not None:
         seen = 1 / step
         if abs(seen / rate - 1) > 1e-3:
@@ -124,14 +124,14 @@ def grid_of(
         step = 1 / rate
 
     # The first of several samples in one slot stays.
-    first = np.concatenate([[True], np.diff(slots) > 0])
+    first = np.concatenate([[True], slots[1:] > np.maximum.accumulate(slots)[:-1]])
     if trusted:
         if repeats:
             book.add("repeats", f"{repeats} timestamps repeat the one before; the first sample stays", samples=repeats)
         twice = int((~first).sum()) - repeats
         if twice > 0:
             book.add("repeats", f"{twice} samples fell on a taken place of the grid and were left out", samples=twice)
-        _note_jitter(book, t - (start + step * slots), steps, step)
+        _note_jitter(book, residual, step)
     slots, kept = slots[first], kept[first]
     start += step * float(slots[0])
     slots = slots - slots[0]
@@ -164,28 +164,82 @@ def _unwrap(t: Array, period: float | None) -> tuple[Array, int, float]:
     return t, 0, 0.0
 
 
-def _on_line(t: Array, step: float, *, fixed: bool) -> tuple[Slots, tuple[float, float]]:
-    """Nearest slot on one straight line, refined from the median step; line as (start, step)."""
-    start = float(t[0])
-    slots = np.rint(_count(t, step)).astype(np.int64)
-    if not fixed:
-        for _ in range(3):
-            start, step = _fit_line(slots, t)
-            slots = np.rint((t - start) / step).astype(np.int64)
-    return slots, (start, step)
+def _undo_set_backs(t: Array, book: Notebook) -> Array:
+    """Let a clock that was set back, and does not soon catch up, go on without a gap."""
+    for here in (np.flatnonzero(np.diff(t) < 0) + 1).tolist():
+        highest = t[:here].max()
+        behind = t[here:] < highest
+        if behind[:_SET_BACK].all() and behind.size > _SET_BACK:
+            step = float(np.median(np.abs(np.diff(t))))
+            back = t[here - 1] - t[here]
+            t = np.concatenate([t[:here], t[here:] + back + step])
+            book.add("clock", f"the clock was set back by {back:.6g} s; taken to go on without a gap", seconds=back)
+    return t
 
 
-def _by_steps(t: Array, step: float) -> tuple[Slots, tuple[float, float]]:
-    """As many slots on as each step holds, rounded."""
-    slots = np.concatenate([[0], np.cumsum(np.rint(np.diff(t) / step))]).astype(np.int64)
-    return slots, _fit_line(slots, t)
-
-
-def _count(t: Array, step: float) -> Array:
-    """Slots since the first sample; the mean of near-median steps keeps the count right over a long recording."""
+def _typical_step(t: Array) -> tuple[float, NDArray[np.bool_]]:
+    """Step between samples, by least squares pooled over stretches without irregular steps; which steps are regular."""
     steps = np.diff(t)
-    usual = steps[np.abs(steps - step) < 0.1 * step]
-    return (t - t[0]) / (usual.mean() if usual.size else step)
+    step = float(np.median(steps[steps > 0]))
+    regular = np.abs(steps - step) <= _IRREGULAR * step
+    begin = np.concatenate([[0], np.flatnonzero(~regular) + 1])
+    length = np.diff(np.append(begin, t.size))
+    number = np.arange(t.size) - np.repeat(begin + (length - 1) / 2, length)
+    power = float(number @ number)
+    if not power > 0:
+        return step, regular
+    ahead = (t - t[0]) / step - np.arange(t.size)
+    ahead -= np.repeat(np.add.reduceat(ahead, begin) / length, length)
+    return step * (1 + float(number @ ahead) / power), regular
+
+
+def _in_bursts(t: Array, step: float, regular: NDArray[np.bool_], nominal: float | None) -> bool:
+    """Whether the long-run rate is another than that of the usual steps, and missing samples are not the reason."""
+    long_run = (t[-1] - t[0]) / (t.size - 1)
+    if abs(long_run / step - 1) < 0.1:
+        return False
+    if nominal is not None and abs(long_run * nominal - 1) < 0.05:
+        return True
+    odd = np.diff(t)[~regular] / step
+    fractional = (np.abs(odd - np.rint(odd)) > 0.25) | (odd < 0.5)
+    return bool(odd.size > 0.05 * t.size and fractional.mean() > 0.25)
+
+
+def _find_slots(t: Array, step: float) -> Slots:
+    order = np.arange(t.size)
+    ahead = (t - t[0]) / step - order
+    doubtful = np.flatnonzero(np.abs(np.diff(ahead)) > 1 - _IRREGULAR) + 1
+    if doubtful.size == 0:
+        return order
+    envelope = _lowest_ahead(ahead)
+    jumps: list[tuple[int, int]] = []  # from which sample on, and how many are missing before it
+    shift, begin, level = 0, 0, float(envelope[0])
+    for here in doubtful.tolist():
+        ahead[begin:here] -= shift
+        before = float(ahead[max(here - _WINDOW, 0) : here].min())
+        level += min((here - begin) / _MEMORY, 1.0) * (before - level)
+        begin = here
+        jump = round(float(envelope[here]) - shift - level)
+        if not jump:
+            continue
+        shift += jump
+        if jump < 0 and jumps and jumps[-1][1] == -jump and here - jumps[-1][0] < _WINDOW:
+            jumps.pop()  # late, not missing: it came back
+        else:
+            jumps.append((here, jump))
+    missing = np.zeros(t.size, dtype=np.int64)
+    for here, jump in jumps:
+        missing[here] += jump
+    return order + np.cumsum(missing)
+
+
+def _lowest_ahead(values: Array) -> Array:
+    """Minimum over each value and the ones after it, as many as the window holds."""
+    lowest, span = values.copy(), 1
+    while span < _WINDOW:
+        np.minimum(lowest[:-span], lowest[span:], out=lowest[:-span])
+        span *= 2
+    return lowest
 
 
 def _fit_line(slots: Slots, t: Array) -> tuple[float, float]:
@@ -198,31 +252,22 @@ def _fit_line(slots: Slots, t: Array) -> tuple[float, float]:
     return float(t.mean() - step * slots.mean()), step
 
 
-def _flaws(slots: Slots) -> int:
-    """Slots left empty plus samples without a slot of their own."""
-    used = np.unique(slots)
-    return int(slots.size - used.size) + int(used[-1] - used[0] + 1 - used.size)
-
-
-def _note_jitter(book, residual: Array, steps: Array, step: float) -> None:  # type: ignore[no-untyped-def]
-    usual = steps[(steps > 0.5 * step) & (steps < 1.5 * step)]
-    if usual.size:
-        rms, largest = float(usual.std()), float(np.abs(usual - step).max())
-        if rms > 1e-3 * step:
-            book.add(
-                "jitter",
-                f"steps between timestamps scatter by {1e3 * rms:.3g} ms rms ({100 * rms / step:.2g} % of a step), "
-                f"at most {1e3 * largest:.3g} ms",
-                rms_s=rms,
-                largest_s=largest,
-            )
-    wander = float(np.abs(residual).max())
-    if wander > 0.5 * step:
+def _note_jitter(book: Notebook, residual: Array, step: float) -> None:
+    scatter = np.diff(residual)
+    # Jitter is what neighbours do not share; a wandering rate is what they do.
+    rms, largest = float(scatter.std() / np.sqrt(2)), float(np.abs(residual).max())
+    if rms > 1e-3 * step:
+        book.add(
+            "jitter",
+            f"timestamps scatter by {1e3 * rms:.3g} ms rms ({100 * rms / step:.2g} % of a step)",
+            rms_s=rms,
+        )
+    if largest > 0.5 * step and largest > 6 * rms:
         book.add(
             "drift",
-            f"the rate wanders: timestamps leave a straight line by up to {1e3 * wander:.3g} ms "
-            f"({wander / step:.3g} steps)",
-            largest_s=wander,
+            f"timestamps leave a straight line by up to {1e3 * largest:.3g} ms ({largest / step:.3g} steps): the rate "
+            "wanders or stamps come late",
+            largest_s=largest,
         )
 
 

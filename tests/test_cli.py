@@ -1,0 +1,494 @@
+"""The command line from the outside: what it prints, what it writes, and how it refuses."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+
+import gyrofuse as gf
+from gyrofuse import cli
+from gyrofuse._output import Outputs, output_folder
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+class Outcome(NamedTuple):
+    """How a command ended."""
+
+    status: int
+    out: str
+    err: str
+
+
+Run = Callable[..., Outcome]
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
+    """Run a command in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments: object) -> Outcome:
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            cli.main([str(argument) for argument in arguments])
+        status = ended.value.code
+        return Outcome(status if isinstance(status, int) else 0 if status is None else 1, *capsys.readouterr())
+
+    return run
+
+
+def noise(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    path = tmp_path / "log.npz"
+    signal = torch.tensor([[1.0], [2.0], [1.5]], dtype=torch.float64) * noise(3, 2000)
+    gf.Recording(signal, rate=100.0, unit="deg/s", sensors=("a", "b", "c")).save(path)
+    return path
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def refused(outcome: Outcome, says: str) -> None:
+    """Status 2, one line on stderr, and nothing on stdout."""
+    assert outcome.status == 2
+    assert outcome.out == ""
+    assert outcome.err.count("\n") == 1
+    assert outcome.err.startswith("error: ")
+    assert says in outcome.err
+
+
+# What it does
+
+
+def test_fuse_prints_the_summary_and_writes_what_is_asked_for(run: Run, log: Path):
+    done = run(
+        "fuse",
+        log,
+        "--scale-weights",
+        "long",
+        "--out",
+        "v.npz",
+        "--figure",
+        "f.svg",
+        "--json",
+        "r.json",
+        "--report",
+        "r.html",
+    )
+    recording = gf.read_recording(log)
+    result = gf.fit_svo(recording, "long")
+    assert done == Outcome(0, done.out, "")
+    assert done.out.startswith(result.summary())
+    fused = gf.read_recording("v.npz")
+    torch.testing.assert_close(fused.signal, result.virtual(recording)[None], rtol=0, atol=0)
+    assert (fused.rate, fused.unit, fused.sensors) == (100.0, "deg/s", ("virtual",))
+    np.testing.assert_array_equal(np.load("v.npz")["weights"], result.weights.numpy())
+    assert json.loads(Path("r.json").read_text()) == result.to_dict()
+    assert Path("f.svg").read_text().startswith("<?xml")
+    assert "Virtual gyro of log.npz" in Path("r.html").read_text()
+    assert sorted(path.name for path in Path().iterdir()) == ["f.svg", "log.npz", "r.html", "r.json", "v.npz"]
+
+
+def test_fuse_writes_text_that_is_read_back(run: Run, log: Path):
+    assert run("fuse", log, "--out", "v.csv").status == 0
+    lines = Path("v.csv").read_text().splitlines()
+    assert lines[0] == "time [s],virtual_gyro [deg/s]"
+    fused, recording = gf.read_recording("v.csv"), gf.read_recording(log)
+    torch.testing.assert_close(fused.signal, gf.fit_svo(recording).virtual(recording)[None], rtol=0, atol=0)
+    assert fused.unit == "deg/s"
+    assert fused.rate == pytest.approx(100.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "arguments"),
+    [
+        ([], {}),
+        (["--scale-weights", "short"], {"scale_weights": "short"}),
+        (["--scale-weights", "1,0,3"], {"scale_weights": [1.0, 0.0, 3.0]}),
+        (["--method", "inverse-variance", "--levels", "4"], {"method": "inverse_variance", "n_levels": 4}),
+        (["--method", "equal", "--confidence-level", "0.5"], {"method": "equal", "confidence_level": 0.5}),
+    ],
+)
+def test_options_reach_the_fit(run: Run, log: Path, options: list[str], arguments: dict[str, object]):
+    assert gf.fit_svo(gf.read_recording(log), **arguments).summary() in run("fuse", log, *options).out
+
+
+def test_reading_options_reach_the_reader(run: Run, tmp_path: Path):
+    counts = (1000 * noise(3, 500)).round().numpy()
+    np.savez(tmp_path / "counts.npz", rates=counts, acceleration=counts)
+    options = ("--rate", "50", "--unit", "rad/s", "--scale", "0.001", "--key", "rates", "--sensors", "y,z")
+    done = run("info", "counts.npz", *options, "--json", "i.json")
+    assert done.status == 0
+    known = json.loads(Path("i.json").read_text())
+    assert (known["rate"], known["unit"], known["sensors"]) == (50.0, "rad/s", ["y", "z"])
+    np.testing.assert_allclose(known["mean"], 0.001 * counts[1:].mean(1))
+
+
+def test_three_axes(run: Run, tmp_path: Path):
+    gf.Recording(noise(3, 4, 1000), rate=100.0, axes=("x", "y", "z")).save(tmp_path / "three.npz")
+    done = run("fuse", "three.npz", "--out", "v.npz", "--figure", "f.png", "--report", "r.html")
+    result = gf.fit_svo(gf.read_recording("three.npz"))
+    assert done.out.startswith(result.summary())
+    fused = gf.read_recording("v.npz")
+    assert fused.sensors == ("x", "y", "z")  # one device: its axes are read as its sensors
+    torch.testing.assert_close(fused.signal, result.virtual(gf.read_recording("three.npz")), rtol=0, atol=0)
+    one = run("fuse", "three.npz", "--axis", "y", "--out", "y.csv")
+    assert one.out.startswith(result[1].summary().splitlines()[0])
+    torch.testing.assert_close(gf.read_recording("y.csv").signal[0], fused.signal[1], rtol=0, atol=1e-12)
+
+
+def test_axes_of_one_device_are_fused_with_a_warning(run: Run, tmp_path: Path):
+    np.savez(tmp_path / "imu.npz", imu_gyr=noise(3, 500).numpy(), fs=100.0)
+    done = run("fuse", "imu.npz")
+    assert done.status == 0
+    assert done.err.startswith("warning: ")
+    assert "only at rest" in done.err
+    assert done.err.count("\n") == 1
+
+
+def test_info_shows_what_is_in_the_log(run: Run, tmp_path: Path):
+    signal = noise(2, 400) + 3.0
+    signal[1, 100:200] = math.nan
+    sensors = ("[bold]x[/bold]", "a name that is far longer than eighty columns " * 3)
+    recording = gf.Recording(signal, rate=50.0, unit="deg/s", sensors=sensors, channels={"temperature": noise(400)})
+    recording.save(tmp_path / "log.npz")
+    done = run("info", "log.npz", "--json", "i.json", "--report", "i.html")
+    assert (done.status, done.err) == (0, "")
+    lines = [line.strip() for line in done.out.splitlines()]
+    for fact in (("rate", "50 Hz"), ("samples", "400"), ("duration", "8 s"), ("unit", "deg/s"), ("source", "log.npz")):
+        assert any(line.split(None, 1) == list(fact) for line in lines)
+    for i, name in enumerate(sensors):
+        (line,) = (line for line in lines if line.startswith(name.strip()))
+        assert ("0 %", "25 %")[i] in line
+        assert f"{signal[i].nanmean().item():.4g}" in line
+    assert any(line.split() == ["temperature", "400"] for line in lines)
+    read = gf.read_recording("log.npz")
+    for note in read.notes:
+        assert note.sentence in done.out
+    assert json.loads(Path("i.json").read_text()) == read.to_dict()
+    assert "[bold]x[/bold]" in Path("i.html").read_text()
+
+
+def test_what_names_hold_does_not_steer_the_terminal(run: Run, tmp_path: Path):
+    gf.Recording(noise(2, 100), rate=50.0, sensors=("\x1b[31mred", "b\x07")).save(tmp_path / "log.npz")
+    for command in ("info", "fuse"):
+        done = run(command, "log.npz")
+        assert done.status == 0
+        assert "?[31mred" in done.out
+        assert "\x1b" not in done.out
+        assert "\x07" not in done.out
+
+
+def test_simulate_array_model(run: Run):
+    model = gf.ArrayModel([(gf.WhiteNoise(1.0), [[2.0, 0.5], [0.5, 1.0]]), (gf.RandomWalk(1e-4), [1.0, 2.0])])
+    Path("model.json").write_text(json.dumps(model.to_dict()))
+    command = ("simulate", "model.json", "--samples", 500, "--rate", 20, "--seed", 7)
+    done = run(*command, "--out", "a.npz", "--json", "s.json", "--report", "s.html")
+    assert (done.status, done.err) == (0, "")
+    recording = gf.read_recording("a.npz")
+    expected = model.simulate(500, generator=torch.Generator().manual_seed(7))
+    torch.testing.assert_close(recording.signal, expected, rtol=0, atol=0)
+    assert (recording.rate, recording.unit) == (20.0, "deg/s")
+    settings = json.loads(Path("s.json").read_text())
+    assert (settings["seed"], settings["n_samples"], settings["model"]) == (7, 500, model.to_dict())
+    run(*command, "--out", "a.csv")
+    torch.testing.assert_close(gf.read_recording("a.csv").signal, expected, rtol=0, atol=0)
+
+
+def test_simulate_sensors_of_one_model(run: Run):
+    formula = "WN(variance=4) + RW(variance=1e-4)"
+    assert (
+        run(
+            "simulate", formula, "--samples", 300, "--rate", 20, "--sensors", 3, "--unit", "rad/s", "--out", "a.npz"
+        ).status
+        == 0
+    )
+    recording = gf.read_recording("a.npz")
+    assert (tuple(recording.signal.shape), recording.unit) == ((3, 300), "rad/s")
+    Path("one.json").write_text(json.dumps(gf.WhiteNoise(1.0).to_dict()))
+    done = run("simulate", "one.json", "--samples", 300, "--rate", 20, "--out", "b.npz")
+    seed = int(
+        done.out.split("seed ")[1].split(",")[0]
+    )  # a random seed is told, so that the recording can be had again
+    run("simulate", "one.json", "--samples", 300, "--rate", 20, "--out", "c.npz", "--seed", seed)
+    assert Path("b.npz").read_bytes() == Path("c.npz").read_bytes()
+
+
+def test_version_and_help(run: Run):
+    assert run("--version") == Outcome(0, f"gyrofuse {gf.__version__}\n", "")
+    for command in ("info", "fuse", "simulate", "demo"):
+        text = run(command, "--help").out
+        assert "--json" in text
+        assert "--report" in text
+
+
+def test_runs_as_a_module_and_loads_little():
+    def python(*arguments: str) -> str:
+        command = [sys.executable, *arguments]
+        return subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT).stdout
+
+    assert python("-m", "gyrofuse", "--version") == f"gyrofuse {gf.__version__}\n"
+    loaded = python("-c", "import sys, gyrofuse.cli; print({'matplotlib', 'jinja2', 'torchmetrics'} & {*sys.modules})")
+    assert loaded == "set()\n"
+
+
+# How it refuses
+
+
+def bad_logs(folder: Path) -> dict[str, Path]:
+    good = folder / "good.npz"
+    gf.Recording(noise(3, 200), rate=100.0).save(good)
+    whole, signal = good.read_bytes(), noise(3, 200).numpy()
+    good.unlink()
+    dead, copied = signal.copy(), signal.copy()
+    dead[1], copied[2] = 0.5, copied[0]
+    junk = np.random.default_rng(0).bytes(3000)
+    rows = "\n".join(",".join(f"{value:.6f}" for value in row) for row in signal.T)
+    files = {
+        "empty.npz": b"",
+        "truncated.npz": whole[: len(whole) // 2],
+        "junk.npz": junk,
+        "empty.csv": b"",
+        "truncated.csv": b"time,gx,gy,gz\n0.0,1",
+        "junk.csv": junk,
+        "text.npz": b"these are not numbers",
+        "no_rate.csv": f"gyro1,gyro2,gyro3\n{rows}".encode(),
+    }
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
+    arrays = {
+        "one_sensor.npz": (signal[:1], 100.0),
+        "one_sample.npz": (signal[:, :1], 100.0),
+        "all_nan.npz": (np.full_like(signal, np.nan), 100.0),
+        "dead.npz": (dead, 100.0),
+        "copied.npz": (copied, 100.0),
+        "negative_rate.npz": (signal, -100.0),
+    }
+    for name, (gyro, rate) in arrays.items():
+        np.savez(folder / name, gyro=gyro, fs=rate)
+    np.savez(folder / "no_rate.npz", gyro=signal)
+    return {path.name: path for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("missing.npz", "missing.npz"),
+        ("empty.npz", "empty.npz"),
+        ("truncated.npz", "truncated.npz"),
+        ("junk.npz", "junk.npz"),
+        ("text.npz", "text.npz"),
+        ("empty.csv", "empty.csv"),
+        ("truncated.csv", "truncated.csv"),
+        ("junk.csv", "junk.csv"),
+        ("no_rate.csv", "--rate"),
+        ("no_rate.npz", "--rate"),
+        ("negative_rate.npz", "rate"),
+        ("one_sensor.npz", "at least 2 sensors"),
+        ("one_sample.npz", "at least 2 samples"),
+        ("all_nan.npz", "no finite sample"),
+        ("dead.npz", "never change"),
+        ("copied.npz", "copies"),
+    ],
+)
+def test_bad_logs_are_refused(run: Run, tmp_path: Path, name: str, says: str):
+    bad_logs(tmp_path)
+    before = contents(tmp_path)
+    refused(run("fuse", name, "--out", "v.npz", "--figure", "f.png", "--json", "r.json", "--report", "r.html"), says)
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--rate", "-100"], "`rate`"),
+        (["--rate", "fast"], "--rate"),
+        (["--scale-weights", "a,b"], "`--scale-weights`"),
+        (["--scale-weights", "longish"], "`--scale-weights`"),
+        (["--scale-weights", ""], "`--scale-weights`"),
+        (["--scale-weights", "1,,2"], "`--scale-weights`"),
+        (["--scale-weights", "1,-1"], "`scale_weights`"),
+        (["--scale-weights", "0,0"], "`scale_weights`"),
+        (["--scale-weights", "nan,1"], "`scale_weights`"),
+        (["--scale-weights", ",".join("1" * 20)], "at most 10"),
+        (["--scale-weights", "1,2,3", "--levels", "5"], "5 levels"),
+        (["--levels", "0"], "`n_levels`"),
+        (["--levels", "99"], "at most 10"),
+        (["--confidence-level", "95"], "`confidence_level`"),
+        (["--method", "magic"], "--method"),
+        (["--sensors", "a,nobody"], "nobody"),
+        (["--axis", "q"], "'q'"),
+        (["--mounting", "missing.json"], "missing.json"),
+        (["--unknown"], "--unknown"),
+        (["--out", "nowhere/v.npz"], "nowhere"),
+        (["--out", "v.xlsx"], ".npz or .csv"),
+        (["--figure", "f.bmp"], ".png"),
+        (["--json", "r.txt"], ".json"),
+        (["--report", "r.pdf"], ".html"),
+        (["--json", "folder.json"], "something else"),
+        (["--out", "log.npz", "--force"], "in use"),
+        (["--report", "r.html", "--json", "taken.json"], "exists already"),
+    ],
+)
+def test_bad_options_are_refused(run: Run, log: Path, tmp_path: Path, options: list[str], says: str):
+    (tmp_path / "folder.json").mkdir()
+    (tmp_path / "taken.json").write_text("mine")
+    before = contents(tmp_path)
+    wanted = [] if "--figure" in options else ["--figure", "other.png"]
+    refused(run("fuse", log, *options, *wanted), says)
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    ("model", "options", "says"),
+    [
+        ("missing.json", [], "missing.json"),
+        ("junk.json", [], "junk.json"),
+        ("list.json", [], "list.json"),
+        ("other.json", [], "other.json"),
+        ("WN(variance=-1)", [], "`variance`"),
+        ("WN + RW", [], "to be estimated"),
+        ("WN(variance=1", [], "`formula`"),
+        ("WN(variance=1)", ["--samples", "0"], "--samples"),
+        ("WN(variance=1)", ["--rate", "0"], "--rate"),
+        ("WN(variance=1)", ["--sensors", "0"], "--sensors"),
+        ("WN(variance=1)", ["--seed", "-1"], "--seed"),
+        ("WN(variance=1)", ["--out", "a.txt"], ".npz or .csv"),
+        ("array.json", ["--sensors", "2"], "--sensors"),
+    ],
+)
+def test_bad_simulations_are_refused(run: Run, tmp_path: Path, model: str, options: list[str], says: str):
+    (tmp_path / "junk.json").write_bytes(b"\xff\xfe{")
+    (tmp_path / "list.json").write_text("[1, 2]")
+    (tmp_path / "other.json").write_text('{"processes": [{"process": "Magic"}]}')
+    array = gf.ArrayModel([(gf.WhiteNoise(1.0), [1.0, 2.0])])
+    (tmp_path / "array.json").write_text(json.dumps(array.to_dict()))
+    before = contents(tmp_path)
+    refused(run("simulate", model, "--samples", 100, "--rate", 10, "--out", "a.npz", *options), says)
+    assert contents(tmp_path) == before
+
+
+def test_missing_arguments_are_refused(run: Run):
+    refused(run("fuse"), "LOG")
+    refused(run("simulate", "WN(variance=1)", "--rate", 10, "--out", "a.npz"), "--samples")
+    refused(run("info", "log.npz", "--rate"), "--rate")
+    refused(run("bake"), "bake")
+
+
+# What becomes of files
+
+
+def test_existing_files_stay_without_force_and_are_replaced_with_it(run: Run, log: Path):
+    names = {"--out": "v.npz", "--figure": "f.png", "--json": "r.json", "--report": "r.html"}
+    for option, name in names.items():
+        Path(name).write_bytes(b"mine")
+        refused(run("fuse", log, option, name), f"{name}: exists already")
+        assert Path(name).read_bytes() == b"mine"
+    outputs = [word for pair in names.items() for word in pair]
+    assert run("fuse", log, *outputs, "--force").status == 0
+    assert all(Path(name).read_bytes() != b"mine" for name in names.values())
+    assert {path.name for path in Path().iterdir()} == {"log.npz", *names.values()}
+
+
+def test_a_late_failure_leaves_nothing_behind(run: Run, log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def fail(*_: object, **__: object) -> str:
+        raise ValueError("no ink")
+
+    monkeypatch.setattr(cli, "fusion_report", fail)
+    Path("v.npz").write_bytes(b"mine")
+    before = contents(tmp_path)
+    refused(
+        run("fuse", log, "--out", "v.npz", "--figure", "f.png", "--json", "r.json", "--report", "r.html", "--force"),
+        "no ink",
+    )
+    assert contents(tmp_path) == before
+
+
+def test_a_defect_is_one_line_and_a_traceback_on_demand(
+    run: Run, log: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    def fail(*_: object, **__: object) -> None:
+        raise KeyError("lost")
+
+    monkeypatch.setattr(cli, "fit_svo", fail)
+    done = run("fuse", log, "--out", "v.npz")
+    assert done == Outcome(1, "", "error: unexpected KeyError: 'lost' (--debug shows where)\n")
+    with pytest.raises(KeyError, match="lost"):
+        cli.main(["--debug", "fuse", str(log), "--out", "v.npz"])
+    assert list(contents(tmp_path)) == ["log.npz"]
+
+
+def test_outputs_appear_together_or_not_at_all(tmp_path: Path):
+    first, second = tmp_path / "1.txt", tmp_path / "2.txt"
+    with Outputs([first, second]) as drafts:
+        for path, draft in drafts.items():
+            draft.write_text(path.name)
+        assert not first.exists()
+        assert not second.exists()
+    assert (first.read_text(), second.read_text()) == ("1.txt", "2.txt")
+
+    def stop_halfway() -> None:
+        with Outputs([first, second], force=True) as drafts:
+            drafts[first].write_text("new")
+            raise RuntimeError("halfway")
+
+    with pytest.raises(RuntimeError, match="halfway"):
+        stop_halfway()
+    assert contents(tmp_path) == {"1.txt": b"1.txt", "2.txt": b"2.txt"}
+
+
+def test_outputs_follow_links_and_refuse_what_is_used_twice(tmp_path: Path):
+    target, link = tmp_path / "target.txt", tmp_path / "link.txt"
+    target.write_text("old")
+    link.symlink_to(target)
+    with Outputs([link], force=True) as drafts:
+        drafts[link].write_text("new")
+    assert link.is_symlink()
+    assert target.read_text() == "new"
+    with pytest.raises(ValueError, match="in use by the same command"):
+        Outputs([link, target], force=True)
+    with pytest.raises(ValueError, match="in use by the same command"):
+        Outputs([link], force=True, inputs=[target])
+    with pytest.raises(FileExistsError, match="exists already"):
+        Outputs([tmp_path / "new.txt", target])
+    with pytest.raises(FileNotFoundError, match="does not exist; create it first"):
+        Outputs([tmp_path / "new.txt", tmp_path / "nowhere" / "file.txt"])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["link.txt", "target.txt"]
+
+
+def test_output_folder_is_replaced_only_when_it_holds_nothing_else(tmp_path: Path):
+    folder = tmp_path / "out"
+
+    def write(force: bool, text: str = "new") -> None:
+        with output_folder(folder, own=("a.txt",), force=force) as draft:
+            (draft / "a.txt").write_text(text)
+            if text == "half":
+                raise RuntimeError("halfway")
+
+    write(force=False)
+    with pytest.raises(FileExistsError, match="exists already"):
+        write(force=False)
+    (folder / "a.txt").write_text("old")
+    write(force=True)
+    assert contents(tmp_path) == {"out/a.txt": b"new"}
+    with pytest.raises(RuntimeError, match="halfway"):
+        write(force=True, text="half")
+    (folder / "thesis.tex").write_text("years of work")
+    with pytest.raises(ValueError, match="holds something else"):
+        write(force=True)
+    assert contents(tmp_path) == {"out/a.txt": b"new", "out/thesis.tex": b"years of work"}
