@@ -48,7 +48,7 @@ class WaveletProducts:
     ) -> None:
         self.n_levels = n_levels
         self._shape = (n_items, n_sensors)
-        self._like = {"dtype": dtype, "device": device}
+        self._like: dict[str, Any] = {"dtype": dtype, "device": device}
         self._tile = tile_length(n_items * n_sensors, device, length)
         # One product of this shape runs on one core: stripes of a tile keep the others busy.
         threads = torch.get_num_threads() if device.type == "cpu" else 1

@@ -96,7 +96,7 @@ class WaveletCrossCovariance(Metric):
         self._settle()
         return mean_products(self.sums, self.counts).to(self.signal_dtype)
 
-    def forward(self, chunk: Tensor) -> Tensor:  # type: ignore[override]
+    def forward(self, chunk: Tensor) -> Tensor:
         """Update with a chunk and return the wavelet cross-covariance of everything so far."""
         self.update(chunk)
         return self.compute()

@@ -75,6 +75,9 @@ def plot_allan_deviation(
         low, high = band
         handles += [ax.fill_between(times, _deviation(low), _deviation(high), zorder=3, **_SHADE)]
         labels += ["its confidence interval"]
+    if not np.isfinite(ax.dataLim.get_points()).all():
+        # Logarithmic axes do not start from nothing.
+        ax.set(xlim=(times[0] / 2, 2 * times[-1]), ylim=(0.1, 1.0))
     ax.set_yscale("log")
     ax.set_ylabel(with_unit("Allan deviation", unit), parse_math=False)
     _time_axis(ax, in_seconds)
@@ -197,7 +200,8 @@ def plot_signals(
     times, handles = _array(time), []
     for i, (values, style) in enumerate(zip(signals.values(), styles, strict=False)):
         instants, low, high, average = _in_blocks(times, _array(values))
-        handles += bottom.plot(instants, average - np.nanmean(average), **style)
+        known = average[np.isfinite(average)]
+        handles += bottom.plot(instants, average - (known.mean() if known.size else 0.0), **style)
         if i == 0:
             top.fill_between(instants, low, high, color=_BLUE, alpha=0.55, linewidth=0.4)
     names = list(signals)

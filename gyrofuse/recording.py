@@ -121,6 +121,25 @@ class Recording:
             signal, names = signal[..., which, :], tuple(names[i] for i in which)
         return replace(self, signal=signal, axes=axes, sensors=names)
 
+    def between(self, start: float, stop: float) -> Recording:
+        """Keep the stretch from `start` to `stop` seconds: the part at rest, say.
+
+        Raises:
+            ValueError: Fewer than two samples lie between.
+        """
+        first, last = (round(edge * self.rate) for edge in (max(start, 0.0), min(stop, self.duration)))
+        if not last - first >= 2:
+            raise ValueError(
+                f"`start`, `stop`: expected a stretch within 0 to {self.duration:.6g} s, got {start:g} to {stop:g} s"
+            )
+        here = slice(first, last)
+        return replace(
+            self,
+            signal=self.signal[..., here],
+            time=self.time[here],
+            channels={name: values[..., here] for name, values in self.channels.items()},
+        )
+
     def to(self, unit: str) -> Recording:
         """Convert to another unit of rate.
 
@@ -142,7 +161,7 @@ class Recording:
         path = Path(path)
         if path.suffix != ".npz":
             raise ValueError(f"`path`: expected a name that ends in .npz, got {path.name!r}")
-        arrays = {name: values.numpy(force=True) for name, values in self.channels.items()}
+        arrays: dict[str, Any] = {name: values.numpy(force=True) for name, values in self.channels.items()}
         arrays |= {
             "gyro": self.signal.numpy(force=True),
             "fs": np.float64(self.rate),

@@ -67,16 +67,13 @@ def fusion_report(
     parts = []
     for i, (name, item) in enumerate(_items(result)):
         own = {label: signal if signal.ndim == 1 else signal[i] for label, signal in signals.items()}
+        drawn = {"unit": item.unit, "in_seconds": item.rate is not None}
         parts.append(
             {
                 "name": name,
                 "verdict": verdict(item),
                 "fusion": _image(7, 8, _draw_fusion, item),
-                "signals": _image(
-                    7, 4.4, plotting.plot_signals, time, own, unit=item.unit, in_seconds=item.rate is not None
-                )
-                if own
-                else None,
+                "signals": _image(7, 4.4, plotting.plot_signals, time, own, **drawn) if own else None,
                 "sensors": _sensor_rows(item),
                 "levels": _level_rows(item),
             }
@@ -106,7 +103,7 @@ def recording_report(recording: Recording, *, title: str) -> str:
     """
     parts = []
     for name, signal in _by_axis(recording):
-        mean = {"mean of the sensors": signal.mean(-2)}
+        mean = {"mean of the sensors": signal.nanmean(-2)}
         parts.append(
             {
                 "name": name,

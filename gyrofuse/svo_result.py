@@ -34,6 +34,10 @@ def fuse(weights: Tensor, signal: Tensor) -> Tensor:
     return (weights.unsqueeze(-2) @ signal).squeeze(-2)  # (..., 1, sensor) @ (..., sensor, time)
 
 
+# Noise of separate sensors hardly agrees more than this at any scale; motion that all of them feel does.
+_MOTION = 0.7
+
+
 @dataclass(frozen=True, eq=False)
 class SVOResult:
     """A fitted virtual gyro. Batched over the leading dimensions of the signal; index it to get one item.
@@ -99,6 +103,28 @@ class SVOResult:
         """Wavelet variance of the plain mean of the sensors, `(..., level)`."""
         return self._variance_of(equal_weights(self.wavelet_cross_covariance))
 
+    @property
+    def agreement(self) -> Tensor:
+        """Median wavelet correlation between the sensors, `(..., level)`; near 1 where they feel the same motion."""
+        scale = self.wavelet_variance.rsqrt()
+        correlation = scale[..., :, None] * self.wavelet_cross_covariance * scale[..., None, :]
+        first, second = torch.triu_indices(len(self.sensors), len(self.sensors), 1).to(scale.device)
+        return correlation[..., first, second].median(-1).values
+
+    @property
+    def motion(self) -> str:
+        """A warning that the array seems to have moved while it was fitted, or an empty string."""
+        agreement = torch.where(self.scale_weights > 0, self.agreement, 0.0)
+        level = int(agreement.reshape(-1, self.n_levels).amax(0).argmax())
+        largest = agreement[..., level].max().item()
+        if not largest > _MOTION:
+            return ""
+        where = f"{self.tau[level].item():.4g} {'s' if self.rate else 'samples'}"
+        return (
+            f"the sensors agree closely (median correlation {largest:.2f} at {where}): the array seems to have moved, "
+            "and what it felt is taken for noise; fit the weights on a stretch at rest"
+        )
+
     def interval_of(self, wavelet_variance: Tensor) -> ConfidenceInterval:
         """Limits of wavelet variances `(..., level)` of this recording, of any sensor or combination."""
         return uncertainty.chi_square_interval(wavelet_variance, self.degrees_of_freedom, self.confidence_level)
@@ -155,6 +181,8 @@ class SVOResult:
             tau, omega, *deviations, ratio = row
             numbers = "  ".join(f"{value:>12.5g}" for value in deviations)
             lines.append(f"{j + 1:>5}  {tau:>13.6g}  {omega:>7.4f}  {numbers}  {ratio:>13.4f}")
+        if self.motion:
+            lines += ["", f"Warning: {self.motion}."]
         return "\n".join(lines)
 
     def __str__(self) -> str:

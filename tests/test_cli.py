@@ -184,6 +184,18 @@ def test_info_shows_what_is_in_the_log(run: Run, tmp_path: Path):
     assert "[bold]x[/bold]" in Path("i.html").read_text()
 
 
+def test_info_of_a_log_without_any_sample(run: Run, tmp_path: Path):
+    signal = noise(3, 100)
+    signal[1] = math.nan
+    for name in ("some.npz", "none.npz"):
+        gf.Recording(signal, rate=50.0).save(tmp_path / name)
+        done = run("info", name, "--json", f"{name}.json", "--report", f"{name}.html")
+        assert (done.status, done.err) == (0, "")
+        assert "100 %" in done.out
+        assert json.loads(Path(f"{name}.json").read_text())["mean"][1] is None
+        signal[:] = math.nan
+
+
 def test_what_names_hold_does_not_steer_the_terminal(run: Run, tmp_path: Path):
     gf.Recording(noise(2, 100), rate=50.0, sensors=("\x1b[31mred", "b\x07")).save(tmp_path / "log.npz")
     for command in ("info", "fuse"):

@@ -85,7 +85,8 @@ class TestRecording:
             tmp_path, **{"gyro": table()[:2], "sensors": ["a", "b[0]"], "heat[b[0]]": table()[2], "note[a]": "warm"}
         )
         streams = numpy_log.read(path)
-        assert [list(stream.channels) for stream in streams] == [[], []] or "heat" in streams[1].channels
+        assert [list(stream.channels) for stream in streams] == [[], ["heat"]]
+        np.testing.assert_array_equal(streams[1].channels["heat"], table()[2])
 
     def test_another_gyro_is_a_channel(self, tmp_path: Path):
         (stream,) = numpy_log.read(save(tmp_path, gyro=table()[0], raw_gyro=table()[1]))
@@ -164,7 +165,9 @@ class TestTables:
         assert stream.channel_units == {"acceleration": "g"}
 
     def test_bare_axes_one_unit_and_a_shared_clock(self, tmp_path: Path):
-        path = save(tmp_path, data=table()[:3], channels=list("xyz"), units="rad/s", t_us=np.arange(N) * 4000, extra=table())
+        path = save(
+            tmp_path, data=table()[:3], channels=list("xyz"), units="rad/s", t_us=np.arange(N) * 4000, extra=table()
+        )
         (stream,) = numpy_log.read(path)
         assert (list(stream.gyro), stream.unit) == (["x", "y", "z"], "rad/s")
         np.testing.assert_allclose(stream.time, np.arange(N) * 0.004, rtol=1e-15)
@@ -240,9 +243,15 @@ class TestTables:
             ({"channels": ["a", "b"]}, r"rows a, b and a gyro"),
             ({"channels": ["gx", "gx"]}, "name each row once"),
             ({"channels": ["gx", "gy", "gz"]}, r"expected arrays \(channel, time\) .* found data \(2, 60\)"),
-            ({"channels": ["gx", "gy"], "units": ["a", "b", "c"]}, "expected `units` to hold one value or one for each"),
+            (
+                {"channels": ["gx", "gy"], "units": ["a", "b", "c"]},
+                "expected `units` to hold one value or one for each",
+            ),
             ({"channels": ["gx", "gy"], "scale": "large"}, "expected `scale` to hold one value"),
-            ({"channels": ["gx", "gy"], "t_us": np.arange(59)}, "expected `t_us` of the length of `data`, 60, found 59"),
+            (
+                {"channels": ["gx", "gy"], "t_us": np.arange(59)},
+                "expected `t_us` of the length of `data`, 60, found 59",
+            ),
         ],
     )
     def test_tables_that_do_not_fit(self, tmp_path: Path, arrays, message):
@@ -270,7 +279,8 @@ class TestBareArray:
         assert (stream.name, stream.gyro[""].tolist()) == ("a", [1, 2, 3])
 
     @pytest.mark.parametrize(
-        "array", [np.zeros(1), np.zeros((1, 1)), np.zeros((0, 3)), np.zeros((2, 3, 9)), np.full(9, "a"), np.zeros(9, complex)]
+        "array",
+        [np.zeros(1), np.zeros((1, 1)), np.zeros((0, 3)), np.zeros((2, 3, 9)), np.full(9, "a"), np.zeros(9, complex)],
     )
     def test_arrays_that_are_no_gyros(self, tmp_path: Path, array):
         np.save(tmp_path / "a.npy", array)
@@ -280,7 +290,7 @@ class TestBareArray:
 
     def test_a_key_means_nothing(self, tmp_path: Path):
         np.save(tmp_path / "a.npy", table())
-        with pytest.raises(RecordingError, match="expected no `key` for an .npy file"):
+        with pytest.raises(RecordingError, match=r"expected no `key` for an \.npy file"):
             numpy_log.read(tmp_path / "a.npy", key="gyro")
 
 
@@ -299,7 +309,7 @@ class TestDamaged:
         path = save(tmp_path, gyro=table(), meta=np.array([_Touch(tmp_path / "hit")], dtype=object))
         np.save(tmp_path / "a.npy", np.array([_Touch(tmp_path / "hit")], dtype=object))
         for file in (path, tmp_path / "a.npy"):
-            with pytest.raises(RecordingError, match="expected a NumPy file of numbers and text.*without objects"):
+            with pytest.raises(RecordingError, match=r"expected a NumPy file of numbers and text.*without objects"):
                 numpy_log.read(file)
         assert not (tmp_path / "hit").exists()
 
@@ -420,7 +430,7 @@ class TestDispatch:
             read_streams(tmp_path / "none.csv")
 
     def test_a_directory_that_is_no_bag(self, tmp_path: Path):
-        with pytest.raises(RecordingError, match="metadata.yaml"):
+        with pytest.raises(RecordingError, match=r"metadata\.yaml"):
             read_streams(tmp_path)
 
     @pytest.mark.parametrize("name", ["log.xyz", "log"])

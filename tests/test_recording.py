@@ -58,6 +58,16 @@ class TestByHand:
         with pytest.raises(ValueError, match="`sensors`: expected some of 'a', 'b', 'c', got 'd'"):
             recording.select(sensors=["d"])
 
+    def test_between(self):
+        temperature = torch.arange(50.0)
+        recording = gf.Recording(signal(), rate=10, channels={"temperature": temperature})
+        part = recording.between(1.0, 3.05)
+        torch.testing.assert_close(part.signal, recording.signal[:, 10:30])
+        torch.testing.assert_close(part.channels["temperature"], temperature[10:30])
+        assert part.time[0].item() == pytest.approx(1.0)
+        with pytest.raises(ValueError, match="expected a stretch within 0 to 5 s, got 6 to 7 s"):
+            recording.between(6, 7)
+
     def test_summary_and_dict_are_reproducible(self):
         values = signal()
         values[1, 10:20] = torch.nan

@@ -54,3 +54,27 @@ def test_nothing_warns_on_good_data():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         fit_svo(array()).summary()
+
+
+def test_motion_is_recognised_and_noise_is_not():
+    """Sensors that agree at a scale that counts have felt the same motion."""
+    still = array()
+    assert fit_svo(still).motion == ""
+    turned = still + 3 * torch.sin(2 * torch.pi * torch.arange(3000, dtype=torch.float64) / 64)
+    result = fit_svo(turned)
+    assert result.agreement.argmax().item() in (4, 5)  # half a period is 32 samples
+    assert "the array seems to have moved" in result.motion
+    assert result.summary().endswith("fit the weights on a stretch at rest.")
+    elsewhere = [1.0] + 10 * [0.0]
+    assert fit_svo(turned, elsewhere).motion == ""
+
+
+def test_agreement_by_hand():
+    wccv = torch.from_numpy(naive.wavelet_cross_covariance(naive.array(4, 300), 3))
+    result = fit_svo(torch.from_numpy(naive.array(4, 300)), n_levels=3)
+    for level in range(3):
+        correlation = wccv[level].numpy().copy()
+        correlation /= np.sqrt(np.outer(np.diag(correlation), np.diag(correlation)))
+        # torch's median of an even number is the lower of the two in the middle
+        expected = np.sort(correlation[np.triu_indices(4, 1)])[2]
+        np.testing.assert_allclose(result.agreement[level], expected, rtol=1e-9)

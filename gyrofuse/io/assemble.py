@@ -61,12 +61,13 @@ def assemble(
 
     units, factors, unit_notes = _units(streams, unit, scale, source)
     notes += unit_notes
+    notes += [note for stream in streams for note in _flaws(stream)]
     devices = list(zip(streams, placed, factors, strict=True))
     if axes:
-        signal = np.stack([np.stack([_clean(s, axis, p, f, notes) for s, p, f in devices]) for axis in axes])
+        signal = np.stack([np.stack([_clean(s, axis, p, f) for s, p, f in devices]) for axis in axes])
         sensors = tuple(stream.name for stream in streams)
     else:
-        signal = np.stack([_clean(s, axis, p, f, notes) for s, p, f in devices for axis in s.gyro])
+        signal = np.stack([_clean(s, axis, p, f) for s, p, f in devices for axis in s.gyro])
         # The axes of a single device are its sensors.
         sensors = tuple(axis if len(s.gyro) > 1 else s.name for s in streams for axis in s.gyro)
     return Assembled(signal, common_rate, units, sensors, axes, _channels(streams, placed), tuple(notes))
@@ -162,37 +163,37 @@ def _choose_axes(
 
 def _grids(streams: Sequence[Stream], rate: float | None, source: str) -> list[Grid]:
     """The grid of each device; devices that share a clock share one."""
-    known: dict[tuple[Any, ...], Grid] = {}
+    known: dict[tuple[float, ...], Grid] = {}
     grids = []
     for stream in streams:
-        stated = rate if rate is not None else stream.rate
         if stream.n_samples < 2:
             raise RecordingError(f"{source}: expected at least 2 samples of {stream.name}, found {stream.n_samples}")
-        if stream.time is None and stated is None:
+        stated = stream.rate if rate is None else rate
+        if stream.time is None and (stated is None or not stated > 0):
+            found = "neither" if stated is None else f"a rate of {stated!r}"
             raise RecordingError(
-                f"{source}: expected timestamps or a sampling rate, found neither; give the rate with rate= (--rate HZ)"
+                f"{source}: expected timestamps or a sampling rate, found {found}; give the rate with rate= (--rate HZ)"
             )
-        if stream.time is None:
-            if not stated > 0:
-                raise RecordingError(
-                    f"{source}: expected a sampling rate above 0, found {stated!r}; give it with rate= (--rate HZ)"
-                )
-            identity: tuple[Any, ...] = (stream.n_samples, stated)
-            if identity not in known:
-                known[identity] = regular_grid(stream.n_samples, stated)
+        if stream.time is None and stated is not None:
+            identity = (stream.n_samples, stated)
+            grid = known.get(identity) or regular_grid(stream.n_samples, stated)
         else:
-            identity = (id(stream.time), stream.time.size)
-            if identity not in known:
-                known[identity] = grid_of(
-                    stream.time,
-                    name=stream.name,
-                    source=source,
-                    clock_period=stream.clock_period,
-                    rate=rate,
-                    nominal=stream.rate,
-                )
-        grids.append(known[identity])
+            identity = (id(stream.time), -1.0)
+            grid = known.get(identity) or _clocked(stream, rate, source)
+        known[identity] = grid
+        grids.append(grid)
     return grids
+
+
+def _clocked(stream: Stream, rate: float | None, source: str) -> Grid:
+    return grid_of(
+        np.asarray(stream.time, dtype=np.float64),
+        name=stream.name,
+        source=source,
+        clock_period=stream.clock_period,
+        rate=rate,
+        nominal=stream.rate,
+    )
 
 
 def _units(
@@ -222,20 +223,27 @@ def _units(
     return target, factors, notes
 
 
-def _clean(stream: Stream, axis: str, place: Placed, factor: float, notes: list[Note]) -> Array:
-    """One gyro on the common grid in the common unit, non-finite samples as NaN."""
-    values = np.asarray(stream.gyro[axis], dtype=np.float64)
-    label = stream.name if len(stream.gyro) == 1 else f"{stream.name} {axis}"
-    missing = int((~np.isfinite(values)).sum())
-    if missing or _starts_from_zero(stream):
-        values = np.where(np.isfinite(values), values, np.nan)
-    if missing:
-        notes.append(
-            Note("non_finite", label, f"{missing} samples are not finite; they are NaN", {"samples": float(missing)})
-        )
+def _flaws(stream: Stream) -> list[Note]:
+    """Samples of a device that say nothing."""
+    notes = []
+    missing = {axis: int((~np.isfinite(values)).sum()) for axis, values in stream.gyro.items()}
+    if any(missing.values()):
+        which = ", ".join(f"{count} on {axis}" if axis else str(count) for axis, count in missing.items() if count)
+        total = float(sum(missing.values()))
+        notes.append(Note("non_finite", stream.name, f"samples that are not finite: {which}; NaN", {"samples": total}))
     if _starts_from_zero(stream):
+        notes.append(Note("startup", stream.name, "the first sample is zero on every axis, as on starting up; NaN"))
+    return notes
+
+
+def _clean(stream: Stream, axis: str, place: Placed, factor: float) -> Array:
+    """One gyro on the common grid in the common unit, samples that say nothing as NaN."""
+    values = np.asarray(stream.gyro[axis], dtype=np.float64)
+    startup = _starts_from_zero(stream)
+    if startup or not np.isfinite(values).all():
+        values = np.where(np.isfinite(values), values, np.nan)
+    if startup:
         values[0] = np.nan
-        notes.append(Note("startup", label, "the first sample is zero on every axis, as devices start up; it is NaN"))
     placed = place.spread(values)
     return placed * factor if factor != 1.0 else placed
 

@@ -191,7 +191,7 @@ def _classify(name: str) -> Column:
 
 def _time_column(name: str, tail: list[str], stated: str, rest: list[str], numbers: list[str]) -> Column:
     unit = _TIME_TOKENS.get(stated.lower(), "") or next((_TIME_TOKENS[t] for t in tail[1:] if t in _TIME_TOKENS), "")
-    return Column(name, "time", _device(rest, numbers, _TIME_TOKENS.keys()), "", unit)
+    return Column(name, "time", _device(rest, numbers, set(_TIME_TOKENS)), "", unit)
 
 
 def _device(rest: list[str], numbers: list[str], drop: frozenset[str] | set[str]) -> str:
@@ -211,7 +211,7 @@ def time_in_seconds(column: Column, values: NDArray[np.generic]) -> tuple[Array,
     """
     ticks = np.asarray(values, dtype=np.float64)
     fine = "sampletimefine" in re.sub(r"[^a-z]", "", column.name.lower())
-    unit, note = column.unit, ""
+    unit, note = column.unit or ("us" if fine else ""), ""  # SampleTimeFine counts microseconds
     if not unit:
         finite = ticks[np.isfinite(ticks)]
         step = float(np.median(np.abs(np.diff(finite)))) if finite.size > 1 else 0.0
@@ -224,7 +224,7 @@ def time_in_seconds(column: Column, values: NDArray[np.generic]) -> tuple[Array,
             unit = "s"
         else:
             unit = "ms" if step < 200 else "us" if step < 200e3 else "ns"
-        if unit != "s" and not (fine and unit == "us"):
+        if unit != "s":
             note = f"time column '{column.name}' states no unit: read as {unit} from its median step of {step:g}"
     return ticks * TICK[unit], WRAP_32_BIT * TICK[unit] if fine else None, note
 

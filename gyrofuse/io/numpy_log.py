@@ -49,11 +49,12 @@ def read(path: Path, *, key: str | None = None) -> list[Stream]:
         RecordingError: Not a NumPy file, damaged, with objects, ambiguous, or without gyro data.
     """
     try:
-        loaded = np.load(path, mmap_mode="r", allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            return _bare_array(loaded, path, key)
-        with loaded:
-            content = {name: loaded[name] for name in loaded.files}
+        with path.open("rb") as file:  # opened here: np.load leaves a damaged archive open
+            if file.read(2) != b"PK":
+                return _bare_array(np.load(path, mmap_mode="r", allow_pickle=False), path, key)
+            file.seek(0)
+            with np.load(file, allow_pickle=False) as archive:
+                content = {name: archive[name] for name in archive.files}
     except RecordingError:
         raise
     except Exception as error:  # a damaged file may fail anywhere in the library
@@ -117,13 +118,13 @@ def _recording(content: _Content, path: Path, key: str | None) -> list[Stream]:
     for name, value in content.items():
         if name in ("gyro", "sensors", "axes"):
             continue
-        base, _, owner = name.removesuffix("]").rpartition("[")
+        owner = next((sensor for sensor in sensors if name.endswith(f"[{sensor}]")), "")
         named_gyro = classify_columns(["gyro", name])[1].kind == "gyro"
-        if not (named_gyro or (base and owner in sensors)):
+        if not (named_gyro or owner):
             spread[name] = value
         elif value.dtype.kind in "biuf" and value.shape[-1:] == (n_samples,):
             # `temperature[imu2]` belongs to the sensor imu2; a second gyro is a channel.
-            number, label = (0, name) if named_gyro else (sensors.index(owner), base)
+            number, label = (sensors.index(owner), name.removesuffix(f"[{owner}]")) if owner else (0, name)
             own[number][label] = value.astype(np.float64)
     return [
         replace(stream, name=sensor, channels=stream.channels | channels, notes=(*stream.notes, *notes))
