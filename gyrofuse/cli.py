@@ -140,6 +140,10 @@ def fuse(
     levels: Annotated[
         int | None, typer.Option(metavar="J", help="Number of levels; as many as fit by default.")
     ] = None,
+    rest: Annotated[
+        str | None,
+        typer.Option(metavar="START:STOP", help="Choose the weights on this stretch alone (seconds); fuse all of it."),
+    ] = None,
     axis: Axis = None,
     sensors: Sensors = None,
     rate: Rate = None,
@@ -157,12 +161,12 @@ def fuse(
     force: Force = False,
 ) -> None:
     """Fuse an array, recorded at rest, into one virtual gyro."""
-    weights = _scale_weights(scale_weights)
+    weights, stretch = _scale_weights(scale_weights), _stretch(rest)
     with _outputs(force, logs, out=out, figure=figure, json=json_file, report=report) as drafts:
         recording = _read(logs, axis, sensors, rate, unit, scale, key, mounting)
         with progress("fusing"):
             result = fit_svo(
-                recording,
+                recording.between(*stretch) if stretch else recording,
                 weights,
                 method=method.value.replace("-", "_"),
                 confidence_level=confidence_level,
@@ -303,6 +307,16 @@ def _read_model(path: Path) -> Model | ArrayModel:
         return model_from_dict(content)
     except (ValueError, TypeError, AttributeError) as error:
         raise ValueError(f"{path}: expected a model in JSON, as to_dict() of a model gives it: {error}") from None
+
+
+def _stretch(rest: str | None) -> tuple[float, float] | None:
+    if rest is None:
+        return None
+    try:
+        start, stop = (float(edge) for edge in rest.split(":"))
+    except ValueError:
+        raise ValueError(f"`--rest`: expected START:STOP in seconds, such as 0:60, got {rest!r}") from None
+    return start, stop
 
 
 def _scale_weights(text: str) -> str | list[float]:

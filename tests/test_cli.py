@@ -128,6 +128,21 @@ def test_options_reach_the_fit(run: Run, log: Path, options: list[str], argument
     assert gf.fit_svo(gf.read_recording(log), **arguments).summary() in run("fuse", log, *options).out
 
 
+def test_weights_of_a_stretch_at_rest_fuse_everything(run: Run, tmp_path: Path):
+    signal = torch.tensor([[1.0], [2.0], [1.5]], dtype=torch.float64) * noise(3, 2000)
+    signal[:, 1000:] += 50 * torch.sin(torch.arange(1000, dtype=torch.float64) / 20)  # the array is moved
+    recording = gf.Recording(signal, rate=100.0, unit="deg/s")
+    recording.save(tmp_path / "moved.npz")
+    assert "seems to have moved" in run("fuse", "moved.npz").out
+    done = run("fuse", "moved.npz", "--rest", "0:10", "--out", "virtual.npz")
+    assert done.status == 0
+    assert "seems to have moved" not in done.out
+    with np.load(tmp_path / "virtual.npz") as written:
+        expected = gf.fit_svo(signal[:, :1000])
+        np.testing.assert_allclose(written["weights"], expected.weights, rtol=1e-9)
+        np.testing.assert_allclose(written["gyro"][0], expected.virtual(signal), rtol=1e-9)
+
+
 def test_reading_options_reach_the_reader(run: Run, tmp_path: Path):
     counts = (1000 * noise(3, 500)).round().numpy()
     np.savez(tmp_path / "counts.npz", rates=counts, acceleration=counts)
@@ -328,6 +343,8 @@ def test_bad_logs_are_refused(run: Run, tmp_path: Path, name: str, says: str):
 @pytest.mark.parametrize(
     ("options", "says"),
     [
+        (["--rest", "5"], "`--rest`: expected START:STOP in seconds"),
+        (["--rest", "90:99"], "expected a stretch within 0 to 20 s, got 90 to 99 s"),
         (["--rate", "-100"], "`rate`"),
         (["--rate", "fast"], "--rate"),
         (["--scale-weights", "a,b"], "`--scale-weights`"),

@@ -105,7 +105,7 @@ class TestSaved:
         assert [p.name for p in tmp_path.iterdir()] == ["r.npz"]
 
     def test_bad_names(self, tmp_path: Path):
-        with pytest.raises(ValueError, match="ends in .npz"):
+        with pytest.raises(ValueError, match=r"ends in \.npz"):
             gf.Recording(signal(), rate=1).save(tmp_path / "r.csv")
         with pytest.raises(FileNotFoundError, match="does not exist"):
             gf.Recording(signal(), rate=1).save(tmp_path / "no" / "r.npz")
@@ -213,7 +213,7 @@ class TestAssembled:
             np.testing.assert_allclose(recording.signal.numpy(), gyro.transpose(1, 0, 2), rtol=1e-6, atol=1e-9)
 
     def test_missing_file(self, tmp_path: Path):
-        with pytest.raises(FileNotFoundError, match="a.npz"):
+        with pytest.raises(FileNotFoundError, match=r"a\.npz"):
             gf.read_recording(tmp_path / "a.npz")
 
 
