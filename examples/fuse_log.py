@@ -1,6 +1,6 @@
 """From a logged gyro array to one virtual gyro.
 
-    python examples/fuse_log.py LOG [LOG ...] [--axis z] [--out virtual.npz]
+python examples/fuse_log.py LOG [LOG ...] [--axis z] [--out virtual.npz]
 """
 
 import argparse

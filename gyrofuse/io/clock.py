@@ -271,7 +271,7 @@ def _note_jitter(book: Notebook, residual: Array, step: float) -> None:
         )
 
 
-def _note_gaps(book, slots: Slots, step: float) -> None:  # type: ignore[no-untyped-def]
+def _note_gaps(book: Notebook, slots: Slots, step: float) -> None:
     gaps = np.diff(slots) - 1
     gaps = gaps[gaps > 0]
     if gaps.size:
