@@ -156,7 +156,8 @@ def verdict(result: SVOResult) -> list[str]:
     Args:
         result: Of one array.
     """
-    sentences = _weights_in_words(result)
+    sentences = [f"Beware: {result.motion}."] if result.motion else []
+    sentences += _weights_in_words(result)
     if result.method != "equal":
         sentences.append(_compared(result, result.equal_wavelet_variance, "the plain mean"))
     best = result.wavelet_variance.amin(-1)

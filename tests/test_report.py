@@ -139,6 +139,13 @@ def test_verdict_of_the_plain_mean():
     assert not any("than that of the plain mean" in sentence for sentence in sentences)
 
 
+def test_verdict_begins_with_motion():
+    still = noise(3, 3000)
+    assert "moved" not in verdict(fit_svo(still))[0]
+    turned = still + 20 * torch.sin(torch.arange(3000, dtype=torch.float64) / 10)
+    assert verdict(fit_svo(turned))[0].startswith("Beware: the sensors agree closely")
+
+
 def test_verdict_warns_where_observations_are_fewer_than_sensors():
     result = made_up([0.9, 0.9, 0.9])
     assert not any("fewer independent" in sentence for sentence in verdict(result))
