@@ -21,6 +21,8 @@ parser.add_argument("--levels", type=int, default=14)
 parser.add_argument("--chunk", type=int, default=1_000_000)
 parser.add_argument("--out", type=Path)
 arguments = parser.parse_args()
+if arguments.out and arguments.out.exists():
+    parser.error(f"{arguments.out} exists already; choose another name")
 
 with tempfile.TemporaryDirectory() as scratch:
     log = arguments.log
@@ -30,6 +32,8 @@ with tempfile.TemporaryDirectory() as scratch:
         np.save(log, array.numpy())
     signal = np.load(log, mmap_mode="r")  # (sensor, time)
     n_sensors, n_samples = signal.shape
+    if n_sensors >= n_samples:
+        parser.error(f"{log}: expected (sensor, time), found shape {signal.shape}; transpose it")
     chunks = [slice(start, start + arguments.chunk) for start in range(0, n_samples, arguments.chunk)]
 
     metric = gf.WaveletCrossCovariance(n_sensors, arguments.levels)

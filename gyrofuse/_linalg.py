@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from gyrofuse._result import named
+
 
 class SingularCovarianceError(ValueError):
     """A covariance matrix of the array is not positive definite, so there are no optimal weights."""
@@ -55,14 +57,14 @@ def _cause(matrix: Tensor, correlation: Tensor, names: Sequence[str], tolerance:
     missing = (~matrix.diagonal().isfinite()).nonzero().flatten().tolist()
     if missing:
         return (
-            f"sensor(s) {_join(names, missing)} have no complete window at some level; "
+            f"sensor(s) {named(names, missing)} have no complete window at some level; "
             "leave them out or use fewer levels"
         )
     if not bool(matrix.isfinite().all()):
         return "some sensors are never recorded together; leave one of them out"
     dead = (matrix.diagonal() <= 0).nonzero().flatten().tolist()
     if dead:
-        return f"sensor(s) {_join(names, dead)} never change (dead or stuck); leave them out"
+        return f"sensor(s) {named(names, dead)} never change (dead or stuck); leave them out"
     equal = (correlation.abs() >= 1 - max(tolerance, 1e-9)).triu(1).nonzero().tolist()
     if equal:
         pairs = ", ".join(f"{names[i]} and {names[k]}" for i, k in equal[:5])
@@ -71,7 +73,3 @@ def _cause(matrix: Tensor, correlation: Tensor, names: Sequence[str], tolerance:
         "the sensors are linearly dependent, or the recording is too short for its number of sensors; "
         "leave sensors out, use more scales, or record longer"
     )
-
-
-def _join(names: Sequence[str], which: Sequence[int]) -> str:
-    return ", ".join(names[i] for i in which)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from torch import Tensor
@@ -13,6 +14,12 @@ class ConfidenceInterval(NamedTuple):
 
     low: Tensor
     high: Tensor
+
+
+def named(names: Sequence[str], which: Sequence[int], most: int = 5) -> str:
+    """Some of the names for a message, not more than a line can bear."""
+    more = f" and {len(which) - most} more" if len(which) > most else ""
+    return ", ".join(names[i] for i in which[:most]) + more
 
 
 def numbered(n: int) -> tuple[str, ...]:

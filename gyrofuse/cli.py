@@ -7,8 +7,11 @@ Bad input ends with one line on stderr and exit status 2, a defect of the progra
 from __future__ import annotations
 
 import json
+import math
 import shutil
+import signal
 import sys
+import threading
 import zipfile
 from collections.abc import Sequence
 from enum import Enum
@@ -115,7 +118,8 @@ def info(
     force: Force = False,
 ) -> None:
     """Show what is in a log: sensors, rate, gaps, units, channels."""
-    with _outputs(force, logs, json=json_file, report=report) as drafts:
+    inputs = [*logs, *([mounting] if mounting else [])]
+    with _outputs(force, inputs, json=json_file, report=report) as drafts:
         recording = _read(logs, axis, sensors, rate, unit, scale, key, mounting)
         if json_file:
             _write_json(drafts[json_file], recording.to_dict())
@@ -162,7 +166,8 @@ def fuse(
 ) -> None:
     """Fuse an array, recorded at rest, into one virtual gyro."""
     weights, stretch = _scale_weights(scale_weights), _stretch(rest)
-    with _outputs(force, logs, out=out, figure=figure, json=json_file, report=report) as drafts:
+    inputs = [*logs, *([mounting] if mounting else [])]
+    with _outputs(force, inputs, out=out, figure=figure, json=json_file, report=report) as drafts:
         recording = _read(logs, axis, sensors, rate, unit, scale, key, mounting)
         with progress("fusing"):
             result = fit_svo(
@@ -173,6 +178,11 @@ def fuse(
                 n_levels=levels,
             )
             virtual = result.virtual(recording)
+        remarks = []
+        if stretch:
+            remarks = [
+                f"Weights from {stretch[0]:g} to {stretch[1]:g} s of {recording.duration:.6g} s; all of it fused."
+            ]
         if out:
             fused = Recording(
                 virtual.unsqueeze(-2),
@@ -187,14 +197,15 @@ def fuse(
             if figure:
                 save_figure(fusion_figure(result), drafts[figure], figure.suffix[1:])
             if report:
-                page = fusion_report(result, recording, virtual, title=f"Virtual gyro of {_titled(logs)}")
+                title = f"Virtual gyro of {_titled(logs)}"
+                page = fusion_report(result, recording, virtual, title=title, remarks=remarks)
                 drafts[report].write_text(page, encoding="utf-8")
         if json_file:
             _write_json(drafts[json_file], result.to_dict())
     for note in recording.notes:
         if note.kind == "axes":
             warn(str(note))
-    say(result.summary())
+    say("\n".join([result.summary(), *remarks]))
     _say_notes(recording)
 
 
@@ -275,6 +286,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # names in logs may hold what the terminal cannot show
             stream.reconfigure(errors="replace")
+    if threading.current_thread() is threading.main_thread():  # ended from outside: leave no draft behind
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     app(arguments)
 
 
@@ -315,7 +328,9 @@ def _stretch(rest: str | None) -> tuple[float, float] | None:
     try:
         start, stop = (float(edge) for edge in rest.split(":"))
     except ValueError:
-        raise ValueError(f"`--rest`: expected START:STOP in seconds, such as 0:60, got {rest!r}") from None
+        start = stop = math.nan
+    if not start < stop:
+        raise ValueError(f"`--rest`: expected START:STOP in seconds, such as 0:60, got {rest!r}")
     return start, stop
 
 

@@ -40,7 +40,7 @@ def wavelet_cross_covariance(signal: Tensor, n_levels: int | None = None) -> Ten
     """
     check_signal("signal", signal)
     n_levels = check_n_levels(n_levels, signal.shape[-1])
-    if signal.requires_grad and torch.is_grad_enabled():
+    if torch.compiler.is_compiling() or (signal.requires_grad and torch.is_grad_enabled()):
         return cross_covariance(haar_coefficients(signal, n_levels))
     sums, counts = wavelet_products(signal.detach(), n_levels)
     return mean_products(sums, counts).to(signal.dtype)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import torch
@@ -94,6 +95,9 @@ class WaveletCrossCovariance(Metric):
     def compute(self) -> Tensor:
         """Return the wavelet cross-covariance so far, `(level, sensor, sensor)`, unit of the signal squared."""
         self._settle()
+        if not bool((self.counts > 0).any()):
+            warnings.warn("fewer than two samples in a row taken in so far: every level is NaN", stacklevel=2)
+            return torch.full_like(self.sums, torch.nan).to(self.signal_dtype)
         return mean_products(self.sums, self.counts).to(self.signal_dtype)
 
     def forward(self, chunk: Tensor) -> Tensor:

@@ -33,7 +33,7 @@ class Recording:
         sensors: Name of each sensor; "1", "2", ... by default.
         time: `(time,)`, seconds from the first slot of the grid; from the rate by default.
         channels: Auxiliary channels on the same grid, time last: `temperature` (time,), `acceleration` (3, time). A
-            channel of one among several devices carries its name: `temperature[imu2]`.
+            channel that several devices have carries the device's name: `temperature[imu2]`.
         axes: Names along the leading dimension, `("x", "y", "z")`; empty when the signal is `(sensor, time)`.
         source: Files it was read from.
         notes: What was found on reading: gaps, repeats, jitter, offsets, cuts, units.
@@ -122,13 +122,17 @@ class Recording:
         return replace(self, signal=signal, axes=axes, sensors=names)
 
     def between(self, start: float, stop: float) -> Recording:
-        """Keep the stretch from `start` to `stop` seconds: the part at rest, say.
+        """Keep the stretch from `start` to `stop` seconds after the first sample: the part at rest, say.
+
+        `time` goes on counting from where it did before.
 
         Raises:
             ValueError: Fewer than two samples lie between.
         """
-        first, last = (round(edge * self.rate) for edge in (max(start, 0.0), min(stop, self.duration)))
-        if not last - first >= 2:
+        within = start < stop and start < self.duration and stop > 0
+        edges = (max(start, 0.0), min(stop, self.duration)) if within else (0.0, 0.0)
+        first, last = (round(edge * self.rate) for edge in edges)
+        if last - first < 2:
             raise ValueError(
                 f"`start`, `stop`: expected a stretch within 0 to {self.duration:.6g} s, got {start:g} to {stop:g} s"
             )
@@ -161,6 +165,9 @@ class Recording:
         path = Path(path)
         if path.suffix != ".npz":
             raise ValueError(f"`path`: expected a name that ends in .npz, got {path.name!r}")
+        taken = {"gyro", "fs", "unit", "sensors", "time", "axes"} & {*self.channels}
+        if taken:
+            raise ValueError(f"`channels`: the names {', '.join(sorted(taken))} mean something else in a file; rename")
         arrays: dict[str, Any] = {name: values.numpy(force=True) for name, values in self.channels.items()}
         arrays |= {
             "gyro": self.signal.numpy(force=True),

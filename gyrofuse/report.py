@@ -167,8 +167,8 @@ def verdict(result: SVOResult) -> list[str]:
         level = int(few.nonzero()[0])
         sentences.append(
             f"From {_time(result, level)} on, the recording holds fewer independent observations "
-            f"({number(result.degrees_of_freedom[level].item(), 2)} or less) than there are sensors: the gain there is "
-            "partly fitted to this very recording, and another one has to confirm it."
+            f"({number(result.degrees_of_freedom[level].item(), 2)} or less) than there are sensors: what it gains "
+            "there is partly fitted to this very recording, and another one has to confirm it."
         )
     return sentences
 
@@ -226,7 +226,7 @@ def _weights_in_words(result: SVOResult) -> list[str]:
 
 def _listed(result: SVOResult, which: Sequence[int]) -> str:
     """Sensors with their weights, as far as a sentence can bear."""
-    shown = [f"{result.sensors[i]} ({result.weights[i].item():.3f})" for i in which[:_MOST_NAMED]]
+    shown = [f"{result.sensors[i]} (weight {result.weights[i].item():.3f})" for i in which[:_MOST_NAMED]]
     if len(which) > _MOST_NAMED:
         shown.append(f"{len(which) - _MOST_NAMED} more")
     return _joined(shown)
@@ -253,7 +253,10 @@ def _where(result: SVOResult, difference: Tensor) -> str:
         return ""
     starts = [f"{number(result.tau[run[0]].item())} to " if len(run) > 1 else "" for run in runs]
     times = _joined([start + _time(result, run[-1]) for start, run in zip(starts, runs, strict=True)])
-    level = int(difference.nan_to_num(-math.inf).argmax())
+    # The size that the recording resolves, rather than the one that a few observations give by chance.
+    resolved = (difference > _ALIKE) & (result.degrees_of_freedom >= len(result.sensors))
+    told = resolved if bool(resolved.any()) else difference > _ALIKE
+    level = int(torch.where(told, difference, -math.inf).argmax())
     if sum(counts) == 1:
         return f"{times}, by {_percent(difference[level].item())}"
     return f"{times}, by up to {_percent(difference[level].item())} (at {_time(result, level)})"

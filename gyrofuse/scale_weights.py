@@ -14,9 +14,9 @@ ScaleWeights = str | Sequence[float] | Tensor
 def resolve_scale_weights(scale_weights: ScaleWeights, n_levels: int) -> Tensor:
     """Turn a name or numbers into scale weights that sum to 1.
 
-    `"flat"` weighs all levels alike. `"short"` is `1/(1 + exp(j - j0))` and `"long"` is `1/(1 + exp(j0 - j))`, the
-    logistic shapes of [Z] section V: `j0 = J // 2` for short; for long the papers' 13 at J = 19 and 15 at J = 21,
-    else two thirds of J, rounded up.
+    `"flat"` weighs all levels alike. `"short"` is `1/(1 + exp(j - j0))` with `j0 = J // 2`, `"long"` is
+    `1/(1 + exp(j0 - j))` with `j0 = J - 6`, or two thirds of J, rounded up, when that is more: the logistic shapes of
+    [Z] sections V and VI, whose printed digits they reproduce (J = 19 and 21).
 
     Args:
         scale_weights: `"flat"`, `"short"`, `"long"`, or one number >= 0 per level (normalised here).
@@ -37,7 +37,7 @@ def resolve_scale_weights(scale_weights: ScaleWeights, n_levels: int) -> Tensor:
         elif scale_weights == "short":
             weights = torch.sigmoid(n_levels // 2 - level)
         elif scale_weights == "long":
-            weights = torch.sigmoid(level - {19: 13, 21: 15}.get(n_levels, math.ceil(2 * n_levels / 3)))
+            weights = torch.sigmoid(level - max(n_levels - 6, math.ceil(2 * n_levels / 3)))
         else:
             raise ValueError(
                 f"`scale_weights`: expected 'flat', 'short', 'long' or one number per level, got {scale_weights!r}"

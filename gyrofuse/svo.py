@@ -21,7 +21,7 @@ from gyrofuse._checks import (
     check_signal,
 )
 from gyrofuse._linalg import check_positive_definite
-from gyrofuse._result import numbered
+from gyrofuse._result import named, numbered
 from gyrofuse.competitors import equal_weights, inverse_variance_weights
 from gyrofuse.covariance import wavelet_products
 from gyrofuse.recording import Recording
@@ -106,9 +106,8 @@ def fit_svo(
     wccv, n_products = _measure(values, n_levels)
     omega = resolve_scale_weights(scale_weights, wccv.shape[-3]).to(wccv)
     degrees = uncertainty.degrees_of_freedom(n_products)
-    # A level that does not count may well be unknown.
-    counting = torch.where(omega[:, None, None] > 0, wccv, 0.0)
-    combined = torch.einsum("j,...jik->...ik", omega, counting)
+    counting = _counting(wccv, omega)
+    combined = _combine(counting, omega)
     check_positive_definite("the wavelet cross-covariance combined over scales", combined, sensors, dtype=values.dtype)
 
     weights_degrees = torch.full_like(combined[..., 0], torch.inf)
@@ -148,9 +147,7 @@ def _check_array(values: Tensor, sensors: Sequence[str]) -> None:
     known = values.isfinite().any(-1)
     if not bool(known.all()):
         empty = (~known).reshape(-1, values.shape[-2]).any(0).nonzero().flatten().tolist()
-        raise ValueError(
-            f"`signal`: sensor(s) {', '.join(sensors[i] for i in empty)} have no finite sample; leave them out"
-        )
+        raise ValueError(f"`signal`: sensor(s) {named(sensors, empty)} have no finite sample; leave them out")
 
 
 def _measure(values: Tensor, n_levels: int | None) -> tuple[Tensor, Tensor]:
@@ -158,16 +155,23 @@ def _measure(values: Tensor, n_levels: int | None) -> tuple[Tensor, Tensor]:
 
     Without `n_levels`, as many levels as all pairs have a complete window for.
     """
-    sums, counts = wavelet_products(values.detach(), check_n_levels(n_levels, values.shape[-1]))
+    asked = check_n_levels(n_levels, values.shape[-1])
+    sums, counts = wavelet_products(values.detach(), asked)
     fewest = counts.amin((-1, -2))  # (..., level)
     if n_levels is None:
-        n_levels = int((fewest > 0).reshape(-1, fewest.shape[-1]).all(0).sum())
-        if n_levels == 0:
+        asked = int((fewest > 0).reshape(-1, fewest.shape[-1]).all(0).sum())
+        if asked == 0:
             raise ValueError(
                 "`signal`: expected two samples in a row that all sensors have, found none; "
                 "the sensors are not recorded together"
             )
-    return (sums / counts)[..., :n_levels, :, :], fewest[..., :n_levels]
+    windows = fewest[..., :asked].sum(-1)
+    if bool((windows < values.shape[-2]).any()):
+        raise ValueError(
+            f"`signal`: expected at least as many complete windows as sensors ({values.shape[-2]}), "
+            f"got {int(windows.min())}; record longer or leave sensors out"
+        )
+    return (sums / counts)[..., :asked, :, :], fewest[..., :asked]
 
 
 class SVOWeights(nn.Module):
@@ -213,6 +217,10 @@ class SVO(nn.Module):
 
     def __init__(self, scale_weights: ScaleWeights = "flat") -> None:
         super().__init__()
+        if isinstance(scale_weights, str):
+            resolve_scale_weights(scale_weights, 1)  # a wrong name is told now, not when it is used
+        else:
+            normalised(scale_weights)
         self.scale_weights = scale_weights
         self.register_buffer("weights", torch.empty(0, dtype=torch.float64))
 
@@ -230,7 +238,8 @@ class SVO(nn.Module):
             TypeError, ValueError, SingularCovarianceError: As `fit_svo`; the weights then stay as they were.
         """
         result = fit_svo(signal, self.scale_weights, **options)
-        self.weights = result.weights.detach().clone()
+        with torch.inference_mode(False):  # so that they can be used in training later
+            self.weights = result.weights.detach().clone()
         return result
 
     def forward(self, signal: Tensor) -> Tensor:
@@ -260,8 +269,12 @@ def _check_levels(wccv: Tensor) -> int:
 
 def _combine(wccv: Tensor, omega: Tensor) -> Tensor:
     omega = omega.to(wccv)
-    # A level that does not count may well be unknown.
-    return torch.einsum("j,...jik->...ik", omega, torch.where(omega[:, None, None] > 0, wccv, 0.0))
+    return torch.einsum("j,...jik->...ik", omega, _counting(wccv, omega))
+
+
+def _counting(wccv: Tensor, omega: Tensor) -> Tensor:
+    """Levels that count; one that does not may well be unknown (NaN)."""
+    return torch.where(omega[:, None, None] > 0, wccv, 0.0)
 
 
 def _optimal_weights(combined: Tensor) -> Tensor:

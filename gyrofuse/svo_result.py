@@ -36,6 +36,8 @@ def fuse(weights: Tensor, signal: Tensor) -> Tensor:
 
 # Noise of separate sensors hardly agrees more than this at any scale; motion that all of them feel does.
 _MOTION = 0.7
+# A level of fewer observations than this shows agreement by chance.
+_TELLING = 8.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +116,8 @@ class SVOResult:
     @property
     def motion(self) -> str:
         """A warning that the array seems to have moved while it was fitted, or an empty string."""
-        agreement = torch.where(self.scale_weights > 0, self.agreement, 0.0)
+        telling = (self.scale_weights > 0) & (self.degrees_of_freedom >= _TELLING)
+        agreement = torch.where(telling, self.agreement, 0.0)
         level = int(agreement.reshape(-1, self.n_levels).amax(0).argmax())
         largest = agreement[..., level].max().item()
         if not largest > _MOTION:
@@ -227,6 +230,7 @@ class SVOResult:
             "unit": self.unit,
             "n_samples": self.n_samples,
             "confidence_level": self.confidence_level,
+            "motion": self.motion,
             "weights": listed(self.weights),
             "weights_cov": listed(self.weights_cov),
             "confidence_interval": {"low": listed(low), "high": listed(high)},

@@ -32,8 +32,7 @@ def degrees_of_freedom(counts: Tensor) -> Tensor:
     """Equivalent degrees of freedom of wavelet variances.
 
     Args:
-        counts: `(..., level)` or `(..., level, ...)` with the level dimension given by `counts` of one recording;
-            number of coefficients `M_j` per level, level last.
+        counts: `(..., level)`, number of coefficients `M_j` of each level.
 
     Returns:
         `(..., level)`, at least 1.

@@ -421,6 +421,13 @@ def test_missing_arguments_are_refused(run: Run):
 # What becomes of files
 
 
+def test_the_mounting_is_never_replaced(run: Run, log: Path, tmp_path: Path):
+    mounting = tmp_path / "mounting.json"
+    mounting.write_text("{}")
+    refused(run("fuse", log, "--mounting", mounting, "--json", mounting, "--force"), "in use")
+    assert mounting.read_text() == "{}"
+
+
 def test_existing_files_stay_without_force_and_are_replaced_with_it(run: Run, log: Path):
     names = {"--out": "v.npz", "--figure": "f.png", "--json": "r.json", "--report": "r.html"}
     for option, name in names.items():

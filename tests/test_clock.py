@@ -157,3 +157,15 @@ def test_jump_of_the_clock_is_no_recording():
     time[2500:] += 1e6
     with pytest.raises(RecordingError, match="cut the log where the clock jumps"):
         grid(time)
+
+
+def test_log_sorted_backwards_is_refused_at_once():
+    with pytest.raises(RecordingError, match="mostly run backwards in imu; sort the log"):
+        grid(-np.arange(100_000) / RATE)
+
+
+def test_stated_rate_that_the_clock_contradicts_is_noted():
+    result = grid(clean(), nominal=250.0)
+    assert result.rate == pytest.approx(RATE)
+    assert numbers(result, "clock")["stated_hz"] == 250.0
+    assert grid(clean(), nominal=100.2).notes == ()

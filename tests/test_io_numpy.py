@@ -449,3 +449,11 @@ class TestDispatch:
     def test_capital_suffix(self, tmp_path: Path):
         path = save(tmp_path, gyro=table())
         assert len(read_streams(path.rename(tmp_path / "LOG.NPZ"))) == 6
+
+
+def test_time_beside_gyro_is_in_seconds(tmp_path: Path):
+    """A clock of whole seconds is one sample a second, not a thousand."""
+    np.savez(tmp_path / "a.npz", gyro=np.random.default_rng(0).normal(size=(2, 50)), time=np.arange(50.0))
+    streams = read_streams(tmp_path / "a.npz")
+    assert streams[0].time is not None
+    np.testing.assert_array_equal(streams[0].time, np.arange(50.0))

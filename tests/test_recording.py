@@ -104,6 +104,11 @@ class TestSaved:
         assert gf.read_recording(path).n_sensors == 3
         assert [p.name for p in tmp_path.iterdir()] == ["r.npz"]
 
+    def test_channel_with_a_name_of_the_format(self, tmp_path: Path):
+        recording = gf.Recording(signal(), rate=1, channels={"time": torch.zeros(50)})
+        with pytest.raises(ValueError, match="`channels`: the names time mean something else in a file"):
+            recording.save(tmp_path / "r.npz")
+
     def test_bad_names(self, tmp_path: Path):
         with pytest.raises(ValueError, match=r"ends in \.npz"):
             gf.Recording(signal(), rate=1).save(tmp_path / "r.csv")
@@ -177,8 +182,11 @@ class TestAssembled:
         np.testing.assert_allclose(recording.signal[:, 1].numpy(), true, atol=1e-8)
         with pytest.raises(ValueError, match="`mounting`: no device side in"):
             gf.read_recording(paths, mounting={"side": MOUNTED_ON_THE_BACK})
-        with pytest.raises(ValueError, match="`mounting`: expected an orthogonal 3 x 3 matrix for back"):
+        with pytest.raises(ValueError, match="`mounting`: expected a 3 x 3 rotation matrix for back"):
             gf.read_recording(paths, mounting={"back": [[1, 2], [3, 4]]})
+        mirror = [[-1, 0, 0], [0, 1, 0], [0, 0, 1]]
+        with pytest.raises(ValueError, match="`mounting`: expected a 3 x 3 rotation matrix for back"):
+            gf.read_recording(paths, mounting={"back": mirror})
         with pytest.raises(ValueError, match="`mounting`: expected a JSON file"):
             gf.read_recording(paths, mounting=tmp_path / "none.json")
 

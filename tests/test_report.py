@@ -95,8 +95,10 @@ def _leaves_matplotlib_alone():
 
 def test_verdict_says_where_the_virtual_gyro_wins_and_where_it_loses():
     carried, uncertain, against_mean, against_best = plain(verdict(made_up([0.5, 0.8, 1.2, 1.001, 0.7], best=2.0)))
-    assert carried == "Sensors that carry the virtual gyro, with weights whose 95 % intervals exclude 0: a (1.000)."
-    assert uncertain == "Sensors whose weights cannot be told from 0: b (0.000) and c (0.000)."
+    assert (
+        carried == "Sensors that carry the virtual gyro, with weights whose 95 % intervals exclude 0: a (weight 1.000)."
+    )
+    assert uncertain == "Sensors whose weights cannot be told from 0: b (weight 0.000) and c (weight 0.000)."
     assert against_mean == (
         "The Allan deviation of the virtual gyro is lower than that of the plain mean at averaging times of "
         "0.01 to 0.02 s and 0.16 s, by up to 50 % (at 0.01 s). It is higher at 0.04 s, by 20 %."
@@ -121,7 +123,7 @@ def test_verdict_orders_carriers_by_size_and_explains_negative_weights():
         weights=torch.tensor([0.3, -0.1, 0.8], dtype=torch.float64),
     )
     carried, negative, *_ = verdict(result)
-    assert carried.endswith(": c (0.800), a (0.300) and b (-0.100).")
+    assert carried.endswith(": c (weight 0.800), a (weight 0.300) and b (weight -0.100).")
     assert negative.startswith("A negative weight subtracts")
 
 
@@ -129,7 +131,7 @@ def test_verdict_without_any_certain_weight():
     unsure = dataclasses.replace(made_up([0.9]), weights_cov=torch.eye(3, dtype=torch.float64), confidence_level=0.9)
     assert verdict(unsure)[0] == "No sensor stands out: the 90 % interval of every weight holds 0."
     unknown = dataclasses.replace(made_up([0.9]), weights_cov=torch.full((3, 3), math.nan, dtype=torch.float64))
-    assert verdict(unknown)[0].startswith("The largest weights are those of a (1.000)")
+    assert verdict(unknown)[0].startswith("The largest weights are those of a (weight 1.000)")
 
 
 def test_verdict_of_the_plain_mean():

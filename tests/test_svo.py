@@ -246,8 +246,8 @@ def with_row(row: int, values: torch.Tensor | float) -> torch.Tensor:
         (array().half(), {}, TypeError, "`signal`: expected float32 or float64, got torch.float16"),
         (array().numpy(), {}, TypeError, "`signal`: expected a torch tensor, got ndarray"),
         (array()[:, :1], {}, ValueError, "`signal`: expected at least 2 samples for one wavelet level, got 1"),
-        (array()[:, :2], {}, SingularCovarianceError, "copies of each other"),
-        (array(8)[:, :5], {}, SingularCovarianceError, "the recording is too short for its number of sensors"),
+        (array()[:, :2], {}, ValueError, r"as many complete windows as sensors \(4\), got 1; record longer"),
+        (array(8)[:, :5], {}, ValueError, r"as many complete windows as sensors \(8\), got 6; record longer"),
         (array(), {"n_levels": 12}, ValueError, "`n_levels`: expected at most 11 for 3000 samples"),
         (array(), {"scale_weights": [1] * 12}, ValueError, "`n_levels`: expected at most 11 for 3000 samples"),
         (array(), {"scale_weights": [1] * 3, "n_levels": 4}, ValueError, "one number for each of 4 levels, got 3"),
@@ -285,6 +285,19 @@ def test_float32_hides_no_useless_sensor(values, message):
     """Rounding makes a copy differ a little from its original, and must not make a fortune out of the difference."""
     with pytest.raises(SingularCovarianceError, match=message):
         fit_svo(with_row(2, values).float())
+
+
+def test_whole_numbers_in_any_type_count_levels():
+    assert fit_svo(array(), n_levels=3.0).n_levels == 3
+
+
+def test_weights_fitted_without_gradients_serve_in_training():
+    svo = SVO("short")
+    with torch.inference_mode():
+        svo.fit(array())
+    signal = array().requires_grad_()
+    svo(signal).sum().backward()
+    assert signal.grad is not None
 
 
 def test_a_batch_without_items():

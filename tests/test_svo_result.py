@@ -6,6 +6,7 @@ import json
 import warnings
 
 import numpy as np
+import pytest
 import torch
 from reference import haar as naive
 
@@ -67,6 +68,17 @@ def test_motion_is_recognised_and_noise_is_not():
     assert result.summary().endswith("fit the weights on a stretch at rest.")
     elsewhere = [1.0] + 10 * [0.0]
     assert fit_svo(turned, elsewhere).motion == ""
+
+
+@pytest.mark.parametrize("n_samples", [4096, 5000])
+@pytest.mark.parametrize("walk", [False, True])
+def test_independent_sensors_hardly_ever_seem_to_have_moved(n_samples: int, walk: bool):
+    """At most 1 of 100 pairs, the hardest case: a level of one observation agrees or disagrees fully."""
+    unit = torch.randn(100, 2, n_samples, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    signal = unit.cumsum(-1) if walk else unit
+    for scale_weights in ("flat", "long"):
+        result = fit_svo(signal, scale_weights)
+        assert sum(bool(result[i].motion) for i in range(100)) <= 1
 
 
 def test_agreement_by_hand():

@@ -101,7 +101,7 @@ def _mount(streams: list[Stream], mounting: Mapping[str, Any] | str | Path | Non
             ) from error
     if not isinstance(mounting, Mapping):
         raise ValueError(f"`mounting`: expected {{device: 3 x 3 matrix}}, got {type(mounting).__name__}")
-    unknown = sorted(set(mounting) - {stream.name for stream in streams})
+    unknown = sorted(map(str, set(mounting) - {stream.name for stream in streams}))
     if unknown:
         known = ", ".join(stream.name for stream in streams)
         raise ValueError(f"`mounting`: no device {', '.join(unknown)} in {source}; there are {known}")
@@ -114,9 +114,9 @@ def _mount(streams: list[Stream], mounting: Mapping[str, Any] | str | Path | Non
             matrix = np.asarray(mounting[stream.name], dtype=np.float64)
         except (TypeError, ValueError):
             matrix = np.empty(0)
-        if matrix.shape != (3, 3) or not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6):
+        if matrix.shape != (3, 3) or not _is_rotation(matrix):
             raise ValueError(
-                f"`mounting`: expected an orthogonal 3 x 3 matrix for {stream.name}, got {mounting[stream.name]}"
+                f"`mounting`: expected a 3 x 3 rotation matrix for {stream.name}, got {mounting[stream.name]}"
             )
         if set(stream.gyro) != set(AXES):
             raise ValueError(
@@ -124,11 +124,16 @@ def _mount(streams: list[Stream], mounting: Mapping[str, Any] | str | Path | Non
             )
         rates = matrix @ np.stack([stream.gyro[a] for a in AXES])
         channels = {
-            name: matrix @ values if values.ndim == 2 and len(values) == 3 else values
+            name: matrix @ values if name in ("acceleration", "magnetic_field") else values
             for name, values in stream.channels.items()
         }
         turned.append(replace(stream, gyro=dict(zip(AXES, rates, strict=True)), channels=channels))
     return turned
+
+
+def _is_rotation(matrix: Array) -> bool:
+    """Orthogonal and no mirror: rates are axial vectors."""
+    return np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6) and bool(np.linalg.det(matrix) > 0)
 
 
 def _choose_axes(
@@ -257,7 +262,7 @@ def _starts_from_zero(stream: Stream) -> bool:
 
 
 def _channels(streams: Sequence[Stream], placed: Sequence[Placed]) -> dict[str, Array]:
-    """Auxiliary channels on the common grid; of one device among several with its name."""
+    """Auxiliary channels on the common grid; those that several devices have carry the device's name."""
     carriers = Counter(name for stream in streams for name in stream.channels)
     return {
         name if carriers[name] == 1 else f"{name}[{stream.name}]": place.spread(np.asarray(values, dtype=np.float64))

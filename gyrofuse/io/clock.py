@@ -24,6 +24,7 @@ _IRREGULAR = 0.55
 _WINDOW, _MEMORY = 64, 1024
 # A clock that is behind for more samples than this was set back.
 _SET_BACK = 100
+_MOST_SET_BACKS = 100
 # A grid with more slots a sample than this is a clock that jumps, not a recording.
 _SPARSEST = 20
 _TICKS = {"microsecond": 1e-6, "millisecond": 1e-3, "nanosecond": 1e-9}
@@ -90,6 +91,10 @@ def grid_of(
     t, n_wraps, period = _unwrap(time[kept], clock_period)
     if n_wraps:
         book.add("wraps", f"the clock wrapped {n_wraps} times, every {period:.6g} s; unwrapped", wraps=n_wraps)
+    if np.count_nonzero(np.diff(t) < 0) > t.size / 2:
+        raise RecordingError(
+            f"{source}: expected timestamps that advance, found that they mostly run backwards in {name}; sort the log"
+        )
     t = _undo_set_backs(t, book)
     ahead = t >= np.maximum.accumulate(t)
     if not ahead.all():
@@ -117,6 +122,13 @@ def grid_of(
             repeats=repeats,
         )
     residual = t - (start + step * slots)
+    if nominal is not None and rate is None and abs(step * nominal - 1) > 0.01:
+        book.add(
+            "clock",
+            f"the log states {nominal:.6g} Hz, its timestamps say {1 / step:.6g} Hz and are believed",
+            clock_hz=1 / step,
+            stated_hz=nominal,
+        )
     if rate is not None:
         seen = 1 / step
         if abs(seen / rate - 1) > 1e-3:
@@ -166,6 +178,8 @@ def _unwrap(t: Array, period: float | None) -> tuple[Array, int, float]:
 
 def _undo_set_backs(t: Array, book: Notebook) -> Array:
     """Let a clock that was set back, and does not soon catch up, go on without a gap."""
+    if (np.diff(t) < 0).sum() > _MOST_SET_BACKS:
+        return t
     for here in (np.flatnonzero(np.diff(t) < 0) + 1).tolist():
         highest = t[:here].max()
         behind = t[here:] < highest

@@ -114,6 +114,8 @@ def _recording(content: _Content, path: Path, key: str | None) -> list[Stream]:
     # A group per sensor is what several devices look like in other files.
     rates = rows.reshape(len(axes), n_sensors, n_samples)
     spread: dict[str, Any] = {f"{i}/gyro/{axis}": rates[k, i] for i in range(n_sensors) for k, axis in enumerate(axes)}
+    if "fs" not in content:
+        spread["time/unit"] = np.str_("s")  # with a rate beside it, the clock tells its unit itself
     own: list[dict[str, Array]] = [{} for _ in sensors]
     for name, value in content.items():
         if name in ("gyro", "sensors", "axes"):
