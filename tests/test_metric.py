@@ -45,7 +45,7 @@ def streamed(signal: torch.Tensor, length: int, *, look_every: int | None = None
         warnings.filterwarnings("ignore", "no complete window")
         for i, chunk in enumerate(signal.split(length, dim=-1)):
             metric.update(chunk)
-            if look_every is not None and i % look_every == 0:
+            if look_every is not None and i % look_every == 0 and metric.n_samples > 1:
                 metric.compute()
         return metric.compute()
 
@@ -72,6 +72,13 @@ def test_the_result_so_far_is_that_of_the_samples_so_far(monkeypatch):
         expected = naive.wavelet_cross_covariance(signal[:, : start + 50].numpy(), 5)
         assert naive.relative_error(metric.compute(), expected) < 1e-10
         assert metric.n_samples == start + 50
+
+
+def test_nothing_taken_in_is_nan_and_says_so():
+    metric = WaveletCrossCovariance(N_SENSORS, 4)
+    metric.update(recording(600)[:, :1])
+    with pytest.warns(UserWarning, match="fewer than two samples in a row taken in so far"):
+        assert metric.compute().isnan().all()
 
 
 def test_forward_gives_the_result_so_far():
