@@ -35,6 +35,7 @@ def read_streams(path: Path, *, key: str | None = None) -> list[Stream]:
 
     Raises:
         FileNotFoundError: No such file.
+        PermissionError: The file may not be read.
         RecordingError: A format that is not read, an empty file, or what the format's reader raises.
         ImportError: The format's library is not installed.
     """
@@ -50,6 +51,7 @@ def read_streams(path: Path, *, key: str | None = None) -> list[Stream]:
     elif path.stat().st_size == 0:
         raise RecordingError(f"{path}: expected a log, found an empty file; record or copy it again")
     else:
-        reader = _READERS[path.suffix.lower()]
+        with path.open("rb"):  # a file that may not be read says so itself
+            reader = _READERS[path.suffix.lower()]
     streams: list[Stream] = import_module(f"gyrofuse.io.{reader}").read(path, key=key)
     return streams

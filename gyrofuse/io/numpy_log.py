@@ -50,7 +50,13 @@ def read(path: Path, *, key: str | None = None) -> list[Stream]:
     """
     try:
         with path.open("rb") as file:  # opened here: np.load leaves a damaged archive open
-            if file.read(2) != b"PK":
+            magic = file.read(6)
+            if magic[:2] != b"PK" and magic != b"\x93NUMPY":
+                raise RecordingError(
+                    f"{path}: expected a NumPy file, found something else; save it with np.savez or np.save, or name "
+                    "it by its format"
+                )
+            if magic[:2] != b"PK":
                 return _bare_array(np.load(path, mmap_mode="r", allow_pickle=False), path, key)
             file.seek(0)
             with np.load(file, allow_pickle=False) as archive:
