@@ -6,44 +6,17 @@ import json
 import math
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 import torch
+from conftest import Outcome, Run
 
 import gyrofuse as gf
 from gyrofuse import cli
 
 ROOT = Path(__file__).resolve().parents[1]
-
-
-class Outcome(NamedTuple):
-    """How a command ended."""
-
-    status: int
-    out: str
-    err: str
-
-
-Run = Callable[..., Outcome]
-
-
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
-    """Run a command in an empty folder."""
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments: object) -> Outcome:
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            cli.main([str(argument) for argument in arguments])
-        status = ended.value.code
-        return Outcome(status if isinstance(status, int) else 0 if status is None else 1, *capsys.readouterr())
-
-    return run
 
 
 def noise(*shape: int, seed: int = 0) -> torch.Tensor:
