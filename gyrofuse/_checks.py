@@ -87,9 +87,3 @@ def check_confidence_level(value: float) -> float:
     if not 0 < number < 1:
         raise ValueError(f"`confidence_level`: expected a number between 0 and 1 such as 0.95, got {value!r}")
     return number
-
-
-def missing_to_nan(signal: Tensor) -> Tensor:
-    """Replace infinities by NaN, the one mark of a missing sample; no copy when there are none."""
-    infinite = torch.isinf(signal)
-    return torch.where(infinite, torch.nan, signal) if bool(infinite.any()) else signal

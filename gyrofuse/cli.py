@@ -118,8 +118,7 @@ def info(
     force: Force = False,
 ) -> None:
     """Show what is in a log: sensors, rate, gaps, units, channels."""
-    inputs = [*logs, *([mounting] if mounting else [])]
-    with _outputs(force, inputs, json=json_file, report=report) as drafts:
+    with _outputs(force, [*logs, mounting], json=json_file, report=report) as drafts:
         recording = _read(logs, axis, sensors, rate, unit, scale, key, mounting)
         if json_file:
             _write_json(drafts[json_file], recording.to_dict())
@@ -166,8 +165,7 @@ def fuse(
 ) -> None:
     """Fuse an array, recorded at rest, into one virtual gyro."""
     weights, stretch = _scale_weights(scale_weights), _stretch(rest)
-    inputs = [*logs, *([mounting] if mounting else [])]
-    with _outputs(force, inputs, out=out, figure=figure, json=json_file, report=report) as drafts:
+    with _outputs(force, [*logs, mounting], out=out, figure=figure, json=json_file, report=report) as drafts:
         recording = _read(logs, axis, sensors, rate, unit, scale, key, mounting)
         with progress("fusing"):
             result = fit_svo(
@@ -345,14 +343,16 @@ def _scale_weights(text: str) -> str | list[float]:
         ) from None
 
 
-def _outputs(force: bool, inputs: Sequence[Path] = (), **asked: Path | None) -> Outputs:
-    """Files to write, those asked for, by option."""
+def _outputs(force: bool, inputs: Sequence[Path | None] = (), **asked: Path | None) -> Outputs:
+    """Files to write, those asked for, by option; none of the inputs given is ever replaced."""
     for option, path in asked.items():
         if path is not None and path.suffix not in _SUFFIXES[option]:
             raise ValueError(
                 f"`--{option}`: expected a name that ends in {' or '.join(_SUFFIXES[option])}, got {str(path)!r}"
             )
-    return Outputs([path for path in asked.values() if path is not None], force=force, inputs=inputs)
+    return Outputs(
+        [path for path in asked.values() if path is not None], force=force, inputs=[path for path in inputs if path]
+    )
 
 
 def _save(recording: Recording, path: Path, **arrays: np.ndarray[Any, Any]) -> None:

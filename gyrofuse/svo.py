@@ -50,7 +50,8 @@ def svo_weights(wccv: Tensor, scale_weights: ScaleWeights = "flat") -> Tensor:
     References:
         [Z] equation (7).
     """
-    combined = _combine(wccv, resolve_scale_weights(scale_weights, _check_levels(wccv)))
+    omega = resolve_scale_weights(scale_weights, _check_levels(wccv)).to(wccv)
+    combined = _combine(_counting(wccv, omega), omega)
     check_positive_definite("the wavelet cross-covariance combined over scales", combined)
     return _optimal_weights(combined)
 
@@ -195,7 +196,8 @@ class SVOWeights(nn.Module):
             omega = resolve_scale_weights(self.scale_weights, n_levels)
         elif len(omega) != n_levels:
             raise ValueError(f"`wccv`: expected {len(omega)} levels, one for each scale weight, got {n_levels}")
-        return _optimal_weights(_combine(wccv, omega))
+        omega = omega.to(wccv)
+        return _optimal_weights(_combine(_counting(wccv, omega), omega))
 
 
 class SVO(nn.Module):
@@ -267,9 +269,9 @@ def _check_levels(wccv: Tensor) -> int:
     return wccv.shape[-3]
 
 
-def _combine(wccv: Tensor, omega: Tensor) -> Tensor:
-    omega = omega.to(wccv)
-    return torch.einsum("j,...jik->...ik", omega, _counting(wccv, omega))
+def _combine(counting: Tensor, omega: Tensor) -> Tensor:
+    """`A = sum_j omega_j Gamma_j`, [Z] equation (6)."""
+    return torch.einsum("j,...jik->...ik", omega, counting)
 
 
 def _counting(wccv: Tensor, omega: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gyrofuse.io.columns import TICK, WRAP_32_BIT
 from gyrofuse.io.notes import Note, Notebook
 from gyrofuse.io.stream import Array, RecordingError
 
@@ -27,7 +28,6 @@ _SET_BACK = 100
 _MOST_SET_BACKS = 100
 # A grid with more slots a sample than this is a clock that jumps, not a recording.
 _SPARSEST = 20
-_TICKS = {"microsecond": 1e-6, "millisecond": 1e-3, "nanosecond": 1e-9}
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +168,7 @@ def _unwrap(t: Array, period: float | None) -> tuple[Array, int, float]:
     if not down.any():
         return t, 0, 0.0
     step = np.median(steps[steps > 0]) if (steps > 0).any() else 0.0
-    periods = [period] if period else [2**32 * tick for tick in _TICKS.values()]
+    periods = [period] if period else [WRAP_32_BIT * TICK[unit] for unit in ("us", "ms", "ns")]
     for candidate in periods:
         wrapped = down & (np.abs(steps + candidate - step) < (candidate / 2 if period else 100 * step))
         if wrapped.any():
