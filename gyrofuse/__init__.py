@@ -27,15 +27,22 @@ from gyrofuse._result import ConfidenceInterval
 from gyrofuse.competitors import equal_weights, inverse_variance_weights
 from gyrofuse.covariance import CrossCovariance, cross_covariance, wavelet_cross_covariance, wavelet_variance
 from gyrofuse.datasheet import Datasheet, datasheet
+from gyrofuse.gain import Gain
 from gyrofuse.haar import HaarFilterBank, haar_coefficients
+from gyrofuse.hypotheses import EnoughData, WeightsTest
+from gyrofuse.intervals import wavelet_cross_covariance_interval, wavelet_variance_interval
 from gyrofuse.io.stream import RecordingError
+from gyrofuse.multiscale import MultiScaleSVO, fit_multiscale
+from gyrofuse.multiscale_result import MultiScaleResult
 from gyrofuse.parsing import model_from_dict, parse_model
 from gyrofuse.processes import AR1, Drift, Model, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
+from gyrofuse.rdvg import RDVGResult, rdvg, rdvg_weights
 from gyrofuse.recording import Recording, read_recording
 from gyrofuse.scale_weights import resolve_scale_weights
 from gyrofuse.simulate import ArrayModel
-from gyrofuse.svo import SVO, SVOWeights, fit_svo, svo_weights
+from gyrofuse.svo import SVO, fit_svo
 from gyrofuse.svo_result import SVOResult
+from gyrofuse.svo_weights import SVOWeights, svo_weights
 
 if TYPE_CHECKING:
     from gyrofuse.metric import WaveletCrossCovariance
@@ -50,9 +57,14 @@ __all__ = [
     "CrossCovariance",
     "Datasheet",
     "Drift",
+    "EnoughData",
+    "Gain",
     "HaarFilterBank",
     "Model",
+    "MultiScaleResult",
+    "MultiScaleSVO",
     "QuantizationNoise",
+    "RDVGResult",
     "RandomWalk",
     "Recording",
     "RecordingError",
@@ -61,20 +73,26 @@ __all__ = [
     "SingularCovarianceError",
     "Sinusoid",
     "WaveletCrossCovariance",
+    "WeightsTest",
     "WhiteNoise",
     "cross_covariance",
     "datasheet",
     "equal_weights",
+    "fit_multiscale",
     "fit_svo",
     "haar_coefficients",
     "inverse_variance_weights",
     "model_from_dict",
     "parse_model",
+    "rdvg",
+    "rdvg_weights",
     "read_recording",
     "resolve_scale_weights",
     "svo_weights",
     "wavelet_cross_covariance",
+    "wavelet_cross_covariance_interval",
     "wavelet_variance",
+    "wavelet_variance_interval",
 ]
 
 # Names whose modules load more than torch and numpy.

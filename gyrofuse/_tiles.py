@@ -32,6 +32,8 @@ class WaveletProducts:
         n_sensors: Sensors of each.
         n_levels: Levels J.
         length: Samples expected, where known; a short recording gets a short tile.
+        bin_length: Keep the sums apart by bins of this many samples, a power of two; needs `length`. A coefficient
+            belongs to the bin of its newest sample.
         dtype: Dtype of the arithmetic; sums and counts are float64.
         device: Where the tiles live.
     """
@@ -45,14 +47,20 @@ class WaveletProducts:
         dtype: torch.dtype,
         device: torch.device,
         length: int | None = None,
+        bin_length: int | None = None,
     ) -> None:
         self.n_levels = n_levels
         self._shape = (n_items, n_sensors)
         self._like: dict[str, Any] = {"dtype": dtype, "device": device}
         self._tile = tile_length(n_items * n_sensors, device, length)
-        # One product of this shape runs on one core: stripes of a tile keep the others busy.
-        threads = torch.get_num_threads() if device.type == "cpu" else 1
-        self._stripes = min(1 << (threads - 1).bit_length(), self._tile) if n_items < threads else 1
+        self._bin_length = bin_length
+        if bin_length is not None and length is not None:
+            self._stripes, n_bins = max(1, self._tile // bin_length), -(-length // bin_length)
+        else:
+            # One product of this shape runs on one core: stripes of a tile keep the others busy.
+            threads = torch.get_num_threads() if device.type == "cpu" else 1
+            self._stripes = min(1 << (threads - 1).bit_length(), self._tile) if n_items < threads else 1
+            n_bins = 1
         self._buffer = self._empty(self._tile // 2 + self._tile)
         self._coefficients = self._empty(self._tile)
         self._products = torch.empty(n_levels, n_items, self._stripes, n_sensors, n_sensors, **self._like)
@@ -64,7 +72,8 @@ class WaveletProducts:
         self._n_staged = 0
         self._time = 0  # samples before the staged ones
         self._flawed = -1  # no sample after this one is missing, of those in finished tiles
-        self._sums = torch.zeros(n_levels, n_items, n_sensors, n_sensors, dtype=torch.float64, device=device)
+        shape = (n_levels, n_items, n_bins, n_sensors, n_sensors)
+        self._sums = torch.zeros(shape, dtype=torch.float64, device=device)
         self._counts = torch.zeros_like(self._sums)
 
     def _look_into_buffer(self) -> None:
@@ -114,22 +123,33 @@ class WaveletProducts:
             taken += n
             if self._n_staged == self._tile:
                 sums, counts, self._flawed = self._run(self._tile, keep=True)
-                self._sums += sums
-                self._counts += counts
+                bins = self._bins()
+                self._sums[:, :, bins] += sums
+                self._counts[:, :, bins] += counts
                 self._time += self._tile
                 self._n_staged = 0
 
     def totals(self) -> tuple[Tensor, Tensor]:
-        """Sums of products (unit of the signal squared) and their counts, `(level, item, sensor, sensor)`.
+        """Sums of products (unit of the signal squared) and their counts, `(level, item, bin, sensor, sensor)`.
 
         Includes the samples of the unfinished tile, which stays unfinished.
         """
-        sums, counts = self._sums, self._counts
+        sums, counts = self._sums.clone(), self._counts.clone()
         if self._n_staged:
             extra_sums, extra_counts, _ = self._run(self._n_staged, keep=False)
-            sums, counts = sums + extra_sums, counts + extra_counts
+            bins = self._bins()
+            n = sums[:, :, bins].shape[2]  # the last stripes may lie beyond the end
+            sums[:, :, bins] += extra_sums[:, :, :n]
+            counts[:, :, bins] += extra_counts[:, :, :n]
         levels = torch.arange(1, self.n_levels + 1, dtype=torch.float64, device=self.device)
-        return sums * torch.exp2(-2 * levels)[:, None, None, None], counts.clone()
+        return sums * torch.exp2(-2 * levels)[:, None, None, None, None], counts
+
+    def _bins(self) -> slice:
+        """Bins that the stripes of the tile at hand belong to."""
+        if self._bin_length is None:
+            return slice(0, 1)
+        first = self._time // self._bin_length
+        return slice(first, first + self._stripes)
 
     def _empty(self, n: int) -> Tensor:
         n_items, n_sensors = self._shape
@@ -138,7 +158,8 @@ class WaveletProducts:
     def _run(self, n: int, *, keep: bool) -> tuple[Tensor, Tensor, int]:
         """Pass the first `n` staged samples through the levels; `keep` makes a full tile part of the past.
 
-        Returns the sums, the counts and the last sample before which one may be missing.
+        Returns the sums and counts of each stripe, where bins are asked for, else of the tile, and the last sample
+        before which one may be missing.
         """
         tile = self._tile
         staged = None if keep else self._staged[:, :n].clone()
@@ -146,8 +167,8 @@ class WaveletProducts:
         # One look at each tile tells which levels have to mind missing samples.
         flawed = self._flawed if bool(smooth.sum().isfinite()) else self._time + n - 1
         self._products.zero_()
-        counts = torch.zeros_like(self._counts)
-        complete = [0] * self.n_levels
+        counts = torch.zeros(self._products.shape, dtype=torch.float64, device=self.device)
+        stripe = tile // self._stripes
         for level in range(self.n_levels):
             lag = 2**level
             if lag < tile:
@@ -171,13 +192,21 @@ class WaveletProducts:
             if first >= n:
                 break
             torch.sub(smooth, past, out=coefficients)
+            # Whole stripes, with nothing in them that is no window of the recording.
+            end = -(-n // stripe) * stripe
+            self._coefficients[:, :first].zero_()
+            self._coefficients[:, n:end].zero_()
             if flawed > self._time + first - 2 * lag:
-                known = coefficients[:, first:].isfinite()
-                self._multiply(torch.where(known, coefficients[:, first:], 0.0), level)
-                counts[level] = _gram(known.to(coefficients.dtype))
+                known = self._coefficients[:, :end].isfinite()
+                self._multiply(torch.where(known, self._coefficients[:, :end], 0.0), self._products[level])
+                known[:, :first] = False
+                known[:, n:] = False
+                self._multiply(known.to(coefficients.dtype), counts[level])
             else:
-                self._multiply(coefficients if first == 0 else coefficients[:, first:], level)
-                complete[level] = n - first
+                self._multiply(self._coefficients[:, :end], self._products[level])
+                starts = torch.arange(0, tile, stripe, dtype=torch.float64, device=self.device)
+                complete = starts.add(stripe).clamp(max=n) - starts.clamp(min=first)
+                counts[level] = complete.clamp(min=0)[:, None, None]
             if level + 1 == self.n_levels:
                 if keep and lag >= tile:
                     self._spare = past
@@ -195,19 +224,17 @@ class WaveletProducts:
                 smooth = past.add_(smooth)
         if staged is not None:
             self._staged[:, :n].copy_(staged)
-        sums = self._products.sum(2, dtype=torch.float64)
-        counts += torch.tensor(complete, dtype=counts.dtype).to(counts.device)[:, None, None, None]
-        return sums, counts, flawed
+        if self._bin_length is None or self._stripes == 1:
+            return self._products.sum(2, True, dtype=torch.float64), counts.sum(2, True), flawed
+        return self._products.double(), counts, flawed
 
-    def _multiply(self, coefficients: Tensor, level: int) -> None:
-        """Write the products of `(item, time, sensor)` coefficients of a level."""
-        n_items, n, n_sensors = coefficients.shape
-        products = self._products[level]  # (item, stripe, sensor, sensor)
-        if self._stripes > 1 and n_sensors > 1 and n % self._stripes == 0 and coefficients.is_contiguous():
-            striped = coefficients.view(n_items * self._stripes, -1, n_sensors)
-            torch.bmm(striped.transpose(1, 2), striped, out=products.view(-1, n_sensors, n_sensors))
-        else:
-            products[:, 0] = _gram(coefficients)
+    def _multiply(self, rows: Tensor, products: Tensor) -> None:
+        """Write the products `(item, stripe, sensor, sensor)` of `(item, time, sensor)` rows of whole stripes."""
+        n_items, n, n_sensors = rows.shape
+        stripe = self._tile // self._stripes
+        n_stripes = n // stripe
+        striped = rows.reshape(n_items * n_stripes, stripe, n_sensors)
+        products[:, :n_stripes] = _gram(striped).view(n_items, n_stripes, n_sensors, n_sensors)
 
 
 def _gram(coefficients: Tensor) -> Tensor:

@@ -124,18 +124,38 @@ def mean_products(sums: Tensor, counts: Tensor) -> Tensor:
 
 def wavelet_products(signal: Tensor, n_levels: int) -> tuple[Tensor, Tensor]:
     """Sums and counts `(..., level, sensor, sensor)` of a whole recording, float64."""
+    sums, counts = binned_products(signal, n_levels)
+    return sums.squeeze(-4), counts.squeeze(-4)
+
+
+def binned_products(signal: Tensor, n_levels: int, bin_length: int | None = None) -> tuple[Tensor, Tensor]:
+    """Sums and counts `(..., bin, level, sensor, sensor)` of the products in each bin of time, float64.
+
+    Args:
+        signal: `(..., sensor, time)`.
+        n_levels: Number of levels J.
+        bin_length: Samples of a bin, a power of two; by default the whole recording is one bin. A coefficient belongs
+            to the bin of its newest sample.
+    """
     *batch, n_sensors, length = signal.shape
     items = signal.reshape(-1, n_sensors, length)
     # As many short recordings at a time as fill one tile.
     group = max(1, tile_length(n_sensors, signal.device, None) // max(length, 1))
-    sums, counts = [], []
+    sums: list[Tensor] = []
+    counts: list[Tensor] = []
     for some in items.split(group):
         products = WaveletProducts(
-            some.shape[0], n_sensors, n_levels, dtype=signal.dtype, device=signal.device, length=length
+            some.shape[0],
+            n_sensors,
+            n_levels,
+            dtype=signal.dtype,
+            device=signal.device,
+            length=length,
+            bin_length=bin_length,
         )
         products.update(some)
-        some_sums, some_counts = products.totals()
-        sums.append(some_sums.movedim(0, 1))
-        counts.append(some_counts.movedim(0, 1))
-    shape = (*batch, n_levels, n_sensors, n_sensors)
+        for parts, total in zip((sums, counts), products.totals(), strict=True):
+            parts.append(total.permute(1, 2, 0, 3, 4))  # (item, bin, level, sensor, sensor)
+    n_bins = sums[0].shape[1]
+    shape = (*batch, n_bins, n_levels, n_sensors, n_sensors)
     return torch.cat(sums).view(shape), torch.cat(counts).view(shape)

@@ -15,8 +15,9 @@ from gyrofuse.processes import AR1, WhiteNoise
 from gyrofuse.recording import Recording
 from gyrofuse.report import fusion_figure, fusion_report, new_figure, number, save_figure, verdict
 from gyrofuse.simulate import ArrayModel
-from gyrofuse.svo import fit_svo, svo_weights
+from gyrofuse.svo import fit_svo
 from gyrofuse.svo_result import SVOResult
+from gyrofuse.svo_weights import svo_weights
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

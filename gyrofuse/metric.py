@@ -144,7 +144,7 @@ class WaveletCrossCovariance(Metric):
     def _totals(self) -> tuple[Tensor, Tensor]:
         assert self._products is not None
         sums, counts = self._products.totals()
-        return sums.squeeze(1), counts.squeeze(1)
+        return sums[:, 0, 0], counts[:, 0, 0]  # one item, one bin
 
     def _settle(self) -> None:
         """Bring the states up to date with the sums, which the chunks reach only tile by tile."""

@@ -1,9 +1,4 @@
-"""Scale-wise variance optimisation (SVO): one virtual gyro from an array, by closed-form optimal weights.
-
-The weights minimise the wavelet variance of the virtual signal, summed over levels with scale weights `omega_j`:
-
-    A = sum_j omega_j Gamma_j,   c = A^-1 1 / (1' A^-1 1)                                   [Z] equations (6), (7)
-"""
+"""Scale-wise variance optimisation (SVO): one virtual gyro from an array, with weights that can be trusted."""
 
 from __future__ import annotations
 
@@ -12,48 +7,25 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from gyrofuse import uncertainty
-from gyrofuse._checks import (
-    check_confidence_level,
-    check_floating,
-    check_n_levels,
-    check_signal,
-)
+from gyrofuse._checks import check_confidence_level, check_n_levels, check_signal
 from gyrofuse._linalg import check_positive_definite
-from gyrofuse._result import named, numbered
-from gyrofuse.competitors import equal_weights, inverse_variance_weights
-from gyrofuse.covariance import wavelet_products
+from gyrofuse._result import ConfidenceInterval, named, numbered
+from gyrofuse.bootstrap import signal_bootstrap
+from gyrofuse.covariance import binned_products
+from gyrofuse.fusion import METHODS, Chosen, choose_weights
+from gyrofuse.influence import bootstrap_inverse_variance_weights_covariance, bootstrap_weights_covariance
+from gyrofuse.pilot import Pilot, fit_pilot
 from gyrofuse.recording import Recording
 from gyrofuse.scale_weights import ScaleWeights, normalised, resolve_scale_weights
+from gyrofuse.series import bin_length
 from gyrofuse.svo_result import SVOResult, fuse
+from gyrofuse.svo_weights import combine, counting
+from gyrofuse.weights_spread import WeightsSpread, certain, normal_spread, spread_of_weights, unknown
 
-METHODS = ("svo", "inverse_variance", "equal")
-COVARIANCES = ("model", "none")
-
-
-def svo_weights(wccv: Tensor, scale_weights: ScaleWeights = "flat") -> Tensor:
-    """Optimal weights of an array from its wavelet cross-covariance; differentiable.
-
-    Args:
-        wccv: `(..., level, sensor, sensor)`, signal^2.
-        scale_weights: `"flat"`, `"short"`, `"long"`, or one number >= 0 per level.
-
-    Returns:
-        `(..., sensor)`, sum 1, may be negative.
-
-    Raises:
-        TypeError: `wccv` is not a floating point tensor.
-        ValueError: Wrong shape or scale weights.
-        SingularCovarianceError: `A` is not positive definite (a dead or duplicated sensor, say).
-
-    References:
-        [Z] equation (7).
-    """
-    omega = resolve_scale_weights(scale_weights, _check_levels(wccv)).to(wccv)
-    combined = _combine(_counting(wccv, omega), omega)
-    check_positive_definite("the wavelet cross-covariance combined over scales", combined)
-    return _optimal_weights(combined)
+COVARIANCES = ("model", "block_bootstrap", "resampling", "none")
 
 
 def fit_svo(
@@ -63,6 +35,7 @@ def fit_svo(
     method: str = "svo",
     confidence_level: float = 0.95,
     covariance: str = "model",
+    block_length: int | None = None,
     n_levels: int | None = None,
 ) -> SVOResult:
     """Fuse an array of gyros into one virtual gyro of the smallest wavelet variance.
@@ -73,9 +46,16 @@ def fit_svo(
     Args:
         signal: `(..., sensor, time)` of at least two sensors, or a `Recording`; NaN = missing sample.
         scale_weights: `"flat"`, `"short"`, `"long"`, or one number >= 0 per level.
-        method: `"svo"`; `"inverse_variance"` (ignores correlation) or `"equal"` for comparison.
+        method: `"svo"`; `"auto"` chooses between it and its relatives by held-out risk: `"model_assisted"` takes the
+            last levels from a smooth model, `"shrinkage"` pulls them towards uncorrelated sensors, `"nonnegative"`
+            keeps every weight >= 0; `"inverse_variance"` ignores correlation; `"equal"`, and `"rdvg"` of Vaccaro and
+            Zaki, which knows white noise and random walk only, for comparison.
         confidence_level: Of every interval in the result.
-        covariance: `"model"` for Gaussian intervals on the safe side, or `"none"`.
+        covariance: What the intervals rest on. `"model"`: the series itself where levels hold many windows, a fitted
+            model where they do not; right at every level. `"block_bootstrap"`: that of [Z] in closed form, right for
+            short scales only. `"resampling"`: signals resampled in blocks ([Z] Remark C), for stationary signals.
+            `"none"`. Only SVO and inverse-variance weights have intervals of their own.
+        block_length: Of the two bootstraps; by default chosen from the data.
         n_levels: Number of levels J. By default as many as there are scale weights, else the largest at which
             every pair of sensors has a complete window.
 
@@ -88,7 +68,7 @@ def fit_svo(
         SingularCovarianceError: A dead, duplicated or linearly dependent sensor.
 
     References:
-        [Z] section II and Theorem 2.
+        [Z] section II, Theorem 2 and section IV.
 
     Example:
         >>> result = fit_svo(signal, "long")
@@ -104,100 +84,49 @@ def fit_svo(
     _check_array(values, sensors)
     if n_levels is None and not isinstance(scale_weights, str):
         n_levels = len(normalised(scale_weights))
-    wccv, n_products = _measure(values, n_levels)
+    batch, items = values.shape[:-2], values.detach().reshape(-1, *values.shape[-2:])
+    sums, counts = _measure(items, n_levels)  # (item, bin, level, sensor, sensor)
+    totals = counts.sum(1)
+    wccv = sums.sum(1) / totals
     omega = resolve_scale_weights(scale_weights, wccv.shape[-3]).to(wccv)
-    degrees = uncertainty.degrees_of_freedom(n_products)
-    counting = _counting(wccv, omega)
-    combined = _combine(counting, omega)
-    check_positive_definite("the wavelet cross-covariance combined over scales", combined, sensors, dtype=values.dtype)
-
-    weights_degrees = torch.full_like(combined[..., 0], torch.inf)
-    if method == "svo":
-        weights = _optimal_weights(combined)
-        weights_cov, weights_degrees = uncertainty.svo_weights_covariance(counting, omega, weights, degrees)
-    elif method == "inverse_variance":
-        weights = inverse_variance_weights(counting, omega)
-        weights_cov = uncertainty.inverse_variance_weights_covariance(counting, omega, weights, degrees)
-    else:
-        weights, weights_cov = equal_weights(wccv), torch.zeros_like(combined)
+    combined = combine(counting(wccv, omega), omega)
+    check_positive_definite(
+        "the wavelet cross-covariance combined over scales",
+        combined.view(*batch, *combined.shape[1:]),
+        sensors,
+        dtype=values.dtype,
+    )
+    chosen = choose_weights(method, items, sums, counts, omega)
+    n_known = int((totals > 0).all(0).flatten(1).all(1).sum())  # later levels do not count, or this were refused
+    known = (sums[:, :, :n_known], counts[:, :, :n_known], omega[:n_known])
     if covariance == "none":
-        weights_cov = torch.full_like(combined, torch.nan)
+        spread, degrees = unknown(chosen.weights), uncertainty.degrees_of_freedom(totals.amin((-1, -2)))
+    else:
+        pilot = fit_pilot(wccv[:, :n_known], values.shape[-1])
+        spread = _spread(chosen, items, *known, pilot, covariance, block_length, confidence_level)
+        degrees = pilot.degrees_of_freedom(chosen.weights[:, None])[..., 0]
+        degrees = pad(degrees, (0, len(omega) - n_known), value=1.0)
+    low, high = chosen.weights - spread.half_width, chosen.weights + spread.half_width
+
+    def batched(value: Tensor, dtype: torch.dtype = values.dtype) -> Tensor:
+        return value.to(dtype).reshape(*batch, *value.shape[1:])
+
     return SVOResult(
-        weights=weights.to(values.dtype),
-        weights_cov=weights_cov.to(values.dtype),
-        weights_degrees=weights_degrees,
+        weights=batched(chosen.weights),
+        weights_cov=batched(spread.covariance),
+        weights_degrees=batched(spread.degrees, torch.float64),
         confidence_level=confidence_level,
-        wavelet_cross_covariance=wccv.to(values.dtype),
+        confidence_interval=ConfidenceInterval(batched(low), batched(high)),
+        wavelet_cross_covariance=batched(wccv),
         scale_weights=omega.to(values.dtype),
-        degrees_of_freedom=degrees,
-        method=method,
+        degrees_of_freedom=batched(degrees, torch.float64),
+        method=chosen.method,
         n_samples=values.shape[-1],
         sensors=tuple(sensors),
         axes=recording.axes if recording else (),
         rate=recording.rate if recording else None,
         unit=recording.unit if recording and recording.unit != "unknown" else None,
     )
-
-
-def _check_array(values: Tensor, sensors: Sequence[str]) -> None:
-    """At least two sensors, each with a sample."""
-    if values.shape[-2] < 2:
-        raise ValueError(
-            f"`signal`: expected at least 2 sensors to fuse, got {values.shape[-2]}; give an array of gyros"
-        )
-    known = values.isfinite().any(-1)
-    if not bool(known.all()):
-        empty = (~known).reshape(-1, values.shape[-2]).any(0).nonzero().flatten().tolist()
-        raise ValueError(f"`signal`: sensor(s) {named(sensors, empty)} have no finite sample; leave them out")
-
-
-def _measure(values: Tensor, n_levels: int | None) -> tuple[Tensor, Tensor]:
-    """Wavelet cross-covariance in float64 and the number of products of the pair that has fewest, `(..., level)`.
-
-    Without `n_levels`, as many levels as all pairs have a complete window for.
-    """
-    asked = check_n_levels(n_levels, values.shape[-1])
-    sums, counts = wavelet_products(values.detach(), asked)
-    fewest = counts.amin((-1, -2))  # (..., level)
-    if n_levels is None:
-        asked = int((fewest > 0).reshape(-1, fewest.shape[-1]).all(0).sum())
-        if asked == 0:
-            raise ValueError(
-                "`signal`: expected two samples in a row that all sensors have, found none; "
-                "the sensors are not recorded together"
-            )
-    windows = fewest[..., :asked].sum(-1)
-    if bool((windows < values.shape[-2]).any()):
-        raise ValueError(
-            f"`signal`: expected at least as many complete windows as sensors ({values.shape[-2]}), "
-            f"got {int(windows.min())}; record longer or leave sensors out"
-        )
-    return (sums / counts)[..., :asked, :, :], fewest[..., :asked]
-
-
-class SVOWeights(nn.Module):
-    """`svo_weights` as a layer, without looking at values: `nn.Sequential(HaarFilterBank(J), CrossCovariance(),
-    SVOWeights("long"))` maps a signal to its weights, differentiable end to end.
-
-    Args:
-        scale_weights: `"flat"`, `"short"`, `"long"`, or one number >= 0 per level.
-    """
-
-    def __init__(self, scale_weights: ScaleWeights = "flat") -> None:
-        super().__init__()
-        self.scale_weights = scale_weights
-        # The values of numbers are looked at here, once.
-        self._numbers = None if isinstance(scale_weights, str) else normalised(scale_weights)
-
-    def forward(self, wccv: Tensor) -> Tensor:
-        """Map `(..., level, sensor, sensor)` to `(..., sensor)`."""
-        n_levels, omega = _check_levels(wccv), self._numbers
-        if omega is None:
-            omega = resolve_scale_weights(self.scale_weights, n_levels)
-        elif len(omega) != n_levels:
-            raise ValueError(f"`wccv`: expected {len(omega)} levels, one for each scale weight, got {n_levels}")
-        omega = omega.to(wccv)
-        return _optimal_weights(_combine(_counting(wccv, omega), omega))
 
 
 class SVO(nn.Module):
@@ -262,26 +191,77 @@ class SVO(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
 
-def _check_levels(wccv: Tensor) -> int:
-    check_floating("wccv", wccv)
-    if wccv.ndim < 3 or wccv.shape[-1] != wccv.shape[-2]:
-        raise ValueError(f"`wccv`: expected (..., level, sensor, sensor), got shape {tuple(wccv.shape)}")
-    return wccv.shape[-3]
+def _spread(
+    chosen: Chosen,
+    items: Tensor,
+    sums: Tensor,
+    counts: Tensor,
+    omega: Tensor,
+    pilot: Pilot,
+    covariance: str,
+    block_length: int | None,
+    confidence_level: float,
+) -> WeightsSpread:
+    """Spread of the weights; that of equal ones is none, and of those without a law unknown."""
+    weights = chosen.weights
+    if chosen.method == "equal":
+        return certain(weights)
+    if chosen.weights_of is None:
+        return unknown(weights)
+    if covariance == "model":
+        return spread_of_weights(sums, counts, omega, pilot, chosen.weights_of, confidence_level)
+    totals = counts.sum(1)
+    wccv = counting(sums.sum(1) / totals, omega)
+    if covariance == "block_bootstrap":
+        closed_form = {
+            "svo": bootstrap_weights_covariance,
+            "inverse_variance": bootstrap_inverse_variance_weights_covariance,
+        }[chosen.method]
+        found = closed_form(items, wccv, omega, weights, counts=totals, block_length=block_length)
+    else:
+        resamples = signal_bootstrap(
+            items, len(omega), block_length=block_length, generator=torch.Generator().manual_seed(0)
+        )
+        moved = chosen.weights_of(combine(counting(resamples, omega), omega)) - weights[:, None]
+        found = moved.mT @ moved / moved.shape[1]  # around the estimate, as [Z] does
+    return normal_spread(found.to(weights), confidence_level)
 
 
-def _combine(counting: Tensor, omega: Tensor) -> Tensor:
-    """`A = sum_j omega_j Gamma_j`, [Z] equation (6)."""
-    return torch.einsum("j,...jik->...ik", omega, counting)
+def _check_array(values: Tensor, sensors: Sequence[str]) -> None:
+    """At least two sensors, each with a sample."""
+    if values.shape[-2] < 2:
+        raise ValueError(
+            f"`signal`: expected at least 2 sensors to fuse, got {values.shape[-2]}; give an array of gyros"
+        )
+    known = values.isfinite().any(-1)
+    if not bool(known.all()):
+        empty = (~known).reshape(-1, values.shape[-2]).any(0).nonzero().flatten().tolist()
+        raise ValueError(f"`signal`: sensor(s) {named(sensors, empty)} have no finite sample; leave them out")
 
 
-def _counting(wccv: Tensor, omega: Tensor) -> Tensor:
-    """Levels that count; one that does not may well be unknown (NaN)."""
-    return torch.where(omega[:, None, None] > 0, wccv, 0.0)
+def _measure(items: Tensor, n_levels: int | None) -> tuple[Tensor, Tensor]:
+    """Sums and counts of products `(item, bin, level, sensor, sensor)`.
 
-
-def _optimal_weights(combined: Tensor) -> Tensor:
-    solved = torch.linalg.solve(combined, combined.new_ones(combined.shape[-1]).expand(combined.shape[:-1]))
-    return solved / solved.sum(-1, keepdim=True)
+    Without `n_levels`, of as many levels as all pairs have a complete window for.
+    """
+    n_sensors, n_samples = items.shape[1:]
+    asked = check_n_levels(n_levels, n_samples)
+    sums, counts = binned_products(items, asked, bin_length(n_samples, n_sensors, asked))
+    fewest = counts.sum(1).amin((-1, -2))  # (item, level)
+    if n_levels is None:
+        asked = int((fewest > 0).all(0).sum())
+        if asked == 0:
+            raise ValueError(
+                "`signal`: expected two samples in a row that all sensors have, found none; "
+                "the sensors are not recorded together"
+            )
+    windows = fewest[:, :asked].sum(-1)
+    if bool((windows < n_sensors).any()):
+        raise ValueError(
+            f"`signal`: expected at least as many complete windows as sensors ({n_sensors}), "
+            f"got {int(windows.min())}; record longer or leave sensors out"
+        )
+    return sums[:, :, :asked], counts[:, :, :asked]
 
 
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:

@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from gyrofuse import uncertainty
-from gyrofuse._checks import check_signal
-from gyrofuse._result import ConfidenceInterval, listed, numbered
+from gyrofuse import gain, hypotheses, uncertainty
+from gyrofuse._checks import check_positive, check_signal
+from gyrofuse._result import ConfidenceInterval, listed, named, numbered
 from gyrofuse.competitors import equal_weights
+from gyrofuse.gain import Gain
+from gyrofuse.hypotheses import EnoughData, Evidence, WeightsTest
 from gyrofuse.recording import Recording
 
 if TYPE_CHECKING:
@@ -49,9 +51,10 @@ class SVOResult:
         weights_cov: `(..., sensor, sensor)`, covariance of the estimated weights themselves; NaN when not asked for.
         weights_degrees: `(..., sensor)`, degrees of freedom of the variance of each weight.
         confidence_level: Of the intervals.
+        confidence_interval: Limits `(..., sensor)` of the weights.
         wavelet_cross_covariance: `(..., level, sensor, sensor)`, signal^2.
         scale_weights: `(level,)`, sum 1.
-        degrees_of_freedom: `(..., level)`, independent observations that a level is taken to hold.
+        degrees_of_freedom: `(..., level)`, independent observations of the virtual gyro that a level holds.
         method: How the weights were chosen.
         n_samples: Length of the signal.
         sensors: Name of each sensor.
@@ -64,6 +67,7 @@ class SVOResult:
     weights_cov: Tensor
     weights_degrees: Tensor
     confidence_level: float
+    confidence_interval: ConfidenceInterval
     wavelet_cross_covariance: Tensor
     scale_weights: Tensor
     degrees_of_freedom: Tensor
@@ -73,11 +77,6 @@ class SVOResult:
     axes: tuple[str, ...] = ()
     rate: float | None = None
     unit: str | None = None
-
-    @property
-    def confidence_interval(self) -> ConfidenceInterval:
-        """Limits `(..., sensor)` of the weights."""
-        return uncertainty.weights_interval(self.weights, self.weights_cov, self.weights_degrees, self.confidence_level)
 
     @property
     def n_levels(self) -> int:
@@ -129,8 +128,86 @@ class SVOResult:
         )
 
     def interval_of(self, wavelet_variance: Tensor) -> ConfidenceInterval:
-        """Limits of wavelet variances `(..., level)` of this recording, of any sensor or combination."""
+        """Limits of wavelet variances `(..., level)` of the virtual gyro, or of another combination as slow as it."""
         return uncertainty.chi_square_interval(wavelet_variance, self.degrees_of_freedom, self.confidence_level)
+
+    @property
+    def effective_observations(self) -> Tensor:
+        """Number of independent observations that each SVO weight rests on, `(..., sensor)`."""
+        return self._evidence("effective_observations").observations.to(self.weights)
+
+    def test_equal(self) -> WeightsTest:
+        """Ask whether equal weights would do: an F test of SVO weights, and what equal ones cost.
+
+        Returns:
+            The test, batched over the leading dimensions.
+
+        Raises:
+            ValueError: Not SVO weights, or no covariance of them.
+        """
+        return hypotheses.equal_weights_test(self._evidence("test_equal"))
+
+    def test_drop(self, sensor: int | str) -> WeightsTest:
+        """Ask whether a sensor earns its place: a test of its SVO weight against zero, and what leaving it out costs.
+
+        Args:
+            sensor: Its index or name.
+
+        Returns:
+            The test, batched over the leading dimensions.
+
+        Raises:
+            ValueError: Not SVO weights, no covariance of them, or no such sensor.
+        """
+        evidence, index = self._evidence("test_drop"), self._index_of(sensor)
+        return hypotheses.dropped_sensor_test(evidence, index, self.sensors[index])
+
+    def enough_data(self, largest_excess: float = hypotheses.SMALL_EXCESS) -> EnoughData:
+        """Ask whether the recording is long enough for these SVO weights.
+
+        Args:
+            largest_excess: What not knowing the best weights may cost on average in wavelet variance, combined over
+                scales; a ratio less 1.
+
+        Returns:
+            The answer, batched over the leading dimensions.
+
+        Raises:
+            ValueError: Not SVO weights, no covariance of them, or `largest_excess` is not positive.
+        """
+        return hypotheses.enough_data(self._evidence("enough_data"), check_positive("largest_excess", largest_excess))
+
+    def gain_over_equal(self) -> Gain:
+        """How many times smaller the wavelet variance is than that of the plain mean, by level, with its interval.
+
+        For these weights in any other recording of the array: SVO weights flatter themselves in their own, for which
+        they are corrected. Weights of other methods are taken as if they had been chosen beforehand.
+
+        Returns:
+            The gain, batched over the leading dimensions.
+
+        Raises:
+            ValueError: Equal weights, or SVO weights without covariance.
+        """
+        if self.method == "equal":
+            raise ValueError(
+                "`gain_over_equal`: expected weights other than equal ones, got method 'equal'; fit with method='svo'"
+            )
+        degrees = self.degrees_of_freedom
+        optimism = torch.zeros_like(degrees)
+        if self.method == "svo":
+            optimism = gain.optimism(self._evidence("gain_over_equal"))
+        estimate, interval = gain.ratio_to_equal(
+            self.weights.double(), self.wavelet_cross_covariance.double(), degrees, optimism, self.confidence_level
+        )
+        return Gain(
+            estimate=estimate,
+            confidence_interval=interval,
+            confidence_level=self.confidence_level,
+            in_sample=self.equal_wavelet_variance / self.virtual_wavelet_variance,
+            tau=self.tau,
+            tau_unit="s" if self.rate else "samples",
+        )
 
     def virtual(self, signal: Tensor | Recording) -> Tensor:
         """Fuse a signal with these weights: `(..., sensor, time)` to `(..., time)`.
@@ -147,7 +224,9 @@ class SVOResult:
         if len(index) > n_batch:
             raise IndexError(f"expected at most {n_batch} indices for batch shape {tuple(self.weights.shape[:-1])}")
         batched = ("weights", "weights_cov", "weights_degrees", "wavelet_cross_covariance", "degrees_of_freedom")
-        return replace(self, axes=(), **{name: getattr(self, name)[index] for name in batched})
+        interval = ConfidenceInterval(*(limit[index] for limit in self.confidence_interval))
+        items = {name: getattr(self, name)[index] for name in batched}
+        return replace(self, axes=(), confidence_interval=interval, **items)
 
     def summary(self) -> str:
         """The weights with their intervals and the gain over equal weights per level, as fixed-width text."""
@@ -184,6 +263,8 @@ class SVOResult:
             tau, omega, *deviations, ratio = row
             numbers = "  ".join(f"{value:>12.5g}" for value in deviations)
             lines.append(f"{j + 1:>5}  {tau:>13.6g}  {omega:>7.4f}  {numbers}  {ratio:>13.4f}")
+        if self._has_covariance:
+            lines += ["", *hypotheses.verdicts(self._evidence("summary"), self.sensors)]
         if self.motion:
             lines += ["", f"Warning: {self.motion}."]
         return "\n".join(lines)
@@ -242,6 +323,39 @@ class SVOResult:
             "virtual_wavelet_variance": listed(self.virtual_wavelet_variance),
             "equal_wavelet_variance": listed(self.equal_wavelet_variance),
         }
+
+    @property
+    def _has_covariance(self) -> bool:
+        return self.method == "svo" and not bool(self.weights_cov.isnan().all())
+
+    def _evidence(self, asked: str) -> Evidence:
+        """What the questions above are answered from."""
+        if self.method != "svo":
+            raise ValueError(f"`{asked}`: expected SVO weights, got method {self.method!r}; fit with method='svo'")
+        if not self._has_covariance:
+            raise ValueError(
+                f"`{asked}`: expected the covariance of the weights, got none; fit with covariance='model'"
+            )
+        omega = self.scale_weights.double()
+        return Evidence(
+            weights=self.weights.double(),
+            covariance=self.weights_cov.double(),
+            weights_degrees=self.weights_degrees.double(),
+            wccv=self.wavelet_cross_covariance.double().nan_to_num(nan=0.0),  # NaN where a level does not count
+            scale_weights=omega,
+            degrees=self.degrees_of_freedom.double(),
+            confidence_level=self.confidence_level,
+        )
+
+    def _index_of(self, sensor: int | str) -> int:
+        if sensor in self.sensors:
+            return self.sensors.index(str(sensor))
+        if isinstance(sensor, int) and not isinstance(sensor, bool) and 0 <= sensor < len(self.sensors):
+            return sensor
+        raise ValueError(
+            f"`sensor`: expected an index from 0 to {len(self.sensors) - 1} or one of "
+            f"{named(self.sensors, range(len(self.sensors)))}, got {sensor!r}"
+        )
 
     def _variance_of(self, weights: Tensor) -> Tensor:
         return torch.einsum("...i,...jik,...k->...j", weights, self.wavelet_cross_covariance, weights)

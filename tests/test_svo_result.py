@@ -18,13 +18,14 @@ def array(n_samples: int = 3000) -> torch.Tensor:
 
 
 def test_summary_is_reproducible_and_fixed_in_width():
-    result = fit_svo(array(), "long")
+    result = fit_svo(array(), "short")
     text = result.summary()
-    assert text == str(result) == fit_svo(array(), "long").summary()
+    assert text == str(result) == fit_svo(array(), "short").summary()
     lines = text.splitlines()
     assert lines[0] == "Virtual gyro (SVO) of 4 sensors, 3000 samples"
-    table = lines[lines.index("Allan deviation (signal) at averaging time tau") + 1 :]
-    assert len(table) == 1 + result.n_levels
+    start = lines.index("Allan deviation (signal) at averaging time tau") + 1
+    table, below = lines[start : start + 1 + result.n_levels], lines[start + 1 + result.n_levels :]
+    assert [line.partition(":")[0] for line in below] == ["", "Equal weights", "Sensors", "Recording"]
     assert len({len(line) for line in table}) == 1
     assert max(map(len, lines)) <= 120
 

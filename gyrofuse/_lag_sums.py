@@ -1,0 +1,134 @@
+"""How wavelet moments of a Gaussian process vary together in a record of finite length, exactly.
+
+For a sum of independent components with matrices `Theta_k` the coefficients have the cross-covariances
+`sum_k Theta_k,ac s^k_jl(lag)`, and the wavelet cross-covariances of levels `j` and `l`
+
+    Cov(gamma_ab,j, gamma_cd,l) = sum_km Q_jl[k,m] (Theta_k,ac Theta_m,bd + Theta_k,ad Theta_m,bc)
+    Q_jl[k,m] = sum_lag n_jl(lag) s^k_jl(lag) s^m_jl(lag) / (M_j M_l)
+
+with `n_jl(lag)` pairs of coefficients that far apart. `Q` depends on the length and the components only.
+
+A Haar coefficient is a second difference of the cumulative sum of the signal, `W_t = (C_t - 2 C_{t-h} + C_{t-2h}) / 2h`
+with `h = tau/2`, so that nine values of one function, the generalised covariance `g` of `C`, give `s_jl(lag)`: `g` is
+any function with `-(g(l+1) - 2 g(l) + g(l-1))` the (generalised) autocovariance of the signal.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# Lags summed one by one between two corners of s(lag); wider stretches are integrated.
+_ONE_BY_ONE = 48
+_NODES, _NODE_WEIGHTS = np.polynomial.legendre.leggauss(8)
+
+
+@functools.lru_cache(maxsize=8)
+def covariance_table(n_samples: int, n_levels: int, time_constants: tuple[float, ...]) -> Array:
+    """`Q` of the components white noise, AR1 with these time constants, random walk.
+
+    Args:
+        n_samples: Length T of the record.
+        n_levels: Levels J.
+        time_constants: Of the AR1s, in samples, `-1/ln(phi)`.
+
+    Returns:
+        `(level, level, component, component)`, read-only. White noise has unit variance, an AR1 has unit variance, a
+        random walk has unit variance of its steps.
+    """
+    n_components = len(time_constants) + 2
+    table = np.empty((n_levels, n_levels, n_components, n_components))
+    for j in range(n_levels):
+        for k in range(j + 1):
+            lags, weights = _quadrature(2**j, 2**k, n_samples)
+            s = unit_covariances(2**j, 2**k, lags, time_constants)  # (component, lag)
+            counts = (n_samples - 2 ** (j + 1) + 1) * (n_samples - 2 ** (k + 1) + 1)
+            table[j, k] = table[k, j] = (s * weights) @ s.T / counts
+    table.setflags(write=False)
+    return table
+
+
+def unit_wavelet_variances(n_levels: int, time_constants: tuple[float, ...]) -> Array:
+    """Wavelet variances `(level, component)` of the same components."""
+    return np.stack([unit_covariances(2**j, 2**j, np.zeros(1), time_constants)[:, 0] for j in range(n_levels)])
+
+
+def unit_covariances(h: int, k: int, lags: Array, time_constants: tuple[float, ...]) -> Array:
+    """Cross-covariances `(component, lag)` of coefficients of filter lengths `2h` and `2k`, the first `lag` later."""
+    taps = np.array([1.0, -2.0, 1.0])
+    shifts = -h * np.arange(3)[:, None] + k * np.arange(3)  # (tap, tap)
+    weights = np.outer(taps, taps).ravel() / (4 * h * k)
+    inside = (lags > -2 * k) & (lags < 2 * h)
+    distance = np.abs(lags[inside, None] + shifts.ravel())  # (lag, pair of taps)
+    # Where the two filters do not overlap the covariance is one exponential, without any cancellation.
+    gap = np.where(lags[~inside] > 0, lags[~inside] - 2 * h, -lags[~inside] - 2 * k)
+    covariances = np.zeros((len(time_constants) + 2, len(lags)))
+    covariances[0, inside] = -distance / 2 @ weights
+    for row, time_constant in zip(covariances[1:-1], time_constants, strict=True):
+        x = 1 / time_constant
+        row[inside] = _exponential(x, distance) @ weights
+        edge = (math.expm1(-x * h) * math.expm1(-x * k) / math.sinh(x / 2)) ** 2 / (16 * h * k)
+        row[~inside] = -edge * np.exp(-x * gap)
+    covariances[-1, inside] = (distance**3 - distance) / 12 @ weights
+    return covariances
+
+
+def block_mean_covariances(block: int, n_blocks: int, time_constants: tuple[float, ...]) -> Array:
+    """Autocovariances `(component, lag)` of the means of successive blocks of samples, lags in blocks.
+
+    That of the random walk is a generalised one: right for everything that does not see a constant.
+    """
+    lag = np.arange(n_blocks, dtype=float)
+    covariances = np.zeros((len(time_constants) + 2, n_blocks))
+    covariances[0, 0] = 1 / block
+    for row, time_constant in zip(covariances[1:-1], time_constants, strict=True):
+        x = 1 / time_constant
+        curvature = 1 / (2 * math.sinh(x / 2) * block) ** 2
+        row[:] = curvature * math.expm1(-x * block) ** 2 * np.exp(-x * block * (lag - 1).clip(min=0))
+        row[0] = 2 * curvature * math.expm1(-x * block) + 1 / (math.tanh(x / 2) * block)
+    edges = np.abs(lag[:, None] + np.array([1.0, 0.0, -1.0])) * block
+    covariances[-1] = (edges**3 - edges) / 12 @ np.array([-1.0, 2.0, -1.0]) / block**2
+    return covariances
+
+
+def _exponential(x: float, distance: Array) -> Array:
+    """Generalised covariance of the sum of an AR1 of unit variance with `phi = e^-x`, even polynomials left out."""
+    u = x * distance
+    # e^-u - 1 + u - u^2/2, by its series where that cancels.
+    small = -(u**3) / 6 * (1 - u / 4 * (1 - u / 5 * (1 - u / 6 * (1 - u / 7))))
+    remainder = np.where(u < 0.02, small, np.expm1(-u) + u - u**2 / 2)
+    slope = 1 / (2 * math.tanh(x / 2)) - x / (4 * math.sinh(x / 2) ** 2) if x > 0.02 else x / 6 * (1 - x**2 / 30)
+    return -remainder / (4 * math.sinh(x / 2) ** 2) - slope * distance
+
+
+def _quadrature(h: int, k: int, n_samples: int) -> tuple[Array, Array]:
+    """Lags and the weights at which a function of them is summed, the numbers of pairs included."""
+    first, last = 2 * h - n_samples, n_samples - 2 * k
+    # Stretches between the corners of s(lag) grow with the distance from a corner, as fast as its memory may fade.
+    corners = {a * h - b * k for a in range(3) for b in range(3)} | {2 * h - 2 * k}
+    steps = [_ONE_BY_ONE << n for n in range(0, n_samples.bit_length(), 2)]
+    near, far = min(h, k), n_samples
+    graded = {c + sign * d for c in corners for sign in (-1, 1) for d in steps if d < 2 * near}
+    graded |= {c + sign * d for c in (-2 * k, -k, 0, h, 2 * h) for sign in (-1, 1) for d in steps if near <= d < far}
+    corners |= graded | {first, last + 1}
+    inside = sorted(c for c in corners if first <= c <= last + 1)
+    lags, weights = [], []
+    for low, high in itertools.pairwise(inside):
+        width = high - low
+        if width <= _ONE_BY_ONE:
+            lags.append(np.arange(low, high, dtype=float))
+            weights.append(np.ones(width))
+        else:
+            # Sum over low <= lag < high of a smooth function, by its integral and half the ends (Euler-Maclaurin).
+            lags.append(np.concatenate([[low], low + width * (1 + _NODES) / 2, [high]]))
+            weights.append(np.concatenate([[0.5], width / 2 * _NODE_WEIGHTS, [-0.5]]))
+    at = np.concatenate(lags)
+    # Newest samples t and t - lag both inside the record and each with a whole window.
+    pairs = np.minimum(n_samples, n_samples + at) - np.maximum(2 * h - 1, 2 * k - 1 + at)
+    return at, np.concatenate(weights) * np.maximum(pairs, 0)

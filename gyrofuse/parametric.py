@@ -1,0 +1,88 @@
+"""Parametric bootstrap: what the last levels would show in other recordings of the same noise.
+
+The combined covariance `A = sum_j omega_j Gamma_j` of a record `X` of block means is the quadratic form `X Q X'` with a
+kernel `Q` over time that large scales make smooth: a few dozen directions in time carry it. In these the components
+`Theta_k` of a pilot model have small matrices `K_k`, so that resamples of `A`, joint over levels and sensors and of the
+exact finite-sample law, cost about as much as one Cholesky factor of size directions x sensors.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gyrofuse._lag_sums import block_mean_covariances
+from gyrofuse.pilot import Pilot
+
+_DIRECTIONS = 32
+
+
+def resample_combined(
+    pilot: Pilot, scale_weights: Tensor, n_resamples: int, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Resamples of `A`, of the levels that the pilot was fitted to.
+
+    Every item of a batch gets the same draws, so that it does not matter what it is batched with.
+
+    Args:
+        pilot: A model fitted to the array, batch `(...)`.
+        scale_weights: `(level,)`; those of lower levels do not matter.
+        n_resamples: Number of resamples.
+        generator: Source of randomness, on the CPU.
+
+    Returns:
+        `(..., resample, sensor, sensor)` and their expectation `(..., sensor, sensor)`, signal^2.
+    """
+    omega = tuple(scale_weights[pilot.first_level :].tolist())
+    kernels, missing = _directions(pilot.n_samples, pilot.first_level, omega)
+    within = torch.from_numpy(kernels).to(pilot.theta)  # K_k: (component, direction, direction)
+    rest = torch.einsum("k,...kio->...io", torch.from_numpy(missing).to(pilot.theta), pilot.theta)
+    n, n_sensors = within.shape[-1], pilot.theta.shape[-1]
+    joint = torch.einsum("...kio,kab->...aibo", pilot.theta, within).flatten(-2).flatten(-3, -2)
+    # Directions that hardly any component moves in make this singular to rounding.
+    size = joint.diagonal(dim1=-2, dim2=-1)
+    root = torch.linalg.cholesky(joint + torch.diag_embed(1e-12 * size + 1e-14 * size.amax(-1, keepdim=True)))
+    normal = torch.randn(n * n_sensors, n_resamples, generator=generator, dtype=root.dtype).to(root.device)
+    drawn = (root @ normal).unflatten(-2, (n, n_sensors)).movedim(-1, -3)  # (..., resample, direction, sensor)
+    expected = torch.einsum("k,...kio->...io", torch.einsum("kaa->k", within), pilot.theta)
+    return drawn.mT @ drawn + rest[..., None, :, :], expected + rest
+
+
+@functools.lru_cache(maxsize=16)
+def _directions(n_samples: int, first_level: int, omega: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Matrices `K_k` `(component, direction, direction)` and what the other directions add, `(component,)`."""
+    block = 2**first_level
+    n_blocks = n_samples // block
+    kernel = _kernel(n_blocks, omega)
+    values, vectors = np.linalg.eigh(kernel)
+    root = vectors * np.sqrt(values.clip(min=0))  # Q = root root'
+    lag = np.abs(np.arange(n_blocks)[:, None] - np.arange(n_blocks))
+    components = []
+    for covariance in block_mean_covariances(block, n_blocks, ()):
+        half = root - root.mean(0)  # the kernel does not see a constant: nor does rounding
+        components.append(half.T @ covariance[lag] @ half)
+    within = np.stack(components)
+    total = within.trace(axis1=1, axis2=2)
+    # The directions that matter to every component alike, each of which may turn out to be the largest.
+    _, vectors = np.linalg.eigh((within / total[:, None, None]).sum(0))
+    kept = vectors[:, ::-1][:, :_DIRECTIONS]
+    reduced = kept.T @ within @ kept
+    return reduced, total - reduced.trace(axis1=1, axis2=2)
+
+
+def _kernel(n_blocks: int, omega: tuple[float, ...]) -> np.ndarray:
+    """`Q = sum_j omega_j / N_j sum_n w_jn w_jn'` over the windows `n` of each level, in blocks."""
+    kernel = np.zeros((n_blocks, n_blocks))
+    for level, weight in enumerate(omega):
+        half = 2**level
+        if weight == 0 or n_blocks < 2 * half:
+            continue
+        window = np.zeros((n_blocks - 2 * half + 1, n_blocks))
+        rows = np.arange(len(window))[:, None]
+        window[rows, rows + np.arange(half)] = -1 / (2 * half)
+        window[rows, rows + half + np.arange(half)] = 1 / (2 * half)
+        kernel += weight / len(window) * window.T @ window
+    return kernel

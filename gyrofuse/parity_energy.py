@@ -1,0 +1,150 @@
+"""The parity space of an array: energies of every sensor's difference from the others, window by window.
+
+Combinations of sensors whose coefficients sum to 0 do not hold the rate that all of them feel: they are the parity
+space, of p - 1 dimensions, in which an array can be watched while it moves. At level j the best combination for
+sensor i is its difference from the optimal fusion of all the others,
+
+    e_i = (N W)_i / N_ii,   N = G^-1 - G^-1 1 1' G^-1 / (1' G^-1 1),   Var e_i = 1 / N_ii,   G = Gamma_j,
+
+and what is left of the parity energy `W' N W` without it is that of the array without sensor i.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+_BLOCK = 2**17  # sensor samples worked on at a time
+_SHARE = 0.75  # of half a wavelet that has to be there
+
+
+class Products(NamedTuple):
+    """Of each window: `means` `(..., window, level, sensor, sensor)` of products of coefficients, their `counts`
+    `(..., window, level)`, and which sensors are `live` `(..., window, sensor)`.
+    """
+
+    means: Tensor
+    counts: Tensor
+    live: Tensor
+
+
+class Energies(NamedTuple):
+    """Of each window, level and sensor: energy of `e_i`, of the sensor itself, both 1 on average in a healthy array;
+    the rest of the parity energy; and the number of coefficients `(..., window, level)`.
+    """
+
+    parity: Tensor
+    own: Tensor
+    rest: Tensor
+    counts: Tensor
+
+
+def chunks_of(signal: Tensor, window: int, n_levels: int, history: Tensor | None = None) -> list[Tensor]:
+    """Stretches of some windows each, with `2**(n_levels + 1)` samples before them (NaN where there are none).
+
+    The longest wavelet looks back on half of these; the rest is to see what was before a fault.
+    """
+    past = 2 ** (n_levels + 1)
+    n_windows = signal.shape[-1] // window
+    if history is not None:
+        signal = torch.cat([history[..., -past:], signal], -1)
+    missing = past if history is None else max(past - history.shape[-1], 0)
+    n_items = max(signal[..., 0].numel(), 1)
+    at_once = max((_BLOCK // n_items - past) // window, past // window, 1)
+    chunks = []
+    for first in range(0, n_windows, at_once):
+        start = first * window - missing
+        stop = start + past + min(at_once, n_windows - first) * window
+        chunks.append(functional.pad(signal[..., max(start, 0) : stop].double(), (max(-start, 0), 0), value=torch.nan))
+    return chunks
+
+
+def window_products(chunk: Tensor, window: int, n_levels: int) -> Products:
+    """Mean products of the coefficients that end in each window of a chunk.
+
+    A sample that one sensor lacks is left out of all, so that the rate cancels, and half a wavelet is the mean of the
+    samples that are left, three quarters at least. With n of h samples in each half the coefficient is taken times
+    `sqrt(2 / (h/n_1 + h/n_0))`, which gives white noise the variance of a whole one and slower noise a little less. A
+    sensor that lacks more than half of a window is absent in it and counts for nothing there.
+    """
+    items = chunk.reshape(-1, *chunk.shape[-2:])
+    # As many at a time as stay in cache.
+    group = max(_BLOCK // max(chunk.shape[-2] * chunk.shape[-1], 1), 1)
+    parts = [_products(some, window, n_levels) for some in items.split(group)]
+    return Products(*(torch.cat(c).reshape(*chunk.shape[:-2], *c[0].shape[1:]) for c in zip(*parts, strict=True)))
+
+
+def _products(chunk: Tensor, window: int, n_levels: int) -> Products:
+    """The same for `(item, sensor, time)`."""
+    length = chunk.shape[-1] - 2 ** (n_levels + 1)
+    lead = -chunk.shape[-1] % window
+    finite = functional.pad(chunk.isfinite(), (lead, 0))
+    present = finite.unflatten(-1, (-1, window)).double().mean(-1) >= 0.5  # (item, sensor, window)
+    absent = ~present & present.any(-2, keepdim=True)
+    some_absent = bool(absent.any())
+    live = ~absent[..., -(length // window) :].mT  # (item, window, sensor)
+    finite = finite[..., lead:]
+    mean = torch.where(finite, chunk, torch.nan).nanmean(-1, keepdim=True)
+    used = (finite | absent.repeat_interleave(window, -1)[..., lead:]).all(-2, keepdim=True)
+    sums = torch.where(finite & used, chunk - mean, 0.0)
+    n, n_own = used.to(sums), (finite & used).to(sums)
+    means, counts = [], []
+    for level in range(n_levels):
+        half = 2**level
+        newer, older = slice(half, None), slice(None, -half)
+        n_1, n_0 = n[..., newer], n[..., older]
+        complete = torch.minimum(n_1, n_0) >= _SHARE * half
+        if some_absent:
+            complete = complete & (n_own[..., newer] == n_1) & (n_own[..., older] == n_0)
+            n_own = n_own[..., newer] + n_own[..., older]
+        scale_1, scale_0 = 1 / n_1.clamp(min=1), 1 / n_0.clamp(min=1)
+        share = (2 / half / (scale_1 + scale_0)).sqrt() / 2
+        last = slice(sums.shape[-1] - half - length, None)
+        ending = sums[..., newer][..., last] * (share * scale_1)[..., last]
+        ending -= sums[..., older][..., last] * (share * scale_0)[..., last]
+        sums, n = sums[..., newer] + sums[..., older], n_1 + n_0
+        ending, complete = (
+            m.unflatten(-1, (-1, window)).movedim(-3, -2) for m in (ending, complete[..., last])
+        )  # (item, window, sensor, time)
+        if some_absent:
+            complete = (complete | ~live.unsqueeze(-1)).all(-2, keepdim=True)
+        filled = torch.where(complete & live.unsqueeze(-1), ending, 0.0)
+        counts.append(complete.sum((-2, -1)).double())
+        means.append(filled @ filled.mT / counts[-1].clamp(min=1)[..., None, None])
+    return Products(torch.stack(means, -3), torch.stack(counts, -1), live)
+
+
+def parity_matrix(gamma: Tensor, live: Tensor) -> tuple[Tensor, Tensor]:
+    """`N` `(..., window, level, sensor, sensor)` of the live sensors, and their optimal weights; 0 for the others.
+
+    Of one window that stands for all where all sensors are live.
+    """
+    mask = (live[..., :1, :] if bool(live.all()) else live).unsqueeze(-2)  # (..., window, 1, sensor)
+    gamma = gamma.unsqueeze(-4)
+    both = mask[..., :, None] & mask[..., None, :]
+    inverse = torch.linalg.inv(torch.where(both, gamma, torch.diag_embed((~mask).to(gamma))))
+    inverse = torch.where(both, inverse, 0.0)
+    sums = inverse.sum(-1)
+    total = sums.sum(-1, keepdim=True).clamp(min=torch.finfo(sums.dtype).tiny)
+    return inverse - sums[..., :, None] * (sums / total)[..., None, :], sums / total
+
+
+def energies_of(
+    products: Products, gamma: Tensor, matrix: Tensor, weights: Tensor, gain_tolerance: float = 0.0
+) -> Energies:
+    means, counts, _ = products
+    own_precision = matrix.diagonal(dim1=-2, dim2=-1)  # N_ii = 1 / Var e_i
+    spared = torch.where(own_precision > 0, own_precision, torch.inf)
+    squares = torch.einsum("...ik,...kl,...li->...i", matrix, means, matrix)
+    parity = squares / spared
+    rest = (torch.einsum("...ik,...ki->...", matrix, means).unsqueeze(-1) - parity).clamp(min=0)
+    if gain_tolerance:
+        # e_i holds at most tolerance x (1 + sum_k |a_k|) times the rate, whose energy is that of the fused signal.
+        rate = torch.einsum("...i,...ik,...k->...", weights, means, weights).unsqueeze(-1)
+        gains = gain_tolerance * matrix.abs().sum(-1) / spared
+        parity = parity / (1 + gains.square() * rate * own_precision)
+    own = means.diagonal(dim1=-2, dim2=-1) / gamma.diagonal(dim1=-2, dim2=-1).unsqueeze(-3)
+    return Energies(parity, own, rest, counts)
