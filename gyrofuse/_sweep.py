@@ -22,8 +22,10 @@ from torch.nn.functional import pad
 
 from gyrofuse._blocks import moments_over_starts
 
-# Numbers in a tile for each CPU thread: a tile, its coefficients and their influences stay in the last level of cache.
-_CPU_TILE = 2**18
+# Numbers in a tile: with its coefficients and their influences it stays in the last level of cache. Many CPU threads
+# need more to share.
+_CPU_TILE = 2**19
+_CPU_TILE_PER_THREAD = 2**18
 _GPU_TILE = 2**24
 # More of these leave the long levels fewer rounds, but make the short ones look further ahead.
 _SHORT_LEVELS = 12
@@ -247,7 +249,9 @@ def _split(v: Tensor, lag: int, dim: int, room: _Room) -> tuple[Tensor, Tensor]:
 
 
 def _tile(device: torch.device) -> int:
-    return _CPU_TILE * torch.get_num_threads() if device.type == "cpu" else _GPU_TILE
+    if device.type != "cpu":
+        return _GPU_TILE
+    return max(_CPU_TILE, _CPU_TILE_PER_THREAD * torch.get_num_threads())
 
 
 def _mean(signal: Tensor) -> Tensor:

@@ -42,13 +42,26 @@ def default_block_length(series: Tensor) -> Tensor:
     check_floating("series", series)
     if series.ndim < 2 or series.shape[-1] == 0:
         raise ValueError(f"`series`: expected (..., row, time) with entries, got shape {tuple(series.shape)}")
+    return length_of_bins(bin_means(series), series.shape[-1])
+
+
+def bin_means(series: Tensor) -> Tensor:
+    """Means of consecutive entries of series `(..., time)`, at most 256 of them, float64."""
     n = series.shape[-1]
-    width = -(-n // _MOST_BINS)
-    binned = series.detach()[..., : n - n % width].to(torch.float64).unflatten(-1, (-1, width)).mean(-1)
-    shortest = math.ceil(n ** (1 / 3))
-    longest = max(n // _FEWEST_BLOCKS, min(shortest, n))
-    optimum = width * _politis_white(binned).amax(-1)
+    width = _bin_width(n)
+    return series.detach()[..., : n - n % width].unflatten(-1, (-1, width)).mean(-1, dtype=torch.float64)
+
+
+def length_of_bins(binned: Tensor, n_entries: int) -> Tensor:
+    """Block length `(...)` of series of `n_entries`, given their `bin_means`, `(..., row, bin)`."""
+    shortest = math.ceil(n_entries ** (1 / 3))
+    longest = max(n_entries // _FEWEST_BLOCKS, min(shortest, n_entries))
+    optimum = _bin_width(n_entries) * _politis_white(binned).amax(-1)
     return optimum.clamp(shortest, longest).ceil().to(torch.int64)
+
+
+def _bin_width(n_entries: int) -> int:
+    return -(-n_entries // _MOST_BINS)
 
 
 def _politis_white(series: Tensor) -> Tensor:

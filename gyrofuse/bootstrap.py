@@ -50,7 +50,8 @@ def block_bootstrap(
 ) -> Tensor:
     """Resample the wavelet cross-covariance by blocks of wavelet coefficients, [Z] Algorithm 1.
 
-    Too narrow at scales beyond the blocks, and everywhere when the last level has few coefficients: see the module.
+    Too narrow at scales beyond the blocks: nominal 95 % intervals of levels with `tau_j` far above `l` hold the truth
+    in 15 to 60 % of recordings. Too narrow everywhere when the last level has few coefficients. See the module.
     Block sums are differences of cumulative sums of centred products, right to about 1e-10. Memory: a few
     times that of the signal.
 
@@ -146,8 +147,9 @@ def bootstrap_wccv_covariance(
     """Covariance of the entries of the wavelet cross-covariance: `block_bootstrap` for endless resamples.
 
     `V* / T` of [Z] (his `V*` is `T` times the covariance). For small arrays and few levels: memory is a few times
-    `time * level * sensor * (sensor + 1) / 2` numbers. Too small at scales beyond the blocks, and everywhere when the
-    last level has few coefficients: see the module.
+    `time * level * sensor * (sensor + 1) / 2` numbers. Too small at scales beyond the blocks: nominal 95 % intervals of
+    levels with `tau_j` far above `l` hold the truth in 15 to 60 % of recordings. Too small everywhere when the last
+    level has few coefficients. See the module.
 
     Args:
         signal: `(..., sensor, time)`, any unit; NaN = missing sample.
@@ -188,8 +190,10 @@ def bootstrap_wccv_interval(
 ) -> ConfidenceInterval:
     """Interval of each entry of the wavelet cross-covariance, by the normal law and `block_bootstrap`'s limit.
 
-    Too narrow at scales beyond the blocks, and everywhere when the last level has few coefficients: see the module.
+    Too narrow at scales beyond the blocks: nominal 95 % intervals of levels with `tau_j` far above `l` hold the truth
+    in 15 to 60 % of recordings. Too narrow everywhere when the last level has few coefficients. See the module.
     The normal law is poor where a level holds few independent coefficients; limits of a variance may be negative.
+    For variances alone, give each sensor as an array of one, `signal.unsqueeze(-2)`.
 
     Args:
         signal: `(..., sensor, time)`, any unit; NaN = missing sample.

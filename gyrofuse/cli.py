@@ -26,12 +26,15 @@ from gyrofuse._checks import check_positive, check_positive_integer
 from gyrofuse._console import Commands, progress, say, say_table, warn
 from gyrofuse._output import Outputs, output_folder
 from gyrofuse.demo import FILES, run_demo
+from gyrofuse.multiscale import fit_multiscale
+from gyrofuse.multiscale_result import MultiScaleResult
 from gyrofuse.parsing import model_from_dict, parse_model
 from gyrofuse.processes import Model
 from gyrofuse.recording import Recording, read_recording
 from gyrofuse.report import (
     fusion_figure,
     fusion_report,
+    multiscale_figure,
     number,
     recording_report,
     save_figure,
@@ -39,6 +42,7 @@ from gyrofuse.report import (
 )
 from gyrofuse.simulate import ArrayModel
 from gyrofuse.svo import fit_svo
+from gyrofuse.svo_result import SVOResult
 
 _SUFFIXES = {
     "out": (".npz", ".csv"),
@@ -62,8 +66,23 @@ class Method(str, Enum):
     """How weights are chosen."""
 
     svo = "svo"
+    multiscale = "multiscale"
+    auto = "auto"
+    model_assisted = "model-assisted"
+    shrinkage = "shrinkage"
+    nonnegative = "nonnegative"
     inverse_variance = "inverse-variance"
     equal = "equal"
+    rdvg = "rdvg"
+
+
+class Covariance(str, Enum):
+    """What the intervals of the weights rest on."""
+
+    model = "model"
+    block_bootstrap = "block-bootstrap"
+    resampling = "resampling"
+    none = "none"
 
 
 Logs = Annotated[
@@ -140,6 +159,9 @@ def fuse(
         ),
     ] = "flat",
     method: Annotated[Method, typer.Option(help="How the weights are chosen.")] = Method.svo,
+    covariance: Annotated[
+        Covariance, typer.Option(help="What the intervals of the weights rest on.")
+    ] = Covariance.model,
     levels: Annotated[
         int | None, typer.Option(metavar="J", help="Number of levels; as many as fit by default.")
     ] = None,
@@ -165,16 +187,24 @@ def fuse(
 ) -> None:
     """Fuse an array, recorded at rest, into one virtual gyro."""
     weights, stretch = _scale_weights(scale_weights), _stretch(rest)
+    if method is Method.multiscale and report:
+        raise ValueError("`--report`: there is none for --method multiscale yet; draw it with --figure")
     with _outputs(force, [*logs, mounting], out=out, figure=figure, json=json_file, report=report) as drafts:
         recording = _read(logs, axis, sensors, rate, unit, scale, key, mounting)
         with progress("fusing"):
-            result = fit_svo(
-                recording.between(*stretch) if stretch else recording,
-                weights,
-                method=method.value.replace("-", "_"),
-                confidence_level=confidence_level,
-                n_levels=levels,
-            )
+            part = recording.between(*stretch) if stretch else recording
+            result: SVOResult | MultiScaleResult
+            if method is Method.multiscale:
+                result = fit_multiscale(part, weights, confidence_level=confidence_level, n_levels=levels)
+            else:
+                result = fit_svo(
+                    part,
+                    weights,
+                    method=method.value.replace("-", "_"),
+                    covariance=covariance.value.replace("-", "_"),
+                    confidence_level=confidence_level,
+                    n_levels=levels,
+                )
             virtual = result.virtual(recording)
         remarks = []
         if stretch:
@@ -193,8 +223,9 @@ def fuse(
             _save(fused, drafts[out], weights=result.weights.numpy())
         with progress("drawing"):
             if figure:
-                save_figure(fusion_figure(result), drafts[figure], figure.suffix[1:])
-            if report:
+                drawn = fusion_figure(result) if isinstance(result, SVOResult) else multiscale_figure(result)
+                save_figure(drawn, drafts[figure], figure.suffix[1:])
+            if report and isinstance(result, SVOResult):
                 title = f"Virtual gyro of {_titled(logs)}"
                 page = fusion_report(result, recording, virtual, title=title, remarks=remarks)
                 drafts[report].write_text(page, encoding="utf-8")

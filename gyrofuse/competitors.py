@@ -7,6 +7,8 @@ import warnings
 import torch
 from torch import Tensor
 
+from gyrofuse.svo_weights import combine, optimal_weights
+
 # How far below 1 the variance that a sensor would bring may seem, in units of the least, by rounding.
 _TOLERANCE = 1e-12
 _MOST_TURNS = 10  # for each sensor
@@ -152,17 +154,6 @@ def shrunk_covariance(wccv: Tensor, target: Tensor, degrees: Tensor) -> tuple[Te
     worth = nu[best]
     share = (worth[..., None] / (worth[..., None] + eta)).to(wccv)[..., None, None]
     return torch.where(known[..., None, None], (1 - share) * wccv + share * target.to(wccv), wccv), worth
-
-
-def combine(wccv: Tensor, scale_weights: Tensor) -> Tensor:
-    """`A = sum_j omega_j Gamma_j`, [Z] equation (6)."""
-    return torch.einsum("j,...jik->...ik", scale_weights.to(wccv), wccv)
-
-
-def optimal_weights(combined: Tensor) -> Tensor:
-    """`A^-1 1 / (1' A^-1 1)` of `A (..., sensor, sensor)`, [Z] equation (7)."""
-    solved = torch.linalg.solve(combined, combined.new_ones(combined.shape[:-1]))
-    return solved / solved.sum(-1, keepdim=True)
 
 
 def _nonnegative_set(matrix: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ FROZEN, BIASED, DRIFTING, NOISIER, FLIPPED, QUIET = range(len(KINDS))
 _SHAPES = (BIASED, DRIFTING, FLIPPED)
 
 _ONSETS = 32  # instants at which a shape may begin, before the best one is looked at more closely
-_LARGEST = 2**22  # numbers worked on at a time
+_LARGEST = 2**18  # numbers worked on at a time
 # Coefficients of a level above which it may be noisy by itself.
 _MANY = 8
 # A sensor that repeats one value for this part of the window is stuck; one that does not is quieter than it was.

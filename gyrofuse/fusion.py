@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gyrofuse.assisted import assisted_covariance
-from gyrofuse.competitors import equal_weights, inverse_variance_weights
 from gyrofuse.rdvg import rdvg_weights
-from gyrofuse.svo_weights import combine, counting, optimal_weights
+from gyrofuse.selection import ESTIMATORS, Selection, select_estimator
+from gyrofuse.svo_weights import counting, optimal_weights
 
-METHODS = ("svo", "model_assisted", "inverse_variance", "equal", "rdvg")
+METHODS = ("auto", "svo", "model_assisted", "shrinkage", "nonnegative", "inverse_variance", "equal", "rdvg")
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,36 +22,45 @@ class Chosen:
     Attributes:
         weights: `(item, sensor)`.
         method: How they were chosen.
-        weights_of: Maps `A` `(..., sensor, sensor)` to the weights, where they are a function of it alone.
+        selection: Why, where they were chosen by held-out risk.
     """
 
     weights: Tensor
     method: str
-    weights_of: Callable[[Tensor], Tensor] | None = None
+    selection: Selection | None = None
+
+    @property
+    def spread_of(self) -> Callable[[Tensor], Tensor] | None:
+        """The function of `A` whose spread is that of the weights, or on the safe side of it; None when unknown.
+
+        Weights with a model's help, or drawn towards others, vary less than those without.
+        """
+        if self.method == "inverse_variance":
+            return _inverse_variance
+        return optimal_weights if self.method in ("svo", "model_assisted", "shrinkage", "auto") else None
 
 
-def choose_weights(method: str, signal: Tensor, sums: Tensor, counts: Tensor, omega: Tensor) -> Chosen:
-    """Weights by one method.
+def choose_weights(method: str, signal: Tensor, wccv: Tensor, totals: Tensor, omega: Tensor) -> Chosen:
+    """Weights by one method, or by the one with the least held-out risk.
 
     Args:
         method: One of `METHODS`.
         signal: `(item, sensor, time)`.
-        sums: `(item, bin, level, sensor, sensor)`, of `gyrofuse.covariance.binned_products`.
-        counts: The same shape.
+        wccv: `(item, level, sensor, sensor)`.
+        totals: The same shape, products in each entry.
         omega: `(level,)`, scale weights.
     """
-    wccv = counting(sums.sum(1) / counts.sum(1), omega)
-    if method == "svo":
-        return Chosen(optimal_weights(combine(wccv, omega)), method, optimal_weights)
-    if method == "inverse_variance":
-        return Chosen(inverse_variance_weights(wccv, omega), method, _inverse_variance)
-    if method == "model_assisted":
-        totals = counts.sum(1)
-        smooth = assisted_covariance(sums.sum(1) / totals, totals.amin((-1, -2)))
-        return Chosen(optimal_weights(combine(counting(smooth, omega), omega)), method)
     if method == "rdvg":
         return Chosen(rdvg_weights(signal).to(wccv), method)
-    return Chosen(equal_weights(wccv), method)
+    counts, wccv = totals.amin((-1, -2)), counting(wccv, omega)
+    if method != "auto":
+        return Chosen(ESTIMATORS[method](wccv, counts, omega), method)
+    selection = select_estimator(signal, omega)
+    names = selection.candidates
+    candidates = torch.stack([ESTIMATORS[name](wccv, counts, omega) for name in names], 1)
+    weights = candidates.take_along_dim(selection.chosen[:, None, None], 1)[:, 0]
+    different = selection.chosen.unique()
+    return Chosen(weights, names[int(different)] if len(different) == 1 else "auto", selection)
 
 
 def _inverse_variance(combined: Tensor) -> Tensor:

@@ -89,7 +89,7 @@ def wavelet_cross_covariance_interval(
 def _intervals(items: Tensor, n_levels: int, confidence_level: float) -> tuple[Tensor, Tensor]:
     """Limits `(item, level, sensor, sensor)`."""
     n_sensors, n_samples = items.shape[1:]
-    sums, counts = binned_products(items, n_levels, series.bin_length(n_samples, n_sensors, n_levels))
+    sums, counts = binned_products(items, n_levels, series.bin_length(n_samples, n_sensors))
     total = counts.sum(1)
     wccv = sums.sum(1) / total  # (item, level, sensor, sensor)
     windows = total / torch.exp2(torch.arange(1, n_levels + 1, dtype=wccv.dtype, device=wccv.device))[:, None, None]

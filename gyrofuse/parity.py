@@ -177,22 +177,15 @@ def _loud(energies: Energies, reference: ParityReference, live: Tensor) -> _Side
     degrees = reference.degrees_of_freedom[..., None, :, None]  # (..., 1, level, 1)
     left = degrees - (live.sum(-1) - 2).clamp(min=0)[..., None, None]
     ratio = energies.parity * (left / degrees) / (1 + energies.rest / degrees)
-    spread = reference.spread.unsqueeze(-3)
-    numerator = _with_spread(_observed(energies).expand_as(ratio), spread)
-    denominator = _with_spread(left, spread / reference.n_windows[..., None, :, None])
     tested = (energies.counts > 0).unsqueeze(-1) & (live.sum(-1, keepdim=True) > 1).unsqueeze(-1)
-    return _side("sf", ratio, numerator, denominator, tested & live.unsqueeze(-2))
+    return _side("sf", ratio, _observed(energies), left, reference.spread, reference, tested & live.unsqueeze(-2))
 
 
 def _quiet(energies: Energies, reference: ParityReference, live: Tensor) -> _Side:
     """Too little energy of a sensor itself."""
-    spread = reference.own_spread.unsqueeze(-3)
-    observed = _observed(energies).expand_as(energies.own)
-    denominator = _with_spread(
-        reference.degrees_of_freedom[..., None, :, None], spread / reference.n_windows[..., None, :, None]
-    )
+    observed, degrees = _observed(energies), reference.degrees_of_freedom[..., None, :, None]
     tested = (observed >= _FEWEST_QUIET) & live.unsqueeze(-2)
-    return _side("cdf", energies.own, _with_spread(observed, spread), denominator, tested)
+    return _side("cdf", energies.own, observed, degrees, reference.own_spread, reference, tested)
 
 
 def _observed(energies: Energies) -> Tensor:
@@ -200,17 +193,34 @@ def _observed(energies: Energies) -> Tensor:
     return degrees_of_freedom(energies.counts).unsqueeze(-1)
 
 
-def _with_spread(degrees: Tensor, spread: Tensor) -> Tensor:
-    """Degrees of freedom of a variance that itself varies: `2/eta` is its relative variance."""
-    return 2 / (2 / degrees + spread)
+def _side(
+    tail: str,
+    ratio: Tensor,
+    observed: Tensor,
+    degrees: Tensor,
+    spread: Tensor,
+    reference: ParityReference,
+    tested: Tensor,
+) -> _Side:
+    """Chance of a variance ratio in a healthy array.
 
-
-def _side(tail: str, ratio: Tensor, numerator: Tensor, denominator: Tensor, tested: Tensor) -> _Side:
+    An F law, whose degrees of freedom the spread lowers: `2/eta` is the relative variance of a variance. Powers that
+    themselves vary have longer tails, and how far they vary is known from some windows only: where they do, the
+    logarithm of the ratio is held against Student's t as well, and the larger chance counts.
+    """
     from scipy import stats
 
-    chance = getattr(stats.f, tail)(*(value.cpu().numpy() for value in (ratio, numerator, denominator)))
-    evidence = numerator / 2 * (ratio - 1 - ratio.clamp(min=1e-300).log())
-    return _Side(ratio, torch.where(tested, torch.as_tensor(chance).to(ratio), torch.nan), evidence)
+    spread, n_windows = spread.unsqueeze(-3), reference.n_windows[..., None, :, None]
+    above, below = 2 / observed + spread, 2 / degrees + spread / n_windows  # relative variances
+    deviation = torch.log1p(above + below).sqrt()
+    score = ratio.clamp(min=1e-300).log() / deviation + deviation / 2
+    chances = []
+    for law, *arguments in ((stats.f, ratio, 2 / above, 2 / below), (stats.t, score, (n_windows - 1).clamp(min=1))):
+        chance = getattr(law, tail)(*(value.cpu().numpy() for value in arguments))
+        chances.append(torch.as_tensor(chance).to(ratio))
+    chance = torch.where(spread > 2 / observed, torch.maximum(*chances), chances[0])
+    evidence = (ratio - 1 - ratio.clamp(min=1e-300).log()) / above
+    return _Side(ratio, torch.where(tested, chance, torch.nan), evidence)
 
 
 def _stationary(result: SVOResult, window: int) -> ParityReference:

@@ -21,6 +21,8 @@ from gyrofuse.uncertainty import degrees_of_freedom
 _FEWEST = 4
 # By default windows are compared with what came before them over this many times their length, as a power of 2.
 _LOOK_BACK = 4
+# Confidence at which noise power is taken to vary by more than sampling.
+_SIGNIFICANT = 0.95
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,12 +205,20 @@ def check_window(window: int, n_samples: int, name: str) -> int:
 
 def _spread(energy: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
     """Variance `(..., level, sensor)` of relative energies `(..., window, level, sensor)` between windows beyond that
-    of sampling, and the number of windows `(..., level)` that it rests on, each counted by its share.
+    of sampling, 0 where it is no more than chance, and the number of windows `(..., level)` that it rests on, each
+    counted by its share.
     """
+    from scipy import stats
+
     share = (counts / counts.sum(-2, keepdim=True).clamp(min=1)).unsqueeze(-1)
     mean = (share * energy).sum(-3, keepdim=True)
     n_windows = 1 / share.square().sum(-3).clamp(min=torch.finfo(share.dtype).tiny)
     variance = (share * (energy / mean - 1).square()).sum(-3) * n_windows / (n_windows - 1).clamp(min=1)
     sampling = (share * 2 / degrees_of_freedom(counts).unsqueeze(-1)).sum(-3)
-    spread = torch.where(n_windows >= 2, variance - sampling, 0.0).clamp(min=0)
+    chance = stats.chi2.ppf(_SIGNIFICANT, (n_windows - 1).clamp(min=1).cpu().numpy())
+    largest = torch.as_tensor(chance).to(sampling) / (n_windows - 1).clamp(min=1)
+    clear = torch.where((n_windows >= 2) & (variance > sampling * largest), variance - sampling, 0.0)
+    # What some levels show clearly is to be expected at those that cannot show it: their mean, by what they know.
+    known = sampling.clamp(min=torch.finfo(sampling.dtype).tiny).reciprocal().square()
+    spread = torch.maximum(clear, (known * clear).sum(-2, keepdim=True) / known.sum(-2, keepdim=True))
     return spread, n_windows.squeeze(-1)

@@ -17,6 +17,7 @@ from torch import Tensor
 from gyrofuse import plotting
 from gyrofuse._result import numbered
 from gyrofuse.covariance import wavelet_variance
+from gyrofuse.multiscale_result import MultiScaleResult
 from gyrofuse.recording import Recording
 from gyrofuse.svo_result import SVOResult
 
@@ -31,6 +32,11 @@ _METHODS = {
     "Signal Processing 70, 2022, equations 6 and 7). They sum to 1 and may be negative.",
     "inverse_variance": "Inverse variance: every sensor is weighted by the reciprocal of its wavelet variance, summed "
     "over scales with the scale weights of the table; correlation between sensors is ignored.",
+    "model_assisted": "Model-assisted SVO: the weights minimise the wavelet variance of the virtual gyro, summed over "
+    "scales with the scale weights of the table, where the last scales, of few observations, are those of a smooth "
+    "noise model fitted to the others.",
+    "rdvg": "Reduced-drift virtual gyro (Vaccaro and Zaki, Sensors 17, 2017): the weights minimise the random walk in "
+    "a model of white noise and random walk.",
     "equal": "Equal weights: the virtual gyro is the plain mean of the sensors.",
 }
 
@@ -112,6 +118,23 @@ def recording_report(recording: Recording, *, title: str) -> str:
             }
         )
     return _render("recording.html.j2", title=title, recording=recording, parts=parts, sensors=sensor_rows(recording))
+
+
+def multiscale_figure(result: MultiScaleResult) -> Figure:
+    """Draw the Allan deviations of a multi-scale virtual gyro, axes side by side.
+
+    Args:
+        result: Of one array, or of one per axis.
+
+    Returns:
+        A figure unknown to pyplot; save it with `save_figure`.
+    """
+    items = [("", result)] if result.weights.ndim == 2 else [(n, result[i]) for i, n in enumerate(result.single.axes)]
+    figure = new_figure(7 if len(items) == 1 else 5 * len(items), 4.6)
+    for ax, (name, item) in zip(figure.subplots(1, len(items), squeeze=False)[0], items, strict=True):
+        item.plot(ax)
+        ax.set_title(name, parse_math=False)
+    return figure
 
 
 def fusion_figure(result: SVOResult) -> Figure:

@@ -9,7 +9,7 @@ covariance `A`. Scale weights of levels that blocks do hold need no such move: t
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -19,14 +19,13 @@ from gyrofuse._checks import check_signal, largest_level
 from gyrofuse._result import listed
 from gyrofuse.assisted import assisted_covariance
 from gyrofuse.competitors import (
-    combine,
     equal_weights,
     inverse_variance_weights,
     nonnegative_weights,
-    optimal_weights,
     shrinkage_weights,
 )
 from gyrofuse.covariance import wavelet_products
+from gyrofuse.svo_weights import combine, optimal_weights
 from gyrofuse.uncertainty import degrees_of_freedom
 
 # From cross-covariance, number of coefficients `(..., level)` and scale weights to weights.
@@ -70,6 +69,18 @@ class Selection:
     n_folds: Tensor
     n_blocks: int
     levels_down: int
+
+    def __getitem__(self, index: Any) -> Selection:
+        """One item, or some, of the leading batch dimensions."""
+        batched = ("risk", "standard_error", "chosen", "n_folds")
+        return replace(self, **{name: getattr(self, name)[index] for name in batched})
+
+    def reshape(self, batch: Sequence[int]) -> Selection:
+        """The same items in other batch dimensions."""
+        batched = ("risk", "standard_error", "chosen", "n_folds")
+        n = self.chosen.ndim
+        values = {name: getattr(self, name) for name in batched}
+        return replace(self, **{name: v.reshape((*batch, *v.shape[n:])) for name, v in values.items()})
 
     @property
     def sentence(self) -> str:

@@ -20,6 +20,8 @@ import math
 import torch
 from torch import Tensor
 
+from gyrofuse._checks import largest_level
+
 # More cosines than this gain little: Student's t is within 3 % of normal.
 MOST_TERMS = 48
 # A level holds `M / tau` windows side by side; four of them for each cosine.
@@ -32,9 +34,9 @@ def number_of_terms(windows: Tensor) -> Tensor:
     return (windows / _WINDOWS_PER_TERM).floor().clamp(2, MOST_TERMS)
 
 
-def bin_length(n_samples: int, n_sensors: int, n_levels: int) -> int:
+def bin_length(n_samples: int, n_sensors: int) -> int:
     """Samples of a bin, a power of two: enough bins to tell the cosines apart, in at most twice the data's memory."""
-    affordable = max(2 * n_samples // (n_sensors * n_levels), 1)
+    affordable = max(2 * n_samples // (n_sensors * max(largest_level(n_samples), 1)), 1)
     n_bins = min(8 * MOST_TERMS, affordable)
     return 1 << max(math.ceil(math.log2(max(n_samples / n_bins, 1))), 0)
 

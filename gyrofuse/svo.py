@@ -54,7 +54,8 @@ def fit_svo(
         covariance: What the intervals rest on. `"model"`: the series itself where levels hold many windows, a fitted
             model where they do not; right at every level. `"block_bootstrap"`: that of [Z] in closed form, right for
             short scales only. `"resampling"`: signals resampled in blocks ([Z] Remark C), for stationary signals.
-            `"none"`. Only SVO and inverse-variance weights have intervals of their own.
+            `"none"`. Model-assisted and shrunk weights, which vary less, get the intervals of SVO weights; nonnegative
+            and RDVG weights get none.
         block_length: Of the two bootstraps; by default chosen from the data.
         n_levels: Number of levels J. By default as many as there are scale weights, else the largest at which
             every pair of sensors has a complete window.
@@ -96,7 +97,7 @@ def fit_svo(
         sensors,
         dtype=values.dtype,
     )
-    chosen = choose_weights(method, items, sums, counts, omega)
+    chosen = choose_weights(method, items, wccv, totals, omega)
     n_known = int((totals > 0).all(0).flatten(1).all(1).sum())  # later levels do not count, or this were refused
     known = (sums[:, :, :n_known], counts[:, :, :n_known], omega[:n_known])
     if covariance == "none":
@@ -121,6 +122,7 @@ def fit_svo(
         scale_weights=omega.to(values.dtype),
         degrees_of_freedom=batched(degrees, torch.float64),
         method=chosen.method,
+        selection=chosen.selection and chosen.selection.reshape(batch),
         n_samples=values.shape[-1],
         sensors=tuple(sensors),
         axes=recording.axes if recording else (),
@@ -206,23 +208,23 @@ def _spread(
     weights = chosen.weights
     if chosen.method == "equal":
         return certain(weights)
-    if chosen.weights_of is None:
+    weights_of = chosen.spread_of
+    if weights_of is None:
         return unknown(weights)
     if covariance == "model":
-        return spread_of_weights(sums, counts, omega, pilot, chosen.weights_of, confidence_level)
+        return spread_of_weights(sums, counts, omega, pilot, weights_of, confidence_level)
     totals = counts.sum(1)
     wccv = counting(sums.sum(1) / totals, omega)
     if covariance == "block_bootstrap":
-        closed_form = {
-            "svo": bootstrap_weights_covariance,
-            "inverse_variance": bootstrap_inverse_variance_weights_covariance,
-        }[chosen.method]
+        closed_form = bootstrap_weights_covariance
+        if chosen.method == "inverse_variance":
+            closed_form = bootstrap_inverse_variance_weights_covariance
         found = closed_form(items, wccv, omega, weights, counts=totals, block_length=block_length)
     else:
         resamples = signal_bootstrap(
             items, len(omega), block_length=block_length, generator=torch.Generator().manual_seed(0)
         )
-        moved = chosen.weights_of(combine(counting(resamples, omega), omega)) - weights[:, None]
+        moved = weights_of(combine(counting(resamples, omega), omega)) - weights[:, None]
         found = moved.mT @ moved / moved.shape[1]  # around the estimate, as [Z] does
     return normal_spread(found.to(weights), confidence_level)
 
@@ -246,7 +248,7 @@ def _measure(items: Tensor, n_levels: int | None) -> tuple[Tensor, Tensor]:
     """
     n_sensors, n_samples = items.shape[1:]
     asked = check_n_levels(n_levels, n_samples)
-    sums, counts = binned_products(items, asked, bin_length(n_samples, n_sensors, asked))
+    sums, counts = binned_products(items, asked, bin_length(n_samples, n_sensors))
     fewest = counts.sum(1).amin((-1, -2))  # (item, level)
     if n_levels is None:
         asked = int((fewest > 0).all(0).sum())

@@ -15,6 +15,7 @@ from gyrofuse.competitors import equal_weights
 from gyrofuse.gain import Gain
 from gyrofuse.hypotheses import EnoughData, Evidence, WeightsTest
 from gyrofuse.recording import Recording
+from gyrofuse.selection import Selection
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -55,12 +56,13 @@ class SVOResult:
         wavelet_cross_covariance: `(..., level, sensor, sensor)`, signal^2.
         scale_weights: `(level,)`, sum 1.
         degrees_of_freedom: `(..., level)`, independent observations of the virtual gyro that a level holds.
-        method: How the weights were chosen.
+        method: How the weights were chosen; `"auto"` where that differs over the batch.
         n_samples: Length of the signal.
         sensors: Name of each sensor.
         axes: Names along the leading dimension (`("x", "y", "z")`), empty when it has none.
         rate: Sampling rate in Hz, when known.
         unit: Unit of the signal, when known.
+        selection: Held-out risks, where the method was chosen by them.
     """
 
     weights: Tensor
@@ -77,6 +79,7 @@ class SVOResult:
     axes: tuple[str, ...] = ()
     rate: float | None = None
     unit: str | None = None
+    selection: Selection | None = None
 
     @property
     def n_levels(self) -> int:
@@ -226,7 +229,8 @@ class SVOResult:
         batched = ("weights", "weights_cov", "weights_degrees", "wavelet_cross_covariance", "degrees_of_freedom")
         interval = ConfidenceInterval(*(limit[index] for limit in self.confidence_interval))
         items = {name: getattr(self, name)[index] for name in batched}
-        return replace(self, axes=(), confidence_interval=interval, **items)
+        selection = self.selection and self.selection[index]
+        return replace(self, axes=(), confidence_interval=interval, selection=selection, **items)
 
     def summary(self) -> str:
         """The weights with their intervals and the gain over equal weights per level, as fixed-width text."""
@@ -263,6 +267,8 @@ class SVOResult:
             tau, omega, *deviations, ratio = row
             numbers = "  ".join(f"{value:>12.5g}" for value in deviations)
             lines.append(f"{j + 1:>5}  {tau:>13.6g}  {omega:>7.4f}  {numbers}  {ratio:>13.4f}")
+        if self.selection:
+            lines += ["", self.selection.sentence]
         if self._has_covariance:
             lines += ["", *hypotheses.verdicts(self._evidence("summary"), self.sensors)]
         if self.motion:
@@ -305,6 +311,7 @@ class SVOResult:
         low, high = self.confidence_interval
         return {
             "method": self.method,
+            "selection": self.selection.to_dict() if self.selection else None,
             "sensors": list(self.sensors),
             "axes": list(self.axes),
             "rate": self.rate,

@@ -66,7 +66,7 @@ class SVOWeights(nn.Module):
 
 def combine(wccv: Tensor, omega: Tensor) -> Tensor:
     """`A = sum_j omega_j Gamma_j`, [Z] equation (6)."""
-    return torch.einsum("j,...jik->...ik", omega, wccv)
+    return torch.einsum("j,...jik->...ik", omega.to(wccv), wccv)
 
 
 def counting(wccv: Tensor, omega: Tensor) -> Tensor:

@@ -49,7 +49,7 @@ def test_wavelet_variances_are_the_exact_ones():
         phi = np.exp(-1 / 25.0)
         np.testing.assert_allclose(white, 1 / tau, rtol=1e-12)
         np.testing.assert_allclose(walk, (tau**2 + 2) / (12 * tau), rtol=1e-9)
-        np.testing.assert_allclose(ar1 * (1 - phi**2), naive.exact_ar1_wavelet_variance(phi, j + 1), rtol=1e-8)
+        np.testing.assert_allclose(ar1, (1 - phi**2) * naive.exact_ar1_wavelet_variance(phi, j + 1), rtol=1e-8)
 
 
 @pytest.mark.parametrize("block", [1, 4, 32])

@@ -110,17 +110,17 @@ def null_results(compression: float) -> dict[str, ParityResult]:
     settings = json.loads(path.read_text())["svo"]
     white, walk = (torch.tensor(settings[name], dtype=torch.float64) for name in "RQ")
     array = ArrayModel([(WhiteNoise(1.0), white), (RandomWalk(1.0), walk * compression)])
-    signal = array.simulate(2048 + 512, batch=(N_RUNS,), generator=torch.Generator().manual_seed(4))
-    calm, moving = signal[..., :2048], signal + white.max().sqrt() * turning(2560)
-    before, after = moving[..., :2048], moving[..., 2048:]
+    signal = array.simulate(1024 + 256, batch=(N_RUNS,), generator=torch.Generator().manual_seed(4))
+    calm, moving = signal[..., :1024], signal + white.max().sqrt() * turning(1280)
+    before, after = moving[..., :1024], moving[..., 1024:]
     return {
-        "fit": parity_test(after, fit_svo(calm, covariance="none"), window=256, before=before),
-        "windows": parity_test(after, fit_parity(calm, 256), before=before),
+        "fit": parity_test(after, fit_svo(calm, covariance="none"), window=128, before=before),
+        "windows": parity_test(after, fit_parity(calm, 128), before=before),
     }
 
 
 @pytest.mark.parametrize("kind", ["fit", "windows"])
-@pytest.mark.parametrize("compression", [2.0**12, 2.0**16, 2.0**20])
+@pytest.mark.parametrize("compression", [2.0**14, 2.0**20])
 def test_false_alarms_are_as_rare_as_stated(compression, kind):
     """At most 1 % of 1000 first windows raise an alarm at 1 %, and 10 % at 10 %, white noise or random walk ruling.
 
@@ -132,7 +132,7 @@ def test_false_alarms_are_as_rare_as_stated(compression, kind):
         assert claimed(result.p_value[:, window] < 0.1, 0.1)
 
 
-@pytest.mark.parametrize("compression", [2.0**12, 2.0**16, 2.0**20])
+@pytest.mark.parametrize("compression", [2.0**14, 2.0**20])
 def test_false_alarms_are_not_rarer_than_need_be(compression):
     """Windows below 10 % are no fewer than one in eight of what is stated: Bonferroni costs, but not power."""
     p = null_results(compression)["fit"].p_value.flatten()
@@ -140,23 +140,23 @@ def test_false_alarms_are_not_rarer_than_need_be(compression):
 
 
 def test_noise_that_varies_by_itself_is_no_fault_to_who_has_seen_it():
-    """Noise power that differs by 60 % (standard deviation) from window to window: 50 arrays, 20 windows of each."""
+    """Noise power that differs by 60 % (standard deviation) from window to window: 50 arrays, 10 windows of each."""
     generator = torch.Generator().manual_seed(6)
-    unit = torch.randn(50, 4, 60, 128, dtype=torch.float64, generator=generator)
-    power = torch.exp(0.55 * torch.randn(50, 4, 60, 1, dtype=torch.float64, generator=generator))
+    unit = torch.randn(50, 4, 50, 128, dtype=torch.float64, generator=generator)
+    power = torch.exp(0.55 * torch.randn(50, 4, 50, 1, dtype=torch.float64, generator=generator))
     signal = (unit * power.sqrt()).flatten(-2)
     calm, rest = signal[..., : 40 * 128], signal[..., 40 * 128 :]
     assert claimed(parity_test(rest, fit_parity(calm, 128)).alarm, 0.01)
     stationary = torch.randn(4, 40 * 128, dtype=torch.float64, generator=generator)
-    assert claimed(parity_test(rest, fit_parity(stationary, 128, extra_spread=1.0)).alarm, 0.05)
-    for blind in (fit_parity(stationary, 128), fit_svo(calm, covariance="none")):
-        assert parity_test(rest, blind, window=128).alarm.double().mean() > 0.5
+    assert claimed(parity_test(rest, fit_parity(stationary, 128, extra_spread=0.8)).alarm, 0.01)
+    for blind in (fit_parity(stationary, 128), fit_svo(calm[0], covariance="none")):
+        assert parity_test(rest[0], blind, window=128).alarm.double().mean() > 0.5
 
 
 def test_scale_factors_may_differ_by_what_is_tolerated():
     generator = torch.Generator().manual_seed(7)
-    signal = noise().simulate(1024, batch=(100,), generator=generator)
-    gains = 1 + 0.01 * (2 * torch.rand(100, N_SENSORS, 1, dtype=torch.float64, generator=generator) - 1)
+    signal = noise().simulate(1024, batch=(40,), generator=generator)
+    gains = 1 + 0.01 * (2 * torch.rand(40, N_SENSORS, 1, dtype=torch.float64, generator=generator) - 1)
     moving = signal + gains * 20 * turning(1024)
     assert parity_test(moving, reference()).alarm.all()
     assert claimed(parity_test(moving, reference(), gain_tolerance=0.01).alarm, 0.01)
@@ -175,7 +175,7 @@ def faulty(kind: str, sensor: int = 3) -> Tensor:
     if kind == "frozen":
         part[:] = part[0].clone()
     elif kind == "biased":
-        part += 8
+        part += 12
     elif kind == "drifting":
         part += 0.02 * time
     elif kind == "noisier":
@@ -203,7 +203,7 @@ def test_a_fault_is_found_named_and_told(kind, sensor):
     assert abs(result.faults[0].start - ONSET) <= WINDOW
     fault = next(fault for fault in result.faults if fault.kind == kind)
     assert fault.sensor == str(sensor + 1)
-    size = {"biased": 8, "drifting": 0.02}.get(kind)
+    size = {"biased": 12, "drifting": 0.02}.get(kind)
     if size:
         assert fault.size == pytest.approx(size, rel=0.2)
     assert f"Sensor {sensor + 1} " in str(result)
@@ -281,9 +281,9 @@ def test_missing_sensors_are_left_out():
 
 
 def test_scattered_losses_neither_alarm_nor_blunt():
-    """Each sensor loses 2 % of its samples, on 200 moving arrays: the rate still cancels, long levels are still there."""
+    """Each sensor loses 2 % of its samples, on 40 moving arrays: the rate cancels, and long levels are still there."""
     generator = torch.Generator().manual_seed(8)
-    signal = noise().simulate(1536, batch=(200,), generator=generator) + turning(1536)
+    signal = noise().simulate(1536, batch=(40,), generator=generator) + turning(1536)
     lost = torch.rand(signal.shape, generator=generator) < 0.02
     holes = torch.where(lost, torch.nan, signal)
     result = parity_test(holes, reference())
@@ -343,7 +343,7 @@ def test_every_sensor_of_a_real_array_is_named(shared: Path):
     fs = study()
     session = fs.mimu_sessions(shared / "data" / "mimu4444_8imu.npz", 256, 2)[2]
     for sensor in range(8):
-        signal = fs.inject(session.pieces, "biased", 3.0, sensor, session, 256)
+        signal = fs.inject(session.pieces[:1], "biased", 3.0, sensor, session, 256)
         faults = parity_test(signal, session.reference).faulty[..., 2:, :].any(-2)  # (piece, axis, sensor)
         expected = torch.arange(8) == sensor
         assert (faults == expected).all()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from reference.haar import coefficients
 from scipy import stats
 
 Array = NDArray[np.float64]
@@ -36,11 +35,22 @@ def degrees(n: float, level: int) -> float:
 
 
 def window_coefficients(signal: Array, level: int, window: int, number: int) -> Array:
-    """Complete coefficients of a level that end in a window, `(sensor, time)`."""
-    w = np.asarray(coefficients(signal, level), dtype=float)
-    ends = np.arange(w.shape[-1]) + 2**level - 1
-    some = w[:, (ends >= number * window) & (ends < (number + 1) * window)]
-    return some[:, np.isfinite(some).all(0)]
+    """Coefficients of a level that end in a window, from the samples that all sensors have, `(sensor, time)`."""
+    half = 2 ** (level - 1)
+    common = np.isfinite(signal).all(0)
+    some = []
+    for end in range(number * window, (number + 1) * window):
+        first = end + 1 - 2 * half
+        if first < 0:
+            continue
+        halves = [np.arange(start, start + half) for start in (first, first + half)]
+        older, newer = (half_window[common[half_window]] for half_window in halves)
+        if min(len(older), len(newer)) < 0.75 * half:
+            continue
+        # what white noise gains in variance where samples are left out
+        excess = (half / len(older) + half / len(newer)) / 2
+        some.append((signal[:, newer].mean(1) - signal[:, older].mean(1)) / 2 / np.sqrt(excess))
+    return np.array(some).T.reshape(len(signal), -1)
 
 
 def p_values(signal: Array, gamma: Array, observations: Array, window: int, number: int) -> tuple[Array, Array, int]:
