@@ -31,12 +31,13 @@ noise = gf.ArrayModel(
     ]
 )
 offsets = torch.randn(6, 1, generator=generator, dtype=torch.float64)  # deg/s
-calibration = noise.simulate(60_000, generator=generator) + offsets
+everything = noise.simulate(60_000 + n_samples, generator=generator) + offsets
+calibration, stream = everything[:, :60_000], everything[:, 60_000:]
 
 # The stream: a motion that all sensors feel, and what happens to some of them.
 time = torch.arange(n_samples, dtype=torch.float64) / rate
 motion = 20 * torch.sin(2 * torch.pi * time / 7) + torch.where((time % 120) < 10, 40.0, 0.0)
-stream = noise.simulate(n_samples, generator=generator) + offsets + motion
+stream = stream + motion
 away = slice(n_samples // 5, 2 * n_samples // 5)
 stream[1, away] = torch.nan
 stream[1, away.stop :] += 0.5  # back with another offset
@@ -71,10 +72,11 @@ for chunk in stream.split(20 * window, dim=-1):
 error = torch.cat(virtual) - motion
 middle = error.reshape(-1, window).mean(-1)
 print(f"Left out: {', '.join(str(i + 1) for i in faulty.nonzero().flatten().tolist()) or 'none'}")
-print(f"Noise of the virtual gyro {error.std():.4f} deg/s, largest step between means of 10 s {middle.diff().abs().max():.4f}")
+print(f"Noise of the virtual gyro {error.std():.4f} deg/s; its largest step between means of 10 s")
+print(f"is {middle.diff().abs().max():.4f} deg/s")
 plain = torch.nanmean(stream, 0) - motion
 steps = plain.reshape(-1, window).nanmean(-1).diff().abs()
-print(f"The mean of whatever is there: largest step {steps.max():.4f} deg/s")
+print(f"That of the mean of whatever is there: {steps.max():.4f} deg/s")
 
 if arguments.plot:
     import matplotlib

@@ -70,7 +70,7 @@ class Sweeps:
         self._statistic = statistic
         self._n_samples, self._n_left = n_samples, n_samples
         longest = 2**statistic.n_levels
-        self._step = min(longest, 1 << max(1, n_samples // _FEWEST_STEPS).bit_length() - 1)
+        self._step = 1 << max(1, n_samples // _FEWEST_STEPS).bit_length() - 1
         self._stretch = max(windows * longest, _SHORTEST_STRETCH, self._step)
         self._chunks: list[Tensor] = []
         self._n_held = 0
@@ -131,12 +131,12 @@ def _swept(signal: Tensor, statistic: Statistic, step: int, last: bool) -> tuple
     """Sweep over a stretch `(item, sensor, time)` of at least `2**n_levels` samples.
 
     Where the recording goes on after it, only times whose longest window ends within the stretch are taken, which has
-    to be a multiple of `step`, a power of two of at most `2**n_levels`.
+    to be a multiple of `step`, a power of two.
 
     Returns:
         The series `(item, out, time)` at the times that all levels share; sums over bins of `step` times,
-        `(level, item, out, bin)`; and sums over all but the last `2**j` times of each bin, for levels with windows
-        shorter than a bin.
+        `(level, item, out, bin)`; and, for levels where this is not 0, sums over the first `D_j mod step` times of each
+        bin, by which the stretches that complete a level are longer than some bins.
     """
     mapping, influence, estimate, _, levels, n_levels = statistic
     n_items, n_sensors, n_samples = signal.shape
@@ -155,7 +155,7 @@ def _swept(signal: Tensor, statistic: Statistic, step: int, last: bool) -> tuple
     like: dict[str, Any] = {"dtype": torch.float64, "device": signal.device}
     series = torch.empty(n_items, n_out, padded, **like)
     bins = torch.zeros(n_levels, n_items, n_out, padded // step, **like)
-    heads = torch.zeros(max(0, step.bit_length() - 2), n_items, n_out, padded // step, **like)
+    heads = torch.zeros(max(0, min(step.bit_length() - 1, n_levels) - 1), n_items, n_out, padded // step, **like)
     smooth = torch.empty(n_items, n_rows, padded, **like) if max(levels) >= n_short else None
     room = _Room(n_items * max(n_rows, n_sensors, n_out) * (tile + phases), like)
     offset = _mean(signal[..., :tile])  # no filter sees it; without it the rest keeps its digits
@@ -180,7 +180,7 @@ def _swept(signal: Tensor, statistic: Statistic, step: int, last: bool) -> tuple
             where = slice(start // step, start // step + binned.shape[-2])
             bins[level, ..., where] = binned.sum(-1)
             if level < len(heads):
-                heads[level, ..., where] = binned[..., : step - 2 ** (level + 1)].sum(-1)
+                heads[level, ..., where] = binned[..., : (2**n_levels - 2 ** (level + 1)) % step].sum(-1)
         else:
             if smooth is not None:
                 n = min(tile, v.shape[-1])

@@ -33,11 +33,11 @@ def assisted_covariance(wccv: Tensor, counts: Tensor) -> Tensor:
     `p(p+1)/2` parameters for each matrix of the model and for each level before it, which keeps its own covariance.
 
     Args:
-        wccv: `(..., level, sensor, sensor)`, signal^2, float64; levels without coefficients may hold anything.
+        wccv: `(..., level, sensor, sensor)`, signal^2; levels without coefficients may hold anything.
         counts: `(..., level)`, number of coefficients of each level.
 
     Returns:
-        The same shape, float64: measured below the level where the model begins, of the model from there on.
+        The same shape and dtype: measured below the level where the model begins, of the model from there on.
     """
     n_levels, n_sensors = wccv.shape[-3], wccv.shape[-1]
     observations = counts * torch.exp2(-torch.arange(1, n_levels + 1, dtype=torch.float64, device=counts.device))
@@ -45,12 +45,15 @@ def assisted_covariance(wccv: Tensor, counts: Tensor) -> Tensor:
     first = min(int((fewest > _MOST_OBSERVATIONS).sum()), max(n_levels - 3, 0))
     # A level can keep its own covariance only if that is well determined, and three levels are left for the model.
     last = max(first, min(int((fewest >= n_sensors).sum()), n_levels - 3))
-    eta = torch.where(counts > 0, (2 * observations).clamp(1.0, _MOST_DEGREES), 0.0)[..., first:]
-    measured = torch.where((counts > 0)[..., None, None], wccv, 0.0)
+    known = (counts > 0) & (wccv.diagonal(dim1=-2, dim2=-1) > 0).all(-1)
+    eta = torch.where(known, (2 * observations).clamp(1.0, _MOST_DEGREES), 0.0)[..., first:]
 
-    size = measured[..., first:, :, :].diagonal(dim1=-2, dim2=-1).mean(-2).sqrt()
+    # In units of each sensor, so that no sensor is small to rounding.
+    measured = torch.where(known[..., None, None], wccv, 0.0).double()[..., first:, :, :]
+    size = measured.diagonal(dim1=-2, dim2=-1).amax(-2).sqrt()
     scale = (size[..., :, None] * size[..., None, :])[..., None, :, :]
-    gamma = measured[..., first:, :, :] / scale
+    identity = torch.eye(n_sensors, dtype=torch.float64, device=wccv.device)
+    gamma = torch.where(known[..., first:, None, None], measured / scale, identity)
     gamma = gamma + _FLOOR * torch.diag_embed(gamma.diagonal(dim1=-2, dim2=-1))
     constants = torch.logspace(first, n_levels - 1, _N_AR1, base=2.0, dtype=torch.float64).tolist()
     unit = _unit_variances(n_levels, tuple(constants)).to(gamma)[first:]
@@ -66,7 +69,7 @@ def assisted_covariance(wccv: Tensor, counts: Tensor) -> Tensor:
     candidates = torch.cat([wide[..., None, :, :, :], some], dim=-4)  # (..., candidate, level, sensor, sensor)
     best = torch.cat([wide_score[..., None], some_scores], dim=-1).argmin(-1)
     best = candidates.take_along_dim(best[..., None, None, None, None], -4).squeeze(-4)
-    return torch.cat([wccv[..., :first, :, :], best * scale], dim=-3)
+    return torch.cat([wccv[..., :first, :, :], (best * scale).to(wccv)], dim=-3)
 
 
 def _fit(gamma: Tensor, eta: Tensor, unit: Tensor, n_own: int) -> tuple[Tensor, Tensor]:

@@ -7,7 +7,7 @@ import warnings
 import torch
 from torch import Tensor
 
-from gyrofuse.svo_weights import combine, optimal_weights
+from gyrofuse.svo_weights import combine, counting, optimal_weights
 
 # How far below 1 the variance that a sensor would bring may seem, in units of the least, by rounding.
 _TOLERANCE = 1e-12
@@ -83,7 +83,7 @@ def shrinkage_weights(wccv: Tensor, scale_weights: Tensor, degrees: Tensor) -> T
         `(..., sensor)`, sum 1, may be negative.
     """
     shrunk, _ = shrunk_covariance(wccv, neighbouring_correlations(wccv, degrees), degrees)
-    return optimal_weights(combine(shrunk, scale_weights))
+    return optimal_weights(combine(counting(shrunk, scale_weights), scale_weights))
 
 
 def neighbouring_correlations(wccv: Tensor, degrees: Tensor) -> Tensor:

@@ -124,7 +124,7 @@ def _test(
     columns, n_tests = None, torch.ones_like(live[..., 0], dtype=torch.float64)
     for _ in reference.sensors:
         matrix, weights = parity_matrix(gamma, live)
-        energies = energies_of(products, gamma, matrix, weights, gain_tolerance)
+        energies = energies_of(products, gamma, matrix, weights, reference.own_variance, gain_tolerance)
         loud, quiet = _loud(energies, reference, live), _quiet(energies, reference, live)
         if columns is None:
             n_tests = loud.p.isfinite().sum((-2, -1)) + quiet.p.isfinite().sum((-2, -1))

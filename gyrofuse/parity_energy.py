@@ -11,6 +11,7 @@ and what is left of the parity energy `W' N W` without it is that of the array w
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -18,6 +19,7 @@ from torch import Tensor
 from torch.nn import functional
 
 _BLOCK = 2**17  # sensor samples worked on at a time
+_ROUNDS = 20  # of a fixed point that settles in a few
 _SHARE = 0.75  # of half a wavelet that has to be there
 
 
@@ -42,7 +44,7 @@ class Energies(NamedTuple):
     counts: Tensor
 
 
-def chunks_of(signal: Tensor, window: int, n_levels: int, history: Tensor | None = None) -> list[Tensor]:
+def chunks_of(signal: Tensor, window: int, n_levels: int, history: Tensor | None = None) -> Iterator[Tensor]:
     """Stretches of some windows each, with `2**(n_levels + 1)` samples before them (NaN where there are none).
 
     The longest wavelet looks back on half of these; the rest is to see what was before a fault.
@@ -54,12 +56,10 @@ def chunks_of(signal: Tensor, window: int, n_levels: int, history: Tensor | None
     missing = past if history is None else max(past - history.shape[-1], 0)
     n_items = max(signal[..., 0].numel(), 1)
     at_once = max((_BLOCK // n_items - past) // window, past // window, 1)
-    chunks = []
     for first in range(0, n_windows, at_once):
         start = first * window - missing
         stop = start + past + min(at_once, n_windows - first) * window
-        chunks.append(functional.pad(signal[..., max(start, 0) : stop].double(), (max(-start, 0), 0), value=torch.nan))
-    return chunks
+        yield functional.pad(signal[..., max(start, 0) : stop].double(), (max(-start, 0), 0), value=torch.nan)
 
 
 def window_products(chunk: Tensor, window: int, n_levels: int) -> Products:
@@ -132,9 +132,41 @@ def parity_matrix(gamma: Tensor, live: Tensor) -> tuple[Tensor, Tensor]:
     return inverse - sums[..., :, None] * (sums / total)[..., None, :], sums / total
 
 
+def own_variance(gamma: Tensor) -> Tensor:
+    """Wavelet variance of each sensor itself, `(..., level, sensor)`, without what all of them felt.
+
+    Vibration in the reference is no noise of the sensors, which may well be quieter one day. Of independent noises
+    `N_ii = u_i - u_i^2 / sum_k u_k` with `u = 1 / variance`, whatever is common; two sensors do not tell.
+    """
+    variance = gamma.diagonal(dim1=-2, dim2=-1)
+    if gamma.shape[-1] < 3:
+        return variance
+    live = torch.ones_like(variance[..., 0, :], dtype=torch.bool).unsqueeze(-2)
+    precision = parity_matrix(gamma, live)[0].squeeze(-4).diagonal(dim1=-2, dim2=-1)
+    alone = precision
+    for _ in range(_ROUNDS):
+        alone = precision / (1 - alone / alone.sum(-1, keepdim=True)).clamp(min=0.1)
+    return torch.minimum(variance, 1 / alone)
+
+
 def energies_of(
-    products: Products, gamma: Tensor, matrix: Tensor, weights: Tensor, gain_tolerance: float = 0.0
+    products: Products,
+    gamma: Tensor,
+    matrix: Tensor,
+    weights: Tensor,
+    own: Tensor,
+    gain_tolerance: float = 0.0,
 ) -> Energies:
+    """Energies of a chunk's windows in units of those of a healthy array.
+
+    Args:
+        products: Of the windows.
+        gamma: `(..., level, sensor, sensor)` of a healthy array.
+        matrix: Its `N`, `(..., window, level, sensor, sensor)`.
+        weights: Its optimal weights, `(..., window, level, sensor)`.
+        own: Its `own_variance`.
+        gain_tolerance: By how much scale factors may differ.
+    """
     means, counts, _ = products
     own_precision = matrix.diagonal(dim1=-2, dim2=-1)  # N_ii = 1 / Var e_i
     spared = torch.where(own_precision > 0, own_precision, torch.inf)
@@ -146,5 +178,4 @@ def energies_of(
         rate = torch.einsum("...i,...ik,...k->...", weights, means, weights).unsqueeze(-1)
         gains = gain_tolerance * matrix.abs().sum(-1) / spared
         parity = parity / (1 + gains.square() * rate * own_precision)
-    own = means.diagonal(dim1=-2, dim2=-1) / gamma.diagonal(dim1=-2, dim2=-1).unsqueeze(-3)
-    return Energies(parity, own, rest, counts)
+    return Energies(parity, means.diagonal(dim1=-2, dim2=-1) / own.unsqueeze(-3), rest, counts)

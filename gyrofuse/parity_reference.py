@@ -13,7 +13,7 @@ from torch import Tensor
 from gyrofuse._checks import check_positive_integer, check_signal, largest_level
 from gyrofuse._linalg import check_positive_definite
 from gyrofuse._result import listed, numbered
-from gyrofuse.parity_energy import Products, chunks_of, energies_of, parity_matrix, window_products
+from gyrofuse.parity_energy import Products, chunks_of, energies_of, own_variance, parity_matrix, window_products
 from gyrofuse.recording import Recording
 from gyrofuse.uncertainty import degrees_of_freedom
 
@@ -34,7 +34,8 @@ class ParityReference:
         degrees_of_freedom: `(..., level)`, independent observations that it rests on.
         spread: `(..., level, sensor)`, variance between healthy windows of the relative energy of the sensor's
             difference from the others, beyond what sampling alone gives.
-        own_spread: The same for the sensor's own wavelet variance.
+        own_variance: `(..., level, sensor)`, wavelet variance of the sensors themselves, without common motion.
+        own_spread: The same as `spread` for these.
         n_windows: `(..., level)`, windows that the spread rests on, in effect.
         window: Their length in samples; 0 when there were none.
         sensors: Name of each sensor.
@@ -43,6 +44,7 @@ class ParityReference:
     wavelet_cross_covariance: Tensor
     degrees_of_freedom: Tensor
     spread: Tensor
+    own_variance: Tensor
     own_spread: Tensor
     n_windows: Tensor
     window: int
@@ -80,6 +82,7 @@ class ParityReference:
             "wavelet_cross_covariance": listed(self.wavelet_cross_covariance),
             "degrees_of_freedom": listed(self.degrees_of_freedom),
             "spread": listed(self.spread),
+            "own_variance": listed(self.own_variance),
             "own_spread": listed(self.own_spread),
             "n_windows": listed(self.n_windows),
         }
@@ -96,7 +99,7 @@ def fit_parity(
 
     Besides the wavelet cross-covariance this is how much the noise power of each sensor varies from window to window
     at each scale: real sensors are not quite stationary, and what they do when nothing is wrong is no fault. The more
-    windows, and the more different the conditions they stem from, the better it is known.
+    windows, forty or better a hundred, and the more different the conditions they stem from, the better it is known.
 
     Args:
         healthy: `(..., sensor, time)` or a `Recording`, or several of them; NaN = missing sample. Windows that lack a
@@ -148,7 +151,7 @@ def fit_parity(
     tested = slice(plain.n_levels)
     products = Products(means[..., tested, :, :], counts[..., tested], torch.ones_like(live))
     gamma = plain.wavelet_cross_covariance
-    energies = energies_of(products, gamma, *parity_matrix(gamma, products.live))
+    energies = energies_of(products, gamma, *parity_matrix(gamma, products.live), plain.own_variance)
     spread, n_windows = _spread(energies.parity, products.counts)
     own_spread, _ = _spread(energies.own, products.counts)
     extra = extra_spread**2
@@ -190,7 +193,16 @@ def stationary_reference(
     check_positive_definite("the wavelet cross-covariance of the healthy array", kept, sensors)
     zeros = torch.zeros_like(kept[..., 0])
     degrees = degrees[..., :usable].double().expand(kept.shape[:-2])
-    return ParityReference(kept, degrees, zeros, zeros, torch.ones_like(degrees), 0, tuple(sensors))
+    return ParityReference(
+        wavelet_cross_covariance=kept,
+        degrees_of_freedom=degrees,
+        spread=zeros,
+        own_variance=own_variance(kept),
+        own_spread=zeros,
+        n_windows=torch.ones_like(degrees),
+        window=0,
+        sensors=tuple(sensors),
+    )
 
 
 def check_window(window: int, n_samples: int, name: str) -> int:

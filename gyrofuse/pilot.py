@@ -18,9 +18,6 @@ from gyrofuse._lag_sums import covariance_table, unit_wavelet_variances
 
 # Levels with more observations than this speak for themselves.
 _MOST_OBSERVATIONS = 2**6
-# Some levels below them help to choose the model, and to fit the simplest one, unless something peculiar (a tone, a
-# filter) shows in these.
-_LEVELS_BELOW = 2
 _ITERATIONS = 60
 
 
@@ -75,7 +72,7 @@ class Pilot:
         return _unit_variances(self.n_levels).to(self.theta)
 
 
-def fit_pilot(wccv: Tensor, n_samples: int) -> Pilot:
+def fit_pilot(wccv: Tensor, n_samples: int, levels_below: int = 2) -> Pilot:
     """Fit the rough model to a wavelet cross-covariance.
 
     Maximises the Wishart likelihood `-sum_j eta_j (ln det S_j + tr(S_j^-1 Gamma_j)) / 2` with
@@ -85,6 +82,8 @@ def fit_pilot(wccv: Tensor, n_samples: int) -> Pilot:
     Args:
         wccv: `(..., level, sensor, sensor)`, signal^2, float64.
         n_samples: Length T of the record.
+        levels_below: How many more levels may help. They make the fit more certain, and bend it where a tone or a
+            filter shows in them.
 
     Returns:
         The fitted model, batched as `wccv`.
@@ -93,7 +92,7 @@ def fit_pilot(wccv: Tensor, n_samples: int) -> Pilot:
     level = torch.arange(1, n_levels + 1, dtype=torch.float64)
     observations = (n_samples - torch.exp2(level) + 1) / torch.exp2(level)
     first = max(min(int((observations > _MOST_OBSERVATIONS).sum()), n_levels - 4), 0)
-    below = max(first - _LEVELS_BELOW, 0)
+    below = max(first - levels_below, 0)
     eta = (2 * observations[below:]).clamp(1, 300).to(wccv.device)
     unit = _unit_variances(n_levels).to(wccv)[below:]
 
@@ -103,8 +102,10 @@ def fit_pilot(wccv: Tensor, n_samples: int) -> Pilot:
     scale = size[..., :, None] * size[..., None, :]
     gamma = wccv[..., below:, :, :] / scale[..., None, :, :]
     last = slice(first - below, None)
-    wide, wide_likelihood = _maximise(gamma, unit, eta)
     narrow, narrow_likelihood = _maximise(gamma[..., last, :, :], unit[last], eta[last])
+    if below == first:
+        return Pilot(narrow * scale[..., None, :, :], n_samples, first, n_levels)
+    wide, wide_likelihood = _maximise(gamma, unit, eta)
     # The levels below, when no model but their own covariances has to fit them.
     own = gamma[..., : last.start, :, :]
     narrow_likelihood = narrow_likelihood + _likelihood(own, own, eta[: last.start])

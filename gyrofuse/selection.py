@@ -25,16 +25,17 @@ from gyrofuse.competitors import (
     shrinkage_weights,
 )
 from gyrofuse.covariance import wavelet_products
-from gyrofuse.svo_weights import combine, optimal_weights
+from gyrofuse.svo_weights import combine, counting, optimal_weights
 from gyrofuse.uncertainty import degrees_of_freedom
 
-# From cross-covariance, number of coefficients `(..., level)` and scale weights to weights.
+# Weights from cross-covariance `(..., level, sensor, sensor)`, number of coefficients `(..., level)` and scale weights.
+# Levels that the scale weights leave out may help to know the others.
 ESTIMATORS: dict[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
-    "model_assisted": lambda wccv, counts, omega: optimal_weights(combine(assisted_covariance(wccv, counts), omega)),
+    "model_assisted": lambda wccv, counts, omega: _weigh(assisted_covariance(wccv, counts), omega),
     "shrinkage": lambda wccv, counts, omega: shrinkage_weights(wccv, omega, degrees_of_freedom(counts)),
-    "svo": lambda wccv, counts, omega: optimal_weights(combine(wccv, omega)),
-    "nonnegative": lambda wccv, counts, omega: nonnegative_weights(wccv, omega),
-    "inverse_variance": lambda wccv, counts, omega: inverse_variance_weights(wccv, omega),
+    "svo": lambda wccv, counts, omega: _weigh(wccv, omega),
+    "nonnegative": lambda wccv, counts, omega: nonnegative_weights(counting(wccv, omega), omega),
+    "inverse_variance": lambda wccv, counts, omega: inverse_variance_weights(counting(wccv, omega), omega),
     "equal": lambda wccv, counts, omega: equal_weights(wccv),
 }
 # The smoothest first: it is kept unless another one is better by more than chance.
@@ -196,7 +197,7 @@ def _choose(relative: Tensor, usable: Tensor, candidates: tuple[str, ...], n_blo
     error = (squares / ((n_folds - 1) * n_folds)[..., None]).sqrt()
     enough = n_folds >= _FEWEST_FOLDS
     mean, error = (torch.where(enough[..., None], v, torch.nan) for v in (mean, error))
-    better = torch.where(mean < -error, mean, torch.where(mean == 0, 0.0, torch.inf))
+    better = torch.where(mean < -error, mean, torch.inf)
     better[..., 0] = 0.0
     chosen = torch.where(enough, better.argmin(-1), len(candidates) - 1)
     return Selection(candidates, mean.exp(), error, chosen, n_folds, n_blocks, down)
@@ -219,6 +220,10 @@ def _pool(which: Tensor, sums: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
     number = torch.einsum("fb,...bjik->...fjik", which, counts)
     fewest = number.amin((-1, -2))
     return torch.where((fewest > 0)[..., None, None], total / number, 0.0), fewest
+
+
+def _weigh(wccv: Tensor, omega: Tensor) -> Tensor:
+    return optimal_weights(combine(counting(wccv, omega), omega))
 
 
 def _positive_definite(matrix: Tensor) -> Tensor:

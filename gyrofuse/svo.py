@@ -17,7 +17,7 @@ from gyrofuse.bootstrap import signal_bootstrap
 from gyrofuse.covariance import binned_products
 from gyrofuse.fusion import METHODS, Chosen, choose_weights
 from gyrofuse.influence import bootstrap_inverse_variance_weights_covariance, bootstrap_weights_covariance
-from gyrofuse.pilot import Pilot, fit_pilot
+from gyrofuse.pilot import fit_pilot
 from gyrofuse.recording import Recording
 from gyrofuse.scale_weights import ScaleWeights, normalised, resolve_scale_weights
 from gyrofuse.series import bin_length
@@ -104,7 +104,7 @@ def fit_svo(
         spread, degrees = unknown(chosen.weights), uncertainty.degrees_of_freedom(totals.amin((-1, -2)))
     else:
         pilot = fit_pilot(wccv[:, :n_known], values.shape[-1])
-        spread = _spread(chosen, items, *known, pilot, covariance, block_length, confidence_level)
+        spread = _spread(chosen, items, *known, covariance, block_length, confidence_level)
         degrees = pilot.degrees_of_freedom(chosen.weights[:, None])[..., 0]
         degrees = pad(degrees, (0, len(omega) - n_known), value=1.0)
     low, high = chosen.weights - spread.half_width, chosen.weights + spread.half_width
@@ -199,7 +199,6 @@ def _spread(
     sums: Tensor,
     counts: Tensor,
     omega: Tensor,
-    pilot: Pilot,
     covariance: str,
     block_length: int | None,
     confidence_level: float,
@@ -212,7 +211,7 @@ def _spread(
     if weights_of is None:
         return unknown(weights)
     if covariance == "model":
-        return spread_of_weights(sums, counts, omega, pilot, weights_of, confidence_level)
+        return spread_of_weights(sums, counts, omega, items.shape[-1], weights_of, confidence_level)
     totals = counts.sum(1)
     wccv = counting(sums.sum(1) / totals, omega)
     if covariance == "block_bootstrap":

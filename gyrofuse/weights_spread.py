@@ -19,11 +19,13 @@ from torch import Tensor
 
 from gyrofuse import series
 from gyrofuse.parametric import resample_combined
-from gyrofuse.pilot import Pilot
+from gyrofuse.pilot import Pilot, fit_pilot
 from gyrofuse.uncertainty import t_quantile
 
 # Windows side by side from which on the series alone is believed.
 _MANY_WINDOWS = 64
+# The share of the variance from which levels of few windows decide: nothing below them shall bend their model.
+_FEW_WINDOWS, _MOST = 64, 0.9985
 # 1.5 for white noise, 1.4 for flicker, 1.25 for a random walk.
 _CORRELATION = 1.3
 _N_RESAMPLES = 999
@@ -69,7 +71,7 @@ def spread_of_weights(
     sums: Tensor,
     counts: Tensor,
     scale_weights: Tensor,
-    pilot: Pilot,
+    n_samples: int,
     weights_of: Callable[[Tensor], Tensor],
     confidence_level: float,
 ) -> WeightsSpread:
@@ -79,7 +81,7 @@ def spread_of_weights(
         sums: `(item, bin, level, sensor, sensor)`, of `gyrofuse.covariance.binned_products`.
         counts: The same shape.
         scale_weights: `(level,)`.
-        pilot: Fitted to the same arrays, one for each item.
+        n_samples: Length T of the recordings.
         weights_of: Maps `A` `(..., sensor, sensor)` to weights `(..., sensor)`; differentiable.
         confidence_level: Probability that the interval holds the true weight.
 
@@ -91,7 +93,7 @@ def spread_of_weights(
     """
     parts, disagree = [], 0
     for items in torch.arange(len(sums), device=sums.device).split(_ITEMS_AT_ONCE):
-        part, refuted = _spread(sums[items], counts[items], scale_weights, pilot[items], weights_of, confidence_level)
+        part, refuted = _spread(sums[items], counts[items], scale_weights, n_samples, weights_of, confidence_level)
         parts.append(part)
         disagree += refuted
     if disagree:
@@ -110,12 +112,13 @@ def _spread(
     sums: Tensor,
     counts: Tensor,
     omega: Tensor,
-    pilot: Pilot,
+    n_samples: int,
     weights_of: Callable[[Tensor], Tensor],
     confidence_level: float,
 ) -> tuple[WeightsSpread, int]:
     totals = counts.sum(1)  # M: (item, level, sensor, sensor)
-    wccv = torch.where(omega[:, None, None] > 0, sums.sum(1) / totals, 0.0)
+    measured = sums.sum(1) / totals
+    wccv = torch.where(omega[:, None, None] > 0, measured, 0.0)
     # What each bin adds to A, less what it would add if all were alike: (item, bin, level, sensor, sensor)
     excess = (sums - counts * wccv[:, None]) / totals[:, None] * omega[:, None, None]
     combined = torch.einsum("j,njik->nik", omega, wccv)
@@ -132,24 +135,55 @@ def _spread(
     if not bool(few.any()):
         return by_series, 0
 
-    low = excess[:, :, : pilot.first_level].sum(2, keepdim=True)
-    first = pilot.first_level
-    # Half as many cosines: here the levels near the last of them decide, whose memory is long.
-    windows_below = _deciding(spread[:, :first], _windows(totals)[:, :first]) / 2
-    lower, terms_below = _series_covariance(low, counts, jacobian, windows_below)
-    lower = lower * _across(spread, wccv, first)[:, None, None]
-    by_model = _resampled(wccv, totals, omega, pilot, weights_of, lower, terms_below, confidence_level)
+    by_model = by_series
+    share = (spread * (_windows(totals) < _FEW_WINDOWS)).sum(-1) / spread.sum(-1)
+    last_levels_decide = share > _MOST
+    for needed, levels_below in ((last_levels_decide, 0), (few & ~last_levels_decide, 2)):
+        if bool(needed.any()):
+            pilot = fit_pilot(measured[needed], n_samples, levels_below)
+            part = _resampled(
+                wccv[needed],
+                totals[needed],
+                omega,
+                pilot,
+                weights_of,
+                *_lower(
+                    excess[needed],
+                    counts[needed],
+                    wccv[needed],
+                    jacobian[needed],
+                    spread[needed],
+                    totals[needed],
+                    pilot.first_level,
+                ),
+                confidence_level,
+            )
+            by_model = _where(needed, part, by_model)
     ratio = (_sd(shown).square() / _sd(by_model.covariance).square()).median(-1).values
     refuted = few & (windows >= series.FEWEST_WINDOWS) & (ratio > _largest_ratio(terms))
-    chosen = (few & ~refuted)[:, None]
-    return (
-        WeightsSpread(
-            torch.where(chosen[..., None], by_model.covariance, by_series.covariance),
-            torch.where(chosen, by_model.degrees, by_series.degrees),
-            torch.where(chosen, by_model.half_width, by_series.half_width),
-        ),
-        int(refuted.sum()),
-    )
+    chosen = few & ~refuted
+    return _where(chosen, by_model, by_series), int(refuted.sum())
+
+
+def _lower(
+    excess: Tensor, counts: Tensor, wccv: Tensor, jacobian: Tensor, spread: Tensor, totals: Tensor, first: int
+) -> tuple[Tensor, Tensor]:
+    """Covariance of the weights that the levels below `first` cause, by their series, and the cosines it rests on."""
+    low = excess[:, :, :first].sum(2, keepdim=True)
+    # Half as many cosines: here the levels near the last of them decide, whose memory is long.
+    windows = _deciding(spread[:, :first], _windows(totals)[:, :first]) / 2
+    lower, terms = _series_covariance(low, counts, jacobian, windows)
+    return lower * _across(spread, wccv, first)[:, None, None], terms
+
+
+def _where(which: Tensor, one: WeightsSpread, other: WeightsSpread) -> WeightsSpread:
+    """`one`, which holds those items or all, where `which`, else `other`."""
+    values = []
+    for name in ("covariance", "degrees", "half_width"):
+        chosen, merged = getattr(one, name), getattr(other, name).clone()
+        merged[which] = chosen if len(chosen) == int(which.sum()) else chosen[which]
+        values.append(merged)
+    return WeightsSpread(*values)
 
 
 def _resampled(

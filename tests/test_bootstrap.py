@@ -179,12 +179,12 @@ def small_tiles(monkeypatch, *, short_levels: int = 2) -> None:
 @pytest.mark.parametrize("n_levels", [2, 4, 7])
 @pytest.mark.parametrize("n_samples", [300, 384])
 def test_tiles_and_stretches_do_not_matter(monkeypatch, n_samples, n_levels, step, gaps):
-    """Completing stretches start at multiples of `step`, as far as a window of the last level has so many samples."""
+    """Completing stretches start at multiples of `step`, which may be shorter or longer than the longest window."""
     small_tiles(monkeypatch)
     monkeypatch.setattr(_sweep, "_FEWEST_STEPS", n_samples // step)
     signal = array(n_samples, gaps=gaps)
     wccv, omega, weights = fitted(signal, "long", n_levels)
-    expected = naive.weights_covariance(signal.numpy(), omega.numpy(), LENGTH, min(step, 2**n_levels))
+    expected = naive.weights_covariance(signal.numpy(), omega.numpy(), LENGTH, step)
     whole = bootstrap_weights_covariance(signal, wccv, omega, weights, block_length=LENGTH)
     assert relative_error(whole, expected) <= 1e-9
     monkeypatch.setattr(influence, "_WINDOWS", 1)
@@ -273,7 +273,7 @@ def test_many_resamples_linearised_have_the_covariance_of_the_weights():
 
 
 @pytest.mark.parametrize("gaps", [False, True])
-@pytest.mark.parametrize(("n_levels", "step"), [(3, 4), (6, 1), (6, 8)])
+@pytest.mark.parametrize(("n_levels", "step"), [(3, 16), (6, 1), (6, 8)])
 def test_a_stream_is_the_whole(monkeypatch, n_levels, step, gaps):
     small_tiles(monkeypatch)
     monkeypatch.setattr(_sweep, "_SHORTEST_STRETCH", 16)

@@ -20,6 +20,7 @@ from torch import Tensor
 from gyrofuse import ArrayModel, RandomWalk, Recording, WhiteNoise, fit_svo
 from gyrofuse.fault_kinds import KINDS
 from gyrofuse.parity import parity_test
+from gyrofuse.parity_energy import own_variance
 from gyrofuse.parity_reference import ParityReference, fit_parity
 from gyrofuse.parity_result import ParityResult
 
@@ -67,13 +68,15 @@ def test_p_values_are_those_of_explicit_regressions(moving):
     signal[:, 130:140] = torch.nan
     if moving:
         signal = signal + turning(1000)
-    result = parity_test(signal, fit, window=200)
     gamma = fit.wavelet_cross_covariance.numpy()
     usable = int((fit.degrees_of_freedom >= 2 + 4).sum())
     assert usable > 7
+    own = own_variance(fit.wavelet_cross_covariance[:usable]).numpy()
+    signal[1, 800:] = signal[1, 800:] * 0.3 + signal[1:2, 800:].mean() * 0.7  # too quiet
+    result = parity_test(signal, fit, window=200)
     for number in range(5):
         loud, quiet, n_tests = naive.p_values(
-            signal.numpy(), gamma[:usable], fit.degrees_of_freedom.numpy(), 200, number
+            signal.numpy(), gamma[:usable], own, fit.degrees_of_freedom.numpy(), 200, number
         )
         p = np.fmin(np.nanmin(loud, 0), np.nanmin(quiet, 0)) * n_tests
         np.testing.assert_allclose(result.p_value[number], min(p.min(), 1), rtol=1e-5)
@@ -313,6 +316,28 @@ def test_several_stretches_make_one_reference():
     torch.testing.assert_close(
         together.wavelet_cross_covariance[levels], whole.wavelet_cross_covariance[levels], rtol=0.1, atol=0.02
     )
+
+
+def test_a_calmer_day_is_no_fault():
+    """The reference felt a vibration of six times the noise, which is no noise of the sensors; a frozen one shows."""
+    vibration = 6 * torch.randn(9000, dtype=torch.float64, generator=torch.Generator().manual_seed(11))
+    shaken = fit_parity(healthy()[:, :9000] + vibration, WINDOW)
+    truth = noise().wavelet_cross_covariance(4).diagonal(dim1=-2, dim2=-1)
+    assert (shaken.wavelet_cross_covariance.diagonal(dim1=-2, dim2=-1)[:4] > 5 * truth).all()
+    assert (shaken.own_variance[:4] < 1.5 * truth).all()
+    signal, before = stretch()
+    assert not parity_test(signal, shaken, before=before).alarm.any()
+    signal[2, ONSET:] = 0.0
+    assert parity_test(signal, shaken, before=before).kind[6:9, 2].eq(KINDS.index("frozen")).all()
+
+
+def test_own_variances_of_independent_sensors():
+    """Whatever is common, and exactly: `v_i` from the differences of three sensors or more."""
+    variance = torch.tensor([[1.0, 2.0, 0.7, 5.0], [3.0, 1.0, 1.0, 1.0]], dtype=torch.float64)
+    for common in (0.0, 100.0):
+        gamma = torch.diag_embed(variance) + common
+        torch.testing.assert_close(own_variance(gamma), variance, rtol=1e-4, atol=0)
+    assert torch.equal(own_variance(gamma[:, :2, :2]), gamma[:, :2, :2].diagonal(dim1=-2, dim2=-1))
 
 
 # Real arrays

@@ -24,7 +24,7 @@ import gyrofuse as gf
 from gyrofuse.demo import N_SAMPLES, RATE, UNIT, demo_array
 
 matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402  (after the choice of the backend)
+import matplotlib.pyplot as plt
 
 N_ARRAYS, N_NEW, N_COVERAGE = 50, 10, 1000  # arrays, new arrays for each, replications of the coverage study
 QUICK_ARRAYS, QUICK_NEW, QUICK_SAMPLES = 6, 2, 2**16
@@ -258,12 +258,16 @@ def plot_variances(study: Study, path: Path) -> None:
         line = LINES[method]
         band = {"color": line["color"], "alpha": 0.15, "linewidth": 0}
         below.loglog(tau, mean[m], label=method, **line)
-        below.fill_between(tau, (mean - spread)[m].clamp(min=mean[m] / 10), (mean + spread)[m], **band)
-        above.semilogx(tau, ratio[m], **line)
-        if method != "equal":
-            above.fill_between(tau, (ratio - half)[m], (ratio + half)[m], **band)
-    # A method that is many times worse would flatten all others.
-    above.set_ylim(0, min(3.0, 1.08 * (ratio + half).max().item()))
+        # intervals of the logarithm
+        factor, ratio_factor = (spread / mean)[m].exp(), (half / ratio)[m].exp()
+        below.fill_between(tau, mean[m] / factor, mean[m] * factor, **band)
+        above.loglog(tau, ratio[m], **line)
+        above.fill_between(tau, ratio[m] / ratio_factor, ratio[m] * ratio_factor, **band)
+    ticks = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20]
+    above.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+    above.minorticks_off()
+    above.set_ylim(max(0.1, 0.7 * ratio.min().item()), min(20.0, 1.4 * ratio.max().item()))
+    below.set_ylim(0.5 * mean.min().item(), 2 * study.sensors.max().item())
     above.set_ylabel("wavelet variance / equal weights")
     below.set_ylabel(f"wavelet variance ({UNIT})$^2$")
     below.set_xlabel("averaging time (s)")
@@ -296,7 +300,7 @@ def plot_weights(study: Study, path: Path) -> None:
     ax.set_ylim(min(low, -0.05) - 0.1 * (high - low), high + 0.1 * (high - low))
     ax.set_xlabel("sensor")
     ax.set_ylabel("weight")
-    ax.legend(fontsize=8, ncols=2)
+    ax.legend(fontsize=8, ncols=7, loc="lower left", bbox_to_anchor=(0, 1), frameon=False, columnspacing=1)
     finish(figure, path)
 
 

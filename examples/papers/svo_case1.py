@@ -14,7 +14,6 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import torch
 from _svo_study import (
-    LINES,
     METHODS,
     N_ARRAYS,
     N_NEW,
@@ -35,7 +34,6 @@ from _svo_study import (
     conclusion,
     figures_written,
     finish,
-    n_levels,
     plot_variances,
     plot_weights,
     print_study,
@@ -73,8 +71,8 @@ def estimates(study: Study) -> tuple[Tensor, Tensor]:
 
 
 def print_estimates(study: Study, sigma2: Tensor, gamma2: Tensor) -> None:
-    print(f"\nWhite noise sigma^2 (1e-8 ({UNIT})^2) and random walk gamma^2 (1e-14 ({UNIT})^2 per 0.1 s) of the virtual")
-    print("signals in new arrays: estimates (median, quartiles), and c'Rc and c'Qc of the weights (median)")
+    print(f"\nWhite noise sigma^2 (1e-8 ({UNIT})^2) and random walk gamma^2 (1e-14 ({UNIT})^2 per 0.1 s) of the")
+    print("virtual signals in new arrays: estimates (median, quartiles), and c'Rc and c'Qc of the weights (median)")
     print(f"{'method':>15}  {'sigma^2':>24}  {'in truth':>8}  {'gamma^2':>24}  {'in truth':>8}")
     for m, method in enumerate(METHODS):
         cells = []

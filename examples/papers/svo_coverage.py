@@ -23,7 +23,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import torch
-from _svo_study import LINES, N_COVERAGE, Q, R, arguments, case1, case2, figures_written, finish, n_levels
+from _svo_study import LINES, N_COVERAGE, R, arguments, case1, case2, figures_written, finish, n_levels
 from scipy import stats
 from torch import Tensor
 

@@ -53,7 +53,9 @@ def window_coefficients(signal: Array, level: int, window: int, number: int) -> 
     return np.array(some).T.reshape(len(signal), -1)
 
 
-def p_values(signal: Array, gamma: Array, observations: Array, window: int, number: int) -> tuple[Array, Array, int]:
+def p_values(
+    signal: Array, gamma: Array, own: Array, observations: Array, window: int, number: int
+) -> tuple[Array, Array, int]:
     """p-values `(level, sensor)` of too much difference and of too little variance, and how many there are."""
     n_levels, n_sensors = gamma.shape[:2]
     loud, quiet = np.full((n_levels, n_sensors), np.nan), np.full((n_levels, n_sensors), np.nan)
@@ -74,5 +76,5 @@ def p_values(signal: Array, gamma: Array, observations: Array, window: int, numb
             left = eta - (n_sensors - 2)
             loud[j, i] = stats.f.sf(energy * left / eta / (1 + rest / eta), seen, left)
             if seen >= 8:
-                quiet[j, i] = stats.f.cdf((w[i] ** 2).mean() / gamma[j, i, i], seen, eta)
+                quiet[j, i] = stats.f.cdf((w[i] ** 2).mean() / own[j, i], seen, eta)
     return loud, quiet, int(np.isfinite(loud).sum() + np.isfinite(quiet).sum())
