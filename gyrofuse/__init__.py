@@ -24,21 +24,29 @@ from typing import TYPE_CHECKING, Any
 
 from gyrofuse._linalg import SingularCovarianceError
 from gyrofuse._result import ConfidenceInterval
-from gyrofuse.competitors import equal_weights, inverse_variance_weights
+from gyrofuse.bootstrap import block_bootstrap, bootstrap_wccv_covariance, bootstrap_wccv_interval, signal_bootstrap
+from gyrofuse.competitors import equal_weights, inverse_variance_weights, nonnegative_weights, shrinkage_weights
 from gyrofuse.covariance import CrossCovariance, cross_covariance, wavelet_cross_covariance, wavelet_variance
 from gyrofuse.datasheet import Datasheet, datasheet
 from gyrofuse.gain import Gain
 from gyrofuse.haar import HaarFilterBank, haar_coefficients
 from gyrofuse.hypotheses import EnoughData, WeightsTest
+from gyrofuse.influence import BootstrapWeightsCovariance, bootstrap_weights_covariance
 from gyrofuse.intervals import wavelet_cross_covariance_interval, wavelet_variance_interval
 from gyrofuse.io.stream import RecordingError
+from gyrofuse.live import LiveSVO, subset_weights
 from gyrofuse.multiscale import MultiScaleSVO, fit_multiscale
 from gyrofuse.multiscale_result import MultiScaleResult
+from gyrofuse.parity import parity_test
+from gyrofuse.parity_reference import ParityReference, fit_parity
+from gyrofuse.parity_result import ParityResult
 from gyrofuse.parsing import model_from_dict, parse_model
 from gyrofuse.processes import AR1, Drift, Model, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
 from gyrofuse.rdvg import RDVGResult, rdvg, rdvg_weights
 from gyrofuse.recording import Recording, read_recording
+from gyrofuse.saturation import find_saturation, mask_saturated
 from gyrofuse.scale_weights import resolve_scale_weights
+from gyrofuse.selection import Selection
 from gyrofuse.simulate import ArrayModel
 from gyrofuse.svo import SVO, fit_svo
 from gyrofuse.svo_result import SVOResult
@@ -53,6 +61,7 @@ __all__ = [
     "AR1",
     "SVO",
     "ArrayModel",
+    "BootstrapWeightsCovariance",
     "ConfidenceInterval",
     "CrossCovariance",
     "Datasheet",
@@ -60,9 +69,12 @@ __all__ = [
     "EnoughData",
     "Gain",
     "HaarFilterBank",
+    "LiveSVO",
     "Model",
     "MultiScaleResult",
     "MultiScaleSVO",
+    "ParityReference",
+    "ParityResult",
     "QuantizationNoise",
     "RDVGResult",
     "RandomWalk",
@@ -70,24 +82,37 @@ __all__ = [
     "RecordingError",
     "SVOResult",
     "SVOWeights",
+    "Selection",
     "SingularCovarianceError",
     "Sinusoid",
     "WaveletCrossCovariance",
     "WeightsTest",
     "WhiteNoise",
+    "block_bootstrap",
+    "bootstrap_wccv_covariance",
+    "bootstrap_wccv_interval",
+    "bootstrap_weights_covariance",
     "cross_covariance",
     "datasheet",
     "equal_weights",
+    "find_saturation",
     "fit_multiscale",
+    "fit_parity",
     "fit_svo",
     "haar_coefficients",
     "inverse_variance_weights",
+    "mask_saturated",
     "model_from_dict",
+    "nonnegative_weights",
+    "parity_test",
     "parse_model",
     "rdvg",
     "rdvg_weights",
     "read_recording",
     "resolve_scale_weights",
+    "shrinkage_weights",
+    "signal_bootstrap",
+    "subset_weights",
     "svo_weights",
     "wavelet_cross_covariance",
     "wavelet_cross_covariance_interval",

@@ -41,8 +41,8 @@ class Statistic(NamedTuple):
 
     Attributes:
         mapping: `(item, row, sensor)`, how the sensors are mixed first, or None to take them as they are.
-        influence: Takes coefficients `(item, row, ...)`, without their factor `2**-j`, the index of their level, and
-            room for the influences `(item, out, ...)`, which it returns, there or elsewhere.
+        influence: Given coefficients `(item, row, ...)`, without their factor `2**-j`, the index of their level and a
+            series `(item, out, ...)`, adds their influences to the series.
         estimate: `(item, out)`, sum of the influences over all levels and times.
         jacobian: `(item, sensor, out)`.
         levels: Indices of the levels that have an influence.
@@ -50,7 +50,7 @@ class Statistic(NamedTuple):
     """
 
     mapping: Tensor | None
-    influence: Callable[[Tensor, int, Tensor], Tensor]
+    influence: Callable[[Tensor, int, Tensor], None]
     estimate: Tensor
     jacobian: Tensor
     levels: tuple[int, ...]
@@ -161,7 +161,9 @@ def _swept(signal: Tensor, statistic: Statistic, step: int, last: bool) -> tuple
     offset = _mean(signal[..., :tile])  # no filter sees it; without it the rest keeps its digits
 
     for start in range(0, n_taken if smooth is None else n_samples, tile):
-        series[..., start : start + tile].zero_()  # here, where it comes into cache
+        h = series[..., start : start + tile].zero_()
+        binned, which = h.unflatten(-1, (-1, step)), slice(start // step, (start + tile) // step)
+        held = torch.zeros_like(binned[..., 0])
         part = signal[..., start : start + tile + phases - 1]
         v = torch.sub(part, offset, out=room(0, part.shape))
         if mapping is not None:
@@ -173,14 +175,14 @@ def _swept(signal: Tensor, statistic: Statistic, step: int, last: bool) -> tuple
             n = min(tile, wanted[level] - start)
             if n <= 0 or level not in levels:
                 continue
-            u = influence(d[..., :n], level, room(3, (n_items, n_out, n)))
-            shared = max(0, min(n, n_shared - start))
-            series[..., start : start + shared] += u[..., :shared]
-            binned = (pad(u, (0, -n % step)) if n % step else u).unflatten(-1, (-1, step))
-            where = slice(start // step, start // step + binned.shape[-2])
-            bins[level, ..., where] = binned.sum(-1)
-            if level < len(heads):
-                heads[level, ..., where] = binned[..., : (2**n_levels - 2 ** (level + 1)) % step].sum(-1)
+            head = (2**n_levels - 2 ** (level + 1)) % step  # D_j mod step
+            behind = binned[..., head:].sum(-1) if head else None
+            influence(d[..., :n], level, h[..., :n])
+            # What a level adds to the series is what its bins hold: one pass for both.
+            before, held = held, binned.sum(-1)
+            bins[level, ..., which] = held - before
+            if behind is not None:
+                heads[level, ..., which] = held - before - (binned[..., head:].sum(-1) - behind)
         else:
             if smooth is not None:
                 n = min(tile, v.shape[-1])
@@ -216,17 +218,19 @@ def _long_levels(
     for first in range(0, phases, width):
         v = room(0, (n_items, n_rows, n_rounds, width)).copy_(smooth[..., first : first + width])
         h = room(1, (n_items, n_out, n_rounds, width)).copy_(series[..., first : first + width])
+        which = slice(first // step, first // step + n_bins)
+        held = h.unflatten(-1, (n_bins, -1)) @ ones
         for level in range(n_short, max(statistic.levels) + 1):
             d, v = _split(v, 2 ** (level - n_short), -2, room)
             if level not in statistic.levels:
                 continue
             whole, rest = divmod(wanted[level], phases)
             n = whole + (rest > 0)
-            u = statistic.influence(d[..., :n, :], level, room(3, (n_items, n_out, n, width)))
             if 0 < rest < first + width:
-                u[..., whole, max(0, rest - first) :] = 0.0  # windows that go on past the end
-            h[..., :n, :] += u
-            bins[level, ..., :n, first // step : first // step + n_bins] += u.unflatten(-1, (n_bins, -1)) @ ones
+                d[..., whole, max(0, rest - first) :] = 0.0  # windows that go on past the end
+            statistic.influence(d[..., :n, :], level, h[..., :n, :])
+            before, held = held, h.unflatten(-1, (n_bins, -1)) @ ones
+            bins[level, ..., which] += held - before
         series[..., first : first + width] = h
 
 
@@ -234,7 +238,7 @@ class _Room:
     """Memory that tiles use over and over: fresh memory costs more than the arithmetic."""
 
     def __init__(self, n: int, like: dict[str, Any]) -> None:
-        self._buffers = [torch.empty(n, **like) for _ in range(4)]
+        self._buffers = [torch.empty(n, **like) for _ in range(3)]
 
     def __call__(self, which: int, shape: Sequence[int]) -> Tensor:
         return self._buffers[which][: math.prod(shape)].view(shape)

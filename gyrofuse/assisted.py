@@ -19,7 +19,8 @@ from gyrofuse._lag_sums import unit_wavelet_variances
 _MOST_OBSERVATIONS = 2**9
 # More of them add nothing to the likelihood: a model that is off by a few per cent shall not be driven by one level.
 _MOST_DEGREES = 300.0
-_N_AR1 = 5
+# AR1s with time constants spread over so many octaves, up to half the longest filter.
+_N_AR1, _OCTAVES = 5, 8
 _ITERATIONS = 150
 # Relative size under which a component has left the model, and variance that keeps matrices regular.
 _GONE, _FLOOR = 1e-6, 1e-6
@@ -40,39 +41,49 @@ def assisted_covariance(wccv: Tensor, counts: Tensor) -> Tensor:
         The same shape and dtype: measured below the level where the model begins, of the model from there on.
     """
     n_levels, n_sensors = wccv.shape[-3], wccv.shape[-1]
-    observations = counts * torch.exp2(-torch.arange(1, n_levels + 1, dtype=torch.float64, device=counts.device))
-    fewest = observations.reshape(-1, n_levels).amin(0)
-    first = min(int((fewest > _MOST_OBSERVATIONS).sum()), max(n_levels - 3, 0))
-    # A level can keep its own covariance only if that is well determined, and three levels are left for the model.
-    last = max(first, min(int((fewest >= n_sensors).sum()), n_levels - 3))
+    level = torch.arange(n_levels, device=wccv.device)
+    observations = counts * torch.exp2(-level.double() - 1)
+    # The model begins where few observations are left; a level before can keep its own covariance only if that is well
+    # determined, and three levels are the model's.
+    first = (observations > _MOST_OBSERVATIONS).sum(-1).clamp(max=max(n_levels - 3, 0))  # (...)
+    last = torch.maximum(first, (observations >= n_sensors).sum(-1).clamp(max=n_levels - 3))
     known = (counts > 0) & (wccv.diagonal(dim1=-2, dim2=-1) > 0).all(-1)
-    eta = torch.where(known, (2 * observations).clamp(1.0, _MOST_DEGREES), 0.0)[..., first:]
+    # An unknown level is next to nothing of uncorrelated noise, which keeps the fit regular where all are unknown.
+    eta = torch.where(known, (2 * observations).clamp(1.0, _MOST_DEGREES), _FLOOR)
+    lowest, highest = int(first.min()), int(last.max())  # of all items: levels below are nobody's
+    level, eta, known = level[lowest:], eta[..., lowest:], known[..., lowest:]
 
     # In units of each sensor, so that no sensor is small to rounding.
-    measured = torch.where(known[..., None, None], wccv, 0.0).double()[..., first:, :, :]
+    measured = torch.where(known[..., None, None], wccv[..., lowest:, :, :], 0.0).double()
     size = measured.diagonal(dim1=-2, dim2=-1).amax(-2).sqrt()
     scale = (size[..., :, None] * size[..., None, :])[..., None, :, :]
     identity = torch.eye(n_sensors, dtype=torch.float64, device=wccv.device)
-    gamma = torch.where(known[..., first:, None, None], measured / scale, identity)
+    gamma = torch.where(known[..., None, None], measured / scale, identity)
     gamma = gamma + _FLOOR * torch.diag_embed(gamma.diagonal(dim1=-2, dim2=-1))
-    constants = torch.logspace(first, n_levels - 1, _N_AR1, base=2.0, dtype=torch.float64).tolist()
-    unit = _unit_variances(n_levels, tuple(constants)).to(gamma)[first:]
+    unit = _unit_variances(n_levels).to(gamma)[lowest:]
 
-    simple = unit[:, [0, -1]]  # white noise and random walk
-    starts = torch.arange(last - first + 1, device=gamma.device)
-    inside = torch.arange(n_levels - first, device=gamma.device) >= starts[:, None]  # (start, level)
-    wide, wide_score = _fit(gamma, eta, unit, last - first)
-    some, some_scores = _fit(gamma[..., None, :, :, :], eta[..., None, :] * inside, simple, last - first)
-    some_scores = some_scores + n_sensors * (n_sensors + 1) / 2 * starts
+    inside = level >= first[..., None]
+    own = inside & (level < last[..., None])
+    wide, wide_score = _fit(gamma, eta * inside, unit, own)
+    wide = torch.where(inside[..., None, None], wide, gamma)
+    # White noise and a random walk, from every start on.
+    starts = torch.arange(lowest, highest + 1, device=wccv.device)
+    inside = level >= starts[:, None]  # (start, level)
+    some, some_scores = _fit(gamma[..., None, :, :, :], eta[..., None, :] * inside, unit[:, [0, -1]], own[..., None, :])
     some = torch.where(inside[..., None, None], some, gamma[..., None, :, :, :])
+    some_scores = some_scores + n_sensors * (n_sensors + 1) / 2 * (starts - first[..., None])
+    allowed = (starts >= first[..., None]) & (starts <= last[..., None])
+    some_scores = torch.where(allowed, some_scores, torch.inf)
 
     candidates = torch.cat([wide[..., None, :, :, :], some], dim=-4)  # (..., candidate, level, sensor, sensor)
     best = torch.cat([wide_score[..., None], some_scores], dim=-1).argmin(-1)
     best = candidates.take_along_dim(best[..., None, None, None, None], -4).squeeze(-4)
-    return torch.cat([wccv[..., :first, :, :], (best * scale).to(wccv)], dim=-3)
+    kept = (level < first[..., None])[..., None, None]
+    best = torch.where(kept, wccv[..., lowest:, :, :], (best * scale).to(wccv))
+    return torch.cat([wccv[..., :lowest, :, :], best], dim=-3)
 
 
-def _fit(gamma: Tensor, eta: Tensor, unit: Tensor, n_own: int) -> tuple[Tensor, Tensor]:
+def _fit(gamma: Tensor, eta: Tensor, unit: Tensor, own: Tensor) -> tuple[Tensor, Tensor]:
     """Covariances of a model `(..., level, sensor, sensor)` and half of Akaike's criterion `(...)`.
 
     Each step replaces `Theta_k` by the geometric mean of `D_k^-1` and `Theta_k N_k Theta_k`, where `D` and `N` are the
@@ -84,7 +95,7 @@ def _fit(gamma: Tensor, eta: Tensor, unit: Tensor, n_own: int) -> tuple[Tensor, 
         gamma: `(..., level, sensor, sensor)`.
         eta: `(..., level)`, degrees of freedom, 0 for levels to leave out.
         unit: `(level, component)`, wavelet variances `f_k(tau_j)`.
-        n_own: Levels whose misfit is counted from that of their own covariance, a constant.
+        own: `(..., level)`, levels whose misfit is counted from that of their own covariance.
     """
     n_sensors, n_components = gamma.shape[-1], unit.shape[-1]
     n_parameters = n_sensors * (n_sensors + 1) / 2
@@ -106,8 +117,8 @@ def _fit(gamma: Tensor, eta: Tensor, unit: Tensor, n_own: int) -> tuple[Tensor, 
     lower = torch.linalg.cholesky(model)
     trace_ratio = torch.cholesky_solve(gamma, lower).diagonal(dim1=-2, dim2=-1).sum(-1)
     log_det = 2 * lower.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    own = torch.logdet(gamma[..., :n_own, :, :]) + n_sensors
-    misfit = (eta * (trace_ratio + log_det)).sum(-1) - (eta[..., :n_own] * own).sum(-1)
+    least = torch.where(own, torch.logdet(gamma) + n_sensors, 0.0)
+    misfit = (eta * (trace_ratio + log_det - least)).sum(-1)
     size = theta.diagonal(dim1=-2, dim2=-1).sum(-1)
     n_matrices = (size > _GONE * size.amax(-1, keepdim=True)).sum(-1)
     return model, misfit / 2 + n_parameters * n_matrices
@@ -128,5 +139,8 @@ def _mix(unit: Tensor, theta: Tensor) -> Tensor:
 
 
 @functools.lru_cache(maxsize=32)
-def _unit_variances(n_levels: int, time_constants: tuple[float, ...]) -> Tensor:
-    return torch.from_numpy(unit_wavelet_variances(n_levels, time_constants))
+def _unit_variances(n_levels: int) -> Tensor:
+    """Wavelet variances `(level, component)` of unit white noise, AR1s and random walk."""
+    longest = n_levels - 1
+    time_constants = torch.logspace(max(longest - _OCTAVES, 0), longest, _N_AR1, base=2.0, dtype=torch.float64)
+    return torch.from_numpy(unit_wavelet_variances(n_levels, tuple(time_constants.tolist())))

@@ -130,11 +130,14 @@ def _rdvg(signal: Tensor) -> RDVGResult:
             "their weights follow the formula but minimise nothing",
             stacklevel=3,
         )
-    ones = Q.new_ones(Q.shape[:-1])
-    solved, info = torch.linalg.solve_ex(Q, ones)
+    return RDVGResult(_weights(Q).to(signal), R.to(signal), Q.to(signal), positive_definite)
+
+
+def _weights(Q: Tensor) -> Tensor:
+    """`Q^-1 1 / (1' Q^-1 1)`, NaN where `Q` is singular."""
+    solved, info = torch.linalg.solve_ex(Q, Q.new_ones(Q.shape[:-1]))
     solved = torch.where(info[..., None] == 0, solved, torch.nan)
-    weights = solved / solved.sum(-1, keepdim=True)
-    return RDVGResult(weights.to(signal), R.to(signal), Q.to(signal), positive_definite)
+    return solved / solved.sum(-1, keepdim=True)
 
 
 def _allan_covariances(signal: Tensor, n_scales: int) -> Tensor:

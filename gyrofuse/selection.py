@@ -110,8 +110,8 @@ class Selection:
         down = f", scale weights {self.levels_down} levels down" if self.levels_down else ""
         lines = [f"Held-out risk over {int(self.n_folds)} folds of {self.n_blocks} blocks{down}"]
         for i, name in enumerate(self.candidates):
-            mark = "<" if i == int(self.chosen) else ""
-            lines.append(f"  {name:<17} {self._change(i):>18} {mark}".rstrip())
+            mark = "  chosen" if i == int(self.chosen) else ""
+            lines.append(f"  {name:<17}{self._change(i) if i else 'the measure':>18}{mark}")
         return "\n".join([*lines, self.sentence])
 
     def __str__(self) -> str:
@@ -180,6 +180,7 @@ def select_estimator(
     held_out = combine(test, omega)
     usable = _positive_definite(combine(train, omega)) & _positive_definite(held_out)  # (..., fold)
     train = torch.where(usable[..., None, None, None], train, torch.eye(train.shape[-1]).to(train))
+    n_products = torch.where(usable[..., None], n_products, 1.0)
     risks = []
     for name in candidates:
         weights = ESTIMATORS[name](train, n_products, omega)

@@ -30,8 +30,9 @@ _FEW_WINDOWS, _MOST = 64, 0.9985
 _CORRELATION = 1.3
 _N_RESAMPLES = 999
 _ITEMS_AT_ONCE = 64
-# The chance that the series is believed against a model that is right.
-_REFUSED = 1e-4
+# The series is believed against the model when its variance is so many times larger than what chance allows, for
+# the model is rough.
+_CLEARLY, _REFUSED = 2.0, 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,4 +293,4 @@ def _largest_ratio(terms: Tensor) -> Tensor:
     from scipy import stats
 
     degrees = terms.cpu().numpy()
-    return torch.as_tensor(stats.chi2.ppf(1 - _REFUSED, degrees) / degrees).to(terms)
+    return torch.as_tensor(_CLEARLY * stats.chi2.ppf(1 - _REFUSED, degrees) / degrees).to(terms)

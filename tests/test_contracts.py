@@ -13,17 +13,22 @@ from gyrofuse import (
     SVO,
     CrossCovariance,
     HaarFilterBank,
+    MultiScaleSVO,
     SVOWeights,
     WaveletCrossCovariance,
     cross_covariance,
     equal_weights,
+    fit_multiscale,
     fit_svo,
     haar_coefficients,
     inverse_variance_weights,
+    rdvg_weights,
     resolve_scale_weights,
     svo_weights,
     wavelet_cross_covariance,
+    wavelet_cross_covariance_interval,
     wavelet_variance,
+    wavelet_variance_interval,
 )
 
 LEVELS = 5
@@ -90,6 +95,13 @@ def chain() -> nn.Module:
     return nn.Sequential(HaarFilterBank(LEVELS), CrossCovariance(), SVOWeights("long"))
 
 
+def multiscale() -> nn.Module:
+    """A fitted multi-scale virtual gyro."""
+    module = MultiScaleSVO(4)
+    module.fit(signal_of(3000, seed=9), n_levels=LEVELS)
+    return module
+
+
 MEMBERS = [
     Member("haar_coefficients", lambda: lambda x: haar_coefficients(x, LEVELS), differentiable=True),
     Member("HaarFilterBank", lambda: HaarFilterBank(LEVELS), differentiable=True, module=True, onnx=True),
@@ -104,6 +116,19 @@ MEMBERS = [
     Member("equal_weights", lambda: lambda x: equal_weights(wavelet_cross_covariance(x, LEVELS))),
     Member("fit_svo", lambda: fit, tolerance=1e-8),
     Member("SVO", fitted, differentiable=True, module=True, onnx=True),
+    Member(
+        "fit_svo, auto", lambda: lambda x: fit_svo(x, "long", method="auto", n_levels=LEVELS).weights, tolerance=1e-8
+    ),
+    Member("fit_svo, nonnegative", lambda: lambda x: fit_svo(x, method="nonnegative", n_levels=LEVELS).weights),
+    Member("wavelet_variance_interval", lambda: lambda x: list(wavelet_variance_interval(x, LEVELS)), tolerance=1e-8),
+    Member(
+        "wavelet_cross_covariance_interval",
+        lambda: lambda x: list(wavelet_cross_covariance_interval(x, LEVELS)),
+        tolerance=1e-8,
+    ),
+    Member("rdvg_weights", lambda: rdvg_weights, tolerance=1e-8),
+    Member("fit_multiscale", lambda: lambda x: fit_multiscale(x, n_levels=LEVELS).weights, tolerance=1e-8),
+    Member("MultiScaleSVO", multiscale, differentiable=True, module=True, onnx=True),
 ]
 
 

@@ -56,4 +56,4 @@ def test_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     for block in blocks("python"):
         exec(block, scope)
     assert scope["weights"].sum().item() == pytest.approx(1)
-    assert scope["virtual"].shape == (4096,)
+    assert scope["virtual"].shape == (2000,)

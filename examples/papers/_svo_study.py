@@ -138,8 +138,8 @@ class Study:
 
 
 def quadratic(weights: Tensor, matrix: Tensor) -> Tensor:
-    """`c' M c` for weights `(..., sensor)`."""
-    return torch.einsum("...i,ik,...k->...", weights, matrix, weights)
+    """`c' M c` for weights `(..., sensor)` and matrices `(..., sensor, sensor)`."""
+    return torch.einsum("...i,...ik,...k->...", weights, matrix, weights)
 
 
 def run_study(model: gf.ArrayModel, n_samples: int, n_arrays: int, n_new: int, seed: int) -> Study:
@@ -168,11 +168,10 @@ def run_study(model: gf.ArrayModel, n_samples: int, n_arrays: int, n_new: int, s
         for _ in range(n_new):
             signal = model.simulate(n_samples, generator=generator)
             wccv = gf.wavelet_cross_covariance(signal, levels)
-            # c' Gamma_j c is the wavelet variance of c'x: (level, method) to (method, level)
-            fixed = torch.stack([quadratic(weights, level) for level in wccv], -1)
+            fixed = quadratic(weights[:, None], wccv)  # wavelet variance of c'x: (method, level)
             fused = gf.wavelet_variance(multiscale.virtual(signal)[None], levels).mT
             found["variance"].append(torch.cat([fixed, fused]))
-            found["best"].append(torch.stack([quadratic(ideal, level) for level in wccv], -1))
+            found["best"].append(quadratic(ideal[:, None], wccv))
         if n_arrays > 10 and (array + 1) % 10 == 0:
             print(f"{array + 1} of {n_arrays} arrays", file=sys.stderr, flush=True)
     stacked = {name: torch.stack(values) for name, values in found.items()}
@@ -295,12 +294,12 @@ def plot_weights(study: Study, path: Path) -> None:
     equal.set_zorder(0)
     ax.set_xticks(range(1, n_sensors + 1), [str(i) for i in range(1, n_sensors + 1)])
     ax.set_xlim(0.5, n_sensors + 0.5)
-    # Outliers of RDVG may lie far away: what nine in ten arrays have is shown.
+    # Outliers of RDVG may lie far away; all but the outermost hundredth of all weights is shown.
     low, high = (study.weights.flatten(0, 1).quantile(q).item() for q in (0.01, 0.99))
     ax.set_ylim(min(low, -0.05) - 0.1 * (high - low), high + 0.1 * (high - low))
     ax.set_xlabel("sensor")
     ax.set_ylabel("weight")
-    ax.legend(fontsize=8, ncols=7, loc="lower left", bbox_to_anchor=(0, 1), frameon=False, columnspacing=1)
+    ax.legend(fontsize=8, ncols=4, loc="lower left", bbox_to_anchor=(0, 1), frameon=False)
     finish(figure, path)
 
 
