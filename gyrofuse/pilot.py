@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gyrofuse._lag_sums import covariance_table, unit_wavelet_variances
+from gyrofuse._lag_sums import covariance_table, unit_wavelet_variances, variance_table
 
 # Levels with more observations than this speak for themselves.
 _MOST_OBSERVATIONS = 2**6
@@ -46,11 +46,17 @@ class Pilot:
         """`(..., level, sensor, sensor)` of the model at every level, trustworthy from `first_level` on."""
         return _model(self.theta, self._unit)
 
-    @property
-    def table(self) -> Tensor:
-        """`Q` of `gyrofuse._lag_sums`, `(level, level, component, component)`."""
-        table = covariance_table(self.n_samples, self.n_levels, ())
-        return torch.from_numpy(np.array(table)).to(self.theta)
+    def covariance_of_moments(self) -> Tensor:
+        """Covariance of the wavelet cross-covariances of a Gaussian record, exact for its length.
+
+        `Cov(gamma_ab,j, gamma_cd,l) = sum_km Q_jl[k,m] (Theta_k,ac Theta_m,bd + Theta_k,ad Theta_m,bc)`.
+
+        Returns:
+            `(..., level, sensor, sensor, level, sensor, sensor)`, signal^4: for few sensors and levels.
+        """
+        table = torch.from_numpy(np.array(covariance_table(self.n_samples, self.n_levels, ()))).to(self.theta)
+        straight = torch.einsum("jlkm,...kac,...mbd->...jablcd", table, self.theta, self.theta)
+        return straight + straight.transpose(-1, -2)
 
     def degrees_of_freedom(self, weights: Tensor) -> Tensor:
         """Equivalent degrees of freedom `2 nu_j^2 / Var nu_j` of the wavelet variance of combinations of sensors.
@@ -63,9 +69,9 @@ class Pilot:
         """
         shares = torch.einsum("...ni,...kio,...no->...nk", weights, self.theta, weights)
         variance = torch.einsum("jk,...nk->...jn", self._unit, shares)
-        diagonal = self.table.diagonal().permute(2, 0, 1)  # (level, component, component)
+        table = torch.from_numpy(np.array(variance_table(self.n_samples, self.n_levels, ()))).to(self.theta)
         # Var nu_j = 2 sum_km Q_jj[k,m] theta_k theta_m
-        return variance.square() / torch.einsum("jkm,...nk,...nm->...jn", diagonal, shares, shares)
+        return variance.square() / torch.einsum("jkm,...nk,...nm->...jn", table, shares, shares)
 
     @property
     def _unit(self) -> Tensor:

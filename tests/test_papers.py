@@ -76,7 +76,7 @@ def test_coverage(tmp_path: Path):
         for scale in ("short", "long"):
             model = [float(cell) for cell in row(study, scale, "model")[:7]]
             bootstrap = [float(cell) for cell in row(study, scale, "block", "bootstrap")[:7]]
-            # Of 60 intervals of 95 %, 50 or fewer hold the truth once in 800 times; 48 tests here.
+            # 48 or fewer of 60 intervals of 95 % hold the truth once in 28 000 times; there are 88 such counts here.
             assert min(model) > 100 * 48 / 60
             assert bootstrap[-1] < model[-1]  # trimmed to the coefficients of the last level, it is too short
         for level in range(1, 11):

@@ -64,6 +64,18 @@ def test_degrees_are_those_of_the_estimates():
     assert ((found / expected - 1).abs() < 4 * error).all(), (found / expected).tolist()
 
 
+def test_covariance_of_moments_is_that_of_recordings():
+    """Levels 1, 4 and 9 of two sensors, over 1500 arrays: every entry within five standard errors."""
+    sums, counts = wavelet_products(arrays(1500, seed=8), N_LEVELS)
+    fitted = pilot.Pilot(torch.stack([WHITE, WALK]), N_SAMPLES, 0, N_LEVELS)
+    levels = [0, 3, 8]
+    found = (sums / counts)[:, levels, :2, :2].flatten(1)
+    expected = fitted.covariance_of_moments()[levels][:, :2, :2][:, :, :, levels][..., :2, :2].reshape(12, 12)
+    scale = expected.diagonal().sqrt()
+    # sd of a covariance of two Gaussian variables: sqrt((1 + r^2) / n) of the product of their sds
+    assert ((found.T.cov() - expected) / scale / scale[:, None]).abs().max() < 5 * (2 / 1500) ** 0.5
+
+
 def test_what_is_peculiar_below_does_not_bend_the_fit():
     """A tone at the levels just below the last ones; without it they help to fit."""
     first = pilot.fit_pilot(true_wccv(), N_SAMPLES).first_level
