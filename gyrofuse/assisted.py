@@ -54,15 +54,14 @@ def assisted_covariance(wccv: Tensor, counts: Tensor) -> Tensor:
     level, eta, known = level[lowest:], eta[..., lowest:], known[..., lowest:]
 
     # In units of each sensor, so that no sensor is small to rounding.
+    inside = level >= first[..., None]
     measured = torch.where(known[..., None, None], wccv[..., lowest:, :, :], 0.0).double()
-    size = measured.diagonal(dim1=-2, dim2=-1).amax(-2).sqrt()
+    variance = torch.where(inside[..., None], measured.diagonal(dim1=-2, dim2=-1), 0.0).amax(-2)
+    size = torch.where(variance > 0, variance, 1.0).sqrt()
     scale = (size[..., :, None] * size[..., None, :])[..., None, :, :]
-    identity = torch.eye(n_sensors, dtype=torch.float64, device=wccv.device)
-    gamma = torch.where(known[..., None, None], measured / scale, identity)
-    gamma = gamma + _FLOOR * torch.diag_embed(gamma.diagonal(dim1=-2, dim2=-1))
+    gamma = _positive(torch.where(known[..., None, None], measured / scale, torch.eye(n_sensors).to(measured)))
     unit = _unit_variances(n_levels).to(gamma)[lowest:]
 
-    inside = level >= first[..., None]
     own = inside & (level < last[..., None])
     wide, wide_score = _fit(gamma, eta * inside, unit, own)
     wide = torch.where(inside[..., None, None], wide, gamma)
@@ -122,6 +121,13 @@ def _fit(gamma: Tensor, eta: Tensor, unit: Tensor, own: Tensor) -> tuple[Tensor,
     size = theta.diagonal(dim1=-2, dim2=-1).sum(-1)
     n_matrices = (size > _GONE * size.amax(-1, keepdim=True)).sum(-1)
     return model, misfit / 2 + n_parameters * n_matrices
+
+
+def _positive(matrix: Tensor) -> Tensor:
+    """The nearest regular covariances: entries that average over different samples may not be one."""
+    values, vectors = torch.linalg.eigh(matrix)
+    least = _FLOOR * matrix.diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True)
+    return (vectors * torch.maximum(values, least)[..., None, :]) @ vectors.mT
 
 
 def _geometric_mean(inverse: Tensor, other: Tensor) -> Tensor:

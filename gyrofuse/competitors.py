@@ -11,7 +11,7 @@ from gyrofuse.svo_weights import combine, counting, optimal_weights
 
 # How far below 1 the variance that a sensor would bring may seem, in units of the least, by rounding.
 _TOLERANCE = 1e-12
-_MOST_TURNS = 10  # for each sensor
+_MOST_TURNS = 1000  # some two for each sensor are usual
 # How fast the levels beside a level lose their say with distance, degrees of freedom from which it needs none, and
 # the share of uncorrelated noise that keeps their mean regular.
 _FADING, _MANY_DEGREES, _FLOOR = 0.15, 1000.0, 1e-6
@@ -104,7 +104,7 @@ def neighbouring_correlations(wccv: Tensor, degrees: Tensor) -> Tensor:
     correlation = wccv / size
     known = correlation.isfinite().all(-1).all(-1)
     level = torch.arange(wccv.shape[-3], device=wccv.device)
-    distance = (level[:, None] - level).abs()
+    distance = (level[:, None] - level).abs().double()
     near = torch.where(distance > 0, _FADING**distance, 0.0) * torch.where(known, degrees, 0.0)[..., None, :]
     near = (near / near.sum(-1, keepdim=True)).to(wccv)  # (..., level, level)
     correlation = torch.where(known[..., None, None], correlation, 0.0)
@@ -168,7 +168,7 @@ def _nonnegative_set(matrix: Tensor) -> Tensor:
     correlation = unit[..., :, None] * matrix * unit[..., None, :]
     sensor = torch.arange(n_sensors, device=matrix.device)
     used, x = torch.ones_like(unit, dtype=torch.bool), torch.zeros_like(unit) + unit.mean(-1, keepdim=True)
-    for _ in range(_MOST_TURNS * n_sensors):
+    for _ in range(_MOST_TURNS):
         aim = _solve_within(correlation, used, unit)
         share = torch.where(used & (aim <= 0), x / (x - aim).clamp(min=torch.finfo(x.dtype).tiny), torch.inf)
         step, leaving = share.min(-1, keepdim=True)

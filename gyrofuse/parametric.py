@@ -17,7 +17,8 @@ from torch import Tensor
 from gyrofuse._lag_sums import block_mean_covariances
 from gyrofuse.pilot import Pilot
 
-_DIRECTIONS = 32
+# The share of the variance that the directions hold, and as many as give its law the right shape.
+_HELD, _FEWEST_DIRECTIONS = 0.8, 24
 
 
 def resample_combined(
@@ -37,7 +38,7 @@ def resample_combined(
         `(..., resample, sensor, sensor)` and their expectation `(..., sensor, sensor)`, signal^2.
     """
     omega = tuple(scale_weights[pilot.first_level :].tolist())
-    kernels, missing = _directions(pilot.n_samples, pilot.first_level, omega)
+    kernels, missing, kept, whole = _directions(pilot.n_samples, pilot.first_level, omega)
     within = torch.from_numpy(kernels).to(pilot.theta)  # K_k: (component, direction, direction)
     rest = torch.einsum("k,...kio->...io", torch.from_numpy(missing).to(pilot.theta), pilot.theta)
     n, n_sensors = within.shape[-1], pilot.theta.shape[-1]
@@ -48,12 +49,20 @@ def resample_combined(
     normal = torch.randn(n * n_sensors, n_resamples, generator=generator, dtype=root.dtype).to(root.device)
     drawn = (root @ normal).unflatten(-2, (n, n_sensors)).movedim(-1, -3)  # (..., resample, direction, sensor)
     expected = torch.einsum("k,...kio->...io", torch.einsum("kaa->k", within), pilot.theta)
-    return drawn.mT @ drawn + rest[..., None, :, :], expected + rest
+    # What the other directions lack in variance, the ones kept make up for.
+    size = pilot.theta.diagonal(dim1=-2, dim2=-1).sum(-1)  # (..., component)
+    share, total = (torch.einsum("...k,km,...m->...", size, torch.from_numpy(m).to(size), size) for m in (kept, whole))
+    moved = (total / share).sqrt()[..., None, None, None] * (drawn.mT @ drawn - expected[..., None, :, :])
+    expected = expected + rest
+    return expected[..., None, :, :] + moved, expected
 
 
 @functools.lru_cache(maxsize=16)
-def _directions(n_samples: int, first_level: int, omega: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Matrices `K_k` `(component, direction, direction)` and what the other directions add, `(component,)`."""
+def _directions(
+    n_samples: int, first_level: int, omega: tuple[float, ...]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Matrices `K_k` `(component, direction, direction)`, what the other directions add, `(component,)`, and the inner
+    products `(component, component)` of the matrices and of those of all directions."""
     block = 2**first_level
     n_blocks = n_samples // block
     kernel = _kernel(n_blocks, omega)
@@ -68,9 +77,13 @@ def _directions(n_samples: int, first_level: int, omega: tuple[float, ...]) -> t
     total = within.trace(axis1=1, axis2=2)
     # The directions that matter to every component alike, each of which may turn out to be the largest.
     _, vectors = np.linalg.eigh((within / total[:, None, None]).sum(0))
-    kept = vectors[:, ::-1][:, :_DIRECTIONS]
-    reduced = kept.T @ within @ kept
-    return reduced, total - reduced.trace(axis1=1, axis2=2)
+    turned = vectors.T[::-1] @ within @ vectors[:, ::-1]
+    # The variance of a quadratic form is that of its squared entries: as many directions as hold most of it.
+    held = (turned**2).cumsum(1).cumsum(2).diagonal(axis1=1, axis2=2)  # (component, direction)
+    n = max(int((held < _HELD * held[:, -1:]).any(0).sum()) + 1, _FEWEST_DIRECTIONS)
+    reduced = turned[:, :n, :n]
+    products = (np.einsum("kab,mab->km", x, x) for x in (reduced, turned))
+    return reduced, total - reduced.trace(axis1=1, axis2=2), *products
 
 
 def _kernel(n_blocks: int, omega: tuple[float, ...]) -> np.ndarray:

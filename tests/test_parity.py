@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import importlib.util
 import json
+import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -343,15 +344,15 @@ def test_own_variances_of_independent_sensors():
 # Real arrays
 
 
+@functools.cache
 def study() -> ModuleType:
+    """The example that injects faults, as a module."""
     path = Path(__file__).resolve().parents[1] / "examples" / "fault_study.py"
     spec = importlib.util.spec_from_file_location("fault_study", path)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    import sys
-
-    sys.modules["fault_study"] = module
+    sys.modules["fault_study"] = module  # its dataclass looks itself up
     spec.loader.exec_module(module)
     return module
 
