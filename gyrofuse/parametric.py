@@ -18,7 +18,7 @@ from gyrofuse._lag_sums import block_mean_covariances
 from gyrofuse.pilot import Pilot
 
 # The share of the variance that the directions hold, and as many as give its law the right shape.
-_HELD, _FEWEST_DIRECTIONS = 0.8, 24
+_HELD, _FEWEST_DIRECTIONS = 0.5, 24
 
 
 def resample_combined(

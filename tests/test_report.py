@@ -13,7 +13,7 @@ import pytest
 import torch
 from matplotlib import pyplot as plt
 
-from gyrofuse import Recording, SVOResult, fit_svo
+from gyrofuse import ConfidenceInterval, Recording, SVOResult, fit_svo
 from gyrofuse.io.notes import Note
 from gyrofuse.report import (
     fusion_figure,
@@ -69,12 +69,19 @@ def made_up(ratios: list[float], best: float = 0.9) -> SVOResult:
         fit_svo(noise(3, 1000), n_levels=len(ratios)),
         weights=torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64),
         weights_cov=1e-4 * torch.eye(3, dtype=torch.float64),
+        confidence_interval=around(0.02),
         wavelet_cross_covariance=wccv,
         degrees_of_freedom=torch.full((len(ratios),), 100.0, dtype=torch.float64),
         sensors=("a", "b", "c"),
         rate=100.0,
         unit="deg/s",
     )
+
+
+def around(half_width: float) -> ConfidenceInterval:
+    """Limits around the weights (1, 0, 0)."""
+    weights = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+    return ConfidenceInterval(weights - half_width, weights + half_width)
 
 
 def noise(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -128,9 +135,9 @@ def test_verdict_orders_carriers_by_size_and_explains_negative_weights():
 
 
 def test_verdict_without_any_certain_weight():
-    unsure = dataclasses.replace(made_up([0.9]), weights_cov=torch.eye(3, dtype=torch.float64), confidence_level=0.9)
+    unsure = dataclasses.replace(made_up([0.9]), confidence_interval=around(1.6), confidence_level=0.9)
     assert verdict(unsure)[0] == "No sensor stands out: the 90 % interval of every weight holds 0."
-    unknown = dataclasses.replace(made_up([0.9]), weights_cov=torch.full((3, 3), math.nan, dtype=torch.float64))
+    unknown = dataclasses.replace(made_up([0.9]), confidence_interval=around(math.nan))
     assert verdict(unknown)[0].startswith("The largest weights are those of a (weight 1.000)")
 
 
