@@ -128,6 +128,9 @@ def test_verdict_orders_carriers_by_size_and_explains_negative_weights():
     result = dataclasses.replace(
         made_up([0.9]),
         weights=torch.tensor([0.3, -0.1, 0.8], dtype=torch.float64),
+        confidence_interval=ConfidenceInterval(
+            torch.tensor([0.2, -0.2, 0.7], dtype=torch.float64), torch.tensor([0.4, -0.05, 0.9], dtype=torch.float64)
+        ),
     )
     carried, negative, *_ = verdict(result)
     assert carried.endswith(": c (weight 0.800), a (weight 0.300) and b (weight -0.100).")
