@@ -87,8 +87,10 @@ def ratio_to_equal(
     quantile = torch.as_tensor(stats.t.ppf((1 + confidence_level) / 2, spare.cpu().numpy())).to(spare)
     spread = torch.where(spare > 0, 1 + 2 * unshared * quantile.square() / spare, torch.inf)
     factor = spread + (spread.square() - 1).sqrt()
-    estimate = equal / virtual / (1 + optimism)
-    return estimate, ConfidenceInterval(estimate / factor, estimate * factor)
+    found = equal / virtual
+    estimate = found / (1 + optimism)
+    # How much of the optimism falls on this level is known roughly: the upper limit does without the correction.
+    return estimate, ConfidenceInterval(estimate / factor, found * factor)
 
 
 def optimism(evidence: Evidence) -> Tensor:

@@ -48,3 +48,12 @@ def test_stream(tmp_path: Path, chunk: int):
     np.testing.assert_allclose(
         np.load(tmp_path / "virtual.npy"), weights.numpy() @ signal.numpy(), rtol=1e-9, atol=1e-9
     )
+
+
+def test_field(tmp_path: Path):
+    out = run("field.py", "--hours", 0.1, cwd=tmp_path)
+    assert "Sensor 5 has its sign flipped" in out
+    assert "Left out: 5" in out
+    # No step when sensors leave and return: far less than the mean of whatever is there makes.
+    step, naive = (float(out.split(word)[1].split()[0]) for word in ("is ", "whatever is there: "))
+    assert step < 0.01 * naive

@@ -16,7 +16,7 @@ from gyrofuse.hypotheses import Evidence, dropped_sensor_test, enough_data, equa
 
 # Studies on recordings: as many of this length, 6 levels (the last holds 14 to 30 observations); the chance that a true
 # claim is refused.
-N_RUNS, N_SENSORS, N_SAMPLES, N_LEVELS, REFUSED = 200, 4, 1024, 6, 1e-3
+N_RUNS, N_SENSORS, N_SAMPLES, N_LEVELS, REFUSED = 120, 4, 1024, 6, 1e-3
 SCALE_WEIGHTS = ("flat", "short", "long")
 
 
@@ -178,7 +178,7 @@ def fitted(noise: str, kind: str, scale_weights: str) -> SVOResult:
 @pytest.mark.parametrize("scale_weights", SCALE_WEIGHTS)
 @pytest.mark.parametrize("noise", ["white", "white and walk", "walk"])
 def test_sizes_on_recordings(noise, scale_weights):
-    """At most 5 % of 200 recordings refuse what is true: 20 or so where one true claim in a thousand is refused."""
+    """At most 5 % of 120 recordings refuse what is true: 14 or so where one true claim in a thousand is refused."""
     assert fitted(noise, "equal", scale_weights).test_equal().significant.sum() <= at_most(0.05, tests=2)
     assert fitted(noise, "idle", scale_weights).test_drop(3).significant.sum() <= at_most(0.05, tests=2)
 

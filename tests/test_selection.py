@@ -92,17 +92,17 @@ def test_every_estimator_is_the_function_of_its_name():
 @pytest.mark.parametrize(
     ("means", "errors", "chosen"),
     [
-        ([0.0, 0.10, -0.05], [0, 0.1, 0.06], 0),  # better, but not by a standard error
-        ([0.0, 0.10, -0.05], [0, 0.1, 0.04], 2),
-        ([0.0, -0.04, -0.05], [0, 0.01, 0.04], 2),  # the better of two
-        ([0.0, -0.04, -0.05], [0, 0.01, 0.06], 1),
+        ([0.0, 0.10, -0.06], [0, 0.1, 0.021], 0),  # better, but not by three standard errors
+        ([0.0, 0.10, -0.06], [0, 0.1, 0.019], 2),
+        ([0.0, -0.04, -0.06], [0, 0.01, 0.01], 2),  # the better of two
+        ([0.0, -0.04, -0.06], [0, 0.01, 0.03], 1),
         ([0.0, 0.0, 0.0], [0, 0, 0], 0),
     ],
 )
-def test_the_first_candidate_stays_unless_another_is_better_by_a_standard_error(means, errors, chosen):
+def test_the_first_candidate_stays_unless_another_is_clearly_better(means, errors, chosen):
     # Four folds whose mean and standard error are these: mean +- sqrt(3) error.
     swing = 3**0.5 * torch.tensor([1.0, -1.0, 1.0, -1.0], dtype=torch.float64)
-    relative = torch.tensor(means).double() + swing[:, None] * torch.tensor(errors).double()
+    relative = torch.tensor(means, dtype=torch.float64) + swing[:, None] * torch.tensor(errors, dtype=torch.float64)
     unusable = torch.full((1, 3), 99.0, dtype=torch.float64)
     usable = torch.tensor([True] * 4 + [False])
     got = selection._choose(torch.cat([relative, unusable]), usable, CANDIDATES, 8, 3)
@@ -112,7 +112,7 @@ def test_the_first_candidate_stays_unless_another_is_better_by_a_standard_error(
 
 
 def test_too_few_folds_leave_the_last_candidate():
-    signal = array(3, 40)
+    signal = array(6, 40)
     got = select_estimator(signal, gf.resolve_scale_weights("long", 5))
     assert got.chosen == 2
     assert got.risk.isnan().all()
@@ -158,9 +158,9 @@ def chosen_excess(signal: Tensor, truth: Tensor, omega: Tensor) -> tuple[Tensor,
 
 def test_long_scale_weights_come_close_to_the_best_candidate_and_far_below_svo():
     truth = WALKS.wavelet_cross_covariance(N_LEVELS)
-    chosen, got, each = chosen_excess(simulated(40, seed=8), truth, LONG)
+    chosen, got, each = chosen_excess(simulated(20, seed=8), truth, LONG)
     assert got.levels_down == 3
-    assert (got.chosen == 0).sum() >= 36
+    assert (got.chosen == 0).sum() >= 18
     assert chosen.mean() < each["svo"].mean() / 3
     assert chosen.mean() < 1.3 * min(e.mean() for e in each.values())
 
@@ -168,17 +168,17 @@ def test_long_scale_weights_come_close_to_the_best_candidate_and_far_below_svo()
 def test_well_determined_levels_cost_nothing():
     short = gf.resolve_scale_weights("short", N_LEVELS)
     truth = WALKS.wavelet_cross_covariance(N_LEVELS)
-    chosen, got, each = chosen_excess(simulated(30, seed=9), truth, short)
+    chosen, got, each = chosen_excess(simulated(10, seed=9), truth, short)
     assert got.levels_down == 0
     assert chosen.mean() < 1.1 * each["svo"].mean()
 
 
 @pytest.mark.parametrize("noise", [with_tone, with_telegraph])
 def test_where_the_model_does_not_hold_the_data_decide(noise):
-    signal, truth = noise(30)
+    signal, truth = noise(12)
     middle = torch.exp(-((torch.arange(1, N_LEVELS + 1) - 7) ** 2) / 2).double()
     chosen, _, each = chosen_excess(signal, truth, middle / middle.sum())
-    assert chosen.mean() < 1.2 * each["svo"].mean()
+    assert chosen.mean() < each["svo"].mean() + 0.01  # one per cent of the risk
     chosen, _, each = chosen_excess(signal, truth, LONG)
     assert chosen.mean() < each["svo"].mean()
 
@@ -224,7 +224,7 @@ def test_the_reason_is_one_sentence_and_the_rest_a_table():
         "Chosen: shrinkage, whose risk on held-out data is 10 +- 4.5 % lower than that of model_assisted."
     )
     assert got[1].sentence == (
-        "Chosen: model_assisted, for no other has a lower risk on held-out data by more than chance "
+        "Chosen: model_assisted, for no other has a clearly lower risk on held-out data "
         "(shrinkage +10 +- 2.2 %, svo +30 +- 13 %)."
     )
     lines = str(got[0]).splitlines()
@@ -237,7 +237,7 @@ def test_the_reason_is_one_sentence_and_the_rest_a_table():
 
 def test_bad_options_are_told():
     signal, omega = array(3, 500), gf.resolve_scale_weights("long", 8)
-    with pytest.raises(ValueError, match="`candidates`: expected names among model_assisted, .*, got \\['best'\\]"):
+    with pytest.raises(ValueError, match=r"`candidates`: expected names among model_assisted, .*, got \['best'\]"):
         select_estimator(signal, omega, ["best"])
     with pytest.raises(ValueError, match=r"`candidates`: expected names .* got \[\]"):
         select_estimator(signal, omega, [])
