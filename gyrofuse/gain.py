@@ -21,6 +21,8 @@ from gyrofuse.hypotheses import Answer, Evidence
 
 # Of the correlation between levels: white noise has 1.5, flicker 1.4 and a random walk 1.25.
 _KAPPA = 1.3
+# Degrees of freedom below which the law of a ratio says nothing.
+_FEWEST_SPARE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +87,7 @@ def ratio_to_equal(
     unshared = (1 - product.square() / (equal * virtual)).clamp(min=0) + 1 - left / degrees
     spare = (left - 1).clamp(min=0)
     quantile = torch.as_tensor(stats.t.ppf((1 + confidence_level) / 2, spare.cpu().numpy())).to(spare)
-    spread = torch.where(spare > 0, 1 + 2 * unshared * quantile.square() / spare, torch.inf)
+    spread = torch.where(spare > _FEWEST_SPARE, 1 + 2 * unshared * quantile.square() / spare, torch.inf)
     factor = spread + (spread.square() - 1).sqrt()
     found = equal / virtual
     estimate = found / (1 + optimism)
