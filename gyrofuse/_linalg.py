@@ -53,6 +53,16 @@ def check_positive_definite(
     )
 
 
+def geometric_mean(inverse: Tensor, other: Tensor) -> Tensor:
+    """The positive `X` with `X D X = M`, the geometric mean of `D^-1` and `M`."""
+    lower = torch.linalg.cholesky(inverse)
+    values, vectors = torch.linalg.eigh(lower.mT @ other @ lower)
+    root = (vectors * values.clamp(min=0).sqrt()[..., None, :]) @ vectors.mT
+    half = torch.linalg.solve_triangular(lower.mT, root, upper=True)
+    mean = torch.linalg.solve_triangular(lower, half, upper=False, left=False)
+    return (mean + mean.mT) / 2
+
+
 def _cause(matrix: Tensor, correlation: Tensor, names: Sequence[str], tolerance: float) -> str:
     missing = (~matrix.diagonal().isfinite()).nonzero().flatten().tolist()
     if missing:

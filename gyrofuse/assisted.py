@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._lag_sums import unit_wavelet_variances
+from gyrofuse._linalg import geometric_mean
 
 # Levels with more observations than this in every recording speak for themselves.
 _MOST_OBSERVATIONS = 2**9
@@ -111,7 +112,7 @@ def _fit(gamma: Tensor, eta: Tensor, unit: Tensor, own: Tensor) -> tuple[Tensor,
         up = torch.einsum("...jk,...jio->...kio", weight, precision @ gamma @ precision)
         trace = theta.diagonal(dim1=-2, dim2=-1).sum(-1).clamp(min=1e-100)
         down = down + (2 * n_parameters / trace)[..., None, None] * identity
-        theta = _geometric_mean(down, theta @ up @ theta)
+        theta = geometric_mean(down, theta @ up @ theta)
     model = _mix(unit, theta)
     lower = torch.linalg.cholesky(model)
     trace_ratio = torch.cholesky_solve(gamma, lower).diagonal(dim1=-2, dim2=-1).sum(-1)
@@ -128,16 +129,6 @@ def _positive(matrix: Tensor) -> Tensor:
     values, vectors = torch.linalg.eigh(matrix)
     least = _FLOOR * matrix.diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True)
     return (vectors * torch.maximum(values, least)[..., None, :]) @ vectors.mT
-
-
-def _geometric_mean(inverse: Tensor, other: Tensor) -> Tensor:
-    """The positive `X` with `X D X = M`, the geometric mean of `D^-1` and `M`."""
-    lower = torch.linalg.cholesky(inverse)
-    values, vectors = torch.linalg.eigh(lower.mT @ other @ lower)
-    root = (vectors * values.clamp(min=0).sqrt()[..., None, :]) @ vectors.mT
-    half = torch.linalg.solve_triangular(lower.mT, root, upper=True)
-    mean = torch.linalg.solve_triangular(lower, half, upper=False, left=False)
-    return (mean + mean.mT) / 2
 
 
 def _mix(unit: Tensor, theta: Tensor) -> Tensor:

@@ -42,7 +42,12 @@ def inverse_variance_weights(wccv: Tensor, scale_weights: Tensor) -> Tensor:
     Returns:
         `(..., sensor)`.
     """
-    precision = torch.einsum("j,...jii->...i", scale_weights.to(wccv), wccv).reciprocal()
+    return precision_weights(combine(wccv, scale_weights))
+
+
+def precision_weights(combined: Tensor) -> Tensor:
+    """`1/A_ii`, normalised to sum 1, of `A (..., sensor, sensor)`."""
+    precision = combined.diagonal(dim1=-2, dim2=-1).reciprocal()
     return precision / precision.sum(-1, keepdim=True)
 
 

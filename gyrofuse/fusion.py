@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gyrofuse.competitors import precision_weights
 from gyrofuse.rdvg import rdvg_weights
 from gyrofuse.selection import ESTIMATORS, Selection, select_estimator
 from gyrofuse.svo_weights import counting, optimal_weights
@@ -36,7 +37,7 @@ class Chosen:
         Weights with a model's help, or drawn towards others, vary less than those without.
         """
         if self.method == "inverse_variance":
-            return _inverse_variance
+            return precision_weights
         return optimal_weights if self.method in ("svo", "model_assisted", "shrinkage", "auto") else None
 
 
@@ -61,8 +62,3 @@ def choose_weights(method: str, signal: Tensor, wccv: Tensor, totals: Tensor, om
     weights = candidates.take_along_dim(selection.chosen[:, None, None], 1)[:, 0]
     different = selection.chosen.unique()
     return Chosen(weights, names[int(different)] if len(different) == 1 else "auto", selection)
-
-
-def _inverse_variance(combined: Tensor) -> Tensor:
-    precision = combined.diagonal(dim1=-2, dim2=-1).reciprocal()
-    return precision / precision.sum(-1, keepdim=True)

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._lag_sums import covariance_table, unit_wavelet_variances, variance_table
+from gyrofuse._linalg import geometric_mean
 
 # Levels with more observations than this speak for themselves.
 _MOST_OBSERVATIONS = 2**6
@@ -148,12 +149,7 @@ def _step(theta: Tensor, gamma: Tensor, shape: Tensor, eta: Tensor) -> Tensor:
     weighted = eta[:, None] * shape  # (level, component)
     down = torch.einsum("jk,...jio->...kio", weighted, precision)  # D
     up = torch.einsum("jk,...jio->...kio", weighted, precision @ gamma @ precision)  # N
-    factor = torch.linalg.cholesky(down)
-    values, vectors = torch.linalg.eigh(factor.mT @ theta @ up @ theta @ factor)
-    root = (vectors * values.clamp(min=0).sqrt()[..., None, :]) @ vectors.mT
-    half = torch.linalg.solve_triangular(factor.mT, root, upper=True)
-    mean = torch.linalg.solve_triangular(factor, half, upper=False, left=False)
-    return (mean + mean.mT) / 2
+    return geometric_mean(down, theta @ up @ theta)
 
 
 def _model(theta: Tensor, unit: Tensor) -> Tensor:

@@ -47,7 +47,7 @@ def fit_svo(
         signal: `(..., sensor, time)` of at least two sensors, or a `Recording`; NaN = missing sample.
         scale_weights: `"flat"`, `"short"`, `"long"`, or one number >= 0 per level.
         method: `"svo"`; `"auto"` chooses between it and its relatives by held-out risk: `"model_assisted"` takes the
-            last levels from a smooth model, `"shrinkage"` pulls them towards uncorrelated sensors, `"nonnegative"`
+            last levels from a smooth model, `"shrinkage"` draws them towards the levels beside them, `"nonnegative"`
             keeps every weight >= 0; `"inverse_variance"` ignores correlation; `"equal"`, and `"rdvg"` of Vaccaro and
             Zaki, which knows white noise and random walk only, for comparison.
         confidence_level: Of every interval in the result.

@@ -49,6 +49,10 @@ class WeightsSpread:
     degrees: Tensor
     half_width: Tensor
 
+    def __getitem__(self, items: Tensor) -> WeightsSpread:
+        """Some items of the leading batch dimension."""
+        return WeightsSpread(self.covariance[items], self.degrees[items], self.half_width[items])
+
 
 def certain(weights: Tensor) -> WeightsSpread:
     """Of weights that do not depend on data."""
@@ -159,11 +163,11 @@ def _spread(
                 ),
                 confidence_level,
             )
-            by_model = _where(needed, part, by_model)
+            by_model = _with(by_model, needed, part)
     ratio = (_sd(shown).square() / _sd(by_model.covariance).square()).median(-1).values
     refuted = few & (windows >= series.FEWEST_WINDOWS) & (ratio > _largest_ratio(terms))
     chosen = few & ~refuted
-    return _where(chosen, by_model, by_series), int(refuted.sum())
+    return _with(by_series, chosen, by_model[chosen]), int(refuted.sum())
 
 
 def _lower(
@@ -177,12 +181,12 @@ def _lower(
     return lower * _across(spread, wccv, first)[:, None, None], terms
 
 
-def _where(which: Tensor, one: WeightsSpread, other: WeightsSpread) -> WeightsSpread:
-    """`one`, which holds those items or all, where `which`, else `other`."""
+def _with(spread: WeightsSpread, which: Tensor, part: WeightsSpread) -> WeightsSpread:
+    """`spread` with `part` in place of those items."""
     values = []
     for name in ("covariance", "degrees", "half_width"):
-        chosen, merged = getattr(one, name), getattr(other, name).clone()
-        merged[which] = chosen if len(chosen) == int(which.sum()) else chosen[which]
+        merged = getattr(spread, name).clone()
+        merged[which] = getattr(part, name)
         values.append(merged)
     return WeightsSpread(*values)
 
