@@ -9,13 +9,14 @@ exact finite-sample law, cost about as much as one Cholesky factor of size direc
 from __future__ import annotations
 
 import functools
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gyrofuse._lag_sums import block_mean_covariances
-from gyrofuse.pilot import Pilot
+from gyrofuse.pilot import Pilot, components_of_memories
 
 # The share of the variance that the directions hold, and as many as give its law the right shape.
 _HELD, _FEWEST_DIRECTIONS = 0.5, 24
@@ -29,61 +30,95 @@ def resample_combined(
     Every item of a batch gets the same draws, so that it does not matter what it is batched with.
 
     Args:
-        pilot: A model fitted to the array, batch `(...)`.
+        pilot: A model fitted to the arrays, batch `(item,)`.
         scale_weights: `(level,)`; those of lower levels do not matter.
         n_resamples: Number of resamples.
         generator: Source of randomness, on the CPU.
 
     Returns:
-        `(..., resample, sensor, sensor)` and their expectation `(..., sensor, sensor)`, signal^2.
+        `(item, resample, sensor, sensor)` and their expectation `(item, sensor, sensor)`, signal^2.
     """
     omega = tuple(scale_weights[pilot.first_level :].tolist())
-    kernels, missing, kept, whole = _directions(pilot.n_samples, pilot.first_level, omega)
-    within = torch.from_numpy(kernels).to(pilot.theta)  # K_k: (component, direction, direction)
-    rest = torch.einsum("k,...kio->...io", torch.from_numpy(missing).to(pilot.theta), pilot.theta)
-    n, n_sensors = within.shape[-1], pilot.theta.shape[-1]
-    joint = torch.einsum("...kio,kab->...aibo", pilot.theta, within).flatten(-2).flatten(-3, -2)
+    n_sensors = pilot.theta.shape[-1]
+    found = _directions(pilot.n_samples, pilot.first_level, omega, pilot.time_constants)
+    most = max(directions.within.shape[-1] for directions in found)  # so that memories do not matter to the draws
+    normal = torch.randn(most * n_sensors, n_resamples, generator=generator, dtype=pilot.theta.dtype)
+    normal = normal.to(pilot.theta.device)
+    resamples = pilot.theta.new_empty(len(pilot.theta), n_resamples, n_sensors, n_sensors)
+    expected = pilot.theta.new_empty(len(pilot.theta), n_sensors, n_sensors)
+    for memory in pilot.memory.unique().tolist():
+        alike = pilot.memory == memory
+        resamples[alike], expected[alike] = _draw(found[memory], pilot.theta[alike], normal)
+    return resamples, expected
+
+
+def _draw(directions: _Directions, theta: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
+    within = torch.from_numpy(directions.within).to(theta)  # K_k: (component, direction, direction)
+    rest = torch.einsum("k,nkio->nio", torch.from_numpy(directions.rest).to(theta), theta)
+    n, n_sensors = within.shape[-1], theta.shape[-1]
+    joint = torch.einsum("nkio,kab->naibo", theta, within).flatten(-2).flatten(-3, -2)
     # Directions that hardly any component moves in make this singular to rounding.
     size = joint.diagonal(dim1=-2, dim2=-1)
     root = torch.linalg.cholesky(joint + torch.diag_embed(1e-12 * size + 1e-14 * size.amax(-1, keepdim=True)))
-    normal = torch.randn(n * n_sensors, n_resamples, generator=generator, dtype=root.dtype).to(root.device)
-    drawn = (root @ normal).unflatten(-2, (n, n_sensors)).movedim(-1, -3)  # (..., resample, direction, sensor)
-    expected = torch.einsum("k,...kio->...io", torch.einsum("kaa->k", within), pilot.theta)
+    drawn = (root @ normal[: n * n_sensors]).unflatten(-2, (n, n_sensors)).movedim(-1, -3)
+    expected = torch.einsum("k,nkio->nio", torch.einsum("kaa->k", within), theta)
     # What the other directions lack in variance, the ones kept make up for.
-    size = pilot.theta.diagonal(dim1=-2, dim2=-1).sum(-1)  # (..., component)
-    share, total = (torch.einsum("...k,km,...m->...", size, torch.from_numpy(m).to(size), size) for m in (kept, whole))
-    moved = (total / share).sqrt()[..., None, None, None] * (drawn.mT @ drawn - expected[..., None, :, :])
+    size = theta.diagonal(dim1=-2, dim2=-1).sum(-1)  # (item, component)
+    share, total = (
+        torch.einsum("nk,km,nm->n", size, torch.from_numpy(products).to(size), size)
+        for products in (directions.kept, directions.whole)
+    )
+    # (item, resample, direction, sensor), squared
+    moved = (total / share).sqrt()[:, None, None, None] * (drawn.mT @ drawn - expected[:, None])
     expected = expected + rest
-    return expected[..., None, :, :] + moved, expected
+    return expected[:, None] + moved, expected
+
+
+class _Directions(NamedTuple):
+    """Few directions in time, for one memory.
+
+    Attributes:
+        within: Matrices `K_k`, `(component, direction, direction)`.
+        rest: What the other directions add, `(component,)`.
+        kept: Inner products of the matrices, `(component, component)`.
+        whole: The same with all directions.
+    """
+
+    within: np.ndarray
+    rest: np.ndarray
+    kept: np.ndarray
+    whole: np.ndarray
 
 
 @functools.lru_cache(maxsize=16)
 def _directions(
-    n_samples: int, first_level: int, omega: tuple[float, ...]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Matrices `K_k` `(component, direction, direction)`, what the other directions add, `(component,)`, and the inner
-    products `(component, component)` of the matrices and of those of all directions."""
+    n_samples: int, first_level: int, omega: tuple[float, ...], time_constants: tuple[float, ...]
+) -> list[_Directions]:
+    """The directions that matter, by memory."""
     block = 2**first_level
     n_blocks = n_samples // block
     kernel = _kernel(n_blocks, omega)
     values, vectors = np.linalg.eigh(kernel)
     root = vectors * np.sqrt(values.clip(min=0))  # Q = root root'
     lag = np.abs(np.arange(n_blocks)[:, None] - np.arange(n_blocks))
-    components = []
-    for covariance in block_mean_covariances(block, n_blocks, ()):
-        half = root - root.mean(0)  # the kernel does not see a constant: nor does rounding
-        components.append(half.T @ covariance[lag] @ half)
-    within = np.stack(components)
+    half = root - root.mean(0)  # the kernel does not see a constant: nor does rounding
+    covariances = block_mean_covariances(block, n_blocks, time_constants)
+    components = np.stack([half.T @ covariance[lag] @ half for covariance in covariances])
+    return [_few(components[pair]) for pair in components_of_memories()]
+
+
+def _few(within: np.ndarray) -> _Directions:
+    """Of matrices `K_k` in all directions, the directions that matter to every component alike."""
     total = within.trace(axis1=1, axis2=2)
-    # The directions that matter to every component alike, each of which may turn out to be the largest.
+    # Each of them may turn out to be the largest.
     _, vectors = np.linalg.eigh((within / total[:, None, None]).sum(0))
     turned = vectors.T[::-1] @ within @ vectors[:, ::-1]
     # The variance of a quadratic form is that of its squared entries: as many directions as hold most of it.
     held = (turned**2).cumsum(1).cumsum(2).diagonal(axis1=1, axis2=2)  # (component, direction)
     n = max(int((held < _HELD * held[:, -1:]).any(0).sum()) + 1, _FEWEST_DIRECTIONS)
     reduced = turned[:, :n, :n]
-    products = (np.einsum("kab,mab->km", x, x) for x in (reduced, turned))
-    return reduced, total - reduced.trace(axis1=1, axis2=2), *products
+    kept, whole = (np.einsum("kab,mab->km", x, x) for x in (reduced, turned))
+    return _Directions(reduced, total - reduced.trace(axis1=1, axis2=2), kept, whole)
 
 
 def _kernel(n_blocks: int, omega: tuple[float, ...]) -> np.ndarray:

@@ -1,7 +1,8 @@
 """A rough model of an array's noise at its last levels, fitted to its wavelet cross-covariance (WCCV).
 
-White noise and a random walk, each with a covariance matrix between the sensors: what rises and what falls with the
-scale. It says how far the last levels can be off, where few observations leave nothing else to go by; a richer model
+White noise and one component with memory, each with a covariance matrix between the sensors: what falls and what rises
+with the scale. The memory is that of a random walk, or where that is far from likely of an AR1, whose noise turns level
+at the last levels. It says how far these can be off, where few observations leave nothing else to go by; a richer model
 would fit their noise, and its intervals come out a tenth too narrow.
 """
 
@@ -20,6 +21,9 @@ from gyrofuse._linalg import geometric_mean
 # Levels with more observations than this speak for themselves.
 _MOST_OBSERVATIONS = 2**6
 _ITERATIONS = 60
+# Time constants of AR1s that may stand for the memory, as parts of the record, and how much more likely (nats) than a
+# random walk they have to be.
+_TIME_CONSTANTS, _EVIDENCE = (1 / 4, 1 / 16), 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,25 +31,38 @@ class Pilot:
     """Matrices of the components of a rough noise model.
 
     Attributes:
-        theta: `(..., 2, sensor, sensor)`, positive semi-definite: white noise and the steps of a random walk.
+        theta: `(..., 2, sensor, sensor)`, positive semi-definite: white noise, and the variance of an AR1 or that of
+            the steps of a random walk.
+        memory: `(...)`, which memory the second component has: 0 the random walk's, 1, 2, ... those of AR1s.
         n_samples: Length of the record.
         first_level: Lowest level (counted from 0) that the model was fitted to.
         n_levels: Levels J.
     """
 
     theta: Tensor
+    memory: Tensor
     n_samples: int
     first_level: int
     n_levels: int
 
     def __getitem__(self, items: Tensor) -> Pilot:
         """Some items of the leading batch dimension."""
-        return replace(self, theta=self.theta[items])
+        return replace(self, theta=self.theta[items], memory=self.memory[items])
+
+    @property
+    def time_constants(self) -> tuple[float, ...]:
+        """Those of the AR1s that `memory` may name, in samples."""
+        return _time_constants(self.n_samples)
 
     @property
     def wavelet_cross_covariance(self) -> Tensor:
         """`(..., level, sensor, sensor)` of the model at every level, trustworthy from `first_level` on."""
-        return _model(self.theta, self._unit)
+        return _model(self.theta, self.unit)
+
+    @property
+    def unit(self) -> Tensor:
+        """Wavelet variances `(..., level, component)` of the components at unit size."""
+        return _unit_variances(self.n_samples, self.n_levels).to(self.theta)[self.memory]
 
     def covariance_of_moments(self) -> Tensor:
         """Covariance of the wavelet cross-covariances of a Gaussian record, exact for its length.
@@ -55,8 +72,9 @@ class Pilot:
         Returns:
             `(..., level, sensor, sensor, level, sensor, sensor)`, signal^4: for few sensors and levels.
         """
-        table = torch.from_numpy(np.array(covariance_table(self.n_samples, self.n_levels, ()))).to(self.theta)
-        straight = torch.einsum("jlkm,...kac,...mbd->...jablcd", table, self.theta, self.theta)
+        table = _by_memory(covariance_table(self.n_samples, self.n_levels, self.time_constants))
+        table = table.to(self.theta)[self.memory]
+        straight = torch.einsum("...jlkm,...kac,...mbd->...jablcd", table, self.theta, self.theta)
         return straight + straight.transpose(-1, -2)
 
     def degrees_of_freedom(self, weights: Tensor) -> Tensor:
@@ -68,23 +86,20 @@ class Pilot:
         Returns:
             `(..., level, combination)`.
         """
-        shares = torch.einsum("...ni,...kio,...no->...nk", weights, self.theta, weights)
-        variance = torch.einsum("jk,...nk->...jn", self._unit, shares)
-        table = torch.from_numpy(np.array(variance_table(self.n_samples, self.n_levels, ()))).to(self.theta)
+        shares = torch.einsum("...ni,...kio,...no->...kn", weights, self.theta, weights)
+        table = _by_memory(variance_table(self.n_samples, self.n_levels, self.time_constants))
         # Var nu_j = 2 sum_km Q_jj[k,m] theta_k theta_m
-        return variance.square() / torch.einsum("jkm,...nk,...nm->...jn", table, shares, shares)
-
-    @property
-    def _unit(self) -> Tensor:
-        return _unit_variances(self.n_levels).to(self.theta)
+        half = torch.einsum("...jkm,...kn,...mn->...jn", table.to(self.theta)[self.memory], shares, shares)
+        return (self.unit @ shares).square() / half
 
 
 def fit_pilot(wccv: Tensor, n_samples: int, levels_below: int = 2) -> Pilot:
     """Fit the rough model to a wavelet cross-covariance.
 
     Maximises the Wishart likelihood `-sum_j eta_j (ln det S_j + tr(S_j^-1 Gamma_j)) / 2` with
-    `S_j = Theta_0 / tau_j + Theta_1 (tau_j^2 + 2) / (12 tau_j)` and `eta_j = 2 M_j / tau_j`, levels taken for
-    independent, over the last levels, and over some more where Akaike's criterion says that these fit as well.
+    `S_j = Theta_0 / tau_j + Theta_1 u_j`, `u_j = (tau_j^2 + 2) / (12 tau_j)` for a random walk, and
+    `eta_j = 2 M_j / tau_j`, levels taken for independent, over the last levels, and over some more where Akaike's
+    criterion says that these fit as well.
 
     Args:
         wccv: `(..., level, sensor, sensor)`, signal^2, float64.
@@ -100,38 +115,40 @@ def fit_pilot(wccv: Tensor, n_samples: int, levels_below: int = 2) -> Pilot:
     observations = (n_samples - torch.exp2(level) + 1) / torch.exp2(level)
     first = max(min(int((observations > _MOST_OBSERVATIONS).sum()), n_levels - 4), 0)
     below = max(first - levels_below, 0)
-    eta = (2 * observations[below:]).clamp(1, 300).to(wccv.device)
-    unit = _unit_variances(n_levels).to(wccv)[below:]
+    eta = (2 * observations).clamp(1, 300).to(wccv.device)
+    unit = _unit_variances(n_samples, n_levels).to(wccv)  # (memory, level, component)
 
     # In units of each sensor, so that no sensor is small to rounding.
     nu = wccv.diagonal(dim1=-2, dim2=-1)
     size = nu.clamp(min=1e-12 * nu.amax(-2, keepdim=True))[..., first:, :].log().mean(-2).exp().sqrt()
     scale = size[..., :, None] * size[..., None, :]
-    gamma = wccv[..., below:, :, :] / scale[..., None, :, :]
-    last = slice(first - below, None)
-    narrow, narrow_likelihood = _maximise(gamma[..., last, :, :], unit[last], eta[last])
-    if below == first:
-        return Pilot(narrow * scale[..., None, :, :], n_samples, first, n_levels)
-    wide, wide_likelihood = _maximise(gamma, unit, eta)
-    # The levels below, when no model but their own covariances has to fit them.
-    own = gamma[..., : last.start, :, :]
-    narrow_likelihood = narrow_likelihood + _likelihood(own, own, eta[: last.start])
-    n_parameters = last.start * n_sensors * (n_sensors + 1) / 2
-    peculiar = narrow_likelihood - wide_likelihood > n_parameters
-    theta = torch.where(peculiar[..., None, None, None], narrow, wide)
-    return Pilot(theta * scale[..., None, :, :], n_samples, first, n_levels)
+    gamma = (wccv / scale[..., None, :, :])[..., None, :, :, :]  # (..., 1, level, sensor, sensor)
+    theta, likelihood = _maximise(gamma[..., first:, :, :], unit[:, first:], eta[first:])
+    if below < first:
+        wide, wide_likelihood = _maximise(gamma[..., below:, :, :], unit[:, below:], eta[below:])
+        # The levels below, when no model but their own covariances has to fit them.
+        own = gamma[..., below:first, :, :]
+        n_parameters = (first - below) * n_sensors * (n_sensors + 1) / 2
+        likelihood = likelihood + _likelihood(own, own, eta[below:first]) - n_parameters
+        fits = wide_likelihood > likelihood
+        theta = torch.where(fits[..., None, None, None], wide, theta)
+        likelihood = torch.maximum(likelihood, wide_likelihood)
+    likelihood[..., 1:] -= _EVIDENCE
+    memory = likelihood.argmax(-1)
+    theta = torch.take_along_dim(theta, memory[..., None, None, None, None], -4).squeeze(-4)
+    return Pilot(theta * scale[..., None, :, :], memory, n_samples, first, n_levels)
 
 
 def _maximise(gamma: Tensor, unit: Tensor, eta: Tensor) -> tuple[Tensor, Tensor]:
-    """Matrices `(..., component, sensor, sensor)` and their log likelihood `(...)`."""
-    height = unit.amax(0)
-    shape = unit / height  # components in units in which they are as large as the data where they are largest
+    """Matrices `(..., memory, component, sensor, sensor)` and their log likelihood `(..., memory)`."""
+    height = unit.amax(-2)  # (memory, component)
+    shape = unit / height[:, None]  # components in units in which they are as large as the data where they are largest
     identity = torch.eye(gamma.shape[-1], dtype=gamma.dtype, device=gamma.device)
-    start = gamma.diagonal(dim1=-2, dim2=-1).mean((-1, -2)) / len(height)
-    theta = (start[..., None, None] * identity)[..., None, :, :].repeat_interleave(len(height), -3)
+    start = gamma.diagonal(dim1=-2, dim2=-1).mean((-1, -2)) / height.shape[-1]  # (..., 1)
+    theta = (start[..., None, None, None] * identity).expand(*gamma.shape[:-4], *height.shape, *identity.shape)
     for _ in range(_ITERATIONS):
         theta = _step(theta, gamma, shape, eta)
-    return theta / height[:, None, None], _likelihood(_model(theta, shape), gamma, eta)
+    return theta / height[..., None, None], _likelihood(_model(theta, shape), gamma, eta)
 
 
 def _likelihood(model: Tensor, gamma: Tensor, eta: Tensor) -> Tensor:
@@ -146,17 +163,32 @@ def _step(theta: Tensor, gamma: Tensor, shape: Tensor, eta: Tensor) -> Tensor:
     so that it never raises it, and keeps the matrices positive.
     """
     precision = torch.cholesky_inverse(torch.linalg.cholesky(_model(theta, shape)))  # (..., level, sensor, sensor)
-    weighted = eta[:, None] * shape  # (level, component)
-    down = torch.einsum("jk,...jio->...kio", weighted, precision)  # D
-    up = torch.einsum("jk,...jio->...kio", weighted, precision @ gamma @ precision)  # N
+    weighted = eta[:, None] * shape  # (..., level, component)
+    down = torch.einsum("...jk,...jio->...kio", weighted, precision)  # D
+    up = torch.einsum("...jk,...jio->...kio", weighted, precision @ gamma @ precision)  # N
     return geometric_mean(down, theta @ up @ theta)
 
 
 def _model(theta: Tensor, unit: Tensor) -> Tensor:
-    return torch.einsum("jk,...kio->...jio", unit, theta)
+    return torch.einsum("...jk,...kio->...jio", unit, theta)
+
+
+def _time_constants(n_samples: int) -> tuple[float, ...]:
+    return tuple(part * n_samples for part in _TIME_CONSTANTS)
 
 
 @functools.lru_cache(maxsize=8)
-def _unit_variances(n_levels: int) -> Tensor:
-    """Wavelet variances `(level, component)` of components of unit size."""
-    return torch.from_numpy(unit_wavelet_variances(n_levels, ()))
+def _unit_variances(n_samples: int, n_levels: int) -> Tensor:
+    """Wavelet variances `(memory, level, component)` of components of unit size."""
+    table = unit_wavelet_variances(n_levels, _time_constants(n_samples))
+    return torch.stack([torch.from_numpy(table[:, pair]) for pair in components_of_memories()])
+
+
+def _by_memory(table: np.ndarray) -> Tensor:
+    """A table over pairs of all components `(..., component, component)`, `(memory, ..., 2, 2)` of those that meet."""
+    return torch.stack([torch.from_numpy(table[..., pair, :][..., pair]) for pair in components_of_memories()])
+
+
+def components_of_memories() -> list[list[int]]:
+    """Which components each memory has among white noise, the AR1s, and a random walk."""
+    return [[0, len(_TIME_CONSTANTS) + 1]] + [[0, k + 1] for k in range(len(_TIME_CONSTANTS))]

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
 
+import gyrofuse as gf
 from gyrofuse import pilot
 from gyrofuse.covariance import wavelet_products
 from gyrofuse.parametric import resample_combined
@@ -31,6 +34,10 @@ def measured(signal: Tensor) -> Tensor:
     return sums / counts
 
 
+def random_walk(first_level: int) -> pilot.Pilot:
+    return pilot.Pilot(torch.stack([WHITE, WALK]), torch.tensor(0), N_SAMPLES, first_level, N_LEVELS)
+
+
 def test_exact_covariances_give_the_model_back():
     fitted = pilot.fit_pilot(true_wccv(), N_SAMPLES)
     torch.testing.assert_close(fitted.theta[-1], WALK, rtol=0, atol=3e-2 * WALK.max().item())
@@ -40,7 +47,8 @@ def test_exact_covariances_give_the_model_back():
 
 def test_every_step_raises_the_likelihood():
     gamma = measured(arrays(1))[0]
-    unit = pilot._unit_variances(N_LEVELS) / pilot._unit_variances(N_LEVELS).amax(0)
+    unit = pilot._unit_variances(N_SAMPLES, N_LEVELS)[0]
+    unit = unit / unit.amax(0)
     eta = torch.full((N_LEVELS,), 20.0, dtype=torch.float64)
     theta = torch.eye(3, dtype=torch.float64).repeat(2, 1, 1)
     before = pilot._likelihood(pilot._model(theta, unit), gamma, eta)
@@ -57,7 +65,7 @@ def test_degrees_are_those_of_the_estimates():
     sums, counts = wavelet_products(arrays(1500), N_LEVELS)
     nu = (sums / counts)[..., 0, 0]  # (run, level)
     found = 2 * true_wccv()[:, 0, 0].square() / nu.var(0)
-    fitted = pilot.Pilot(torch.stack([WHITE, WALK]), N_SAMPLES, 0, N_LEVELS)
+    fitted = random_walk(first_level=0)
     expected = fitted.degrees_of_freedom(torch.tensor([[1.0, 0, 0]]).double())[:, 0]
     # A chi-square variable has the excess kurtosis 12 / eta.
     error = ((2 + 12 / expected) / 1500).sqrt()
@@ -67,13 +75,41 @@ def test_degrees_are_those_of_the_estimates():
 def test_covariance_of_moments_is_that_of_recordings():
     """Levels 1, 4 and 9 of two sensors, over 1500 arrays: every entry within five standard errors."""
     sums, counts = wavelet_products(arrays(1500, seed=8), N_LEVELS)
-    fitted = pilot.Pilot(torch.stack([WHITE, WALK]), N_SAMPLES, 0, N_LEVELS)
+    fitted = random_walk(first_level=0)
     levels = [0, 3, 8]
     found = (sums / counts)[:, levels, :2, :2].flatten(1)
     expected = fitted.covariance_of_moments()[levels][:, :2, :2][:, :, :, levels][..., :2, :2].reshape(12, 12)
     scale = expected.diagonal().sqrt()
     # sd of a covariance of two Gaussian variables: sqrt((1 + r^2) / n) of the product of their sds
     assert ((found.T.cov() - expected) / scale / scale[:, None]).abs().max() < 5 * (2 / 1500) ** 0.5
+
+
+def test_memory_is_the_random_walk_s_unless_an_ar1_is_far_likelier():
+    """Of 40 arrays each; a sixteenth of the record is a time constant that an AR1 may have."""
+    sums, counts = wavelet_products(arrays(40, seed=2), N_LEVELS)
+    assert (pilot.fit_pilot(sums / counts, N_SAMPLES).memory == 0).sum() >= 38
+    slow = gf.AR1(math.exp(-16 / N_SAMPLES), 1.0)
+    model = gf.ArrayModel([(gf.WhiteNoise(1.0), WHITE), (slow, 10 * WALK)])
+    signal = model.simulate(N_SAMPLES, batch=(40,), generator=torch.Generator().manual_seed(3))
+    sums, counts = wavelet_products(signal, N_LEVELS)
+    fitted = pilot.fit_pilot(sums / counts, N_SAMPLES)
+    assert (fitted.memory == 2).sum() >= 32
+    # The variance at the last level, where the walk that goes as far at the first ones would have many times as much.
+    last = fitted.wavelet_cross_covariance.diagonal(dim1=-2, dim2=-1)[:, -1]
+    truth = model.wavelet_cross_covariance(N_LEVELS).diagonal(dim1=-2, dim2=-1)[-1]
+    found = last[fitted.memory == 2].mean(0)
+    torch.testing.assert_close(found, truth, rtol=0.25, atol=0)
+
+
+def test_resamples_of_a_mixed_batch_are_those_of_its_items():
+    theta = torch.stack([WHITE, WALK]).expand(3, 2, 3, 3)
+    omega = torch.arange(N_LEVELS).double()
+    mixed = pilot.Pilot(theta, torch.tensor([0, 2, 0]), N_SAMPLES, 5, N_LEVELS)
+    drawn, expected = resample_combined(mixed, omega, 50, torch.Generator().manual_seed(1))
+    for item in range(3):
+        alone = resample_combined(mixed[[item]], omega, 50, torch.Generator().manual_seed(1))
+        torch.testing.assert_close(alone, (drawn[[item]], expected[[item]]))
+    assert (expected[0] - expected[1]).abs().max() > 0.1 * expected[0].abs().max()
 
 
 def test_what_is_peculiar_below_does_not_bend_the_fit():
@@ -97,8 +133,8 @@ def test_resamples_follow_the_law_of_recordings(scale_weights):
     omega = torch.tensor(scale_weights).double() / sum(scale_weights)
     sums, counts = wavelet_products(arrays(1500, seed=4), N_LEVELS)
     real = torch.einsum("j,njik->nik", omega, sums / counts)
-    model = pilot.Pilot(torch.stack([WHITE, WALK]), N_SAMPLES, 5, N_LEVELS)
-    drawn, expected = resample_combined(model, omega, 4000, torch.Generator().manual_seed(1))
+    model = pilot.Pilot(torch.stack([WHITE, WALK])[None], torch.tensor([0]), N_SAMPLES, 5, N_LEVELS)
+    drawn, expected = (x[0] for x in resample_combined(model, omega, 4000, torch.Generator().manual_seed(1)))
     exact = torch.einsum("j,jik->ik", omega, true_wccv())
     torch.testing.assert_close(expected, exact, rtol=0.02, atol=1e-5)
     scale = real.std(0)

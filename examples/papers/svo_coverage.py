@@ -1,9 +1,9 @@
 """How often the intervals hold the truth: figure 5 of Zhang et al. (2022), for more noises and methods.
 
-Nominal 95 % intervals of the SVO weights for short and for long averaging times, by a fitted model and by the paper's
-block bootstrap, and of the wavelet variance of single sensors at every level that has two windows side by side
-(`M_j >= 2 tau_j`). 1000 arrays of 2^13 and of 2^16 samples for every noise; `--quick` has 60 arrays of 2^12 samples and
-wavelet variances of one sensor.
+Nominal 95 % intervals of the SVO weights by a fitted model and by the paper's block bootstrap, for short and for long
+averaging times, those of the record and those of the paper's record cut to as many levels as there are; and of the
+wavelet variance of single sensors at every level that has two windows side by side (`M_j >= 2 tau_j`). 1000 arrays of
+2^13 and of 2^16 samples for every noise; `--quick` has 60 arrays of 2^12 samples and wavelet variances of one sensor.
 
 The noises: Case 1 (white noise and random walk) and Case 2 (white noise and three AR(1)) of the paper, which take the
 same part of a record as in its 29 hours, Case 1 with Laplace innovations, and Case 1 with a wandering tone that all
@@ -23,7 +23,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import torch
-from _svo_study import LINES, N_COVERAGE, R, arguments, case1, case2, figures_written, finish, n_levels
+from _svo_study import LINES, N_COVERAGE, N_SAMPLES, R, arguments, case1, case2, figures_written, finish, n_levels
 from scipy import stats
 from torch import Tensor
 
@@ -130,7 +130,8 @@ def cover(noise: Noise, n_samples: int, n_arrays: int, sensors: slice, generator
     truth, levels = noise.truth(n_samples), n_levels(n_samples)
     # M_j >= 2 tau_j: two windows side by side
     known = sum((n_samples - 2**j + 1) >= 2 * 2**j for j in range(1, levels + 1))
-    weights = {(w, c): torch.zeros(len(R), dtype=torch.long) for w in ("short", "long") for c in COVARIANCES}
+    scale_weights = scales(levels)
+    weights = {(w, c): torch.zeros(len(R), dtype=torch.long) for w in scale_weights for c in COVARIANCES}
     own = truth[:known].diagonal(dim1=-2, dim2=-1)[:, sensors]
     variance = torch.zeros(own.shape, dtype=torch.long)
     done = 0
@@ -138,15 +139,25 @@ def cover(noise: Noise, n_samples: int, n_arrays: int, sensors: slice, generator
         batch = min(BATCH[n_samples], n_arrays - done)
         signal = _SCALE * noise.simulate(n_samples, batch, generator)
         for (name, covariance), count in weights.items():
-            best = gf.svo_weights(truth, name)
+            omega = scale_weights[name]
+            best = gf.svo_weights(truth, omega)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # that the bootstrap is poor at the last levels is what we measure
-                fitted = gf.fit_svo(signal, name, covariance=COVARIANCES[covariance], n_levels=levels)
+                fitted = gf.fit_svo(signal, omega, covariance=COVARIANCES[covariance], n_levels=levels)
             count += _held(fitted.confidence_interval, best)
         interval = gf.wavelet_variance_interval(signal[:, sensors], known)
         variance += _held(interval, _SCALE**2 * own)
         done += batch
     return Coverage(n_arrays, weights, variance)
+
+
+def scales(levels: int) -> dict[str, Tensor]:
+    """Scale weights by name."""
+    found = {name: gf.resolve_scale_weights(name, levels) for name in ("short", "long")}
+    for name in ("short", "long"):
+        cut = gf.resolve_scale_weights(name, n_levels(N_SAMPLES))[:levels]
+        found[f"{name}, cut"] = cut / cut.sum()
+    return found
 
 
 def _held(interval: gf.ConfidenceInterval, truth: Tensor) -> Tensor:
@@ -165,10 +176,10 @@ def print_coverage(found: dict[tuple[str, int], Coverage]) -> None:
         low, high = (100 * edge for edge in band(coverage.n))
         print(f"\n{name}, {coverage.n} arrays of {n_samples} samples: coverage (%) of 95 % intervals;")
         print(f"95 % of right ones lie in [{low:.1f}, {high:.1f}]; [ ]: binomial 95 % interval of the mean's coverage")
-        print(f"{'weights':>7}  {'covariance':>15}  " + "  ".join(f"{i:>5}" for i in range(1, len(R) + 1)) + "   mean")
+        print(f"{'weights':>10}  {'covariance':>15}  " + "  ".join(f"{i:>5}" for i in range(1, len(R) + 1)) + "   mean")
         for (scale, covariance), held in coverage.weights.items():
             cells = "  ".join(f"{100 * share:>5.1f}" for share in (held / coverage.n).tolist())
-            print(f"{scale:>7}  {covariance:>15}  {cells}  {_with_interval(held, coverage.n)}")
+            print(f"{scale:>10}  {covariance:>15}  {cells}  {_with_interval(held, coverage.n)}")
         print(f"wavelet variance of {coverage.variance.shape[1]} sensor(s), by level")
         print(f"{'level':>7}  {'M_j / tau_j':>15}  {'least':>5}  {'most':>5}   mean")
         for j, held in enumerate(coverage.variance, 1):
