@@ -34,7 +34,6 @@ from gyrofuse.recording import Recording, read_recording
 from gyrofuse.report import (
     fusion_figure,
     fusion_report,
-    multiscale_figure,
     number,
     recording_report,
     save_figure,
@@ -187,8 +186,6 @@ def fuse(
 ) -> None:
     """Fuse an array, recorded at rest, into one virtual gyro."""
     weights, stretch = _scale_weights(scale_weights), _stretch(rest)
-    if method is Method.multiscale and report:
-        raise ValueError("`--report`: there is none for --method multiscale yet; draw it with --figure")
     with _outputs(force, [*logs, mounting], out=out, figure=figure, json=json_file, report=report) as drafts:
         recording = _read(logs, axis, sensors, rate, unit, scale, key, mounting)
         with progress("fusing"):
@@ -223,9 +220,8 @@ def fuse(
             _save(fused, drafts[out], weights=result.weights.numpy())
         with progress("drawing"):
             if figure:
-                drawn = fusion_figure(result) if isinstance(result, SVOResult) else multiscale_figure(result)
-                save_figure(drawn, drafts[figure], figure.suffix[1:])
-            if report and isinstance(result, SVOResult):
+                save_figure(fusion_figure(result), drafts[figure], figure.suffix[1:])
+            if report:
                 title = f"Virtual gyro of {_titled(logs)}"
                 page = fusion_report(result, recording, virtual, title=title, remarks=remarks)
                 drafts[report].write_text(page, encoding="utf-8")

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from gyrofuse._checks import check_signal
-from gyrofuse._result import listed, numbered
+from gyrofuse._result import ConfidenceInterval, listed, numbered
 from gyrofuse._tiles import tile_length
 from gyrofuse.recording import Recording
-from gyrofuse.svo_result import SVOResult
+from gyrofuse.svo_result import SVOResult, plot_deviations
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -121,6 +121,11 @@ class MultiScaleResult:
     single: SVOResult
 
     @property
+    def method(self) -> str:
+        """How the weights were chosen, `"multiscale"`."""
+        return "multiscale"
+
+    @property
     def n_bands(self) -> int:
         """Number of bands."""
         return self.weights.shape[-2]
@@ -136,14 +141,49 @@ class MultiScaleResult:
         return self.single.sensors
 
     @property
+    def axes(self) -> tuple[str, ...]:
+        """Names along the leading dimension, empty when it has none."""
+        return self.single.axes
+
+    @property
+    def rate(self) -> float | None:
+        """Sampling rate in Hz, when known."""
+        return self.single.rate
+
+    @property
+    def unit(self) -> str | None:
+        """Unit of the signal, when known."""
+        return self.single.unit
+
+    @property
+    def n_samples(self) -> int:
+        """Length of the signal."""
+        return self.single.n_samples
+
+    @property
     def scale_weights(self) -> Tensor:
         """`(level,)`, sum 1: how much each level counts, relative to its optimum."""
         return self.single.scale_weights
 
     @property
+    def degrees_of_freedom(self) -> Tensor:
+        """`(..., level)`, independent observations of the virtual gyro that a level holds."""
+        return self.single.degrees_of_freedom
+
+    @property
+    def confidence_level(self) -> float:
+        """Of the intervals."""
+        return self.single.confidence_level
+
+    @property
     def tau(self) -> Tensor:
         """Averaging time of each level, and of each band but the last, which holds all that is slower."""
         return self.single.tau
+
+    @property
+    def wavelet_variance(self) -> Tensor:
+        """Wavelet variance of every sensor, `(..., level, sensor)`."""
+        return self.single.wavelet_variance
 
     @property
     def equal_wavelet_variance(self) -> Tensor:
@@ -154,6 +194,10 @@ class MultiScaleResult:
     def motion(self) -> str:
         """A warning that the array seems to have moved while it was fitted, or an empty string."""
         return self.single.motion
+
+    def interval_of(self, wavelet_variance: Tensor) -> ConfidenceInterval:
+        """Limits of wavelet variances `(..., level)` of the virtual gyro."""
+        return self.single.interval_of(wavelet_variance)
 
     def virtual(self, signal: Tensor | Recording) -> Tensor:
         """Fuse a signal with these weights: `(..., sensor, time)` to `(..., time)`.
@@ -172,19 +216,18 @@ class MultiScaleResult:
     def summary(self) -> str:
         """The weights of every band and the gain per level, as fixed-width text."""
         if self.weights.ndim > 2:
-            names = self.single.axes or numbered(self.weights.shape[0])
+            names = self.axes or numbered(self.weights.shape[0])
             parts = [f"[{name}]\n{self[i].summary()}" for i, name in enumerate(names[:8])]
             if len(names) > 8:
                 parts.append(f"... and {len(names) - 8} more")
             return "\n\n".join(parts)
-        single = self.single
-        unit, second = single.unit or "signal", "s" if single.rate else "samples"
-        rate = f", {single.rate:.6g} Hz" if single.rate else ""
+        unit, second = self.unit or "signal", "s" if self.rate else "samples"
+        rate = f", {self.rate:.6g} Hz" if self.rate else ""
         shown = self.sensors[:_MOST_SENSORS]
         more = f" (first {len(shown)} of {len(self.sensors)} sensors)" if len(shown) < len(self.sensors) else ""
         lines = [
             f"Multi-scale virtual gyro ({self.n_bands} bands) of {len(self.sensors)} sensors, "
-            f"{single.n_samples} samples{rate}",
+            f"{self.n_samples} samples{rate}",
             "",
             f"Weights of each band of time scale tau{more}",
             f"{f'tau ({second})':>13}  " + " ".join(f"{name[:8]:>8}" for name in shown),
@@ -203,9 +246,9 @@ class MultiScaleResult:
         best, equal, one, virtual = (
             (2 * variance).sqrt()
             for variance in (
-                single.wavelet_variance.amin(-1),
+                self.wavelet_variance.amin(-1),
                 self.equal_wavelet_variance,
-                single.virtual_wavelet_variance,
+                self.single.virtual_wavelet_variance,
                 self.virtual_wavelet_variance,
             )
         )
@@ -233,43 +276,28 @@ class MultiScaleResult:
         Raises:
             ValueError: The result holds a batch; index it first.
         """
-        from gyrofuse import plotting
-
-        if self.weights.ndim > 2:
-            raise ValueError(f"expected one virtual gyro to plot, got {len(self.weights)}; index the result, result[0]")
-        return plotting.plot_allan_deviation(
-            self.tau,
-            self.single.wavelet_variance,
-            names=self.sensors,
-            virtual=self.virtual_wavelet_variance,
-            band=self.single.interval_of(self.virtual_wavelet_variance),
-            equal=self.equal_wavelet_variance,
-            unit=self.single.unit,
-            in_seconds=self.single.rate is not None,
-            ax=ax,
-        )
+        return plot_deviations(self.single, self.virtual_wavelet_variance, ax)
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain lists and numbers, ready for JSON (NaN as None)."""
-        single = self.single
         return {
-            "method": "multiscale",
+            "method": self.method,
             "sensors": list(self.sensors),
-            "axes": list(single.axes),
-            "rate": single.rate,
-            "unit": single.unit,
-            "n_samples": single.n_samples,
+            "axes": list(self.axes),
+            "rate": self.rate,
+            "unit": self.unit,
+            "n_samples": self.n_samples,
             "motion": self.motion,
             "n_bands": self.n_bands,
             "weights": listed(self.weights),
             "scale_weights": listed(self.scale_weights),
             "tau": listed(self.tau),
-            "degrees_of_freedom": listed(single.degrees_of_freedom),
-            "wavelet_cross_covariance": listed(single.wavelet_cross_covariance),
-            "wavelet_variance": listed(single.wavelet_variance),
+            "degrees_of_freedom": listed(self.degrees_of_freedom),
+            "wavelet_cross_covariance": listed(self.single.wavelet_cross_covariance),
+            "wavelet_variance": listed(self.wavelet_variance),
             "virtual_wavelet_variance": listed(self.virtual_wavelet_variance),
             "optimal_wavelet_variance": listed(self.optimal_wavelet_variance),
             "equal_wavelet_variance": listed(self.equal_wavelet_variance),
-            "single_wavelet_variance": listed(single.virtual_wavelet_variance),
-            "single_weights": listed(single.weights),
+            "single_wavelet_variance": listed(self.single.virtual_wavelet_variance),
+            "single_weights": listed(self.single.weights),
         }

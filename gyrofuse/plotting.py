@@ -175,6 +175,50 @@ def plot_weights(
     return ax
 
 
+def plot_band_weights(
+    tau: Numbers, weights: Numbers, *, names: Sequence[str], in_seconds: bool = True, ax: Axes | None = None
+) -> Axes:
+    """Draw the weights of every band as colours over the averaging times that it governs; blue adds, orange subtracts.
+
+    Args:
+        tau: Averaging times `(level,)`, seconds or samples; all bands but the last have those of the first levels.
+        weights: `(band, sensor)`; the last band holds all that is slower.
+        names: Name of each sensor.
+        in_seconds: Whether `tau` is in seconds, else in samples.
+        ax: Where to draw; new axes by default.
+
+    Returns:
+        The axes.
+    """
+    from matplotlib.colors import LinearSegmentedColormap
+
+    ax = ax if ax is not None else _new_axes()
+    times, values = _array(tau), _array(weights)
+    n_bands = len(values)
+    # A level reaches half an octave to either side; the last band to the end, or an octave where no level is left.
+    starts = np.append(times, 2 * times[-1])[:n_bands] / np.sqrt(2)
+    edges = np.append(starts, np.sqrt(2) * max(times[-1], starts[-1] * np.sqrt(2)))
+    largest = np.abs(values[np.isfinite(values)]).max(initial=1e-9)
+    colors = LinearSegmentedColormap.from_list("signed", [_ORANGE, "white", _BLUE])
+    mesh = ax.pcolormesh(
+        edges, np.arange(len(names) + 1) - 0.5, values.T, cmap=colors, vmin=-largest, vmax=largest, edgecolors="face"
+    )
+    _time_axis(ax, in_seconds)
+    ax.invert_yaxis()  # the first sensor above, as in a table
+    step = -(-len(names) // _MOST_LABELS)
+    ax.set_yticks(range(0, len(names), step), [_clean(name) for name in names[::step]], parse_math=False)
+    ax.set_ylabel("sensor")
+    _finish(ax)
+    ax.grid(visible=False)
+    # Beside the axes rather than out of them: figures above keep the same time axis.
+    scale = ax.inset_axes((1.02, 0.0, 0.02, 1.0))
+    ax.figure.colorbar(mesh, cax=scale)
+    scale.spines["outline"].set(color=_FRAME, linewidth=0.8)
+    scale.set_ylabel("weight", color=_INK, fontsize=_LABEL)
+    scale.tick_params(color=_FRAME, labelcolor=_INK, labelsize=_TICK)
+    return ax
+
+
 def plot_signals(
     figure: Figure | SubFigure,
     time: Numbers,
@@ -236,7 +280,7 @@ def plot_fusion(
         figure: Where to draw.
         tau: Averaging times `(level,)`, seconds or samples.
         wavelet_variance: Of every sensor, `(level, sensor)`, signal^2.
-        weights: `(sensor,)`.
+        weights: `(sensor,)`, or `(band, sensor)`.
         names: Name of each sensor.
         virtual: Wavelet variance of the virtual gyro, `(level,)`.
         equal: Wavelet variance of the plain mean, `(level,)`.
@@ -264,10 +308,18 @@ def plot_fusion(
         in_seconds=in_seconds,
         ax=middle,
     )
-    unknown = np.full(len(names), np.nan)
-    low, high = interval if interval is not None else (unknown, unknown)
-    plot_weights(weights, low, high, names=names, ax=below)
-    figure.align_ylabels()
+    values = _array(weights)
+    if values.ndim == 2:
+        below.sharex(middle)
+        middle.set_xlabel("")
+        middle.tick_params(labelbottom=False)
+        plot_band_weights(tau, values, names=names, in_seconds=in_seconds, ax=below)
+    else:
+        unknown = np.full(len(names), np.nan)
+        low, high = interval if interval is not None else (unknown, unknown)
+        plot_weights(values, low, high, names=names, ax=below)
+    # Names of sensors beside the bands would push the labels above far out.
+    figure.align_ylabels([above, middle] if values.ndim == 2 else [above, middle, below])
 
 
 def with_unit(label: str, unit: str | None) -> str:

@@ -37,6 +37,37 @@ def fuse(weights: Tensor, signal: Tensor) -> Tensor:
     return (weights.unsqueeze(-2) @ signal).squeeze(-2)  # (..., 1, sensor) @ (..., sensor, time)
 
 
+def plot_deviations(array: SVOResult, virtual: Tensor, ax: Axes | None = None) -> Axes:
+    """Draw the Allan deviation of every sensor, the plain mean and a virtual gyro, with the latter's band.
+
+    Args:
+        array: One array; its own weights are not looked at.
+        virtual: Wavelet variance of the virtual gyro, `(level,)`.
+        ax: Where to draw; new axes by default.
+
+    Returns:
+        The axes.
+
+    Raises:
+        ValueError: `array` holds a batch.
+    """
+    from gyrofuse import plotting
+
+    if array.weights.ndim > 1:
+        raise ValueError(f"expected one virtual gyro to plot, got {len(array.weights)}; index the result, result[0]")
+    return plotting.plot_allan_deviation(
+        array.tau,
+        array.wavelet_variance,
+        names=array.sensors,
+        virtual=virtual,
+        band=array.interval_of(virtual),
+        equal=array.equal_wavelet_variance,
+        unit=array.unit,
+        in_seconds=array.rate is not None,
+        ax=ax,
+    )
+
+
 # Noise of separate sensors hardly agrees more than this at any scale; motion that all of them feel does.
 _MOTION = 0.7
 # A level of fewer observations than this shows agreement by chance.
@@ -290,21 +321,7 @@ class SVOResult:
         Raises:
             ValueError: The result holds a batch; index it first.
         """
-        from gyrofuse import plotting
-
-        if self.weights.ndim > 1:
-            raise ValueError(f"expected one virtual gyro to plot, got {len(self.weights)}; index the result, result[0]")
-        return plotting.plot_allan_deviation(
-            self.tau,
-            self.wavelet_variance,
-            names=self.sensors,
-            virtual=self.virtual_wavelet_variance,
-            band=self.interval_of(self.virtual_wavelet_variance),
-            equal=self.equal_wavelet_variance,
-            unit=self.unit,
-            in_seconds=self.rate is not None,
-            ax=ax,
-        )
+        return plot_deviations(self, self.virtual_wavelet_variance, ax)
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain lists and numbers, ready for JSON (NaN as None)."""

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 
-from gyrofuse import Recording, fit_svo
+from gyrofuse import Recording, fit_multiscale, fit_svo
 from gyrofuse.report import fusion_report, recording_report
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
@@ -81,11 +81,14 @@ def recording() -> Recording:
     return Recording(noise, rate=100.0, unit="deg/s", sensors=HOSTILE, axes=("x", "y", "z"))
 
 
-@pytest.fixture(scope="module", params=["fusion", "axes", "recording"])
+@pytest.fixture(scope="module", params=["fusion", "axes", "multiscale", "recording"])
 def page(request: pytest.FixtureRequest, recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
     result = fit_svo(recording, "long")
     if request.param == "axes":
         html = fusion_report(result, recording, result.virtual(recording), title=HOSTILE[0], remarks=[HOSTILE[1]])
+    elif request.param == "multiscale":
+        bands = fit_multiscale(recording, "long")
+        html = fusion_report(bands, recording, bands.virtual(recording), title=HOSTILE[0])
     elif request.param == "fusion":
         html = fusion_report(result[0], title=HOSTILE[2])
     else:

@@ -76,6 +76,30 @@ def test_fuse_prints_the_summary_and_writes_what_is_asked_for(run: Run, log: Pat
     assert sorted(path.name for path in Path().iterdir()) == ["f.svg", "log.npz", "r.html", "r.json", "v.npz"]
 
 
+def test_fuse_with_weights_for_every_band(run: Run, log: Path):
+    outputs = {"--out": "v.npz", "--figure": "f.svg", "--json": "r.json", "--report": "r.html"}
+    words = [word for pair in outputs.items() for word in pair]
+    done = run("fuse", log, "--method", "multiscale", "--scale-weights", "long", "--rest", "0:15", *words)
+    recording = gf.read_recording(log)
+    result = gf.fit_multiscale(recording.between(0, 15), "long")
+    assert done == Outcome(0, done.out, "")
+    assert done.out.startswith(result.summary())
+    fused = gf.read_recording("v.npz")
+    torch.testing.assert_close(fused.signal, result.virtual(recording)[None], rtol=0, atol=0)
+    np.testing.assert_array_equal(np.load("v.npz")["weights"], result.weights.numpy())
+    known = json.loads(Path("r.json").read_text())
+    assert known == result.to_dict()
+    page = Path("r.html").read_text()
+    for text in ("Virtual gyro of log.npz", "Multi-scale virtual gyro", "Weights from 0 to 15 s of 20 s"):
+        assert text in page
+    for value in (weight for band in known["weights"] for weight in band):
+        assert f"<td>{value:+.4f}</td>" in page
+    for name in ("virtual", "equal", "optimal", "single"):
+        for value in known[f"{name}_wavelet_variance"]:
+            assert f"<td>{value:.3e}</td>" in page
+    assert {path.name for path in Path().iterdir()} == {"log.npz", *outputs.values()}
+
+
 def test_fuse_writes_text_that_is_read_back(run: Run, log: Path):
     assert run("fuse", log, "--out", "v.csv").status == 0
     lines = Path("v.csv").read_text().splitlines()
@@ -356,6 +380,36 @@ def test_bad_options_are_refused(run: Run, log: Path, tmp_path: Path, options: l
 
 
 @pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--levels", "0"], "`n_levels`"),
+        (["--levels", "99"], "at most 10"),
+        (["--confidence-level", "95"], "`confidence_level`"),
+        (["--scale-weights", "1,-1"], "`scale_weights`"),
+        (["--sensors", "a"], "at least 2 sensors"),
+        (["--report", "r.pdf"], ".html"),
+        (["--report", "nowhere/r.html"], "nowhere"),
+        (["--report", "taken.html"], "exists already"),
+    ],
+)
+def test_bad_options_are_refused_for_bands(run: Run, log: Path, tmp_path: Path, options: list[str], says: str):
+    (tmp_path / "taken.html").write_text("mine")
+    before = contents(tmp_path)
+    wanted = [] if "--report" in options else ["--report", "r.html"]
+    refused(run("fuse", log, "--method", "multiscale", *options, *wanted), says)
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("method", list(cli.Method))
+def test_every_method_has_a_report(run: Run, tmp_path: Path, method: cli.Method):
+    wandering = noise(3, 1000) + 0.1 * noise(3, 1000, seed=1).cumsum(-1)
+    gf.Recording(wandering, rate=100.0).save(tmp_path / "log.npz")
+    done = run("fuse", "log.npz", "--method", method.value, "--covariance", "none", "--report", "r.html")
+    assert (done.status, done.err) == (0, "")
+    assert "How it was computed" in Path("r.html").read_text()
+
+
+@pytest.mark.parametrize(
     ("model", "options", "says"),
     [
         ("missing.json", [], "missing.json"),
@@ -413,17 +467,18 @@ def test_existing_files_stay_without_force_and_are_replaced_with_it(run: Run, lo
     assert {path.name for path in Path().iterdir()} == {"log.npz", *names.values()}
 
 
-def test_a_late_failure_leaves_nothing_behind(run: Run, log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("method", ["svo", "multiscale"])
+def test_a_late_failure_leaves_nothing_behind(
+    run: Run, log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
+):
     def fail(*_: object, **__: object) -> str:
         raise ValueError("no ink")
 
     monkeypatch.setattr(cli, "fusion_report", fail)
     Path("v.npz").write_bytes(b"mine")
     before = contents(tmp_path)
-    refused(
-        run("fuse", log, "--out", "v.npz", "--figure", "f.png", "--json", "r.json", "--report", "r.html", "--force"),
-        "no ink",
-    )
+    outputs = ("--out", "v.npz", "--figure", "f.png", "--json", "r.json", "--report", "r.html")
+    refused(run("fuse", log, "--method", method, *outputs, "--force"), "no ink")
     assert contents(tmp_path) == before
 
 

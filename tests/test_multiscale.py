@@ -361,6 +361,17 @@ def test_a_plot_shows_sensors_mean_and_virtual_gyro():
     ]
 
 
+def test_a_plot_differs_from_that_of_one_vector_in_the_virtual_gyro_alone():
+    figure = pytest.importorskip("matplotlib.figure").Figure
+    result = fit_multiscale(array())
+    drawn, single = (
+        [line.get_ydata() for line in item.plot(figure().subplots()).lines] for item in (result, result.single)
+    )
+    *shared, virtual = drawn
+    np.testing.assert_array_equal(shared, single[:-1])
+    np.testing.assert_allclose(virtual, (2 * result.virtual_wavelet_variance).sqrt())
+
+
 def test_motion_is_told():
     turned = array() + 3 * torch.sin(2 * torch.pi * torch.arange(3000, dtype=torch.float64) / 64)
     assert fit_multiscale(array()).motion == ""
@@ -373,6 +384,7 @@ def test_a_recording_brings_its_names_rate_and_unit():
     result = MultiScaleSVO().fit(recording)
     assert torch.equal(result.weights, fit_multiscale(signal).weights)
     assert torch.equal(result.virtual(recording), result.virtual(signal))
+    assert (result.axes, result.rate, result.unit, result.n_samples) == (("x", "y"), 100.0, "deg/s", 3000)
     for part in ("[x]", "[y]", "100 Hz", "Allan deviation (deg/s)", "tau (s)", "       a        b"):
         assert part in result.summary()
 

@@ -205,6 +205,48 @@ def test_fusion_draws_ratio_deviation_and_weights_over_one_time_axis():
     assert weights.get_ylabel() == "weight"
 
 
+def test_band_weights_are_colours_over_the_times_that_they_govern():
+    ax = new_axes()
+    weights = np.array([[0.2, 0.8], [0.5, 0.5], [1.4, -0.4]])
+    assert plotting.plot_band_weights(TAU, torch.tensor(weights), names=["a", "b"], ax=ax) is ax
+    (mesh,) = ax.collections
+    np.testing.assert_array_equal(mesh.get_array(), weights.T)
+    assert mesh.get_clim() == (-1.4, 1.4)  # white is 0
+    edges = mesh.get_coordinates()[0, :, 0]
+    np.testing.assert_allclose(edges, [TAU[0] / 2**0.5, TAU[1] / 2**0.5, TAU[2] / 2**0.5, TAU[-1] * 2**0.5])
+    assert [tick.get_text() for tick in ax.get_yticklabels()] == ["a", "b"]
+    assert ax.yaxis_inverted()
+    assert ax.get_xlabel() == "averaging time (s)"
+
+
+@pytest.mark.parametrize(("n_bands", "end"), [(1, 2**0.5), (8, 2**0.5), (9, 2**1.5)])
+def test_the_last_band_reaches_to_the_end(n_bands: int, end: float):
+    ax = new_axes()
+    plotting.plot_band_weights(TAU, np.full((n_bands, 3), 1 / 3), names=["a", "b", "c"], in_seconds=False, ax=ax)
+    edges = ax.collections[0].get_coordinates()[0, :, 0]
+    assert len(edges) == n_bands + 1
+    assert edges[-1] == pytest.approx(end * TAU[-1])
+    assert ax.get_xlabel() == "averaging time (samples)"
+
+
+def test_names_beside_bands_thin_out_when_they_are_many():
+    ax = new_axes()
+    plotting.plot_band_weights(TAU, np.zeros((4, 64)), names=[f"imu{i}" for i in range(64)], ax=ax)
+    assert [tick.get_text() for tick in ax.get_yticklabels()] == [f"imu{i}" for i in range(0, 64, 4)]
+
+
+def test_fusion_draws_bands_over_the_same_time_axis(tmp_path: Path):
+    figure = Figure(figsize=(7, 8), layout="constrained")
+    nu = variances(2)
+    bands = np.array([[0.4, 0.6], [1.2, -0.2]])
+    plotting.plot_fusion(figure, TAU, nu, bands, names=["a$", "b"], virtual=nu[:, 0], equal=nu[:, 1], unit="deg/s")
+    ratio, deviation, weights = figure.axes
+    figure.savefig(tmp_path / "figure.svg")
+    assert ratio.get_xlim() == deviation.get_xlim() == weights.get_xlim()
+    np.testing.assert_array_equal(weights.collections[0].get_array(), bands.T)
+    assert (deviation.get_xlabel(), weights.get_xlabel()) == ("", "averaging time (s)")
+
+
 def test_long_signals_are_reduced_to_ranges_and_averages():
     figure = Figure(figsize=(7, 4), layout="constrained")
     n = 600_000

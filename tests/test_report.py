@@ -12,8 +12,10 @@ import matplotlib
 import pytest
 import torch
 from matplotlib import pyplot as plt
+from scipy import stats
 
-from gyrofuse import ConfidenceInterval, Recording, SVOResult, fit_svo
+from gyrofuse import ConfidenceInterval, MultiScaleResult, Recording, SVOResult, fit_multiscale, fit_svo
+from gyrofuse.fusion import METHODS
 from gyrofuse.io.notes import Note
 from gyrofuse.report import (
     fusion_figure,
@@ -86,6 +88,19 @@ def around(half_width: float) -> ConfidenceInterval:
 
 def noise(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def made_up_bands(virtual: list[float], equal: list[float], degrees: list[float]) -> MultiScaleResult:
+    """Two bands of three sensors, with these Allan deviations of the virtual gyro and of the plain mean."""
+    n = len(virtual)
+    variance, mean = (torch.tensor(values, dtype=torch.float64).square() / 2 for values in (virtual, equal))
+    single = dataclasses.replace(
+        made_up([0.9] * n),
+        wavelet_cross_covariance=3 * mean[:, None, None] * torch.eye(3, dtype=torch.float64),
+        degrees_of_freedom=torch.tensor(degrees, dtype=torch.float64),
+    )
+    weights = torch.tensor([[0.2, 0.5, 0.3], [1.1, 0.2, -0.3]], dtype=torch.float64)
+    return MultiScaleResult(weights, variance, variance / 2, single)
 
 
 def plain(sentences: list[str]) -> list[str]:
@@ -174,6 +189,47 @@ def test_verdict_names_a_few_of_many_sensors():
     assert sentences[0].endswith("and 12 more.")
 
 
+def test_verdict_of_bands_begins_with_both_ends():
+    result = made_up_bands([0.8, 1.2, 1.0, 0.1], [1.0, 1.0, 1.25, 1.0], [1e6, 300.0, 20.0, 1.0])
+    low, high = ((2 * limit[2]).sqrt().item() for limit in result.interval_of(result.virtual_wavelet_variance))
+    short, long, bands, mean, best, one, few = plain(verdict(result))
+    assert short == (
+        "At 0.01 s, the shortest averaging time, the Allan deviation is 20 % lower than with equal weights: "
+        "0.8 deg/s, 95 % interval 0.7989 to 0.8011, against 1."
+    )
+    assert long == (
+        "At 0.04 s, the longest averaging time with no fewer observations than sensors, the Allan deviation is 20 % "
+        f"lower than with equal weights: 1 deg/s, 95 % interval {low:.4g} to {high:.4g}, against 1.25."
+    )
+    assert low == pytest.approx(math.sqrt(20 / stats.chi2.ppf(0.975, 20)))
+    assert high == pytest.approx(math.sqrt(20 / stats.chi2.ppf(0.025, 20)))
+    assert bands == (
+        "Each of 2 bands of time scales has its own weights: in the fastest band sensor b (weight 0.500) weighs most, "
+        "in the slowest sensor a (weight 1.100)."
+    )
+    assert mean.endswith("0.01 s and 0.04 to 0.08 s, by up to 20 % (at 0.01 s). It is higher at 0.02 s, by 20 %.")
+    assert "than that of the best single sensor" in best
+    assert "than that of one vector of weights for all scales (judged where" in one
+    assert "0.08 s" not in one
+    assert few.startswith("From 0.08 s on")
+
+
+def test_verdict_of_bands_that_gain_nothing_and_of_one_level_that_is_resolved():
+    alike, bands, *_ = plain(verdict(made_up_bands([1.0, 2.0], [1.0, 1.0], [100.0, 2.0])))
+    assert "the Allan deviation is that of equal weights within 0.5 %: 1 deg/s, 95 % interval" in alike
+    assert bands.startswith("Each of 2 bands")
+    worse, longer, *_ = plain(verdict(made_up_bands([1.1, 2.0], [1.0, 1.0], [100.0, 50.0])))
+    assert "is 10 % higher than with equal weights" in worse
+    assert "is 100 % higher than with equal weights" in longer
+
+
+def test_verdict_of_one_band_and_of_motion():
+    still = noise(3, 3000)
+    assert any(s.startswith("There is one band for all time scales") for s in verdict(fit_multiscale(still, n_bands=1)))
+    turned = still + 20 * torch.sin(torch.arange(3000, dtype=torch.float64) / 10)
+    assert verdict(fit_multiscale(turned))[0].startswith("Beware: the sensors agree closely")
+
+
 @pytest.mark.parametrize(
     ("value", "digits", "text"),
     [
@@ -218,6 +274,72 @@ def test_page_holds_everything_and_needs_nothing():
         assert float(row[0]) == pytest.approx(0.01 * 2**j)
         assert float(row[5]) == pytest.approx((2 * result.virtual_wavelet_variance[j]).sqrt().item(), rel=1e-3)
         assert row[3] == result.sensors[result.wavelet_variance[j].argmin()]
+
+
+def test_page_of_bands_holds_the_numbers_of_the_dictionary():
+    recording = Recording(noise(3, 5000), rate=100.0, unit="deg/s", source=("log.csv",))
+    result = fit_multiscale(recording, "long")
+    html = fusion_report(result, recording, result.virtual(recording), title="Bands", remarks=["A remark."])
+    page, known = Page(html), result.to_dict()
+    assert page.tags.count("img") == 2
+    for sentence in verdict(result):
+        assert html.index("Verdict") < html.index(sentence) < html.index("<figure>")
+    times = [number(tau, 6) for tau in known["tau"]]
+    names = [*times[: known["n_bands"] - 1], "longer"]
+    for name, weights in zip(names, known["weights"], strict=True):
+        assert [name, *(f"{weight:+.4f}" for weight in weights)] in page.rows
+    named = ("equal", "single", "optimal", "virtual")
+    for j, time_ in enumerate(times):
+        best = min(known["wavelet_variance"][j])
+        equal, one, least, virtual = (known[f"{name}_wavelet_variance"][j] for name in named)
+        variances = [f"{value:.3e}" for value in (best, equal, one, least, virtual)]
+        assert [time_, *variances, f"{virtual / equal:.4f}", f"{virtual / best:.4f}"] in page.rows
+        limits = result.interval_of(result.virtual_wavelet_variance)
+        deviations = [(2 * value) ** 0.5 for value in (equal, virtual, *(limit[j].item() for limit in limits))]
+        (row,) = (row for row in page.rows if len(row) == 10 and row[0] == time_)
+        assert row[1] == f"{known['scale_weights'][j]:.4f}"
+        assert row[4:] == [
+            *(f"{value:.3e}" for value in deviations),
+            f"{(virtual / equal) ** 0.5:.4f}",
+            number(known["degrees_of_freedom"][j], 3),
+        ]
+    for text in ("Multi-scale virtual gyro", "A remark.", "log.csv", "(deg/s)2", "95 % interval"):
+        assert text in page.text
+
+
+def test_page_of_bands_for_every_axis_with_markup_and_levels_that_are_not_known():
+    signal = noise(2, 3, 1024)
+    signal[1, 0, 500:520] = math.nan  # no complete window of the last levels
+    scale_weights = [1.0] * 8 + [0.0, 0.0]
+    recording = Recording(signal, rate=50.0, axes=("x", "z"), sensors=(SCRIPT, BOLD, "{{ 7 * 7 }}"))
+    result = fit_multiscale(recording, scale_weights)
+    assert result.virtual_wavelet_variance.isnan().any()
+    page = Page(fusion_report(result, recording, title=SCRIPT))
+    assert page.tags.count("img") == 2
+    assert not {"script", "b"} & {*page.tags}
+    assert "nan" not in page.text.lower()
+    assert page.text.count("Axis ") == 2
+    for name in recording.sensors:
+        assert name in page.text
+    assert sum(row[0] == "longer" for row in page.rows) == 2
+    without_rate = Page(fusion_report(fit_multiscale(noise(2, 100)), title="Samples"))
+    assert any(row[0] == "averaging time (samples)" for row in without_rate.rows)
+    assert "(None)" not in without_rate.text
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_has_its_page(method: str):
+    wandering = noise(3, 1000) + 0.1 * noise(3, 1000, seed=1).cumsum(-1)
+    page = Page(fusion_report(fit_svo(wandering, method=method, covariance="none"), title=method))
+    assert "How it was computed" in page.text
+    assert "nan" not in page.text.lower()
+
+
+def test_page_says_why_weights_were_chosen():
+    result = fit_svo(noise(2, 3, 1000), method="auto", covariance="none")
+    assert result.selection is not None
+    different = dataclasses.replace(result, method="auto")  # as when the choice differs over the axes
+    assert result.selection.sentence in Page(fusion_report(different, title="Chosen")).text
 
 
 def test_every_axis_has_its_section():
@@ -279,6 +401,12 @@ def test_report_of_a_recording():
     assert rows[-1]["missing"] == 0.25
 
 
+def test_figure_of_bands_of_several_axes():
+    figure = fusion_figure(fit_multiscale(Recording(noise(2, 3, 1000), rate=10.0, axes=("x", "y"))))
+    assert [part.get_suptitle() for part in figure.subfigs] == ["x", "y"]
+    assert all(part.axes[2].get_ylabel() == "sensor" for part in figure.subfigs)
+
+
 def test_figure_of_several_axes_and_formats(tmp_path):
     result = fit_svo(Recording(noise(2, 3, 1000), rate=10.0, axes=("x", "y")))
     figure = fusion_figure(result)
@@ -302,3 +430,5 @@ def test_more_than_one_batch_dimension_is_refused():
         fusion_report(result, title="Too many")
     with pytest.raises(ValueError, match="`result`"):
         fusion_figure(result)
+    with pytest.raises(ValueError, match=r"`result`: expected one array, or one per axis, got batch shape \(2, 2\)"):
+        fusion_report(fit_multiscale(noise(2, 2, 3, 500)), title="Too many")
