@@ -15,7 +15,12 @@ class SingularCovarianceError(ValueError):
 
 
 def check_positive_definite(
-    name: str, matrix: Tensor, labels: Sequence[str] | None = None, *, dtype: torch.dtype | None = None
+    name: str,
+    matrix: Tensor,
+    labels: Sequence[str] | None = None,
+    *,
+    dtype: torch.dtype | None = None,
+    least: float = 0.0,
 ) -> None:
     """Raise when any covariance of a batch is not positive definite, naming items, sensors and likely causes.
 
@@ -24,6 +29,7 @@ def check_positive_definite(
         matrix: `(..., sensor, sensor)`.
         labels: Names of the sensors, for the message.
         dtype: What the matrix was computed in, when that is less than its own.
+        least: Smallest eigenvalue of the correlation matrix that what follows can work with.
 
     Raises:
         SingularCovarianceError: Non-finite entries, a sensor without variance, two equal sensors, or a smallest
@@ -37,7 +43,7 @@ def check_positive_definite(
     correlation = scale[..., :, None] * matrix * scale[..., None, :]
     finite = correlation.isfinite().all(-1).all(-1)
     smallest = torch.linalg.eigvalsh(torch.where(finite[..., None, None], correlation, 0.0))[..., 0]
-    tolerance = 10 * n_sensors * torch.finfo(dtype or matrix.dtype).eps
+    tolerance = max(10 * n_sensors * torch.finfo(dtype or matrix.dtype).eps, least)
     bad = ~finite | (variance <= 0).any(-1) | (smallest <= tolerance)
     if not bool(bad.any()):
         return

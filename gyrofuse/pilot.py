@@ -37,6 +37,7 @@ class Pilot:
         n_samples: Length of the record.
         first_level: Lowest level (counted from 0) that the model was fitted to.
         n_levels: Levels J.
+        observations: `(..., level)`, degrees of freedom of each level that the fit rests on; 0 elsewhere.
     """
 
     theta: Tensor
@@ -44,10 +45,12 @@ class Pilot:
     n_samples: int
     first_level: int
     n_levels: int
+    observations: Tensor
 
     def __getitem__(self, items: Tensor) -> Pilot:
         """Some items of the leading batch dimension."""
-        return replace(self, theta=self.theta[items], memory=self.memory[items])
+        chosen = {name: getattr(self, name)[items] for name in ("theta", "memory", "observations")}
+        return replace(self, **chosen)
 
     @property
     def time_constants(self) -> tuple[float, ...]:
@@ -92,6 +95,29 @@ class Pilot:
         half = torch.einsum("...jkm,...kn,...mn->...jn", table.to(self.theta)[self.memory], shares, shares)
         return (self.unit @ shares).square() / half
 
+    def certainty(self, weights: Tensor, scale_weights: Tensor) -> Tensor:
+        """Degrees of freedom of the fitted wavelet variance of a combination of sensors, `2 s^2 / Var s`.
+
+        Levels count as independent, as in the likelihood; they are not, and at the last ones a half or less is left.
+
+        Args:
+            weights: `(..., sensor)`.
+            scale_weights: `(level,)`, which add the levels from `first_level` on up to `s = sum_j omega_j nu_j`.
+
+        Returns:
+            `(...)`.
+        """
+        shares = torch.einsum("...i,...kio,...o->...k", weights, self.theta, weights)
+        parts = self.unit * shares[..., None, :]  # of each component in nu_j: (..., level, component)
+        # Fisher information of the logarithms of the shares, levels taken for independent.
+        precision = self.observations / (2 * parts.sum(-1).square())
+        information = torch.einsum("...j,...jk,...jm->...km", precision, parts, parts)
+        size = information.diagonal(dim1=-2, dim2=-1)
+        # A component without a share has no information, and no slope either.
+        information = information + torch.diag_embed(1e-9 * size.sum(-1, keepdim=True).expand_as(size))
+        slope = torch.einsum("j,...jk->...k", scale_weights[self.first_level :], parts[..., self.first_level :, :])
+        return 2 * slope.sum(-1).square() / (slope * torch.linalg.solve(information, slope)).sum(-1)
+
 
 def fit_pilot(wccv: Tensor, n_samples: int, levels_below: int = 2) -> Pilot:
     """Fit the rough model to a wavelet cross-covariance.
@@ -124,6 +150,7 @@ def fit_pilot(wccv: Tensor, n_samples: int, levels_below: int = 2) -> Pilot:
     scale = size[..., :, None] * size[..., None, :]
     gamma = (wccv / scale[..., None, :, :])[..., None, :, :, :]  # (..., 1, level, sensor, sensor)
     theta, likelihood = _maximise(gamma[..., first:, :, :], unit[:, first:], eta[first:])
+    start = torch.full(likelihood.shape, first, device=wccv.device)
     if below < first:
         wide, wide_likelihood = _maximise(gamma[..., below:, :, :], unit[:, below:], eta[below:])
         # The levels below, when no model but their own covariances has to fit them.
@@ -133,10 +160,13 @@ def fit_pilot(wccv: Tensor, n_samples: int, levels_below: int = 2) -> Pilot:
         fits = wide_likelihood > likelihood
         theta = torch.where(fits[..., None, None, None], wide, theta)
         likelihood = torch.maximum(likelihood, wide_likelihood)
+        start = torch.where(fits, below, start)
     likelihood[..., 1:] -= _EVIDENCE
     memory = likelihood.argmax(-1)
     theta = torch.take_along_dim(theta, memory[..., None, None, None, None], -4).squeeze(-4)
-    return Pilot(theta * scale[..., None, :, :], memory, n_samples, first, n_levels)
+    start = torch.take_along_dim(start, memory[..., None], -1)
+    rests = torch.where(torch.arange(n_levels, device=wccv.device) >= start, eta, 0.0)
+    return Pilot(theta * scale[..., None, :, :], memory, n_samples, first, n_levels, rests)
 
 
 def _maximise(gamma: Tensor, unit: Tensor, eta: Tensor) -> tuple[Tensor, Tensor]:

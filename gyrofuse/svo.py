@@ -26,6 +26,7 @@ from gyrofuse.svo_weights import combine, counting
 from gyrofuse.weights_spread import WeightsSpread, certain, normal_spread, spread_of_weights, unknown
 
 COVARIANCES = ("model", "block_bootstrap", "resampling", "none")
+_LEAST_DISTINCT = 1e-10
 
 
 def fit_svo(
@@ -52,10 +53,10 @@ def fit_svo(
             Zaki, which knows white noise and random walk only, for comparison.
         confidence_level: Of every interval in the result.
         covariance: What the intervals rest on. `"model"`: the series itself where levels hold many windows, a fitted
-            model where they do not; right at every level. `"block_bootstrap"`: that of [Z] in closed form, right for
-            short scales only. `"resampling"`: signals resampled in blocks ([Z] Remark C), for stationary signals.
-            `"none"`. Model-assisted and shrunk weights, which vary less, get the intervals of SVO weights; nonnegative
-            and RDVG weights get none.
+            model where they do not; right at every level. `"block_bootstrap"`: that of [Z] in closed form; it
+            overlooks what lasts longer than a block, more so the longer the scale. `"resampling"`: signals resampled
+            in blocks ([Z] Remark C), for stationary signals. `"none"`. Model-assisted and shrunk weights, which vary
+            less, get the intervals of SVO weights; nonnegative and RDVG weights get none.
         block_length: Of the two bootstraps; by default chosen from the data.
         n_levels: Number of levels J. By default as many as there are scale weights, else the largest at which
             every pair of sensors has a complete window.
@@ -96,6 +97,8 @@ def fit_svo(
         combined.view(*batch, *combined.shape[1:]),
         sensors,
         dtype=values.dtype,
+        # A model of the noise is fitted to every pair of sensors, and fails sooner than the weights do.
+        least=_LEAST_DISTINCT if covariance == "model" else 0.0,
     )
     chosen = choose_weights(method, items, wccv, totals, omega)
     n_known = int((totals > 0).all(0).flatten(1).all(1).sum())  # later levels do not count, or this were refused

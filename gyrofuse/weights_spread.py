@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -28,7 +28,11 @@ _MANY_WINDOWS = 64
 _FEW_WINDOWS, _MOST = 64, 0.9985
 # 1.5 for white noise, 1.4 for flicker, 1.25 for a random walk.
 _CORRELATION = 1.3
-_N_RESAMPLES = 999
+_N_RESAMPLES, _MOST_RESAMPLES = 999, 9_999
+# So many of them beyond the limits; farther out the tail is taken for a normal one.
+_BEYOND = 50
+# Blocks of the resampled record; a longer one is a stretch of so many, with less noise.
+_MOST_BLOCKS = 256
 _ITEMS_AT_ONCE = 64
 # The series is believed against the model when its variance is so many times larger than what chance allows, for
 # the model is rough.
@@ -205,14 +209,21 @@ def _resampled(
     generator = torch.Generator().manual_seed(0)  # the same recording gets the same intervals
     first = pilot.first_level
     n_sensors = lower.shape[-1]
-    n_resamples = max(_N_RESAMPLES, math.ceil(50 / (1 - confidence_level)))
+    resampled_level = min(confidence_level, 1 - _BEYOND / _MOST_RESAMPLES)
+    n_resamples = max(_N_RESAMPLES, math.ceil(_BEYOND / (1 - resampled_level)))
+    pilot = replace(pilot, n_samples=min(pilot.n_samples, _MOST_BLOCKS << first))
     resamples, expected = resample_combined(pilot, omega, n_resamples, generator)
     below = torch.einsum("j,njik->nik", omega[:first], wccv[:, :first])
     center = weights_of(expected + below)
-    # Missing samples leave fewer products than the model counts.
+    # Missing samples leave fewer products than the model counts, and a stretch counts fewer than there are.
     whole = pilot.n_samples - torch.exp2(torch.arange(1, len(omega) + 1, dtype=omega.dtype, device=omega.device)) + 1
     share = torch.einsum("j,ni,njik,nk->nj", omega, center, wccv, center).clamp(min=0)
     missing = (share * (whole / totals.amin((-1, -2)))).sum(-1) / share.sum(-1)
+    combined = resamples + below[:, None]
+    moved = missing.sqrt()[:, None, None] * (weights_of(combined) - center[:, None])
+    # The model is fitted too, and the weights have used up a part of what it was fitted to.
+    certainty = pilot.certainty(center, omega)
+    moved = moved * (certainty / (certainty - n_sensors + 1).clamp(min=2)).sqrt()[:, None, None]
     normal = torch.randn(n_resamples, n_sensors, generator=generator, dtype=lower.dtype).to(lower.device)
     values, vectors = torch.linalg.eigh(lower)
     noise = normal @ (vectors * values.clamp(min=0).sqrt()[:, None, :]).mT
@@ -220,11 +231,24 @@ def _resampled(
     width = 2 / (9 * terms_below[:, None])
     draw = torch.randn(n_resamples, generator=generator, dtype=lower.dtype).to(lower.device)
     noise = noise / (1 - width + width.sqrt() * draw).clamp(min=0.1).pow(1.5)[..., None]
-    moved = missing.sqrt()[:, None, None] * (weights_of(resamples + below[:, None]) - center[:, None]) + noise
+    moved = moved + noise
     covariance = moved.mT @ moved / n_resamples  # (item, sensor, sensor), the bias of few observations included
-    rank = min(math.ceil(confidence_level * (n_resamples + 1)), n_resamples)
-    half_width = moved.abs().kthvalue(rank, dim=1).values
+    # Percentile t: where a recording shows little noise by chance it is off by more of what it shows.
+    own = _spread_of_one(weights_of, torch.einsum("j,njik->nik", omega, wccv))
+    rank = min(math.ceil(resampled_level * (n_resamples + 1)), n_resamples)
+    half_width = own * (moved / _spread_of_one(weights_of, combined)).abs().kthvalue(rank, dim=1).values
+    if confidence_level > resampled_level:
+        normal_law = torch.full((), torch.inf, dtype=torch.float64)
+        half_width = half_width * (
+            t_quantile(normal_law, confidence_level) / t_quantile(normal_law, resampled_level)
+        ).to(half_width)
     return WeightsSpread(covariance, _observations_left(expected + below, center, covariance), half_width)
+
+
+def _spread_of_one(weights_of: Callable[[Tensor], Tensor], combined: Tensor) -> Tensor:
+    """Standard deviation `(..., sensor)` of each weight if `A` rested on one observation: `2 tr(J A J A)`."""
+    half = [row @ combined for row in _jacobian_rows(weights_of, combined)]
+    return torch.stack([(2 * (x * x.mT).sum((-2, -1))).sqrt() for x in half], -1)
 
 
 def _observations_left(combined: Tensor, weights: Tensor, covariance: Tensor) -> Tensor:
@@ -251,7 +275,8 @@ def _spread_by_level(wccv: Tensor, totals: Tensor, omega: Tensor, jacobian: Tens
     """
     half = torch.einsum("niab,njbc->njiac", jacobian, wccv)
     spread = torch.einsum("njiac,njica->nj", half, half) * omega.square() / _windows(totals)
-    return torch.where(omega > 0, spread, 0.0)
+    # With missing samples a level's matrix may be indefinite.
+    return torch.where(omega > 0, spread.clamp(min=0), 0.0)
 
 
 def _windows(totals: Tensor) -> Tensor:
@@ -280,12 +305,17 @@ def _across(spread: Tensor, wccv: Tensor, first: int) -> Tensor:
 
 def _jacobian(weights_of: Callable[[Tensor], Tensor], combined: Tensor) -> Tensor:
     """Derivative `(item, sensor, sensor, sensor)` of each weight by the symmetric matrix `A`."""
+    return torch.stack(list(_jacobian_rows(weights_of, combined)), 1)
+
+
+def _jacobian_rows(weights_of: Callable[[Tensor], Tensor], combined: Tensor) -> Iterator[Tensor]:
+    """Derivatives of one weight after the other, each of the shape of `combined`."""
     with torch.inference_mode(False), torch.enable_grad():
         leaf = combined.clone().requires_grad_()
         weights = weights_of(leaf).unbind(-1)
-        rows = [torch.autograd.grad(weight.sum(), leaf, retain_graph=True)[0] for weight in weights]
-    jacobian = torch.stack(rows, 1)
-    return (jacobian + jacobian.mT) / 2
+    for weight in weights:
+        row = torch.autograd.grad(weight.sum(), leaf, retain_graph=True)[0]
+        yield (row + row.mT) / 2
 
 
 def _sd(covariance: Tensor) -> Tensor:

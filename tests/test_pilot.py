@@ -35,7 +35,12 @@ def measured(signal: Tensor) -> Tensor:
 
 
 def random_walk(first_level: int) -> pilot.Pilot:
-    return pilot.Pilot(torch.stack([WHITE, WALK]), torch.tensor(0), N_SAMPLES, first_level, N_LEVELS)
+    return with_memory(torch.tensor(0), first_level)
+
+
+def with_memory(memory: Tensor, first_level: int) -> pilot.Pilot:
+    theta = torch.stack([WHITE, WALK]).expand(*memory.shape, 2, 3, 3)
+    return pilot.Pilot(theta, memory, N_SAMPLES, first_level, N_LEVELS, torch.ones(*memory.shape, N_LEVELS))
 
 
 def test_exact_covariances_give_the_model_back():
@@ -102,14 +107,25 @@ def test_memory_is_the_random_walk_s_unless_an_ar1_is_far_likelier():
 
 
 def test_resamples_of_a_mixed_batch_are_those_of_its_items():
-    theta = torch.stack([WHITE, WALK]).expand(3, 2, 3, 3)
     omega = torch.arange(N_LEVELS).double()
-    mixed = pilot.Pilot(theta, torch.tensor([0, 2, 0]), N_SAMPLES, 5, N_LEVELS)
+    mixed = with_memory(torch.tensor([0, 2, 0]), 5)
     drawn, expected = resample_combined(mixed, omega, 50, torch.Generator().manual_seed(1))
     for item in range(3):
         alone = resample_combined(mixed[[item]], omega, 50, torch.Generator().manual_seed(1))
         torch.testing.assert_close(alone, (drawn[[item]], expected[[item]]))
     assert (expected[0] - expected[1]).abs().max() > 0.1 * expected[0].abs().max()
+
+
+def test_certainty_is_that_of_the_fit():
+    """`2 s^2 / Var s` of a fixed combination over 300 fits, a fifth or more: the last levels depend on each other."""
+    fitted = pilot.fit_pilot(measured(arrays(300, seed=5)), N_SAMPLES)
+    weights = torch.tensor([0.2, 0.5, 0.3]).double()
+    omega = torch.tensor([0] * 7 + [1, 2, 3, 4]).double() / 10
+    model = torch.einsum("i,njio,o->nj", weights, fitted.wavelet_cross_covariance, weights)
+    combined = model[:, fitted.first_level :] @ omega[fitted.first_level :]
+    found = 2 * combined.mean() ** 2 / combined.var()
+    said = fitted.certainty(weights.expand(300, 3), omega).median()
+    assert 0.2 < found / said < 1.2, (found.item(), said.item())
 
 
 def test_what_is_peculiar_below_does_not_bend_the_fit():
@@ -133,7 +149,7 @@ def test_resamples_follow_the_law_of_recordings(scale_weights):
     omega = torch.tensor(scale_weights).double() / sum(scale_weights)
     sums, counts = wavelet_products(arrays(1500, seed=4), N_LEVELS)
     real = torch.einsum("j,njik->nik", omega, sums / counts)
-    model = pilot.Pilot(torch.stack([WHITE, WALK])[None], torch.tensor([0]), N_SAMPLES, 5, N_LEVELS)
+    model = with_memory(torch.tensor([0]), 5)
     drawn, expected = (x[0] for x in resample_combined(model, omega, 4000, torch.Generator().manual_seed(1)))
     exact = torch.einsum("j,jik->ik", omega, true_wccv())
     torch.testing.assert_close(expected, exact, rtol=0.02, atol=1e-5)
