@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -102,6 +103,16 @@ def _filter(steps: Tensor, signal: Tensor, state: Tensor) -> tuple[Tensor, Tenso
     return virtual, torch.cat(kept, dim=-1) if kept else state
 
 
+def well_observed(degrees: Tensor, n_sensors: int) -> Tensor:
+    """Levels `(..., level)` that, like all below them, hold no fewer observations than there are sensors.
+
+    Args:
+        degrees: Independent observations, `(..., level)`.
+        n_sensors: Number of sensors.
+    """
+    return (degrees >= n_sensors).int().cumprod(-1).bool()
+
+
 @dataclass(frozen=True, eq=False)
 class MultiScaleResult:
     """A fitted multi-scale virtual gyro. Batched over the leading dimensions of the signal; index it to get one item.
@@ -110,8 +121,10 @@ class MultiScaleResult:
         weights: `(..., band, sensor)`; each band sums to 1, weights may be negative. Band `k = 1..K` is the difference
             between the means over the last `2**(k-1)` and `2**k` samples, the last band the mean over `2**K`.
         virtual_wavelet_variance: `(..., level)`, of the recording itself fused with these weights, signal^2.
-        optimal_wavelet_variance: `(..., level)`, estimate of the smallest wavelet variance that any weights can have
-            at that level alone, `1 / (1' Gamma_j^-1 1)`, signal^2. At the last levels it is on the low side.
+        optimal_wavelet_variance: `(..., level)`, estimate of the smallest wavelet variance that one vector of weights
+            can have at that level alone, `1 / (1' S_j^-1 1)`, signal^2, where `S_j` is `Gamma_j` shrunk towards the
+            level below; on the low side at the last levels. No lower bound of `virtual_wavelet_variance`: bands weigh
+            the time scales within a level apart, and they are chosen from the very recording.
         single: One vector of weights for all scales, by `fit_svo` from the same recording and scale weights.
     """
 
@@ -257,6 +270,15 @@ class MultiScaleResult:
             tau, *deviations, ratio = row
             numbers = "  ".join(f"{value:>12.5g}" for value in deviations)
             lines.append(f"{j + 1:>5}  {tau:>13.6g}  {numbers}  {ratio:>13.4f}")
+        few = ~well_observed(self.degrees_of_freedom, len(self.sensors)) & self.virtual_wavelet_variance.isfinite()
+        if bool(few.any()):
+            start = f"{self.tau[int(few.nonzero()[0])].item():.6g} {second}"
+            most = self.degrees_of_freedom[few].max().item()
+            told = (
+                f"Few observations: from {start} on, {most:.2g} or less, fewer than sensors; what is gained there is "
+                "partly fitted to this very recording, and another one has to confirm it."
+            )
+            lines += ["", textwrap.fill(told, 110)]
         if self.motion:
             lines += ["", f"Warning: {self.motion}."]
         return "\n".join(lines)

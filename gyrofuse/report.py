@@ -13,6 +13,7 @@ from gyrofuse import plotting
 from gyrofuse._result import numbered
 from gyrofuse.covariance import wavelet_variance
 from gyrofuse.multiscale_result import MultiScaleResult
+from gyrofuse.rdvg import rdvg
 from gyrofuse.recording import Recording
 from gyrofuse.report_page import image, new_figure, number, render, save_figure
 from gyrofuse.report_words import ALIKE, Fused, verdict
@@ -49,12 +50,14 @@ _METHODS = {
     "with the scale weights of the table, and none is negative.",
     "multiscale": "Multi-scale virtual gyro: every sensor is split, causally and without delay, into bands of time "
     "scales that add up to it, and each band is fused with its own weights, which sum to 1 and may be negative. "
-    "Together they minimise the wavelet variance of the virtual gyro relative to the least possible at each level, "
-    "averaged with the scale weights of the table. The weights come without intervals, and so do the ratios: "
+    "Together they minimise the wavelet variance of the virtual gyro relative to the least that one vector of weights "
+    "for that level alone would leave, averaged with the scale weights of the table. The weights come without "
+    "intervals, and so do the ratios: "
     "virtual gyro and plain mean are made of the same samples, so that their ratio is known better than the interval "
     "of either says, but weights flatter themselves in the recording that they were chosen from.",
     "rdvg": "Reduced-drift virtual gyro (Vaccaro and Zaki, Sensors 17, 2017): the weights minimise the random walk in "
-    "a model of white noise and random walk.",
+    "a model of white noise and random walk. Nothing makes the estimated covariance of the random walks, Q, positive "
+    "definite; where it is not, the weights follow the formula but minimise nothing.",
     "equal": "Equal weights: the virtual gyro is the plain mean of the sensors.",
 }
 
@@ -89,16 +92,18 @@ def fusion_report(
         if recording is not None:
             signals["plain mean"], time = recording.signal.mean(-2), recording.time
     parts = []
+    cautions = _cautions(result, recording)
     for i, (name, item) in enumerate(_items(result)):
         own = {label: signal if signal.ndim == 1 else signal[i] for label, signal in signals.items()}
         drawn = {"unit": item.unit, "in_seconds": item.rate is not None}
         parts.append(
             {
                 "name": name,
-                "verdict": verdict(item),
+                "verdict": cautions[i] + verdict(item),
                 "fusion": image(7, 8, _draw_fusion, item),
                 "signals": image(7, 4.4, plotting.plot_signals, time, own, **drawn) if own else None,
                 "sensors": _sensor_rows(item) if isinstance(item, SVOResult) else None,
+                "with_intervals": isinstance(item, SVOResult) and bool(item.confidence_interval[0].isfinite().any()),
                 "bands": _band_rows(item) if isinstance(item, MultiScaleResult) else None,
                 "levels": _level_rows(item),
             }
@@ -191,6 +196,30 @@ def _items(result: Fused) -> list[tuple[str, Fused]]:
     if not batch:
         return [("", result)]
     return [(name, result[i]) for i, name in enumerate(result.axes or numbered(batch[0]))]
+
+
+def _cautions(result: Fused, recording: Recording | None) -> list[list[str]]:
+    """For each item, what its weights lack: those of RDVG minimise nothing where `Q` is not a covariance.
+
+    A result does not keep `Q`. It is estimated again, and believed where the weights are those of the result: they are
+    not where these come from another stretch of the recording.
+    """
+    weights = [item.weights for _, item in _items(result)]
+    if result.method != "rdvg" or recording is None:
+        return [[] for _ in weights]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the fit has warned
+        again = rdvg(recording.signal)
+    found, sound = again.weights.reshape(-1, again.weights.shape[-1]), again.positive_definite.reshape(-1).tolist()
+    if found.shape != (len(weights), len(result.sensors)):
+        return [[] for _ in weights]
+    pairs = zip(found, weights, strict=True)
+    same = [torch.allclose(ours.to(own), own, rtol=1e-3, atol=1e-6, equal_nan=True) for ours, own in pairs]
+    told = (
+        "Beware: the estimated covariance of the random walks, Q, is not positive definite: the weights follow the "
+        "formula of RDVG but minimise nothing."
+    )
+    return [[told] if known and not good else [] for known, good in zip(same, sound, strict=True)]
 
 
 def _sensor_rows(result: SVOResult) -> list[dict[str, Any]]:

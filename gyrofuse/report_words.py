@@ -9,7 +9,7 @@ from itertools import groupby
 import torch
 from torch import Tensor
 
-from gyrofuse.multiscale_result import MultiScaleResult
+from gyrofuse.multiscale_result import MultiScaleResult, well_observed
 from gyrofuse.report_page import number
 from gyrofuse.svo_result import SVOResult
 
@@ -22,6 +22,9 @@ _MOST_NAMED = 8  # sensors listed in one sentence
 def verdict(result: Fused) -> list[str]:
     """Say in sentences which sensors carry the virtual gyro, where it wins and where it loses.
 
+    Levels that hold fewer observations than there are sensors are left out of where it wins and loses, and a sentence
+    says so, unless no level holds more.
+
     Args:
         result: Of one array.
     """
@@ -33,26 +36,46 @@ def verdict(result: Fused) -> list[str]:
     if result.method != "equal":
         sentences.append(_compared(result, result.equal_wavelet_variance, "the plain mean"))
     sentences.append(_compared(result, result.wavelet_variance.amin(-1), "the best single sensor"))
-    resolved = result.degrees_of_freedom >= len(result.sensors)
-    if isinstance(result, MultiScaleResult) and bool(resolved.any()):
+    if isinstance(result, MultiScaleResult) and bool(_resolved(result).any()):
         # Beyond, the one vector is fitted to the very recording even more than the bands are.
-        one = torch.where(resolved, result.single.virtual_wavelet_variance, torch.nan)
-        name = "one vector of weights for all scales (judged where observations are no fewer than sensors)"
-        sentences.append(_compared(result, one, name))
-    few = ~resolved & (result.scale_weights > 0)
-    if result.method in ("svo", "multiscale") and bool(few.any()):
-        level = int(few.nonzero()[0])
-        sentences.append(
-            f"From {_time(result, level)} on, the recording holds fewer independent observations "
-            f"({number(result.degrees_of_freedom[level].item(), 2)} or less) than there are sensors: what it gains "
-            "there is partly fitted to this very recording, and another one has to confirm it."
-        )
-    return sentences
+        one = result.single.virtual_wavelet_variance
+        sentences.append(_compared(result, one, "one vector of weights for all scales"))
+    return sentences + _few_in_words(result)
+
+
+def _resolved(result: Fused) -> Tensor:
+    """Levels `(level,)` that are known and, like all below them, hold no fewer observations than there are sensors."""
+    return well_observed(result.degrees_of_freedom, len(result.sensors)) & result.virtual_wavelet_variance.isfinite()
+
+
+def _judged(result: Fused) -> Tensor:
+    """Levels `(level,)` that comparisons are about: those that are resolved, or all where none is."""
+    resolved = _resolved(result)
+    return resolved if bool(resolved.any()) else torch.ones_like(resolved)
+
+
+def _few_in_words(result: Fused) -> list[str]:
+    """Where observations are fewer than sensors, and what follows for the comparisons and for the weights."""
+    few = ~_resolved(result) & result.virtual_wavelet_variance.isfinite()
+    if not bool(few.any()):
+        return []
+    most = number(result.degrees_of_freedom[few].max().item(), 2)
+    start = (
+        f"From {_time(result, int(few.nonzero()[0]))} on, the recording holds fewer independent observations "
+        f"({most} or less) than there are sensors"
+    )
+    left_out = ", so that the comparisons end before" if bool(_resolved(result).any()) else ""
+    if result.method in ("svo", "multiscale") and bool((result.scale_weights[few] > 0).any()):
+        return [
+            f"{start}{left_out}: what it gains there is partly fitted to this very recording, and another one has to "
+            "confirm it."
+        ]
+    return [f"{start}{left_out or ': the comparisons are an indication and no more'}."]
 
 
 def _ends_in_words(result: MultiScaleResult) -> list[str]:
     """What the virtual gyro gains at the shortest averaging time and at the longest that the recording resolves."""
-    resolved = (result.degrees_of_freedom >= len(result.sensors)) & result.virtual_wavelet_variance.isfinite()
+    resolved = _resolved(result)
     longest = int(resolved.nonzero().max()) if bool(resolved.any()) else 0
     sentences = [_gained_at(result, 0, "the shortest averaging time")]
     if longest:
@@ -126,9 +149,13 @@ def _listed(result: SVOResult, which: Sequence[int]) -> str:
 
 def _compared(result: Fused, other: Tensor, name: str) -> str:
     """Where the Allan deviation of the virtual gyro is lower than another one, and where it is higher."""
+    judged = _judged(result)
+    left_out = ~judged & result.virtual_wavelet_variance.isfinite()
     ratio = (result.virtual_wavelet_variance / other).sqrt()
     lower, higher = _where(result, 1 - ratio), _where(result, ratio - 1)
     start = "The Allan deviation of the virtual gyro is"
+    if bool(left_out.any()):
+        start = f"Up to {_time(result, int(judged.nonzero().max()))}, the Allan deviation of the virtual gyro is"
     if lower:
         rest = f"It is higher at {higher}." if higher else "It is nowhere higher."
         return f"{start} lower than that of {name} at averaging times of {lower}. {rest}"
@@ -138,17 +165,18 @@ def _compared(result: Fused, other: Tensor, name: str) -> str:
 
 
 def _where(result: Fused, difference: Tensor) -> str:
-    """Averaging times at which a difference counts, neighbours as a range, and how large it gets."""
-    counts = (difference > ALIKE).tolist()
+    """Averaging times at which a difference counts, neighbours as a range, and how large it gets.
+
+    Both are about the levels that the recording resolves; a few observations give large differences by chance.
+    """
+    large = _judged(result) & (difference > ALIKE)
+    counts = large.tolist()
     runs = [list(run) for holds, run in groupby(range(len(counts)), counts.__getitem__) if holds]
     if not runs:
         return ""
     starts = [f"{number(result.tau[run[0]].item())} to " if len(run) > 1 else "" for run in runs]
     times = _joined([start + _time(result, run[-1]) for start, run in zip(starts, runs, strict=True)])
-    # The size that the recording resolves, rather than the one that a few observations give by chance.
-    resolved = (difference > ALIKE) & (result.degrees_of_freedom >= len(result.sensors))
-    told = resolved if bool(resolved.any()) else difference > ALIKE
-    level = int(torch.where(told, difference, -math.inf).argmax())
+    level = int(torch.where(large, difference, -math.inf).argmax())
     if sum(counts) == 1:
         return f"{times}, by {_percent(difference[level].item())}"
     return f"{times}, by up to {_percent(difference[level].item())} (at {_time(result, level)})"

@@ -324,7 +324,13 @@ def test_summary_is_reproducible_and_fixed_in_width():
         assert lines[0] == f"Multi-scale virtual gyro (8 bands) of {n_sensors} sensors, 3000 samples"
         assert max(map(len, lines)) <= 120
         start = lines.index("Allan deviation (signal) at averaging time tau")
-        assert len({len(line) for line in lines[start + 1 :]}) == 1
+        table, below = lines[start + 1 : start + 2 + result.n_levels], lines[start + 2 + result.n_levels :]
+        assert len({len(line) for line in table}) == 1
+        few = int((result.degrees_of_freedom < n_sensors).nonzero()[0])
+        most = f"{result.degrees_of_freedom[few].item():.2g}"
+        assert below[0] == ""
+        assert below[1].startswith(f"Few observations: from {2**few} samples on, {most} or less, fewer than sensors; ")
+        assert len(below) == 3
         assert len({len(line) for line in lines[3 : start - 1]}) == 1
         assert lines[start - 2].split()[0] == "longer"
     assert "(first 11 of 14 sensors)" in text
@@ -468,7 +474,13 @@ def test_other_signals_than_the_weights_are_for_are_named():
     with pytest.raises(TypeError, match=r"`signal`: expected float32 or float64, got torch.int16"):
         svo(SIGNAL.to(torch.int16))
     with pytest.raises(ValueError, match=r"`state`: expected shape \(3, 15\) for this signal, got \(3, 7\)"):
-        svo(SIGNAL, torch.zeros(3, 7))
+        svo(SIGNAL, torch.zeros(3, 7, dtype=SIGNAL.dtype))
+    with pytest.raises(
+        TypeError, match=r"`state`: expected torch\.float32 as the signal has, got torch\.float64; give"
+    ):
+        svo(SIGNAL.float(), svo.start(SIGNAL.double()))
+    with pytest.raises(TypeError, match="`state`: expected a torch tensor, got list"):
+        svo(SIGNAL, [0.0])
 
 
 @pytest.mark.parametrize("n_bands", [0, 1.5, True])

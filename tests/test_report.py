@@ -17,6 +17,7 @@ from scipy import stats
 from gyrofuse import ConfidenceInterval, MultiScaleResult, Recording, SVOResult, fit_multiscale, fit_svo
 from gyrofuse.fusion import METHODS
 from gyrofuse.io.notes import Note
+from gyrofuse.rdvg import rdvg
 from gyrofuse.report import (
     fusion_figure,
     fusion_report,
@@ -178,9 +179,36 @@ def test_verdict_warns_where_observations_are_fewer_than_sensors():
     assert not any("fewer independent" in sentence for sentence in verdict(result))
     few = dataclasses.replace(result, degrees_of_freedom=torch.tensor([30.0, 2.5, 1.2], dtype=torch.float64))
     (warning,) = (sentence for sentence in verdict(few) if "fewer independent" in sentence)
-    assert warning.startswith("From 0.02 s on, the recording holds fewer independent observations (2.5 or less)")
+    start = "From 0.02 s on, the recording holds fewer independent observations (2.5 or less) than there are sensors, "
+    assert warning.startswith(f"{start}so that the comparisons end before: what it gains there is partly fitted")
     unweighted = dataclasses.replace(few, scale_weights=torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64))
-    assert not any("fewer independent" in sentence for sentence in verdict(unweighted))
+    assert verdict(unweighted)[-1] == f"{start}so that the comparisons end before."
+
+
+def test_verdict_takes_range_and_maximum_from_the_levels_that_are_well_observed():
+    result = dataclasses.replace(
+        made_up([0.9, 1.2, 0.8, 0.5, 1.9, 0.4]),
+        degrees_of_freedom=torch.tensor([90.0, 50.0, 30.0, 2.5, 3.5, 1.0], dtype=torch.float64),
+        method="nonnegative",
+    )
+    *_, against_mean, against_best, few = plain(verdict(result))
+    assert against_mean == (
+        "Up to 0.04 s, the Allan deviation of the virtual gyro is lower than that of the plain mean at averaging times "
+        "of 0.01 s and 0.04 s, by up to 20 % (at 0.04 s). It is higher at 0.02 s, by 20 %."
+    )
+    assert against_best.startswith("Up to 0.04 s, ")
+    assert few == (
+        "From 0.08 s on, the recording holds fewer independent observations (3.5 or less) than there are sensors, "
+        "so that the comparisons end before."
+    )
+    nowhere = dataclasses.replace(result, degrees_of_freedom=torch.full((6,), 2.0, dtype=torch.float64))
+    *_, against_mean, _, few = plain(verdict(nowhere))
+    assert against_mean.endswith(
+        "0.01 s, 0.04 to 0.08 s and 0.32 s, by up to 60 % (at 0.32 s). It is higher at 0.02 s and 0.16 s, by up to "
+        "90 % (at 0.16 s)."
+    )
+    assert few.startswith("From 0.01 s on")
+    assert few.endswith("than there are sensors: the comparisons are an indication and no more.")
 
 
 def test_verdict_names_a_few_of_many_sensors():
@@ -207,9 +235,10 @@ def test_verdict_of_bands_begins_with_both_ends():
         "Each of 2 bands of time scales has its own weights: in the fastest band sensor b (weight 0.500) weighs most, "
         "in the slowest sensor a (weight 1.100)."
     )
-    assert mean.endswith("0.01 s and 0.04 to 0.08 s, by up to 20 % (at 0.01 s). It is higher at 0.02 s, by 20 %.")
+    assert mean.startswith("Up to 0.04 s, the Allan deviation")
+    assert mean.endswith("0.01 s and 0.04 s, by up to 20 % (at 0.01 s). It is higher at 0.02 s, by 20 %.")
     assert "than that of the best single sensor" in best
-    assert "than that of one vector of weights for all scales (judged where" in one
+    assert "than that of one vector of weights for all scales" in one
     assert "0.08 s" not in one
     assert few.startswith("From 0.08 s on")
 
@@ -303,7 +332,8 @@ def test_page_of_bands_holds_the_numbers_of_the_dictionary():
             f"{(virtual / equal) ** 0.5:.4f}",
             number(known["degrees_of_freedom"][j], 3),
         ]
-    for text in ("Multi-scale virtual gyro", "A remark.", "log.csv", "(deg/s)2", "95 % interval"):
+    assert "least possible" not in page.text.lower()
+    for text in ("Multi-scale virtual gyro", "one vector for this level", "log.csv", "(deg/s)2", "95 % interval"):
         assert text in page.text
 
 
@@ -333,6 +363,20 @@ def test_every_method_has_its_page(method: str):
     page = Page(fusion_report(fit_svo(wandering, method=method, covariance="none"), title=method))
     assert "How it was computed" in page.text
     assert "nan" not in page.text.lower()
+
+
+@pytest.mark.filterwarnings("ignore:RDVG:UserWarning")
+def test_page_says_where_rdvg_weights_minimise_nothing():
+    white, walk = noise(3, 4000), noise(3, 4000, seed=1).cumsum(-1)
+    signal = torch.stack([white, white + walk])
+    assert rdvg(signal).positive_definite.tolist() == [False, True]
+    recording = Recording(signal, rate=10.0, axes=("x", "y"))
+    html = fusion_report(fit_svo(recording, method="rdvg"), recording, title="RDVG")
+    told = "Beware: the estimated covariance of the random walks, Q, is not positive definite"
+    assert html.count(told) == 1
+    assert html.index("<h3>x</h3>") < html.index(told) < html.index("<h3>y</h3>")
+    part = fit_svo(recording.between(0, 200), method="rdvg")  # of which the whole recording does not tell
+    assert told not in fusion_report(part, recording, title="RDVG")
 
 
 def test_page_says_why_weights_were_chosen():
@@ -372,7 +416,9 @@ def test_missing_numbers_are_dashes():
     page = Page(fusion_report(result, title="No intervals"))
     assert "nan" not in page.text.lower()
     for i, name in enumerate(result.sensors):
-        assert [name, f"{result.weights[i]:+.4f}", "-", "-", ""] in page.rows
+        assert [name, f"{result.weights[i]:+.4f}"] in page.rows
+    assert "with their 95 % intervals" not in page.text
+    assert "with their 95 % intervals" in Page(fusion_report(fit_svo(noise(3, 1000)), title="Intervals")).text
     assert "at 100 Hz" not in page.text
     assert any(row[0] == "averaging time (samples)" for row in page.rows)
 
