@@ -82,7 +82,16 @@ def check_positive(name: str, value: float) -> float:
 
 
 def check_confidence_level(value: float) -> float:
-    """Return `value` when it lies strictly between 0 and 1."""
+    """Return `value` as a float when it lies strictly between 0 and 1.
+
+    Raises:
+        TypeError: Not a number.
+        ValueError: Out of range.
+    """
+    if not isinstance(value, Real):
+        raise TypeError(
+            f"`confidence_level`: expected a number between 0 and 1 such as 0.95, got {type(value).__name__} {value!r}"
+        )
     number = float(value)
     if not 0 < number < 1:
         raise ValueError(f"`confidence_level`: expected a number between 0 and 1 such as 0.95, got {value!r}")

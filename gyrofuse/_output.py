@@ -116,6 +116,8 @@ def _creating(path: Path) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError:
+        if path.resolve().parent.is_dir():  # a file system that makes its own files, such as /proc
+            raise OSError(f"{path}: the folder {path.parent} takes no new files; choose another place") from None
         raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist; create it first") from None
     except OSError as error:
         raise OSError(f"{path}: cannot be written there ({error.strerror}); choose another place") from None

@@ -88,17 +88,26 @@ def n_columns(n_samples: int, n_levels: int) -> int:
     return n_samples - 2**n_levels + 1
 
 
-def check_block_length(block_length: int, n_entries: int) -> int:
-    """Return a block length that fits the entries that blocks are taken from.
+def check_block_length(block_length: int, n_samples: int, n_levels: int | None = None) -> int:
+    """Return a block length that fits what blocks are taken from: samples, or coefficients of `n_levels` levels.
 
     Raises:
-        ValueError: Not a whole number from 1 to `n_entries`.
+        ValueError: Not a whole number from 1 to that.
     """
     length = check_positive_integer("block_length", block_length)
-    if length > n_entries:
+    if n_levels is None:
+        if length > n_samples:
+            raise ValueError(
+                f"`block_length`: expected at most {n_samples}, as many as the recording has samples, got {length}; "
+                "give shorter blocks"
+            )
+    elif length > n_columns(n_samples, n_levels):
+        # Fewer levels that hold a block, and of which the block bootstrap would not warn.
+        fewer = [j for j in range(1, n_levels) if length <= n_columns(n_samples, j) >= n_samples / 3]
+        remedy = f" or fewer levels, such as `n_levels={fewer[-1]}`" if fewer else ""
         raise ValueError(
-            f"`block_length`: expected at most {n_entries}, as many as the recording has samples, or coefficients at "
-            f"the last level, got {length}; give shorter blocks or fewer levels"
+            f"`block_length`: expected at most {n_columns(n_samples, n_levels)}, as many coefficients as "
+            f"{n_samples} samples have at level {n_levels}, got {length}; give shorter blocks{remedy}"
         )
     return length
 

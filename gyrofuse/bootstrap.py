@@ -351,7 +351,9 @@ def _checked(signal: Tensor, n_levels: int | None) -> tuple[Tensor, int]:
 def _lengths_for_coefficients(values: Tensor, n_levels: int, block_length: int | None) -> Tensor:
     """Block length of each item for blocks of coefficients, which the times that all levels share have to bear."""
     warn_of_few_columns(values.shape[-1], n_levels, stacklevel=4)
-    return _lengths(values, n_levels, n_columns(values.shape[-1], n_levels), block_length)
+    if block_length is not None:
+        return torch.full((len(values),), check_block_length(block_length, values.shape[-1], n_levels))
+    return _lengths(values, n_levels, n_columns(values.shape[-1], n_levels), None)
 
 
 def _lengths(values: Tensor, n_levels: int, n_entries: int, block_length: int | None) -> Tensor:

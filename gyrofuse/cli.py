@@ -84,6 +84,9 @@ class Covariance(str, Enum):
     none = "none"
 
 
+# Methods whose weights have no law to rest an interval on, or, equal ones, are not estimated at all.
+_WITHOUT_INTERVALS = (Method.multiscale, Method.nonnegative, Method.equal, Method.rdvg)
+
 Logs = Annotated[
     list[Path],
     typer.Argument(metavar="LOG...", help="The recording. Several files are one array, aligned on their clocks."),
@@ -159,8 +162,8 @@ def fuse(
     ] = "flat",
     method: Annotated[Method, typer.Option(help="How the weights are chosen.")] = Method.svo,
     covariance: Annotated[
-        Covariance, typer.Option(help="What the intervals of the weights rest on.")
-    ] = Covariance.model,
+        Covariance | None, typer.Option(show_default="model", help="What the intervals of the weights rest on.")
+    ] = None,
     levels: Annotated[
         int | None, typer.Option(metavar="J", help="Number of levels; as many as fit by default.")
     ] = None,
@@ -186,6 +189,11 @@ def fuse(
 ) -> None:
     """Fuse an array, recorded at rest, into one virtual gyro."""
     weights, stretch = _scale_weights(scale_weights), _stretch(rest)
+    if method in _WITHOUT_INTERVALS and covariance not in (None, Covariance.none):
+        raise ValueError(
+            f"`--covariance`: {covariance.value} has no use, for --method {method.value} gives no intervals of its "
+            "weights; leave the option out, or choose another method"
+        )
     with _outputs(force, [*logs, mounting], out=out, figure=figure, json=json_file, report=report) as drafts:
         recording = _read(logs, axis, sensors, rate, unit, scale, key, mounting)
         with progress("fusing"):
@@ -198,7 +206,7 @@ def fuse(
                     part,
                     weights,
                     method=method.value.replace("-", "_"),
-                    covariance=covariance.value.replace("-", "_"),
+                    covariance=(covariance or Covariance.model).value.replace("-", "_"),
                     confidence_level=confidence_level,
                     n_levels=levels,
                 )
@@ -220,7 +228,7 @@ def fuse(
             _save(fused, drafts[out], weights=result.weights.numpy())
         with progress("drawing"):
             if figure:
-                save_figure(fusion_figure(result), drafts[figure], figure.suffix[1:])
+                save_figure(fusion_figure(result), drafts[figure], figure.suffix[1:].lower())
             if report:
                 title = f"Virtual gyro of {_titled(logs)}"
                 page = fusion_report(result, recording, virtual, title=title, remarks=remarks)
@@ -373,7 +381,7 @@ def _scale_weights(text: str) -> str | list[float]:
 def _outputs(force: bool, inputs: Sequence[Path | None] = (), **asked: Path | None) -> Outputs:
     """Files to write, those asked for, by option; none of the inputs given is ever replaced."""
     for option, path in asked.items():
-        if path is not None and path.suffix not in _SUFFIXES[option]:
+        if path is not None and path.suffix.lower() not in _SUFFIXES[option]:
             raise ValueError(
                 f"`--{option}`: expected a name that ends in {' or '.join(_SUFFIXES[option])}, got {str(path)!r}"
             )
@@ -384,7 +392,7 @@ def _outputs(force: bool, inputs: Sequence[Path | None] = (), **asked: Path | No
 
 def _save(recording: Recording, path: Path, **arrays: np.ndarray[Any, Any]) -> None:
     """Save a recording as .csv, or as .npz with further arrays."""
-    if path.suffix == ".csv":
+    if path.suffix.lower() == ".csv":
         ends = [f"_{axis}" for axis in recording.axes] or [""]
         names = [f"{sensor}_gyro{end}" for end in ends for sensor in recording.sensors]
         columns = torch.cat([recording.time[None], recording.signal.flatten(0, -2)]).T

@@ -157,7 +157,7 @@ class BootstrapWeightsCovariance:
     ) -> None:
         n_samples = check_positive_integer("n_samples", n_samples)
         omega = _checked_levels(wccv, scale_weights, weights, counts, n_samples)
-        length = check_block_length(block_length, n_columns(n_samples, len(omega)))
+        length = check_block_length(block_length, n_samples, len(omega))
         warn_of_few_columns(n_samples, len(omega), stacklevel=3)
         _check_combined(wccv, omega)
         self._shape, self._dtype = weights.shape, weights.dtype
@@ -298,7 +298,7 @@ def _weights_covariance(
         )
     if statistic_of is _svo:
         _check_combined(wccv, omega)
-    given = None if block_length is None else check_block_length(block_length, n_columns(n_samples, len(omega)))
+    given = None if block_length is None else check_block_length(block_length, n_samples, len(omega))
     warn_of_few_columns(n_samples, len(omega), stacklevel=4)
     values = signal.detach().reshape(-1, *signal.shape[-2:])
     if counts is None and not bool(values.sum().isfinite()):

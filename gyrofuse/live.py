@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from gyrofuse._checks import check_positive, check_positive_integer, check_signal
 from gyrofuse._linalg import check_positive_definite
-from gyrofuse.saturation import check_full_scale
+from gyrofuse.saturation import check_full_scale, check_n_samples
 from gyrofuse.scale_weights import ScaleWeights, resolve_scale_weights
 from gyrofuse.svo_result import SVOResult
 
@@ -90,7 +90,8 @@ class LiveSVO(nn.Module):
             `mask_saturated` has those.
 
     Raises:
-        ValueError: A result of another method, or a number out of range.
+        TypeError: `result` is not an `SVOResult`.
+        ValueError: A result of another method, a number out of range, or full scales of another shape than the sensors.
         SingularCovarianceError: The combined covariance of the result is not positive definite.
 
     Example:
@@ -117,17 +118,20 @@ class LiveSVO(nn.Module):
         full_scale: float | Tensor | None = None,
     ) -> None:
         super().__init__()
+        if not isinstance(result, SVOResult):
+            raise TypeError(
+                f"`result`: expected an SVOResult, got {type(result).__name__}; "
+                "fit the array at rest with fit_svo(signal)"
+            )
         combined = _covariance_of(result)
         if time_constant is None:
             time = _tracking_time(result, combined)
         else:
             time = torch.full_like(combined[..., 0, 0], max(check_positive("time_constant", time_constant), 1.0))
         longest = round(time.max().item())
-        if hold is not None and hold < 0:
-            raise ValueError(f"`hold`: expected a whole number >= 0, got {hold!r}")
-        self.hold = longest if hold is None else int(hold)
+        self.hold = longest if hold is None else check_n_samples("hold", hold)
         self.settle = longest if settle is None else check_positive_integer("settle", settle)
-        limit = torch.tensor(torch.inf) if full_scale is None else check_full_scale(full_scale)
+        limit = check_full_scale(torch.inf if full_scale is None else full_scale, combined.shape[:-1])
         self.register_buffer("combined", combined)
         self.register_buffer("time_constant", time)
         self.register_buffer("full_scale", limit.to(combined))
@@ -189,6 +193,12 @@ class LiveSVO(nn.Module):
             fitted = self.combined.shape[:-2]
             if fitted != batch[len(batch) - len(fitted) :]:
                 raise ValueError(f"`signal`: expected batch shape {tuple(fitted)} as fitted, got {tuple(batch)}")
+            wanted = self.full_scale.shape
+            if not _expands(wanted, signal.shape[:-1]):
+                raise ValueError(
+                    f"`signal`: expected a batch shape that goes with `full_scale` of shape {tuple(wanted)}, "
+                    f"got {tuple(batch)}"
+                )
             self.offsets = self.combined.new_zeros(*batch, n_sensors)
             self.gap = torch.full_like(self.offsets, self.hold + 1, dtype=torch.int64)
             self.age = torch.zeros_like(self.gap)
@@ -318,6 +328,11 @@ def _averages(values: Tensor, rate: Tensor, starts: Tensor, segment: Tensor) -> 
     learnt = torch.zeros_like(at_end).index_add_(-1, segment, share * values)
     kept = torch.where(whole[..., starts], 0.0, torch.exp(at_end - before))
     return kept.permute(2, 0, 1), learnt.permute(2, 0, 1)
+
+
+def _expands(shape: torch.Size, to: torch.Size) -> bool:
+    pairs = zip(reversed(shape), reversed(to), strict=False)
+    return len(shape) <= len(to) and all(own in (1, other) for own, other in pairs)
 
 
 def _solve_subsets(combined: Tensor, live: Tensor, *, check: bool = False) -> Tensor:

@@ -38,7 +38,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gyrofuse._checks import check_positive_integer
+from gyrofuse._checks import check_floating, check_positive_integer, check_signal
 from gyrofuse._linalg import check_positive_definite
 from gyrofuse.covariance import wavelet_products
 from gyrofuse.multiscale_result import MultiScaleResult, fuse_bands
@@ -180,8 +180,18 @@ class MultiScaleSVO(nn.Module):
         """Fuse `(..., sensor, time)` into `(..., time)`; given the state of a stream, return it too, moved on.
 
         A time at which any sensor lacks its sample gives NaN, and is left out of what follows.
+
+        Raises:
+            TypeError: `signal` is not a floating point tensor, or `state` not one of its dtype.
+            ValueError: `signal` or `state` does not fit the weights.
         """
         self._check_fitted()
+        check_signal("signal", signal)
+        if state is not None and check_floating("state", state).dtype != signal.dtype:
+            raise TypeError(
+                f"`state`: expected {signal.dtype} as the signal has, got {state.dtype}; give chunks of one dtype, or "
+                f"convert with state.to({signal.dtype})"
+            )
         virtual, after = fuse_bands(self.weights, signal, state)
         return virtual if state is None else (virtual, after)
 

@@ -57,11 +57,13 @@ def parity_test(
         gain_tolerance: By how much scale factors may differ, 0.01 say, without being a fault while the array turns.
 
     Returns:
-        The result, batched over `(..., window)`.
+        The result, batched over `(..., window)`. It names the sensors and windows that could not be tested.
 
     Raises:
-        TypeError: `signal` or `before` is neither a floating point tensor nor a `Recording`.
-        ValueError: Shapes that do not fit, a window longer than the signal, or numbers out of range.
+        TypeError: `signal` or `before` is neither a floating point tensor nor a `Recording`, or `reference` is neither
+            a `ParityReference` nor an `SVOResult`.
+        ValueError: Shapes that do not fit, a window longer than the signal, numbers out of range, or so many missing
+            samples that no window could be tested.
 
     Example:
         >>> healthy = fit_parity(calibration, window=512)
@@ -70,8 +72,13 @@ def parity_test(
     of = signal if isinstance(signal, Recording) else None
     values = signal.signal if isinstance(signal, Recording) else signal
     check_signal("signal", values)
+    if not isinstance(reference, ParityReference | SVOResult):
+        raise TypeError(
+            f"`reference`: expected a ParityReference or an SVOResult, got {type(reference).__name__}; "
+            "learn one from a healthy stretch with fit_parity(healthy, window)"
+        )
     known = reference.window if isinstance(reference, ParityReference) else 0
-    window = check_window(window or known or values.shape[-1], values.shape[-1], "signal")
+    window = check_window((known or values.shape[-1]) if window is None else window, values.shape[-1], "signal")
     healthy = reference if isinstance(reference, ParityReference) else _stationary(reference, window)
     _check_shape(values, healthy)
     for name, value in (("false_alarm", false_alarm), ("gain_tolerance", gain_tolerance)):
@@ -82,6 +89,12 @@ def parity_test(
         for chunk in chunks_of(values, window, healthy.n_levels, _history(values, before))
     ]
     columns = _Columns(*(torch.cat(column, values.ndim - 2) for column in zip(*parts, strict=True)))
+    if not bool(columns.tested.any()):
+        missing = 100 * (~values.isfinite()).double().mean().item()
+        raise ValueError(
+            f"`signal`: expected a window of {window} samples that two sensors have at least half of, found none "
+            f"({missing:.3g} % of all samples are missing); record with fewer losses or leave sensors out"
+        )
     return ParityResult(
         **columns._asdict(),
         window=window,
@@ -94,7 +107,7 @@ def parity_test(
 
 
 class _Columns(NamedTuple):
-    """Columns of the result, `(..., window, sensor)` each and the last `(..., window)`."""
+    """Columns of the result, `(..., window, sensor)` each and `p_value` `(..., window)`."""
 
     faulty: Tensor
     kind: Tensor
@@ -103,6 +116,7 @@ class _Columns(NamedTuple):
     size: Tensor
     p_values: Tensor
     p_value: Tensor
+    tested: Tensor
 
 
 class _Side(NamedTuple):
@@ -120,7 +134,8 @@ def _test(
 ) -> _Columns:
     """Name one sensor of each window, leave it out and look again, until no more are found."""
     products = window_products(chunk, window, reference.n_levels)
-    gamma, live = reference.wavelet_cross_covariance, products.live
+    # Long wavelets look back beyond a window, whose own samples have to be there all the same.
+    gamma, live = reference.wavelet_cross_covariance, products.live & _present(chunk, window, products.live)
     columns, n_tests = None, torch.ones_like(live[..., 0], dtype=torch.float64)
     for _ in reference.sensors:
         matrix, weights = parity_matrix(gamma, live)
@@ -132,7 +147,7 @@ def _test(
         p_loud, p_quiet = (_adjusted(side.p, n_tests) for side in (loud, quiet))  # (..., window, level, sensor)
         p_values = torch.minimum(p_loud, p_quiet).amin(-2)
         if columns is None:
-            columns = _nothing(live, p_values)
+            columns = _nothing(p_values, loud.p.isfinite().any(-2))
         columns = columns._replace(p_values=torch.where(live, p_values, columns.p_values))
         # Of two sensors either may be the one that is off; only one that is stuck gives itself away.
         stuck = p_quiet.amin(-2) < false_alarm
@@ -158,9 +173,15 @@ def _test(
     return columns
 
 
-def _nothing(live: Tensor, p_values: Tensor) -> _Columns:
-    none, unknown = torch.full_like(live, -1, dtype=torch.int64), torch.full_like(p_values, torch.nan)
-    return _Columns(torch.zeros_like(live), none, none, unknown, unknown, p_values, p_values.amin(-1))
+def _present(chunk: Tensor, window: int, live: Tensor) -> Tensor:
+    """Sensors `(..., window, sensor)` that have half of the samples of a window at least."""
+    finite = chunk[..., chunk.shape[-1] - window * live.shape[-2] :].isfinite().unflatten(-1, (-1, window))
+    return (2 * finite.sum(-1) >= window).mT
+
+
+def _nothing(p_values: Tensor, tested: Tensor) -> _Columns:
+    none, unknown = torch.full_like(tested, -1, dtype=torch.int64), torch.full_like(p_values, torch.nan)
+    return _Columns(torch.zeros_like(tested), none, none, unknown, unknown, p_values, p_values.amin(-1), tested)
 
 
 def _adjusted(p: Tensor, n_tests: Tensor) -> Tensor:

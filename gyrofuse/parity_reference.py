@@ -206,8 +206,10 @@ def stationary_reference(
 
 
 def check_window(window: int, n_samples: int, name: str) -> int:
-    """Return `window` when it is a whole number of samples that `name` has."""
+    """Return `window` when it is a whole number, 2 or more, of samples that `name` has."""
     window = check_positive_integer("window", window)
+    if window == 1:
+        raise ValueError("`window`: expected at least 2 samples, for one shows no course; got 1; give a longer window")
     if window > n_samples:
         raise ValueError(
             f"`window`: expected at most the {n_samples} samples of `{name}`, got {window}; give a shorter window"

@@ -56,6 +56,8 @@ class ParityResult:
         p_values: `(..., window, sensor)`, adjusted for all tests of a window; of a sensor that was not named, without
             those that were.
         p_value: `(..., window)`, of the array.
+        tested: `(..., window, sensor)`, whether a sensor was held against the others at one level at least; where it
+            was not, for want of samples, its `p_values` of 1 say nothing.
         window: Samples of a window.
         false_alarm: Stated probability of an alarm in a window of a healthy array.
         sensors: Name of each sensor.
@@ -71,6 +73,7 @@ class ParityResult:
     size: Tensor
     p_values: Tensor
     p_value: Tensor
+    tested: Tensor
     window: int
     false_alarm: float
     sensors: tuple[str, ...]
@@ -148,9 +151,47 @@ class ParityResult:
         n_unnamed = int((self.alarm & ~self.faulty.any(-1)).sum())
         if n_unnamed:
             lines.append(f"- In {n_unnamed} window(s) two sensors disagree; it takes a third to tell which is wrong.")
+        untested = self._untested()
         if not faults and not n_unnamed:
-            lines.append(f"- No sensor stands out (smallest p = {self.p_value.min().item():.2g}).")
+            where = ", as far as they were tested" if untested else ""
+            lines.append(f"- No sensor stands out{where} (smallest p = {self.p_value.min().item():.2g}).")
+        lines += [f"- {gap}" for gap in untested[:20]]
+        if len(untested) > 20:
+            lines.append(f"- ... and {len(untested) - 20} more not tested")
         return "\n".join(lines)
+
+    def _untested(self) -> list[str]:
+        """Sensors that could not be tested, and the windows of that, in words; sensors with the same windows as one."""
+        missing = ~self.tested.movedim(-1, -2).cpu()  # (..., sensor, window)
+        gaps: dict[tuple[tuple[int, ...], tuple[int, ...]], list[int]] = {}
+        for *item, sensor in missing.any(-1).nonzero().tolist():
+            here: Any = (*item, sensor)
+            windows = tuple(missing[here].nonzero().flatten().tolist())
+            gaps.setdefault((tuple(item), windows), []).append(sensor)
+        return [self._gap(item, sensors, list(windows)) for (item, windows), sensors in gaps.items()]
+
+    def _gap(self, item: tuple[int, ...], sensors: list[int], windows: list[int]) -> str:
+        second = 1 / (self.rate or 1.0)
+        runs: list[list[int]] = []
+        for window in windows:
+            if runs and window == runs[-1][1] + 1:
+                runs[-1][1] = window
+            else:
+                runs.append([window, window])
+        numbers = [f"{first + 1}" if first == last else f"{first + 1} to {last + 1}" for first, last in runs]
+        edges = [(first * self.window * second, (last + 1) * self.window * second) for first, last in runs]
+        times = [f"{start:.6g} to {stop:.6g}" for start, stop in edges]
+        n_windows, more = self.p_value.shape[-1], f" and {len(runs) - 5} more" if len(runs) > 5 else ""
+        when = "in any window"
+        if len(windows) < n_windows:
+            when = (
+                f"in window{'s' if len(windows) > 1 else ''} {', '.join(numbers[:5])}{more} of {n_windows} "
+                f"({', '.join(times[:5])}{more} {'s' if self.rate else 'samples'})"
+            )
+        who = f"sensor{'s' if len(sensors) > 1 else ''} {', '.join(self.sensors[i] for i in sensors)}"
+        if len(sensors) == len(self.sensors):
+            who = "all sensors"
+        return f"{f'[{self._item(item)}] ' if item else ''}Not tested: {who} {when}; too few samples to compare."
 
     def __str__(self) -> str:
         return self.summary()
@@ -169,6 +210,7 @@ class ParityResult:
             "p_value": listed(self.p_value),
             "p_values": listed(self.p_values),
             "faulty": self.faulty.tolist(),
+            "tested": self.tested.tolist(),
             "faults": [
                 {**fault._asdict(), "item": list(fault.item), "size": fault.size if math.isfinite(fault.size) else None}
                 for fault in self.faults

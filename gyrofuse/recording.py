@@ -107,7 +107,7 @@ class Recording:
             sensors: Names, or positions from 0.
 
         Raises:
-            ValueError: No such axis or sensor.
+            ValueError: No such axis or sensor, or a sensor named twice.
         """
         signal, axes, names = self.signal, self.axes, self.sensors
         if axis is not None:
@@ -118,6 +118,9 @@ class Recording:
             which = [_position(names, sensor) for sensor in sensors]
             if not which:
                 raise ValueError(f"`sensors`: expected some of {_named(names)}, got none")
+            twice = next((names[i] for k, i in enumerate(which) if i in which[:k]), None)
+            if twice is not None:
+                raise ValueError(f"`sensors`: expected each sensor once, got {twice!r} twice; name it once")
             signal, names = signal[..., which, :], tuple(names[i] for i in which)
         return replace(self, signal=signal, axes=axes, sensors=names)
 
@@ -163,7 +166,7 @@ class Recording:
             FileNotFoundError: The folder does not exist.
         """
         path = Path(path)
-        if path.suffix != ".npz":
+        if path.suffix.lower() != ".npz":
             raise ValueError(f"`path`: expected a name that ends in .npz, got {path.name!r}")
         taken = {"gyro", "fs", "unit", "sensors", "time", "axes"} & {*self.channels}
         if taken:
@@ -178,8 +181,8 @@ class Recording:
         }
         if self.axes:
             arrays["axes"] = np.array(self.axes)
-        with Outputs([path], force=force) as drafts:
-            np.savez(drafts[path], **arrays)
+        with Outputs([path], force=force) as drafts, drafts[path].open("wb") as file:
+            np.savez(file, **arrays)  # to a name of another case it would append a suffix
 
     def summary(self) -> str:
         """What the recording holds, as fixed-width text."""

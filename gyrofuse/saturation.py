@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from numbers import Real
+
 import torch
 from torch import Tensor, nn
 
@@ -29,14 +31,14 @@ def mask_saturated(signal: Tensor, full_scale: float | Tensor, *, guard: int = 1
 
     Raises:
         TypeError: `signal` is not a floating point tensor.
-        ValueError: A full scale that is not above 0, or a negative guard.
+        ValueError: A full scale that is not above 0 or of another shape than the sensors, or a guard that is not a
+            whole number >= 0.
     """
     check_signal("signal", signal)
-    limit = check_full_scale(full_scale).to(signal)
-    if guard < 0:
-        raise ValueError(f"`guard`: expected a whole number >= 0, got {guard!r}")
+    limit = check_full_scale(full_scale, signal.shape[:-1]).to(signal)
+    guard = check_n_samples("guard", guard)
     clipped = signal.abs() >= limit.unsqueeze(-1)
-    if guard:
+    if guard and clipped.numel():
         flat = clipped.reshape(1, -1, signal.shape[-1]).to(torch.float32)
         spread = nn.functional.max_pool1d(flat, 2 * guard + 1, stride=1, padding=guard)
         clipped = spread.view(clipped.shape) > 0
@@ -53,13 +55,16 @@ def find_saturation(signal: Tensor) -> Tensor:
         signal: `(..., sensor, time)`; non-finite samples are left out.
 
     Returns:
-        `(..., sensor)`, the smaller size of the two ends that are piled up; infinite where neither is.
+        `(..., sensor)`, the smaller size of the two ends that are piled up; infinite where neither is, and where there
+        is no sample.
 
     Raises:
         TypeError: `signal` is not a floating point tensor.
     """
     check_signal("signal", signal)
-    full_scale = torch.full_like(signal[..., 0], torch.inf)
+    full_scale = signal.new_full(signal.shape[:-1], torch.inf)
+    if signal.shape[-1] == 0:
+        return full_scale
     for sign in (1, -1):
         value = torch.where(signal.isfinite(), sign * signal, -torch.inf)
         top = value.amax(-1, keepdim=True)
@@ -71,9 +76,25 @@ def find_saturation(signal: Tensor) -> Tensor:
     return full_scale
 
 
-def check_full_scale(value: float | Tensor) -> Tensor:
-    """Return full scales as a tensor when all are above 0."""
+def check_full_scale(value: float | Tensor, sensors: torch.Size) -> Tensor:
+    """Return full scales as a tensor when all are above 0 and go with arrays of shape `sensors`, `(..., sensor)`."""
     limit = torch.as_tensor(value, dtype=torch.float64)
     if not bool((limit > 0).all()):
         raise ValueError(f"`full_scale`: expected numbers > 0, got {limit.tolist()}")
+    try:
+        fits = torch.broadcast_shapes(limit.shape, sensors)[-1] == sensors[-1]
+    except RuntimeError:
+        fits = False
+    if not fits:
+        raise ValueError(
+            f"`full_scale`: expected one number, or one for each of {sensors[-1]} sensors in a shape that goes with "
+            f"{tuple(sensors)}, got shape {tuple(limit.shape)}"
+        )
     return limit
+
+
+def check_n_samples(name: str, value: int) -> int:
+    """Return `value` as an int when it is a whole number of samples, 0 or more."""
+    if isinstance(value, bool) or not isinstance(value, Real) or not (value >= 0 and value % 1 == 0):
+        raise ValueError(f"`{name}`: expected a whole number >= 0, got {value!r}")
+    return int(value)

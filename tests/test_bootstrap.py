@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import contracts
@@ -19,6 +20,7 @@ from gyrofuse import (
     _sweep,
     block_length,
     bootstrap,
+    fit_svo,
     influence,
     inverse_variance_weights,
     resolve_scale_weights,
@@ -26,7 +28,7 @@ from gyrofuse import (
     wavelet_cross_covariance,
 )
 from gyrofuse._blocks import BlockSums
-from gyrofuse.block_length import default_block_length
+from gyrofuse.block_length import check_block_length, default_block_length
 from gyrofuse.bootstrap import (
     block_bootstrap,
     bootstrap_wccv_covariance,
@@ -519,6 +521,20 @@ def test_messages_of_block_lengths(function):
         function(np.zeros((3, 100)))
     with pytest.raises(ValueError, match="`n_levels`: expected at most 6 for 100 samples"):
         function(array(100), 7)
+
+
+def test_a_block_that_the_last_level_cannot_hold_names_a_level_that_can():
+    signal = array(4096)
+    with pytest.raises(
+        ValueError,
+        match=r"`block_length`: expected at most 1, .* 4096 samples have at level 12, got 64; .* `n_levels=11`",
+    ):
+        fit_svo(signal, covariance="block_bootstrap", block_length=64)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fit_svo(signal, covariance="block_bootstrap", block_length=64, n_levels=11)
+    with pytest.raises(ValueError, match=r"got 4096; give shorter blocks$"):
+        check_block_length(4096, 4096, 12)
 
 
 def test_other_messages():

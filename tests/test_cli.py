@@ -100,6 +100,18 @@ def test_fuse_with_weights_for_every_band(run: Run, log: Path):
     assert {path.name for path in Path().iterdir()} == {"log.npz", *outputs.values()}
 
 
+def test_suffixes_may_be_upper_case(run: Run, log: Path):
+    plain, upper = ["v.npz", "f.png", "r.json", "r.html"], ["V.NPZ", "F.PNG", "S.JSON", "S.HTML"]
+    for names in (plain, upper):
+        words = [word for pair in zip(("--out", "--figure", "--json", "--report"), names, strict=True) for word in pair]
+        assert run("fuse", log, *words).status == 0
+    assert {path.name for path in Path().iterdir()} == {"log.npz", *plain, *upper}
+    assert Path("F.PNG").read_bytes().startswith(b"\x89PNG")
+    assert torch.equal(gf.read_recording("V.NPZ").signal, gf.read_recording("v.npz").signal)
+    assert run("fuse", log, "--out", "V.CSV").status == 0
+    assert Path("V.CSV").read_text().startswith("time [s],")
+
+
 def test_fuse_writes_text_that_is_read_back(run: Run, log: Path):
     assert run("fuse", log, "--out", "v.csv").status == 0
     lines = Path("v.csv").read_text().splitlines()
@@ -357,6 +369,10 @@ def test_bad_logs_are_refused(run: Run, tmp_path: Path, name: str, says: str):
         (["--confidence-level", "95"], "`confidence_level`"),
         (["--method", "magic"], "--method"),
         (["--sensors", "a,nobody"], "nobody"),
+        (["--sensors", "a,b,a"], "expected each sensor once, got 'a' twice"),
+        (["--method", "equal", "--covariance", "model"], "`--covariance`: model has no use"),
+        (["--method", "nonnegative", "--covariance", "resampling"], "--method nonnegative gives no intervals"),
+        (["--method", "rdvg", "--covariance", "block-bootstrap"], "leave the option out, or choose another method"),
         (["--axis", "q"], "'q'"),
         (["--mounting", "missing.json"], "missing.json"),
         (["--unknown"], "--unknown"),
@@ -382,6 +398,7 @@ def test_bad_options_are_refused(run: Run, log: Path, tmp_path: Path, options: l
 @pytest.mark.parametrize(
     ("options", "says"),
     [
+        (["--covariance", "model"], "--method multiscale gives no intervals of its weights"),
         (["--levels", "0"], "`n_levels`"),
         (["--levels", "99"], "at most 10"),
         (["--confidence-level", "95"], "`confidence_level`"),

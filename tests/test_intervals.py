@@ -12,6 +12,7 @@ from scipy import stats
 from torch import Tensor
 
 from gyrofuse import wavelet_cross_covariance, wavelet_cross_covariance_interval, wavelet_variance_interval
+from gyrofuse._checks import check_confidence_level
 
 N_RUNS, N_SAMPLES, N_LEVELS = 120, 2048, 10
 MIX = np.array([[1.0, 0, 0], [0.6, 0.8, 0], [-0.3, 0.2, 0.9]])
@@ -103,6 +104,12 @@ def test_levels_without_a_window_are_unknown():
 
 @pytest.mark.parametrize("interval", [wavelet_variance_interval, wavelet_cross_covariance_interval])
 def test_bad_input_is_named(interval):
+    with pytest.raises(TypeError, match=r"`confidence_level`: expected a number between 0 and 1 .* got str 'a'"):
+        check_confidence_level("a")
+    with pytest.raises(TypeError, match=r"`confidence_level`: expected a number .* got NoneType None"):
+        check_confidence_level(None)
+    with pytest.raises(ValueError, match=r"`confidence_level`: expected a number .* got nan"):
+        check_confidence_level(float("nan"))
     with pytest.raises(ValueError, match="`confidence_level`: expected a number between 0 and 1"):
         interval(torch.zeros(2, 100), confidence_level=95)
     with pytest.raises(ValueError, match="`n_levels`: expected at most 6"):

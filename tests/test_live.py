@@ -23,7 +23,7 @@ from reference import live as naive
 from scipy import stats
 from torch import Tensor
 
-from gyrofuse import ArrayModel, RandomWalk, SVOResult, WhiteNoise, fit_svo, wavelet_cross_covariance
+from gyrofuse import ArrayModel, RandomWalk, SVOResult, WhiteNoise, fit_multiscale, fit_svo, wavelet_cross_covariance
 from gyrofuse._linalg import SingularCovarianceError
 from gyrofuse.live import LiveSVO, subset_weights
 
@@ -375,6 +375,9 @@ def test_it_is_never_worse_to_average_longer_than_that():
     [
         ({"time_constant": 0.0}, "`time_constant`: expected a finite number > 0, got 0.0"),
         ({"hold": -1}, "`hold`: expected a whole number >= 0, got -1"),
+        ({"hold": torch.nan}, "`hold`: expected a whole number >= 0, got nan"),
+        ({"hold": 2.7}, "`hold`: expected a whole number >= 0, got 2.7"),
+        ({"full_scale": torch.ones(3)}, r"`full_scale`: .* one for each of 4 sensors .* got shape \(3,\)"),
         ({"settle": 0}, "`settle`: expected a whole number >= 1, got 0"),
         ({"full_scale": -1.0}, "`full_scale`: expected numbers > 0, got -1.0"),
     ],
@@ -402,6 +405,21 @@ def test_bad_streams_are_named():
     batched = LiveSVO(fit_svo(array().expand(3, 4, 3000)))
     with pytest.raises(ValueError, match=r"`signal`: expected batch shape \(3,\) as fitted, got \(\)"):
         batched(array())
+
+
+def test_full_scales_of_another_batch_than_the_stream_are_named():
+    live = LiveSVO(fitted(), full_scale=torch.full((2, N_SENSORS), 100.0))
+    assert live(array()[:, :9].expand(2, N_SENSORS, 9)).shape == (2, 9)
+    live.reset()
+    for batch in ((), (3,)):
+        with pytest.raises(ValueError, match=r"`signal`: expected a batch shape that goes with `full_scale` of shape"):
+            live(array()[:, :9].expand(*batch, N_SENSORS, 9))
+
+
+@pytest.mark.parametrize("result", [array(100), fit_multiscale(array())])
+def test_what_is_no_fit_is_named(result):
+    with pytest.raises(TypeError, match=f"`result`: expected an SVOResult, got {type(result).__name__}; fit the array"):
+        LiveSVO(result)
 
 
 def test_other_methods_have_no_weights_of_subsets():

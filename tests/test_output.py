@@ -48,6 +48,9 @@ def test_outputs_follow_links_and_refuse_what_is_used_twice(tmp_path: Path):
         Outputs([tmp_path / "new.txt", target])
     with pytest.raises(FileNotFoundError, match="does not exist; create it first"):
         Outputs([tmp_path / "new.txt", tmp_path / "nowhere" / "file.txt"])
+    if Path("/proc/self").is_dir():
+        with pytest.raises(OSError, match="the folder /proc takes no new files; choose another place"):
+            Outputs([Path("/proc/file.txt")])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["link.txt", "target.txt"]
 
 

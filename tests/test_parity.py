@@ -279,9 +279,43 @@ def test_missing_sensors_are_left_out():
     others = [0, 1, 3, 4]
     alone = parity_test(signal[others], fit_parity(healthy()[others, :9000], WINDOW), before=before[others])
     torch.testing.assert_close(result.p_value[3:7], alone.p_value[3:7], rtol=0.3, atol=1e-3)
-    gone = parity_test(torch.full_like(signal, torch.nan), reference())
-    assert not gone.alarm.any()
-    assert gone.p_value.eq(1).all()
+    assert result.tested[:2].all()
+    assert result.tested[3:7].tolist() == [[True, True, False, True, True]] * 4
+
+
+def test_what_could_not_be_tested_is_named():
+    signal, before = stretch()
+    n_windows = signal.shape[-1] // WINDOW
+    signal[2, : 5 * WINDOW] = torch.nan
+    result = parity_test(signal, reference(), before=before)
+    expected = torch.ones(n_windows, N_SENSORS, dtype=torch.bool)
+    expected[:5, 2] = False
+    assert torch.equal(result.tested, expected)
+    text = result.summary()
+    assert "No sensor stands out, as far as they were tested (smallest p = " in text
+    assert f"- Not tested: sensor 3 in windows 1 to 5 of {n_windows} (0 to 1280 samples); too few samples" in text
+    assert json.loads(json.dumps(result.to_dict()))["tested"] == expected.tolist()
+    signal[:, 6 * WINDOW : 7 * WINDOW] = torch.nan  # where nobody is there nothing is judged by what came before
+    signal[0] = torch.nan
+    batch = parity_test(Recording(torch.stack([stretch()[0], signal]), rate=100.0, axes=("x", "y")), reference())
+    assert not batch.tested[1, 6].any()
+    assert batch.p_value[1, 6] == 1
+    text = batch.summary()
+    assert "[x] Not" not in text
+    assert "- [y] Not tested: sensor 1 in any window; too few samples to compare." in text
+    assert f"- [y] Not tested: sensor 3 in windows 1 to 5, 7 of {n_windows} (0 to 12.8, 15.36 to 17.92 s); too" in text
+    assert f"- [y] Not tested: sensors 2, 4, 5 in window 7 of {n_windows}" in text
+    whole = parity_test(stretch()[0], reference(), before=before)
+    assert "ested:" not in whole.summary()
+
+
+def test_many_gaps_are_cut_short():
+    signal = noise().simulate(60 * 64, batch=(30,), generator=torch.Generator().manual_seed(5))
+    for item in range(30):
+        signal[item, item % N_SENSORS].unflatten(-1, (60, 64))[::2] = torch.nan
+    text = parity_test(signal, fit_parity(healthy(), 64)).summary()
+    assert "in windows 1, 3, 5, 7, 9 and 25 more of 60 (0 to 64, 128 to 192, " in text
+    assert text.endswith("- ... and 10 more not tested")
 
 
 def test_scattered_losses_neither_alarm_nor_blunt():
@@ -494,6 +528,23 @@ def test_the_reference_says_what_it_rests_on():
         (lambda: fit_parity(healthy()[0], 9), ValueError, r"`healthy`: expected \(..., sensor, time\)"),
         (lambda: parity_test(healthy()[:3], reference()), ValueError, "`signal`: expected .* the 5 sensors of the ref"),
         (lambda: parity_test(healthy()[:, :99], reference()), ValueError, "`window`: expected at most the 99 samples"),
+        (
+            lambda: parity_test(healthy(), reference(), window=1),
+            ValueError,
+            "`window`: expected at least 2 samples.* 1;",
+        ),
+        (lambda: parity_test(healthy(), reference(), window=0), ValueError, "`window`: expected a whole number >= 1"),
+        (lambda: fit_parity(healthy(), 1), ValueError, "`window`: expected at least 2 samples"),
+        (
+            lambda: parity_test(torch.full_like(healthy(), torch.nan), reference()),
+            ValueError,
+            r"`signal`: expected a window of 256 samples .* found none \(100 % of all samples are missing\)",
+        ),
+        (
+            lambda: parity_test(healthy(), healthy()),
+            TypeError,
+            "`reference`: expected a ParityReference or an SVOResult, got Tensor; .* fit_parity",
+        ),
         (lambda: parity_test(healthy(), reference(), false_alarm=1), ValueError, "`false_alarm`: expected .* got 1"),
         (
             lambda: parity_test(healthy(), reference(), gain_tolerance=-1),

@@ -53,6 +53,9 @@ class TestByHand:
         expected = torch.deg2rad(recording.signal[1, [2, 0]])
         torch.testing.assert_close(part.signal, expected)
         assert (part.sensors, part.axes, part.unit) == (("c", "a"), (), "rad/s")
+        for twice in (["b", "a", "b"], [1, 1], ["b", 1]):
+            with pytest.raises(ValueError, match="`sensors`: expected each sensor once, got 'b' twice; name it once"):
+                recording.select(sensors=twice)
         with pytest.raises(ValueError, match="`axis`: expected one of 'x', 'y', got 'z'"):
             recording.select(axis="z")
         with pytest.raises(ValueError, match="`sensors`: expected some of 'a', 'b', 'c', got 'd'"):

@@ -36,6 +36,17 @@ def test_a_bad_full_scale_is_named():
         mask_saturated(array(), 0.0)
     with pytest.raises(ValueError, match="`guard`: expected a whole number >= 0, got -1"):
         mask_saturated(array(), 1.0, guard=-1)
+    for guard in (2.5, torch.nan, True):
+        with pytest.raises(ValueError, match=f"`guard`: expected a whole number >= 0, got {guard}"):
+            mask_saturated(array(), 1.0, guard=guard)
+    for full_scale in (torch.ones(3), torch.ones(2, 3)):
+        with pytest.raises(ValueError, match="`full_scale`: expected one number, or one for each of 4 sensors in a"):
+            mask_saturated(array(), full_scale)
+
+
+def test_nothing_holds_no_saturation():
+    assert find_saturation(torch.zeros(2, 3, 0)).tolist() == [[torch.inf] * 3] * 2
+    assert mask_saturated(torch.zeros(2, 3, 0), 1.0).shape == (2, 3, 0)
 
 
 def test_full_scale_is_found_from_the_pile_of_clipped_values():
