@@ -28,7 +28,10 @@ from gyrofuse.bootstrap import block_bootstrap, bootstrap_wccv_covariance, boots
 from gyrofuse.competitors import equal_weights, inverse_variance_weights, nonnegative_weights, shrinkage_weights
 from gyrofuse.covariance import CrossCovariance, cross_covariance, wavelet_cross_covariance, wavelet_variance
 from gyrofuse.datasheet import Datasheet, datasheet
+from gyrofuse.export import StateSpace, state_space, to_c_header, to_kalibr
 from gyrofuse.gain import Gain
+from gyrofuse.gmwm import fit_gmwm
+from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.haar import HaarFilterBank, haar_coefficients
 from gyrofuse.hypotheses import EnoughData, WeightsTest
 from gyrofuse.influence import BootstrapWeightsCovariance, bootstrap_weights_covariance
@@ -67,6 +70,7 @@ __all__ = [
     "Datasheet",
     "Drift",
     "EnoughData",
+    "GMWMResult",
     "Gain",
     "HaarFilterBank",
     "LiveSVO",
@@ -85,6 +89,7 @@ __all__ = [
     "Selection",
     "SingularCovarianceError",
     "Sinusoid",
+    "StateSpace",
     "WaveletCrossCovariance",
     "WeightsTest",
     "WhiteNoise",
@@ -96,6 +101,7 @@ __all__ = [
     "datasheet",
     "equal_weights",
     "find_saturation",
+    "fit_gmwm",
     "fit_multiscale",
     "fit_parity",
     "fit_svo",
@@ -112,8 +118,11 @@ __all__ = [
     "resolve_scale_weights",
     "shrinkage_weights",
     "signal_bootstrap",
+    "state_space",
     "subset_weights",
     "svo_weights",
+    "to_c_header",
+    "to_kalibr",
     "wavelet_cross_covariance",
     "wavelet_cross_covariance_interval",
     "wavelet_variance",

@@ -16,7 +16,6 @@ any function with `-(g(l+1) - 2 g(l) + g(l-1))` the (generalised) autocovariance
 from __future__ import annotations
 
 import functools
-import itertools
 import math
 
 import numpy as np
@@ -60,7 +59,7 @@ def variance_table(n_samples: int, n_levels: int, time_constants: tuple[float, .
 
 
 def _entry(j: int, k: int, n_samples: int, time_constants: tuple[float, ...]) -> Array:
-    lags, weights = _quadrature(2**j, 2**k, n_samples)
+    lags, weights, _ = lag_quadrature(2**j, 2**k, n_samples)
     s = unit_covariances(2**j, 2**k, lags, time_constants)  # (component, lag)
     counts = (n_samples - 2 ** (j + 1) + 1) * (n_samples - 2 ** (k + 1) + 1)
     return (s * weights) @ s.T / counts
@@ -74,17 +73,18 @@ def unit_wavelet_variances(n_levels: int, time_constants: tuple[float, ...]) -> 
 def unit_covariances(h: int, k: int, lags: Array, time_constants: tuple[float, ...]) -> Array:
     """Cross-covariances `(component, lag)` of coefficients of filter lengths `2h` and `2k`, the first `lag` later."""
     taps = np.array([1.0, -2.0, 1.0])
-    shifts = -h * np.arange(3)[:, None] + k * np.arange(3)  # (tap, tap)
-    weights = np.outer(taps, taps).ravel() / (4 * h * k)
+    # Pairs of taps as far apart as each other count once.
+    shifts, copies = np.unique((-h * np.arange(3)[:, None] + k * np.arange(3)).ravel(), return_inverse=True)
+    weights = np.bincount(copies, np.outer(taps, taps).ravel()) / (4 * h * k)
     inside = (lags > -2 * k) & (lags < 2 * h)
-    distance = np.abs(lags[inside, None] + shifts.ravel())  # (lag, pair of taps)
+    distance = np.abs(lags[inside, None] + shifts)  # (lag, pair of taps)
     # Where the two filters do not overlap the covariance is one exponential, without any cancellation.
     gap = np.where(lags[~inside] > 0, lags[~inside] - 2 * h, -lags[~inside] - 2 * k)
     covariances = np.zeros((len(time_constants) + 2, len(lags)))
     covariances[0, inside] = -distance / 2 @ weights
     for row, time_constant in zip(covariances[1:-1], time_constants, strict=True):
         x = 1 / time_constant
-        row[inside] = _exponential(x, distance) @ weights
+        row[inside] = _exponential(x, distance, weights, fine=x * x * h * k < 0.01)
         edge = (math.expm1(-x * h) * math.expm1(-x * k) / math.sinh(x / 2)) ** 2 / (16 * h * k)
         row[~inside] = -edge * np.exp(-x * gap)
     covariances[-1, inside] = (distance**3 - distance) / 12 @ weights
@@ -109,18 +109,35 @@ def block_mean_covariances(block: int, n_blocks: int, time_constants: tuple[floa
     return covariances
 
 
-def _exponential(x: float, distance: Array) -> Array:
-    """Generalised covariance of the sum of an AR1 of unit variance with `phi = e^-x`, even polynomials left out."""
+def _exponential(x: float, distance: Array, weights: Array, *, fine: bool) -> Array:
+    """Weighted sums `(lag,)` of the generalised covariance of the sum of an AR1 of unit variance with `phi = e^-x`.
+
+    Even polynomials of the distance are left out, which the weights do not see; `fine` leaves out all of them where the
+    weights would cancel what is left to rounding.
+    """
     u = x * distance
+    curvature = 1 / (4 * math.sinh(x / 2) ** 2)
+    if not fine:
+        return -curvature * (np.exp(-u) @ weights) - distance @ weights / (2 * math.tanh(x / 2))
     # e^-u - 1 + u - u^2/2, by its series where that cancels.
-    small = -(u**3) / 6 * (1 - u / 4 * (1 - u / 5 * (1 - u / 6 * (1 - u / 7))))
-    remainder = np.where(u < 0.02, small, np.expm1(-u) + u - u**2 / 2)
-    slope = 1 / (2 * math.tanh(x / 2)) - x / (4 * math.sinh(x / 2) ** 2) if x > 0.02 else x / 6 * (1 - x**2 / 30)
-    return -remainder / (4 * math.sinh(x / 2) ** 2) - slope * distance
+    few = u < 0.02
+    v = u if few.all() else u[few]
+    series = -v * v * v / 6 * (1 - v / 4 * (1 - v / 5 * (1 - v / 6 * (1 - v / 7))))
+    if few.all():
+        remainder = series
+    else:
+        remainder = np.exp(-u) - 1 + u - u * u / 2
+        remainder[few] = series
+    slope = 1 / (2 * math.tanh(x / 2)) - x * curvature if x > 0.02 else x / 6 * (1 - x**2 / 30)
+    return -curvature * (remainder @ weights) - slope * (distance @ weights)
 
 
-def _quadrature(h: int, k: int, n_samples: int) -> tuple[Array, Array]:
-    """Lags and the weights at which a function of them is summed, the numbers of pairs included."""
+def lag_quadrature(h: int, k: int, n_samples: int) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Lags, the weights at which a function of them is summed, the numbers of pairs included, and which are alone.
+
+    Lags that are alone stand for themselves, the others, not all of them whole numbers, for stretches of a smooth
+    function.
+    """
     first, last = 2 * h - n_samples, n_samples - 2 * k
     # Stretches between the corners of s(lag) grow with the distance from a corner, as fast as its memory may fade.
     corners = {a * h - b * k for a in range(3) for b in range(3)} | {2 * h - 2 * k}
@@ -129,18 +146,15 @@ def _quadrature(h: int, k: int, n_samples: int) -> tuple[Array, Array]:
     graded = {c + sign * d for c in corners for sign in (-1, 1) for d in steps if d < 2 * near}
     graded |= {c + sign * d for c in (-2 * k, -k, 0, h, 2 * h) for sign in (-1, 1) for d in steps if near <= d < far}
     corners |= graded | {first, last + 1}
-    inside = sorted(c for c in corners if first <= c <= last + 1)
-    lags, weights = [], []
-    for low, high in itertools.pairwise(inside):
-        width = high - low
-        if width <= _ONE_BY_ONE:
-            lags.append(np.arange(low, high, dtype=float))
-            weights.append(np.ones(width))
-        else:
-            # Sum over low <= lag < high of a smooth function, by its integral and half the ends (Euler-Maclaurin).
-            lags.append(np.concatenate([[low], low + width * (1 + _NODES) / 2, [high]]))
-            weights.append(np.concatenate([[0.5], width / 2 * _NODE_WEIGHTS, [-0.5]]))
-    at = np.concatenate(lags)
+    edges = np.array(sorted(c for c in corners if first <= c <= last + 1), dtype=float)
+    low, width = edges[:-1], np.diff(edges)
+    narrow = width <= _ONE_BY_ONE
+    single = np.concatenate([start + np.arange(n) for start, n in zip(low[narrow], width[narrow], strict=True)])
+    # Sum over low <= lag < high of a smooth function, by its integral and half the ends (Euler-Maclaurin).
+    low, width = low[~narrow, None], width[~narrow, None]
+    at = np.concatenate([single, np.hstack([low, low + width * (1 + _NODES) / 2, low + width]).ravel()])
+    ends = np.full_like(low, 0.5)
+    weights = np.concatenate([np.ones_like(single), np.hstack([ends, width / 2 * _NODE_WEIGHTS, -ends]).ravel()])
     # Newest samples t and t - lag both inside the record and each with a whole window.
     pairs = np.minimum(n_samples, n_samples + at) - np.maximum(2 * h - 1, 2 * k - 1 + at)
-    return at, np.concatenate(weights) * np.maximum(pairs, 0)
+    return at, weights * np.maximum(pairs, 0), np.arange(len(at)) < len(single)

@@ -236,6 +236,19 @@ def haar_kernel(z: Tensor, tau: Tensor) -> Tensor:
     return torch.where(correlated, not_between - not_within, within - between) / 2
 
 
+def haar_kernel_slope(z: Tensor, tau: Tensor) -> Tensor:
+    """Derivative of `haar_kernel` by real `z`, by the same recursion, `(..., level)`."""
+    half = tau / 2
+    power = torch.where(half == 1, z, torch.exp(half * z.abs().clamp(min=1e-300).log()))  # z^h
+    loss = 1 - power
+    loss_slope = -half * torch.where(z == 0, (half == 1).to(z), power / torch.where(z == 0, 1.0, z))
+    log_m = _sum_before(torch.log1p(-loss / 2))
+    log_m_slope = _sum_before(-loss_slope / (2 - loss))
+    between_slope = torch.exp(2 * log_m) * (1 + 2 * z * log_m_slope)
+    within_slope = _sum_before(half * between_slope) / half
+    return (within_slope - between_slope) / 2
+
+
 def _sum_before(terms: Tensor) -> Tensor:
     """Sum of the terms before each, along the last dimension."""
     return torch.nn.functional.pad(terms[..., :-1].cumsum(-1), (1, 0))

@@ -1,0 +1,56 @@
+"""Non-negative least squares for many small problems at once."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+_FULL_EXCHANGES, _MOST = 3, 200
+_ROUNDING = 1e-12
+
+
+def nonnegative_least_squares(gram: Tensor, moment: Tensor) -> Tensor:
+    """Minimise `c' G c / 2 - m' c` over `c >= 0`, by block principal pivoting.
+
+    Args:
+        gram: `G`, `(..., unknown, unknown)`, positive semi-definite; `A' A` of a least-squares problem.
+        moment: `m`, `(..., unknown)`; `A' b`.
+
+    Returns:
+        `c`, `(..., unknown)`, with exact zeros.
+
+    References:
+        J. Kim, H. Park, SIAM Journal on Scientific Computing 33, 2011.
+    """
+    n = moment.shape[-1]
+    size = gram.diagonal(dim1=-2, dim2=-1).clamp(min=torch.finfo(gram.dtype).tiny).sqrt()
+    correlation = (gram / size[..., :, None] / size[..., None, :]).reshape(-1, n, n)
+    target = (moment / size).reshape(-1, n)
+    floor = _ROUNDING * target.abs().amax(-1, keepdim=True)
+    eye = torch.eye(n, dtype=gram.dtype, device=gram.device)
+    free = torch.ones_like(target, dtype=torch.bool)
+    fewest = torch.full_like(target[:, 0], n + 1)
+    tries = torch.full_like(fewest, _FULL_EXCHANGES)
+    order = torch.arange(n, device=gram.device)
+    todo = torch.arange(len(target), device=gram.device)
+    solution = torch.zeros_like(target)
+    for _ in range(_MOST):
+        now = free[todo].to(gram.dtype)
+        # Columns that two processes share to rounding: the smallest step off the edge keeps the system solvable.
+        matrix = correlation[todo] * now[:, :, None] * now[:, None, :] + eye * (1 - now + 1e-14)[:, :, None]
+        found = torch.linalg.solve_ex(matrix, target[todo] * now)[0]
+        slope = (correlation[todo] @ found[..., None])[..., 0] - target[todo]
+        solution[todo] = found * now
+        wrong = torch.where(free[todo], found < 0, slope < -floor[todo])
+        n_wrong = wrong.sum(-1).to(gram.dtype)
+        fewer = n_wrong < fewest[todo]
+        fewest[todo] = torch.where(fewer, n_wrong, fewest[todo])
+        tries[todo] = torch.where(fewer, _FULL_EXCHANGES, tries[todo] - 1.0)
+        # Without progress exchange one unknown only, the last: that ends (Murty).
+        last = order == torch.where(wrong, order, -1).amax(-1, keepdim=True)
+        swap = torch.where((tries[todo] >= 0)[:, None], wrong, wrong & last)
+        free[todo] ^= swap
+        todo = todo[n_wrong > 0]
+        if not len(todo):
+            break
+    return (solution.clamp(min=0) / size.reshape(-1, n)).view_as(moment)

@@ -1,0 +1,191 @@
+"""A fitted noise model, or a batch of them: parameters with intervals, and how well they fit."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from gyrofuse._composition import Composition
+from gyrofuse._result import ConfidenceInterval, listed
+from gyrofuse.datasheet import datasheet
+from gyrofuse.moment_covariance import moment_covariance
+from gyrofuse.moment_inference import Fit, Inference
+from gyrofuse.processes import Model
+from gyrofuse.uncertainty import chi_square_interval
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_MOST_TABLES = 12  # items that a summary prints in full
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class GMWMResult:
+    """Noise models fitted to wavelet variances; `...` are the leading dimensions of the signal.
+
+    Attributes:
+        model: Fitted, with parameters `(..., sensor)`.
+        param_names: Of the parameters, such as `ar1_1.phi`.
+        params: `(..., sensor, parameter)`; NaN where nothing could be fitted.
+        param_cov: `(..., sensor, parameter, parameter)`; zero rows for variances that are estimated as zero.
+        confidence_interval: Limits `(..., sensor, parameter)`. A variance at zero has an upper limit only.
+        confidence_level: Of these.
+        determined: `(..., sensor, parameter)`; where False the data say hardly more than the order of magnitude.
+        objective: `r' Omega r` with `r = nu - nu(theta)`, `(..., sensor)`.
+        j_statistic: `r' V^-1 r`, `(..., sensor)`.
+        p_value: Of the J test, that the model is complete, `(..., sensor)`; NaN where the model has as many
+            parameters as there are levels, or the weighting is not optimal.
+        converged: `(..., sensor)`.
+        wavelet_variance: Measured, `(..., level, sensor)`, signal^2.
+        fitted_wavelet_variance: Of the model, the same.
+        n_samples: Length of the records.
+        weighting: Of the moments.
+        sensors: Names.
+        rate: Hz, where known.
+        unit: Of the signal, where known.
+    """
+
+    model: Model
+    param_names: tuple[str, ...]
+    params: Tensor
+    param_cov: Tensor
+    confidence_interval: ConfidenceInterval
+    confidence_level: float
+    determined: Tensor
+    objective: Tensor
+    j_statistic: Tensor
+    p_value: Tensor
+    converged: Tensor
+    wavelet_variance: Tensor
+    fitted_wavelet_variance: Tensor
+    n_samples: int
+    weighting: str
+    sensors: tuple[str, ...]
+    rate: float | None
+    unit: str | None
+
+    @classmethod
+    def build(
+        cls,
+        *,
+        fit: Fit,
+        inference: Inference,
+        made_of: Composition,
+        usable: Tensor,
+        wavelet_variance: Tensor,
+        batch: tuple[int, ...],
+        **rest: Any,
+    ) -> GMWMResult:
+        """Put the items that could be fitted back into their places among all, `(item,)` -> `(..., sensor)`."""
+
+        def placed(value: Tensor, missing: float | bool) -> Tensor:
+            whole = value.new_full((len(usable), *value.shape[1:]), missing)
+            whole[usable] = value
+            return whole.view(*batch, *value.shape[1:])
+
+        tested = (inference.degrees > 0) & (rest["weighting"] == "optimal")
+        p_value = torch.where(tested, _chi_square_tail(inference.j_statistic, inference.degrees), torch.nan)
+        params = placed(inference.params, torch.nan)
+        return cls(
+            model=(model := Model(list(made_of.processes))).with_params(params),
+            param_names=model.param_names,
+            params=params,
+            param_cov=placed(inference.covariance, torch.nan),
+            confidence_interval=ConfidenceInterval(placed(inference.low, torch.nan), placed(inference.high, torch.nan)),
+            determined=placed(inference.determined, False),
+            objective=placed(inference.objective, torch.nan),
+            j_statistic=placed(inference.j_statistic, torch.nan),
+            p_value=placed(p_value, torch.nan),
+            converged=placed(fit.converged, False),
+            wavelet_variance=wavelet_variance.view(*batch, -1).mT,
+            fitted_wavelet_variance=placed(inference.fitted, torch.nan).mT,
+            **rest,
+        )
+
+    def summary(self) -> str:
+        """Parameters with intervals, sensor by sensor, and in datasheet units where rate and unit are known."""
+        batch = self.params.shape[:-2]
+        name = " + ".join(p.symbol for p in self.model.processes)
+        lines = [f"GMWM fit of {name}: {self.n_samples} samples, {self.wavelet_variance.shape[-2]} levels"]
+        n_items = self.params.shape[:-1].numel()
+        if batch:
+            lines.append(f"{n_items} fits in a batch {tuple(batch)}, {int(self.converged.sum())} converged")
+        if n_items > _MOST_TABLES:
+            return "\n".join(lines)
+        for index in itertools.product(*map(range, self.params.shape[:-1])):
+            lines += ["", *self._table(index)]
+        return "\n".join(lines)
+
+    def __str__(self) -> str:
+        return self.summary()
+
+    def _table(self, index: tuple[int, ...]) -> list[str]:
+        where = f" of item {', '.join(map(str, index[:-1]))}" if len(index) > 1 else ""
+        head = f"sensor {self.sensors[index[-1]]}{where}"
+        if not bool(self.params[index].isfinite().all()):
+            return [f"{head}: not fitted"]
+        fits = ""
+        if bool(self.p_value[index].isfinite()):
+            fits = f", J = {self.j_statistic[index].item():.4g}, p = {self.p_value[index].item():.2g}"
+        if not bool(self.converged[index]):
+            fits += ", not converged"
+        low, high = self.confidence_interval
+        level = f"{100 * self.confidence_level:g} % interval"
+        rows = [f"{head}{fits}", f"  {'parameter':<24}{'estimate':>13}  {level:^29}"]
+        for k, name in enumerate(self.param_names):
+            value, first, last = (t[index][k].item() for t in (self.params, low, high))
+            note = "" if bool(self.determined[index][k]) else "  weakly determined"
+            if value == 0:
+                note = "  at its limit"
+            rows.append(f"  {name:<24}{value:>13.6g}  [{first:>13.6g}, {last:>13.6g}]{note}")
+        if self.rate and self.unit:
+            own = self.model.with_params(self.params[index])
+            rows += ["  " + line for line in datasheet(own, self.rate, self.unit).summary().splitlines()[1:]]
+        return rows
+
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Draw the first sensor's wavelet deviation with intervals, the fitted model and each of its components.
+
+        Args:
+            ax: Where to draw; a new figure by default.
+        """
+        from gyrofuse.plotting_models import plot_moment_fit
+
+        first = (0,) * (self.params.ndim - 1)
+        measured = self.wavelet_variance.mT[first]
+        model = self.model.with_params(self.params[first])
+        spread = moment_covariance(model, self.n_samples, len(measured)).diagonal()
+        limits = chi_square_interval(measured, 2 * measured.square() / spread, self.confidence_level)
+        return plot_moment_fit(measured, limits, model, rate=self.rate, unit=self.unit, ax=ax)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain numbers and lists; what is not known is None."""
+        low, high = self.confidence_interval
+        return {
+            "model": self.model.to_dict(),
+            "param_names": list(self.param_names),
+            "params": listed(self.params),
+            "param_cov": listed(self.param_cov),
+            "confidence_interval": {"low": listed(low), "high": listed(high)},
+            "confidence_level": self.confidence_level,
+            "determined": self.determined.tolist(),
+            "objective": listed(self.objective),
+            "j_statistic": listed(self.j_statistic),
+            "p_value": listed(self.p_value),
+            "converged": self.converged.tolist(),
+            "wavelet_variance": listed(self.wavelet_variance),
+            "fitted_wavelet_variance": listed(self.fitted_wavelet_variance),
+            "n_samples": self.n_samples,
+            "weighting": self.weighting,
+            "sensors": list(self.sensors),
+            "rate": self.rate,
+            "unit": self.unit,
+        }
+
+
+def _chi_square_tail(statistic: Tensor, degrees: Tensor) -> Tensor:
+    return torch.special.gammaincc(degrees.clamp(min=1) / 2, statistic.clamp(min=0) / 2)

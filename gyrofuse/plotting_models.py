@@ -1,0 +1,72 @@
+"""Figures of fitted noise models."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gyrofuse.plotting import _BLUE, _INK, _SHADE, _deviation, _finish, _new_axes, _time_axis, with_unit
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from gyrofuse.processes import Model
+
+# Okabe and Ito without the blue of the sum.
+_COLOURS = ("#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
+_STYLES = ("--", "-.", ":")
+
+
+def plot_moment_fit(
+    wavelet_variance: Tensor,
+    limits: tuple[Tensor, Tensor],
+    model: Model,
+    *,
+    rate: float | None = None,
+    unit: str | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw a measured Allan deviation `sqrt(2 nu)` with intervals, that of the fitted model, and its components.
+
+    Args:
+        wavelet_variance: `(level,)`, signal^2.
+        limits: Lower and upper limits of it, `(level,)` each.
+        model: Fitted, with scalar parameters.
+        rate: Hz; without it the averaging times are in samples.
+        unit: Unit of the signal.
+        ax: Where to draw; new axes by default.
+
+    Returns:
+        The axes.
+    """
+    ax = ax if ax is not None else _new_axes()
+    n_levels = len(wavelet_variance)
+    times = np.exp2(np.arange(n_levels)) / (rate or 1.0)
+    low, high = limits
+    handles: list[Any] = [ax.fill_between(times, _deviation(low), _deviation(high), zorder=1, **_SHADE)]
+    labels = ["interval"]
+    dots: dict[str, Any] = {"color": _INK, "marker": "o", "markersize": 4, "linestyle": "none"}
+    handles += ax.plot(times, _deviation(wavelet_variance), zorder=4, **dots)
+    labels += ["measured"]
+    handles += ax.plot(times, _deviation(model.wavelet_variance(n_levels)), color=_BLUE, linewidth=2.2, zorder=3)
+    labels += ["fitted model"]
+    shown = torch.cat([low, high, wavelet_variance])
+    floor = shown[shown > 0].min().item() / 30
+    seen: dict[str, int] = {}
+    for k, process in enumerate(model.processes):
+        seen[process.symbol] = seen.get(process.symbol, 0) + 1
+        variance = process.wavelet_variance(n_levels)
+        if not bool((variance > floor).any()):
+            continue
+        visible = torch.where(variance > floor, variance, torch.nan)
+        style: dict[str, Any] = {"color": _COLOURS[k % len(_COLOURS)], "linestyle": _STYLES[k % len(_STYLES)]}
+        handles += ax.plot(times, _deviation(visible), zorder=2, linewidth=1.1, **style)
+        labels += [process.symbol + (f" {seen[process.symbol]}" if process.repeatable else "")]
+    ax.set_yscale("log")
+    ax.set_ylabel(with_unit("Allan deviation", unit), parse_math=False)
+    _time_axis(ax, rate is not None)
+    _finish(ax, handles, labels)
+    return ax

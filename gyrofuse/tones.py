@@ -1,0 +1,614 @@
+"""Spectral lines of rate signals: vibration tones found in the noise and measured to the Cramer-Rao bound.
+
+A tone `a sin(beta t + phase)` stands out of a periodogram with a Hann taper, whose side lobes die out within a few
+dozen bins, so that neither a random walk nor another tone hides it. It is measured by weighted least squares on the
+orthonormal DCT-II, which diagonalises white noise and random walks: `y_k = sqrt(2/T) sum_t x_t cos(pi k (t + 1/2) / T)`
+has the variance `S(k / 2T)`. On the clock `u` that is 0 in the middle of the record the even `k` see only the tone's
+cosine and the odd ones only its sine, both through the Dirichlet kernel `D(x) = sin(T x / 2) / sin(x / 2)`.
+
+Inside, a record is in units of its rms, frequencies are bins of one of the two transforms, and a batch is
+`(item, time)`.
+
+References:
+    E. J. Hannan, The estimation of frequency, Journal of Applied Probability 10, 1973: the bounds
+    `var beta = 24 S / (a^2 T^3)`, `var a = 2 S / T`.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gyrofuse._checks import check_floating, check_positive_integer
+
+NoiseSpectrum = Callable[[Tensor], Tensor]
+
+FEWEST_SAMPLES = 32
+# Cycles from 0 and from half the sampling rate: lines are looked for beyond the first number. Below the second the
+# tone's amplitude, phase and frequency cannot be told apart, nor from a trend.
+_FIRST_CYCLE, FEWEST_CYCLES = 2, 3
+# Bins on either side of a line: of the DCT for its fit, of the Hann periodogram for its removal.
+_HALF_WIDTH, _LINE_HALF_WIDTH = 32, 64
+# Samples of a batch transformed at a time.
+_CHUNK = 2**20
+# The few dozen coefficients of a fit need no second transform: sums over blocks of time, with so many powers of time
+# within a block, give them to 1e-10.
+_BLOCKS, _POWERS = 256, 8
+_GRID = torch.arange(-24, 25, dtype=torch.float64) / 16  # first look around the peak, in 1/T cycles per sample
+_STEPS, _SWEEPS = 6, 3
+# Smooth background: bands at least so many bins and a fraction of their frequency wide, or of the distance from the
+# highest frequency, down to a part of that; its curvature in log frequency is white noise of this intensity (between
+# white noise and a random walk it reaches 1 within an octave).
+_BAND, _BAND_FRACTION, _TOP, _CURVATURE = 6, 0.18, 1 / 32, 0.3
+# Variance of the log of the median of n neighbouring Hann ordinates, times n: twice that of independent ones, which
+# every other one nearly is.
+_MEDIAN_VARIANCE = 2 / math.log(2) ** 2
+_ENOUGH_ORDINATES = 2**10  # for the median of a band
+_LOW = 64  # bins over which the taper's width matters
+
+
+@dataclass(frozen=True, eq=False)
+class Tones:
+    """Tones `amplitude * sin(beta * t + phase)`, `t = 1, 2, ..`, by decreasing power, all in float64.
+
+    Attributes:
+        beta: `(..., tone)`, rad per sample, in `(0, pi)`.
+        amplitude: `(..., tone)`, signal.
+        phase: `(..., tone)`, rad.
+        beta_sd: `(..., tone)`, Cramer-Rao bound at the noise around the line. NaN: not identifiable, for a tone with
+            fewer than three cycles in the record, or as close to half the sampling rate.
+        amplitude_sd: `(..., tone)`, signal, likewise.
+        p_value: `(..., tone)`, of the test that what remained when the tone was found was noise alone.
+    """
+
+    beta: Tensor
+    amplitude: Tensor
+    phase: Tensor
+    beta_sd: Tensor
+    amplitude_sd: Tensor
+    p_value: Tensor
+
+    def waveform(self, n_samples: int) -> Tensor:
+        """Sum of the tones over a record, `(..., time)`, signal."""
+        time = torch.arange(1, n_samples + 1, dtype=self.beta.dtype, device=self.beta.device)
+        total = self.beta.new_zeros(*self.beta.shape[:-1], n_samples)
+        parameters = (v.unbind(-1) for v in (self.beta, self.amplitude, self.phase))
+        for beta, amplitude, phase in zip(*parameters, strict=True):
+            total += amplitude[..., None] * torch.sin(beta[..., None] * time + phase[..., None])
+        return total
+
+
+def find_tones(signal: Tensor, n_tones: int, noise_spectrum: NoiseSpectrum | None = None) -> Tones:
+    """Find the largest spectral lines and measure their frequencies and amplitudes.
+
+    One after the other: the largest ratio of periodogram to background, a fit over the bins around it, its removal
+    from these bins; then all are fitted again until none sees the others.
+
+    Args:
+        signal: `(..., time)`, at least 32 samples.
+        n_tones: How many lines, whether significant or not; see `Tones.p_value`.
+        noise_spectrum: Two-sided density per sample of the noise without tones at frequencies `(frequency,)` in cycles
+            per sample, for instance `Model.spectrum` of a fitted model: `(..., frequency)`, signal^2. By default a
+            smooth background is taken from the periodogram itself, and p values allow for its error; below some ten
+            cycles in the record, or as close to half the sampling rate, it absorbs all but strong lines, and the
+            standard deviations of what is left come out too small.
+
+    Returns:
+        The tones of every item, on the device of `signal`.
+
+    Raises:
+        TypeError: Not a floating point tensor.
+        ValueError: Too few samples, missing or constant ones, too many tones, or a spectrum that is not positive or
+            does not fit the batch.
+    """
+    n_tones = check_positive_integer("n_tones", n_tones)
+    _check(signal)
+    n_samples = signal.shape[-1]
+    if n_tones > n_samples // 16:
+        raise ValueError(
+            f"`n_tones`: expected at most {n_samples // 16} for {n_samples} samples (16 for each), got {n_tones}; "
+            "ask for fewer or give a longer signal"
+        )
+    found = [record.find(n_tones) for record in _records(signal, noise_spectrum)]
+    shape = (*signal.shape[:-1], n_tones)
+    return Tones(*(torch.cat(parts).reshape(shape) for parts in zip(*found, strict=True)))
+
+
+def line_p_value(signal: Tensor, noise_spectrum: NoiseSpectrum | None = None) -> Tensor:
+    """Test whether the largest line of the periodogram is more than noise.
+
+    A Hann ordinate over the noise density is exponential, and the largest of `n` of them exceeds `x` with the
+    probability `1 - (1 - e^-x)^n`.
+
+    Args:
+        signal: `(..., time)`, at least 32 samples.
+        noise_spectrum: As for `find_tones`.
+
+    Returns:
+        P values `(...)`, float64.
+
+    Raises:
+        TypeError: Not a floating point tensor.
+        ValueError: As for `find_tones`.
+    """
+    _check(signal)
+    return torch.cat([record.peak()[1] for record in _records(signal, noise_spectrum)]).reshape(signal.shape[:-1])
+
+
+def _check(signal: Tensor) -> None:
+    check_floating("signal", signal)
+    if signal.ndim == 0 or signal.shape[-1] < FEWEST_SAMPLES or signal.numel() == 0:
+        raise ValueError(
+            f"`signal`: expected (..., time) with at least one record of at least {FEWEST_SAMPLES} samples, "
+            f"got shape {tuple(signal.shape)}; give a longer signal"
+        )
+    low, high = torch.aminmax(signal.detach(), dim=-1)
+    if not bool((low.isfinite() & high.isfinite()).all()):
+        raise ValueError("`signal`: expected finite samples, got NaN or infinity; cut the record where samples miss")
+    if bool((low == high).any()):
+        raise ValueError(
+            f"`signal`: expected records that vary, got {int((low == high).sum())} constant; leave out dead sensors"
+        )
+
+
+def _records(signal: Tensor, noise_spectrum: NoiseSpectrum | None) -> Iterator[_Records]:
+    """The batch in parts of bounded size, one at a time."""
+    items = signal.detach().reshape(-1, signal.shape[-1])
+    n_samples = items.shape[-1]
+    length = _fast_length(n_samples)
+    density = low = None
+    if noise_spectrum is not None:
+        f = torch.arange(1, length // 2 + 1, dtype=torch.float64, device=signal.device) / length
+        density = _density(noise_spectrum, f, signal)
+        fine, kernel = (torch.from_numpy(v).to(signal.device) for v in _taper_kernel(n_samples, length))
+        low = _density(noise_spectrum, fine, signal) @ kernel.T
+    size = max(_CHUNK // n_samples, 1)
+    for first in range(0, len(items), size):
+        part = slice(first, first + size)
+        own = None if density is None or low is None else (density[part], low[part])
+        yield _Records(items[part], length, own)
+
+
+def _density(noise_spectrum: NoiseSpectrum, f: Tensor, signal: Tensor) -> Tensor:
+    """Noise density `(item, frequency)`, checked."""
+    batch = signal.shape[:-1]
+    density = torch.as_tensor(noise_spectrum(f)).detach().to(device=f.device, dtype=f.dtype)
+    try:
+        density = density.expand(*batch, len(f))
+    except RuntimeError:
+        raise ValueError(
+            f"`noise_spectrum`: expected a density {(*batch, len(f))} or one that broadcasts to it for frequencies "
+            f"{(len(f),)}, got shape {tuple(density.shape)}"
+        ) from None
+    if not bool((density.isfinite() & (density > 0)).all()):
+        raise ValueError(
+            "`noise_spectrum`: expected a finite density > 0 at all frequencies in (0, 1/2], got others; "
+            "give a model with white noise or leave it out"
+        )
+    return density.reshape(-1, len(f))
+
+
+class _Records:
+    """Records of one length with their periodograms, from which the lines found so far are taken out.
+
+    Args:
+        items: `(item, time)`.
+        length: Of the transform.
+        density: Of the noise, at the bins from 1 on and as the taper shows it at the lowest: `(item, bin)` both.
+    """
+
+    def __init__(self, items: Tensor, length: int, density: tuple[Tensor, Tensor] | None) -> None:
+        self._length, self._density, self._n = length, density, items.shape[-1]
+        self._first = math.ceil(_FIRST_CYCLE * length / self._n)  # bins in which lines are looked for
+        self._last = length // 2 - self._first + 1
+        n, device = self._n, items.device
+        u = torch.arange(n, dtype=torch.float64, device=device) - (n - 1) / 2
+        taper = (1 + torch.cos(2 * math.pi / n * u)) / 2
+        signal = items.to(torch.float64)
+        # Any constant would do for size; dividing twice keeps the squares of tiny and of huge records within range.
+        largest = signal.abs().amax(-1, keepdim=True)
+        signal = signal / largest
+        signal -= (signal @ taper / taper.sum())[:, None]
+        rms = signal.square().mean(-1, keepdim=True).sqrt()
+        self._signal = signal.div_(rms)
+        self._unit = largest * rms  # (item, 1)
+        self._spectrum = torch.fft.rfft(self._signal * taper, n=self._length)
+        self._highest = self._length // 2
+        k = torch.arange(1, self._highest + 1, dtype=torch.float64, device=device)
+        self._place = _place(k, self._highest)
+        if self._density is not None:
+            log_size = 2 * self._unit.log()
+            self._log_s = self._density[0].log() - log_size
+            self._log_seen = self._log_s.clone()
+            n_low = self._density[1].shape[-1]
+            self._log_seen[:, :n_low] = self._density[1].log() - log_size
+
+    def find(self, n_tones: int) -> tuple[Tensor, ...]:
+        """`beta, amplitude, phase, beta_sd, amplitude_sd, p_value`, all `(item, tone)`."""
+        lines: list[_Line] = []
+        p_values = []
+        for _ in range(n_tones):
+            peak, p_value = self.peak()
+            lines.append(self._coefficients(2 * math.pi / self._length * peak.to(torch.float64)))
+            p_values.append(p_value)
+            self._fit(lines, len(lines) - 1, search=True)
+            for _ in range(_SWEEPS if len(lines) > 1 else 0):
+                for i in range(len(lines)):
+                    self._fit(lines, i)
+        self._set_background(self._power())  # without the lines
+        for i in range(n_tones):
+            self._fit(lines, i)
+        beta, amplitude, phase = (torch.stack(v, -1) for v in zip(*(line.polar() for line in lines), strict=True))
+        sds = [line.standard_deviations(self._weights(line), self._n) for line in lines]
+        beta_sd, amplitude_sd = (torch.stack(v, -1) for v in zip(*sds, strict=True))
+        cycles = torch.minimum(beta, math.pi - beta) * self._n / (2 * math.pi)
+        hidden = cycles < FEWEST_CYCLES
+        phase = torch.remainder(phase - beta * (self._n + 1) / 2, 2 * math.pi)
+        results = (
+            beta,
+            amplitude * self._unit,
+            phase,
+            beta_sd.masked_fill(hidden, torch.nan),
+            (amplitude_sd * self._unit).masked_fill(hidden, torch.nan),
+            torch.stack(p_values, -1),
+        )
+        order = amplitude.argsort(dim=-1, descending=True, stable=True)
+        return tuple(v.gather(-1, order) for v in results)
+
+    def peak(self) -> tuple[Tensor, Tensor]:
+        """Bin of the largest line and its p value, both `(item,)`."""
+        power = self._power()
+        dof = self._set_background(power)
+        searched = slice(self._first - 1, self._last)
+        ratio = self._log_seen[:, searched].neg().exp_().mul_(power[:, searched])
+        if dof is not None:
+            # An exponential variable over a background known to `dof` looks: 2 and 2 dof degrees of freedom.
+            ratio = ratio.div_(dof[searched]).log1p_().mul_(dof[searched])
+        largest, at = ratio.max(-1)
+        n_ordinates = self._n / 2 - 2 * _FIRST_CYCLE
+        p_value = -torch.expm1(n_ordinates * torch.log1p(-torch.exp(-largest)))
+        return at + self._first, p_value
+
+    def _power(self) -> Tensor:
+        """Periodogram at the bins from 1 on, with the mean `S`, floored where rounding is all there is."""
+        spectrum = self._spectrum[:, 1 : self._highest + 1]
+        power = spectrum.real.square().add_(spectrum.imag.square())
+        return power.mul_(8 / 3 / self._n).clamp_(min=1e-30)
+
+    def _set_background(self, power: Tensor) -> Tensor | None:
+        """Smooth density of the noise from the periodogram; returns degrees of freedom by bin, or None when given."""
+        if self._density is not None:
+            return None
+        smoother = _smoother(self._first, self._last, self._length // 2)
+        matrix, at = (torch.from_numpy(v).to(power) for v in (smoother.matrix, smoother.places))
+        centre = at[1:-1]
+        logs = power.new_empty(len(power), len(smoother.edges))
+        for b, (low, high) in enumerate(smoother.edges):
+            logs[:, b] = _log_of_median(power[:, low - 1 : high - 1 : _stride(high - low)])
+        smooth = logs @ matrix.T  # (item, point)
+        for _ in range(2):
+            # Where a band spans octaves, once more without the slope.
+            for b, (low, high) in enumerate(smoother.edges):
+                if low > _LOW:
+                    break
+                bins = self._place[low - 1 : high - 1]
+                slope = (smooth[:, b + 2] - smooth[:, b]) / (at[b + 2] - at[b])
+                tilt = torch.exp(slope[:, None] * (bins - centre[b]))
+                logs[:, b] = _log_of_median(power[:, low - 1 : high - 1] / tilt)
+            smooth = logs @ matrix.T
+        # Straight lines between the points; the variance goes with them as one more item.
+        corners = torch.cat([smooth, torch.from_numpy(smoother.variance).to(power)[None]])
+        slopes = corners.diff(dim=-1) / at.diff()
+        lines = power.new_empty(len(corners), self._highest)
+        cuts = [0, *torch.searchsorted(self._place, at[1:-1]).tolist(), self._highest]
+        for b, (low, high) in enumerate(itertools.pairwise(cuts)):
+            offset = corners[:, b] - slopes[:, b] * at[b]
+            torch.addcmul(offset[:, None], slopes[:, b, None], self._place[None, low:high], out=lines[:, low:high])
+        self._log_s = self._log_seen = lines[:-1]
+        return 1 / lines[-1]
+
+    def _coefficients(self, beta: Tensor) -> _Line:
+        """DCT-II coefficients around frequencies `(item,)`."""
+        n, device = self._n, beta.device
+        middle = (beta * n / math.pi).round().clamp(1, n - 1)  # (item,)
+        size = -(-n // _BLOCKS)
+        n_blocks = -(-n // size)
+        blocks = torch.nn.functional.pad(self._signal, (0, n_blocks * size - n)).unflatten(-1, (n_blocks, size))
+        within = torch.arange(size, dtype=torch.float64, device=device) - (size - 1) / 2
+        centre = torch.arange(n_blocks, dtype=torch.float64, device=device) * size + size / 2  # of t + 1/2
+        omega = math.pi / n * middle
+        carrier = torch.polar(torch.ones_like(within), -omega[:, None] * within)  # (item, time in block)
+        power = torch.arange(_POWERS, dtype=torch.float64, device=device)
+        powers = (within[:, None] * (2 / size)) ** power  # (time in block, power)
+        table = torch.view_as_real(carrier[..., None] * powers).flatten(-2)
+        moments = torch.view_as_complex((blocks @ table).unflatten(-1, (_POWERS, 2)))  # (item, block, power)
+        moments = moments * torch.polar(torch.ones_like(centre), -omega[:, None] * centre)[..., None]
+        offset = torch.arange(-_HALF_WIDTH, _HALF_WIDTH + 1, dtype=torch.float64, device=device)
+        delta = math.pi / n * offset
+        # exp(-i delta (centre + within)), the second factor as a series.
+        factors = (delta * (-0.5j * size)) / power[1:, None]
+        series = torch.cat([torch.ones_like(factors[:1]), factors.cumprod(0)])  # (power, bin)
+        outer = torch.polar(torch.ones(1, dtype=torch.float64, device=device), -delta * centre[:, None])
+        kernel = (outer[:, None] * series).flatten(0, 1)  # (block power, bin)
+        k = middle[:, None] + offset
+        values = math.sqrt(2 / n) * (moments.flatten(1) @ kernel).real
+        inside = (k >= 1) & (k <= n - 1)
+        zero = torch.zeros_like(beta)
+        return _Line(k, torch.where(inside, values, 0.0), inside, beta, zero, zero)
+
+    def _weights(self, line: _Line) -> Tensor:
+        """`1/S` at the bins of a fit, `S` interpolated as a power law."""
+        position = (line.k * (self._length / (2 * self._n))).clamp(min=0.25)
+        index = position.floor().long().clamp(1, self._log_s.shape[-1] - 1) - 1
+        low, high = self._place[index], self._place[index + 1]
+        weight = (_place(position, self._highest) - low) / (high - low)
+        log_s = torch.lerp(self._log_s.gather(-1, index), self._log_s.gather(-1, index + 1), weight)
+        return torch.where(line.inside, torch.exp(-log_s), 0.0)
+
+    def _fit(self, lines: list[_Line], which: int, search: bool = False) -> None:
+        """Fit one line to what the others leave, and take it out of the periodogram instead of what it was."""
+        line = lines[which]
+        values = line.values
+        for other in lines[:which] + lines[which + 1 :]:
+            values = values - other.at(line.k, self._n)
+        values = torch.where(line.inside, values, 0.0)
+        fitted = line.fitted(values, self._weights(line), self._n, search)
+        self._add_to_spectrum(line, 1)
+        self._add_to_spectrum(fitted, -1)
+        lines[which] = fitted
+
+    def _add_to_spectrum(self, line: _Line, sign: int) -> None:
+        n, length = self._n, self._length
+        centre = (line.beta * length / (2 * math.pi)).round().long()
+        reach = torch.arange(-_LINE_HALF_WIDTH, _LINE_HALF_WIDTH + 1, device=centre.device)
+        index = centre[:, None] + reach
+        inside = (index >= 0) & (index < self._spectrum.shape[-1])
+        omega = 2 * math.pi / length * index.to(torch.float64)
+        complex_amplitude = torch.complex(line.cosine, -line.sine)[:, None]
+        beta = line.beta[:, None]
+        shown = complex_amplitude * _hann(beta - omega, n) + complex_amplitude.conj() * _hann(beta + omega, n)
+        # The clock of the transform starts with the record, that of the tone in its middle.
+        shown = shown * torch.polar(torch.full_like(omega, sign / 2), -omega * (n - 1) / 2)
+        shown = torch.where(inside, shown, 0.0)
+        self._spectrum.scatter_add_(-1, index.clamp(0, self._spectrum.shape[-1] - 1), shown)
+
+
+@dataclass(frozen=True, eq=False)
+class _Line:
+    """A tone `cosine * cos(beta u) + sine * sin(beta u)` of every item, and the data around it.
+
+    Attributes:
+        k: Bins of the DCT-II, `(item, bin)`.
+        values: Its coefficients there, `(item, bin)`.
+        inside: Which bins there are, `(item, bin)`: not the mean.
+        beta: `(item,)`, rad per sample.
+        cosine: `(item,)`.
+        sine: `(item,)`.
+    """
+
+    k: Tensor
+    values: Tensor
+    inside: Tensor
+    beta: Tensor
+    cosine: Tensor
+    sine: Tensor
+
+    def at(self, k: Tensor, n: int) -> Tensor:
+        """DCT-II of the tone, `(item, bin)`."""
+        even, odd, _ = _templates(self.beta[:, None], k, n)
+        return self.cosine[:, None] * even + self.sine[:, None] * odd
+
+    def polar(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Frequency, amplitude, and phase as a sine on the centred clock."""
+        return self.beta, torch.hypot(self.cosine, self.sine), torch.atan2(self.cosine, self.sine)
+
+    def fitted(self, values: Tensor, weights: Tensor, n: int, search: bool) -> _Line:
+        """Weighted least squares: Gauss-Newton in `beta`, the two amplitudes solved for."""
+        cycle = 2 * math.pi / n
+        lowest = cycle / 2
+        beta = self.beta
+        if search:
+            grid = (beta[:, None] + cycle * _GRID.to(beta.device)).clamp(lowest, math.pi - lowest)
+            explained = _project(grid, self.k, values, weights, n).explained
+            beta = grid.gather(-1, explained.argmax(-1, keepdim=True))[:, 0]
+        best = _project(beta[:, None], self.k, values, weights, n)
+        for _ in range(_STEPS):
+            moved = beta + best.step[:, 0].clamp(-cycle / 8, cycle / 8)
+            moved = moved.clamp(lowest, math.pi - lowest)
+            trial = _project(moved[:, None], self.k, values, weights, n)
+            # Rounding may lower what is explained at the top.
+            better = (trial.explained >= best.explained * (1 - 1e-13))[:, 0]
+            beta = torch.where(better, moved, (beta + moved) / 2)
+            best = _project(beta[:, None], self.k, values, weights, n)
+        return _Line(self.k, self.values, self.inside, beta, best.cosine[:, 0], best.sine[:, 0])
+
+    def standard_deviations(self, weights: Tensor, n: int) -> tuple[Tensor, Tensor]:
+        """Of `beta` and of the amplitude, from the Fisher information of the bins fitted, both `(item,)`."""
+        even, odd, slopes = _templates(self.beta[:, None], self.k, n)
+        slope = self.cosine[:, None] * slopes[0] + self.sine[:, None] * slopes[1]
+        columns = torch.stack([even, odd, slope / n], -1)  # amplitude per cycle: entries of one size
+        size = torch.hypot(self.cosine, self.sine)
+        columns = columns / torch.stack([torch.ones_like(size), torch.ones_like(size), size], -1)[:, None]
+        information = columns.mT @ (weights[..., None] * columns)
+        covariance, info = torch.linalg.inv_ex(information)
+        covariance = torch.where((info == 0)[:, None, None], covariance, torch.nan)
+        direction = torch.stack([self.cosine, self.sine], -1) / size[:, None]
+        variance = torch.einsum("na,nab,nb->n", direction, covariance[:, :2, :2], direction)
+        return covariance[:, 2, 2].sqrt() / (n * size), variance.sqrt()
+
+
+@dataclass(frozen=True, eq=False)
+class _Projection:
+    """Least squares at given frequencies, all `(item, frequency)`; `step` is the Gauss-Newton step of `beta`."""
+
+    explained: Tensor
+    cosine: Tensor
+    sine: Tensor
+    step: Tensor
+
+
+def _project(beta: Tensor, k: Tensor, values: Tensor, weights: Tensor, n: int) -> _Projection:
+    even, odd, slopes = _templates(beta[..., None], k[:, None], n)  # (item, frequency, bin)
+    values, weights = values[:, None], weights[:, None]
+
+    def share(template: Tensor, of: Tensor) -> Tensor:
+        return (weights * template * of).sum(-1)
+
+    # Odd and even bins share nothing, so that the normal equations are diagonal.
+    norms = share(even, even), share(odd, odd)
+    cosine, sine = share(even, values) / norms[0], share(odd, values) / norms[1]
+    slope = cosine[..., None] * slopes[0] + sine[..., None] * slopes[1]
+    slope = slope - even * (share(even, slope) / norms[0])[..., None] - odd * (share(odd, slope) / norms[1])[..., None]
+    residual = values - cosine[..., None] * even - sine[..., None] * odd
+    information = share(slope, slope)
+    step = torch.where(information > 0, share(slope, residual) / information, 0.0)
+    return _Projection(cosine.square() * norms[0] + sine.square() * norms[1], cosine, sine, step)
+
+
+def _templates(beta: Tensor, k: Tensor, n: int) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
+    """DCT-II coefficients `k` of `cos(beta u)` and `sin(beta u)`, and their derivatives with respect to `beta`.
+
+    `sum_u e^(i beta u) cos(omega u + pi k/2) = (e^(i pi k/2) D(beta + omega) + e^(-i pi k/2) D(beta - omega)) / 2`.
+    """
+    omega = math.pi / n * k
+    quarter = torch.remainder(k, 4)
+    scale = math.sqrt(1 / (2 * n))
+    even = scale * ((quarter == 0).to(k) - (quarter == 2).to(k))  # cos(pi k/2)
+    odd = scale * ((quarter == 1).to(k) - (quarter == 3).to(k))  # sin(pi k/2)
+    above, above_slope = _dirichlet(beta + omega, n)
+    below, below_slope = _dirichlet(beta - omega, n)
+    slopes = even * (above_slope + below_slope), odd * (above_slope - below_slope)
+    return even * (above + below), odd * (above - below), slopes
+
+
+def _dirichlet(x: Tensor, n: int) -> tuple[Tensor, Tensor]:
+    """`D(x) = sin(n x/2) / sin(x/2)` and its derivative, for `-2 pi < x < 2 pi`."""
+    z = n / 2 * x
+    near = z.abs() < 1e-2
+    half = torch.where(near, 1.0, x / 2)
+    over = 1 / torch.sin(half)
+    value = torch.sin(z) * over
+    slope = (n * torch.cos(z) - torch.cos(half) * over * torch.sin(z)) * over / 2
+    value = torch.where(near, n * (1 - z.square() / 6), value)
+    return value, torch.where(near, -n * n / 2 * z * (1 / 3 - z.square() / 30), slope)
+
+
+def _hann(x: Tensor, n: int) -> Tensor:
+    """Transform of the Hann taper on the centred clock, `sum_u (1 + cos(2 pi u/n))/2 cos(x u)`."""
+    shift = 2 * math.pi / n
+    # Whole turns would leave the Dirichlet kernel's domain; for even n they change its sign.
+    turns = torch.round(x / (2 * math.pi))
+    x = x - 2 * math.pi * turns
+    sign = 1.0 if n % 2 else 1 - 2 * torch.remainder(turns, 2)
+    side = (_dirichlet(x - shift, n)[0] + _dirichlet(x + shift, n)[0]) / 4
+    return sign * (_dirichlet(x, n)[0] / 2 + side)
+
+
+def _stride(n_bins: int) -> int:
+    """Of the ordinates that the median of a band looks at."""
+    return max(n_bins // _ENOUGH_ORDINATES, 1)
+
+
+def _log_of_median(ordinates: Tensor) -> Tensor:
+    """Log of the mean of exponential ordinates `(item, bin)`, by their median."""
+    n = ordinates.shape[-1]
+    rank = (n + 1) // 2
+    # Mean of that order statistic of n unit exponentials, ln 2 for many.
+    expected = sum(1 / i for i in range(n - rank + 1, n + 1)) if n < 100 else math.log(2)
+    return (ordinates.kthvalue(rank, dim=-1).values / expected).log()
+
+
+def _place(k: Tensor, highest: int) -> Tensor:
+    """Coordinate of the background: log frequency, at high frequencies rather the log distance from the highest."""
+    return k.log() - ((1 + _TOP) * highest - k).log()
+
+
+@dataclass(frozen=True, eq=False)
+class _Smoother:
+    """Linear smoother of the logs of bands.
+
+    Attributes:
+        edges: First bin of each band and the one after its last.
+        places: `(point,)`: the lowest bin, the middles of the bands, the highest bin.
+        matrix: `(point, band)`.
+        variance: Of the smoothed log, `(point,)`.
+    """
+
+    edges: list[tuple[int, int]]
+    places: np.ndarray
+    matrix: np.ndarray
+    variance: np.ndarray
+
+
+@functools.lru_cache(maxsize=16)
+def _smoother(first: int, last: int, highest: int) -> _Smoother:
+    """Smoothing spline: minimises `sum_b (y_b - s_b)^2 / v_b + integral (s'')^2 / q` over `_place`."""
+    edges = []
+    low = first
+    while low <= last:
+        distance = max(min(low, highest - low), highest * _TOP)
+        high = low + max(_BAND, math.ceil(_BAND_FRACTION * min(low, distance)))
+        if last + 1 - high < max(_BAND, (high - low) // 2):
+            high = last + 1
+        edges.append((low, high))
+        low = high
+    middles = [(a + b - 1) / 2 if a > _LOW else float(np.exp(np.log(np.arange(a, b)).mean())) for a, b in edges]
+    x = _place(torch.tensor([1.0, *middles, float(highest)], dtype=torch.float64), highest).numpy()
+    gap = np.diff(x)
+    curvature = np.zeros((len(x) - 2, len(x)))
+    for i in range(len(x) - 2):
+        width = (gap[i] + gap[i + 1]) / 2
+        row = np.array([1 / gap[i], -1 / gap[i] - 1 / gap[i + 1], 1 / gap[i + 1]]) / width
+        curvature[i, i : i + 3] = row * math.sqrt(width)
+    n_bins = np.array([b - a for a, b in edges])
+    variance = np.array(
+        [_MEDIAN_VARIANCE * (1 if _stride(n) == 1 else 0.5) / (n / _stride(n)) for n in n_bins.tolist()]
+    )
+    data = np.zeros((len(x), len(edges)))
+    data[1:-1] = np.diag(1 / variance)
+    precision = curvature.T @ curvature / _CURVATURE + np.pad(np.diag(1 / variance), 1)
+    covariance = np.linalg.inv(precision)
+    return _Smoother(edges, x, covariance @ data, covariance.diagonal().copy())
+
+
+@functools.lru_cache(maxsize=16)
+def _taper_kernel(n_samples: int, length: int) -> tuple[np.ndarray, np.ndarray]:
+    """Frequencies and weights `(bin, frequency)` that turn a density into the mean periodogram of the lowest bins.
+
+    The taper looks at `S` over two bins to either side, over which a steep spectrum bends; a mean removed with the
+    taper's weights takes the frequency 0 out.
+    """
+    per_bin = 8
+    n_low = min(_LOW, length // 4)
+    g = (np.arange((n_low + 8) * per_bin) + 0.5) / per_bin  # cycles in the record
+    g = g[g < n_samples / 2]
+    k = np.arange(1, n_low + 1)[:, None] * (n_samples / length)
+
+    def shape(v: np.ndarray) -> np.ndarray:
+        near = np.abs(np.abs(v) - 1) < 1e-9
+        return np.where(near, 0.5, np.sinc(v) / np.where(near, 1.0, 1 - v**2))
+
+    seen = [(shape(k - sign * g) - shape(k) * shape(g)) ** 2 for sign in (1, -1)]
+    kernel = (seen[0] + seen[1]) / (1.5 * per_bin)
+    return g / n_samples, kernel
+
+
+def _fast_length(n: int) -> int:
+    """Smallest even length >= n with the factors 2, 3 and 5 only: a prime one can be a hundred times slower."""
+    best = 1 << max((n - 1).bit_length(), 1)
+    five = 1
+    while five < best:
+        three = five
+        while three < best:
+            two = max(-(-n // three) - 1, 0).bit_length()
+            best = min(best, three << max(two, 1))
+            three *= 3
+        five *= 5
+    return best
