@@ -26,6 +26,9 @@ from gyrofuse._checks import check_positive, check_positive_integer
 from gyrofuse._console import Commands, progress, say, say_table, warn
 from gyrofuse._output import Outputs, output_folder
 from gyrofuse.demo import FILES, run_demo
+from gyrofuse.export import to_kalibr
+from gyrofuse.gmwm import fit_gmwm
+from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.multiscale import fit_multiscale
 from gyrofuse.multiscale_result import MultiScaleResult
 from gyrofuse.parsing import model_from_dict, parse_model
@@ -34,6 +37,7 @@ from gyrofuse.recording import Recording, read_recording
 from gyrofuse.report import (
     fusion_figure,
     fusion_report,
+    new_figure,
     number,
     recording_report,
     save_figure,
@@ -48,6 +52,8 @@ _SUFFIXES = {
     "figure": (".png", ".svg", ".pdf"),
     "json": (".json",),
     "report": (".html",),
+    "kalibr": (".yaml", ".yml"),
+    "model-out": (".json",),
 }
 
 app = typer.Typer(
@@ -240,6 +246,65 @@ def fuse(
             warn(str(note))
     say("\n".join([result.summary(), *remarks]))
     _say_notes(recording)
+
+
+@app.command()
+def fit(
+    logs: Logs,
+    model: Annotated[
+        str, typer.Option(metavar="FORMULA", help='Processes to fit, such as "WN + AR1 + RW" or "WN + 2*AR1 + SIN".')
+    ],
+    levels: Annotated[
+        int | None, typer.Option(metavar="J", help="Number of levels; as many as hold two windows by default.")
+    ] = None,
+    rest: Annotated[str | None, typer.Option(metavar="START:STOP", help="Fit this stretch alone (seconds).")] = None,
+    axis: Axis = None,
+    sensors: Sensors = None,
+    rate: Rate = None,
+    unit: Unit = None,
+    scale: Scale = None,
+    key: Key = None,
+    mounting: Mounting = None,
+    confidence_level: Annotated[float, typer.Option(metavar="P", help="Of all intervals.")] = 0.95,
+    kalibr: Annotated[Path | None, typer.Option(metavar="FILE", help="Write Kalibr's imu.yaml, of one sensor.")] = None,
+    model_out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the fitted model, .json, which simulate reads.")
+    ] = None,
+    figure: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draw the fit of the first sensor, .png, .svg or .pdf.")
+    ] = None,
+    json_file: Json = None,
+    force: Force = False,
+) -> None:
+    """Fit a noise model to every sensor of a log, recorded at rest."""
+    stretch = _stretch(rest)
+    outputs = {"kalibr": kalibr, "model-out": model_out, "figure": figure, "json": json_file}
+    with _outputs(force, [*logs, mounting], **outputs) as drafts:
+        recording = _read(logs, axis, sensors, rate, unit, scale, key, mounting)
+        with progress("fitting"):
+            part = recording.between(*stretch) if stretch else recording
+            result = fit_gmwm(part, model, confidence_level=confidence_level, n_levels=levels)
+        if kalibr:
+            drafts[kalibr].write_text(_kalibr(result, recording), encoding="utf-8")
+        if model_out:
+            _write_json(drafts[model_out], result.model.to_dict())
+        if figure:
+            drawn = new_figure(7.0, 4.6)
+            result.plot(drawn.subplots())
+            save_figure(drawn, drafts[figure], figure.suffix[1:])
+        if json_file:
+            _write_json(drafts[json_file], result.to_dict())
+    say(result.summary())
+    _say_notes(recording)
+
+
+def _kalibr(result: GMWMResult, recording: Recording) -> str:
+    params = result.params.flatten(0, -2)
+    if len(params) != 1:
+        raise ValueError(
+            f"`--kalibr`: expected one sensor and axis, got {len(params)}; choose with --sensors and --axis"
+        )
+    return to_kalibr(result.model.with_params(params[0]), recording.rate, recording.unit)
 
 
 @app.command()

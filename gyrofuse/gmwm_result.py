@@ -159,7 +159,9 @@ class GMWMResult:
         measured = self.wavelet_variance.mT[first]
         model = self.model.with_params(self.params[first])
         spread = moment_covariance(model, self.n_samples, len(measured)).diagonal()
-        limits = chi_square_interval(measured, 2 * measured.square() / spread, self.confidence_level)
+        # Degrees of freedom of the model: a variance that came out small by chance would seem to have none.
+        degrees = 2 * model.wavelet_variance(len(measured)).square() / spread
+        limits = chi_square_interval(measured, degrees, self.confidence_level)
         return plot_moment_fit(measured, limits, model, rate=self.rate, unit=self.unit, ax=ax)
 
     def to_dict(self) -> dict[str, Any]:

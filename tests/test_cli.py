@@ -229,6 +229,51 @@ def test_what_names_hold_does_not_steer_the_terminal(run: Run, tmp_path: Path):
         assert "\x07" not in done.out
 
 
+def test_fit_prints_the_parameters_and_writes_what_is_asked_for(run: Run, log: Path):
+    done = run(
+        "fit",
+        log,
+        "--model",
+        "WN",
+        "--json",
+        "r.json",
+        "--model-out",
+        "m.json",
+        "--figure",
+        "f.png",
+        "--confidence-level",
+        0.9,
+    )
+    assert done.status == 0
+    result = gf.fit_gmwm(gf.read_recording(log), "WN", confidence_level=0.9)
+    assert str(result) in done.out
+    assert json.loads(Path("r.json").read_text())["params"] == result.to_dict()["params"]
+    assert Path("f.png").read_bytes().startswith(b"\x89PNG")
+    again = run("simulate", "m.json", "--samples", 100, "--rate", 100, "--out", "s.npz")
+    assert again.status == 0
+    assert gf.read_recording("s.npz").signal.shape == (3, 100)
+
+
+def test_fit_writes_kalibr_of_one_sensor(run: Run, log: Path):
+    assert run("fit", log, "--model", "WN", "--sensors", "b", "--kalibr", "imu.yaml").status == 0
+    assert "gyroscope_noise_density: " in Path("imu.yaml").read_text()
+    refused(run("fit", log, "--model", "WN", "--kalibr", "all.yaml"), "expected one sensor and axis, got 3")
+    assert not Path("all.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (("--model", "WN + FOO"), "unknown process 'FOO'"),
+        (("--model", "WN + 5*AR1"), "at most as many parameters as"),
+        (("--model", "WN(variance=1)"), "expected parameters to be estimated"),
+        (("--model", "WN", "--kalibr", "imu.txt"), "`--kalibr`: expected a name that ends in .yaml or .yml"),
+    ],
+)
+def test_fit_refuses(run: Run, log: Path, options: tuple[str, ...], says: str):
+    refused(run("fit", log, *options), says)
+
+
 def test_simulate_array_model(run: Run):
     model = gf.ArrayModel([(gf.WhiteNoise(1.0), [[2.0, 0.5], [0.5, 1.0]]), (gf.RandomWalk(1e-4), [1.0, 2.0])])
     Path("model.json").write_text(json.dumps(model.to_dict()))
