@@ -28,7 +28,7 @@ from gyrofuse.bootstrap import block_bootstrap, bootstrap_wccv_covariance, boots
 from gyrofuse.competitors import equal_weights, inverse_variance_weights, nonnegative_weights, shrinkage_weights
 from gyrofuse.covariance import CrossCovariance, cross_covariance, wavelet_cross_covariance, wavelet_variance
 from gyrofuse.datasheet import Datasheet, datasheet
-from gyrofuse.export import StateSpace, state_space, to_c_header, to_kalibr
+from gyrofuse.export import to_c_header, to_kalibr
 from gyrofuse.gain import Gain
 from gyrofuse.gmwm import fit_gmwm
 from gyrofuse.gmwm_result import GMWMResult
@@ -51,6 +51,7 @@ from gyrofuse.saturation import find_saturation, mask_saturated
 from gyrofuse.scale_weights import resolve_scale_weights
 from gyrofuse.selection import Selection
 from gyrofuse.simulate import ArrayModel
+from gyrofuse.state_space import StateSpace, state_space
 from gyrofuse.svo import SVO, fit_svo
 from gyrofuse.svo_result import SVOResult
 from gyrofuse.svo_weights import SVOWeights, svo_weights

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 import torch
 
-from gyrofuse.export import StateSpace, state_space, to_c_header, to_kalibr
+from gyrofuse.export import to_c_header, to_kalibr
 from gyrofuse.processes import AR1, Drift, Model, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
+from gyrofuse.state_space import StateSpace, state_space
 
 # Every process with its mean at t = 1, 2, .. and its autocovariance at s, t.
 ZERO = np.zeros_like

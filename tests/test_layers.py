@@ -38,7 +38,17 @@ LAYERS = [
     {"svo_weights"},
     {"intervals", "influence", "parametric", "pilot", "moment_inference", "_moment_search"},
     {"bootstrap", "series", "block_length", "scale_weights", "moment_covariance", "tones", "_composition"},
-    {"covariance", "metric", "uncertainty", "simulate", "parsing", "datasheet", "export", "plotting_models"},
+    {
+        "covariance",
+        "metric",
+        "uncertainty",
+        "simulate",
+        "parsing",
+        "datasheet",
+        "export",
+        "state_space",
+        "plotting_models",
+    },
     {"haar", "processes", "recording", "io"},
     {"units", "plotting"},
 ]
