@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import fields
 
 import torch
 from torch import Tensor
@@ -14,11 +15,12 @@ from gyrofuse._result import named, numbered
 from gyrofuse.covariance import wavelet_variance
 from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.moment_covariance import moment_covariance
-from gyrofuse.moment_inference import Fit, infer
+from gyrofuse.moment_inference import Estimates, Fit, Inference, estimated, infer
 from gyrofuse.parsing import parse_model
 from gyrofuse.processes import Model, Process, Sinusoid
 from gyrofuse.recording import Recording
 from gyrofuse.tones import find_tones
+from gyrofuse.whittle import refine_whittle
 
 WEIGHTINGS = ("optimal", "diagonal", "identity")
 _REWEIGHTINGS, _UPDATES, _DISTINCT = 3, 3, 3
@@ -34,6 +36,7 @@ def fit_gmwm(
     confidence_level: float = 0.95,
     n_samples: int | None = None,
     n_levels: int | None = None,
+    refine: bool = False,
     strict: bool = False,
 ) -> GMWMResult:
     """Fit a sum of noise processes to the wavelet variance of every sensor.
@@ -51,6 +54,8 @@ def fit_gmwm(
         confidence_level: Probability that an interval holds the true value.
         n_samples: Length of the record behind a wavelet variance.
         n_levels: Number of levels J; by default all that hold two windows side by side.
+        refine: Go on from the moments to the maximum of the spectral (Whittle) likelihood, which knows the parameters
+            a few per cent better; the fit has to start near it, and the signal may have no missing samples.
         strict: Raise when an item cannot be fitted, instead of marking it.
 
     Returns:
@@ -91,15 +96,25 @@ def fit_gmwm(
         _report(nu, usable, sensors, strict)
     fit = _fit_items(nu[usable], series[usable] if series is not None else None, length, made_of, omega)
     inference = infer(fit, made_of, length, confidence_level)
+    estimates, fitted = inference.estimates, inference.fitted
+    if refine:
+        if series is None:
+            raise ValueError(
+                "`refine`: expected a signal, whose spectrum says more than its wavelet variance, got none"
+            )
+        estimates, fitted = _refined(series[usable], fit, made_of, inference, confidence_level)
     return GMWMResult.build(
         fit=fit,
         inference=inference,
+        estimates=estimates,
+        fitted=fitted,
         made_of=made_of,
         usable=usable,
         wavelet_variance=nu,
         batch=(*batch, n_sensors),
         n_samples=length,
         weighting=name,
+        refined=refine,
         confidence_level=confidence_level,
         sensors=tuple(sensors),
         rate=recording.rate if recording else None,
@@ -161,6 +176,29 @@ def _fit_items(nu: Tensor, series: Tensor | None, n_samples: int, made_of: Compo
         converged=reached & linear.isfinite().all(-1),
         omega=omega,
     )
+
+
+def _refined(
+    series: Tensor, fit: Fit, made_of: Composition, inference: Inference, confidence_level: float
+) -> tuple[Estimates, Tensor]:
+    """Estimates and wavelet variances at the maximum of the spectral likelihood; the moments' where there is none."""
+    whittle = refine_whittle(series, made_of, fit.linear, fit.shape)
+    kept = ~whittle.converged
+    if bool(kept.any()):
+        warnings.warn(
+            f"`refine`: {int(kept.sum())} of {len(kept)} fits could not be refined (missing samples, or no maximum "
+            "near the moments); they are those of the moments",
+            stacklevel=3,
+        )
+    linear = torch.where(kept[:, None], fit.linear, whittle.linear)
+    shape = torch.where(kept[:, None], fit.shape, whittle.shape)
+    better = estimated(made_of, linear, shape, whittle.covariance, whittle.edge_sd, confidence_level)
+    own = inference.estimates
+    merged = (
+        torch.where(kept.view(-1, *(1,) * (new.ndim - 1)), old, new)
+        for old, new in ((getattr(own, f.name), getattr(better, f.name)) for f in fields(Estimates))
+    )
+    return Estimates(*merged), (made_of.columns(fit.tau, shape) @ linear[..., None])[..., 0]
 
 
 def _n_starts(made_of: Composition) -> int:

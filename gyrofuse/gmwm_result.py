@@ -13,7 +13,7 @@ from gyrofuse._composition import Composition
 from gyrofuse._result import ConfidenceInterval, listed
 from gyrofuse.datasheet import datasheet
 from gyrofuse.moment_covariance import moment_covariance
-from gyrofuse.moment_inference import Fit, Inference
+from gyrofuse.moment_inference import Estimates, Fit, Inference
 from gyrofuse.processes import Model
 from gyrofuse.uncertainty import chi_square_interval
 
@@ -44,6 +44,7 @@ class GMWMResult:
         fitted_wavelet_variance: Of the model, the same.
         n_samples: Length of the records.
         weighting: Of the moments.
+        refined: Whether the parameters are those of the spectral likelihood; the J test is the moments' all the same.
         sensors: Names.
         rate: Hz, where known.
         unit: Of the signal, where known.
@@ -64,6 +65,7 @@ class GMWMResult:
     fitted_wavelet_variance: Tensor
     n_samples: int
     weighting: str
+    refined: bool
     sensors: tuple[str, ...]
     rate: float | None
     unit: str | None
@@ -74,6 +76,8 @@ class GMWMResult:
         *,
         fit: Fit,
         inference: Inference,
+        estimates: Estimates,
+        fitted: Tensor,
         made_of: Composition,
         usable: Tensor,
         wavelet_variance: Tensor,
@@ -89,20 +93,20 @@ class GMWMResult:
 
         tested = (inference.degrees > 0) & (rest["weighting"] == "optimal")
         p_value = torch.where(tested, _chi_square_tail(inference.j_statistic, inference.degrees), torch.nan)
-        params = placed(inference.params, torch.nan)
+        params = placed(estimates.params, torch.nan)
         return cls(
             model=(model := Model(list(made_of.processes))).with_params(params),
             param_names=model.param_names,
             params=params,
-            param_cov=placed(inference.covariance, torch.nan),
-            confidence_interval=ConfidenceInterval(placed(inference.low, torch.nan), placed(inference.high, torch.nan)),
-            determined=placed(inference.determined, False),
+            param_cov=placed(estimates.covariance, torch.nan),
+            confidence_interval=ConfidenceInterval(placed(estimates.low, torch.nan), placed(estimates.high, torch.nan)),
+            determined=placed(estimates.determined, False),
             objective=placed(inference.objective, torch.nan),
             j_statistic=placed(inference.j_statistic, torch.nan),
             p_value=placed(p_value, torch.nan),
             converged=placed(fit.converged, False),
             wavelet_variance=wavelet_variance.view(*batch, -1).mT,
-            fitted_wavelet_variance=placed(inference.fitted, torch.nan).mT,
+            fitted_wavelet_variance=placed(fitted, torch.nan).mT,
             **rest,
         )
 
@@ -110,7 +114,8 @@ class GMWMResult:
         """Parameters with intervals, sensor by sensor, and in datasheet units where rate and unit are known."""
         batch = self.params.shape[:-2]
         name = " + ".join(p.symbol for p in self.model.processes)
-        lines = [f"GMWM fit of {name}: {self.n_samples} samples, {self.wavelet_variance.shape[-2]} levels"]
+        kind = "GMWM fit, refined by spectral likelihood," if self.refined else "GMWM fit"
+        lines = [f"{kind} of {name}: {self.n_samples} samples, {self.wavelet_variance.shape[-2]} levels"]
         n_items = self.params.shape[:-1].numel()
         if batch:
             lines.append(f"{n_items} fits in a batch {tuple(batch)}, {int(self.converged.sum())} converged")
@@ -183,6 +188,7 @@ class GMWMResult:
             "fitted_wavelet_variance": listed(self.fitted_wavelet_variance),
             "n_samples": self.n_samples,
             "weighting": self.weighting,
+            "refined": self.refined,
             "sensors": list(self.sensors),
             "rate": self.rate,
             "unit": self.unit,

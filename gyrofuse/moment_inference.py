@@ -39,18 +39,14 @@ class Fit:
 
 
 @dataclass(frozen=True, eq=False)
-class Inference:
-    """Uncertainty of fitted parameters.
+class Estimates:
+    """Parameters of the model with their uncertainty.
 
     Attributes:
         params: `(item, parameter)`.
         covariance: `(item, parameter, parameter)`; zero rows for variances at zero.
         low: `(item, parameter)`.
         high: `(item, parameter)`; of a variance at zero a one-sided limit.
-        fitted: Wavelet variances of the fitted model, `(item, level)`.
-        objective: `r' Omega r`, `(item,)`.
-        j_statistic: `r' V^-1 r`, `(item,)`.
-        degrees: Of freedom of the J statistic, `(item,)`.
         determined: `(item, parameter)`, whether the data say more than its order of magnitude.
     """
 
@@ -58,29 +54,38 @@ class Inference:
     covariance: Tensor
     low: Tensor
     high: Tensor
+    determined: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Inference:
+    """What a moment fit says.
+
+    Attributes:
+        estimates: Parameters with their uncertainty.
+        fitted: Wavelet variances of the fitted model, `(item, level)`.
+        objective: `r' Omega r`, `(item,)`.
+        j_statistic: `r' V^-1 r`, `(item,)`.
+        degrees: Of freedom of the J statistic, `(item,)`.
+    """
+
+    estimates: Estimates
     fitted: Tensor
     objective: Tensor
     j_statistic: Tensor
     degrees: Tensor
-    determined: Tensor
 
 
 def infer(fit: Fit, made_of: Composition, n_samples: int, confidence_level: float) -> Inference:
-    """Sandwich covariance `(A' O A)^-1 A' O V O A (A' O A)^-1`, `A = d nu / d theta` ([V] theorem 2), and intervals.
-
-    Intervals are symmetric in the logarithm of variances and amplitudes and in `atanh phi`. A variance estimated as
-    zero lies on the edge of its range: it gets the upper limit only, and an AR1 without variance any `phi`.
+    """Sandwich covariance `(A' O A)^-1 A' O V O A (A' O A)^-1`, `A = d nu / d theta` ([V] theorem 2), and the J test.
 
     Args:
         fit: Where the search ended.
         made_of: Structure of the model.
         n_samples: Length T of the records.
         confidence_level: Probability that an interval holds the true value.
-
-    Returns:
-        Parameters with their uncertainty.
     """
-    values, slope = made_of.columns(fit.tau, fit.shape), made_of.slopes(fit.tau, fit.shape)
+    values, slopes = made_of.columns(fit.tau, fit.shape), made_of.slopes(fit.tau, fit.shape)
     fitted = (values @ fit.linear[..., None])[..., 0]
     covariance = moment_covariance(made_of.model(fit.linear, fit.shape), n_samples, len(fit.tau))
     residual = fit.variance - fitted
@@ -90,77 +95,91 @@ def infer(fit: Fit, made_of: Composition, n_samples: int, confidence_level: floa
 
     # Jacobian by p, and by x of the unknown shapes: (item, level, unknown)
     moving = [made_of.shaped.index(k) for k in made_of.curved]
-    by_shape = (slope * fit.linear[:, None, made_of.shaped])[..., moving]
-    jacobian = torch.cat([values, by_shape], -1)
+    jacobian = torch.cat([values, (slopes * fit.linear[:, None, made_of.shaped])[..., moving]], -1)
     present = fit.linear > 0  # (item, process)
     active = torch.cat([present, present[:, made_of.curved]], -1)
     own, objective = _sandwich(jacobian, active, covariance, residual, fit.omega)
     # With the variances at zero let off it, how far they might be.
-    edge, _ = _sandwich(
-        jacobian, torch.cat([torch.ones_like(present), present[:, made_of.curved]], -1), covariance, residual, fit.omega
+    free = torch.cat([torch.ones_like(present), present[:, made_of.curved]], -1)
+    edge, _ = _sandwich(jacobian, free, covariance, residual, fit.omega)
+    n_linear = made_of.n_linear
+    estimates = estimated(
+        made_of,
+        fit.linear,
+        fit.shape,
+        _in_logs(own, fit, made_of),
+        edge.diagonal(dim1=-2, dim2=-1)[:, :n_linear].clamp(min=0).sqrt(),
+        confidence_level,
     )
-    n_free = active.sum(-1)
-    degrees = (len(fit.tau) - n_free).to(j_statistic)
+    degrees = (len(fit.tau) - active.sum(-1)).to(j_statistic)
+    return Inference(estimates, fitted, objective, j_statistic, degrees)
 
-    z = _normal_quantile((1 + confidence_level) / 2)
-    z_one_sided = _normal_quantile(confidence_level)
-    params = made_of.params(fit.linear, fit.shape)
-    low, high, scale = torch.empty_like(params), torch.empty_like(params), torch.zeros_like(params)
-    determined = torch.ones_like(params, dtype=torch.bool)
-    unknown = [-1] * params.shape[-1]  # which column of the Jacobian a parameter has
-    column, at_curved, at_shaped, at_held = 0, made_of.n_linear, 0, 0
-    spread = own.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
-    limit = edge.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
-    held_at: list[tuple[int, int]] = []
+
+def _in_logs(own: Tensor, fit: Fit, made_of: Composition) -> Tensor:
+    """Covariance `(item, unknown, unknown)` of `ln p` of all processes and `x` of all shaped ones, held ones too."""
+    n_linear, shaped = made_of.n_linear, made_of.shaped
+    scale = torch.where(fit.linear > 0, fit.linear.clamp(min=1e-300).reciprocal(), 0.0)
+    scale = torch.cat([scale, torch.ones_like(own[:, n_linear:, 0])], -1)
+    place = [*range(n_linear), *(n_linear + shaped.index(k) for k in made_of.curved)]
+    size = n_linear + len(shaped)
+    spread = own.new_zeros(len(own), size, size)
+    index = torch.tensor(place, device=own.device)
+    spread[:, index[:, None], index] = own * scale[:, :, None] * scale[:, None, :]
+    held = [n_linear + at for at, k in enumerate(shaped) if k not in made_of.curved]
+    if held:
+        part = fit.shape[:, [at - n_linear for at in held]].sigmoid()
+        spread[:, held, held] = (fit.held_sd / (torch.pi * part * (1 - part))).square()
+    return spread
+
+
+def estimated(
+    made_of: Composition, linear: Tensor, shape: Tensor, spread: Tensor, edge_sd: Tensor, confidence_level: float
+) -> Estimates:
+    """Parameters with intervals that respect their ranges.
+
+    Intervals are symmetric in the logarithm of variances and amplitudes, in `atanh phi` and in `logit(beta / pi)`. A
+    variance estimated as zero lies on the edge of its range: it gets an upper limit only, and an AR1 without variance
+    any `phi`.
+
+    Args:
+        made_of: Structure of the model.
+        linear: `p`, `(item, process)`.
+        shape: `x`, `(item, shaped)`.
+        spread: Covariance of `ln p` of all processes and `x` of all shaped ones, `(item, unknown, unknown)`.
+        edge_sd: Standard deviation of `p` itself with those at zero let off it, `(item, process)`.
+        confidence_level: Probability that an interval holds the true value.
+    """
+    z, one_sided = _normal_quantile((1 + confidence_level) / 2), _normal_quantile(confidence_level)
+    sd = spread.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
+    found: list[tuple[int, Tensor, Tensor, Tensor, Tensor]] = []  # unknown, low, high, slope, determined
+    at_shaped = made_of.n_linear
     for k, process in enumerate(made_of.processes):
-        p, sd = fit.linear[:, k], spread[:, k]
-        rooted = isinstance(process, (Sinusoid, Drift))
-        if isinstance(process, AR1):
-            x, sd_x = fit.shape[:, at_shaped], spread[:, at_curved]
-            there = present[:, k]
-            low[:, column] = torch.where(there, (x - z * sd_x).tanh(), -1.0)
-            high[:, column] = torch.where(there, (x + z * sd_x).tanh(), 1.0)
-            scale[:, column] = 1 - x.tanh().square()
-            determined[:, column] = there & (sd_x < WEAKLY_DETERMINED)
-            unknown[column] = at_curved
-            column, at_curved, at_shaped = column + 1, at_curved + 1, at_shaped + 1
-        ratio = torch.where(p > 0, sd / p, torch.inf)
-        first = torch.where(p > 0, p * torch.exp(-z * ratio), 0.0)
-        last = torch.where(p > 0, p * torch.exp(z * ratio), z_one_sided * limit[:, k])
-        low[:, column], high[:, column] = (first.sqrt(), last.sqrt()) if rooted else (first, last)
-        # a = sqrt(p)
-        scale[:, column] = torch.where(p > 0, 0.5 / p.clamp(min=1e-300).sqrt(), 0.0) if rooted else 1.0
-        determined[:, column] = ratio < WEAKLY_DETERMINED
-        unknown[column] = k
-        column += 1
-        if isinstance(process, Sinusoid):
-            x = fit.shape[:, at_shaped]
-            at_shaped += 1
-            if made_of.held:
-                beta, sd_b = params[:, column], fit.held_sd[:, at_held]
-                held_at.append((column, at_held))
-                at_held += 1
-                low[:, column] = (beta - z * sd_b).nan_to_num(nan=0.0).clamp(min=0)
-                high[:, column] = (beta + z * sd_b).nan_to_num(nan=torch.pi).clamp(max=torch.pi)
-                determined[:, column] = sd_b < WEAKLY_DETERMINED * beta
+        p, ratio = linear[:, k], sd[:, k]
+        present = p > 0
+        low = torch.where(present, p * torch.exp(-z * ratio), 0.0)
+        high = torch.where(present, p * torch.exp(z * ratio), one_sided * edge_sd[:, k])
+        size = (k, low, high, p, present & (ratio < WEAKLY_DETERMINED))
+        if isinstance(process, (Sinusoid, Drift)):  # p is the square of the parameter
+            size = (k, low.sqrt(), high.sqrt(), p.sqrt() / 2, size[-1])
+        if isinstance(process, (AR1, Sinusoid)):
+            x, width = shape[:, at_shaped - made_of.n_linear], sd[:, at_shaped]
+            # Without variance, or fewer than a few cycles of a tone, it may be anything.
+            width = torch.where(present & width.isfinite(), width, torch.inf)
+            known = width < WEAKLY_DETERMINED
+            if isinstance(process, AR1):
+                form = (at_shaped, (x - z * width).tanh(), (x + z * width).tanh(), 1 - x.tanh().square(), known)
+                found += [form, size]
             else:
-                sd_x = spread[:, at_curved]
-                low[:, column] = torch.pi * (x - z * sd_x).sigmoid()
-                high[:, column] = torch.pi * (x + z * sd_x).sigmoid()
-                scale[:, column] = torch.pi * x.sigmoid() * (1 - x.sigmoid())
-                determined[:, column] = sd_x < WEAKLY_DETERMINED
-                unknown[column] = at_curved
-                at_curved += 1
-            column += 1
-    known = [c for c, u in enumerate(unknown) if u >= 0]
-    full = torch.zeros(*params.shape, params.shape[-1], dtype=params.dtype, device=params.device)
-    index = torch.tensor([unknown[c] for c in known], device=params.device)
-    block = own[:, index[:, None], index] * scale[:, known, None] * scale[:, None, known]
-    place = torch.tensor(known, device=params.device)
-    full[:, place[:, None], place] = block
-    for c, tone in held_at:
-        full[:, c, c] = fit.held_sd[:, tone].square()
-    return Inference(params, full, low, high, fitted, objective, j_statistic, degrees, determined)
+                part = x.sigmoid()
+                low, high = (torch.pi * (x + sign * z * width).sigmoid() for sign in (-1, 1))
+                found += [size, (at_shaped, low, high, torch.pi * part * (1 - part), known)]
+            at_shaped += 1
+        else:
+            found.append(size)
+    lows, highs, slopes, determined = (torch.stack(column, -1) for column in list(zip(*found, strict=True))[1:])
+    index = torch.tensor([unknown for unknown, *_ in found], device=spread.device)
+    covariance = spread[:, index[:, None], index] * slopes[:, :, None] * slopes[:, None, :]
+    return Estimates(made_of.params(linear, shape), covariance, lows, highs, determined)
 
 
 def _sandwich(
