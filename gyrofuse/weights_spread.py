@@ -314,7 +314,8 @@ def _jacobian_rows(weights_of: Callable[[Tensor], Tensor], combined: Tensor) -> 
         leaf = combined.clone().requires_grad_()
         weights = weights_of(leaf).unbind(-1)
     for weight in weights:
-        row = torch.autograd.grad(weight.sum(), leaf, retain_graph=True)[0]
+        with torch.inference_mode(False), torch.enable_grad():
+            row = torch.autograd.grad(weight.sum(), leaf, retain_graph=True)[0]
         yield (row + row.mT) / 2
 
 
