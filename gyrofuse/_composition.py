@@ -71,6 +71,10 @@ class Composition:
             values.append(value)
         return torch.stack(values, -1)
 
+    def wavelet_variance(self, tau: Tensor, linear: Tensor, shape: Tensor) -> Tensor:
+        """Of the whole sum, `(..., level)`, from `p` and `x`."""
+        return (self.columns(tau, shape) @ linear[..., None])[..., 0]
+
     def slopes(self, tau: Tensor, shape: Tensor) -> Tensor:
         """Derivatives `du/dx` of the `shaped` processes, `(..., level, shaped)`."""
         found = []

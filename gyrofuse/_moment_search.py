@@ -100,7 +100,7 @@ def minimise(
         values, slope = made_of.columns(tau, at), made_of.slopes(tau, at)
         jacobian = _times(w, slope * p[:, None, made_of.shaped])[..., moving]
         jacobian = jacobian - _projected(_times(w, values), p > 0, jacobian)
-        residual = _times(w, (y - (values @ p[..., None])[..., 0])[..., None])
+        residual = _times(w, y[..., None] - values @ p[..., None])
         gradient = (jacobian.mT @ residual)[..., 0]
         normal = jacobian.mT @ jacobian
         size = normal.diagonal(dim1=-2, dim2=-1)
@@ -141,10 +141,7 @@ def _evaluate(target: Tensor, root: Tensor, tau: Tensor, made_of: Composition, x
 
 def _solve(values: Tensor, target: Tensor, root: Tensor) -> tuple[Tensor, Tensor]:
     """Variances that fit best, and the distance left; `values` `(..., level, linear)`."""
-    if root.ndim == values.ndim:
-        columns, y = root @ values, root @ target[..., None]
-    else:
-        columns, y = root[..., None] * values, (root * target)[..., None]
+    columns, y = _times(root, values), _times(root, target[..., None])
     linear = nonnegative_least_squares(columns.mT @ columns, (columns.mT @ y)[..., 0])
     return linear, (y - columns @ linear[..., None]).square().sum((-2, -1))
 

@@ -71,6 +71,8 @@ def fit_gmwm(
     recording = signal if isinstance(signal, Recording) else None
     values = signal.signal if isinstance(signal, Recording) else signal
     check_confidence_level(confidence_level)
+    if refine and n_samples is not None:
+        raise ValueError("`refine`: expected a signal, whose spectrum says more than its wavelet variance, got none")
     if n_samples is None:
         check_signal("signal", values)
         length = values.shape[-1]
@@ -97,11 +99,7 @@ def fit_gmwm(
     fit = _fit_items(nu[usable], series[usable] if series is not None else None, length, made_of, omega)
     inference = infer(fit, made_of, length, confidence_level)
     estimates, fitted = inference.estimates, inference.fitted
-    if refine:
-        if series is None:
-            raise ValueError(
-                "`refine`: expected a signal, whose spectrum says more than its wavelet variance, got none"
-            )
+    if refine and series is not None:
         estimates, fitted = _refined(series[usable], fit, made_of, inference, confidence_level)
     return GMWMResult.build(
         fit=fit,
@@ -145,7 +143,7 @@ def _fit_items(nu: Tensor, series: Tensor | None, n_samples: int, made_of: Compo
         each(nu, n_starts), each(root, n_starts), tau, made_of, start.flatten(0, 1)
     )
     for _ in range(_REWEIGHTINGS if own is None else 0):
-        fitted = (made_of.columns(tau, x) @ linear[..., None])[..., 0]
+        fitted = made_of.wavelet_variance(tau, linear, x)
         root = (observations.sqrt() / fitted.clamp(min=1e-30)).clamp(max=1e15)
         linear, x, objective, _ = search.minimise(each(nu, n_starts), root, tau, made_of, x)
         # Distances with different weights: the likelihood of independent normal variances makes them comparable.
@@ -198,7 +196,7 @@ def _refined(
         torch.where(kept.view(-1, *(1,) * (new.ndim - 1)), old, new)
         for old, new in ((getattr(own, f.name), getattr(better, f.name)) for f in fields(Estimates))
     )
-    return Estimates(*merged), (made_of.columns(fit.tau, shape) @ linear[..., None])[..., 0]
+    return Estimates(*merged), made_of.wavelet_variance(fit.tau, linear, shape)
 
 
 def _n_starts(made_of: Composition) -> int:

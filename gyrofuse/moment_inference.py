@@ -10,6 +10,7 @@ from torch import Tensor
 from gyrofuse._composition import Composition
 from gyrofuse.moment_covariance import moment_covariance
 from gyrofuse.processes import AR1, Drift, Sinusoid
+from gyrofuse.uncertainty import normal_quantile
 
 # Beyond this spread of its logarithm a variance is known to hardly its order of magnitude.
 WEAKLY_DETERMINED = 0.5
@@ -149,7 +150,7 @@ def estimated(
         edge_sd: Standard deviation of `p` itself with those at zero let off it, `(item, process)`.
         confidence_level: Probability that an interval holds the true value.
     """
-    z, one_sided = _normal_quantile((1 + confidence_level) / 2), _normal_quantile(confidence_level)
+    z, one_sided = normal_quantile((1 + confidence_level) / 2), normal_quantile(confidence_level)
     sd = spread.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
     found: list[tuple[int, Tensor, Tensor, Tensor, Tensor]] = []  # unknown, low, high, slope, determined
     at_shaped = made_of.n_linear
@@ -206,7 +207,3 @@ def _sandwich(
     spread = inverse @ (weighted.mT @ covariance @ weighted) @ inverse
     keep = active[:, :, None] & active[:, None, :]
     return torch.where(keep, spread / size[:, :, None] / size[:, None, :], 0.0), objective
-
-
-def _normal_quantile(probability: float) -> float:
-    return float(torch.special.ndtri(torch.tensor(probability, dtype=torch.float64)))

@@ -56,6 +56,11 @@ def chi_square_interval(variance: Tensor, degrees: Tensor, confidence_level: flo
     return ConfidenceInterval(scaled / low, scaled / high)
 
 
+def normal_quantile(probability: float) -> float:
+    """Quantile of the standard normal law."""
+    return float(torch.special.ndtri(torch.tensor(probability, dtype=torch.float64)))
+
+
 def t_quantile(degrees: Tensor, confidence_level: float) -> Tensor:
     """Quantile of Student's t for a symmetric interval, of the shape of `degrees`; infinite ones are normal."""
     from scipy import stats

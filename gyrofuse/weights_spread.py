@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -20,7 +20,7 @@ from torch import Tensor
 from gyrofuse import series
 from gyrofuse.parametric import resample_combined
 from gyrofuse.pilot import Pilot, fit_pilot
-from gyrofuse.uncertainty import t_quantile
+from gyrofuse.uncertainty import normal_quantile, t_quantile
 
 # Windows side by side from which on the series alone is believed.
 _MANY_WINDOWS = 64
@@ -55,7 +55,7 @@ class WeightsSpread:
 
     def __getitem__(self, items: Tensor) -> WeightsSpread:
         """Some items of the leading batch dimension."""
-        return WeightsSpread(self.covariance[items], self.degrees[items], self.half_width[items])
+        return WeightsSpread(*(getattr(self, field.name)[items] for field in fields(self)))
 
 
 def certain(weights: Tensor) -> WeightsSpread:
@@ -112,9 +112,7 @@ def spread_of_weights(
             "noise, and take intervals at the last levels as indicative",
             stacklevel=3,
         )
-    return WeightsSpread(
-        *(torch.cat(values) for values in zip(*((p.covariance, p.degrees, p.half_width) for p in parts), strict=True))
-    )
+    return WeightsSpread(*(torch.cat([getattr(p, field.name) for p in parts]) for field in fields(WeightsSpread)))
 
 
 def _spread(
@@ -188,9 +186,9 @@ def _lower(
 def _with(spread: WeightsSpread, which: Tensor, part: WeightsSpread) -> WeightsSpread:
     """`spread` with `part` in place of those items."""
     values = []
-    for name in ("covariance", "degrees", "half_width"):
-        merged = getattr(spread, name).clone()
-        merged[which] = getattr(part, name)
+    for field in fields(spread):
+        merged = getattr(spread, field.name).clone()
+        merged[which] = getattr(part, field.name)
         values.append(merged)
     return WeightsSpread(*values)
 
@@ -238,10 +236,9 @@ def _resampled(
     rank = min(math.ceil(resampled_level * (n_resamples + 1)), n_resamples)
     half_width = own * (moved / _spread_of_one(weights_of, combined)).abs().kthvalue(rank, dim=1).values
     if confidence_level > resampled_level:
-        normal_law = torch.full((), torch.inf, dtype=torch.float64)
         half_width = half_width * (
-            t_quantile(normal_law, confidence_level) / t_quantile(normal_law, resampled_level)
-        ).to(half_width)
+            normal_quantile((1 + confidence_level) / 2) / normal_quantile((1 + resampled_level) / 2)
+        )
     return WeightsSpread(covariance, _observations_left(expected + below, center, covariance), half_width)
 
 
