@@ -24,8 +24,8 @@ from gyrofuse.uncertainty import normal_quantile, t_quantile
 
 # Windows side by side from which on the series alone is believed.
 _MANY_WINDOWS = 64
-# The share of the variance from which levels of few windows decide: nothing below them shall bend their model.
-_FEW_WINDOWS, _MOST = 64, 0.9985
+# The share of the variance from which levels of fewer decide: nothing below them shall bend their model.
+_MOST = 0.9985
 # 1.5 for white noise, 1.4 for flicker, 1.25 for a random walk.
 _CORRELATION = 1.3
 _N_RESAMPLES, _MOST_RESAMPLES = 999, 9_999
@@ -143,7 +143,7 @@ def _spread(
         return by_series, 0
 
     by_model = by_series
-    share = (spread * (_windows(totals) < _FEW_WINDOWS)).sum(-1) / spread.sum(-1)
+    share = (spread * (_windows(totals) < _MANY_WINDOWS)).sum(-1) / spread.sum(-1)
     last_levels_decide = share > _MOST
     for needed, levels_below in ((last_levels_decide, 0), (few & ~last_levels_decide, 2)):
         if bool(needed.any()):
