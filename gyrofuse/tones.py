@@ -16,17 +16,17 @@ References:
 
 from __future__ import annotations
 
-import functools
-import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from gyrofuse._checks import check_floating, check_positive_integer
+from gyrofuse._line import Line
+from gyrofuse._line_background import place, smooth_background
+from gyrofuse._transforms import fast_length, taper_kernel, tone_in_hann
 
 NoiseSpectrum = Callable[[Tensor], Tensor]
 
@@ -41,17 +41,7 @@ _CHUNK = 2**20
 # The few dozen coefficients of a fit need no second transform: sums over blocks of time, with so many powers of time
 # within a block, give them to 1e-10.
 _BLOCKS, _POWERS = 256, 8
-_GRID = torch.arange(-24, 25, dtype=torch.float64) / 16  # first look around the peak, in 1/T cycles per sample
-_STEPS, _SWEEPS = 6, 3
-# Smooth background: bands at least so many bins and a fraction of their frequency wide, or of the distance from the
-# highest frequency, down to a part of that; its curvature in log frequency is white noise of this intensity (between
-# white noise and a random walk it reaches 1 within an octave).
-_BAND, _BAND_FRACTION, _TOP, _CURVATURE = 6, 0.18, 1 / 32, 0.3
-# Variance of the log of the median of n neighbouring Hann ordinates, times n: twice that of independent ones, which
-# every other one nearly is.
-_MEDIAN_VARIANCE = 2 / math.log(2) ** 2
-_ENOUGH_ORDINATES = 2**10  # for the median of a band
-_LOW = 64  # bins over which the taper's width matters
+_SWEEPS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,12 +152,12 @@ def _records(signal: Tensor, noise_spectrum: NoiseSpectrum | None) -> Iterator[_
     """The batch in parts of bounded size, one at a time."""
     items = signal.detach().reshape(-1, signal.shape[-1])
     n_samples = items.shape[-1]
-    length = _fast_length(n_samples)
+    length = fast_length(n_samples)
     density = low = None
     if noise_spectrum is not None:
         f = torch.arange(1, length // 2 + 1, dtype=torch.float64, device=signal.device) / length
         density = _density(noise_spectrum, f, signal)
-        fine, kernel = (torch.from_numpy(v).to(signal.device) for v in _taper_kernel(n_samples, length))
+        fine, kernel = (torch.from_numpy(v).to(signal.device) for v in taper_kernel(n_samples, length))
         low = _density(noise_spectrum, fine, signal) @ kernel.T
     size = max(_CHUNK // n_samples, 1)
     for first in range(0, len(items), size):
@@ -222,7 +212,7 @@ class _Records:
         self._spectrum = torch.fft.rfft(self._signal * taper, n=self._length)
         self._highest = self._length // 2
         k = torch.arange(1, self._highest + 1, dtype=torch.float64, device=device)
-        self._place = _place(k, self._highest)
+        self._place = place(k, self._highest)
         if self._density is not None:
             log_size = 2 * self._unit.log()
             self._log_s = self._density[0].log() - log_size
@@ -232,7 +222,7 @@ class _Records:
 
     def find(self, n_tones: int) -> tuple[Tensor, ...]:
         """`beta, amplitude, phase, beta_sd, amplitude_sd, p_value`, all `(item, tone)`."""
-        lines: list[_Line] = []
+        lines: list[Line] = []
         p_values = []
         for _ in range(n_tones):
             peak, p_value = self.peak()
@@ -286,35 +276,11 @@ class _Records:
         """Smooth density of the noise from the periodogram; returns degrees of freedom by bin, or None when given."""
         if self._density is not None:
             return None
-        smoother = _smoother(self._first, self._last, self._length // 2)
-        matrix, at = (torch.from_numpy(v).to(power) for v in (smoother.matrix, smoother.places))
-        centre = at[1:-1]
-        logs = power.new_empty(len(power), len(smoother.edges))
-        for b, (low, high) in enumerate(smoother.edges):
-            logs[:, b] = _log_of_median(power[:, low - 1 : high - 1 : _stride(high - low)])
-        smooth = logs @ matrix.T  # (item, point)
-        for _ in range(2):
-            # Where a band spans octaves, once more without the slope.
-            for b, (low, high) in enumerate(smoother.edges):
-                if low > _LOW:
-                    break
-                bins = self._place[low - 1 : high - 1]
-                slope = (smooth[:, b + 2] - smooth[:, b]) / (at[b + 2] - at[b])
-                tilt = torch.exp(slope[:, None] * (bins - centre[b]))
-                logs[:, b] = _log_of_median(power[:, low - 1 : high - 1] / tilt)
-            smooth = logs @ matrix.T
-        # Straight lines between the points; the variance goes with them as one more item.
-        corners = torch.cat([smooth, torch.from_numpy(smoother.variance).to(power)[None]])
-        slopes = corners.diff(dim=-1) / at.diff()
-        lines = power.new_empty(len(corners), self._highest)
-        cuts = [0, *torch.searchsorted(self._place, at[1:-1]).tolist(), self._highest]
-        for b, (low, high) in enumerate(itertools.pairwise(cuts)):
-            offset = corners[:, b] - slopes[:, b] * at[b]
-            torch.addcmul(offset[:, None], slopes[:, b, None], self._place[None, low:high], out=lines[:, low:high])
-        self._log_s = self._log_seen = lines[:-1]
-        return 1 / lines[-1]
+        self._log_s, variance = smooth_background(power, self._place, self._first, self._last)
+        self._log_seen = self._log_s
+        return 1 / variance
 
-    def _coefficients(self, beta: Tensor) -> _Line:
+    def _coefficients(self, beta: Tensor) -> Line:
         """DCT-II coefficients around frequencies `(item,)`."""
         n, device = self._n, beta.device
         middle = (beta * n / math.pi).round().clamp(1, n - 1)  # (item,)
@@ -341,18 +307,18 @@ class _Records:
         values = math.sqrt(2 / n) * (moments.flatten(1) @ kernel).real
         inside = (k >= 1) & (k <= n - 1)
         zero = torch.zeros_like(beta)
-        return _Line(k, torch.where(inside, values, 0.0), inside, beta, zero, zero)
+        return Line(k, torch.where(inside, values, 0.0), inside, beta, zero, zero)
 
-    def _weights(self, line: _Line) -> Tensor:
+    def _weights(self, line: Line) -> Tensor:
         """`1/S` at the bins of a fit, `S` interpolated as a power law."""
         position = (line.k * (self._length / (2 * self._n))).clamp(min=0.25)
         index = position.floor().long().clamp(1, self._log_s.shape[-1] - 1) - 1
         low, high = self._place[index], self._place[index + 1]
-        weight = (_place(position, self._highest) - low) / (high - low)
+        weight = (place(position, self._highest) - low) / (high - low)
         log_s = torch.lerp(self._log_s.gather(-1, index), self._log_s.gather(-1, index + 1), weight)
         return torch.where(line.inside, torch.exp(-log_s), 0.0)
 
-    def _fit(self, lines: list[_Line], which: int, search: bool = False) -> None:
+    def _fit(self, lines: list[Line], which: int, search: bool = False) -> None:
         """Fit one line to what the others leave, and take it out of the periodogram instead of what it was."""
         line = lines[which]
         values = line.values
@@ -364,7 +330,7 @@ class _Records:
         self._add_to_spectrum(fitted, -1)
         lines[which] = fitted
 
-    def _add_to_spectrum(self, line: _Line, sign: int) -> None:
+    def _add_to_spectrum(self, line: Line, sign: int) -> None:
         n, length = self._n, self._length
         centre = (line.beta * length / (2 * math.pi)).round().long()
         reach = torch.arange(-_LINE_HALF_WIDTH, _LINE_HALF_WIDTH + 1, device=centre.device)
@@ -373,242 +339,10 @@ class _Records:
         omega = 2 * math.pi / length * index.to(torch.float64)
         complex_amplitude = torch.complex(line.cosine, -line.sine)[:, None]
         beta = line.beta[:, None]
-        shown = complex_amplitude * _hann(beta - omega, n) + complex_amplitude.conj() * _hann(beta + omega, n)
+        shown = complex_amplitude * tone_in_hann(beta - omega, n) + complex_amplitude.conj() * tone_in_hann(
+            beta + omega, n
+        )
         # The clock of the transform starts with the record, that of the tone in its middle.
         shown = shown * torch.polar(torch.full_like(omega, sign / 2), -omega * (n - 1) / 2)
         shown = torch.where(inside, shown, 0.0)
         self._spectrum.scatter_add_(-1, index.clamp(0, self._spectrum.shape[-1] - 1), shown)
-
-
-@dataclass(frozen=True, eq=False)
-class _Line:
-    """A tone `cosine * cos(beta u) + sine * sin(beta u)` of every item, and the data around it.
-
-    Attributes:
-        k: Bins of the DCT-II, `(item, bin)`.
-        values: Its coefficients there, `(item, bin)`.
-        inside: Which bins there are, `(item, bin)`: not the mean.
-        beta: `(item,)`, rad per sample.
-        cosine: `(item,)`.
-        sine: `(item,)`.
-    """
-
-    k: Tensor
-    values: Tensor
-    inside: Tensor
-    beta: Tensor
-    cosine: Tensor
-    sine: Tensor
-
-    def at(self, k: Tensor, n: int) -> Tensor:
-        """DCT-II of the tone, `(item, bin)`."""
-        even, odd, _ = _templates(self.beta[:, None], k, n)
-        return self.cosine[:, None] * even + self.sine[:, None] * odd
-
-    def polar(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Frequency, amplitude, and phase as a sine on the centred clock."""
-        return self.beta, torch.hypot(self.cosine, self.sine), torch.atan2(self.cosine, self.sine)
-
-    def fitted(self, values: Tensor, weights: Tensor, n: int, search: bool) -> _Line:
-        """Weighted least squares: Gauss-Newton in `beta`, the two amplitudes solved for."""
-        cycle = 2 * math.pi / n
-        lowest = cycle / 2
-        beta = self.beta
-        if search:
-            grid = (beta[:, None] + cycle * _GRID.to(beta.device)).clamp(lowest, math.pi - lowest)
-            explained = _project(grid, self.k, values, weights, n).explained
-            beta = grid.gather(-1, explained.argmax(-1, keepdim=True))[:, 0]
-        best = _project(beta[:, None], self.k, values, weights, n)
-        for _ in range(_STEPS):
-            moved = beta + best.step[:, 0].clamp(-cycle / 8, cycle / 8)
-            moved = moved.clamp(lowest, math.pi - lowest)
-            trial = _project(moved[:, None], self.k, values, weights, n)
-            # Rounding may lower what is explained at the top.
-            better = (trial.explained >= best.explained * (1 - 1e-13))[:, 0]
-            beta = torch.where(better, moved, (beta + moved) / 2)
-            best = _project(beta[:, None], self.k, values, weights, n)
-        return _Line(self.k, self.values, self.inside, beta, best.cosine[:, 0], best.sine[:, 0])
-
-    def standard_deviations(self, weights: Tensor, n: int) -> tuple[Tensor, Tensor]:
-        """Of `beta` and of the amplitude, from the Fisher information of the bins fitted, both `(item,)`."""
-        even, odd, slopes = _templates(self.beta[:, None], self.k, n)
-        slope = self.cosine[:, None] * slopes[0] + self.sine[:, None] * slopes[1]
-        columns = torch.stack([even, odd, slope / n], -1)  # amplitude per cycle: entries of one size
-        size = torch.hypot(self.cosine, self.sine)
-        columns = columns / torch.stack([torch.ones_like(size), torch.ones_like(size), size], -1)[:, None]
-        information = columns.mT @ (weights[..., None] * columns)
-        covariance, info = torch.linalg.inv_ex(information)
-        covariance = torch.where((info == 0)[:, None, None], covariance, torch.nan)
-        direction = torch.stack([self.cosine, self.sine], -1) / size[:, None]
-        variance = torch.einsum("na,nab,nb->n", direction, covariance[:, :2, :2], direction)
-        return covariance[:, 2, 2].sqrt() / (n * size), variance.sqrt()
-
-
-@dataclass(frozen=True, eq=False)
-class _Projection:
-    """Least squares at given frequencies, all `(item, frequency)`; `step` is the Gauss-Newton step of `beta`."""
-
-    explained: Tensor
-    cosine: Tensor
-    sine: Tensor
-    step: Tensor
-
-
-def _project(beta: Tensor, k: Tensor, values: Tensor, weights: Tensor, n: int) -> _Projection:
-    even, odd, slopes = _templates(beta[..., None], k[:, None], n)  # (item, frequency, bin)
-    values, weights = values[:, None], weights[:, None]
-
-    def share(template: Tensor, of: Tensor) -> Tensor:
-        return (weights * template * of).sum(-1)
-
-    # Odd and even bins share nothing, so that the normal equations are diagonal.
-    norms = share(even, even), share(odd, odd)
-    cosine, sine = share(even, values) / norms[0], share(odd, values) / norms[1]
-    slope = cosine[..., None] * slopes[0] + sine[..., None] * slopes[1]
-    slope = slope - even * (share(even, slope) / norms[0])[..., None] - odd * (share(odd, slope) / norms[1])[..., None]
-    residual = values - cosine[..., None] * even - sine[..., None] * odd
-    information = share(slope, slope)
-    step = torch.where(information > 0, share(slope, residual) / information, 0.0)
-    return _Projection(cosine.square() * norms[0] + sine.square() * norms[1], cosine, sine, step)
-
-
-def _templates(beta: Tensor, k: Tensor, n: int) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
-    """DCT-II coefficients `k` of `cos(beta u)` and `sin(beta u)`, and their derivatives with respect to `beta`.
-
-    `sum_u e^(i beta u) cos(omega u + pi k/2) = (e^(i pi k/2) D(beta + omega) + e^(-i pi k/2) D(beta - omega)) / 2`.
-    """
-    omega = math.pi / n * k
-    quarter = torch.remainder(k, 4)
-    scale = math.sqrt(1 / (2 * n))
-    even = scale * ((quarter == 0).to(k) - (quarter == 2).to(k))  # cos(pi k/2)
-    odd = scale * ((quarter == 1).to(k) - (quarter == 3).to(k))  # sin(pi k/2)
-    above, above_slope = _dirichlet(beta + omega, n)
-    below, below_slope = _dirichlet(beta - omega, n)
-    slopes = even * (above_slope + below_slope), odd * (above_slope - below_slope)
-    return even * (above + below), odd * (above - below), slopes
-
-
-def _dirichlet(x: Tensor, n: int) -> tuple[Tensor, Tensor]:
-    """`D(x) = sin(n x/2) / sin(x/2)` and its derivative, for `-2 pi < x < 2 pi`."""
-    z = n / 2 * x
-    near = z.abs() < 1e-2
-    half = torch.where(near, 1.0, x / 2)
-    over = 1 / torch.sin(half)
-    value = torch.sin(z) * over
-    slope = (n * torch.cos(z) - torch.cos(half) * over * torch.sin(z)) * over / 2
-    value = torch.where(near, n * (1 - z.square() / 6), value)
-    return value, torch.where(near, -n * n / 2 * z * (1 / 3 - z.square() / 30), slope)
-
-
-def _hann(x: Tensor, n: int) -> Tensor:
-    """Transform of the Hann taper on the centred clock, `sum_u (1 + cos(2 pi u/n))/2 cos(x u)`."""
-    shift = 2 * math.pi / n
-    # Whole turns would leave the Dirichlet kernel's domain; for even n they change its sign.
-    turns = torch.round(x / (2 * math.pi))
-    x = x - 2 * math.pi * turns
-    sign = 1.0 if n % 2 else 1 - 2 * torch.remainder(turns, 2)
-    side = (_dirichlet(x - shift, n)[0] + _dirichlet(x + shift, n)[0]) / 4
-    return sign * (_dirichlet(x, n)[0] / 2 + side)
-
-
-def _stride(n_bins: int) -> int:
-    """Of the ordinates that the median of a band looks at."""
-    return max(n_bins // _ENOUGH_ORDINATES, 1)
-
-
-def _log_of_median(ordinates: Tensor) -> Tensor:
-    """Log of the mean of exponential ordinates `(item, bin)`, by their median."""
-    n = ordinates.shape[-1]
-    rank = (n + 1) // 2
-    # Mean of that order statistic of n unit exponentials, ln 2 for many.
-    expected = sum(1 / i for i in range(n - rank + 1, n + 1)) if n < 100 else math.log(2)
-    return (ordinates.kthvalue(rank, dim=-1).values / expected).log()
-
-
-def _place(k: Tensor, highest: int) -> Tensor:
-    """Coordinate of the background: log frequency, at high frequencies rather the log distance from the highest."""
-    return k.log() - ((1 + _TOP) * highest - k).log()
-
-
-@dataclass(frozen=True, eq=False)
-class _Smoother:
-    """Linear smoother of the logs of bands.
-
-    Attributes:
-        edges: First bin of each band and the one after its last.
-        places: `(point,)`: the lowest bin, the middles of the bands, the highest bin.
-        matrix: `(point, band)`.
-        variance: Of the smoothed log, `(point,)`.
-    """
-
-    edges: list[tuple[int, int]]
-    places: np.ndarray
-    matrix: np.ndarray
-    variance: np.ndarray
-
-
-@functools.lru_cache(maxsize=16)
-def _smoother(first: int, last: int, highest: int) -> _Smoother:
-    """Smoothing spline: minimises `sum_b (y_b - s_b)^2 / v_b + integral (s'')^2 / q` over `_place`."""
-    edges = []
-    low = first
-    while low <= last:
-        distance = max(min(low, highest - low), highest * _TOP)
-        high = low + max(_BAND, math.ceil(_BAND_FRACTION * min(low, distance)))
-        if last + 1 - high < max(_BAND, (high - low) // 2):
-            high = last + 1
-        edges.append((low, high))
-        low = high
-    middles = [(a + b - 1) / 2 if a > _LOW else float(np.exp(np.log(np.arange(a, b)).mean())) for a, b in edges]
-    x = _place(torch.tensor([1.0, *middles, float(highest)], dtype=torch.float64), highest).numpy()
-    gap = np.diff(x)
-    curvature = np.zeros((len(x) - 2, len(x)))
-    for i in range(len(x) - 2):
-        width = (gap[i] + gap[i + 1]) / 2
-        row = np.array([1 / gap[i], -1 / gap[i] - 1 / gap[i + 1], 1 / gap[i + 1]]) / width
-        curvature[i, i : i + 3] = row * math.sqrt(width)
-    n_bins = np.array([b - a for a, b in edges])
-    variance = np.array(
-        [_MEDIAN_VARIANCE * (1 if _stride(n) == 1 else 0.5) / (n / _stride(n)) for n in n_bins.tolist()]
-    )
-    data = np.zeros((len(x), len(edges)))
-    data[1:-1] = np.diag(1 / variance)
-    precision = curvature.T @ curvature / _CURVATURE + np.pad(np.diag(1 / variance), 1)
-    covariance = np.linalg.inv(precision)
-    return _Smoother(edges, x, covariance @ data, covariance.diagonal().copy())
-
-
-@functools.lru_cache(maxsize=16)
-def _taper_kernel(n_samples: int, length: int) -> tuple[np.ndarray, np.ndarray]:
-    """Frequencies and weights `(bin, frequency)` that turn a density into the mean periodogram of the lowest bins.
-
-    The taper looks at `S` over two bins to either side, over which a steep spectrum bends; a mean removed with the
-    taper's weights takes the frequency 0 out.
-    """
-    per_bin = 8
-    n_low = min(_LOW, length // 4)
-    g = (np.arange((n_low + 8) * per_bin) + 0.5) / per_bin  # cycles in the record
-    g = g[g < n_samples / 2]
-    k = np.arange(1, n_low + 1)[:, None] * (n_samples / length)
-
-    def shape(v: np.ndarray) -> np.ndarray:
-        near = np.abs(np.abs(v) - 1) < 1e-9
-        return np.where(near, 0.5, np.sinc(v) / np.where(near, 1.0, 1 - v**2))
-
-    seen = [(shape(k - sign * g) - shape(k) * shape(g)) ** 2 for sign in (1, -1)]
-    kernel = (seen[0] + seen[1]) / (1.5 * per_bin)
-    return g / n_samples, kernel
-
-
-def _fast_length(n: int) -> int:
-    """Smallest even length >= n with the factors 2, 3 and 5 only: a prime one can be a hundred times slower."""
-    best = 1 << max((n - 1).bit_length(), 1)
-    five = 1
-    while five < best:
-        three = five
-        while three < best:
-            two = max(-(-n // three) - 1, 0).bit_length()
-            best = min(best, three << max(two, 1))
-            three *= 3
-        five *= 5
-    return best

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse import tones
+from gyrofuse import _transforms, tones
 from gyrofuse.tones import find_tones, line_p_value
 
 # Voirol et al., Simulation 1
@@ -74,7 +74,7 @@ def test_coefficients_are_those_of_the_whole_transform(n):
 def test_templates_are_transforms_of_a_tone(n, beta):
     u = np.arange(n) - (n - 1) / 2
     k = torch.arange(1, n, dtype=torch.float64)[None]
-    even, odd, slopes = tones._templates(torch.tensor([[beta]], dtype=torch.float64), k, n)
+    even, odd, slopes = _transforms.tone_in_cosines(torch.tensor([[beta]], dtype=torch.float64), k, n)
     np.testing.assert_allclose(even[0], dct(np.cos(beta * u))[1:], atol=1e-12)
     np.testing.assert_allclose(odd[0], dct(np.sin(beta * u))[1:], atol=1e-12)
     np.testing.assert_allclose(slopes[0][0], dct(-u * np.sin(beta * u))[1:], atol=1e-9)
@@ -85,7 +85,7 @@ def test_dirichlet_kernel_is_smooth_where_its_series_takes_over():
     n = 1000
     x = torch.tensor([1.999e-5, 2.001e-5], dtype=torch.float64)  # n x / 2 = 0.01
     u = torch.arange(n, dtype=torch.float64) - (n - 1) / 2
-    value, slope = tones._dirichlet(x, n)
+    value, slope = _transforms.dirichlet(x, n)
     torch.testing.assert_close(value, torch.cos(x[:, None] * u).sum(-1), rtol=1e-9, atol=0)
     torch.testing.assert_close(slope, (-u * torch.sin(x[:, None] * u)).sum(-1), rtol=1e-5, atol=0)
 
@@ -96,7 +96,7 @@ def test_hann_kernel_is_the_transform_of_the_taper(n):
     taper = torch.sin(math.pi / n * (torch.arange(n, dtype=torch.float64) + 0.5)) ** 2
     x = torch.linspace(-6.2, 6.2, 41, dtype=torch.float64)
     expected = (taper * torch.cos(x[:, None] * u)).sum(-1)
-    torch.testing.assert_close(tones._hann(x, n), expected, rtol=0, atol=1e-11)
+    torch.testing.assert_close(_transforms.tone_in_hann(x, n), expected, rtol=0, atol=1e-11)
 
 
 def test_fast_lengths_have_small_factors_and_no_smaller_one_would_do():
@@ -108,13 +108,13 @@ def test_fast_lengths_have_small_factors_and_no_smaller_one_would_do():
 
     for n in [*range(32, 600), 10_007, 99_991]:
         expected = next(m for m in range(n, 2 * n) if m % 2 == 0 and smooth(m))
-        assert tones._fast_length(n) == expected
+        assert _transforms.fast_length(n) == expected
 
 
 def test_what_the_taper_sees_of_a_steep_spectrum():
     """Mean Hann periodogram of 4000 random walks at the lowest bins, within four standard errors."""
     n, walk = 250, gf.RandomWalk(1.0)
-    g, kernel = tones._taper_kernel(n, 270)
+    g, kernel = _transforms.taper_kernel(n, 270)
     t = torch.arange(n, dtype=torch.float64)
     taper = torch.sin(math.pi / n * (t + 0.5)) ** 2
     x = walk.simulate(n, batch=(4000,), generator=seeded(1))
