@@ -73,6 +73,13 @@ def check_positive_integer(name: str, value: int) -> int:
     return int(value)
 
 
+def check_n_samples(name: str, value: int) -> int:
+    """Return `value` as an int when it is a whole number of samples, 0 or more."""
+    if isinstance(value, bool) or not isinstance(value, Real) or not (value >= 0 and value % 1 == 0):
+        raise ValueError(f"`{name}`: expected a whole number >= 0, got {value!r}")
+    return int(value)
+
+
 def check_positive(name: str, value: float) -> float:
     """Return `value` as a float when it is finite and above zero."""
     number = float(value)

@@ -19,6 +19,7 @@ References:
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -114,12 +115,12 @@ class Evidence:
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class Answer(ABC):
     """What the answers below share: text for each item of a batch, and plain numbers."""
 
+    @abstractmethod
     def summary(self) -> str:
         """The answer in words and numbers."""
-        raise NotImplementedError
 
     def __str__(self) -> str:
         return self.summary()

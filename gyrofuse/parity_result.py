@@ -218,7 +218,7 @@ class ParityResult:
         }
 
     def plot(self, ax: Axes | None = None) -> Axes:
-        """Draw how unlikely each sensor is over time; windows with a fault are outlined.
+        """Draw how unlikely each sensor is over time; windows with a fault are outlined, untested ones are blue.
 
         Args:
             ax: Where to draw; new axes by default.
@@ -237,9 +237,11 @@ class ParityResult:
             )
         if ax is None:
             ax = plt.subplots(figsize=(7.0, 3.2), layout="constrained")[1]
-        strength = -self.p_values.clamp(min=1e-12).log10().cpu().numpy().T  # (sensor, window)
+        strength = -self.p_values.clamp(min=1e-12).log10()
+        strength = torch.where(self.tested, strength, torch.nan).cpu().numpy().T  # (sensor, window)
         edges = [*self.start.tolist(), self.p_value.shape[-1] * self.window / (self.rate or 1.0)]
         rows = [i - 0.5 for i in range(len(self.sensors) + 1)]
+        ax.set_facecolor("#cfe3ef")  # shows where there is no value
         image = ax.pcolormesh(edges, rows, strength, cmap="Greys", vmin=0, vmax=12)
         for window, sensor in self.faulty.nonzero().tolist():
             width = edges[window + 1] - edges[window]

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from numbers import Real
-
 import torch
 from torch import Tensor, nn
 
-from gyrofuse._checks import check_signal
+from gyrofuse._checks import check_n_samples, check_signal
 
 # The top value of a rounded sinusoid is met up to 1/(sqrt 2 - 1) = 2.4 times as often as the one below it, that of
 # noise not even as often; more than this is a pile of clipped values.
@@ -91,10 +89,3 @@ def check_full_scale(value: float | Tensor, sensors: torch.Size) -> Tensor:
             f"{tuple(sensors)}, got shape {tuple(limit.shape)}"
         )
     return limit
-
-
-def check_n_samples(name: str, value: int) -> int:
-    """Return `value` as an int when it is a whole number of samples, 0 or more."""
-    if isinstance(value, bool) or not isinstance(value, Real) or not (value >= 0 and value % 1 == 0):
-        raise ValueError(f"`{name}`: expected a whole number >= 0, got {value!r}")
-    return int(value)

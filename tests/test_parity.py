@@ -494,6 +494,18 @@ def test_plot_outlines_what_was_found():
     plt.close("all")
 
 
+def test_plot_leaves_out_what_was_not_tested():
+    signal = faulty("biased").clone()
+    signal[1, :300] = torch.nan
+    result = parity_test(signal, reference())
+    assert not bool(result.tested.all())
+    import matplotlib.pyplot as plt
+
+    shown = result.plot().collections[0].get_array()
+    assert shown.mask.T.tolist() == (~result.tested).tolist()
+    plt.close("all")
+
+
 def test_the_reference_says_what_it_rests_on():
     text = reference().summary()
     assert text == str(reference())
