@@ -24,6 +24,8 @@ from typing import TYPE_CHECKING, Any
 
 from gyrofuse._linalg import SingularCovarianceError
 from gyrofuse._result import ConfidenceInterval
+from gyrofuse.array_gmwm import fit_array_gmwm
+from gyrofuse.array_gmwm_result import ArrayGMWMResult
 from gyrofuse.bootstrap import block_bootstrap, bootstrap_wccv_covariance, bootstrap_wccv_interval, signal_bootstrap
 from gyrofuse.competitors import equal_weights, inverse_variance_weights, nonnegative_weights, shrinkage_weights
 from gyrofuse.covariance import CrossCovariance, cross_covariance, wavelet_cross_covariance, wavelet_variance
@@ -38,6 +40,7 @@ from gyrofuse.influence import BootstrapWeightsCovariance, bootstrap_weights_cov
 from gyrofuse.intervals import wavelet_cross_covariance_interval, wavelet_variance_interval
 from gyrofuse.io.stream import RecordingError
 from gyrofuse.live import LiveSVO, subset_weights
+from gyrofuse.moment_bootstrap import GMWMBootstrap, bootstrap_gmwm
 from gyrofuse.multiscale import MultiScaleSVO, fit_multiscale
 from gyrofuse.multiscale_result import MultiScaleResult
 from gyrofuse.parity import parity_test
@@ -45,8 +48,11 @@ from gyrofuse.parity_reference import ParityReference, fit_parity
 from gyrofuse.parity_result import ParityResult
 from gyrofuse.parsing import model_from_dict, parse_model
 from gyrofuse.processes import AR1, Drift, Model, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
+from gyrofuse.ranking import rank_models
+from gyrofuse.ranking_result import RankResult
 from gyrofuse.rdvg import RDVGResult, rdvg, rdvg_weights
 from gyrofuse.recording import Recording, read_recording
+from gyrofuse.robust import robust_wavelet_variance
 from gyrofuse.saturation import find_saturation, mask_saturated
 from gyrofuse.scale_weights import resolve_scale_weights
 from gyrofuse.selection import Selection
@@ -64,6 +70,7 @@ __version__ = "0.1.0"
 __all__ = [
     "AR1",
     "SVO",
+    "ArrayGMWMResult",
     "ArrayModel",
     "BootstrapWeightsCovariance",
     "ConfidenceInterval",
@@ -71,6 +78,7 @@ __all__ = [
     "Datasheet",
     "Drift",
     "EnoughData",
+    "GMWMBootstrap",
     "GMWMResult",
     "Gain",
     "HaarFilterBank",
@@ -83,6 +91,7 @@ __all__ = [
     "QuantizationNoise",
     "RDVGResult",
     "RandomWalk",
+    "RankResult",
     "Recording",
     "RecordingError",
     "SVOResult",
@@ -95,6 +104,7 @@ __all__ = [
     "WeightsTest",
     "WhiteNoise",
     "block_bootstrap",
+    "bootstrap_gmwm",
     "bootstrap_wccv_covariance",
     "bootstrap_wccv_interval",
     "bootstrap_weights_covariance",
@@ -102,6 +112,7 @@ __all__ = [
     "datasheet",
     "equal_weights",
     "find_saturation",
+    "fit_array_gmwm",
     "fit_gmwm",
     "fit_multiscale",
     "fit_parity",
@@ -113,10 +124,12 @@ __all__ = [
     "nonnegative_weights",
     "parity_test",
     "parse_model",
+    "rank_models",
     "rdvg",
     "rdvg_weights",
     "read_recording",
     "resolve_scale_weights",
+    "robust_wavelet_variance",
     "shrinkage_weights",
     "signal_bootstrap",
     "state_space",

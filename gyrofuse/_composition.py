@@ -50,6 +50,21 @@ class Composition:
         """Processes with a parameter that is not linear, unknown or held."""
         return [k for k, p in enumerate(self.processes) if isinstance(p, (AR1, Sinusoid))]
 
+    @property
+    def places(self) -> list[int]:
+        """Of each `p`, then of each `x`, among the parameters of the model."""
+        linear, shape, at = [], [], 0
+        for process in self.processes:
+            if isinstance(process, AR1):
+                shape.append(at)
+                at += 1
+            linear.append(at)
+            at += 1
+            if isinstance(process, Sinusoid):
+                shape.append(at)
+                at += 1
+        return linear + shape
+
     def columns(self, tau: Tensor, shape: Tensor) -> Tensor:
         """Wavelet variances `u` of the processes with linear parameter one.
 
@@ -94,7 +109,7 @@ class Composition:
                 found += [p.sqrt()]
             else:
                 found += [p]
-        return torch.stack(found, -1)
+        return torch.stack(found, -1) + 0.0  # no -0
 
     def model(self, linear: Tensor, shape: Tensor) -> Model:
         """The model with these parameters."""

@@ -16,7 +16,7 @@ from gyrofuse._composition import Composition, shape_of
 from gyrofuse._nnls import nonnegative_least_squares
 from gyrofuse.processes import AR1
 
-_STEPS = 30
+_STEPS, _ENOUGH = 30, 1e-10
 # The damping after which a step that does not help is taken for rounding.
 _MOST_DAMPING = 1e10
 _PROBLEMS_AT_ONCE = 200_000
@@ -24,7 +24,13 @@ _CLOSE = 1e-3
 
 
 def starting_points(
-    target: Tensor, weight: Tensor, tau: Tensor, made_of: Composition, held: Tensor, n_starts: int
+    target: Tensor,
+    weight: Tensor,
+    tau: Tensor,
+    made_of: Composition,
+    held: Tensor,
+    n_starts: int,
+    fixed: tuple[int, Tensor] | None = None,
 ) -> Tensor:
     """The best points of a grid that are not neighbours.
 
@@ -35,6 +41,7 @@ def starting_points(
         made_of: Structure of the model.
         held: `x` of the sinusoids where these are held, `(item, sinusoid)`.
         n_starts: How many; fewer where the grid has fewer.
+        fixed: A process, and its `p` `(item,)`; None where all are free.
 
     Returns:
         `x` of the shaped processes, `(item, start, shaped)`.
@@ -56,7 +63,8 @@ def starting_points(
         # What does not differ between the items is computed once.
         n_own = n_items if held.shape[-1] else 1
         values = made_of.columns(tau, _with_held(part[None].expand(n_own, -1, -1), held, made_of))
-        objective.append(_solve(values, target[:, None], weight.sqrt()[:, None])[1])
+        given = (fixed[0], fixed[1][:, None]) if fixed else None
+        objective.append(_solve(values, target[:, None], weight.sqrt()[:, None], given)[1])
     cost = torch.cat(objective, -1)  # (item, point)
     place = torch.tensor(index, device=target.device)
     chosen = []
@@ -69,7 +77,16 @@ def starting_points(
 
 
 def minimise(
-    target: Tensor, root: Tensor, tau: Tensor, made_of: Composition, start: Tensor, n_steps: int = _STEPS
+    target: Tensor,
+    root: Tensor,
+    tau: Tensor,
+    made_of: Composition,
+    start: Tensor,
+    n_steps: int = _STEPS,
+    *,
+    fixed: tuple[int, Tensor] | None = None,
+    still: int | None = None,
+    enough: float = _ENOUGH,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Levenberg-Marquardt on `|W (target - u(x) p)|^2`.
 
@@ -80,16 +97,19 @@ def minimise(
         made_of: Structure of the model.
         start: `x`, `(problem, shaped)`.
         n_steps: At most so many steps.
+        fixed: A process, and its `p` `(problem,)`; None where all are free.
+        still: One of `x` that stays where it starts.
+        enough: Share of the objective by which a step has to lower it to be followed by another.
 
     Returns:
         `p` `(problem, linear)`, `x` `(problem, shaped)`, the minimum `(problem,)` and whether it was reached.
     """
-    moving = [made_of.shaped.index(k) for k in made_of.curved]
+    moving = [at for at in map(made_of.shaped.index, made_of.curved) if at != still]
     x = start.clone()
-    linear, objective = _evaluate(target, root, tau, made_of, x)
+    linear, objective = _evaluate(target, root, tau, made_of, x, fixed)
     if not moving:
         return linear, x, objective, torch.ones_like(objective, dtype=torch.bool)
-    low, high = _limits(made_of, tau, x)
+    low, high = (ends[moving] for ends in limits(made_of, tau, x))
     damping = torch.full_like(objective, 1e-3)
     done = ~objective.isfinite()
     for _ in range(n_steps):
@@ -99,17 +119,21 @@ def minimise(
         y, w, at, p = target[todo], root[todo], x[todo], linear[todo]
         values, slope = made_of.columns(tau, at), made_of.slopes(tau, at)
         jacobian = _times(w, slope * p[:, None, made_of.shaped])[..., moving]
-        jacobian = jacobian - _projected(_times(w, values), p > 0, jacobian)
+        free = p > 0
+        if fixed:
+            free[:, fixed[0]] = False
+        jacobian = jacobian - _projected(_times(w, values), free, jacobian)
         residual = _times(w, y[..., None] - values @ p[..., None])
         gradient = (jacobian.mT @ residual)[..., 0]
         normal = jacobian.mT @ jacobian
         size = normal.diagonal(dim1=-2, dim2=-1)
         # An AR1 whose variance is zero does not move.
-        still = torch.where(size > 0, size, 1.0)
-        step = torch.linalg.solve_ex(normal + torch.diag_embed(damping[todo][:, None] * still), gradient)[0]
+        own_size = torch.where(size > 0, size, 1.0)
+        step = torch.linalg.solve_ex(normal + torch.diag_embed(damping[todo][:, None] * own_size), gradient)[0]
         tried = at.clone()
         tried[:, moving] = (at[:, moving] + step.clamp(-2, 2)).clamp(low, high)
-        new_linear, new_objective = _evaluate(y, w, tau, made_of, tried)
+        given = (fixed[0], fixed[1][todo]) if fixed else None
+        new_linear, new_objective = _evaluate(y, w, tau, made_of, tried, given)
         old = objective[todo]
         better = new_objective < old
         gain = old - new_objective
@@ -118,7 +142,7 @@ def minimise(
         objective[todo] = torch.where(better, new_objective, old)
         damping[todo] = torch.where(better, damping[todo] / 5, damping[todo] * 4).clamp(min=1e-12)
         stuck = (step.abs().amax(-1) < 1e-7) | (damping[todo] > _MOST_DAMPING)
-        done[todo] = torch.where(better, gain <= 1e-10 * old, stuck)
+        done[todo] = torch.where(better, gain <= enough * old, stuck)
     return linear, x, objective, done & objective.isfinite()
 
 
@@ -135,15 +159,34 @@ def distinct(objective: Tensor, x: Tensor, n_kept: int) -> Tensor:
     return torch.stack(kept, 1)
 
 
-def _evaluate(target: Tensor, root: Tensor, tau: Tensor, made_of: Composition, x: Tensor) -> tuple[Tensor, Tensor]:
-    return _solve(made_of.columns(tau, x), target, root)
+def whitening(covariance: Tensor) -> Tensor:
+    """`W` with `W' W = V^-1`, lower triangular; NaN where there is none."""
+    root, failed = torch.linalg.cholesky_ex(covariance)
+    eye = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
+    found = torch.linalg.solve_triangular(root, eye.expand_as(root), upper=False)
+    return torch.where((failed > 0)[:, None, None], torch.nan, found)
 
 
-def _solve(values: Tensor, target: Tensor, root: Tensor) -> tuple[Tensor, Tensor]:
+def _evaluate(
+    target: Tensor, root: Tensor, tau: Tensor, made_of: Composition, x: Tensor, fixed: tuple[int, Tensor] | None
+) -> tuple[Tensor, Tensor]:
+    return _solve(made_of.columns(tau, x), target, root, fixed)
+
+
+def _solve(values: Tensor, target: Tensor, root: Tensor, fixed: tuple[int, Tensor] | None) -> tuple[Tensor, Tensor]:
     """Variances that fit best, and the distance left; `values` `(..., level, linear)`."""
     columns, y = _times(root, values), _times(root, target[..., None])
-    linear = nonnegative_least_squares(columns.mT @ columns, (columns.mT @ y)[..., 0])
-    return linear, (y - columns @ linear[..., None]).square().sum((-2, -1))
+    others = columns
+    if fixed:
+        k, value = fixed
+        y = y - value[..., None, None] * columns[..., k : k + 1]
+        others = columns.clone()
+        others[..., k] = 0.0  # whose own solution is zero
+    linear = nonnegative_least_squares(others.mT @ others, (others.mT @ y)[..., 0])
+    objective = (y - others @ linear[..., None]).square().sum((-2, -1))
+    if fixed:
+        linear[..., k] = value
+    return linear, objective
 
 
 def _times(root: Tensor, matrix: Tensor) -> Tensor:
@@ -180,9 +223,10 @@ def _grid(kind: type, tau: Tensor) -> Tensor:
     return (2 / period.clamp(min=2.01)).logit()
 
 
-def _limits(made_of: Composition, tau: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+def limits(made_of: Composition, tau: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+    """Least and largest `x` of the shaped processes, `(shaped,)`."""
     low, high = [], []
-    for k in made_of.curved:
+    for k in made_of.shaped:
         if isinstance(made_of.processes[k], AR1):
             low.append(-3.0)
             high.append(math.atanh(math.exp(-1 / (64 * float(tau[-1])))))

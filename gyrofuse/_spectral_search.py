@@ -19,9 +19,20 @@ _LONGEST = 32  # time constant of an AR1 at the end of its range, in records
 
 
 def maximise(
-    energy: Tensor, count: Tensor, bins: Bins, noise: Noise, p: Tensor, x: Tensor
+    energy: Tensor,
+    count: Tensor,
+    bins: Bins,
+    noise: Noise,
+    p: Tensor,
+    x: Tensor,
+    held: int | None = None,
+    enough: float = _ENOUGH,
+    n_steps: int = _STEPS,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Damped scoring; returns `p`, `x` and whether the top was reached, `(item,)`.
+
+    One of the unknowns, `p` first, may be `held` where it is; `enough` nats are worth no further step, of at
+    most `n_steps`.
 
     With the observed information where it is positive definite: near the top of a flat likelihood it ends in a few
     steps, for which the Fisher information takes hundreds.
@@ -40,7 +51,7 @@ def maximise(
     damping = torch.full_like(deviance, _DAMPING)
     done = ~deviance.isfinite()
     reached = torch.zeros_like(done)
-    for _ in range(_STEPS):
+    for _ in range(n_steps):
         todo = (~done).nonzero()[:, 0]
         if not len(todo):
             break
@@ -49,6 +60,8 @@ def maximise(
         by_x = gradient[:, n_linear:]
         moving = (own_p[:, noise.moving] > 0) & ~((own_x >= end) & (by_x > 0)) & ~((own_x <= -end) & (by_x < 0))
         active = torch.cat([torch.ones_like(own_p, dtype=torch.bool), moving], -1).to(p)
+        if held is not None:
+            active[:, held] = 0.0
         gradient = gradient * active
         size = information.diagonal(dim1=-2, dim2=-1) * active
         more = torch.diag_embed(damping[todo, None] * size + (1 - active))
@@ -73,9 +86,15 @@ def maximise(
         p[at], x[at], deviance[at] = new_p[better], new_x[better], new[better]
         columns[at], slopes[at], bends[at] = new_columns[better], new_slopes[better], new_bends[better]
         damping[todo] = torch.where(better, damping[todo] / 10, damping[todo] * 10).clamp(min=1e-12)
-        reached[todo] = promised < _ENOUGH
-        done[todo] = (promised < _ENOUGH) | (damping[todo] > _MOST_DAMPING) | ~promised.isfinite()
+        reached[todo] = promised < enough
+        done[todo] = (promised < enough) | (damping[todo] > _MOST_DAMPING) | ~promised.isfinite()
     return p * unit, x, reached
+
+
+def deviance(energy: Tensor, count: Tensor, bins: Bins, noise: Noise, p: Tensor, x: Tensor) -> Tensor:
+    """Minus twice the log likelihood, but for what does not depend on the model, `(item,)`."""
+    mean = (energy / count).clamp(min=torch.finfo(energy.dtype).tiny)
+    return _deviance(mean, count, noise.variances(bins, p, x))
 
 
 def _deviance(mean: Tensor, count: Tensor, variance: Tensor) -> Tensor:
@@ -130,5 +149,6 @@ def _inverse(information: Tensor, active: Tensor) -> Tensor:
     keep = (active[:, :, None] & active[:, None, :]).to(information)
     scaled = information * size[:, :, None] * size[:, None, :] * keep + torch.diag_embed((~active).to(information))
     root, failed = torch.linalg.cholesky_ex(scaled)
+    root = torch.where((failed > 0)[:, None, None], torch.eye(root.shape[-1]).to(root), root)
     inverse = torch.cholesky_inverse(root) * size[:, :, None] * size[:, None, :] * keep
     return torch.where((failed > 0)[:, None, None], torch.where(keep > 0, torch.nan, 0.0), inverse)

@@ -7,7 +7,6 @@ Bad input ends with one line on stderr and exit status 2, a defect of the progra
 from __future__ import annotations
 
 import json
-import math
 import shutil
 import signal
 import sys
@@ -24,20 +23,35 @@ import typer
 
 from gyrofuse._checks import check_positive, check_positive_integer
 from gyrofuse._console import Commands, progress, say, say_table, warn
-from gyrofuse._output import Outputs, output_folder
+from gyrofuse._output import output_folder
+from gyrofuse.cli_models import fit, rank
+from gyrofuse.cli_shared import (
+    Axis,
+    Force,
+    Json,
+    Key,
+    Logs,
+    Mounting,
+    Rate,
+    Report,
+    Scale,
+    Sensors,
+    Unit,
+    outputs,
+    read,
+    say_notes,
+    stretch,
+    write_json,
+)
 from gyrofuse.demo import FILES, run_demo
-from gyrofuse.export import to_kalibr
-from gyrofuse.gmwm import fit_gmwm
-from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.multiscale import fit_multiscale
 from gyrofuse.multiscale_result import MultiScaleResult
 from gyrofuse.parsing import model_from_dict, parse_model
 from gyrofuse.processes import Model
-from gyrofuse.recording import Recording, read_recording
+from gyrofuse.recording import Recording
 from gyrofuse.report import (
     fusion_figure,
     fusion_report,
-    new_figure,
     number,
     recording_report,
     save_figure,
@@ -46,15 +60,6 @@ from gyrofuse.report import (
 from gyrofuse.simulate import ArrayModel
 from gyrofuse.svo import fit_svo
 from gyrofuse.svo_result import SVOResult
-
-_SUFFIXES = {
-    "out": (".npz", ".csv"),
-    "figure": (".png", ".svg", ".pdf"),
-    "json": (".json",),
-    "report": (".html",),
-    "kalibr": (".yaml", ".yml"),
-    "model-out": (".json",),
-}
 
 app = typer.Typer(
     name="gyrofuse",
@@ -93,24 +98,6 @@ class Covariance(str, Enum):
 # Methods whose weights have no law to rest an interval on, or, equal ones, are not estimated at all.
 _WITHOUT_INTERVALS = (Method.multiscale, Method.nonnegative, Method.equal, Method.rdvg)
 
-Logs = Annotated[
-    list[Path],
-    typer.Argument(metavar="LOG...", help="The recording. Several files are one array, aligned on their clocks."),
-]
-Axis = Annotated[str | None, typer.Option(metavar="x|y|z", help="Take this axis alone.")]
-Sensors = Annotated[str | None, typer.Option(metavar="A,B,...", help="Take these sensors alone.")]
-Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Sampling rate, where the log does not say.")]
-Unit = Annotated[str | None, typer.Option(metavar="UNIT", help="Unit of the rates, where the log does not say.")]
-Scale = Annotated[float | None, typer.Option(help="Factor that turns what is logged (counts) into the unit.")]
-Key = Annotated[str | None, typer.Option(metavar="NAME", help="Topic, array, group or column that holds the gyros.")]
-Mounting = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE", help="JSON: for each device by name, the 3x3 matrix to the common frame."),
-]
-Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write what is found as JSON.")]
-Report = Annotated[Path | None, typer.Option(metavar="FILE", help="Write a report, one HTML page.")]
-Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
-
 
 def _version(wanted: bool) -> None:
     if wanted:
@@ -145,10 +132,10 @@ def info(
     force: Force = False,
 ) -> None:
     """Show what is in a log: sensors, rate, gaps, units, channels."""
-    with _outputs(force, [*logs, mounting], json=json_file, report=report) as drafts:
-        recording = _read(logs, axis, sensors, rate, unit, scale, key, mounting)
+    with outputs(force, [*logs, mounting], json=json_file, report=report) as drafts:
+        recording = read(logs, axis, sensors, rate, unit, scale, key, mounting)
         if json_file:
-            _write_json(drafts[json_file], recording.to_dict())
+            write_json(drafts[json_file], recording.to_dict())
         if report:
             with progress("drawing"):
                 page = recording_report(recording, title=f"What is in {_titled(logs)}")
@@ -194,16 +181,16 @@ def fuse(
     force: Force = False,
 ) -> None:
     """Fuse an array, recorded at rest, into one virtual gyro."""
-    weights, stretch = _scale_weights(scale_weights), _stretch(rest)
+    weights, resting = _scale_weights(scale_weights), stretch(rest)
     if method in _WITHOUT_INTERVALS and covariance not in (None, Covariance.none):
         raise ValueError(
             f"`--covariance`: {covariance.value} has no use, for --method {method.value} gives no intervals of its "
             "weights; leave the option out, or choose another method"
         )
-    with _outputs(force, [*logs, mounting], out=out, figure=figure, json=json_file, report=report) as drafts:
-        recording = _read(logs, axis, sensors, rate, unit, scale, key, mounting)
+    with outputs(force, [*logs, mounting], out=out, figure=figure, json=json_file, report=report) as drafts:
+        recording = read(logs, axis, sensors, rate, unit, scale, key, mounting)
         with progress("fusing"):
-            part = recording.between(*stretch) if stretch else recording
+            part = recording.between(*resting) if resting else recording
             result: SVOResult | MultiScaleResult
             if method is Method.multiscale:
                 result = fit_multiscale(part, weights, confidence_level=confidence_level, n_levels=levels)
@@ -218,9 +205,9 @@ def fuse(
                 )
             virtual = result.virtual(recording)
         remarks = []
-        if stretch:
+        if resting:
             remarks = [
-                f"Weights from {stretch[0]:g} to {stretch[1]:g} s of {recording.duration:.6g} s; all of it fused."
+                f"Weights from {resting[0]:g} to {resting[1]:g} s of {recording.duration:.6g} s; all of it fused."
             ]
         if out:
             fused = Recording(
@@ -240,71 +227,16 @@ def fuse(
                 page = fusion_report(result, recording, virtual, title=title, remarks=remarks)
                 drafts[report].write_text(page, encoding="utf-8")
         if json_file:
-            _write_json(drafts[json_file], result.to_dict())
+            write_json(drafts[json_file], result.to_dict())
     for note in recording.notes:
         if note.kind == "axes":
             warn(str(note))
     say("\n".join([result.summary(), *remarks]))
-    _say_notes(recording)
+    say_notes(recording)
 
 
-@app.command()
-def fit(
-    logs: Logs,
-    model: Annotated[
-        str, typer.Option(metavar="FORMULA", help='Processes to fit, such as "WN + AR1 + RW" or "WN + 2*AR1 + SIN".')
-    ],
-    levels: Annotated[
-        int | None, typer.Option(metavar="J", help="Number of levels; as many as hold two windows by default.")
-    ] = None,
-    rest: Annotated[str | None, typer.Option(metavar="START:STOP", help="Fit this stretch alone (seconds).")] = None,
-    axis: Axis = None,
-    sensors: Sensors = None,
-    rate: Rate = None,
-    unit: Unit = None,
-    scale: Scale = None,
-    key: Key = None,
-    mounting: Mounting = None,
-    confidence_level: Annotated[float, typer.Option(metavar="P", help="Of all intervals.")] = 0.95,
-    kalibr: Annotated[Path | None, typer.Option(metavar="FILE", help="Write Kalibr's imu.yaml, of one sensor.")] = None,
-    model_out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write the fitted model, .json, which simulate reads.")
-    ] = None,
-    figure: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Draw the fit of the first sensor, .png, .svg or .pdf.")
-    ] = None,
-    json_file: Json = None,
-    force: Force = False,
-) -> None:
-    """Fit a noise model to every sensor of a log, recorded at rest."""
-    stretch = _stretch(rest)
-    outputs = {"kalibr": kalibr, "model-out": model_out, "figure": figure, "json": json_file}
-    with _outputs(force, [*logs, mounting], **outputs) as drafts:
-        recording = _read(logs, axis, sensors, rate, unit, scale, key, mounting)
-        with progress("fitting"):
-            part = recording.between(*stretch) if stretch else recording
-            result = fit_gmwm(part, model, confidence_level=confidence_level, n_levels=levels)
-        if kalibr:
-            drafts[kalibr].write_text(_kalibr(result, recording), encoding="utf-8")
-        if model_out:
-            _write_json(drafts[model_out], result.model.to_dict())
-        if figure:
-            drawn = new_figure(7.0, 4.6)
-            result.plot(drawn.subplots())
-            save_figure(drawn, drafts[figure], figure.suffix[1:])
-        if json_file:
-            _write_json(drafts[json_file], result.to_dict())
-    say(result.summary())
-    _say_notes(recording)
-
-
-def _kalibr(result: GMWMResult, recording: Recording) -> str:
-    params = result.params.flatten(0, -2)
-    if len(params) != 1:
-        raise ValueError(
-            f"`--kalibr`: expected one sensor and axis, got {len(params)}; choose with --sensors and --axis"
-        )
-    return to_kalibr(result.model.with_params(params[0]), recording.rate, recording.unit)
+app.command()(fit)
+app.command()(rank)
 
 
 @app.command()
@@ -335,7 +267,7 @@ def simulate(
     check_positive_integer("--samples", samples)
     check_positive_integer("--sensors", 1 if sensors is None else sensors)
     source = [Path(model)] if model.lower().endswith(".json") else []
-    with _outputs(force, source, out=out, json=json_file, report=report) as drafts:
+    with outputs(force, source, out=out, json=json_file, report=report) as drafts:
         noise = _read_model(source[0]) if source else parse_model(model)
         generator = torch.Generator()
         seed = generator.seed() % 2**32 if seed is None else seed
@@ -349,7 +281,7 @@ def simulate(
         _save(recording, drafts[out])
         if json_file:
             settings = {"model": noise.to_dict(), "n_samples": samples, "rate": rate, "unit": unit, "seed": seed}
-            _write_json(drafts[json_file], settings)
+            write_json(drafts[json_file], settings)
         if report:
             page = recording_report(recording, title=f"A simulated recording of {model}")
             drafts[report].write_text(page, encoding="utf-8")
@@ -368,7 +300,7 @@ def demo(
     Needs no file and no network. The truth is known, and what is found is held against it.
     """
     with (
-        _outputs(force, json=json_file, report=report) as drafts,
+        outputs(force, json=json_file, report=report) as drafts,
         output_folder(out, own=FILES, force=force) as folder,
     ):
         with progress("simulating, fusing and drawing"):
@@ -389,47 +321,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     app(arguments)
 
 
-def _read(
-    logs: Sequence[Path],
-    axis: str | None,
-    sensors: str | None,
-    rate: float | None,
-    unit: str | None,
-    scale: float | None,
-    key: str | None,
-    mounting: Path | None,
-) -> Recording:
-    with progress("reading"):
-        return read_recording(
-            logs,
-            axis=axis,
-            sensors=None if sensors is None else sensors.split(","),
-            rate=rate,
-            unit=unit,
-            scale=scale,
-            key=key,
-            mounting=mounting,
-        )
-
-
 def _read_model(path: Path) -> Model | ArrayModel:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         return model_from_dict(content)
     except (ValueError, TypeError, AttributeError) as error:
         raise ValueError(f"{path}: expected a model in JSON, as to_dict() of a model gives it: {error}") from None
-
-
-def _stretch(rest: str | None) -> tuple[float, float] | None:
-    if rest is None:
-        return None
-    try:
-        start, stop = (float(edge) for edge in rest.split(":"))
-    except ValueError:
-        start = stop = math.nan
-    if not start < stop:
-        raise ValueError(f"`--rest`: expected START:STOP in seconds, such as 0:60, got {rest!r}")
-    return start, stop
 
 
 def _scale_weights(text: str) -> str | list[float]:
@@ -441,18 +338,6 @@ def _scale_weights(text: str) -> str | list[float]:
         raise ValueError(
             f"`--scale-weights`: expected flat, short, long, or numbers separated by commas, got {text!r}"
         ) from None
-
-
-def _outputs(force: bool, inputs: Sequence[Path | None] = (), **asked: Path | None) -> Outputs:
-    """Files to write, those asked for, by option; none of the inputs given is ever replaced."""
-    for option, path in asked.items():
-        if path is not None and path.suffix.lower() not in _SUFFIXES[option]:
-            raise ValueError(
-                f"`--{option}`: expected a name that ends in {' or '.join(_SUFFIXES[option])}, got {str(path)!r}"
-            )
-    return Outputs(
-        [path for path in asked.values() if path is not None], force=force, inputs=[path for path in inputs if path]
-    )
 
 
 def _save(recording: Recording, path: Path, **arrays: np.ndarray[Any, Any]) -> None:
@@ -470,10 +355,6 @@ def _save(recording: Recording, path: Path, **arrays: np.ndarray[Any, Any]) -> N
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w") as file:
                 np.lib.format.write_array(file, array)
-
-
-def _write_json(path: Path, content: dict[str, Any]) -> None:
-    path.write_text(json.dumps(content, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def _titled(logs: Sequence[Path]) -> str:
@@ -505,10 +386,4 @@ def _say_recording(recording: Recording) -> None:
     if recording.channels:
         channels = [(name, " x ".join(map(str, values.shape))) for name, values in recording.channels.items()]
         say_table(("channel", "shape"), channels)
-    _say_notes(recording)
-
-
-def _say_notes(recording: Recording) -> None:
-    rows = [(note.kind.replace("_", " "), note.stream or "-", note.sentence) for note in recording.notes]
-    if rows:
-        say_table(("found", "where", "what"), rows)
+    say_notes(recording)

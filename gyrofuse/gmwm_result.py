@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from gyrofuse._composition import Composition
+from gyrofuse._records import Records
 from gyrofuse._result import ConfidenceInterval, listed
 from gyrofuse.datasheet import datasheet
-from gyrofuse.moment_covariance import moment_covariance
 from gyrofuse.moment_inference import Estimates, Fit, Inference
 from gyrofuse.processes import Model
 from gyrofuse.uncertainty import chi_square_interval
@@ -35,6 +35,8 @@ class GMWMResult:
         confidence_interval: Limits `(..., sensor, parameter)`. A variance at zero has an upper limit only.
         confidence_level: Of these.
         determined: `(..., sensor, parameter)`; where False the data say hardly more than the order of magnitude.
+        identified: `(..., sensor)`; False where parameters cannot be told apart at this length.
+        remarks: What cannot, in words, for each sensor, item after item.
         objective: `r' Omega r` with `r = nu - nu(theta)`, `(..., sensor)`.
         j_statistic: `r' V^-1 r`, `(..., sensor)`.
         p_value: Of the J test, that the model is complete, `(..., sensor)`; NaN where the model has as many
@@ -42,7 +44,7 @@ class GMWMResult:
         converged: `(..., sensor)`.
         wavelet_variance: Measured, `(..., level, sensor)`, signal^2.
         fitted_wavelet_variance: Of the model, the same.
-        n_samples: Length of the records.
+        records: Length of the record, or of those that the fit was to jointly, and the wavelet variances' efficiency.
         weighting: Of the moments.
         refined: Whether the parameters are those of the spectral likelihood; the J test is the moments' all the same.
         sensors: Names.
@@ -57,13 +59,15 @@ class GMWMResult:
     confidence_interval: ConfidenceInterval
     confidence_level: float
     determined: Tensor
+    identified: Tensor
+    remarks: tuple[tuple[str, ...], ...]
     objective: Tensor
     j_statistic: Tensor
     p_value: Tensor
     converged: Tensor
     wavelet_variance: Tensor
     fitted_wavelet_variance: Tensor
-    n_samples: int
+    records: Records
     weighting: str
     refined: bool
     sensors: tuple[str, ...]
@@ -78,6 +82,7 @@ class GMWMResult:
         inference: Inference,
         estimates: Estimates,
         fitted: Tensor,
+        remarks: list[tuple[str, ...]],
         made_of: Composition,
         usable: Tensor,
         wavelet_variance: Tensor,
@@ -94,6 +99,7 @@ class GMWMResult:
         tested = (inference.degrees > 0) & (rest["weighting"] == "optimal")
         p_value = torch.where(tested, _chi_square_tail(inference.j_statistic, inference.degrees), torch.nan)
         params = placed(estimates.params, torch.nan)
+        said = iter(remarks)
         return cls(
             model=(model := Model(list(made_of.processes))).with_params(params),
             param_names=model.param_names,
@@ -101,6 +107,8 @@ class GMWMResult:
             param_cov=placed(estimates.covariance, torch.nan),
             confidence_interval=ConfidenceInterval(placed(estimates.low, torch.nan), placed(estimates.high, torch.nan)),
             determined=placed(estimates.determined, False),
+            identified=placed(torch.tensor([not texts for texts in remarks], device=usable.device), False),
+            remarks=tuple(next(said) if ok else () for ok in usable.tolist()),
             objective=placed(inference.objective, torch.nan),
             j_statistic=placed(inference.j_statistic, torch.nan),
             p_value=placed(p_value, torch.nan),
@@ -110,12 +118,23 @@ class GMWMResult:
             **rest,
         )
 
+    @property
+    def n_samples(self) -> int:
+        """Length of the records, all together."""
+        return sum(self.records.lengths)
+
+    @property
+    def efficiency(self) -> float:
+        """Of the wavelet variances, 1 for the classic ones, less for robust ones."""
+        return self.records.efficiency
+
     def summary(self) -> str:
         """Parameters with intervals, sensor by sensor, and in datasheet units where rate and unit are known."""
         batch = self.params.shape[:-2]
         name = " + ".join(p.symbol for p in self.model.processes)
         kind = "GMWM fit, refined by spectral likelihood," if self.refined else "GMWM fit"
-        lines = [f"{kind} of {name}: {self.n_samples} samples, {self.wavelet_variance.shape[-2]} levels"]
+        robust = f", robust, efficiency {self.efficiency:g}" if self.efficiency < 1 else ""
+        lines = [f"{kind} of {name}: {self.n_samples} samples, {self.wavelet_variance.shape[-2]} levels{robust}"]
         n_items = self.params.shape[:-1].numel()
         if batch:
             lines.append(f"{n_items} fits in a batch {tuple(batch)}, {int(self.converged.sum())} converged")
@@ -147,23 +166,27 @@ class GMWMResult:
             if value == 0:
                 note = "  at its limit"
             rows.append(f"  {name:<24}{value:>13.6g}  [{first:>13.6g}, {last:>13.6g}]{note}")
+        item = sum(i * step for i, step in zip(index, self.identified.stride(), strict=True))
+        rows += [f"  {text}" for text in self.remarks[item]]
         if self.rate and self.unit:
             own = self.model.with_params(self.params[index])
             rows += ["  " + line for line in datasheet(own, self.rate, self.unit).summary().splitlines()[1:]]
         return rows
 
-    def plot(self, ax: Axes | None = None) -> Axes:
-        """Draw the first sensor's wavelet deviation with intervals, the fitted model and each of its components.
+    def plot(self, ax: Axes | None = None, *, index: tuple[int, ...] | None = None) -> Axes:
+        """Draw one sensor's Allan deviation with intervals, the fitted model and each of its components.
 
         Args:
             ax: Where to draw; a new figure by default.
+            index: Of the sensor among the leading dimensions; the first by default.
         """
         from gyrofuse.plotting_models import plot_moment_fit
 
-        first = (0,) * (self.params.ndim - 1)
-        measured = self.wavelet_variance.mT[first]
-        model = self.model.with_params(self.params[first])
-        spread = moment_covariance(model, self.n_samples, len(measured)).diagonal()
+        index = (0,) * (self.params.ndim - 1) if index is None else index
+        measured = self.wavelet_variance.mT[index]
+        model = self.model.with_params(self.params[index])
+        covariance = self.records.covariance(model)
+        spread = covariance.diagonal()
         # Degrees of freedom of the model: a variance that came out small by chance would seem to have none.
         degrees = 2 * model.wavelet_variance(len(measured)).square() / spread
         limits = chi_square_interval(measured, degrees, self.confidence_level)
@@ -180,6 +203,8 @@ class GMWMResult:
             "confidence_interval": {"low": listed(low), "high": listed(high)},
             "confidence_level": self.confidence_level,
             "determined": self.determined.tolist(),
+            "identified": self.identified.tolist(),
+            "remarks": [list(texts) for texts in self.remarks],
             "objective": listed(self.objective),
             "j_statistic": listed(self.j_statistic),
             "p_value": listed(self.p_value),
@@ -189,6 +214,7 @@ class GMWMResult:
             "n_samples": self.n_samples,
             "weighting": self.weighting,
             "refined": self.refined,
+            "efficiency": self.efficiency,
             "sensors": list(self.sensors),
             "rate": self.rate,
             "unit": self.unit,

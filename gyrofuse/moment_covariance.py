@@ -128,8 +128,7 @@ class _Tables(NamedTuple):
 
 @functools.lru_cache(maxsize=8)
 def _tables(n_samples: int, n_levels: int) -> _Tables:
-    steps = math.ceil(math.log(2 * _LONGEST * n_samples) / _SPACING)  # the time constant is e^v / 2
-    v: Array = _SPACING * np.arange(round(_LOWEST / _SPACING), steps + 1, dtype=np.float64)
+    v = _grid(n_samples)
     # Where each AR1 has its bump, and once beyond for the random walk; spectra are those over cosh(w).
     w = np.append(v, v[-1] + _SPACING)
     spectra = np.column_stack([1 / np.cosh(v - w[:, None]), np.exp(w - v[-1])])
@@ -148,6 +147,12 @@ def _tables(n_samples: int, n_levels: int) -> _Tables:
     frequencies = np.arctan(np.exp(-w)) / math.pi
     arrays = (frequencies, interpolation.T, np.stack([first, second]), np.stack(squares, -1), np.stack(means, -1))
     return _Tables(*(torch.from_numpy(np.ascontiguousarray(array)) for array in arrays))
+
+
+def _grid(n_samples: int) -> Array:
+    """Values of `v` of the AR1s."""
+    steps = math.ceil(math.log(2 * _LONGEST * n_samples) / _SPACING)  # the time constant is e^v / 2
+    return _SPACING * np.arange(round(_LOWEST / _SPACING), steps + 1, dtype=np.float64)
 
 
 def _covariances(h: int, k: int, lags: Array, alone: NDArray[np.bool_], v: Array) -> Array:

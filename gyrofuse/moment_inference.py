@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._composition import Composition
-from gyrofuse.moment_covariance import moment_covariance
+from gyrofuse._records import Records
 from gyrofuse.processes import AR1, Drift, Sinusoid
 from gyrofuse.uncertainty import normal_quantile
 
@@ -25,18 +25,23 @@ class Fit:
         linear: `p`, `(item, process)`.
         shape: `x`, `(item, shaped)`.
         held_sd: Spread of the frequencies `beta` that were held, `(item, sinusoid)`.
-        tau: `(level,)`.
         converged: `(item,)`.
         omega: Weights `(level,)` or `(level, level)`, or `"optimal"` or `"diagonal"`.
+        records: What was measured.
     """
 
     variance: Tensor
     linear: Tensor
     shape: Tensor
     held_sd: Tensor
-    tau: Tensor
     converged: Tensor
     omega: str | Tensor
+    records: Records
+
+    @property
+    def tau(self) -> Tensor:
+        """Filter lengths `(level,)`."""
+        return self.records.tau.to(self.variance.device)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,18 +82,18 @@ class Inference:
     degrees: Tensor
 
 
-def infer(fit: Fit, made_of: Composition, n_samples: int, confidence_level: float) -> Inference:
+def infer(fit: Fit, made_of: Composition, confidence_level: float) -> Inference:
     """Sandwich covariance `(A' O A)^-1 A' O V O A (A' O A)^-1`, `A = d nu / d theta` ([V] theorem 2), and the J test.
 
     Args:
         fit: Where the search ended.
         made_of: Structure of the model.
-        n_samples: Length T of the records.
         confidence_level: Probability that an interval holds the true value.
     """
     values, slopes = made_of.columns(fit.tau, fit.shape), made_of.slopes(fit.tau, fit.shape)
     fitted = (values @ fit.linear[..., None])[..., 0]
-    covariance = moment_covariance(made_of.model(fit.linear, fit.shape), n_samples, len(fit.tau))
+    model = made_of.model(fit.linear, fit.shape)
+    covariance = fit.records.covariance(model)
     residual = fit.variance - fitted
     root, failed = torch.linalg.cholesky_ex(covariance)
     whitened = torch.linalg.solve_triangular(root, residual[..., None], upper=False)[..., 0]

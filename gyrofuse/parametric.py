@@ -2,8 +2,9 @@
 
 The combined covariance `A = sum_j omega_j Gamma_j` of a record `X` of block means is the quadratic form `X Q X'` with a
 kernel `Q` over time that large scales make smooth: a few dozen directions in time carry it. In these the components
-`Theta_k` of a pilot model have small matrices `K_k`, so that resamples of `A`, joint over levels and sensors and of the
-exact finite-sample law, cost about as much as one Cholesky factor of size directions x sensors.
+`Theta_k` of a pilot model have small matrices `K_k`. Both components are diagonal in one basis of the sensors, so that
+resamples of `A`, joint over levels and sensors and of the exact finite-sample law, take one Cholesky factor of the size
+of the directions for each sensor.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ _HELD, _FEWEST_DIRECTIONS = 0.5, 24
 
 
 def resample_combined(
-    pilot: Pilot, scale_weights: Tensor, n_resamples: int, generator: torch.Generator
+    pilot: Pilot, scale_weights: Tensor, n_samples: int, n_resamples: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """Resamples of `A`, of the levels that the pilot was fitted to.
 
@@ -32,6 +33,7 @@ def resample_combined(
     Args:
         pilot: A model fitted to the arrays, batch `(item,)`.
         scale_weights: `(level,)`; those of lower levels do not matter.
+        n_samples: Length of each resampled record.
         n_resamples: Number of resamples.
         generator: Source of randomness, on the CPU.
 
@@ -40,9 +42,9 @@ def resample_combined(
     """
     omega = tuple(scale_weights[pilot.first_level :].tolist())
     n_sensors = pilot.theta.shape[-1]
-    found = _directions(pilot.n_samples, pilot.first_level, omega, pilot.time_constants)
+    found = _directions(n_samples, pilot.first_level, omega, pilot.time_constants)
     most = max(directions.within.shape[-1] for directions in found)  # so that memories do not matter to the draws
-    normal = torch.randn(most * n_sensors, n_resamples, generator=generator, dtype=pilot.theta.dtype)
+    normal = torch.randn(n_sensors, n_resamples, most, generator=generator, dtype=pilot.theta.dtype)
     normal = normal.to(pilot.theta.device)
     resamples = pilot.theta.new_empty(len(pilot.theta), n_resamples, n_sensors, n_sensors)
     expected = pilot.theta.new_empty(len(pilot.theta), n_sensors, n_sensors)
@@ -54,24 +56,33 @@ def resample_combined(
 
 def _draw(directions: _Directions, theta: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
     within = torch.from_numpy(directions.within).to(theta)  # K_k: (component, direction, direction)
-    rest = torch.einsum("k,nkio->nio", torch.from_numpy(directions.rest).to(theta), theta)
-    n, n_sensors = within.shape[-1], theta.shape[-1]
-    joint = torch.einsum("nkio,kab->naibo", theta, within).flatten(-2).flatten(-3, -2)
-    # Directions that hardly any component moves in make this singular to rounding.
-    size = joint.diagonal(dim1=-2, dim2=-1)
-    root = torch.linalg.cholesky(joint + torch.diag_embed(1e-12 * size + 1e-14 * size.amax(-1, keepdim=True)))
-    drawn = (root @ normal[: n * n_sensors]).unflatten(-2, (n, n_sensors)).movedim(-1, -3)
-    expected = torch.einsum("k,nkio->nio", torch.einsum("kaa->k", within), theta)
+    total = torch.einsum("kaa->k", within)
+    expected = torch.einsum("k,nkio->nio", total, theta)
+    # In this basis of the sensors every component is diagonal, and what they show independent.
+    root = _root(expected)
+    half = torch.linalg.solve_triangular(root, theta[:, 0], upper=False)
+    share, turn = torch.linalg.eigh(total[0] * torch.linalg.solve_triangular(root, half.mT, upper=False))
+    basis = root @ turn
+    share = torch.stack([share, 1 - share], -1).clamp(min=0)  # of each component: (item, sensor, component)
+    joint = torch.einsum("nsk,kab->nsab", share, within / total[:, None, None])
+    drawn = normal[..., : within.shape[-1]] @ _root(joint).mT  # (item, sensor, resample, direction)
+    drawn = drawn.transpose(-3, -2).contiguous()
+    products = basis[:, None] @ (drawn @ drawn.mT) @ basis[:, None].mT
     # What the other directions lack in variance, the ones kept make up for.
     size = theta.diagonal(dim1=-2, dim2=-1).sum(-1)  # (item, component)
-    share, total = (
-        torch.einsum("nk,km,nm->n", size, torch.from_numpy(products).to(size), size)
-        for products in (directions.kept, directions.whole)
+    kept, whole = (
+        torch.einsum("nk,km,nm->n", size, torch.from_numpy(inner).to(size), size)
+        for inner in (directions.kept, directions.whole)
     )
-    # (item, resample, direction, sensor), squared
-    moved = (total / share).sqrt()[:, None, None, None] * (drawn.mT @ drawn - expected[:, None])
-    expected = expected + rest
+    moved = (whole / kept).sqrt()[:, None, None, None] * (products - expected[:, None])
+    expected = expected + torch.einsum("k,nkio->nio", torch.from_numpy(directions.rest).to(theta), theta)
     return expected[:, None] + moved, expected
+
+
+def _root(matrix: Tensor) -> Tensor:
+    """Cholesky factor. What hardly any component moves in makes the matrix singular to rounding."""
+    size = matrix.diagonal(dim1=-2, dim2=-1)
+    return torch.linalg.cholesky(matrix + torch.diag_embed(1e-12 * size + 1e-14 * size.amax(-1, keepdim=True)))
 
 
 class _Directions(NamedTuple):

@@ -70,3 +70,27 @@ def plot_moment_fit(
     _time_axis(ax, rate is not None)
     _finish(ax, handles, labels)
     return ax
+
+
+def plot_residuals(residuals: Tensor, *, rate: float | None = None, ax: Axes | None = None) -> Axes:
+    """Draw wavelet variances measured less fitted, in standard deviations, with the range of 95 % of them.
+
+    Args:
+        residuals: `(level,)`.
+        rate: Hz; without it the averaging times are in samples.
+        ax: Where to draw; new axes by default.
+
+    Returns:
+        The axes.
+    """
+    ax = ax if ax is not None else _new_axes()
+    times = np.exp2(np.arange(len(residuals))) / (rate or 1.0)
+    ax.axhline(0.0, color=_BLUE, linewidth=1.2)
+    for limit in (-1.96, 1.96):
+        ax.axhline(limit, color=_BLUE, linewidth=0.8, linestyle="--")
+    ax.vlines(times, 0.0, residuals.tolist(), color=_INK, linewidth=1.0)
+    ax.plot(times, residuals.tolist(), "o", color=_INK, markersize=4)
+    ax.set_ylabel("residual")
+    _time_axis(ax, rate is not None)
+    _finish(ax)
+    return ax

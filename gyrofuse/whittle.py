@@ -53,6 +53,8 @@ class WhittleFit:
         slope: Of the ramp, with its sign, `(item,)`, signal per sample; 0 without one.
         slope_sd: With the noise as fitted, `(item,)`: too small where a random walk was estimated as 0.
         log_likelihood: Of what is left without tones and ramp, `(item,)`, nats.
+        energy: Sums of squared ordinates of that, `(item, bin)`, and
+        count: ordinates less the degrees of freedom of tones and ramp.
         converged: `(item,)`.
     """
 
@@ -64,6 +66,8 @@ class WhittleFit:
     slope: Tensor
     slope_sd: Tensor
     log_likelihood: Tensor
+    energy: Tensor
+    count: Tensor
     converged: Tensor
 
 
@@ -157,7 +161,8 @@ def _refined(
             count[:, : taken.shape[-1]] -= taken
         if tones is not None:
             count -= bins.taken_by(tones.beta, tones.phase)
-        p, x, reached = maximise(energy, count.clamp(min=_LEAST_COUNT), bins, noise, p, x)
+        count = count.clamp(min=_LEAST_COUNT)
+        p, x, reached = maximise(energy, count, bins, noise, p, x)
     linear[:, noise.which], shape[:, noise.at_x] = p, x
     if tones is not None:
         linear[:, tone_at] = tones.amplitude.square()
@@ -165,11 +170,11 @@ def _refined(
     linear[:, ramp_at] = slope.square()[:, None]
     linear, shape = made_of.ordered(linear, shape)
     p, x = linear[:, noise.which], shape[:, noise.at_x]
-    own, edge_sd = uncertainty(count.clamp(min=_LEAST_COUNT), bins, noise, p, x)
+    own, edge_sd = uncertainty(count, bins, noise, p, x)
     variance = noise.variances(bins, p, x)
     log_likelihood = -(bins.count * (2 * math.pi * variance).log() + energy / variance).sum(-1) / 2
     covariance, edge = _assembled(own, edge_sd, made_of, noise, at_tones, tones, slope, slope_sd, ramp_at)
-    return WhittleFit(linear, shape, covariance, edge, tones, slope, slope_sd, log_likelihood, reached)
+    return WhittleFit(linear, shape, covariance, edge, tones, slope, slope_sd, log_likelihood, energy, count, reached)
 
 
 def _transformed(signal: Tensor, tones: Tones | None, slope: Tensor | None) -> Iterator[Tensor]:
@@ -274,5 +279,7 @@ def _placed(fit: WhittleFit, usable: Tensor) -> WhittleFit:
         placed(fit.slope),
         placed(fit.slope_sd),
         placed(fit.log_likelihood),
+        placed(fit.energy),
+        placed(fit.count),
         placed(fit.converged),
     )

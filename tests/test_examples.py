@@ -50,6 +50,17 @@ def test_stream(tmp_path: Path, chunk: int):
     )
 
 
+def test_robust_fit(tmp_path: Path):
+    signal = torch.randn(1, 20_000, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    signal[:, ::5000] += 50
+    gf.Recording(signal, rate=100.0).save(tmp_path / "log.npz")
+    out = run("robust_fit.py", "log.npz", "--levels", 8, cwd=tmp_path)
+    classic, robust = (float(word) for word in out.split("white_noise.variance")[1].replace("[", " ").split()[0:4:3])
+    assert classic > 1.4
+    assert abs(robust - 1) < 0.05
+    assert (tmp_path / "robust_fit.png").stat().st_size > 10_000
+
+
 def test_field(tmp_path: Path):
     out = run("field.py", "--hours", 0.1, cwd=tmp_path)
     assert "Sensor 5 has its sign flipped" in out

@@ -13,7 +13,7 @@ from torch import Tensor
 
 import gyrofuse as gf
 from gyrofuse import _moment_search as search
-from gyrofuse.gmwm import _composition
+from gyrofuse.moment_fit import composition_of
 
 SIMULATION = gf.WhiteNoise(1.0) + gf.AR1(0.975, 0.03) + gf.RandomWalk(4e-4) + gf.Sinusoid(0.85, 0.35)
 FORMULA = "WN + AR1 + RW + SIN"
@@ -79,7 +79,7 @@ def test_no_start_finds_a_lower_minimum_of_noisy_copies(shared, axis, formula):
     noise = torch.randn(n, len(nu), generator=generator, dtype=torch.float64)
     copies = nu * (noise * (variance.sqrt() / nu).clamp(max=0.5)).exp()
     found = gf.fit_gmwm(copies.unsqueeze(-1), formula, weighting=1 / variance, n_samples=20_000)
-    made_of = _composition(formula, held=False)
+    made_of = composition_of(formula, held=False)
     tau = 2.0 ** torch.arange(1, len(nu) + 1, dtype=torch.float64)
     best = torch.full((n,), torch.inf, dtype=torch.float64)
     for _ in range(20):

@@ -109,11 +109,21 @@ def test_memory_is_the_random_walk_s_unless_an_ar1_is_far_likelier():
 def test_resamples_of_a_mixed_batch_are_those_of_its_items():
     omega = torch.arange(N_LEVELS).double()
     mixed = with_memory(torch.tensor([0, 2, 0]), 5)
-    drawn, expected = resample_combined(mixed, omega, 50, torch.Generator().manual_seed(1))
+    drawn, expected = resample_combined(mixed, omega, mixed.n_samples, 50, torch.Generator().manual_seed(1))
     for item in range(3):
-        alone = resample_combined(mixed[[item]], omega, 50, torch.Generator().manual_seed(1))
+        alone = resample_combined(mixed[[item]], omega, mixed.n_samples, 50, torch.Generator().manual_seed(1))
         torch.testing.assert_close(alone, (drawn[[item]], expected[[item]]))
     assert (expected[0] - expected[1]).abs().max() > 0.1 * expected[0].abs().max()
+
+
+@pytest.mark.parametrize("memory", [0, 1, 2])
+def test_a_stretch_of_the_record_has_the_same_noise(memory):
+    """The last levels of half a record: what is expected of them does not depend on how long the record is."""
+    omega = torch.tensor([0.0] * 7 + [1, 1, 1, 0]).double() / 3
+    model = with_memory(torch.tensor([memory]), 6)
+    _, whole = resample_combined(model, omega, N_SAMPLES, 2, torch.Generator().manual_seed(1))
+    _, half = resample_combined(model, omega, N_SAMPLES // 2, 2, torch.Generator().manual_seed(1))
+    torch.testing.assert_close(half, whole, rtol=1e-6, atol=1e-9)
 
 
 def test_certainty_is_that_of_the_fit():
@@ -150,7 +160,7 @@ def test_resamples_follow_the_law_of_recordings(scale_weights):
     sums, counts = wavelet_products(arrays(1500, seed=4), N_LEVELS)
     real = torch.einsum("j,njik->nik", omega, sums / counts)
     model = with_memory(torch.tensor([0]), 5)
-    drawn, expected = (x[0] for x in resample_combined(model, omega, 4000, torch.Generator().manual_seed(1)))
+    drawn, expected = (x[0] for x in resample_combined(model, omega, N_SAMPLES, 4000, torch.Generator().manual_seed(1)))
     exact = torch.einsum("j,jik->ik", omega, true_wccv())
     torch.testing.assert_close(expected, exact, rtol=0.02, atol=1e-5)
     scale = real.std(0)

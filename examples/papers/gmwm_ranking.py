@@ -1,0 +1,222 @@
+"""Which processes made a record: `rank_models` on the three simulations of Voirol et al., and on parts of them.
+
+Every composition that is left when processes are taken out of a simulation is simulated and ranked among all that
+make sense: how often the true one is chosen, how often it is chosen or named as equivalent, and what the wavelet
+variance information criterion (WVIC) would choose. Before that, theory says which of them a record of this length can
+show: a composition is taken for identified where 95 of 100 records give it a better criterion than the best smaller
+one has, a sinusoid where its line is twice as high as the test asks for, with three cycles or more. An AR1 with a
+time constant above half the record is the random walk that it is there. Simulations 2 and 3 have 160 000 samples
+here, 10 000 000 in the paper.
+
+    python examples/papers/gmwm_ranking.py [--quick] [--simulation N] [--samples T] [--runs N] [--out FOLDER] [--seed N]
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import matplotlib.pyplot as plt
+import torch
+from _gmwm_study import SIMULATIONS
+from _svo_study import arguments, figures_written, finish
+from torch import Tensor
+
+import gyrofuse as gf
+from gyrofuse._rank_candidates import composition, n_parameters, name_of
+from gyrofuse._rank_spectra import Spectra
+from gyrofuse.processes import Process
+from gyrofuse.tones import FEWEST_CYCLES
+
+N_SAMPLES = {1: 40_000, 2: 160_000, 3: 160_000}
+N_RUNS, QUICK_RUNS, QUICK_SAMPLES = 200, 10, 20_000
+_AT_ONCE = 2**23
+_LINE_LEVEL = 0.001
+_DRAWS = 2000
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of a simulation.
+
+    Attributes:
+        model: With values.
+        name: Of the composition that it is at this length.
+        lost: By how much 95 of 100 records prefer it to its closest rival; negative: not identified.
+        rival: Its name.
+    """
+
+    model: gf.Model
+    name: str
+    lost: float
+    rival: str
+
+
+def kinds_at(model: gf.Model, n_samples: int) -> list[type[Process]]:
+    """Types of the processes as a record of this length can show them."""
+    kinds: list[type[Process]] = []
+    for process in model.processes:
+        kind: type[Process] = type(process)
+        if isinstance(process, gf.AR1) and float(process.phi) > math.exp(-2 / n_samples):
+            kind = gf.RandomWalk
+        kinds.append(kind)
+    return kinds
+
+
+def parts(simulation: gf.Model, n_samples: int) -> list[Part]:
+    """All parts of a model that have noise in them, and what theory says of each."""
+    found = []
+    for n in range(1, len(simulation.processes) + 1):
+        for processes in itertools.combinations(simulation.processes, n):
+            if all(isinstance(p, gf.Sinusoid) for p in processes):
+                continue
+            model = gf.Model(list(processes))
+            name = name_of(kinds_at(model, n_samples))
+            lost, rival = min(loss_without_noise(model, n_samples), loss_without_tone(model, n_samples))
+            found.append(Part(model, name, lost, rival))
+    return found
+
+
+def noise_of(model: gf.Model) -> gf.Model:
+    return gf.Model([p for p in model.processes if not isinstance(p, gf.Sinusoid)])
+
+
+def loss_without_noise(model: gf.Model, n_samples: int) -> tuple[float, str]:
+    """Smallest loss among the noises with one process less, or a random walk in place of an AR1."""
+    noise = noise_of(model)
+    kinds = kinds_at(noise, n_samples)
+    spectra = Spectra(torch.zeros(1, n_samples, dtype=torch.float64))
+    f = torch.arange(1, n_samples, dtype=torch.float64) / (2 * n_samples)
+    density = noise.spectrum(f)
+    edges = spectra.bins.edges
+    spectra.energy = torch.stack([density[a - 1 : b - 1].sum() for a, b in itertools.pairwise(edges)])[None]
+    rivals = [kinds[:k] + kinds[k + 1 :] for k in range(len(kinds)) if len(kinds) > 1]
+    for k, limit in itertools.product(range(len(kinds)), (gf.RandomWalk, gf.WhiteNoise)):
+        if kinds[k] is gf.AR1:
+            rivals.append([*kinds[:k], limit, *kinds[k + 1 :]])
+    count, truth = spectra.bins.count, spectra.energy[0] / spectra.bins.count
+    generator = torch.Generator().manual_seed(0)
+    degrees = (count / 2).expand(_DRAWS, -1)
+    drawn = 2 * torch._standard_gamma(degrees, generator=generator) * truth  # energies of records
+    losses = [(math.inf, "-")]
+    for rival in rivals:
+        others = [v for v in rival if v is not gf.AR1]
+        if len(set(others)) < len(others):
+            continue  # two of a kind
+        made_of = composition(rival, held=True)
+        linear = (spectra.energy.sum() / n_samples).expand(1, made_of.n_linear)
+        grid = torch.linspace(0.05, 0.95, 8, dtype=torch.float64) * math.log(n_samples)
+        fits = [
+            spectra.fit(made_of, linear, torch.tensor([start], dtype=torch.float64).reshape(1, len(made_of.shaped)))
+            for start in itertools.combinations((-1 / grid.exp()).exp().atanh().tolist(), len(made_of.shaped))
+        ]
+        best = max(fits, key=lambda fit: fit.log_likelihood.item())
+        variance = spectra.variances(made_of, best)[0]
+        gained = (drawn / variance - drawn / truth + count * (variance / truth).log()).sum(-1).quantile(0.05).item()
+        saved = n_parameters(composition(kinds, held=True)) - n_parameters(made_of)
+        losses.append((gained - saved * math.log(n_samples), made_of.name))
+    return min(losses)
+
+
+def loss_without_tone(model: gf.Model, n_samples: int) -> tuple[float, str]:
+    """Of the weakest line: its height over the noise less twice what the test asks for."""
+    needed = 2 * math.log(n_samples / 2 / _LINE_LEVEL)
+    losses = [(math.inf, "-")]
+    for tone in (p for p in model.processes if isinstance(p, gf.Sinusoid)):
+        amplitude, beta = float(tone.amplitude), torch.tensor([float(tone.beta)], dtype=torch.float64)
+        height = amplitude**2 * n_samples / (4 * noise_of(model).spectrum(beta / (2 * math.pi)).item())
+        cycles = float(tone.beta) * n_samples / (2 * math.pi)
+        losses.append((height - needed if cycles > FEWEST_CYCLES else -math.inf, "one SIN less"))
+    return min(losses)
+
+
+@dataclass(frozen=True)
+class Rates:
+    """How often a part was recognised.
+
+    Attributes:
+        right: Chosen.
+        named: Chosen, or named as equivalent.
+        wvic: Chosen by WVIC.
+        others: What was chosen instead, most often first.
+    """
+
+    right: float
+    named: float
+    wvic: float
+    others: list[tuple[str, int]]
+
+
+def rates(part: Part, n_samples: int, n_runs: int, generator: torch.Generator) -> Rates:
+    """Rank so many records of a part."""
+    right = named = wvic = 0
+    others: dict[str, int] = {}
+    for first in range(0, n_runs, max(_AT_ONCE // n_samples, 1)):
+        n = min(max(_AT_ONCE // n_samples, 1), n_runs - first)
+        signal: Tensor = part.model.simulate(n_samples, batch=(n, 1), generator=generator)
+        ranked = gf.rank_models(signal, line_level=_LINE_LEVEL, fit=False)
+        place = ranked.candidates.index(part.name) if part.name in ranked.candidates else -2
+        right += int((ranked.choice == place).sum())
+        wvic += int((ranked.wvic_choice == place).sum())
+        named += int(((ranked.choice == place) | (place >= 0) & ranked.equivalent[..., place]).sum())
+        for name in ranked.names:
+            if name != part.name:
+                others[str(name)] = others.get(str(name), 0) + 1
+    ordered = sorted(others.items(), key=lambda item: -item[1])
+    return Rates(right / n_runs, named / n_runs, wvic / n_runs, ordered)
+
+
+def study(number: int, n_samples: int, n_runs: int, seed: int) -> list[tuple[Part, Rates]]:
+    """Print the table of a simulation and return its identified parts."""
+    print(f"\nSimulation {number}: {n_samples} samples, {n_runs} records of each composition")
+    print(f"{'true composition':<26}{'chosen':>8}{'or equivalent':>15}{'WVIC':>8}{'margin':>10}  most often instead")
+    found = []
+    for k, part in enumerate(parts(SIMULATIONS[number], n_samples)):
+        if part.lost < 0:
+            print(f"{part.name:<26}{'not identified':>31}{part.lost:>10.1f}  closest: {part.rival}", flush=True)
+            continue
+        rate = rates(part, n_samples, n_runs, torch.Generator().manual_seed(1000 * seed + 100 * number + k))
+        cells = f"{rate.right:>8.3f}{rate.named:>15.3f}{rate.wvic:>8.3f}{part.lost:>10.1f}"
+        print(f"{part.name:<26}{cells}  {', '.join(f'{n} {name}' for name, n in rate.others[:3])}", flush=True)
+        found.append((part, rate))
+    total = [sum(getattr(rate, kind) for _, rate in found) / len(found) for kind in ("right", "named", "wvic")]
+    least = min(rate.right for _, rate in found)
+    print(f"mean: chosen {total[0]:.3f} (least {least:.3f}), or equivalent {total[1]:.3f}; WVIC {total[2]:.3f}")
+    return found
+
+
+def main() -> None:
+    parser = arguments(__doc__)
+    parser.add_argument("--simulation", type=int, choices=list(SIMULATIONS), help="this one alone")
+    parser.add_argument("--samples", type=int, help="length of the records; 40 000 and 160 000 by default")
+    parser.add_argument("--runs", type=int, help=f"records of each composition; {N_RUNS} by default")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    which = [options.simulation] if options.simulation else ([1] if options.quick else list(SIMULATIONS))
+    n_runs = options.runs or (QUICK_RUNS if options.quick else N_RUNS)
+    lengths = dict.fromkeys(N_SAMPLES, QUICK_SAMPLES) if options.quick else N_SAMPLES
+    tables = {number: study(number, options.samples or lengths[number], n_runs, options.seed) for number in which}
+    heights = [len(table) for table in tables.values()]
+    size = (8, 1.2 + 0.32 * sum(heights))
+    figure, axes = plt.subplots(
+        len(tables), 1, figsize=size, squeeze=False, height_ratios=heights, layout="constrained"
+    )
+    for ax, (number, table) in zip(axes[:, 0], tables.items(), strict=True):
+        for kind, label, color, marker in (
+            ("right", "BIC of the spectral likelihood", "#0072b2", "o"),
+            ("wvic", "WVIC", "#d55e00", "s"),
+        ):
+            ax.plot([getattr(rate, kind) for _, rate in table], range(len(table)), marker, color=color, label=label)
+        ax.set_yticks(range(len(table)), [part.name for part, _ in table], fontsize=8)
+        ax.axvline(0.95, color="#555555", linewidth=0.8, linestyle="--")
+        ax.set_xlim(-0.02, 1.02)
+        ax.set_title(f"Simulation {number}", fontsize=10)
+    axes[-1, 0].set_xlabel("share of records of which the true composition was chosen")
+    axes[0, 0].legend(loc="lower left", fontsize=8)
+    finish(figure, options.out / "gmwm_ranking.png")
+    figures_written(options.out, "gmwm_ranking.png")
+
+
+if __name__ == "__main__":
+    main()

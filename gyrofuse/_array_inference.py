@@ -1,0 +1,172 @@
+"""What a moment fit of arrays says of its matrices: intervals that respect their range, and the J test."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gyrofuse._array_moments import array_moment_covariance, pairs, unvech, vech, weights_of
+from gyrofuse._array_search import jacobian
+from gyrofuse._composition import Composition
+from gyrofuse.moment_inference import _sandwich
+from gyrofuse.processes import AR1
+from gyrofuse.uncertainty import normal_quantile
+
+# Of the largest eigenvalue of a matrix between sensors of unit size, what is as good as none.
+_NOTHING = 1e-5
+# Standard deviations from zero below which the logarithm of a variance tells nothing.
+_RESOLVED = 0.5
+
+
+class ArrayFit(NamedTuple):
+    """Where a search ended.
+
+    Attributes:
+        theta: `(item, process, sensor, sensor)`.
+        shape: `x`, `(item, shaped)`.
+        converged: `(item,)`.
+        spread: Covariance of the entries of `theta` and the `x` that moved, `(item, unknown, unknown)`; NaN for entries
+            that no moment tells.
+        objective: `r' Omega r`, `(item,)`.
+        degrees: Of freedom of the J statistic, `(item,)`.
+        dispersion: Variance of the J statistic over that of a chi-square, `(item,)`.
+    """
+
+    theta: Tensor
+    shape: Tensor
+    converged: Tensor
+    spread: Tensor
+    objective: Tensor
+    degrees: Tensor
+    dispersion: Tensor
+
+
+class Estimate(NamedTuple):
+    """A value with its standard deviation and interval, all of one shape."""
+
+    value: Tensor
+    sd: Tensor
+    low: Tensor
+    high: Tensor
+
+
+def spread_of_fit(
+    gamma: Tensor, theta: Tensor, shape: Tensor, n_samples: int, made_of: Composition, weighting: str
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Sandwich covariance `(A' O A)^-1 A' O V O A (A' O A)^-1` with `A` the Jacobian, as if no matrix lacked rank.
+
+    Args:
+        gamma: What was fitted, `(item, level, sensor, sensor)`.
+        theta: `(item, process, sensor, sensor)`.
+        shape: `x`, `(item, shaped)`.
+        n_samples: Length T of the records.
+        made_of: Structure of the model.
+        weighting: Of the moments.
+
+    Returns:
+        Covariance, objective, degrees of freedom and dispersion as in `ArrayFit`.
+    """
+    n_items, n_levels, n_sensors = gamma.shape[:3]
+    tau = torch.exp2(torch.arange(1, n_levels + 1, dtype=gamma.dtype, device=gamma.device))
+    present = vech(gamma).isfinite()
+    covariance = array_moment_covariance(made_of, theta, shape, n_samples, n_levels)
+    weight = weights_of(covariance, present, weighting)
+    fitted = made_of.columns(tau, shape) @ vech(theta)
+    residual = torch.where(present, vech(gamma) - fitted, 0.0).flatten(1)
+    # As many levels as processes tell a pair's entries.
+    told = (present.sum(1) >= made_of.n_linear)[:, None].expand(-1, made_of.n_linear, -1).flatten(1)
+    known = torch.cat([told, told.new_ones(n_items, len(made_of.curved))], -1)
+    columns = jacobian(tau, made_of, theta, shape) * present.flatten(1)[..., None]
+    flat = covariance.reshape(*weight.shape)
+    spread, objective = _sandwich(columns, known, flat, residual, weight)
+    spread = torch.where(known[:, :, None] & known[:, None, :], spread, torch.nan)
+    eigenvalues = torch.linalg.eigvalsh(theta)
+    lost = (eigenvalues < _NOTHING * eigenvalues[..., -1:]).sum(-1)
+    degrees = present.flatten(1).sum(-1) - known.sum(-1) + (lost * (lost + 1) // 2).sum(-1)
+    own = [at for at, pair in enumerate(zip(*pairs(n_sensors), strict=True)) if pair[0] == pair[1]]
+    variance = covariance.diagonal(dim1=1, dim2=3).diagonal(dim1=1, dim2=2)
+    rarity = (variance / fitted.square() / 2)[..., own]  # of observations: one over their number, (item, level, sensor)
+    return spread, objective, degrees, _dispersion(rarity, present[..., own], degrees)
+
+
+def _dispersion(rarity: Tensor, present: Tensor, degrees: Tensor) -> Tensor:
+    """Variance of `r' V^-1 r` over twice its degrees of freedom, when levels hold few observations.
+
+    Of a covariance `S` of `p` variables with `n` observations, `n tr((S - 1)^2) / 2` has mean `p (p + 1) / 2` and
+    variance `p (p + 1) + p (2 p^2 + 5 p + 5) / n`.
+    """
+    p = present.sum(-1)  # (item, level)
+    mean = torch.where(present, rarity, 0.0).sum(-1) / p.clamp(min=1)
+    return 1 + (p * (2 * p.square() + 5 * p + 5) * mean).sum(-1) / (2 * degrees.clamp(min=1))
+
+
+def matrices(fit: ArrayFit, confidence_level: float) -> tuple[Estimate, Estimate]:
+    """Entries of the matrices, and correlations, each `(item, process, sensor, sensor)`.
+
+    Intervals are symmetric in the logarithm of variances, in `atanh` of correlations, and in covariances as they are. A
+    variance that is hardly told from zero gets an upper limit only.
+    """
+    n_processes, n_sensors = fit.theta.shape[1], fit.theta.shape[-1]
+    a, b = pairs(n_sensors)
+    n_pairs = len(a)
+    n_linear = n_processes * n_pairs
+    whole = fit.spread[:, :n_linear, :n_linear].unflatten(1, (n_processes, -1)).unflatten(3, (n_processes, -1))
+    spread = whole.diagonal(dim1=1, dim2=3).movedim(-1, 1)  # (item, process, pair, pair)
+    sd = spread.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
+    value = torch.where(sd.isnan(), torch.nan, vech(fit.theta))
+    z, one_sided = normal_quantile((1 + confidence_level) / 2), normal_quantile(confidence_level)
+    low, high = value - z * sd, value + z * sd
+    own = (a == b).nonzero()[:, 0]
+    variance, ratio = value[..., own], sd[..., own] / value[..., own]
+    resolved = ratio < 1 / _RESOLVED
+    low[..., own] = torch.where(resolved, variance * torch.exp(-z * ratio), 0 * variance)
+    high[..., own] = torch.where(resolved, variance * torch.exp(z * ratio), variance + one_sided * sd[..., own])
+    entries = Estimate(*(unvech(part) for part in (value, sd, low, high)))
+
+    # d rho = d theta_ab / s - rho (d theta_aa / theta_aa + d theta_bb / theta_bb) / 2
+    first, second = own[a], own[b]
+    scale = (value[..., first] * value[..., second]).sqrt()
+    rho = (value / scale).clamp(-1, 1)
+    place = torch.arange(n_pairs)
+    slopes = torch.zeros_like(spread)
+    slopes[..., place, place] = 1 / scale
+    slopes[..., place, first] -= rho / (2 * value[..., first])
+    slopes[..., place, second] -= rho / (2 * value[..., second])
+    filled = spread.nan_to_num(nan=0.0)
+    rho_sd = (slopes.nan_to_num(nan=0.0) @ filled * slopes.nan_to_num(nan=0.0)).sum(-1).clamp(min=0).sqrt()
+    rho_sd = torch.where(rho.isnan(), torch.nan, rho_sd)
+    # Towards a correlation of one, which it takes for certain, the scale of atanh ends.
+    width = z * rho_sd / (1 - rho.square()).clamp(min=1e-12)
+    middle = rho.clamp(-1 + 1e-12, 1 - 1e-12).atanh()
+    low, high = ((middle + sign * width).tanh() for sign in (-1, 1))
+    # Every sensor agrees with itself.
+    certain = [torch.where(a == b, one, part) for one, part in ((0.0, rho_sd), (1.0, low), (1.0, high))]
+    return entries, Estimate(*(unvech(part) for part in (rho, *certain)))
+
+
+def shared(fit: ArrayFit, held_sd: Tensor, made_of: Composition, confidence_level: float) -> Estimate:
+    """Parameters `(item, parameter)` of all sensors, `phi` of AR1s and `beta` of tones, in the order of the model.
+
+    Intervals are symmetric in `atanh phi` and `logit(beta / pi)`.
+    """
+    z = normal_quantile((1 + confidence_level) / 2)
+    n_moving = len(made_of.curved)
+    moving = fit.spread.diagonal(dim1=-2, dim2=-1)[:, fit.spread.shape[-1] - n_moving :].clamp(min=0).sqrt()
+    moved, held = iter(moving.unbind(-1)), iter(held_sd.unbind(-1))
+    found = []
+    for k, x in zip(made_of.shaped, fit.shape.unbind(-1), strict=True):
+        if isinstance(made_of.processes[k], AR1):
+            width = next(moved)
+            value, slope, ends = x.tanh(), 1 - x.tanh().square(), ((x - z * width).tanh(), (x + z * width).tanh())
+        else:
+            part = x.sigmoid()
+            slope = torch.pi * part * (1 - part)
+            width = next(moved) if k in made_of.curved else next(held) / slope
+            value = torch.pi * part
+            ends = (torch.pi * (x - z * width).sigmoid(), torch.pi * (x + z * width).sigmoid())
+        found.append(Estimate(value, slope * width, *ends))
+    if not found:
+        return Estimate(*(fit.shape,) * 4)
+    return Estimate(*(torch.stack(column, -1) for column in zip(*found, strict=True)))

@@ -1,0 +1,134 @@
+"""Compositions fitted to the wavelet variances of records, each from where smaller ones ended.
+
+Leaner than the fit of one model: without a search for several minima and without polishing, which many compositions
+too large for their record would spend on flat valleys.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gyrofuse import _moment_search as search
+from gyrofuse._composition import Composition
+from gyrofuse._nnls import nonnegative_least_squares
+from gyrofuse._records import Records
+from gyrofuse.moment_covariance import moment_covariance
+from gyrofuse.moment_inference import Estimates, Fit, infer
+from gyrofuse.processes import AR1
+
+_UPDATES = 2
+_GRID_POINTS = 48
+_STEPS_NEAR = 10
+
+
+@dataclass(frozen=True, eq=False)
+class MomentFit:
+    """Minimum of `r' V^-1 r`, `V` that of the fit.
+
+    Attributes:
+        linear: `p`, `(item, process)`, signal^2.
+        shape: `x`, `(item, shaped)`.
+        objective: `r' V^-1 r`, `(item,)`.
+        log_det: `ln det V`, of wavelet variances over the largest, `(item,)`.
+        active: Parameters that are not at an edge, `(item,)`.
+    """
+
+    linear: Tensor
+    shape: Tensor
+    objective: Tensor
+    log_det: Tensor
+    active: Tensor
+
+
+class Moments:
+    """Wavelet variances of records.
+
+    Args:
+        variance: `(item, level)`, finite and > 0.
+        n_samples: Length T of the records.
+    """
+
+    def __init__(self, variance: Tensor, n_samples: int) -> None:
+        self.variance, self.n_samples = variance, n_samples
+        self.size = variance.amax(-1, keepdim=True)
+        self._target = variance / self.size
+        levels = variance.shape[-1]
+        self.tau = torch.exp2(torch.arange(1, levels + 1, dtype=variance.dtype, device=variance.device))
+        self.observations = (3 * (n_samples - self.tau + 1) / self.tau).clamp(min=1)
+        self._diagonal = self.observations.sqrt() / self._target
+
+    def fit(self, made_of: Composition, starts: list[Tensor]) -> MomentFit:
+        """Climb down from each `x` `(item, shaped)`, and from the lowest place with the fit's own `V`."""
+        target, tau = self._target, self.tau
+        ends = [search.minimise(target, self._diagonal, tau, made_of, start)[:3] for start in starts]
+        lowest = torch.stack([objective.nan_to_num(nan=torch.inf) for *_, objective in ends]).argmin(0)
+        items = torch.arange(len(target), device=target.device)
+        linear, x = (torch.stack(column)[lowest, items] for column in list(zip(*ends, strict=True))[:2])
+        for _ in range(_UPDATES):
+            linear, x, _, _ = search.minimise(target, self._whitening(made_of, linear, x), tau, made_of, x)
+        return self._summed_up(made_of, linear, x)
+
+    def near(self, made_of: Composition, linear: Tensor, shape: Tensor) -> MomentFit:
+        """Minimum next to a maximum of the likelihood, with the `V` of that."""
+        root = self._whitening(made_of, linear / self.size, shape)
+        linear, x, _, _ = search.minimise(self._target, root, self.tau, made_of, shape, _STEPS_NEAR)
+        return self._summed_up(made_of, linear, x)
+
+    def part(self, items: Tensor) -> Moments:
+        """Of some items."""
+        return Moments(self.variance[items], self.n_samples)
+
+    def _summed_up(self, made_of: Composition, linear: Tensor, x: Tensor) -> MomentFit:
+        target, tau = self._target, self.tau
+        root = self._whitening(made_of, linear, x)
+        residual = target - made_of.wavelet_variance(tau, linear, x)
+        objective = (root @ residual[..., None]).square().sum((-2, -1))
+        log_det = -2 * root.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        present = linear > 0
+        active = (present.sum(-1) + present[:, made_of.curved].sum(-1)).to(linear)
+        linear, x = made_of.ordered(linear * self.size, x)
+        return MomentFit(linear, x, objective, log_det, active)
+
+    def estimates(self, made_of: Composition, fit: MomentFit) -> Estimates:
+        """Parameters with their uncertainty."""
+        done = torch.ones(len(fit.linear), dtype=torch.bool, device=fit.linear.device)
+        held = fit.shape[:, :0]
+        records = Records((self.n_samples,), (len(self.tau),))
+        return infer(Fit(self.variance, fit.linear, fit.shape, held, done, "optimal", records), made_of, 0.95).estimates
+
+    def roots(self, made_of: Composition) -> list[Tensor]:
+        """Starts of a composition with at most one shaped process: the best points of a grid."""
+        weight = self._diagonal.square()
+        held = self._target.new_empty(len(self._target), 0)
+        found = search.starting_points(self._target, weight, self.tau, made_of, held, 4)
+        return list(found.unbind(1))
+
+    def widened(self, parent: Composition, fit: MomentFit, made_of: Composition) -> Tensor:
+        """Start of a composition with one process more, a further shape where variances with it fit best."""
+        if len(made_of.shaped) == len(parent.shaped):
+            return fit.shape
+        before, after = ([type(m.processes[k]) for k in m.shaped] for m in (parent, made_of))
+        at = next(i for i, kind in enumerate(after) if before[i : i + 1] != [kind])
+        grid = self._grid(isinstance(made_of.processes[made_of.shaped[at]], AR1))
+        tried = fit.shape[:, None].expand(-1, len(grid), -1)
+        new = grid[:, None].expand(len(fit.shape), -1, 1)
+        tried = torch.cat([tried[..., :at], new, tried[..., at:]], -1)  # (item, point, shaped)
+        columns = made_of.columns(self.tau, tried) * self._diagonal[:, None, :, None]
+        wanted = (self._target * self._diagonal)[:, None, :, None]
+        linear = nonnegative_least_squares(columns.mT @ columns, (columns.mT @ wanted)[..., 0])
+        misfit = (wanted - columns @ linear[..., None]).square().sum((-2, -1))
+        return tried[torch.arange(len(tried), device=tried.device), misfit.argmin(-1)]
+
+    def _grid(self, ar1: bool) -> Tensor:
+        longest = float(self.tau[-1])
+        steps = torch.linspace(0, 1, _GRID_POINTS, dtype=torch.float64, device=self.tau.device)
+        if ar1:
+            phi = torch.exp(-1 / (longest * (1 / (3 * longest)) ** steps))
+            return torch.cat([phi, phi.new_tensor([-0.3, -0.7])]).atanh()
+        return (2 / (4 * longest * (2.01 / (4 * longest)) ** steps)).logit()
+
+    def _whitening(self, made_of: Composition, linear: Tensor, x: Tensor) -> Tensor:
+        return search.whitening(moment_covariance(made_of.model(linear, x), self.n_samples, len(self.tau)))

@@ -1,0 +1,190 @@
+"""Largest likelihoods of compositions for many records, each climbed to from the best with one process less."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import Generic, TypeVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse import _rank_candidates as compositions
+from gyrofuse._composition import Composition
+from gyrofuse._rank_candidates import Key, Kinds
+from gyrofuse._rank_moments import MomentFit, Moments
+from gyrofuse._rank_spectra import NoiseFit, Spectra
+
+# Criteria are minus twice a log posterior probability: up to here, 3 nats, the odds are below 20 to 1.
+EQUIVALENT = 6.0
+# Compositions of one size whose children are tried.
+_BEAM = 3
+# Time constants at which the first AR1 starts, as powers of the length.
+_FIRST_AR1 = (-0.2, 0.2, 0.5, 0.8)
+
+FitT = TypeVar("FitT", NoiseFit, MomentFit)
+
+
+class _Search(ABC, Generic[FitT]):
+    """Fits of compositions to some of the records each.
+
+    Args:
+        n_items: How many records.
+        n_samples: Length T of each.
+        device: Where they are.
+
+    Attributes:
+        fits: Of all records; NaN where a composition was not tried.
+    """
+
+    held: bool
+
+    def __init__(self, n_items: int, n_samples: int, device: torch.device) -> None:
+        self._everyone, self._n_samples = torch.arange(n_items, device=device), n_samples
+        self.fits: dict[Key, tuple[Composition, FitT]] = {}
+
+    def run(self, wanted: list[Kinds], searching: bool) -> None:
+        """Fit all that are wanted to all records, or search among them for those that matter to each."""
+        if searching:
+            self._widen(wanted)
+            return
+        for kinds in compositions.with_ancestors(wanted):
+            self._try_out(kinds, self._everyone)
+
+    def found(self, key: Key) -> tuple[Composition, Tensor, FitT]:
+        """A composition, the records to which it was fitted, and the fit of those."""
+        made_of, fit = self.fits[key]
+        items = self._loss(fit).isfinite().nonzero()[:, 0]
+        return made_of, items, _part(fit, items)
+
+    def criterion(self, key: Key) -> Tensor:
+        """BIC `(item,)`, infinite where it was not tried."""
+        made_of, fit = self.fits[key]
+        penalty = compositions.n_parameters(made_of) * math.log(self._n_samples)
+        return (self._loss(fit) + penalty).nan_to_num(nan=torch.inf)
+
+    def _widen(self, wanted: list[Kinds]) -> None:
+        """From one process to more, for every record the children of its few best, as long as one of them gains."""
+        known = {compositions.key_of(kinds) for kinds in wanted}
+        everyone = torch.ones_like(self._everyone, dtype=torch.bool)
+        best = torch.full_like(self._everyone, torch.inf, dtype=torch.float64)
+        todo = {compositions.key_of(kinds): (kinds, everyone) for kinds in wanted if len(kinds) == 1}
+        while todo:
+            for kinds, which in todo.values():
+                self._try_out(kinds, which.nonzero()[:, 0])
+            found = torch.stack([self.criterion(key) for key in todo])  # (candidate, item)
+            going = found.amin(0) < best + EQUIVALENT
+            best = torch.minimum(best, found.amin(0))
+            kept = (found.argsort(0).argsort(0) < _BEAM) & found.isfinite() & going
+            following: dict[Key, tuple[Kinds, Tensor]] = {}
+            for (kinds, _), which in zip(todo.values(), kept, strict=True):
+                for child in compositions.children(kinds, known) if bool(which.any()) else ():
+                    _, other = following.get(compositions.key_of(child), (child, torch.zeros_like(which)))
+                    following[compositions.key_of(child)] = child, which | other
+            todo = following
+
+    def _try_out(self, kinds: Kinds, items: Tensor) -> None:
+        """Fit one composition to some records, from the best of its parents."""
+        made_of = compositions.composition(kinds, self.held)
+        smaller = [self.fits[key] for key in compositions.parents(kinds) if key in self.fits]
+        if smaller:
+            best = torch.stack([self._loss(fit)[items].nan_to_num(nan=torch.inf) for _, fit in smaller]).argmin(0)
+            starts: list[tuple[Tensor, tuple[Tensor, ...]]] = []
+            for n, (parent, fit) in enumerate(smaller):
+                own = (best == n).nonzero()[:, 0]
+                if len(own):
+                    starts.append((own, self._start(made_of, items[own], parent, _part(fit, items[own]))))
+            columns = zip(*(values for _, values in starts), strict=True)
+            joined = [_among([own for own, _ in starts], column, len(items)) for column in columns]
+            found = self._climb(made_of, items, *joined)
+        else:
+            found = self._first(made_of, items)
+        whole = (_among([items], [getattr(found, f.name)], len(self._everyone)) for f in fields(found))
+        self.fits[compositions.key_of(kinds)] = made_of, type(found)(*whole)
+
+    @abstractmethod
+    def _loss(self, fit: FitT) -> Tensor:
+        """Minus twice the log likelihood `(item,)`."""
+
+    @abstractmethod
+    def _first(self, made_of: Composition, items: Tensor) -> FitT:
+        """Fit a composition without parents."""
+
+    @abstractmethod
+    def _start(self, made_of: Composition, items: Tensor, parent: Composition, fit: FitT) -> tuple[Tensor, ...]:
+        """Where to start, from a parent's fit to the same records."""
+
+    @abstractmethod
+    def _climb(self, made_of: Composition, items: Tensor, *start: Tensor) -> FitT:
+        """Fit from there."""
+
+
+class SpectralSearch(_Search[NoiseFit]):
+    """By the spectral likelihood of records without lines."""
+
+    held = True
+
+    def __init__(self, spectra: Spectra) -> None:
+        super().__init__(len(spectra.energy), spectra.bins.n_samples, spectra.energy.device)
+        self._spectra = spectra
+
+    def _loss(self, fit: NoiseFit) -> Tensor:
+        return -2 * fit.log_likelihood
+
+    def _first(self, made_of: Composition, items: Tensor) -> NoiseFit:
+        spectra = self._spectra.part(items)
+        size = spectra.energy.sum(-1, keepdim=True) / spectra.count.sum(-1, keepdim=True)
+        linear = size.expand(-1, made_of.n_linear)
+        if not made_of.shaped:
+            return spectra.fit(made_of, linear, linear[:, :0])
+        constants = (float(self._n_samples) ** power for power in _FIRST_AR1)
+        ends = [spectra.fit(made_of, linear, torch.full_like(size, math.atanh(math.exp(-1 / c)))) for c in constants]
+        best = ends[0]
+        for other in ends[1:]:
+            best = best.where(best.log_likelihood >= other.log_likelihood, other)
+        return best
+
+    def _start(self, made_of: Composition, items: Tensor, parent: Composition, fit: NoiseFit) -> tuple[Tensor, ...]:
+        return self._spectra.part(items).widened(parent, fit, made_of)
+
+    def _climb(self, made_of: Composition, items: Tensor, *start: Tensor) -> NoiseFit:
+        linear, shape = start
+        return self._spectra.part(items).fit(made_of, linear, shape)
+
+
+class MomentSearch(_Search[MomentFit]):
+    """By the likelihood of wavelet variances, taken for normal with the `V` of each fit."""
+
+    held = False
+
+    def __init__(self, moments: Moments) -> None:
+        super().__init__(len(moments.variance), moments.n_samples, moments.variance.device)
+        self._moments = moments
+
+    def _loss(self, fit: MomentFit) -> Tensor:
+        return fit.objective + fit.log_det
+
+    def _first(self, made_of: Composition, items: Tensor) -> MomentFit:
+        moments = self._moments.part(items)
+        return moments.fit(made_of, moments.roots(made_of))
+
+    def _start(self, made_of: Composition, items: Tensor, parent: Composition, fit: MomentFit) -> tuple[Tensor, ...]:
+        return (self._moments.part(items).widened(parent, fit, made_of),)
+
+    def _climb(self, made_of: Composition, items: Tensor, *start: Tensor) -> MomentFit:
+        return self._moments.part(items).fit(made_of, list(start))
+
+
+def _part(fit: FitT, items: Tensor) -> FitT:
+    """Of some records."""
+    return type(fit)(*(getattr(fit, f.name)[items] for f in fields(fit)))
+
+
+def _among(places: Sequence[Tensor], values: Sequence[Tensor], n_items: int) -> Tensor:
+    """Values in their places among so many, NaN elsewhere."""
+    whole = values[0].new_full((n_items, *values[0].shape[1:]), torch.nan)
+    for items, value in zip(places, values, strict=True):
+        whole[items] = value
+    return whole

@@ -1,0 +1,116 @@
+"""What a fitted noise model comes to, in sentences: whether it is complete, what rules at which scale, what is weak."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import groupby
+
+import torch
+from torch import Tensor
+
+from gyrofuse.gmwm_result import GMWMResult
+from gyrofuse.processes import Model, Sinusoid
+from gyrofuse.report_page import number
+
+# Of the J test: a model is refused below the second, doubted below the first.
+_DOUBTED, _REFUSED = 0.05, 0.01
+_NAMES = {
+    "WN": "white noise",
+    "QN": "quantisation noise",
+    "RW": "the random walk",
+    "DR": "the drift",
+    "AR1": "the AR1",
+    "SIN": "the tone",
+}
+
+
+def model_verdict(result: GMWMResult, index: tuple[int, ...]) -> list[str]:
+    """Say in sentences how well the model of one sensor fits and what it consists of.
+
+    Args:
+        result: Fitted.
+        index: Of the sensor among the leading dimensions.
+    """
+    if not bool(result.params[index].isfinite().all()):
+        return ["Nothing could be fitted: its wavelet variance is missing or zero at some level."]
+    return [*_completeness(result, index), *_rulers(result, index), *_tones(result, index), *_weak(result, index)]
+
+
+def residuals(result: GMWMResult, index: tuple[int, ...]) -> Tensor:
+    """Measured less fitted wavelet variances over their standard deviation in the model, `(level,)`."""
+    measured, fitted = result.wavelet_variance.mT[index], result.fitted_wavelet_variance.mT[index]
+    return (measured - fitted) / result.records.covariance(_model(result, index)).diagonal().sqrt()
+
+
+def _model(result: GMWMResult, index: tuple[int, ...]) -> Model:
+    return result.model.with_params(result.params[index])
+
+
+def _completeness(result: GMWMResult, index: tuple[int, ...]) -> Iterator[str]:
+    if not bool(result.converged[index]):
+        yield "Beware: the search for the best parameters did not end; they are where it stopped."
+    p_value = result.p_value[index].item()
+    if p_value != p_value:
+        return
+    told = f"J test: p = {number(p_value, 2)}" if p_value > 0 else "J test: p < 1e-300"
+    if p_value >= _DOUBTED:
+        yield f"The model explains the wavelet variances at all scales within what chance allows ({told})."
+        return
+    off = residuals(result, index)
+    worst = int(off.abs().argmax())
+    size = f"{abs(off[worst].item()):.1f} standard deviations {'above' if off[worst] > 0 else 'below'} the model's"
+    where = f"at {_time(result, worst)} the measured wavelet variance is {size}"
+    if p_value >= _REFUSED:
+        yield f"The model is in doubt ({told}): {where}."
+    else:
+        yield (
+            f"The model is not complete ({told}): {where}. Intervals hold only for what the model knows; add a process "
+            "or look for a disturbance."
+        )
+
+
+def _rulers(result: GMWMResult, index: tuple[int, ...]) -> Iterator[str]:
+    """Which process rules from which averaging time to which."""
+    processes = _model(result, index).processes
+    n_levels = result.wavelet_variance.shape[-2]
+    shares = torch.stack([process.wavelet_variance(n_levels) for process in processes])  # (process, level)
+    symbols = [process.symbol for process in processes]
+    labels, seen = [], dict.fromkeys(symbols, 0)
+    for symbol in symbols:
+        seen[symbol] += 1
+        labels.append(_NAMES[symbol] + (f" {seen[symbol]}" if symbols.count(symbol) > 1 else ""))
+    runs = [(name, list(levels)) for name, levels in groupby(range(n_levels), lambda j: int(shares[:, j].argmax()))]
+    parts = []
+    for k, levels in runs:
+        first, last = _time(result, levels[0]), _time(result, levels[-1])
+        parts.append(f"{labels[k]} " + (f"at {first}" if len(levels) == 1 else f"from {first} to {last}"))
+    yield "Largest by averaging time: " + ", then ".join(parts) + "."
+
+
+def _tones(result: GMWMResult, index: tuple[int, ...]) -> Iterator[str]:
+    for process in _model(result, index).processes:
+        if isinstance(process, Sinusoid) and bool((process.params[0] > 0).all()):
+            amplitude, beta = process.params.tolist()
+            cycles = beta / (2 * torch.pi)
+            place = f"{number(cycles * result.rate, 6)} Hz" if result.rate else f"{number(cycles, 6)} cycles per sample"
+            unit = f" {result.unit}" if result.unit else ""
+            yield f"A tone at {place} with an amplitude of {number(amplitude, 3)}{unit}."
+
+
+def _weak(result: GMWMResult, index: tuple[int, ...]) -> Iterator[str]:
+    values = result.params[index]
+    names = [
+        name for name, known in zip(result.param_names, result.determined[index].tolist(), strict=True) if not known
+    ]
+    zero = [name for name, value in zip(result.param_names, values.tolist(), strict=True) if value == 0]
+    if zero:
+        yield f"Not seen, with an upper limit only: {', '.join(zero)}."
+    weak = [name for name in names if name not in zero]
+    if weak:
+        yield f"Hardly known beyond the order of magnitude: {', '.join(weak)}."
+
+
+def _time(result: GMWMResult, level: int) -> str:
+    """Averaging time of a level, counted from 0."""
+    samples = 2.0**level
+    return f"{number(samples / result.rate, 3)} s" if result.rate else f"{samples:g} samples"

@@ -1,0 +1,123 @@
+"""The search of a moment fit, from starting points to weights `V^-1`, for many records at once."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gyrofuse import _moment_search as search
+from gyrofuse._composition import Composition, shape_of
+from gyrofuse._records import Records
+from gyrofuse.moment_inference import Fit
+from gyrofuse.parsing import parse_model
+from gyrofuse.processes import Model, Process, Sinusoid
+from gyrofuse.tones import find_tones
+
+_REWEIGHTINGS, _UPDATES, _DISTINCT = 3, 3, 3
+# Steps that the best start may take to its minimum; flat valleys need some hundreds.
+_POLISHING = 500
+
+
+def fit_items(
+    nu: Tensor, frequencies: tuple[Tensor, Tensor] | None, records: Records, made_of: Composition, omega: str | Tensor
+) -> Fit:
+    """Fit all items at once.
+
+    Args:
+        nu: Wavelet variances `(item, level)`.
+        frequencies: `beta` of the sinusoids and its spread where the moments need not find it, `(item, sinusoid)`,
+            from high to low.
+        records: What was measured.
+        made_of: Structure of the model.
+        omega: Weights `(level,)` or `(level, level)`, or `"optimal"` or `"diagonal"`.
+    """
+    n_items = len(nu)
+    tau, observations = records.tau.to(nu), records.observations.to(nu)
+    # Scaled so that no record is small to rounding.
+    size = nu.amax(-1, keepdim=True)
+    nu = nu / size
+    beta, held_sd = frequencies or (nu.new_empty(n_items, 0), nu.new_empty(n_items, 0))
+    held = shape_of(beta.to(nu), Sinusoid)
+    own = omega.to(nu) if isinstance(omega, Tensor) else None
+    weight = observations / nu.square() if own is None else (own if own.ndim == 1 else own.diagonal()).expand_as(nu)
+    start = search.starting_points(nu, weight, tau, made_of, held, n_starts_for(made_of))  # (item, start, shaped)
+    n_starts = start.shape[1]
+
+    def each(value: Tensor, n: int) -> Tensor:
+        return value[:, None].expand(-1, n, *value.shape[1:]).flatten(0, 1)
+
+    root = weight.sqrt() if own is None or own.ndim == 1 else torch.linalg.cholesky(own).mT.expand(n_items, -1, -1)
+    linear, x, objective, _ = search.minimise(
+        each(nu, n_starts), each(root, n_starts), tau, made_of, start.flatten(0, 1)
+    )
+    for _ in range(_REWEIGHTINGS if own is None else 0):
+        fitted = made_of.wavelet_variance(tau, linear, x)
+        root = (observations.sqrt() / fitted.clamp(min=1e-30)).clamp(max=1e15)
+        linear, x, objective, _ = search.minimise(each(nu, n_starts), root, tau, made_of, x)
+        # Distances with different weights: the likelihood of independent normal variances makes them comparable.
+        objective = objective - 2 * root.log().sum(-1)
+    kept = search.distinct(objective.view(n_items, -1), x.view(n_items, n_starts, -1), _DISTINCT)
+    n_kept = kept.shape[1]
+    chosen = (torch.arange(n_items, device=nu.device)[:, None] * n_starts + kept).flatten()
+    linear, x, objective = linear[chosen], x[chosen], objective[chosen]
+    if own is None:
+        for _ in range(_UPDATES):
+            covariance = records.covariance(made_of.model(linear, x))
+            root = (
+                covariance.diagonal(dim1=-2, dim2=-1).rsqrt() if omega == "diagonal" else search.whitening(covariance)
+            )
+            linear, x, distance, _ = search.minimise(each(nu, n_kept), root, tau, made_of, x)
+        diagonal = root if root.ndim == 2 else root.diagonal(dim1=-2, dim2=-1)
+        # r' V^-1 r + ln det V: a V too large would make its own fit look good.
+        objective = distance - 2 * diagonal.log().sum(-1)
+    best = objective.view(n_items, n_kept).nan_to_num(nan=torch.inf).argmin(-1)
+    best = best + n_kept * torch.arange(n_items, device=nu.device)
+    root = root[best] if own is None else root
+    linear, x, _, reached = search.minimise(nu, root, tau, made_of, x[best], _POLISHING)
+    linear, x = made_of.ordered(linear, x)
+    return Fit(
+        variance=nu * size,
+        linear=linear * size,
+        shape=x,
+        held_sd=held_sd.to(nu),
+        converged=reached & linear.isfinite().all(-1),
+        omega=omega,
+        records=records,
+    )
+
+
+def n_starts_for(made_of: Composition) -> int:
+    """As many as found the lowest minimum of noisy copies every time."""
+    tones = sum(isinstance(made_of.processes[k], Sinusoid) for k in made_of.curved)
+    return min(4 * 4 ** (len(made_of.curved) - 1) if tones else (1, 4, 6, 8)[min(len(made_of.curved), 3)], 32)
+
+
+def tone_frequencies(series: Tensor, made_of: Composition) -> tuple[Tensor, Tensor] | None:
+    """`beta` of the sinusoids from the spectra of records `(item, time)`, from high to low frequency, and its spread.
+
+    Returns:
+        Both `(item, sinusoid)`; None where the model has no sinusoids.
+    """
+    n_tones = sum(isinstance(p, Sinusoid) for p in made_of.processes)
+    if n_tones == 0:
+        return None
+    found = find_tones(series.to(torch.float64), n_tones)
+    order = found.beta.argsort(-1, descending=True)
+    return found.beta.gather(-1, order), found.beta_sd.gather(-1, order)
+
+
+def composition_of(model: Model | str, held: bool) -> Composition:
+    """Structure of a model without values; `held` as there."""
+    model = parse_model(model) if isinstance(model, str) else model
+    if not isinstance(model, Model):
+        raise TypeError(f"`model`: expected a model or a formula such as 'WN + AR1 + RW', got {type(model).__name__}")
+    given = [name for name, value in model._named() if value is not None]
+    if given:
+        raise ValueError(
+            f"`model`: expected parameters to be estimated, got values of {', '.join(given)}; "
+            "write the process without values, as in WhiteNoise() + AR1()"
+        )
+    # Processes of a kind side by side, in the order in which the kinds first appear.
+    kinds = list(dict.fromkeys(map(type, model.processes)))
+    processes: list[Process] = sorted(model.processes, key=lambda p: kinds.index(type(p)))
+    return Composition(tuple(processes), held)

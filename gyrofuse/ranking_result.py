@@ -1,0 +1,192 @@
+"""Compositions of noise processes, ranked."""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from gyrofuse._rank_candidates import name_of
+from gyrofuse._rank_table import Table
+from gyrofuse._result import listed
+from gyrofuse.gmwm_result import GMWMResult
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_MOST_TABLES, _MOST_ROWS, _MOST_BARS = 12, 8, 12
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RankResult:
+    """Candidates for every sensor; `...` are the leading dimensions of the signal.
+
+    Attributes:
+        candidates: Names, such as `WN + AR1 + RW`.
+        criterion: `(..., sensor, candidate)`, less is better; NaN where it was not tried, for a candidate with another
+            number of sinusoids than was found, or a sensor that could not be ranked. Of a signal without the part that
+            sinusoids have in it.
+        wvic: Wavelet variance information criterion, the same.
+        p_value: Of the J test, that the candidate is complete, the same.
+        redundant: Whether the fit amounts to a smaller candidate that explains the record as well, the same.
+        reasons: Why, for every sensor, `...` flattened, and candidate; None where it is not redundant.
+        equivalent: Whether it is as good as the chosen one, and not it, the same as `criterion`.
+        choice: Index of the chosen candidate, `(..., sensor)`; -1 where a sensor could not be ranked.
+        wvic_choice: Index of that with the least WVIC, the same.
+        n_tones: Sinusoids found, the same, -1 as before; None from a wavelet variance.
+        best: Fit of the chosen candidate for every sensor, `...` flattened; None where there is none.
+        n_samples: Length of the records.
+        from_signal: Whether the criterion is that of the spectral likelihood, or of the wavelet variance.
+        sensors: Names.
+    """
+
+    candidates: tuple[str, ...]
+    criterion: Tensor
+    wvic: Tensor
+    p_value: Tensor
+    redundant: Tensor
+    reasons: tuple[tuple[str | None, ...], ...]
+    equivalent: Tensor
+    choice: Tensor
+    wvic_choice: Tensor
+    n_tones: Tensor | None
+    best: tuple[GMWMResult | None, ...]
+    n_samples: int
+    from_signal: bool
+    sensors: tuple[str, ...]
+
+    @classmethod
+    def build(
+        cls, *, table: Table, usable: Tensor, batch: tuple[int, ...], best: tuple[GMWMResult | None, ...], **rest: Any
+    ) -> RankResult:
+        """Put the items that could be ranked back into their places among all, `(item,)` -> `(..., sensor)`."""
+
+        def placed(value: Tensor, missing: float | bool) -> Tensor:
+            whole = value.new_full((len(usable), *value.shape[1:]), missing)
+            whole[usable] = value
+            return whole.view(*batch, *value.shape[1:])
+
+        reasons = iter(table.reasons)
+        nothing: list[str | None] = [None] * len(table.kinds)
+        return cls(
+            candidates=tuple(map(name_of, table.kinds)),
+            criterion=placed(table.criterion, torch.nan),
+            wvic=placed(table.wvic, torch.nan),
+            p_value=placed(table.p_value, torch.nan),
+            redundant=placed(table.redundant, False),
+            reasons=tuple(tuple(next(reasons) if there else nothing) for there in usable.tolist()),
+            equivalent=placed(table.equivalent, False),
+            choice=placed(table.choice, -1),
+            wvic_choice=placed(table.wvic_choice, -1),
+            n_tones=None if table.n_tones is None else placed(table.n_tones, -1),
+            best=best,
+            **rest,
+        )
+
+    @property
+    def difference(self) -> Tensor:
+        """Criterion less that of the chosen candidate, `(..., sensor, candidate)`; a redundant one may be below 0."""
+        return self.criterion - self.criterion.gather(-1, self.choice.clamp(min=0)[..., None])
+
+    @property
+    def names(self) -> tuple[str | None, ...]:
+        """Chosen for every sensor, `...` flattened."""
+        return tuple(self.candidates[c] if c >= 0 else None for c in self.choice.flatten().tolist())
+
+    def summary(self) -> str:
+        """The best candidates, sensor by sensor; of a large batch how often each was chosen."""
+        by = "spectral likelihood (BIC)" if self.from_signal else "likelihood of the wavelet variance (BIC)"
+        n_items = self.choice.numel()
+        lines = [f"Noise models ranked by {by}: {self.n_samples} samples, {len(self.candidates)} candidates"]
+        if self.choice.ndim > 1:
+            lines.append(f"{n_items} records in a batch {tuple(self.choice.shape[:-1])}")
+        if n_items > _MOST_TABLES:
+            counts = Counter(name or "not ranked" for name in self.names)
+            lines += [f"  {n:>8}  {name}" for name, n in counts.most_common(_MOST_ROWS)]
+            return "\n".join(lines)
+        for n, index in enumerate(itertools.product(*map(range, self.choice.shape))):
+            lines += ["", *self._table(n, index)]
+        return "\n".join(lines)
+
+    def __str__(self) -> str:
+        return self.summary()
+
+    def _table(self, n: int, index: tuple[int, ...]) -> list[str]:
+        where = f" of item {', '.join(map(str, index[:-1]))}" if len(index) > 1 else ""
+        head = f"sensor {self.sensors[index[-1]]}{where}"
+        if int(self.choice[index]) < 0:
+            return [f"{head}: not ranked"]
+        lines = [f"{head}: {self.candidates[int(self.choice[index])]}"]
+        same = [name for name, there in zip(self.candidates, self.equivalent[index].tolist(), strict=True) if there]
+        if same:
+            lines.append(f"  not told from it: {', '.join(same)}")
+        wide = max(map(len, self.candidates))
+        lines.append(f"  {'candidate':<{wide}}  {'criterion':>10}  {'WVIC':>8}  {'J test p':>8}")
+        wvic = self.wvic[index] - self.wvic[index][int(self.wvic_choice[index])]
+        difference = self.difference[index]
+        order = self._order(index)
+        for c in order[:_MOST_ROWS]:
+            note = self.reasons[n][c]
+            row = f"  {self.candidates[c]:<{wide}}  {difference[c].item():>+10.2f}  {wvic[c].item():>+8.2f}"
+            row += f"  {self.p_value[index][c].item():>8.2g}"
+            lines.append(row + (f"  redundant: {note}" if note else ""))
+        if len(order) > _MOST_ROWS:
+            lines.append(f"  and {len(order) - _MOST_ROWS} more; WVIC's own choice: {self._wvic_name(index)}")
+        else:
+            lines.append(f"  WVIC's own choice: {self._wvic_name(index)}")
+        return lines
+
+    def _wvic_name(self, index: tuple[int, ...]) -> str:
+        return self.candidates[int(self.wvic_choice[index])]
+
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Draw the criterion of the first sensor's best candidates over that of the chosen one.
+
+        Args:
+            ax: Where to draw; a new figure by default.
+        """
+        from gyrofuse.plotting import _finish, _new_axes
+
+        ax = ax if ax is not None else _new_axes()
+        first = (0,) * self.choice.ndim
+        order = self._order(first)[:_MOST_BARS]
+        difference = [self.difference[first][c].item() for c in order]
+        colors = ["#b8b8b8" if bool(self.redundant[first][c]) else "#0072b2" for c in order]
+        ax.barh(range(len(order)), difference, color=colors)
+        ax.set_yticks(range(len(order)), [self.candidates[c] for c in order])
+        ax.invert_yaxis()
+        ax.set_xscale("symlog", linthresh=10)
+        ax.set_xlabel("criterion over that of the chosen model (grey: redundant)")
+        _finish(ax)
+        return ax
+
+    def _order(self, index: tuple[int, ...]) -> list[int]:
+        """Candidates that were tried, from the best on."""
+        difference = self.difference[index]
+        order = difference.nan_to_num(nan=torch.inf).argsort().tolist()
+        return [c for c in order if bool(difference[c].isfinite())]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain numbers and lists; what is not known is None."""
+        return {
+            "candidates": list(self.candidates),
+            "names": list(self.names),
+            "criterion": listed(self.criterion),
+            "difference": listed(self.difference),
+            "wvic": listed(self.wvic),
+            "p_value": listed(self.p_value),
+            "redundant": self.redundant.tolist(),
+            "reasons": [list(row) for row in self.reasons],
+            "equivalent": self.equivalent.tolist(),
+            "choice": self.choice.tolist(),
+            "wvic_choice": self.wvic_choice.tolist(),
+            "n_tones": None if self.n_tones is None else self.n_tones.tolist(),
+            "best": [None if fit is None else fit.to_dict() for fit in self.best],
+            "n_samples": self.n_samples,
+            "from_signal": self.from_signal,
+            "sensors": list(self.sensors),
+        }

@@ -1,0 +1,96 @@
+"""Report of fitted noise models as one self-contained HTML page."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import TYPE_CHECKING, Any
+
+from gyrofuse.datasheet import datasheet
+from gyrofuse.gmwm_result import GMWMResult
+from gyrofuse.model_words import model_verdict, residuals
+from gyrofuse.plotting_models import plot_residuals
+from gyrofuse.recording import Recording
+from gyrofuse.report_page import image, render
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# Pages stay readable; the JSON file holds all.
+_MOST_SENSORS = 24
+
+
+def model_report(result: GMWMResult, recording: Recording | None = None, *, title: str) -> str:
+    """Write the report of noise models fitted to the sensors of a recording.
+
+    Args:
+        result: Of the sensors of one array, or of one per axis.
+        recording: What was fitted, for its notes.
+        title: Heading of the page.
+
+    Returns:
+        An HTML page that needs no other file, no network and no script.
+    """
+    indices = list(itertools.product(*map(range, result.params.shape[:-1])))
+    parts = [
+        {
+            "name": _name(result, recording, index),
+            "verdict": model_verdict(result, index),
+            "figure": image(7, 6.2, _draw, result, index) if _fitted(result, index) else None,
+            "parameters": _parameter_rows(result, index),
+            "datasheet": _datasheet_rows(result, index),
+        }
+        for index in indices[:_MOST_SENSORS]
+    ]
+    return render(
+        "models.html.j2",
+        title=title,
+        result=result,
+        recording=recording,
+        model=" + ".join(process.symbol for process in result.model.processes),
+        parts=parts,
+        left_out=len(indices) - len(parts),
+        percent=f"{100 * result.confidence_level:g} %",
+    )
+
+
+def _name(result: GMWMResult, recording: Recording | None, index: tuple[int, ...]) -> str:
+    *batch, sensor = index
+    axes = recording.axes if recording else ()
+    name = f"Sensor {result.sensors[sensor]}"
+    if len(batch) == 1 and axes:
+        return f"{name}, axis {axes[batch[0]]}"
+    return name + (f", item {', '.join(map(str, batch))}" if batch else "")
+
+
+def _fitted(result: GMWMResult, index: tuple[int, ...]) -> bool:
+    return bool(result.params[index].isfinite().all())
+
+
+def _draw(figure: Figure, result: GMWMResult, index: tuple[int, ...]) -> None:
+    above, below = figure.subplots(2, 1, height_ratios=[3, 1], sharex=True)
+    result.plot(above, index=index)
+    above.set_xlabel("")
+    plot_residuals(residuals(result, index), rate=result.rate, ax=below)
+
+
+def _parameter_rows(result: GMWMResult, index: tuple[int, ...]) -> list[dict[str, Any]]:
+    columns = (result.params, *result.confidence_interval, result.determined)
+    rows = zip(result.param_names, *(column[index].tolist() for column in columns), strict=True)
+    return [
+        {
+            "name": name,
+            "value": value,
+            "low": low,
+            "high": high,
+            "note": "at its limit" if value == 0 else "" if known or math.isnan(value) else "weakly determined",
+        }
+        for name, value, low, high, known in rows
+    ]
+
+
+def _datasheet_rows(result: GMWMResult, index: tuple[int, ...]) -> list[dict[str, Any]]:
+    if not (result.rate and result.unit and _fitted(result, index)):
+        return []
+    sheet = datasheet(result.model.with_params(result.params[index]), result.rate, result.unit)
+    return [entry._asdict() for entry in sheet.entries]

@@ -1,0 +1,254 @@
+"""Ranking of compositions: that the true one is chosen, that smaller ones are seen in larger, and the criteria."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+import torch
+from scipy import fft, stats
+from torch import Tensor
+
+import gyrofuse as gf
+from gyrofuse._rank_candidates import all_noises, composition, key_of, simplified
+from gyrofuse.moment_covariance import moment_covariance
+
+
+def signals(model: gf.Model, n: int, n_samples: int = 4096, seed: int = 0) -> Tensor:
+    return model.simulate(n_samples, batch=(n, 1), generator=torch.Generator().manual_seed(seed))
+
+
+WHITE = gf.WhiteNoise(1.0)
+WALK = gf.RandomWalk(4e-3)
+MARKOV = gf.AR1(0.975, 0.05)
+TONE = gf.Sinusoid(0.85, 0.35)
+PARTS = {
+    "WN": gf.Model([WHITE]),
+    "WN + RW": WHITE + WALK,
+    "WN + AR1": WHITE + MARKOV,
+    "AR1": gf.Model([MARKOV]),
+    "WN + RW + SIN": WHITE + WALK + TONE,
+    "WN + AR1 + SIN": WHITE + MARKOV + TONE,
+}
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_the_true_composition_is_chosen(name):
+    """In 12 records; a rate of 95 % gives fewer than 8 once in 5400 times."""
+    found = gf.rank_models(signals(PARTS[name], 12, 2048), fit=False)
+    right = found.names.count(name)
+    assert right >= stats.binom.ppf(0.0005, 12, 0.95), found.summary()
+    assert bool((found.difference[~found.redundant].nan_to_num(nan=0.0) >= 0).all())
+
+
+def test_two_tones_and_none():
+    both = PARTS["WN"] + TONE + gf.Sinusoid(0.5, 1.1)
+    assert (gf.rank_models(signals(both, 6), fit=False).n_tones == 2).all()
+    # 0.1 % a record: more than 2 of 60 once in 30 000 times.
+    assert int((gf.rank_models(signals(PARTS["WN"], 60, 512), ["WN", "WN + SIN"], fit=False).n_tones > 0).sum()) <= 2
+
+
+def test_bic_of_white_noise_and_of_a_walk():
+    """Variances that scale one known shape have their likelihood in closed form."""
+    signal = signals(PARTS["WN + RW"], 2, 1000)
+    found = gf.rank_models(signal, ["WN", "RW"], fit=False)
+    y = fft.dct(signal[:, 0].numpy(), norm="ortho")[:, 1:]
+    sine = np.sin(math.pi * np.arange(1, 1000) / 2000) ** 2
+    for c, shape in enumerate((np.ones(999), 0.25 / sine)):
+        variance = shape * (y**2 / shape).mean(-1, keepdims=True)
+        bic = (np.log(2 * math.pi * variance) + y**2 / variance).sum(-1) + math.log(1000)
+        # Bands hold ordinates over which the walk's variance changes by a twelfth.
+        assert found.criterion[:, 0, c].tolist() == pytest.approx(bic.tolist(), abs=1e-6 if c == 0 else 8)
+
+
+def test_larger_candidates_never_have_less_likelihood():
+    """Each starts where the best with one process less ended."""
+    names = ["WN", "WN + AR1", "WN + AR1 + RW", "WN + QN + AR1 + RW", "WN + QN + 2*AR1 + RW"]
+    found = gf.rank_models(signals(PARTS["WN + AR1"], 8), names, fit=False)
+    penalty = torch.tensor([1, 3, 4, 5, 7]) * math.log(4096)
+    likelihood = -(found.criterion[:, 0] - penalty) / 2
+    assert (likelihood.diff(dim=-1) > -1e-3).all()
+    assert set(found.names) == {"WN + AR1"}
+
+
+def test_wavelet_variances_alone():
+    """Criteria as by hand, and the true composition; fewer than 15 of 20 once in 3000 times at 95 %."""
+    signal = signals(PARTS["WN + RW"], 20)[:, 0]
+    variance = gf.wavelet_variance(signal, 11)  # 20 sensors
+    names = ["WN", "RW", "WN + RW", "WN + AR1 + RW", "WN + QN + RW"]
+    found = gf.rank_models(variance, names, n_samples=4096)
+    assert found.names.count("WN + RW") >= 15
+    assert found.n_tones is None
+    fit = gf.fit_gmwm(variance[:, :1], "WN + RW", n_samples=4096)
+    residual = (variance[:, 0] - fit.fitted_wavelet_variance[:, 0]).numpy()
+    spread = moment_covariance(fit.model.with_params(fit.params[0]), 4096, 11).numpy()
+    distance = residual @ np.linalg.solve(spread, residual)
+    size = variance[:, 0].max().item()
+    bic = distance + np.linalg.slogdet(spread / size**2)[1] + 2 * math.log(4096)
+    assert found.criterion[0, 2].item() == pytest.approx(bic, abs=0.02)
+    assert found.wvic[0, 2].item() == pytest.approx(distance + 4, abs=0.02)
+    assert found.p_value[0, 2].item() == pytest.approx(stats.chi2.sf(distance, 9), abs=0.01)
+    searched = gf.rank_models(variance[:, :8], n_samples=4096, fit=False)
+    assert searched.names.count("WN + RW") >= 5  # fewer once in 2700 times at 95 %
+
+
+def test_wvic_keeps_more_than_bic():
+    """2 ln L of a process too many exceeds WVIC's 2 far more often than BIC's ln T."""
+    found = gf.rank_models(signals(PARTS["WN"], 20), fit=False)
+    place = found.candidates.index("WN")
+    assert int((found.choice == place).sum()) > int((found.wvic_choice == place).sum()) > 0
+
+
+def test_what_a_fit_amounts_to():
+    made_of = composition([gf.WhiteNoise, gf.AR1, gf.AR1, gf.RandomWalk], held=True)
+    phi, short, long = 0.9, 0.001, math.exp(-1 / 800)
+    rows = {
+        (1.0, phi, 1.0, 0.5, 1.0, 1.0): None,
+        (1.0, phi, 0.0, 0.5, 1.0, 1.0): ("WN + AR1 + RW", "AR1 1 has no variance"),
+        (0.0, phi, 1.0, 0.5, 1.0, 1.0): ("2*AR1 + RW", "WN has no variance"),
+        (1.0, phi, 1.0, phi + 1e-4, 1.0, 1.0): ("WN + AR1 + RW", "AR1 2 is AR1 1"),
+        (1.0, long, 1.0, 0.5, 1.0, 1.0): ("WN + AR1 + RW", "AR1 1 is a random walk"),
+        (1.0, phi, 1.0, short, 1.0, 1.0): ("WN + AR1 + RW", "AR1 2 is white noise"),
+        (1.0, phi, 1.0, 0.5, 1.0, 1e-9): ("WN + 2*AR1", "RW is not identified"),
+        (0.0, long, 1.0, short, 1.0, 0.0): (
+            "WN + RW",
+            "WN has no variance, AR1 1 is a random walk, AR1 2 is white noise, RW has no variance",
+        ),
+    }
+    params = torch.tensor(list(rows), dtype=torch.float64)
+    covariance = torch.diag_embed(torch.full_like(params, 1e-6))
+    found = simplified(made_of, params, covariance, 1000)
+    for got, expected in zip(found, rows.values(), strict=True):
+        if expected is None:
+            assert got is None
+        else:
+            assert got is not None
+            assert (composition(got[0], held=True).name, got[1]) == expected
+
+
+def test_redundant_and_equivalent_are_named():
+    walk = gf.rank_models(signals(PARTS["WN + RW"], 1, seed=4)[0], ["WN + RW", "WN + AR1", "WN + AR1 + RW"], fit=False)
+    assert walk.names == ("WN + RW",)
+    assert walk.redundant[0].tolist()[2]
+    assert walk.reasons[0][2] is not None
+    # A time constant of three quarters of the record: nobody can tell.
+    slow = gf.rank_models(signals(WHITE + gf.AR1(1 - 1 / 3000, 4e-3), 12), ["WN + RW", "WN + AR1"], fit=False)
+    assert int(slow.equivalent.sum()) >= 6
+    alone = gf.rank_models(signals(PARTS["WN + RW"], 1)[0], ["WN + AR1"], fit=False)
+    assert not alone.redundant.any()  # there is no smaller one among the candidates
+    assert alone.names == ("WN + AR1",)
+
+
+def test_the_number_of_sinusoids_is_kept_to_the_candidates():
+    signal = signals(PARTS["WN + RW + SIN"] + gf.Sinusoid(0.5, 1.1), 1)[0]
+    found = gf.rank_models(signal, ["WN + RW", "WN + RW + SIN", "RW + SIN"], fit=False)
+    assert found.names == ("WN + RW + SIN",)
+    assert found.criterion[0, 0].isnan()  # without the sinusoid that is there it is not tried
+    forced = gf.rank_models(signals(PARTS["WN"], 1)[0], ["WN + 2*SIN", "WN + RW + 2*SIN"], fit=False)
+    assert forced.names == ("WN + 2*SIN",)
+
+
+def test_ramp():
+    signal = signals(PARTS["WN"] + gf.Drift(1e-3), 1)[0]
+    found = gf.rank_models(signal)
+    assert found.names == ("WN + DR",)
+    assert found.best[0].params[0, 1].item() == pytest.approx(1e-3, rel=0.1)
+
+
+def test_result_of_a_recording():
+    signal = torch.cat([signals(PARTS["WN"], 1)[0], signals(PARTS["WN + RW + SIN"], 1)[0]])
+    recording = gf.Recording(signal, rate=100.0, unit="deg/s", sensors=("a", "b"))
+    found = gf.rank_models(recording)
+    assert found.names == ("WN", "WN + RW + SIN")
+    assert found.sensors == ("a", "b")
+    fit = found.best[1]
+    assert (fit.sensors, fit.rate, fit.unit, fit.refined) == (("b",), 100.0, "deg/s", True)
+    assert fit.params.shape == (1, 4)
+    expected = gf.fit_gmwm(signal[1:], "WN + RW + SIN", refine=True)
+    torch.testing.assert_close(fit.params, expected.params, rtol=1e-6, atol=0)
+    text = str(found)
+    assert text == found.summary()
+    assert "sensor b: WN + RW + SIN" in text
+    assert max(map(len, text.splitlines())) < 140
+    plain = found.to_dict()
+    assert json.loads(json.dumps(plain, allow_nan=False)) == plain
+    assert plain["best"][1]["params"] == fit.to_dict()["params"]
+    with mpl.rc_context({"backend": "agg"}):
+        ax = found.plot()
+    assert next(label.get_text() for label in ax.get_yticklabels()) == "WN"
+
+
+def test_batch_is_its_items():
+    signal = torch.stack(
+        [signals(PARTS[name], 2, 2048)[:, 0] for name in ("WN + AR1", "WN + RW + SIN")]
+    )  # (2, 2, time)
+    names = ["WN", "WN + AR1", "WN + RW", "WN + RW + SIN"]
+    whole = gf.rank_models(signal, names, fit=False)
+    assert whole.criterion.shape == (2, 2, 4)
+    assert whole.choice.shape == whole.wvic_choice.shape == (2, 2)
+    for i in range(2):
+        item = gf.rank_models(signal[i], names, fit=False)
+        torch.testing.assert_close(item.criterion, whole.criterion[i], rtol=1e-6, atol=1e-3, equal_nan=True)
+        assert item.choice.tolist() == whole.choice[i].tolist()
+    single = gf.rank_models(signal.float(), names, fit=False)
+    assert single.names == whole.names
+    assert single.criterion.dtype == torch.float64
+    many = gf.rank_models(signals(PARTS["WN"], 13, 256), ["WN", "RW"], fit=False)
+    assert "13  WN" in many.summary()
+
+
+def test_items_that_cannot_be_ranked():
+    signal = signals(PARTS["WN"], 3, 512)[:, 0]
+    signal[1, 7] = torch.nan
+    with pytest.warns(UserWarning, match="got 1 of 3 others; they are not ranked"):
+        found = gf.rank_models(signal, ["WN", "RW"])
+    assert found.names == ("WN", None, "WN")
+    assert found.choice.tolist() == [0, -1, 0]
+    assert found.best[1] is None
+    assert "sensor 2: not ranked" in found.summary()
+    with pytest.raises(ValueError, match="`signal`: expected records that vary and have no missing samples"):
+        gf.rank_models(signal[1:2])
+    with pytest.raises(ValueError, match="`signal`: expected wavelet variances that are finite and > 0"):
+        gf.rank_models(torch.zeros(4, 1), n_samples=512)
+
+
+def test_default_candidates():
+    noises = all_noises(20)
+    assert len(noises) == len({key_of(kinds) for kinds in noises}) == 62  # 4 * 2^4, less nothing and a ramp alone
+    assert max(len(kinds) + kinds.count(gf.AR1) for kinds in all_noises(5)) == 5
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "says"),
+    [
+        ({"candidates": "WN"}, TypeError, "`candidates`: expected a sequence of models or formulas"),
+        ({"candidates": [3]}, TypeError, "`candidates`: expected models or formulas such as 'WN \\+ AR1', got int"),
+        ({"candidates": []}, ValueError, "`candidates`: expected at least one, got none"),
+        ({"candidates": ["WN", gf.WhiteNoise()]}, ValueError, "got WN twice"),
+        ({"candidates": ["WN + RW", "RW + WN"]}, ValueError, "`candidates`: expected each composition once"),
+        ({"candidates": ["SIN + DR"]}, ValueError, "`candidates`: expected a noise in each, got DR \\+ SIN"),
+        ({"candidates": ["WN(variance=1)"]}, ValueError, "got values of white_noise.variance"),
+        ({"candidates": ["WN + 5*AR1"]}, ValueError, "at most as many parameters as the 8 levels, got 11"),
+        ({"line_level": 0.0}, ValueError, "`line_level`: expected a probability"),
+        ({"max_tones": -1}, ValueError, "`max_tones`: expected a whole number >= 0"),
+        ({"n_levels": 0}, ValueError, "`n_levels`: expected a whole number >= 1"),
+        ({"confidence_level": 1.0}, ValueError, "`confidence_level`: expected a number between 0 and 1"),
+    ],
+)
+def test_refusals(options, error, says):
+    with pytest.raises(error, match=says):
+        gf.rank_models(signals(PARTS["WN"], 1, 512)[0], **options)
+
+
+def test_refusals_of_signals():
+    with pytest.raises(TypeError, match="`signal`: expected a torch tensor"):
+        gf.rank_models([1.0, 2.0])
+    with pytest.raises(ValueError, match="`signal`: expected at least 32 samples, got 20"):
+        gf.rank_models(torch.randn(1, 20))
+    with pytest.raises(ValueError, match=r"expected a wavelet variance .* of at most 9 levels"):
+        gf.rank_models(torch.ones(10, 1), n_samples=512)
+    with pytest.raises(ValueError, match="`n_levels`: expected 1 to 5"):
+        gf.rank_models(torch.ones(5, 1), n_samples=512, n_levels=6)
