@@ -39,6 +39,7 @@ from gyrofuse.hypotheses import EnoughData, WeightsTest
 from gyrofuse.influence import BootstrapWeightsCovariance, bootstrap_weights_covariance
 from gyrofuse.intervals import wavelet_cross_covariance_interval, wavelet_variance_interval
 from gyrofuse.io.stream import RecordingError
+from gyrofuse.joint import JointFit, fit_jointly
 from gyrofuse.live import LiveSVO, subset_weights
 from gyrofuse.moment_bootstrap import GMWMBootstrap, bootstrap_gmwm
 from gyrofuse.multiscale import MultiScaleSVO, fit_multiscale
@@ -82,6 +83,7 @@ __all__ = [
     "GMWMResult",
     "Gain",
     "HaarFilterBank",
+    "JointFit",
     "LiveSVO",
     "Model",
     "MultiScaleResult",
@@ -114,6 +116,7 @@ __all__ = [
     "find_saturation",
     "fit_array_gmwm",
     "fit_gmwm",
+    "fit_jointly",
     "fit_multiscale",
     "fit_parity",
     "fit_svo",

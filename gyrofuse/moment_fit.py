@@ -16,6 +16,8 @@ from gyrofuse.tones import find_tones
 _REWEIGHTINGS, _UPDATES, _DISTINCT = 3, 3, 3
 # Steps that the best start may take to its minimum; flat valleys need some hundreds.
 _POLISHING = 500
+# Half steps where whole ones do not come to rest, and the relative move of wavelet variances below which these did.
+_DAMPED, _STEPS_EACH, _AT_REST = 40, 5, 1e-2
 
 
 def fit_items(
@@ -60,20 +62,25 @@ def fit_items(
     n_kept = kept.shape[1]
     chosen = (torch.arange(n_items, device=nu.device)[:, None] * n_starts + kept).flatten()
     linear, x, objective = linear[chosen], x[chosen], objective[chosen]
+    passed = []
     if own is None:
         for _ in range(_UPDATES):
-            covariance = records.covariance(made_of.model(linear, x))
-            root = (
-                covariance.diagonal(dim1=-2, dim2=-1).rsqrt() if omega == "diagonal" else search.whitening(covariance)
-            )
+            root = _root(records.covariance(made_of.model(linear, x)), omega)
+            passed.append(_misfit(each(nu, n_kept), root, tau, made_of, linear, x))
             linear, x, distance, _ = search.minimise(each(nu, n_kept), root, tau, made_of, x)
-        diagonal = root if root.ndim == 2 else root.diagonal(dim1=-2, dim2=-1)
-        # r' V^-1 r + ln det V: a V too large would make its own fit look good.
-        objective = distance - 2 * diagonal.log().sum(-1)
+        objective = distance - _log_det(root)
     best = objective.view(n_items, n_kept).nan_to_num(nan=torch.inf).argmin(-1)
     best = best + n_kept * torch.arange(n_items, device=nu.device)
     root = root[best] if own is None else root
     linear, x, _, reached = search.minimise(nu, root, tau, made_of, x[best], _POLISHING)
+    if own is None:
+        final = _misfit(nu, _root(records.covariance(made_of.model(linear, x)), omega), tau, made_of, linear, x)
+        least = torch.stack([value.view(n_items, n_kept).amin(-1) for value in passed]).amin(0)
+        chasing = final > least + len(tau)
+        if bool(chasing.any()):
+            linear[chasing], x[chasing], reached[chasing] = _damped(
+                nu[chasing], records, made_of, omega, linear[chasing], x[chasing]
+            )
     linear, x = made_of.ordered(linear, x)
     return Fit(
         variance=nu * size,
@@ -84,6 +91,41 @@ def fit_items(
         omega=omega,
         records=records,
     )
+
+
+def _damped(
+    nu: Tensor, records: Records, made_of: Composition, omega: str | Tensor, linear: Tensor, x: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Half way to the fit with the weights of the last one, again and again, and whether that came to rest.
+
+    Where no parameters fit, whole steps may lead from one bad fit to another and back.
+    """
+    tau = records.tau.to(nu)
+    for _ in range(_DAMPED):
+        before = made_of.wavelet_variance(tau, linear, x)
+        root = _root(records.covariance(made_of.model(linear, x)), omega)
+        whole_linear, whole_x, _, _ = search.minimise(nu, root, tau, made_of, x, _STEPS_EACH)
+        moved = (made_of.wavelet_variance(tau, whole_linear, whole_x) / before - 1).abs().amax(-1)
+        if bool((moved < _AT_REST).all()):
+            break
+        linear, x = (linear + whole_linear) / 2, (x + whole_x) / 2
+    return whole_linear, whole_x, moved < _AT_REST
+
+
+def _misfit(target: Tensor, root: Tensor, tau: Tensor, made_of: Composition, linear: Tensor, x: Tensor) -> Tensor:
+    """`r' V^-1 r + ln det V`: a V too large would make its own fit look good."""
+    residual = target - made_of.wavelet_variance(tau, linear, x)
+    whitened = root * residual if root.ndim == 2 else (root @ residual[..., None])[..., 0]
+    return whitened.square().sum(-1) - _log_det(root)
+
+
+def _log_det(root: Tensor) -> Tensor:
+    """`ln det V^-1` from its factor."""
+    return 2 * (root if root.ndim == 2 else root.diagonal(dim1=-2, dim2=-1)).log().sum(-1)
+
+
+def _root(covariance: Tensor, omega: str | Tensor) -> Tensor:
+    return covariance.diagonal(dim1=-2, dim2=-1).rsqrt() if omega == "diagonal" else search.whitening(covariance)
 
 
 def n_starts_for(made_of: Composition) -> int:

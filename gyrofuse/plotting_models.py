@@ -94,3 +94,16 @@ def plot_residuals(residuals: Tensor, *, rate: float | None = None, ax: Axes | N
     _time_axis(ax, rate is not None)
     _finish(ax)
     return ax
+
+
+def add_recordings(wavelet_variances: list[Tensor], *, rate: float | None = None, ax: Axes) -> None:
+    """Add the Allan deviations of several recordings to the figure of their joint fit.
+
+    Args:
+        wavelet_variances: `(level,)` of each.
+        rate: Hz; without it the averaging times are in samples.
+        ax: Of `plot_moment_fit`.
+    """
+    for variance in wavelet_variances:
+        times = np.exp2(np.arange(len(variance))) / (rate or 1.0)
+        ax.plot(times, _deviation(variance), color=_INK, linewidth=0.7, alpha=0.6, zorder=3)

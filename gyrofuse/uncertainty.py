@@ -67,3 +67,9 @@ def t_quantile(degrees: Tensor, confidence_level: float) -> Tensor:
 
     quantile = stats.t.ppf((1 + confidence_level) / 2, degrees.detach().cpu().numpy())
     return torch.as_tensor(quantile).to(degrees)
+
+
+def chi_square_tail(statistic: Tensor, degrees: Tensor) -> Tensor:
+    """Probability that chi-square of so many degrees of freedom exceeds the statistic; NaN where there are none."""
+    tail = torch.special.gammaincc(degrees.clamp(min=1) / 2, statistic.clamp(min=0) / 2)
+    return torch.where(degrees > 0, tail, torch.nan)

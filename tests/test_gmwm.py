@@ -6,6 +6,7 @@ import json
 import math
 
 import matplotlib as mpl
+import numpy as np
 import pytest
 import torch
 from scipy import stats
@@ -221,3 +222,13 @@ def test_result_speaks_draws_and_simulates_again():
     again = gf.model_from_dict(json.loads(json.dumps(found.to_dict()["model"])))
     torch.testing.assert_close(again.params, found.params)
     assert again.simulate(64).shape == (1, 64)
+
+
+def test_a_process_more_does_not_fit_worse_where_no_model_fits(shared):
+    """A hand-held recording: weights and fit would chase each other from one bad fit to another and back."""
+    recorded = np.load(shared / "data" / "broad_trials.npz")
+    first, last = (np.flatnonzero(np.diff(recorded["t26_movement"])) + 1)[:2]
+    signal = torch.as_tensor(recorded["t26"][4:5, first + 600 : last - 600].astype(float))
+    without, with_tone = (gf.fit_gmwm(signal, formula) for formula in ("AR1 + RW", "AR1 + RW + SIN"))
+    assert with_tone.j_statistic < without.j_statistic
+    assert bool(without.converged)
