@@ -42,6 +42,7 @@ from gyrofuse.io.stream import RecordingError
 from gyrofuse.joint import JointFit, fit_jointly
 from gyrofuse.live import LiveSVO, subset_weights
 from gyrofuse.moment_bootstrap import GMWMBootstrap, bootstrap_gmwm
+from gyrofuse.moment_covariance import moment_covariance
 from gyrofuse.multiscale import MultiScaleSVO, fit_multiscale
 from gyrofuse.multiscale_result import MultiScaleResult
 from gyrofuse.parity import parity_test
@@ -124,6 +125,7 @@ __all__ = [
     "inverse_variance_weights",
     "mask_saturated",
     "model_from_dict",
+    "moment_covariance",
     "nonnegative_weights",
     "parity_test",
     "parse_model",

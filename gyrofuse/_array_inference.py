@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -16,8 +17,12 @@ from gyrofuse.uncertainty import normal_quantile
 
 # Of the largest eigenvalue of a matrix between sensors of unit size, what is as good as none.
 _NOTHING = 1e-5
+# Of a moment of unit size, the same.
+_GONE = 1e-8
 # Standard deviations from zero below which the logarithm of a variance tells nothing.
 _RESOLVED = 0.5
+# Of a memory of which the record holds fewer time constants, the delta method says nothing that holds.
+_FEWEST_TIME_CONSTANTS = 20
 
 
 class ArrayFit(NamedTuple):
@@ -32,6 +37,7 @@ class ArrayFit(NamedTuple):
         objective: `r' Omega r`, `(item,)`.
         degrees: Of freedom of the J statistic, `(item,)`.
         dispersion: Variance of the J statistic over that of a chi-square, `(item,)`.
+        rank: Of each matrix, `(item, process)`.
     """
 
     theta: Tensor
@@ -41,6 +47,7 @@ class ArrayFit(NamedTuple):
     objective: Tensor
     degrees: Tensor
     dispersion: Tensor
+    rank: Tensor
 
 
 class Estimate(NamedTuple):
@@ -54,7 +61,7 @@ class Estimate(NamedTuple):
 
 def spread_of_fit(
     gamma: Tensor, theta: Tensor, shape: Tensor, n_samples: int, made_of: Composition, weighting: str
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Sandwich covariance `(A' O A)^-1 A' O V O A (A' O A)^-1` with `A` the Jacobian, as if no matrix lacked rank.
 
     Args:
@@ -66,29 +73,30 @@ def spread_of_fit(
         weighting: Of the moments.
 
     Returns:
-        Covariance, objective, degrees of freedom and dispersion as in `ArrayFit`.
+        Covariance, objective, degrees of freedom, dispersion and ranks as in `ArrayFit`.
     """
     n_items, n_levels, n_sensors = gamma.shape[:3]
     tau = torch.exp2(torch.arange(1, n_levels + 1, dtype=gamma.dtype, device=gamma.device))
     present = vech(gamma).isfinite()
     covariance = array_moment_covariance(made_of, theta, shape, n_samples, n_levels)
     weight = weights_of(covariance, present, weighting)
-    fitted = made_of.columns(tau, shape) @ vech(theta)
+    columns = made_of.columns(tau, shape)
+    fitted = columns @ vech(theta)
     residual = torch.where(present, vech(gamma) - fitted, 0.0).flatten(1)
     # As many levels as processes tell a pair's entries.
     told = (present.sum(1) >= made_of.n_linear)[:, None].expand(-1, made_of.n_linear, -1).flatten(1)
     known = torch.cat([told, told.new_ones(n_items, len(made_of.curved))], -1)
-    columns = jacobian(tau, made_of, theta, shape) * present.flatten(1)[..., None]
+    slopes = jacobian(tau, made_of, theta, shape) * present.flatten(1)[..., None]
     flat = covariance.reshape(*weight.shape)
-    spread, objective = _sandwich(columns, known, flat, residual, weight)
+    spread, objective = _sandwich(slopes, known, flat, residual, weight)
     spread = torch.where(known[:, :, None] & known[:, None, :], spread, torch.nan)
-    eigenvalues = torch.linalg.eigvalsh(theta)
-    lost = (eigenvalues < _NOTHING * eigenvalues[..., -1:]).sum(-1)
+    eigenvalues = torch.linalg.eigvalsh(theta) * columns.amax(-2)[..., None]  # of moments of unit size
+    lost = ((eigenvalues < _NOTHING * eigenvalues[..., -1:]) | (eigenvalues < _GONE)).sum(-1)
     degrees = present.flatten(1).sum(-1) - known.sum(-1) + (lost * (lost + 1) // 2).sum(-1)
     own = [at for at, pair in enumerate(zip(*pairs(n_sensors), strict=True)) if pair[0] == pair[1]]
     variance = covariance.diagonal(dim1=1, dim2=3).diagonal(dim1=1, dim2=2)
     rarity = (variance / fitted.square() / 2)[..., own]  # of observations: one over their number, (item, level, sensor)
-    return spread, objective, degrees, _dispersion(rarity, present[..., own], degrees)
+    return spread, objective, degrees, _dispersion(rarity, present[..., own], degrees), n_sensors - lost
 
 
 def _dispersion(rarity: Tensor, present: Tensor, degrees: Tensor) -> Tensor:
@@ -106,7 +114,8 @@ def matrices(fit: ArrayFit, confidence_level: float) -> tuple[Estimate, Estimate
     """Entries of the matrices, and correlations, each `(item, process, sensor, sensor)`.
 
     Intervals are symmetric in the logarithm of variances, in `atanh` of correlations, and in covariances as they are. A
-    variance that is hardly told from zero gets an upper limit only.
+    variance that is hardly told from zero gets an upper limit only, as does one of a matrix that lacks rank, whose
+    covariances and correlations get none: the bound on its eigenvalues leaves nothing that is symmetric.
     """
     n_processes, n_sensors = fit.theta.shape[1], fit.theta.shape[-1]
     a, b = pairs(n_sensors)
@@ -121,8 +130,12 @@ def matrices(fit: ArrayFit, confidence_level: float) -> tuple[Estimate, Estimate
     own = (a == b).nonzero()[:, 0]
     variance, ratio = value[..., own], sd[..., own] / value[..., own]
     resolved = ratio < 1 / _RESOLVED
-    low[..., own] = torch.where(resolved, variance * torch.exp(-z * ratio), 0 * variance)
-    high[..., own] = torch.where(resolved, variance * torch.exp(z * ratio), variance + one_sided * sd[..., own])
+    whole_rank = (fit.rank == n_sensors)[..., None]  # (item, process, 1)
+    low, high = (torch.where(whole_rank, limit, torch.nan) for limit in (low, high))
+    two_sided = resolved & whole_rank
+    low[..., own] = torch.where(two_sided, variance * torch.exp(-z * ratio), 0 * variance)
+    reach = torch.where(two_sided, z, one_sided) * ratio
+    high[..., own] = variance * torch.where(resolved, torch.exp(reach), 1 + reach)
     entries = Estimate(*(unvech(part) for part in (value, sd, low, high)))
 
     # d rho = d theta_ab / s - rho (d theta_aa / theta_aa + d theta_bb / theta_bb) / 2
@@ -140,26 +153,37 @@ def matrices(fit: ArrayFit, confidence_level: float) -> tuple[Estimate, Estimate
     # Towards a correlation of one, which it takes for certain, the scale of atanh ends.
     width = z * rho_sd / (1 - rho.square()).clamp(min=1e-12)
     middle = rho.clamp(-1 + 1e-12, 1 - 1e-12).atanh()
-    low, high = ((middle + sign * width).tanh() for sign in (-1, 1))
+    low, high = (torch.where(whole_rank, (middle + sign * width).tanh(), torch.nan) for sign in (-1, 1))
     # Every sensor agrees with itself.
     certain = [torch.where(a == b, one, part) for one, part in ((0.0, rho_sd), (1.0, low), (1.0, high))]
     return entries, Estimate(*(unvech(part) for part in (rho, *certain)))
 
 
-def shared(fit: ArrayFit, held_sd: Tensor, made_of: Composition, confidence_level: float) -> Estimate:
+def is_long(phi: Tensor, n_samples: int) -> Tensor:
+    """Whether the record holds too few time constants of an AR1, of the shape of `phi`."""
+    return phi > math.exp(-_FEWEST_TIME_CONSTANTS / n_samples)
+
+
+def shared(fit: ArrayFit, held_sd: Tensor, made_of: Composition, confidence_level: float, n_samples: int) -> Estimate:
     """Parameters `(item, parameter)` of all sensors, `phi` of AR1s and `beta` of tones, in the order of the model.
 
-    Intervals are symmetric in `atanh phi` and `logit(beta / pi)`.
+    Intervals are symmetric in `atanh phi` and `logit(beta / pi)`. No AR1 has one where the matrix of any of them lacks
+    rank or its memory is long: what that one gets wrong the others make up for.
     """
     z = normal_quantile((1 + confidence_level) / 2)
     n_moving = len(made_of.curved)
     moving = fit.spread.diagonal(dim1=-2, dim2=-1)[:, fit.spread.shape[-1] - n_moving :].clamp(min=0).sqrt()
     moved, held = iter(moving.unbind(-1)), iter(held_sd.unbind(-1))
+    memories = [k for k, process in enumerate(made_of.processes) if isinstance(process, AR1)]
+    vague = (fit.rank[:, memories] < fit.theta.shape[-1]).any(-1)
+    for k in memories:
+        vague |= is_long(fit.shape[:, made_of.shaped.index(k)].tanh(), n_samples)
     found = []
     for k, x in zip(made_of.shaped, fit.shape.unbind(-1), strict=True):
         if isinstance(made_of.processes[k], AR1):
             width = next(moved)
-            value, slope, ends = x.tanh(), 1 - x.tanh().square(), ((x - z * width).tanh(), (x + z * width).tanh())
+            value, slope = x.tanh(), 1 - x.tanh().square()
+            ends = tuple(torch.where(vague, torch.nan, (x + sign * z * width).tanh()) for sign in (-1, 1))
         else:
             part = x.sigmoid()
             slope = torch.pi * part * (1 - part)

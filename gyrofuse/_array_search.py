@@ -1,7 +1,7 @@
 """Minimum of a weighted distance between the wavelet cross-covariance of arrays and that of a model.
 
-Matrices are `Theta = L L'` and move to `L exp(D) L'` with a symmetric `D`: they stay positive whatever the step, and
-a matrix that wants to lose rank does so as fast as its logarithm can fall.
+Matrices are `Theta = S S` with a symmetric `S`, and steps are of `S`: they stay positive whatever the step, and one
+that wants to lose rank does so in a few steps, since the distance is quadratic in what `S` loses.
 """
 
 from __future__ import annotations
@@ -13,57 +13,72 @@ from gyrofuse import _moment_search as search
 from gyrofuse._array_moments import pairs, unvech, vech
 from gyrofuse._composition import Composition
 
-# The longest step of a logarithm.
-_STRIDE = 3.0
-# Damping of a step, relative to the diagonal, one after the other until it leads downhill.
-_DAMPINGS = (1e-7, 1e-4, 1e-2, 1.0, 1e2)
+# The longest step of an `x`, and the difference that tells how its slopes change.
+_STRIDE, _APART = 1.0, 1e-4
+# Damping of a step, relative to the scaled curvatures, one after the other until it leads downhill.
+_DAMPINGS = (0.0, 1e-4, 1e-2, 1.0, 1e2)
+# Of a curvature, what is as good as none.
+_FLAT = 1e-10
+# What an eigenvalue adds to a moment of unit size at least: from nothing at all there is no way back.
+_LEAST = 1e-10
 
 
 def step_downhill(
-    gamma: Tensor, weight: Tensor, tau: Tensor, made_of: Composition, root: Tensor, shape: Tensor
+    gamma: Tensor, weight: Tensor, tau: Tensor, made_of: Composition, root: Tensor, shape: Tensor, exact: bool
 ) -> tuple[Tensor, Tensor]:
     """One damped Newton step on `r' W r`, `r = gamma - sum_k u_k(x) Theta_k`.
 
     Args:
-        gamma: Moments `(item, level, pair)`; those without weight may be anything finite.
+        gamma: Moments `(item, level, pair)` of unit size; those without weight may be anything finite.
         weight: `W`, `(item, moment, moment)`.
         tau: `(level,)`.
         made_of: Structure of the model.
-        root: `L`, `(item, process, sensor, sensor)`.
+        root: `S`, `(item, process, sensor, sensor)`.
         shape: `x`, `(item, shaped)`.
+        exact: With all second derivatives, which also leave saddles; else with those that are never negative, whose
+            steps are shorter far from a minimum.
 
     Returns:
-        `L` and `x`, as they were where no step leads downhill.
+        `S` and `x`, as they were where no step leads downhill.
     """
     root, shape = root.clone(), shape.clone()
     moving = [made_of.shaped.index(k) for k in made_of.curved]
     low, high = (ends[moving] for ends in search.limits(made_of, tau, shape))
     distance = _distance(gamma, weight, tau, made_of, root, shape)
-    gradient, normal = _quadratic(gamma, weight, tau, made_of, root, shape)
-    size = normal.diagonal(dim1=-2, dim2=-1)
+    gradient, bends, size = _quadratic(gamma, weight, tau, made_of, root, shape, exact)
     # What no moment depends on does not move.
-    still = torch.diag_embed(1e-12 * size.mean(-1, keepdim=True) + torch.finfo(size.dtype).tiny + 0 * size)
-    todo = distance.isfinite().nonzero()[:, 0]
+    unit = torch.where(size > 0, size, 1.0).rsqrt()
+    scaled = unit[..., :, None] * bends * unit[..., None, :]
+    finite = distance.isfinite() & scaled.isfinite().flatten(1).all(-1)
+    curvature, vectors = torch.linalg.eigh(torch.where(finite[:, None, None], scaled, 0.0))
+    # Where the distance bends down a step leads away from the saddle, as long as if it bent up.
+    curvature = curvature.abs() + _FLAT
+    downhill = (vectors.mT @ (unit * gradient)[..., None])[..., 0]
+    todo = finite.nonzero()[:, 0]
     for damping in _DAMPINGS:
         at, x = root[todo], shape[todo]
-        system = normal[todo] + still[todo] + torch.diag_embed(damping * size[todo])
-        step = torch.linalg.solve_ex(system, gradient[todo])[0]
+        step = unit[todo] * (vectors[todo] @ (downhill[todo] / (curvature[todo] + damping))[..., None])[..., 0]
         n_linear = step.shape[-1] - len(moving)
-        values, vectors = torch.linalg.eigh(_in_basis(step[:, :n_linear].unflatten(-1, (root.shape[1], -1))))
-        tried = at @ (vectors * (values.clamp(-_STRIDE, _STRIDE) / 2).exp()[..., None, :]) @ vectors.mT
+        tried = at + _in_basis(step[:, :n_linear].unflatten(-1, (root.shape[1], -1)))
         moved = x.clone()
-        moved[:, moving] = (x[:, moving] + step[:, n_linear:].clamp(-1, 1)).clamp(low, high)
+        moved[:, moving] = (x[:, moving] + step[:, n_linear:].clamp(-_STRIDE, _STRIDE)).clamp(low, high)
         better = _distance(gamma[todo], weight[todo], tau, made_of, tried, moved) <= distance[todo]
         root[todo] = torch.where(better[:, None, None, None], tried, at)
         shape[todo] = torch.where(better[:, None], moved, x)
         todo = todo[~better]
         if not len(todo):
             break
-    return root, shape
+    return square_root(root @ root, _LEAST / made_of.columns(tau, shape).amax(-2)), shape
+
+
+def square_root(theta: Tensor, least: Tensor) -> Tensor:
+    """The symmetric `S` with `S S = Theta`, of eigenvalues of at least `least` `(item, process)`."""
+    values, vectors = torch.linalg.eigh(theta)
+    return (vectors * torch.maximum(values, least[..., None]).sqrt()[..., None, :]) @ vectors.mT
 
 
 def _distance(gamma: Tensor, weight: Tensor, tau: Tensor, made_of: Composition, root: Tensor, shape: Tensor) -> Tensor:
-    residual = (gamma - made_of.columns(tau, shape) @ vech(root @ root.mT)).flatten(1)
+    residual = (gamma - made_of.columns(tau, shape) @ vech(root @ root)).flatten(1)
     return ((weight @ residual[..., None])[..., 0] * residual).sum(-1)
 
 
@@ -80,16 +95,16 @@ def jacobian(tau: Tensor, made_of: Composition, theta: Tensor, shape: Tensor) ->
 
 
 def _quadratic(
-    gamma: Tensor, weight: Tensor, tau: Tensor, made_of: Composition, root: Tensor, shape: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Half of the gradient downhill and of the second derivatives, by `D` in the basis and by `x`, item by item.
+    gamma: Tensor, weight: Tensor, tau: Tensor, made_of: Composition, root: Tensor, shape: Tensor, exact: bool
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Half of the gradient downhill and of the second derivatives, by `S` in the basis and by `x`, item by item.
 
-    `exp(D) = 1 + D + D^2/2` adds `tr(M D^2) / 2` with `M = L' G L` and the gradient `G` by `Theta`, of which the
-    positive part is kept: then a step is always one downhill.
+    `exact` has those of the model in it, weighted with the residuals; else only what of them bends the distance up. The
+    third is a curvature for the scale of each unknown, `(item, unknown)`, positive where any moment depends on it.
     """
     n_items, n_levels, n_pairs = gamma.shape
     n_processes = root.shape[1]
-    theta = vech(root @ root.mT)
+    theta = vech(root @ root)
     moving = [made_of.shaped.index(k) for k in made_of.curved]
     values, slopes = made_of.columns(tau, shape), made_of.slopes(tau, shape)[..., moving]
     residual = gamma - values @ theta
@@ -101,7 +116,9 @@ def _quadratic(
     half = half.view(n_items, -1, n_pairs, n_levels, n_pairs).movedim(3, -1) @ both[:, None, None]
     full = half.transpose(-1, -2)
     # Moves of Theta along the basis, (item, process, pair, basis), and of the shapes along theta
-    moves = vech(root[:, :, None] @ _basis(root) @ root[:, :, None].mT).mT
+    side = root[:, :, None] @ _basis(root)
+    free = _free(weight, n_pairs)
+    moves = vech(side + side.mT).mT * free[:, None, None]
     along = theta[:, made_of.curved]
     linear = torch.einsum("nkqa,nkqmr,nmrb->nkamb", moves, full[:, :n_processes, :, :n_processes], moves)
     mixed = torch.einsum("nkqa,nkqsr,nsr->nkas", moves, full[:, :n_processes, :, n_processes:], along)
@@ -113,20 +130,42 @@ def _quadratic(
         ],
         -1,
     )
-    linear.diagonal(dim1=1, dim2=3).add_(_bend(root, downhill[:, :n_processes]).movedim(1, -1))
+    both_free = (free[:, :, None] * free[:, None])[:, None]
+    plain = torch.cat([torch.einsum("nkaka->nka", linear).flatten(1), torch.einsum("nss->ns", curved)], -1)
+    linear.diagonal(dim1=1, dim2=3).add_((_bend(root, downhill[:, :n_processes], exact) * both_free).movedim(1, -1))
+    if exact:
+        for at, k in enumerate(made_of.curved):
+            mixed[:, k, :, at] -= torch.einsum("nqa,nq->na", moves[:, k], downhill[:, n_processes + at])
+        ahead, behind = (made_of.slopes(tau, shape + sign * _APART)[..., moving] for sign in (1, -1))
+        second = (ahead - behind) / (2 * _APART)
+        curved.diagonal(dim1=1, dim2=2).sub_((along * (second.mT @ weighted)).sum(-1))
     top = torch.cat([linear.flatten(3).flatten(1, 2), mixed.flatten(1, 2)], -1)
-    return gradient, torch.cat([top, torch.cat([mixed.flatten(1, 2).mT, curved], -1)], -2)
+    bends = torch.cat([top, torch.cat([mixed.flatten(1, 2).mT, curved], -1)], -2)
+    return gradient, bends, torch.maximum(plain, bends.diagonal(dim1=-2, dim2=-1).abs())
 
 
-def _bend(root: Tensor, downhill: Tensor) -> Tensor:
-    """The second derivatives of `tr(M D^2) / 2`, `(item, process, basis, basis)`."""
+def _free(weight: Tensor, n_pairs: int) -> Tensor:
+    """1 for directions of the basis between sensors with moments, else 0, `(item, basis)`: the others stay."""
+    told = (weight.diagonal(dim1=-2, dim2=-1).unflatten(-1, (-1, n_pairs)) > 0).any(1)
+    first, second = pairs(int((2 * n_pairs) ** 0.5))
+    own = told[:, first == second]
+    return (own[:, first] & own[:, second]).to(weight)
+
+
+def _bend(root: Tensor, downhill: Tensor, exact: bool) -> Tensor:
+    """Half of the second derivatives of `2 tr(G D^2)`, `G` half of the gradient by `Theta`, or its positive part.
+
+    Returns:
+        `(item, process, basis, basis)`.
+    """
     eye = torch.eye(root.shape[-1], dtype=root.dtype, device=root.device)
     gradient = -unvech(downhill) * (1 + eye) / 2
-    values, vectors = torch.linalg.eigh(root.mT @ gradient @ root)
-    positive = (vectors * values.clamp(min=0)[..., None, :]) @ vectors.mT
+    if not exact:
+        values, vectors = torch.linalg.eigh(gradient)
+        gradient = (vectors * values.clamp(min=0)[..., None, :]) @ vectors.mT
     basis = _basis(root)
-    bend = (positive[:, :, None] @ basis).flatten(-2) @ basis.flatten(-2).mT
-    return (bend + bend.mT) / 2
+    bend = (gradient[:, :, None] @ basis).flatten(-2) @ basis.flatten(-2).mT
+    return bend + bend.mT
 
 
 def _basis(like: Tensor) -> Tensor:

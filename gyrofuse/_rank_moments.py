@@ -69,21 +69,21 @@ class Moments:
         linear, x = (torch.stack(column)[lowest, items] for column in list(zip(*ends, strict=True))[:2])
         for _ in range(_UPDATES):
             linear, x, _, _ = search.minimise(target, self._whitening(made_of, linear, x), tau, made_of, x)
-        return self._summed_up(made_of, linear, x)
+        return self._summed_up(made_of, linear, x, self._whitening(made_of, linear, x))
 
     def near(self, made_of: Composition, linear: Tensor, shape: Tensor) -> MomentFit:
         """Minimum next to a maximum of the likelihood, with the `V` of that."""
         root = self._whitening(made_of, linear / self.size, shape)
         linear, x, _, _ = search.minimise(self._target, root, self.tau, made_of, shape, _STEPS_NEAR)
-        return self._summed_up(made_of, linear, x)
+        # The maximum is the better estimate, and so is its V.
+        return self._summed_up(made_of, linear, x, root)
 
     def part(self, items: Tensor) -> Moments:
         """Of some items."""
         return Moments(self.variance[items], self.n_samples)
 
-    def _summed_up(self, made_of: Composition, linear: Tensor, x: Tensor) -> MomentFit:
+    def _summed_up(self, made_of: Composition, linear: Tensor, x: Tensor, root: Tensor) -> MomentFit:
         target, tau = self._target, self.tau
-        root = self._whitening(made_of, linear, x)
         residual = target - made_of.wavelet_variance(tau, linear, x)
         objective = (root @ residual[..., None]).square().sum((-2, -1))
         log_det = -2 * root.diagonal(dim1=-2, dim2=-1).log().sum(-1)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import fields
 from typing import Generic, TypeVar
 
@@ -86,23 +85,31 @@ class _Search(ABC, Generic[FitT]):
             todo = following
 
     def _try_out(self, kinds: Kinds, items: Tensor) -> None:
-        """Fit one composition to some records, from the best of its parents."""
+        """Fit one composition to some records, from each of its parents: from the best of them alone it may be stuck.
+
+        Where an AR1 of the best one stands for white noise, say, white noise cannot take its place.
+        """
         made_of = compositions.composition(kinds, self.held)
         smaller = [self.fits[key] for key in compositions.parents(kinds) if key in self.fits]
-        if smaller:
-            best = torch.stack([self._loss(fit)[items].nan_to_num(nan=torch.inf) for _, fit in smaller]).argmin(0)
-            starts: list[tuple[Tensor, tuple[Tensor, ...]]] = []
-            for n, (parent, fit) in enumerate(smaller):
-                own = (best == n).nonzero()[:, 0]
-                if len(own):
-                    starts.append((own, self._start(made_of, items[own], parent, _part(fit, items[own]))))
-            columns = zip(*(values for _, values in starts), strict=True)
-            joined = [_among([own for own, _ in starts], column, len(items)) for column in columns]
-            found = self._climb(made_of, items, *joined)
-        else:
-            found = self._first(made_of, items)
-        whole = (_among([items], [getattr(found, f.name)], len(self._everyone)) for f in fields(found))
-        self.fits[compositions.key_of(kinds)] = made_of, type(found)(*whole)
+        found = None if smaller else self._whole(self._first(made_of, items), items)
+        for parent, fit in smaller:
+            own = items[self._loss(fit)[items].isfinite()]
+            if len(own):
+                climbed = self._climb(made_of, own, *self._start(made_of, own, parent, _part(fit, own)))
+                whole = self._whole(climbed, own)
+                found = whole if found is None else self._better(found, whole)
+        if found is not None:
+            self.fits[compositions.key_of(kinds)] = made_of, found
+
+    def _whole(self, fit: FitT, items: Tensor) -> FitT:
+        """Of all records, NaN but for these."""
+        return type(fit)(*(_among(items, getattr(fit, f.name), len(self._everyone)) for f in fields(fit)))
+
+    def _better(self, one: FitT, other: FitT) -> FitT:
+        """For each record the fit with less loss."""
+        first = ~(self._loss(other) < self._loss(one).nan_to_num(nan=torch.inf))
+        pairs = ((getattr(one, f.name), getattr(other, f.name)) for f in fields(one))
+        return type(one)(*(torch.where(first.view(-1, *(1,) * (a.ndim - 1)), a, b) for a, b in pairs))
 
     @abstractmethod
     def _loss(self, fit: FitT) -> Tensor:
@@ -143,7 +150,7 @@ class SpectralSearch(_Search[NoiseFit]):
         ends = [spectra.fit(made_of, linear, torch.full_like(size, math.atanh(math.exp(-1 / c)))) for c in constants]
         best = ends[0]
         for other in ends[1:]:
-            best = best.where(best.log_likelihood >= other.log_likelihood, other)
+            best = self._better(best, other)
         return best
 
     def _start(self, made_of: Composition, items: Tensor, parent: Composition, fit: NoiseFit) -> tuple[Tensor, ...]:
@@ -182,9 +189,8 @@ def _part(fit: FitT, items: Tensor) -> FitT:
     return type(fit)(*(getattr(fit, f.name)[items] for f in fields(fit)))
 
 
-def _among(places: Sequence[Tensor], values: Sequence[Tensor], n_items: int) -> Tensor:
+def _among(places: Tensor, values: Tensor, n_items: int) -> Tensor:
     """Values in their places among so many, NaN elsewhere."""
-    whole = values[0].new_full((n_items, *values[0].shape[1:]), torch.nan)
-    for items, value in zip(places, values, strict=True):
-        whole[items] = value
+    whole = values.new_full((n_items, *values.shape[1:]), torch.nan)
+    whole[places] = values
     return whole

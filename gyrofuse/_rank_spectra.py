@@ -10,7 +10,7 @@ import itertools
 import math
 from collections import Counter
 from copy import copy
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -51,10 +51,10 @@ class NoiseFit:
     slope_sd: Tensor
     log_likelihood: Tensor
 
-    def where(self, first: Tensor, other: NoiseFit) -> NoiseFit:
-        """This fit where `first` `(item,)`, the other one elsewhere."""
-        pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(NoiseFit))
-        return NoiseFit(*(torch.where(first.view(-1, *(1,) * (a.ndim - 1)), a, b) for a, b in pairs))
+
+def summed(bins: Bins, values: Tensor) -> Tensor:
+    """Sums `(item, bin)` of what is given for ordinates `(item, k)`."""
+    return torch.stack([values[:, a:b].sum(-1) for a, b in itertools.pairwise(bins.edges)], -1)
 
 
 class Spectra:
@@ -66,24 +66,19 @@ class Spectra:
     """
 
     def __init__(self, series: Tensor, tones: Tones | None = None) -> None:
-        n = series.shape[-1]
-        self.bins = Bins(n, series.device)
-        time = torch.arange(n, dtype=torch.float64, device=series.device)
+        self.bins = Bins(series.shape[-1], series.device)
+        time = torch.arange(self.bins.n_samples, dtype=torch.float64, device=series.device)
         shown = cosine_ordinates(time[None])
         energy, cross = [], []
         for values in _transformed(series, tones, None):
-            energy.append(self._summed(values.square()))
-            cross.append(self._summed(values * shown))
+            energy.append(summed(self.bins, values.square()))
+            cross.append(summed(self.bins, values * shown))
         self.energy, self.cross = torch.cat(energy), torch.cat(cross)  # (item, bin)
-        self.ramp = self._summed(shown.square())  # (1, bin)
+        self.ramp = summed(self.bins, shown.square())  # (1, bin)
         count = self.bins.count.expand(len(series), -1)
         if tones is not None:
             count = count - self.bins.taken_by(tones.beta, tones.phase)
         self.count = count.clamp(min=_LEAST_COUNT)
-
-    def _summed(self, values: Tensor) -> Tensor:
-        edges = self.bins.edges
-        return torch.stack([values[:, a:b].sum(-1) for a, b in itertools.pairwise(edges)], -1)
 
     def part(self, items: Tensor) -> Spectra:
         """Of some items."""
@@ -107,11 +102,11 @@ class Spectra:
         slope = slope_sd = size.new_zeros(len(p))
         for _ in range(_RAMP_ROUNDS if ramp_at else 1):
             if ramp_at:
-                slope, slope_sd, energy = self._without_ramp(noise.variances(self.bins, p, x))
+                slope, slope_sd, energy = self.without_ramp(noise.variances(self.bins, p, x))
             p, x, _ = maximise(energy, self.count, self.bins, noise, p, x, enough=_ENOUGH)
         variance = noise.variances(self.bins, p, x)
         if ramp_at:
-            slope, slope_sd, energy = self._without_ramp(variance)
+            slope, slope_sd, energy = self.without_ramp(variance)
         log_likelihood = -(self.bins.count * (2 * math.pi * variance).log() + energy / variance).sum(-1) / 2
         whole = linear.clone()
         whole[:, noise.which] = p
@@ -119,7 +114,7 @@ class Spectra:
         whole, x = made_of.ordered(whole, x)
         return NoiseFit(whole, x, slope, slope_sd, log_likelihood)
 
-    def _without_ramp(self, variance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def without_ramp(self, variance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Slope by weighted least squares, its standard deviation, and the energy that it leaves."""
         information = (self.ramp / variance).sum(-1)
         slope = (self.cross / variance).sum(-1) / information
@@ -172,13 +167,15 @@ class Spectra:
         p, x = fit.linear[:, noise.which], fit.shape
         columns, slopes, _ = noise.columns(self.bins, x)
         variance = (columns @ p[..., None])[..., 0]
-        energy = self._without_ramp(variance)[2] if _drifts(parent) else self.energy
+        energy = self.without_ramp(variance)[2] if _drifts(parent) else self.energy
         root = (self.count / 2).sqrt()[..., None] / variance[..., None]
         moving = slopes * p[:, None, noise.moving]
         there = torch.cat([p > 0, p[:, noise.moving] > 0], -1)[:, None]
         known = torch.cat([columns, moving], -1) * root * there
-        size = known.norm(dim=-2, keepdim=True)
-        basis = torch.linalg.qr(known / torch.where(size > 0, size, 1.0))[0]
+        known = known / known.norm(dim=-2, keepdim=True).clamp(min=1e-300)
+        # Columns of zeros come last: in their places the basis has vectors that mean nothing.
+        first = there.sort(descending=True)
+        basis = torch.linalg.qr(known.take_along_dim(first.indices, -1))[0] * first.values
         grid = _grid(self.bins.n_samples).to(p)
         shapes = self.bins.ar1(grid.tanh())[0].mT * root  # (item, bin, grid)
         new = shapes - basis @ (basis.mT @ shapes)

@@ -29,11 +29,13 @@ def numbered(n: int) -> tuple[str, ...]:
 
 def listed(value: Tensor) -> Any:
     """Nested lists of plain numbers, NaN and infinities as None, ready for JSON."""
-    plain = value.detach().cpu().tolist()
+    return cleaned(value.detach().cpu().tolist())
 
-    def clean(entry: Any) -> Any:
-        if isinstance(entry, list):
-            return [clean(e) for e in entry]
-        return entry if math.isfinite(entry) else None
 
-    return clean(plain)
+def cleaned(entry: Any) -> Any:
+    """Plain lists and dictionaries with None in place of NaN and infinities."""
+    if isinstance(entry, dict):
+        return {key: cleaned(value) for key, value in entry.items()}
+    if isinstance(entry, list):
+        return [cleaned(value) for value in entry]
+    return None if isinstance(entry, float) and not math.isfinite(entry) else entry

@@ -28,9 +28,10 @@ from gyrofuse.processes import Drift, Model, Sinusoid
 from gyrofuse.recording import Recording
 
 WEIGHTINGS = ("optimal", "pairwise")
-# Most steps, the first of them with rough weights, and the change of the fitted moments, a chi-square, with which they
-# have come to rest.
-_UPDATES, _ROUGH, _AT_REST = 60, 6, 1e-5
+# Most steps with weights that follow the fit, the first of them with rough ones, and most steps with weights that stay.
+_UPDATES, _ROUGH, _POLISHING = 20, 6, 100
+# Changes of the fitted moments, chi-squares, with which these steps have come to rest.
+_NEAR, _AT_REST = 1e-5, 1e-9
 # Starts, by how much their `x` differ in all, and the steps after which the best of them goes on alone.
 _DISTINCT, _APART, _TRIAL = 3, 0.5, 12
 # Numbers that the weights of all items may take at a time.
@@ -52,13 +53,15 @@ def fit_array_gmwm(
 
     `theta = argmin r' Omega r`, `r = vech(Gamma_j - sum_k f_k(tau_j) Theta_k)` over all levels, with `Omega = V^-1` of
     the fitted model and its finite length,
-    `Cov(gamma_ab,j, gamma_cd,l) = sum_km Q_jl[k,m] (Theta_k,ac Theta_m,bd + Theta_k,ad Theta_m,bc)`, followed until it
-    rests. Matrices are positive by construction; `phi` of an AR1 and the frequency of a tone are those of all sensors.
+    `Cov(gamma_ab,j, gamma_cd,l) = sum_km Q_jl[k,m] (Theta_k,ac Theta_m,bd + Theta_k,ad Theta_m,bc)`, followed for
+    twenty steps or until it rests and then kept. Matrices are positive by construction; `phi` of an AR1 and the
+    frequency of a tone are those of all sensors.
     Of a tone the matrix is that of squared amplitudes in phase, `a_i a_k cos(phase_i - phase_k)`, which is all that
     wavelet moments see; its frequency comes from the sensor that shows it most sharply.
 
-    A memory as long as a seventh of the record is hardly told from a random walk: its matrix often lacks rank, and the
-    intervals of it and of the memories beside it hold the truth in eight of ten records; at a thirtieth all is well.
+    A memory as long as a seventh of the record is hardly told from a random walk: its matrix mostly lacks rank, weights
+    for long times are no better than those of the measured moments, and in one of ten records the memory is found far
+    too short. `remarks` tell all but the last; at a thirtieth all is well.
 
     Missing samples leave out moments without any complete window; the others count as those of a complete record. A
     sensor without samples has NaN everywhere, and a pair that is never seen together a NaN covariance.
@@ -113,7 +116,7 @@ def fit_array_gmwm(
     return ArrayGMWMResult.build(
         fit=fit,
         squared=squared,
-        shared=shared(fit, held_sd, made_of, confidence_level),
+        shared=shared(fit, held_sd, made_of, confidence_level, length),
         made_of=made_of,
         usable=usable,
         wavelet_cross_covariance=wccv,
@@ -151,13 +154,14 @@ def _fit_items(
     root, shape = root.flatten(0, 1), shape.flatten(0, 1)
     if n_starts > 1:
         every, seen = (value.repeat_interleave(n_starts, 0) for value in (moments, present))
-        root, shape, _ = _follow(every, seen, tau, n_samples, made_of, weighting, root, shape, _ROUGH, _TRIAL)
+        root, shape = _follow(every, seen, tau, n_samples, made_of, weighting, root, shape, _ROUGH, _TRIAL)
         score = _misfit(every, seen, tau, n_samples, made_of, root, shape).nan_to_num(nan=torch.inf)
         best = score.view(n_items, -1).argmin(-1) + n_starts * torch.arange(n_items, device=score.device)
         root, shape = root[best], shape[best]
     rough = 0 if n_starts > 1 else _ROUGH
-    root, shape, rests = _follow(moments, present, tau, n_samples, made_of, weighting, root, shape, rough, _UPDATES)
-    theta = root @ root.mT
+    root, shape = _follow(moments, present, tau, n_samples, made_of, weighting, root, shape, rough, _UPDATES)
+    root, shape, rests = _settle(moments, present, tau, n_samples, made_of, weighting, root, shape)
+    theta = root @ root
     # AR1s from slow to fast, tones from high to low frequency.
     place = torch.arange(made_of.n_linear, dtype=shape.dtype, device=shape.device).expand(len(shape), -1)
     order, shape = made_of.ordered(place, shape)
@@ -175,31 +179,65 @@ def _follow(
     shape: Tensor,
     rough: int,
     most: int,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Steps with the weights of where each starts, the first `rough` ones with those of pairs.
-
-    Gives `L`, `x` and whether they came to rest.
+) -> tuple[Tensor, Tensor]:
+    """`S` and `x` after steps with weights of where these start, the first `rough` ones with those of pairs.
 
     A minimum for weights that stay would be far off where the data hardly tell a memory, and the next one far off on
-    the other side.
+    the other side. Weights of the mean of the covariances so far, of which the latest counts half, keep steps from
+    going to and fro between two fits of which each has the other's weights.
     """
     root, shape = root.clone(), shape.clone()
     fitted = torch.zeros_like(moments)
-    rests = torch.zeros(len(moments), dtype=torch.bool, device=moments.device)
+    todo = torch.arange(len(moments), device=moments.device)
+    mean = moments.new_empty(0)
     for step in range(most):
+        at, x = root[todo], shape[todo]
+        covariance = array_moment_covariance(made_of, at @ at, x, n_samples, len(tau))
+        mean = (mean + covariance) / 2 if step > rough else covariance
+        weight = weights_of(mean, present[todo], weighting if step >= rough else "pairwise")
+        at, x = array_search.step_downhill(moments[todo], weight, tau, made_of, at, x, exact=False)
+        new = made_of.columns(tau, x) @ vech(at @ at)
+        near = (_squared(weight, new - fitted[todo]) < _NEAR) & (step >= rough)
+        root[todo], shape[todo], fitted[todo] = at, x, new
+        todo, mean = todo[~near], mean[~near]
+        if not len(todo):
+            break
+    return root, shape
+
+
+def _settle(
+    moments: Tensor,
+    present: Tensor,
+    tau: Tensor,
+    n_samples: int,
+    made_of: Composition,
+    weighting: str,
+    root: Tensor,
+    shape: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`S` and `x` of the minimum for the weights of where it starts, and whether the steps came to rest."""
+    root, shape = root.clone(), shape.clone()
+    covariance = array_moment_covariance(made_of, root @ root, shape, n_samples, len(tau))
+    weight = weights_of(covariance, present, weighting)
+    todo = torch.arange(len(moments), device=moments.device)
+    rests = torch.zeros(len(moments), dtype=torch.bool, device=moments.device)
+    for _ in range(_POLISHING):
+        at, x = root[todo], shape[todo]
+        before = made_of.columns(tau, x) @ vech(at @ at)
+        at, x = array_search.step_downhill(moments[todo], weight[todo], tau, made_of, at, x, exact=True)
+        move = made_of.columns(tau, x) @ vech(at @ at) - before
+        root[todo], shape[todo] = at, x
+        rests[todo] = _squared(weight[todo], move) < _AT_REST
         todo = (~rests).nonzero()[:, 0]
         if not len(todo):
             break
-        at, x = root[todo], shape[todo]
-        covariance = array_moment_covariance(made_of, at @ at.mT, x, n_samples, len(tau))
-        weight = weights_of(covariance, present[todo], weighting if step >= rough else "pairwise")
-        at, x = array_search.step_downhill(moments[todo], weight, tau, made_of, at, x)
-        new = made_of.columns(tau, x) @ vech(at @ at.mT)
-        move = (new - fitted[todo]).flatten(1)
-        change = ((weight @ move[..., None])[..., 0] * move).sum(-1)
-        root[todo], shape[todo], fitted[todo] = at, x, new
-        rests[todo] = (change < _AT_REST) & (step >= rough)
     return root, shape, rests
+
+
+def _squared(weight: Tensor, move: Tensor) -> Tensor:
+    """`d' W d`, `(item,)`, of moments `(item, level, pair)`."""
+    flat = move.flatten(1)
+    return ((weight @ flat[..., None])[..., 0] * flat).sum(-1)
 
 
 def _misfit(
@@ -212,15 +250,14 @@ def _misfit(
     shape: Tensor,
 ) -> Tensor:
     """`r' V^-1 r + ln det V`, which compares fits with different weights, `(item,)`."""
-    covariance = array_moment_covariance(made_of, root @ root.mT, shape, n_samples, len(tau))
+    covariance = array_moment_covariance(made_of, root @ root, shape, n_samples, len(tau))
     weight = weights_of(covariance, present, "optimal")
-    residual = (moments - made_of.columns(tau, shape) @ vech(root @ root.mT)).flatten(1)
-    distance = ((weight @ residual[..., None])[..., 0] * residual).sum(-1)
+    distance = _squared(weight, moments - made_of.columns(tau, shape) @ vech(root @ root))
     return distance - torch.logdet(weight + torch.diag_embed((~present.flatten(1)).to(weight)))
 
 
 def _starts(gamma: Tensor, held: Tensor, tau: Tensor, n_samples: int, made_of: Composition) -> tuple[Tensor, Tensor]:
-    """`L` of uncorrelated sensors and `x`, `(item, start, ...)`: of each sensor's own fits, those that suit all."""
+    """`S` of uncorrelated sensors and `x`, `(item, start, ...)`: of each sensor's own fits, those that suit all."""
     nu = gamma.diagonal(dim1=-2, dim2=-1).mT  # (item, sensor, level)
     n_items, n_sensors, _ = nu.shape
     known = nu.isfinite().any(-1).to(nu)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from gyrofuse._array_inference import ArrayFit, Estimate, matrices
+from gyrofuse._array_inference import ArrayFit, Estimate, is_long, matrices
 from gyrofuse._composition import Composition
 from gyrofuse._result import ConfidenceInterval, listed
 from gyrofuse.live import subset_weights
@@ -32,6 +33,7 @@ _BATCHED = (
     "degrees_of_freedom",
     "p_value",
     "converged",
+    "rank",
     "wavelet_cross_covariance",
     "fitted_wavelet_cross_covariance",
 )
@@ -48,18 +50,20 @@ class ArrayGMWMResult:
             innovations of an AR1, of the steps of a random walk, of amplitudes in phase of a tone (their squares on the
             diagonal). Positive semi-definite. NaN for a sensor without samples and a pair that is never seen together.
         theta_sd: Standard deviation of every entry, as if no matrix lacked rank.
-        confidence_interval: Limits of every entry. A variance that is hardly told from zero has an upper limit only.
+        confidence_interval: Limits of every entry. A variance that is hardly told from zero, or in a matrix that lacks
+            rank, has an upper limit only; covariances of such a matrix have none (NaN).
         correlation: Of the sensors in each process.
-        correlation_interval: Limits of the same.
+        correlation_interval: Limits of the same, NaN where the matrix lacks rank.
         param_names: Of what all sensors share, such as `ar1_1.phi`.
         params: `(..., parameter)`.
         params_sd: `(..., parameter)`.
-        params_interval: Limits `(..., parameter)`.
+        params_interval: Limits `(..., parameter)`, NaN for `phi` where `remarks` say so.
         confidence_level: Of all intervals.
         objective: `r' Omega r` with `r` the entries of measured less fitted wavelet cross-covariance, `(...)`.
         degrees_of_freedom: Moments less parameters, `(...)`.
         p_value: Of the J test, that the model is complete, `(...)`; NaN with other than optimal weights.
-        converged: `(...)`.
+        converged: `(...)`, whether the search came to rest.
+        rank: Of every matrix, `(..., process)`, 0 for an array that could not be fitted.
         wavelet_cross_covariance: Measured, `(..., level, sensor, sensor)`, signal^2.
         fitted_wavelet_cross_covariance: Of the model, the same.
         n_samples: Length of the records.
@@ -84,6 +88,7 @@ class ArrayGMWMResult:
     degrees_of_freedom: Tensor
     p_value: Tensor
     converged: Tensor
+    rank: Tensor
     wavelet_cross_covariance: Tensor
     fitted_wavelet_cross_covariance: Tensor
     n_samples: int
@@ -139,10 +144,16 @@ class ArrayGMWMResult:
             degrees_of_freedom=placed(fit.degrees.to(theta)),
             p_value=placed(torch.where(tested, tail, torch.nan)),
             converged=placed(fit.converged, False),
+            rank=placed(fit.rank, 0),
             wavelet_cross_covariance=wavelet_cross_covariance,
             fitted_wavelet_cross_covariance=placed(torch.einsum("njk,nkab->njab", columns, theta)),
             **rest,
         )
+
+    @property
+    def remarks(self) -> tuple[tuple[str, ...], ...]:
+        """What the record does not tell, in words, for each array, item after item."""
+        return tuple(self._remarks(index) for index in itertools.product(*map(range, self.converged.shape)))
 
     @property
     def model(self) -> ArrayModel:
@@ -214,7 +225,7 @@ class ArrayGMWMResult:
                 value = self.theta[k, i, i].item()
                 others = " ".join(f"{rho:6.2f}" for rho in self.correlation[k, i].tolist())
                 lines.append(f"  {sensor:<12}{value:>12.5g} [{low:>11.5g}, {high:>11.5g}]  {others}")
-        return "\n".join(lines)
+        return "\n".join([*lines, *("", *self.remarks[0]) * bool(self.remarks[0])])
 
     def __str__(self) -> str:
         return self.summary()
@@ -263,7 +274,27 @@ class ArrayGMWMResult:
             elif isinstance(value, Tensor):
                 value = value.tolist() if value.dtype == torch.bool else listed(value)
             plain[entry.name] = list(value) if isinstance(value, tuple) else value
-        return plain
+        return plain | {"remarks": [list(texts) for texts in self.remarks]}
+
+    def _remarks(self, index: tuple[int, ...]) -> tuple[str, ...]:
+        n_sensors = self.theta.shape[-1]
+        if not bool(self._present()[index].any()):
+            return ()
+        shapes = dict(zip(self.param_names, self.params[index].unbind(-1), strict=True))
+        names = dict.fromkeys(name.split(".")[0] for name in Model(list(self.processes)).param_names)
+        found = []
+        for name, rank in zip(names, self.rank[index].tolist(), strict=True):
+            phi = shapes.get(f"{name}.phi")
+            if rank < n_sensors:
+                nor = "" if phi is None else ", nor of any phi"
+                lacking = f"{name}: matrix of rank {rank} of {n_sensors}"
+                found.append(f"{lacking}; no intervals of its covariances and correlations{nor}")
+            if phi is not None and bool(is_long(phi, self.n_samples)):
+                found.append(
+                    f"{name}: a memory so long is hardly told from a random walk; no intervals of any phi, and weights "
+                    "for long times may be no better than those of the measured wavelet cross-covariance"
+                )
+        return tuple(found)
 
     def _present(self) -> Tensor:
         """Sensors with samples, `(..., sensor)`."""

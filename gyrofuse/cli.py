@@ -41,6 +41,7 @@ from gyrofuse.cli_shared import (
     read,
     say_notes,
     stretch,
+    titled,
     write_json,
 )
 from gyrofuse.demo import FILES, run_demo
@@ -138,7 +139,7 @@ def info(
             write_json(drafts[json_file], recording.to_dict())
         if report:
             with progress("drawing"):
-                page = recording_report(recording, title=f"What is in {_titled(logs)}")
+                page = recording_report(recording, title=f"What is in {titled(logs)}")
             drafts[report].write_text(page, encoding="utf-8")
     _say_recording(recording)
 
@@ -223,7 +224,7 @@ def fuse(
             if figure:
                 save_figure(fusion_figure(result), drafts[figure], figure.suffix[1:].lower())
             if report:
-                title = f"Virtual gyro of {_titled(logs)}"
+                title = f"Virtual gyro of {titled(logs)}"
                 page = fusion_report(result, recording, virtual, title=title, remarks=remarks)
                 drafts[report].write_text(page, encoding="utf-8")
         if json_file:
@@ -308,7 +309,7 @@ def demo(
         for path, name in ((json_file, "result.json"), (report, "report.html")):
             if path:
                 shutil.copyfile(folder / name, drafts[path])
-    say(f"{story}\n\nReport: {out / 'report.html'}\nFigures: {out / 'figures'}")
+    say(f"{story}\n\nReport: {out / 'report.html'}\nNoise models: {out / 'models.html'}\nFigures: {out / 'figures'}")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -355,10 +356,6 @@ def _save(recording: Recording, path: Path, **arrays: np.ndarray[Any, Any]) -> N
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w") as file:
                 np.lib.format.write_array(file, array)
-
-
-def _titled(logs: Sequence[Path]) -> str:
-    return logs[0].name if len(logs) == 1 else f"{logs[0].name} and {len(logs) - 1} more"
 
 
 def _say_recording(recording: Recording) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from enum import Enum
 from pathlib import Path
 from typing import Annotated
 
@@ -16,6 +18,7 @@ from gyrofuse.cli_shared import (
     Logs,
     Mounting,
     Rate,
+    Report,
     Scale,
     Sensors,
     Unit,
@@ -23,16 +26,28 @@ from gyrofuse.cli_shared import (
     read,
     say_notes,
     stretch,
+    titled,
     write_json,
 )
-from gyrofuse.export import to_kalibr
+from gyrofuse.export import to_c_header, to_kalibr
 from gyrofuse.gmwm import fit_gmwm
 from gyrofuse.gmwm_result import GMWMResult
+from gyrofuse.processes import Model
 from gyrofuse.ranking import rank_models
 from gyrofuse.recording import Recording
 from gyrofuse.report import new_figure, save_figure
+from gyrofuse.report_models import model_report
+from gyrofuse.report_ranking import rank_report
 
 _MOST_FITS = 12  # printed in full
+
+
+class Weighting(str, Enum):
+    """How much the levels count."""
+
+    optimal = "optimal"
+    diagonal = "diagonal"
+    identity = "identity"
 
 
 def fit(
@@ -43,6 +58,14 @@ def fit(
     levels: Annotated[
         int | None, typer.Option(metavar="J", help="Number of levels; as many as hold two windows by default.")
     ] = None,
+    weighting: Annotated[Weighting, typer.Option(help="How much the levels count.")] = Weighting.optimal,
+    refine: Annotated[
+        bool, typer.Option("--refine", help="Go on to the maximum of the spectral likelihood, a little sharper.")
+    ] = False,
+    robust: Annotated[
+        float,
+        typer.Option(metavar="EFF", help="Efficiency of the wavelet variance; below 1, such as 0.6, it is robust."),
+    ] = 1.0,
     rest: Annotated[str | None, typer.Option(metavar="START:STOP", help="Fit this stretch alone (seconds).")] = None,
     axis: Axis = None,
     sensors: Sensors = None,
@@ -53,6 +76,9 @@ def fit(
     mounting: Mounting = None,
     confidence_level: Annotated[float, typer.Option(metavar="P", help="Of all intervals.")] = 0.95,
     kalibr: Annotated[Path | None, typer.Option(metavar="FILE", help="Write Kalibr's imu.yaml, of one sensor.")] = None,
+    header: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write a Kalman filter's matrices as a C header, of one sensor.")
+    ] = None,
     model_out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the fitted model, .json, which simulate reads.")
     ] = None,
@@ -60,37 +86,68 @@ def fit(
         Path | None, typer.Option(metavar="FILE", help="Draw the fit of the first sensor, .png, .svg or .pdf.")
     ] = None,
     json_file: Json = None,
+    report: Report = None,
     force: Force = False,
 ) -> None:
     """Fit a noise model to every sensor of a log, recorded at rest."""
     resting = stretch(rest)
-    asked = {"kalibr": kalibr, "model-out": model_out, "figure": figure, "json": json_file}
-    with outputs(force, [*logs, mounting], **asked) as drafts:
+    if refine and robust < 1:
+        raise ValueError("`--refine`: the spectral likelihood is not robust; leave out --refine or --robust")
+    asked = {"kalibr": kalibr, "header": header, "model-out": model_out, "figure": figure, "json": json_file}
+    with outputs(force, [*logs, mounting], report=report, **asked) as drafts:
         recording = read(logs, axis, sensors, rate, unit, scale, key, mounting)
         with progress("fitting"):
             part = recording.between(*resting) if resting else recording
-            result = fit_gmwm(part, model, confidence_level=confidence_level, n_levels=levels)
-        if kalibr:
-            drafts[kalibr].write_text(_kalibr(result, recording), encoding="utf-8")
+            result = fit_gmwm(
+                part,
+                model,
+                weighting=weighting.value,
+                confidence_level=confidence_level,
+                n_levels=levels,
+                refine=refine,
+                efficiency=robust,
+            )
+        for option, path, written in (("kalibr", kalibr, to_kalibr), ("header", header, to_c_header)):
+            if path:
+                drafts[path].write_text(_exported(result, recording, option, written), encoding="utf-8")
         if model_out:
-            write_json(drafts[model_out], result.model.to_dict())
+            write_json(drafts[model_out], _known_model(result).to_dict())
         if figure:
             drawn = new_figure(7.0, 4.6)
             result.plot(drawn.subplots())
-            save_figure(drawn, drafts[figure], figure.suffix[1:])
+            save_figure(drawn, drafts[figure], figure.suffix[1:].lower())
+        if report:
+            with progress("drawing"):
+                page = model_report(result, part, title=f"Noise of {titled(logs)}")
+            drafts[report].write_text(page, encoding="utf-8")
         if json_file:
             write_json(drafts[json_file], result.to_dict())
     say(result.summary())
     say_notes(recording)
 
 
-def _kalibr(result: GMWMResult, recording: Recording) -> str:
+def _known_model(result: GMWMResult) -> Model:
+    """The fitted model, where all sensors have one."""
+    missing = ~result.params.isfinite().all(-1).reshape(-1, len(result.sensors)).all(0)
+    if bool(missing.any()):
+        names = [name for name, gone in zip(result.sensors, missing.tolist(), strict=True) if gone]
+        raise ValueError(
+            f"`--model-out`: expected sensors that could all be fitted, got none for {', '.join(names)}; leave them "
+            "out with --sensors"
+        )
+    return result.model
+
+
+def _exported(
+    result: GMWMResult, recording: Recording, option: str, written: Callable[[Model, float, str], str]
+) -> str:
+    """A file for other tools, of the only sensor."""
     params = result.params.flatten(0, -2)
     if len(params) != 1:
         raise ValueError(
-            f"`--kalibr`: expected one sensor and axis, got {len(params)}; choose with --sensors and --axis"
+            f"`--{option}`: expected one sensor and axis, got {len(params)}; choose with --sensors and --axis"
         )
-    return to_kalibr(result.model.with_params(params[0]), recording.rate, recording.unit)
+    return written(result.model.with_params(params[0]), recording.rate, recording.unit)
 
 
 def rank(
@@ -118,12 +175,13 @@ def rank(
         Path | None, typer.Option(metavar="FILE", help="Draw the ranking of the first sensor, .png, .svg or .pdf.")
     ] = None,
     json_file: Json = None,
+    report: Report = None,
     force: Force = False,
 ) -> None:
     """Find which noise processes made the signal of every sensor of a log, recorded at rest."""
     resting = stretch(rest)
     formulas = None if candidates is None else [formula.strip() for formula in candidates.split(",")]
-    with outputs(force, [*logs, mounting], figure=figure, json=json_file) as drafts:
+    with outputs(force, [*logs, mounting], figure=figure, json=json_file, report=report) as drafts:
         recording = read(logs, axis, sensors, rate, unit, scale, key, mounting)
         with progress("ranking"):
             part = recording.between(*resting) if resting else recording
@@ -131,7 +189,11 @@ def rank(
         if figure:
             drawn = new_figure(7.0, 4.6)
             result.plot(drawn.subplots())
-            save_figure(drawn, drafts[figure], figure.suffix[1:])
+            save_figure(drawn, drafts[figure], figure.suffix[1:].lower())
+        if report:
+            with progress("drawing"):
+                page = rank_report(result, part, title=f"Noise models for {titled(logs)}")
+            drafts[report].write_text(page, encoding="utf-8")
         if json_file:
             write_json(drafts[json_file], result.to_dict())
     say(result.summary())

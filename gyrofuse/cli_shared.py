@@ -21,6 +21,7 @@ _SUFFIXES = {
     "report": (".html",),
     "kalibr": (".yaml", ".yml"),
     "model-out": (".json",),
+    "header": (".h",),
 }
 
 Logs = Annotated[
@@ -89,6 +90,11 @@ def outputs(force: bool, inputs: Sequence[Path | None] = (), **asked: Path | Non
     return Outputs(
         [path for path in asked.values() if path is not None], force=force, inputs=[path for path in inputs if path]
     )
+
+
+def titled(logs: Sequence[Path]) -> str:
+    """What a title calls a log of one file or several."""
+    return logs[0].name if len(logs) == 1 else f"{logs[0].name} and {len(logs) - 1} more"
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:

@@ -11,9 +11,12 @@ import torch
 from torch import Tensor
 
 from gyrofuse import plotting
+from gyrofuse.demo_models import CANDIDATES, models_figure, models_story, true_models
 from gyrofuse.processes import AR1, WhiteNoise
+from gyrofuse.ranking import rank_models
 from gyrofuse.recording import Recording
 from gyrofuse.report import fusion_figure, fusion_report, new_figure, number, save_figure, verdict
+from gyrofuse.report_ranking import rank_report
 from gyrofuse.simulate import ArrayModel
 from gyrofuse.svo import fit_svo
 from gyrofuse.svo_result import SVOResult
@@ -53,7 +56,7 @@ _P3 = (
     (7.38584e-15, -1.00044e-15, -1.3776e-15, 5.19119e-15, 3.78632e-15, 4.990004e-14),
 )
 
-FILES = ("report.html", "result.json", "figures")
+FILES = ("report.html", "result.json", "models.html", "models.json", "figures")
 
 
 def demo_array() -> ArrayModel:
@@ -66,7 +69,7 @@ def demo_array() -> ArrayModel:
 
 
 def run_demo(folder: Path, n_samples: int = N_SAMPLES) -> str:
-    """Simulate the array, fuse it for long and short averaging times, and write report, result and figures.
+    """Simulate the array, fuse it for long and short averaging times, find noise models, and write all of it down.
 
     Args:
         folder: Where to write `FILES`; it exists.
@@ -82,15 +85,29 @@ def run_demo(folder: Path, n_samples: int = N_SAMPLES) -> str:
     truth = array.wavelet_cross_covariance(long.n_levels)
     remarks = _remarks(long, truth)
     title = "Six simulated gyros, fused for long averaging times"
-    report = fusion_report(long, recording, long.virtual(recording), title=title, remarks=remarks)
-    (folder / "report.html").write_text(report, encoding="utf-8")
-    (folder / "result.json").write_text(json.dumps(long.to_dict()) + "\n", encoding="utf-8")
+    virtual = long.virtual(recording)
+    report = fusion_report(long, recording, virtual, title=title, remarks=remarks)
+    together = Recording(
+        torch.cat([signal, virtual[None]]), rate=RATE, unit=UNIT, sensors=(*recording.sensors, "virtual")
+    )
+    models, truths = rank_models(together, CANDIDATES), true_models(array, long.weights)
+    title = "Noise models of six simulated gyros and of the virtual gyro"
+    pages = {"report.html": report, "models.html": rank_report(models, together, title=title)}
+    for name, page in pages.items():
+        (folder / name).write_text(page, encoding="utf-8")
+    for name, result in (("result.json", long), ("models.json", models)):
+        (folder / name).write_text(json.dumps(result.to_dict()) + "\n", encoding="utf-8")
     figures = folder / "figures"
     figures.mkdir()
-    drawn = {"long": fusion_figure(long), "short": fusion_figure(short), "truth": _truth_figure(long, short, truth)}
+    drawn = {
+        "long": fusion_figure(long),
+        "short": fusion_figure(short),
+        "truth": _truth_figure(long, short, truth),
+        "models": models_figure(models, truths),
+    }
     for name, figure in drawn.items():
         save_figure(figure, figures / f"{name}.png", "png")
-    return _story(long, short, truth, remarks)
+    return f"{_story(long, short, truth, remarks)}\n\n{models_story(models, truths)}"
 
 
 def _symmetric(rows: tuple[tuple[float, ...], ...]) -> Tensor:

@@ -200,7 +200,11 @@ def _braces(values: Tensor) -> str:
 
 
 def _check_scalar(name: str, model: Model) -> None:
-    """Raise when the model is one of a batch."""
+    """Raise when it is no model, or one of a batch."""
+    if not isinstance(model, Model):
+        raise TypeError(
+            f"`{name}`: expected a model, got {type(model).__name__} {model!r}; a formula has no values: fit it"
+        )
     if model.params.ndim > 1:
         raise ValueError(
             f"`{name}`: expected scalar parameters, got a batch of shape {tuple(model.params.shape[:-1])}; "

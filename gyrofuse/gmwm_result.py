@@ -11,11 +11,11 @@ from torch import Tensor
 
 from gyrofuse._composition import Composition
 from gyrofuse._records import Records
-from gyrofuse._result import ConfidenceInterval, listed
+from gyrofuse._result import ConfidenceInterval, cleaned, listed
 from gyrofuse.datasheet import datasheet
 from gyrofuse.moment_inference import Estimates, Fit, Inference
 from gyrofuse.processes import Model
-from gyrofuse.uncertainty import chi_square_interval
+from gyrofuse.uncertainty import chi_square_interval, chi_square_tail
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -40,7 +40,7 @@ class GMWMResult:
         objective: `r' Omega r` with `r = nu - nu(theta)`, `(..., sensor)`.
         j_statistic: `r' V^-1 r`, `(..., sensor)`.
         p_value: Of the J test, that the model is complete, `(..., sensor)`; NaN where the model has as many
-            parameters as there are levels, or the weighting is not optimal.
+            parameters as there are levels, or the weights are not `V^-1`.
         converged: `(..., sensor)`.
         wavelet_variance: Measured, `(..., level, sensor)`, signal^2.
         fitted_wavelet_variance: Of the model, the same.
@@ -50,6 +50,7 @@ class GMWMResult:
         sensors: Names.
         rate: Hz, where known.
         unit: Of the signal, where known.
+        moments: That were matched, `"variance"` or `"log"`.
     """
 
     model: Model
@@ -73,6 +74,7 @@ class GMWMResult:
     sensors: tuple[str, ...]
     rate: float | None
     unit: str | None
+    moments: str = "variance"
 
     @classmethod
     def build(
@@ -96,8 +98,8 @@ class GMWMResult:
             whole[usable] = value
             return whole.view(*batch, *value.shape[1:])
 
-        tested = (inference.degrees > 0) & (rest["weighting"] == "optimal")
-        p_value = torch.where(tested, _chi_square_tail(inference.j_statistic, inference.degrees), torch.nan)
+        tested = (inference.degrees > 0) & (rest["weighting"] in ("optimal", "continuous"))
+        p_value = torch.where(tested, chi_square_tail(inference.j_statistic, inference.degrees), torch.nan)
         params = placed(estimates.params, torch.nan)
         said = iter(remarks)
         return cls(
@@ -134,7 +136,10 @@ class GMWMResult:
         name = " + ".join(p.symbol for p in self.model.processes)
         kind = "GMWM fit, refined by spectral likelihood," if self.refined else "GMWM fit"
         robust = f", robust, efficiency {self.efficiency:g}" if self.efficiency < 1 else ""
-        lines = [f"{kind} of {name}: {self.n_samples} samples, {self.wavelet_variance.shape[-2]} levels{robust}"]
+        matched = f", {self.weighting} weighting" if self.weighting != "optimal" else ""
+        matched += ", log moments" if self.moments == "log" else ""
+        levels = self.wavelet_variance.shape[-2]
+        lines = [f"{kind} of {name}: {self.n_samples} samples, {levels} levels{matched}{robust}"]
         n_items = self.params.shape[:-1].numel()
         if batch:
             lines.append(f"{n_items} fits in a batch {tuple(batch)}, {int(self.converged.sum())} converged")
@@ -196,7 +201,7 @@ class GMWMResult:
         """Return plain numbers and lists; what is not known is None."""
         low, high = self.confidence_interval
         return {
-            "model": self.model.to_dict(),
+            "model": cleaned(self.model.to_dict()),
             "param_names": list(self.param_names),
             "params": listed(self.params),
             "param_cov": listed(self.param_cov),
@@ -213,13 +218,10 @@ class GMWMResult:
             "fitted_wavelet_variance": listed(self.fitted_wavelet_variance),
             "n_samples": self.n_samples,
             "weighting": self.weighting,
+            "moments": self.moments,
             "refined": self.refined,
             "efficiency": self.efficiency,
             "sensors": list(self.sensors),
             "rate": self.rate,
             "unit": self.unit,
         }
-
-
-def _chi_square_tail(statistic: Tensor, degrees: Tensor) -> Tensor:
-    return torch.special.gammaincc(degrees.clamp(min=1) / 2, statistic.clamp(min=0) / 2)

@@ -72,9 +72,9 @@ class JointFit:
             lines.append(f"  {'parameter':<24}" + "".join(f"{name:>14}" for name in names) + "   largest shift")
             for k, name in enumerate(self.joint.param_names):
                 values = [fit.params[index][k].item() for fit in (self.joint, *self.separate)]
-                off = self.shift[(slice(None), *index, k)]
-                shift = "-" if bool(off.isnan().all()) else f"{off.abs().nan_to_num().max().item():.1f} sd"
-                lines.append(f"  {name:<24}" + "".join(f"{value:>14.6g}" for value in values) + f"{shift:>16}")
+                off = torch.stack([shift[index][k] for shift in self.shift])
+                largest = "-" if bool(off.isnan().all()) else f"{off.abs().nan_to_num().max().item():.1f} sd"
+                lines.append(f"  {name:<24}" + "".join(f"{value:>14.6g}" for value in values) + f"{largest:>16}")
         return "\n".join(lines)
 
     def __str__(self) -> str:
@@ -160,7 +160,8 @@ def fit_jointly(
     frequencies, disagreement = _frequencies(separate, made_of, usable)
     fit = fit_items(nu, frequencies, records, made_of, "optimal")
     inference = infer(fit, made_of, confidence_level)
-    estimates = profiled(inference.estimates, MomentSurface(fit, made_of), fit, made_of, confidence_level)
+    surface = MomentSurface(fit, made_of)
+    estimates = profiled(inference.estimates, surface, fit, made_of, confidence_level, inference.refused)
 
     whole = first.wavelet_variance.new_full((len(usable), records.n_levels), torch.nan)
     whole[usable] = nu

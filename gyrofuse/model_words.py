@@ -14,6 +14,12 @@ from gyrofuse.report_page import number
 
 # Of the J test: a model is refused below the second, doubted below the first.
 _DOUBTED, _REFUSED = 0.05, 0.01
+_WEIGHTS = {
+    "optimal": "weighted by the inverse of their covariance under the fitted model",
+    "diagonal": "weighted by the reciprocals of their variances under the fitted model",
+    "identity": "all levels weighted alike",
+    "given": "with weights that were given",
+}
 _NAMES = {
     "WN": "white noise",
     "QN": "quantisation noise",
@@ -36,6 +42,32 @@ def model_verdict(result: GMWMResult, index: tuple[int, ...]) -> list[str]:
     return [*_completeness(result, index), *_rulers(result, index), *_tones(result, index), *_weak(result, index)]
 
 
+def model_method(result: GMWMResult) -> str:
+    """Say in sentences how a model was fitted.
+
+    Args:
+        result: Fitted.
+    """
+    weights = _WEIGHTS[result.weighting]
+    sentences = [
+        f"Generalised Method of Wavelet Moments: the parameters bring the model's Haar wavelet variances closest to "
+        f"those measured, {weights} (Voirol et al., Accounting for Vibration Noise in Stochastic Measurement Errors; "
+        "Guerrier, Skaloud, Stebler and Victoria-Feser, JASA 108, 2013)."
+    ]
+    if result.efficiency < 1:
+        sentences.append(
+            f"Wavelet variances are robust, of efficiency {result.efficiency:g}: a few wild samples hardly move them; "
+            "their covariance is their own, and intervals are those of clean noise."
+        )
+    if result.refined:
+        sentences.append("From there the spectral (Whittle) likelihood was maximised.")
+    sentences.append(
+        "Frequencies of tones are those of the spectrum. Intervals rest on the model: where the J test refuses it they "
+        "are too narrow."
+    )
+    return " ".join(sentences)
+
+
 def residuals(result: GMWMResult, index: tuple[int, ...]) -> Tensor:
     """Measured less fitted wavelet variances over their standard deviation in the model, `(level,)`."""
     measured, fitted = result.wavelet_variance.mT[index], result.fitted_wavelet_variance.mT[index]
@@ -47,10 +79,16 @@ def _model(result: GMWMResult, index: tuple[int, ...]) -> Model:
 
 
 def _completeness(result: GMWMResult, index: tuple[int, ...]) -> Iterator[str]:
-    if not bool(result.converged[index]):
-        yield "Beware: the search for the best parameters did not end; they are where it stopped."
     p_value = result.p_value[index].item()
+    if not bool(result.converged[index]):
+        yield "Beware: the search for the best fit to the wavelet variances did not end; what it found is shown."
+        if p_value < _DOUBTED:
+            return  # the best may fit
     if p_value != p_value:
+        if result.weighting != "optimal":
+            yield "Whether the model is complete was not tested: the J test asks for optimal weighting."
+        else:
+            yield "Whether the model is complete cannot be tested: it has as many parameters as there are levels."
         return
     told = f"J test: p = {number(p_value, 2)}" if p_value > 0 else "J test: p < 1e-300"
     if p_value >= _DOUBTED:
@@ -108,6 +146,10 @@ def _weak(result: GMWMResult, index: tuple[int, ...]) -> Iterator[str]:
     weak = [name for name in names if name not in zero]
     if weak:
         yield f"Hardly known beyond the order of magnitude: {', '.join(weak)}."
+    item = sum(i * step for i, step in zip(index, result.identified.stride(), strict=True))
+    for remark in result.remarks[item]:
+        names_of, _, what = remark.partition(": ")
+        yield f"Not identified: {names_of} ({what})."
 
 
 def _time(result: GMWMResult, level: int) -> str:

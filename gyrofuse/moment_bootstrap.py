@@ -13,8 +13,9 @@ from gyrofuse._checks import check_positive_integer
 from gyrofuse._composition import Composition
 from gyrofuse._paths import own_generator
 from gyrofuse._result import ConfidenceInterval, listed
+from gyrofuse.continuous import fit_moments
 from gyrofuse.gmwm_result import GMWMResult
-from gyrofuse.moment_fit import fit_items, tone_frequencies
+from gyrofuse.moment_fit import tone_frequencies
 from gyrofuse.moment_inference import Estimates, Fit, Inference, estimated, infer
 from gyrofuse.processes import AR1, Sinusoid
 from gyrofuse.robust import robust_wavelet_variance
@@ -188,7 +189,8 @@ def _fitted(
     """Estimates and standard deviations `(resample, item, parameter)`, J statistics `(resample, item)`."""
     levels, series = result.wavelet_variance.shape[-2], records.flatten(0, 1)
     variance = robust_wavelet_variance(series[:, None], levels, efficiency=result.records.efficiency)[..., 0]
-    fit: Fit = fit_items(variance, tone_frequencies(series, made_of), result.records, made_of, omega)
+    frequencies = tone_frequencies(series, made_of)
+    fit: Fit = fit_moments(variance, frequencies, result.records, made_of, omega, result.moments)
     inference: Inference = infer(fit, made_of, result.confidence_level)
     estimates: Estimates = inference.estimates
     params, covariance = estimates.params, estimates.covariance

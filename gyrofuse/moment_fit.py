@@ -16,8 +16,9 @@ from gyrofuse.tones import find_tones
 _REWEIGHTINGS, _UPDATES, _DISTINCT = 3, 3, 3
 # Steps that the best start may take to its minimum; flat valleys need some hundreds.
 _POLISHING = 500
-# Half steps where whole ones do not come to rest, and the relative move of wavelet variances below which these did.
-_DAMPED, _STEPS_EACH, _AT_REST = 40, 5, 1e-2
+# Where whole steps do not come to rest, as each is -1 to -7 times the last: a part of them; how many, with how many
+# steps of the search in each, and the relative move of wavelet variances below which they are at rest.
+_PART, _DAMPED, _STEPS_EACH, _AT_REST = 0.25, 60, 5, 1e-2
 
 
 def fit_items(
@@ -96,7 +97,7 @@ def fit_items(
 def _damped(
     nu: Tensor, records: Records, made_of: Composition, omega: str | Tensor, linear: Tensor, x: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Half way to the fit with the weights of the last one, again and again, and whether that came to rest.
+    """A part of the way to the fit with the weights of the last one, again and again; whether that came to rest.
 
     Where no parameters fit, whole steps may lead from one bad fit to another and back.
     """
@@ -108,7 +109,7 @@ def _damped(
         moved = (made_of.wavelet_variance(tau, whole_linear, whole_x) / before - 1).abs().amax(-1)
         if bool((moved < _AT_REST).all()):
             break
-        linear, x = (linear + whole_linear) / 2, (x + whole_x) / 2
+        linear, x = linear.lerp(whole_linear, _PART), x.lerp(whole_x, _PART)
     return whole_linear, whole_x, moved < _AT_REST
 
 

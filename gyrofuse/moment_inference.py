@@ -8,12 +8,14 @@ import torch
 from torch import Tensor
 
 from gyrofuse._composition import Composition
+from gyrofuse._log_moments import log_residual
 from gyrofuse._records import Records
 from gyrofuse.processes import AR1, Drift, Sinusoid
-from gyrofuse.uncertainty import normal_quantile
+from gyrofuse.uncertainty import chi_square_tail, normal_quantile
 
 # Beyond this spread of its logarithm a variance is known to hardly its order of magnitude.
 WEAKLY_DETERMINED = 0.5
+_NO_CHANCE = 1e-3  # p-value of the J test
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,8 +28,9 @@ class Fit:
         shape: `x`, `(item, shaped)`.
         held_sd: Spread of the frequencies `beta` that were held, `(item, sinusoid)`.
         converged: `(item,)`.
-        omega: Weights `(level,)` or `(level, level)`, or `"optimal"` or `"diagonal"`.
+        omega: Weights `(level,)` or `(level, level)`, or `"optimal"`, `"diagonal"` or `"continuous"`.
         records: What was measured.
+        moments: `"variance"`, or `"log"` of their logarithms.
     """
 
     variance: Tensor
@@ -37,6 +40,7 @@ class Fit:
     converged: Tensor
     omega: str | Tensor
     records: Records
+    moments: str = "variance"
 
     @property
     def tau(self) -> Tensor:
@@ -81,6 +85,11 @@ class Inference:
     j_statistic: Tensor
     degrees: Tensor
 
+    @property
+    def refused(self) -> Tensor:
+        """Whether the J test leaves the model no chance, `(item,)`."""
+        return chi_square_tail(self.j_statistic, self.degrees) < _NO_CHANCE
+
 
 def infer(fit: Fit, made_of: Composition, confidence_level: float) -> Inference:
     """Sandwich covariance `(A' O A)^-1 A' O V O A (A' O A)^-1`, `A = d nu / d theta` ([V] theorem 2), and the J test.
@@ -95,6 +104,8 @@ def infer(fit: Fit, made_of: Composition, confidence_level: float) -> Inference:
     model = made_of.model(fit.linear, fit.shape)
     covariance = fit.records.covariance(model)
     residual = fit.variance - fitted
+    if fit.moments == "log":
+        residual, covariance = log_residual(fit.variance, fitted, covariance)
     root, failed = torch.linalg.cholesky_ex(covariance)
     whitened = torch.linalg.solve_triangular(root, residual[..., None], upper=False)[..., 0]
     j_statistic = torch.where(failed > 0, torch.nan, whitened.square().sum(-1))

@@ -206,6 +206,7 @@ def profiled(
     fit: Fit,
     made_of: Composition,
     confidence_level: float,
+    refused: Tensor,
     which: Tensor | None = None,
 ) -> Estimates:
     """Replace the limits of what is uncertain, see `moment_identity.uncertain`, by those of the profile.
@@ -216,6 +217,8 @@ def profiled(
         fit: Of the moments.
         made_of: Structure of the model.
         confidence_level: Probability that an interval holds the true value.
+        refused: Items whose model does not fit, `(item,)`. What is minimised may rise steeply there without any
+            meaning: the wider one of both intervals is kept.
         which: Items, `(item,)`; all by default.
     """
     needed = uncertain(made_of, estimates, fit.records.longest, confidence_level)
@@ -255,7 +258,10 @@ def profiled(
             first, last = _shape_limits(surface, items, unknown, sd, least, most, z[items])
             width = last - first
             first, last = (v.tanh() if moving else torch.pi * v.sigmoid() for v in (first, last))
-        low[items, place], high[items, place] = torch.minimum(first, own), torch.maximum(last, own)
+        first, last = torch.minimum(first, own), torch.maximum(last, own)
+        wide, linear = refused[items], (estimates.low[items, place], estimates.high[items, place])
+        low[items, place] = torch.where(wide, torch.minimum(first, linear[0]), first)
+        high[items, place] = torch.where(wide, torch.maximum(last, linear[1]), last)
         determined[items, place] = width < 2 * z[items] * WEAKLY_DETERMINED
     return replace(estimates, low=low, high=high, determined=determined)
 

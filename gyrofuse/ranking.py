@@ -43,11 +43,14 @@ def rank_models(
 
     The number of sinusoids comes first, by tests of the largest spectral line against the fitted noise; the noise
     without them follows, by `BIC = -2 ln L + p ln T` with the spectral (Whittle) likelihood `L`. Of wavelet variances
-    alone, `-2 ln L` is `r' V^-1 r + ln det V` with `r = nu - nu(theta)`. Beside it stands the wavelet variance
-    information criterion, `WVIC = r' V^-1 r + 2 tr(cov(nu, nu(theta)) V^-1)`, whose second term is twice the number of
-    parameters; it keeps some processes too many. A candidate whose fit amounts to a smaller one that explains the
-    record as well is redundant and not chosen; candidates that odds of less than 20 to 1 separate from the best, or
-    that have its spectrum, are named as equivalent.
+    alone, `-2 ln L` is `r' V^-1 r + ln det V` with `r = nu - nu(theta)`.
+
+    Beside it stands the wavelet variance information criterion, `WVIC = r' V^-1 r + 2 tr(cov(nu, nu(theta)) V^-1)`,
+    whose second term is twice the number of parameters; it keeps some processes too many.
+
+    A candidate whose fit amounts to a smaller one that explains the record as well is redundant and not chosen;
+    candidates that odds of less than 20 to 1 separate from the best, or that have its spectrum, are named as
+    equivalent.
 
     Args:
         signal: `(..., sensor, time)`, or a `Recording`; an item with missing samples is not ranked. With `n_samples`
@@ -149,6 +152,7 @@ def _one_of(whole: GMWMResult, i: int, sensors: tuple[str, ...], recording: Reco
         | {
             "model": whole.model.with_params(own["params"]),
             "confidence_interval": interval,
+            "remarks": (whole.remarks[i],),
             "sensors": sensors,
             "rate": recording.rate if recording else None,
             "unit": recording.unit if recording and known else None,

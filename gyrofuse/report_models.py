@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from gyrofuse.datasheet import datasheet
 from gyrofuse.gmwm_result import GMWMResult
-from gyrofuse.model_words import model_verdict, residuals
+from gyrofuse.model_words import model_method, model_verdict, residuals
 from gyrofuse.plotting_models import plot_residuals
 from gyrofuse.recording import Recording
 from gyrofuse.report_page import image, render
@@ -33,14 +34,7 @@ def model_report(result: GMWMResult, recording: Recording | None = None, *, titl
     """
     indices = list(itertools.product(*map(range, result.params.shape[:-1])))
     parts = [
-        {
-            "name": _name(result, recording, index),
-            "verdict": model_verdict(result, index),
-            "figure": image(7, 6.2, _draw, result, index) if _fitted(result, index) else None,
-            "parameters": _parameter_rows(result, index),
-            "datasheet": _datasheet_rows(result, index),
-        }
-        for index in indices[:_MOST_SENSORS]
+        model_part(result, index, sensor_name(result.sensors, recording, index)) for index in indices[:_MOST_SENSORS]
     ]
     return render(
         "models.html.j2",
@@ -50,14 +44,40 @@ def model_report(result: GMWMResult, recording: Recording | None = None, *, titl
         model=" + ".join(process.symbol for process in result.model.processes),
         parts=parts,
         left_out=len(indices) - len(parts),
-        percent=f"{100 * result.confidence_level:g} %",
+        method=model_method(result),
     )
 
 
-def _name(result: GMWMResult, recording: Recording | None, index: tuple[int, ...]) -> str:
+def model_part(result: GMWMResult, index: tuple[int, ...], name: str) -> dict[str, Any]:
+    """What a page shows of the model of one sensor.
+
+    Args:
+        result: Fitted.
+        index: Of the sensor among the leading dimensions.
+        name: What the page calls it.
+    """
+    return {
+        "name": name,
+        "verdict": model_verdict(result, index),
+        "figure": image(7, 6.2, _draw, result, index) if _fitted(result, index) else None,
+        "parameters": _parameter_rows(result, index),
+        "datasheet": _datasheet_rows(result, index),
+        "unit": result.unit,
+        "percent": f"{100 * result.confidence_level:g} %",
+    }
+
+
+def sensor_name(sensors: Sequence[str], recording: Recording | None, index: tuple[int, ...]) -> str:
+    """What a page calls a sensor.
+
+    Args:
+        sensors: Their names.
+        recording: For the names of its axes.
+        index: Of the sensor among the leading dimensions.
+    """
     *batch, sensor = index
     axes = recording.axes if recording else ()
-    name = f"Sensor {result.sensors[sensor]}"
+    name = f"Sensor {sensors[sensor]}"
     if len(batch) == 1 and axes:
         return f"{name}, axis {axes[batch[0]]}"
     return name + (f", item {', '.join(map(str, batch))}" if batch else "")
@@ -68,7 +88,9 @@ def _fitted(result: GMWMResult, index: tuple[int, ...]) -> bool:
 
 
 def _draw(figure: Figure, result: GMWMResult, index: tuple[int, ...]) -> None:
-    above, below = figure.subplots(2, 1, height_ratios=[3, 1], sharex=True)
+    figure.set_layout_engine("none")  # nothing to fit in, and half of the time saved
+    margins = {"left": 0.11, "right": 0.98, "bottom": 0.08, "top": 0.98, "hspace": 0.08}
+    above, below = figure.subplots(2, 1, height_ratios=[3, 1], sharex=True, gridspec_kw=margins)
     result.plot(above, index=index)
     above.set_xlabel("")
     plot_residuals(residuals(result, index), rate=result.rate, ax=below)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 import gyrofuse as gf
 from gyrofuse import _array_search as search
+from gyrofuse import moment_fit
 from gyrofuse._array_inference import spread_of_fit
 from gyrofuse._array_moments import array_moment_covariance, unvech, vech
 from gyrofuse.moment_fit import composition_of
@@ -74,25 +75,27 @@ def test_covariance_of_moments_is_that_of_quadratic_forms():
     assert error.max() < 0.01  # what the covariance of one sensor promises
 
 
-def test_gradient_is_that_of_the_distance():
+def test_derivatives_are_those_of_the_distance():
+    """Slopes of slopes are differences of step 1e-4: their error, of its square, is below 1e-7 of the largest."""
     made_of = composition_of("WN + AR1 + RW", held=False)
     generator = torch.Generator().manual_seed(2)
     tau = 2.0 ** torch.arange(1, 7, dtype=torch.float64)
     root = torch.randn(1, 3, 2, 2, generator=generator, dtype=torch.float64)
+    root = root + root.mT
     shape = torch.tensor([[1.3]], dtype=torch.float64)
     gamma = torch.randn(1, 6, 3, generator=generator, dtype=torch.float64)
     half = torch.randn(18, 18, generator=generator, dtype=torch.float64)
     weight = (half @ half.T)[None]
-    gradient, normal = search._quadratic(gamma, weight, tau, made_of, root, shape)
-    assert (torch.linalg.eigvalsh(normal) > 0).all()
+    gradient, bends, _ = search._quadratic(gamma, weight, tau, made_of, root, shape, exact=True)
 
     def distance(unknown: Tensor) -> Tensor:
-        turn = search._in_basis(unknown[:9].view(1, 3, 3))
-        moved = root @ torch.linalg.matrix_exp(turn / 2)
+        moved = root + search._in_basis(unknown[:9].view(1, 3, 3))
         return search._distance(gamma, weight, tau, made_of, moved, shape + unknown[9:]).sum()
 
-    expected = torch.func.grad(distance)(torch.zeros(10, dtype=torch.float64))
-    torch.testing.assert_close(-2 * gradient[0], expected, rtol=1e-7, atol=0)
+    nowhere = torch.zeros(10, dtype=torch.float64)
+    torch.testing.assert_close(-2 * gradient[0], torch.func.grad(distance)(nowhere), rtol=1e-7, atol=0)
+    expected = torch.func.hessian(distance)(nowhere)
+    torch.testing.assert_close(2 * bends[0], expected, rtol=1e-7, atol=1e-7 * expected.abs().max().item())
 
 
 def test_mean_and_spread_are_those_of_theory(many):
@@ -150,8 +153,14 @@ def test_weights_from_the_model_lose_less(many):
         (gf.WhiteNoise(1.0) + gf.RandomWalk(1e-3), "WN + RW"),
     ],
 )
-def test_one_sensor_is_the_plain_fit(model, formula):
-    """The plain fit follows the weights three times, this one until they rest: a hundredth of a standard deviation."""
+def test_one_sensor_is_the_plain_fit(model, formula, monkeypatch):
+    """With the weights of both at rest: here where a step moves the fit by less than a chi-square of 1e-5.
+
+    That is 0.0032 standard deviations, and of a parameter known to 19 % a change of its weights, and so of the
+    objective, of 2 * 0.0032 * 0.19 = 1.2e-3, of which steps that contract leave less than 1e-3. The plain fit stops
+    after three changes of its weights, which alone leaves 1.3e-3 of its objective; ten bring it to rest.
+    """
+    monkeypatch.setattr(moment_fit, "_UPDATES", 10)
     signal = model.simulate(2**13, batch=(6,), generator=torch.Generator().manual_seed(3))[:, None]
     plain = gf.fit_gmwm(signal, formula)
     found = gf.fit_array_gmwm(signal, formula)
@@ -159,11 +168,11 @@ def test_one_sensor_is_the_plain_fit(model, formula):
     sd = dict(zip(plain.param_names, plain.param_cov[:, 0].diagonal(dim1=-2, dim2=-1).sqrt().unbind(-1), strict=True))
     sizes = [name for name in plain.param_names if name.endswith("variance")]
     for k, name in enumerate(sizes):
-        assert ((found.theta[:, k, 0, 0] - own[name]).abs() < 0.01 * sd[name]).all(), name
+        assert ((found.theta[:, k, 0, 0] - own[name]).abs() < 0.0032 * sd[name]).all(), name
         torch.testing.assert_close(found.theta_sd[:, k, 0, 0], sd[name], rtol=1e-2, atol=0)
     for k, name in enumerate(found.param_names):
-        assert ((found.params[:, k] - own[name]).abs() < 0.01 * sd[name]).all(), name
-    torch.testing.assert_close(found.objective, plain.j_statistic[:, 0], rtol=1e-2, atol=0)
+        assert ((found.params[:, k] - own[name]).abs() < 0.0032 * sd[name]).all(), name
+    torch.testing.assert_close(found.objective, plain.j_statistic[:, 0], rtol=1e-3, atol=0)
 
 
 def test_shared_memory_is_found_with_its_tone():
@@ -190,15 +199,43 @@ def test_matrices_are_positive_where_truth_lacks_rank():
 
 
 def test_without_a_walk_its_variances_are_next_to_nothing():
+    """Above three standard deviations of theory one in ten at most (Cantelli); directions without variance vanish.
+
+    The search ends with a move of less than a chi-square of 1e-9, 3e-5 standard deviations.
+    """
     white = gf.ArrayModel([(gf.WhiteNoise(1.0), WHITE)])
     found = gf.fit_array_gmwm(signals(20, white), "WN + RW")
-    low, high = found.confidence_interval
+    assert bool(found.converged.all())
+    made_of = composition_of("WN + RW", held=False)
+    gamma = white.wavelet_cross_covariance(found.wavelet_cross_covariance.shape[-3])
+    truth = torch.stack([WHITE, 1e-12 * torch.eye(3, dtype=torch.float64)])
+    nothing = torch.empty(1, 0, dtype=torch.float64)
+    spread, *_ = spread_of_fit(gamma[None], truth[None], nothing, N_SAMPLES, made_of, "optimal")
+    sd = unvech(spread[0].diagonal().sqrt().view(2, 6))[1].diagonal()
     walk = found.theta[:, 1].diagonal(dim1=-2, dim2=-1)
-    assert (walk < 1e-4).all()  # against 1.6e-3 and more above
-    assert (high[:, 1].diagonal(dim1=-2, dim2=-1) > 0).all()
-    at_zero = low[:, 1].diagonal(dim1=-2, dim2=-1) == 0
-    assert at_zero.any()
+    assert int((walk > 3 * sd).sum()) <= stats.binom.ppf(0.9995, walk.numel(), 0.1)
+    values = torch.linalg.eigvalsh(found.theta[:, 1])
+    lost = (values < 3e-5 * sd.amax()).sum(-1)
+    assert torch.equal(found.rank[:, 1], 3 - lost)
+    assert (lost > 0).sum() >= 10
+    low, high = (limit[lost > 0, 1] for limit in found.confidence_interval)
+    assert (low.diagonal(dim1=-2, dim2=-1) == 0).all()
+    assert (high.diagonal(dim1=-2, dim2=-1) > 0).all()
+    assert low[:, 0, 1].isnan().all()
+    item = int((lost > 0).nonzero()[0])
+    assert "random_walk: matrix of rank" in found[item].remarks[0][0]
+    assert found[item].remarks[0][0] in str(found[item])
     assert found.theta.isfinite().all()
+
+
+def test_memory_as_long_as_the_record_is_said_to_be():
+    memory = gf.ArrayModel([(gf.AR1(math.exp(-1 / 1000), 1.0), WALK)])
+    model = gf.ArrayModel([(gf.WhiteNoise(1.0), WHITE)]) + memory
+    found = gf.fit_array_gmwm(signals(1, model)[0], "WN + AR1")
+    assert "ar1_1: a memory so long" in " ".join(found.remarks[0])
+    assert found.params_interval.low.isnan().all()
+    assert found.params.isfinite().all()
+    assert found.to_dict()["remarks"] == [list(found.remarks[0])]
 
 
 def test_missing_sensor_is_the_fit_of_the_others():

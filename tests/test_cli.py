@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import Outcome, Run
+from pages import Page
 
 import gyrofuse as gf
 from gyrofuse import cli
@@ -240,7 +241,9 @@ def test_fit_prints_the_parameters_and_writes_what_is_asked_for(run: Run, log: P
         "--model-out",
         "m.json",
         "--figure",
-        "f.png",
+        "f.SVG",
+        "--report",
+        "r.html",
         "--confidence-level",
         0.9,
     )
@@ -248,7 +251,11 @@ def test_fit_prints_the_parameters_and_writes_what_is_asked_for(run: Run, log: P
     result = gf.fit_gmwm(gf.read_recording(log), "WN", confidence_level=0.9)
     assert str(result) in done.out
     assert json.loads(Path("r.json").read_text())["params"] == result.to_dict()["params"]
-    assert Path("f.png").read_bytes().startswith(b"\x89PNG")
+    assert b"<svg" in Path("f.SVG").read_bytes()
+    page = Page(Path("r.html").read_text())
+    assert "Noise of log.npz" in page.text
+    assert page.tags.count("img") == 3
+    assert "90 % interval" in page.text
     again = run("simulate", "m.json", "--samples", 100, "--rate", 100, "--out", "s.npz")
     assert again.status == 0
     assert gf.read_recording("s.npz").signal.shape == (3, 100)
@@ -261,6 +268,32 @@ def test_fit_writes_kalibr_of_one_sensor(run: Run, log: Path):
     assert not Path("all.yaml").exists()
 
 
+def test_fit_writes_a_header_of_one_sensor(run: Run, log: Path):
+    assert run("fit", log, "--model", "WN", "--sensors", "b", "--header", "noise.h").status == 0
+    one = gf.fit_gmwm(gf.read_recording(log, sensors=["b"]), "WN")
+    assert Path("noise.h").read_text() == gf.to_c_header(one.model.with_params(one.params[0]), 100.0, "deg/s")
+    refused(run("fit", log, "--model", "WN", "--header", "all.h"), "`--header`: expected one sensor and axis, got 3")
+    assert not Path("all.h").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "arguments", "says"),
+    [
+        (("--refine",), {"refine": True}, "From there the spectral (Whittle) likelihood was maximised."),
+        (("--robust", 0.6), {"efficiency": 0.6}, "Wavelet variances are robust, of efficiency 0.6:"),
+        (("--weighting", "diagonal"), {"weighting": "diagonal"}, "by the reciprocals of their variances"),
+        (("--weighting", "identity", "--levels", 4), {"weighting": "identity", "n_levels": 4}, "all levels weighted"),
+    ],
+)
+def test_options_reach_the_noise_fit(
+    run: Run, log: Path, options: tuple[object, ...], arguments: dict[str, object], says: str
+):
+    done = run("fit", log, "--model", "WN", *options, "--report", "r.html")
+    assert (done.status, done.err) == (0, "")
+    assert str(gf.fit_gmwm(gf.read_recording(log), "WN", **arguments)) in done.out
+    assert says in Page(Path("r.html").read_text()).text
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [
@@ -268,10 +301,27 @@ def test_fit_writes_kalibr_of_one_sensor(run: Run, log: Path):
         (("--model", "WN + 5*AR1"), "at most as many parameters as"),
         (("--model", "WN(variance=1)"), "expected parameters to be estimated"),
         (("--model", "WN", "--kalibr", "imu.txt"), "`--kalibr`: expected a name that ends in .yaml or .yml"),
+        (("--model", "WN", "--header", "noise.c"), "`--header`: expected a name that ends in .h"),
+        (("--model", "WN", "--report", "r.pdf"), "`--report`: expected a name that ends in .html"),
+        (("--model", "WN", "--report", "nowhere/r.html"), "the folder nowhere does not exist"),
+        (("--model", "WN", "--refine", "--robust", "0.6"), "leave out --refine or --robust"),
+        (("--model", "WN", "--robust", "0.3"), "expected 0.5 to 1, got 0.3"),
+        (("--model", "WN + SIN", "--robust", "0.6"), "SIN"),
+        (("--model", "WN", "--weighting", "equal"), "'equal' is not one of 'optimal', 'diagonal', 'identity'"),
     ],
 )
-def test_fit_refuses(run: Run, log: Path, options: tuple[str, ...], says: str):
+def test_fit_refuses(run: Run, log: Path, tmp_path: Path, options: tuple[str, ...], says: str):
+    before = contents(tmp_path)
     refused(run("fit", log, *options), says)
+    assert contents(tmp_path) == before
+
+
+def test_reports_of_fits_are_replaced_with_force_only(run: Run, log: Path):
+    Path("r.html").write_text("mine")
+    refused(run("fit", log, "--model", "WN", "--report", "r.html"), "r.html: exists already")
+    assert Path("r.html").read_text() == "mine"
+    assert run("fit", log, "--model", "WN", "--report", "r.html", "--force").status == 0
+    assert Path("r.html").read_text().startswith("<!DOCTYPE html>")
 
 
 def test_simulate_array_model(run: Run):

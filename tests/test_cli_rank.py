@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from conftest import Run
+from pages import Page
 
 import gyrofuse as gf
 
@@ -23,14 +24,19 @@ def log(tmp_path: Path) -> Path:
 
 
 def test_prints_the_table_and_the_fits_and_writes_what_is_asked_for(run: Run, log: Path):
-    done = run("rank", log, "--candidates", "WN, RW ,WN+RW", "--json", "r.json", "--figure", "f.png")
+    files = ("--json", "r.json", "--figure", "f.PNG", "--report", "r.html")
+    done = run("rank", log, "--candidates", "WN, RW ,WN+RW", *files)
     assert (done.status, done.err) == (0, "")
     result = gf.rank_models(gf.read_recording(log), ["WN", "RW", "WN + RW"])
     assert result.names == ("WN", "WN + RW")
     assert str(result) in done.out
     assert all(str(fit) in done.out for fit in result.best)
     assert json.loads(Path("r.json").read_text()) == result.to_dict()
-    assert Path("f.png").read_bytes().startswith(b"\x89PNG")
+    assert Path("f.PNG").read_bytes().startswith(b"\x89PNG")
+    page = Page(Path("r.html").read_text())
+    assert "Noise models for log.npz" in page.text
+    assert [row[0] for row in page.rows if row[-1] == "chosen"] == ["WN", "WN + RW"]
+    assert page.tags.count("img") == 2
 
 
 def test_sensors_and_stretch(run: Run, log: Path):
@@ -49,6 +55,8 @@ def test_sensors_and_stretch(run: Run, log: Path):
         (("--candidates", "WN, WN"), "expected each composition once, got WN twice"),
         (("--json", "r.txt"), "`--json`: expected a name that ends in .json"),
         (("--rest", "5"), "`--rest`: expected START:STOP"),
+        (("--report", "r.pdf"), "`--report`: expected a name that ends in .html"),
+        (("--report", "nowhere/r.html"), "the folder nowhere does not exist"),
     ],
 )
 def test_refuses(run: Run, log: Path, options: tuple[str, ...], says: str):
@@ -57,3 +65,14 @@ def test_refuses(run: Run, log: Path, options: tuple[str, ...], says: str):
     assert done.err.startswith("error: ")
     assert done.err.count("\n") == 1
     assert says in done.err
+
+
+def test_a_report_is_replaced_with_force_only(run: Run, log: Path):
+    Path("r.html").write_text("mine")
+    rank = ("rank", log, "--candidates", "WN", "--report", "r.html")
+    refused = run(*rank)
+    assert (refused.status, refused.out) == (2, "")
+    assert "r.html: exists already" in refused.err
+    assert Path("r.html").read_text() == "mine"
+    assert run(*rank, "--force").status == 0
+    assert Path("r.html").read_text().startswith("<!DOCTYPE html>")

@@ -18,6 +18,8 @@ from gyrofuse import (
     WaveletCrossCovariance,
     cross_covariance,
     equal_weights,
+    fit_array_gmwm,
+    fit_gmwm,
     fit_multiscale,
     fit_svo,
     haar_coefficients,
@@ -127,6 +129,17 @@ MEMBERS = [
         "wavelet_cross_covariance_interval",
         lambda: lambda x: list(wavelet_cross_covariance_interval(x, LEVELS)),
         tolerance=1e-8,
+    ),
+    # Parameters are float64 whatever the signal.
+    Member(
+        "fit_gmwm",
+        lambda: lambda x: fit_gmwm(x, "WN + RW", n_levels=LEVELS).params.to(x.dtype),
+        tolerance=1e-5,
+    ),
+    Member(
+        "fit_array_gmwm",
+        lambda: lambda x: fit_array_gmwm(x, "WN + RW", n_levels=LEVELS).theta.to(x.dtype),
+        tolerance=1e-5,
     ),
     Member("rdvg_weights", lambda: rdvg_weights, tolerance=1e-8),
     Member("fit_multiscale", lambda: lambda x: fit_multiscale(x, n_levels=LEVELS).weights, tolerance=1e-8),

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from pages import Page
 
 import gyrofuse as gf
 from gyrofuse import cli
 from gyrofuse.demo import FILES, demo_array, run_demo
+from gyrofuse.demo_models import models_story, true_models
 
-FIGURES = ["long.png", "short.png", "truth.png"]
+FIGURES = ["long.png", "models.png", "short.png", "truth.png"]
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +64,47 @@ def test_story_and_files(tmp_path: Path):
     assert f"the intervals hold {held} of 6" in " ".join(story.split())
     report = (tmp_path / "report.html").read_text()
     assert "The array is simulated" in report
+    models = json.loads((tmp_path / "models.json").read_text())
+    rows = re.findall(r"^ *(\d|virtual)  (WN[^ ]*(?: \+ [^ ]+)*) +([-\d.].*)$", story, re.MULTILINE)
+    assert [row[0] for row in rows] == [*"123456", "virtual"]
+    assert [row[1] for row in rows] == models["names"]
+    for row, fit, truth in zip(rows, models["best"], true_models(array, weights), strict=True):
+        walk, true_walk, *_ = row[2].split()
+        white = fit["params"][0][fit["param_names"].index("white_noise.variance")]
+        assert float(walk) == pytest.approx(60 * (white / 10) ** 0.5, rel=1e-3)  # deg/sqrt(h) at 10 Hz
+        assert float(true_walk) == pytest.approx(60 * (truth.params[0].item() / 10) ** 0.5, rel=1e-3)
+    page = Page((tmp_path / "models.html").read_text())
+    assert [row[0] for row in page.rows if row[-1] == "chosen"] == models["names"]
+    assert "Sensor virtual" in page.text
+
+
+def test_models_of_the_truth():
+    array = demo_array()
+    weights = torch.tensor([0.3, -0.1, 0.2, 0.4, 0.1, 0.1], dtype=torch.float64)
+    *each, virtual = true_models(array, weights)
+    truth = array.wavelet_cross_covariance(12)
+    own = torch.stack([model.wavelet_variance(12) for model in each], -1)
+    torch.testing.assert_close(own, truth.diagonal(dim1=-2, dim2=-1), rtol=1e-10, atol=0)
+    fused = torch.einsum("i,jik,k->j", weights, truth, weights)
+    torch.testing.assert_close(virtual.wavelet_variance(12), fused, rtol=1e-10, atol=0)
+
+
+def test_a_fit_that_did_not_end_has_no_test():
+    truths = [gf.WhiteNoise(1e-4) + gf.AR1(0.99, 1e-6)] * 2
+    generator = torch.Generator().manual_seed(0)
+    signal = torch.stack([truth.simulate(4096, generator=generator) for truth in truths])
+    result = gf.rank_models(gf.Recording(signal, rate=10.0, unit="deg/s"), ["WN", "WN + AR1"])
+    story = models_story(result, truths)
+    assert "2 of 2 are found as that" in " ".join(story.split())
+    assert "The J test refuses none of them." in story
+    bad, good = result.best
+    bad = replace(bad, converged=torch.tensor([False]))
+    story = models_story(replace(result, best=(bad, good)), truths)
+    assert "It says nothing of 1, whose wavelet moments were not fitted to the end." in " ".join(story.split())
+    assert next(line for line in story.splitlines() if line.startswith("      1")).endswith(" -")
+    bad = replace(bad, converged=torch.tensor([True]), p_value=torch.tensor([1e-5]))
+    story = models_story(replace(result, best=(bad, good)), truths)
+    assert "The J test refuses the model of 1." in " ".join(story.split())
 
 
 def test_command_writes_its_folder_once(
@@ -75,7 +119,9 @@ def test_command_writes_its_folder_once(
         return ended.value.code
 
     assert status("--json", "copy.json", "--report", "copy.html") in (0, None)
-    assert "Report: gyrofuse-demo/report.html" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "Report: gyrofuse-demo/report.html" in out
+    assert "Noise models: gyrofuse-demo/models.html" in out
     assert Path("copy.json").read_bytes() == Path("gyrofuse-demo/result.json").read_bytes()
     assert Path("copy.html").read_bytes() == Path("gyrofuse-demo/report.html").read_bytes()
     Path("gyrofuse-demo/result.json").write_text("mine")

@@ -448,3 +448,9 @@ def test_files_are_of_one_sensor_in_a_known_unit(export):
         export(WhiteNoise(1.0), unit="counts")
     with pytest.raises(ValueError, match=r"`model`: expected scalar parameters, got a batch of shape \(2,\)"):
         export(WhiteNoise(torch.ones(2)))
+
+
+@pytest.mark.parametrize("write", [to_kalibr, to_c_header])
+def test_a_formula_is_no_model(write):
+    with pytest.raises(TypeError, match="expected a model, got str 'WN'; a formula has no values: fit it"):
+        write("WN", 100.0, "deg/s")

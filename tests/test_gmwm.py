@@ -232,3 +232,21 @@ def test_a_process_more_does_not_fit_worse_where_no_model_fits(shared):
     without, with_tone = (gf.fit_gmwm(signal, formula) for formula in ("AR1 + RW", "AR1 + RW + SIN"))
     assert with_tone.j_statistic < without.j_statistic
     assert bool(without.converged)
+
+
+def test_a_refused_model_does_not_get_sharper_intervals():
+    """White noise and a walk fitted to an AR1: what is minimised rises steeply beside a minimum that means nothing."""
+    signal = gf.AR1(0.9, 1.0).simulate(2280, batch=(100,), generator=torch.Generator().manual_seed(7))
+    result = gf.fit_gmwm(signal, "WN + RW")
+    low, high = result.confidence_interval
+    seen = (result.params[:, 0] > 0) & (result.p_value < 1e-3)
+    assert seen.sum() > 50
+    assert ((high - low)[seen, 0] > 0.2 * result.params[seen, 0]).all()
+
+
+@pytest.mark.filterwarnings("ignore:`signal`")
+def test_a_sensor_that_is_not_fitted_is_none_in_the_dictionary():
+    signal = torch.randn(2, 2000, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    signal[1] = 3.0
+    plain = gf.fit_gmwm(signal, "WN + RW").to_dict()
+    assert json.loads(json.dumps(plain, allow_nan=False))["model"]["processes"][0]["variance"][1] is None

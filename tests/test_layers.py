@@ -17,7 +17,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "gyrofuse"
 # underscore puts a module at the bottom, unless it is named here. A name without a file is one to come.
 LAYERS = [
     {"__main__", "cli", "cli_models", "cli_shared", "_console", "lightning_module"},
-    {"demo", "report", "report_words", "report_models", "model_words", "report_page"},
+    {"demo", "demo_models", "report", "report_words", "report_models", "report_ranking", "model_words", "report_page"},
     {"__init__"},
     {"mismatch", "navigation"},
     {
@@ -54,6 +54,7 @@ LAYERS = [
         "pilot",
         "moment_inference",
         "moment_fit",
+        "continuous",
         "_moment_search",
         "_array_inference",
         "_array_search",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 
 import matplotlib
 import pytest
@@ -11,7 +12,7 @@ from matplotlib import pyplot as plt
 from pages import Page
 
 from gyrofuse import AR1, GMWMResult, RandomWalk, Recording, Sinusoid, WhiteNoise, fit_gmwm, report_models
-from gyrofuse.model_words import model_verdict, residuals
+from gyrofuse.model_words import model_method, model_verdict, residuals
 from gyrofuse.moment_covariance import moment_covariance
 from gyrofuse.plotting_models import plot_residuals
 from gyrofuse.report_models import model_report
@@ -72,6 +73,50 @@ def test_verdict_tells_of_two_alike():
     words = plain(model_verdict(fit_gmwm(signal[None], "2*AR1"), (0,)))
     assert "the AR1 2 from 1 samples" in words
     assert "the AR1 1 from" in words
+
+
+def test_verdict_says_what_cannot_be_told_apart():
+    generator = torch.Generator().manual_seed(7)
+    slow = (WhiteNoise(1.0) + AR1(0.99999, 1e-2)).simulate(2**12, generator=generator)
+    quick = (WhiteNoise(1.0) + AR1(0.9, 1.0)).simulate(2**12, generator=generator)
+    signal = torch.stack([torch.stack([quick, slow]), torch.stack([slow, quick])])  # (item, sensor, time)
+    result = fit_gmwm(signal, "WN + AR1")
+    told = "Not identified: ar1_1 (indistinguishable from a random walk at this length)."
+    found = [told in model_verdict(result, index) for index in ((0, 0), (0, 1), (1, 0), (1, 1))]
+    assert found == [False, True, True, False] == [bool(texts) for texts in result.remarks]
+    assert model_report(result, title="remarks").count(told) == 2
+
+
+def test_verdict_refuses_nothing_where_the_search_did_not_end():
+    refused, fine = fit("WN + RW"), fit("WN + RW + SIN")
+    assert refused.p_value[0] < 1e-6
+    words = plain(model_verdict(replace(refused, converged=torch.tensor([False, True])), (0,)))
+    assert "Beware: the search for the best fit to the wavelet variances did not end" in words
+    assert "not complete" not in words
+    words = plain(model_verdict(replace(fine, converged=torch.tensor([False, True])), (0,)))
+    assert "Beware" in words
+    assert "explains the wavelet variances at all scales" in words
+
+
+def test_verdict_says_why_there_is_no_test():
+    variance = fit("WN + RW").wavelet_variance
+    untested = plain(model_verdict(fit_gmwm(recording(), "WN", weighting="identity"), (0,)))
+    assert "was not tested: the J test asks for optimal weighting" in untested
+    full = plain(model_verdict(fit_gmwm(variance, "WN + RW", n_samples=2**14, n_levels=2), (0,)))
+    assert "cannot be tested: it has as many parameters as there are levels" in full
+
+
+def test_method_says_how_the_model_was_fitted():
+    classic = model_method(fit("WN + RW"))
+    assert "inverse of their covariance" in classic
+    assert "robust" not in classic
+    assert "Whittle" not in classic
+    assert "of efficiency 0.7" in model_method(fit_gmwm(recording(), "WN", efficiency=0.7))
+    assert "Whittle" in model_method(fit_gmwm(recording(), "WN", refine=True))
+    assert "reciprocals" in model_method(fit_gmwm(recording(), "WN", weighting="diagonal"))
+    assert "weighted alike" in model_method(fit_gmwm(recording(), "WN", weighting="identity"))
+    weights = torch.ones(13, dtype=torch.float64)
+    assert "that were given" in model_method(fit_gmwm(recording(), "WN", weighting=weights))
 
 
 @pytest.mark.filterwarnings("ignore:`signal`")

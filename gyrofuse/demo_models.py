@@ -1,0 +1,137 @@
+"""The demonstration's noise models: what was found for every sensor, with the truth beside it."""
+
+from __future__ import annotations
+
+import itertools
+from textwrap import fill
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from gyrofuse._rank_candidates import name_of
+from gyrofuse.datasheet import datasheet
+from gyrofuse.gmwm_result import GMWMResult
+from gyrofuse.processes import AR1, Model
+from gyrofuse.ranking_result import RankResult
+from gyrofuse.report_page import new_figure, number
+from gyrofuse.simulate import ArrayModel
+from gyrofuse.units import correlation_time
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# What a gyro's noise may be, without tones; the default of `rank_models` is more.
+CANDIDATES = ("WN", "WN + RW", "WN + AR1", "WN + AR1 + RW", "WN + 2*AR1", "WN + 2*AR1 + RW", "WN + 3*AR1")
+_QUANTITIES = (("angle random walk N", "deg/sqrt(h)"), ("bias instability B", "deg/h"))
+_REFUSED = 0.01  # p-values of the J test below
+
+
+def true_models(array: ArrayModel, weights: Tensor) -> list[Model]:
+    """Noise of every sensor of an array, and of the virtual gyro that it makes with these weights.
+
+    Args:
+        array: Of white noise and AR1s with unit variances, and their covariances between the sensors.
+        weights: `(sensor,)`.
+    """
+    each = torch.cat([torch.eye(len(weights), dtype=torch.float64), weights[None]])
+    sizes = [torch.einsum("si,ik,sk->s", each, matrix, each).tolist() for _, matrix in array.components]
+    model = Model([process for process, _ in array.components])
+    params = []
+    for own in zip(*sizes, strict=True):
+        known = zip(model.processes, own, strict=True)
+        params.append([value for process, size in known for value in (*process.params[:-1].tolist(), size)])
+    return [model.with_params(row) for row in torch.tensor(params, dtype=torch.float64)]
+
+
+def models_story(result: RankResult, truths: list[Model]) -> str:
+    """Table of the models found, in datasheet units, with the truth beside them, and what it tells.
+
+    Args:
+        result: Ranked, for every sensor, with its fits.
+        truths: As many.
+    """
+    fits = [fit for fit in result.best if fit is not None]
+    columns = "  ".join(f"{name:>9}" for name in ("fitted", "truth") * 2)
+    lines = [
+        f"{'':>7}  {'':<22}  {'angle random walk':^20}  {'bias instability':^20}",
+        f"{'':>7}  {'':<22}  {'(deg/sqrt(h))':^20}  {'(deg/h)':^20}",
+        f"{'sensor':>7}  {'noise model':<22}  {columns}  {'J test p':>8}",
+    ]
+    for fit, name, truth in zip(fits, result.names, truths, strict=True):
+        found, true = (_quantities(model, fit) for model in (_model(fit), truth))
+        numbers = [f"{number(value):>9}" for value in itertools.chain(*zip(found, true, strict=True))]
+        p_value = number(_p_value(fit), 2)
+        lines.append("  ".join([f"{fit.sensors[0]:>7}", f"{name:<22}", *numbers, f"{p_value:>8}"]))
+    head = "Noise model of every gyro and of the virtual gyro, as the likelihood of their spectra ranks them:"
+    return "\n".join([head, *(line.rstrip() for line in lines)]) + "\n\n" + fill(_told(fits, result, truths[0]), 110)
+
+
+def models_figure(result: RankResult, truths: list[Model]) -> Figure:
+    """Allan deviation of every sensor, measured, fitted and in truth.
+
+    Args:
+        result: Ranked, for every sensor, with its fits.
+        truths: As many.
+    """
+    fits = [fit for fit in result.best if fit is not None]
+    figure = new_figure(9, 2.7 * ((len(fits) + 1) // 2))
+    figure.set_layout_engine("none")
+    margins = {"left": 0.08, "right": 0.98, "bottom": 0.06, "top": 0.97, "hspace": 0.2, "wspace": 0.16}
+    panels = figure.subplots((len(fits) + 1) // 2, 2, sharex=True, squeeze=False, gridspec_kw=margins).flatten()
+    for n, (ax, fit, truth, name) in enumerate(zip(panels, fits, truths, result.names, strict=False)):
+        fit.plot(ax)
+        variance = truth.wavelet_variance(fit.wavelet_variance.shape[-2])
+        times = torch.exp2(torch.arange(len(variance))) / (fit.rate or 1.0)
+        lines = ax.plot(times, (2 * variance).sqrt(), "--", color="black", linewidth=1.2, zorder=6)
+        known = ax.get_legend()
+        labels = [text.get_text() for text in known.get_texts()]
+        ax.legend([*known.legend_handles, *lines], [*labels, "truth"], fontsize=7, frameon=False, ncols=2)
+        if n % 2:
+            ax.set_ylabel("")
+        if n < len(fits) - 2:
+            ax.set_xlabel("")
+        else:  # the last of its column
+            ax.tick_params(labelbottom=True)
+        ax.set_title(f"{fit.sensors[0]}: {name}", loc="left", fontsize=9)
+    for ax in panels[len(fits) :]:
+        ax.set_axis_off()
+    return figure
+
+
+def _model(fit: GMWMResult) -> Model:
+    return fit.model.with_params(fit.params[0])
+
+
+def _p_value(fit: GMWMResult) -> float | None:
+    """Of the J test; None where there is none, or the search did not end."""
+    p_value = fit.p_value[0].item()
+    return p_value if bool(fit.converged[0]) and p_value == p_value else None
+
+
+def _quantities(model: Model, fit: GMWMResult) -> list[float | None]:
+    """Angle random walk and bias instability; None where a model has none."""
+    entries = datasheet(model, fit.rate or 1.0, fit.unit or "deg/s").entries
+    known = {(entry.name, entry.unit): entry.value for entry in entries}
+    return [known.get(quantity) for quantity in _QUANTITIES]
+
+
+def _told(fits: list[GMWMResult], result: RankResult, truth: Model) -> str:
+    """What the truth is, how many of the models are it, and which the J test refuses."""
+    slow = [process for process in truth.processes if isinstance(process, AR1)]
+    times = [number(correlation_time(process.params[0].item(), fits[0].rate or 1.0), 3) for process in slow]
+    name = name_of([type(process) for process in truth.processes])
+    same = sum(found == name for found in result.names)
+    tests = {fit.sensors[0]: _p_value(fit) for fit in fits}
+    refused = [sensor for sensor, p_value in tests.items() if p_value is not None and p_value < _REFUSED]
+    untested = [sensor for sensor, p_value in tests.items() if p_value is None]
+    doubts = f"The J test refuses the model of {', '.join(refused)}." if refused else "The J test refuses none of them."
+    if untested:
+        doubts += f" It says nothing of {', '.join(untested)}, whose wavelet moments were not fitted to the end."
+    return (
+        f"In truth all are {name}, with time constants of {', '.join(times)} s; {same} of {len(fits)} are found as "
+        "that. A parameter has to gain more likelihood than its charge, and of processes slower than a good part of "
+        f"the recording two look much like one. {doubts} Bias instability is the lowest dip of the Allan deviation; "
+        "a model may lack a dip that the truth has. At long averaging times the virtual gyro looks "
+        "better than it is, as its weights are from this very recording."
+    )

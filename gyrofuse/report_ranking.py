@@ -1,0 +1,131 @@
+"""Report of ranked noise models as one self-contained HTML page."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from typing import Any
+
+from gyrofuse.model_words import model_method
+from gyrofuse.ranking_result import RankResult
+from gyrofuse.recording import Recording
+from gyrofuse.report_models import model_part, sensor_name
+from gyrofuse.report_page import number, render
+
+# Pages stay readable; the JSON file holds all.
+_MOST_SENSORS, _MOST_ROWS = 24, 15
+_MOST_NATS = 15.0  # beyond, odds are no number to print
+
+
+def rank_report(result: RankResult, recording: Recording | None = None, *, title: str) -> str:
+    """Write the report of noise models ranked for the sensors of a recording.
+
+    Args:
+        result: Of the sensors of one array, or of one per axis.
+        recording: What was ranked, for its notes.
+        title: Heading of the page.
+
+    Returns:
+        An HTML page that needs no other file, no network and no script.
+    """
+    indices = list(itertools.product(*map(range, result.choice.shape)))
+    parts = [_part(result, recording, n, index) for n, index in enumerate(indices[:_MOST_SENSORS])]
+    fits = [fit for fit in result.best if fit is not None]
+    return render(
+        "ranking.html.j2",
+        title=title,
+        result=result,
+        recording=recording,
+        parts=parts,
+        left_out=len(indices) - len(parts),
+        method=model_method(fits[0]) if fits else None,
+    )
+
+
+def rank_verdict(result: RankResult, index: tuple[int, ...]) -> list[str]:
+    """Say in sentences which model a sensor has, what is as good, and why the next one is not.
+
+    Args:
+        result: Ranked.
+        index: Of the sensor among the leading dimensions.
+    """
+    if int(result.choice[index]) < 0:
+        return ["Not ranked: its record does not vary or has missing samples."]
+    return list(_sentences(result, index))
+
+
+def _sentences(result: RankResult, index: tuple[int, ...]) -> Iterator[str]:
+    names, choice = result.candidates, int(result.choice[index])
+    rows = _rows(result, index)
+    if len(rows) > 1:
+        yield f"{names[choice]} is the best of {len(rows)} candidates tried."
+    else:
+        yield f"{names[choice]} is the only candidate that was tried."
+    if result.n_tones is not None and (n_tones := int(result.n_tones[index])):
+        found = "One line stands" if n_tones == 1 else f"{n_tones} lines stand"
+        yield f"{found} out of the noise in the spectrum."
+    same = [row["name"] for row in rows if row["standing"] == "equivalent"]
+    if same:
+        yield f"The record does not tell it from {', '.join(same)}."
+    for row in rows:
+        if row["reason"] and row["difference"] < 0:
+            better = f"a criterion {-row['difference']:.1f} below, but is more than it takes: {row['reason']}."
+            yield f"{row['name']} has {better}"
+    others = [row for row in rows if row["standing"] in ("", "redundant") and row["difference"] >= 0]
+    if others:
+        yield _why_not(others[0])
+    wvic = names[int(result.wvic_choice[index])]
+    if wvic != names[choice]:
+        yield f"The wavelet variance information criterion, which keeps some processes too many, prefers {wvic}."
+
+
+def _why_not(row: dict[str, Any]) -> str:
+    """Why the runner-up lost."""
+    nats = row["difference"] / 2
+    odds = f"odds of {number(math.exp(nats), 2)} to 1" if nats < _MOST_NATS else "beyond any doubt"
+    told = f"The runner-up, {row['name']}, has a criterion {row['difference']:.1f} above ({odds})"
+    if row["reason"]:
+        return f"{told} and is more than it takes: {row['reason']}."
+    if row["p_value"] < 0.01:
+        return f"{told}; its wavelet variances do not fit (J test: p = {number(row['p_value'], 2)})."
+    return f"{told}."
+
+
+def _part(result: RankResult, recording: Recording | None, n: int, index: tuple[int, ...]) -> dict[str, Any]:
+    name, fit = sensor_name(result.sensors, recording, index), result.best[n]
+    rows = _rows(result, index)
+    return {
+        "name": name,
+        "anchor": f"fit-{n + 1}",
+        "verdict": rank_verdict(result, index),
+        "rows": rows[:_MOST_ROWS],
+        "more": len(rows[_MOST_ROWS:]),
+        "fit": None if fit is None else model_part(fit, (0,), name),
+    }
+
+
+def _rows(result: RankResult, index: tuple[int, ...]) -> list[dict[str, Any]]:
+    """The candidates that were tried, from the best on."""
+    choice = int(result.choice[index])
+    if choice < 0:
+        return []
+    item = list(itertools.product(*map(range, result.choice.shape))).index(index)
+    wvic = result.wvic[index] - result.wvic[index][int(result.wvic_choice[index])]
+    columns = (result.difference, result.p_value, result.redundant, result.equivalent)
+    table = zip(result.candidates, wvic.tolist(), *(c[index].tolist() for c in columns), strict=True)
+    rows = []
+    for c, (name, own_wvic, difference, p_value, redundant, equivalent) in enumerate(table):
+        if math.isfinite(difference):
+            standing = "chosen" if c == choice else "equivalent" if equivalent else "redundant" if redundant else ""
+            rows.append(
+                {
+                    "name": name,
+                    "difference": difference,
+                    "wvic": own_wvic,
+                    "p_value": p_value,
+                    "standing": standing,
+                    "reason": result.reasons[item][c],
+                }
+            )
+    return sorted(rows, key=lambda row: (row["difference"], row["standing"] != "chosen"))
