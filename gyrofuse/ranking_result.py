@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _MOST_TABLES, _MOST_ROWS, _MOST_BARS = 12, 8, 12
+_NONE_FITS = 1e-3  # p-value of the J test
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -124,6 +125,9 @@ class RankResult:
         same = [name for name, there in zip(self.candidates, self.equivalent[index].tolist(), strict=True) if there]
         if same:
             lines.append(f"  not told from it: {', '.join(same)}")
+        best = self.p_value[index].nan_to_num(nan=1.0).max().item()
+        if best < _NONE_FITS:
+            lines.append(f"  no candidate fits: the J test refuses all (largest p = {best:.1g})")
         wide = max(map(len, self.candidates))
         lines.append(f"  {'candidate':<{wide}}  {'criterion':>10}  {'WVIC':>8}  {'J test p':>8}")
         wvic = self.wvic[index] - self.wvic[index][int(self.wvic_choice[index])]

@@ -314,3 +314,9 @@ def test_refusals_of_signals():
         gf.rank_models(torch.ones(10, 1), n_samples=512)
     with pytest.raises(ValueError, match="`n_levels`: expected 1 to 5"):
         gf.rank_models(torch.ones(5, 1), n_samples=512, n_levels=6)
+
+
+def test_the_summary_says_when_no_candidate_fits():
+    signal = (gf.AR1(0.9, 1.0)).simulate(4000, batch=(1,), generator=torch.Generator().manual_seed(4))
+    assert "no candidate fits: the J test refuses all" in gf.rank_models(signal, ["WN", "RW"], fit=False).summary()
+    assert "no candidate fits" not in gf.rank_models(signal, ["WN", "AR1"], fit=False).summary()
