@@ -15,7 +15,6 @@ from gyrofuse import _moment_search as search
 from gyrofuse._composition import Composition
 from gyrofuse._nnls import nonnegative_least_squares
 from gyrofuse._records import Records
-from gyrofuse.moment_covariance import moment_covariance
 from gyrofuse.moment_inference import Estimates, Fit, infer
 from gyrofuse.processes import AR1
 
@@ -56,8 +55,8 @@ class Moments:
         self.size = variance.amax(-1, keepdim=True)
         self._target = variance / self.size
         levels = variance.shape[-1]
-        self.tau = torch.exp2(torch.arange(1, levels + 1, dtype=variance.dtype, device=variance.device))
-        self.observations = (3 * (n_samples - self.tau + 1) / self.tau).clamp(min=1)
+        self.records = Records((n_samples,), (levels,))
+        self.tau, self.observations = self.records.tau.to(variance), self.records.observations.to(variance)
         self._diagonal = self.observations.sqrt() / self._target
 
     def fit(self, made_of: Composition, starts: list[Tensor]) -> MomentFit:
@@ -96,8 +95,8 @@ class Moments:
         """Parameters with their uncertainty."""
         done = torch.ones(len(fit.linear), dtype=torch.bool, device=fit.linear.device)
         held = fit.shape[:, :0]
-        records = Records((self.n_samples,), (len(self.tau),))
-        return infer(Fit(self.variance, fit.linear, fit.shape, held, done, "optimal", records), made_of, 0.95).estimates
+        whole = Fit(self.variance, fit.linear, fit.shape, held, done, "optimal", self.records)
+        return infer(whole, made_of, 0.95).estimates
 
     def roots(self, made_of: Composition) -> list[Tensor]:
         """Starts of a composition with at most one shaped process: the best points of a grid."""
@@ -131,4 +130,4 @@ class Moments:
         return (2 / (4 * longest * (2.01 / (4 * longest)) ** steps)).logit()
 
     def _whitening(self, made_of: Composition, linear: Tensor, x: Tensor) -> Tensor:
-        return search.whitening(moment_covariance(made_of.model(linear, x), self.n_samples, len(self.tau)))
+        return search.whitening(self.records.covariance(made_of.model(linear, x)))

@@ -15,6 +15,7 @@ from gyrofuse._rank_spectra import decide_lines
 from gyrofuse.covariance import wavelet_variance
 from gyrofuse.moment_inference import estimated
 from gyrofuse.processes import Drift, Sinusoid
+from gyrofuse.uncertainty import chi_square_tail
 
 # Two spectra that a record tells apart by less than this many nats on average are the same.
 _SAME = 0.5
@@ -103,7 +104,7 @@ def by_spectrum(series: Tensor, wanted: list[Kinds] | None, levels: int, max_ton
             items=items,
             criterion=search.criterion(key)[items],
             wvic=own.objective + 2 * own.active,
-            p_value=_tail(own.objective, levels - own.active - lines.n_tones[items]),
+            p_value=chi_square_tail(own.objective, levels - own.active - lines.n_tones[items]),
             simpler=compositions.simplified(made_of, estimates.params, estimates.covariance, n_samples),
             fitted=spectra.variances(made_of, fit),
         )
@@ -139,7 +140,7 @@ def by_moments(variance: Tensor, wanted: list[Kinds] | None, n_samples: int) -> 
                 items=items,
                 criterion=search.criterion(key)[items],
                 wvic=fit.objective + 2 * fit.active,
-                p_value=_tail(fit.objective, levels - fit.active),
+                p_value=chi_square_tail(fit.objective, levels - fit.active),
                 simpler=compositions.simplified(made_of, estimates.params, estimates.covariance, n_samples),
                 fitted=made_of.wavelet_variance(moments.tau, fit.linear, fit.shape),
             )
@@ -199,11 +200,6 @@ def _equivalent(entries: list[Entry], criterion: Tensor, redundant: Tensor, choi
             same[entry.items, c] |= which[entry.items] & (apart < _SAME)
     found = near | same
     return found.scatter(-1, choice[:, None], False)
-
-
-def _tail(statistic: Tensor, degrees: Tensor) -> Tensor:
-    tail = torch.special.gammaincc(degrees.clamp(min=1) / 2, statistic.clamp(min=0) / 2)
-    return torch.where(degrees > 0, tail, torch.nan)
 
 
 def _n_tones(kinds: Kinds) -> int:

@@ -34,6 +34,7 @@ from gyrofuse.gmwm import fit_gmwm
 from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.processes import Model
 from gyrofuse.ranking import rank_models
+from gyrofuse.ranking_result import RankResult
 from gyrofuse.recording import Recording
 from gyrofuse.report import new_figure, save_figure
 from gyrofuse.report_models import model_report
@@ -113,9 +114,7 @@ def fit(
         if model_out:
             write_json(drafts[model_out], _known_model(result).to_dict())
         if figure:
-            drawn = new_figure(7.0, 4.6)
-            result.plot(drawn.subplots())
-            save_figure(drawn, drafts[figure], figure.suffix[1:].lower())
+            _draw(result, drafts[figure], figure)
         if report:
             with progress("drawing"):
                 page = model_report(result, part, title=f"Noise of {titled(logs)}")
@@ -124,6 +123,13 @@ def fit(
             write_json(drafts[json_file], result.to_dict())
     say(result.summary())
     say_notes(recording)
+
+
+def _draw(result: GMWMResult | RankResult, draft: Path, path: Path) -> None:
+    """The figure of the first sensor, in the format that the path asks for."""
+    drawn = new_figure(7.0, 4.6)
+    result.plot(drawn.subplots())
+    save_figure(drawn, draft, path.suffix[1:].lower())
 
 
 def _known_model(result: GMWMResult) -> Model:
@@ -187,9 +193,7 @@ def rank(
             part = recording.between(*resting) if resting else recording
             result = rank_models(part, formulas, confidence_level=confidence_level, n_levels=levels)
         if figure:
-            drawn = new_figure(7.0, 4.6)
-            result.plot(drawn.subplots())
-            save_figure(drawn, drafts[figure], figure.suffix[1:].lower())
+            _draw(result, drafts[figure], figure)
         if report:
             with progress("drawing"):
                 page = rank_report(result, part, title=f"Noise models for {titled(logs)}")

@@ -11,10 +11,11 @@ from torch import Tensor
 from gyrofuse._composition import Composition
 from gyrofuse.moment_inference import WEAKLY_DETERMINED, Estimates
 from gyrofuse.processes import AR1, Model, RandomWalk, Sinusoid, WhiteNoise
+from gyrofuse.tones import FEWEST_CYCLES
 from gyrofuse.uncertainty import normal_quantile
 
 # A tone of fewer cycles is a trend, an AR1 of which the record holds fewer time constants a random walk.
-FEWEST_CYCLES, FEWEST_TIME_CONSTANTS = 3.0, 2.0
+FEWEST_TIME_CONSTANTS = 2.0
 _ONE_FOR_THE_OTHER = 0.95  # correlation beyond which two parameters are known in combination only
 
 
