@@ -11,6 +11,7 @@ from torch import Tensor
 from gyrofuse._array_moments import array_moment_covariance, pairs, unvech, vech, weights_of
 from gyrofuse._array_search import jacobian
 from gyrofuse._composition import Composition
+from gyrofuse._records import Records
 from gyrofuse.moment_inference import _sandwich
 from gyrofuse.processes import AR1
 from gyrofuse.uncertainty import normal_quantile
@@ -21,8 +22,9 @@ _NOTHING = 1e-5
 _GONE = 1e-8
 # Standard deviations from zero below which the logarithm of a variance tells nothing.
 _RESOLVED = 0.5
-# Of a memory of which the record holds fewer time constants, the delta method says nothing that holds.
-_FEWEST_TIME_CONSTANTS = 20
+# Of a memory of which the record holds fewer time constants, the delta method says nothing that holds: one of a seventh
+# of the record looks like anything from a thirtieth to a random walk.
+FEWEST_TIME_CONSTANTS = 50
 
 
 class ArrayFit(NamedTuple):
@@ -60,7 +62,7 @@ class Estimate(NamedTuple):
 
 
 def spread_of_fit(
-    gamma: Tensor, theta: Tensor, shape: Tensor, n_samples: int, made_of: Composition, weighting: str
+    gamma: Tensor, theta: Tensor, shape: Tensor, records: Records, made_of: Composition, weighting: str
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Sandwich covariance `(A' O A)^-1 A' O V O A (A' O A)^-1` with `A` the Jacobian, as if no matrix lacked rank.
 
@@ -68,18 +70,18 @@ def spread_of_fit(
         gamma: What was fitted, `(item, level, sensor, sensor)`.
         theta: `(item, process, sensor, sensor)`.
         shape: `x`, `(item, shaped)`.
-        n_samples: Length T of the records.
+        records: Their length and levels.
         made_of: Structure of the model.
         weighting: Of the moments.
 
     Returns:
         Covariance, objective, degrees of freedom, dispersion and ranks as in `ArrayFit`.
     """
-    n_items, n_levels, n_sensors = gamma.shape[:3]
-    tau = torch.exp2(torch.arange(1, n_levels + 1, dtype=gamma.dtype, device=gamma.device))
+    n_items, n_sensors = len(gamma), gamma.shape[-1]
     present = vech(gamma).isfinite()
-    covariance = array_moment_covariance(made_of, theta, shape, n_samples, n_levels)
+    covariance = array_moment_covariance(made_of, theta, shape, records)
     weight = weights_of(covariance, present, weighting)
+    tau = records.tau.to(gamma)
     columns = made_of.columns(tau, shape)
     fitted = columns @ vech(theta)
     residual = torch.where(present, vech(gamma) - fitted, 0.0).flatten(1)
@@ -110,12 +112,13 @@ def _dispersion(rarity: Tensor, present: Tensor, degrees: Tensor) -> Tensor:
     return 1 + (p * (2 * p.square() + 5 * p + 5) * mean).sum(-1) / (2 * degrees.clamp(min=1))
 
 
-def matrices(fit: ArrayFit, confidence_level: float) -> tuple[Estimate, Estimate]:
+def matrices(fit: ArrayFit, told: Tensor, confidence_level: float) -> tuple[Estimate, Estimate]:
     """Entries of the matrices, and correlations, each `(item, process, sensor, sensor)`.
 
     Intervals are symmetric in the logarithm of variances, in `atanh` of correlations, and in covariances as they are. A
-    variance that is hardly told from zero gets an upper limit only, as does one of a matrix that lacks rank, whose
-    covariances and correlations get none: the bound on its eigenvalues leaves nothing that is symmetric.
+    variance that is hardly told from zero gets an upper limit only, as do those of a matrix that is not `told`, whose
+    covariances and correlations get none: the bound on its eigenvalues leaves nothing that is symmetric, and a memory
+    found too short makes all variances too large.
     """
     n_processes, n_sensors = fit.theta.shape[1], fit.theta.shape[-1]
     a, b = pairs(n_sensors)
@@ -130,9 +133,9 @@ def matrices(fit: ArrayFit, confidence_level: float) -> tuple[Estimate, Estimate
     own = (a == b).nonzero()[:, 0]
     variance, ratio = value[..., own], sd[..., own] / value[..., own]
     resolved = ratio < 1 / _RESOLVED
-    whole_rank = (fit.rank == n_sensors)[..., None]  # (item, process, 1)
-    low, high = (torch.where(whole_rank, limit, torch.nan) for limit in (low, high))
-    two_sided = resolved & whole_rank
+    told = told[..., None]  # (item, process, 1)
+    low, high = (torch.where(told, limit, torch.nan) for limit in (low, high))
+    two_sided = resolved & told
     low[..., own] = torch.where(two_sided, variance * torch.exp(-z * ratio), 0 * variance)
     reach = torch.where(two_sided, z, one_sided) * ratio
     high[..., own] = variance * torch.where(resolved, torch.exp(reach), 1 + reach)
@@ -153,7 +156,7 @@ def matrices(fit: ArrayFit, confidence_level: float) -> tuple[Estimate, Estimate
     # Towards a correlation of one, which it takes for certain, the scale of atanh ends.
     width = z * rho_sd / (1 - rho.square()).clamp(min=1e-12)
     middle = rho.clamp(-1 + 1e-12, 1 - 1e-12).atanh()
-    low, high = (torch.where(whole_rank, (middle + sign * width).tanh(), torch.nan) for sign in (-1, 1))
+    low, high = (torch.where(told, (middle + sign * width).tanh(), torch.nan) for sign in (-1, 1))
     # Every sensor agrees with itself.
     certain = [torch.where(a == b, one, part) for one, part in ((0.0, rho_sd), (1.0, low), (1.0, high))]
     return entries, Estimate(*(unvech(part) for part in (rho, *certain)))
@@ -161,23 +164,30 @@ def matrices(fit: ArrayFit, confidence_level: float) -> tuple[Estimate, Estimate
 
 def is_long(phi: Tensor, n_samples: int) -> Tensor:
     """Whether the record holds too few time constants of an AR1, of the shape of `phi`."""
-    return phi > math.exp(-_FEWEST_TIME_CONSTANTS / n_samples)
+    return phi > math.exp(-FEWEST_TIME_CONSTANTS / n_samples)
 
 
-def shared(fit: ArrayFit, held_sd: Tensor, made_of: Composition, confidence_level: float, n_samples: int) -> Estimate:
+def told_matrices(fit: ArrayFit, made_of: Composition, n_samples: int) -> Tensor:
+    """Whether a matrix has full rank and its process no long memory, `(item, process)`."""
+    told = fit.rank == fit.theta.shape[-1]
+    for k, x in zip(made_of.shaped, fit.shape.unbind(-1), strict=True):
+        if isinstance(made_of.processes[k], AR1):
+            told[:, k] &= ~is_long(x.tanh(), n_samples)
+    return told
+
+
+def shared(fit: ArrayFit, told: Tensor, held_sd: Tensor, made_of: Composition, confidence_level: float) -> Estimate:
     """Parameters `(item, parameter)` of all sensors, `phi` of AR1s and `beta` of tones, in the order of the model.
 
-    Intervals are symmetric in `atanh phi` and `logit(beta / pi)`. No AR1 has one where the matrix of any of them lacks
-    rank or its memory is long: what that one gets wrong the others make up for.
+    Intervals are symmetric in `atanh phi` and `logit(beta / pi)`. No AR1 has one where the matrix of any of them is
+    not `told`: what that one gets wrong the others make up for.
     """
     z = normal_quantile((1 + confidence_level) / 2)
     n_moving = len(made_of.curved)
     moving = fit.spread.diagonal(dim1=-2, dim2=-1)[:, fit.spread.shape[-1] - n_moving :].clamp(min=0).sqrt()
     moved, held = iter(moving.unbind(-1)), iter(held_sd.unbind(-1))
     memories = [k for k, process in enumerate(made_of.processes) if isinstance(process, AR1)]
-    vague = (fit.rank[:, memories] < fit.theta.shape[-1]).any(-1)
-    for k in memories:
-        vague |= is_long(fit.shape[:, made_of.shaped.index(k)].tanh(), n_samples)
+    vague = ~told[:, memories].all(-1)
     found = []
     for k, x in zip(made_of.shaped, fit.shape.unbind(-1), strict=True):
         if isinstance(made_of.processes[k], AR1):

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._composition import Composition
-from gyrofuse.moment_covariance import moment_covariance
+from gyrofuse._records import Records
 
 # Of the size of each moment, what keeps covariances of moments that hardly differ regular.
 _RIDGE = 1e-11
@@ -37,9 +37,7 @@ def unvech(entries: Tensor) -> Tensor:
     return entries[..., place.to(entries.device)]
 
 
-def array_moment_covariance(
-    made_of: Composition, theta: Tensor, shape: Tensor, n_samples: int, n_levels: int
-) -> Tensor:
+def array_moment_covariance(made_of: Composition, theta: Tensor, shape: Tensor, records: Records) -> Tensor:
     """Covariance of the estimated WCCV of a Gaussian array, for the finite length of its record.
 
     `Cov(gamma_ab,j, gamma_cd,l) = sum_km Q_jl[k,m] (Theta_k,ac Theta_m,bd + Theta_k,ad Theta_m,bc)` over the processes,
@@ -50,24 +48,23 @@ def array_moment_covariance(
         made_of: Structure of the model.
         theta: Matrices of the processes at unit size, `(item, process, sensor, sensor)`, positive.
         shape: `x` of the shaped processes, `(item, shaped)`.
-        n_samples: Length T of the record.
-        n_levels: Levels J.
+        records: Their length and levels.
 
     Returns:
         `(item, level, pair, level, pair)`, signal^4.
     """
     size = theta.diagonal(dim1=-2, dim2=-1).mean(-1)  # (item, process)
-    table = _table(made_of, size, shape, n_samples, n_levels)
+    table = _table(made_of, size, shape, records)
     part = theta / size[..., None, None]
     a, b = pairs(theta.shape[-1])
     straight = part[:, :, None, a[:, None], a] * part[:, None, :, b[:, None], b]
     crossed = part[:, :, None, a[:, None], b] * part[:, None, :, b[:, None], a]
     products = (straight + crossed).flatten(1, 2).flatten(2)  # (item, k m, pair pair)
     covariance = table.flatten(1, 2).flatten(2).mT @ products
-    return covariance.view(-1, n_levels, n_levels, len(a), len(a)).transpose(2, 3)
+    return covariance.view(-1, records.n_levels, records.n_levels, len(a), len(a)).transpose(2, 3)
 
 
-def _table(made_of: Composition, size: Tensor, shape: Tensor, n_samples: int, n_levels: int) -> Tensor:
+def _table(made_of: Composition, size: Tensor, shape: Tensor, records: Records) -> Tensor:
     """`Q` of processes of these sizes, `(item, process, process, level, level)`.
 
     A sum of two processes has `V = 2 (Q_kk + Q_mm + 2 Q_km)`. Of their true sizes, so that what a small process loses
@@ -79,8 +76,8 @@ def _table(made_of: Composition, size: Tensor, shape: Tensor, n_samples: int, n_
     chosen[torch.arange(len(first)), first] = 1
     chosen[torch.arange(len(first)), second] = 1
     model = made_of.model(size[:, None] * chosen, shape[:, None].expand(-1, len(first), -1))
-    sums = moment_covariance(model, n_samples, n_levels)  # (item, pair of processes, level, level)
-    table = sums.new_empty(len(size), n_processes, n_processes, n_levels, n_levels)
+    sums = records.covariance(model)  # (item, pair of processes, level, level)
+    table = sums.new_empty(len(size), n_processes, n_processes, records.n_levels, records.n_levels)
     table[:, first, second] = table[:, second, first] = sums
     alone = table[:, range(n_processes), range(n_processes)]
     table = (table - alone[:, :, None] - alone[:, None]) / 4

@@ -47,6 +47,11 @@ def largest_level(n_samples: int) -> int:
     return max(int(n_samples).bit_length() - 1, 0)
 
 
+def infinite_where(infinite: Tensor, moments: Tensor) -> Tensor:
+    """Moments of signals, infinite where the signals are, although windows with such samples do not count in them."""
+    return torch.where(infinite, torch.inf, moments)
+
+
 def check_n_levels(n_levels: int | None, n_samples: int) -> int:
     """Resolve the number of levels; `None` is the largest `J` with `2**J <= n_samples`.
 
@@ -71,6 +76,20 @@ def check_positive_integer(name: str, value: int) -> int:
     if isinstance(value, bool) or not isinstance(value, Real) or value < 1 or value % 1 != 0:
         raise ValueError(f"`{name}`: expected a whole number >= 1, got {value!r}")
     return int(value)
+
+
+def check_length(n_samples: int, *, recorded: bool) -> int:
+    """Return the length of the record behind moments that are given, as an int.
+
+    Raises:
+        ValueError: Not a length, or what is given is a recording, which has its own.
+    """
+    if recorded:
+        raise ValueError(
+            f"`n_samples`: expected None with a Recording, whose length is known, got {n_samples!r}; leave it out, it "
+            "goes with wavelet variances alone"
+        )
+    return check_positive_integer("n_samples", n_samples)
 
 
 def check_n_samples(name: str, value: int) -> int:

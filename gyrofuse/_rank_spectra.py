@@ -226,7 +226,7 @@ def decide_lines(series: Tensor, allowed: list[int], level: float, ramp: bool) -
         ramp: Whether records may have one, which would hide tones of few cycles.
     """
     rest = series.to(torch.float64).clone()
-    searched = _detrended(rest) if ramp else rest.clone()
+    searched = detrended(rest) if ramp else rest.clone()
     clean = searched.clone()
     spectra = Spectra(rest)
     n_tones = torch.zeros(len(series), dtype=torch.long, device=series.device)
@@ -251,7 +251,7 @@ def decide_lines(series: Tensor, allowed: list[int], level: float, ramp: bool) -
     return Lines(n_tones, rest, spectra)
 
 
-def _detrended(series: Tensor) -> Tensor:
+def detrended(series: Tensor) -> Tensor:
     """Without the straight line of least squares."""
     time = torch.linspace(-1, 1, series.shape[-1], dtype=series.dtype, device=series.device)
     slope = (series @ time) / time.square().sum()
@@ -268,6 +268,12 @@ def _reference(spectra: Spectra) -> tuple[Noise, NoiseFit]:
         made_of = Composition((*parent.processes, AR1()), True)
         parent, fit = made_of, spectra.fit(made_of, *spectra.widened(parent, fit, made_of))
     return Noise(parent), fit
+
+
+def reference_density(spectra: Spectra) -> NoiseSpectrum:
+    """Density of a noise that follows nearly any smooth spectrum, fitted to records without their lines."""
+    noise, fit = _reference(spectra)
+    return _density(noise, fit.linear, fit.shape)
 
 
 def _density(noise: Noise, linear: Tensor, shape: Tensor) -> NoiseSpectrum:

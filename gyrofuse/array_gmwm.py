@@ -7,37 +7,32 @@ import warnings
 import torch
 from torch import Tensor
 
-from gyrofuse import _array_search as array_search
-from gyrofuse import _moment_search as search
-from gyrofuse._array_inference import ArrayFit, shared, spread_of_fit
-from gyrofuse._array_moments import array_moment_covariance, vech, weights_of
+from gyrofuse._array_fit import fit_matrices
+from gyrofuse._array_inference import ArrayFit, spread_of_fit
 from gyrofuse._checks import (
     check_confidence_level,
     check_floating,
+    check_length,
     check_n_levels,
-    check_positive_integer,
     check_signal,
+    infinite_where,
     largest_level,
 )
 from gyrofuse._composition import Composition, shape_of
+from gyrofuse._model_tones import model_tones
+from gyrofuse._records import Records
 from gyrofuse._result import named, numbered
 from gyrofuse.array_gmwm_result import ArrayGMWMResult
 from gyrofuse.covariance import wavelet_products
-from gyrofuse.moment_fit import composition_of, n_starts_for, tone_frequencies
+from gyrofuse.moment_fit import composition_of
 from gyrofuse.processes import Drift, Model, Sinusoid
 from gyrofuse.recording import Recording
 
 WEIGHTINGS = ("optimal", "pairwise")
-# Most steps with weights that follow the fit, the first of them with rough ones, and most steps with weights that stay.
-_UPDATES, _ROUGH, _POLISHING = 20, 6, 100
-# Changes of the fitted moments, chi-squares, with which these steps have come to rest.
-_NEAR, _AT_REST = 1e-5, 1e-9
-# Starts, by how much their `x` differ in all, and the steps after which the best of them goes on alone.
-_DISTINCT, _APART, _TRIAL = 3, 0.5, 12
 # Numbers that the weights of all items may take at a time.
 _NUMBERS_AT_ONCE = 4_000_000
-# Part of the lowest level that each process begins with at least, although a sensor shows nothing of it.
-_SEED = 1e-2
+# Largest correlation that entries (i, k) and (k, i) may differ by: float32 rounds to some 1e-7.
+_ASYMMETRIC = 1e-5
 
 
 def fit_array_gmwm(
@@ -53,22 +48,23 @@ def fit_array_gmwm(
 
     `theta = argmin r' Omega r`, `r = vech(Gamma_j - sum_k f_k(tau_j) Theta_k)` over all levels, with `Omega = V^-1` of
     the fitted model and its finite length,
-    `Cov(gamma_ab,j, gamma_cd,l) = sum_km Q_jl[k,m] (Theta_k,ac Theta_m,bd + Theta_k,ad Theta_m,bc)`, followed for
-    twenty steps or until it rests and then kept. Matrices are positive by construction; `phi` of an AR1 and the
-    frequency of a tone are those of all sensors.
-    Of a tone the matrix is that of squared amplitudes in phase, `a_i a_k cos(phase_i - phase_k)`, which is all that
-    wavelet moments see; its frequency comes from the sensor that shows it most sharply.
+    `Cov(gamma_ab,j, gamma_cd,l) = sum_km Q_jl[k,m] (Theta_k,ac Theta_m,bd + Theta_k,ad Theta_m,bc)`, followed until
+    it rests. Matrices are positive by construction; `phi` of an AR1 and the frequency of a tone are of all sensors. The
+    matrix of a tone is that of squared amplitudes in phase, `a_i a_k cos(phase_i - phase_k)`, which is all that wavelet
+    moments see; its frequency comes from the sensor that shows it most sharply.
 
-    A memory as long as a seventh of the record is hardly told from a random walk: its matrix mostly lacks rank, weights
-    for long times are no better than those of the measured moments, and in one of ten records the memory is found far
-    too short. `remarks` tell all but the last; at a thirtieth all is well.
+    A memory longer than a fiftieth of the record is hardly told from a random walk. Its matrix often lacks rank, its
+    variances have upper limits only, its covariances and correlations no limits at all, nor has any `phi`; weights for
+    long times may be no better than those of the measured moments. `remarks` say where. In about one of a
+    hundred records a long memory is found shorter than that, with limits that do not hold.
 
     Missing samples leave out moments without any complete window; the others count as those of a complete record. A
     sensor without samples has NaN everywhere, and a pair that is never seen together a NaN covariance.
 
     Args:
-        signal: `(..., sensor, time)`, NaN = missing sample, or a `Recording`. With `n_samples` given a wavelet
-            cross-covariance `(..., level, sensor, sensor)` of records that long.
+        signal: `(..., sensor, time)`, NaN = missing sample, or a `Recording`; an array with infinite samples is not
+            fitted. With `n_samples` given a wavelet cross-covariance `(..., level, sensor, sensor)` of records that
+            long.
         model: Processes without values, such as `WhiteNoise() + AR1() + RandomWalk()`, or `"WN + AR1 + RW"`.
         n_levels: Number of levels J; by default all that hold two windows side by side.
         confidence_level: Probability that an interval holds the true value.
@@ -97,13 +93,15 @@ def fit_array_gmwm(
         length, wccv = values.shape[-1], _measured(values.detach(), n_levels)
     else:
         check_floating("signal", values)
-        length, wccv = check_positive_integer("n_samples", n_samples), _given(values.detach(), n_samples, n_levels)
+        length = check_length(n_samples, recorded=recording is not None)
+        wccv = _given(values.detach(), length, n_levels)
     levels, n_sensors = wccv.shape[-3:-1]
+    sensors = tuple(recording.sensors) if recording else numbered(n_sensors)
     made_of = composition_of(model, held=n_samples is None)
     _check_model(made_of, levels)
     wccv = wccv.to(torch.float64)
     gamma = wccv.reshape(-1, levels, n_sensors, n_sensors)
-    usable = _usable(gamma)
+    usable = _usable(gamma, sensors)
     series = values.detach().reshape(-1, n_sensors, length)[usable] if n_samples is None else None
     gamma = gamma[usable]
     # In units of each sensor, so that no sensor is small to rounding.
@@ -112,190 +110,45 @@ def fit_array_gmwm(
     squared = (size[:, :, None] * size[:, None, :])[:, None]
     scaled = gamma / squared
     held, held_sd = _held(series, made_of, scaled)
-    fit = _fit(scaled, held, length, made_of, weighting)
+    records = Records((length,), (levels,))
+    fit = _fit(scaled, held, records, made_of, weighting)
     return ArrayGMWMResult.build(
         fit=fit,
         squared=squared,
-        shared=shared(fit, held_sd, made_of, confidence_level, length),
+        held_sd=held_sd,
         made_of=made_of,
         usable=usable,
         wavelet_cross_covariance=wccv,
-        n_samples=length,
+        records=records,
         weighting=weighting,
         confidence_level=confidence_level,
-        sensors=tuple(recording.sensors) if recording else numbered(n_sensors),
+        sensors=sensors,
         rate=recording.rate if recording else None,
         unit=recording.unit if recording and recording.unit != "unknown" else None,
     )
 
 
-def _fit(gamma: Tensor, held: Tensor, n_samples: int, made_of: Composition, weighting: str) -> ArrayFit:
+def _fit(gamma: Tensor, held: Tensor, records: Records, made_of: Composition, weighting: str) -> ArrayFit:
     """Fit arrays `(item, level, sensor, sensor)`, some at a time."""
     moments = gamma.shape[1] * gamma.shape[2] * (gamma.shape[2] + 1) // 2
     at_once = max(_NUMBERS_AT_ONCE // moments**2, 1)
     found = []
     for some, known in zip(gamma.split(at_once), held.split(at_once), strict=True):
-        theta, shape, converged = _fit_items(some, known, n_samples, made_of, weighting)
-        spread = spread_of_fit(some, theta, shape, n_samples, made_of, weighting)
+        theta, shape, converged = fit_matrices(some, known, records, made_of, weighting)
+        spread = spread_of_fit(some, theta, shape, records, made_of, weighting)
         found.append((theta, shape, converged & spread[1].isfinite(), *spread))
     return ArrayFit(*(torch.cat(parts) for parts in zip(*found, strict=True)))
 
 
-def _fit_items(
-    gamma: Tensor, held: Tensor, n_samples: int, made_of: Composition, weighting: str
-) -> tuple[Tensor, Tensor, Tensor]:
-    """`Theta`, `x` and whether the search came to rest."""
-    n_levels = gamma.shape[1]
-    tau = torch.exp2(torch.arange(1, n_levels + 1, dtype=gamma.dtype, device=gamma.device))
-    present = vech(gamma).isfinite()
-    moments = torch.where(present, vech(gamma), 0.0)
-    root, shape = _starts(gamma, held, tau, n_samples, made_of)  # (item, start, ...)
-    n_items, n_starts = shape.shape[:2]
-    root, shape = root.flatten(0, 1), shape.flatten(0, 1)
-    if n_starts > 1:
-        every, seen = (value.repeat_interleave(n_starts, 0) for value in (moments, present))
-        root, shape = _follow(every, seen, tau, n_samples, made_of, weighting, root, shape, _ROUGH, _TRIAL)
-        score = _misfit(every, seen, tau, n_samples, made_of, root, shape).nan_to_num(nan=torch.inf)
-        best = score.view(n_items, -1).argmin(-1) + n_starts * torch.arange(n_items, device=score.device)
-        root, shape = root[best], shape[best]
-    rough = 0 if n_starts > 1 else _ROUGH
-    root, shape = _follow(moments, present, tau, n_samples, made_of, weighting, root, shape, rough, _UPDATES)
-    root, shape, rests = _settle(moments, present, tau, n_samples, made_of, weighting, root, shape)
-    theta = root @ root
-    # AR1s from slow to fast, tones from high to low frequency.
-    place = torch.arange(made_of.n_linear, dtype=shape.dtype, device=shape.device).expand(len(shape), -1)
-    order, shape = made_of.ordered(place, shape)
-    return theta.take_along_dim(order.long()[..., None, None], 1), shape, rests
-
-
-def _follow(
-    moments: Tensor,
-    present: Tensor,
-    tau: Tensor,
-    n_samples: int,
-    made_of: Composition,
-    weighting: str,
-    root: Tensor,
-    shape: Tensor,
-    rough: int,
-    most: int,
-) -> tuple[Tensor, Tensor]:
-    """`S` and `x` after steps with weights of where these start, the first `rough` ones with those of pairs.
-
-    A minimum for weights that stay would be far off where the data hardly tell a memory, and the next one far off on
-    the other side. Weights of the mean of the covariances so far, of which the latest counts half, keep steps from
-    going to and fro between two fits of which each has the other's weights.
-    """
-    root, shape = root.clone(), shape.clone()
-    fitted = torch.zeros_like(moments)
-    todo = torch.arange(len(moments), device=moments.device)
-    mean = moments.new_empty(0)
-    for step in range(most):
-        at, x = root[todo], shape[todo]
-        covariance = array_moment_covariance(made_of, at @ at, x, n_samples, len(tau))
-        mean = (mean + covariance) / 2 if step > rough else covariance
-        weight = weights_of(mean, present[todo], weighting if step >= rough else "pairwise")
-        at, x = array_search.step_downhill(moments[todo], weight, tau, made_of, at, x, exact=False)
-        new = made_of.columns(tau, x) @ vech(at @ at)
-        near = (_squared(weight, new - fitted[todo]) < _NEAR) & (step >= rough)
-        root[todo], shape[todo], fitted[todo] = at, x, new
-        todo, mean = todo[~near], mean[~near]
-        if not len(todo):
-            break
-    return root, shape
-
-
-def _settle(
-    moments: Tensor,
-    present: Tensor,
-    tau: Tensor,
-    n_samples: int,
-    made_of: Composition,
-    weighting: str,
-    root: Tensor,
-    shape: Tensor,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """`S` and `x` of the minimum for the weights of where it starts, and whether the steps came to rest."""
-    root, shape = root.clone(), shape.clone()
-    covariance = array_moment_covariance(made_of, root @ root, shape, n_samples, len(tau))
-    weight = weights_of(covariance, present, weighting)
-    todo = torch.arange(len(moments), device=moments.device)
-    rests = torch.zeros(len(moments), dtype=torch.bool, device=moments.device)
-    for _ in range(_POLISHING):
-        at, x = root[todo], shape[todo]
-        before = made_of.columns(tau, x) @ vech(at @ at)
-        at, x = array_search.step_downhill(moments[todo], weight[todo], tau, made_of, at, x, exact=True)
-        move = made_of.columns(tau, x) @ vech(at @ at) - before
-        root[todo], shape[todo] = at, x
-        rests[todo] = _squared(weight[todo], move) < _AT_REST
-        todo = (~rests).nonzero()[:, 0]
-        if not len(todo):
-            break
-    return root, shape, rests
-
-
-def _squared(weight: Tensor, move: Tensor) -> Tensor:
-    """`d' W d`, `(item,)`, of moments `(item, level, pair)`."""
-    flat = move.flatten(1)
-    return ((weight @ flat[..., None])[..., 0] * flat).sum(-1)
-
-
-def _misfit(
-    moments: Tensor,
-    present: Tensor,
-    tau: Tensor,
-    n_samples: int,
-    made_of: Composition,
-    root: Tensor,
-    shape: Tensor,
-) -> Tensor:
-    """`r' V^-1 r + ln det V`, which compares fits with different weights, `(item,)`."""
-    covariance = array_moment_covariance(made_of, root @ root, shape, n_samples, len(tau))
-    weight = weights_of(covariance, present, "optimal")
-    distance = _squared(weight, moments - made_of.columns(tau, shape) @ vech(root @ root))
-    return distance - torch.logdet(weight + torch.diag_embed((~present.flatten(1)).to(weight)))
-
-
-def _starts(gamma: Tensor, held: Tensor, tau: Tensor, n_samples: int, made_of: Composition) -> tuple[Tensor, Tensor]:
-    """`S` of uncorrelated sensors and `x`, `(item, start, ...)`: of each sensor's own fits, those that suit all."""
-    nu = gamma.diagonal(dim1=-2, dim2=-1).mT  # (item, sensor, level)
-    n_items, n_sensors, _ = nu.shape
-    known = nu.isfinite().any(-1).to(nu)
-    nu = torch.where(nu.isfinite(), nu, nu.nanmean(1, keepdim=True))
-    weight = (3 * (n_samples - tau + 1) / tau).clamp(min=1) / nu.square()  # as of white noise
-    everywhere = held[:, None].expand(-1, n_sensors, -1).flatten(0, 1)
-    own = search.starting_points(
-        nu.flatten(0, 1), weight.flatten(0, 1), tau, made_of, everywhere, n_starts_for(made_of)
-    )  # (item sensor, start, shaped)
-    target, root = (v.flatten(0, 1)[:, None].expand(-1, own.shape[1], -1).flatten(0, 1) for v in (nu, weight.sqrt()))
-    n, n_shaped = n_sensors * own.shape[1], own.shape[2]
-    own = search.minimise(target, root, tau, made_of, own.flatten(0, 1))[1].view(n_items, n, n_shaped)
-    _, own = made_of.ordered(own.new_zeros(n_items, n, made_of.n_linear), own)
-    # Each of them in every sensor: (item, candidate, sensor)
-    target, root = (v[:, None].expand(-1, n, -1, -1).flatten(0, 2) for v in (nu, weight.sqrt()))
-    shape = own[:, :, None].expand(-1, -1, n_sensors, -1).flatten(0, 2)
-    linear, _, objective, _ = search.minimise(target, root, tau, made_of, shape, 0)
-    linear = linear.view(n_items, n, n_sensors, -1)
-    score = (objective.view(n_items, n, n_sensors) * known[:, None]).sum(-1).nan_to_num(nan=torch.inf)
-    kept = []
-    for _ in range(_DISTINCT if len(made_of.curved) > 1 else 1):
-        kept.append(score.argmin(-1))
-        near = (own - own.take_along_dim(kept[-1][:, None, None], 1)).abs().sum(-1) < _APART
-        score = torch.where(near, torch.inf, score)
-    best = torch.stack(kept, -1)  # (item, start)
-    linear, shape = linear.take_along_dim(best[..., None, None], 1), own.take_along_dim(best[..., None], 1)
-    least = _SEED * (nu[:, None, :, :, None] / made_of.columns(tau, shape)[:, :, None]).amin(-2)
-    return torch.diag_embed(torch.maximum(linear, least).sqrt().mT), shape
-
-
 def _held(series: Tensor | None, made_of: Composition, gamma: Tensor) -> tuple[Tensor, Tensor]:
     """`x` of the sinusoids, and the spread of beta, of the sensor that shows them most sharply, `(item, tone)`."""
-    found = tone_frequencies(series.flatten(0, 1), made_of) if series is not None else None
+    found = model_tones(series.flatten(0, 1), made_of) if series is not None else None
     if series is None or found is None:
         empty = gamma.new_empty(len(gamma), 0)
         return empty, empty
-    beta, sd = (value.to(gamma).unflatten(0, series.shape[:2]) for value in found)  # (item, sensor, tone)
-    best = sd.amax(-1).argmin(-1)[:, None, None]
+    # (item, sensor, tone)
+    beta, sd = (value.to(gamma).unflatten(0, series.shape[:2]) for value in (found.beta, found.beta_sd))
+    best = sd.amax(-1).nan_to_num(nan=torch.inf).argmin(-1)[:, None, None]
     return shape_of(beta.take_along_dim(best, 1)[:, 0], Sinusoid), sd.take_along_dim(best, 1)[:, 0]
 
 
@@ -307,7 +160,9 @@ def _measured(signal: Tensor, n_levels: int | None) -> Tensor:
     if n_levels is None:
         seen = counts.diagonal(dim1=-2, dim2=-1).amax(-1) > 0  # (..., level)
         asked = max(int(seen.reshape(-1, asked).all(0).sum()), 1)
-    return (sums / counts)[..., :asked, :, :]
+    infinite = signal.isinf().any(-1)
+    both = (infinite[..., :, None] | infinite[..., None, :])[..., None, :, :]
+    return infinite_where(both, sums / counts)[..., :asked, :, :]
 
 
 def _given(wccv: Tensor, n_samples: int, n_levels: int | None) -> Tensor:
@@ -319,6 +174,12 @@ def _given(wccv: Tensor, n_samples: int, n_levels: int | None) -> Tensor:
         )
     if n_levels is not None and not 1 <= n_levels <= wccv.shape[-3]:
         raise ValueError(f"`n_levels`: expected 1 to {wccv.shape[-3]}, the levels given, got {n_levels}")
+    size = wccv.diagonal(dim1=-2, dim2=-1).sqrt()
+    if bool(((wccv - wccv.mT).abs() > _ASYMMETRIC * size[..., :, None] * size[..., None, :]).any()):
+        raise ValueError(
+            "`signal`: expected a symmetric wavelet cross-covariance, got one whose entries (i, k) and (k, i) differ; "
+            "give that of `wavelet_cross_covariance`, or the mean of it and its transpose"
+        )
     return wccv[..., :n_levels, :, :]
 
 
@@ -336,7 +197,7 @@ def _check_model(made_of: Composition, n_levels: int) -> None:
         )
 
 
-def _usable(gamma: Tensor) -> Tensor:
+def _usable(gamma: Tensor, sensors: tuple[str, ...]) -> Tensor:
     """Arrays `(item,)` that can be fitted; says which cannot."""
     nu = gamma.diagonal(dim1=-2, dim2=-1)
     # A moment counts where it was measured; a variance of zero or an infinite entry is no noise.
@@ -345,10 +206,13 @@ def _usable(gamma: Tensor) -> Tensor:
     )
     if bool(usable.all()):
         return usable
-    items = [str(i) for i in (~usable).nonzero()[:, 0].tolist()]
+    places = []
+    for i in (~usable).nonzero()[:, 0].tolist():
+        bad = ((nu[i] <= 0) | nu[i].isinf()).any(0).nonzero()[:, 0].tolist()
+        places.append(f"{i} (sensor {named(sensors, bad)})" if bad else str(i))
     what = (
-        "expected wavelet variances > 0 (a constant signal has none) and a sensor with windows at every level, got "
-        f"others in array(s) {named(items, range(len(items)))}"
+        "expected wavelet variances > 0 (a constant signal has none, nor has one with infinite samples) and a sensor "
+        f"with windows at every level, got others in array(s) {named(places, range(len(places)))}"
     )
     if not bool(usable.any()):
         raise ValueError(f"`signal`: {what}; leave sensors out or ask for fewer `n_levels`")

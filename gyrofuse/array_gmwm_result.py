@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from gyrofuse._array_inference import ArrayFit, Estimate, is_long, matrices
+from gyrofuse._array_inference import FEWEST_TIME_CONSTANTS, ArrayFit, is_long, matrices, shared, told_matrices
 from gyrofuse._composition import Composition
+from gyrofuse._records import Records
 from gyrofuse._result import ConfidenceInterval, listed
 from gyrofuse.live import subset_weights
 from gyrofuse.processes import Model, Process
 from gyrofuse.scale_weights import ScaleWeights
 from gyrofuse.simulate import ArrayModel
+from gyrofuse.uncertainty import chi_square_tail
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,9 +53,9 @@ class ArrayGMWMResult:
             diagonal). Positive semi-definite. NaN for a sensor without samples and a pair that is never seen together.
         theta_sd: Standard deviation of every entry, as if no matrix lacked rank.
         confidence_interval: Limits of every entry. A variance that is hardly told from zero, or in a matrix that lacks
-            rank, has an upper limit only; covariances of such a matrix have none (NaN).
+            rank or of a long memory, has an upper limit only; covariances of such a matrix have none (NaN).
         correlation: Of the sensors in each process.
-        correlation_interval: Limits of the same, NaN where the matrix lacks rank.
+        correlation_interval: Limits of the same, NaN where the matrix lacks rank or is that of a long memory.
         param_names: Of what all sensors share, such as `ar1_1.phi`.
         params: `(..., parameter)`.
         params_sd: `(..., parameter)`.
@@ -103,31 +105,32 @@ class ArrayGMWMResult:
         *,
         fit: ArrayFit,
         squared: Tensor,
-        shared: Estimate,
+        held_sd: Tensor,
         made_of: Composition,
         usable: Tensor,
+        records: Records,
         wavelet_cross_covariance: Tensor,
         **rest: Any,
     ) -> ArrayGMWMResult:
         """Put the arrays that could be fitted back into their places among all, `(item,)` -> `(...)`.
 
-        `squared` are the units of the entries of their matrices, `(item, 1, sensor, sensor)`.
+        `squared` are the units of the entries of their matrices, `(item, 1, sensor, sensor)`, `held_sd` the spreads of
+        the frequencies of tones, `(item, tone)`.
         """
-        batch, levels = wavelet_cross_covariance.shape[:-3], wavelet_cross_covariance.shape[-3]
+        batch = wavelet_cross_covariance.shape[:-3]
 
         def placed(value: Tensor, missing: float | bool = torch.nan) -> Tensor:
             whole = value.new_full((len(usable), *value.shape[1:]), missing)
             whole[usable] = value
             return whole.view((*batch, *value.shape[1:]))
 
-        tau = torch.exp2(torch.arange(1, levels + 1, dtype=squared.dtype, device=squared.device))
-        entries, correlation = matrices(fit, rest["confidence_level"])
+        told = told_matrices(fit, made_of, records.longest)
+        entries, correlation = matrices(fit, told, rest["confidence_level"])
+        params = shared(fit, told, held_sd, made_of, rest["confidence_level"])
         theta = entries.value * squared
-        columns = made_of.columns(tau, fit.shape)
+        columns = made_of.columns(records.tau.to(squared), fit.shape)
         # A scaled chi-square of the same mean and variance.
-        half = 2 * fit.dispersion
-        tail = torch.special.gammaincc(fit.degrees.clamp(min=1) / half, fit.objective.clamp(min=0) / half)
-        tested = (fit.degrees > 0) & (rest["weighting"] == "optimal")
+        p_value = chi_square_tail(fit.objective / fit.dispersion, fit.degrees / fit.dispersion)
         names = Model(list(made_of.processes)).param_names
         return cls(
             processes=made_of.processes,
@@ -137,16 +140,17 @@ class ArrayGMWMResult:
             correlation=placed(correlation.value),
             correlation_interval=ConfidenceInterval(placed(correlation.low), placed(correlation.high)),
             param_names=tuple(name for name in names if name.endswith((".phi", ".beta"))),
-            params=placed(shared.value),
-            params_sd=placed(shared.sd),
-            params_interval=ConfidenceInterval(placed(shared.low), placed(shared.high)),
+            params=placed(params.value),
+            params_sd=placed(params.sd),
+            params_interval=ConfidenceInterval(placed(params.low), placed(params.high)),
             objective=placed(fit.objective),
             degrees_of_freedom=placed(fit.degrees.to(theta)),
-            p_value=placed(torch.where(tested, tail, torch.nan)),
+            p_value=placed(p_value if rest["weighting"] == "optimal" else torch.full_like(p_value, torch.nan)),
             converged=placed(fit.converged, False),
             rank=placed(fit.rank, 0),
             wavelet_cross_covariance=wavelet_cross_covariance,
             fitted_wavelet_cross_covariance=placed(torch.einsum("njk,nkab->njab", columns, theta)),
+            n_samples=records.longest,
             **rest,
         )
 
@@ -217,7 +221,8 @@ class ArrayGMWMResult:
         level = f"{100 * self.confidence_level:g} % interval"
         shared = zip(self.param_names, self.params, *self.params_interval, strict=True)
         for label, value, low, high in shared:
-            lines.append(f"{label:<16}{value:>13.6g}  {level} [{low:.6g}, {high:.6g}]")
+            limits = f"{level} [{low:.6g}, {high:.6g}]" if low.isfinite() else "no interval, see below"
+            lines.append(f"{label:<16}{value:>13.6g}  {limits}")
         for k, process in enumerate(self.processes):
             lines += ["", f"{process.symbol}: variances with {level}s, correlations"]
             for i, sensor in enumerate(self.sensors):
@@ -285,15 +290,25 @@ class ArrayGMWMResult:
         found = []
         for name, rank in zip(names, self.rank[index].tolist(), strict=True):
             phi = shapes.get(f"{name}.phi")
-            if rank < n_sensors:
-                nor = "" if phi is None else ", nor of any phi"
-                lacking = f"{name}: matrix of rank {rank} of {n_sensors}"
-                found.append(f"{lacking}; no intervals of its covariances and correlations{nor}")
-            if phi is not None and bool(is_long(phi, self.n_samples)):
-                found.append(
-                    f"{name}: a memory so long is hardly told from a random walk; no intervals of any phi, and weights "
-                    "for long times may be no better than those of the measured wavelet cross-covariance"
+            is_vague = phi is not None and bool(is_long(phi, self.n_samples))
+            reasons = [f"matrix of rank {rank} of {n_sensors}"] * (rank < n_sensors)
+            if is_vague:
+                reasons.append(
+                    "hardly told from a random walk at this length, its memory is longer than "
+                    f"1/{FEWEST_TIME_CONSTANTS} of the record"
                 )
+            if reasons:
+                limits = "upper limits only of its variances, no intervals of its covariances and correlations"
+                nor = "" if phi is None else ", nor of any phi"
+                found.append(f"{name}: {' and '.join(reasons)}; {limits}{nor}")
+            if is_vague:
+                found.append(
+                    f"{name}: weights for long times may be no better than those of the measured wavelet "
+                    "cross-covariance"
+                )
+        for name, low, high in zip(self.param_names, *(limit[index] for limit in self.params_interval), strict=True):
+            if name.endswith(".phi") and low <= 0 <= high:
+                found.append(f"{name.split('.')[0]}: indistinguishable from white noise at this length")
         return tuple(found)
 
     def _present(self) -> Tensor:

@@ -37,6 +37,7 @@ from gyrofuse.cli_shared import (
     Scale,
     Sensors,
     Unit,
+    known_unit,
     outputs,
     read,
     say_notes,
@@ -264,6 +265,7 @@ def simulate(
     force: Force = False,
 ) -> None:
     """Simulate a recording from a noise model."""
+    unit = known_unit(unit)
     check_positive("--rate", rate)
     check_positive_integer("--samples", samples)
     check_positive_integer("--sensors", 1 if sensors is None else sensors)

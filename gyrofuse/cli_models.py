@@ -39,6 +39,8 @@ from gyrofuse.recording import Recording
 from gyrofuse.report import new_figure, save_figure
 from gyrofuse.report_models import model_report
 from gyrofuse.report_ranking import rank_report
+from gyrofuse.tones import FEWEST_SAMPLES
+from gyrofuse.units import RATE_UNITS
 
 _MOST_FITS = 12  # printed in full
 
@@ -153,6 +155,11 @@ def _exported(
         raise ValueError(
             f"`--{option}`: expected one sensor and axis, got {len(params)}; choose with --sensors and --axis"
         )
+    if recording.unit not in RATE_UNITS:
+        raise ValueError(
+            f"`--{option}`: expected a log in one of {', '.join(RATE_UNITS)}, got unit {recording.unit!r}; where the "
+            "log does not say, give its unit with --unit, and with --scale the factor to it from other numbers"
+        )
     return written(result.model.with_params(params[0]), recording.rate, recording.unit)
 
 
@@ -184,24 +191,47 @@ def rank(
     report: Report = None,
     force: Force = False,
 ) -> None:
-    """Find which noise processes made the signal of every sensor of a log, recorded at rest."""
+    """Find which noise processes made the signal of every sensor of a log, recorded at rest.
+
+    Spectra ask for records without gaps: where samples are missing, the longest stretch in which all sensors have
+    theirs is ranked, and said.
+    """
     resting = stretch(rest)
     formulas = None if candidates is None else [formula.strip() for formula in candidates.split(",")]
     with outputs(force, [*logs, mounting], figure=figure, json=json_file, report=report) as drafts:
         recording = read(logs, axis, sensors, rate, unit, scale, key, mounting)
         with progress("ranking"):
-            part = recording.between(*resting) if resting else recording
+            asked = recording.between(*resting) if resting else recording
+            part, remarks = _without_gaps(asked)
             result = rank_models(part, formulas, confidence_level=confidence_level, n_levels=levels)
         if figure:
             _draw(result, drafts[figure], figure)
         if report:
             with progress("drawing"):
-                page = rank_report(result, part, title=f"Noise models for {titled(logs)}")
+                page = rank_report(result, part, title=f"Noise models for {titled(logs)}", remarks=remarks)
             drafts[report].write_text(page, encoding="utf-8")
         if json_file:
             write_json(drafts[json_file], result.to_dict())
-    say(result.summary())
+    say("\n".join([result.summary(), *remarks]))
     fits = [fit for fit in result.best if fit is not None]
     if len(fits) <= _MOST_FITS:
         say("\n".join(f"\n{fit}" for fit in fits))
     say_notes(recording)
+
+
+def _without_gaps(recording: Recording) -> tuple[Recording, list[str]]:
+    """The longest stretch that a spectrum can be taken of, and what to say about it."""
+    part = recording.longest_whole()
+    if part.n_samples == recording.n_samples:
+        return recording, []
+    if part.n_samples < FEWEST_SAMPLES <= recording.n_samples:
+        raise ValueError(
+            f"`LOG`: expected a stretch of at least {FEWEST_SAMPLES} samples that no sensor lacks, got one of "
+            f"{part.n_samples}; choose with --sensors, or fit a model with `gyrofuse fit`, which gets along with gaps"
+        )
+    start = part.time[0].item()
+    more = "; fewer --sensors may have a longer one" if part.n_sensors > 1 else ""
+    return part, [
+        f"Ranked on {start:.6g} to {start + part.duration:.6g} s alone, {part.n_samples} of {recording.n_samples} "
+        f"samples, the longest stretch that no sensor lacks a sample of{more}."
+    ]

@@ -12,7 +12,9 @@ import typer
 
 from gyrofuse._console import progress, say_table
 from gyrofuse._output import Outputs
+from gyrofuse.io.columns import canonical_unit
 from gyrofuse.recording import Recording, read_recording
+from gyrofuse.units import OTHER_UNITS, RATE_UNITS
 
 _SUFFIXES = {
     "out": (".npz", ".csv"),
@@ -60,11 +62,23 @@ def read(
             axis=axis,
             sensors=None if sensors is None else sensors.split(","),
             rate=rate,
-            unit=unit,
+            unit=None if unit is None else known_unit(unit),
             scale=scale,
             key=key,
             mounting=mounting,
         )
+
+
+def known_unit(unit: str) -> str:
+    """The unit that `--unit` names, in this project's spelling."""
+    known = (*RATE_UNITS, *OTHER_UNITS)
+    name = canonical_unit(unit)
+    if name not in known:
+        raise ValueError(
+            f"`--unit`: expected one of {', '.join(known)}, got {unit!r}; give one of them, and with --scale the "
+            "factor that brings the numbers of the log to it"
+        )
+    return name
 
 
 def stretch(rest: str | None) -> tuple[float, float] | None:

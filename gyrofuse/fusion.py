@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.competitors import precision_weights
-from gyrofuse.rdvg import rdvg_weights
+from gyrofuse.rdvg import rdvg
 from gyrofuse.selection import ESTIMATORS, Selection, select_estimator
 from gyrofuse.svo_weights import counting, optimal_weights
 
@@ -24,11 +24,13 @@ class Chosen:
         weights: `(item, sensor)`.
         method: How they were chosen.
         selection: Why, where they were chosen by held-out risk.
+        positive_definite: `(item,)`, whether weights by RDVG minimise anything; None for other methods.
     """
 
     weights: Tensor
     method: str
     selection: Selection | None = None
+    positive_definite: Tensor | None = None
 
     @property
     def spread_of(self) -> Callable[[Tensor], Tensor] | None:
@@ -52,7 +54,8 @@ def choose_weights(method: str, signal: Tensor, wccv: Tensor, totals: Tensor, om
         omega: `(level,)`, scale weights.
     """
     if method == "rdvg":
-        return Chosen(rdvg_weights(signal).to(wccv), method)
+        found = rdvg(signal)
+        return Chosen(found.weights.to(wccv), method, positive_definite=found.positive_definite)
     counts, wccv = totals.amin((-1, -2)), counting(wccv, omega)
     if method != "auto":
         return Chosen(ESTIMATORS[method](wccv, counts, omega), method)

@@ -8,13 +8,21 @@ from dataclasses import fields
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import check_confidence_level, check_floating, check_positive_integer, check_signal, largest_level
+from gyrofuse._checks import (
+    check_confidence_level,
+    check_floating,
+    check_length,
+    check_signal,
+    infinite_where,
+    largest_level,
+)
 from gyrofuse._composition import Composition
+from gyrofuse._model_tones import model_tones
 from gyrofuse._records import Records
 from gyrofuse._result import named, numbered
 from gyrofuse.continuous import fit_moments
 from gyrofuse.gmwm_result import GMWMResult
-from gyrofuse.moment_fit import composition_of, tone_frequencies
+from gyrofuse.moment_fit import composition_of
 from gyrofuse.moment_identity import remarks
 from gyrofuse.moment_inference import Estimates, Fit, Inference, estimated, infer
 from gyrofuse.moment_profile import MomentSurface, SpectralSurface, profiled
@@ -22,6 +30,7 @@ from gyrofuse.processes import Model
 from gyrofuse.recording import Recording
 from gyrofuse.robust import check_efficiency, robust_wavelet_variance
 from gyrofuse.robust_covariance import check_gaussian
+from gyrofuse.tones import Tones
 from gyrofuse.whittle import refine_whittle
 
 WEIGHTINGS = ("optimal", "diagonal", "identity", "continuous")
@@ -46,7 +55,9 @@ def fit_gmwm(
     `theta = argmin (nu - nu(theta))' Omega (nu - nu(theta))` over the levels ([V] equation 5), with `Omega = V^-1` of
     the fitted model (`optimal`), the reciprocal variances (`diagonal`), the identity, or weights of your own. The
     frequencies of sinusoids come from the signal's spectrum, where they show a thousand times more sharply than in
-    wavelet variances. AR1s are given from slow to fast, sinusoids from high to low frequency.
+    wavelet variances; lines of fewer than 30 cycles or hardly above the noise are tested against a noise spectrum
+    fitted to the record, and `remarks` say which could be noise. AR1s are given from slow to fast, sinusoids from high
+    to low frequency.
 
     Intervals are symmetric in logarithms, `atanh phi` and `logit(beta / pi)`. Those of variances at zero, of what is
     known to hardly its order of magnitude and of AR1s that another process could stand for are by profile: every value
@@ -66,8 +77,8 @@ def fit_gmwm(
     intervals hold the truth as often (95 to 97 %).
 
     Args:
-        signal: `(..., sensor, time)`, NaN = missing sample, or a `Recording`. With `n_samples` given a wavelet
-            variance `(..., level, sensor)` of records that long.
+        signal: `(..., sensor, time)`, NaN = missing sample, or a `Recording`; a sensor with infinite samples is not
+            fitted. With `n_samples` given a wavelet variance `(..., level, sensor)` of records that long.
         model: Processes without values, such as `WhiteNoise() + AR1() + RandomWalk()`, or `"WN + AR1 + RW"`.
         weighting: `"optimal"`, `"diagonal"`, `"identity"`, `"continuous"`, or `Omega` as `(level,)` or
             `(level, level)`.
@@ -89,8 +100,8 @@ def fit_gmwm(
 
     Raises:
         TypeError: `signal` is not a floating point tensor or a `Recording`.
-        ValueError: More parameters than levels, a model with values, bad options, a sinusoid or a drift with
-            `efficiency` below 1, or no item that can be fitted.
+        ValueError: More parameters than levels, a model with values, bad options, `n_samples` of what is no wavelet
+            variance, a sinusoid or a drift with `efficiency` below 1, or no item that can be fitted.
 
     References:
         [V] section III; S. Guerrier, J. Skaloud, Y. Stebler, M.-P. Victoria-Feser, JASA 108, 2013; for `continuous`
@@ -110,10 +121,11 @@ def fit_gmwm(
         length = values.shape[-1]
         levels = _levels(n_levels, length, efficiency)
         variance = robust_wavelet_variance(values.detach(), levels, efficiency=efficiency).to(torch.float64)
+        variance = infinite_where(values.isinf().any(-1)[..., None, :], variance)
         series = values.detach().reshape(-1, length)
     else:
         check_floating("signal", values)
-        length, series = check_positive_integer("n_samples", n_samples), None
+        length, series = check_length(n_samples, recorded=recording is not None), None
         variance = _given(values, length, n_levels).to(torch.float64)
     *batch, levels, n_sensors = variance.shape
     sensors = recording.sensors if recording else numbered(n_sensors)
@@ -131,13 +143,14 @@ def fit_gmwm(
     nu = variance.mT.reshape(-1, levels)  # (item, level)
     usable = (nu.isfinite() & (nu > 0)).all(-1)
     if not bool(usable.all()):
-        _report(nu, usable, sensors, strict)
+        _report(nu, usable, sensors, strict, efficiency)
     records = Records((length,), (levels,), efficiency)
-    frequencies = tone_frequencies(series[usable], made_of) if series is not None else None
+    tones = model_tones(series[usable], made_of) if series is not None else None
+    frequencies = None if tones is None else (tones.beta, tones.beta_sd)
     fit = fit_moments(nu[usable], frequencies, records, made_of, omega, moments)
     inference = infer(fit, made_of, confidence_level)
     if refine and series is not None:
-        estimates, fitted = _refined(series[usable], fit, made_of, inference, confidence_level)
+        estimates, fitted = _refined(series[usable], tones, fit, made_of, inference, confidence_level)
     else:
         surface = MomentSurface(fit, made_of)
         estimates = profiled(inference.estimates, surface, fit, made_of, confidence_level, inference.refused)
@@ -147,7 +160,7 @@ def fit_gmwm(
         inference=inference,
         estimates=estimates,
         fitted=fitted,
-        remarks=remarks(made_of, estimates, length, confidence_level),
+        remarks=remarks(made_of, estimates, length, confidence_level, tones),
         made_of=made_of,
         usable=usable,
         wavelet_variance=nu,
@@ -164,10 +177,15 @@ def fit_gmwm(
 
 
 def _refined(
-    series: Tensor, fit: Fit, made_of: Composition, inference: Inference, confidence_level: float
+    series: Tensor,
+    tones: Tones | None,
+    fit: Fit,
+    made_of: Composition,
+    inference: Inference,
+    confidence_level: float,
 ) -> tuple[Estimates, Tensor]:
     """Estimates and wavelet variances at the maximum of the spectral likelihood; the moments' where there is none."""
-    whittle = refine_whittle(series, made_of, fit.linear, fit.shape)
+    whittle = refine_whittle(series, made_of, fit.linear, fit.shape, tones=tones)
     kept = ~whittle.converged
     if bool(kept.any()):
         warnings.warn(
@@ -229,6 +247,11 @@ def _levels(n_levels: int | None, n_samples: int, efficiency: float) -> int:
 def _given(values: Tensor, n_samples: int, n_levels: int | None) -> Tensor:
     """A wavelet variance `(..., level, sensor)`, with `n_levels` of its levels."""
     most = largest_level(n_samples)
+    if values.shape[-1:] == (n_samples,):
+        raise ValueError(
+            f"`signal`: expected a wavelet variance (..., level, sensor) with `n_samples`, got shape "
+            f"{tuple(values.shape)}, that of a signal; leave out `n_samples`, or give as many sensors one by one"
+        )
     if values.ndim < 2 or values.shape[-2] > most or values.shape[-2] == 0:
         raise ValueError(
             f"`signal`: expected a wavelet variance (..., level, sensor) of at most {most} levels for {n_samples} "
@@ -241,16 +264,20 @@ def _given(values: Tensor, n_samples: int, n_levels: int | None) -> Tensor:
     return values[..., :n_levels, :]
 
 
-def _report(nu: Tensor, usable: Tensor, sensors: tuple[str, ...], strict: bool) -> None:
+def _report(nu: Tensor, usable: Tensor, sensors: tuple[str, ...], strict: bool, efficiency: float) -> None:
     """Say which items cannot be fitted."""
     bad = (~usable).nonzero()[:, 0].tolist()
     n_sensors = len(sensors)
     items = [f" of item {i // n_sensors}" if len(nu) > n_sensors else "" for i in bad]
     places = [f"sensor {sensors[i % n_sensors]}{item}" for i, item in zip(bad, items, strict=True)]
     what = (
-        "expected wavelet variances that are finite and > 0 at every level (a constant signal has none, gaps leave no "
-        f"whole window at the last levels), got others at {named(places, range(len(places)))}"
+        "expected wavelet variances that are finite and > 0 at every level (a constant signal has none, nor has one "
+        "with infinite samples; gaps leave no whole window at the last levels), got others at "
+        f"{named(places, range(len(places)))}"
     )
     if strict or not bool(usable.any()):
-        raise ValueError(f"`signal`: {what}; leave them out or ask for fewer `n_levels`")
+        # Of few distinct values the first levels have no robust scale, with whatever number of levels.
+        coarse = efficiency < 1 and bool(nu[~usable, 0].isnan().any())
+        remedy = "give `efficiency=1` (no --robust) for signals of few distinct values, or " if coarse else ""
+        raise ValueError(f"`signal`: {what}; {remedy}leave them out or ask for fewer `n_levels`")
     warnings.warn(f"`signal`: {what}; their results are NaN and not converged", stacklevel=3)

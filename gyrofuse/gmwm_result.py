@@ -16,6 +16,7 @@ from gyrofuse.datasheet import datasheet
 from gyrofuse.moment_inference import Estimates, Fit, Inference
 from gyrofuse.processes import Model
 from gyrofuse.uncertainty import chi_square_interval, chi_square_tail
+from gyrofuse.units import RATE_UNITS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -131,7 +132,7 @@ class GMWMResult:
         return self.records.efficiency
 
     def summary(self) -> str:
-        """Parameters with intervals, sensor by sensor, and in datasheet units where rate and unit are known."""
+        """Parameters with intervals, sensor by sensor, and in datasheet units where rate and unit of rate are known."""
         batch = self.params.shape[:-2]
         name = " + ".join(p.symbol for p in self.model.processes)
         kind = "GMWM fit, refined by spectral likelihood," if self.refined else "GMWM fit"
@@ -173,7 +174,7 @@ class GMWMResult:
             rows.append(f"  {name:<24}{value:>13.6g}  [{first:>13.6g}, {last:>13.6g}]{note}")
         item = sum(i * step for i, step in zip(index, self.identified.stride(), strict=True))
         rows += [f"  {text}" for text in self.remarks[item]]
-        if self.rate and self.unit:
+        if self.rate and self.unit in RATE_UNITS:
             own = self.model.with_params(self.params[index])
             rows += ["  " + line for line in datasheet(own, self.rate, self.unit).summary().splitlines()[1:]]
         return rows

@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from gyrofuse._checks import check_positive_integer
 from gyrofuse._composition import Composition
+from gyrofuse._model_tones import model_tones
 from gyrofuse._paths import own_generator
 from gyrofuse._result import ConfidenceInterval, listed
 from gyrofuse.continuous import fit_moments
 from gyrofuse.gmwm_result import GMWMResult
-from gyrofuse.moment_fit import tone_frequencies
 from gyrofuse.moment_inference import Estimates, Fit, Inference, estimated, infer
 from gyrofuse.processes import AR1, Sinusoid
 from gyrofuse.robust import robust_wavelet_variance
 from gyrofuse.whittle import refine_whittle
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _SAMPLES_AT_ONCE = 2**22
 _FEWEST = 20
@@ -33,7 +37,7 @@ class GMWMBootstrap:
         param_names: Of the parameters.
         params: Estimates `(..., sensor, parameter)` that were simulated from.
         bias: Mean of the resampled estimates less the estimate, `(..., sensor, parameter)`.
-        std: Standard deviation of the resampled estimates, the same.
+        std: Standard deviation of the resampled estimates, the same; NaN of fewer than two.
         percentile: Interval between quantiles of the resampled estimates.
         studentized: Interval by quantiles of `(u* - u) / sd*`, with `u` the logarithm of variances and amplitudes,
             `atanh phi`, `logit(beta / pi)`. That of the percentiles where a standard deviation is unknown, as in the
@@ -60,22 +64,58 @@ class GMWMBootstrap:
     sensors: tuple[str, ...]
 
     def summary(self) -> str:
-        """Bias, spread and interval of every parameter, sensor by sensor."""
+        """Bias, spread and interval of every parameter, sensor by sensor, or why there are none."""
         level = f"{100 * self.confidence_level:g} % studentized"
         lines = [f"Parametric bootstrap of a GMWM fit: {self.n_resamples} resamples"]
         for index in itertools.product(*map(range, self.params.shape[:-1])):
             where = f" of item {', '.join(map(str, index[:-1]))}" if len(index) > 1 else ""
-            failed = f", {self.n_failed[index]} not fitted" if bool(self.n_failed[index]) else ""
-            lines += ["", f"sensor {self.sensors[index[-1]]}{where}: p = {self.p_value[index].item():.2g}{failed}"]
+            lines += ["", f"sensor {self.sensors[index[-1]]}{where}: {self._head(index)}"]
+            if not bool(self.params[index].isfinite().all()):
+                continue
             lines.append(f"  {'parameter':<24}{'estimate':>13}{'bias':>13}{'std':>13}  {level:^29}")
             columns = (self.params, self.bias, self.std, *self.studentized)
             for name, *row in zip(self.param_names, *(column[index].tolist() for column in columns), strict=True):
                 value, bias, std, low, high = row
-                lines.append(f"  {name:<24}{value:>13.6g}{bias:>13.3g}{std:>13.3g}  [{low:>13.6g}, {high:>13.6g}]")
+                limits = f"[{low:>13.6g}, {high:>13.6g}]" if math.isfinite(low) else f"{'-':^29}"
+                note = "  at its limit: see the interval of the fit" if value == 0 else ""
+                shown = (f"{number:>13.3g}" if math.isfinite(number) else f"{'-':>13}" for number in (bias, std))
+                lines.append(f"  {name:<24}{value:>13.6g}{''.join(shown)}  {limits}{note}")
         return "\n".join(lines)
 
     def __str__(self) -> str:
         return self.summary()
+
+    def _head(self, index: tuple[int, ...]) -> str:
+        """The p-value of one sensor, or why there is none, and how many resamples were lost."""
+        n_failed = int(self.n_failed[index])
+        if not bool(self.params[index].isfinite().all()):
+            return "not fitted, so that there is nothing to resample"
+        if n_failed == self.n_resamples:
+            return f"none of {n_failed} resamples could be fitted; the fit stands alone"
+        return f"p = {self.p_value[index].item():.2g}" + (f", {n_failed} not fitted" if n_failed else "")
+
+    def plot(self, ax: Axes | None = None, *, index: tuple[int, ...] | None = None) -> Axes:
+        """Draw bias and both intervals of one sensor's parameters, less the estimates, in standard deviations.
+
+        Args:
+            ax: Where to draw; new axes by default.
+            index: Of the sensor among the leading dimensions; the first by default.
+
+        Returns:
+            The axes.
+        """
+        from gyrofuse.plotting_models import plot_resampled
+
+        index = (0,) * (self.params.ndim - 1) if index is None else index
+        own, std = self.params[index], self.std[index]
+        known = std > 0  # a variance at zero in every resample has no scale
+        percentile, studentized = (
+            tuple(((limit[index] - own) / std)[known] for limit in interval)
+            for interval in (self.percentile, self.studentized)
+        )
+        names = [name for name, there in zip(self.param_names, known.tolist(), strict=True) if there]
+        bias = (self.bias[index] / std)[known]
+        return plot_resampled(names, bias, percentile, studentized, percent=100 * self.confidence_level, ax=ax)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers and lists; what is not known is None."""
@@ -155,12 +195,13 @@ def bootstrap_gmwm(
     n_failed = failed.sum(0)
     again = torch.where(failed[..., None], torch.nan, again)
     mean = again.nanmean(0)
-    std = ((again - mean).square().nansum(0) / (n_resamples - n_failed - 1).clamp(min=1)[:, None]).sqrt()
+    std = ((again - mean).square().nansum(0) / (n_resamples - n_failed - 1)[:, None]).sqrt()
+    std = torch.where((n_resamples - n_failed > 1)[:, None], std, torch.nan)
     tail = (1 - result.confidence_level) / 2
     percentile = again.nanquantile(tail, 0), again.nanquantile(1 - tail, 0)
     studentized = _studentized(made_of, own, again, spread, _sds(result, made_of, usable), tail, percentile)
     larger = (distance >= result.j_statistic.flatten()[usable]).sum(0)
-    p_value = (1 + larger) / (1 + n_resamples - n_failed)
+    p_value = torch.where(n_failed < n_resamples, (1 + larger) / (1 + n_resamples - n_failed), torch.nan)
 
     def placed(value: Tensor) -> Tensor:
         missing = 0 if value.dtype == torch.int64 else torch.nan
@@ -189,13 +230,14 @@ def _fitted(
     """Estimates and standard deviations `(resample, item, parameter)`, J statistics `(resample, item)`."""
     levels, series = result.wavelet_variance.shape[-2], records.flatten(0, 1)
     variance = robust_wavelet_variance(series[:, None], levels, efficiency=result.records.efficiency)[..., 0]
-    frequencies = tone_frequencies(series, made_of)
+    tones = model_tones(series, made_of)
+    frequencies = None if tones is None else (tones.beta, tones.beta_sd)
     fit: Fit = fit_moments(variance, frequencies, result.records, made_of, omega, result.moments)
     inference: Inference = infer(fit, made_of, result.confidence_level)
     estimates: Estimates = inference.estimates
     params, covariance = estimates.params, estimates.covariance
     if result.refined:
-        refined = refine_whittle(series, made_of, fit.linear, fit.shape)
+        refined = refine_whittle(series, made_of, fit.linear, fit.shape, tones=tones)
         better = estimated(
             made_of, refined.linear, refined.shape, refined.covariance, refined.edge_sd, result.confidence_level
         )

@@ -11,7 +11,6 @@ from gyrofuse._records import Records
 from gyrofuse.moment_inference import Fit
 from gyrofuse.parsing import parse_model
 from gyrofuse.processes import Model, Process, Sinusoid
-from gyrofuse.tones import find_tones
 
 _REWEIGHTINGS, _UPDATES, _DISTINCT = 3, 3, 3
 # Steps that the best start may take to its minimum; flat valleys need some hundreds.
@@ -133,20 +132,6 @@ def n_starts_for(made_of: Composition) -> int:
     """As many as found the lowest minimum of noisy copies every time."""
     tones = sum(isinstance(made_of.processes[k], Sinusoid) for k in made_of.curved)
     return min(4 * 4 ** (len(made_of.curved) - 1) if tones else (1, 4, 6, 8)[min(len(made_of.curved), 3)], 32)
-
-
-def tone_frequencies(series: Tensor, made_of: Composition) -> tuple[Tensor, Tensor] | None:
-    """`beta` of the sinusoids from the spectra of records `(item, time)`, from high to low frequency, and its spread.
-
-    Returns:
-        Both `(item, sinusoid)`; None where the model has no sinusoids.
-    """
-    n_tones = sum(isinstance(p, Sinusoid) for p in made_of.processes)
-    if n_tones == 0:
-        return None
-    found = find_tones(series.to(torch.float64), n_tones)
-    order = found.beta.argsort(-1, descending=True)
-    return found.beta.gather(-1, order), found.beta_sd.gather(-1, order)
 
 
 def composition_of(model: Model | str, held: bool) -> Composition:

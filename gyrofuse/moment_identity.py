@@ -11,11 +11,12 @@ from torch import Tensor
 from gyrofuse._composition import Composition
 from gyrofuse.moment_inference import WEAKLY_DETERMINED, Estimates
 from gyrofuse.processes import AR1, Model, RandomWalk, Sinusoid, WhiteNoise
-from gyrofuse.tones import FEWEST_CYCLES
+from gyrofuse.tones import FEWEST_CYCLES, Tones
 from gyrofuse.uncertainty import normal_quantile
 
 # A tone of fewer cycles is a trend, an AR1 of which the record holds fewer time constants a random walk.
 FEWEST_TIME_CONSTANTS = 2.0
+_BY_CHANCE = 0.05  # p value above which a line may be noise
 _ONE_FOR_THE_OTHER = 0.95  # correlation beyond which two parameters are known in combination only
 
 
@@ -38,7 +39,7 @@ def uncertain(made_of: Composition, estimates: Estimates, n_samples: int, confid
 
 
 def remarks(
-    made_of: Composition, estimates: Estimates, n_samples: int, confidence_level: float
+    made_of: Composition, estimates: Estimates, n_samples: int, confidence_level: float, tones: Tones | None = None
 ) -> list[tuple[str, ...]]:
     """What cannot be told apart at this length, in words, for each item.
 
@@ -47,6 +48,7 @@ def remarks(
         estimates: With their final intervals.
         n_samples: Length T of the records.
         confidence_level: Of these.
+        tones: Behind the sinusoids, in their order; None where the moments found these.
     """
     params = Model(list(made_of.processes)).param_names
     names = [params[place].split(".")[0] for place in made_of.places[: made_of.n_linear]]
@@ -73,6 +75,11 @@ def remarks(
     for where, text in found:
         for item in where.nonzero()[:, 0].tolist():
             said[item].append(text)
+    if tones is not None:
+        sinusoids = [name for k, name in enumerate(names) if isinstance(made_of.processes[k], Sinusoid)]
+        for item, tone in (tones.p_value >= _BY_CHANCE).nonzero().tolist():
+            p_value = tones.p_value[item, tone].item()
+            said[item].append(f"{sinusoids[tone]}: not told from the noise (p = {p_value:.1g})")
     return [tuple(texts) for texts in said]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import difflib
 from collections.abc import Mapping
 from typing import Any
 
@@ -86,8 +87,17 @@ def _process(name: ast.Name, call: ast.Call, text: str) -> Process:
 def _kind(node: ast.Name, text: str) -> type[Any]:
     kind = _SPELLINGS.get(node.id.lower())
     if kind is None:
-        raise _error(node, text, f"unknown process {node.id!r}; known: {_KNOWN}")
+        raise _error(node, text, _unknown(node.id))
     return kind
+
+
+def _unknown(name: object) -> str:
+    """What is wrong with the name of a process, and what it may stand for."""
+    text = str(name).lower()
+    cutoff = 0.6 if len(text) > 2 else 0.5  # one letter of two
+    close = difflib.get_close_matches(text, _SPELLINGS, n=1, cutoff=cutoff)
+    hint = f"did you mean {_SPELLINGS[close[0]].symbol}? " if close else ""
+    return f"unknown process {name!r}; {hint}known: {_KNOWN}"
 
 
 def _number(node: ast.expr, text: str) -> Any:
@@ -134,7 +144,7 @@ def _process_from_dict(entry: Mapping[str, Any]) -> Process:
     name = values.pop("process", None)
     kind = _SPELLINGS.get(str(name).lower())
     if kind is None:
-        raise ValueError(f"`description`: unknown process {name!r} in {entry!r}; known: {_KNOWN}")
+        raise ValueError(f"`description`: in {entry!r}: {_unknown(name)}")
     unknown = sorted(set(values) - set(kind().parameters))
     if unknown:
         raise ValueError(

@@ -96,6 +96,42 @@ def plot_residuals(residuals: Tensor, *, rate: float | None = None, ax: Axes | N
     return ax
 
 
+def plot_resampled(
+    names: list[str],
+    bias: Tensor,
+    percentile: tuple[Tensor, ...],
+    studentized: tuple[Tensor, ...],
+    *,
+    percent: float,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw how far the parameters of resamples are from the estimates, in standard deviations of the resamples.
+
+    Args:
+        names: Of the parameters.
+        bias: `(parameter,)`.
+        percentile: Lower and upper limits, `(parameter,)` each.
+        studentized: The same.
+        percent: Probability of both intervals.
+        ax: Where to draw; new axes by default.
+
+    Returns:
+        The axes.
+    """
+    ax = ax if ax is not None else _new_axes()
+    places = np.arange(len(names))
+    ax.axvline(0.0, color=_INK, linewidth=0.8)
+    handles: list[Any] = []
+    for (low, high), shift, color, width in ((percentile, -0.12, _COLOURS[0], 1.6), (studentized, 0.12, _BLUE, 2.6)):
+        handles.append(ax.hlines(places + shift, low.tolist(), high.tolist(), color=color, linewidth=width))
+    handles += ax.plot(bias.tolist(), places, "o", color=_INK, markersize=4)
+    ax.set_yticks(places, names)
+    ax.set_ylim(len(names) - 0.5, -0.5)
+    ax.set_xlabel("less the estimate, in standard deviations of the resamples")
+    _finish(ax, handles, [f"{percent:g} % percentile", f"{percent:g} % studentized", "mean of the resamples"])
+    return ax
+
+
 def add_recordings(wavelet_variances: list[Tensor], *, rate: float | None = None, ax: Axes) -> None:
     """Add the Allan deviations of several recordings to the figure of their joint fit.
 

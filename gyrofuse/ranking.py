@@ -13,8 +13,8 @@ from gyrofuse import _rank_candidates as compositions
 from gyrofuse._checks import (
     check_confidence_level,
     check_floating,
+    check_length,
     check_n_levels,
-    check_positive_integer,
     check_signal,
     largest_level,
 )
@@ -53,8 +53,9 @@ def rank_models(
     equivalent.
 
     Args:
-        signal: `(..., sensor, time)`, or a `Recording`; an item with missing samples is not ranked. With `n_samples`
-            given a wavelet variance `(..., level, sensor)` of records that long.
+        signal: `(..., sensor, time)`, or a `Recording`; an item with missing or infinite samples is not ranked, as its
+            spectrum asks for a whole record: give the longest stretch without, `Recording.longest_whole`. With
+            `n_samples` given a wavelet variance `(..., level, sensor)` of records that long.
         candidates: Models without values or formulas such as `"WN + AR1"`; by default sums of WN, QN, up to three
             AR1s, RW and DR, with as many sinusoids as there are lines. They are tried from one process on, for
             every sensor the extensions of its three best, as long as one of them gains.
@@ -70,7 +71,8 @@ def rank_models(
 
     Raises:
         TypeError: `signal` is not a floating point tensor or a `Recording`, or candidates are no models.
-        ValueError: Bad candidates or options, too few samples, or no item that can be ranked.
+        ValueError: Bad candidates or options, `n_samples` of what is no wavelet variance, too few samples, or no item
+            that can be ranked.
 
     References:
         [V] sections III and IV; G. Schwarz, Annals of Statistics 6, 1978; R. E. Kass, A. E. Raftery, JASA 90, 1995.
@@ -95,7 +97,7 @@ def rank_models(
         usable = items.sum(-1, dtype=torch.float64).isfinite() & (items != items[:, :1]).any(-1)
     else:
         check_floating("signal", values)
-        length = check_positive_integer("n_samples", n_samples)
+        length = check_length(n_samples, recorded=recording is not None)
         values = _given(values, length, n_levels)
         levels = values.shape[-2]
         items = values.detach().mT.reshape(-1, levels).to(torch.float64)
@@ -163,8 +165,8 @@ def _one_of(whole: GMWMResult, i: int, sensors: tuple[str, ...], recording: Reco
 def _report(usable: Tensor, from_signal: bool) -> None:
     """Say how many items cannot be ranked."""
     what = (
-        "expected records that vary and have no missing samples (of records with gaps give the wavelet variance and "
-        "`n_samples`)"
+        "expected records that vary and have no missing samples or infinite ones (of records with gaps give a stretch "
+        "without, or the wavelet variance and `n_samples`)"
         if from_signal
         else "expected wavelet variances that are finite and > 0 at every level"
     )

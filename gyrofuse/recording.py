@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from gyrofuse._checks import check_positive, check_signal
 from gyrofuse._output import Outputs
@@ -139,7 +140,29 @@ class Recording:
             raise ValueError(
                 f"`start`, `stop`: expected a stretch within 0 to {self.duration:.6g} s, got {start:g} to {stop:g} s"
             )
-        here = slice(first, last)
+        return self._cut(slice(first, last))
+
+    def longest_whole(self) -> Recording:
+        """Keep the longest stretch in which no sensor misses a sample; sensors without any are passed over.
+
+        `time` goes on counting from where it did before.
+
+        Raises:
+            ValueError: There is no time at which all of them have a sample.
+        """
+        known = self.signal.isfinite()
+        whole = (known | ~known.any(-1, keepdim=True)).flatten(0, -2).all(0)
+        turns = pad(whole.int(), (1, 1)).diff()
+        starts, stops = (turns > 0).nonzero()[:, 0], (turns < 0).nonzero()[:, 0]
+        if not len(starts):
+            raise ValueError(
+                f"`signal`: expected a time at which all of {_named(self.sensors)} have a sample, got none; select "
+                "fewer sensors"
+            )
+        longest = int((stops - starts).argmax())
+        return self._cut(slice(int(starts[longest]), int(stops[longest])))
+
+    def _cut(self, here: slice) -> Recording:
         return replace(
             self,
             signal=self.signal[..., here],

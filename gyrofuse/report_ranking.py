@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from gyrofuse.model_words import model_method
@@ -18,13 +18,16 @@ _MOST_SENSORS, _MOST_ROWS = 24, 15
 _MOST_NATS = 15.0  # beyond, odds are no number to print
 
 
-def rank_report(result: RankResult, recording: Recording | None = None, *, title: str) -> str:
+def rank_report(
+    result: RankResult, recording: Recording | None = None, *, title: str, remarks: Sequence[str] = ()
+) -> str:
     """Write the report of noise models ranked for the sensors of a recording.
 
     Args:
         result: Of the sensors of one array, or of one per axis.
         recording: What was ranked, for its notes.
         title: Heading of the page.
+        remarks: Sentences shown below the verdict.
 
     Returns:
         An HTML page that needs no other file, no network and no script.
@@ -38,6 +41,7 @@ def rank_report(result: RankResult, recording: Recording | None = None, *, title
         result=result,
         recording=recording,
         parts=parts,
+        remarks=remarks,
         left_out=len(indices) - len(parts),
         method=model_method(fits[0]) if fits else None,
     )

@@ -62,7 +62,8 @@ def robust_wavelet_variance(signal: Tensor, n_levels: int | None = None, *, effi
 
     Returns:
         `(..., level, sensor)`, unit of the signal squared. NaN, with a warning, where no scale fits: no coefficient,
-        or most of them zero.
+        or most of them zero, as at the first levels of a signal of few distinct values. 0 where all of them are, as in
+        `wavelet_variance`.
 
     Raises:
         TypeError: `signal` is not a floating point tensor.
@@ -85,8 +86,8 @@ def robust_wavelet_variance(signal: Tensor, n_levels: int | None = None, *, effi
     unsolved = int(variance.isnan().sum())
     if unsolved:
         warnings.warn(
-            f"no robust scale at {unsolved} of {variance.numel()} levels: NaN there; they hold no complete window, or "
-            "are zero for the most part as a coarse quantiser makes them; ask for other levels",
+            f"no robust scale at {unsolved} of {variance.numel()} levels: NaN there; they hold no complete window (ask "
+            "for fewer levels), or are zero for the most part as a coarse quantiser makes them (give `efficiency=1`)",
             stacklevel=2,
         )
     return variance.view(*batch, n_sensors, n_levels).mT.to(signal.dtype)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -126,6 +127,7 @@ def fit_svo(
         degrees_of_freedom=batched(degrees, torch.float64),
         method=chosen.method,
         selection=chosen.selection and chosen.selection.reshape(batch),
+        positive_definite=None if chosen.positive_definite is None else chosen.positive_definite.reshape(batch),
         n_samples=values.shape[-1],
         sensors=tuple(sensors),
         axes=recording.axes if recording else (),
@@ -228,6 +230,14 @@ def _spread(
         )
         moved = weights_of(combine(counting(resamples, omega), omega)) - weights[:, None]
         found = moved.mT @ moved / moved.shape[1]  # around the estimate, as [Z] does
+        lost = int(found.isnan().flatten(1).any(1).sum())
+        if lost:
+            warnings.warn(
+                f"`covariance`: resampling gives no intervals for {lost} of {len(items)} array(s), for the missing "
+                "samples leave some resamples without any complete window at some level; give covariance='model', a "
+                "stretch without gaps or fewer `n_levels`",
+                stacklevel=3,
+            )
     return normal_spread(found.to(weights), confidence_level)
 
 

@@ -94,6 +94,8 @@ class SVOResult:
         rate: Sampling rate in Hz, when known.
         unit: Unit of the signal, when known.
         selection: Held-out risks, where the method was chosen by them.
+        positive_definite: `(...)`, of RDVG whether the estimated covariance of the random walks is one: where not, the
+            weights minimise nothing. None for other methods.
     """
 
     weights: Tensor
@@ -111,6 +113,7 @@ class SVOResult:
     rate: float | None = None
     unit: str | None = None
     selection: Selection | None = None
+    positive_definite: Tensor | None = None
 
     @property
     def n_levels(self) -> int:
@@ -260,6 +263,8 @@ class SVOResult:
         batched = ("weights", "weights_cov", "weights_degrees", "wavelet_cross_covariance", "degrees_of_freedom")
         interval = ConfidenceInterval(*(limit[index] for limit in self.confidence_interval))
         items = {name: getattr(self, name)[index] for name in batched}
+        if self.positive_definite is not None:
+            items["positive_definite"] = self.positive_definite[index]
         selection = self.selection and self.selection[index]
         return replace(self, axes=(), confidence_interval=interval, selection=selection, **items)
 
@@ -329,6 +334,7 @@ class SVOResult:
         return {
             "method": self.method,
             "selection": self.selection.to_dict() if self.selection else None,
+            "positive_definite": None if self.positive_definite is None else self.positive_definite.tolist(),
             "sensors": list(self.sensors),
             "axes": list(self.axes),
             "rate": self.rate,

@@ -75,7 +75,9 @@ class Tones:
         return total
 
 
-def find_tones(signal: Tensor, n_tones: int, noise_spectrum: NoiseSpectrum | None = None) -> Tones:
+def find_tones(
+    signal: Tensor, n_tones: int, noise_spectrum: NoiseSpectrum | None = None, *, highest: float = math.pi
+) -> Tones:
     """Find the largest spectral lines and measure their frequencies and amplitudes.
 
     One after the other: the largest ratio of periodogram to background, a fit over the bins around it, its removal
@@ -89,14 +91,15 @@ def find_tones(signal: Tensor, n_tones: int, noise_spectrum: NoiseSpectrum | Non
             smooth background is taken from the periodogram itself, and p values allow for its error; below some ten
             cycles in the record, or as close to half the sampling rate, it absorbs all but strong lines, and the
             standard deviations of what is left come out too small.
+        highest: Frequency up to which lines are looked for, rad per sample; p values are of a line up to there.
 
     Returns:
         The tones of every item, on the device of `signal`.
 
     Raises:
         TypeError: Not a floating point tensor.
-        ValueError: Too few samples, missing or constant ones, too many tones, or a spectrum that is not positive or
-            does not fit the batch.
+        ValueError: Too few samples, missing or constant ones, too many tones, a highest frequency with no line
+            below, or a spectrum that is not positive or does not fit the batch.
     """
     n_tones = check_positive_integer("n_tones", n_tones)
     _check(signal)
@@ -106,7 +109,13 @@ def find_tones(signal: Tensor, n_tones: int, noise_spectrum: NoiseSpectrum | Non
             f"`n_tones`: expected at most {n_samples // 16} for {n_samples} samples (16 for each), got {n_tones}; "
             "ask for fewer or give a longer signal"
         )
-    found = [record.find(n_tones) for record in _records(signal, noise_spectrum)]
+    lowest = 2 * math.pi * FEWEST_CYCLES / n_samples
+    if not lowest <= highest <= math.pi:
+        raise ValueError(
+            f"`highest`: expected a frequency from {lowest:.3g} ({FEWEST_CYCLES} cycles in the record) to pi, got "
+            f"{highest!r}; it is in rad per sample"
+        )
+    found = [record.find(n_tones) for record in _records(signal, noise_spectrum, highest)]
     shape = (*signal.shape[:-1], n_tones)
     return Tones(*(torch.cat(parts).reshape(shape) for parts in zip(*found, strict=True)))
 
@@ -148,7 +157,7 @@ def _check(signal: Tensor) -> None:
         )
 
 
-def _records(signal: Tensor, noise_spectrum: NoiseSpectrum | None) -> Iterator[_Records]:
+def _records(signal: Tensor, noise_spectrum: NoiseSpectrum | None, highest: float = math.pi) -> Iterator[_Records]:
     """The batch in parts of bounded size, one at a time."""
     items = signal.detach().reshape(-1, signal.shape[-1])
     n_samples = items.shape[-1]
@@ -163,7 +172,7 @@ def _records(signal: Tensor, noise_spectrum: NoiseSpectrum | None) -> Iterator[_
     for first in range(0, len(items), size):
         part = slice(first, first + size)
         own = None if density is None or low is None else (density[part], low[part])
-        yield _Records(items[part], length, own)
+        yield _Records(items[part], length, own, highest)
 
 
 def _density(noise_spectrum: NoiseSpectrum, f: Tensor, signal: Tensor) -> Tensor:
@@ -192,12 +201,17 @@ class _Records:
         items: `(item, time)`.
         length: Of the transform.
         density: Of the noise, at the bins from 1 on and as the taper shows it at the lowest: `(item, bin)` both.
+        highest: Frequency up to which lines are looked for, rad per sample.
     """
 
-    def __init__(self, items: Tensor, length: int, density: tuple[Tensor, Tensor] | None) -> None:
+    def __init__(self, items: Tensor, length: int, density: tuple[Tensor, Tensor] | None, highest: float) -> None:
         self._length, self._density, self._n = length, density, items.shape[-1]
-        self._first = math.ceil(_FIRST_CYCLE * length / self._n)  # bins in which lines are looked for
+        self._first = math.ceil(_FIRST_CYCLE * length / self._n)  # bins in which there may be lines
         self._last = length // 2 - self._first + 1
+        n_bins = self._last - self._first + 1
+        n_searched = min(math.floor(highest * length / (2 * math.pi)) - self._first + 1, n_bins)
+        self._searched = slice(self._first - 1, self._first - 1 + n_searched)  # of the bins from 1 on
+        self._n_ordinates = (self._n / 2 - 2 * _FIRST_CYCLE) * (n_searched / n_bins)
         n, device = self._n, items.device
         u = torch.arange(n, dtype=torch.float64, device=device) - (n - 1) / 2
         taper = (1 + torch.cos(2 * math.pi / n * u)) / 2
@@ -256,14 +270,13 @@ class _Records:
         """Bin of the largest line and its p value, both `(item,)`."""
         power = self._power()
         dof = self._set_background(power)
-        searched = slice(self._first - 1, self._last)
-        ratio = self._log_seen[:, searched].neg().exp_().mul_(power[:, searched])
+        ratio = self._log_seen[:, self._searched].neg().exp_().mul_(power[:, self._searched])
         if dof is not None:
             # An exponential variable over a background known to `dof` looks: 2 and 2 dof degrees of freedom.
-            ratio = ratio.div_(dof[searched]).log1p_().mul_(dof[searched])
+            looks = dof[self._searched]
+            ratio = ratio.div_(looks).log1p_().mul_(looks)
         largest, at = ratio.max(-1)
-        n_ordinates = self._n / 2 - 2 * _FIRST_CYCLE
-        p_value = -torch.expm1(n_ordinates * torch.log1p(-torch.exp(-largest)))
+        p_value = -torch.expm1(self._n_ordinates * torch.log1p(-torch.exp(-largest)))
         return at + self._first, p_value
 
     def _power(self) -> Tensor:

@@ -71,5 +71,5 @@ def t_quantile(degrees: Tensor, confidence_level: float) -> Tensor:
 
 def chi_square_tail(statistic: Tensor, degrees: Tensor) -> Tensor:
     """Probability that chi-square of so many degrees of freedom exceeds the statistic; NaN where there are none."""
-    tail = torch.special.gammaincc(degrees.clamp(min=1) / 2, statistic.clamp(min=0) / 2)
+    tail = torch.special.gammaincc(torch.where(degrees > 0, degrees, 1) / 2, statistic.clamp(min=0) / 2)
     return torch.where(degrees > 0, tail, torch.nan)

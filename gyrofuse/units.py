@@ -12,6 +12,9 @@ SECONDS_PER_HOUR = 3600.0
 ARCSECONDS_PER_DEGREE = 3600.0
 
 _DEG_PER_S = {"deg/s": 1.0, "mdeg/s": 1e-3, "deg/h": 1 / SECONDS_PER_HOUR, "rad/s": 180 / math.pi}
+RATE_UNITS = tuple(_DEG_PER_S)
+# Of what else sensors give; no datasheet speaks in them.
+OTHER_UNITS = ("m/s^2", "g", "counts")
 
 
 def rate_unit_factor(unit: str, target: str = "deg/s") -> float:
@@ -22,7 +25,10 @@ def rate_unit_factor(unit: str, target: str = "deg/s") -> float:
     """
     for name, value in (("unit", unit), ("target", target)):
         if value not in _DEG_PER_S:
-            raise ValueError(f"`{name}`: expected one of {', '.join(_DEG_PER_S)}, got {value!r}")
+            raise ValueError(
+                f"`{name}`: expected one of {', '.join(RATE_UNITS)}, got {value!r}; multiply the signal by the factor "
+                "to one of them, or state the unit where none is"
+            )
     return _DEG_PER_S[unit] / _DEG_PER_S[target]
 
 

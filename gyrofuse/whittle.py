@@ -72,7 +72,13 @@ class WhittleFit:
 
 
 def refine_whittle(
-    signal: Tensor, made_of: Composition, linear: Tensor, shape: Tensor, *, n_rounds: int = 2
+    signal: Tensor,
+    made_of: Composition,
+    linear: Tensor,
+    shape: Tensor,
+    *,
+    tones: Tones | None = None,
+    n_rounds: int = 2,
 ) -> WhittleFit:
     """Maximise the Whittle likelihood of records from where a moment fit ended.
 
@@ -87,6 +93,8 @@ def refine_whittle(
         made_of: Structure of the model.
         linear: `p` to start from, `(item, process)`; zeros may leave the edge again.
         shape: `x` to start from, `(item, shaped)`; frequencies of sinusoids are found anew.
+        tones: Of the sinusoids, from high to low frequency, `(item, tone)`: kept in records where others are found,
+            as a start that takes a tone for noise would hide it. By default nothing is known of them.
         n_rounds: How often tones and ramp are measured and the noise is fitted; once where there are none.
 
     Returns:
@@ -106,7 +114,8 @@ def refine_whittle(
     usable = signal.sum(-1, dtype=torch.float64).isfinite() & (signal != signal[:, :1]).any(-1)
     usable &= (started >= 0).all(-1) & (started.sum(-1) > 0) & started.isfinite().all(-1)
     usable &= shape[:, noise.at_x].isfinite().all(-1)
-    whole = _refined(signal[usable], made_of, noise, at_tones, linear[usable], shape[usable], n_rounds)
+    known = None if tones is None else _of(tones, usable)
+    whole = _refined(signal[usable], made_of, noise, at_tones, linear[usable], shape[usable], known, n_rounds)
     return _placed(whole, usable)
 
 
@@ -135,6 +144,7 @@ def _refined(
     at_tones: list[int],
     linear: Tensor,
     shape: Tensor,
+    known: Tones | None,
     n_rounds: int,
 ) -> WhittleFit:
     """The same for items that can be fitted."""
@@ -153,6 +163,7 @@ def _refined(
     for _ in range(n_rounds if at_tones or ramp_at else 1):
         if at_tones:
             tones = _measured_tones(signal, slope, len(at_tones), noise, p, x)
+            tones = tones if known is None else _kept(known, tones, n_samples)
         if ramp is not None:
             slope, slope_sd, taken = ramp.measured(signal, tones, p, x)
         energy = bins.energy(_transformed(signal, tones, slope if ramp is not None else None))
@@ -210,8 +221,14 @@ class _Ramp:
         return slope, information.rsqrt(), weight * self.shown.square() / information[:, None]
 
 
-def _of(tones: Tones, part: slice) -> Tones:
+def _of(tones: Tones, part: slice | Tensor) -> Tones:
     return Tones(*(getattr(tones, f.name)[part] for f in fields(Tones)))
+
+
+def _kept(known: Tones, found: Tones, n_samples: int) -> Tones:
+    """Those found where they are the known ones, within half a cycle in the record, and else the known ones."""
+    same = ((found.beta - known.beta).abs() < math.pi / n_samples).all(-1, keepdim=True)
+    return Tones(*(torch.where(same, getattr(found, f.name), getattr(known, f.name)) for f in fields(Tones)))
 
 
 def _measured_tones(signal: Tensor, slope: Tensor, n_tones: int, noise: Noise, p: Tensor, x: Tensor) -> Tones:

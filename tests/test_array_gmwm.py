@@ -15,8 +15,10 @@ from torch import Tensor
 import gyrofuse as gf
 from gyrofuse import _array_search as search
 from gyrofuse import moment_fit
+from gyrofuse._array_fit import _Problem
 from gyrofuse._array_inference import spread_of_fit
 from gyrofuse._array_moments import array_moment_covariance, unvech, vech
+from gyrofuse._records import Records
 from gyrofuse.moment_fit import composition_of
 
 N_SAMPLES, N_RUNS = 4096, 200
@@ -69,7 +71,7 @@ def test_covariance_of_moments_is_that_of_quadratic_forms():
     expected = naive_moment_covariance(list(zip(over_time, theta, strict=True)), levels)
     made_of = composition_of("WN + AR1 + RW", held=False)
     shape = torch.tensor([[math.atanh(phi)]], dtype=torch.float64)
-    got = array_moment_covariance(made_of, torch.from_numpy(theta)[None], shape, n_samples, levels)[0]
+    got = array_moment_covariance(made_of, torch.from_numpy(theta)[None], shape, Records((n_samples,), (levels,)))[0]
     scale = np.sqrt(np.einsum("jqjq->jq", expected))
     error = np.abs(got.numpy() - expected) / (scale[:, :, None, None] * scale)
     assert error.max() < 0.01  # what the covariance of one sensor promises
@@ -101,9 +103,10 @@ def test_derivatives_are_those_of_the_distance():
 def test_mean_and_spread_are_those_of_theory(many):
     """Mean within 0.2 standard deviations and 3.5 standard errors of the truth, spread within 3.5 of theory."""
     made_of = composition_of("WN + RW", held=False)
-    gamma = ARRAY.wavelet_cross_covariance(many.wavelet_cross_covariance.shape[-3])
+    levels = many.wavelet_cross_covariance.shape[-3]
+    gamma = ARRAY.wavelet_cross_covariance(levels)
     nothing = torch.empty(1, 0, dtype=torch.float64)
-    spread, *_ = spread_of_fit(gamma[None], TRUTH[None], nothing, N_SAMPLES, made_of, "optimal")
+    spread, *_ = spread_of_fit(gamma[None], TRUTH[None], nothing, Records((N_SAMPLES,), (levels,)), made_of, "optimal")
     theory = unvech(spread[0].diagonal().sqrt().view(2, 6))
     bias = (many.theta.mean(0) - TRUTH) / theory
     assert (bias.abs() < 0.2 + 3.5 / math.sqrt(N_RUNS)).all(), bias
@@ -207,10 +210,11 @@ def test_without_a_walk_its_variances_are_next_to_nothing():
     found = gf.fit_array_gmwm(signals(20, white), "WN + RW")
     assert bool(found.converged.all())
     made_of = composition_of("WN + RW", held=False)
-    gamma = white.wavelet_cross_covariance(found.wavelet_cross_covariance.shape[-3])
+    levels = found.wavelet_cross_covariance.shape[-3]
+    gamma = white.wavelet_cross_covariance(levels)
     truth = torch.stack([WHITE, 1e-12 * torch.eye(3, dtype=torch.float64)])
     nothing = torch.empty(1, 0, dtype=torch.float64)
-    spread, *_ = spread_of_fit(gamma[None], truth[None], nothing, N_SAMPLES, made_of, "optimal")
+    spread, *_ = spread_of_fit(gamma[None], truth[None], nothing, Records((N_SAMPLES,), (levels,)), made_of, "optimal")
     sd = unvech(spread[0].diagonal().sqrt().view(2, 6))[1].diagonal()
     walk = found.theta[:, 1].diagonal(dim1=-2, dim2=-1)
     assert int((walk > 3 * sd).sum()) <= stats.binom.ppf(0.9995, walk.numel(), 0.1)
@@ -228,14 +232,51 @@ def test_without_a_walk_its_variances_are_next_to_nothing():
     assert found.theta.isfinite().all()
 
 
-def test_memory_as_long_as_the_record_is_said_to_be():
-    memory = gf.ArrayModel([(gf.AR1(math.exp(-1 / 1000), 1.0), WALK)])
-    model = gf.ArrayModel([(gf.WhiteNoise(1.0), WHITE)]) + memory
-    found = gf.fit_array_gmwm(signals(1, model)[0], "WN + AR1")
-    assert "ar1_1: a memory so long" in " ".join(found.remarks[0])
+def test_memory_as_long_as_the_record_has_upper_limits():
+    """The matrix has full rank, and yet its variances have upper limits only: they hold the truth, per sensor."""
+    memory = gf.ArrayModel([(gf.AR1(math.exp(-7 / N_SAMPLES), 1.0), WALK)])
+    found = gf.fit_array_gmwm(signals(40, gf.ArrayModel([(gf.WhiteNoise(1.0), WHITE)]) + memory), "WN + AR1")
+    assert (found.rank == 3).all()
+    low, high = (limit[:, 1] for limit in found.confidence_interval)
+    own = torch.eye(3, dtype=torch.bool)
+    assert (low[:, own] == 0).all()
+    held = (high[:, own] >= WALK.diagonal()).sum(0)
+    assert (held >= stats.binom.ppf(0.0005, 40, 0.95)).all(), held
+    for nothing in (low[:, ~own], high[:, ~own], found.correlation_interval.low[:, 1][:, ~own]):
+        assert nothing.isnan().all()
     assert found.params_interval.low.isnan().all()
     assert found.params.isfinite().all()
-    assert found.to_dict()["remarks"] == [list(found.remarks[0])]
+    words = "ar1_1: hardly told from a random walk at this length, its memory is longer than 1/50 of the record"
+    assert words in found[0].remarks[0][0]
+    assert words in str(found[0])
+    assert "no interval, see below" in str(found[0])
+    assert found[0].to_dict()["remarks"] == [list(found[0].remarks[0])]
+
+
+def test_memory_next_to_white_noise_is_said_to_be():
+    found = gf.fit_array_gmwm(signals(8, gf.ArrayModel([(gf.WhiteNoise(1.0), WHITE)]), 512), "WN + AR1")
+    low, high = (limit[:, 0] for limit in found.params_interval)
+    alike = (low <= 0) & (high >= 0)
+    assert alike.any()
+    said = ["ar1_1: indistinguishable from white noise at this length" in texts for texts in found.remarks]
+    assert said == alike.tolist()
+
+
+def test_fit_is_no_worse_than_the_truth():
+    """In `r' V^-1 r + ln det V`, also where weights that stay would lead far off, as in the first of these arrays."""
+    slow, fast = math.exp(-7 / N_SAMPLES), 0.9
+    theta = torch.stack([WHITE, 5 * WALK, 50 * WALK.flip(0, 1)])
+    processes = (gf.WhiteNoise(1.0), gf.AR1(slow, 1.0), gf.AR1(fast, 1.0))
+    model = gf.ArrayModel(list(zip(processes, theta, strict=True)))
+    found = gf.fit_array_gmwm(signals(40, model, seed=3)[13:17], "WN + 2*AR1")
+    gamma = found.wavelet_cross_covariance
+    present, records = torch.ones_like(vech(gamma), dtype=torch.bool), Records((N_SAMPLES,), (gamma.shape[1],))
+    problem = _Problem(vech(gamma), present, records, composition_of("WN + 2*AR1", held=False), "optimal")
+    none = torch.zeros(4, 3, dtype=torch.float64)
+    got = problem.misfit(search.square_root(found.theta, none), found.params.atanh())
+    shape = torch.tensor([slow, fast], dtype=torch.float64).atanh().expand(4, -1)
+    assert (got < problem.misfit(search.square_root(theta.expand(4, -1, -1, -1), none), shape)).all()
+    assert bool(found.converged.all())
 
 
 def test_missing_sensor_is_the_fit_of_the_others():
@@ -378,3 +419,24 @@ def test_levels_of_given_moments_are_checked():
         gf.fit_array_gmwm(wccv, "WN + RW", n_samples=N_SAMPLES, n_levels=7)
     with pytest.raises(TypeError, match=r"`signal`: expected a torch tensor"):
         gf.fit_array_gmwm([[1.0, 2.0]], "WN + RW")
+
+
+@pytest.mark.parametrize("value", [3.0, math.inf])
+def test_the_sensor_that_spoils_an_array_is_named(value):
+    signal = signals(2)
+    signal[0, 1, :: 1 if math.isfinite(value) else 1000] = value
+    with pytest.warns(UserWarning, match=r"got others in array\(s\) 0 \(sensor 2\); their results are NaN"):
+        assert gf.fit_array_gmwm(signal, "WN + RW").converged.tolist() == [False, True]
+    recording = gf.Recording(signal[0], rate=1.0, sensors=("a", "b", "c"))
+    with pytest.raises(ValueError, match=r"got others in array\(s\) 0 \(sensor b\); leave sensors out"):
+        gf.fit_array_gmwm(recording, "WN + RW")
+
+
+def test_given_moments_are_symmetric_and_not_a_recording():
+    wccv = gf.wavelet_cross_covariance(signals(1)[0].float(), 6)  # rounds
+    assert bool(gf.fit_array_gmwm(wccv, "WN + RW", n_samples=N_SAMPLES).converged)
+    wccv[2, 0, 1] *= 1.5
+    with pytest.raises(ValueError, match="`signal`: expected a symmetric wavelet cross-covariance"):
+        gf.fit_array_gmwm(wccv, "WN + RW", n_samples=N_SAMPLES)
+    with pytest.raises(ValueError, match="`n_samples`: expected None with a Recording"):
+        gf.fit_array_gmwm(gf.Recording(signals(1)[0], rate=1.0), "WN + RW", n_samples=N_SAMPLES)

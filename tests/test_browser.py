@@ -14,8 +14,10 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 
-from gyrofuse import Recording, fit_multiscale, fit_svo
+from gyrofuse import Recording, fit_gmwm, fit_multiscale, fit_svo, rank_models
 from gyrofuse.report import fusion_report, recording_report
+from gyrofuse.report_models import model_report
+from gyrofuse.report_ranking import rank_report
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 HOSTILE = ('"><script>alert(1)</script>', "<b>imu</b>", "<img src=x onerror=alert(2)>", "{{ 7 * 7 }}")
@@ -27,6 +29,8 @@ addEventListener("load", () => {
     tags: [...document.querySelectorAll("*")].map(e => e.tagName),
     text: document.body.innerText,
     overflow: root.scrollWidth - root.clientWidth,
+    hidden: [...document.querySelectorAll(".scroll:has(.stacked)")].map(e => e.scrollWidth - e.clientWidth),
+    colours: [getComputedStyle(document.body).backgroundColor, getComputedStyle(document.body).color],
   });
 });
 </script>"""
@@ -81,7 +85,7 @@ def recording() -> Recording:
     return Recording(noise, rate=100.0, unit="deg/s", sensors=HOSTILE, axes=("x", "y", "z"))
 
 
-@pytest.fixture(scope="module", params=["fusion", "axes", "multiscale", "recording"])
+@pytest.fixture(scope="module", params=["fusion", "axes", "multiscale", "recording", "fit", "rank"])
 def page(request: pytest.FixtureRequest, recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
     result = fit_svo(recording, "long")
     if request.param == "axes":
@@ -89,6 +93,13 @@ def page(request: pytest.FixtureRequest, recording: Recording, tmp_path_factory:
     elif request.param == "multiscale":
         bands = fit_multiscale(recording, "long")
         html = fusion_report(bands, recording, bands.virtual(recording), title=HOSTILE[0])
+    elif request.param == "fit":
+        axis = recording.select(axis="x")
+        html = model_report(fit_gmwm(axis, "WN + QN + AR1 + RW"), axis, title=HOSTILE[0])
+    elif request.param == "rank":
+        axis = recording.select(axis="x")
+        ranked = rank_models(axis, ["WN", "WN + RW", "WN + QN + AR1 + RW"])
+        html = rank_report(ranked, axis, title=HOSTILE[0], remarks=[HOSTILE[1]])
     elif request.param == "fusion":
         html = fusion_report(result[0], title=HOSTILE[2])
     else:
@@ -129,4 +140,17 @@ def test_markup_in_names_stays_text(browser: Browser, page: Path):
 
 
 def test_fits_a_phone(browser: Browser, page: Path):
-    assert browser.measure(page, "--window-size=500,900")["overflow"] <= 0
+    for width in (420, 500):
+        measured = browser.measure(page, f"--window-size={width},900")
+        assert measured["overflow"] <= 0
+        assert all(hidden <= 0 for hidden in measured["hidden"])  # stacked tables show all they say
+
+
+def test_light_and_dark(browser: Browser, page: Path):
+    """Dark ink on a light page, and the other way round where the reader prefers it."""
+    light, dark = (
+        [sum(map(int, re.findall(r"\d+", colour)[:3])) for colour in measured["colours"]]
+        for measured in (browser.measure(page, f"--blink-settings=preferredColorScheme={scheme}") for scheme in (1, 0))
+    )
+    assert light[0] > 700 > 150 > light[1]
+    assert dark[0] < 150 < 600 < dark[1]

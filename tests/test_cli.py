@@ -307,6 +307,10 @@ def test_options_reach_the_noise_fit(
         (("--model", "WN", "--refine", "--robust", "0.6"), "leave out --refine or --robust"),
         (("--model", "WN", "--robust", "0.3"), "expected 0.5 to 1, got 0.3"),
         (("--model", "WN + SIN", "--robust", "0.6"), "SIN"),
+        (
+            ("--model", "WN", "--unit", "banana"),
+            "`--unit`: expected one of deg/s, mdeg/s, deg/h, rad/s, m/s^2, g, counts",
+        ),
         (("--model", "WN", "--weighting", "equal"), "'equal' is not one of 'optimal', 'diagonal', 'identity'"),
     ],
 )
@@ -314,6 +318,28 @@ def test_fit_refuses(run: Run, log: Path, tmp_path: Path, options: tuple[str, ..
     before = contents(tmp_path)
     refused(run("fit", log, *options), says)
     assert contents(tmp_path) == before
+
+
+def test_units_that_the_log_does_not_state(run: Run):
+    signal = torch.randn(1, 500, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    gf.Recording(signal, rate=100.0).save("bare.npz")
+    fit = ("fit", "bare.npz", "--model", "WN")
+    refused(run(*fit, "--header", "n.h"), "where the log does not say, give its unit with --unit")
+    assert "angle random walk" not in run(*fit).out
+    for word, unit in (("dps", "deg/s"), ("rad/s", "rad/s")):  # what it says to do
+        done = run(*fit, "--unit", word, "--header", "n.h", "--force")
+        assert done.status == 0
+        assert "angle random walk N" in done.out
+        assert f"in {unit}" in Path("n.h").read_text()
+    for unit in ("m/s^2", "g", "counts"):
+        done = run(*fit, "--unit", unit)
+        assert done.status == 0
+        assert "angle random walk" not in done.out
+        refused(run(*fit, "--unit", unit, "--header", "other.h"), f"got unit '{unit}'; where the log does not say")
+    done = run(*fit, "--unit", "deg/s", "--scale", 0.001, "--header", "other.h")  # and of counts
+    assert done.status == 0
+    simulate = ("simulate", "WN(variance=1)", "--samples", 100, "--rate", 10, "--out", "s.npz")
+    refused(run(*simulate, "--unit", "furlong"), "`--unit`: expected one of deg/s")
 
 
 def test_reports_of_fits_are_replaced_with_force_only(run: Run, log: Path):

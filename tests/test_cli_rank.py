@@ -67,6 +67,31 @@ def test_refuses(run: Run, log: Path, options: tuple[str, ...], says: str):
     assert says in done.err
 
 
+def test_samples_that_are_missing_leave_the_longest_stretch(run: Run, log: Path):
+    recording = gf.read_recording(log)
+    recording.signal[0, [300, 1500]] = torch.nan
+    recording.signal[1, 310] = torch.inf  # NaN in the log's recording
+    recording.save(log, force=True)
+    done = run("rank", log, "--candidates", "WN,WN+RW", "--report", "r.html", "--json", "r.json")
+    assert done.status == 0
+    told = "Ranked on 3.11 to 15 s alone, 1189 of 2000 samples, the longest stretch that no sensor lacks a sample of"
+    assert told in " ".join(done.out.split())
+    result = gf.rank_models(gf.read_recording(log).between(3.11, 15.0), ["WN", "WN + RW"])
+    assert str(result) in done.out
+    assert json.loads(Path("r.json").read_text()) == result.to_dict()
+    assert told in Page(Path("r.html").read_text()).text
+    whole = run("rank", log, "--candidates", "WN,WN+RW", "--rest", "4:14")
+    assert "Ranked on" not in whole.out
+    alone = run("rank", log, "--candidates", "WN,WN+RW", "--sensors", "b")
+    assert "Ranked on 3.11 to 20 s alone, 1689 of 2000 samples" in alone.out
+    assert "fewer --sensors" not in alone.out
+    recording.signal[0, ::20] = torch.nan
+    recording.save(log, force=True)
+    refused = run("rank", log)
+    assert (refused.status, refused.out) == (2, "")
+    assert "`LOG`: expected a stretch of at least 32 samples that no sensor lacks, got one of 19" in refused.err
+
+
 def test_a_report_is_replaced_with_force_only(run: Run, log: Path):
     Path("r.html").write_text("mine")
     rank = ("rank", log, "--candidates", "WN", "--report", "r.html")

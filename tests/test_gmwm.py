@@ -250,3 +250,39 @@ def test_a_sensor_that_is_not_fitted_is_none_in_the_dictionary():
     signal[1] = 3.0
     plain = gf.fit_gmwm(signal, "WN + RW").to_dict()
     assert json.loads(json.dumps(plain, allow_nan=False))["model"]["processes"][0]["variance"][1] is None
+
+
+def test_infinite_samples_are_no_measurement():
+    signal = torch.randn(2, 1000, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
+    signal[1, 7] = -math.inf
+    with pytest.warns(
+        UserWarning, match=r"nor has one with infinite samples; .* got others at sensor 2; their results"
+    ):
+        found = gf.fit_gmwm(signal, "WN")
+    assert found.converged.tolist() == [True, False]
+    with pytest.raises(ValueError, match="infinite samples"):
+        gf.fit_gmwm(signal, "WN", strict=True)
+    with pytest.raises(ValueError, match=r"`signal`: .* infinite samples"):
+        gf.fit_jointly([signal[:1], signal[1:]], "WN")
+    signal[1, 7] = math.nan
+    assert gf.fit_gmwm(signal, "WN").converged.all()
+
+
+def test_lengths_are_for_wavelet_variances_alone():
+    signal = torch.randn(2, 1000, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
+    recording = gf.Recording(signal, rate=1.0)
+    for function in (gf.fit_gmwm, lambda values, model, **options: gf.rank_models(values, [model], **options)):
+        with pytest.raises(ValueError, match=r"`n_samples`: expected None with a Recording, .* got 1000; leave it out"):
+            function(recording, "WN", n_samples=1000)
+        with pytest.raises(
+            ValueError, match=r"`signal`: expected a wavelet variance .* got shape \(2, 1000\), that of"
+        ):
+            function(signal, "WN", n_samples=1000)
+
+
+def test_other_units_than_of_rates_have_no_datasheet():
+    signal = torch.randn(1, 1000, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
+    texts = {unit: str(gf.fit_gmwm(gf.Recording(signal, rate=1.0, unit=unit), "WN")) for unit in ("m/s^2", "deg/s")}
+    assert "white_noise.variance" in texts["m/s^2"]
+    assert "angle random walk" not in texts["m/s^2"]
+    assert "angle random walk" in texts["deg/s"]

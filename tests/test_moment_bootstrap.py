@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 
+import matplotlib as mpl
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -96,6 +98,52 @@ def test_it_speaks_and_leaves_out_what_was_not_fitted():
     assert found.std[1].isnan().all()
     assert "random_walk.variance" in str(found)
     assert json.loads(json.dumps(found.to_dict()))["p_value"][1] is None
+
+
+def test_where_nothing_can_be_stated_it_says_why(fitted, monkeypatch):
+    signal = signals()
+    signal[1] = 1.0
+    with pytest.warns(UserWarning, match="constant signal"):
+        half = gf.fit_gmwm(signal, "WN + RW")
+    text = str(gf.bootstrap_gmwm(half, 20, generator=seeded()))
+    assert "sensor 2: not fitted, so that there is nothing to resample" in text
+    assert "nan" not in text
+
+    def fails(records, *rest):
+        again, spread, distance = moment_bootstrap_fitted(records, *rest)
+        again[:, 0] = torch.nan
+        again[1:, 1] = torch.nan
+        return again, spread, distance
+
+    moment_bootstrap_fitted = moment_bootstrap._fitted
+    monkeypatch.setattr(moment_bootstrap, "_fitted", fails)
+    found = gf.bootstrap_gmwm(fitted, 20, generator=seeded())
+    text = str(found)
+    assert "sensor 1: none of 20 resamples could be fitted; the fit stands alone" in text
+    assert f"{fitted.params[0, 0].item():.6g}" in text
+    assert ", 19 not fitted" in text
+    assert "nan" not in text
+    assert found.p_value.isfinite().tolist() == [False, True]
+    assert found.std.isnan().all()  # of one resample there is no spread
+
+
+def test_a_variance_at_zero_is_referred_to_the_fit():
+    white = torch.randn(1, 512, generator=seeded(0), dtype=torch.float64)
+    fit = gf.fit_gmwm(white, "WN + QN + RW")
+    assert (fit.params == 0).any()
+    assert "at its limit: see the interval of the fit" in str(gf.bootstrap_gmwm(fit, 20, generator=seeded()))
+
+
+def test_figure_shows_intervals_in_standard_deviations(fitted):
+    found = gf.bootstrap_gmwm(fitted, 20, generator=seeded(1))
+    with mpl.rc_context({"backend": "agg"}):
+        ax = found.plot(index=(1,))
+    assert [label.get_text() for label in ax.get_yticklabels()] == list(fitted.param_names)
+    labels = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert labels == ["95 % percentile", "95 % studentized", "mean of the resamples"]
+    drawn = torch.as_tensor(np.array([line[:, 0] for line in ax.collections[1].get_segments()]))
+    low, high = ((limit[1] - found.params[1]) / found.std[1] for limit in found.studentized)
+    torch.testing.assert_close(drawn, torch.stack([low, high], -1))
 
 
 def test_bad_arguments_are_told(fitted):

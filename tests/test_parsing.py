@@ -36,6 +36,9 @@ def test_formulas(formula, meaning):
         ("WN +", r"cannot read 'WN \+' near character 4"),
         ("WN RW", "near character"),
         ("WN + XY", r"at character 6 of 'WN \+ XY': unknown process 'XY'; known: WN \(WhiteNoise\)"),
+        ("WN + AR", "unknown process 'AR'; did you mean AR1\\? known: WN"),
+        ("WM", "unknown process 'WM'; did you mean WN\\? known: WN"),
+        ("WhiteNose", "unknown process 'WhiteNose'; did you mean WN\\?"),
         ("WN - RW", "expected processes joined by"),
         ("-AR1", "expected processes joined by"),
         ("2*3", "expected processes joined by"),
@@ -68,6 +71,7 @@ def test_dictionary_keeps_batches_and_unknowns():
         ({}, "expected the entry 'processes' of a model or 'components' of an array"),
         ({"processes": []}, "at least one process"),
         ({"processes": [{"process": "Pink"}]}, "unknown process 'Pink'.*known: WN"),
+        ({"processes": [{"process": "AR"}]}, "unknown process 'AR'; did you mean AR1"),
         ({"processes": [{"variance": 1.0}]}, "unknown process None"),
         (
             {"processes": [{"process": "AR1", "theta": 1.0}]},

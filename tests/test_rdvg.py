@@ -183,6 +183,16 @@ def test_bad_signals_are_told():
         rdvg(sparse)
 
 
+def test_a_virtual_gyro_says_where_its_weights_minimise_nothing():
+    signal, _, _ = white_and_walk(4096, 2, seed=0)
+    signal[1] = torch.randn(3, 4096, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    with pytest.warns(UserWarning, match="not positive definite in 1 of 2"):
+        result = gf.fit_svo(signal, method="rdvg")
+    assert result.to_dict()["positive_definite"] == [True, False]
+    assert result[1].to_dict()["positive_definite"] is False
+    assert gf.fit_svo(signal[0], method="equal").to_dict()["positive_definite"] is None
+
+
 def test_the_summary_and_the_dictionary_say_what_was_found():
     signal, _, _ = white_and_walk(4096, 2, seed=0)
     result = rdvg(signal[0])

@@ -57,3 +57,7 @@ def test_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         exec(block, scope)
     assert scope["weights"].sum().item() == pytest.approx(1)
     assert scope["virtual"].shape == (2000,)
+    told = str(scope["ranked"])
+    assert scope["ranked"].names == ("WN + AR1 + SIN",) * 3
+    for words in ("criterion", "redundant: AR1 2 is white noise", "not told from it: 2*AR1 + SIN"):
+        assert words in told

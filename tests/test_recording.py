@@ -71,6 +71,22 @@ class TestByHand:
         with pytest.raises(ValueError, match="expected a stretch within 0 to 5 s, got 6 to 7 s"):
             recording.between(6, 7)
 
+    def test_longest_whole(self):
+        values = signal()
+        values[0, 10], values[1, 35], values[2, 36] = torch.nan, torch.inf, torch.nan
+        recording = gf.Recording(values, rate=10, channels={"temperature": torch.arange(50.0)})
+        part = recording.longest_whole()
+        torch.testing.assert_close(part.signal, values[:, 11:35])
+        assert part.time[0].item() == pytest.approx(1.1)
+        assert part.channels["temperature"][0] == 11
+        values[2] = torch.nan  # passed over
+        assert gf.Recording(values.expand(2, 3, 50), rate=10).longest_whole().n_samples == 24
+        values[:2, ::2], values[2, 1::2] = torch.nan, 0.0
+        values[1, 1::2] = torch.nan
+        values[1, 0] = 1.0
+        with pytest.raises(ValueError, match="`signal`: expected a time at which all of '1', '2', '3' have a sample"):
+            gf.Recording(values, rate=10).longest_whole()
+
     def test_summary_and_dict_are_reproducible(self):
         values = signal()
         values[1, 10:20] = torch.nan

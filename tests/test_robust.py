@@ -186,6 +186,26 @@ def test_where_no_scale_fits():
     assert got.isnan().flatten().tolist() == [False] * 2 + [True] * 3
 
 
+def test_few_distinct_values_are_told_a_way_out_that_works():
+    signal = (noise(2, 4000) / 5).round()
+    with pytest.warns(UserWarning, match=r"as a coarse quantiser makes them \(give `efficiency=1`\)"):
+        assert gf.robust_wavelet_variance(signal, 6)[0].isnan().all()
+    assert (gf.robust_wavelet_variance(signal, 6, efficiency=1) > 0).all()
+    with (
+        pytest.warns(UserWarning, match="no robust scale"),
+        pytest.raises(ValueError, match=r"give `efficiency=1` .* for signals of few distinct values"),
+    ):
+        gf.fit_gmwm(signal, "WN", efficiency=0.6)
+    assert gf.fit_gmwm(signal, "WN", efficiency=1).params.isfinite().all()
+
+
+def test_a_constant_has_no_variance_as_in_the_classic():
+    signal = torch.full((1, 64), 3.0, dtype=torch.float64)
+    robust, classic = gf.robust_wavelet_variance(signal), gf.wavelet_variance(signal)
+    assert torch.equal(robust, classic)
+    assert (robust == 0).all()
+
+
 @pytest.mark.parametrize(
     ("arguments", "error", "match"),
     [

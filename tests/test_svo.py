@@ -180,6 +180,17 @@ def test_intervals_on_request():
     assert ((wide.low < narrow.low) & (narrow.high < wide.high)).all()
 
 
+def test_resampling_without_intervals_says_so():
+    signal = torch.randn(2, 2, 512, dtype=torch.float64, generator=torch.Generator().manual_seed(8))
+    signal[1, 0, 250] = torch.nan
+    with pytest.warns(UserWarning, match="`covariance`: resampling gives no intervals for 1 of 2 array") as caught:
+        result = fit_svo(signal, covariance="resampling", n_levels=8)
+    assert caught[0].filename == __file__
+    assert result.confidence_interval.low.isnan().all(-1).tolist() == [False, True]
+    for options in ({"n_levels": 8}, {"n_levels": 3, "covariance": "resampling"}):  # what it says to do
+        assert fit_svo(signal, **options).confidence_interval.low.isfinite().all()
+
+
 def test_a_batch_equals_its_items():
     signal = torch.stack([array(seed=seed) for seed in range(6)]).view(2, 3, 4, 3000)
     result = fit_svo(signal, "long")

@@ -109,7 +109,8 @@ def print_runs(name: str, runs: Runs) -> None:
     for k, (process, _) in enumerate(runs.components):
         cells = [held[0][k][own], held[0][k][~own], held[1][k][~own]]
         shares = "".join(
-            f"{100 * cell.nanmean().item():>{width}.1f}" for cell, width in zip(cells, (11, 13, 14), strict=True)
+            f"{'none' if cell.isnan().all() else format(100 * cell.nanmean().item(), '.1f'):>{width}}"
+            for cell, width in zip(cells, (11, 13, 14), strict=True)
         )
         label = process.symbol + (f" {process.phi:.4f}" if isinstance(process, gf.AR1) else "")
         print(f"{label:<12}{bias[k].abs().max().item():>8.2f}{ratio[k].median().item():>9.2f}{shares}")
