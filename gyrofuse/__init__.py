@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 from gyrofuse._linalg import SingularCovarianceError
 from gyrofuse._result import ConfidenceInterval
+from gyrofuse._version import __version__ as __version__
 from gyrofuse.array_gmwm import fit_array_gmwm
 from gyrofuse.array_gmwm_result import ArrayGMWMResult
 from gyrofuse.bootstrap import block_bootstrap, bootstrap_wccv_covariance, bootstrap_wccv_interval, signal_bootstrap
@@ -66,8 +67,7 @@ from gyrofuse.svo_weights import SVOWeights, svo_weights
 
 if TYPE_CHECKING:
     from gyrofuse.metric import WaveletCrossCovariance
-
-__version__ = "0.1.0"
+    from gyrofuse.mismatch import Finding, MismatchReport, diagnose
 
 __all__ = [
     "AR1",
@@ -80,12 +80,14 @@ __all__ = [
     "Datasheet",
     "Drift",
     "EnoughData",
+    "Finding",
     "GMWMBootstrap",
     "GMWMResult",
     "Gain",
     "HaarFilterBank",
     "JointFit",
     "LiveSVO",
+    "MismatchReport",
     "Model",
     "MultiScaleResult",
     "MultiScaleSVO",
@@ -113,6 +115,7 @@ __all__ = [
     "bootstrap_weights_covariance",
     "cross_covariance",
     "datasheet",
+    "diagnose",
     "equal_weights",
     "find_saturation",
     "fit_array_gmwm",
@@ -149,7 +152,12 @@ __all__ = [
 ]
 
 # Names whose modules load more than torch and numpy.
-_LAZY = {"WaveletCrossCovariance": "gyrofuse.metric"}
+_LAZY = {
+    "WaveletCrossCovariance": "gyrofuse.metric",
+    "diagnose": "gyrofuse.mismatch",
+    "Finding": "gyrofuse.mismatch",
+    "MismatchReport": "gyrofuse.mismatch",
+}
 
 
 def __getattr__(name: str) -> Any:

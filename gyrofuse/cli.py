@@ -6,7 +6,6 @@ Bad input ends with one line on stderr and exit status 2, a defect of the progra
 
 from __future__ import annotations
 
-import json
 import shutil
 import signal
 import sys
@@ -24,6 +23,7 @@ import typer
 from gyrofuse._checks import check_positive, check_positive_integer
 from gyrofuse._console import Commands, progress, say, say_table, warn
 from gyrofuse._output import output_folder
+from gyrofuse.cli_mismatch import diagnose
 from gyrofuse.cli_models import fit, rank
 from gyrofuse.cli_shared import (
     Axis,
@@ -40,6 +40,7 @@ from gyrofuse.cli_shared import (
     known_unit,
     outputs,
     read,
+    read_model,
     say_notes,
     stretch,
     titled,
@@ -48,7 +49,7 @@ from gyrofuse.cli_shared import (
 from gyrofuse.demo import FILES, run_demo
 from gyrofuse.multiscale import fit_multiscale
 from gyrofuse.multiscale_result import MultiScaleResult
-from gyrofuse.parsing import model_from_dict, parse_model
+from gyrofuse.parsing import parse_model
 from gyrofuse.processes import Model
 from gyrofuse.recording import Recording
 from gyrofuse.report import (
@@ -239,6 +240,7 @@ def fuse(
 
 app.command()(fit)
 app.command()(rank)
+app.command()(diagnose)
 
 
 @app.command()
@@ -271,13 +273,16 @@ def simulate(
     check_positive_integer("--sensors", 1 if sensors is None else sensors)
     source = [Path(model)] if model.lower().endswith(".json") else []
     with outputs(force, source, out=out, json=json_file, report=report) as drafts:
-        noise = _read_model(source[0]) if source else parse_model(model)
+        noise = read_model(source[0]) if source else parse_model(model)
         generator = torch.Generator()
         seed = generator.seed() % 2**32 if seed is None else seed
         generator.manual_seed(seed)
-        if isinstance(noise, ArrayModel) and sensors is not None:
-            raise ValueError(f"`--sensors`: {model} is a model of {noise.n_sensors} sensors; leave the option out")
-        batch = () if isinstance(noise, ArrayModel) else (1 if sensors is None else sensors,)
+        whole = not isinstance(noise, Model)
+        if not isinstance(noise, Model | ArrayModel):
+            noise.check(rate, unit)
+        if whole and sensors is not None:
+            raise ValueError(f"`--sensors`: {model} is a model of a whole array; leave the option out")
+        batch = () if whole else (1 if sensors is None else sensors,)
         with progress("simulating"):
             signal = noise.simulate(samples, batch=batch, generator=generator).flatten(0, -2)
         recording = Recording(signal, rate=rate, unit=unit)
@@ -311,7 +316,8 @@ def demo(
         for path, name in ((json_file, "result.json"), (report, "report.html")):
             if path:
                 shutil.copyfile(folder / name, drafts[path])
-    say(f"{story}\n\nReport: {out / 'report.html'}\nNoise models: {out / 'models.html'}\nFigures: {out / 'figures'}")
+    pages = {"Report": "report.html", "Noise models": "models.html", "Mismatch": "mismatch.html", "Figures": "figures"}
+    say("\n".join([f"{story}\n", *(f"{name}: {out / file}" for name, file in pages.items())]))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -322,14 +328,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if threading.current_thread() is threading.main_thread():  # ended from outside: leave no draft behind
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     app(arguments)
-
-
-def _read_model(path: Path) -> Model | ArrayModel:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        return model_from_dict(content)
-    except (ValueError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path}: expected a model in JSON, as to_dict() of a model gives it: {error}") from None
 
 
 def _scale_weights(text: str) -> str | list[float]:

@@ -27,6 +27,7 @@ from gyrofuse.cli_shared import (
     say_notes,
     stretch,
     titled,
+    without_gaps,
     write_json,
 )
 from gyrofuse.export import to_c_header, to_kalibr
@@ -43,6 +44,7 @@ from gyrofuse.tones import FEWEST_SAMPLES
 from gyrofuse.units import RATE_UNITS
 
 _MOST_FITS = 12  # printed in full
+_WITH_GAPS = ", or fit a model with `gyrofuse fit`, which gets along with gaps"
 
 
 class Weighting(str, Enum):
@@ -202,7 +204,7 @@ def rank(
         recording = read(logs, axis, sensors, rate, unit, scale, key, mounting)
         with progress("ranking"):
             asked = recording.between(*resting) if resting else recording
-            part, remarks = _without_gaps(asked)
+            part, remarks = without_gaps(asked, "Ranked", FEWEST_SAMPLES, _WITH_GAPS)
             result = rank_models(part, formulas, confidence_level=confidence_level, n_levels=levels)
         if figure:
             _draw(result, drafts[figure], figure)
@@ -217,21 +219,3 @@ def rank(
     if len(fits) <= _MOST_FITS:
         say("\n".join(f"\n{fit}" for fit in fits))
     say_notes(recording)
-
-
-def _without_gaps(recording: Recording) -> tuple[Recording, list[str]]:
-    """The longest stretch that a spectrum can be taken of, and what to say about it."""
-    part = recording.longest_whole()
-    if part.n_samples == recording.n_samples:
-        return recording, []
-    if part.n_samples < FEWEST_SAMPLES <= recording.n_samples:
-        raise ValueError(
-            f"`LOG`: expected a stretch of at least {FEWEST_SAMPLES} samples that no sensor lacks, got one of "
-            f"{part.n_samples}; choose with --sensors, or fit a model with `gyrofuse fit`, which gets along with gaps"
-        )
-    start = part.time[0].item()
-    more = "; fewer --sensors may have a longer one" if part.n_sensors > 1 else ""
-    return part, [
-        f"Ranked on {start:.6g} to {start + part.duration:.6g} s alone, {part.n_samples} of {recording.n_samples} "
-        f"samples, the longest stretch that no sensor lacks a sample of{more}."
-    ]

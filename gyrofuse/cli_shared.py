@@ -6,15 +6,21 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from gyrofuse._console import progress, say_table
 from gyrofuse._output import Outputs
 from gyrofuse.io.columns import canonical_unit
+from gyrofuse.parsing import model_from_dict
+from gyrofuse.processes import Model
 from gyrofuse.recording import Recording, read_recording
+from gyrofuse.simulate import ArrayModel
 from gyrofuse.units import OTHER_UNITS, RATE_UNITS
+
+if TYPE_CHECKING:
+    from gyrofuse.mismatch.repaired import RepairedModel
 
 _SUFFIXES = {
     "out": (".npz", ".csv"),
@@ -23,6 +29,7 @@ _SUFFIXES = {
     "report": (".html",),
     "kalibr": (".yaml", ".yml"),
     "model-out": (".json",),
+    "corrected": (".npz",),
     "header": (".h",),
 }
 
@@ -109,6 +116,44 @@ def outputs(force: bool, inputs: Sequence[Path | None] = (), **asked: Path | Non
 def titled(logs: Sequence[Path]) -> str:
     """What a title calls a log of one file or several."""
     return logs[0].name if len(logs) == 1 else f"{logs[0].name} and {len(logs) - 1} more"
+
+
+def read_model(path: Path) -> Model | ArrayModel | RepairedModel:
+    """A model from JSON, as `to_dict()` of a model gives it, or that of a simulation that a diagnosis repaired."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if "effects" not in content:
+            return model_from_dict(content)
+        from gyrofuse.mismatch.saved import repaired_from_dict
+
+        return repaired_from_dict(content)
+    except (ValueError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path}: expected a model in JSON, as to_dict() of a model gives it: {error}") from None
+
+
+def without_gaps(recording: Recording, done: str, fewest: int, otherwise: str = "") -> tuple[Recording, list[str]]:
+    """The longest stretch that no sensor lacks a sample of, and what to say about it.
+
+    Args:
+        recording: As read.
+        done: What the command does with it, a participle: "Ranked".
+        fewest: Samples that it needs.
+        otherwise: What else could be done where there are fewer.
+    """
+    part = recording.longest_whole()
+    if part.n_samples == recording.n_samples:
+        return recording, []
+    if part.n_samples < fewest <= recording.n_samples:
+        raise ValueError(
+            f"`LOG`: expected a stretch of at least {fewest} samples that no sensor lacks, got one of "
+            f"{part.n_samples}; choose with --sensors{otherwise}"
+        )
+    start = part.time[0].item()
+    more = "; fewer --sensors may have a longer one" if part.n_sensors > 1 else ""
+    return part, [
+        f"{done} on {start:.6g} to {start + part.duration:.6g} s alone, {part.n_samples} of {recording.n_samples} "
+        f"samples, the longest stretch that no sensor lacks a sample of{more}."
+    ]
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse import plotting
+from gyrofuse.demo_mismatch import MOST_SAMPLES, concealed, mismatch_story
 from gyrofuse.demo_models import CANDIDATES, models_figure, models_story, true_models
 from gyrofuse.processes import AR1, WhiteNoise
 from gyrofuse.ranking import rank_models
@@ -56,7 +57,7 @@ _P3 = (
     (7.38584e-15, -1.00044e-15, -1.3776e-15, 5.19119e-15, 3.78632e-15, 4.990004e-14),
 )
 
-FILES = ("report.html", "result.json", "models.html", "models.json", "figures")
+FILES = ("report.html", "result.json", "models.html", "models.json", "mismatch.html", "mismatch.json", "figures")
 
 
 def demo_array() -> ArrayModel:
@@ -69,7 +70,7 @@ def demo_array() -> ArrayModel:
 
 
 def run_demo(folder: Path, n_samples: int = N_SAMPLES) -> str:
-    """Simulate the array, fuse it for long and short averaging times, find noise models, and write all of it down.
+    """Simulate the array, fuse it, find noise models and a concealed effect, and write all of it down.
 
     Args:
         folder: Where to write `FILES`; it exists.
@@ -78,8 +79,10 @@ def run_demo(folder: Path, n_samples: int = N_SAMPLES) -> str:
     Returns:
         What was simulated and found, as text.
     """
-    array = demo_array()
-    signal = array.simulate(n_samples, generator=torch.Generator().manual_seed(SEED))
+    from gyrofuse.mismatch import diagnose
+
+    array, generator = demo_array(), torch.Generator().manual_seed(SEED)
+    signal = array.simulate(n_samples, generator=generator)
     recording = Recording(signal, rate=RATE, unit=UNIT)
     long, short = (fit_svo(recording, scale_weights) for scale_weights in ("long", "short"))
     truth = array.wavelet_cross_covariance(long.n_levels)
@@ -93,9 +96,12 @@ def run_demo(folder: Path, n_samples: int = N_SAMPLES) -> str:
     models, truths = rank_models(together, CANDIDATES), true_models(array, long.weights)
     title = "Noise models of six simulated gyros and of the virtual gyro"
     pages = {"report.html": report, "models.html": rank_report(models, together, title=title)}
+    other = concealed(array, min(n_samples, MOST_SAMPLES), RATE, UNIT, generator)
+    mismatch = diagnose(other, array)
+    mismatch.to_html(folder / "mismatch.html", title="A recording of six gyros, and a simulation that lacks something")
     for name, page in pages.items():
         (folder / name).write_text(page, encoding="utf-8")
-    for name, result in (("result.json", long), ("models.json", models)):
+    for name, result in (("result.json", long), ("models.json", models), ("mismatch.json", mismatch)):
         (folder / name).write_text(json.dumps(result.to_dict()) + "\n", encoding="utf-8")
     figures = folder / "figures"
     figures.mkdir()
@@ -107,7 +113,8 @@ def run_demo(folder: Path, n_samples: int = N_SAMPLES) -> str:
     }
     for name, figure in drawn.items():
         save_figure(figure, figures / f"{name}.png", "png")
-    return f"{_story(long, short, truth, remarks)}\n\n{models_story(models, truths)}"
+    stories = (_story(long, short, truth, remarks), models_story(models, truths), mismatch_story(other, mismatch))
+    return "\n\n".join(stories)
 
 
 def _symmetric(rows: tuple[tuple[float, ...], ...]) -> Tensor:

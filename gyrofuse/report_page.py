@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from gyrofuse import plotting
+from gyrofuse._version import __version__
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -71,8 +72,6 @@ def render(template: str, **context: Any) -> str:
         **context: What the template asks for, all of it.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    from gyrofuse import __version__
 
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).with_name("templates")),

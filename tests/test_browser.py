@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from html import unescape
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,8 +15,9 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 
-from gyrofuse import Recording, fit_gmwm, fit_multiscale, fit_svo, rank_models
+from gyrofuse import Recording, WhiteNoise, diagnose, fit_gmwm, fit_multiscale, fit_svo, rank_models
 from gyrofuse.report import fusion_report, recording_report
+from gyrofuse.report_mismatch import mismatch_page
 from gyrofuse.report_models import model_report
 from gyrofuse.report_ranking import rank_report
 
@@ -85,7 +87,7 @@ def recording() -> Recording:
     return Recording(noise, rate=100.0, unit="deg/s", sensors=HOSTILE, axes=("x", "y", "z"))
 
 
-@pytest.fixture(scope="module", params=["fusion", "axes", "multiscale", "recording", "fit", "rank"])
+@pytest.fixture(scope="module", params=["fusion", "axes", "multiscale", "recording", "fit", "rank", "mismatch"])
 def page(request: pytest.FixtureRequest, recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
     result = fit_svo(recording, "long")
     if request.param == "axes":
@@ -100,6 +102,12 @@ def page(request: pytest.FixtureRequest, recording: Recording, tmp_path_factory:
         axis = recording.select(axis="x")
         ranked = rank_models(axis, ["WN", "WN + RW", "WN + QN + AR1 + RW"])
         html = rank_report(ranked, axis, title=HOSTILE[0], remarks=[HOSTILE[1]])
+    elif request.param == "mismatch":
+        axis = recording.select(axis="x")
+        turns = 0.9 * torch.arange(axis.n_samples, dtype=torch.float64)
+        report = diagnose(replace(axis, signal=axis.signal + 0.5 * turns.cos()), WhiteNoise(1.0))
+        assert report.findings
+        html = mismatch_page(report, title=HOSTILE[0], remarks=[HOSTILE[1]])
     elif request.param == "fusion":
         html = fusion_report(result[0], title=HOSTILE[2])
     else:

@@ -16,10 +16,19 @@ PACKAGE = Path(__file__).resolve().parents[1] / "gyrofuse"
 # From top to bottom; modules of one layer may use each other, as long as nothing goes round in circles. A leading
 # underscore puts a module at the bottom, unless it is named here. A name without a file is one to come.
 LAYERS = [
-    {"__main__", "cli", "cli_models", "cli_shared", "_console", "lightning_module"},
-    {"demo", "demo_models", "report", "report_words", "report_models", "report_ranking", "model_words", "report_page"},
+    {"__main__", "cli", "cli_mismatch", "cli_models", "cli_shared", "_console", "lightning_module"},
+    {
+        "demo",
+        "demo_mismatch",
+        "demo_models",
+        "report",
+        "report_words",
+        "report_models",
+        "report_ranking",
+        "model_words",
+    },
     {"__init__"},
-    {"mismatch", "navigation"},
+    {"mismatch", "report_mismatch", "navigation"},
     {
         "svo",
         "svo_result",
@@ -88,6 +97,8 @@ LAYERS = [
         "export",
         "state_space",
         "plotting_models",
+        "plotting_mismatch",
+        "report_page",
     },
     {"haar", "processes", "recording", "io"},
     {"units", "plotting"},

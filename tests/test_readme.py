@@ -57,6 +57,11 @@ def test_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         exec(block, scope)
     assert scope["weights"].sum().item() == pytest.approx(1)
     assert scope["virtual"].shape == (2000,)
+    assert [finding.mechanism for finding in scope["report"].findings] == ["vibration_tone"]
+    assert scope["report"].findings[0].frequency_hz == pytest.approx(12.5, abs=1e-3)
+    assert scope["repaired"].shape == (10, 3, 20_000)
+    assert scope["clean"].sensors == scope["recording"].sensors
+    assert Path("mismatch.html").stat().st_size > 0
     told = str(scope["ranked"])
     assert scope["ranked"].names == ("WN + AR1 + SIN",) * 3
     for words in ("criterion", "redundant: AR1 2 is white noise", "not told from it: 2*AR1 + SIN"):

@@ -1,0 +1,158 @@
+"""Command for what a simulation leaves out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import torch
+import typer
+
+from gyrofuse._console import progress, say
+from gyrofuse.cli_shared import (
+    Axis,
+    Force,
+    Json,
+    Key,
+    Logs,
+    Mounting,
+    Rate,
+    Report,
+    Scale,
+    Sensors,
+    Unit,
+    known_unit,
+    outputs,
+    read,
+    read_model,
+    say_notes,
+    stretch,
+    titled,
+    without_gaps,
+    write_json,
+)
+from gyrofuse.processes import Model
+from gyrofuse.recording import Recording, read_recording
+from gyrofuse.simulate import ArrayModel
+
+if TYPE_CHECKING:
+    from gyrofuse.mismatch import MismatchReport
+
+_RECORDS = 4  # as long as the recording, that are drawn of a repaired simulation
+
+
+def diagnose(
+    logs: Logs,
+    simulation: Annotated[
+        Path,
+        typer.Option(metavar="SIM", help="What a simulator gives for the same array: a recording, or a model, .json."),
+    ],
+    false_alarm: Annotated[
+        float, typer.Option(metavar="P", help="Probability of a finding where nothing is missing.")
+    ] = 0.01,
+    twins: Annotated[
+        int, typer.Option(metavar="N", help="Hold the false alarm for this very recording, by N twins of it.")
+    ] = 0,
+    rest: Annotated[
+        str | None, typer.Option(metavar="START:STOP", help="Diagnose this stretch alone (seconds).")
+    ] = None,
+    axis: Axis = None,
+    sensors: Sensors = None,
+    rate: Rate = None,
+    unit: Unit = None,
+    scale: Scale = None,
+    key: Key = None,
+    mounting: Mounting = None,
+    corrected: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the log without what can be taken off it, .npz.")
+    ] = None,
+    model_out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the repaired simulation, .json.")
+    ] = None,
+    json_file: Json = None,
+    report: Report = None,
+    force: Force = False,
+) -> None:
+    """Find where a log, recorded at rest, differs from a simulation, and which physics that left out.
+
+    The verdict comes first; it is no error to find something. Spectra ask for records without gaps: where samples are
+    missing, the longest stretch in which all sensors have theirs is diagnosed, and said.
+    """
+    resting = stretch(rest)
+    asked = {"corrected": corrected, "model-out": model_out, "json": json_file, "report": report}
+    with outputs(force, [*logs, mounting, simulation], **asked) as drafts:
+        recording = _one_axis(read(logs, axis, sensors, rate, unit, scale, key, mounting), titled(logs))
+        simulated = _simulation(simulation, recording, axis, sensors, rate, unit)
+        part = recording.between(*resting) if resting else recording
+        found, remarks = _diagnosed(part, simulated, (titled(logs), simulation), false_alarm, twins)
+        if corrected:
+            whole, _ = without_gaps(part, "", 0)
+            found.correct(whole).save(drafts[corrected], force=True)
+        if model_out:
+            write_json(drafts[model_out], found.model.to_dict())
+        if report:
+            with progress("drawing"):
+                found.to_html(drafts[report], title=f"{titled(logs)} against {simulation.name}", remarks=remarks)
+        if json_file:
+            names = {"recording": list(recording.source), "simulation": simulation.name}
+            write_json(drafts[json_file], {**names, **found.to_dict()})
+    say("\n".join([found.summary(), *remarks]))
+    say_notes(recording)
+
+
+def _diagnosed(
+    recording: Recording,
+    simulation: Recording | Model | ArrayModel,
+    names: tuple[str, Path],
+    false_alarm: float,
+    twins: int,
+) -> tuple[MismatchReport, list[str]]:
+    """The report on the longest whole stretch, and what to say about that; what is wrong names its file."""
+    from gyrofuse.mismatch import diagnose as find_mismatch
+    from gyrofuse.mismatch.inputs import FEWEST
+
+    with progress("comparing"):
+        if isinstance(simulation, Recording):
+            simulation, _ = without_gaps(simulation, "", 0)
+        try:
+            part, remarks = without_gaps(recording, "Diagnosed", FEWEST)
+            return find_mismatch(part, simulation, false_alarm=false_alarm, twins=twins), remarks
+        except (ValueError, TypeError) as error:
+            message = str(error)
+            files = {"`recording`": names[0], "`LOG`": names[0], "`simulation`": str(names[1])}
+            options = {"`false_alarm`": "`--false-alarm`", "`twins`": "`--twins`"}
+            for parameter, told in {**files, **options}.items():
+                message = message.replace(parameter, told)
+            raise type(error)(message) from None
+
+
+def _simulation(
+    path: Path, recording: Recording, axis: str | None, sensors: str | None, rate: float | None, unit: str | None
+) -> Recording | Model | ArrayModel:
+    """What SIM holds: a model, or a recording of the same sensors and axis."""
+    if path.suffix.lower() == ".json":
+        model = read_model(path)
+        if isinstance(model, Model | ArrayModel):
+            return model
+        model.check(recording.rate, recording.unit)
+        drawn = model.simulate(_RECORDS * recording.n_samples, generator=torch.Generator().manual_seed(0))
+        return Recording(drawn, rate=recording.rate, unit=recording.unit)
+    with progress("reading"):
+        whole = read_recording(path, rate=rate, unit=None if unit is None else known_unit(unit))
+    if axis is not None and axis in whole.axes:
+        whole = whole.select(axis=axis)
+    names = [] if sensors is None else sensors.split(",")
+    if whole.n_sensors > recording.n_sensors and set(names) <= set(whole.sensors):
+        whole = whole.select(sensors=names or None)
+    return _one_axis(whole, path.name)
+
+
+def _one_axis(recording: Recording, name: str) -> Recording:
+    """The recording `(sensor, time)`."""
+    if recording.signal.ndim == 2:
+        return recording
+    if len(recording.axes) == 1:
+        return recording.select(axis=recording.axes[0])
+    raise ValueError(
+        f"{name}: expected the sensors of one axis, got axes {', '.join(recording.axes)}; choose one with --axis"
+    )

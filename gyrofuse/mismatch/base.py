@@ -1,0 +1,125 @@
+"""The noise of a simulation as a non-negative sum of simple spectra: a description to weigh and to generate with.
+
+Each sensor is white noise, quantisation noise, AR1s of fixed corner frequencies, three a decade, and a random walk.
+With fixed corners the fit to spectra is convex and needs no starting values.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from gyrofuse._lag_sums import block_mean_covariances
+from gyrofuse._model import Model
+from gyrofuse._nnls import nonnegative_least_squares
+from gyrofuse.mismatch.spectra import Bands
+from gyrofuse.processes import AR1, QuantizationNoise, RandomWalk, WhiteNoise
+from gyrofuse.simulate import ArrayModel
+
+_PER_DECADE = 3
+_ROUNDS = 5
+_NEGLIGIBLE = 1e-3  # of the power in every band
+
+
+@dataclass(frozen=True, eq=False)
+class Base:
+    """Independent sensors, each a sum of simple processes.
+
+    Attributes:
+        n_samples: Of the records it describes, which sets the slowest corner.
+        coefficients: `(sensor, atom)`, >= 0, signal^2: variances of white noise, of the angle's quantisation, of the
+            AR1s' innovations, and of the walk's increments.
+    """
+
+    n_samples: int
+    coefficients: Tensor
+
+    def spectrum(self, f: Tensor) -> Tensor:
+        """Density per sample `(sensor, frequency)` at `f` cycles per sample."""
+        return self.coefficients @ _atoms(self.n_samples, f)
+
+    def model(self) -> ArrayModel:
+        """The same as an array of sensors, without atoms that nowhere matter."""
+        return ArrayModel.from_sensors([self._sensor(row) for row in self._essential()])
+
+    def block_covariance(self, block: int, n_blocks: int) -> Tensor:
+        """Covariances of means over successive blocks, `(sensor, block, block)`, up to a constant."""
+        lags = torch.from_numpy(block_mean_covariances(block, n_blocks, _time_constants(self.n_samples)))
+        white, *shaped, walk = lags
+        # Those are of AR1s with variance one, the coefficients are of innovations.
+        shaped = [row / -math.expm1(-2 / tau) for row, tau in zip(shaped, _time_constants(self.n_samples), strict=True)]
+        # The angle's quantisation telescopes over a block.
+        quantized = torch.zeros_like(white)
+        quantized[0] = 2 / block**2
+        quantized[1:2] = -1 / block**2
+        covariance = self.coefficients @ torch.stack([white, quantized, *shaped, walk])
+        place = torch.arange(n_blocks)
+        return covariance[:, (place[:, None] - place).abs()]
+
+    def scaled(self, factor: Tensor) -> Base:
+        """Every density times `factor` `(sensor,)`."""
+        return replace(self, coefficients=self.coefficients * factor[:, None])
+
+    def _essential(self) -> Tensor:
+        """Coefficients without those that give no more than a thousandth of the power anywhere."""
+        f = torch.logspace(math.log10(1 / self.n_samples), math.log10(0.5), 100, dtype=torch.float64)
+        shares = self.coefficients[..., None] * _atoms(self.n_samples, f)  # (sensor, atom, frequency)
+        matters = (shares / shares.sum(1, keepdim=True)).amax(-1) > _NEGLIGIBLE
+        return torch.where(matters, self.coefficients, 0.0)
+
+    def _sensor(self, row: Tensor) -> Model:
+        white, quantized, *shaped, walk = row.tolist()
+        processes: list[Model] = [WhiteNoise(white)]
+        processes += [QuantizationNoise(quantized)] if quantized else []
+        phis = [math.exp(-1 / tau) for tau in _time_constants(self.n_samples)]
+        processes += [AR1(phi, variance) for phi, variance in zip(phis, shaped, strict=True) if variance]
+        processes += [RandomWalk(walk)] if walk else []
+        return Model(processes)
+
+
+def fit_base(power: Tensor, bands: Bands, n_samples: int, dof: Tensor) -> Base:
+    """Fit spectra `(sensor, band)` by the likelihood of their ordinates, Whittle's.
+
+    Args:
+        power: Densities per sample.
+        bands: Where they are means.
+        n_samples: Of the records to describe.
+        dof: What each band is worth, complex ordinates, `(band,)`; 0 leaves it out.
+    """
+    atoms = bands.mean_of(_atoms(n_samples, bands.places))  # (atom, band)
+    root = dof.sqrt()
+    fitted, free = power, None
+    for _ in range(_ROUNDS):  # scoring: least squares with the variances of what was fitted last
+        weights = root / fitted
+        design = atoms * weights[:, None]  # (sensor, atom, band)
+        coefficients = nonnegative_least_squares(
+            design @ design.mT, (design @ (weights * power)[..., None])[..., 0], free
+        )
+        free = coefficients > 0
+        fitted = coefficients @ atoms
+    return Base(n_samples, coefficients)
+
+
+@functools.lru_cache(maxsize=64)
+def _time_constants(n_samples: int) -> tuple[float, ...]:
+    """Of the AR1s, samples: corners from one cycle in the record to a sixth of a cycle a sample."""
+    decades = math.log10(n_samples / 6)
+    return tuple(n_samples / (2 * math.pi) * 10 ** (-i / _PER_DECADE) for i in range(int(decades * _PER_DECADE) + 1))
+
+
+def _atoms(n_samples: int, f: Tensor) -> Tensor:
+    """Spectra of the atoms with coefficient one, `(atom, frequency)`."""
+    phi = torch.tensor([math.exp(-1 / tau) for tau in _time_constants(n_samples)], dtype=torch.float64)[:, None]
+    one = torch.ones((), dtype=torch.float64)
+    return torch.cat(
+        [
+            WhiteNoise._spectrum(f, one)[None],
+            QuantizationNoise._spectrum(f, one)[None],
+            AR1._spectrum(f, phi, one),
+            RandomWalk._spectrum(f, one)[None],
+        ]
+    )

@@ -1,0 +1,301 @@
+"""Bumps of a spectrum wider than a line and narrower than an octave.
+
+The power of every stretch of 4, 8, 16, .. bins is set against its flanks: slopes and the unknown level of the noise
+cancel. The best one is fitted closely, with level and slope of the noise around it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+from weakref import WeakKeyDictionary
+
+import torch
+from scipy import stats
+from torch import Tensor
+
+from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.evidence import Evidence, corrected
+from gyrofuse.mismatch.shape_fit import Fit, Ratios, fit, smooth_coherence
+from gyrofuse.mismatch.shape_terms import Background, Bump, CommonBump, Ground
+from gyrofuse.mismatch.side import Side
+from gyrofuse.mismatch.spectra import Bands, degrees_of_freedom, hann_transform
+from gyrofuse.mismatch.witnesses import level_of
+
+_NARROWEST = 4  # bins
+_FLANK, _GAP = 1.5, 0.5  # widths
+_DEPENDENT = 2.2  # bins under a Hann taper for an independent one, as far tails have it
+_LOWEST = 12  # bins
+_TRIES = 6
+_LINE = 0.6  # of the excess in three bins
+_AS_WELL = 0.01  # p value at which the simulation has it as well
+_CUT_OFF = 0.6  # of the simulation's power
+_CELLS, _CELL = 24, 5  # on either side, and fewest bins of one
+
+
+class Stretch(NamedTuple):
+    """Bins that stand out.
+
+    Attributes:
+        frequency: Of their middle, cycles per sample.
+        width: Cycles per sample.
+        p_value: For all stretches, sensor by sensor and together.
+        sensors: In which it alone stands out.
+    """
+
+    frequency: float
+    width: float
+    p_value: float
+    sensors: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Oscillation:
+    """A bump as fitted.
+
+    Attributes:
+        stretch: Where it was seen.
+        centre, width: Centre and half width, cycles per sample, and standard deviations of their logarithms.
+        variance: `(sensor,)`, and standard deviation.
+        gain: Complex gains of a common source `(sensor,)`; None where sensors have bumps of their own.
+        nats: Gain in log likelihood, less what the numbers cost.
+    """
+
+    stretch: Stretch
+    centre: float
+    width: float
+    log_sd: tuple[float, float]
+    variance: Tensor
+    variance_sd: Tensor
+    gain: Tensor | None
+    nats: float
+
+
+def bump_witness(case: Case) -> Evidence:
+    """The strongest bump that the simulation does not have."""
+    found = strongest_bump(case)
+    f = found.frequency * case.scene.rate
+    names = ", ".join(case.scene.sensors[i] for i in found.sensors)
+    return Evidence(
+        "bump",
+        found.p_value,
+        f"a bump {found.width * case.scene.rate:.3g} Hz wide at {f:.5g} Hz in sensors {names}",
+        sensors=found.sensors,
+        levels=(level_of(found.frequency),),
+        frequency_hz=f,
+    )
+
+
+_bumps: WeakKeyDictionary[Case, Stretch] = WeakKeyDictionary()
+
+
+def strongest_bump(case: Case) -> Stretch:
+    """The most conspicuous bump of the recording that is neither a line nor in the simulation."""
+    if case not in _bumps:
+        _bumps[case] = _strongest(case)
+    return _bumps[case]
+
+
+def _strongest(case: Case) -> Stretch:
+    power, length = _whitened(case.recorded, case)
+    shared = _effective_sensors(case)
+    known = torch.zeros(power.shape[-1], dtype=torch.bool)
+    simulated: tuple[Tensor, int] | None = None
+    starts, widths, scores = _scanned(power, length, case, shared)
+    n_places = scores.numel()
+    for _ in range(_TRIES):
+        flat = int(scores.argmax())
+        row, column = divmod(flat, scores.shape[1])
+        a, n = int(starts[column]), int(widths[column])
+        p = corrected(_tail(power, row, a, n, length, case, shared), n_places)
+        stretch = Stretch((a + (n - 1) / 2) / length, n / length, p, _alone(power, a, n, length, case))
+        if p > _AS_WELL:
+            return stretch
+        inside = power[:, a : a + n].mean(0)
+        excess = (inside - _flanks(power, a, n).mean()).clamp(min=0)
+        line = float(excess.topk(3).values.sum()) > _LINE * float(excess.sum())
+        if simulated is None:
+            simulated = _whitened(case.simulated, case)
+        if not line and not _has_it(simulated, stretch, case, row):
+            return stretch
+        known[max(a - n, 0) : a + 2 * n] = True
+        over = torch.stack([known[int(s) : int(s + w)].any() for s, w in zip(starts, widths, strict=True)])
+        scores[:, over] = -math.inf
+        if not bool(scores.isfinite().any()):
+            break
+    return stretch._replace(p_value=1.0)
+
+
+def _whitened(side: Side, case: Case) -> tuple[Tensor, int]:
+    """Powers over the simulation's noise, `(sensor, bin)`, mean of the records, and the length padded to."""
+    transform, length = hann_transform(side.signal)
+    f = torch.arange(transform.shape[-1], dtype=torch.float64) / length
+    power = transform.abs().square().mean(0)
+    return power / case.base.spectrum(f.clamp(min=1 / length)), length
+
+
+def _effective_sensors(case: Case) -> Tensor:
+    """How many independent sensors a mean over all is worth in each band, `(band,)`."""
+    p = case.n_sensors
+    c = smooth_coherence(case.recorded.coherence, case.recorded.dof).abs().square().sum((-1, -2))
+    return (p**2 / c).clamp(1.0, float(p))
+
+
+def _sums(power: Tensor, starts: Tensor, n: Tensor) -> Tensor:
+    total = torch.cat([torch.zeros_like(power[:, :1]), power.cumsum(-1)], -1)
+    return total[:, starts + n] - total[:, starts]
+
+
+def _flank_places(a: Tensor, n: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    wide, gap = (_FLANK * n).long(), (_GAP * n).long()
+    return a - gap - wide, a + n + gap, wide
+
+
+def _flanks(power: Tensor, a: int, n: int) -> Tensor:
+    """Mean of both flanks, `(sensor,)`."""
+    left, right, wide = _flank_places(torch.tensor([a]), torch.tensor([n]))
+    return ((_sums(power, left, wide) + _sums(power, right, wide)) / (2 * wide))[:, 0]
+
+
+def _dof(n: Tensor | float, length: int, case: Case) -> Tensor:
+    return (torch.as_tensor(n, dtype=torch.float64) * case.n_samples / length / _DEPENDENT).clamp(min=1.0)
+
+
+def _scanned(power: Tensor, length: int, case: Case, shared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """First bins and widths of all stretches, and their scores `(sensor + 1, stretch)`, normal but for rounding."""
+    last = int((0.5 - 2 / case.n_samples) * length)
+    starts, widths, n = [], [], _NARROWEST
+    while n <= last // 8:
+        first = max(int(_LOWEST + (_FLANK + _GAP) * n), 4 * n)  # no wider than a quarter of its frequency
+        a = torch.arange(first, last - int((1 + _FLANK + _GAP) * n) - 1, max(n // 2, 1))
+        starts.append(a)
+        widths.append(torch.full_like(a, n))
+        n *= 2
+    start, width = torch.cat(starts), torch.cat(widths)
+    left, right, wide = _flank_places(start, width)
+    ratio = (_sums(power, start, width) / width) / ((_sums(power, left, wide) + _sums(power, right, wide)) / (2 * wide))
+    d = _dof(width, length, case)
+    scores = [_normal(ratio, d, 2 * _FLANK * d)]
+    if len(power) > 1:
+        worth = d * shared[_band(start + width / 2, length, case)]
+        scores.append(_normal(ratio.mean(0, keepdim=True), worth, 2 * _FLANK * worth))
+    return start, width, torch.cat(scores)
+
+
+def _band(place: Tensor, length: int, case: Case) -> Tensor:
+    edges = torch.tensor(case.bands.edges[1:-1], dtype=torch.float64) / case.n_samples
+    return torch.bucketize(place.to(torch.float64) / length, edges, right=True)
+
+
+def _normal(ratio: Tensor, d: Tensor, flank: Tensor) -> Tensor:
+    """Normal score of an F-distributed ratio, to rounding (Wilson and Hilferty; Paulson)."""
+    a, b = 1 / (9 * d), 1 / (9 * flank)
+    root = ratio.clamp(min=1e-12).pow(1 / 3)
+    return ((1 - b) * root - (1 - a)) / (b * root.square() + a).sqrt()
+
+
+def _tail(power: Tensor, row: int, a: int, n: int, length: int, case: Case, shared: Tensor) -> float:
+    ratio = power[:, a : a + n].mean(-1) / _flanks(power, a, n)
+    d = float(_dof(n, length, case))
+    if row < len(power):
+        value = float(ratio[row])
+    else:
+        value = float(ratio.mean())
+        d *= float(shared[int(_band(torch.tensor(a + n / 2), length, case))])
+    return float(stats.f.sf(value, 2 * d, 2 * d * 2 * _FLANK))
+
+
+def _alone(power: Tensor, a: int, n: int, length: int, case: Case) -> tuple[int, ...]:
+    d = float(_dof(n, length, case))
+    tails = stats.f.sf((power[:, a : a + n].mean(-1) / _flanks(power, a, n)).numpy(), 2 * d, 4 * _FLANK * d)
+    p = len(power)
+    return tuple(i for i in range(p) if corrected(float(tails[i]), p) < 0.01) or (int(tails.argmin()),)
+
+
+def _has_it(simulated: tuple[Tensor, int], stretch: Stretch, case: Case, row: int) -> bool:
+    """Whether the simulation has a bump at the same place."""
+    power, length = simulated
+    n = max(round(stretch.width * length), _NARROWEST)
+    a = round(stretch.frequency * length - (n - 1) / 2)
+    if a < int(_LOWEST + (_FLANK + _GAP) * n) or a + int((1 + _FLANK + _GAP) * n) + 1 >= power.shape[-1]:
+        return False
+    rows = slice(None) if row == len(power) else slice(row, row + 1)
+    ratio = float((power[:, a : a + n].mean(-1) / _flanks(power, a, n))[rows].mean())
+    own = len(case.simulated.signal) * case.simulated.signal.shape[-1] / case.n_samples
+    d = max(n * own / _DEPENDENT, 1.0)
+    return float(stats.f.sf(ratio, 2 * d, 4 * _FLANK * d)) < _AS_WELL
+
+
+_fitted: WeakKeyDictionary[Case, Oscillation | None] = WeakKeyDictionary()
+
+
+def oscillation_of(case: Case) -> Oscillation | None:
+    """The strongest bump, fitted; None where it is no oscillation."""
+    if case not in _fitted:
+        _fitted[case] = _closely(case, strongest_bump(case))
+    return _fitted[case]
+
+
+def _closely(case: Case, stretch: Stretch) -> Oscillation | None:
+    n = case.n_samples
+    cell = max(round(stretch.width * n / 4), _CELL)
+    centre = round(stretch.frequency * n)
+    count = min(_CELLS, (centre - 3) // cell, (n // 2 - 4 - centre) // cell)
+    if count < 6:
+        return None
+    # Where a filter cuts off, flanks are not alike: broad shapes have to tell.
+    ends = torch.tensor([centre - count * cell, centre + count * cell], dtype=torch.float64)
+    first, last = (int(b) for b in _band(ends, n, case))
+    passed = case.recorded.power[:, first : last + 1] / case.simulated.power[:, first : last + 1].clamp(min=1e-300)
+    if float(passed.mean(0).min()) < _CUT_OFF:
+        return None
+    edges = tuple(centre + cell * k for k in range(-count, count + 1))
+    ends = torch.tensor(edges, dtype=torch.float64)
+    dof = torch.full((2 * count,), degrees_of_freedom(cell), dtype=torch.float64)
+    local = Bands(n, edges, (ends[:-1] + ends[1:] - 1) / 2 / n, dof)
+    ground = Ground(case.base, local)
+    coherence = smooth_coherence(case.simulated.coherence, case.simulated.dof)
+    band = int(_band(torch.tensor(float(centre)), n, case))
+    expected = coherence[band].expand(2 * count, -1, -1)
+    sides = Side(case.recorded.signal, local).spectra, ground.mean.mT, dof, torch.full_like(dof, 1e12)
+    data = Ratios.of(ground, sides, expected, torch.ones_like(dof))
+    background = fit(data, [Background.start(case.n_sensors)])
+    return _best(case, stretch, data, background)
+
+
+def _best(case: Case, stretch: Stretch, data: Ratios, background: Fit) -> Oscillation | None:
+    ground, p = data.ground, case.n_sensors
+    middle = len(ground.bands.frequency) // 2
+    least = max(1.5 / case.n_samples, stretch.width / 40) / stretch.frequency
+    height = (data.observed - background.model).diagonal(dim1=-2, dim2=-1).real[middle - 2 : middle + 2].mean(0)
+    level = ground.mean[:, middle] * height.clamp(min=1e-3)
+    tried: list[Fit] = []
+    for share in (0.25, 0.6):
+        width = share * stretch.width
+        bump = Bump.start(stretch.frequency, width, level * 2 * math.pi * width)
+        bump = Bump(bump.local, bump.free, bump.shared, least)
+        own = fit(data, [*background.terms, bump])
+        tried.append(own)
+        if p > 1:
+            excess = data.observed - background.model
+            source = CommonBump.start(ground, excess, data.worth, "oscillation", own.terms[1].shared)
+            source = CommonBump(source.local, source.free, source.shared, narrowest=least)
+            tried.append(fit(data, [*background.terms, source]))
+
+    def value(found: Fit) -> float:
+        numbers = found.n_free - isinstance(found.terms[1], CommonBump) - 2 * p
+        return found.gain - background.gain - data.penalty * numbers
+
+    best = max(tried, key=value)
+    term, (local_sd, log_sd) = best.terms[1], best.sd(1)
+    if isinstance(term, CommonBump):
+        gain = torch.complex(*term.local)
+        variance = gain.abs().square()
+        spread = 2 * gain.abs() * local_sd.square().mean(0).sqrt()
+    else:
+        gain, variance, spread = None, term.local[0], local_sd[0]
+    centre, width = (float(x) for x in term.shared.exp())
+    if centre < 2 * width or value(best) < 0:
+        return None
+    return Oscillation(stretch, centre, width, tuple(log_sd.tolist()), variance, spread, gain, value(best))

@@ -1,0 +1,116 @@
+"""A recording and a simulation side by side, as far as the diagnosis has come.
+
+What was found either is taken off the recording (a tone, a temperature's share) or is built into the simulation (a
+filter, rounding): after each finding the two are compared afresh, sample against sample, so that their finite lengths
+act on both alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.base import Base
+from gyrofuse.mismatch.lines import FoundLine, strongest_line
+from gyrofuse.mismatch.side import Side
+from gyrofuse.mismatch.spectra import Bands, bands
+
+N_BLOCKS = 256
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What is known about a recording beside its samples.
+
+    Attributes:
+        rate: Hz.
+        unit: Of the signals.
+        sensors: Names.
+        channels: Auxiliary channels `(row, time)` by name.
+    """
+
+    rate: float
+    unit: str
+    sensors: tuple[str, ...]
+    channels: Mapping[str, Tensor] = field(default_factory=dict)
+
+    def seconds(self, n_samples: int) -> Tensor:
+        """Times of the samples, s."""
+        return torch.arange(n_samples, dtype=torch.float64) / self.rate
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """State of a diagnosis.
+
+    Attributes:
+        scene: Rate, unit, names, auxiliary channels.
+        recorded: The recording, one record, without what was taken off it.
+        simulated: The simulation, with what was built into it: records as long as the recording, or a single shorter
+            one.
+    """
+
+    scene: Scene
+    recorded: Side
+    simulated: Side
+
+    @classmethod
+    def of(cls, scene: Scene, recording: Tensor, simulation: Tensor) -> Case:
+        """A case of a recording `(sensor, time)` and a simulation `(record, sensor, time)`."""
+        both = bands(recording.shape[-1])
+        return cls(scene, Side(recording[None], both), Side(simulation, both))
+
+    @property
+    def recording(self) -> Tensor:
+        """`(sensor, time)`, without what was taken off it."""
+        return self.recorded.signal[0]
+
+    @property
+    def bands(self) -> Bands:
+        """Bands of frequency of the recording."""
+        return self.recorded.bands
+
+    @property
+    def n_sensors(self) -> int:
+        return self.recording.shape[-2]
+
+    @property
+    def n_samples(self) -> int:
+        return self.recording.shape[-1]
+
+    @property
+    def base(self) -> Base:
+        """The simulation's noise as a sum of simple spectra."""
+        return self.simulated.base
+
+    @cached_property
+    def line(self) -> FoundLine:
+        """The strongest line of the recording that the simulation does not have."""
+        return strongest_line(self.recorded, self.simulated)
+
+    @property
+    def block(self) -> int:
+        """Samples of one of the 256 blocks for what is slow."""
+        return self.n_samples // N_BLOCKS
+
+    def less(self, taken: Tensor) -> Case:
+        """With a signal `(sensor, time)` taken off the recording."""
+        return replace(self, recorded=Side((self.recording - taken)[None], self.bands))
+
+    def with_recording(self, recording: Tensor) -> Case:
+        """With another recording `(sensor, time)`: one that was cleaned."""
+        return replace(self, recorded=Side(recording[None], self.bands))
+
+    def with_simulation(self, simulation: Tensor) -> Case:
+        """With another simulation `(record, sensor, time)`: one that something was built into."""
+        return replace(self, simulated=Side(simulation, self.bands))
+
+
+def block_means(signal: Tensor) -> Tensor:
+    """Means over 256 blocks of equal length, `(..., time)` -> `(..., block)`; what is left over is not used."""
+    block = signal.shape[-1] // N_BLOCKS
+    return signal[..., : block * N_BLOCKS].unflatten(-1, (N_BLOCKS, block)).mean(-1)

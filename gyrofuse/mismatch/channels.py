@@ -1,0 +1,168 @@
+"""Regression of an array on auxiliary channels, in the domain of cosine transforms.
+
+`y_k = K a_k + noise` at every ordinate, `y` the sensors, `a` the rows of a channel, `K` real: the same gain at every
+frequency, phase 0. The transform makes white noise and random walks independent from ordinate to ordinate, which the
+Fourier transform of a stretch does not: there a slow channel and a wandering bias look alike at their ends. The noise
+has the shape of the base, and in each band the recording's own cross-spectral matrix on top of it, so that sensors with
+noise in common count once.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import torch
+from scipy import special
+from torch import Tensor
+
+from gyrofuse._transforms import cosine_ordinates
+from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.evidence import Evidence, corrected
+
+_LEAST_DOF = 20.0  # of a simulation's band: below, it does not tell what chance alone would do to a slow channel
+_ORDINATES = 40  # behind a coherence matrix, for each sensor
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelFit:
+    """Gains of the sensors on the rows of a channel.
+
+    Attributes:
+        gains: `(sensor, row)`, signal per unit of the channel.
+        covariance: Of the gains, `(sensor, row, sensor, row)`.
+        statistic: Twice the log likelihood ratio, chi-square with a degree of freedom for each gain.
+        quadrature: The same for gains a quarter of a cycle late, which no instantaneous coupling has.
+        share: Largest share of one band in the statistic.
+        own: p values sensor by sensor, `(sensor,)`.
+        p_value: Of the array, for having asked it whole and sensor by sensor.
+    """
+
+    gains: Tensor
+    covariance: Tensor
+    statistic: float
+    quadrature: float
+    share: float
+    own: Tensor
+    p_value: float
+
+
+def regress(case: Case, rows: Tensor, signal: Tensor | None = None) -> ChannelFit | None:
+    """Regress the recording, or `signal` `(sensor, time)`, on rows `(row, time)`; None where these do not move."""
+    signal = case.recording if signal is None else signal
+    n_sensors, n_rows, n = len(signal), len(rows), signal.shape[-1]
+    rows = rows - rows.mean(-1, keepdim=True)
+    size = rows.square().mean(-1).sqrt()
+    if not bool((size > 1e-12).all()):
+        return None
+    y, a = cosine_ordinates(signal), cosine_ordinates(rows / size[:, None])
+    late = cosine_ordinates(_quarter_late(rows / size[:, None]))
+    k = torch.arange(n, dtype=torch.float64)
+    weights = case.base.spectrum((k / (2 * n)).clamp(min=1 / (2 * n))).rsqrt()  # (sensor, ordinate)
+    edges = [1, *(2 * edge for edge in case.bands.edges[1:-1]), n]
+    moment, moment_late = (torch.zeros(n_sensors * n_rows, dtype=torch.float64) for _ in range(2))
+    matrix = torch.zeros(n_sensors * n_rows, n_sensors * n_rows, dtype=torch.float64)
+    parts = []
+    known = case.simulated.dof >= _LEAST_DOF
+    for use, inverse, (first, end) in zip(known, _inverses(case), itertools.pairwise(edges), strict=True):
+        if not use:
+            continue
+        w = weights[:, first:end]
+        white = (inverse @ (w * y[:, first:end])) * w  # (sensor, ordinate)
+        design = (w[:, None] * a[:, first:end]).flatten(0, 1)  # (sensor * row, ordinate)
+        matrix += design @ design.mT * inverse.repeat_interleave(n_rows, 0).repeat_interleave(n_rows, 1)
+        parts.append((white @ a[:, first:end].mT).flatten())
+        moment += parts[-1]
+        moment_late += (white @ late[:, first:end].mT).flatten()
+    if not parts or float(torch.linalg.cond(matrix)) > 1e12:
+        return None
+    covariance = torch.linalg.inv(matrix)
+    gains = covariance @ moment
+    statistic = float(gains @ matrix @ gains)
+    contributions = torch.stack([own @ gains for own in parts])
+    blocks = covariance.view(n_sensors, n_rows, n_sensors, n_rows)
+    each = gains.view(n_sensors, n_rows)
+    own_statistic = torch.stack([each[i] @ torch.linalg.solve(blocks[i, :, i], each[i]) for i in range(n_sensors)])
+    own = torch.from_numpy(special.chdtrc(n_rows, own_statistic.numpy()))
+    pooled = float(special.chdtrc(n_sensors * n_rows, statistic))
+    p_value = corrected(min(2 * pooled, 2 * corrected(float(own.amin()), n_sensors)), 1)
+    return ChannelFit(
+        gains=each / size,
+        covariance=blocks / size[:, None, None] / size,
+        statistic=statistic,
+        quadrature=float(moment_late @ covariance @ moment_late),
+        share=float(contributions.amax() / contributions.sum()) if statistic > 0 else 1.0,
+        own=own,
+        p_value=min(p_value, 1.0),
+    )
+
+
+def channel_witness(case: Case) -> Evidence:
+    """Gains of the sensors on fast channels and on the products of their rows."""
+    tried = []
+    for name in [*accelerations(case), *rates(case)]:
+        rows = case.scene.channels[name].to(torch.float64)
+        rows = rows.reshape(-1, rows.shape[-1])
+        kinds = [("", rows), (" squared", products(rows))] if name in accelerations(case) else [("", rows)]
+        for words, regressors in kinds:
+            fit = regress(case, regressors)
+            if fit is not None:
+                tried.append((fit, name, words))
+    if not tried:
+        return Evidence("channel", 1.0, "there is no acceleration or reference rate to compare with")
+    fit, name, words = min(tried, key=lambda entry: entry[0].p_value)
+    return Evidence(
+        "channel",
+        corrected(fit.p_value, len(tried)),
+        f"sensors follow {name}{words}",
+        sensors=tuple((fit.own < 0.01 / len(fit.own)).nonzero()[:, 0].tolist()),
+        channel=name,
+    )
+
+
+def accelerations(case: Case) -> list[str]:
+    """Names of the channels of acceleration, whole ones."""
+    return _channels(case, "accel")
+
+
+def rates(case: Case) -> list[str]:
+    """Names of the channels of a reference rate, whole ones."""
+    return _channels(case, "rate")
+
+
+def products(rows: Tensor) -> Tensor:
+    """Squares and products of rows `(row, time)` without their means."""
+    rows = rows - rows.mean(-1, keepdim=True)
+    upper = torch.triu_indices(len(rows), len(rows))
+    return rows[upper[0]] * rows[upper[1]]
+
+
+def _channels(case: Case, word: str) -> list[str]:
+    return [
+        name
+        for name, values in case.scene.channels.items()
+        if word in name.lower() and bool(torch.isfinite(values).all())
+    ]
+
+
+def _quarter_late(rows: Tensor) -> Tensor:
+    """Rows `(row, time)` a quarter of a cycle late at every frequency."""
+    return torch.fft.irfft(torch.fft.rfft(rows) * -1j, n=rows.shape[-1])
+
+
+def _inverses(case: Case) -> Tensor:
+    """Inverse in each band of the recording's noise matrix over the base, real, `(band, sensor, sensor)`.
+
+    From as many bands as it takes: few ordinates make an inverse too large.
+    """
+    dof = case.bands.dof
+    size = case.bands.mean_of(case.base.spectrum(case.bands.places)).mT.sqrt()  # (band, sensor)
+    whitened = case.recorded.spectra.real / size[:, :, None] / size[:, None, :] * dof[:, None, None]
+    wanted = min(_ORDINATES * case.n_sensors, float(dof.sum()))
+    smooth = []
+    for b in range(len(dof)):
+        low, high = b, b + 1
+        while float(dof[low:high].sum()) < wanted:
+            low, high = max(low - 1, 0), min(high + 1, len(dof))
+        smooth.append(whitened[low:high].sum(0) / dof[low:high].sum())
+    return torch.linalg.inv(torch.stack(smooth))

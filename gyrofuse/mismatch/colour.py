@@ -1,0 +1,48 @@
+"""Records filtered by a response given in frequency, and noise of a given density."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from gyrofuse._transforms import fast_length
+
+
+def filtered(signal: Tensor, response: Callable[[Tensor], Tensor]) -> Tensor:
+    """Signals `(..., sensor, time)` through filters.
+
+    Increments are filtered and added up again, so that a walk's two ends need not meet.
+
+    Args:
+        signal: Records.
+        response: Complex gains `(sensor, frequency)` at `f` cycles per sample.
+    """
+    n = signal.shape[-1]
+    increments = signal.diff(dim=-1, prepend=signal[..., :1])
+    gain = response(torch.arange(n // 2 + 1, dtype=torch.float64) / n)
+    moved = torch.fft.irfft(torch.fft.rfft(increments) * gain, n=n).cumsum(-1)
+    middle = signal.mean(-1, keepdim=True)
+    return moved - moved.mean(-1, keepdim=True) + middle * gain[..., :1].real
+
+
+def noise(n_samples: int, density: Callable[[Tensor], Tensor], rows: int, generator: torch.Generator) -> Tensor:
+    """Gaussian records `(row, time)` of a density per sample at `f` cycles per sample, rows independent."""
+    length = fast_length(2 * n_samples)
+    white = torch.randn(rows, length, generator=generator, dtype=torch.float64)
+    f = (torch.arange(length // 2 + 1, dtype=torch.float64) / length).clamp(min=1 / length)
+    return torch.fft.irfft(torch.fft.rfft(white) * density(f).sqrt(), n=length)[:, :n_samples]
+
+
+def of_phase(gain: Tensor, source: Tensor) -> Tensor:
+    """Records `(sensor, time)` of one source, or of as many as sensors, with the phases of complex gains."""
+    return gain.real[:, None] * source + gain.imag[:, None] * quadrature(source)
+
+
+def quadrature(signal: Tensor) -> Tensor:
+    """Records `(..., time)` with every frequency a quarter of a cycle ahead."""
+    n = signal.shape[-1]
+    transform = torch.fft.rfft(signal) * 1j
+    transform[..., 0] = 0
+    return torch.fft.irfft(transform, n=n)

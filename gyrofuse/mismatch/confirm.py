@@ -1,0 +1,107 @@
+"""Confirmation on data that a repair has not seen: interleaved blocks, one half to estimate, the other to judge."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gyrofuse.covariance import wavelet_cross_covariance
+from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.halves import N_HALVES, estimation_samples, held_out_blocks
+from gyrofuse.mismatch.mechanism import Finding, Mechanism
+
+_ACCEPTED_T = 1.7
+_Z = 1.959963984540054
+_SHORTEST = 8  # a block is so many times as long as its longest wavelet
+
+
+class Gain(NamedTuple):
+    """Gain in log score on the blocks held out, nats, `(block,)`."""
+
+    blocks: Tensor
+
+    @property
+    def total(self) -> float:
+        return float(self.blocks.sum())
+
+    @property
+    def sd(self) -> float:
+        return float(self.blocks.std()) * math.sqrt(len(self.blocks))
+
+    @property
+    def accepted(self) -> bool:
+        """Whether it is better than chance would have it."""
+        return self.total > _ACCEPTED_T * self.sd
+
+
+class HeldOut(NamedTuple):
+    """Agreement of recording and simulation on data that no number was estimated from.
+
+    Attributes:
+        before: Discrepancy of wavelet cross-covariances per degree of freedom; 1 is what noise alone gives.
+        after: The same with the repaired simulation.
+        gain: Log score of the repair, nats, with 95 % limits `low` and `high`.
+    """
+
+    before: float
+    after: float
+    gain: float
+    low: float
+    high: float
+
+    def to_dict(self) -> dict[str, object]:
+        """Plain numbers, ready for JSON."""
+        gain = {"value": self.gain, "low": self.low, "high": self.high}
+        return {"before": self.before, "after": self.after, "gain": gain}
+
+
+def held_out_gain(case: Case, effect: Mechanism) -> Gain:
+    """Gain in log score of one mechanism, its numbers estimated on the other half."""
+    return Gain(effect.refitted(case, estimation_samples(case.n_samples)).gains(case))
+
+
+def held_out(start: Case, found: Sequence[tuple[Case, Finding]], generator: torch.Generator) -> HeldOut:
+    """Agreement before and after all repairs, their numbers estimated on the even blocks.
+
+    Args:
+        start: Recording and simulation as they came.
+        found: Each finding with the case in which it was found, in order.
+        generator: Of what is built into the simulation.
+    """
+    keep, after = estimation_samples(start.n_samples), start
+    gains = [torch.zeros(1, dtype=torch.float64)]
+    for case, finding in found:
+        refitted = finding.effect.refitted(case, keep)
+        gains.append(refitted.gains(case))
+        after = refitted.explained(after, generator)
+    total = Gain(sum(gains, torch.zeros(1, dtype=torch.float64)))
+    reach = _Z * total.sd if found else 0.0
+    return HeldOut(discrepancy(start), discrepancy(after), total.total, total.total - reach, total.total + reach)
+
+
+def discrepancy(case: Case) -> float:
+    """Squared difference of wavelet cross-covariances over its variance, mean over levels and pairs of sensors.
+
+    On the blocks held out of the recording, against all blocks of the simulation, which also tell the variance.
+    """
+    recorded = _block_moments(held_out_blocks(case.recording))
+    n = case.n_samples // N_HALVES
+    usable = case.simulated.signal[..., : case.simulated.signal.shape[-1] // n * n]
+    simulated = _block_moments(usable.unflatten(-1, (-1, n))).flatten(0, 1)
+    n_recorded, n_simulated = len(recorded), len(simulated)
+    variance = simulated.var(0) * (1 / n_recorded + 1 / n_simulated)
+    # The variance is itself estimated, as in Student's distribution.
+    expected = (n_simulated - 1) / (n_simulated - 3)
+    return float(((recorded.mean(0) - simulated.mean(0)).square() / variance).mean()) / expected
+
+
+def _block_moments(blocks: Tensor) -> Tensor:
+    """Wavelet cross-covariances `(..., block, moment)` of blocks `(..., sensor, block, time)`."""
+    n_levels = int(math.log2(blocks.shape[-1] / _SHORTEST))
+    wccv = wavelet_cross_covariance(blocks.movedim(-2, -3), n_levels)  # (..., block, level, sensor, sensor)
+    pairs = torch.triu_indices(wccv.shape[-1], wccv.shape[-1])
+    return wccv[..., pairs[0], pairs[1]].flatten(-2)

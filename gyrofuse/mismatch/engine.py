@@ -1,0 +1,114 @@
+"""Diagnosis: witness, nominate, repair, confirm."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from numbers import Real
+
+import torch
+from torch import Tensor
+
+from gyrofuse._checks import check_n_samples
+from gyrofuse._model import Model
+from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.confirm import held_out, held_out_gain
+from gyrofuse.mismatch.evidence import corrected
+from gyrofuse.mismatch.inputs import noise_of, prepared
+from gyrofuse.mismatch.mechanism import Finding
+from gyrofuse.mismatch.mechanisms import STAGES
+from gyrofuse.mismatch.repaired import RepairedModel
+from gyrofuse.mismatch.report import MismatchReport
+from gyrofuse.mismatch.testimony import combined, testimony
+from gyrofuse.mismatch.twins import FEWEST, calibrated, twin_p_values
+from gyrofuse.recording import Recording
+from gyrofuse.simulate import ArrayModel
+
+_MOST = 12  # findings: a recording that needs more is another instrument
+
+
+def diagnose(
+    recording: Recording | Tensor,
+    simulation: Recording | Tensor | Model | ArrayModel,
+    *,
+    false_alarm: float = 0.01,
+    rate: float | None = None,
+    twins: int = 0,
+    generator: torch.Generator | None = None,
+) -> MismatchReport:
+    """Find where a recording and a simulation differ, and which physics the simulation left out.
+
+    Args:
+        recording: What a real array gave; its auxiliary channels are used. A tensor is `(sensor, time)`.
+        simulation: What a simulator gives for the same array: samples, of any length and without channels, or a noise
+            model, one for all sensors, with batched parameters one for each, or an `ArrayModel`.
+        false_alarm: Probability of a finding where nothing is missing.
+        rate: Hz, for recordings given as tensors; 1 by default.
+        twins: How many twins of the recording, in which nothing is missing, tell how surprising the witnesses are.
+            By default none: their own p values are held to, which are honest for the noise of ordinary sensors. With
+            50 or more the error rate holds for this very recording, at so many times the cost of a look.
+        generator: Source of the diagnosis's own random numbers: of a model's samples, and of what is built into the
+            simulation. By default one with a fixed seed, so that a diagnosis can be repeated.
+
+    Returns:
+        Verdict, findings, held-out scores, and the repaired simulation.
+
+    Raises:
+        TypeError: Neither samples nor a model.
+        ValueError: Recording and simulation do not fit each other, are too short, or constant.
+    """
+    if isinstance(false_alarm, bool) or not isinstance(false_alarm, Real) or not 0 < false_alarm < 1:
+        raise ValueError(f"`false_alarm`: expected a number between 0 and 1 such as 0.01, got {false_alarm!r}")
+    if check_n_samples("twins", twins) and twins < FEWEST:
+        raise ValueError(f"`twins`: expected 0, or {FEWEST} or more, got {twins}; fewer cannot tell a tail")
+    if generator is None:
+        generator = torch.Generator().manual_seed(0)
+    start = prepared(recording, simulation, rate, generator)
+    model = RepairedModel(noise_of(simulation, start), start.scene)
+    evidence = testimony(start)
+    p_value = combined(evidence)
+    if twins:
+        p_value = calibrated(p_value, twin_p_values(start, twins, generator))
+    if p_value > false_alarm:
+        return MismatchReport(
+            mismatch=False,
+            p_value=p_value,
+            findings=(),
+            unexplained=(),
+            held_out=held_out(start, (), generator),
+            model=model,
+            evidence=evidence,
+            evidence_after=evidence,
+            case=start,
+            repaired=start,
+        )
+    case: Case = start
+    found: list[tuple[Case, Finding]] = []
+    level = false_alarm / sum(map(len, STAGES))
+    for stage in STAGES:
+        while len(found) < _MOST:
+            nominated = [f for f in (m.nominate(case, level) for m in stage) if f is not None]
+            accepted = None
+            for finding in sorted(nominated, key=lambda f: -f.gain):
+                gain = held_out_gain(case, finding.effect)
+                if gain.accepted:
+                    accepted = replace(finding, held_out_gain=gain.total)
+                    break
+            if accepted is None:
+                break
+            found.append((case, accepted))
+            case = accepted.effect.explained(case, generator)
+    findings = tuple(f for _, f in found)
+    after = testimony(case)
+    left = [e for e in after if corrected(e.p_value, len(evidence)) <= false_alarm]
+    return MismatchReport(
+        mismatch=True,
+        p_value=p_value,
+        findings=findings,
+        unexplained=tuple(left),
+        held_out=held_out(start, found, generator),
+        model=replace(model, effects=tuple(f.effect for f in findings)),
+        evidence=evidence,
+        evidence_after=after,
+        case=start,
+        repaired=case,
+    )

@@ -1,0 +1,41 @@
+"""What a witness says: how surprising the worst place is, and where it lies."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Testimony of one witness, over all the places it looked at.
+
+    Attributes:
+        witness: Its name.
+        p_value: Of the most extreme place, for having looked at them all.
+        words: What it saw there, in plain English.
+        sensors: Positions of the sensors concerned.
+        levels: Wavelet levels concerned, from 1.
+        frequency_hz: Of the most extreme place, where it has one.
+        time_s: Likewise, s after the first sample.
+        channel: Auxiliary channel concerned.
+    """
+
+    witness: str
+    p_value: float
+    words: str
+    sensors: tuple[int, ...] = ()
+    levels: tuple[int, ...] = ()
+    frequency_hz: float | None = None
+    time_s: float | None = None
+    channel: str | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, ready for JSON."""
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
+
+
+def corrected(p: float, places: float) -> float:
+    """p value of the smallest of so many independent ones, each uniform: `1 - (1 - p)^places`, to rounding."""
+    return -math.expm1(places * math.log1p(-min(p, 1.0))) if p < 1 else 1.0

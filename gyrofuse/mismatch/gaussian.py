@@ -1,0 +1,51 @@
+"""Mechanisms that are a matter of spectra alone: filters, and Gaussian noise added. Both go into the simulation."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.colour import filtered
+from gyrofuse.mismatch.mechanism import Mechanism
+
+
+class BuiltIn(Mechanism):
+    """A mechanism that nothing takes off a recording: it is built into the samples of the simulation."""
+
+    def explained(self, case: Case, generator: torch.Generator) -> Case:
+        return case.with_simulation(self.simulated(case.simulated.signal, case.scene, generator))
+
+
+class Filter(BuiltIn):
+    """A linear filter of each sensor."""
+
+    def response(self, f: Tensor) -> Tensor:
+        """Complex gains `(sensor, frequency)` at `f` cycles per sample."""
+        raise NotImplementedError
+
+    def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
+        return filtered(signal, self.response)
+
+    def spectra(self, matrices: Tensor, f: Tensor) -> Tensor:
+        gain = self.response(f).mT.to(matrices.dtype)  # (frequency, sensor)
+        return matrices * gain[:, :, None] * gain[:, None, :].conj()
+
+
+class Addition(BuiltIn):
+    """Gaussian noise on top."""
+
+    def density(self, f: Tensor) -> Tensor:
+        """Cross-spectral densities `(frequency, sensor, sensor)` at `f` cycles per sample."""
+        raise NotImplementedError
+
+    def path(self, n_samples: int, generator: torch.Generator) -> Tensor:
+        """One record of it, `(sensor, time)`."""
+        raise NotImplementedError
+
+    def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
+        records = signal.flatten(0, -3) if signal.ndim > 2 else signal[None]
+        return torch.stack([r + self.path(r.shape[-1], generator) for r in records]).view_as(signal)
+
+    def spectra(self, matrices: Tensor, f: Tensor) -> Tensor:
+        return matrices + self.density(f).to(matrices.dtype)

@@ -1,0 +1,343 @@
+"""What is sudden: outliers, changes of the noise level, jumps.
+
+A record is whitened by its own smooth spectrum in the orthonormal DCT-II, `e = C^T y / sqrt(S)`, which has no ends
+that meet; `C^T y / S` over the mean of `1/S` is the error of a sample predicted from all others, most sensitive to an
+outlier of one sample. The smooth spectrum is the geometric mean over narrow bands, so that lines do not raise it, and
+ordinates of lines are left out.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from scipy import fft, stats
+from torch import Tensor
+from torch.nn.functional import avg_pool1d
+
+from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.episodes import episodes_of
+from gyrofuse.mismatch.evidence import Evidence, corrected
+from gyrofuse.mismatch.remembered import remembered
+from gyrofuse.mismatch.side import Side
+
+_NARROWEST, _WIDEST = 32, 64  # bands, ordinates
+_LOG_CHI2 = -1.2703628454614782  # mean of log chi2_1
+_LINE = 25.0  # ordinates this far above the spectrum are lines
+_SKIRT = 1 / 8  # share of ordinates of a line, beyond which the stretch around belongs to it
+_ENDS = 64  # a line's skirt is felt in so small a part of the record at each end
+_MOST_RECORDS = 2  # of the simulation: as honest as more
+_MAD = 0.6744897501960817
+_TAILS = (3.5, 4.0, 4.5, 5.0, 6.0, 8.0)
+_HEAVY = 1e-3  # p value of tails that the simulation has as well
+_CUT = 9.0  # squares: an outlier is no change of level
+_BLOCK = 128
+_BURST = 15  # lags
+_CHANGES = 1.62  # range of a stationary CUSUM that one in ten exceeds
+_UNSTEADY, _CLUSTERED = 2.1, 3.5  # range and clustering that one steady simulation in two hundred exceeds
+_TOP = 6  # levels at the top that have too few coefficients
+_NEIGHBOURS = 8  # thinned Haar coefficients that are correlated
+
+
+class LeftOut(NamedTuple):
+    """Samples against their prediction from all others.
+
+    Attributes:
+        error: `(record, sensor, time)`, unit of the signal.
+        sd: Of the errors, robust, `(record, sensor)`.
+        white: Whitened record, `(record, sensor, time)`, robust sd 1.
+    """
+
+    error: Tensor
+    sd: Tensor
+    white: Tensor
+
+    @property
+    def z(self) -> Tensor:
+        """Errors over their sd."""
+        return self.error / self.sd[..., None]
+
+
+@remembered
+def left_out(side: Side) -> LeftOut:
+    """Of one side, of its first records."""
+    signal = side.signal[:_MOST_RECORDS]
+    y = torch.from_numpy(fft.dct(signal.numpy(), norm="ortho", axis=-1))[..., 1:]
+    spectrum = _smooth_spectrum(y)
+    lines = _lines(y, spectrum)
+    y = torch.where(lines, 0.0, y)
+    white, inverse = _back(y / spectrum.sqrt()), 1 / spectrum
+    error = _back(y * inverse) / inverse.mean(-1, keepdim=True)
+    has_lines = lines.any(-1, keepdim=True)
+    white, error = (torch.where(has_lines, _mirrored(v), v) for v in (white, error))
+    return LeftOut(error, _robust_sd(error), white / _robust_sd(white)[..., None])
+
+
+def _lines(y: Tensor, spectrum: Tensor) -> Tensor:
+    """Ordinates `(..., k)` of lines and of their skirts, at every width."""
+    lines = y.square() > _LINE * spectrum
+    n, reach, every = y.shape[-1], 4, torch.arange(y.shape[-1])
+    # Two neighbours at least make a skirt.
+    while reach < n // _ENDS and bool((lines.sum(-1) > 1).any()):
+        total = torch.nn.functional.pad(lines.cumsum(-1), (1, 0))
+        within = total[..., (every + reach + 1).clamp(max=n)] - total[..., (every - reach).clamp(min=0)]
+        lines = lines | (within > _SKIRT * (2 * reach + 1))
+        reach *= 2
+    return lines
+
+
+def _mirrored(values: Tensor) -> Tensor:
+    """With the ends `(..., time)` replaced by what is next to them."""
+    m = values.shape[-1] // _ENDS
+    inner = values[..., m:-m]
+    return torch.cat([inner[..., :m].flip(-1), inner, inner[..., -m:].flip(-1)], -1)
+
+
+def _back(ordinates: Tensor) -> Tensor:
+    with_mean = torch.nn.functional.pad(ordinates, (1, 0))
+    return torch.from_numpy(fft.idct(with_mean.numpy(), norm="ortho", axis=-1))
+
+
+def _smooth_spectrum(y: Tensor) -> Tensor:
+    """Geometric means over narrow bands of ordinates `(..., k)`, interpolated."""
+    n, edges = y.shape[-1], [0]
+    while edges[-1] < n:
+        edges.append(edges[-1] + min(max(edges[-1] // 16, _NARROWEST), _WIDEST))
+    edges[-1] = n
+    if edges[-1] - edges[-2] < _NARROWEST:
+        del edges[-2]
+    ends = torch.tensor(edges)
+    log_power = y.square().clamp(min=1e-300).log()
+    total = torch.nn.functional.pad(log_power.cumsum(-1), (1, 0))[..., ends]
+    means = total.diff(dim=-1) / ends.diff() - _LOG_CHI2
+    centre = (ends[1:] + ends[:-1] - 1) / 2
+    k = torch.arange(n, dtype=torch.float64)
+    right = torch.bucketize(k, centre).clamp(1, len(centre) - 1)
+    share = (k - centre[right - 1]) / (centre[right] - centre[right - 1])
+    return (means[..., right - 1] + share.clamp(0, 1) * (means[..., right] - means[..., right - 1])).exp()
+
+
+def _robust_sd(values: Tensor) -> Tensor:
+    """From the median modulus, or the mean square where half of the values are zero."""
+    robust = values.abs().median(-1).values / _MAD
+    return torch.where(robust > 0, robust, values.square().mean(-1).sqrt().clamp(min=1e-300))
+
+
+def pooled_squares(z: Tensor) -> Tensor:
+    """`z^T R^-1 z` over the sensors of `(record, sensor, time)`, chi-square distributed: `(record, time)`."""
+    # Rank correlation of signs: outliers do not count for more.
+    sign = z.sign()
+    r = torch.sin(math.pi / 2 * (sign @ sign.mT) / z.shape[-1])
+    root = torch.linalg.cholesky(r + 1e-6 * torch.eye(r.shape[-1], dtype=r.dtype))
+    return torch.linalg.solve_triangular(root, z, upper=False).square().sum(-2)
+
+
+def _tail_p(recorded: Tensor, simulated: Tensor, probability: float) -> Tensor:
+    """p value of so many exceedances, `(..., time)` each, of a level that noise exceeds with `probability`."""
+    own, other = recorded.sum(-1).to(torch.float64).numpy(), simulated.sum(-1).to(torch.float64)
+    n, m = recorded.shape[-1], simulated.shape[-1]
+    gaussian = stats.poisson.sf(own - 1, n * probability)
+    heavy = stats.poisson.sf(other.numpy() - 1, m * probability) < _HEAVY
+    two_sample = stats.binom.sf(own - 1, own + other.numpy(), n / (n + m))
+    return torch.where(torch.as_tensor(heavy), torch.as_tensor(two_sample), torch.as_tensor(gaussian))
+
+
+def spike_p_values(case: Case) -> Tensor:
+    """p values of the tails of each sensor, and of all together, `(sensor + 1,)`, for all the levels looked at."""
+    z, other = left_out(case.recorded).z, left_out(case.simulated).z
+    own_q, other_q = pooled_squares(z)[0], pooled_squares(other).flatten()
+    z, other = z[0].abs(), other.abs().movedim(1, 0).flatten(1)
+    best = torch.ones(case.n_sensors + 1, dtype=torch.float64)
+    for level in _TAILS:
+        p = 2 * float(stats.norm.sf(level))
+        together = float(stats.chi2.isf(p, case.n_sensors))
+        single = _tail_p(z > level, other > level, p)
+        pooled = _tail_p(own_q > together, other_q > together, p)
+        best = torch.minimum(best, torch.cat([single, pooled[None]]))
+    return -torch.expm1(len(_TAILS) * torch.log1p(-best.clamp(max=1 - 1e-16)))
+
+
+def spike_witness(case: Case) -> Evidence:
+    """Outliers of single samples, sensor by sensor and all together."""
+    p_values = spike_p_values(case)
+    z = left_out(case.recorded).z[0].abs()
+    worst = int(p_values[:-1].argmin())
+    at = int(z[worst].argmax())
+    count = int((z[worst] > 5).sum())
+    return Evidence(
+        "spike",
+        corrected(float(p_values.min()), len(p_values)),
+        f"{count} samples beyond 5 sd in sensor {case.scene.sensors[worst]}, the largest {float(z[worst, at]):.3g} sd",
+        sensors=(worst,),
+        levels=(1,),
+        time_s=at / case.scene.rate,
+    )
+
+
+@remembered
+def _block_squares(side: Side) -> Tensor:
+    """Means of `min(e^2, 9)` over blocks, `(record, sensor, block)`."""
+    squares = left_out(side).white.square().clamp(max=_CUT)
+    return avg_pool1d(squares, _BLOCK)
+
+
+def _ranges(blocks: Tensor) -> Tensor:
+    """Range of the CUSUM of `(..., block)` over its sd, from first differences: Kuiper's, of a Brownian bridge."""
+    sd = (blocks.diff(dim=-1).square().mean(-1) / 2).sqrt()
+    path = (blocks - blocks.mean(-1, keepdim=True)).cumsum(-1)
+    return (path.amax(-1) - path.amin(-1)) / (sd * math.sqrt(blocks.shape[-1]))
+
+
+def _kuiper_p(reach: float) -> float:
+    """Of a Brownian bridge's range, `2 sum (4 j^2 x^2 - 1) exp(-2 j^2 x^2)`."""
+    if reach < 0.6:
+        return 1.0
+    terms = [(4 * (j * reach) ** 2 - 1) * math.exp(-2 * (j * reach) ** 2) for j in range(1, 40)]
+    return min(max(2 * sum(terms), 0.0), 1.0)
+
+
+def level_profile(case: Case) -> Tensor:
+    """Variance of the noise that the simulation gives each sample, `(sensor, time)`, or 1 where it is steady."""
+    steady = _steady(case.simulated)
+    if bool(steady.all()) or case.simulated.signal.shape[-1] != case.n_samples:
+        return torch.ones(case.n_sensors, 1, dtype=torch.float64)
+    profile = torch.ones(case.n_sensors, case.n_samples, dtype=torch.float64)
+    white = left_out(case.simulated).white
+    for i in (~steady).nonzero()[:, 0].tolist():
+        found = episodes_of(white[:, i], torch.zeros(len(white) + 1, dtype=torch.float64))
+        if found is not None:
+            profile[i, found.inside(case.n_samples)] = float(found.factor.log().mean().exp())
+    return profile
+
+
+@remembered
+def _steady(side: Side) -> Tensor:
+    """Which sensors `(sensor,)` have a noise level that does not change."""
+    squares = left_out(side).white.square().clamp(max=_CUT)
+    return (_ranges(_block_squares(side)).amax(0) < _UNSTEADY) & (_clustering(squares).amax(0) < _CLUSTERED)
+
+
+def levelled(case: Case) -> Tensor:
+    """Whitened recording `(sensor, time)` over the noise level that the simulation has there."""
+    return left_out(case.recorded).white[0] / level_profile(case).sqrt()
+
+
+def variance_p_values(case: Case) -> Tensor:
+    """p values that the noise level changes, in each sensor and in all together, `(sensor + 1,)`.
+
+    Once for episodes, from the range of the CUSUM, once for bursts, from the autocorrelation of the squares.
+    """
+    squares = levelled(case).square().clamp(max=_CUT)
+    blocks = avg_pool1d(squares, _BLOCK)
+    blocks = torch.cat([blocks, _standardised(blocks).sum(0, keepdim=True)])
+    other = _block_squares(case.simulated)
+    other = torch.cat([other, _standardised(other).sum(1, keepdim=True)], 1)
+    wander = (_ranges(other).amax(0) / _CHANGES).clamp(min=1.0)
+    fast = torch.cat([squares, _standardised(squares).sum(0, keepdim=True)])
+    simulated = left_out(case.simulated).white[0].square().clamp(max=_CUT)
+    simulated = torch.cat([simulated, _standardised(simulated).sum(0, keepdim=True)])
+    heavy = (_clustering(simulated) - 2.5).clamp(min=0)
+    if not bool(_steady(case.simulated).all()) and case.simulated.signal.shape[-1] == case.n_samples:
+        wander, heavy = torch.ones_like(wander), torch.zeros_like(heavy)  # it was divided by
+    episodes = torch.tensor([_kuiper_p(float(r)) for r in _ranges(blocks) / wander], dtype=torch.float64)
+    bursts = torch.special.ndtr(heavy - _clustering(fast))
+    both = torch.minimum(episodes, bursts)
+    return 1 - (1 - both).square()
+
+
+def _standardised(values: Tensor) -> Tensor:
+    return (values - values.mean(-1, keepdim=True)) / values.std(-1, keepdim=True)
+
+
+def _clustering(squares: Tensor) -> Tensor:
+    """Standard normal sum of the autocorrelations of `(..., time)` at short lags."""
+    x = _standardised(squares)
+    n = x.shape[-1]
+    lags = [(x[..., lag:] * x[..., :-lag]).sum(-1) for lag in range(1, _BURST + 1)]
+    return torch.stack(lags).sum(0) / math.sqrt(n * _BURST)
+
+
+def variance_witness(case: Case) -> Evidence:
+    """Changes of the noise level within the recording."""
+    p_values = variance_p_values(case)
+    worst = int(p_values.argmin())
+    every = worst == case.n_sensors
+    squares = levelled(case).square().clamp(max=_CUT)
+    blocks = avg_pool1d(squares.mean(0, keepdim=True) if every else squares[worst : worst + 1], _BLOCK)[0]
+    path = (blocks - blocks.mean()).cumsum(-1)
+    onset = min(int(path.argmin()), int(path.argmax())) + 1
+    where = "all sensors together" if every else f"sensor {case.scene.sensors[worst]}"
+    return Evidence(
+        "variance",
+        corrected(float(p_values.min()), len(p_values)),
+        f"a noise level that changes in {where}",
+        sensors=tuple(range(case.n_sensors)) if every else (worst,),
+        levels=(1,),
+        time_s=onset * _BLOCK / case.scene.rate,
+    )
+
+
+def kurtosis_p_values(case: Case) -> Tensor:
+    """Two-sided p values of the kurtosis of Haar coefficients, `(level, sensor)`, from level 1 to J - 6."""
+    n_levels = int(math.log2(case.n_samples)) - _TOP
+    scores = _kurtosis_scores(case.recorded)[:n_levels]
+    simulated = _kurtosis_scores(case.simulated)
+    # Levels too high for a shorter simulation have none to compare with.
+    known = min(len(simulated), len(scores))
+    scores = scores[:known] - simulated[:known].sign() * (simulated[:known].abs() - 3.5).clamp(min=0)
+    return 2 * torch.special.ndtr(-scores.abs())
+
+
+@remembered
+def _kurtosis_scores(side: Side) -> Tensor:
+    """Kurtosis of thinned Haar coefficients as a standard normal variable, `(level, sensor)`; mean of the records."""
+    mean = side.signal[:_MOST_RECORDS]
+    mean = mean - mean.mean(-1, keepdim=True)
+    scores, stride = [], 1
+    for level in range(1, int(math.log2(side.signal.shape[-1])) - _TOP + 1):
+        half = 2 ** (level - 1) // stride  # samples of the thinned mean in half a wavelet
+        w = (mean[..., half:] - mean[..., :-half]) / 2
+        w = w[..., :: max(half // 2, 1)]
+        centred = w - w.mean(-1, keepdim=True)
+        kurtosis = centred.pow(4).mean(-1) / centred.square().mean(-1).square()
+        scores.append(_normal_kurtosis(kurtosis, _independent(centred)).mean(0))
+        mean = (mean[..., half:] + mean[..., :-half]) / 2
+        if half == 4:
+            mean, stride = mean[..., ::2], stride * 2
+    return torch.stack(scores)
+
+
+def _independent(w: Tensor) -> Tensor:
+    """How many independent normal values `(...)` have a kurtosis as certain as that of `(..., time)`.
+
+    The fourth Hermite polynomials of two values correlated by `rho` are correlated by `rho^4`.
+    """
+    energy = w.square().sum(-1)
+    rho = [(w[..., lag:] * w[..., :-lag]).sum(-1) / energy for lag in range(1, _NEIGHBOURS + 1)]
+    return w.shape[-1] / (1 + 2 * torch.stack(rho).pow(4).sum(0))
+
+
+def _normal_kurtosis(b2: Tensor, n: Tensor) -> Tensor:
+    """Standard normal score of a sample kurtosis of `n` independent values (Anscombe and Glynn, 1983)."""
+    mean = 3 * (n - 1) / (n + 1)
+    variance = 24 * n * (n - 2) * (n - 3) / ((n + 1).square() * (n + 3) * (n + 5))
+    x = (b2 - mean) / variance.sqrt()
+    tail = (6 * (n + 3) * (n + 5) / (n * (n - 2) * (n - 3))).sqrt()
+    skew = 6 * (n * n - 5 * n + 2) / ((n + 7) * (n + 9)) * tail
+    a = 6 + 8 / skew * (2 / skew + (1 + 4 / skew.square()).sqrt())
+    ratio = (1 - 2 / a) / (1 + x * (2 / (a - 4)).sqrt())
+    return (1 - 2 / (9 * a) - ratio.sign() * ratio.abs().pow(1 / 3)) / (2 / (9 * a)).sqrt()
+
+
+def jump_witness(case: Case) -> Evidence:
+    """Jumps between levels, from the kurtosis of Haar coefficients at every scale."""
+    tails = kurtosis_p_values(case)
+    level, sensor = divmod(int(tails.argmin()), tails.shape[1])
+    return Evidence(
+        "jump",
+        corrected(float(tails.min()), tails.numel()),
+        f"wavelet coefficients at level {level + 1} that are not normal in sensor {case.scene.sensors[sensor]}",
+        sensors=(sensor,),
+        levels=(level + 1,),
+    )

@@ -1,0 +1,123 @@
+"""What comes in: a recording and a simulation made comparable, or a clear word why they are not."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gyrofuse._checks import check_positive, check_signal
+from gyrofuse._model import Model
+from gyrofuse._result import named, numbered
+from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.recording import Recording
+from gyrofuse.simulate import ArrayModel
+
+FEWEST = 4096
+_RECORDS = 4  # as long as the recording, that are drawn of a model
+_SAME_RATE = 1e-3
+
+
+def prepared(
+    recording: Recording | Tensor,
+    simulation: Recording | Tensor | Model | ArrayModel,
+    rate: float | None,
+    generator: torch.Generator,
+) -> Case:
+    """Recording and simulation as a case, after all that can be said at the door."""
+    if isinstance(recording, Recording):
+        if rate is not None:
+            raise ValueError(
+                f"`rate`: expected none, since the recording has one ({recording.rate:g} Hz), got {rate!r}"
+            )
+        signal = recording.signal
+        scene = Scene(recording.rate, recording.unit, recording.sensors, dict(recording.channels))
+    else:
+        signal = check_signal("recording", recording)
+        scene = Scene(1.0 if rate is None else check_positive("rate", rate), "unknown", numbered(signal.shape[-2]))
+    signal = _checked("recording", signal, scene)
+    if isinstance(simulation, Model | ArrayModel):
+        drawn = _drawn(simulation, len(signal), signal.shape[-1], generator)
+    else:
+        drawn = _samples(simulation, scene, signal.shape[-1], from_tensor=not isinstance(recording, Recording))
+    if drawn.shape[-2] != signal.shape[-2]:
+        raise ValueError(
+            f"`simulation`: expected {signal.shape[-2]} sensors as in the recording, got {drawn.shape[-2]}; "
+            "simulate the same array, or select its sensors"
+        )
+    return Case.of(scene, signal, drawn)
+
+
+def noise_of(simulation: Recording | Tensor | Model | ArrayModel, case: Case) -> ArrayModel:
+    """The simulation's noise as a model: the one given, or one that describes its samples."""
+    if isinstance(simulation, ArrayModel):
+        return simulation
+    if isinstance(simulation, Model):
+        rows = simulation.params.expand(case.n_sensors, -1)
+        return ArrayModel.from_sensors([simulation.with_params(row) for row in rows])
+    return case.base.model()
+
+
+def _drawn(model: Model | ArrayModel, n_sensors: int, n_samples: int, generator: torch.Generator) -> Tensor:
+    """Records of a model, `(record, sensor, time)`."""
+    if isinstance(model, ArrayModel):
+        return model.simulate(n_samples, batch=(_RECORDS,), generator=generator)
+    own = model.params.shape[:-1]
+    if own not in ((), (n_sensors,)):
+        raise ValueError(
+            f"`simulation`: expected a model of one sensor, or with parameters ({n_sensors},) for each, "
+            f"got parameters of shape {tuple(own)}"
+        )
+    return model.simulate(n_samples, batch=(_RECORDS, *(() if own else (n_sensors,))), generator=generator)
+
+
+def _samples(simulation: Recording | Tensor, scene: Scene, n_samples: int, *, from_tensor: bool) -> Tensor:
+    """Given samples as records `(record, sensor, time)` of the recording's length, or one of their own."""
+    if isinstance(simulation, Recording):
+        signal = simulation.signal
+        if not from_tensor and abs(simulation.rate / scene.rate - 1) > _SAME_RATE:
+            raise ValueError(
+                f"`simulation`: expected samples at {scene.rate:g} Hz as in the recording, got {simulation.rate:g} Hz; "
+                "simulate at the recording's rate, or resample"
+            )
+        both = {scene.unit, simulation.unit}
+        if len(both) == 2 and "unknown" not in both:
+            signal = simulation.to(scene.unit).signal
+    elif isinstance(simulation, Tensor):
+        signal = check_signal("simulation", simulation)
+    else:
+        raise TypeError(
+            f"`simulation`: expected a recording, a tensor (sensor, time), a model or an array model, "
+            f"got {type(simulation).__name__}"
+        )
+    signal = _checked("simulation", signal, scene)
+    n_records = signal.shape[-1] // n_samples
+    if not n_records:
+        return signal[None]
+    return signal[:, : n_records * n_samples].unflatten(-1, (n_records, n_samples)).movedim(1, 0)
+
+
+def _checked(name: str, signal: Tensor, scene: Scene) -> Tensor:
+    """A whole, moving signal `(sensor, time)` in float64."""
+    if signal.ndim != 2:
+        raise ValueError(f"`{name}`: expected (sensor, time), got shape {tuple(signal.shape)}; give one axis at a time")
+    if signal.shape[-1] < FEWEST:
+        raise ValueError(
+            f"`{name}`: expected at least {FEWEST} samples for a diagnosis, got {signal.shape[-1]}; give a longer one"
+        )
+    missing = (~signal.isfinite()).any(-1).nonzero()[:, 0].tolist()
+    if missing:
+        raise ValueError(
+            f"`{name}`: expected whole sensors, got missing samples in {named(_names(scene, len(signal)), missing)}; "
+            "give a stretch without gaps"
+        )
+    constant = (signal.amax(-1) == signal.amin(-1)).nonzero()[:, 0].tolist()
+    if constant:
+        raise ValueError(
+            f"`{name}`: expected sensors that move, got constant ones: {named(_names(scene, len(signal)), constant)}; "
+            "leave them out"
+        )
+    return signal.to(torch.float64)
+
+
+def _names(scene: Scene, n: int) -> tuple[str, ...]:
+    return scene.sensors if len(scene.sensors) == n else numbered(n)

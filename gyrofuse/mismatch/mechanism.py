@@ -1,0 +1,129 @@
+"""What every mechanism of the catalogue is: an equation with numbers, and how a recording shows it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import torch
+from torch import Tensor
+
+from gyrofuse._result import cleaned
+from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.halves import spectral_gains
+
+
+class Parameter(NamedTuple):
+    """A number with its limits at the confidence level of the diagnosis."""
+
+    value: float
+    low: float
+    high: float
+    unit: str
+
+
+class Mechanism:
+    """Physics that a simulator left out: an equation whose numbers are known.
+
+    A subclass is a frozen dataclass of numbers. `nominate` finds it in a case; the rest says what it does, so that it
+    composes with any noise model.
+    """
+
+    name: ClassVar[str]
+
+    @classmethod
+    def nominate(cls, case: Case, level: float) -> Finding | None:
+        """The strongest instance that the recording shows at p below `level`, if any.
+
+        Args:
+            case: Recording and simulation, as far as explained.
+            level: Largest p value, which allows for all the places that were looked at.
+        """
+        raise NotImplementedError
+
+    def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
+        """What becomes of the clean signals `(..., sensor, time)` of a simulation."""
+        raise NotImplementedError
+
+    def removed(self, signal: Tensor, scene: Scene) -> Tensor:
+        """A recording `(..., sensor, time)` without what can be taken off it: all of it, by default none."""
+        return signal
+
+    def explained(self, case: Case, generator: torch.Generator) -> Case:
+        """The case with the mechanism accounted for: taken off the recording or built into the simulation."""
+        raise NotImplementedError
+
+    def spectra(self, matrices: Tensor, f: Tensor) -> Tensor:
+        """What becomes of cross-spectral densities `(frequency, sensor, sensor)` at `f` cycles per sample.
+
+        What `removed` takes off does not count; by default nothing happens.
+        """
+        return matrices
+
+    def gains(self, case: Case) -> Tensor:
+        """Gain in log score of each block that was held out, `(block,)`, nats, with the numbers as they are.
+
+        By default that of the spectra of what is left; where a mechanism is no matter of spectra, its own likelihood.
+        """
+        return spectral_gains(case, self.removed(case.recording, case.scene), self.spectra)
+
+    def refitted(self, case: Case, keep: Tensor) -> Mechanism:
+        """The same mechanism with its numbers estimated anew from the samples `keep` `(time,)` alone.
+
+        Args:
+            case: As it was when the mechanism was found.
+            keep: Which samples may be used.
+        """
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """One difference between recording and simulation, with its name.
+
+    Attributes:
+        mechanism: Name of the physics.
+        effect: It, with its numbers.
+        alternatives: Names that the data cannot tell apart from it.
+        sensors: Positions of the sensors concerned, from 0.
+        levels: Wavelet levels concerned, from 1.
+        frequency_hz: Of a line or band.
+        time_s: Onset, s after the first sample.
+        channel: Auxiliary channel that it follows.
+        parameters: By name, with limits and units.
+        p_value: For having looked at every place where it could have been.
+        held_out_gain: Log score on data not used for it, nats; None until confirmed.
+        sentence: The same in plain English.
+    """
+
+    mechanism: str
+    effect: Mechanism
+    sentence: str
+    p_value: float
+    sensors: tuple[int, ...]
+    parameters: dict[str, Parameter]
+    levels: tuple[int, ...] = ()
+    alternatives: tuple[str, ...] = ()
+    frequency_hz: float | None = None
+    time_s: float | None = None
+    channel: str | None = None
+    gain: float = 0.0
+    held_out_gain: float | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, ready for JSON."""
+        return cleaned(
+            {
+                "mechanism": self.mechanism,
+                "alternatives": list(self.alternatives),
+                "sensors": list(self.sensors),
+                "levels": list(self.levels),
+                "frequency_hz": self.frequency_hz,
+                "time_s": self.time_s,
+                "channel": self.channel,
+                "parameters": {name: entry._asdict() for name, entry in self.parameters.items()},
+                "p_value": self.p_value,
+                "held_out_gain": self.held_out_gain,
+                "sentence": self.sentence,
+            }
+        )

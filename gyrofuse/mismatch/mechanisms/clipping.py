@@ -1,0 +1,101 @@
+"""Full scale: values beyond the limits of a converter are set to them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.evidence import corrected
+from gyrofuse.mismatch.halves import held_out_blocks
+from gyrofuse.mismatch.impulses import left_out
+from gyrofuse.mismatch.marginals import EndStop, end_stops
+from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.vibration_tone import named_sensors
+
+_CELL = 0.02  # width of a cell at the limit, sd: what a sample there is worth is bounded by it
+
+
+@dataclass(frozen=True, eq=False)
+class Clipping(Mechanism):
+    """`y = min(max(x, low), high)`: mass at the extremes, where noise would go on.
+
+    Attributes:
+        low, high: `(sensor,)`, unit of the signal; infinite where nothing is clipped.
+        centre: `(sensor,)`, mean of the recording: a simulation's own mean stands for it.
+    """
+
+    name: ClassVar[str] = "clipping"
+    low: Tensor
+    high: Tensor
+    centre: Tensor
+
+    @classmethod
+    def nominate(cls, case: Case, level: float) -> Finding | None:
+        found = [end for end in end_stops(case) if end.p_value <= level]
+        if not found:
+            return None
+        effect = cls(_limits_of(found, -1, case), _limits_of(found, 1, case), case.recording.mean(-1))
+        sensors = tuple(sorted({end.sensor for end in found}))
+        parameters = {
+            f"{'high' if end.sign > 0 else 'low'}[{end.sensor}]": Parameter(
+                end.limit, end.limit, end.limit, case.scene.unit
+            )
+            for end in found
+        }
+        where = "all sensors" if len(sensors) == case.n_sensors else named_sensors(case.scene, sensors)
+        ends = sorted({"above" if end.sign > 0 else "below" for end in found})
+        at = min(found, key=lambda end: end.p_value)
+        share = float(effect._clipped(case.recording).to(torch.float64)[list(sensors)].mean())
+        return Finding(
+            cls.name,
+            effect,
+            f"values are cut {' and '.join(ends)} in {where}, as at {at.limit:.6g} {case.scene.unit} in sensor "
+            f"{case.scene.sensors[at.sensor]}: {100 * share:.2g} % of the samples sit at the limits",
+            corrected(at.p_value, 1),
+            sensors,
+            parameters,
+            levels=(1,),
+            gain=float(effect._scores(case).sum()),
+        )
+
+    def refitted(self, case: Case, keep: Tensor) -> Clipping:
+        part = case.recording[:, keep]
+        low = torch.where(self.low.isfinite(), part.amin(-1), self.low)
+        high = torch.where(self.high.isfinite(), part.amax(-1), self.high)
+        return Clipping(low, high, part.mean(-1))
+
+    def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
+        shift = signal.mean(-1, keepdim=True) - self.centre[:, None]
+        return signal.clamp(self.low[:, None] + shift, self.high[:, None] + shift)
+
+    def explained(self, case: Case, generator: torch.Generator) -> Case:
+        return case.with_simulation(self.simulated(case.simulated.signal, case.scene, generator))
+
+    def gains(self, case: Case) -> Tensor:
+        return held_out_blocks(self._scores(case)).sum((0, -1))
+
+    def _clipped(self, signal: Tensor) -> Tensor:
+        return (signal <= self.low[:, None]) | (signal >= self.high[:, None])
+
+    def _scores(self, case: Case) -> Tensor:
+        """Log of the mass beyond a limit over that of a cell next to it, for the samples there, `(sensor, time)`."""
+        expected = left_out(case.recorded)
+        error, sd = expected.error[0], expected.sd[0][:, None]
+        # Distance of the limit from what all other samples say, outwards.
+        outward = torch.where(case.recording >= self.high[:, None], error, -error) / sd
+        mass = torch.special.log_ndtr(-outward)
+        cell = -outward.square() / 2 - math.log(2 * math.pi) / 2 + math.log(_CELL)
+        return torch.where(self._clipped(case.recording), mass - cell, 0.0)
+
+
+def _limits_of(found: list[EndStop], sign: int, case: Case) -> Tensor:
+    limits = torch.full((case.n_sensors,), sign * math.inf, dtype=torch.float64)
+    for end in found:
+        if end.sign == sign:
+            limits[end.sensor] = end.limit
+    return limits

@@ -1,0 +1,99 @@
+"""Noise of one source in several sensors."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.colour import noise, of_phase
+from gyrofuse.mismatch.gaussian import Addition
+from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.shape_terms import Common, common_density
+from gyrofuse.mismatch.shape_words import Z, found, named, spanned
+from gyrofuse.mismatch.shapes import chosen_shape, refit
+
+_WORDS = {"white": "white noise", "ar1": "AR1 noise", "walk": "a random walk"}
+_SEEN = 3.0  # standard deviations
+
+
+@dataclass(frozen=True, eq=False)
+class CommonMode(Addition):
+    """`S_ij -> S_ij + g_i g_j* C(f)`: one source in every sensor, with gains, signs and phases of their own.
+
+    Sensors are coherent where it shows; what each has of its own never is. Covariances at no lag miss a source whose
+    phases are a quarter of a cycle apart, cross-spectra do not.
+
+    Attributes:
+        kind: White, AR1 or walk.
+        corner: Of an AR1, cycles per sample; 0 for others.
+        gain: `g`, complex, `(sensor,)`: a sample's rms; for walks that of an increment.
+    """
+
+    name: ClassVar[str] = "common_mode"
+    kind: str
+    corner: float
+    gain: Tensor
+
+    @classmethod
+    def nominate(cls, case: Case, level: float) -> Finding | None:
+        shape = chosen_shape(case, cls.name, level)
+        if shape is None or not isinstance(shape.term, Common):
+            return None
+        term, unit = shape.term, case.scene.unit
+        gain = torch.complex(*term.local)
+        reference = gain[gain.abs().argmax()]
+        gain = gain * reference.conj() / reference.abs()
+        sd = (shape.sd[0].square().mean(0)).sqrt()
+        size = gain.abs()
+        sensors = tuple(i for i in range(len(gain)) if float(size[i]) > _SEEN * float(sd[i]))
+        if len(sensors) < 2:
+            return None  # one sensor has nothing in common
+        parameters = {}
+        for i in sensors:
+            s, d = float(size[i]), float(sd[i])
+            parameters[f"gain[{i}]"] = Parameter(s, max(s - Z * d, 0.0), s + Z * d, unit)
+            turn, reach = math.degrees(float(gain[i].angle())), math.degrees(Z * d / s)
+            parameters[f"phase[{i}]"] = Parameter(turn, turn - reach, turn + reach, "deg")
+        corner = 0.0
+        if term.kind == "ar1":
+            middle, spread = float(term.shared[0]), float(shape.sd[1][0])
+            corner = math.exp(middle)
+            rate = case.scene.rate
+            parameters["corner"] = spanned(lambda x: math.exp(x) * rate, middle, spread, "Hz")
+        against = [i for i in sensors if float(gain[i].real) < 0]
+        sign = f", with the sign reversed in {named(case.scene, tuple(against))}" if against else ""
+        return found(
+            case,
+            cls(term.kind, corner, gain),
+            shape,
+            sensors,
+            parameters,
+            f"{_WORDS[term.kind]} common to {named(case.scene, sensors)} that the simulation does not have, up to "
+            f"{float(size.max()):.3g} {unit}{sign}",
+        )
+
+    def density(self, f: Tensor) -> Tensor:
+        return self._source(f)[:, None, None] * (self.gain[:, None] * self.gain.conj())
+
+    def path(self, n_samples: int, generator: torch.Generator) -> Tensor:
+        if self.kind == "walk":
+            source = torch.randn(1, n_samples, generator=generator, dtype=torch.float64)
+        else:
+            source = noise(n_samples, self._source, 1, generator)
+        sensors = of_phase(self.gain, source)
+        return sensors.cumsum(-1) if self.kind == "walk" else sensors
+
+    def _source(self, f: Tensor) -> Tensor:
+        return common_density(self.kind, f, torch.tensor([self.corner], dtype=torch.float64))
+
+    def refitted(self, case: Case, keep: Tensor) -> Mechanism:
+        shared = torch.tensor([math.log(self.corner)] if self.kind == "ar1" else [], dtype=torch.float64)
+        local = torch.stack([self.gain.real, self.gain.imag])
+        term = refit(case, keep, Common(local, torch.ones_like(local, dtype=torch.bool), shared, self.kind))
+        corner = math.exp(float(term.shared[0])) if self.kind == "ar1" else 0.0
+        return replace(self, gain=torch.complex(*term.local), corner=corner)

@@ -1,0 +1,98 @@
+"""A tone whose frequency wanders: a rotor that is not held to its speed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse._paths import ar1_recursion
+from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.gaussian import Addition
+from gyrofuse.mismatch.mechanism import Finding, Mechanism
+from gyrofuse.mismatch.oscillating import Mode, nominated, refitted_mode
+
+_SHORT = 0.05  # cycles of the width in which a phase that diffuses forgets its frequency
+_LONG = 8.0
+_REACH = 10.0  # half widths of the band that is cleaned
+_FLANK = 6.0
+
+
+@dataclass(frozen=True, eq=False)
+class DriftingTone(Addition):
+    """`x_i(t) = a_i cos(phi(t) + theta_i)` with `phi' = 2 pi (f_0 + u(t))` and a wandering `u`, an AR1.
+
+    Its line is wider than the record's resolution, yet it has one frequency at a time and a steady amplitude: windows
+    that are short against its wander show a peak, and where it wanders too fast for that its squared envelope still
+    varies less than that of Gaussian noise.
+
+    Attributes:
+        mode: Centre, half width, and gains: complex, `a / sqrt 2`.
+        slow: Whether short windows show its frequency.
+    """
+
+    name: ClassVar[str] = "drifting_tone"
+    mode: Mode
+    slow: bool
+
+    @classmethod
+    def nominate(cls, case: Case, level: float) -> Finding | None:
+        seen = nominated(case, level, tone=True)
+        if seen is None:
+            return None
+        mode, finding = seen
+        rate = case.scene.rate
+        return finding.of(
+            cls(mode, finding.slow),
+            f"a tone near {mode.centre * rate:.4g} Hz whose frequency wanders by about {mode.width * rate:.2g} Hz, in "
+            f"{finding.where}, of amplitude up to {math.sqrt(2) * float(mode.gain.abs().max()):.3g} "
+            f"{case.scene.unit}, that the simulation does not have",
+            amplitude="amplitude",
+            factor=math.sqrt(2),
+        )
+
+    def density(self, f: Tensor) -> Tensor:
+        return self.mode.matrix() * self.mode.profile(f, float(f[1] - f[0]))[:, None, None]
+
+    def path(self, n_samples: int, generator: torch.Generator) -> Tensor:
+        width = self.mode.width
+        memory = (_LONG if self.slow else _SHORT) / (2 * math.pi * width)  # samples
+        phi = math.exp(-1 / memory)
+        # A phase that diffuses as fast as a Lorentzian of that half width has it.
+        spread = width if self.slow else math.sqrt(width / math.pi * (1 - phi) / (1 + phi))
+        steps = torch.randn(n_samples, generator=generator, dtype=torch.float64) * spread
+        steps[1:] *= math.sqrt(1 - phi**2)
+        turn = 2 * math.pi * torch.rand((), generator=generator, dtype=torch.float64)
+        phase = 2 * math.pi * (self.mode.centre + _wandered(steps, phi)).cumsum(0) + turn
+        angle = self.mode.gain.angle()[:, None] + phase
+        return math.sqrt(2) * self.mode.gain.abs()[:, None] * angle.cos()
+
+    def explained(self, case: Case, generator: torch.Generator) -> Case:
+        """Its band is filled with the noise around it: another path of its own would differ from the recorded one."""
+        signal, n = case.recording, case.n_samples
+        ramp = torch.linspace(0, 1, n, dtype=torch.float64) * (signal[:, -1:] - signal[:, :1])
+        transform = torch.fft.rfft(signal - ramp)
+        reach = self.mode.width * _REACH
+        first = max(round((self.mode.centre - reach) * n), 1)
+        last = min(round((self.mode.centre + reach) * n), n // 2 - 1)
+        flank = max(round(self.mode.width * _FLANK * n), 16)
+        bins = torch.arange(n // 2 + 1)
+        beside = ((bins >= first - flank) & (bins < first)) | ((bins > last) & (bins <= last + flank))
+        beside &= bins > 0
+        density = case.base.spectrum(bins.clamp(min=1) / n)
+        level = (transform.abs().square() / density)[:, beside].mean(-1, keepdim=True)
+        parts = torch.randn(2, len(signal), last - first + 1, generator=generator, dtype=torch.float64)
+        fresh = torch.complex(parts[0], parts[1]) / math.sqrt(2)
+        transform[:, first : last + 1] = fresh * (level * density[:, first : last + 1]).sqrt()
+        return case.with_recording(torch.fft.irfft(transform, n=n) + ramp)
+
+    def refitted(self, case: Case, keep: Tensor) -> Mechanism:
+        return replace(self, mode=refitted_mode(case, keep, self.mode))
+
+
+def _wandered(steps: Tensor, phi: float) -> Tensor:
+    """AR1 path `(time,)` of its steps, the first one stationary."""
+    return ar1_recursion(steps[None], torch.tensor([phi], dtype=steps.dtype))[0]

@@ -1,0 +1,35 @@
+"""A gain on acceleration: the proof mass of a gyroscope is also that of an accelerometer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.channels import accelerations
+from gyrofuse.mismatch.mechanisms._channel_gain import ChannelGain, gravity_unit
+
+
+@dataclass(frozen=True, eq=False)
+class GSensitivity(ChannelGain):
+    """`x_i(t) = g_i . a(t)`: every frequency with the same gain, at phase 0.
+
+    A vibration that sensors and accelerometer both feel has gains that differ from frequency to frequency, and phases.
+    Where all acceleration lies in one band, the two cannot be told apart.
+    """
+
+    name: ClassVar[str] = "g_sensitivity"
+    of_one_band: ClassVar[tuple[str, ...]] = ("vibration_tone", "common_mode")
+
+    @classmethod
+    def channels(cls, case: Case) -> list[str]:
+        return accelerations(case)
+
+    @classmethod
+    def words(cls, gain: float, channel: str, where: str, unit: str) -> str:
+        return f"{where} follows {channel} with a gain of up to {gain:.3g} {unit}, which the simulation does not have"
+
+    @classmethod
+    def _per(cls, scene: Scene, name: str) -> str:
+        unit = gravity_unit(scene, name)
+        return super()._per(scene, name) if unit is None else f"/{unit}"

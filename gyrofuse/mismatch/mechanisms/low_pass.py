@@ -1,0 +1,72 @@
+"""A sensor's own low-pass filter."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.gaussian import Filter
+from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.shape_terms import ORDERS, LowPass, filter_corner, filter_response
+from gyrofuse.mismatch.shape_words import Z, found, named
+from gyrofuse.mismatch.shapes import chosen_shape, refit
+
+
+@dataclass(frozen=True, eq=False)
+class LowPassFilter(Filter):
+    """`S_i -> |H_i(f)|^2 S_i` with `|H|^2 = 1 / (1 + (f / f_c)^(2 n))`, or a digital filter like it, `n` 1 or 2.
+
+    It multiplies all there is, walks and tones too; the deficit sits in the first levels and grows towards the highest
+    frequency. Lower white noise alone would lower all frequencies above the corner alike.
+
+    Attributes:
+        kind: Form of the filter.
+        strength: Of each sensor's, `(sensor,)`; 0 is none.
+    """
+
+    name: ClassVar[str] = "low_pass"
+    kind: str
+    strength: Tensor
+
+    @classmethod
+    def nominate(cls, case: Case, level: float) -> Finding | None:
+        shape = chosen_shape(case, cls.name, level)
+        if shape is None or not isinstance(shape.term, LowPass):
+            return None
+        term, rate = shape.term, case.scene.rate
+        strength, sd = term.local[0], shape.sd[0][0]
+        corner, highest, lowest = (
+            filter_corner(term.kind, q.clamp(min=0)) * rate for q in (strength, strength - Z * sd, strength + Z * sd)
+        )
+        sensors = tuple(int(i) for i in term.free[0].nonzero()[:, 0])
+        order = Parameter(float(ORDERS[term.kind]), 1.0, 2.0, "1")
+        parameters = {"order": order}
+        for i in sensors:
+            parameters[f"corner[{i}]"] = Parameter(float(corner[i]), float(lowest[i]), float(highest[i]), "Hz")
+        inside = [float(corner[i]) for i in sensors if math.isfinite(float(corner[i]))]
+        where = f"half power at {min(inside):.4g} Hz" if inside else "half power above half the sampling rate"
+        if inside and max(inside) > 1.02 * min(inside):
+            where = f"half power between {min(inside):.4g} and {max(inside):.4g} Hz"
+        return found(
+            case,
+            cls(term.kind, strength),
+            shape,
+            sensors,
+            parameters,
+            f"a low-pass filter of order {ORDERS[term.kind]} in {named(case.scene, sensors)} that the simulation does "
+            f"not have, {where}",
+            frequency_hz=min(inside) if inside else None,
+        )
+
+    def response(self, f: Tensor) -> Tensor:
+        return filter_response(self.kind, self.strength, f)
+
+    def refitted(self, case: Case, keep: Tensor) -> Mechanism:
+        own = self.strength[None]
+        term = LowPass(own, own > 0, torch.zeros(0, dtype=torch.float64), self.kind)
+        return replace(self, strength=refit(case, keep, term).local[0])

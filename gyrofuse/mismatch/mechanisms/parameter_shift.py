@@ -1,0 +1,95 @@
+"""Nothing left out: the same noise with other numbers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.base import Base
+from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.gaussian import Filter
+from gyrofuse.mismatch.mechanism import Finding, Mechanism
+from gyrofuse.mismatch.shape_terms import Parts, Shift
+from gyrofuse.mismatch.shape_words import Z, found, spanned
+from gyrofuse.mismatch.shapes import chosen_shape, refit
+
+_PARTS = ("white", "ar1", "corner", "random_walk")
+_WORDS = ("white noise", "AR1 noise", "AR1 corner frequency", "random walk")
+
+
+@dataclass(frozen=True, eq=False)
+class ParameterShift(Filter):
+    """`S_i = a_i W_i(f) + b_i A_i(f / c_i) + d_i R_i(f)`: the simulation's noise with other
+    numbers.
+
+    Every band of a sensor's spectrum changes smoothly between levels that its own noise has. A filter turns spectra
+    down near the highest frequency alone, more than any level of white noise can follow; what is added keeps apart by
+    its own shape. Where records are short, a changed level and a weak filter are alike.
+
+    Attributes:
+        base: Noise that the numbers apply to.
+        log_factors: Logarithms of `a`, `b`, `c`, `d`, `(4, sensor)`; levels are powers.
+    """
+
+    name: ClassVar[str] = "parameter_shift"
+    base: Base
+    log_factors: Tensor
+
+    @classmethod
+    def nominate(cls, case: Case, level: float) -> Finding | None:
+        shape = chosen_shape(case, cls.name, level)
+        if shape is None:
+            return None
+        parameters, words = {}, []
+        before = _numbers(case.base, case.scene.rate, case.scene.unit)
+        for i in range(case.n_sensors):
+            for k, name in enumerate(_PARTS):
+                sd = float(shape.sd[0][k, i])
+                if math.isnan(sd):
+                    continue
+                value = float(shape.term.local[k, i])
+                power = 1.0 if name == "corner" else 0.5  # levels are reported as standard deviations
+                low, high = value - Z * sd, value + Z * sd
+                parameters[f"{name}_factor[{i}]"] = spanned(math.exp, power * value, power * sd, "1")
+                if low > 0 or high < 0:
+                    number, unit = before[k][i]
+                    factor = math.exp(power * value)
+                    words.append(
+                        f"{_WORDS[k]} of sensor {case.scene.sensors[i]} {number:.3g} -> {number * factor:.3g} {unit}"
+                    )
+        sensors = tuple(int(i) for i in shape.term.free.any(0).nonzero()[:, 0])
+        return found(
+            case,
+            cls(case.base, shape.term.local),
+            shape,
+            sensors,
+            parameters,
+            "the physics is complete, the numbers were wrong: " + ("; ".join(words) or "levels differ slightly"),
+        )
+
+    def response(self, f: Tensor) -> Tensor:
+        parts = Parts(self.base, f.clamp(min=1 / self.base.n_samples))
+        return (parts.shifted(self.log_factors) / parts.densities.sum(0)).sqrt()
+
+    def refitted(self, case: Case, keep: Tensor) -> Mechanism:
+        term = Shift(self.log_factors, self.log_factors != 0, torch.zeros(0, dtype=torch.float64))
+        return replace(self, log_factors=refit(case, keep, term).local)
+
+
+def _numbers(base: Base, rate: float, unit: str) -> list[list[tuple[float, str]]]:
+    """Numbers of the parts before, each sensor's with its unit: sds of a sample, corner in Hz, sd of an increment."""
+    f = torch.tensor([1 / base.n_samples], dtype=torch.float64)
+    parts = Parts(base, f)
+    white = parts.densities[0][:, 0].sqrt()
+    variance, corner = parts.moments()
+    walk = (parts.densities[2][:, 0] * 4 * torch.sin(math.pi * f).square()).sqrt()
+    return [
+        [(float(x), f"{unit} per sample") for x in white],
+        [(float(x), f"{unit} rms") for x in variance.sqrt()],
+        [(float(x) * rate, "Hz") for x in corner],
+        [(float(x), f"{unit} per step") for x in walk],
+    ]

@@ -1,0 +1,40 @@
+"""A gain on products of acceleration: vibration rectification."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from torch import Tensor
+
+from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.channels import accelerations, products
+from gyrofuse.mismatch.mechanisms._channel_gain import ChannelGain, gravity_unit
+
+
+@dataclass(frozen=True, eq=False)
+class QuadraticCoupling(ChannelGain):
+    """`x_i(t) = a(t)' Q_i a(t)`: lines at twice those of the acceleration, and a bias that follows its mean square.
+
+    At twice a line there is no linear coherence with the acceleration, which tells it from a tone.
+    """
+
+    name: ClassVar[str] = "quadratic_coupling"
+    of_one_band: ClassVar[tuple[str, ...]] = ("vibration_tone",)
+
+    @classmethod
+    def channels(cls, case: Case) -> list[str]:
+        return accelerations(case)
+
+    @classmethod
+    def rows(cls, values: Tensor) -> Tensor:
+        return products(values)
+
+    @classmethod
+    def words(cls, gain: float, channel: str, where: str, unit: str) -> str:
+        return f"{where} follows the square of {channel} with a gain of up to {gain:.3g} {unit}: vibration is rectified"
+
+    @classmethod
+    def _per(cls, scene: Scene, name: str) -> str:
+        unit = gravity_unit(scene, name)
+        return f" per squared unit of {name}" if unit is None else f"/{unit}^2" if unit == "g" else f"/({unit})^2"

@@ -1,0 +1,119 @@
+"""Rounding of the rate to whole steps: a converter that the simulator left out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.evidence import corrected
+from gyrofuse.mismatch.halves import held_out_blocks
+from gyrofuse.mismatch.marginals import Lattice, missing_lattices, off_lattice
+from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.vibration_tone import named_sensors
+
+_Z = 1.959963984540054
+_SHARPEST = 0.02  # blur in steps: what an exact lattice is worth is bounded by it
+
+
+@dataclass(frozen=True, eq=False)
+class Quantization(Mechanism):
+    """`y = offset + step round((x - offset)/step)`: an exact lattice of values, or one blurred by what came after.
+
+    Looks like white noise of variance `step^2/12`; the values on their lattice tell them apart. Noise added after the
+    rounding is no part of it.
+
+    Attributes:
+        step: `(sensor,)`, unit of the signal; 0 where a sensor is not rounded.
+        offset: `(sensor,)`, likewise: the lattice's point next to 0.
+        blur: `(sensor,)`, sd of what was added after the rounding, steps.
+    """
+
+    name: ClassVar[str] = "quantization"
+    step: Tensor
+    offset: Tensor
+    blur: Tensor
+
+    @classmethod
+    def nominate(cls, case: Case, level: float) -> Finding | None:
+        found = missing_lattices(case, level)
+        if not found:
+            return None
+        none = Lattice(0.0, 0.0, 0.0, 1.0)
+        rows = [found.get(i, none) for i in range(case.n_sensors)]
+        step, offset, blur = (torch.tensor([row[k] for row in rows], dtype=torch.float64) for k in range(3))
+        effect = cls(step, offset, blur)
+        sensors = tuple(found)
+        parameters = {}
+        for i in sensors:
+            value = float(step[i])
+            reach = _Z * effect._step_sd(i, case.recording[i])
+            parameters[f"lsb[{i}]"] = Parameter(value, value - reach, value + reach, case.scene.unit)
+        where = "all sensors" if len(sensors) == case.n_sensors else named_sensors(case.scene, sensors)
+        hidden = ", hidden under what was added later" if float(blur.max()) > 0 else ""
+        return Finding(
+            cls.name,
+            effect,
+            f"the rate is rounded to steps of {_several(step[list(sensors)])} {case.scene.unit} in {where}{hidden}",
+            max(corrected(found[i].p_value, case.n_sensors) for i in sensors),
+            sensors,
+            parameters,
+            levels=(1,),
+            gain=float(effect._scores(case.recording).sum()),
+        )
+
+    def refitted(self, case: Case, keep: Tensor) -> Quantization:
+        place = off_lattice(case.recording[:, keep], self._divisor, self.offset[:, None])
+        turn = torch.exp(2j * math.pi * place).mean(-1)
+        offset = self.offset + turn.angle() / (2 * math.pi) * self.step
+        blur = torch.sqrt(-2 * turn.abs().clamp(1e-6, 1.0).log()) / (2 * math.pi)
+        return Quantization(self.step, offset, torch.where(self.blur > 0, blur, self.blur))
+
+    def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
+        offset = self.offset[:, None]
+        rounded = ((signal - offset) / self._divisor).round() * self._divisor + offset
+        return torch.where(self.step[:, None] > 0, rounded, signal)
+
+    def explained(self, case: Case, generator: torch.Generator) -> Case:
+        return case.with_simulation(self.simulated(case.simulated.signal, case.scene, generator))
+
+    def gains(self, case: Case) -> Tensor:
+        return held_out_blocks(self._scores(case.recording)).sum((0, -1))
+
+    @property
+    def _divisor(self) -> Tensor:
+        return torch.where(self.step > 0, self.step, 1.0)[:, None]
+
+    def _scores(self, signal: Tensor) -> Tensor:
+        """Log density of the distances from the lattice against an even one, `(sensor, time)`: a wrapped normal's."""
+        place = off_lattice(signal, self._divisor, self.offset[:, None])
+        blur = self.blur.clamp(min=_SHARPEST)[:, None]
+        return torch.where(self.step[:, None] > 0, _wrapped_normal(place, blur).clamp(min=1e-12).log(), 0.0)
+
+    def _step_sd(self, sensor: int, signal: Tensor) -> float:
+        """From the information of each distance on the lattice, as values spread over many steps."""
+        r = (torch.arange(2048, dtype=torch.float64) + 0.5) / 2048 - 0.5
+        density = _wrapped_normal(r, self.blur[sensor].clamp(min=1e-3))
+        slope = density.roll(-1) - density.roll(1)
+        information = float((slope.square() / density.clamp(min=1e-12)).mean()) * 1024**2
+        spread = float((signal / self.step[sensor]).std())
+        return float(self.step[sensor]) / math.sqrt(max(information * len(signal) * spread**2, 1e-300))
+
+
+def _wrapped_normal(place: Tensor, sd: Tensor) -> Tensor:
+    """Density at `place`, within half a turn of 0, of a normal variable on a circle of length one."""
+    turns = torch.arange(-3, 4, dtype=torch.float64)
+    normal = torch.zeros_like(place)
+    for turn in turns.tolist():
+        normal = normal + torch.exp(-((place - turn) / sd).square() / 2)
+    return normal / (math.sqrt(2 * math.pi) * sd)
+
+
+def _several(values: Tensor) -> str:
+    """One number for values that agree, else the range."""
+    low, high = float(values.min()), float(values.max())
+    return f"{low:.4g}" if high <= low * (1 + 1e-3) else f"{low:.4g} to {high:.4g}"

@@ -1,0 +1,32 @@
+"""A scale factor or misalignment: the output follows the true rate with a gain that is off."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.channels import rates
+from gyrofuse.mismatch.mechanisms._channel_gain import ChannelGain
+
+
+@dataclass(frozen=True, eq=False)
+class ScaleFactor(ChannelGain):
+    """`x_i(t) = error_i omega(t)` beside what the simulation has of the rate `omega`, an auxiliary channel.
+
+    Seen only while the rate changes: at a constant rate it is a bias.
+    """
+
+    name: ClassVar[str] = "scale_factor"
+
+    @classmethod
+    def channels(cls, case: Case) -> list[str]:
+        return rates(case)
+
+    @classmethod
+    def words(cls, gain: float, channel: str, where: str, unit: str) -> str:
+        return f"{where} follows {channel} with a gain that is off by up to {1e6 * gain:.3g} ppm"
+
+    @classmethod
+    def _per(cls, scene: Scene, name: str) -> str:
+        return f"/({scene.unit})"

@@ -1,0 +1,104 @@
+"""A step: a bias that changes at once and stays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.mechanism import Finding
+from gyrofuse.mismatch.mechanisms.vibration_tone import named_sensors
+from gyrofuse.mismatch.slow import cell_differences
+from gyrofuse.mismatch.slow_effect import (
+    SlowEffect,
+    doubt,
+    estimate,
+    only,
+    place,
+    plausible,
+    quantiles,
+    sizes,
+    slow_levels,
+    strong_scan,
+)
+from gyrofuse.mismatch.slow_scans import Scan, SlowLook, concerned, steps
+
+_CELLS = 256
+_MARGIN = 24  # cells on either side of the places left
+_FINE = 4.0  # cells to a standard deviation
+_NEGLIGIBLE = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Step(SlowEffect):
+    """`x_i(t) = size_i` from `t0` on, in every sensor `i`.
+
+    Where a random walk gets there by many small steps, this takes one. A sensor that jumps to and fro between two
+    levels has random telegraph noise, and is left alone.
+
+    Attributes:
+        size: `(sensor,)`, unit of the signal.
+        onset_s: `t0`, s after the first sample.
+    """
+
+    name: ClassVar[str] = "step"
+    onset_s: float
+
+    @classmethod
+    def nominate(cls, case: Case, level: float) -> Finding | None:
+        strong = strong_scan(case, cls.name, level)
+        if strong is None:
+            return None
+        look, scan, alternatives = strong
+        found = estimate(look, scan, steps(case))
+        which = concerned(scan)
+        onset = place(onset_samples(case, look, scan, found.size), case.scene.rate)
+        effect = cls(only(found.size, which), scan.fit.log_factors, onset.value)
+        largest = max(which, key=lambda i: abs(float(found.size[i])))
+        return Finding(
+            cls.name,
+            effect,
+            f"the bias of {named_sensors(case.scene, which)} steps at {onset.value:.6g} s, by up to "
+            f"{abs(float(found.size[largest])):.3g} {case.scene.unit} (sensor {case.scene.sensors[largest]})",
+            scan.p_value,
+            which,
+            {"onset": onset, **sizes("size", found, which, case.scene.unit)},
+            levels=slow_levels(case.n_samples),
+            alternatives=alternatives,
+            time_s=onset.value,
+            gain=scan.gain,
+        )
+
+    def path(self, n_samples: int, scene: Scene) -> Tensor:
+        # Times of samples are exact multiples only to rounding.
+        return (torch.arange(n_samples) >= round(self.onset_s * scene.rate)).to(torch.float64)
+
+
+def onset_samples(case: Case, look: SlowLook, scan: Scan, size: Tensor) -> tuple[float, float, float]:
+    """Median of the onset with 95 % limits, samples, from ever finer cells around it; the sizes are held."""
+    which = list(concerned(scan))
+    size = size[which, None]
+    widened = doubt(scan) ** 2
+    low, high = plausible(look, scan)
+    margin = max(high - low, 4.0 * case.block)
+    while True:
+        first, end = max(int(low - margin), 0), min(int(high + margin), case.n_samples)
+        cell = max(-(-(end - first) // _CELLS), 1)
+        n_cells = (end - first) // cell
+        signal = case.recording[which, first : first + n_cells * cell]
+        y = signal.unflatten(-1, (n_cells, cell)).mean(-1).diff()
+        covariance = cell_differences(case.base, cell, n_cells)[which]
+        inverse = torch.linalg.inv(covariance * scan.fit.log_factors[which, :1, None].exp())
+        information = inverse.diagonal(dim1=-1, dim2=-2)
+        gain = size * (inverse @ y[..., None])[..., 0] - size.square() * information / 2
+        weight = torch.softmax(gain.sum(0) / widened, 0)
+        places = first + cell * torch.arange(1, n_cells, dtype=torch.float64)
+        mean = places @ weight
+        sd = float(((places - mean).square() @ weight).sqrt())
+        if cell == 1 or sd > _FINE * cell:
+            return quantiles(places, weight)
+        at = (weight > _NEGLIGIBLE * weight.max()).nonzero()[:, 0]
+        low, high, margin = float(places[at[0]]), float(places[at[-1]]), _MARGIN * cell

@@ -1,0 +1,108 @@
+"""Samples read twice: a bus that is faster than the sensor, or a value that was not ready."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.evidence import corrected
+from gyrofuse.mismatch.halves import held_out_blocks
+from gyrofuse.mismatch.marginals import repeated, repeats
+from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.vibration_tone import named_sensors
+
+_Z = 1.959963984540054
+_TOGETHER = 0.5  # share of the repeats that all have at once, beyond chance
+
+
+@dataclass(frozen=True, eq=False)
+class StuckSamples(Mechanism):
+    """`y_t = y_{t-1}` with probability `p`, else `x_t`: more repeats than the values' own resolution makes.
+
+    On a lattice they are counted against those of the rounded simulation.
+
+    Attributes:
+        probability: `(sensor,)`.
+        by_chance: `(sensor,)`, of a repeat without the mechanism.
+        together: Whether all the sensors concerned repeat at the same time.
+    """
+
+    name: ClassVar[str] = "stuck_samples"
+    probability: Tensor
+    by_chance: Tensor
+    together: bool
+
+    @classmethod
+    def nominate(cls, case: Case, level: float) -> Finding | None:
+        found = repeats(case)
+        p_values = [corrected(float(p), case.n_sensors) for p in found.p_values]
+        sensors = tuple(i for i, p in enumerate(p_values) if p <= level)
+        if not sensors:
+            return None
+        effect = cls._estimated(case, sensors, torch.ones(case.n_samples, dtype=torch.bool))
+        parameters = {}
+        for i in sensors:
+            value = float(effect.probability[i])
+            own = float(found.share[i])
+            sd = math.hypot(float(found.sd[i]), math.sqrt(own * (1 - own) / found.n)) / (1 - float(effect.by_chance[i]))
+            parameters[f"probability[{i}]"] = Parameter(value, max(value - _Z * sd, 0.0), min(value + _Z * sd, 1.0), "")
+        where = "all sensors" if len(sensors) == case.n_sensors else named_sensors(case.scene, sensors)
+        largest = max(sensors, key=lambda i: float(effect.probability[i]))
+        jointly = " at the same time" if effect.together else ""
+        return Finding(
+            cls.name,
+            effect,
+            f"samples repeat the one before{jointly} in {where}, with a probability of up to "
+            f"{float(effect.probability[largest]):.3g} (sensor {case.scene.sensors[largest]}), "
+            f"where the simulation has {float(effect.by_chance[largest]):.2g}",
+            min(p_values),
+            sensors,
+            parameters,
+            levels=(1,),
+            gain=float(effect._scores(case).sum()),
+        )
+
+    @classmethod
+    def _estimated(cls, case: Case, sensors: tuple[int, ...], keep: Tensor) -> StuckSamples:
+        same = repeated(case.recording)[:, keep]
+        chance = repeats(case).expected.clamp(max=0.999)
+        share = same.to(torch.float64).mean(-1)
+        concerned = torch.zeros(case.n_sensors, dtype=torch.bool)
+        concerned[list(sensors)] = True
+        probability = torch.where(concerned, ((share - chance) / (1 - chance)).clamp(min=0), 0.0)
+        at = list(sensors)
+        jointly = float(same[at].all(0).to(torch.float64).mean() - share[at].prod())
+        together = len(at) > 1 and jointly > _TOGETHER * float(probability[at].min())
+        return cls(probability, chance, together)
+
+    def refitted(self, case: Case, keep: Tensor) -> StuckSamples:
+        return self._estimated(case, tuple(self.probability.nonzero()[:, 0].tolist()), keep)
+
+    def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
+        n = signal.shape[-1]
+        draws = (*signal.shape[:-2], 1, n) if self.together else signal.shape
+        held = torch.rand(draws, generator=generator, dtype=torch.float64) < self.probability[:, None]
+        held[..., 0] = False
+        source = torch.where(held, 0, torch.arange(n)).cummax(-1).values
+        return signal.gather(-1, source)
+
+    def explained(self, case: Case, generator: torch.Generator) -> Case:
+        return case.with_simulation(self.simulated(case.simulated.signal, case.scene, generator))
+
+    def gains(self, case: Case) -> Tensor:
+        return held_out_blocks(self._scores(case)).sum((0, -1))
+
+    def _scores(self, case: Case) -> Tensor:
+        """Log likelihood ratio of each sample's being a repeat or not, `(sensor, time)`."""
+        # A simulation without any repeats does not say that they are impossible.
+        chance = self.by_chance.clamp(min=0.5 / case.simulated.signal[:, 0].numel())
+        stuck = chance + self.probability * (1 - chance)
+        stuck = stuck.clamp(max=1 - 1e-9)
+        yes, no = (stuck / chance).log(), ((1 - stuck) / (1 - chance)).log()
+        scores = torch.where(repeated(case.recording), yes[:, None], no[:, None])
+        return torch.where(self.probability[:, None] > 0, scores, 0.0)

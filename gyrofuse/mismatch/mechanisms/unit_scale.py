@@ -1,0 +1,73 @@
+"""Other units: the numbers of recording and simulation differ by a factor that units have."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.witnesses import power_tails
+
+_UNITS = {
+    180 / math.pi: "deg/s against rad/s",
+    1000.0: "mdeg/s against deg/s",
+    3600.0: "deg/h against deg/s",
+    3600 * 180 / math.pi: "deg/h against rad/s",
+    9.80665: "m/s^2 against g",
+}
+_NEAR = 0.25  # of the logarithm: noise levels of sensors of one kind differ by as much
+
+
+@dataclass(frozen=True, eq=False)
+class UnitScale(Mechanism):
+    """`x = factor * simulated`, the factor one between two units, for all sensors.
+
+    Attributes:
+        factor: Recording over simulation.
+    """
+
+    name: ClassVar[str] = "parameter_shift"
+    factor: float
+
+    @classmethod
+    def nominate(cls, case: Case, level: float) -> Finding | None:
+        known = case.simulated.dof > 0
+        ratios = (case.recorded.power / case.simulated.power)[:, known].log().median(-1).values / 2  # (sensor,)
+        for size, words in _UNITS.items():
+            for sign in (1, -1):
+                if bool(((ratios - sign * math.log(size)).abs() < _NEAR).all()):
+                    return cls._found(
+                        case, size**sign, words if sign == 1 else " against ".join(words.split(" against ")[::-1])
+                    )
+        return None
+
+    @classmethod
+    def _found(cls, case: Case, factor: float, words: str) -> Finding:
+        tails = power_tails(case)
+        return Finding(
+            cls.name,
+            cls(factor),
+            f"every sensor of the recording is {factor:.4g} times the simulation, as {words} would be: "
+            "give both in the same unit",
+            min(float(tails.nan_to_num(nan=1.0).amin()) * tails.numel(), 1.0),
+            tuple(range(case.n_sensors)),
+            {"factor": Parameter(factor, factor, factor, "")},
+            gain=math.inf,
+        )
+
+    def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
+        return self.factor * signal
+
+    def explained(self, case: Case, generator: torch.Generator) -> Case:
+        return case.with_simulation(self.factor * case.simulated.signal)
+
+    def spectra(self, matrices: Tensor, f: Tensor) -> Tensor:
+        return self.factor**2 * matrices
+
+    def refitted(self, case: Case, keep: Tensor) -> UnitScale:
+        return self

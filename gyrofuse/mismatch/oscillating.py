@@ -1,0 +1,157 @@
+"""What resonances and wandering tones have in common: a bump of the spectrum, and its gains in the sensors."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.bumps import Oscillation, Stretch, oscillation_of
+from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.shape_terms import Bump, CommonBump, oscillation
+from gyrofuse.mismatch.shape_words import Z, named, spanned
+from gyrofuse.mismatch.shapes import chosen_shape, run_length
+from gyrofuse.mismatch.steadiness import Steadiness, steadiness
+from gyrofuse.mismatch.witnesses import level_of
+
+_SEEN = 3.0  # standard deviations
+_SMEARED = 0.7  # bins: half width of a line under a Hann taper
+
+
+@dataclass(frozen=True, eq=False)
+class Mode:
+    """A bump and how the sensors see it.
+
+    Attributes:
+        centre, width: Centre and half width, cycles per sample.
+        gain: Complex, `(sensor,)`: rms and phase.
+        shared: Whether one source moves all sensors, or each has its own.
+    """
+
+    centre: float
+    width: float
+    gain: Tensor
+    shared: bool
+
+    def profile(self, f: Tensor, resolution: float = 0.0) -> Tensor:
+        """Density of variance one at `f` cycles per sample, as spectra of a resolution show it."""
+        width = torch.tensor(math.hypot(self.width, _SMEARED * resolution), dtype=torch.float64)
+        return oscillation(f, torch.tensor(self.centre, dtype=torch.float64), width)
+
+    def matrix(self) -> Tensor:
+        """Covariance of the sensors, complex, `(sensor, sensor)`."""
+        if self.shared:
+            return self.gain[:, None] * self.gain.conj()
+        return torch.diag(self.gain.abs().square()).to(self.gain.dtype)
+
+
+class Seen(NamedTuple):
+    """A bump that may be named, with all that a finding says whatever its name."""
+
+    case: Case
+    bump: Oscillation
+    verdict: Steadiness
+    sensors: tuple[int, ...]
+    rivals: tuple[str, ...]
+
+    @property
+    def where(self) -> str:
+        return named(self.case.scene, self.sensors)
+
+    def of(self, effect: Mechanism, sentence: str, amplitude: str, factor: float) -> Finding:
+        """The finding, amplitudes `factor` times the rms."""
+        bump, rate, unit = self.bump, self.case.scene.rate, self.case.scene.unit
+        centre_sd, width_sd = bump.log_sd
+        parameters = {
+            "frequency": spanned(lambda x: rate * math.exp(x), math.log(bump.centre), centre_sd, "Hz"),
+            "width": spanned(lambda x: 2 * rate * math.exp(x), math.log(bump.width), width_sd, "Hz"),
+        }
+        if amplitude == "rms":
+            spread = math.hypot(centre_sd, width_sd)
+            quality = math.log(bump.centre / bump.width / 2)
+            parameters["quality_factor"] = spanned(math.exp, quality, spread, "1")
+        for i in self.sensors:
+            value, sd = float(bump.variance[i]), float(bump.variance_sd[i])
+            parameters[f"{amplitude}[{i}]"] = spanned(lambda x: factor * math.sqrt(max(x, 0.0)), value, sd, unit)
+            if bump.gain is not None:
+                reference = bump.gain[bump.gain.abs().argmax()]
+                turn = math.degrees(float((bump.gain[i] * reference.conj()).angle()))
+                reach = math.degrees(Z * sd / (2 * value))
+                parameters[f"phase[{i}]"] = Parameter(turn, turn - reach, turn + reach, "deg")
+        other = ("resonance",) if effect.name == "drifting_tone" else ("drifting_tone",)
+        alternatives = tuple(sorted({*self.rivals, *(other if self.verdict.open else ())} - {effect.name}))
+        if alternatives:
+            sentence += f"; these data do not tell it apart from {', '.join(alternatives)}"
+        return Finding(
+            effect.name,
+            effect,
+            sentence,
+            bump.stretch.p_value,
+            self.sensors,
+            parameters,
+            levels=(level_of(bump.centre),),
+            alternatives=alternatives,
+            frequency_hz=bump.centre * rate,
+            gain=bump.nats,
+        )
+
+    @property
+    def slow(self) -> bool:
+        return self.verdict.slow
+
+
+def nominated(case: Case, level: float, *, tone: bool) -> tuple[Mode, Seen] | None:
+    """The strongest bump, if it is a tone, or if it is none."""
+    bump = oscillation_of(case)
+    rivals: tuple[str, ...] = ()
+    if bump is None or bump.stretch.p_value > level:
+        shape = chosen_shape(case, "resonance", level)
+        if shape is None or not isinstance(shape.term, Bump | CommonBump):
+            return None
+        rivals = shape.alternatives
+        term, (local_sd, log_sd) = shape.term, shape.sd
+        centre, width = (float(x) for x in term.shared.exp())
+        if isinstance(term, CommonBump):
+            gain = torch.complex(*term.local)
+            variance, spread = gain.abs().square(), 2 * gain.abs() * local_sd.square().mean(0).sqrt()
+        else:
+            gain, variance, spread = None, term.local[0], local_sd[0].nan_to_num(nan=math.inf)
+        stretch = Stretch(centre, width, shape.p_value, ())
+        sds = (float(log_sd[0]), float(log_sd[1]))
+        bump = Oscillation(stretch, centre, width, sds, variance, spread, gain, shape.gain)
+    sensors = tuple(int(i) for i in (bump.variance > _SEEN * bump.variance_sd).nonzero()[:, 0])
+    verdict = steadiness(case, bump)
+    if not sensors or verdict.tone != tone:
+        return None
+    gain = bump.variance.clamp(min=0).sqrt().to(torch.complex128) if bump.gain is None else bump.gain
+    mode = Mode(bump.centre, bump.width, gain, bump.gain is not None)
+    return mode, Seen(case, bump, verdict, sensors, rivals)
+
+
+def refitted_mode(case: Case, keep: Tensor, mode: Mode) -> Mode:
+    """The same centre and width, gains from the power over the flanks in blocks of the samples `keep`."""
+    block = run_length(keep)
+    blocks = case.recording[:, keep].unflatten(-1, (-1, block))
+    taper = torch.hann_window(block, dtype=torch.float64) * math.sqrt(8 / 3 / block)
+    transform = torch.fft.rfft((blocks - blocks.mean(-1, keepdim=True)) * taper).movedim(-1, 0)  # (bin, sensor, block)
+    f = torch.arange(len(transform), dtype=torch.float64) / block
+    level = case.base.spectrum(f.clamp(min=1 / block)).mT.sqrt()
+    spectra = transform @ transform.mH / transform.shape[-1]
+    white = spectra / (level[:, :, None] * level[:, None, :])
+    reach = 3 * mode.width + 3 / block
+    apart = (f - mode.centre).abs()
+    usable = (f > 2.5 / block) & (f < 0.5 - 2 / block)
+    inside, beside = usable & (apart <= reach), usable & (apart > reach) & (apart <= 2.5 * reach)
+    if not bool(inside.any()) or not bool(beside.any()):
+        return mode
+    excess = (white[inside] - white[beside].mean(0)) * (level[inside][:, :, None] * level[inside][:, None, :])
+    share = mode.profile(f[inside], 1 / block).sum() - mode.profile(f[beside], 1 / block).mean() * int(inside.sum())
+    covariance = excess.sum(0) / share
+    if mode.shared:
+        values, vectors = torch.linalg.eigh((covariance + covariance.mH) / 2)
+        return replace(mode, gain=vectors[:, -1] * values[-1].clamp(min=0).sqrt())
+    return replace(mode, gain=covariance.diagonal().real.clamp(min=0).sqrt().to(torch.complex128))

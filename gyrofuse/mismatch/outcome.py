@@ -1,0 +1,112 @@
+"""What a diagnosis found, as data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, TypeVar
+
+from torch import Tensor
+
+from gyrofuse._result import cleaned
+from gyrofuse.mismatch.benefit import Benefit, benefit
+from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.comparison import VarianceComparison, compared_variances
+from gyrofuse.mismatch.confirm import HeldOut
+from gyrofuse.mismatch.evidence import Evidence
+from gyrofuse.mismatch.mechanism import Finding
+from gyrofuse.mismatch.repaired import RepairedModel
+from gyrofuse.recording import Recording
+from gyrofuse.scale_weights import ScaleWeights
+
+_Signal = TypeVar("_Signal", Recording, Tensor)
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """Where recording and simulation differ, what the simulation left out, and how much better the repair fits.
+
+    Attributes:
+        mismatch: Whether they differ at all.
+        p_value: Of agreement, for the whole recording.
+        findings: Differences with names, in the order in which they were found.
+        unexplained: What witnesses still see after the repair.
+        held_out: Agreement on data not used for the repair.
+        model: The repaired simulation; it simulates.
+        evidence: What each witness saw before the repair.
+        evidence_after: What each witness saw after it.
+        case: Recording and simulation as they came.
+        repaired: The recording without what can be taken off it, and the simulation with all else.
+    """
+
+    mismatch: bool
+    p_value: float
+    findings: tuple[Finding, ...]
+    unexplained: tuple[Evidence, ...]
+    held_out: HeldOut
+    model: RepairedModel
+    evidence: tuple[Evidence, ...]
+    evidence_after: tuple[Evidence, ...]
+    case: Case
+    repaired: Case
+
+    def correct(self, recording: _Signal) -> _Signal:
+        """The recording that was diagnosed, or one that runs along with it, without what can be taken off it.
+
+        What has a place in time (a tone's phase, a step) counts from the first sample.
+
+        Args:
+            recording: `(sensor, time)` in the unit of the diagnosis, or a recording with its unit and channels.
+
+        Returns:
+            The same kind, of the same dtype.
+
+        Raises:
+            ValueError: Other sensors than those of the diagnosis.
+        """
+        scene = self.model.scene
+        signal = recording.signal if isinstance(recording, Recording) else recording
+        if signal.ndim < 2 or signal.shape[-2] != len(scene.sensors):
+            raise ValueError(
+                f"`recording`: expected (sensor, time) with the {len(scene.sensors)} sensors of the diagnosis, got "
+                f"shape {tuple(signal.shape)}; correct the recording that was diagnosed"
+            )
+        if not isinstance(recording, Recording):
+            return self.model.correct(signal.double()).to(signal.dtype)
+        other_unit = recording.unit != scene.unit and "unknown" not in (recording.unit, scene.unit)
+        converted = recording.to(scene.unit) if other_unit else recording
+        own = replace(self.model, scene=replace(scene, channels={**scene.channels, **recording.channels}))
+        corrected = replace(converted, signal=own.correct(converted.signal.double()).to(signal.dtype))
+        return corrected.to(recording.unit) if other_unit else corrected
+
+    def benefit(self, scale_weights: ScaleWeights = "long") -> Benefit:
+        """Fuse the recording before and after correction: what the virtual gyro gains by it.
+
+        Args:
+            scale_weights: `"flat"`, `"short"`, `"long"`, or one number >= 0 per level.
+
+        Raises:
+            SingularCovarianceError: Sensors that are copies of each other have no best weights.
+        """
+        recording = self.case.recording
+        return benefit(recording, self.model.correct(recording), scale_weights)
+
+    @cached_property
+    def variances(self) -> list[VarianceComparison]:
+        """Wavelet variances of recording and simulation, as they came and after the repair."""
+        return compared_variances(self.case, self.repaired)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, ready for JSON."""
+        return cleaned(
+            {
+                "mismatch": self.mismatch,
+                "p_value": self.p_value,
+                "findings": [finding.to_dict() for finding in self.findings],
+                "unexplained": [entry.to_dict() for entry in self.unexplained],
+                "evidence": [entry.to_dict() for entry in self.evidence],
+                "evidence_after": [entry.to_dict() for entry in self.evidence_after],
+                "held_out": self.held_out.to_dict(),
+                "model": self.model.to_dict(),
+            }
+        )

@@ -1,0 +1,145 @@
+"""Law of standardised values among which a few are outliers, and how these lie in time and over sensors."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from scipy import optimize, stats
+from torch import Tensor
+
+_BULK = 2.5  # values below it are counted in a histogram
+_BINS = 250
+_EVENT, _COMPANY = 3.5, 2.5  # sd
+_NEAR = (2, 9)  # samples on either side
+_CLUSTERED = 0.6  # share of events that have company
+
+
+class Outliers(NamedTuple):
+    """`z` is standard normal, but with probability `rate` moved by `height`, of either sign, with sd `spread`.
+
+    Attributes:
+        rate: Probability.
+        height, spread: In sd of the noise.
+        rate_sd, amplitude_sd: Standard errors of `rate` and `amplitude`.
+    """
+
+    rate: float
+    height: float
+    spread: float
+    rate_sd: float = math.nan
+    amplitude_sd: float = math.nan
+
+    @classmethod
+    def none(cls) -> Outliers:
+        return cls(0.0, 0.0, 0.0)
+
+    @property
+    def amplitude(self) -> float:
+        return math.hypot(self.height, self.spread)
+
+    def posterior(self, z: Tensor) -> Tensor:
+        """Probability of each value's being an outlier."""
+        if self.rate <= 0:
+            return torch.zeros_like(z)
+        return torch.exp(math.log(self.rate) + _moved(z, self) - mixture(z, self))
+
+
+def mixture(z: Tensor, law: Outliers) -> Tensor:
+    """Log density of `z` under the law."""
+    plain = -z.square() / 2 - math.log(2 * math.pi) / 2
+    return torch.logaddexp(math.log1p(-law.rate) + plain, math.log(max(law.rate, 1e-300)) + _moved(z, law))
+
+
+def free_gaussian(z: Tensor) -> Tensor:
+    """Log density of `z` under a normal law of its own variance."""
+    variance = z.square().mean()
+    return -z.square() / (2 * variance) - (2 * math.pi * variance).log() / 2
+
+
+def fitted(z: Tensor) -> Outliers:
+    """Maximum likelihood in `log rate`, `log height`, `log spread`, and limits from its curvature."""
+    z, counts = _condensed(z.abs())
+    n = float(counts.sum())
+
+    def deviance(theta: list[float]) -> float:
+        law = Outliers(min(math.exp(theta[0]), 0.5), math.exp(theta[1]), math.exp(theta[2]))
+        return -float((counts * mixture(z, law)).sum())
+
+    bounds = [(math.log(0.2 / n), math.log(0.3)), (math.log(0.3), math.log(1e4)), (math.log(0.05), math.log(1e4))]
+    starts = [
+        (max(float(counts[z > level].sum()), 1.0) / n, height)
+        for level, height in ((3.0, 3.0), (4.0, 6.0), (6.0, float(z[z > 6].mean()) if bool((z > 6).any()) else 8.0))
+    ]
+    runs = [
+        optimize.minimize(
+            deviance,
+            [math.log(rate), math.log(height), math.log(0.3 * height)],
+            method="L-BFGS-B",
+            bounds=bounds,
+            options={"maxiter": 60},
+        )
+        for rate, height in starts
+    ]
+    best = min(runs, key=lambda run: float(run.fun))
+    rate, height, spread = (math.exp(v) for v in best.x)
+    rate_sd, amplitude_sd = _spread_of(z, counts, Outliers(rate, height, spread))
+    return Outliers(rate, height, spread, rate_sd, amplitude_sd)
+
+
+def clustered(white: Tensor) -> bool:
+    """Whether outliers of `(sensor, time)` lie together, as those of loud episodes do."""
+    near = _NEAR[1]
+    for row in white.abs():
+        events = (row > _EVENT).nonzero()[:, 0]
+        events = events[(events >= near) & (events < len(row) - near)]
+        if len(events) < 4:
+            continue
+        steps = torch.arange(_NEAR[0], near + 1)
+        around = row[events[:, None] + torch.cat([-steps, steps])]
+        if float((around.amax(-1) > _COMPANY).to(torch.float64).mean()) > _CLUSTERED:
+            return True
+    return False
+
+
+def simultaneous(z: Tensor, hit: tuple[int, ...]) -> bool:
+    """Whether at one sensor's outliers the others `(sensor, time)` concerned are large too."""
+    if len(hit) < 2:
+        return False
+    squares, total, n = z[list(hit)].square().clamp(max=25.0), 0.0, 0
+    for i in range(len(hit)):
+        events = squares[i] > _EVENT**2
+        others = torch.cat([squares[:i], squares[i + 1 :]])[:, events]
+        total, n = total + float(others.sum()), n + others.numel()
+    return n > 0 and bool(stats.chi2.sf(total, n) < 1e-3)
+
+
+def _moved(z: Tensor, law: Outliers) -> Tensor:
+    variance = 1 + law.spread**2
+    up, down = -(z - law.height).square() / (2 * variance), -(z + law.height).square() / (2 * variance)
+    return torch.logaddexp(up, down) - math.log(2) - math.log(2 * math.pi * variance) / 2
+
+
+def _condensed(size: Tensor) -> tuple[Tensor, Tensor]:
+    """Moduli and how often: the many small ones by a histogram."""
+    bulk = size < _BULK
+    counts = torch.histc(size[bulk], _BINS, 0.0, _BULK)
+    centres = (torch.arange(_BINS, dtype=torch.float64) + 0.5) * (_BULK / _BINS)
+    large = size[~bulk]
+    return torch.cat([centres, large]), torch.cat([counts, torch.ones_like(large)])
+
+
+def _spread_of(z: Tensor, counts: Tensor, law: Outliers) -> tuple[float, float]:
+    """Standard errors of rate and amplitude by the information in the scores, differentiated numerically."""
+    theta = [math.log(law.rate), math.log(law.height), math.log(law.spread)]
+    step, slopes = 1e-4, []
+    for k in range(3):
+        moved = [Outliers(*(math.exp(v + sign * step * (j == k)) for j, v in enumerate(theta))) for sign in (1.0, -1.0)]
+        slopes.append((mixture(z, moved[0]) - mixture(z, moved[1])) / (2 * step))
+    scores = torch.stack(slopes)
+    information = (scores * counts) @ scores.mT
+    covariance = torch.linalg.pinv(information, hermitian=True)
+    amplitude = law.amplitude
+    gradient = torch.tensor([0.0, law.height**2 / amplitude, law.spread**2 / amplitude], dtype=torch.float64)
+    return law.rate * math.sqrt(float(covariance[0, 0])), math.sqrt(float(gradient @ covariance @ gradient))

@@ -1,0 +1,113 @@
+"""The simulation with what it left out: noise of the array and the mechanisms that act on it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gyrofuse._checks import check_positive_integer
+from gyrofuse._paths import own_generator
+from gyrofuse.mismatch.case import Scene
+from gyrofuse.mismatch.mechanism import Mechanism
+from gyrofuse.simulate import ArrayModel
+
+_SAME_RATE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class RepairedModel:
+    """Noise of an array, and mechanisms that act on it one after the other; compose with `+`.
+
+    Attributes:
+        noise: Of the array.
+        scene: Rate, unit, sensors and auxiliary channels of the recording.
+        effects: In the order in which they act.
+    """
+
+    noise: ArrayModel
+    scene: Scene
+    effects: tuple[Mechanism, ...] = ()
+
+    def __add__(self, effect: Mechanism) -> RepairedModel:
+        return replace(self, effects=(*self.effects, effect)) if isinstance(effect, Mechanism) else NotImplemented
+
+    def simulate(
+        self,
+        n_samples: int,
+        *,
+        batch: Sequence[int] = (),
+        channels: Mapping[str, Tensor] | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Draw records `(*batch, sensor, time)`.
+
+        Args:
+            n_samples: Samples of each.
+            batch: Shape of the independent records.
+            channels: Auxiliary channels `(row, time)` that mechanisms follow; those of the recording by default.
+            generator: Source of randomness; by default a fresh one.
+        """
+        n_samples = check_positive_integer("n_samples", n_samples)
+        generator = own_generator(generator, None)
+        scene = self.scene if channels is None else replace(self.scene, channels=dict(channels))
+        signal = self.noise.simulate(n_samples, batch=tuple(batch), generator=generator)
+        for effect in self.effects:
+            signal = effect.simulated(signal, scene, generator)
+        return signal
+
+    def correct(self, signal: Tensor) -> Tensor:
+        """A recording `(sensor, time)` without what can be taken off it: tones, temperature, steps, spikes."""
+        for effect in self.effects:
+            signal = effect.removed(signal, self.scene)
+        return signal
+
+    def check(self, rate: float, unit: str) -> None:
+        """Make sure that a simulation at this rate and in this unit, without auxiliary channels, is the one repaired.
+
+        Raises:
+            ValueError: It is not.
+        """
+        scene = self.scene
+        if abs(rate / scene.rate - 1) > _SAME_RATE:
+            raise ValueError(f"`rate`: expected that of the repaired simulation, {scene.rate:g} Hz, got {rate:g} Hz")
+        if "unknown" not in (unit, scene.unit) and unit != scene.unit:
+            raise ValueError(f"`unit`: expected that of the repaired simulation, {scene.unit!r}, got {unit!r}")
+        followed = {str(getattr(effect, "channel", "")) for effect in self.effects} - {"", *scene.channels}
+        if followed:
+            raise ValueError(
+                f"`channels`: expected {', '.join(sorted(followed))}, which the simulation follows, got none; simulate "
+                "in Python, where `simulate` takes channels"
+            )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, ready for JSON; without the auxiliary channels."""
+        scene = self.scene
+        return {
+            "noise": self.noise.to_dict(),
+            "effects": [
+                {"mechanism": effect.name, "kind": type(effect).__name__, "numbers": _plain(effect)}
+                for effect in self.effects
+            ],
+            "rate": scene.rate,
+            "unit": scene.unit,
+            "sensors": list(scene.sensors),
+        }
+
+    def __str__(self) -> str:
+        return " + ".join([str(self.noise), *(effect.name for effect in self.effects)])
+
+
+def _plain(value: Any) -> Any:
+    """Numbers of a mechanism, what is not finite as text."""
+    if isinstance(value, Tensor):
+        return _plain(value.tolist())
+    if is_dataclass(value):
+        return {entry.name: _plain(getattr(value, entry.name)) for entry in fields(value)}
+    if isinstance(value, tuple | list):
+        return [_plain(entry) for entry in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value

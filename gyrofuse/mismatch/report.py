@@ -1,0 +1,81 @@
+"""The answer of a diagnosis, and how it is told."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gyrofuse.mismatch.outcome import Outcome
+from gyrofuse.mismatch.telling import fused_words
+from gyrofuse.plotting_mismatch import plot_map
+from gyrofuse.report_mismatch import mismatch_page
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+@dataclass(frozen=True, eq=False)
+class MismatchReport(Outcome):
+    """Where recording and simulation differ, what the simulation left out, and how much better the repair fits.
+
+    Attributes:
+        mismatch: Whether they differ at all.
+        p_value: Of agreement, for the whole recording.
+        findings: Differences with names, in the order in which they were found.
+        unexplained: What witnesses still see after the repair.
+        held_out: Agreement on data not used for the repair.
+        model: The repaired simulation; it simulates.
+        evidence: What each witness saw before the repair.
+        evidence_after: What each witness saw after it.
+        case: Recording and simulation as they came.
+        repaired: The recording without what can be taken off it, and the simulation with all else.
+    """
+
+    def summary(self) -> str:
+        """The verdict in sentences, then the numbers."""
+        if not self.mismatch:
+            return f"Recording and simulation agree (p = {self.p_value:.2g})."
+        lines = [f"Recording and simulation differ (p = {self.p_value:.2g})."]
+        for i, finding in enumerate(self.findings, 1):
+            gain = "" if finding.held_out_gain is None else f"; {finding.held_out_gain:+.1f} nats on data held out"
+            lines.append(f"{i}. {finding.mechanism}: {finding.sentence} (p = {finding.p_value:.2g}{gain})")
+            if finding.alternatives:
+                lines.append(f"   cannot be told apart from {', '.join(finding.alternatives)}")
+            for name, entry in finding.parameters.items():
+                lines.append(f"   {name:<24} {entry.value:>12.6g} {entry.unit}  ({entry.low:.6g} to {entry.high:.6g})")
+        lines += [f"unexplained, {e.witness}: {e.words} (p = {e.p_value:.2g})" for e in self.unexplained]
+        h = self.held_out
+        lines.append(
+            f"On data held out: discrepancy {h.before:.2f} before and {h.after:.2f} after repair (1 = noise alone), "
+            f"gain {h.gain:.1f} nats ({h.low:.1f} to {h.high:.1f})"
+        )
+        return "\n".join([*lines, *fused_words(self)])
+
+    def __str__(self) -> str:
+        return self.summary()
+
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Draw where recording and simulation differ: sensors over averaging times, in standard deviations.
+
+        Args:
+            ax: Where to draw; new axes by default.
+
+        Returns:
+            The axes.
+        """
+        scene = self.case.scene
+        return plot_map(self.variances[0].z, rate=scene.rate, names=scene.sensors, ax=ax)
+
+    def to_html(
+        self, path: str | Path, *, title: str = "Recording and simulation", remarks: Sequence[str] = ()
+    ) -> None:
+        """Write the report as one HTML page that needs no other file, no network and no script.
+
+        Args:
+            path: Where to; an existing file is replaced.
+            title: Heading of the page.
+            remarks: Sentences shown below the verdict.
+        """
+        Path(path).write_text(mismatch_page(self, title=title, remarks=remarks), encoding="utf-8")

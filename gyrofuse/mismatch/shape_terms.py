@@ -1,0 +1,395 @@
+"""Spectral shapes that compete: what each makes of the spectra of a simulation, with its numbers as plain tensors."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.base import Base, _atoms, _time_constants
+from gyrofuse.mismatch.spectra import Bands
+from gyrofuse.processes import AR1
+
+_FAST = 3.0  # samples: AR1s of shorter memory are all but white
+_SLOW = 2.2  # time constants above n / (2 pi) over this look like a walk in every band
+_LITTLE = 0.3  # of the white noise: fast AR1s below count as white
+_MATTERS = 0.05  # of the power in some band, for a part to have a level of its own
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """The noise of a simulation in three parts: what is white, AR1s, and a walk.
+
+    Attributes:
+        base: It.
+        f: Frequencies, cycles per sample, `(place,)`.
+    """
+
+    base: Base
+    f: Tensor
+
+    @cached_property
+    def coefficients(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Of the parts, `(sensor, atom)`: together those of the base."""
+        c = self.base.coefficients
+        tau = torch.tensor((0.0, 0.0, *_time_constants(self.base.n_samples), math.inf), dtype=c.dtype)
+        walk = (tau >= self.base.n_samples / (2 * math.pi) / _SLOW).expand_as(c)
+        fast = (tau < _FAST) & (tau > 0)
+        height = (c * fast / (1 - torch.exp(-1 / tau.clamp(min=1e-9))).square()).sum(-1, keepdim=True)
+        white = (tau == 0) | (fast & (height < _LITTLE * c[:, :1]))
+        zero = torch.zeros_like(c)
+        return torch.where(white, c, zero), torch.where(white | walk, zero, c), torch.where(walk, c, zero)
+
+    @cached_property
+    def densities(self) -> Tensor:
+        """Of the parts, `(part, sensor, place)`."""
+        return torch.stack(self.coefficients) @ _atoms(self.base.n_samples, self.f)
+
+    @cached_property
+    def _corners(self) -> tuple[Tensor, Tensor]:
+        """Inverse time constants `(atom, 1, 1)` of the AR1s that some sensor has, and plateaus `(atom, sensor, 1)`."""
+        rate = 1 / torch.tensor(_time_constants(self.base.n_samples), dtype=torch.float64)
+        plateau = (self.coefficients[1][:, 2:-1] / (1 - torch.exp(-rate)).square()).mT
+        has = (plateau > 0).any(-1)
+        return rate[has][:, None, None], plateau[has][..., None]
+
+    def moments(self) -> tuple[Tensor, Tensor]:
+        """Variance of the AR1s together, and their corner, cycles per sample, `(sensor,)`, weighted by variance."""
+        rate, plateau = (x[..., 0] for x in self._corners)  # (atom, 1), (atom, sensor)
+        phi = torch.exp(-rate)
+        variances = plateau * (1 - phi) / (1 + phi)
+        total = variances.sum(0)
+        return total, (variances * rate).sum(0) / total.clamp(min=1e-300) / (2 * math.pi)
+
+    def shifted(self, log_factors: Tensor) -> Tensor:
+        """Density with other numbers, `(..., sensor, place)`.
+
+        Args:
+            log_factors: Of the power of what is white, of the AR1s' plateaus, of their corners, and of the walk's
+                increments, `(..., 4, sensor)`.
+        """
+        white, level, corner, walk = log_factors.clamp(-30, 30).exp()[..., None].unbind(-3)  # (..., sensor, 1)
+        rate, plateau = self._corners
+        phi = torch.exp(-corner[..., None, :, :] * rate)  # (..., atom, sensor, 1)
+        coloured = AR1._spectrum(self.f, phi, plateau * (1 - phi).square()).sum(-3)
+        return white * self.densities[0] + level * coloured + walk * self.densities[2]
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """The noise of a simulation at the places of bands.
+
+    Attributes:
+        base: It.
+        bands: Where spectra are compared.
+    """
+
+    base: Base
+    bands: Bands
+
+    @cached_property
+    def places(self) -> Tensor:
+        """Cycles per sample, `(place,)`."""
+        return self.bands.places
+
+    @cached_property
+    def parts(self) -> Parts:
+        return Parts(self.base, self.places)
+
+    @cached_property
+    def density(self) -> Tensor:
+        """`(sensor, place)`."""
+        return self.parts.densities.sum(0)
+
+    @cached_property
+    def mean(self) -> Tensor:
+        """`(sensor, band)`."""
+        return self.bands.mean_of(self.density)
+
+    @cached_property
+    def matters(self) -> Tensor:
+        """Which parts of the noise have a share in some band, `(part, sensor)`."""
+        return (self.bands.mean_of(self.parts.densities) / self.mean).amax(-1) > _MATTERS
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """One shape with its numbers.
+
+    Attributes:
+        local: Numbers of each sensor, `(number, sensor)`, and which of them are free.
+        shared: Numbers that sensors share, `(number,)`.
+    """
+
+    name: ClassVar[str]
+    prior_sd: ClassVar[tuple[float, ...]] = ()  # of local numbers around zero
+    lower: ClassVar[float] = -math.inf
+    acts: ClassVar[str] = "add"  # or "scale" the noise, or "filter" everything
+
+    local: Tensor
+    free: Tensor
+    shared: Tensor
+
+    def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
+        """Factors on spectra, or densities added, `(..., sensor, place)`, of numbers with leading dimensions."""
+        raise NotImplementedError
+
+    def reach(self) -> Tensor:
+        """How far shared numbers may go at once."""
+        return torch.full_like(self.shared, 0.7)
+
+    def within(self) -> Term:
+        """With numbers that are allowed."""
+        return replace(self, local=self.local.clamp(min=self.lower))
+
+
+@dataclass(frozen=True, eq=False)
+class Shift(Term):
+    """Other levels and corners: local numbers as in `Parts.shifted`."""
+
+    name: ClassVar[str] = "parameter_shift"
+    acts: ClassVar[str] = "scale"
+    prior_sd: ClassVar[tuple[float, ...]] = (3.0, 3.0, 1.5, 3.0)
+
+    @classmethod
+    def start(cls, ground: Ground) -> Shift:
+        white, coloured, walk = ground.matters
+        free = torch.stack([white, coloured, coloured, walk])
+        return cls(torch.zeros(4, free.shape[-1], dtype=torch.float64), free, torch.zeros(0, dtype=torch.float64))
+
+    def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
+        return ground.parts.shifted(local) / ground.density
+
+
+FILTERS = ("pole", "poles", "bilinear", "sampled", "bilinear2", "sampled2")
+_POLES = {"pole": 1.0, "poles": math.sqrt(2) - 1}
+ORDERS = {"pole": 1, "poles": 2, "bilinear": 1, "sampled": 1, "bilinear2": 2, "sampled2": 2}
+
+
+def filter_strength(kind: str, corner: Tensor) -> Tensor:
+    """Number of a filter whose power is halved at `corner` cycles per sample: 0 is none."""
+    if kind in _POLES:  # 2 q (1 - cos) = x (1 - q)^2 at the corner, where one pole lets 1 / (1 + x) pass
+        b = 1 + (1 - torch.cos(2 * math.pi * corner)) / _POLES[kind]
+        return b - (b.square() - 1).sqrt()
+    if kind == "bilinear":
+        return 1 / torch.tan(math.pi * corner).square()
+    if kind == "sampled":
+        return 1 / (2 * corner).square()
+    if kind == "bilinear2":
+        return 1 / torch.tan(math.pi * corner).pow(4)
+    return 1 / (2 * corner).pow(4)
+
+
+def filter_corner(kind: str, strength: Tensor) -> Tensor:
+    """Cycles per sample at which a filter halves the power; infinite where it never does."""
+    q = strength.clamp(min=1e-300)
+    if kind in _POLES:
+        cosine = 1 - _POLES[kind] * (1 - q).square() / (2 * q)
+        return torch.where(cosine >= -1, cosine.clamp(-1, 1).acos() / (2 * math.pi), math.inf)
+    order = 1 / 2 if kind in ("bilinear", "sampled") else 1 / 4
+    if kind.startswith("bilinear"):
+        return torch.atan(q.pow(-order)) / math.pi
+    return q.pow(-order) / 2
+
+
+def filter_power(kind: str, strength: Tensor, f: Tensor) -> Tensor:
+    """Squared response `(..., frequency)` of filters of `strength` `(...,)`."""
+    q = strength[..., None]
+    if kind in _POLES:
+        q = q.clamp(max=0.9999)
+        power = (1 - q).square() / ((1 - q).square() + 4 * q * torch.sin(math.pi * f).square())
+        return power if kind == "pole" else power.square()
+    at = torch.tan(math.pi * f.clamp(max=0.49999999)) if kind.startswith("bilinear") else 2 * f
+    return 1 / (1 + q * at.square()) if ORDERS[kind] == 1 else 1 / (1 + q * at.pow(4))
+
+
+def filter_response(kind: str, strength: Tensor, f: Tensor) -> Tensor:
+    """Complex response `(..., frequency)`, causal."""
+    q = strength[..., None]
+    turn = 2 * math.pi * f
+    if kind in _POLES:
+        q = q.clamp(max=0.9999)
+        response = (1 - q) / (1 - q * torch.polar(torch.ones_like(turn), -turn))
+        return response if kind == "pole" else response.square()
+    at = torch.tan(math.pi * f.clamp(max=0.49999999)) if kind.startswith("bilinear") else 2 * f
+    if ORDERS[kind] == 1:
+        return 1 / (1 + 1j * q.sqrt() * at)
+    s = q.pow(0.25) * at
+    return 1 / torch.complex(1 - s.square(), math.sqrt(2) * s)
+
+
+@dataclass(frozen=True, eq=False)
+class LowPass(Term):
+    """A filter of each sensor: its local number is the strength, 0 for none."""
+
+    name: ClassVar[str] = "low_pass"
+    acts: ClassVar[str] = "filter"
+    lower: ClassVar[float] = 0.0
+
+    kind: str = "pole"
+
+    @classmethod
+    def starts(cls, ground: Ground, kind: str) -> list[LowPass]:
+        p = len(ground.mean)
+        free = torch.ones(1, p, dtype=torch.bool)
+        corners = torch.logspace(math.log10(0.45), math.log10(0.004), 10, dtype=torch.float64)
+        nothing = torch.zeros(0, dtype=torch.float64)
+        return [
+            cls(filter_strength(kind, corner).expand(1, p).clone(), free, nothing, kind)
+            for corner in (*corners, *([torch.tensor(1.5)] if kind.startswith("sampled") else []))
+        ]
+
+    def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
+        return filter_power(self.kind, local[..., 0, :], ground.places)
+
+
+@dataclass(frozen=True, eq=False)
+class Flicker(Term):
+    """`a / f` added: the local number is `a`."""
+
+    name: ClassVar[str] = "flicker"
+    lower: ClassVar[float] = 0.0
+
+    @classmethod
+    def start(cls, ground: Ground) -> Flicker:
+        unit = (ground.density * ground.places).amin(-1)
+        return cls(0.1 * unit[None], torch.ones(1, len(unit), dtype=torch.bool), torch.zeros(0, dtype=torch.float64))
+
+    def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
+        return local[..., 0, :, None] / ground.places
+
+
+def oscillation(f: Tensor, centre: Tensor, width: Tensor) -> Tensor:
+    """Density of an AR2 of variance one with poles at `centre`, half as high `width` beside it, cycles per sample."""
+    r, omega = torch.exp(-2 * math.pi * width), 2 * math.pi * centre
+    z = torch.polar(torch.ones_like(f), -2 * math.pi * f)
+    polynomial = 1 - 2 * r * torch.cos(omega) * z + r.square() * z.square()
+    variance = (1 + r**2) / ((1 - r**2) * (1 + r**4 - 2 * r**2 * torch.cos(2 * omega)))
+    return 1 / (variance * polynomial.abs().square())
+
+
+@dataclass(frozen=True, eq=False)
+class Bump(Term):
+    """An AR2 added: local its variance, shared the logarithms of centre and half width, cycles per sample.
+
+    Attributes:
+        narrowest: Least half width that bands can show, over the centre.
+    """
+
+    name: ClassVar[str] = "resonance"
+    lower: ClassVar[float] = 0.0
+
+    narrowest: float = 0.02
+
+    @classmethod
+    def start(cls, centre: float, width: float, variance: Tensor) -> Bump:
+        shared = torch.tensor([math.log(centre), math.log(width)], dtype=torch.float64)
+        return cls(variance[None], torch.ones(1, len(variance), dtype=torch.bool), shared)
+
+    def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
+        centre, width = shared[..., 0, None].exp(), shared[..., 1, None].exp()
+        return local[..., 0, :, None] * oscillation(ground.places, centre, width)[..., None, :]
+
+    def reach(self) -> Tensor:
+        return _bump_reach(self.shared)
+
+    def within(self) -> Bump:
+        return replace(self, local=self.local.clamp(min=0.0), shared=_bump_within(self.shared, self.narrowest))
+
+
+@dataclass(frozen=True, eq=False)
+class Common(Term):
+    """Noise of one source in every sensor: local are the real and imaginary parts of the gains.
+
+    Shared is the logarithm of the corner, cycles per sample, for an AR1.
+    """
+
+    name: ClassVar[str] = "common_mode"
+
+    kind: str = "white"
+
+    def shape(self, ground: Ground, shared: Tensor) -> Tensor:
+        """Density of the source, `(..., place)`."""
+        return common_density(self.kind, ground.places, shared.exp())
+
+    def within(self) -> Common:
+        return replace(self, shared=self.shared.clamp(max=math.log(0.45))) if self.kind == "ar1" else self
+
+    @classmethod
+    def start(cls, ground: Ground, excess: Tensor, worth: Tensor, kind: str, shared: Tensor) -> Common:
+        """Gains from the strongest direction of an excess `(band, sensor, sensor)` over the noise's densities."""
+        p = excess.shape[-1]
+        nothing = cls(torch.zeros(2, p, dtype=torch.float64), torch.ones(2, p, dtype=torch.bool), shared, kind)
+        level = ground.mean.mT.sqrt()
+        c = ground.bands.mean_of(nothing.shape(ground, shared))  # (band,)
+        size = c[:, None, None] / (level[:, :, None] * level[:, None, :])
+        weight = (worth[:, None, None] * size).to(excess.dtype)
+        gram = (excess * weight).sum(0) / (weight.real * size).sum(0)
+        values, vectors = torch.linalg.eigh((gram + gram.mH) / 2)
+        g = vectors[:, -1] * values[-1].clamp(min=1e-300).sqrt()
+        return replace(nothing, local=torch.stack([g.real, g.imag]))
+
+
+@dataclass(frozen=True, eq=False)
+class CommonBump(Common):
+    """An oscillation of one source in every sensor: shared are the logarithms of centre and half width."""
+
+    name: ClassVar[str] = "resonance"
+
+    kind: str = "oscillation"
+    narrowest: float = 0.02
+
+    def reach(self) -> Tensor:
+        return _bump_reach(self.shared)
+
+    def within(self) -> CommonBump:
+        return replace(self, shared=_bump_within(self.shared, self.narrowest))
+
+
+def _bump_reach(shared: Tensor) -> Tensor:
+    """A centre goes no further at once than half its width."""
+    return torch.stack([(shared[1] - shared[0]).exp() / 2, torch.tensor(0.7, dtype=torch.float64)])
+
+
+def _bump_within(shared: Tensor, narrowest: float) -> Tensor:
+    centre = shared[0].clamp(max=math.log(0.49))
+    # Broader ones would not be seen to fall on both sides.
+    widest = torch.minimum(centre - math.log(2), (0.5 - centre.exp()).log() - math.log(2))
+    return torch.stack([centre, torch.minimum(torch.maximum(shared[1], centre + math.log(narrowest)), widest)])
+
+
+@dataclass(frozen=True, eq=False)
+class Background(Term):
+    """Level and slope of the noise around a bump: local are the logarithm at the centre and its rise to the end."""
+
+    name: ClassVar[str] = "background"
+    acts: ClassVar[str] = "scale"
+
+    @classmethod
+    def start(cls, n_sensors: int) -> Background:
+        free = torch.ones(2, n_sensors, dtype=torch.bool)
+        return cls(torch.zeros(2, n_sensors, dtype=torch.float64), free, torch.zeros(0, dtype=torch.float64))
+
+    def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
+        low, high = ground.places[0], ground.places[-1]
+        x = (2 * ground.places - low - high) / (high - low)
+        return (local[..., 0, :, None] + local[..., 1, :, None] * x).exp()
+
+
+def common_density(kind: str, f: Tensor, shared: Tensor) -> Tensor:
+    """Density of a source: white, AR1s and oscillations of variance one, walks of increments of variance one.
+
+    `shared` are the corner of an AR1, or centre and half width of an oscillation, cycles per sample.
+    """
+    if kind == "white":
+        return torch.ones_like(f)
+    if kind == "walk":
+        return 1 / (4 * torch.sin(math.pi * f.clamp(min=1e-12)).square())
+    if kind == "oscillation":
+        return oscillation(f, shared[0], shared[1])
+    phi = torch.exp(-2 * math.pi * shared[0])
+    return AR1._spectrum(f, phi, 1 - phi.square())

@@ -1,0 +1,51 @@
+"""Sentences and findings of spectral shapes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.shapes import Shape
+
+Z = 1.959963984540054
+
+
+def spanned(number: Callable[[float], float], middle: float, sd: float, unit: str) -> Parameter:
+    """A number that rises with an estimate of normal error, and its limits."""
+    return Parameter(number(middle), number(middle - Z * sd), number(middle + Z * sd), unit)
+
+
+def named(scene: Scene, sensors: tuple[int, ...]) -> str:
+    """Sensors by their names."""
+    if len(sensors) == len(scene.sensors):
+        return "all sensors"
+    return ("sensor " if len(sensors) == 1 else "sensors ") + ", ".join(scene.sensors[i] for i in sensors)
+
+
+def found(
+    case: Case,
+    effect: Mechanism,
+    shape: Shape,
+    sensors: tuple[int, ...],
+    parameters: dict[str, Parameter],
+    sentence: str,
+    frequency_hz: float | None = None,
+) -> Finding:
+    """A finding made of a spectral shape."""
+    if shape.alternatives:
+        sentence += f"; these data do not tell it apart from {', '.join(shape.alternatives)}"
+    limits = {name: entry for name, entry in parameters.items() if not math.isnan(entry.value)}
+    return Finding(
+        effect.name,
+        effect,
+        sentence,
+        shape.p_value,
+        sensors,
+        limits,
+        levels=shape.levels,
+        alternatives=shape.alternatives,
+        frequency_hz=frequency_hz,
+        gain=shape.gain,
+    )

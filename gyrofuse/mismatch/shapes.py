@@ -1,0 +1,305 @@
+"""Which spectral shapes make a simulation's spectra those of a recording: chosen by BIC, jointly, and their rivals."""
+
+from __future__ import annotations
+
+import math
+import weakref
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from scipy import stats
+from torch import Tensor
+
+from gyrofuse.mismatch.bumps import oscillation_of
+from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.evidence import corrected
+from gyrofuse.mismatch.shape_fit import Fit, Ratios, data_model, fit, log_score, ratios
+from gyrofuse.mismatch.shape_terms import FILTERS, Bump, Common, CommonBump, Flicker, LowPass, Shift, Term, oscillation
+from gyrofuse.mismatch.side import Side
+from gyrofuse.mismatch.witnesses import level_of
+
+_MOST = 4  # shapes at once
+_RIVAL = 5.0  # nats
+_QUICK, _FAR, _KEPT = 6, 20.0, 3  # rounds of a first look; nats behind that are not made up; shapes looked at closely
+_DOUBT = 1e-3  # p value of what is left by shapes that may be named
+_SMALL = 0.1  # share of what there was to explain that may be left all the same
+_PLACES = 12.0  # shapes and places that compete
+_NEW = 10.0  # nats that a shape costs beside its numbers
+_TOUCH = 0.1
+_ORDER = {"scale": 0, "add": 1, "filter": 2}  # a filter acts on what was added, levels are those of the noise alone
+_PLAIN = 15.0  # nats
+_ALONE = 8.0  # nats that a shape has to bring by itself
+_CLEAN = 8  # bins
+_FORMS = 3  # of filters
+_WIDTHS = (0.06, 0.15, 0.35)  # half width of a bump over its centre
+_CORNER_BINS = (4.0, 0.3)  # corners of common AR1s to start from: bins, cycles per sample
+
+
+class Shape(NamedTuple):
+    """A shape that was chosen.
+
+    Attributes:
+        term: It, its numbers those of the joint fit.
+        sd: Standard deviations of its local `(number, sensor)` and shared numbers; NaN where not free.
+        gain: Nats that it adds to the others, without what its numbers cost.
+        p_value: Of the same, for all the shapes that compete.
+        alternatives: Mechanisms that explain as much in its place.
+        frequency: Where it acts most, cycles per sample.
+        levels: Wavelet levels where it shows.
+    """
+
+    term: Term
+    sd: tuple[Tensor, Tensor]
+    gain: float
+    p_value: float
+    alternatives: tuple[str, ...]
+    frequency: float
+    levels: tuple[int, ...]
+
+
+_found: weakref.WeakKeyDictionary[Case, tuple[Shape, ...]] = weakref.WeakKeyDictionary()
+
+
+def shapes(case: Case) -> tuple[Shape, ...]:
+    """Shapes that together explain the spectra, in the order in which they act; none where they do not."""
+    if case not in _found:
+        _found[case] = _searched(case)
+    return _found[case]
+
+
+def chosen_shape(case: Case, name: str, level: float) -> Shape | None:
+    """The first shape, if it is that one and at p below `level`; narrow bumps that are plain come before it."""
+    bump = oscillation_of(case)
+    if name != "resonance" and bump is not None and bump.stretch.p_value <= level and bump.nats > _PLAIN:
+        return None
+    best = shapes(case)[:1]
+    return best[0] if best and best[0].term.name == name and best[0].p_value <= level else None
+
+
+def compared(case: Case) -> Ratios:
+    """Spectra of a case, without bands that hold a line which is not explained."""
+    usable = torch.ones_like(case.bands.dof)
+    scale = case.simulated.signal.shape[-1] / case.n_samples
+    if scale < 1:  # the lowest bins of short records hold what leaks from below
+        usable *= torch.tensor(case.bands.edges[:-1]) * scale >= _CLEAN
+    if case.line.p_value < _DOUBT:
+        edges = torch.tensor(case.bands.edges[1:-1], dtype=torch.float64) / case.n_samples
+        usable[torch.bucketize(torch.tensor(case.line.frequency, dtype=torch.float64), edges, right=True)] = 0.0
+    return ratios(case.recorded, case.simulated, case.base, usable)
+
+
+def refit(case: Case, keep: Tensor, term: Term) -> Term:
+    """A shape with its numbers estimated anew from blocks of samples, in the company of no other."""
+    block = run_length(keep)
+    recorded = case.recording[:, keep].unflatten(-1, (-1, block)).movedim(1, 0)
+    simulated = case.simulated.signal
+    n = simulated.shape[-1] // block * block
+    simulated = simulated[..., :n].unflatten(-1, (-1, block)).movedim(-2, -3).flatten(0, 1)
+    part = Case(case.scene, *_sides(recorded, simulated))
+    data = ratios(part.recorded, part.simulated, case.base)
+    found = fit(data, [term])
+    return fit(data.centred(found.model.diagonal(dim1=-2, dim2=-1).real), found.terms).terms[0]
+
+
+def run_length(keep: Tensor) -> int:
+    """Length of the runs of samples kept, which are equally long."""
+    edges = torch.nn.functional.pad(keep.to(torch.int8), (1, 1)).diff().nonzero()[:, 0]
+    return int(edges.diff()[::2].min())
+
+
+def _sides(recorded: Tensor, simulated: Tensor) -> tuple[Side, Side]:
+    from gyrofuse.mismatch.spectra import bands
+
+    both = bands(recorded.shape[-1])
+    return Side(recorded, both), Side(simulated, both)
+
+
+def _searched(case: Case) -> tuple[Shape, ...]:
+    data = compared(case)
+    if float(data.worth.sum()) < 50:
+        return ()
+    data, chosen = _chosen(data)
+    if chosen is None or not _convincing(data, chosen):
+        return ()
+    found = []
+    for i, term in enumerate(chosen.terms):
+        others = [t for j, t in enumerate(chosen.terms) if j != i]
+        without = fit(data, others).gain if others else 0.0
+        gain = chosen.gain - without
+        n_free = int((chosen.places[i] >= 0).sum())
+        p = corrected(float(stats.chi2.sf(2 * max(gain, 0.0), _freedom(data, term))), _PLACES)
+        rivals = {
+            rival.name
+            for rival in _candidates(data, others)
+            if rival.name != term.name and _as_good(data, [*others, rival], chosen.gain - _RIVAL)
+        }
+        seen = (log_score(data, data_model(data, [term])) - log_score(data, data.expected)).clamp(min=0)
+        levels = {level_of(float(f)) for f in data.ground.bands.frequency[seen > 0.05 * seen.sum()]}
+        found.append(
+            Shape(
+                term,
+                chosen.sd(i),
+                gain - data.penalty * n_free,
+                p,
+                tuple(sorted(rivals)),
+                float(data.ground.bands.frequency[seen.argmax()]),
+                tuple(sorted(levels)),
+            )
+        )
+    nothing = float(log_score(data, data.expected).sum())
+
+    def place(shape: Shape) -> tuple[bool, int, float]:
+        alone = float(log_score(data, data_model(data, [shape.term])).sum()) - nothing
+        return alone < _ALONE, _ORDER[shape.term.acts], -alone
+
+    return tuple(sorted(found, key=place))
+
+
+def _as_good(data: Ratios, terms: list[Term], gain: float) -> bool:
+    """Whether shapes gain as much; those that are far from it after a few rounds are not followed."""
+    quick = fit(data, terms, _QUICK)
+    return quick.gain > gain or (quick.gain > gain - _FAR and fit(data, quick.terms).gain > gain)
+
+
+def _freedom(data: Ratios, term: Term) -> int:
+    """Numbers that could have been free."""
+    p = data.n_sensors
+    if isinstance(term, Shift):
+        return int(Shift.start(data.ground).free.sum())
+    return (2 * p - 1 if isinstance(term, Common) else term.local.numel()) + 2 * len(term.shared)
+
+
+def _chosen(data: Ratios) -> tuple[Ratios, Fit | None]:
+    """Shapes added one at a time while BIC falls, then taken away while it falls."""
+    best: Fit | None = None
+    value = 0.0
+    for _ in range(_MOST):
+        now = list(best.terms) if best else []
+        quick = [fit(data, [*now, c], _QUICK) for c in _candidates(data, now)]
+        kept = {*sorted(quick, key=lambda f: -f.gain)[:_KEPT], *sorted(quick, key=lambda f: -_value(data, f))[:_KEPT]}
+        tried = [_pruned(data, fit(data, f.terms)) for f in kept]
+        top = max(tried, key=lambda f: _value(data, f), default=None)
+        if top is None or _value(data, top) <= value:
+            break
+        data = data.centred(top.model.diagonal(dim1=-2, dim2=-1).real)
+        best = fit(data, top.terms)
+        value = _value(data, best)
+    while best is not None and len(best.terms) > 1:
+        fewer = [[_freed(data, t) for t in best.terms if t is not gone] for gone in best.terms]
+        top = max((_pruned(data, fit(data, terms)) for terms in fewer), key=lambda f: _value(data, f))
+        if _value(data, top) <= value:
+            break
+        best, value = top, _value(data, top)
+    return data, best
+
+
+def _value(data: Ratios, found: Fit) -> float:
+    """Log likelihood less what shapes and their numbers cost; a common source's phase is no number."""
+    n = found.n_free - sum(isinstance(t, Common) for t in found.terms)
+    return found.gain - data.penalty * n - _NEW * len(found.terms)
+
+
+def _freed(data: Ratios, term: Term) -> Term:
+    """With numbers for every sensor again: what another shape took over may be its own."""
+    if isinstance(term, Common):
+        return term
+    if isinstance(term, Shift):
+        return replace(term, free=Shift.start(data.ground).free)
+    least = term.local.amax(-1, keepdim=True) * _TOUCH
+    return replace(term, free=torch.ones_like(term.free), local=torch.where(term.free, term.local, least))
+
+
+def _pruned(data: Ratios, found: Fit) -> Fit:
+    """Without numbers of single sensors that do not differ from none."""
+    for threshold in (1.0, _least_t(data.n_sensors)):
+        terms: list[Term] = []
+        changed = False
+        for i, term in enumerate(found.terms):
+            if isinstance(term, Common):
+                terms.append(term)
+                continue
+            local_sd, _ = found.sd(i)
+            t = torch.where(term.free, (term.local / local_sd).abs().nan_to_num(nan=0.0), 0.0)
+            keep = term.free & ((t >= threshold) | (t == t.max()))
+            changed |= bool((keep != term.free).any())
+            terms.append(replace(term, free=keep, local=torch.where(keep, term.local, 0.0)))
+        if changed:
+            found = fit(data, terms)
+    return found
+
+
+def _least_t(n_sensors: int) -> float:
+    return float(stats.norm.isf(0.005 / n_sensors))
+
+
+def _convincing(data: Ratios, found: Fit) -> bool:
+    """Whether what is left is no more than chance, or little of what there was."""
+    p = data.n_sensors
+    wide = data.worth >= 2 * p
+    single = data.observed.diagonal(dim1=-2, dim2=-1).real
+    fitted = found.model.diagonal(dim1=-2, dim2=-1).real
+    w = data.worth[:, None]
+    before = (w * (single - 1 - single.log()))[wide].sum()
+    ratio = single / fitted
+    left = float((w * (ratio - 1 - ratio.log()))[wide].sum())
+    freedom = p * int(wide.sum())
+    excess = left - freedom / 2
+    return excess < _SMALL * (float(before) - freedom / 2) or float(stats.chi2.sf(2 * left, freedom)) > _DOUBT
+
+
+def _candidates(data: Ratios, company: list[Term]) -> Iterator[Term]:
+    """Shapes to add to some, with numbers to start from."""
+    names = {t.name for t in company}
+    ground = data.ground
+
+    def score(terms: list[Term]) -> float:
+        return float(log_score(data, data_model(data, terms)).sum())
+
+    model = data_model(data, company)
+    if "parameter_shift" not in names and bool(ground.matters.any()):
+        yield Shift.start(ground)
+    if "low_pass" not in names:
+        filters = [s for kind in FILTERS for s in LowPass.starts(ground, kind)]
+        best: dict[str, LowPass] = {}
+        for start in sorted(filters, key=lambda s: -score([*company, s])):
+            best.setdefault(start.kind, start)
+        yield from list(best.values())[:_FORMS]
+    if "flicker" not in names:
+        yield Flicker.start(ground)
+    excess = data.observed - model
+    bump = _bump(data, model)
+    if bump is not None:
+        yield bump
+        if data.n_sensors > 1:
+            yield CommonBump.start(ground, excess, data.worth, "oscillation", bump.shared)
+    if data.n_sensors > 1:
+        nothing = torch.zeros(0, dtype=torch.float64)
+        for kind in ("white", "walk"):
+            yield Common.start(ground, excess, data.worth, kind, nothing)
+        n = ground.bands.n_samples
+        corners = torch.logspace(
+            math.log10(_CORNER_BINS[0] / n), math.log10(_CORNER_BINS[1]), 8, dtype=torch.float64
+        ).log()
+        starts_at = [Common.start(ground, excess, data.worth, "ar1", c[None]) for c in corners]
+        yield max(starts_at, key=lambda s: score([*company, s]))
+
+
+def _bump(data: Ratios, model: Tensor) -> Bump | None:
+    """The bump that what is left is most like, of centres at the bands and widths up to a third of them."""
+    ground = data.ground
+    fitted, seen = (m.diagonal(dim1=-2, dim2=-1).real for m in (model, data.observed))  # (band, sensor)
+    left, worth = seen / fitted - 1, data.worth[:, None]
+    places = ground.places
+    best, top = 0.0, None
+    for centre in ground.bands.frequency[ground.bands.frequency * ground.bands.n_samples > 16]:
+        for share in _WIDTHS:
+            profile = ground.bands.mean_of(oscillation(places, centre, share * centre))
+            template = profile[:, None] / ground.mean.mT / fitted
+            size = (worth * template.square()).sum(0)
+            amount = (worth * left * template).sum(0).clamp(min=0) / size  # (sensor,)
+            gain = float((amount.square() * size).sum())
+            if gain > best:
+                best, top = gain, Bump.start(float(centre), share * float(centre), amount)
+    return top

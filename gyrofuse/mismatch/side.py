@@ -1,0 +1,65 @@
+"""Signals of one side, the recording or the simulation, and what is derived from them."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.base import Base, fit_base
+from gyrofuse.mismatch.spectra import Bands, cross_spectra, degrees_of_freedom
+
+_LEAST_BIN = 3  # of records shorter than the bands are for: below, they say nothing
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """Signals of one side. What is derived is computed once, when it is first asked for.
+
+    Attributes:
+        signal: `(record, sensor, time)`.
+        bands: Bands of frequency of the recording, for both sides.
+    """
+
+    signal: Tensor
+    bands: Bands
+
+    @cached_property
+    def spectra(self) -> Tensor:
+        """Mean cross-spectral matrices of the records, `(band, sensor, sensor)`, per sample."""
+        return cross_spectra(self.signal, self.bands).mean(0)
+
+    @cached_property
+    def dof(self) -> Tensor:
+        """What a band is worth, independent complex ordinates, `(band,)`; 0 where records are too short to say."""
+        n_records, _, n = self.signal.shape
+        scale = n / self.bands.n_samples
+        if scale == 1:
+            return n_records * self.bands.dof
+        edges = [round(edge * scale) for edge in self.bands.edges]
+        return torch.tensor(
+            [
+                n_records * degrees_of_freedom(max(b - a, 1)) if a >= _LEAST_BIN else 0.0
+                for a, b in itertools.pairwise(edges)
+            ],
+            dtype=torch.float64,
+        )
+
+    @cached_property
+    def power(self) -> Tensor:
+        """Spectral densities per sample, `(sensor, band)`."""
+        return self.spectra.diagonal(dim1=-1, dim2=-2).real.mT
+
+    @cached_property
+    def coherence(self) -> Tensor:
+        """Complex coherences of the sensors, `(band, sensor, sensor)`."""
+        size = self.power.mT.sqrt()
+        return self.spectra / size[:, :, None] / size[:, None, :]
+
+    @cached_property
+    def base(self) -> Base:
+        """The noise as a sum of simple spectra."""
+        return fit_base(self.power, self.bands, self.bands.n_samples, self.dof)

@@ -1,0 +1,208 @@
+"""Effects with one path for all sensors, each in its own size: what steps, warm-ups and temperature drifts share.
+
+Held-out blocks judge them thus. The means over the held-out blocks have a joint covariance; they are whitened with it,
+and compared with the template of the sizes that the other blocks gave. What a slow effect does may all happen in one
+block: so the whitened means are turned such that every share of them sees the same part of the effect. The other
+directions that come in are slow cosines: where the noise is stronger than thought, the shares scatter more.
+Interleaved blocks lie closer than the noise's memory: nothing is predicted from the blocks in between. An effect that
+is over within one of them is split finer: every other one of the 256 blocks judges.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.case import N_BLOCKS, Case, Scene
+from gyrofuse.mismatch.halves import N_HALVES, estimation_samples
+from gyrofuse.mismatch.mechanism import Mechanism, Parameter
+from gyrofuse.mismatch.slow import bridged, differences, scores, whole_blocks
+from gyrofuse.mismatch.slow_scans import Family, Scan, SlowLook, concerned, slow_look
+
+_Z = 1.959963984540054
+_STRONG = 5e-4  # a slow effect leaves traces that look like another one: largest p value
+_TOO_CLOSE = 5.0  # nats
+_PLAUSIBLE = 6.0  # nats below the best place
+_TOO_LITTLE = 0.25
+_SHARES = N_HALVES // 2
+
+
+@dataclass(frozen=True, eq=False)
+class SlowEffect(Mechanism):
+    """`x_i(t) = size_i path(t)`.
+
+    Attributes:
+        size: `(sensor,)`; 0 in sensors that are not concerned.
+        log_factors: Of the slow noise beside it, `(sensor, part)`, against the simulation's: for weights.
+    """
+
+    size: Tensor
+    log_factors: Tensor
+
+    def path(self, n_samples: int, scene: Scene) -> Tensor:
+        """For a size of one, `(time,)`."""
+        raise NotImplementedError
+
+    def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
+        return signal + self._effect(signal.shape[-1], scene)
+
+    def removed(self, signal: Tensor, scene: Scene) -> Tensor:
+        return signal - self._effect(signal.shape[-1], scene)
+
+    def explained(self, case: Case, generator: torch.Generator) -> Case:
+        return case.less(self._effect(case.n_samples, case.scene))
+
+    def refitted(self, case: Case, keep: Tensor) -> SlowEffect:
+        """Sizes by generalised least squares on the blocks whose samples are all kept; the path stays."""
+        kept = whole_blocks(keep)
+        if self._brief(case):
+            kept = kept & _even_blocks()
+        y, x, root = self._among(case, kept)
+        size = scores(y, torch.cholesky_inverse(root), x[None])[0][:, 0]
+        # Nothing is learnt of a path that does not change over the blocks.
+        size = torch.where(size.isfinite() & (self.size != 0), size, 0.0)
+        return replace(self, size=size)
+
+    def gains(self, case: Case) -> Tensor:
+        judged = ~_even_blocks() if self._brief(case) else whole_blocks(~estimation_samples(case.n_samples))
+        y, x, root = self._among(case, judged)
+        white = torch.linalg.solve_triangular(root, y[..., None], upper=False)  # (sensor, difference, 1)
+        k = torch.arange(1, _SHARES, dtype=torch.float64)[:, None]
+        t = torch.arange(len(x) + 1, dtype=torch.float64)
+        cosines = (math.pi * k * (t + 0.5) / len(t)).cos().diff()
+        directions = self.size[:, None, None] * torch.cat([x[None], cosines]).mT  # (sensor, difference, direction)
+        directions = torch.linalg.solve_triangular(root, directions, upper=False).flatten(0, 1)
+        length = directions[:, 0].norm() / math.sqrt(_SHARES)
+        axes = torch.linalg.qr(directions).Q
+        axes[:, 0] *= (axes[:, 0] @ directions[:, 0]).sign()
+        seen = _hadamard(_SHARES) @ (axes.mT @ white.flatten())
+        return length * seen - length.square() / 2
+
+    def _brief(self, case: Case) -> bool:
+        """Whether all but a quarter of the effect falls into the blocks to estimate with."""
+        among = [whole_blocks(estimation_samples(case.n_samples) == kept) for kept in (True, False)]
+        seen, judged = (
+            (torch.linalg.solve_triangular(root, x[:, None], upper=False).square().sum((-1, -2)) * self.size**2).sum()
+            for _, x, root in (self._among(case, blocks) for blocks in among)
+        )
+        return bool(judged < _TOO_LITTLE * (seen + judged))
+
+    def _among(self, case: Case, kept: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Differences of the blocks kept, the path's, and the Cholesky factor of their covariance."""
+        look, sums = slow_look(case), bridged(kept)
+        root = torch.linalg.cholesky(look.noise.among(kept).covariance(self.log_factors))
+        x = differences(self.path(case.n_samples, case.scene))
+        return look.y @ sums.mT, sums @ x, root
+
+    def _effect(self, n_samples: int, scene: Scene) -> Tensor:
+        return self.size[:, None] * self.path(n_samples, scene)
+
+
+class Estimate(NamedTuple):
+    """Place and sizes of an effect, over all places that the data leave possible.
+
+    Attributes:
+        place: Median of the places, with 2.5 and 97.5 % quantiles, samples.
+        size, sd: `(sensor,)`.
+    """
+
+    place: tuple[float, float, float]
+    size: Tensor
+    sd: Tensor
+
+
+def strong_scan(case: Case, name: str, level: float) -> tuple[SlowLook, Scan, tuple[str, ...]] | None:
+    """The scan of a mechanism and its equals; None where it is not there, or where another one is better."""
+    look = slow_look(case)
+    scan = look.scan(name)
+    if scan is None or scan.p_value > min(level, _STRONG) or not concerned(scan):
+        return None
+    rivals = [other for other in look.scans if other is not scan]
+    if any(other.gain > scan.gain + _TOO_CLOSE for other in rivals):
+        return None
+    return look, scan, tuple(other.family.name for other in rivals if other.gain > scan.gain - _TOO_CLOSE)
+
+
+def doubt(scan: Scan) -> float:
+    """How much wider limits are than the noise at its best says, for it may be stronger without the effect.
+
+    As in limits from the likelihood ratio, the ratio of the effect's size to its uncertainty is that of the scan.
+    """
+    which = list(concerned(scan))
+    return max(float(scan.held[which].norm() / scan.z[which].norm()), 1.0)
+
+
+def plausible(look: SlowLook, scan: Scan) -> tuple[float, float]:
+    """First and last place that the data leave possible, and one more on either side, samples."""
+    gain = _gain(look, scan, scan.family)
+    at = (gain > gain.max() - _PLAUSIBLE).nonzero()[:, 0]
+    places = scan.family.places
+    return float(places[max(int(at[0]) - 1, 0)]), float(places[min(int(at[-1]) + 1, len(places) - 1)])
+
+
+def estimate(look: SlowLook, scan: Scan, fine: Family) -> Estimate:
+    """Mean over the places of a family, each as likely as the data say: the places are the prior."""
+    size, information = scores(look.y, scan.fit.inverse, fine.templates)
+    weight = torch.softmax(_gain(look, scan, fine), 0)
+    mean = (size * weight).sum(-1)
+    variance = ((doubt(scan) ** 2 / information + size.square()) * weight).sum(-1) - mean.square()
+    return Estimate(quantiles(fine.places, weight), mean, variance.sqrt())
+
+
+def _gain(look: SlowLook, scan: Scan, family: Family) -> Tensor:
+    """Of the sensors concerned, nats, `(template,)`."""
+    size, information = scores(look.y, scan.fit.inverse, family.templates)
+    return (size.square() * information)[list(concerned(scan))].sum(0) / 2 / doubt(scan) ** 2
+
+
+def quantiles(places: Tensor, weight: Tensor) -> tuple[float, float, float]:
+    """Median, 2.5 and 97.5 % quantiles of places with weights that sum to one."""
+    below = weight.cumsum(0) - weight / 2
+    low, middle, high = (
+        float(places[min(int(torch.searchsorted(below, share)), len(places) - 1)])
+        for share in torch.tensor([0.025, 0.5, 0.975], dtype=torch.float64)
+    )
+    return middle, low, high
+
+
+def only(size: Tensor, which: tuple[int, ...]) -> Tensor:
+    """Sizes `(sensor,)` of some sensors, 0 in the others."""
+    kept = torch.zeros_like(size)
+    kept[list(which)] = size[list(which)]
+    return kept
+
+
+def place(places: tuple[float, float, float], rate: float) -> Parameter:
+    """A place with its limits, in seconds."""
+    value, low, high = places
+    return Parameter(value / rate, low / rate, high / rate, "s")
+
+
+def sizes(name: str, found: Estimate, which: tuple[int, ...], unit: str) -> dict[str, Parameter]:
+    """One parameter for each sensor concerned."""
+    limits = {}
+    for i in which:
+        size, reach = float(found.size[i]), _Z * float(found.sd[i])
+        limits[f"{name}[{i}]"] = Parameter(size, size - reach, size + reach, unit)
+    return limits
+
+
+def slow_levels(n_samples: int) -> tuple[int, ...]:
+    """Wavelet levels at which a block is no more than half a wavelet."""
+    return tuple(range(int(math.log2(n_samples / N_BLOCKS)) + 1, int(math.log2(n_samples)) + 1))
+
+
+def _even_blocks() -> Tensor:
+    return torch.arange(N_BLOCKS) % 2 == 0
+
+
+def _hadamard(n: int) -> Tensor:
+    """Orthogonal with entries of one size, all positive in the first column; `n` is a power of two."""
+    matrix = torch.ones(1, 1, dtype=torch.float64)
+    while len(matrix) < n:
+        matrix = torch.cat([torch.cat([matrix, matrix], 1), torch.cat([matrix, -matrix], 1)]) / math.sqrt(2)
+    return matrix

@@ -1,0 +1,152 @@
+"""A tone whose frequency wanders, or noise through a resonance? Their spectra may be the same.
+
+Of a Gaussian oscillation the squared envelope is exponential, `E |z|^4 = 2 (E |z|^2)^2`, and in short windows all its
+frequencies are present; a tone has one frequency at a time and a steady envelope. Both are judged against Gaussian
+records of the same spectrum, and against tones that wander in it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate, pad
+
+from gyrofuse.mismatch.bumps import Oscillation
+from gyrofuse.mismatch.case import Case
+
+_DRAWN = 60
+_REACH = 6.0  # half widths on either side
+_LEAST = 96  # bins that are needed
+_FIRES, _WOULD_FIRE = 4.5, 9.0  # standard deviations
+_SLOW = 0.05  # of the record, between changes of speed of a tone that wanders slowly
+
+
+class Steadiness(NamedTuple):
+    """What the envelope and short windows say.
+
+    Attributes:
+        tone: Whether it is a tone.
+        open: Whether the other one is possible too.
+        slow: Whether short windows show its frequency, so that it wanders slowly.
+    """
+
+    tone: bool
+    open: bool
+    slow: bool
+
+
+def steadiness(case: Case, bump: Oscillation) -> Steadiness:
+    """Judge a bump; one that sensors do not share is no tone."""
+    several = int((bump.variance > 3 * bump.variance_sd).sum()) > 1
+    if bump.gain is None and several:
+        return Steadiness(tone=False, open=False, slow=False)
+    noise = case.base.spectrum(torch.tensor([bump.centre], dtype=torch.float64))[:, 0]
+    if bump.gain is None:
+        weights = torch.zeros_like(noise).to(torch.complex128)
+        weights[int((bump.variance / noise).argmax())] = 1.0
+    else:
+        weights = bump.gain.conj() / noise
+    bins, floor = _baseband(case, bump, weights)
+    if len(bins) < _LEAST:
+        return Steadiness(tone=False, open=True, slow=False)
+    generator = torch.Generator().manual_seed(0)
+    smooth = _smoothed(bins.abs().square())
+    gaussian = _drawn(smooth, generator)
+    ridge, steady = _scores(bins[None], gaussian)
+    if max(float(ridge), float(steady)) > _FIRES:
+        return Steadiness(tone=True, open=False, slow=float(ridge) > _FIRES)
+    would = []
+    for tones in _tones(bump, smooth, floor, case.n_samples, generator):
+        a, b = _scores(tones, gaussian)
+        would.append(float(torch.maximum(a, b).median()))
+    return Steadiness(tone=False, open=min(would) < _WOULD_FIRE, slow=False)
+
+
+def _baseband(case: Case, bump: Oscillation, weights: Tensor) -> tuple[Tensor, float]:
+    """Bins `(bin,)` around the bump of the sensors' weighted sum, and the power of noise in each."""
+    n = case.n_samples
+    ramp = torch.linspace(0, 1, n, dtype=torch.float64)
+    signal = case.recording - (case.recording[:, -1:] - case.recording[:, :1]) * ramp
+    reach = max(round(_REACH * bump.width * n), _LEAST // 2)
+    centre = round(bump.centre * n)
+    reach = min(reach, centre - 3, n // 2 - centre - 2)
+    transform = torch.fft.rfft(signal)
+    bins = weights @ transform[:, centre - reach : centre + reach]
+    power = bins.abs().square()
+    edge = max(len(power) // 8, 1)
+    floor = float((power[:edge].mean() + power[-edge:].mean()) / 2)
+    tail = 1 / (1 + (reach / max(bump.width * n, 1e-9)) ** 2)
+    return bins, max(floor - tail * float(power.max()), 0.2 * floor)
+
+
+def _smoothed(power: Tensor) -> Tensor:
+    reach = max(len(power) // 40, 2)
+    total = pad(power.cumsum(0), (1, 0))
+    place = torch.arange(len(power))
+    low, high = (place - reach).clamp(min=0), (place + reach + 1).clamp(max=len(power))
+    return (total[high] - total[low]) / (high - low)
+
+
+def _normals(shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
+    parts = torch.randn(2, *shape, generator=generator, dtype=torch.float64)
+    return torch.complex(parts[0], parts[1]) / math.sqrt(2)
+
+
+def _drawn(power: Tensor, generator: torch.Generator) -> Tensor:
+    """Gaussian records' bins `(record, bin)`."""
+    return _normals((_DRAWN, len(power)), generator) * power.sqrt()
+
+
+def _tones(bump: Oscillation, smooth: Tensor, floor: float, n_samples: int, generator: torch.Generator) -> list[Tensor]:
+    """Tones as wide and strong as the bump, in noise: of a phase that diffuses, and of speeds that wander."""
+    count, rows = len(smooth), _DRAWN // 4
+    width = bump.width * n_samples / count  # cycles per sample of the base band
+    energy = float((smooth - floor).clamp(min=0).sum()) / count
+    diffusing = torch.randn(rows, count, generator=generator, dtype=torch.float64) * math.sqrt(4 * math.pi * width)
+    phases = [diffusing.cumsum(-1)]
+    for share in (count * _SLOW, 1 / width):  # samples between changes of speed
+        step = max(round(share), 2)
+        knots = torch.randn(rows, 1, count // step + 2, generator=generator, dtype=torch.float64) * width
+        speed = interpolate(knots, count, mode="linear", align_corners=True)[:, 0]
+        phases.append(2 * math.pi * speed.cumsum(-1))
+    made = []
+    for phase in phases:
+        tone = torch.polar(torch.full_like(phase, math.sqrt(energy)), phase)
+        bins = torch.fft.fftshift(torch.fft.fft(tone) / math.sqrt(count), dim=-1)
+        made.append(bins + _normals((rows, count), generator) * math.sqrt(floor))
+    return made
+
+
+def _scores(bins: Tensor, gaussian: Tensor) -> tuple[Tensor, Tensor]:
+    """How far records lie from Gaussian ones, sds `(record,)`: of short windows' peaks, and of the envelope."""
+    ridge, among = _ridges(bins), _ridges(gaussian)  # (window, record)
+    middle, spread = among.mean(1, keepdim=True), among.std(1, keepdim=True)
+    most = ((among - middle) / spread).amax(0)
+    peak = (((ridge - middle) / spread).amax(0) - most.mean()) / most.std()
+    steady, usual = _steady(bins), _steady(gaussian)
+    return peak, (steady - usual.mean()) / usual.std()
+
+
+def _steady(bins: Tensor) -> Tensor:
+    """`2 - E |z|^4 / (E |z|^2)^2`: 0 of Gaussian noise, 1 of a tone."""
+    best = bins.shape[-1]
+    inner = bins[..., best // 4 : best - best // 4]
+    power = torch.fft.ifft(inner).abs().square()
+    return 2 - power.square().mean(-1) / power.mean(-1).square()
+
+
+def _ridges(bins: Tensor) -> Tensor:
+    """Mean log of the highest bin over the mean bin in windows of several lengths, `(length, record)`."""
+    z = torch.fft.ifft(bins)
+    n, found = z.shape[-1], []
+    length = 8
+    while length <= max(n // 8, 8):
+        windows = z[..., : n // length * length].unflatten(-1, (-1, length))
+        power = torch.fft.fft(windows).abs().square()
+        white = power / power.mean(-2, keepdim=True)
+        found.append((white.amax(-1) / white.mean(-1)).log().mean(-1))
+        length *= 2
+    return torch.stack(found)

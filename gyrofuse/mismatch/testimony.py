@@ -1,0 +1,40 @@
+"""All witnesses together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from gyrofuse.mismatch.bumps import bump_witness
+from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.channels import channel_witness
+from gyrofuse.mismatch.evidence import Evidence, corrected
+from gyrofuse.mismatch.impulses import jump_witness, spike_witness, variance_witness
+from gyrofuse.mismatch.marginals import marginal_witness
+from gyrofuse.mismatch.pooled import common_witness, shape_witness
+from gyrofuse.mismatch.slow_scans import slow_witness
+from gyrofuse.mismatch.witnesses import coherence_witness, line_witness, spectrum_witness
+
+WITNESSES: tuple[Callable[[Case], Evidence], ...] = (
+    marginal_witness,
+    spike_witness,
+    channel_witness,
+    line_witness,
+    jump_witness,
+    slow_witness,
+    variance_witness,
+    spectrum_witness,
+    shape_witness,
+    bump_witness,
+    coherence_witness,
+    common_witness,
+)
+
+
+def testimony(case: Case) -> tuple[Evidence, ...]:
+    """What every witness says."""
+    return tuple(witness(case) for witness in WITNESSES)
+
+
+def combined(evidence: tuple[Evidence, ...]) -> float:
+    """p value of all witnesses together: that of the most extreme, for having asked so many."""
+    return corrected(min(e.p_value for e in evidence), len(evidence))

@@ -1,0 +1,100 @@
+"""Witnesses: statistics on which a recording and a simulation ought to agree, each with an honest p value."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from scipy import stats
+from torch import Tensor
+
+from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.evidence import Evidence, corrected
+
+_COHERENCE_DOF = 80  # below, sums over pairs have no simple law
+_TAIL = 10.0
+
+
+def spectrum_witness(case: Case) -> Evidence:
+    """Ratio of powers in each band and sensor, F distributed with both records' degrees of freedom."""
+    tails = power_tails(case)
+    places = int(tails.isfinite().sum())
+    if not places:
+        return Evidence("spectrum", 1.0, "the simulation is too short to compare spectra with")
+    sensor, band = divmod(int(tails.nan_to_num(nan=1.0).argmin()), tails.shape[1])
+    p = float(tails[sensor, band])
+    which = (tails < 0.05 / places).nonzero()
+    ratio = float(case.recorded.power[sensor, band] / case.simulated.power[sensor, band])
+    f = float(case.bands.frequency[band]) * case.scene.rate
+    return Evidence(
+        "spectrum",
+        corrected(p, places),
+        f"power near {f:.3g} Hz is {ratio:.3g} times the simulation's in sensor {case.scene.sensors[sensor]}",
+        sensors=tuple(sorted({int(i) for i in which[:, 0]})) or (sensor,),
+        levels=tuple(sorted({level_of(float(case.bands.frequency[b])) for b in which[:, 1].tolist() or [band]})),
+        frequency_hz=f,
+    )
+
+
+def line_witness(case: Case) -> Evidence:
+    """The strongest spectral line that the simulation does not have."""
+    line = case.line
+    f = line.frequency * case.scene.rate
+    names = ", ".join(case.scene.sensors[i] for i in line.sensors)
+    return Evidence(
+        "line",
+        line.p_value,
+        f"a line at {f:.6g} Hz in sensors {names}",
+        sensors=line.sensors,
+        levels=(level_of(line.frequency),),
+        frequency_hz=f,
+    )
+
+
+def coherence_witness(case: Case) -> Evidence:
+    """Difference of complex coherences in each band, summed over the pairs of sensors."""
+    d, simulated = case.bands.dof, case.simulated.dof
+    if case.n_sensors < 2:
+        return Evidence("coherence", 1.0, "a single sensor has no pairs")
+    one, other = case.recorded.coherence, case.simulated.coherence
+    upper = torch.triu_indices(case.n_sensors, case.n_sensors, 1)
+    difference = (one - other).abs().square()[:, upper[0], upper[1]]  # (band, pair)
+    per_ordinate = 1 / d + 1 / simulated.clamp(min=1e-9)
+    size = ((one.abs().square() + other.abs().square()) / 2)[:, upper[0], upper[1]] - per_ordinate[:, None] / 2
+    # What a sample coherence varies by, both parts.
+    variance = (1 - size.clamp(0.0, 1 - 1e-6)).square() * per_ordinate[:, None]
+    q = (difference / variance).sum(-1)
+    known = (d >= _COHERENCE_DOF) & (simulated >= _COHERENCE_DOF)
+    if not bool(known.any()):
+        return Evidence("coherence", 1.0, "the recording is too short to compare coherences")
+    # Gamma distributed but for a slightly heavier tail, here that of a ratio.
+    n_pairs = difference.shape[-1]
+    tails = stats.f.sf((q / n_pairs).numpy(), 2 * n_pairs, _TAIL * d.minimum(simulated).clamp(min=1.0).numpy())
+    tails = torch.from_numpy(tails).masked_fill(~known, 1.0)
+    band = int(tails.argmin())
+    pair = int(difference[band].argmax())
+    i, j = (case.scene.sensors[int(k[pair])] for k in upper)
+    largest = float(one[band].abs()[upper[0], upper[1]][pair])
+    f = float(case.bands.frequency[band]) * case.scene.rate
+    return Evidence(
+        "coherence",
+        corrected(float(tails[band]), int(known.sum())),
+        f"sensors {i} and {j} have a coherence of {largest:.2f} near {f:.3g} Hz",
+        sensors=tuple(range(case.n_sensors)),
+        levels=(level_of(float(case.bands.frequency[band])),),
+        frequency_hz=f,
+    )
+
+
+def power_tails(case: Case) -> Tensor:
+    """Two-sided p values of the ratio of powers `(sensor, band)`; NaN where the simulation says nothing."""
+    ratio = case.recorded.power / case.simulated.power
+    d, simulated = 2 * case.bands.dof, 2 * case.simulated.dof
+    law = stats.f(d.numpy(), simulated.clamp(min=1e-9).numpy())
+    tails = 2 * torch.from_numpy(law.sf(ratio.numpy())).minimum(torch.from_numpy(law.cdf(ratio.numpy())))
+    return tails.clamp(max=1.0).masked_fill(simulated <= 0, math.nan)
+
+
+def level_of(frequency: float) -> int:
+    """Wavelet level whose octave `(2^-j-1, 2^-j)` holds a frequency in cycles per sample, from 1."""
+    return max(math.floor(-math.log2(frequency)), 1)

@@ -1,0 +1,311 @@
+"""Effects that are a known signal: their size is half the whitened energy."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import mechanics, thermal
+from .bench import Bench, Part, quantity, rms
+from .clock import sample_times
+from .spectral import added
+
+Array = NDArray[np.float64]
+
+
+def _amplitudes(bench: Bench, part: Part) -> Array:
+    assert part.signal is not None
+    return math.sqrt(2) * np.std(part.signal[list(part.sensors)], axis=1)
+
+
+def _at_sensors(bench: Bench, sensors: tuple[int, ...], phase: NDArray[Any]) -> Array:
+    """A rotor's oscillation as each sensor has it: gain and phase of its own."""
+    unit = np.zeros((bench.n_sensors, bench.n))
+    for sensor, gain in zip(sensors, bench.gains(sensors, signed=False)[list(sensors)], strict=True):
+        unit[sensor] = gain * bench.sampled(np.cos(phase + bench.rng.uniform(0, 2 * np.pi)))
+    return unit
+
+
+def vibration_tone(bench: Bench, nats: float, *, frequency: float | None = None) -> Part:
+    """A governed rotor: one line, its phase different at each sensor."""
+    sensors = bench.some_sensors(2)
+    f = bench.rng.uniform(0.05, 0.45) * bench.rate if frequency is None else frequency
+    phase = 2 * np.pi * f / bench.step_rate * np.arange(bench.steps)
+    unit = _at_sensors(bench, sensors, phase)
+    part, _ = bench.shape(
+        "vibration_tone",
+        nats,
+        unit,
+        frequency_hz=f,
+        frequency_sd_hz=bench.frequency_sd(nats),
+        look_alikes=("drifting_tone", "resonance") if nats < 8 else (),
+    )
+    amplitude = _amplitudes(bench, part)
+    part.parameters.update(
+        amplitude=quantity(rms(amplitude), "deg/s", amplitude),
+        frequency=quantity(f, "Hz"),
+    )
+    return part
+
+
+def drifting_tone(bench: Bench, nats: float) -> Part:
+    """A rotor whose speed wanders by many line widths.
+
+    The oracle knows the spectrum of the wandering line (the time it spends at each frequency), not its path: a lower
+    bound of the divergence, which a known path would exceed.
+    """
+    sensors = bench.some_sensors(3)
+    f = bench.rng.uniform(0.1, 0.4) * bench.rate
+    wander = bench.rng.uniform(20, 200) / bench.duration  # Hz
+    seconds = bench.duration / bench.rng.uniform(5, 20)
+    phase = mechanics.rotor_phase(
+        bench.steps, f / bench.step_rate, wander / bench.step_rate, seconds * bench.step_rate, bench.rng
+    )
+    unit = _at_sensors(bench, sensors, phase)
+    course = np.diff(phase) * bench.step_rate / (2 * np.pi)  # Hz
+    # half the power in each of the 2n bins of width rate/(2n), as long as the line stays there, two bins blurred
+    share, _ = np.histogram(course / bench.rate, bins=(np.arange(bench.n) + 0.5) / (2 * bench.n), density=False)
+    share = np.convolve(share / len(course), [0.1, 0.2, 0.4, 0.2, 0.1], "same")
+    power = np.sum(unit**2, axis=1)  # over all coefficients, by Parseval
+    part, size = added(bench, "drifting_tone", nats, power[:, None] * share)
+    amplitude = math.sqrt(2 * size) * np.std(unit[list(sensors)], axis=1)
+    return replace(
+        part,
+        signal=math.sqrt(size) * unit,
+        frequency_hz=float(course.mean()),
+        parameters={
+            "amplitude": quantity(rms(amplitude), "deg/s", amplitude),
+            "frequency": quantity(float(course.mean()), "Hz"),
+            "wander": quantity(float(np.std(course)), "Hz"),
+        },
+    )
+
+
+def tone_beside_shaking(bench: Bench, nats: float) -> Part:
+    """A line near twice the frequency of an acceleration line, and not linked to it: some line widths off."""
+    part = vibration_tone(bench, nats, frequency=bench.rng.uniform(0.1, 0.45) * bench.rate)
+    assert part.frequency_hz is not None
+    half = part.frequency_hz / 2 + bench.rng.choice([-1, 1]) * bench.rng.uniform(4, 20) / bench.duration
+    _, seen = _acceleration(bench)
+    seen[0] += 0.4 * common_line(bench.n, half / bench.rate, 1.0, bench.rng)
+    return replace(part, channels={"acceleration": seen})
+
+
+def step(bench: Bench, nats: float, *, count: int = 1) -> Part:
+    """Bias steps; one by default."""
+    sensors = bench.some_sensors(1)
+    n = bench.n
+    if count == 1:
+        onsets = np.array([int(bench.rng.uniform(0.15, 0.85) * n)])
+        sizes = np.ones(1)
+    else:
+        onsets = np.sort(bench.rng.choice(np.arange(n // 50, n - n // 50), count, replace=False))
+        sizes = bench.rng.standard_normal(count)
+    course = (sizes[:, None] * (np.arange(n) >= onsets[:, None])).sum(axis=0)
+    gains = bench.gains(sensors)
+    part, size = bench.shape("step", nats, gains[:, None] * course)
+    assert part.signal is not None
+    look_alikes = bench.rivals(part.signal, {"warm_up_transient": _warm_ups(bench)})
+    if count > 1:
+        return replace(part, look_alikes=(*look_alikes, "random_telegraph"))
+    jump = size * gains[list(sensors)]
+    onset = float(onsets[0] / bench.rate)
+    # change of mean in white noise: the maximum-likelihood epoch has variance 26/delta^4 samples^2
+    delta = float(np.sum(jump**2 / bench.base.white[list(sensors)]))
+    return replace(
+        part,
+        look_alikes=look_alikes,
+        time_s=onset,
+        onset_sd_s=math.sqrt(26) / delta / bench.rate,
+        parameters={"size": quantity(rms(jump), "deg/s", jump), "onset": quantity(onset, "s")},
+    )
+
+
+def _steps(bench: Bench) -> Array:
+    """Steps at 50 epochs: (epoch, time)."""
+    return (np.arange(bench.n) >= np.linspace(0.01, 0.99, 50)[:, None] * bench.n).astype(float)
+
+
+def _warm_ups(bench: Bench) -> Array:
+    """Transients of 20 time constants: (time constant, time)."""
+    return np.exp(-np.arange(bench.n) / (np.geomspace(0.003, 1.0, 20)[:, None] * bench.n))
+
+
+def temperature_drift(bench: Bench, nats: float) -> Part:
+    """The bias follows the temperature of the die, which lags behind the thermometer."""
+    sensors = bench.some_sensors(2)
+    inside = thermal.box(
+        thermal.room(bench.n, bench.rate, bench.rng), bench.rate, bench.rng.uniform(3, 15), bench.rng.uniform(10, 60)
+    )
+    lag = bench.rng.uniform(0.5, 5.0)
+    die = thermal.lagged(inside, lag * bench.rate, float(inside[0]))
+    gains = bench.gains(sensors)
+    part, size = bench.shape(
+        "temperature_drift",
+        nats,
+        gains[:, None] * (die - die.mean()),
+        channel="temperature",
+        channels={"temperature": thermal.thermometer(inside, bench.rng)},
+    )
+    assert part.signal is not None
+    slope = size * gains[list(sensors)]
+    return replace(
+        part,
+        look_alikes=bench.rivals(part.signal, {"step": _steps(bench), "warm_up_transient": _warm_ups(bench)}),
+        parameters={"coefficient": quantity(rms(slope), "deg/s/K", slope), "lag": quantity(lag, "s")},
+    )
+
+
+def warm_up_transient(bench: Bench, nats: float, *, thermometer: str = "none") -> Part:
+    """Self-heating after power-on; thermometer "board" sees the room only, "die" the heating only."""
+    sensors = bench.some_sensors(2)
+    seconds = bench.duration * bench.rng.uniform(0.03, 0.25)
+    course = thermal.warm_up(bench.n, bench.rate, seconds)
+    gains = bench.gains(sensors)
+    ambient = thermal.room(bench.n, bench.rate, bench.rng)
+    channels = {}
+    if thermometer == "board":
+        channels = {"temperature": thermal.thermometer(thermal.box(ambient, bench.rate, 0.0, 40.0), bench.rng)}
+    elif thermometer == "die":
+        heated = thermal.box(np.full(bench.n, 22.0), bench.rate, 9.0, seconds)
+        channels = {"temperature": thermal.thermometer(heated, bench.rng)}
+    part, size = bench.shape(
+        "warm_up_transient",
+        nats,
+        gains[:, None] * course,
+        time_s=0.0,
+        channels=channels,
+    )
+    assert part.signal is not None
+    rivals = {"step": _steps(bench)}
+    if "temperature" in channels:
+        rivals["temperature_drift"] = channels["temperature"][None]
+    height = size * gains[list(sensors)]
+    return replace(
+        part,
+        look_alikes=bench.rivals(part.signal, rivals),
+        parameters={"size": quantity(rms(height), "deg/s", height), "time_constant": quantity(seconds, "s")},
+    )
+
+
+def _acceleration(bench: Bench) -> tuple[Array, Array]:
+    """What shakes the gyroscopes, and what the accelerometer (0.2 mg/sqrt(Hz)) says of it."""
+    true = bench.sampled(mechanics.floor_vibration(bench.steps, bench.step_rate, bench.rng))
+    return true, true + 2e-4 * math.sqrt(bench.rate) * bench.rng.standard_normal(true.shape)
+
+
+def g_sensitivity(bench: Bench, nats: float) -> Part:
+    """A gain on acceleration, the same at every frequency."""
+    sensors = bench.some_sensors(2)
+    true, seen = _acceleration(bench)
+    axes = bench.rng.standard_normal((bench.n_sensors, 3)) * (bench.gains(sensors, signed=False)[:, None])
+    part, size = bench.shape(
+        "g_sensitivity", nats, axes @ (true - true.mean(axis=1, keepdims=True)), channel="acceleration",
+        channels={"acceleration": seen},
+    )  # fmt: skip
+    gain = size * np.linalg.norm(axes[list(sensors)], axis=1)
+    part.parameters.update(gain=quantity(rms(gain), "deg/s/g", gain))
+    return part
+
+
+def quadratic_coupling(bench: Bench, nats: float) -> Part:
+    """The rate answers to the square of one axis' acceleration: a line at twice its frequency, and a slow bias."""
+    sensors = bench.some_sensors(2)
+    f = bench.rng.uniform(0.06, 0.22) * bench.rate
+    loudness = 1 + 0.5 * np.sin(2 * np.pi * bench.rng.uniform(1, 4) * np.arange(bench.steps) / bench.steps)
+    phase = mechanics.rotor_phase(
+        bench.steps, f / bench.step_rate, 3 / bench.duration / bench.step_rate, bench.steps / 10, bench.rng
+    )
+    shaking = mechanics.floor_vibration(bench.steps, bench.step_rate, bench.rng)
+    shaking[0] += 0.4 * loudness * np.cos(phase)
+    seen = bench.sampled(shaking)
+    gains = bench.gains(sensors)
+    part, size = bench.shape(
+        "quadratic_coupling",
+        nats,
+        gains[:, None] * bench.sampled(shaking[0] ** 2),
+        frequency_hz=2 * f,
+        channel="acceleration",
+        channels={"acceleration": seen + 2e-4 * math.sqrt(bench.rate) * bench.rng.standard_normal(seen.shape)},
+    )
+    gain = size * gains[list(sensors)]
+    part.parameters.update(gain=quantity(rms(gain), "deg/s/g^2", gain))
+    return part
+
+
+def scale_factor(bench: Bench, nats: float, *, constant: bool = False) -> Part:
+    """A rate table: the gyroscopes' output less the table's rate, which is a channel; each gain is off by its own."""
+    sensors = bench.some_sensors(2)
+    t = np.arange(bench.n) / bench.rate
+    turn = np.full(bench.n, 30.0)
+    for _ in range(0 if constant else 4):
+        swing = 2 * np.pi * (bench.rng.uniform(0.02, 0.3) * t + bench.rng.uniform())
+        turn += bench.rng.uniform(10, 40) * np.sin(swing)
+    gains = bench.gains(sensors)
+    unit = gains[:, None] * turn
+    channels = {"reference_rate": turn + (0.0 if constant else 0.002 * bench.rng.standard_normal(bench.n))}
+    if constant:
+        return Part(
+            "not_identifiable", 0.0, sensors, lambda recording: 0.0, signal=1e-3 * unit, channels=channels,
+            channel="reference_rate", look_alikes=("scale_factor",),
+        )  # fmt: skip
+    part, size = bench.shape("scale_factor", nats, unit, channel="reference_rate", channels=channels)
+    error = size * gains[list(sensors)]
+    part.parameters.update(error=quantity(1e6 * rms(error), "ppm", 1e6 * error))
+    return part
+
+
+def clock_skew(bench: Bench, nats: float, *, lost: bool = False) -> Part:
+    """Some sensors run on a clock of their own: a line that all share, known to the simulator, slips in phase there.
+
+    The clock is off by some ppm, or it loses samples. The oracle fits phase and amplitude of the line at each sensor
+    under both hypotheses; what is left of the difference is the signal. The offset sets its size; for lost samples, the
+    amplitude of the line, which the simulator knows.
+    """
+    sensors = bench.some_sensors(1, 3)
+    chosen, n = np.isin(np.arange(bench.n_sensors), sensors)[:, None], bench.n
+    f = bench.rng.uniform(0.1, 0.4) * bench.rate
+    turn, start = 2 * np.pi * f / bench.rate, bench.rng.uniform(0, 2 * np.pi)
+    amplitude, ppm = 0.5 * float(bench.sigma.mean()), float(bench.rng.choice([-1.0, 1.0]))
+    angle = turn * np.arange(n) + start
+    quadratures = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+    def slipped(times: Array) -> tuple[Array, Array]:
+        """The line at these times, and what is left of it beside the regular one."""
+        line = np.cos(turn * times + start)
+        return line, line - quadratures @ np.linalg.lstsq(quadratures, line, rcond=None)[0]
+
+    if lost:
+        gone = bench.rng.choice(np.arange(n // 10, 9 * n // 10), int(bench.rng.integers(1, 6)), replace=False)
+        line, rest = slipped(sample_times(n, 0.0, gone))
+        part, amplitude = bench.shape("clock_skew", nats, chosen * rest)
+        parameters = {"lost": quantity(len(gone), "")}
+    else:
+        # the residual grows in proportion to a small offset, so a few corrections reach the size asked for
+        for _ in range(40):
+            line, rest = slipped(sample_times(n, ppm, np.empty(0)))
+            part, size = bench.shape("clock_skew", nats, chosen * rest)
+            if abs(math.log(size / amplitude)) < 1e-4:
+                break
+            ppm *= min(max(size / amplitude, 1e-2), 2.0)
+        parameters = {"skew": quantity(ppm, "ppm")}
+    seen = 2e-4 * math.sqrt(bench.rate) * bench.rng.standard_normal((3, n)) + 0.05 * np.cos(angle)
+    seen[2] += 1.0
+    return replace(
+        part,
+        signal=amplitude * np.where(chosen, line, np.cos(angle)),  # the oracle's residual is orthogonal to the line
+        look_alikes=("drifting_tone", "vibration_tone"),
+        frequency_hz=f,
+        channels={"acceleration": seen},
+        simulation=lambda simulated: simulated + common_line(simulated.shape[-1], f / bench.rate, amplitude, bench.rng),
+        parameters={**parameters, "frequency": quantity(f, "Hz")},
+    )
+
+
+def common_line(n: int, nu: float, amplitude: float, rng: np.random.Generator) -> Array:
+    """A line that all sensors share, `nu` in cycles per sample, its phase drawn."""
+    return amplitude * np.cos(2 * np.pi * (nu * np.arange(n) + rng.uniform()))

@@ -1,0 +1,226 @@
+"""Effects that are Gaussian noise of another spectrum: their size is the Kullback-Leibler divergence."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import converter, mechanics
+from .analog import OVERSAMPLING, bank_spectrum, relaxator_bank
+from .bench import Bench, Part, quantity, rms
+from .likelihood import (
+    ar1_spectrum,
+    coefficients,
+    distinct_nats,
+    divergence,
+    expected_power,
+    folded,
+    grid,
+    quadratic_null,
+    solve,
+    spectral_llr,
+)
+
+Array = NDArray[np.float64]
+NARROW = ("drifting_tone", "resonance")
+
+
+def _fine_grid(bench: Bench) -> Array:
+    return np.arange(bench.steps + 1) / (2 * bench.steps)
+
+
+def added(bench: Bench, mechanism: str, nats: float, unit: Array) -> tuple[Part, float]:
+    """Noise of spectrum v `unit` (sensor, frequency) added to the base, at the v whose divergence is `nats`; and v."""
+    reference = float((bench.spectrum / np.maximum(unit.max(axis=0), 1e-300)).min())
+
+    def expected(size: float) -> float:
+        return float(divergence(bench.spectrum + size * unit, bench.spectrum).sum())
+
+    size = solve(nats, expected, 1e-9 * reference, 1e6 * reference)
+    after = bench.spectrum + size * unit
+    each = divergence(after, bench.spectrum)
+    sensors = tuple(int(i) for i in np.flatnonzero(unit.sum(axis=1) > 0))
+    look_alikes: tuple[str, ...] = ("parameter_shift",) if bench.looks_like_parameters(after) else ()
+    if mechanism in NARROW and (after / bench.spectrum).max() < 2:  # its envelope drowns in the noise of its band
+        look_alikes += tuple(name for name in NARROW if name != mechanism)
+    part = Part(
+        mechanism,
+        nats,
+        sensors,
+        lambda recording: spectral_llr(recording, after, bench.spectrum),
+        oracle_null=quadratic_null(after / bench.spectrum),
+        sensor_nats=tuple(float(each[i]) for i in sensors),
+        look_alikes=look_alikes,
+    )
+    return part, size
+
+
+def resonance(bench: Bench, nats: float) -> Part:
+    """A structure that rings in noise, at each sensor with a gain and a drive of its own."""
+    sensors = bench.some_sensors(2)
+    f, quality = bench.rng.uniform(0.06, 0.4) * bench.rate, math.exp(bench.rng.uniform(math.log(8), math.log(60)))
+    gains = bench.gains(sensors, signed=False)
+    nu = f / bench.step_rate
+    unit = folded(mechanics.resonator_spectrum(_fine_grid(bench), nu, quality), OVERSAMPLING)[1:-1]
+    part, size = added(bench, "resonance", nats, gains[:, None] ** 2 * unit)
+    signal = np.zeros((bench.n_sensors, bench.n))
+    for i in sensors:
+        ringing = mechanics.resonator(bench.steps, nu, quality, bench.rng)
+        signal[i] = math.sqrt(size) * gains[i] * bench.sampled(ringing)
+    sd = math.sqrt(size) * gains[list(sensors)] * abs(np.sinc(f / bench.rate))
+    return replace(
+        part,
+        signal=signal,
+        frequency_hz=f,
+        parameters={
+            "frequency": quantity(f, "Hz"),
+            "quality": quantity(quality, ""),
+            "amplitude": quantity(rms(sd), "deg/s", sd),  # standard deviation after the converter
+        },
+    )
+
+
+def power_law(bench: Bench, nats: float, *, mechanism: str = "flicker", exponent: float = 1.0) -> Part:
+    """1/f^exponent noise by a bank of relaxators, from a quarter of a sample to a tenth of the recording."""
+    sensors = bench.some_sensors(2)
+    gains = bench.gains(sensors, signed=False)
+    taus = np.geomspace(OVERSAMPLING / 4, bench.steps / 10, 2 * int(math.log10(4 * bench.n)) + 1)
+    variances = taus ** (exponent - 1) / np.sum(taus ** (exponent - 1))
+    unit = expected_power(folded(bank_spectrum(_fine_grid(bench), taus, variances), OVERSAMPLING))
+    part, size = added(bench, mechanism, nats, gains[:, None] ** 2 * unit)
+    signal = np.zeros((bench.n_sensors, bench.n))
+    for i in sensors:
+        signal[i] = math.sqrt(size) * gains[i] * bench.sampled(relaxator_bank(bench.steps, taus, variances, bench.rng))
+    # one more relaxator may stand for it, and for other exponents flicker noise may
+    after = bench.spectrum + size * gains[:, None] ** 2 * unit
+    f = grid(bench.n)
+    corners = [ar1_spectrum(f, math.exp(-1 / tau), 1.0) * (1 - math.exp(-1 / tau)) ** 2 for tau in
+               np.geomspace(10, bench.n / 10, 3)]  # fmt: skip
+    alone = [np.broadcast_to(corner, after.shape) * bench.base.white[:, None] / after for corner in corners]
+    twin = np.broadcast_to(1 / f, after.shape) * bench.base.white[:, None] / after
+    own = [component / after for component in bench.components]
+    look_alikes = set(part.look_alikes)
+    if any(distinct_nats(after, bench.spectrum, [*own, extra]) < 5 for extra in alone):
+        look_alikes.add("parameter_shift")
+    if mechanism != "flicker" and distinct_nats(after, bench.spectrum, [*own, twin]) < 5:
+        look_alikes.add("flicker")
+    middle = (f > 10 / bench.n) & (f < 0.1)
+    level = math.sqrt(2 * size * float(np.mean((unit * f**exponent)[middle]))) * gains[list(sensors)]
+    return replace(
+        part,
+        signal=signal,
+        look_alikes=tuple(sorted(look_alikes)),
+        parameters={
+            # for 1/f noise its standard deviation in each factor e of frequency
+            "level": quantity(rms(level), "deg/s", level),
+        },
+    )
+
+
+def common_mode(bench: Bench, nats: float) -> Part:
+    """White noise of one supply in several sensors; each keeps the level that the simulator expects."""
+    sensors = bench.some_sensors(3)
+    gains = bench.gains(sensors, signed=False) * bench.sigma
+
+    def law(share: float) -> tuple[Array, Array]:
+        """Independent part (sensor, frequency) and log determinant of the cross-spectral matrix, per frequency."""
+        alone = bench.spectrum - share * gains[:, None] ** 2
+        return alone, np.log(alone).sum(axis=0) + np.log1p(share * (gains[:, None] ** 2 / alone).sum(axis=0))
+
+    def expected(share: float) -> float:
+        return float((np.log(bench.spectrum).sum(axis=0) - law(share)[1]).sum() / 2)
+
+    share = solve(nats, expected, 1e-7, 0.6)
+    alone, logdet = law(share)
+
+    def llr(recording: Array) -> float:
+        x = coefficients(recording)
+        projected = (gains[:, None] * x / alone).sum(axis=0)
+        capacity = 1 + share * (gains[:, None] ** 2 / alone).sum(axis=0)
+        quadratic = (x**2 / bench.spectrum - x**2 / alone).sum(axis=0) + share * projected**2 / capacity
+        return float((quadratic + np.log(bench.spectrum).sum(axis=0) - logdet).sum() / 2)
+
+    supply = bench.sampled(math.sqrt(OVERSAMPLING) * bench.rng.standard_normal(bench.steps))
+    level = math.sqrt(share) * gains
+    sparse = slice(None, None, 16)  # the spectra are smooth: one frequency of 16 gives the law of the ratio
+    whitened = level / np.sqrt(bench.spectrum[:, sparse]).T  # (frequency, sensor)
+    inside = whitened[:, :, None] * whitened[:, None, :]
+    inside[:, np.arange(bench.n_sensors), np.arange(bench.n_sensors)] = 1.0
+    null = quadratic_null(np.linalg.eigvalsh(inside))
+    return Part(
+        "common_mode",
+        nats,
+        sensors,
+        llr,
+        oracle_null=(16 * null[0], 16 * null[1], 16 * null[2]),
+        signal=level[:, None] * supply,
+        base=replace(bench.base, white=bench.base.white - level**2),
+        parameters={"gain": quantity(rms(level[list(sensors)]), "deg/s", level[list(sensors)])},
+    )
+
+
+def low_pass(bench: Bench, nats: float) -> Part:
+    """A second-order filter in the sensor, before the converter."""
+    sensors = bench.some_sensors(2)
+    chosen = np.isin(np.arange(bench.n_sensors), sensors)[:, None]
+    nu = _fine_grid(bench)
+
+    def after(corner: float) -> Array:
+        passed = folded(OVERSAMPLING * converter.low_pass_gain(nu, corner), OVERSAMPLING)[1:-1]
+        return bench.spectrum - chosen * bench.base.white[:, None] * (1 - passed)
+
+    inverse = solve(nats, lambda x: float(divergence(after(1 / x), bench.spectrum).sum()), 1 / 0.49, 1 / 0.004)
+    corner = 1 / inverse
+    spectrum = after(corner)
+
+    def filtered(analog: Array) -> Array:
+        return np.where(chosen, converter.low_pass(analog, corner), analog)
+
+    return Part(
+        "low_pass",
+        nats,
+        sensors,
+        lambda recording: spectral_llr(recording, spectrum, bench.spectrum),
+        oracle_null=quadratic_null(spectrum / bench.spectrum),
+        analog=filtered,
+        sensor_nats=tuple(float(v) for v in divergence(spectrum, bench.spectrum)[list(sensors)]),
+        look_alikes=("parameter_shift",) if bench.looks_like_parameters(spectrum) else (),
+        frequency_hz=corner * bench.step_rate,
+        parameters={"corner": quantity(corner * bench.step_rate, "Hz")},
+    )
+
+
+def parameter_shift(bench: Bench, nats: float, *, only: str | None = None) -> Part:
+    """The same physics with other numbers; `only` one of "white", "ar1", "walk"."""
+    sensors = bench.some_sensors(2)
+    chosen = np.isin(np.arange(bench.n_sensors), sensors)
+    names = ["white", "ar1", "walk"]
+    weights = bench.rng.uniform(0.3, 1, 3) * bench.rng.choice([-1, 1], 3)
+    if only:
+        weights = np.array([float(name == only) for name in names]) * (-1 if only == "white" else 1)
+
+    def shifted(size: float) -> tuple[Array, Array, Array]:
+        white, ar1, walk = np.exp(size * weights[:, None] * chosen)
+        return bench.base.white * white, bench.base.variance * ar1[:, None], bench.base.walk * walk
+
+    def base(size: float) -> Part:
+        white, variance, walk = shifted(size)
+        changed = replace(bench.base, white=white, variance=variance, walk=walk)
+        spectrum = changed.spectrum(bench.n)
+        each = divergence(spectrum, bench.spectrum)
+        factors = dict(zip(names, np.exp(size * weights), strict=True))
+        return Part(
+            "parameter_shift",
+            float(each.sum()),
+            sensors,
+            lambda recording: spectral_llr(recording, spectrum, bench.spectrum),
+            oracle_null=quadratic_null(spectrum / bench.spectrum),
+            base=changed,
+            sensor_nats=tuple(float(each[i]) for i in sensors),
+            parameters={f"{name}_factor": quantity(factor, "") for name, factor in factors.items()},
+        )
+
+    return base(solve(nats, lambda size: base(size).nats, 1e-5, 14.0))

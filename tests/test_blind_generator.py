@@ -1,0 +1,439 @@
+"""The blind proof's generator, seal and judge: effects of the size claimed, nulls without one, counts by hand."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.signal import periodogram
+from scipy.stats import beta, binom, kurtosis
+
+sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
+from blind import (
+    bench,
+    cases,
+    converter,
+    judge,
+    likelihood,
+    mechanics,
+    ordinary_view,
+    scoring,
+    seal,
+    thermal,
+    traps,
+    trial,
+)
+from blind.analog import OVERSAMPLING, consumer_base
+from blind.cases import make_case
+
+BLIND = Path(__file__).parent / "benchmarks" / "blind"
+N = 8192
+EFFECTS = [name for name in cases.kinds() if cases.KINDS[name].group not in ("null", "unidentifiable")]
+
+
+def test_generator_knows_nothing_of_the_library():
+    for path in set(BLIND.glob("*.py")) - {BLIND / "analyser.py"}:
+        assert not re.search(
+            r"import gyrofuse|from gyrofuse|import torch|from torch|import analyse", path.read_text()
+        ), path
+
+
+@pytest.mark.parametrize("kind", cases.kinds())
+def test_case_is_complete_and_repeatable(kind):
+    n = 2048
+    first, again = (make_case(kind, 30.0, 5, n_samples=n) for _ in range(2))
+    np.testing.assert_array_equal(first.recording["gyro"], again.recording["gyro"])
+    assert seal.digest_of(seal.plain(first.truth)) == seal.digest_of(seal.plain(again.truth))
+    assert first.recording["gyro"].shape == (6, n)
+    for name, values in first.recording.items():
+        if name not in ("gyro", "fs", "unit"):
+            assert values.shape[-1] == n, name
+            assert np.isfinite(values).all(), name
+    assert np.isfinite(first.recording["gyro"]).all()
+    assert ("terms" in first.simulation) != ("gyro" in first.simulation)
+    json.dumps(seal.plain(first.truth), allow_nan=False)
+    for effect in first.truth["effects"]:
+        assert effect["mechanism"] in effect["class"]
+        assert all(0 <= sensor < 6 for sensor in effect["sensors"])
+        assert len(effect["sensor_nats"]) in (0, len(effect["sensors"]))
+        for parameter in effect["parameters"].values():
+            assert len(parameter.get("per_sensor", effect["sensors"])) == len(effect["sensors"])
+
+
+def test_seed_kind_and_size_all_change_the_numbers():
+    names = [("step", 30.0, 5), ("step", 30.0, 6), ("step", 31.0, 5), ("null", None, 5)]
+    first = [make_case(kind, nats, seed, n_samples=64).recording["gyro"][0, 0] for kind, nats, seed in names]
+    assert len(set(first)) == 4
+
+
+def test_unknown_kind():
+    with pytest.raises(ValueError, match="`kind`: expected one of"):
+        make_case("gremlins", 30.0, 0)
+
+
+# base and simulation
+
+
+@pytest.mark.parametrize("kind", ["null", "null_slow_ar1", "null_white_only"])
+def test_null_recording_and_simulation_share_one_spectrum(kind):
+    """Ratio of powers in 12 bands pooled over 6 sensors and 12 seeds; every |z| < 4 of the F law's log."""
+    edges = np.geomspace(1e-3, 0.5, 13)
+    powers = np.zeros((2, len(edges) - 1))
+    counts = np.zeros((2, len(edges) - 1))
+    for seed in range(12):
+        case = make_case(kind, None, seed, n_samples=N)
+        if "terms" in case.simulation:
+            continue
+        reference = None
+        for side, signal in enumerate((case.recording["gyro"], case.simulation["gyro"])):
+            f, power = periodogram(np.diff(signal, axis=1), window="hann")
+            white = 2 - 2 * np.cos(2 * np.pi * f)
+            level = np.median(power[:, f > 0.3] / white[f > 0.3], axis=1) if reference is None else reference
+            reference = level
+            band = np.digitize(f, edges) - 1
+            for k in range(len(edges) - 1):
+                powers[side, k] += (power[:, band == k] / white[band == k] / level[:, None]).sum()
+                counts[side, k] += power[:, band == k].size
+    ratio = np.log(powers[0] / counts[0]) - np.log(powers[1] / counts[1])
+    # a band's ordinates have the mean's relative variance 1.94/n (Hann), more where sensors differ in level
+    z = ratio / np.sqrt(1.94 * (1 / counts[0] + 1 / counts[1]) * 1.5)
+    assert np.abs(z).max() < 4, z
+
+
+def test_oversampled_base_has_the_spectrum_that_is_said():
+    base = consumer_base(np.random.default_rng(0), 200.0)
+    analog = base.analog(2 * N, np.random.default_rng(1))
+    power = likelihood.coefficients(converter.decimate(analog, OVERSAMPLING)) ** 2 / base.spectrum(2 * N)
+    for part in np.array_split(power, 8, axis=1):
+        assert abs(part.mean() - 1) < 4 * np.sqrt(2 / part.size)
+
+
+def test_wavelet_variance_of_nulls_is_ordinary():
+    """The ordinary view's false alarms: at most what 1 % allows in 30 cases (binomial bound fixed beforehand)."""
+    p = []
+    for seed in range(30):
+        case = make_case("null", None, seed, n_samples=N)
+        p.append(ordinary_view.ordinary_p_value(case.recording["gyro"], case.simulation))
+    assert np.sum(np.array(p) < 0.01) <= binom.ppf(0.999, 30, 0.01)
+
+
+# the size of an effect
+
+
+def test_folded_spectrum_against_a_simulated_one():
+    rng = np.random.default_rng(3)
+    nu, quality = 0.03, 5.0
+    fine = mechanics.resonator_spectrum(np.arange(8 * N + 1) / (16 * N), nu, quality)
+    predicted = likelihood.folded(fine, 8)[1:-1]
+    runs = [converter.decimate(mechanics.resonator(8 * N, nu, quality, rng), 8) for _ in range(30)]
+    power = np.mean([likelihood.coefficients(run) ** 2 for run in runs], axis=0)
+    for a, b in zip(np.array_split(power, 20), np.array_split(predicted, 20), strict=True):
+        assert abs(a.mean() / b.mean() - 1) < 4 * np.sqrt(2 / (30 * a.size / 4))
+
+
+def test_white_noise_stays_white_through_the_converter():
+    np.testing.assert_allclose(likelihood.folded(np.full(8 * 64 + 1, 8.0), 8), 1.0, rtol=1e-12)
+
+
+def test_expected_power_against_the_double_sum():
+    """E c_k^2 = sum_st b_k(s) b_k(t) r(s - t) for an AR1 process on 64 samples."""
+    n, phi = 64, 0.8
+    spectrum = likelihood.ar1_spectrum(np.arange(n + 1) / (2 * n), phi, 1 - phi**2)
+    covariance = phi ** np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    basis = likelihood.coefficients(np.eye(n))  # row t: every coefficient of an impulse at t
+    exact = np.einsum("sk,tk,st->k", basis, basis, covariance)
+    np.testing.assert_allclose(likelihood.expected_power(spectrum), exact, rtol=1e-4)  # r(64) = 6e-7 folds over
+
+
+def test_oracle_keeps_its_false_alarm_rate():
+    """At nominal 5 %, 40 null recordings for each of six effects: at most the 99.9 % point of the binomial law."""
+    rng = np.random.default_rng(8)
+    alarms, trials = 0, 0
+    for name in ("vibration_tone", "resonance", "common_mode", "variance_change", "quantization", "flicker"):
+        table = bench.Bench(consumer_base(rng, 200.0), N, rng)
+        part = cases.KINDS[name].effects[0](table, 20.0)
+        true = cases.effect_truth(part, 0.0)
+        for _ in range(40):
+            ratio = part.llr(table.base.simulate(N, rng) + table.base.bias[:, None])
+            alarms += scoring.oracle_detects(true | {"oracle_llr": ratio}, 0.05)
+            trials += 1
+    assert binom.ppf(0.001, trials, 0.05) <= alarms <= binom.ppf(0.999, trials, 0.05)
+
+
+SIZES = [k for k in EFFECTS if cases.KINDS[k].group in ("mechanism", "outside") and k not in
+         ("quantization_bare", "dead_band", "clipping", "stuck_samples", "random_telegraph")]  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", SIZES)
+def test_oracle_ratio_has_the_claimed_mean(kind):
+    """Mean of 8 log likelihood ratios at 60 nats, within 6 standard errors of the normal law and 8 %."""
+    nats, runs = 60.0, 8
+    ratios = [make_case(kind, nats, 100 + s, n_samples=N).truth["effects"][0]["oracle_llr"] for s in range(runs)]
+    assert abs(np.mean(ratios) - nats) < 4 * 1.5 * np.sqrt(2 * nats / runs) + 0.08 * nats
+
+
+def test_tone_stands_out_by_its_amplitude():
+    case = make_case("vibration_tone", 300.0, 2, n_samples=N)
+    (effect,) = case.truth["effects"]
+    for sensor, amplitude in zip(effect["sensors"], effect["parameters"]["amplitude"]["per_sensor"], strict=True):
+        t = np.arange(N) / case.recording["fs"]
+        x = case.recording["gyro"][sensor]
+        seen = 2 * abs(np.mean((x - x.mean()) * np.exp(-2j * np.pi * effect["frequency_hz"] * t)))
+        assert abs(seen - amplitude) < 5 * np.std(x) * np.sqrt(2 / N)
+
+
+def test_tone_bound_is_that_of_one_sinusoid():
+    """Var omega = 24 S/(a^2 T^3), with a^2 T/(4 S) nats."""
+    base = consumer_base(np.random.default_rng(0), 200.0)
+    table = bench.Bench(base, N, np.random.default_rng(0))
+    a2_over_s = 4 * 50.0 / N
+    expected = np.sqrt(24 / (a2_over_s * N**3)) * 200.0 / (2 * np.pi)
+    assert table.frequency_sd(50.0) == pytest.approx(expected, rel=1e-12)
+
+
+def test_spikes_have_heavy_tails_and_bare_rounding_a_lattice():
+    spiky = make_case("spikes_bus", 1000.0, 1, n_samples=N)
+    named = spiky.truth["effects"][0]["sensors"]
+    tails = kurtosis(np.diff(spiky.recording["gyro"], axis=1), axis=1)
+    others = [i for i in range(6) if i not in named]
+    assert tails[named].min() > 0.3
+    assert all(abs(tails[i]) < 0.3 for i in others)
+
+    case = make_case("quantization_bare", None, 1, n_samples=N)
+    step = case.truth["effects"][0]["parameters"]["lsb"]["value"]
+    steps = case.recording["gyro"] / step
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
+
+
+def test_hidden_lattice_shows_in_the_characteristic_function_only():
+    case = make_case("quantization", 3000.0, 4, n_samples=N)
+    (effect,) = case.truth["effects"]
+    turns = 2j * np.pi / effect["parameters"]["lsb"]["value"]
+    power = N * np.abs(np.mean(np.exp(turns * case.recording["gyro"]), axis=1)) ** 2
+    named = np.isin(np.arange(6), effect["sensors"])
+    assert power[named].min() > 20
+    assert np.all(power[~named] < 12)
+    assert len(np.unique(case.recording["gyro"])) == 6 * N
+
+
+def test_clipping_dead_band_and_repeats_are_counted():
+    """Altered samples over 20 seeds: Poisson with the claimed mean, within 4 standard deviations."""
+    found = {"clipping": 0, "dead_band": 0, "stuck_samples": 0}
+    for seed in range(20):
+        x = make_case("clipping", 30.0, seed, n_samples=N).recording["gyro"]
+        found["clipping"] += sum(
+            count for row in x for count in (np.sum(row == row.max()), np.sum(row == row.min())) if count > 1
+        )
+        found["dead_band"] += np.sum(make_case("dead_band", 30.0, seed, n_samples=N).recording["gyro"] == 0)
+        x = make_case("stuck_samples", 30.0, seed, n_samples=N).recording["gyro"]
+        same = np.any(np.diff(x, axis=1) == 0, axis=0)
+        found["stuck_samples"] += np.sum(same[1:] & ~same[:-1]) + same[0]
+    for name, count in found.items():
+        assert abs(count - 600) < 4 * np.sqrt(600) + 0.1 * 600, name
+
+
+def test_box_follows_the_heat_equation():
+    time = np.arange(2000) / 10.0
+    expected = 20 + 8 * (1 - np.exp(-(time + 0.1) / 25))
+    np.testing.assert_allclose(thermal.box(np.full(2000, 20.0), 10.0, 8.0, 25.0), expected, rtol=1e-12)
+
+
+def test_trap_oracle_against_the_sum_over_all_paths():
+    """The forward algorithm on eight blocks, beside the likelihood of each of the 256 paths."""
+    spectrum = np.full(319, 2.0) + 0.5 / np.arange(1, 320)
+    oracle = traps.TrapOracle(spectrum, 320, 2000.0, 1000.0)
+    oracle.blocks = 8
+    means = np.random.default_rng(0).standard_normal((2, 8))
+    step = 1.3
+    taps = np.concatenate([[1.0], -oracle.prediction])
+    total = np.zeros(2)
+    for path in range(256):
+        states = (path >> np.arange(8)) & 1
+        chance = [1 - oracle.up_share, oracle.up_share][states[0]]
+        for a, b in pairwise(states):
+            chance *= oracle.transition[a, b]
+        ratio = np.zeros(2)
+        for t in range(traps.ORDER, 8):
+            window = slice(t, t - traps.ORDER - 1 if t > traps.ORDER else None, -1)
+            seen, said = means[:, window] @ taps, step * (states[window] - 0.5) @ taps
+            ratio += (said * seen - said**2 / 2) / oracle.innovation
+        total += chance * np.exp(ratio)
+    np.testing.assert_allclose(oracle.llr(means, step), np.log(total), rtol=1e-9)
+
+
+def test_dwells_of_the_trap():
+    path = traps.telegraph(400_000, 50.0, 150.0, np.random.default_rng(0))
+    switches = np.abs(np.diff(path)).sum()
+    assert abs(path.mean() - 0.25) < 0.02
+    assert abs(switches - 2 * 400_000 / 200) < 4 * np.sqrt(4000)
+
+
+def test_alias_and_constant_rate_leave_nothing_to_find():
+    case = make_case("blind:alias", None, 3, n_samples=N)
+    (effect,) = case.truth["effects"]
+    turn = np.exp(-2j * np.pi * effect["frequency_hz"] / case.recording["fs"] * np.arange(N))
+    ours, theirs = (np.abs(x @ turn) for x in (case.recording["gyro"], case.simulation["gyro"]))
+    for sensor in effect["sensors"]:
+        assert abs(ours[sensor] - theirs[sensor]) < 5 * np.sqrt(N) * case.recording["gyro"][sensor].std()
+    constant = make_case("blind:constant_rate", None, 3, n_samples=N)
+    assert np.ptp(constant.recording["reference_rate"]) == 0
+
+
+# the seal
+
+
+def test_seal_refuses_what_was_changed(tmp_path):
+    truth, answers = tmp_path / "truth.json", tmp_path / "answers.json"
+    digest = seal.seal([{"kind": "null"}], truth)
+    frozen = seal.freeze([{"mismatch": False}], digest, answers)
+    assert seal.unseal(truth, digest, answers, frozen) == ([{"kind": "null"}], [{"mismatch": False}])
+    assert seal.seal([{"kind": "null"}], tmp_path / "again.json") != digest  # salted
+
+    kept = answers.read_text()
+    answers.write_text(kept.replace("false", "true"))
+    with pytest.raises(seal.SealBrokenError, match="`answers_path`: expected the frozen answers"):
+        seal.unseal(truth, digest, answers, frozen)
+    answers.write_text(kept)
+    other = seal.seal([{"kind": "step"}], tmp_path / "other.json")
+    with pytest.raises(seal.SealBrokenError, match="expected answers to these truths"):
+        seal.unseal(tmp_path / "other.json", other, answers, frozen)
+    truth.write_text(truth.read_text().replace("null", "step"))
+    with pytest.raises(seal.SealBrokenError, match="`truth_path`: expected the sealed truths"):
+        seal.unseal(truth, digest, answers, frozen)
+    two = seal.freeze([None, None], other, answers)
+    with pytest.raises(seal.SealBrokenError, match="expected 1 answers, got 2"):
+        seal.unseal(tmp_path / "other.json", other, answers, two)
+
+
+# the judge
+
+
+def effect(**changes):
+    return {
+        "mechanism": "step", "class": ["step", "warm_up_transient"], "sensors": [0, 2], "sensor_nats": [20.0, 2.0],
+        "nats": 30.0, "oracle_llr": 28.0, "oracle_law": "cumulants",
+        "oracle_null": [-30.0, 60.0, 0.0], "frequency_hz": None, "frequency_sd_hz": None,
+        "time_s": 10.0, "onset_sd_s": 0.5, "channel": None,
+        "parameters": {"step": {"value": 0.1, "unit": "deg/s", "per_sensor": [0.08, 0.12]}}, **changes,
+    }  # fmt: skip
+
+
+def truth(group="mechanism", effects=None, kind="step", nats=30.0):
+    effects = [effect()] if effects is None else effects
+    return {"group": group, "kind": kind, "nats": nats, "effects": effects, "true_gain": 28.0}
+
+
+def answer(*named, mismatch=True, **fields):
+    findings = [{"mechanism": name, "alternatives": [], "sensors": [0, 2], **fields} for name in named]
+    held_out = {"before": 1.5, "after": 1.0, "gain": {"value": 14.0, "low": 5.0, "high": 20.0}}
+    return {"mismatch": mismatch, "findings": findings, "unexplained": [], "held_out": held_out}
+
+
+SILENT = {"mismatch": False, "findings": [], "unexplained": [], "held_out": {}}
+
+
+def test_judge_counts_by_hand():
+    truths = [truth()] * 5 + [truth("null", [], "null", None)] * 4
+    answers = [
+        answer("step", time_s=10.4, parameters={"step": {"value": 0.1, "low": 0.09, "high": 0.11, "unit": "deg/s"}}),
+        answer("warm_up_transient"),
+        answer("flicker"),
+        answer("flicker", alternatives=["step"], sensors=[0]),
+        SILENT,
+        SILENT,
+        SILENT,
+        answer("step"),
+        None,
+    ]
+    verdict = judge.judge(truths, answers)
+
+    def count(line, of="all", nats=None):
+        row = verdict.row(line, of, nats)
+        return row.hits, row.trials
+
+    assert count("false alarm") == (1, 4)
+    assert count("diagnosis failed") == (1, 9)
+    assert count("detected", "step", 30.0) == (4, 5)
+    assert count("right name") == (1, 5)
+    assert count("right class") == (3, 5)
+    assert count("right class, of detected") == (3, 4)
+    assert count("wrong name with confidence") == (1, 5)
+    assert count("oracle detects") == (5, 5)
+    assert count("exact sensors") == (1, 1)
+    assert count("onset within 3 sd of the oracle") == (1, 1)
+    assert count("interval covers", "step.step") == (1, 1)
+    assert count("held-out score improves") == (4, 4)
+    assert verdict.to_dict()["figures"][0]["median"] == pytest.approx(0.8)  # 0.4 s of 0.5 s
+    gain = next(f for f in verdict.figures if f.line.startswith("gain"))
+    assert np.median(gain.values) == pytest.approx(0.5)
+    low, high = verdict.row("false alarm").interval
+    assert low == pytest.approx(beta.ppf(0.025, 1, 4))
+    assert high == pytest.approx(beta.ppf(0.975, 2, 3))
+    assert "false alarm" in str(verdict)
+    json.dumps(verdict.to_dict(), allow_nan=False)
+
+
+def test_judge_of_the_other_groups():
+    outside = truth("outside", [effect(mechanism="chirp", **{"class": ["chirp"]})], "outside:chirp")
+    vague = answer("not_identifiable") | {"unexplained": ["0.1 to 0.4 fs"]}
+    blind = truth("unidentifiable", [effect(mechanism="not_identifiable", **{"class": ["not_identifiable"]})], "alias")
+    two = truth("two", [effect(), effect(mechanism="flicker", **{"class": ["flicker"]})], "two:step+flicker")
+    verdict = judge.judge(
+        [outside, outside, blind, blind, two, two],
+        [vague, answer("drifting_tone"), SILENT, answer("scale_factor"), answer("step", "flicker"), answer("step")],
+    )
+    assert verdict.row("outside: misnamed")[3:] == (1, 2)
+    assert verdict.row("outside: unexplained, of detected")[3:] == (1, 2)
+    assert verdict.row("unidentifiable: abstained")[3:] == (1, 2)
+    assert verdict.row("two: both in class")[3:] == (1, 2)
+    assert verdict.row("two: at least one in class")[3:] == (2, 2)
+
+
+def test_scores_of_sensors_and_intervals():
+    true = effect()
+    assert scoring.right_sensors(true, {"sensors": [0]}) == (False, True)  # the other has 2 nats
+    assert scoring.right_sensors(true, {"sensors": [0, 1]}) == (False, False)
+    interval = {"low": 0.07, "high": 0.09, "unit": "deg/s"}
+    each = {"parameters": {"step[0]": interval, "step[1]": interval, "step[2]": interval, "step": interval}}
+    assert scoring.coverage(true, each) == [("step", True), ("step", False), ("step", False)]
+    assert scoring.unmatched(true, each) == ["step[1]"]
+    foreign = {"parameters": {"step": {"unit": "rad/s"}, "size": {"unit": "deg/s"}}}
+    assert scoring.unmatched(true, foreign) == ["step", "size"]
+    weak = effect(oracle_null=[-3.0, 6.0, 0.0])
+    assert not scoring.oracle_detects(weak | {"oracle_llr": 2.69}, 0.01)  # -3 + 2.326 sqrt 6 = 2.698
+    assert scoring.oracle_detects(weak | {"oracle_llr": 2.71}, 0.01)
+    assert scoring.oracle_detects(effect(nats=30.0, oracle_llr=5.0, oracle_law="bound"), 0.01)
+
+
+def test_concealed_is_what_wavelet_variances_do_not_show():
+    loud = make_case("vibration_tone", 3000.0, 1, n_samples=N).truth
+    faint = make_case("vibration_tone", 10.0, 1, n_samples=N).truth
+    assert ordinary_view.concealed(faint)
+    assert not ordinary_view.concealed(loud)
+
+
+def test_trial_from_plan_to_verdict(tmp_path):
+    plan = trial.plan_trial(1, 2, (30.0,), seed=1, groups=("null", "unidentifiable"))
+    assert len(plan) == 2 * len(cases.kinds("null")) + len(cases.kinds("unidentifiable"))
+    seen = []
+
+    def analyse(recording, simulation):
+        seen.append(set(recording) | set(simulation))
+        if len(seen) == 1:
+            raise RuntimeError("no opinion")
+        return SILENT
+
+    verdict = trial.run_trial(plan, analyse, tmp_path, n_samples=2048)
+    assert verdict.row("false alarm").hits == 0
+    assert verdict.row("diagnosis failed")[3:] == (1, len(plan))
+    assert all(
+        names <= {"gyro", "fs", "unit", "terms", "temperature", "acceleration", "reference_rate"} for names in seen
+    )
+    digests = json.loads((tmp_path / "digests.json").read_text())
+    assert seal.digest_of(json.loads((tmp_path / "truth.json").read_text())) == digests["truth"]
+    assert "no opinion" in (tmp_path / "failures.txt").read_text()

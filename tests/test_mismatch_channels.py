@@ -1,0 +1,158 @@
+"""Gains on fast auxiliary channels: against least squares in time, size, power, limits, and what is no such gain."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from scipy import stats
+
+import gyrofuse as gf
+from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.channels import channel_witness, products, regress
+from gyrofuse.mismatch.mechanisms.g_sensitivity import GSensitivity
+from gyrofuse.mismatch.mechanisms.quadratic_coupling import QuadraticCoupling
+from gyrofuse.mismatch.mechanisms.scale_factor import ScaleFactor
+
+N = 2**13
+NOISE = gf.WhiteNoise(1.0) + gf.AR1(0.99, 1e-3)
+LEVEL = 1e-4
+
+
+def generator(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def acceleration(g: torch.Generator, n_rows: int = 3) -> torch.Tensor:
+    shaking = (gf.AR1(0.9, 1e-3) + gf.WhiteNoise(1e-4)).simulate(N, batch=(n_rows,), generator=g)
+    shaking[-1] += 1.0
+    return shaking
+
+
+def case(g: torch.Generator, added: torch.Tensor | float = 0.0, **channels: torch.Tensor) -> Case:
+    x = NOISE.simulate(N, batch=(5, 4), generator=g)
+    return Case.of(Scene(100.0, "deg/s", ("1", "2", "3", "4"), channels), x[0] + added, x[1:])
+
+
+def of_size(rows: torch.Tensor, gains: torch.Tensor, nats: float) -> torch.Tensor:
+    """Gains scaled until half the whitened energy of what they add is `nats`."""
+    added = gains @ (rows - rows.mean(-1, keepdim=True))
+    f = torch.arange(1, N // 2) / N
+    energy = (torch.fft.rfft(added)[:, 1 : N // 2].abs().square() / N / NOISE.spectrum(f)).sum()
+    return gains * math.sqrt(nats / float(energy))
+
+
+def test_in_white_noise_it_is_least_squares():
+    g = generator(1)
+    x = torch.randn(2, 3, N, generator=g, dtype=torch.float64)
+    rows = torch.randn(2, N, generator=g, dtype=torch.float64)
+    fit = regress(Case.of(Scene(1.0, "x", ("1", "2", "3")), x[0], x[1:]), rows)
+    rows = rows - rows.mean(-1, keepdim=True)
+    least_squares = torch.linalg.lstsq(rows.mT, (x[0] - x[0].mean(-1, keepdim=True)).mT).solution.mT
+    # The lowest bands are left out, and weights are estimated.
+    assert ((fit.gains - least_squares).abs() < 0.3 / math.sqrt(N)).all()
+    sd = fit.covariance.flatten(2).flatten(0, 1).diagonal().sqrt()
+    assert ((sd * math.sqrt(N) - 1).abs() < 0.1).all()
+
+
+@pytest.mark.parametrize("common", [0.0, 0.8])
+def test_chance_is_not_a_gain(common):
+    g, n_runs = generator(2), 60
+    values, statistics = [], []
+    for _ in range(n_runs):
+        shared = NOISE.simulate(N, batch=(2, 1), generator=g)
+        x = math.sqrt(1 - common) * NOISE.simulate(N, batch=(2, 4), generator=g) + math.sqrt(common) * shared
+        rows = acceleration(g)
+        fit = regress(Case.of(Scene(1.0, "x", ("1", "2", "3", "4")), x[0], x[1:]), rows)
+        values.append(fit.p_value)
+        statistics.append(fit.statistic)
+    hits = sum(p < 0.05 for p in values)
+    assert stats.binom.sf(hits - 1, n_runs, 0.05) > 1e-3, f"{hits} of {n_runs}"
+    mean = sum(statistics) / n_runs  # chi-square with 12 degrees of freedom
+    assert abs(mean - 12) < 4 * math.sqrt(24 / n_runs) + 0.4
+
+
+def test_a_gain_of_thirty_nats_is_found_with_limits_that_hold():
+    g, found, held, stated = generator(3), 0, 0, 0
+    for _ in range(25):
+        shaking = acceleration(g)
+        gains = torch.randn(4, 3, generator=g, dtype=torch.float64)
+        gains[2:] = 0
+        gains = of_size(shaking, gains, 30.0)
+        finding = GSensitivity.nominate(case(g, gains @ shaking, acceleration=shaking), LEVEL)
+        if finding is None:
+            continue
+        found += 1
+        assert finding.channel == "acceleration"
+        for i in (0, 1):
+            entry = finding.parameters.get(f"gain[{i}]")
+            if entry is not None:
+                assert entry.unit == "deg/s/g"
+                stated += 1
+                held += entry.low <= float(gains[i].norm()) <= entry.high
+    assert found >= 22
+    assert stats.binom.cdf(held, stated, 0.95) > 1e-3, f"{held} of {stated}"
+
+
+def test_a_square_is_told_from_a_gain():
+    g = generator(4)
+    shaking = acceleration(g)
+    rows = products(shaking)
+    gains = torch.zeros(4, 6, dtype=torch.float64)
+    gains[1, 0] = 1.0
+    both = case(g, of_size(rows, gains, 60.0) @ rows, acceleration=shaking)
+    finding = QuadraticCoupling.nominate(both, LEVEL)
+    assert finding.sensors == (1,)
+    assert finding.parameters["gain[1]"].unit == "deg/s/g^2"
+    assert GSensitivity.nominate(both, LEVEL) is None
+    assert channel_witness(both).p_value < LEVEL
+
+
+def test_a_scale_factor_follows_the_reference():
+    g = generator(5)
+    rate = 30 * torch.sin(2 * math.pi * 0.002 * torch.arange(N, dtype=torch.float64))[None].cumsum(-1) / 50
+    rate = rate + 5 * acceleration(g, 1)
+    gains = of_size(rate, torch.tensor([[1.0], [0.0], [-1.0], [0.0]], dtype=torch.float64), 60.0)
+    finding = ScaleFactor.nominate(case(g, gains @ rate, reference_rate=rate[0]), LEVEL)
+    assert finding.sensors == (0, 2)
+    assert "ppm" in finding.sentence
+
+
+def test_a_delay_is_no_gain():
+    g = generator(6)
+    shaking = acceleration(g)
+    late = torch.fft.irfft(torch.fft.rfft(shaking - shaking.mean(-1, keepdim=True)) * 1j, n=N)
+    gains = of_size(late, torch.ones(4, 3, dtype=torch.float64), 200.0)
+    assert GSensitivity.nominate(case(g, gains @ late, acceleration=shaking), LEVEL) is None
+
+
+def test_a_single_line_leaves_alternatives():
+    g = generator(7)
+    shaking = 1e-6 * acceleration(g)
+    shaking[0] += 0.3 * torch.sin(2 * math.pi * 0.123 * torch.arange(N))
+    gains = of_size(shaking, torch.tensor([[1.0, 0, 0]] * 4, dtype=torch.float64), 60.0)
+    finding = GSensitivity.nominate(case(g, gains @ shaking, acceleration=shaking), LEVEL)
+    assert "vibration_tone" in finding.alternatives
+
+
+def test_what_was_found_is_taken_off_and_confirmed_on_other_blocks():
+    g = generator(8)
+    shaking = acceleration(g)
+    gains = of_size(shaking, torch.randn(4, 3, generator=g, dtype=torch.float64), 100.0)
+    both = case(g, gains @ shaking, acceleration=shaking)
+    effect = GSensitivity.nominate(both, LEVEL).effect
+    assert channel_witness(effect.explained(both, g)).p_value > 0.01
+    other = effect.refitted(both, torch.arange(N) % (N // 16) < N // 32)
+    assert float(other.gains(both).sum()) > 10
+    assert torch.equal(effect.removed(effect.simulated(both.recording, both.scene, g), both.scene), both.recording) or (
+        (effect.removed(effect.simulated(both.recording, both.scene, g), both.scene) - both.recording).abs().max()
+        < 1e-12
+    )
+
+
+def test_a_simulation_needs_the_channel_for_its_whole_length():
+    g = generator(9)
+    both = case(g, 0.0, acceleration=acceleration(g))
+    with pytest.raises(ValueError, match="expected 8193 samples of 'acceleration'"):
+        GSensitivity("acceleration", torch.ones(4, 3).double()).simulated(torch.zeros(4, N + 1).double(), both.scene, g)

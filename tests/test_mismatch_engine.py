@@ -1,0 +1,156 @@
+"""Diagnosis from end to end: verdicts, names, repairs, and what is said of input that does not fit."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+import torch
+from scipy import stats
+
+import gyrofuse as gf
+from gyrofuse.mismatch import diagnose
+from gyrofuse.mismatch.twins import calibrated, twin, twin_p_values
+
+MODEL = gf.WhiteNoise(1.0) + gf.AR1(0.999, 1e-4) + gf.RandomWalk(1e-8)
+N, RATE = 2**14, 100.0
+
+
+def generator(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def array(seed: int, n_samples: int = N) -> gf.Recording:
+    return gf.Recording(MODEL.simulate(n_samples, batch=(6,), generator=generator(seed)), rate=RATE, unit="deg/s")
+
+
+def with_tone(recording: gf.Recording, amplitude: float) -> gf.Recording:
+    gains = torch.tensor([1.0, 0.5, 0.0, 0.0, 0.8, 0.0], dtype=torch.float64)[:, None]
+    wave = torch.sin(2 * math.pi * 12.34 * recording.time + 1)
+    return gf.Recording(recording.signal + amplitude * gains * wave, rate=RATE, unit="deg/s")
+
+
+def test_a_concealed_tone_is_found_named_and_repaired():
+    report = diagnose(with_tone(array(1), 0.12), array(2, 4 * N))
+    assert report.mismatch
+    (finding,) = report.findings
+    assert finding.mechanism == "vibration_tone"
+    assert finding.sensors == (0, 1, 4)
+    frequency = finding.parameters["frequency"]
+    assert frequency.low < 12.34 < frequency.high
+    assert frequency.unit == "Hz"
+    for i, truth in ((0, 0.12), (1, 0.06), (4, 0.096)):
+        entry = finding.parameters[f"amplitude[{i}]"]
+        assert abs(entry.value - truth) < 2 * (entry.high - entry.low)
+    assert not report.unexplained
+    assert report.held_out.gain > 10
+    assert finding.held_out_gain == pytest.approx(report.held_out.gain)
+
+
+def test_what_was_found_is_taken_off_and_simulated_again():
+    recording = with_tone(array(1), 0.12)
+    report = diagnose(recording, array(2, 4 * N))
+    left = diagnose(gf.Recording(report.correct(recording.signal), rate=RATE, unit="deg/s"), array(3, 4 * N))
+    assert not left.mismatch
+    again = report.model.simulate(4 * N, generator=generator(4))
+    assert not diagnose(recording, gf.Recording(again, rate=RATE, unit="deg/s"), false_alarm=1e-3).mismatch
+
+
+def test_agreement_is_said():
+    report = diagnose(array(5), array(6, 4 * N))
+    assert not report.mismatch
+    assert report.findings == ()
+    assert "agree" in report.summary()
+    assert report.held_out.gain == 0
+    assert report.held_out.before == report.held_out.after
+
+
+def test_verdicts_are_repeatable_and_leave_the_global_generator_alone():
+    state = torch.get_rng_state()
+    first, second = (diagnose(with_tone(array(1), 0.12), MODEL) for _ in range(2))
+    assert first.to_dict() == second.to_dict()
+    assert torch.equal(state, torch.get_rng_state())
+
+
+def test_results_are_plain_for_json():
+    report = diagnose(with_tone(array(1), 0.12), array(2))
+    content = json.loads(json.dumps(report.to_dict(), allow_nan=False))
+    assert {"mismatch", "p_value", "findings", "unexplained", "held_out", "model", "evidence"} <= content.keys()
+    assert {
+        "mechanism", "alternatives", "sensors", "levels", "frequency_hz", "time_s", "channel", "parameters", "p_value",
+        "held_out_gain", "sentence",
+    } == content["findings"][0].keys()  # fmt: skip
+    assert {"before", "after", "gain"} == content["held_out"].keys()
+    assert "vibration_tone" in str(report)
+
+
+def test_models_and_samples_of_any_length_serve_as_simulations():
+    recording = with_tone(array(1), 0.12)
+    batched = MODEL.with_params(MODEL.params.expand(6, -1))
+    for simulation in (MODEL, batched, gf.ArrayModel.from_sensors([MODEL] * 6), array(2, N // 2), array(2, 3 * N // 2)):
+        report = diagnose(recording, simulation)
+        assert [f.mechanism for f in report.findings] == ["vibration_tone"]
+
+
+def test_other_units_are_a_finding():
+    recording = array(1)
+    report = diagnose(gf.Recording(recording.signal * math.pi / 180, rate=RATE), array(2, 4 * N).signal)
+    assert report.mismatch
+    assert report.findings[0].mechanism == "parameter_shift"
+    assert "rad/s against deg/s" in report.findings[0].sentence
+    assert len(report.findings) == 1
+    assert not report.unexplained
+
+
+def test_known_units_are_converted():
+    assert not diagnose(array(5).to("rad/s"), array(6, 4 * N)).mismatch
+
+
+def test_twins_agree_and_their_rank_is_a_p_value():
+    case = diagnose(array(5), array(6)).case
+    mate = twin(case, generator(1))
+    assert mate.recording.shape == case.recording.shape
+    assert mate.simulated.signal.shape == case.simulated.signal.shape
+    values = twin_p_values(case, 60, generator(2))
+    hits = int((values < 0.05).sum())
+    assert stats.binom.sf(hits - 1, 60, 0.05) > 1e-3
+    assert calibrated(1.0, values) == 1.0
+    assert calibrated(1e-9, values) < 1e-4
+
+
+def test_the_fitted_tail_is_that_of_honest_witnesses():
+    uniform = torch.rand(400, generator=generator(3), dtype=torch.float64)
+    for p in (0.5, 0.1, 0.01, 1e-4):
+        assert 0.5 < calibrated(p, uniform) / p < 2
+
+
+@pytest.mark.parametrize(
+    ("recording", "simulation", "options", "message"),
+    [
+        (torch.zeros(2, 5000).double(), MODEL, {}, "got constant ones: 1, 2; leave them out"),
+        (array(1).signal[0], MODEL, {}, r"`recording`: expected \(..., sensor, time\)"),
+        (array(1, 4000), MODEL, {}, "expected at least 4096 samples for a diagnosis, got 4000"),
+        (array(1), array(2).select(sensors=[0, 1]), {}, "expected 6 sensors as in the recording, got 2"),
+        (array(1), gf.Recording(array(2).signal, rate=50.0), {}, "expected samples at 100 Hz.*got 50 Hz"),
+        (array(1), "model.json", {}, "expected a recording, a tensor.*got str"),
+        (array(1), MODEL, {"rate": 100.0}, "the recording has one"),
+        (array(1), MODEL, {"false_alarm": 1.5}, "`false_alarm`: expected a number between 0 and 1"),
+        (array(1), MODEL, {"twins": 3}, "`twins`: expected 0, or 50 or more, got 3"),
+        (array(1).signal[None].expand(3, -1, -1), MODEL, {}, "one axis at a time"),
+        (array(1), MODEL.with_params(MODEL.params.expand(5, -1)), {}, r"parameters \(6,\) for each, got.*\(5,\)"),
+        (array(1), gf.WhiteNoise() + gf.AR1(), {}, "expected a number, got a parameter to be estimated"),
+    ],
+)
+def test_what_does_not_fit_is_told(recording, simulation, options, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        diagnose(recording, simulation, **options)
+
+
+def test_missing_samples_are_told():
+    signal = array(1).signal.clone()
+    signal[2, 100] = math.nan
+    with pytest.raises(
+        ValueError, match="expected whole sensors, got missing samples in 3; give a stretch without gaps"
+    ):
+        diagnose(gf.Recording(signal, rate=RATE), MODEL)

@@ -1,0 +1,413 @@
+"""Rounding, clipping, repeats, outliers, noise levels, telegraph noise: kernels against naive twins, what is found."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy import fft, stats
+from torch import Tensor
+
+from gyrofuse import AR1, RandomWalk, WhiteNoise
+from gyrofuse.haar import haar_coefficients
+from gyrofuse.mismatch import episodes, impulses, marginals, outliers, switching
+from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.halves import estimation_samples
+from gyrofuse.mismatch.mechanism import Finding, Mechanism
+from gyrofuse.mismatch.mechanisms.clipping import Clipping
+from gyrofuse.mismatch.mechanisms.quantization import Quantization
+from gyrofuse.mismatch.mechanisms.random_telegraph import RandomTelegraph, _path
+from gyrofuse.mismatch.mechanisms.spikes import Spikes
+from gyrofuse.mismatch.mechanisms.stuck_samples import StuckSamples
+from gyrofuse.mismatch.mechanisms.variance_change import VarianceChange
+from gyrofuse.mismatch.side import Side
+from gyrofuse.mismatch.spectra import bands
+
+N, RATE, LEVEL = 16384, 100.0, 5e-4
+SCENE = Scene(RATE, "deg/s", ("x", "y", "z"))
+NOISE = WhiteNoise(1.0) + AR1(0.98, 0.004) + RandomWalk(1e-5)
+WITNESSES = (
+    marginals.marginal_witness,
+    impulses.spike_witness,
+    impulses.variance_witness,
+    impulses.jump_witness,
+)
+MECHANISMS: tuple[type[Mechanism], ...] = (
+    Quantization,
+    Clipping,
+    StuckSamples,
+    Spikes,
+    VarianceChange,
+    RandomTelegraph,
+)
+
+
+def drawn(seed: int, records: int = 4) -> tuple[Tensor, Tensor, torch.Generator]:
+    g = torch.Generator().manual_seed(seed)
+    recording = NOISE.simulate(N, batch=(3,), generator=g)
+    return recording, NOISE.simulate(N, batch=(records, 3), generator=g), g
+
+
+def even(*shape: int, g: torch.Generator) -> Tensor:
+    return torch.rand(shape, generator=g, dtype=torch.float64)
+
+
+def normal(*shape: int, g: torch.Generator) -> Tensor:
+    return torch.randn(shape, generator=g, dtype=torch.float64)
+
+
+def nominated(case: Case, mechanism: type[Mechanism]) -> Finding:
+    found = mechanism.nominate(case, LEVEL)
+    assert found is not None
+    return found
+
+
+def settled(case: Case, found: Finding, g: torch.Generator) -> Case:
+    """The case after the repair, in which the same is not found again; the repair gains on data held out."""
+    gains = found.effect.refitted(case, estimation_samples(N)).gains(case)
+    assert gains.shape == (16,)
+    assert float(gains.sum()) > 1.7 * float(gains.std()) * 4
+    after = found.effect.explained(case, g)
+    assert type(found.effect).nominate(after, LEVEL) is None
+    return after
+
+
+def covers(found: Finding, name: str, truth: float) -> bool:
+    parameter = found.parameters[name]
+    return parameter.low - 1e-9 <= truth <= parameter.high + 1e-9
+
+
+# Nothing is missing.
+
+
+def test_witnesses_and_nominations_are_silent_where_nothing_is_missing() -> None:
+    false = np.zeros(len(WITNESSES))
+    for seed in range(20):
+        recording, simulation, _ = drawn(seed, records=1)
+        case = Case.of(SCENE, recording, simulation)
+        false += [witness(case).p_value < 0.05 for witness in WITNESSES]
+        if seed < 6:
+            assert [m.name for m in MECHANISMS if m.nominate(case, LEVEL) is not None] == []
+    assert stats.binom.sf(5, 20, 0.05) < 5e-4
+    assert (false <= 5).all(), false
+
+
+def test_lines_and_a_resonance_make_neither_spikes_nor_levels() -> None:
+    t = torch.arange(N, dtype=torch.float64)
+    false = np.zeros(2)
+    for seed in range(6):
+        recording, simulation, g = drawn(100 + seed, records=1)
+        poles = torch.tensor([1.0, -2 * 0.98 * math.cos(1.2), 0.98**2], dtype=torch.float64)
+        impulse = torch.zeros(1024, dtype=torch.float64)
+        impulse[0] = 1.0
+        for k in range(1, 1024):
+            impulse[k] = -poles[1] * impulse[k - 1] - (poles[2] * impulse[k - 2] if k > 1 else 0.0)
+        driven = torch.fft.irfft(torch.fft.rfft(normal(3, N, g=g)) * torch.fft.rfft(impulse, n=N), n=N)
+        recording = recording + 3 * torch.cos(1.931 * t + seed) + 0.8 * torch.cos(0.731 * t) + 0.1 * driven
+        case = Case.of(SCENE, recording, simulation)
+        false += [impulses.spike_witness(case).p_value < 0.01, impulses.variance_witness(case).p_value < 0.01]
+    assert stats.binom.sf(1, 6, 0.01) < 5e-3
+    assert (false <= 1).all(), false
+
+
+# Single values.
+
+
+@pytest.mark.parametrize(("step", "offset"), [(1.0, 0.3), (0.2, 0.0), (4.0, 1.0)])
+def test_rounding_is_read_off_the_values(step: float, offset: float) -> None:
+    recording, simulation, g = drawn(1)
+    recording[:2] = ((recording[:2] - offset) / step).round() * step + offset
+    case = Case.of(SCENE, recording, simulation)
+    found = nominated(case, Quantization)
+    assert found.sensors == (0, 1)
+    assert found.alternatives == ()
+    assert found.parameters["lsb[0]"].value == pytest.approx(step, rel=1e-9)
+    after = settled(case, found, g)
+    assert marginals.marginal_witness(after).p_value > 0.001
+    repaired = found.effect.simulated(simulation, SCENE, g)
+    assert float(marginals.off_lattice(repaired[:, :2], step, offset).abs().max()) < 1e-9
+    assert torch.equal(repaired[:, 2], simulation[:, 2])
+
+
+def test_rounding_that_a_simulation_has_too_is_not_missing() -> None:
+    recording, simulation, _ = drawn(2)
+    case = Case.of(SCENE, (2 * recording).round() / 2, (2 * simulation).round() / 2)
+    assert Quantization.nominate(case, LEVEL) is None
+    assert StuckSamples.nominate(case, LEVEL) is None
+    assert marginals.marginal_witness(case).p_value > 0.01
+
+
+def test_a_lattice_hidden_under_later_noise_is_found() -> None:
+    inside = 0
+    for seed in range(6):
+        recording, simulation, g = drawn(10 + seed)
+        recording = 1.5 * (recording / 1.5).round() + 0.45 * normal(3, N, g=g)
+        case = Case.of(SCENE, recording, simulation)
+        found = nominated(case, Quantization)
+        assert found.sensors == (0, 1, 2)
+        inside += sum(covers(found, f"lsb[{i}]", 1.5) for i in range(3))
+    # Fewer than 13 of 18 at 95 % have probability 2e-4.
+    assert inside >= 13
+
+
+def test_the_characteristic_function_is_that_of_the_definition() -> None:
+    g = torch.Generator().manual_seed(3)
+    values = normal(500, g=g)
+    u = torch.tensor([0.5, 3.0, 7.0], dtype=torch.float64)
+    naive = [500 * abs(np.mean(np.exp(1j * v * values.numpy()))) ** 2 for v in u.tolist()]
+    np.testing.assert_allclose(marginals._power(values, u).numpy(), naive, rtol=1e-10)
+
+
+def test_values_cut_at_a_limit_are_clipped() -> None:
+    recording, simulation, g = drawn(4)
+    recording[0].clamp_(max=3.0)
+    recording[2].clamp_(-2.5, 2.0)
+    case = Case.of(SCENE, recording, simulation)
+    found = nominated(case, Clipping)
+    assert found.sensors == (0, 2)
+    assert {name: p.value for name, p in found.parameters.items()} == {"high[0]": 3.0, "high[2]": 2.0, "low[2]": -2.5}
+    settled(case, found, g)
+
+
+def test_clipping_shows_on_a_lattice_as_well() -> None:
+    recording, simulation, _ = drawn(5)
+    recording, simulation = recording.clamp(max=2.0).round(), simulation.round()
+    case = Case.of(SCENE, recording, simulation)
+    assert nominated(case, Clipping).parameters["high[0]"].value == 2.0
+    plain = Case.of(SCENE, drawn(5)[0].round(), simulation)
+    assert Clipping.nominate(plain, LEVEL) is None
+
+
+@pytest.mark.parametrize("rounded", [False, True])
+@pytest.mark.parametrize("together", [False, True])
+def test_repeats_beyond_those_of_the_lattice_are_stuck_samples(rounded: bool, together: bool) -> None:
+    recording, simulation, g = drawn(6)
+    if rounded:
+        recording, simulation = (2 * recording).round() / 2, (2 * simulation).round() / 2
+    p = torch.tensor([0.05, 0.0, 0.05], dtype=torch.float64)
+    stuck = StuckSamples(p, torch.zeros(3, dtype=torch.float64), together)
+    case = Case.of(SCENE, stuck.simulated(recording, SCENE, g), simulation)
+    found = nominated(case, StuckSamples)
+    assert found.sensors == (0, 2)
+    assert covers(found, "probability[0]", 0.05)
+    assert isinstance(found.effect, StuckSamples)
+    assert found.effect.together is together
+    settled(case, found, g)
+
+
+# Outliers.
+
+
+def test_whitening_is_division_by_the_smooth_spectrum_in_the_cosines() -> None:
+    g = torch.Generator().manual_seed(7)
+    x = normal(2, 600, g=g)
+    side = Side(x[None], bands(4096))
+    y = fft.dct(x.numpy(), norm="ortho")[:, 1:]
+    spectrum = impulses._smooth_spectrum(torch.from_numpy(y)).numpy()
+    k, t = np.arange(1, 600)[:, None], np.arange(600)
+    basis = math.sqrt(2 / 600) * np.cos(math.pi * k * (t + 0.5) / 600)
+    white = (y / np.sqrt(spectrum)) @ basis
+    white /= np.median(np.abs(white), axis=-1, keepdims=True) / stats.norm.ppf(0.75)
+    np.testing.assert_allclose(impulses.left_out(side).white[0].numpy(), white, rtol=2e-3, atol=1e-6)
+    np.testing.assert_allclose(spectrum[:, :32].mean(-1), np.exp(np.log(y[:, :32] ** 2).mean(-1) + 1.27), rtol=0.3)
+
+
+def test_isolated_outliers_are_spikes() -> None:
+    recording, simulation, g = drawn(8)
+    hit = even(3, N, g=g) < 2e-3
+    hit[1] = False
+    recording = recording + hit * 7.0 * (even(3, N, g=g) - 0.5).sign()
+    case = Case.of(SCENE, recording, simulation)
+    found = nominated(case, Spikes)
+    assert found.sensors == (0, 2)
+    assert found.alternatives == ()
+    assert "not at the same time" in found.sentence
+    assert covers(found, "amplitude[0]", 7.0)
+    assert covers(found, "rate[0]", 2e-3 * RATE * 3600)
+    after = settled(case, found, g)
+    assert impulses.spike_witness(after).p_value > 0.001
+    assert float(found.effect.removed(recording, SCENE).abs().max()) < 6.0
+
+
+def test_outliers_in_all_sensors_at_once_are_a_shock() -> None:
+    recording, simulation, g = drawn(9)
+    hit = even(1, N, g=g) < 2e-3
+    case = Case.of(SCENE, recording + hit * 5.0 * (even(3, N, g=g) - 0.5).sign(), simulation)
+    found = nominated(case, Spikes)
+    assert found.sensors == (0, 1, 2)
+    assert isinstance(found.effect, Spikes)
+    assert found.effect.together
+    simulated = found.effect.simulated(torch.zeros(3, N, dtype=torch.float64), SCENE, g)
+    assert torch.equal(simulated[0] != 0, simulated[1] != 0)
+
+
+def test_limits_of_rate_and_amplitude_hold() -> None:
+    inside = np.zeros(2)
+    for seed in range(20):
+        g = torch.Generator().manual_seed(seed)
+        z = normal(N, g=g) + (even(N, g=g) < 3e-3) * 5.0 * (even(N, g=g) - 0.5).sign()
+        law = outliers.fitted(z)
+        inside += [
+            abs(law.amplitude / 5 - 1) < 2 * law.amplitude_sd / law.amplitude,
+            abs(math.log(law.rate / 3e-3)) < 2 * law.rate_sd / law.rate,
+        ]
+    # Fewer than 15 of 20 at 95 % have probability 3e-4.
+    assert (inside >= 15).all(), inside
+
+
+def test_the_law_of_outliers_is_normalised() -> None:
+    z = torch.linspace(-60, 60, 240001, dtype=torch.float64)
+    density = outliers.mixture(z, outliers.Outliers(0.2, 5.0, 2.0)).exp()
+    assert float(torch.trapezoid(density, z)) == pytest.approx(1, abs=1e-9)
+
+
+# Levels of noise.
+
+
+def test_a_louder_episode_is_a_change_of_variance() -> None:
+    onset = 0
+    for seed in range(6):
+        recording, simulation, g = drawn(20 + seed, records=2)
+        start, stop = 5000 + 211 * seed, 8500 + 211 * seed
+        recording[:2, start:stop] += normal(2, stop - start, g=g)
+        case = Case.of(SCENE, recording, simulation)
+        found = nominated(case, VarianceChange)
+        assert found.sensors == (0, 1)
+        onset += covers(found, "start", start / RATE) + covers(found, "stop", stop / RATE)
+        assert found.time_s == pytest.approx(start / RATE, abs=1.0)
+        assert Spikes.nominate(case, LEVEL) is None
+        if seed < 1:
+            settled(case, found, g)
+    # Fewer than 8 of 12 at 95 % have probability 2e-4.
+    assert onset >= 8
+
+
+def test_bursts_are_no_spikes() -> None:
+    recording, simulation, g = drawn(30)
+    for k in range(8):
+        at = 2048 * k + int(even(1, g=g) * 1800)
+        recording[1, at : at + 160] += 2 * normal(160, g=g)
+    case = Case.of(SCENE, recording, simulation)
+    assert Spikes.nominate(case, LEVEL) is None
+    found = nominated(case, VarianceChange)
+    assert found.sensors == (1,)
+    assert isinstance(found.effect, VarianceChange)
+    assert len(found.effect.episodes) == 8
+    settled(case, found, g)
+
+
+def test_the_likeliest_stretches_are_those_of_all_that_are_possible() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        sums = rng.normal(size=9).tolist()
+
+        def worth(states: tuple[int, ...], values: list[float] = sums) -> float:
+            changes = sum(a != b for a, b in itertools.pairwise((0, *states)))
+            return sum(v for v, s in zip(values, states, strict=True) if s) - 0.7 * changes
+
+        best = max(itertools.product((0, 1), repeat=9), key=worth)
+        states = np.zeros(9, dtype=int)
+        for a, b in episodes._several(sums, 0.7):
+            states[a:b] = 1
+        assert worth(tuple(states.tolist())) == pytest.approx(worth(best))
+        one = max((sum(sums[a:b]), (a, b)) for a in range(9) for b in range(a + 1, 10))[1]
+        assert episodes._single(sums) == [one]
+
+
+def test_kuipers_law() -> None:
+    # Stephens' points of the range of a Brownian bridge.
+    assert impulses._kuiper_p(1.747) == pytest.approx(0.05, abs=5e-4)
+    assert impulses._kuiper_p(2.001) == pytest.approx(0.01, abs=2e-4)
+
+
+# Telegraph noise.
+
+
+def test_kurtosis_is_that_of_the_wavelet_coefficients() -> None:
+    g = torch.Generator().manual_seed(11)
+    x = NOISE.simulate(4096, batch=(2,), generator=g)
+    scores = impulses._kurtosis_scores(Side(x[None], bands(4096)))
+    for level, w in enumerate(haar_coefficients(x, 6), start=1):
+        w = w[..., :: max(2 ** (level - 2), 1) if level > 2 else 1]
+        naive = stats.kurtosis(w.numpy(), axis=-1, fisher=False)
+        mine = impulses._normal_kurtosis(torch.from_numpy(naive), impulses._independent(w - w.mean(-1, keepdim=True)))
+        np.testing.assert_allclose(scores[level - 1].numpy(), mine.numpy(), atol=0.05)
+    sample = np.random.default_rng(0).normal(size=200)
+    b2 = torch.tensor(stats.kurtosis(sample, fisher=False))
+    score = impulses._normal_kurtosis(b2, torch.tensor(200.0, dtype=torch.float64))
+    assert float(score) == pytest.approx(float(stats.kurtosistest(sample).statistic), rel=1e-9)
+
+
+def _stretch(y: np.ndarray, r: float, q: float) -> switching.Stretches:
+    return switching.Stretches(y[None, None], np.array([r]), np.array([q]), 1)
+
+
+def test_the_gaussian_likelihood_is_that_of_the_normal_law() -> None:
+    rng = np.random.default_rng(1)
+    n, r, q, sd, tau = 12, 0.5, 0.02, 0.8, 3.0
+    y = rng.normal(size=n)
+    k = np.arange(n)
+    far = switching._LARGEST * (r + sd**2)
+    level = far + q * (np.minimum(k[:, None], k) + 1)
+    covariance = level + sd**2 * np.exp(-abs(k[:, None] - k) / tau) + r * np.eye(n)
+
+    def log_density(m: int) -> float:
+        law = stats.multivariate_normal(np.full(m, y.mean()), covariance[:m, :m])
+        return float(law.logpdf(y[:m])) + m / 2 * math.log(2 * math.pi)
+
+    mine = switching.gaussian_scores(_stretch(y, r, q), np.array([[sd]]), np.array([[tau]]))
+    assert mine[0, 0, 0] == pytest.approx(log_density(n) - log_density(n // 2), abs=1e-6)
+
+
+def test_the_likelihood_of_two_levels_sums_over_all_paths() -> None:
+    rng = np.random.default_rng(2)
+    n, r, q, half, up, down = 12, 0.3, 0.01, 1.0, 4.0, 6.0
+    y = rng.normal(size=n) * math.sqrt(r) + half * np.repeat([1, -1, 1], 4)
+    k = np.arange(n)
+    covariance = switching._LARGEST * (r + half**2) + q * (np.minimum(k[:, None], k) + 1) + r * np.eye(n)
+    leave, enter = 1 - math.exp(-1 / up), 1 - math.exp(-1 / down)
+    move = {(1, 1): 1 - leave, (1, -1): leave, (-1, 1): enter, (-1, -1): 1 - enter}
+
+    def log_density(m: int) -> float:
+        paths = np.array(list(itertools.product((1, -1), repeat=m)))
+        prior = np.where(paths[:, 0] == 1, enter, leave) / (leave + enter)
+        for a, b in itertools.pairwise(range(m)):
+            prior = prior * np.array([move[i, j] for i, j in paths[:, [a, b]].tolist()])
+        law = stats.multivariate_normal(np.full(m, y.mean()), covariance[:m, :m])
+        return float(np.log((prior * np.exp(law.logpdf(y[:m] - half * paths))).sum())) + m / 2 * math.log(2 * math.pi)
+
+    mine = switching.switching_scores(_stretch(y, r, q), *(np.array([[v]]) for v in (half, up, down)))
+    # Four pairs merged to two after each block: an approximation.
+    assert mine[0, 0, 0] == pytest.approx(log_density(n) - log_density(n // 2), abs=0.1)
+
+
+def test_two_levels_are_telegraph_noise_and_an_ar1_is_not() -> None:
+    recording, simulation, g = drawn(40)
+    recording[1] += 0.8 * _path(N, 120.0, 180.0, g)
+    case = Case.of(SCENE, recording, simulation)
+    found = nominated(case, RandomTelegraph)
+    assert found.sensors == (1,)
+    assert found.parameters["half_step[1]"].value == pytest.approx(0.8, rel=0.15)
+    assert found.parameters["dwell_up[1]"].value == pytest.approx(1.2, rel=0.5)
+    assert found.parameters["dwell_down[1]"].value == pytest.approx(1.8, rel=0.5)
+    settled(case, found, g)
+    assert impulses.jump_witness(case).p_value < 1e-4
+    other, simulation, g = drawn(41)
+    other[1] += AR1(0.985, 0.64 * (1 - 0.985**2)).simulate(N, generator=g)
+    assert RandomTelegraph.nominate(Case.of(SCENE, other, simulation), LEVEL) is None
+
+
+def test_a_step_is_no_telegraph() -> None:
+    recording, simulation, _ = drawn(42)
+    recording[1, 6000:] += 8.0
+    assert RandomTelegraph.nominate(Case.of(SCENE, recording, simulation), LEVEL) is None
+
+
+def test_paths_dwell_as_they_should() -> None:
+    path = _path(400_000, 50.0, 150.0, torch.Generator().manual_seed(5))
+    assert set(path.unique().tolist()) == {-1.0, 1.0}
+    assert float((path > 0).double().mean()) == pytest.approx(0.25, abs=0.03)
+    assert int((path.diff() != 0).sum()) == pytest.approx(4000, rel=0.06)

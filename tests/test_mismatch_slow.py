@@ -1,0 +1,248 @@
+"""Steps, warm-ups and temperature drifts: covariances and scans against direct sums and theory, and what is found."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+import gyrofuse as gf
+from gyrofuse.mismatch.base import Base, _time_constants
+from gyrofuse.mismatch.case import Case, Scene, block_means
+from gyrofuse.mismatch.confirm import held_out_gain
+from gyrofuse.mismatch.halves import estimation_samples
+from gyrofuse.mismatch.mechanisms.step import Step
+from gyrofuse.mismatch.mechanisms.temperature_drift import TemperatureDrift
+from gyrofuse.mismatch.mechanisms.warm_up_transient import WarmUpTransient
+from gyrofuse.mismatch.slow import best_fit, bridged, cell_differences, differences, slow_noise
+from gyrofuse.mismatch.slow_effect import quantiles
+from gyrofuse.mismatch.slow_scans import (
+    curve_length,
+    expected_exceedances,
+    jumps_to_and_fro,
+    lagged,
+    slow_witness,
+    steps,
+    warm_ups,
+)
+
+N, RATE, SENSORS = 16384, 100.0, 4
+LEVEL = 5e-4
+T = torch.arange(N, dtype=torch.float64)
+TEMPERATURE = 25 + 3 * (1 - (-T / 4000).exp()) + (2 * math.pi * T / 6000 + 1).cos()
+ALL = (Step, WarmUpTransient, TemperatureDrift)
+
+
+def generator(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+@functools.cache
+def noise(seed: int, n_records: int) -> torch.Tensor:
+    model = gf.WhiteNoise(1.0) + gf.AR1(0.99, 1e-3) + gf.RandomWalk(1e-7)
+    return model.simulate(N, batch=(n_records, SENSORS), generator=generator(seed)).double()
+
+
+def case(effect: torch.Tensor | float = 0.0, seed: int = 1) -> Case:
+    scene = Scene(RATE, "deg/s", ("a", "b", "c", "d"), {"temperature[imu2]": TEMPERATURE})
+    return Case.of(scene, noise(seed, 1)[0] + effect, noise(100 + seed, 3))
+
+
+def test_covariance_of_cells_is_that_of_the_samples():
+    n, cell, n_cells = 512, 8, 5
+    constants = np.array(_time_constants(n))
+    coefficients = torch.rand(2, len(constants) + 3, generator=generator(2), dtype=torch.float64)
+    found = cell_differences(Base(n, coefficients), cell, n_cells).numpy()
+    t = np.arange(cell * n_cells)
+    apart = np.abs(t[:, None] - t)
+    phi = np.exp(-1 / constants)[:, None, None]
+    angle = np.diff(np.eye(len(t) + 1), axis=0)
+    atoms = [np.eye(len(t)), angle @ angle.T, *(phi**apart / (1 - phi**2)), np.minimum(t[:, None], t)]
+    means = np.kron(np.eye(n_cells), np.ones(cell) / cell)
+    to_differences = np.diff(means, axis=0)
+    for row, own in zip(coefficients.numpy(), found, strict=True):
+        direct = sum(c * to_differences @ atom @ to_differences.T for c, atom in zip(row, atoms, strict=True))
+        np.testing.assert_allclose(own, direct, rtol=1e-8, atol=1e-9 * np.abs(direct).max())
+
+
+def test_differences_are_taken_over_gaps():
+    kept = torch.tensor([0, 1, 1, 0, 0, 1, 0, 1]).bool()
+    means = torch.randn(8, generator=generator(3), dtype=torch.float64)
+    assert torch.allclose(bridged(kept) @ means.diff(), means[kept].diff())
+
+
+def test_the_fit_is_a_maximum():
+    now = case()
+    noise, y = slow_noise(now), differences(now.recording)
+    fit = best_fit(noise, y)
+
+    def value(theta: torch.Tensor) -> float:
+        v = noise.covariance(theta)
+        quadratic = (y * torch.linalg.solve(v, y)).sum()
+        own = (((theta - noise.centre) / noise.spread).square()[:, :2]).sum()
+        beside = (((theta - noise.centre) / noise.spread).square()[0, 2:]).sum()
+        return -float(quadratic + torch.logdet(v).sum() + own + beside) / 2
+
+    assert value(fit.log_factors) == pytest.approx(float(fit.value.sum()), rel=1e-9)
+    for part in range(4):
+        for change in (-0.2, 0.2):
+            other = fit.log_factors.clone()
+            other[:, part] += change
+            assert value(other) < value(fit.log_factors) + 0.05, "to a twentieth of a nat"
+
+
+def test_templates_are_those_of_the_paths():
+    now = case()
+    tau = 700.0
+    path = (-T / tau).exp()
+    assert torch.allclose(
+        warm_ups(now, torch.tensor([tau], dtype=torch.float64)).templates[0], differences(path), atol=1e-12
+    )
+    family = steps(now)
+    for place in (0, 101, 500):
+        path = (family.places[place] <= T).double()
+        assert torch.allclose(family.templates[place], differences(path))
+
+
+def test_a_lag_is_a_low_pass_of_first_order():
+    scene = Scene(RATE, "deg/s", ("a",), {"temperature": TEMPERATURE})
+    lag, y = 50.0, [float(TEMPERATURE[0])]
+    for x in TEMPERATURE[1:300].tolist():
+        y.append(y[-1] + (1 - math.exp(-1 / lag)) * (x - y[-1]))
+    np.testing.assert_allclose(lagged(scene, "temperature", 0, lag, N)[:300].numpy(), y, rtol=1e-12)
+    with pytest.raises(ValueError, match=r"`channels`: expected 'temperature' at 20000 samples or more, got 16384"):
+        lagged(scene, "temperature", 0, lag, 20000)
+
+
+def test_the_tail_of_a_scan_is_that_of_its_maximum():
+    n, n_templates, n_runs, n_sensors = 60, 40, 20000, 3
+    angle = torch.linspace(0, 1, n_templates, dtype=torch.float64)[:, None] * 6
+    k = torch.arange(n, dtype=torch.float64)
+    templates = torch.exp(-0.5 * ((k - 10 - angle * 6) / 4).square())
+    information = templates.square().sum(-1)
+    length = curve_length(torch.eye(n, dtype=torch.float64)[None], templates, information[None])
+    unit = templates / information.sqrt()[:, None]
+    assert float(length) == pytest.approx(float((unit[1:] * unit[:-1]).sum(-1).arccos().sum()))
+    z = torch.randn(n_runs, n_sensors, n, generator=generator(4), dtype=torch.float64) @ unit.T
+    largest = z.square().sum(1).amax(-1)
+    q = torch.tensor([14.0], dtype=torch.float64)
+    expected = -math.expm1(-float(expected_exceedances(q, n_sensors, length, n_templates)))
+    found = int((largest > 14).sum())
+    # Davies' bound is close far out: between the law and a quarter more.
+    low, high = stats.binom.ppf([1e-4, 1 - 1e-4], n_runs, expected)
+    assert 0.75 * low <= found <= high
+
+
+def test_quantiles_of_places():
+    places = torch.linspace(0, 100, 2001, dtype=torch.float64)
+    weight = torch.softmax(-((places - 40) / 5).square() / 2, 0)
+    middle, low, high = quantiles(places, weight)
+    assert (middle, low, high) == pytest.approx((40, 40 - 9.8, 40 + 9.8), abs=0.1)
+
+
+def test_sensors_that_jump_to_and_fro_are_known():
+    beside = torch.diag(torch.ones(254, dtype=torch.float64), 1)
+    inverse = torch.linalg.inv(2 * torch.eye(255, dtype=torch.float64) - beside - beside.mT)
+    y = torch.randn(256, generator=generator(5), dtype=torch.float64).diff()
+    telegraph, staircase, single = y.clone(), y.clone(), y.clone()
+    telegraph[[20, 70, 120, 150, 220]] += 4 * torch.tensor([1.0, -1, 1, -1, 1])
+    staircase[[20, 70, 120, 150, 220]] += 4
+    single[70] += 8
+    assert [jumps_to_and_fro(x, inverse) for x in (telegraph, staircase, single, y)] == [True, False, False, False]
+
+
+@pytest.mark.parametrize("seed", range(1, 9))
+def test_nothing_is_found_where_nothing_is_missing(seed: int):
+    now = case(seed=seed)
+    assert slow_witness(now).p_value > 1e-3
+    assert all(mechanism.nominate(now, LEVEL) is None for mechanism in ALL)
+
+
+def best(now: Case):
+    found = [f for f in (mechanism.nominate(now, LEVEL) for mechanism in ALL) if f is not None]
+    return max(found, key=lambda f: f.gain)
+
+
+SIZE = torch.tensor([0.8, 0.0, -0.5, 0.4], dtype=torch.float64)
+
+
+@pytest.mark.parametrize(
+    ("mechanism", "path", "place", "at", "size"),
+    [
+        (Step, (T >= 9000).double(), "onset", 90.0, "size"),
+        (WarmUpTransient, 2 * (-T / 1500).exp(), "time_constant", 15.0, "size"),
+        (TemperatureDrift, TEMPERATURE / 2, "lag", 0.0, "coefficient"),
+    ],
+)
+def test_an_effect_is_found_by_its_name(mechanism, path: torch.Tensor, place: str, at: float, size: str):
+    now = case(SIZE[:, None] * path)
+    assert slow_witness(now).p_value < 1e-6
+    finding = best(now)
+    assert finding.mechanism == mechanism.name
+    assert finding.alternatives == ()
+    assert {0, 2} <= set(finding.sensors)
+    p = finding.parameters[place]
+    assert abs(p.value - at) <= p.high - p.low
+    assert p.unit == "s"
+    scale = 2.0 if mechanism is WarmUpTransient else 0.5 if mechanism is TemperatureDrift else 1.0
+    for i in (0, 2):
+        entry = finding.parameters[f"{size}[{i}]"]
+        sd = (entry.high - entry.low) / 3.92
+        assert abs(entry.value - scale * float(SIZE[i])) < 4 * sd
+    assert held_out_gain(now, finding.effect).accepted
+    after = finding.effect.explained(now, generator(1))
+    assert slow_witness(after).p_value > 0.01
+    back = finding.effect.simulated(finding.effect.removed(now.recording, now.scene), now.scene, generator(1))
+    assert torch.allclose(back, now.recording)
+    refitted = finding.effect.refitted(now, estimation_samples(N))
+    assert refitted.gains(now).shape == (16,)
+    assert float((refitted.size - scale * SIZE)[[0, 2]].abs().max()) < 0.5 * scale
+
+
+def test_the_channel_is_named_and_the_unit_is_by_kelvin():
+    finding = best(case(SIZE[:, None] * TEMPERATURE))
+    assert finding.channel == "temperature[imu2]"
+    assert finding.parameters["coefficient[0]"].unit == "deg/s/K"
+
+
+def test_the_onset_of_a_large_step_is_known_to_samples():
+    at = 6345
+    finding = best(case(torch.tensor([8.0, 0, 6, 0])[:, None] * (at <= T).double()))
+    assert finding.mechanism == "step"
+    assert abs(finding.time_s * RATE - at) <= 2
+    p = finding.parameters["onset"]
+    assert p.low * RATE <= at <= p.high * RATE
+
+
+def test_steps_are_found_one_after_the_other():
+    one, other = (T >= 4000).double(), (T >= 12000).double()
+    effect = torch.stack([2 * one, 1.5 * other, 0 * T, -1.5 * one])
+    now = case(effect)
+    onsets = []
+    for _ in range(2):
+        finding = Step.nominate(now, LEVEL)
+        assert finding is not None
+        onsets.append(finding.time_s)
+        now = finding.effect.explained(now, generator(1))
+    assert sorted(onsets) == pytest.approx([40, 120], abs=2)
+    assert Step.nominate(now, LEVEL) is None
+
+
+def test_a_stationary_telegraph_is_no_step():
+    state = torch.ones(N, dtype=torch.float64)
+    for at in (2000, 4500, 6000, 9000, 11000, 14500):
+        state[at:] *= -1
+    effect = torch.zeros(SENSORS, N, dtype=torch.float64)
+    effect[1] = state
+    assert Step.nominate(case(effect), LEVEL) is None
+
+
+def test_block_means_of_the_effect_are_gone():
+    now = case(SIZE[:, None] * (T >= 9000).double() * 4)
+    finding = best(now)
+    left = block_means(finding.effect.removed(now.recording, now.scene))
+    assert float((left[0, 150:].mean() - left[0, :130].mean()).abs()) < 0.3

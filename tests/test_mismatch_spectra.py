@@ -1,0 +1,148 @@
+"""Cross-spectra in bands, the dictionary of noises, and lines, against direct sums, theory and simulation."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+import gyrofuse as gf
+from gyrofuse.mismatch.base import _time_constants, fit_base
+from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.lines import strongest_line
+from gyrofuse.mismatch.side import Side
+from gyrofuse.mismatch.spectra import bands, cross_spectra, hann_transform
+
+
+def generator(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def case(recording: torch.Tensor, simulation: torch.Tensor, rate: float = 100.0) -> Case:
+    return Case.of(Scene(rate, "deg/s", tuple(map(str, range(recording.shape[-2])))), recording, simulation)
+
+
+def test_cross_spectra_are_those_of_sine_tapers():
+    n, n_sensors = 128, 3
+    x = torch.randn(n_sensors, n, generator=generator(1), dtype=torch.float64)
+    wanted = bands(n)
+    found = cross_spectra(x, wanted).numpy()
+    centred = x.numpy() - x.numpy().mean(-1, keepdims=True)
+    t = np.arange(n)
+    for b, (first, end) in enumerate(zip(wanted.edges[:-1], wanted.edges[1:], strict=True)):
+        total = np.zeros((n_sensors, n_sensors), complex)
+        for m in range(first, end):
+            for k in range(1, 5):
+                taper = math.sqrt(2 / n) * np.sin(math.pi * k * t / n)
+                y = (centred * taper * np.exp(-2j * math.pi * m * t / n)).sum(-1)
+                total += np.outer(y, y.conj())
+        np.testing.assert_allclose(found[b], total / (4 * (end - first)), rtol=1e-10, atol=1e-12)
+
+
+def test_bands_cover_the_bins_once_and_are_wide_enough():
+    for n in (64, 1000, 4096, 2**18):
+        edges = bands(n).edges
+        widths = np.diff(edges)
+        assert edges[0] == 3
+        assert edges[-1] == (n - 4) // 2
+        assert (widths > 4).all()
+        if n > 1000:
+            assert widths[-1] < 0.3 * edges[-1]
+
+
+def test_degrees_of_freedom_of_bands_hold():
+    wanted, n_runs = bands(512), 4000
+    x = torch.randn(n_runs, 1, 512, generator=generator(2), dtype=torch.float64)
+    power = cross_spectra(x, wanted)[..., 0, 0].real
+    found = power.mean(0).square() / power.var(0)
+    # The relative error of a variance from n runs of a gamma variable is some sqrt((2 + 6/d)/n); five of them.
+    error = 5 * torch.sqrt((2 + 6 / wanted.dof) / n_runs)
+    assert ((found / wanted.dof).log().abs() < error).all()
+    assert (power.mean(0) - 1).abs().max() < 5 / math.sqrt(n_runs * float(wanted.dof.min()))
+
+
+def test_the_dictionary_describes_the_noise_of_sensors():
+    n = 2**14
+    model = gf.WhiteNoise(1.0) + gf.AR1(0.99, 1e-3) + gf.RandomWalk(1e-7)
+    side = Side(model.simulate(n, batch=(64, 1), generator=generator(3)), bands(n))
+    f = side.bands.frequency
+    ratio = side.base.spectrum(f)[0] / model.spectrum(f)
+    assert (ratio - 1).abs()[2:].max() < 0.06
+    assert (side.base.coefficients >= 0).all()
+    assert (side.base.coefficients > 0).sum() <= 8, "most of the dictionary is not needed"
+
+
+def test_covariance_of_block_means_is_that_of_the_noise():
+    model = gf.WhiteNoise(0.5) + gf.QuantizationNoise(2.0) + gf.AR1(0.9, 0.3)
+    n, block, n_blocks = 1024, 16, 64
+    f = bands(n).frequency
+    base = fit_base(model.spectrum(f)[None], bands(n), n, bands(n).dof)
+    coefficients = torch.zeros_like(base.coefficients)
+    coefficients[0, :2] = torch.tensor([0.5, 2.0])
+    slow = int((coefficients.shape[1] - 3) / 2) + 2
+    phi = math.exp(-1 / _time_constants(n)[slow - 2])
+    coefficients[0, slow] = 0.3
+    exact = type(base)(n, coefficients).block_covariance(block, n_blocks)[0]
+    model = gf.WhiteNoise(0.5) + gf.QuantizationNoise(2.0) + gf.AR1(phi, 0.3)
+    x = model.simulate(n, batch=(4000,), generator=generator(4))
+    means = x.unflatten(-1, (n_blocks, block)).mean(-1)
+    found = means.mT @ means / len(means)
+    error = 5 * math.sqrt(2 / 4000) * float(exact[0, 0])
+    assert (found - exact).abs().max() < error
+
+
+def test_the_model_of_a_dictionary_has_its_spectrum():
+    n = 2**13
+    model = gf.WhiteNoise(1.0) + gf.AR1(0.999, 1e-4)
+    side = Side(model.simulate(n, batch=(4, 2), generator=generator(5)), bands(n))
+    drawn = side.base.model().simulate(n, batch=(200,), generator=generator(6))
+    again = cross_spectra(drawn, side.bands).mean(0).diagonal(dim1=-1, dim2=-2).real.mT
+    fitted = side.bands.mean_of(side.base.spectrum(side.bands.places))
+    sd = 1 / torch.sqrt(200 * side.bands.dof)
+    # Leakage of what is slower than the record adds to the lowest bands.
+    assert ((again / fitted - 1).abs() / sd)[:, 3:].max() < 5
+
+
+@pytest.mark.parametrize("shared_noise", [0.0, 0.9])
+def test_lines_are_not_found_where_there_are_none(shared_noise):
+    n, n_runs = 4096, 200
+    model = gf.WhiteNoise(1.0) + gf.AR1(0.98, 1e-2)
+    g, values = generator(7), []
+    for _ in range(n_runs):
+        own = model.simulate(n, batch=(2, 4), generator=g)
+        common = model.simulate(n, batch=(2, 1), generator=g)
+        x = math.sqrt(1 - shared_noise) * own + math.sqrt(shared_noise) * common
+        values.append(case(x[0], x[1:]).line.p_value)
+    hits = sum(p < 0.05 for p in values)
+    assert stats.binom.sf(hits - 1, n_runs, 0.05) > 1e-3, f"{hits} of {n_runs}"
+
+
+def test_a_line_is_found_between_bins_and_in_its_sensors():
+    n = 2**13
+    x = gf.WhiteNoise(1.0).simulate(n, batch=(2, 4), generator=generator(8))
+    f = 700.4 / n
+    x[0, 1:3] += 0.2 * torch.sin(2 * math.pi * f * torch.arange(n))
+    line = case(x[0], x[1:]).line
+    assert line.p_value < 1e-6
+    assert abs(line.frequency - f) * n < 1
+    assert line.sensors == (1, 2)
+
+
+def test_a_line_of_the_simulation_is_no_news():
+    n = 2**13
+    x = gf.WhiteNoise(1.0).simulate(n, batch=(2, 4), generator=generator(9))
+    x += 0.3 * torch.sin(2 * math.pi * 700.4 / n * torch.arange(n))
+    both = case(x[0], x[1:])
+    assert strongest_line(both.recorded, Side(x[1:], bands(n))).p_value > 0.01
+    assert abs(both.line.frequency * n - 700.4) > 3
+
+
+def test_hann_transform_has_the_density_as_mean_square():
+    x = gf.AR1(0.9, 1.0).simulate(1000, batch=(800,), generator=generator(10))
+    transform, length = hann_transform(x)
+    at = torch.tensor([0.05, 0.2, 0.4])
+    found = transform.abs().square().mean(0)[(at * length).round().long()]
+    assert ((found / gf.AR1(0.9, 1.0).spectrum(at) - 1).abs() < 0.2).all()
