@@ -339,7 +339,7 @@ def test_what_is_missing_is_named_measured_and_explained(name: str):
         assert entry.low < entry.value < entry.high
         # Four standard deviations; one estimate is no test of coverage.
         assert abs(entry.value - value) < 2.1 * (entry.high - entry.low) / 2, key
-    assert held_out_gain(given, found.effect).accepted
+    assert held_out_gain(given, found.effect).confirms(found.p_value)
     explained = found.effect.explained(given, generator(1))
     assert shape_witness(explained).p_value > 1e-4
     assert nominated(explained) is None

@@ -193,7 +193,7 @@ def test_an_effect_is_found_by_its_name(mechanism, path: torch.Tensor, place: st
         entry = finding.parameters[f"{size}[{i}]"]
         sd = (entry.high - entry.low) / 3.92
         assert abs(entry.value - scale * float(SIZE[i])) < 4 * sd
-    assert held_out_gain(now, finding.effect).accepted
+    assert held_out_gain(now, finding.effect).confirms(finding.p_value)
     after = finding.effect.explained(now, generator(1))
     assert slow_witness(after).p_value > 0.01
     back = finding.effect.simulated(finding.effect.removed(now.recording, now.scene), now.scene, generator(1))

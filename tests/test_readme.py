@@ -21,7 +21,7 @@ def test_begins_with_one_sentence_and_two_commands():
     assert first.startswith("pip install ")
     assert first.endswith("gyrofuse demo")
     assert second.startswith("pip install ")
-    assert second.endswith("pytest")
+    assert second.endswith("pytest -n auto")
     before = README[: README.index("```bash")].strip().splitlines()
     assert before[0] == "# gyrofuse"
     assert before[2].count(". ") == 0

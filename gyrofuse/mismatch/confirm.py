@@ -15,6 +15,7 @@ from gyrofuse.mismatch.halves import N_HALVES, estimation_samples, held_out_bloc
 from gyrofuse.mismatch.mechanism import Finding, Mechanism
 
 _ACCEPTED_T = 1.7
+_BEYOND_DOUBT = 1e-6
 _Z = 1.959963984540054
 _SHORTEST = 8  # a block is so many times as long as its longest wavelet
 
@@ -32,10 +33,13 @@ class Gain(NamedTuple):
     def sd(self) -> float:
         return float(self.blocks.std()) * math.sqrt(len(self.blocks))
 
-    @property
-    def accepted(self) -> bool:
-        """Whether it is better than chance would have it."""
-        return self.total > _ACCEPTED_T * self.sd
+    def confirms(self, p_value: float) -> bool:
+        """Whether a finding of that p value holds on the blocks held out.
+
+        By more than chance would have it; for what is beyond doubt where it was found it is enough not to be worse,
+        since many numbers from half the data cost much of what half the data can gain.
+        """
+        return self.total > (0.0 if p_value < _BEYOND_DOUBT else _ACCEPTED_T * self.sd)
 
 
 class HeldOut(NamedTuple):

@@ -86,11 +86,11 @@ def diagnose(
     level = false_alarm / sum(map(len, STAGES))
     for stage in STAGES:
         while len(found) < _MOST:
-            nominated = [f for f in (m.nominate(case, level) for m in stage) if f is not None]
+            nominated = [f for f in (m.nominate(case, level) for m in stage) if f is not None and not _known(f, found)]
             accepted = None
             for finding in sorted(nominated, key=lambda f: -f.gain):
                 gain = held_out_gain(case, finding.effect)
-                if gain.accepted:
+                if gain.confirms(finding.p_value):
                     accepted = replace(finding, held_out_gain=gain.total)
                     break
             if accepted is None:
@@ -111,4 +111,13 @@ def diagnose(
         evidence_after=after,
         case=start,
         repaired=case,
+    )
+
+
+def _known(finding: Finding, found: list[tuple[Case, Finding]]) -> bool:
+    """Whether the same was found before: what its repair could not take away is not another one."""
+    return any(
+        (finding.mechanism, finding.sensors, finding.channel, finding.time_s, finding.frequency_hz)
+        == (other.mechanism, other.sensors, other.channel, other.time_s, other.frequency_hz)
+        for _, other in found
     )

@@ -11,7 +11,7 @@ import math
 from typing import NamedTuple
 
 import torch
-from scipy import stats
+from scipy import special, stats
 from torch import Tensor
 
 from gyrofuse.mismatch.case import Case
@@ -32,6 +32,7 @@ _SAME_STEP = 1e-3
 _BLOCKS = 32  # whose spread tells how far repeats vary by themselves
 _QUARTERS = 4
 _BY_CHANCE = 3.0  # times the variance expected of quarters
+_COARSE, _AT_LAST_STEP = 0.05, 4.0  # of the noise; samples that may lie on a lattice's last step by chance
 _FEWEST_AT_END = 3  # samples at an end stop
 
 
@@ -263,6 +264,10 @@ def end_stops(case: Case) -> tuple[EndStop, ...]:
             beyond = float(torch.special.ndtr((sign * mean - limit - resolution / 2) / sd).sum())
             by_chance = min(5 * resolution / sd, 1.0) ** (runs - 1)
             p = min(math.exp(-beyond), by_chance)
+            if (
+                resolution > _COARSE * sd
+            ):  # tails of rounded noise are not normal: the number at the end has to tell too
+                p = max(p, float(special.pdtrc(runs - 1, _AT_LAST_STEP)))
             found.append(EndStop(i, sign, sign * limit, corrected(p, 4 * case.n_sensors)))
     return tuple(found)
 

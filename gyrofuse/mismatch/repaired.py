@@ -104,6 +104,8 @@ class RepairedModel:
 
 def _plain(value: Any) -> Any:
     """Numbers of a mechanism, what is not finite as text."""
+    if isinstance(value, Tensor) and value.is_complex():
+        return {"real": _plain(value.real), "imag": _plain(value.imag)}
     if isinstance(value, Tensor):
         return _plain(value.tolist())
     if is_dataclass(value):

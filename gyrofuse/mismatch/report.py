@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gyrofuse.mismatch.outcome import Outcome
-from gyrofuse.mismatch.telling import fused_words
+from gyrofuse.mismatch.telling import fused_words, parameter_words
 from gyrofuse.plotting_mismatch import plot_map
 from gyrofuse.report_mismatch import mismatch_page
 
@@ -44,7 +44,8 @@ class MismatchReport(Outcome):
             if finding.alternatives:
                 lines.append(f"   cannot be told apart from {', '.join(finding.alternatives)}")
             for name, entry in finding.parameters.items():
-                lines.append(f"   {name:<24} {entry.value:>12.6g} {entry.unit}  ({entry.low:.6g} to {entry.high:.6g})")
+                words = parameter_words(name, self.case.scene.sensors)
+                lines.append(f"   {words:<24} {entry.value:>12.6g} {entry.unit}  ({entry.low:.6g} to {entry.high:.6g})")
         lines += [f"unexplained, {e.witness}: {e.words} (p = {e.p_value:.2g})" for e in self.unexplained]
         h = self.held_out
         lines.append(

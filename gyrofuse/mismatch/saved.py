@@ -51,6 +51,8 @@ def _rebuilt(kind: Any, numbers: Mapping[str, Any]) -> Any:
 
 
 def _value(declared: str, value: Any) -> Any:
+    if declared == "Tensor" and isinstance(value, Mapping):
+        return torch.complex(_value(declared, value["real"]), _value(declared, value["imag"]))
     if declared == "Tensor":
         return torch.from_numpy(np.array(_finished(value)))
     return _rebuilt(Base, value) if declared == "Base" else _finished(value)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.channels import ChannelFit, regress
+from gyrofuse.mismatch.halves import signal_gains
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.mechanisms.vibration_tone import named_sensors
 from gyrofuse.mismatch.witnesses import level_of
@@ -26,7 +27,7 @@ class ChannelGain(Mechanism):
 
     Attributes:
         channel: Its name.
-        coupling: `(sensor, row)`, signal per unit of the rows.
+        coupling: `(sensor, row)`, signal per unit of the rows; 0 for sensors that do not show it.
     """
 
     of_one_band: ClassVar[tuple[str, ...]] = ()
@@ -77,7 +78,7 @@ class ChannelGain(Mechanism):
         )
         return Finding(
             cls.name,
-            cls(name, fit.gains),
+            cls(name, _only(fit.gains, present)),
             cls.words(sizes[largest].value, name, where, unit),
             fit.p_value * len(candidates),
             present,
@@ -94,7 +95,11 @@ class ChannelGain(Mechanism):
         rows = self._rows(case.scene, self.channel)
         means = [(v * weight).sum(-1, keepdim=True) / weight.sum() for v in (rows, case.recording)]
         fit = regress(case, (rows - means[0]) * weight, (case.recording - means[1]) * weight)
-        return self if fit is None else type(self)(self.channel, fit.gains)
+        present = tuple(self.coupling.any(-1).nonzero()[:, 0].tolist())
+        return self if fit is None else type(self)(self.channel, _only(fit.gains, present))
+
+    def gains(self, case: Case) -> Tensor:
+        return signal_gains(case, self._path(case.scene, case.n_samples))
 
     def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
         return signal + self._path(scene, signal.shape[-1])
@@ -124,6 +129,13 @@ class ChannelGain(Mechanism):
     def _per(cls, scene: Scene, name: str) -> str:
         """What a gain is per: the unit of acceleration that gravity gives away, or nothing."""
         return f" per unit of {name}"
+
+
+def _only(gains: Tensor, sensors: tuple[int, ...]) -> Tensor:
+    """Gains of some sensors, those of the others zero."""
+    kept = torch.zeros_like(gains)
+    kept[list(sensors)] = gains[list(sensors)]
+    return kept
 
 
 def gravity_unit(scene: Scene, name: str) -> str | None:
