@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -48,21 +48,7 @@ class Base:
 
     def block_covariance(self, block: int, n_blocks: int) -> Tensor:
         """Covariances of means over successive blocks, `(sensor, block, block)`, up to a constant."""
-        lags = torch.from_numpy(block_mean_covariances(block, n_blocks, _time_constants(self.n_samples)))
-        white, *shaped, walk = lags
-        # Those are of AR1s with variance one, the coefficients are of innovations.
-        shaped = [row / -math.expm1(-2 / tau) for row, tau in zip(shaped, _time_constants(self.n_samples), strict=True)]
-        # The angle's quantisation telescopes over a block.
-        quantized = torch.zeros_like(white)
-        quantized[0] = 2 / block**2
-        quantized[1:2] = -1 / block**2
-        covariance = self.coefficients @ torch.stack([white, quantized, *shaped, walk])
-        place = torch.arange(n_blocks)
-        return covariance[:, (place[:, None] - place).abs()]
-
-    def scaled(self, factor: Tensor) -> Base:
-        """Every density times `factor` `(sensor,)`."""
-        return replace(self, coefficients=self.coefficients * factor[:, None])
+        return torch.einsum("sa,aij->sij", self.coefficients, atom_covariances(self.n_samples, block, n_blocks))
 
     def _essential(self) -> Tensor:
         """Coefficients without those that give no more than a thousandth of the power anywhere."""
@@ -109,6 +95,20 @@ def _time_constants(n_samples: int) -> tuple[float, ...]:
     """Of the AR1s, samples: corners from one cycle in the record to a sixth of a cycle a sample."""
     decades = math.log10(n_samples / 6)
     return tuple(n_samples / (2 * math.pi) * 10 ** (-i / _PER_DECADE) for i in range(int(decades * _PER_DECADE) + 1))
+
+
+def atom_covariances(n_samples: int, block: int, n_blocks: int) -> Tensor:
+    """Covariances of block means, up to a constant, for each atom with coefficient one, `(atom, block, block)`."""
+    constants = _time_constants(n_samples)
+    lags = torch.from_numpy(block_mean_covariances(block, n_blocks, constants))
+    # Those of AR1s are for unit variance, coefficients are variances of innovations.
+    lags[1:-1] /= -torch.expm1(-2 / torch.tensor(constants, dtype=torch.float64))[:, None]
+    # The angle's quantisation telescopes over a block.
+    quantized = torch.zeros_like(lags[:1])
+    quantized[0, :2] = torch.tensor([2.0, -1.0]) / block**2
+    lags = torch.cat([lags[:1], quantized, lags[1:]])
+    place = torch.arange(n_blocks)
+    return lags[:, (place[:, None] - place).abs()]
 
 
 def _atoms(n_samples: int, f: Tensor) -> Tensor:

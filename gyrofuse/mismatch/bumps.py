@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from typing import NamedTuple
-from weakref import WeakKeyDictionary
 
 import torch
 from scipy import stats
@@ -17,6 +16,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import Evidence, corrected
+from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.shape_fit import Fit, Ratios, fit, smooth_coherence
 from gyrofuse.mismatch.shape_terms import Background, Bump, CommonBump, Ground
 from gyrofuse.mismatch.side import Side
@@ -87,17 +87,9 @@ def bump_witness(case: Case) -> Evidence:
     )
 
 
-_bumps: WeakKeyDictionary[Case, Stretch] = WeakKeyDictionary()
-
-
+@remembered
 def strongest_bump(case: Case) -> Stretch:
     """The most conspicuous bump of the recording that is neither a line nor in the simulation."""
-    if case not in _bumps:
-        _bumps[case] = _strongest(case)
-    return _bumps[case]
-
-
-def _strongest(case: Case) -> Stretch:
     power, length = _whitened(case.recorded, case)
     shared = _effective_sensors(case)
     known = torch.zeros(power.shape[-1], dtype=torch.bool)
@@ -227,14 +219,10 @@ def _has_it(simulated: tuple[Tensor, int], stretch: Stretch, case: Case, row: in
     return float(stats.f.sf(ratio, 2 * d, 4 * _FLANK * d)) < _AS_WELL
 
 
-_fitted: WeakKeyDictionary[Case, Oscillation | None] = WeakKeyDictionary()
-
-
+@remembered
 def oscillation_of(case: Case) -> Oscillation | None:
     """The strongest bump, fitted; None where it is no oscillation."""
-    if case not in _fitted:
-        _fitted[case] = _closely(case, strongest_bump(case))
-    return _fitted[case]
+    return _closely(case, strongest_bump(case))
 
 
 def _closely(case: Case, stretch: Stretch) -> Oscillation | None:

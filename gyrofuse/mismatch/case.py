@@ -7,7 +7,7 @@ act on both alike.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -37,6 +37,12 @@ class Scene:
     unit: str
     sensors: tuple[str, ...]
     channels: Mapping[str, Tensor] = field(default_factory=dict)
+
+    def named(self, which: Sequence[int], every: str | None = None) -> str:
+        """Sensors by their names, for a sentence; all of them by the words `every`, where given."""
+        if every is not None and len(which) == len(self.sensors):
+            return every
+        return ("sensor " if len(which) == 1 else "sensors ") + ", ".join(self.sensors[i] for i in which)
 
     def seconds(self, n_samples: int) -> Tensor:
         """Times of the samples, s."""

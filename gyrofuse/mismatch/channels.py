@@ -21,7 +21,6 @@ from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import Evidence, corrected
 
 _LEAST_DOF = 20.0  # of a simulation's band: below, it does not tell what chance alone would do to a slow channel
-_ORDINATES = 40  # behind a coherence matrix, for each sensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +63,8 @@ def regress(case: Case, rows: Tensor, signal: Tensor | None = None) -> ChannelFi
     matrix = torch.zeros(n_sensors * n_rows, n_sensors * n_rows, dtype=torch.float64)
     parts = []
     known = case.simulated.dof >= _LEAST_DOF
-    for use, inverse, (first, end) in zip(known, _inverses(case), itertools.pairwise(edges), strict=True):
+    inverses = torch.linalg.inv(case.recorded.over(case.base).real)
+    for use, inverse, (first, end) in zip(known, inverses, itertools.pairwise(edges), strict=True):
         if not use:
             continue
         w = weights[:, first:end]
@@ -148,21 +148,3 @@ def _channels(case: Case, word: str) -> list[str]:
 def _quarter_late(rows: Tensor) -> Tensor:
     """Rows `(row, time)` a quarter of a cycle late at every frequency."""
     return torch.fft.irfft(torch.fft.rfft(rows) * -1j, n=rows.shape[-1])
-
-
-def _inverses(case: Case) -> Tensor:
-    """Inverse in each band of the recording's noise matrix over the base, real, `(band, sensor, sensor)`.
-
-    From as many bands as it takes: few ordinates make an inverse too large.
-    """
-    dof = case.bands.dof
-    size = case.bands.mean_of(case.base.spectrum(case.bands.places)).mT.sqrt()  # (band, sensor)
-    whitened = case.recorded.spectra.real / size[:, :, None] / size[:, None, :] * dof[:, None, None]
-    wanted = min(_ORDINATES * case.n_sensors, float(dof.sum()))
-    smooth = []
-    for b in range(len(dof)):
-        low, high = b, b + 1
-        while float(dof[low:high].sum()) < wanted:
-            low, high = max(low - 1, 0), min(high + 1, len(dof))
-        smooth.append(whitened[low:high].sum(0) / dof[low:high].sum())
-    return torch.linalg.inv(torch.stack(smooth))

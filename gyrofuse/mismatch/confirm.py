@@ -12,18 +12,18 @@ from torch import Tensor
 from gyrofuse.covariance import wavelet_cross_covariance
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.halves import N_HALVES, estimation_samples, held_out_blocks
-from gyrofuse.mismatch.mechanism import Finding, Mechanism
+from gyrofuse.mismatch.mechanism import Mechanism, Z
 
 _ACCEPTED_T = 1.7
 _BEYOND_DOUBT = 1e-6
-_Z = 1.959963984540054
 _SHORTEST = 8  # a block is so many times as long as its longest wavelet
 
 
 class Gain(NamedTuple):
-    """Gain in log score on the blocks held out, nats, `(block,)`."""
+    """Gain in log score on the blocks held out, nats, `(block,)`, and the mechanism refitted to the others."""
 
     blocks: Tensor
+    refitted: Mechanism
 
     @property
     def total(self) -> float:
@@ -31,7 +31,7 @@ class Gain(NamedTuple):
 
     @property
     def sd(self) -> float:
-        return float(self.blocks.std()) * math.sqrt(len(self.blocks))
+        return _sd_of_sum(self.blocks)
 
     def confirms(self, p_value: float) -> bool:
         """Whether a finding of that p value holds on the blocks held out.
@@ -65,26 +65,29 @@ class HeldOut(NamedTuple):
 
 def held_out_gain(case: Case, effect: Mechanism) -> Gain:
     """Gain in log score of one mechanism, its numbers estimated on the other half."""
-    return Gain(effect.refitted(case, estimation_samples(case.n_samples)).gains(case))
+    refitted = effect.refitted(case, estimation_samples(case.n_samples))
+    return Gain(refitted.gains(case), refitted)
 
 
-def held_out(start: Case, found: Sequence[tuple[Case, Finding]], generator: torch.Generator) -> HeldOut:
+def held_out(start: Case, gains: Sequence[Gain], generator: torch.Generator) -> HeldOut:
     """Agreement before and after all repairs, their numbers estimated on the even blocks.
 
     Args:
         start: Recording and simulation as they came.
-        found: Each finding with the case in which it was found, in order.
+        gains: Of the findings, in order.
         generator: Of what is built into the simulation.
     """
-    keep, after = estimation_samples(start.n_samples), start
-    gains = [torch.zeros(1, dtype=torch.float64)]
-    for case, finding in found:
-        refitted = finding.effect.refitted(case, keep)
-        gains.append(refitted.gains(case))
-        after = refitted.explained(after, generator)
-    total = Gain(sum(gains, torch.zeros(1, dtype=torch.float64)))
-    reach = _Z * total.sd if found else 0.0
-    return HeldOut(discrepancy(start), discrepancy(after), total.total, total.total - reach, total.total + reach)
+    after = start
+    for gain in gains:
+        after = gain.refitted.explained(after, generator)
+    total, reach = sum(gain.total for gain in gains), 0.0
+    if gains:
+        reach = Z * _sd_of_sum(torch.stack([gain.blocks for gain in gains]).sum(0))
+    return HeldOut(discrepancy(start), discrepancy(after), total, total - reach, total + reach)
+
+
+def _sd_of_sum(blocks: Tensor) -> float:
+    return float(blocks.std()) * math.sqrt(len(blocks))
 
 
 def discrepancy(case: Case) -> float:

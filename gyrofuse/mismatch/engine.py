@@ -11,7 +11,7 @@ from torch import Tensor
 from gyrofuse._checks import check_n_samples
 from gyrofuse._model import Model
 from gyrofuse.mismatch.case import Case
-from gyrofuse.mismatch.confirm import held_out, held_out_gain
+from gyrofuse.mismatch.confirm import Gain, held_out, held_out_gain
 from gyrofuse.mismatch.evidence import corrected
 from gyrofuse.mismatch.inputs import noise_of, prepared
 from gyrofuse.mismatch.mechanism import Finding
@@ -82,7 +82,8 @@ def diagnose(
             repaired=start,
         )
     case: Case = start
-    found: list[tuple[Case, Finding]] = []
+    found: list[Finding] = []
+    gains: list[Gain] = []
     level = false_alarm / sum(map(len, STAGES))
     for stage in STAGES:
         while len(found) < _MOST:
@@ -92,12 +93,13 @@ def diagnose(
                 gain = held_out_gain(case, finding.effect)
                 if gain.confirms(finding.p_value):
                     accepted = replace(finding, held_out_gain=gain.total)
+                    gains.append(gain)
                     break
             if accepted is None:
                 break
-            found.append((case, accepted))
+            found.append(accepted)
             case = accepted.effect.explained(case, generator)
-    findings = tuple(f for _, f in found)
+    findings = tuple(found)
     after = testimony(case)
     left = [e for e in after if corrected(e.p_value, len(evidence)) <= false_alarm]
     return MismatchReport(
@@ -105,7 +107,7 @@ def diagnose(
         p_value=p_value,
         findings=findings,
         unexplained=tuple(left),
-        held_out=held_out(start, found, generator),
+        held_out=held_out(start, gains, generator),
         model=replace(model, effects=tuple(f.effect for f in findings)),
         evidence=evidence,
         evidence_after=after,
@@ -114,10 +116,10 @@ def diagnose(
     )
 
 
-def _known(finding: Finding, found: list[tuple[Case, Finding]]) -> bool:
+def _known(finding: Finding, found: list[Finding]) -> bool:
     """Whether the same was found before: what its repair could not take away is not another one."""
     return any(
         (finding.mechanism, finding.sensors, finding.channel, finding.time_s, finding.frequency_hz)
         == (other.mechanism, other.sensors, other.channel, other.time_s, other.frequency_hz)
-        for _, other in found
+        for other in found
     )

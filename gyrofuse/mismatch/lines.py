@@ -27,7 +27,6 @@ _REACH, _GUARD = 32, 3  # bins on either side that tell the background, and thos
 _NEARBY = 2.0 * (_REACH - _GUARD)
 _FEWEST_CYCLES = 10.0
 _LINE_IN_SIMULATION = 1e-3  # p value
-_ORDINATES = 40  # for each sensor, behind a coherence matrix that is inverted
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,8 @@ def strongest_line(recorded: Side, simulated: Side) -> FoundLine:
     known = _without_verdict(f, simulated)
     n_bins = int((~known).sum())
     p = z.shape[0]
-    matrices = _matrices(recorded, simulated.base, f)
+    band = torch.tensor(recorded.bands.edges[1:-1], dtype=torch.float64) / recorded.bands.n_samples
+    matrices = recorded.over(simulated.base)[torch.bucketize(f, band, right=True)]
     pooled = (z.mH[..., None, :] @ torch.linalg.solve(matrices, z.mT[..., None]))[..., 0, 0].real
     log_pooled = _log_tail(pooled[None], p)[0].masked_fill(known, 0.0)
     single = _log_tail(z.abs().square(), 1)
@@ -106,28 +106,3 @@ def _without_verdict(f: Tensor, simulated: Side) -> Tensor:
     for place in (log_p < math.log(_LINE_IN_SIMULATION)).nonzero()[:, 0].tolist():
         known |= (f - place / length).abs() * min(n, simulated.signal.shape[-1]) < _GUARD + 1
     return known
-
-
-def _matrices(recorded: Side, base: Base, f: Tensor) -> Tensor:
-    """Whitened cross-spectral matrix of the recording at each frequency, `(bin, sensor, sensor)`.
-
-    From as many bands as it takes: an inverse from too few ordinates would make lines of chance.
-    """
-    dof = recorded.bands.dof
-    size = recorded.bands.mean_of(base.spectrum(recorded.bands.places)).mT.sqrt()
-    whitened = recorded.spectra / size[:, :, None] / size[:, None, :]
-    total, worth = _sums(whitened * dof[:, None, None]), _sums(dof)
-    wanted = min(_ORDINATES * recorded.signal.shape[-2], float(dof.sum()))
-    smooth = []
-    for b in range(len(dof)):
-        low, high = b, b + 1
-        while worth[high] - worth[low] < wanted:
-            low, high = max(low - 1, 0), min(high + 1, len(dof))
-        smooth.append((total[high] - total[low]) / (worth[high] - worth[low]))
-    edges = torch.tensor(recorded.bands.edges[1:-1], dtype=torch.float64) / recorded.bands.n_samples
-    return torch.stack(smooth)[torch.bucketize(f, edges, right=True)]
-
-
-def _sums(values: Tensor) -> Tensor:
-    """Sums of the first 0, 1, .. entries along the first dimension."""
-    return torch.cat([torch.zeros_like(values[:1]), values.cumsum(0)])

@@ -12,6 +12,8 @@ from gyrofuse._result import cleaned
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.halves import spectral_gains
 
+Z = 1.959963984540054  # of 95 % limits
+
 
 class Parameter(NamedTuple):
     """A number with its limits at the confidence level of the diagnosis."""

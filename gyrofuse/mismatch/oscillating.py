@@ -11,9 +11,9 @@ from torch import Tensor
 
 from gyrofuse.mismatch.bumps import Oscillation, Stretch, oscillation_of
 from gyrofuse.mismatch.case import Case
-from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.shape_terms import Bump, CommonBump, oscillation
-from gyrofuse.mismatch.shape_words import Z, named, spanned
+from gyrofuse.mismatch.shape_words import spanned
 from gyrofuse.mismatch.shapes import chosen_shape, run_length
 from gyrofuse.mismatch.steadiness import Steadiness, steadiness
 from gyrofuse.mismatch.witnesses import level_of
@@ -60,7 +60,7 @@ class Seen(NamedTuple):
 
     @property
     def where(self) -> str:
-        return named(self.case.scene, self.sensors)
+        return self.case.scene.named(self.sensors, "all sensors")
 
     def of(self, effect: Mechanism, sentence: str, amplitude: str, factor: float) -> Finding:
         """The finding, amplitudes `factor` times the rms."""

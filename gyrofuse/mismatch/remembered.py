@@ -1,4 +1,4 @@
-"""Values derived from one side of a case, computed once and kept as long as the side is."""
+"""Values derived from a case or one of its sides, computed once and kept as long as it is."""
 
 from __future__ import annotations
 
@@ -7,19 +7,18 @@ from collections.abc import Callable
 from typing import TypeVar
 from weakref import WeakKeyDictionary
 
-from gyrofuse.mismatch.side import Side
-
+Source = TypeVar("Source")
 Derived = TypeVar("Derived")
 
 
-def remembered(function: Callable[[Side], Derived]) -> Callable[[Side], Derived]:
-    """The function, evaluated once for each side."""
-    known: WeakKeyDictionary[Side, Derived] = WeakKeyDictionary()
+def remembered(function: Callable[[Source], Derived]) -> Callable[[Source], Derived]:
+    """The function, evaluated once for each case or side."""
+    known: WeakKeyDictionary[Source, Derived] = WeakKeyDictionary()
 
     @functools.wraps(function)
-    def lookup(side: Side) -> Derived:
-        if side not in known:
-            known[side] = function(side)
-        return known[side]
+    def lookup(source: Source) -> Derived:
+        if source not in known:
+            known[source] = function(source)
+        return known[source]
 
     return lookup

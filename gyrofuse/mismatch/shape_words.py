@@ -5,23 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from gyrofuse.mismatch.case import Case, Scene
-from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.shapes import Shape
-
-Z = 1.959963984540054
 
 
 def spanned(number: Callable[[float], float], middle: float, sd: float, unit: str) -> Parameter:
     """A number that rises with an estimate of normal error, and its limits."""
     return Parameter(number(middle), number(middle - Z * sd), number(middle + Z * sd), unit)
-
-
-def named(scene: Scene, sensors: tuple[int, ...]) -> str:
-    """Sensors by their names."""
-    if len(sensors) == len(scene.sensors):
-        return "all sensors"
-    return ("sensor " if len(sensors) == 1 else "sensors ") + ", ".join(scene.sensors[i] for i in sensors)
 
 
 def found(

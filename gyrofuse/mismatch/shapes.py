@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import weakref
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
@@ -15,6 +14,7 @@ from torch import Tensor
 from gyrofuse.mismatch.bumps import oscillation_of
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import corrected
+from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.shape_fit import Fit, Ratios, data_model, fit, log_score, ratios
 from gyrofuse.mismatch.shape_terms import FILTERS, Bump, Common, CommonBump, Flicker, LowPass, Shift, Term, oscillation
 from gyrofuse.mismatch.side import Side
@@ -59,14 +59,10 @@ class Shape(NamedTuple):
     levels: tuple[int, ...]
 
 
-_found: weakref.WeakKeyDictionary[Case, tuple[Shape, ...]] = weakref.WeakKeyDictionary()
-
-
+@remembered
 def shapes(case: Case) -> tuple[Shape, ...]:
     """Shapes that together explain the spectra, in the order in which they act; none where they do not."""
-    if case not in _found:
-        _found[case] = _searched(case)
-    return _found[case]
+    return _searched(case)
 
 
 def chosen_shape(case: Case, name: str, level: float) -> Shape | None:

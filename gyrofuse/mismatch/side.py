@@ -12,6 +12,7 @@ from torch import Tensor
 from gyrofuse.mismatch.base import Base, fit_base
 from gyrofuse.mismatch.spectra import Bands, cross_spectra, degrees_of_freedom
 
+_ORDINATES = 40  # for each sensor, behind a matrix that is inverted
 _LEAST_BIN = 3  # of records shorter than the bands are for: below, they say nothing
 
 
@@ -63,3 +64,26 @@ class Side:
     def base(self) -> Base:
         """The noise as a sum of simple spectra."""
         return fit_base(self.power, self.bands, self.bands.n_samples, self.dof)
+
+    def over(self, base: Base) -> Tensor:
+        """Cross-spectral matrices over the spectra of a base, to be inverted, `(band, sensor, sensor)`.
+
+        Means over as many bands as it takes: an inverse from too few ordinates would be too large.
+        """
+        dof = self.bands.dof
+        size = self.bands.mean_of(base.spectrum(self.bands.places)).mT.sqrt()  # (band, sensor)
+        total = _sums(self.spectra / size[:, :, None] / size[:, None, :] * dof[:, None, None])
+        worth = _sums(dof)
+        wanted = min(_ORDINATES * self.signal.shape[-2], float(dof.sum()))
+        smooth = []
+        for b in range(len(dof)):
+            low, high = b, b + 1
+            while worth[high] - worth[low] < wanted:
+                low, high = max(low - 1, 0), min(high + 1, len(dof))
+            smooth.append((total[high] - total[low]) / (worth[high] - worth[low]))
+        return torch.stack(smooth)
+
+
+def _sums(values: Tensor) -> Tensor:
+    """Sums of the first 0, 1, .. entries along the first dimension."""
+    return torch.cat([torch.zeros_like(values[:1]), values.cumsum(0)])

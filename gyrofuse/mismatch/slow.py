@@ -20,8 +20,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse._lag_sums import block_mean_covariances
-from gyrofuse.mismatch.base import Base, _time_constants
+from gyrofuse.mismatch.base import Base, _time_constants, atom_covariances
 from gyrofuse.mismatch.case import N_BLOCKS, Case, block_means
 
 _ROUNDS = 12
@@ -84,7 +83,7 @@ def slow_noise(case: Case) -> SlowNoise:
     """What the simulation says of block means, in parts that may be wrong, each by its own factor."""
     base = case.base
     constants = torch.tensor(_time_constants(base.n_samples), dtype=torch.float64)
-    atoms = _atom_covariances(base.n_samples, case.block)
+    atoms = atom_covariances(base.n_samples, case.block, N_BLOCKS).diff(dim=-1).diff(dim=-2)
     fast = torch.cat([torch.ones(2), constants < case.block, torch.zeros(1)]).to(torch.float64)
     own = [torch.einsum("sa,aij->sij", base.coefficients * share, atoms) for share in (fast, 1 - fast)]
     # AR1s of equal variance and log-spaced corners are flicker.
@@ -170,22 +169,9 @@ def whole_blocks(keep: Tensor) -> Tensor:
 
 
 @functools.lru_cache(maxsize=4)
-def _atom_covariances(n_samples: int, block: int, n_blocks: int = N_BLOCKS) -> Tensor:
-    """Of differences of successive block means, for each atom of a `Base`, `(atom, difference, difference)`."""
-    constants = _time_constants(n_samples)
-    lags = torch.from_numpy(block_mean_covariances(block, n_blocks, constants))
-    # Those of AR1s are for unit variance, coefficients are variances of innovations.
-    lags[1:-1] /= -torch.expm1(-2 / torch.tensor(constants, dtype=torch.float64))[:, None]
-    quantized = torch.zeros_like(lags[:1])
-    quantized[0, :2] = torch.tensor([2.0, -1.0]) / block**2
-    place = torch.arange(n_blocks)
-    lags = torch.cat([lags[:1], quantized, lags[1:]])
-    return lags[:, (place[:, None] - place).abs()].diff(dim=-1).diff(dim=-2)
-
-
 def cell_differences(base: Base, cell: int, n_cells: int) -> Tensor:
     """Covariance of differences of means over cells of any length, `(sensor, difference, difference)`."""
-    return torch.einsum("sa,aij->sij", base.coefficients, _atom_covariances(base.n_samples, cell, n_cells))
+    return base.block_covariance(cell, n_cells).diff(dim=-1).diff(dim=-2)
 
 
 def _shared_step(information: Tensor, slope: Tensor) -> Tensor:

@@ -19,11 +19,10 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import N_BLOCKS, Case, Scene
 from gyrofuse.mismatch.halves import N_HALVES, estimation_samples
-from gyrofuse.mismatch.mechanism import Mechanism, Parameter
+from gyrofuse.mismatch.mechanism import Mechanism, Parameter, Z
 from gyrofuse.mismatch.slow import bridged, differences, scores, whole_blocks
 from gyrofuse.mismatch.slow_scans import Family, Scan, SlowLook, concerned, slow_look
 
-_Z = 1.959963984540054
 _STRONG = 5e-4  # a slow effect leaves traces that look like another one: largest p value
 _TOO_CLOSE = 5.0  # nats
 _PLAUSIBLE = 6.0  # nats below the best place
@@ -186,7 +185,7 @@ def sizes(name: str, found: Estimate, which: tuple[int, ...], unit: str) -> dict
     """One parameter for each sensor concerned."""
     limits = {}
     for i in which:
-        size, reach = float(found.size[i]), _Z * float(found.sd[i])
+        size, reach = float(found.size[i]), Z * float(found.sd[i])
         limits[f"{name}[{i}]"] = Parameter(size, size - reach, size + reach, unit)
     return limits
 

@@ -11,7 +11,6 @@ import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
-from weakref import WeakKeyDictionary
 
 import torch
 from scipy import stats
@@ -20,6 +19,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import N_BLOCKS, Case, Scene, block_means
 from gyrofuse.mismatch.evidence import Evidence, corrected
+from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.slow import Fit, SlowNoise, best_fit, differences, scores, slow_noise
 
 _LOW_BINS = 24  # of whitened differences, in which sensors are compared
@@ -181,15 +181,11 @@ class SlowLook:
         return (1 - share) * c + share * torch.eye(len(c), dtype=c.dtype)
 
 
-_looks: WeakKeyDictionary[Case, SlowLook] = WeakKeyDictionary()
-
-
+@remembered
 def slow_look(case: Case) -> SlowLook:
     """What is slow in a case, looked at once for the witness and for all mechanisms."""
-    if case not in _looks:
-        noise, y = slow_noise(case), differences(case.recording)
-        _looks[case] = SlowLook(noise, y, best_fit(noise, y), (steps(case), warm_ups(case), *temperatures(case)))
-    return _looks[case]
+    noise, y = slow_noise(case), differences(case.recording)
+    return SlowLook(noise, y, best_fit(noise, y), (steps(case), warm_ups(case), *temperatures(case)))
 
 
 def slow_witness(case: Case) -> Evidence:

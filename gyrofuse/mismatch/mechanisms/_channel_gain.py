@@ -12,11 +12,9 @@ from torch import Tensor
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.channels import ChannelFit, regress
 from gyrofuse.mismatch.halves import signal_gains
-from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
-from gyrofuse.mismatch.mechanisms.vibration_tone import named_sensors
+from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.witnesses import level_of
 
-_Z = 1.959963984540054
 _OF_ONE_BAND = 0.9  # share of the evidence from which a gain might be a line's alone
 _LATE = 0.25  # share of the evidence a quarter of a cycle late, from which it is no instantaneous coupling
 
@@ -71,7 +69,7 @@ class ChannelGain(Mechanism):
         unit = f"{case.scene.unit}{cls._per(case.scene, name)}"
         sizes = {i: _size(fit, i, unit) for i in present}
         largest = max(sizes, key=lambda i: sizes[i].value)
-        where = "every sensor" if len(present) == case.n_sensors else named_sensors(case.scene, present)
+        where = case.scene.named(present, "every sensor")
         rows = cls._rows(case.scene, name)
         busiest = (
             float(torch.fft.rfft(rows - rows.mean(-1, keepdim=True)).abs().square().sum(0).argmax()) / case.n_samples
@@ -152,4 +150,4 @@ def _size(fit: ChannelFit, sensor: int, unit: str) -> Parameter:
     size = float(gains.norm())
     direction = gains / max(size, 1e-300)
     sd = math.sqrt(float(direction @ fit.covariance[sensor, :, sensor] @ direction))
-    return Parameter(size, max(size - _Z * sd, 0.0), size + _Z * sd, unit)
+    return Parameter(size, max(size - Z * sd, 0.0), size + Z * sd, unit)

@@ -15,7 +15,6 @@ from gyrofuse.mismatch.halves import held_out_blocks
 from gyrofuse.mismatch.impulses import left_out
 from gyrofuse.mismatch.marginals import EndStop, end_stops
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
-from gyrofuse.mismatch.mechanisms.vibration_tone import named_sensors
 
 _CELL = 0.02  # width of a cell at the limit, sd: what a sample there is worth is bounded by it
 
@@ -47,7 +46,7 @@ class Clipping(Mechanism):
             )
             for end in found
         }
-        where = "all sensors" if len(sensors) == case.n_sensors else named_sensors(case.scene, sensors)
+        where = case.scene.named(sensors, "all sensors")
         ends = sorted({"above" if end.sign > 0 else "below" for end in found})
         at = min(found, key=lambda end: end.p_value)
         share = float(effect._clipped(case.recording).to(torch.float64)[list(sensors)].mean())

@@ -12,9 +12,9 @@ from torch import Tensor
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.colour import noise, of_phase
 from gyrofuse.mismatch.gaussian import Addition
-from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.shape_terms import Common, common_density
-from gyrofuse.mismatch.shape_words import Z, found, named, spanned
+from gyrofuse.mismatch.shape_words import found, spanned
 from gyrofuse.mismatch.shapes import chosen_shape, refit
 
 _WORDS = {"white": "white noise", "ar1": "AR1 noise", "walk": "a random walk"}
@@ -66,14 +66,15 @@ class CommonMode(Addition):
             rate = case.scene.rate
             parameters["corner"] = spanned(lambda x: math.exp(x) * rate, middle, spread, "Hz")
         against = [i for i in sensors if float(gain[i].real) < 0]
-        sign = f", with the sign reversed in {named(case.scene, tuple(against))}" if against else ""
+        where = case.scene.named(sensors, "all sensors")
+        sign = f", with the sign reversed in {case.scene.named(against)}" if against else ""
         return found(
             case,
             cls(term.kind, corner, gain),
             shape,
             sensors,
             parameters,
-            f"{_WORDS[term.kind]} common to {named(case.scene, sensors)} that the simulation does not have, up to "
+            f"{_WORDS[term.kind]} common to {where} that the simulation does not have, up to "
             f"{float(size.max()):.3g} {unit}{sign}",
         )
 

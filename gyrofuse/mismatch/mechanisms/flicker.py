@@ -14,7 +14,7 @@ from gyrofuse.mismatch.colour import noise
 from gyrofuse.mismatch.gaussian import Addition
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.shape_terms import Flicker
-from gyrofuse.mismatch.shape_words import found, named, spanned
+from gyrofuse.mismatch.shape_words import found, spanned
 from gyrofuse.mismatch.shapes import chosen_shape, refit
 
 
@@ -44,6 +44,7 @@ class FlickerNoise(Addition):
             parameters[f"level[{i}]"] = spanned(
                 lambda x: math.sqrt(max(x, 0.0)), float(a[i]), float(sd[i]), case.scene.unit
             )
+        where = case.scene.named(sensors, "all sensors")
         largest = max(float(a[i].sqrt()) for i in sensors)
         return found(
             case,
@@ -51,7 +52,7 @@ class FlickerNoise(Addition):
             shape,
             sensors,
             parameters,
-            f"1/f noise in {named(case.scene, sensors)} that the simulation does not have, up to {largest:.3g} "
+            f"1/f noise in {where} that the simulation does not have, up to {largest:.3g} "
             f"{case.scene.unit} rms in each factor e of frequency",
         )
 

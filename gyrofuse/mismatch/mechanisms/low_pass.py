@@ -11,9 +11,9 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.gaussian import Filter
-from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.shape_terms import ORDERS, LowPass, filter_corner, filter_response
-from gyrofuse.mismatch.shape_words import Z, found, named
+from gyrofuse.mismatch.shape_words import found
 from gyrofuse.mismatch.shapes import chosen_shape, refit
 
 
@@ -48,18 +48,18 @@ class LowPassFilter(Filter):
         parameters = {"order": order}
         for i in sensors:
             parameters[f"corner[{i}]"] = Parameter(float(corner[i]), float(lowest[i]), float(highest[i]), "Hz")
+        where = case.scene.named(sensors, "all sensors")
         inside = [float(corner[i]) for i in sensors if math.isfinite(float(corner[i]))]
-        where = f"half power at {min(inside):.4g} Hz" if inside else "half power above half the sampling rate"
+        corners = f"half power at {min(inside):.4g} Hz" if inside else "half power above half the sampling rate"
         if inside and max(inside) > 1.02 * min(inside):
-            where = f"half power between {min(inside):.4g} and {max(inside):.4g} Hz"
+            corners = f"half power between {min(inside):.4g} and {max(inside):.4g} Hz"
         return found(
             case,
             cls(term.kind, strength),
             shape,
             sensors,
             parameters,
-            f"a low-pass filter of order {ORDERS[term.kind]} in {named(case.scene, sensors)} that the simulation does "
-            f"not have, {where}",
+            f"a low-pass filter of order {ORDERS[term.kind]} in {where} that the simulation does not have, {corners}",
             frequency_hz=min(inside) if inside else None,
         )
 

@@ -12,9 +12,9 @@ from torch import Tensor
 from gyrofuse.mismatch.base import Base
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.gaussian import Filter
-from gyrofuse.mismatch.mechanism import Finding, Mechanism
+from gyrofuse.mismatch.mechanism import Finding, Mechanism, Z
 from gyrofuse.mismatch.shape_terms import Parts, Shift
-from gyrofuse.mismatch.shape_words import Z, found, spanned
+from gyrofuse.mismatch.shape_words import found, spanned
 from gyrofuse.mismatch.shapes import chosen_shape, refit
 
 _PARTS = ("white", "ar1", "corner", "random_walk")

@@ -13,10 +13,8 @@ from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.evidence import corrected
 from gyrofuse.mismatch.halves import held_out_blocks
 from gyrofuse.mismatch.marginals import Lattice, missing_lattices, off_lattice
-from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
-from gyrofuse.mismatch.mechanisms.vibration_tone import named_sensors
+from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 
-_Z = 1.959963984540054
 _SHARPEST = 0.02  # blur in steps: what an exact lattice is worth is bounded by it
 
 
@@ -51,9 +49,9 @@ class Quantization(Mechanism):
         parameters = {}
         for i in sensors:
             value = float(step[i])
-            reach = _Z * effect._step_sd(i, case.recording[i])
+            reach = Z * effect._step_sd(i, case.recording[i])
             parameters[f"lsb[{i}]"] = Parameter(value, value - reach, value + reach, case.scene.unit)
-        where = "all sensors" if len(sensors) == case.n_sensors else named_sensors(case.scene, sensors)
+        where = case.scene.named(sensors, "all sensors")
         hidden = ", hidden under what was added later" if float(blur.max()) > 0 else ""
         return Finding(
             cls.name,

@@ -14,8 +14,7 @@ from torch import Tensor
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.halves import N_HALVES
 from gyrofuse.mismatch.impulses import kurtosis_p_values
-from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
-from gyrofuse.mismatch.mechanisms.vibration_tone import named_sensors
+from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.switching import (
     Best,
     Stretches,
@@ -29,7 +28,6 @@ from gyrofuse.mismatch.witnesses import power_tails
 
 Array = NDArray[np.float64]
 
-_Z = 1.959963984540054
 _SUSPECT = 0.01
 _PRESENT = 5.0  # nats over the Gaussian rival
 _LEFT_OUT = 4  # stretches
@@ -81,10 +79,10 @@ class RandomTelegraph(Mechanism):
                 (("half_step", 1.0, case.scene.unit), ("dwell_up", second, "s"), ("dwell_down", second, "s"))
             ):
                 value = scale * math.exp(two.theta[k, j])
-                reach = math.exp(min(_Z * math.sqrt(two.covariance[k, j, j]), 50.0))
+                reach = math.exp(min(Z * math.sqrt(two.covariance[k, j, j]), 50.0))
                 parameters[f"{name}[{i}]"] = Parameter(value, value / reach, value * reach, unit)
         largest = max(sensors, key=lambda i: float(effect.half_step[i]))
-        where = "all sensors" if len(sensors) == n else named_sensors(case.scene, sensors)
+        where = case.scene.named(sensors, "all sensors")
         plain = gaussian_scores(data, 0 * two.theta[:, :1], 1 + 0 * two.theta[:, :1]).sum((1, 2))
         return Finding(
             cls.name,

@@ -14,11 +14,9 @@ from gyrofuse.mismatch.episodes import episodes_of, two_level_scores
 from gyrofuse.mismatch.evidence import corrected
 from gyrofuse.mismatch.halves import held_out_blocks
 from gyrofuse.mismatch.impulses import left_out, levelled, spike_p_values, variance_p_values
-from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
-from gyrofuse.mismatch.mechanisms.vibration_tone import named_sensors
+from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.outliers import Outliers, clustered, fitted, free_gaussian, mixture, simultaneous
 
-_Z = 1.959963984540054
 _HOUR = 3600.0
 _ALIKE = 5.0  # nats
 _PLAIN = 5.0  # sd: outliers that can be taken off one by one
@@ -84,7 +82,7 @@ class Spikes(Mechanism):
             if alike
         ]
         largest = max(hit, key=lambda i: float(effect.amplitude[i]))
-        where = "all sensors" if len(hit) == case.n_sensors else named_sensors(case.scene, hit)
+        where = case.scene.named(hit, "all sensors")
         how = "at the same time, as shocks do" if effect.together else "not at the same time, as errors of a bus are"
         return Finding(
             cls.name,
@@ -170,5 +168,5 @@ def _louder(case: Case) -> float:
 
 
 def _limits(value: float, sd: float, unit: str) -> Parameter:
-    reach = math.exp(min(_Z * sd / max(value, 1e-300), 50.0))
+    reach = math.exp(min(Z * sd / max(value, 1e-300), 50.0))
     return Parameter(value, value / reach, value * reach, unit)

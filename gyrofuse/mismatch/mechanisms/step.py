@@ -10,7 +10,6 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.mechanism import Finding
-from gyrofuse.mismatch.mechanisms.vibration_tone import named_sensors
 from gyrofuse.mismatch.slow import cell_differences
 from gyrofuse.mismatch.slow_effect import (
     SlowEffect,
@@ -61,7 +60,7 @@ class Step(SlowEffect):
         return Finding(
             cls.name,
             effect,
-            f"the bias of {named_sensors(case.scene, which)} steps at {onset.value:.6g} s, by up to "
+            f"the bias of {case.scene.named(which)} steps at {onset.value:.6g} s, by up to "
             f"{abs(float(found.size[largest])):.3g} {case.scene.unit} (sensor {case.scene.sensors[largest]})",
             scan.p_value,
             which,

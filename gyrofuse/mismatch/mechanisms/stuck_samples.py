@@ -13,10 +13,8 @@ from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.evidence import corrected
 from gyrofuse.mismatch.halves import held_out_blocks
 from gyrofuse.mismatch.marginals import repeated, repeats
-from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
-from gyrofuse.mismatch.mechanisms.vibration_tone import named_sensors
+from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 
-_Z = 1.959963984540054
 _TOGETHER = 0.5  # share of the repeats that all have at once, beyond chance
 
 
@@ -50,8 +48,8 @@ class StuckSamples(Mechanism):
             value = float(effect.probability[i])
             own = float(found.share[i])
             sd = math.hypot(float(found.sd[i]), math.sqrt(own * (1 - own) / found.n)) / (1 - float(effect.by_chance[i]))
-            parameters[f"probability[{i}]"] = Parameter(value, max(value - _Z * sd, 0.0), min(value + _Z * sd, 1.0), "")
-        where = "all sensors" if len(sensors) == case.n_sensors else named_sensors(case.scene, sensors)
+            parameters[f"probability[{i}]"] = Parameter(value, max(value - Z * sd, 0.0), min(value + Z * sd, 1.0), "")
+        where = case.scene.named(sensors, "all sensors")
         largest = max(sensors, key=lambda i: float(effect.probability[i]))
         jointly = " at the same time" if effect.together else ""
         return Finding(

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.mechanism import Finding
-from gyrofuse.mismatch.mechanisms.vibration_tone import named_sensors
 from gyrofuse.mismatch.slow import scores
 from gyrofuse.mismatch.slow_effect import SlowEffect, estimate, only, place, plausible, sizes, slow_levels, strong_scan
 from gyrofuse.mismatch.slow_scans import Scan, SlowLook, concerned, lagged, temperature
@@ -63,7 +62,7 @@ class TemperatureDrift(SlowEffect):
         return Finding(
             cls.name,
             effect,
-            f"the bias of {named_sensors(case.scene, which)} follows {channel}{behind}, by up to "
+            f"the bias of {case.scene.named(which)} follows {channel}{behind}, by up to "
             f"{abs(float(found.size[largest])):.3g} {unit} (sensor {case.scene.sensors[largest]})",
             scan.p_value,
             which,

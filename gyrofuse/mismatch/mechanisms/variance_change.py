@@ -15,10 +15,8 @@ from gyrofuse.mismatch.episodes import episodes_of, onset_limits, two_level_scor
 from gyrofuse.mismatch.evidence import corrected
 from gyrofuse.mismatch.halves import held_out_blocks
 from gyrofuse.mismatch.impulses import levelled, variance_p_values
-from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
-from gyrofuse.mismatch.mechanisms.vibration_tone import named_sensors
+from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 
-_Z = 1.959963984540054
 _SLOWER = 65  # samples: what varies more slowly is not louder
 
 
@@ -58,12 +56,12 @@ class VarianceChange(Mechanism):
         }
         inside = sum(e.stop - e.start for e in found.episodes)
         for i in sensors:
-            reach = math.exp(_Z * math.sqrt(2 / inside + 2 / max(case.n_samples - inside, 1)))
+            reach = math.exp(Z * math.sqrt(2 / inside + 2 / max(case.n_samples - inside, 1)))
             value = float(found.factor[i])
             parameters[f"factor[{i}]"] = Parameter(value, value / reach, value * reach, "")
         gain = float(two_level_scores(white, found.factor, found.inside(case.n_samples)).sum())
         largest = max(sensors, key=lambda i: abs(math.log(float(found.factor[i]))))
-        where = "all sensors" if len(sensors) == case.n_sensors else named_sensors(case.scene, sensors)
+        where = case.scene.named(sensors, "all sensors")
         more = f" and {len(found.episodes) - 1} more times" if len(found.episodes) > 1 else ""
         return Finding(
             cls.name,

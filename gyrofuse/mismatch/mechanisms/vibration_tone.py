@@ -10,10 +10,9 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.case import Case, Scene
-from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.witnesses import level_of
 
-_Z = 1.959963984540054
 _ROUNDS = 6
 
 
@@ -54,7 +53,7 @@ class VibrationTone(Mechanism):
         for i in present:
             parameters[f"amplitude[{i}]"] = _limits(float(tone.amplitude[i]), float(sd[i]), case.scene.unit)
         largest = max(present, key=lambda i: float(tone.amplitude[i]))
-        where = "all sensors" if len(present) == case.n_sensors else named_sensors(case.scene, present)
+        where = case.scene.named(present, "all sensors")
         return Finding(
             cls.name,
             tone,
@@ -124,10 +123,5 @@ def density_near(case: Case, f: float) -> Tensor:
     return (power / shape).mean(-1) * here
 
 
-def named_sensors(scene: Scene, which: tuple[int, ...]) -> str:
-    """Sensors by their names, for a sentence."""
-    return ("sensor " if len(which) == 1 else "sensors ") + ", ".join(scene.sensors[i] for i in which)
-
-
 def _limits(value: float, sd: float, unit: str) -> Parameter:
-    return Parameter(value, value - _Z * sd, value + _Z * sd, unit)
+    return Parameter(value, value - Z * sd, value + Z * sd, unit)

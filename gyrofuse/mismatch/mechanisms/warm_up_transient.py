@@ -11,7 +11,6 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.mechanism import Finding
-from gyrofuse.mismatch.mechanisms.vibration_tone import named_sensors
 from gyrofuse.mismatch.slow_effect import SlowEffect, estimate, only, place, plausible, sizes, slow_levels, strong_scan
 from gyrofuse.mismatch.slow_scans import concerned, warm_ups
 
@@ -49,7 +48,7 @@ class WarmUpTransient(SlowEffect):
         return Finding(
             cls.name,
             effect,
-            f"the bias of {named_sensors(case.scene, which)} decays after the start with a time constant of "
+            f"the bias of {case.scene.named(which)} decays after the start with a time constant of "
             f"{tau.value:.3g} s, by up to {abs(float(found.size[largest])):.3g} {case.scene.unit} "
             f"(sensor {case.scene.sensors[largest]})",
             scan.p_value,
