@@ -15,7 +15,7 @@ from gyrofuse import AR1, RandomWalk, WhiteNoise
 from gyrofuse.haar import haar_coefficients
 from gyrofuse.mismatch import episodes, impulses, marginals, outliers, switching
 from gyrofuse.mismatch.case import Case, Scene
-from gyrofuse.mismatch.halves import estimation_samples
+from gyrofuse.mismatch.confirm import held_out_gain
 from gyrofuse.mismatch.mechanism import Finding, Mechanism
 from gyrofuse.mismatch.mechanisms.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.quantization import Quantization
@@ -67,9 +67,9 @@ def nominated(case: Case, mechanism: type[Mechanism]) -> Finding:
 
 def settled(case: Case, found: Finding, g: torch.Generator) -> Case:
     """The case after the repair, in which the same is not found again; the repair gains on data held out."""
-    gains = found.effect.refitted(case, estimation_samples(N)).gains(case)
-    assert gains.shape == (16,)
-    assert float(gains.sum()) > 1.7 * float(gains.std()) * 4
+    gain = held_out_gain(case, found.effect)
+    assert gain.blocks.shape == (32,)
+    assert gain.total > 1.7 * gain.sd
     after = found.effect.explained(case, g)
     assert type(found.effect).nominate(after, LEVEL) is None
     return after

@@ -14,11 +14,10 @@ import gyrofuse as gf
 from gyrofuse.mismatch.base import Base, _time_constants
 from gyrofuse.mismatch.case import Case, Scene, block_means
 from gyrofuse.mismatch.confirm import held_out_gain
-from gyrofuse.mismatch.halves import estimation_samples
 from gyrofuse.mismatch.mechanisms.step import Step
 from gyrofuse.mismatch.mechanisms.temperature_drift import TemperatureDrift
 from gyrofuse.mismatch.mechanisms.warm_up_transient import WarmUpTransient
-from gyrofuse.mismatch.slow import best_fit, bridged, cell_differences, differences, slow_noise
+from gyrofuse.mismatch.slow import best_fit, cell_differences, differences, slow_noise
 from gyrofuse.mismatch.slow_effect import quantiles
 from gyrofuse.mismatch.slow_scans import (
     curve_length,
@@ -67,12 +66,6 @@ def test_covariance_of_cells_is_that_of_the_samples():
     for row, own in zip(coefficients.numpy(), found, strict=True):
         direct = sum(c * to_differences @ atom @ to_differences.T for c, atom in zip(row, atoms, strict=True))
         np.testing.assert_allclose(own, direct, rtol=1e-8, atol=1e-9 * np.abs(direct).max())
-
-
-def test_differences_are_taken_over_gaps():
-    kept = torch.tensor([0, 1, 1, 0, 0, 1, 0, 1]).bool()
-    means = torch.randn(8, generator=generator(3), dtype=torch.float64)
-    assert torch.allclose(bridged(kept) @ means.diff(), means[kept].diff())
 
 
 def test_the_fit_is_a_maximum():
@@ -198,8 +191,8 @@ def test_an_effect_is_found_by_its_name(mechanism, path: torch.Tensor, place: st
     assert slow_witness(after).p_value > 0.01
     back = finding.effect.simulated(finding.effect.removed(now.recording, now.scene), now.scene, generator(1))
     assert torch.allclose(back, now.recording)
-    refitted = finding.effect.refitted(now, estimation_samples(N))
-    assert refitted.gains(now).shape == (16,)
+    refitted = finding.effect.refitted(now, 0)
+    assert refitted.gains(now, 0).shape == (8,)
     assert float((refitted.size - scale * SIZE)[[0, 2]].abs().max()) < 0.5 * scale
 
 

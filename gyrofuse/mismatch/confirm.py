@@ -1,4 +1,4 @@
-"""Confirmation on data that a repair has not seen: interleaved blocks, one half to estimate, the other to judge."""
+"""Confirmation on data that a repair has not seen: each fold of blocks with numbers estimated from the others."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from torch import Tensor
 
 from gyrofuse.covariance import wavelet_cross_covariance
 from gyrofuse.mismatch.case import Case
-from gyrofuse.mismatch.halves import N_HALVES, estimation_samples, held_out_blocks
+from gyrofuse.mismatch.folds import N_FOLDS, N_JUDGED, held_out_blocks, in_fold
 from gyrofuse.mismatch.mechanism import Mechanism, Z
 
-_ACCEPTED_T = 1.7
+_ACCEPTED_T = 1.0
 _BEYOND_DOUBT = 1e-6
 _SHORTEST = 8  # a block is so many times as long as its longest wavelet
 
 
 class Gain(NamedTuple):
-    """Gain in log score on the blocks held out, nats, `(block,)`, and the mechanism refitted to the others."""
+    """Gain in log score of each block while it was held out, nats, `(block,)`, and the mechanism of each fold."""
 
     blocks: Tensor
-    refitted: Mechanism
+    refitted: tuple[Mechanism, ...]
 
     @property
     def total(self) -> float:
@@ -36,8 +36,8 @@ class Gain(NamedTuple):
     def confirms(self, p_value: float) -> bool:
         """Whether a finding of that p value holds on the blocks held out.
 
-        By more than chance would have it; for what is beyond doubt where it was found it is enough not to be worse,
-        since many numbers from half the data cost much of what half the data can gain.
+        By more than its own scatter; for what is beyond doubt where it was found it is enough not to be worse, since
+        many numbers cost much of what is held out.
         """
         return self.total > (0.0 if p_value < _BEYOND_DOUBT else _ACCEPTED_T * self.sd)
 
@@ -64,46 +64,56 @@ class HeldOut(NamedTuple):
 
 
 def held_out_gain(case: Case, effect: Mechanism) -> Gain:
-    """Gain in log score of one mechanism, its numbers estimated on the other half."""
-    refitted = effect.refitted(case, estimation_samples(case.n_samples))
-    return Gain(refitted.gains(case), refitted)
+    """Gain in log score of one mechanism on every block, its numbers estimated without the block's fold."""
+    refitted = tuple(effect.refitted(case, fold) for fold in range(N_FOLDS))
+    blocks = torch.empty(N_JUDGED, dtype=torch.float64)
+    for fold, one in enumerate(refitted):
+        blocks[in_fold(N_JUDGED, fold)] = one.gains(case, fold)
+    return Gain(blocks, refitted)
 
 
 def held_out(start: Case, gains: Sequence[Gain], generator: torch.Generator) -> HeldOut:
-    """Agreement before and after all repairs, their numbers estimated on the even blocks.
+    """Agreement before and after all repairs, on blocks that their numbers were not estimated from.
 
     Args:
         start: Recording and simulation as they came.
         gains: Of the findings, in order.
         generator: Of what is built into the simulation.
     """
-    after = start
-    for gain in gains:
-        after = gain.refitted.explained(after, generator)
     total, reach = sum(gain.total for gain in gains), 0.0
     if gains:
         reach = Z * _sd_of_sum(torch.stack([gain.blocks for gain in gains]).sum(0))
-    return HeldOut(discrepancy(start), discrepancy(after), total, total - reach, total + reach)
+    before = torch.stack([discrepancy(start, fold) for fold in range(N_FOLDS)]).mean()
+    after = before
+    if gains:
+        repaired = []
+        for fold in range(N_FOLDS):
+            case = start
+            for gain in gains:
+                case = gain.refitted[fold].explained(case, generator)
+            repaired.append(discrepancy(case, fold))
+        after = torch.stack(repaired).mean()
+    return HeldOut(float(before), float(after), total, total - reach, total + reach)
 
 
 def _sd_of_sum(blocks: Tensor) -> float:
     return float(blocks.std()) * math.sqrt(len(blocks))
 
 
-def discrepancy(case: Case) -> float:
+def discrepancy(case: Case, fold: int) -> Tensor:
     """Squared difference of wavelet cross-covariances over its variance, mean over levels and pairs of sensors.
 
-    On the blocks held out of the recording, against all blocks of the simulation, which also tell the variance.
+    On the blocks of the recording that a fold holds out, against all of the simulation, which also tell the variance.
     """
-    recorded = _block_moments(held_out_blocks(case.recording))
-    n = case.n_samples // N_HALVES
+    recorded = _block_moments(held_out_blocks(case.recording, fold))
+    n = case.n_samples // N_JUDGED
     usable = case.simulated.signal[..., : case.simulated.signal.shape[-1] // n * n]
     simulated = _block_moments(usable.unflatten(-1, (-1, n))).flatten(0, 1)
     n_recorded, n_simulated = len(recorded), len(simulated)
     variance = simulated.var(0) * (1 / n_recorded + 1 / n_simulated)
     # The variance is itself estimated, as in Student's distribution.
     expected = (n_simulated - 1) / (n_simulated - 3)
-    return float(((recorded.mean(0) - simulated.mean(0)).square() / variance).mean()) / expected
+    return ((recorded.mean(0) - simulated.mean(0)).square() / variance).mean() / expected
 
 
 def _block_moments(blocks: Tensor) -> Tensor:

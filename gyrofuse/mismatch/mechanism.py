@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gyrofuse._result import cleaned
 from gyrofuse.mismatch.case import Case, Scene
-from gyrofuse.mismatch.halves import spectral_gains
+from gyrofuse.mismatch.folds import spectral_gains
 
 Z = 1.959963984540054  # of 95 % limits
 
@@ -62,19 +62,19 @@ class Mechanism:
         """
         return matrices
 
-    def gains(self, case: Case) -> Tensor:
-        """Gain in log score of each block that was held out, `(block,)`, nats, with the numbers as they are.
+    def gains(self, case: Case, fold: int) -> Tensor:
+        """Gain in log score of each block that a fold holds out, `(block,)`, nats, with the numbers as they are.
 
         By default that of the spectra of what is left; where a mechanism is no matter of spectra, its own likelihood.
         """
-        return spectral_gains(case, self.removed(case.recording, case.scene), self.spectra)
+        return spectral_gains(case, self.removed(case.recording, case.scene), self.spectra, fold)
 
-    def refitted(self, case: Case, keep: Tensor) -> Mechanism:
-        """The same mechanism with its numbers estimated anew from the samples `keep` `(time,)` alone.
+    def refitted(self, case: Case, fold: int) -> Mechanism:
+        """The same mechanism with its numbers estimated anew, where it is known to be, without what a fold holds out.
 
         Args:
             case: As it was when the mechanism was found.
-            keep: Which samples may be used.
+            fold: Which one.
         """
         raise NotImplementedError
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.bumps import Oscillation, Stretch, oscillation_of
 from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.folds import estimation_samples
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.shape_terms import Bump, CommonBump, oscillation
 from gyrofuse.mismatch.shape_words import spanned
@@ -132,8 +133,9 @@ def nominated(case: Case, level: float, *, tone: bool) -> tuple[Mode, Seen] | No
     return mode, Seen(case, bump, verdict, sensors, rivals)
 
 
-def refitted_mode(case: Case, keep: Tensor, mode: Mode) -> Mode:
-    """The same centre and width, gains from the power over the flanks in blocks of the samples `keep`."""
+def refitted_mode(case: Case, fold: int, mode: Mode) -> Mode:
+    """The same centre and width, gains from the power over the flanks in blocks that a fold does not hold out."""
+    keep = estimation_samples(case.n_samples, fold)
     block = run_length(keep)
     blocks = case.recording[:, keep].unflatten(-1, (-1, block))
     taper = torch.hann_window(block, dtype=torch.float64) * math.sqrt(8 / 3 / block)

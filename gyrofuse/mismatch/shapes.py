@@ -14,6 +14,7 @@ from torch import Tensor
 from gyrofuse.mismatch.bumps import oscillation_of
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import corrected
+from gyrofuse.mismatch.folds import estimation_samples
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.shape_fit import Fit, Ratios, data_model, fit, log_score, ratios
 from gyrofuse.mismatch.shape_terms import FILTERS, Bump, Common, CommonBump, Flicker, LowPass, Shift, Term, oscillation
@@ -86,8 +87,9 @@ def compared(case: Case) -> Ratios:
     return ratios(case.recorded, case.simulated, case.base, usable)
 
 
-def refit(case: Case, keep: Tensor, term: Term) -> Term:
-    """A shape with its numbers estimated anew from blocks of samples, in the company of no other."""
+def refit(case: Case, fold: int, term: Term) -> Term:
+    """A shape with its numbers estimated anew without what a fold holds out, in the company of no other."""
+    keep = estimation_samples(case.n_samples, fold)
     block = run_length(keep)
     recorded = case.recording[:, keep].unflatten(-1, (-1, block)).movedim(1, 0)
     simulated = case.simulated.signal
@@ -100,7 +102,7 @@ def refit(case: Case, keep: Tensor, term: Term) -> Term:
 
 
 def run_length(keep: Tensor) -> int:
-    """Length of the runs of samples kept, which are equally long."""
+    """Length of the shortest run of samples kept, of which the others are multiples."""
     edges = torch.nn.functional.pad(keep.to(torch.int8), (1, 1)).diff().nonzero()[:, 0]
     return int(edges.diff()[::2].min())
 

@@ -57,11 +57,6 @@ class SlowNoise:
         """`(sensor, difference, difference)` with factors `(sensor, part)`."""
         return torch.einsum("sp,spij->sij", log_factors.exp(), self.parts)
 
-    def among(self, kept: Tensor) -> SlowNoise:
-        """The same for the blocks `kept` `(block,)` alone, their differences taken over the gaps."""
-        sums = bridged(kept)
-        return replace(self, parts=sums @ self.parts @ sums.mT)
-
 
 class Fit(NamedTuple):
     """Best log factors of a template, `x = 0` without one.
@@ -154,18 +149,6 @@ def scores(y: Tensor, inverse: Tensor, templates: Tensor) -> tuple[Tensor, Tenso
 def differences(signal: Tensor) -> Tensor:
     """Successive differences of the means of 256 blocks, `(..., time)` -> `(..., difference)`."""
     return block_means(signal).diff()
-
-
-def bridged(kept: Tensor) -> Tensor:
-    """Which sums of successive differences are those between the blocks kept, `(difference kept, difference)`."""
-    at = kept.nonzero()[:, 0]
-    place = torch.arange(len(kept) - 1)
-    return ((place >= at[:-1, None]) & (place < at[1:, None])).to(torch.float64)
-
-
-def whole_blocks(keep: Tensor) -> Tensor:
-    """Which of the 256 blocks have all their samples in `keep` `(time,)`."""
-    return block_means(keep.to(torch.float64)) == 1
 
 
 @functools.lru_cache(maxsize=4)

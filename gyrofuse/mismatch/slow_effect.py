@@ -1,11 +1,9 @@
 """Effects with one path for all sensors, each in its own size: what steps, warm-ups and temperature drifts share.
 
-Held-out blocks judge them thus. The means over the held-out blocks have a joint covariance; they are whitened with it,
-and compared with the template of the sizes that the other blocks gave. What a slow effect does may all happen in one
-block: so the whitened means are turned such that every share of them sees the same part of the effect. The other
-directions that come in are slow cosines: where the noise is stronger than thought, the shares scatter more.
-Interleaved blocks lie closer than the noise's memory: nothing is predicted from the blocks in between. An effect that
-is over within one of them is split finer: every other one of the 256 blocks judges.
+Held out are whitened differences of block means, which are independent: folds take them in turns. What a slow effect
+does may all happen in one of them, so those that judge are turned such that every share of them sees the same part of
+the effect. The other directions that come in are slow cosines: where the noise is stronger than thought, the shares
+scatter more.
 """
 
 from __future__ import annotations
@@ -18,16 +16,15 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.case import N_BLOCKS, Case, Scene
-from gyrofuse.mismatch.halves import N_HALVES, estimation_samples
+from gyrofuse.mismatch.folds import N_FOLDS, N_JUDGED, in_fold
 from gyrofuse.mismatch.mechanism import Mechanism, Parameter, Z
-from gyrofuse.mismatch.slow import bridged, differences, scores, whole_blocks
+from gyrofuse.mismatch.slow import differences, scores
 from gyrofuse.mismatch.slow_scans import Family, Scan, SlowLook, concerned, slow_look
 
 _STRONG = 5e-4  # a slow effect leaves traces that look like another one: largest p value
 _TOO_CLOSE = 5.0  # nats
 _PLAUSIBLE = 6.0  # nats below the best place
-_TOO_LITTLE = 0.25
-_SHARES = N_HALVES // 2
+_SHARES = N_JUDGED // N_FOLDS
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,47 +52,36 @@ class SlowEffect(Mechanism):
     def explained(self, case: Case, generator: torch.Generator) -> Case:
         return case.less(self._effect(case.n_samples, case.scene))
 
-    def refitted(self, case: Case, keep: Tensor) -> SlowEffect:
-        """Sizes by generalised least squares on the blocks whose samples are all kept; the path stays."""
-        kept = whole_blocks(keep)
-        if self._brief(case):
-            kept = kept & _even_blocks()
-        y, x, root = self._among(case, kept)
-        size = scores(y, torch.cholesky_inverse(root), x[None])[0][:, 0]
-        # Nothing is learnt of a path that does not change over the blocks.
-        size = torch.where(size.isfinite() & (self.size != 0), size, 0.0)
-        return replace(self, size=size)
+    def refitted(self, case: Case, fold: int) -> SlowEffect:
+        """Sizes by generalised least squares without the whitened differences that the fold holds out."""
+        y, directions = self._whitened(case)
+        x = directions[..., 0] * ~in_fold(y.shape[-1], fold)
+        size = (x * y).sum(-1) / x.square().sum(-1)
+        return replace(self, size=torch.where(size.isfinite() & (self.size != 0), size, 0.0))
 
-    def gains(self, case: Case) -> Tensor:
-        judged = ~_even_blocks() if self._brief(case) else whole_blocks(~estimation_samples(case.n_samples))
-        y, x, root = self._among(case, judged)
-        white = torch.linalg.solve_triangular(root, y[..., None], upper=False)  # (sensor, difference, 1)
-        k = torch.arange(1, _SHARES, dtype=torch.float64)[:, None]
-        t = torch.arange(len(x) + 1, dtype=torch.float64)
-        cosines = (math.pi * k * (t + 0.5) / len(t)).cos().diff()
-        directions = self.size[:, None, None] * torch.cat([x[None], cosines]).mT  # (sensor, difference, direction)
-        directions = torch.linalg.solve_triangular(root, directions, upper=False).flatten(0, 1)
+    def gains(self, case: Case, fold: int) -> Tensor:
+        y, directions = self._whitened(case)
+        judged = in_fold(y.shape[-1], fold)
+        directions = (self.size[:, None, None] * directions)[:, judged].flatten(0, 1)
         length = directions[:, 0].norm() / math.sqrt(_SHARES)
         axes = torch.linalg.qr(directions).Q
         axes[:, 0] *= (axes[:, 0] @ directions[:, 0]).sign()
-        seen = _hadamard(_SHARES) @ (axes.mT @ white.flatten())
+        seen = _hadamard(_SHARES) @ (axes.mT @ y[:, judged].flatten())
         return length * seen - length.square() / 2
 
-    def _brief(self, case: Case) -> bool:
-        """Whether all but a quarter of the effect falls into the blocks to estimate with."""
-        among = [whole_blocks(estimation_samples(case.n_samples) == kept) for kept in (True, False)]
-        seen, judged = (
-            (torch.linalg.solve_triangular(root, x[:, None], upper=False).square().sum((-1, -2)) * self.size**2).sum()
-            for _, x, root in (self._among(case, blocks) for blocks in among)
-        )
-        return bool(judged < _TOO_LITTLE * (seen + judged))
+    def _whitened(self, case: Case) -> tuple[Tensor, Tensor]:
+        """Whitened differences of block means, `(sensor, difference)`, and directions `(sensor, difference, _SHARES)`.
 
-    def _among(self, case: Case, kept: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Differences of the blocks kept, the path's, and the Cholesky factor of their covariance."""
-        look, sums = slow_look(case), bridged(kept)
-        root = torch.linalg.cholesky(look.noise.among(kept).covariance(self.log_factors))
+        The first is the path's; the others are slow cosines.
+        """
+        look = slow_look(case)
+        root = torch.linalg.cholesky(look.noise.covariance(self.log_factors))
+        k = torch.arange(1, _SHARES, dtype=torch.float64)[:, None]
+        cosines = (math.pi * k * (torch.arange(N_BLOCKS) + 0.5) / N_BLOCKS).cos().diff()
         x = differences(self.path(case.n_samples, case.scene))
-        return look.y @ sums.mT, sums @ x, root
+        both = torch.cat([look.y[..., None], torch.cat([x[None], cosines]).mT.expand(len(look.y), -1, -1)], -1)
+        white = torch.linalg.solve_triangular(root, both, upper=False)
+        return white[..., 0], white[..., 1:]
 
     def _effect(self, n_samples: int, scene: Scene) -> Tensor:
         return self.size[:, None] * self.path(n_samples, scene)
@@ -193,10 +179,6 @@ def sizes(name: str, found: Estimate, which: tuple[int, ...], unit: str) -> dict
 def slow_levels(n_samples: int) -> tuple[int, ...]:
     """Wavelet levels at which a block is no more than half a wavelet."""
     return tuple(range(int(math.log2(n_samples / N_BLOCKS)) + 1, int(math.log2(n_samples)) + 1))
-
-
-def _even_blocks() -> Tensor:
-    return torch.arange(N_BLOCKS) % 2 == 0
 
 
 def _hadamard(n: int) -> Tensor:

@@ -7,7 +7,7 @@ Both stand on a wandering background `b_k = b_{k-1} + N(0, q)` seen in white noi
 by filters for the four pairs of states before and now, merged to two after each block (Harrison and Stevens, 1976;
 Kim, 1994).
 The rival has an Ornstein-Uhlenbeck process of any variance and time constant instead (Kalman's filter).
-The record is cut into as many stretches as there are halves; each filter starts one stretch earlier.
+The record is cut into as many stretches as there are blocks to judge; each filter starts one stretch earlier.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.base import Base
 from gyrofuse.mismatch.case import Case
-from gyrofuse.mismatch.halves import N_HALVES
+from gyrofuse.mismatch.folds import N_JUDGED
 
 Array = NDArray[np.float64]
 
@@ -55,10 +55,10 @@ class Stretches(NamedTuple):
 
 def stretches(case: Case, sensors: tuple[int, ...]) -> Stretches:
     """Block means of sensors of the recording."""
-    length = case.n_samples // N_HALVES
+    length = case.n_samples // N_JUDGED
     n = min(_MOST_BLOCKS, length)
     block = length // n
-    x = case.recording[list(sensors), : length * N_HALVES].unflatten(-1, (N_HALVES, length))
+    x = case.recording[list(sensors), : length * N_JUDGED].unflatten(-1, (N_JUDGED, length))
     own = x[..., : n * block].unflatten(-1, (n, block)).mean(-1).numpy()
     before = np.concatenate([np.full_like(own[:, :1], np.nan), own[:, :-1]], axis=1)
     near, far = (_variogram(case.base, block, lag)[list(sensors)] for lag in (1, _FAR))

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.channels import ChannelFit, regress
-from gyrofuse.mismatch.halves import signal_gains
+from gyrofuse.mismatch.folds import estimation_samples, signal_gains
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.witnesses import level_of
 
@@ -87,8 +87,9 @@ class ChannelGain(Mechanism):
             gain=fit.statistic / 2,
         )
 
-    def refitted(self, case: Case, keep: Tensor) -> ChannelGain:
+    def refitted(self, case: Case, fold: int) -> ChannelGain:
         """Regression on the kept samples alone, the others left out of both sides."""
+        keep = estimation_samples(case.n_samples, fold)
         weight = keep.to(torch.float64)
         rows = self._rows(case.scene, self.channel)
         means = [(v * weight).sum(-1, keepdim=True) / weight.sum() for v in (rows, case.recording)]
@@ -96,8 +97,8 @@ class ChannelGain(Mechanism):
         present = tuple(self.coupling.any(-1).nonzero()[:, 0].tolist())
         return self if fit is None else type(self)(self.channel, _only(fit.gains, present))
 
-    def gains(self, case: Case) -> Tensor:
-        return signal_gains(case, self._path(case.scene, case.n_samples))
+    def gains(self, case: Case, fold: int) -> Tensor:
+        return signal_gains(case, self._path(case.scene, case.n_samples), fold)
 
     def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
         return signal + self._path(scene, signal.shape[-1])

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.evidence import corrected
-from gyrofuse.mismatch.halves import held_out_blocks
+from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.impulses import left_out
 from gyrofuse.mismatch.marginals import EndStop, end_stops
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
@@ -62,7 +62,8 @@ class Clipping(Mechanism):
             gain=float(effect._scores(case).sum()),
         )
 
-    def refitted(self, case: Case, keep: Tensor) -> Clipping:
+    def refitted(self, case: Case, fold: int) -> Clipping:
+        keep = estimation_samples(case.n_samples, fold)
         part = case.recording[:, keep]
         low = torch.where(self.low.isfinite(), part.amin(-1), self.low)
         high = torch.where(self.high.isfinite(), part.amax(-1), self.high)
@@ -75,8 +76,8 @@ class Clipping(Mechanism):
     def explained(self, case: Case, generator: torch.Generator) -> Case:
         return case.with_simulation(self.simulated(case.simulated.signal, case.scene, generator))
 
-    def gains(self, case: Case) -> Tensor:
-        return held_out_blocks(self._scores(case)).sum((0, -1))
+    def gains(self, case: Case, fold: int) -> Tensor:
+        return held_out_blocks(self._scores(case), fold).sum((0, -1))
 
     def _clipped(self, signal: Tensor) -> Tensor:
         return (signal <= self.low[:, None]) | (signal >= self.high[:, None])

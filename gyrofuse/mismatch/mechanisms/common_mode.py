@@ -92,9 +92,9 @@ class CommonMode(Addition):
     def _source(self, f: Tensor) -> Tensor:
         return common_density(self.kind, f, torch.tensor([self.corner], dtype=torch.float64))
 
-    def refitted(self, case: Case, keep: Tensor) -> Mechanism:
+    def refitted(self, case: Case, fold: int) -> Mechanism:
         shared = torch.tensor([math.log(self.corner)] if self.kind == "ar1" else [], dtype=torch.float64)
         local = torch.stack([self.gain.real, self.gain.imag])
-        term = refit(case, keep, Common(local, torch.ones_like(local, dtype=torch.bool), shared, self.kind))
+        term = refit(case, fold, Common(local, torch.ones_like(local, dtype=torch.bool), shared, self.kind))
         corner = math.exp(float(term.shared[0])) if self.kind == "ar1" else 0.0
         return replace(self, gain=torch.complex(*term.local), corner=corner)

@@ -89,8 +89,8 @@ class DriftingTone(Addition):
         transform[:, first : last + 1] = fresh * (level * density[:, first : last + 1]).sqrt()
         return case.with_recording(torch.fft.irfft(transform, n=n) + ramp)
 
-    def refitted(self, case: Case, keep: Tensor) -> Mechanism:
-        return replace(self, mode=refitted_mode(case, keep, self.mode))
+    def refitted(self, case: Case, fold: int) -> Mechanism:
+        return replace(self, mode=refitted_mode(case, fold, self.mode))
 
 
 def _wandered(steps: Tensor, phi: float) -> Tensor:

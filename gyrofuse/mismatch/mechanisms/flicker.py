@@ -62,7 +62,7 @@ class FlickerNoise(Addition):
     def path(self, n_samples: int, generator: torch.Generator) -> Tensor:
         return self.level.sqrt()[:, None] * noise(n_samples, torch.reciprocal, len(self.level), generator)
 
-    def refitted(self, case: Case, keep: Tensor) -> Mechanism:
+    def refitted(self, case: Case, fold: int) -> Mechanism:
         own = self.level[None]
         term = Flicker(own, own > 0, torch.zeros(0, dtype=torch.float64))
-        return replace(self, level=refit(case, keep, term).local[0])
+        return replace(self, level=refit(case, fold, term).local[0])

@@ -66,7 +66,7 @@ class LowPassFilter(Filter):
     def response(self, f: Tensor) -> Tensor:
         return filter_response(self.kind, self.strength, f)
 
-    def refitted(self, case: Case, keep: Tensor) -> Mechanism:
+    def refitted(self, case: Case, fold: int) -> Mechanism:
         own = self.strength[None]
         term = LowPass(own, own > 0, torch.zeros(0, dtype=torch.float64), self.kind)
-        return replace(self, strength=refit(case, keep, term).local[0])
+        return replace(self, strength=refit(case, fold, term).local[0])

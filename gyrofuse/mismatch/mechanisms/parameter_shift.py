@@ -75,9 +75,9 @@ class ParameterShift(Filter):
         parts = Parts(self.base, f.clamp(min=1 / self.base.n_samples))
         return (parts.shifted(self.log_factors) / parts.densities.sum(0)).sqrt()
 
-    def refitted(self, case: Case, keep: Tensor) -> Mechanism:
+    def refitted(self, case: Case, fold: int) -> Mechanism:
         term = Shift(self.log_factors, self.log_factors != 0, torch.zeros(0, dtype=torch.float64))
-        return replace(self, log_factors=refit(case, keep, term).local)
+        return replace(self, log_factors=refit(case, fold, term).local)
 
 
 def _numbers(base: Base, rate: float, unit: str) -> list[list[tuple[float, str]]]:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.evidence import corrected
-from gyrofuse.mismatch.halves import held_out_blocks
+from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.marginals import Lattice, missing_lattices, off_lattice
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 
@@ -64,7 +64,8 @@ class Quantization(Mechanism):
             gain=float(effect._scores(case.recording).sum()),
         )
 
-    def refitted(self, case: Case, keep: Tensor) -> Quantization:
+    def refitted(self, case: Case, fold: int) -> Quantization:
+        keep = estimation_samples(case.n_samples, fold)
         place = off_lattice(case.recording[:, keep], self._divisor, self.offset[:, None])
         turn = torch.exp(2j * math.pi * place).mean(-1)
         offset = self.offset + turn.angle() / (2 * math.pi) * self.step
@@ -79,8 +80,8 @@ class Quantization(Mechanism):
     def explained(self, case: Case, generator: torch.Generator) -> Case:
         return case.with_simulation(self.simulated(case.simulated.signal, case.scene, generator))
 
-    def gains(self, case: Case) -> Tensor:
-        return held_out_blocks(self._scores(case.recording)).sum((0, -1))
+    def gains(self, case: Case, fold: int) -> Tensor:
+        return held_out_blocks(self._scores(case.recording), fold).sum((0, -1))
 
     @property
     def _divisor(self) -> Tensor:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gyrofuse.mismatch.case import Case, Scene
-from gyrofuse.mismatch.halves import N_HALVES
+from gyrofuse.mismatch.folds import N_JUDGED, in_fold
 from gyrofuse.mismatch.impulses import kurtosis_p_values
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.switching import (
@@ -56,7 +56,7 @@ class RandomTelegraph(Mechanism):
         suspects = _suspects(case)
         if not suspects:
             return None
-        data, every = stretches(case, suspects), torch.ones(N_HALVES, dtype=torch.bool)
+        data, every = stretches(case, suspects), torch.ones(N_JUDGED, dtype=torch.bool)
         two, rival = best_switching(data, every), best_gaussian(data, every)
         over = _without_best(data, two, rival)
         dwell = torch.from_numpy(two.theta[:, 1:]).exp()
@@ -106,12 +106,10 @@ class RandomTelegraph(Mechanism):
         numbers[1:, sensors] *= block / case.scene.rate
         return cls(*numbers)
 
-    def refitted(self, case: Case, keep: Tensor) -> RandomTelegraph:
+    def refitted(self, case: Case, fold: int) -> RandomTelegraph:
         sensors = self.half_step.nonzero()[:, 0].tolist()
-        length = case.n_samples // N_HALVES
-        usable = keep[: length * N_HALVES].unflatten(-1, (N_HALVES, length)).all(-1)
         data = stretches(case, tuple(sensors))
-        return self._of(case, sensors, best_switching(data, usable).theta, data.block)
+        return self._of(case, sensors, best_switching(data, ~in_fold(N_JUDGED, fold)).theta, data.block)
 
     def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
         n = signal.shape[-1]
@@ -125,14 +123,14 @@ class RandomTelegraph(Mechanism):
     def explained(self, case: Case, generator: torch.Generator) -> Case:
         return case.with_simulation(self.simulated(case.simulated.signal, case.scene, generator))
 
-    def gains(self, case: Case) -> Tensor:
+    def gains(self, case: Case, fold: int) -> Tensor:
         sensors = tuple(self.half_step.nonzero()[:, 0].tolist())
         data = stretches(case, sensors)
         at = list(sensors)
         block = data.block / case.scene.rate
         half, up, down = (v[at, None].numpy() for v in (self.half_step, self.up / block, self.down / block))
         gain = switching_scores(data, half, up, down) - gaussian_scores(data, 0 * half, 1 + 0 * half)
-        return torch.from_numpy(gain.sum((0, 1)))[1::2]
+        return torch.from_numpy(gain.sum((0, 1)))[in_fold(N_JUDGED, fold)]
 
 
 def _without_best(data: Stretches, two: Best, rival: Best) -> Array:
@@ -141,7 +139,7 @@ def _without_best(data: Stretches, two: Best, rival: Best) -> Array:
     sd, tau = np.exp(rival.theta.T)[..., None]
     scores = switching_scores(data, half, up, down)[:, 0]
     over = scores - gaussian_scores(data, sd, tau)[:, 0]
-    rest = np.argsort(np.argsort(over, axis=-1), axis=-1) < N_HALVES - _LEFT_OUT
+    rest = np.argsort(np.argsort(over, axis=-1), axis=-1) < N_JUDGED - _LEFT_OUT
     return np.asarray((scores * rest).sum(-1) - best_gaussian(data, torch.from_numpy(rest)).value)
 
 

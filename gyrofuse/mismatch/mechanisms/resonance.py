@@ -53,5 +53,5 @@ class Resonance(Addition):
         rows = 1 if self.mode.shared else len(self.mode.gain)
         return of_phase(self.mode.gain, noise(n_samples, self.mode.profile, rows, generator))
 
-    def refitted(self, case: Case, keep: Tensor) -> Mechanism:
-        return replace(self, mode=refitted_mode(case, keep, self.mode))
+    def refitted(self, case: Case, fold: int) -> Mechanism:
+        return replace(self, mode=refitted_mode(case, fold, self.mode))

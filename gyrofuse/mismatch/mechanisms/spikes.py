@@ -12,7 +12,7 @@ from torch import Tensor
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.episodes import episodes_of, two_level_scores
 from gyrofuse.mismatch.evidence import corrected
-from gyrofuse.mismatch.halves import held_out_blocks
+from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.impulses import left_out, levelled, spike_p_values, variance_p_values
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.outliers import Outliers, clustered, fitted, free_gaussian, mixture, simultaneous
@@ -109,7 +109,8 @@ class Spikes(Mechanism):
         sd = left_out(case.recorded).sd[0]
         return cls(rate, height * sd, spread * sd, together)
 
-    def refitted(self, case: Case, keep: Tensor) -> Spikes:
+    def refitted(self, case: Case, fold: int) -> Spikes:
+        keep = estimation_samples(case.n_samples, fold)
         z = left_out(case.recorded).z[0]
         hit = tuple(self.rate.nonzero()[:, 0].tolist())
         return self._of(case, hit, [fitted(row[keep]) for row in z], self.together)
@@ -141,13 +142,13 @@ class Spikes(Mechanism):
         predicted = case.recording - expected.error[0] + noise
         return case.with_recording(torch.where(self._outliers(case), predicted, case.recording))
 
-    def gains(self, case: Case) -> Tensor:
+    def gains(self, case: Case, fold: int) -> Tensor:
         z = left_out(case.recorded).z[0]
         scores = torch.zeros_like(z)
         for i, law in enumerate(self._laws(case)):
             if law.rate > 0:
                 scores[i] = mixture(z[i], law) - free_gaussian(z[i])
-        return held_out_blocks(scores).sum((0, -1))
+        return held_out_blocks(scores, fold).sum((0, -1))
 
     def _laws(self, case: Case) -> list[Outliers]:
         sd = left_out(case.recorded).sd[0]

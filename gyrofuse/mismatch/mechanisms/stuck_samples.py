@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.evidence import corrected
-from gyrofuse.mismatch.halves import held_out_blocks
+from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.marginals import repeated, repeats
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 
@@ -78,7 +78,8 @@ class StuckSamples(Mechanism):
         together = len(at) > 1 and jointly > _TOGETHER * float(probability[at].min())
         return cls(probability, chance, together)
 
-    def refitted(self, case: Case, keep: Tensor) -> StuckSamples:
+    def refitted(self, case: Case, fold: int) -> StuckSamples:
+        keep = estimation_samples(case.n_samples, fold)
         return self._estimated(case, tuple(self.probability.nonzero()[:, 0].tolist()), keep)
 
     def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
@@ -92,8 +93,8 @@ class StuckSamples(Mechanism):
     def explained(self, case: Case, generator: torch.Generator) -> Case:
         return case.with_simulation(self.simulated(case.simulated.signal, case.scene, generator))
 
-    def gains(self, case: Case) -> Tensor:
-        return held_out_blocks(self._scores(case)).sum((0, -1))
+    def gains(self, case: Case, fold: int) -> Tensor:
+        return held_out_blocks(self._scores(case), fold).sum((0, -1))
 
     def _scores(self, case: Case) -> Tensor:
         """Log likelihood ratio of each sample's being a repeat or not, `(sensor, time)`."""

@@ -69,5 +69,5 @@ class UnitScale(Mechanism):
     def spectra(self, matrices: Tensor, f: Tensor) -> Tensor:
         return self.factor**2 * matrices
 
-    def refitted(self, case: Case, keep: Tensor) -> UnitScale:
+    def refitted(self, case: Case, fold: int) -> UnitScale:
         return self

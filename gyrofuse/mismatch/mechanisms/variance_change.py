@@ -13,7 +13,7 @@ from torch.nn.functional import avg_pool1d
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.episodes import episodes_of, onset_limits, two_level_scores
 from gyrofuse.mismatch.evidence import corrected
-from gyrofuse.mismatch.halves import held_out_blocks
+from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.impulses import levelled, variance_p_values
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 
@@ -78,7 +78,8 @@ class VarianceChange(Mechanism):
             gain=gain,
         )
 
-    def refitted(self, case: Case, keep: Tensor) -> VarianceChange:
+    def refitted(self, case: Case, fold: int) -> VarianceChange:
+        keep = estimation_samples(case.n_samples, fold)
         squares = levelled(case)[:, keep].square()
         inside = self._inside(case.n_samples, case.scene.rate)[keep]
         if not bool(inside.any()) or bool(inside.all()):
@@ -97,9 +98,9 @@ class VarianceChange(Mechanism):
     def explained(self, case: Case, generator: torch.Generator) -> Case:
         return case.with_simulation(self.simulated(case.simulated.signal, case.scene, generator))
 
-    def gains(self, case: Case) -> Tensor:
+    def gains(self, case: Case, fold: int) -> Tensor:
         inside = self._inside(case.n_samples, case.scene.rate)
-        return held_out_blocks(two_level_scores(levelled(case), self.factor, inside)).sum((0, -1))
+        return held_out_blocks(two_level_scores(levelled(case), self.factor, inside), fold).sum((0, -1))
 
     def _inside(self, n_samples: int, rate: float) -> Tensor:
         within = torch.zeros(n_samples, dtype=torch.bool)

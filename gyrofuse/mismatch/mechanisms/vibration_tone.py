@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.folds import estimation_samples
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.witnesses import level_of
 
@@ -89,7 +90,8 @@ class VibrationTone(Mechanism):
             omega += float(step.clamp(-1.0 / case.n_samples, 1.0 / case.n_samples))
         return cls(omega * case.scene.rate / (2 * math.pi), at[0], at[1])
 
-    def refitted(self, case: Case, keep: Tensor) -> VibrationTone:
+    def refitted(self, case: Case, fold: int) -> VibrationTone:
+        keep = estimation_samples(case.n_samples, fold)
         return self._fitted(case, self.frequency_hz, keep)
 
     def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:

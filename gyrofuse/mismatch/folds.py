@@ -1,4 +1,8 @@
-"""Interleaved blocks of a recording: the even ones to estimate with, the odd ones held out."""
+"""Interleaved blocks of a recording in four folds: each is judged with numbers estimated from the other three.
+
+Cross-validation uses every block to judge and most of them to estimate: with one half for either, the numbers of a
+weak effect cost as much as the other half can gain.
+"""
 
 from __future__ import annotations
 
@@ -10,24 +14,30 @@ from torch import Tensor
 from gyrofuse._transforms import cosine_ordinates, fast_length
 from gyrofuse.mismatch.case import Case
 
-N_HALVES = 32
+N_JUDGED = 32  # blocks
+N_FOLDS = 4
 _FIRST = 3  # ordinate of a block: below, what is slower than the block leaks in
 
 
-def estimation_samples(n_samples: int) -> Tensor:
-    """Which samples `(time,)` may be used for estimates: those in the even blocks, and none that are left over."""
-    block = n_samples // N_HALVES
+def in_fold(n_blocks: int, fold: int) -> Tensor:
+    """Which of so many blocks, taken in turns, a fold holds out, `(block,)`."""
+    return torch.arange(n_blocks) % N_FOLDS == fold
+
+
+def estimation_samples(n_samples: int, fold: int) -> Tensor:
+    """Which samples `(time,)` may be used for estimates: those in the blocks of other folds, and none left over."""
+    block = n_samples // N_JUDGED
     place = torch.arange(n_samples) // block
-    return (place % 2 == 0) & (place < N_HALVES)
+    return (place % N_FOLDS != fold) & (place < N_JUDGED)
 
 
-def held_out_blocks(signal: Tensor) -> Tensor:
-    """The odd blocks of signals `(..., time)`, as `(..., block, time)`."""
-    block = signal.shape[-1] // N_HALVES
-    return signal[..., : N_HALVES * block].unflatten(-1, (N_HALVES, block))[..., 1::2, :]
+def held_out_blocks(signal: Tensor, fold: int) -> Tensor:
+    """The blocks of signals `(..., time)` that a fold holds out, as `(..., block, time)`."""
+    block = signal.shape[-1] // N_JUDGED
+    return signal[..., : N_JUDGED * block].unflatten(-1, (N_JUDGED, block))[..., fold::N_FOLDS, :]
 
 
-def spectral_gains(case: Case, left: Tensor, spectra: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+def spectral_gains(case: Case, left: Tensor, spectra: Callable[[Tensor, Tensor], Tensor], fold: int) -> Tensor:
     """Gain in log score of each block held out, `(block,)`, nats.
 
     The likelihood of cosine transforms, whose ordinates are independent for white noise and random walks. They are
@@ -37,14 +47,15 @@ def spectral_gains(case: Case, left: Tensor, spectra: Callable[[Tensor, Tensor],
         case: Recording and simulation without the mechanism.
         left: `(sensor, time)`: the recording without what the mechanism takes off.
         spectra: What the mechanism makes of the simulation's cross-spectra.
+        fold: Which one.
     """
-    block = case.n_samples // N_HALVES
+    block = case.n_samples // N_JUDGED
     f = torch.arange(_FIRST, block, dtype=torch.float64) / (2 * block)
     plain = torch.diag_embed(case.base.spectrum(f).mT).to(torch.complex128)
-    return _log_scores(left, spectra(plain, f).real) - _log_scores(case.recording, plain.real)
+    return _log_scores(left, spectra(plain, f).real, fold) - _log_scores(case.recording, plain.real, fold)
 
 
-def signal_gains(case: Case, taken: Tensor) -> Tensor:
+def signal_gains(case: Case, taken: Tensor, fold: int) -> Tensor:
     """Gain in log score of each block held out, `(block,)`, nats, from a known signal `(sensor, time)` taken off.
 
     Signal and recording are whitened over the whole record, so that what is slower than a block counts as well: with
@@ -57,12 +68,12 @@ def signal_gains(case: Case, taken: Tensor) -> Tensor:
     both = torch.stack([case.recording, taken])
     both = both - both.mean(-1, keepdim=True)
     e, s = torch.fft.irfft(torch.fft.rfft(both, n=length) * over, n=length)[..., :n]
-    return held_out_blocks(e * s - s.square() / 2).sum((0, -1))
+    return held_out_blocks(e * s - s.square() / 2, fold).sum((0, -1))
 
 
-def _log_scores(signal: Tensor, matrices: Tensor) -> Tensor:
+def _log_scores(signal: Tensor, matrices: Tensor, fold: int) -> Tensor:
     """Log likelihood of the blocks held out, `(block,)`, for spectra `(ordinate, sensor, sensor)`."""
-    blocks = held_out_blocks(signal)  # (sensor, block, time)
+    blocks = held_out_blocks(signal, fold)  # (sensor, block, time)
     ordinates = cosine_ordinates(blocks.flatten(0, 1)).view_as(blocks)[..., _FIRST:].permute(1, 2, 0)
     power = matrices.diagonal(dim1=-1, dim2=-2)
     if bool((matrices == torch.diag_embed(power)).all()):
