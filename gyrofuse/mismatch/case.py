@@ -7,7 +7,7 @@ act on both alike.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -58,17 +58,21 @@ class Case:
         recorded: The recording, one record, without what was taken off it.
         simulated: The simulation, with what was built into it: records as long as the recording, or a single shorter
             one.
+        analog: The simulation's samples `(record, sensor, time)` before the converter.
+        converter: What it does to them, with the place of each in the chain.
     """
 
     scene: Scene
     recorded: Side
     simulated: Side
+    analog: Tensor
+    converter: tuple[tuple[int, Callable[[Tensor], Tensor]], ...] = ()
 
     @classmethod
     def of(cls, scene: Scene, recording: Tensor, simulation: Tensor) -> Case:
         """A case of a recording `(sensor, time)` and a simulation `(record, sensor, time)`."""
         both = bands(recording.shape[-1])
-        return cls(scene, Side(recording[None], both), Side(simulation, both))
+        return cls(scene, Side(recording[None], both), Side(simulation, both), simulation)
 
     @property
     def recording(self) -> Tensor:
@@ -111,9 +115,20 @@ class Case:
         """With another recording `(sensor, time)`: one that was cleaned."""
         return replace(self, recorded=Side(recording[None], self.bands))
 
-    def with_simulation(self, simulation: Tensor) -> Case:
-        """With another simulation `(record, sensor, time)`: one that something was built into."""
-        return replace(self, simulated=Side(simulation, self.bands))
+    def built_in(self, act: Callable[[Tensor], Tensor], place: int = 0) -> Case:
+        """With something that acts on the simulation's samples, after what has a lower place in the chain.
+
+        What the converter does (places above 0) is done again to what anything analogue has changed.
+        """
+        analog, converter = self.analog, self.converter
+        if place:
+            converter = tuple(sorted((*converter, (place, act)), key=lambda entry: entry[0]))
+        else:
+            analog = act(analog)
+        signal = analog
+        for _, converted in converter:
+            signal = converted(signal)
+        return replace(self, simulated=Side(signal, self.bands), analog=analog, converter=converter)
 
 
 def block_means(signal: Tensor) -> Tensor:

@@ -16,6 +16,7 @@ from gyrofuse.mismatch.evidence import corrected
 from gyrofuse.mismatch.inputs import noise_of, prepared
 from gyrofuse.mismatch.mechanism import Finding
 from gyrofuse.mismatch.mechanisms import STAGES
+from gyrofuse.mismatch.remainder import ASKED_FOR_BY, Remainder
 from gyrofuse.mismatch.repaired import RepairedModel
 from gyrofuse.mismatch.report import MismatchReport
 from gyrofuse.mismatch.testimony import combined, testimony
@@ -23,7 +24,7 @@ from gyrofuse.mismatch.twins import FEWEST, calibrated, twin_p_values
 from gyrofuse.recording import Recording
 from gyrofuse.simulate import ArrayModel
 
-_MOST = 12  # findings: a recording that needs more is another instrument
+_MOST, _OF_A_KIND = 20, 6  # findings: a recording that needs more is another instrument
 
 
 def diagnose(
@@ -87,7 +88,8 @@ def diagnose(
     level = false_alarm / sum(map(len, STAGES))
     for stage in STAGES:
         while len(found) < _MOST:
-            nominated = [f for f in (m.nominate(case, level) for m in stage) if f is not None and not _known(f, found)]
+            open_ones = [m for m in stage if sum(f.mechanism == m.name for f in found) < _OF_A_KIND]
+            nominated = [f for f in (m.nominate(case, level) for m in open_ones) if f and not _known(f, found)]
             accepted = None
             for finding in sorted(nominated, key=lambda f: -f.gain):
                 gain = held_out_gain(case, finding.effect)
@@ -102,13 +104,21 @@ def diagnose(
     findings = tuple(found)
     after = testimony(case)
     left = [e for e in after if corrected(e.p_value, len(evidence)) <= false_alarm]
+    effects = tuple(f.effect for f in findings)
+    asking = [e.p_value for e in left if e.witness in ASKED_FOR_BY]
+    if asking:
+        remainder = Remainder.of(case)
+        gain = held_out_gain(case, remainder)
+        if gain.confirms(min(asking)):
+            case, effects = remainder.explained(case, generator), (*effects, remainder)
+            gains.append(gain)
     return MismatchReport(
         mismatch=True,
         p_value=p_value,
         findings=findings,
         unexplained=tuple(left),
         held_out=held_out(start, gains, generator),
-        model=replace(model, effects=tuple(f.effect for f in findings)),
+        model=replace(model, effects=effects),
         evidence=evidence,
         evidence_after=after,
         case=start,

@@ -5,19 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.case import Scene
 from gyrofuse.mismatch.colour import filtered
 from gyrofuse.mismatch.mechanism import Mechanism
 
 
-class BuiltIn(Mechanism):
-    """A mechanism that nothing takes off a recording: it is built into the samples of the simulation."""
-
-    def explained(self, case: Case, generator: torch.Generator) -> Case:
-        return case.with_simulation(self.simulated(case.simulated.signal, case.scene, generator))
-
-
-class Filter(BuiltIn):
+class Filter(Mechanism):
     """A linear filter of each sensor."""
 
     def response(self, f: Tensor) -> Tensor:
@@ -32,7 +25,7 @@ class Filter(BuiltIn):
         return matrices * gain[:, :, None] * gain[:, None, :].conj()
 
 
-class Addition(BuiltIn):
+class Addition(Mechanism):
     """Gaussian noise on top."""
 
     def density(self, f: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ from gyrofuse.simulate import ArrayModel
 FEWEST = 4096
 _RECORDS = 4  # as long as the recording, that are drawn of a model
 _SAME_RATE = 1e-3
+_SINGULAR = 1e-10  # of correlation matrices
 
 
 def prepared(
@@ -44,6 +45,8 @@ def prepared(
             f"`simulation`: expected {signal.shape[-2]} sensors as in the recording, got {drawn.shape[-2]}; "
             "simulate the same array, or select its sensors"
         )
+    _check_own("recording", signal)
+    _check_own("simulation", drawn[0])
     return Case.of(scene, signal, drawn)
 
 
@@ -117,6 +120,17 @@ def _checked(name: str, signal: Tensor, scene: Scene) -> Tensor:
             "leave them out"
         )
     return signal.to(torch.float64)
+
+
+def _check_own(name: str, signal: Tensor) -> None:
+    """Every sensor has to have something of its own: spectra of what adds up to nothing have no inverse."""
+    change = signal.diff()
+    change = change / change.norm(dim=-1, keepdim=True)
+    if float(torch.linalg.eigvalsh(change @ change.mT)[0]) < _SINGULAR:
+        raise ValueError(
+            f"`{name}`: expected sensors with noise of their own, got some that are a sum of others (deviations from "
+            "a mean add up to nothing); leave one of them out"
+        )
 
 
 def _names(scene: Scene, n: int) -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -32,6 +33,8 @@ class Mechanism:
     """
 
     name: ClassVar[str]
+    happened_once: ClassVar[bool] = False  # at a time of this recording, not in another one
+    place: ClassVar[int] = 0  # in the chain from sensor to numbers: clipped, rounded, repeated come after all else
 
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:
@@ -52,8 +55,8 @@ class Mechanism:
         return signal
 
     def explained(self, case: Case, generator: torch.Generator) -> Case:
-        """The case with the mechanism accounted for: taken off the recording or built into the simulation."""
-        raise NotImplementedError
+        """The case with the mechanism taken off the recording or, as by default, built into the simulation."""
+        return case.built_in(partial(self.simulated, scene=case.scene, generator=generator), self.place)
 
     def spectra(self, matrices: Tensor, f: Tensor) -> Tensor:
         """What becomes of cross-spectral densities `(frequency, sensor, sensor)` at `f` cycles per sample.

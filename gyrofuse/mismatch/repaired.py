@@ -26,7 +26,7 @@ class RepairedModel:
     Attributes:
         noise: Of the array.
         scene: Rate, unit, sensors and auxiliary channels of the recording.
-        effects: In the order in which they act.
+        effects: In the order in which they were found; those of the converter act last.
     """
 
     noise: ArrayModel
@@ -35,6 +35,10 @@ class RepairedModel:
 
     def __add__(self, effect: Mechanism) -> RepairedModel:
         return replace(self, effects=(*self.effects, effect)) if isinstance(effect, Mechanism) else NotImplemented
+
+    def elsewhere(self) -> RepairedModel:
+        """The same for another recording: without steps and episodes, which happened once."""
+        return replace(self, effects=tuple(effect for effect in self.effects if not effect.happened_once))
 
     def simulate(
         self,
@@ -56,7 +60,7 @@ class RepairedModel:
         generator = own_generator(generator, None)
         scene = self.scene if channels is None else replace(self.scene, channels=dict(channels))
         signal = self.noise.simulate(n_samples, batch=tuple(batch), generator=generator)
-        for effect in self.effects:
+        for effect in sorted(self.effects, key=lambda effect: effect.place):
             signal = effect.simulated(signal, scene, generator)
         return signal
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gyrofuse.mismatch.outcome import Outcome
-from gyrofuse.mismatch.telling import fused_words, parameter_words
+from gyrofuse.mismatch.telling import fused_words, p_words, parameter_words
 from gyrofuse.plotting_mismatch import plot_map
 from gyrofuse.report_mismatch import mismatch_page
 
@@ -37,16 +37,16 @@ class MismatchReport(Outcome):
         """The verdict in sentences, then the numbers."""
         if not self.mismatch:
             return f"Recording and simulation agree (p = {self.p_value:.2g})."
-        lines = [f"Recording and simulation differ (p = {self.p_value:.2g})."]
+        lines = [f"Recording and simulation differ ({p_words(self.p_value)})."]
         for i, finding in enumerate(self.findings, 1):
             gain = "" if finding.held_out_gain is None else f"; {finding.held_out_gain:+.1f} nats on data held out"
-            lines.append(f"{i}. {finding.mechanism}: {finding.sentence} (p = {finding.p_value:.2g}{gain})")
+            lines.append(f"{i}. {finding.mechanism}: {finding.sentence} ({p_words(finding.p_value)}{gain})")
             if finding.alternatives:
                 lines.append(f"   cannot be told apart from {', '.join(finding.alternatives)}")
             for name, entry in finding.parameters.items():
                 words = parameter_words(name, self.case.scene.sensors)
                 lines.append(f"   {words:<24} {entry.value:>12.6g} {entry.unit}  ({entry.low:.6g} to {entry.high:.6g})")
-        lines += [f"unexplained, {e.witness}: {e.words} (p = {e.p_value:.2g})" for e in self.unexplained]
+        lines += [f"unexplained, {e.witness}: {e.words} ({p_words(e.p_value)})" for e in self.unexplained]
         h = self.held_out
         lines.append(
             f"On data held out: discrepancy {h.before:.2f} before and {h.after:.2f} after repair (1 = noise alone), "

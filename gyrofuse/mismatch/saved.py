@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
@@ -13,6 +14,7 @@ from gyrofuse.mismatch.base import Base
 from gyrofuse.mismatch.case import Scene
 from gyrofuse.mismatch.mechanism import Mechanism
 from gyrofuse.mismatch.mechanisms import STAGES
+from gyrofuse.mismatch.remainder import Remainder
 from gyrofuse.mismatch.repaired import RepairedModel
 from gyrofuse.parsing import model_from_dict
 from gyrofuse.simulate import ArrayModel
@@ -39,7 +41,7 @@ def repaired_from_dict(description: Mapping[str, Any]) -> RepairedModel:
 
 
 def _effect(entry: Mapping[str, Any]) -> Mechanism:
-    kinds = {kind.__name__: kind for stage in STAGES for kind in stage}
+    kinds = {kind.__name__: kind for kind in (*itertools.chain(*STAGES), Remainder)}
     if entry["kind"] not in kinds:
         raise ValueError(f"`description`: expected a mechanism among {', '.join(kinds)}, got {entry['kind']!r}")
     return _rebuilt(kinds[entry["kind"]], entry["numbers"])

@@ -95,8 +95,7 @@ def refit(case: Case, fold: int, term: Term) -> Term:
     simulated = case.simulated.signal
     n = simulated.shape[-1] // block * block
     simulated = simulated[..., :n].unflatten(-1, (-1, block)).movedim(-2, -3).flatten(0, 1)
-    part = Case(case.scene, *_sides(recorded, simulated))
-    data = ratios(part.recorded, part.simulated, case.base)
+    data = ratios(*_sides(recorded, simulated), case.base)
     found = fit(data, [term])
     return fit(data.centred(found.model.diagonal(dim1=-2, dim2=-1).real), found.terms).terms[0]
 

@@ -7,6 +7,7 @@ import re
 from gyrofuse._linalg import SingularCovarianceError
 from gyrofuse.mismatch.benefit import Benefit
 from gyrofuse.mismatch.outcome import Outcome
+from gyrofuse.mismatch.remainder import Remainder
 
 ALIKE = 0.01  # relative change of a variance that is not worth a word
 
@@ -31,6 +32,7 @@ SEPARATED_BY = {
     "common_mode": "one sensor mounted apart, or on another supply",
     "scale_factor": "a recording on a table that turns at known rates",
     "clock_skew": "timestamps of each sensor, or a known motion that all of them feel",
+    "not_identifiable": "the same under another motion, at another sampling rate, or with another channel",
     "parameter_shift": "a longer recording, or one of the same device under other conditions",
 }
 
@@ -44,7 +46,7 @@ def verdict(outcome: Outcome) -> list[str]:
             f"What surprises most among {len(outcome.evidence)} witnesses, {mechanism_words(most.witness)}, is no more "
             f"than chance gives (p = {most.p_value:.2g}).",
         ]
-    sentences = [f"Recording and simulation differ: p = {chance(outcome.p_value)} if nothing were missing."]
+    sentences = [f"Recording and simulation differ: {p_words(outcome.p_value)} if nothing were missing."]
     if all(f.mechanism == "not_identifiable" for f in outcome.findings):
         sentences.append("What the simulation leaves out could not be named.")
     sentences += [f"{capital(f.sentence)}." for f in outcome.findings]
@@ -56,6 +58,11 @@ def verdict(outcome: Outcome) -> list[str]:
         )
     left = ", ".join(mechanism_words(e.witness) for e in outcome.unexplained)
     sentences.append(f"Unexplained, as seen by: {left}." if left else "After the repair no witness sees a difference.")
+    if any(isinstance(effect, Remainder) for effect in outcome.model.effects):
+        sentences.append(
+            "So that the repaired simulation has the recording's spectra all the same, it ends with a filter for each "
+            "sensor that stands for no physics."
+        )
     return sentences + fused_words(outcome)
 
 
@@ -86,7 +93,12 @@ def benefit_of(outcome: Outcome) -> Benefit | None:
 
 def chance(p_value: float) -> str:
     """A p value in digits."""
-    return f"{p_value:.2g}" if p_value > 0 else "below 1e-300"
+    return f"{p_value:.2g}" if p_value > 0 else "< 1e-300"
+
+
+def p_words(p_value: float) -> str:
+    """A p value in a sentence."""
+    return f"p = {chance(p_value)}" if p_value > 0 else f"p {chance(p_value)}"
 
 
 def nats(value: float) -> str:

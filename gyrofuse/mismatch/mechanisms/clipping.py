@@ -29,6 +29,7 @@ class Clipping(Mechanism):
     """
 
     name: ClassVar[str] = "clipping"
+    place: ClassVar[int] = 1
     low: Tensor
     high: Tensor
     centre: Tensor
@@ -72,9 +73,6 @@ class Clipping(Mechanism):
     def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
         shift = signal.mean(-1, keepdim=True) - self.centre[:, None]
         return signal.clamp(self.low[:, None] + shift, self.high[:, None] + shift)
-
-    def explained(self, case: Case, generator: torch.Generator) -> Case:
-        return case.with_simulation(self.simulated(case.simulated.signal, case.scene, generator))
 
     def gains(self, case: Case, fold: int) -> Tensor:
         return held_out_blocks(self._scores(case), fold).sum((0, -1))

@@ -32,6 +32,7 @@ class Quantization(Mechanism):
     """
 
     name: ClassVar[str] = "quantization"
+    place: ClassVar[int] = 2
     step: Tensor
     offset: Tensor
     blur: Tensor
@@ -76,9 +77,6 @@ class Quantization(Mechanism):
         offset = self.offset[:, None]
         rounded = ((signal - offset) / self._divisor).round() * self._divisor + offset
         return torch.where(self.step[:, None] > 0, rounded, signal)
-
-    def explained(self, case: Case, generator: torch.Generator) -> Case:
-        return case.with_simulation(self.simulated(case.simulated.signal, case.scene, generator))
 
     def gains(self, case: Case, fold: int) -> Tensor:
         return held_out_blocks(self._scores(case.recording), fold).sum((0, -1))

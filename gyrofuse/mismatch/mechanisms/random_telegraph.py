@@ -120,9 +120,6 @@ class RandomTelegraph(Mechanism):
                 record[i] += float(self.half_step[i]) * _path(n, up, down, generator)
         return records.reshape(signal.shape)
 
-    def explained(self, case: Case, generator: torch.Generator) -> Case:
-        return case.with_simulation(self.simulated(case.simulated.signal, case.scene, generator))
-
     def gains(self, case: Case, fold: int) -> Tensor:
         sensors = tuple(self.half_step.nonzero()[:, 0].tolist())
         data = stretches(case, sensors)

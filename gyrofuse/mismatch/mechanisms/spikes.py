@@ -137,7 +137,7 @@ class Spikes(Mechanism):
         expected = left_out(case.recorded)
         plain = self.amplitude >= _PLAIN * expected.sd[0]
         if not bool(plain[self.rate > 0].all()):
-            return case.with_simulation(self.simulated(case.simulated.signal, case.scene, generator))
+            return super().explained(case, generator)
         noise = torch.randn(case.recording.shape, generator=generator, dtype=torch.float64) * expected.sd[0][:, None]
         predicted = case.recording - expected.error[0] + noise
         return case.with_recording(torch.where(self._outliers(case), predicted, case.recording))

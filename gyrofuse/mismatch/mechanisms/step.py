@@ -15,6 +15,7 @@ from gyrofuse.mismatch.slow_effect import (
     SlowEffect,
     doubt,
     estimate,
+    log_factors,
     only,
     place,
     plausible,
@@ -23,7 +24,8 @@ from gyrofuse.mismatch.slow_effect import (
     slow_levels,
     strong_scan,
 )
-from gyrofuse.mismatch.slow_scans import Scan, SlowLook, concerned, steps
+from gyrofuse.mismatch.slow_families import steps
+from gyrofuse.mismatch.slow_scans import Scan, SlowLook, concerned
 
 _CELLS = 256
 _MARGIN = 24  # cells on either side of the places left
@@ -44,6 +46,7 @@ class Step(SlowEffect):
     """
 
     name: ClassVar[str] = "step"
+    happened_once: ClassVar[bool] = True
     onset_s: float
 
     @classmethod
@@ -55,7 +58,7 @@ class Step(SlowEffect):
         found = estimate(look, scan, steps(case))
         which = concerned(scan)
         onset = place(onset_samples(case, look, scan, found.size), case.scene.rate)
-        effect = cls(only(found.size, which), scan.fit.log_factors, onset.value)
+        effect = cls(only(found.size, which), log_factors(scan), onset.value)
         largest = max(which, key=lambda i: abs(float(found.size[i])))
         return Finding(
             cls.name,

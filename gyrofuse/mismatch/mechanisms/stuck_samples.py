@@ -31,6 +31,7 @@ class StuckSamples(Mechanism):
     """
 
     name: ClassVar[str] = "stuck_samples"
+    place: ClassVar[int] = 3
     probability: Tensor
     by_chance: Tensor
     together: bool
@@ -89,9 +90,6 @@ class StuckSamples(Mechanism):
         held[..., 0] = False
         source = torch.where(held, 0, torch.arange(n)).cummax(-1).values
         return signal.gather(-1, source)
-
-    def explained(self, case: Case, generator: torch.Generator) -> Case:
-        return case.with_simulation(self.simulated(case.simulated.signal, case.scene, generator))
 
     def gains(self, case: Case, fold: int) -> Tensor:
         return held_out_blocks(self._scores(case), fold).sum((0, -1))

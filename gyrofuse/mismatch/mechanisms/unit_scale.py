@@ -63,9 +63,6 @@ class UnitScale(Mechanism):
     def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
         return self.factor * signal
 
-    def explained(self, case: Case, generator: torch.Generator) -> Case:
-        return case.with_simulation(self.factor * case.simulated.signal)
-
     def spectra(self, matrices: Tensor, f: Tensor) -> Tensor:
         return self.factor**2 * matrices
 

@@ -32,6 +32,7 @@ class VarianceChange(Mechanism):
     """
 
     name: ClassVar[str] = "variance_change"
+    happened_once: ClassVar[bool] = True
     episodes: tuple[tuple[float, float], ...]
     factor: Tensor
 
@@ -94,9 +95,6 @@ class VarianceChange(Mechanism):
         fast = signal - avg_pool1d(padded, reach, 1)[:, 0].reshape(signal.shape)
         inside = self._inside(signal.shape[-1], scene.rate)
         return signal + (self.factor.sqrt() - 1)[:, None] * fast * inside
-
-    def explained(self, case: Case, generator: torch.Generator) -> Case:
-        return case.with_simulation(self.simulated(case.simulated.signal, case.scene, generator))
 
     def gains(self, case: Case, fold: int) -> Tensor:
         inside = self._inside(case.n_samples, case.scene.rate)

@@ -1,0 +1,59 @@
+"""What is left of the spectra once everything with a name is explained: a repair without physics.
+
+A simulator that is handed back ought to agree with the recording where the catalogue does not reach, too. The remainder
+is no finding: witnesses that asked for it stay in the report as unexplained.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.folds import N_JUDGED, estimation_samples
+from gyrofuse.mismatch.gaussian import Filter
+from gyrofuse.mismatch.side import Side
+
+ASKED_FOR_BY = ("spectrum", "shape", "bump")  # witnesses
+
+
+@dataclass(frozen=True, eq=False)
+class Remainder(Filter):
+    """`S_i(f) -> S_i(f) exp(2 g_i(log f))` with `g` linear between the middles of bands, a filter without phase.
+
+    Attributes:
+        frequency: Middles of the bands, cycles per sample, `(band,)`.
+        log_gain: `g`, `(sensor, band)`.
+    """
+
+    name: ClassVar[str] = "remainder"
+    frequency: Tensor
+    log_gain: Tensor
+
+    @classmethod
+    def of(cls, case: Case) -> Remainder:
+        """What the spectra ask for."""
+        return cls._between(case.recorded, case.simulated)
+
+    @classmethod
+    def _between(cls, recorded: Side, simulated: Side) -> Remainder:
+        """Halves of log ratios of powers, each drawn towards none by as much as chance explains of it (Stein)."""
+        worth = torch.minimum(recorded.dof, simulated.dof)
+        ratio = (recorded.power.clamp(min=1e-300) / simulated.power.clamp(min=1e-300)).log()
+        chance = 1 / recorded.dof.clamp(min=1e-9) + 1 / simulated.dof.clamp(min=1e-9)
+        kept = (1 - chance / ratio.square().clamp(min=1e-300)).clamp(min=0.0) * (worth > 0)
+        return cls(recorded.bands.frequency, kept * ratio / 2)
+
+    def response(self, f: Tensor) -> Tensor:
+        x, at = f.clamp(self.frequency[0], self.frequency[-1]).log(), self.frequency.log()
+        right = torch.searchsorted(at, x).clamp(1, len(at) - 1)
+        share = (x - at[right - 1]) / (at[right] - at[right - 1])
+        return torch.lerp(self.log_gain[:, right - 1], self.log_gain[:, right], share).exp()
+
+    def refitted(self, case: Case, fold: int) -> Remainder:
+        block = case.n_samples // N_JUDGED
+        kept = case.recording[:, estimation_samples(case.n_samples, fold)]
+        return self._between(Side(kept.unflatten(-1, (-1, block)).movedim(-2, 0), case.bands), case.simulated)
