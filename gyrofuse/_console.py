@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Collection, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 from typer.core import TyperGroup
@@ -68,6 +69,20 @@ def say_table(head: Sequence[str], rows: Sequence[Sequence[str]], right: Collect
 def progress(what: str) -> AbstractContextManager[Any]:
     """Show what takes time, on a terminal only."""
     return Console(stderr=True).status(f"{what} ...")
+
+
+@contextmanager
+def progress_bar(what: str) -> Iterator[Callable[[str, float], None]]:
+    """Show how far something has come, on a terminal only; gives what is told the next step and the share done."""
+    console = Console(stderr=True)
+    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task(what, total=1.0)
+
+        def show(step: str, share: float) -> None:
+            bar.update(task, completed=share, description=f"{what}: {step}")
+
+        yield show
 
 
 def warn(text: str) -> None:

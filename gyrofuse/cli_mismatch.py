@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import torch
 import typer
 
-from gyrofuse._console import progress, say
+from gyrofuse._console import progress, progress_bar, say
 from gyrofuse.cli_shared import (
     Axis,
     Force,
@@ -111,12 +111,12 @@ def _diagnosed(
     from gyrofuse.mismatch import diagnose as find_mismatch
     from gyrofuse.mismatch.inputs import FEWEST
 
-    with progress("comparing"):
+    with progress_bar("comparing") as show:
         if isinstance(simulation, Recording):
             simulation, _ = without_gaps(simulation, "", 0)
         try:
             part, remarks = without_gaps(recording, "Diagnosed", FEWEST)
-            return find_mismatch(part, simulation, false_alarm=false_alarm, twins=twins), remarks
+            return find_mismatch(part, simulation, false_alarm=false_alarm, twins=twins, progress=show), remarks
         except (ValueError, TypeError) as error:
             message = str(error)
             files = {"`recording`": names[0], "`LOG`": names[0], "`simulation`": str(names[1])}

@@ -81,7 +81,7 @@ def test_results_are_plain_for_json():
         "mechanism", "alternatives", "sensors", "levels", "frequency_hz", "time_s", "channel", "parameters", "p_value",
         "held_out_gain", "sentence",
     } == content["findings"][0].keys()  # fmt: skip
-    assert {"before", "after", "gain"} == content["held_out"].keys()
+    assert {"before", "after", "gain", "auc"} == content["held_out"].keys()
     assert "vibration_tone" in str(report)
 
 
@@ -154,3 +154,20 @@ def test_missing_samples_are_told():
         ValueError, match="expected whole sensors, got missing samples in 3; give a stretch without gaps"
     ):
         diagnose(gf.Recording(signal, rate=RATE), MODEL)
+
+
+def test_progress_is_told_and_never_goes_back():
+    told: list[tuple[str, float]] = []
+    diagnose(with_tone(array(1), 0.12), array(2), progress=lambda *step: told.append(step))
+    shares = [share for _, share in told]
+    assert shares == sorted(shares)
+    assert 0 <= shares[0] < 0.1 and 0.8 < shares[-1] <= 1
+    assert any("vibration_tone" in what for what, _ in told)
+
+
+def test_sensors_that_add_up_to_nothing_are_refused():
+    signal = array(1).signal
+    with pytest.raises(
+        ValueError, match="`recording`: expected sensors with noise of their own.*leave one of them out"
+    ):
+        diagnose(signal - signal.mean(0), array(2).signal)

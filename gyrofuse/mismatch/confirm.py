@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gyrofuse.covariance import wavelet_cross_covariance
 from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.classifier import distinguishability
 from gyrofuse.mismatch.folds import N_FOLDS, N_JUDGED, held_out_blocks, in_fold
 from gyrofuse.mismatch.mechanism import Mechanism, Z
 
@@ -20,10 +21,17 @@ _SHORTEST = 8  # a block is so many times as long as its longest wavelet
 
 
 class Gain(NamedTuple):
-    """Gain in log score of each block while it was held out, nats, `(block,)`, and the mechanism of each fold."""
+    """Gain in log score of a mechanism.
+
+    Attributes:
+        blocks: Of each block while it was held out, nats, `(block,)`.
+        refitted: The mechanism of each fold.
+        as_found: Of all blocks with the numbers that were found, nats.
+    """
 
     blocks: Tensor
     refitted: tuple[Mechanism, ...]
+    as_found: float
 
     @property
     def total(self) -> float:
@@ -37,9 +45,9 @@ class Gain(NamedTuple):
         """Whether a finding of that p value holds on the blocks held out.
 
         By more than its own scatter; for what is beyond doubt where it was found it is enough not to be worse, since
-        many numbers cost much of what is held out.
+        many numbers cost much of what is held out. Numbers that hold only in the company of others do not pass.
         """
-        return self.total > (0.0 if p_value < _BEYOND_DOUBT else _ACCEPTED_T * self.sd)
+        return self.as_found > 0 and self.total > (0.0 if p_value < _BEYOND_DOUBT else _ACCEPTED_T * self.sd)
 
 
 class HeldOut(NamedTuple):
@@ -49,6 +57,9 @@ class HeldOut(NamedTuple):
         before: Discrepancy of wavelet cross-covariances per degree of freedom; 1 is what noise alone gives.
         after: The same with the repaired simulation.
         gain: Log score of the repair, nats, with 95 % limits `low` and `high`.
+        auc_before: Area under the ROC curve of a classifier that tells windows of the one from windows of the other;
+            0.5 is guessing.
+        auc_after: The same with the repaired simulation.
     """
 
     before: float
@@ -56,11 +67,14 @@ class HeldOut(NamedTuple):
     gain: float
     low: float
     high: float
+    auc_before: float
+    auc_after: float
 
     def to_dict(self) -> dict[str, object]:
         """Plain numbers, ready for JSON."""
         gain = {"value": self.gain, "low": self.low, "high": self.high}
-        return {"before": self.before, "after": self.after, "gain": gain}
+        auc = {"before": self.auc_before, "after": self.auc_after}
+        return {"before": self.before, "after": self.after, "gain": gain, "auc": auc}
 
 
 def held_out_gain(case: Case, effect: Mechanism) -> Gain:
@@ -69,7 +83,8 @@ def held_out_gain(case: Case, effect: Mechanism) -> Gain:
     blocks = torch.empty(N_JUDGED, dtype=torch.float64)
     for fold, one in enumerate(refitted):
         blocks[in_fold(N_JUDGED, fold)] = one.gains(case, fold)
-    return Gain(blocks, refitted)
+    as_found = sum(float(effect.gains(case, fold).sum()) for fold in range(N_FOLDS))
+    return Gain(blocks, refitted, as_found)
 
 
 def held_out(start: Case, gains: Sequence[Gain], generator: torch.Generator) -> HeldOut:
@@ -83,24 +98,28 @@ def held_out(start: Case, gains: Sequence[Gain], generator: torch.Generator) -> 
     total, reach = sum(gain.total for gain in gains), 0.0
     if gains:
         reach = Z * _sd_of_sum(torch.stack([gain.blocks for gain in gains]).sum(0))
-    before = torch.stack([discrepancy(start, fold) for fold in range(N_FOLDS)]).mean()
-    after = before
+    before = after = [_agreement(start, fold) for fold in range(N_FOLDS)]
     if gains:
-        repaired = []
+        after = []
         for fold in range(N_FOLDS):
-            case = start
+            repaired = start
             for gain in gains:
-                case = gain.refitted[fold].explained(case, generator)
-            repaired.append(discrepancy(case, fold))
-        after = torch.stack(repaired).mean()
-    return HeldOut(float(before), float(after), total, total - reach, total + reach)
+                repaired = gain.refitted[fold].explained(repaired, generator)
+            after.append(_agreement(repaired, fold))
+    (d, auc), (d_after, auc_after) = (torch.stack(folds).mean(0).tolist() for folds in (before, after))
+    return HeldOut(d, d_after, total, total - reach, total + reach, auc, auc_after)
+
+
+def _agreement(case: Case, fold: int) -> Tensor:
+    """Discrepancy and area under the curve on what a fold holds out."""
+    return torch.tensor([discrepancy(case, fold), distinguishability(case, fold)], dtype=torch.float64)
 
 
 def _sd_of_sum(blocks: Tensor) -> float:
     return float(blocks.std()) * math.sqrt(len(blocks))
 
 
-def discrepancy(case: Case, fold: int) -> Tensor:
+def discrepancy(case: Case, fold: int) -> float:
     """Squared difference of wavelet cross-covariances over its variance, mean over levels and pairs of sensors.
 
     On the blocks of the recording that a fold holds out, against all of the simulation, which also tell the variance.
@@ -113,7 +132,7 @@ def discrepancy(case: Case, fold: int) -> Tensor:
     variance = simulated.var(0) * (1 / n_recorded + 1 / n_simulated)
     # The variance is itself estimated, as in Student's distribution.
     expected = (n_simulated - 1) / (n_simulated - 3)
-    return ((recorded.mean(0) - simulated.mean(0)).square() / variance).mean() / expected
+    return float(((recorded.mean(0) - simulated.mean(0)).square() / variance).mean()) / expected
 
 
 def _block_moments(blocks: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from numbers import Real
 
@@ -24,6 +25,7 @@ from gyrofuse.mismatch.twins import FEWEST, calibrated, twin_p_values
 from gyrofuse.recording import Recording
 from gyrofuse.simulate import ArrayModel
 
+_LOOKING, _NAMING, _CHECKING = 0.3, 0.4, 0.2  # shares of the work
 _MOST, _OF_A_KIND = 20, 6  # findings: a recording that needs more is another instrument
 
 
@@ -35,6 +37,7 @@ def diagnose(
     rate: float | None = None,
     twins: int = 0,
     generator: torch.Generator | None = None,
+    progress: Callable[[str, float], None] = lambda _what, _share: None,
 ) -> MismatchReport:
     """Find where a recording and a simulation differ, and which physics the simulation left out.
 
@@ -49,6 +52,8 @@ def diagnose(
             50 or more the error rate holds for this very recording, at so many times the cost of a look.
         generator: Source of the diagnosis's own random numbers: of a model's samples, and of what is built into the
             simulation. By default one with a fixed seed, so that a diagnosis can be repeated.
+        progress: Is told what is looked at next, and the share of the work that is done: where something is missing
+            there is more of it.
 
     Returns:
         Verdict, findings, held-out scores, and the repaired simulation.
@@ -65,7 +70,7 @@ def diagnose(
         generator = torch.Generator().manual_seed(0)
     start = prepared(recording, simulation, rate, generator)
     model = RepairedModel(noise_of(simulation, start), start.scene)
-    evidence = testimony(start)
+    evidence = testimony(start, lambda what, share: progress(what, _LOOKING * share))
     p_value = combined(evidence)
     if twins:
         p_value = calibrated(p_value, twin_p_values(start, twins, generator))
@@ -86,7 +91,8 @@ def diagnose(
     found: list[Finding] = []
     gains: list[Gain] = []
     level = false_alarm / sum(map(len, STAGES))
-    for stage in STAGES:
+    for number, stage in enumerate(STAGES):
+        progress(", ".join(m.name for m in stage), _LOOKING + _NAMING * number / len(STAGES))
         while len(found) < _MOST:
             open_ones = [m for m in stage if sum(f.mechanism == m.name for f in found) < _OF_A_KIND]
             nominated = [f for f in (m.nominate(case, level) for m in open_ones) if f and not _known(f, found)]
@@ -102,7 +108,7 @@ def diagnose(
             found.append(accepted)
             case = accepted.effect.explained(case, generator)
     findings = tuple(found)
-    after = testimony(case)
+    after = testimony(case, lambda what, share: progress(what, _LOOKING + _NAMING + _CHECKING * share))
     left = [e for e in after if corrected(e.p_value, len(evidence)) <= false_alarm]
     effects = tuple(f.effect for f in findings)
     asking = [e.p_value for e in left if e.witness in ASKED_FOR_BY]

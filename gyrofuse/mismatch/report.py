@@ -50,7 +50,8 @@ class MismatchReport(Outcome):
         h = self.held_out
         lines.append(
             f"On data held out: discrepancy {h.before:.2f} before and {h.after:.2f} after repair (1 = noise alone), "
-            f"gain {h.gain:.1f} nats ({h.low:.1f} to {h.high:.1f})"
+            f"gain {h.gain:.1f} nats ({h.low:.1f} to {h.high:.1f}); a classifier tells the two apart with an area "
+            f"under the curve of {h.auc_before:.2f} before and {h.auc_after:.2f} after (0.5 = guessing)"
         )
         return "\n".join([*lines, *fused_words(self)])
 

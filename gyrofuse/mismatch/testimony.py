@@ -30,9 +30,13 @@ WITNESSES: tuple[Callable[[Case], Evidence], ...] = (
 )
 
 
-def testimony(case: Case) -> tuple[Evidence, ...]:
-    """What every witness says."""
-    return tuple(witness(case) for witness in WITNESSES)
+def testimony(case: Case, progress: Callable[[str, float], None] = lambda _what, _share: None) -> tuple[Evidence, ...]:
+    """What every witness says; `progress` is told which is asked next, and the share of them that were."""
+    evidence = []
+    for number, witness in enumerate(WITNESSES):
+        progress(witness.__name__.replace("_", " "), number / len(WITNESSES))
+        evidence.append(witness(case))
+    return tuple(evidence)
 
 
 def combined(evidence: tuple[Evidence, ...]) -> float:

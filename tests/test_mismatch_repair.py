@@ -1,0 +1,118 @@
+"""What becomes of a simulation that is repaired: what acts last, what remains, and who can still tell."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+import gyrofuse as gf
+from gyrofuse.mismatch import diagnose
+from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.classifier import area_under_curve, distinguishability, features
+from gyrofuse.mismatch.folds import N_FOLDS, estimation_samples, held_out_blocks, in_fold
+from gyrofuse.mismatch.mechanisms.flicker import FlickerNoise
+from gyrofuse.mismatch.mechanisms.quantization import Quantization
+from gyrofuse.mismatch.mechanisms.step import Step
+from gyrofuse.mismatch.remainder import Remainder
+from gyrofuse.mismatch.repaired import RepairedModel
+
+N, P = 8192, 3
+SCENE = Scene(100.0, "deg/s", ("1", "2", "3"))
+NONE = torch.zeros(P, dtype=torch.float64)
+
+
+def generator(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def white(seed: int, n_records: int = 4) -> torch.Tensor:
+    return torch.randn(n_records, P, N, generator=generator(seed), dtype=torch.float64)
+
+
+def case(recording: torch.Tensor, seed: int = 2) -> Case:
+    return Case.of(SCENE, recording, white(seed))
+
+
+def rounding(step: float) -> Quantization:
+    return Quantization(torch.full((P,), step, dtype=torch.float64), NONE, NONE)
+
+
+def test_every_sample_is_held_out_once_and_estimates_never_see_it():
+    signal = torch.arange(N + 5, dtype=torch.float64)
+    seen = torch.cat([held_out_blocks(signal, fold).flatten() for fold in range(N_FOLDS)])
+    assert torch.equal(seen.sort().values, signal[:N])
+    for fold in range(N_FOLDS):
+        kept = set(signal[estimation_samples(N + 5, fold)].tolist())
+        assert kept.isdisjoint(held_out_blocks(signal, fold).flatten().tolist())
+        assert len(kept) == N * (N_FOLDS - 1) // N_FOLDS
+    assert torch.stack([in_fold(10, fold) for fold in range(N_FOLDS)]).sum(0).tolist() == [1] * 10
+
+
+def test_rounding_stays_last_whatever_is_found_after_it():
+    g = generator(3)
+    noise = FlickerNoise(torch.full((P,), 0.3, dtype=torch.float64))
+    after = noise.explained(rounding(0.5).explained(case(white(1)[0]), g), g)
+    steps = after.simulated.signal / 0.5
+    assert torch.allclose(steps, steps.round())
+    assert float(after.analog.diff().abs().amin()) > 0
+    model = gf.ArrayModel.from_sensors([gf.Model([gf.WhiteNoise(1.0)])] * P)
+    drawn = RepairedModel(model, SCENE, (rounding(0.5), noise)).simulate(1000, generator=g) / 0.5
+    assert torch.allclose(drawn, drawn.round())
+
+
+def test_what_happened_once_is_not_expected_elsewhere():
+    step = Step(torch.ones(P, dtype=torch.float64), torch.zeros(P, 4, dtype=torch.float64), 10.0)
+    model = gf.ArrayModel.from_sensors([gf.Model([gf.WhiteNoise(1.0)])] * P)
+    repaired = RepairedModel(model, SCENE, (step, rounding(0.1)))
+    assert [effect.name for effect in repaired.elsewhere().effects] == ["quantization"]
+
+
+def test_a_remainder_has_the_ratio_of_the_spectra():
+    f = torch.linspace(0.01, 0.49, 50, dtype=torch.float64)
+    coloured = white(1)[0] + 0.8 * white(1)[0].roll(1, -1)
+    found = Remainder.of(case(coloured))
+    truth = (1 + 0.64 + 1.6 * torch.cos(2 * math.pi * f)).log() / 2
+    assert float((found.response(f).log() - truth).abs().mean()) < 0.08
+    before, after = case(coloured), found.explained(case(coloured), generator(1))
+    one, other = (c.recorded.power.log() - c.simulated.power.log() for c in (before, after))
+    assert float(other.abs().mean()) < 0.3 * float(one.abs().mean())
+
+
+def test_nothing_remains_where_nothing_differs():
+    assert float(Remainder.of(case(white(1)[0])).log_gain.abs().mean()) < 0.03
+
+
+def test_a_difference_without_a_name_stays_unexplained_and_is_filled_in():
+    g, n = generator(5), 2**14
+    base = gf.WhiteNoise(1.0) + gf.RandomWalk(1e-8)
+    recording = base.simulate(n, batch=(P,), generator=g)
+    f = torch.arange(n // 2 + 1, dtype=torch.float64) / n
+    ripple = 1 + 0.3 * torch.cos(8 * math.pi * f)
+    recording = torch.fft.irfft(torch.fft.rfft(recording) * ripple, n=n)
+    report = diagnose(recording, base.simulate(4 * n, batch=(P,), generator=g), rate=100.0)
+    assert report.unexplained
+    assert isinstance(report.model.effects[-1], Remainder)
+    assert report.held_out.after < 0.5 * report.held_out.before
+    assert report.held_out.auc_before > 0.8
+    assert report.held_out.auc_after < 0.6
+    assert "stands for no physics" in "".join(gf.mismatch.telling.verdict(report))
+
+
+def test_area_under_the_curve_counts_pairs():
+    positive, negative = torch.tensor([0.0, 1.0, 2.0]), torch.tensor([1.0, 3.0])
+    pairs = [(p > n) + 0.5 * (p == n) for p in positive.tolist() for n in negative.tolist()]
+    assert area_under_curve(positive, negative) == pytest.approx(sum(pairs) / 6)
+
+
+def test_nobody_tells_what_is_alike_and_anybody_what_is_louder():
+    areas = torch.tensor([[distinguishability(case(white(s)[0], s + 50), 0) for s in range(12)]])
+    assert abs(float(areas.mean()) - 0.5) < 3 * float(areas.std()) / math.sqrt(12)
+    assert distinguishability(case(1.3 * white(1)[0]), 0) > 0.9
+
+
+def test_features_are_finite_for_what_stands_still():
+    signal = torch.zeros(P, N, dtype=torch.float64)
+    signal[:, ::7] = 1.0
+    assert bool(features(signal, 32).isfinite().all())
