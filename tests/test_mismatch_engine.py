@@ -161,13 +161,12 @@ def test_progress_is_told_and_never_goes_back():
     diagnose(with_tone(array(1), 0.12), array(2), progress=lambda *step: told.append(step))
     shares = [share for _, share in told]
     assert shares == sorted(shares)
-    assert 0 <= shares[0] < 0.1 and 0.8 < shares[-1] <= 1
+    assert 0 <= shares[0] < 0.1
+    assert 0.8 < shares[-1] <= 1
     assert any("vibration_tone" in what for what, _ in told)
 
 
 def test_sensors_that_add_up_to_nothing_are_refused():
     signal = array(1).signal
-    with pytest.raises(
-        ValueError, match="`recording`: expected sensors with noise of their own.*leave one of them out"
-    ):
+    with pytest.raises(ValueError, match="`recording`: expected sensors with noise of their own"):
         diagnose(signal - signal.mean(0), array(2).signal)

@@ -30,7 +30,10 @@ WITNESSES: tuple[Callable[[Case], Evidence], ...] = (
 )
 
 
-def testimony(case: Case, progress: Callable[[str, float], None] = lambda _what, _share: None) -> tuple[Evidence, ...]:
+def testimony(
+    case: Case,
+    progress: Callable[[str, float], None] = lambda _what, _share: None,  # noqa: PT028 (this is no test)
+) -> tuple[Evidence, ...]:
     """What every witness says; `progress` is told which is asked next, and the share of them that were."""
     evidence = []
     for number, witness in enumerate(WITNESSES):
