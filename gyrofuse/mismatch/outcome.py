@@ -24,20 +24,7 @@ _Signal = TypeVar("_Signal", Recording, Tensor)
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Where recording and simulation differ, what the simulation left out, and how much better the repair fits.
-
-    Attributes:
-        mismatch: Whether they differ at all.
-        p_value: Of agreement, for the whole recording.
-        findings: Differences with names, in the order in which they were found.
-        unexplained: What witnesses still see after the repair.
-        held_out: Agreement on data not used for the repair.
-        model: The repaired simulation; it simulates.
-        evidence: What each witness saw before the repair.
-        evidence_after: What each witness saw after it.
-        case: Recording and simulation as they came.
-        repaired: The recording without what can be taken off it, and the simulation with all else.
-    """
+    """The data of a `MismatchReport`, where each entry is described; what tells of it needs no more."""
 
     mismatch: bool
     p_value: float
