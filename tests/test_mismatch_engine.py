@@ -11,7 +11,8 @@ from scipy import stats
 
 import gyrofuse as gf
 from gyrofuse.mismatch import diagnose
-from gyrofuse.mismatch.twins import calibrated, twin, twin_p_values
+from gyrofuse.mismatch.evidence import calibrated
+from gyrofuse.mismatch.twins import twin, twin_p_values
 
 MODEL = gf.WhiteNoise(1.0) + gf.AR1(0.999, 1e-4) + gf.RandomWalk(1e-8)
 N, RATE = 2**14, 100.0

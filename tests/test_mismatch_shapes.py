@@ -12,10 +12,11 @@ from scipy import stats
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.mismatch.bumps import bump_witness, oscillation_of, strongest_bump
+from gyrofuse.mismatch.bumps import _coherent_scores, bump_witness, oscillation_of, strongest_bump
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.colour import filtered, noise, of_phase, quadrature
 from gyrofuse.mismatch.confirm import held_out_gain
+from gyrofuse.mismatch.filter_forms import FILTERS, filter_corner, filter_power, filter_response, filter_strength
 from gyrofuse.mismatch.mechanism import Finding, Mechanism
 from gyrofuse.mismatch.mechanisms.common_mode import CommonMode
 from gyrofuse.mismatch.mechanisms.drifting_tone import DriftingTone
@@ -25,19 +26,15 @@ from gyrofuse.mismatch.mechanisms.parameter_shift import ParameterShift
 from gyrofuse.mismatch.mechanisms.resonance import Resonance
 from gyrofuse.mismatch.oscillating import Mode
 from gyrofuse.mismatch.pooled import common_witness, shape_witness
-from gyrofuse.mismatch.shape_fit import Ratios, data_model, equivalent, fit, linearised, log_score, smooth_coherence
+from gyrofuse.mismatch.shape_fit import Ratios, data_model, fit, linearised, log_score
+from gyrofuse.mismatch.shape_law import equivalent, smooth_coherence
 from gyrofuse.mismatch.shape_terms import (
-    FILTERS,
     Common,
     Flicker,
     LowPass,
     Parts,
     Shift,
     Term,
-    filter_corner,
-    filter_power,
-    filter_response,
-    filter_strength,
     oscillation,
 )
 from gyrofuse.mismatch.shapes import compared, shapes
@@ -102,6 +99,9 @@ def test_whittles_score_is_that_of_determinants_and_traces():
     for b in (0, 5, 20):
         m, q, w = model[b].numpy(), data.observed[b].numpy(), float(data.worth[b])
         expected = -w * (np.linalg.slogdet(m)[1] + np.trace(np.linalg.solve(m, q)).real)
+        # What coherences are worth beyond powers, where the simulation's sensors are independent.
+        g, k = (x / np.sqrt(np.outer(x.diagonal().real, x.diagonal().real)) for x in (m, q))
+        expected -= float(data.extra[b]) * (np.linalg.slogdet(g)[1] + np.trace(np.linalg.solve(g, k)).real)
         assert float(log_score(data, model)[b]) == pytest.approx(expected, rel=1e-9)
 
 
@@ -236,8 +236,37 @@ def test_witnesses_of_shapes_are_honest_with_common_noise_in_both():
         one, other = (x.simulate(4096, generator=g) for x in (array(), array()))
         source = 0.02 * torch.randn(2, 1, 4096, generator=g, dtype=torch.float64) * SIGNS[:, None]
         given = case(one + source[0], (other + source[1])[None])
-        p += [min(w(given).p_value for w in (shape_witness, bump_witness, common_witness))]
-    assert sum(x < 0.05 for x in p) <= stats.binom.isf(1e-3, n_runs, 0.15)
+        p += [min(w(given).p_value for w in (shape_witness, bump_witness, common_witness, coherence_witness))]
+    assert sum(x < 0.05 for x in p) <= stats.binom.isf(1e-3, n_runs, 0.2)
+
+
+@pytest.mark.parametrize("d", [20, 60])
+def test_correlations_of_independent_sensors_have_the_law_of_a_product_of_beta_variables(d: int):
+    n_runs = 4000
+    parts = torch.randn(2, n_runs, P, d, generator=generator(31), dtype=torch.float64)
+    z = torch.complex(parts[0], parts[1])
+    scores = _coherent_scores(z @ z.mH, float(d))
+    for level in (0.05, 0.005):
+        count = (scores > float(stats.norm.isf(level))).sum(-1).tolist()
+        low, high = stats.binom.ppf(1e-3, n_runs, 0.85 * level), stats.binom.isf(1e-3, n_runs, 1.15 * level)
+        assert all(low <= c <= high for c in count)
+
+
+def test_white_noise_of_which_sensors_share_a_part_is_named_though_no_power_changes():
+    g, share = generator(32), 0.06
+    own, simulation = array((1 - share) * WHITE).simulate(N, generator=g), array().simulate(N, batch=(1,), generator=g)
+    gain = (share * WHITE * torch.tensor([1 + i / 20 for i in range(P)], dtype=torch.float64)).sqrt()
+    given = case(own + gain[:, None] * torch.randn(1, N, generator=g, dtype=torch.float64), simulation)
+    found = CommonMode.nominate(given, 1e-4)
+    assert found is not None
+    assert isinstance(found.effect, CommonMode)
+    assert found.effect.inside
+    for i in found.sensors:
+        entry = found.parameters[f"gain[{i}]"]
+        assert abs(entry.value - float(gain[i])) < 2.1 * (entry.high - entry.low) / 2
+    explained = found.effect.explained(given, g)
+    assert shape_witness(explained).p_value > 1e-4
+    assert common_witness(explained).p_value > 1e-4
 
 
 def test_small_changes_of_all_bands_are_seen_where_single_bands_say_nothing():
@@ -369,9 +398,10 @@ def effects() -> dict[str, Mechanism]:
         "resonance of all": Resonance(Mode(0.1, 0.01, gain, shared=True)),
         "drifting_tone": DriftingTone(Mode(0.1, 0.02, 0.3 * gain, shared=True), slow=False),
         "flicker": FlickerNoise(1e-6 * SIGNS.square()),
-        "white in common": CommonMode("white", 0.0, gain),
-        "AR1 in common": CommonMode("ar1", 0.01, gain),
-        "walk in common": CommonMode("walk", 0.0, gain / 100),
+        "white in common": CommonMode("white", 0.0, gain, given.base, inside=False),
+        "AR1 in common": CommonMode("ar1", 0.01, gain, given.base, inside=False),
+        "walk in common": CommonMode("walk", 0.0, gain / 100, given.base, inside=False),
+        "white of both": CommonMode("white", 0.0, gain / 2, given.base, inside=True),
     }
 
 

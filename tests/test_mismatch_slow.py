@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import functools
+import gc
 import math
+import weakref
 
 import numpy as np
 import pytest
@@ -14,19 +16,30 @@ import gyrofuse as gf
 from gyrofuse.mismatch.base import Base, _time_constants
 from gyrofuse.mismatch.case import Case, Scene, block_means
 from gyrofuse.mismatch.confirm import held_out_gain
+from gyrofuse.mismatch.evidence import calibrated
 from gyrofuse.mismatch.mechanisms.step import Step
 from gyrofuse.mismatch.mechanisms.temperature_drift import TemperatureDrift
 from gyrofuse.mismatch.mechanisms.warm_up_transient import WarmUpTransient
-from gyrofuse.mismatch.slow import best_fit, cell_differences, differences, slow_noise
+from gyrofuse.mismatch.slow import (
+    SlowNoise,
+    best_fit,
+    cell_differences,
+    cosines,
+    ordinates,
+    scores,
+    slow_ordinates,
+    told,
+    where,
+)
 from gyrofuse.mismatch.slow_effect import quantiles
+from gyrofuse.mismatch.slow_families import lagged, steps, warm_ups
 from gyrofuse.mismatch.slow_scans import (
+    best_place,
     curve_length,
     expected_exceedances,
     jumps_to_and_fro,
-    lagged,
+    slow_look,
     slow_witness,
-    steps,
-    warm_ups,
 )
 
 N, RATE, SENSORS = 16384, 100.0, 4
@@ -68,17 +81,77 @@ def test_covariance_of_cells_is_that_of_the_samples():
         np.testing.assert_allclose(own, direct, rtol=1e-8, atol=1e-9 * np.abs(direct).max())
 
 
+def test_ordinates_are_cosines_of_block_means():
+    signal = torch.randn(3, 1024, generator=generator(7), dtype=torch.float64)
+    t = np.arange(256) + 0.5
+    means = signal.numpy().reshape(3, 256, 4).mean(-1)
+    direct = [[math.sqrt(2 / 256) * (m * np.cos(math.pi * k * t / 256)).sum() for k in range(1, 256)] for m in means]
+    np.testing.assert_allclose(slow_ordinates(signal + 5).numpy(), direct, atol=1e-12)
+    assert torch.allclose(ordinates(cosines()), torch.eye(255, dtype=torch.float64), atol=1e-12)
+
+
+def test_the_spectra_of_ordinates_are_those_of_the_covariance():
+    noise = told(case()).noise()
+    factors = torch.randn(SENSORS, 4, generator=generator(3), dtype=torch.float64)
+    full = cosines() @ noise.covariance(factors) @ cosines().mT
+    spectra = (factors.exp()[..., None] * noise.parts).sum(1)
+    np.testing.assert_allclose(spectra, full.diagonal(dim1=-1, dim2=-2), rtol=1e-9)
+    beside = full / (spectra[:, :, None] * spectra[:, None, :]).sqrt() - torch.eye(255, dtype=torch.float64)
+    assert float(beside.abs().max()) < 0.1, "nearly independent"
+
+
+def test_many_fits_at_once_are_those_one_by_one():
+    now = case()
+    noise, y = told(now).noise(), slow_ordinates(now.recording)
+    values = told(now).values * torch.tensor([0.8, 1.0, 1.3], dtype=torch.float64)[:, None, None]
+    many, x = told(now)._replace(values=values).noise(), steps(now).templates[200]
+    ys = torch.stack([y, y + 0.05 * x, y - 0.1 * x])
+    together = best_fit(many, ys, x)
+    for i in range(3):
+        alone = SlowNoise(noise.n_samples, many.coefficients[i], noise.centre, noise.spread, noise.ahead)
+        own = best_fit(alone, ys[i], x)
+        assert torch.allclose(own.size, together.size[i], atol=1e-3)
+        assert float(own.value.sum()) == pytest.approx(float(together.value[i].sum()), abs=0.01)
+    size, information = scores(ys[0], own.variance, x[None])
+    weight = 1 / own.variance
+    np.testing.assert_allclose(size[:, 0], (weight * x * ys[0]).sum(-1) / (weight * x * x).sum(-1))
+    np.testing.assert_allclose(information[:, 0], (weight * x * x).sum(-1))
+
+
+def test_tuples_are_chosen_item_by_item():
+    one, other = (best_fit(told(now).noise(), slow_ordinates(now.recording)) for now in (case(), case(seed=2)))
+    pair = [
+        type(one)(*(torch.stack([a, b]) for a, b in zip(x, y, strict=True))) for x, y in ((one, other), (other, one))
+    ]
+    chosen = where(torch.tensor([True, False]), *pair)
+    assert all(torch.equal(a, torch.stack([b, b])) for a, b in zip(chosen, one, strict=True))
+
+
+def test_slow_noise_is_told_to_the_lowest_frequencies():
+    """Pooled over sensors alike, the power of the first ordinates is known to a fraction of itself."""
+    model = gf.WhiteNoise(1.0) + gf.RandomWalk(1e-6)
+    ratios = []
+    for seed in range(12):
+        signal = model.simulate(N, batch=(2, SENSORS), generator=generator(50 + seed)).double()
+        now = Case.of(Scene(RATE, "deg/s", ("a", "b", "c", "d")), signal[0], signal[1:])
+        walk = 1e-6 * torch.from_numpy(np.minimum(*np.indices((256, 256)))).double() * now.block
+        exact = (cosines() @ walk @ cosines().mT).diagonal()[:3] + 1 / now.block
+        ratios.append((told(now).noise().own[:, :3] / exact).log())
+    ratio = torch.stack(ratios)
+    assert float(ratio.mean().abs()) < 0.35
+    assert float(ratio.std()) < 0.8, "2.2 from bands alone"
+
+
 def test_the_fit_is_a_maximum():
     now = case()
-    noise, y = slow_noise(now), differences(now.recording)
+    noise, y = told(now).noise(), slow_ordinates(now.recording)
     fit = best_fit(noise, y)
 
     def value(theta: torch.Tensor) -> float:
-        v = noise.covariance(theta)
-        quadratic = (y * torch.linalg.solve(v, y)).sum()
+        v = (theta.exp()[..., None] * noise.parts).sum(1)
         own = (((theta - noise.centre) / noise.spread).square()[:, :2]).sum()
         beside = (((theta - noise.centre) / noise.spread).square()[0, 2:]).sum()
-        return -float(quadratic + torch.logdet(v).sum() + own + beside) / 2
+        return -float((y.square() / v + v.log()).sum() + own + beside) / 2
 
     assert value(fit.log_factors) == pytest.approx(float(fit.value.sum()), rel=1e-9)
     for part in range(4):
@@ -93,12 +166,12 @@ def test_templates_are_those_of_the_paths():
     tau = 700.0
     path = (-T / tau).exp()
     assert torch.allclose(
-        warm_ups(now, torch.tensor([tau], dtype=torch.float64)).templates[0], differences(path), atol=1e-12
+        warm_ups(now, torch.tensor([tau], dtype=torch.float64)).templates[0], slow_ordinates(path), atol=1e-12
     )
     family = steps(now)
     for place in (0, 101, 500):
         path = (family.places[place] <= T).double()
-        assert torch.allclose(family.templates[place], differences(path))
+        assert torch.allclose(family.templates[place], slow_ordinates(path))
 
 
 def test_a_lag_is_a_low_pass_of_first_order():
@@ -117,7 +190,7 @@ def test_the_tail_of_a_scan_is_that_of_its_maximum():
     k = torch.arange(n, dtype=torch.float64)
     templates = torch.exp(-0.5 * ((k - 10 - angle * 6) / 4).square())
     information = templates.square().sum(-1)
-    length = curve_length(torch.eye(n, dtype=torch.float64)[None], templates, information[None])
+    length = curve_length(torch.ones(1, n, dtype=torch.float64), templates, information[None])
     unit = templates / information.sqrt()[:, None]
     assert float(length) == pytest.approx(float((unit[1:] * unit[:-1]).sum(-1).arccos().sum()))
     z = torch.randn(n_runs, n_sensors, n, generator=generator(4), dtype=torch.float64) @ unit.T
@@ -128,6 +201,26 @@ def test_the_tail_of_a_scan_is_that_of_its_maximum():
     # Davies' bound is close far out: between the law and a quarter more.
     low, high = stats.binom.ppf([1e-4, 1 - 1e-4], n_runs, expected)
     assert 0.75 * low <= found <= high
+
+
+def test_a_p_value_is_held_against_twins():
+    honest = torch.linspace(0.0005, 0.9995, 1000, dtype=torch.float64)
+    assert calibrated(1e-6, honest) == pytest.approx(1e-6, rel=0.3)
+    assert calibrated(0.5, honest) == pytest.approx(0.5, abs=0.01)
+    boastful = honest**2
+    assert calibrated(1e-6, boastful) == pytest.approx(1e-3, rel=0.3)
+    assert calibrated(0.1, honest.sqrt()) == pytest.approx(0.01, abs=0.002)
+
+
+def test_p_values_of_scans_hold_among_twins():
+    """Of 256 twins with simulations of one record, 5 % or hardly more are found at 5 %."""
+    look = slow_look(case())
+    noise, y, null = look._twins
+    heard = torch.ones(SENSORS, dtype=torch.float64)
+    for family in look.families:
+        p = best_place(noise, y, null, family, heard).p_value
+        assert int((p < 0.05).sum()) <= stats.binom.ppf(0.999, 256, 0.08)
+        assert int((p < 0.001).sum()) <= stats.binom.ppf(0.999, 256, 0.004)
 
 
 def test_quantiles_of_places():
@@ -145,7 +238,17 @@ def test_sensors_that_jump_to_and_fro_are_known():
     telegraph[[20, 70, 120, 150, 220]] += 4 * torch.tensor([1.0, -1, 1, -1, 1])
     staircase[[20, 70, 120, 150, 220]] += 4
     single[70] += 8
-    assert [jumps_to_and_fro(x, inverse) for x in (telegraph, staircase, single, y)] == [True, False, False, False]
+    found = [jumps_to_and_fro(inverse @ x, inverse) for x in (telegraph, staircase, single, y)]
+    assert found == [True, False, False, False]
+
+
+def test_a_look_does_not_keep_its_case():
+    now = case()
+    slow_look(now)
+    gone = weakref.ref(now)
+    del now
+    gc.collect()
+    assert gone() is None
 
 
 @pytest.mark.parametrize("seed", range(1, 9))

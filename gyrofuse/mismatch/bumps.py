@@ -1,11 +1,14 @@
 """Bumps of a spectrum wider than a line and narrower than an octave.
 
 The power of every stretch of 4, 8, 16, .. bins is set against its flanks: slopes and the unknown level of the noise
-cancel. The best one is fitted closely, with level and slope of the noise around it.
+cancel. In wider ones the sensors' correlations are tested as well: of independent sensors their determinant is a
+product of Beta variables, and a source of all sensors stands out where no power does. The best one is fitted closely,
+with level and slope of the noise around it.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -13,11 +16,13 @@ from typing import NamedTuple
 import torch
 from scipy import stats
 from torch import Tensor
+from torch.nn.functional import pad
 
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import Evidence, corrected
 from gyrofuse.mismatch.remembered import remembered
-from gyrofuse.mismatch.shape_fit import Fit, Ratios, fit, smooth_coherence
+from gyrofuse.mismatch.shape_fit import Fit, Ratios, fit
+from gyrofuse.mismatch.shape_law import smooth_coherence
 from gyrofuse.mismatch.shape_terms import Background, Bump, CommonBump, Ground
 from gyrofuse.mismatch.side import Side
 from gyrofuse.mismatch.spectra import Bands, degrees_of_freedom, hann_transform
@@ -31,6 +36,7 @@ _TRIES = 6
 _LINE = 0.6  # of the excess in three bins
 _AS_WELL = 0.01  # p value at which the simulation has it as well
 _CUT_OFF = 0.6  # of the simulation's power
+_ORDINATES = 2.5  # for each sensor, behind correlations
 _CELLS, _CELL = 24, 5  # on either side, and fewest bins of one
 
 
@@ -90,17 +96,25 @@ def bump_witness(case: Case) -> Evidence:
 @remembered
 def strongest_bump(case: Case) -> Stretch:
     """The most conspicuous bump of the recording that is neither a line nor in the simulation."""
-    power, length = _whitened(case.recorded, case)
+    transform, length = _whitened(case.recorded, case)
+    power = transform[0].abs().square()
     shared = _effective_sensors(case)
     known = torch.zeros(power.shape[-1], dtype=torch.bool)
     simulated: tuple[Tensor, int] | None = None
     starts, widths, scores = _scanned(power, length, case, shared)
-    n_places = scores.numel()
+    together = _correlated(transform[0], length, case)
+    starts, widths = torch.cat([starts, together[0]]), torch.cat([widths, together[1]])
+    n_places = scores.numel() + 2 * len(together[0])
+    scores = pad(scores, (0, len(together[0])), value=-math.inf)
+    scores = torch.cat([scores, pad(together[2], (scores.shape[1] - len(together[0]), 0), value=-math.inf)])
     for _ in range(_TRIES):
         flat = int(scores.argmax())
         row, column = divmod(flat, scores.shape[1])
         a, n = int(starts[column]), int(widths[column])
-        p = corrected(_tail(power, row, a, n, length, case, shared), n_places)
+        tail = float(stats.norm.sf(float(scores[row, column])))
+        if row < len(scores) - len(together[2]):
+            tail = _tail(power, row, a, n, length, case, shared)
+        p = corrected(tail, n_places)
         stretch = Stretch((a + (n - 1) / 2) / length, n / length, p, _alone(power, a, n, length, case))
         if p > _AS_WELL:
             return stretch
@@ -109,7 +123,7 @@ def strongest_bump(case: Case) -> Stretch:
         line = float(excess.topk(3).values.sum()) > _LINE * float(excess.sum())
         if simulated is None:
             simulated = _whitened(case.simulated, case)
-        if not line and not _has_it(simulated, stretch, case, row):
+        if not line and not _has_it(simulated, stretch, case, row, coherent=row >= len(scores) - len(together[2])):
             return stretch
         known[max(a - n, 0) : a + 2 * n] = True
         over = torch.stack([known[int(s) : int(s + w)].any() for s, w in zip(starts, widths, strict=True)])
@@ -120,11 +134,69 @@ def strongest_bump(case: Case) -> Stretch:
 
 
 def _whitened(side: Side, case: Case) -> tuple[Tensor, int]:
-    """Powers over the simulation's noise, `(sensor, bin)`, mean of the records, and the length padded to."""
+    """Transform over the simulation's noise, `(record, sensor, bin)`, and the length padded to."""
     transform, length = hann_transform(side.signal)
     f = torch.arange(transform.shape[-1], dtype=torch.float64) / length
-    power = transform.abs().square().mean(0)
-    return power / case.base.spectrum(f.clamp(min=1 / length)), length
+    return transform / case.base.spectrum(f.clamp(min=1 / length)).sqrt(), length
+
+
+def _correlated(transform: Tensor, length: int, case: Case) -> tuple[Tensor, Tensor, Tensor]:
+    """First bins and widths of wide stretches, and normal scores of their correlations `(2, stretch)`.
+
+    What sensors share over a broad band of both is taken out first.
+    """
+    p = len(transform)
+    n = 2 ** math.ceil(math.log2(_ORDINATES * _DEPENDENT * p * length / case.n_samples))
+    nothing = torch.zeros(0, dtype=torch.int64)
+    starts, widths, scores = [nothing], [nothing], [torch.zeros(2, 0, dtype=torch.float64)]
+    last = int((0.5 - 2 / case.n_samples) * length)
+    if p > 1 and 2 * n < last:
+        apart = _decorrelated(transform[:, :last], length, case)
+        half = apart[:, : last // (n // 2) * (n // 2)].unflatten(-1, (-1, n // 2)).movedim(1, 0)
+        blocks = half @ half.mH  # (block, sensor, sensor)
+        while n <= last // 8 and len(blocks) > 1:
+            a = torch.arange(len(blocks) - 1) * (n // 2)
+            inside = a >= max(int(_LOWEST + (_FLANK + _GAP) * n), 4 * n)
+            inside &= a + n + int((_FLANK + _GAP) * n) + 1 < last
+            starts.append(a[inside])
+            widths.append(torch.full_like(a[inside], n))
+            scores.append(_coherent_scores((blocks[:-1] + blocks[1:])[inside], float(_dof(n, length, case))))
+            blocks = blocks[: len(blocks) // 2 * 2].unflatten(0, (-1, 2)).sum(1)
+            n *= 2
+    return torch.cat(starts), torch.cat(widths), torch.cat(scores, -1)
+
+
+def _decorrelated(transform: Tensor, length: int, case: Case) -> Tensor:
+    """Without the coherence of broad bands."""
+    coherence = smooth_coherence(case.recorded.coherence, case.recorded.dof)
+    apart = transform.clone()
+    edges = [0, *(round(e * length / case.n_samples) for e in case.bands.edges[1:-1]), transform.shape[-1]]
+    for matrix, (a, b) in zip(coherence, itertools.pairwise(edges), strict=True):
+        root = torch.linalg.cholesky(matrix)
+        apart[:, a:b] = torch.linalg.solve_triangular(root, transform[:, a:b], upper=False)
+    return apart
+
+
+def _coherent_scores(matrices: Tensor, d: float) -> Tensor:
+    """Normal scores of correlations in phase, and of any, `(2, stretch)`, from sums of `d` ordinates.
+
+    Of independent sensors `det K` is a product of Beta variables of `d - k` and `k`, `k = 1 .. p - 1`; of real parts
+    they are half as large, and the ordinates twice as many. Its logarithm is Gamma distributed, to rounding.
+    """
+    k = torch.arange(1, matrices.shape[-1], dtype=torch.float64)
+    found = []
+    for own, a, b in ((matrices.real, d - k / 2, k / 2), (matrices, d - k, k)):
+        size = own.diagonal(dim1=-2, dim2=-1).real.clamp(min=1e-300).rsqrt()
+        q = -torch.linalg.slogdet(own * (size[:, :, None] * size[:, None, :])).logabsdet
+        mean = float((torch.digamma(a + b) - torch.digamma(a)).sum())
+        variance = float((torch.polygamma(1, a) - torch.polygamma(1, a + b)).sum())
+        found.append(_normal_of_gamma(q / mean, mean**2 / variance))
+    return torch.stack(found)
+
+
+def _normal_of_gamma(ratio: Tensor, shape: float) -> Tensor:
+    """Normal score of a Gamma variable over its mean (Wilson and Hilferty)."""
+    return (ratio.clamp(min=1e-12).pow(1 / 3) - 1 + 1 / (9 * shape)) * 3 * math.sqrt(shape)
 
 
 def _effective_sensors(case: Case) -> Tensor:
@@ -205,17 +277,21 @@ def _alone(power: Tensor, a: int, n: int, length: int, case: Case) -> tuple[int,
     return tuple(i for i in range(p) if corrected(float(tails[i]), p) < 0.01) or (int(tails.argmin()),)
 
 
-def _has_it(simulated: tuple[Tensor, int], stretch: Stretch, case: Case, row: int) -> bool:
+def _has_it(simulated: tuple[Tensor, int], stretch: Stretch, case: Case, row: int, *, coherent: bool) -> bool:
     """Whether the simulation has a bump at the same place."""
-    power, length = simulated
+    transform, length = simulated
+    power = transform.abs().square().mean(0)
     n = max(round(stretch.width * length), _NARROWEST)
     a = round(stretch.frequency * length - (n - 1) / 2)
     if a < int(_LOWEST + (_FLANK + _GAP) * n) or a + int((1 + _FLANK + _GAP) * n) + 1 >= power.shape[-1]:
         return False
-    rows = slice(None) if row == len(power) else slice(row, row + 1)
+    rows = slice(row, row + 1) if row < len(power) else slice(None)
     ratio = float((power[:, a : a + n].mean(-1) / _flanks(power, a, n))[rows].mean())
     own = len(case.simulated.signal) * case.simulated.signal.shape[-1] / case.n_samples
     d = max(n * own / _DEPENDENT, 1.0)
+    if coherent and d > len(power):
+        inside = transform[..., a : a + n].movedim(0, 1).flatten(1)
+        return float(_coherent_scores((inside @ inside.mH)[None], d).max()) > float(stats.norm.isf(_AS_WELL))
     return float(stats.f.sf(ratio, 2 * d, 4 * _FLANK * d)) < _AS_WELL
 
 
@@ -280,7 +356,7 @@ def _best(case: Case, stretch: Stretch, data: Ratios, background: Fit) -> Oscill
     if isinstance(term, CommonBump):
         gain = torch.complex(*term.local)
         variance = gain.abs().square()
-        spread = 2 * gain.abs() * local_sd.square().mean(0).sqrt()
+        spread = 2 * gain.abs() * local_sd.square().nanmean(0).sqrt()
     else:
         gain, variance, spread = None, term.local[0], local_sd[0]
     centre, width = (float(x) for x in term.shared.exp())

@@ -4,7 +4,8 @@
 frequency, phase 0. The transform makes white noise and random walks independent from ordinate to ordinate, which the
 Fourier transform of a stretch does not: there a slow channel and a wandering bias look alike at their ends. The noise
 has the shape of the base, and in each band the recording's own cross-spectral matrix on top of it, so that sensors with
-noise in common count once.
+noise in common count once. Lines that the simulation has as well are left out: there its own motion would be compared
+with the channel's.
 """
 
 from __future__ import annotations
@@ -19,8 +20,10 @@ from torch import Tensor
 from gyrofuse._transforms import cosine_ordinates
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import Evidence, corrected
+from gyrofuse.mismatch.lines import simulated_lines, without_lines
 
-_LEAST_DOF = 20.0  # of a simulation's band: below, it does not tell what chance alone would do to a slow channel
+_LINE = 4  # bins on either side of a line that the simulation has
+_LEAST_DOF = 3.0  # of a simulation's band: below, it does not tell what chance alone would do to a slow channel
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +48,11 @@ class ChannelFit:
     own: Tensor
     p_value: float
 
+    @property
+    def excess(self) -> float:
+        """Of the statistic over what chance gives."""
+        return self.statistic - self.gains.numel()
+
 
 def regress(case: Case, rows: Tensor, signal: Tensor | None = None) -> ChannelFit | None:
     """Regress the recording, or `signal` `(sensor, time)`, on rows `(row, time)`; None where these do not move."""
@@ -54,14 +62,18 @@ def regress(case: Case, rows: Tensor, signal: Tensor | None = None) -> ChannelFi
     size = rows.square().mean(-1).sqrt()
     if not bool((size > 1e-12).all()):
         return None
+    lines = simulated_lines(case.simulated)
+    signal, rows = without_lines(signal, lines), without_lines(rows, lines)
     y, a = cosine_ordinates(signal), cosine_ordinates(rows / size[:, None])
     late = cosine_ordinates(_quarter_late(rows / size[:, None]))
     k = torch.arange(n, dtype=torch.float64)
     weights = case.base.spectrum((k / (2 * n)).clamp(min=1 / (2 * n))).rsqrt()  # (sensor, ordinate)
+    for f in lines:
+        weights[:, (k / 2 - f * n).abs() < _LINE] = 0.0
     edges = [1, *(2 * edge for edge in case.bands.edges[1:-1]), n]
     moment, moment_late = (torch.zeros(n_sensors * n_rows, dtype=torch.float64) for _ in range(2))
     matrix = torch.zeros(n_sensors * n_rows, n_sensors * n_rows, dtype=torch.float64)
-    parts = []
+    parts, informed = [], []
     known = case.simulated.dof >= _LEAST_DOF
     inverses = torch.linalg.inv(case.recorded.over(case.base).real)
     for use, inverse, (first, end) in zip(known, inverses, itertools.pairwise(edges), strict=True):
@@ -70,6 +82,7 @@ def regress(case: Case, rows: Tensor, signal: Tensor | None = None) -> ChannelFi
         w = weights[:, first:end]
         white = (inverse @ (w * y[:, first:end])) * w  # (sensor, ordinate)
         design = (w[:, None] * a[:, first:end]).flatten(0, 1)  # (sensor * row, ordinate)
+        informed.append(design.square().sum(-1).view(n_sensors, n_rows).sum(-1))
         matrix += design @ design.mT * inverse.repeat_interleave(n_rows, 0).repeat_interleave(n_rows, 1)
         parts.append((white @ a[:, first:end].mT).flatten())
         moment += parts[-1]
@@ -83,8 +96,11 @@ def regress(case: Case, rows: Tensor, signal: Tensor | None = None) -> ChannelFi
     blocks = covariance.view(n_sensors, n_rows, n_sensors, n_rows)
     each = gains.view(n_sensors, n_rows)
     own_statistic = torch.stack([each[i] @ torch.linalg.solve(blocks[i, :, i], each[i]) for i in range(n_sensors)])
-    own = torch.from_numpy(special.chdtrc(n_rows, own_statistic.numpy()))
-    pooled = float(special.chdtrc(n_sensors * n_rows, statistic))
+    own = _tails(own_statistic, n_rows, torch.stack(informed), case.simulated.dof[known])
+    sure = torch.from_numpy(special.chdtri(n_rows, own.numpy()))  # what would be as rare if the noise were known
+    pooled = float(
+        special.chdtrc(n_sensors * n_rows, statistic * float(sure.sum() / own_statistic.sum().clamp(min=1e-300)))
+    )
     p_value = corrected(min(2 * pooled, 2 * corrected(float(own.amin()), n_sensors)), 1)
     return ChannelFit(
         gains=each / size,
@@ -97,13 +113,30 @@ def regress(case: Case, rows: Tensor, signal: Tensor | None = None) -> ChannelFi
     )
 
 
+def _tails(statistic: Tensor, n_rows: int, informed: Tensor, dof: Tensor) -> Tensor:
+    """p values `(sensor,)` of statistics, with noise that the simulation tells no better than its own length allows.
+
+    Args:
+        statistic: Chi-square if the noise were known, `(sensor,)`.
+        n_rows: Its degrees of freedom.
+        informed: What each band tells of the gains, `(band, sensor)`.
+        dof: What each band of the simulation is worth, complex ordinates, `(band,)`.
+    """
+    share = informed / informed.sum(0)
+    freedom = 2 / (share.square() / dof[:, None]).sum(0)
+    tails = special.betainc(freedom.numpy() / 2, n_rows / 2, (freedom / (freedom + statistic)).numpy())
+    return torch.from_numpy(tails).clamp(min=1e-300)
+
+
 def channel_witness(case: Case) -> Evidence:
     """Gains of the sensors on fast channels and on the products of their rows."""
     tried = []
     for name in [*accelerations(case), *rates(case)]:
         rows = case.scene.channels[name].to(torch.float64)
         rows = rows.reshape(-1, rows.shape[-1])
-        kinds = [("", rows), (" squared", products(rows))] if name in accelerations(case) else [("", rows)]
+        kinds = [("", rows)]
+        if name in accelerations(case):
+            kinds += [(" squared", products(rows)), (" squared", squared_length(rows))]
         for words, regressors in kinds:
             fit = regress(case, regressors)
             if fit is not None:
@@ -135,6 +168,11 @@ def products(rows: Tensor) -> Tensor:
     rows = rows - rows.mean(-1, keepdim=True)
     upper = torch.triu_indices(len(rows), len(rows))
     return rows[upper[0]] * rows[upper[1]]
+
+
+def squared_length(rows: Tensor) -> Tensor:
+    """Squared length of a vector of rows `(row, time)` without their means, `(1, time)`."""
+    return (rows - rows.mean(-1, keepdim=True)).square().sum(0, keepdim=True)
 
 
 def _channels(case: Case, word: str) -> list[str]:

@@ -13,7 +13,7 @@ from gyrofuse._checks import check_n_samples
 from gyrofuse._model import Model
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.confirm import Gain, held_out, held_out_gain
-from gyrofuse.mismatch.evidence import corrected
+from gyrofuse.mismatch.evidence import calibrated, corrected
 from gyrofuse.mismatch.inputs import noise_of, prepared
 from gyrofuse.mismatch.mechanism import Finding
 from gyrofuse.mismatch.mechanisms import STAGES
@@ -21,7 +21,7 @@ from gyrofuse.mismatch.remainder import ASKED_FOR_BY, Remainder
 from gyrofuse.mismatch.repaired import RepairedModel
 from gyrofuse.mismatch.report import MismatchReport
 from gyrofuse.mismatch.testimony import combined, testimony
-from gyrofuse.mismatch.twins import FEWEST, calibrated, twin_p_values
+from gyrofuse.mismatch.twins import FEWEST, twin_p_values
 from gyrofuse.recording import Recording
 from gyrofuse.simulate import ArrayModel
 

@@ -8,11 +8,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.level_scan import scanned_levels
+
 _FINEST_BLOCKS = 16384
 _SHORTEST_BLOCK = 16
 _ROUNDS = 4
-_STARTS = (0.0, 3.0)  # factors to start from; 0 is that of the CUSUM's own range
-_CERTAIN = 3.0  # sd of the log of a factor
+_LOUDER = 3.0  # factor to start from, where no stretch is
+_CUT = 25.0  # squares: an outlier is no episode
+_CERTAIN = 2.5  # sd of the log of a factor
 
 
 class Episode(NamedTuple):
@@ -48,8 +51,9 @@ def episodes_of(white: Tensor, p_values: Tensor) -> Episodes | None:
         p_values: That its level changes, for each sensor and for all together, `(sensor + 1,)`.
     """
     best, best_score = None, 0.0
-    for factor in _STARTS:
-        found, score = _from_start(white, p_values, factor)
+    scan = scanned_levels(white.square().clamp(max=_CUT))
+    for factor, stretch in ((0.0, None), (0.0, (scan.start, scan.stop)), (_LOUDER, None)):
+        found, score = _from_start(white, p_values, factor, stretch)
         if found is not None and (best is None or score > best_score):
             best, best_score = found, score
     return best
@@ -82,15 +86,21 @@ def onset_limits(log_ratios: Tensor, episode: Episode, *, rising: bool) -> tuple
     return first + low + offset, first + min(high, len(weight) - 1) + offset
 
 
-def _from_start(white: Tensor, p_values: Tensor, start: float) -> tuple[Episodes | None, float]:
+def _from_start(
+    white: Tensor, p_values: Tensor, start: float, stretch: tuple[int, int] | None
+) -> tuple[Episodes | None, float]:
+    """The likeliest episodes from a factor on, or where it is 0 from a stretch or that of the CUSUM's range."""
     n = white.shape[-1]
-    squares = white.square().clamp(max=25.0)
+    squares = white.square().clamp(max=_CUT)
     own = p_values[:-1] <= max(float(p_values.min()), 1e-4)
     concerned = own if bool(own.any()) else torch.ones_like(own)
     inside = torch.zeros(n, dtype=torch.bool)
     factor = torch.where(concerned, start, 1.0).to(torch.float64)
     if start == 0:
-        inside = _widest(_blocks(squares[concerned]).mean(0), n)
+        if stretch is None:
+            inside = _widest(_blocks(squares[concerned]).mean(0), n)
+        else:
+            inside[slice(*stretch)] = True
         factor = _factors(squares, inside, concerned)
     for _ in range(_ROUNDS):
         log_ratios = _log_ratios(squares, factor, inside)
@@ -103,9 +113,9 @@ def _from_start(white: Tensor, p_values: Tensor, start: float) -> tuple[Episodes
         factor = _factors(squares, inside, torch.ones_like(concerned))
         if bool((factor == 1).all()):
             return None, 0.0
-    if found[0].start == 0:  # what the recording starts with is the rule, what comes later the episode
-        edges = [*(e for pair in found for e in pair if 0 < e < n), *([n] if found[-1].stop < n else [])]
-        found = tuple(Episode(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True))
+    if 2 * int(inside.sum()) > n:  # what lasts longer is the rule
+        edges = [0, *(e for pair in found for e in pair), n]
+        found = tuple(Episode(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if a < b)
         factor, inside = 1 / factor, ~inside
     score = float(two_level_scores(white, factor, inside).sum()) - 2 * len(found) * math.log(n)
     return Episodes(found, factor), score

@@ -6,6 +6,10 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from torch import Tensor
+
+_TAIL = 0.25  # share of the twins behind the fitted tail
+
 
 @dataclass(frozen=True)
 class Evidence:
@@ -39,3 +43,17 @@ class Evidence:
 def corrected(p: float, places: float) -> float:
     """p value of the smallest of so many independent ones, each uniform: `1 - (1 - p)^places`, to rounding."""
     return -math.expm1(places * math.log1p(-min(p, 1.0))) if p < 1 else 1.0
+
+
+def calibrated(p_value: float, among: Tensor) -> float:
+    """p value from its rank among those of twins `(twin,)`, in which nothing is missing.
+
+    Beyond the smallest quarter of them the tail is fitted instead of counted: `-log p` has an exponential tail, with
+    rate one where witnesses are honest. The maximum of its likelihood is the inverse mean excess.
+    """
+    scores, own = -among.clamp(min=1e-300).log(), -math.log(max(p_value, 1e-300))
+    threshold = float(scores.quantile(1 - _TAIL))
+    if own <= threshold:
+        return float(((scores >= own).sum() + 1) / (len(scores) + 1))
+    excess = scores[scores > threshold] - threshold
+    return _TAIL * math.exp(-(own - threshold) / float(excess.mean()))

@@ -19,11 +19,14 @@ from torch.nn.functional import avg_pool1d
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.episodes import episodes_of
 from gyrofuse.mismatch.evidence import Evidence, corrected
+from gyrofuse.mismatch.level_scan import LevelScan, scanned_levels
 from gyrofuse.mismatch.remembered import remembered
+from gyrofuse.mismatch.shocks import WeakOutliers, weak_outliers
 from gyrofuse.mismatch.side import Side
 
 _NARROWEST, _WIDEST = 32, 64  # bands, ordinates
 _LOG_CHI2 = -1.2703628454614782  # mean of log chi2_1
+_LEFT = 1 - 1.5 / _WIDEST  # of a sample's own part: the spectrum follows each ordinate by three quarters of its share
 _LINE = 25.0  # ordinates this far above the spectrum are lines
 _SKIRT = 1 / 8  # share of ordinates of a line, beyond which the stretch around belongs to it
 _ENDS = 64  # a line's skirt is felt in so small a part of the record at each end
@@ -31,11 +34,12 @@ _MOST_RECORDS = 2  # of the simulation: as honest as more
 _MAD = 0.6744897501960817
 _TAILS = (3.5, 4.0, 4.5, 5.0, 6.0, 8.0)
 _HEAVY = 1e-3  # p value of tails that the simulation has as well
+_OWN = 0.05  # p value of what the simulation has as well
 _CUT = 9.0  # squares: an outlier is no change of level
 _BLOCK = 128
 _BURST = 15  # lags
 _CHANGES = 1.62  # range of a stationary CUSUM that one in ten exceeds
-_UNSTEADY, _CLUSTERED = 2.1, 3.5  # range and clustering that one steady simulation in two hundred exceeds
+_UNSTEADY = 1e-4  # p value of a simulation's level that changes
 _TOP = 6  # levels at the top that have too few coefficients
 _NEIGHBOURS = 8  # thinned Haar coefficients that are correlated
 
@@ -68,7 +72,7 @@ def left_out(side: Side) -> LeftOut:
     lines = _lines(y, spectrum)
     y = torch.where(lines, 0.0, y)
     white, inverse = _back(y / spectrum.sqrt()), 1 / spectrum
-    error = _back(y * inverse) / inverse.mean(-1, keepdim=True)
+    error = _back(y * inverse) / (_LEFT * inverse.mean(-1, keepdim=True))
     has_lines = lines.any(-1, keepdim=True)
     white, error = (torch.where(has_lines, _mirrored(v), v) for v in (white, error))
     return LeftOut(error, _robust_sd(error), white / _robust_sd(white)[..., None])
@@ -158,33 +162,50 @@ def spike_p_values(case: Case) -> Tensor:
     return -torch.expm1(len(_TAILS) * torch.log1p(-best.clamp(max=1 - 1e-16)))
 
 
+def spike_p_value(case: Case) -> float:
+    """p value of outliers anywhere, by the tails or by many weak ones."""
+    tails = spike_p_values(case)
+    p_value = corrected(float(tails.min()), len(tails))
+    # A simulation that has weak outliers too is compared by the tails alone.
+    many = likely_outliers(case.recorded).p_value if likely_outliers(case.simulated).p_value > _OWN else 1.0
+    return corrected(min(p_value, many), 2)
+
+
+@remembered
+def likely_outliers(side: Side) -> WeakOutliers:
+    """Evidence of weak outliers in the first record."""
+    return weak_outliers(left_out(side).z[0])
+
+
 def spike_witness(case: Case) -> Evidence:
     """Outliers of single samples, sensor by sensor and all together."""
-    p_values = spike_p_values(case)
+    p_values, p_value = spike_p_values(case), spike_p_value(case)
     z = left_out(case.recorded).z[0].abs()
     worst = int(p_values[:-1].argmin())
     at = int(z[worst].argmax())
     count = int((z[worst] > 5).sum())
-    return Evidence(
-        "spike",
-        corrected(float(p_values.min()), len(p_values)),
-        f"{count} samples beyond 5 sd in sensor {case.scene.sensors[worst]}, the largest {float(z[worst, at]):.3g} sd",
-        sensors=(worst,),
-        levels=(1,),
-        time_s=at / case.scene.rate,
+    words = (
+        f"{count} samples beyond 5 sd in sensor {case.scene.sensors[worst]}, the largest {float(z[worst, at]):.3g} sd"
     )
+    sensors: tuple[int, ...] = (worst,)
+    if corrected(float(p_values.min()), len(p_values)) > p_value:
+        many = likely_outliers(case.recorded)
+        sensors = tuple((many.sensors > 0.5).nonzero()[:, 0].tolist()) or sensors
+        words = f"outliers of {many.size:g} sd {'in several sensors at once' if many.shock else 'in single sensors'}"
+    return Evidence("spike", p_value, words, sensors=sensors, levels=(1,), time_s=at / case.scene.rate)
 
 
-@remembered
-def _block_squares(side: Side) -> Tensor:
-    """Means of `min(e^2, 9)` over blocks, `(record, sensor, block)`."""
-    squares = left_out(side).white.square().clamp(max=_CUT)
-    return avg_pool1d(squares, _BLOCK)
+def _squares(white: Tensor) -> Tensor:
+    """`min(e^2, 9)` of whitened records `(..., sensor, time)`, and last of all their sum over the sensors."""
+    squares = white.square().clamp(max=_CUT)
+    return torch.cat([squares, _standardised(squares).sum(-2, keepdim=True)], -2)
 
 
-def _ranges(blocks: Tensor) -> Tensor:
-    """Range of the CUSUM of `(..., block)` over its sd, from first differences: Kuiper's, of a Brownian bridge."""
-    sd = (blocks.diff(dim=-1).square().mean(-1) / 2).sqrt()
+def _ranges(squares: Tensor) -> Tensor:
+    """Range of the CUSUM of `(..., time)` in blocks over its sd: Kuiper's, of a Brownian bridge."""
+    blocks = squares[..., : squares.shape[-1] // _BLOCK * _BLOCK].unflatten(-1, (-1, _BLOCK)).mean(-1)
+    # From first differences, which bursts raise; chance must not lower it below that of independent samples.
+    sd = (blocks.diff(dim=-1).square().mean(-1) / 2).sqrt().maximum(squares.std(-1) / math.sqrt(_BLOCK))
     path = (blocks - blocks.mean(-1, keepdim=True)).cumsum(-1)
     return (path.amax(-1) - path.amin(-1)) / (sd * math.sqrt(blocks.shape[-1]))
 
@@ -197,25 +218,28 @@ def _kuiper_p(reach: float) -> float:
     return min(max(2 * sum(terms), 0.0), 1.0)
 
 
+@remembered
+def _scanned(side: Side) -> LevelScan:
+    """Scan of all the records, in which the level would change at the same times."""
+    return scanned_levels(left_out(side).white.flatten(0, 1).square().clamp(max=_CUT))
+
+
+def _divided(case: Case) -> bool:
+    """Whether the simulation's own levels are taken off the recording."""
+    return case.simulated.signal.shape[-1] == case.n_samples and _scanned(case.simulated).p_value < _UNSTEADY
+
+
 def level_profile(case: Case) -> Tensor:
     """Variance of the noise that the simulation gives each sample, `(sensor, time)`, or 1 where it is steady."""
-    steady = _steady(case.simulated)
-    if bool(steady.all()) or case.simulated.signal.shape[-1] != case.n_samples:
-        return torch.ones(case.n_sensors, 1, dtype=torch.float64)
-    profile = torch.ones(case.n_sensors, case.n_samples, dtype=torch.float64)
+    profile = torch.ones(case.n_sensors, 1, dtype=torch.float64)
     white = left_out(case.simulated).white
-    for i in (~steady).nonzero()[:, 0].tolist():
-        found = episodes_of(white[:, i], torch.zeros(len(white) + 1, dtype=torch.float64))
-        if found is not None:
-            profile[i, found.inside(case.n_samples)] = float(found.factor.log().mean().exp())
-    return profile
-
-
-@remembered
-def _steady(side: Side) -> Tensor:
-    """Which sensors `(sensor,)` have a noise level that does not change."""
-    squares = left_out(side).white.square().clamp(max=_CUT)
-    return (_ranges(_block_squares(side)).amax(0) < _UNSTEADY) & (_clustering(squares).amax(0) < _CLUSTERED)
+    if not _divided(case):
+        return profile
+    found = episodes_of(white.flatten(0, 1), torch.zeros(white[..., 0].numel() + 1, dtype=torch.float64))
+    if found is None:
+        return profile
+    factor = found.factor.view(white.shape[:-1]).log().mean(0).exp()
+    return torch.where(found.inside(case.n_samples), factor[:, None], 1.0)
 
 
 def levelled(case: Case) -> Tensor:
@@ -228,22 +252,25 @@ def variance_p_values(case: Case) -> Tensor:
 
     Once for episodes, from the range of the CUSUM, once for bursts, from the autocorrelation of the squares.
     """
-    squares = levelled(case).square().clamp(max=_CUT)
-    blocks = avg_pool1d(squares, _BLOCK)
-    blocks = torch.cat([blocks, _standardised(blocks).sum(0, keepdim=True)])
-    other = _block_squares(case.simulated)
-    other = torch.cat([other, _standardised(other).sum(1, keepdim=True)], 1)
+    squares, other = _squares(levelled(case)), _squares(left_out(case.simulated).white)
     wander = (_ranges(other).amax(0) / _CHANGES).clamp(min=1.0)
-    fast = torch.cat([squares, _standardised(squares).sum(0, keepdim=True)])
-    simulated = left_out(case.simulated).white[0].square().clamp(max=_CUT)
-    simulated = torch.cat([simulated, _standardised(simulated).sum(0, keepdim=True)])
-    heavy = (_clustering(simulated) - 2.5).clamp(min=0)
-    if not bool(_steady(case.simulated).all()) and case.simulated.signal.shape[-1] == case.n_samples:
-        wander, heavy = torch.ones_like(wander), torch.zeros_like(heavy)  # it was divided by
-    episodes = torch.tensor([_kuiper_p(float(r)) for r in _ranges(blocks) / wander], dtype=torch.float64)
-    bursts = torch.special.ndtr(heavy - _clustering(fast))
+    heavy = (_clustering(other[0]) - 2.5).clamp(min=0)
+    if _divided(case):
+        wander, heavy = torch.ones_like(wander), torch.zeros_like(heavy)
+    episodes = torch.tensor([_kuiper_p(float(r)) for r in _ranges(squares) / wander], dtype=torch.float64)
+    bursts = torch.special.ndtr(heavy - _clustering(squares))
     both = torch.minimum(episodes, bursts)
     return 1 - (1 - both).square()
+
+
+def variance_p_value(case: Case) -> float:
+    """p value that the noise level changes anywhere: in one sensor or all, or by little in several."""
+    each = variance_p_values(case)
+    p_value = corrected(float(each.min()), len(each))
+    several = 1.0
+    if _divided(case) or _scanned(case.simulated).p_value > _OWN:
+        several = scanned_levels(levelled(case).square().clamp(max=_CUT)).p_value
+    return corrected(min(p_value, several), 2)
 
 
 def _standardised(values: Tensor) -> Tensor:
@@ -270,7 +297,7 @@ def variance_witness(case: Case) -> Evidence:
     where = "all sensors together" if every else f"sensor {case.scene.sensors[worst]}"
     return Evidence(
         "variance",
-        corrected(float(p_values.min()), len(p_values)),
+        variance_p_value(case),
         f"a noise level that changes in {where}",
         sensors=tuple(range(case.n_sensors)) if every else (worst,),
         levels=(1,),

@@ -17,6 +17,7 @@ from torch import Tensor
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import Evidence, corrected
 from gyrofuse.mismatch.impulses import left_out
+from gyrofuse.mismatch.recurring import missing_recurrences
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.side import Side
 
@@ -28,7 +29,8 @@ _LOWEST = 3.5  # u s, where a peak found by its flank or its harmonics may still
 _DOUBTFUL = 0.05  # p value of a lattice that is not looked at more closely
 _PER_STEP = 6  # histogram bins a step, at the finest
 _MOST_BINS = 2**21
-_SAME_STEP = 1e-3
+_SAME_STEP, _ALIKE = 1e-3, 0.04  # of steps that are exact, and hidden
+_SIMULATED = 0.05  # p value of a hidden lattice that the simulation has as well
 _BLOCKS = 32  # whose spread tells how far repeats vary by themselves
 _QUARTERS = 4
 _BY_CHANCE = 3.0  # times the variance expected of quarters
@@ -56,19 +58,23 @@ def innovation_sd(side: Side) -> Tensor:
 
 
 @remembered
+def exact_lattices(side: Side) -> tuple[Lattice | None, ...]:
+    """The lattice of each sensor's values in the first record that needs no statistics, `None` without."""
+    return tuple(
+        _exact_lattice(values, float(sd)) for values, sd in zip(side.signal[0], innovation_sd(side), strict=True)
+    )
+
+
+@remembered
 def lattices(side: Side) -> tuple[Lattice | None, ...]:
     """The lattice of each sensor's values in the first record, `None` where nothing looks like one."""
-    return tuple(_lattice(values, float(sd)) for values, sd in zip(side.signal[0], innovation_sd(side), strict=True))
+    every = zip(exact_lattices(side), side.signal[0], innovation_sd(side), strict=True)
+    return tuple(exact or _hidden_lattice(values.unique(), float(sd)) for exact, values, sd in every)
 
 
-def _lattice(values: Tensor, sd: float) -> Lattice | None:
-    unique, counts = torch.unique(values, return_counts=True)
-    exact = _exact_lattice(unique, counts, sd)
-    return exact if exact is not None else _hidden_lattice(unique, sd)
-
-
-def _exact_lattice(unique: Tensor, counts: Tensor, sd: float) -> Lattice | None:
+def _exact_lattice(values: Tensor, sd: float) -> Lattice | None:
     """From the gaps between values that recur."""
+    unique, counts = torch.unique(values, return_counts=True)
     gaps = unique.diff()
     # A gap far below what matters is the noise of arithmetic.
     for step in (float(gaps.median()), float(gaps.min())) if len(gaps) > 1 else ():
@@ -141,14 +147,36 @@ def off_lattice(values: Tensor, step: float | Tensor, offset: float | Tensor) ->
 def missing_lattices(case: Case, level: float) -> dict[int, Lattice]:
     """Lattices of the recording, by sensor, that the simulation does not have and could be rounded to."""
     missing = {}
-    for i, (own, other) in enumerate(zip(lattices(case.recorded), lattices(case.simulated), strict=True)):
+    for i, own in enumerate(lattices(case.recorded)):
         if own is None or corrected(own.p_value, case.n_sensors) > level:
             continue
-        rounded = other is not None and corrected(other.p_value, case.n_sensors) <= max(level, 1e-3)
-        if rounded and other is not None and other.step > own.step * (1 - _SAME_STEP):
-            continue
-        missing[i] = own
-    return missing
+        left = _not_simulated(case, i, own)
+        if left is not None and corrected(left.p_value, case.n_sensors) <= level:
+            missing[i] = left
+    if not missing:
+        return missing
+    steps = [found.step for found in missing.values()]
+    for i, own in enumerate(lattices(case.recorded)):  # a step that is known elsewhere needs less to be believed
+        alike = own is not None and own.p_value < _DOUBTFUL and any(abs(own.step / s - 1) < _ALIKE for s in steps)
+        if i not in missing and own is not None and alike:
+            left = _not_simulated(case, i, own)
+            if left is not None and left.p_value < _DOUBTFUL:
+                missing[i] = left
+    return dict(sorted(missing.items()))
+
+
+def _not_simulated(case: Case, sensor: int, own: Lattice) -> Lattice | None:
+    """A lattice of the recording, with the p value of its being no clearer than the simulation's; `None` if exact."""
+    values = case.simulated.signal[:, sensor].flatten()
+    if own.blur == 0:
+        other = exact_lattices(case.simulated)[sensor]
+        return None if other is not None and other.step > own.step * (1 - _SAME_STEP) else own
+    u, n, m = torch.tensor([2 * math.pi / own.step], dtype=torch.float64), case.n_samples, len(values)
+    power, other_power = (float(_power(v - v.mean(), u)) for v in (case.recording[sensor], values))
+    if other_power < -math.log(_SIMULATED):
+        return own
+    clearer = max(math.sqrt(power / n) - math.sqrt(other_power / m), 0.0)
+    return own._replace(p_value=max(own.p_value, math.exp(-(clearer**2) / (1 / n + 1 / m))))
 
 
 class Repeats(NamedTuple):
@@ -285,7 +313,7 @@ def _share_at_end(values: Tensor, cell: float) -> float:
 
 
 def marginal_witness(case: Case) -> Evidence:
-    """Lattice, repeats and end stops of single values, against those of the simulation."""
+    """Lattice, repeats, end stops and returns of single values, against those of the simulation."""
     steps = missing_lattices(case, 1.0)
     same = repeats(case).p_values
     candidates = [
@@ -296,10 +324,14 @@ def marginal_witness(case: Case) -> Evidence:
     candidates.append((corrected(float(same[often]), case.n_sensors), often, "samples repeated more often than there"))
     ends = min(end_stops(case), key=lambda end: end.p_value)
     candidates.append((ends.p_value, ends.sensor, f"values that end at {ends.limit:.6g} {case.scene.unit}"))
+    candidates += [
+        (p, i, f"{found.times} times the value {found.value:.6g} {case.scene.unit}, where values do not recur,")
+        for i, (found, p) in missing_recurrences(case).items()
+    ]
     p, sensor, words = min(candidates)
     return Evidence(
         "marginal",
-        corrected(p, 3),
+        corrected(p, 4),
         f"{words} in sensor {case.scene.sensors[sensor]}",
         sensors=(sensor,),
         levels=(1,),

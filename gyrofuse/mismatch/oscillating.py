@@ -118,7 +118,7 @@ def nominated(case: Case, level: float, *, tone: bool) -> tuple[Mode, Seen] | No
         centre, width = (float(x) for x in term.shared.exp())
         if isinstance(term, CommonBump):
             gain = torch.complex(*term.local)
-            variance, spread = gain.abs().square(), 2 * gain.abs() * local_sd.square().mean(0).sqrt()
+            variance, spread = gain.abs().square(), 2 * gain.abs() * local_sd.square().nanmean(0).sqrt()
         else:
             gain, variance, spread = None, term.local[0], local_sd[0].nan_to_num(nan=math.inf)
         stretch = Stretch(centre, width, shape.p_value, ())

@@ -6,7 +6,7 @@ import math
 from typing import NamedTuple
 
 import torch
-from scipy import optimize, stats
+from scipy import optimize
 from torch import Tensor
 
 _BULK = 2.5  # values below it are counted in a histogram
@@ -101,18 +101,6 @@ def clustered(white: Tensor) -> bool:
         if float((around.amax(-1) > _COMPANY).to(torch.float64).mean()) > _CLUSTERED:
             return True
     return False
-
-
-def simultaneous(z: Tensor, hit: tuple[int, ...]) -> bool:
-    """Whether at one sensor's outliers the others `(sensor, time)` concerned are large too."""
-    if len(hit) < 2:
-        return False
-    squares, total, n = z[list(hit)].square().clamp(max=25.0), 0.0, 0
-    for i in range(len(hit)):
-        events = squares[i] > _EVENT**2
-        others = torch.cat([squares[:i], squares[i + 1 :]])[:, events]
-        total, n = total + float(others.sum()), n + others.numel()
-    return n > 0 and bool(stats.chi2.sf(total, n) < 1e-3)
 
 
 def _moved(z: Tensor, law: Outliers) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from typing import NamedTuple
 
 import torch
 from scipy import stats
@@ -11,8 +12,11 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import Evidence, corrected
-from gyrofuse.mismatch.witnesses import level_of, power_tails
+from gyrofuse.mismatch.remembered import remembered
+from gyrofuse.mismatch.witnesses import level_of, power_tails, whitened_difference
 
+_ABSENT = 0.7  # standard deviations of what the simulation has, below which it has nothing
+_SHOWN = 0.1  # p value below which the simulation's sensors share something
 _DRAWN, _COUNTED = 4000, 40  # matrices of noise, and those of them beyond which the tail is not counted
 _NEIGHBOURS = 1.1  # bands next to each other are slightly correlated
 
@@ -26,9 +30,12 @@ def shape_witness(case: Case) -> Evidence:
     scores = torch.where(worth > 0, scores.nan_to_num(nan=0.0), 0.0)  # (sensor, band)
     weights = worth.sqrt()
     pooled, spread = _windows(scores * weights, weights, case)
-    z = pooled / spread.clamp(min=1e-12)
-    row, column = divmod(int(z.abs().argmax()), z.shape[1])
-    p = 2 * float(stats.norm.sf(float(z.abs().max())))
+    z = (pooled / spread.clamp(min=1e-12)).abs()
+    # All sensors together have as large a share of the chances as all that are alone.
+    places = _places(one.shape[-1]) * torch.tensor([2.0 * len(one)] * len(one) + [2.0])[:, None]
+    log_p = math.log(2) + torch.special.log_ndtr(-z) + places.log()
+    row, column = divmod(int(log_p.argmin()), z.shape[1])
+    p = 2 * float(stats.norm.sf(float(z[row, column])))
     first, last, sensors = _window_of(row, column, case)
     f = math.sqrt(float(case.bands.frequency[first] * case.bands.frequency[last])) * case.scene.rate
     inside = slice(first, last + 1)
@@ -39,7 +46,7 @@ def shape_witness(case: Case) -> Evidence:
     )
     return Evidence(
         "shape",
-        corrected(p, z.numel()),
+        corrected(p, float(places[row, column])),
         f"power is {math.exp(log_ratio):.3g} times the simulation's over a broad band around {f:.3g} Hz",
         sensors=sensors,
         levels=tuple(sorted({level_of(float(case.bands.frequency[b])) for b in range(first, last + 1)})),
@@ -47,64 +54,110 @@ def shape_witness(case: Case) -> Evidence:
     )
 
 
-def common_witness(case: Case) -> Evidence:
-    """Coherence that the simulation does not have, pooled over neighbouring bands, all pairs of sensors together.
+class Source(NamedTuple):
+    """Coherence that the simulation does not have.
 
-    The difference of coherence matrices is whitened by what both have in common: its entries then vary by
-    `1/d + 1/s`, whatever noise the sensors share.
+    Attributes:
+        p_value: Of the strongest run of bands, for all runs.
+        first, last: Its bands.
+        pair: The two sensors that share most.
+        independent: Whether the simulation's sensors have nothing of it, nor share anything in any other run.
     """
-    p, d, s = case.n_sensors, case.recorded.dof, case.simulated.dof
-    known = (d >= 2 * p) & (s >= 2 * p)
-    if p < 2 or int(known.sum()) < 2:
+
+    p_value: float
+    first: int
+    last: int
+    pair: tuple[int, int]
+    independent: bool
+
+
+def common_witness(case: Case) -> Evidence:
+    """Coherence that the simulation does not have, pooled over neighbouring bands, all pairs of sensors together."""
+    found = common_source(case)
+    if found is None:
         return Evidence("common", 1.0, "nothing to compare coherences of")
-    one, other, d, s = case.recorded.coherence[known], case.simulated.coherence[known], d[known], s[known]
-    both = (d[:, None, None] * one + s[:, None, None] * other) / (d + s)[:, None, None]
-    root = torch.linalg.cholesky(both)
-    left = torch.linalg.solve_triangular(root, one - other, upper=False)
-    white = torch.linalg.solve_triangular(root, left.mH, upper=False)
-    pairs = torch.triu_indices(p, p, 1)
-    worth = d * s / (d + s)
-    starts, ends = _runs(len(d))
-    total = torch.cat([torch.zeros(1, p, p, dtype=white.dtype), (white * worth[:, None, None]).cumsum(0)])
-    weight = torch.cat([torch.zeros_like(worth[:1]), worth.cumsum(0)])
-    sums = (total[ends] - total[starts]) / ((weight[ends] - weight[starts]) * _NEIGHBOURS).sqrt()[:, None, None]
-    sums = sums - torch.diag_embed(sums.diagonal(dim1=-2, dim2=-1))
-    size = torch.linalg.eigvalsh(sums).abs().amax(-1)  # one source has one direction
-    run = int(size.argmax())
-    first, last = int(starts[run]), int(ends[run]) - 1
-    sums = sums[:, pairs[0], pairs[1]]
-    pair = int(sums[run].abs().argmax())
-    i, j = (case.scene.sensors[int(k[pair])] for k in pairs)
-    frequency = case.bands.frequency[known]
-    f = math.sqrt(float(frequency[first] * frequency[last])) * case.scene.rate
+    i, j = (case.scene.sensors[k] for k in found.pair)
+    frequency = case.bands.frequency[found.first : found.last + 1]
+    f = math.sqrt(float(frequency[0] * frequency[-1])) * case.scene.rate
     return Evidence(
         "common",
-        corrected(_tail(float(size[run]), p), len(size)),
+        found.p_value,
         f"sensors share noise over a broad band around {f:.3g} Hz, most of all {i} and {j}",
-        sensors=tuple(range(p)),
-        levels=tuple(sorted({level_of(float(x)) for x in frequency[first : last + 1]})),
+        sensors=tuple(range(case.n_sensors)),
+        levels=tuple(sorted({level_of(float(x)) for x in frequency})),
         frequency_hz=f,
     )
 
 
-def _tail(size: float, p: int) -> float:
+@remembered
+def common_source(case: Case) -> Source | None:
+    """The most conspicuous coherence of a run of bands, in phase or not.
+
+    The difference of coherence matrices is whitened by what both have in common: its entries then vary by
+    `1/d + 1/s`, whatever noise the sensors share. Where the simulation has nothing of what the recording shows, its
+    sensors are independent, and the recording's coherences vary by `1/d` around none.
+    """
+    p, d, s = case.n_sensors, case.recorded.dof, case.simulated.dof
+    known = (d >= 2 * p) & (s >= 2 * p)
+    if p < 2 or int(known.sum()) < 2:
+        return None
+    one, other, d, s = case.recorded.coherence[known], case.simulated.coherence[known], d[known], s[known]
+    white = whitened_difference(one, other, d, s)
+    starts, ends = _runs(len(d))
+
+    def sums(matrices: Tensor, worth: Tensor) -> Tensor:
+        """Of whole runs, in units of their noise, with no diagonal."""
+        total = torch.cat([torch.zeros(1, p, p, dtype=white.dtype), (matrices * worth[:, None, None]).cumsum(0)])
+        weight = torch.cat([torch.zeros_like(worth[:1]), worth.cumsum(0)])
+        size = ((weight[ends] - weight[starts]) * _NEIGHBOURS).sqrt()
+        run = (total[ends] - total[starts]) / size[:, None, None]
+        return run - torch.diag_embed(run.diagonal(dim1=-2, dim2=-1))
+
+    difference, alone, simulated = sums(white, d * s / (d + s)), sums(one, d), sums(other, s)
+    found, nothing, places = [], True, _places(len(d))
+    for real in (True, False):  # in phase but for signs, or any
+        apart, recorded, had = ((m.real.to(m.dtype) if real else m) for m in (difference, alone, simulated))
+        values, vectors = torch.linalg.eigh(recorded)  # one source has one direction
+        top = values.abs().argmax(-1)
+        size, u = values.gather(-1, top[:, None])[:, 0], vectors[torch.arange(len(top)), :, top]
+        along = torch.einsum("ri,rij,rj->r", u.conj(), had, u).real * size.sign()
+        spread = (1 - u.abs().pow(4).sum(-1)).clamp(min=1e-9).sqrt()
+        independent = along < _ABSENT * spread
+        largest = torch.where(independent, size.abs(), torch.linalg.eigvalsh(apart).abs().amax(-1))
+        tails = torch.tensor([_tail(float(x), p, real) for x in largest], dtype=torch.float64)
+        run = int((tails * places).argmin())
+        pairs = torch.triu_indices(p, p, 1)
+        shared = (recorded if bool(independent[run]) else apart)[run][pairs[0], pairs[1]].abs()
+        place = pairs[:, int(shared.argmax())]
+        bands = known.nonzero()[:, 0]
+        first, last = int(bands[starts[run]]), int(bands[ends[run] - 1])
+        value = corrected(float(tails[run]), 2 * float(places[run]))
+        found.append(Source(value, first, last, (int(place[0]), int(place[1])), bool(independent[run])))
+        shown = float(torch.linalg.eigvalsh(had).abs().max())
+        nothing &= corrected(_tail(shown, p, real), 2 * len(largest)) > _SHOWN
+    best = min(found, key=lambda source: source.p_value)
+    return best._replace(independent=best.independent and nothing)
+
+
+def _tail(size: float, p: int, real: bool) -> float:
     """Upper tail of the largest eigenvalue, of either sign, of a Hermitian matrix of noise without a diagonal.
 
-    Counted among drawn ones, and beyond them by the law of its far tail, `l^(2p - 2) exp(-l^2 / (2 (1 - 1/p)))`.
+    Counted among drawn ones, and beyond them by the law of its far tail, `l^k exp(-l^2 / (2 (1 - 1/p)))`.
     """
-    drawn = _noise_sizes(p)
+    drawn = _noise_sizes(p, real)
     if size <= float(drawn[-_COUNTED]):
         return float((drawn >= size).sum() + 1) / (len(drawn) + 1)
     anchor = float(drawn[-_COUNTED])
-    log_ratio = (2 * p - 2) * math.log(size / anchor) - (size**2 - anchor**2) / (2 * (1 - 1 / p))
+    power = p - 1 if real else 2 * p - 2
+    log_ratio = power * math.log(size / anchor) - (size**2 - anchor**2) / (2 * (1 - 1 / p))
     return min(_COUNTED / len(drawn) * math.exp(max(log_ratio, -700.0)), 1.0)
 
 
-@functools.lru_cache(maxsize=8)
-def _noise_sizes(p: int) -> Tensor:
+@functools.lru_cache(maxsize=16)
+def _noise_sizes(p: int, real: bool) -> Tensor:
     """Largest eigenvalues of noise, sorted."""
     parts = torch.randn(2, _DRAWN, p, p, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    upper = (torch.complex(parts[0], parts[1]) / math.sqrt(2)).triu(1)
+    upper = (torch.complex(parts[0], torch.zeros_like(parts[1]) if real else parts[1]) / math.sqrt(2)).triu(1)
     return torch.linalg.eigvalsh(upper + upper.mH).abs().amax(-1).sort().values
 
 
@@ -148,6 +201,13 @@ def _runs(n_bands: int) -> tuple[Tensor, Tensor]:
         ends.append(n_bands)
         length *= 2
     return torch.tensor(starts), torch.tensor(ends)
+
+
+def _places(n_bands: int) -> Tensor:
+    """How many places each run stands for, `(run,)`: lengths have equal shares of the chances."""
+    starts, ends = _runs(n_bands)
+    _, kind, count = (ends - starts).unique(return_inverse=True, return_counts=True)
+    return (count[kind] * len(count)).to(torch.float64)
 
 
 def _window_of(row: int, column: int, case: Case) -> tuple[int, int, tuple[int, ...]]:

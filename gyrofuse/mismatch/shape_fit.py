@@ -6,7 +6,9 @@ added, over the noise of the simulation, `H` filters. Its likelihood is Whittle'
 
     -w (log det M + tr M^-1 Q),   w = d s / (d + s),
 
-where the diagonal of `Q` is first moved so that one band alone gains what the law of F gives it.
+where the diagonal of `Q` is first moved so that one band alone gains what the law of F gives it. Where the sensors of
+the simulation are independent, so that its coherences are known, those of the recording are worth `d`: the likelihood
+of both correlation matrices is added `d - w` times.
 """
 
 from __future__ import annotations
@@ -16,19 +18,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-import numpy as np
 import torch
-from scipy import special, stats
 from torch import Tensor
 
 from gyrofuse.mismatch.base import Base
+from gyrofuse.mismatch.shape_law import equivalent, equivalent_moments, smooth_coherence
 from gyrofuse.mismatch.shape_terms import Common, Ground, Term
 from gyrofuse.mismatch.side import Side
 
-_ORDINATES = 40  # for each sensor, behind a coherence
 _ROUNDS, _ENOUGH = 25, 0.01
 _STEP = 1e-4
-_QUANTILES = 200
 _NOTHING = 1e-9  # of the largest information
 
 
@@ -43,6 +42,7 @@ class Ratios:
         worth: `w`, `(band,)`; 0 leaves a band out.
         sides: `R`, powers of the simulation `(band, sensor)`, `d` and `s`.
         mean: Of `equivalent` powers where nothing differs, `(band,)`.
+        extra: What coherences are worth beyond powers, `(band,)`.
     """
 
     ground: Ground
@@ -51,14 +51,22 @@ class Ratios:
     worth: Tensor
     sides: tuple[Tensor, Tensor, Tensor, Tensor]
     mean: Tensor
+    extra: Tensor
 
     @classmethod
     def of(
-        cls, ground: Ground, sides: tuple[Tensor, Tensor, Tensor, Tensor], expected: Tensor, usable: Tensor
+        cls,
+        ground: Ground,
+        sides: tuple[Tensor, Tensor, Tensor, Tensor],
+        expected: Tensor,
+        usable: Tensor,
+        independent: bool = False,
     ) -> Ratios:
         spectra, _, d, s = sides
         mean, worth = equivalent_moments(d, s)
-        bare = cls(ground, spectra, expected, worth * usable * (s > 0), (*sides[:2], d, s), mean)
+        worth = worth * usable * (s > 0)
+        extra = (d - worth).clamp(min=0) * (worth > 0) * independent
+        bare = cls(ground, spectra, expected, worth, (*sides[:2], d, s), mean, extra)
         return bare.centred(torch.ones_like(ground.mean.mT))
 
     def centred(self, level: Tensor) -> Ratios:
@@ -79,60 +87,16 @@ class Ratios:
         return math.log(max(float(self.worth.sum()), 2.0)) / 2
 
 
-def ratios(recorded: Side, simulated: Side, base: Base, usable: Tensor | None = None) -> Ratios:
-    """Compare two sides; `usable` `(band,)` leaves bands out."""
+def ratios(
+    recorded: Side, simulated: Side, base: Base, usable: Tensor | None = None, independent: bool = False
+) -> Ratios:
+    """Compare two sides; `usable` `(band,)` leaves bands out, `independent` are the sensors of the simulation."""
     usable = torch.ones_like(recorded.dof) if usable is None else usable
     sides = recorded.spectra, simulated.power.clamp(min=1e-300).mT, recorded.dof, simulated.dof
     expected = smooth_coherence(simulated.coherence, simulated.dof)
-    return Ratios.of(Ground(base, recorded.bands), sides, expected, usable)
-
-
-def equivalent(ratio: Tensor, d: Tensor, s: Tensor) -> Tensor:
-    """Power whose gain under Whittle's likelihood of `w` ordinates is that of an F-distributed ratio.
-
-    Both against one: `w (q - 1 - log q) = (d + s) log((s + d r) / (s + d)) - d log r`.
-    """
-    d, s = torch.broadcast_tensors(d, s.clamp(min=1e-6))
-    gain = (d + s) * torch.log1p(d * (ratio - 1) / (s + d)) - d * ratio.clamp(min=1e-300).log()
-    h = (gain * (d + s) / (d * s)).clamp(min=0.0)
-    argument = -torch.exp(-1 - h.clamp(max=700.0)).numpy()
-    low, high = (torch.from_numpy(-special.lambertw(argument, k).real) for k in (0, -1))
-    q = torch.where(ratio < 1, low, high)
-    return torch.where(h > 700, 1 + h + (1 + h).log(), q).clamp(min=1e-12)
-
-
-def equivalent_moments(d: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean of the equivalent of F-distributed ratios, and its square over their variance, `(band,)`."""
-    middle = (np.arange(_QUANTILES) + 0.5) / _QUANTILES
-    s = s.clamp(min=1.0)
-    ratio = stats.f.ppf(middle, 2 * d.numpy()[:, None], 2 * s.clamp(max=1e7).numpy()[:, None])
-    q = equivalent(torch.from_numpy(ratio), d[:, None], s[:, None])
-    return q.mean(-1), q.mean(-1).square() / q.var(-1)
-
-
-def smooth_coherence(coherence: Tensor, dof: Tensor) -> Tensor:
-    """Coherence in each band from as many neighbouring ones as an inverse takes, `(band, sensor, sensor)`.
-
-    It is drawn towards none by what chance gives to independent sensors: else whatever makes sensors more independent
-    would seem to explain something (Stein).
-    """
-    p = coherence.shape[-1]
-    wanted = min(_ORDINATES * p, float(dof.sum()))
-    weighted = torch.cat([torch.zeros_like(coherence[:1]), (coherence * dof[:, None, None]).cumsum(0)])
-    worth = torch.cat([torch.zeros_like(dof[:1]), dof.cumsum(0)])
-    eye, smooth = torch.eye(p, dtype=coherence.dtype), []
-    for b in range(len(dof)):
-        low, high = b, b + 1
-        while worth[high] - worth[low] < wanted and (low, high) != (0, len(dof)):
-            low, high = max(low - 1, 0), min(high + 1, len(dof))
-        ordinates = worth[high] - worth[low]
-        c = (weighted[high] - weighted[low]) / ordinates.clamp(min=1e-9)
-        size = c.diagonal().real.clamp(min=1e-9).rsqrt()
-        c = c * size[:, None] * size
-        chance = p * (p - 1) / ordinates.clamp(min=1e-9)
-        share = (1 - chance / (c - eye).abs().square().sum().clamp(min=1e-12)).clamp(min=0.0)
-        smooth.append(eye + share * (c - eye))
-    return torch.stack(smooth)
+    if independent:
+        expected = torch.eye(expected.shape[-1], dtype=expected.dtype).expand_as(expected)
+    return Ratios.of(Ground(base, recorded.bands), sides, expected, usable, independent)
 
 
 class Fit(NamedTuple):
@@ -173,15 +137,14 @@ def fit(data: Ratios, terms: Sequence[Term], rounds: int = _ROUNDS) -> Fit:
     precision = torch.cat([_precision(t) for t in terms])
     model, derivatives = linearised(data, terms)
     best = _score(data, model) - _penalty(terms)
-    damping, information = 1e-3, torch.eye(int(free.sum()), dtype=torch.float64)
-    for _ in range(rounds):
-        inverse = torch.linalg.inv(model)
-        left = inverse @ (data.observed - model) @ inverse
+    damping, information = 1e-3, torch.eye(len(free), dtype=torch.float64)
+    for _ in range(rounds if math.isfinite(best) else 0):
         vector, reach = _numbers(terms), torch.cat([_reach(t) for t in terms])
-        moved = inverse @ derivatives  # (number, band, sensor, sensor)
-        weighted = moved * data.worth[:, None, None]
-        full = torch.einsum("kbij,lbji->kl", weighted, moved).real
-        slope = torch.einsum("bij,kbji->k", left * data.worth[:, None, None], derivatives).real - precision * vector
+        full, slope = _curved(model, derivatives, data.observed, data.worth)
+        if bool((data.extra > 0).any()):
+            beside = _curved(*_correlated(model, derivatives), _correlations(data.observed), data.extra)
+            full, slope = full + beside[0], slope + beside[1]
+        slope = slope - precision * vector
         information = full + precision.diag()
         # A number at its bound that wants to go beyond stays there.
         bound = torch.cat([_lower(t) for t in terms])
@@ -210,6 +173,29 @@ def fit(data: Ratios, terms: Sequence[Term], rounds: int = _ROUNDS) -> Fit:
     return Fit(terms, _score(data, model) - _score(data, data.expected), covariance, where.split(sizes), model)
 
 
+def _curved(model: Tensor, derivatives: Tensor, observed: Tensor, worth: Tensor) -> tuple[Tensor, Tensor]:
+    """Information `(number, number)` and slope `(number,)` of Whittle's likelihood."""
+    inverse = torch.linalg.inv(model)
+    left = inverse @ (observed - model) @ inverse
+    moved = inverse @ derivatives  # (number, band, sensor, sensor)
+    full = torch.einsum("kbij,lbji->kl", moved * worth[:, None, None], moved).real
+    return full, torch.einsum("bij,kbji->k", left * worth[:, None, None], derivatives).real
+
+
+def _correlations(matrices: Tensor) -> Tensor:
+    size = matrices.diagonal(dim1=-2, dim2=-1).real.clamp(min=1e-300).rsqrt()
+    return matrices * (size[..., :, None] * size[..., None, :])
+
+
+def _correlated(model: Tensor, derivatives: Tensor) -> tuple[Tensor, Tensor]:
+    """Correlations of a model and their derivatives."""
+    size = model.diagonal(dim1=-2, dim2=-1).real.clamp(min=1e-300)
+    rise = derivatives.diagonal(dim1=-2, dim2=-1).real / size / 2  # (number, band, sensor)
+    own = _correlations(model)
+    moved = derivatives * (size.rsqrt()[:, :, None] * size.rsqrt()[:, None, :])
+    return own, moved - own * (rise[..., :, None] + rise[..., None, :])
+
+
 def data_model(data: Ratios, terms: Sequence[Term]) -> Tensor:
     """`M`, `(band, sensor, sensor)`."""
     return _composed(data, *_pieces(data, terms))
@@ -223,7 +209,8 @@ def _pieces(data: Ratios, terms: Sequence[Term]) -> tuple[Tensor, Tensor, Tensor
     for term in terms:
         if isinstance(term, Common):
             g = torch.complex(*term.local)
-            common = common + _relative(ground, term.shape(ground, term.shared)) * (g[:, None] * g.conj())
+            source = term.acting(g[:, None] * g.conj())
+            common = common + _relative(ground, term.shape(ground, term.shared)) * source
             continue
         values = term.values(ground, term.local, term.shared)
         if term.acts == "scale":
@@ -297,24 +284,29 @@ def _common_derivatives(data: Ratios, term: Common, filters: Tensor) -> Tensor:
     passed = ground.bands.mean_of(filters).clamp(min=0).sqrt().mT
     through = passed[:, :, None] * passed[:, None, :]
     row = torch.eye(len(g), dtype=g.dtype)[:, :, None] * g.conj()  # e_i g^H
-    parts = torch.cat([row + row.mH, 1j * row + (1j * row).mH])  # (number, sensor, sensor)
+    parts = term.acting(torch.cat([row + row.mH, 1j * row + (1j * row).mH]))  # (number, sensor, sensor)
     source = _relative(ground, term.shape(ground, term.shared)) * through
     slopes = parts[:, None] * source
     for turn in _STEP * torch.eye(len(term.shared), dtype=torch.float64):
         moved = _relative(ground, term.shape(ground, term.shared + turn)) * through
-        slopes = torch.cat([slopes, ((moved - source) / _STEP * (g[:, None] * g.conj()))[None]])
+        slopes = torch.cat([slopes, ((moved - source) / _STEP * term.acting(g[:, None] * g.conj()))[None]])
     return slopes
 
 
 def log_score(data: Ratios, model: Tensor) -> Tensor:
     """Whittle's log likelihood of each band, `(band,)`."""
+    score = _whittle(model, data.observed, data.worth)
+    if bool((data.extra > 0).any()):
+        score = score + _whittle(_correlations(model), _correlations(data.observed), data.extra)
+    return score
+
+
+def _whittle(model: Tensor, observed: Tensor, worth: Tensor) -> Tensor:
     root, bad = torch.linalg.cholesky_ex(model)
-    inside = torch.cholesky_solve(data.observed, root).diagonal(dim1=-2, dim2=-1).real.sum(-1)
+    inside = torch.cholesky_solve(observed, root).diagonal(dim1=-2, dim2=-1).real.sum(-1)
     determinant = 2 * root.diagonal(dim1=-2, dim2=-1).real.clamp(min=1e-300).log().sum(-1)
-    score = -(data.worth * (determinant + inside))
-    return torch.where((data.worth > 0) & (bad > 0), -math.inf, score.nan_to_num(nan=-math.inf)).masked_fill(
-        data.worth == 0, 0.0
-    )
+    score = (-(worth * (determinant + inside))).nan_to_num(nan=-math.inf).masked_fill(bad > 0, -math.inf)
+    return score.masked_fill(worth == 0, 0.0)
 
 
 def _score(data: Ratios, model: Tensor) -> float:

@@ -11,12 +11,14 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.base import Base, _atoms, _time_constants
+from gyrofuse.mismatch.filter_forms import FILTERS, filter_corner, filter_power, filter_strength
 from gyrofuse.mismatch.spectra import Bands
 from gyrofuse.processes import AR1
 
 _FAST = 3.0  # samples: AR1s of shorter memory are all but white
 _SLOW = 2.2  # time constants above n / (2 pi) over this look like a walk in every band
 _LITTLE = 0.3  # of the white noise: fast AR1s below count as white
+_HIGHEST = 3.0  # corner of an analog filter to start from, cycles per sample
 _MATTERS = 0.05  # of the power in some band, for a part to have a level of its own
 
 
@@ -161,65 +163,24 @@ class Shift(Term):
         free = torch.stack([white, coloured, coloured, walk])
         return cls(torch.zeros(4, free.shape[-1], dtype=torch.float64), free, torch.zeros(0, dtype=torch.float64))
 
+    @classmethod
+    def starts(cls, ground: Ground) -> list[Shift]:
+        """All numbers free, and those of single parts."""
+        every = cls.start(ground)
+        single = [replace(every, free=every.free & rows[:, None]) for rows in _SINGLE]
+        return [every, *(s for s in single if bool(s.free.any()))]
+
+    @property
+    def parts(self) -> Tensor:
+        """Which rows of numbers are free in some sensor, `(number,)`."""
+        return self.free.any(-1)
+
     def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
         return ground.parts.shifted(local) / ground.density
 
 
-FILTERS = ("pole", "poles", "bilinear", "sampled", "bilinear2", "sampled2")
-_POLES = {"pole": 1.0, "poles": math.sqrt(2) - 1}
-ORDERS = {"pole": 1, "poles": 2, "bilinear": 1, "sampled": 1, "bilinear2": 2, "sampled2": 2}
-
-
-def filter_strength(kind: str, corner: Tensor) -> Tensor:
-    """Number of a filter whose power is halved at `corner` cycles per sample: 0 is none."""
-    if kind in _POLES:  # 2 q (1 - cos) = x (1 - q)^2 at the corner, where one pole lets 1 / (1 + x) pass
-        b = 1 + (1 - torch.cos(2 * math.pi * corner)) / _POLES[kind]
-        return b - (b.square() - 1).sqrt()
-    if kind == "bilinear":
-        return 1 / torch.tan(math.pi * corner).square()
-    if kind == "sampled":
-        return 1 / (2 * corner).square()
-    if kind == "bilinear2":
-        return 1 / torch.tan(math.pi * corner).pow(4)
-    return 1 / (2 * corner).pow(4)
-
-
-def filter_corner(kind: str, strength: Tensor) -> Tensor:
-    """Cycles per sample at which a filter halves the power; infinite where it never does."""
-    q = strength.clamp(min=1e-300)
-    if kind in _POLES:
-        cosine = 1 - _POLES[kind] * (1 - q).square() / (2 * q)
-        return torch.where(cosine >= -1, cosine.clamp(-1, 1).acos() / (2 * math.pi), math.inf)
-    order = 1 / 2 if kind in ("bilinear", "sampled") else 1 / 4
-    if kind.startswith("bilinear"):
-        return torch.atan(q.pow(-order)) / math.pi
-    return q.pow(-order) / 2
-
-
-def filter_power(kind: str, strength: Tensor, f: Tensor) -> Tensor:
-    """Squared response `(..., frequency)` of filters of `strength` `(...,)`."""
-    q = strength[..., None]
-    if kind in _POLES:
-        q = q.clamp(max=0.9999)
-        power = (1 - q).square() / ((1 - q).square() + 4 * q * torch.sin(math.pi * f).square())
-        return power if kind == "pole" else power.square()
-    at = torch.tan(math.pi * f.clamp(max=0.49999999)) if kind.startswith("bilinear") else 2 * f
-    return 1 / (1 + q * at.square()) if ORDERS[kind] == 1 else 1 / (1 + q * at.pow(4))
-
-
-def filter_response(kind: str, strength: Tensor, f: Tensor) -> Tensor:
-    """Complex response `(..., frequency)`, causal."""
-    q = strength[..., None]
-    turn = 2 * math.pi * f
-    if kind in _POLES:
-        q = q.clamp(max=0.9999)
-        response = (1 - q) / (1 - q * torch.polar(torch.ones_like(turn), -turn))
-        return response if kind == "pole" else response.square()
-    at = torch.tan(math.pi * f.clamp(max=0.49999999)) if kind.startswith("bilinear") else 2 * f
-    if ORDERS[kind] == 1:
-        return 1 / (1 + 1j * q.sqrt() * at)
-    s = q.pow(0.25) * at
-    return 1 / torch.complex(1 - s.square(), math.sqrt(2) * s)
+# White noise, the level of the AR1s, level and corner, the walk.
+_SINGLE = torch.tensor([[1, 0, 0, 0], [0, 1, 0, 0], [0, 1, 1, 0], [0, 0, 0, 1]], dtype=torch.bool)
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,6 +203,13 @@ class LowPass(Term):
             cls(filter_strength(kind, corner).expand(1, p).clone(), free, nothing, kind)
             for corner in (*corners, *([torch.tensor(1.5)] if kind.startswith("sampled") else []))
         ]
+
+    def others(self) -> list[LowPass]:
+        """The other forms, of the same corners as far as they can have them."""
+        corner = filter_corner(self.kind, self.local)
+        other = {k: corner.clamp(max=_HIGHEST if k.startswith("sampled") else 0.45) for k in FILTERS if k != self.kind}
+        starts = {kind: torch.where(self.free, filter_strength(kind, c), 0.0) for kind, c in other.items()}
+        return [replace(self, kind=kind, local=local) for kind, local in starts.items()]
 
     def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
         return filter_power(self.kind, local[..., 0, :], ground.places)
@@ -303,14 +271,33 @@ class Bump(Term):
 
 @dataclass(frozen=True, eq=False)
 class Common(Term):
-    """Noise of one source in every sensor: local are the real and imaginary parts of the gains.
+    """Noise of one source in every sensor: local are the real and imaginary parts of the gains, or real ones alone.
 
     Shared is the logarithm of the corner, cycles per sample, for an AR1.
+
+    Attributes:
+        kind: White, AR1 or walk.
+        inside: Whether it is a part of what each sensor has, whose power stays, instead of coming on top.
     """
 
     name: ClassVar[str] = "common_mode"
 
     kind: str = "white"
+    inside: bool = False
+
+    def acting(self, matrix: Tensor) -> Tensor:
+        """What comes on top of a matrix `(..., sensor, sensor)` of a source."""
+        return matrix - torch.diag_embed(matrix.diagonal(dim1=-2, dim2=-1)) if self.inside else matrix
+
+    def variants(self) -> list[Common]:
+        """The same in phase or not, on top or inside."""
+        aligned = self.free.clone()
+        aligned[1] = False
+        forms = [
+            replace(self, free=aligned, local=self.local * aligned),
+            replace(self, free=torch.ones_like(self.free)),
+        ]
+        return [replace(form, inside=inside) for form in forms for inside in (False, True)]
 
     def shape(self, ground: Ground, shared: Tensor) -> Tensor:
         """Density of the source, `(..., place)`."""
@@ -318,6 +305,22 @@ class Common(Term):
 
     def within(self) -> Common:
         return replace(self, shared=self.shared.clamp(max=math.log(0.45))) if self.kind == "ar1" else self
+
+    @property
+    def turned(self) -> bool:
+        """Whether sensors have phases of their own, beside signs."""
+        return bool(self.free[1].any())
+
+    @classmethod
+    def starts(cls, ground: Ground, excess: Tensor, worth: Tensor, kind: str, shared: Tensor) -> tuple[Common, Common]:
+        """In phase but for signs, and with any phases."""
+        free = torch.tensor([[True], [False]]).expand(2, excess.shape[-1])
+        aligned = cls.start(ground, excess.real.to(excess.dtype), worth, kind, shared)
+        # Vectors of real matrices are real but for a factor.
+        g = torch.complex(*aligned.local)
+        g = (g * g[g.abs().argmax()].conj().sgn()).real
+        local = torch.stack([g, torch.zeros_like(g)])
+        return replace(aligned, local=local, free=free), cls.start(ground, excess, worth, kind, shared)
 
     @classmethod
     def start(cls, ground: Ground, excess: Tensor, worth: Tensor, kind: str, shared: Tensor) -> Common:

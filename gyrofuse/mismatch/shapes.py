@@ -14,20 +14,25 @@ from torch import Tensor
 from gyrofuse.mismatch.bumps import oscillation_of
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import corrected
+from gyrofuse.mismatch.filter_forms import FILTERS
 from gyrofuse.mismatch.folds import estimation_samples
+from gyrofuse.mismatch.pooled import common_source
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.shape_fit import Fit, Ratios, data_model, fit, log_score, ratios
-from gyrofuse.mismatch.shape_terms import FILTERS, Bump, Common, CommonBump, Flicker, LowPass, Shift, Term, oscillation
+from gyrofuse.mismatch.shape_terms import Bump, Common, CommonBump, Flicker, LowPass, Shift, Term, oscillation
 from gyrofuse.mismatch.side import Side
+from gyrofuse.mismatch.spectra import bands
 from gyrofuse.mismatch.witnesses import level_of
 
 _MOST = 4  # shapes at once
 _RIVAL = 5.0  # nats
+_ALIKE = 2.0  # nats between forms of a filter that are both likely
 _QUICK, _FAR, _KEPT = 6, 20.0, 3  # rounds of a first look; nats behind that are not made up; shapes looked at closely
 _DOUBT = 1e-3  # p value of what is left by shapes that may be named
 _SMALL = 0.1  # share of what there was to explain that may be left all the same
-_PLACES = 12.0  # shapes and places that compete
-_NEW = 10.0  # nats that a shape costs beside its numbers
+_PLACES = 16.0  # shapes and places that compete
+_NEW = 8.0  # nats that a shape costs beside its numbers
+_NUMBER = 2.0  # nats for a number of a sensor: those of sensors that have it are alike
 _TOUCH = 0.1
 _ORDER = {"scale": 0, "add": 1, "filter": 2}  # a filter acts on what was added, levels are those of the noise alone
 _PLAIN = 15.0  # nats
@@ -36,6 +41,9 @@ _CLEAN = 8  # bins
 _FORMS = 3  # of filters
 _WIDTHS = (0.06, 0.15, 0.35)  # half width of a bump over its centre
 _CORNER_BINS = (4.0, 0.3)  # corners of common AR1s to start from: bins, cycles per sample
+
+
+Form = tuple[LowPass, tuple[Tensor, Tensor]]
 
 
 class Shape(NamedTuple):
@@ -49,6 +57,7 @@ class Shape(NamedTuple):
         alternatives: Mechanisms that explain as much in its place.
         frequency: Where it acts most, cycles per sample.
         levels: Wavelet levels where it shows.
+        forms: Other forms of a filter that explain about as much, as `term` and `sd`.
     """
 
     term: Term
@@ -58,6 +67,7 @@ class Shape(NamedTuple):
     alternatives: tuple[str, ...]
     frequency: float
     levels: tuple[int, ...]
+    forms: tuple[Form, ...]
 
 
 @remembered
@@ -84,7 +94,7 @@ def compared(case: Case) -> Ratios:
     if case.line.p_value < _DOUBT:
         edges = torch.tensor(case.bands.edges[1:-1], dtype=torch.float64) / case.n_samples
         usable[torch.bucketize(torch.tensor(case.line.frequency, dtype=torch.float64), edges, right=True)] = 0.0
-    return ratios(case.recorded, case.simulated, case.base, usable)
+    return ratios(case.recorded, case.simulated, case.base, usable, _independent(case))
 
 
 def refit(case: Case, fold: int, term: Term) -> Term:
@@ -92,12 +102,16 @@ def refit(case: Case, fold: int, term: Term) -> Term:
     keep = estimation_samples(case.n_samples, fold)
     block = run_length(keep)
     recorded = case.recording[:, keep].unflatten(-1, (-1, block)).movedim(1, 0)
-    simulated = case.simulated.signal
-    n = simulated.shape[-1] // block * block
-    simulated = simulated[..., :n].unflatten(-1, (-1, block)).movedim(-2, -3).flatten(0, 1)
-    data = ratios(*_sides(recorded, simulated), case.base)
+    simulated = _in_blocks(case.simulated)[block]
+    data = ratios(Side(recorded, simulated.bands), simulated, case.base, independent=_independent(case))
     found = fit(data, [term])
     return fit(data.centred(found.model.diagonal(dim1=-2, dim2=-1).real), found.terms).terms[0]
+
+
+def _independent(case: Case) -> bool:
+    """Whether the simulation's sensors have nothing of what those of the recording share."""
+    source = common_source(case)
+    return source is not None and source.independent
 
 
 def run_length(keep: Tensor) -> int:
@@ -106,11 +120,23 @@ def run_length(keep: Tensor) -> int:
     return int(edges.diff()[::2].min())
 
 
-def _sides(recorded: Tensor, simulated: Tensor) -> tuple[Side, Side]:
-    from gyrofuse.mismatch.spectra import bands
+class _Blocks(dict[int, Side]):
+    """A side's records cut into blocks, by their length: the same for all folds."""
 
-    both = bands(recorded.shape[-1])
-    return Side(recorded, both), Side(simulated, both)
+    def __init__(self, signal: Tensor) -> None:
+        super().__init__()
+        self.signal = signal
+
+    def __missing__(self, block: int) -> Side:
+        n = self.signal.shape[-1] // block * block
+        cut = self.signal[..., :n].unflatten(-1, (-1, block)).movedim(-2, -3).flatten(0, 1)
+        self[block] = Side(cut, bands(block))
+        return self[block]
+
+
+@remembered
+def _in_blocks(side: Side) -> _Blocks:
+    return _Blocks(side.signal)
 
 
 def _searched(case: Case) -> tuple[Shape, ...]:
@@ -123,9 +149,8 @@ def _searched(case: Case) -> tuple[Shape, ...]:
     found = []
     for i, term in enumerate(chosen.terms):
         others = [t for j, t in enumerate(chosen.terms) if j != i]
-        without = fit(data, others).gain if others else 0.0
+        without = max(fit(data, others).gain, 0.0) if others else 0.0
         gain = chosen.gain - without
-        n_free = int((chosen.places[i] >= 0).sum())
         p = corrected(float(stats.chi2.sf(2 * max(gain, 0.0), _freedom(data, term))), _PLACES)
         rivals = {
             rival.name
@@ -138,11 +163,12 @@ def _searched(case: Case) -> tuple[Shape, ...]:
             Shape(
                 term,
                 chosen.sd(i),
-                gain - data.penalty * n_free,
+                gain - _cost(data, term),
                 p,
                 tuple(sorted(rivals)),
                 float(data.ground.bands.frequency[seen.argmax()]),
                 tuple(sorted(levels)),
+                _forms(data, term, others, chosen.gain),
             )
         )
     nothing = float(log_score(data, data.expected).sum())
@@ -152,6 +178,16 @@ def _searched(case: Case) -> tuple[Shape, ...]:
         return alone < _ALONE, _ORDER[shape.term.acts], -alone
 
     return tuple(sorted(found, key=place))
+
+
+def _forms(
+    data: Ratios, term: Term, others: list[Term], gain: float
+) -> tuple[tuple[LowPass, tuple[Tensor, Tensor]], ...]:
+    """Other forms of a filter that are about as likely."""
+    if not isinstance(term, LowPass):
+        return ()
+    fits = [fit(data, [*others, form]) for form in term.others()]
+    return tuple((t, f.sd(-1)) for f in fits if f.gain > gain - _ALIKE and isinstance(t := f.terms[-1], LowPass))
 
 
 def _as_good(data: Ratios, terms: list[Term], gain: float) -> bool:
@@ -164,8 +200,10 @@ def _freedom(data: Ratios, term: Term) -> int:
     """Numbers that could have been free."""
     p = data.n_sensors
     if isinstance(term, Shift):
-        return int(Shift.start(data.ground).free.sum())
-    return (2 * p - 1 if isinstance(term, Common) else term.local.numel()) + 2 * len(term.shared)
+        return int(Shift.start(data.ground).free[term.parts].sum())
+    if isinstance(term, Common):
+        return (2 * p - 1 if term.turned else p) + 2 * len(term.shared)
+    return term.local.numel() + 2 * len(term.shared)
 
 
 def _chosen(data: Ratios) -> tuple[Ratios, Fit | None]:
@@ -176,7 +214,7 @@ def _chosen(data: Ratios) -> tuple[Ratios, Fit | None]:
         now = list(best.terms) if best else []
         quick = [fit(data, [*now, c], _QUICK) for c in _candidates(data, now)]
         kept = {*sorted(quick, key=lambda f: -f.gain)[:_KEPT], *sorted(quick, key=lambda f: -_value(data, f))[:_KEPT]}
-        tried = [_pruned(data, fit(data, f.terms)) for f in kept]
+        tried = [_varied(data, _pruned(data, fit(data, f.terms))) for f in kept]
         top = max(tried, key=lambda f: _value(data, f), default=None)
         if top is None or _value(data, top) <= value:
             break
@@ -193,9 +231,14 @@ def _chosen(data: Ratios) -> tuple[Ratios, Fit | None]:
 
 
 def _value(data: Ratios, found: Fit) -> float:
-    """Log likelihood less what shapes and their numbers cost; a common source's phase is no number."""
-    n = found.n_free - sum(isinstance(t, Common) for t in found.terms)
-    return found.gain - data.penalty * n - _NEW * len(found.terms)
+    """Log likelihood less what shapes and their numbers cost."""
+    return found.gain - sum(_cost(data, t) + _NEW for t in found.terms)
+
+
+def _cost(data: Ratios, term: Term) -> float:
+    """Of a shape's numbers, nats; a common source's phase is no number."""
+    own = int(term.free.sum()) - (isinstance(term, Common) and term.turned)
+    return _NUMBER * own + data.penalty * len(term.shared)
 
 
 def _freed(data: Ratios, term: Term) -> Term:
@@ -203,14 +246,15 @@ def _freed(data: Ratios, term: Term) -> Term:
     if isinstance(term, Common):
         return term
     if isinstance(term, Shift):
-        return replace(term, free=Shift.start(data.ground).free)
+        return replace(term, free=Shift.start(data.ground).free & term.parts[:, None])
     least = term.local.amax(-1, keepdim=True) * _TOUCH
     return replace(term, free=torch.ones_like(term.free), local=torch.where(term.free, term.local, least))
 
 
 def _pruned(data: Ratios, found: Fit) -> Fit:
-    """Without numbers of single sensors that do not differ from none."""
-    for threshold in (1.0, _least_t(data.n_sensors)):
+    """Without numbers of single sensors that do not differ from none, as far as it pays."""
+    best = found
+    for threshold in (1.0, 2.0, _least_t(data.n_sensors)):
         terms: list[Term] = []
         changed = False
         for i, term in enumerate(found.terms):
@@ -224,7 +268,19 @@ def _pruned(data: Ratios, found: Fit) -> Fit:
             terms.append(replace(term, free=keep, local=torch.where(keep, term.local, 0.0)))
         if changed:
             found = fit(data, terms)
-    return found
+            best = max(best, found, key=lambda f: _value(data, f))
+    return best
+
+
+def _varied(data: Ratios, found: Fit) -> Fit:
+    """With the last shape's forms tried as well, if it is a common source."""
+    *others, last = found.terms
+    if type(last) is not Common:
+        return found
+    forms = [[*others, form] for form in last.variants() if (form.turned, form.inside) != (last.turned, last.inside)]
+    # A part is no more than the whole.
+    possible = [form for form in forms if bool(log_score(data, data_model(data, form)).isfinite().all())]
+    return max([found, *(fit(data, form) for form in possible)], key=lambda f: _value(data, f))
 
 
 def _least_t(n_sensors: int) -> float:
@@ -256,7 +312,7 @@ def _candidates(data: Ratios, company: list[Term]) -> Iterator[Term]:
 
     model = data_model(data, company)
     if "parameter_shift" not in names and bool(ground.matters.any()):
-        yield Shift.start(ground)
+        yield from Shift.starts(ground)
     if "low_pass" not in names:
         filters = [s for kind in FILTERS for s in LowPass.starts(ground, kind)]
         best: dict[str, LowPass] = {}
@@ -270,17 +326,17 @@ def _candidates(data: Ratios, company: list[Term]) -> Iterator[Term]:
     if bump is not None:
         yield bump
         if data.n_sensors > 1:
-            yield CommonBump.start(ground, excess, data.worth, "oscillation", bump.shared)
+            yield from CommonBump.starts(ground, excess, data.worth, "oscillation", bump.shared)
     if data.n_sensors > 1:
         nothing = torch.zeros(0, dtype=torch.float64)
         for kind in ("white", "walk"):
-            yield Common.start(ground, excess, data.worth, kind, nothing)
+            yield from Common.starts(ground, excess, data.worth, kind, nothing)
         n = ground.bands.n_samples
         corners = torch.logspace(
             math.log10(_CORNER_BINS[0] / n), math.log10(_CORNER_BINS[1]), 8, dtype=torch.float64
         ).log()
-        starts_at = [Common.start(ground, excess, data.worth, "ar1", c[None]) for c in corners]
-        yield max(starts_at, key=lambda s: score([*company, s]))
+        starts_at = [Common.starts(ground, excess, data.worth, "ar1", c[None]) for c in corners]
+        yield from max(starts_at, key=lambda s: score([*company, s[0]]))
 
 
 def _bump(data: Ratios, model: Tensor) -> Bump | None:

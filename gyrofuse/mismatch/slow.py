@@ -1,13 +1,17 @@
-"""What is slow: means over 256 blocks, their exact covariance, and likelihoods that let it be somewhat wrong.
+"""What is slow: means over 256 blocks, their spectra, and likelihoods that let the noise be somewhat wrong.
 
-Successive differences `d` of a sensor's block means do not see its constant bias, and have a covariance even where
-there is a random walk:
+Cosine ordinates `y_k` of a sensor's block means do not see its constant bias. They are independent for white noise and
+random walks, and nearly so for what lies between:
 
-    d ~ N(b x, sum_k e^theta_k Q_k)
+    y_k ~ N(b x_k, sum_p e^theta_p S_pk)
 
-with a template `x` of size `b`. `Q` are what the simulation has below and above the length of a block, and flicker and
-a random walk beside it. The `theta` have a normal prior around the simulation: without one the noise swallows the
-effect, without freedom it is taken for one. Hypotheses are compared with the `theta` best for each.
+with a template `x` of size `b`. `S` are the exact variances of what the simulation has below and above the length of a
+block, and of flicker and a random walk beside it. The `theta` have a normal prior around the simulation: without one
+the noise swallows the effect, without freedom it is taken for one. Hypotheses are compared with the `theta` best for
+each.
+
+Spectra in bands say nothing of the first few ordinates, on which slow effects live: what the simulation has there is
+told by its own ordinates, and by what the sensors of an array have in common.
 """
 
 from __future__ import annotations
@@ -15,11 +19,13 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from functools import cached_property
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
+from gyrofuse._nnls import nonnegative_least_squares
 from gyrofuse.mismatch.base import Base, _time_constants, atom_covariances
 from gyrofuse.mismatch.case import N_BLOCKS, Case, block_means
 
@@ -31,71 +37,135 @@ _PRIOR_SD = 0.35  # of the simulation's own parts, when it is long
 # say nothing any more, and how free it is.
 _BESIDE = {"flicker": (-3.5, 2.0), "walk": (-4.5, 2.0)}
 _LOWEST = 2.0
+_OTHER_ATOMS = 3  # of a base, beside AR1s
 _OWN = 2  # parts that the simulation has: fast and slow
 _AHEAD = (0.0, 0.0, 3.0, 4.0)  # where to start: a part that is far too small has no slope to climb
 _SLOWEST_BANDS = 3
 _LEAST_DOF = 0.25
+_UNSEEN = 8  # ordinates below the bands
+_ALIKE = 1.0  # what each of them is worth that all sensors together tell of one, complex ordinates
+_FIT_ROUNDS = 5
+
+_Tuple = TypeVar("_Tuple", bound=tuple[Any, ...])
 
 
 @dataclass(frozen=True, eq=False)
 class SlowNoise:
-    """Noise of the differences of block means, independent sensors.
+    """Noise of block means, independent sensors; of one case, or of many at once.
 
     Attributes:
-        parts: `Q`, `(sensor, part, difference, difference)`.
+        n_samples: Of the record.
+        coefficients: Of each part, in the atoms of a base, `(..., sensor, part, atom)`.
         centre, spread: Prior of the log factors, `(part,)`; of the parts beside the simulation there is one for all
             sensors, since those of an array are made alike.
         ahead: From the centre to where a fit starts.
     """
 
-    parts: Tensor
+    n_samples: int
+    coefficients: Tensor
     centre: Tensor
     spread: Tensor
     ahead: Tensor
 
+    @classmethod
+    def around(cls, base: Base, dof: float) -> SlowNoise:
+        """Around a simulation with a base `(..., sensor, atom)`, whose slowest bands are worth `dof`."""
+        n_samples, block = base.n_samples, base.n_samples // N_BLOCKS
+        constants = torch.tensor(_time_constants(n_samples), dtype=torch.float64)
+        none = torch.zeros(1, dtype=torch.float64)
+        fast = torch.cat([torch.ones(2, dtype=torch.float64), (constants < block).to(none), none])
+        # AR1s of equal variance and log-spaced corners are flicker.
+        flicker = torch.cat([none, none, -torch.expm1(-2 / constants), none])
+        walk = torch.eye(len(flicker), dtype=torch.float64)[-1]
+        lowest = torch.tensor([_LOWEST / n_samples], dtype=torch.float64)
+        power = base.spectrum(lowest)  # (..., sensor, 1)
+        beside = [power / replace(base, coefficients=one[None]).spectrum(lowest) * one for one in (flicker, walk)]
+        known = math.hypot(_PRIOR_SD, 1 / math.sqrt(max(dof, _LEAST_DOF)))
+        centre = torch.tensor([0.0, 0.0, *(c for c, _ in _BESIDE.values())], dtype=torch.float64)
+        spread = torch.tensor([_PRIOR_SD, known, *(s for _, s in _BESIDE.values())], dtype=torch.float64)
+        parts = torch.stack([base.coefficients * fast, base.coefficients * (1 - fast), *beside], -2)
+        return cls(n_samples, parts, centre, spread, torch.tensor(_AHEAD, dtype=torch.float64))
+
+    @cached_property
+    def parts(self) -> Tensor:
+        """`S`, `(..., sensor, part, ordinate)`."""
+        return self.coefficients @ _atom_variances(self.n_samples, self.n_samples // N_BLOCKS)
+
+    @property
+    def own(self) -> Tensor:
+        """Variances of the ordinates as the simulation has them, `(..., sensor, ordinate)`."""
+        return self.parts[..., :_OWN, :].sum(-2)
+
     def covariance(self, log_factors: Tensor) -> Tensor:
-        """`(sensor, difference, difference)` with factors `(sensor, part)`."""
-        return torch.einsum("sp,spij->sij", log_factors.exp(), self.parts)
+        """Of block means with factors `(sensor, part)`, exact up to a constant, `(sensor, block, block)`."""
+        coefficients = torch.einsum("sp,spa->sa", log_factors.exp(), self.coefficients)
+        return Base(self.n_samples, coefficients).block_covariance(self.n_samples // N_BLOCKS, N_BLOCKS)
 
 
 class Fit(NamedTuple):
     """Best log factors of a template, `x = 0` without one.
 
     Attributes:
-        log_factors: `(sensor, part)`.
-        value: Logarithm of likelihood times prior, `(sensor,)`, without constants.
-        inverse: Of the covariance, `(sensor, difference, difference)`.
-        size: `b`, `(sensor,)`.
+        log_factors: `(..., sensor, part)`.
+        value: Logarithm of likelihood times prior, `(..., sensor)`, without constants.
+        variance: Of the ordinates, `(..., sensor, ordinate)`.
+        size: `b`, `(..., sensor)`.
     """
 
     log_factors: Tensor
     value: Tensor
-    inverse: Tensor
+    variance: Tensor
     size: Tensor
 
 
-def slow_noise(case: Case) -> SlowNoise:
-    """What the simulation says of block means, in parts that may be wrong, each by its own factor."""
-    base = case.base
-    constants = torch.tensor(_time_constants(base.n_samples), dtype=torch.float64)
-    atoms = atom_covariances(base.n_samples, case.block, N_BLOCKS).diff(dim=-1).diff(dim=-2)
-    fast = torch.cat([torch.ones(2), constants < case.block, torch.zeros(1)]).to(torch.float64)
-    own = [torch.einsum("sa,aij->sij", base.coefficients * share, atoms) for share in (fast, 1 - fast)]
-    # AR1s of equal variance and log-spaced corners are flicker.
-    flicker = torch.cat(
-        [torch.zeros(2, dtype=torch.float64), -torch.expm1(-2 / constants), torch.zeros(1, dtype=torch.float64)]
+class Told(NamedTuple):
+    """What a simulation tells of slow noise.
+
+    Attributes:
+        values: Powers in bands, then mean squares of the first ordinates, `(..., sensor, place)`.
+        atoms: What they are for each atom of a base with coefficient one, `(atom, place)`.
+        dof: What they are worth, complex ordinates, `(place,)`.
+        slowest_dof: The same of the slowest bands of the recording.
+        n_samples: Of the recording.
+    """
+
+    values: Tensor
+    atoms: Tensor
+    dof: Tensor
+    slowest_dof: float
+    n_samples: int
+
+    def noise(self) -> SlowNoise:
+        """Of block means, in parts that may be wrong, each by its own factor."""
+        return SlowNoise.around(Base(self.n_samples, self.coefficients()), self.slowest_dof)
+
+    def coefficients(self) -> Tensor:
+        """Those of each sensor's atoms, `(..., sensor, atom)`, drawn to what all sensors together tell."""
+        scale = self.values[..., :_SLOWEST_BANDS].mean(-1, keepdim=True)
+        pooled = (self.values / scale).mean(-2, keepdim=True)
+        common = _fitted(pooled, self.atoms, self.values.shape[-2] * self.dof, pooled)
+        unseen = _atom_variances(self.n_samples, self.n_samples // N_BLOCKS)[:, :_UNSEEN]
+        atoms = torch.cat([unseen, self.atoms], -1)
+        dof = torch.cat([torch.full((_UNSEEN,), _ALIKE, dtype=torch.float64), self.dof])
+        start = scale * (common @ atoms)
+        return _fitted(torch.cat([start[..., :_UNSEEN], self.values], -1), atoms, dof, start)
+
+
+def told(case: Case) -> Told:
+    """What the simulation tells."""
+    n, bands, signal, dof = case.n_samples, case.bands, case.simulated.signal, case.simulated.dof
+    every = Base(n, torch.eye(len(_time_constants(n)) + _OTHER_ATOMS, dtype=torch.float64))
+    first = slow_ordinates(signal)[..., :_UNSEEN].square().mean(0)
+    atoms = _atom_variances(n, signal.shape[-1] // N_BLOCKS)[:, :_UNSEEN]
+    worth = torch.full((_UNSEEN,), len(signal) / 2, dtype=torch.float64)
+    seen = dof > 0
+    return Told(
+        torch.cat([case.simulated.power[:, seen], first], -1),
+        torch.cat([bands.mean_of(every.spectrum(bands.places))[:, seen], atoms], -1),
+        torch.cat([dof[seen], worth]),
+        float(dof[:_SLOWEST_BANDS].sum()),
+        n,
     )
-    walk = torch.eye(len(flicker), dtype=torch.float64)[-1]
-    lowest = torch.tensor([_LOWEST / base.n_samples], dtype=torch.float64)
-    beside = []
-    for coefficients in (flicker, walk):
-        share = base.spectrum(lowest) / replace(base, coefficients=coefficients[None]).spectrum(lowest)  # (sensor, 1)
-        beside.append(share[..., None] * torch.einsum("a,aij->ij", coefficients, atoms))
-    dof = float(case.simulated.dof[:_SLOWEST_BANDS].sum())
-    known = math.hypot(_PRIOR_SD, 1 / math.sqrt(max(dof, _LEAST_DOF)))
-    centre = torch.tensor([0.0, 0.0, *(c for c, _ in _BESIDE.values())], dtype=torch.float64)
-    spread = torch.tensor([_PRIOR_SD, known, *(s for _, s in _BESIDE.values())], dtype=torch.float64)
-    return SlowNoise(torch.stack([*own, *beside], 1), centre, spread, torch.tensor(_AHEAD, dtype=torch.float64))
 
 
 def best_fit(noise: SlowNoise, y: Tensor, x: Tensor | None = None, start: Tensor | None = None) -> Fit:
@@ -103,34 +173,29 @@ def best_fit(noise: SlowNoise, y: Tensor, x: Tensor | None = None, start: Tensor
 
     Args:
         noise: Of `y`.
-        y: Differences `(sensor, difference)`.
-        x: Template `(sensor, difference)`.
-        start: Log factors to start from, `(sensor, part)`.
+        y: Ordinates `(..., sensor, ordinate)`.
+        x: Template `(..., 1, ordinate)`.
+        start: Log factors to start from, `(..., sensor, part)`.
     """
-    theta = (noise.centre + noise.ahead).expand(len(y), -1) if start is None else start
+    theta = (noise.centre + noise.ahead).expand(*y.shape[:-1], -1) if start is None else start
     precision = noise.spread**-2
-    precision = torch.cat([precision[:_OWN], precision[_OWN:] / len(y)])  # what is shared counts once
+    precision = torch.cat([precision[:_OWN], precision[_OWN:] / y.shape[-2]])  # what is shared counts once
     best: Fit | None = None
     for _ in range(_ROUNDS):
-        root = torch.linalg.cholesky(noise.covariance(theta))
-        inverse = torch.cholesky_inverse(root)
-        size, left = torch.zeros_like(y[:, 0]), y
+        parts = theta.exp()[..., None] * noise.parts
+        variance = parts.sum(-2)
+        size, left = torch.zeros_like(y[..., 0]), y
         if x is not None:
-            weighted = (inverse @ x[..., None])[..., 0]
-            size = (weighted * y).sum(-1) / (weighted * x).sum(-1)
-            left = y - size[:, None] * x
-        white = (inverse @ left[..., None])[..., 0]
-        log_determinant = 2 * root.diagonal(dim1=-1, dim2=-2).log().sum(-1)
+            size = (x * y / variance).sum(-1) / (x.square() / variance).sum(-1)
+            left = y - size[..., None] * x
+        power = left.square() / variance
         off = theta - noise.centre
-        prior = (off.square() * precision).sum(-1)
-        value = -((left * white).sum(-1) + log_determinant + prior) / 2
-        now = Fit(theta, value, inverse, size)
-        best = now if best is None else max(best, now, key=lambda fit: float(fit.value.sum()))
-        factors = theta.exp()
-        pulls = factors[..., None] * (noise.parts @ white[:, None, :, None])[..., 0]  # (sensor, part, difference)
-        trace = factors * (noise.parts * inverse[:, None]).sum((-1, -2))
-        slope = ((pulls * white[:, None]).sum(-1) - trace) / 2 - off * precision
-        information = pulls @ inverse @ pulls.mT / 2 + torch.diag(precision)
+        value = -((power + variance.log()).sum(-1) + (off.square() * precision).sum(-1)) / 2
+        now = Fit(theta, value, variance, size)
+        best = now if best is None else where(value.sum(-1) > best.value.sum(-1), now, best)
+        share = parts / variance[..., None, :]
+        slope = (share @ (power - 1)[..., None])[..., 0] / 2 - off * precision
+        information = (share * power[..., None, :]) @ share.mT / 2 + torch.diag(precision)
         step = _shared_step(information, slope).clamp(-_LONGEST_STEP, _LONGEST_STEP)
         theta = theta + step
         if float(step.abs().max()) < _CLOSE:
@@ -139,16 +204,27 @@ def best_fit(noise: SlowNoise, y: Tensor, x: Tensor | None = None, start: Tensor
     return best
 
 
-def scores(y: Tensor, inverse: Tensor, templates: Tensor) -> tuple[Tensor, Tensor]:
-    """Sizes `(sensor, template)` of each template alone, and the information on them, by generalised least squares."""
-    weighted = templates @ inverse  # (sensor, template, difference)
-    information = (weighted * templates).sum(-1)
-    return (weighted @ y[..., None])[..., 0] / information, information
+def scores(y: Tensor, variance: Tensor, templates: Tensor) -> tuple[Tensor, Tensor]:
+    """Sizes `(..., sensor, template)` of each template alone and the information on them: weighted least squares."""
+    information = (1 / variance) @ templates.square().mT
+    return (y / variance) @ templates.mT / information, information
 
 
-def differences(signal: Tensor) -> Tensor:
-    """Successive differences of the means of 256 blocks, `(..., time)` -> `(..., difference)`."""
-    return block_means(signal).diff()
+def ordinates(means: Tensor) -> Tensor:
+    """Orthonormal cosine transforms of 256 means, without the constant: `(..., block)` -> `(..., ordinate)`."""
+    return means @ cosines().mT
+
+
+def slow_ordinates(signal: Tensor) -> Tensor:
+    """Those of a signal, `(..., time)` -> `(..., ordinate)`."""
+    return ordinates(block_means(signal))
+
+
+@functools.lru_cache(maxsize=1)
+def cosines() -> Tensor:
+    """Rows of the DCT-II but the first, `(ordinate, block)`."""
+    k = torch.arange(1, N_BLOCKS, dtype=torch.float64)[:, None]
+    return math.sqrt(2 / N_BLOCKS) * (math.pi * k * (torch.arange(N_BLOCKS) + 0.5) / N_BLOCKS).cos()
 
 
 @functools.lru_cache(maxsize=4)
@@ -157,12 +233,44 @@ def cell_differences(base: Base, cell: int, n_cells: int) -> Tensor:
     return base.block_covariance(cell, n_cells).diff(dim=-1).diff(dim=-2)
 
 
+def where(which: Tensor, these: _Tuple, others: _Tuple) -> _Tuple:
+    """Of tuples of tensors `(..., any)` those of `these` where `which` `(...)` says so, else those of `others`."""
+    chosen = [
+        where(which, one, other)
+        if isinstance(one, tuple)
+        else torch.where(which.reshape(which.shape + (1,) * (one.ndim - which.ndim)), one, other)
+        for one, other in zip(these, others, strict=True)
+    ]
+    return type(these)(*chosen)
+
+
+@functools.lru_cache(maxsize=4)
+def _atom_variances(n_samples: int, block: int) -> Tensor:
+    """Exact variances of the ordinates of each atom with coefficient one, for any blocks, `(atom, ordinate)`."""
+    return ((cosines() @ atom_covariances(n_samples, block, N_BLOCKS)) * cosines()).sum(-1)
+
+
+def _fitted(values: Tensor, atoms: Tensor, dof: Tensor, start: Tensor) -> Tensor:
+    """Coefficients `(..., atom)` of greatest likelihood for mean squares `(..., place)`, by scoring from `start`."""
+    fitted, free = start, None
+    for _ in range(_FIT_ROUNDS):
+        weight = dof.sqrt() / fitted
+        design = atoms * weight[..., None, :]  # (..., atom, place)
+        moment = (design @ (weight * values)[..., None])[..., 0]
+        coefficients = nonnegative_least_squares(design @ design.mT, moment, free)
+        free = coefficients > 0
+        fitted = coefficients @ atoms
+    return coefficients
+
+
 def _shared_step(information: Tensor, slope: Tensor) -> Tensor:
-    """Newton's step `(sensor, part)` with one factor for all sensors in the parts beside the simulation."""
+    """Newton's step `(..., sensor, part)` with one factor for all sensors in the parts beside the simulation."""
     own, beside = slice(None, _OWN), slice(_OWN, None)
-    through = torch.linalg.solve(information[:, own, own], information[:, own, beside])  # (sensor, own, beside)
-    left = information[:, beside, beside] - information[:, beside, own] @ through
-    pull = slope[:, beside] - (through.mT @ slope[:, own, None])[..., 0]
-    common = torch.linalg.solve(left.sum(0), pull.sum(0))
-    rest = torch.linalg.solve(information[:, own, own], slope[:, own]) - through @ common
-    return torch.cat([rest, common.expand(len(slope), -1)], 1)
+    rows = torch.cat([information[..., own, beside], slope[..., own, None]], -1)
+    solved = torch.linalg.solve(information[..., own, own], rows)
+    through, alone = solved[..., :-1], solved[..., -1]  # (..., sensor, own, beside), (..., sensor, own)
+    left = information[..., beside, beside] - information[..., beside, own] @ through
+    pull = slope[..., beside] - (through.mT @ slope[..., own, None])[..., 0]
+    common = torch.linalg.solve(left.sum(-3), pull.sum(-2)[..., None])[..., None, :, :]  # (..., 1, beside, 1)
+    rest = alone - (through @ common)[..., 0]
+    return torch.cat([rest, common[..., 0].expand(*slope.shape[:-1], -1)], -1)

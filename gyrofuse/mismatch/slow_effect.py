@@ -15,11 +15,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.case import N_BLOCKS, Case, Scene
+from gyrofuse.mismatch.case import N_BLOCKS, Case, Scene, block_means
 from gyrofuse.mismatch.folds import N_FOLDS, N_JUDGED, in_fold
 from gyrofuse.mismatch.mechanism import Mechanism, Parameter, Z
-from gyrofuse.mismatch.slow import differences, scores
-from gyrofuse.mismatch.slow_scans import Family, Scan, SlowLook, concerned, slow_look
+from gyrofuse.mismatch.slow import cosines, scores
+from gyrofuse.mismatch.slow_families import Family
+from gyrofuse.mismatch.slow_scans import Scan, SlowLook, concerned, slow_look
 
 _STRONG = 5e-4  # a slow effect leaves traces that look like another one: largest p value
 _TOO_CLOSE = 5.0  # nats
@@ -74,12 +75,12 @@ class SlowEffect(Mechanism):
 
         The first is the path's; the others are slow cosines.
         """
-        look = slow_look(case)
-        root = torch.linalg.cholesky(look.noise.covariance(self.log_factors))
-        k = torch.arange(1, _SHARES, dtype=torch.float64)[:, None]
-        cosines = (math.pi * k * (torch.arange(N_BLOCKS) + 0.5) / N_BLOCKS).cos().diff()
-        x = differences(self.path(case.n_samples, case.scene))
-        both = torch.cat([look.y[..., None], torch.cat([x[None], cosines]).mT.expand(len(look.y), -1, -1)], -1)
+        covariance = slow_look(case).noise.covariance(self.log_factors).diff(dim=-1).diff(dim=-2)
+        path = block_means(self.path(case.n_samples, case.scene))
+        directions = torch.cat([path[None], cosines()[: _SHARES - 1]])
+        y = block_means(case.recording)
+        both = torch.cat([y[:, None], directions.expand(len(y), -1, -1)], 1).diff().mT
+        root = torch.linalg.cholesky(covariance)
         white = torch.linalg.solve_triangular(root, both, upper=False)
         return white[..., 0], white[..., 1:]
 
@@ -112,13 +113,13 @@ def strong_scan(case: Case, name: str, level: float) -> tuple[SlowLook, Scan, tu
     return look, scan, tuple(other.family.name for other in rivals if other.gain > scan.gain - _TOO_CLOSE)
 
 
-def doubt(scan: Scan) -> float:
-    """How much wider limits are than the noise at its best says, for it may be stronger without the effect.
+def log_factors(scan: Scan) -> Tensor:
+    """Of the slow noise beside an effect, as strong as the doubt leaves it, `(sensor, part)`.
 
-    As in limits from the likelihood ratio, the ratio of the effect's size to its uncertainty is that of the scan.
+    Without the effect the noise that fits best is stronger: as much as makes the effect's weight that of the scan.
     """
     which = list(concerned(scan))
-    return max(float(scan.held[which].norm() / scan.z[which].norm()), 1.0)
+    return scan.fit.log_factors + 2 * max(float((scan.held[which].norm() / scan.z[which].norm()).log()), 0.0)
 
 
 def plausible(look: SlowLook, scan: Scan) -> tuple[float, float]:
@@ -131,17 +132,17 @@ def plausible(look: SlowLook, scan: Scan) -> tuple[float, float]:
 
 def estimate(look: SlowLook, scan: Scan, fine: Family) -> Estimate:
     """Mean over the places of a family, each as likely as the data say: the places are the prior."""
-    size, information = scores(look.y, scan.fit.inverse, fine.templates)
+    size, information = scores(look.y, scan.fit.variance, fine.templates)
     weight = torch.softmax(_gain(look, scan, fine), 0)
     mean = (size * weight).sum(-1)
-    variance = ((doubt(scan) ** 2 / information + size.square()) * weight).sum(-1) - mean.square()
+    variance = ((1 / information + size.square()) * weight).sum(-1) - mean.square()
     return Estimate(quantiles(fine.places, weight), mean, variance.sqrt())
 
 
 def _gain(look: SlowLook, scan: Scan, family: Family) -> Tensor:
     """Of the sensors concerned, nats, `(template,)`."""
-    size, information = scores(look.y, scan.fit.inverse, family.templates)
-    return (size.square() * information)[list(concerned(scan))].sum(0) / 2 / doubt(scan) ** 2
+    size, information = scores(look.y, scan.fit.variance, family.templates)
+    return (size.square() * information)[list(concerned(scan))].sum(0) / 2
 
 
 def quantiles(places: Tensor, weight: Tensor) -> tuple[float, float, float]:

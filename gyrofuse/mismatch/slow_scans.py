@@ -1,8 +1,9 @@
-"""Scans of block means for slow effects: templates by place, how surprising the best is, and what it would be.
+"""Scans of block means for slow effects: how surprising the best template is, and what it would be.
 
 A scan takes the best of a family of templates (onsets, time constants, lags of a temperature). Its p value is that of
 the maximum of a chi-square process along the whitened templates, from the length of the curve they draw on the sphere
-(Davies, 1987), and never more than that of so many separate tests.
+(Davies, 1987), and never more than that of so many separate tests. Where it is small it is held against twins: block
+means without an effect, beside simulations that tell of their noise no better than the one at hand.
 """
 
 from __future__ import annotations
@@ -13,68 +14,55 @@ from functools import cached_property
 from typing import NamedTuple
 
 import torch
-from scipy import stats
-from scipy.signal import lfilter
 from torch import Tensor
 
-from gyrofuse.mismatch.case import N_BLOCKS, Case, Scene, block_means
-from gyrofuse.mismatch.evidence import Evidence, corrected
+from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.evidence import Evidence, calibrated, corrected
 from gyrofuse.mismatch.remembered import remembered
-from gyrofuse.mismatch.slow import Fit, SlowNoise, best_fit, differences, scores, slow_noise
+from gyrofuse.mismatch.slow import Fit, SlowNoise, Told, best_fit, scores, slow_ordinates, told, where
+from gyrofuse.mismatch.slow_families import Family, edges, steps, temperatures, warm_ups
 
-_LOW_BINS = 24  # of whitened differences, in which sensors are compared
-_DULL = 0.2  # a p value above which the noise is not refitted, although ...
-_SWALLOWED = math.sqrt(2)  # ... noise without the effect makes it look that much smaller
+_LOW = 48  # ordinates in which sensors are compared
 _SCANS = 2  # the second with the covariance that the first effect leaves
 _PRESENT = 3.0  # standard deviations, noise held: 0.3 % each
 _JUMP = 5.0  # standard deviations
 _FEWEST_JUMPS, _MOST_JUMPS = 4, 10
 _TWO_LEVELS = 1.6  # distance of the outermost levels, in jumps
-_TIME_CONSTANTS = 24
-_LAGS = 16
+_TWINS = 256
+_DOUBTED = 0.01  # p values below are held against twins
+_FAR = 1000.0  # of chi-squares, beyond which tails are zero to rounding
+_LEAST = 0.1  # cube root of a chi-square over its mean
 
 
-class Family(NamedTuple):
-    """Templates of one mechanism.
+class Best(NamedTuple):
+    """The best template of a family, for one case or for many at once.
 
     Attributes:
-        name: Of the mechanism.
-        templates: Differences of block means for a size of one, `(template, difference)`.
-        places: What tells them apart, `(template,)`, samples: onset, time constant or lag.
-        channel: Of a temperature, and its row.
-        row: Likewise.
+        at: Which of them, `(...)`.
+        fit: With it.
+        held: Sizes in standard deviations, `(..., sensor)`, with the noise held.
+        z: The same with what the likelihood ratio leaves of it.
+        gain: Of all sensors together, nats, less what it costs to have looked at all places, `(...)`.
+        p_value: For having looked at all of them, `(...)`.
     """
 
-    name: str
-    templates: Tensor
-    places: Tensor
-    channel: str | None = None
-    row: int = 0
+    at: Tensor
+    fit: Fit
+    held: Tensor
+    z: Tensor
+    gain: Tensor
+    p_value: Tensor
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """The best template of a family.
-
-    Attributes:
-        family: Templates.
-        best: Which of them.
-        fit: With it.
-        held: Sizes in standard deviations, `(sensor,)`, with the noise held.
-        z: The same with what the likelihood ratio leaves of it.
-        relation: Their correlation.
-        lengths: Of the family's curves, `(sensor,)`.
-        gain: Of all sensors together, nats.
-        p_value: For having looked at all of them.
-    """
+    """The best template of a family in a case; attributes as in `Best`."""
 
     family: Family
     best: int
     fit: Fit
     held: Tensor
     z: Tensor
-    relation: Tensor
-    lengths: Tensor
     gain: float
     p_value: float
 
@@ -92,6 +80,7 @@ class Scan:
 class SlowLook:
     """All that scans need of a case; what is derived is computed once."""
 
+    simulation: Told
     noise: SlowNoise
     y: Tensor
     null: Fit
@@ -113,36 +102,12 @@ class SlowLook:
         return next((s for s in self.scans if s.family.name == name), None)
 
     def _scan(self, family: Family) -> Scan:
-        """Best template with the noise refitted beside it, and once more with the noise that it leaves."""
-        best = self._seen(family, self.null, None)
-        if _p_value(_SWALLOWED * best.z, best.relation, best.lengths, len(family.places)) > _DULL:
-            return best
-        tried: set[int] = set()
-        seen = best
-        while seen.best not in tried and len(tried) < _SCANS:
-            tried.add(seen.best)
-            x = seen.template.expand(len(self.y), -1)
-            fit = best_fit(self.noise, self.y, x, self.null.log_factors)
-            size, information = scores(self.y, fit.inverse, seen.template[None])
-            held = (size * information.sqrt())[:, 0] * self._heard(family)
-            # The noise that fits best without the effect may be stronger in all sensors: that leaves less of it.
-            ratio = 2 * float((fit.value - self.null.value).sum())
-            share = min(max(ratio, 0.0) / max(float(held.square().sum()), 1e-300), 1.0)
-            z = held * math.sqrt(share) / self._excess(fit, seen.template).sqrt()
-            relation = self._relation(fit, seen.template)
-            fitted = _of(family, seen.best, fit, held, z, relation, seen.lengths)
-            best = fitted if len(tried) == 1 or fitted.p_value < best.p_value else best
-            seen = self._seen(family, fit, seen.template)
-        return best
-
-    def _seen(self, family: Family, fit: Fit, template: Tensor | None) -> Scan:
-        """Best template with the noise held, which `template` was fitted beside."""
-        size, information = scores(self.y, fit.inverse, family.templates)
-        z = size * information.sqrt() * self._heard(family)[:, None]  # (sensor, template)
-        lengths = curve_length(fit.inverse, family.templates, information)
-        relation = self._relation(fit, template)
-        at = _most_extreme(z, lengths, relation)
-        return _of(family, at, fit, z[:, at], z[:, at], relation, lengths)
+        heard = self._heard(family)
+        found = best_place(self.noise, self.y, self.null, family, heard)
+        p_value = float(found.p_value)
+        if p_value < _DOUBTED:
+            p_value = max(p_value, calibrated(p_value, best_place(*self._twins, family, heard).p_value))
+        return Scan(family, int(found.at), found.fit, found.held, found.z, float(found.gain), p_value)
 
     def _heard(self, family: Family) -> Tensor:
         """Sensors that count: 0 for steps in those that jump to and fro, which is another mechanism."""
@@ -150,42 +115,68 @@ class SlowLook:
 
     @cached_property
     def _to_and_fro(self) -> Tensor:
-        inverse = torch.cholesky_inverse(
-            torch.linalg.cholesky(self.noise.covariance(self.noise.centre.expand(len(self.y), -1)))
-        )
-        pairs = zip(self.y, inverse, strict=True)
-        return torch.tensor([jumps_to_and_fro(y, own) for y, own in pairs], dtype=torch.float64)
-
-    def _excess(self, fit: Fit, template: Tensor) -> Tensor:
-        """By how much steps anywhere are larger than the noise lets expect, mean squares, 1 at least, `(sensor,)`."""
-        size, information = scores(self.y - fit.size[:, None] * template, fit.inverse, self._probes)
-        mean = (size.square() * information).mean(-1)
-        return ((mean + mean.mean()) / 2).clamp(min=1)
+        weight = 1 / self.noise.own
+        jumps = edges()
+        pairs = ((jumps @ (own * y), (jumps * own) @ jumps.mT) for own, y in zip(weight, self.y, strict=True))
+        return torch.tensor([jumps_to_and_fro(*pair) for pair in pairs], dtype=torch.float64)
 
     @cached_property
-    def _probes(self) -> Tensor:
-        """Steps at every edge of blocks."""
-        return torch.eye(self.y.shape[-1], dtype=torch.float64)
+    def _twins(self) -> tuple[SlowNoise, Tensor, Fit]:
+        """Noise as their simulations tell it, ordinates `(twin, sensor, ordinate)`, and fits without an effect.
 
-    def _relation(self, fit: Fit, template: Tensor | None) -> Tensor:
-        """Correlation of the sensors' slow noise, shrunk towards none by as much as chance explains of it."""
-        left = self.y if template is None else self.y - fit.size[:, None] * template
-        white = (torch.linalg.cholesky(fit.inverse).mT @ left[..., None])[..., 0]
-        low = torch.fft.rfft(white)[:, 1 : _LOW_BINS + 1]
-        c = (low @ low.mH).real
-        c = c / c.diagonal().sqrt().outer(c.diagonal().sqrt())
-        upper = torch.triu_indices(len(c), len(c), 1)
-        r = c[upper[0], upper[1]]
-        by_chance = float((1 - r.square()).square().sum() / (2 * _LOW_BINS))
-        share = min(by_chance / max(float(r.square().sum()), 1e-300), 1.0)
-        return (1 - share) * c + share * torch.eye(len(c), dtype=c.dtype)
+        A twin's recording has the noise that the simulation tells of; its simulation tells it no better than this one.
+        """
+        generator = torch.Generator().manual_seed(0)
+        simulation = self.simulation
+        expected = simulation.coefficients() @ simulation.atoms
+        # Chi-square by its cube root, which is normal (Wilson and Hilferty, 1931).
+        spread = 1 / (9 * simulation.dof)
+        normal = torch.randn(_TWINS, *expected.shape, generator=generator, dtype=torch.float64)
+        values = expected * (1 - spread + normal * spread.sqrt()).clamp(min=_LEAST) ** 3
+        noise = simulation._replace(values=values).noise()
+        normal = torch.randn(_TWINS, *self.y.shape, generator=generator, dtype=torch.float64)
+        y = self.noise.own.sqrt() * normal
+        return noise, y, best_fit(noise, y)
+
+
+def best_place(noise: SlowNoise, y: Tensor, null: Fit, family: Family, heard: Tensor) -> Best:
+    """The best template with the noise refitted beside it, and again with the noise that it leaves.
+
+    Args:
+        noise: Of `y`.
+        y: Ordinates `(..., sensor, ordinate)`.
+        null: Fit without an effect.
+        family: Templates.
+        heard: 1 for sensors that count, else 0, `(sensor,)`.
+    """
+    best: Best | None = None
+    fit, relation = null, related(y, null.variance)
+    for _ in range(_SCANS):
+        size, information = scores(y, fit.variance, family.templates)
+        lengths = curve_length(fit.variance, family.templates, information)
+        at = _most_extreme(size * information.sqrt() * heard[:, None], lengths, relation)
+        x = family.templates[at][..., None, :]
+        fit = best_fit(noise, y, x, null.log_factors)
+        left = y - fit.size[..., None] * x
+        relation = related(left, fit.variance)
+        held = fit.size * (x.square() / fit.variance).sum(-1).sqrt() * heard
+        # The noise that fits best without the effect may be stronger in all sensors: that leaves less of it.
+        ratio = 2 * (fit.value - null.value).sum(-1).clamp(min=0)
+        share = (ratio / held.square().sum(-1).clamp(min=1e-300)).clamp(max=1)
+        z = held * share.sqrt()[..., None] / _excess(left, fit.variance).sqrt()
+        gain, p_value = _surprise(z, lengths, relation, len(family.places))
+        now = Best(at, fit, held, z, gain, p_value)
+        best = now if best is None else where(p_value < best.p_value, now, best)
+    assert best is not None
+    return best
 
 
 @remembered
 def slow_look(case: Case) -> SlowLook:
     """What is slow in a case, looked at once for the witness and for all mechanisms."""
-    noise, y = slow_noise(case), differences(case.recording)
-    return SlowLook(noise, y, best_fit(noise, y), (steps(case), warm_ups(case), *temperatures(case)))
+    simulation, y = told(case), slow_ordinates(case.recording)
+    noise, families = simulation.noise(), (steps(case), warm_ups(case), *temperatures(case))
+    return SlowLook(simulation, noise, y, best_fit(noise, y), families)
 
 
 def slow_witness(case: Case) -> Evidence:
@@ -214,80 +205,20 @@ def concerned(scan: Scan) -> tuple[int, ...]:
     return tuple((scan.held.abs() > _PRESENT).nonzero()[:, 0].tolist())
 
 
-def steps(case: Case) -> Family:
-    """Steps at the edges of blocks and in their middles."""
-    n = N_BLOCKS - 1
-    edges = torch.eye(n, dtype=torch.float64)
-    middles = (edges[:-1] + edges[1:]) / 2
-    templates = torch.cat([edges, middles])
-    onsets = torch.cat([torch.arange(1.0, n + 1), torch.arange(1.5, n)]).to(torch.float64)
-    order = onsets.argsort()
-    return Family("step", templates[order], onsets[order] * case.block)
+def jumps_to_and_fro(score: Tensor, gram: Tensor) -> bool:
+    """Whether a sensor has several jumps that lead between two levels, found one by one.
 
-
-def warm_ups(case: Case, time_constants: Tensor | None = None) -> Family:
-    """Decays `exp(-t / tau)` with time constants `(template,)`, samples; by default from half a block to the record."""
-    if time_constants is None:
-        time_constants = torch.logspace(
-            math.log10(case.block / 2), math.log10(case.n_samples), _TIME_CONSTANTS, dtype=torch.float64
-        )
-    tau = time_constants[:, None]
-    # The mean over a block, a geometric sum.
-    mean = torch.expm1(-case.block / tau) / torch.expm1(-1 / tau) / case.block
-    means = mean * (-torch.arange(N_BLOCKS) * case.block / tau).exp()
-    return Family("warm_up_transient", means.diff(), time_constants)
-
-
-def temperatures(case: Case) -> list[Family]:
-    """Each row of each temperature, with lags from none to a quarter of the record."""
-    lags = torch.logspace(math.log10(case.block / 2), math.log10(case.n_samples / 4), _LAGS - 1, dtype=torch.float64)
-    lags = torch.cat([torch.zeros(1, dtype=torch.float64), lags])
-    return [temperature(case.scene, channel, row, lags, case.n_samples) for channel, row in temperature_rows(case)]
-
-
-def temperature_rows(case: Case) -> list[tuple[str, int]]:
-    """Names and rows of the channels that are temperatures, whole, and not constant."""
-    return [
-        (name, row)
-        for name, values in case.scene.channels.items()
-        if name.lower().startswith("temperature")
-        for row, channel in enumerate(values.reshape(-1, values.shape[-1]))
-        if bool(channel.isfinite().all()) and bool(channel.amax() > channel.amin())
-    ]
-
-
-def temperature(scene: Scene, channel: str, row: int, lags: Tensor, n_samples: int) -> Family:
-    """One row with lags `(template,)` in samples."""
-    paths = torch.stack([lagged(scene, channel, row, float(lag), n_samples) for lag in lags])
-    return Family("temperature_drift", block_means(paths).diff(), lags, channel, row)
-
-
-def lagged(scene: Scene, channel: str, row: int, lag: float, n_samples: int) -> Tensor:
-    """Temperature of what follows a channel with a lag in samples, `tau dy/dt = x - y`, from equilibrium, `(time,)`."""
-    x = scene.channels[channel]
-    x = x.reshape(-1, x.shape[-1])[row].to(torch.float64)
-    if len(x) < n_samples:
-        raise ValueError(
-            f"`channels`: expected {channel!r} at {n_samples} samples or more, got {len(x)}; "
-            "give it for the whole record"
-        )
-    x = x[:n_samples]
-    if not lag:
-        return x
-    keeps = math.exp(-1 / lag)
-    y, _ = lfilter([1 - keeps], [1, -keeps], x.numpy(), zi=[keeps * float(x[0])])
-    return torch.from_numpy(y)
-
-
-def jumps_to_and_fro(y: Tensor, inverse: Tensor) -> bool:
-    """Whether differences `(difference,)` have several jumps that lead between two levels, found one by one."""
+    Args:
+        score: Weighted products of the data with steps at the edges of blocks, `(edge,)`.
+        gram: Those of the steps with each other, `(edge, edge)`.
+    """
     at: list[int] = []
-    jumps = torch.zeros(0, dtype=y.dtype)
+    jumps = torch.zeros(0, dtype=score.dtype)
     while len(at) < _MOST_JUMPS:
-        within = inverse[at][:, at]
-        jumps = torch.linalg.solve(within, (inverse @ y)[at])
-        left = inverse @ y - inverse[:, at] @ jumps
-        information = inverse.diagonal() - (inverse[:, at] * torch.linalg.solve(within, inverse[at]).mT).sum(-1)
+        within = gram[at][:, at]
+        jumps = torch.linalg.solve(within, score[at])
+        left = score - gram[:, at] @ jumps
+        information = gram.diagonal() - (gram[:, at] * torch.linalg.solve(within, gram[at]).mT).sum(-1)
         information[at] = math.inf
         squares = left.square() / information
         if float(squares.max()) < _JUMP**2:
@@ -300,45 +231,67 @@ def jumps_to_and_fro(y: Tensor, inverse: Tensor) -> bool:
     return bool(levels.amax() - levels.amin() < _TWO_LEVELS * jumps.abs().median())
 
 
-def curve_length(inverse: Tensor, templates: Tensor, information: Tensor) -> Tensor:
-    """Length of the curve of whitened unit templates on the sphere, `(sensor,)`."""
-    inner = ((templates[:-1] @ inverse) * templates[1:]).sum(-1)
-    cosine = inner / (information[:, :-1] * information[:, 1:]).sqrt()
+def related(left: Tensor, variance: Tensor) -> Tensor:
+    """Correlation of the sensors' slow noise `(..., sensor, sensor)`, shrunk towards none by as much as is chance."""
+    low = (left / variance.sqrt())[..., :_LOW]
+    c = low @ low.mT
+    size = c.diagonal(dim1=-1, dim2=-2).sqrt()
+    c = c / size[..., :, None] / size[..., None, :]
+    upper = torch.triu_indices(c.shape[-1], c.shape[-1], 1)
+    squares = c[..., upper[0], upper[1]].square()
+    by_chance = (1 - squares).square().sum(-1) / _LOW
+    share = (by_chance / squares.sum(-1).clamp(min=1e-300)).clamp(max=1)[..., None, None]
+    return (1 - share) * c + share * torch.eye(c.shape[-1], dtype=c.dtype)
+
+
+def curve_length(variance: Tensor, templates: Tensor, information: Tensor) -> Tensor:
+    """Length of the curve of whitened unit templates on the sphere, `(..., sensor)`."""
+    inner = (1 / variance) @ (templates[:-1] * templates[1:]).mT
+    cosine = inner / (information[..., :-1] * information[..., 1:]).sqrt()
     return cosine.clamp(-1, 1).arccos().sum(-1)
 
 
 def expected_exceedances(q: Tensor, dof: int, length: Tensor, places: int) -> Tensor:
     """How often a chi-square process along a curve exceeds `q`, by Davies (1987), or by the number of its places."""
-    one = torch.from_numpy(stats.chi2.sf(q.numpy(), dof))
+    one = torch.special.gammaincc(torch.full_like(q, dof / 2), q / 2)
     high = q.clamp(min=max(dof - 1, 1e-3))  # below the mode, upcrossings do not count the places
     log_rate = (dof - 1) / 2 * (high / 2).log() - high / 2 - math.lgamma(dof / 2) - math.log(math.pi) / 2
     return torch.minimum(one + length * log_rate.exp(), places * one)
 
 
-def _of(family: Family, best: int, fit: Fit, held: Tensor, z: Tensor, relation: Tensor, lengths: Tensor) -> Scan:
-    gain = float(_pooled(z[:, None], relation)[0]) / 2
-    p_value = _p_value(z, relation, lengths, len(family.places))
-    return Scan(family, best, fit, held, z, relation, lengths, gain, p_value)
+def _excess(left: Tensor, variance: Tensor) -> Tensor:
+    """By how much steps anywhere are larger than the noise lets expect, mean squares, 1 at least, `(..., sensor)`."""
+    size, information = scores(left, variance, edges())
+    mean = (size.square() * information).mean(-1)
+    return ((mean + mean.mean(-1, keepdim=True)) / 2).clamp(min=1)
 
 
 def _pooled(z: Tensor, relation: Tensor) -> Tensor:
-    """`z' R^-1 z`, `(sensor, template)` -> `(template,)`."""
-    return (z * torch.linalg.solve(relation, z)).sum(0)
+    """`z' R^-1 z`, `(..., sensor, template)` -> `(..., template)`."""
+    return (z * torch.linalg.solve(relation, z)).sum(-2)
 
 
-def _most_extreme(z: Tensor, lengths: Tensor, relation: Tensor) -> int:
-    """Template that is least expected, all sensors together or one alone."""
-    return int(torch.minimum(*_expected(z, lengths, relation, z.shape[1])).argmin())
+def _most_extreme(z: Tensor, lengths: Tensor, relation: Tensor) -> Tensor:
+    """Template that is least expected, all sensors together or one alone, `(...)`."""
+    n_sensors, places = z.shape[-2:]
+    pooled, at = _pooled(z, relation).max(-1)
+    squares, alone_at = z.square().max(-1)  # (..., sensor)
+    together = expected_exceedances(pooled, n_sensors, lengths.mean(-1), places)
+    alone, which = expected_exceedances(squares, 1, lengths, places).min(-1)
+    better = n_sensors * alone < together
+    return torch.where(better, alone_at.gather(-1, which[..., None])[..., 0], at)
 
 
-def _p_value(z: Tensor, relation: Tensor, lengths: Tensor, places: int) -> float:
-    """Of the best template: exceedances come as in a Poisson process."""
-    together, alone = (float(expected[0]) for expected in _expected(z[:, None], lengths, relation, places))
-    return -math.expm1(-together) if len(z) == 1 else corrected(-math.expm1(-min(together, alone)), 2)
-
-
-def _expected(z: Tensor, lengths: Tensor, relation: Tensor, places: int) -> tuple[Tensor, Tensor]:
-    """How many templates were expected to do as well, for each `(template,)`: all sensors together, the best alone."""
-    together = expected_exceedances(_pooled(z, relation), len(z), lengths.mean(), places)
-    alone = expected_exceedances(z.square(), 1, lengths[:, None], places)
-    return together, len(z) * alone.amin(0)
+def _surprise(z: Tensor, lengths: Tensor, relation: Tensor, places: int) -> tuple[Tensor, Tensor]:
+    """Gain of sizes `(..., sensor)` less the price of having looked everywhere, and p value of the best template."""
+    n_sensors = z.shape[-1]
+    pooled = _pooled(z[..., None], relation)[..., 0]
+    together = expected_exceedances(pooled, n_sensors, lengths.mean(-1), places)
+    far = pooled.clamp(max=_FAR)
+    here = torch.special.gammaincc(torch.full_like(far, n_sensors / 2), far / 2)
+    gain = pooled / 2 - (expected_exceedances(far, n_sensors, lengths.mean(-1), places) / here).log()
+    if n_sensors == 1:
+        return gain, -torch.expm1(-together)
+    alone = n_sensors * expected_exceedances(z.square(), 1, lengths, places).amin(-1)
+    # The better of two ways, where exceedances come as in a Poisson process.
+    return gain, -torch.expm1(-2 * torch.minimum(together, alone))

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from gyrofuse.mismatch.bumps import bump_witness
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.channels import channel_witness
+from gyrofuse.mismatch.clocks import clock_witness
 from gyrofuse.mismatch.evidence import Evidence, corrected
 from gyrofuse.mismatch.impulses import jump_witness, spike_witness, variance_witness
 from gyrofuse.mismatch.marginals import marginal_witness
@@ -19,6 +20,7 @@ WITNESSES: tuple[Callable[[Case], Evidence], ...] = (
     spike_witness,
     channel_witness,
     line_witness,
+    clock_witness,
     jump_witness,
     slow_witness,
     variance_witness,

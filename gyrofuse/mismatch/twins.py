@@ -6,8 +6,6 @@ those given and with the same auxiliary channels: whatever finite lengths and ch
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -15,7 +13,6 @@ from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.testimony import combined, testimony
 
 FEWEST = 50
-_TAIL = 0.25  # share of the twins behind the fitted tail
 
 
 def twin(case: Case, generator: torch.Generator) -> Case:
@@ -30,17 +27,3 @@ def twin_p_values(case: Case, n_twins: int, generator: torch.Generator) -> Tenso
     """p values of all witnesses together among twins, `(twin,)`: uniform, as far as every witness is honest."""
     values = [combined(testimony(twin(case, generator))) for _ in range(n_twins)]
     return torch.tensor(values, dtype=torch.float64)
-
-
-def calibrated(p_value: float, among: Tensor) -> float:
-    """p value of agreement from its rank among those of twins `(twin,)`.
-
-    Beyond the smallest quarter of them the tail is fitted instead of counted: `-log p` has an exponential tail, with
-    rate one where witnesses are honest. The maximum of its likelihood is the inverse mean excess.
-    """
-    scores, own = -among.clamp(min=1e-300).log(), -math.log(max(p_value, 1e-300))
-    threshold = float(scores.quantile(1 - _TAIL))
-    if own <= threshold:
-        return float(((scores >= own).sum() + 1) / (len(scores) + 1))
-    excess = scores[scores > threshold] - threshold
-    return _TAIL * math.exp(-(own - threshold) / float(excess.mean()))

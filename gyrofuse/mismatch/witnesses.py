@@ -56,17 +56,16 @@ def coherence_witness(case: Case) -> Evidence:
     d, simulated = case.bands.dof, case.simulated.dof
     if case.n_sensors < 2:
         return Evidence("coherence", 1.0, "a single sensor has no pairs")
-    one, other = case.recorded.coherence, case.simulated.coherence
-    upper = torch.triu_indices(case.n_sensors, case.n_sensors, 1)
-    difference = (one - other).abs().square()[:, upper[0], upper[1]]  # (band, pair)
-    per_ordinate = 1 / d + 1 / simulated.clamp(min=1e-9)
-    size = ((one.abs().square() + other.abs().square()) / 2)[:, upper[0], upper[1]] - per_ordinate[:, None] / 2
-    # What a sample coherence varies by, both parts.
-    variance = (1 - size.clamp(0.0, 1 - 1e-6)).square() * per_ordinate[:, None]
-    q = (difference / variance).sum(-1)
     known = (d >= _COHERENCE_DOF) & (simulated >= _COHERENCE_DOF)
     if not bool(known.any()):
         return Evidence("coherence", 1.0, "the recording is too short to compare coherences")
+    one, other = case.recorded.coherence, case.simulated.coherence
+    upper = torch.triu_indices(case.n_sensors, case.n_sensors, 1)
+    # Whitened by what both have in common, entries vary alike and apart, whatever noise the sensors share.
+    white = whitened_difference(one[known], other[known], d[known], simulated[known])
+    difference = torch.zeros(len(d), upper.shape[1], dtype=d.dtype)  # (band, pair)
+    difference[known] = white.abs().square()[:, upper[0], upper[1]]
+    q = difference.sum(-1) / (1 / d + 1 / simulated.clamp(min=1e-9))
     # Gamma distributed but for a slightly heavier tail, here that of a ratio.
     n_pairs = difference.shape[-1]
     tails = stats.f.sf((q / n_pairs).numpy(), 2 * n_pairs, _TAIL * d.minimum(simulated).clamp(min=1.0).numpy())
@@ -84,6 +83,14 @@ def coherence_witness(case: Case) -> Evidence:
         levels=(level_of(float(case.bands.frequency[band])),),
         frequency_hz=f,
     )
+
+
+def whitened_difference(one: Tensor, other: Tensor, d: Tensor, s: Tensor) -> Tensor:
+    """Difference of coherences `(band, sensor, sensor)` of `d` and `s` ordinates, in units of their mean."""
+    both = (d[:, None, None] * one + s[:, None, None] * other) / (d + s)[:, None, None]
+    root = torch.linalg.cholesky(both)
+    left = torch.linalg.solve_triangular(root, one - other, upper=False)
+    return torch.linalg.solve_triangular(root, left.mH, upper=False)
 
 
 def power_tails(case: Case) -> Tensor:

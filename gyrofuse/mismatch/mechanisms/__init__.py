@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from gyrofuse.mismatch.mechanism import Mechanism
 from gyrofuse.mismatch.mechanisms.clipping import Clipping
+from gyrofuse.mismatch.mechanisms.clock_skew import ClockSkew
 from gyrofuse.mismatch.mechanisms.common_mode import CommonMode
 from gyrofuse.mismatch.mechanisms.drifting_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.flicker import FlickerNoise
@@ -32,6 +33,7 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (UnitScale,),
     (Quantization, Clipping, StuckSamples),  # facts on the numbers themselves
     (Spikes,),
+    (ClockSkew,),
     (GSensitivity, QuadraticCoupling, ScaleFactor),
     (VibrationTone,),
     (RandomTelegraph,),

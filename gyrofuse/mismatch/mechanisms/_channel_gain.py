@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
@@ -16,7 +17,9 @@ from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.witnesses import level_of
 
 _OF_ONE_BAND = 0.9  # share of the evidence from which a gain might be a line's alone
+_SEEN = 0.04  # chance that a sensor is named which does not follow the channel
 _LATE = 0.25  # share of the evidence a quarter of a cycle late, from which it is no instantaneous coupling
+_SCATTER = 3.0  # standard deviations of what is so by chance
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,11 +29,14 @@ class ChannelGain(Mechanism):
     Attributes:
         channel: Its name.
         coupling: `(sensor, row)`, signal per unit of the rows; 0 for sensors that do not show it.
+        kind: Which rows are made from the channel.
     """
 
     of_one_band: ClassVar[tuple[str, ...]] = ()
+    quantity: ClassVar[str] = "gain"
     channel: str
     coupling: Tensor
+    kind: str = "each"
 
     @classmethod
     def channels(cls, case: Case) -> list[str]:
@@ -38,9 +44,9 @@ class ChannelGain(Mechanism):
         raise NotImplementedError
 
     @classmethod
-    def rows(cls, values: Tensor) -> Tensor:
-        """Rows `(row, time)` of a channel's values `(row, time)`."""
-        return values
+    def rows(cls, values: Tensor) -> Mapping[str, Tensor]:
+        """Kinds of rows `(row, time)` that it may follow, made of a channel's values `(row, time)`."""
+        return {"each": values}
 
     @classmethod
     def words(cls, gain: float, channel: str, where: str, unit: str) -> str:
@@ -49,53 +55,50 @@ class ChannelGain(Mechanism):
 
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:
-        best: tuple[ChannelFit, str] | None = None
-        candidates = cls.channels(case)
-        for name in candidates:
-            fit = regress(case, cls._rows(case.scene, name))
-            if (
-                fit is not None
-                and fit.p_value * len(candidates) <= level
-                and (best is None or fit.statistic > best[0].statistic)
-            ):
-                best = fit, name
-        if best is None:
+        tried = [
+            (fit, name, kind)
+            for name in cls.channels(case)
+            for kind, rows in cls._rows(case.scene, name).items()
+            if (fit := regress(case, rows)) is not None
+        ]
+        if not tried:
             return None
-        fit, name = best
-        chance = fit.gains.numel()  # what either would be without any gain
-        if fit.quadrature - chance > _LATE * (fit.statistic - chance):
+        fit, name, kind = min(tried, key=lambda entry: (entry[0].p_value, -entry[0].excess))
+        p_value = min(fit.p_value * len(tried), 1.0)
+        chance = fit.gains.numel()  # mean of what is seen a quarter of a cycle late, with the variance twice as large
+        if p_value > level or fit.quadrature > chance + _SCATTER * math.sqrt(2 * chance) + _LATE * fit.excess:
             return None
-        present = tuple((fit.own < 0.01 / case.n_sensors).nonzero()[:, 0].tolist()) or (int(fit.own.argmin()),)
-        unit = f"{case.scene.unit}{cls._per(case.scene, name)}"
-        sizes = {i: _size(fit, i, unit) for i in present}
-        largest = max(sizes, key=lambda i: sizes[i].value)
+        present = tuple((fit.own < _SEEN / case.n_sensors).nonzero()[:, 0].tolist()) or (int(fit.own.argmin()),)
+        unit, factor = cls._unit(case.scene, name)
+        sizes = {i: _size(fit, i, unit, factor) for i in present}
+        largest = max(sizes, key=lambda i: abs(sizes[i].value))
         where = case.scene.named(present, "every sensor")
-        rows = cls._rows(case.scene, name)
+        rows = cls._rows(case.scene, name)[kind]
         busiest = (
             float(torch.fft.rfft(rows - rows.mean(-1, keepdim=True)).abs().square().sum(0).argmax()) / case.n_samples
         )
         return Finding(
             cls.name,
-            cls(name, _only(fit.gains, present)),
-            cls.words(sizes[largest].value, name, where, unit),
-            fit.p_value * len(candidates),
+            cls(name, _only(fit.gains, present), kind),
+            cls.words(abs(sizes[largest].value), name, where, unit),
+            p_value,
             present,
-            {f"gain[{i}]": entry for i, entry in sizes.items()},
+            {f"{cls.quantity}[{i}]": entry for i, entry in sizes.items()},
             levels=(level_of(max(busiest, 1 / case.n_samples)),),
             alternatives=cls.of_one_band if fit.share > _OF_ONE_BAND else (),
             channel=name,
-            gain=fit.statistic / 2,
+            gain=fit.excess / 2,
         )
 
     def refitted(self, case: Case, fold: int) -> ChannelGain:
         """Regression on the kept samples alone, the others left out of both sides."""
         keep = estimation_samples(case.n_samples, fold)
         weight = keep.to(torch.float64)
-        rows = self._rows(case.scene, self.channel)
+        rows = self._rows(case.scene, self.channel)[self.kind]
         means = [(v * weight).sum(-1, keepdim=True) / weight.sum() for v in (rows, case.recording)]
         fit = regress(case, (rows - means[0]) * weight, (case.recording - means[1]) * weight)
         present = tuple(self.coupling.any(-1).nonzero()[:, 0].tolist())
-        return self if fit is None else type(self)(self.channel, _only(fit.gains, present))
+        return self if fit is None else replace(self, coupling=_only(fit.gains, present))
 
     def gains(self, case: Case, fold: int) -> Tensor:
         return signal_gains(case, self._path(case.scene, case.n_samples), fold)
@@ -110,7 +113,7 @@ class ChannelGain(Mechanism):
         return case.less(self._path(case.scene, case.n_samples))
 
     def _path(self, scene: Scene, n_samples: int) -> Tensor:
-        rows = self._rows(scene, self.channel)
+        rows = self._rows(scene, self.channel)[self.kind]
         if rows.shape[-1] < n_samples:
             raise ValueError(
                 f"`channels`: expected {n_samples} samples of {self.channel!r}, which {self.name} follows, "
@@ -119,15 +122,15 @@ class ChannelGain(Mechanism):
         return self.coupling @ rows[:, :n_samples]
 
     @classmethod
-    def _rows(cls, scene: Scene, name: str) -> Tensor:
+    def _rows(cls, scene: Scene, name: str) -> dict[str, Tensor]:
         values = scene.channels[name].to(torch.float64)
-        rows = cls.rows(values.reshape(-1, values.shape[-1]))
-        return rows - rows.mean(-1, keepdim=True)
+        kinds = cls.rows(values.reshape(-1, values.shape[-1]))
+        return {kind: rows - rows.mean(-1, keepdim=True) for kind, rows in kinds.items()}
 
     @classmethod
-    def _per(cls, scene: Scene, name: str) -> str:
-        """What a gain is per: the unit of acceleration that gravity gives away, or nothing."""
-        return f" per unit of {name}"
+    def _unit(cls, scene: Scene, name: str) -> tuple[str, float]:
+        """Unit of the numbers given to readers, and what gains are multiplied with for it."""
+        return f"{scene.unit} per unit of {name}", 1.0
 
 
 def _only(gains: Tensor, sensors: tuple[int, ...]) -> Tensor:
@@ -145,10 +148,10 @@ def gravity_unit(scene: Scene, name: str) -> str | None:
     )
 
 
-def _size(fit: ChannelFit, sensor: int, unit: str) -> Parameter:
-    """Length of a sensor's vector of gains, with limits."""
-    gains = fit.gains[sensor]
-    size = float(gains.norm())
-    direction = gains / max(size, 1e-300)
-    sd = math.sqrt(float(direction @ fit.covariance[sensor, :, sensor] @ direction))
-    return Parameter(size, max(size - Z * sd, 0.0), size + Z * sd, unit)
+def _size(fit: ChannelFit, sensor: int, unit: str, factor: float) -> Parameter:
+    """A sensor's gain with its sign, or the length of its vector of gains, with limits."""
+    gains, covariance = factor * fit.gains[sensor], factor**2 * fit.covariance[sensor, :, sensor]
+    size = float(gains[0] if len(gains) == 1 else gains.norm())
+    direction = gains / max(abs(size), 1e-300)
+    reach = Z * math.sqrt(float(direction @ covariance @ direction))
+    return Parameter(size, size - reach if len(gains) == 1 else max(size - reach, 0.0), size + reach, unit)

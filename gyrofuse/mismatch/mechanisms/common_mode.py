@@ -9,8 +9,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.case import Case
-from gyrofuse.mismatch.colour import noise, of_phase
+from gyrofuse.mismatch.base import Base
+from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.colour import filtered, noise, of_phase
 from gyrofuse.mismatch.gaussian import Addition
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.shape_terms import Common, common_density
@@ -18,7 +19,8 @@ from gyrofuse.mismatch.shape_words import found, spanned
 from gyrofuse.mismatch.shapes import chosen_shape, refit
 
 _WORDS = {"white": "white noise", "ar1": "AR1 noise", "walk": "a random walk"}
-_SEEN = 3.0  # standard deviations
+_REST = 0.01  # of a sensor's power that is its own, at least
+_SEEN, _LEAST = 3.0, 1.5  # standard deviations of a sensor's gain, and of the second largest
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,12 +34,16 @@ class CommonMode(Addition):
         kind: White, AR1 or walk.
         corner: Of an AR1, cycles per sample; 0 for others.
         gain: `g`, complex, `(sensor,)`: a sample's rms; for walks that of an increment.
+        own: Noise of the simulation.
+        inside: Whether it is a part of that noise, so that each sensor's power stays, instead of coming on top.
     """
 
     name: ClassVar[str] = "common_mode"
     kind: str
     corner: float
     gain: Tensor
+    own: Base
+    inside: bool
 
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:
@@ -48,17 +54,19 @@ class CommonMode(Addition):
         gain = torch.complex(*term.local)
         reference = gain[gain.abs().argmax()]
         gain = gain * reference.conj() / reference.abs()
-        sd = (shape.sd[0].square().mean(0)).sqrt()
+        sd = shape.sd[0].square().nanmean(0).sqrt()
         size = gain.abs()
-        sensors = tuple(i for i in range(len(gain)) if float(size[i]) > _SEEN * float(sd[i]))
-        if len(sensors) < 2:
-            return None  # one sensor has nothing in common
+        least = min(_SEEN, float((size / sd).topk(2).values[-1]))  # one sensor has nothing in common
+        if least < _LEAST:
+            return None
+        sensors = tuple(i for i in range(len(gain)) if float(size[i]) >= least * float(sd[i]))
         parameters = {}
         for i in sensors:
             s, d = float(size[i]), float(sd[i])
             parameters[f"gain[{i}]"] = Parameter(s, max(s - Z * d, 0.0), s + Z * d, unit)
-            turn, reach = math.degrees(float(gain[i].angle())), math.degrees(Z * d / s)
-            parameters[f"phase[{i}]"] = Parameter(turn, turn - reach, turn + reach, "deg")
+            if term.turned:
+                turn, reach = math.degrees(float(gain[i].angle())), math.degrees(Z * d / s)
+                parameters[f"phase[{i}]"] = Parameter(turn, turn - reach, turn + reach, "deg")
         corner = 0.0
         if term.kind == "ar1":
             middle, spread = float(term.shared[0]), float(shape.sd[1][0])
@@ -68,18 +76,35 @@ class CommonMode(Addition):
         against = [i for i in sensors if float(gain[i].real) < 0]
         where = case.scene.named(sensors, "all sensors")
         sign = f", with the sign reversed in {case.scene.named(against)}" if against else ""
+        share = ", as a part of the noise that each has" if term.inside else ""
         return found(
             case,
-            cls(term.kind, corner, gain),
+            cls(term.kind, corner, gain, case.base, term.inside),
             shape,
             sensors,
             parameters,
             f"{_WORDS[term.kind]} common to {where} that the simulation does not have, up to "
-            f"{float(size.max()):.3g} {unit}{sign}",
+            f"{float(size.max()):.3g} {unit}{sign}{share}",
         )
 
     def density(self, f: Tensor) -> Tensor:
         return self._source(f)[:, None, None] * (self.gain[:, None] * self.gain.conj())
+
+    def left(self, f: Tensor) -> Tensor:
+        """Factors `(sensor, frequency)` on what each sensor has of its own."""
+        if not self.inside:
+            return torch.ones(len(self.gain), len(f), dtype=torch.float64)
+        f = f.clamp(min=1 / self.own.n_samples)
+        part = self.gain.abs().square()[:, None] * self._source(f) / self.own.spectrum(f)
+        return (1 - part).clamp(min=_REST).sqrt()
+
+    def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
+        own = filtered(signal, self.left) if self.inside else signal
+        return super().simulated(own, scene, generator)
+
+    def spectra(self, matrices: Tensor, f: Tensor) -> Tensor:
+        left = self.left(f).mT.to(matrices.dtype)
+        return super().spectra(matrices * left[:, :, None] * left[:, None, :], f)
 
     def path(self, n_samples: int, generator: torch.Generator) -> Tensor:
         if self.kind == "walk":
@@ -95,6 +120,8 @@ class CommonMode(Addition):
     def refitted(self, case: Case, fold: int) -> Mechanism:
         shared = torch.tensor([math.log(self.corner)] if self.kind == "ar1" else [], dtype=torch.float64)
         local = torch.stack([self.gain.real, self.gain.imag])
-        term = refit(case, fold, Common(local, torch.ones_like(local, dtype=torch.bool), shared, self.kind))
+        free = torch.ones_like(local, dtype=torch.bool)
+        free[1] = bool(self.gain.imag.any())
+        term = refit(case, fold, Common(local, free, shared, self.kind, self.inside))
         corner = math.exp(float(term.shared[0])) if self.kind == "ar1" else 0.0
         return replace(self, gain=torch.complex(*term.local), corner=corner)

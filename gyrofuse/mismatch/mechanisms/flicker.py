@@ -12,7 +12,7 @@ from torch import Tensor
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.colour import noise
 from gyrofuse.mismatch.gaussian import Addition
-from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanism import Finding, Mechanism
 from gyrofuse.mismatch.shape_terms import Flicker
 from gyrofuse.mismatch.shape_words import found, spanned
 from gyrofuse.mismatch.shapes import chosen_shape, refit
@@ -39,7 +39,7 @@ class FlickerNoise(Addition):
             return None
         a, sd = shape.term.local[0], shape.sd[0][0]
         sensors = tuple(int(i) for i in shape.term.free[0].nonzero()[:, 0])
-        parameters = {"exponent": Parameter(1.0, 1.0, 1.0, "1")}
+        parameters = {}
         for i in sensors:
             parameters[f"level[{i}]"] = spanned(
                 lambda x: math.sqrt(max(x, 0.0)), float(a[i]), float(sd[i]), case.scene.unit

@@ -7,7 +7,9 @@ from typing import ClassVar
 
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.channels import accelerations
+from gyrofuse.mismatch.mechanism import Finding
 from gyrofuse.mismatch.mechanisms._channel_gain import ChannelGain, gravity_unit
+from gyrofuse.mismatch.mechanisms.not_identifiable import not_identifiable
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,6 +24,14 @@ class GSensitivity(ChannelGain):
     of_one_band: ClassVar[tuple[str, ...]] = ("vibration_tone", "common_mode")
 
     @classmethod
+    def nominate(cls, case: Case, level: float) -> Finding | None:
+        finding = super().nominate(case, level)
+        if finding is None or not finding.alternatives:
+            return finding
+        where = case.scene.named(finding.sensors, "every sensor")
+        return not_identifiable(finding, f"{where} moves with {finding.channel} in one narrow band alone")
+
+    @classmethod
     def channels(cls, case: Case) -> list[str]:
         return accelerations(case)
 
@@ -30,6 +40,6 @@ class GSensitivity(ChannelGain):
         return f"{where} follows {channel} with a gain of up to {gain:.3g} {unit}, which the simulation does not have"
 
     @classmethod
-    def _per(cls, scene: Scene, name: str) -> str:
+    def _unit(cls, scene: Scene, name: str) -> tuple[str, float]:
         unit = gravity_unit(scene, name)
-        return super()._per(scene, name) if unit is None else f"/{unit}"
+        return super()._unit(scene, name) if unit is None else (f"{scene.unit}/{unit}", 1.0)

@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.filter_forms import filter_corner, filter_response
 from gyrofuse.mismatch.gaussian import Filter
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
-from gyrofuse.mismatch.shape_terms import ORDERS, LowPass, filter_corner, filter_response
+from gyrofuse.mismatch.shape_terms import LowPass
 from gyrofuse.mismatch.shape_words import found
 from gyrofuse.mismatch.shapes import chosen_shape, refit
 
@@ -39,15 +40,16 @@ class LowPassFilter(Filter):
         if shape is None or not isinstance(shape.term, LowPass):
             return None
         term, rate = shape.term, case.scene.rate
-        strength, sd = term.local[0], shape.sd[0][0]
-        corner, highest, lowest = (
-            filter_corner(term.kind, q.clamp(min=0)) * rate for q in (strength, strength - Z * sd, strength + Z * sd)
-        )
+        strength = term.local[0]
         sensors = tuple(int(i) for i in term.free[0].nonzero()[:, 0])
-        order = Parameter(float(ORDERS[term.kind]), 1.0, 2.0, "1")
-        parameters = {"order": order}
+        # Which form it has is not known either; digital ones need not halve the power at all.
+        forms = [_limits(form, sd[0][0]) * rate for form, sd in ((term, shape.sd), *shape.forms)]
+        forms = [limits for limits in forms if bool(limits[1, list(sensors)].isfinite().all())] or forms
+        corner, lowest, highest = forms[0][1], torch.stack(forms)[:, 0].amin(0), torch.stack(forms)[:, 2].amax(0)
+        parameters = {}
         for i in sensors:
-            parameters[f"corner[{i}]"] = Parameter(float(corner[i]), float(lowest[i]), float(highest[i]), "Hz")
+            if math.isfinite(float(corner[i])):
+                parameters[f"corner[{i}]"] = Parameter(float(corner[i]), float(lowest[i]), float(highest[i]), "Hz")
         where = case.scene.named(sensors, "all sensors")
         inside = [float(corner[i]) for i in sensors if math.isfinite(float(corner[i]))]
         corners = f"half power at {min(inside):.4g} Hz" if inside else "half power above half the sampling rate"
@@ -59,7 +61,7 @@ class LowPassFilter(Filter):
             shape,
             sensors,
             parameters,
-            f"a low-pass filter of order {ORDERS[term.kind]} in {where} that the simulation does not have, {corners}",
+            f"a low-pass filter in {where} that the simulation does not have, {corners}",
             frequency_hz=min(inside) if inside else None,
         )
 
@@ -70,3 +72,9 @@ class LowPassFilter(Filter):
         own = self.strength[None]
         term = LowPass(own, own > 0, torch.zeros(0, dtype=torch.float64), self.kind)
         return replace(self, strength=refit(case, fold, term).local[0])
+
+
+def _limits(term: LowPass, sd: Tensor) -> Tensor:
+    """Lowest, best and highest corners, cycles per sample, `(3, sensor)`."""
+    steps = torch.tensor([Z, 0.0, -Z], dtype=torch.float64)[:, None]
+    return filter_corner(term.kind, (term.local[0] + steps * sd.nan_to_num(nan=0.0)).clamp(min=0))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
 from torch import Tensor
 
 from gyrofuse.mismatch.case import Case, Scene
-from gyrofuse.mismatch.channels import accelerations, products
+from gyrofuse.mismatch.channels import accelerations, products, squared_length
 from gyrofuse.mismatch.mechanisms._channel_gain import ChannelGain, gravity_unit
 
 
@@ -16,6 +17,7 @@ from gyrofuse.mismatch.mechanisms._channel_gain import ChannelGain, gravity_unit
 class QuadraticCoupling(ChannelGain):
     """`x_i(t) = a(t)' Q_i a(t)`: lines at twice those of the acceleration, and a bias that follows its mean square.
 
+    Most simply `Q_i` is a number, a gain on the squared length of the acceleration.
     At twice a line there is no linear coherence with the acceleration, which tells it from a tone.
     """
 
@@ -27,14 +29,15 @@ class QuadraticCoupling(ChannelGain):
         return accelerations(case)
 
     @classmethod
-    def rows(cls, values: Tensor) -> Tensor:
-        return products(values)
+    def rows(cls, values: Tensor) -> Mapping[str, Tensor]:
+        return {"each": products(values), "length": squared_length(values)}
 
     @classmethod
     def words(cls, gain: float, channel: str, where: str, unit: str) -> str:
         return f"{where} follows the square of {channel} with a gain of up to {gain:.3g} {unit}: vibration is rectified"
 
     @classmethod
-    def _per(cls, scene: Scene, name: str) -> str:
+    def _unit(cls, scene: Scene, name: str) -> tuple[str, float]:
         unit = gravity_unit(scene, name)
-        return f" per squared unit of {name}" if unit is None else f"/{unit}^2" if unit == "g" else f"/({unit})^2"
+        squared = f" per squared unit of {name}" if unit is None else f"/{unit}^2" if unit == "g" else f"/({unit})^2"
+        return f"{scene.unit}{squared}", 1.0

@@ -14,7 +14,9 @@ from gyrofuse.mismatch.evidence import corrected
 from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.marginals import Lattice, missing_lattices, off_lattice
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
+from gyrofuse.mismatch.mechanisms.dead_band import DeadBand
 
+_TABLE = 1024  # points of a law
 _SHARPEST = 0.02  # blur in steps: what an exact lattice is worth is bounded by it
 
 
@@ -41,11 +43,11 @@ class Quantization(Mechanism):
     def nominate(cls, case: Case, level: float) -> Finding | None:
         found = missing_lattices(case, level)
         if not found:
-            return None
+            return DeadBand.nominate(case, level)
         none = Lattice(0.0, 0.0, 0.0, 1.0)
         rows = [found.get(i, none) for i in range(case.n_sensors)]
         step, offset, blur = (torch.tensor([row[k] for row in rows], dtype=torch.float64) for k in range(3))
-        effect = cls(step, offset, blur)
+        effect = cls(step, offset, blur)._placed(case.recording)
         sensors = tuple(found)
         parameters = {}
         for i in sensors:
@@ -58,7 +60,7 @@ class Quantization(Mechanism):
             cls.name,
             effect,
             f"the rate is rounded to steps of {_several(step[list(sensors)])} {case.scene.unit} in {where}{hidden}",
-            max(corrected(found[i].p_value, case.n_sensors) for i in sensors),
+            min(corrected(found[i].p_value, case.n_sensors) for i in sensors),
             sensors,
             parameters,
             levels=(1,),
@@ -66,17 +68,25 @@ class Quantization(Mechanism):
         )
 
     def refitted(self, case: Case, fold: int) -> Quantization:
-        keep = estimation_samples(case.n_samples, fold)
-        place = off_lattice(case.recording[:, keep], self._divisor, self.offset[:, None])
-        turn = torch.exp(2j * math.pi * place).mean(-1)
+        return self._placed(case.recording[:, estimation_samples(case.n_samples, fold)])
+
+    def _placed(self, signal: Tensor) -> Quantization:
+        """With offset and blur of samples `(sensor, time)`, for the steps as they are."""
+        turn = torch.exp(2j * math.pi * off_lattice(signal, self._divisor, self.offset[:, None])).mean(-1)
         offset = self.offset + turn.angle() / (2 * math.pi) * self.step
         blur = torch.sqrt(-2 * turn.abs().clamp(1e-6, 1.0).log()) / (2 * math.pi)
         return Quantization(self.step, offset, torch.where(self.blur > 0, blur, self.blur))
 
     def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
-        offset = self.offset[:, None]
-        rounded = ((signal - offset) / self._divisor).round() * self._divisor + offset
-        return torch.where(self.step[:, None] > 0, rounded, signal)
+        """Distances from the lattice get the law that they have in the recording, in the order in which they are.
+
+        Without blur that is rounding. Hidden under noise that the simulation knows already, it adds next to nothing.
+        """
+        place = (signal - self.offset[:, None]) / self._divisor
+        nearest = place.round()
+        rows = (place - nearest).movedim(-2, 0).contiguous()
+        moved = torch.stack([_pulled(row, float(blur)) for row, blur in zip(rows, self.blur, strict=True)], -2)
+        return torch.where(self.step[:, None] > 0, (nearest + moved) * self._divisor + self.offset[:, None], signal)
 
     def gains(self, case: Case, fold: int) -> Tensor:
         return held_out_blocks(self._scores(case.recording), fold).sum((0, -1))
@@ -99,6 +109,19 @@ class Quantization(Mechanism):
         information = float((slope.square() / density.clamp(min=1e-12)).mean()) * 1024**2
         spread = float((signal / self.step[sensor]).std())
         return float(self.step[sensor]) / math.sqrt(max(information * len(signal) * spread**2, 1e-300))
+
+
+def _pulled(place: Tensor, blur: float) -> Tensor:
+    """Even distances from a lattice, steps, mapped in order to those of a wrapped normal variable."""
+    if blur == 0:
+        return torch.zeros_like(place)
+    edges = torch.linspace(-0.5, 0.5, _TABLE + 1, dtype=torch.float64)
+    middle = (edges[1:] + edges[:-1]) / 2
+    total = torch.nn.functional.pad(_wrapped_normal(middle, torch.tensor(blur)).cumsum(0), (1, 0))
+    total = total / total[-1].clone() - 0.5
+    right = torch.bucketize(place, total).clamp(1, _TABLE)
+    share = (place - total[right - 1]) / (total[right] - total[right - 1]).clamp(min=1e-300)
+    return edges[right - 1] + share.clamp(0, 1) * (edges[right] - edges[right - 1])
 
 
 def _wrapped_normal(place: Tensor, sd: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ class ScaleFactor(ChannelGain):
     """
 
     name: ClassVar[str] = "scale_factor"
+    quantity: ClassVar[str] = "error"
 
     @classmethod
     def channels(cls, case: Case) -> list[str]:
@@ -25,8 +26,8 @@ class ScaleFactor(ChannelGain):
 
     @classmethod
     def words(cls, gain: float, channel: str, where: str, unit: str) -> str:
-        return f"{where} follows {channel} with a gain that is off by up to {1e6 * gain:.3g} ppm"
+        return f"{where} follows {channel} with a gain that is off by up to {gain:.3g} ppm"
 
     @classmethod
-    def _per(cls, scene: Scene, name: str) -> str:
-        return f"/({scene.unit})"
+    def _unit(cls, scene: Scene, name: str) -> tuple[str, float]:
+        return "ppm", 1e6

@@ -11,16 +11,18 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.episodes import episodes_of, two_level_scores
-from gyrofuse.mismatch.evidence import corrected
 from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
-from gyrofuse.mismatch.impulses import left_out, levelled, spike_p_values, variance_p_values
+from gyrofuse.mismatch.impulses import left_out, levelled, likely_outliers, spike_p_value, variance_p_values
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
-from gyrofuse.mismatch.outliers import Outliers, clustered, fitted, free_gaussian, mixture, simultaneous
+from gyrofuse.mismatch.outliers import Outliers, clustered, fitted, free_gaussian, mixture
+from gyrofuse.mismatch.shocks import fitted_shock, shock_posterior, shock_scores
 
 _HOUR = 3600.0
 _ALIKE = 5.0  # nats
 _PLAIN = 5.0  # sd: outliers that can be taken off one by one
 _PRESENT = 4.0  # nats
+_LIKELY = 0.8  # probability of being hit
+_ROUNDS, _ROUNDS_AGAIN = 40, 10
 _ISOLATED = 0.03  # more frequent ones are another law of the noise
 
 
@@ -50,28 +52,36 @@ class Spikes(Mechanism):
 
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:
-        p_values = spike_p_values(case)
-        p_value = corrected(float(p_values.min()), len(p_values))
+        p_value = spike_p_value(case)
         if p_value > level:
             return None
         z = left_out(case.recorded).z[0]
         laws = [fitted(row) for row in z]
-        gains = [float((mixture(row, law) - free_gaussian(row)).sum()) for row, law in zip(z, laws, strict=True)]
-        hit = tuple(i for i, gain in enumerate(gains) if gain > _PRESENT and float(p_values[i]) < 0.05)
-        if any(laws[i].rate > _ISOLATED for i in hit):
+        gains = _gains(z, laws).sum(-1)
+        hit = tuple((gains > _PRESENT).nonzero()[:, 0].tolist())
+        weak = likely_outliers(case.recorded)
+        if not weak.shock and weak.apart > -math.log(level):
+            hit = tuple(i for i in range(case.n_sensors) if i in hit or float(weak.sensors[i]) > _LIKELY)
+        laws = _alike(z, laws, hit)
+        gain = float(_gains(z, laws)[list(hit)].sum())
+        shock = _shock(case, laws, hit)
+        together = shock is not None and shock[1] > gain
+        if shock is not None and together:
+            laws, gain = shock
+            hit = tuple(i for i, law in enumerate(laws) if law.rate > 0)
+        if not hit or any(laws[i].rate > _ISOLATED for i in hit) or clustered(levelled(case)[list(hit)]):
             return None
-        if not hit or clustered(levelled(case)[list(hit)]):
-            return None
-        gain = sum(gains[i] for i in hit)
         rival = _louder(case)
         if rival > gain + _ALIKE:
             return None
-        effect = cls._of(case, hit, laws, simultaneous(z, hit))
+        effect = cls._of(case, hit, laws, together)
         parameters = {}
         for i in hit:
             per_hour = case.scene.rate * _HOUR
             law, scale = laws[i], float(left_out(case.recorded).sd[0, i])
-            parameters[f"rate[{i}]"] = _limits(law.rate * per_hour, law.rate_sd * per_hour, "1/h")
+            parameters["rate" if together else f"rate[{i}]"] = _limits(
+                law.rate * per_hour, law.rate_sd * per_hour, "1/h"
+            )
             parameters[f"amplitude[{i}]"] = _limits(law.amplitude * scale, law.amplitude_sd * scale, case.scene.unit)
         alternatives = [
             name
@@ -88,7 +98,7 @@ class Spikes(Mechanism):
             cls.name,
             effect,
             f"isolated outliers in {where}{', ' + how if len(hit) > 1 else ''}: "
-            f"{parameters[f'rate[{largest}]'].value:.3g} an hour of {float(effect.amplitude[largest]):.3g} "
+            f"{laws[largest].rate * case.scene.rate * _HOUR:.3g} an hour of {float(effect.amplitude[largest]):.3g} "
             f"{case.scene.unit} in sensor {case.scene.sensors[largest]}",
             p_value,
             hit,
@@ -113,7 +123,10 @@ class Spikes(Mechanism):
         keep = estimation_samples(case.n_samples, fold)
         z = left_out(case.recorded).z[0]
         hit = tuple(self.rate.nonzero()[:, 0].tolist())
-        return self._of(case, hit, [fitted(row[keep]) for row in z], self.together)
+        if self.together:
+            return self._of(case, hit, fitted_shock(z[:, keep], self._laws(case), _ROUNDS_AGAIN), True)
+        laws = [fitted(row[keep]) if i in hit else Outliers.none() for i, row in enumerate(z)]
+        return self._of(case, hit, _alike(z[:, keep], laws, hit), False)
 
     def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
         def draw(kind: str, shape: tuple[int, ...]) -> Tensor:
@@ -143,12 +156,10 @@ class Spikes(Mechanism):
         return case.with_recording(torch.where(self._outliers(case), predicted, case.recording))
 
     def gains(self, case: Case, fold: int) -> Tensor:
-        z = left_out(case.recorded).z[0]
-        scores = torch.zeros_like(z)
-        for i, law in enumerate(self._laws(case)):
-            if law.rate > 0:
-                scores[i] = mixture(z[i], law) - free_gaussian(z[i])
-        return held_out_blocks(scores, fold).sum((0, -1))
+        z, laws = left_out(case.recorded).z[0], self._laws(case)
+        if self.together:
+            return held_out_blocks(_shock_gains(z, laws), fold).sum(-1)
+        return held_out_blocks(_gains(z, laws) * (self.rate[:, None] > 0), fold).sum((0, -1))
 
     def _laws(self, case: Case) -> list[Outliers]:
         sd = left_out(case.recorded).sd[0]
@@ -157,8 +168,46 @@ class Spikes(Mechanism):
 
     def _outliers(self, case: Case) -> Tensor:
         """Samples that are outliers more likely than not, `(sensor, time)`."""
-        z = left_out(case.recorded).z[0]
-        return torch.stack([law.posterior(row) > 0.5 for row, law in zip(z, self._laws(case), strict=True)])
+        z, laws = left_out(case.recorded).z[0], self._laws(case)
+        if self.together:
+            return (self.rate[:, None] > 0) & (shock_posterior(z, laws) > 0.5)
+        return torch.stack([law.posterior(row) > 0.5 for row, law in zip(z, laws, strict=True)])
+
+
+def _gains(z: Tensor, laws: list[Outliers]) -> Tensor:
+    """Log likelihood over normal laws of their own variance, `(sensor, time)`."""
+    return torch.stack([mixture(row, law) - free_gaussian(row) for row, law in zip(z, laws, strict=True)])
+
+
+def _alike(z: Tensor, laws: list[Outliers], hit: tuple[int, ...]) -> list[Outliers]:
+    """One law for all sensors concerned, in sd of their noise, where it is as good as one for each (Akaike)."""
+    if len(hit) < 2:
+        return laws
+    shared = fitted(z[list(hit)].flatten())
+    one = [shared if i in hit else law for i, law in enumerate(laws)]
+    worse = float((_gains(z, laws) - _gains(z, one))[list(hit)].sum())
+    return one if worse < 3 * (len(hit) - 1) else laws
+
+
+def _shock(case: Case, apart: list[Outliers], hit: tuple[int, ...]) -> tuple[list[Outliers], float] | None:
+    """Laws of outliers that hit several sensors at once, and what they gain, nats."""
+    z, weak = left_out(case.recorded).z[0], likely_outliers(case.recorded)
+    if weak.shock:
+        hit = tuple((weak.sensors > 0.5).nonzero()[:, 0].tolist())
+        start = [Outliers(weak.rate, weak.size, 0.1 * weak.size)] * len(z)
+    else:
+        start = [law._replace(rate=max((apart[i].rate for i in hit), default=0.0)) for law in apart]
+    if len(hit) < 2:
+        return None
+    laws = fitted_shock(z, [law if i in hit else Outliers.none() for i, law in enumerate(start)], _ROUNDS)
+    return laws, float(_shock_gains(z, laws).sum())
+
+
+def _shock_gains(z: Tensor, laws: list[Outliers]) -> Tensor:
+    """Log likelihood of shocks over normal laws of their own variance, `(time,)`."""
+    rows = [row for row, law in zip(z, laws, strict=True) if law.rate > 0]
+    plain = sum((mixture(row, Outliers.none()) - free_gaussian(row) for row in rows), torch.zeros(()))
+    return shock_scores(z, laws) + plain
 
 
 def _louder(case: Case) -> float:

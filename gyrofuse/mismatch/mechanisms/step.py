@@ -13,7 +13,6 @@ from gyrofuse.mismatch.mechanism import Finding
 from gyrofuse.mismatch.slow import cell_differences
 from gyrofuse.mismatch.slow_effect import (
     SlowEffect,
-    doubt,
     estimate,
     log_factors,
     only,
@@ -83,7 +82,6 @@ def onset_samples(case: Case, look: SlowLook, scan: Scan, size: Tensor) -> tuple
     """Median of the onset with 95 % limits, samples, from ever finer cells around it; the sizes are held."""
     which = list(concerned(scan))
     size = size[which, None]
-    widened = doubt(scan) ** 2
     low, high = plausible(look, scan)
     margin = max(high - low, 4.0 * case.block)
     while True:
@@ -96,7 +94,7 @@ def onset_samples(case: Case, look: SlowLook, scan: Scan, size: Tensor) -> tuple
         inverse = torch.linalg.inv(covariance * scan.fit.log_factors[which, :1, None].exp())
         information = inverse.diagonal(dim1=-1, dim2=-2)
         gain = size * (inverse @ y[..., None])[..., 0] - size.square() * information / 2
-        weight = torch.softmax(gain.sum(0) / widened, 0)
+        weight = torch.softmax(gain.sum(0), 0)
         places = first + cell * torch.arange(1, n_cells, dtype=torch.float64)
         mean = places @ weight
         sd = float(((places - mean).square() @ weight).sqrt())

@@ -9,11 +9,22 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.case import N_BLOCKS, Case, Scene
 from gyrofuse.mismatch.mechanism import Finding
-from gyrofuse.mismatch.slow import scores
-from gyrofuse.mismatch.slow_effect import SlowEffect, estimate, only, place, plausible, sizes, slow_levels, strong_scan
-from gyrofuse.mismatch.slow_scans import Scan, SlowLook, concerned, lagged, temperature
+from gyrofuse.mismatch.slow import cosines, ordinates
+from gyrofuse.mismatch.slow_effect import (
+    SlowEffect,
+    estimate,
+    log_factors,
+    only,
+    place,
+    plausible,
+    sizes,
+    slow_levels,
+    strong_scan,
+)
+from gyrofuse.mismatch.slow_families import lagged, temperature
+from gyrofuse.mismatch.slow_scans import Scan, SlowLook, concerned
 
 _PLACES = 48
 _SURROGATES = 200
@@ -56,7 +67,7 @@ class TemperatureDrift(SlowEffect):
         lag = place(found.place, case.scene.rate)
         if low == 0:
             lag = lag._replace(low=0.0)
-        effect = cls(only(found.size, which), scan.fit.log_factors, lag.value, channel, row)
+        effect = cls(only(found.size, which), log_factors(scan), lag.value, channel, row)
         largest = max(which, key=lambda i: abs(float(found.size[i])))
         behind = f" with a lag of {lag.value:.3g} s" if lag.low > 0 else ""
         return Finding(
@@ -84,20 +95,19 @@ def _beats_surrogates(look: SlowLook, scan: Scan) -> bool:
     The trend itself, which any drift has, is left out of both; where little is owed to the shape nothing can be said.
     """
     generator = torch.Generator().manual_seed(0)
-    inverse = scan.fit.inverse[list(concerned(scan))]
-    y = look.y[list(concerned(scan))]
-    means = torch.cat([torch.zeros(1, dtype=torch.float64), scan.template.cumsum(0)])
-    t = torch.linspace(-1, 1, len(means), dtype=torch.float64)
-    left = means - means.mean()
+    which = list(concerned(scan))
+    y, variance = look.y[which], scan.fit.variance[which]
+    t = torch.linspace(-1, 1, N_BLOCKS, dtype=torch.float64)
+    left = scan.template @ cosines()
     left = left - (left @ t) / (t @ t) * t
     transform = torch.fft.rfft(left)
     turn = 2 * math.pi * torch.rand(_SURROGATES, len(transform), generator=generator, dtype=torch.float64)
     surrogates = torch.fft.irfft(transform * torch.polar(torch.ones_like(turn), turn), n=len(left))
-    shapes = torch.cat([left[None], surrogates]).diff()
-    trend = t.diff()
-    slope = (inverse @ trend) / (trend @ inverse @ trend)[:, None]  # (sensor, difference)
+    shapes, trend = ordinates(torch.cat([left[None], surrogates])), ordinates(t)
+    slope = trend / variance / (trend.square() / variance).sum(-1, keepdim=True)  # (sensor, ordinate)
     y = y - (slope * y).sum(-1, keepdim=True) * trend
-    shapes = shapes - (shapes @ slope.mT).mT[..., None] * trend  # (sensor, surrogate, difference)
-    size, information = scores(y, inverse, shapes)
-    gain = (size.square() * information).sum(0) / 2
+    shapes = shapes - (shapes @ slope.mT).mT[..., None] * trend  # (sensor, surrogate, ordinate)
+    information = (shapes.square() / variance[:, None]).sum(-1)
+    score = (shapes @ (y / variance)[..., None])[..., 0]
+    gain = (score.square() / information).sum(0) / 2
     return float(gain[0]) < _DECISIVE or int((gain[1:] >= gain[0]).sum()) <= _BETTER

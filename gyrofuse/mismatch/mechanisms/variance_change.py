@@ -12,9 +12,8 @@ from torch.nn.functional import avg_pool1d
 
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.episodes import episodes_of, onset_limits, two_level_scores
-from gyrofuse.mismatch.evidence import corrected
 from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
-from gyrofuse.mismatch.impulses import levelled, variance_p_values
+from gyrofuse.mismatch.impulses import levelled, variance_p_value, variance_p_values
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 
 _SLOWER = 65  # samples: what varies more slowly is not louder
@@ -38,8 +37,7 @@ class VarianceChange(Mechanism):
 
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:
-        p_values = variance_p_values(case)
-        p_value = corrected(float(p_values.min()), len(p_values))
+        p_values, p_value = variance_p_values(case), variance_p_value(case)
         if p_value > level:
             return None
         white = levelled(case)

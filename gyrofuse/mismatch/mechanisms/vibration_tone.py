@@ -12,14 +12,21 @@ from torch import Tensor
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.folds import estimation_samples
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
+from gyrofuse.mismatch.remembered import remembered
+from gyrofuse.mismatch.side import Side
+from gyrofuse.mismatch.spectra import hann_transform
 from gyrofuse.mismatch.witnesses import level_of
 
 _ROUNDS = 6
+_SEEN = 0.04  # chance that a sensor is named which has no tone
+_REACH, _GUARD = 64, 3  # bins on either side that tell the noise, and those too near to
 
 
 @dataclass(frozen=True, eq=False)
 class VibrationTone(Mechanism):
     """`x_i(t) = cosine_i cos(2 pi f t) + sine_i sin(2 pi f t)` in every sensor `i`.
+
+    Samples at one rate `f_s` do not tell `f` from `k f_s - f` and `k f_s + f`.
 
     Attributes:
         frequency_hz: `f`, one for all sensors.
@@ -46,10 +53,11 @@ class VibrationTone(Mechanism):
         n, noise = case.n_samples, density_near(case, f)  # (sensor,)
         sd = (2 * noise / n).sqrt()
         snr = tone.amplitude / sd
-        present = (
-            tuple((snr > math.sqrt(-2 * math.log(0.01 / case.n_sensors))).nonzero()[:, 0].tolist()) or line.sensors
-        )
-        spread = math.sqrt(24 / (n**3 * float((tone.amplitude.square() / noise).sum()))) / (2 * math.pi)
+        seen = math.sqrt(-2 * math.log(_SEEN / case.n_sensors))
+        present = tuple((snr > seen).nonzero()[:, 0].tolist()) or (int(snr.argmax()),)
+        # Noise adds to the squares of amplitudes, but tells nothing of the frequency.
+        energy = max(float((snr.square() - 2).clamp(min=0.0)[list(present)].sum()), 1.0)
+        spread = math.sqrt(12 / energy) / (2 * math.pi * n)
         parameters = {"frequency": _limits(tone.frequency_hz, spread * case.scene.rate, "Hz")}
         for i in present:
             parameters[f"amplitude[{i}]"] = _limits(float(tone.amplitude[i]), float(sd[i]), case.scene.unit)
@@ -60,7 +68,8 @@ class VibrationTone(Mechanism):
             tone,
             f"a tone at {tone.frequency_hz:.6g} Hz in {where}, of amplitude up to "
             f"{float(tone.amplitude[largest]):.3g} {case.scene.unit} (sensor {case.scene.sensors[largest]}), "
-            "that the simulation does not have",
+            f"that the simulation does not have; without a filter before sampling it may be one at "
+            f"{case.scene.rate - tone.frequency_hz:.6g}, {case.scene.rate + tone.frequency_hz:.6g} .. Hz",
             line.p_value,
             present,
             parameters,
@@ -111,18 +120,19 @@ class VibrationTone(Mechanism):
 
 def density_near(case: Case, f: float) -> Tensor:
     """Noise of the recording around a line, without the line itself, per sample `(sensor,)`."""
-    n = case.n_samples
-    centre = round(f * n)
-    reach = torch.cat([torch.arange(-24, -3), torch.arange(4, 25)])
-    bins = (centre + reach)[(centre + reach > 2) & (centre + reach < n // 2)]
-    t = torch.arange(n, dtype=torch.float64)
-    transform = torch.fft.rfft(
-        (case.recording - case.recording.mean(-1, keepdim=True)) * torch.hann_window(n, dtype=t.dtype)
-    )
-    power = transform[:, bins].abs().square() / (n * 3 / 8)
-    shape = case.base.spectrum(bins / n)
-    here = case.base.spectrum(torch.tensor([f], dtype=torch.float64))[:, 0]
-    return (power / shape).mean(-1) * here
+    power, length = _tapered_power(case.recorded)
+    apart = torch.cat([torch.arange(-_REACH, -_GUARD), torch.arange(_GUARD + 1, _REACH + 1)])
+    places = f + apart / case.n_samples
+    places = places[(places > 2.5 / case.n_samples) & (places < 0.5 - 0.5 / case.n_samples)]
+    here = case.base.spectrum(torch.tensor([f], dtype=torch.float64))
+    return (power[:, (places * length).round().long()] / case.base.spectrum(places) * here).mean(-1)
+
+
+@remembered
+def _tapered_power(side: Side) -> tuple[Tensor, int]:
+    """Periodogram `(sensor, bin)` of a recording under a Hann taper, and the length it was padded to."""
+    transform, length = hann_transform(side.signal[0])
+    return transform.abs().square(), length
 
 
 def _limits(value: float, sd: float, unit: str) -> Parameter:

@@ -11,8 +11,19 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.mechanism import Finding
-from gyrofuse.mismatch.slow_effect import SlowEffect, estimate, only, place, plausible, sizes, slow_levels, strong_scan
-from gyrofuse.mismatch.slow_scans import concerned, warm_ups
+from gyrofuse.mismatch.slow_effect import (
+    SlowEffect,
+    estimate,
+    log_factors,
+    only,
+    place,
+    plausible,
+    sizes,
+    slow_levels,
+    strong_scan,
+)
+from gyrofuse.mismatch.slow_families import warm_ups
+from gyrofuse.mismatch.slow_scans import concerned
 
 _PLACES = 200
 
@@ -43,7 +54,7 @@ class WarmUpTransient(SlowEffect):
         found = estimate(look, scan, warm_ups(case, taus))
         which = concerned(scan)
         tau = place(found.place, case.scene.rate)
-        effect = cls(only(found.size, which), scan.fit.log_factors, tau.value)
+        effect = cls(only(found.size, which), log_factors(scan), tau.value)
         largest = max(which, key=lambda i: abs(float(found.size[i])))
         return Finding(
             cls.name,

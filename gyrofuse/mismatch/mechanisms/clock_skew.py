@@ -1,0 +1,156 @@
+"""A clock of its own: sensors that sample at another rate than the others, or lose samples."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.clocks import BLOCKS, best_slope, demodulated, strongest_slip
+from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
+from gyrofuse.mismatch.lines import whitened
+from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
+from gyrofuse.mismatch.resampling import resampled
+from gyrofuse.mismatch.witnesses import level_of
+
+_MILLION = 1e6
+
+
+@dataclass(frozen=True, eq=False)
+class ClockSkew(Mechanism):
+    """`x_i(t) = y_i((1 + skew) t + lost(t))` for some sensors `i`, `y_i` with the clock of the others, `t` in samples.
+
+    A slope or steps in the phase of a tone that all feel. Of noise alone, which has no common clock, it changes nothing
+    that could be seen.
+
+    Attributes:
+        sensors: Those concerned.
+        skew: What they are ahead per sample.
+        losses: First sample after each loss, and how many samples were lost, in the order of time.
+        frequency: Of the tone that shows it, cycles per sample.
+        slipping, steady: Amplitudes of the tone with and without the slip, complex, `(sensor concerned,)`, in units of
+            the noise.
+    """
+
+    name: ClassVar[str] = "clock_skew"
+    sensors: tuple[int, ...]
+    skew: float
+    losses: tuple[tuple[int, int], ...]
+    frequency: float
+    slipping: Tensor
+    steady: Tensor
+
+    @classmethod
+    def nominate(cls, case: Case, level: float) -> Finding | None:
+        slip = strongest_slip(case)
+        if slip is None or slip.p_value > level:
+            return None
+        rate, scene = case.scene.rate, case.scene
+        none = torch.zeros(len(slip.sensors), dtype=torch.complex128)
+        losses = tuple((loss.at, loss.count) for loss in slip.losses)
+        effect = cls(slip.sensors, slip.skew, losses, slip.frequency, none, none)
+        effect = effect._fitted(case, torch.ones(case.n_samples, dtype=torch.bool))
+        who = scene.named(slip.sensors, "all sensors")
+        against = f"the tone at {slip.frequency * rate:.6g} Hz in "
+        against += "the other sensors" if slip.reference is None else slip.reference
+        if losses:
+            lost = sum(loss.count for loss in slip.losses)
+            low, high = (sum(loss.count_limits[end] for loss in slip.losses) for end in (0, 1))
+            parameters = {"lost": Parameter(lost, low, high, "")}
+            for j, loss in enumerate(slip.losses):
+                parameters[f"time_of_loss_{j + 1}"] = Parameter(
+                    loss.at / rate, loss.at_limits[0] / rate, loss.at_limits[1] / rate, "s"
+                )
+            times = ", ".join(f"{loss.at / rate:.4g}" for loss in slip.losses)
+            sentence = f"{who} lost {lost} samples against {against}: its phase steps at {times} s"
+        else:
+            reach = Z * slip.skew_sd
+            parameters = {
+                "skew": Parameter(
+                    _MILLION * slip.skew, _MILLION * (slip.skew - reach), _MILLION * (slip.skew + reach), "ppm"
+                )
+            }
+            sentence = f"the clock of {who} differs by {_MILLION * slip.skew:.3g} ppm from {against}: its phase slips"
+        return Finding(
+            cls.name,
+            effect,
+            sentence,
+            slip.p_value,
+            slip.sensors,
+            parameters,
+            levels=(level_of(slip.frequency),),
+            frequency_hz=slip.frequency * rate,
+            time_s=losses[0][0] / rate if losses else None,
+            channel=slip.reference,
+            gain=slip.gain,
+        )
+
+    def _fitted(self, case: Case, keep: Tensor) -> ClockSkew:
+        """Amplitudes with and without the slip, least squares on the samples to keep."""
+        signal = whitened(case.recording, case.base)[list(self.sensors)] * keep
+        turned = [self._carrier(case.n_samples, slips) for slips in (True, False)]
+        # Over many cycles the two quadratures are orthogonal.
+        slipping, steady = ((2 * signal.to(carrier.dtype) @ carrier.conj()) / keep.sum() for carrier in turned)
+        return replace(self, slipping=slipping, steady=steady)
+
+    def refitted(self, case: Case, fold: int) -> ClockSkew:
+        keep = estimation_samples(case.n_samples, fold)
+        if not self.skew:
+            return self._fitted(case, keep)
+        signal = whitened(case.recording, case.base)[list(self.sensors)] * keep
+        slope, _ = best_slope(demodulated(signal, self.frequency))
+        skew = slope / (self.frequency * (case.n_samples // BLOCKS * BLOCKS))
+        return replace(self, skew=skew)._fitted(case, keep)
+
+    def gains(self, case: Case, fold: int) -> Tensor:
+        signal = whitened(case.recording, case.base)[list(self.sensors)]
+        scores = []
+        for amplitude, slips in ((self.slipping, True), (self.steady, False)):
+            tone = (amplitude[:, None] * self._carrier(case.n_samples, slips)).real
+            scores.append(held_out_blocks(signal * tone - tone.square() / 2, fold).sum((0, -1)))
+        return scores[0] - scores[1]
+
+    def _carrier(self, n_samples: int, slips: bool) -> Tensor:
+        """`exp(i phase)` of the tone, with the slip or without it, `(time,)`."""
+        t = torch.arange(n_samples, dtype=torch.float64)
+        phase = 2 * math.pi * self.frequency * (t + self._ahead(t) if slips else t)
+        return torch.polar(torch.ones_like(phase), phase)
+
+    def _ahead(self, t: Tensor) -> Tensor:
+        """By how many samples the sensors are ahead at their sample `t`."""
+        return self.skew * t + sum(count * (t >= at) for at, count in self.losses)
+
+    def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
+        t = torch.arange(signal.shape[-1], dtype=torch.float64)
+        return self._with(signal, t + self._ahead(t))
+
+    def removed(self, signal: Tensor, scene: Scene) -> Tensor:
+        n = signal.shape[-1]
+        ends = [0, *(place for at, _ in self.losses for place in (at - 1, at) if 0 < at < n), n - 1]
+        knots = torch.tensor(ends, dtype=torch.float64)
+        true = knots + self._ahead(knots)
+        t = torch.arange(n, dtype=torch.float64)
+        piece = (torch.bucketize(t, true, right=True) - 1).clamp(0, len(knots) - 2)
+        slope = (knots[piece + 1] - knots[piece]) / (true[piece + 1] - true[piece])
+        return self._with(signal, knots[piece] + (t - true[piece]) * slope)
+
+    def _with(self, signal: Tensor, times: Tensor) -> Tensor:
+        """Signals with the sensors concerned taken at other times, in samples."""
+        which = list(self.sensors)
+        changed = signal.clone()
+        changed[..., which, :] = resampled(signal[..., which, :], times).to(signal.dtype)
+        return changed
+
+    def explained(self, case: Case, generator: torch.Generator) -> Case:
+        """Lost samples are made room for; of a skew only the tone is put right: resampling would colour the noise."""
+        if self.losses:
+            return case.with_recording(self.removed(case.recording, case.scene))
+        slip = self._carrier(case.n_samples, slips=True) - self._carrier(case.n_samples, slips=False)
+        taken = torch.zeros_like(case.recording)
+        taken[list(self.sensors)] = (self.slipping[:, None] * slip).real
+        density = case.base.spectrum(torch.tensor([self.frequency], dtype=torch.float64))
+        return case.less(taken * density.sqrt())

@@ -1,0 +1,91 @@
+"""A dead band: what is nearer to zero rate than its half-width is put out as zero."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
+from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.recurring import band_limits, fits_band, missing_recurrences, recurring
+
+_SURE = math.log(50)  # nats that one sample in the band is worth at most
+
+
+@dataclass(frozen=True, eq=False)
+class DeadBand(Mechanism):
+    """`y = value` where `|x - value| < half_width`, else `x`: rounding of what is small alone.
+
+    One value recurs among values that do not, and around it none is left. A value filled in for missing samples
+    recurs too, but its neighbours are as near to it as any others are.
+
+    Attributes:
+        value: Put out in the band, unit of the signal, `(sensor,)`.
+        half_width: `(sensor,)`, likewise; 0 where there is no band.
+        centre: `(sensor,)`, mean of the recording: a simulation's own mean stands for it.
+    """
+
+    name: ClassVar[str] = "quantization"
+    place: ClassVar[int] = 2
+    value: Tensor
+    half_width: Tensor
+    centre: Tensor
+
+    @classmethod
+    def nominate(cls, case: Case, level: float) -> Finding | None:
+        missing = {i: pair for i, pair in missing_recurrences(case).items() if fits_band(pair[0])}
+        if not missing or min(p for _, p in missing.values()) > level:
+            return None
+        first, p_value = min(missing.values(), key=lambda pair: pair[1])
+        found = {i: own for i, (own, p) in missing.items() if p <= level}
+        for i in set(range(case.n_sensors)) - set(found):  # where the same value returns a few times
+            again = recurring(i, case.recording[i], first.value)
+            if again is not None and fits_band(again):
+                found[i] = again
+        found = dict(sorted(found.items()))
+        numbers = torch.zeros(2, case.n_sensors, dtype=torch.float64)
+        parameters = {}
+        for i, own in found.items():
+            middle, low, high = band_limits(own)
+            numbers[:, i] = torch.tensor([own.value, middle])
+            parameters[f"dead_band[{i}]"] = Parameter(middle, low, high, case.scene.unit)
+        effect = cls(numbers[0], numbers[1], case.recording.mean(-1))
+        sensors = tuple(found)
+        return Finding(
+            cls.name,
+            effect,
+            f"a dead band: within {float(effect.half_width.max()):.3g} {case.scene.unit} of {first.value:.3g} "
+            f"{case.scene.unit} the rate is put out as {first.value:.3g} in {case.scene.named(sensors, 'all sensors')}",
+            p_value,
+            sensors,
+            parameters,
+            levels=(1,),
+            gain=float(effect._scores(case.recording).sum()),
+        )
+
+    def refitted(self, case: Case, fold: int) -> DeadBand:
+        keep = estimation_samples(case.n_samples, fold)
+        half_width = self.half_width.clone()
+        for i in half_width.nonzero()[:, 0].tolist():
+            again = recurring(i, case.recording[i, keep], float(self.value[i]))
+            if again is not None:
+                half_width[i] = band_limits(again)[0]
+        return DeadBand(self.value, half_width, self.centre)
+
+    def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
+        value = self.value[:, None] + signal.mean(-1, keepdim=True) - self.centre[:, None]
+        return torch.where((signal - value).abs() < self.half_width[:, None], value, signal)
+
+    def gains(self, case: Case, fold: int) -> Tensor:
+        return held_out_blocks(self._scores(case.recording), fold).sum((0, -1))
+
+    def _scores(self, signal: Tensor) -> Tensor:
+        """What samples in the band speak for it, or against it where they are not at its value, `(sensor, time)`."""
+        away = (signal - self.value[:, None]).abs()
+        inside = (away < self.half_width[:, None]) & (self.half_width[:, None] > 0)
+        return inside * torch.where(away == 0, _SURE, -_SURE).to(signal.dtype)

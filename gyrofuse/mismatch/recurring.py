@@ -1,0 +1,124 @@
+"""A value that recurs where values do not: a dead band sets all that is near zero to zero.
+
+How often a value would recur by chance is told by its neighbours: so many samples in so wide a gap, over the finest
+difference between them.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from scipy import stats
+from torch import Tensor
+
+from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.evidence import corrected
+from gyrofuse.mismatch.remembered import remembered
+from gyrofuse.mismatch.side import Side
+
+_CONTINUOUS = 0.5  # share of samples with a value of their own
+_NEIGHBOURS = 64  # on either side
+_FEWEST, _FEWEST_AGAIN = 4, 2  # times; of a value that recurs in another sensor as well
+_OWN = 1e-3  # p value of a value that recurs in the simulation
+
+
+class Recurring(NamedTuple):
+    """The value of a sensor that recurs most often beyond chance, though not next to itself.
+
+    Attributes:
+        sensor: Position.
+        value: It.
+        times: How often it was reached, in one or several records.
+        expected: By chance.
+        density: Of samples around it, per unit of the signal.
+        below, above: The values next to it.
+        places: Values that could have recurred.
+    """
+
+    sensor: int
+    value: float
+    times: int
+    expected: float
+    density: float
+    below: float
+    above: float
+    places: int
+
+    @property
+    def p_value(self) -> float:
+        """Of as many, for having looked at every value of the sensor."""
+        return corrected(float(stats.poisson.sf(self.times - 1, self.expected)), self.places)
+
+
+@remembered
+def recurring_values(side: Side) -> tuple[Recurring | None, ...]:
+    """Of each sensor, over the first record; `None` where values recur by their resolution, or none does."""
+    return tuple(recurring(i, values) for i, values in enumerate(side.signal[0]))
+
+
+def recurring(sensor: int, values: Tensor, value: float | None = None) -> Recurring | None:
+    """The value of `(time,)` that recurs most often, or the one given."""
+    new = torch.ones(len(values), dtype=torch.bool)
+    new[1:] = values[1:] != values[:-1]  # what is held is no return
+    unique, counts = torch.unique(values[new], return_counts=True)
+    if len(unique) < max(_CONTINUOUS * len(values), 4 * _NEIGHBOURS):
+        return None
+    at = int(counts[1:-1].argmax()) + 1  # ends are a matter of limits
+    if value is not None:
+        at = min(max(int(torch.searchsorted(unique, value)), 1), len(unique) - 2)
+        if float(unique[at]) != value:
+            return None
+    if int(counts[at]) < (_FEWEST if value is None else _FEWEST_AGAIN):
+        return None
+    low, high = max(at - _NEIGHBOURS, 0), min(at + _NEIGHBOURS, len(unique) - 1)
+    gaps = unique[low : high + 1].diff()
+    gap = float(unique[at + 1] - unique[at - 1])
+    wide = float(unique[high] - unique[low]) - gap
+    density = float(counts[low : high + 1].sum() - counts[at]) / max(wide, 1e-300)
+    expected = density * float(gaps.min())
+    return Recurring(
+        sensor,
+        float(unique[at]),
+        int(counts[at]),
+        expected,
+        density,
+        float(unique[at - 1]),
+        float(unique[at + 1]),
+        len(unique),
+    )
+
+
+def missing_recurrences(case: Case) -> dict[int, tuple[Recurring, float]]:
+    """Values that recur in the recording but not as often in the simulation, by sensor, with p values."""
+    missing = {}
+    n, other_n = case.n_samples, case.simulated.signal.shape[-1]
+    for own, other in zip(recurring_values(case.recorded), recurring_values(case.simulated), strict=True):
+        if own is None:
+            continue
+        p = own.p_value
+        if other is not None and other.p_value < _OWN:
+            both = own.times + other.times
+            p = max(p, float(stats.binom.sf(own.times - 1, both, n / (n + other_n))))
+        missing[own.sensor] = (own, corrected(p, case.n_sensors))
+    return missing
+
+
+def band_limits(found: Recurring) -> tuple[float, float, float]:
+    """Half-width of a dead band, and 95 % limits.
+
+    The nearest value that was left lies beyond it by an exponential variable: `reach/b - 1` is F distributed over the
+    count.
+    """
+    reach, count = min(found.value - found.below, found.above - found.value), found.times
+    middle, high, low = (reach / (1 + float(stats.f.ppf(q, 2, 2 * count)) / count) for q in (0.5, 0.025, 0.975))
+    return middle, low, high
+
+
+def fits_band(found: Recurring) -> bool:
+    """Whether as many samples are missing around the value as returned to it: it is not one that was filled in."""
+    missing = 2 * min(found.value - found.below, found.above - found.value) * found.density
+    least, most = stats.chi2.ppf(_OWN, 2 * found.times) / 2, stats.chi2.isf(_OWN, 2 * found.times + 2) / 2
+    # The nearest value that is left lies beyond the band by one on average.
+    return bool(least < missing < most - math.log(_OWN))

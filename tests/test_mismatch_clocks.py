@@ -1,0 +1,162 @@
+"""Clocks that differ: slopes and steps of the phase of a shared tone, against direct sums, size, power and limits."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from scipy import stats
+
+import gyrofuse as gf
+from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.clocks import BLOCKS, best_slope, clock_witness, demodulated, strongest_slip
+from gyrofuse.mismatch.confirm import held_out_gain
+from gyrofuse.mismatch.mechanisms.clock_skew import ClockSkew
+from gyrofuse.mismatch.resampling import resampled
+
+N = 2**14
+NOISE = gf.WhiteNoise(1.0) + gf.AR1(0.99, 1e-3)
+TONE = 0.1817
+LEVEL = 1e-4
+
+
+def generator(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def case(g: torch.Generator, ahead: torch.Tensor, amplitude: float = 0.3, *, channel: bool = False) -> Case:
+    """Four sensors with a tone, which `(sensor, time)` or fewer samples ahead of the others, and a simulation of it."""
+    t = torch.arange(N, dtype=torch.float64)
+    x = NOISE.simulate(N, batch=(2, 4), generator=g)
+    turn = 2 * math.pi * torch.rand(2, 4, 1, generator=g, dtype=torch.float64)
+    x[0] += amplitude * torch.cos(2 * math.pi * TONE * (t + ahead) + turn[0])
+    x[1] += amplitude * torch.cos(2 * math.pi * TONE * t + turn[1])
+    channels = {"acceleration": torch.cos(2 * math.pi * TONE * t)[None]} if channel else {}
+    return Case.of(Scene(100.0, "deg/s", ("1", "2", "3", "4"), channels), x[0], x[1:])
+
+
+def skewed(skew: float, *sensors: int) -> torch.Tensor:
+    ahead = torch.zeros(4, N, dtype=torch.float64)
+    ahead[list(sensors)] = skew * torch.arange(N, dtype=torch.float64)
+    return ahead
+
+
+def lost(losses: dict[int, int], *sensors: int) -> torch.Tensor:
+    ahead = torch.zeros(4, N, dtype=torch.float64)
+    for at, count in losses.items():
+        ahead[list(sensors), at:] += count
+    return ahead
+
+
+def test_blocks_turn_with_the_tone_and_have_noise_of_one():
+    g = generator(1)
+    x = torch.randn(3, N, generator=g, dtype=torch.float64)
+    z = demodulated(x, TONE)
+    t = torch.arange(N, dtype=torch.float64)
+    block = N // BLOCKS
+    here = slice(7 * block, 8 * block)
+    angle = 2 * math.pi * TONE * t[here]
+    direct = torch.linalg.lstsq(torch.stack([angle.cos(), angle.sin()], 1), x[1, here, None]).solution[:, 0]
+    scale = z[1, 7] / torch.complex(direct[0], -direct[1])
+    assert abs(scale.imag) < 1e-9
+    assert abs(float(scale.real) * 2 / math.sqrt(block) - 1) < 0.1
+    assert abs(float(z.abs().square().mean()) - 1) < 5 / math.sqrt(3 * BLOCKS)
+
+
+def test_the_best_slope_is_the_frequency_of_the_tone():
+    t = torch.arange(N, dtype=torch.float64)
+    g = generator(2)
+    x = torch.cos(2 * math.pi * (TONE + 1.234 / N) * t)[None] + 0.1 * torch.randn(1, N, generator=g).double()
+    slope, energy = best_slope(demodulated(x, TONE))
+    assert abs(slope - 1.234) < 0.01
+    assert abs(energy / (N / 4 / 0.01) - 1) < 0.2
+
+
+@pytest.mark.parametrize("channel", [False, True])
+def test_one_clock_does_not_slip(channel):
+    g, n_runs = generator(3), 40
+    values = [clock_witness(case(g, torch.zeros(4, N), channel=channel)).p_value for _ in range(n_runs)]
+    hits = sum(p < 0.05 for p in values)
+    assert stats.binom.sf(hits - 1, n_runs, 0.05) > 1e-3, f"{hits} of {n_runs}"
+    assert min(values) > 1e-4
+
+
+@pytest.mark.parametrize("channel", [False, True])
+def test_a_skew_is_found_in_its_sensors_with_limits_that_hold(channel):
+    g, held, n_runs, true = generator(4), 0, 15, 80e-6
+    for _ in range(n_runs):
+        finding = ClockSkew.nominate(case(g, skewed(true, 2), channel=channel), LEVEL)
+        assert finding.sensors == (2,)
+        assert finding.channel == ("acceleration" if channel else None)
+        entry = finding.parameters["skew"]
+        held += entry.low <= 1e6 * true <= entry.high
+    assert stats.binom.cdf(held, n_runs, 0.95) > 1e-3, f"{held} of {n_runs}"
+    assert "sensor 3 differs by" in finding.sentence
+
+
+def test_lost_samples_are_counted_and_found_in_time():
+    g, n_runs, right, held = generator(5), 10, 0, 0
+    true = {N // 3: 1, 3 * N // 5: 2}
+    for _ in range(n_runs):
+        finding = ClockSkew.nominate(case(g, lost(true, 0, 3), channel=True), LEVEL)
+        assert finding.sensors == (0, 3)
+        right += finding.parameters["lost"].value == 3
+        for j, at in enumerate(true):
+            entry = finding.parameters.get(f"time_of_loss_{j + 1}")
+            held += entry is not None and entry.low <= at / 100 <= entry.high
+    assert right >= 9
+    assert stats.binom.cdf(held, 2 * n_runs, 0.95) > 1e-3, f"{held} of {2 * n_runs}"
+
+
+def test_samples_lost_by_one_sensor_need_no_channel():
+    finding = ClockSkew.nominate(case(generator(6), lost({N // 2: 1}, 1)), LEVEL)
+    assert finding.sensors == (1,)
+    assert abs(finding.time_s - N / 200) < 2
+
+
+@pytest.mark.parametrize("ahead", [skewed(80e-6, 1), lost({5000: 1, 11000: 1}, 1)])
+def test_what_was_found_is_put_right_and_confirmed(ahead):
+    g = generator(7)
+    both = case(g, ahead, channel=True)
+    effect = ClockSkew.nominate(both, LEVEL).effect
+    gain = held_out_gain(both, effect)
+    assert gain.total > 3 * gain.sd
+    assert clock_witness(effect.explained(both, g)).p_value > 0.01
+    assert clock_witness(both.with_recording(effect.removed(both.recording, both.scene))).p_value > 0.01
+
+
+def test_removed_undoes_simulated():
+    g = generator(8)
+    smooth = gf.AR1(0.9, 1.0).simulate(N, batch=(4,), generator=g)
+    smooth = torch.fft.irfft(torch.fft.rfft(smooth)[:, : N // 8], n=N)
+    scene = Scene(100.0, "deg/s", ("1", "2", "3", "4"))
+    none = torch.zeros(2, dtype=torch.complex128)
+    skew = ClockSkew((0, 2), 50e-6, (), TONE, none, none)
+    back = skew.removed(skew.simulated(smooth, scene, g), scene)
+    assert (back - smooth)[:, 100:-100].abs().max() < 1e-3 * smooth.std()
+    assert torch.equal(back[1], smooth[1])
+    drop = ClockSkew((0, 2), 0.0, ((4000, 3),), TONE, none, none)
+    dropped = drop.simulated(smooth, scene, g)
+    assert torch.allclose(dropped[0, 4000 : N - 3], smooth[0, 4003:])
+    back = drop.removed(dropped, scene)
+    keep = torch.ones(N, dtype=torch.bool)
+    keep[4000:4003] = False
+    keep[-3:] = False
+    assert torch.allclose(back[:, keep], smooth[:, keep])
+
+
+def test_resampling_is_exact_at_samples_and_right_between():
+    t = torch.arange(400, dtype=torch.float64)
+    tone = torch.cos(0.9 * t)[None]
+    assert torch.allclose(resampled(tone, t + 2)[:, :398], tone[:, 2:])
+    between = resampled(tone, t + 0.37)[0, 50:-50]
+    assert (between - torch.cos(0.9 * (t + 0.37))[50:-50]).abs().max() < 1e-3
+
+
+def test_without_a_shared_tone_nothing_is_said():
+    g = generator(9)
+    x = NOISE.simulate(N, batch=(2, 4), generator=g)
+    both = Case.of(Scene(100.0, "deg/s", ("1", "2", "3", "4")), x[0], x[1:])
+    assert strongest_slip(both) is None
+    assert clock_witness(both).p_value == 1.0

@@ -1,0 +1,212 @@
+"""Weak outliers, small changes of level and dead bands: mean likelihood ratios against naive twins, what is found."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+from torch import Tensor
+
+from gyrofuse import WhiteNoise
+from gyrofuse.mismatch import level_scan, shocks
+from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.confirm import held_out_gain
+from gyrofuse.mismatch.marginals import marginal_witness
+from gyrofuse.mismatch.mechanism import Finding, Mechanism
+from gyrofuse.mismatch.mechanisms.dead_band import DeadBand
+from gyrofuse.mismatch.mechanisms.quantization import Quantization
+from gyrofuse.mismatch.mechanisms.spikes import Spikes
+from gyrofuse.mismatch.mechanisms.variance_change import VarianceChange
+from gyrofuse.mismatch.outliers import Outliers
+from gyrofuse.mismatch.recurring import band_limits, fits_band, recurring
+
+N, RATE, LEVEL = 16384, 100.0, 5e-4
+SCENE = Scene(RATE, "deg/s", ("x", "y", "z"))
+
+
+def drawn(seed: int) -> tuple[Tensor, Tensor, torch.Generator]:
+    g = torch.Generator().manual_seed(seed)
+    noise = WhiteNoise(1.0)
+    return noise.simulate(N, batch=(3,), generator=g), noise.simulate(N, batch=(2, 3), generator=g), g
+
+
+def even(*shape: int, g: torch.Generator) -> Tensor:
+    return torch.rand(shape, generator=g, dtype=torch.float64)
+
+
+def normal(*shape: int, g: torch.Generator) -> Tensor:
+    return torch.randn(shape, generator=g, dtype=torch.float64)
+
+
+def nominated(case: Case, mechanism: type[Mechanism]) -> Finding:
+    found = mechanism.nominate(case, LEVEL)
+    assert found is not None
+    return found
+
+
+def covers(found: Finding, name: str, truth: float) -> bool:
+    return found.parameters[name].low <= truth <= found.parameters[name].high
+
+
+# Outliers.
+
+
+def test_ratios_of_outliers_are_products_over_samples_and_sets() -> None:
+    g = torch.Generator().manual_seed(0)
+    z, size = normal(3, 800, g=g), 2.7
+    z[:, ::100] += 3.0
+    rates = torch.tensor([0.005, 0.02], dtype=torch.float64)
+    mine = shocks._log_ratios(z, size, rates)
+    for k, p in enumerate(rates.tolist()):
+        for members in range(1, 8):
+            own = z.numpy()[[i for i in range(3) if members >> i & 1]]
+            ratio = (np.cosh(size * own) * math.exp(-(size**2) / 2)).prod(0)
+            # Two terms of a series stand for the many small ones.
+            assert float(mine[k, members]) == pytest.approx(np.log1p(p * (ratio - 1)).sum(), abs=0.02)
+
+
+def test_nothing_is_seen_in_noise_even_if_sensors_share_it() -> None:
+    false = 0
+    for seed in range(30):
+        g = torch.Generator().manual_seed(seed)
+        z = normal(4, 4096, g=g) + 0.7 * normal(1, 4096, g=g)
+        false += shocks.weak_outliers(z / z.std(-1, keepdim=True)).p_value < 0.05
+    assert stats.binom.sf(6, 30, 0.05) < 1e-3
+    assert false <= 6
+
+
+def test_shocks_too_weak_for_any_sensor_alone_are_named() -> None:
+    named = inside = 0
+    for seed in range(6):
+        recording, simulation, g = drawn(100 + seed)
+        hit = (even(1, N, g=g) < 3e-3) & torch.tensor([[True], [False], [True]])
+        recording = recording + hit * 3.0 * (even(3, N, g=g) - 0.5).sign()
+        case = Case.of(SCENE, recording, simulation)
+        found = Spikes.nominate(case, LEVEL)
+        if found is None:
+            continue
+        assert isinstance(found.effect, Spikes)
+        named += found.sensors == (0, 2) and found.effect.together
+        inside += covers(found, "rate", 3e-3 * RATE * 3600) if found.effect.together else 0
+        gain = held_out_gain(case, found.effect)
+        assert gain.total > gain.sd
+        if not seed:
+            assert Spikes.nominate(found.effect.explained(case, g), LEVEL) is None
+    assert named >= 5
+    # Fewer than 4 of 6 at 95 % have probability 2e-3.
+    assert inside >= 4
+
+
+def test_a_fit_of_shocks_recovers_them_and_says_which_samples_are_hit() -> None:
+    g = torch.Generator().manual_seed(3)
+    hit = even(1, N, g=g) < 4e-3
+    z = normal(3, N, g=g) + hit * 4.0 * (even(3, N, g=g) - 0.5).sign()
+    start = [Outliers(1e-3, 2.7, 0.3)] * 3
+    laws = shocks.fitted_shock(z, start, 40)
+    for law in laws:
+        assert abs(law.amplitude - 4) < 4 * law.amplitude_sd
+        assert abs(law.rate - 4e-3) < 4 * law.rate_sd
+    said = shocks.shock_posterior(z, laws) > 0.5
+    assert int((said != hit[0]).sum()) < 0.05 * int(hit.sum()) + 3
+    assert float(shocks.shock_scores(z, laws).sum()) > float(shocks.shock_scores(z, start).sum())
+
+
+# Levels.
+
+
+def test_the_scan_of_levels_is_the_mean_over_stretches_and_factors() -> None:
+    g = torch.Generator().manual_seed(4)
+    squares = normal(2, 64, g=g).square()
+    x, n = (squares / squares.sum(-1, keepdim=True)).numpy(), 64
+    by_length = []
+    for m in sorted({round(2 ** (k / 2)) for k in range(11)}):
+        reach = np.minimum(np.array(level_scan._DEVIATIONS) * math.sqrt(2 / m + 2 / (n - m)), math.log(30))
+        ratios = []
+        for log_r, a in itertools.product([*reach, *-reach], range(0, n - m + 1, max(m // 8, 1))):
+            share = x[:, a : a + m].sum(-1)
+            one = math.exp(-m / 2 * log_r) * (1 - share + share * math.exp(-log_r)) ** (-n / 2)
+            ratios.append(((1 + one) / 2).prod())
+        by_length.append(np.mean(ratios))
+    assert level_scan.scanned_levels(squares).log_ratio == pytest.approx(math.log(np.mean(by_length)), abs=1e-9)
+
+
+def test_a_level_that_changes_by_little_in_several_sensors_is_named() -> None:
+    found_all = 0
+    for seed in range(6):
+        recording, simulation, _ = drawn(200 + seed)
+        recording[:, 5000:9000] *= math.sqrt(1.13)
+        found = VarianceChange.nominate(Case.of(SCENE, recording, simulation), LEVEL)
+        found_all += found is not None and covers(found, "start", 50.0) and covers(found, "stop", 90.0)
+        assert VarianceChange.nominate(Case.of(SCENE, drawn(300 + seed)[0], simulation), LEVEL) is None
+    # Start and stop of six at 95 % each: fewer than 4 have probability 2e-3.
+    assert found_all >= 4
+
+
+# Dead bands.
+
+
+def test_a_dead_band_is_found_among_values_that_do_not_recur() -> None:
+    inside, half_width = 0, 8e-4
+    for seed in range(8):
+        recording, simulation, g = drawn(400 + seed)
+        recording[:2][recording[:2].abs() < half_width] = 0.0
+        case = Case.of(SCENE, recording, simulation)
+        found = nominated(case, Quantization)
+        assert isinstance(found.effect, DeadBand)
+        assert (found.mechanism, found.sensors) == ("quantization", (0, 1))
+        inside += covers(found, "dead_band[0]", half_width) + covers(found, "dead_band[1]", half_width)
+        gain = held_out_gain(case, found.effect)
+        assert gain.total > gain.sd
+        after = found.effect.explained(case, g)
+        assert marginal_witness(after).p_value > 0.001
+    # Fewer than 12 of 16 at 95 % have probability 9e-4.
+    assert inside >= 12
+
+
+def test_a_value_filled_in_is_no_dead_band() -> None:
+    recording, simulation, g = drawn(500)
+    recording[0, even(N, g=g) < 1e-3] = 0.0
+    case = Case.of(SCENE, recording, simulation)
+    assert marginal_witness(case).p_value < 1e-6
+    assert Quantization.nominate(case, LEVEL) is None
+
+
+def test_values_of_single_precision_return_by_chance_alone() -> None:
+    for seed in range(10):
+        recording, simulation, _ = drawn(600 + seed)
+        case = Case.of(SCENE, recording.float().double(), simulation)
+        assert marginal_witness(case).p_value > 0.01
+        assert Quantization.nominate(case, LEVEL) is None
+
+
+def test_limits_of_a_band_follow_from_the_nearest_value_left() -> None:
+    away = torch.linspace(0.01, 1.0, 500, dtype=torch.float64)
+    returns = torch.tensor([0.0, 0.5] * 5, dtype=torch.float64)
+    own = recurring(0, torch.cat([away, -1.2 * away, returns]), 0.0)
+    assert own is not None
+    assert (own.times, own.below, own.above) == (5, pytest.approx(-0.012), pytest.approx(0.01))
+    q = stats.f.ppf([0.975, 0.5, 0.025], 2, 10)
+    low, middle, high = 0.01 / (1 + q / 5)
+    assert band_limits(own) == pytest.approx((middle, low, high))
+    assert fits_band(own)
+    assert not fits_band(own._replace(times=40))
+
+
+# Hidden lattices.
+
+
+def test_a_hidden_lattice_is_built_in_without_other_power() -> None:
+    g = torch.Generator().manual_seed(7)
+    x = normal(3, 200_000, g=g)
+    numbers = (torch.tensor(v, dtype=torch.float64) for v in ([1.0, 0.0, 1.0], [0.2, 0.0, 0.0], [0.3, 0.0, 0.0]))
+    effect = Quantization(*numbers)
+    y = effect.simulated(x, SCENE, g)
+    turn = torch.exp(2j * math.pi * (y[0] - 0.2)).mean().abs()
+    assert float(turn) == pytest.approx(math.exp(-2 * math.pi**2 * 0.09), rel=0.03)
+    assert float((y[0] - x[0]).square().mean()) < 0.4 / 12
+    assert torch.equal(y[1], x[1])
+    assert torch.equal(y[2], x[2].round())
