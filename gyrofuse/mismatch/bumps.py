@@ -20,6 +20,7 @@ from torch.nn.functional import pad
 
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import Evidence, corrected
+from gyrofuse.mismatch.lines import simulated_lines, without_lines
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.shape_fit import Fit, Ratios, fit
 from gyrofuse.mismatch.shape_law import smooth_coherence
@@ -135,7 +136,7 @@ def strongest_bump(case: Case) -> Stretch:
 
 def _whitened(side: Side, case: Case) -> tuple[Tensor, int]:
     """Transform over the simulation's noise, `(record, sensor, bin)`, and the length padded to."""
-    transform, length = hann_transform(side.signal)
+    transform, length = hann_transform(without_lines(side.signal, simulated_lines(case.simulated)))
     f = torch.arange(transform.shape[-1], dtype=torch.float64) / length
     return transform / case.base.spectrum(f.clamp(min=1 / length)).sqrt(), length
 
@@ -168,9 +169,11 @@ def _correlated(transform: Tensor, length: int, case: Case) -> tuple[Tensor, Ten
 
 def _decorrelated(transform: Tensor, length: int, case: Case) -> Tensor:
     """Without the coherence of broad bands."""
-    coherence = smooth_coherence(case.recorded.coherence, case.recorded.dof)
     apart = transform.clone()
     edges = [0, *(round(e * length / case.n_samples) for e in case.bands.edges[1:-1]), transform.shape[-1]]
+    matrices = torch.stack([part @ part.mH for a, b in itertools.pairwise(edges) for part in [transform[:, a:b]]])
+    size = matrices.diagonal(dim1=-1, dim2=-2).real.rsqrt()
+    coherence = smooth_coherence(matrices * (size[:, :, None] * size[:, None, :]), case.recorded.dof)
     for matrix, (a, b) in zip(coherence, itertools.pairwise(edges), strict=True):
         root = torch.linalg.cholesky(matrix)
         apart[:, a:b] = torch.linalg.solve_triangular(root, transform[:, a:b], upper=False)

@@ -38,6 +38,7 @@ _ORDER = {"scale": 0, "add": 1, "filter": 2}  # a filter acts on what was added,
 _PLAIN = 15.0  # nats
 _ALONE = 8.0  # nats that a shape has to bring by itself
 _CLEAN = 8  # bins
+_BROAD = 3.0  # half widths
 _FORMS = 3  # of filters
 _WIDTHS = (0.06, 0.15, 0.35)  # half width of a bump over its centre
 _CORNER_BINS = (4.0, 0.3)  # corners of common AR1s to start from: bins, cycles per sample
@@ -74,6 +75,21 @@ class Shape(NamedTuple):
 def shapes(case: Case) -> tuple[Shape, ...]:
     """Shapes that together explain the spectra, in the order in which they act; none where they do not."""
     return _searched(case)
+
+
+def _like_switching(term: Term) -> bool:
+    """Whether a sensor that jumps between two levels may have that spectrum: more power below some frequency.
+
+    Where jumps can be told from Gaussian noise, they were before spectra were looked at.
+    """
+    if isinstance(term, Common):
+        return False
+    if isinstance(term, Bump):
+        centre, width = term.shared.exp().tolist()
+        return bool(centre < _BROAD * width)
+    if isinstance(term, Shift):
+        return bool((term.local[1:] > 0).any())
+    return isinstance(term, Flicker)
 
 
 def chosen_shape(case: Case, name: str, level: float) -> Shape | None:
@@ -157,6 +173,8 @@ def _searched(case: Case) -> tuple[Shape, ...]:
             for rival in _candidates(data, others)
             if rival.name != term.name and _as_good(data, [*others, rival], chosen.gain - _RIVAL)
         }
+        if _like_switching(term):
+            rivals.add("random_telegraph")
         seen = (log_score(data, data_model(data, [term])) - log_score(data, data.expected)).clamp(min=0)
         levels = {level_of(float(f)) for f in data.ground.bands.frequency[seen > 0.05 * seen.sum()]}
         found.append(

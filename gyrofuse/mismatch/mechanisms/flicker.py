@@ -26,7 +26,8 @@ class FlickerNoise(Addition):
     hundreds of bins of the spectrum. Walks fall as `1 / f^2`.
 
     Attributes:
-        level: `a`, `(sensor,)`, unit of the signal squared.
+        level: `a`, `(sensor,)`, unit of the signal squared. The noise between `f` and `e f` has the variance `2 a`:
+            spectra are two-sided.
     """
 
     name: ClassVar[str] = "flicker"
@@ -42,10 +43,10 @@ class FlickerNoise(Addition):
         parameters = {}
         for i in sensors:
             parameters[f"level[{i}]"] = spanned(
-                lambda x: math.sqrt(max(x, 0.0)), float(a[i]), float(sd[i]), case.scene.unit
+                lambda x: math.sqrt(2 * max(x, 0.0)), float(a[i]), float(sd[i]), case.scene.unit
             )
         where = case.scene.named(sensors, "all sensors")
-        largest = max(float(a[i].sqrt()) for i in sensors)
+        largest = max(math.sqrt(2 * float(a[i])) for i in sensors)
         return found(
             case,
             cls(a),

@@ -52,12 +52,11 @@ class ParameterShift(Filter):
                 if math.isnan(sd):
                     continue
                 value = float(shape.term.local[k, i])
-                power = 1.0 if name == "corner" else 0.5  # levels are reported as standard deviations
                 low, high = value - Z * sd, value + Z * sd
-                parameters[f"{name}_factor[{i}]"] = spanned(math.exp, power * value, power * sd, "1")
+                parameters[f"{name}_factor[{i}]"] = spanned(math.exp, value, sd, "1")  # of variances
                 if low > 0 or high < 0:
                     number, unit = before[k][i]
-                    factor = math.exp(power * value)
+                    factor = math.exp(value if name == "corner" else value / 2)  # in standard deviations
                     words.append(
                         f"{_WORDS[k]} of sensor {case.scene.sensors[i]} {number:.3g} -> {number * factor:.3g} {unit}"
                     )

@@ -45,10 +45,15 @@ class StuckSamples(Mechanism):
             return None
         effect = cls._estimated(case, sensors, torch.ones(case.n_samples, dtype=torch.bool))
         parameters = {}
+        same = repeated(case.recording)
         for i in sensors:
             value = float(effect.probability[i])
             own = float(found.share[i])
-            sd = math.hypot(float(found.sd[i]), math.sqrt(own * (1 - own) / found.n)) / (1 - float(effect.by_chance[i]))
+            runs = run_lengths(same[i])
+            # Samples that repeat one after the other are one event.
+            clustered = float(runs.square().sum() / runs.sum()) if len(runs) else 1.0
+            spread = math.sqrt(own * (1 - own) * clustered / found.n)
+            sd = math.hypot(float(found.sd[i]), spread) / (1 - float(effect.by_chance[i]))
             parameters[f"probability[{i}]"] = Parameter(value, max(value - Z * sd, 0.0), min(value + Z * sd, 1.0), "")
         where = case.scene.named(sensors, "all sensors")
         largest = max(sensors, key=lambda i: float(effect.probability[i]))
@@ -103,3 +108,9 @@ class StuckSamples(Mechanism):
         yes, no = (stuck / chance).log(), ((1 - stuck) / (1 - chance)).log()
         scores = torch.where(repeated(case.recording), yes[:, None], no[:, None])
         return torch.where(self.probability[:, None] > 0, scores, 0.0)
+
+
+def run_lengths(true: Tensor) -> Tensor:
+    """Lengths of the runs of true entries of `(time,)`, `(run,)`."""
+    edges = torch.nn.functional.pad(true.to(torch.int8), (1, 1)).diff().nonzero()[:, 0]
+    return edges.diff()[::2].to(torch.float64)
