@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import N_BLOCKS, Case, Scene, block_means
 from gyrofuse.mismatch.folds import N_FOLDS, N_JUDGED, in_fold
-from gyrofuse.mismatch.mechanism import Mechanism, Parameter, Z
+from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.slow import cosines, scores
 from gyrofuse.mismatch.slow_families import Family
 from gyrofuse.mismatch.slow_scans import Scan, SlowLook, concerned, slow_look
@@ -101,7 +101,21 @@ class Estimate(NamedTuple):
     sd: Tensor
 
 
-def strong_scan(case: Case, name: str, level: float) -> tuple[SlowLook, Scan, tuple[str, ...]] | None:
+class Strong(NamedTuple):
+    """A scan that may be named.
+
+    Attributes:
+        look: What it is part of.
+        scan: It.
+        alternatives: Mechanisms that fit as well.
+    """
+
+    look: SlowLook
+    scan: Scan
+    alternatives: tuple[str, ...]
+
+
+def strong_scan(case: Case, name: str, level: float) -> Strong | None:
     """The scan of a mechanism and its equals; None where it is not there, or where another one is better."""
     look = slow_look(case)
     scan = look.scan(name)
@@ -110,7 +124,7 @@ def strong_scan(case: Case, name: str, level: float) -> tuple[SlowLook, Scan, tu
     rivals = [other for other in look.scans if other is not scan]
     if any(other.gain > scan.gain + _TOO_CLOSE for other in rivals):
         return None
-    return look, scan, tuple(other.family.name for other in rivals if other.gain > scan.gain - _TOO_CLOSE)
+    return Strong(look, scan, tuple(other.family.name for other in rivals if other.gain > scan.gain - _TOO_CLOSE))
 
 
 def log_factors(scan: Scan) -> Tensor:
@@ -168,18 +182,56 @@ def place(places: tuple[float, float, float], rate: float) -> Parameter:
     return Parameter(value / rate, low / rate, high / rate, "s")
 
 
-def sizes(name: str, found: Estimate, which: tuple[int, ...], unit: str) -> dict[str, Parameter]:
-    """One parameter for each sensor concerned."""
+def slow_finding(
+    case: Case,
+    strong: Strong,
+    effect: SlowEffect,
+    found: Estimate,
+    words: str,
+    place: dict[str, Parameter],
+    *,
+    size: str = "size",
+    unit: str | None = None,
+    time_s: float | None = None,
+    channel: str | None = None,
+) -> Finding:
+    """A finding made of a scan.
+
+    Args:
+        case: Where it was found.
+        strong: The scan.
+        effect: It, with its numbers.
+        found: Its sizes.
+        words: What the bias does.
+        place: Parameter that says where.
+        size: Name of the sizes.
+        unit: Theirs; by default that of the signal.
+        time_s: Onset.
+        channel: That it follows.
+    """
+    scan, unit = strong.scan, unit or case.scene.unit
+    which = concerned(scan)
     limits = {}
     for i in which:
-        size, reach = float(found.size[i]), Z * float(found.sd[i])
-        limits[f"{name}[{i}]"] = Parameter(size, size - reach, size + reach, unit)
-    return limits
-
-
-def slow_levels(n_samples: int) -> tuple[int, ...]:
-    """Wavelet levels at which a block is no more than half a wavelet."""
-    return tuple(range(int(math.log2(n_samples / N_BLOCKS)) + 1, int(math.log2(n_samples)) + 1))
+        value, reach = float(found.size[i]), Z * float(found.sd[i])
+        limits[f"{size}[{i}]"] = Parameter(value, value - reach, value + reach, unit)
+    largest = max(which, key=lambda i: abs(float(found.size[i])))
+    # A block is no more than half a wavelet there.
+    levels = range(int(math.log2(case.n_samples / N_BLOCKS)) + 1, int(math.log2(case.n_samples)) + 1)
+    return Finding(
+        effect.name,
+        effect,
+        f"the bias of {case.scene.named(which)} {words}, by up to {abs(float(found.size[largest])):.3g} {unit} "
+        f"(sensor {case.scene.sensors[largest]})",
+        scan.p_value,
+        which,
+        {**place, **limits},
+        levels=tuple(levels),
+        alternatives=strong.alternatives,
+        time_s=time_s,
+        channel=channel,
+        gain=scan.gain,
+    )
 
 
 def _hadamard(n: int) -> Tensor:

@@ -19,8 +19,7 @@ from gyrofuse.mismatch.slow_effect import (
     place,
     plausible,
     quantiles,
-    sizes,
-    slow_levels,
+    slow_finding,
     strong_scan,
 )
 from gyrofuse.mismatch.slow_families import steps
@@ -53,25 +52,12 @@ class Step(SlowEffect):
         strong = strong_scan(case, cls.name, level)
         if strong is None:
             return None
-        look, scan, alternatives = strong
+        look, scan = strong.look, strong.scan
         found = estimate(look, scan, steps(case))
-        which = concerned(scan)
         onset = place(onset_samples(case, look, scan, found.size), case.scene.rate)
-        effect = cls(only(found.size, which), log_factors(scan), onset.value)
-        largest = max(which, key=lambda i: abs(float(found.size[i])))
-        return Finding(
-            cls.name,
-            effect,
-            f"the bias of {case.scene.named(which)} steps at {onset.value:.6g} s, by up to "
-            f"{abs(float(found.size[largest])):.3g} {case.scene.unit} (sensor {case.scene.sensors[largest]})",
-            scan.p_value,
-            which,
-            {"onset": onset, **sizes("size", found, which, case.scene.unit)},
-            levels=slow_levels(case.n_samples),
-            alternatives=alternatives,
-            time_s=onset.value,
-            gain=scan.gain,
-        )
+        effect = cls(only(found.size, concerned(scan)), log_factors(scan), onset.value)
+        words = f"steps at {onset.value:.6g} s"
+        return slow_finding(case, strong, effect, found, words, {"onset": onset}, time_s=onset.value)
 
     def path(self, n_samples: int, scene: Scene) -> Tensor:
         # Times of samples are exact multiples only to rounding.

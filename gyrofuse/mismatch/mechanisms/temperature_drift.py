@@ -19,8 +19,7 @@ from gyrofuse.mismatch.slow_effect import (
     only,
     place,
     plausible,
-    sizes,
-    slow_levels,
+    slow_finding,
     strong_scan,
 )
 from gyrofuse.mismatch.slow_families import lagged, temperature
@@ -56,32 +55,28 @@ class TemperatureDrift(SlowEffect):
         strong = strong_scan(case, cls.name, level)
         if strong is None:
             return None
-        look, scan, alternatives = strong
+        look, scan = strong.look, strong.scan
         if not _beats_surrogates(look, scan):
             return None
         channel, row = scan.family.channel or "", scan.family.row
         low, high = plausible(look, scan)
         lags = torch.linspace(low, high, _PLACES, dtype=torch.float64)
         found = estimate(look, scan, temperature(case.scene, channel, row, lags, case.n_samples))
-        which, unit = concerned(scan), f"{case.scene.unit}/K"
         lag = place(found.place, case.scene.rate)
         if low == 0:
             lag = lag._replace(low=0.0)
-        effect = cls(only(found.size, which), log_factors(scan), lag.value, channel, row)
-        largest = max(which, key=lambda i: abs(float(found.size[i])))
-        behind = f" with a lag of {lag.value:.3g} s" if lag.low > 0 else ""
-        return Finding(
-            cls.name,
+        effect = cls(only(found.size, concerned(scan)), log_factors(scan), lag.value, channel, row)
+        words = f"follows {channel}" + (f" with a lag of {lag.value:.3g} s" if lag.low > 0 else "")
+        return slow_finding(
+            case,
+            strong,
             effect,
-            f"the bias of {case.scene.named(which)} follows {channel}{behind}, by up to "
-            f"{abs(float(found.size[largest])):.3g} {unit} (sensor {case.scene.sensors[largest]})",
-            scan.p_value,
-            which,
-            {"lag": lag, **sizes("coefficient", found, which, unit)},
-            levels=slow_levels(case.n_samples),
-            alternatives=alternatives,
+            found,
+            words,
+            {"lag": lag},
+            size="coefficient",
+            unit=f"{case.scene.unit}/K",
             channel=channel,
-            gain=scan.gain,
         )
 
     def path(self, n_samples: int, scene: Scene) -> Tensor:

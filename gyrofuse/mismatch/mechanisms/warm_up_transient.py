@@ -18,8 +18,7 @@ from gyrofuse.mismatch.slow_effect import (
     only,
     place,
     plausible,
-    sizes,
-    slow_levels,
+    slow_finding,
     strong_scan,
 )
 from gyrofuse.mismatch.slow_families import warm_ups
@@ -48,28 +47,14 @@ class WarmUpTransient(SlowEffect):
         strong = strong_scan(case, cls.name, level)
         if strong is None:
             return None
-        look, scan, alternatives = strong
+        look, scan = strong.look, strong.scan
         low, high = plausible(look, scan)
         taus = torch.logspace(math.log10(low), math.log10(high), _PLACES, dtype=torch.float64)
         found = estimate(look, scan, warm_ups(case, taus))
-        which = concerned(scan)
         tau = place(found.place, case.scene.rate)
-        effect = cls(only(found.size, which), log_factors(scan), tau.value)
-        largest = max(which, key=lambda i: abs(float(found.size[i])))
-        return Finding(
-            cls.name,
-            effect,
-            f"the bias of {case.scene.named(which)} decays after the start with a time constant of "
-            f"{tau.value:.3g} s, by up to {abs(float(found.size[largest])):.3g} {case.scene.unit} "
-            f"(sensor {case.scene.sensors[largest]})",
-            scan.p_value,
-            which,
-            {"time_constant": tau, **sizes("size", found, which, case.scene.unit)},
-            levels=slow_levels(case.n_samples),
-            alternatives=alternatives,
-            time_s=0.0,
-            gain=scan.gain,
-        )
+        effect = cls(only(found.size, concerned(scan)), log_factors(scan), tau.value)
+        words = f"decays after the start with a time constant of {tau.value:.3g} s"
+        return slow_finding(case, strong, effect, found, words, {"time_constant": tau}, time_s=0.0)
 
     def path(self, n_samples: int, scene: Scene) -> Tensor:
         return (-scene.seconds(n_samples) / self.time_constant_s).exp()
