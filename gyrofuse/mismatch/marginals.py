@@ -219,6 +219,9 @@ def repeats(case: Case) -> Repeats:
     # A resolution finer than any lattice that matters, such as that of float32, makes a few.
     differences = case.recording.diff(dim=-1)
     density = 1 / (math.sqrt(2 * math.pi) * differences.square().mean(-1).sqrt())
+    # Rounded values repeat by chance the more often the less there is of other noise.
+    quieter = case.simulated.signal.diff().abs().mean((0, -1)) / differences.abs().mean(-1).clamp(min=1e-300)
+    other = (other * quieter.clamp(min=1.0)).clamp(max=1.0)
     expected = other + torch.where(other == 0, _resolution(case) * density, 0.0)
     binomial = expected * (1 - expected).clamp(min=0) + 1 / n_recorded
     variance = torch.maximum(binomial / n_recorded + binomial / n_simulated, fast + other_fast)

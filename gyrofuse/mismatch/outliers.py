@@ -14,6 +14,7 @@ _BINS = 250
 _EVENT, _COMPANY = 3.5, 2.5  # sd
 _NEAR = (2, 9)  # samples on either side
 _CLUSTERED = 0.6  # share of events that have company
+_FLAT = 2.0  # times what the number of events alone says
 
 
 class Outliers(NamedTuple):
@@ -85,6 +86,9 @@ def fitted(z: Tensor) -> Outliers:
     best = min(runs, key=lambda run: float(run.fun))
     rate, height, spread = (math.exp(v) for v in best.x)
     rate_sd, amplitude_sd = _spread_of(z, counts, Outliers(rate, height, spread))
+    # One or two events have no curvature to speak of: no more than twice what their number says.
+    most = _FLAT / math.sqrt(max(rate * n, 1.0))
+    rate_sd, amplitude_sd = min(rate_sd, most * rate), min(amplitude_sd, most * math.hypot(spread, 1.0))
     return Outliers(rate, height, spread, rate_sd, amplitude_sd)
 
 

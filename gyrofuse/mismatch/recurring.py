@@ -77,7 +77,9 @@ def recurring(sensor: int, values: Tensor, value: float | None = None) -> Recurr
     gap = float(unique[at + 1] - unique[at - 1])
     wide = float(unique[high] - unique[low]) - gap
     density = float(counts[low : high + 1].sum() - counts[at]) / max(wide, 1e-300)
-    expected = density * float(gaps.min())
+    # Values near a lattice finer than the noise, such as that of rounded floats, recur as their neighbours do.
+    around = torch.cat([counts[low:at], counts[at + 1 : high + 1]]).to(torch.float64)
+    expected = max(density * float(gaps.min()), float((around * (around - 1)).sum() / around.sum()))
     return Recurring(
         sensor,
         float(unique[at]),

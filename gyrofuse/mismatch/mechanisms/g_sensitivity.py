@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from gyrofuse.mismatch.case import Case, Scene
@@ -10,6 +11,8 @@ from gyrofuse.mismatch.channels import accelerations
 from gyrofuse.mismatch.mechanism import Finding
 from gyrofuse.mismatch.mechanisms._channel_gain import ChannelGain, gravity_unit
 from gyrofuse.mismatch.mechanisms.not_identifiable import not_identifiable
+
+_LARGEST = 1.0  # deg/s per g, ten times that of poor gyroscopes
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +29,8 @@ class GSensitivity(ChannelGain):
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:
         finding = super().nominate(case, level)
+        if finding is not None and not finding.alternatives and _beyond_sensors(case.scene, finding):
+            return replace(finding, alternatives=("common_mode",))
         if finding is None or not finding.alternatives:
             return finding
         where = case.scene.named(finding.sensors, "every sensor")
@@ -43,3 +48,12 @@ class GSensitivity(ChannelGain):
     def _unit(cls, scene: Scene, name: str) -> tuple[str, float]:
         unit = gravity_unit(scene, name)
         return super()._unit(scene, name) if unit is None else (f"{scene.unit}/{unit}", 1.0)
+
+
+def _beyond_sensors(scene: Scene, finding: Finding) -> bool:
+    """Whether gains are far above those of gyroscopes: what accelerates the board may turn it as well."""
+    unit, turn = gravity_unit(scene, finding.channel or ""), {"deg/s": 1.0, "rad/s": math.degrees(1)}.get(scene.unit)
+    if unit is None or turn is None:
+        return False
+    largest = max(abs(entry.value) for entry in finding.parameters.values())
+    return largest * turn * (9.80665 if unit == "m/s^2" else 1.0) > _LARGEST

@@ -32,6 +32,7 @@ _SUSPECT = 0.01
 _PRESENT = 5.0  # nats over the Gaussian rival
 _LEFT_OUT = 4  # stretches
 _FEWEST_SWITCHES = 8.0  # fewer are steps
+_SHORTEST = 8.0  # samples on one level: shorter, two codes of a converter look like two levels
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +62,10 @@ class RandomTelegraph(Mechanism):
         over = _without_best(data, two, rival)
         dwell = torch.from_numpy(two.theta[:, 1:]).exp()
         switches = data.n_blocks / dwell.mean(-1)
-        present = [k for k in range(len(suspects)) if over[k] > _PRESENT and switches[k] > _FEWEST_SWITCHES]
+        long = dwell.amin(-1) * data.block > _SHORTEST
+        present = [
+            k for k in range(len(suspects)) if over[k] > _PRESENT and switches[k] > _FEWEST_SWITCHES and bool(long[k])
+        ]
         if not present:
             return None
         n = case.n_sensors
