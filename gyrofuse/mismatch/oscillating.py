@@ -74,7 +74,7 @@ class Seen(NamedTuple):
         if amplitude == "rms":
             spread = math.hypot(centre_sd, width_sd)
             quality = math.log(bump.centre / bump.width / 2)
-            parameters["quality_factor"] = spanned(math.exp, quality, spread, "1")
+            parameters["quality_factor"] = spanned(math.exp, quality, spread, "")
         for i in self.sensors:
             value, sd = float(bump.variance[i]), float(bump.variance_sd[i])
             parameters[f"{amplitude}[{i}]"] = spanned(lambda x: factor * math.sqrt(max(x, 0.0)), value, sd, unit)

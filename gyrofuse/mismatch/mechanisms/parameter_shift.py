@@ -53,7 +53,7 @@ class ParameterShift(Filter):
                     continue
                 value = float(shape.term.local[k, i])
                 low, high = value - Z * sd, value + Z * sd
-                parameters[f"{name}_factor[{i}]"] = spanned(math.exp, value, sd, "1")  # of variances
+                parameters[f"{name}_factor[{i}]"] = spanned(math.exp, value, sd, "")  # of variances
                 if low > 0 or high < 0:
                     number, unit = before[k][i]
                     factor = math.exp(value if name == "corner" else value / 2)  # in standard deviations
