@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from mismatch_draws import LEVEL, even, nominated, normal
 from scipy import fft, stats
 from torch import Tensor
 
@@ -26,7 +27,7 @@ from gyrofuse.mismatch.mechanisms.variance_change import VarianceChange
 from gyrofuse.mismatch.side import Side
 from gyrofuse.mismatch.spectra import bands
 
-N, RATE, LEVEL = 16384, 100.0, 5e-4
+N, RATE = 16384, 100.0
 SCENE = Scene(RATE, "deg/s", ("x", "y", "z"))
 NOISE = WhiteNoise(1.0) + AR1(0.98, 0.004) + RandomWalk(1e-5)
 WITNESSES = (
@@ -49,20 +50,6 @@ def drawn(seed: int, records: int = 4) -> tuple[Tensor, Tensor, torch.Generator]
     g = torch.Generator().manual_seed(seed)
     recording = NOISE.simulate(N, batch=(3,), generator=g)
     return recording, NOISE.simulate(N, batch=(records, 3), generator=g), g
-
-
-def even(*shape: int, g: torch.Generator) -> Tensor:
-    return torch.rand(shape, generator=g, dtype=torch.float64)
-
-
-def normal(*shape: int, g: torch.Generator) -> Tensor:
-    return torch.randn(shape, generator=g, dtype=torch.float64)
-
-
-def nominated(case: Case, mechanism: type[Mechanism]) -> Finding:
-    found = mechanism.nominate(case, LEVEL)
-    assert found is not None
-    return found
 
 
 def settled(case: Case, found: Finding, g: torch.Generator) -> Case:

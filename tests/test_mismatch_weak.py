@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from mismatch_draws import LEVEL, even, nominated, normal
 from scipy import stats
 from torch import Tensor
 
@@ -16,7 +17,7 @@ from gyrofuse.mismatch import level_scan, shocks
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.confirm import held_out_gain
 from gyrofuse.mismatch.marginals import marginal_witness
-from gyrofuse.mismatch.mechanism import Finding, Mechanism
+from gyrofuse.mismatch.mechanism import Finding
 from gyrofuse.mismatch.mechanisms.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.spikes import Spikes
@@ -24,7 +25,7 @@ from gyrofuse.mismatch.mechanisms.variance_change import VarianceChange
 from gyrofuse.mismatch.outliers import Outliers
 from gyrofuse.mismatch.recurring import band_limits, fits_band, recurring
 
-N, RATE, LEVEL = 16384, 100.0, 5e-4
+N, RATE = 16384, 100.0
 SCENE = Scene(RATE, "deg/s", ("x", "y", "z"))
 
 
@@ -32,20 +33,6 @@ def drawn(seed: int) -> tuple[Tensor, Tensor, torch.Generator]:
     g = torch.Generator().manual_seed(seed)
     noise = WhiteNoise(1.0)
     return noise.simulate(N, batch=(3,), generator=g), noise.simulate(N, batch=(2, 3), generator=g), g
-
-
-def even(*shape: int, g: torch.Generator) -> Tensor:
-    return torch.rand(shape, generator=g, dtype=torch.float64)
-
-
-def normal(*shape: int, g: torch.Generator) -> Tensor:
-    return torch.randn(shape, generator=g, dtype=torch.float64)
-
-
-def nominated(case: Case, mechanism: type[Mechanism]) -> Finding:
-    found = mechanism.nominate(case, LEVEL)
-    assert found is not None
-    return found
 
 
 def covers(found: Finding, name: str, truth: float) -> bool:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.base import Base
-from gyrofuse.mismatch.lines import FoundLine, strongest_line
+from gyrofuse.mismatch.lines import FoundLine, strongest_line, whitened
 from gyrofuse.mismatch.side import Side
 from gyrofuse.mismatch.spectra import Bands, bands
 
@@ -101,6 +101,11 @@ class Case:
     def line(self) -> FoundLine:
         """The strongest line of the recording that the simulation does not have."""
         return strongest_line(self.recorded, self.simulated)
+
+    @cached_property
+    def white(self) -> Tensor:
+        """The recording in units of the simulation's noise, without its means, `(sensor, time)`."""
+        return whitened(self.recording, self.base)
 
     @property
     def block(self) -> int:

@@ -12,6 +12,7 @@ from torch import Tensor
 from gyrofuse.covariance import wavelet_cross_covariance
 from gyrofuse.mismatch.case import N_BLOCKS, Case
 from gyrofuse.mismatch.folds import N_JUDGED, in_fold
+from gyrofuse.mismatch.remembered import remembered
 
 _LEVELS_LEFT = 3  # of a window's longest wavelets, too few coefficients
 _RIDGE = 1.0  # windows' worth of prior on the features' scatter
@@ -21,10 +22,7 @@ _TINY = 1e-300
 
 def distinguishability(case: Case, fold: int) -> float:
     """Area under the ROC curve on windows that a fold holds out, each as long as 1/256 of the recording."""
-    window = case.block
-    recorded = features(case.recording, window)
-    records = case.simulated.signal[:_MOST_RECORDS]
-    simulated = torch.cat([features(record, window) for record in records])
+    recorded, simulated = _both(case)
     everything = torch.cat([recorded, simulated])
     everything = (everything - everything.mean(0)) / everything.std(0).clamp(min=1e-12)
     label = torch.arange(len(everything)) < len(recorded)
@@ -32,6 +30,13 @@ def distinguishability(case: Case, fold: int) -> float:
     judged = in_fold(N_JUDGED, fold)[place // (N_BLOCKS // N_JUDGED) % N_JUDGED]
     score = everything[judged] @ _discriminant(everything[~judged], label[~judged])
     return area_under_curve(score[label[judged]], score[~label[judged]])
+
+
+@remembered
+def _both(case: Case) -> tuple[Tensor, Tensor]:
+    """Features of the windows of the recording and of the simulation."""
+    records = case.simulated.signal[:_MOST_RECORDS]
+    return features(case.recording, case.block), torch.cat([features(record, case.block) for record in records])
 
 
 def features(signal: Tensor, window: int) -> Tensor:

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import Evidence
-from gyrofuse.mismatch.lines import sets_of, simulated_lines, whitened
+from gyrofuse.mismatch.lines import sets_of, simulated_lines
 from gyrofuse.mismatch.remembered import remembered
 
 BLOCKS = 512
@@ -120,8 +120,7 @@ def strongest_slip(case: Case) -> Slip | None:
     tones = [f for f in simulated_lines(case.simulated) if f * block >= _FEWEST_CYCLES][:_TONES]
     if not tones:
         return None
-    signal = whitened(case.recording, case.base)
-    slips = [slip for f in tones for slip in _of_tone(case, signal, f)]
+    slips = [slip for f in tones for slip in _of_tone(case, f)]
     best = min(slips, key=lambda slip: slip.log_p, default=None)
     return None if best is None else replace(best, log_p=best.log_p + math.log(2 * len(tones)))
 
@@ -149,9 +148,9 @@ def best_slope(z: Tensor) -> tuple[float, float]:
     return float(_slopes()[at]) + max(min(offset, 1.0), -1.0) / _FINER, here
 
 
-def _of_tone(case: Case, signal: Tensor, f: float) -> list[Slip]:
+def _of_tone(case: Case, f: float) -> list[Slip]:
     """A skew and a loss of samples, as a tone of about `f` cycles per sample shows them."""
-    z = demodulated(signal, f)
+    z = demodulated(case.white, f)
     length = case.n_samples // BLOCKS * BLOCKS
     seen = _reference(case, f, float(_energy(z).amax()))
     if seen is None and len(z) < 2:

@@ -14,6 +14,7 @@ from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.classifier import distinguishability
 from gyrofuse.mismatch.folds import N_FOLDS, N_JUDGED, held_out_blocks, in_fold
 from gyrofuse.mismatch.mechanism import Mechanism, Z
+from gyrofuse.mismatch.remembered import remembered
 
 _ACCEPTED_T = 1.0
 _BEYOND_DOUBT = 1e-6
@@ -125,14 +126,20 @@ def discrepancy(case: Case, fold: int) -> float:
     On the blocks of the recording that a fold holds out, against all of the simulation, which also tell the variance.
     """
     recorded = _block_moments(held_out_blocks(case.recording, fold))
-    n = case.n_samples // N_JUDGED
-    usable = case.simulated.signal[..., : case.simulated.signal.shape[-1] // n * n]
-    simulated = _block_moments(usable.unflatten(-1, (-1, n))).flatten(0, 1)
+    simulated = _simulated_moments(case)
     n_recorded, n_simulated = len(recorded), len(simulated)
     variance = simulated.var(0) * (1 / n_recorded + 1 / n_simulated)
     # The variance is itself estimated, as in Student's distribution.
     expected = (n_simulated - 1) / (n_simulated - 3)
     return float(((recorded.mean(0) - simulated.mean(0)).square() / variance).mean()) / expected
+
+
+@remembered
+def _simulated_moments(case: Case) -> Tensor:
+    """Of all blocks of the simulation, as long as those that are judged, `(block, moment)`."""
+    n = case.n_samples // N_JUDGED
+    usable = case.simulated.signal[..., : case.simulated.signal.shape[-1] // n * n]
+    return _block_moments(usable.unflatten(-1, (-1, n))).flatten(0, 1)
 
 
 def _block_moments(blocks: Tensor) -> Tensor:

@@ -11,8 +11,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from gyrofuse._transforms import cosine_ordinates, fast_length
+from gyrofuse._transforms import cosine_ordinates
 from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.lines import whitened
 
 N_JUDGED = 32  # blocks
 N_FOLDS = 4
@@ -61,14 +62,8 @@ def signal_gains(case: Case, taken: Tensor, fold: int) -> Tensor:
     Signal and recording are whitened over the whole record, so that what is slower than a block counts as well: with
     `e` and `s` in units of the noise the gain of a sample is `e s - s^2 / 2`.
     """
-    n = case.n_samples
-    length = fast_length(n)
-    f = torch.arange(length // 2 + 1, dtype=torch.float64) / length
-    over = case.base.spectrum(f.clamp(min=1 / length)).rsqrt()
-    both = torch.stack([case.recording, taken])
-    both = both - both.mean(-1, keepdim=True)
-    e, s = torch.fft.irfft(torch.fft.rfft(both, n=length) * over, n=length)[..., :n]
-    return held_out_blocks(e * s - s.square() / 2, fold).sum((0, -1))
+    s = whitened(taken, case.base)
+    return held_out_blocks(case.white * s - s.square() / 2, fold).sum((0, -1))
 
 
 def _log_scores(signal: Tensor, matrices: Tensor, fold: int) -> Tensor:

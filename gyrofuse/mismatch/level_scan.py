@@ -18,7 +18,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-_LOOSE = 0.05  # of the bound on the probability of a mean ratio
+from gyrofuse.mismatch.evidence import ratio_p_value
+from gyrofuse.mismatch.shocks import log_half
+
 _FINEST = 512  # blocks in the record
 _STRIDE = 8  # starts in a stretch
 _LENGTHS = 2  # in an octave
@@ -41,7 +43,7 @@ class LevelScan(NamedTuple):
     @property
     def p_value(self) -> float:
         """Of a level that does not change."""
-        return math.exp(min(math.log(_LOOSE) - self.log_ratio, 0.0))
+        return ratio_p_value(self.log_ratio)
 
 
 def scanned_levels(squares: Tensor) -> LevelScan:
@@ -61,7 +63,7 @@ def scanned_levels(squares: Tensor) -> LevelScan:
         start = torch.arange(0, n_blocks - length + 1, max(length // _STRIDE, 1))
         x = total[:, None, start + length] - total[:, None, start]  # (sensor, 1, place)
         one = -m / 2 * log_r - n / 2 * torch.log1p(x * torch.expm1(-log_r))
-        every = (torch.logaddexp(one, torch.zeros_like(one)) - math.log(2)).sum(0)  # (factor, place)
+        every = log_half(one).sum(0)  # (factor, place)
         logs.append(torch.logsumexp(every.flatten(), 0) - math.log(every.numel()))
         if float(every.max()) > best:
             best, at = float(every.max()), int(start[int(every.amax(0).argmax())])

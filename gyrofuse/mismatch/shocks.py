@@ -18,9 +18,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.evidence import ratio_p_value
 from gyrofuse.mismatch.outliers import Outliers
 
-_LOOSE = 0.05  # of the bound on the probability of a mean ratio
 _SIZES = (1.5, 2.0, 2.7, 3.6, 5.0, 8.0)
 _EVENTS = (4.0, 16.0, 64.0)  # in the record
 _NOTABLE = 0.03  # p l, below which two terms of a series do
@@ -58,7 +58,7 @@ class WeakOutliers(NamedTuple):
     @property
     def p_value(self) -> float:
         """Of no outliers at all."""
-        return math.exp(min(math.log(_LOOSE) - self.log_ratio, 0.0))
+        return ratio_p_value(self.log_ratio)
 
 
 def weak_outliers(z: Tensor) -> WeakOutliers:
@@ -70,7 +70,7 @@ def weak_outliers(z: Tensor) -> WeakOutliers:
     logs = [torch.stack([_log_ratios(z[group], size, rates) for size in _SIZES]) for group in groups]
     alone = [[1 << i for i in range(len(group))] for group in groups]
     single = torch.cat([log[..., own] for log, own in zip(logs, alone, strict=True)], -1)  # (size, rate, sensor)
-    apart = _log_half(single).sum(-1)
+    apart = log_half(single).sum(-1)
     size, rate = divmod(int(apart.argmax()), len(rates))
     sensors, total, together = torch.sigmoid(single[size, rate]), float(_log_mean(apart.flatten())), -math.inf
     several = [[s for s in range(log.shape[-1]) if s.bit_count() > 1] for log in logs]
@@ -118,7 +118,7 @@ def _products(rows: Tensor) -> Tensor:
     return products
 
 
-def _log_half(log_ratio: Tensor) -> Tensor:
+def log_half(log_ratio: Tensor) -> Tensor:
     """`log((1 + E)/2)`."""
     return torch.logaddexp(log_ratio, torch.zeros_like(log_ratio)) - math.log(2)
 

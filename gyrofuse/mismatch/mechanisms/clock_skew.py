@@ -12,7 +12,6 @@ from torch import Tensor
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.clocks import BLOCKS, best_slope, demodulated, strongest_slip
 from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
-from gyrofuse.mismatch.lines import whitened
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.resampling import resampled
 from gyrofuse.mismatch.witnesses import level_of
@@ -91,7 +90,7 @@ class ClockSkew(Mechanism):
 
     def _fitted(self, case: Case, keep: Tensor) -> ClockSkew:
         """Amplitudes with and without the slip, least squares on the samples to keep."""
-        signal = whitened(case.recording, case.base)[list(self.sensors)] * keep
+        signal = case.white[list(self.sensors)] * keep
         turned = [self._carrier(case.n_samples, slips) for slips in (True, False)]
         # Over many cycles the two quadratures are orthogonal.
         slipping, steady = ((2 * signal.to(carrier.dtype) @ carrier.conj()) / keep.sum() for carrier in turned)
@@ -101,13 +100,13 @@ class ClockSkew(Mechanism):
         keep = estimation_samples(case.n_samples, fold)
         if not self.skew:
             return self._fitted(case, keep)
-        signal = whitened(case.recording, case.base)[list(self.sensors)] * keep
+        signal = case.white[list(self.sensors)] * keep
         slope, _ = best_slope(demodulated(signal, self.frequency))
         skew = slope / (self.frequency * (case.n_samples // BLOCKS * BLOCKS))
         return replace(self, skew=skew)._fitted(case, keep)
 
     def gains(self, case: Case, fold: int) -> Tensor:
-        signal = whitened(case.recording, case.base)[list(self.sensors)]
+        signal = case.white[list(self.sensors)]
         scores = []
         for amplitude, slips in ((self.slipping, True), (self.steady, False)):
             tone = (amplitude[:, None] * self._carrier(case.n_samples, slips)).real
