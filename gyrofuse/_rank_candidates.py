@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -21,6 +22,9 @@ _MOST_AR1S = 3
 _ORDER: tuple[type[Process], ...] = (WhiteNoise, QuantizationNoise, AR1, RandomWalk, Drift, Sinusoid)
 # A variance or a shape known to a factor of e^4 either way is not known.
 _UNKNOWN = 2.0
+# Of Hannan and Quinn; more than 1 for a choice that is right in the end. At 1.5 a process too many pays its way in less
+# than 1 % of records of 10^4 to 10^7 samples, where a charge of ln T turns away many of those that are there.
+_HANNAN_QUINN = 1.5
 # AR1s whose time constants differ by less than a tenth.
 _ALIKE = 0.05
 
@@ -54,6 +58,11 @@ def n_unknown(kinds: Kinds, held: bool) -> int:
 def n_parameters(made_of: Composition) -> int:
     """Unknowns of a composition; of a sinusoid amplitude and frequency."""
     return made_of.n_linear + len(made_of.shaped)
+
+
+def charge(made_of: Composition, n_samples: int) -> float:
+    """What its parameters cost in `-2 ln L`: `2 c ln ln T` each."""
+    return n_parameters(made_of) * 2 * _HANNAN_QUINN * math.log(math.log(n_samples))
 
 
 def all_noises(most: int) -> list[Kinds]:

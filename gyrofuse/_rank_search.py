@@ -16,8 +16,10 @@ from gyrofuse._rank_candidates import Key, Kinds
 from gyrofuse._rank_moments import MomentFit, Moments
 from gyrofuse._rank_spectra import NoiseFit, Spectra
 
-# Criteria are minus twice a log posterior probability: up to here, 3 nats, the odds are below 20 to 1.
-EQUIVALENT = 6.0
+# Penalised likelihoods within a factor of e^2 = 7: the record does not decide.
+EQUIVALENT = 4.0
+# Larger compositions are tried as long as the best of a size is at most so much above the best so far.
+_PATIENCE = 6.0
 # Compositions of one size whose children are tried.
 _BEAM = 3
 # Time constants at which the first AR1 starts, as powers of the length.
@@ -59,10 +61,9 @@ class _Search(ABC, Generic[FitT]):
         return made_of, items, _part(fit, items)
 
     def criterion(self, key: Key) -> Tensor:
-        """BIC `(item,)`, infinite where it was not tried."""
+        """Of Hannan and Quinn, `(item,)`, infinite where it was not tried."""
         made_of, fit = self.fits[key]
-        penalty = compositions.n_parameters(made_of) * math.log(self._n_samples)
-        return (self._loss(fit) + penalty).nan_to_num(nan=torch.inf)
+        return (self._loss(fit) + compositions.charge(made_of, self._n_samples)).nan_to_num(nan=torch.inf)
 
     def _widen(self, wanted: list[Kinds]) -> None:
         """From one process to more, for every record the children of its few best, as long as one of them gains."""
@@ -74,7 +75,7 @@ class _Search(ABC, Generic[FitT]):
             for kinds, which in todo.values():
                 self._try_out(kinds, which.nonzero()[:, 0])
             found = torch.stack([self.criterion(key) for key in todo])  # (candidate, item)
-            going = found.amin(0) < best + EQUIVALENT
+            going = found.amin(0) < best + _PATIENCE
             best = torch.minimum(best, found.amin(0))
             kept = (found.argsort(0).argsort(0) < _BEAM) & found.isfinite() & going
             following: dict[Key, tuple[Kinds, Tensor]] = {}

@@ -18,7 +18,7 @@ from torch import Tensor
 from gyrofuse._composition import Composition
 from gyrofuse._cosine_bins import Bins, Noise
 from gyrofuse._spectral_search import maximise, uncertainty
-from gyrofuse._transforms import cosine_ordinates
+from gyrofuse._transforms import ramp_ordinates
 from gyrofuse.processes import AR1, Drift, QuantizationNoise, RandomWalk, WhiteNoise
 from gyrofuse.tones import NoiseSpectrum, Tones, find_tones, line_p_value
 from gyrofuse.whittle import _LEAST_COUNT, _transformed
@@ -67,8 +67,7 @@ class Spectra:
 
     def __init__(self, series: Tensor, tones: Tones | None = None) -> None:
         self.bins = Bins(series.shape[-1], series.device)
-        time = torch.arange(self.bins.n_samples, dtype=torch.float64, device=series.device)
-        shown = cosine_ordinates(time[None])
+        shown = ramp_ordinates(self.bins.n_samples, series.device)[None]
         energy, cross = [], []
         for values in _transformed(series, tones, None):
             energy.append(summed(self.bins, values.square()))

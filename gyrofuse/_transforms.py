@@ -36,6 +36,17 @@ def cosine_ordinates(signal: Tensor) -> Tensor:
     return values
 
 
+def ramp_ordinates(n: int, device: torch.device | None = None) -> Tensor:
+    """Orthonormal DCT-II `(k,)` of the ramp `0, 1, ..., n - 1` without its mean.
+
+    `-sqrt(2/n) cos(w) / (2 sin(w)^2)` with `w = pi k / (2 n)` at odd `k`, nothing at even ones.
+    """
+    w = math.pi / (2 * n) * torch.arange(1, n, 2, dtype=torch.float64, device=device)
+    shown = torch.zeros(n, dtype=torch.float64, device=device)
+    shown[1::2] = w.cos() / w.sin().square() * -math.sqrt(1 / (2 * n))
+    return shown
+
+
 def tone_in_cosines(beta: Tensor, k: Tensor, n: int) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
     """DCT-II coefficients `k` of `cos(beta u)` and `sin(beta u)`, and their derivatives with respect to `beta`.
 

@@ -100,7 +100,7 @@ class RankResult:
 
     def summary(self) -> str:
         """The best candidates, sensor by sensor; of a large batch how often each was chosen."""
-        by = "spectral likelihood (BIC)" if self.from_signal else "likelihood of the wavelet variance (BIC)"
+        by = f"{'spectral likelihood' if self.from_signal else 'likelihood of the wavelet variance'} (Hannan-Quinn)"
         n_items = self.choice.numel()
         lines = [f"Noise models ranked by {by}: {self.n_samples} samples, {len(self.candidates)} candidates"]
         if self.choice.ndim > 1:

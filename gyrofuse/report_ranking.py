@@ -15,7 +15,7 @@ from gyrofuse.report_page import number, render
 
 # Pages stay readable; the JSON file holds all.
 _MOST_SENSORS, _MOST_ROWS = 24, 15
-_MOST_NATS = 15.0  # beyond, odds are no number to print
+_MOST_NATS = 15.0  # beyond, a ratio is no number to print
 
 
 def rank_report(
@@ -87,8 +87,8 @@ def _sentences(result: RankResult, index: tuple[int, ...]) -> Iterator[str]:
 def _why_not(row: dict[str, Any]) -> str:
     """Why the runner-up lost."""
     nats = row["difference"] / 2
-    odds = f"odds of {number(math.exp(nats), 2)} to 1" if nats < _MOST_NATS else "beyond any doubt"
-    told = f"The runner-up, {row['name']}, has a criterion {row['difference']:.1f} above ({odds})"
+    ratio = f"{number(math.exp(nats), 2)} times less likely" if nats < _MOST_NATS else "beyond any doubt"
+    told = f"The runner-up, {row['name']}, has a criterion {row['difference']:.1f} above ({ratio})"
     if row["reason"]:
         return f"{told} and is more than it takes: {row['reason']}."
     if row["p_value"] < 0.01:

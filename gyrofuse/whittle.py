@@ -26,7 +26,7 @@ from gyrofuse._checks import check_floating, check_positive_integer
 from gyrofuse._composition import Composition
 from gyrofuse._cosine_bins import SINGLE, Bins, Noise
 from gyrofuse._spectral_search import maximise, uncertainty
-from gyrofuse._transforms import cosine_ordinates
+from gyrofuse._transforms import cosine_ordinates, ramp_ordinates
 from gyrofuse.processes import Drift, Sinusoid
 from gyrofuse.tones import FEWEST_SAMPLES, Tones, find_tones
 
@@ -207,9 +207,8 @@ class _Ramp:
     """A ramp `slope * t` by weighted least squares on the first ordinates, where all but 1e-6 of it shows."""
 
     def __init__(self, bins: Bins, signal: Tensor, noise: Noise) -> None:
-        time = torch.arange(bins.n_samples, dtype=torch.float64, device=signal.device)
         n_first = min(SINGLE, bins.n_samples - 1)
-        self.shown = cosine_ordinates(time[None])[0, 1 : n_first + 1]
+        self.shown = ramp_ordinates(bins.n_samples, signal.device)[1 : n_first + 1]
         self._bins, self._noise = bins, noise
 
     def measured(self, signal: Tensor, tones: Tones | None, p: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:

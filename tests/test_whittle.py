@@ -19,7 +19,7 @@ from torch import Tensor
 from gyrofuse._composition import Composition
 from gyrofuse._cosine_bins import Bins, Noise
 from gyrofuse._model import Model
-from gyrofuse._transforms import cosine_ordinates
+from gyrofuse._transforms import cosine_ordinates, ramp_ordinates
 from gyrofuse.export import state_space
 from gyrofuse.processes import AR1, Drift, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
 from gyrofuse.whittle import WhittleFit, refine_whittle
@@ -104,6 +104,12 @@ def test_ordinates_are_a_cosine_transform(n):
     found = cosine_ordinates(signal)
     np.testing.assert_allclose(found[:, 1:], signal.numpy() @ dct(n).T, atol=1e-12)
     assert (found[:, 0] == 0).all()
+
+
+@pytest.mark.parametrize("n", [32, 33, 1000])
+def test_ordinates_of_a_ramp(n):
+    ramp = torch.arange(n, dtype=torch.float64)
+    np.testing.assert_allclose(ramp_ordinates(n), cosine_ordinates(ramp[None])[0], atol=1e-10 * n)
 
 
 @pytest.mark.parametrize("n", [40, 41])

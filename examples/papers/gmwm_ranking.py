@@ -25,7 +25,7 @@ from scipy import stats
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse._rank_candidates import Kinds, composition, n_parameters, name_of
+from gyrofuse._rank_candidates import Kinds, charge, composition, name_of
 from gyrofuse._rank_spectra import Spectra, summed
 from gyrofuse.processes import Process
 from gyrofuse.tones import FEWEST_CYCLES
@@ -95,14 +95,15 @@ def share_with_noise(noise: gf.Model, n_samples: int) -> tuple[float, str]:
     kinds = kinds_at(noise, n_samples)
     drawn, truth = drawn_spectra(noise, n_samples)
     own = (drawn.energy / truth + drawn.bins.count * truth.log()).sum(-1)
-    own += n_parameters(composition(kinds, held=True)) * math.log(n_samples)
+    own += charge(composition(kinds, held=True), n_samples)
     shares = [(1.0, "-")]
     for rival in rivals(kinds):
         variance = closest(rival, drawn)
-        energy, charge = drawn.energy, n_parameters(composition(rival, held=True)) * math.log(n_samples)
+        energy = drawn.energy
         if gf.Drift in rival:
             energy = drawn.without_ramp(variance)[2]
-        other = (energy / variance + drawn.bins.count * variance.log()).sum(-1) + charge
+        other = (energy / variance + drawn.bins.count * variance.log()).sum(-1)
+        other += charge(composition(rival, held=True), n_samples)
         shares.append(((other > own).double().mean().item(), name_of(rival)))
     return min(shares)
 
@@ -237,7 +238,7 @@ def main() -> None:
     )
     for ax, (number, table) in zip(axes[:, 0], tables.items(), strict=True):
         for kind, label, color, marker in (
-            ("right", "BIC of the spectral likelihood", "#0072b2", "o"),
+            ("right", "spectral likelihood, Hannan-Quinn", "#0072b2", "o"),
             ("wvic", "WVIC", "#d55e00", "s"),
         ):
             ax.plot([getattr(rate, kind) for _, rate in table], range(len(table)), marker, color=color, label=label)
