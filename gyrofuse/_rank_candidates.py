@@ -61,8 +61,10 @@ def n_parameters(made_of: Composition) -> int:
 
 
 def charge(made_of: Composition, n_samples: int) -> float:
-    """What its parameters cost in `-2 ln L`: `2 c ln ln T` each."""
-    return n_parameters(made_of) * 2 * _HANNAN_QUINN * math.log(math.log(n_samples))
+    """What its parameters cost in `-2 ln L`: `2 c ln ln T` each, the slope of a ramp, known to `T^(-3/2)`, `ln T`."""
+    drifts = kinds_of(made_of).count(Drift)
+    each = 2 * _HANNAN_QUINN * math.log(math.log(n_samples))
+    return (n_parameters(made_of) - drifts) * each + drifts * math.log(n_samples)
 
 
 def all_noises(most: int) -> list[Kinds]:

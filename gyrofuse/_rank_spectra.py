@@ -52,6 +52,18 @@ class NoiseFit:
     log_likelihood: Tensor
 
 
+def gathered(parts: list[tuple[Tensor, Spectra]]) -> Spectra:
+    """Spectra of the items at all places, the last of those at one."""
+    whole = copy(parts[0][1])
+    n_items = int(torch.cat([places for places, _ in parts]).max()) + 1
+    for name in ("energy", "cross", "count"):
+        values = whole.energy.new_empty(n_items, whole.energy.shape[-1])
+        for places, part in parts:
+            values[places] = getattr(part, name)
+        setattr(whole, name, values)
+    return whole
+
+
 def summed(bins: Bins, values: Tensor) -> Tensor:
     """Sums `(item, bin)` of what is given for ordinates `(item, k)`."""
     return torch.stack([values[:, a:b].sum(-1) for a, b in itertools.pairwise(bins.edges)], -1)
@@ -84,11 +96,6 @@ class Spectra:
         some = copy(self)
         some.energy, some.cross, some.count = self.energy[items], self.cross[items], self.count[items]
         return some
-
-    def put(self, places: Tensor, other: Spectra, which: Tensor) -> None:
-        """Put the items `which` of other spectra into places of these."""
-        for name in ("energy", "cross", "count"):
-            getattr(self, name)[places] = getattr(other, name)[which]
 
     def fit(self, made_of: Composition, linear: Tensor, shape: Tensor) -> NoiseFit:
         """Climb from `p` and `x` to the maximum next to them, the slope of a ramp solved for."""
@@ -227,7 +234,7 @@ def decide_lines(series: Tensor, allowed: list[int], level: float, ramp: bool) -
     rest = series.to(torch.float64).clone()
     searched = detrended(rest) if ramp else rest.clone()
     clean = searched.clone()
-    spectra = Spectra(rest)
+    parts = []
     n_tones = torch.zeros(len(series), dtype=torch.long, device=series.device)
     todo = torch.arange(len(series), device=series.device)
     density: NoiseSpectrum | None = None
@@ -246,8 +253,11 @@ def decide_lines(series: Tensor, allowed: list[int], level: float, ramp: bool) -
         if k in allowed:
             n_tones[todo] = k
             rest[todo] = series[todo] - wave
-            spectra.put(todo, part, line)
-    return Lines(n_tones, rest, spectra)
+            parts.append((todo, part.part(line)))
+    plain = (n_tones == 0).nonzero()[:, 0]
+    if len(plain):
+        parts.insert(0, (plain, Spectra(rest[plain])))
+    return Lines(n_tones, rest, gathered(parts))
 
 
 def detrended(series: Tensor) -> Tensor:

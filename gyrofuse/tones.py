@@ -67,12 +67,16 @@ class Tones:
 
     def waveform(self, n_samples: int) -> Tensor:
         """Sum of the tones over a record, `(..., time)`, signal."""
-        time = torch.arange(1, n_samples + 1, dtype=self.beta.dtype, device=self.beta.device)
-        total = self.beta.new_zeros(*self.beta.shape[:-1], n_samples)
-        parameters = (v.unbind(-1) for v in (self.beta, self.amplitude, self.phase))
-        for beta, amplitude, phase in zip(*parameters, strict=True):
-            total += amplitude[..., None] * torch.sin(beta[..., None] * time + phase[..., None])
-        return total
+        size = math.isqrt(n_samples - 1) + 1
+        n_blocks = -(-n_samples // size)
+        start = size * torch.arange(n_blocks, dtype=self.beta.dtype, device=self.beta.device)
+        within = torch.arange(1, size + 1, dtype=self.beta.dtype, device=self.beta.device)
+        # sin(a + b) = sin a cos b + cos a sin b, of block and place in it, for all tones in one product.
+        a = self.beta[..., None] * start + self.phase[..., None]  # (..., tone, block)
+        b = self.beta[..., None] * within
+        size_of = self.amplitude[..., None]
+        blocks = torch.cat([size_of * a.sin(), size_of * a.cos()], -2).mT @ torch.cat([b.cos(), b.sin()], -2)
+        return blocks.flatten(-2)[..., :n_samples]
 
 
 def find_tones(
