@@ -2,10 +2,12 @@
 
 Recordings are made from physics by a generator that knows nothing of the library; the truth is sealed, its SHA-256
 printed; every case is diagnosed with what a user would have; answers are frozen; then a judge opens the truth and
-counts, with binomial intervals. The folder receives all of it. `--quick` has a few small cases of each mechanism.
+counts, with binomial intervals. The folder receives all of it, and curves of detection against the size of effects.
+`--data` adds effects put into real recordings at rest, of a folder with `adis16405_rec1.npz` to `3`. `--quick` has a
+few small cases of each mechanism.
 
     python examples/blind_proof.py [--per-kind N] [--nulls N] [--nats L [L ...]] [--group G [G ...]] [--samples T]
-        [--seed S] [--workers W] [--quick] [--out FOLDER]
+        [--seed S] [--workers W] [--data FOLDER] [--quick] [--out FOLDER]
 """
 
 from __future__ import annotations
@@ -23,7 +25,9 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "benchmarks"))
 
 from blind.analyser import analyse
-from blind.cases import NATS
+from blind.cases import GROUPS, NATS
+from blind.curves import draw_curves
+from blind.field import FILES
 from blind.trial import plan_trial, run_trial
 
 
@@ -33,26 +37,32 @@ def main() -> None:
     parser.add_argument("--nulls", type=int, default=50, help="cases of each kind without an effect")
     parser.add_argument("--nats", type=float, nargs="+", default=list(NATS), help="sizes, log likelihood ratios")
     parser.add_argument(
-        "--group", nargs="+", help="mechanism, null, pair, two, outside, unidentifiable; all by default"
+        "--group", nargs="+", choices=[*GROUPS, "real"], help="of cases; all by default, real ones with --data"
     )
     parser.add_argument("--samples", type=int, default=65536, help="of each recording")
     parser.add_argument("--seed", type=int, help="drawn, and printed, by default")
     parser.add_argument("--workers", type=int, default=2, help="processes")
+    parser.add_argument("--data", type=Path, help="folder with real recordings")
     parser.add_argument("--quick", action="store_true", help="a small proof, in minutes")
     parser.add_argument("--out", type=Path, default=Path("blind_proof"), help="folder of what is written")
     options = parser.parse_args()
     if options.quick:
         options.per_kind, options.nulls, options.nats, options.samples = 1, 1, [100.0], 16384
         options.group = options.group or ["mechanism", "null"]
+    groups = options.group or [*GROUPS, *(["real"] if options.data else [])]
+    if "real" in groups and not (options.data and all((options.data / name).is_file() for name in FILES)):
+        parser.error(f"--data: expected a folder with {', '.join(FILES)}, got {options.data}")
     seed = secrets.randbits(64) if options.seed is None else options.seed
-    plan = plan_trial(options.per_kind, options.nulls, tuple(options.nats), seed=seed, groups=options.group)
+    plan = plan_trial(options.per_kind, options.nulls, tuple(options.nats), seed=seed, groups=groups)
     print(f"{len(plan)} cases of {options.samples} samples, seed {seed}", flush=True)
     with ProcessPoolExecutor(options.workers, initializer=partial(torch.set_num_threads, 1)) as pool:
         over = partial(pool.map, chunksize=1)
-        verdict = run_trial(plan, analyse, options.out, n_samples=options.samples, over=over)
+        verdict = run_trial(plan, analyse, options.out, n_samples=options.samples, over=over, data=options.data)
     digests = json.loads((options.out / "digests.json").read_text())
     print(f"truth   {digests['truth']}\nanswers {digests['answers']}\n")
     print(verdict)
+    if draw_curves(verdict, options.out / "curves.png"):
+        print(f"\nFigure: {options.out / 'curves.png'}")
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from blind import (
     bench,
     cases,
     converter,
+    field,
     judge,
     likelihood,
     mechanics,
@@ -30,10 +31,12 @@ from blind import (
 )
 from blind.analog import OVERSAMPLING, consumer_base
 from blind.cases import make_case
+from blind.curves import draw_curves
 
 BLIND = Path(__file__).parent / "benchmarks" / "blind"
 N = 8192
-EFFECTS = [name for name in cases.kinds() if cases.KINDS[name].group not in ("null", "unidentifiable")]
+MADE = [name for group in cases.GROUPS for name in cases.kinds(group)]
+EFFECTS = [name for name in MADE if cases.KINDS[name].group not in ("null", "unidentifiable")]
 
 
 def test_generator_knows_nothing_of_the_library():
@@ -43,7 +46,7 @@ def test_generator_knows_nothing_of_the_library():
         ), path
 
 
-@pytest.mark.parametrize("kind", cases.kinds())
+@pytest.mark.parametrize("kind", MADE)
 def test_case_is_complete_and_repeatable(kind):
     n = 2048
     first, again = (make_case(kind, 30.0, 5, n_samples=n) for _ in range(2))
@@ -325,7 +328,8 @@ def effect(**changes):
 
 def truth(group="mechanism", effects=None, kind="step", nats=30.0):
     effects = [effect()] if effects is None else effects
-    return {"group": group, "kind": kind, "nats": nats, "effects": effects, "true_gain": 28.0}
+    whose = {"group": group, "kind": kind, "nats": nats, "effects": effects}
+    return whose | {"true_gain": 28.0, "n_samples": 4096, "simulated": 8192}
 
 
 def answer(*named, mismatch=True, **fields):
@@ -392,6 +396,12 @@ def test_judge_of_the_other_groups():
     assert verdict.row("unidentifiable: abstained")[3:] == (1, 2)
     assert verdict.row("two: both in class")[3:] == (1, 2)
     assert verdict.row("two: at least one in class")[3:] == (2, 2)
+    real = truth("real", [effect()], "real:step")
+    untouched = truth("real", [], "real:untouched", None)
+    found = judge.judge([real, real, untouched], [answer("step"), answer("flicker"), answer("flicker")])
+    assert found.row("real: right name")[3:] == (1, 2)
+    assert found.row("real: something else named")[3:] == (1, 2)
+    assert found.row("real, untouched: something named")[3:] == (1, 1)
 
 
 def test_scores_of_sensors_and_intervals():
@@ -408,6 +418,47 @@ def test_scores_of_sensors_and_intervals():
     assert not scoring.oracle_detects(weak | {"oracle_llr": 2.69}, 0.01)  # -3 + 2.326 sqrt 6 = 2.698
     assert scoring.oracle_detects(weak | {"oracle_llr": 2.71}, 0.01)
     assert scoring.oracle_detects(effect(nats=30.0, oracle_llr=5.0, oracle_law="bound"), 0.01)
+
+
+@pytest.mark.parametrize("kind", cases.kinds("real"))
+def test_effects_in_real_recordings(kind, shared):
+    """The background is there unchanged, the simulation is its continuation, the effect has its size in its noise."""
+    data = shared / "data"
+    n = 4096
+    case = make_case(kind, 30.0, 5, n_samples=n, data=data)
+    again = make_case(kind, 30.0, 5, n_samples=n, data=data)
+    np.testing.assert_array_equal(case.recording["gyro"], again.recording["gyro"])
+    assert case.recording["gyro"].shape == case.simulation["gyro"].shape == (3, n)
+    assert case.recording["fs"] == 100.0
+    added = make_case("real:untouched", None, 5, n_samples=n, data=data).recording["gyro"]
+    assert np.allclose(added / 0.05, np.round(added / 0.05))  # counts
+    json.dumps(seal.plain(case.truth), allow_nan=False)
+    if case.truth["effects"]:
+        (effect,) = case.truth["effects"]
+        assert sum(effect["sensor_nats"] or [30.0]) == pytest.approx(30, rel=1e-6)
+
+
+def test_real_recordings_are_asked_for():
+    with pytest.raises(ValueError, match=r"`data`: expected a folder with adis16405_rec1.npz"):
+        make_case("real:step", 30.0, 1)
+
+
+def test_spectrum_of_a_stretch():
+    """White noise of two levels; the bands of the upper half have 700 ordinates and more, 5 %."""
+    rng = np.random.default_rng(4)
+    base = field.measured_base(rng.standard_normal((2, N)) * np.array([[1.0], [3.0]]), 100.0)
+    np.testing.assert_allclose(base.white, [1.0, 9.0], rtol=0.2)
+    np.testing.assert_allclose(base.spectrum(N)[:, N // 2 :], np.outer([1.0, 9.0], np.ones(N // 2 - 1)), rtol=0.25)
+    with pytest.raises(ValueError, match="as measured"):
+        base.components(N // 2)
+
+
+def test_curves_are_drawn(tmp_path):
+    found = judge.judge([truth("mechanism", [effect()])] * 2, [answer("step"), SILENT])
+    assert draw_curves(found, tmp_path / "curves.png")
+    assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
+    assert not draw_curves(judge.judge([truth("null", [], "null", None)], [SILENT]), tmp_path / "none.png")
+    assert not (tmp_path / "none.png").exists()
 
 
 def test_concealed_is_what_wavelet_variances_do_not_show():

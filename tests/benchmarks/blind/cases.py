@@ -11,12 +11,13 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from . import marginal, mechanics, shapes, spectral, strange, thermal
+from . import field, marginal, mechanics, shapes, spectral, strange, thermal
 from .analog import Base, consumer_base
 from .bench import Bench, Part
 from .converter import round_to_lattice
@@ -24,6 +25,7 @@ from .converter import round_to_lattice
 Array = NDArray[np.float64]
 RATE = 200.0
 NATS = (3.0, 10.0, 30.0, 100.0)
+GROUPS = ("mechanism", "null", "pair", "two", "outside", "unidentifiable")  # and "real", which needs recordings
 
 
 class Case(NamedTuple):
@@ -36,7 +38,7 @@ class Case(NamedTuple):
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of case: its group, the effects, and what else lies on the table."""
+    """A kind of case: its group, the effects, and what else lies on the table; the group "real" has real noise."""
 
     group: str
     effects: tuple[Callable[[Bench, float], Part], ...] = ()
@@ -141,6 +143,17 @@ _UNIDENTIFIABLE: dict[str, tuple[Callable[[Bench, float], Part], dict[str, Any]]
     "alias": (strange.alias, {"share": 1.0}),
 }
 
+_REAL: dict[str, tuple[Callable[[Bench, float], Part], ...]] = {
+    "untouched": (),
+    "vibration_tone": (shapes.vibration_tone,),
+    "step": (shapes.step,),
+    "temperature_drift": (shapes.temperature_drift,),
+    "warm_up_transient": (_with(shapes.warm_up_transient, thermometer="board"),),
+    "g_sensitivity": (shapes.g_sensitivity,),
+    "scale_factor": (shapes.scale_factor,),
+    "spikes": (_with(marginal.spikes, simultaneous=False),),
+}
+
 KINDS: dict[str, Kind] = {
     **{name: Kind("mechanism", (effect,)) for name, effect in _MECHANISMS.items()},
     **{name: Kind("null", (), tuple(options.items())) for name, options in _NULLS.items()},
@@ -148,15 +161,18 @@ KINDS: dict[str, Kind] = {
     **{f"two:{name}": Kind("two", tuple(_MECHANISMS[part] for part in parts)) for name, parts in _COMBINED.items()},
     **{f"outside:{name}": Kind("outside", (effect,)) for name, effect in _OUTSIDE.items()},
     **{f"blind:{name}": Kind("unidentifiable", (e,), tuple(o.items())) for name, (e, o) in _UNIDENTIFIABLE.items()},
+    **{f"real:{name}": Kind("real", effects) for name, effects in _REAL.items()},
 }
 
 
 def kinds(group: str | None = None) -> list[str]:
-    """Names of the kinds, of one group: mechanism, null, pair, two, outside, unidentifiable."""
+    """Names of the kinds, of one group: mechanism, null, pair, two, outside, unidentifiable, real."""
     return [name for name, kind in KINDS.items() if group in (None, kind.group)]
 
 
-def make_case(kind: str, nats: float | None, seed: int, *, n_samples: int = 65536, rate: float = RATE) -> Case:
+def make_case(
+    kind: str, nats: float | None, seed: int, *, n_samples: int = 65536, rate: float = RATE, data: Path | None = None
+) -> Case:
     """One case, the same for the same arguments.
 
     Args:
@@ -164,7 +180,8 @@ def make_case(kind: str, nats: float | None, seed: int, *, n_samples: int = 6553
         nats: Detectability of each effect, 100 if None; nothing to kinds without an effect, and to bare rounding.
         seed: Of all random numbers.
         n_samples: Length of the recording.
-        rate: In Hz.
+        rate: In Hz; real recordings have their own.
+        data: Folder of the real recordings, for kinds that need one.
 
     Returns:
         Recording, simulation and truth.
@@ -175,13 +192,24 @@ def make_case(kind: str, nats: float | None, seed: int, *, n_samples: int = 6553
     nats = (100.0 if nats is None else float(nats)) if made.effects else None
     root = np.random.SeedSequence([seed, zlib.crc32(kind.encode()), round(1000 * (nats or 0))])
     of_base, of_effect, of_recording, of_simulation, of_table = map(np.random.default_rng, root.spawn(5))
-    base = _base(made, of_base, rate)
+    real = None
+    if made.group == "real":
+        if data is None:
+            raise ValueError(f"`data`: expected a folder with {', '.join(field.FILES)} for {kind}, got none")
+        real = field.background(data, n_samples, of_base)
+        rate = real.rate
+    base = field.measured_base(real.recording, rate) if real else _base(made, of_base, rate)
     bench = Bench(base, n_samples, of_effect)
     parts = [effect(bench, nats) for effect in made.effects if nats is not None]
 
-    gyro, llrs = _record(bench, parts, of_recording)
-    simulation = _simulation(made, bench, parts, of_simulation)
-    channels = _channels(made, bench, of_table)
+    if real:
+        gyro, llrs = _converted(bench, parts, real.recording)
+        simulation: dict[str, Any] = {"gyro": real.simulation, "fs": rate, "unit": "deg/s"}
+        channels: dict[str, Array] = {}
+    else:
+        gyro, llrs = _record(bench, parts, of_recording)
+        simulation = _simulation(made, bench, parts, of_simulation)
+        channels = _channels(made, bench, of_table)
     for part in parts:
         channels |= part.channels
     if made.option("known_tone"):
@@ -203,6 +231,7 @@ def make_case(kind: str, nats: float | None, seed: int, *, n_samples: int = 6553
         "nats": nats,
         "n_samples": n_samples,
         "rate_hz": rate,
+        "simulated": simulation["gyro"].shape[-1] if "gyro" in simulation else None,
         "effects": effects,
         "true_gain": float(sum(llrs)) if parts and finite else None,
     }
@@ -226,7 +255,11 @@ def _record(bench: Bench, parts: list[Part], rng: np.random.Generator) -> tuple[
     for part in parts:
         if part.analog is not None:
             analog = part.analog(analog)
-    gyro = bench.sampled(analog)
+    return _converted(bench, parts, bench.sampled(analog))
+
+
+def _converted(bench: Bench, parts: list[Part], gyro: Array) -> tuple[Array, list[float]]:
+    """What parts add to a sampled signal and its converter makes of it, and each one's log likelihood ratio."""
     for part in parts:
         if part.signal is not None:
             gyro = gyro + part.signal

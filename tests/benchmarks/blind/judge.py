@@ -165,27 +165,36 @@ def _single(counts: _Counts, figures: Any, truth: Record, answer: Record | None,
     if not prefix:
         (effect,) = truth["effects"]
         counts.add("oracle detects", scoring.oracle_detects(effect, false_alarm), (truth["kind"],), truth["nats"])
+        counts.add(f"detected, simulation {_length(truth)}", scoring.detected(answer), (truth["kind"],), truth["nats"])
         _details(counts, figures, effect, answer)
         _held_out(counts, figures, truth, answer)
 
 
-def _details(counts: _Counts, figures: Any, effect: Record, answer: Record | None) -> None:
+def _length(truth: Record) -> str:
+    """Of the simulation: what a comparison with few samples cannot show, no analyst can."""
+    simulated = truth["simulated"]
+    return "a model" if simulated is None else f"{simulated / truth['n_samples']:g} times as long"
+
+
+def _details(counts: _Counts, figures: Any, effect: Record, answer: Record | None, prefix: str = "") -> None:
     """What is said of an effect whose name is right."""
     finding, name = scoring.match(effect, answer), effect["mechanism"]
     if finding is None or finding["mechanism"] != name:
         return
     exact, resolved = scoring.right_sensors(effect, finding)
-    counts.add("exact sensors", exact, (name,))
-    counts.add("exact sensors, resolved ones", resolved, (name,))
+    counts.add(f"{prefix}exact sensors", exact, (name,))
+    counts.add(f"{prefix}exact sensors, resolved ones", resolved, (name,))
     for line, error in (
         ("frequency", scoring.frequency_error(effect, finding)),
         ("onset", scoring.onset_error(effect, finding)),
     ):
         if error is not None:
-            counts.add(f"{line} within 3 sd of the oracle", error <= 3, (name,))
-            figures[f"{line} error / sd of the oracle", name].append(error)
+            counts.add(f"{prefix}{line} within 3 sd of the oracle", error <= 3, (name,))
+            figures[f"{prefix}{line} error / sd of the oracle", name].append(error)
     for parameter, covered in scoring.coverage(effect, finding):
-        counts.add("interval covers", covered, (f"{name}.{parameter}",))
+        counts.add(f"{prefix}interval covers", covered, (f"{name}.{parameter}",))
+    if prefix:
+        return
     unmatched = scoring.unmatched(effect, finding)
     for parameter in finding.get("parameters") or {}:
         counts.add("parameter can be judged", parameter not in unmatched, (f"{name}.{parameter.partition('[')[0]}",))
@@ -238,6 +247,22 @@ def _unidentifiable(counts: _Counts, figures: Any, truth: Record, answer: Record
     ), (truth["kind"],))  # fmt: skip
 
 
+def _real(counts: _Counts, figures: Any, truth: Record, answer: Record | None, false_alarm: float) -> None:
+    """Of an effect put into a real recording; what else is found there may be there."""
+    of, nats = (truth["kind"],), truth["nats"]
+    if not truth["effects"]:
+        counts.add("real, untouched: detected", scoring.detected(answer), of)
+        counts.add("real, untouched: something named", bool(scoring.findings(answer)), of)
+        return
+    (effect,) = truth["effects"]
+    finding = scoring.match(effect, answer)
+    counts.add("real: detected", scoring.detected(answer), of, nats)
+    counts.add("real: right name", finding is not None and finding["mechanism"] == effect["mechanism"], of, nats)
+    counts.add("real: right class", finding is not None, of, nats)
+    counts.add("real: something else named", bool(scoring.wrong_names(truth, answer)), of, nats)
+    _details(counts, figures, effect, answer, "real: ")
+
+
 _GROUPS: dict[str, Callable[[_Counts, Any, Record, Record | None, float], None]] = {
     "null": _null,
     "mechanism": _single,
@@ -245,6 +270,7 @@ _GROUPS: dict[str, Callable[[_Counts, Any, Record, Record | None, float], None]]
     "two": _two,
     "outside": _outside,
     "unidentifiable": _unidentifiable,
+    "real": _real,
 }
 
 

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .cases import KINDS, NATS, RATE, make_case
+from .cases import GROUPS, KINDS, NATS, RATE, Case, make_case
 from .judge import Verdict, judge
 from .ordinary_view import is_concealed
 from .seal import freeze, seal, unseal
@@ -35,7 +35,7 @@ class Item(NamedTuple):
 
 
 def plan_trial(
-    per_kind: int, nulls: int, nats: Sequence[float] = NATS, *, seed: int, groups: Sequence[str] | None = None
+    per_kind: int, nulls: int, nats: Sequence[float] = NATS, *, seed: int, groups: Sequence[str] = GROUPS
 ) -> list[Item]:
     """Cases in random order.
 
@@ -44,13 +44,13 @@ def plan_trial(
         nulls: Cases of each kind without one.
         nats: Detectabilities.
         seed: Of the order and of the cases' seeds.
-        groups: Of kinds; all by default.
+        groups: Of kinds; by default all but "real", which asks for recordings.
     """
     items: list[tuple[str, float | None]] = []
     for name, kind in KINDS.items():
-        if groups is not None and kind.group not in groups:
+        if kind.group not in groups:
             continue
-        if kind.group == "null":
+        if not kind.effects:
             items += [(name, None)] * nulls
         elif kind.group == "unidentifiable" or name == "quantization_bare":
             items += [(name, None)] * (per_kind * len(nats))
@@ -70,6 +70,7 @@ def run_trial(
     rate: float = RATE,
     false_alarm: float = 0.01,
     over: Mapping = map,
+    data: Path | None = None,
 ) -> Verdict:
     """Truths are sealed before the first recording is shown; the truth is opened once the answers are frozen.
 
@@ -84,13 +85,15 @@ def run_trial(
         rate: Hz.
         false_alarm: Error rate that the analyst is held to.
         over: `map`, or the `map` of a pool of processes, which gives answers in order.
+        data: Folder of real recordings, for the group "real".
     """
     at = Path(folder)
     at.mkdir(parents=True, exist_ok=True)
-    truths = [make_case(*item, n_samples=n_samples, rate=rate).truth for item in plan]
+    made = partial(_made, n_samples, rate, data)
+    truths = [made(item).truth for item in plan]
     digests = {"truth": seal(truths, at / "truth.json")}
     (at / "digests.json").write_text(json.dumps(digests))
-    answered = list(over(partial(_answered, analyse, n_samples, rate), plan))
+    answered = list(over(partial(_answered, analyse, made), plan))
     failures = [f"case {number}\n{entry.failure}\n" for number, entry in enumerate(answered) if entry.failure]
     if failures:
         (at / "failures.txt").write_text("".join(failures))
@@ -109,9 +112,13 @@ class _Answered(NamedTuple):
     failure: str | None
 
 
-def _answered(analyse: Analyse, n_samples: int, rate: float, item: Item) -> _Answered:
+def _made(n_samples: int, rate: float, data: Path | None, item: Item) -> Case:
+    return make_case(*item, n_samples=n_samples, rate=rate, data=data)
+
+
+def _answered(analyse: Analyse, made: Callable[[Item], Case], item: Item) -> _Answered:
     """One case answered; a diagnosis that fails is counted by the judge as nothing detected, nothing named."""
-    case = make_case(*item, n_samples=n_samples, rate=rate)
+    case = made(item)
     hidden = is_concealed(case)
     try:
         return _Answered(analyse(case.recording, case.simulation), hidden, None)
