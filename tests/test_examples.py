@@ -50,6 +50,16 @@ def test_stream(tmp_path: Path, chunk: int):
     )
 
 
+def test_blind_bias(tmp_path: Path):
+    """A step looks like a random walk thousands of times as large."""
+    out = run("blind_bias.py", "--quick", cwd=tmp_path)
+    as_recorded, corrected = (
+        float(word) for word in next(v for v in out.splitlines() if v[:4] == "step").split()[2::3]
+    )
+    assert as_recorded > 1000
+    assert corrected < 10
+
+
 def test_robust_fit(tmp_path: Path):
     signal = torch.randn(1, 20_000, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     signal[:, ::5000] += 50

@@ -20,10 +20,11 @@ _PROCESSES = {
 
 def analyse(recording: dict[str, Any], simulation: dict[str, Any], *, false_alarm: float = 0.01) -> dict[str, Any]:
     """Diagnose arrays as they lie in a log, and give the report's dictionary."""
-    return gf.diagnose(_recording(recording), _simulation(simulation), false_alarm=false_alarm).to_dict()
+    return gf.diagnose(recording_of(recording), simulation_of(simulation), false_alarm=false_alarm).to_dict()
 
 
-def _recording(arrays: dict[str, Any]) -> gf.Recording:
+def recording_of(arrays: dict[str, Any]) -> gf.Recording:
+    """Gyroscopes and auxiliary channels."""
     channels = {
         name: torch.as_tensor(values, dtype=torch.float64)
         for name, values in arrays.items()
@@ -33,9 +34,13 @@ def _recording(arrays: dict[str, Any]) -> gf.Recording:
     return gf.Recording(signal, rate=float(arrays["fs"]), unit=str(arrays["unit"]), channels=channels)
 
 
-def _simulation(given: dict[str, Any]) -> gf.Recording | gf.ArrayModel:
+def simulation_of(given: dict[str, Any]) -> gf.Recording | gf.ArrayModel:
+    """Samples, or a noise model."""
     if "terms" not in given:
-        return _recording(given)
-    return gf.ArrayModel.from_sensors(
-        [gf.Model([_PROCESSES[name](**numbers) for name, numbers in sensor]) for sensor in given["terms"]]
-    )
+        return recording_of(given)
+    return gf.ArrayModel.from_sensors(noise_models(given["terms"]))
+
+
+def noise_models(terms: list[list[list[Any]]]) -> list[gf.Model]:
+    """One for each sensor."""
+    return [gf.Model([_PROCESSES[name](**numbers) for name, numbers in sensor]) for sensor in terms]

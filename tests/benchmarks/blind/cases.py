@@ -231,6 +231,7 @@ def make_case(
         "nats": nats,
         "n_samples": n_samples,
         "rate_hz": rate,
+        "base": None if real else bench.base.terms(),
         "simulated": simulation["gyro"].shape[-1] if "gyro" in simulation else None,
         "effects": effects,
         "true_gain": float(sum(llrs)) if parts and finite else None,
