@@ -21,6 +21,8 @@ from gyrofuse.mismatch.telling import (
     chance,
     fused_words,
     mechanism_words,
+    nats,
+    otherwise_words,
     parameter_words,
     verdict,
 )
@@ -82,6 +84,7 @@ def mismatch_page(outcome: Outcome, *, title: str, remarks: Sequence[str] = ()) 
         moving=scene.sensors[moving],
         lines=lines,
         witnesses=_witnesses(outcome),
+        otherwise=[capital(words) for words in map(otherwise_words, outcome.findings) if words],
         looked_for=_looked_for(outcome),
         fused=_fused(outcome),
     )
@@ -117,6 +120,7 @@ def _part(outcome: Outcome, finding: Finding) -> dict[str, Any]:
         "follows": finding.channel or "",
         "p value": chance(finding.p_value),
         "gain held out": "" if finding.held_out_gain is None else f"{finding.held_out_gain:+.1f} nats",
+        "lost if left out alone": "" if finding.gain_without is None else f"{nats(finding.gain_without)} nats",
     }
     return {
         "name": mechanism_words(finding.mechanism),

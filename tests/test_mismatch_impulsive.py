@@ -349,28 +349,6 @@ def test_the_gaussian_likelihood_is_that_of_the_normal_law() -> None:
     assert mine[0, 0, 0] == pytest.approx(log_density(n) - log_density(n // 2), abs=1e-6)
 
 
-def test_the_likelihood_of_two_levels_sums_over_all_paths() -> None:
-    rng = np.random.default_rng(2)
-    n, r, q, half, up, down = 12, 0.3, 0.01, 1.0, 4.0, 6.0
-    y = rng.normal(size=n) * math.sqrt(r) + half * np.repeat([1, -1, 1], 4)
-    k = np.arange(n)
-    covariance = switching._LARGEST * (r + half**2) + q * (np.minimum(k[:, None], k) + 1) + r * np.eye(n)
-    leave, enter = 1 - math.exp(-1 / up), 1 - math.exp(-1 / down)
-    move = {(1, 1): 1 - leave, (1, -1): leave, (-1, 1): enter, (-1, -1): 1 - enter}
-
-    def log_density(m: int) -> float:
-        paths = np.array(list(itertools.product((1, -1), repeat=m)))
-        prior = np.where(paths[:, 0] == 1, enter, leave) / (leave + enter)
-        for a, b in itertools.pairwise(range(m)):
-            prior = prior * np.array([move[i, j] for i, j in paths[:, [a, b]].tolist()])
-        law = stats.multivariate_normal(np.full(m, y.mean()), covariance[:m, :m])
-        return float(np.log((prior * np.exp(law.logpdf(y[:m] - half * paths))).sum())) + m / 2 * math.log(2 * math.pi)
-
-    mine = switching.switching_scores(_stretch(y, r, q), *(np.array([[v]]) for v in (half, up, down)))
-    # Four pairs merged to two after each block: an approximation.
-    assert mine[0, 0, 0] == pytest.approx(log_density(n) - log_density(n // 2), abs=0.1)
-
-
 def test_two_levels_are_telegraph_noise_and_an_ar1_is_not() -> None:
     recording, simulation, g = drawn(40)
     recording[1] += 0.8 * _path(N, 120.0, 180.0, g)

@@ -25,9 +25,10 @@ from gyrofuse.mismatch.mechanisms.low_pass import LowPassFilter
 from gyrofuse.mismatch.mechanisms.parameter_shift import ParameterShift
 from gyrofuse.mismatch.mechanisms.resonance import Resonance
 from gyrofuse.mismatch.oscillating import Mode
-from gyrofuse.mismatch.pooled import common_witness, shape_witness
+from gyrofuse.mismatch.pooled import common_witness
 from gyrofuse.mismatch.shape_fit import Ratios, data_model, fit, linearised, log_score
 from gyrofuse.mismatch.shape_law import equivalent, smooth_coherence
+from gyrofuse.mismatch.shape_scan import shape_witness
 from gyrofuse.mismatch.shape_terms import (
     Common,
     Flicker,

@@ -10,9 +10,23 @@ import torch
 from scipy import stats
 
 import gyrofuse as gf
+from gyrofuse.mismatch import shape_scan
 from gyrofuse.mismatch.base import _time_constants, fit_base
 from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.folds import N_FOLDS
 from gyrofuse.mismatch.lines import _log_hotelling, sets_of, simulated_lines, strongest_line, without_lines
+from gyrofuse.mismatch.shape_bands import (
+    N_SLOW,
+    deep_base,
+    narrow,
+    narrow_bands,
+    neighbours,
+    slow,
+    slow_fold,
+    slow_gains,
+    slow_ordinates,
+)
+from gyrofuse.mismatch.shape_scan import scanned, shape_witness
 from gyrofuse.mismatch.side import Side
 from gyrofuse.mismatch.spectra import bands, cross_spectra, hann_transform
 
@@ -193,3 +207,95 @@ def test_hann_transform_has_the_density_as_mean_square():
     at = torch.tensor([0.05, 0.2, 0.4])
     found = transform.abs().square().mean(0)[(at * length).round().long()]
     assert ((found / gf.AR1(0.9, 1.0).spectrum(at) - 1).abs() < 0.2).all()
+
+
+# Down to the slowest ordinates ---------------------------------------------------------------------------------------
+
+
+def walking(seed: int, factor: float = 1.0, n: int = 4096) -> Case:
+    g = generator(seed)
+    one, other = (gf.WhiteNoise(1.0) + gf.RandomWalk(1e-5 * x) for x in (factor, 1.0))
+    return case(one.simulate(n, batch=(3,), generator=g), other.simulate(n, batch=(4, 3), generator=g))
+
+
+def test_powers_of_neighbouring_narrow_bands_are_correlated_as_said():
+    wanted, n_runs = narrow_bands(512), 4000
+    x = torch.randn(n_runs, 1, 512, generator=generator(20), dtype=torch.float64)
+    power = cross_spectra(x, wanted)[..., 0, 0].real
+    found = torch.corrcoef(power.mT).diagonal(1)
+    # Standard deviations of a correlation are 1 / sqrt(n); of some forty none is 4.5 of them away.
+    assert ((found - neighbours(wanted.edges)).abs() < 4.5 / math.sqrt(n_runs)).all()
+
+
+def test_slow_ratios_are_those_of_the_law_of_f():
+    given = slow(walking(21))
+    factors = torch.tensor([[0.5, 0.2, 0.1], [2.0, 1.0, 0.0], [-0.7, -0.3, 0.0]], dtype=torch.float64)
+    found = given.log_ratios(factors)
+    for i in range(3):
+        expected = 0.0
+        for b in range(3):
+            law = stats.f(2 * float(given.d[b]), 2 * float(given.s[b]))
+            r, h = float(given.ratio[i, b]), float(factors[i, b])
+            expected += law.logpdf(r * math.exp(-h)) - h - law.logpdf(r)
+        assert float(found[i]) == pytest.approx(expected, rel=1e-9)
+
+
+def test_the_scan_of_shapes_is_the_mean_over_all_of_them():
+    given = walking(22, n=1024)
+    data, below = narrow(given), slow(given)
+    looked_for = shape_scan._shapes(given, data)
+    z = shape_scan.independent(
+        torch.einsum("hsb,sb->hs", looked_for.templates, data.scores), looked_for.templates, data
+    )
+    shared = data.coherence[: shape_scan._LOW].mean(0).sum(-1).clamp(min=1)
+    total = 0.0
+    for h in range(len(z)):
+        a = looked_for.sizes[h]
+        up, down = (
+            np.exp((w * a * z[h] - a**2 / 2 + below.log_ratios(w * looked_for.slow)[h] / shared).numpy())
+            for w in (1, -1)
+        )
+        for way, ratio in enumerate((up, down, (up + down) / 2)):
+            chance = math.exp(float(looked_for.log_chances[way, h]))
+            total += chance * np.mean([np.prod(1 - e + e * ratio) for e in shape_scan._SHARES])
+    found = scanned(given)
+    assert found is not None
+    assert found.log_ratio == pytest.approx(math.log(total), abs=1e-9)
+
+
+def test_chances_of_shapes_add_up_to_one():
+    given = walking(23)
+    assert float(shape_scan._shapes(given, narrow(given)).log_chances.exp().sum()) == pytest.approx(1.0, abs=1e-9)
+
+
+def test_a_larger_walk_is_seen_in_its_slowest_ordinates():
+    n_runs = 20
+    seen = sum(shape_witness(walking(100 + s, 40.0)).p_value < 1e-3 for s in range(n_runs))
+    false = sum(shape_witness(walking(200 + s)).p_value < 0.05 for s in range(n_runs))
+    assert seen >= stats.binom.ppf(1e-3, n_runs, 0.8)
+    assert false <= stats.binom.isf(1e-3, n_runs, 0.05)
+
+
+def test_slow_ordinates_are_held_out_once_and_gain_what_their_likelihood_does():
+    given = walking(24, 40.0)
+
+    def spectra(matrices: torch.Tensor, f: torch.Tensor) -> torch.Tensor:
+        return matrices * (1 + 1e-3 / f.to(matrices.dtype))[:, None, None]
+
+    y = slow_ordinates(given.recorded)[0].numpy()
+    f = np.arange(1, N_SLOW + 1) / (2 * given.n_samples)
+    power = deep_base(given).spectrum(torch.from_numpy(f)).numpy()
+    factor = 1 + 1e-3 / f
+    expected = (stats.norm.logpdf(y, scale=np.sqrt(power * factor)) - stats.norm.logpdf(y, scale=np.sqrt(power))).sum(0)
+    for fold in range(N_FOLDS):
+        own = [k for k in range(1, N_SLOW + 1) if slow_fold(k) == fold]
+        assert float(slow_gains(given, spectra, fold).sum()) == pytest.approx(expected[[k - 1 for k in own]].sum())
+
+
+def test_shorter_simulations_say_nothing_of_the_slowest_ordinates():
+    g = generator(25)
+    noise = gf.WhiteNoise(1.0) + gf.RandomWalk(1e-5)
+    given = case(noise.simulate(4096, batch=(2,), generator=g), noise.simulate(2048, batch=(1, 2), generator=g))
+    assert float(slow(given).log_ratios(torch.ones(2, 3, dtype=torch.float64)).abs().max()) == 0.0
+    assert not slow_gains(given, lambda m, f: 2 * m, 0).any()
+    assert shape_witness(given).p_value > 1e-3

@@ -40,7 +40,7 @@ class Gain(NamedTuple):
 
     @property
     def sd(self) -> float:
-        return _sd_of_sum(self.blocks)
+        return sd_of_sum(self.blocks)
 
     def confirms(self, p_value: float) -> bool:
         """Whether a finding of that p value holds on the blocks held out.
@@ -98,7 +98,7 @@ def held_out(start: Case, gains: Sequence[Gain], generator: torch.Generator) -> 
     """
     total, reach = sum(gain.total for gain in gains), 0.0
     if gains:
-        reach = Z * _sd_of_sum(torch.stack([gain.blocks for gain in gains]).sum(0))
+        reach = Z * sd_of_sum(torch.stack([gain.blocks for gain in gains]).sum(0))
     before = after = [_agreement(start, fold) for fold in range(N_FOLDS)]
     if gains:
         after = []
@@ -116,7 +116,8 @@ def _agreement(case: Case, fold: int) -> Tensor:
     return torch.tensor([discrepancy(case, fold), distinguishability(case, fold)], dtype=torch.float64)
 
 
-def _sd_of_sum(blocks: Tensor) -> float:
+def sd_of_sum(blocks: Tensor) -> float:
+    """Standard deviation of a sum over blocks, from their scatter."""
     return float(blocks.std()) * math.sqrt(len(blocks))
 
 

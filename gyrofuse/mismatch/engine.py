@@ -1,4 +1,4 @@
-"""Diagnosis: witness, nominate, repair, confirm."""
+"""Diagnosis: witness, nominate, repair, confirm, and ask what would be otherwise."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from torch import Tensor
 from gyrofuse._checks import check_n_samples
 from gyrofuse._model import Model
 from gyrofuse.mismatch.case import Case
-from gyrofuse.mismatch.confirm import Gain, held_out, held_out_gain
+from gyrofuse.mismatch.confirm import held_out, held_out_gain
+from gyrofuse.mismatch.counterfactual import Link, settled
 from gyrofuse.mismatch.evidence import calibrated, corrected
 from gyrofuse.mismatch.inputs import noise_of, prepared
 from gyrofuse.mismatch.mechanism import Finding
@@ -25,7 +26,7 @@ from gyrofuse.mismatch.twins import FEWEST, twin_p_values
 from gyrofuse.recording import Recording
 from gyrofuse.simulate import ArrayModel
 
-_LOOKING, _NAMING, _CHECKING = 0.3, 0.4, 0.2  # shares of the work
+_LOOKED, _NAMED, _COMPARED, _CHECKED = 0.3, 0.65, 0.75, 0.9  # shares of the work that are done by then
 _MOST, _OF_A_KIND = 20, 6  # findings: a recording that needs more is another instrument
 
 
@@ -70,7 +71,7 @@ def diagnose(
         generator = torch.Generator().manual_seed(0)
     start = prepared(recording, simulation, rate, generator)
     model = RepairedModel(noise_of(simulation, start), start.scene)
-    evidence = testimony(start, lambda what, share: progress(what, _LOOKING * share))
+    evidence = testimony(start, lambda what, share: progress(what, _LOOKED * share))
     p_value = combined(evidence)
     if twins:
         p_value = calibrated(p_value, twin_p_values(start, twins, generator))
@@ -88,27 +89,29 @@ def diagnose(
             repaired=start,
         )
     case: Case = start
-    found: list[Finding] = []
-    gains: list[Gain] = []
+    links: list[Link] = []
     level = false_alarm / sum(map(len, STAGES))
     for number, stage in enumerate(STAGES):
-        progress(", ".join(m.name for m in stage), _LOOKING + _NAMING * number / len(STAGES))
-        while len(found) < _MOST:
+        progress(", ".join(m.name for m in stage), _LOOKED + (_NAMED - _LOOKED) * number / len(STAGES))
+        while len(links) < _MOST:
+            found = [link.finding for link in links]
             open_ones = [m for m in stage if sum(f.mechanism == m.name for f in found) < _OF_A_KIND]
             nominated = [f for f in (m.nominate(case, level) for m in open_ones) if f and not _known(f, found)]
             accepted = None
             for finding in sorted(nominated, key=lambda f: -f.gain):
                 gain = held_out_gain(case, finding.effect)
                 if gain.confirms(finding.p_value):
-                    accepted = replace(finding, held_out_gain=gain.total)
-                    gains.append(gain)
+                    accepted = Link(replace(finding, held_out_gain=gain.total), case, gain)
                     break
             if accepted is None:
                 break
-            found.append(accepted)
-            case = accepted.effect.explained(case, generator)
-    findings = tuple(found)
-    after = testimony(case, lambda what, share: progress(what, _LOOKING + _NAMING + _CHECKING * share))
+            links.append(accepted)
+            case = accepted.finding.effect.explained(case, generator)
+    progress("look-alikes", _NAMED)
+    links, case = settled(links, case, level, generator)
+    findings = tuple(link.finding for link in links)
+    gains = [link.gain for link in links]
+    after = testimony(case, lambda what, share: progress(what, _COMPARED + (_CHECKED - _COMPARED) * share))
     left = [e for e in after if corrected(e.p_value, len(evidence)) <= false_alarm]
     effects = tuple(f.effect for f in findings)
     asking = [e.p_value for e in left if e.witness in ASKED_FOR_BY]

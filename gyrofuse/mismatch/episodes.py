@@ -15,7 +15,10 @@ _SHORTEST_BLOCK = 16
 _ROUNDS = 4
 _LOUDER = 3.0  # factor to start from, where no stretch is
 _CUT = 25.0  # squares: an outlier is no episode
-_CERTAIN = 2.5  # sd of the log of a factor
+_CERTAIN, _BEYOND_DOUBT = 2.5, 3.5  # sd of the log of a factor
+_PRIOR = 0.5  # sd of the log of a factor beforehand
+_GRID, _REFINEMENTS = 160, 3  # starts and stops that are looked at at once, and how often more finely
+_TAIL, _ZOOM = 0.025, 1e-5  # of the posterior, beyond limits, and where no finer grid is made
 
 
 class Episode(NamedTuple):
@@ -26,10 +29,17 @@ class Episode(NamedTuple):
 
 
 class Episodes(NamedTuple):
-    """Episodes and the factor of the variance within them, `(sensor,)`; 1 where a sensor takes no part."""
+    """Stretches of another level.
+
+    Attributes:
+        episodes: In order of time.
+        factor: Of the variance within them, `(sensor,)`; 1 where a sensor takes no part.
+        log_ratio: Log of the mean likelihood ratio of a single one, wherever it is, nats.
+    """
 
     episodes: tuple[Episode, ...]
     factor: Tensor
+    log_ratio: float = 0.0
 
     def inside(self, n: int) -> Tensor:
         """Samples within, `(time,)`."""
@@ -37,10 +47,6 @@ class Episodes(NamedTuple):
         for start, stop in self.episodes:
             within[start:stop] = True
         return within
-
-    def log_ratios(self, white: Tensor) -> Tensor:
-        """Log likelihood ratio of each sample's belonging to an episode, `(time,)`."""
-        return _log_ratios(white.square(), self.factor, self.inside(white.shape[-1]))
 
 
 def episodes_of(white: Tensor, p_values: Tensor) -> Episodes | None:
@@ -56,7 +62,25 @@ def episodes_of(white: Tensor, p_values: Tensor) -> Episodes | None:
         found, score = _from_start(white, p_values, factor, stretch)
         if found is not None and (best is None or score > best_score):
             best, best_score = found, score
-    return best
+    return None if best is None else best._replace(factor=_of_the_concerned(white, best), log_ratio=scan.log_ratio)
+
+
+def _of_the_concerned(white: Tensor, found: Episodes) -> Tensor:
+    """Factors, 1 in sensors that are nearer to no change than to what those that surely change have in the mean."""
+    inside = found.inside(white.shape[-1])
+    log_factor, sd = _log_factors(white.square().clamp(max=_CUT), inside)
+    certain = found.factor != 1
+    typical = float(log_factor[certain].mean()) if bool(certain.any()) else 0.0
+    alike = (2 * log_factor - typical) * typical > 0
+    concerned = (alike if typical else certain) | (log_factor.abs() > _BEYOND_DOUBT * sd)
+    return torch.where(concerned, log_factor.exp(), 1.0)
+
+
+def _log_factors(squares: Tensor, inside: Tensor) -> tuple[Tensor, float]:
+    """Of the variance inside to that outside, `(sensor,)`, and their sd."""
+    n_inside = int(inside.sum())
+    ratio = squares[:, inside].mean(-1) / squares[:, ~inside].mean(-1).clamp(min=1e-300)
+    return ratio.clamp(min=1e-300).log(), math.sqrt(2 / n_inside + 2 / (len(inside) - n_inside))
 
 
 def two_level_scores(white: Tensor, factor: Tensor, inside: Tensor) -> Tensor:
@@ -68,22 +92,84 @@ def two_level_scores(white: Tensor, factor: Tensor, inside: Tensor) -> Tensor:
     return (squares / mean - squares / level - (level / mean).log()) / 2
 
 
-def onset_limits(log_ratios: Tensor, episode: Episode, *, rising: bool) -> tuple[int, int]:
-    """95 % limits of an episode's start (`rising`) or stop, by the likelihood of every place up to its other end."""
-    n = len(log_ratios)
-    if rising:
-        first, last = 0, episode.stop
-        # Samples from the start on belong to the episode.
-        likelihood = log_ratios[first:last].flip(0).cumsum(0).flip(0)
-        offset = 0
-    else:
-        first, last = episode.start, n
-        likelihood = log_ratios[first:last].cumsum(0)
-        offset = 1
-    weight = (likelihood - likelihood.max()).exp().cumsum(0)
-    weight = weight / weight[-1].clone()
-    low, high = (int(torch.searchsorted(weight, q)) for q in (0.025, 0.975))
-    return first + low + offset, first + min(high, len(weight) - 1) + offset
+class Limits(NamedTuple):
+    """Median and 95 % limits."""
+
+    value: float
+    low: float
+    high: float
+
+
+class Told(NamedTuple):
+    """What the data tell of one episode.
+
+    Attributes:
+        start, stop: Samples.
+        log_factor: Mean and sd of its logarithm, `(sensor,)`.
+        log_factor_sd: Likewise.
+    """
+
+    start: Limits
+    stop: Limits
+    log_factor: Tensor
+    log_factor_sd: Tensor
+
+
+def told_of_first(white: Tensor, episodes: tuple[Episode, ...]) -> Told:
+    """Posterior of the first episode's ends and factors, the other episodes given.
+
+    With `x` the share of a sensor's energy in `m` of `n` samples, the likelihood of the best factor is
+
+        log L = n/2 log(1/n) - m/2 log(x/m) - (n - m)/2 log((1 - x)/(n - m)),
+
+    and normal in the factor's logarithm, of which the information is `I = m (n - m)/2n`: under a normal prior of sd
+    `tau` it is `L^s / sqrt(1 + tau^2 I)`, `s = tau^2 I/(1 + tau^2 I)`. All starts and stops are as likely beforehand; a
+    grid of them is made finer where the posterior is.
+
+    Args:
+        white: Whitened recording of the sensors concerned, `(sensor, time)`.
+        episodes: In order of time.
+    """
+    end = white.shape[-1]
+    others = Episodes(episodes[1:], torch.ones(0)).inside(end)
+    squares = torch.where(others, 0.0, white.square().clamp(max=_CUT))
+    total = torch.nn.functional.pad(squares.cumsum(-1), (1, 0))
+    n = int((~others).sum())
+    last = episodes[1].start if len(episodes) > 1 else end
+    ranges = [(0, last), (0, last)]
+    for _ in range(_REFINEMENTS):
+        start, stop = (_grid(low, high) for low, high in ranges)
+        m = (stop[None] - start[:, None]).to(torch.float64)  # (start, stop)
+        possible = (m >= _SHORTEST_BLOCK) & (m <= n - _SHORTEST_BLOCK)
+        m = torch.where(possible, m, n / 2)
+        information = m * (n - m) / (2 * n)
+        shrunk = _PRIOR**2 * information / (1 + _PRIOR**2 * information)
+        x = ((total[:, None, stop] - total[:, start, None]) / total[:, -1, None, None]).clamp(1e-12, 1 - 1e-12)
+        inside, outside = (x / m).log(), ((1 - x) / (n - m)).log()
+        gain = -(math.log(n) * n + inside * m + outside * (n - m)) / 2
+        log_weight = (shrunk * gain + torch.log1p(-shrunk) / 2).sum(0)
+        weight = torch.softmax(log_weight.masked_fill(~possible, -math.inf).flatten(), 0).view_as(m)
+        ends = ((start, weight.sum(1)), (stop, weight.sum(0)))
+        steps = [int(grid.diff().max()) if len(grid) > 1 else 1 for grid, _ in ends]
+        ranges = [
+            (max(_quantile(*pair, _ZOOM) - step, 0), min(_quantile(*pair, 1 - _ZOOM) + step, last))
+            for pair, step in zip(ends, steps, strict=True)
+        ]
+    from_, to = (Limits(*(float(_quantile(*pair, share)) for share in (0.5, _TAIL, 1 - _TAIL))) for pair in ends)
+    mean = shrunk * (inside - outside)
+    log_factor = (weight * mean).sum((1, 2))
+    variance = (weight * (mean.square() + shrunk / information)).sum((1, 2)) - log_factor.square()
+    return Told(from_, to, log_factor, variance.clamp(min=0).sqrt())
+
+
+def _grid(low: int, high: int) -> Tensor:
+    return torch.linspace(low, high, min(high - low + 1, _GRID), dtype=torch.float64).round().long()
+
+
+def _quantile(places: Tensor, weight: Tensor, share: float) -> int:
+    """Of places that are `weight` likely."""
+    below = weight.cumsum(0) - weight / 2
+    return int(places[min(int(torch.searchsorted(below, share)), len(places) - 1)])
 
 
 def _from_start(
@@ -126,9 +212,8 @@ def _factors(squares: Tensor, inside: Tensor, concerned: Tensor) -> Tensor:
     n_inside = int(inside.sum())
     if n_inside == 0 or n_inside == len(inside):
         return torch.ones(len(squares), dtype=torch.float64)
-    factor = squares[:, inside].mean(-1) / squares[:, ~inside].mean(-1).clamp(min=1e-300)
-    sd = math.sqrt(2 / n_inside + 2 / (len(inside) - n_inside))
-    return torch.where(concerned & (factor.log().abs() > _CERTAIN * sd), factor, 1.0)
+    log_factor, sd = _log_factors(squares, inside)
+    return torch.where(concerned & (log_factor.abs() > _CERTAIN * sd), log_factor.exp(), 1.0)
 
 
 def _log_ratios(squares: Tensor, factor: Tensor, inside: Tensor) -> Tensor:

@@ -5,12 +5,20 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.case import Scene
+from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.colour import filtered
 from gyrofuse.mismatch.mechanism import Mechanism
+from gyrofuse.mismatch.shape_bands import slow_gains
 
 
-class Filter(Mechanism):
+class Spectral(Mechanism):
+    """What is judged by blocks and, where they are too short, by the slowest ordinates of the whole record."""
+
+    def gains(self, case: Case, fold: int) -> Tensor:
+        return super().gains(case, fold) + slow_gains(case, self.spectra, fold)
+
+
+class Filter(Spectral):
     """A linear filter of each sensor."""
 
     def response(self, f: Tensor) -> Tensor:
@@ -25,7 +33,7 @@ class Filter(Mechanism):
         return matrices * gain[:, :, None] * gain[:, None, :].conj()
 
 
-class Addition(Mechanism):
+class Addition(Spectral):
     """Gaussian noise on top."""
 
     def density(self, f: Tensor) -> Tensor:

@@ -20,6 +20,7 @@ from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.episodes import episodes_of
 from gyrofuse.mismatch.evidence import Evidence, corrected
 from gyrofuse.mismatch.level_scan import LevelScan, scanned_levels
+from gyrofuse.mismatch.modulation import Modulation, strongest_modulation
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.shocks import WeakOutliers, weak_outliers
 from gyrofuse.mismatch.side import Side
@@ -273,6 +274,20 @@ def variance_p_value(case: Case) -> float:
     return corrected(min(p_value, several), 2)
 
 
+@remembered
+def modulation(case: Case) -> Modulation:
+    """The most conspicuous modulation of the noise level that the simulation does not have."""
+    found = strongest_modulation(levelled(case).square().clamp(max=_CUT))
+    if found.p_value > _OWN:
+        return found
+    profile = level_profile(case)
+    white = left_out(case.simulated).white / (profile if _divided(case) else 1.0) ** 0.5
+    other = min(strongest_modulation(record.square().clamp(max=_CUT)).p_value for record in white)
+    # A simulation that may be modulated as well has to be surpassed; one that surely is tells nothing.
+    p_value = found.p_value if other > _OWN else min(found.p_value / other, 1.0) if other > _HEAVY else 1.0
+    return found._replace(p_value=p_value)
+
+
 def _standardised(values: Tensor) -> Tensor:
     return (values - values.mean(-1, keepdim=True)) / values.std(-1, keepdim=True)
 
@@ -286,7 +301,20 @@ def _clustering(squares: Tensor) -> Tensor:
 
 
 def variance_witness(case: Case) -> Evidence:
-    """Changes of the noise level within the recording."""
+    """Changes of the noise level within the recording: once, in bursts, slowly or with a period."""
+    changed, wave = variance_p_value(case), modulation(case)
+    p_value = corrected(min(changed, wave.p_value), 2)
+    if wave.p_value < changed:
+        high = wave.high * case.scene.rate
+        how = f"with a frequency of {high:.5g} Hz" if wave.period else f"more slowly than {high:.3g} Hz"
+        return Evidence(
+            "variance",
+            p_value,
+            f"a noise level that goes up and down {how} in {case.scene.named(wave.sensors, 'all sensors')}",
+            sensors=wave.sensors,
+            levels=(1,),
+            frequency_hz=high if wave.period else None,
+        )
     p_values = variance_p_values(case)
     worst = int(p_values.argmin())
     every = worst == case.n_sensors
@@ -297,7 +325,7 @@ def variance_witness(case: Case) -> Evidence:
     where = "all sensors together" if every else f"sensor {case.scene.sensors[worst]}"
     return Evidence(
         "variance",
-        variance_p_value(case),
+        p_value,
         f"a noise level that changes in {where}",
         sensors=tuple(range(case.n_sensors)) if every else (worst,),
         levels=(1,),

@@ -82,6 +82,20 @@ class Mechanism:
         raise NotImplementedError
 
 
+class Instead(NamedTuple):
+    """The look-alike that does best in the place of a finding, all others in.
+
+    Attributes:
+        mechanism: Its name.
+        gain: Its gain in log score on the blocks held out, nats.
+        sd: Standard deviation of the difference between both gains, block by block.
+    """
+
+    mechanism: str
+    gain: float
+    sd: float
+
+
 @dataclass(frozen=True, eq=False)
 class Finding:
     """One difference between recording and simulation, with its name.
@@ -98,6 +112,8 @@ class Finding:
         parameters: By name, with limits and units.
         p_value: For having looked at every place where it could have been.
         held_out_gain: Log score on data not used for it, nats; None until confirmed.
+        gain_without: The same where all other findings are in: what is lost if it alone is left out.
+        instead: Its best look-alike on the same blocks; None where nothing in the catalogue looks like it.
         sentence: The same in plain English.
     """
 
@@ -114,6 +130,8 @@ class Finding:
     channel: str | None = None
     gain: float = 0.0
     held_out_gain: float | None = None
+    gain_without: float | None = None
+    instead: Instead | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, ready for JSON."""
@@ -129,6 +147,8 @@ class Finding:
                 "parameters": {name: entry._asdict() for name, entry in self.parameters.items()},
                 "p_value": self.p_value,
                 "held_out_gain": self.held_out_gain,
+                "gain_without": self.gain_without,
+                "instead": None if self.instead is None else self.instead._asdict(),
                 "sentence": self.sentence,
             }
         )

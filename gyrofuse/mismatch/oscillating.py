@@ -20,6 +20,9 @@ from gyrofuse.mismatch.steadiness import Steadiness, steadiness
 from gyrofuse.mismatch.witnesses import level_of
 
 _SEEN = 3.0  # standard deviations
+_BAND = 6.0  # half widths on either side
+_PARTS, _MOST_ALIKE = 16, 0.8  # of a record, to see a frequency wander, and the correlation of neighbours
+_FEWEST = 3  # samples of the band in a part
 _SMEARED = 0.7  # bins: half width of a line under a Hann taper
 
 
@@ -67,6 +70,8 @@ class Seen(NamedTuple):
         """The finding, amplitudes `factor` times the rms."""
         bump, rate, unit = self.bump, self.case.scene.rate, self.case.scene.unit
         centre_sd, width_sd = bump.log_sd
+        if effect.name == "drifting_tone" or self.verdict.open:
+            centre_sd = math.hypot(centre_sd, wandering_sd(self.case, bump) / bump.centre)
         parameters = {
             "frequency": spanned(lambda x: rate * math.exp(x), math.log(bump.centre), centre_sd, "Hz"),
             "width": spanned(lambda x: 2 * rate * math.exp(x), math.log(bump.width), width_sd, "Hz"),
@@ -131,6 +136,30 @@ def nominated(case: Case, level: float, *, tone: bool) -> tuple[Mode, Seen] | No
     gain = bump.variance.clamp(min=0).sqrt().to(torch.complex128) if bump.gain is None else bump.gain
     mode = Mode(bump.centre, bump.width, gain, bump.gain is not None)
     return mode, Seen(case, bump, verdict, sensors, rivals)
+
+
+def wandering_sd(case: Case, bump: Oscillation) -> float:
+    """Standard deviation of a record's mean frequency that wanders, from means over its parts, cycles per sample.
+
+    Of the sum of sensors in phase: the mean turn from sample to sample in a band whose middle is the centre, where
+    white noise has none. Neighbouring parts that are alike make the mean of all as uncertain as fewer of them would.
+    """
+    n = case.n_samples
+    centre, reach = round(bump.centre * n), max(round(_BAND * bump.width * n), 2 * _PARTS)
+    reach = min(reach, centre - 1, n // 2 - centre)
+    strength = bump.variance.clamp(min=0).sqrt().to(torch.complex128) if bump.gain is None else bump.gain
+    weights = strength.conj() / case.base.spectrum(torch.tensor([bump.centre], dtype=torch.float64))[:, 0]
+    bins = weights @ torch.fft.rfft(case.recording)[:, centre - reach : centre + reach]
+    z = torch.fft.ifft(torch.fft.ifftshift(bins))
+    if len(z) < _FEWEST * _PARTS:
+        return 0.0
+    parts = z[: len(z) // _PARTS * _PARTS].unflatten(0, (_PARTS, -1))
+    turns = (parts[:, 1:] * parts[:, :-1].conj()).sum(-1).angle() / (2 * math.pi)
+    left = turns - turns.mean()
+    alike = float((left[1:] * left[:-1]).sum() / left.square().sum())
+    alike = min(max(alike + (1 + 4 * alike) / _PARTS, 0.0), _MOST_ALIKE)  # a mean of its own biases it down
+    spread = float(left.square().sum()) / (_PARTS - 1) / _PARTS * (1 + alike) / (1 - alike)
+    return math.sqrt(spread) * len(z) / n
 
 
 def refitted_mode(case: Case, fold: int, mode: Mode) -> Mode:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
 import torch
-from scipy import optimize
+from numpy.typing import NDArray
+from scipy import optimize, special, stats
 from torch import Tensor
 
 _BULK = 2.5  # values below it are counted in a histogram
@@ -15,6 +18,8 @@ _EVENT, _COMPANY = 3.5, 2.5  # sd
 _NEAR = (2, 9)  # samples on either side
 _CLUSTERED = 0.6  # share of events that have company
 _FLAT = 2.0  # times what the number of events alone says
+
+_Law = Callable[..., NDArray[np.float64]]
 
 
 class Outliers(NamedTuple):
@@ -55,7 +60,11 @@ def mixture(z: Tensor, law: Outliers) -> Tensor:
 
 def free_gaussian(z: Tensor) -> Tensor:
     """Log density of `z` under a normal law of its own variance."""
-    variance = z.square().mean()
+    return _weighted_gaussian(z, torch.ones_like(z))
+
+
+def _weighted_gaussian(z: Tensor, counts: Tensor) -> Tensor:
+    variance = (counts * z.square()).sum() / counts.sum()
     return -z.square() / (2 * variance) - (2 * math.pi * variance).log() / 2
 
 
@@ -90,6 +99,39 @@ def fitted(z: Tensor) -> Outliers:
     most = _FLAT / math.sqrt(max(rate * n, 1.0))
     rate_sd, amplitude_sd = min(rate_sd, most * rate), min(amplitude_sd, most * math.hypot(spread, 1.0))
     return Outliers(rate, height, spread, rate_sd, amplitude_sd)
+
+
+def heavy_tailed(z: Tensor) -> float:
+    """Log likelihood of noise that is heavy-tailed throughout over a normal law, of its own variance each.
+
+    The better of Student's law and of a normal plus a Laplace variable, scale and shape fitted.
+    """
+    z, counts = _condensed(z.abs())
+    x, weight = z.numpy(), counts.numpy()
+    plain = float((counts * _weighted_gaussian(z, counts)).sum())
+    best = -math.inf
+    for law, start, bounds in (
+        (_student, (20.0, 1.0), ((2.1, 1e4), (0.3, 2.0))),
+        (_normal_laplace, (0.3, 0.95), ((0.02, 2.0), (0.05, 2.0))),
+    ):
+
+        def deviance(theta: NDArray[np.float64], law: _Law = law) -> float:
+            return -float((weight * law(x, *np.exp(theta))).sum())
+
+        run = optimize.minimize(deviance, np.log(start), method="L-BFGS-B", bounds=np.log(bounds))
+        best = max(best, -float(run.fun) - plain)
+    return best
+
+
+def _student(z: NDArray[np.float64], freedom: float, scale: float) -> NDArray[np.float64]:
+    return np.asarray(stats.t.logpdf(z / scale, freedom)) - math.log(scale)
+
+
+def _normal_laplace(z: NDArray[np.float64], width: float, sd: float) -> NDArray[np.float64]:
+    """Density of `sd` times a normal plus `width` times a Laplace variable."""
+    r = sd / width
+    up, down = -z / width + special.log_ndtr(z / sd - r), z / width + special.log_ndtr(-z / sd - r)
+    return np.asarray(np.logaddexp(up, down)) + r * r / 2 - math.log(2 * width)
 
 
 def clustered(white: Tensor) -> bool:

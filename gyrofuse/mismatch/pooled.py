@@ -1,4 +1,4 @@
-"""Witnesses of what is small and broad: powers and coherences pooled over neighbouring bands."""
+"""Witness of what sensors share over a broad band: coherences pooled over neighbouring bands."""
 
 from __future__ import annotations
 
@@ -7,51 +7,17 @@ import math
 from typing import NamedTuple
 
 import torch
-from scipy import stats
 from torch import Tensor
 
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import Evidence, corrected
 from gyrofuse.mismatch.remembered import remembered
-from gyrofuse.mismatch.witnesses import level_of, power_tails, whitened_difference
+from gyrofuse.mismatch.witnesses import level_of, whitened_difference
 
 _ABSENT = 0.7  # standard deviations of what the simulation has, below which it has nothing
 _SHOWN = 0.1  # p value below which the simulation's sensors share something
 _DRAWN, _COUNTED = 4000, 40  # matrices of noise, and those of them beyond which the tail is not counted
 _NEIGHBOURS = 1.1  # bands next to each other are slightly correlated
-
-
-def shape_witness(case: Case) -> Evidence:
-    """Broad differences of power: log ratios pooled over neighbouring bands and over sensors, against noise alone."""
-    one, other, worth = case.recorded.power, case.simulated.power, _worth(case)
-    if not bool((worth > 0).any()):
-        return Evidence("shape", 1.0, "the simulation is too short to compare spectra with")
-    scores = _normal_scores(power_tails(case), one > other)
-    scores = torch.where(worth > 0, scores.nan_to_num(nan=0.0), 0.0)  # (sensor, band)
-    weights = worth.sqrt()
-    pooled, spread = _windows(scores * weights, weights, case)
-    z = (pooled / spread.clamp(min=1e-12)).abs()
-    # All sensors together have as large a share of the chances as all that are alone.
-    places = _places(one.shape[-1]) * torch.tensor([2.0 * len(one)] * len(one) + [2.0])[:, None]
-    log_p = math.log(2) + torch.special.log_ndtr(-z) + places.log()
-    row, column = divmod(int(log_p.argmin()), z.shape[1])
-    p = 2 * float(stats.norm.sf(float(z[row, column])))
-    first, last, sensors = _window_of(row, column, case)
-    f = math.sqrt(float(case.bands.frequency[first] * case.bands.frequency[last])) * case.scene.rate
-    inside = slice(first, last + 1)
-    log_ratio = float(
-        ((one / other).log() * weights.square())[list(sensors), inside].sum()
-        / weights[inside].square().sum()
-        / len(sensors)
-    )
-    return Evidence(
-        "shape",
-        corrected(p, float(places[row, column])),
-        f"power is {math.exp(log_ratio):.3g} times the simulation's over a broad band around {f:.3g} Hz",
-        sensors=sensors,
-        levels=tuple(sorted({level_of(float(case.bands.frequency[b])) for b in range(first, last + 1)})),
-        frequency_hz=f,
-    )
 
 
 class Source(NamedTuple):
@@ -161,35 +127,6 @@ def _noise_sizes(p: int, real: bool) -> Tensor:
     return torch.linalg.eigvalsh(upper + upper.mH).abs().amax(-1).sort().values
 
 
-def _worth(case: Case) -> Tensor:
-    d, s = case.recorded.dof, case.simulated.dof
-    return d * s / (d + s).clamp(min=1e-9)
-
-
-def _normal_scores(tails: Tensor, above: Tensor) -> Tensor:
-    size = torch.special.ndtri((tails / 2).clamp(min=1e-300)).abs()
-    return torch.where(above, size, -size)
-
-
-def _windows(scores: Tensor, weights: Tensor, case: Case) -> tuple[Tensor, Tensor]:
-    """Sums of scores over runs of bands, for each sensor and all, `(row, column)`, and their spreads.
-
-    Powers of sensors that share noise go together: their correlation is the squared coherence.
-    """
-    n_bands = scores.shape[-1]
-    coherence = torch.maximum(case.recorded.coherence.abs(), case.simulated.coherence.abs()).square()
-    together = coherence.sum((-1, -2)) * weights.square()  # variance of the sum over sensors in a band
-    rows = torch.cat([scores, scores.sum(0, keepdim=True)])
-    variances = torch.cat([weights.square().expand_as(scores), together[None]])
-    starts, ends = _runs(n_bands)
-
-    def sums(values: Tensor) -> Tensor:
-        total = torch.cat([torch.zeros_like(values[:, :1]), values.cumsum(-1)], -1)
-        return total[:, ends] - total[:, starts]
-
-    return sums(rows), (sums(variances) * _NEIGHBOURS).sqrt()
-
-
 def _runs(n_bands: int) -> tuple[Tensor, Tensor]:
     """First band and the band after the last, of runs of 2, 4, 8, .. bands that overlap by half, and of all."""
     starts, ends, length = [0], [n_bands], 2
@@ -208,9 +145,3 @@ def _places(n_bands: int) -> Tensor:
     starts, ends = _runs(n_bands)
     _, kind, count = (ends - starts).unique(return_inverse=True, return_counts=True)
     return (count[kind] * len(count)).to(torch.float64)
-
-
-def _window_of(row: int, column: int, case: Case) -> tuple[int, int, tuple[int, ...]]:
-    starts, ends = _runs(len(case.bands.dof))
-    sensors = tuple(range(case.n_sensors)) if row == case.n_sensors else (row,)
-    return int(starts[column]), int(ends[column]) - 1, sensors

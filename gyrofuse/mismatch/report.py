@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gyrofuse.mismatch.outcome import Outcome
-from gyrofuse.mismatch.telling import fused_words, p_words, parameter_words
+from gyrofuse.mismatch.telling import fused_words, nats, otherwise_words, p_words, parameter_words
 from gyrofuse.plotting_mismatch import plot_map
 from gyrofuse.report_mismatch import mismatch_page
 
@@ -43,6 +43,9 @@ class MismatchReport(Outcome):
             lines.append(f"{i}. {finding.mechanism}: {finding.sentence} ({p_words(finding.p_value)}{gain})")
             if finding.alternatives:
                 lines.append(f"   cannot be told apart from {', '.join(finding.alternatives)}")
+            lines += [f"   {words}" for words in (otherwise_words(finding),) if words]
+            if finding.gain_without is not None and len(self.findings) > 1:
+                lines.append(f"   left out alone, it would cost {nats(finding.gain_without)} nats (held out)")
             for name, entry in finding.parameters.items():
                 words = parameter_words(name, self.case.scene.sensors)
                 lines.append(f"   {words:<24} {entry.value:>12.6g} {entry.unit}  ({entry.low:.6g} to {entry.high:.6g})")

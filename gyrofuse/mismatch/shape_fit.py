@@ -22,9 +22,9 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.base import Base
+from gyrofuse.mismatch.shape_bands import Deep
 from gyrofuse.mismatch.shape_law import equivalent, equivalent_moments, smooth_coherence
 from gyrofuse.mismatch.shape_terms import Common, Ground, Term
-from gyrofuse.mismatch.side import Side
 
 _ROUNDS, _ENOUGH = 25, 0.01
 _STEP = 1e-4
@@ -74,7 +74,8 @@ class Ratios:
         spectra, power, d, s = self.sides
         own = spectra.diagonal(dim1=-2, dim2=-1).real.clamp(min=1e-300)
         wanted = level * equivalent(own / power / level, d[:, None], s[:, None]) / self.mean[:, None]
-        scale = (wanted / own).sqrt()
+        # Where nothing is simulated ratios have no size.
+        scale = (torch.where((self.worth > 0)[:, None], wanted, 1.0) / own).sqrt()
         return replace(self, observed=spectra * (scale[:, :, None] * scale[:, None, :]))
 
     @property
@@ -87,16 +88,15 @@ class Ratios:
         return math.log(max(float(self.worth.sum()), 2.0)) / 2
 
 
-def ratios(
-    recorded: Side, simulated: Side, base: Base, usable: Tensor | None = None, independent: bool = False
-) -> Ratios:
+def ratios(both: Deep, base: Base, usable: Tensor, independent: bool) -> Ratios:
     """Compare two sides; `usable` `(band,)` leaves bands out, `independent` are the sensors of the simulation."""
-    usable = torch.ones_like(recorded.dof) if usable is None else usable
-    sides = recorded.spectra, simulated.power.clamp(min=1e-300).mT, recorded.dof, simulated.dof
-    expected = smooth_coherence(simulated.coherence, simulated.dof)
+    power = both.simulated.diagonal(dim1=-2, dim2=-1).real.clamp(min=1e-300)
+    size = power.rsqrt()
+    expected = smooth_coherence(both.simulated * (size[:, :, None] * size[:, None, :]), both.s)
     if independent:
         expected = torch.eye(expected.shape[-1], dtype=expected.dtype).expand_as(expected)
-    return Ratios.of(Ground(base, recorded.bands), sides, expected, usable, independent)
+    sides = both.recorded, power, both.d, both.s
+    return Ratios.of(Ground(base, both.bands), sides, expected, usable, independent)
 
 
 class Fit(NamedTuple):

@@ -18,7 +18,9 @@ from gyrofuse.mismatch.filter_forms import FILTERS
 from gyrofuse.mismatch.folds import estimation_samples
 from gyrofuse.mismatch.pooled import common_source
 from gyrofuse.mismatch.remembered import remembered
+from gyrofuse.mismatch.shape_bands import N_SLOW, Groups, deep, deep_base, narrow_bands, slow_fold
 from gyrofuse.mismatch.shape_fit import Fit, Ratios, data_model, fit, log_score, ratios
+from gyrofuse.mismatch.shape_scan import scanned
 from gyrofuse.mismatch.shape_terms import Bump, Common, CommonBump, Flicker, LowPass, Shift, Term, oscillation
 from gyrofuse.mismatch.side import Side
 from gyrofuse.mismatch.spectra import bands
@@ -37,6 +39,7 @@ _TOUCH = 0.1
 _ORDER = {"scale": 0, "add": 1, "filter": 2}  # a filter acts on what was added, levels are those of the noise alone
 _PLAIN = 15.0  # nats
 _ALONE = 8.0  # nats that a shape has to bring by itself
+_PER_OCTAVE = 4
 _CLEAN = 8  # bins
 _BROAD = 3.0  # half widths
 _FORMS = 3  # of filters
@@ -103,14 +106,17 @@ def chosen_shape(case: Case, name: str, level: float) -> Shape | None:
 
 def compared(case: Case) -> Ratios:
     """Spectra of a case, without bands that hold a line which is not explained."""
-    usable = torch.ones_like(case.bands.dof)
+    wanted = narrow_bands(case.n_samples, _PER_OCTAVE)
+    both = deep(case, Side(case.recorded.signal, wanted), Side(case.simulated.signal, wanted))
+    n_slow, usable = len(both.d) - len(wanted.dof), torch.ones_like(both.d)
     scale = case.simulated.signal.shape[-1] / case.n_samples
     if scale < 1:  # the lowest bins of short records hold what leaks from below
-        usable *= torch.tensor(case.bands.edges[:-1]) * scale >= _CLEAN
+        usable[n_slow:] *= torch.tensor(wanted.edges[:-1]) * scale >= _CLEAN
     if case.line.p_value < _DOUBT:
-        edges = torch.tensor(case.bands.edges[1:-1], dtype=torch.float64) / case.n_samples
-        usable[torch.bucketize(torch.tensor(case.line.frequency, dtype=torch.float64), edges, right=True)] = 0.0
-    return ratios(case.recorded, case.simulated, case.base, usable, _independent(case))
+        edges = torch.tensor(wanted.edges[1:-1], dtype=torch.float64) / case.n_samples
+        place = torch.bucketize(torch.tensor(case.line.frequency, dtype=torch.float64), edges, right=True)
+        usable[n_slow + place] = 0.0
+    return ratios(both, deep_base(case), usable, _independent(case))
 
 
 def refit(case: Case, fold: int, term: Term) -> Term:
@@ -119,9 +125,17 @@ def refit(case: Case, fold: int, term: Term) -> Term:
     block = run_length(keep)
     recorded = case.recording[:, keep].unflatten(-1, (-1, block)).movedim(1, 0)
     simulated = _in_blocks(case.simulated)[block]
-    data = ratios(Side(recorded, simulated.bands), simulated, case.base, independent=_independent(case))
+    both = deep(case, Side(recorded, simulated.bands), simulated, _slow_without(fold))
+    data = ratios(both, deep_base(case), torch.ones_like(both.d), _independent(case))
     found = fit(data, [term])
     return fit(data.centred(found.model.diagonal(dim1=-2, dim2=-1).real), found.terms).terms[0]
+
+
+def _slow_without(fold: int) -> Groups:
+    """Slow ordinates that a fold does not hold out, in groups of an octave."""
+    octaves = [range(2**j, min(2 ** (j + 1), N_SLOW + 1)) for j in range(N_SLOW.bit_length())]
+    groups = (tuple(k for k in octave if slow_fold(k) != fold) for octave in octaves)
+    return tuple(group for group in groups if group)
 
 
 def _independent(case: Case) -> bool:
@@ -159,7 +173,9 @@ def _searched(case: Case) -> tuple[Shape, ...]:
     data = compared(case)
     if float(data.worth.sum()) < 50:
         return ()
-    data, chosen = _chosen(data)
+    scan = scanned(case)
+    p_seen = 1.0 if scan is None else scan.p_value
+    data, chosen = _chosen(data, differ=p_seen < _DOUBT)
     if chosen is None or not _convincing(data, chosen):
         return ()
     found = []
@@ -168,6 +184,8 @@ def _searched(case: Case) -> tuple[Shape, ...]:
         without = max(fit(data, others).gain, 0.0) if others else 0.0
         gain = chosen.gain - without
         p = corrected(float(stats.chi2.sf(2 * max(gain, 0.0), _freedom(data, term))), _PLACES)
+        if not others:  # it is all that differs
+            p = min(p, p_seen)
         rivals = {
             rival.name
             for rival in _candidates(data, others)
@@ -224,10 +242,10 @@ def _freedom(data: Ratios, term: Term) -> int:
     return term.local.numel() + 2 * len(term.shared)
 
 
-def _chosen(data: Ratios) -> tuple[Ratios, Fit | None]:
-    """Shapes added one at a time while BIC falls, then taken away while it falls."""
+def _chosen(data: Ratios, *, differ: bool) -> tuple[Ratios, Fit | None]:
+    """Shapes added one at a time while BIC falls, then taken away while it falls; one at least of what does differ."""
     best: Fit | None = None
-    value = 0.0
+    value = -math.inf if differ else 0.0
     for _ in range(_MOST):
         now = list(best.terms) if best else []
         quick = [fit(data, [*now, c], _QUICK) for c in _candidates(data, now)]
@@ -238,7 +256,7 @@ def _chosen(data: Ratios) -> tuple[Ratios, Fit | None]:
             break
         data = data.centred(top.model.diagonal(dim1=-2, dim2=-1).real)
         best = fit(data, top.terms)
-        value = _value(data, best)
+        value = max(_value(data, best), 0.0)
     while best is not None and len(best.terms) > 1:
         fewer = [[_freed(data, t) for t in best.terms if t is not gone] for gone in best.terms]
         top = max((_pruned(data, fit(data, terms)) for terms in fewer), key=lambda f: _value(data, f))

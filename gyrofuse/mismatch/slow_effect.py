@@ -116,15 +116,19 @@ class Strong(NamedTuple):
 
 
 def strong_scan(case: Case, name: str, level: float) -> Strong | None:
-    """The scan of a mechanism and its equals; None where it is not there, or where another one is better."""
+    """The scan of a mechanism and its equals; None where it is not there, or where another one is better.
+
+    A stronger random walk than the simulation's is one of them, under the name of what changes numbers.
+    """
     look = slow_look(case)
     scan = look.scan(name)
     if scan is None or scan.p_value > min(level, _STRONG) or not concerned(scan):
         return None
-    rivals = [other for other in look.scans if other is not scan]
-    if any(other.gain > scan.gain + _TOO_CLOSE for other in rivals):
+    rivals = {other.family.name: other.gain for other in look.scans if other is not scan}
+    rivals["parameter_shift"] = look.wandering
+    if any(gain > scan.gain + _TOO_CLOSE for gain in rivals.values()):
         return None
-    return Strong(look, scan, tuple(other.family.name for other in rivals if other.gain > scan.gain - _TOO_CLOSE))
+    return Strong(look, scan, tuple(rival for rival, gain in rivals.items() if gain > scan.gain - _TOO_CLOSE))
 
 
 def log_factors(scan: Scan) -> Tensor:

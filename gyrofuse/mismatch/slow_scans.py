@@ -24,6 +24,7 @@ from gyrofuse.mismatch.slow_families import Family, edges, steps, temperatures, 
 
 _LOW = 48  # ordinates in which sensors are compared
 _SCANS = 2  # the second with the covariance that the first effect leaves
+_FREE = 5.0  # sd of log factors that nothing is known of
 _PRESENT = 3.0  # standard deviations, noise held: 0.3 % each
 _JUMP = 5.0  # standard deviations
 _FEWEST_JUMPS, _MOST_JUMPS = 4, 10
@@ -100,6 +101,15 @@ class SlowLook:
     def scan(self, name: str) -> Scan | None:
         """That of one mechanism; None where there is nothing to scan."""
         return next((s for s in self.scans if s.family.name == name), None)
+
+    @cached_property
+    def wandering(self) -> float:
+        """Nats that slow noise gains in place of any effect, its strength free in each sensor, less one for each."""
+        spread = self.noise.spread.clone()
+        spread[1:] = _FREE  # all but what is fast
+        free = best_fit(replace(self.noise, spread=spread), self.y, start=self.null.log_factors)
+        before, after = (float((self.y.square() / v + v.log()).sum()) / 2 for v in (self.null.variance, free.variance))
+        return before - after - len(self.y)
 
     def _scan(self, family: Family) -> Scan:
         heard = self._heard(family)

@@ -1,13 +1,8 @@
-"""Likelihoods of block means: a level that switches between two values, or a Gaussian process as its rival.
+"""Likelihoods of block means of a Gaussian process where another one might switch between two values.
 
-Both stand on a wandering background `b_k = b_{k-1} + N(0, q)` seen in white noise of variance `r`. Two levels:
-
-    y_k = b_k + a s_k + N(0, r),   s_k = +-1 with mean dwells `up` and `down`
-
-by filters for the four pairs of states before and now, merged to two after each block (Harrison and Stevens, 1976;
-Kim, 1994).
-The rival has an Ornstein-Uhlenbeck process of any variance and time constant instead (Kalman's filter).
-The record is cut into as many stretches as there are blocks to judge; each filter starts one stretch earlier.
+It stands on a wandering background `b_k = b_{k-1} + N(0, q)` seen in white noise of variance `r`, and is an
+Ornstein-Uhlenbeck process of any variance and time constant (Kalman's filter). The record is cut into as many stretches
+as there are blocks to judge; each filter starts one stretch earlier.
 """
 
 from __future__ import annotations
@@ -77,48 +72,8 @@ def _variogram(base: Base, block: int, lag: int) -> Array:
     return 2 * np.asarray(np.trapezoid(density * seen, f))
 
 
-def switching_scores(data: Stretches, half: Array, up: Array, down: Array) -> Array:
-    """Log likelihood of two levels, `(sensor, trial, stretch)`.
-
-    Args:
-        data: Block means.
-        half: Half the distance of the levels, `(sensor, trial)`.
-        up: Mean dwell in the upper one, blocks.
-        down: In the lower one.
-    """
-    y, r, q = data.means[:, None], data.noise[:, None, None], data.steps[:, None, None]
-    shape = (*half.shape, y.shape[2])
-    leave, enter = 1 - np.exp(-1 / up[..., None]), 1 - np.exp(-1 / down[..., None])
-    # First axis: the state before, second: the state now; upper, lower.
-    move = np.log(np.stack([np.stack([1 - leave, leave]), np.stack([enter, 1 - enter])]))
-    offset = np.stack([half, -half])[None, ..., None]
-    log_weight = np.log(np.stack([enter, leave]) / (leave + enter)) + np.zeros(shape)
-    mean = np.nanmean(y, axis=-1) + np.zeros((2, *shape))
-    variance = _LARGEST * (r + half[..., None] ** 2) + np.zeros((2, *shape))
-    total = np.zeros(shape)
-    for k in range(y.shape[-1]):
-        variance = variance + q
-        seen = np.isfinite(y[..., k])
-        s = variance + np.where(seen, r, 1e12 * r)
-        e = np.where(seen, y[..., k], 0.0) - offset - mean[:, None]
-        log_l = (log_weight - np.log(s) / 2)[:, None] + move - e**2 / (2 * s)[:, None]
-        largest = log_l.max((0, 1))
-        likelihood = np.exp(log_l - largest)
-        weight = likelihood.sum(0) + 1e-300
-        both = weight.sum(0)
-        if k >= y.shape[-1] // 2:
-            total += largest + np.log(both)
-        log_weight = np.log(weight / both)
-        share = likelihood / weight
-        gain = variance / s
-        moved = mean[:, None] + gain[:, None] * e
-        mean = (share * moved).sum(0)
-        variance = (share * (((1 - gain) * variance)[:, None] + (moved - mean) ** 2)).sum(0)
-    return total
-
-
 def gaussian_scores(data: Stretches, sd: Array, tau: Array) -> Array:
-    """Log likelihood of an Ornstein-Uhlenbeck process instead, `(sensor, trial, stretch)`.
+    """Log likelihood of an Ornstein-Uhlenbeck process, `(sensor, trial, stretch)`.
 
     Args:
         data: Block means.
@@ -162,26 +117,15 @@ class Best(NamedTuple):
     covariance: Array
 
 
-def best_switching(data: Stretches, stretch: Tensor) -> Best:
-    """Half-step and dwells of the largest likelihood on the stretches `([sensor,] stretch)` that may be used."""
-    chosen = _columns(stretch)
-
-    def score(theta: Array) -> Array:
-        half, up, down = np.exp(np.moveaxis(theta, -1, 0))
-        return np.asarray((switching_scores(data, half, up, down) * chosen).sum(-1))
-
-    return _climbed(score, _grid(data, 3), (0.5, 0.3, 0.15, 0.1))
-
-
 def best_gaussian(data: Stretches, stretch: Tensor) -> Best:
-    """Sd and time constant of the rival, likewise."""
+    """Sd and time constant of the largest likelihood on the stretches `([sensor,] stretch)` that may be used."""
     chosen = _columns(stretch)
 
     def score(theta: Array) -> Array:
         sd, tau = np.exp(np.moveaxis(theta, -1, 0))
         return np.asarray((gaussian_scores(data, sd, tau) * chosen).sum(-1))
 
-    return _climbed(score, _grid(data, 2), (0.5, 0.3, 0.15, 0.1))
+    return _climbed(score, _grid(data), (0.5, 0.3, 0.15, 0.1))
 
 
 def _columns(stretch: Tensor) -> Array:
@@ -189,12 +133,12 @@ def _columns(stretch: Tensor) -> Array:
     return np.asarray(stretch.reshape(-1, 1, stretch.shape[-1]).numpy(), dtype=float)
 
 
-def _grid(data: Stretches, n_parameters: int) -> Array:
+def _grid(data: Stretches) -> Array:
     """Trials `(sensor, trial, parameter)`: sizes by factors of 2, times by factors of 2."""
     sizes = 0.1 * 2.0 ** np.arange(8)
     n_times = max(int(math.log2(data.n_blocks / 12 / 3)), 2)
     times = 3 * 2.0 ** np.arange(n_times)
-    trials = np.array([(a, *([t] * (n_parameters - 1))) for a, t in itertools.product(sizes, times)])
+    trials = np.array(list(itertools.product(sizes, times)))
     grid = np.log(trials)[None].repeat(len(data.noise), axis=0)
     grid[..., 0] += np.log(np.sqrt(data.noise))[:, None]
     return grid

@@ -6,6 +6,7 @@ import re
 
 from gyrofuse._linalg import SingularCovarianceError
 from gyrofuse.mismatch.benefit import Benefit
+from gyrofuse.mismatch.mechanism import Finding
 from gyrofuse.mismatch.outcome import Outcome
 from gyrofuse.mismatch.remainder import Remainder
 
@@ -64,6 +65,17 @@ def verdict(outcome: Outcome) -> list[str]:
             "sensor that stands for no physics."
         )
     return sentences + fused_words(outcome)
+
+
+def otherwise_words(finding: Finding) -> str:
+    """What would be with its best look-alike in the place of a finding; nothing where it has none."""
+    if finding.instead is None or finding.gain_without is None:
+        return ""
+    less, sd = finding.gain_without - finding.instead.gain, finding.instead.sd
+    start = f"instead of {mechanism_words(finding.mechanism)}: {mechanism_words(finding.instead.mechanism)}"
+    if finding.instead.mechanism in finding.alternatives:
+        return f"{start} would do as well, {nats(abs(less))} nats {'less' if less >= 0 else 'more'} (held out)"
+    return f"{start} would gain {nats(less)} nats less (held out, standard deviation {nats(sd)})"
 
 
 def fused_words(outcome: Outcome) -> list[str]:

@@ -9,10 +9,13 @@ from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.channels import channel_witness
 from gyrofuse.mismatch.clocks import clock_witness
 from gyrofuse.mismatch.evidence import Evidence, corrected
+from gyrofuse.mismatch.hysteresis import hysteresis_witness
 from gyrofuse.mismatch.impulses import jump_witness, spike_witness, variance_witness
 from gyrofuse.mismatch.marginals import marginal_witness
-from gyrofuse.mismatch.pooled import common_witness, shape_witness
+from gyrofuse.mismatch.pooled import common_witness
+from gyrofuse.mismatch.shape_scan import shape_witness
 from gyrofuse.mismatch.slow_scans import slow_witness
+from gyrofuse.mismatch.sweeps import sweep_witness
 from gyrofuse.mismatch.witnesses import coherence_witness, line_witness, spectrum_witness
 
 WITNESSES: tuple[Callable[[Case], Evidence], ...] = (
@@ -20,9 +23,11 @@ WITNESSES: tuple[Callable[[Case], Evidence], ...] = (
     spike_witness,
     channel_witness,
     line_witness,
+    sweep_witness,
     clock_witness,
     jump_witness,
     slow_witness,
+    hysteresis_witness,
     variance_witness,
     spectrum_witness,
     shape_witness,

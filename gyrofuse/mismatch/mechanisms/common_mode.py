@@ -14,6 +14,7 @@ from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.colour import filtered, noise, of_phase
 from gyrofuse.mismatch.gaussian import Addition
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
+from gyrofuse.mismatch.shape_bands import deep_base
 from gyrofuse.mismatch.shape_terms import Common, common_density
 from gyrofuse.mismatch.shape_words import found, spanned
 from gyrofuse.mismatch.shapes import chosen_shape, refit
@@ -79,7 +80,7 @@ class CommonMode(Addition):
         share = ", as a part of the noise that each has" if term.inside else ""
         return found(
             case,
-            cls(term.kind, corner, gain, case.base, term.inside),
+            cls(term.kind, corner, gain, deep_base(case), term.inside),
             shape,
             sensors,
             parameters,

@@ -13,6 +13,7 @@ from gyrofuse.mismatch.base import Base
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.gaussian import Filter
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Z
+from gyrofuse.mismatch.shape_bands import deep_base
 from gyrofuse.mismatch.shape_terms import Parts, Shift
 from gyrofuse.mismatch.shape_words import found, spanned
 from gyrofuse.mismatch.shapes import chosen_shape, refit
@@ -45,7 +46,8 @@ class ParameterShift(Filter):
         if shape is None:
             return None
         parameters, words = {}, []
-        before = _numbers(case.base, case.scene.rate, case.scene.unit)
+        base = deep_base(case)
+        before = _numbers(base, case.scene.rate, case.scene.unit)
         for i in range(case.n_sensors):
             for k, name in enumerate(_PARTS):
                 sd = float(shape.sd[0][k, i])
@@ -63,7 +65,7 @@ class ParameterShift(Filter):
         sensors = tuple(int(i) for i in shape.term.free.any(0).nonzero()[:, 0])
         return found(
             case,
-            cls(case.base, shape.term.local),
+            cls(base, shape.term.local),
             shape,
             sensors,
             parameters,

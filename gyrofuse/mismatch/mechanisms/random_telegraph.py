@@ -3,44 +3,32 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
+from scipy import stats
 from torch import Tensor
 
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.folds import N_JUDGED, in_fold
-from gyrofuse.mismatch.impulses import kurtosis_p_values
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
-from gyrofuse.mismatch.switching import (
-    Best,
-    Stretches,
-    best_gaussian,
-    best_switching,
-    gaussian_scores,
-    stretches,
-    switching_scores,
-)
-from gyrofuse.mismatch.witnesses import power_tails
+from gyrofuse.mismatch.telegraph_fit import Numbers, excess, scores, two_levels
 
-Array = NDArray[np.float64]
-
-_SUSPECT = 0.01
-_PRESENT = 5.0  # nats over the Gaussian rival
-_LEFT_OUT = 4  # stretches
-_FEWEST_SWITCHES = 8.0  # fewer are steps
-_SHORTEST = 8.0  # samples on one level: shorter, two codes of a converter look like two levels
+_PRESENT, _CERTAIN = 5.0, 8.0  # nats over the Gaussian rival, of all sensors together
+_GAUSSIAN = ("flicker", "parameter_shift")  # what may have the same spectrum
+_CHOSEN = 1.5  # nats that each sensor costs
+_NUMBERS = 4  # of a sensor: half step, dwells, and the rival's place
 
 
 @dataclass(frozen=True, eq=False)
 class RandomTelegraph(Mechanism):
     """`y_t = x_t + half_step s_t`, `s_t = +-1` with exponential dwells of mean `up` and `down`.
 
-    Has the spectrum of an AR1; two levels instead of a normal law tell them apart, which takes
-    `half_step^2 dwell / S > 2` or so.
+    Has the spectrum of an AR1; that it has two levels instead of a normal law tells them apart. For noise with so much
+    power that it can just be seen that is not enough: the name takes a likelihood above that of the best Gaussian
+    process of any variance and time constant.
 
     Attributes:
         half_step: `(sensor,)`, unit of the signal; 0 where there is none.
@@ -54,40 +42,29 @@ class RandomTelegraph(Mechanism):
 
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:
-        suspects = _suspects(case)
-        if not suspects:
+        fits = {i: fit for i, fit in two_levels(case).items() if fit.over > _CHOSEN and fit.lasts}
+        over = _CHOSEN + sum(fit.over - _CHOSEN for fit in fits.values())
+        if over < _PRESENT:
             return None
-        data, every = stretches(case, suspects), torch.ones(N_JUDGED, dtype=torch.bool)
-        two, rival = best_switching(data, every), best_gaussian(data, every)
-        over = _without_best(data, two, rival)
-        dwell = torch.from_numpy(two.theta[:, 1:]).exp()
-        switches = data.n_blocks / dwell.mean(-1)
-        long = dwell.amin(-1) * data.block > _SHORTEST
-        present = [
-            k for k in range(len(suspects)) if over[k] > _PRESENT and switches[k] > _FEWEST_SWITCHES and bool(long[k])
-        ]
-        if not present:
-            return None
-        n = case.n_sensors
-        # A likelihood ratio exceeds x with probability 1/x at most, whatever the rival.
-        log_p = min(math.log(n) - max(over[k] for k in present), n * math.log(2) - sum(over[k] for k in present))
-        p_value = math.exp(min(log_p, 0.0))
+        sensors = tuple(fits)
+        gain = float(excess(case).gain[list(sensors)].sum()) + sum(fit.over for fit in fits.values())
+        sets = math.comb(case.n_sensors, len(sensors))
+        p_value = min(sets * float(stats.chi2.sf(2 * gain, _NUMBERS * len(sensors))), 1.0)
         if p_value > level:
             return None
-        effect = cls._of(case, [suspects[k] for k in present], two.theta[present], data.block)
-        sensors, second = tuple(suspects[k] for k in present), data.block / case.scene.rate
+        effect = cls._of(case, {i: fit.best for i, fit in fits.items()})
         parameters = {}
-        for k in present:
-            i = suspects[k]
-            for j, (name, scale, unit) in enumerate(
-                (("half_step", 1.0, case.scene.unit), ("dwell_up", second, "s"), ("dwell_down", second, "s"))
-            ):
-                value = scale * math.exp(two.theta[k, j])
-                reach = math.exp(min(Z * math.sqrt(two.covariance[k, j, j]), 50.0))
+        for i, fit in fits.items():
+            found = (
+                ("half_step", effect.half_step, case.scene.unit),
+                ("dwell_up", effect.up, "s"),
+                ("dwell_down", effect.down, "s"),
+            )
+            for (name, values, unit), sd in zip(found, fit.log_sd, strict=True):
+                value, reach = float(values[i]), math.exp(min(Z * sd, 50.0))
                 parameters[f"{name}[{i}]"] = Parameter(value, value / reach, value * reach, unit)
         largest = max(sensors, key=lambda i: float(effect.half_step[i]))
         where = case.scene.named(sensors, "all sensors")
-        plain = gaussian_scores(data, 0 * two.theta[:, :1], 1 + 0 * two.theta[:, :1]).sum((1, 2))
         return Finding(
             cls.name,
             effect,
@@ -99,21 +76,23 @@ class RandomTelegraph(Mechanism):
             sensors,
             parameters,
             levels=_levels(effect, sensors, case.scene.rate),
-            gain=float(sum(two.value[k] - plain[k] for k in present)),
+            alternatives=() if over > _CERTAIN else _GAUSSIAN,
+            gain=gain,
         )
 
     @classmethod
-    def _of(cls, case: Case, sensors: list[int], theta: object, block: int) -> RandomTelegraph:
-        numbers = torch.zeros(3, case.n_sensors, dtype=torch.float64)
-        numbers[1:] = 1.0
-        numbers[:, sensors] = torch.as_tensor(theta).exp().mT
-        numbers[1:, sensors] *= block / case.scene.rate
-        return cls(*numbers)
+    def _of(cls, case: Case, numbers: Mapping[int, Numbers]) -> RandomTelegraph:
+        """With the numbers of some sensors, times in samples."""
+        values = torch.zeros(3, case.n_sensors, dtype=torch.float64)
+        values[1:] = 1.0
+        for i, (half, up, down) in numbers.items():
+            values[:, i] = torch.tensor([half, up / case.scene.rate, down / case.scene.rate], dtype=torch.float64)
+        return cls(*values)
 
     def refitted(self, case: Case, fold: int) -> RandomTelegraph:
+        fits = two_levels(case)
         sensors = self.half_step.nonzero()[:, 0].tolist()
-        data = stretches(case, tuple(sensors))
-        return self._of(case, sensors, best_switching(data, ~in_fold(N_JUDGED, fold)).theta, data.block)
+        return self._of(case, {i: fits[i].without(fold) for i in sensors if i in fits})
 
     def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
         n = signal.shape[-1]
@@ -125,32 +104,11 @@ class RandomTelegraph(Mechanism):
         return records.reshape(signal.shape)
 
     def gains(self, case: Case, fold: int) -> Tensor:
-        sensors = tuple(self.half_step.nonzero()[:, 0].tolist())
-        data = stretches(case, sensors)
-        at = list(sensors)
-        block = data.block / case.scene.rate
-        half, up, down = (v[at, None].numpy() for v in (self.half_step, self.up / block, self.down / block))
-        gain = switching_scores(data, half, up, down) - gaussian_scores(data, 0 * half, 1 + 0 * half)
-        return torch.from_numpy(gain.sum((0, 1)))[in_fold(N_JUDGED, fold)]
-
-
-def _without_best(data: Stretches, two: Best, rival: Best) -> Array:
-    """Log likelihood over the Gaussian rival, `(sensor,)`, without the best stretches: steps show in a few."""
-    half, up, down = np.exp(two.theta.T)[..., None]
-    sd, tau = np.exp(rival.theta.T)[..., None]
-    scores = switching_scores(data, half, up, down)[:, 0]
-    over = scores - gaussian_scores(data, sd, tau)[:, 0]
-    rest = np.argsort(np.argsort(over, axis=-1), axis=-1) < N_JUDGED - _LEFT_OUT
-    return np.asarray((scores * rest).sum(-1) - best_gaussian(data, torch.from_numpy(rest)).value)
-
-
-def _suspects(case: Case) -> tuple[int, ...]:
-    """Sensors with wavelet coefficients that are not normal, or more power than the simulation's somewhere."""
-    tails = kurtosis_p_values(case)
-    odd = tails.amin(0) * len(tails) < _SUSPECT
-    power = power_tails(case).nan_to_num(nan=1.0).masked_fill(case.recorded.power < case.simulated.power, 1.0)
-    odd |= power.amin(-1) * power.shape[-1] < _SUSPECT
-    return tuple(odd.nonzero()[:, 0].tolist())
+        total = torch.zeros(N_JUDGED, dtype=torch.float64)
+        for i in self.half_step.nonzero()[:, 0].tolist():
+            up, down = (float(v[i]) * case.scene.rate for v in (self.up, self.down))
+            total += torch.from_numpy(scores(case, i, Numbers(float(self.half_step[i]), up, down)))
+        return total[in_fold(N_JUDGED, fold)]
 
 
 def _levels(effect: RandomTelegraph, sensors: tuple[int, ...], rate: float) -> tuple[int, ...]:

@@ -14,11 +14,12 @@ from gyrofuse.mismatch.episodes import episodes_of, two_level_scores
 from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.impulses import left_out, levelled, likely_outliers, spike_p_value, variance_p_values
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
-from gyrofuse.mismatch.outliers import Outliers, clustered, fitted, free_gaussian, mixture
+from gyrofuse.mismatch.outliers import Outliers, clustered, fitted, free_gaussian, heavy_tailed, mixture
 from gyrofuse.mismatch.shocks import fitted_shock, shock_posterior, shock_scores
 
 _HOUR = 3600.0
 _ALIKE = 5.0  # nats
+_RARE = 2.0  # nats by which a few outliers have to surpass noise that is heavy-tailed throughout
 _PLAIN = 5.0  # sd: outliers that can be taken off one by one
 _PRESENT = 4.0  # nats
 _LIKELY = 0.8  # probability of being hit
@@ -31,7 +32,8 @@ class Spikes(Mechanism):
     """`y_t = x_t + a_t` at isolated samples, `a_t` of either sign, of modulus `height` with some `spread`.
 
     Looks like white noise; the tails of what is left of a sample when all others have spoken tell them apart. Loud
-    episodes have such tails too, but their outliers lie together.
+    episodes have such tails too, but their outliers lie together. Noise that is heavy-tailed throughout has more of the
+    small ones than a few spikes leave: it is none of these, and has no name here.
 
     Attributes:
         rate: Of spikes, for a sample, `(sensor,)`; 0 where there are none.
@@ -62,6 +64,7 @@ class Spikes(Mechanism):
         weak = likely_outliers(case.recorded)
         if not weak.shock and weak.apart > -math.log(level):
             hit = tuple(i for i in range(case.n_sensors) if i in hit or float(weak.sensors[i]) > _LIKELY)
+        apart = float(gains[list(hit)].sum())
         laws = _alike(z, laws, hit)
         gain = float(_gains(z, laws)[list(hit)].sum())
         shock = _shock(case, laws, hit)
@@ -70,6 +73,8 @@ class Spikes(Mechanism):
             laws, gain = shock
             hit = tuple(i for i, law in enumerate(laws) if law.rate > 0)
         if not hit or any(laws[i].rate > _ISOLATED for i in hit) or clustered(levelled(case)[list(hit)]):
+            return None
+        if (gain if together else apart) < sum(heavy_tailed(z[i]) for i in hit) + _RARE:
             return None
         rival = _louder(case)
         if rival > gain + _ALIKE:

@@ -11,11 +11,12 @@ from torch import Tensor
 from torch.nn.functional import avg_pool1d
 
 from gyrofuse.mismatch.case import Case, Scene
-from gyrofuse.mismatch.episodes import episodes_of, onset_limits, two_level_scores
+from gyrofuse.mismatch.episodes import Episodes, Limits, episodes_of, told_of_first, two_level_scores
 from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
-from gyrofuse.mismatch.impulses import levelled, variance_p_value, variance_p_values
+from gyrofuse.mismatch.impulses import levelled, modulation, variance_p_value, variance_p_values
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 
+_FACTOR, _NATS = 1.25, 5.0  # by which a level that goes up and down all the time has to be likelier
 _SLOWER = 65  # samples: what varies more slowly is not louder
 
 
@@ -23,7 +24,8 @@ _SLOWER = 65  # samples: what varies more slowly is not louder
 class VarianceChange(Mechanism):
     """`sd_t = sqrt(factor) sd` within episodes, for what is faster than 65 samples.
 
-    Looks like heavy tails; its loud samples lie together.
+    Looks like heavy tails; its loud samples lie together. A level that wanders or oscillates all the time has no start
+    and no stop: where that is likelier by far it has no name here.
 
     Attributes:
         episodes: Starts and stops, s after the first sample.
@@ -42,22 +44,17 @@ class VarianceChange(Mechanism):
             return None
         white = levelled(case)
         found = episodes_of(white, p_values)
-        if found is None:
+        if found is None or _goes_up_and_down(case, found):
             return None
         rate = case.scene.rate
         effect = cls(tuple((e.start / rate, e.stop / rate) for e in found.episodes), found.factor)
         sensors = tuple((found.factor != 1).nonzero()[:, 0].tolist())
-        first = found.episodes[0]
-        log_ratios = found.log_ratios(white)
-        parameters = {
-            "start": _time(first.start, onset_limits(log_ratios, first, rising=True), rate),
-            "stop": _time(first.stop, onset_limits(log_ratios, first, rising=False), rate),
-        }
-        inside = sum(e.stop - e.start for e in found.episodes)
-        for i in sensors:
-            reach = math.exp(Z * math.sqrt(2 / inside + 2 / max(case.n_samples - inside, 1)))
-            value = float(found.factor[i])
-            parameters[f"factor[{i}]"] = Parameter(value, value / reach, value * reach, "")
+        told = told_of_first(white[list(sensors)], found.episodes)
+        parameters = {name: _time(limits, rate) for name, limits in (("start", told.start), ("stop", told.stop))}
+        for i, value, sd in zip(sensors, told.log_factor.tolist(), told.log_factor_sd.tolist(), strict=True):
+            parameters[f"factor[{i}]"] = Parameter(
+                math.exp(value), math.exp(value - Z * sd), math.exp(value + Z * sd), ""
+            )
         gain = float(two_level_scores(white, found.factor, found.inside(case.n_samples)).sum())
         largest = max(sensors, key=lambda i: abs(math.log(float(found.factor[i]))))
         where = case.scene.named(sensors, "all sensors")
@@ -66,14 +63,14 @@ class VarianceChange(Mechanism):
             cls.name,
             effect,
             f"the noise's variance is {float(found.factor[largest]):.3g} times the rest (sensor "
-            f"{case.scene.sensors[largest]}) from {first.start / rate:.6g} s "
-            f"to {first.stop / rate:.6g} s{more} in {where}",
+            f"{case.scene.sensors[largest]}) from {parameters['start'].value:.6g} s "
+            f"to {parameters['stop'].value:.6g} s{more} in {where}",
             p_value,
             sensors,
             parameters,
             levels=(1,),
             alternatives=("spikes",) if max(e.stop - e.start for e in found.episodes) < 8 else (),
-            time_s=first.start / rate,
+            time_s=parameters["start"].value,
             gain=gain,
         )
 
@@ -105,5 +102,15 @@ class VarianceChange(Mechanism):
         return within
 
 
-def _time(at: int, limits: tuple[int, int], rate: float) -> Parameter:
-    return Parameter(at / rate, limits[0] / rate, limits[1] / rate, "s")
+def _goes_up_and_down(case: Case, found: Episodes) -> bool:
+    """Whether a level that is modulated all the time says more than episodes with a start and a stop."""
+    n, wave = case.n_samples, modulation(case)
+    scores = two_level_scores(levelled(case), found.factor, found.inside(n))
+    numbers = 2 * len(found.episodes) + int((found.factor != 1).sum()) / 2
+    once = max(found.log_ratio, float(scores.sum()) - numbers * math.log(n))
+    always = max(-math.log(max(wave.p_value, 1e-300)), wave.log_ratio)
+    return always > _FACTOR * once + _NATS
+
+
+def _time(limits: Limits, rate: float) -> Parameter:
+    return Parameter(limits.value / rate, limits.low / rate, limits.high / rate, "s")

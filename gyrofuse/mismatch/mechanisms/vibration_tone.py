@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
+from scipy import stats
 from torch import Tensor
 
 from gyrofuse.mismatch.case import Case, Scene
@@ -19,6 +20,8 @@ from gyrofuse.mismatch.witnesses import level_of
 
 _ROUNDS = 6
 _SEEN = 0.04  # chance that a sensor is named which has no tone
+_TAIL = 0.025  # beyond either limit
+_STRONG, _FAR, _HALVINGS = 12.0, 6.0, 40  # standard deviations from which a law is normal, and beyond which none is
 _REACH, _GUARD = 64, 3  # bins on either side that tell the noise, and those too near to
 
 
@@ -48,7 +51,7 @@ class VibrationTone(Mechanism):
         line = case.line
         if line.p_value > level:
             return None
-        tone = cls._fitted(case, line.frequency * case.scene.rate, torch.ones(case.n_samples, dtype=torch.bool))
+        tone = cls.at(case, line.frequency * case.scene.rate)
         f = tone.frequency_hz / case.scene.rate
         n, noise = case.n_samples, density_near(case, f)  # (sensor,)
         sd = (2 * noise / n).sqrt()
@@ -59,8 +62,9 @@ class VibrationTone(Mechanism):
         energy = max(float((snr.square() - 2).clamp(min=0.0)[list(present)].sum()), 1.0)
         spread = math.sqrt(12 / energy) / (2 * math.pi * n)
         parameters = {"frequency": _limits(tone.frequency_hz, spread * case.scene.rate, "Hz")}
-        for i in present:
-            parameters[f"amplitude[{i}]"] = _limits(float(tone.amplitude[i]), float(sd[i]), case.scene.unit)
+        low, value, high = sd[list(present)] * amplitude_limits(snr[list(present)], seen)
+        for row in zip(present, value.tolist(), low.tolist(), high.tolist(), strict=True):
+            parameters[f"amplitude[{row[0]}]"] = Parameter(*row[1:], case.scene.unit)
         largest = max(present, key=lambda i: float(tone.amplitude[i]))
         where = case.scene.named(present, "all sensors")
         return Finding(
@@ -77,6 +81,11 @@ class VibrationTone(Mechanism):
             frequency_hz=tone.frequency_hz,
             gain=float(snr.square().sum()) / 2,
         )
+
+    @classmethod
+    def at(cls, case: Case, frequency_hz: float) -> VibrationTone:
+        """The tone of all samples within half a bin of a frequency."""
+        return cls._fitted(case, frequency_hz, torch.ones(case.n_samples, dtype=torch.bool))
 
     @classmethod
     def _fitted(cls, case: Case, frequency_hz: float, keep: Tensor) -> VibrationTone:
@@ -128,11 +137,46 @@ def density_near(case: Case, f: float) -> Tensor:
     return (power[:, (places * length).round().long()] / case.base.spectrum(places) * here).mean(-1)
 
 
+def line_near(case: Case, f: float, reach: float) -> float:
+    """The highest place of the recording's spectrum over the simulation's noise within a reach, cycles per sample."""
+    power, length = _tapered_power(case.recorded)
+    first, last = max(math.floor((f - reach) * length), 1), min(math.ceil((f + reach) * length), length // 2 - 1)
+    place = torch.arange(first, last + 1, dtype=torch.float64) / length
+    return float(place[(power[:, first : last + 1] / case.base.spectrum(place)).sum(0).argmax()])
+
+
 @remembered
 def _tapered_power(side: Side) -> tuple[Tensor, int]:
     """Periodogram `(sensor, bin)` of a recording under a Hann taper, and the length it was padded to."""
     transform, length = hann_transform(side.signal[0])
     return transform.abs().square(), length
+
+
+def amplitude_limits(snr: Tensor, seen: float) -> Tensor:
+    """Lower limits, estimates and upper limits of amplitudes `(3, sensor)`, all in standard deviations.
+
+    For amplitudes that were estimated because they are above `seen` (those that are not for having been the largest):
+    the square is noncentral chi-square of two degrees of freedom, of which only the tail beyond `seen` comes here.
+    Weak ones are there because noise has made them larger; equal tails of that law cover them as often as strong ones.
+    """
+    value = (snr.square() - 1).clamp(min=0.0).sqrt()
+    limits = value + Z * torch.tensor([[-1.0], [1.0]], dtype=torch.float64)
+    weak = snr < _STRONG
+    if bool(weak.any()):
+        limits[:, weak] = _tail_limits(snr[weak], seen if float(snr.min()) > seen else 0.0)
+    return torch.stack([limits[0], value.clamp(limits[0], limits[1]), limits[1]])
+
+
+def _tail_limits(snr: Tensor, seen: float) -> Tensor:
+    """Amplitudes at which what comes beyond `seen` is beyond `snr` with 2.5 and 97.5 %, `(2, sensor)`, halved in on."""
+    wanted = torch.tensor([[_TAIL], [1 - _TAIL]], dtype=torch.float64)
+    low, high = torch.zeros(2, len(snr), dtype=torch.float64), (snr + _FAR).repeat(2, 1)
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        law = stats.ncx2(2, middle.square().numpy())
+        share = torch.from_numpy(law.sf(snr.square().numpy()) / law.sf(seen**2))
+        low, high = torch.where(share < wanted, middle, low), torch.where(share < wanted, high, middle)
+    return high
 
 
 def _limits(value: float, sd: float, unit: str) -> Parameter:

@@ -1,0 +1,156 @@
+"""Look-alikes of a finding: what else in the catalogue could stand in its place, fitted as if it did.
+
+Only those are set against a finding whose log score means the same, so that the difference says which is likelier:
+slow effects on whitened differences of block means, spectra and what is taken off a recording by Whittle's likelihood,
+outliers by laws of single samples.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+
+import torch
+
+from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.mechanism import Finding, Mechanism
+from gyrofuse.mismatch.mechanisms import STAGES
+from gyrofuse.mismatch.mechanisms._channel_gain import ChannelGain
+from gyrofuse.mismatch.mechanisms.common_mode import CommonMode
+from gyrofuse.mismatch.mechanisms.drifting_tone import DriftingTone
+from gyrofuse.mismatch.mechanisms.flicker import FlickerNoise
+from gyrofuse.mismatch.mechanisms.low_pass import LowPassFilter
+from gyrofuse.mismatch.mechanisms.parameter_shift import ParameterShift
+from gyrofuse.mismatch.mechanisms.resonance import Resonance
+from gyrofuse.mismatch.mechanisms.step import Step
+from gyrofuse.mismatch.mechanisms.temperature_drift import TemperatureDrift
+from gyrofuse.mismatch.mechanisms.vibration_tone import VibrationTone, line_near
+from gyrofuse.mismatch.mechanisms.warm_up_transient import WarmUpTransient
+from gyrofuse.mismatch.oscillating import Mode
+from gyrofuse.mismatch.shape_fit import Fit, data_model, fit, log_score
+from gyrofuse.mismatch.shape_terms import Common, Flicker, LowPass, Shift, Term
+from gyrofuse.mismatch.shapes import compared
+from gyrofuse.mismatch.slow_effect import SlowEffect, only
+from gyrofuse.mismatch.slow_scans import slow_look
+
+_ANY = 1.0  # p value: look-alikes need not be surprising
+_NARROWEST = 1.5  # bins: half width of a bump in the place of a line
+_REACH = 2.0  # half widths in which a line is looked for in the place of a bump
+_ROUNDS = 8
+_NUMBER = 2.0  # nats for each number of a sensor
+_FILTERS = ("pole", "poles")
+
+
+def look_alikes(case: Case, finding: Finding) -> list[Mechanism]:
+    """What could stand in the place of a finding, with numbers from the case in which it is left out.
+
+    Args:
+        case: With all other findings in.
+        finding: It.
+    """
+    effect = finding.effect
+    found: list[Mechanism] = []
+    for kinds, rivals in _RIVALS:
+        if isinstance(effect, kinds):
+            found += rivals(case, finding)
+    found += _nominated(case, _NOMINATED.get(effect.name, ()))
+    return [rival for rival in found if rival.name not in (effect.name, finding.mechanism)]
+
+
+def _nominated(case: Case, names: tuple[str, ...]) -> Iterator[Mechanism]:
+    """Mechanisms that find themselves, whatever their p value."""
+    for mechanism in (m for stage in STAGES for m in stage if m.name in names):
+        found = mechanism.nominate(case, _ANY)
+        if found is not None:
+            yield found.effect
+
+
+def _slow(case: Case, finding: Finding) -> Iterator[Mechanism]:
+    """Other paths of the same sensors in the same noise."""
+    effect = finding.effect
+    assert isinstance(effect, SlowEffect)
+    for scan in slow_look(case).scans:
+        size, place = only(scan.fit.size, finding.sensors), scan.place / case.scene.rate
+        if scan.family.name == Step.name:
+            yield Step(size, effect.log_factors, place)
+        elif scan.family.name == WarmUpTransient.name:
+            yield WarmUpTransient(size, effect.log_factors, place)
+        else:
+            family = scan.family
+            yield TemperatureDrift(size, effect.log_factors, place, family.channel or "", family.row)
+
+
+def _shapes(case: Case, finding: Finding) -> list[Mechanism]:
+    """The shape of the same sensors' spectra that gains most, less what its numbers cost."""
+    data = compared(case)
+    if not float(data.worth.sum()):
+        return []
+    ground, nothing = data.ground, torch.zeros(0, dtype=torch.float64)
+    own = torch.zeros(case.n_sensors, dtype=torch.bool)
+    own[list(finding.sensors)] = True
+
+    def score(term: Term) -> float:
+        return float(log_score(data, data_model(data, [term])).sum())
+
+    terms: list[Term] = [Flicker.start(ground)]
+    if bool(ground.matters.any()):
+        terms.append(Shift.start(ground))
+    terms.append(max((s for kind in _FILTERS for s in LowPass.starts(ground, kind)), key=score))
+    if case.n_sensors > 1:
+        terms.append(Common.starts(ground, data.observed - data.expected, data.worth, "white", nothing)[0])
+    tried: list[Fit] = []
+    for term in terms:
+        if finding.effect.name == term.name:
+            continue
+        free = term.free if isinstance(term, Common) else term.free & own
+        if not bool(free.any()):
+            continue
+        tried.append(fit(data, [replace(term, free=free, local=torch.where(free, term.local, 0.0))], _ROUNDS))
+    best = max(tried, key=lambda f: f.gain - _NUMBER * f.n_free, default=None)
+    return [] if best is None else [_of_term(case, best.terms[0])]
+
+
+def _of_term(case: Case, term: Term) -> Mechanism:
+    if isinstance(term, Shift):
+        return ParameterShift(case.base, term.local)
+    if isinstance(term, Flicker):
+        return FlickerNoise(term.local[0])
+    if isinstance(term, LowPass):
+        return LowPassFilter(term.kind, term.local[0])
+    assert isinstance(term, Common)
+    return CommonMode(term.kind, 0.0, torch.complex(*term.local), case.base, term.inside)
+
+
+def _bump(case: Case, finding: Finding) -> list[Mechanism]:
+    """Noise as narrow as the record can show, in the place of a tone."""
+    tone = finding.effect
+    assert isinstance(tone, VibrationTone)
+    gain = torch.complex(tone.cosine, -tone.sine) / math.sqrt(2)
+    return [Resonance(Mode(tone.frequency_hz / case.scene.rate, _NARROWEST / case.n_samples, gain, True))]
+
+
+def _tone(case: Case, finding: Finding) -> list[Mechanism]:
+    """A tone at the highest place of a bump."""
+    effect = finding.effect
+    assert isinstance(effect, Resonance | DriftingTone)
+    mode = effect.mode
+    return [VibrationTone.at(case, line_near(case, mode.centre, _REACH * mode.width) * case.scene.rate)]
+
+
+_Maker = Callable[[Case, Finding], Iterable[Mechanism]]
+_RIVALS: tuple[tuple[tuple[type[Mechanism], ...], _Maker], ...] = (
+    ((SlowEffect,), _slow),
+    ((ParameterShift, LowPassFilter, FlickerNoise, CommonMode, Resonance, ChannelGain), _shapes),
+    ((VibrationTone,), _bump),
+    ((Resonance, DriftingTone), _tone),
+)
+# Those that are found without the finding's help.
+_NOMINATED = {
+    "g_sensitivity": ("quadratic_coupling", "scale_factor"),
+    "quadratic_coupling": ("g_sensitivity", "scale_factor"),
+    "scale_factor": ("g_sensitivity", "quadratic_coupling"),
+    "common_mode": ("g_sensitivity",),
+    "spikes": ("variance_change",),
+    "variance_change": ("spikes",),
+}

@@ -1,0 +1,204 @@
+"""A mean likelihood ratio over shapes of a difference, its size, and the sensors that have it.
+
+Ratios of powers have normal scores `u`; a difference of log spectra `h` moves them by `h sqrt(w)`. Along
+`t = h sqrt(w) / |h sqrt(w)|` each sensor has one number `z = t u`, normal with mean `a`. Over shapes, signs, sizes `a`
+and shares `e` of the sensors that have it, the mean of
+
+    prod_i (1 - e + e exp(a z_i - a^2 / 2))
+
+has expectation one where nothing differs. The slowest ordinates, too few for normal scores, give their likelihood
+ratio by the law of F.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.evidence import Evidence, ratio_p_value
+from gyrofuse.mismatch.filter_forms import filter_power, filter_strength
+from gyrofuse.mismatch.remembered import remembered
+from gyrofuse.mismatch.shape_bands import Narrow, deep_base, narrow, slow
+from gyrofuse.mismatch.shape_terms import oscillation
+from gyrofuse.mismatch.witnesses import level_of
+from gyrofuse.processes import AR1
+
+_SIZES = (1.0, 1.6, 2.5, 4.0)
+_SHARES = (0.2, 0.5, 0.9)
+_CORNERS_PER_DECADE = 2
+_FILTERS = (0.01, 0.04, 0.12, 0.35)  # corners, cycles per sample
+_WIDTHS = (0.02, 0.06, 0.18)  # half width of a bump over its centre
+_PLAIN = (0.1, 0.02, 0.1, 0.14)  # chances of white, blue, flicker noise and walks
+_AR1S, _LEVELS, _FILTERED, _BUMPED = 0.16, 0.02, 0.16, 0.3
+_WAYS = (0.6, 0.15, 0.25)  # up, down, either sensor by sensor
+_LOWEST = 40.0  # bins: bumps below are colour
+_COMMON = (0.12, 1.25)  # share of noise whose ratio exceeds one, and how it falls: drawn
+_LOW = 6  # bands
+_ROUNDS = 24
+
+
+class Shapes(NamedTuple):
+    """What is looked for.
+
+    Attributes:
+        templates: Of unit length under the weights, `(shape, sensor, band)`.
+        sizes: Their lengths, `(shape, sensor)`.
+        slow: Logarithms of factors in the slowest bands, `(shape, sensor, band)`.
+        log_chances: Of the shapes up, down, and either way sensor by sensor, `(3, shape)`.
+    """
+
+    templates: Tensor
+    sizes: Tensor
+    slow: Tensor
+    log_chances: Tensor
+
+
+class Scan(NamedTuple):
+    """What was seen.
+
+    Attributes:
+        log_ratio: Of the mean over all.
+        sensors: That have the likeliest.
+        weight: Of the bands in it, `(band,)`; and whether it goes up.
+        up: Whether powers are larger.
+    """
+
+    log_ratio: float
+    sensors: tuple[int, ...]
+    weight: Tensor
+    up: bool
+
+    @property
+    def p_value(self) -> float:
+        """That of a mean ratio; ratios of a few are more common than the law of large ones has it."""
+        return max(ratio_p_value(self.log_ratio), _COMMON[0] * math.exp(-_COMMON[1] * max(self.log_ratio, -1.0)))
+
+
+def shape_witness(case: Case) -> Evidence:
+    """Smooth differences of power: coloured noise, levels, filters, modes, over all sensors that have them."""
+    seen = scanned(case)
+    if seen is None:
+        return Evidence("shape", 1.0, "the simulation is too short to compare spectra with")
+    frequency = narrow(case).frequency
+    inside = frequency[seen.weight > 0.2 * seen.weight.max()]
+    f = float((seen.weight * frequency.log()).sum().div(seen.weight.sum()).exp()) * case.scene.rate
+    return Evidence(
+        "shape",
+        seen.p_value,
+        f"power is {'larger' if seen.up else 'smaller'} than the simulation's, most of all around {f:.3g} Hz, in "
+        f"{case.scene.named(seen.sensors, 'all sensors')}",
+        sensors=seen.sensors,
+        levels=tuple(sorted({level_of(float(x)) for x in inside})),
+        frequency_hz=f,
+    )
+
+
+@remembered
+def scanned(case: Case) -> Scan | None:
+    """The mean likelihood ratio of all shapes, and the likeliest."""
+    data = narrow(case)
+    if float(data.worth.sum()) < 10:
+        return None
+    looked_for = _shapes(case, data)
+    z = independent(torch.einsum("hsb,sb->hs", looked_for.templates, data.scores), looked_for.templates, data)
+    apart = data.coherence[:_LOW].mean(0).sum(-1)  # powers of what sensors share go together
+    up, down = (
+        way * looked_for.sizes * z
+        - looked_for.sizes.square() / 2
+        + slow(case).log_ratios(way * looked_for.slow) / apart.clamp(min=1)
+        for way in (1, -1)
+    )
+    ways = torch.stack([up, down, torch.logaddexp(up, down) - math.log(2)])  # (way, shape, sensor)
+    e = torch.tensor(_SHARES, dtype=torch.float64)
+    log_ratios = torch.logaddexp(torch.log1p(-e), e.log() + ways[..., None]).sum(-2)  # (way, shape, share)
+    log_ratios = log_ratios + looked_for.log_chances[..., None]
+    way, shape, share = (int(i) for i in torch.unravel_index(log_ratios.argmax(), log_ratios.shape))
+    own = torch.maximum(up, down)[shape] if way == 2 else ways[way, shape]
+    sensors = tuple(int(i) for i in (own > math.log(1 / _SHARES[share] - 1)).nonzero()[:, 0]) or (int(own.argmax()),)
+    weight = looked_for.templates[shape, list(sensors)].square().mean(0)
+    rises = float((up - down)[shape, list(sensors)].sum()) > 0
+    return Scan(float(log_ratios.flatten().logsumexp(0)) - math.log(len(_SHARES)), sensors, weight, rises)
+
+
+def independent(z: Tensor, templates: Tensor, data: Narrow) -> Tensor:
+    """Numbers of sensors `(shape, sensor)`, apart and of variance one: powers of what sensors share go together."""
+    cover = torch.einsum("hib,hjb,bij->hij", templates, templates, data.coherence)
+    beside = torch.einsum("hib,hib,b->hi", templates[..., 1:], templates[..., :-1], data.together)
+    variance = (1 + 2 * beside).clamp(min=0.5)
+    cover = cover - torch.diag_embed(cover.diagonal(dim1=-1, dim2=-2)) + torch.eye(z.shape[-1], dtype=z.dtype)
+    values, vectors = torch.linalg.eigh(cover)
+    root = (vectors * values.clamp(min=0.05).rsqrt()[..., None, :]) @ vectors.mT
+    return (root @ (z / variance.sqrt())[..., None])[..., 0]
+
+
+def _shapes(case: Case, data: Narrow) -> Shapes:
+    """Templates of all shapes, with their chances."""
+    n, below = case.n_samples, slow(case)
+    places = torch.cat([below.places, data.places])
+    ground = deep_base(case).spectrum(places.flatten()).unflatten(-1, places.shape)  # (sensor, band, place)
+    worth = torch.cat([below.d * below.s / (below.d + below.s), data.worth])
+    colour = torch.stack([(density / ground).mean(-1) for density in _densities(n, places)])
+    colour = torch.cat([colour, torch.ones_like(colour[:1])])
+    filters = torch.stack(
+        [-filter_power("sampled", filter_strength("sampled", torch.tensor(c)), places).log() for c in _FILTERS]
+    )
+    filters = filters.mean(-1)[:, None].expand(-1, len(ground), -1)
+    bumps, chances = _bumps(n, places, ground)
+    count = torch.tensor([len(colour), len(filters), len(bumps)])
+    log_chances = torch.full((3, int(count.sum())), -math.inf, dtype=torch.float64)
+    of_colour, of_filters, of_bumps = log_chances.split(count.tolist(), -1)
+    n_ar1s = len(colour) - len(_PLAIN) - 1
+    own = torch.tensor([*_PLAIN, *([_AR1S / n_ar1s] * n_ar1s), _LEVELS], dtype=torch.float64)
+    of_colour[:] = (torch.tensor(_WAYS, dtype=torch.float64)[:, None] * own).log()
+    of_filters[1] = math.log(_FILTERED / len(filters))
+    of_bumps[0] = (_BUMPED * chances).log()
+    weak = torch.cat([filters, bumps])
+    length = (worth * weak.square()).sum(-1, keepdim=True).sqrt()
+    moved = torch.cat([torch.cat([_grown(colour, worth, size), weak * (size / length)]) for size in _SIZES])
+    shown = moved[..., len(below.d) :] * data.worth.sqrt()
+    sizes = shown.square().sum(-1).sqrt()
+    return Shapes(
+        shown / sizes[..., None].clamp(min=1e-300),
+        sizes,
+        moved[..., : len(below.d)],
+        log_chances.repeat(1, len(_SIZES)) - math.log(len(_SIZES)),
+    )
+
+
+def _densities(n_samples: int, f: Tensor) -> Tensor:
+    """White, blue, flicker, walk and AR1s of corners two a decade, `(shape, 1, band, place)`."""
+    sine = torch.sin(math.pi * f).square()
+    decades = math.log10(0.3 * n_samples / 3)
+    corners = 0.3 * 10 ** (-torch.arange(int(decades * _CORNERS_PER_DECADE) + 1) / _CORNERS_PER_DECADE)
+    phi = torch.exp(-2 * math.pi * corners.to(f.dtype))[:, None, None]
+    coloured = AR1._spectrum(f, phi, (1 - phi).square())
+    return torch.cat([torch.stack([torch.ones_like(f), sine, 1 / f, 1 / sine]), coloured])[:, None]
+
+
+def _grown(relative: Tensor, worth: Tensor, size: float) -> Tensor:
+    """Logarithms `log(1 + c x)` of what comes on top, of a length, `(shape, sensor, band)`."""
+    scaled = relative / relative.amax(-1, keepdim=True).clamp(min=1e-300)
+    low = torch.full_like(relative[..., :1], -30.0)
+    high = -low
+    for _ in range(_ROUNDS):
+        middle = (low + high) / 2
+        short = (worth * torch.log1p(middle.exp() * scaled).square()).sum(-1, keepdim=True) < size**2
+        low, high = torch.where(short, middle, low), torch.where(short, high, middle)
+    return torch.log1p(low.exp() * scaled)
+
+
+def _bumps(n_samples: int, places: Tensor, ground: Tensor) -> tuple[Tensor, Tensor]:
+    """Bumps `(shape, sensor, band)` at centres half a width apart, and their chances: widths have equal ones."""
+    shapes, chances = [], []
+    for share in _WIDTHS:
+        step = math.log1p(share)
+        n = int(math.log(0.49 * n_samples / _LOWEST) / step)
+        centre = 0.49 * torch.exp(-step * torch.arange(n, dtype=torch.float64))[:, None, None]
+        density = oscillation(places, centre, share * centre)
+        shapes.append((density[:, None] / ground).mean(-1))
+        chances.append(torch.full((n,), 1 / n / len(_WIDTHS), dtype=torch.float64))
+    return torch.cat(shapes), torch.cat(chances)

@@ -1,0 +1,162 @@
+"""A line whose frequency moves steadily, as that of a machine that runs up: in no bin for long, a line all the same.
+
+Records, whitened and without what sensors have in common over broad bands, are cut into segments, in each of which a
+rate of change is undone before the transform: what is left is normal, with power one, in segments and bins. Powers are
+added up along all straight tracks, by a tree that shares the sums of shorter ones (Taylor, 1974). Where the sum over
+the sensors is largest, sums of sensors with either sign are asked for, whose power is Gamma distributed on every track.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.evidence import Evidence, corrected
+from gyrofuse.mismatch.impulses import left_out
+from gyrofuse.mismatch.lines import sets_of
+from gyrofuse.mismatch.remembered import remembered
+from gyrofuse.mismatch.shape_law import smooth_coherence
+from gyrofuse.mismatch.side import Side
+from gyrofuse.mismatch.witnesses import level_of
+
+_SEGMENT = 16  # roots of the record's length
+_EVERY = 4  # bins that a frequency moves within a segment, from one rate that is undone to the next
+_CUT = 8.0  # power of a sensor: a steady line that is crossed is no track
+_CANDIDATES = 16  # of each rate, that are looked at closely
+_OWN = 0.05  # p value of what the simulation has as well
+_SIGNED = 7  # sensors up to which every sign is tried
+
+
+class Sweep(NamedTuple):
+    """The most conspicuous track.
+
+    Attributes:
+        p_value: For having looked at all.
+        first, last: Frequencies at the record's ends, cycles per sample; beyond a half they are folded back.
+        sensors: In which it was seen.
+    """
+
+    p_value: float
+    first: float
+    last: float
+    sensors: tuple[int, ...]
+
+
+def sweep_witness(case: Case) -> Evidence:
+    """A line whose frequency moves, that the simulation does not have."""
+    found = _strongest(case.recorded)
+    p_value = found.p_value
+    if p_value < _OWN and _strongest(case.simulated).p_value < _OWN:
+        p_value = 1.0
+    first, last = (f * case.scene.rate for f in (found.first, found.last))
+    return Evidence(
+        "sweep",
+        p_value,
+        f"a line that moves from {first:.4g} Hz to {last:.4g} Hz in {case.scene.named(found.sensors, 'all sensors')}",
+        sensors=found.sensors,
+        levels=tuple(sorted({level_of(max(f, 1 / case.n_samples)) for f in (found.first, found.last)})),
+    )
+
+
+@remembered
+def _strongest(side: Side) -> Sweep:
+    """In the first record."""
+    return strongest_sweep(_decorrelated(side))
+
+
+def _decorrelated(side: Side) -> Tensor:
+    """Whitened record `(sensor, time)` without the coherence of broad bands."""
+    white = left_out(side).white[0]
+    n = white.shape[-1]
+    transform = torch.fft.rfft(white)
+    edges = [0, *(round(e * n / side.bands.n_samples) for e in side.bands.edges[1:-1]), transform.shape[-1]]
+    for matrix, (a, b) in zip(smooth_coherence(side.coherence, side.dof), itertools.pairwise(edges), strict=True):
+        root = torch.linalg.cholesky(matrix)
+        transform[:, a:b] = torch.linalg.solve_triangular(root, transform[:, a:b], upper=False)
+    white = torch.fft.irfft(transform, n=n)
+    return white / white.square().mean(-1, keepdim=True).sqrt()
+
+
+def strongest_sweep(white: Tensor) -> Sweep:
+    """Of independent whitened samples `(sensor, time)`."""
+    p, n = white.shape
+    length = 2 ** round(math.log2(_SEGMENT * math.sqrt(n)))
+    count = 2 ** int(math.log2(n // length))
+    segments = white[:, : count * length].view(p, count, length).to(torch.float32)
+    moves = length // (2 * count)  # bins from segment to segment, for half a cycle per sample over the record
+    centred = ((torch.arange(length) - (length - 1) / 2) / length).square()
+    signs = _signs(p)
+    sizes = signs.abs().sum(-1)
+    best, first, rate, sensors = 0.0, 0.0, 0.0, tuple(range(p))
+    for undone in range(_EVERY // 2, moves + _EVERY // 2, _EVERY):
+        turn = torch.polar(torch.full((length,), length**-0.5), -math.pi * undone * centred)
+        bins = torch.fft.fft(segments * turn)  # (sensor, segment, bin)
+        powers = bins.abs().square().clamp(max=_CUT)
+        for move in range(max(undone - _EVERY // 2, 1), min(undone + _EVERY // 2, moves)):
+            sums = _tracks(powers.sum(0), move)
+            at = sums.flatten().topk(_CANDIDATES).indices
+            tracks = _followed(powers, bins, move, at // length, at % length)  # (sensor, candidate, segment)
+            power = (signs @ tracks.flatten(1)).abs().square().view(len(signs), *tracks.shape[1:]).sum(-1)
+            which, place = divmod(int((power / sizes[:, None]).argmax()), len(at))
+            highest = float(power[which, place] / sizes[which])
+            if highest > best:
+                best, first = highest, int(at[place]) % length / length
+                rate = (move + int(at[place]) // length / max(count - 1, 1)) / length
+                sensors = tuple(signs[which].abs().nonzero()[:, 0].tolist())
+    tail = float(torch.special.gammaincc(*torch.tensor([count, best], dtype=torch.float64)))
+    places = float((moves - 1) * count * length * len(signs))
+    start, stop = (abs(math.remainder(f, 1.0)) for f in (first - rate / 2, first + (count - 0.5) * rate))
+    return Sweep(corrected(tail, places), start, stop, sensors)
+
+
+def _signs(p: int) -> Tensor:
+    """Combinations of `p` sensors, each left out, or of either sign against the first one that takes part."""
+    if p > _SIGNED:
+        return sets_of(p)[0].to(torch.complex64)
+    every = torch.tensor(list(itertools.product((0.0, 1.0, -1.0), repeat=p)))
+    first = every.gather(-1, (every != 0).to(torch.int64).argmax(-1, keepdim=True))[:, 0]
+    return every[first > 0].to(torch.complex64)
+
+
+def _followed(powers: Tensor, bins: Tensor, move: int, more: Tensor, start: Tensor) -> Tensor:
+    """Values along tracks, cut, `(sensor, candidate, segment)`."""
+    count, length = bins.shape[1:]
+    segment = torch.arange(count)
+    at = (start[:, None] + move * segment + _drift(more, count)) % length  # (candidate, segment)
+    values, size = bins[:, segment, at], powers[:, segment, at].sqrt()
+    return values * (size / values.abs().clamp(min=1e-20))
+
+
+def _drift(more: Tensor, count: int) -> Tensor:
+    """Bins by which tracks that move by `more` in the end have moved in each segment, as the tree has it."""
+    drift = torch.zeros(len(more), 1, dtype=torch.int64)
+    shifts, size = [more], 1
+    while 2 * size <= count:
+        shifts.append(shifts[-1] // 2)
+        size *= 2
+    for d in shifts[-2::-1] if count > 1 else []:
+        drift = torch.cat([drift, drift + ((d + 1) // 2)[:, None]], -1)
+    return drift
+
+
+def _tracks(powers: Tensor, move: int) -> Tensor:
+    """Sums along tracks that begin at each bin and move by `move` bins a segment, and some more, `(more, bin)`.
+
+    Args:
+        powers: `(segment, bin)`, as many segments as a power of two.
+        move: At least; by the record's end a track has moved up to as many bins more as there are segments, less one.
+    """
+    count, length = powers.shape
+    bins = torch.arange(length)
+    at = (bins + move * torch.arange(count)[:, None]) % length
+    sums = powers.gather(-1, at)[:, None]  # (group, shift, bin)
+    while len(sums) > 1:
+        early, late = sums[::2], sums[1::2]
+        shifts = [early[:, d // 2] + late[:, d // 2].roll(-((d + 1) // 2), -1) for d in range(2 * sums.shape[1])]
+        sums = torch.stack(shifts, 1)
+    return sums[0]

@@ -1,0 +1,206 @@
+"""Findings left out, set against look-alikes, and dropped where others make them needless."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from scipy import stats
+
+import gyrofuse as gf
+from gyrofuse.mismatch import diagnose
+from gyrofuse.mismatch.bumps import Oscillation, Stretch
+from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.confirm import held_out_gain
+from gyrofuse.mismatch.counterfactual import Link, settled
+from gyrofuse.mismatch.look_alikes import look_alikes
+from gyrofuse.mismatch.mechanism import Finding, Instead, Mechanism
+from gyrofuse.mismatch.mechanisms.drifting_tone import DriftingTone
+from gyrofuse.mismatch.mechanisms.quantization import Quantization
+from gyrofuse.mismatch.mechanisms.step import Step
+from gyrofuse.mismatch.mechanisms.vibration_tone import VibrationTone, amplitude_limits, line_near
+from gyrofuse.mismatch.mechanisms.warm_up_transient import WarmUpTransient
+from gyrofuse.mismatch.oscillating import Mode, wandering_sd
+from gyrofuse.mismatch.telling import otherwise_words
+
+MODEL = gf.WhiteNoise(1.0) + gf.AR1(0.999, 1e-4) + gf.RandomWalk(1e-8)
+N, RATE, SENSORS = 2**14, 100.0, 4
+LEVEL = 5e-4
+
+
+def generator(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def case_of(seed: int, signal: torch.Tensor | None = None) -> Case:
+    """A recording with a signal added, beside a simulation of twice its length."""
+    recording = MODEL.simulate(N, batch=(SENSORS,), generator=generator(seed))
+    simulation = MODEL.simulate(N, batch=(2, SENSORS), generator=generator(seed + 1))
+    scene = Scene(RATE, "deg/s", tuple("abcd"))
+    return Case.of(scene, recording if signal is None else recording + signal, simulation)
+
+
+def tone(frequency: float, amplitude: float) -> torch.Tensor:
+    angle = 2 * math.pi * frequency * torch.arange(N, dtype=torch.float64) / RATE
+    return amplitude * torch.tensor([1.0, 0.7, 0.0, 0.5], dtype=torch.float64)[:, None] * angle.cos()
+
+
+def step(size: float) -> torch.Tensor:
+    return size * torch.ones(SENSORS, 1, dtype=torch.float64) * (torch.arange(N) >= N // 2)
+
+
+def chain(case: Case, *mechanisms: type[Mechanism]) -> tuple[list[Link], Case]:
+    """Findings one after the other."""
+    links = []
+    for mechanism in mechanisms:
+        finding = mechanism.nominate(case, LEVEL)
+        assert finding is not None
+        gain = held_out_gain(case, finding.effect)
+        links.append(Link(replace(finding, held_out_gain=gain.total), case, gain))
+        case = finding.effect.explained(case, generator(0))
+    return links, case
+
+
+def test_what_stands_alone_stays_and_its_loss_is_its_gain():
+    links, case = chain(case_of(1, tone(12.34, 0.15)), VibrationTone)
+    after = settled(links, case, LEVEL, generator(0))
+    (link,) = after.links
+    assert after.case is case
+    assert link.finding.gain_without == link.finding.held_out_gain
+    assert link.finding.instead is not None
+    assert link.finding.instead.mechanism == "resonance"
+    assert link.finding.instead.gain < link.finding.gain_without - 10
+    assert link.finding.alternatives == ()
+
+
+def test_two_effects_are_each_judged_with_the_other_in():
+    start = case_of(3, tone(12.34, 0.12) + step(0.5))
+    links, case = chain(start, VibrationTone, Step)
+    first, second = settled(links, case, LEVEL, generator(0)).links
+    # Without the tone: the recording less the step alone.
+    left = links[1].finding.effect.explained(start, generator(0))
+    assert first.finding.gain_without == pytest.approx(held_out_gain(left, first.finding.effect).total, rel=1e-9)
+    assert second.finding.gain_without == second.finding.held_out_gain
+
+
+def test_what_others_make_needless_is_dropped_and_the_rest_rebuilt():
+    start = case_of(5, tone(12.34, 0.15))
+    (true,), _ = chain(start, VibrationTone)
+    # The same tone a third too weak, found first: what it leaves was found again, and is all there is without it.
+    effect = true.finding.effect
+    assert isinstance(effect, VibrationTone)
+    weak = replace(effect, frequency_hz=effect.frequency_hz + 0.3 * RATE / N, cosine=0.3 * effect.cosine)
+    poor = replace(true.finding, effect=weak, p_value=0.1)
+    middle = weak.explained(start, generator(0))
+    links = [Link(poor, start, held_out_gain(start, weak)), Link(true.finding, middle, held_out_gain(middle, effect))]
+    after = settled(links, effect.explained(middle, generator(0)), LEVEL, generator(0))
+    (link,) = after.links
+    assert link.before is start
+    assert link.finding.held_out_gain == pytest.approx(true.finding.held_out_gain, rel=1e-9)
+    torch.testing.assert_close(after.case.recording, effect.explained(start, generator(0)).recording)
+
+
+def test_a_better_look_alike_takes_the_place():
+    decay = 1.2 * torch.ones(SENSORS, 1, dtype=torch.float64) * (-torch.arange(N) / (0.15 * N)).exp()
+    start = case_of(7, decay)
+    (true,), _ = chain(start, WarmUpTransient)
+    effect = true.finding.effect
+    assert isinstance(effect, WarmUpTransient)
+    wrong = Step(-0.2 * effect.size, effect.log_factors, 0.1 * N / RATE)
+    finding = replace(true.finding, mechanism="step", effect=wrong, p_value=1e-9)
+    link = Link(finding, start, held_out_gain(start, wrong))
+    assert link.gain.confirms(1e-9)
+    (after,) = settled([link], wrong.explained(start, generator(0)), LEVEL, generator(0)).links
+    assert after.finding.mechanism == "warm_up_transient"
+    assert after.finding.instead is not None
+    assert after.finding.instead.mechanism == "step"
+
+
+def test_the_converter_is_judged_on_numbers_as_they_came():
+    start = case_of(9, tone(12.34, 0.15))
+    rounded = start.with_recording((start.recording / 0.5).round() * 0.5)
+    links, case = chain(rounded, Quantization, VibrationTone)
+    after = settled(links, case, LEVEL, generator(0))
+    assert [link.finding.mechanism for link in after.links] == ["quantization", "vibration_tone"]
+    assert after.links[0].finding.gain_without == after.links[0].finding.held_out_gain
+
+
+def test_look_alikes_have_other_names_and_the_same_sensors():
+    case = case_of(11, step(0.6))
+    (link,), _ = chain(case, Step)
+    rivals = look_alikes(case, link.finding)
+    assert [rival.name for rival in rivals] == ["warm_up_transient"]
+    assert isinstance(rivals[0], WarmUpTransient)
+    assert rivals[0].size.nonzero()[:, 0].tolist() == list(link.finding.sensors)
+
+
+def test_reports_tell_what_was_ruled_out(tmp_path):
+    case = case_of(1, tone(12.34, 0.15))
+    recording = gf.Recording(case.recording, rate=RATE, unit="deg/s")
+    report = diagnose(recording, gf.Recording(case.simulated.signal[0], rate=RATE, unit="deg/s"))
+    (finding,) = report.findings
+    words = otherwise_words(finding)
+    assert words.startswith("instead of vibration tone: resonance would gain")
+    assert words in report.summary()
+    report.to_html(tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text()
+    assert "Instead of vibration tone: resonance would gain" in page
+    assert "lost if left out alone" in page
+    entry = report.to_dict()["findings"][0]["instead"]
+    assert {"mechanism", "gain", "sd"} == entry.keys()
+
+
+def test_equals_are_told_as_such():
+    finding = Finding(
+        "step",
+        Step(torch.ones(1), torch.zeros(1, 2), 1.0),
+        "a step",
+        1e-9,
+        (0,),
+        {},
+        alternatives=("warm_up_transient",),
+        gain_without=12.0,
+        instead=Instead("warm_up_transient", 11.0, 2.0),
+    )
+    assert otherwise_words(finding) == ("instead of step: warm up transient would do as well, 1.0 nats less (held out)")
+    assert otherwise_words(replace(finding, instead=None)) == ""
+
+
+def test_limits_of_amplitudes_hold_among_those_that_were_seen():
+    seen = 3.0
+    g = generator(13)
+    for truth in (2.0, 3.0, 5.0, 15.0):
+        z = torch.randn(2, 3000, generator=g, dtype=torch.float64)
+        snr = torch.hypot(z[0] + truth, z[1])
+        low, value, high = amplitude_limits(snr[snr > seen], seen)
+        hits = int(((low <= truth) & (truth <= high)).sum())
+        assert stats.binomtest(hits, len(low), 0.95).pvalue > 1e-3
+        assert bool(((low <= value) & (value <= high)).all())
+
+
+def test_limits_of_amplitudes_are_those_of_the_law():
+    snr = torch.tensor([4.5], dtype=torch.float64)
+    low, _, high = amplitude_limits(snr, 3.0)[:, 0].tolist()
+    for limit, share in ((low, 0.025), (high, 0.975)):
+        law = stats.ncx2(2, limit**2)
+        assert law.sf(4.5**2) / law.sf(9.0) == pytest.approx(share, rel=1e-6)
+
+
+def test_a_frequency_that_wanders_is_known_as_well_as_its_mean_over_the_record():
+    width, n_draws = 20 / N, 40
+    gain = torch.ones(SENSORS, dtype=torch.complex128)
+    bump = Oscillation(Stretch(0.1, width, 0.0, ()), 0.1, width, (0.0, 0.0), gain.real, gain.real / 10, gain, 100.0)
+    found = []
+    for seed in range(n_draws):
+        path = DriftingTone(Mode(0.1, width, gain, True), True).path(N, generator(seed))
+        found.append(wandering_sd(case_of(100 + seed, path), bump) ** 2)
+    tau = 8 / (2 * math.pi * width)  # samples, the memory of what wanders slowly
+    truth = width**2 * 2 * tau / N * (1 - tau / N * (1 - math.exp(-N / tau)))
+    assert 0.7 * truth < sum(found) / n_draws < 1.5 * truth
+
+
+def test_the_highest_place_near_a_frequency_is_the_line():
+    case = case_of(15, tone(12.34, 0.3))
+    assert abs(line_near(case, 0.1236, 0.001) - 0.1234) < 1 / N

@@ -1,0 +1,204 @@
+"""Two levels in coloured noise: the likelihood sums over paths, its rival is Kalman's, names and numbers hold."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+from mismatch_draws import LEVEL, nominated
+from scipy import stats
+from torch import Tensor
+
+from gyrofuse import AR1, RandomWalk, WhiteNoise
+from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.confirm import held_out_gain
+from gyrofuse.mismatch.folds import N_JUDGED
+from gyrofuse.mismatch.mechanisms.random_telegraph import RandomTelegraph, _path
+from gyrofuse.mismatch.telegraph import (
+    _LARGEST,
+    Background,
+    _filter,
+    _thinned,
+    backgrounds,
+    gaussian_values,
+    switching_values,
+)
+from gyrofuse.mismatch.telegraph_fit import Numbers, excess, scores, two_levels, vertex
+
+N, SCENE = 16384, Scene(100.0, "deg/s", ("x", "y"))
+NOISE = WhiteNoise(1.0) + AR1(0.995, 2e-4) + RandomWalk(1e-7)
+LEVELS = Numbers(0.35, 160.0, 110.0)
+PHI, STEPS, WHITE = np.array([0.8, 0.97, 1.0]), np.array([0.05, 0.02, 0.01]), 0.4
+START = np.append(STEPS[:2] / (1 - PHI[:2] ** 2), _LARGEST)
+BACKGROUND = Background(WHITE, PHI, STEPS, START)
+
+
+def drawn(seed: int, extra: Tensor | None = None) -> Case:
+    g = torch.Generator().manual_seed(seed)
+    recording = NOISE.simulate(N, batch=(2,), generator=g)
+    simulation = NOISE.simulate(N, batch=(4, 2), generator=g)
+    if extra is not None:
+        recording[1] += extra
+    return Case.of(SCENE, recording, simulation)
+
+
+def telegraph(seed: int) -> Case:
+    g = torch.Generator().manual_seed(1000 + seed)
+    return drawn(seed, LEVELS.half * _path(N, LEVELS.up, LEVELS.down, g))
+
+
+def covariance(n: int) -> np.ndarray:
+    """Of block means in `BACKGROUND`, part by part."""
+    k = np.arange(n)
+    lag, earlier = np.abs(k[:, None] - k), np.minimum(k[:, None], k)
+    ar1s = sum(v * p**lag for v, p in zip(START, PHI[:2], strict=False))
+    return np.asarray(ar1s + _LARGEST + STEPS[2] * (earlier + 1) + WHITE * np.eye(n))
+
+
+def log_density(y: np.ndarray, mean: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Normal log densities but for a constant."""
+    law = stats.multivariate_normal(mean, matrix)
+    return np.asarray(law.logpdf(y) + y.shape[-1] / 2 * math.log(2 * math.pi))
+
+
+def test_the_rival_has_the_likelihood_of_the_normal_law() -> None:
+    y = np.random.default_rng(1).normal(size=30)
+    lag = np.abs(np.arange(30)[:, None] - np.arange(30))
+    for sd, tau in ((0.0, 1.0), (0.9, 4.0)):
+        matrix = covariance(30) + sd**2 * np.exp(-lag / tau)
+        mine = gaussian_values(y, BACKGROUND, np.array([sd, 2.0]), np.array([tau, 7.0]))[0].sum()
+        assert mine == pytest.approx(log_density(y, np.full(30, y.mean()), matrix), abs=1e-6)
+
+
+def every_path(y: np.ndarray, half: float, up: float, down: float) -> float:
+    n = len(y)
+    leave, enter = 1 - math.exp(-1 / up), 1 - math.exp(-1 / down)
+    move = {(1, 1): 1 - leave, (1, -1): leave, (-1, 1): enter, (-1, -1): 1 - enter}
+    paths = np.array(list(itertools.product((1, -1), repeat=n + 1)))  # one block ahead of the first
+    prior = np.where(paths[:, 0] == 1, enter, leave) / (leave + enter)
+    for a in range(n):
+        prior = prior * np.array([move[i, j] for i, j in paths[:, [a, a + 1]].tolist()])
+    densities = log_density(y - half * (paths[:, :-1] + paths[:, 1:]) / 2, np.full(n, y.mean()), covariance(n))
+    return float(np.log((prior * np.exp(densities)).sum()))
+
+
+def test_the_likelihood_of_two_levels_sums_over_all_paths() -> None:
+    y = np.random.default_rng(2).normal(size=10) * 0.7 + np.repeat([1, -1], 5)
+    truth = every_path(y, 1.0, 4.0, 6.0)
+    numbers = (np.array([1.0, 0.3]), np.array([4.0, 2.0]), np.array([6.0, 9.0]))
+    all_paths = switching_values(y, BACKGROUND, *numbers, 4096).sum(-1)
+    assert all_paths[0] == pytest.approx(truth, abs=1e-9)
+    assert all_paths[1] == pytest.approx(every_path(y, 0.3, 2.0, 9.0), abs=1e-9)
+    assert switching_values(y, BACKGROUND, *numbers, 256).sum(-1)[0] == pytest.approx(truth, abs=0.1)
+
+
+def test_thinning_keeps_the_heavy_and_is_unbiased() -> None:
+    weight = np.random.default_rng(3).dirichlet(np.full(40, 0.3), size=5)
+    mean, uniforms = np.zeros_like(weight), (np.arange(2000) + 0.5) / 2000
+    for uniform in uniforms:
+        kept, new = _thinned(weight, 16, float(uniform))
+        assert kept.shape == new.shape == (5, 16)
+        assert all(len(set(row)) == 16 for row in kept.tolist())
+        np.add.at(mean.ravel(), kept.ravel(), new.ravel() / len(uniforms))
+    assert np.abs(mean - weight).max() < 2e-3 * weight.max()
+
+
+def test_thinning_makes_up_for_paths_without_weight() -> None:
+    kept, new = _thinned(np.eye(40)[:3], 16, 0.5)
+    assert kept.shape == (3, 16)
+    assert new.sum(1) == pytest.approx(np.ones(3))
+
+
+def test_gains_settle_and_one_is_left_for_the_level_at_the_start() -> None:
+    gains, variances = _filter(BACKGROUND, 2000)
+    assert gains[0].sum() == pytest.approx(1.0, abs=1e-3)
+    assert np.abs(np.diff(gains[-2:], axis=0)).max() < 1e-9
+    assert variances[-1] > WHITE + STEPS.sum()
+
+
+def test_backgrounds_have_the_variances_of_block_means() -> None:
+    case, block = drawn(4), 32
+    background = backgrounds(case.base, block)[0]
+    lags = np.arange(0, 60, 6)
+
+    def variogram(matrix: np.ndarray) -> np.ndarray:
+        return np.array([matrix[0, 0] + matrix[lag, lag] - 2 * matrix[0, lag] for lag in lags[1:]])
+
+    exact = case.base.block_covariance(block, 60)[0].numpy()
+    k = np.arange(60)
+    lag, earlier = np.abs(k[:, None] - k), np.minimum(k[:, None], k)
+    variances = background.start[:-1]
+    ar1s = sum(v * p**lag for v, p in zip(variances, background.phi, strict=False))
+    mine = ar1s + background.steps[-1] * earlier + background.white * np.eye(60)
+    assert variogram(mine) == pytest.approx(variogram(exact), rel=0.1)
+
+
+def test_a_parabola_gives_back_its_vertex() -> None:
+    rng = np.random.default_rng(5)
+    trials = rng.normal(size=(40, 3)) * 0.3
+    curvature, centre = np.diag([100.0, 20.0, 10.0]) + 4.0, np.array([0.1, -0.2, 0.15])
+    off = trials - centre
+    theta, matrix = vertex(trials, 7 - (off @ curvature * off).sum(-1) / 2)
+    assert theta == pytest.approx(centre, abs=1e-6)
+    assert matrix == pytest.approx(np.linalg.inv(curvature), rel=1e-6)
+
+
+def test_a_lorentzian_is_told_by_its_spectrum() -> None:
+    found = excess(telegraph(6))
+    tau = 1 / (1 / LEVELS.up + 1 / LEVELS.down)
+    sd = 2 * LEVELS.half * math.sqrt(LEVELS.up * LEVELS.down) / (LEVELS.up + LEVELS.down)
+    assert float(found.gain[1]) > 40 > 6 > float(found.gain[0])
+    assert float(found.sd[1]) == pytest.approx(sd, rel=0.2)
+    assert float(found.tau[1]) == pytest.approx(tau, rel=0.6)
+
+
+def test_two_levels_are_named_where_noise_is_coloured() -> None:
+    within, named, seeds = 0, 0, range(10, 14)
+    for seed in seeds:
+        case = telegraph(seed)
+        found = RandomTelegraph.nominate(case, LEVEL)
+        if found is None:
+            continue
+        named += 1
+        assert found.sensors == (1,)
+        gain = held_out_gain(case, found.effect)
+        assert gain.blocks.shape == (N_JUDGED,)
+        assert gain.total > gain.sd
+        truth = {"half_step[1]": LEVELS.half, "dwell_up[1]": LEVELS.up / 100, "dwell_down[1]": LEVELS.down / 100}
+        within += sum(found.parameters[k].low <= v <= found.parameters[k].high for k, v in truth.items())
+    assert named >= 3
+    assert within >= 3 * named - 3
+
+
+def test_an_ar1_of_the_same_spectrum_is_not() -> None:
+    tau = 1 / (1 / LEVELS.up + 1 / LEVELS.down)
+    for seed in range(20, 24):
+        g = torch.Generator().manual_seed(seed)
+        phi = math.exp(-1 / tau)
+        extra = AR1(phi, LEVELS.half**2 * (1 - phi**2)).simulate(N, generator=g)
+        assert RandomTelegraph.nominate(drawn(seed, extra), LEVEL) is None
+
+
+def test_scores_are_those_of_the_fit_or_computed() -> None:
+    case = telegraph(10)
+    fit = two_levels(case)[1]
+    assert scores(case, 1, fit.best) is not None
+    assert scores(case, 1, fit.best) == pytest.approx(fit.values[0])
+    near = scores(case, 1, fit.best._replace(half=fit.best.half * 1.001))
+    assert near.sum() == pytest.approx(fit.values[0].sum(), abs=1.0)
+    # A sensor that was not tried.
+    assert scores(case, 0, LEVELS).sum() < -10
+    assert scores(case, 0, Numbers(0.1, 2.0, 2.0)) == pytest.approx(np.zeros(N_JUDGED))
+
+
+def test_the_repair_builds_levels_into_every_record() -> None:
+    found = nominated(telegraph(10), RandomTelegraph)
+    zero = torch.zeros(3, 2, 5000, dtype=torch.float64)
+    made = found.effect.simulated(zero, SCENE, torch.Generator().manual_seed(1))
+    half = found.parameters["half_step[1]"].value
+    assert bool((made[:, 0] == 0).all())
+    assert made[:, 1].abs().unique().tolist() == pytest.approx([half])
+    assert not torch.equal(made[0, 1], made[1, 1])
