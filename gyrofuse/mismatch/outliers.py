@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,18 +17,22 @@ _BINS = 250
 _EVENT, _COMPANY = 3.5, 2.5  # sd
 _NEAR = (2, 9)  # samples on either side
 _CLUSTERED = 0.6  # share of events that have company
+_OFF = 0.05  # logarithm, by which the sd of the noise may be wrong
+_ROUNDS = 3
 _FLAT = 2.0  # times what the number of events alone says
 
 _Law = Callable[..., NDArray[np.float64]]
 
 
 class Outliers(NamedTuple):
-    """`z` is standard normal, but with probability `rate` moved by `height`, of either sign, with sd `spread`.
+    """`z` is normal of sd `scale`, but with probability `rate` moved by `height`, of either sign, with sd `spread`.
 
     Attributes:
         rate: Probability.
-        height, spread: In sd of the noise.
+        height, spread: In sd of the noise as it was estimated.
         rate_sd, amplitude_sd: Standard errors of `rate` and `amplitude`.
+        scale: Sd of what is no outlier: a robust estimate of it is half a per cent off, which many faint outliers
+            would have to make up for.
     """
 
     rate: float
@@ -36,6 +40,7 @@ class Outliers(NamedTuple):
     spread: float
     rate_sd: float = math.nan
     amplitude_sd: float = math.nan
+    scale: float = 1.0
 
     @classmethod
     def none(cls) -> Outliers:
@@ -44,6 +49,20 @@ class Outliers(NamedTuple):
     @property
     def amplitude(self) -> float:
         return math.hypot(self.height, self.spread)
+
+    def scaled(self, z: Tensor) -> Outliers:
+        """With the most likely scale for values, all else as it is."""
+        law = self
+        for _ in range(_ROUNDS):
+            plain = 1 - law.posterior(z)
+            law = law._replace(scale=float(((plain * z.square()).sum() / plain.sum()).sqrt()))
+        return law
+
+    def times(self, factor: float) -> Outliers:
+        """Of values so many times as large."""
+        sizes = (self.height, self.spread, self.amplitude_sd, self.scale)
+        height, spread, amplitude_sd, scale = (factor * size for size in sizes)
+        return Outliers(self.rate, height, spread, self.rate_sd, amplitude_sd, scale)
 
     def posterior(self, z: Tensor) -> Tensor:
         """Probability of each value's being an outlier."""
@@ -54,7 +73,7 @@ class Outliers(NamedTuple):
 
 def mixture(z: Tensor, law: Outliers) -> Tensor:
     """Log density of `z` under the law."""
-    plain = -z.square() / 2 - math.log(2 * math.pi) / 2
+    plain = -(z / law.scale).square() / 2 - math.log(2 * math.pi * law.scale**2) / 2
     return torch.logaddexp(math.log1p(-law.rate) + plain, math.log(max(law.rate, 1e-300)) + _moved(z, law))
 
 
@@ -69,15 +88,16 @@ def _weighted_gaussian(z: Tensor, counts: Tensor) -> Tensor:
 
 
 def fitted(z: Tensor) -> Outliers:
-    """Maximum likelihood in `log rate`, `log height`, `log spread`, and limits from its curvature."""
+    """Maximum likelihood in `log rate`, `log height`, `log spread`, `log scale`, and limits from its curvature."""
     z, counts = _condensed(z.abs())
     n = float(counts.sum())
 
     def deviance(theta: list[float]) -> float:
-        law = Outliers(min(math.exp(theta[0]), 0.5), math.exp(theta[1]), math.exp(theta[2]))
+        law = _law_of(theta)
         return -float((counts * mixture(z, law)).sum())
 
     bounds = [(math.log(0.2 / n), math.log(0.3)), (math.log(0.3), math.log(1e4)), (math.log(0.05), math.log(1e4))]
+    bounds += [(-_OFF, _OFF)]
     starts = [
         (max(float(counts[z > level].sum()), 1.0) / n, height)
         for level, height in ((3.0, 3.0), (4.0, 6.0), (6.0, float(z[z > 6].mean()) if bool((z > 6).any()) else 8.0))
@@ -85,7 +105,7 @@ def fitted(z: Tensor) -> Outliers:
     runs = [
         optimize.minimize(
             deviance,
-            [math.log(rate), math.log(height), math.log(0.3 * height)],
+            [math.log(rate), math.log(height), math.log(0.3 * height), 0.0],
             method="L-BFGS-B",
             bounds=bounds,
             options={"maxiter": 60},
@@ -93,12 +113,18 @@ def fitted(z: Tensor) -> Outliers:
         for rate, height in starts
     ]
     best = min(runs, key=lambda run: float(run.fun))
-    rate, height, spread = (math.exp(v) for v in best.x)
-    rate_sd, amplitude_sd = _spread_of(z, counts, Outliers(rate, height, spread))
+    law = _law_of(best.x)
+    rate, spread = law.rate, law.spread
+    rate_sd, amplitude_sd = _spread_of(z, counts, list(best.x))
     # One or two events have no curvature to speak of: no more than twice what their number says.
     most = _FLAT / math.sqrt(max(rate * n, 1.0))
     rate_sd, amplitude_sd = min(rate_sd, most * rate), min(amplitude_sd, most * math.hypot(spread, 1.0))
-    return Outliers(rate, height, spread, rate_sd, amplitude_sd)
+    return law._replace(rate_sd=rate_sd, amplitude_sd=amplitude_sd)
+
+
+def _law_of(theta: Sequence[float]) -> Outliers:
+    rate, height, spread, scale = (math.exp(v) for v in theta)
+    return Outliers(min(rate, 0.5), height, spread, scale=scale)
 
 
 def heavy_tailed(z: Tensor) -> float:
@@ -150,7 +176,7 @@ def clustered(white: Tensor) -> bool:
 
 
 def _moved(z: Tensor, law: Outliers) -> Tensor:
-    variance = 1 + law.spread**2
+    variance = law.scale**2 + law.spread**2
     up, down = -(z - law.height).square() / (2 * variance), -(z + law.height).square() / (2 * variance)
     return torch.logaddexp(up, down) - math.log(2) - math.log(2 * math.pi * variance) / 2
 
@@ -164,16 +190,16 @@ def _condensed(size: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cat([centres, large]), torch.cat([counts, torch.ones_like(large)])
 
 
-def _spread_of(z: Tensor, counts: Tensor, law: Outliers) -> tuple[float, float]:
+def _spread_of(z: Tensor, counts: Tensor, theta: Sequence[float]) -> tuple[float, float]:
     """Standard errors of rate and amplitude by the information in the scores, differentiated numerically."""
-    theta = [math.log(law.rate), math.log(law.height), math.log(law.spread)]
+    law = _law_of(theta)
     step, slopes = 1e-4, []
-    for k in range(3):
-        moved = [Outliers(*(math.exp(v + sign * step * (j == k)) for j, v in enumerate(theta))) for sign in (1.0, -1.0)]
+    for k in range(len(theta)):
+        moved = [_law_of([v + sign * step * (j == k) for j, v in enumerate(theta)]) for sign in (1.0, -1.0)]
         slopes.append((mixture(z, moved[0]) - mixture(z, moved[1])) / (2 * step))
     scores = torch.stack(slopes)
     information = (scores * counts) @ scores.mT
     covariance = torch.linalg.pinv(information, hermitian=True)
     amplitude = law.amplitude
-    gradient = torch.tensor([0.0, law.height**2 / amplitude, law.spread**2 / amplitude], dtype=torch.float64)
+    gradient = torch.tensor([0.0, law.height**2 / amplitude, law.spread**2 / amplitude, 0.0], dtype=torch.float64)
     return law.rate * math.sqrt(float(covariance[0, 0])), math.sqrt(float(gradient @ covariance @ gradient))

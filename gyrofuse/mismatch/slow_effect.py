@@ -17,6 +17,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import N_BLOCKS, Case, Scene, block_means
 from gyrofuse.mismatch.folds import N_FOLDS, N_JUDGED, in_fold
+from gyrofuse.mismatch.hysteresis import strongest_relay
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.slow import cosines, scores
 from gyrofuse.mismatch.slow_families import Family
@@ -118,7 +119,8 @@ class Strong(NamedTuple):
 def strong_scan(case: Case, name: str, level: float) -> Strong | None:
     """The scan of a mechanism and its equals; None where it is not there, or where another one is better.
 
-    A stronger random walk than the simulation's is one of them, under the name of what changes numbers.
+    A stronger random walk than the simulation's is one of them, under the name of what changes numbers. Where a relay
+    that a temperature switches fits as well, it may be nothing that has a name here.
     """
     look = slow_look(case)
     scan = look.scan(name)
@@ -127,6 +129,9 @@ def strong_scan(case: Case, name: str, level: float) -> Strong | None:
     rivals = {other.family.name: other.gain for other in look.scans if other is not scan}
     rivals["parameter_shift"] = look.wandering
     if any(gain > scan.gain + _TOO_CLOSE for gain in rivals.values()):
+        return None
+    relay = strongest_relay(case)
+    if relay is not None and relay.gain > scan.gain - _TOO_CLOSE:
         return None
     return Strong(look, scan, tuple(rival for rival, gain in rivals.items() if gain > scan.gain - _TOO_CLOSE))
 

@@ -23,8 +23,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
+from gyrofuse._nnls import nonnegative_least_squares
 from gyrofuse.mismatch.base import Base
 
 Array = NDArray[np.float64]
@@ -63,7 +63,8 @@ def backgrounds(base: Base, block: int, n_shaped: int = 4) -> list[Background]:
     atoms = np.concatenate([np.ones((1, len(f))), shaped, 1 / (4 * np.sin(np.pi * f) ** 2)[None]])
     found = []
     for row in density:
-        white, *variances, walk = nnls((atoms / row).T, np.ones(len(f)))[0]
+        relative = torch.from_numpy(atoms / row)
+        white, *variances, walk = nonnegative_least_squares(relative @ relative.mT, relative.sum(-1)).tolist()
         variance = np.array(variances)
         steps = np.append(variance * (1 - phi**2), walk)
         # Differences of successive means say nothing of a noise that has no white part.

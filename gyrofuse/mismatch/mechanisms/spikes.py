@@ -164,6 +164,7 @@ class Spikes(Mechanism):
         z, laws = left_out(case.recorded).z[0], self._laws(case)
         if self.together:
             return held_out_blocks(_shock_gains(z, laws), fold).sum(-1)
+        laws = [law.scaled(row) for row, law in zip(z, laws, strict=True)]
         return held_out_blocks(_gains(z, laws) * (self.rate[:, None] > 0), fold).sum((0, -1))
 
     def _laws(self, case: Case) -> list[Outliers]:
@@ -188,8 +189,8 @@ def _alike(z: Tensor, laws: list[Outliers], hit: tuple[int, ...]) -> list[Outlie
     """One law for all sensors concerned, in sd of their noise, where it is as good as one for each (Akaike)."""
     if len(hit) < 2:
         return laws
-    shared = fitted(z[list(hit)].flatten())
-    one = [shared if i in hit else law for i, law in enumerate(laws)]
+    shared = fitted(torch.cat([z[i] / laws[i].scale for i in hit]))
+    one = [shared.times(law.scale) if i in hit else law for i, law in enumerate(laws)]
     worse = float((_gains(z, laws) - _gains(z, one))[list(hit)].sum())
     return one if worse < 3 * (len(hit) - 1) else laws
 

@@ -130,7 +130,8 @@ def lost_samples(bench: Bench, nats: float) -> Part:
     tail = bench.rng.standard_normal((bench.n_sensors, count)) * bench.sigma[:, None]
 
     def convert(x: Array) -> Array:
-        return clock.lose(np.concatenate([x, x[:, -1:] + tail], axis=1), np.append(at, np.zeros(count, bool)), bench.n)
+        more = x.mean(axis=1, keepdims=True) + tail
+        return clock.lose(np.concatenate([x, more], axis=1), np.append(at, np.zeros(count, bool)), bench.n)
 
     return Part("not_identifiable", 0.0, everyone, lambda recording: 0.0, converter=convert)
 
