@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -60,7 +61,7 @@ class HeldOut(NamedTuple):
         gain: Log score of the repair, nats, with 95 % limits `low` and `high`.
         auc_before: Area under the ROC curve of a classifier that tells windows of the one from windows of the other;
             0.5 is guessing.
-        auc_after: The same with the repaired simulation.
+        auc_after: The same of the recording as it came and what the repaired simulation makes.
     """
 
     before: float
@@ -99,21 +100,24 @@ def held_out(start: Case, gains: Sequence[Gain], generator: torch.Generator) -> 
     total, reach = sum(gain.total for gain in gains), 0.0
     if gains:
         reach = Z * sd_of_sum(torch.stack([gain.blocks for gain in gains]).sum(0))
-    before = after = [_agreement(start, fold) for fold in range(N_FOLDS)]
+    before = after = [(discrepancy(start, fold), distinguishability(start, fold)) for fold in range(N_FOLDS)]
     if gains:
         after = []
         for fold in range(N_FOLDS):
-            repaired = start
-            for gain in gains:
-                repaired = gain.refitted[fold].explained(repaired, generator)
-            after.append(_agreement(repaired, fold))
-    (d, auc), (d_after, auc_after) = (torch.stack(folds).mean(0).tolist() for folds in (before, after))
+            repaired = simulated = start
+            for effect in (gain.refitted[fold] for gain in gains):
+                repaired = effect.explained(repaired, generator)
+                simulated = _simulated(simulated, effect, generator)
+            after.append((discrepancy(repaired, fold), distinguishability(simulated, fold)))
+    (d, auc), (d_after, auc_after) = (
+        torch.tensor(folds, dtype=torch.float64).mean(0).tolist() for folds in (before, after)
+    )
     return HeldOut(d, d_after, total, total - reach, total + reach, auc, auc_after)
 
 
-def _agreement(case: Case, fold: int) -> Tensor:
-    """Discrepancy and area under the curve on what a fold holds out."""
-    return torch.tensor([discrepancy(case, fold), distinguishability(case, fold)], dtype=torch.float64)
+def _simulated(case: Case, effect: Mechanism, generator: torch.Generator) -> Case:
+    """With an effect simulated, whether or not it could be taken off: what is cleaned shows that it was."""
+    return case.built_in(partial(effect.simulated, scene=case.scene, generator=generator), effect.place)
 
 
 def sd_of_sum(blocks: Tensor) -> float:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -11,8 +14,16 @@ from gyrofuse.mismatch.mechanism import Mechanism
 from gyrofuse.mismatch.shape_bands import slow_gains
 
 
+@dataclass(frozen=True, eq=False)
 class Spectral(Mechanism):
-    """What is judged by blocks and, where they are too short, by the slowest ordinates of the whole record."""
+    """What is judged by blocks and, where they are too short, by the slowest ordinates of the whole record.
+
+    Attributes:
+        company: Shapes in whose company its numbers were found, and are estimated anew: by itself it would have to
+            stand for them as well. No part of what is saved.
+    """
+
+    company: tuple[Any, ...] = field(default=(), kw_only=True, metadata={"saved": False})
 
     def gains(self, case: Case, fold: int) -> Tensor:
         return super().gains(case, fold) + slow_gains(case, self.spectra, fold)

@@ -15,7 +15,7 @@ from gyrofuse.mismatch.folds import estimation_samples
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.shape_terms import Bump, CommonBump, oscillation
 from gyrofuse.mismatch.shape_words import spanned
-from gyrofuse.mismatch.shapes import chosen_shape, run_length
+from gyrofuse.mismatch.shapes import chosen_shape, refit, run_length
 from gyrofuse.mismatch.steadiness import Steadiness, steadiness
 from gyrofuse.mismatch.witnesses import level_of
 
@@ -23,6 +23,7 @@ _SEEN = 3.0  # standard deviations
 _BAND = 6.0  # half widths on either side
 _PARTS, _MOST_ALIKE = 16, 0.8  # of a record, to see a frequency wander, and the correlation of neighbours
 _FEWEST = 3  # samples of the band in a part
+_BROAD = 0.06  # half width over centre
 _SMEARED = 0.7  # bins: half width of a line under a Hann taper
 
 
@@ -163,7 +164,14 @@ def wandering_sd(case: Case, bump: Oscillation) -> float:
 
 
 def refitted_mode(case: Case, fold: int, mode: Mode) -> Mode:
-    """The same centre and width, gains from the power over the flanks in blocks that a fold does not hold out."""
+    """The same centre and width, gains from the power over the flanks in blocks that a fold does not hold out.
+
+    A broad mode has no flanks of its own: it is fitted to the whole spectrum.
+    """
+    if not mode.shared and mode.width > _BROAD * mode.centre:
+        term = refit(case, fold, Bump.start(mode.centre, mode.width, mode.gain.abs().square()))
+        centre, width = term.shared.exp().tolist()
+        return Mode(centre, width, term.local[0].sqrt().to(torch.complex128), False)
     keep = estimation_samples(case.n_samples, fold)
     block = run_length(keep)
     blocks = case.recording[:, keep].unflatten(-1, (-1, block))

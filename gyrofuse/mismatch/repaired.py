@@ -113,7 +113,8 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Tensor):
         return _plain(value.tolist())
     if is_dataclass(value):
-        return {entry.name: _plain(getattr(value, entry.name)) for entry in fields(value)}
+        saved = (entry.name for entry in fields(value) if entry.metadata.get("saved", True))
+        return {name: _plain(getattr(value, name)) for name in saved}
     if isinstance(value, tuple | list):
         return [_plain(entry) for entry in value]
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value

@@ -49,7 +49,8 @@ def _effect(entry: Mapping[str, Any]) -> Mechanism:
 
 def _rebuilt(kind: Any, numbers: Mapping[str, Any]) -> Any:
     """A dataclass from the plain numbers of its fields, by what they are declared to be."""
-    return kind(**{field.name: _value(str(field.type), numbers[field.name]) for field in fields(kind)})
+    saved = (field for field in fields(kind) if field.metadata.get("saved", True))
+    return kind(**{field.name: _value(str(field.type), numbers[field.name]) for field in saved})
 
 
 def _value(declared: str, value: Any) -> Any:

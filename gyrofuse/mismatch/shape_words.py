@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 from gyrofuse.mismatch.case import Case
-from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
+from gyrofuse.mismatch.gaussian import Spectral
+from gyrofuse.mismatch.mechanism import Finding, Parameter, Z
 from gyrofuse.mismatch.shapes import Shape
 
 
@@ -17,7 +19,7 @@ def spanned(number: Callable[[float], float], middle: float, sd: float, unit: st
 
 def found(
     case: Case,
-    effect: Mechanism,
+    effect: Spectral,
     shape: Shape,
     sensors: tuple[int, ...],
     parameters: dict[str, Parameter],
@@ -30,7 +32,7 @@ def found(
     limits = {name: entry for name, entry in parameters.items() if not math.isnan(entry.value)}
     return Finding(
         effect.name,
-        effect,
+        replace(effect, company=shape.company),
         sentence,
         shape.p_value,
         sensors,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -55,6 +55,7 @@ class Shape(NamedTuple):
 
     Attributes:
         term: It, its numbers those of the joint fit.
+        company: The others of that fit.
         sd: Standard deviations of its local `(number, sensor)` and shared numbers; NaN where not free.
         gain: Nats that it adds to the others, without what its numbers cost.
         p_value: Of the same, for all the shapes that compete.
@@ -65,6 +66,7 @@ class Shape(NamedTuple):
     """
 
     term: Term
+    company: tuple[Term, ...]
     sd: tuple[Tensor, Tensor]
     gain: float
     p_value: float
@@ -119,15 +121,15 @@ def compared(case: Case) -> Ratios:
     return ratios(both, deep_base(case), usable, _independent(case))
 
 
-def refit(case: Case, fold: int, term: Term) -> Term:
-    """A shape with its numbers estimated anew without what a fold holds out, in the company of no other."""
+def refit(case: Case, fold: int, term: Term, company: Sequence[Term] = ()) -> Term:
+    """A shape with its numbers estimated anew without what a fold holds out, together with those of its company."""
     keep = estimation_samples(case.n_samples, fold)
     block = run_length(keep)
     recorded = case.recording[:, keep].unflatten(-1, (-1, block)).movedim(1, 0)
     simulated = _in_blocks(case.simulated)[block]
     both = deep(case, Side(recorded, simulated.bands), simulated, _slow_without(fold))
     data = ratios(both, deep_base(case), torch.ones_like(both.d), _independent(case))
-    found = fit(data, [term])
+    found = fit(data, [term, *company])
     return fit(data.centred(found.model.diagonal(dim1=-2, dim2=-1).real), found.terms).terms[0]
 
 
@@ -198,6 +200,7 @@ def _searched(case: Case) -> tuple[Shape, ...]:
         found.append(
             Shape(
                 term,
+                tuple(others),
                 chosen.sd(i),
                 gain - _cost(data, term),
                 p,

@@ -123,6 +123,6 @@ class CommonMode(Addition):
         local = torch.stack([self.gain.real, self.gain.imag])
         free = torch.ones_like(local, dtype=torch.bool)
         free[1] = bool(self.gain.imag.any())
-        term = refit(case, fold, Common(local, free, shared, self.kind, self.inside))
+        term = refit(case, fold, Common(local, free, shared, self.kind, self.inside), self.company)
         corner = math.exp(float(term.shared[0])) if self.kind == "ar1" else 0.0
         return replace(self, gain=torch.complex(*term.local), corner=corner)

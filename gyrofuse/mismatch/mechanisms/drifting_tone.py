@@ -19,6 +19,7 @@ _SHORT = 0.05  # cycles of the width in which a phase that diffuses forgets its 
 _LONG = 8.0
 _REACH = 10.0  # half widths of the band that is cleaned
 _FLANK = 6.0
+_FAINT = 0.03  # of the largest gain
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,8 +87,12 @@ class DriftingTone(Addition):
         level = (transform.abs().square() / density)[:, beside].mean(-1, keepdim=True)
         parts = torch.randn(2, len(signal), last - first + 1, generator=generator, dtype=torch.float64)
         fresh = torch.complex(parts[0], parts[1]) / math.sqrt(2)
-        transform[:, first : last + 1] = fresh * (level * density[:, first : last + 1]).sqrt()
-        return case.with_recording(torch.fft.irfft(transform, n=n) + ramp)
+        size = self.mode.gain.abs()
+        concerned = size > _FAINT * size.amax()  # the others stay as they are
+        filled = fresh * (level * density[:, first : last + 1]).sqrt()
+        transform[concerned, first : last + 1] = filled[concerned]
+        cleaned = torch.fft.irfft(transform, n=n) + ramp
+        return case.with_recording(torch.where(concerned[:, None], cleaned, signal))
 
     def refitted(self, case: Case, fold: int) -> Mechanism:
         return replace(self, mode=refitted_mode(case, fold, self.mode))

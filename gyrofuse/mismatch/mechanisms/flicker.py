@@ -66,4 +66,4 @@ class FlickerNoise(Addition):
     def refitted(self, case: Case, fold: int) -> Mechanism:
         own = self.level[None]
         term = Flicker(own, own > 0, torch.zeros(0, dtype=torch.float64))
-        return replace(self, level=refit(case, fold, term).local[0])
+        return replace(self, level=refit(case, fold, term, self.company).local[0])

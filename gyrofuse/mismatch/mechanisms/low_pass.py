@@ -70,7 +70,7 @@ class LowPassFilter(Filter):
     def refitted(self, case: Case, fold: int) -> Mechanism:
         own = self.strength[None]
         term = LowPass(own, own > 0, torch.zeros(0, dtype=torch.float64), self.kind)
-        return replace(self, strength=refit(case, fold, term).local[0])
+        return replace(self, strength=refit(case, fold, term, self.company).local[0])
 
 
 def _limits(term: LowPass, sd: Tensor) -> Tensor:

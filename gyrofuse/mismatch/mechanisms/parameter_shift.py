@@ -78,7 +78,7 @@ class ParameterShift(Filter):
 
     def refitted(self, case: Case, fold: int) -> Mechanism:
         term = Shift(self.log_factors, self.log_factors != 0, torch.zeros(0, dtype=torch.float64))
-        return replace(self, log_factors=refit(case, fold, term).local)
+        return replace(self, log_factors=refit(case, fold, term, self.company).local)
 
 
 def _numbers(base: Base, rate: float, unit: str) -> list[list[tuple[float, str]]]:
