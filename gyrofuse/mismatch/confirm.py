@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -107,17 +106,12 @@ def held_out(start: Case, gains: Sequence[Gain], generator: torch.Generator) -> 
             repaired = simulated = start
             for effect in (gain.refitted[fold] for gain in gains):
                 repaired = effect.explained(repaired, generator)
-                simulated = _simulated(simulated, effect, generator)
+                simulated = effect.built_into(simulated, generator)  # what was cleaned shows that it was
             after.append((discrepancy(repaired, fold), distinguishability(simulated, fold)))
     (d, auc), (d_after, auc_after) = (
         torch.tensor(folds, dtype=torch.float64).mean(0).tolist() for folds in (before, after)
     )
     return HeldOut(d, d_after, total, total - reach, total + reach, auc, auc_after)
-
-
-def _simulated(case: Case, effect: Mechanism, generator: torch.Generator) -> Case:
-    """With an effect simulated, whether or not it could be taken off: what is cleaned shows that it was."""
-    return case.built_in(partial(effect.simulated, scene=case.scene, generator=generator), effect.place)
 
 
 def sd_of_sum(blocks: Tensor) -> float:

@@ -56,6 +56,10 @@ class Mechanism:
 
     def explained(self, case: Case, generator: torch.Generator) -> Case:
         """The case with the mechanism taken off the recording or, as by default, built into the simulation."""
+        return self.built_into(case, generator)
+
+    def built_into(self, case: Case, generator: torch.Generator) -> Case:
+        """The case with the mechanism in the simulation, whether or not it could be taken off the recording."""
         return case.built_in(partial(self.simulated, scene=case.scene, generator=generator), self.place)
 
     def spectra(self, matrices: Tensor, f: Tensor) -> Tensor:
