@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gyrofuse import AR1, RandomWalk, WhiteNoise
 from gyrofuse.haar import haar_coefficients
-from gyrofuse.mismatch import episodes, impulses, marginals, outliers, switching
+from gyrofuse.mismatch import episodes, impulses, marginals, outliers
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.confirm import held_out_gain
 from gyrofuse.mismatch.mechanism import Finding, Mechanism
@@ -326,27 +326,6 @@ def test_kurtosis_is_that_of_the_wavelet_coefficients() -> None:
     b2 = torch.tensor(stats.kurtosis(sample, fisher=False))
     score = impulses._normal_kurtosis(b2, torch.tensor(200.0, dtype=torch.float64))
     assert float(score) == pytest.approx(float(stats.kurtosistest(sample).statistic), rel=1e-9)
-
-
-def _stretch(y: np.ndarray, r: float, q: float) -> switching.Stretches:
-    return switching.Stretches(y[None, None], np.array([r]), np.array([q]), 1)
-
-
-def test_the_gaussian_likelihood_is_that_of_the_normal_law() -> None:
-    rng = np.random.default_rng(1)
-    n, r, q, sd, tau = 12, 0.5, 0.02, 0.8, 3.0
-    y = rng.normal(size=n)
-    k = np.arange(n)
-    far = switching._LARGEST * (r + sd**2)
-    level = far + q * (np.minimum(k[:, None], k) + 1)
-    covariance = level + sd**2 * np.exp(-abs(k[:, None] - k) / tau) + r * np.eye(n)
-
-    def log_density(m: int) -> float:
-        law = stats.multivariate_normal(np.full(m, y.mean()), covariance[:m, :m])
-        return float(law.logpdf(y[:m])) + m / 2 * math.log(2 * math.pi)
-
-    mine = switching.gaussian_scores(_stretch(y, r, q), np.array([[sd]]), np.array([[tau]]))
-    assert mine[0, 0, 0] == pytest.approx(log_density(n) - log_density(n // 2), abs=1e-6)
 
 
 def test_two_levels_are_telegraph_noise_and_an_ar1_is_not() -> None:

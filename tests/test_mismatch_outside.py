@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from mismatch_draws import LEVEL, even, normal
 from scipy import integrate, stats
 from torch import Tensor
 
@@ -15,7 +16,6 @@ from gyrofuse.mismatch import episodes, hysteresis, impulses, modulation, outlie
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.mechanisms.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.variance_change import VarianceChange
-from tests.mismatch_draws import LEVEL, even, normal
 
 N, P, RATE = 2**14, 3, 100.0
 NOISE = WhiteNoise(1.0) + AR1(0.999, 1e-4) + RandomWalk(1e-8)

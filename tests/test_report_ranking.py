@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import replace
 
 import pytest
@@ -57,9 +58,9 @@ def test_the_runner_up_lost_by_odds_and_for_a_reason():
     difference[(result.difference[1] == 0) | result.equivalent[1]] = torch.inf
     runner = int(difference.nan_to_num(nan=torch.inf).argmin())
     words = plain(rank_verdict(result, (1,)))
-    assert (
-        f"The runner-up, {CANDIDATES[runner]}, has a criterion {difference[runner].item():.1f} above (odds of" in words
-    )
+    odds = number(math.exp(difference[runner].item() / 2), 2)
+    told = f"The runner-up, {CANDIDATES[runner]}, has a criterion {difference[runner].item():.1f} above"
+    assert f"{told} ({odds} times less likely)" in words
     reason = result.reasons[1][runner]
     assert reason
     assert f"and is more than it takes: {reason}." in words
