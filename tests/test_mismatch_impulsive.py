@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 from mismatch_draws import LEVEL, even, nominated, normal
-from scipy import fft, stats
+from scipy import fft, optimize, stats
 from torch import Tensor
 
 from gyrofuse import AR1, RandomWalk, WhiteNoise
 from gyrofuse.haar import haar_coefficients
-from gyrofuse.mismatch import episodes, impulses, marginals, outliers
+from gyrofuse.mismatch import episodes, impulses, marginals, outlier_limits, outliers
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.confirm import held_out_gain
 from gyrofuse.mismatch.mechanism import Finding, Mechanism
@@ -231,18 +231,49 @@ def test_outliers_in_all_sensors_at_once_are_a_shock() -> None:
     assert torch.equal(simulated[0] != 0, simulated[1] != 0)
 
 
-def test_limits_of_rate_and_amplitude_hold() -> None:
+@pytest.mark.parametrize(("height", "rate"), [(5.0, 3e-3), (3.2, 2e-3)])
+def test_limits_of_rate_and_amplitude_hold(height: float, rate: float) -> None:
     inside = np.zeros(2)
     for seed in range(20):
         g = torch.Generator().manual_seed(seed)
-        z = normal(N, g=g) + (even(N, g=g) < 3e-3) * 5.0 * (even(N, g=g) - 0.5).sign()
-        law = outliers.fitted(z)
-        inside += [
-            abs(law.amplitude / 5 - 1) < 2 * law.amplitude_sd / law.amplitude,
-            abs(math.log(law.rate / 3e-3)) < 2 * law.rate_sd / law.rate,
-        ]
+        z = 1.003 * normal(N, g=g) + (even(N, g=g) < rate) * height * (even(N, g=g) - 0.5).sign()
+        law = outlier_limits.with_limits(z, outliers.fitted(z))
+        sides = ((law.rate_limits, rate), (law.amplitude_limits, height))
+        inside += [low < truth < high for (low, high), truth in sides]
+        assert law.rate_limits[0] < law.rate < law.rate_limits[1]
+        assert law.amplitude_limits[0] < law.amplitude < law.amplitude_limits[1]
     # Fewer than 15 of 20 at 95 % have probability 3e-4.
     assert (inside >= 15).all(), inside
+
+
+def test_a_limit_is_where_the_likelihood_at_best_is_lower_by_what_95_per_cent_allow() -> None:
+    g = torch.Generator().manual_seed(5)
+    z = normal(4096, g=g) + (even(4096, g=g) < 5e-3) * 4.0 * (even(4096, g=g) - 0.5).sign()
+    law = outlier_limits.with_limits(z, outliers.fitted(z))
+    sample = outliers.Sample(z)
+
+    def lowest(rate: float) -> float:
+        runs = [
+            optimize.minimize(
+                lambda rest: sample.deviance(outliers.law_of([math.log(rate), *rest])),
+                [math.log(law.amplitude), start, 0.0],
+                method="Nelder-Mead",
+                options={"maxiter": 2000},
+            )
+            for start in (-2.0, -0.5)
+        ]
+        return min(float(run.fun) for run in runs)
+
+    for limit in law.rate_limits:
+        assert lowest(limit) - lowest(law.rate) == pytest.approx(1.92, abs=0.25)  # limits are found to 2 %
+
+
+def test_what_is_held_of_the_spread_yields_to_many_outliers() -> None:
+    g = torch.Generator().manual_seed(6)
+    hit = even(N, g=g) < 1e-2
+    z = normal(N, g=g) + hit * (12.0 + 8.0 * normal(N, g=g)) * (even(N, g=g) - 0.5).sign()
+    law = outliers.fitted(z)
+    assert law.spread == pytest.approx(8.0, rel=0.25)
 
 
 def test_the_law_of_outliers_is_normalised() -> None:

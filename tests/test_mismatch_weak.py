@@ -95,8 +95,11 @@ def test_a_fit_of_shocks_recovers_them_and_says_which_samples_are_hit() -> None:
     start = [Outliers(1e-3, 2.7, 0.3)] * 3
     laws = shocks.fitted_shock(z, start, 40)
     for law in laws:
-        assert abs(law.amplitude - 4) < 4 * law.amplitude_sd
-        assert abs(law.rate - 4e-3) < 4 * law.rate_sd
+        for value, (_, high), truth in (
+            (law.amplitude, law.amplitude_limits, 4.0),
+            (law.rate, law.rate_limits, 4e-3),
+        ):
+            assert abs(math.log(truth / value)) < 2 * math.log(high / value)  # limits are at 2 sd
     said = shocks.shock_posterior(z, laws) > 0.5
     assert int((said != hit[0]).sum()) < 0.05 * int(hit.sum()) + 3
     assert float(shocks.shock_scores(z, laws).sum()) > float(shocks.shock_scores(z, start).sum())

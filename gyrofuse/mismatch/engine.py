@@ -14,7 +14,7 @@ from gyrofuse._model import Model
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.confirm import held_out, held_out_gain
 from gyrofuse.mismatch.counterfactual import Link, settled
-from gyrofuse.mismatch.evidence import calibrated, corrected
+from gyrofuse.mismatch.evidence import calibrated, corrected, uncorrected
 from gyrofuse.mismatch.inputs import noise_of, prepared
 from gyrofuse.mismatch.mechanism import Finding
 from gyrofuse.mismatch.mechanisms import STAGES
@@ -90,7 +90,8 @@ def diagnose(
         )
     case: Case = start
     links: list[Link] = []
-    level = false_alarm / sum(map(len, STAGES))
+    # What would have been a mismatch, had one witness alone said it.
+    level = uncorrected(false_alarm, len(evidence))
     for number, stage in enumerate(STAGES):
         progress(", ".join(m.name for m in stage), _LOOKED + (_NAMED - _LOOKED) * number / len(STAGES))
         while len(links) < _MOST:

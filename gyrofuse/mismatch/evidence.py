@@ -9,6 +9,7 @@ from typing import Any
 from torch import Tensor
 
 _LOOSE = 0.05  # of the bound on the probability of a mean ratio
+_BY_CHANCE, _SURELY = 0.05, 1e-3  # p values of what a simulation shows
 _TAIL = 0.25  # share of the twins behind the fitted tail
 
 
@@ -46,6 +47,11 @@ def corrected(p: float, places: float) -> float:
     return -math.expm1(places * math.log1p(-min(p, 1.0))) if p < 1 else 1.0
 
 
+def uncorrected(p: float, places: float) -> float:
+    """What the smallest of so many p values is where it has `p` when corrected for their number."""
+    return -math.expm1(math.log1p(-min(p, 1 - 1e-16)) / places)
+
+
 def ratio_p_value(log_ratio: float) -> float:
     """p value of a mean likelihood ratio, from its logarithm.
 
@@ -53,6 +59,17 @@ def ratio_p_value(log_ratio: float) -> float:
     less than `1/70x`. To `1/20x` is held.
     """
     return math.exp(min(math.log(_LOOSE) - log_ratio, 0.0))
+
+
+def surpassing(own: float, other: float) -> float:
+    """p value of what the simulation shows too, there with the p value `other`.
+
+    What it may have by chance the recording has to surpass: `own / other` is below `x` with a probability below `x`.
+    Beside what it surely has, there is nothing to be told.
+    """
+    if other > _BY_CHANCE:
+        return own
+    return min(own / other, 1.0) if other > _SURELY else 1.0
 
 
 def calibrated(p_value: float, among: Tensor) -> float:

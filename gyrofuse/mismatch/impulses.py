@@ -18,7 +18,7 @@ from torch.nn.functional import avg_pool1d
 
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.episodes import episodes_of
-from gyrofuse.mismatch.evidence import Evidence, corrected
+from gyrofuse.mismatch.evidence import Evidence, corrected, surpassing
 from gyrofuse.mismatch.level_scan import LevelScan, scanned_levels
 from gyrofuse.mismatch.modulation import Modulation, strongest_modulation
 from gyrofuse.mismatch.remembered import remembered
@@ -35,7 +35,7 @@ _MOST_RECORDS = 2  # of the simulation: as honest as more
 _MAD = 0.6744897501960817
 _TAILS = (3.5, 4.0, 4.5, 5.0, 6.0, 8.0)
 _HEAVY = 1e-3  # p value of tails that the simulation has as well
-_OWN = 0.05  # p value of what the simulation has as well
+_NOTHING = 0.05  # p value of what need not be compared
 _CUT = 9.0  # squares: an outlier is no change of level
 _BLOCK = 128
 _BURST = 15  # lags
@@ -167,8 +167,7 @@ def spike_p_value(case: Case) -> float:
     """p value of outliers anywhere, by the tails or by many weak ones."""
     tails = spike_p_values(case)
     p_value = corrected(float(tails.min()), len(tails))
-    # A simulation that has weak outliers too is compared by the tails alone.
-    many = likely_outliers(case.recorded).p_value if likely_outliers(case.simulated).p_value > _OWN else 1.0
+    many = surpassing(likely_outliers(case.recorded).p_value, likely_outliers(case.simulated).p_value)
     return corrected(min(p_value, many), 2)
 
 
@@ -268,9 +267,9 @@ def variance_p_value(case: Case) -> float:
     """p value that the noise level changes anywhere: in one sensor or all, or by little in several."""
     each = variance_p_values(case)
     p_value = corrected(float(each.min()), len(each))
-    several = 1.0
-    if _divided(case) or _scanned(case.simulated).p_value > _OWN:
-        several = scanned_levels(levelled(case).square().clamp(max=_CUT)).p_value
+    several = scanned_levels(levelled(case).square().clamp(max=_CUT)).p_value
+    if not _divided(case):
+        several = surpassing(several, _scanned(case.simulated).p_value)
     return corrected(min(p_value, several), 2)
 
 
@@ -278,14 +277,12 @@ def variance_p_value(case: Case) -> float:
 def modulation(case: Case) -> Modulation:
     """The most conspicuous modulation of the noise level that the simulation does not have."""
     found = strongest_modulation(levelled(case).square().clamp(max=_CUT))
-    if found.p_value > _OWN:
+    if found.p_value > _NOTHING:
         return found
     profile = level_profile(case)
     white = left_out(case.simulated).white / (profile if _divided(case) else 1.0) ** 0.5
     other = min(strongest_modulation(record.square().clamp(max=_CUT)).p_value for record in white)
-    # A simulation that may be modulated as well has to be surpassed; one that surely is tells nothing.
-    p_value = found.p_value if other > _OWN else min(found.p_value / other, 1.0) if other > _HEAVY else 1.0
-    return found._replace(p_value=p_value)
+    return found._replace(p_value=surpassing(found.p_value, other))
 
 
 def _standardised(values: Tensor) -> Tensor:

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from scipy import optimize, special, stats
 from torch import Tensor
 
-_BULK = 2.5  # values below it are counted in a histogram
-_BINS = 250
+_BULK = 6.0  # values below it are counted in a histogram
+_BINS = 600
 _EVENT, _COMPANY = 3.5, 2.5  # sd
 _NEAR = (2, 9)  # samples on either side
 _CLUSTERED = 0.6  # share of events that have company
 _OFF = 0.05  # logarithm, by which the sd of the noise may be wrong
 _ROUNDS = 3
-_FLAT = 2.0  # times what the number of events alone says
+_RATIO, _RATIO_SD = 0.2, 0.8  # of spread to height beforehand: median, and sd of its logarithm
 
 _Law = Callable[..., NDArray[np.float64]]
 
@@ -30,7 +30,7 @@ class Outliers(NamedTuple):
     Attributes:
         rate: Probability.
         height, spread: In sd of the noise as it was estimated.
-        rate_sd, amplitude_sd: Standard errors of `rate` and `amplitude`.
+        rate_limits, amplitude_limits: Of `rate` and `amplitude`, 95 %.
         scale: Sd of what is no outlier: a robust estimate of it is half a per cent off, which many faint outliers
             would have to make up for.
     """
@@ -38,9 +38,9 @@ class Outliers(NamedTuple):
     rate: float
     height: float
     spread: float
-    rate_sd: float = math.nan
-    amplitude_sd: float = math.nan
     scale: float = 1.0
+    rate_limits: tuple[float, float] = (math.nan, math.nan)
+    amplitude_limits: tuple[float, float] = (math.nan, math.nan)
 
     @classmethod
     def none(cls) -> Outliers:
@@ -60,9 +60,9 @@ class Outliers(NamedTuple):
 
     def times(self, factor: float) -> Outliers:
         """Of values so many times as large."""
-        sizes = (self.height, self.spread, self.amplitude_sd, self.scale)
-        height, spread, amplitude_sd, scale = (factor * size for size in sizes)
-        return Outliers(self.rate, height, spread, self.rate_sd, amplitude_sd, scale)
+        height, spread, scale = (factor * size for size in (self.height, self.spread, self.scale))
+        low, high = self.amplitude_limits
+        return Outliers(self.rate, height, spread, scale, self.rate_limits, (factor * low, factor * high))
 
     def posterior(self, z: Tensor) -> Tensor:
         """Probability of each value's being an outlier."""
@@ -87,44 +87,61 @@ def _weighted_gaussian(z: Tensor, counts: Tensor) -> Tensor:
     return -z.square() / (2 * variance) - (2 * math.pi * variance).log() / 2
 
 
+class Sample:
+    """Moduli of values, of which the many small ones are counted in bins, with the likelihood of laws of outliers.
+
+    How far moduli of outliers spread is hardly told by a few that stand little above the noise, and with a wide spread
+    they may be any number of faint ones. Beforehand it is held to be a fifth of the height within a factor of five.
+    """
+
+    def __init__(self, z: Tensor) -> None:
+        size = z.abs()
+        bulk = size < _BULK
+        counts = torch.histc(size[bulk], _BINS, 0.0, _BULK)
+        centres = (torch.arange(_BINS, dtype=torch.float64) + 0.5) * (_BULK / _BINS)
+        large = size[~bulk]
+        self.values, self.counts = torch.cat([centres, large]), torch.cat([counts, torch.ones_like(large)])
+        self.n = float(self.counts.sum())
+
+    def deviance(self, law: Outliers) -> float:
+        """Minus the log likelihood, nats, and minus the log of what is held of the spread beforehand."""
+        beforehand = (math.log(law.spread / law.height / _RATIO) / _RATIO_SD) ** 2 / 2
+        return beforehand - float((self.counts * mixture(self.values, law)).sum())
+
+
+def law_of(theta: Sequence[float]) -> Outliers:
+    """Of log rate, log amplitude, log of spread over height, log scale."""
+    rate, amplitude, ratio, scale = (math.exp(v) for v in theta)
+    height = amplitude / math.hypot(1.0, ratio)
+    return Outliers(rate, height, ratio * height, scale)
+
+
+def bounds_of(n: float) -> list[tuple[float, float]]:
+    """Within which numbers of `law_of` are looked for, of `n` values."""
+    return [(math.log(0.2 / n), math.log(0.3)), (math.log(0.3), math.log(1e4)), (math.log(0.01), 1.0), (-_OFF, _OFF)]
+
+
 def fitted(z: Tensor) -> Outliers:
-    """Maximum likelihood in `log rate`, `log height`, `log spread`, `log scale`, and limits from its curvature."""
-    z, counts = _condensed(z.abs())
-    n = float(counts.sum())
-
-    def deviance(theta: list[float]) -> float:
-        law = _law_of(theta)
-        return -float((counts * mixture(z, law)).sum())
-
-    bounds = [(math.log(0.2 / n), math.log(0.3)), (math.log(0.3), math.log(1e4)), (math.log(0.05), math.log(1e4))]
-    bounds += [(-_OFF, _OFF)]
-    starts = [
-        (max(float(counts[z > level].sum()), 1.0) / n, height)
-        for level, height in ((3.0, 3.0), (4.0, 6.0), (6.0, float(z[z > 6].mean()) if bool((z > 6).any()) else 8.0))
-    ]
+    """Most likely rate, height, spread and scale."""
+    sample = Sample(z)
+    values, counts, n = sample.values, sample.counts, sample.n
+    starts = []
+    for level, least in ((3.0, 3.0), (4.0, 6.0), (6.0, 8.0)):
+        beyond = values > level
+        number = float(counts[beyond].sum())
+        height = float((counts * values)[beyond].sum()) / number if level == 6.0 and number else least
+        starts.append([math.log(max(number, 1.0) / n), math.log(height), math.log(_RATIO), 0.0])
     runs = [
         optimize.minimize(
-            deviance,
-            [math.log(rate), math.log(height), math.log(0.3 * height), 0.0],
+            lambda theta: sample.deviance(law_of(theta)),
+            start,
             method="L-BFGS-B",
-            bounds=bounds,
+            bounds=bounds_of(n),
             options={"maxiter": 60},
         )
-        for rate, height in starts
+        for start in starts
     ]
-    best = min(runs, key=lambda run: float(run.fun))
-    law = _law_of(best.x)
-    rate, spread = law.rate, law.spread
-    rate_sd, amplitude_sd = _spread_of(z, counts, list(best.x))
-    # One or two events have no curvature to speak of: no more than twice what their number says.
-    most = _FLAT / math.sqrt(max(rate * n, 1.0))
-    rate_sd, amplitude_sd = min(rate_sd, most * rate), min(amplitude_sd, most * math.hypot(spread, 1.0))
-    return law._replace(rate_sd=rate_sd, amplitude_sd=amplitude_sd)
-
-
-def _law_of(theta: Sequence[float]) -> Outliers:
-    rate, height, spread, scale = (math.exp(v) for v in theta)
-    return Outliers(min(rate, 0.5), height, spread, scale=scale)
+    return law_of(min(runs, key=lambda run: float(run.fun)).x)
 
 
 def heavy_tailed(z: Tensor) -> float:
@@ -132,9 +149,9 @@ def heavy_tailed(z: Tensor) -> float:
 
     The better of Student's law and of a normal plus a Laplace variable, scale and shape fitted.
     """
-    z, counts = _condensed(z.abs())
-    x, weight = z.numpy(), counts.numpy()
-    plain = float((counts * _weighted_gaussian(z, counts)).sum())
+    sample = Sample(z)
+    x, weight = sample.values.numpy(), sample.counts.numpy()
+    plain = float((sample.counts * _weighted_gaussian(sample.values, sample.counts)).sum())
     best = -math.inf
     for law, start, bounds in (
         (_student, (20.0, 1.0), ((2.1, 1e4), (0.3, 2.0))),
@@ -179,27 +196,3 @@ def _moved(z: Tensor, law: Outliers) -> Tensor:
     variance = law.scale**2 + law.spread**2
     up, down = -(z - law.height).square() / (2 * variance), -(z + law.height).square() / (2 * variance)
     return torch.logaddexp(up, down) - math.log(2) - math.log(2 * math.pi * variance) / 2
-
-
-def _condensed(size: Tensor) -> tuple[Tensor, Tensor]:
-    """Moduli and how often: the many small ones by a histogram."""
-    bulk = size < _BULK
-    counts = torch.histc(size[bulk], _BINS, 0.0, _BULK)
-    centres = (torch.arange(_BINS, dtype=torch.float64) + 0.5) * (_BULK / _BINS)
-    large = size[~bulk]
-    return torch.cat([centres, large]), torch.cat([counts, torch.ones_like(large)])
-
-
-def _spread_of(z: Tensor, counts: Tensor, theta: Sequence[float]) -> tuple[float, float]:
-    """Standard errors of rate and amplitude by the information in the scores, differentiated numerically."""
-    law = _law_of(theta)
-    step, slopes = 1e-4, []
-    for k in range(len(theta)):
-        moved = [_law_of([v + sign * step * (j == k) for j, v in enumerate(theta)]) for sign in (1.0, -1.0)]
-        slopes.append((mixture(z, moved[0]) - mixture(z, moved[1])) / (2 * step))
-    scores = torch.stack(slopes)
-    information = (scores * counts) @ scores.mT
-    covariance = torch.linalg.pinv(information, hermitian=True)
-    amplitude = law.amplitude
-    gradient = torch.tensor([0.0, law.height**2 / amplitude, law.spread**2 / amplitude, 0.0], dtype=torch.float64)
-    return law.rate * math.sqrt(float(covariance[0, 0])), math.sqrt(float(gradient @ covariance @ gradient))

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.evidence import ratio_p_value
+from gyrofuse.mismatch.mechanism import Z
 from gyrofuse.mismatch.outliers import Outliers
 
 _SIZES = (1.5, 2.0, 2.7, 3.6, 5.0, 8.0)
@@ -180,7 +181,14 @@ def _with_limits(z: Tensor, laws: list[Outliers], hit: list[int]) -> list[Outlie
         # amplitude^2 = height^2 + v - 1
         gradient = torch.tensor([law.height, 0.5], dtype=torch.float64) / law.amplitude
         own = covariance[1 + 2 * k : 3 + 2 * k, 1 + 2 * k : 3 + 2 * k]
+        amplitude_sd = math.sqrt(float(gradient @ own @ gradient))
         result[i] = law._replace(
-            rate_sd=rate * math.sqrt(float(covariance[0, 0])), amplitude_sd=math.sqrt(float(gradient @ own @ gradient))
+            rate_limits=_limits(rate, rate * math.sqrt(float(covariance[0, 0]))),
+            amplitude_limits=_limits(law.amplitude, amplitude_sd),
         )
     return result
+
+
+def _limits(value: float, sd: float) -> tuple[float, float]:
+    reach = math.exp(min(Z * sd / value, 50.0))
+    return value / reach, value * reach

@@ -13,7 +13,8 @@ from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.episodes import episodes_of, two_level_scores
 from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.impulses import left_out, levelled, likely_outliers, spike_p_value, variance_p_values
-from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
+from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.outlier_limits import with_limits
 from gyrofuse.mismatch.outliers import Outliers, clustered, fitted, free_gaussian, heavy_tailed, mixture
 from gyrofuse.mismatch.shocks import fitted_shock, shock_posterior, shock_scores
 
@@ -80,14 +81,7 @@ class Spikes(Mechanism):
         if rival > gain + _ALIKE:
             return None
         effect = cls._of(case, hit, laws, together)
-        parameters = {}
-        for i in hit:
-            per_hour = case.scene.rate * _HOUR
-            law, scale = laws[i], float(left_out(case.recorded).sd[0, i])
-            parameters["rate" if together else f"rate[{i}]"] = _limits(
-                law.rate * per_hour, law.rate_sd * per_hour, "1/h"
-            )
-            parameters[f"amplitude[{i}]"] = _limits(law.amplitude * scale, law.amplitude_sd * scale, case.scene.unit)
+        parameters = cls._parameters(case, hit, laws if together else _limited(z, laws, hit), together)
         alternatives = [
             name
             for name, alike in (
@@ -123,6 +117,16 @@ class Spikes(Mechanism):
         )
         sd = left_out(case.recorded).sd[0]
         return cls(rate, height * sd, spread * sd, together)
+
+    @staticmethod
+    def _parameters(case: Case, hit: tuple[int, ...], laws: list[Outliers], together: bool) -> dict[str, Parameter]:
+        per_hour, sd, parameters = case.scene.rate * _HOUR, left_out(case.recorded).sd[0], {}
+        for i in hit:
+            law, scale = laws[i], float(sd[i])
+            rates, amplitudes = (law.rate, *law.rate_limits), (law.amplitude, *law.amplitude_limits)
+            parameters["rate" if together else f"rate[{i}]"] = Parameter(*(per_hour * v for v in rates), "1/h")
+            parameters[f"amplitude[{i}]"] = Parameter(*(scale * v for v in amplitudes), case.scene.unit)
+        return parameters
 
     def refitted(self, case: Case, fold: int) -> Spikes:
         keep = estimation_samples(case.n_samples, fold)
@@ -195,6 +199,18 @@ def _alike(z: Tensor, laws: list[Outliers], hit: tuple[int, ...]) -> list[Outlie
     return one if worse < 3 * (len(hit) - 1) else laws
 
 
+def _limited(z: Tensor, laws: list[Outliers], hit: tuple[int, ...]) -> list[Outliers]:
+    """With limits; those of one law for all sensors from the values of all."""
+    shared = len({laws[i].rate for i in hit}) == 1
+    limited = list(laws)
+    for group in [hit] if shared else [(i,) for i in hit]:
+        unit = laws[group[0]].times(1 / laws[group[0]].scale)
+        found = with_limits(torch.cat([z[i] / laws[i].scale for i in group]), unit)
+        for i in group:
+            limited[i] = found.times(laws[i].scale)
+    return limited
+
+
 def _shock(case: Case, apart: list[Outliers], hit: tuple[int, ...]) -> tuple[list[Outliers], float] | None:
     """Laws of outliers that hit several sensors at once, and what they gain, nats."""
     z, weak = left_out(case.recorded).z[0], likely_outliers(case.recorded)
@@ -221,8 +237,3 @@ def _louder(case: Case) -> float:
     white = levelled(case)
     found = episodes_of(white, variance_p_values(case))
     return 0.0 if found is None else float(two_level_scores(white, found.factor, found.inside(case.n_samples)).sum())
-
-
-def _limits(value: float, sd: float, unit: str) -> Parameter:
-    reach = math.exp(min(Z * sd / max(value, 1e-300), 50.0))
-    return Parameter(value, value / reach, value * reach, unit)
