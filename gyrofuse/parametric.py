@@ -49,8 +49,9 @@ def resample_combined(
     resamples = pilot.theta.new_empty(len(pilot.theta), n_resamples, n_sensors, n_sensors)
     expected = pilot.theta.new_empty(len(pilot.theta), n_sensors, n_sensors)
     for memory in pilot.memory.unique().tolist():
-        alike = pilot.memory == memory
-        resamples[alike], expected[alike] = _draw(found[memory], pilot.theta[alike], normal)
+        # One after the other: what one draws fits the cache, what many draw is new memory every time.
+        for item in (pilot.memory == memory).nonzero():
+            resamples[item], expected[item] = _draw(found[memory], pilot.theta[item], normal)
     return resamples, expected
 
 

@@ -1,16 +1,29 @@
-"""The data beside the repository, and the command line as a function."""
+"""The data beside the repository, the command line as a function, and threads and memory of the tests' processes."""
 
 from __future__ import annotations
 
+import ctypes
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 
+# Before torch is loaded: tests' matrices are small, and beside other tests a second thread only waits for the first.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 from gyrofuse import cli
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+# glibc gives large arrays back and asks for new ones, page by page: up to a third of all the time here. In this process
+# (M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_MAX of malloc.h), and in those that tests start.
+_TRIM, _PAD, _MAPPED = 2**31 - 1, 2**26, 0
+if hasattr(ctypes.pythonapi, "mallopt"):
+    for option, value in ((-1, _TRIM), (-2, _PAD), (-4, _MAPPED)):
+        ctypes.pythonapi.mallopt(option, value)
+os.environ |= {"MALLOC_TRIM_THRESHOLD_": str(_TRIM), "MALLOC_TOP_PAD_": str(_PAD), "MALLOC_MMAP_MAX_": str(_MAPPED)}
 
 
 @pytest.fixture(scope="session")

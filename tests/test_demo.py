@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,14 @@ from gyrofuse.demo import FILES, demo_array, run_demo
 from gyrofuse.demo_models import models_story, true_models
 
 FIGURES = ["long.png", "models.png", "short.png", "truth.png"]
+N_LEVELS = 12
+
+
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The folder of a short demonstration, and its story."""
+    folder = tmp_path_factory.mktemp("demo")
+    return folder, run_demo(folder, n_samples=2**N_LEVELS)
 
 
 @pytest.fixture(scope="module")
@@ -43,14 +52,14 @@ def test_true_weights_are_the_published_ones(settings: dict, scales: str):
     torch.testing.assert_close(virtual, published, rtol=1e-6, atol=0)
 
 
-def test_story_and_files(tmp_path: Path):
-    story = run_demo(tmp_path, n_samples=2**15)
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(FILES)
-    assert sorted(path.name for path in (tmp_path / "figures").iterdir()) == FIGURES
-    result = json.loads((tmp_path / "result.json").read_text())
-    assert result["n_samples"] == 2**15
+def test_story_and_files(ran: tuple[Path, str]):
+    folder, story = ran
+    assert sorted(path.name for path in folder.iterdir()) == sorted(FILES)
+    assert sorted(path.name for path in (folder / "figures").iterdir()) == FIGURES
+    result = json.loads((folder / "result.json").read_text())
+    assert result["n_samples"] == 2**N_LEVELS
     array = demo_array()
-    truth = array.wavelet_cross_covariance(15)
+    truth = array.wavelet_cross_covariance(N_LEVELS)
     best = gf.svo_weights(truth, "long")
     rows = re.findall(r"^ +(\d)  +([-+][\d.]+)  \[ *([-+][\d.]+), ([-+][\d.]+)\]  +([-+][\d.]+)$", story, re.MULTILINE)
     numbers = torch.tensor([[float(value) for value in row[1:]] for row in rows], dtype=torch.float64)
@@ -62,9 +71,9 @@ def test_story_and_files(tmp_path: Path):
     assert float(in_truth) == pytest.approx(gain[0].item(), rel=1e-3)
     held = int(((numbers[:, 1] <= best) & (best <= numbers[:, 2])).sum())
     assert f"the intervals hold {held} of 6" in " ".join(story.split())
-    report = (tmp_path / "report.html").read_text()
+    report = (folder / "report.html").read_text()
     assert "The array is simulated" in report
-    models = json.loads((tmp_path / "models.json").read_text())
+    models = json.loads((folder / "models.json").read_text())
     rows = re.findall(r"^ *(\d|virtual)  (WN[^ ]*(?: \+ [^ ]+)*) +([-\d.].*)$", story, re.MULTILINE)
     assert [row[0] for row in rows] == [*"123456", "virtual"]
     assert [row[1] for row in rows] == models["names"]
@@ -73,7 +82,7 @@ def test_story_and_files(tmp_path: Path):
         white = fit["params"][0][fit["param_names"].index("white_noise.variance")]
         assert float(walk) == pytest.approx(60 * (white / 10) ** 0.5, rel=1e-3)  # deg/sqrt(h) at 10 Hz
         assert float(true_walk) == pytest.approx(60 * (truth.params[0].item() / 10) ** 0.5, rel=1e-3)
-    page = Page((tmp_path / "models.html").read_text())
+    page = Page((folder / "models.html").read_text())
     assert [row[0] for row in page.rows if row[-1] == "chosen"] == models["names"]
     assert "Sensor virtual" in page.text
 
@@ -108,10 +117,15 @@ def test_a_fit_that_did_not_end_has_no_test():
 
 
 def test_command_writes_its_folder_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ran: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(cli, "run_demo", lambda folder: run_demo(folder, n_samples=2**12))
+
+    def ran_before(folder: Path) -> str:
+        shutil.copytree(ran[0], folder, dirs_exist_ok=True)
+        return ran[1]
+
+    monkeypatch.setattr(cli, "run_demo", ran_before)
 
     def status(*options: str) -> int | str | None:
         with pytest.raises(SystemExit) as ended:
@@ -128,6 +142,7 @@ def test_command_writes_its_folder_once(
     assert status() == 2
     assert Path("gyrofuse-demo/result.json").read_text() == "mine"
     assert "gyrofuse-demo: exists already" in capsys.readouterr().err
+    monkeypatch.setattr(cli, "run_demo", lambda folder: run_demo(folder, n_samples=2**N_LEVELS))  # it repeats itself
     assert status("--force") in (0, None)
     assert Path("gyrofuse-demo/result.json").read_bytes() == Path("copy.json").read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["copy.html", "copy.json", "gyrofuse-demo"]

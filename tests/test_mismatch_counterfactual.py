@@ -15,14 +15,16 @@ from gyrofuse.mismatch.bumps import Oscillation, Stretch
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.confirm import held_out_gain
 from gyrofuse.mismatch.counterfactual import Link, settled
-from gyrofuse.mismatch.look_alikes import look_alikes
+from gyrofuse.mismatch.look_alikes import happened_instead, look_alikes
 from gyrofuse.mismatch.mechanism import Finding, Instead, Mechanism
+from gyrofuse.mismatch.mechanisms.common_mode import CommonMode
 from gyrofuse.mismatch.mechanisms.drifting_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.step import Step
 from gyrofuse.mismatch.mechanisms.vibration_tone import VibrationTone, amplitude_limits, line_near
 from gyrofuse.mismatch.mechanisms.warm_up_transient import WarmUpTransient
 from gyrofuse.mismatch.oscillating import Mode, wandering_sd
+from gyrofuse.mismatch.slow_scans import slow_look
 from gyrofuse.mismatch.telling import otherwise_words
 
 MODEL = gf.WhiteNoise(1.0) + gf.AR1(0.999, 1e-4) + gf.RandomWalk(1e-8)
@@ -61,6 +63,23 @@ def chain(case: Case, *mechanisms: type[Mechanism]) -> tuple[list[Link], Case]:
         links.append(Link(replace(finding, held_out_gain=gain.total), case, gain))
         case = finding.effect.explained(case, generator(0))
     return links, case
+
+
+def test_red_noise_may_be_a_step_that_gains_as_much():
+    stepped, plain = case_of(3, step(0.3)), case_of(3)
+    scan = slow_look(stepped).scan("step")
+    assert scan is not None
+    assert scan.p_value < 0.01
+    gain = torch.complex(*torch.full((2, SENSORS), 0.1, dtype=torch.float64))
+    noise = CommonMode("walk", 0.0, gain, stepped.base, False)
+
+    def alike(case: Case, effect: Mechanism, nats: float) -> tuple[str, ...]:
+        return happened_instead(case, Finding(effect.name, effect, "", 1e-4, (0, 1), {}, gain=nats))
+
+    assert "step" in alike(stepped, noise, scan.gain + 4)
+    assert "step" not in alike(stepped, noise, scan.gain + 6)
+    assert alike(plain, noise, 10.0) == ()
+    assert alike(stepped, VibrationTone.at(stepped, 12.0), scan.gain) == ()
 
 
 def test_what_stands_alone_stays_and_its_loss_is_its_gain():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 
@@ -32,8 +33,16 @@ def with_tone(recording: gf.Recording, amplitude: float) -> gf.Recording:
     return gf.Recording(recording.signal + amplitude * gains * wave, rate=RATE, unit="deg/s")
 
 
+@functools.cache
+def concealed_tone(n_simulated: int) -> tuple[gf.MismatchReport, list[tuple[str, float]]]:
+    """A tone, diagnosed with a simulation of that length, and what progress was told."""
+    told: list[tuple[str, float]] = []
+    simulation = array(2, n_simulated)
+    return diagnose(with_tone(array(1), 0.12), simulation, progress=lambda *step: told.append(step)), told
+
+
 def test_a_concealed_tone_is_found_named_and_repaired():
-    report = diagnose(with_tone(array(1), 0.12), array(2, 4 * N))
+    report, _ = concealed_tone(4 * N)
     assert report.mismatch
     (finding,) = report.findings
     assert finding.mechanism == "vibration_tone"
@@ -51,7 +60,7 @@ def test_a_concealed_tone_is_found_named_and_repaired():
 
 def test_what_was_found_is_taken_off_and_simulated_again():
     recording = with_tone(array(1), 0.12)
-    report = diagnose(recording, array(2, 4 * N))
+    report, _ = concealed_tone(4 * N)
     left = diagnose(gf.Recording(report.correct(recording.signal), rate=RATE, unit="deg/s"), array(3, 4 * N))
     assert not left.mismatch
     again = report.model.simulate(4 * N, generator=generator(4))
@@ -69,13 +78,13 @@ def test_agreement_is_said():
 
 def test_verdicts_are_repeatable_and_leave_the_global_generator_alone():
     state = torch.get_rng_state()
-    first, second = (diagnose(with_tone(array(1), 0.12), MODEL) for _ in range(2))
+    first, second = (diagnose(with_tone(array(1, N // 2), 0.16), MODEL) for _ in range(2))
     assert first.to_dict() == second.to_dict()
     assert torch.equal(state, torch.get_rng_state())
 
 
 def test_results_are_plain_for_json():
-    report = diagnose(with_tone(array(1), 0.12), array(2))
+    report, _ = concealed_tone(N)
     content = json.loads(json.dumps(report.to_dict(), allow_nan=False))
     assert {"mismatch", "p_value", "findings", "unexplained", "held_out", "model", "evidence"} <= content.keys()
     assert {
@@ -87,9 +96,9 @@ def test_results_are_plain_for_json():
 
 
 def test_models_and_samples_of_any_length_serve_as_simulations():
-    recording = with_tone(array(1), 0.12)
+    recording = with_tone(array(1, N // 2), 0.16)
     batched = MODEL.with_params(MODEL.params.expand(6, -1))
-    for simulation in (MODEL, batched, gf.ArrayModel.from_sensors([MODEL] * 6), array(2, N // 2), array(2, 3 * N // 2)):
+    for simulation in (MODEL, batched, gf.ArrayModel.from_sensors([MODEL] * 6), array(2, N // 4), array(2, 3 * N // 4)):
         report = diagnose(recording, simulation)
         assert [f.mechanism for f in report.findings] == ["vibration_tone"]
 
@@ -109,7 +118,7 @@ def test_known_units_are_converted():
 
 
 def test_twins_agree_and_their_rank_is_a_p_value():
-    case = diagnose(array(5), array(6)).case
+    case = diagnose(array(5, N // 2), array(6, N // 2)).case
     mate = twin(case, generator(1))
     assert mate.recording.shape == case.recording.shape
     assert mate.simulated.signal.shape == case.simulated.signal.shape
@@ -158,8 +167,7 @@ def test_missing_samples_are_told():
 
 
 def test_progress_is_told_and_never_goes_back():
-    told: list[tuple[str, float]] = []
-    diagnose(with_tone(array(1), 0.12), array(2), progress=lambda *step: told.append(step))
+    _, told = concealed_tone(N)
     shares = [share for _, share in told]
     assert shares == sorted(shares)
     assert 0 <= shares[0] < 0.1

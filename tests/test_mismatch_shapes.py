@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -22,14 +23,15 @@ from gyrofuse.mismatch.mechanisms.common_mode import CommonMode
 from gyrofuse.mismatch.mechanisms.drifting_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.low_pass import LowPassFilter
-from gyrofuse.mismatch.mechanisms.parameter_shift import ParameterShift
+from gyrofuse.mismatch.mechanisms.parameter_shift import ParameterShift, _numbers
 from gyrofuse.mismatch.mechanisms.resonance import Resonance
 from gyrofuse.mismatch.oscillating import Mode
 from gyrofuse.mismatch.pooled import common_witness
-from gyrofuse.mismatch.shape_fit import Ratios, data_model, fit, linearised, log_score
+from gyrofuse.mismatch.shape_fit import Ratios, data_model, fair_gain, fit, linearised, log_score
 from gyrofuse.mismatch.shape_law import equivalent, smooth_coherence
-from gyrofuse.mismatch.shape_scan import shape_witness
+from gyrofuse.mismatch.shape_scan import bump_start, shape_witness
 from gyrofuse.mismatch.shape_terms import (
+    Bump,
     Common,
     Flicker,
     LowPass,
@@ -44,6 +46,7 @@ from gyrofuse.simulate import ArrayModel
 
 N, P, RATE = 16384, 6, 100.0
 WHITE = 1e-4
+BUMP = Mode(0.12, 0.01, torch.ones(6, dtype=torch.complex128), False)
 SIGNS = torch.tensor([1.0, 1.0, -1.0, 0.5, 1.0, 1.0], dtype=torch.float64)
 CATALOGUE = (ParameterShift, LowPassFilter, Resonance, DriftingTone, FlickerNoise, CommonMode)
 
@@ -104,6 +107,53 @@ def test_whittles_score_is_that_of_determinants_and_traces():
         g, k = (x / np.sqrt(np.outer(x.diagonal().real, x.diagonal().real)) for x in (m, q))
         expected -= float(data.extra[b]) * (np.linalg.slogdet(g)[1] + np.trace(np.linalg.solve(g, k)).real)
         assert float(log_score(data, model)[b]) == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_model_gains_what_the_law_of_f_gives_it():
+    # Independent sensors: the likelihood of every ratio by itself, at whatever powers the data were centred before.
+    data = compared(drawn(1, lambda x, g: 3 * x, n=4096))
+    model = data.expected * torch.linspace(0.5, 12, len(data.worth), dtype=torch.float64)[:, None, None]
+    spectra, power, d, s = data.sides
+    ratio = spectra.diagonal(dim1=-2, dim2=-1).real / power
+    total = 0.0
+    for b in range(len(d)):
+        a, c, m = 2 * float(d[b]), 2 * float(s[b]), float(model[b, 0, 0].real)
+        for r in ratio[b].tolist() if data.worth[b] > 0 else ():
+            # `mean` is what the equivalent of a ratio of one is on average: it moves both alike.
+            total += stats.f.logpdf(r / m, a, c) - math.log(m) - stats.f.logpdf(r, a, c)
+    bare = replace(
+        data, mean=torch.ones_like(data.mean), worth=d * s / (d + s) * (data.worth > 0), extra=0 * data.extra
+    )
+    eye = torch.eye(P, dtype=torch.complex128).expand_as(data.expected)
+    bare, model = replace(bare, expected=eye), eye * model.diagonal(dim1=-2, dim2=-1)[..., None]
+    alone = replace(bare, sides=(spectra * torch.eye(P), power, d, s))
+    assert fair_gain(alone, model) == pytest.approx(total, rel=1e-4)
+    elsewhere = alone.centred(7 * torch.ones(len(d), P, dtype=torch.float64))
+    assert fair_gain(elsewhere, model) == pytest.approx(fair_gain(alone, model), rel=1e-9)
+
+
+def test_standard_deviations_of_sensors_at_a_known_width():
+    data = compared(drawn(3, lambda x, g: x + 0.004 * noise(N, BUMP.profile, P, g)))
+    free = torch.ones(1, P, dtype=torch.bool)
+    free[0, 2] = False
+    found = fit(data, [Bump(torch.full((1, P), 1e-5, dtype=torch.float64) * free, free, tensor(0.12, 0.01).log())])
+    information = torch.linalg.inv(found.covariance)[: P - 1, : P - 1]  # the shared numbers come last
+    expected = torch.linalg.inv(information).diagonal().sqrt()
+    sd = found.sd_given_shared(0)[0]
+    assert sd.isnan().tolist() == (~free[0]).tolist()
+    torch.testing.assert_close(sd[free[0]], expected, rtol=1e-4, atol=0)
+    assert (sd[free[0]] <= found.sd(0)[0][0, free[0]]).all()
+
+
+def test_a_bump_is_looked_for_where_it_is_in_the_sensors_that_may_have_it():
+    data = compared(drawn(3, lambda x, g: x + 0.004 * noise(N, BUMP.profile, P, g)), 24)
+    some = torch.arange(P) < 2
+    starts = [(f, w * f) for f in (0.06, 0.09, 0.12, 0.16, 0.3) for w in (0.02, 0.08)]
+    start = bump_start(data, data.expected, starts, some)
+    assert start is not None
+    assert float(start.shared[0].exp()) == pytest.approx(0.12)
+    assert ((start.local[0] > 0) == some).all()
+    assert bump_start(data, data.observed, starts, some) is None
 
 
 def shape_examples(data: Ratios) -> list[Term]:
@@ -197,6 +247,35 @@ def test_parts_make_up_the_noise_and_move_as_their_numbers_say():
         rtol=1e-2,
         atol=0,
     )
+
+
+def test_a_walk_that_was_not_seen_may_grow():
+    g = generator(8)
+    plain = ArrayModel.from_sensors([gf.WhiteNoise(WHITE)] * P)
+    given = case(plain.simulate(N, generator=g), plain.simulate(N, batch=(4,), generator=g))
+    f = torch.logspace(-4.2, -0.31, 60, dtype=torch.float64)
+    parts, none = Parts(given.base, f), torch.zeros(4, P, dtype=torch.float64)
+    torch.testing.assert_close(parts.shifted(none), given.base.spectrum(f))
+    unseen = parts.unseen[:, 0] > 0
+    assert int(unseen.sum()) >= P // 2  # of the others chance shows a walk
+    assert (parts.unseen[:, f > 2 / N] < 0.02 * given.base.spectrum(f)[:, f > 2 / N]).all()
+    grown = none.clone()
+    grown[3] = math.log(101)
+    more = parts.shifted(grown) - given.base.spectrum(f)
+    torch.testing.assert_close(more[unseen], 100 * (parts.densities[2] + parts.unseen)[unseen])
+    # Without it a walk could not be other numbers of noise that has none.
+    walk = 3e-5 * torch.randn(P, N, generator=g, dtype=torch.float64).cumsum(-1)
+    data = compared(case(given.recording + walk, given.simulated.signal))
+    start = Shift.start(data.ground)
+    assert start.free[3].all()
+    assert (
+        fit(data, [start]).gain
+        > 20 + fit(data, [replace(start, free=start.free & (torch.arange(4) < 3)[:, None])]).gain
+    )
+    # How much of it there was is not said.
+    before, least = _numbers(given.base, RATE, "deg/s")
+    assert [number == 0 for number, _ in before[3]] == unseen.tolist()
+    assert all(x > 0 for x in least)
 
 
 def test_filters_act_on_walks_without_a_jump_at_the_ends():
@@ -372,6 +451,27 @@ def test_what_is_missing_is_named_measured_and_explained(name: str):
     explained = found.effect.explained(given, generator(1))
     assert shape_witness(explained).p_value > 1e-4
     assert nominated(explained) is None
+
+
+def test_modes_of_single_sensors_that_bands_are_too_wide_for():
+    # Half as wide as a quarter of an octave, and too weak for a stretch of bins among all of them.
+    mode = Mode(0.2, 0.2 / 2 / 15, tensor(*(P * [1.0])).to(torch.complex128), False)
+    has = tensor(1, 0, 0, 1, 0, 1)
+    named, inside = 0, []
+    for seed in range(6):
+        given = drawn(700 + seed, lambda x, g: x + 3.6e-3 * has[:, None] * noise(N, mode.profile, P, g))
+        found = Resonance.nominate(given, 1e-3)
+        if found is None:
+            continue
+        named += 1
+        f, q = found.parameters["frequency"], found.parameters["quality_factor"]
+        inside += [f.low <= 0.2 * RATE <= f.high, q.low <= 15 <= q.high]
+        again = found.effect.refitted(given, 0)
+        assert isinstance(again, Resonance)
+        assert isinstance(found.effect, Resonance)
+        assert ((again.mode.gain != 0) <= (found.effect.mode.gain != 0)).all()
+    assert named >= 4
+    assert sum(inside) >= stats.binom.ppf(1e-3, len(inside), 0.95)
 
 
 def test_a_filter_and_what_it_acts_on_are_found_one_after_the_other():

@@ -1,8 +1,11 @@
 """The studies of the papers run, print their verdicts and draw their figures."""
 
-import os
+import contextlib
+import io
+import runpy
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
@@ -11,9 +14,24 @@ PAPERS = Path(__file__).resolve().parents[1] / "examples" / "papers"
 
 
 def run(name: str, *arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, str(PAPERS / name), "--quick", *map(str, arguments)]
-    one_core = os.environ | {"OMP_NUM_THREADS": "1"}
-    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=one_core)
+    """Run a study as a command, in this process: it need not load the library again."""
+    command = [str(PAPERS / name), "--quick", *map(str, arguments)]
+    status = 0
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        warnings.catch_warnings(),
+        contextlib.redirect_stdout(io.StringIO()) as out,
+        contextlib.redirect_stderr(io.StringIO()) as err,
+    ):
+        warnings.simplefilter("default")
+        patch.chdir(cwd)
+        patch.syspath_prepend(PAPERS)
+        patch.setattr(sys, "argv", command)
+        try:
+            runpy.run_path(command[0], run_name="__main__")
+        except SystemExit as ended:
+            status = ended.code
+    return subprocess.CompletedProcess(command, status, out.getvalue(), err.getvalue())
 
 
 def is_png(path: Path) -> bool:

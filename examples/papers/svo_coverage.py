@@ -3,7 +3,8 @@
 Nominal 95 % intervals of the SVO weights by a fitted model and by the paper's block bootstrap, for short and for long
 averaging times, those of the record and those of the paper's record cut to as many levels as there are; and of the
 wavelet variance of single sensors at every level that has two windows side by side (`M_j >= 2 tau_j`). 1000 arrays of
-2^13 and of 2^16 samples for every noise; `--quick` has 60 arrays of 2^12 samples and wavelet variances of one sensor.
+2^13 and of 2^16 samples for every noise; `--quick` has 60 arrays of 2^12 samples, wavelet variances of one sensor, and
+no averaging times of the paper's record.
 
 The noises: Case 1 (white noise and random walk) and Case 2 (white noise and three AR(1)) of the paper, which take the
 same part of a record as in its 29 hours, Case 1 with Laplace innovations, and Case 1 with a wandering tone that all
@@ -125,12 +126,14 @@ class Coverage:
     variance: Tensor
 
 
-def cover(noise: Noise, n_samples: int, n_arrays: int, sensors: slice, generator: torch.Generator) -> Coverage:
-    """Count how often the intervals hold the truth in `n_arrays` arrays."""
+def cover(
+    noise: Noise, n_samples: int, n_arrays: int, sensors: slice, cut: bool, generator: torch.Generator
+) -> Coverage:
+    """Count how often the intervals hold the truth in `n_arrays` arrays; `cut` as in `scales`."""
     truth, levels = noise.truth(n_samples), n_levels(n_samples)
     # M_j >= 2 tau_j: two windows side by side
     known = sum((n_samples - 2**j + 1) >= 2 * 2**j for j in range(1, levels + 1))
-    scale_weights = scales(levels)
+    scale_weights = scales(levels, cut)
     weights = {(w, c): torch.zeros(len(R), dtype=torch.long) for w in scale_weights for c in COVARIANCES}
     own = truth[:known].diagonal(dim1=-2, dim2=-1)[:, sensors]
     variance = torch.zeros(own.shape, dtype=torch.long)
@@ -151,12 +154,12 @@ def cover(noise: Noise, n_samples: int, n_arrays: int, sensors: slice, generator
     return Coverage(n_arrays, weights, variance)
 
 
-def scales(levels: int) -> dict[str, Tensor]:
-    """Scale weights by name."""
+def scales(levels: int, cut: bool) -> dict[str, Tensor]:
+    """Scale weights by name, with those of the paper's record `cut` to these levels or without."""
     found = {name: gf.resolve_scale_weights(name, levels) for name in ("short", "long")}
-    for name in ("short", "long"):
-        cut = gf.resolve_scale_weights(name, n_levels(N_SAMPLES))[:levels]
-        found[f"{name}, cut"] = cut / cut.sum()
+    for name in tuple(found) if cut else ():
+        known = gf.resolve_scale_weights(name, n_levels(N_SAMPLES))[:levels]
+        found[f"{name}, cut"] = known / known.sum()
     return found
 
 
@@ -234,7 +237,7 @@ def main() -> None:
     found, generator = {}, torch.Generator().manual_seed(options.seed)
     for n_samples in sizes:
         for name, noise in NOISES.items():
-            found[name, n_samples] = cover(noise, n_samples, n_arrays, sensors, generator)
+            found[name, n_samples] = cover(noise, n_samples, n_arrays, sensors, not options.quick, generator)
             if not options.quick:
                 print(f"{name}, {n_samples} samples: done", file=sys.stderr, flush=True)
     print_coverage(found)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from scipy import stats
@@ -24,7 +24,7 @@ from gyrofuse.mismatch.lines import simulated_lines, without_lines
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.shape_fit import Fit, Ratios, fit
 from gyrofuse.mismatch.shape_law import smooth_coherence
-from gyrofuse.mismatch.shape_terms import Background, Bump, CommonBump, Ground
+from gyrofuse.mismatch.shape_terms import Bump, CommonBump, Ground, Term
 from gyrofuse.mismatch.side import Side
 from gyrofuse.mismatch.spectra import Bands, degrees_of_freedom, hann_transform
 from gyrofuse.mismatch.witnesses import level_of
@@ -77,6 +77,24 @@ class Oscillation:
     variance_sd: Tensor
     gain: Tensor | None
     nats: float
+
+
+@dataclass(frozen=True, eq=False)
+class Background(Term):
+    """Level and slope of the noise around a bump: local are the logarithm at the centre and its rise to the end."""
+
+    name: ClassVar[str] = "background"
+    acts: ClassVar[str] = "scale"
+
+    @classmethod
+    def start(cls, n_sensors: int) -> Background:
+        free = torch.ones(2, n_sensors, dtype=torch.bool)
+        return cls(torch.zeros(2, n_sensors, dtype=torch.float64), free, torch.zeros(0, dtype=torch.float64))
+
+    def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
+        low, high = ground.places[0], ground.places[-1]
+        x = (2 * ground.places - low - high) / (high - low)
+        return (local[..., 0, :, None] + local[..., 1, :, None] * x).exp()
 
 
 def bump_witness(case: Case) -> Evidence:

@@ -13,7 +13,7 @@ import torch
 
 from gyrofuse.mismatch.case import Case, block_means
 from gyrofuse.mismatch.confirm import Gain, held_out_gain, sd_of_sum
-from gyrofuse.mismatch.look_alikes import look_alikes
+from gyrofuse.mismatch.look_alikes import happened_instead, look_alikes
 from gyrofuse.mismatch.mechanism import Finding, Instead, Mechanism
 from gyrofuse.mismatch.mechanisms import STAGES
 from gyrofuse.mismatch.slow_effect import SlowEffect
@@ -124,15 +124,15 @@ def _relinked(
 def _compared(finding: Finding, gain: Gain, left: Case) -> Finding:
     """A finding with what would be without it, and with its best look-alike."""
     told = replace(finding, gain_without=gain.total)
+    alike = happened_instead(left, finding)
     rivals = [(held_out_gain(left, effect), effect) for effect in look_alikes(left, finding)]
-    if not rivals:
-        return told
-    best, effect = max(rivals, key=lambda rival: rival[0].total)
-    less, sd = gain.total - best.total, _spread(left, finding.effect, gain, effect, best)
-    told = replace(told, instead=Instead(effect.name, best.total, sd))
-    if best.total > 0 and less < max(_AS_GOOD_SD * sd, _AS_GOOD) and effect.name not in finding.alternatives:
-        return replace(told, alternatives=(*finding.alternatives, effect.name))
-    return told
+    if rivals:
+        best, effect = max(rivals, key=lambda rival: rival[0].total)
+        less, sd = gain.total - best.total, _spread(left, finding.effect, gain, effect, best)
+        told = replace(told, instead=Instead(effect.name, best.total, sd))
+        if best.total > 0 and less < max(_AS_GOOD_SD * sd, _AS_GOOD):
+            alike += (effect.name,)
+    return replace(told, alternatives=tuple(dict.fromkeys((*finding.alternatives, *alike))))
 
 
 def _better(finding: Finding, left: Case, level: float) -> Finding | None:

@@ -13,7 +13,8 @@ from gyrofuse.recording import Recording
 from gyrofuse.simulate import ArrayModel
 
 FEWEST = 4096
-_RECORDS = 4  # as long as the recording, that are drawn of a model
+# Of a model: records as long as the recording. What is told apart of an effect grows as m/(1 + m), the work as m.
+_FEWEST_RECORDS, _MOST_RECORDS, _MOST_VALUES = 4, 16, 2**23
 _SAME_RATE = 1e-3
 _SINGULAR = 1e-10  # of correlation matrices
 
@@ -62,15 +63,16 @@ def noise_of(simulation: Recording | Tensor | Model | ArrayModel, case: Case) ->
 
 def _drawn(model: Model | ArrayModel, n_sensors: int, n_samples: int, generator: torch.Generator) -> Tensor:
     """Records of a model, `(record, sensor, time)`."""
+    n_records = min(max(_MOST_VALUES // (n_sensors * n_samples), _FEWEST_RECORDS), _MOST_RECORDS)
     if isinstance(model, ArrayModel):
-        return model.simulate(n_samples, batch=(_RECORDS,), generator=generator)
+        return model.simulate(n_samples, batch=(n_records,), generator=generator)
     own = model.params.shape[:-1]
     if own not in ((), (n_sensors,)):
         raise ValueError(
             f"`simulation`: expected a model of one sensor, or with parameters ({n_sensors},) for each, "
             f"got parameters of shape {tuple(own)}"
         )
-    return model.simulate(n_samples, batch=(_RECORDS, *(() if own else (n_sensors,))), generator=generator)
+    return model.simulate(n_samples, batch=(n_records, *(() if own else (n_sensors,))), generator=generator)
 
 
 def _samples(simulation: Recording | Tensor, scene: Scene, n_samples: int, *, from_tensor: bool) -> Tensor:

@@ -40,6 +40,8 @@ _REACH = 2.0  # half widths in which a line is looked for in the place of a bump
 _ROUNDS = 8
 _NUMBER = 2.0  # nats for each number of a sensor
 _FILTERS = ("pole", "poles")
+_RED = (ParameterShift, FlickerNoise, CommonMode)
+_MAY_BE, _AS_MUCH = 0.1, 5.0  # p value, and nats below
 
 
 def look_alikes(case: Case, finding: Finding) -> list[Mechanism]:
@@ -56,6 +58,14 @@ def look_alikes(case: Case, finding: Finding) -> list[Mechanism]:
             found += rivals(case, finding)
     found += _nominated(case, _NOMINATED.get(effect.name, ()))
     return [rival for rival in found if rival.name not in (effect.name, finding.mechanism)]
+
+
+def happened_instead(case: Case, finding: Finding) -> tuple[str, ...]:
+    """What happened once and gains as much as a finding of more slow noise does: a step is red noise as well."""
+    if not isinstance(finding.effect, _RED):
+        return ()
+    scans = slow_look(case).scans
+    return tuple(s.family.name for s in scans if s.p_value < _MAY_BE and s.gain > finding.gain - _AS_MUCH)
 
 
 def _nominated(case: Case, names: tuple[str, ...]) -> Iterator[Mechanism]:

@@ -130,7 +130,11 @@ def nominated(case: Case, level: float, *, tone: bool) -> tuple[Mode, Seen] | No
         stretch = Stretch(centre, width, shape.p_value, ())
         sds = (float(log_sd[0]), float(log_sd[1]))
         bump = Oscillation(stretch, centre, width, sds, variance, spread, gain, shape.gain)
-    sensors = tuple(int(i) for i in (bump.variance > _SEEN * bump.variance_sd).nonzero()[:, 0])
+        # Which sensors it takes is a matter of likelihood: variances are as uncertain as the width is.
+        has = term.free.any(0)
+    else:
+        has = bump.variance > _SEEN * bump.variance_sd
+    sensors = tuple(int(i) for i in has.nonzero()[:, 0])
     verdict = steadiness(case, bump)
     if not sensors or verdict.tone != tone:
         return None
@@ -164,12 +168,22 @@ def wandering_sd(case: Case, bump: Oscillation) -> float:
 
 
 def refitted_mode(case: Case, fold: int, mode: Mode) -> Mode:
+    """Numbers anew, without the blocks that a fold holds out.
+
+    Sensors that do not have the mode are not to get what chance would give them.
+    """
+    found = _refitted(case, fold, mode)
+    return replace(found, gain=found.gain * (mode.gain != 0))
+
+
+def _refitted(case: Case, fold: int, mode: Mode) -> Mode:
     """The same centre and width, gains from the power over the flanks in blocks that a fold does not hold out.
 
     A broad mode has no flanks of its own: it is fitted to the whole spectrum.
     """
     if not mode.shared and mode.width > _BROAD * mode.centre:
-        term = refit(case, fold, Bump.start(mode.centre, mode.width, mode.gain.abs().square()))
+        start = Bump.start(mode.centre, mode.width, mode.gain.abs().square())
+        term = refit(case, fold, replace(start, free=start.local > 0))
         centre, width = term.shared.exp().tolist()
         return Mode(centre, width, term.local[0].sqrt().to(torch.complex128), False)
     keep = estimation_samples(case.n_samples, fold)

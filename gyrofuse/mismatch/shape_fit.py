@@ -128,6 +128,18 @@ class Fit(NamedTuple):
         n = own.local.numel()
         return sd[:n].view_as(own.local), sd[n:]
 
+    def sd_given_shared(self, term: int) -> Tensor:
+        """Those of the local numbers were the shared ones known: whether a sensor has it need not wait for a width."""
+        places, own = self.places[term], self.terms[term]
+        n = own.local.numel()
+        free, shared = places[:n][places[:n] >= 0], places[n:]
+        across = self.covariance[free][:, shared]
+        known = across @ torch.linalg.pinv(self.covariance[shared][:, shared], hermitian=True)
+        variance = self.covariance.diagonal()[free] - (known * across).sum(-1)
+        sd = torch.full((n,), math.nan, dtype=torch.float64)
+        sd[places[:n] >= 0] = variance.clamp(min=0).sqrt()
+        return sd.view_as(own.local)
+
 
 def fit(data: Ratios, terms: Sequence[Term], rounds: int = _ROUNDS) -> Fit:
     """Fisher scoring of all free numbers together."""
@@ -299,6 +311,22 @@ def log_score(data: Ratios, model: Tensor) -> Tensor:
     if bool((data.extra > 0).any()):
         score = score + _whittle(_correlations(model), _correlations(data.observed), data.extra)
     return score
+
+
+def fair_gain(data: Ratios, model: Tensor) -> float:
+    """Log likelihood over that of no difference, nats, where neither is favoured.
+
+    The law of F is taken at the powers of each: taken at those of one, the other would be held to ratios of which few
+    ordinates make far too much.
+    """
+
+    def score(matrices: Tensor) -> float:
+        own = data.centred(matrices.diagonal(dim1=-2, dim2=-1).real)
+        seen = own.observed.diagonal(dim1=-2, dim2=-1).real
+        best = torch.where((data.worth > 0)[:, None], data.worth[:, None] * (seen.log() + 1), 0.0)
+        return float(log_score(own, matrices).sum() + best.sum())
+
+    return score(model) - score(data.expected)
 
 
 def _whittle(model: Tensor, observed: Tensor, worth: Tensor) -> Tensor:

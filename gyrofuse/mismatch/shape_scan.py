@@ -13,6 +13,7 @@ ratio by the law of F.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import torch
@@ -23,7 +24,8 @@ from gyrofuse.mismatch.evidence import Evidence, ratio_p_value
 from gyrofuse.mismatch.filter_forms import filter_power, filter_strength
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.shape_bands import Narrow, deep_base, narrow, slow
-from gyrofuse.mismatch.shape_terms import oscillation
+from gyrofuse.mismatch.shape_fit import Ratios
+from gyrofuse.mismatch.shape_terms import Bump, oscillation
 from gyrofuse.mismatch.witnesses import level_of
 from gyrofuse.processes import AR1
 
@@ -122,6 +124,32 @@ def scanned(case: Case) -> Scan | None:
     weight = looked_for.templates[shape, list(sensors)].square().mean(0)
     rises = float((up - down)[shape, list(sensors)].sum()) > 0
     return Scan(float(log_ratios.flatten().logsumexp(0)) - math.log(len(_SHARES)), sensors, weight, rises)
+
+
+def bump_start(data: Ratios, model: Tensor, starts: Iterable[tuple[float, float]], has: Tensor) -> Bump | None:
+    """The bump that what a model leaves is most like; None where nothing is left.
+
+    Args:
+        data: What is to be explained.
+        model: `M` without it.
+        starts: Centres and half widths, cycles per sample.
+        has: Which sensors may have it, `(sensor,)`.
+    """
+    ground = data.ground
+    fitted, seen = (m.diagonal(dim1=-2, dim2=-1).real for m in (model, data.observed))  # (band, sensor)
+    left, worth = seen / fitted - 1, data.worth[:, None]
+    best, top = 0.0, None
+    for centre, width in starts:
+        profile = ground.bands.mean_of(
+            oscillation(ground.places, *torch.tensor([centre, width], dtype=torch.float64).unbind())
+        )
+        template = profile[:, None] / ground.mean.mT / fitted
+        size = (worth * template.square()).sum(0)
+        amount = (worth * left * template).sum(0).clamp(min=0) / size * has  # (sensor,)
+        gain = float((amount.square() * size).sum())
+        if gain > best:
+            best, top = gain, Bump.start(centre, width, amount)
+    return top
 
 
 def independent(z: Tensor, templates: Tensor, data: Narrow) -> Tensor:

@@ -19,6 +19,7 @@ _FAST = 3.0  # samples: AR1s of shorter memory are all but white
 _SLOW = 2.2  # time constants above n / (2 pi) over this look like a walk in every band
 _LITTLE = 0.3  # of the white noise: fast AR1s below count as white
 _HIGHEST = 3.0  # corner of an analog filter to start from, cycles per sample
+_UNSEEN = 0.02  # share of the noise at one cycle per record: a walk below it is not known to be there or not
 _MATTERS = 0.05  # of the power in some band, for a part to have a level of its own
 
 
@@ -52,6 +53,17 @@ class Parts:
         return torch.stack(self.coefficients) @ _atoms(self.base.n_samples, self.f)
 
     @cached_property
+    def unseen(self) -> Tensor:
+        """Density of a walk that records would not show, less that of the one that there is, `(sensor, place)`.
+
+        One that grew is told from none before: other numbers, and no physics that was left out.
+        """
+        n, c = self.base.n_samples, self.base.coefficients
+        slowest = _atoms(n, torch.tensor([1 / n], dtype=c.dtype))
+        lacking = ((_UNSEEN * c - self.coefficients[2]) @ slowest).clamp(min=0)
+        return lacking * _atoms(n, self.f)[-1] / slowest[-1]
+
+    @cached_property
     def _corners(self) -> tuple[Tensor, Tensor]:
         """Inverse time constants `(atom, 1, 1)` of the AR1s that some sensor has, and plateaus `(atom, sensor, 1)`."""
         rate = 1 / torch.tensor(_time_constants(self.base.n_samples), dtype=torch.float64)
@@ -78,7 +90,8 @@ class Parts:
         rate, plateau = self._corners
         phi = torch.exp(-corner[..., None, :, :] * rate)  # (..., atom, sensor, 1)
         coloured = AR1._spectrum(self.f, phi, plateau * (1 - phi).square()).sum(-3)
-        return white * self.densities[0] + level * coloured + walk * self.densities[2]
+        grown = walk * self.densities[2] + (walk - 1).clamp(min=0) * self.unseen
+        return white * self.densities[0] + level * coloured + grown
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +128,9 @@ class Ground:
     @cached_property
     def matters(self) -> Tensor:
         """Which parts of the noise have a share in some band, `(part, sensor)`."""
-        return (self.bands.mean_of(self.parts.densities) / self.mean).amax(-1) > _MATTERS
+        white, coloured, walk = self.parts.densities
+        possible = torch.stack([white, coloured, walk + self.parts.unseen])
+        return (self.bands.mean_of(possible) / self.mean).amax(-1) > _MATTERS
 
 
 @dataclass(frozen=True, eq=False)
@@ -363,24 +378,6 @@ def _bump_within(shared: Tensor, narrowest: float) -> Tensor:
     # Broader ones would not be seen to fall on both sides.
     widest = torch.minimum(centre - math.log(2), (0.5 - centre.exp()).log() - math.log(2))
     return torch.stack([centre, torch.minimum(torch.maximum(shared[1], centre + math.log(narrowest)), widest)])
-
-
-@dataclass(frozen=True, eq=False)
-class Background(Term):
-    """Level and slope of the noise around a bump: local are the logarithm at the centre and its rise to the end."""
-
-    name: ClassVar[str] = "background"
-    acts: ClassVar[str] = "scale"
-
-    @classmethod
-    def start(cls, n_sensors: int) -> Background:
-        free = torch.ones(2, n_sensors, dtype=torch.bool)
-        return cls(torch.zeros(2, n_sensors, dtype=torch.float64), free, torch.zeros(0, dtype=torch.float64))
-
-    def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
-        low, high = ground.places[0], ground.places[-1]
-        x = (2 * ground.places - low - high) / (high - low)
-        return (local[..., 0, :, None] + local[..., 1, :, None] * x).exp()
 
 
 def common_density(kind: str, f: Tensor, shared: Tensor) -> Tensor:

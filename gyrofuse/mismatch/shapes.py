@@ -18,12 +18,11 @@ from gyrofuse.mismatch.filter_forms import FILTERS
 from gyrofuse.mismatch.folds import estimation_samples
 from gyrofuse.mismatch.pooled import common_source
 from gyrofuse.mismatch.remembered import remembered
-from gyrofuse.mismatch.shape_bands import N_SLOW, Groups, deep, deep_base, narrow_bands, slow_fold
-from gyrofuse.mismatch.shape_fit import Fit, Ratios, data_model, fit, log_score, ratios
-from gyrofuse.mismatch.shape_scan import scanned
-from gyrofuse.mismatch.shape_terms import Bump, Common, CommonBump, Flicker, LowPass, Shift, Term, oscillation
+from gyrofuse.mismatch.shape_bands import N_SLOW, Groups, deep, deep_base, in_blocks, narrow_bands, slow_fold
+from gyrofuse.mismatch.shape_fit import Fit, Ratios, data_model, fair_gain, fit, log_score, ratios
+from gyrofuse.mismatch.shape_scan import bump_start, scanned
+from gyrofuse.mismatch.shape_terms import Bump, Common, CommonBump, Flicker, LowPass, Shift, Term
 from gyrofuse.mismatch.side import Side
-from gyrofuse.mismatch.spectra import bands
 from gyrofuse.mismatch.witnesses import level_of
 
 _MOST = 4  # shapes at once
@@ -44,6 +43,9 @@ _CLEAN = 8  # bins
 _BROAD = 3.0  # half widths
 _FORMS = 3  # of filters
 _WIDTHS = (0.06, 0.15, 0.35)  # half width of a bump over its centre
+_BROAD, _NARROW = 0.1, (0.02, 0.04, 0.08)  # the same, below which bands are too wide for it, and of it there
+_FINE, _NARROWEST = 24, 0.005  # bands in an octave for those, and the least that they show
+_OFF = 0.25  # logarithm by which a centre from wide bands may be off
 _CORNER_BINS = (4.0, 0.3)  # corners of common AR1s to start from: bins, cycles per sample
 
 
@@ -106,9 +108,9 @@ def chosen_shape(case: Case, name: str, level: float) -> Shape | None:
     return best[0] if best and best[0].term.name == name and best[0].p_value <= level else None
 
 
-def compared(case: Case) -> Ratios:
+def compared(case: Case, per_octave: int = _PER_OCTAVE) -> Ratios:
     """Spectra of a case, without bands that hold a line which is not explained."""
-    wanted = narrow_bands(case.n_samples, _PER_OCTAVE)
+    wanted = narrow_bands(case.n_samples, per_octave)
     both = deep(case, Side(case.recorded.signal, wanted), Side(case.simulated.signal, wanted))
     n_slow, usable = len(both.d) - len(wanted.dof), torch.ones_like(both.d)
     scale = case.simulated.signal.shape[-1] / case.n_samples
@@ -126,7 +128,7 @@ def refit(case: Case, fold: int, term: Term, company: Sequence[Term] = ()) -> Te
     keep = estimation_samples(case.n_samples, fold)
     block = run_length(keep)
     recorded = case.recording[:, keep].unflatten(-1, (-1, block)).movedim(1, 0)
-    simulated = _in_blocks(case.simulated)[block]
+    simulated = in_blocks(case.simulated)[block]
     both = deep(case, Side(recorded, simulated.bands), simulated, _slow_without(fold))
     data = ratios(both, deep_base(case), torch.ones_like(both.d), _independent(case))
     found = fit(data, [term, *company])
@@ -152,25 +154,6 @@ def run_length(keep: Tensor) -> int:
     return int(edges.diff()[::2].min())
 
 
-class _Blocks(dict[int, Side]):
-    """A side's records cut into blocks, by their length: the same for all folds."""
-
-    def __init__(self, signal: Tensor) -> None:
-        super().__init__()
-        self.signal = signal
-
-    def __missing__(self, block: int) -> Side:
-        n = self.signal.shape[-1] // block * block
-        cut = self.signal[..., :n].unflatten(-1, (-1, block)).movedim(-2, -3).flatten(0, 1)
-        self[block] = Side(cut, bands(block))
-        return self[block]
-
-
-@remembered
-def _in_blocks(side: Side) -> _Blocks:
-    return _Blocks(side.signal)
-
-
 def _searched(case: Case) -> tuple[Shape, ...]:
     data = compared(case)
     if float(data.worth.sum()) < 50:
@@ -180,28 +163,30 @@ def _searched(case: Case) -> tuple[Shape, ...]:
     data, chosen = _chosen(data, differ=p_seen < _DOUBT)
     if chosen is None or not _convincing(data, chosen):
         return ()
-    found = []
+    found, whole = [], fair_gain(data, chosen.model)
     for i, term in enumerate(chosen.terms):
         others = [t for j, t in enumerate(chosen.terms) if j != i]
-        without = max(fit(data, others).gain, 0.0) if others else 0.0
-        gain = chosen.gain - without
+        gain = whole - (max(_fairly(data, others), 0.0) if others else 0.0)
         p = corrected(float(stats.chi2.sf(2 * max(gain, 0.0), _freedom(data, term))), _PLACES)
         if not others:  # it is all that differs
             p = min(p, p_seen)
         rivals = {
             rival.name
             for rival in _candidates(data, others)
-            if rival.name != term.name and _as_good(data, [*others, rival], chosen.gain - _RIVAL)
+            if rival.name != term.name and _as_good(data, [*others, rival], chosen, whole)
         }
         if _like_switching(term):
             rivals.add("random_telegraph")
         seen = (log_score(data, data_model(data, [term])) - log_score(data, data.expected)).clamp(min=0)
         levels = {level_of(float(f)) for f in data.ground.bands.frequency[seen > 0.05 * seen.sum()]}
+        told, sd = term, chosen.sd(i)
+        if isinstance(term, Bump | CommonBump) and float(term.shared.diff()) < math.log(_BROAD):
+            told, sd = _closer(case, term, others)
         found.append(
             Shape(
-                term,
+                told,
                 tuple(others),
-                chosen.sd(i),
+                sd,
                 gain - _cost(data, term),
                 p,
                 tuple(sorted(rivals)),
@@ -219,9 +204,7 @@ def _searched(case: Case) -> tuple[Shape, ...]:
     return tuple(sorted(found, key=place))
 
 
-def _forms(
-    data: Ratios, term: Term, others: list[Term], gain: float
-) -> tuple[tuple[LowPass, tuple[Tensor, Tensor]], ...]:
+def _forms(data: Ratios, term: Term, others: list[Term], gain: float) -> tuple[Form, ...]:
     """Other forms of a filter that are about as likely."""
     if not isinstance(term, LowPass):
         return ()
@@ -229,10 +212,21 @@ def _forms(
     return tuple((t, f.sd(-1)) for f in fits if f.gain > gain - _ALIKE and isinstance(t := f.terms[-1], LowPass))
 
 
-def _as_good(data: Ratios, terms: list[Term], gain: float) -> bool:
-    """Whether shapes gain as much; those that are far from it after a few rounds are not followed."""
+def _as_good(data: Ratios, terms: list[Term], chosen: Fit, gain: float) -> bool:
+    """Whether shapes gain about as much as those chosen, a nat less for each number that they do without (Akaike).
+
+    Those that are far from it after a few rounds are not followed.
+    """
     quick = fit(data, terms, _QUICK)
-    return quick.gain > gain or (quick.gain > gain - _FAR and fit(data, quick.terms).gain > gain)
+    least = gain - _RIVAL - max(chosen.n_free - quick.n_free, 0)
+    near = quick.gain > chosen.gain - _FAR or fair_gain(data, quick.model) > least + _RIVAL - _FAR
+    return near and _fairly(data, quick.terms) > least
+
+
+def _fairly(data: Ratios, terms: Sequence[Term]) -> float:
+    """Gain of shapes with the numbers that suit them best where the law of F is taken at their own powers."""
+    own = data.centred(fit(data, terms).model.diagonal(dim1=-2, dim2=-1).real)
+    return fair_gain(data, fit(own, terms).model)
 
 
 def _freedom(data: Ratios, term: Term) -> int:
@@ -300,8 +294,7 @@ def _pruned(data: Ratios, found: Fit) -> Fit:
             if isinstance(term, Common):
                 terms.append(term)
                 continue
-            local_sd, _ = found.sd(i)
-            t = torch.where(term.free, (term.local / local_sd).abs().nan_to_num(nan=0.0), 0.0)
+            t = torch.where(term.free, (term.local / found.sd_given_shared(i)).abs().nan_to_num(nan=0.0), 0.0)
             keep = term.free & ((t >= threshold) | (t == t.max()))
             changed |= bool((keep != term.free).any())
             terms.append(replace(term, free=keep, local=torch.where(keep, term.local, 0.0)))
@@ -378,20 +371,25 @@ def _candidates(data: Ratios, company: list[Term]) -> Iterator[Term]:
         yield from max(starts_at, key=lambda s: score([*company, s[0]]))
 
 
+def _closer(case: Case, term: Bump | CommonBump, others: list[Term]) -> tuple[Term, tuple[Tensor, Tensor]]:
+    """A bump that is no wider than bands are, from narrower ones, and standard deviations of its numbers."""
+    data = compared(case, _FINE)
+    model = data_model(data, others)
+    seen, frequency = term.shared[0].exp(), data.ground.bands.frequency
+    centres = frequency[(frequency / seen).log().abs() < _OFF].tolist()
+    starts = ((centre, share * centre) for centre in centres for share in _NARROW)
+    start = bump_start(data, model, starts, term.free.any(0)) or term
+    local = start.local
+    if isinstance(term, CommonBump):
+        common = CommonBump.start(data.ground, data.observed - model, data.worth, "oscillation", start.shared)
+        local = common.local * term.free
+    found = fit(data, [*others, replace(term, local=local, shared=start.shared, narrowest=_NARROWEST)])
+    return found.terms[-1], found.sd(-1)
+
+
 def _bump(data: Ratios, model: Tensor) -> Bump | None:
     """The bump that what is left is most like, of centres at the bands and widths up to a third of them."""
-    ground = data.ground
-    fitted, seen = (m.diagonal(dim1=-2, dim2=-1).real for m in (model, data.observed))  # (band, sensor)
-    left, worth = seen / fitted - 1, data.worth[:, None]
-    places = ground.places
-    best, top = 0.0, None
-    for centre in ground.bands.frequency[ground.bands.frequency * ground.bands.n_samples > 16]:
-        for share in _WIDTHS:
-            profile = ground.bands.mean_of(oscillation(places, centre, share * centre))
-            template = profile[:, None] / ground.mean.mT / fitted
-            size = (worth * template.square()).sum(0)
-            amount = (worth * left * template).sum(0).clamp(min=0) / size  # (sensor,)
-            gain = float((amount.square() * size).sum())
-            if gain > best:
-                best, top = gain, Bump.start(float(centre), share * float(centre), amount)
-    return top
+    bands = data.ground.bands
+    centres = bands.frequency[bands.frequency * bands.n_samples > 16].tolist()
+    starts = ((centre, share * centre) for centre in centres for share in _WIDTHS)
+    return bump_start(data, model, starts, torch.ones(data.n_sensors, dtype=torch.bool))

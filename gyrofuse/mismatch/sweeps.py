@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.case import Case
-from gyrofuse.mismatch.evidence import Evidence, corrected
+from gyrofuse.mismatch.evidence import Evidence, corrected, surpassing
 from gyrofuse.mismatch.impulses import left_out
 from gyrofuse.mismatch.lines import sets_of
 from gyrofuse.mismatch.remembered import remembered
@@ -28,7 +28,7 @@ _SEGMENT = 16  # roots of the record's length
 _EVERY = 4  # bins that a frequency moves within a segment, from one rate that is undone to the next
 _CUT = 8.0  # power of a sensor: a steady line that is crossed is no track
 _CANDIDATES = 16  # of each rate, that are looked at closely
-_OWN = 0.05  # p value of what the simulation has as well
+_NOTABLE = 0.05  # p value of what the simulation is asked about
 _SIGNED = 7  # sensors up to which every sign is tried
 
 
@@ -51,8 +51,8 @@ def sweep_witness(case: Case) -> Evidence:
     """A line whose frequency moves, that the simulation does not have."""
     found = _strongest(case.recorded)
     p_value = found.p_value
-    if p_value < _OWN and _strongest(case.simulated).p_value < _OWN:
-        p_value = 1.0
+    if p_value < _NOTABLE:
+        p_value = surpassing(p_value, _strongest(case.simulated).p_value)
     first, last = (f * case.scene.rate for f in (found.first, found.last))
     return Evidence(
         "sweep",

@@ -47,7 +47,7 @@ class ParameterShift(Filter):
             return None
         parameters, words = {}, []
         base = deep_base(case)
-        before = _numbers(base, case.scene.rate, case.scene.unit)
+        before, least = _numbers(base, case.scene.rate, case.scene.unit)
         for i in range(case.n_sensors):
             for k, name in enumerate(_PARTS):
                 sd = float(shape.sd[0][k, i])
@@ -55,13 +55,13 @@ class ParameterShift(Filter):
                     continue
                 value = float(shape.term.local[k, i])
                 low, high = value - Z * sd, value + Z * sd
-                parameters[f"{name}_factor[{i}]"] = spanned(math.exp, value, sd, "")  # of variances
+                number, unit = before[k][i]
+                if number:  # else the simulation does not show how much it has
+                    parameters[f"{name}_factor[{i}]"] = spanned(math.exp, value, sd, "")  # of variances
                 if low > 0 or high < 0:
-                    number, unit = before[k][i]
                     factor = math.exp(value if name == "corner" else value / 2)  # in standard deviations
-                    words.append(
-                        f"{_WORDS[k]} of sensor {case.scene.sensors[i]} {number:.3g} -> {number * factor:.3g} {unit}"
-                    )
+                    after = f"{(number or least[i]) * factor:.3g} {unit}"
+                    words.append(f"{_WORDS[k]} of sensor {case.scene.sensors[i]} {number:.3g} -> {after}")
         sensors = tuple(int(i) for i in shape.term.free.any(0).nonzero()[:, 0])
         return found(
             case,
@@ -81,16 +81,22 @@ class ParameterShift(Filter):
         return replace(self, log_factors=refit(case, fold, term, self.company).local)
 
 
-def _numbers(base: Base, rate: float, unit: str) -> list[list[tuple[float, str]]]:
-    """Numbers of the parts before, each sensor's with its unit: sds of a sample, corner in Hz, sd of an increment."""
+def _numbers(base: Base, rate: float, unit: str) -> tuple[list[list[tuple[float, str]]], list[float]]:
+    """Numbers of the parts before, each sensor's with its unit: sds of a sample, corner in Hz, sd of an increment.
+
+    Walks that are not seen have none; the sds that stand for them come last.
+    """
     f = torch.tensor([1 / base.n_samples], dtype=torch.float64)
     parts = Parts(base, f)
     white = parts.densities[0][:, 0].sqrt()
     variance, corner = parts.moments()
-    walk = (parts.densities[2][:, 0] * 4 * torch.sin(math.pi * f).square()).sqrt()
-    return [
+    unseen = parts.unseen[:, 0]
+    walk = ((parts.densities[2][:, 0] + unseen) * 4 * torch.sin(math.pi * f).square()).sqrt()
+    seen = torch.where(unseen > 0, 0.0, walk)
+    numbers = [
         [(float(x), f"{unit} per sample") for x in white],
         [(float(x), f"{unit} rms") for x in variance.sqrt()],
         [(float(x) * rate, "Hz") for x in corner],
-        [(float(x), f"{unit} per step") for x in walk],
+        [(float(x), f"{unit} per step") for x in seen],
     ]
+    return numbers, walk.tolist()

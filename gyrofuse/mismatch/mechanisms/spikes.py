@@ -123,9 +123,12 @@ class Spikes(Mechanism):
         per_hour, sd, parameters = case.scene.rate * _HOUR, left_out(case.recorded).sd[0], {}
         for i in hit:
             law, scale = laws[i], float(sd[i])
-            rates, amplitudes = (law.rate, *law.rate_limits), (law.amplitude, *law.amplitude_limits)
-            parameters["rate" if together else f"rate[{i}]"] = Parameter(*(per_hour * v for v in rates), "1/h")
-            parameters[f"amplitude[{i}]"] = Parameter(*(scale * v for v in amplitudes), case.scene.unit)
+            low, high = law.rate_limits
+            parameters["rate" if together else f"rate[{i}]"] = Parameter(
+                law.rate * per_hour, low * per_hour, high * per_hour, "1/h"
+            )
+            low, high = law.amplitude_limits
+            parameters[f"amplitude[{i}]"] = Parameter(law.amplitude * scale, low * scale, high * scale, case.scene.unit)
         return parameters
 
     def refitted(self, case: Case, fold: int) -> Spikes:
