@@ -118,7 +118,8 @@ def test_known_units_are_converted():
 
 
 def test_twins_agree_and_their_rank_is_a_p_value():
-    case = diagnose(array(5, N // 2), array(6, N // 2)).case
+    some = [0, 2, 4]
+    case = diagnose(array(5, N // 4).select(sensors=some), array(6, N // 4).select(sensors=some)).case
     mate = twin(case, generator(1))
     assert mate.recording.shape == case.recording.shape
     assert mate.simulated.signal.shape == case.simulated.signal.shape
