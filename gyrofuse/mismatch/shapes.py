@@ -43,7 +43,7 @@ _CLEAN = 8  # bins
 _BROAD = 3.0  # half widths
 _FORMS = 3  # of filters
 _WIDTHS = (0.06, 0.15, 0.35)  # half width of a bump over its centre
-_BROAD, _NARROW = 0.1, (0.02, 0.04, 0.08)  # the same, below which bands are too wide for it, and of it there
+_SHARP, _NARROW = 0.1, (0.02, 0.04, 0.08)  # the same, below which bands are too wide for it, and of it there
 _FINE, _NARROWEST = 24, 0.005  # bands in an octave for those, and the least that they show
 _OFF = 0.25  # logarithm by which a centre from wide bands may be off
 _CORNER_BINS = (4.0, 0.3)  # corners of common AR1s to start from: bins, cycles per sample
@@ -97,6 +97,11 @@ def _like_switching(term: Term) -> bool:
     if isinstance(term, Shift):
         return bool((term.local[1:] > 0).any())
     return isinstance(term, Flicker)
+
+
+def _like_missing(term: Term, data: Ratios) -> bool:
+    """Whether an AR1 may have that spectrum, of which the simulation has none whose numbers could be other ones."""
+    return _like_switching(term) and not isinstance(term, Shift) and not bool(data.ground.matters[1].any())
 
 
 def chosen_shape(case: Case, name: str, level: float) -> Shape | None:
@@ -177,10 +182,12 @@ def _searched(case: Case) -> tuple[Shape, ...]:
         }
         if _like_switching(term):
             rivals.add("random_telegraph")
+        if _like_missing(term, data):
+            rivals.add("parameter_shift")
         seen = (log_score(data, data_model(data, [term])) - log_score(data, data.expected)).clamp(min=0)
         levels = {level_of(float(f)) for f in data.ground.bands.frequency[seen > 0.05 * seen.sum()]}
         told, sd = term, chosen.sd(i)
-        if isinstance(term, Bump | CommonBump) and float(term.shared.diff()) < math.log(_BROAD):
+        if isinstance(term, Bump | CommonBump) and float(term.shared.diff()) < math.log(_SHARP):
             told, sd = _closer(case, term, others)
         found.append(
             Shape(
