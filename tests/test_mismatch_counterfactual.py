@@ -25,6 +25,7 @@ from gyrofuse.mismatch.mechanisms.vibration_tone import VibrationTone, amplitude
 from gyrofuse.mismatch.mechanisms.warm_up_transient import WarmUpTransient
 from gyrofuse.mismatch.oscillating import Mode, wandering_sd
 from gyrofuse.mismatch.slow_scans import slow_look
+from gyrofuse.mismatch.steadiness import Steadiness, steadiness
 from gyrofuse.mismatch.telling import otherwise_words
 
 MODEL = gf.WhiteNoise(1.0) + gf.AR1(0.999, 1e-4) + gf.RandomWalk(1e-8)
@@ -223,3 +224,22 @@ def test_a_frequency_that_wanders_is_known_as_well_as_its_mean_over_the_record()
 def test_the_highest_place_near_a_frequency_is_the_line():
     case = case_of(15, tone(12.34, 0.3))
     assert abs(line_near(case, 0.1236, 0.001) - 0.1234) < 1 / N
+
+
+def test_noise_that_a_simulator_of_white_noise_lacks_leaves_a_better_one():
+    white = gf.WhiteNoise(1.0)
+    recording = (white + gf.AR1(0.9, 2e-2)).simulate(N, batch=(3,), generator=generator(4))
+    report = diagnose(gf.Recording(recording, rate=RATE, unit="deg/s"), white)
+    assert report.held_out.low > 0
+    assert report.held_out.after < report.held_out.before
+    names = {"parameter_shift", "flicker"}  # an AR1 has no name of its own
+    assert all(names & {f.mechanism, *f.alternatives} for f in report.findings)
+
+
+def test_a_bump_at_either_end_of_the_spectrum_is_no_tone():
+    case = case_of(5)
+    one = torch.ones(SENSORS, dtype=torch.float64)
+    for centre in (2.0 / N, 0.5 - 2.0 / N):
+        stretch = Stretch(centre, 4.0 / N, 1e-6, (0,))
+        bump = Oscillation(stretch, centre, 2.0 / N, (0.1, 0.1), one, 0.1 * one, one.to(torch.complex128), 10.0)
+        assert steadiness(case, bump) == Steadiness(tone=False, open=True, slow=False)

@@ -64,11 +64,10 @@ def settled(links: list[Link], case: Case, level: float, generator: torch.Genera
         found = []
         for k, (link, (gain, left)) in enumerate(zip(links, judged, strict=True)):
             told = _compared(link.finding, gain, left)
-            better = None if swapped else _better(told, left, level)
+            better = None if swapped else _better(links[k:], told, left, level, generator)
             if better is not None:
                 swapped = True
-                rest = [better, *(other.finding for other in links[k + 1 :])]
-                links, case = _relinked(links[:k], rest, link.before, generator)
+                links, case = _relinked(links[:k], better, link.before, generator)
                 break
             found.append(link._replace(finding=told))
         else:
@@ -135,16 +134,34 @@ def _compared(finding: Finding, gain: Gain, left: Case) -> Finding:
     return replace(told, alternatives=tuple(dict.fromkeys((*finding.alternatives, *alike))))
 
 
-def _better(finding: Finding, left: Case, level: float) -> Finding | None:
-    """The look-alike of a finding, if it is better by more than chance, there by itself, and holds."""
-    if finding.instead is None or finding.gain_without is None:
+def _better(
+    links: list[Link], told: Finding, left: Case, level: float, generator: torch.Generator
+) -> list[Finding] | None:
+    """Findings with a look-alike in the place of the first, if it is better by more than chance, there, and holds.
+
+    It comes last, after all that it was found beside. Later findings under its name, which may have mended what the
+    first one did not fit, go with that if it does as much alone.
+    """
+    if told.instead is None or told.gain_without is None:
         return None
-    if finding.instead.gain <= finding.gain_without + _BETTER_SD * finding.instead.sd:
+    if told.instead.gain <= told.gain_without + _BETTER_SD * told.instead.sd:
         return None
-    for mechanism in (m for stage in STAGES for m in stage if m.name == finding.instead.mechanism):
+    first, *later = links
+    gone = [link for link in later if link.finding.mechanism == told.instead.mechanism]
+    rest = [link.finding for link in later if link not in gone]
+    least = 0.0
+    if gone:
+        least = sum((link.gain.total for link in gone), first.gain.total)
+        left = first.before
+        for other in rest:
+            left = other.effect.explained(left, generator)
+    for mechanism in (m for stage in STAGES for m in stage if m.name == told.instead.mechanism):
         found = mechanism.nominate(left, level)
-        if found is not None and held_out_gain(left, found.effect).confirms(found.p_value):
-            return found
+        if found is None:
+            continue
+        gain = held_out_gain(left, found.effect)
+        if gain.confirms(found.p_value) and gain.total > least:
+            return [*rest, found]
     return None
 
 

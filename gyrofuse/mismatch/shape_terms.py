@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
@@ -185,6 +187,14 @@ class Shift(Term):
         single = [replace(every, free=every.free & rows[:, None]) for rows in _SINGLE]
         return [every, *(s for s in single if bool(s.free.any()))]
 
+    @classmethod
+    def moved(cls, ground: Ground) -> Iterator[Shift]:
+        """AR1s far from what they were, where no slope leads to: of a simulator that has next to none."""
+        every = cls.start(ground)
+        for level, corner in itertools.product(*_MOVED):
+            local = torch.tensor([0.0, level, corner, 0.0], dtype=torch.float64)[:, None] * every.free
+            yield replace(every, local=local)
+
     @property
     def parts(self) -> Tensor:
         """Which rows of numbers are free in some sensor, `(number,)`."""
@@ -194,6 +204,7 @@ class Shift(Term):
         return ground.parts.shifted(local) / ground.density
 
 
+_MOVED = ((0.0, 2.0, 4.0, 6.0), (-3.0, -1.5, 0.0, 1.5, 3.0, 4.5))  # log factors of variance and corner
 # White noise, the level of the AR1s, level and corner, the walk.
 _SINGLE = torch.tensor([[1, 0, 0, 0], [0, 1, 0, 0], [0, 1, 1, 0], [0, 0, 0, 1]], dtype=torch.bool)
 

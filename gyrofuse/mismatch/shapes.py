@@ -100,8 +100,9 @@ def _like_switching(term: Term) -> bool:
 
 
 def _like_missing(term: Term, data: Ratios) -> bool:
-    """Whether an AR1 may have that spectrum, of which the simulation has none whose numbers could be other ones."""
-    return _like_switching(term) and not isinstance(term, Shift) and not bool(data.ground.matters[1].any())
+    """Whether it may be an AR1 of sensors of which the simulation has none whose numbers could be other ones."""
+    lacking = term.free.any(0) & ~data.ground.matters[1]
+    return _like_switching(term) and not isinstance(term, Shift) and bool(lacking.any())
 
 
 def chosen_shape(case: Case, name: str, level: float) -> Shape | None:
@@ -352,6 +353,8 @@ def _candidates(data: Ratios, company: list[Term]) -> Iterator[Term]:
     model = data_model(data, company)
     if "parameter_shift" not in names and bool(ground.matters.any()):
         yield from Shift.starts(ground)
+        if bool(ground.matters[1].any()):
+            yield max(Shift.moved(ground), key=lambda s: score([*company, s]))
     if "low_pass" not in names:
         filters = [s for kind in FILTERS for s in LowPass.starts(ground, kind)]
         best: dict[str, LowPass] = {}
