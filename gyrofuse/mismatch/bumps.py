@@ -8,7 +8,6 @@ with level and slope of the noise around it.
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
@@ -23,7 +22,7 @@ from gyrofuse.mismatch.evidence import Evidence, corrected
 from gyrofuse.mismatch.lines import simulated_lines, without_lines
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.shape_fit import Fit, Ratios, fit
-from gyrofuse.mismatch.shape_law import smooth_coherence
+from gyrofuse.mismatch.shape_law import decorrelated, smooth_coherence
 from gyrofuse.mismatch.shape_terms import Bump, CommonBump, Ground, Term
 from gyrofuse.mismatch.side import Side
 from gyrofuse.mismatch.spectra import Bands, degrees_of_freedom, hann_transform
@@ -170,7 +169,9 @@ def _correlated(transform: Tensor, length: int, case: Case) -> tuple[Tensor, Ten
     starts, widths, scores = [nothing], [nothing], [torch.zeros(2, 0, dtype=torch.float64)]
     last = int((0.5 - 2 / case.n_samples) * length)
     if p > 1 and 2 * n < last:
-        apart = _decorrelated(transform[:, :last], length, case)
+        scale = length / case.n_samples
+        edges = [0, *(round(e * scale) for e in case.bands.edges[1:-1]), last]
+        apart = decorrelated(transform[:, :last], edges, case.recorded.dof)
         half = apart[:, : last // (n // 2) * (n // 2)].unflatten(-1, (-1, n // 2)).movedim(1, 0)
         blocks = half @ half.mH  # (block, sensor, sensor)
         while n <= last // 8 and len(blocks) > 1:
@@ -183,19 +184,6 @@ def _correlated(transform: Tensor, length: int, case: Case) -> tuple[Tensor, Ten
             blocks = blocks[: len(blocks) // 2 * 2].unflatten(0, (-1, 2)).sum(1)
             n *= 2
     return torch.cat(starts), torch.cat(widths), torch.cat(scores, -1)
-
-
-def _decorrelated(transform: Tensor, length: int, case: Case) -> Tensor:
-    """Without the coherence of broad bands."""
-    apart = transform.clone()
-    edges = [0, *(round(e * length / case.n_samples) for e in case.bands.edges[1:-1]), transform.shape[-1]]
-    matrices = torch.stack([part @ part.mH for a, b in itertools.pairwise(edges) for part in [transform[:, a:b]]])
-    size = matrices.diagonal(dim1=-1, dim2=-2).real.rsqrt()
-    coherence = smooth_coherence(matrices * (size[:, :, None] * size[:, None, :]), case.recorded.dof)
-    for matrix, (a, b) in zip(coherence, itertools.pairwise(edges), strict=True):
-        root = torch.linalg.cholesky(matrix)
-        apart[:, a:b] = torch.linalg.solve_triangular(root, transform[:, a:b], upper=False)
-    return apart
 
 
 def _coherent_scores(matrices: Tensor, d: float) -> Tensor:

@@ -30,7 +30,7 @@ _LOG_CHI2 = -1.2703628454614782  # mean of log chi2_1
 _LEFT = 1 - 1.5 / _WIDEST  # of a sample's own part: the spectrum follows each ordinate by three quarters of its share
 _LINE = 25.0  # ordinates this far above the spectrum are lines
 _SKIRT = 1 / 8  # share of ordinates of a line, beyond which the stretch around belongs to it
-_ENDS = 64  # a line's skirt is felt in so small a part of the record at each end
+ENDS = 64  # a line's skirt is felt in so small a part of the record at each end
 _MOST_RECORDS = 2  # of the simulation: as honest as more
 _MAD = 0.6744897501960817
 _TAILS = (3.5, 4.0, 4.5, 5.0, 6.0, 8.0)
@@ -84,7 +84,7 @@ def _lines(y: Tensor, spectrum: Tensor) -> Tensor:
     lines = y.square() > _LINE * spectrum
     n, reach, every = y.shape[-1], 4, torch.arange(y.shape[-1])
     # Two neighbours at least make a skirt.
-    while reach < n // _ENDS and bool((lines.sum(-1) > 1).any()):
+    while reach < n // ENDS and bool((lines.sum(-1) > 1).any()):
         total = torch.nn.functional.pad(lines.cumsum(-1), (1, 0))
         within = total[..., (every + reach + 1).clamp(max=n)] - total[..., (every - reach).clamp(min=0)]
         lines = lines | (within > _SKIRT * (2 * reach + 1))
@@ -94,7 +94,7 @@ def _lines(y: Tensor, spectrum: Tensor) -> Tensor:
 
 def _mirrored(values: Tensor) -> Tensor:
     """With the ends `(..., time)` replaced by what is next to them."""
-    m = values.shape[-1] // _ENDS
+    m = values.shape[-1] // ENDS
     inner = values[..., m:-m]
     return torch.cat([inner[..., :m].flip(-1), inner, inner[..., -m:].flip(-1)], -1)
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from scipy import special, stats
@@ -57,3 +60,14 @@ def smooth_coherence(coherence: Tensor, dof: Tensor) -> Tensor:
         share = (1 - chance / (c - eye).abs().square().sum().clamp(min=1e-12)).clamp(min=0.0)
         smooth.append(eye + share * (c - eye))
     return torch.stack(smooth)
+
+
+def decorrelated(transform: Tensor, edges: Sequence[int], dof: Tensor) -> Tensor:
+    """Fourier transform `(sensor, bin)` without the coherence of bands, which are worth `dof`."""
+    parts = [transform[:, a:b] for a, b in itertools.pairwise(edges)]
+    matrices = torch.stack([part @ part.mH for part in parts])
+    size = matrices.diagonal(dim1=-1, dim2=-2).real.clamp(min=1e-300).rsqrt()
+    coherence = smooth_coherence(matrices * (size[:, :, None] * size[:, None, :]), dof)
+    roots = torch.linalg.cholesky(coherence)
+    solved = [torch.linalg.solve_triangular(r, part, upper=False) for r, part in zip(roots, parts, strict=True)]
+    return torch.cat(solved, -1)

@@ -16,11 +16,11 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.case import Case
-from gyrofuse.mismatch.evidence import Evidence, corrected, surpassing
-from gyrofuse.mismatch.impulses import left_out
+from gyrofuse.mismatch.evidence import Evidence, corrected
+from gyrofuse.mismatch.impulses import ENDS, left_out
 from gyrofuse.mismatch.lines import sets_of
 from gyrofuse.mismatch.remembered import remembered
-from gyrofuse.mismatch.shape_law import smooth_coherence
+from gyrofuse.mismatch.shape_law import decorrelated
 from gyrofuse.mismatch.side import Side
 from gyrofuse.mismatch.witnesses import level_of
 
@@ -28,7 +28,7 @@ _SEGMENT = 16  # roots of the record's length
 _EVERY = 4  # bins that a frequency moves within a segment, from one rate that is undone to the next
 _CUT = 8.0  # power of a sensor: a steady line that is crossed is no track
 _CANDIDATES = 16  # of each rate, that are looked at closely
-_NOTABLE = 0.05  # p value of what the simulation is asked about
+_NOTABLE = 0.05  # p value
 _SIGNED = 7  # sensors up to which every sign is tried
 
 
@@ -51,8 +51,9 @@ def sweep_witness(case: Case) -> Evidence:
     """A line whose frequency moves, that the simulation does not have."""
     found = _strongest(case.recorded)
     p_value = found.p_value
-    if p_value < _NOTABLE:
-        p_value = surpassing(p_value, _strongest(case.simulated).p_value)
+    # Lines that both have leave traces here of any size: what the simulation may show is nothing to surpass.
+    if p_value < _NOTABLE and _strongest(case.simulated).p_value < _NOTABLE:
+        p_value = 1.0
     first, last = (f * case.scene.rate for f in (found.first, found.last))
     return Evidence(
         "sweep",
@@ -75,11 +76,13 @@ def _decorrelated(side: Side) -> Tensor:
     n = white.shape[-1]
     transform = torch.fft.rfft(white)
     edges = [0, *(round(e * n / side.bands.n_samples) for e in side.bands.edges[1:-1]), transform.shape[-1]]
-    for matrix, (a, b) in zip(smooth_coherence(side.coherence, side.dof), itertools.pairwise(edges), strict=True):
-        root = torch.linalg.cholesky(matrix)
-        transform[:, a:b] = torch.linalg.solve_triangular(root, transform[:, a:b], upper=False)
+    transform = decorrelated(transform, edges, side.dof)
     white = torch.fft.irfft(transform, n=n)
-    return white / white.square().mean(-1, keepdim=True).sqrt()
+    white = white / white.square().mean(-1, keepdim=True).sqrt()
+    # Beside lines the ends are mirrored from what is next to them: seen twice, chance would look like more.
+    end = n // ENDS
+    white[:, :end], white[:, -end:] = 0.0, 0.0
+    return white
 
 
 def strongest_sweep(white: Tensor) -> Sweep:
