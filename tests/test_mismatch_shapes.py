@@ -40,7 +40,7 @@ from gyrofuse.mismatch.shape_terms import (
     Term,
     oscillation,
 )
-from gyrofuse.mismatch.shapes import compared, shapes
+from gyrofuse.mismatch.shapes import compared, leading_shape
 from gyrofuse.mismatch.witnesses import coherence_witness, spectrum_witness
 from gyrofuse.simulate import ArrayModel
 
@@ -567,4 +567,4 @@ def test_coherent_or_not_is_told_of_a_bump():
 
 def test_shapes_are_searched_once_for_a_case():
     given = drawn(20, CHANGES["levels"][1])
-    assert shapes(given) is shapes(given)
+    assert leading_shape(given) is leading_shape(given)

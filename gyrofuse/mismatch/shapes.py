@@ -79,8 +79,8 @@ class Shape(NamedTuple):
 
 
 @remembered
-def shapes(case: Case) -> tuple[Shape, ...]:
-    """Shapes that together explain the spectra, in the order in which they act; none where they do not."""
+def leading_shape(case: Case) -> Shape | None:
+    """Of the shapes that together explain the spectra the one that acts first; None where they do not."""
     return _searched(case)
 
 
@@ -110,8 +110,8 @@ def chosen_shape(case: Case, name: str, level: float) -> Shape | None:
     bump = oscillation_of(case)
     if name != "resonance" and bump is not None and bump.stretch.p_value <= level and bump.nats > _PLAIN:
         return None
-    best = shapes(case)[:1]
-    return best[0] if best and best[0].term.name == name and best[0].p_value <= level else None
+    best = leading_shape(case)
+    return best if best is not None and best.term.name == name and best.p_value <= level else None
 
 
 def compared(case: Case, per_octave: int = _PER_OCTAVE) -> Ratios:
@@ -160,56 +160,65 @@ def run_length(keep: Tensor) -> int:
     return int(edges.diff()[::2].min())
 
 
-def _searched(case: Case) -> tuple[Shape, ...]:
+def _searched(case: Case) -> Shape | None:
     data = compared(case)
     if float(data.worth.sum()) < 50:
-        return ()
+        return None
     scan = scanned(case)
     p_seen = 1.0 if scan is None else scan.p_value
     data, chosen = _chosen(data, differ=p_seen < _DOUBT)
     if chosen is None or not _convincing(data, chosen):
-        return ()
-    found, whole = [], fair_gain(data, chosen.model)
-    for i, term in enumerate(chosen.terms):
-        others = [t for j, t in enumerate(chosen.terms) if j != i]
-        gain = whole - (max(_fairly(data, others), 0.0) if others else 0.0)
-        p = corrected(float(stats.chi2.sf(2 * max(gain, 0.0), _freedom(data, term))), _PLACES)
-        if not others:  # it is all that differs
-            p = min(p, p_seen)
-        rivals = {
-            rival.name
-            for rival in _candidates(data, others)
-            if rival.name != term.name and _as_good(data, [*others, rival], chosen, whole)
-        }
-        if _like_switching(term):
-            rivals.add("random_telegraph")
-        if _like_missing(term, data):
-            rivals.add("parameter_shift")
-        seen = (log_score(data, data_model(data, [term])) - log_score(data, data.expected)).clamp(min=0)
-        levels = {level_of(float(f)) for f in data.ground.bands.frequency[seen > 0.05 * seen.sum()]}
-        told, sd = term, chosen.sd(i)
-        if isinstance(term, Bump | CommonBump) and float(term.shared.diff()) < math.log(_SHARP):
-            told, sd = _closer(case, term, others)
-        found.append(
-            Shape(
-                told,
-                tuple(others),
-                sd,
-                gain - _cost(data, term),
-                p,
-                tuple(sorted(rivals)),
-                float(data.ground.bands.frequency[seen.argmax()]),
-                tuple(sorted(levels)),
-                _forms(data, term, others, chosen.gain),
-            )
-        )
+        return None
+    seen = [_told(case, chosen, i) for i in range(len(chosen.terms))]
     nothing = float(log_score(data, data.expected).sum())
 
-    def place(shape: Shape) -> tuple[bool, int, float]:
-        alone = float(log_score(data, data_model(data, [shape.term])).sum()) - nothing
-        return alone < _ALONE, _ORDER[shape.term.acts], -alone
+    def place(i: int) -> tuple[bool, int, float]:
+        term, _ = seen[i]
+        alone = float(log_score(data, data_model(data, [term])).sum()) - nothing
+        return alone < _ALONE, _ORDER[term.acts], -alone
 
-    return tuple(sorted(found, key=place))
+    first = min(range(len(seen)), key=place)
+    term, others = chosen.terms[first], _others(chosen, first)
+    whole = fair_gain(data, chosen.model)
+    gain = whole - (max(_fairly(data, others), 0.0) if others else 0.0)
+    p = corrected(float(stats.chi2.sf(2 * max(gain, 0.0), _freedom(data, term))), _PLACES)
+    if not others:  # it is all that differs
+        p = min(p, p_seen)
+    rivals = {
+        rival.name
+        for rival in _candidates(data, others)
+        if rival.name != term.name and _as_good(data, [*others, rival], chosen, whole)
+    }
+    if _like_switching(term):
+        rivals.add("random_telegraph")
+    if _like_missing(term, data):
+        rivals.add("parameter_shift")
+    score = (log_score(data, data_model(data, [term])) - log_score(data, data.expected)).clamp(min=0)
+    frequency = data.ground.bands.frequency
+    told, sd = seen[first]
+    return Shape(
+        told,
+        tuple(others),
+        sd,
+        gain - _cost(data, term),
+        p,
+        tuple(sorted(rivals)),
+        float(frequency[score.argmax()]),
+        tuple(sorted({level_of(float(f)) for f in frequency[score > 0.05 * score.sum()]})),
+        _forms(data, term, others, chosen.gain),
+    )
+
+
+def _others(chosen: Fit, i: int) -> list[Term]:
+    return [t for j, t in enumerate(chosen.terms) if j != i]
+
+
+def _told(case: Case, chosen: Fit, i: int) -> tuple[Term, tuple[Tensor, Tensor]]:
+    """A shape and standard deviations of its numbers; bumps as narrower bands tell them."""
+    term = chosen.terms[i]
+    if isinstance(term, Bump | CommonBump) and float(term.shared.diff()) < math.log(_SHARP):
+        return _closer(case, term, _others(chosen, i))
+    return term, chosen.sd(i)
 
 
 def _forms(data: Ratios, term: Term, others: list[Term], gain: float) -> tuple[Form, ...]:
