@@ -8,35 +8,43 @@ with level and slope of the noise around it.
 
 from __future__ import annotations
 
+import functools
+import itertools
 import math
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 import torch
 from scipy import stats
+from scipy.signal import windows
 from torch import Tensor
 from torch.nn.functional import pad
 
+from gyrofuse._transforms import fast_length
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import Evidence, corrected
-from gyrofuse.mismatch.lines import simulated_lines, without_lines
+from gyrofuse.mismatch.lines import simulated_lines, whitened, without_lines
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.shape_fit import Fit, Ratios, fit
 from gyrofuse.mismatch.shape_law import decorrelated, smooth_coherence
+from gyrofuse.mismatch.shape_scan import scanned
 from gyrofuse.mismatch.shape_terms import Bump, CommonBump, Ground, Term
 from gyrofuse.mismatch.side import Side
-from gyrofuse.mismatch.spectra import Bands, degrees_of_freedom, hann_transform
+from gyrofuse.mismatch.spectra import Bands, degrees_of_freedom
 from gyrofuse.mismatch.witnesses import level_of
 
 _NARROWEST = 4  # bins
 _FLANK, _GAP = 1.5, 0.5  # widths
-_DEPENDENT = 2.2  # bins under a Hann taper for an independent one, as far tails have it
+_ENDS = 0.1  # of the record, under the taper: lines leak as far as twenty bins
+_DEPENDENT = 1.15  # bins under it for an independent one, as far tails have it
 _LOWEST = 12  # bins
 _TRIES = 6
+_MOST = 3.4  # medians of a modulus: one bin in three thousand is above
 _LINE = 0.6  # of the excess in three bins
 _AS_WELL = 0.01  # p value at which the simulation has it as well
 _CUT_OFF = 0.6  # of the simulation's power
 _ORDINATES = 2.5  # for each sensor, behind correlations
+_NUMBER = 2.0  # nats for a number of a sensor: those of sensors that have it are alike
 _CELLS, _CELL = 24, 5  # on either side, and fewest bins of one
 
 
@@ -114,13 +122,14 @@ def bump_witness(case: Case) -> Evidence:
 @remembered
 def strongest_bump(case: Case) -> Stretch:
     """The most conspicuous bump of the recording that is neither a line nor in the simulation."""
-    transform, length = _whitened(case.recorded, case)
+    transform, length = _transformed(case.recorded, case)
     power = transform[0].abs().square()
     shared = _effective_sensors(case)
     known = torch.zeros(power.shape[-1], dtype=torch.bool)
     simulated: tuple[Tensor, int] | None = None
-    starts, widths, scores = _scanned(power, length, case, shared)
-    together = _correlated(transform[0], length, case)
+    apart = _apart(transform[0], length, case)
+    starts, widths, scores = _scanned(power, apart.abs().square(), length, case, shared)
+    together = _correlated(apart, length, case)
     starts, widths = torch.cat([starts, together[0]]), torch.cat([widths, together[1]])
     n_places = scores.numel() + 2 * len(together[0])
     scores = pad(scores, (0, len(together[0])), value=-math.inf)
@@ -131,7 +140,7 @@ def strongest_bump(case: Case) -> Stretch:
         a, n = int(starts[column]), int(widths[column])
         tail = float(stats.norm.sf(float(scores[row, column])))
         if row < len(scores) - len(together[2]):
-            tail = _tail(power, row, a, n, length, case, shared)
+            tail = _tail(power, apart.abs().square(), row, a, n, length, case, shared)
         p = corrected(tail, n_places)
         stretch = Stretch((a + (n - 1) / 2) / length, n / length, p, _alone(power, a, n, length, case))
         if p > _AS_WELL:
@@ -140,7 +149,7 @@ def strongest_bump(case: Case) -> Stretch:
         excess = (inside - _flanks(power, a, n).mean()).clamp(min=0)
         line = float(excess.topk(3).values.sum()) > _LINE * float(excess.sum())
         if simulated is None:
-            simulated = _whitened(case.simulated, case)
+            simulated = _transformed(case.simulated, case)
         if not line and not _has_it(simulated, stretch, case, row, coherent=row >= len(scores) - len(together[2])):
             return stretch
         known[max(a - n, 0) : a + 2 * n] = True
@@ -151,27 +160,47 @@ def strongest_bump(case: Case) -> Stretch:
     return stretch._replace(p_value=1.0)
 
 
-def _whitened(side: Side, case: Case) -> tuple[Tensor, int]:
+@functools.lru_cache(maxsize=8)
+def light_taper(n: int) -> Tensor:
+    """For whitened samples `(n,)`, of squares that sum to one: one that holds back what is red costs half of them."""
+    taper = torch.from_numpy(windows.tukey(n, _ENDS))
+    return taper / taper.square().sum().sqrt()
+
+
+def _transformed(side: Side, case: Case) -> tuple[Tensor, int]:
     """Transform over the simulation's noise, `(record, sensor, bin)`, and the length padded to."""
-    transform, length = hann_transform(without_lines(side.signal, simulated_lines(case.simulated)))
-    f = torch.arange(transform.shape[-1], dtype=torch.float64) / length
-    return transform / case.base.spectrum(f.clamp(min=1 / length)).sqrt(), length
+    white = whitened(without_lines(side.signal, simulated_lines(case.simulated)), case.base)
+    n = white.shape[-1]
+    length = fast_length(n)
+    return torch.fft.rfft(white * light_taper(n), n=length), length
 
 
-def _correlated(transform: Tensor, length: int, case: Case) -> tuple[Tensor, Tensor, Tensor]:
-    """First bins and widths of wide stretches, and normal scores of their correlations `(2, stretch)`.
+def _apart(transform: Tensor, length: int, case: Case) -> Tensor:
+    """Without what sensors `(sensor, bin)` share over broad bands of both; zero above the last of them.
 
-    What sensors share over a broad band of both is taken out first.
+    Bins are cut to a few times the power around: lines are nothing that bands share.
     """
-    p = len(transform)
+    last = _last(length, case)
+    scale = length / case.n_samples
+    edges = [0, *(round(e * scale) for e in case.bands.edges[1:-1]), last]
+    parts = [transform[:, a:b] for a, b in itertools.pairwise(edges)]
+    limits = [_MOST * part.abs().median(-1, keepdim=True).values for part in parts]
+    cut = [part * (limit / part.abs()).clamp(max=1) for part, limit in zip(parts, limits, strict=True)]
+    apart = decorrelated(torch.cat(cut, -1), edges, case.recorded.dof)
+    return pad(apart, (0, transform.shape[-1] - last))
+
+
+def _last(length: int, case: Case) -> int:
+    return int((0.5 - 2 / case.n_samples) * length)
+
+
+def _correlated(apart: Tensor, length: int, case: Case) -> tuple[Tensor, Tensor, Tensor]:
+    """First bins and widths of wide stretches, and normal scores of their correlations `(2, stretch)`."""
+    p, last = len(apart), _last(length, case)
     n = 2 ** math.ceil(math.log2(_ORDINATES * _DEPENDENT * p * length / case.n_samples))
     nothing = torch.zeros(0, dtype=torch.int64)
     starts, widths, scores = [nothing], [nothing], [torch.zeros(2, 0, dtype=torch.float64)]
-    last = int((0.5 - 2 / case.n_samples) * length)
     if p > 1 and 2 * n < last:
-        scale = length / case.n_samples
-        edges = [0, *(round(e * scale) for e in case.bands.edges[1:-1]), last]
-        apart = decorrelated(transform[:, :last], edges, case.recorded.dof)
         half = apart[:, : last // (n // 2) * (n // 2)].unflatten(-1, (-1, n // 2)).movedim(1, 0)
         blocks = half @ half.mH  # (block, sensor, sensor)
         while n <= last // 8 and len(blocks) > 1:
@@ -235,9 +264,12 @@ def _dof(n: Tensor | float, length: int, case: Case) -> Tensor:
     return (torch.as_tensor(n, dtype=torch.float64) * case.n_samples / length / _DEPENDENT).clamp(min=1.0)
 
 
-def _scanned(power: Tensor, length: int, case: Case, shared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """First bins and widths of all stretches, and their scores `(sensor + 1, stretch)`, normal but for rounding."""
-    last = int((0.5 - 2 / case.n_samples) * length)
+def _scanned(power: Tensor, apart: Tensor, length: int, case: Case, shared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """First bins and widths of all stretches, and their scores `(sensor + 2, stretch)`, normal but for rounding.
+
+    Of each sensor, of the mean over all, and of those that rise, whichever they are.
+    """
+    last = _last(length, case)
     starts, widths, n = [], [], _NARROWEST
     while n <= last // 8:
         first = max(int(_LOWEST + (_FLANK + _GAP) * n), 4 * n)  # no wider than a quarter of its frequency
@@ -246,14 +278,33 @@ def _scanned(power: Tensor, length: int, case: Case, shared: Tensor) -> tuple[Te
         widths.append(torch.full_like(a, n))
         n *= 2
     start, width = torch.cat(starts), torch.cat(widths)
-    left, right, wide = _flank_places(start, width)
-    ratio = (_sums(power, start, width) / width) / ((_sums(power, left, wide) + _sums(power, right, wide)) / (2 * wide))
     d = _dof(width, length, case)
+    ratio = _ratios(power, start, width)
     scores = [_normal(ratio, d, 2 * _FLANK * d)]
     if len(power) > 1:
         worth = d * shared[_band(start + width / 2, length, case)]
         scores.append(_normal(ratio.mean(0, keepdim=True), worth, 2 * _FLANK * worth))
+        rises = _normal(_ratios(apart, start, width), d, 2 * _FLANK * d).clamp(min=0).square().sum(0)
+        scores.append(_normal_of_rises(rises, len(power))[None])
     return start, width, torch.cat(scores)
+
+
+def _ratios(power: Tensor, start: Tensor, width: Tensor) -> Tensor:
+    """Means over stretches over those of their flanks, `(sensor, stretch)`."""
+    left, right, wide = _flank_places(start, width)
+    return (_sums(power, start, width) / width) / ((_sums(power, left, wide) + _sums(power, right, wide)) / (2 * wide))
+
+
+def _tail_of_rises(total: Tensor, p: int) -> Tensor:
+    """Tail of a sum of squares of those of `p` normal variables that are positive."""
+    k = torch.arange(1, p + 1, dtype=torch.float64)
+    weights = torch.tensor([math.comb(p, j) * 0.5**p for j in range(1, p + 1)], dtype=torch.float64)
+    return (weights * torch.special.gammaincc(k / 2, total[..., None] / 2)).sum(-1)
+
+
+def _normal_of_rises(total: Tensor, p: int) -> Tensor:
+    """Normal score of such a sum."""
+    return -torch.special.ndtri(_tail_of_rises(total, p).clamp(min=1e-300))
 
 
 def _band(place: Tensor, length: int, case: Case) -> Tensor:
@@ -268,10 +319,15 @@ def _normal(ratio: Tensor, d: Tensor, flank: Tensor) -> Tensor:
     return ((1 - b) * root - (1 - a)) / (b * root.square() + a).sqrt()
 
 
-def _tail(power: Tensor, row: int, a: int, n: int, length: int, case: Case, shared: Tensor) -> float:
+def _tail(power: Tensor, apart: Tensor, row: int, a: int, n: int, length: int, case: Case, shared: Tensor) -> float:
+    """Tail of a score, without rounding."""
+    p, d = len(power), float(_dof(n, length, case))
+    if row == p + 1:
+        ratios = apart[:, a : a + n].mean(-1) / _flanks(apart, a, n)
+        scores = torch.from_numpy(stats.norm.isf(stats.f.sf(ratios.numpy(), 2 * d, 2 * d * 2 * _FLANK)))
+        return float(_tail_of_rises(scores.clamp(0, 37).square().sum(), p))
     ratio = power[:, a : a + n].mean(-1) / _flanks(power, a, n)
-    d = float(_dof(n, length, case))
-    if row < len(power):
+    if row < p:
         value = float(ratio[row])
     else:
         value = float(ratio.mean())
@@ -310,6 +366,16 @@ def oscillation_of(case: Case) -> Oscillation | None:
     return _closely(case, strongest_bump(case))
 
 
+@remembered
+def likeliest_oscillation(case: Case) -> Oscillation | None:
+    """The bump that is the likeliest of all shapes of a difference, fitted; None where another one is."""
+    seen = scanned(case)
+    if seen is None or seen.bump is None:
+        return None
+    centre, width = seen.bump
+    return _closely(case, Stretch(centre, 2 * width, seen.p_value, seen.sensors))
+
+
 def _closely(case: Case, stretch: Stretch) -> Oscillation | None:
     n = case.n_samples
     cell = max(round(stretch.width * n / 4), _CELL)
@@ -343,25 +409,25 @@ def _best(case: Case, stretch: Stretch, data: Ratios, background: Fit) -> Oscill
     least = max(1.5 / case.n_samples, stretch.width / 40) / stretch.frequency
     height = (data.observed - background.model).diagonal(dim1=-2, dim2=-1).real[middle - 2 : middle + 2].mean(0)
     level = ground.mean[:, middle] * height.clamp(min=1e-3)
+
+    def value(found: Fit) -> float:
+        numbers = sum(int(t.free.sum()) - isinstance(t, CommonBump) for t in found.terms)
+        return found.gain - _NUMBER * numbers - data.penalty * sum(len(t.shared) for t in found.terms)
+
     tried: list[Fit] = []
-    for share in (0.25, 0.6):
+    for company, share in itertools.product(([], background.terms), (0.25, 0.6)):
         width = share * stretch.width
         bump = Bump.start(stretch.frequency, width, level * 2 * math.pi * width)
-        bump = Bump(bump.local, bump.free, bump.shared, least)
-        own = fit(data, [*background.terms, bump])
+        own = fit(data, [*company, Bump(bump.local, bump.free, bump.shared, least)])
         tried.append(own)
         if p > 1:
             excess = data.observed - background.model
-            source = CommonBump.start(ground, excess, data.worth, "oscillation", own.terms[1].shared)
+            source = CommonBump.start(ground, excess, data.worth, "oscillation", own.terms[-1].shared)
             source = CommonBump(source.local, source.free, source.shared, narrowest=least)
-            tried.append(fit(data, [*background.terms, source]))
-
-    def value(found: Fit) -> float:
-        numbers = found.n_free - isinstance(found.terms[1], CommonBump) - 2 * p
-        return found.gain - background.gain - data.penalty * numbers
-
+            tried.append(fit(data, [*company, source]))
     best = max(tried, key=value)
-    term, (local_sd, log_sd) = best.terms[1], best.sd(1)
+    nats = value(best) - max(value(background), 0.0)
+    term, (local_sd, log_sd) = best.terms[-1], best.sd(-1)
     if isinstance(term, CommonBump):
         gain = torch.complex(*term.local)
         variance = gain.abs().square()
@@ -369,6 +435,6 @@ def _best(case: Case, stretch: Stretch, data: Ratios, background: Fit) -> Oscill
     else:
         gain, variance, spread = None, term.local[0], local_sd[0]
     centre, width = (float(x) for x in term.shared.exp())
-    if centre < 2 * width or value(best) < 0:
+    if centre < 2 * width or nats < 0:
         return None
-    return Oscillation(stretch, centre, width, tuple(log_sd.tolist()), variance, spread, gain, value(best))
+    return Oscillation(stretch, centre, width, tuple(log_sd.tolist()), variance, spread, gain, nats)

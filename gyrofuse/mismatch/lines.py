@@ -20,7 +20,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from scipy import special
+from scipy import fft, special
 from torch import Tensor
 from torch.nn.functional import max_pool1d
 
@@ -203,12 +203,16 @@ def _log_hotelling(z: Tensor, matrices: Tensor, sets: Tensor, m: Tensor) -> Tens
 
 
 def whitened(signal: Tensor, base: Base) -> Tensor:
-    """Signals `(sensor, time)` in units of the noise of a base, without their means."""
-    signal = signal - signal.mean(-1, keepdim=True)
-    length = fast_length(signal.shape[-1])
-    f = torch.arange(length // 2 + 1, dtype=torch.float64) / length
-    transform = torch.fft.rfft(signal, n=length) / base.spectrum(f.clamp(min=1 / length)).sqrt()
-    return torch.fft.irfft(transform, n=length)[..., : signal.shape[-1]]
+    """Signals `(..., sensor, time)` in units of the noise of a base, without their means.
+
+    By cosine transforms: a Fourier transform has ends meet that do not, and a record that wanders would jump there.
+    """
+    n = signal.shape[-1]
+    f = torch.arange(n, dtype=torch.float64) / (2 * n)
+    ordinates = torch.from_numpy(fft.dct(signal.numpy(), norm="ortho", axis=-1))
+    ordinates = ordinates / base.spectrum(f.clamp(min=1 / n)).sqrt()
+    ordinates[..., 0] = 0.0
+    return torch.from_numpy(fft.idct(ordinates.numpy(), norm="ortho", axis=-1))
 
 
 def _transformed(signal: Tensor, base: Base) -> tuple[Tensor, int]:

@@ -9,9 +9,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.bumps import Oscillation, Stretch, oscillation_of
+from gyrofuse.mismatch.bumps import (
+    Oscillation,
+    Stretch,
+    light_taper,
+    likeliest_oscillation,
+    oscillation_of,
+)
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.folds import estimation_samples
+from gyrofuse.mismatch.lines import simulated_lines, whitened, without_lines
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.shape_terms import Bump, CommonBump, oscillation
 from gyrofuse.mismatch.shape_words import spanned
@@ -19,12 +26,13 @@ from gyrofuse.mismatch.shapes import chosen_shape, refit, run_length
 from gyrofuse.mismatch.steadiness import Steadiness, steadiness
 from gyrofuse.mismatch.witnesses import level_of
 
-_SEEN = 3.0  # standard deviations
+_SEEN = 2.3  # standard deviations: one in a hundred by chance
 _BAND = 6.0  # half widths on either side
 _PARTS, _MOST_ALIKE = 16, 0.8  # of a record, to see a frequency wander, and the correlation of neighbours
 _FEWEST = 3  # samples of the band in a part
-_BROAD = 0.06  # half width over centre
-_SMEARED = 0.7  # bins: half width of a line under a Hann taper
+_BROAD = 0.1  # half width over centre
+_SMEARED = 0.45  # bins: half width of a line under a light taper
+_REACH, _FEWEST_BINS = 7.5, 6  # half widths around a mode, and bins, that tell its strength
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +124,8 @@ def nominated(case: Case, level: float, *, tone: bool) -> tuple[Mode, Seen] | No
     bump = oscillation_of(case)
     rivals: tuple[str, ...] = ()
     if bump is None or bump.stretch.p_value > level:
+        bump = likeliest_oscillation(case)
+    if bump is None or bump.stretch.p_value > level:
         shape = chosen_shape(case, "resonance", level)
         if shape is None or not isinstance(shape.term, Bump | CommonBump):
             return None
@@ -177,7 +187,7 @@ def refitted_mode(case: Case, fold: int, mode: Mode) -> Mode:
 
 
 def _refitted(case: Case, fold: int, mode: Mode) -> Mode:
-    """The same centre and width, gains from the power over the flanks in blocks that a fold does not hold out.
+    """The same centre and width, gains from the power in blocks that a fold does not hold out.
 
     A broad mode has no flanks of its own: it is fitted to the whole spectrum.
     """
@@ -188,23 +198,27 @@ def _refitted(case: Case, fold: int, mode: Mode) -> Mode:
         return Mode(centre, width, term.local[0].sqrt().to(torch.complex128), False)
     keep = estimation_samples(case.n_samples, fold)
     block = run_length(keep)
-    blocks = case.recording[:, keep].unflatten(-1, (-1, block))
-    taper = torch.hann_window(block, dtype=torch.float64) * math.sqrt(8 / 3 / block)
-    transform = torch.fft.rfft((blocks - blocks.mean(-1, keepdim=True)) * taper).movedim(-1, 0)  # (bin, sensor, block)
+    blocks = whitened(without_lines(case.recording, simulated_lines(case.simulated)), case.base)[:, keep].unflatten(
+        -1, (-1, block)
+    )
+    transform = torch.fft.rfft(blocks * light_taper(block)).movedim(-1, 0)  # (bin, sensor, block)
     f = torch.arange(len(transform), dtype=torch.float64) / block
-    level = case.base.spectrum(f.clamp(min=1 / block)).mT.sqrt()
-    spectra = transform @ transform.mH / transform.shape[-1]
-    white = spectra / (level[:, :, None] * level[:, None, :])
-    reach = 3 * mode.width + 3 / block
-    apart = (f - mode.centre).abs()
-    usable = (f > 2.5 / block) & (f < 0.5 - 2 / block)
-    inside, beside = usable & (apart <= reach), usable & (apart > reach) & (apart <= 2.5 * reach)
-    if not bool(inside.any()) or not bool(beside.any()):
+    usable = (f > 2.5 / block) & (f < 0.5 - 2 / block) & ((f - mode.centre).abs() <= _REACH * (mode.width + 1 / block))
+    if int(usable.sum()) < _FEWEST_BINS:
         return mode
-    excess = (white[inside] - white[beside].mean(0)) * (level[inside][:, :, None] * level[inside][:, None, :])
-    share = mode.profile(f[inside], 1 / block).sum() - mode.profile(f[beside], 1 / block).mean() * int(inside.sum())
-    covariance = excess.sum(0) / share
+    f, transform = f[usable], transform[usable]
+    level = case.base.spectrum(f).mT.sqrt()
+    both = level[:, :, None] * level[:, None, :]
+    white = transform @ transform.mH / transform.shape[-1]
+    covariance = excess_along(mode.profile(f, 1 / block), white, both)
     if mode.shared:
         values, vectors = torch.linalg.eigh((covariance + covariance.mH) / 2)
         return replace(mode, gain=vectors[:, -1] * values[-1].clamp(min=0).sqrt())
     return replace(mode, gain=covariance.diagonal().real.clamp(min=0).sqrt().to(torch.complex128))
+
+
+def excess_along(profile: Tensor, white: Tensor, both: Tensor) -> Tensor:
+    """Least squares `C` of spectra `(bin, sensor, sensor)` as `L + C profile / both`, whatever the level `L`."""
+    template = profile[:, None, None] / both
+    weight = template - template.mean(0)
+    return (weight * white).sum(0) / (weight * template).sum(0)

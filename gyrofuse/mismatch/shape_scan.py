@@ -13,7 +13,7 @@ ratio by the law of F.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import torch
@@ -67,12 +67,14 @@ class Scan(NamedTuple):
         sensors: That have the likeliest.
         weight: Of the bands in it, `(band,)`; and whether it goes up.
         up: Whether powers are larger.
+        bump: Centre and half width, cycles per sample, if it is one.
     """
 
     log_ratio: float
     sensors: tuple[int, ...]
     weight: Tensor
     up: bool
+    bump: tuple[float, float] | None
 
     @property
     def p_value(self) -> float:
@@ -123,7 +125,10 @@ def scanned(case: Case) -> Scan | None:
     sensors = tuple(int(i) for i in (own > math.log(1 / _SHARES[share] - 1)).nonzero()[:, 0]) or (int(own.argmax()),)
     weight = looked_for.templates[shape, list(sensors)].square().mean(0)
     rises = float((up - down)[shape, list(sensors)].sum()) > 0
-    return Scan(float(log_ratios.flatten().logsumexp(0)) - math.log(len(_SHARES)), sensors, weight, rises)
+    bumps = list(_bump_places(case.n_samples))
+    place = shape % (len(looked_for.templates) // len(_SIZES)) - len(looked_for.templates) // len(_SIZES) + len(bumps)
+    mean = float(log_ratios.flatten().logsumexp(0)) - math.log(len(_SHARES))
+    return Scan(mean, sensors, weight, rises, bumps[place] if place >= 0 else None)
 
 
 def bump_start(data: Ratios, model: Tensor, starts: Iterable[tuple[float, float]], has: Tensor) -> Bump | None:
@@ -219,14 +224,18 @@ def _grown(relative: Tensor, worth: Tensor, size: float) -> Tensor:
     return torch.log1p(low.exp() * scaled)
 
 
-def _bumps(n_samples: int, places: Tensor, ground: Tensor) -> tuple[Tensor, Tensor]:
-    """Bumps `(shape, sensor, band)` at centres half a width apart, and their chances: widths have equal ones."""
-    shapes, chances = [], []
+def _bump_places(n_samples: int) -> Iterator[tuple[float, float]]:
+    """Centres half a width apart, and half widths."""
     for share in _WIDTHS:
         step = math.log1p(share)
-        n = int(math.log(0.49 * n_samples / _LOWEST) / step)
-        centre = 0.49 * torch.exp(-step * torch.arange(n, dtype=torch.float64))[:, None, None]
-        density = oscillation(places, centre, share * centre)
-        shapes.append((density[:, None] / ground).mean(-1))
-        chances.append(torch.full((n,), 1 / n / len(_WIDTHS), dtype=torch.float64))
-    return torch.cat(shapes), torch.cat(chances)
+        for k in range(int(math.log(0.49 * n_samples / _LOWEST) / step)):
+            centre = 0.49 * math.exp(-step * k)
+            yield centre, share * centre
+
+
+def _bumps(n_samples: int, places: Tensor, ground: Tensor) -> tuple[Tensor, Tensor]:
+    """Bumps `(shape, sensor, band)` and their chances: widths have equal ones."""
+    centre, width = torch.tensor(list(_bump_places(n_samples)), dtype=torch.float64).mT[:, :, None, None]
+    density = oscillation(places, centre, width)
+    _, kind, count = (width / centre).flatten().round(decimals=9).unique(return_inverse=True, return_counts=True)
+    return (density[:, None] / ground).mean(-1), 1 / count[kind].to(torch.float64) / len(_WIDTHS)

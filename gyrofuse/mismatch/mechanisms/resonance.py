@@ -47,7 +47,7 @@ class Resonance(Addition):
         )
 
     def density(self, f: Tensor) -> Tensor:
-        return self.mode.matrix() * self.mode.profile(f, float(f[1] - f[0]))[:, None, None]
+        return self.mode.matrix() * self.mode.profile(f, 2 * float(f[1] - f[0]))[:, None, None]
 
     def path(self, n_samples: int, generator: torch.Generator) -> Tensor:
         rows = 1 if self.mode.shared else len(self.mode.gain)
