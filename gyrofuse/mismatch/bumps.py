@@ -153,7 +153,7 @@ def strongest_bump(case: Case) -> Stretch:
         if not line and not _has_it(simulated, stretch, case, row, coherent=row >= len(scores) - len(together[2])):
             return stretch
         known[max(a - n, 0) : a + 2 * n] = True
-        over = torch.stack([known[int(s) : int(s + w)].any() for s, w in zip(starts, widths, strict=True)])
+        over = _sums(known[None].to(torch.float64), starts, widths)[0] > 0
         scores[:, over] = -math.inf
         if not bool(scores.isfinite().any()):
             break

@@ -58,11 +58,15 @@ def steadiness(case: Case, bump: Oscillation) -> Steadiness:
     ridge, steady = _scores(bins[None], gaussian)
     if max(float(ridge), float(steady)) > _FIRES:
         return Steadiness(tone=True, open=False, slow=float(ridge) > _FIRES)
-    would = []
+    seen = torch.stack([ridge, steady]).double()
+    would, log_ratios = [], []
     for tones in _tones(bump, smooth, floor, case.n_samples, generator):
-        a, b = _scores(tones, gaussian)
-        would.append(float(torch.maximum(a, b).median()))
-    return Steadiness(tone=False, open=min(would) < _WOULD_FIRE, slow=False)
+        made = torch.stack(_scores(tones, gaussian)).double()  # (score, record)
+        would.append(float(made.amax(0).median()))
+        middle, spread = made.mean(1, keepdim=True), made.std(1, keepdim=True).clamp(min=1.0)
+        log_ratios.append((seen.square() / 2 - ((seen - middle) / spread).square() / 2 - spread.log()).sum())
+    likelier = float(torch.stack(log_ratios).logsumexp(0)) > math.log(len(log_ratios))
+    return Steadiness(tone=likelier, open=likelier or min(would) < _WOULD_FIRE, slow=float(ridge) > float(steady))
 
 
 def _baseband(case: Case, bump: Oscillation, weights: Tensor) -> tuple[Tensor, float]:
