@@ -1,31 +1,21 @@
-"""Spectral shapes that a simulation lacks, against direct sums, theory and simulation."""
+"""Spectral shapes that a simulation lacks: fits and witnesses, against direct sums, theory and simulation."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from scipy import stats
-from torch import Tensor
+from shape_draws import BUMP, CHANGES, RATE, SIGNS, WHITE, N, P, array, case, drawn, generator, nominated, tensor
 
 import gyrofuse as gf
-from gyrofuse.mismatch.bumps import _coherent_scores, bump_witness, oscillation_of, strongest_bump
-from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.bumps import bump_witness
 from gyrofuse.mismatch.colour import filtered, noise, of_phase, quadrature
-from gyrofuse.mismatch.confirm import held_out_gain
 from gyrofuse.mismatch.filter_forms import FILTERS, filter_corner, filter_power, filter_response, filter_strength
-from gyrofuse.mismatch.mechanism import Finding, Mechanism
-from gyrofuse.mismatch.mechanisms.common_mode import CommonMode
-from gyrofuse.mismatch.mechanisms.drifting_tone import DriftingTone
-from gyrofuse.mismatch.mechanisms.flicker import FlickerNoise
-from gyrofuse.mismatch.mechanisms.low_pass import LowPassFilter
-from gyrofuse.mismatch.mechanisms.parameter_shift import ParameterShift, _numbers
-from gyrofuse.mismatch.mechanisms.resonance import Resonance
-from gyrofuse.mismatch.oscillating import Mode
+from gyrofuse.mismatch.mechanisms.parameter_shift import _numbers
 from gyrofuse.mismatch.pooled import common_witness
 from gyrofuse.mismatch.shape_fit import Ratios, data_model, fair_gain, fit, linearised, log_score
 from gyrofuse.mismatch.shape_law import equivalent, smooth_coherence
@@ -43,43 +33,6 @@ from gyrofuse.mismatch.shape_terms import (
 from gyrofuse.mismatch.shapes import compared, leading_shape
 from gyrofuse.mismatch.witnesses import coherence_witness, spectrum_witness
 from gyrofuse.simulate import ArrayModel
-
-N, P, RATE = 16384, 6, 100.0
-WHITE = 1e-4
-BUMP = Mode(0.12, 0.01, torch.ones(6, dtype=torch.complex128), False)
-SIGNS = torch.tensor([1.0, 1.0, -1.0, 0.5, 1.0, 1.0], dtype=torch.float64)
-CATALOGUE = (ParameterShift, LowPassFilter, Resonance, DriftingTone, FlickerNoise, CommonMode)
-
-
-def generator(seed: int) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
-
-
-def case(recording: Tensor, simulation: Tensor) -> Case:
-    return Case.of(Scene(RATE, "deg/s", tuple(map(str, range(recording.shape[-2])))), recording, simulation)
-
-
-def array(white: float = WHITE, phi: float = 0.99) -> ArrayModel:
-    sensor = [gf.WhiteNoise(white * (1 + i / 20)) + gf.AR1(phi, 2e-7) + gf.RandomWalk(1e-9) for i in range(P)]
-    return ArrayModel.from_sensors(sensor)
-
-
-def tensor(*values: float) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
-
-
-def drawn(seed: int, change: Callable[[Tensor, torch.Generator], Tensor] | None = None, n: int = N) -> Case:
-    g = generator(seed)
-    recording, simulation = array().simulate(n, generator=g), array().simulate(n, batch=(4,), generator=g)
-    return case(recording if change is None else change(recording, g), simulation)
-
-
-def nominated(given: Case, level: float = 1e-3) -> Finding | None:
-    found = [f for f in (m.nominate(given, level) for m in CATALOGUE) if f is not None]
-    return max(found, key=lambda f: f.gain, default=None)
-
-
-# Kernels ----------------------------------------------------------------------------------------------------------
 
 
 def test_a_power_gains_under_whittle_what_the_law_of_f_gives_it():
@@ -299,9 +252,6 @@ def test_noise_of_a_density_and_its_quadrature():
     assert ahead[100:-100].mean().imag == pytest.approx(1.0, abs=1e-9)
 
 
-# Witnesses --------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("witness", [shape_witness, bump_witness, common_witness])
 def test_witnesses_of_shapes_are_honest(witness):
     n_runs = 40
@@ -318,35 +268,6 @@ def test_witnesses_of_shapes_are_honest_with_common_noise_in_both():
         given = case(one + source[0], (other + source[1])[None])
         p += [min(w(given).p_value for w in (shape_witness, bump_witness, common_witness, coherence_witness))]
     assert sum(x < 0.05 for x in p) <= stats.binom.isf(1e-3, n_runs, 0.2)
-
-
-@pytest.mark.parametrize("d", [20, 60])
-def test_correlations_of_independent_sensors_have_the_law_of_a_product_of_beta_variables(d: int):
-    n_runs = 4000
-    parts = torch.randn(2, n_runs, P, d, generator=generator(31), dtype=torch.float64)
-    z = torch.complex(parts[0], parts[1])
-    scores = _coherent_scores(z @ z.mH, float(d))
-    for level in (0.05, 0.005):
-        count = (scores > float(stats.norm.isf(level))).sum(-1).tolist()
-        low, high = stats.binom.ppf(1e-3, n_runs, 0.85 * level), stats.binom.isf(1e-3, n_runs, 1.15 * level)
-        assert all(low <= c <= high for c in count)
-
-
-def test_white_noise_of_which_sensors_share_a_part_is_named_though_no_power_changes():
-    g, share = generator(32), 0.06
-    own, simulation = array((1 - share) * WHITE).simulate(N, generator=g), array().simulate(N, batch=(1,), generator=g)
-    gain = (share * WHITE * torch.tensor([1 + i / 20 for i in range(P)], dtype=torch.float64)).sqrt()
-    given = case(own + gain[:, None] * torch.randn(1, N, generator=g, dtype=torch.float64), simulation)
-    found = CommonMode.nominate(given, 1e-4)
-    assert found is not None
-    assert isinstance(found.effect, CommonMode)
-    assert found.effect.inside
-    for i in found.sensors:
-        entry = found.parameters[f"gain[{i}]"]
-        assert abs(entry.value - float(gain[i])) < 2.1 * (entry.high - entry.low) / 2
-    explained = found.effect.explained(given, g)
-    assert shape_witness(explained).p_value > 1e-4
-    assert common_witness(explained).p_value > 1e-4
 
 
 def test_small_changes_of_all_bands_are_seen_where_single_bands_say_nothing():
@@ -377,169 +298,6 @@ def test_a_short_simulation_has_little_to_say():
     assert nominated(given) is None
 
 
-def oscillating(g: torch.Generator, centre: float, width: float, rows: int, n: int = N) -> Tensor:
-    return noise(n, lambda f: oscillation(f, tensor(centre)[0], tensor(width)[0]), rows, g)
-
-
-def test_a_line_is_no_bump_and_a_bump_of_both_sides_neither():
-    t = torch.arange(N, dtype=torch.float64)
-    line = drawn(9, lambda x, g: x + 0.002 * torch.cos(2 * math.pi * 0.1234 * t))
-    assert strongest_bump(line).p_value > 1e-3
-    g = generator(10)
-    both = [array().simulate(N, generator=g) + 0.005 * oscillating(g, 0.1, 0.002, P) for _ in range(3)]
-    assert strongest_bump(case(both[0], torch.stack(both[1:]))).p_value > 1e-3
-
-
-# Mechanisms -------------------------------------------------------------------------------------------------------
-
-
-def wandering(g: torch.Generator, n: int = N) -> Tensor:
-    speed = noise(n, lambda f: 1 / (1e-8 + f.square()), 1, g)[0]
-    return torch.cos(2 * math.pi * (0.1 + 0.002 * speed / speed.std()).cumsum(0))
-
-
-CHANGES: dict[str, tuple[str, Callable[[Tensor, torch.Generator], Tensor], dict[str, float]]] = {
-    "levels": ("parameter_shift", lambda x, g: 1.1 * x, {"white_factor[2]": 1.1**2}),
-    "filter": (
-        "low_pass",
-        lambda x, g: filtered(
-            x, lambda f: filter_response("bilinear2", filter_strength("bilinear2", tensor(*(P * [0.3]))), f)
-        ),
-        {"corner[1]": 30.0},
-    ),
-    "own modes": (
-        "resonance",
-        lambda x, g: x + 0.004 * oscillating(g, 0.1, 0.01, P),
-        {"frequency": 10.0, "width": 2.0, "rms[3]": 0.004},
-    ),
-    "one mode": (
-        "resonance",
-        lambda x, g: x + 0.004 * oscillating(g, 0.1, 0.002, 1) * SIGNS[:, None],
-        {"frequency": 10.0, "width": 0.4, "rms[3]": 0.002},
-    ),
-    "tone": ("drifting_tone", lambda x, g: x + 0.004 * wandering(g) * SIGNS[:, None], {"amplitude[0]": 0.004}),
-    "flicker": ("flicker", lambda x, g: x + 1e-3 * noise(N, torch.reciprocal, P, g), {"level[4]": 2**0.5 * 1e-3}),
-    "white in common": (
-        "common_mode",
-        lambda x, g: x + 0.004 * torch.randn(1, N, generator=g, dtype=torch.float64) * SIGNS[:, None],
-        {"gain[0]": 0.004, "gain[3]": 0.002},
-    ),
-    "a walk in common": (
-        "common_mode",
-        lambda x, g: x + 3e-4 * torch.randn(1, N, generator=g, dtype=torch.float64).cumsum(-1) * SIGNS[:, None],
-        {"gain[0]": 3e-4, "gain[3]": 1.5e-4},
-    ),
-}
-
-
-@pytest.mark.parametrize("name", CHANGES)
-def test_what_is_missing_is_named_measured_and_explained(name: str):
-    mechanism, change, truth = CHANGES[name]
-    given = drawn(sum(map(ord, name)), change)
-    found = nominated(given)
-    assert found is not None
-    assert found.mechanism == mechanism
-    assert set(found.alternatives) <= {"drifting_tone", "resonance", "random_telegraph"}
-    assert found.sensors == tuple(range(P))
-    assert found.p_value < 1e-6
-    for key, value in truth.items():
-        entry = found.parameters[key]
-        assert entry.low < entry.value < entry.high
-        # Four standard deviations; one estimate is no test of coverage.
-        assert abs(entry.value - value) < 2.1 * (entry.high - entry.low) / 2, key
-    assert held_out_gain(given, found.effect).confirms(found.p_value)
-    explained = found.effect.explained(given, generator(1))
-    assert shape_witness(explained).p_value > 1e-4
-    assert nominated(explained) is None
-
-
-def test_modes_of_single_sensors_that_bands_are_too_wide_for():
-    # Half as wide as a quarter of an octave, and too weak for a stretch of bins among all of them.
-    mode = Mode(0.2, 0.2 / 2 / 15, tensor(*(P * [1.0])).to(torch.complex128), False)
-    has = tensor(1, 0, 0, 1, 0, 1)
-    named, inside = 0, []
-    for seed in range(6):
-        given = drawn(700 + seed, lambda x, g: x + 3.6e-3 * has[:, None] * noise(N, mode.profile, P, g))
-        found = Resonance.nominate(given, 1e-3)
-        if found is None:
-            continue
-        named += 1
-        f, q = found.parameters["frequency"], found.parameters["quality_factor"]
-        inside += [f.low <= 0.2 * RATE <= f.high, q.low <= 15 <= q.high]
-        again = found.effect.refitted(given, 0)
-        assert isinstance(again, Resonance)
-        assert isinstance(found.effect, Resonance)
-        assert ((again.mode.gain != 0) <= (found.effect.mode.gain != 0)).all()
-    assert named >= 4
-    assert sum(inside) >= stats.binom.ppf(1e-3, len(inside), 0.95)
-
-
-def test_a_filter_and_what_it_acts_on_are_found_one_after_the_other():
-    def change(x: Tensor, g: torch.Generator) -> Tensor:
-        q = filter_strength("bilinear2", tensor(*(P * [0.3])))
-        return filtered(x + 0.004 * wandering(g) * SIGNS[:, None], lambda f: filter_response("bilinear2", q, f))
-
-    given, names = drawn(12, change), []
-    while (found := nominated(given)) is not None:
-        names.append(found.mechanism)
-        given = found.effect.explained(given, generator(2))
-        assert len(names) < 4
-    assert names == ["drifting_tone", "low_pass"]
-
-
-def effects() -> dict[str, Mechanism]:
-    given = drawn(13)
-    gain = torch.polar(SIGNS.abs() * 0.01, tensor(0.0, 0.5, 3.0, 1.0, 2.0, -1.0))
-    factors = torch.zeros(4, P, dtype=torch.float64)
-    factors[0], factors[1], factors[3] = 0.4, -0.5, 0.7
-    return {
-        "parameter_shift": ParameterShift(given.base, factors),
-        "low_pass": LowPassFilter("pole", tensor(0.1, 0.2, 0.3, 0.2, 0.1, 0.0)),
-        "resonance": Resonance(Mode(0.1, 0.01, gain, shared=False)),
-        "resonance of all": Resonance(Mode(0.1, 0.01, gain, shared=True)),
-        "drifting_tone": DriftingTone(Mode(0.1, 0.02, 0.3 * gain, shared=True), slow=False),
-        "flicker": FlickerNoise(1e-6 * SIGNS.square()),
-        "white in common": CommonMode("white", 0.0, gain, given.base, inside=False),
-        "AR1 in common": CommonMode("ar1", 0.01, gain, given.base, inside=False),
-        "walk in common": CommonMode("walk", 0.0, gain / 100, given.base, inside=False),
-        "white of both": CommonMode("white", 0.0, gain / 2, given.base, inside=True),
-    }
-
-
-@pytest.mark.parametrize("name", list(effects()))
-def test_signals_have_the_spectra_that_a_mechanism_promises(name: str):
-    effect, given = effects()[name], drawn(14)
-    n_records = 6
-    plain = array().simulate(N, batch=(n_records,), generator=generator(15))
-    built = effect.simulated(plain, given.scene, generator(16))
-    assert built.shape == plain.shape
-    before, after = case(given.recording, plain), case(given.recording, built)
-    places = given.bands.places
-    matrices = torch.diag_embed(before.base.spectrum(places).mT).to(torch.complex128)
-    promised = effect.spectra(matrices, places).movedim(0, -1)
-    expected = given.bands.mean_of(promised).movedim(-1, 0)
-    high = given.bands.dof > 40
-    level = expected.diagonal(dim1=-2, dim2=-1).real.sqrt()
-    error = (after.simulated.spectra - expected).abs() / (level[:, :, None] * level[:, None, :])
-    spread = (n_records * given.bands.dof).rsqrt()
-    # A source of one path is common: its errors in several sensors are one error.
-    assert float((error.amax((-1, -2)) / spread)[high].median()) < 4.0
-    assert float((error.amax((-1, -2)) / spread)[high].max()) < 12.0
-
-
-@pytest.mark.parametrize("name", ["levels", "filter", "own modes", "one mode", "flicker", "white in common"])
-def test_numbers_without_a_fold_are_near_those_of_all(name: str):
-    _, change, _ = CHANGES[name]
-    given = drawn(17, change)
-    found = nominated(given)
-    assert found is not None
-    part = found.effect.refitted(given, 0)
-    f = torch.linspace(0.02, 0.45, 40, dtype=torch.float64)
-    matrices = torch.diag_embed(given.base.spectrum(f).mT).to(torch.complex128)
-    one, other = (e.spectra(matrices, f).diagonal(dim1=-2, dim2=-1).real for e in (found.effect, part))
-    assert float((one / other).log().abs().mean()) < 0.1
-
-
 def test_fits_of_nothing_gain_what_chance_gives():
     gains = []
     for s in range(12):
@@ -547,22 +305,6 @@ def test_fits_of_nothing_gain_what_chance_gives():
         gains.append(2 * fit(data, [LowPass.starts(data.ground, "pole")[0]]).gain)
     # Half the sensors' estimates would be negative: at most chi-square with as many numbers.
     assert float(np.mean(gains)) < P + 4 * math.sqrt(2 * P / 12)
-
-
-def test_nothing_is_named_where_nothing_is_missing():
-    named = [f.mechanism for s in range(3) if (f := nominated(drawn(500 + s))) is not None]
-    assert named == []
-
-
-def test_coherent_or_not_is_told_of_a_bump():
-    alone = oscillation_of(drawn(18, CHANGES["own modes"][1]))
-    together = oscillation_of(drawn(19, CHANGES["one mode"][1]))
-    assert alone is not None
-    assert together is not None
-    assert alone.gain is None
-    assert together.gain is not None
-    turned = together.gain * together.gain[0].conj()
-    assert (turned.real.sign() == SIGNS.sign()).all()
 
 
 def test_shapes_are_searched_once_for_a_case():

@@ -1,0 +1,115 @@
+"""Bumps of the spectrum: what is one, how it is fitted, and whether it is a tone."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from scipy import stats
+from shape_draws import CHANGES, RATE, SIGNS, N, P, array, case, drawn, generator, oscillating, tensor
+
+from gyrofuse.mismatch.bumps import _coherent_scores, _normal_of_rises, oscillation_of, strongest_bump
+from gyrofuse.mismatch.colour import noise
+from gyrofuse.mismatch.lines import whitened
+from gyrofuse.mismatch.mechanisms.resonance import Resonance
+from gyrofuse.mismatch.oscillating import Mode, excess_along
+from gyrofuse.mismatch.shape_terms import oscillation
+from gyrofuse.mismatch.steadiness import steadiness
+
+
+@pytest.mark.parametrize("d", [20, 60])
+def test_correlations_of_independent_sensors_have_the_law_of_a_product_of_beta_variables(d: int):
+    n_runs = 4000
+    parts = torch.randn(2, n_runs, P, d, generator=generator(31), dtype=torch.float64)
+    z = torch.complex(parts[0], parts[1])
+    scores = _coherent_scores(z @ z.mH, float(d))
+    for level in (0.05, 0.005):
+        count = (scores > float(stats.norm.isf(level))).sum(-1).tolist()
+        low, high = stats.binom.ppf(1e-3, n_runs, 0.85 * level), stats.binom.isf(1e-3, n_runs, 1.15 * level)
+        assert all(low <= c <= high for c in count)
+
+
+def test_a_line_is_no_bump_and_a_bump_of_both_sides_neither():
+    t = torch.arange(N, dtype=torch.float64)
+    line = drawn(9, lambda x, g: x + 0.002 * torch.cos(2 * math.pi * 0.1234 * t))
+    assert strongest_bump(line).p_value > 1e-3
+    g = generator(10)
+    both = [array().simulate(N, generator=g) + 0.005 * oscillating(g, 0.1, 0.002, P) for _ in range(3)]
+    assert strongest_bump(case(both[0], torch.stack(both[1:]))).p_value > 1e-3
+
+
+def test_modes_of_single_sensors_that_bands_are_too_wide_for():
+    # Half as wide as a quarter of an octave, and too weak for a stretch of bins among all of them.
+    mode = Mode(0.2, 0.2 / 2 / 15, tensor(*(P * [1.0])).to(torch.complex128), False)
+    has = tensor(1, 0, 0, 1, 0, 1)
+    named, inside = 0, []
+    for seed in range(6):
+        given = drawn(700 + seed, lambda x, g: x + 3.6e-3 * has[:, None] * noise(N, mode.profile, P, g))
+        found = Resonance.nominate(given, 1e-3)
+        if found is None:
+            continue
+        named += 1
+        f, q = found.parameters["frequency"], found.parameters["quality_factor"]
+        inside += [f.low <= 0.2 * RATE <= f.high, q.low <= 15 <= q.high]
+        again = found.effect.refitted(given, 0)
+        assert isinstance(again, Resonance)
+        assert isinstance(found.effect, Resonance)
+        assert ((again.mode.gain != 0) <= (found.effect.mode.gain != 0)).all()
+    assert named >= 4
+    assert sum(inside) >= stats.binom.ppf(1e-3, len(inside), 0.95)
+
+
+def test_coherent_or_not_is_told_of_a_bump():
+    alone = oscillation_of(drawn(18, CHANGES["own modes"][1]))
+    together = oscillation_of(drawn(19, CHANGES["one mode"][1]))
+    assert alone is not None
+    assert together is not None
+    assert alone.gain is None
+    assert together.gain is not None
+    turned = together.gain * together.gain[0].conj()
+    assert (turned.real.sign() == SIGNS.sign()).all()
+
+
+def test_sums_of_what_rises_have_their_law():
+    z = torch.randn(40_000, P, generator=generator(40), dtype=torch.float64)
+    scores = _normal_of_rises(z.clamp(min=0).square().sum(-1), P)
+    for level in (0.2, 0.01):
+        count = int((scores > stats.norm.isf(level)).sum())
+        assert stats.binom.ppf(1e-3, len(z), level) <= count <= stats.binom.isf(1e-3, len(z), level)
+
+
+def test_a_mode_of_some_sensors_is_seen_that_a_taper_would_hide():
+    # Some 15 nats in each of three sensors; half of them are left under a Hann taper.
+    mode, n_runs, seen = Mode(0.3, 0.01, torch.ones(P, dtype=torch.complex128), False), 10, 0
+    has = tensor(1, 0, 0, 1, 0, 1)
+    for seed in range(n_runs):
+        given = drawn(720 + seed, lambda x, g: x + 2.4e-3 * has[:, None] * noise(N, mode.profile, P, g))
+        seen += strongest_bump(given).p_value < 1e-3
+    assert seen >= stats.binom.ppf(1e-3, n_runs, 0.9)
+
+
+def test_gains_of_a_mode_are_told_whatever_the_level_of_the_noise():
+    g = generator(41)
+    profile = oscillation(torch.linspace(0.1, 0.2, 50, dtype=torch.float64), *tensor(0.15, 0.01))
+    root = torch.complex(*torch.randn(2, 3, 3, generator=g, dtype=torch.float64))
+    both = (1 + torch.rand(50, 1, 1, generator=g, dtype=torch.float64)).expand(-1, 3, 3)
+    wanted, level = root @ root.mH, torch.eye(3, dtype=torch.complex128) * 1.3
+    found = excess_along(profile, level + wanted * profile[:, None, None] / both, both)
+    torch.testing.assert_close(found, wanted)
+
+
+@pytest.mark.parametrize(("name", "tone"), [("tone", True), ("one mode", False)])
+def test_a_source_that_all_share_is_a_tone_or_is_not(name: str, tone: bool):
+    n_runs, told = 8, 0
+    for seed in range(n_runs):
+        bump = oscillation_of(given := drawn(740 + seed, CHANGES[name][1]))
+        told += bump is not None and steadiness(given, bump).tone == tone
+    assert told >= stats.binom.ppf(1e-3, n_runs, 0.95)
+
+
+def test_whitened_walks_do_not_jump_where_they_end():
+    g = generator(42)
+    walk = torch.randn(P, N, generator=g, dtype=torch.float64).cumsum(-1)
+    white = whitened(walk, case(walk, torch.randn(4, P, N, generator=g, dtype=torch.float64).cumsum(-1)).base)
+    assert float(white[:, [0, -1]].abs().max()) < 5 * float(white.std())

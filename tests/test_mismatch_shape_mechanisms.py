@@ -1,0 +1,144 @@
+"""Mechanisms that are shapes of the spectrum: named, measured, explained, simulated."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from shape_draws import (
+    CHANGES,
+    SIGNS,
+    WHITE,
+    N,
+    P,
+    array,
+    case,
+    drawn,
+    generator,
+    nominated,
+    tensor,
+    wandering,
+)
+from torch import Tensor
+
+from gyrofuse.mismatch.colour import filtered
+from gyrofuse.mismatch.confirm import held_out_gain
+from gyrofuse.mismatch.filter_forms import filter_response, filter_strength
+from gyrofuse.mismatch.mechanism import Mechanism
+from gyrofuse.mismatch.mechanisms.common_mode import CommonMode
+from gyrofuse.mismatch.mechanisms.drifting_tone import DriftingTone
+from gyrofuse.mismatch.mechanisms.flicker import FlickerNoise
+from gyrofuse.mismatch.mechanisms.low_pass import LowPassFilter
+from gyrofuse.mismatch.mechanisms.parameter_shift import ParameterShift
+from gyrofuse.mismatch.mechanisms.resonance import Resonance
+from gyrofuse.mismatch.oscillating import Mode
+from gyrofuse.mismatch.pooled import common_witness
+from gyrofuse.mismatch.shape_scan import shape_witness
+
+
+def test_white_noise_of_which_sensors_share_a_part_is_named_though_no_power_changes():
+    g, share = generator(32), 0.06
+    own, simulation = array((1 - share) * WHITE).simulate(N, generator=g), array().simulate(N, batch=(1,), generator=g)
+    gain = (share * WHITE * torch.tensor([1 + i / 20 for i in range(P)], dtype=torch.float64)).sqrt()
+    given = case(own + gain[:, None] * torch.randn(1, N, generator=g, dtype=torch.float64), simulation)
+    found = CommonMode.nominate(given, 1e-4)
+    assert found is not None
+    assert isinstance(found.effect, CommonMode)
+    assert found.effect.inside
+    for i in found.sensors:
+        entry = found.parameters[f"gain[{i}]"]
+        assert abs(entry.value - float(gain[i])) < 2.1 * (entry.high - entry.low) / 2
+    explained = found.effect.explained(given, g)
+    assert shape_witness(explained).p_value > 1e-4
+    assert common_witness(explained).p_value > 1e-4
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_what_is_missing_is_named_measured_and_explained(name: str):
+    mechanism, change, truth = CHANGES[name]
+    given = drawn(sum(map(ord, name)), change)
+    found = nominated(given)
+    assert found is not None
+    assert found.mechanism == mechanism
+    assert set(found.alternatives) <= {"drifting_tone", "resonance", "random_telegraph"}
+    assert found.sensors == tuple(range(P))
+    assert found.p_value < 1e-6
+    for key, value in truth.items():
+        entry = found.parameters[key]
+        assert entry.low < entry.value < entry.high
+        # Four standard deviations; one estimate is no test of coverage.
+        assert abs(entry.value - value) < 2.1 * (entry.high - entry.low) / 2, key
+    assert held_out_gain(given, found.effect).confirms(found.p_value)
+    explained = found.effect.explained(given, generator(1))
+    assert shape_witness(explained).p_value > 1e-4
+    assert nominated(explained) is None
+
+
+def test_a_filter_and_what_it_acts_on_are_found_one_after_the_other():
+    def change(x: Tensor, g: torch.Generator) -> Tensor:
+        q = filter_strength("bilinear2", tensor(*(P * [0.3])))
+        return filtered(x + 0.004 * wandering(g) * SIGNS[:, None], lambda f: filter_response("bilinear2", q, f))
+
+    given, names = drawn(12, change), []
+    while (found := nominated(given)) is not None:
+        names.append(found.mechanism)
+        given = found.effect.explained(given, generator(2))
+        assert len(names) < 4
+    assert names == ["drifting_tone", "low_pass"]
+
+
+def effects() -> dict[str, Mechanism]:
+    given = drawn(13)
+    gain = torch.polar(SIGNS.abs() * 0.01, tensor(0.0, 0.5, 3.0, 1.0, 2.0, -1.0))
+    factors = torch.zeros(4, P, dtype=torch.float64)
+    factors[0], factors[1], factors[3] = 0.4, -0.5, 0.7
+    return {
+        "parameter_shift": ParameterShift(given.base, factors),
+        "low_pass": LowPassFilter("pole", tensor(0.1, 0.2, 0.3, 0.2, 0.1, 0.0)),
+        "resonance": Resonance(Mode(0.1, 0.01, gain, shared=False)),
+        "resonance of all": Resonance(Mode(0.1, 0.01, gain, shared=True)),
+        "drifting_tone": DriftingTone(Mode(0.1, 0.02, 0.3 * gain, shared=True), slow=False),
+        "flicker": FlickerNoise(1e-6 * SIGNS.square()),
+        "white in common": CommonMode("white", 0.0, gain, given.base, inside=False),
+        "AR1 in common": CommonMode("ar1", 0.01, gain, given.base, inside=False),
+        "walk in common": CommonMode("walk", 0.0, gain / 100, given.base, inside=False),
+        "white of both": CommonMode("white", 0.0, gain / 2, given.base, inside=True),
+    }
+
+
+@pytest.mark.parametrize("name", list(effects()))
+def test_signals_have_the_spectra_that_a_mechanism_promises(name: str):
+    effect, given = effects()[name], drawn(14)
+    n_records = 6
+    plain = array().simulate(N, batch=(n_records,), generator=generator(15))
+    built = effect.simulated(plain, given.scene, generator(16))
+    assert built.shape == plain.shape
+    before, after = case(given.recording, plain), case(given.recording, built)
+    places = given.bands.places
+    matrices = torch.diag_embed(before.base.spectrum(places).mT).to(torch.complex128)
+    promised = effect.spectra(matrices, places).movedim(0, -1)
+    expected = given.bands.mean_of(promised).movedim(-1, 0)
+    high = given.bands.dof > 40
+    level = expected.diagonal(dim1=-2, dim2=-1).real.sqrt()
+    error = (after.simulated.spectra - expected).abs() / (level[:, :, None] * level[:, None, :])
+    spread = (n_records * given.bands.dof).rsqrt()
+    # A source of one path is common: its errors in several sensors are one error.
+    assert float((error.amax((-1, -2)) / spread)[high].median()) < 4.0
+    assert float((error.amax((-1, -2)) / spread)[high].max()) < 12.0
+
+
+@pytest.mark.parametrize("name", ["levels", "filter", "own modes", "one mode", "flicker", "white in common"])
+def test_numbers_without_a_fold_are_near_those_of_all(name: str):
+    _, change, _ = CHANGES[name]
+    given = drawn(17, change)
+    found = nominated(given)
+    assert found is not None
+    part = found.effect.refitted(given, 0)
+    f = torch.linspace(0.02, 0.45, 40, dtype=torch.float64)
+    matrices = torch.diag_embed(given.base.spectrum(f).mT).to(torch.complex128)
+    one, other = (e.spectra(matrices, f).diagonal(dim1=-2, dim2=-1).real for e in (found.effect, part))
+    assert float((one / other).log().abs().mean()) < 0.1
+
+
+def test_nothing_is_named_where_nothing_is_missing():
+    named = [f.mechanism for s in range(3) if (f := nominated(drawn(500 + s))) is not None]
+    assert named == []
