@@ -9,7 +9,8 @@ import torch
 from scipy import stats
 from shape_draws import CHANGES, RATE, SIGNS, N, P, array, case, drawn, generator, oscillating, tensor
 
-from gyrofuse.mismatch.bumps import _coherent_scores, _normal_of_rises, oscillation_of, strongest_bump
+from gyrofuse.mismatch.bump_fit import oscillation_of
+from gyrofuse.mismatch.bumps import _coherent_scores, _normal_of_rises, strongest_bump
 from gyrofuse.mismatch.colour import noise
 from gyrofuse.mismatch.lines import whitened
 from gyrofuse.mismatch.mechanisms.resonance import Resonance

@@ -11,7 +11,8 @@ from scipy import stats
 
 import gyrofuse as gf
 from gyrofuse.mismatch import diagnose
-from gyrofuse.mismatch.bumps import Oscillation, Stretch
+from gyrofuse.mismatch.bump_fit import Oscillation
+from gyrofuse.mismatch.bumps import Stretch
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.confirm import held_out_gain
 from gyrofuse.mismatch.counterfactual import Link, settled

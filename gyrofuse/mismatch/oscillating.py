@@ -9,13 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.bumps import (
-    Oscillation,
-    Stretch,
-    light_taper,
-    likeliest_oscillation,
-    oscillation_of,
-)
+from gyrofuse.mismatch.bump_fit import Oscillation, likeliest_oscillation, oscillation_of
+from gyrofuse.mismatch.bumps import Stretch, light_taper
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.folds import estimation_samples
 from gyrofuse.mismatch.lines import simulated_lines, whitened, without_lines

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -11,42 +11,34 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from gyrofuse.mismatch.bumps import oscillation_of
+from gyrofuse.mismatch.bump_fit import oscillation_of
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import corrected
-from gyrofuse.mismatch.filter_forms import FILTERS
 from gyrofuse.mismatch.folds import estimation_samples
 from gyrofuse.mismatch.pooled import common_source
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.shape_bands import N_SLOW, Groups, deep, deep_base, in_blocks, narrow_bands, slow_fold
+from gyrofuse.mismatch.shape_choice import QUICK, best_shapes, candidates, convincing, cost_of
 from gyrofuse.mismatch.shape_fit import Fit, Ratios, data_model, fair_gain, fit, log_score, ratios
 from gyrofuse.mismatch.shape_scan import bump_start, scanned
 from gyrofuse.mismatch.shape_terms import Bump, Common, CommonBump, Flicker, LowPass, Shift, Term
 from gyrofuse.mismatch.side import Side
 from gyrofuse.mismatch.witnesses import level_of
 
-_MOST = 4  # shapes at once
 _RIVAL = 5.0  # nats
 _ALIKE = 2.0  # nats between forms of a filter that are both likely
-_QUICK, _FAR, _KEPT = 6, 20.0, 3  # rounds of a first look; nats behind that are not made up; shapes looked at closely
+_FAR = 20.0  # nats behind after a first look that are not made up
 _DOUBT = 1e-3  # p value of what is left by shapes that may be named
-_SMALL = 0.1  # share of what there was to explain that may be left all the same
 _PLACES = 16.0  # shapes and places that compete
-_NEW = 8.0  # nats that a shape costs beside its numbers
-_NUMBER = 2.0  # nats for a number of a sensor: those of sensors that have it are alike
-_TOUCH = 0.1
 _ORDER = {"scale": 0, "add": 1, "filter": 2}  # a filter acts on what was added, levels are those of the noise alone
 _PLAIN = 25.0  # nats
 _ALONE = 8.0  # nats that a shape has to bring by itself
 _PER_OCTAVE = 4
 _CLEAN = 8  # bins
 _BROAD = 3.0  # half widths
-_FORMS = 3  # of filters
-_WIDTHS = (0.06, 0.15, 0.35)  # half width of a bump over its centre
 _SHARP, _NARROW = 0.1, (0.02, 0.04, 0.08)  # the same, below which bands are too wide for it, and of it there
 _FINE, _NARROWEST = 24, 0.005  # bands in an octave for those, and the least that they show
 _OFF = 0.25  # logarithm by which a centre from wide bands may be off
-_CORNER_BINS = (4.0, 0.3)  # corners of common AR1s to start from: bins, cycles per sample
 
 
 Form = tuple[LowPass, tuple[Tensor, Tensor]]
@@ -166,8 +158,8 @@ def _searched(case: Case) -> Shape | None:
         return None
     scan = scanned(case)
     p_seen = 1.0 if scan is None else scan.p_value
-    data, chosen = _chosen(data, differ=p_seen < _DOUBT)
-    if chosen is None or not _convincing(data, chosen):
+    data, chosen = best_shapes(data, differ=p_seen < _DOUBT)
+    if chosen is None or not convincing(data, chosen):
         return None
     seen = [_told(case, chosen, i) for i in range(len(chosen.terms))]
     nothing = float(log_score(data, data.expected).sum())
@@ -186,7 +178,7 @@ def _searched(case: Case) -> Shape | None:
         p = min(p, p_seen)
     rivals = {
         rival.name
-        for rival in _candidates(data, others)
+        for rival in candidates(data, others)
         if rival.name != term.name and _as_good(data, [*others, rival], chosen, whole)
     }
     if _like_switching(term):
@@ -200,7 +192,7 @@ def _searched(case: Case) -> Shape | None:
         told,
         tuple(others),
         sd,
-        gain - _cost(data, term),
+        gain - cost_of(data, term),
         p,
         tuple(sorted(rivals)),
         float(frequency[score.argmax()]),
@@ -234,7 +226,7 @@ def _as_good(data: Ratios, terms: list[Term], chosen: Fit, gain: float) -> bool:
 
     Those that are far from it after a few rounds are not followed.
     """
-    quick = fit(data, terms, _QUICK)
+    quick = fit(data, terms, QUICK)
     least = gain - _RIVAL - max(chosen.n_free - quick.n_free, 0)
     near = quick.gain > chosen.gain - _FAR or fair_gain(data, quick.model) > least + _RIVAL - _FAR
     return near and _fairly(data, quick.terms) > least
@@ -256,140 +248,6 @@ def _freedom(data: Ratios, term: Term) -> int:
     return term.local.numel() + 2 * len(term.shared)
 
 
-def _chosen(data: Ratios, *, differ: bool) -> tuple[Ratios, Fit | None]:
-    """Shapes added one at a time while BIC falls, then taken away while it falls; one at least of what does differ."""
-    best: Fit | None = None
-    value = -math.inf if differ else 0.0
-    for _ in range(_MOST):
-        now = list(best.terms) if best else []
-        quick = [fit(data, [*now, c], _QUICK) for c in _candidates(data, now)]
-        kept = {*sorted(quick, key=lambda f: -f.gain)[:_KEPT], *sorted(quick, key=lambda f: -_value(data, f))[:_KEPT]}
-        tried = [_varied(data, _pruned(data, fit(data, f.terms))) for f in kept]
-        top = max(tried, key=lambda f: _value(data, f), default=None)
-        if top is None or _value(data, top) <= value:
-            break
-        data = data.centred(top.model.diagonal(dim1=-2, dim2=-1).real)
-        best = fit(data, top.terms)
-        value = max(_value(data, best), 0.0)
-    while best is not None and len(best.terms) > 1:
-        fewer = [[_freed(data, t) for t in best.terms if t is not gone] for gone in best.terms]
-        top = max((_pruned(data, fit(data, terms)) for terms in fewer), key=lambda f: _value(data, f))
-        if _value(data, top) <= value:
-            break
-        best, value = top, _value(data, top)
-    return data, best
-
-
-def _value(data: Ratios, found: Fit) -> float:
-    """Log likelihood less what shapes and their numbers cost."""
-    return found.gain - sum(_cost(data, t) + _NEW for t in found.terms)
-
-
-def _cost(data: Ratios, term: Term) -> float:
-    """Of a shape's numbers, nats; a common source's phase is no number."""
-    own = int(term.free.sum()) - (isinstance(term, Common) and term.turned)
-    return _NUMBER * own + data.penalty * len(term.shared)
-
-
-def _freed(data: Ratios, term: Term) -> Term:
-    """With numbers for every sensor again: what another shape took over may be its own."""
-    if isinstance(term, Common):
-        return term
-    if isinstance(term, Shift):
-        return replace(term, free=Shift.start(data.ground).free & term.parts[:, None])
-    least = term.local.amax(-1, keepdim=True) * _TOUCH
-    return replace(term, free=torch.ones_like(term.free), local=torch.where(term.free, term.local, least))
-
-
-def _pruned(data: Ratios, found: Fit) -> Fit:
-    """Without numbers of single sensors that do not differ from none, as far as it pays."""
-    best = found
-    for threshold in (1.0, 2.0, _least_t(data.n_sensors)):
-        terms: list[Term] = []
-        changed = False
-        for i, term in enumerate(found.terms):
-            if isinstance(term, Common):
-                terms.append(term)
-                continue
-            t = torch.where(term.free, (term.local / found.sd_given_shared(i)).abs().nan_to_num(nan=0.0), 0.0)
-            keep = term.free & ((t >= threshold) | (t == t.max()))
-            changed |= bool((keep != term.free).any())
-            terms.append(replace(term, free=keep, local=torch.where(keep, term.local, 0.0)))
-        if changed:
-            found = fit(data, terms)
-            best = max(best, found, key=lambda f: _value(data, f))
-    return best
-
-
-def _varied(data: Ratios, found: Fit) -> Fit:
-    """With the last shape's forms tried as well, if it is a common source."""
-    *others, last = found.terms
-    if type(last) is not Common:
-        return found
-    forms = [[*others, form] for form in last.variants() if (form.turned, form.inside) != (last.turned, last.inside)]
-    # A part is no more than the whole.
-    possible = [form for form in forms if bool(log_score(data, data_model(data, form)).isfinite().all())]
-    return max([found, *(fit(data, form) for form in possible)], key=lambda f: _value(data, f))
-
-
-def _least_t(n_sensors: int) -> float:
-    return float(stats.norm.isf(0.005 / n_sensors))
-
-
-def _convincing(data: Ratios, found: Fit) -> bool:
-    """Whether what is left is no more than chance, or little of what there was."""
-    p = data.n_sensors
-    wide = data.worth >= 2 * p
-    single = data.observed.diagonal(dim1=-2, dim2=-1).real
-    fitted = found.model.diagonal(dim1=-2, dim2=-1).real
-    w = data.worth[:, None]
-    before = (w * (single - 1 - single.log()))[wide].sum()
-    ratio = single / fitted
-    left = float((w * (ratio - 1 - ratio.log()))[wide].sum())
-    freedom = p * int(wide.sum())
-    excess = left - freedom / 2
-    return excess < _SMALL * (float(before) - freedom / 2) or float(stats.chi2.sf(2 * left, freedom)) > _DOUBT
-
-
-def _candidates(data: Ratios, company: list[Term]) -> Iterator[Term]:
-    """Shapes to add to some, with numbers to start from."""
-    names = {t.name for t in company}
-    ground = data.ground
-
-    def score(terms: list[Term]) -> float:
-        return float(log_score(data, data_model(data, terms)).sum())
-
-    model = data_model(data, company)
-    if "parameter_shift" not in names and bool(ground.matters.any()):
-        yield from Shift.starts(ground)
-        if bool(ground.matters[1].any()):
-            yield max(Shift.moved(ground), key=lambda s: score([*company, s]))
-    if "low_pass" not in names:
-        filters = [s for kind in FILTERS for s in LowPass.starts(ground, kind)]
-        best: dict[str, LowPass] = {}
-        for start in sorted(filters, key=lambda s: -score([*company, s])):
-            best.setdefault(start.kind, start)
-        yield from list(best.values())[:_FORMS]
-    if "flicker" not in names:
-        yield Flicker.start(ground)
-    excess = data.observed - model
-    bump = _bump(data, model)
-    if bump is not None:
-        yield bump
-        if data.n_sensors > 1:
-            yield from CommonBump.starts(ground, excess, data.worth, "oscillation", bump.shared)
-    if data.n_sensors > 1:
-        nothing = torch.zeros(0, dtype=torch.float64)
-        for kind in ("white", "walk"):
-            yield from Common.starts(ground, excess, data.worth, kind, nothing)
-        n = ground.bands.n_samples
-        corners = torch.logspace(
-            math.log10(_CORNER_BINS[0] / n), math.log10(_CORNER_BINS[1]), 8, dtype=torch.float64
-        ).log()
-        starts_at = [Common.starts(ground, excess, data.worth, "ar1", c[None]) for c in corners]
-        yield from max(starts_at, key=lambda s: score([*company, s[0]]))
-
-
 def _closer(case: Case, term: Bump | CommonBump, others: list[Term]) -> tuple[Term, tuple[Tensor, Tensor]]:
     """A bump that is no wider than bands are, from narrower ones, and standard deviations of its numbers."""
     data = compared(case, _FINE)
@@ -404,11 +262,3 @@ def _closer(case: Case, term: Bump | CommonBump, others: list[Term]) -> tuple[Te
         local = common.local * term.free
     found = fit(data, [*others, replace(term, local=local, shared=start.shared, narrowest=_NARROWEST)])
     return found.terms[-1], found.sd(-1)
-
-
-def _bump(data: Ratios, model: Tensor) -> Bump | None:
-    """The bump that what is left is most like, of centres at the bands and widths up to a third of them."""
-    bands = data.ground.bands
-    centres = bands.frequency[bands.frequency * bands.n_samples > 16].tolist()
-    starts = ((centre, share * centre) for centre in centres for share in _WIDTHS)
-    return bump_start(data, model, starts, torch.ones(data.n_sensors, dtype=torch.bool))

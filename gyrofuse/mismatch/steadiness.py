@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate, pad
 
-from gyrofuse.mismatch.bumps import Oscillation
+from gyrofuse.mismatch.bump_fit import Oscillation
 from gyrofuse.mismatch.case import Case
 
 _DRAWN = 60

@@ -1,0 +1,144 @@
+"""Bumps of a spectrum fitted closely: centre, width and gains, beside level and slope of the noise where that pays."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.bumps import Stretch, band_of, strongest_bump
+from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.remembered import remembered
+from gyrofuse.mismatch.shape_choice import cost_of
+from gyrofuse.mismatch.shape_fit import Fit, Ratios, fit
+from gyrofuse.mismatch.shape_law import smooth_coherence
+from gyrofuse.mismatch.shape_scan import scanned
+from gyrofuse.mismatch.shape_terms import Bump, CommonBump, Ground, Term
+from gyrofuse.mismatch.side import Side
+from gyrofuse.mismatch.spectra import Bands, degrees_of_freedom
+
+_CUT_OFF = 0.6  # of the simulation's power
+_CELLS, _CELL = 24, 5  # on either side, and fewest bins of one
+
+
+@dataclass(frozen=True, eq=False)
+class Oscillation:
+    """A bump as fitted.
+
+    Attributes:
+        stretch: Where it was seen.
+        centre, width: Centre and half width, cycles per sample, and standard deviations of their logarithms.
+        variance: `(sensor,)`, and standard deviation.
+        gain: Complex gains of a common source `(sensor,)`; None where sensors have bumps of their own.
+        nats: Gain in log likelihood, less what the numbers cost.
+    """
+
+    stretch: Stretch
+    centre: float
+    width: float
+    log_sd: tuple[float, float]
+    variance: Tensor
+    variance_sd: Tensor
+    gain: Tensor | None
+    nats: float
+
+
+@dataclass(frozen=True, eq=False)
+class Background(Term):
+    """Level and slope of the noise around a bump: local are the logarithm at the centre and its rise to the end."""
+
+    name: ClassVar[str] = "background"
+    acts: ClassVar[str] = "scale"
+
+    @classmethod
+    def start(cls, n_sensors: int) -> Background:
+        free = torch.ones(2, n_sensors, dtype=torch.bool)
+        return cls(torch.zeros(2, n_sensors, dtype=torch.float64), free, torch.zeros(0, dtype=torch.float64))
+
+    def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
+        low, high = ground.places[0], ground.places[-1]
+        x = (2 * ground.places - low - high) / (high - low)
+        return (local[..., 0, :, None] + local[..., 1, :, None] * x).exp()
+
+
+@remembered
+def oscillation_of(case: Case) -> Oscillation | None:
+    """The strongest bump, fitted; None where it is no oscillation."""
+    return _closely(case, strongest_bump(case))
+
+
+@remembered
+def likeliest_oscillation(case: Case) -> Oscillation | None:
+    """The bump that is the likeliest of all shapes of a difference, fitted; None where another one is."""
+    seen = scanned(case)
+    if seen is None or seen.bump is None:
+        return None
+    centre, width = seen.bump
+    return _closely(case, Stretch(centre, 2 * width, seen.p_value, seen.sensors))
+
+
+def _closely(case: Case, stretch: Stretch) -> Oscillation | None:
+    n = case.n_samples
+    cell = max(round(stretch.width * n / 4), _CELL)
+    centre = round(stretch.frequency * n)
+    count = min(_CELLS, (centre - 3) // cell, (n // 2 - 4 - centre) // cell)
+    if count < 6:
+        return None
+    # Where a filter cuts off, flanks are not alike: broad shapes have to tell.
+    ends = torch.tensor([centre - count * cell, centre + count * cell], dtype=torch.float64)
+    first, last = (int(b) for b in band_of(ends, n, case))
+    passed = case.recorded.power[:, first : last + 1] / case.simulated.power[:, first : last + 1].clamp(min=1e-300)
+    if float(passed.mean(0).min()) < _CUT_OFF:
+        return None
+    edges = tuple(centre + cell * k for k in range(-count, count + 1))
+    ends = torch.tensor(edges, dtype=torch.float64)
+    dof = torch.full((2 * count,), degrees_of_freedom(cell), dtype=torch.float64)
+    local = Bands(n, edges, (ends[:-1] + ends[1:] - 1) / 2 / n, dof)
+    ground = Ground(case.base, local)
+    coherence = smooth_coherence(case.simulated.coherence, case.simulated.dof)
+    band = int(band_of(torch.tensor(float(centre)), n, case))
+    expected = coherence[band].expand(2 * count, -1, -1)
+    sides = Side(case.recorded.signal, local).spectra, ground.mean.mT, dof, torch.full_like(dof, 1e12)
+    data = Ratios.of(ground, sides, expected, torch.ones_like(dof))
+    background = fit(data, [Background.start(case.n_sensors)])
+    return _best(case, stretch, data, background)
+
+
+def _best(case: Case, stretch: Stretch, data: Ratios, background: Fit) -> Oscillation | None:
+    ground, p = data.ground, case.n_sensors
+    middle = len(ground.bands.frequency) // 2
+    least = max(1.5 / case.n_samples, stretch.width / 40) / stretch.frequency
+    height = (data.observed - background.model).diagonal(dim1=-2, dim2=-1).real[middle - 2 : middle + 2].mean(0)
+    level = ground.mean[:, middle] * height.clamp(min=1e-3)
+
+    def value(found: Fit) -> float:
+        return found.gain - sum(cost_of(data, t) for t in found.terms)
+
+    tried: list[Fit] = []
+    for company, share in itertools.product(([], background.terms), (0.25, 0.6)):
+        width = share * stretch.width
+        bump = Bump.start(stretch.frequency, width, level * 2 * math.pi * width)
+        own = fit(data, [*company, Bump(bump.local, bump.free, bump.shared, least)])
+        tried.append(own)
+        if p > 1:
+            excess = data.observed - background.model
+            source = CommonBump.start(ground, excess, data.worth, "oscillation", own.terms[-1].shared)
+            source = CommonBump(source.local, source.free, source.shared, narrowest=least)
+            tried.append(fit(data, [*company, source]))
+    best = max(tried, key=value)
+    nats = value(best) - max(value(background), 0.0)
+    term, (local_sd, log_sd) = best.terms[-1], best.sd(-1)
+    if isinstance(term, CommonBump):
+        gain = torch.complex(*term.local)
+        variance = gain.abs().square()
+        spread = 2 * gain.abs() * local_sd.square().nanmean(0).sqrt()
+    else:
+        gain, variance, spread = None, term.local[0], local_sd[0]
+    centre, width = (float(x) for x in term.shared.exp())
+    if centre < 2 * width or nats < 0:
+        return None
+    return Oscillation(stretch, centre, width, tuple(log_sd.tolist()), variance, spread, gain, nats)
