@@ -22,6 +22,7 @@ _SLOW = 2.2  # time constants above n / (2 pi) over this look like a walk in eve
 _LITTLE = 0.3  # of the white noise: fast AR1s below count as white
 _HIGHEST = 3.0  # corner of an analog filter to start from, cycles per sample
 _UNSEEN = 0.02  # share of the noise at one cycle per record: a walk below it is not known to be there or not
+_LOOKED_AT = 60  # frequencies
 _MATTERS = 0.05  # of the power in some band, for a part to have a level of its own
 
 
@@ -66,6 +67,19 @@ class Parts:
         return lacking * _atoms(n, self.f)[-1] / slowest[-1]
 
     @cached_property
+    def unseen_ar1(self) -> tuple[float, Tensor]:
+        """Inverse time constant of an AR1 that records would not show, and its plateaus `(sensor, 1)`.
+
+        The plateau is 0 for sensors that have AR1s. Where a simulation is white, noise with a memory is told from none.
+        """
+        n, c = self.base.n_samples, self.base.coefficients
+        middle = math.sqrt(0.5 / n)  # cycles per sample
+        f = torch.logspace(math.log10(1 / n), math.log10(0.5), _LOOKED_AT, dtype=c.dtype)
+        has = ((self.coefficients[1] @ _atoms(n, f)) / self.base.spectrum(f)).amax(-1, keepdim=True) > _MATTERS
+        plateau = _UNSEEN * self.base.spectrum(torch.tensor([middle], dtype=c.dtype))
+        return 2 * math.pi * middle, torch.where(has, 0.0, plateau)
+
+    @cached_property
     def _corners(self) -> tuple[Tensor, Tensor]:
         """Inverse time constants `(atom, 1, 1)` of the AR1s that some sensor has, and plateaus `(atom, sensor, 1)`."""
         rate = 1 / torch.tensor(_time_constants(self.base.n_samples), dtype=torch.float64)
@@ -92,8 +106,11 @@ class Parts:
         rate, plateau = self._corners
         phi = torch.exp(-corner[..., None, :, :] * rate)  # (..., atom, sensor, 1)
         coloured = AR1._spectrum(self.f, phi, plateau * (1 - phi).square()).sum(-3)
-        grown = walk * self.densities[2] + (walk - 1).clamp(min=0) * self.unseen
-        return white * self.densities[0] + level * coloured + grown
+        walks = walk * self.densities[2] + (walk - 1).clamp(min=0) * self.unseen
+        slower, tiny = self.unseen_ar1
+        phi = torch.exp(-corner * slower)
+        new = (level - 1).clamp(min=0) * AR1._spectrum(self.f, phi, tiny * (1 - phi).square())
+        return white * self.densities[0] + level * coloured + new + walks
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +149,9 @@ class Ground:
         """Which parts of the noise have a share in some band, `(part, sensor)`."""
         white, coloured, walk = self.parts.densities
         possible = torch.stack([white, coloured, walk + self.parts.unseen])
-        return (self.bands.mean_of(possible) / self.mean).amax(-1) > _MATTERS
+        matters = (self.bands.mean_of(possible) / self.mean).amax(-1) > _MATTERS
+        matters[1] |= self.parts.unseen_ar1[1][:, 0] > 0
+        return matters
 
 
 @dataclass(frozen=True, eq=False)

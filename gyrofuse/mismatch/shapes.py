@@ -91,12 +91,6 @@ def _like_switching(term: Term) -> bool:
     return isinstance(term, Flicker)
 
 
-def _like_missing(term: Term, data: Ratios) -> bool:
-    """Whether it may be an AR1 of sensors of which the simulation has none whose numbers could be other ones."""
-    lacking = term.free.any(0) & ~data.ground.matters[1]
-    return _like_switching(term) and not isinstance(term, Shift) and bool(lacking.any())
-
-
 def chosen_shape(case: Case, name: str, level: float) -> Shape | None:
     """The first shape, if it is that one and at p below `level`; narrow bumps that are plain come before it."""
     bump = oscillation_of(case)
@@ -183,8 +177,6 @@ def _searched(case: Case) -> Shape | None:
     }
     if _like_switching(term):
         rivals.add("random_telegraph")
-    if _like_missing(term, data):
-        rivals.add("parameter_shift")
     score = (log_score(data, data_model(data, [term])) - log_score(data, data.expected)).clamp(min=0)
     frequency = data.ground.bands.frequency
     told, sd = seen[first]

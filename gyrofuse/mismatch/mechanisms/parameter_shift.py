@@ -58,10 +58,15 @@ class ParameterShift(Filter):
                 number, unit = before[k][i]
                 if number:  # else the simulation does not show how much it has
                     parameters[f"{name}_factor[{i}]"] = spanned(math.exp, value, sd, "")  # of variances
+                elif name == "corner":
+                    parameters[f"{name}[{i}]"] = spanned(lambda x: least[2][i] * math.exp(x), value, sd, unit)  # noqa: B023
                 if low > 0 or high < 0:
                     factor = math.exp(value if name == "corner" else value / 2)  # in standard deviations
-                    after = f"{(number or least[i]) * factor:.3g} {unit}"
-                    words.append(f"{_WORDS[k]} of sensor {case.scene.sensors[i]} {number:.3g} -> {after}")
+                    if name == "ar1":  # of one plateau, a faster one has more variance
+                        factor *= math.exp(float(shape.term.local[2, i]) / 2)
+                    before_it = f"{number:.3g}" if number else "none"
+                    after = f"{(number or least[k][i]) * factor:.3g} {unit}"
+                    words.append(f"{_WORDS[k]} of sensor {case.scene.sensors[i]} {before_it} -> {after}")
         sensors = tuple(int(i) for i in shape.term.free.any(0).nonzero()[:, 0])
         return found(
             case,
@@ -81,22 +86,26 @@ class ParameterShift(Filter):
         return replace(self, log_factors=refit(case, fold, term, self.company).local)
 
 
-def _numbers(base: Base, rate: float, unit: str) -> tuple[list[list[tuple[float, str]]], list[float]]:
+def _numbers(base: Base, rate: float, unit: str) -> tuple[list[list[tuple[float, str]]], list[list[float]]]:
     """Numbers of the parts before, each sensor's with its unit: sds of a sample, corner in Hz, sd of an increment.
 
-    Walks that are not seen have none; the sds that stand for them come last.
+    AR1s and walks that are not seen have zeros; the numbers that stand for them come last, of every part.
     """
     f = torch.tensor([1 / base.n_samples], dtype=torch.float64)
     parts = Parts(base, f)
     white = parts.densities[0][:, 0].sqrt()
     variance, corner = parts.moments()
+    slower, plateau = parts.unseen_ar1[0], parts.unseen_ar1[1][:, 0]
+    lacks, phi = plateau > 0, math.exp(-slower)
+    least_rms = (plateau * (1 - phi) / (1 + phi)).sqrt()
+    least_corner = torch.full_like(plateau, rate * slower / (2 * math.pi))
     unseen = parts.unseen[:, 0]
     walk = ((parts.densities[2][:, 0] + unseen) * 4 * torch.sin(math.pi * f).square()).sqrt()
-    seen = torch.where(unseen > 0, 0.0, walk)
-    numbers = [
-        [(float(x), f"{unit} per sample") for x in white],
-        [(float(x), f"{unit} rms") for x in variance.sqrt()],
-        [(float(x) * rate, "Hz") for x in corner],
-        [(float(x), f"{unit} per step") for x in seen],
-    ]
-    return numbers, walk.tolist()
+    columns = (
+        (white, f"{unit} per sample"),
+        (torch.where(lacks, 0.0, variance.sqrt()), f"{unit} rms"),
+        (torch.where(lacks, 0.0, corner * rate), "Hz"),
+        (torch.where(unseen > 0, 0.0, walk), f"{unit} per step"),
+    )
+    numbers = [[(float(x), words) for x in column] for column, words in columns]
+    return numbers, [x.tolist() for x in (white, least_rms, least_corner, walk)]
