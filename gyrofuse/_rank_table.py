@@ -13,7 +13,6 @@ from gyrofuse._rank_moments import Moments
 from gyrofuse._rank_search import EQUIVALENT, MomentSearch, SpectralSearch
 from gyrofuse._rank_spectra import decide_lines
 from gyrofuse.covariance import wavelet_variance
-from gyrofuse.moment_inference import estimated
 from gyrofuse.processes import Drift, Sinusoid
 from gyrofuse.uncertainty import chi_square_tail
 
@@ -32,7 +31,7 @@ class Entry:
         items: Which records, `(item,)`.
         criterion: `(item,)`, less is better.
         wvic: `(item,)`.
-        p_value: Of the J test, `(item,)`.
+        p_value: Of the J test at the parameters of greatest likelihood, `(item,)`.
         simpler: What it amounts to with fewer parameters, and why.
         fitted: Variances of bins or levels, `(item, bin)`.
     """
@@ -97,14 +96,14 @@ def by_spectrum(series: Tensor, wanted: list[Kinds] | None, levels: int, max_ton
         made_of, items, fit = search.found(key)
         spectra = lines.spectra.part(items)
         own = moments.part(items).near(made_of, fit.linear, fit.shape)
-        spread, edge = spectra.spread(made_of, fit)
-        estimates = estimated(made_of, fit.linear, fit.shape, spread, edge, 0.95)
+        there = moments.part(items).against(made_of, fit.linear, fit.shape, *spectra.spread(made_of, fit))
+        estimates = there.estimates
         entries[key] = Entry(
             kinds=kinds,
             items=items,
             criterion=search.criterion(key)[items],
             wvic=own.objective + 2 * own.active,
-            p_value=chi_square_tail(own.objective, levels - own.active - lines.n_tones[items]),
+            p_value=there.p_value,
             simpler=compositions.simplified(made_of, estimates.params, estimates.covariance, n_samples),
             fitted=spectra.variances(made_of, fit),
         )

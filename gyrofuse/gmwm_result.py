@@ -13,9 +13,9 @@ from gyrofuse._composition import Composition
 from gyrofuse._records import Records
 from gyrofuse._result import ConfidenceInterval, cleaned, listed
 from gyrofuse.datasheet import datasheet
-from gyrofuse.moment_inference import Estimates, Fit, Inference
+from gyrofuse.moment_inference import Inference
 from gyrofuse.processes import Model
-from gyrofuse.uncertainty import chi_square_interval, chi_square_tail
+from gyrofuse.uncertainty import chi_square_interval
 from gyrofuse.units import RATE_UNITS
 
 if TYPE_CHECKING:
@@ -39,15 +39,16 @@ class GMWMResult:
         identified: `(..., sensor)`; False where parameters cannot be told apart at this length.
         remarks: What cannot, in words, for each sensor, item after item.
         objective: `r' Omega r` with `r = nu - nu(theta)`, `(..., sensor)`.
-        j_statistic: `r' V^-1 r`, `(..., sensor)`.
+        j_statistic: `r' V^-1 r` at these parameters, `(..., sensor)`.
         p_value: Of the J test, that the model is complete, `(..., sensor)`; NaN where the model has as many
-            parameters as there are levels, or the weights are not `V^-1`.
-        converged: `(..., sensor)`.
+            parameters as there are levels, or the weights are not `V^-1`. Where the parameters are refined, by
+            a chi-square of the mean and variance that the J statistic has there.
+        converged: `(..., sensor)`; of the likelihood where it refined the parameters, else of the moments.
         wavelet_variance: Measured, `(..., level, sensor)`, signal^2.
         fitted_wavelet_variance: Of the model, the same.
         records: Length of the record, or of those that the fit was to jointly, and the wavelet variances' efficiency.
         weighting: Of the moments.
-        refined: Whether the parameters are those of the spectral likelihood; the J test is the moments' all the same.
+        refined: Whether the parameters are those of the spectral likelihood.
         sensors: Names.
         rate: Hz, where known.
         unit: Of the signal, where known.
@@ -81,10 +82,7 @@ class GMWMResult:
     def build(
         cls,
         *,
-        fit: Fit,
         inference: Inference,
-        estimates: Estimates,
-        fitted: Tensor,
         remarks: list[tuple[str, ...]],
         made_of: Composition,
         usable: Tensor,
@@ -99,8 +97,8 @@ class GMWMResult:
             whole[usable] = value
             return whole.view(*batch, *value.shape[1:])
 
-        tested = (inference.degrees > 0) & (rest["weighting"] in ("optimal", "continuous"))
-        p_value = torch.where(tested, chi_square_tail(inference.j_statistic, inference.degrees), torch.nan)
+        estimates, tested = inference.estimates, rest["weighting"] in ("optimal", "continuous")
+        p_value = inference.p_value if tested else torch.full_like(inference.p_value, torch.nan)
         params = placed(estimates.params, torch.nan)
         said = iter(remarks)
         return cls(
@@ -115,9 +113,9 @@ class GMWMResult:
             objective=placed(inference.objective, torch.nan),
             j_statistic=placed(inference.j_statistic, torch.nan),
             p_value=placed(p_value, torch.nan),
-            converged=placed(fit.converged, False),
+            converged=placed(inference.converged, False),
             wavelet_variance=wavelet_variance.view(*batch, -1).mT,
-            fitted_wavelet_variance=placed(fitted, torch.nan).mT,
+            fitted_wavelet_variance=placed(inference.fitted, torch.nan).mT,
             **rest,
         )
 

@@ -32,7 +32,8 @@ class RankResult:
             number of sinusoids than was found, or a sensor that could not be ranked. Of a signal without the part that
             sinusoids have in it.
         wvic: Wavelet variance information criterion, the same.
-        p_value: Of the J test, that the candidate is complete, the same.
+        p_value: Of the J test, that the candidate is complete, the same; at the parameters of greatest likelihood. Of
+            a signal it is that of the record without its sinusoids, but for the chosen one that of its fit.
         redundant: Whether the fit amounts to a smaller candidate that explains the record as well, the same.
         reasons: Why, for every sensor, `...` flattened, and candidate; None where it is not redundant.
         equivalent: Whether it is as good as the chosen one, and not it, the same as `criterion`.
