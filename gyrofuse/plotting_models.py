@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 # Okabe and Ito without the blue of the sum.
 _COLOURS = ("#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 _STYLES = ("--", "-.", ":")
+_FADED = "#b8b8b8"
+# Of the criterion, up to which its axis is linear.
+_LINEAR = 10.0
 
 
 def plot_moment_fit(
@@ -129,6 +132,58 @@ def plot_resampled(
     ax.set_ylim(len(names) - 0.5, -0.5)
     ax.set_xlabel("less the estimate, in standard deviations of the resamples")
     _finish(ax, handles, [f"{percent:g} % percentile", f"{percent:g} % studentized", "mean of the resamples"])
+    return ax
+
+
+def plot_ranking(
+    names: list[str],
+    difference: Tensor,
+    redundant: Tensor,
+    *,
+    aside: list[str] | None = None,
+    title: str | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the criteria of candidates over that of the chosen one.
+
+    Args:
+        names: Of the candidates, from the best on.
+        difference: Of their criteria, `(candidate,)`.
+        redundant: Whether they are more than it takes, `(candidate,)`.
+        aside: Candidates that were not compared.
+        title: Of the axes.
+        ax: Where to draw; new axes by default.
+
+    Returns:
+        The axes.
+    """
+    ax = ax if ax is not None else _new_axes()
+    values, aside = difference.tolist(), aside or []
+    least, most = min([0.0, *values]), max([_LINEAR, *values])
+    ax.axvline(0.0, color=_INK, linewidth=0.8, zorder=1)
+    for redundancy, color, label in ((False, _BLUE, "candidate"), (True, _FADED, "redundant")):
+        places = [k for k, own in enumerate(redundant.tolist()) if own == redundancy]
+        if places:
+            shown = [values[k] for k in places]
+            ax.hlines(places, 0.0, shown, color=color, linewidth=5, zorder=2)
+            ax.plot(shown, places, "o", color=color, markersize=8, zorder=3, label=label)
+    for k, value in enumerate(values):
+        text = "chosen" if value == 0 else f"{value:+.1f}"
+        ax.annotate(text, (max(value, 0.0), k), (9, 0), textcoords="offset points", va="center", fontsize=8)
+    for k in range(len(aside)):
+        ax.annotate("not compared", (0.0, len(values) + k), (9, 0), textcoords="offset points", va="center", fontsize=8)
+    ax.set_yticks(range(len(values) + len(aside)), [*names, *aside])
+    ax.set_ylim(len(values) + len(aside) - 0.5, -0.5)
+    ax.set_xscale("symlog", linthresh=_LINEAR)
+    decades = [_LINEAR * 10.0**k for k in range(12)]
+    ticks = [-t for t in decades if t <= -least] + [0.0, _LINEAR / 2] + [t for t in decades if t <= 4 * most]
+    ax.set_xticks(sorted(ticks), [f"{t:.6g}" for t in sorted(ticks)])
+    ax.set_xticks([], minor=True)
+    ax.set_xlim(1.5 * least - 0.1 * _LINEAR, 4 * most)  # room for the numbers
+    ax.set_xlabel("criterion over that of the chosen model (half nats)")
+    if title:
+        ax.set_title(title, loc="left", fontsize=10, parse_math=False)
+    _finish(ax, *(ax.get_legend_handles_labels() if bool(redundant.any()) else ()))
     return ax
 
 
