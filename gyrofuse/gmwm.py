@@ -56,8 +56,8 @@ def fit_gmwm(
     the fitted model (`optimal`), the reciprocal variances (`diagonal`), the identity, or weights of your own. The
     frequencies of sinusoids come from the signal's spectrum, where they show a thousand times more sharply than in
     wavelet variances; lines of fewer than 30 cycles or hardly above the noise are tested against a noise spectrum
-    fitted to the record, and `remarks` say which could be noise. AR1s are given from slow to fast, sinusoids from high
-    to low frequency.
+    fitted to the record, and `remarks` say which could be noise, and where the amplitude that the moments ask for is
+    more than the spectrum holds. AR1s are given from slow to fast, sinusoids from high to low frequency.
 
     Intervals are symmetric in logarithms, `atanh phi` and `logit(beta / pi)`. Those of variances at zero, of what is
     known to hardly its order of magnitude and of AR1s that another process could stand for are by profile: every value

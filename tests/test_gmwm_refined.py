@@ -82,6 +82,17 @@ def test_a_moment_fit_that_bends_to_what_is_missing_does_not_speak_for_the_refin
     assert found.p_value[0] < 1e-6
 
 
+def test_an_amplitude_that_stands_in_for_a_missing_process_is_told():
+    """Noise of high frequency that the model lacks: a sinusoid has it in the moments, not in the spectrum."""
+    signal = records(gf.AR1(-0.6, 1.0) + gf.Sinusoid(0.5, 2.7), 4)
+    told = "sinusoid_1: the spectrum holds an amplitude of 0."
+    found = gf.fit_gmwm(signal, "WN + SIN")
+    assert all(any(text.startswith(told) for text in texts) for texts in found.remarks)
+    assert "refine the fit" in found.summary()
+    for fit in (gf.fit_gmwm(signal, "AR1 + SIN"), gf.fit_gmwm(signal, "WN + SIN", refine=True)):
+        assert not any("stands in" in text for texts in fit.remarks for text in texts)
+
+
 def test_ranked_and_fitted_agree_on_whether_a_model_is_complete():
     for truth, complete in ((NOISE + TONE, True), (gf.WhiteNoise(1.0) + gf.AR1(0.99, 5e-3) + gf.AR1(0.5, 1.0), False)):
         candidates = ["WN + AR1 + RW + SIN"] if complete else ["WN + RW"]
