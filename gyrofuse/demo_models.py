@@ -111,7 +111,8 @@ def _p_value(fit: GMWMResult) -> float | None:
 
 def _quantities(model: Model, fit: GMWMResult) -> list[float | None]:
     """Angle random walk and bias instability; None where a model has none."""
-    entries = datasheet(model, fit.rate or 1.0, fit.unit or "deg/s").entries
+    levels = fit.wavelet_variance.shape[-2]
+    entries = datasheet(model, fit.rate or 1.0, fit.unit or "deg/s", n_levels=levels).entries
     known = {(entry.name, entry.unit): entry.value for entry in entries}
     return [known.get(quantity) for quantity in _QUANTITIES]
 
@@ -131,7 +132,8 @@ def _told(fits: list[GMWMResult], result: RankResult, truth: Model) -> str:
     return (
         f"In truth all are {name}, with time constants of {', '.join(times)} s; {same} of {len(fits)} are found as "
         "that. A parameter has to gain more likelihood than its charge, and of processes slower than a good part of "
-        f"the recording two look much like one. {doubts} Bias instability is the lowest dip of the Allan deviation; "
-        "a model may lack a dip that the truth has. At long averaging times the virtual gyro looks "
+        f"the recording two look much like one. {doubts} Bias instability is the lowest dip of the Allan deviation "
+        "that longer averaging within the recording does not get below; a model may lack one that the truth has. At "
+        "long averaging times the virtual gyro looks "
         "better than it is, as its weights are from this very recording."
     )

@@ -12,7 +12,7 @@ from torch import Tensor
 from gyrofuse._composition import Composition
 from gyrofuse._records import Records
 from gyrofuse._result import ConfidenceInterval, cleaned, listed
-from gyrofuse.datasheet import datasheet
+from gyrofuse.datasheet import Datasheet, datasheet
 from gyrofuse.moment_inference import Inference
 from gyrofuse.processes import Model
 from gyrofuse.uncertainty import chi_square_interval
@@ -173,9 +173,17 @@ class GMWMResult:
         item = sum(i * step for i, step in zip(index, self.identified.stride(), strict=True))
         rows += [f"  {text}" for text in self.remarks[item]]
         if self.rate and self.unit in RATE_UNITS:
-            own = self.model.with_params(self.params[index])
-            rows += ["  " + line for line in datasheet(own, self.rate, self.unit).summary().splitlines()[1:]]
+            rows += ["  " + line for line in self.datasheet(index).summary().splitlines()[1:]]
         return rows
+
+    def datasheet(self, index: tuple[int, ...]) -> Datasheet:
+        """One sensor's model in datasheet units, where rate and unit of rate are known.
+
+        Args:
+            index: Of the sensor among the leading dimensions.
+        """
+        own, levels = self.model.with_params(self.params[index]), self.wavelet_variance.shape[-2]
+        return datasheet(own, self.rate or 1.0, self.unit or "", n_levels=levels)
 
     def plot(self, ax: Axes | None = None, *, index: tuple[int, ...] | None = None) -> Axes:
         """Draw one sensor's Allan deviation with intervals, the fitted model and each of its components.

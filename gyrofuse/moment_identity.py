@@ -84,8 +84,8 @@ def remarks(
         for item, tone in _standing_in(made_of, estimates, tones).nonzero().tolist():
             held = tones.amplitude[item, tone].item()
             said[item].append(
-                f"{sinusoids[tone]}: the spectrum holds an amplitude of {held:.2g} at this frequency, the rest stands in"
-                " for what the model lacks; refine the fit"
+                f"{sinusoids[tone]}: the spectrum holds an amplitude of {held:.2g} at this frequency, the rest stands "
+                "in for what the model lacks; refine the fit"
             )
     return [tuple(texts) for texts in said]
 

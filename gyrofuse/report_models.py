@@ -7,7 +7,6 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from gyrofuse.datasheet import datasheet
 from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.model_words import model_method, model_verdict, residuals
 from gyrofuse.plotting_models import plot_residuals
@@ -115,5 +114,4 @@ def _parameter_rows(result: GMWMResult, index: tuple[int, ...]) -> list[dict[str
 def _datasheet_rows(result: GMWMResult, index: tuple[int, ...]) -> list[dict[str, Any]]:
     if not (result.rate and result.unit in RATE_UNITS and _fitted(result, index)):
         return []
-    sheet = datasheet(result.model.with_params(result.params[index]), result.rate, result.unit)
-    return [entry._asdict() for entry in sheet.entries]
+    return [entry._asdict() for entry in result.datasheet(index).entries]
