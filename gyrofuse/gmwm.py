@@ -264,7 +264,8 @@ def _report(nu: Tensor, usable: Tensor, sensors: tuple[str, ...], strict: bool, 
     places = [f"sensor {sensors[i % n_sensors]}{item}" for i, item in zip(bad, items, strict=True)]
     what = (
         "expected wavelet variances that are finite and > 0 at every level (a constant signal has none, nor has one "
-        "with infinite samples; gaps leave no whole window at the last levels), got others at "
+        "with infinite samples; squares of huge or tiny numbers leave the range; gaps leave no whole window at the "
+        "last levels), got others at "
         f"{named(places, range(len(places)))}"
     )
     if strict or not bool(usable.any()):

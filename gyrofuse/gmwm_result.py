@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from gyrofuse._composition import Composition
 from gyrofuse._records import Records
-from gyrofuse._result import ConfidenceInterval, cleaned, listed
+from gyrofuse._result import ConfidenceInterval, cleaned, counted, listed
 from gyrofuse.datasheet import Datasheet, datasheet
 from gyrofuse.moment_inference import Inference
 from gyrofuse.processes import Model
@@ -129,16 +130,20 @@ class GMWMResult:
         """Of the wavelet variances, 1 for the classic ones, less for robust ones."""
         return self.records.efficiency
 
+    @property
+    def name(self) -> str:
+        """Of the model, such as `AR1 + RW + 3*SIN`."""
+        return Composition(self.model.processes, held=True).name
+
     def summary(self) -> str:
         """Parameters with intervals, sensor by sensor, and in datasheet units where rate and unit of rate are known."""
         batch = self.params.shape[:-2]
-        name = " + ".join(p.symbol for p in self.model.processes)
         kind = "GMWM fit, refined by spectral likelihood," if self.refined else "GMWM fit"
         robust = f", robust, efficiency {self.efficiency:g}" if self.efficiency < 1 else ""
         matched = f", {self.weighting} weighting" if self.weighting != "optimal" else ""
         matched += ", log moments" if self.moments == "log" else ""
         levels = self.wavelet_variance.shape[-2]
-        lines = [f"{kind} of {name}: {self.n_samples} samples, {levels} levels{matched}{robust}"]
+        lines = [f"{kind} of {self.name}: {self.n_samples} samples, {counted(levels, 'level')}{matched}{robust}"]
         n_items = self.params.shape[:-1].numel()
         if batch:
             lines.append(f"{n_items} fits in a batch {tuple(batch)}, {int(self.converged.sum())} converged")
@@ -169,7 +174,9 @@ class GMWMResult:
             note = "" if bool(self.determined[index][k]) else "  weakly determined"
             if value == 0:
                 note = "  at its limit"
-            rows.append(f"  {name:<24}{value:>13.6g}  [{first:>13.6g}, {last:>13.6g}]{note}")
+            digits = _digits(value, last - first)
+            numbers = [f"{number:>13.{digits}g}" for number in (value, first, last)]
+            rows.append(f"  {name:<24}{numbers[0]}  [{numbers[1]}, {numbers[2]}]{note}")
         item = sum(i * step for i, step in zip(index, self.identified.stride(), strict=True))
         rows += [f"  {text}" for text in self.remarks[item]]
         if self.rate and self.unit in RATE_UNITS:
@@ -202,7 +209,16 @@ class GMWMResult:
         # Degrees of freedom of the model: a variance that came out small by chance would seem to have none.
         degrees = 2 * model.wavelet_variance(len(measured)).square() / spread
         limits = chi_square_interval(measured, degrees, self.confidence_level)
-        return plot_moment_fit(measured, limits, model, rate=self.rate, unit=self.unit, ax=ax)
+        return plot_moment_fit(
+            measured,
+            limits,
+            model,
+            confidence_level=self.confidence_level,
+            rate=self.rate,
+            unit=self.unit,
+            title=f"sensor {self.sensors[index[-1]]}: {self.name}",
+            ax=ax,
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers and lists; what is not known is None."""
@@ -232,3 +248,9 @@ class GMWMResult:
             "rate": self.rate,
             "unit": self.unit,
         }
+
+
+def _digits(value: float, width: float) -> int:
+    """Significant digits with which the limits of an interval differ from the value; 6 do but for tones."""
+    known = width > 0 and math.isfinite(width) and value != 0
+    return min(max(6, math.ceil(math.log10(abs(value) / width)) + 2), 11) if known else 6

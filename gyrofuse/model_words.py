@@ -61,7 +61,7 @@ def model_method(result: GMWMResult) -> str:
         )
     if result.refined:
         sentences.append(
-            "From there the spectral (Whittle) likelihood was maximised; parameters, residuals and J test are those of "
+            "From there the spectral (Whittle) likelihood was maximised. Parameters, residuals and J test are those of "
             "its maximum."
         )
     sentences.append(

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 # Okabe and Ito without the blue of the sum.
 _COLOURS = ("#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 _STYLES = ("--", "-.", ":")
+# Of a legend, a row as a share of the axes' height.
+_LEGEND_COLUMNS, _LEGEND_ROW = 4, 0.07
 _FADED = "#b8b8b8"
 # Of the criterion, up to which its axis is linear.
 _LINEAR = 10.0
@@ -28,8 +30,10 @@ def plot_moment_fit(
     limits: tuple[Tensor, Tensor],
     model: Model,
     *,
+    confidence_level: float | None = None,
     rate: float | None = None,
     unit: str | None = None,
+    title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
     """Draw a measured Allan deviation `sqrt(2 nu)` with intervals, that of the fitted model, and its components.
@@ -38,8 +42,10 @@ def plot_moment_fit(
         wavelet_variance: `(level,)`, signal^2.
         limits: Lower and upper limits of it, `(level,)` each.
         model: Fitted, with scalar parameters.
+        confidence_level: Of the limits, for the legend.
         rate: Hz; without it the averaging times are in samples.
         unit: Unit of the signal.
+        title: Of the axes.
         ax: Where to draw; new axes by default.
 
     Returns:
@@ -50,7 +56,7 @@ def plot_moment_fit(
     times = np.exp2(np.arange(n_levels)) / (rate or 1.0)
     low, high = limits
     handles: list[Any] = [ax.fill_between(times, _deviation(low), _deviation(high), zorder=1, **_SHADE)]
-    labels = ["interval"]
+    labels = ["interval" if confidence_level is None else f"{100 * confidence_level:g} % interval"]
     dots: dict[str, Any] = {"color": _INK, "marker": "o", "markersize": 4, "linestyle": "none"}
     handles += ax.plot(times, _deviation(wavelet_variance), zorder=4, **dots)
     labels += ["measured"]
@@ -64,14 +70,20 @@ def plot_moment_fit(
         variance = process.wavelet_variance(n_levels)
         if not bool((variance > floor).any()):
             continue
-        visible = torch.where(variance > floor, variance, torch.nan)
+        visible = torch.where(variance > 0, variance, torch.nan)
         style: dict[str, Any] = {"color": _COLOURS[k % len(_COLOURS)], "linestyle": _STYLES[k % len(_STYLES)]}
         handles += ax.plot(times, _deviation(visible), zorder=2, linewidth=1.1, **style)
         labels += [process.symbol + (f" {seen[process.symbol]}" if process.repeatable else "")]
     ax.set_yscale("log")
     ax.set_ylabel(with_unit("Allan deviation", unit), parse_math=False)
     _time_axis(ax, rate is not None)
-    _finish(ax, handles, labels)
+    if title:
+        ax.set_title(title, loc="left", fontsize=10, parse_math=False)
+    # Curves go on to the lower edge, and above all of them there is room for the legend.
+    bottom, top = (2 * floor) ** 0.5, (2 * max(shown.nan_to_num().max().item(), floor)) ** 0.5
+    room = _LEGEND_ROW * (1 + -(-len(labels) // _LEGEND_COLUMNS))
+    ax.set_ylim(bottom, top * (top / bottom) ** (room / (1 - room)))
+    _finish(ax, handles, labels, loc="upper center", ncols=_LEGEND_COLUMNS)
     return ax
 
 

@@ -41,7 +41,7 @@ def model_report(result: GMWMResult, recording: Recording | None = None, *, titl
         title=title,
         result=result,
         recording=recording,
-        model=" + ".join(process.symbol for process in result.model.processes),
+        model=result.name,
         parts=parts,
         left_out=len(indices) - len(parts),
         method=model_method(result),
@@ -93,6 +93,7 @@ def _draw(figure: Figure, result: GMWMResult, index: tuple[int, ...]) -> None:
     above, below = figure.subplots(2, 1, height_ratios=[3, 1], sharex=True, gridspec_kw=margins)
     result.plot(above, index=index)
     above.set_xlabel("")
+    above.set_title("", loc="left")  # the page has it
     plot_residuals(residuals(result, index), rate=result.rate, ax=below)
 
 
