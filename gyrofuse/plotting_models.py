@@ -60,9 +60,10 @@ def plot_moment_fit(
     dots: dict[str, Any] = {"color": _INK, "marker": "o", "markersize": 4, "linestyle": "none"}
     handles += ax.plot(times, _deviation(wavelet_variance), zorder=4, **dots)
     labels += ["measured"]
-    handles += ax.plot(times, _deviation(model.wavelet_variance(n_levels)), color=_BLUE, linewidth=2.2, zorder=3)
+    fitted = model.wavelet_variance(n_levels).to(wavelet_variance)
+    handles += ax.plot(times, _deviation(fitted), color=_BLUE, linewidth=2.2, zorder=3)
     labels += ["fitted model"]
-    shown = torch.cat([low, high, wavelet_variance])
+    shown = torch.cat([low, high, wavelet_variance, fitted])
     floor = shown[shown > 0].min().item() / 30
     seen: dict[str, int] = {}
     for k, process in enumerate(model.processes):

@@ -245,6 +245,17 @@ def test_a_refused_model_does_not_get_sharper_intervals():
     assert ((high - low)[seen, 0] > 0.2 * result.params[seen, 0]).all()
 
 
+def test_the_figure_holds_what_is_measured_and_a_model_that_does_not_fit():
+    signal = gf.AR1(0.9, 1.0).simulate(4000, batch=(1,), generator=torch.Generator().manual_seed(7))
+    found = gf.fit_gmwm(signal, "RW")
+    with mpl.rc_context({"backend": "agg"}):
+        ax = found.plot()
+        low, high = ax.get_ylim()
+    for variance in (found.wavelet_variance, found.fitted_wavelet_variance):
+        deviation = (2 * variance).sqrt()
+        assert low < deviation.min() <= deviation.max() < high
+
+
 @pytest.mark.filterwarnings("ignore:`signal`")
 def test_a_sensor_that_is_not_fitted_is_none_in_the_dictionary():
     signal = torch.randn(2, 2000, dtype=torch.float64, generator=torch.Generator().manual_seed(3))

@@ -174,7 +174,7 @@ def plot(recordings: list[Fitted], path: Path) -> None:
     figure, axes = plt.subplots(2, columns, figsize=(5.2 * columns, 8), layout="constrained", squeeze=False)
     for ax, (name, result) in zip(axes.T.flat, panels, strict=True):
         result.plot(ax)
-        ax.set_title(f"{name}: {result.name}", fontsize=10)
+        ax.set_title(f"{name}: {result.name}", loc="left", fontsize=10)
     finish(figure, path)
 
 
