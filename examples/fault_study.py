@@ -173,6 +173,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="every third sensor, fewer runs")
     parser.add_argument("--out", type=Path, default=Path("faults.png"), help="where the figure goes")
     arguments = parser.parse_args()
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
     n_pieces = 1 if arguments.quick else 5
 
     arrays: dict[str, tuple[list[Session], int]] = {}

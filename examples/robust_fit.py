@@ -22,6 +22,7 @@ parser.add_argument("--efficiency", type=float, default=0.6)
 parser.add_argument("--levels", type=int)
 parser.add_argument("--out", type=Path, default=Path("robust_fit.png"))
 arguments = parser.parse_args()
+arguments.out.parent.mkdir(parents=True, exist_ok=True)
 
 if arguments.log is None:
     truth = gf.parse_model("WN(variance=1) + RW(variance=1e-6)")
@@ -53,10 +54,13 @@ for k, name in enumerate(classic.param_names):
     print(f"{name:<24}{''.join(columns)}")
 print(f"{'J test, p':<24}{classic.p_value[0].item():>12.2g}{robust.p_value[0].item():>41.2g}")
 
-figure, axes = plt.subplots(1, 2, figsize=(11, 4.5), sharey=True)
+figure, axes = plt.subplots(1, 2, figsize=(11, 4.5))
 for ax, fit in zip(axes, (classic, robust), strict=True):
     fit.plot(ax=ax)
-    ax.set_title("classic" if fit.efficiency == 1 else f"robust, efficiency {fit.efficiency:g}")
+    ax.set_title("classic" if fit.efficiency == 1 else f"robust, efficiency {fit.efficiency:g}", loc="left")
+lows, highs = zip(*(ax.get_ylim() for ax in axes), strict=True)
+for ax in axes:
+    ax.set_ylim(min(lows), max(highs))
 figure.tight_layout()
 figure.savefig(arguments.out, dpi=120)
 print(f"\nThe figure is in {arguments.out}.")

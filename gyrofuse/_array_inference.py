@@ -12,7 +12,7 @@ from gyrofuse._array_moments import array_moment_covariance, pairs, unvech, vech
 from gyrofuse._array_search import jacobian
 from gyrofuse._composition import Composition
 from gyrofuse._records import Records
-from gyrofuse.moment_inference import _sandwich
+from gyrofuse.moment_inference import _quadratic, _sandwich
 from gyrofuse.processes import AR1
 from gyrofuse.uncertainty import normal_quantile
 
@@ -90,7 +90,7 @@ def spread_of_fit(
     known = torch.cat([told, told.new_ones(n_items, len(made_of.curved))], -1)
     slopes = jacobian(tau, made_of, theta, shape) * present.flatten(1)[..., None]
     flat = covariance.reshape(*weight.shape)
-    spread, objective = _sandwich(slopes, known, flat, residual, weight)
+    spread, objective = _sandwich(slopes, known, flat, weight), _quadratic(residual, weight)
     spread = torch.where(known[:, :, None] & known[:, None, :], spread, torch.nan)
     eigenvalues = torch.linalg.eigvalsh(theta) * columns.amax(-2)[..., None]  # of moments of unit size
     lost = ((eigenvalues < _NOTHING * eigenvalues[..., -1:]) | (eigenvalues < _GONE)).sum(-1)

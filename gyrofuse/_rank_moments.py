@@ -15,7 +15,7 @@ from gyrofuse import _moment_search as search
 from gyrofuse._composition import Composition
 from gyrofuse._nnls import nonnegative_least_squares
 from gyrofuse._records import Records
-from gyrofuse.moment_inference import Estimates, Fit, infer
+from gyrofuse.moment_inference import Estimates, Fit, Inference, infer, infer_efficient
 from gyrofuse.processes import AR1
 
 _UPDATES = 2
@@ -93,10 +93,15 @@ class Moments:
 
     def estimates(self, made_of: Composition, fit: MomentFit) -> Estimates:
         """Parameters with their uncertainty."""
-        done = torch.ones(len(fit.linear), dtype=torch.bool, device=fit.linear.device)
-        held = fit.shape[:, :0]
-        whole = Fit(self.variance, fit.linear, fit.shape, held, done, "optimal", self.records)
-        return infer(whole, made_of, 0.95).estimates
+        return infer(self._at(fit.linear, fit.shape), made_of, 0.95).estimates
+
+    def against(self, made_of: Composition, p: Tensor, x: Tensor, spread: Tensor, edge_sd: Tensor) -> Inference:
+        """Efficient estimates from elsewhere, with their uncertainty as in `infer_efficient`, and their J test."""
+        return infer_efficient(self._at(p, x), made_of, spread, edge_sd, 0.95)
+
+    def _at(self, linear: Tensor, shape: Tensor) -> Fit:
+        done = torch.ones(len(linear), dtype=torch.bool, device=linear.device)
+        return Fit(self.variance, linear, shape, shape[:, :0], done, "optimal", self.records)
 
     def roots(self, made_of: Composition) -> list[Tensor]:
         """Starts of a composition with at most one shaped process: the best points of a grid."""

@@ -209,12 +209,14 @@ class Lines:
     """Spectral lines decided on.
 
     Attributes:
-        n_tones: How many, `(item,)`.
+        n_tones: How many were taken out, `(item,)`.
+        n_found: How many stand out of the noise, one more than the most allowed at most, `(item,)`.
         rest: Records without them, `(item, time)`, float64.
         spectra: Of the records without them.
     """
 
     n_tones: Tensor
+    n_found: Tensor
     rest: Tensor
     spectra: Spectra
 
@@ -236,16 +238,18 @@ def decide_lines(series: Tensor, allowed: list[int], level: float, ramp: bool) -
     clean = searched.clone()
     parts = []
     n_tones = torch.zeros(len(series), dtype=torch.long, device=series.device)
+    n_found = torch.zeros_like(n_tones)
     todo = torch.arange(len(series), device=series.device)
     density: NoiseSpectrum | None = None
-    for k in range(1, max(allowed) + 1):
+    for k in range(1, max(allowed) + 2):
         tones = find_tones(searched[todo], k, density)
         part = Spectra(series[todo], tones)
         noise, fit = _reference(part)
         p_value = line_p_value(clean[todo], _density(noise, fit.linear, fit.shape))
+        n_found[todo[p_value < level]] = k
         line = (p_value < level) | (k <= min(allowed))
         todo = todo[line]
-        if not len(todo):
+        if not len(todo) or k > max(allowed):
             break
         density = _density(noise, fit.linear[line], fit.shape[line])
         wave = tones.waveform(series.shape[-1])[line]
@@ -257,7 +261,7 @@ def decide_lines(series: Tensor, allowed: list[int], level: float, ramp: bool) -
     plain = (n_tones == 0).nonzero()[:, 0]
     if len(plain):
         parts.insert(0, (plain, Spectra(rest[plain])))
-    return Lines(n_tones, rest, gathered(parts))
+    return Lines(n_tones, n_found, rest, gathered(parts))
 
 
 def detrended(series: Tensor) -> Tensor:

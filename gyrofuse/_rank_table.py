@@ -11,9 +11,9 @@ from gyrofuse import _rank_candidates as compositions
 from gyrofuse._rank_candidates import Key, Kinds
 from gyrofuse._rank_moments import Moments
 from gyrofuse._rank_search import EQUIVALENT, MomentSearch, SpectralSearch
-from gyrofuse._rank_spectra import decide_lines
+from gyrofuse._rank_spectra import Lines, decide_lines
+from gyrofuse._result import counted
 from gyrofuse.covariance import wavelet_variance
-from gyrofuse.moment_inference import estimated
 from gyrofuse.processes import Drift, Sinusoid
 from gyrofuse.uncertainty import chi_square_tail
 
@@ -32,7 +32,7 @@ class Entry:
         items: Which records, `(item,)`.
         criterion: `(item,)`, less is better.
         wvic: `(item,)`.
-        p_value: Of the J test, `(item,)`.
+        p_value: Of the J test at the parameters of greatest likelihood, `(item,)`.
         simpler: What it amounts to with fewer parameters, and why.
         fitted: Variances of bins or levels, `(item, bin)`.
     """
@@ -55,12 +55,13 @@ class Table:
         criterion: `(item, candidate)`; NaN where it was not tried, for it has another number of sinusoids.
         wvic: The same.
         p_value: The same.
-        reasons: Why a candidate is redundant, `[item][candidate]`.
+        reasons: Why a candidate is redundant, or was not compared, `[item][candidate]`.
         redundant: `(item, candidate)`.
         equivalent: To the chosen one, without it, `(item, candidate)`.
         choice: `(item,)`.
         wvic_choice: `(item,)`.
-        n_tones: Sinusoids found, `(item,)`; None where none were looked for.
+        n_tones: Sinusoids taken out, `(item,)`; None where none were looked for.
+        n_lines: That stand out of the noise, one more than candidates have sinusoids at most, the same.
     """
 
     kinds: list[Kinds]
@@ -73,6 +74,7 @@ class Table:
     choice: Tensor
     wvic_choice: Tensor
     n_tones: Tensor | None
+    n_lines: Tensor | None
 
 
 def by_spectrum(series: Tensor, wanted: list[Kinds] | None, levels: int, max_tones: int, line_level: float) -> Table:
@@ -97,14 +99,14 @@ def by_spectrum(series: Tensor, wanted: list[Kinds] | None, levels: int, max_ton
         made_of, items, fit = search.found(key)
         spectra = lines.spectra.part(items)
         own = moments.part(items).near(made_of, fit.linear, fit.shape)
-        spread, edge = spectra.spread(made_of, fit)
-        estimates = estimated(made_of, fit.linear, fit.shape, spread, edge, 0.95)
+        there = moments.part(items).against(made_of, fit.linear, fit.shape, *spectra.spread(made_of, fit))
+        estimates = there.estimates
         entries[key] = Entry(
             kinds=kinds,
             items=items,
             criterion=search.criterion(key)[items],
             wvic=own.objective + 2 * own.active,
-            p_value=chi_square_tail(own.objective, levels - own.active - lines.n_tones[items]),
+            p_value=there.p_value,
             simpler=compositions.simplified(made_of, estimates.params, estimates.covariance, n_samples),
             fitted=spectra.variances(made_of, fit),
         )
@@ -117,7 +119,19 @@ def by_spectrum(series: Tensor, wanted: list[Kinds] | None, levels: int, max_ton
             if len(which) or not searching:
                 simpler = [s and ([*s[0], *tones], s[1]) for s in entry.simpler]
                 placed.append(_part(entry, kinds, which, simpler))
-    return _tabulated(placed, lines.spectra.bins.count, len(series), lines.n_tones)
+    table = _tabulated(placed, lines.spectra.bins.count, len(series), lines)
+    if not searching:
+        _set_aside(table, lines, max(allowed))
+    return table
+
+
+def _set_aside(table: Table, lines: Lines, most: int) -> None:
+    """Say why candidates were not compared."""
+    for own, n_tones, n_found in zip(table.reasons, lines.n_tones.tolist(), lines.n_found.tolist(), strict=True):
+        found = ("at least " if n_found > most else "") + counted(n_found, "line")
+        for c, kinds in enumerate(table.kinds):
+            if (n := _n_tones(kinds)) != n_tones:
+                own[c] = f"the spectrum has {found}, the model {n or 'none'}"
 
 
 def by_moments(variance: Tensor, wanted: list[Kinds] | None, n_samples: int) -> Table:
@@ -160,7 +174,7 @@ def _part(entry: Entry, kinds: Kinds, items: Tensor, simpler: list[tuple[Kinds, 
     )
 
 
-def _tabulated(entries: list[Entry], count: Tensor, n_items: int, n_tones: Tensor | None) -> Table:
+def _tabulated(entries: list[Entry], count: Tensor, n_items: int, lines: Lines | None) -> Table:
     empty = entries[0].criterion.new_full((n_items, len(entries)), torch.nan)
     criterion, wvic, p_value = empty.clone(), empty.clone(), empty.clone()
     for c, entry in enumerate(entries):
@@ -179,7 +193,8 @@ def _tabulated(entries: list[Entry], count: Tensor, n_items: int, n_tones: Tenso
     sizes = torch.tensor([float(len(entry.kinds)) for entry in entries]).to(wvic)
     wvic_choice = (wvic + _TIE * sizes).nan_to_num(nan=torch.inf).argmin(-1)
     kinds = [entry.kinds for entry in entries]
-    return Table(kinds, criterion, wvic, p_value, reasons, redundant, equivalent, choice, wvic_choice, n_tones)
+    found = (None, None) if lines is None else (lines.n_tones, lines.n_found)
+    return Table(kinds, criterion, wvic, p_value, reasons, redundant, equivalent, choice, wvic_choice, *found)
 
 
 def _equivalent(entries: list[Entry], criterion: Tensor, redundant: Tensor, choice: Tensor, count: Tensor) -> Tensor:

@@ -22,6 +22,11 @@ def named(names: Sequence[str], which: Sequence[int], most: int = 5) -> str:
     return ", ".join(names[i] for i in which[:most]) + more
 
 
+def counted(n: int, noun: str) -> str:
+    """A number of things, such as `1 sensor` and `no lines`."""
+    return f"{n or 'no'} {noun}" + ("" if n == 1 else "s")
+
+
 def numbered(n: int) -> tuple[str, ...]:
     """Names `"1"` to `"n"` for sensors without any."""
     return tuple(str(i + 1) for i in range(n))

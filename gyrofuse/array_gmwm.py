@@ -51,7 +51,9 @@ def fit_array_gmwm(
     `Cov(gamma_ab,j, gamma_cd,l) = sum_km Q_jl[k,m] (Theta_k,ac Theta_m,bd + Theta_k,ad Theta_m,bc)`, followed until
     it rests. Matrices are positive by construction; `phi` of an AR1 and the frequency of a tone are of all sensors. The
     matrix of a tone is that of squared amplitudes in phase, `a_i a_k cos(phase_i - phase_k)`, which is all that wavelet
-    moments see; its frequency comes from the sensor that shows it most sharply.
+    moments see; its frequency comes from the sensor that shows it most sharply. A tone has two phases, so that of three
+    or more sensors its matrix has rank 2 at most. The search knows no such bound, and at that edge entries are not
+    normal: amplitudes of three or more sensors have upper limits only.
 
     A memory longer than a fiftieth of the record is hardly told from a random walk. Its matrix often lacks rank, its
     variances have upper limits only, its covariances and correlations no limits at all, nor has any `phi`; weights for

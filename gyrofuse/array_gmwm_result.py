@@ -12,9 +12,9 @@ from torch import Tensor
 from gyrofuse._array_inference import FEWEST_TIME_CONSTANTS, ArrayFit, is_long, matrices, shared, told_matrices
 from gyrofuse._composition import Composition
 from gyrofuse._records import Records
-from gyrofuse._result import ConfidenceInterval, listed
+from gyrofuse._result import ConfidenceInterval, counted, listed
 from gyrofuse.live import subset_weights
-from gyrofuse.processes import Model, Process
+from gyrofuse.processes import Model, Process, Sinusoid
 from gyrofuse.scale_weights import ScaleWeights
 from gyrofuse.simulate import ArrayModel
 from gyrofuse.uncertainty import chi_square_tail
@@ -49,8 +49,9 @@ class ArrayGMWMResult:
     Attributes:
         processes: Of the sum, without values.
         theta: Covariance matrices between the sensors `(..., process, sensor, sensor)`: of white noise, of the
-            innovations of an AR1, of the steps of a random walk, of amplitudes in phase of a tone (their squares on the
-            diagonal). Positive semi-definite. NaN for a sensor without samples and a pair that is never seen together.
+            innovations of an AR1, of the steps of a random walk, of amplitudes in phase of a tone (their squares, twice
+            its variances, on the diagonal; of rank 2 at most, as a tone has two phases). Positive semi-definite. NaN
+            for a sensor without samples and a pair that is never seen together.
         theta_sd: Standard deviation of every entry, as if no matrix lacked rank.
         confidence_interval: Limits of every entry. A variance that is hardly told from zero, or in a matrix that lacks
             rank or of a long memory, has an upper limit only; covariances of such a matrix have none (NaN).
@@ -205,9 +206,10 @@ class ArrayGMWMResult:
 
     def summary(self) -> str:
         """Deviations of the sensors by process with intervals, largest correlations, and the fit."""
-        name = " + ".join(p.symbol for p in self.processes)
+        name = Composition(self.processes, held=True).name
         levels, n_sensors = self.wavelet_cross_covariance.shape[-3:-1]
-        head = f"GMWM fit of an array, {name}: {n_sensors} sensors, {self.n_samples} samples, {levels} levels"
+        head = f"GMWM fit of an array, {name}: {counted(n_sensors, 'sensor')}, {self.n_samples} samples, "
+        head += counted(levels, "level")
         batch = self.theta.shape[:-3]
         if batch:
             return f"{head}\n{batch.numel()} arrays in a batch {tuple(batch)}, {int(self.converged.sum())} converged"
@@ -224,7 +226,8 @@ class ArrayGMWMResult:
             limits = f"{level} [{low:.6g}, {high:.6g}]" if low.isfinite() else "no interval, see below"
             lines.append(f"{label:<16}{value:>13.6g}  {limits}")
         for k, process in enumerate(self.processes):
-            lines += ["", f"{process.symbol}: variances with {level}s, correlations"]
+            what = "squared amplitudes, twice the variances," if isinstance(process, Sinusoid) else "variances"
+            lines += ["", f"{process.symbol}: {what} with {level}s, correlations"]
             for i, sensor in enumerate(self.sensors):
                 low, high = (limit[k, i, i].item() for limit in self.confidence_interval)
                 value = self.theta[k, i, i].item()

@@ -37,6 +37,7 @@ from gyrofuse.cli_shared import (
     Scale,
     Sensors,
     Unit,
+    at_rest,
     known_unit,
     outputs,
     read,
@@ -193,7 +194,7 @@ def fuse(
     with outputs(force, [*logs, mounting], out=out, figure=figure, json=json_file, report=report) as drafts:
         recording = read(logs, axis, sensors, rate, unit, scale, key, mounting)
         with progress("fusing"):
-            part = recording.between(*resting) if resting else recording
+            part = at_rest(recording, resting)
             result: SVOResult | MultiScaleResult
             if method is Method.multiscale:
                 result = fit_multiscale(part, weights, confidence_level=confidence_level, n_levels=levels)
@@ -280,9 +281,11 @@ def simulate(
         whole = not isinstance(noise, Model)
         if not isinstance(noise, Model | ArrayModel):
             noise.check(rate, unit)
-        if whole and sensors is not None:
-            raise ValueError(f"`--sensors`: {model} is a model of a whole array; leave the option out")
-        batch = () if whole else (1 if sensors is None else sensors,)
+        each = _each(noise)
+        if (whole or len(each) > 1) and sensors is not None:
+            own = f"{len(each)} sensors" if len(each) > 1 else "a whole array"
+            raise ValueError(f"`--sensors`: {model} is a model of {own}; leave the option out")
+        batch = () if whole or len(each) > 1 else (1 if sensors is None else sensors,)
         with progress("simulating"):
             signal = noise.simulate(samples, batch=batch, generator=generator).flatten(0, -2)
         recording = Recording(signal, rate=rate, unit=unit)
@@ -293,7 +296,15 @@ def simulate(
         if report:
             page = recording_report(recording, title=f"A simulated recording of {model}")
             drafts[report].write_text(page, encoding="utf-8")
-    say(f"{noise}\n{signal.shape[0]} x {samples} samples at {rate:g} Hz, seed {seed}, in {out}")
+    say("\n".join(map(str, each)))
+    say(f"{signal.shape[0]} x {samples} samples at {rate:g} Hz, seed {seed}, in {out}")
+
+
+def _each(noise: Any) -> list[Any]:
+    """A model for every sensor where there are several."""
+    if not isinstance(noise, Model) or noise.params.ndim < 2:
+        return [noise]
+    return [noise.with_params(own) for own in noise.params.flatten(0, -2)]
 
 
 @app.command()

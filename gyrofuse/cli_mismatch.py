@@ -21,6 +21,7 @@ from gyrofuse.cli_shared import (
     Scale,
     Sensors,
     Unit,
+    at_rest,
     known_unit,
     outputs,
     read,
@@ -83,7 +84,7 @@ def diagnose(
     with outputs(force, [*logs, mounting, simulation], **asked) as drafts:
         recording = _one_axis(read(logs, axis, sensors, rate, unit, scale, key, mounting), titled(logs))
         simulated = _simulation(simulation, recording, axis, sensors, rate, unit)
-        part = recording.between(*resting) if resting else recording
+        part = at_rest(recording, resting)
         found, remarks = _diagnosed(part, simulated, (titled(logs), simulation), false_alarm, twins)
         if corrected:
             whole, _ = without_gaps(part, "", 0)

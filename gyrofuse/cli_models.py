@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from enum import Enum
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -22,11 +23,14 @@ from gyrofuse.cli_shared import (
     Scale,
     Sensors,
     Unit,
+    at_rest,
+    files_written,
     outputs,
     read,
     say_notes,
     stretch,
     titled,
+    unit_note,
     without_gaps,
     write_json,
 )
@@ -81,6 +85,9 @@ def fit(
     mounting: Mounting = None,
     confidence_level: Annotated[float, typer.Option(metavar="P", help="Of all intervals.")] = 0.95,
     kalibr: Annotated[Path | None, typer.Option(metavar="FILE", help="Write Kalibr's imu.yaml, of one sensor.")] = None,
+    kalibr_slow: Annotated[
+        float, typer.Option(metavar="S", help="AR1s with a correlation time from this on are Kalibr's random walk.")
+    ] = 1.0,
     header: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write a Kalman filter's matrices as a C header, of one sensor.")
     ] = None,
@@ -102,7 +109,7 @@ def fit(
     with outputs(force, [*logs, mounting], report=report, **asked) as drafts:
         recording = read(logs, axis, sensors, rate, unit, scale, key, mounting)
         with progress("fitting"):
-            part = recording.between(*resting) if resting else recording
+            part = at_rest(recording, resting)
             result = fit_gmwm(
                 part,
                 model,
@@ -112,7 +119,10 @@ def fit(
                 refine=refine,
                 efficiency=robust,
             )
-        for option, path, written in (("kalibr", kalibr, to_kalibr), ("header", header, to_c_header)):
+        for option, path, written in (
+            ("kalibr", kalibr, partial(to_kalibr, slow=kalibr_slow)),
+            ("header", header, to_c_header),
+        ):
             if path:
                 drafts[path].write_text(_exported(result, recording, option, written), encoding="utf-8")
         if model_out:
@@ -125,7 +135,8 @@ def fit(
             drafts[report].write_text(page, encoding="utf-8")
         if json_file:
             write_json(drafts[json_file], result.to_dict())
-    say(result.summary())
+    written_files = files_written(kalibr, header, model_out, figure, json_file, report)
+    say("\n".join([result.summary(), *unit_note(recording.unit), *written_files]))
     say_notes(recording)
 
 
@@ -203,7 +214,7 @@ def rank(
     with outputs(force, [*logs, mounting], figure=figure, json=json_file, report=report) as drafts:
         recording = read(logs, axis, sensors, rate, unit, scale, key, mounting)
         with progress("ranking"):
-            asked = recording.between(*resting) if resting else recording
+            asked = at_rest(recording, resting)
             part, remarks = without_gaps(asked, "Ranked", FEWEST_SAMPLES, _WITH_GAPS)
             result = rank_models(part, formulas, confidence_level=confidence_level, n_levels=levels)
         if figure:
@@ -218,4 +229,6 @@ def rank(
     fits = [fit for fit in result.best if fit is not None]
     if len(fits) <= _MOST_FITS:
         say("\n".join(f"\n{fit}" for fit in fits))
+    if notes := [*unit_note(recording.unit), *files_written(figure, json_file, report)]:
+        say("\n".join(notes))
     say_notes(recording)

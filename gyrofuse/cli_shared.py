@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gyrofuse._console import progress, say_table
+from gyrofuse._console import progress, say_table, warn
 from gyrofuse._output import Outputs
 from gyrofuse.io.columns import canonical_unit
 from gyrofuse.parsing import model_from_dict
@@ -101,6 +101,18 @@ def stretch(rest: str | None) -> tuple[float, float] | None:
     return start, stop
 
 
+def at_rest(recording: Recording, resting: tuple[float, float] | None) -> Recording:
+    """The stretch that `--rest` asks for, all without it; where the log ends before it does, that is said."""
+    if resting is None:
+        return recording
+    part = recording.between(*resting)
+    if resting[1] > recording.duration + 1 / recording.rate:
+        warn(
+            f"`--rest`: expected a stretch within 0 to {recording.duration:.6g} s, got {resting[1]:g} s; it ends there"
+        )
+    return part
+
+
 def outputs(force: bool, inputs: Sequence[Path | None] = (), **asked: Path | None) -> Outputs:
     """Files to write, those asked for, by option; none of the inputs given is ever replaced."""
     for option, path in asked.items():
@@ -119,9 +131,11 @@ def titled(logs: Sequence[Path]) -> str:
 
 
 def read_model(path: Path) -> Model | ArrayModel | RepairedModel:
-    """A model from JSON, as `to_dict()` of a model gives it, or that of a simulation that a diagnosis repaired."""
+    """A model from JSON: of `to_dict()` of a model or of a fit, or of a simulation that a diagnosis repaired."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
+        if "processes" not in content and isinstance(content.get("model"), dict):
+            content = content["model"]
         if "effects" not in content:
             return model_from_dict(content)
         from gyrofuse.mismatch.saved import repaired_from_dict
@@ -159,6 +173,19 @@ def without_gaps(recording: Recording, done: str, fewest: int, otherwise: str = 
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write plain numbers as JSON."""
     path.write_text(json.dumps(content, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def unit_note(unit: str) -> list[str]:
+    """What to say of a unit that no datasheet can be given in."""
+    if unit in (*RATE_UNITS, *OTHER_UNITS, "unknown"):
+        return []
+    return [f"Unit {unit!r} is none of {', '.join((*RATE_UNITS, *OTHER_UNITS))}: numbers are in it as they stand."]
+
+
+def files_written(*paths: Path | None) -> list[str]:
+    """A line that names the files written, where there are any."""
+    names = [str(path) for path in paths if path]
+    return [f"Written: {', '.join(names)}"] if names else []
 
 
 def say_notes(recording: Recording) -> None:

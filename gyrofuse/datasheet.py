@@ -21,7 +21,7 @@ from gyrofuse.processes import (
     WhiteNoise,
 )
 
-_LEVELS = 40  # where the floor of the Allan deviation is looked for
+_LEVELS = 40  # where the floor of the Allan deviation is looked for: of any record
 
 
 class DatasheetEntry(NamedTuple):
@@ -60,16 +60,19 @@ class Datasheet:
         return {"rate": self.rate, "unit": self.unit, "entries": [e._asdict() for e in self.entries]}
 
 
-def datasheet(model: Model, rate: float, unit: str) -> Datasheet:
+def datasheet(model: Model, rate: float, unit: str, *, n_levels: int = _LEVELS) -> Datasheet:
     """Translate a model into angle random walk, bias instability, rate random walk and the like.
 
     Bias instability is the lowest local minimum of the Allan deviation, without tones and drifts, over 0.664,
-    on octave averaging times; a model whose Allan deviation has no such floor has none.
+    on octave averaging times, of those that longer averaging does not get below; a model whose Allan deviation has no
+    such floor has none, as one without a random walk, which falls in the end.
 
     Args:
         model: With scalar parameters.
         rate: Sampling rate, Hz.
         unit: Rate unit of the model: deg/s, mdeg/s, deg/h or rad/s.
+        n_levels: Averaging times looked at, from one sample up; those of the record behind the model, which knows no
+            others.
 
     Raises:
         ValueError: A parameter is to be estimated or batched, or an unknown unit.
@@ -85,7 +88,7 @@ def datasheet(model: Model, rate: float, unit: str) -> Datasheet:
             "pick one item with model.with_params(model.params[i])"
         )
     entries = [e for process in model.processes for e in _entries(process, rate, unit, degrees)]
-    return Datasheet(rate, unit, (*entries, *_floor(model, rate, degrees)))
+    return Datasheet(rate, unit, (*entries, *_floor(model, rate, degrees, n_levels)))
 
 
 def _entries(process: Process, rate: float, unit: str, degrees: float) -> Iterator[DatasheetEntry]:
@@ -116,13 +119,14 @@ def _entries(process: Process, rate: float, unit: str, degrees: float) -> Iterat
         yield DatasheetEntry("tone amplitude", amplitude, unit)
 
 
-def _floor(model: Model, rate: float, degrees: float) -> Iterator[DatasheetEntry]:
+def _floor(model: Model, rate: float, degrees: float, n_levels: int) -> Iterator[DatasheetEntry]:
     noise = [p for p in model.processes if not isinstance(p, (Sinusoid, Drift))]
     if not noise:
         return
-    deviation = (2 * Model(noise).wavelet_variance(_LEVELS)).sqrt()  # Allan, at 2**(level - 1) samples
+    deviation = (2 * Model(noise).wavelet_variance(n_levels)).sqrt()  # Allan, at 2**(level - 1) samples
     inner = deviation[1:-1]
-    lowest = torch.where((inner < deviation[:-2]) & (inner < deviation[2:]), inner, torch.inf)
+    later = deviation.flip(0).cummin(0).values.flip(0)[2:]
+    lowest = torch.where((inner < deviation[:-2]) & (inner < later), inner, torch.inf)
     if torch.isfinite(lowest).any():
         floor = float(lowest.min()) * degrees * units.SECONDS_PER_HOUR
         yield DatasheetEntry("bias instability B", units.bias_instability(floor), "deg/h")

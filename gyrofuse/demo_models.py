@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from textwrap import fill
 from typing import TYPE_CHECKING
 
@@ -10,20 +11,20 @@ import torch
 from torch import Tensor
 
 from gyrofuse._rank_candidates import name_of
-from gyrofuse.datasheet import datasheet
 from gyrofuse.gmwm_result import GMWMResult
-from gyrofuse.processes import AR1, Model
+from gyrofuse.processes import AR1, Model, WhiteNoise
 from gyrofuse.ranking_result import RankResult
 from gyrofuse.report_page import new_figure, number
 from gyrofuse.simulate import ArrayModel
-from gyrofuse.units import correlation_time
+from gyrofuse.units import SECONDS_PER_HOUR, angle_random_walk, correlation_time, per_sqrt_hour, rate_unit_factor
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # What a gyro's noise may be, without tones; the default of `rank_models` is more.
 CANDIDATES = ("WN", "WN + RW", "WN + AR1", "WN + AR1 + RW", "WN + 2*AR1", "WN + 2*AR1 + RW", "WN + 3*AR1")
-_QUANTITIES = (("angle random walk N", "deg/sqrt(h)"), ("bias instability B", "deg/h"))
+# Averages of the recording that still tell something: their number at the averaging time of the table.
+_AVERAGES = 100
 _REFUSED = 0.01  # p-values of the J test below
 
 
@@ -53,9 +54,10 @@ def models_story(result: RankResult, truths: list[Model]) -> str:
     """
     fits = [fit for fit in result.best if fit is not None]
     columns = "  ".join(f"{name:>9}" for name in ("fitted", "truth") * 2)
+    at = f"{number(2.0 ** _level(fits[0]) / (fits[0].rate or 1.0), 3)} s (deg/h)"
     lines = [
-        f"{'':>7}  {'':<22}  {'angle random walk':^20}  {'bias instability':^20}",
-        f"{'':>7}  {'':<22}  {'(deg/sqrt(h))':^20}  {'(deg/h)':^20}",
+        f"{'':>7}  {'':<22}  {'angle random walk':^20}  {'Allan deviation at':^20}",
+        f"{'':>7}  {'':<22}  {'(deg/sqrt(h))':^20}  {at:^20}",
         f"{'sensor':>7}  {'noise model':<22}  {columns}  {'J test p':>8}",
     ]
     for fit, name, truth in zip(fits, result.names, truths, strict=True):
@@ -109,11 +111,17 @@ def _p_value(fit: GMWMResult) -> float | None:
     return p_value if bool(fit.converged[0]) and p_value == p_value else None
 
 
-def _quantities(model: Model, fit: GMWMResult) -> list[float | None]:
-    """Angle random walk and bias instability; None where a model has none."""
-    entries = datasheet(model, fit.rate or 1.0, fit.unit or "deg/s").entries
-    known = {(entry.name, entry.unit): entry.value for entry in entries}
-    return [known.get(quantity) for quantity in _QUANTITIES]
+def _level(fit: GMWMResult) -> int:
+    """Of the averaging time, counted from 0."""
+    return max(int(math.log2(fit.n_samples / _AVERAGES)), 0)
+
+
+def _quantities(model: Model, fit: GMWMResult) -> list[float]:
+    """Angle random walk, and the Allan deviation where slow noise rules."""
+    rate, degrees = fit.rate or 1.0, rate_unit_factor(fit.unit or "deg/s")
+    white = sum(process.params.item() for process in model.processes if isinstance(process, WhiteNoise))
+    slow = (2 * model.wavelet_variance(_level(fit) + 1)[-1]).sqrt().item()
+    return [per_sqrt_hour(angle_random_walk(white, rate)) * degrees, slow * degrees * SECONDS_PER_HOUR]
 
 
 def _told(fits: list[GMWMResult], result: RankResult, truth: Model) -> str:
@@ -131,7 +139,6 @@ def _told(fits: list[GMWMResult], result: RankResult, truth: Model) -> str:
     return (
         f"In truth all are {name}, with time constants of {', '.join(times)} s; {same} of {len(fits)} are found as "
         "that. A parameter has to gain more likelihood than its charge, and of processes slower than a good part of "
-        f"the recording two look much like one. {doubts} Bias instability is the lowest dip of the Allan deviation; "
-        "a model may lack a dip that the truth has. At long averaging times the virtual gyro looks "
+        f"the recording two look much like one. {doubts} At long averaging times the virtual gyro looks "
         "better than it is, as its weights are from this very recording."
     )

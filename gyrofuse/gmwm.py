@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import fields
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -24,7 +24,7 @@ from gyrofuse.continuous import fit_moments
 from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.moment_fit import composition_of
 from gyrofuse.moment_identity import remarks
-from gyrofuse.moment_inference import Estimates, Fit, Inference, estimated, infer
+from gyrofuse.moment_inference import Fit, Inference, either, infer, infer_efficient
 from gyrofuse.moment_profile import MomentSurface, SpectralSurface, profiled
 from gyrofuse.processes import Model
 from gyrofuse.recording import Recording
@@ -56,8 +56,8 @@ def fit_gmwm(
     the fitted model (`optimal`), the reciprocal variances (`diagonal`), the identity, or weights of your own. The
     frequencies of sinusoids come from the signal's spectrum, where they show a thousand times more sharply than in
     wavelet variances; lines of fewer than 30 cycles or hardly above the noise are tested against a noise spectrum
-    fitted to the record, and `remarks` say which could be noise. AR1s are given from slow to fast, sinusoids from high
-    to low frequency.
+    fitted to the record, and `remarks` say which could be noise, and where the amplitude that the moments ask for is
+    more than the spectrum holds. AR1s are given from slow to fast, sinusoids from high to low frequency.
 
     Intervals are symmetric in logarithms, `atanh phi` and `logit(beta / pi)`. Those of variances at zero, of what is
     known to hardly its order of magnitude and of AR1s that another process could stand for are by profile: every value
@@ -87,7 +87,9 @@ def fit_gmwm(
         n_samples: Length of the record behind a wavelet variance.
         n_levels: Number of levels J; by default all that hold two windows side by side.
         refine: Go on from the moments to the maximum of the spectral (Whittle) likelihood, which knows the parameters
-            a few per cent better; the fit has to start near it, and the signal may have no missing samples.
+            a few per cent better; the fit has to start near it, and the signal may have no missing samples. The J test
+            is that of the parameters given: of white noise, an AR1 and a random walk without and with a tone it refuses
+            4.3 and 4.7 % at 5 % (300 records each of 10 000 samples), 6.0 and 2.8 % (250 records each of 40 000).
         efficiency: 1 for the mean square of the coefficients; below, for `robust_wavelet_variance` of that efficiency
             (as a wavelet variance given must be), with its own covariance in weights, intervals and J test. Gaussian
             processes only: it is not consistent for sinusoids and drifts. Levels hold 16 windows by default. Spikes no
@@ -150,17 +152,12 @@ def fit_gmwm(
     fit = fit_moments(nu[usable], frequencies, records, made_of, omega, moments)
     inference = infer(fit, made_of, confidence_level)
     if refine and series is not None:
-        estimates, fitted = _refined(series[usable], tones, fit, made_of, inference, confidence_level)
+        inference = _refined(series[usable], tones, fit, made_of, inference, confidence_level)
     else:
-        surface = MomentSurface(fit, made_of)
-        estimates = profiled(inference.estimates, surface, fit, made_of, confidence_level, inference.refused)
-        fitted = inference.fitted
+        inference = profiled(inference, MomentSurface(fit, made_of), fit, made_of, confidence_level)
     return GMWMResult.build(
-        fit=fit,
         inference=inference,
-        estimates=estimates,
-        fitted=fitted,
-        remarks=remarks(made_of, estimates, length, confidence_level, tones),
+        remarks=remarks(made_of, inference.estimates, length, confidence_level, tones),
         made_of=made_of,
         usable=usable,
         wavelet_variance=nu,
@@ -183,8 +180,8 @@ def _refined(
     made_of: Composition,
     inference: Inference,
     confidence_level: float,
-) -> tuple[Estimates, Tensor]:
-    """Estimates and wavelet variances at the maximum of the spectral likelihood; the moments' where there is none."""
+) -> Inference:
+    """What the maximum of the spectral likelihood says, and the moments where there is none."""
     whittle = refine_whittle(series, made_of, fit.linear, fit.shape, tones=tones)
     kept = ~whittle.converged
     if bool(kept.any()):
@@ -193,18 +190,13 @@ def _refined(
             "near the moments); they are those of the moments",
             stacklevel=3,
         )
-    linear = torch.where(kept[:, None], fit.linear, whittle.linear)
-    shape = torch.where(kept[:, None], fit.shape, whittle.shape)
-    better = estimated(made_of, linear, shape, whittle.covariance, whittle.edge_sd, confidence_level)
+    linear, shape = either(kept, fit.linear, whittle.linear), either(kept, fit.shape, whittle.shape)
+    there = replace(fit, linear=linear, shape=shape, converged=torch.ones_like(kept))
+    better = infer_efficient(there, made_of, whittle.covariance, whittle.edge_sd, confidence_level)
     likelihood = SpectralSurface(linear, shape, whittle.energy, whittle.count, made_of, series.shape[-1])
-    better = profiled(better, likelihood, fit, made_of, confidence_level, inference.refused, ~kept)
-    moments = MomentSurface(fit, made_of)
-    own = profiled(inference.estimates, moments, fit, made_of, confidence_level, inference.refused, kept)
-    merged = (
-        torch.where(kept.view(-1, *(1,) * (new.ndim - 1)), old, new)
-        for old, new in ((getattr(own, f.name), getattr(better, f.name)) for f in fields(Estimates))
-    )
-    return Estimates(*merged), made_of.wavelet_variance(fit.tau, linear, shape)
+    better = profiled(better, likelihood, fit, made_of, confidence_level, ~kept)
+    own = profiled(inference, MomentSurface(fit, made_of), fit, made_of, confidence_level, kept)
+    return either(kept, own, better)
 
 
 def _weighting(weighting: str | Tensor, levels: int) -> tuple[str, str | Tensor]:
@@ -272,7 +264,8 @@ def _report(nu: Tensor, usable: Tensor, sensors: tuple[str, ...], strict: bool, 
     places = [f"sensor {sensors[i % n_sensors]}{item}" for i, item in zip(bad, items, strict=True)]
     what = (
         "expected wavelet variances that are finite and > 0 at every level (a constant signal has none, nor has one "
-        "with infinite samples; gaps leave no whole window at the last levels), got others at "
+        "with infinite samples; squares of huge or tiny numbers leave the range; gaps leave no whole window at the "
+        "last levels), got others at "
         f"{named(places, range(len(places)))}"
     )
     if strict or not bool(usable.any()):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -11,11 +12,11 @@ from torch import Tensor
 
 from gyrofuse._composition import Composition
 from gyrofuse._records import Records
-from gyrofuse._result import ConfidenceInterval, cleaned, listed
-from gyrofuse.datasheet import datasheet
-from gyrofuse.moment_inference import Estimates, Fit, Inference
+from gyrofuse._result import ConfidenceInterval, cleaned, counted, listed
+from gyrofuse.datasheet import Datasheet, datasheet
+from gyrofuse.moment_inference import Inference
 from gyrofuse.processes import Model
-from gyrofuse.uncertainty import chi_square_interval, chi_square_tail
+from gyrofuse.uncertainty import chi_square_interval
 from gyrofuse.units import RATE_UNITS
 
 if TYPE_CHECKING:
@@ -39,15 +40,16 @@ class GMWMResult:
         identified: `(..., sensor)`; False where parameters cannot be told apart at this length.
         remarks: What cannot, in words, for each sensor, item after item.
         objective: `r' Omega r` with `r = nu - nu(theta)`, `(..., sensor)`.
-        j_statistic: `r' V^-1 r`, `(..., sensor)`.
+        j_statistic: `r' V^-1 r` at these parameters, `(..., sensor)`.
         p_value: Of the J test, that the model is complete, `(..., sensor)`; NaN where the model has as many
-            parameters as there are levels, or the weights are not `V^-1`.
-        converged: `(..., sensor)`.
+            parameters as there are levels, or the weights are not `V^-1`. Where the parameters are refined, by
+            a chi-square of the mean and variance that the J statistic has there.
+        converged: `(..., sensor)`; of the likelihood where it refined the parameters, else of the moments.
         wavelet_variance: Measured, `(..., level, sensor)`, signal^2.
         fitted_wavelet_variance: Of the model, the same.
         records: Length of the record, or of those that the fit was to jointly, and the wavelet variances' efficiency.
         weighting: Of the moments.
-        refined: Whether the parameters are those of the spectral likelihood; the J test is the moments' all the same.
+        refined: Whether the parameters are those of the spectral likelihood.
         sensors: Names.
         rate: Hz, where known.
         unit: Of the signal, where known.
@@ -81,10 +83,7 @@ class GMWMResult:
     def build(
         cls,
         *,
-        fit: Fit,
         inference: Inference,
-        estimates: Estimates,
-        fitted: Tensor,
         remarks: list[tuple[str, ...]],
         made_of: Composition,
         usable: Tensor,
@@ -99,8 +98,8 @@ class GMWMResult:
             whole[usable] = value
             return whole.view(*batch, *value.shape[1:])
 
-        tested = (inference.degrees > 0) & (rest["weighting"] in ("optimal", "continuous"))
-        p_value = torch.where(tested, chi_square_tail(inference.j_statistic, inference.degrees), torch.nan)
+        estimates, tested = inference.estimates, rest["weighting"] in ("optimal", "continuous")
+        p_value = inference.p_value if tested else torch.full_like(inference.p_value, torch.nan)
         params = placed(estimates.params, torch.nan)
         said = iter(remarks)
         return cls(
@@ -115,9 +114,9 @@ class GMWMResult:
             objective=placed(inference.objective, torch.nan),
             j_statistic=placed(inference.j_statistic, torch.nan),
             p_value=placed(p_value, torch.nan),
-            converged=placed(fit.converged, False),
+            converged=placed(inference.converged, False),
             wavelet_variance=wavelet_variance.view(*batch, -1).mT,
-            fitted_wavelet_variance=placed(fitted, torch.nan).mT,
+            fitted_wavelet_variance=placed(inference.fitted, torch.nan).mT,
             **rest,
         )
 
@@ -131,16 +130,20 @@ class GMWMResult:
         """Of the wavelet variances, 1 for the classic ones, less for robust ones."""
         return self.records.efficiency
 
+    @property
+    def name(self) -> str:
+        """Of the model, such as `AR1 + RW + 3*SIN`."""
+        return Composition(self.model.processes, held=True).name
+
     def summary(self) -> str:
         """Parameters with intervals, sensor by sensor, and in datasheet units where rate and unit of rate are known."""
         batch = self.params.shape[:-2]
-        name = " + ".join(p.symbol for p in self.model.processes)
         kind = "GMWM fit, refined by spectral likelihood," if self.refined else "GMWM fit"
         robust = f", robust, efficiency {self.efficiency:g}" if self.efficiency < 1 else ""
         matched = f", {self.weighting} weighting" if self.weighting != "optimal" else ""
         matched += ", log moments" if self.moments == "log" else ""
         levels = self.wavelet_variance.shape[-2]
-        lines = [f"{kind} of {name}: {self.n_samples} samples, {levels} levels{matched}{robust}"]
+        lines = [f"{kind} of {self.name}: {self.n_samples} samples, {counted(levels, 'level')}{matched}{robust}"]
         n_items = self.params.shape[:-1].numel()
         if batch:
             lines.append(f"{n_items} fits in a batch {tuple(batch)}, {int(self.converged.sum())} converged")
@@ -171,13 +174,23 @@ class GMWMResult:
             note = "" if bool(self.determined[index][k]) else "  weakly determined"
             if value == 0:
                 note = "  at its limit"
-            rows.append(f"  {name:<24}{value:>13.6g}  [{first:>13.6g}, {last:>13.6g}]{note}")
+            digits = _digits(value, last - first)
+            numbers = [f"{number:>13.{digits}g}" for number in (value, first, last)]
+            rows.append(f"  {name:<24}{numbers[0]}  [{numbers[1]}, {numbers[2]}]{note}")
         item = sum(i * step for i, step in zip(index, self.identified.stride(), strict=True))
         rows += [f"  {text}" for text in self.remarks[item]]
         if self.rate and self.unit in RATE_UNITS:
-            own = self.model.with_params(self.params[index])
-            rows += ["  " + line for line in datasheet(own, self.rate, self.unit).summary().splitlines()[1:]]
+            rows += ["  " + line for line in self.datasheet(index).summary().splitlines()[1:]]
         return rows
+
+    def datasheet(self, index: tuple[int, ...]) -> Datasheet:
+        """One sensor's model in datasheet units, where rate and unit of rate are known.
+
+        Args:
+            index: Of the sensor among the leading dimensions.
+        """
+        own, levels = self.model.with_params(self.params[index]), self.wavelet_variance.shape[-2]
+        return datasheet(own, self.rate or 1.0, self.unit or "", n_levels=levels)
 
     def plot(self, ax: Axes | None = None, *, index: tuple[int, ...] | None = None) -> Axes:
         """Draw one sensor's Allan deviation with intervals, the fitted model and each of its components.
@@ -196,7 +209,16 @@ class GMWMResult:
         # Degrees of freedom of the model: a variance that came out small by chance would seem to have none.
         degrees = 2 * model.wavelet_variance(len(measured)).square() / spread
         limits = chi_square_interval(measured, degrees, self.confidence_level)
-        return plot_moment_fit(measured, limits, model, rate=self.rate, unit=self.unit, ax=ax)
+        return plot_moment_fit(
+            measured,
+            limits,
+            model,
+            confidence_level=self.confidence_level,
+            rate=self.rate,
+            unit=self.unit,
+            title=f"sensor {self.sensors[index[-1]]}: {self.name}",
+            ax=ax,
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers and lists; what is not known is None."""
@@ -226,3 +248,9 @@ class GMWMResult:
             "rate": self.rate,
             "unit": self.unit,
         }
+
+
+def _digits(value: float, width: float) -> int:
+    """Significant digits with which the limits of an interval differ from the value; 6 do but for tones."""
+    known = width > 0 and math.isfinite(width) and value != 0
+    return min(max(6, math.ceil(math.log10(abs(value) / width)) + 2), 11) if known else 6

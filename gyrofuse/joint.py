@@ -160,17 +160,13 @@ def fit_jointly(
     frequencies, disagreement = _frequencies(separate, made_of, usable)
     fit = fit_items(nu, frequencies, records, made_of, "optimal")
     inference = infer(fit, made_of, confidence_level)
-    surface = MomentSurface(fit, made_of)
-    estimates = profiled(inference.estimates, surface, fit, made_of, confidence_level, inference.refused)
+    inference = profiled(inference, MomentSurface(fit, made_of), fit, made_of, confidence_level)
 
     whole = first.wavelet_variance.new_full((len(usable), records.n_levels), torch.nan)
     whole[usable] = nu
     joint = GMWMResult.build(
-        fit=fit,
         inference=inference,
-        estimates=estimates,
-        fitted=inference.fitted,
-        remarks=remarks(made_of, estimates, records.longest, confidence_level),
+        remarks=remarks(made_of, inference.estimates, records.longest, confidence_level),
         made_of=made_of,
         usable=usable,
         wavelet_variance=whole,

@@ -60,7 +60,10 @@ def model_method(result: GMWMResult) -> str:
             "their covariance is their own, and intervals are those of clean noise."
         )
     if result.refined:
-        sentences.append("From there the spectral (Whittle) likelihood was maximised.")
+        sentences.append(
+            "From there the spectral (Whittle) likelihood was maximised. Parameters, residuals and J test are those of "
+            "its maximum."
+        )
     sentences.append(
         "Frequencies of tones are those of the spectrum. Intervals rest on the model: where the J test refuses it they "
         "are too narrow."

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -17,7 +17,7 @@ from gyrofuse._paths import own_generator
 from gyrofuse._result import ConfidenceInterval, listed
 from gyrofuse.continuous import fit_moments
 from gyrofuse.gmwm_result import GMWMResult
-from gyrofuse.moment_inference import Estimates, Fit, Inference, estimated, infer
+from gyrofuse.moment_inference import Fit, Inference, infer, infer_efficient
 from gyrofuse.processes import AR1, Sinusoid
 from gyrofuse.robust import robust_wavelet_variance
 from gyrofuse.whittle import refine_whittle
@@ -234,14 +234,11 @@ def _fitted(
     frequencies = None if tones is None else (tones.beta, tones.beta_sd)
     fit: Fit = fit_moments(variance, frequencies, result.records, made_of, omega, result.moments)
     inference: Inference = infer(fit, made_of, result.confidence_level)
-    estimates: Estimates = inference.estimates
-    params, covariance = estimates.params, estimates.covariance
     if result.refined:
         refined = refine_whittle(series, made_of, fit.linear, fit.shape, tones=tones)
-        better = estimated(
-            made_of, refined.linear, refined.shape, refined.covariance, refined.edge_sd, result.confidence_level
-        )
-        params, covariance = better.params, better.covariance
+        there = replace(fit, linear=refined.linear, shape=refined.shape)
+        inference = infer_efficient(there, made_of, refined.covariance, refined.edge_sd, result.confidence_level)
+    params, covariance = inference.estimates.params, inference.estimates.covariance
     spread = _in_unknowns(made_of, params, covariance)
     batch = records.shape[:2]
     return params.unflatten(0, batch), spread.unflatten(0, batch), inference.j_statistic.unflatten(0, batch)

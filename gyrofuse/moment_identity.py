@@ -17,6 +17,7 @@ from gyrofuse.uncertainty import normal_quantile
 # A tone of fewer cycles is a trend, an AR1 of which the record holds fewer time constants a random walk.
 FEWEST_TIME_CONSTANTS = 2.0
 _BY_CHANCE = 0.05  # p value above which a line may be noise
+_BEYOND_DOUBT = 5.0  # standard deviations between two measurements of one amplitude
 _ONE_FOR_THE_OTHER = 0.95  # correlation beyond which two parameters are known in combination only
 
 
@@ -80,6 +81,12 @@ def remarks(
         for item, tone in (tones.p_value >= _BY_CHANCE).nonzero().tolist():
             p_value = tones.p_value[item, tone].item()
             said[item].append(f"{sinusoids[tone]}: not told from the noise (p = {p_value:.1g})")
+        for item, tone in _standing_in(made_of, estimates, tones).nonzero().tolist():
+            held = tones.amplitude[item, tone].item()
+            said[item].append(
+                f"{sinusoids[tone]}: the spectrum holds an amplitude of {held:.2g} at this frequency, the rest stands "
+                "in for what the model lacks; refine the fit"
+            )
     return [tuple(texts) for texts in said]
 
 
@@ -127,6 +134,13 @@ def _combined(made_of: Composition, estimates: Estimates) -> dict[tuple[int, int
             weak & (size > 0) & (estimates.covariance[:, one, two].square() > _ONE_FOR_THE_OTHER**2 * size)
         )
     return found
+
+
+def _standing_in(made_of: Composition, estimates: Estimates, tones: Tones) -> Tensor:
+    """Sinusoids that the moments find beyond doubt larger than the spectrum does, `(item, sinusoid)`."""
+    places = [made_of.places[k] for k, process in enumerate(made_of.processes) if isinstance(process, Sinusoid)]
+    spread = estimates.covariance.diagonal(dim1=-2, dim2=-1)[:, places] + tones.amplitude_sd.square()
+    return estimates.params[:, places] - tones.amplitude > _BEYOND_DOUBT * spread.sqrt()
 
 
 def _shape_at(made_of: Composition, k: int) -> int:

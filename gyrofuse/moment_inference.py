@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -76,7 +77,9 @@ class Inference:
         fitted: Wavelet variances of the fitted model, `(item, level)`.
         objective: `r' Omega r`, `(item,)`.
         j_statistic: `r' V^-1 r`, `(item,)`.
-        degrees: Of freedom of the J statistic, `(item,)`.
+        degrees: Of freedom of the J statistic, its mean, `(item,)`.
+        dispersion: Variance of the J statistic over that of a chi-square of this mean, `(item,)`.
+        converged: `(item,)`.
     """
 
     estimates: Estimates
@@ -84,11 +87,26 @@ class Inference:
     objective: Tensor
     j_statistic: Tensor
     degrees: Tensor
+    dispersion: Tensor
+    converged: Tensor
+
+    @property
+    def p_value(self) -> Tensor:
+        """Of the J test, by a scaled chi-square of the same mean and variance, `(item,)`; NaN without freedom."""
+        return chi_square_tail(self.j_statistic / self.dispersion, self.degrees / self.dispersion)
 
     @property
     def refused(self) -> Tensor:
         """Whether the J test leaves the model no chance, `(item,)`."""
-        return chi_square_tail(self.j_statistic, self.degrees) < _NO_CHANCE
+        return self.p_value < _NO_CHANCE
+
+
+def either(condition: Tensor, one: Any, other: Any) -> Any:
+    """The first for items that meet a condition `(item,)`, the second for the others; tensors, or records of them."""
+    if isinstance(one, Tensor):
+        return torch.where(condition.view(-1, *(1,) * (one.ndim - 1)), one, other)
+    pairs = ((getattr(one, f.name), getattr(other, f.name)) for f in fields(one))
+    return type(one)(*(either(condition, *pair) for pair in pairs))
 
 
 def infer(fit: Fit, made_of: Composition, confidence_level: float) -> Inference:
@@ -99,37 +117,112 @@ def infer(fit: Fit, made_of: Composition, confidence_level: float) -> Inference:
         made_of: Structure of the model.
         confidence_level: Probability that an interval holds the true value.
     """
+    own = _misfit(fit, made_of)
+    # Jacobian by p, and by x of the unknown shapes: (item, level, unknown)
+    moving = [made_of.shaped.index(k) for k in made_of.curved]
+    jacobian = torch.cat([own.values, own.slopes[..., moving]], -1)
+    present = fit.linear > 0  # (item, process)
+    active = torch.cat([present, present[:, made_of.curved]], -1)
+    spread = _sandwich(jacobian, active, own.covariance, own.weight)
+    # With the variances at zero let off it, how far they might be.
+    free = torch.cat([torch.ones_like(present), present[:, made_of.curved]], -1)
+    edge = _sandwich(jacobian, free, own.covariance, own.weight)
+    estimates = estimated(
+        made_of,
+        fit.linear,
+        fit.shape,
+        _in_logs(spread, fit, made_of),
+        edge.diagonal(dim1=-2, dim2=-1)[:, : made_of.n_linear].clamp(min=0).sqrt(),
+        confidence_level,
+    )
+    degrees = (len(fit.tau) - active.sum(-1)).to(own.j_statistic)
+    return Inference(
+        estimates, own.fitted, own.objective, own.j_statistic, degrees, torch.ones_like(degrees), fit.converged
+    )
+
+
+def infer_efficient(
+    fit: Fit, made_of: Composition, spread: Tensor, edge_sd: Tensor, confidence_level: float
+) -> Inference:
+    """What efficient estimates leave of the moments: the J test at parameters that are no minimum of it.
+
+    An efficient estimate of covariance `S` is uncorrelated with what it leaves (Hausman):
+    `Var r = V - A S A'`, so that `r' V^-1 r` is a sum of squares of normal variables with the eigenvalues of
+    `1 - L^-1 A S A' L^-T`, `V = L L'`, as weights: 0 to 1, where a minimum has zeros and ones alone.
+
+    Args:
+        fit: Moments, and the estimates in the place of where a search ended.
+        made_of: Structure of the model.
+        spread: `S`, of `ln p` of all processes and `x` of all shaped ones, `(item, unknown, unknown)`; what is not
+            known of it takes nothing from the residuals, so that the test refuses too seldom.
+        edge_sd: As in `estimated`.
+        confidence_level: Probability that an interval holds the true value.
+
+    References:
+        J. A. Hausman, Econometrica 46, 1978.
+    """
+    own = _misfit(fit, made_of)
+    jacobian = torch.cat([own.values * fit.linear[:, None], own.slopes], -1)
+    moved = torch.linalg.solve_triangular(own.root, jacobian, upper=False)
+    part = moved @ spread.nan_to_num(nan=0.0, posinf=0.0) @ moved.mT
+    taken = torch.linalg.eigvalsh(torch.where(own.j_statistic.isfinite()[:, None, None], part, 0.0)).clamp(0, 1)
+    degrees = (1 - taken).sum(-1)
+    dispersion = (1 - taken).square().sum(-1) / degrees
+    estimates = estimated(made_of, fit.linear, fit.shape, spread, edge_sd, confidence_level)
+    return Inference(estimates, own.fitted, own.objective, own.j_statistic, degrees, dispersion, fit.converged)
+
+
+@dataclass(frozen=True, eq=False)
+class _Misfit:
+    """Moments against a model.
+
+    Attributes:
+        fitted: `nu(theta)`, `(item, level)`.
+        covariance: `V`, `(item, level, level)`.
+        root: Its Cholesky factor.
+        weight: `Omega`, or one for each item.
+        objective: `r' Omega r`, `(item,)`.
+        j_statistic: `r' V^-1 r`, `(item,)`.
+        values: Derivatives `(item, level, process)` by `p`.
+        slopes: The same by `x` of all shaped processes.
+    """
+
+    fitted: Tensor
+    covariance: Tensor
+    root: Tensor
+    weight: Tensor
+    objective: Tensor
+    j_statistic: Tensor
+    values: Tensor
+    slopes: Tensor
+
+
+def _misfit(fit: Fit, made_of: Composition) -> _Misfit:
     values, slopes = made_of.columns(fit.tau, fit.shape), made_of.slopes(fit.tau, fit.shape)
     fitted = (values @ fit.linear[..., None])[..., 0]
-    model = made_of.model(fit.linear, fit.shape)
-    covariance = fit.records.covariance(model)
+    covariance = fit.records.covariance(made_of.model(fit.linear, fit.shape))
     residual = fit.variance - fitted
     if fit.moments == "log":
         residual, covariance = log_residual(fit.variance, fitted, covariance)
     root, failed = torch.linalg.cholesky_ex(covariance)
     whitened = torch.linalg.solve_triangular(root, residual[..., None], upper=False)[..., 0]
     j_statistic = torch.where(failed > 0, torch.nan, whitened.square().sum(-1))
+    weight = _weight(fit.omega, covariance)
+    objective = _quadratic(residual, weight)
+    slopes = slopes * fit.linear[:, None, made_of.shaped]
+    return _Misfit(fitted, covariance, root, weight, objective, j_statistic, values, slopes)
 
-    # Jacobian by p, and by x of the unknown shapes: (item, level, unknown)
-    moving = [made_of.shaped.index(k) for k in made_of.curved]
-    jacobian = torch.cat([values, (slopes * fit.linear[:, None, made_of.shaped])[..., moving]], -1)
-    present = fit.linear > 0  # (item, process)
-    active = torch.cat([present, present[:, made_of.curved]], -1)
-    own, objective = _sandwich(jacobian, active, covariance, residual, fit.omega)
-    # With the variances at zero let off it, how far they might be.
-    free = torch.cat([torch.ones_like(present), present[:, made_of.curved]], -1)
-    edge, _ = _sandwich(jacobian, free, covariance, residual, fit.omega)
-    n_linear = made_of.n_linear
-    estimates = estimated(
-        made_of,
-        fit.linear,
-        fit.shape,
-        _in_logs(own, fit, made_of),
-        edge.diagonal(dim1=-2, dim2=-1)[:, :n_linear].clamp(min=0).sqrt(),
-        confidence_level,
-    )
-    degrees = (len(fit.tau) - active.sum(-1)).to(j_statistic)
-    return Inference(estimates, fitted, objective, j_statistic, degrees)
+
+def _quadratic(residual: Tensor, weight: Tensor) -> Tensor:
+    return ((weight @ residual[..., None])[..., 0] * residual).sum(-1)
+
+
+def _weight(omega: str | Tensor, covariance: Tensor) -> Tensor:
+    if isinstance(omega, Tensor):
+        return torch.diag(omega.to(covariance)) if omega.ndim == 1 else omega.to(covariance)
+    if omega == "diagonal":
+        return torch.diag_embed(covariance.diagonal(dim1=-2, dim2=-1).reciprocal())
+    return torch.linalg.inv_ex(covariance)[0]
 
 
 def _in_logs(own: Tensor, fit: Fit, made_of: Composition) -> Tensor:
@@ -199,21 +292,12 @@ def estimated(
     return Estimates(made_of.params(linear, shape), covariance, lows, highs, determined)
 
 
-def _sandwich(
-    jacobian: Tensor, active: Tensor, covariance: Tensor, residual: Tensor, omega: str | Tensor
-) -> tuple[Tensor, Tensor]:
-    """Covariance `(item, unknown, unknown)` of the unknowns, zero where not active, and `r' Omega r`."""
+def _sandwich(jacobian: Tensor, active: Tensor, covariance: Tensor, weight: Tensor) -> Tensor:
+    """Covariance `(item, unknown, unknown)` of the unknowns, zero where not active."""
     columns = jacobian * active[:, None].to(jacobian)
     size = columns.square().sum(-2).sqrt()
     size = torch.where(size > 0, size, 1.0)
     columns = columns / size[:, None]
-    if isinstance(omega, Tensor):
-        weight = torch.diag(omega.to(covariance)) if omega.ndim == 1 else omega.to(covariance)
-    elif omega == "diagonal":
-        weight = torch.diag_embed(covariance.diagonal(dim1=-2, dim2=-1).reciprocal())
-    else:
-        weight = torch.linalg.inv_ex(covariance)[0]
-    objective = ((weight @ residual[..., None])[..., 0] * residual).sum(-1)
     weighted = weight @ columns
     bread = columns.mT @ weighted
     scale = bread.diagonal(dim1=-2, dim2=-1).clamp(min=torch.finfo(bread.dtype).tiny).sqrt()
@@ -222,4 +306,4 @@ def _sandwich(
     inverse = torch.linalg.inv_ex(scaled)[0] / scale[:, :, None] / scale[:, None, :]
     spread = inverse @ (weighted.mT @ covariance @ weighted) @ inverse
     keep = active[:, :, None] & active[:, None, :]
-    return torch.where(keep, spread / size[:, :, None] / size[:, None, :], 0.0), objective
+    return torch.where(keep, spread / size[:, :, None] / size[:, None, :], 0.0)

@@ -26,7 +26,7 @@ from gyrofuse._cosine_bins import Bins, Noise
 from gyrofuse._profile import crossings, grid
 from gyrofuse._spectral_search import deviance, maximise
 from gyrofuse.moment_identity import uncertain
-from gyrofuse.moment_inference import WEAKLY_DETERMINED, Estimates, Fit
+from gyrofuse.moment_inference import WEAKLY_DETERMINED, Fit, Inference
 from gyrofuse.processes import AR1, Drift, Sinusoid
 from gyrofuse.uncertainty import normal_quantile
 
@@ -201,26 +201,27 @@ def _as_normal(variance: Tensor, expected: Tensor, covariance: Tensor) -> Tensor
 
 
 def profiled(
-    estimates: Estimates,
+    inference: Inference,
     surface: Surface,
     fit: Fit,
     made_of: Composition,
     confidence_level: float,
-    refused: Tensor,
     which: Tensor | None = None,
-) -> Estimates:
+) -> Inference:
     """Replace the limits of what is uncertain, see `moment_identity.uncertain`, by those of the profile.
 
+    Where the model does not fit, what is minimised may rise steeply without any meaning: the wider one of both
+    intervals is kept.
+
     Args:
-        estimates: Of the fit.
+        inference: Estimates, and whether the model fits.
         surface: What was minimised.
         fit: Of the moments.
         made_of: Structure of the model.
         confidence_level: Probability that an interval holds the true value.
-        refused: Items whose model does not fit, `(item,)`. What is minimised may rise steeply there without any
-            meaning: the wider one of both intervals is kept.
         which: Items, `(item,)`; all by default.
     """
+    estimates, refused = inference.estimates, inference.refused
     needed = uncertain(made_of, estimates, fit.records.longest, confidence_level)
     needed &= estimates.params.isfinite().all(-1, keepdim=True)
     if fit.omega != "optimal" and isinstance(surface, MomentSurface):
@@ -263,7 +264,7 @@ def profiled(
         low[items, place] = torch.where(wide, torch.minimum(first, linear[0]), first)
         high[items, place] = torch.where(wide, torch.maximum(last, linear[1]), last)
         determined[items, place] = width < 2 * z[items] * WEAKLY_DETERMINED
-    return replace(estimates, low=low, high=high, determined=determined)
+    return replace(inference, estimates=replace(estimates, low=low, high=high, determined=determined))
 
 
 def _widths(surface: Surface, made_of: Composition, needed: Tensor, confidence_level: float) -> Tensor:

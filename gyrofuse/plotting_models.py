@@ -18,6 +18,11 @@ if TYPE_CHECKING:
 # Okabe and Ito without the blue of the sum.
 _COLOURS = ("#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 _STYLES = ("--", "-.", ":")
+# Of a legend, a row as a share of the axes' height.
+_LEGEND_COLUMNS, _LEGEND_ROW = 4, 0.07
+_FADED = "#b8b8b8"
+# Of the criterion, up to which its axis is linear.
+_LINEAR = 10.0
 
 
 def plot_moment_fit(
@@ -25,8 +30,10 @@ def plot_moment_fit(
     limits: tuple[Tensor, Tensor],
     model: Model,
     *,
+    confidence_level: float | None = None,
     rate: float | None = None,
     unit: str | None = None,
+    title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
     """Draw a measured Allan deviation `sqrt(2 nu)` with intervals, that of the fitted model, and its components.
@@ -35,8 +42,10 @@ def plot_moment_fit(
         wavelet_variance: `(level,)`, signal^2.
         limits: Lower and upper limits of it, `(level,)` each.
         model: Fitted, with scalar parameters.
+        confidence_level: Of the limits, for the legend.
         rate: Hz; without it the averaging times are in samples.
         unit: Unit of the signal.
+        title: Of the axes.
         ax: Where to draw; new axes by default.
 
     Returns:
@@ -47,13 +56,14 @@ def plot_moment_fit(
     times = np.exp2(np.arange(n_levels)) / (rate or 1.0)
     low, high = limits
     handles: list[Any] = [ax.fill_between(times, _deviation(low), _deviation(high), zorder=1, **_SHADE)]
-    labels = ["interval"]
+    labels = ["interval" if confidence_level is None else f"{100 * confidence_level:g} % interval"]
     dots: dict[str, Any] = {"color": _INK, "marker": "o", "markersize": 4, "linestyle": "none"}
     handles += ax.plot(times, _deviation(wavelet_variance), zorder=4, **dots)
     labels += ["measured"]
-    handles += ax.plot(times, _deviation(model.wavelet_variance(n_levels)), color=_BLUE, linewidth=2.2, zorder=3)
+    fitted = model.wavelet_variance(n_levels).to(wavelet_variance)
+    handles += ax.plot(times, _deviation(fitted), color=_BLUE, linewidth=2.2, zorder=3)
     labels += ["fitted model"]
-    shown = torch.cat([low, high, wavelet_variance])
+    shown = torch.cat([low, high, wavelet_variance, fitted])
     floor = shown[shown > 0].min().item() / 30
     seen: dict[str, int] = {}
     for k, process in enumerate(model.processes):
@@ -61,14 +71,20 @@ def plot_moment_fit(
         variance = process.wavelet_variance(n_levels)
         if not bool((variance > floor).any()):
             continue
-        visible = torch.where(variance > floor, variance, torch.nan)
+        visible = torch.where(variance > 0, variance, torch.nan)
         style: dict[str, Any] = {"color": _COLOURS[k % len(_COLOURS)], "linestyle": _STYLES[k % len(_STYLES)]}
         handles += ax.plot(times, _deviation(visible), zorder=2, linewidth=1.1, **style)
         labels += [process.symbol + (f" {seen[process.symbol]}" if process.repeatable else "")]
     ax.set_yscale("log")
     ax.set_ylabel(with_unit("Allan deviation", unit), parse_math=False)
     _time_axis(ax, rate is not None)
-    _finish(ax, handles, labels)
+    if title:
+        ax.set_title(title, loc="left", fontsize=10, parse_math=False)
+    # Curves go on to the lower edge, and above all of them there is room for the legend.
+    bottom, top = (2 * floor) ** 0.5, (2 * max(shown.nan_to_num().max().item(), floor)) ** 0.5
+    room = _LEGEND_ROW * (1 + -(-len(labels) // _LEGEND_COLUMNS))
+    ax.set_ylim(bottom, top * (top / bottom) ** (room / (1 - room)))
+    _finish(ax, handles, labels, loc="upper center", ncols=_LEGEND_COLUMNS)
     return ax
 
 
@@ -129,6 +145,58 @@ def plot_resampled(
     ax.set_ylim(len(names) - 0.5, -0.5)
     ax.set_xlabel("less the estimate, in standard deviations of the resamples")
     _finish(ax, handles, [f"{percent:g} % percentile", f"{percent:g} % studentized", "mean of the resamples"])
+    return ax
+
+
+def plot_ranking(
+    names: list[str],
+    difference: Tensor,
+    redundant: Tensor,
+    *,
+    aside: list[str] | None = None,
+    title: str | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the criteria of candidates over that of the chosen one.
+
+    Args:
+        names: Of the candidates, from the best on.
+        difference: Of their criteria, `(candidate,)`.
+        redundant: Whether they are more than it takes, `(candidate,)`.
+        aside: Candidates that were not compared.
+        title: Of the axes.
+        ax: Where to draw; new axes by default.
+
+    Returns:
+        The axes.
+    """
+    ax = ax if ax is not None else _new_axes()
+    values, aside = difference.tolist(), aside or []
+    least, most = min([0.0, *values]), max([_LINEAR, *values])
+    ax.axvline(0.0, color=_INK, linewidth=0.8, zorder=1)
+    for redundancy, color, label in ((False, _BLUE, "candidate"), (True, _FADED, "redundant")):
+        places = [k for k, own in enumerate(redundant.tolist()) if own == redundancy]
+        if places:
+            shown = [values[k] for k in places]
+            ax.hlines(places, 0.0, shown, color=color, linewidth=5, zorder=2)
+            ax.plot(shown, places, "o", color=color, markersize=8, zorder=3, label=label)
+    for k, value in enumerate(values):
+        text = "chosen" if value == 0 else f"{value:+.1f}"
+        ax.annotate(text, (max(value, 0.0), k), (9, 0), textcoords="offset points", va="center", fontsize=8)
+    for k in range(len(aside)):
+        ax.annotate("not compared", (0.0, len(values) + k), (9, 0), textcoords="offset points", va="center", fontsize=8)
+    ax.set_yticks(range(len(values) + len(aside)), [*names, *aside])
+    ax.set_ylim(len(values) + len(aside) - 0.5, -0.5)
+    ax.set_xscale("symlog", linthresh=_LINEAR)
+    decades = [_LINEAR * 10.0**k for k in range(12)]
+    ticks = [-t for t in decades if t <= -least] + [0.0, _LINEAR / 2] + [t for t in decades if t <= 4 * most]
+    ax.set_xticks(sorted(ticks), [f"{t:.6g}" for t in sorted(ticks)])
+    ax.set_xticks([], minor=True)
+    ax.set_xlim(1.5 * least - 0.1 * _LINEAR, 4 * most)  # room for the numbers
+    ax.set_xlabel("criterion over that of the chosen model (half nats)")
+    if title:
+        ax.set_title(title, loc="left", fontsize=10, parse_math=False)
+    _finish(ax, *(ax.get_legend_handles_labels() if bool(redundant.any()) else ()))
     return ax
 
 

@@ -123,6 +123,8 @@ def rank_models(
     for c in table.choice.unique().tolist() if fit else ():
         which = places[table.choice == c]
         whole = _fitted(items[which], Model([kind() for kind in table.kinds[c]]), levels, n_samples, confidence_level)
+        # With the sinusoids in the model, not taken out: one J test for the table and the fit.
+        table.p_value[table.choice == c, c] = whole.p_value[:, 0]
         for i, place in enumerate(which.tolist()):
             own = (sensors[place % batch[-1]],)
             best[place] = _one_of(whole, i, own, recording)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from gyrofuse._rank_candidates import name_of
 from gyrofuse._rank_table import Table
-from gyrofuse._result import listed
+from gyrofuse._result import counted, listed
 from gyrofuse.gmwm_result import GMWMResult
 
 if TYPE_CHECKING:
@@ -32,13 +33,17 @@ class RankResult:
             number of sinusoids than was found, or a sensor that could not be ranked. Of a signal without the part that
             sinusoids have in it.
         wvic: Wavelet variance information criterion, the same.
-        p_value: Of the J test, that the candidate is complete, the same.
+        p_value: Of the J test, that the candidate is complete, the same; at the parameters of greatest likelihood. Of
+            a signal it is that of the record without its sinusoids, but for the chosen one that of its fit.
         redundant: Whether the fit amounts to a smaller candidate that explains the record as well, the same.
-        reasons: Why, for every sensor, `...` flattened, and candidate; None where it is not redundant.
+        reasons: Why, for every sensor, `...` flattened, and candidate, and why one that was given was not compared;
+            None where there is nothing to say.
         equivalent: Whether it is as good as the chosen one, and not it, the same as `criterion`.
         choice: Index of the chosen candidate, `(..., sensor)`; -1 where a sensor could not be ranked.
-        wvic_choice: Index of that with the least WVIC, the same.
-        n_tones: Sinusoids found, the same, -1 as before; None from a wavelet variance.
+        wvic_choice: Index of that with the least WVIC, the same: no advice, as its weights are from each candidate's
+            own covariance, which is large where the candidate fits badly.
+        n_tones: Sinusoids of those compared, the same, -1 as before; None from a wavelet variance.
+        n_lines: Lines that stand out of the noise, the same, at most one more than candidates have sinusoids.
         best: Fit of the chosen candidate for every sensor, `...` flattened; None where there is none.
         n_samples: Length of the records.
         from_signal: Whether the criterion is that of the spectral likelihood, or of the wavelet variance.
@@ -55,6 +60,7 @@ class RankResult:
     choice: Tensor
     wvic_choice: Tensor
     n_tones: Tensor | None
+    n_lines: Tensor | None
     best: tuple[GMWMResult | None, ...]
     n_samples: int
     from_signal: bool
@@ -84,6 +90,7 @@ class RankResult:
             choice=placed(table.choice, -1),
             wvic_choice=placed(table.wvic_choice, -1),
             n_tones=None if table.n_tones is None else placed(table.n_tones, -1),
+            n_lines=None if table.n_lines is None else placed(table.n_lines, -1),
             best=best,
             **rest,
         )
@@ -98,25 +105,56 @@ class RankResult:
         """Chosen for every sensor, `...` flattened."""
         return tuple(self.candidates[c] if c >= 0 else None for c in self.choice.flatten().tolist())
 
+    @property
+    def compared(self) -> str:
+        """How many candidates were compared, such as `3 of 4 candidates`, for any sensor."""
+        n = int(self.criterion.isfinite().flatten(0, -2).any(0).sum())
+        return (f"{n} of " if n < len(self.candidates) else "") + counted(len(self.candidates), "candidate")
+
+    def compared_to(self, index: tuple[int, ...]) -> list[int]:
+        """Candidates that were compared for a sensor, from the best on."""
+        difference = self.difference[index]
+        order = difference.nan_to_num(nan=torch.inf).argsort().tolist()
+        return [c for c in order if bool(difference[c].isfinite())]
+
+    def set_aside(self, index: tuple[int, ...]) -> list[int]:
+        """Candidates given that were not compared for a sensor; `reasons` says why."""
+        known = self.reasons_of(index)
+        return [c for c, value in enumerate(self.criterion[index].tolist()) if math.isnan(value) and known[c]]
+
+    def doubts(self, index: tuple[int, ...]) -> list[str]:
+        """What speaks against every candidate of a sensor, in sentences."""
+        found = []
+        p_value = self.p_value[index].nan_to_num(nan=1.0).max().item()
+        if p_value < _NONE_FITS:
+            found.append(f"No candidate fits: the J test refuses all (largest p = {p_value:.1g}).")
+        if self.n_lines is not None and self.n_tones is not None and bool(self.n_lines[index] > self.n_tones[index]):
+            found.append("The spectrum has a line more than those compared have sinusoids: allow more of them (SIN).")
+        return found
+
+    def reasons_of(self, index: tuple[int, ...]) -> tuple[str | None, ...]:
+        """`reasons` of a sensor, for every candidate."""
+        return self.reasons[sum(i * step for i, step in zip(index, self.choice.stride(), strict=True))]
+
     def summary(self) -> str:
         """The best candidates, sensor by sensor; of a large batch how often each was chosen."""
         by = f"{'spectral likelihood' if self.from_signal else 'likelihood of the wavelet variance'} (Hannan-Quinn)"
         n_items = self.choice.numel()
-        lines = [f"Noise models ranked by {by}: {self.n_samples} samples, {len(self.candidates)} candidates"]
+        lines = [f"Noise models ranked by {by}: {self.n_samples} samples, {self.compared}"]
         if self.choice.ndim > 1:
             lines.append(f"{n_items} records in a batch {tuple(self.choice.shape[:-1])}")
         if n_items > _MOST_TABLES:
             counts = Counter(name or "not ranked" for name in self.names)
             lines += [f"  {n:>8}  {name}" for name, n in counts.most_common(_MOST_ROWS)]
             return "\n".join(lines)
-        for n, index in enumerate(itertools.product(*map(range, self.choice.shape))):
-            lines += ["", *self._table(n, index)]
+        for index in itertools.product(*map(range, self.choice.shape)):
+            lines += ["", *self._table(index)]
         return "\n".join(lines)
 
     def __str__(self) -> str:
         return self.summary()
 
-    def _table(self, n: int, index: tuple[int, ...]) -> list[str]:
+    def _table(self, index: tuple[int, ...]) -> list[str]:
         where = f" of item {', '.join(map(str, index[:-1]))}" if len(index) > 1 else ""
         head = f"sensor {self.sensors[index[-1]]}{where}"
         if int(self.choice[index]) < 0:
@@ -125,27 +163,20 @@ class RankResult:
         same = [name for name, there in zip(self.candidates, self.equivalent[index].tolist(), strict=True) if there]
         if same:
             lines.append(f"  not told from it: {', '.join(same)}")
-        best = self.p_value[index].nan_to_num(nan=1.0).max().item()
-        if best < _NONE_FITS:
-            lines.append(f"  no candidate fits: the J test refuses all (largest p = {best:.1g})")
+        lines += [f"  {text}" for text in self.doubts(index)]
         wide = max(map(len, self.candidates))
         lines.append(f"  {'candidate':<{wide}}  {'criterion':>10}  {'WVIC':>8}  {'J test p':>8}")
         wvic = self.wvic[index] - self.wvic[index][int(self.wvic_choice[index])]
-        difference = self.difference[index]
-        order = self._order(index)
+        difference, reasons = self.difference[index], self.reasons_of(index)
+        order = self.compared_to(index)
         for c in order[:_MOST_ROWS]:
-            note = self.reasons[n][c]
             row = f"  {self.candidates[c]:<{wide}}  {difference[c].item():>+10.2f}  {wvic[c].item():>+8.2f}"
             row += f"  {self.p_value[index][c].item():>8.2g}"
-            lines.append(row + (f"  redundant: {note}" if note else ""))
+            lines.append(row + (f"  redundant: {reasons[c]}" if reasons[c] else ""))
         if len(order) > _MOST_ROWS:
-            lines.append(f"  and {len(order) - _MOST_ROWS} more; WVIC's own choice: {self._wvic_name(index)}")
-        else:
-            lines.append(f"  WVIC's own choice: {self._wvic_name(index)}")
+            lines.append(f"  and {len(order) - _MOST_ROWS} more")
+        lines += [f"  {self.candidates[c]:<{wide}}  not compared: {reasons[c]}" for c in self.set_aside(index)]
         return lines
-
-    def _wvic_name(self, index: tuple[int, ...]) -> str:
-        return self.candidates[int(self.wvic_choice[index])]
 
     def plot(self, ax: Axes | None = None) -> Axes:
         """Draw the criterion of the first sensor's best candidates over that of the chosen one.
@@ -153,26 +184,19 @@ class RankResult:
         Args:
             ax: Where to draw; a new figure by default.
         """
-        from gyrofuse.plotting import _finish, _new_axes
+        from gyrofuse.plotting_models import plot_ranking
 
-        ax = ax if ax is not None else _new_axes()
         first = (0,) * self.choice.ndim
-        order = self._order(first)[:_MOST_BARS]
-        difference = [self.difference[first][c].item() for c in order]
-        colors = ["#b8b8b8" if bool(self.redundant[first][c]) else "#0072b2" for c in order]
-        ax.barh(range(len(order)), difference, color=colors)
-        ax.set_yticks(range(len(order)), [self.candidates[c] for c in order])
-        ax.invert_yaxis()
-        ax.set_xscale("symlog", linthresh=10)
-        ax.set_xlabel("criterion over that of the chosen model (grey: redundant)")
-        _finish(ax)
-        return ax
-
-    def _order(self, index: tuple[int, ...]) -> list[int]:
-        """Candidates that were tried, from the best on."""
-        difference = self.difference[index]
-        order = difference.nan_to_num(nan=torch.inf).argsort().tolist()
-        return [c for c in order if bool(difference[c].isfinite())]
+        order = self.compared_to(first)[:_MOST_BARS]
+        aside = self.set_aside(first)[: _MOST_BARS - len(order)]
+        return plot_ranking(
+            [self.candidates[c] for c in order],
+            self.difference[first][order],
+            self.redundant[first][order],
+            aside=[self.candidates[c] for c in aside],
+            title=f"sensor {self.sensors[0]}",
+            ax=ax,
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers and lists; what is not known is None."""
@@ -189,6 +213,7 @@ class RankResult:
             "choice": self.choice.tolist(),
             "wvic_choice": self.wvic_choice.tolist(),
             "n_tones": None if self.n_tones is None else self.n_tones.tolist(),
+            "n_lines": None if self.n_lines is None else self.n_lines.tolist(),
             "best": [None if fit is None else fit.to_dict() for fit in self.best],
             "n_samples": self.n_samples,
             "from_signal": self.from_signal,

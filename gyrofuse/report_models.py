@@ -7,7 +7,6 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from gyrofuse.datasheet import datasheet
 from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.model_words import model_method, model_verdict, residuals
 from gyrofuse.plotting_models import plot_residuals
@@ -42,7 +41,7 @@ def model_report(result: GMWMResult, recording: Recording | None = None, *, titl
         title=title,
         result=result,
         recording=recording,
-        model=" + ".join(process.symbol for process in result.model.processes),
+        model=result.name,
         parts=parts,
         left_out=len(indices) - len(parts),
         method=model_method(result),
@@ -94,6 +93,7 @@ def _draw(figure: Figure, result: GMWMResult, index: tuple[int, ...]) -> None:
     above, below = figure.subplots(2, 1, height_ratios=[3, 1], sharex=True, gridspec_kw=margins)
     result.plot(above, index=index)
     above.set_xlabel("")
+    above.set_title("", loc="left")  # the page has it
     plot_residuals(residuals(result, index), rate=result.rate, ax=below)
 
 
@@ -115,5 +115,4 @@ def _parameter_rows(result: GMWMResult, index: tuple[int, ...]) -> list[dict[str
 def _datasheet_rows(result: GMWMResult, index: tuple[int, ...]) -> list[dict[str, Any]]:
     if not (result.rate and result.unit in RATE_UNITS and _fitted(result, index)):
         return []
-    sheet = datasheet(result.model.with_params(result.params[index]), result.rate, result.unit)
-    return [entry._asdict() for entry in sheet.entries]
+    return [entry._asdict() for entry in result.datasheet(index).entries]

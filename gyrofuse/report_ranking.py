@@ -66,8 +66,14 @@ def _sentences(result: RankResult, index: tuple[int, ...]) -> Iterator[str]:
         yield f"{names[choice]} is the best of {len(rows)} candidates tried."
     else:
         yield f"{names[choice]} is the only candidate that was tried."
-    if result.n_tones is not None and (n_tones := int(result.n_tones[index])):
-        found = "One line stands" if n_tones == 1 else f"{n_tones} lines stand"
+    aside: dict[str, list[str]] = {}
+    for c in result.set_aside(index):
+        aside.setdefault(str(result.reasons_of(index)[c]), []).append(names[c])
+    for reason, those in aside.items():
+        yield f"Not compared: {', '.join(those)} ({reason})."
+    yield from result.doubts(index)
+    if result.n_lines is not None and (n_lines := int(result.n_lines[index])):
+        found = "One line stands" if n_lines == 1 else f"{n_lines} lines stand"
         yield f"{found} out of the noise in the spectrum."
     same = [row["name"] for row in rows if row["standing"] == "equivalent"]
     if same:
@@ -79,9 +85,6 @@ def _sentences(result: RankResult, index: tuple[int, ...]) -> Iterator[str]:
     others = [row for row in rows if row["standing"] in ("", "redundant") and row["difference"] >= 0]
     if others:
         yield _why_not(others[0])
-    wvic = names[int(result.wvic_choice[index])]
-    if wvic != names[choice]:
-        yield f"The wavelet variance information criterion, which keeps some processes too many, prefers {wvic}."
 
 
 def _why_not(row: dict[str, Any]) -> str:
@@ -114,22 +117,19 @@ def _rows(result: RankResult, index: tuple[int, ...]) -> list[dict[str, Any]]:
     choice = int(result.choice[index])
     if choice < 0:
         return []
-    item = list(itertools.product(*map(range, result.choice.shape))).index(index)
     wvic = result.wvic[index] - result.wvic[index][int(result.wvic_choice[index])]
-    columns = (result.difference, result.p_value, result.redundant, result.equivalent)
-    table = zip(result.candidates, wvic.tolist(), *(c[index].tolist() for c in columns), strict=True)
     rows = []
-    for c, (name, own_wvic, difference, p_value, redundant, equivalent) in enumerate(table):
-        if math.isfinite(difference):
-            standing = "chosen" if c == choice else "equivalent" if equivalent else "redundant" if redundant else ""
-            rows.append(
-                {
-                    "name": name,
-                    "difference": difference,
-                    "wvic": own_wvic,
-                    "p_value": p_value,
-                    "standing": standing,
-                    "reason": result.reasons[item][c],
-                }
-            )
+    named = (("equivalent", result.equivalent), ("redundant", result.redundant))
+    for c in result.compared_to(index):
+        standing = "chosen" if c == choice else next((word for word, there in named if bool(there[index][c])), "")
+        rows.append(
+            {
+                "name": result.candidates[c],
+                "difference": result.difference[index][c].item(),
+                "wvic": wvic[c].item(),
+                "p_value": result.p_value[index][c].item(),
+                "standing": standing,
+                "reason": result.reasons_of(index)[c],
+            }
+        )
     return sorted(rows, key=lambda row: (row["difference"], row["standing"] != "chosen"))

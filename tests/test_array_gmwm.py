@@ -188,6 +188,8 @@ def test_shared_memory_is_found_with_its_tone():
     assert ((found.params[:, 0] - 0.98).abs() < 4 * found.params_sd[:, 0]).all()
     assert ((found.params[:, 1] - 0.3).abs() < 4 * found.params_sd[:, 1]).all()
     assert ((found.theta[:, 2] - gains.outer(gains)).abs() < 4.5 * found.theta_sd[:, 2]).all()
+    assert (found.rank[:, 2] <= 2).all()
+    assert "SIN: squared amplitudes, twice the variances, with 95 % intervals" in found[0].summary()
 
 
 def test_matrices_are_positive_where_truth_lacks_rank():

@@ -261,6 +261,37 @@ def test_fit_prints_the_parameters_and_writes_what_is_asked_for(run: Run, log: P
     assert gf.read_recording("s.npz").signal.shape == (3, 100)
 
 
+def test_fit_lists_its_files_and_simulate_reads_what_it_wrote(run: Run, log: Path):
+    fitted = run("fit", log, "--model", "WN", "--json", "f.json", "--figure", "f.png")
+    assert "Written: f.png, f.json" in fitted.out
+    again = run("simulate", "f.json", "--samples", 100, "--rate", 100, "--out", "s.npz")
+    assert again.status == 0
+    assert again.out.count("WhiteNoise(variance=") == 3
+    assert "<batch" not in again.out
+    assert gf.read_recording("s.npz").signal.shape == (3, 100)
+    refused(
+        run("simulate", "f.json", "--samples", 9, "--rate", 1, "--out", "t.npz", "--sensors", 5),
+        "f.json is a model of 3 sensors; leave the option out",
+    )
+
+
+def test_a_stretch_beyond_the_log_and_a_strange_unit_are_told(run: Run, log: Path, tmp_path: Path):
+    told = run("fit", log, "--model", "WN", "--rest", "0:1e9")
+    assert told.status == 0
+    assert "`--rest`: expected a stretch within 0 to" in told.err
+    assert "`--rest`" not in run("fit", log, "--model", "WN", "--rest", "0:15").err
+    signal = gf.read_recording(log).signal
+    gf.Recording(signal, rate=50.0, unit="furlong").save(tmp_path / "strange.npz")
+    assert "Unit 'furlong' is none of deg/s" in run("fit", "strange.npz", "--model", "WN").out
+    assert "is none of" not in run("fit", log, "--model", "WN").out
+
+
+def test_kalibr_has_a_longest_correlation_time_of_white_noise(run: Run, log: Path):
+    fit = ("fit", log, "--model", "WN + AR1", "--sensors", "b")
+    assert run(*fit, "--kalibr", "k.yaml", "--kalibr-slow", 7.5).status == 0
+    assert "correlation time of 7.5 s or more" in Path("k.yaml").read_text()
+
+
 def test_fit_writes_kalibr_of_one_sensor(run: Run, log: Path):
     assert run("fit", log, "--model", "WN", "--sensors", "b", "--kalibr", "imu.yaml").status == 0
     assert "gyroscope_noise_density: " in Path("imu.yaml").read_text()

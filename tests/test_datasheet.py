@@ -46,6 +46,22 @@ def test_bias_instability_is_the_floor_of_the_allan_deviation():
     assert got["bias instability reached at", "s"] == pytest.approx(102.4)
 
 
+def test_a_dip_that_is_undercut_later_is_no_floor():
+    quick = WhiteNoise(1.0) + AR1(0.9, 1.0)  # dips before the AR1, falls below that after it
+    deviation = (2 * quick.wavelet_variance(20)).sqrt()
+    assert ((deviation[1:-1] < deviation[:-2]) & (deviation[1:-1] < deviation[2:])).any()
+    assert not any("bias" in entry.name for entry in datasheet(quick, 10.0, "deg/s").entries)
+    walk = values(datasheet(quick + RandomWalk(1e-6), 10.0, "deg/s"))
+    deviation = (2 * (quick + RandomWalk(1e-6)).wavelet_variance(30)).sqrt()
+    assert walk["bias instability reached at", "s"] == pytest.approx(2.0 ** int(deviation.argmin()) / 10.0)
+
+
+def test_a_record_knows_no_averaging_times_beyond_its_own():
+    slow = WhiteNoise(1.0) + AR1(1 - 1e-6, 1e-7)
+    assert not any("bias" in entry.name for entry in datasheet(slow, 10.0, "deg/s").entries)
+    assert any("bias" in entry.name for entry in datasheet(slow, 10.0, "deg/s", n_levels=16).entries)
+
+
 @pytest.mark.parametrize(
     "model", [WhiteNoise(1.0), RandomWalk(1.0), WhiteNoise(1.0) + Sinusoid(1.0, 0.1), Drift(1.0)], ids=str
 )

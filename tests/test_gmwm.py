@@ -217,7 +217,8 @@ def test_result_speaks_draws_and_simulates_again():
     with mpl.rc_context({"backend": "agg"}):
         ax = found.plot()
         labels = [t.get_text() for t in ax.get_legend().get_texts()]
-    assert labels[:3] == ["interval", "measured", "fitted model"]
+    assert ax.get_title(loc="left") == f"sensor 1: {found.name}"
+    assert labels[:3] == ["95 % interval", "measured", "fitted model"]
     assert "SIN 1" in labels
     again = gf.model_from_dict(json.loads(json.dumps(found.to_dict()["model"])))
     torch.testing.assert_close(again.params, found.params)
@@ -242,6 +243,17 @@ def test_a_refused_model_does_not_get_sharper_intervals():
     seen = (result.params[:, 0] > 0) & (result.p_value < 1e-3)
     assert seen.sum() > 50
     assert ((high - low)[seen, 0] > 0.2 * result.params[seen, 0]).all()
+
+
+def test_the_figure_holds_what_is_measured_and_a_model_that_does_not_fit():
+    signal = gf.AR1(0.9, 1.0).simulate(4000, batch=(1,), generator=torch.Generator().manual_seed(7))
+    found = gf.fit_gmwm(signal, "RW")
+    with mpl.rc_context({"backend": "agg"}):
+        ax = found.plot()
+        low, high = ax.get_ylim()
+    for variance in (found.wavelet_variance, found.fitted_wavelet_variance):
+        deviation = (2 * variance).sqrt()
+        assert low < deviation.min() <= deviation.max() < high
 
 
 @pytest.mark.filterwarnings("ignore:`signal`")
@@ -278,6 +290,25 @@ def test_lengths_are_for_wavelet_variances_alone():
             ValueError, match=r"`signal`: expected a wavelet variance .* got shape \(2, 1000\), that of"
         ):
             function(signal, "WN", n_samples=1000)
+
+
+def test_limits_of_tones_are_printed_with_the_digits_they_need():
+    signal = (gf.WhiteNoise(1.0) + gf.Sinusoid(1.0, 0.35)).simulate(
+        20_000, batch=(1,), generator=torch.Generator().manual_seed(4)
+    )
+    found = gf.fit_gmwm(signal, "WN + SIN")
+    (row,) = (line for line in found.summary().splitlines() if "beta" in line)
+    cells = row.replace("[", " ").replace("]", " ").replace(",", " ").split()
+    value, low, high = map(float, cells[1:])
+    assert low < value < high
+    first, last = (limit[0, 2].item() for limit in found.confidence_interval)
+    assert high - low == pytest.approx(last - first, rel=0.1)
+
+
+def test_squares_that_leave_the_range_are_told():
+    signal = 1e160 * torch.randn(1, 1000, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
+    with pytest.raises(ValueError, match="squares of huge or tiny numbers leave the range"):
+        gf.fit_gmwm(signal, "WN")
 
 
 def test_other_units_than_of_rates_have_no_datasheet():

@@ -37,6 +37,19 @@ def test_simulation_2_of_a_length(tmp_path: Path):
     assert "2 runs of 262144 samples, 17 levels" in done.stdout
 
 
+def test_figures_go_to_a_new_folder(tmp_path: Path):
+    done = run("gmwm_running_time.py", "--turns", 1, "--samples", 4096, "--out", "new/folder", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert is_png(tmp_path / "new" / "folder" / "gmwm_running_time.png")
+
+
+def test_calibration_names_the_recordings_that_it_needs(tmp_path: Path):
+    done = run("gmwm_calibration.py", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "expected a folder with adis16405_rec1.npz" in done.stderr
+    assert "broad_trials.npz; name it with --data FOLDER" in done.stderr
+
+
 def test_running_time(tmp_path: Path):
     done = run("gmwm_running_time.py", "--turns", 1, cwd=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -232,6 +232,21 @@ def test_result_of_a_recording():
     with mpl.rc_context({"backend": "agg"}):
         ax = found.plot()
     assert next(label.get_text() for label in ax.get_yticklabels()) == "WN"
+    assert ax.get_title(loc="left") == "sensor a"
+
+
+def test_the_figure_shows_the_chosen_one_and_those_not_compared():
+    signal = signals(PARTS["WN + RW + SIN"], 1)[0]
+    found = gf.rank_models(signal, ["WN", "RW + SIN", "WN + RW + SIN"], fit=False)
+    with mpl.rc_context({"backend": "agg"}):
+        ax = found.plot()
+    names = [label.get_text() for label in ax.get_yticklabels()]
+    assert names == ["WN + RW + SIN", "RW + SIN", "WN"]
+    difference = found.difference[0, 1].item()
+    assert [t.get_text() for t in ax.texts] == ["chosen", f"{difference:+.1f}", "not compared"]
+    assert ax.get_xlim()[0] < 0 < difference < ax.get_xlim()[1]
+    ticks = [t.get_text() for t in ax.get_xticklabels()]
+    assert ticks[:3] == ["0", "5", "10"]
 
 
 def test_batch_is_its_items():
@@ -318,5 +333,5 @@ def test_refusals_of_signals():
 
 def test_the_summary_says_when_no_candidate_fits():
     signal = (gf.AR1(0.9, 1.0)).simulate(4000, batch=(1,), generator=torch.Generator().manual_seed(4))
-    assert "no candidate fits: the J test refuses all" in gf.rank_models(signal, ["WN", "RW"], fit=False).summary()
-    assert "no candidate fits" not in gf.rank_models(signal, ["WN", "AR1"], fit=False).summary()
+    assert "No candidate fits: the J test refuses all" in gf.rank_models(signal, ["WN", "RW"], fit=False).summary()
+    assert "No candidate fits" not in gf.rank_models(signal, ["WN", "AR1"], fit=False).summary()

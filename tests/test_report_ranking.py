@@ -45,7 +45,7 @@ def test_verdict_names_the_model_the_line_and_what_is_as_good():
     tried = int(result.difference[0].isfinite().sum())
     assert f"WN + RW + SIN is the best of {tried} candidates tried." in left
     assert "One line stands out of the noise in the spectrum." in left
-    assert "line" not in right
+    assert "stands out" not in right
     for index, words in enumerate((left, right)):
         same = [name for name, there in zip(CANDIDATES, result.equivalent[index].tolist(), strict=True) if there]
         assert ("The record does not tell it from" in words) == bool(same)
@@ -88,12 +88,45 @@ def test_a_redundant_candidate_with_a_better_criterion_is_named():
     assert f"{CANDIDATES[c]} has a criterion 2.5 below, but is more than it takes: {reason}." in words
 
 
-def test_what_wvic_prefers():
+def test_wvic_advises_nothing():
     result = ranked()
     other = replace(result, wvic_choice=torch.full_like(result.choice, CANDIDATES.index("WN + AR1 + RW")))
-    assert "keeps some processes too many, prefers WN + AR1 + RW." in plain(rank_verdict(other, (1,)))
-    same = replace(result, wvic_choice=result.choice)
-    assert "prefers" not in plain(rank_verdict(same, (1,)))
+    assert "prefers" not in plain(rank_verdict(other, (1,)))
+    assert "own choice" not in other.summary()
+
+
+def test_page_and_summary_name_those_that_were_not_compared():
+    result = gf.rank_models(recording(), ["WN", "WN + RW", "WN + AR1", "WN + RW + SIN"])
+    reason = "the spectrum has 1 line, the model none"
+    left, right = (plain(rank_verdict(result, (i,))) for i in range(2))
+    assert "WN + RW + SIN is the only candidate that was tried." in left
+    assert f"Not compared: WN, WN + RW, WN + AR1 ({reason})." in left
+    assert "Not compared: WN + RW + SIN (the spectrum has no lines, the model 1)." in right
+    assert f"WN + RW        not compared: {reason}" in result.summary()
+    assert result.reasons[0] == (reason, reason, reason, None)
+    assert result.to_dict()["n_lines"] == [1, 0]
+    page = Page(rank_report(result, recording(), title="aside"))
+    assert "4 candidates compared" in page.text
+    alone = gf.rank_models(recording().signal[:1], ["WN", "WN + RW + SIN"], fit=False)
+    assert "1 of 2 candidates" in alone.summary()
+
+
+def test_a_line_without_a_candidate_for_it_is_told():
+    told = "The spectrum has a line more than those compared have sinusoids"
+    result = gf.rank_models(recording(), ["WN + RW", "WN + AR1"], fit=False)
+    assert told in plain(rank_verdict(result, (0,)))
+    assert told in result.summary()
+    assert told not in plain(rank_verdict(result, (1,)))
+    assert result.n_tones.tolist() == [0, 0]
+    assert result.n_lines.tolist() == [1, 0]
+
+
+def test_page_and_summary_say_when_no_candidate_fits():
+    result = gf.rank_models(recording().signal[1:], ["WN", "RW"])
+    told = "No candidate fits: the J test refuses all (largest p = "
+    assert told in plain(rank_verdict(result, (0,)))
+    assert told in result.summary()
+    assert told not in plain(rank_verdict(ranked(), (1,)))
 
 
 def test_page_holds_what_the_result_says():
@@ -104,7 +137,7 @@ def test_page_holds_what_the_result_says():
     assert [link for link in page.links if link.startswith("#")] == ["#fit-1", "#fit-2"]
     assert all(link.startswith(("#", "data:image/svg+xml;base64,")) for link in page.links)
     assert "Sensor <b>right</b>" in page.text
-    assert "7 noise models compared on 8192 samples at 50 Hz" in page.text
+    assert "7 candidates compared on 8192 samples at 50 Hz" in page.text
     wvic = result.wvic - result.wvic.gather(-1, result.wvic_choice[:, None])
     for sensor in range(2):
         for c, name in enumerate(CANDIDATES):

@@ -341,9 +341,16 @@ def arguments(description: str) -> argparse.ArgumentParser:
     """Parser with the options that all studies have."""
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a small study, in seconds")
-    parser.add_argument("--out", type=Path, default=Path(), help="folder of the figures; the current one by default")
+    parser.add_argument("--out", type=_folder, default=Path(), help="folder of the figures; the current one by default")
     parser.add_argument("--seed", type=int, default=1, help="of the random numbers")
     return parser
+
+
+def _folder(name: str) -> Path:
+    """Made before anything is computed, so that no study fails when it is done."""
+    folder = Path(name)
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
 
 
 def figures_written(folder: Path, *names: str) -> None:

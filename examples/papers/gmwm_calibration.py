@@ -174,7 +174,7 @@ def plot(recordings: list[Fitted], path: Path) -> None:
     figure, axes = plt.subplots(2, columns, figsize=(5.2 * columns, 8), layout="constrained", squeeze=False)
     for ax, (name, result) in zip(axes.T.flat, panels, strict=True):
         result.plot(ax)
-        ax.set_title(f"{name}: {' + '.join(process.symbol for process in result.model.processes)}", fontsize=10)
+        ax.set_title(f"{name}: {result.name}", loc="left", fontsize=10)
     finish(figure, path)
 
 
@@ -183,13 +183,12 @@ def main() -> None:
     parser.add_argument("--data", type=Path, help="folder of the recordings")
     options = parser.parse_args()
     if options.data is None:
-        print("expected the folder of the recordings; name it with --data FOLDER", file=sys.stderr)
+        print(f"expected a folder with {', '.join((*ADIS, BROAD))}; name it with --data FOLDER", file=sys.stderr)
         sys.exit(2)
     missing = [name for name in (*ADIS, BROAD) if not (options.data / name).is_file()]
     if missing:
         print(f"{options.data}: expected {', '.join(missing)}; name their folder with --data FOLDER", file=sys.stderr)
         sys.exit(2)
-    options.out.mkdir(parents=True, exist_ok=True)
     swinging, phone = adis(options.data, options.quick), broad(options.data)
     print_table("ADIS16405 at rest, accelerometer x (g)", swinging)
     print_table("BROAD with a vibrating phone, accelerometer y (m/s^2)", phone)

@@ -126,10 +126,11 @@ def plot(model: gf.Model, both: list[Fits], path: Path) -> None:
     for k, ax in enumerate(axes):
         for place, (fit, color) in enumerate(zip(both, _COLORS, strict=True)):
             error_boxes(ax, fit.params[:, k : k + 1], [place], color)
-        ax.axhline(basic.params[k].item(), color="#000000", linewidth=0.9, linestyle="--")
+        truth = ax.axhline(basic.params[k].item(), color="#000000", linewidth=0.9, linestyle="--")
         ax.set_xticks(range(2), KINDS)
         ax.set_title(symbol(basic.param_names[k]))
         ax.margins(y=0.1)
+    figure.legend([truth], ["truth"], loc="outside lower center", fontsize=8)
     finish(figure, path)
 
 
@@ -138,7 +139,6 @@ def main() -> None:
     parser.add_argument("--samples", type=int, help=f"length of the records; {N_EMULATION} by default")
     parser.add_argument("--runs", type=int, help=f"records; {N_RUNS} by default")
     options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
     n_samples = options.samples or (QUICK_SAMPLES if options.quick else N_EMULATION)
     n_runs = options.runs or (QUICK_RUNS if options.quick else N_RUNS)
     model = emulation(n_samples)

@@ -225,7 +225,6 @@ def main() -> None:
     parser.add_argument("--samples", type=int, help="length of the records; 40 000 and 160 000 by default")
     parser.add_argument("--runs", type=int, help=f"records of each composition; {N_RUNS} by default")
     options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
     which = [options.simulation] if options.simulation else ([1] if options.quick else list(SIMULATIONS))
     n_runs = options.runs or (QUICK_RUNS if options.quick else N_RUNS)
     lengths = dict.fromkeys(N_SAMPLES, QUICK_SAMPLES) if options.quick else N_SAMPLES
@@ -243,11 +242,11 @@ def main() -> None:
         ):
             ax.plot([getattr(rate, kind) for _, rate in table], range(len(table)), marker, color=color, label=label)
         ax.set_yticks(range(len(table)), [part.name for part, _ in table], fontsize=8)
-        ax.axvline(0.95, color="#555555", linewidth=0.8, linestyle="--")
+        ax.axvline(0.95, color="#555555", linewidth=0.8, linestyle="--", label="95 % of the records")
         ax.set_xlim(-0.02, 1.02)
         ax.set_title(f"Simulation {number}", fontsize=10)
     axes[-1, 0].set_xlabel("share of records of which the true composition was chosen")
-    axes[0, 0].legend(loc="lower left", fontsize=8)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
     finish(figure, options.out / "gmwm_ranking.png")
     figures_written(options.out, "gmwm_ranking.png")
 

@@ -59,11 +59,10 @@ def main() -> None:
     parser.add_argument("--samples", type=int, nargs="+", help="lengths of the records")
     parser.add_argument("--turns", type=int, default=3, help="of each length; the median counts")
     options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
     lengths = sorted(options.samples or (QUICK_SAMPLES if options.quick else SAMPLES))
     generator = torch.Generator().manual_seed(options.seed)
     # What a first call of anything costs is not of interest.
-    gf.fit_gmwm(SIMULATIONS[1].simulate(4096, batch=(1,), generator=generator), unknown(SIMULATIONS[1]), refine=True)
+    stages(SIMULATIONS[1].simulate(4096, batch=(1,), generator=generator), 1)
     print(f"{SIMULATIONS[1]}, one record, {torch.get_num_threads()} thread(s)")
     print("CPU seconds, in brackets the share of the refined fit")
     print(
@@ -115,7 +114,7 @@ def plot(lengths: list[int], rows: list[list[float]], path: Path) -> None:
     ax.loglog(lengths, [sum(row) for row in rows], "k:", linewidth=2, label="GMWM, refined")
     ax.set_xlabel("samples")
     ax.set_ylabel("CPU time (s)")
-    ax.legend(fontsize=8)
+    figure.legend(loc="outside right upper", fontsize=8)
     finish(figure, path)
 
 

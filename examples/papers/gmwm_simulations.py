@@ -240,7 +240,6 @@ def main() -> None:
     parser.add_argument("--samples", type=int, nargs="+", help="lengths of the records; the paper's by default")
     parser.add_argument("--runs", type=int, help=f"records of each length; {N_RUNS} by default")
     options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
     number = options.simulation
     lengths = sorted(options.samples or (QUICK_SAMPLES if options.quick else N_SAMPLES)[number])
     n_runs = options.runs or (QUICK_RUNS[number] if options.quick else N_RUNS)

@@ -68,7 +68,6 @@ def print_conclusions(study: Study) -> None:
 
 def main() -> None:
     options = arguments(__doc__).parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
     n_samples = QUICK_SAMPLES if options.quick else N_SAMPLES
     sizes = (QUICK_ARRAYS, QUICK_NEW) if options.quick else (N_ARRAYS, N_NEW)
     study = run_study(case2(n_samples), n_samples, *sizes, options.seed)

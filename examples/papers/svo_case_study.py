@@ -216,7 +216,6 @@ def main() -> None:
     if missing:
         print(f"{options.data}: expected {', '.join(missing)}; name their folder with --data FOLDER", file=sys.stderr)
         sys.exit(2)
-    options.out.mkdir(parents=True, exist_ok=True)
 
     arrays = [read(options.data, options.quick) for read in (adis, mimu, xsens)]
     figures, weights = [], []

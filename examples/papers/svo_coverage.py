@@ -231,7 +231,6 @@ def plot_coverage(found: dict[tuple[str, int], Coverage], n_samples: int, path: 
 
 def main() -> None:
     options = arguments(__doc__).parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
     sizes, n_arrays = (QUICK_SIZES, QUICK_REPLICATIONS) if options.quick else (SIZES, N_COVERAGE)
     sensors = slice(1) if options.quick else slice(None)
     found, generator = {}, torch.Generator().manual_seed(options.seed)
