@@ -22,7 +22,8 @@ _SLOW = 2.2  # time constants above n / (2 pi) over this look like a walk in eve
 _LITTLE = 0.3  # of the white noise: fast AR1s below count as white
 _HIGHEST = 3.0  # corner of an analog filter to start from, cycles per sample
 _UNSEEN = 0.02  # share of the noise at one cycle per record: a walk below it is not known to be there or not
-_LOOKED_AT = 60  # frequencies
+_BY_CHANCE, _LOOKED_AT = 10, 60  # bins, and frequencies above
+_CHANCE = 0.15  # share of the noise there that AR1s may have in the spectrum of white noise
 _MATTERS = 0.05  # of the power in some band, for a part to have a level of its own
 
 
@@ -70,12 +71,13 @@ class Parts:
     def unseen_ar1(self) -> tuple[float, Tensor]:
         """Inverse time constant of an AR1 that records would not show, and its plateaus `(sensor, 1)`.
 
-        The plateau is 0 for sensors that have AR1s. Where a simulation is white, noise with a memory is told from none.
+        The plateau is 0 for sensors that have AR1s, more than chance would make of none. Of a white
+        simulation, noise with a memory is other numbers.
         """
         n, c = self.base.n_samples, self.base.coefficients
         middle = math.sqrt(0.5 / n)  # cycles per sample
-        f = torch.logspace(math.log10(1 / n), math.log10(0.5), _LOOKED_AT, dtype=c.dtype)
-        has = ((self.coefficients[1] @ _atoms(n, f)) / self.base.spectrum(f)).amax(-1, keepdim=True) > _MATTERS
+        f = torch.logspace(math.log10(_BY_CHANCE / n), math.log10(0.5), _LOOKED_AT, dtype=c.dtype)
+        has = ((self.coefficients[1] @ _atoms(n, f)) / self.base.spectrum(f)).amax(-1, keepdim=True) > _CHANCE
         plateau = _UNSEEN * self.base.spectrum(torch.tensor([middle], dtype=c.dtype))
         return 2 * math.pi * middle, torch.where(has, 0.0, plateau)
 
@@ -103,13 +105,15 @@ class Parts:
                 increments, `(..., 4, sensor)`.
         """
         white, level, corner, walk = log_factors.clamp(-30, 30).exp()[..., None].unbind(-3)  # (..., sensor, 1)
-        rate, plateau = self._corners
-        phi = torch.exp(-corner[..., None, :, :] * rate)  # (..., atom, sensor, 1)
-        coloured = AR1._spectrum(self.f, phi, plateau * (1 - phi).square()).sum(-3)
         walks = walk * self.densities[2] + (walk - 1).clamp(min=0) * self.unseen
         slower, tiny = self.unseen_ar1
         phi = torch.exp(-corner * slower)
         new = (level - 1).clamp(min=0) * AR1._spectrum(self.f, phi, tiny * (1 - phi).square())
+        # What chance makes of none is not to grow beside it.
+        level, corner = (torch.where(tiny > 0, 1.0, x) for x in (level, corner))
+        rate, plateau = self._corners
+        phi = torch.exp(-corner[..., None, :, :] * rate)  # (..., atom, sensor, 1)
+        coloured = AR1._spectrum(self.f, phi, plateau * (1 - phi).square()).sum(-3)
         return white * self.densities[0] + level * coloured + new + walks
 
 

@@ -59,7 +59,7 @@ class ParameterShift(Filter):
                 if number:  # else the simulation does not show how much it has
                     parameters[f"{name}_factor[{i}]"] = spanned(math.exp, value, sd, "")  # of variances
                 elif name == "corner":
-                    parameters[f"{name}[{i}]"] = spanned(lambda x: least[2][i] * math.exp(x), value, sd, unit)  # noqa: B023
+                    parameters[f"{name}[{i}]"] = spanned(math.exp, value + math.log(least[k][i]), sd, unit)
                 if low > 0 or high < 0:
                     factor = math.exp(value if name == "corner" else value / 2)  # in standard deviations
                     if name == "ar1":  # of one plateau, a faster one has more variance
