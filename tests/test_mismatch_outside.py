@@ -14,6 +14,7 @@ from torch import Tensor
 from gyrofuse import AR1, RandomWalk, WhiteNoise
 from gyrofuse.mismatch import episodes, hysteresis, impulses, modulation, outliers, sweeps
 from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.mechanisms.common_mode import CommonMode
 from gyrofuse.mismatch.mechanisms.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.variance_change import VarianceChange
 
@@ -236,3 +237,16 @@ def test_a_bias_that_depends_on_the_way_is_seen() -> None:
     assert found.channel == "temperature"
     assert 1 in found.sensors
     assert hysteresis.hysteresis_witness(Case.of(scene(), recording, simulation)).p_value == 1.0
+
+
+def test_a_loop_of_all_sensors_is_no_noise_in_common() -> None:
+    recording, simulation, _ = drawn(31)
+    t = torch.arange(N, dtype=torch.float64) / N
+    temperature = 25 + 3 * torch.sin(2 * math.pi * 2.2 * t)
+    path = hysteresis.relays(temperature[:: N // 256])
+    recording += 0.3 * path[len(path) // 2].repeat_interleave(N // 256)
+    case = Case.of(scene(temperature=temperature), recording, simulation)
+    without = Case.of(scene(), recording, simulation)
+    assert CommonMode.nominate(without, 1e-3) is not None
+    assert CommonMode.nominate(case, 1e-3) is None
+    assert hysteresis.hysteresis_witness(case).p_value < 1e-3

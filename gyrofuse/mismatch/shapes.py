@@ -15,6 +15,7 @@ from gyrofuse.mismatch.bump_fit import oscillation_of
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import corrected
 from gyrofuse.mismatch.folds import estimation_samples
+from gyrofuse.mismatch.hysteresis import strongest_relay
 from gyrofuse.mismatch.pooled import common_source
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.shape_bands import N_SLOW, Groups, deep, deep_base, in_blocks, narrow_bands, slow_fold
@@ -35,6 +36,7 @@ _PLAIN = 25.0  # nats
 _ALONE = 8.0  # nats that a shape has to bring by itself
 _PER_OCTAVE = 4
 _CLEAN = 8  # bins
+_SLOW = 64  # cycles per record
 _BROAD = 3.0  # half widths
 _SHARP, _NARROW = 0.1, (0.02, 0.04, 0.08)  # the same, below which bands are too wide for it, and of it there
 _FINE, _NARROWEST = 24, 0.005  # bands in an octave for those, and the least that they show
@@ -97,7 +99,11 @@ def chosen_shape(case: Case, name: str, level: float) -> Shape | None:
     if name != "resonance" and bump is not None and bump.stretch.p_value <= level and bump.nats > _PLAIN:
         return None
     best = leading_shape(case)
-    return best if best is not None and best.term.name == name and best.p_value <= level else None
+    if best is None or best.term.name != name or best.p_value > level:
+        return None
+    # A loop that a temperature draws is no noise, however slow.
+    relay = strongest_relay(case) if best.frequency * case.n_samples < _SLOW else None
+    return best if relay is None or relay.p_value > level else None
 
 
 def compared(case: Case, per_octave: int = _PER_OCTAVE) -> Ratios:
