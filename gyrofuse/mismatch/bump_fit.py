@@ -112,7 +112,8 @@ def _best(case: Case, stretch: Stretch, data: Ratios, background: Fit) -> Oscill
     ground, p = data.ground, case.n_sensors
     middle = len(ground.bands.frequency) // 2
     least = max(1.5 / case.n_samples, stretch.width / 40) / stretch.frequency
-    height = (data.observed - background.model).diagonal(dim1=-2, dim2=-1).real[middle - 2 : middle + 2].mean(0)
+    excess = data.observed - background.model
+    height = excess.diagonal(dim1=-2, dim2=-1).real[middle - 2 : middle + 2].mean(0)
     level = ground.mean[:, middle] * height.clamp(min=1e-3)
 
     def value(found: Fit) -> float:
@@ -125,7 +126,6 @@ def _best(case: Case, stretch: Stretch, data: Ratios, background: Fit) -> Oscill
         own = fit(data, [*company, Bump(bump.local, bump.free, bump.shared, least)])
         tried.append(own)
         if p > 1:
-            excess = data.observed - background.model
             source = CommonBump.start(ground, excess, data.worth, "oscillation", own.terms[-1].shared)
             source = CommonBump(source.local, source.free, source.shared, narrowest=least)
             tried.append(fit(data, [*company, source]))

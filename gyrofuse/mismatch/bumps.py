@@ -79,7 +79,8 @@ def strongest_bump(case: Case) -> Stretch:
     known = torch.zeros(power.shape[-1], dtype=torch.bool)
     simulated: tuple[Tensor, int] | None = None
     apart = _apart(transform[0], length, case)
-    starts, widths, scores = _scanned(power, apart.abs().square(), length, case, shared)
+    power_apart = apart.abs().square()
+    starts, widths, scores = _scanned(power, power_apart, length, case, shared)
     together = _correlated(apart, length, case)
     starts, widths = torch.cat([starts, together[0]]), torch.cat([widths, together[1]])
     n_places = scores.numel() + 2 * len(together[0])
@@ -91,7 +92,7 @@ def strongest_bump(case: Case) -> Stretch:
         a, n = int(starts[column]), int(widths[column])
         tail = float(stats.norm.sf(float(scores[row, column])))
         if row < len(scores) - len(together[2]):
-            tail = _tail(power, apart.abs().square(), row, a, n, length, case, shared)
+            tail = _tail(power, power_apart, row, a, n, length, case, shared)
         p = corrected(tail, n_places)
         stretch = Stretch((a + (n - 1) / 2) / length, n / length, p, _alone(power, a, n, length, case))
         if p > _AS_WELL:

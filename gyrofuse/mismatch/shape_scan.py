@@ -126,7 +126,8 @@ def scanned(case: Case) -> Scan | None:
     weight = looked_for.templates[shape, list(sensors)].square().mean(0)
     rises = float((up - down)[shape, list(sensors)].sum()) > 0
     bumps = list(_bump_places(case.n_samples))
-    place = shape % (len(looked_for.templates) // len(_SIZES)) - len(looked_for.templates) // len(_SIZES) + len(bumps)
+    n_shapes = len(looked_for.templates) // len(_SIZES)
+    place = shape % n_shapes - (n_shapes - len(bumps))  # bumps come last
     mean = float(log_ratios.flatten().logsumexp(0)) - math.log(len(_SHARES))
     return Scan(mean, sensors, weight, rises, bumps[place] if place >= 0 else None)
 
