@@ -46,6 +46,18 @@ class Oscillation:
     gain: Tensor | None
     nats: float
 
+    @classmethod
+    def of(cls, stretch: Stretch, term: Bump | CommonBump, sd: tuple[Tensor, Tensor], nats: float) -> Oscillation:
+        """From a fitted term, with the standard deviations of its local and its shared numbers."""
+        local_sd, log_sd = sd
+        if isinstance(term, CommonBump):
+            gain = torch.complex(*term.local)
+            variance, spread = gain.abs().square(), 2 * gain.abs() * local_sd.square().nanmean(0).sqrt()
+        else:
+            gain, variance, spread = None, term.local[0], local_sd[0].nan_to_num(nan=math.inf)
+        (centre, width), (centre_sd, width_sd) = term.shared.exp().tolist(), log_sd.tolist()
+        return cls(stretch, centre, width, (centre_sd, width_sd), variance, spread, gain, nats)
+
 
 @dataclass(frozen=True, eq=False)
 class Background(Term):
@@ -131,14 +143,7 @@ def _best(case: Case, stretch: Stretch, data: Ratios, background: Fit) -> Oscill
             tried.append(fit(data, [*company, source]))
     best = max(tried, key=value)
     nats = value(best) - max(value(background), 0.0)
-    term, (local_sd, log_sd) = best.terms[-1], best.sd(-1)
-    if isinstance(term, CommonBump):
-        gain = torch.complex(*term.local)
-        variance = gain.abs().square()
-        spread = 2 * gain.abs() * local_sd.square().nanmean(0).sqrt()
-    else:
-        gain, variance, spread = None, term.local[0], local_sd[0]
-    centre, width = (float(x) for x in term.shared.exp())
-    if centre < 2 * width or nats < 0:
-        return None
-    return Oscillation(stretch, centre, width, tuple(log_sd.tolist()), variance, spread, gain, nats)
+    term = best.terms[-1]
+    assert isinstance(term, Bump | CommonBump)
+    found = Oscillation.of(stretch, term, best.sd(-1), nats)
+    return None if found.centre < 2 * found.width or nats < 0 else found

@@ -24,7 +24,6 @@ from gyrofuse.mismatch.evidence import Evidence, corrected
 from gyrofuse.mismatch.lines import simulated_lines, whitened, without_lines
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.shape_law import decorrelated, smooth_coherence
-from gyrofuse.mismatch.side import Side
 from gyrofuse.mismatch.witnesses import level_of
 
 _NARROWEST = 4  # bins
@@ -73,12 +72,12 @@ def bump_witness(case: Case) -> Evidence:
 @remembered
 def strongest_bump(case: Case) -> Stretch:
     """The most conspicuous bump of the recording that is neither a line nor in the simulation."""
-    transform, length = _transformed(case.recorded, case)
-    power = transform[0].abs().square()
+    transform, length = _transformed(case.lineless)
+    power = transform.abs().square()
     shared = _effective_sensors(case)
     known = torch.zeros(power.shape[-1], dtype=torch.bool)
     simulated: tuple[Tensor, int] | None = None
-    apart = _apart(transform[0], length, case)
+    apart = _apart(transform, length, case)
     power_apart = apart.abs().square()
     starts, widths, scores = _scanned(power, power_apart, length, case, shared)
     together = _correlated(apart, length, case)
@@ -101,7 +100,8 @@ def strongest_bump(case: Case) -> Stretch:
         excess = (inside - _flanks(power, a, n).mean()).clamp(min=0)
         line = float(excess.topk(3).values.sum()) > _LINE * float(excess.sum())
         if simulated is None:
-            simulated = _transformed(case.simulated, case)
+            bare = without_lines(case.simulated.signal, simulated_lines(case.simulated))
+            simulated = _transformed(whitened(bare, case.base))
         if not line and not _has_it(simulated, stretch, case, row, coherent=row >= len(scores) - len(together[2])):
             return stretch
         known[max(a - n, 0) : a + 2 * n] = True
@@ -119,9 +119,8 @@ def light_taper(n: int) -> Tensor:
     return taper / taper.square().sum().sqrt()
 
 
-def _transformed(side: Side, case: Case) -> tuple[Tensor, int]:
-    """Transform over the simulation's noise, `(record, sensor, bin)`, and the length padded to."""
-    white = whitened(without_lines(side.signal, simulated_lines(case.simulated)), case.base)
+def _transformed(white: Tensor) -> tuple[Tensor, int]:
+    """Transform of whitened samples, `(..., sensor, bin)`, and the length padded to."""
     n = white.shape[-1]
     length = fast_length(n)
     return torch.fft.rfft(white * light_taper(n), n=length), length

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.base import Base
-from gyrofuse.mismatch.lines import FoundLine, strongest_line, whitened
+from gyrofuse.mismatch.lines import FoundLine, simulated_lines, strongest_line, whitened, without_lines
 from gyrofuse.mismatch.side import Side
 from gyrofuse.mismatch.spectra import Bands, bands
 
@@ -106,6 +106,12 @@ class Case:
     def white(self) -> Tensor:
         """The recording in units of the simulation's noise, without its means, `(sensor, time)`."""
         return whitened(self.recording, self.base)
+
+    @cached_property
+    def lineless(self) -> Tensor:
+        """Likewise, and without the lines that the simulation has."""
+        lines = simulated_lines(self.simulated)
+        return whitened(without_lines(self.recording, lines), self.base) if lines else self.white
 
     @property
     def block(self) -> int:

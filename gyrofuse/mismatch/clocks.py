@@ -3,16 +3,14 @@
 A sensor that takes its sample `t` at `(1 + skew) t + lost(t)` turns the phase of a tone of `f` cycles per sample by
 `2 pi f` times what it is ahead: a slope, or steps. With `z_b` the whitened signal demodulated in `B` blocks, in units
 of the noise, a path `phi_b` of the phase has the log likelihood `|sum z_b exp(-i phi_b)|^2 / B` with the best amplitude
-and phase. No slip at all has as many numbers, so that chance gains `g` nats at no more than `exp(-g)` of the places.
+and phase. No slip at all has as many numbers, so that the mean likelihood ratio over paths has expectation one.
 
 The reference is an auxiliary channel with the same tone, where there is one, or else the other sensors.
 """
 
 from __future__ import annotations
 
-import cmath
 import functools
-import itertools
 import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -21,8 +19,9 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.case import Case
-from gyrofuse.mismatch.evidence import Evidence
+from gyrofuse.mismatch.evidence import Evidence, ratio_p_value
 from gyrofuse.mismatch.lines import sets_of, simulated_lines
+from gyrofuse.mismatch.losses import Loss, losses_of, paths_of
 from gyrofuse.mismatch.remembered import remembered
 
 BLOCKS = 512
@@ -30,21 +29,6 @@ _FEWEST_CYCLES = 2.0  # of a tone in a block
 _TONES = 3
 _CLEARER = 10.0  # times the evidence of any sensor that a channel needs to be the reference
 _CYCLES, _FINER = 4, 32  # slip over the record that is looked for, and steps of a cycle
-_MOST_LOST, _FEW_LOST = 8, 4  # samples at once
-_COARSER = 4  # blocks in which two losses are looked for at once
-_MOST_LOSSES = 16
-_CERTAIN = 3.0  # nats that a further loss must gain beyond chance
-_AS_GOOD = 2.0  # nats within which another number is as good
-
-
-@dataclass(frozen=True)
-class Loss:
-    """Samples lost at once: the first sample after them, and how many, each with limits."""
-
-    at: int
-    count: int
-    at_limits: tuple[int, int]
-    count_limits: tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -56,8 +40,9 @@ class Slip:
         sensors: Those that slip.
         skew: What they are ahead per sample, and its standard deviation `skew_sd`.
         losses: In the order of time.
+        lost: Limits of how many samples were lost in all.
         gain: Log likelihood over that of no slip, nats.
-        log_p: Logarithm of the p value, for all sets of sensors, slopes and steps.
+        log_ratio: Of the mean likelihood ratio over sets of sensors and slopes or steps, less what was tried.
         reference: Name of the channel that tells; None where the other sensors do.
     """
 
@@ -66,13 +51,14 @@ class Slip:
     skew: float
     skew_sd: float
     losses: tuple[Loss, ...]
+    lost: tuple[int, int]
     gain: float
-    log_p: float
+    log_ratio: float
     reference: str | None
 
     @property
     def p_value(self) -> float:
-        return math.exp(min(self.log_p, 0.0))
+        return ratio_p_value(self.log_ratio)
 
 
 class _Fit(NamedTuple):
@@ -82,8 +68,9 @@ class _Fit(NamedTuple):
         which: Index of the set of sensors.
         slope, variance: Cycles over the record that they are ahead, and their variance.
         losses: Of samples.
+        lost: Limits of how many in all.
         gain: Over no slip, nats.
-        log_p: Logarithm of the p value for all places of the kind.
+        log_ratio: Of the mean likelihood ratio over all sets and places of the kind.
         rest: Cycles over the record by which the others differ from where they were looked for.
     """
 
@@ -91,8 +78,9 @@ class _Fit(NamedTuple):
     slope: float
     variance: float
     losses: list[Loss]
+    lost: tuple[int, int]
     gain: float
-    log_p: float
+    log_ratio: float
     rest: float
 
 
@@ -121,8 +109,8 @@ def strongest_slip(case: Case) -> Slip | None:
     if not tones:
         return None
     slips = [slip for f in tones for slip in _of_tone(case, f)]
-    best = min(slips, key=lambda slip: slip.log_p, default=None)
-    return None if best is None else replace(best, log_p=best.log_p + math.log(2 * len(tones)))
+    best = max(slips, key=lambda slip: slip.log_ratio, default=None)
+    return None if best is None else replace(best, log_ratio=best.log_ratio - math.log(2 * len(tones)))
 
 
 def demodulated(signal: Tensor, f: float) -> Tensor:
@@ -176,8 +164,9 @@ def _of_tone(case: Case, f: float) -> list[Slip]:
                 fit.slope * scale,
                 0.0 if fit.losses else math.sqrt(fit.variance + slope_variance) * scale,
                 tuple(_in_samples(loss, length // BLOCKS) for loss in fit.losses),
+                fit.lost,
                 fit.gain,
-                fit.log_p,
+                fit.log_ratio,
                 name,
             )
         )
@@ -206,132 +195,40 @@ def _reference(case: Case, f: float, strongest: float) -> tuple[str, float, floa
 def _skewed(z: Tensor, sets: Tensor, log_chance: Tensor, *, fixed: bool) -> _Fit:
     """The most likely set of sensors with a skew, against a reference that is fixed or the other sensors."""
     energy = _energy(z)  # (sensor, slope)
-    own, others = sets @ energy, (1 - sets) @ energy
+    own = sets @ energy
     middle = energy.shape[-1] // 2
-    gains = own.amax(-1) - own[:, middle] if fixed else own.amax(-1) + others.amax(-1) - energy.sum(0).amax()
-    log_p = math.log(4 * _CYCLES) - gains - log_chance
-    which = int(log_p.argmin())
+    # Where the others tell, both have the slopes that suit them, and no slip has the one that suits all.
+    over = -own[:, middle] if fixed else ((1 - sets) @ energy).amax(-1) - energy.sum(0).amax()
+    gains = own.amax(-1) + over
+    means = torch.logsumexp(own, -1) - math.log(own.shape[-1]) + over
+    which = int((gains + log_chance).argmax())
     inside = sets[which].bool()
     slope, size = best_slope(z[inside])
     rest, rest_size = (0.0, math.inf) if fixed else best_slope(z[~inside])
     variance = _variance(size) + _variance(rest_size)
-    return _Fit(which, slope - rest, variance, [], float(gains[which]), float(log_p[which]), rest)
+    ratio = float(torch.logsumexp(means + log_chance, 0))
+    return _Fit(which, slope - rest, variance, [], (0, 0), float(gains[which]), ratio, rest)
 
 
 def _lost(z: Tensor, sets: Tensor, log_chance: Tensor, angle: float, *, fixed: bool) -> _Fit:
     """The most likely set of sensors that lost samples, each of which turns the tone by `angle`."""
     rests, handicap = [0.0] * len(sets), torch.zeros(len(sets), dtype=torch.float64)
-    if fixed:
-        gains = (sets @ _step_gains(z, angle).flatten(1) - _counts_cost().repeat(BLOCKS - 1)).amax(-1)
-    else:
+    if not fixed:
         rests = [best_slope(z[~row.bool()])[0] for row in sets]
-        turned = [z * _turn(-rest) for rest in rests]
+    straight = z * _turn(-torch.tensor(rests, dtype=torch.float64))[:, None]  # (set, sensor, block)
+    if not fixed:
         # No slip may have another slope than suits the others alone.
-        alike = torch.stack([rows.sum(-1).abs().square().sum() / BLOCKS for rows in turned])
+        alike = straight.sum(-1).abs().square().sum(-1) / BLOCKS
         handicap = (_energy(z).sum(0).amax() - alike).clamp(min=0.0)
-        steps = (_step_gains(rows[row.bool()], angle).sum(0) for row, rows in zip(sets, turned, strict=True))
-        gains = torch.stack([(step - _counts_cost()).amax() for step in steps]) - handicap
-    which = int((gains + log_chance).argmax())
-    straight = z[sets[which].bool()] * _turn(-rests[which])
-    found = _best_losses(straight, angle)
-    losses = []
-    for at in sorted(found):
-        near_best = _further(straight, {place: count for place, count in found.items() if place != at}, angle)
-        near = near_best >= near_best.amax() - _AS_GOOD
-        places, counts = near.any(-1).nonzero()[:, 0] + 1, near.any(0).nonzero()[:, 0] + 1
-        limits = (int(places[0]), int(places[-1])), (int(counts[0]), int(counts[-1]))
-        losses.append(Loss(at, found[at], *limits))
-    gain, cost = _gain_of(straight, found, angle) - float(handicap[which]), _cost(found)
-    return _Fit(which, 0.0, 0.0, losses, gain, cost - gain - float(log_chance[which]), rests[which])
-
-
-def _best_losses(z: Tensor, angle: float) -> dict[int, int]:
-    """Losses in rows `(row, block)` that all share: block after each, and how many samples.
-
-    From the best one or two at once, one more as long as it gains enough, each time all of them moved to where they are
-    best.
-    """
-    starts: list[dict[int, int]] = [{}, _best_pair(z, angle)]
-    best: dict[int, int] = {}
-    for found in starts:
-        while len(found) < _MOST_LOSSES:
-            longer = _moved(z, _with_best(z, found, angle), angle)
-            gained = _gain_of(z, longer, angle) - _gain_of(z, found, angle) - _cost(longer) + _cost(found)
-            if found and gained < _CERTAIN:
-                break
-            found = longer
-        if not best or _gain_of(z, found, angle) - _cost(found) > _gain_of(z, best, angle) - _cost(best):
-            best = found
-    return best
-
-
-def _best_pair(z: Tensor, angle: float) -> dict[int, int]:
-    """The best two losses, places and counts coarsely."""
-    sums = z.unflatten(-1, (-1, _COARSER)).sum(-1).cumsum(-1)
-    first, second = torch.triu_indices(sums.shape[-1] - 1, sums.shape[-1] - 1, 1)
-    parts = sums[:, first], sums[:, second] - sums[:, first], sums[:, -1:] - sums[:, second]
-    best, found = -math.inf, {}
-    for one, other in itertools.product(range(1, _FEW_LOST + 1), repeat=2):
-        turned = parts[0] + cmath.exp(-1j * angle * one) * parts[1] + cmath.exp(-1j * angle * (one + other)) * parts[2]
-        gain = turned.abs().square().sum(0) / BLOCKS - math.log(2) * (one + other)
-        at = int(gain.argmax())
-        if float(gain[at]) > best:
-            best = float(gain[at])
-            found = {_COARSER * (int(first[at]) + 1): one, _COARSER * (int(second[at]) + 1): other}
-    return found
-
-
-def _with_best(z: Tensor, losses: dict[int, int], angle: float) -> dict[int, int]:
-    """Losses and the one more that gains most."""
-    gain = _further(z, losses, angle)
-    gain[[at - 1 for at in losses]] = -math.inf
-    at, count = divmod(int(gain.argmax()), _MOST_LOST)
-    return {**losses, at + 1: count + 1}
-
-
-def _moved(z: Tensor, losses: dict[int, int], angle: float) -> dict[int, int]:
-    """Losses, each in turn where it is best beside the others."""
-    for _ in range(2):
-        for at in list(losses):
-            losses = _with_best(z, {place: count for place, count in losses.items() if place != at}, angle)
-    return losses
-
-
-def _further(z: Tensor, losses: dict[int, int], angle: float) -> Tensor:
-    """Gain of one loss beside others in all rows, less what its count costs, nats, `(place, count)`."""
-    return _step_gains(_put_back(z, losses, angle), angle).sum(0) - _counts_cost()
-
-
-def _gain_of(z: Tensor, losses: dict[int, int], angle: float) -> float:
-    """Gain of losses in all rows, nats."""
-    energies = [rows.sum(-1).abs().square().sum() / BLOCKS for rows in (_put_back(z, losses, angle), z)]
-    return float(energies[0] - energies[1])
-
-
-def _cost(losses: dict[int, int]) -> float:
-    """Logarithm of how many places and counts losses are chosen from: each further sample is half as likely."""
-    return len(losses) * math.log(BLOCKS - 1) + math.log(2) * sum(losses.values())
-
-
-def _counts_cost() -> Tensor:
-    return math.log(2) * torch.arange(1, _MOST_LOST + 1, dtype=torch.float64)
-
-
-def _step_gains(z: Tensor, angle: float) -> Tensor:
-    """Gain of one loss in each row `(row, block)`, nats, `(row, place, count)`."""
-    before = z.cumsum(-1)
-    whole, before = before[:, -1:], before[:, :-1]
-    turn = torch.polar(torch.ones(_MOST_LOST, dtype=torch.float64), -angle * torch.arange(1.0, _MOST_LOST + 1).double())
-    turned = before[..., None] + (whole - before)[..., None] * turn
-    return (turned.abs().square() - whole[..., None].abs().square()) / BLOCKS
-
-
-def _put_back(z: Tensor, losses: dict[int, int], angle: float) -> Tensor:
-    """Rows without the steps of the phase that losses made."""
-    lost = torch.zeros(BLOCKS, dtype=torch.float64)
-    for at, count in losses.items():
-        lost[at:] += count
-    return z * torch.polar(torch.ones_like(lost), -angle * lost)
+    paths = paths_of(straight, sets, angle)
+    ratios = paths.log_ratio - handicap + log_chance
+    which = int(ratios.argmax())
+    losses, gain = losses_of(straight[which, sets[which].bool()], paths.lost[which], angle)
+    low, high = paths.limits(which)
+    count = sum(loss.count for loss in losses)
+    lost = min(low, count), max(high, count)
+    gain -= float(handicap[which])
+    return _Fit(which, 0.0, 0.0, losses, lost, gain, float(torch.logsumexp(ratios, 0)), rests[which])
 
 
 def _slopes() -> Tensor:

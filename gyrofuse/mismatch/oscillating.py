@@ -13,7 +13,6 @@ from gyrofuse.mismatch.bump_fit import Oscillation, likeliest_oscillation, oscil
 from gyrofuse.mismatch.bumps import Stretch, light_taper
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.folds import estimation_samples
-from gyrofuse.mismatch.lines import simulated_lines, whitened, without_lines
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.shape_terms import Bump, CommonBump, oscillation
 from gyrofuse.mismatch.shape_words import spanned
@@ -125,18 +124,10 @@ def nominated(case: Case, level: float, *, tone: bool) -> tuple[Mode, Seen] | No
         if shape is None or not isinstance(shape.term, Bump | CommonBump):
             return None
         rivals = shape.alternatives
-        term, (local_sd, log_sd) = shape.term, shape.sd
-        centre, width = (float(x) for x in term.shared.exp())
-        if isinstance(term, CommonBump):
-            gain = torch.complex(*term.local)
-            variance, spread = gain.abs().square(), 2 * gain.abs() * local_sd.square().nanmean(0).sqrt()
-        else:
-            gain, variance, spread = None, term.local[0], local_sd[0].nan_to_num(nan=math.inf)
-        stretch = Stretch(centre, width, shape.p_value, ())
-        sds = (float(log_sd[0]), float(log_sd[1]))
-        bump = Oscillation(stretch, centre, width, sds, variance, spread, gain, shape.gain)
+        centre, width = shape.term.shared.exp().tolist()
+        bump = Oscillation.of(Stretch(centre, width, shape.p_value, ()), shape.term, shape.sd, shape.gain)
         # Which sensors it takes is a matter of likelihood: variances are as uncertain as the width is.
-        has = term.free.any(0)
+        has = shape.term.free.any(0)
     else:
         has = bump.variance > _SEEN * bump.variance_sd
     sensors = tuple(int(i) for i in has.nonzero()[:, 0])
@@ -193,9 +184,7 @@ def _refitted(case: Case, fold: int, mode: Mode) -> Mode:
         return Mode(centre, width, term.local[0].sqrt().to(torch.complex128), False)
     keep = estimation_samples(case.n_samples, fold)
     block = run_length(keep)
-    blocks = whitened(without_lines(case.recording, simulated_lines(case.simulated)), case.base)[:, keep].unflatten(
-        -1, (-1, block)
-    )
+    blocks = case.lineless[:, keep].unflatten(-1, (-1, block))
     transform = torch.fft.rfft(blocks * light_taper(block)).movedim(-1, 0)  # (bin, sensor, block)
     f = torch.arange(len(transform), dtype=torch.float64) / block
     usable = (f > 2.5 / block) & (f < 0.5 - 2 / block) & ((f - mode.centre).abs() <= _REACH * (mode.width + 1 / block))

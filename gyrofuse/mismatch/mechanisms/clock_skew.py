@@ -58,8 +58,7 @@ class ClockSkew(Mechanism):
         against += "the other sensors" if slip.reference is None else slip.reference
         if losses:
             lost = sum(loss.count for loss in slip.losses)
-            low, high = (sum(loss.count_limits[end] for loss in slip.losses) for end in (0, 1))
-            parameters = {"lost": Parameter(lost, low, high, "")}
+            parameters = {"lost": Parameter(lost, *slip.lost, "")}
             for j, loss in enumerate(slip.losses):
                 parameters[f"time_of_loss_{j + 1}"] = Parameter(
                     loss.at / rate, loss.at_limits[0] / rate, loss.at_limits[1] / rate, "s"
