@@ -16,11 +16,13 @@ from torch.nn.functional import interpolate, pad
 
 from gyrofuse.mismatch.bump_fit import Oscillation
 from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.wandering import wandering_log_ratio
 
 _DRAWN = 60
 _REACH = 6.0  # half widths on either side
 _LEAST = 96  # bins that are needed
 _FIRES, _WOULD_FIRE = 4.5, 9.0  # standard deviations
+_SURE = 3.0  # nats
 _SLOW = 0.05  # of the record, between changes of speed of a tone that wanders slowly
 
 
@@ -58,15 +60,14 @@ def steadiness(case: Case, bump: Oscillation) -> Steadiness:
     ridge, steady = _scores(bins[None], gaussian)
     if max(float(ridge), float(steady)) > _FIRES:
         return Steadiness(tone=True, open=False, slow=float(ridge) > _FIRES)
-    seen = torch.stack([ridge, steady]).double()
-    would, log_ratios = [], []
-    for tones in _tones(bump, smooth, floor, case.n_samples, generator):
-        made = torch.stack(_scores(tones, gaussian)).double()  # (score, record)
-        would.append(float(made.amax(0).median()))
-        middle, spread = made.mean(1, keepdim=True), made.std(1, keepdim=True).clamp(min=1.0)
-        log_ratios.append((seen.square() / 2 - ((seen - middle) / spread).square() / 2 - spread.log()).sum())
-    likelier = float(torch.stack(log_ratios).logsumexp(0)) > math.log(len(log_ratios))
-    return Steadiness(tone=likelier, open=likelier or min(would) < _WOULD_FIRE, slow=float(ridge) > float(steady))
+    log_ratio = wandering_log_ratio(case, bump, weights)
+    # What would not be seen of a tone is no proof of noise.
+    would = [
+        float(torch.stack(_scores(tones, gaussian)).amax(0).median())
+        for tones in _tones(bump, smooth, floor, case.n_samples, generator)
+    ]
+    unsure = abs(log_ratio) < _SURE or (log_ratio < 0 and min(would) < _WOULD_FIRE)
+    return Steadiness(tone=log_ratio > 0, open=unsure, slow=float(ridge) > float(steady))
 
 
 def _baseband(case: Case, bump: Oscillation, weights: Tensor) -> tuple[Tensor, float]:

@@ -1,0 +1,111 @@
+"""A tone that wanders, or Gaussian noise of the same spectrum: mean likelihood ratios over the courses of either.
+
+In a band of frequencies around a bump, a tone of amplitude `A` in noise of variance one per sample gives windows of
+`L` samples, transformed at twice as many frequencies, powers `P` with the likelihood ratio
+
+    exp(-rho) I_0(2 sqrt(rho P)),   rho = A^2 L,
+
+over noise alone, whatever its phase (Rice); from window to window its frequency moves as a hidden Markov chain does.
+Gaussian noise has a hump, Lorentzian or normal, on a level, and Whittle's likelihood. Each is averaged over windows,
+strengths and speeds, or centres, widths and heights.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.bump_fit import Oscillation
+from gyrofuse.mismatch.case import Case
+
+_REACH, _FEWEST = 8.0, 256  # half widths on either side, and bins
+_SHORTEST, _LONGEST, _WINDOWS = 4, 128, 4  # samples of a window, and fewest windows
+_STRENGTHS = (0.25, 0.4, 0.6, 1.0, 1.5)  # of the likeliest hump's energy
+_SPEEDS = (0.5, 1.5, 4.0)  # steps from window to window, in half their resolution
+_WIDTHS, _NARROWEST, _WIDEST = 10, 2.0, 0.125  # bins, and share of the band
+_OFF = 0.12  # share of the band by which centres are off
+_CENTRES, _HEIGHTS = 9, (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 12.8, 25.0, 50.0, 100.0)
+
+
+def wandering_log_ratio(case: Case, bump: Oscillation, weights: Tensor) -> float:
+    """Log likelihood of a tone over that of Gaussian noise, in the sensors' weighted sum around a bump."""
+    bins = _band(case, bump, weights)
+    if len(bins) < _FEWEST:
+        return 0.0
+    hump, level, energy = _hump(bins.abs().square())
+    tone = _tone(bins / math.sqrt(level), energy)
+    noise = -len(bins) * math.log(level) - float(bins.abs().square().sum()) / level
+    return tone + noise - hump
+
+
+def _band(case: Case, bump: Oscillation, weights: Tensor) -> Tensor:
+    """Bins `(bin,)` of the sum in units of its noise."""
+    n = case.n_samples
+    ramp = torch.linspace(0, 1, n, dtype=torch.float64)
+    signal = case.recording - (case.recording[:, -1:] - case.recording[:, :1]) * ramp
+    centre, reach = round(bump.centre * n), max(round(_REACH * bump.width * n), _FEWEST)
+    reach = min(reach, centre - 3, n // 2 - centre - 2)
+    inside = slice(centre - reach, centre + reach)
+    f = torch.arange(inside.start, inside.stop, dtype=torch.float64) / n
+    noise = weights.abs().square() @ case.base.spectrum(f) * n
+    return (weights @ torch.fft.rfft(signal)[:, inside]) / noise.sqrt()
+
+
+def _hump(power: Tensor) -> tuple[float, float, float]:
+    """Mean log likelihood of Gaussian humps, and level and energy of the likeliest, in units of the level."""
+    n = len(power)
+    k = torch.arange(n, dtype=torch.float64) - (n - 1) / 2
+    widths = torch.logspace(math.log10(_NARROWEST), math.log10(_WIDEST * n), _WIDTHS, dtype=torch.float64)
+    height = torch.tensor(_HEIGHTS, dtype=torch.float64)[:, None, None]
+    values, best = [], (-math.inf, 1.0, 0.0)
+    for centre in torch.linspace(-_OFF * n, _OFF * n, _CENTRES).tolist():
+        square = ((k - centre) / widths[:, None]).square()
+        for shape in (1 / (1 + square), (-square / 2).exp()):
+            spectrum = 1 + height * shape  # (height, width, bin)
+            level = (power / spectrum).mean(-1)
+            value = -n * (level.log() + 1) - spectrum.log().sum(-1)
+            values.append(value.flatten())
+            at = int(value.argmax())
+            if float(value.max()) > best[0]:
+                energy = (height * shape).sum(-1)
+                best = float(value.max()), float(level.flatten()[at]), float(energy.flatten()[at])
+    every = torch.cat(values)
+    return float(every.logsumexp(0)) - math.log(len(every)), best[1], best[2]
+
+
+def _tone(bins: Tensor, energy: float) -> float:
+    """Mean log likelihood ratio of tones over noise of one in each bin."""
+    n = len(bins)
+    z = torch.fft.ifft(torch.fft.ifftshift(bins)) * math.sqrt(n)
+    found, length = [], _SHORTEST
+    while length <= min(n // _WINDOWS, _LONGEST):
+        windows = z[: n // length * length].unflatten(-1, (-1, length))
+        power = torch.fft.fft(windows, n=2 * length).abs().square() / length  # (window, frequency), in circular order
+        found.append(_courses(power, energy / len(power)))
+        length *= 2
+    every = torch.cat(found)
+    return float(every.logsumexp(0)) - math.log(len(every))
+
+
+def _courses(power: Tensor, energy: float) -> Tensor:
+    """Log likelihood ratios `(strength * speed,)` over all courses of the frequency through windows."""
+    n = power.shape[-1]
+    power = torch.fft.fftshift(power, dim=-1)
+    rho = energy * torch.tensor(_STRENGTHS, dtype=torch.float64)[:, None, None, None]
+    x = 2 * (rho * power[:, None]).sqrt()
+    log_ratio = torch.special.i0e(x).log() + x - rho  # (strength, window, 1, frequency)
+    peak = log_ratio.amax(-1, keepdim=True)
+    ratio = (log_ratio - peak).exp()
+    apart = (torch.arange(n)[:, None] - torch.arange(n)).abs().to(torch.float64)
+    chain = (-apart / torch.tensor(_SPEEDS, dtype=torch.float64)[:, None, None]).exp()
+    chain = chain / chain.sum(-1, keepdim=True)
+    state = torch.full((len(_STRENGTHS), len(_SPEEDS), n), 1 / n, dtype=torch.float64)
+    total = peak.sum((1, 2, 3))[:, None].expand(-1, len(_SPEEDS))
+    for window in range(len(power)):
+        here = state * ratio[:, window]
+        size = here.sum(-1, keepdim=True)
+        total = total + size[..., 0].log()
+        state = ((here / size).movedim(1, 0) @ chain).movedim(0, 1)
+    return total.flatten()
