@@ -10,8 +10,10 @@ from scipy import stats
 from shape_draws import CHANGES, RATE, SIGNS, N, P, array, case, drawn, generator, oscillating, tensor
 
 from gyrofuse.mismatch.bump_fit import oscillation_of
-from gyrofuse.mismatch.bumps import _coherent_scores, _normal_of_rises, strongest_bump
+from gyrofuse.mismatch.bump_scan import log_ratios
+from gyrofuse.mismatch.bumps import strongest_bump
 from gyrofuse.mismatch.colour import noise
+from gyrofuse.mismatch.hump_scan import _scores, scanned_humps
 from gyrofuse.mismatch.lines import whitened
 from gyrofuse.mismatch.mechanisms.resonance import Resonance
 from gyrofuse.mismatch.oscillating import Mode, excess_along
@@ -19,16 +21,48 @@ from gyrofuse.mismatch.shape_terms import oscillation
 from gyrofuse.mismatch.steadiness import steadiness
 
 
-@pytest.mark.parametrize("d", [20, 60])
-def test_correlations_of_independent_sensors_have_the_law_of_a_product_of_beta_variables(d: int):
-    n_runs = 4000
-    parts = torch.randn(2, n_runs, P, d, generator=generator(31), dtype=torch.float64)
-    z = torch.complex(parts[0], parts[1])
-    scores = _coherent_scores(z @ z.mH, float(d))
-    for level in (0.05, 0.005):
-        count = (scores > float(stats.norm.isf(level))).sum(-1).tolist()
-        low, high = stats.binom.ppf(1e-3, n_runs, 0.85 * level), stats.binom.isf(1e-3, n_runs, 1.15 * level)
-        assert all(low <= c <= high for c in count)
+@pytest.mark.parametrize("p", [1, 3, 6])
+def test_a_source_that_sensors_share_has_a_mean_ratio_of_one_where_there_is_none(p: int):
+    # Whatever the noise is that sensors share: heavy tails of ratios make their mean uncertain.
+    n_runs, m, f = 20_000, 6, 24
+    g = generator(31)
+    mix = torch.eye(p, dtype=torch.complex128) + 0.8
+    z = mix @ torch.complex(*torch.randn(2, n_runs, p, m + f, generator=g, dtype=torch.float64))
+    inside, beside = (x @ x.mH for x in (z[..., :m], z[..., m:]))
+    ratio = log_ratios(inside, beside, m, f).exp()
+    assert float(ratio.mean()) < 1 + 4 * float(ratio.std()) / math.sqrt(n_runs)
+    for x in (5.0, 50.0):
+        assert float((ratio > x).double().mean()) < 1 / x
+    # A source six times as loud as the noise would be seen.
+    loud = torch.complex(*torch.randn(2, n_runs, 1, m, generator=g, dtype=torch.float64))
+    z[..., :m] += math.sqrt(6.0) * mix[:, :1] * loud
+    inside = z[..., :m] @ z[..., :m].mH
+    assert float(log_ratios(inside, beside, m, f).median()) > 2
+
+
+@pytest.mark.parametrize("half", [4.0, 16.0, 64.0])
+def test_scores_of_humps_are_normal_where_there_is_none(half: float):
+    cell = max(int(half / 4), 1)
+    power = torch.empty(4, 2**18, dtype=torch.float64).exponential_(generator=generator(32))
+    cells = power.unflatten(-1, (-1, cell)).mean(-1)
+    scores, whole = _scores(cells, half / cell, float(cell), 3)
+    scores = scores[:, whole]
+    assert abs(float(scores.mean())) < 0.01
+    assert abs(float(scores.std()) - 1) < 0.02
+    for x in (2.0, 3.0):
+        share = float((scores > x).double().mean()) / float(stats.norm.sf(x))
+        assert 0.8 < share < 1.25
+
+
+def test_a_hump_is_where_it_was_put():
+    power = torch.empty(P, 2**14, dtype=torch.float64).exponential_(generator=generator(33))
+    k = torch.arange(2**14)
+    power[:3] *= 1 + 1.2 / (1 + ((k - 5000) / 60).square())
+    best = max(scanned_humps(power, 1.0), key=lambda scan: float(scan.log_ratio.amax()))
+    at = int(best.log_ratio.argmax())
+    assert abs(int(best.first[at]) + best.width / 2 - 5000) < 60
+    assert 60 <= best.width <= 300
+    assert float(best.log_ratio.amax()) > 20
 
 
 def test_a_line_is_no_bump_and_a_bump_of_both_sides_neither():
@@ -70,14 +104,6 @@ def test_coherent_or_not_is_told_of_a_bump():
     assert together.gain is not None
     turned = together.gain * together.gain[0].conj()
     assert (turned.real.sign() == SIGNS.sign()).all()
-
-
-def test_sums_of_what_rises_have_their_law():
-    z = torch.randn(40_000, P, generator=generator(40), dtype=torch.float64)
-    scores = _normal_of_rises(z.clamp(min=0).square().sum(-1), P)
-    for level in (0.2, 0.01):
-        count = int((scores > stats.norm.isf(level)).sum())
-        assert stats.binom.ppf(1e-3, len(z), level) <= count <= stats.binom.isf(1e-3, len(z), level)
 
 
 def test_a_mode_of_some_sensors_is_seen_that_a_taper_would_hide():

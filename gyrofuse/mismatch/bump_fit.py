@@ -23,6 +23,7 @@ from gyrofuse.mismatch.spectra import Bands, degrees_of_freedom
 
 _CUT_OFF = 0.6  # of the simulation's power
 _CELLS, _CELL = 24, 5  # on either side, and fewest bins of one
+_FINER, _NARROW = 3, 0.1  # times, and half width in the stretch
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +95,17 @@ def likeliest_oscillation(case: Case) -> Oscillation | None:
 
 
 def _closely(case: Case, stretch: Stretch) -> Oscillation | None:
+    """Fitted in cells of a quarter of the stretch, and in finer ones where it turns out to be much narrower."""
+    found = _in_cells(case, stretch)
+    for _ in range(_FINER):
+        if found is None or found.width > _NARROW * stretch.width:
+            break
+        stretch = stretch._replace(frequency=found.centre, width=stretch.width / 4)
+        found = _in_cells(case, stretch) or found
+    return found
+
+
+def _in_cells(case: Case, stretch: Stretch) -> Oscillation | None:
     n = case.n_samples
     cell = max(round(stretch.width * n / 4), _CELL)
     centre = round(stretch.frequency * n)

@@ -13,9 +13,10 @@ from scipy.signal import windows
 from torch import Tensor
 
 from gyrofuse._transforms import fast_length
-from gyrofuse.mismatch.bump_scan import log_shared, scanned_bumps
+from gyrofuse.mismatch.bump_scan import log_ratios, scanned_bumps
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import Evidence, corrected, ratio_p_value
+from gyrofuse.mismatch.hump_scan import scanned_humps
 from gyrofuse.mismatch.lines import simulated_lines, whitened, without_lines
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.shape_law import decorrelated
@@ -68,7 +69,9 @@ def strongest_bump(case: Case) -> Stretch:
     last = int((0.5 - 2 / case.n_samples) * length)
     transform = transform[:, :last]
     worth = case.n_samples / length / _DEPENDENT
-    scans = list(scanned_bumps(transform, _apart(transform, length, case), worth))
+    scans = list(scanned_humps(_apart(transform, length, case).abs().square(), worth))
+    if case.n_sensors > 1:
+        scans += scanned_bumps(transform, worth)
     power, nothing = transform.abs().square(), Stretch(0.25, 0.5, 1.0, tuple(range(case.n_sensors)))
     simulated: tuple[Tensor, int] | None = None
     for _ in range(_TRIES if scans else 0):
@@ -155,5 +158,5 @@ def _has_it(simulated: tuple[Tensor, int], stretch: Stretch, case: Case) -> bool
     flanks = torch.cat([left, right], -1)
     worth = case.simulated.signal.shape[-1] / length / _DEPENDENT
     m, f = max(inside.shape[-1] * worth, 1.0), flanks.shape[-1] * worth
-    log_ratio = log_shared((inside @ inside.mH)[None], (flanks @ flanks.mH)[None], m, f)
+    log_ratio = log_ratios((inside @ inside.mH)[None], (flanks @ flanks.mH)[None], m, f)
     return ratio_p_value(float(log_ratio)) < _AS_WELL

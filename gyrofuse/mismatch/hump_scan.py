@@ -1,0 +1,88 @@
+"""A mean likelihood ratio over Lorentzian humps that each sensor has of its own.
+
+Powers `P` of bins whose mean is a level are weighed with a hump's shape less its mean, `c = sum (L - mean L) P`,
+over the level that the same bins show: nearly a Beta variable with the skewness of its weights, and `u` its normal
+score. A hump moves `u` by `a`; where `e` is the share of sensors that have it,
+
+    prod_i (1 - e + e exp(a u_i - a^2 / 2))
+
+has expectation one where nothing stands out, and so has its mean over places, widths, sizes and shares.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+from torch.nn.functional import conv1d
+
+from gyrofuse.mismatch.bump_scan import Stretches
+
+_NARROWEST, _BROADEST = 4.0, 12.0  # half widths: bins, and of them in the spectrum
+_FINER = math.sqrt(2)
+_CELLS = 4  # in a half width
+_REACH = 5.0  # half widths on either side
+_WHOLE = 0.8  # of a shape that has to lie in the spectrum
+_LOWEST, _ABOVE = 12, 8.0  # bins, and half widths, above which centres lie
+_SIZES = (2.0, 3.0, 4.5, 6.5)
+_SHARES = (0.2, 0.5, 0.9)
+
+
+def scanned_humps(power: Tensor, worth: float) -> Iterator[Stretches]:
+    """Humps of half widths from four bins, a root of two apart, every half of a half width.
+
+    Args:
+        power: Of bins `(sensor, bin)`, of sensors that share nothing.
+        worth: Independent ordinates in a bin.
+    """
+    n_bins, half = power.shape[-1], _NARROWEST
+    while half <= n_bins / _BROADEST:
+        cell = max(int(half / _CELLS), 1)
+        cells = power[:, : n_bins // cell * cell].unflatten(-1, (-1, cell)).mean(-1)
+        score, whole = _scores(cells, half / cell, cell * worth, -(-_LOWEST // cell))
+        centre = torch.arange(cells.shape[-1]) * cell + cell // 2
+        which = (whole & (centre > _ABOVE * half)).nonzero()[:, 0][:: max(round(half / 2 / cell), 1)]
+        if len(which):
+            width = round(2 * half)
+            yield Stretches(centre[which] - width // 2, width, _log_ratios(score[:, which]))
+        half *= _FINER
+
+
+def _scores(cells: Tensor, half: float, worth: float, lowest: int) -> tuple[Tensor, Tensor]:
+    """Normal scores of a hump centred on each cell `(sensor, cell)`, and whether enough of it lies in the spectrum."""
+    reach = round(_REACH * half)
+    shape = 1 / (1 + (torch.arange(-reach, reach + 1, dtype=torch.float64) / half).square())
+    kernels = torch.stack([torch.ones_like(shape), shape, shape.square()])[:, None]
+    used = torch.ones_like(cells[:1])
+    used[:, :lowest] = 0
+    count, first, second = conv1d(used[None], kernels, padding=reach)[0]
+    total, along = conv1d((cells * used)[:, None], kernels[:2], padding=reach).unbind(1)
+    count = count.clamp(min=1.0)
+    variance = (second - first.square() / count).clamp(min=1e-9) / worth
+    standard = (along * count / total.clamp(min=1e-300) - first) / variance.sqrt()
+    away = shape - shape.mean()
+    skewness = float(away.pow(3).sum() / away.square().sum().pow(1.5)) * math.sqrt(len(shape))
+    inside = (1 - skewness / math.hypot(skewness, 2.0)) / 2
+    return _normal_of_share(standard, inside, len(shape) * worth), count > _WHOLE * len(shape)
+
+
+def _normal_of_share(standard: Tensor, inside: float, n: float) -> Tensor:
+    """Normal score (Paulson) of a standardised Beta variable of mean `inside` and `n` ordinates."""
+    share = (inside + standard * math.sqrt(inside * (1 - inside) / (n + 1))).clamp(1e-9, 1 - 1e-9)
+    root = (share / inside * (1 - inside) / (1 - share)).pow(1 / 3)
+    a, b = 1 / (9 * n * inside), 1 / (9 * n * (1 - inside))
+    return ((1 - b) * root - (1 - a)) / (b * root.square() + a).sqrt()
+
+
+def _log_ratios(score: Tensor) -> Tensor:
+    """Of normal scores `(sensor, place)`, `(place,)`."""
+    shares = _SHARES if len(score) > 1 else (1.0,)
+    total = torch.full_like(score[0], -math.inf)
+    for a in _SIZES:
+        one = a * score - a**2 / 2
+        for e in shares:
+            some = one if e == 1 else torch.logaddexp(one + math.log(e), one.new_tensor(math.log(1 - e)))
+            total = torch.logaddexp(total, some.sum(0))
+    return total - math.log(len(_SIZES) * len(shares))
