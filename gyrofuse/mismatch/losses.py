@@ -23,6 +23,7 @@ _STEPS, _STATES = 128, 20  # of the chain: times, and samples lost, from 0
 _EXPECTED = 2.0  # losses
 _TOTALS = (2, 3, 4, 5, 6, 8)  # lost evenly over the record, as paths to begin with
 _PLACES, _AT_ONCE = (0.2, 0.4, 0.6, 0.8), (1, 2)  # of a single loss, likewise
+_PARTS = (16, 8, 4)  # of the record, at the start of which nothing may be lost yet
 _ROUNDS, _KEPT = 4, 3
 _MOST_LOST, _FEW_LOST = 8, 4  # samples at once
 _COARSER = 4  # blocks in which two losses are looked for at once
@@ -74,7 +75,8 @@ def paths_of(z: Tensor, sets: Tensor, angle: float) -> Paths:
     turn = torch.polar(torch.ones(_STATES, dtype=torch.float64), -angle * torch.arange(_STATES, dtype=torch.float64))
     chain = _chain()
     starts = turn[_starts()]  # (start, step)
-    amplitude = (z @ starts.mT / _STEPS).movedim(-1, 1)  # (set, start, sensor)
+    early = [z[..., : _STEPS // part].mean(-1) for part in _PARTS]
+    amplitude = torch.cat([(z @ starts.mT / _STEPS).movedim(-1, 1), torch.stack(early, 1)], 1)  # (set, start, sensor)
     for number in range(_ROUNDS):
         projected = (amplitude.conj() @ z)[..., None] * turn
         squares = amplitude.abs().square().sum(-1)[..., None, None]
