@@ -19,6 +19,7 @@ from gyrofuse._checks import (
     largest_level,
 )
 from gyrofuse._composition import Composition, shape_of
+from gyrofuse._linalg import check_positive_definite
 from gyrofuse._model_tones import model_tones
 from gyrofuse._records import Records
 from gyrofuse._result import named, numbered
@@ -81,6 +82,7 @@ def fit_array_gmwm(
         TypeError: `signal` is not a floating point tensor or a `Recording`.
         ValueError: More parameters than levels, a model with values or a drift, bad options, or no array that can be
             fitted.
+        SingularCovarianceError: A duplicated or linearly dependent sensor.
 
     References:
         [V] section III, for one sensor.
@@ -106,6 +108,8 @@ def fit_array_gmwm(
     usable = _usable(gamma, sensors)
     series = values.detach().reshape(-1, n_sensors, length)[usable] if n_samples is None else None
     gamma = gamma[usable]
+    whole = gamma[:, 0].isfinite().all(-1).all(-1)
+    check_positive_definite("`signal`: the wavelet cross-covariance at level 1", gamma[whole, 0], sensors)
     # In units of each sensor, so that no sensor is small to rounding.
     nu = gamma.diagonal(dim1=-2, dim2=-1)
     size = nu.log().nanmean(-2).nan_to_num(nan=0.0).div(2).exp()  # (item, sensor)

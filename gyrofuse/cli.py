@@ -39,6 +39,7 @@ from gyrofuse.cli_shared import (
     Unit,
     at_rest,
     known_unit,
+    model_grid,
     outputs,
     read,
     read_model,
@@ -100,6 +101,7 @@ class Covariance(str, Enum):
 
 
 # Methods whose weights have no law to rest an interval on, or, equal ones, are not estimated at all.
+_SAME_RATE = 1e-3  # of rates read from time stamps
 _WITHOUT_INTERVALS = (Method.multiscale, Method.nonnegative, Method.equal, Method.rdvg)
 
 
@@ -253,13 +255,18 @@ def simulate(
         ),
     ],
     samples: Annotated[int, typer.Option(metavar="N", help="Samples of each sensor.")],
-    rate: Annotated[float, typer.Option(metavar="HZ", help="Sampling rate.")],
     out: Annotated[Path, typer.Option(metavar="FILE", help="Where the recording goes, .npz or .csv.")],
+    rate: Annotated[
+        float | None, typer.Option(metavar="HZ", help="Sampling rate; by default that of a model fitted to a log.")
+    ] = None,
     sensors: Annotated[
         int | None,
         typer.Option(metavar="N", help="How many independent sensors; 1 by default, unless MODEL is an array."),
     ] = None,
-    unit: Annotated[str, typer.Option(metavar="UNIT", help="Unit of the rates.")] = "deg/s",
+    unit: Annotated[
+        str | None,
+        typer.Option(metavar="UNIT", help="Unit of the rates; by default that of a model fitted to a log, or deg/s."),
+    ] = None,
     seed: Annotated[
         int | None, typer.Option(metavar="S", min=0, max=2**63 - 1, help="The same seed gives the same recording.")
     ] = None,
@@ -268,13 +275,12 @@ def simulate(
     force: Force = False,
 ) -> None:
     """Simulate a recording from a noise model."""
-    unit = known_unit(unit)
-    check_positive("--rate", rate)
     check_positive_integer("--samples", samples)
     check_positive_integer("--sensors", 1 if sensors is None else sensors)
     source = [Path(model)] if model.lower().endswith(".json") else []
     with outputs(force, source, out=out, json=json_file, report=report) as drafts:
         noise = read_model(source[0]) if source else parse_model(model)
+        rate, unit = _grid(source[0] if source else None, rate, unit)
         generator = torch.Generator()
         seed = generator.seed() % 2**32 if seed is None else seed
         generator.manual_seed(seed)
@@ -298,6 +304,20 @@ def simulate(
             drafts[report].write_text(page, encoding="utf-8")
     say("\n".join(map(str, each)))
     say(f"{signal.shape[0]} x {samples} samples at {rate:g} Hz, seed {seed}, in {out}")
+
+
+def _grid(source: Path | None, rate: float | None, unit: str | None) -> tuple[float, str]:
+    """Rate and unit: those asked for, which have to be those of the log that a model was fitted to."""
+    own_rate, own_unit = (None, None) if source is None else model_grid(source)
+    chosen = own_rate if rate is None else check_positive("--rate", rate)
+    if chosen is None:
+        raise ValueError("`--rate`: expected the sampling rate in Hz, which this model does not say, got none; give it")
+    if own_rate is not None and abs(chosen / own_rate - 1) > _SAME_RATE:
+        raise ValueError(f"`--rate`: expected {own_rate:g} Hz, for which the model was fitted, got {chosen:g}")
+    named = None if unit is None else known_unit(unit)
+    if None not in (named, own_unit) and named != own_unit:
+        raise ValueError(f"`--unit`: expected {own_unit}, for which the model was fitted, got {named}")
+    return chosen, named or own_unit or "deg/s"
 
 
 def _each(noise: Any) -> list[Any]:

@@ -126,7 +126,8 @@ def fit(
             if path:
                 drafts[path].write_text(_exported(result, recording, option, written), encoding="utf-8")
         if model_out:
-            write_json(drafts[model_out], _known_model(result).to_dict())
+            known = _known_model(result, "model-out").to_dict()
+            write_json(drafts[model_out], {**known, "rate": recording.rate, "unit": recording.unit})
         if figure:
             _draw(result, drafts[figure], figure)
         if report:
@@ -141,19 +142,22 @@ def fit(
 
 
 def _draw(result: GMWMResult | RankResult, draft: Path, path: Path) -> None:
-    """The figure of the first sensor, in the format that the path asks for."""
+    """The figure of the first sensor that has one, in the format that the path asks for."""
     drawn = new_figure(7.0, 4.6)
-    result.plot(drawn.subplots())
+    if isinstance(result, GMWMResult):
+        result.plot(drawn.subplots(), index=tuple(result.params.isfinite().all(-1).nonzero()[0].tolist()))
+    else:
+        result.plot(drawn.subplots())
     save_figure(drawn, draft, path.suffix[1:].lower())
 
 
-def _known_model(result: GMWMResult) -> Model:
+def _known_model(result: GMWMResult, option: str) -> Model:
     """The fitted model, where all sensors have one."""
     missing = ~result.params.isfinite().all(-1).reshape(-1, len(result.sensors)).all(0)
     if bool(missing.any()):
         names = [name for name, gone in zip(result.sensors, missing.tolist(), strict=True) if gone]
         raise ValueError(
-            f"`--model-out`: expected sensors that could all be fitted, got none for {', '.join(names)}; leave them "
+            f"`--{option}`: expected sensors that could all be fitted, got none for {', '.join(names)}; leave them "
             "out with --sensors"
         )
     return result.model
@@ -173,7 +177,7 @@ def _exported(
             f"`--{option}`: expected a log in one of {', '.join(RATE_UNITS)}, got unit {recording.unit!r}; where the "
             "log does not say, give its unit with --unit, and with --scale the factor to it from other numbers"
         )
-    return written(result.model.with_params(params[0]), recording.rate, recording.unit)
+    return written(_known_model(result, option).with_params(params[0]), recording.rate, recording.unit)
 
 
 def rank(

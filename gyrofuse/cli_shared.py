@@ -145,6 +145,14 @@ def read_model(path: Path) -> Model | ArrayModel | RepairedModel:
         raise ValueError(f"{path}: expected a model in JSON, as to_dict() of a model gives it: {error}") from None
 
 
+def model_grid(path: Path) -> tuple[float | None, str | None]:
+    """Rate in Hz and unit of the log that a model in JSON was fitted to, where it says."""
+    content = json.loads(path.read_text(encoding="utf-8"))
+    rate, unit = content.get("rate"), content.get("unit")
+    known = isinstance(unit, str) and unit != "unknown"
+    return (rate if isinstance(rate, float | int) else None), (unit if known else None)
+
+
 def without_gaps(recording: Recording, done: str, fewest: int, otherwise: str = "") -> tuple[Recording, list[str]]:
     """The longest stretch that no sensor lacks a sample of, and what to say about it.
 

@@ -21,6 +21,7 @@ from gyrofuse.processes import (
     WhiteNoise,
 )
 
+_WHITE_AFTER = 1.0  # s
 _LEVELS = 40  # where the floor of the Allan deviation is looked for: of any record
 
 
@@ -39,7 +40,7 @@ class Datasheet:
     Attributes:
         rate: Hz.
         unit: Rate unit of the model.
-        entries: Quantities in the order of the model's processes; one may appear in two units.
+        entries: Angle random walk, then the rest in the order of the model's processes; one may appear in two units.
     """
 
     rate: float
@@ -62,6 +63,8 @@ class Datasheet:
 
 def datasheet(model: Model, rate: float, unit: str, *, n_levels: int = _LEVELS) -> Datasheet:
     """Translate a model into angle random walk, bias instability, rate random walk and the like.
+
+    Where no white noise is left, angle random walk is that of AR1s with a correlation time below one second.
 
     Bias instability is the lowest local minimum of the Allan deviation, without tones and drifts, over 0.664,
     on octave averaging times, of those that longer averaging does not get below; a model whose Allan deviation has no
@@ -87,18 +90,33 @@ def datasheet(model: Model, rate: float, unit: str, *, n_levels: int = _LEVELS) 
             f"`model`: expected scalar parameters, got a batch of shape {tuple(model.params.shape[:-1])}; "
             "pick one item with model.with_params(model.params[i])"
         )
-    entries = [e for process in model.processes for e in _entries(process, rate, unit, degrees)]
-    return Datasheet(rate, unit, (*entries, *_floor(model, rate, degrees, n_levels)))
+    white = list(_angle_random_walk(model, rate, unit, degrees))
+    entries = [e for process in model.processes for e in _entries(process, rate, degrees, unit)]
+    return Datasheet(rate, unit, (*white, *entries, *_floor(model, rate, degrees, n_levels)))
 
 
-def _entries(process: Process, rate: float, unit: str, degrees: float) -> Iterator[DatasheetEntry]:
+def _angle_random_walk(model: Model, rate: float, unit: str, degrees: float) -> Iterator[DatasheetEntry]:
+    """Of white noise; where there is none, of the AR1s that are white after less than a second."""
+    variance = sum(p.params.tolist()[0] for p in model.processes if isinstance(p, WhiteNoise))
+    name = "angle random walk N"
+    if variance == 0:
+        shaped = [p.params.tolist() for p in model.processes if isinstance(p, AR1)]
+        variance = sum(own / (1 - phi) ** 2 for phi, own in shaped if _short(phi, rate))
+        name += " of AR1s"
+    if variance > 0:
+        density = units.angle_random_walk(variance, rate)
+        yield DatasheetEntry(name, units.per_sqrt_hour(density * degrees), "deg/sqrt(h)")
+        yield DatasheetEntry(name, density, f"{unit}/sqrt(Hz)")
+
+
+def _short(phi: float, rate: float) -> bool:
+    return phi <= 0 or units.correlation_time(phi, rate) < _WHITE_AFTER
+
+
+def _entries(process: Process, rate: float, degrees: float, unit: str) -> Iterator[DatasheetEntry]:
     first, *rest = process.params.tolist()
     hour = units.SECONDS_PER_HOUR
-    if isinstance(process, WhiteNoise):
-        density = units.angle_random_walk(first, rate)
-        yield DatasheetEntry("angle random walk N", units.per_sqrt_hour(density * degrees), "deg/sqrt(h)")
-        yield DatasheetEntry("angle random walk N", density, f"{unit}/sqrt(Hz)")
-    elif isinstance(process, QuantizationNoise):
+    if isinstance(process, QuantizationNoise):
         angle = units.quantization(first, rate) * degrees * units.ARCSECONDS_PER_DEGREE
         yield DatasheetEntry("quantization Q", angle, "arcsec")
     elif isinstance(process, RandomWalk):

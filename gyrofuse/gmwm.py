@@ -17,6 +17,7 @@ from gyrofuse._checks import (
     largest_level,
 )
 from gyrofuse._composition import Composition
+from gyrofuse._drift_sign import rising, signed
 from gyrofuse._model_tones import model_tones
 from gyrofuse._records import Records
 from gyrofuse._result import named, numbered
@@ -26,7 +27,7 @@ from gyrofuse.moment_fit import composition_of
 from gyrofuse.moment_identity import remarks
 from gyrofuse.moment_inference import Fit, Inference, either, infer, infer_efficient
 from gyrofuse.moment_profile import MomentSurface, SpectralSurface, profiled
-from gyrofuse.processes import Model
+from gyrofuse.processes import Drift, Model, Sinusoid
 from gyrofuse.recording import Recording
 from gyrofuse.robust import check_efficiency, robust_wavelet_variance
 from gyrofuse.robust_covariance import check_gaussian
@@ -57,7 +58,8 @@ def fit_gmwm(
     frequencies of sinusoids come from the signal's spectrum, where they show a thousand times more sharply than in
     wavelet variances; lines of fewer than 30 cycles or hardly above the noise are tested against a noise spectrum
     fitted to the record, and `remarks` say which could be noise, and where the amplitude that the moments ask for is
-    more than the spectrum holds. AR1s are given from slow to fast, sinusoids from high to low frequency.
+    more than the spectrum holds. A drift has the sign of the signal's slope; a wavelet variance tells none, and it is
+    given as rising. AR1s are given from slow to fast, sinusoids from high to low frequency.
 
     Intervals are symmetric in logarithms, `atanh phi` and `logit(beta / pi)`. Those of variances at zero, of what is
     known to hardly its order of magnitude and of AR1s that another process could stand for are by profile: every value
@@ -132,6 +134,8 @@ def fit_gmwm(
     *batch, levels, n_sensors = variance.shape
     sensors = recording.sensors if recording else numbered(n_sensors)
     made_of = composition_of(model, held=series is not None)
+    if all(isinstance(p, Drift | Sinusoid) for p in made_of.processes):
+        raise ValueError(f"`model`: expected a noise process beside sinusoids and drifts, got {made_of.name}; add WN")
     if efficiency < 1:
         check_gaussian(Model(list(made_of.processes)))
     n_unknown = made_of.n_linear + len(made_of.curved)
@@ -155,9 +159,13 @@ def fit_gmwm(
         inference = _refined(series[usable], tones, fit, made_of, inference, confidence_level)
     else:
         inference = profiled(inference, MomentSurface(fit, made_of), fit, made_of, confidence_level)
+    said = remarks(made_of, inference.estimates, length, confidence_level, tones)
+    if series is not None:
+        estimates = signed(inference.estimates, Model(list(made_of.processes)), rising(series[usable]))
+        inference = replace(inference, estimates=estimates)
     return GMWMResult.build(
         inference=inference,
-        remarks=remarks(made_of, inference.estimates, length, confidence_level, tones),
+        remarks=said,
         made_of=made_of,
         usable=usable,
         wavelet_variance=nu,

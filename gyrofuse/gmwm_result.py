@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _MOST_TABLES = 12  # items that a summary prints in full
+_REFUSED = 0.01
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -148,6 +149,10 @@ class GMWMResult:
         if batch:
             lines.append(f"{n_items} fits in a batch {tuple(batch)}, {int(self.converged.sum())} converged")
         if n_items > _MOST_TABLES:
+            tested = self.p_value.isfinite()
+            if bool(tested.any()):
+                refused = int((self.p_value[tested] < _REFUSED).sum())
+                lines.append(f"the J test refuses {refused} of {int(tested.sum())} models (p < {_REFUSED:g})")
             return "\n".join(lines)
         for index in itertools.product(*map(range, self.params.shape[:-1])):
             lines += ["", *self._table(index)]

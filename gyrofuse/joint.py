@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -13,6 +13,7 @@ from torch import Tensor
 from gyrofuse import _moment_search as search
 from gyrofuse._checks import check_signal
 from gyrofuse._composition import Composition
+from gyrofuse._drift_sign import drifts_of, signed
 from gyrofuse._records import Records
 from gyrofuse._result import listed
 from gyrofuse.gmwm import fit_gmwm
@@ -164,9 +165,15 @@ def fit_jointly(
 
     whole = first.wavelet_variance.new_full((len(usable), records.n_levels), torch.nan)
     whole[usable] = nu
+    said = remarks(made_of, inference.estimates, records.longest, confidence_level)
+    model_of = Model(list(made_of.processes))
+    # Ramps of the recordings, with their signs, say which way their mean goes.
+    every = torch.stack([one.params.flatten(0, -2)[usable] for one in separate]).sum(0)
+    slopes = every[:, drifts_of(model_of)].sum(-1)
+    sign = torch.where(slopes < 0, -1.0, 1.0).to(torch.float64)
     joint = GMWMResult.build(
-        inference=inference,
-        remarks=remarks(made_of, inference.estimates, records.longest, confidence_level),
+        inference=replace(inference, estimates=signed(inference.estimates, model_of, sign)),
+        remarks=said,
         made_of=made_of,
         usable=usable,
         wavelet_variance=whole,

@@ -56,8 +56,8 @@ def model_method(result: GMWMResult) -> str:
     ]
     if result.efficiency < 1:
         sentences.append(
-            f"Wavelet variances are robust, of efficiency {result.efficiency:g}: a few wild samples hardly move them; "
-            "their covariance is their own, and intervals are those of clean noise."
+            f"Wavelet variances are robust, of efficiency {result.efficiency:g}: wild samples, up to one in "
+            "two thousand, hardly move them; their covariance is their own, and intervals are those of clean noise."
         )
     if result.refined:
         sentences.append(
@@ -104,10 +104,10 @@ def _completeness(result: GMWMResult, index: tuple[int, ...]) -> Iterator[str]:
     if p_value >= _REFUSED:
         yield f"The model is in doubt ({told}): {where}."
     else:
-        yield (
-            f"The model is not complete ({told}): {where}. Intervals hold only for what the model knows; add a process "
-            "or look for a disturbance."
-        )
+        remedy = "add a process or look for a disturbance"
+        if result.efficiency < 1:
+            remedy = "add a process; where more than one sample in a thousand is wild, slow levels have them too"
+        yield f"The model is not complete ({told}): {where}. Intervals hold only for what the model knows; {remedy}."
 
 
 def _rulers(result: GMWMResult, index: tuple[int, ...]) -> Iterator[str]:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gyrofuse._checks import check_positive_integer
 from gyrofuse._composition import Composition
+from gyrofuse._drift_sign import drifts_of
 from gyrofuse._model_tones import model_tones
 from gyrofuse._paths import own_generator
 from gyrofuse._result import ConfidenceInterval, listed
@@ -157,11 +158,16 @@ def bootstrap_gmwm(
         Intervals, bias and the p-value of the fit.
 
     Raises:
+        TypeError: `result` is none of `fit_gmwm`.
         ValueError: Fewer than 20 resamples, weights missing or given to a fit that had none, or nothing was fitted.
 
     References:
         B. Efron, R. J. Tibshirani, An Introduction to the Bootstrap, 1993, chapters 12 and 13.
     """
+    if not isinstance(result, GMWMResult):
+        raise TypeError(
+            f"`result`: expected a GMWMResult of fit_gmwm, got {type(result).__name__}; of a joint fit give `.joint`"
+        )
     n_resamples = check_positive_integer("n_resamples", n_resamples)
     if n_resamples < _FEWEST:
         raise ValueError(f"`n_resamples`: expected at least {_FEWEST}, got {n_resamples}; quantiles need them")
@@ -189,8 +195,10 @@ def bootstrap_gmwm(
         records = model.simulate(result.n_samples, batch=(batch,), generator=generator)  # (resample, item, time)
         drawn.append(_fitted(records, result, made_of, omega))
     again, spread, distance = (torch.cat(parts) for parts in zip(*drawn, strict=True))
+    # Moments hold squares of slopes: what falls is resampled as if it rose, and turned back at the end.
+    turn = torch.where(drifts_of(model).to(params.device) & (params[usable] < 0), -1.0, 1.0).to(torch.float64)
+    own = params[usable] * turn
 
-    own = params[usable]
     failed = ~again.isfinite().all(-1)
     n_failed = failed.sum(0)
     again = torch.where(failed[..., None], torch.nan, again)
@@ -199,7 +207,7 @@ def bootstrap_gmwm(
     std = torch.where((n_resamples - n_failed > 1)[:, None], std, torch.nan)
     tail = (1 - result.confidence_level) / 2
     percentile = again.nanquantile(tail, 0), again.nanquantile(1 - tail, 0)
-    studentized = _studentized(made_of, own, again, spread, _sds(result, made_of, usable), tail, percentile)
+    studentized = _studentized(made_of, own, again, spread, _sds(result, made_of, own, usable), tail, percentile)
     larger = (distance >= result.j_statistic.flatten()[usable]).sum(0)
     p_value = torch.where(n_failed < n_resamples, (1 + larger) / (1 + n_resamples - n_failed), torch.nan)
 
@@ -209,13 +217,17 @@ def bootstrap_gmwm(
         whole[usable] = value
         return whole.view(*result.params.shape[:-1], *value.shape[1:])
 
+    def turned(limits: tuple[Tensor, Tensor]) -> ConfidenceInterval:
+        low, high = (limit * turn for limit in limits)
+        return ConfidenceInterval(placed(torch.where(turn < 0, high, low)), placed(torch.where(turn < 0, low, high)))
+
     return GMWMBootstrap(
         param_names=result.param_names,
         params=result.params,
-        bias=placed(mean - own),
+        bias=placed((mean - own) * turn),
         std=placed(std),
-        percentile=ConfidenceInterval(*map(placed, percentile)),
-        studentized=ConfidenceInterval(*map(placed, studentized)),
+        percentile=turned(percentile),
+        studentized=turned(studentized),
         confidence_level=result.confidence_level,
         p_value=placed(p_value.to(own)),
         n_resamples=n_resamples,
@@ -244,9 +256,8 @@ def _fitted(
     return params.unflatten(0, batch), spread.unflatten(0, batch), inference.j_statistic.unflatten(0, batch)
 
 
-def _sds(result: GMWMResult, made_of: Composition, usable: Tensor) -> Tensor:
-    params, covariance = result.params.flatten(0, -2)[usable], result.param_cov.flatten(0, -3)[usable]
-    return _in_unknowns(made_of, params, covariance)
+def _sds(result: GMWMResult, made_of: Composition, params: Tensor, usable: Tensor) -> Tensor:
+    return _in_unknowns(made_of, params, result.param_cov.flatten(0, -3)[usable])
 
 
 def _in_unknowns(made_of: Composition, params: Tensor, covariance: Tensor) -> Tensor:

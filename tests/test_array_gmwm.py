@@ -442,3 +442,10 @@ def test_given_moments_are_symmetric_and_not_a_recording():
         gf.fit_array_gmwm(wccv, "WN + RW", n_samples=N_SAMPLES)
     with pytest.raises(ValueError, match="`n_samples`: expected None with a Recording"):
         gf.fit_array_gmwm(gf.Recording(signals(1)[0], rate=1.0), "WN + RW", n_samples=N_SAMPLES)
+
+
+def test_a_duplicated_sensor_is_named():
+    signal = torch.randn(3, 4096, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    signal[1] = 2 * signal[0]
+    with pytest.raises(gf.SingularCovarianceError, match="1 and 2"):
+        gf.fit_array_gmwm(signal, "WN")

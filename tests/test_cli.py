@@ -270,9 +270,33 @@ def test_fit_lists_its_files_and_simulate_reads_what_it_wrote(run: Run, log: Pat
     assert "<batch" not in again.out
     assert gf.read_recording("s.npz").signal.shape == (3, 100)
     refused(
-        run("simulate", "f.json", "--samples", 9, "--rate", 1, "--out", "t.npz", "--sensors", 5),
+        run("simulate", "f.json", "--samples", 9, "--out", "t.npz", "--sensors", 5),
         "f.json is a model of 3 sensors; leave the option out",
     )
+
+
+@pytest.mark.parametrize("option", ["--json", "--model-out"])
+def test_a_model_knows_rate_and_unit_of_its_log(run: Run, log: Path, tmp_path: Path, option: str):
+    gf.Recording(gf.read_recording(log).signal, rate=80.0, unit="rad/s").save(tmp_path / "radians.npz")
+    assert run("fit", "radians.npz", "--model", "WN", option, "f.json").status == 0
+    assert run("simulate", "f.json", "--samples", 100, "--out", "s.npz").status == 0
+    again = gf.read_recording("s.npz")
+    assert again.unit == "rad/s"
+    assert again.rate == pytest.approx(80.0)
+    assert run("simulate", "f.json", "--samples", 9, "--rate", 80, "--unit", "rad/s", "--out", "t.npz").status == 0
+    for wrong, says in ((("--rate", 7), "expected 80 Hz"), (("--unit", "deg/s"), "expected rad/s")):
+        refused(run("simulate", "f.json", "--samples", 9, *wrong, "--out", "u.npz"), says)
+    refused(run("simulate", "WN(variance=1)", "--samples", 9, "--out", "u.npz"), "`--rate`: expected the sampling rate")
+
+
+@pytest.mark.filterwarnings("ignore:`signal`. expected wavelet variances")
+def test_one_dead_sensor_leaves_the_others_their_figure(run: Run, log: Path, tmp_path: Path):
+    signal = gf.read_recording(log).signal.clone()
+    signal[0] = 1.0
+    gf.Recording(signal, rate=100.0, unit="deg/s").save(tmp_path / "dead.npz")
+    assert run("fit", "dead.npz", "--model", "WN", "--figure", "f.png").status == 0
+    assert Path("f.png").stat().st_size > 5000
+    refused(run("fit", "dead.npz", "--model", "WN", "--model-out", "m.json"), "sensors that could all be fitted")
 
 
 def test_a_stretch_beyond_the_log_and_a_strange_unit_are_told(run: Run, log: Path, tmp_path: Path):

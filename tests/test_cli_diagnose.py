@@ -108,7 +108,7 @@ def test_the_repaired_simulation_simulates_and_agrees(run: Run, log: Path):
         assert done.out.startswith("Recording and simulation agree")
     wrong = run("simulate", "m.json", "--samples", N, "--rate", 10, "--out", "t.npz")
     assert wrong.status == 2
-    assert "expected that of the repaired simulation, 50 Hz, got 10 Hz" in wrong.err
+    assert "expected 50 Hz, for which the model was fitted, got 10" in wrong.err
     assert run("simulate", "m.json", "--samples", N, "--rate", RATE, "--sensors", 2, "--out", "t.npz").status == 2
 
 

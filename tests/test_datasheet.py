@@ -81,7 +81,18 @@ def test_units_of_the_model_do_not_change_what_is_in_degrees():
 
 
 def test_negative_ar1_has_no_correlation_time():
-    assert [entry.name for entry in datasheet(AR1(-0.5, 1.0), 1.0, "deg/s").entries] == ["Gauss-Markov deviation"]
+    names = [entry.name for entry in datasheet(WhiteNoise(1.0) + AR1(-0.5, 1.0), 1.0, "deg/s").entries]
+    assert names == 2 * ["angle random walk N"] + ["Gauss-Markov deviation"]
+
+
+def test_without_white_noise_short_ar1s_walk():
+    # As averages over many correlation times show it; one of ten seconds does not, nor does white noise of none.
+    short, long = AR1(0.17, 1e-2), AR1(math.exp(-1 / 1000), 1e-9)
+    got = values(datasheet(WhiteNoise(0.0) + short + long, 100.0, "deg/s"))
+    assert got["angle random walk N of AR1s", "deg/s/sqrt(Hz)"] == pytest.approx(
+        float((short.wavelet_variance(16)[-1] * 2 * 2**15).sqrt()) / 10, rel=1e-3
+    )
+    assert ("angle random walk N", "deg/s/sqrt(Hz)") not in got
 
 
 def test_summary_is_of_fixed_width_and_the_dictionary_plain():

@@ -317,3 +317,36 @@ def test_other_units_than_of_rates_have_no_datasheet():
     assert "white_noise.variance" in texts["m/s^2"]
     assert "angle random walk" not in texts["m/s^2"]
     assert "angle random walk" in texts["deg/s"]
+
+
+@pytest.mark.parametrize("refine", [False, True])
+def test_a_drift_has_the_sign_of_the_signal(refine: bool):
+    g = torch.Generator().manual_seed(5)
+    slopes = torch.tensor([-1e-5, 1e-5], dtype=torch.float64)
+    falling = gf.WhiteNoise(1e-4).simulate(8192, batch=(2,), generator=g) + slopes[:, None] * torch.arange(8192)
+    fit = gf.fit_gmwm(falling, "WN + DR", refine=refine)
+    at = fit.param_names.index("drift.slope")
+    assert (fit.params[:, at].sign() == slopes.sign()).all()
+    low, high = fit.confidence_interval
+    assert ((low[:, at] < slopes) & (slopes < high[:, at])).all()
+    assert (fit.param_cov.diagonal(dim1=-2, dim2=-1) >= 0).all()
+    # The filter that is made of it follows the signal.
+    own = gf.state_space(fit.model.with_params(fit.params[0]), 1.0).kalman_log_likelihood(falling[0])
+    true = gf.state_space(gf.WhiteNoise(1e-4) + gf.Drift(-1e-5), 1.0).kalman_log_likelihood(falling[0])
+    assert abs(float(own - true)) < 20
+    if not refine:
+        again = gf.bootstrap_gmwm(fit, 20, generator=g)
+        assert ((again.percentile.low[:, at] < slopes) & (slopes < again.percentile.high[:, at])).all()
+        joint = gf.fit_jointly([falling, falling], "WN + DR").joint
+        assert (joint.params[:, at].sign() == slopes.sign()).all()
+
+
+@pytest.mark.parametrize("model", ["DR", "SIN", "DR + SIN"])
+def test_a_model_without_noise_is_refused(model: str):
+    with pytest.raises(ValueError, match="a noise process beside sinusoids and drifts"):
+        gf.fit_gmwm(torch.randn(1, 4096, dtype=torch.float64), model)
+
+
+def test_what_is_no_fit_cannot_be_resampled():
+    with pytest.raises(TypeError, match="expected a GMWMResult"):
+        gf.bootstrap_gmwm(torch.zeros(3), 20)

@@ -45,6 +45,7 @@ LAYERS = [
         "moment_bootstrap",
         "ranking",
         "ranking_result",
+        "_drift_sign",
         "_rank_table",
         "_rank_search",
         "_rank_spectra",
