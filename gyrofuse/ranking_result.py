@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gyrofuse._rank_candidates import name_of
 from gyrofuse._rank_table import Table
-from gyrofuse._result import counted, listed
+from gyrofuse._result import chance, counted, listed, p_words
 from gyrofuse.gmwm_result import GMWMResult
 
 if TYPE_CHECKING:
@@ -125,12 +125,21 @@ class RankResult:
     def doubts(self, index: tuple[int, ...]) -> list[str]:
         """What speaks against every candidate of a sensor, in sentences."""
         found = []
-        p_value = self.p_value[index].nan_to_num(nan=1.0).max().item()
-        if p_value < _NONE_FITS:
-            found.append(f"No candidate fits: the J test refuses all (largest p = {p_value:.1g}).")
+        if self.none_fits(index):
+            largest = p_words(max(self._tested(index)))
+            found.append(f"No candidate fits: the J test refuses all (largest {largest}).")
         if self.n_lines is not None and self.n_tones is not None and bool(self.n_lines[index] > self.n_tones[index]):
             found.append("The spectrum has a line more than those compared have sinusoids: allow more of them (SIN).")
         return found
+
+    def none_fits(self, index: tuple[int, ...]) -> bool:
+        """Whether the J test refuses all candidates of a sensor that it could be made of."""
+        return max(self._tested(index), default=1.0) < _NONE_FITS
+
+    def _tested(self, index: tuple[int, ...]) -> list[float]:
+        """P-values of the J tests there are, of candidates compared."""
+        p_values = self.p_value[index]
+        return p_values[p_values.isfinite() & self.criterion[index].isfinite()].tolist()
 
     def reasons_of(self, index: tuple[int, ...]) -> tuple[str | None, ...]:
         """`reasons` of a sensor, for every candidate."""
@@ -171,7 +180,7 @@ class RankResult:
         order = self.compared_to(index)
         for c in order[:_MOST_ROWS]:
             row = f"  {self.candidates[c]:<{wide}}  {difference[c].item():>+10.2f}  {wvic[c].item():>+8.2f}"
-            row += f"  {self.p_value[index][c].item():>8.2g}"
+            row += f"  {chance(self.p_value[index][c].item()):>8}"
             lines.append(row + (f"  redundant: {reasons[c]}" if reasons[c] else ""))
         if len(order) > _MOST_ROWS:
             lines.append(f"  and {len(order) - _MOST_ROWS} more")
