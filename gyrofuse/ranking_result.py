@@ -15,6 +15,8 @@ from gyrofuse._rank_candidates import name_of
 from gyrofuse._rank_table import Table
 from gyrofuse._result import chance, counted, listed, p_words
 from gyrofuse.gmwm_result import GMWMResult
+from gyrofuse.parsing import parse_model
+from gyrofuse.processes import Sinusoid
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -129,8 +131,12 @@ class RankResult:
             largest = p_words(max(self._tested(index)))
             found.append(f"No candidate fits: the J test refuses all (largest {largest}).")
         if self.n_lines is not None and self.n_tones is not None and bool(self.n_lines[index] > self.n_tones[index]):
-            found.append("The spectrum has a line more than those compared have sinusoids: allow more of them (SIN).")
+            found.append("The spectrum has more lines than those compared have sinusoids: allow more of them (SIN).")
         return found
+
+    def lines_counted(self, index: tuple[int, ...]) -> bool:
+        """Whether `n_lines` of a sensor is their number, or the count ended at one more than candidates have."""
+        return self.n_lines is not None and int(self.n_lines[index]) <= max(map(_n_tones, self.candidates))
 
     def none_fits(self, index: tuple[int, ...]) -> bool:
         """Whether the J test refuses all candidates of a sensor that it could be made of."""
@@ -228,3 +234,7 @@ class RankResult:
             "from_signal": self.from_signal,
             "sensors": list(self.sensors),
         }
+
+
+def _n_tones(candidate: str) -> int:
+    return sum(isinstance(process, Sinusoid) for process in parse_model(candidate).processes)

@@ -73,8 +73,10 @@ def _sentences(result: RankResult, index: tuple[int, ...]) -> Iterator[str]:
         yield f"Not compared: {', '.join(those)} ({reason})."
     yield from result.doubts(index)
     if result.n_lines is not None and (n_lines := int(result.n_lines[index])):
-        found = "One line stands" if n_lines == 1 else f"{n_lines} lines stand"
-        yield f"{found} out of the noise in the spectrum."
+        found = "One line" if n_lines == 1 else f"{n_lines} lines"
+        if not result.lines_counted(index):
+            found = f"At least {found.lower()}"
+        yield f"{found} stand{'s' if n_lines == 1 else ''} out of the noise in the spectrum."
     same = [row["name"] for row in rows if row["standing"] == "equivalent"]
     if same:
         yield f"The record does not tell it from {', '.join(same)}."

@@ -249,6 +249,20 @@ def test_the_figure_shows_the_chosen_one_and_those_not_compared():
     assert ticks[:3] == ["0", "5", "10"]
 
 
+@pytest.mark.parametrize("levels", [1, 2, 3])
+def test_the_search_leaves_out_what_has_too_many_parameters_with_the_sinusoid(levels):
+    signal = signals(PARTS["WN + AR1 + SIN"], 1)[0]
+    found = gf.rank_models(signal, n_levels=levels)
+    assert found.n_tones.tolist() == [min(levels - 1, 1)]
+    assert found.names[0] is not None
+    assert found.best[0].params.shape[-1] - found.n_tones[0] <= levels
+    aside = [found.candidates[c] for c in found.set_aside((0,))]
+    assert ("WN + AR1 + SIN" in aside) == (levels == 3)
+    assert ("WN + RW + SIN" in aside) == (levels == 2)
+    size = levels + 1
+    assert f"not compared: {size} parameters, but {levels} levels" in found.summary() or levels == 1
+
+
 def test_batch_is_its_items():
     signal = torch.stack(
         [signals(PARTS[name], 2, 2048)[:, 0] for name in ("WN + AR1", "WN + RW + SIN")]

@@ -112,13 +112,26 @@ def test_page_and_summary_name_those_that_were_not_compared():
 
 
 def test_a_line_without_a_candidate_for_it_is_told():
-    told = "The spectrum has a line more than those compared have sinusoids"
+    told = "The spectrum has more lines than those compared have sinusoids"
     result = gf.rank_models(recording(), ["WN + RW", "WN + AR1"], fit=False)
     assert told in plain(rank_verdict(result, (0,)))
     assert told in result.summary()
     assert told not in plain(rank_verdict(result, (1,)))
     assert result.n_tones.tolist() == [0, 0]
     assert result.n_lines.tolist() == [1, 0]
+
+
+def test_lines_are_not_counted_beyond_what_candidates_allow():
+    time = torch.arange(4096, dtype=torch.float64)
+    noise = torch.randn(1, 4096, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    signal = noise + sum(torch.cos(f * time) for f in (0.3, 0.7, 1.1, 1.9))
+    capped = gf.rank_models(signal, ["WN", "WN + 2*SIN"], fit=False)
+    assert "At least 3 lines stand out of the noise" in plain(rank_verdict(capped, (0,)))
+    one = gf.rank_models(signal, ["WN"], fit=False)
+    assert "At least one line stands out of the noise" in plain(rank_verdict(one, (0,)))
+    whole = gf.rank_models(signal, ["WN", "WN + 5*SIN", "WN + 4*SIN"], fit=False)
+    assert "4 lines stand out of the noise" in plain(rank_verdict(whole, (0,)))
+    assert "At least" not in plain(rank_verdict(whole, (0,)))
 
 
 def test_page_and_summary_say_when_no_candidate_fits():
