@@ -44,6 +44,11 @@ def p_words(p_value: float) -> str:
     return f"p = {chance(p_value)}" if p_value > 0 else f"p {chance(p_value)}"
 
 
+def signed(value: float) -> str:
+    """A difference with two decimals, nothing as `+0.00`."""
+    return f"{round(value, 2) + 0.0:+.2f}"
+
+
 def listed(value: Tensor) -> Any:
     """Nested lists of plain numbers, NaN and infinities as None, ready for JSON."""
     return cleaned(value.detach().cpu().tolist())

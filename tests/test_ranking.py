@@ -249,6 +249,33 @@ def test_the_figure_shows_the_chosen_one_and_those_not_compared():
     assert ticks[:3] == ["0", "5", "10"]
 
 
+def test_the_figure_says_what_it_does_not_show():
+    signal = signals(gf.Model([gf.AR1(0.9, 1.0)]), 2)[:, 0]
+    signal[0] = 3.0
+    with pytest.warns(UserWarning, match="they are not ranked"):
+        found = gf.rank_models(signal, ["WN", "RW"], fit=False)
+    with mpl.rc_context({"backend": "agg"}):
+        ax = found.plot()
+    assert ax.get_title(loc="left") == "sensor 2"
+    assert ax.get_title(loc="right") == "1 sensor before it not ranked"
+    assert ax.texts[0].get_text() == "chosen, though the J test refuses it"
+    many = gf.rank_models(signal[1:], fit=False)
+    n = int(many.criterion.isfinite().sum())
+    assert n > 12
+    with mpl.rc_context({"backend": "agg"}):
+        ax = many.plot(title="Sensor 1, axis y")
+    assert ax.get_title(loc="right") == f"12 best of {n}"
+    assert ax.get_title(loc="left") == "Sensor 1, axis y"
+    assert "chosen" in [text.get_text() for text in ax.texts]
+
+
+def test_one_order_of_processes():
+    signal = signals(PARTS["WN + AR1"] + gf.Drift(1e-3), 1)[0]
+    found = gf.rank_models(signal, ["WN + DR + AR1"])
+    assert found.names == ("WN + AR1 + DR",)
+    assert found.best[0].name == "WN + AR1 + DR"
+
+
 @pytest.mark.parametrize("levels", [1, 2, 3])
 def test_the_search_leaves_out_what_has_too_many_parameters_with_the_sinusoid(levels):
     signal = signals(PARTS["WN + AR1 + SIN"], 1)[0]
