@@ -120,16 +120,18 @@ def read_candidates(candidates: Sequence[Model | str]) -> list[Kinds]:
 
 
 def with_ancestors(wanted: Iterable[Kinds]) -> list[Kinds]:
-    """All wanted and those on the way to them, from small to large: fewer AR1s, then fewer sinusoids."""
+    """All wanted and those with any of their processes left out, from small to large.
+
+    On the way over a part of them alone a climb may get stuck: with WN tried first, an AR1 that is weak next to it goes
+    unseen, while WN joins an AR1 that had the record to itself.
+    """
     found: dict[Key, Kinds] = {}
     for kinds in wanted:
-        kinds = list(kinds)
-        while set(kinds) - {Drift, Sinusoid}:
-            found.setdefault(key_of(kinds), list(kinds))
-            shaped = [kind for kind in (AR1, Sinusoid) if kind in kinds]
-            if not shaped:
-                break
-            kinds.remove(shaped[0])
+        numbers = Counter(kinds)
+        for fewer in itertools.product(*(range(n + 1) for n in numbers.values())):
+            part = [kind for kind, n in zip(numbers, fewer, strict=True) for _ in range(n)]
+            if set(part) - {Drift, Sinusoid}:
+                found.setdefault(key_of(part), part)
     return sorted(found.values(), key=len)
 
 

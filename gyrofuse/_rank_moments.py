@@ -15,10 +15,13 @@ from gyrofuse import _moment_search as search
 from gyrofuse._composition import Composition
 from gyrofuse._nnls import nonnegative_least_squares
 from gyrofuse._records import Records
+from gyrofuse.moment_fit import damped, misfit
 from gyrofuse.moment_inference import Estimates, Fit, Inference, infer, infer_efficient
 from gyrofuse.processes import AR1
 
-_UPDATES = 2
+_REWEIGHTINGS, _UPDATES = 3, 3
+# By how much more than on the way the last weights' fit may miss, in half nats, before it is thought to go to and fro.
+_CHASING = 1.0
 _GRID_POINTS = 48
 _STEPS_NEAR = 10
 
@@ -60,15 +63,37 @@ class Moments:
         self._diagonal = self.observations.sqrt() / self._target
 
     def fit(self, made_of: Composition, starts: list[Tensor]) -> MomentFit:
-        """Climb down from each `x` `(item, shaped)`, and from the lowest place with the fit's own `V`."""
+        """Climb down from each `x` `(item, shaped)` with weights of the fit: one by one, then its own `V`."""
         target, tau = self._target, self.tau
-        ends = [search.minimise(target, self._diagonal, tau, made_of, start)[:3] for start in starts]
+        ends = [self._climbed(made_of, start) for start in starts]
         lowest = torch.stack([objective.nan_to_num(nan=torch.inf) for *_, objective in ends]).argmin(0)
         items = torch.arange(len(target), device=target.device)
         linear, x = (torch.stack(column)[lowest, items] for column in list(zip(*ends, strict=True))[:2])
+        passed = []
         for _ in range(_UPDATES):
-            linear, x, _, _ = search.minimise(target, self._whitening(made_of, linear, x), tau, made_of, x)
+            root = self._whitening(made_of, linear, x)
+            passed.append(misfit(target, root, tau, made_of, linear, x))
+            linear, x, _, _ = search.minimise(target, root, tau, made_of, x)
+        final = misfit(target, self._whitening(made_of, linear, x), tau, made_of, linear, x)
+        chasing = final > torch.stack(passed).amin(0) + _CHASING
+        if bool(chasing.any()):
+            linear[chasing], x[chasing], _ = damped(
+                target[chasing], self.records, made_of, "optimal", linear[chasing], x[chasing]
+            )
         return self._summed_up(made_of, linear, x, self._whitening(made_of, linear, x))
+
+    def _climbed(self, made_of: Composition, start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """With independent levels, whose weights are first the measured variances, then the fitted ones.
+
+        A fit to chance in the measured ones, such as one long scale that came out small, would have a `V` to match.
+        """
+        root = self._diagonal
+        linear, x, _, _ = search.minimise(self._target, root, self.tau, made_of, start)
+        for _ in range(_REWEIGHTINGS):
+            fitted = made_of.wavelet_variance(self.tau, linear, x)
+            root = (self.observations.sqrt() / fitted.clamp(min=1e-30)).clamp(max=1e15)
+            linear, x, objective, _ = search.minimise(self._target, root, self.tau, made_of, x)
+        return linear, x, objective - 2 * root.log().sum(-1)
 
     def near(self, made_of: Composition, linear: Tensor, shape: Tensor) -> MomentFit:
         """Minimum next to a maximum of the likelihood, with the `V` of that."""

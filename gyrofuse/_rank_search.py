@@ -37,10 +37,13 @@ class _Search(ABC, Generic[FitT]):
         device: Where they are.
 
     Attributes:
+        held: Sinusoids are no part of what is fitted.
+        afresh: Compositions with one shape start from a grid too.
         fits: Of all records; NaN where a composition was not tried.
     """
 
     held: bool
+    afresh: bool
 
     def __init__(self, n_items: int, n_samples: int, device: torch.device) -> None:
         self._everyone, self._n_samples = torch.arange(n_items, device=device), n_samples
@@ -92,7 +95,8 @@ class _Search(ABC, Generic[FitT]):
         """
         made_of = compositions.composition(kinds, self.held)
         smaller = [self.fits[key] for key in compositions.parents(kinds) if key in self.fits]
-        found = None if smaller else self._whole(self._first(made_of, items), items)
+        afresh = not smaller or (self.afresh and len(made_of.curved) == 1)
+        found = self._whole(self._first(made_of, items), items) if afresh else None
         for parent, fit in smaller:
             own = items[self._loss(fit)[items].isfinite()]
             if len(own):
@@ -118,7 +122,7 @@ class _Search(ABC, Generic[FitT]):
 
     @abstractmethod
     def _first(self, made_of: Composition, items: Tensor) -> FitT:
-        """Fit a composition without parents."""
+        """Fit a composition from no other one's fit."""
 
     @abstractmethod
     def _start(self, made_of: Composition, items: Tensor, parent: Composition, fit: FitT) -> tuple[Tensor, ...]:
@@ -132,7 +136,7 @@ class _Search(ABC, Generic[FitT]):
 class SpectralSearch(_Search[NoiseFit]):
     """By the spectral likelihood of records without lines."""
 
-    held = True
+    held, afresh = True, False
 
     def __init__(self, spectra: Spectra) -> None:
         super().__init__(len(spectra.energy), spectra.bins.n_samples, spectra.energy.device)
@@ -165,7 +169,8 @@ class SpectralSearch(_Search[NoiseFit]):
 class MomentSearch(_Search[MomentFit]):
     """By the likelihood of wavelet variances, taken for normal with the `V` of each fit."""
 
-    held = False
+    # The few long scales by which a shape is known are noisy: a smaller composition's fit may lead away from it.
+    held, afresh = False, True
 
     def __init__(self, moments: Moments) -> None:
         super().__init__(len(moments.variance), moments.n_samples, moments.variance.device)

@@ -81,7 +81,8 @@ def by_spectrum(series: Tensor, wanted: list[Kinds] | None, levels: int, max_ton
     """Rank for records `(item, time)`."""
     n_samples = series.shape[-1]
     if wanted is None:
-        noises, allowed = compositions.all_noises(levels), list(range(max_tones + 1))
+        # A level is left for a noise.
+        noises, allowed = compositions.all_noises(levels), list(range(min(max_tones, levels - 1) + 1))
     else:
         noises, allowed = [_without_tones(kinds) for kinds in wanted], sorted({_n_tones(kinds) for kinds in wanted})
     ramp = any(Drift in kinds for kinds in noises)
@@ -118,19 +119,22 @@ def by_spectrum(series: Tensor, wanted: list[Kinds] | None, levels: int, max_ton
             which = (lines.n_tones[entry.items] == len(tones)).nonzero()[:, 0]
             if len(which) or not searching:
                 simpler = [s and ([*s[0], *tones], s[1]) for s in entry.simpler]
-                placed.append(_part(entry, kinds, which, simpler))
+                fits_in = compositions.n_unknown(kinds, held=True) <= levels
+                placed.append(_part(entry, kinds, which if fits_in else which[:0], simpler))
     table = _tabulated(placed, lines.spectra.bins.count, len(series), lines)
-    if not searching:
-        _set_aside(table, lines, max(allowed))
+    _set_aside(table, lines, None if searching else max(allowed), levels)
     return table
 
 
-def _set_aside(table: Table, lines: Lines, most: int) -> None:
-    """Say why candidates were not compared."""
+def _set_aside(table: Table, lines: Lines, most: int | None, levels: int) -> None:
+    """Say why candidates were not compared: those for other sinusoids, at most so many, where any were given."""
     for own, n_tones, n_found in zip(table.reasons, lines.n_tones.tolist(), lines.n_found.tolist(), strict=True):
-        found = ("at least " if n_found > most else "") + counted(n_found, "line")
         for c, kinds in enumerate(table.kinds):
-            if (n := _n_tones(kinds)) != n_tones:
+            n, size = _n_tones(kinds), compositions.n_unknown(kinds, held=True)
+            if n == n_tones and size > levels:
+                own[c] = f"{size} parameters, but {counted(levels, 'level')}"
+            elif n != n_tones and most is not None:
+                found = ("at least " if n_found > most else "") + counted(n_found, "line")
                 own[c] = f"the spectrum has {found}, the model {n or 'none'}"
 
 

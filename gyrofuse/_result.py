@@ -32,6 +32,23 @@ def numbered(n: int) -> tuple[str, ...]:
     return tuple(str(i + 1) for i in range(n))
 
 
+def chance(p_value: float) -> str:
+    """A p value in digits, `-` where there is no test."""
+    if math.isnan(p_value):
+        return "-"
+    return f"{p_value:.2g}" if p_value > 0 else "< 1e-300"
+
+
+def p_words(p_value: float) -> str:
+    """A p value in a sentence."""
+    return f"p = {chance(p_value)}" if p_value > 0 else f"p {chance(p_value)}"
+
+
+def signed(value: float) -> str:
+    """A difference with two decimals, nothing as `+0.00`."""
+    return f"{round(value, 2) + 0.0:+.2f}"
+
+
 def listed(value: Tensor) -> Any:
     """Nested lists of plain numbers, NaN and infinities as None, ready for JSON."""
     return cleaned(value.detach().cpu().tolist())

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from enum import Enum
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -39,13 +39,15 @@ from gyrofuse.gmwm import fit_gmwm
 from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.processes import Model
 from gyrofuse.ranking import rank_models
-from gyrofuse.ranking_result import RankResult
 from gyrofuse.recording import Recording
 from gyrofuse.report import new_figure, save_figure
-from gyrofuse.report_models import model_report
+from gyrofuse.report_models import model_report, sensor_name
 from gyrofuse.report_ranking import rank_report
 from gyrofuse.tones import FEWEST_SAMPLES
 from gyrofuse.units import RATE_UNITS
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _MOST_FITS = 12  # printed in full
 _WITH_GAPS = ", or fit a model with `gyrofuse fit`, which gets along with gaps"
@@ -129,7 +131,8 @@ def fit(
             known = _known_model(result, "model-out").to_dict()
             write_json(drafts[model_out], {**known, "rate": recording.rate, "unit": recording.unit})
         if figure:
-            _draw(result, drafts[figure], figure)
+            first = tuple(result.params.isfinite().all(-1).nonzero()[0].tolist())  # that could be fitted
+            _draw(partial(result.plot, index=first), drafts[figure], figure)
         if report:
             with progress("drawing"):
                 page = model_report(result, part, title=f"Noise of {titled(logs)}")
@@ -141,13 +144,10 @@ def fit(
     say_notes(recording)
 
 
-def _draw(result: GMWMResult | RankResult, draft: Path, path: Path) -> None:
-    """The figure of the first sensor that has one, in the format that the path asks for."""
+def _draw(plot: Callable[[Axes], Axes], draft: Path, path: Path) -> None:
+    """The figure of one sensor, in the format that the path asks for."""
     drawn = new_figure(7.0, 4.6)
-    if isinstance(result, GMWMResult):
-        result.plot(drawn.subplots(), index=tuple(result.params.isfinite().all(-1).nonzero()[0].tolist()))
-    else:
-        result.plot(drawn.subplots())
+    plot(drawn.subplots())
     save_figure(drawn, draft, path.suffix[1:].lower())
 
 
@@ -202,7 +202,8 @@ def rank(
     mounting: Mounting = None,
     confidence_level: Annotated[float, typer.Option(metavar="P", help="Of all intervals.")] = 0.95,
     figure: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Draw the ranking of the first sensor, .png, .svg or .pdf.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Draw the ranking of the first sensor that has one, .png, .svg or .pdf."),
     ] = None,
     json_file: Json = None,
     report: Report = None,
@@ -222,7 +223,8 @@ def rank(
             part, remarks = without_gaps(asked, "Ranked", FEWEST_SAMPLES, _WITH_GAPS)
             result = rank_models(part, formulas, confidence_level=confidence_level, n_levels=levels)
         if figure:
-            _draw(result, drafts[figure], figure)
+            named = sensor_name(result.sensors, part, result.first_ranked)
+            _draw(partial(result.plot, title=named), drafts[figure], figure)
         if report:
             with progress("drawing"):
                 page = rank_report(result, part, title=f"Noise models for {titled(logs)}", remarks=remarks)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gyrofuse._composition import Composition
 from gyrofuse._records import Records
-from gyrofuse._result import ConfidenceInterval, cleaned, counted, listed
+from gyrofuse._result import ConfidenceInterval, cleaned, counted, listed, p_words
 from gyrofuse.datasheet import Datasheet, datasheet
 from gyrofuse.moment_inference import Inference
 from gyrofuse.processes import Model
@@ -168,7 +168,7 @@ class GMWMResult:
             return [f"{head}: not fitted"]
         fits = ""
         if bool(self.p_value[index].isfinite()):
-            fits = f", J = {self.j_statistic[index].item():.4g}, p = {self.p_value[index].item():.2g}"
+            fits = f", J = {self.j_statistic[index].item():.4g}, {p_words(self.p_value[index].item())}"
         if not bool(self.converged[index]):
             fits += ", not converged"
         low, high = self.confidence_interval

@@ -8,6 +8,7 @@ from itertools import groupby
 import torch
 from torch import Tensor
 
+from gyrofuse._result import p_words
 from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.processes import Model, Sinusoid
 from gyrofuse.report_page import number
@@ -93,7 +94,7 @@ def _completeness(result: GMWMResult, index: tuple[int, ...]) -> Iterator[str]:
         else:
             yield "Whether the model is complete cannot be tested: it has as many parameters as there are levels."
         return
-    told = f"J test: p = {number(p_value, 2)}" if p_value > 0 else "J test: p < 1e-300"
+    told = f"J test: {p_words(p_value)}"
     if p_value >= _DOUBTED:
         yield f"The model explains the wavelet variances at all scales within what chance allows ({told})."
         return

@@ -66,7 +66,7 @@ def fit_items(
     if own is None:
         for _ in range(_UPDATES):
             root = _root(records.covariance(made_of.model(linear, x)), omega)
-            passed.append(_misfit(each(nu, n_kept), root, tau, made_of, linear, x))
+            passed.append(misfit(each(nu, n_kept), root, tau, made_of, linear, x))
             linear, x, distance, _ = search.minimise(each(nu, n_kept), root, tau, made_of, x)
         objective = distance - _log_det(root)
     best = objective.view(n_items, n_kept).nan_to_num(nan=torch.inf).argmin(-1)
@@ -74,11 +74,11 @@ def fit_items(
     root = root[best] if own is None else root
     linear, x, _, reached = search.minimise(nu, root, tau, made_of, x[best], _POLISHING)
     if own is None:
-        final = _misfit(nu, _root(records.covariance(made_of.model(linear, x)), omega), tau, made_of, linear, x)
+        final = misfit(nu, _root(records.covariance(made_of.model(linear, x)), omega), tau, made_of, linear, x)
         least = torch.stack([value.view(n_items, n_kept).amin(-1) for value in passed]).amin(0)
         chasing = final > least + len(tau)
         if bool(chasing.any()):
-            linear[chasing], x[chasing], reached[chasing] = _damped(
+            linear[chasing], x[chasing], reached[chasing] = damped(
                 nu[chasing], records, made_of, omega, linear[chasing], x[chasing]
             )
     linear, x = made_of.ordered(linear, x)
@@ -93,7 +93,7 @@ def fit_items(
     )
 
 
-def _damped(
+def damped(
     nu: Tensor, records: Records, made_of: Composition, omega: str | Tensor, linear: Tensor, x: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """A part of the way to the fit with the weights of the last one, again and again; whether that came to rest.
@@ -112,7 +112,7 @@ def _damped(
     return whole_linear, whole_x, moved < _AT_REST
 
 
-def _misfit(target: Tensor, root: Tensor, tau: Tensor, made_of: Composition, linear: Tensor, x: Tensor) -> Tensor:
+def misfit(target: Tensor, root: Tensor, tau: Tensor, made_of: Composition, linear: Tensor, x: Tensor) -> Tensor:
     """`r' V^-1 r + ln det V`: a V too large would make its own fit look good."""
     residual = target - made_of.wavelet_variance(tau, linear, x)
     whitened = root * residual if root.ndim == 2 else (root @ residual[..., None])[..., 0]

@@ -151,10 +151,12 @@ def plot_resampled(
 def plot_ranking(
     names: list[str],
     difference: Tensor,
-    redundant: Tensor,
+    standings: list[str],
     *,
+    refused: bool = False,
     aside: list[str] | None = None,
     title: str | None = None,
+    note: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
     """Draw the criteria of candidates over that of the chosen one.
@@ -162,9 +164,11 @@ def plot_ranking(
     Args:
         names: Of the candidates, from the best on.
         difference: Of their criteria, `(candidate,)`.
-        redundant: Whether they are more than it takes, `(candidate,)`.
+        standings: Of each `chosen`, `not told from it`, `redundant` or nothing.
+        refused: Whether the J test refuses the chosen one.
         aside: Candidates that were not compared.
         title: Of the axes.
+        note: On what is not shown, to the right of the title.
         ax: Where to draw; new axes by default.
 
     Returns:
@@ -174,14 +178,15 @@ def plot_ranking(
     values, aside = difference.tolist(), aside or []
     least, most = min([0.0, *values]), max([_LINEAR, *values])
     ax.axvline(0.0, color=_INK, linewidth=0.8, zorder=1)
-    for redundancy, color, label in ((False, _BLUE, "candidate"), (True, _FADED, "redundant")):
-        places = [k for k, own in enumerate(redundant.tolist()) if own == redundancy]
+    for named, color in ((("chosen", ""), _BLUE), (("not told from it",), _COLOURS[1]), (("redundant",), _FADED)):
+        places = [k for k, own in enumerate(standings) if own in named]
         if places:
             shown = [values[k] for k in places]
             ax.hlines(places, 0.0, shown, color=color, linewidth=5, zorder=2)
-            ax.plot(shown, places, "o", color=color, markersize=8, zorder=3, label=label)
-    for k, value in enumerate(values):
-        text = "chosen" if value == 0 else f"{value:+.1f}"
+            ax.plot(shown, places, "o", color=color, markersize=8, zorder=3, label=named[-1] or "candidate")
+    chosen = "chosen, though the J test refuses it" if refused else "chosen"
+    for k, (value, standing) in enumerate(zip(values, standings, strict=True)):
+        text = chosen if standing == "chosen" else f"{value:+.1f}"
         ax.annotate(text, (max(value, 0.0), k), (9, 0), textcoords="offset points", va="center", fontsize=8)
     for k in range(len(aside)):
         ax.annotate("not compared", (0.0, len(values) + k), (9, 0), textcoords="offset points", va="center", fontsize=8)
@@ -196,7 +201,10 @@ def plot_ranking(
     ax.set_xlabel("criterion over that of the chosen model (half nats)")
     if title:
         ax.set_title(title, loc="left", fontsize=10, parse_math=False)
-    _finish(ax, *(ax.get_legend_handles_labels() if bool(redundant.any()) else ()))
+    if note:
+        ax.set_title(note, loc="right", fontsize=8, parse_math=False)
+    marked = {"not told from it", "redundant"} & set(standings)
+    _finish(ax, *(ax.get_legend_handles_labels() if marked else ()))
     return ax
 
 

@@ -122,7 +122,8 @@ def rank_models(
     places = usable.nonzero()[:, 0]
     for c in table.choice.unique().tolist() if fit else ():
         which = places[table.choice == c]
-        whole = _fitted(items[which], Model([kind() for kind in table.kinds[c]]), levels, n_samples, confidence_level)
+        model = compositions.composition(table.kinds[c], held=True)  # its processes in the order of the table
+        whole = _fitted(items[which], Model(list(model.processes)), levels, n_samples, confidence_level)
         # With the sinusoids in the model, not taken out: one J test for the table and the fit.
         table.p_value[table.choice == c, c] = whole.p_value[:, 0]
         for i, place in enumerate(which.tolist()):

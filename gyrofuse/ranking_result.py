@@ -13,8 +13,10 @@ from torch import Tensor
 
 from gyrofuse._rank_candidates import name_of
 from gyrofuse._rank_table import Table
-from gyrofuse._result import counted, listed
+from gyrofuse._result import chance, counted, listed, p_words, signed
 from gyrofuse.gmwm_result import GMWMResult
+from gyrofuse.parsing import parse_model
+from gyrofuse.processes import Sinusoid
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -107,9 +109,31 @@ class RankResult:
 
     @property
     def compared(self) -> str:
-        """How many candidates were compared, such as `3 of 4 candidates`, for any sensor."""
-        n = int(self.criterion.isfinite().flatten(0, -2).any(0).sum())
-        return (f"{n} of " if n < len(self.candidates) else "") + counted(len(self.candidates), "candidate")
+        """How many candidates were compared, such as `3 of 4 candidates`, and `2 and 3` for sensors that differ."""
+        counts = self.criterion.isfinite().sum(-1)[self.choice >= 0].tolist()
+        whole = counted(len(self.candidates), "candidate")
+        least, most = min(counts), max(counts)
+        if least == most:
+            return whole if most == len(self.candidates) else f"{most} of {whole}"
+        *first, last = map(str, counts)
+        told = f"{', '.join(first)} and {last}" if len(counts) <= _MOST_ROWS else f"{least} to {most}"
+        return f"{told} of {whole}"
+
+    @property
+    def wvic_difference(self) -> Tensor:
+        """WVIC less the least, `(..., sensor, candidate)`."""
+        return self.wvic - self.wvic.nan_to_num(nan=torch.inf).amin(-1, keepdim=True)
+
+    def standing(self, index: tuple[int, ...], c: int) -> str:
+        """Where a candidate stands for a sensor: `chosen`, `not told from it`, `redundant`, or nothing to say.
+
+        What has the chosen one's spectrum and amounts to it is not told from it.
+        """
+        if c == int(self.choice[index]):
+            return "chosen"
+        if bool(self.equivalent[index][c]):
+            return "not told from it"
+        return "redundant" if bool(self.redundant[index][c]) else ""
 
     def compared_to(self, index: tuple[int, ...]) -> list[int]:
         """Candidates that were compared for a sensor, from the best on."""
@@ -125,12 +149,25 @@ class RankResult:
     def doubts(self, index: tuple[int, ...]) -> list[str]:
         """What speaks against every candidate of a sensor, in sentences."""
         found = []
-        p_value = self.p_value[index].nan_to_num(nan=1.0).max().item()
-        if p_value < _NONE_FITS:
-            found.append(f"No candidate fits: the J test refuses all (largest p = {p_value:.1g}).")
+        if self.none_fits(index):
+            largest = p_words(max(self._tested(index)))
+            found.append(f"No candidate fits: the J test refuses all (largest {largest}).")
         if self.n_lines is not None and self.n_tones is not None and bool(self.n_lines[index] > self.n_tones[index]):
-            found.append("The spectrum has a line more than those compared have sinusoids: allow more of them (SIN).")
+            found.append("The spectrum has more lines than those compared have sinusoids: allow more of them (SIN).")
         return found
+
+    def lines_counted(self, index: tuple[int, ...]) -> bool:
+        """Whether `n_lines` of a sensor is their number, or the count ended at one more than candidates have."""
+        return self.n_lines is not None and int(self.n_lines[index]) <= max(map(_n_tones, self.candidates))
+
+    def none_fits(self, index: tuple[int, ...]) -> bool:
+        """Whether the J test refuses all candidates of a sensor that it could be made of."""
+        return max(self._tested(index), default=1.0) < _NONE_FITS
+
+    def _tested(self, index: tuple[int, ...]) -> list[float]:
+        """P-values of the J tests there are, of candidates compared."""
+        p_values = self.p_value[index]
+        return p_values[p_values.isfinite() & self.criterion[index].isfinite()].tolist()
 
     def reasons_of(self, index: tuple[int, ...]) -> tuple[str | None, ...]:
         """`reasons` of a sensor, for every candidate."""
@@ -155,8 +192,7 @@ class RankResult:
         return self.summary()
 
     def _table(self, index: tuple[int, ...]) -> list[str]:
-        where = f" of item {', '.join(map(str, index[:-1]))}" if len(index) > 1 else ""
-        head = f"sensor {self.sensors[index[-1]]}{where}"
+        head = f"sensor {self._place(index)}"
         if int(self.choice[index]) < 0:
             return [f"{head}: not ranked"]
         lines = [f"{head}: {self.candidates[int(self.choice[index])]}"]
@@ -164,39 +200,58 @@ class RankResult:
         if same:
             lines.append(f"  not told from it: {', '.join(same)}")
         lines += [f"  {text}" for text in self.doubts(index)]
-        wide = max(map(len, self.candidates))
+        wide = max(map(len, ("candidate", *self.candidates)))
         lines.append(f"  {'candidate':<{wide}}  {'criterion':>10}  {'WVIC':>8}  {'J test p':>8}")
-        wvic = self.wvic[index] - self.wvic[index][int(self.wvic_choice[index])]
-        difference, reasons = self.difference[index], self.reasons_of(index)
+        wvic, difference, reasons = self.wvic_difference[index], self.difference[index], self.reasons_of(index)
         order = self.compared_to(index)
         for c in order[:_MOST_ROWS]:
-            row = f"  {self.candidates[c]:<{wide}}  {difference[c].item():>+10.2f}  {wvic[c].item():>+8.2f}"
-            row += f"  {self.p_value[index][c].item():>8.2g}"
-            lines.append(row + (f"  redundant: {reasons[c]}" if reasons[c] else ""))
+            row = f"  {self.candidates[c]:<{wide}}  {signed(difference[c].item()):>10}  {signed(wvic[c].item()):>8}"
+            row += f"  {chance(self.p_value[index][c].item()):>8}"
+            told = ": ".join(filter(None, (self.standing(index, c), reasons[c])))
+            lines.append(f"{row}  {told}".rstrip())
         if len(order) > _MOST_ROWS:
             lines.append(f"  and {len(order) - _MOST_ROWS} more")
         lines += [f"  {self.candidates[c]:<{wide}}  not compared: {reasons[c]}" for c in self.set_aside(index)]
         return lines
 
-    def plot(self, ax: Axes | None = None) -> Axes:
-        """Draw the criterion of the first sensor's best candidates over that of the chosen one.
+    @property
+    def first_ranked(self) -> tuple[int, ...]:
+        """Index of the first sensor that could be ranked."""
+        return tuple((self.choice >= 0).nonzero()[0].tolist())
+
+    def plot(self, ax: Axes | None = None, *, title: str | None = None) -> Axes:
+        """Draw the criterion of the first ranked sensor's best candidates over that of the chosen one.
 
         Args:
             ax: Where to draw; a new figure by default.
+            title: By default the sensor, and its place in a batch.
         """
         from gyrofuse.plotting_models import plot_ranking
 
-        first = (0,) * self.choice.ndim
-        order = self.compared_to(first)[:_MOST_BARS]
+        first = self.first_ranked
+        compared = self.compared_to(first)
+        order = compared[:_MOST_BARS]
         aside = self.set_aside(first)[: _MOST_BARS - len(order)]
+        notes = [f"{len(order)} best of {len(compared)}"] if len(order) < len(compared) else []
+        before = int((self.choice.flatten() < 0).cumprod(0).sum())
+        if before:
+            notes.append(f"{counted(before, 'sensor')} before it not ranked")
+        p_value = self.p_value[first][int(self.choice[first])].item()
         return plot_ranking(
             [self.candidates[c] for c in order],
             self.difference[first][order],
-            self.redundant[first][order],
+            [self.standing(first, c) for c in order],
+            refused=p_value < _NONE_FITS,
             aside=[self.candidates[c] for c in aside],
-            title=f"sensor {self.sensors[0]}",
+            title=title or f"sensor {self._place(first)}",
+            note=", ".join(notes),
             ax=ax,
         )
+
+    def _place(self, index: tuple[int, ...]) -> str:
+        """Name of a sensor, and its item in a batch."""
+        where = f" of item {', '.join(map(str, index[:-1]))}" if len(index) > 1 else ""
+        return f"{self.sensors[index[-1]]}{where}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers and lists; what is not known is None."""
@@ -219,3 +274,7 @@ class RankResult:
             "from_signal": self.from_signal,
             "sensors": list(self.sensors),
         }
+
+
+def _n_tones(candidate: str) -> int:
+    return sum(isinstance(process, Sinusoid) for process in parse_model(candidate).processes)

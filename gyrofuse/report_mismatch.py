@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from gyrofuse._result import chance
 from gyrofuse.mismatch.case import Case, block_means
 from gyrofuse.mismatch.comparison import VarianceComparison, compared_powers, grouped_spectrum
 from gyrofuse.mismatch.mechanism import Finding, Parameter
@@ -18,7 +19,6 @@ from gyrofuse.mismatch.telling import (
     SEPARATED_BY,
     benefit_of,
     capital,
-    chance,
     fused_words,
     mechanism_words,
     nats,

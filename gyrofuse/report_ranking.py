@@ -7,7 +7,10 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+from gyrofuse._rank_candidates import charge, n_parameters
+from gyrofuse._result import chance, counted, p_words, signed
 from gyrofuse.model_words import model_method
+from gyrofuse.moment_fit import composition_of
 from gyrofuse.ranking_result import RankResult
 from gyrofuse.recording import Recording
 from gyrofuse.report_models import model_part, sensor_name
@@ -15,6 +18,8 @@ from gyrofuse.report_page import number, render
 
 # Pages stay readable; the JSON file holds all.
 _MOST_SENSORS, _MOST_ROWS = 24, 15
+_NO_GAIN = 0.1  # nats
+_DOUBTED = 0.01  # p-value of the J test
 _MOST_NATS = 15.0  # beyond, a ratio is no number to print
 
 
@@ -73,9 +78,11 @@ def _sentences(result: RankResult, index: tuple[int, ...]) -> Iterator[str]:
         yield f"Not compared: {', '.join(those)} ({reason})."
     yield from result.doubts(index)
     if result.n_lines is not None and (n_lines := int(result.n_lines[index])):
-        found = "One line stands" if n_lines == 1 else f"{n_lines} lines stand"
-        yield f"{found} out of the noise in the spectrum."
-    same = [row["name"] for row in rows if row["standing"] == "equivalent"]
+        found = "One line" if n_lines == 1 else f"{n_lines} lines"
+        if not result.lines_counted(index):
+            found = f"At least {found.lower()}"
+        yield f"{found} stand{'s' if n_lines == 1 else ''} out of the noise in the spectrum."
+    same = [row["name"] for row in rows if row["standing"] == "not told from it"]
     if same:
         yield f"The record does not tell it from {', '.join(same)}."
     for row in rows:
@@ -84,19 +91,31 @@ def _sentences(result: RankResult, index: tuple[int, ...]) -> Iterator[str]:
             yield f"{row['name']} has {better}"
     others = [row for row in rows if row["standing"] in ("", "redundant") and row["difference"] >= 0]
     if others:
-        yield _why_not(others[0])
+        which = "The runner-up" if others[0] is rows[1] else "The next one"
+        yield f"{which}, {others[0]['name']}, {_why_not(result, index, others[0])}."
 
 
-def _why_not(row: dict[str, Any]) -> str:
-    """Why the runner-up lost."""
+def _why_not(result: RankResult, index: tuple[int, ...], row: dict[str, Any]) -> str:
+    """Why the next one lost."""
+    own, chosen = (
+        composition_of(name, held=True) for name in (row["name"], result.candidates[int(result.choice[index])])
+    )
+    more = n_parameters(own) - n_parameters(chosen)
+    charged = (charge(own, result.n_samples) - charge(chosen, result.n_samples)) / 2
     nats = row["difference"] / 2
-    ratio = f"{number(math.exp(nats), 2)} times less likely" if nats < _MOST_NATS else "beyond any doubt"
-    told = f"The runner-up, {row['name']}, has a criterion {row['difference']:.1f} above ({ratio})"
+    if more > 0 and abs(charged - nats) < _NO_GAIN:
+        what = f"no likelihood gained for {counted(more, 'more number')}"
+    elif nats < _MOST_NATS:
+        what = f"{number(math.exp(nats), 2)} times less likely, with its numbers charged for"
+    else:
+        what = "beyond any doubt"
+    told = f"has a criterion {row['difference']:.1f} above ({what})"
     if row["reason"]:
-        return f"{told} and is more than it takes: {row['reason']}."
-    if row["p_value"] < 0.01:
-        return f"{told}; its wavelet variances do not fit (J test: p = {number(row['p_value'], 2)})."
-    return f"{told}."
+        return f"{told} and is more than it takes: {row['reason']}"
+    # That is against it only where the chosen one fits.
+    if row["p_value"] < _DOUBTED <= result.p_value[index][int(result.choice[index])].item():
+        return f"{told}; its wavelet variances do not fit (J test: {p_words(row['p_value'])})"
+    return told
 
 
 def _part(result: RankResult, recording: Recording | None, n: int, index: tuple[int, ...]) -> dict[str, Any]:
@@ -114,21 +133,20 @@ def _part(result: RankResult, recording: Recording | None, n: int, index: tuple[
 
 def _rows(result: RankResult, index: tuple[int, ...]) -> list[dict[str, Any]]:
     """The candidates that were tried, from the best on."""
-    choice = int(result.choice[index])
-    if choice < 0:
+    if int(result.choice[index]) < 0:
         return []
-    wvic = result.wvic[index] - result.wvic[index][int(result.wvic_choice[index])]
     rows = []
-    named = (("equivalent", result.equivalent), ("redundant", result.redundant))
     for c in result.compared_to(index):
-        standing = "chosen" if c == choice else next((word for word, there in named if bool(there[index][c])), "")
+        difference = result.difference[index][c].item()
         rows.append(
             {
                 "name": result.candidates[c],
-                "difference": result.difference[index][c].item(),
-                "wvic": wvic[c].item(),
+                "difference": difference,
+                "criterion": signed(difference),
+                "wvic": signed(result.wvic_difference[index][c].item()),
                 "p_value": result.p_value[index][c].item(),
-                "standing": standing,
+                "p": chance(result.p_value[index][c].item()),
+                "standing": result.standing(index, c),
                 "reason": result.reasons_of(index)[c],
             }
         )

@@ -39,6 +39,18 @@ def test_prints_the_table_and_the_fits_and_writes_what_is_asked_for(run: Run, lo
     assert page.tags.count("img") == 2
 
 
+@pytest.mark.filterwarnings("ignore:`signal`")
+def test_a_sensor_that_does_not_vary_is_left_out_of_the_figure(run: Run, log: Path):
+    recording = gf.read_recording(log)
+    recording.signal[0] = 1.0
+    recording.save(log, force=True)
+    done = run("rank", log, "--candidates", "WN,WN+RW", "--figure", "f.svg")
+    assert done.status == 0
+    drawn = Path("f.svg").read_text()
+    assert "Sensor b" in drawn
+    assert "1 sensor before it not ranked" in drawn
+
+
 def test_sensors_and_stretch(run: Run, log: Path):
     done = run("rank", log, "--sensors", "b", "--rest", "0:10", "--confidence-level", 0.9)
     assert done.status == 0

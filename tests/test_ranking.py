@@ -249,6 +249,47 @@ def test_the_figure_shows_the_chosen_one_and_those_not_compared():
     assert ticks[:3] == ["0", "5", "10"]
 
 
+def test_the_figure_says_what_it_does_not_show():
+    signal = signals(gf.Model([gf.AR1(0.9, 1.0)]), 2)[:, 0]
+    signal[0] = 3.0
+    with pytest.warns(UserWarning, match="they are not ranked"):
+        found = gf.rank_models(signal, ["WN", "RW"], fit=False)
+    with mpl.rc_context({"backend": "agg"}):
+        ax = found.plot()
+    assert ax.get_title(loc="left") == "sensor 2"
+    assert ax.get_title(loc="right") == "1 sensor before it not ranked"
+    assert ax.texts[0].get_text() == "chosen, though the J test refuses it"
+    many = gf.rank_models(signal[1:], fit=False)
+    n = int(many.criterion.isfinite().sum())
+    assert n > 12
+    with mpl.rc_context({"backend": "agg"}):
+        ax = many.plot(title="Sensor 1, axis y")
+    assert ax.get_title(loc="right") == f"12 best of {n}"
+    assert ax.get_title(loc="left") == "Sensor 1, axis y"
+    assert "chosen" in [text.get_text() for text in ax.texts]
+
+
+def test_one_order_of_processes():
+    signal = signals(PARTS["WN + AR1"] + gf.Drift(1e-3), 1)[0]
+    found = gf.rank_models(signal, ["WN + DR + AR1"])
+    assert found.names == ("WN + AR1 + DR",)
+    assert found.best[0].name == "WN + AR1 + DR"
+
+
+@pytest.mark.parametrize("levels", [1, 2, 3])
+def test_the_search_leaves_out_what_has_too_many_parameters_with_the_sinusoid(levels):
+    signal = signals(PARTS["WN + AR1 + SIN"], 1)[0]
+    found = gf.rank_models(signal, n_levels=levels)
+    assert found.n_tones.tolist() == [min(levels - 1, 1)]
+    assert found.names[0] is not None
+    assert found.best[0].params.shape[-1] - found.n_tones[0] <= levels
+    aside = [found.candidates[c] for c in found.set_aside((0,))]
+    assert ("WN + AR1 + SIN" in aside) == (levels == 3)
+    assert ("WN + RW + SIN" in aside) == (levels == 2)
+    size = levels + 1
+    assert f"not compared: {size} parameters, but {levels} levels" in found.summary() or levels == 1
+
+
 def test_batch_is_its_items():
     signal = torch.stack(
         [signals(PARTS[name], 2, 2048)[:, 0] for name in ("WN + AR1", "WN + RW + SIN")]
@@ -335,3 +376,37 @@ def test_the_summary_says_when_no_candidate_fits():
     signal = (gf.AR1(0.9, 1.0)).simulate(4000, batch=(1,), generator=torch.Generator().manual_seed(4))
     assert "No candidate fits: the J test refuses all" in gf.rank_models(signal, ["WN", "RW"], fit=False).summary()
     assert "No candidate fits" not in gf.rank_models(signal, ["WN", "AR1"], fit=False).summary()
+
+
+def test_candidates_that_were_not_tested_do_not_hide_that_none_fits():
+    """Each sensor has candidates that are for the other alone: one of the two has a line."""
+    signal = signals(gf.Model([gf.AR1(0.9, 1.0)]), 2)[:, 0]
+    signal[1] += 20 * torch.cos(0.35 * torch.arange(4096, dtype=torch.float64))
+    found = gf.rank_models(signal, ["WN", "RW", "WN + SIN", "RW + SIN"], fit=False)
+    assert found.p_value[0].isnan().tolist() == [False, False, True, True]
+    for sensor in range(2):
+        assert "No candidate fits" in " ".join(found.doubts((sensor,)))
+
+
+def test_weak_processes_in_wavelet_variances_are_climbed_to_from_every_side():
+    """A criterion as good as with all that lead to it, and no candidate behind the fit of that model alone."""
+    model = gf.WhiteNoise(1e-4) + gf.AR1(0.99, 1e-6)
+    signal = signals(model, 3, 8192)[:, 0]
+    hard = [44, 71]  # where white noise takes all, and the climb from there stays with it
+    more = torch.stack(
+        [model.simulate(8192, batch=(3,), generator=torch.Generator().manual_seed(s // 3))[s % 3] for s in hard]
+    )
+    variance = gf.wavelet_variance(torch.cat([signal, more]))
+    names = ["WN", "WN + AR1", "WN + 2*AR1"]
+    found = gf.rank_models(variance, names, n_samples=8192, fit=False)
+    assert set(found.names) == {"WN + AR1"}
+    whole = gf.rank_models(variance, [*names, "AR1", "2*AR1"], n_samples=8192, fit=False)
+    assert (found.criterion - whole.criterion[:, :3]).max() < 0.1
+    alone = gf.fit_gmwm(variance, "WN + AR1", n_samples=8192)
+    size = variance.amax(0)
+    for s, params in enumerate(alone.params):
+        fitted = alone.model.with_params(params)
+        spread = moment_covariance(fitted, 8192, len(variance))
+        residual = variance[:, s] - fitted.wavelet_variance(len(variance))
+        loss = residual @ torch.linalg.solve(spread, residual) + torch.linalg.slogdet(spread / size[s] ** 2)[1]
+        assert found.criterion[s, 1].item() < loss.item() + 3 * 3 * math.log(math.log(8192)) + 0.1

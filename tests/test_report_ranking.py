@@ -6,6 +6,7 @@ import functools
 import math
 from dataclasses import replace
 
+import matplotlib as mpl
 import pytest
 import torch
 from pages import Page
@@ -60,10 +61,87 @@ def test_the_runner_up_lost_by_odds_and_for_a_reason():
     words = plain(rank_verdict(result, (1,)))
     odds = number(math.exp(difference[runner].item() / 2), 2)
     told = f"The runner-up, {CANDIDATES[runner]}, has a criterion {difference[runner].item():.1f} above"
-    assert f"{told} ({odds} times less likely)" in words
+    assert f"{told} ({odds} times less likely, with its numbers charged for)" in words
     reason = result.reasons[1][runner]
     assert reason
     assert f"and is more than it takes: {reason}." in words
+
+
+def compared(*rows: tuple[str, float, float]) -> gf.RankResult:
+    """A ranking of these candidates with the first one chosen: name, criterion and p value."""
+    n = len(rows)
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.randn(1, 512, generator=generator, dtype=torch.float64)
+    base = gf.rank_models(noise, ["WN"], fit=False)
+    values = torch.tensor([row[1:] for row in rows], dtype=torch.float64)[None]
+    nothing = torch.zeros(1, n, dtype=torch.bool)
+    return replace(
+        base,
+        candidates=tuple(row[0] for row in rows),
+        criterion=values[..., 0],
+        wvic=values[..., 0],
+        p_value=values[..., 1],
+        redundant=nothing,
+        equivalent=nothing,
+        reasons=((None,) * n,),
+    )
+
+
+def test_a_charge_alone_is_no_odds():
+    charge = 3 * math.log(math.log(512))
+    same = plain(rank_verdict(compared(("WN", 0.0, 0.5), ("WN + QN", charge + 0.1, 0.5)), (0,)))
+    assert f"has a criterion {charge + 0.1:.1f} above (no likelihood gained for 1 more number)." in same
+    two = plain(rank_verdict(compared(("WN", 0.0, 0.5), ("WN + AR1", 2 * charge, 0.5)), (0,)))
+    assert "(no likelihood gained for 2 more numbers)" in two
+    other = plain(rank_verdict(compared(("WN", 0.0, 0.5), ("WN + QN", charge + 0.5, 0.5)), (0,)))
+    assert "times less likely, with its numbers charged for)" in other
+
+
+def test_what_does_not_fit_is_held_against_it_where_the_chosen_one_fits():
+    told = "its wavelet variances do not fit"
+    fits = plain(rank_verdict(compared(("WN", 0.0, 0.5), ("RW", 9.0, 0.0)), (0,)))
+    assert f"{told} (J test: p < 1e-300)" in fits
+    assert told not in plain(rank_verdict(compared(("WN", 0.0, 5e-3), ("RW", 9.0, 1e-5)), (0,)))
+
+
+def test_one_candidate_has_one_standing():
+    base = compared(("WN + AR1", 0.0, 0.5), ("2*AR1", 1.0, 0.0), ("WN", 9.0, math.nan))
+    marks = torch.tensor([[False, True, False]])
+    result = replace(base, redundant=marks, equivalent=marks, reasons=((None, "AR1 2 is white noise", None),))
+    assert [result.standing((0,), c) for c in range(3)] == ["chosen", "not told from it", ""]
+    told = "not told from it: AR1 2 is white noise"
+    assert told in result.summary()
+    assert "redundant:" not in result.summary()
+    assert any(row[-1] == told for row in Page(rank_report(result, title="one")).rows)
+    with mpl.rc_context({"backend": "agg"}):
+        ax = result.plot()
+    assert [text.get_text() for text in ax.get_legend().get_texts()] == ["candidate", "not told from it"]
+    words = plain(rank_verdict(result, (0,)))
+    assert "The next one, WN, has" in words  # third in the table
+    assert "runner-up" not in words
+    assert "< 1e-300" in result.summary()
+    assert result.summary().endswith(" -")  # without a test
+
+
+def test_the_table_is_in_line_and_nothing_is_no_less_than_nothing():
+    result = compared(("WN", 0.0, 0.5), ("RW", -1e-3, 0.5))
+    rows = result.summary().splitlines()[-3:]
+    assert "-0.00" not in result.summary()
+    assert "-0.00" not in Page(rank_report(result, title="zero")).text
+    assert [row.index(word) + len(word) for row, word in zip(rows, ("criterion", "+0.00", "+0.00"), strict=True)] == (
+        [rows[0].index("criterion") + len("criterion")] * 3
+    )
+
+
+def test_candidates_are_counted_for_every_sensor():
+    result = ranked()
+    counts = result.criterion.isfinite().sum(-1).tolist()
+    assert counts[0] != counts[1]
+    assert result.compared == f"{counts[0]} and {counts[1]} of 7 candidates"
+    criterion = result.criterion[:1].expand(9, -1).clone()
+    criterion[3, int(result.choice[0])] = torch.nan
+    many = replace(result, criterion=criterion, choice=result.choice[:1].expand(9))
+    assert many.compared == f"{counts[0] - 1} to {counts[0]} of 7 candidates"
 
 
 def test_odds_too_large_for_a_number():
@@ -112,13 +190,26 @@ def test_page_and_summary_name_those_that_were_not_compared():
 
 
 def test_a_line_without_a_candidate_for_it_is_told():
-    told = "The spectrum has a line more than those compared have sinusoids"
+    told = "The spectrum has more lines than those compared have sinusoids"
     result = gf.rank_models(recording(), ["WN + RW", "WN + AR1"], fit=False)
     assert told in plain(rank_verdict(result, (0,)))
     assert told in result.summary()
     assert told not in plain(rank_verdict(result, (1,)))
     assert result.n_tones.tolist() == [0, 0]
     assert result.n_lines.tolist() == [1, 0]
+
+
+def test_lines_are_not_counted_beyond_what_candidates_allow():
+    time = torch.arange(4096, dtype=torch.float64)
+    noise = torch.randn(1, 4096, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    signal = noise + sum(torch.cos(f * time) for f in (0.3, 0.7, 1.1, 1.9))
+    capped = gf.rank_models(signal, ["WN", "WN + 2*SIN"], fit=False)
+    assert "At least 3 lines stand out of the noise" in plain(rank_verdict(capped, (0,)))
+    one = gf.rank_models(signal, ["WN"], fit=False)
+    assert "At least one line stands out of the noise" in plain(rank_verdict(one, (0,)))
+    whole = gf.rank_models(signal, ["WN", "WN + 5*SIN", "WN + 4*SIN"], fit=False)
+    assert "4 lines stand out of the noise" in plain(rank_verdict(whole, (0,)))
+    assert "At least" not in plain(rank_verdict(whole, (0,)))
 
 
 def test_page_and_summary_say_when_no_candidate_fits():

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gyrofuse._result import p_words
 from gyrofuse.mismatch.outcome import Outcome
-from gyrofuse.mismatch.telling import fused_words, nats, otherwise_words, p_words, parameter_words
+from gyrofuse.mismatch.telling import fused_words, nats, otherwise_words, parameter_words
 from gyrofuse.plotting_mismatch import plot_map
 from gyrofuse.report_mismatch import mismatch_page
 

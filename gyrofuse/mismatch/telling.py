@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 
 from gyrofuse._linalg import SingularCovarianceError
+from gyrofuse._result import p_words
 from gyrofuse.mismatch.benefit import Benefit
 from gyrofuse.mismatch.mechanism import Finding
 from gyrofuse.mismatch.outcome import Outcome
@@ -101,16 +102,6 @@ def benefit_of(outcome: Outcome) -> Benefit | None:
         return outcome.benefit()
     except SingularCovarianceError:
         return None
-
-
-def chance(p_value: float) -> str:
-    """A p value in digits."""
-    return f"{p_value:.2g}" if p_value > 0 else "< 1e-300"
-
-
-def p_words(p_value: float) -> str:
-    """A p value in a sentence."""
-    return f"p = {chance(p_value)}" if p_value > 0 else f"p {chance(p_value)}"
 
 
 def nats(value: float) -> str:
