@@ -58,7 +58,9 @@ def _scores(cells: Tensor, half: float, worth: float, lowest: int) -> tuple[Tens
     used = torch.ones_like(cells[:1])
     used[:, :lowest] = 0
     count, first, second = conv1d(used[None], kernels, padding=reach)[0]
-    total, along = conv1d((cells * used)[:, None], kernels[:2], padding=reach).unbind(1)
+    # Sensor by sensor: convolutions of many rows lay out every window of all of them.
+    rows = [conv1d(row[None, None], kernels[:2], padding=reach)[0] for row in cells * used]
+    total, along = torch.stack(rows, 1)
     count = count.clamp(min=1.0)
     variance = (second - first.square() / count).clamp(min=1e-9) / worth
     standard = (along * count / total.clamp(min=1e-300) - first) / variance.sqrt()
