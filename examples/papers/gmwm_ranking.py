@@ -6,9 +6,11 @@ variance information criterion (WVIC) would choose. Before that, theory says whi
 show: a composition is taken for identified where 95 of 100 records give it a better criterion, at its true values,
 than its closest rival has, and a test at its true frequency finds each sinusoid as often, with three cycles or more.
 No method can do much better than this share. An AR1 with a time constant above half the record is the random walk
-that it is there. Simulations 2 and 3 have 160 000 samples here, 10 000 000 in the paper.
+that it is there. Simulations 2 and 3 have 160 000 samples here, 10 000 000 in the paper: `--simulation 2 --samples
+10000000 --not-shown-by 160000` ranks what only so many show, at some six seconds a record.
 
-    python examples/papers/gmwm_ranking.py [--quick] [--simulation N] [--samples T] [--runs N] [--out FOLDER] [--seed N]
+    python examples/papers/gmwm_ranking.py [--quick] [--simulation N] [--samples T] [--not-shown-by T] [--runs N]
+        [--out FOLDER] [--seed N]
 """
 
 from __future__ import annotations
@@ -200,12 +202,15 @@ def rates(part: Part, n_samples: int, n_runs: int, generator: torch.Generator) -
     return Rates(right / n_runs, named / n_runs, wvic / n_runs, ordered)
 
 
-def study(number: int, n_samples: int, n_runs: int, most: int, seed: int) -> list[tuple[Part, Rates]]:
-    """Print the table of a simulation and return its identified parts."""
+def study(number: int, n_samples: int, n_runs: int, most: int, seed: int, shown: int) -> list[tuple[Part, Rates]]:
+    """Print the table of a simulation and return its identified parts, but for those that a shorter record shows."""
     print(f"\nSimulation {number}: {n_samples} samples, {n_runs} records of each composition")
     print(f"{'true composition':<26}{'chosen':>8}{'or equivalent':>15}{'WVIC':>8}{'at most':>10}  most often instead")
     found = []
+    known = [part.share >= _IDENTIFIED for part in parts(SIMULATIONS[number], shown, most)] if shown else []
     for k, part in enumerate(parts(SIMULATIONS[number], n_samples, most)):
+        if known and known[k]:
+            continue
         if part.share < _IDENTIFIED:
             print(f"{part.name:<26}{'not identified':>31}{part.share:>10.3f}  closest: {part.rival}", flush=True)
             continue
@@ -213,6 +218,8 @@ def study(number: int, n_samples: int, n_runs: int, most: int, seed: int) -> lis
         cells = f"{rate.right:>8.3f}{rate.named:>15.3f}{rate.wvic:>8.3f}{part.share:>10.3f}"
         print(f"{part.name:<26}{cells}  {', '.join(f'{n} {name}' for name, n in rate.others[:3])}", flush=True)
         found.append((part, rate))
+    if not found:
+        raise SystemExit("there is no composition to rank: records of this length show none that is asked for")
     total = [sum(getattr(rate, kind) for _, rate in found) / len(found) for kind in ("right", "named", "wvic")]
     least = min(rate.right for _, rate in found)
     print(f"mean: chosen {total[0]:.3f} (least {least:.3f}), or equivalent {total[1]:.3f}; WVIC {total[2]:.3f}")
@@ -223,13 +230,17 @@ def main() -> None:
     parser = arguments(__doc__)
     parser.add_argument("--simulation", type=int, choices=list(SIMULATIONS), help="this one alone")
     parser.add_argument("--samples", type=int, help="length of the records; 40 000 and 160 000 by default")
+    parser.add_argument("--not-shown-by", type=int, default=0, help="only compositions that this length does not show")
     parser.add_argument("--runs", type=int, help=f"records of each composition; {N_RUNS} by default")
     options = parser.parse_args()
     which = [options.simulation] if options.simulation else ([1] if options.quick else list(SIMULATIONS))
     n_runs = options.runs or (QUICK_RUNS if options.quick else N_RUNS)
     lengths = dict.fromkeys(N_SAMPLES, QUICK_SAMPLES) if options.quick else N_SAMPLES
     most = QUICK_PROCESSES if options.quick else max(len(model.processes) for model in SIMULATIONS.values())
-    tables = {number: study(number, options.samples or lengths[number], n_runs, most, options.seed) for number in which}
+    tables = {
+        number: study(number, options.samples or lengths[number], n_runs, most, options.seed, options.not_shown_by)
+        for number in which
+    }
     heights = [len(table) for table in tables.values()]
     size = (8, 1.2 + 0.32 * sum(heights))
     figure, axes = plt.subplots(
