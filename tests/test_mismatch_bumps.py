@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 from scipy import stats
-from shape_draws import CHANGES, RATE, SIGNS, N, P, array, case, drawn, generator, oscillating, tensor
+from shape_draws import CHANGES, RATE, SIGNS, N, P, array, case, drawn, generator, nominated, oscillating, tensor
 
 from gyrofuse.mismatch.bump_fit import oscillation_of
 from gyrofuse.mismatch.bump_scan import log_ratios
@@ -140,3 +140,11 @@ def test_whitened_walks_do_not_jump_where_they_end():
     walk = torch.randn(P, N, generator=g, dtype=torch.float64).cumsum(-1)
     white = whitened(walk, case(walk, torch.randn(4, P, N, generator=g, dtype=torch.float64).cumsum(-1)).base)
     assert float(white[:, [0, -1]].abs().max()) < 5 * float(white.std())
+
+
+def test_what_rings_after_a_blow_is_no_mode_and_no_tone():
+    after = torch.arange(N, dtype=torch.float64) - 5000
+    ring = (-after.clamp(min=0) / 40).exp() * torch.cos(2 * math.pi * 0.21 * after) * (after > 0)
+    given = drawn(3, lambda x, _: x + 0.3 * SIGNS[:, None] * ring)
+    assert strongest_bump(given).p_value < 1e-6
+    assert nominated(given) is None

@@ -24,6 +24,7 @@ _SEEN = 2.3  # standard deviations: one in a hundred by chance
 _BAND = 6.0  # half widths on either side
 _PARTS, _MOST_ALIKE = 16, 0.8  # of a record, to see a frequency wander, and the correlation of neighbours
 _FEWEST = 3  # samples of the band in a part
+_MOMENTS, _MOST_AT_ONCE = 32, 0.5  # parts of a record, and share of the excess in one
 _BROAD = 0.1  # half width over centre
 _SMEARED = 0.45  # bins: half width of a line under a light taper
 _REACH, _FEWEST_BINS = 7.5, 6  # half widths around a mode, and bins, that tell its strength
@@ -132,11 +133,37 @@ def nominated(case: Case, level: float, *, tone: bool) -> tuple[Mode, Seen] | No
         has = bump.variance > _SEEN * bump.variance_sd
     sensors = tuple(int(i) for i in has.nonzero()[:, 0])
     verdict = steadiness(case, bump)
-    if not sensors or verdict.tone != tone:
+    if not sensors or verdict.tone != tone or _momentary(case, bump):
         return None
     gain = bump.variance.clamp(min=0).sqrt().to(torch.complex128) if bump.gain is None else bump.gain
     mode = Mode(bump.centre, bump.width, gain, bump.gain is not None)
     return mode, Seen(case, bump, verdict, sensors, rivals)
+
+
+def _in_band(case: Case, bump: Oscillation) -> tuple[Tensor, float]:
+    """Sensors summed in phase, in a band whose middle is the centre, and the power that noise alone has there.
+
+    Complex samples `(time,)`, one for each bin of the band.
+    """
+    n = case.n_samples
+    centre, reach = round(bump.centre * n), max(round(_BAND * bump.width * n), 2 * _PARTS)
+    reach = min(reach, centre - 1, n // 2 - centre)
+    strength = bump.variance.clamp(min=0).sqrt().to(torch.complex128) if bump.gain is None else bump.gain
+    noise = case.base.spectrum(torch.tensor([bump.centre], dtype=torch.float64))[:, 0]
+    weights = strength.conj() / noise
+    bins = weights @ torch.fft.rfft(case.recording)[:, centre - reach : centre + reach]
+    level = float(weights.abs().square() @ noise) * n / len(bins)
+    return torch.fft.ifft(torch.fft.ifftshift(bins)), level
+
+
+def _momentary(case: Case, bump: Oscillation) -> bool:
+    """Whether one moment has most of it: what rings after a blow is neither noise through a resonance nor a tone."""
+    z, level = _in_band(case, bump)
+    length = len(z) // _MOMENTS
+    if length < 1:
+        return False
+    excess = z[: length * _MOMENTS].unflatten(0, (_MOMENTS, length)).abs().square().mean(-1) - level
+    return float(excess.max()) > _MOST_AT_ONCE * float(excess.sum().clamp(min=0))
 
 
 def wandering_sd(case: Case, bump: Oscillation) -> float:
@@ -145,13 +172,7 @@ def wandering_sd(case: Case, bump: Oscillation) -> float:
     Of the sum of sensors in phase: the mean turn from sample to sample in a band whose middle is the centre, where
     white noise has none. Neighbouring parts that are alike make the mean of all as uncertain as fewer of them would.
     """
-    n = case.n_samples
-    centre, reach = round(bump.centre * n), max(round(_BAND * bump.width * n), 2 * _PARTS)
-    reach = min(reach, centre - 1, n // 2 - centre)
-    strength = bump.variance.clamp(min=0).sqrt().to(torch.complex128) if bump.gain is None else bump.gain
-    weights = strength.conj() / case.base.spectrum(torch.tensor([bump.centre], dtype=torch.float64))[:, 0]
-    bins = weights @ torch.fft.rfft(case.recording)[:, centre - reach : centre + reach]
-    z = torch.fft.ifft(torch.fft.ifftshift(bins))
+    z, _ = _in_band(case, bump)
     if len(z) < _FEWEST * _PARTS:
         return 0.0
     parts = z[: len(z) // _PARTS * _PARTS].unflatten(0, (_PARTS, -1))
@@ -160,7 +181,7 @@ def wandering_sd(case: Case, bump: Oscillation) -> float:
     alike = float((left[1:] * left[:-1]).sum() / left.square().sum())
     alike = min(max(alike + (1 + 4 * alike) / _PARTS, 0.0), _MOST_ALIKE)  # a mean of its own biases it down
     spread = float(left.square().sum()) / (_PARTS - 1) / _PARTS * (1 + alike) / (1 - alike)
-    return math.sqrt(spread) * len(z) / n
+    return math.sqrt(spread) * len(z) / case.n_samples
 
 
 def refitted_mode(case: Case, fold: int, mode: Mode) -> Mode:
