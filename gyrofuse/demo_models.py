@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._rank_candidates import name_of
-from gyrofuse.gmwm_result import GMWMResult
+from gyrofuse.gmwm_result import REFUSED, GMWMResult
 from gyrofuse.processes import AR1, Model, WhiteNoise
 from gyrofuse.ranking_result import RankResult
 from gyrofuse.report_page import new_figure, number
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 CANDIDATES = ("WN", "WN + RW", "WN + AR1", "WN + AR1 + RW", "WN + 2*AR1", "WN + 2*AR1 + RW", "WN + 3*AR1")
 # Averages of the recording that still tell something: their number at the averaging time of the table.
 _AVERAGES = 100
-_REFUSED = 0.01  # p-values of the J test below
 
 
 def true_models(array: ArrayModel, weights: Tensor) -> list[Model]:
@@ -131,7 +130,7 @@ def _told(fits: list[GMWMResult], result: RankResult, truth: Model) -> str:
     name = name_of([type(process) for process in truth.processes])
     same = sum(found == name for found in result.names)
     tests = {fit.sensors[0]: _p_value(fit) for fit in fits}
-    refused = [sensor for sensor, p_value in tests.items() if p_value is not None and p_value < _REFUSED]
+    refused = [sensor for sensor, p_value in tests.items() if p_value is not None and p_value < REFUSED]
     untested = [sensor for sensor, p_value in tests.items() if p_value is None]
     doubts = f"The J test refuses the model of {', '.join(refused)}." if refused else "The J test refuses none of them."
     if untested:

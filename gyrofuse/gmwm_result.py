@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _MOST_TABLES = 12  # items that a summary prints in full
-_REFUSED = 0.01
+REFUSED = 0.01  # p-values of the J test below
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -151,8 +151,8 @@ class GMWMResult:
         if n_items > _MOST_TABLES:
             tested = self.p_value.isfinite()
             if bool(tested.any()):
-                refused = int((self.p_value[tested] < _REFUSED).sum())
-                lines.append(f"the J test refuses {refused} of {int(tested.sum())} models (p < {_REFUSED:g})")
+                refused = int((self.p_value[tested] < REFUSED).sum())
+                lines.append(f"the J test refuses {refused} of {int(tested.sum())} models (p < {REFUSED:g})")
             return "\n".join(lines)
         for index in itertools.product(*map(range, self.params.shape[:-1])):
             lines += ["", *self._table(index)]

@@ -9,12 +9,11 @@ import torch
 from torch import Tensor
 
 from gyrofuse._result import p_words
-from gyrofuse.gmwm_result import GMWMResult
+from gyrofuse.gmwm_result import REFUSED, GMWMResult
 from gyrofuse.processes import Model, Sinusoid
 from gyrofuse.report_page import number
 
-# Of the J test: a model is refused below the second, doubted below the first.
-_DOUBTED, _REFUSED = 0.05, 0.01
+_DOUBTED = 0.05  # p-values of the J test below
 _WEIGHTS = {
     "optimal": "weighted by the inverse of their covariance under the fitted model",
     "diagonal": "weighted by the reciprocals of their variances under the fitted model",
@@ -102,7 +101,7 @@ def _completeness(result: GMWMResult, index: tuple[int, ...]) -> Iterator[str]:
     worst = int(off.abs().argmax())
     size = f"{abs(off[worst].item()):.1f} standard deviations {'above' if off[worst] > 0 else 'below'} the model's"
     where = f"at {_time(result, worst)} the measured wavelet variance is {size}"
-    if p_value >= _REFUSED:
+    if p_value >= REFUSED:
         yield f"The model is in doubt ({told}): {where}."
     else:
         remedy = "add a process or look for a disturbance"

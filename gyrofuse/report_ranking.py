@@ -9,6 +9,7 @@ from typing import Any
 
 from gyrofuse._rank_candidates import charge, n_parameters
 from gyrofuse._result import chance, counted, p_words, signed
+from gyrofuse.gmwm_result import REFUSED
 from gyrofuse.model_words import model_method
 from gyrofuse.moment_fit import composition_of
 from gyrofuse.ranking_result import RankResult
@@ -19,7 +20,6 @@ from gyrofuse.report_page import number, render
 # Pages stay readable; the JSON file holds all.
 _MOST_SENSORS, _MOST_ROWS = 24, 15
 _NO_GAIN = 0.1  # nats
-_DOUBTED = 0.01  # p-value of the J test
 _MOST_NATS = 15.0  # beyond, a ratio is no number to print
 
 
@@ -113,7 +113,7 @@ def _why_not(result: RankResult, index: tuple[int, ...], row: dict[str, Any]) ->
     if row["reason"]:
         return f"{told} and is more than it takes: {row['reason']}"
     # That is against it only where the chosen one fits.
-    if row["p_value"] < _DOUBTED <= result.p_value[index][int(result.choice[index])].item():
+    if row["p_value"] < REFUSED <= result.p_value[index][int(result.choice[index])].item():
         return f"{told}; its wavelet variances do not fit (J test: {p_words(row['p_value'])})"
     return told
 

@@ -175,7 +175,7 @@ def _of_tone(case: Case, f: float) -> list[Slip]:
 
 def _in_samples(loss: Loss, block: int) -> Loss:
     first, last = loss.at_limits
-    return Loss(loss.at * block, loss.count, ((first - 1) * block, (last + 1) * block), loss.count_limits)
+    return Loss(loss.at * block, loss.count, ((first - 1) * block, (last + 1) * block))
 
 
 def _reference(case: Case, f: float, strongest: float) -> tuple[str, float, float] | None:

@@ -35,12 +35,11 @@ _BEYOND = 0.025  # probability of totals beyond a limit
 
 @dataclass(frozen=True)
 class Loss:
-    """Samples lost at once: the first sample after them, and how many, each with limits."""
+    """Samples lost at once: the first sample after them, with limits, and how many."""
 
     at: int
     count: int
     at_limits: tuple[int, int]
-    count_limits: tuple[int, int]
 
 
 class Paths(NamedTuple):
@@ -140,10 +139,8 @@ def losses_of(z: Tensor, lost: Tensor, angle: float) -> tuple[list[Loss], float]
     losses = []
     for at in sorted(found):
         near_best = _further(z, {place: count for place, count in found.items() if place != at}, angle)
-        near = near_best >= near_best.amax() - _AS_GOOD
-        places, counts = near.any(-1).nonzero()[:, 0] + 1, near.any(0).nonzero()[:, 0] + 1
-        limits = (int(places[0]), int(places[-1])), (int(counts[0]), int(counts[-1]))
-        losses.append(Loss(at, found[at], *limits))
+        places = (near_best >= near_best.amax() - _AS_GOOD).any(-1).nonzero()[:, 0] + 1
+        losses.append(Loss(at, found[at], (int(places[0]), int(places[-1]))))
     return losses, _gain_of(z, found, angle)
 
 

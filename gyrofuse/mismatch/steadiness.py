@@ -16,7 +16,7 @@ from torch.nn.functional import interpolate, pad
 
 from gyrofuse.mismatch.bump_fit import Oscillation
 from gyrofuse.mismatch.case import Case
-from gyrofuse.mismatch.wandering import wandering_log_ratio
+from gyrofuse.mismatch.wandering import rampless_transform, wandering_log_ratio
 
 _DRAWN = 60
 _REACH = 6.0  # half widths on either side
@@ -73,15 +73,12 @@ def steadiness(case: Case, bump: Oscillation) -> Steadiness:
 def _baseband(case: Case, bump: Oscillation, weights: Tensor) -> tuple[Tensor, float]:
     """Bins `(bin,)` around the bump of the sensors' weighted sum, and the power of noise in each; none without room."""
     n = case.n_samples
-    ramp = torch.linspace(0, 1, n, dtype=torch.float64)
-    signal = case.recording - (case.recording[:, -1:] - case.recording[:, :1]) * ramp
     reach = max(round(_REACH * bump.width * n), _LEAST // 2)
     centre = round(bump.centre * n)
     reach = min(reach, centre - 3, n // 2 - centre - 2)
     if 2 * reach < _LEAST:
         return torch.zeros(0, dtype=weights.dtype), 0.0
-    transform = torch.fft.rfft(signal)
-    bins = weights @ transform[:, centre - reach : centre + reach]
+    bins = weights @ rampless_transform(case)[:, centre - reach : centre + reach]
     power = bins.abs().square()
     edge = max(len(power) // 8, 1)
     floor = float((power[:edge].mean() + power[-edge:].mean()) / 2)

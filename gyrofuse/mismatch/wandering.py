@@ -19,6 +19,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.bump_fit import Oscillation
 from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.remembered import remembered
 
 _REACH, _FEWEST = 8.0, 256  # half widths on either side, and bins
 _SHORTEST, _LONGEST, _WINDOWS = 4, 128, 4  # samples of a window, and fewest windows
@@ -40,17 +41,22 @@ def wandering_log_ratio(case: Case, bump: Oscillation, weights: Tensor) -> float
     return tone + noise - hump
 
 
+@remembered
+def rampless_transform(case: Case) -> Tensor:
+    """Transform `(sensor, bin)` of the recording whose ends are made to meet."""
+    ramp = torch.linspace(0, 1, case.n_samples, dtype=torch.float64)
+    return torch.fft.rfft(case.recording - (case.recording[:, -1:] - case.recording[:, :1]) * ramp)
+
+
 def _band(case: Case, bump: Oscillation, weights: Tensor) -> Tensor:
     """Bins `(bin,)` of the sum in units of its noise."""
     n = case.n_samples
-    ramp = torch.linspace(0, 1, n, dtype=torch.float64)
-    signal = case.recording - (case.recording[:, -1:] - case.recording[:, :1]) * ramp
     centre, reach = round(bump.centre * n), max(round(_REACH * bump.width * n), _FEWEST)
     reach = min(reach, centre - 3, n // 2 - centre - 2)
     inside = slice(centre - reach, centre + reach)
     f = torch.arange(inside.start, inside.stop, dtype=torch.float64) / n
     noise = weights.abs().square() @ case.base.spectrum(f) * n
-    return (weights @ torch.fft.rfft(signal)[:, inside]) / noise.sqrt()
+    return (weights @ rampless_transform(case)[:, inside]) / noise.sqrt()
 
 
 def _hump(power: Tensor) -> tuple[float, float, float]:
