@@ -10,10 +10,12 @@ import torch
 from torch import Tensor
 
 from gyrofuse.covariance import wavelet_cross_covariance
-from gyrofuse.mismatch.case import N_BLOCKS, Case
+from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.folds import N_JUDGED, in_fold
 from gyrofuse.mismatch.remembered import remembered
 
+_WINDOWS = 512  # of a recording: the area of so many is told to 0.02, and a window of it still holds four levels
+_SHORTEST = 64  # samples of a window
 _LEVELS_LEFT = 3  # of a window's longest wavelets, too few coefficients
 _RIDGE = 1.0  # windows' worth of prior on the features' scatter
 _MOST_RECORDS = 2
@@ -21,13 +23,14 @@ _TINY = 1e-300
 
 
 def distinguishability(case: Case, fold: int) -> float:
-    """Area under the ROC curve on windows that a fold holds out, each as long as 1/256 of the recording."""
+    """Area under the ROC curve on windows that a fold holds out, each as long as 1/512 of the recording, or longer."""
     recorded, simulated = _both(case)
+    per_block = len(recorded) // N_JUDGED
     everything = torch.cat([recorded, simulated])
     everything = (everything - everything.mean(0)) / everything.std(0).clamp(min=1e-12)
     label = torch.arange(len(everything)) < len(recorded)
     place = torch.cat([torch.arange(len(part)) for part in (recorded, simulated)])
-    judged = in_fold(N_JUDGED, fold)[place // (N_BLOCKS // N_JUDGED) % N_JUDGED]
+    judged = in_fold(N_JUDGED, fold)[place // per_block % N_JUDGED]
     score = everything[judged] @ _discriminant(everything[~judged], label[~judged])
     return area_under_curve(score[label[judged]], score[~label[judged]])
 
@@ -36,7 +39,9 @@ def distinguishability(case: Case, fold: int) -> float:
 def _both(case: Case) -> tuple[Tensor, Tensor]:
     """Features of the windows of the recording and of the simulation."""
     records = case.simulated.signal[:_MOST_RECORDS]
-    return features(case.recording, case.block), torch.cat([features(record, case.block) for record in records])
+    n_windows = min(_WINDOWS, case.n_samples // (_SHORTEST * N_JUDGED) * N_JUDGED)
+    window = case.n_samples // n_windows
+    return features(case.recording, window), torch.cat([features(record, window) for record in records])
 
 
 def features(signal: Tensor, window: int) -> Tensor:
