@@ -23,6 +23,7 @@ import typer
 from gyrofuse._checks import check_positive, check_positive_integer
 from gyrofuse._console import Commands, progress, say, say_table, warn
 from gyrofuse._output import output_folder
+from gyrofuse.cli_fleet import fleet
 from gyrofuse.cli_mismatch import diagnose
 from gyrofuse.cli_models import fit, rank
 from gyrofuse.cli_shared import (
@@ -31,6 +32,7 @@ from gyrofuse.cli_shared import (
     Json,
     Key,
     Logs,
+    Method,
     Mounting,
     Rate,
     Report,
@@ -44,6 +46,7 @@ from gyrofuse.cli_shared import (
     read,
     read_model,
     say_notes,
+    scale_weights_of,
     stretch,
     titled,
     write_json,
@@ -75,20 +78,6 @@ app = typer.Typer(
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-
-
-class Method(str, Enum):
-    """How weights are chosen."""
-
-    svo = "svo"
-    multiscale = "multiscale"
-    auto = "auto"
-    model_assisted = "model-assisted"
-    shrinkage = "shrinkage"
-    nonnegative = "nonnegative"
-    inverse_variance = "inverse-variance"
-    equal = "equal"
-    rdvg = "rdvg"
 
 
 class Covariance(str, Enum):
@@ -187,7 +176,7 @@ def fuse(
     force: Force = False,
 ) -> None:
     """Fuse an array, recorded at rest, into one virtual gyro."""
-    weights, resting = _scale_weights(scale_weights), stretch(rest)
+    weights, resting = scale_weights_of(scale_weights), stretch(rest)
     if method in _WITHOUT_INTERVALS and covariance not in (None, Covariance.none):
         raise ValueError(
             f"`--covariance`: {covariance.value} has no use, for --method {method.value} gives no intervals of its "
@@ -244,6 +233,7 @@ def fuse(
 app.command()(fit)
 app.command()(rank)
 app.command()(diagnose)
+app.command()(fleet)
 
 
 @app.command()
@@ -359,17 +349,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if threading.current_thread() is threading.main_thread():  # ended from outside: leave no draft behind
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     app(arguments)
-
-
-def _scale_weights(text: str) -> str | list[float]:
-    if text in ("flat", "short", "long"):
-        return text
-    try:
-        return [float(part) for part in text.split(",")]
-    except ValueError:
-        raise ValueError(
-            f"`--scale-weights`: expected flat, short, long, or numbers separated by commas, got {text!r}"
-        ) from None
 
 
 def _save(recording: Recording, path: Path, **arrays: np.ndarray[Any, Any]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -52,6 +53,20 @@ Report = Annotated[Path | None, typer.Option(metavar="FILE", help="Write a repor
 Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
 
 
+class Method(str, Enum):
+    """How weights are chosen."""
+
+    svo = "svo"
+    multiscale = "multiscale"
+    auto = "auto"
+    model_assisted = "model-assisted"
+    shrinkage = "shrinkage"
+    nonnegative = "nonnegative"
+    inverse_variance = "inverse-variance"
+    equal = "equal"
+    rdvg = "rdvg"
+
+
 def read(
     logs: Sequence[Path],
     axis: str | None,
@@ -86,6 +101,18 @@ def known_unit(unit: str) -> str:
             "factor that brings the numbers of the log to it"
         )
     return name
+
+
+def scale_weights_of(text: str) -> str | tuple[float, ...]:
+    """The name that `--scale-weights` gives, or its numbers."""
+    if text in ("flat", "short", "long"):
+        return text
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise ValueError(
+            f"`--scale-weights`: expected flat, short, long, or numbers separated by commas, got {text!r}"
+        ) from None
 
 
 def stretch(rest: str | None) -> tuple[float, float] | None:

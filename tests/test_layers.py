@@ -16,7 +16,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "gyrofuse"
 # From top to bottom; modules of one layer may use each other, as long as nothing goes round in circles. A leading
 # underscore puts a module at the bottom, unless it is named here. A name without a file is one to come.
 LAYERS = [
-    {"__main__", "cli", "cli_mismatch", "cli_models", "cli_shared", "_console", "lightning_module"},
+    {"__main__", "cli", "cli_fleet", "cli_mismatch", "cli_models", "cli_shared", "_console", "lightning_module"},
     {
         "demo",
         "demo_mismatch",
@@ -25,9 +25,11 @@ LAYERS = [
         "report_words",
         "report_models",
         "report_ranking",
+        "report_fleet",
         "model_words",
     },
     {"__init__"},
+    {"fleet"},
     {"mismatch", "report_mismatch", "navigation"},
     {
         "svo",
@@ -99,6 +101,7 @@ LAYERS = [
         "state_space",
         "plotting_models",
         "plotting_mismatch",
+        "plotting_fleet",
         "report_page",
     },
     {"haar", "processes", "recording", "io"},

@@ -24,6 +24,7 @@ _READERS = {
     ".db3": "rosbag",
     ".mcap": "rosbag",
 }
+SUFFIXES = tuple(_READERS)
 
 
 def read_streams(path: Path, *, key: str | None = None) -> list[Stream]:
@@ -46,7 +47,7 @@ def read_streams(path: Path, *, key: str | None = None) -> list[Stream]:
             raise RecordingError(f"{path}: expected a log, or a ROS 2 folder with metadata.yaml, found another folder")
         reader = "rosbag"
     elif path.suffix.lower() not in _READERS:
-        known = " ".join(_READERS)
+        known = " ".join(SUFFIXES)
         raise RecordingError(f"{path}: expected a log ({known}), found {path.suffix or 'no suffix'!r}; convert it")
     elif path.stat().st_size == 0:
         raise RecordingError(f"{path}: expected a log, found an empty file; record or copy it again")

@@ -1,0 +1,106 @@
+"""Which logs a fleet has, and in which groups they are worked on."""
+
+from __future__ import annotations
+
+import glob
+import os
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from pathlib import Path
+
+from gyrofuse.io import SUFFIXES
+
+_WILD = "*?["
+
+
+def find_logs(paths: Iterable[str | Path], *, manifest: str | Path | None = None) -> tuple[Path, ...]:
+    """All logs that names stand for, each once, in their order.
+
+    A file is a log whatever its suffix; of a folder, all files below with a suffix that is read, and ROS 2 folders. A
+    folder that may not be looked into is listed as it is, so that its row says so.
+
+    Args:
+        paths: Files, folders, and patterns such as `"flights/*/imu.npz"`, with `**` for any folders between.
+        manifest: Text file with one such name a line, relative to its own folder; lines that begin with `#` do not
+            count. What it names and is not there is listed all the same.
+
+    Raises:
+        FileNotFoundError: A name that is neither there nor a pattern that anything fits, or no such manifest.
+        ValueError: No log at all.
+    """
+    found: dict[Path, Path] = {}
+    for path in paths:
+        for log in _logs_of(Path(path)):
+            found.setdefault(log.resolve(), log)
+    if manifest is not None:
+        for path in _listed(Path(manifest)):
+            for log in _expanded(path) or [path]:
+                found.setdefault(log.resolve(), log)
+    if not found:
+        raise ValueError(f"`paths`: expected logs ({' '.join(SUFFIXES)}) or folders with some, found none")
+    return tuple(found.values())
+
+
+def groups_of(logs: Sequence[Path], size: int, done: Collection[str] = ()) -> tuple[tuple[Path, ...], ...]:
+    """Logs in groups of up to `size`, as they follow each other, without those that are done; the largest first.
+
+    The groups are those of all logs, whatever is done: what is computed together does not depend on where a run was
+    stopped. The order shares out the work evenly where processes take groups in turns.
+
+    Args:
+        logs: Of the fleet.
+        size: Of a group.
+        done: Names of logs whose rows are there.
+    """
+    groups = (tuple(logs[i : i + size]) for i in range(0, len(logs), size))
+    left = [part for part in (tuple(log for log in group if str(log) not in done) for group in groups) if part]
+    return tuple(sorted(left, key=lambda group: -sum(map(_size, group))))
+
+
+def _logs_of(path: Path) -> Iterable[Path]:
+    logs = _expanded(path)
+    if not logs and path.is_dir():
+        return ()
+    if not logs:
+        what = "file fits the pattern" if any(c in str(path) for c in _WILD) else "such file or folder"
+        raise FileNotFoundError(f"{path}: no {what}; check the name")
+    return logs
+
+
+def _expanded(path: Path) -> list[Path]:
+    """Logs behind a file, a folder or a pattern."""
+    if path.is_dir():
+        return list(_walked(path))
+    if path.exists():
+        return [path]
+    if not any(c in str(path) for c in _WILD):
+        return []
+    return [log for name in sorted(glob.glob(str(path), recursive=True)) for log in _expanded(Path(name))]
+
+
+def _walked(folder: Path) -> Iterator[Path]:
+    """Logs below a folder, and folders that cannot be read, sorted by name."""
+    unreadable: list[Path] = []
+    for name, folders, files in os.walk(folder, onerror=lambda error: unreadable.append(Path(error.filename))):
+        if "metadata.yaml" in files:
+            folders.clear()
+            yield Path(name)
+            continue
+        folders.sort()
+        yield from (Path(name) / file for file in sorted(files) if _is_log(file))
+    yield from unreadable
+
+
+def _is_log(name: str) -> bool:
+    return not name.startswith(".") and Path(name).suffix.lower() in SUFFIXES
+
+
+def _listed(manifest: Path) -> list[Path]:
+    lines = [line.strip() for line in manifest.read_text(encoding="utf-8").splitlines()]
+    return [manifest.parent / line for line in lines if line and not line.startswith("#")]
+
+
+def _size(log: Path) -> int:
+    try:
+        return log.stat().st_size
+    except OSError:  # its row will say so
+        return 0

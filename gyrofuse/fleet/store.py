@@ -1,0 +1,279 @@
+"""A Parquet file that fills up group by group and can be gone on with, wherever its writing was stopped.
+
+Rows of a group appear together, as one small Parquet file in a folder beside the table; when all are there they become
+the table. A file of a group is named after its logs: whoever writes it again writes the same.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import secrets
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gyrofuse._version import __version__
+
+if TYPE_CHECKING:
+    import pyarrow
+
+COMMON = {
+    "log": "text",
+    "status": "text",
+    "error": "text",
+    "sensors": "texts",
+    "n_samples": "whole",
+    "rate": "number",
+    "unit": "text",
+    "missing": "number",
+    "notes": "texts",
+    "warnings": "texts",
+}
+_SETTINGS = b"gyrofuse"
+_MOST_OPEN = 4  # files in memory while the table is made
+_MOST_LOGS, _MOST_BYTES = 1000, 2**26  # in a row group of it
+
+
+class ResultStore:
+    """Where rows go.
+
+    Args:
+        path: The table, `.parquet`.
+        columns: Of the task, by name, beside those that all tasks have.
+        settings: What the rows depend on: only a run of the same goes on with what is there.
+
+    Raises:
+        ImportError: pyarrow is not installed.
+    """
+
+    def __init__(self, path: str | Path, columns: Mapping[str, str], settings: Mapping[str, Any]) -> None:
+        _arrow(Path(path))
+        self.path = Path(path)
+        self.parts = self.path.with_name(f".{self.path.name}.parts")
+        self._columns = {**COMMON, **columns}
+        self._settings = json.loads(json.dumps(settings))  # as they are read back
+
+    def open(self, *, force: bool = False) -> None:
+        """Make ready for writing.
+
+        Args:
+            force: Whether a table or parts of other settings are replaced.
+
+        Raises:
+            FileExistsError: What is there is of other settings, or no table of a fleet.
+            FileNotFoundError: The folder does not exist.
+            OSError: It cannot be written to.
+        """
+        for file in (self.path, self.parts / "settings.json"):
+            found = _settings_of(file)
+            if found == self._settings or not file.exists():
+                continue
+            if not force:
+                what = (
+                    "no table of a fleet"
+                    if found is None
+                    else f"of other settings ({_difference(found, self._settings)})"
+                )
+                raise FileExistsError(f"{file}: is {what}; choose another name, or replace it with --force (`force`)")
+            file.unlink()
+            shutil.rmtree(self.parts, ignore_errors=True)
+        if not self.path.resolve().parent.is_dir():
+            raise FileNotFoundError(f"{self.path}: the folder {self.path.parent} does not exist; create it first")
+        self.parts.mkdir(exist_ok=True)
+        for draft in self.parts.glob("*.draft"):  # of a process that was killed
+            draft.unlink(missing_ok=True)
+        self._place(
+            self.parts / "settings.json",
+            lambda draft: draft.write_text(json.dumps(self._settings) + "\n", encoding="utf-8"),
+        )
+
+    def write(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Add all rows of some logs, at once or not at all."""
+        from pyarrow import parquet
+
+        logs = "\n".join(dict.fromkeys(row["log"] for row in rows))
+        name = hashlib.sha256(logs.encode("utf-8", "surrogateescape")).hexdigest()[:32]
+        table = self._table(rows)
+        self._place(self.parts / f"{name}.parquet", lambda draft: parquet.write_table(table, draft))
+
+    def done(self, *, failed: bool = True) -> frozenset[str]:
+        """Names of the logs whose rows are there; a part that cannot be read does not count and is removed.
+
+        Args:
+            failed: Whether those that failed count as done.
+        """
+        status = {
+            row["log"]: row["status"]
+            for path in self._files()
+            for row in _read_file(path, ["log", "status"]).to_pylist()
+        }
+        return frozenset(log for log, said in status.items() if failed or said == "ok")
+
+    @property
+    def n_parts(self) -> int:
+        """Groups of logs whose rows are there and not yet in the table."""
+        return sum(1 for _ in self.parts.glob("*.parquet"))
+
+    def finish(self, order: Sequence[str]) -> int:
+        """Make the table of the rows, in the order of their logs, and remove the parts; a few parts at a time.
+
+        Args:
+            order: Names of logs; others that the table has stay before them.
+
+        Returns:
+            Number of rows.
+        """
+        from pyarrow import parquet
+
+        source: dict[str, Path] = {}  # a part's rows before those of the table
+        for path in self._files():
+            source |= dict.fromkeys(_read_file(path, ["log"]).column("log").to_pylist(), path)
+        last = set(order)
+        names = [*(name for name in source if name not in last), *(name for name in order if name in source)]
+        n_rows = 0
+
+        def write(draft: Path) -> None:
+            nonlocal n_rows
+            with parquet.ParquetWriter(draft, self._schema()) as writer:
+                for table in _in_order(names, source, self._table([])):
+                    writer.write_table(table)
+                    n_rows += table.num_rows
+
+        self._place(self.path, write)
+        shutil.rmtree(self.parts, ignore_errors=True)
+        return n_rows
+
+    def _files(self) -> list[Path]:
+        """The table, then the parts that can be read; one that a machine has cut short is removed and done again."""
+        return [*([self.path] if self.path.exists() else []), *filter(_whole, sorted(self.parts.glob("*.parquet")))]
+
+    def _table(self, rows: Sequence[Mapping[str, Any]]) -> pyarrow.Table:
+        import pyarrow as pa
+
+        rows = [{name: row.get(name) for name in self._columns} for row in rows]
+        return pa.Table.from_pylist(rows, schema=self._schema())
+
+    def _schema(self) -> pyarrow.Schema:
+        import pyarrow as pa
+
+        kinds = {
+            "text": pa.string(),
+            "texts": pa.list_(pa.string()),
+            "number": pa.float64(),
+            "numbers": pa.list_(pa.float64()),
+            "whole": pa.int64(),
+            "truth": pa.bool_(),
+        }
+        metadata = {_SETTINGS: json.dumps(self._settings), b"gyrofuse_version": __version__}
+        return pa.schema([(name, kinds[kind]) for name, kind in self._columns.items()], metadata=metadata)
+
+    def _place(self, path: Path, write: Any) -> None:
+        """Write under another name, then rename."""
+        folder = self.parts if self.parts.is_dir() else path.parent
+        draft = folder / f"{secrets.token_hex(8)}.draft"
+        try:
+            write(draft)
+            draft.replace(path)
+        except OSError as error:
+            raise type(error)(f"{path}: cannot be written ({error}); what is finished is kept, go on later") from error
+        finally:
+            draft.unlink(missing_ok=True)
+
+
+def read_results(path: str | Path, *, without: Sequence[str] = ()) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Settings and rows of a table of a fleet.
+
+    Args:
+        path: The table.
+        without: Columns that are left out.
+
+    Raises:
+        FileNotFoundError: No such file.
+        ValueError: Not a table of a fleet.
+        ImportError: pyarrow is not installed.
+    """
+    _arrow(Path(path))
+    from pyarrow import parquet
+
+    if not Path(path).exists():
+        raise FileNotFoundError(f"{path}: no such file; check the name and the folder")
+    settings = _settings_of(Path(path))
+    if settings is None:
+        raise ValueError(f"{path}: expected a table that `gyrofuse fleet` wrote, found another file")
+    with parquet.ParquetFile(path) as file:
+        return settings, file.read([name for name in file.schema_arrow.names if name not in without]).to_pylist()
+
+
+def _read_file(path: Path, columns: list[str] | None) -> pyarrow.Table:
+    from pyarrow import parquet
+
+    with parquet.ParquetFile(path) as file:
+        return file.read(columns=columns)
+
+
+def _whole(part: Path) -> bool:
+    import pyarrow as pa
+
+    try:
+        _read_file(part, ["log"])
+    except (pa.ArrowException, OSError):
+        part.unlink(missing_ok=True)
+        return False
+    return True
+
+
+def _in_order(names: Sequence[str], source: Mapping[str, Path], empty: pyarrow.Table) -> Iterator[pyarrow.Table]:
+    """Rows of logs in their order, in tables of a size that does not depend on the files that they come from."""
+    import pyarrow as pa
+
+    kept, n_bytes = [empty], 0
+    files: dict[Path, tuple[pyarrow.Table, dict[str, list[int]]]] = {}
+    for name in names:
+        path = source[name]
+        if path not in files:
+            if len(files) == _MOST_OPEN:
+                del files[next(iter(files))]
+            table = _read_file(path, None)
+            places: dict[str, list[int]] = {}
+            for i, log in enumerate(table.column("log").to_pylist()):
+                places.setdefault(log, []).append(i)
+            files[path] = table, places
+        table, places = files[path]
+        rows = table.take(places[name])
+        kept.append(rows)
+        n_bytes += rows.nbytes
+        if len(kept) > _MOST_LOGS or n_bytes > _MOST_BYTES:
+            yield pa.concat_tables(kept).combine_chunks()
+            kept, n_bytes = [empty], 0
+    if len(kept) > 1:
+        yield pa.concat_tables(kept).combine_chunks()
+
+
+def _settings_of(path: Path) -> dict[str, Any] | None:
+    """What a table or its parts say that they were made with; None where nothing is said."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    try:
+        if path.suffix == ".json":
+            content = path.read_text(encoding="utf-8")
+        else:
+            content = (parquet.read_schema(path).metadata or {})[_SETTINGS].decode()
+        settings = json.loads(content)
+    except (OSError, KeyError, ValueError, pa.ArrowException):
+        return None
+    return settings if isinstance(settings, dict) else None
+
+
+def _difference(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
+    names = [name for name in {**one, **other} if one.get(name) != other.get(name)]
+    return ", ".join(f"{name} {one.get(name)!r} instead of {other.get(name)!r}" for name in names)
+
+
+def _arrow(path: Path) -> None:
+    try:
+        import pyarrow  # noqa: F401
+    except ImportError as error:
+        raise ImportError(f'{path}: writing Parquet needs pyarrow; pip install "gyrofuse[logs]"') from error

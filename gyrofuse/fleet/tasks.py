@@ -1,0 +1,253 @@
+"""What is asked of every log of a fleet: rows of a table.
+
+A column holds `"text"`, `"texts"`, `"number"`, `"numbers"`, `"whole"` numbers or `"truth"` values.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse._model import Model
+from gyrofuse.gmwm import fit_gmwm
+from gyrofuse.mismatch import diagnose
+from gyrofuse.parsing import parse_model
+from gyrofuse.recording import Recording
+from gyrofuse.simulate import ArrayModel
+from gyrofuse.svo import fit_svo
+from gyrofuse.svo_result import SVOResult
+from gyrofuse.units import RATE_UNITS
+
+Row = dict[str, Any]
+
+_STACKED = 2**15  # samples: shorter arrays are faster together
+
+
+@dataclass(frozen=True)
+class Fuse:
+    """One virtual gyro for each log.
+
+    Attributes:
+        scale_weights: `"flat"`, `"short"`, `"long"`, or one number for each level.
+        method: As of `fit_svo`.
+        confidence_level: Of the limits of the weights.
+        virtual: Whether the virtual signal is kept as well, in the column `virtual`.
+    """
+
+    scale_weights: str | tuple[float, ...] = "flat"
+    method: str = "svo"
+    confidence_level: float = 0.95
+    virtual: bool = False
+
+    name: ClassVar[str] = "fuse"
+
+    @property
+    def columns(self) -> dict[str, str]:
+        """Its own columns, beside those of every task."""
+        own = ("weights", "low", "high", "relative_noise", "tau", "virtual_deviation", "equal_deviation", "gain")
+        kept = {"virtual": "numbers"} if self.virtual else {}
+        return {"axis": "text", **dict.fromkeys(own, "numbers"), "motion": "text", **kept}
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What the rows depend on, ready for JSON."""
+        return {"task": self.name, **asdict(self)}
+
+    def rows(self, recordings: Sequence[Recording]) -> list[list[Row]]:
+        """Rows of each recording, one for each of its axes; short ones of the same shape are fitted together."""
+        first = recordings[0].signal
+        alike = len(recordings) > 1 and all(r.signal.shape == first.shape for r in recordings)
+        if not alike or first.shape[-1] > _STACKED:
+            return [self._rows(self._fitted(r), r) for r in recordings]
+        together = self._fitted(torch.stack([r.signal for r in recordings]))
+        return [
+            self._rows(replace(together[i], sensors=r.sensors, rate=r.rate, unit=r.unit), r)
+            for i, r in enumerate(recordings)
+        ]
+
+    def _fitted(self, signal: Recording | Tensor) -> SVOResult:
+        return fit_svo(signal, self.scale_weights, method=self.method, confidence_level=self.confidence_level)
+
+    def _rows(self, result: SVOResult, recording: Recording) -> list[Row]:
+        axes: tuple[str | None, ...] = recording.axes or (None,)
+        virtual = result.virtual(recording) if self.virtual else None
+        rows = []
+        for i, axis in enumerate(axes):
+            one, at = (result, ()) if axis is None else (result[i], (i,))
+            low, high = one.confidence_interval
+            row: Row = {
+                "axis": axis,
+                "weights": one.weights.tolist(),
+                "low": low.tolist(),
+                "high": high.tolist(),
+                "relative_noise": relative_noise(one.wavelet_variance).tolist(),
+                "tau": one.tau.tolist(),
+                "virtual_deviation": (2 * one.virtual_wavelet_variance).sqrt().tolist(),
+                "equal_deviation": (2 * one.equal_wavelet_variance).sqrt().tolist(),
+                "gain": _gain(one).sqrt().tolist(),
+                "motion": one.motion or None,
+            }
+            if virtual is not None:
+                row["virtual"] = virtual[at].tolist()
+            rows.append(row)
+        return rows
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A noise model for each sensor of each log.
+
+    Attributes:
+        model: Formula, such as `"WN + AR1 + RW"`.
+        refine: Whether the spectral likelihood is gone on to.
+        confidence_level: Of the limits of the parameters.
+    """
+
+    model: str = "WN + AR1 + RW"
+    refine: bool = False
+    confidence_level: float = 0.95
+
+    name: ClassVar[str] = "fit"
+    columns: ClassVar[dict[str, str]] = {
+        "axis": "text",
+        "sensor": "text",
+        "model": "text",
+        "parameters": "texts",
+        "values": "numbers",
+        "low": "numbers",
+        "high": "numbers",
+        "p_value": "number",
+        "converged": "truth",
+        "identified": "truth",
+        "remarks": "texts",
+        "quantities": "texts",
+        "figures": "numbers",
+        "figure_units": "texts",
+    }
+
+    def __post_init__(self) -> None:
+        parse_model(self.model)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What the rows depend on, ready for JSON."""
+        return {"task": self.name, **asdict(self)}
+
+    def rows(self, recordings: Sequence[Recording]) -> list[list[Row]]:
+        """Rows of each recording, one for each sensor and axis."""
+        return [self._rows(recording) for recording in recordings]
+
+    def _rows(self, recording: Recording) -> list[Row]:
+        fit = fit_gmwm(recording, self.model, refine=self.refine, confidence_level=self.confidence_level)
+        low, high = fit.confidence_interval
+        rows = []
+        for number, index in enumerate(torch.cartesian_prod(*map(torch.arange, fit.params.shape[:-1])).tolist()):
+            at = tuple(index) if isinstance(index, list) else (index,)
+            fitted = bool(fit.params[at].isfinite().all())
+            entries = fit.datasheet(at).entries if fitted and recording.unit in RATE_UNITS else ()
+            rows.append(
+                {
+                    "axis": recording.axes[at[0]] if recording.axes else None,
+                    "sensor": recording.sensors[at[-1]],
+                    "model": json.dumps(fit.model.with_params(fit.params[at]).to_dict()) if fitted else None,
+                    "parameters": list(fit.param_names),
+                    "values": fit.params[at].tolist(),
+                    "low": low[at].tolist(),
+                    "high": high[at].tolist(),
+                    "p_value": float(fit.p_value[at]),
+                    "converged": bool(fit.converged[at]),
+                    "identified": bool(fit.identified[at]),
+                    "remarks": list(fit.remarks[number]),
+                    "quantities": [entry.name for entry in entries],
+                    "figures": [entry.value for entry in entries],
+                    "figure_units": [entry.unit for entry in entries],
+                }
+            )
+        return rows
+
+
+@dataclass(frozen=True)
+class Diagnose:
+    """What a simulation leaves out of each log.
+
+    Attributes:
+        simulation: Samples of the same array, or a noise model.
+        false_alarm: Probability of a finding where nothing is missing.
+        source: What the simulation is called.
+    """
+
+    simulation: Recording | Model | ArrayModel
+    false_alarm: float = 0.01
+    source: str = "simulation"
+
+    name: ClassVar[str] = "diagnose"
+    columns: ClassVar[dict[str, str]] = {
+        "axis": "text",
+        "mismatch": "truth",
+        "p_value": "number",
+        "mechanisms": "texts",
+        "sentences": "texts",
+        "unexplained": "texts",
+        "discrepancy_before": "number",
+        "discrepancy_after": "number",
+        "gain": "number",
+        "findings": "text",
+    }
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What the rows depend on, ready for JSON."""
+        return {"task": self.name, "simulation": self.source, "false_alarm": self.false_alarm}
+
+    def rows(self, recordings: Sequence[Recording]) -> list[list[Row]]:
+        """Rows of each recording, one for each of its axes."""
+        return [self._rows(recording) for recording in recordings]
+
+    def _rows(self, recording: Recording) -> list[Row]:
+        rows = []
+        for axis in recording.axes or (None,):
+            whole = (recording if axis is None else recording.select(axis=axis)).longest_whole()
+            whole = replace(whole, signal=whole.signal.cpu())  # where its tests run
+            found = diagnose(whole, self.simulation, false_alarm=self.false_alarm)
+            rows.append(
+                {
+                    "axis": axis,
+                    "mismatch": found.mismatch,
+                    "p_value": found.p_value,
+                    "mechanisms": [f.mechanism for f in found.findings],
+                    "sentences": [f.sentence for f in found.findings],
+                    "unexplained": [e.words for e in found.unexplained],
+                    "discrepancy_before": found.held_out.before,
+                    "discrepancy_after": found.held_out.after,
+                    "gain": found.held_out.gain,
+                    "findings": json.dumps([f.to_dict() for f in found.findings]),
+                }
+            )
+        return rows
+
+
+Task = Fuse | Fit | Diagnose
+
+
+def _gain(result: SVOResult) -> Tensor:
+    """Wavelet variance of the plain mean over that of the virtual gyro in any other recording, `(level,)`."""
+    if result.method == "equal":
+        return torch.ones_like(result.virtual_wavelet_variance)
+    return result.gain_over_equal().estimate
+
+
+def relative_noise(wavelet_variance: Tensor) -> Tensor:
+    """How many times noisier each sensor is than the median of its array, `(level, sensor)` to `(sensor,)`.
+
+    Of Allan deviations, as the geometric mean over the levels that are known.
+    """
+    ratio = (wavelet_variance / wavelet_variance.median(-1, keepdim=True).values).sqrt()
+    known = ratio.isfinite() & (ratio > 0)
+    log = torch.where(known, ratio, torch.ones_like(ratio)).log().sum(0)
+    return torch.where(known.any(0), log / known.sum(0).clamp(min=1), torch.full_like(log, math.nan)).exp()

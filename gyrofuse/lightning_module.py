@@ -1,0 +1,173 @@
+"""Fleets of logs under Lightning's `Trainer`: on one process or many, one machine or several.
+
+task = Fuse("long")
+store = ResultStore("results.parquet", task.columns, task.settings)
+data = GyroArrayDataModule(["logs/"], done=store.done())
+trainer = Trainer(devices=2, strategy="ddp", accelerator="cpu", callbacks=[ResultWriter(store)], logger=False)
+trainer.predict(FusionModule(task), datamodule=data, return_predictions=False)
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import warnings
+from collections.abc import Collection, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch import LightningDataModule, LightningModule, Trainer
+from lightning.pytorch.callbacks import BasePredictionWriter, Callback
+from torch.utils.data import DataLoader
+
+from gyrofuse._checks import check_positive_integer
+from gyrofuse.fleet.logs import find_logs, groups_of
+from gyrofuse.fleet.store import ResultStore
+from gyrofuse.fleet.tasks import Fuse, Row, Task
+from gyrofuse.fleet.work import Log, LogGroups, rows_of
+
+
+class GyroArrayDataModule(LightningDataModule):
+    """Logs of arrays, read when their turn comes, in groups of any lengths and numbers of sensors: nothing is padded.
+
+    Args:
+        paths: Files, folders and patterns, as of `find_logs`.
+        manifest: Text file with one of them a line.
+        group_size: Logs that a process takes at a time, and whose rows appear together. Short arrays of one shape
+            are fitted together: more than one pays where logs are many and short.
+        num_workers: Processes that read ahead.
+        done: Names of logs that are left out, though the others stay in their groups.
+        **options: Of `read_recording`: `axis`, `sensors`, `rate`, `unit`, `scale`, `key`, `mounting`.
+
+    Raises:
+        FileNotFoundError: A name that stands for nothing.
+        ValueError: No log at all, or a number below one.
+    """
+
+    def __init__(
+        self,
+        paths: Iterable[str | Path] = (),
+        *,
+        manifest: str | Path | None = None,
+        group_size: int = 1,
+        num_workers: int = 0,
+        done: Collection[str] = (),
+        **options: Any,
+    ) -> None:
+        super().__init__()
+        self.logs = find_logs(paths, manifest=manifest)
+        self.groups = groups_of(self.logs, check_positive_integer("group_size", group_size), done)
+        self.num_workers = num_workers
+        self.options = options
+
+    def predict_dataloader(self) -> DataLoader[tuple[Log, ...]]:
+        """Groups of logs; Lightning shares them out among processes, each once."""
+        groups = LogGroups(self.groups, self.options)
+        # Of a batch of one group: samplers of distributed runs want batches.
+        return DataLoader(groups, batch_size=1, collate_fn=_only, num_workers=self.num_workers)
+
+
+class FusionModule(LightningModule):
+    """One of the tasks of a fleet as a prediction: groups of logs in, rows of a table out.
+
+    Args:
+        task: `Fuse`, `Fit` or `Diagnose`; fusion by default.
+    """
+
+    def __init__(self, task: Task | None = None) -> None:
+        super().__init__()
+        self.task: Task = Fuse() if task is None else task
+
+    def predict_step(self, batch: Sequence[Log], batch_idx: int = 0) -> list[Row]:
+        """Rows of all logs of a group, those that failed included."""
+        return rows_of(self.task, batch)
+
+
+def _only(batch: Sequence[Any]) -> Any:
+    (item,) = batch
+    return item
+
+
+class ResultWriter(BasePredictionWriter):
+    """Writes rows to a table as they arrive: one process opens it, and completes it when all have done their share.
+
+    Args:
+        store: The table.
+        force: Whether a table of other settings is replaced.
+    """
+
+    def __init__(self, store: ResultStore, *, force: bool = False) -> None:
+        super().__init__(write_interval="batch")
+        self.store = store
+        self.force = force
+        self._made_by = os.getpid()
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Open the table, before anyone writes."""
+        super().setup(trainer, pl_module, stage)
+        if trainer.is_global_zero:
+            self.store.open(force=self.force)
+        trainer.strategy.barrier("opened")
+
+    def on_predict_batch_start(self, *_: Any, **__: Any) -> None:
+        """A process whose parent was killed does not work on unseen."""
+        if os.getpid() != self._made_by and os.getppid() != self._made_by:
+            os._exit(1)
+
+    def write_on_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        prediction: Any,
+        batch_indices: Sequence[int] | None,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int,
+    ) -> None:
+        """Add the rows of a group."""
+        self.store.write(prediction)
+
+    def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Complete the table."""
+        trainer.strategy.barrier("written")
+        if trainer.is_global_zero:
+            data = getattr(trainer, "datamodule", None)
+            self.store.finish([str(log) for log in data.logs] if isinstance(data, GyroArrayDataModule) else ())
+        trainer.strategy.barrier("finished")
+
+
+class _Quiet(Callback):
+    """Keeps Lightning from announcing itself, in spawned processes as well: they unpickle it before they begin."""
+
+    def __init__(self) -> None:
+        self.hushed = True  # something to pickle: without it, unpickling does nothing
+        self._hush()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self._hush()
+
+    @staticmethod
+    def _hush() -> None:
+        for name in ("lightning.pytorch", "lightning.fabric"):
+            logging.getLogger(name).setLevel(logging.ERROR)
+        warnings.filterwarnings("ignore", module=r"lightning\.|torch\.")
+
+
+def quiet_trainer(*, devices: int, accelerator: str = "cpu", callbacks: Sequence[Callback] = ()) -> Trainer:
+    """A trainer for predictions alone, which says nothing and leaves no files behind.
+
+    Args:
+        devices: Processes, one for each device; more than one are spawned.
+        accelerator: `"cpu"`, `"gpu"` or `"auto"`.
+        callbacks: Such as a `ResultWriter`.
+    """
+    return Trainer(
+        devices=devices,
+        accelerator=accelerator,
+        strategy="ddp_spawn" if devices > 1 else "auto",
+        callbacks=[_Quiet(), *callbacks],
+        logger=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        enable_checkpointing=False,
+    )

@@ -1,0 +1,82 @@
+"""Figures of a fleet of logs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gyrofuse.plotting import _BLUE, _FRAME, _MEAN, _array, _clean, _finish, _new_axes
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.ticker import Locator
+
+_COLOURS = (_BLUE, "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#969696")
+_FEWEST_BINS, _MOST_BINS = 5, 60
+
+
+def plot_spread(
+    values: Sequence[float], *, label: str, mark: float, meaning: str, what: str = "logs", ax: Axes | None = None
+) -> Axes:
+    """Draw how a number is spread over a fleet.
+
+    Args:
+        values: One for each log; those that are not finite are left out.
+        label: Of their axis.
+        mark: Where a line is drawn.
+        meaning: Of that line.
+        what: Is counted.
+        ax: Where to draw; new axes by default.
+
+    Returns:
+        The axes.
+    """
+    ax = ax if ax is not None else _new_axes()
+    known = _array(values)
+    known = known[np.isfinite(known)]
+    n_bins = min(max(round(2 * np.sqrt(known.size)), _FEWEST_BINS), _MOST_BINS)
+    ax.hist(known, bins=n_bins, color=_BLUE, alpha=0.75)
+    line = ax.axvline(mark, **_MEAN)
+    ax.set_xlabel(label)
+    ax.set_ylabel(what)
+    ax.yaxis.set_major_locator(_whole())
+    _finish(ax, [line], [meaning], loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0.2)
+    return ax
+
+
+def plot_course(weights: Sequence[Sequence[float]], *, names: Sequence[str], ax: Axes | None = None) -> Axes:
+    """Draw the weights of an array from log to log.
+
+    Args:
+        weights: `(log, sensor)`.
+        names: Of the sensors.
+        ax: Where to draw; new axes by default.
+
+    Returns:
+        The axes.
+    """
+    ax = ax if ax is not None else _new_axes()
+    table = _array(weights)
+    ax.axhline(0, color=_FRAME, linewidth=0.8, zorder=1)
+    place = np.arange(1, len(table) + 1)
+    handles = [
+        ax.plot(place, table[:, i], marker=".", linewidth=1.2, color=_COLOURS[i % len(_COLOURS)])[0]
+        for i in range(table.shape[1])
+    ]
+    handles.append(ax.axhline(1 / table.shape[1], zorder=2, **_MEAN))
+    ax.set_xlabel("log, in the order of the table")
+    ax.set_ylabel("weight")
+    ax.xaxis.set_major_locator(_whole())
+    shown = len(_COLOURS)
+    labels = [*(_clean(name) for name in names[:shown]), "plain mean"]
+    kept = [*handles[:-1][:shown], handles[-1]]
+    _finish(ax, kept, labels, loc="lower right", bbox_to_anchor=(1, 1), ncols=min(len(kept), 5), borderaxespad=0.2)
+    return ax
+
+
+def _whole() -> Locator:
+    from matplotlib.ticker import MaxNLocator
+
+    return MaxNLocator(integer=True)

@@ -1,0 +1,125 @@
+"""Report of a fleet of logs as one self-contained HTML page: what stands out first, then the ranking."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from statistics import median
+from typing import TYPE_CHECKING, Any
+
+from gyrofuse.fleet.standing import FEWEST_IN_TIME, LEVEL, NOISY, Standing, arrays_of
+from gyrofuse.plotting_fleet import plot_course, plot_spread
+from gyrofuse.report_page import image, number, render
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# Pages stay readable; the table holds all.
+_MOST_ROWS, _MOST_COURSES = 50, 6
+_RANKED_BY = {
+    "fuse": ("Gain", "Allan deviation of the plain mean over that of the virtual gyro, mean over averaging times"),
+    "fit": ("J test p", "p value of the J test, that the model is complete"),
+    "diagnose": ("p value", "p value of agreement between log and simulation"),
+}
+
+
+def fleet_report(standing: Standing, rows: Sequence[Mapping[str, Any]], *, title: str) -> str:
+    """Write the report of a fleet.
+
+    Args:
+        standing: What stands out.
+        rows: Of the table.
+        title: Heading of the page.
+
+    Returns:
+        An HTML page that needs no other file, no network and no script.
+    """
+    heading, meaning = _RANKED_BY[standing.task]
+    values = [value for value, _ in standing.ranked]
+    return render(
+        "fleet.html.j2",
+        title=title,
+        standing=standing,
+        verdict=verdict(standing),
+        heading=heading,
+        meaning=meaning,
+        spread=_spread(standing.task, meaning, values) if len(values) > 1 else None,
+        ranked=[_ranked_row(value, row) for value, row in standing.ranked[:_MOST_ROWS]],
+        courses=_courses(rows) if standing.task == "fuse" else [],
+        most=_MOST_ROWS,
+        noisy_limit=NOISY,
+    )
+
+
+def verdict(standing: Standing) -> list[str]:
+    """What stands out, in sentences."""
+    failed = len(standing.failures)
+    said = [
+        f"{standing.n_logs} logs, " + (f"{failed} of which could not be used." if failed else "all of them usable.")
+    ]
+    values = [value for value, _ in standing.ranked if value == value]
+    if standing.task == "fuse" and values:
+        middle = number(median(values), 3)
+        said.append(f"The Allan deviation of the plain mean is {middle} times that of the virtual gyro (median).")
+        noisy = [s for s in standing.noisy if s.relative_noise > NOISY]
+        said += [
+            f"Sensor {s.sensor} of {s.array} is {number(s.relative_noise, 3)} times as noisy as its array's median."
+            for s in noisy[:3]
+        ]
+        if standing.outliers:
+            said.append(f"{len({o.log for o in standing.outliers})} logs are unlike the others.")
+        said += [
+            f"The weight of sensor {d.sensor} of {d.array} drifts from {number(d.first, 3)} to {number(d.last, 3)}."
+            for d in standing.drifts[:3]
+        ]
+        if not (noisy or standing.outliers or standing.drifts):
+            said.append("No sensor, log or drift of weights stands out.")
+    if standing.task == "fit" and values:
+        said.append(f"{sum(v < LEVEL for v in values)} of {len(values)} fits are refused by the J test at {LEVEL:g}.")
+    if standing.task == "diagnose":
+        differ = sum(bool(row["mismatch"]) for _, row in standing.ranked)
+        said.append(f"{differ} of {len(standing.ranked)} recordings differ from the simulation.")
+    return said
+
+
+def _ranked_row(value: float, row: Mapping[str, Any]) -> dict[str, Any]:
+    told = {
+        "log": row["log"],
+        "where": " ".join(f"{kind} {row[kind]}" for kind in ("axis", "sensor") if row.get(kind)),
+        "value": number(value, 3),
+    }
+    if "weights" in row:
+        told["said"] = ", ".join(f"{w:+.3f}" for w in row["weights"])
+    elif "values" in row:
+        told["said"] = ", ".join(f"{n} {number(v)}" for n, v in zip(row["parameters"], row["values"], strict=True))
+    else:
+        told["said"] = (
+            "; ".join([*row["sentences"], *(f"unexplained: {words}" for words in row["unexplained"])]) or "agrees"
+        )
+    return told
+
+
+def _spread(task: str, label: str, values: Sequence[float]) -> str:
+    mark, meaning = (1.0, "plain mean") if task == "fuse" else (LEVEL, f"{LEVEL:g}")
+    what = "recordings of arrays" if task == "fuse" else "fits" if task == "fit" else "recordings"
+    draw = partial(plot_spread, values, label=_RANKED_BY[task][1], mark=mark, meaning=meaning, what=what)
+    return image(7, 3, _on_axes, draw)
+
+
+def _courses(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+    """Figures of weights over the logs of arrays that have several."""
+    good = [row for row in rows if row["status"] == "ok"]
+    several = [(name, own) for name, own in arrays_of(good).items() if len(own) >= FEWEST_IN_TIME]
+    return [
+        {
+            "name": name,
+            "figure": image(
+                7, 3.2, _on_axes, partial(plot_course, [row["weights"] for row in own], names=own[0]["sensors"])
+            ),
+        }
+        for name, own in several[:_MOST_COURSES]
+    ]
+
+
+def _on_axes(figure: Figure, draw: Any) -> None:
+    draw(ax=figure.subplots())

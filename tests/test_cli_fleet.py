@@ -1,0 +1,167 @@
+"""`gyrofuse fleet`: one table of many logs, whatever happens to the logs or to the run."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import Run
+
+import gyrofuse as gf
+from gyrofuse.fleet import Fuse, ResultStore, read_results
+
+pytest.importorskip("pyarrow")
+
+
+@pytest.fixture
+def logs(tmp_path: Path) -> Path:
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    generator = torch.Generator().manual_seed(0)
+    for i in range(8):
+        noise = torch.randn(3, 4000, generator=generator, dtype=torch.float64)
+        gf.Recording(noise * torch.arange(1.0, 4.0)[:, None], rate=100.0, unit="deg/s").save(folder / f"{i}.npz")
+    (folder / "empty.csv").write_bytes(b"")
+    return folder
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "gyrofuse", "fleet", *map(str, arguments)]
+
+
+def test_a_fleet_is_fused_into_a_table_and_told(run: Run, logs: Path):
+    done = run(
+        "fleet", "logs", "--out", "r.parquet", "--scale-weights", "long", "--json", "s.json", "--report", "r.html"
+    )
+    assert (done.status, done.err) == (0, "")
+    assert done.out.startswith("9 logs, 1 failed\n")
+    assert "failed: logs/empty.csv: expected a log, found an empty file" in done.out
+    settings, rows = read_results("r.parquet")
+    assert settings["scale_weights"] == "long"
+    assert [row["log"] for row in rows] == [f"logs/{i}.npz" for i in range(8)] + ["logs/empty.csv"]
+    alone = gf.fit_svo(gf.read_recording(logs / "3.npz"), "long")
+    assert rows[3]["weights"] == pytest.approx(alone.weights.tolist(), rel=1e-9)
+    told = json.loads(Path("s.json").read_text())
+    assert told["n_logs"] == 9
+    assert told["failures"][0]["log"] == "logs/empty.csv"
+    assert "9 logs, 1 of which could not be used." in Path("r.html").read_text()
+    assert not Path(".r.parquet.parts").exists()
+
+
+def test_the_same_command_does_what_is_left(run: Run, logs: Path):
+    run("fleet", "logs", "--out", "r.parquet")
+    before = Path("r.parquet").read_bytes()
+    for i in range(8):
+        (logs / f"{i}.npz").write_bytes(b"no longer a log")  # finished ones are not read again
+    assert run("fleet", "logs", "--out", "r.parquet").status == 0
+    assert Path("r.parquet").read_bytes() == before
+    (logs / "empty.csv").unlink()
+    gf.Recording(torch.randn(3, 4000, dtype=torch.float64), rate=100.0).save(logs / "9.npz")
+    assert run("fleet", "logs", "--out", "r.parquet").out.startswith("10 logs, 1 failed")
+
+
+def test_failed_logs_are_tried_again_when_asked(run: Run, logs: Path):
+    run("fleet", "logs", "--out", "r.parquet")
+    (logs / "empty.csv").write_text("gx,gy\n" + "\n".join(f"{i % 7},{i % 5}" for i in range(4000)))
+    assert run("fleet", "logs", "--out", "r.parquet", "--rate", "100").status == 2  # other settings
+    assert "1 failed" in run("fleet", "logs", "--out", "r.parquet").out
+    again = run("fleet", "logs", "--out", "r.parquet", "--retry").out
+    assert "rate" in again  # the log states none: it was read, and says another thing now
+
+
+def test_fits_and_diagnoses(run: Run, logs: Path):
+    done = run("fleet", "logs/0.npz", "logs/1.npz", "--out", "f.parquet", "--task", "fit", "--model", "WN")
+    assert done.status == 0, done.err
+    _, rows = read_results("f.parquet")
+    assert [(row["log"], row["sensor"]) for row in rows] == [(f"logs/{i}.npz", s) for i in range(2) for s in "123"]
+    assert [row["values"][0] for row in rows[:3]] == pytest.approx([1, 4, 9], rel=0.1)
+    gf.Recording(torch.randn(3, 16_384, dtype=torch.float64), rate=100.0, unit="deg/s").save("long.npz")
+    Path("m.json").write_text(json.dumps(gf.WhiteNoise(4.0).to_dict()))
+    done = run("fleet", "long.npz", "--out", "d.parquet", "--task", "diagnose", "--simulation", "m.json")
+    assert done.status == 0, done.err
+    assert "1 of 1 differ\n  parameter_shift: 1 logs" in done.out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("gone.npz",), "gone.npz: no such file or folder; check the name"),
+        ((), "`paths`: expected logs"),
+        (("logs", "--out", "r.csv"), "`--out`: expected a name that ends in .parquet, got 'r.csv'"),
+        (("logs", "--devices", "0"), "`--devices`"),
+        (("logs", "--group", "0"), "`--group`"),
+        (("logs", "--task", "diagnose"), "`--simulation`: expected what to compare with"),
+        (("logs", "--task", "fit", "--model", "WN + nonsense"), "nonsense"),
+        (("logs", "--method", "magic"), "--method"),
+        (("logs", "--method", "multiscale"), "`--method`: expected one with a weight for each sensor"),
+        (("logs", "--scale-weights", "tall"), "`--scale-weights`: expected flat, short, long"),
+        (("logs", "--out", "no/r.parquet"), "the folder no does not exist; create it first"),
+        (("logs", "--accelerator", "abacus"), "`--accelerator`: expected cpu, gpu or auto, got 'abacus'"),
+    ],
+)
+def test_bad_requests_are_refused_before_any_work(run: Run, logs: Path, arguments, says):
+    before = sorted(Path().rglob("*"))
+    done = run("fleet", *arguments)
+    assert done.status == 2
+    assert says in done.err
+    assert done.err.count("\n") == 1
+    assert sorted(Path().rglob("*")) == before
+
+
+def test_two_processes_give_the_same_table(run: Run, logs: Path, tmp_path: Path):
+    run("fleet", "logs", "--out", "one.parquet", "--group", "3")
+    two = subprocess.run(
+        command("logs", "--out", "two.parquet", "--group", 3, "--devices", 2),
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
+    assert (two.returncode, two.stderr) == (0, "")
+    assert Path("one.parquet").read_bytes() == Path("two.parquet").read_bytes()
+
+
+def test_a_trainer_of_ones_own_gives_the_same_table(run: Run, logs: Path, tmp_path: Path):
+    run("fleet", "logs", "--out", "one.parquet")
+    script = tmp_path / "own.py"
+    script.write_text(
+        "from lightning.pytorch import Trainer\n"
+        "from gyrofuse.fleet import Fuse, ResultStore\n"
+        "from gyrofuse.lightning_module import FusionModule, GyroArrayDataModule, ResultWriter\n"
+        "task = Fuse()\n"
+        "store = ResultStore('own.parquet', task.columns, task.settings)\n"
+        "data = GyroArrayDataModule(['logs'], done=store.done())\n"
+        "trainer = Trainer(devices=2, strategy='ddp', accelerator='cpu', callbacks=[ResultWriter(store)],\n"
+        "                  logger=False, enable_checkpointing=False, enable_progress_bar=False)\n"
+        "trainer.predict(FusionModule(task), datamodule=data, return_predictions=False)\n"
+    )
+    own = subprocess.run([sys.executable, str(script)], cwd=tmp_path, capture_output=True, text=True)
+    assert own.returncode == 0, own.stderr
+    assert Path("one.parquet").read_bytes() == Path("own.parquet").read_bytes()
+
+
+@pytest.mark.parametrize("devices", [1, 2])
+def test_a_killed_run_goes_on_where_it_was(run: Run, logs: Path, tmp_path: Path, devices: int):
+    manifest = tmp_path / "all.txt"
+    manifest.write_text("".join(f"logs/{i}.npz\n" for i in range(8)))
+    run("fleet", "--manifest", manifest, "--out", "whole.parquet")
+    store = ResultStore(tmp_path / "r.parquet", Fuse().columns, {})
+    asked = command("--manifest", manifest, "--out", "r.parquet", "--devices", devices)
+    with subprocess.Popen(asked, cwd=tmp_path, stderr=subprocess.DEVNULL) as process:
+        while store.n_parts < 2 and process.poll() is None:
+            time.sleep(0.005)
+        os.kill(process.pid, signal.SIGKILL)
+    done = store.done()
+    assert len(done) >= 2
+    for log in done:
+        Path(log).write_bytes(b"no longer a log")  # finished ones are not done again
+    if not (tmp_path / "r.parquet").exists():
+        assert run("fleet", "--manifest", manifest, "--out", "r.parquet").status == 0
+    assert Path("r.parquet").read_bytes() == Path("whole.parquet").read_bytes()
+    assert not store.parts.exists()

@@ -1,0 +1,113 @@
+"""What stands out in a fleet, and the page that tells it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gyrofuse.fleet.standing import mean_gain, standing_of
+from gyrofuse.report_fleet import fleet_report
+
+
+def fused(n: int, *, seed: int = 0, drift: float = 0.0, sensors: tuple[str, ...] = ("s1", "s2", "s3")) -> list[dict]:
+    rng = np.random.default_rng(seed)
+    rows = []
+    for i in range(n):
+        weights = np.array([0.5, 0.3, 0.2]) + 0.02 * rng.standard_normal(3)
+        weights[0] += drift * i / n
+        rows.append(
+            {
+                "log": f"log{i:03d}.npz",
+                "axis": None,
+                "status": "ok",
+                "error": None,
+                "sensors": list(sensors),
+                "weights": list(weights / weights.sum()),
+                "relative_noise": list(np.array([0.8, 1.0, 1.4]) * np.exp(0.05 * rng.standard_normal(3))),
+                "gain": list(1.3 * np.exp(0.05 * rng.standard_normal(4))),
+                "virtual_deviation": list(1e-3 * np.exp(0.05 * rng.standard_normal(4))),
+            }
+        )
+    return rows
+
+
+def test_an_even_fleet_has_nothing_that_stands_out():
+    alarms = 0
+    for seed in range(100):
+        standing = standing_of("fuse", fused(40, seed=seed))
+        alarms += bool(standing.drifts) + bool(standing.outliers)
+    assert alarms <= 9  # of 200, at 1 % each: more than 9 have a chance of 1e-4
+    assert "unlike the others" not in str(standing_of("fuse", fused(40)))
+
+
+def test_a_drifting_weight_is_told():
+    (drift, *_) = standing_of("fuse", fused(40, drift=0.2)).drifts
+    assert drift.sensor == "s1"
+    assert drift.last > drift.first
+    assert drift.p_value < 1e-6
+    assert drift.tau > 0.5
+
+
+def test_a_noisy_sensor_and_a_strange_log_are_told():
+    rows = fused(30)
+    for row in rows:
+        row["relative_noise"][2] *= 3
+    rows[7]["virtual_deviation"] = [5e-3] * 4
+    rows[11]["gain"] = [4.0] * 4
+    standing = standing_of("fuse", rows)
+    assert standing.noisy[0].sensor == "s3"
+    assert standing.noisy[0].relative_noise == pytest.approx(4.2, rel=0.05)
+    assert {o.log for o in standing.outliers} == {"log007.npz", "log011.npz"}
+    assert standing.ranked[0][1]["log"] == "log011.npz"
+    text = str(standing)
+    assert "noisy: sensor s3" in text
+    assert "unlike the others: log007.npz" in text
+
+
+def test_gain_is_the_mean_over_known_averaging_times():
+    assert mean_gain({"gain": [1.0, 4.0, None]}) == pytest.approx(2.0)
+    assert np.isnan(mean_gain({"gain": [None]}))
+
+
+def test_failures_are_counted_and_explained():
+    rows = [*fused(3), {"log": "bad.npz", "status": "failed", "error": "empty file", "axis": None}]
+    standing = standing_of("fuse", rows)
+    assert (standing.n_logs, standing.failures) == (4, (("bad.npz", "empty file"),))
+    assert "failed: bad.npz: empty file" in str(standing)
+    nothing = standing_of("fuse", rows[3:])
+    assert "1 logs, 1 failed" in str(nothing)
+    assert "empty file" in fleet_report(nothing, rows[3:], title="Fleet")
+
+
+def test_the_page_tells_what_stands_out_and_stays_text():
+    rows = [*fused(12, drift=0.3), {"log": "<b>bad</b>.npz", "status": "failed", "error": "empty", "axis": None}]
+    page = fleet_report(standing_of("fuse", rows), rows, title="Fleet of <i>mine</i>")
+    assert "&lt;b&gt;bad&lt;/b&gt;.npz" in page
+    assert "<i>mine" not in page
+    assert "The weight of sensor s1" in page
+    assert page.count("<img") == 2  # weights over time, spread of gains
+    assert "log000.npz" in page
+
+
+def test_pages_of_fits_and_diagnoses():
+    fits = [
+        {"log": f"{i}", "axis": None, "sensor": "1", "status": "ok", "error": None, "sensors": ["1"], "p_value": p}
+        | {"parameters": ["white_noise.variance"], "values": [2.5]}
+        for i, p in enumerate([0.5, 0.001, None])
+    ]
+    standing = standing_of("fit", fits)
+    assert [row["log"] for _, row in standing.ranked] == ["1", "0", "2"]
+    assert "1 of 3 fits refused" in str(standing)
+    assert "white_noise.variance 2.5" in fleet_report(standing, fits, title="Fits")
+    found = [
+        {"log": "a", "axis": None, "status": "ok", "error": None, "sensors": ["1"], "p_value": 1e-9, "mismatch": True}
+        | {"mechanisms": ["vibration_tone"], "sentences": ["a tone at 12.5 Hz"], "unexplained": ["jumps"]},
+        {"log": "b", "axis": None, "status": "ok", "error": None, "sensors": ["1"], "p_value": 0.4, "mismatch": False}
+        | {"mechanisms": [], "sentences": [], "unexplained": []},
+    ]
+    standing = standing_of("diagnose", found)
+    assert dict(standing.mechanisms) == {"vibration_tone": 1, "unexplained": 1}
+    assert "1 of 2 differ" in str(standing)
+    page = fleet_report(standing, found, title="Diagnoses")
+    assert "a tone at 12.5 Hz; unexplained: jumps" in page
+    assert "agrees" in page
