@@ -145,9 +145,7 @@ def _task(
     if kind is Kind.fuse:
         weights = scale_weights_of(scale_weights)
         if method is Method.multiscale:
-            raise ValueError(
-                "`--method`: expected one with a weight for each sensor, got multiscale; fuse logs one by one"
-            )
+            raise ValueError("`--method`: expected one with a weight for each sensor, got multiscale; choose another")
         return Fuse(weights, method=method.value.replace("-", "_"), virtual=virtual)
     if kind is Kind.fit:
         return Fit(model)

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import gyrofuse as gf
+from gyrofuse.fleet import read_results
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text()
@@ -62,6 +63,7 @@ def test_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert scope["repaired"].shape == (10, 3, 20_000)
     assert scope["clean"].sensors == scope["recording"].sensors
     assert Path("mismatch.html").stat().st_size > 0
+    assert read_results("fleet.parquet")[1][0]["status"] == "ok"
     told = str(scope["ranked"])
     assert scope["ranked"].names == ("WN + AR1 + SIN",) * 3
     for words in ("criterion", "redundant: AR1 2 is white noise", "not told from it: 2*AR1 + SIN"):
