@@ -16,7 +16,11 @@ import pytest
 import torch
 
 from gyrofuse import Recording, WhiteNoise, diagnose, fit_gmwm, fit_multiscale, fit_svo, rank_models
+from gyrofuse.fleet import Fuse
+from gyrofuse.fleet.standing import standing_of
+from gyrofuse.fleet.work import Log, rows_of
 from gyrofuse.report import fusion_report, recording_report
+from gyrofuse.report_fleet import fleet_report
 from gyrofuse.report_mismatch import mismatch_page
 from gyrofuse.report_models import model_report
 from gyrofuse.report_ranking import rank_report
@@ -87,7 +91,9 @@ def recording() -> Recording:
     return Recording(noise, rate=100.0, unit="deg/s", sensors=HOSTILE, axes=("x", "y", "z"))
 
 
-@pytest.fixture(scope="module", params=["fusion", "axes", "multiscale", "recording", "fit", "rank", "mismatch"])
+@pytest.fixture(
+    scope="module", params=["fusion", "axes", "multiscale", "recording", "fit", "rank", "mismatch", "fleet"]
+)
 def page(request: pytest.FixtureRequest, recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
     result = fit_svo(recording, "long")
     if request.param == "axes":
@@ -108,6 +114,10 @@ def page(request: pytest.FixtureRequest, recording: Recording, tmp_path_factory:
         report = diagnose(replace(axis, signal=axis.signal + 0.5 * turns.cos()), WhiteNoise(1.0))
         assert report.findings
         html = mismatch_page(report, title=HOSTILE[0], remarks=[HOSTILE[1]])
+    elif request.param == "fleet":
+        logs = [Log(f"{HOSTILE[i % 4]}{i}", recording.select(axis="xyz"[i % 3])) for i in range(10)]
+        rows = rows_of(Fuse("long"), [*logs, Log("gone.npz", None, "no such file")])
+        html = fleet_report(standing_of("fuse", rows), rows, title=HOSTILE[0])
     elif request.param == "fusion":
         html = fusion_report(result[0], title=HOSTILE[2])
     else:
