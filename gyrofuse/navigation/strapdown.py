@@ -1,0 +1,110 @@
+"""Strapdown navigation from increments of angle and velocity, over batches.
+
+In a frame tangent to the Earth and fixed to it (north, east, down),
+
+    C' = C W_ib - W_ie C,   v' = C f + g - 2 w_ie x v,   r' = v.
+
+An interval's increments are integrals in the axes of a body that turns meanwhile: coning and sculling are what the
+order of turns and pushes within it changes, worked out from the interval and the one before (Savage 1998, parts 1 and
+2; Titterton and Weston, chapter 11).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gyrofuse.navigation.attitude import from_rotation_vector, multiply, rotate
+from gyrofuse.navigation.trajectory import GRAVITY
+
+_SMALL = 1e-4  # rad
+
+
+class State(NamedTuple):
+    """Of navigation, `(..., component)`.
+
+    Attributes:
+        attitude: Quaternion, body to navigation frame.
+        velocity: m/s.
+        position: m.
+    """
+
+    attitude: Tensor
+    velocity: Tensor
+    position: Tensor
+
+
+def step(state: State, now: tuple[Tensor, Tensor], before: tuple[Tensor, Tensor], dt: float, earth: Tensor) -> State:
+    """One interval on.
+
+    Args:
+        state: At its start.
+        now: Increments of angle (rad) and velocity (m/s) in it, `(..., 3)` each.
+        before: Those of the interval before.
+        dt: s.
+        earth: Rate of the Earth in the navigation frame, rad/s, `(3,)`.
+
+    Returns:
+        The state at its end.
+    """
+    angle, push = now
+    angle_, push_ = before
+    # Coning: linear rate over both intervals.
+    turn = angle + torch.linalg.cross(angle_, angle) / 12
+    # Rotation while it is pushed, exact for constant rate and force, and sculling beside it.
+    pushed = push + _turned(angle, push)
+    pushed = pushed + (torch.linalg.cross(angle_, push) + torch.linalg.cross(push_, angle)) / 12
+    gained = rotate(state.attitude, pushed)
+    half = from_rotation_vector((-0.5 * dt * earth).expand_as(angle))
+    gained = rotate(half, gained)  # the frame turns as well
+    down = torch.tensor([0.0, 0.0, GRAVITY], dtype=angle.dtype, device=angle.device)
+    gained = gained + dt * down
+    gained = gained - 2 * dt * torch.linalg.cross(earth.expand_as(gained), state.velocity + gained / 2)
+    velocity = state.velocity + gained
+    # Of a push that changes linearly, twice integrated.
+    change = rotate(state.attitude, push - push_ + torch.linalg.cross(angle, push))
+    position = state.position + dt * (state.velocity + gained / 2 - change / 12)
+    whole = from_rotation_vector((-dt * earth).expand_as(angle))
+    attitude = multiply(multiply(whole, state.attitude), from_rotation_vector(turn))
+    return State(attitude / attitude.norm(dim=-1, keepdim=True), velocity, position)
+
+
+def _turned(angle: Tensor, push: Tensor) -> Tensor:
+    """What the turn adds to a push `(..., 3)` in the axes of the interval's start, rate and force constant."""
+    size = angle.norm(dim=-1, keepdim=True)
+    square, safe = size.square(), size.clamp(min=_SMALL)
+    one = torch.where(size < _SMALL, 0.5 - square / 24, (1 - torch.cos(safe)) / safe.square())
+    two = torch.where(size < _SMALL, 1 / 6 - square / 120, (1 - torch.sin(safe) / safe) / safe.square())
+    first = torch.linalg.cross(angle, push)
+    return one * first + two * torch.linalg.cross(angle, first)
+
+
+def navigate(start: State, angles: Tensor, pushes: Tensor, dt: float, earth: Tensor) -> State:
+    """All intervals, one after the other.
+
+    Args:
+        start: The state at first.
+        angles: Increments of angle, rad, `(..., interval, 3)`.
+        pushes: Increments of velocity, m/s, `(..., interval, 3)`.
+        dt: Length of an interval, s.
+        earth: Rate of the Earth in the navigation frame, rad/s, `(3,)`.
+
+    Returns:
+        States at the end of every interval, `(..., interval, component)`.
+    """
+    state, states = start, []
+    before = _extrapolated(angles), _extrapolated(pushes)
+    for angle, push in zip(angles.unbind(-2), pushes.unbind(-2), strict=True):
+        state = step(state, (angle, push), before, dt, earth)
+        before = angle, push
+        states.append(state)
+    return State(*(torch.stack(parts, -2) for parts in zip(*states, strict=True)))
+
+
+def _extrapolated(increments: Tensor) -> Tensor:
+    """What the interval before the first would have given, were the change the same."""
+    if increments.shape[-2] < 2:
+        return increments[..., 0, :]
+    return 2 * increments[..., 0, :] - increments[..., 1, :]

@@ -1,0 +1,227 @@
+"""Trajectories whose rates and specific forces are known exactly.
+
+Position and Euler angles are splines of degree five; what gyros and accelerometers feel follows from their derivatives.
+The frame is tangent to the Earth: north, east, down.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.interpolate import BSpline, make_interp_spline
+from torch import Tensor
+
+from gyrofuse._checks import check_positive
+from gyrofuse.navigation.attitude import conjugate, from_euler, rotate
+
+GRAVITY = 9.80665  # m/s^2, along the third axis
+EARTH_RATE = 7.292115e-5  # rad/s
+_DEGREE = 5
+_NODES = 6  # of Gauss and Legendre, in an interval
+_SLOWEST = 0.5  # m/s: below, there is no direction of flight
+
+
+class Motion(NamedTuple):
+    """At some times, `(time, ...)`.
+
+    Attributes:
+        position: m.
+        velocity: m/s.
+        attitude: Quaternion, body to navigation frame.
+        rate: Of the body against inertial space, in its axes, rad/s.
+        specific_force: In the axes of the body, m/s^2.
+    """
+
+    position: Tensor
+    velocity: Tensor
+    attitude: Tensor
+    rate: Tensor
+    specific_force: Tensor
+
+
+class Increments(NamedTuple):
+    """What an ideal unit gives for each interval: integrals of rate and specific force, `(interval, 3)`.
+
+    Attributes:
+        angle: rad.
+        velocity: m/s.
+    """
+
+    angle: Tensor
+    velocity: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """A smooth motion through given places.
+
+    Attributes:
+        time: s, `(point,)`, increasing.
+        position: North, east, down in m, `(point, 3)`.
+        euler: Roll, pitch, yaw in rad, `(point, 3)`; without them those of a coordinated flight.
+        latitude: rad; with it the Earth turns.
+
+    Raises:
+        ValueError: Fewer than six points, times that do not increase, other shapes, or numbers that are not finite.
+    """
+
+    time: Tensor
+    position: Tensor
+    euler: Tensor | None = None
+    latitude: float | None = None
+
+    def __post_init__(self) -> None:
+        n = len(self.time)
+        if n <= _DEGREE or self.time.ndim != 1:
+            raise ValueError(f"`time`: expected at least {_DEGREE + 1} points, got shape {tuple(self.time.shape)}")
+        if not bool((self.time.diff() > 0).all()):
+            raise ValueError("`time`: expected increasing seconds, got some that do not increase; sort and thin them")
+        for name, values in (("position", self.position), ("euler", self.euler)):
+            if values is None:
+                continue
+            if values.shape != (n, 3):
+                raise ValueError(f"`{name}`: expected shape ({n}, 3), got {tuple(values.shape)}")
+            if not bool(values.isfinite().all()):
+                raise ValueError(f"`{name}`: expected finite numbers, got others; leave those points out")
+
+    @property
+    def duration(self) -> float:
+        """From the first point to the last, s."""
+        return float(self.time[-1] - self.time[0])
+
+    @property
+    def earth_rate(self) -> Tensor:
+        """Of the Earth in the navigation frame, rad/s, `(3,)`."""
+        if self.latitude is None:
+            return torch.zeros(3, dtype=torch.float64)
+        return EARTH_RATE * torch.tensor([np.cos(self.latitude), 0.0, -np.sin(self.latitude)], dtype=torch.float64)
+
+    def at(self, time: Tensor) -> Motion:
+        """Motion at times `(time,)`, s from the first point."""
+        t = (time.to(torch.float64) + self.time[0]).numpy()
+        position, velocity, acceleration = (torch.from_numpy(self._place(t, nu)) for nu in range(3))
+        angles, turning = (torch.from_numpy(self._angles(t, nu)) for nu in range(2))
+        attitude, earth = from_euler(angles), self.earth_rate
+        to_body = conjugate(attitude)
+        rate = _body_rate(angles, turning) + rotate(to_body, earth.expand_as(velocity))
+        down = torch.tensor([0.0, 0.0, GRAVITY], dtype=torch.float64)
+        # v' = C f + g - 2 w_ie x v, in a frame that is fixed to the Earth (Groves, sections 2.3 and 5.2).
+        force = acceleration - down + 2 * torch.linalg.cross(earth.expand_as(velocity), velocity)
+        return Motion(position, velocity, attitude, rate, rotate(to_body, force))
+
+    def increments(self, rate: float) -> Increments:
+        """What an ideal unit of that rate (Hz) gives, interval by interval, by quadrature of high order."""
+        step = 1 / check_positive("rate", rate)
+        n = round(self.duration * rate)
+        nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+        start = torch.arange(n, dtype=torch.float64)[:, None] * step
+        motion = self.at((start + torch.from_numpy((nodes + 1) / 2) * step).flatten())
+        share = torch.from_numpy(weights / 2) * step
+        angle, velocity = (
+            torch.einsum("ikc,k->ic", values.unflatten(0, (n, _NODES)), share)
+            for values in (motion.rate, motion.specific_force)
+        )
+        return Increments(angle, velocity)
+
+    @cached_property
+    def _place(self) -> BSpline:
+        return make_interp_spline(self.time.numpy(), self.position.numpy(), k=_DEGREE)
+
+    @cached_property
+    def _angles(self) -> BSpline:
+        if self.euler is not None:
+            euler = self.euler.numpy().copy()
+            euler[:, 2] = np.unwrap(euler[:, 2])
+            return make_interp_spline(self.time.numpy(), euler, k=_DEGREE)
+        t = np.linspace(float(self.time[0]), float(self.time[-1]), max(round(2 * self.duration), 4 * _DEGREE))
+        return make_interp_spline(t, _coordinated(self._place(t, 1), self._place(t, 2)), k=_DEGREE)
+
+
+def flight() -> Trajectory:
+    """A flight of 235 s: a climb, turns to either side at 18 to 25 m/s, and a descent."""
+    # s, north, east, up: m
+    points = torch.tensor(
+        [
+            [0, 0, 0, 100],
+            [15, 285, 10, 108],
+            [30, 555, 90, 120],
+            [45, 730, 300, 133],
+            [60, 700, 570, 146],
+            [75, 480, 730, 158],
+            [90, 210, 690, 168],
+            [105, 40, 490, 176],
+            [120, 60, 230, 182],
+            [135, 250, 60, 186],
+            [150, 510, 30, 188],
+            [165, 760, 110, 187],
+            [180, 930, 310, 183],
+            [195, 920, 570, 176],
+            [210, 750, 770, 167],
+            [225, 500, 830, 156],
+            [235, 320, 800, 149],
+        ],
+        dtype=torch.float64,
+    )
+    return Trajectory(points[:, 0], points[:, 1:] * torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))
+
+
+def read_trajectory(path: str | Path) -> Trajectory:
+    """Read a trajectory from a text file with named columns separated by commas.
+
+    Columns: `time` (s), `north`, `east`, `down` (m), and, if there are any, `roll`, `pitch`, `yaw` (rad).
+
+    Raises:
+        FileNotFoundError: No such file.
+        ValueError: Columns are missing, or what `Trajectory` refuses.
+    """
+    with Path(path).open(encoding="utf-8") as file:
+        names = [name.strip().lower() for name in file.readline().split(",")]
+        try:
+            table = np.loadtxt(file, delimiter=",", ndmin=2)
+        except ValueError as error:
+            raise ValueError(f"{path}: expected numbers separated by commas below the names: {error}") from None
+    missing = [name for name in ("time", "north", "east", "down") if name not in names]
+    if missing or table.shape[-1] != len(names):
+        what = f"no {', '.join(missing)}" if missing else f"{table.shape[-1]} columns below {len(names)} names"
+        raise ValueError(f"{path}: expected the columns time, north, east, down [, roll, pitch, yaw], found {what}")
+    column = {name: torch.from_numpy(table[:, i].copy()) for i, name in enumerate(names)}
+    euler = ("roll", "pitch", "yaw")
+    angles = torch.stack([column[name] for name in euler], -1) if set(euler) <= set(names) else None
+    place = torch.stack([column[name] for name in ("north", "east", "down")], -1)
+    try:
+        return Trajectory(column["time"], place, angles)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def _coordinated(velocity: np.ndarray, acceleration: np.ndarray) -> np.ndarray:
+    """Roll, pitch and yaw of a craft that flies where it points and banks so that it does not slip, `(time, 3)`."""
+    speed = np.hypot(velocity[:, 0], velocity[:, 1])
+    if speed.min() < _SLOWEST:
+        raise ValueError(
+            f"`position`: expected a flight of more than {_SLOWEST} m/s over ground, got {speed.min():.3g}; give "
+            "`euler` for one that hovers"
+        )
+    yaw = np.unwrap(np.arctan2(velocity[:, 1], velocity[:, 0]))
+    pitch = np.arctan2(-velocity[:, 2], speed)
+    sideways = (velocity[:, 0] * acceleration[:, 1] - velocity[:, 1] * acceleration[:, 0]) / speed
+    return np.stack([np.arctan2(sideways, GRAVITY), pitch, yaw], -1)
+
+
+def _body_rate(euler: Tensor, turning: Tensor) -> Tensor:
+    """Rate in the body's axes of Euler angles and their derivatives `(..., 3)` (Titterton and Weston, section 3.6)."""
+    roll, pitch, _ = euler.unbind(-1)
+    roll_, pitch_, yaw_ = turning.unbind(-1)
+    return torch.stack(
+        [
+            roll_ - yaw_ * torch.sin(pitch),
+            pitch_ * torch.cos(roll) + yaw_ * torch.sin(roll) * torch.cos(pitch),
+            -pitch_ * torch.sin(roll) + yaw_ * torch.cos(roll) * torch.cos(pitch),
+        ],
+        -1,
+    )
