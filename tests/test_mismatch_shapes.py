@@ -50,6 +50,16 @@ def test_a_power_gains_under_whittle_what_the_law_of_f_gives_it():
     assert ((q > 1) == (ratio > 1)).all()
 
 
+def test_equivalents_of_ratios_near_one_are_finite_and_smooth():
+    ratio = torch.cat([1 + torch.linspace(-3e-4, 3e-4, 2001), torch.tensor([1.0, 1 + 1e-16, 1 - 1e-9])]).to(
+        torch.float64
+    )
+    for d, s in ((5.0, 3.0), (2951.0, 1e9)):
+        q = equivalent(ratio, torch.tensor(d, dtype=torch.float64), torch.tensor(s, dtype=torch.float64))
+        torch.testing.assert_close(q, ratio, rtol=1e-7, atol=0)
+        assert bool((q[:2001].diff() > 0).all())
+
+
 def test_whittles_score_is_that_of_determinants_and_traces():
     data = compared(drawn(1, n=4096))
     model = data_model(data, [Shift.start(data.ground)])

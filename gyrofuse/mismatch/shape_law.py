@@ -12,6 +12,7 @@ from torch import Tensor
 
 _ORDINATES = 40  # for each sensor, behind a coherence
 _QUANTILES = 200
+_NEAR_ONE = 1e-8  # nats an ordinate
 
 
 def equivalent(ratio: Tensor, d: Tensor, s: Tensor) -> Tensor:
@@ -25,6 +26,9 @@ def equivalent(ratio: Tensor, d: Tensor, s: Tensor) -> Tensor:
     argument = -torch.exp(-1 - h.clamp(max=700.0)).numpy()
     low, high = (torch.from_numpy(-special.lambertw(argument, k).real) for k in (0, -1))
     q = torch.where(ratio < 1, low, high)
+    # At its branch point Lambert's function is lost to rounding: there `q - 1 - log q = h` has a series.
+    root = torch.where(ratio < 1, -1.0, 1.0) * (2 * h).sqrt()
+    q = torch.where(h < _NEAR_ONE, 1 + root + root.square() / 3, q)
     return torch.where(h > 700, 1 + h + (1 + h).log(), q).clamp(min=1e-12)
 
 
