@@ -12,7 +12,7 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import check_positive_integer
+from gyrofuse._checks import check_positive, check_positive_integer
 from gyrofuse._paths import own_generator
 
 Parameter = float | Tensor | None
@@ -93,6 +93,17 @@ class Model:
             )
         columns = iter(params.unbind(-1))
         return Model([type(p)(**{name: next(columns) for name in p.parameters}) for p in self.processes])
+
+    def scaled(self, factor: float) -> Model:
+        """Return the model of the signal times a factor: in another unit, say.
+
+        Raises:
+            ValueError: A parameter is to be estimated, or the factor is not positive.
+        """
+        factor = check_positive("factor", factor)
+        powers = {"variance": 2, "amplitude": 1, "slope": 1}
+        scale = [factor ** powers.get(name.rpartition(".")[2], 0) for name in self.param_names]
+        return self.with_params(self.params * self.params.new_tensor(scale))
 
     def wavelet_variance(self, n_levels: int) -> Tensor:
         """Theoretical Haar wavelet variance `(..., level)` of levels 1 to `n_levels`, signal^2, float64.

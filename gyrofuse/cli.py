@@ -26,6 +26,7 @@ from gyrofuse._output import output_folder
 from gyrofuse.cli_fleet import fleet
 from gyrofuse.cli_mismatch import diagnose
 from gyrofuse.cli_models import fit, rank
+from gyrofuse.cli_navigation import emulate
 from gyrofuse.cli_shared import (
     Axis,
     Force,
@@ -234,6 +235,7 @@ app.command()(fit)
 app.command()(rank)
 app.command()(diagnose)
 app.command()(fleet)
+app.command()(emulate)
 
 
 @app.command()

@@ -34,6 +34,8 @@ _SUFFIXES = {
     "header": (".h",),
 }
 
+_NO_MODEL = "expected a model in JSON, as to_dict() of a model gives it"
+
 Logs = Annotated[
     list[Path],
     typer.Argument(metavar="LOG...", help="The recording. Several files are one array, aligned on their clocks."),
@@ -159,8 +161,8 @@ def titled(logs: Sequence[Path]) -> str:
 
 def read_model(path: Path) -> Model | ArrayModel | RepairedModel:
     """A model from JSON: of `to_dict()` of a model or of a fit, or of a simulation that a diagnosis repaired."""
+    content = _model_content(path)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
         if "processes" not in content and isinstance(content.get("model"), dict):
             content = content["model"]
         if "effects" not in content:
@@ -169,15 +171,25 @@ def read_model(path: Path) -> Model | ArrayModel | RepairedModel:
 
         return repaired_from_dict(content)
     except (ValueError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path}: expected a model in JSON, as to_dict() of a model gives it: {error}") from None
+        raise ValueError(f"{path}: {_NO_MODEL}: {error}") from None
 
 
 def model_grid(path: Path) -> tuple[float | None, str | None]:
     """Rate in Hz and unit of the log that a model in JSON was fitted to, where it says."""
-    content = json.loads(path.read_text(encoding="utf-8"))
+    content = _model_content(path)
     rate, unit = content.get("rate"), content.get("unit")
     known = isinstance(unit, str) and unit != "unknown"
     return (rate if isinstance(rate, float | int) else None), (unit if known else None)
+
+
+def _model_content(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path}: {_NO_MODEL}: {error}") from None
+    if not isinstance(content, dict):
+        raise ValueError(f"{path}: {_NO_MODEL}, found a {type(content).__name__}")
+    return content
 
 
 def without_gaps(recording: Recording, done: str, fewest: int, otherwise: str = "") -> tuple[Recording, list[str]]:

@@ -16,7 +16,17 @@ PACKAGE = Path(__file__).resolve().parents[1] / "gyrofuse"
 # From top to bottom; modules of one layer may use each other, as long as nothing goes round in circles. A leading
 # underscore puts a module at the bottom, unless it is named here. A name without a file is one to come.
 LAYERS = [
-    {"__main__", "cli", "cli_fleet", "cli_mismatch", "cli_models", "cli_shared", "_console", "lightning_module"},
+    {
+        "__main__",
+        "cli",
+        "cli_fleet",
+        "cli_mismatch",
+        "cli_models",
+        "cli_navigation",
+        "cli_shared",
+        "_console",
+        "lightning_module",
+    },
     {
         "demo",
         "demo_mismatch",
@@ -102,6 +112,7 @@ LAYERS = [
         "plotting_models",
         "plotting_mismatch",
         "plotting_fleet",
+        "plotting_navigation",
         "report_page",
     },
     {"haar", "processes", "recording", "io"},

@@ -179,16 +179,18 @@ def read_trajectory(path: str | Path) -> Trajectory:
         FileNotFoundError: No such file.
         ValueError: Columns are missing, or what `Trajectory` refuses.
     """
-    with Path(path).open(encoding="utf-8") as file:
-        names = [name.strip().lower() for name in file.readline().split(",")]
-        try:
-            table = np.loadtxt(file, delimiter=",", ndmin=2)
-        except ValueError as error:
-            raise ValueError(f"{path}: expected numbers separated by commas below the names: {error}") from None
+    first, *lines = Path(path).read_text(encoding="utf-8").splitlines() or [""]
+    names = [name.strip().lower() for name in first.split(",")]
     missing = [name for name in ("time", "north", "east", "down") if name not in names]
-    if missing or table.shape[-1] != len(names):
-        what = f"no {', '.join(missing)}" if missing else f"{table.shape[-1]} columns below {len(names)} names"
+    if missing or not lines:
+        what = f"no {', '.join(missing)}" if missing else "no rows"
         raise ValueError(f"{path}: expected the columns time, north, east, down [, roll, pitch, yaw], found {what}")
+    try:
+        table = np.loadtxt(lines, delimiter=",", ndmin=2)
+    except ValueError as error:
+        raise ValueError(f"{path}: expected numbers separated by commas below the names: {error}") from None
+    if table.shape[-1] != len(names):
+        raise ValueError(f"{path}: expected as many columns as names, {len(names)}, found {table.shape[-1]}")
     column = {name: torch.from_numpy(table[:, i].copy()) for i, name in enumerate(names)}
     euler = ("roll", "pitch", "yaw")
     angles = torch.stack([column[name] for name in euler], -1) if set(euler) <= set(names) else None
