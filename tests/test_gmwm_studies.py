@@ -98,3 +98,16 @@ def test_calibration_says_which_recordings_it_lacks(tmp_path: Path, arguments: t
     done = run("gmwm_calibration.py", *arguments, cwd=tmp_path)
     assert done.returncode == 2
     assert message in done.stderr
+
+
+def test_navigation_emulation(tmp_path: Path):
+    done = run("navigation_emulation.py", "--quick", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert is_png(tmp_path / "navigation_flight.png")
+    assert is_png(tmp_path / "navigation_ratio.png")
+    truth, without, with_tones = (float(cell) for cell in row(done.stdout, "ar1_1.variance"))
+    assert without > 1.5 * truth
+    assert with_tones == pytest.approx(truth, rel=0.1)
+    peak = float(done.stdout.split("positions of 1 to 1.5 m ")[1].split()[0])
+    assert 0.9 < peak < 2
+    assert sum(verdicts(done.stdout).values()) == 2
