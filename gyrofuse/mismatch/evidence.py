@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-_LOOSE = 0.025  # of the bound on the probability of a mean ratio
+_LOOSE = 0.05  # of the bound on the probability of a mean ratio
 _BY_CHANCE, _SURELY = 0.05, 1e-3  # p values of what a simulation shows
 _TAIL = 0.25  # share of the twins behind the fitted tail
 
@@ -56,7 +56,7 @@ def ratio_p_value(log_ratio: float) -> float:
     """p value of a mean likelihood ratio, from its logarithm.
 
     It exceeds `x` with probability `1/x` at most (Ville, 1939); for outliers and levels importance sampling gives
-    less than `1/70x`. To `1/40x` is held.
+    less than `1/70x`. To `1/20x` is held.
     """
     return math.exp(min(math.log(_LOOSE) - log_ratio, 0.0))
 

@@ -38,7 +38,7 @@ _PLAIN = (0.1, 0.02, 0.1, 0.14)  # chances of white, blue, flicker noise and wal
 _AR1S, _LEVELS, _FILTERED, _BUMPED = 0.16, 0.02, 0.16, 0.3
 _WAYS = (0.6, 0.15, 0.25)  # up, down, either sensor by sensor
 _LOWEST = 40.0  # bins: bumps below are colour
-_COMMON = (0.06, 1.25)  # share of noise whose ratio exceeds one, and how it falls: drawn
+_COMMON = (0.12, 1.25)  # share of noise whose ratio exceeds one, and how it falls: drawn
 _LOW = 6  # bands
 _ROUNDS = 24
 
