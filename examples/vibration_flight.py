@@ -1,0 +1,134 @@
+"""An array under vibration in the air: three ways of fusing it, and a filter tuned with and without what was left out.
+
+Six gyros on each axis share a vibration at 11.3 Hz, each by its own amount, and have noise of their own. A recording on
+the ground gives the weights of three virtual gyros (plain mean, SVO, multi-scale) and a noise model of each, white
+noise, an AR1 and a random walk, fitted as it is. `gyrofuse.diagnose` compares the recording with that model, finds the
+tone, and the model is fitted again without it and with the tone as states of the filter. Flights of 235 s, satellites
+away from 160 to 210 s, are then estimated with the error of every virtual gyro and either tuning.
+
+    python examples/vibration_flight.py [--flights 40] [--rate 100] [--quick] [--figure flight.png]
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+import gyrofuse as gf
+from gyrofuse.navigation import Alignment, UnitErrors, flight, fly
+from gyrofuse.navigation.sensors import Axes, Drawn
+
+N_SENSORS, TONE_HZ = 6, 11.3
+DEGREE = math.pi / 180
+WHITE = torch.tensor([0.10, 0.12, 0.15, 0.10, 0.20, 0.14], dtype=torch.float64)  # deg/s at 100 Hz
+SLOW = torch.tensor([6e-4, 1.5e-3, 5e-4, 2e-3, 8e-4, 1e-3], dtype=torch.float64)  # deg/s, sd of an AR1's steps
+WALK = torch.tensor([4e-5, 1e-5, 6e-5, 1e-5, 3e-5, 2e-5], dtype=torch.float64)  # deg/s per step
+TONE = torch.tensor([0.10, 0.14, -0.06, 0.12, 0.04, 0.09], dtype=torch.float64)  # deg/s
+ACCELEROMETER = "WN(variance=1e-4) + RW(variance=1e-11)"
+ALIGNMENT = Alignment(attitude=(0.1 * DEGREE, 0.1 * DEGREE, 0.5 * DEGREE))
+
+
+class Tuning(NamedTuple):
+    """A model that the filter is told, rad/s, and what of it was found."""
+
+    model: gf.Model
+    words: str
+
+
+def array(n_samples: int, batch: tuple[int, ...], rate: float, generator: torch.Generator) -> torch.Tensor:
+    """Errors of arrays, deg/s, `(..., sensor, time)`."""
+    noise = gf.WhiteNoise(WHITE.square() * rate / 100) + gf.AR1(torch.full_like(SLOW, 0.998), SLOW.square())
+    signal = (noise + gf.RandomWalk(WALK.square())).simulate(n_samples, batch=batch, generator=generator)
+    phase = 2 * math.pi * torch.rand(*batch, 1, 1, generator=generator, dtype=torch.float64)
+    t = torch.arange(n_samples, dtype=torch.float64) / rate
+    return signal + TONE[:, None] * torch.sin(2 * math.pi * TONE_HZ * t + phase)
+
+
+def tunings(virtual: torch.Tensor, rate: float) -> tuple[Tuning, Tuning]:
+    """Of a virtual gyro's recording `(time,)`: fitted as it is, and with what the diagnosis finds."""
+    recording = gf.Recording(virtual[None], rate=rate, unit="deg/s")
+    plain = gf.fit_gmwm(recording, "WN + AR1 + RW").model
+    plain = plain.with_params(plain.params[0])
+    report = gf.diagnose(recording, plain)
+    tones = [f for f in report.findings if f.mechanism == "vibration_tone"]
+    if not tones:
+        return Tuning(plain, "as it is"), Tuning(plain, "nothing found")
+    rest = gf.fit_gmwm(report.correct(recording), "WN + AR1 + RW").model
+    whole = rest.with_params(rest.params[0])
+    for tone in tones:
+        amplitude = max(p.value for name, p in tone.parameters.items() if name.startswith("amplitude"))
+        whole = whole + gf.Sinusoid(amplitude, 2 * math.pi * float(tone.frequency_hz or 0.0) / rate)
+    found = ", ".join(f"{tone.frequency_hz:.4g} Hz" for tone in tones)
+    return Tuning(plain, "as it is"), Tuning(whole, f"with a tone at {found}")
+
+
+def errors_of(fused: torch.Tensor, accelerometer: Axes) -> Drawn:
+    """Errors of a unit from those of its virtual gyros, deg/s, `(flight, 3, time)`."""
+    samples = fused.transpose(-1, -2) * DEGREE
+    return Drawn(Axes(samples, samples.new_full((*samples.shape, 0), torch.nan)), accelerometer)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--flights", type=int, default=40)
+    parser.add_argument("--rate", type=float, default=100.0, help="of the unit, Hz; above 30")
+    parser.add_argument("--quick", action="store_true", help="a small study")
+    parser.add_argument("--figure", type=Path, help="draw position errors over time, .png")
+    asked = parser.parse_args()
+    rate, n_flights = (40.0, 6) if asked.quick else (asked.rate, asked.flights)
+    if rate <= 30 or n_flights < 1:
+        parser.error("expected a rate above 30 Hz and at least one flight")
+    generator = torch.Generator().manual_seed(0)
+    trajectory = flight()
+    n_samples = round(trajectory.duration * rate)
+    ground = array(2**15 if asked.quick else 2**18, (), rate, generator)
+    aloft = array(n_samples, (n_flights, 3), rate, generator)
+    accelerometer = (
+        UnitErrors(gf.WhiteNoise(1.0), gf.parse_model(ACCELEROMETER), rate)
+        .simulate(n_samples, n_flights, generator)
+        .accelerometer
+    )
+    svo, bands = gf.fit_svo(ground, "long"), gf.fit_multiscale(ground, "long")
+    virtual = {
+        "plain mean": (ground.mean(-2), aloft.mean(-2)),
+        "SVO": (svo.virtual(ground), svo.virtual(aloft)),
+        "multi-scale": (bands.virtual(ground), bands.virtual(aloft)),
+    }
+    print(f"{n_flights} flights of {trajectory.duration:g} s at {rate:g} Hz; root mean square at the end of the outage")
+    print(f"{'virtual gyro':<14}{'filter tuned':<28}{'position (m)':>14}{'attitude (deg)':>16}{'claimed (m)':>13}")
+    courses = {}
+    for name, (resting, flying) in virtual.items():
+        for tuning in tunings(resting[..., resting.isnan().sum() :], rate):
+            told = UnitErrors(tuning.model.scaled(DEGREE), gf.parse_model(ACCELEROMETER), rate)
+            own = torch.Generator().manual_seed(1)
+            drawn = errors_of(flying.nan_to_num(), accelerometer)
+            out = fly(trajectory, drawn, told, alignment=ALIGNMENT, generator=own)
+            end = int((out.time - 210).abs().argmin())
+            position, attitude = (v.square().sum(-1).mean(-1).sqrt() for v in (out.position, out.attitude))
+            claimed = out.sd[end, :, 6:9].square().sum(-1).mean().sqrt()
+            courses[f"{name}, {tuning.words}"] = out.time, position
+            print(
+                f"{name:<14}{tuning.words:<28}{float(position[end]):>14.3g}{float(attitude[end]) / DEGREE:>16.3g}"
+                f"{float(claimed):>13.3g}",
+                flush=True,
+            )
+    if asked.figure:
+        import matplotlib.pyplot as plt
+
+        figure, ax = plt.subplots(figsize=(8, 4), layout="constrained")
+        for k, (label, (time, position)) in enumerate(courses.items()):
+            style = {"color": ("#969696", "#e69f00", "#0072b2")[k // 2], "linestyle": ("-", "--")[k % 2]}
+            ax.plot(time, position, label=label, **style)
+        ax.axvspan(160, 210, color="#ececec", zorder=0)
+        ax.set(xlabel="time (s)", ylabel="position error, root mean square (m)", yscale="log")
+        ax.legend(fontsize=8, frameon=False)
+        figure.savefig(asked.figure, dpi=150)
+        print(f"Figure: {asked.figure}")
+
+
+if __name__ == "__main__":
+    main()
