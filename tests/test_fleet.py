@@ -146,6 +146,16 @@ def test_writing_the_same_logs_again_leaves_one_of_each(tmp_path):
     assert store.finish(["a", "b"]) == 2
 
 
+def test_what_worked_counts_before_what_failed(tmp_path):
+    store = store_at(tmp_path / "r.parquet")
+    for logs in (["a", "b"], ["a"], ["a", "c"]):  # in whatever order their files come
+        store.open()
+        store.write([row(name, status="ok" if logs == ["a"] else "failed") for name in logs])
+    assert store.done(failed=False) == {"a"}
+    store.finish(["a", "b", "c"])
+    assert [r["status"] for r in read_results(store.path)[1]] == ["ok", "failed", "failed"]
+
+
 def test_a_part_that_was_cut_short_is_done_again(tmp_path):
     store = store_at(tmp_path / "r.parquet")
     store.open()

@@ -104,12 +104,7 @@ class ResultStore:
         Args:
             failed: Whether those that failed count as done.
         """
-        status = {
-            row["log"]: row["status"]
-            for path in self._files()
-            for row in _read_file(path, ["log", "status"]).to_pylist()
-        }
-        return frozenset(log for log, said in status.items() if failed or said == "ok")
+        return frozenset(log for log, (_, status) in self._sources().items() if failed or status == "ok")
 
     @property
     def n_parts(self) -> int:
@@ -127,9 +122,7 @@ class ResultStore:
         """
         from pyarrow import parquet
 
-        source: dict[str, Path] = {}  # a part's rows before those of the table
-        for path in self._files():
-            source |= dict.fromkeys(_read_file(path, ["log"]).column("log").to_pylist(), path)
+        source = {log: path for log, (path, _) in self._sources().items()}
         last = set(order)
         names = [*(name for name in source if name not in last), *(name for name in order if name in source)]
         n_rows = 0
@@ -144,6 +137,15 @@ class ResultStore:
         self._place(self.path, write)
         shutil.rmtree(self.parts, ignore_errors=True)
         return n_rows
+
+    def _sources(self) -> dict[str, tuple[Path, str]]:
+        """File and status of each log's rows: what worked before what failed, a part before the table."""
+        found: dict[str, tuple[Path, str]] = {}
+        for path in self._files():
+            for row in _read_file(path, ["log", "status"]).to_pylist():
+                if row["status"] == "ok" or row["log"] not in found or found[row["log"]][1] != "ok":
+                    found[row["log"]] = path, row["status"]
+        return found
 
     def _files(self) -> list[Path]:
         """The table, then the parts that can be read; one that a machine has cut short is removed and done again."""
