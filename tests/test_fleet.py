@@ -258,7 +258,7 @@ def test_axes_have_rows_of_their_own():
     assert [(r["axis"], r["sensor"]) for r in fits] == [(a, s) for a in "xy" for s in "123"]
     np.testing.assert_allclose([r["values"][0] for r in fits[:3]], [1, 4, 9], rtol=0.1)
     assert fits[0]["quantities"][0] == "angle random walk N"
-    assert gf.model_from_dict(json.loads(fits[0]["model"])).names == ("white_noise",)
+    assert gf.model_from_dict(json.loads(fits[0]["model"])).param_names == ("white_noise.variance",)
 
 
 def test_a_diagnosis_says_what_is_left_out():
