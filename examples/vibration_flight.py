@@ -19,7 +19,7 @@ from typing import NamedTuple
 import torch
 
 import gyrofuse as gf
-from gyrofuse.navigation import Alignment, UnitErrors, flight, fly
+from gyrofuse.navigation import Alignment, Gnss, Trajectory, UnitErrors, flight, fly
 from gyrofuse.navigation.sensors import Axes, Drawn
 
 N_SENSORS, TONE_HZ = 6, 11.3
@@ -79,11 +79,13 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="a small study")
     parser.add_argument("--figure", type=Path, help="draw position errors over time, .png")
     asked = parser.parse_args()
-    rate, n_flights = (40.0, 6) if asked.quick else (asked.rate, asked.flights)
+    rate, n_flights = (32.0, 6) if asked.quick else (asked.rate, asked.flights)
     if rate <= 30 or n_flights < 1:
         parser.error("expected a rate above 30 Hz and at least one flight")
     generator = torch.Generator().manual_seed(0)
-    trajectory = flight()
+    trajectory, away = flight(), (160.0, 210.0)
+    if asked.quick:
+        trajectory, away = Trajectory(trajectory.time[:8], trajectory.position[:8]), (60.0, 100.0)
     n_samples = round(trajectory.duration * rate)
     ground = array(2**15 if asked.quick else 2**18, (), rate, generator)
     aloft = array(n_samples, (n_flights, 3), rate, generator)
@@ -106,8 +108,8 @@ def main() -> None:
             told = UnitErrors(tuning.model.scaled(DEGREE), gf.parse_model(ACCELEROMETER), rate)
             own = torch.Generator().manual_seed(1)
             drawn = errors_of(flying.nan_to_num(), accelerometer)
-            out = fly(trajectory, drawn, told, alignment=ALIGNMENT, generator=own)
-            end = int((out.time - 210).abs().argmin())
+            out = fly(trajectory, drawn, told, gnss=Gnss(outage=away), alignment=ALIGNMENT, generator=own)
+            end = int((out.time - away[1]).abs().argmin())
             position, attitude = (v.square().sum(-1).mean(-1).sqrt() for v in (out.position, out.attitude))
             claimed = out.sd[end, :, 6:9].square().sum(-1).mean().sqrt()
             courses[f"{name}, {tuning.words}"] = out.time, position
@@ -123,7 +125,7 @@ def main() -> None:
         for k, (label, (time, position)) in enumerate(courses.items()):
             style = {"color": ("#969696", "#e69f00", "#0072b2")[k // 2], "linestyle": ("-", "--")[k % 2]}
             ax.plot(time, position, label=label, **style)
-        ax.axvspan(160, 210, color="#ececec", zorder=0)
+        ax.axvspan(*away, color="#ececec", zorder=0)
         ax.set(xlabel="time (s)", ylabel="position error, root mean square (m)", yscale="log")
         ax.legend(fontsize=8, frameon=False)
         figure.savefig(asked.figure, dpi=150)

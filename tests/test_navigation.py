@@ -111,9 +111,8 @@ def test_what_the_unit_feels_gives_the_motion_back_in_an_independent_integration
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("latitude", [None, 0.8])
-def test_an_ideal_unit_gives_the_flight_back(latitude):
-    position, velocity, attitude = navigated(replace(flight(), latitude=latitude), 100.0, 235.0)
+def test_an_ideal_unit_gives_the_flight_back():
+    position, velocity, attitude = navigated(replace(flight(), latitude=0.8), 100.0, 235.0)
     assert position < 1e-3
     assert velocity < 1e-4
     assert attitude < 1e-6

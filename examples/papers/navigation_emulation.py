@@ -28,7 +28,7 @@ from gyrofuse.navigation import Alignment, Emulation, Gnss, emulate, flight
 from gyrofuse.plotting_navigation import plot_ratio_over_time
 
 QUICK_SAMPLES, QUICK_RUNS = 2**15, 8
-RATE = 100.0
+RATE, QUICK_RATE = 100.0, 20.0
 PAPER_PEAK = 1.1789
 _FLIGHT, _RATIO = "navigation_flight.png", "navigation_ratio.png"
 # m/s^2, of a sample at 100 Hz
@@ -49,14 +49,14 @@ def in_rad(params: torch.Tensor, basic: gf.Model) -> gf.Model:
     return basic.with_params(params).scaled(math.pi / 180)
 
 
-def flown(told: list[gf.Model], truth: gf.Model, accelerometer: str, gnss: Gnss, seed: int) -> Emulation:
+def flown(told: list[gf.Model], truth: gf.Model, accelerometer: str, gnss: Gnss, rate: float, seed: int) -> Emulation:
     """Flights with filters that are told the fits without tones and with them."""
     return emulate(
         told[0],
         told[1],
         truth=truth,
         accelerometer=gf.parse_model(accelerometer),
-        rate=RATE,
+        rate=rate,
         gnss=gnss,
         alignment=WELL_ALIGNED,
         n_flights=len(told[0].params),
@@ -96,6 +96,7 @@ def main() -> None:
     asked = parser.parse_args()
     n_samples = asked.samples or (QUICK_SAMPLES if asked.quick else N_EMULATION)
     n_runs = asked.runs or (QUICK_RUNS if asked.quick else N_RUNS)
+    rate = QUICK_RATE if asked.quick else RATE
     model = emulation(n_samples)
     basic = without_tones(model)
     both = fit_both(model, n_samples, n_runs, torch.Generator().manual_seed(asked.seed))
@@ -114,7 +115,7 @@ def main() -> None:
     print(f"\n{head:<60}  {'peak':>7}  {'95 % interval':>17}  {'at (s)':>7}")
     for accelerometer, fix in cases:
         name = f"{accelerometer}, {fix}"
-        studies[name] = flown(told, truth, ACCELEROMETERS[accelerometer], FIXES[fix], asked.seed)
+        studies[name] = flown(told, truth, ACCELEROMETERS[accelerometer], FIXES[fix], rate, asked.seed)
         when, ratio, low, high = studies[name].peak
         print(f"{name:<60}  {ratio:>7.4f}  [{low:>6.4f}, {high:>6.4f}]  {when:>7.5g}", flush=True)
     print("\nThe paper's conclusions (section 5, figure 8)")
