@@ -196,7 +196,7 @@ def test_a_model_in_another_unit_is_that_of_the_signal_times_a_factor():
 
 def flown(told: UnitErrors, n_flights: int = 40):
     trajectory = flight()
-    drawn = unit().simulate(60 * 50, n_flights, torch.Generator().manual_seed(3))
+    drawn = unit().simulate(60 * 50, n_flights, torch.Generator().manual_seed(3), with_states=True)
     alignment = Alignment(attitude=(0.2 * DEGREE, 0.2 * DEGREE, 0.5 * DEGREE))
     generator = torch.Generator().manual_seed(4)
     return fly(trajectory, drawn, told, gnss=Gnss(outage=(40.0, 50.0)), alignment=alignment, generator=generator)

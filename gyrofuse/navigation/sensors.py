@@ -35,9 +35,20 @@ class UnitErrors:
         """Linear systems of a gyro and of an accelerometer, one step a sample."""
         return state_space(self.gyro, self.rate), state_space(self.accelerometer, self.rate)
 
-    def simulate(self, n_samples: int, n_flights: int, generator: torch.Generator) -> Drawn:
-        """Draw errors of so many flights; models with batch dimensions have one flight each."""
-        return Drawn(*(_drawn(m, n_samples, n_flights, generator) for m in (self.gyro, self.accelerometer)))
+    def simulate(
+        self, n_samples: int, n_flights: int, generator: torch.Generator, *, with_states: bool = False
+    ) -> Drawn:
+        """Draw errors of so many flights; models with batch dimensions have one flight each.
+
+        Args:
+            n_samples: Of each flight.
+            n_flights: How many.
+            generator: Source of randomness.
+            with_states: Whether to keep what the processes are made of, to judge a filter's claims by: as much memory
+                again for each of them.
+        """
+        models = self.gyro, self.accelerometer
+        return Drawn(*(_drawn(model, n_samples, n_flights, generator, with_states) for model in models))
 
 
 class Axes(NamedTuple):
@@ -45,7 +56,8 @@ class Axes(NamedTuple):
 
     Attributes:
         samples: `(flight, time, 3)`.
-        states: What the filter's states of the sensors truly are, `(flight, time, 3, state)`; NaN where nobody knows.
+        states: What the filter's states of the sensors truly are, `(flight, time, 3, state)`; NaN where nobody knows,
+            and none where they were not kept.
     """
 
     samples: Tensor
@@ -59,17 +71,16 @@ class Drawn(NamedTuple):
     accelerometer: Axes
 
 
-def _drawn(model: Model, n_samples: int, n_flights: int, generator: torch.Generator) -> Axes:
-    batched = model.params.ndim > 1
-    batch = (3,) if batched else (3, n_flights)
-    total: Tensor | None = None
+def _drawn(model: Model, n_samples: int, n_flights: int, generator: torch.Generator, with_states: bool) -> Axes:
+    batch = (3,) if model.params.ndim > 1 else (3, n_flights)
+    total = torch.zeros(3, n_flights, n_samples, dtype=torch.float64)
     states = []
     for process in model.processes:
         path = process.simulate(n_samples, batch=batch, generator=generator)  # (3, flight, time)
-        total = path if total is None else total + path
-        n_states = state_space(process, 1.0).F.shape[-1]
-        known = isinstance(process, AR1 | RandomWalk)
-        states += [path] if known else [torch.full_like(path, torch.nan)] * n_states
-    assert total is not None
+        total += path
+        if with_states:
+            n_states = state_space(process, 1.0).F.shape[-1]
+            known = isinstance(process, AR1 | RandomWalk)
+            states += [path] if known else [torch.full_like(path, torch.nan)] * n_states
     stacked = torch.stack(states, -1) if states else total.new_zeros(*total.shape, 0)
     return Axes(total.permute(1, 2, 0), stacked.permute(1, 2, 0, 3))

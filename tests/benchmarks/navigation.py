@@ -52,7 +52,7 @@ def main() -> None:
     asked = parser.parse_args()
     n = 30 if asked.quick else asked.flights
     trajectory, errors = flight(), unit()
-    drawn = errors.simulate(round(trajectory.duration * RATE), n, torch.Generator().manual_seed(0))
+    drawn = errors.simulate(round(trajectory.duration * RATE), n, torch.Generator().manual_seed(0), with_states=True)
     start = time.perf_counter()
     alignment = Alignment(attitude=(0.1 * DEGREE, 0.1 * DEGREE, 0.5 * DEGREE))
     out = fly(trajectory, drawn, errors, gnss=Gnss(), alignment=alignment, generator=torch.Generator().manual_seed(1))
