@@ -98,3 +98,21 @@ def test_real_mismatch_names_the_files_that_it_lacks(tmp_path: Path):
     done = subprocess.run(command, check=False, capture_output=True, text=True)
     assert done.returncode == 2
     assert "expected a folder with broad_trials.npz" in done.stderr
+
+
+def test_long_recording(tmp_path: Path):
+    options = ("--samples", 70_000, "--levels", 10, "--scale-weights", "short")
+    out = run("long_recording.py", *options, "--check", cwd=tmp_path)
+    assert float(out.split("Largest difference of a weight")[1].split(",")[0]) < 1e-12
+    peak, before = (float(out.split(word)[1].split()[0]) for word in ("Peak memory of a process", "of which"))
+    assert before <= peak < 1000  # MB
+    # The same samples whatever the chunks, or every number of the table would be another.
+    again = run("long_recording.py", *options, "--chunk", 7777, cwd=tmp_path)
+    assert again.split("values in")[0] == out.split("values in")[0]
+
+
+def test_long_recording_refuses_more_levels_than_samples(tmp_path: Path):
+    command = [sys.executable, str(EXAMPLES / "long_recording.py"), "--samples", "1000", "--levels", "10"]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 2
+    assert "--levels: expected at most 9 for 1000 samples" in done.stderr

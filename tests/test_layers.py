@@ -32,6 +32,8 @@ LAYERS = [
     {
         "svo",
         "svo_result",
+        "svo_stream",
+        "virtual_file",
         "multiscale",
         "multiscale_result",
         "live",
@@ -101,7 +103,7 @@ LAYERS = [
         "plotting_mismatch",
         "report_page",
     },
-    {"haar", "processes", "recording", "io"},
+    {"haar", "processes", "recording", "long_recording", "io"},
     {"units", "plotting"},
 ]
 HEAVY = {
