@@ -42,6 +42,7 @@ from gyrofuse.intervals import wavelet_cross_covariance_interval, wavelet_varian
 from gyrofuse.io.stream import RecordingError
 from gyrofuse.joint import JointFit, fit_jointly
 from gyrofuse.live import LiveSVO, subset_weights
+from gyrofuse.long_recording import LongRecording, open_long, stretch_of
 from gyrofuse.moment_bootstrap import GMWMBootstrap, bootstrap_gmwm
 from gyrofuse.moment_covariance import moment_covariance
 from gyrofuse.multiscale import MultiScaleSVO, fit_multiscale
@@ -64,10 +65,12 @@ from gyrofuse.state_space import StateSpace, state_space
 from gyrofuse.svo import SVO, fit_svo
 from gyrofuse.svo_result import SVOResult
 from gyrofuse.svo_weights import SVOWeights, svo_weights
+from gyrofuse.virtual_file import write_virtual
 
 if TYPE_CHECKING:
     from gyrofuse.metric import WaveletCrossCovariance
     from gyrofuse.mismatch import Finding, MismatchReport, diagnose
+    from gyrofuse.svo_stream import StreamedSVOResult, stream_svo
 
 __all__ = [
     "AR1",
@@ -87,6 +90,7 @@ __all__ = [
     "HaarFilterBank",
     "JointFit",
     "LiveSVO",
+    "LongRecording",
     "MismatchReport",
     "Model",
     "MultiScaleResult",
@@ -105,6 +109,7 @@ __all__ = [
     "SingularCovarianceError",
     "Sinusoid",
     "StateSpace",
+    "StreamedSVOResult",
     "WaveletCrossCovariance",
     "WeightsTest",
     "WhiteNoise",
@@ -130,6 +135,7 @@ __all__ = [
     "model_from_dict",
     "moment_covariance",
     "nonnegative_weights",
+    "open_long",
     "parity_test",
     "parse_model",
     "rank_models",
@@ -141,6 +147,8 @@ __all__ = [
     "shrinkage_weights",
     "signal_bootstrap",
     "state_space",
+    "stream_svo",
+    "stretch_of",
     "subset_weights",
     "svo_weights",
     "to_c_header",
@@ -149,6 +157,7 @@ __all__ = [
     "wavelet_cross_covariance_interval",
     "wavelet_variance",
     "wavelet_variance_interval",
+    "write_virtual",
 ]
 
 # Names whose modules load more than torch and numpy.
@@ -157,6 +166,8 @@ _LAZY = {
     "diagnose": "gyrofuse.mismatch",
     "Finding": "gyrofuse.mismatch",
     "MismatchReport": "gyrofuse.mismatch",
+    "StreamedSVOResult": "gyrofuse.svo_stream",
+    "stream_svo": "gyrofuse.svo_stream",
 }
 
 

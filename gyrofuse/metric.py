@@ -58,6 +58,7 @@ class WaveletCrossCovariance(Metric):
         self.add_state("counts", torch.zeros(shape, dtype=torch.float64), dist_reduce_fx="sum")
         self._products: WaveletProducts | None = None
         self._settled: tuple[Tensor, Tensor] | None = None
+        self._updated = False
 
     @property
     def n_samples(self) -> int:
@@ -75,9 +76,12 @@ class WaveletCrossCovariance(Metric):
             ValueError: Another number of sensors, or another device than the chunks before.
         """
         self._take("chunk", chunk)
+        self._updated = True
 
     def prime(self, history: Tensor) -> None:
         """Take in the samples just before the first chunk, without counting their own windows.
+
+        A long history may come in several calls, oldest first.
 
         Args:
             history: `(sensor, time)`, the `2**n_levels - 1` samples before the first chunk, or all there are.
@@ -87,7 +91,7 @@ class WaveletCrossCovariance(Metric):
             TypeError: `history` is not a floating point tensor.
             ValueError: Another number of sensors.
         """
-        if self._products is not None:
+        if self._updated:
             raise RuntimeError("`prime` comes before the first `update`; call reset() to start again")
         self._take("history", history)
         self._settled = self._totals()
@@ -123,6 +127,7 @@ class WaveletCrossCovariance(Metric):
         super().reset()
         self._products = None
         self._settled = None
+        self._updated = False
 
     def _take(self, name: str, chunk: Tensor) -> None:
         check_signal(name, chunk)

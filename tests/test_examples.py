@@ -109,3 +109,54 @@ def test_vibration_flight(tmp_path: Path):
     assert svo[0] < mean[0]
     assert all(0.4 < made / claimed < 2.5 for made, _, claimed in rows.values())
     assert (tmp_path / "f.png").stat().st_size > 10_000
+
+
+def test_long_recording(tmp_path: Path):
+    options = ("--samples", 70_000, "--levels", 10, "--scale-weights", "short")
+    out = run("long_recording.py", *options, "--check", cwd=tmp_path)
+    assert float(out.split("Largest difference of a weight")[1].split(",")[0]) < 1e-12
+    peak, before = (float(out.split(word)[1].split()[0]) for word in ("Peak memory of a process", "of which"))
+    assert before <= peak < 1000  # MB
+    # The same samples whatever the chunks, or every number of the table would be another.
+    again = run("long_recording.py", *options, "--chunk", 7777, cwd=tmp_path)
+    assert again.split("values in")[0] == out.split("values in")[0]
+
+
+def test_long_recording_refuses_more_levels_than_samples(tmp_path: Path):
+    command = [sys.executable, str(EXAMPLES / "long_recording.py"), "--samples", "1000", "--levels", "10"]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 2
+    assert "--levels: expected at most 9 for 1000 samples" in done.stderr
+
+
+def test_train_scale_weights(tmp_path: Path):
+    out = run("train_scale_weights.py", "--quick", "--out", "kept", "--figure", "learnt.png", cwd=tmp_path)
+    saved = torch.load(tmp_path / "kept" / "best.ckpt", weights_only=True)["state_dict"]["logits"].softmax(0)
+    levels = out.split("long\n")[1].split("\n\n")[0].splitlines()
+    printed = [float(line.split()[1]) for line in levels]
+    np.testing.assert_allclose(printed, saved, atol=1e-4)
+    # Flat scale weights, from which it starts, have 0.3 there.
+    assert sum(printed[-3:]) > 0.6, "the angle after a minute is made of what lasts about a minute"
+    ratios = {line[:20].strip(): line[20:].replace(",", "").split() for line in out.splitlines() if "[" in line}
+    assert float(ratios["flat"][2].strip("[")) > 1, "out of sample better than what it starts from"
+    equal, rival = float(ratios["equal weights"][1]), float(ratios["long"][1])
+    assert equal > rival
+    verdict = out.split("The learnt scale weights ")[1]
+    assert verdict.startswith("beat" if float(ratios["long"][2].strip("[")) > 1 else "do NOT beat")
+    assert (tmp_path / "learnt.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--horizon", "1000"], "--horizon: expected 1 to 8192 samples, half of the stretch"),
+        (["--out", "."], "--out: expected a new or empty folder"),
+    ],
+)
+def test_train_scale_weights_refuses(tmp_path: Path, options: list[str], message: str):
+    (tmp_path / "mine.txt").touch()
+    command = [sys.executable, str(EXAMPLES / "train_scale_weights.py"), *options]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert {path.name for path in tmp_path.iterdir()} == {"mine.txt"}

@@ -44,6 +44,8 @@ LAYERS = [
     {
         "svo",
         "svo_result",
+        "svo_stream",
+        "virtual_file",
         "multiscale",
         "multiscale_result",
         "live",
@@ -115,7 +117,7 @@ LAYERS = [
         "plotting_navigation",
         "report_page",
     },
-    {"haar", "processes", "recording", "io"},
+    {"haar", "processes", "recording", "long_recording", "io"},
     {"units", "plotting"},
 ]
 HEAVY = {

@@ -1,0 +1,273 @@
+"""Logs that are read a stretch of time at a go: .npy, stored .npz, HDF5 and Parquet.
+
+Nothing is kept open or in memory between two reads, not even a memory map, whose pages would count as memory of the
+process for as long as it lives. What `read` is bound to are names and numbers, so that it can be sent to a process.
+"""
+
+from __future__ import annotations
+
+import struct
+import zipfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gyrofuse.io.arrays import settings_by_group, stated_rate, stated_unit
+from gyrofuse.io.columns import classify_columns
+from gyrofuse.io.stream import Array, RecordingError
+
+_LOCAL_HEADER = 30  # bytes of a .zip member's own header before its name
+
+
+@dataclass(frozen=True)
+class Slices:
+    """A log whose samples are read by stretches.
+
+    Attributes:
+        read: Maps `(start, stop)`, positions in time, to the samples `(sensor, stop - start)`.
+        n_samples: Samples of each sensor.
+        sensors: Name of each sensor.
+        rate: Sampling rate that the log states in Hz, or None.
+        unit: Unit that the log states, or `"unknown"`.
+    """
+
+    read: Callable[[int, int], Array]
+    n_samples: int
+    sensors: tuple[str, ...]
+    rate: float | None
+    unit: str
+
+
+def open_slices(path: Path, key: str | Sequence[str] | None) -> Slices:
+    """Find the gyros of a log without reading them.
+
+    Args:
+        path: The file; its suffix says the format.
+        key: The array of an .npz or HDF5 file, or the columns of a Parquet file, one for each sensor.
+
+    Raises:
+        FileNotFoundError: No such file.
+        RecordingError: A format that has to be read whole, a damaged file, or none or several arrays that could be it.
+        ImportError: The library of the format is not installed.
+    """
+    openers: dict[str, Callable[[Path, Any], Slices]] = {
+        ".npy": _open_npy,
+        ".npz": _open_npz,
+        ".h5": _open_hdf5,
+        ".hdf5": _open_hdf5,
+        ".parquet": _open_parquet,
+    }
+    suffix = path.suffix.lower()
+    if suffix not in openers:
+        raise RecordingError(
+            f"{path}: expected one of {', '.join(openers)}, which can be read by stretches, found {suffix or 'no'!r}; "
+            "save it as .npy (sensor, time), or read it whole with read_recording"
+        )
+    if key is not None and not isinstance(key, str) and suffix != ".parquet":
+        raise RecordingError(f"{path}: expected `key` to name one array, got {key!r}; several go with .parquet only")
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    try:
+        return openers[suffix](path, key)
+    except (RecordingError, ImportError):
+        raise
+    except Exception as error:  # a damaged file may fail anywhere in its library
+        raise RecordingError(
+            f"{path}: expected a {suffix} file, found one that cannot be read ({error}); save or export it again"
+        ) from error
+
+
+def _open_npy(path: Path, key: str | None) -> Slices:
+    if key is not None:
+        raise RecordingError(f"{path}: expected no `key` for an .npy file, which holds one array, found {key!r}")
+    return _mapped(path, 0, "the array", {})
+
+
+def _open_npz(path: Path, key: str | None) -> Slices:
+    with zipfile.ZipFile(path) as archive, np.load(path, allow_pickle=False) as content:
+        headers = {}
+        for info in archive.infolist():
+            with archive.open(info) as member:
+                headers[info.filename.removesuffix(".npy")] = (_header(member), info)
+        name = _choose(path, {n: (dtype, shape) for n, ((shape, _, dtype), _) in headers.items()}, key)
+        info = headers[name][1]
+        if info.compress_type != zipfile.ZIP_STORED:
+            raise RecordingError(
+                f"{path}: expected `{name}` as it is, found it compressed, which cannot be read by stretches; "
+                "save it with np.savez or np.save, not np.savez_compressed"
+            )
+        few = {n: content[n] for n, ((shape, _, _), _) in headers.items() if n != name and prod(shape) <= 1024}
+    with path.open("rb") as file:
+        file.seek(info.header_offset)
+        name_and_extra = struct.unpack_from("<HH", file.read(_LOCAL_HEADER), _LOCAL_HEADER - 4)
+    return _mapped(path, info.header_offset + _LOCAL_HEADER + sum(name_and_extra), f"`{name}`", few)
+
+
+def _mapped(path: Path, start: int, what: str, settings: dict[str, Any]) -> Slices:
+    """An array in NumPy's format that begins `start` bytes into a file."""
+    with path.open("rb") as file:
+        file.seek(start)
+        shape, fortran, dtype = _header(file)
+        offset = file.tell()
+    names = _names(settings.get("sensors"))
+    n_sensors, n_samples, time_first = _orientation(path, what, dtype, shape, len(names))
+    layout: dict[str, Any] = {"dtype": dtype, "offset": offset, "shape": shape, "order": "F" if fortran else "C"}
+    np.memmap(path, mode="r", **layout)  # a file cut short is told now, not in the middle of a run
+    return _slices(partial(_read_mapped, path, layout, time_first), n_samples, n_sensors, names, settings, "")
+
+
+def _header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Shape, whether it is in Fortran order, and dtype; the file is left where the numbers begin."""
+    version = np.lib.format.read_magic(file)
+    reader = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, fortran, dtype = reader(file)
+    return shape, fortran, dtype
+
+
+def _read_mapped(path: Path, layout: dict[str, Any], time_first: bool, start: int, stop: int) -> Array:
+    mapped = np.memmap(path, mode="r", **layout)
+    return _rows(mapped, time_first, start, stop)
+
+
+def _open_hdf5(path: Path, key: str | None) -> Slices:
+    try:
+        import h5py
+    except ImportError as error:
+        raise ImportError(f'{path}: reading HDF5 needs h5py; pip install "gyrofuse[logs]"') from error
+    with h5py.File(path, "r") as file:
+        found: dict[str, Any] = {}
+        settings = dict(file.attrs)
+
+        def visit(name: str, item: Any) -> None:
+            settings.update({f"{name}/{key}": value for key, value in item.attrs.items() if np.size(value) == 1})
+            if isinstance(item, h5py.Dataset):
+                found[name] = (item.dtype, item.shape)
+                if item.size is not None and item.size == 1:
+                    settings[name] = item[()]
+
+        file.visititems(visit)
+        name = _choose(path, found, key)
+        dtype, shape = found[name]
+        n_sensors, n_samples, time_first = _orientation(path, f"`{name}`", dtype, shape, 0)
+    read = partial(_read_hdf5, path, name, time_first)
+    return _slices(read, n_samples, n_sensors, (), settings, name)
+
+
+def _read_hdf5(path: Path, name: str, time_first: bool, start: int, stop: int) -> Array:
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        return _rows(file[name], time_first, start, stop)
+
+
+def _open_parquet(path: Path, key: str | Sequence[str] | None) -> Slices:
+    try:
+        from pyarrow import parquet
+        from pyarrow import types as kinds
+    except ImportError as error:
+        raise ImportError(f'{path}: reading Parquet needs pyarrow; pip install "gyrofuse[logs]"') from error
+    with parquet.ParquetFile(path) as file:
+        schema, metadata = file.schema_arrow, file.metadata
+        numbers = [f.name for f in schema if kinds.is_integer(f.type) or kinds.is_floating(f.type)]
+        ends = np.cumsum([metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)]).tolist()
+    if key is None:
+        gyros = [column for column in classify_columns(numbers) if column.kind == "gyro"]
+        wanted = [column.name for column in gyros]
+        if len({column.device for column in gyros}) > 1 and len({column.axis for column in gyros}) > 1:
+            raise RecordingError(
+                f"{path}: expected one gyro column for each sensor, found several axes of several devices "
+                f"({', '.join(wanted)}); name those of one axis with `key`"
+            )
+    else:
+        wanted = [key] if isinstance(key, str) else list(key)
+    absent = [name for name in wanted if name not in numbers]
+    if absent or not wanted or not ends or ends[-1] < 2:
+        asked = "a column with the name of a gyro (gyro_x, gx)" if key is None else f"columns {wanted} (`key`)"
+        raise RecordingError(
+            f"{path}: expected {asked} of numbers with at least 2 rows, found {metadata.num_rows} rows of "
+            f"{', '.join(schema.names)}; say with `key` which columns are the sensors"
+        )
+    settings = {name.decode(): value.decode(errors="replace") for name, value in (schema.metadata or {}).items()}
+    units = {column.unit for column in classify_columns(wanted)} - {""}
+    if len(units) == 1:
+        settings["unit"] = units.pop()
+    return _slices(partial(_read_parquet, path, wanted, ends), ends[-1], len(wanted), tuple(wanted), settings, "")
+
+
+def _read_parquet(path: Path, names: list[str], ends: list[int], start: int, stop: int) -> Array:
+    from pyarrow import parquet
+
+    rows = np.empty((len(names), stop - start))
+    with parquet.ParquetFile(path) as file:
+        for group, end in enumerate(ends):
+            begin = ends[group - 1] if group else 0
+            first, last = max(start, begin), min(stop, end)
+            if first >= last:
+                continue
+            table = file.read_row_group(group, columns=names).slice(first - begin, last - first)
+            for row, name in zip(rows, names, strict=True):
+                row[first - start : last - start] = table.column(name).to_numpy()
+    return rows
+
+
+def _choose(path: Path, found: dict[str, tuple[Any, tuple[int, ...]]], key: str | None) -> str:
+    """The array asked for, else `gyro`, else the only one of two dimensions."""
+    tables = [name for name, (dtype, shape) in found.items() if dtype.kind in "iuf" and len(shape) == 2]
+    gyros = [name for name in tables if name.rpartition("/")[2] == "gyro"]
+    wanted = [name for name in found if name == key] if key is not None else gyros or tables
+    if len(wanted) != 1:
+        asked = "one array (sensor, time) of numbers" if key is None else f"an array {key!r} (`key`)"
+        listed = ", ".join(f"{name} {shape}" for name, (_, shape) in found.items()) or "nothing"
+        raise RecordingError(f"{path}: expected {asked}, found {listed}; name the gyros with `key`")
+    return wanted[0]
+
+
+def _orientation(path: Path, what: str, dtype: Any, shape: tuple[int, ...], n_names: int) -> tuple[int, int, bool]:
+    """Sensors, samples, and whether time comes first: the longer dimension is time, unless names settle it."""
+    if dtype.kind not in "iuf" or len(shape) not in (1, 2) or min(shape, default=0) < 1 or max(shape) < 2:
+        raise RecordingError(
+            f"{path}: expected {what} to be numbers (sensor, time) with at least 2 samples, found {dtype} {shape}; "
+            "save one axis of real numbers"
+        )
+    if len(shape) == 1:
+        return 1, shape[0], False
+    time_first = shape[0] > shape[1] and shape[0] != n_names
+    n_sensors, n_samples = shape[::-1] if time_first else shape
+    return n_sensors, n_samples, time_first
+
+
+def _rows(array: Any, time_first: bool, start: int, stop: int) -> Array:
+    """A stretch of an array of one or two dimensions as `(sensor, time)`, float64 and in memory."""
+    if len(array.shape) == 1:
+        part = array[None, start:stop] if isinstance(array, np.ndarray) else array[start:stop][None]
+    else:
+        part = array[start:stop].T if time_first else array[:, start:stop]
+    return np.array(part, dtype=np.float64, order="C")
+
+
+def _names(value: Any) -> tuple[str, ...]:
+    return () if value is None else tuple(np.asarray(value).astype(str).ravel().tolist())
+
+
+def _slices(
+    read: Callable[[int, int], Array],
+    n_samples: int,
+    n_sensors: int,
+    names: tuple[str, ...],
+    settings: dict[str, Any],
+    name: str,
+) -> Slices:
+    fits = len(names) == n_sensors == len({*names})
+    by_group = settings_by_group(settings)
+    return Slices(
+        read=read,
+        n_samples=n_samples,
+        sensors=names if fits else tuple(str(number) for number in range(1, n_sensors + 1)),
+        rate=stated_rate(by_group, name),
+        unit=stated_unit(by_group, name),
+    )
