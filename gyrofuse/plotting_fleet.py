@@ -18,7 +18,14 @@ _FEWEST_BINS, _MOST_BINS = 5, 60
 
 
 def plot_spread(
-    values: Sequence[float], *, label: str, mark: float, meaning: str, what: str = "logs", ax: Axes | None = None
+    values: Sequence[float],
+    *,
+    label: str,
+    mark: float,
+    meaning: str,
+    what: str = "logs",
+    limits: tuple[float, float] | None = None,
+    ax: Axes | None = None,
 ) -> Axes:
     """Draw how a number is spread over a fleet.
 
@@ -28,6 +35,7 @@ def plot_spread(
         mark: Where a line is drawn.
         meaning: Of that line.
         what: Is counted.
+        limits: Of the axis; those of the values by default.
         ax: Where to draw; new axes by default.
 
     Returns:
@@ -37,7 +45,7 @@ def plot_spread(
     known = _array(values)
     known = known[np.isfinite(known)]
     n_bins = min(max(round(2 * np.sqrt(known.size)), _FEWEST_BINS), _MOST_BINS)
-    ax.hist(known, bins=n_bins, color=_BLUE, alpha=0.75)
+    ax.hist(known, bins=n_bins, range=limits, color=_BLUE, alpha=0.75)
     line = ax.axvline(mark, **_MEAN)
     ax.set_xlabel(label)
     ax.set_ylabel(what)

@@ -101,8 +101,9 @@ def _ranked_row(value: float, row: Mapping[str, Any]) -> dict[str, Any]:
 
 def _spread(task: str, label: str, values: Sequence[float]) -> str:
     mark, meaning = (1.0, "plain mean") if task == "fuse" else (LEVEL, f"{LEVEL:g}")
+    limits = None if task == "fuse" else (0.0, 1.0)
     what = "recordings of arrays" if task == "fuse" else "fits" if task == "fit" else "recordings"
-    draw = partial(plot_spread, values, label=_RANKED_BY[task][1], mark=mark, meaning=meaning, what=what)
+    draw = partial(plot_spread, values, label=_RANKED_BY[task][1], mark=mark, meaning=meaning, what=what, limits=limits)
     return image(7, 3, _on_axes, draw)
 
 
