@@ -27,6 +27,7 @@ import torch
 from scipy.optimize import nnls
 
 import gyrofuse as gf
+from gyrofuse.fleet import ResultStore
 
 SECONDS = "a log = a + b T p J + c T p (p + 1) J + d T p"  # T samples, p sensors, J levels
 
@@ -86,55 +87,79 @@ def kills(runs: int, devices: int, n_logs: int, n_samples: int) -> None:
                 sys.exit(1)
 
 
+def paced(folder: Path, out: Path, devices: int, n_logs: int) -> tuple[float, float]:
+    """Seconds of a whole run, and logs a second between the first tenth of them and the last."""
+    out.unlink(missing_ok=True)
+    store = ResultStore(out, {}, {})
+    first, last = n_logs // 10, n_logs - n_logs // 10
+    reached: dict[int, tuple[float, int]] = {}
+    start = time.perf_counter()
+    with subprocess.Popen(
+        command(folder, "--out", out, "--devices", devices), env=environment(), stdout=subprocess.DEVNULL
+    ) as process:
+        while process.poll() is None:
+            done = store.n_parts
+            for mark in (first, last):
+                if done >= mark:
+                    reached.setdefault(mark, (time.perf_counter(), done))
+            time.sleep(0.02)
+    (t0, n0), (t1, n1) = reached[first], reached[last]
+    return time.perf_counter() - start, (n1 - n0) / (t1 - t0)
+
+
 def throughput(n_logs: int, n_samples: int, rounds: int) -> None:
-    """One process against two, in turn; what starting costs is timed with a fleet of two logs."""
+    """One process against two, in turn."""
     with tempfile.TemporaryDirectory() as scratch:
-        folder, few = Path(scratch, "logs"), Path(scratch, "few")
+        folder = Path(scratch, "logs")
         folder.mkdir()
-        few.mkdir()
         write_logs(folder, n_logs, n_samples)
-        write_logs(few, 2, 4000)
-        seconds: dict[tuple[str, int], list[float]] = {}
+        outs = {devices: Path(scratch, f"{devices}.parquet") for devices in (1, 2)}
+        found: dict[int, list[tuple[float, float]]] = {1: [], 2: []}
         for _ in range(rounds):
-            for devices in (1, 2):
-                for name, logs in (("start", few), ("all", folder)):
-                    out = Path(scratch, f"{name}{devices}.parquet")
-                    seconds.setdefault((name, devices), []).append(timed(logs, out, devices))
-        same = Path(scratch, "all1.parquet").read_bytes() == Path(scratch, "all2.parquet").read_bytes()
-    medians = {key: float(np.median(values)) for key, values in seconds.items()}
-    work = {devices: medians["all", devices] - medians["start", devices] for devices in (1, 2)}
-    for devices in (1, 2):
-        print(
-            f"{devices} process(es): {medians['all', devices]:.1f} s for {n_logs} logs of 6 x {n_samples}, of which "
-            f"{medians['start', devices]:.1f} s to start; {n_logs / work[devices]:.2f} logs/s beyond that"
-        )
-    whole = medians["all", 1] / medians["all", 2]
-    print(f"two processes have {work[1] / work[2]:.2f} times the throughput; with starting {whole:.2f}")
+            for devices, out in outs.items():
+                found[devices].append(paced(folder, out, devices, n_logs))
+                print(
+                    f"{devices} process(es): {found[devices][-1][0]:.1f} s, {found[devices][-1][1]:.2f} logs/s",
+                    flush=True,
+                )
+        same = outs[1].read_bytes() == outs[2].read_bytes()
+    whole, pace = ({d: float(np.median([r[k] for r in runs])) for d, runs in found.items()} for k in (0, 1))
+    print(
+        f"{n_logs} logs of 6 x {n_samples}: two processes have {pace[2] / pace[1]:.2f} times the throughput of one once"
+    )
+    print(f"they have begun; with starting and ending {whole[1] / whole[2]:.2f} ({whole[1]:.1f} s, {whole[2]:.1f} s)")
     print(f"tables equal to the last bit: {same}")
 
 
-def features(n_samples: float, n_sensors: float, n_levels: float) -> list[float]:
-    """Of the cost of a log."""
+def in_time(n_samples: float, n_sensors: float, n_levels: float) -> list[float]:
+    """What the seconds of a log grow with."""
     size = n_samples * n_sensors
     return [1.0, size * n_levels, size * (n_sensors + 1) * n_levels, size]
+
+
+def in_memory(n_samples: float, n_sensors: float, n_levels: float) -> list[float]:
+    """What its bytes grow with."""
+    return [1.0, n_samples * n_sensors]
 
 
 def measured(n_samples: int, n_sensors: int, n_levels: int, runs: int) -> tuple[float, float]:
     """Seconds of one log, median, and bytes of resident memory that it adds, in a process of its own."""
     script = (
-        "import sys, time, resource, torch, gyrofuse as gf\n"
+        "import sys, time, torch, gyrofuse as gf\n"
         "T, p, J, runs = map(int, sys.argv[1:])\n"
         "torch.set_num_threads(1)\n"
         "gf.fit_svo(torch.randn(p, 4096, dtype=torch.float64))\n"
-        "peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024\n"
-        "before = peak()\n"
+        "def resident(which):\n"
+        "    return int(open('/proc/self/status').read().split(which)[1].split()[0]) * 1024\n"
+        "open('/proc/self/clear_refs', 'w').write('5')\n"  # the peak so far, of the imports, does not count
+        "before = resident('VmRSS:')\n"
         "x = torch.randn(p, T, dtype=torch.float64)\n"
         "times = []\n"
         "for _ in range(runs):\n"
         "    start = time.perf_counter()\n"
         "    gf.fit_svo(x, n_levels=J)\n"
         "    times.append(time.perf_counter() - start)\n"
-        "print(sorted(times)[len(times) // 2], peak() - before)\n"
+        "print(sorted(times)[len(times) // 2], resident('VmHWM:') - before)\n"
     )
     sizes = map(str, (n_samples, n_sensors, n_levels, runs))
     run = subprocess.run(
@@ -152,25 +177,26 @@ def cost(quick: bool) -> None:
         sizes += [(2 * base, 24, 12), (10 * base, 3, 10), (base, 3, 12), (4 * base, 12, 14)]
     check = (100 * base if not quick else 40 * base, 6, 14)
     found = {size: measured(*size, runs=5) for size in sizes}
-    table = np.array([features(*size) for size in sizes])
-    models = []
-    for k, what in enumerate(("seconds", "MiB")):
-        values = np.array([found[size][k] for size in sizes]) / (1 if k == 0 else 2**20)
-        weight = 1 / values  # relative errors count alike
-        models.append(nnls(table * weight[:, None], np.ones(len(values)))[0])
-        fitted = table @ models[-1]
-        for size, own, said in zip(sizes, values, fitted, strict=True):
-            print(f"{what:>8}  T {size[0]:>9} p {size[1]:>2} J {size[2]:>2}: measured {own:9.4g}, model {said:9.4g}")
     seconds, extra = measured(*check, runs=1)
-    said = [float(np.array(features(*check)) @ model) for model in models]
-    print(
-        f"check at T {check[0]}, p {check[1]}, J {check[2]}: {seconds:.3g} s, model {said[0]:.3g}; "
-        f"{extra / 2**20:.4g} MiB, model {said[1]:.4g}"
-    )
-    log = features(360_000, 6, 14)  # an hour at 100 Hz
-    one = float(np.array(log) @ models[0])
+    models = {}
+    # Memory that was there before, of the imports, hides what a short log takes.
+    kinds = (("seconds", in_time, 1.0, 0.0, seconds), ("MiB", in_memory, 2.0**20, 4.0, extra))
+    for k, (what, features, unit, least, reached) in enumerate(kinds):
+        values = np.array([found[size][k] for size in sizes]) / unit
+        table = np.array([features(*size) for size in sizes])
+        seen = values > least
+        models[what] = nnls(table[seen] / values[seen, None], np.ones(seen.sum()))[0]  # relative errors count alike
+        for size, own, said in zip(sizes, values, table @ models[what], strict=True):
+            print(f"{what:>8}  T {size[0]:>9} p {size[1]:>2} J {size[2]:>2}: measured {own:9.4g}, model {said:9.4g}")
+        said = float(np.array(features(*check)) @ models[what])
+        size = f"{what:>8}  T {check[0]:>9} p {check[1]:>2} J {check[2]:>2}"
+        print(f"{size}: measured {reached / unit:9.4g}, model {said:9.4g}   not fitted to")
+    hour = 360_000, 6, 14  # at 100 Hz
+    one, memory = (float(np.array(f(*hour)) @ models[what]) for what, f, *_ in kinds)
     hours = 1e6 * one / 3600 / 64
-    print(f"a million logs of an hour of 6 gyros at 100 Hz: {one:.3g} s each, {hours:.3g} h on 64 processes")
+    print(
+        f"a log of an hour of 6 gyros at 100 Hz: {one:.3g} s, {memory:.3g} MiB; a million on 64 processes: {hours:.3g} h"
+    )
     print(f"({SECONDS})")
 
 
