@@ -195,7 +195,7 @@ def cost(quick: bool) -> None:
     one, memory = (float(np.array(f(*hour)) @ models[what]) for what, f, *_ in kinds)
     hours = 1e6 * one / 3600 / 64
     print(
-        f"a log of an hour of 6 gyros at 100 Hz: {one:.3g} s, {memory:.3g} MiB; a million on 64 processes: {hours:.3g} h"
+        f"an hour of 6 gyros at 100 Hz: {one:.3g} s, {memory:.3g} MiB; a million of them on 64 processes: {hours:.3g} h"
     )
     print(f"({SECONDS})")
 
