@@ -62,6 +62,9 @@ class Blocks:
 
 def peak_memory() -> float:
     """Most memory that this process ever had, in MB."""
+    status = Path("/proc/self/status")
+    if status.exists():  # what the other call says begins with what the process had that started this one
+        return int(status.read_text().split("VmHWM:")[1].split()[0]) * 1.024e-3
     kilobytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return kilobytes / (1e6 if sys.platform == "darwin" else 1e3)  # macOS counts bytes
 
