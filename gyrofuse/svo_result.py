@@ -11,7 +11,7 @@ from torch import Tensor
 from gyrofuse import gain, hypotheses, uncertainty
 from gyrofuse._checks import check_positive, check_signal
 from gyrofuse._result import ConfidenceInterval, listed, named, numbered
-from gyrofuse.competitors import equal_weights
+from gyrofuse._virtual_gyro import VirtualGyro
 from gyrofuse.gain import Gain
 from gyrofuse.hypotheses import EnoughData, Evidence, WeightsTest
 from gyrofuse.recording import Recording
@@ -75,7 +75,7 @@ _TELLING = 8.0
 
 
 @dataclass(frozen=True, eq=False)
-class SVOResult:
+class SVOResult(VirtualGyro):
     """A fitted virtual gyro. Batched over the leading dimensions of the signal; index it to get one item.
 
     Attributes:
@@ -114,32 +114,6 @@ class SVOResult:
     unit: str | None = None
     selection: Selection | None = None
     positive_definite: Tensor | None = None
-
-    @property
-    def n_levels(self) -> int:
-        """Number of levels J."""
-        return self.scale_weights.shape[0]
-
-    @property
-    def tau(self) -> Tensor:
-        """Averaging time `2**(j-1)` of each level as in the Allan deviation; seconds, or samples without a rate."""
-        level = torch.arange(self.n_levels, dtype=torch.float64)
-        return torch.exp2(level) / (self.rate or 1.0)
-
-    @property
-    def wavelet_variance(self) -> Tensor:
-        """Wavelet variance of every sensor, `(..., level, sensor)`."""
-        return self.wavelet_cross_covariance.diagonal(dim1=-2, dim2=-1)
-
-    @property
-    def virtual_wavelet_variance(self) -> Tensor:
-        """Wavelet variance `c' Gamma_j c` of the virtual gyro, `(..., level)`."""
-        return self._variance_of(self.weights)
-
-    @property
-    def equal_wavelet_variance(self) -> Tensor:
-        """Wavelet variance of the plain mean of the sensors, `(..., level)`."""
-        return self._variance_of(equal_weights(self.wavelet_cross_covariance))
 
     @property
     def agreement(self) -> Tensor:
@@ -276,33 +250,18 @@ class SVOResult:
             if len(names) > 8:
                 parts.append(f"... and {len(names) - 8} more")
             return "\n\n".join(parts)
-        unit, second = self.unit or "signal", "s" if self.rate else "samples"
-        rate = f", {self.rate:.6g} Hz" if self.rate else ""
         low, high = self.confidence_interval
         name = {"svo": "SVO"}.get(self.method, self.method.replace("_", " "))
         width = max(6, *(len(sensor) for sensor in self.sensors))
         lines = [
-            f"Virtual gyro ({name}) of {len(self.sensors)} sensors, {self.n_samples} samples{rate}",
+            self._headline(name),
             "",
             f"{'sensor':<{width}}  {'weight':>10}  {f'{100 * self.confidence_level:g} % interval':>24}",
         ]
         for i, sensor in enumerate(self.sensors):
             interval = f"[{low[i].item():+.5f}, {high[i].item():+.5f}]" if not low[i].isnan() else "-"
             lines.append(f"{sensor:<{width}}  {self.weights[i].item():>+10.5f}  {interval:>24}")
-        lines += [
-            "",
-            f"Allan deviation ({unit}) at averaging time tau",
-            f"{'level':>5}  {f'tau ({second})':>13}  {'weight':>7}  {'best sensor':>12}  {'equal':>12}  {'virtual':>12}"
-            f"  {'virtual/equal':>13}",
-        ]
-        best = (2 * self.wavelet_variance.amin(-1)).sqrt()
-        equal = (2 * self.equal_wavelet_variance).sqrt()
-        virtual = (2 * self.virtual_wavelet_variance).sqrt()
-        columns = (self.tau, self.scale_weights, best, equal, virtual, virtual / equal)
-        for j, row in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
-            tau, omega, *deviations, ratio = row
-            numbers = "  ".join(f"{value:>12.5g}" for value in deviations)
-            lines.append(f"{j + 1:>5}  {tau:>13.6g}  {omega:>7.4f}  {numbers}  {ratio:>13.4f}")
+        lines += ["", *self._deviation_table()]
         if self.selection:
             lines += ["", self.selection.sentence]
         if self._has_covariance:
@@ -386,6 +345,3 @@ class SVOResult:
             f"`sensor`: expected an index from 0 to {len(self.sensors) - 1} or one of "
             f"{named(self.sensors, range(len(self.sensors)))}, got {sensor!r}"
         )
-
-    def _variance_of(self, weights: Tensor) -> Tensor:
-        return torch.einsum("...i,...jik,...k->...j", weights, self.wavelet_cross_covariance, weights)

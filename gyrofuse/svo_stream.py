@@ -12,7 +12,7 @@ from gyrofuse._checks import check_n_levels, largest_level
 from gyrofuse._linalg import check_positive_definite
 from gyrofuse._processes import place
 from gyrofuse._result import listed
-from gyrofuse.competitors import equal_weights
+from gyrofuse._virtual_gyro import VirtualGyro
 from gyrofuse.long_recording import LongRecording, Progress, check_long_recording, silent, stretch_of
 from gyrofuse.metric import WaveletCrossCovariance
 from gyrofuse.scale_weights import ScaleWeights, normalised, resolve_scale_weights
@@ -148,7 +148,7 @@ def measure_stretch(
 
 
 @dataclass(frozen=True, eq=False)
-class StreamedSVOResult:
+class StreamedSVOResult(VirtualGyro):
     """Weights of a recording that was streamed.
 
     Attributes:
@@ -169,63 +169,21 @@ class StreamedSVOResult:
     rate: float | None = None
     unit: str | None = None
 
-    @property
-    def n_levels(self) -> int:
-        """Number of levels J."""
-        return self.scale_weights.shape[0]
-
-    @property
-    def tau(self) -> Tensor:
-        """Averaging time `2**(j-1)` of each level as in the Allan deviation; seconds, or samples without a rate."""
-        return torch.exp2(torch.arange(self.n_levels, dtype=torch.float64)) / (self.rate or 1.0)
-
-    @property
-    def wavelet_variance(self) -> Tensor:
-        """Wavelet variance of every sensor, `(level, sensor)`."""
-        return self.wavelet_cross_covariance.diagonal(dim1=-2, dim2=-1)
-
-    @property
-    def virtual_wavelet_variance(self) -> Tensor:
-        """Wavelet variance `c' Gamma_j c` of the virtual gyro, `(level,)`."""
-        return self._variance_of(self.weights)
-
-    @property
-    def equal_wavelet_variance(self) -> Tensor:
-        """Wavelet variance of the plain mean of the sensors, `(level,)`."""
-        return self._variance_of(equal_weights(self.wavelet_cross_covariance))
-
     def virtual(self, signal: Tensor) -> Tensor:
         """Fuse a chunk `(..., sensor, time)` into `(..., time)`; a sample that any sensor lacks is NaN."""
         return fuse(self.weights.to(signal), signal)
 
     def summary(self) -> str:
         """The weights and the gain over equal weights per level, as fixed-width text."""
-        unit, second = self.unit or "signal", "s" if self.rate else "samples"
-        rate = f", {self.rate:.6g} Hz" if self.rate else ""
         width = max(6, *(len(sensor) for sensor in self.sensors))
         lines = [
-            f"Virtual gyro (SVO, streamed) of {len(self.sensors)} sensors, {self.n_samples} samples{rate}",
+            self._headline("SVO, streamed"),
             "",
             f"{'sensor':<{width}}  {'weight':>10}",
             *(f"{s:<{width}}  {w:>+10.5f}" for s, w in zip(self.sensors, self.weights.tolist(), strict=True)),
             "",
-            f"Allan deviation ({unit}) at averaging time tau",
-            f"{'level':>5}  {f'tau ({second})':>13}  {'weight':>7}  {'best sensor':>12}  {'equal':>12}  {'virtual':>12}"
-            f"  {'virtual/equal':>13}",
+            *self._deviation_table(),
         ]
-        best, equal, virtual = (
-            (2 * variance).sqrt()
-            for variance in (
-                self.wavelet_variance.amin(-1),
-                self.equal_wavelet_variance,
-                self.virtual_wavelet_variance,
-            )
-        )
-        columns = (self.tau, self.scale_weights, best, equal, virtual, virtual / equal)
-        for j, row in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
-            tau, omega, *deviations, ratio = row
-            numbers = "  ".join(f"{value:>12.5g}" for value in deviations)
-            lines.append(f"{j + 1:>5}  {tau:>13.6g}  {omega:>7.4f}  {numbers}  {ratio:>13.4f}")
         return "\n".join(lines)
 
     def __str__(self) -> str:
@@ -269,9 +227,6 @@ class StreamedSVOResult:
             "virtual_wavelet_variance": listed(self.virtual_wavelet_variance),
             "equal_wavelet_variance": listed(self.equal_wavelet_variance),
         }
-
-    def _variance_of(self, weights: Tensor) -> Tensor:
-        return torch.einsum("i,jik,k->j", weights, self.wavelet_cross_covariance, weights)
 
 
 def _most_levels(recording: LongRecording) -> int:

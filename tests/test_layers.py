@@ -45,6 +45,7 @@ LAYERS = [
         "svo",
         "svo_result",
         "svo_stream",
+        "_virtual_gyro",
         "virtual_file",
         "multiscale",
         "multiscale_result",
