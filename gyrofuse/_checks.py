@@ -122,3 +122,11 @@ def check_confidence_level(value: float) -> float:
     if not 0 < number < 1:
         raise ValueError(f"`confidence_level`: expected a number between 0 and 1 such as 0.95, got {value!r}")
     return number
+
+
+_SAME_RATE = 1e-3
+
+
+def same_rate(first: float, second: float) -> bool:
+    """Whether two sampling rates are the same, as far as rates that are read from time stamps can tell."""
+    return abs(first / second - 1) <= _SAME_RATE

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 import typer
 
-from gyrofuse._checks import check_positive, check_positive_integer
+from gyrofuse._checks import check_positive_integer
 from gyrofuse._console import Commands, progress, say, say_table, warn
 from gyrofuse._output import output_folder
 from gyrofuse.cli_fleet import fleet
@@ -40,9 +40,9 @@ from gyrofuse.cli_shared import (
     Scale,
     Sensors,
     Unit,
+    agreed_rate,
+    agreed_unit,
     at_rest,
-    known_unit,
-    model_grid,
     outputs,
     read,
     read_model,
@@ -91,7 +91,6 @@ class Covariance(str, Enum):
 
 
 # Methods whose weights have no law to rest an interval on, or, equal ones, are not estimated at all.
-_SAME_RATE = 1e-3  # of rates read from time stamps
 _WITHOUT_INTERVALS = (Method.multiscale, Method.nonnegative, Method.equal, Method.rdvg)
 
 
@@ -272,7 +271,12 @@ def simulate(
     source = [Path(model)] if model.lower().endswith(".json") else []
     with outputs(force, source, out=out, json=json_file, report=report) as drafts:
         noise = read_model(source[0]) if source else parse_model(model)
-        rate, unit = _grid(source[0] if source else None, rate, unit)
+        rate = agreed_rate(source, rate)
+        if rate is None:
+            raise ValueError(
+                "`--rate`: expected the sampling rate in Hz, which this model does not say, got none; give it"
+            )
+        unit = agreed_unit(source[0] if source else None, unit)
         generator = torch.Generator()
         seed = generator.seed() % 2**32 if seed is None else seed
         generator.manual_seed(seed)
@@ -296,20 +300,6 @@ def simulate(
             drafts[report].write_text(page, encoding="utf-8")
     say("\n".join(map(str, each)))
     say(f"{signal.shape[0]} x {samples} samples at {rate:g} Hz, seed {seed}, in {out}")
-
-
-def _grid(source: Path | None, rate: float | None, unit: str | None) -> tuple[float, str]:
-    """Rate and unit: those asked for, which have to be those of the log that a model was fitted to."""
-    own_rate, own_unit = (None, None) if source is None else model_grid(source)
-    chosen = own_rate if rate is None else check_positive("--rate", rate)
-    if chosen is None:
-        raise ValueError("`--rate`: expected the sampling rate in Hz, which this model does not say, got none; give it")
-    if own_rate is not None and abs(chosen / own_rate - 1) > _SAME_RATE:
-        raise ValueError(f"`--rate`: expected {own_rate:g} Hz, for which the model was fitted, got {chosen:g}")
-    named = None if unit is None else known_unit(unit)
-    if None not in (named, own_unit) and named != own_unit:
-        raise ValueError(f"`--unit`: expected {own_unit}, for which the model was fitted, got {named}")
-    return chosen, named or own_unit or "deg/s"
 
 
 def _each(noise: Any) -> list[Any]:

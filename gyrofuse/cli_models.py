@@ -6,7 +6,7 @@ from collections.abc import Callable
 from enum import Enum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -24,6 +24,7 @@ from gyrofuse.cli_shared import (
     Sensors,
     Unit,
     at_rest,
+    draw,
     files_written,
     outputs,
     read,
@@ -40,14 +41,10 @@ from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.processes import Model
 from gyrofuse.ranking import rank_models
 from gyrofuse.recording import Recording
-from gyrofuse.report import new_figure, save_figure
 from gyrofuse.report_models import model_report, sensor_name
 from gyrofuse.report_ranking import rank_report
 from gyrofuse.tones import FEWEST_SAMPLES
 from gyrofuse.units import RATE_UNITS
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 _MOST_FITS = 12  # printed in full
 _WITH_GAPS = ", or fit a model with `gyrofuse fit`, which gets along with gaps"
@@ -132,7 +129,7 @@ def fit(
             write_json(drafts[model_out], {**known, "rate": recording.rate, "unit": recording.unit})
         if figure:
             first = tuple(result.params.isfinite().all(-1).nonzero()[0].tolist())  # that could be fitted
-            _draw(partial(result.plot, index=first), drafts[figure], figure)
+            draw(partial(result.plot, index=first), drafts[figure], figure)
         if report:
             with progress("drawing"):
                 page = model_report(result, part, title=f"Noise of {titled(logs)}")
@@ -142,13 +139,6 @@ def fit(
     written_files = files_written(kalibr, header, model_out, figure, json_file, report)
     say("\n".join([result.summary(), *unit_note(recording.unit), *written_files]))
     say_notes(recording)
-
-
-def _draw(plot: Callable[[Axes], Axes], draft: Path, path: Path) -> None:
-    """The figure of one sensor, in the format that the path asks for."""
-    drawn = new_figure(7.0, 4.6)
-    plot(drawn.subplots())
-    save_figure(drawn, draft, path.suffix[1:].lower())
 
 
 def _known_model(result: GMWMResult, option: str) -> Model:
@@ -224,7 +214,7 @@ def rank(
             result = rank_models(part, formulas, confidence_level=confidence_level, n_levels=levels)
         if figure:
             named = sensor_name(result.sensors, part, result.first_ranked)
-            _draw(partial(result.plot, title=named), drafts[figure], figure)
+            draw(partial(result.plot, title=named), drafts[figure], figure)
         if report:
             with progress("drawing"):
                 page = rank_report(result, part, title=f"Noise models for {titled(logs)}", remarks=remarks)

@@ -3,32 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import torch
 import typer
 
-from gyrofuse._checks import check_positive, check_positive_integer
+from gyrofuse._checks import check_positive_integer
 from gyrofuse._console import progress_bar, say
 from gyrofuse.cli_shared import (
     Force,
     Json,
+    agreed_rate,
+    agreed_unit,
+    draw,
     files_written,
-    known_unit,
-    model_grid,
     outputs,
     read_model,
     write_json,
 )
 from gyrofuse.processes import Model
 from gyrofuse.units import RATE_UNITS, rate_unit_factor
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from gyrofuse.navigation import Emulation
-
-_SAME_RATE = 1e-3
 
 
 def emulate(
@@ -69,7 +63,7 @@ def emulate(
     given = [path for path in (model, against, truth, accelerometer, trajectory) if path is not None]
     with outputs(force, given, figure=figure, json=json_file) as drafts:
         gyros = [path for path in (model, against, truth) if path is not None]
-        hz = _rate(gyros, rate)
+        hz = agreed_rate(gyros, rate) or 100.0
         told = [_gyro(path, unit) for path in gyros]
         with progress_bar("flying") as show:
             result = compare(
@@ -84,20 +78,10 @@ def emulate(
                 progress=show,
             )
         if figure:
-            _draw(result, drafts[figure], figure)
+            draw(result.plot, drafts[figure], figure, height=3.6)
         if json_file:
             write_json(drafts[json_file], {"model": str(model), "against": str(against), **result.to_dict()})
     say("\n".join([result.summary(), *files_written(figure, json_file)]))
-
-
-def _rate(paths: list[Path], rate: float | None) -> float:
-    """That asked for, or the one that models say."""
-    known = {path: own for path in paths for own in (model_grid(path)[0],) if own is not None}
-    chosen = check_positive("--rate", rate) if rate is not None else next(iter(known.values()), 100.0)
-    for path, own in known.items():
-        if abs(own / chosen - 1) > _SAME_RATE:
-            raise ValueError(f"{path}: expected a model of samples at {chosen:g} Hz, found one at {own:g} Hz")
-    return chosen
 
 
 def _single(path: Path) -> Model:
@@ -110,18 +94,7 @@ def _single(path: Path) -> Model:
 
 def _gyro(path: Path, unit: str | None) -> Model:
     """In rad/s."""
-    own = model_grid(path)[1]
-    name = known_unit(unit) if unit is not None else own or "deg/s"
-    if own is not None and name != own:
-        raise ValueError(f"`--unit`: expected {own}, for which {path} was fitted, got {name}")
+    name = agreed_unit(path, unit)
     if name not in RATE_UNITS:
         raise ValueError(f"{path}: expected a model in one of {', '.join(RATE_UNITS)}, found {name}; give --unit")
     return _single(path).scaled(rate_unit_factor(name, "rad/s"))
-
-
-def _draw(result: Emulation, draft: Path, name: Path) -> None:
-    from gyrofuse.report import new_figure, save_figure
-
-    figure: Figure = new_figure(7, 3.6)
-    result.plot(figure.subplots())
-    save_figure(figure, draft, name.suffix[1:].lower())

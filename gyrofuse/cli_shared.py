@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from gyrofuse._checks import check_positive, same_rate
 from gyrofuse._console import progress, say_table, warn
 from gyrofuse._output import Outputs
 from gyrofuse.io.columns import canonical_unit
@@ -21,6 +22,8 @@ from gyrofuse.simulate import ArrayModel
 from gyrofuse.units import OTHER_UNITS, RATE_UNITS
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
     from gyrofuse.mismatch.repaired import RepairedModel
 
 _SUFFIXES = {
@@ -180,6 +183,38 @@ def model_grid(path: Path) -> tuple[float | None, str | None]:
     rate, unit = content.get("rate"), content.get("unit")
     known = isinstance(unit, str) and unit != "unknown"
     return (rate if isinstance(rate, float | int) else None), (unit if known else None)
+
+
+def agreed_rate(models: Sequence[Path], rate: float | None) -> float | None:
+    """Sampling rate that was asked for, or that of the logs that models were fitted to: all have to be the same."""
+    chosen, by = (None, "") if rate is None else (check_positive("--rate", rate), "--rate")
+    for model in models:
+        own = model_grid(model)[0]
+        if own is not None and chosen is not None and not same_rate(own, chosen):
+            raise ValueError(
+                f"`{by}`: expected {own:g} Hz, for which the model was fitted, got {chosen:g}; see {model}"
+            )
+        if own is not None and chosen is None:
+            chosen, by = own, str(model)
+    return chosen
+
+
+def agreed_unit(model: Path | None, unit: str | None) -> str:
+    """Unit that was asked for, which has to be that of the log that the model was fitted to, or that; deg/s else."""
+    own = None if model is None else model_grid(model)[1]
+    asked = None if unit is None else known_unit(unit)
+    if None not in (asked, own) and asked != own:
+        raise ValueError(f"`--unit`: expected {own}, for which the model was fitted, got {asked}; see {model}")
+    return asked or own or "deg/s"
+
+
+def draw(plot: Callable[[Axes], Axes], draft: Path, path: Path, width: float = 7.0, height: float = 4.6) -> None:
+    """A figure of one panel, in the format that the path asks for."""
+    from gyrofuse.report_page import new_figure, save_figure
+
+    figure = new_figure(width, height)
+    plot(figure.subplots())
+    save_figure(figure, draft, path.suffix[1:].lower())
 
 
 def _model_content(path: Path) -> dict[str, Any]:

@@ -40,7 +40,7 @@ def test_two_models_are_compared(run: Run, models: Path):
     ("arguments", "says"),
     [
         (("--model", "a.json", "--against", "gone.json"), "gone.json"),
-        (("--model", "a.json", "--against", "b.json", "--rate", "100"), "expected a model of samples at 100 Hz, found"),
+        (("--model", "a.json", "--against", "b.json", "--rate", "100"), "Hz, for which the model was fitted, got 100"),
         (("--model", "a.json", "--against", "b.json", "--unit", "rad/s"), "`--unit`: expected deg/s"),
         (("--model", "a.json", "--against", "b.json", "--flights", "0"), "`--flights`"),
         (("--model", "a.json", "--against", "path.csv"), "path.csv: expected a model in JSON"),

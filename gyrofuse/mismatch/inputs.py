@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import check_positive, check_signal
+from gyrofuse._checks import check_positive, check_signal, same_rate
 from gyrofuse._model import Model
 from gyrofuse._result import named, numbered
 from gyrofuse.mismatch.case import Case, Scene
@@ -15,7 +15,6 @@ from gyrofuse.simulate import ArrayModel
 FEWEST = 4096
 # Of a model: records as long as the recording. What is told apart of an effect grows as m/(1 + m), the work as m.
 _FEWEST_RECORDS, _MOST_RECORDS, _MOST_VALUES = 4, 16, 2**23
-_SAME_RATE = 1e-3
 _SINGULAR = 1e-10  # of correlation matrices
 
 
@@ -79,7 +78,7 @@ def _samples(simulation: Recording | Tensor, scene: Scene, n_samples: int, *, fr
     """Given samples as records `(record, sensor, time)` of the recording's length, or one of their own."""
     if isinstance(simulation, Recording):
         signal = simulation.signal
-        if not from_tensor and abs(simulation.rate / scene.rate - 1) > _SAME_RATE:
+        if not from_tensor and not same_rate(simulation.rate, scene.rate):
             raise ValueError(
                 f"`simulation`: expected samples at {scene.rate:g} Hz as in the recording, got {simulation.rate:g} Hz; "
                 "simulate at the recording's rate, or resample"

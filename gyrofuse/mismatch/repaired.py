@@ -10,13 +10,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import check_positive_integer
+from gyrofuse._checks import check_positive_integer, same_rate
 from gyrofuse._paths import own_generator
 from gyrofuse.mismatch.case import Scene
 from gyrofuse.mismatch.mechanism import Mechanism
 from gyrofuse.simulate import ArrayModel
-
-_SAME_RATE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +75,7 @@ class RepairedModel:
             ValueError: It is not.
         """
         scene = self.scene
-        if abs(rate / scene.rate - 1) > _SAME_RATE:
+        if not same_rate(rate, scene.rate):
             raise ValueError(f"`rate`: expected that of the repaired simulation, {scene.rate:g} Hz, got {rate:g} Hz")
         if "unknown" not in (unit, scene.unit) and unit != scene.unit:
             raise ValueError(f"`unit`: expected that of the repaired simulation, {scene.unit!r}, got {unit!r}")
