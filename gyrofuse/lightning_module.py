@@ -1,10 +1,11 @@
 """Fleets of logs under Lightning's `Trainer`: on one process or many, one machine or several.
 
-task = Fuse("long")
-store = ResultStore("results.parquet", task.columns, task.settings)
-data = GyroArrayDataModule(["logs/"], done=store.done())
-trainer = Trainer(devices=2, strategy="ddp", accelerator="cpu", callbacks=[ResultWriter(store)], logger=False)
-trainer.predict(FusionModule(task), datamodule=data, return_predictions=False)
+Example:
+    >>> task = Fuse("long")
+    >>> store = ResultStore("results.parquet", task.columns, task.settings)
+    >>> data = GyroArrayDataModule(["logs/"], done=store.done())
+    >>> trainer = Trainer(devices=2, strategy="ddp", accelerator="cpu", callbacks=[ResultWriter(store)], logger=False)
+    >>> trainer.predict(FusionModule(task), datamodule=data, return_predictions=False)
 """
 
 from __future__ import annotations

@@ -35,7 +35,6 @@ def fleet_report(standing: Standing, rows: Sequence[Mapping[str, Any]], *, title
         An HTML page that needs no other file, no network and no script.
     """
     heading, meaning = _RANKED_BY[standing.task]
-    values = [value for value, _ in standing.ranked]
     return render(
         "fleet.html.j2",
         title=title,
@@ -43,7 +42,7 @@ def fleet_report(standing: Standing, rows: Sequence[Mapping[str, Any]], *, title
         verdict=verdict(standing),
         heading=heading,
         meaning=meaning,
-        spread=_spread(standing.task, meaning, values) if len(values) > 1 else None,
+        spread=_spread(standing.task, meaning, standing.values) if len(standing.values) > 1 else None,
         ranked=[_ranked_row(value, row) for value, row in standing.ranked[:_MOST_ROWS]],
         courses=_courses(rows) if standing.task == "fuse" else [],
         most=_MOST_ROWS,
@@ -57,14 +56,12 @@ def verdict(standing: Standing) -> list[str]:
     said = [
         f"{standing.n_logs} logs, " + (f"{failed} of which could not be used." if failed else "all of them usable.")
     ]
-    values = [value for value, _ in standing.ranked if value == value]
-    if standing.task == "fuse" and values:
-        middle = number(median(values), 3)
+    if standing.task == "fuse" and standing.values:
+        middle = number(median(standing.values), 3)
         said.append(f"The Allan deviation of the plain mean is {middle} times that of the virtual gyro (median).")
-        noisy = [s for s in standing.noisy if s.relative_noise > NOISY]
         said += [
             f"Sensor {s.sensor} of {s.array} is {number(s.relative_noise, 3)} times as noisy as its array's median."
-            for s in noisy[:3]
+            for s in standing.too_noisy[:3]
         ]
         if standing.outliers:
             said.append(f"{len({o.log for o in standing.outliers})} logs are unlike the others.")
@@ -72,13 +69,12 @@ def verdict(standing: Standing) -> list[str]:
             f"The weight of sensor {d.sensor} of {d.array} drifts from {number(d.first, 3)} to {number(d.last, 3)}."
             for d in standing.drifts[:3]
         ]
-        if not (noisy or standing.outliers or standing.drifts):
+        if not (standing.too_noisy or standing.outliers or standing.drifts):
             said.append("No sensor, log or drift of weights stands out.")
-    if standing.task == "fit" and values:
-        said.append(f"{sum(v < LEVEL for v in values)} of {len(values)} fits are refused by the J test at {LEVEL:g}.")
+    if standing.task == "fit" and standing.values:
+        said.append(f"{standing.n_refused} of {len(standing.ranked)} fits are refused by the J test at {LEVEL:g}.")
     if standing.task == "diagnose":
-        differ = sum(bool(row["mismatch"]) for _, row in standing.ranked)
-        said.append(f"{differ} of {len(standing.ranked)} recordings differ from the simulation.")
+        said.append(f"{standing.n_differ} of {len(standing.ranked)} recordings differ from the simulation.")
     return said
 
 

@@ -13,7 +13,6 @@ NOISY = 2.0  # times the median of an array
 _OUTLIER = 5.0  # robust standard deviations
 _FEWEST = 5  # arrays, to say what is usual
 FEWEST_IN_TIME = 8  # recordings of one array, to say what drifts
-_MAD = 0.6744897501960817
 LEVEL = 0.01  # chance of a drift, for all sensors together
 
 
@@ -73,25 +72,42 @@ class Standing:
     drifts: tuple[Drift, ...]
     mechanisms: tuple[tuple[str, int], ...]
 
+    @property
+    def values(self) -> list[float]:
+        """What is ranked by, of those that have it."""
+        return [value for value, _ in self.ranked if np.isfinite(value)]
+
+    @property
+    def too_noisy(self) -> tuple[NoisySensor, ...]:
+        """Sensors more than `NOISY` times as noisy as the median of their array."""
+        return tuple(sensor for sensor in self.noisy if sensor.relative_noise > NOISY)
+
+    @property
+    def n_refused(self) -> int:
+        """Fits that the J test refuses."""
+        return sum(value < LEVEL for value in self.values)
+
+    @property
+    def n_differ(self) -> int:
+        """Recordings that differ from their simulation."""
+        return sum(bool(row["mismatch"]) for _, row in self.ranked)
+
     def summary(self) -> str:
         """In a few lines."""
         lines = [f"{self.n_logs} logs, {len(self.failures)} failed"]
-        if self.task == "fuse" and self.ranked:
-            gains = np.array([gain for gain, _ in self.ranked])
+        if self.task == "fuse" and self.values:
             lines.append(
                 f"Allan deviation of the plain mean over that of the virtual gyro, mean over averaging times: median "
-                f"{np.median(gains):.3g}, {gains.min():.3g} to {gains.max():.3g}"
+                f"{np.median(self.values):.3g}, {min(self.values):.3g} to {max(self.values):.3g}"
             )
         if self.task == "fit":
-            doubted = sum(value < LEVEL for value, _ in self.ranked)
-            lines.append(f"{doubted} of {len(self.ranked)} fits refused by the J test at {LEVEL:g}")
+            lines.append(f"{self.n_refused} of {len(self.ranked)} fits refused by the J test at {LEVEL:g}")
         if self.task == "diagnose":
-            lines.append(f"{sum(bool(row['mismatch']) for _, row in self.ranked)} of {len(self.ranked)} differ")
+            lines.append(f"{self.n_differ} of {len(self.ranked)} differ")
         lines += [f"  {name}: {count} logs" for name, count in self.mechanisms]
         lines += [
             f"noisy: sensor {s.sensor} of {s.array}, {s.relative_noise:.3g} times its array's median, {s.n_logs} logs"
-            for s in self.noisy[:3]
-            if s.relative_noise > NOISY
+            for s in self.too_noisy[:3]
         ]
         lines += [
             f"unlike the others: {o.log}, {o.what} {o.value:.3g} where {o.usual:.3g} is usual"
@@ -210,7 +226,7 @@ def _outliers(rows: Sequence[Mapping[str, Any]]) -> Iterable[Outlier]:
         for what, values in quantities.items():
             log = np.log(np.array(values, dtype=float))
             middle = np.nanmedian(log)
-            sd = np.nanmedian(np.abs(log - middle)) / _MAD
+            sd = stats.median_abs_deviation(log, scale="normal", nan_policy="omit")
             for row, value in zip(own, log, strict=True):
                 away = abs(value - middle) / max(sd, 1e-12)
                 if away > _OUTLIER and abs(value - middle) > 1e-6:

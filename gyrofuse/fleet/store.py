@@ -141,15 +141,23 @@ class ResultStore:
     def _sources(self) -> dict[str, tuple[Path, str]]:
         """File and status of each log's rows: what worked before what failed, a part before the table."""
         found: dict[str, tuple[Path, str]] = {}
-        for path in self._files():
-            for row in _read_file(path, ["log", "status"]).to_pylist():
+        for path in [*([self.path] if self.path.exists() else []), *sorted(self.parts.glob("*.parquet"))]:
+            for row in self._logs_in(path):
                 if row["status"] == "ok" or row["log"] not in found or found[row["log"]][1] != "ok":
                     found[row["log"]] = path, row["status"]
         return found
 
-    def _files(self) -> list[Path]:
-        """The table, then the parts that can be read; one that a machine has cut short is removed and done again."""
-        return [*([self.path] if self.path.exists() else []), *filter(_whole, sorted(self.parts.glob("*.parquet")))]
+    def _logs_in(self, path: Path) -> list[dict[str, str]]:
+        """Name and status of every row; none of a part that a machine has cut short: it is removed and done again."""
+        import pyarrow as pa
+
+        try:
+            return _read_file(path, ["log", "status"]).to_pylist()
+        except (pa.ArrowException, OSError):
+            if path == self.path:
+                raise
+            path.unlink(missing_ok=True)
+            return []
 
     def _table(self, rows: Sequence[Mapping[str, Any]]) -> pyarrow.Table:
         import pyarrow as pa
@@ -213,17 +221,6 @@ def _read_file(path: Path, columns: list[str] | None) -> pyarrow.Table:
 
     with parquet.ParquetFile(path) as file:
         return file.read(columns=columns)
-
-
-def _whole(part: Path) -> bool:
-    import pyarrow as pa
-
-    try:
-        _read_file(part, ["log"])
-    except (pa.ArrowException, OSError):
-        part.unlink(missing_ok=True)
-        return False
-    return True
 
 
 def _in_order(names: Sequence[str], source: Mapping[str, Path], empty: pyarrow.Table) -> Iterator[pyarrow.Table]:

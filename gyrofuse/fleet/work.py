@@ -84,7 +84,7 @@ def rows_of(task: Task, logs: Sequence[Log]) -> list[Row]:
             continue
         for (name, _), answer in zip(group, together, strict=True):
             answers[name] = answer
-    return [row for log in logs for row in _whole_rows(log, answers[log.name], task)]
+    return [row for log in logs for row in _whole_rows(log, answers[log.name])]
 
 
 def _alike(logs: Sequence[Log]) -> Iterable[list[tuple[str, Recording]]]:
@@ -120,7 +120,7 @@ def _alone(task: Task, recording: Recording) -> _Answer:
     return _Answer(rows, warned=[str(w.message) for w in caught])
 
 
-def _whole_rows(log: Log, answer: _Answer, task: Task) -> list[Row]:
+def _whole_rows(log: Log, answer: _Answer) -> list[Row]:
     common: Row = {"log": log.name, "status": "ok" if answer.error is None else "failed", "error": answer.error}
     if log.recording is not None:
         r = log.recording
