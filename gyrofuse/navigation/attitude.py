@@ -50,7 +50,10 @@ def matrix(q: Tensor) -> Tensor:
 
 
 def from_euler(angles: Tensor) -> Tensor:
-    """Quaternion of roll, pitch and yaw `(..., 3)` in radians: yaw first, about the axis that points down."""
+    """Quaternion of roll, pitch and yaw `(..., 3)` in radians: yaw first, about the axis that points down.
+
+    That of the matrix of Groves, second edition, (2.22), transposed: here the body is turned into the frame.
+    """
     half = angles / 2
     (cr, cp, cy), (sr, sp, sy) = torch.cos(half).unbind(-1), torch.sin(half).unbind(-1)
     return torch.stack(

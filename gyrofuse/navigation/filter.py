@@ -6,7 +6,9 @@ The errors are of attitude `psi` (`C_estimated = (I - [psi x]) C`, in the naviga
     psi' = -w_ie x psi - C dw,   dv' = [f x] psi + C df - 2 w_ie x dv,   dr' = dv
 
 with the errors `dw`, `df` of gyros and accelerometers that the noise models make (Titterton and Weston, chapters 12 and
-13; Groves, chapter 14; Farrell, chapter 11).
+13; Groves, chapter 14; Farrell, chapter 11). Numbers in round brackets are those of Groves, Principles of GNSS,
+Inertial, and Multisensor Integrated Navigation Systems, second edition, whose Earth-centred frame is here the tangent
+one, gravity the same everywhere in it.
 """
 
 from __future__ import annotations
@@ -81,10 +83,9 @@ class Flown(NamedTuple):
 
     Attributes:
         time: s.
-        position: m, `(time, flight, 3)`.
-        velocity: m/s.
-        attitude: `psi`, rad.
-        sd: Of all states that the filter claims, `(time, flight, state)`.
+        error: Of attitude (`psi`, rad), velocity (m/s), position (m) and the sensors' states, axis by axis, gyros
+            first, `(time, flight, state)`; NaN for what nobody knows.
+        sd: Of the same, as the filter claims.
         nees: Squared errors in units of the claimed covariance, of attitude, velocity, position and the sensors'
             known states, `(time, flight, 4)`; NaN where nobody knows.
         sizes: How many states each of them has.
@@ -92,13 +93,26 @@ class Flown(NamedTuple):
     """
 
     time: Tensor
-    position: Tensor
-    velocity: Tensor
-    attitude: Tensor
+    error: Tensor
     sd: Tensor
     nees: Tensor
     sizes: tuple[int, int, int, int]
     nis: Tensor
+
+    @property
+    def attitude(self) -> Tensor:
+        """Errors of attitude, rad, `(time, flight, 3)`."""
+        return self.error[..., _ATTITUDE]
+
+    @property
+    def velocity(self) -> Tensor:
+        """Errors of velocity, m/s."""
+        return self.error[..., _VELOCITY]
+
+    @property
+    def position(self) -> Tensor:
+        """Errors of position, m."""
+        return self.error[..., _POSITION]
 
 
 class _Sensor(NamedTuple):
@@ -185,13 +199,11 @@ def fly(
         seen.append((last * dt, *_errors(state, truth, last, sensors, known, covariance)))
         first = last
         progress("flying", last / n_samples)
-    time, attitude, velocity, position, claimed, nees = zip(*seen, strict=True)
+    time, error, claimed, nees = zip(*seen, strict=True)
     sizes = (3, 3, 3, 3 * sum(s.system.F.shape[-1] for s in sensors))
     return Flown(
         torch.tensor(time, dtype=torch.float64),
-        torch.stack(position),
-        torch.stack(velocity),
-        torch.stack(attitude),
+        torch.stack(error),
         torch.stack(claimed),
         torch.stack(nees),
         sizes,
@@ -243,14 +255,14 @@ def _carried(
             noise = transition @ noise @ transition.mT + noise
             transition = transition @ transition
     assert done is not None
-    moved = done[0] @ covariance @ done[0].mT + done[1]
+    moved = done[0] @ covariance @ done[0].mT + done[1]  # (3.46), the noise composed instead of halved
     return (moved + moved.mT) / 2
 
 
 def _one_sample(
     turn: Tensor, force: Tensor, sensors: list[_Sensor], earth: Tensor, dt: float, size: int
 ) -> tuple[Tensor, Tensor]:
-    """Transition and noise of one sample, `(flight, state, state)` each."""
+    """Transition (14.50) and noise (14.82) of one sample, `(flight, state, state)` each."""
     n_flights = len(turn)
     eye = torch.eye(size, dtype=turn.dtype)
     transition = eye.expand(n_flights, size, size).clone()
@@ -283,17 +295,17 @@ def _corrected(
     state: State, sensors: list[_Sensor], covariance: Tensor, fix: Tensor, sd: Tensor
 ) -> tuple[State, list[_Sensor], Tensor, Tensor]:
     """Everything after a position `(flight, 3)`, and the innovation squared in units of its covariance."""
-    innovation = state.position - fix  # of the position error and the fix's own
+    innovation = state.position - fix  # (14.102) with H of (14.115), both with the other sign
     spread = covariance[:, _POSITION, _POSITION] + torch.diag(sd.square())
     root = torch.linalg.cholesky(spread)
-    gain = torch.cholesky_solve(covariance[:, _POSITION, :], root).mT  # (flight, state, 3)
-    error = (gain @ innovation[..., None])[..., 0]
+    gain = torch.cholesky_solve(covariance[:, _POSITION, :], root).mT  # (3.21), (flight, state, 3)
+    error = (gain @ innovation[..., None])[..., 0]  # (3.24), nothing being predicted in closed loop
     surprise = torch.linalg.solve_triangular(root, innovation[..., None], upper=False).square().sum((-1, -2))
     # (I - K H) P (I - K H)' + K R K', which stays positive definite (Joseph).
     kept = torch.eye(covariance.shape[-1], dtype=covariance.dtype).repeat(len(covariance), 1, 1)
     kept[:, :, _POSITION] -= gain
     covariance = kept @ covariance @ kept.mT + gain * sd.square() @ gain.mT
-    state = State(
+    state = State(  # (14.7) to (14.9)
         multiply(from_rotation_vector(error[:, _ATTITUDE]), state.attitude),
         state.velocity - error[:, _VELOCITY],
         state.position - error[:, _POSITION],
@@ -309,20 +321,19 @@ def _corrected(
 def _errors(
     state: State, truth: tuple[Tensor, ...], at: int, sensors: list[_Sensor], known: list[Tensor], covariance: Tensor
 ) -> tuple[Tensor, ...]:
-    """Attitude, velocity and position errors, claimed standard deviations, and squared errors in their units."""
+    """Errors of all states, claimed standard deviations, and squared errors of kinds of states in their units."""
     position, velocity, attitude = (part[at] for part in truth[:3])
     psi = rotation_vector(multiply(attitude.expand_as(state.attitude), conjugate(state.attitude)))
     off = [psi, state.velocity - velocity, state.position - position]
     slices = [_ATTITUDE, _VELOCITY, _POSITION, slice(9, covariance.shape[-1])]
-    alike = all(k.shape[-1] == s.estimate.shape[-1] for k, s in zip(known, sensors, strict=True))
-    if alike:
+    if all(k.shape[-1] == s.estimate.shape[-1] for k, s in zip(known, sensors, strict=True)):
         left = [(k - s.estimate).flatten(-2) for k, s in zip(known, sensors, strict=True)]
-        off.append(torch.cat(left, -1))
-    nees = [_nees(error, covariance[:, own, own]) for error, own in zip(off, slices, strict=False)]
-    while len(nees) < len(slices):
-        nees.append(torch.full_like(nees[0], torch.nan))
+    else:
+        left = [torch.full_like(s.estimate, torch.nan).flatten(-2) for s in sensors]
+    off.append(torch.cat(left, -1))
+    nees = [_nees(error, covariance[:, own, own]) for error, own in zip(off, slices, strict=True)]
     claimed = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
-    return (*off[:3], claimed, torch.stack(nees, -1))
+    return torch.cat(off, -1), claimed, torch.stack(nees, -1)
 
 
 def _nees(error: Tensor, covariance: Tensor) -> Tensor:

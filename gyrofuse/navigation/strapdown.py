@@ -6,7 +6,8 @@ In a frame tangent to the Earth and fixed to it (north, east, down),
 
 An interval's increments are integrals in the axes of a body that turns meanwhile: coning and sculling are what the
 order of turns and pushes within it changes, worked out from the interval and the one before (Savage 1998, parts 1 and
-2; Titterton and Weston, chapter 11).
+2; Titterton and Weston, chapter 11). Numbers in round brackets are those of Groves, Principles of GNSS, Inertial, and
+Multisensor Integrated Navigation Systems, second edition, whose Earth-centred frame is here the tangent one.
 """
 
 from __future__ import annotations
@@ -53,21 +54,22 @@ def step(state: State, now: tuple[Tensor, Tensor], before: tuple[Tensor, Tensor]
     angle_, push_ = before
     # Coning: linear rate over both intervals.
     turn = angle + torch.linalg.cross(angle_, angle) / 12
-    # Rotation while it is pushed, exact for constant rate and force, and sculling beside it.
+    # Rotation while it is pushed, exact for constant rate and force (5.84), and sculling beside it.
     pushed = push + _turned(angle, push)
     pushed = pushed + (torch.linalg.cross(angle_, push) + torch.linalg.cross(push_, angle)) / 12
     gained = rotate(state.attitude, pushed)
     half = from_rotation_vector((-0.5 * dt * earth).expand_as(angle))
-    gained = rotate(half, gained)  # the frame turns as well
+    gained = rotate(half, gained)  # (5.85): the frame turns as well
     down = torch.tensor([0.0, 0.0, GRAVITY], dtype=angle.dtype, device=angle.device)
     gained = gained + dt * down
+    # (5.36), with the velocity in the middle
     gained = gained - 2 * dt * torch.linalg.cross(earth.expand_as(gained), state.velocity + gained / 2)
     velocity = state.velocity + gained
-    # Of a push that changes linearly, twice integrated.
+    # (5.38) beside what a push that changes linearly adds, twice integrated.
     change = rotate(state.attitude, push - push_ + torch.linalg.cross(angle, push))
     position = state.position + dt * (state.velocity + gained / 2 - change / 12)
     whole = from_rotation_vector((-dt * earth).expand_as(angle))
-    attitude = multiply(multiply(whole, state.attitude), from_rotation_vector(turn))
+    attitude = multiply(multiply(whole, state.attitude), from_rotation_vector(turn))  # (5.75), with quaternions
     return State(attitude / attitude.norm(dim=-1, keepdim=True), velocity, position)
 
 

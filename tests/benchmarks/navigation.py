@@ -3,7 +3,8 @@
     python tests/benchmarks/navigation.py [--flights 500] [--quick]
 
 Flights with errors of the very model that the filter is told: normalised squared errors of attitude, velocity,
-position and the sensors' states (NEES), and of innovations (NIS), averaged over the flights, against their 95 % bands.
+position and the sensors' states (NEES), of every state alone, and of innovations (NIS), averaged over the flights,
+against their 95 % bands.
 Averages at neighbouring times go together, so that a share of 95 % is what is expected, not what is had exactly.
 """
 
@@ -23,6 +24,10 @@ from gyrofuse.navigation import Alignment, Gnss, UnitErrors, flight, fly
 DEGREE = math.pi / 180
 RATE = 100.0
 NAMES = ("attitude", "velocity", "position", "sensors")
+STATES = [f"{what} {axis}" for what in ("attitude", "velocity", "position") for axis in ("north", "east", "down")]
+STATES += [f"gyro {axis}, {what}" for axis in "xyz" for what in ("AR1", "RW")] + [
+    f"accelerometer {axis}, RW" for axis in "xyz"
+]
 
 
 def unit() -> UnitErrors:
@@ -39,7 +44,7 @@ def told(name: str, values: torch.Tensor, n_flights: int, size: int) -> None:
     mean = values.mean(-1)
     inside = ((mean > low) & (mean < high)).double().mean()
     print(
-        f"{name:<10}  {size:>2} states  mean {float(mean.mean()) / size:.3f} of what is expected; inside the 95 % band "
+        f"{name:<22}  {size:>2} states  mean {float(mean.mean()) / size:.3f} of what is expected; inside the 95 % band "
         f"[{low / size:.3f}, {high / size:.3f}] at {100 * float(inside):.1f} % of the times; "
         f"{float(mean.min()) / size:.3f} to {float(mean.max()) / size:.3f}"
     )
@@ -59,6 +64,8 @@ def main() -> None:
     seconds = time.perf_counter() - start
     for k, (name, size) in enumerate(zip(NAMES, out.sizes, strict=True)):
         told(name, out.nees[..., k], n, size)
+    for k, name in enumerate(STATES):
+        told(name, (out.error[..., k] / out.sd[..., k]).square(), n, 1)
     told("innovation", out.nis, n, 3)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(f"{n} flights of {trajectory.duration:g} s at {RATE:g} Hz: {seconds:.1f} s, peak {peak:.0f} MiB")
