@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from torch import distributed
@@ -35,9 +37,31 @@ def told_by_first(value: Any, world_size: int) -> Any:
     return value
 
 
-def where_true(value: bool, world_size: int) -> list[int]:
-    """Processes for which something is true, in all of them."""
-    told: list[Any] = [value] * world_size
+@contextmanager
+def all_or_none(otherwise: str, world_size: int) -> Iterator[None]:
+    """Work that is worth something if all processes do their share: nobody waits for one that fails.
+
+    Args:
+        otherwise: What is to be said if one fails, a clause: "x.npy was not written".
+        world_size: Number of processes.
+
+    Raises:
+        RuntimeError: Another process failed; that one raises what happened to it.
+    """
+    try:
+        yield
+    except BaseException:
+        _told_of(True, world_size)
+        raise
+    if failed := [str(rank) for rank, whether in enumerate(_told_of(False, world_size)) if whether]:
+        raise RuntimeError(
+            f"{otherwise}, for process(es) {', '.join(failed)} of {world_size} failed; their own errors say why"
+        )
+
+
+def _told_of(failed: bool, world_size: int) -> list[bool]:
+    """Who failed, in all processes."""
+    told = [failed] * world_size
     if world_size > 1:
-        distributed.all_gather_object(told, value)
-    return [rank for rank, whether in enumerate(told) if whether]
+        distributed.all_gather_object(told, failed)
+    return told

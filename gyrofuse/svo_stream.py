@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gyrofuse._checks import check_n_levels, largest_level
 from gyrofuse._linalg import check_positive_definite
-from gyrofuse._processes import place
+from gyrofuse._processes import all_or_none, place
 from gyrofuse._result import listed
 from gyrofuse._virtual_gyro import VirtualGyro
 from gyrofuse.long_recording import LongRecording, Progress, check_long_recording, silent, stretch_of
@@ -58,7 +58,7 @@ def stream_svo(
     Raises:
         TypeError: `recording` is not a `LongRecording`.
         ValueError: Fewer than two sensors, too few samples, no window that all sensors have, or bad options.
-        RuntimeError: `fabric` has several processes and was not launched.
+        RuntimeError: `fabric` has several processes and was not launched, or another process failed.
         SingularCovarianceError: A dead, duplicated or linearly dependent sensor.
 
     References:
@@ -77,14 +77,15 @@ def stream_svo(
     n_levels = check_n_levels(asked if asked is not None else _most_levels(recording), recording.n_samples)
     resolve_scale_weights(scale_weights, n_levels)  # what is wrong with them is told now, not after hours
     rank, world_size = place(fabric)
-    metric = measure_stretch(
-        recording,
-        n_levels,
-        *stretch_of(recording.n_samples, rank, world_size),
-        chunk_samples=chunk_samples,
-        device=None if fabric is None else fabric.device,
-        progress=progress,
-    )
+    with all_or_none("`recording`: was not read to its end", world_size):
+        metric = measure_stretch(
+            recording,
+            n_levels,
+            *stretch_of(recording.n_samples, rank, world_size),
+            chunk_samples=chunk_samples,
+            device=None if fabric is None else fabric.device,
+            progress=progress,
+        )
     metric.sync(should_sync=world_size > 1)
     sums, counts = metric.sums.cpu(), metric.counts.cpu()
     windows = counts.amin((-1, -2))

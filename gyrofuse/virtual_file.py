@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gyrofuse._checks import check_floating
 from gyrofuse._output import Outputs
-from gyrofuse._processes import place, told_by_first, where_true
+from gyrofuse._processes import all_or_none, place, told_by_first
 from gyrofuse.long_recording import LongRecording, Progress, check_long_recording, silent, stretch_of
 from gyrofuse.svo_result import fuse
 
@@ -88,16 +88,8 @@ def _draft_for_all(path: Path, n_samples: int, fabric: Fabric | None, *, force: 
         found = told_by_first(found, world_size)
         if isinstance(found, Exception):
             raise found
-        try:
+        with all_or_none(f"{path}: was not written", world_size):
             yield found
-        except BaseException:
-            where_true(True, world_size)
-            raise
-        if failed := where_true(False, world_size):
-            raise RuntimeError(
-                f"{path}: was not written, for process(es) {', '.join(map(str, failed))} of {world_size} failed; "
-                "their own errors say why"
-            )
     if fabric is not None:
         fabric.barrier()  # the file has its name before anyone goes on
 

@@ -266,7 +266,10 @@ def test_what_cannot_be_read_by_stretches_is_refused(tmp_path: Path):
 
 
 def one_of_two(rank: int, port: int, folder: str) -> None:
-    """One process that writes its half of three virtual gyros and says what came of it: none, 0 or 1 fails halfway."""
+    """One process that writes its half of three virtual gyros and says what came of it: none, 0 or 1 fails halfway.
+
+    And what came of measuring the recording: nobody waits for one that failed.
+    """
     distributed.init_process_group("gloo", init_method=f"tcp://127.0.0.1:{port}", rank=rank, world_size=2)
     signal, fabric = samples(), launched(rank, 2)
     fabric.barrier = distributed.barrier
@@ -286,22 +289,31 @@ def one_of_two(rank: int, port: int, folder: str) -> None:
             except (OSError, RuntimeError) as error:
                 said = f"{type(error).__name__}: {error}"
             Path(folder, f"{failing} {rank}.txt").write_text(said)
+            try:
+                weights = gf.stream_svo(recording, n_levels=3, chunk_samples=300, fabric=fabric).weights
+                measured = f"{len(weights)} weights"
+            except (OSError, RuntimeError) as error:
+                measured = f"{type(error).__name__}: {error}"
+            Path(folder, f"{failing} {rank} measured.txt").write_text(measured)
     finally:
         distributed.destroy_process_group()
 
 
 @pytest.mark.skipif(not distributed.is_available(), reason="this torch is built without torch.distributed")
-def test_a_file_of_two_processes_appears_whole_or_not_at_all(tmp_path: Path):
+def test_two_processes_are_both_done_or_both_told(tmp_path: Path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     torch.multiprocessing.spawn(one_of_two, args=(port, str(tmp_path)), nprocs=2)
     said = {path.stem: path.read_text() for path in tmp_path.glob("*.txt")}
     assert said["None 0"] == said["None 1"] == "nothing"
+    assert said["None 0 measured"] == said["None 1 measured"] == "4 weights"
     np.testing.assert_allclose(np.load(tmp_path / "None.npy"), samples().mean(0).numpy(), rtol=1e-13)
     for failing in (0, 1):
         assert said[f"{failing} {failing}"] == "OSError: the disk is gone"
         assert f"was not written, for process(es) {failing} of 2 failed" in said[f"{failing} {1 - failing}"]
+        assert said[f"{failing} {failing} measured"] == "OSError: the disk is gone"
+        assert f"read to its end, for process(es) {failing} of 2" in said[f"{failing} {1 - failing} measured"]
     assert {path.name for path in tmp_path.iterdir()} == {"None.npy", *(f"{name}.txt" for name in said)}
 
 
