@@ -213,6 +213,10 @@ def test_a_filter_that_is_told_the_truth_is_consistent():
             at = int((out.time - second).abs().argmin())
             low, high = stats.chi2.interval(0.9999, 40 * size)
             assert low < float(out.nees[at, :, state].sum()) < high
+    off = (out.error / out.sd)[10::100].square().sum(1)  # (time, state), each state alone
+    low, high = stats.chi2.interval(1 - 1e-3 / off.numel(), 40)
+    assert off.shape[-1] == sum(out.sizes)
+    assert bool(((off > low) & (off < high)).all())
 
 
 def test_a_filter_that_is_told_too_little_noise_shows_it():
