@@ -17,12 +17,13 @@ from gyrofuse.cli_shared import (
     agreed_unit,
     draw,
     files_written,
+    model_grid,
     outputs,
     read_model,
     write_json,
 )
 from gyrofuse.processes import Model
-from gyrofuse.units import RATE_UNITS, rate_unit_factor
+from gyrofuse.units import GRAVITY, RATE_UNITS, rate_unit_factor
 
 
 def emulate(
@@ -32,11 +33,12 @@ def emulate(
         Path | None, typer.Option(metavar="FILE", help="What makes the errors; the model of --against by default.")
     ] = None,
     accelerometer: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Noise of the accelerometers, m/s^2; of a fair one by default.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Noise of the accelerometers, m/s^2 or g; of fair ones by default."),
     ] = None,
     trajectory: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.csv", help="time, north, east, down [, roll, pitch, yaw]; a flight by default."),
+        typer.Option(metavar="FILE.csv", help="time (s), north, east, down (m) [, roll, pitch, yaw (rad)]."),
     ] = None,
     rate: Annotated[
         float | None, typer.Option(metavar="HZ", help="Of the samples; that of the models, or 100, by default.")
@@ -63,14 +65,14 @@ def emulate(
     given = [path for path in (model, against, truth, accelerometer, trajectory) if path is not None]
     with outputs(force, given, figure=figure, json=json_file) as drafts:
         gyros = [path for path in (model, against, truth) if path is not None]
-        hz = agreed_rate(gyros, rate) or 100.0
+        hz = agreed_rate([*gyros, *([accelerometer] if accelerometer else [])], rate) or 100.0
         told = [_gyro(path, unit) for path in gyros]
         with progress_bar("flying") as show:
             result = compare(
                 told[0],
                 told[1],
                 truth=told[2] if truth else None,
-                accelerometer=_single(accelerometer) if accelerometer else None,
+                accelerometer=_accelerometer(accelerometer) if accelerometer else None,
                 rate=hz,
                 trajectory=read_trajectory(trajectory) if trajectory else None,
                 n_flights=flights,
@@ -98,3 +100,11 @@ def _gyro(path: Path, unit: str | None) -> Model:
     if name not in RATE_UNITS:
         raise ValueError(f"{path}: expected a model in one of {', '.join(RATE_UNITS)}, found {name}; give --unit")
     return _single(path).scaled(rate_unit_factor(name, "rad/s"))
+
+
+def _accelerometer(path: Path) -> Model:
+    """In m/s^2, which a model that says nothing is in."""
+    unit = model_grid(path)[1]
+    if unit not in (None, "m/s^2", "g"):
+        raise ValueError(f"{path}: expected a model of an accelerometer in m/s^2 or g, found one in {unit}")
+    return _single(path).scaled(GRAVITY if unit == "g" else 1.0)

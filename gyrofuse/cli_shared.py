@@ -190,6 +190,8 @@ def agreed_rate(models: Sequence[Path], rate: float | None) -> float | None:
     chosen, by = (None, "") if rate is None else (check_positive("--rate", rate), "--rate")
     for model in models:
         own = model_grid(model)[0]
+        if own is not None:
+            check_positive(f"{model}: rate", own)
         if own is not None and chosen is not None and not same_rate(own, chosen):
             raise ValueError(
                 f"`{by}`: expected {own:g} Hz, for which the model was fitted, got {chosen:g}; see {model}"

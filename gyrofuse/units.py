@@ -10,6 +10,7 @@ import math
 
 SECONDS_PER_HOUR = 3600.0
 ARCSECONDS_PER_DEGREE = 3600.0
+GRAVITY = 9.80665  # m/s^2, standard
 
 _DEG_PER_S = {"deg/s": 1.0, "mdeg/s": 1e-3, "deg/h": 1 / SECONDS_PER_HOUR, "rad/s": 180 / math.pi}
 RATE_UNITS = tuple(_DEG_PER_S)

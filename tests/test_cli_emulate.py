@@ -17,6 +17,9 @@ def models(tmp_path: Path) -> Path:
     wrong = gf.parse_model("AR1(phi=0.18,variance=0.03) + RW(variance=1e-6)")
     for name, model in (("b", truth), ("a", wrong)):
         (tmp_path / f"{name}.json").write_text(json.dumps({**model.to_dict(), "rate": 10.0, "unit": "deg/s"}))
+    accelerometer = gf.WhiteNoise(1e-4).to_dict()
+    for name, told in (("fast", {"rate": 20.0}), ("metres", {"unit": "m/s^2"}), ("g", {"unit": "g"})):
+        (tmp_path / f"{name}.json").write_text(json.dumps({**accelerometer, **told}))
     rows = [f"{15 * i},{250 * i},{40 * (i % 2)},{-100 - i}" for i in range(8)]
     (tmp_path / "path.csv").write_text("\n".join(["time,north,east,down", *rows]))
     return tmp_path
@@ -36,6 +39,14 @@ def test_two_models_are_compared(run: Run, models: Path):
     assert json.loads(Path("f.json").read_text())["ratio"] == told["ratio"]
 
 
+def test_accelerometers_are_in_their_unit(run: Run, models: Path):
+    asked = ("emulate", "--model", "a.json", "--against", "b.json", "--trajectory", "path.csv", "--flights", 8)
+    for name in ("metres", "g"):
+        assert run(*asked, "--accelerometer", f"{name}.json", "--json", f"{name}-out.json").status == 0
+    metres, g = (json.loads(Path(f"{name}-out.json").read_text())["position"][1][-1] for name in ("metres", "g"))
+    assert g > 1.1 * metres  # with a fix every second
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
@@ -45,6 +56,8 @@ def test_two_models_are_compared(run: Run, models: Path):
         (("--model", "a.json", "--against", "b.json", "--flights", "0"), "`--flights`"),
         (("--model", "a.json", "--against", "path.csv"), "path.csv: expected a model in JSON"),
         (("--model", "a.json", "--against", "b.json", "--trajectory", "a.json"), "a.json: expected"),
+        (("--model", "a.json", "--against", "b.json", "--accelerometer", "a.json"), "m/s^2 or g, found one in deg/s"),
+        (("--model", "a.json", "--against", "b.json", "--accelerometer", "fast.json"), "expected 20 Hz, for which"),
     ],
 )
 def test_bad_requests_are_refused(run: Run, models: Path, arguments, says):

@@ -34,7 +34,8 @@ from gyrofuse.navigation.attitude import (
     rotation_vector,
     skew,
 )
-from gyrofuse.navigation.trajectory import EARTH_RATE, GRAVITY
+from gyrofuse.navigation.trajectory import EARTH_RATE
+from gyrofuse.units import GRAVITY
 
 DEGREE = math.pi / 180
 NO_EARTH = torch.zeros(3, dtype=torch.float64)
@@ -219,6 +220,22 @@ def test_a_filter_that_is_told_the_truth_is_consistent():
     assert bool(((off > low) & (off < high)).all())
 
 
+def test_a_filter_starts_from_where_the_model_does():
+    """A ramp is known from its first sample on: told of it, the filter takes it off."""
+    gyro = gf.WhiteNoise((0.02 * DEGREE) ** 2) + gf.Drift(2e-4 * DEGREE)
+    told = UnitErrors(gyro, gf.WhiteNoise(0.01**2), 50.0)
+    drawn = told.simulate(60 * 50, 40, torch.Generator().manual_seed(3))
+    alignment = Alignment(attitude=(0.2 * DEGREE, 0.2 * DEGREE, 0.5 * DEGREE))
+    asked = {"gnss": Gnss(outage=(40.0, 50.0)), "alignment": alignment}
+    out = fly(flight(), drawn, told, generator=torch.Generator().manual_seed(4), **asked)
+    low, high = stats.chi2.interval(0.9999, 120)
+    end = int((out.time - 50.0).abs().argmin())
+    assert all(low < total < high for total in out.nees[end, :, :3].sum(0).tolist())
+    unaware = UnitErrors(gf.WhiteNoise((0.02 * DEGREE) ** 2), told.accelerometer, 50.0)
+    lost = fly(flight(), drawn, unaware, generator=torch.Generator().manual_seed(4), **asked)
+    assert float(lost.nees[end, :, 0].sum()) > 10 * high
+
+
 def test_a_filter_that_is_told_too_little_noise_shows_it():
     out = flown(unit(0.1))
     assert float(out.nis.sum()) > stats.chi2.isf(0.01, out.nis.numel() * 3)  # the fixes' own errors are most of it
@@ -256,6 +273,54 @@ def test_the_same_model_costs_the_same_and_a_wrong_one_more():
     assert len(other.plot().lines) >= 2
 
 
+def test_an_outage_after_the_flight_is_none():
+    truth = gf.parse_model("AR1(phi=0.18,variance=1e-5) + RW(variance=2e-13)")
+    wrong = gf.parse_model("AR1(phi=0.18,variance=1e-5) + RW(variance=2e-10)")
+    short = Trajectory(flight().time[:6], flight().position[:6])
+    asked = {"trajectory": short, "rate": 20.0, "n_flights": 4}
+    none, after = (emulate(wrong, truth, gnss=Gnss(outage=o), **asked) for o in (None, (160.0, 210.0)))
+    assert after.outage is None
+    assert after.peak[:2] == none.peak[:2]
+    assert float(after.ratio.max()) == after.peak.ratio
+    assert math.isnan(after.peak.low)  # four flights do not tell how far off it may be
+    assert after.to_dict()["peak"]["low"] is None
+    assert emulate(wrong, truth, gnss=Gnss(outage=(60.0, 210.0)), **asked).outage == (60.0, 75.0)
+
+
+def test_limits_of_the_peak_know_that_it_was_chosen():
+    """Two filters that are wrong by as much: the largest of many ratios is above one, its limits are not."""
+    truth = gf.parse_model("AR1(phi=0.18,variance=1e-5) + RW(variance=2e-11)")
+    more, less = (gf.parse_model(f"AR1(phi=0.18,variance=1e-5) + RW(variance=2e-{k})") for k in (10, 12))
+    short = Trajectory(flight().time[:8], flight().position[:8])
+    asked = {"trajectory": short, "gnss": Gnss(outage=(60.0, 100.0)), "rate": 20.0, "n_flights": 12, "truth": truth}
+    one, other = emulate(more, less, **asked).peak, emulate(less, more, **asked).peak
+    assert min(one.low, other.low) < 1.0
+    assert max(one.ratio, other.ratio) > 1.0
+    assert all(peak.low < peak.ratio <= peak.high for peak in (one, other))
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"rate": 0.0}, "`rate`"),
+        ({"rate": -1.0}, "`rate`"),
+        ({"sd": 1.0}, "`sd`: expected three numbers"),
+        ({"sd": (1.0, -1.0, 1.0)}, "`sd`: expected three numbers"),
+        ({"outage": (210.0, 160.0)}, "`outage`: expected its start and a later end"),
+    ],
+)
+def test_fixes_that_cannot_be_are_refused(options, says):
+    with pytest.raises(ValueError, match=says):
+        Gnss(**options)
+
+
+@pytest.mark.parametrize(("rate", "of_fixes"), [(0.3, 1.0), (20.0, 50.0), (20.0, 3.0)])
+def test_fixes_between_samples_are_refused(rate, of_fixes):
+    model = gf.WhiteNoise(1e-6)
+    with pytest.raises(ValueError, match="`gnss`: expected fixes a whole number of the unit's samples apart"):
+        emulate(model, model, rate=rate, gnss=Gnss(rate=of_fixes), n_flights=2)
+
+
 def test_models_for_each_flight_are_those_of_the_flights():
     truth = gf.AR1(0.18, 1e-5) + gf.RandomWalk(2e-13)
     each = truth.with_params(truth.params.expand(6, -1).clone())
@@ -280,12 +345,21 @@ def test_bad_trajectories_are_refused(tmp_path):
         Trajectory(t, place * torch.nan)
     with pytest.raises(ValueError, match=r"more than 0.5 m/s over ground, got 0; give `euler`"):
         Trajectory(t, torch.zeros(8, 3, dtype=torch.float64)).at(t)
+    with pytest.raises(ValueError, match=r"a pitch of at most pi/2, got a pitch of 5; degrees\?"):
+        Trajectory(t, place, place.new_full((8, 3), 5.0))
+    with pytest.raises(ValueError, match=r"`latitude`: expected rad, at most pi/2, got 47; degrees\?"):
+        Trajectory(t, place, latitude=47.0)
+    with pytest.raises(TypeError, match="`time`: expected a torch tensor, got list"):
+        Trajectory([0, 1], place)  # type: ignore[arg-type]
     path = tmp_path / "t.csv"
     path.write_text("time,north\n0,1\n")
     with pytest.raises(ValueError, match="found no east, down"):
         read_trajectory(path)
     path.write_text("time,north,east,down\n0,1,2\n")
     with pytest.raises(ValueError, match="expected as many columns as names, 4, found 3"):
+        read_trajectory(path)
+    path.write_text("\n".join(["time,north,east,down,roll,pitch", *(f"{i},{9 * i},0,0,0,0" for i in range(8))]))
+    with pytest.raises(ValueError, match="expected roll, pitch and yaw, or none of them, found roll and pitch alone"):
         read_trajectory(path)
 
 
@@ -297,6 +371,27 @@ def test_a_trajectory_is_read_from_a_table(tmp_path):
     torch.testing.assert_close(motion.position[0], tensor(30, 3, -3))
     torch.testing.assert_close(motion.attitude[0], from_euler(tensor(0, 0.1, 0.3)))
     torch.testing.assert_close(motion.rate[0], tensor(-0.1 * math.sin(0.1), 0, 0.1 * math.cos(0.1)))
+
+
+def test_roll_and_yaw_go_round():
+    t = torch.arange(0, 60, 1.0, dtype=torch.float64)
+    turned = 0.3 * t
+    wrapped = torch.remainder(turned + math.pi, 2 * math.pi) - math.pi
+    euler = torch.stack([wrapped, 0 * t, 0 * t], -1)
+    rate = Trajectory(t, torch.stack([9 * t, 0 * t, 0 * t], -1), euler).at(torch.linspace(1, 58, 200)).rate
+    torch.testing.assert_close(rate, tensor(0.3, 0, 0).expand_as(rate))
+
+
+def test_at_rest_on_the_turning_earth_nothing_moves():
+    t = torch.arange(0, 601, 1.0, dtype=torch.float64)
+    zero = torch.zeros(len(t), 3, dtype=torch.float64)
+    rest = Trajectory(t, zero, zero + tensor(0.1, 0.2, 0.3), latitude=0.8)
+    first, ideal = rest.at(t[:1]), rest.increments(1.0)
+    start = State(first.attitude[0], first.velocity[0], first.position[0])
+    end = navigate(start, *ideal, 1.0, rest.earth_rate)
+    assert float(end.position.norm(dim=-1).max()) < 1e-3  # m, after ten minutes at one sample a second
+    with pytest.raises(ValueError, match=r"`angles` and `pushes`: expected \(..., interval, 3\) both"):
+        navigate(start, ideal.angle[:0], ideal.velocity[:0], 1.0, rest.earth_rate)
 
 
 def test_at_rest_the_unit_feels_the_earth_turn():

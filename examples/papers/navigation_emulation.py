@@ -159,7 +159,7 @@ def main() -> None:
             "fig 8",
             f"it rises in the outage, to {PAPER_PEAK} ({name})",
             f"peak {ratio:.4f}, 95 % interval {low:.4f} to {high:.4f}",
-            low <= PAPER_PEAK <= high,
+            1 < low <= PAPER_PEAK <= high,
         )
     plot_flight(asked.out / _FLIGHT)
     plot_ratios(studies, asked.out / _RATIO)

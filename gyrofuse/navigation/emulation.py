@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import check_positive_integer
+from gyrofuse._checks import check_confidence_level, check_positive_integer
 from gyrofuse._model import Model
-from gyrofuse._result import ConfidenceInterval, listed
+from gyrofuse._result import ConfidenceInterval, cleaned, listed
 from gyrofuse.navigation.filter import Alignment, Flown, Gnss, fly
 from gyrofuse.navigation.sensors import UnitErrors
 from gyrofuse.navigation.trajectory import Trajectory, flight
@@ -20,7 +21,24 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _RESAMPLES = 1000
+_FEWEST = 5  # flights, for limits
 _ACCELEROMETER = "WN(variance=1e-4) + RW(variance=1e-11)"  # m/s^2, of a sample
+
+
+class Peak(NamedTuple):
+    """The largest ratio, and limits that know that it was chosen for being the largest.
+
+    Attributes:
+        time: s.
+        ratio: Of mean position errors.
+        low: Lower limit, by resampling flights and choosing anew each time; NaN with fewer than five flights.
+        high: Upper limit.
+    """
+
+    time: float
+    ratio: float
+    low: float
+    high: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,10 +50,11 @@ class Emulation:
         position: Mean length of the position error over flights, m, of the one and of the other, `(2, time)`.
         attitude: Mean length of the attitude error, rad, likewise.
         ratio: Of the position errors, the one over the other, `(time,)`.
-        interval: Its limits, by resampling flights, `(time,)` each.
-        confidence_level: Of these.
+        interval: Its limits at each time, by resampling flights, `(time,)` each; NaN with fewer than five flights.
+        peak: The largest ratio of the outage, or anywhere without one.
+        confidence_level: Of all limits.
         n_flights: Flights.
-        outage: s, where there is one.
+        outage: s, as far as the flights go; None without one.
     """
 
     time: Tensor
@@ -43,18 +62,10 @@ class Emulation:
     attitude: Tensor
     ratio: Tensor
     interval: ConfidenceInterval
+    peak: Peak
     confidence_level: float
     n_flights: int
     outage: tuple[float, float] | None
-
-    @property
-    def peak(self) -> tuple[float, float, float, float]:
-        """The largest ratio during the outage, or anywhere without one: time (s), ratio, and its limits."""
-        inside = torch.ones_like(self.time, dtype=torch.bool)
-        if self.outage is not None:
-            inside = (self.time > self.outage[0]) & (self.time <= self.outage[1])
-        at = int(torch.where(inside, self.ratio, -torch.inf).argmax())
-        return tuple(float(v[at]) for v in (self.time, self.ratio, *self.interval))  # type: ignore[return-value]
 
     def summary(self) -> str:
         """The costs in a few lines."""
@@ -89,12 +100,11 @@ class Emulation:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain lists and numbers, ready for JSON."""
-        when, ratio, low, high = self.peak
         return {
             "n_flights": self.n_flights,
             "confidence_level": self.confidence_level,
             "outage": None if self.outage is None else list(self.outage),
-            "peak": {"time": when, "ratio": ratio, "low": low, "high": high},
+            "peak": cleaned(self.peak._asdict()),
             "time": listed(self.time),
             "ratio": listed(self.ratio),
             "low": listed(self.interval.low),
@@ -142,12 +152,14 @@ def emulate(
         Errors over time, and their ratio.
 
     Raises:
-        ValueError: Models without a state space, of other batch sizes, or numbers out of range.
+        ValueError: Models without a state space, of other batch sizes, numbers out of range, or fixes that are not a
+            whole number of samples apart.
 
     References:
         Voirol et al., section on the emulation study, steps (iii) and (iv).
     """
     check_positive_integer("n_flights", n_flights)
+    check_confidence_level(confidence_level)
     for name, given in (("model", model), ("against", against), ("truth", truth)):
         if given is not None and given.params.ndim > 1 and given.params.shape[:-1] != (n_flights,):
             raise ValueError(
@@ -156,6 +168,7 @@ def emulate(
             )
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     path, gnss = trajectory or flight(), gnss or Gnss()
+    gnss.samples_apart(rate)
     shared = _accelerometer() if accelerometer is None else accelerometer
     n_samples = round(path.duration * rate)
     drawn = UnitErrors(against if truth is None else truth, shared, rate).simulate(n_samples, n_flights, generator)
@@ -178,7 +191,10 @@ def emulate(
                 progress=half,
             )
         )
-    return _compared(flown[0], flown[1], gnss.outage, confidence_level, generator)
+    outage = gnss.outage
+    if outage is not None:
+        outage = (outage[0], min(outage[1], path.duration)) if outage[0] < path.duration else None
+    return _compared(flown[0], flown[1], outage, confidence_level, generator)
 
 
 def _accelerometer() -> Model:
@@ -198,8 +214,28 @@ def _compared(
     share.scatter_add_(0, resampled.mT, torch.ones_like(share))
     means = lengths @ share / n  # (2, time, resample): flights stay together, so both share what they have in common
     tails = torch.tensor([(1 - level) / 2, (1 + level) / 2], dtype=lengths.dtype)
-    low, high = (means[0] / means[1]).quantile(tails, dim=-1)
+    ratio, ratios = position[0] / position[1], means[0] / means[1]
+    inside = torch.ones_like(one.time, dtype=torch.bool)
+    if outage is not None:
+        inside = (one.time > outage[0]) & (one.time <= outage[1])
+    at = int(torch.where(inside, ratio, -torch.inf).argmax())
+    largest = float(ratio[at])
+    # The largest of many is too large, and that of resampled flights is by as much larger again: turned round.
+    below, above = (largest**2 / ratios[inside].amax(0).quantile(tails.flip(0))).tolist()
+    above = max(above, largest)
+    low, high = ratios.quantile(tails, dim=-1)
+    if n < _FEWEST:
+        below = above = math.nan
+        low, high = (torch.full_like(ratio, torch.nan) for _ in range(2))
     attitude = torch.stack([flown.attitude.norm(dim=-1).mean(-1) for flown in (one, other)])
     return Emulation(
-        one.time, position, attitude, position[0] / position[1], ConfidenceInterval(low, high), level, n, outage
+        time=one.time,
+        position=position,
+        attitude=attitude,
+        ratio=ratio,
+        interval=ConfidenceInterval(low, high),
+        peak=Peak(float(one.time[at]), largest, below, above),
+        confidence_level=level,
+        n_flights=n,
+        outage=outage,
     )

@@ -14,13 +14,14 @@ one, gravity the same everywhere in it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from gyrofuse._checks import check_positive
 from gyrofuse.navigation.attitude import (
     conjugate,
     from_rotation_vector,
@@ -47,11 +48,36 @@ class Gnss:
         rate: Hz; a whole number of the unit's samples apart.
         sd: Of the errors of north, east and down, independent from fix to fix, m.
         outage: Start and end of what has none, s.
+
+    Raises:
+        ValueError: Numbers that are not positive, or an outage that ends before it starts.
     """
 
     rate: float = 1.0
     sd: tuple[float, float, float] = (1.0, 1.0, 1.5)
     outage: tuple[float, float] | None = (160.0, 210.0)
+
+    def __post_init__(self) -> None:
+        check_positive("rate", self.rate)
+        sd = tuple(self.sd) if isinstance(self.sd, Sequence) else (self.sd,)
+        if len(sd) != 3 or not all(math.isfinite(value) and value > 0 for value in sd):
+            raise ValueError(f"`sd`: expected three numbers of metres > 0, of north, east and down, got {self.sd!r}")
+        if self.outage is not None and not 0 <= self.outage[0] < self.outage[1]:
+            raise ValueError(f"`outage`: expected its start and a later end in s, got {self.outage!r}")
+
+    def samples_apart(self, rate: float) -> int:
+        """Samples of a unit of that rate (Hz) from fix to fix.
+
+        Raises:
+            ValueError: Not a whole number of them.
+        """
+        apart = rate / self.rate
+        if round(apart) < 1 or not math.isclose(apart, round(apart), rel_tol=1e-6):
+            raise ValueError(
+                f"`gnss`: expected fixes a whole number of the unit's samples apart, got {self.rate:g} Hz beside "
+                f"{rate:g} Hz; choose a rate of the unit that is a multiple of that of the fixes"
+            )
+        return round(apart)
 
     def available(self, time: float) -> bool:
         """Whether there is a fix at a time, s."""
@@ -63,7 +89,7 @@ class Alignment:
     """Standard deviations of what is known at first, of each axis.
 
     Attributes:
-        attitude: rad: roll, pitch, yaw.
+        attitude: rad: about north, east and down.
         velocity: m/s.
         position: m.
     """
@@ -153,15 +179,18 @@ def fly(
 
     Returns:
         Errors at every tenth sample and right after every fix.
+
+    Raises:
+        ValueError: Fixes that are not a whole number of samples apart.
     """
     gnss, alignment = gnss or Gnss(), alignment or Alignment()
     dt, earth = 1 / told.rate, trajectory.earth_rate
     ideal = trajectory.increments(told.rate)
     n_flights, n_samples = drawn.gyro.samples.shape[:2]
     n_samples = min(n_samples, len(ideal.angle))
-    every = round(told.rate / gnss.rate)
+    every = gnss.samples_apart(told.rate)
     truth = trajectory.at(torch.arange(n_samples + 1, dtype=torch.float64) * dt)
-    sensors = [_Sensor(s, s.F.new_zeros(n_flights, 3, s.F.shape[-1])) for s in told.systems()]
+    sensors = [_Sensor(s, s.x0[..., None, :].expand(n_flights, 3, -1)) for s in told.systems()]
     covariance = _initial(alignment, sensors, n_flights)
     off = torch.randn(n_flights, 9, generator=generator, dtype=torch.float64) * alignment.sd
     state = State(

@@ -17,8 +17,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse.navigation.attitude import from_rotation_vector, multiply, rotate
-from gyrofuse.navigation.trajectory import GRAVITY
+from gyrofuse.navigation.attitude import conjugate, from_rotation_vector, multiply, rotate
+from gyrofuse.units import GRAVITY
 
 _SMALL = 1e-4  # rad
 
@@ -65,8 +65,9 @@ def step(state: State, now: tuple[Tensor, Tensor], before: tuple[Tensor, Tensor]
     # (5.36), with the velocity in the middle
     gained = gained - 2 * dt * torch.linalg.cross(earth.expand_as(gained), state.velocity + gained / 2)
     velocity = state.velocity + gained
-    # (5.38) beside what a push that changes linearly adds, twice integrated.
-    change = rotate(state.attitude, push - push_ + torch.linalg.cross(angle, push))
+    # (5.38) beside what a push that changes linearly adds, twice integrated: in the frame, which turns with the Earth.
+    still = rotate(conjugate(state.attitude), (dt * earth).expand_as(angle))
+    change = rotate(state.attitude, push - push_ + torch.linalg.cross(angle - still, push))
     position = state.position + dt * (state.velocity + gained / 2 - change / 12)
     whole = from_rotation_vector((-dt * earth).expand_as(angle))
     attitude = multiply(multiply(whole, state.attitude), from_rotation_vector(turn))  # (5.75), with quaternions
@@ -95,7 +96,15 @@ def navigate(start: State, angles: Tensor, pushes: Tensor, dt: float, earth: Ten
 
     Returns:
         States at the end of every interval, `(..., interval, component)`.
+
+    Raises:
+        ValueError: No interval, or other shapes.
     """
+    if angles.shape != pushes.shape or angles.ndim < 2 or angles.shape[-2] < 1 or angles.shape[-1] != 3:
+        raise ValueError(
+            f"`angles` and `pushes`: expected (..., interval, 3) both, with at least one interval, got "
+            f"{tuple(angles.shape)} and {tuple(pushes.shape)}"
+        )
     state, states = start, []
     before = _extrapolated(angles), _extrapolated(pushes)
     for angle, push in zip(angles.unbind(-2), pushes.unbind(-2), strict=True):

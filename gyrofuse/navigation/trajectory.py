@@ -6,6 +6,7 @@ The frame is tangent to the Earth: north, east, down.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,10 +17,10 @@ import torch
 from scipy.interpolate import BSpline, make_interp_spline
 from torch import Tensor
 
-from gyrofuse._checks import check_positive
+from gyrofuse._checks import check_floating, check_positive
 from gyrofuse.navigation.attitude import conjugate, from_euler, rotate
+from gyrofuse.units import GRAVITY
 
-GRAVITY = 9.80665  # m/s^2, along the third axis
 EARTH_RATE = 7.292115e-5  # rad/s
 _DEGREE = 5
 _NODES = 6  # of Gauss and Legendre, in an interval
@@ -63,11 +64,14 @@ class Trajectory:
     Attributes:
         time: s, `(point,)`, increasing.
         position: North, east, down in m, `(point, 3)`.
-        euler: Roll, pitch, yaw in rad, `(point, 3)`; without them those of a coordinated flight.
+        euler: Roll, pitch, yaw in rad, `(point, 3)`, roll and yaw of any number of turns; without them those of a
+            coordinated flight.
         latitude: rad; with it the Earth turns.
 
     Raises:
-        ValueError: Fewer than six points, times that do not increase, other shapes, or numbers that are not finite.
+        TypeError: Not tensors.
+        ValueError: Fewer than six points, times that do not increase, other shapes, numbers that are not finite, or
+            angles that cannot be in rad.
     """
 
     time: Tensor
@@ -76,6 +80,9 @@ class Trajectory:
     latitude: float | None = None
 
     def __post_init__(self) -> None:
+        for name, values in (("time", self.time), ("position", self.position), ("euler", self.euler)):
+            if values is not None:
+                check_floating(name, values)
         n = len(self.time)
         if n <= _DEGREE or self.time.ndim != 1:
             raise ValueError(f"`time`: expected at least {_DEGREE + 1} points, got shape {tuple(self.time.shape)}")
@@ -88,6 +95,13 @@ class Trajectory:
                 raise ValueError(f"`{name}`: expected shape ({n}, 3), got {tuple(values.shape)}")
             if not bool(values.isfinite().all()):
                 raise ValueError(f"`{name}`: expected finite numbers, got others; leave those points out")
+        if self.euler is not None and float(self.euler[:, 1].abs().max()) > math.pi / 2:
+            raise ValueError(
+                f"`euler`: expected roll, pitch and yaw in rad, a pitch of at most pi/2, got a pitch of "
+                f"{float(self.euler[:, 1].abs().max()):g}; degrees? divide by 57.3"
+            )
+        if self.latitude is not None and not abs(self.latitude) <= math.pi / 2:
+            raise ValueError(f"`latitude`: expected rad, at most pi/2, got {self.latitude:g}; degrees? divide by 57.3")
 
     @property
     def duration(self) -> float:
@@ -136,7 +150,8 @@ class Trajectory:
     def _angles(self) -> BSpline:
         if self.euler is not None:
             euler = self.euler.numpy().copy()
-            euler[:, 2] = np.unwrap(euler[:, 2])
+            for turns in (0, 2):  # pitch does not go round
+                euler[:, turns] = np.unwrap(euler[:, turns])
             return make_interp_spline(self.time.numpy(), euler, k=_DEGREE)
         t = np.linspace(float(self.time[0]), float(self.time[-1]), max(round(2 * self.duration), 4 * _DEGREE))
         return make_interp_spline(t, _coordinated(self._place(t, 1), self._place(t, 2)), k=_DEGREE)
@@ -192,8 +207,10 @@ def read_trajectory(path: str | Path) -> Trajectory:
     if table.shape[-1] != len(names):
         raise ValueError(f"{path}: expected as many columns as names, {len(names)}, found {table.shape[-1]}")
     column = {name: torch.from_numpy(table[:, i].copy()) for i, name in enumerate(names)}
-    euler = ("roll", "pitch", "yaw")
-    angles = torch.stack([column[name] for name in euler], -1) if set(euler) <= set(names) else None
+    euler = [name for name in ("roll", "pitch", "yaw") if name in names]
+    if len(euler) in (1, 2):
+        raise ValueError(f"{path}: expected roll, pitch and yaw, or none of them, found {' and '.join(euler)} alone")
+    angles = torch.stack([column[name] for name in euler], -1) if euler else None
     place = torch.stack([column[name] for name in ("north", "east", "down")], -1)
     try:
         return Trajectory(column["time"], place, angles)

@@ -15,6 +15,7 @@ from gyrofuse.mismatch.channels import ChannelFit, regress
 from gyrofuse.mismatch.folds import estimation_samples, signal_gains
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.witnesses import level_of
+from gyrofuse.units import GRAVITY
 
 _OF_ONE_BAND = 0.9  # share of the evidence from which a gain might be a line's alone
 _SEEN = 0.04  # chance that a sensor is named which does not follow the channel
@@ -144,7 +145,7 @@ def gravity_unit(scene: Scene, name: str) -> str | None:
     """Unit of a channel of acceleration, by the size of gravity in it."""
     size = float(scene.channels[name].to(torch.float64).reshape(-1, scene.channels[name].shape[-1]).mean(-1).norm())
     return next(
-        (unit for unit, one in (("g", 1.0), ("m/s^2", 9.80665)) if abs(math.log(max(size, 1e-9) / one)) < 0.2), None
+        (unit for unit, one in (("g", 1.0), ("m/s^2", GRAVITY)) if abs(math.log(max(size, 1e-9) / one)) < 0.2), None
     )
 
 

@@ -11,6 +11,7 @@ from gyrofuse.mismatch.channels import accelerations
 from gyrofuse.mismatch.mechanism import Finding
 from gyrofuse.mismatch.mechanisms._channel_gain import ChannelGain, gravity_unit
 from gyrofuse.mismatch.mechanisms.not_identifiable import not_identifiable
+from gyrofuse.units import GRAVITY
 
 _LARGEST = 1.0  # deg/s per g, ten times that of poor gyroscopes
 
@@ -56,4 +57,4 @@ def _beyond_sensors(scene: Scene, finding: Finding) -> bool:
     if unit is None or turn is None:
         return False
     largest = max(abs(entry.value) for entry in finding.parameters.values())
-    return largest * turn * (9.80665 if unit == "m/s^2" else 1.0) > _LARGEST
+    return largest * turn * (GRAVITY if unit == "m/s^2" else 1.0) > _LARGEST

@@ -12,13 +12,14 @@ from torch import Tensor
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.witnesses import power_tails
+from gyrofuse.units import GRAVITY
 
 _UNITS = {
     180 / math.pi: "deg/s against rad/s",
     1000.0: "mdeg/s against deg/s",
     3600.0: "deg/h against deg/s",
     3600 * 180 / math.pi: "deg/h against rad/s",
-    9.80665: "m/s^2 against g",
+    GRAVITY: "m/s^2 against g",
 }
 _NEAR = 0.25  # of the logarithm: noise levels of sensors of one kind differ by as much
 
