@@ -142,15 +142,18 @@ def test_a_slow_rate_is_judged_with_as_much_doubt_as_the_simulation_leaves():
 
 
 def test_a_motion_that_the_simulation_has_too_is_no_gain():
-    g, t = generator(12), torch.arange(N, dtype=torch.float64)
-    shaking = 1e-4 * acceleration(g)
-    shaking[0] += 0.3 * torch.sin(2 * math.pi * 0.123 * t)
-    x = NOISE.simulate(N, batch=(5, 4), generator=g)
-    x[0] += 0.3 * torch.sin(2 * math.pi * 0.123 * t)
-    x[1:] += 0.3 * torch.sin(2 * math.pi * 0.123 * t + 1.0)
-    both = Case.of(Scene(100.0, "deg/s", ("1", "2", "3", "4"), {"acceleration": shaking}), x[0], x[1:])
-    assert GSensitivity.nominate(both, 0.01) is None
-    assert channel_witness(both).p_value > 1e-3
+    t, nominated = torch.arange(N, dtype=torch.float64), 0
+    for seed in range(12, 22):
+        g = generator(seed)
+        shaking = 1e-4 * acceleration(g)
+        shaking[0] += 0.3 * torch.sin(2 * math.pi * 0.123 * t)
+        x = NOISE.simulate(N, batch=(5, 4), generator=g)
+        x[0] += 0.3 * torch.sin(2 * math.pi * 0.123 * t)
+        x[1:] += 0.3 * torch.sin(2 * math.pi * 0.123 * t + 1.0)
+        both = Case.of(Scene(100.0, "deg/s", ("1", "2", "3", "4"), {"acceleration": shaking}), x[0], x[1:])
+        nominated += GSensitivity.nominate(both, 0.01) is not None
+        assert channel_witness(both).p_value > 1e-3
+    assert nominated <= 1  # of ten, at a level of 0.01
 
 
 def test_a_scale_factor_follows_the_reference():

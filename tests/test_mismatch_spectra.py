@@ -14,7 +14,8 @@ from gyrofuse.mismatch import shape_scan
 from gyrofuse.mismatch.base import _time_constants, fit_base
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.folds import N_FOLDS
-from gyrofuse.mismatch.lines import _log_hotelling, sets_of, simulated_lines, strongest_line, without_lines
+from gyrofuse.mismatch.known_lines import without_lines
+from gyrofuse.mismatch.lines import _log_hotelling, sets_of, simulated_lines, strongest_line
 from gyrofuse.mismatch.shape_bands import (
     N_SLOW,
     deep_base,

@@ -126,7 +126,7 @@ def _in_cells(case: Case, stretch: Stretch) -> Oscillation | None:
     coherence = smooth_coherence(case.simulated.coherence, case.simulated.dof)
     band = int(band_of(torch.tensor(float(centre)), n, case))
     expected = coherence[band].expand(2 * count, -1, -1)
-    sides = Side(case.recorded.signal, local).spectra, ground.mean.mT, dof, torch.full_like(dof, 1e12)
+    sides = Side(case.recorded.noise, local).spectra, ground.mean.mT, dof, torch.full_like(dof, 1e12)
     data = Ratios.of(ground, sides, expected, torch.ones_like(dof))
     background = fit(data, [Background.start(case.n_sensors)])
     return _best(case, stretch, data, background)

@@ -17,7 +17,8 @@ from gyrofuse.mismatch.bump_scan import log_ratios, scanned_bumps
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import Evidence, corrected, ratio_p_value
 from gyrofuse.mismatch.hump_scan import scanned_humps
-from gyrofuse.mismatch.lines import simulated_lines, whitened, without_lines
+from gyrofuse.mismatch.known_lines import without_lines
+from gyrofuse.mismatch.lines import simulated_lines, whitened
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.shape_law import decorrelated
 from gyrofuse.mismatch.witnesses import level_of

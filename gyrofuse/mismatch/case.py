@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.base import Base
-from gyrofuse.mismatch.lines import FoundLine, simulated_lines, strongest_line, whitened, without_lines
+from gyrofuse.mismatch.known_lines import without_lines
+from gyrofuse.mismatch.lines import FoundLine, simulated_lines, strongest_line, whitened
 from gyrofuse.mismatch.side import Side
 from gyrofuse.mismatch.spectra import Bands, bands
 
@@ -118,13 +119,20 @@ class Case:
         """Samples of one of the 256 blocks for what is slow."""
         return self.n_samples // N_BLOCKS
 
+    def knowing(self, lines: tuple[float, ...]) -> Case:
+        """Where the simulation has lines at these frequencies, cycles per sample: its noise is what is beside them."""
+        if not lines:
+            return self
+        recorded, simulated = (replace(side, lines=lines) for side in (self.recorded, self.simulated))
+        return replace(self, recorded=recorded, simulated=simulated)
+
     def less(self, taken: Tensor) -> Case:
         """With a signal `(sensor, time)` taken off the recording."""
-        return replace(self, recorded=Side((self.recording - taken)[None], self.bands))
+        return replace(self, recorded=replace(self.recorded, signal=(self.recording - taken)[None]))
 
     def with_recording(self, recording: Tensor) -> Case:
         """With another recording `(sensor, time)`: one that was cleaned."""
-        return replace(self, recorded=Side(recording[None], self.bands))
+        return replace(self, recorded=replace(self.recorded, signal=recording[None]))
 
     def built_in(self, act: Callable[[Tensor], Tensor], place: int = 0) -> Case:
         """With something that acts on the simulation's samples, after what has a lower place in the chain.
@@ -139,7 +147,7 @@ class Case:
         signal = analog
         for _, converted in converter:
             signal = converted(signal)
-        return replace(self, simulated=Side(signal, self.bands), analog=analog, converter=converter)
+        return replace(self, simulated=replace(self.simulated, signal=signal), analog=analog, converter=converter)
 
 
 def block_means(signal: Tensor) -> Tensor:

@@ -20,7 +20,8 @@ from torch import Tensor
 from gyrofuse._transforms import cosine_ordinates
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import Evidence, corrected
-from gyrofuse.mismatch.lines import simulated_lines, without_lines
+from gyrofuse.mismatch.known_lines import without_lines
+from gyrofuse.mismatch.lines import simulated_lines
 
 _LINE = 4  # bins on either side of a line that the simulation has
 _LEAST_DOF = 3.0  # of a simulation's band: below, it does not tell what chance alone would do to a slow channel

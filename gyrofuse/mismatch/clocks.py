@@ -20,7 +20,8 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import Evidence, ratio_p_value
-from gyrofuse.mismatch.lines import sets_of, simulated_lines
+from gyrofuse.mismatch.known_lines import without_lines
+from gyrofuse.mismatch.lines import sets_of, simulated_lines, whitened
 from gyrofuse.mismatch.losses import Loss, losses_of, paths_of
 from gyrofuse.mismatch.remembered import remembered
 
@@ -105,10 +106,11 @@ def clock_witness(case: Case) -> Evidence:
 def strongest_slip(case: Case) -> Slip | None:
     """The most likely slip of any tone that the recording shares with the simulation."""
     block = case.n_samples // BLOCKS
-    tones = [f for f in simulated_lines(case.simulated) if f * block >= _FEWEST_CYCLES][:_TONES]
+    lines = simulated_lines(case.simulated)
+    tones = [f for f in lines if f * block >= _FEWEST_CYCLES][:_TONES]
     if not tones:
         return None
-    slips = [slip for f in tones for slip in _of_tone(case, f)]
+    slips = [slip for f in tones for slip in _of_tone(case, f, tuple(other for other in lines if other != f))]
     best = max(slips, key=lambda slip: slip.log_ratio, default=None)
     return None if best is None else replace(best, log_ratio=best.log_ratio - math.log(2 * len(tones)))
 
@@ -136,9 +138,9 @@ def best_slope(z: Tensor) -> tuple[float, float]:
     return float(_slopes()[at]) + max(min(offset, 1.0), -1.0) / _FINER, here
 
 
-def _of_tone(case: Case, f: float) -> list[Slip]:
-    """A skew and a loss of samples, as a tone of about `f` cycles per sample shows them."""
-    z = demodulated(case.white, f)
+def _of_tone(case: Case, f: float, others: tuple[float, ...]) -> list[Slip]:
+    """A skew and a loss of samples, as a tone of about `f` cycles per sample shows them, beside other ones."""
+    z = demodulated(whitened(without_lines(case.recording, others), case.base) if others else case.white, f)
     length = case.n_samples // BLOCKS * BLOCKS
     seen = _reference(case, f, float(_energy(z).amax()))
     if seen is None and len(z) < 2:

@@ -67,7 +67,7 @@ class LeftOut(NamedTuple):
 @remembered
 def left_out(side: Side) -> LeftOut:
     """Of one side, of its first records."""
-    signal = side.signal[:_MOST_RECORDS]
+    signal = side.noise[:_MOST_RECORDS]
     y = torch.from_numpy(fft.dct(signal.numpy(), norm="ortho", axis=-1))[..., 1:]
     spectrum = _smooth_spectrum(y)
     lines = _lines(y, spectrum)
@@ -344,7 +344,7 @@ def kurtosis_p_values(case: Case) -> Tensor:
 @remembered
 def _kurtosis_scores(side: Side) -> Tensor:
     """Kurtosis of thinned Haar coefficients as a standard normal variable, `(level, sensor)`; mean of the records."""
-    mean = side.signal[:_MOST_RECORDS]
+    mean = side.noise[:_MOST_RECORDS]
     mean = mean - mean.mean(-1, keepdim=True)
     scores, stride = [], 1
     for level in range(1, int(math.log2(side.signal.shape[-1])) - _TOP + 1):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import torch
 from torch import Tensor
 
@@ -9,6 +11,8 @@ from gyrofuse._checks import check_positive, check_signal, same_rate
 from gyrofuse._model import Model
 from gyrofuse._result import named, numbered
 from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.known_lines import amplitudes
+from gyrofuse.mismatch.lines import simulated_lines
 from gyrofuse.recording import Recording
 from gyrofuse.simulate import ArrayModel
 
@@ -16,6 +20,7 @@ FEWEST = 4096
 # Of a model: records as long as the recording. What is told apart of an effect grows as m/(1 + m), the work as m.
 _FEWEST_RECORDS, _MOST_RECORDS, _MOST_VALUES = 4, 16, 2**23
 _SINGULAR = 1e-10  # of correlation matrices
+_SEARCHES = 4  # for lines
 
 
 def prepared(
@@ -47,7 +52,32 @@ def prepared(
         )
     _check_own("recording", signal)
     _check_own("simulation", drawn[0])
-    return Case.of(scene, signal, drawn)
+    case = Case.of(scene, signal, drawn)
+    return case.knowing(_lines(simulation, case))
+
+
+def _lines(simulation: Recording | Tensor | Model | ArrayModel, case: Case) -> tuple[float, ...]:
+    """Frequencies of the simulation's tones, cycles per sample: those that its model names, and those to be seen.
+
+    Strongest first.
+    """
+    named = simulation.lines if isinstance(simulation, Model) else ()
+    lines: list[float] = []
+    apart = 1 / case.n_samples  # closer, or so near to the ends, lines are one or none
+
+    def added(frequencies: Iterable[float]) -> bool:
+        before = len(lines)
+        for f in frequencies:
+            if apart < f < 0.5 - apart and all(abs(f - other) > apart for other in lines):
+                lines.append(f)
+        return len(lines) > before
+
+    added(f for line in named for f in line.frequency.flatten().tolist())
+    for _ in range(_SEARCHES):  # the side lobes of strong lines hide weak ones
+        if not added(simulated_lines(case.knowing(tuple(lines)).simulated)):
+            break
+    strength = amplitudes(case.simulated.signal, tuple(lines)).mean((0, 1)) if lines else torch.zeros(0)
+    return tuple(lines[i] for i in strength.argsort(descending=True).tolist())
 
 
 def noise_of(simulation: Recording | Tensor | Model | ArrayModel, case: Case) -> ArrayModel:

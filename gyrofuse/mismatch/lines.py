@@ -27,6 +27,7 @@ from torch.nn.functional import max_pool1d
 from gyrofuse._transforms import fast_length
 from gyrofuse.mismatch.base import Base
 from gyrofuse.mismatch.evidence import corrected
+from gyrofuse.mismatch.known_lines import amplitudes, precise
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.side import Side
 
@@ -80,7 +81,7 @@ def strongest_line(recorded: Side, simulated: Side) -> FoundLine:
     f = torch.arange(z.shape[-1], dtype=torch.float64) / length
     shortest = min(recorded.signal.shape[-1], simulated.signal.shape[-1])
     known = torch.zeros_like(f, dtype=torch.bool)
-    for place in simulated_lines(simulated):
+    for place in _shared(simulated_lines(simulated), recorded, simulated):
         here = (f - place).abs() < (_GUARD + 1) / shortest
         known |= here | ((f - place).abs() < _reach(z[:, here]) / recorded.signal.shape[-1])
     lines = _lines(z, length, recorded, simulated.base, known)
@@ -90,11 +91,26 @@ def strongest_line(recorded: Side, simulated: Side) -> FoundLine:
     return FoundLine(float(lines.frequency[at]), p_value, tuple(sensors))
 
 
+def _shared(lines: tuple[float, ...], recorded: Side, simulated: Side) -> list[float]:
+    """Those of the simulation's lines that the recording has as well, half as large or larger.
+
+    Where it has not, a line beside that place is the recording's own.
+    """
+    if not lines:
+        return []
+    own, others = (amplitudes(side.signal, lines).square().mean(0).sum(0) for side in (recorded, simulated))
+    there = own > others / 4
+    return [f for f, yes in zip(lines, there.tolist(), strict=True) if yes]
+
+
 @remembered
 def simulated_lines(side: Side) -> tuple[float, ...]:
-    """Frequencies of the lines that a simulation has in any of its records, strongest first, cycles per sample."""
+    """Frequencies of lines that a simulation has in any of its records, cycles per sample.
+
+    Those that are known, and what is seen beside them, strongest first.
+    """
     found: list[tuple[float, float, float]] = []
-    for signal in side.signal:
+    for signal in side.noise:
         z, length = _transformed(signal, side.base)
         lines = _lines(z, length, side, side.base, torch.zeros(z.shape[-1], dtype=torch.bool))
         for log_p, f in zip(lines.log_p.tolist(), lines.frequency.tolist(), strict=True):
@@ -104,22 +120,7 @@ def simulated_lines(side: Side) -> tuple[float, ...]:
     for _, f, reach in sorted(found):
         if all(abs(f - other) > far for other, far in kept):
             kept.append((f, reach))
-    return tuple(f for f, _ in kept)
-
-
-def without_lines(signal: Tensor, frequencies: tuple[float, ...]) -> Tensor:
-    """Signals `(..., time)` less least-squares lines at known frequencies, cycles per sample.
-
-    Their amplitudes and phases may change linearly, so that a frequency need only be known to a bin.
-    """
-    if not frequencies:
-        return signal
-    n = signal.shape[-1]
-    t = torch.arange(n, dtype=torch.float64)
-    angle = 2 * math.pi * torch.tensor(frequencies, dtype=torch.float64)[:, None] * t
-    steady = torch.cat([angle.cos(), angle.sin()])
-    basis = torch.cat([steady, steady * (2 * t / n - 1), torch.ones(1, n, dtype=torch.float64)])
-    return signal - torch.linalg.solve(basis @ basis.mT, basis @ signal.mT).mT @ basis
+    return (*side.lines, *precise(side.noise, tuple(f for f, _ in kept)))
 
 
 def _reach(z: Tensor) -> float:

@@ -55,5 +55,5 @@ class Remainder(Filter):
 
     def refitted(self, case: Case, fold: int) -> Remainder:
         block = case.n_samples // N_JUDGED
-        kept = case.recording[:, estimation_samples(case.n_samples, fold)]
+        kept = case.recorded.noise[0][:, estimation_samples(case.n_samples, fold)]
         return self._between(Side(kept.unflatten(-1, (-1, block)).movedim(-2, 0), case.bands), case.simulated)

@@ -137,7 +137,7 @@ def _sides(case: Case) -> tuple[Side, Side]:
     """Both sides in narrow bands."""
     scale = case.simulated.signal.shape[-1] / case.n_samples
     fine = narrow_bands(case.n_samples, least=math.ceil(_WIDTH / scale))
-    return Side(case.recorded.signal, fine), Side(case.simulated.signal, fine)
+    return Side(case.recorded.noise, fine), Side(case.simulated.noise, fine)
 
 
 @remembered
@@ -174,7 +174,7 @@ def slow(case: Case) -> Slow:
 @remembered
 def slow_ordinates(side: Side) -> Tensor:
     """Cosine ordinates that blocks which are judged do not show, `(record, sensor, ordinate)`, from the first."""
-    records = side.signal
+    records = side.noise
     return cosine_ordinates(records.flatten(0, 1))[:, 1 : N_SLOW + 1].clone().unflatten(0, records.shape[:2])
 
 
@@ -216,7 +216,7 @@ class _Blocks(dict[int, Side]):
 @remembered
 def in_blocks(side: Side) -> _Blocks:
     """Sides by the length of the blocks that they are cut into."""
-    return _Blocks(side.signal)
+    return _Blocks(side.noise)
 
 
 @functools.lru_cache(maxsize=8)

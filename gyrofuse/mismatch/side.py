@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.base import Base, fit_base
+from gyrofuse.mismatch.known_lines import without_lines
 from gyrofuse.mismatch.spectra import Bands, cross_spectra, degrees_of_freedom
 
 _ORDINATES = 40  # for each sensor, behind a matrix that is inverted
@@ -23,15 +24,23 @@ class Side:
     Attributes:
         signal: `(record, sensor, time)`.
         bands: Bands of frequency of the recording, for both sides.
+        lines: Frequencies that the simulation has lines at, cycles per sample: no noise, and left out where noise is
+            looked at.
     """
 
     signal: Tensor
     bands: Bands
+    lines: tuple[float, ...] = ()
+
+    @cached_property
+    def noise(self) -> Tensor:
+        """The signal without the simulation's lines."""
+        return without_lines(self.signal, self.lines)
 
     @cached_property
     def spectra(self) -> Tensor:
         """Mean cross-spectral matrices of the records, `(band, sensor, sensor)`, per sample."""
-        return cross_spectra(self.signal, self.bands).mean(0)
+        return cross_spectra(self.noise, self.bands).mean(0)
 
     @cached_property
     def dof(self) -> Tensor:

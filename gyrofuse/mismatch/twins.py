@@ -20,7 +20,8 @@ def twin(case: Case, generator: torch.Generator) -> Case:
     model = case.base.model()
     n_records, _, n = case.simulated.signal.shape
     recording = model.simulate(case.n_samples, generator=generator)
-    return Case.of(case.scene, recording, model.simulate(n, batch=(n_records,), generator=generator))
+    simulation = model.simulate(n, batch=(n_records,), generator=generator)
+    return Case.of(case.scene, recording, simulation).knowing(case.simulated.lines)
 
 
 def twin_p_values(case: Case, n_twins: int, generator: torch.Generator) -> Tensor:

@@ -1,0 +1,87 @@
+"""Tones that the simulation knows of: no finding where the recording has them alike, one where they differ."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+import gyrofuse as gf
+from gyrofuse.mismatch import testimony as court
+from gyrofuse.mismatch.inputs import prepared
+from gyrofuse.mismatch.known_lines import amplitudes, precise, without_lines
+from gyrofuse.mismatch.lines import simulated_lines
+
+N, RATE = 16_384, 100.0
+NOISE = gf.parse_model("WN(variance=1e-3) + AR1(phi=0.99,variance=1e-6)")
+
+
+def toned(amplitude: float = 0.02, beta: float = 0.34) -> gf.Model:
+    return NOISE + gf.Sinusoid(amplitude, beta)
+
+
+def recorded(model: gf.Model, seed: int, n_samples: int = N) -> gf.Recording:
+    signal = model.simulate(n_samples, batch=(3,), generator=torch.Generator().manual_seed(seed))
+    return gf.Recording(signal, rate=RATE, unit="deg/s")
+
+
+@pytest.mark.parametrize("frequency", [0.0007, 0.05411, 0.43])
+@pytest.mark.parametrize("off", [-0.4, 0.12])
+def test_a_frequency_is_made_precise(frequency: float, off: float):
+    t = torch.arange(N, dtype=torch.float64)
+    phases = torch.tensor([[0.3], [2.0]], dtype=torch.float64)
+    signal = (0.3 * torch.sin(2 * math.pi * frequency * t + phases) + 5.0)[None]  # (record, sensor, time)
+    (found,) = precise(signal, (frequency + off / N,))
+    assert abs(found - frequency) * N < 1e-5
+    torch.testing.assert_close(amplitudes(signal, (found,)), torch.full((1, 2, 1), 0.3, dtype=torch.float64))
+    torch.testing.assert_close(without_lines(signal, (found,)), torch.full_like(signal, 5.0), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+def test_a_tone_that_both_have_is_no_mismatch(sampled: bool):
+    """Of the same size, and of any phase: sensors agree at its frequency in the one as in the other, and by chance."""
+    tones = toned() + gf.Sinusoid(0.003, 1.1) + gf.Sinusoid(0.2, 0.0031 if not sampled else 2.0)
+    p_values = []
+    for seed in range(8):
+        simulation = recorded(tones, 100 + seed) if sampled else tones
+        case = prepared(recorded(tones, seed), simulation, None, torch.Generator().manual_seed(seed))
+        assert len(case.simulated.lines) == 3
+        p_values.append(court.combined(court.testimony(case)))
+    assert min(p_values) > 0.01 / 8
+    assert sum(p < 0.1 for p in p_values) <= 3
+
+
+def test_side_lobes_of_a_strong_tone_hide_no_weak_one():
+    tones = toned(0.3, 0.5) + gf.Sinusoid(0.004, 0.56) + gf.Sinusoid(0.004, 1.9)
+    case = prepared(recorded(tones, 1), recorded(tones, 2), None, torch.Generator().manual_seed(0))
+    found = sorted(2 * math.pi * f for f in simulated_lines(case.simulated))
+    assert found == pytest.approx([0.5, 0.56, 1.9], abs=2e-4)
+
+
+@pytest.mark.parametrize("factor", [0.0, 0.8, 1.5])
+def test_a_tone_of_another_size_is_told(factor: float):
+    case = prepared(recorded(toned(0.02 * factor), 3), toned(), None, torch.Generator().manual_seed(0))
+    evidence = min(court.testimony(case), key=lambda e: e.p_value)
+    assert evidence.witness == "line"
+    assert evidence.p_value < 1e-10
+    assert evidence.sensors == (0, 1, 2)
+    assert evidence.frequency_hz == pytest.approx(0.34 / (2 * math.pi) * RATE)
+    said = float(evidence.words.split(" has ")[1].split()[0])
+    assert said == pytest.approx(factor, abs=0.1)
+
+
+def test_a_tone_at_another_frequency_is_named_and_the_missing_one_told():
+    report = gf.diagnose(recorded(toned(beta=0.3405), 4), toned())
+    assert [finding.mechanism for finding in report.findings] == ["vibration_tone"]
+    assert report.findings[0].frequency_hz == pytest.approx(0.3405 / (2 * math.pi) * RATE, rel=1e-5)
+    assert "the line at 5.4112" in report.unexplained[0].words
+
+
+def test_what_is_missing_is_found_beside_a_tone_that_both_have():
+    recording = recorded(toned(), 5)
+    late = torch.arange(N) >= 10_000
+    stepped = gf.Recording(recording.signal + 0.012 * late, rate=RATE, unit="deg/s")
+    report = gf.diagnose(stepped, toned())
+    assert [finding.mechanism for finding in report.findings] == ["step"]
+    assert report.unexplained == ()
