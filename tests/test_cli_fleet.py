@@ -87,6 +87,9 @@ def test_fits_and_diagnoses(run: Run, logs: Path):
     done = run("fleet", "long.npz", "--out", "d.parquet", "--task", "diagnose", "--simulation", "m.json")
     assert done.status == 0, done.err
     assert "1 of 1 differ\n  parameter_shift: 1 logs" in done.out
+    Path("m.json").write_text(json.dumps(gf.WhiteNoise(1.0).to_dict()))
+    gone_on = run("fleet", "long.npz", "logs", "--out", "d.parquet", "--task", "diagnose", "--simulation", "m.json")
+    assert (gone_on.status, "d.parquet: is of other settings (simulation_sha256 " in gone_on.err) == (2, True)
 
 
 @pytest.mark.parametrize(

@@ -275,6 +275,20 @@ def test_a_diagnosis_says_what_is_left_out():
     assert other["gain"] > 0
 
 
+def test_a_simulation_of_the_same_name_and_other_numbers_is_another_setting():
+    one, same, other = (Diagnose(gf.WhiteNoise(v), source="model.json").settings for v in (1.0, 1.0, 2.0))
+    assert one == same
+    assert one["simulation"] == other["simulation"]
+    assert one != other
+    recording = array(0)
+    warm = gf.Recording(recording.signal, rate=100.0, unit="deg/s", channels={"temperature": recording.time})
+    settings = [Diagnose(r).settings for r in (recording, array(0), array(1), recording.to("rad/s"), warm)]
+    assert settings[0] == settings[1]
+    assert all(settings[0] != s for s in settings[2:])
+    with pytest.raises(TypeError, match=r"`simulation`: expected a Recording or a noise model, got str; read"):
+        Diagnose("model.json")
+
+
 def test_relative_noise_is_that_of_known_levels():
     variance = torch.tensor([[1.0, 4.0, 16.0], [4.0, 4.0, 1.0], [torch.nan, 4.0, 4.0]], dtype=torch.float64)
     # Over the medians 4 and 4: ratios of deviations 1/2, 1, 2 and 1, 1, 1/2; a level with a gap has the rest.

@@ -5,10 +5,12 @@ A column holds `"text"`, `"texts"`, `"number"`, `"numbers"`, `"whole"` numbers o
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from typing import Any, ClassVar
 
 import torch
@@ -200,10 +202,31 @@ class Diagnose:
         "findings": "text",
     }
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.simulation, Recording | Model | ArrayModel):
+            raise TypeError(
+                f"`simulation`: expected a Recording or a noise model, got {type(self.simulation).__name__}; read a "
+                "recording with read_recording(path), or a model in JSON with model_from_dict"
+            )
+
     @property
     def settings(self) -> dict[str, Any]:
         """What the rows depend on, ready for JSON."""
-        return {"task": self.name, "simulation": self.source, "false_alarm": self.false_alarm}
+        named = {"task": self.name, "simulation": self.source, "false_alarm": self.false_alarm}
+        return {**named, "simulation_sha256": self._digest}
+
+    @cached_property
+    def _digest(self) -> str:
+        """Of the numbers of the simulation, whose name stays where the simulation changes."""
+        if not isinstance(self.simulation, Recording):
+            return hashlib.sha256(json.dumps(self.simulation.to_dict()).encode()).hexdigest()
+        r = self.simulation
+        held = {"signal": r.signal, "time": r.time, **r.channels}
+        said = [r.rate, r.unit, r.sensors, r.axes, {name: list(values.shape) for name, values in held.items()}]
+        digest = hashlib.sha256(json.dumps(said).encode())
+        for values in held.values():
+            digest.update(values.numpy(force=True).tobytes())
+        return digest.hexdigest()
 
     def rows(self, recordings: Sequence[Recording]) -> list[list[Row]]:
         """Rows of each recording, one for each of its axes."""
