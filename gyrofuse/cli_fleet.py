@@ -176,11 +176,12 @@ def _run(
     """Work on what is not done yet, with a bar."""
     from torch.multiprocessing import ProcessExitedException, ProcessRaisedException
 
+    from gyrofuse.fleet.logs import identity
     from gyrofuse.lightning_module import FusionModule, GyroArrayDataModule, ResultWriter, quiet_trainer
 
     data = GyroArrayDataModule(logs, group_size=group, done=store.done(failed=not retry), **options)
     if not data.groups:
-        store.finish([str(log) for log in logs])
+        store.finish([identity(log) for log in logs])
         return
     try:
         with _watched(store, store.n_parts, len(data.groups), len(logs)):

@@ -22,7 +22,7 @@ from lightning.pytorch.callbacks import BasePredictionWriter, Callback
 from torch.utils.data import DataLoader
 
 from gyrofuse._checks import check_positive_integer
-from gyrofuse.fleet.logs import find_logs, groups_of
+from gyrofuse.fleet.logs import find_logs, groups_of, identity
 from gyrofuse.fleet.store import ResultStore
 from gyrofuse.fleet.tasks import Fuse, Row, Task
 from gyrofuse.fleet.work import Log, LogGroups, rows_of
@@ -37,7 +37,7 @@ class GyroArrayDataModule(LightningDataModule):
         group_size: Logs that a process takes at a time, and whose rows appear together. Short arrays of one shape
             are fitted together: more than one pays where logs are many and short.
         num_workers: Processes that read ahead.
-        done: Names of logs that are left out, though the others stay in their groups.
+        done: Identities of logs (`ResultStore.done`) that are left out, though the others stay in their groups.
         **options: Of `read_recording`: `axis`, `sensors`, `rate`, `unit`, `scale`, `key`, `mounting`.
 
     Raises:
@@ -133,7 +133,7 @@ class ResultWriter(BasePredictionWriter):
         trainer.strategy.barrier("written")
         if trainer.is_global_zero:
             data = getattr(trainer, "datamodule", None)
-            self.store.finish([str(log) for log in data.logs] if isinstance(data, GyroArrayDataModule) else ())
+            self.store.finish([identity(log) for log in data.logs] if isinstance(data, GyroArrayDataModule) else ())
         trainer.strategy.barrier("finished")
 
 

@@ -32,6 +32,13 @@ def logs(tmp_path: Path) -> Path:
     return folder
 
 
+def spoil(log: Path) -> None:
+    """Make a log useless in a way that only reading it can tell."""
+    before = log.stat()
+    log.write_bytes(bytes(before.st_size))
+    os.utime(log, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+
 def command(*arguments: object) -> list[str]:
     return [sys.executable, "-m", "gyrofuse", "fleet", *map(str, arguments)]
 
@@ -59,12 +66,42 @@ def test_the_same_command_does_what_is_left(run: Run, logs: Path):
     run("fleet", "logs", "--out", "r.parquet")
     before = Path("r.parquet").read_bytes()
     for i in range(8):
-        (logs / f"{i}.npz").write_bytes(b"no longer a log")  # finished ones are not read again
+        spoil(logs / f"{i}.npz")  # finished ones are not read again
     assert run("fleet", "logs", "--out", "r.parquet").status == 0
     assert Path("r.parquet").read_bytes() == before
     (logs / "empty.csv").unlink()
     gf.Recording(torch.randn(3, 4000, dtype=torch.float64), rate=100.0).save(logs / "9.npz")
     assert run("fleet", "logs", "--out", "r.parquet").out.startswith("10 logs, 1 failed")
+
+
+def test_a_log_that_was_replaced_is_done_again(run: Run, logs: Path):
+    run("fleet", "logs", "--out", "r.parquet")
+    before = {row["log"]: row for row in read_results("r.parquet")[1]}
+    assert before["logs/3.npz"]["size"] == (logs / "3.npz").stat().st_size
+    assert before["logs/3.npz"]["modified"] == (logs / "3.npz").stat().st_mtime_ns
+    gf.Recording(torch.randn(3, 5000, dtype=torch.float64), rate=100.0).save(logs / "3.npz", force=True)
+    (logs / "5.npz").write_bytes(b"no longer a log")
+    (logs / "6.npz").unlink()
+    assert run("fleet", "logs", "--out", "r.parquet").out.startswith("9 logs, 2 failed")
+    after = {row["log"]: row for row in read_results("r.parquet")[1]}
+    assert (after["logs/3.npz"]["n_samples"], after["logs/5.npz"]["status"]) == (5000, "failed")
+    same = {name for name in before if after[name] == before[name]}
+    assert same == set(before) - {"logs/3.npz", "logs/5.npz"}  # of a log that is gone, what is known of it
+
+
+def test_a_log_has_one_row_whatever_it_is_called(run: Run, logs: Path, tmp_path: Path, monkeypatch):
+    run("fleet", "logs", "--out", "r.parquet")
+    before = Path("r.parquet").read_bytes()
+    (tmp_path / "link.npz").symlink_to(logs / "0.npz")
+    for names in (["./logs/0.npz", "logs/../logs/1.npz"], [logs], ["link.npz"]):
+        assert run("fleet", *names, "--out", "r.parquet").status == 0
+        told = sorted(row["log"] for row in read_results("r.parquet")[1])
+        assert told == [*(f"logs/{i}.npz" for i in range(8)), "logs/empty.csv"]
+    monkeypatch.chdir(logs)
+    assert run("fleet", ".", "--out", "../r.parquet").out.startswith("9 logs, 1 failed")
+    monkeypatch.chdir(tmp_path)
+    assert run("fleet", "logs", "--out", "r.parquet").status == 0
+    assert Path("r.parquet").read_bytes() == before
 
 
 def test_failed_logs_are_tried_again_when_asked(run: Run, logs: Path):
@@ -163,7 +200,7 @@ def test_a_killed_run_goes_on_where_it_was(run: Run, logs: Path, tmp_path: Path,
     done = store.done()
     assert len(done) >= 2
     for log in done:
-        Path(log).write_bytes(b"no longer a log")  # finished ones are not done again
+        spoil(Path(log))  # finished ones are not done again
     if not (tmp_path / "r.parquet").exists():
         assert run("fleet", "--manifest", manifest, "--out", "r.parquet").status == 0
     assert Path("r.parquet").read_bytes() == Path("whole.parquet").read_bytes()

@@ -192,6 +192,10 @@ def test_only_a_run_of_the_same_settings_goes_on(tmp_path):
     (tmp_path / "t.parquet").write_bytes(b"mine")
     with pytest.raises(FileExistsError, match="no table of a fleet; choose another name"):
         store_at(tmp_path / "t.parquet").open()
+    ResultStore(tmp_path / "u.parquet", {"tau": "numbers"}, {"task": "fuse"}).finish([])
+    with pytest.raises(FileExistsError, match="of other columns, written by another version; choose another name"):
+        store_at(tmp_path / "u.parquet").open()
+    (tmp_path / "u.parquet").unlink()
     with pytest.raises(FileNotFoundError, match="does not exist; create it first"):
         store_at(tmp_path / "no" / "r.parquet").open()
     with pytest.raises(ValueError, match="expected a table that `gyrofuse fleet` wrote"):

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch.utils.data import Dataset
 
+from gyrofuse.fleet.logs import State, as_text, identity, state_of
 from gyrofuse.fleet.tasks import Row, Task
 from gyrofuse.recording import Recording, read_recording
 
@@ -23,11 +24,15 @@ class Log:
         name: Its path, as given.
         recording: None where it could not be read.
         error: Why.
+        path: Absolute, where it is a file or folder.
+        state: When reading began.
     """
 
     name: str
     recording: Recording | None
     error: str | None = None
+    path: str | None = None
+    state: State = field(default_factory=State)
 
     def to(self, device: torch.device) -> Log:
         """With the signal on a device."""
@@ -55,10 +60,11 @@ class LogGroups(Dataset[tuple[Log, ...]]):
         return tuple(self._read(path) for path in self.groups[index])
 
     def _read(self, path: Path) -> Log:
+        log = Log(as_text(str(path)), None, path=identity(path), state=state_of(path))
         try:
-            return Log(str(path), read_recording(path, **self.options))
+            return replace(log, recording=read_recording(path, **self.options))
         except Exception as error:  # whatever a damaged file does to a library, the others are read
-            return Log(str(path), None, _said(error).removeprefix(f"{path}: "))
+            return replace(log, error=_said(error).removeprefix(f"{log.name}: "))
 
 
 @dataclass
@@ -121,7 +127,8 @@ def _alone(task: Task, recording: Recording) -> _Answer:
 
 
 def _whole_rows(log: Log, answer: _Answer) -> list[Row]:
-    common: Row = {"log": log.name, "status": "ok" if answer.error is None else "failed", "error": answer.error}
+    common: Row = {"log": log.name, "path": log.path, **log.state._asdict()}
+    common |= {"status": "ok" if answer.error is None else "failed", "error": answer.error}
     if log.recording is not None:
         r = log.recording
         common |= {
@@ -138,6 +145,6 @@ def _whole_rows(log: Log, answer: _Answer) -> list[Row]:
 
 def _said(error: Exception) -> str:
     """One line; what is a defect rather than bad input says its type."""
-    words = " ".join(str(error).split())
+    words = as_text(" ".join(str(error).split()))
     known = isinstance(error, ValueError | TypeError | OSError | ImportError)
     return words if known and words else f"{type(error).__name__}: {words}"
