@@ -38,6 +38,7 @@ from gyrofuse.simulate import ArrayModel
 if TYPE_CHECKING:
     from gyrofuse.fleet.store import ResultStore
     from gyrofuse.fleet.tasks import Task
+    from gyrofuse.lightning_module import GyroArrayDataModule
 
 _ACCELERATORS = ("cpu", "gpu", "auto")
 _LOOK = 0.5  # s between looks at how far a run has come
@@ -94,9 +95,10 @@ def fleet(
     A log that cannot be used gets a row that says why, and the others theirs. Stopped at any moment, the same command
     goes on where it was.
     """
-    from gyrofuse.fleet.logs import find_logs
+    from gyrofuse.fleet.logs import groups_of
     from gyrofuse.fleet.standing import standing_of
     from gyrofuse.fleet.store import ResultStore, read_results
+    from gyrofuse.lightning_module import GyroArrayDataModule
 
     check_positive_integer("--devices", devices)
     check_positive_integer("--group", group)
@@ -106,7 +108,7 @@ def fleet(
     if out.suffix.lower() != ".parquet":
         raise ValueError(f"`--out`: expected a name that ends in .parquet, got {str(out)!r}")
     asked = _task(task, scale_weights, method, virtual, model, simulation, false_alarm)
-    options = {
+    options: dict[str, Any] = {
         "axis": axis,
         "sensors": None if sensors is None else sensors.split(","),
         "rate": rate,
@@ -117,9 +119,10 @@ def fleet(
     options = {name: value for name, value in options.items() if value is not None}
     with outputs(force, [manifest, simulation], json=json_file, report=report) as drafts:
         store = ResultStore(out, asked.columns, {**asked.settings, **options})
-        logs = find_logs(paths or [], manifest=manifest)
+        data = GyroArrayDataModule(paths or [], manifest=manifest, **options)
         store.open(force=force)
-        _run(asked, store, logs, options, devices, accelerator, group, retry)
+        data.groups = groups_of(data.logs, group, store.done(failed=not retry))
+        _run(asked, store, data, devices, accelerator)
         settings, rows = read_results(out, without=["virtual"])
         standing = standing_of(settings["task"], rows)
         if json_file:
@@ -163,28 +166,18 @@ def _simulation(path: Path) -> Any:
     return noise
 
 
-def _run(
-    task: Task,
-    store: ResultStore,
-    logs: tuple[Path, ...],
-    options: dict[str, Any],
-    devices: int,
-    accelerator: str,
-    group: int,
-    retry: bool,
-) -> None:
+def _run(task: Task, store: ResultStore, data: GyroArrayDataModule, devices: int, accelerator: str) -> None:
     """Work on what is not done yet, with a bar."""
     from torch.multiprocessing import ProcessExitedException, ProcessRaisedException
 
     from gyrofuse.fleet.logs import identity
-    from gyrofuse.lightning_module import FusionModule, GyroArrayDataModule, ResultWriter, quiet_trainer
+    from gyrofuse.lightning_module import FusionModule, ResultWriter, quiet_trainer
 
-    data = GyroArrayDataModule(logs, group_size=group, done=store.done(failed=not retry), **options)
     if not data.groups:
-        store.finish([identity(log) for log in logs])
+        store.finish([identity(log) for log in data.logs])
         return
     try:
-        with _watched(store, store.n_parts, len(data.groups), len(logs)):
+        with _watched(store, store.n_parts, len(data.groups), len(data.logs)):
             trainer = quiet_trainer(devices=devices, accelerator=accelerator, callbacks=[ResultWriter(store)])
             trainer.predict(FusionModule(task), datamodule=data, return_predictions=False)
     except ProcessRaisedException as error:  # its last line is what was raised

@@ -104,6 +104,21 @@ def test_a_log_has_one_row_whatever_it_is_called(run: Run, logs: Path, tmp_path:
     assert Path("r.parquet").read_bytes() == before
 
 
+def test_names_that_lead_nowhere_and_names_in_no_text_are_rows(run: Run, logs: Path):
+    (logs / "link.npz").symlink_to("gone.npz")
+    (logs / "round.npz").symlink_to("round.npz")
+    (logs / "7.npz").rename(os.fsdecode(bytes(logs) + b"/\xff.npz"))
+    Path("all.txt").write_bytes(b"logs\nabsent.npz\nno/*.npz\nlogs/\xff.npz\nlogs/\xfe.npz\n")
+    done = run("fleet", "--manifest", "all.txt", "--out", "r.parquet", "--report", "r.html", "--json", "r.json")
+    assert done.status == 0, done.err
+    rows = {row["log"]: row for row in read_results("r.parquet")[1]}
+    assert rows["logs/\\xff.npz"]["status"] == "ok"
+    for name in ("logs/link.npz", "logs/round.npz", "absent.npz", "no/*.npz", "logs/\\xfe.npz"):
+        assert rows[name]["error"] == "no such file; check the name and the folder"
+    Path("absent.npz").write_bytes((logs / "0.npz").read_bytes())
+    assert run("fleet", "--manifest", "all.txt", "--out", "r.parquet").out.startswith("14 logs, 5 failed")
+
+
 def test_failed_logs_are_tried_again_when_asked(run: Run, logs: Path):
     run("fleet", "logs", "--out", "r.parquet")
     (logs / "empty.csv").write_text("gx,gy\n" + "\n".join(f"{i % 7},{i % 5}" for i in range(4000)))
