@@ -299,3 +299,7 @@ def test_relative_noise_is_that_of_known_levels():
     noise = relative_noise(variance[:2])
     np.testing.assert_allclose(noise, np.sqrt([0.5, 1.0, 1.0]))
     assert bool(relative_noise(torch.full((2, 3), torch.nan)).isnan().all())
+    even = torch.tensor([[1.0, 2.0, 4.0, 9.0]], dtype=torch.float64)
+    np.testing.assert_allclose(relative_noise(even), np.sqrt([1 / 3, 2 / 3, 4 / 3, 3.0]))
+    gap = torch.tensor([[1.0, 2.0, torch.nan, 6.0]], dtype=torch.float64)
+    np.testing.assert_allclose(relative_noise(gap), np.sqrt([1 / 2, 1.0, torch.nan, 3.0]))

@@ -270,7 +270,8 @@ def relative_noise(wavelet_variance: Tensor) -> Tensor:
 
     Of Allan deviations, as the geometric mean over the levels that are known.
     """
-    ratio = (wavelet_variance / wavelet_variance.median(-1, keepdim=True).values).sqrt()
+    # Of an even number the mean of the two in the middle, which torch.median is not.
+    ratio = (wavelet_variance / wavelet_variance.nanquantile(0.5, -1, keepdim=True)).sqrt()
     known = ratio.isfinite() & (ratio > 0)
     log = torch.where(known, ratio, torch.ones_like(ratio)).log().sum(0)
     return torch.where(known.any(0), log / known.sum(0).clamp(min=1), torch.full_like(log, math.nan)).exp()
