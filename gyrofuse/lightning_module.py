@@ -63,7 +63,9 @@ class GyroArrayDataModule(LightningDataModule):
 
     def predict_dataloader(self) -> DataLoader[tuple[Log, ...]]:
         """Groups of logs; Lightning shares them out among processes, each once."""
-        groups = LogGroups(self.groups, self.options)
+        # Lightning's sampler wants one for each process at least; an empty group has no rows.
+        idle = self.trainer.world_size - len(self.groups) if self.trainer and self.groups else 0
+        groups = LogGroups([*self.groups, *[()] * idle], self.options)
         # Of a batch of one group: samplers of distributed runs want batches.
         return DataLoader(groups, batch_size=1, collate_fn=_only, num_workers=self.num_workers)
 
@@ -93,8 +95,11 @@ class ResultWriter(BasePredictionWriter):
     """Writes rows to a table as they arrive: one process opens it, and completes it when all have done their share.
 
     Args:
-        store: The table.
+        store: The table, of the columns and settings of the module's task.
         force: Whether a table of other settings is replaced.
+
+    Raises:
+        ValueError: On setup, where the table is of another task, or of the same with other settings.
     """
 
     def __init__(self, store: ResultStore, *, force: bool = False) -> None:
@@ -106,6 +111,13 @@ class ResultWriter(BasePredictionWriter):
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Open the table, before anyone writes."""
         super().setup(trainer, pl_module, stage)
+        if isinstance(pl_module, FusionModule) and not self.store.holds(
+            pl_module.task.columns, pl_module.task.settings
+        ):
+            raise ValueError(
+                "`store`: expected the columns and settings of the module's task, got others; make it with "
+                "ResultStore(path, task.columns, task.settings)"
+            )
         if trainer.is_global_zero:
             self.store.open(force=self.force)
         trainer.strategy.barrier("opened")
@@ -128,8 +140,8 @@ class ResultWriter(BasePredictionWriter):
         """Add the rows of a group."""
         self.store.write(prediction)
 
-    def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Complete the table."""
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Complete the table; here, since Lightning begins and ends no prediction where nothing is left to do."""
         trainer.strategy.barrier("written")
         if trainer.is_global_zero:
             data = getattr(trainer, "datamodule", None)

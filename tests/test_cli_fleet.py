@@ -15,7 +15,9 @@ import torch
 from conftest import Run
 
 import gyrofuse as gf
-from gyrofuse.fleet import Fuse, ResultStore, read_results
+from gyrofuse.fleet import Fit, Fuse, ResultStore, find_logs, read_results
+from gyrofuse.fleet.work import LogGroups, rows_of
+from gyrofuse.lightning_module import FusionModule, GyroArrayDataModule, ResultWriter, quiet_trainer
 
 pytest.importorskip("pyarrow")
 
@@ -196,9 +198,50 @@ def test_a_trainer_of_ones_own_gives_the_same_table(run: Run, logs: Path, tmp_pa
         "                  logger=False, enable_checkpointing=False, enable_progress_bar=False)\n"
         "trainer.predict(FusionModule(task), datamodule=data, return_predictions=False)\n"
     )
-    own = subprocess.run([sys.executable, str(script)], cwd=tmp_path, capture_output=True, text=True)
-    assert own.returncode == 0, own.stderr
-    assert Path("one.parquet").read_bytes() == Path("own.parquet").read_bytes()
+    for _ in range(2):  # the second time nothing is left
+        own = subprocess.run([sys.executable, str(script)], cwd=tmp_path, capture_output=True, text=True)
+        assert own.returncode == 0, own.stderr
+        assert Path("one.parquet").read_bytes() == Path("own.parquet").read_bytes()
+        assert not Path(".own.parquet.parts").exists()
+
+
+def own_run(folder: Path, store: ResultStore, module: FusionModule) -> None:
+    data = GyroArrayDataModule([folder], done=store.done())
+    trainer = quiet_trainer(devices=1, callbacks=[ResultWriter(store)])
+    trainer.predict(module, datamodule=data, return_predictions=False)
+
+
+def test_a_run_of_ones_own_with_nothing_left_completes_the_table(logs: Path, tmp_path: Path):
+    task = Fuse()
+    store = ResultStore(tmp_path / "r.parquet", task.columns, task.settings)
+    own_run(logs, store, FusionModule(task))
+    before = store.path.read_bytes()
+    own_run(logs, store, FusionModule(task))
+    assert store.path.read_bytes() == before
+    assert not store.parts.exists()
+    store.path.unlink()  # as if stopped between the last row and the table
+    store.open()
+    for log in find_logs([logs]):
+        store.write(rows_of(task, LogGroups([[log]], {})[0]))
+    own_run(logs, store, FusionModule(task))
+    assert store.path.read_bytes() == before
+    assert not store.parts.exists()
+
+
+def test_a_table_of_another_task_is_refused_before_any_work(logs: Path, tmp_path: Path):
+    for task in (Fit("WN"), Fuse("long"), Fuse(virtual=True)):
+        store = ResultStore(tmp_path / "r.parquet", Fuse().columns, Fuse().settings)
+        with pytest.raises(ValueError, match=r"`store`: expected the columns and settings of the module's task"):
+            own_run(logs, store, FusionModule(task))
+    assert sorted(tmp_path.iterdir()) == [logs]
+
+
+def test_more_processes_than_logs(run: Run, logs: Path, tmp_path: Path):
+    run("fleet", "logs/0.npz", "--out", "one.parquet")
+    asked = command("logs/0.npz", "--out", "two.parquet", "--devices", 2)
+    two = subprocess.run(asked, cwd=tmp_path, capture_output=True, text=True, timeout=100)
+    assert (two.returncode, two.stderr) == (0, "")
+    assert Path("one.parquet").read_bytes() == Path("two.parquet").read_bytes()
 
 
 @pytest.mark.parametrize("devices", [1, 2])

@@ -98,10 +98,17 @@ class ResultStore:
             draft.unlink(missing_ok=True)
         self._place(self.parts / _HEAD, lambda draft: parquet.write_table(self._table([]), draft))
 
+    def holds(self, columns: Mapping[str, str], settings: Mapping[str, Any]) -> bool:
+        """Whether it is for rows of these columns and settings; settings of reading may be there beside them."""
+        asked = json.loads(json.dumps(settings))
+        return self._columns == {**COMMON, **columns} and asked.items() <= self._settings.items()
+
     def write(self, rows: Sequence[Mapping[str, Any]]) -> None:
         """Add all rows of some logs, at once or not at all."""
         from pyarrow import parquet
 
+        if not rows:
+            return
         logs = "\n".join(dict.fromkeys(map(identity_in, rows)))
         name = hashlib.sha256(logs.encode()).hexdigest()[:32]
         table = self._table(rows)
