@@ -36,6 +36,8 @@ from gyrofuse.recording import read_recording
 from gyrofuse.simulate import ArrayModel
 
 if TYPE_CHECKING:
+    from lightning.pytorch import Trainer
+
     from gyrofuse.fleet.store import ResultStore
     from gyrofuse.fleet.tasks import Task
     from gyrofuse.lightning_module import GyroArrayDataModule
@@ -71,15 +73,22 @@ def fleet(
     ] = 1,
     retry: Annotated[bool, typer.Option("--retry", help="Try logs again that failed before.")] = False,
     scale_weights: Annotated[
-        str, typer.Option(metavar="flat|short|long|W1,W2,...", help="fuse: which averaging times count.")
-    ] = "flat",
-    method: Annotated[Method, typer.Option(help="fuse: how weights are chosen.")] = Method.svo,
+        str | None,
+        typer.Option(
+            metavar="flat|short|long|W1,W2,...", show_default="flat", help="fuse: which averaging times count."
+        ),
+    ] = None,
+    method: Annotated[Method | None, typer.Option(show_default="svo", help="fuse: how weights are chosen.")] = None,
     virtual: Annotated[bool, typer.Option("--virtual", help="fuse: keep the virtual gyros in the table.")] = False,
-    model: Annotated[str, typer.Option(metavar="FORMULA", help="fit: processes to fit.")] = "WN + AR1 + RW",
+    model: Annotated[
+        str | None, typer.Option(metavar="FORMULA", show_default="WN + AR1 + RW", help="fit: processes to fit.")
+    ] = None,
     simulation: Annotated[
         Path | None, typer.Option(metavar="SIM", help="diagnose: a recording of the simulator, or a model, .json.")
     ] = None,
-    false_alarm: Annotated[float, typer.Option(metavar="P", help="diagnose: where nothing is missing.")] = 0.01,
+    false_alarm: Annotated[
+        float | None, typer.Option(metavar="P", show_default="0.01", help="diagnose: where nothing is missing.")
+    ] = None,
     axis: Axis = None,
     sensors: Sensors = None,
     rate: Rate = None,
@@ -92,8 +101,8 @@ def fleet(
 ) -> None:
     """Fuse, fit or diagnose many logs, on one process or several, into one table with a row for each.
 
-    A log that cannot be used gets a row that says why, and the others theirs. Stopped at any moment, the same command
-    goes on where it was.
+    A log that cannot be used gets a row that says why, and the others theirs; the exit status is 1 where that holds for
+    all of them. Stopped at any moment, the same command goes on where it was.
     """
     from gyrofuse.fleet.logs import groups_of
     from gyrofuse.fleet.standing import standing_of
@@ -107,6 +116,16 @@ def fleet(
         raise ValueError(f"`--accelerator`: expected {known}, got {accelerator!r}")
     if out.suffix.lower() != ".parquet":
         raise ValueError(f"`--out`: expected a name that ends in .parquet, got {str(out)!r}")
+    for option, kind, given in (
+        ("--scale-weights", Kind.fuse, scale_weights is not None),
+        ("--method", Kind.fuse, method is not None),
+        ("--virtual", Kind.fuse, virtual),
+        ("--model", Kind.fit, model is not None),
+        ("--simulation", Kind.diagnose, simulation is not None),
+        ("--false-alarm", Kind.diagnose, false_alarm is not None),
+    ):
+        if given and kind is not task:
+            raise ValueError(f"`{option}`: expected with --task {kind.value} alone, got {task.value}; leave it out")
     asked = _task(task, scale_weights, method, virtual, model, simulation, false_alarm)
     options: dict[str, Any] = {
         "axis": axis,
@@ -120,9 +139,10 @@ def fleet(
     with outputs(force, [manifest, simulation], json=json_file, report=report) as drafts:
         store = ResultStore(out, asked.columns, {**asked.settings, **options})
         data = GyroArrayDataModule(paths or [], manifest=manifest, **options)
+        trainer = _trainer(store, devices, accelerator)
         store.open(force=force)
         data.groups = groups_of(data.logs, group, store.done(failed=not retry))
-        _run(asked, store, data, devices, accelerator)
+        _run(asked, store, data, trainer)
         settings, rows = read_results(out, without=["virtual"])
         standing = standing_of(settings["task"], rows)
         if json_file:
@@ -132,29 +152,32 @@ def fleet(
 
             drafts[report].write_text(fleet_report(standing, rows, title=f"Fleet in {out.name}"), encoding="utf-8")
     say("\n".join([standing.summary(), *files_written(out, json_file, report)]))
+    if len(standing.failures) == standing.n_logs:
+        raise typer.Exit(1)  # for what starts the command and goes on with the table
 
 
 def _task(
     kind: Kind,
-    scale_weights: str,
-    method: Method,
+    scale_weights: str | None,
+    method: Method | None,
     virtual: bool,
-    model: str,
+    model: str | None,
     simulation: Path | None,
-    false_alarm: float,
+    false_alarm: float | None,
 ) -> Task:
     from gyrofuse.fleet.tasks import Diagnose, Fit, Fuse
 
     if kind is Kind.fuse:
-        weights = scale_weights_of(scale_weights)
         if method is Method.multiscale:
             raise ValueError("`--method`: expected one with a weight for each sensor, got multiscale; choose another")
-        return Fuse(weights, method=method.value.replace("-", "_"), virtual=virtual)
+        weights = Fuse.scale_weights if scale_weights is None else scale_weights_of(scale_weights)
+        return Fuse(weights, method=(method or Method.svo).value.replace("-", "_"), virtual=virtual)
     if kind is Kind.fit:
-        return Fit(model)
+        return Fit() if model is None else Fit(model)
     if simulation is None:
         raise ValueError("`--simulation`: expected what to compare with, a recording or a model, got none; give it")
-    return Diagnose(_simulation(simulation), false_alarm=false_alarm, source=str(simulation))
+    level = Diagnose.false_alarm if false_alarm is None else false_alarm
+    return Diagnose(_simulation(simulation), false_alarm=level, source=str(simulation))
 
 
 def _simulation(path: Path) -> Any:
@@ -166,19 +189,32 @@ def _simulation(path: Path) -> Any:
     return noise
 
 
-def _run(task: Task, store: ResultStore, data: GyroArrayDataModule, devices: int, accelerator: str) -> None:
+def _trainer(store: ResultStore, devices: int, accelerator: str) -> Trainer:
+    from lightning.pytorch.utilities.exceptions import MisconfigurationException
+
+    from gyrofuse.lightning_module import ResultWriter, quiet_trainer
+
+    try:
+        return quiet_trainer(devices=devices, accelerator=accelerator, callbacks=[ResultWriter(store)])
+    except MisconfigurationException as error:
+        raise ValueError(
+            f"`--accelerator`: expected {devices} of the kind {accelerator}, which this computer does not have "
+            f"({error}); leave it out, or ask for fewer --devices"
+        ) from None
+
+
+def _run(task: Task, store: ResultStore, data: GyroArrayDataModule, trainer: Trainer) -> None:
     """Work on what is not done yet, with a bar."""
     from torch.multiprocessing import ProcessExitedException, ProcessRaisedException
 
     from gyrofuse.fleet.logs import identity
-    from gyrofuse.lightning_module import FusionModule, ResultWriter, quiet_trainer
+    from gyrofuse.lightning_module import FusionModule
 
     if not data.groups:
         store.finish([identity(log) for log in data.logs])
         return
     try:
         with _watched(store, store.n_parts, len(data.groups), len(data.logs)):
-            trainer = quiet_trainer(devices=devices, accelerator=accelerator, callbacks=[ResultWriter(store)])
             trainer.predict(FusionModule(task), datamodule=data, return_predictions=False)
     except ProcessRaisedException as error:  # its last line is what was raised
         kind, _, words = str(error).strip().rpartition("\n")[2].partition(": ")

@@ -32,7 +32,7 @@ class GyroArrayDataModule(LightningDataModule):
     """Logs of arrays, read when their turn comes, in groups of any lengths and numbers of sensors: nothing is padded.
 
     Args:
-        paths: Files, folders and patterns, as of `find_logs`.
+        paths: Files, folders and patterns, or one of them, as of `find_logs`.
         manifest: Text file with one of them a line.
         group_size: Logs that a process takes at a time, and whose rows appear together. Short arrays of one shape
             are fitted together: more than one pays where logs are many and short.
@@ -42,12 +42,13 @@ class GyroArrayDataModule(LightningDataModule):
 
     Raises:
         FileNotFoundError: A name that stands for nothing.
-        ValueError: No log at all, or a number below one.
+        ValueError: No log at all, a number below one, or a rate or scale that is none.
+        TypeError: An option that `read_recording` does not have.
     """
 
     def __init__(
         self,
-        paths: Iterable[str | Path] = (),
+        paths: str | Path | Iterable[str | Path] = (),
         *,
         manifest: str | Path | None = None,
         group_size: int = 1,
@@ -59,7 +60,7 @@ class GyroArrayDataModule(LightningDataModule):
         self.logs = find_logs(paths, manifest=manifest)
         self.groups = groups_of(self.logs, check_positive_integer("group_size", group_size), done)
         self.num_workers = num_workers
-        self.options = options
+        self.options = LogGroups((), options).options  # wrong ones are told now, not by every row
 
     def predict_dataloader(self) -> DataLoader[tuple[Log, ...]]:
         """Groups of logs; Lightning shares them out among processes, each once."""

@@ -160,6 +160,18 @@ def test_fits_and_diagnoses(run: Run, logs: Path):
         (("logs", "--method", "multiscale"), "`--method`: expected one with a weight for each sensor"),
         (("logs", "--scale-weights", "tall"), "`--scale-weights`: expected flat, short, long"),
         (("logs", "--out", "no/r.parquet"), "the folder no does not exist; create it first"),
+        (("logs", "--scale-weights", "1,-1"), "`scale_weights`: expected finite numbers >= 0, not all zero"),
+        (("logs", "--scale-weights", "1,nan"), "`scale_weights`: expected finite numbers >= 0, not all zero"),
+        (("logs", "--rate", "-1"), "`rate`: expected a finite number > 0"),
+        (("logs", "--scale", "0"), "`scale`: expected a finite number other than 0"),
+        (("logs", "--false-alarm", "3"), "`--false-alarm`: expected with --task diagnose alone, got fuse; leave"),
+        (("logs", "--model", "WN"), "`--model`: expected with --task fit alone, got fuse; leave it out"),
+        (("logs", "--task", "fit", "--virtual"), "`--virtual`: expected with --task fuse alone, got fit"),
+        (("logs", "--task", "fit", "--method", "svo"), "`--method`: expected with --task fuse alone, got fit"),
+        (
+            ("logs", "--task", "diagnose", "--simulation", "logs/0.npz", "--false-alarm", "3"),
+            "`false_alarm`: expected a number between 0 and 1",
+        ),
         (("logs", "--accelerator", "abacus"), "`--accelerator`: expected cpu, gpu or auto, got 'abacus'"),
     ],
 )
@@ -170,6 +182,23 @@ def test_bad_requests_are_refused_before_any_work(run: Run, logs: Path, argument
     assert says in done.err
     assert done.err.count("\n") == 1
     assert sorted(Path().rglob("*")) == before
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a computer without a GPU")
+def test_an_accelerator_that_is_not_there_is_refused(run: Run, logs: Path):
+    done = run("fleet", "logs", "--accelerator", "gpu")
+    assert done.status == 2
+    assert "`--accelerator`: expected 1 of the kind gpu, which this computer does not have" in done.err
+    assert done.err.count("\n") == 1
+    assert sorted(Path().iterdir()) == [Path("logs")]
+
+
+def test_logs_that_all_fail_are_told_by_the_exit_status(run: Run, logs: Path):
+    done = run("fleet", "logs/empty.csv", "--out", "r.parquet")
+    assert (done.status, done.err) == (1, "")
+    assert done.out.startswith("1 logs, 1 failed\n")
+    assert read_results("r.parquet")[1][0]["status"] == "failed"
+    assert run("fleet", "logs/empty.csv", "logs/0.npz", "--out", "r.parquet").status == 0
 
 
 def test_two_processes_give_the_same_table(run: Run, logs: Path, tmp_path: Path):
@@ -234,6 +263,15 @@ def test_a_table_of_another_task_is_refused_before_any_work(logs: Path, tmp_path
         with pytest.raises(ValueError, match=r"`store`: expected the columns and settings of the module's task"):
             own_run(logs, store, FusionModule(task))
     assert sorted(tmp_path.iterdir()) == [logs]
+
+
+def test_data_modules_take_one_path_and_options_of_reading_alone(logs: Path):
+    for path in (logs / "0.npz", str(logs / "0.npz")):
+        assert GyroArrayDataModule(path, rate=100.0).logs == (logs / "0.npz",)
+    with pytest.raises(TypeError, match=r"`foo`: expected an option of read_recording \(axis, .*; leave it out"):
+        GyroArrayDataModule(logs, foo=3)
+    with pytest.raises(ValueError, match="`rate`: expected a finite number > 0"):
+        GyroArrayDataModule(logs, rate=-1.0)
 
 
 def test_more_processes_than_logs(run: Run, logs: Path, tmp_path: Path):

@@ -293,6 +293,22 @@ def test_a_simulation_of_the_same_name_and_other_numbers_is_another_setting():
         Diagnose("model.json")
 
 
+@pytest.mark.parametrize(
+    ("made", "says"),
+    [
+        (lambda: Fuse("longest"), "`scale_weights`: expected 'flat', 'short', 'long'"),
+        (lambda: Fuse((1.0, -1.0)), "`scale_weights`: expected finite numbers >= 0"),
+        (lambda: Fuse(method="foo"), "`method`: expected one of 'auto', 'svo'"),
+        (lambda: Fuse(confidence_level=95), "`confidence_level`: expected a number between 0 and 1"),
+        (lambda: Fit(confidence_level=95), "`confidence_level`: expected a number between 0 and 1"),
+        (lambda: Diagnose(gf.WhiteNoise(1.0), false_alarm=3), "`false_alarm`: expected a number between 0 and 1"),
+    ],
+)
+def test_bad_options_are_refused_when_a_task_is_made(made, says):
+    with pytest.raises(ValueError, match=says):
+        made()
+
+
 def test_relative_noise_is_that_of_known_levels():
     variance = torch.tensor([[1.0, 4.0, 16.0], [4.0, 4.0, 1.0], [torch.nan, 4.0, 4.0]], dtype=torch.float64)
     # Over the medians 4 and 4: ratios of deviations 1/2, 1, 2 and 1, 1, 1/2; a level with a gap has the rest.

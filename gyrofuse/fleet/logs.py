@@ -40,14 +40,14 @@ def as_text(text: str) -> str:
     return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
-def find_logs(paths: Iterable[str | Path], *, manifest: str | Path | None = None) -> tuple[Path, ...]:
+def find_logs(paths: str | Path | Iterable[str | Path], *, manifest: str | Path | None = None) -> tuple[Path, ...]:
     """All logs that names stand for, each once, in their order.
 
     A file is a log whatever its suffix; of a folder, all files below with a suffix that is read, and ROS 2 folders. A
     folder that may not be looked into is listed as it is, so that its row says so.
 
     Args:
-        paths: Files, folders, and patterns such as `"flights/*/imu.npz"`, with `**` for any folders between.
+        paths: Files, folders, and patterns such as `"flights/*/imu.npz"`, with `**` for any folders between; or one.
         manifest: Text file with one such name a line, relative to its own folder; lines that begin with `#` do not
             count. What it names and is not there is listed all the same.
 
@@ -56,7 +56,7 @@ def find_logs(paths: Iterable[str | Path], *, manifest: str | Path | None = None
         ValueError: No log at all.
     """
     found: dict[str, Path] = {}
-    for path in paths:
+    for path in [paths] if isinstance(paths, str | Path) else paths:
         for log in _logs_of(Path(path)):
             found.setdefault(identity(log), log)
     if manifest is not None:

@@ -16,11 +16,14 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from gyrofuse._checks import check_confidence_level
 from gyrofuse._model import Model
+from gyrofuse.fusion import METHODS
 from gyrofuse.gmwm import fit_gmwm
 from gyrofuse.mismatch import diagnose
 from gyrofuse.parsing import parse_model
 from gyrofuse.recording import Recording
+from gyrofuse.scale_weights import normalised, resolve_scale_weights
 from gyrofuse.simulate import ArrayModel
 from gyrofuse.svo import fit_svo
 from gyrofuse.svo_result import SVOResult
@@ -40,6 +43,9 @@ class Fuse:
         method: As of `fit_svo`.
         confidence_level: Of the limits of the weights.
         virtual: Whether the virtual signal is kept as well, in the column `virtual`.
+
+    Raises:
+        TypeError, ValueError: As `fit_svo`, where an option is wrong for any log.
     """
 
     scale_weights: str | tuple[float, ...] = "flat"
@@ -48,6 +54,17 @@ class Fuse:
     virtual: bool = False
 
     name: ClassVar[str] = "fuse"
+
+    def __post_init__(self) -> None:
+        # What is wrong with the task is told at once, not by every row.
+        if isinstance(self.scale_weights, str):
+            resolve_scale_weights(self.scale_weights, 1)
+        else:
+            normalised(self.scale_weights)
+            object.__setattr__(self, "scale_weights", tuple(map(float, self.scale_weights)))
+        if self.method not in METHODS:
+            raise ValueError(f"`method`: expected one of {', '.join(map(repr, METHODS))}, got {self.method!r}")
+        check_confidence_level(self.confidence_level)
 
     @property
     def columns(self) -> dict[str, str]:
@@ -135,6 +152,7 @@ class Fit:
 
     def __post_init__(self) -> None:
         parse_model(self.model)
+        check_confidence_level(self.confidence_level)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -182,6 +200,10 @@ class Diagnose:
         simulation: Samples of the same array, or a noise model.
         false_alarm: Probability of a finding where nothing is missing.
         source: What the simulation is called.
+
+    Raises:
+        TypeError: The simulation is neither.
+        ValueError: `false_alarm` is no probability.
     """
 
     simulation: Recording | Model | ArrayModel
@@ -208,6 +230,8 @@ class Diagnose:
                 f"`simulation`: expected a Recording or a noise model, got {type(self.simulation).__name__}; read a "
                 "recording with read_recording(path), or a model in JSON with model_from_dict"
             )
+        if not 0 < self.false_alarm < 1:
+            raise ValueError(f"`false_alarm`: expected a number between 0 and 1 such as 0.01, got {self.false_alarm!r}")
 
     @property
     def settings(self) -> dict[str, Any]:

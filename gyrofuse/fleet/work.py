@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,9 @@ from torch.utils.data import Dataset
 
 from gyrofuse.fleet.logs import State, as_text, identity, state_of
 from gyrofuse.fleet.tasks import Row, Task
-from gyrofuse.recording import Recording, read_recording
+from gyrofuse.recording import Recording, check_reading, read_recording
+
+_OPTIONS = tuple(signature(read_recording).parameters)[1:]  # without the path
 
 
 @dataclass(frozen=True)
@@ -47,11 +50,21 @@ class LogGroups(Dataset[tuple[Log, ...]]):
     Args:
         groups: Paths, group by group.
         options: Of `read_recording`.
+
+    Raises:
+        TypeError: An option that it does not have.
+        ValueError: A rate or scale that is none.
     """
 
     def __init__(self, groups: Sequence[Sequence[Path]], options: Mapping[str, Any]) -> None:
         self.groups = tuple(map(tuple, groups))
         self.options = dict(options)
+        unknown = [name for name in options if name not in _OPTIONS]
+        if unknown:
+            raise TypeError(
+                f"`{unknown[0]}`: expected an option of read_recording ({', '.join(_OPTIONS)}); leave it out"
+            )
+        check_reading(rate=self.options.get("rate"), scale=self.options.get("scale"))
 
     def __len__(self) -> int:
         return len(self.groups)
