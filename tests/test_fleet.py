@@ -120,6 +120,21 @@ def test_a_table_fills_up_and_is_in_order(tmp_path):
     assert list(tmp_path.iterdir()) == [store.path]
 
 
+@pytest.mark.parametrize("task", [Fuse(virtual=True), Fit(), Diagnose(gf.WhiteNoise(1.0))], ids=lambda task: task.name)
+def test_every_column_of_a_table_is_described(tmp_path, task):
+    ResultStore(tmp_path / "r.parquet", task.columns, task.settings).finish([])
+    fields = list(pa.parquet.read_schema(tmp_path / "r.parquet"))
+    told = {field.name: (field.metadata or {}).get(b"description", b"").decode() for field in fields}
+    assert {"log", "path", "size", "modified", *task.columns} <= set(told)
+    assert all(len(words) > 5 for words in told.values())
+    if task.name == "fuse":
+        assert "corrected for the weights having been chosen on this one" in told["gain"]
+        assert told["tau"].endswith(", s")
+    if task.name == "diagnose":
+        assert told["gain"].endswith(", nats")
+    assert "the sensor lacks that lacks most" in told["missing"]
+
+
 def test_a_table_grows_and_new_rows_replace_old_ones(tmp_path):
     store = store_at(tmp_path / "r.parquet")
     store.open()
@@ -192,7 +207,7 @@ def test_only_a_run_of_the_same_settings_goes_on(tmp_path):
     (tmp_path / "t.parquet").write_bytes(b"mine")
     with pytest.raises(FileExistsError, match="no table of a fleet; choose another name"):
         store_at(tmp_path / "t.parquet").open()
-    ResultStore(tmp_path / "u.parquet", {"tau": "numbers"}, {"task": "fuse"}).finish([])
+    ResultStore(tmp_path / "u.parquet", {}, {"task": "fuse"}).finish([])
     with pytest.raises(FileExistsError, match="of other columns, written by another version; choose another name"):
         store_at(tmp_path / "u.parquet").open()
     (tmp_path / "u.parquet").unlink()
@@ -234,6 +249,21 @@ def test_bad_logs_get_rows_and_those_beside_them_theirs(folder):
     np.testing.assert_allclose(rows["a.npz"]["weights"], alone.weights, rtol=1e-9)
     assert rows["a.npz"]["sensors"] == ["1", "2", "3"]
     assert rows["a.npz"]["rate"] == pytest.approx(100.0)
+
+
+def test_rows_say_whether_their_recording_is_long_enough():
+    drifting = gf.parse_model("WN(variance=1e-6) + RW(variance=1)").simulate(
+        64, batch=(5,), generator=torch.Generator().manual_seed(0)
+    )
+    recordings = [array(1), gf.Recording(drifting, rate=100.0), gf.Recording(drifting.flip(0), rate=100.0)]
+    long, *short = rows_of(Fuse("long"), [Log(str(i), r) for i, r in enumerate(recordings)])
+    assert (long["enough"], long["warnings"]) == (True, [])
+    for row, recording in zip(short, recordings[1:], strict=True):
+        data = gf.fit_svo(recording, "long").enough_data()
+        assert (row["enough"], row["warnings"]) == (False, [str(data)])
+        assert row["scale_weights"] == pytest.approx(gf.fit_svo(recording, "long").scale_weights.tolist())
+    (equal,) = rows_of(Fuse(method="equal"), [Log("log", array(1))])
+    assert (equal["enough"], equal["warnings"]) == (None, [])
 
 
 def test_arrays_of_one_shape_are_fitted_together_to_the_same(folder):

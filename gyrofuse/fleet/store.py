@@ -20,20 +20,28 @@ from gyrofuse.fleet.logs import State, state_of
 if TYPE_CHECKING:
     import pyarrow
 
+
+class Column(NamedTuple):
+    """What a column holds: `"text"`, `"number"`, `"whole"` numbers, `"truth"` values, `"texts"` or `"numbers"`."""
+
+    kind: str
+    description: str
+
+
 COMMON = {
-    "log": "text",
-    "path": "text",
-    "size": "whole",
-    "modified": "whole",
-    "status": "text",
-    "error": "text",
-    "sensors": "texts",
-    "n_samples": "whole",
-    "rate": "number",
-    "unit": "text",
-    "missing": "number",
-    "notes": "texts",
-    "warnings": "texts",
+    "log": Column("text", "the log as it was named"),
+    "path": Column("text", "its absolute path, by which it is known again"),
+    "size": Column("whole", "of the log in bytes, when it was read"),
+    "modified": Column("whole", "when it was last changed before, ns since 1970"),
+    "status": Column("text", "ok or failed"),
+    "error": Column("text", "why it failed"),
+    "sensors": Column("texts", "names of the sensors"),
+    "n_samples": Column("whole", "samples of each sensor, missing ones included"),
+    "rate": Column("number", "sampling rate in Hz"),
+    "unit": Column("text", "of the signal"),
+    "missing": Column("number", "share of its samples that the sensor lacks that lacks most, 0 to 1"),
+    "notes": Column("texts", "what was found on reading: gaps, repeats, jitter, offsets"),
+    "warnings": Column("texts", "what the task warned of"),
 }
 _SETTINGS = b"gyrofuse"
 _HEAD = "head"  # among the parts: a table of no rows
@@ -54,14 +62,14 @@ class ResultStore:
 
     Args:
         path: The table, `.parquet`.
-        columns: Of the task, by name, beside those that all tasks have.
+        columns: Of the task, by name, beside those that all tasks have; descriptions become metadata of the fields.
         settings: What the rows depend on: only a run of the same goes on with what is there.
 
     Raises:
         ImportError: pyarrow is not installed.
     """
 
-    def __init__(self, path: str | Path, columns: Mapping[str, str], settings: Mapping[str, Any]) -> None:
+    def __init__(self, path: str | Path, columns: Mapping[str, Column], settings: Mapping[str, Any]) -> None:
         _arrow(Path(path))
         self.path = Path(path)
         self.parts = self.path.with_name(f".{self.path.name}.parts")
@@ -98,7 +106,7 @@ class ResultStore:
             draft.unlink(missing_ok=True)
         self._place(self.parts / _HEAD, lambda draft: parquet.write_table(self._table([]), draft))
 
-    def holds(self, columns: Mapping[str, str], settings: Mapping[str, Any]) -> bool:
+    def holds(self, columns: Mapping[str, Column], settings: Mapping[str, Any]) -> bool:
         """Whether it is for rows of these columns and settings; settings of reading may be there beside them."""
         asked = json.loads(json.dumps(settings))
         return self._columns == {**COMMON, **columns} and asked.items() <= self._settings.items()
@@ -213,8 +221,11 @@ class ResultStore:
             "whole": pa.int64(),
             "truth": pa.bool_(),
         }
-        metadata = {_SETTINGS: json.dumps(self._settings), b"gyrofuse_version": __version__}
-        return pa.schema([(name, kinds[kind]) for name, kind in self._columns.items()], metadata=metadata)
+        fields = [
+            pa.field(name, kinds[column.kind], metadata={"description": column.description})
+            for name, column in self._columns.items()
+        ]
+        return pa.schema(fields, metadata={_SETTINGS: json.dumps(self._settings), b"gyrofuse_version": __version__})
 
     def _place(self, path: Path, write: Any) -> None:
         """Write under another name, then rename."""

@@ -151,9 +151,8 @@ def _whole_rows(log: Log, answer: _Answer) -> list[Row]:
             "unit": r.unit,
             "missing": float(r.missing.max()),
             "notes": [str(note) for note in r.notes],
-            "warnings": answer.warned,
         }
-    return [{**common, **own} for own in answer.rows or [{}]]
+    return [{**common, **own, "warnings": [*answer.warned, *own.get("warnings", ())]} for own in answer.rows or [{}]]
 
 
 def _said(error: Exception) -> str:
