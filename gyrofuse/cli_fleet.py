@@ -150,7 +150,8 @@ def fleet(
         if report:
             from gyrofuse.report_fleet import fleet_report
 
-            drafts[report].write_text(fleet_report(standing, rows, title=f"Fleet in {out.name}"), encoding="utf-8")
+            page = fleet_report(standing, rows, title=f"Fleet in {out.name}", settings=settings)
+            drafts[report].write_text(page, encoding="utf-8")
     say("\n".join([standing.summary(), *files_written(out, json_file, report)]))
     if len(standing.failures) == standing.n_logs:
         raise typer.Exit(1)  # for what starts the command and goes on with the table
