@@ -159,6 +159,8 @@ def test_fits_and_diagnoses(run: Run, logs: Path):
         (("logs", "--method", "magic"), "--method"),
         (("logs", "--method", "multiscale"), "`--method`: expected one with a weight for each sensor"),
         (("logs", "--scale-weights", "tall"), "`--scale-weights`: expected flat, short, long"),
+        (("logs", "--out", "f.parquet"), "f.parquet: expected the name of a file, found a folder; choose another name"),
+        (("logs", "--out", "f.parquet", "--force"), "f.parquet: expected the name of a file, found a folder"),
         (("logs", "--out", "no/r.parquet"), "the folder no does not exist; create it first"),
         (("logs", "--scale-weights", "1,-1"), "`scale_weights`: expected finite numbers >= 0, not all zero"),
         (("logs", "--scale-weights", "1,nan"), "`scale_weights`: expected finite numbers >= 0, not all zero"),
@@ -176,6 +178,7 @@ def test_fits_and_diagnoses(run: Run, logs: Path):
     ],
 )
 def test_bad_requests_are_refused_before_any_work(run: Run, logs: Path, arguments, says):
+    Path("f.parquet").mkdir()
     before = sorted(Path().rglob("*"))
     done = run("fleet", *arguments)
     assert done.status == 2

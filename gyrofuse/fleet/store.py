@@ -86,9 +86,12 @@ class ResultStore:
             FileExistsError: What is there is of other settings, or no table of a fleet.
             FileNotFoundError: The folder does not exist.
             OSError: It cannot be written to.
+            ValueError: It is a folder.
         """
         from pyarrow import parquet
 
+        if self.path.is_dir():
+            raise ValueError(f"{self.path}: expected the name of a file, found a folder; choose another name")
         for file in (self.path, self.parts / _HEAD):
             differs = self._difference_to(file) if file.exists() else None
             if differs is None:
