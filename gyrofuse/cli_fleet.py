@@ -60,7 +60,11 @@ def fleet(
         typer.Argument(metavar="PATH...", help='Logs, folders with logs, and patterns such as "flights/*/imu.npz".'),
     ] = None,
     out: Annotated[
-        Path, typer.Option(metavar="FILE", help="Where the rows go, .parquet; a run that was stopped goes on there.")
+        Path,
+        typer.Option(
+            metavar="FILE",
+            help="Where the rows go, .parquet (takes gyrofuse[logs]); a run that was stopped goes on there.",
+        ),
     ] = Path("results.parquet"),
     task: Annotated[Kind, typer.Option(help="What is asked of every log.")] = Kind.fuse,
     manifest: Annotated[
