@@ -108,7 +108,7 @@ def fleet(
     A log that cannot be used gets a row that says why, and the others theirs; the exit status is 1 where that holds for
     all of them. Stopped at any moment, the same command goes on where it was.
     """
-    from gyrofuse.fleet.logs import groups_of
+    from gyrofuse.fleet.logs import groups_of, identity
     from gyrofuse.fleet.standing import standing_of
     from gyrofuse.fleet.store import ResultStore, read_results
     from gyrofuse.lightning_module import GyroArrayDataModule
@@ -143,6 +143,7 @@ def fleet(
     with outputs(force, [manifest, simulation], json=json_file, report=report) as drafts:
         store = ResultStore(out, asked.columns, {**asked.settings, **options})
         data = GyroArrayDataModule(paths or [], manifest=manifest, **options)
+        data.logs = tuple(log for log in data.logs if identity(log) != identity(out))  # its suffix is that of a log
         trainer = _trainer(store, devices, accelerator)
         store.open(force=force)
         data.groups = groups_of(data.logs, group, store.done(failed=not retry))

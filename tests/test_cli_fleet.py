@@ -91,6 +91,17 @@ def test_a_log_that_was_replaced_is_done_again(run: Run, logs: Path):
     assert same == set(before) - {"logs/3.npz", "logs/5.npz"}  # of a log that is gone, what is known of it
 
 
+def test_a_table_among_its_logs_is_none_of_them_and_no_log_becomes_a_table(run: Run, logs: Path):
+    assert run("fleet", "logs", "--out", "logs/r.parquet").out.startswith("9 logs, 1 failed")
+    before = (logs / "r.parquet").read_bytes()
+    assert run("fleet", "logs", "--out", "logs/r.parquet").out.startswith("9 logs, 1 failed")
+    assert (logs / "r.parquet").read_bytes() == before
+    (logs / "log.parquet").write_bytes(b"a log")
+    done = run("fleet", "logs", "--out", "logs/log.parquet", "--force")
+    assert (done.status, "logs/log.parquet: is no table of a fleet; choose another name" in done.err) == (2, True)
+    assert (logs / "log.parquet").read_bytes() == b"a log"
+
+
 def test_a_log_has_one_row_whatever_it_is_called(run: Run, logs: Path, tmp_path: Path, monkeypatch):
     run("fleet", "logs", "--out", "r.parquet")
     before = Path("r.parquet").read_bytes()

@@ -45,6 +45,7 @@ COMMON = {
 }
 _SETTINGS = b"gyrofuse"
 _HEAD = "head"  # among the parts: a table of no rows
+_NO_TABLE = "no table of a fleet"
 _MOST_OPEN = 4  # files in memory while the table is made
 _MOST_LOGS, _MOST_BYTES = 1000, 2**26  # in a row group of it
 
@@ -80,7 +81,7 @@ class ResultStore:
         """Make ready for writing.
 
         Args:
-            force: Whether a table or parts of other settings are replaced.
+            force: Whether a table or parts of other settings are replaced; another file never is.
 
         Raises:
             FileExistsError: What is there is of other settings, or no table of a fleet.
@@ -96,6 +97,8 @@ class ResultStore:
             differs = self._difference_to(file) if file.exists() else None
             if differs is None:
                 continue
+            if file == self.path and differs == _NO_TABLE:  # a log, perhaps
+                raise FileExistsError(f"{file}: is {differs}; choose another name")
             if not force:
                 raise FileExistsError(
                     f"{file}: is {differs}; choose another name, or replace it with --force (`force`)"
@@ -200,7 +203,7 @@ class ResultStore:
 
         found = _settings_of(file)
         if found is None:
-            return "no table of a fleet"
+            return _NO_TABLE
         if found != self._settings:
             return f"of other settings ({_difference(found, self._settings)})"
         if parquet.read_schema(file).names != list(self._columns):
