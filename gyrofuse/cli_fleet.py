@@ -36,8 +36,11 @@ from gyrofuse.recording import read_recording
 from gyrofuse.simulate import ArrayModel
 
 if TYPE_CHECKING:
+    from lightning.pytorch import Trainer
+
     from gyrofuse.fleet.store import ResultStore
     from gyrofuse.fleet.tasks import Task
+    from gyrofuse.lightning_module import GyroArrayDataModule
 
 _ACCELERATORS = ("cpu", "gpu", "auto")
 _LOOK = 0.5  # s between looks at how far a run has come
@@ -57,7 +60,11 @@ def fleet(
         typer.Argument(metavar="PATH...", help='Logs, folders with logs, and patterns such as "flights/*/imu.npz".'),
     ] = None,
     out: Annotated[
-        Path, typer.Option(metavar="FILE", help="Where the rows go, .parquet; a run that was stopped goes on there.")
+        Path,
+        typer.Option(
+            metavar="FILE",
+            help="Where the rows go, .parquet (takes gyrofuse[logs]); a run that was stopped goes on there.",
+        ),
     ] = Path("results.parquet"),
     task: Annotated[Kind, typer.Option(help="What is asked of every log.")] = Kind.fuse,
     manifest: Annotated[
@@ -70,15 +77,22 @@ def fleet(
     ] = 1,
     retry: Annotated[bool, typer.Option("--retry", help="Try logs again that failed before.")] = False,
     scale_weights: Annotated[
-        str, typer.Option(metavar="flat|short|long|W1,W2,...", help="fuse: which averaging times count.")
-    ] = "flat",
-    method: Annotated[Method, typer.Option(help="fuse: how weights are chosen.")] = Method.svo,
+        str | None,
+        typer.Option(
+            metavar="flat|short|long|W1,W2,...", show_default="flat", help="fuse: which averaging times count."
+        ),
+    ] = None,
+    method: Annotated[Method | None, typer.Option(show_default="svo", help="fuse: how weights are chosen.")] = None,
     virtual: Annotated[bool, typer.Option("--virtual", help="fuse: keep the virtual gyros in the table.")] = False,
-    model: Annotated[str, typer.Option(metavar="FORMULA", help="fit: processes to fit.")] = "WN + AR1 + RW",
+    model: Annotated[
+        str | None, typer.Option(metavar="FORMULA", show_default="WN + AR1 + RW", help="fit: processes to fit.")
+    ] = None,
     simulation: Annotated[
         Path | None, typer.Option(metavar="SIM", help="diagnose: a recording of the simulator, or a model, .json.")
     ] = None,
-    false_alarm: Annotated[float, typer.Option(metavar="P", help="diagnose: where nothing is missing.")] = 0.01,
+    false_alarm: Annotated[
+        float | None, typer.Option(metavar="P", show_default="0.01", help="diagnose: where nothing is missing.")
+    ] = None,
     axis: Axis = None,
     sensors: Sensors = None,
     rate: Rate = None,
@@ -91,12 +105,13 @@ def fleet(
 ) -> None:
     """Fuse, fit or diagnose many logs, on one process or several, into one table with a row for each.
 
-    A log that cannot be used gets a row that says why, and the others theirs. Stopped at any moment, the same command
-    goes on where it was.
+    A log that cannot be used gets a row that says why, and the others theirs; the exit status is 1 where that holds for
+    all of them. Stopped at any moment, the same command goes on where it was.
     """
-    from gyrofuse.fleet.logs import find_logs
+    from gyrofuse.fleet.logs import groups_of, identity
     from gyrofuse.fleet.standing import standing_of
     from gyrofuse.fleet.store import ResultStore, read_results
+    from gyrofuse.lightning_module import GyroArrayDataModule
 
     check_positive_integer("--devices", devices)
     check_positive_integer("--group", group)
@@ -105,8 +120,18 @@ def fleet(
         raise ValueError(f"`--accelerator`: expected {known}, got {accelerator!r}")
     if out.suffix.lower() != ".parquet":
         raise ValueError(f"`--out`: expected a name that ends in .parquet, got {str(out)!r}")
+    for option, kind, given in (
+        ("--scale-weights", Kind.fuse, scale_weights is not None),
+        ("--method", Kind.fuse, method is not None),
+        ("--virtual", Kind.fuse, virtual),
+        ("--model", Kind.fit, model is not None),
+        ("--simulation", Kind.diagnose, simulation is not None),
+        ("--false-alarm", Kind.diagnose, false_alarm is not None),
+    ):
+        if given and kind is not task:
+            raise ValueError(f"`{option}`: expected with --task {kind.value} alone, got {task.value}; leave it out")
     asked = _task(task, scale_weights, method, virtual, model, simulation, false_alarm)
-    options = {
+    options: dict[str, Any] = {
         "axis": axis,
         "sensors": None if sensors is None else sensors.split(","),
         "rate": rate,
@@ -117,9 +142,12 @@ def fleet(
     options = {name: value for name, value in options.items() if value is not None}
     with outputs(force, [manifest, simulation], json=json_file, report=report) as drafts:
         store = ResultStore(out, asked.columns, {**asked.settings, **options})
-        logs = find_logs(paths or [], manifest=manifest)
+        data = GyroArrayDataModule(paths or [], manifest=manifest, **options)
+        data.logs = tuple(log for log in data.logs if identity(log) != identity(out))  # its suffix is that of a log
+        trainer = _trainer(store, devices, accelerator)
         store.open(force=force)
-        _run(asked, store, logs, options, devices, accelerator, group, retry)
+        data.groups = groups_of(data.logs, group, store.done(failed=not retry))
+        _run(asked, store, data, trainer)
         settings, rows = read_results(out, without=["virtual"])
         standing = standing_of(settings["task"], rows)
         if json_file:
@@ -127,31 +155,35 @@ def fleet(
         if report:
             from gyrofuse.report_fleet import fleet_report
 
-            drafts[report].write_text(fleet_report(standing, rows, title=f"Fleet in {out.name}"), encoding="utf-8")
+            page = fleet_report(standing, rows, title=f"Fleet in {out.name}", settings=settings)
+            drafts[report].write_text(page, encoding="utf-8")
     say("\n".join([standing.summary(), *files_written(out, json_file, report)]))
+    if len(standing.failures) == standing.n_logs:
+        raise typer.Exit(1)  # for what starts the command and goes on with the table
 
 
 def _task(
     kind: Kind,
-    scale_weights: str,
-    method: Method,
+    scale_weights: str | None,
+    method: Method | None,
     virtual: bool,
-    model: str,
+    model: str | None,
     simulation: Path | None,
-    false_alarm: float,
+    false_alarm: float | None,
 ) -> Task:
     from gyrofuse.fleet.tasks import Diagnose, Fit, Fuse
 
     if kind is Kind.fuse:
-        weights = scale_weights_of(scale_weights)
         if method is Method.multiscale:
             raise ValueError("`--method`: expected one with a weight for each sensor, got multiscale; choose another")
-        return Fuse(weights, method=method.value.replace("-", "_"), virtual=virtual)
+        weights = Fuse.scale_weights if scale_weights is None else scale_weights_of(scale_weights)
+        return Fuse(weights, method=(method or Method.svo).value.replace("-", "_"), virtual=virtual)
     if kind is Kind.fit:
-        return Fit(model)
+        return Fit() if model is None else Fit(model)
     if simulation is None:
         raise ValueError("`--simulation`: expected what to compare with, a recording or a model, got none; give it")
-    return Diagnose(_simulation(simulation), false_alarm=false_alarm, source=str(simulation))
+    level = Diagnose.false_alarm if false_alarm is None else false_alarm
+    return Diagnose(_simulation(simulation), false_alarm=level, source=str(simulation))
 
 
 def _simulation(path: Path) -> Any:
@@ -163,28 +195,32 @@ def _simulation(path: Path) -> Any:
     return noise
 
 
-def _run(
-    task: Task,
-    store: ResultStore,
-    logs: tuple[Path, ...],
-    options: dict[str, Any],
-    devices: int,
-    accelerator: str,
-    group: int,
-    retry: bool,
-) -> None:
+def _trainer(store: ResultStore, devices: int, accelerator: str) -> Trainer:
+    from lightning.pytorch.utilities.exceptions import MisconfigurationException
+
+    from gyrofuse.lightning_module import ResultWriter, quiet_trainer
+
+    try:
+        return quiet_trainer(devices=devices, accelerator=accelerator, callbacks=[ResultWriter(store)])
+    except MisconfigurationException as error:
+        raise ValueError(
+            f"`--accelerator`: expected {devices} of the kind {accelerator}, which this computer does not have "
+            f"({error}); leave it out, or ask for fewer --devices"
+        ) from None
+
+
+def _run(task: Task, store: ResultStore, data: GyroArrayDataModule, trainer: Trainer) -> None:
     """Work on what is not done yet, with a bar."""
     from torch.multiprocessing import ProcessExitedException, ProcessRaisedException
 
-    from gyrofuse.lightning_module import FusionModule, GyroArrayDataModule, ResultWriter, quiet_trainer
+    from gyrofuse.fleet.logs import identity
+    from gyrofuse.lightning_module import FusionModule
 
-    data = GyroArrayDataModule(logs, group_size=group, done=store.done(failed=not retry), **options)
     if not data.groups:
-        store.finish([str(log) for log in logs])
+        store.finish([identity(log) for log in data.logs])
         return
     try:
-        with _watched(store, store.n_parts, len(data.groups), len(logs)):
-            trainer = quiet_trainer(devices=devices, accelerator=accelerator, callbacks=[ResultWriter(store)])
+        with _watched(store, store.n_parts, len(data.groups), len(data.logs)):
             trainer.predict(FusionModule(task), datamodule=data, return_predictions=False)
     except ProcessRaisedException as error:  # its last line is what was raised
         kind, _, words = str(error).strip().rpartition("\n")[2].partition(": ")

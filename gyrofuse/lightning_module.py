@@ -22,7 +22,7 @@ from lightning.pytorch.callbacks import BasePredictionWriter, Callback
 from torch.utils.data import DataLoader
 
 from gyrofuse._checks import check_positive_integer
-from gyrofuse.fleet.logs import find_logs, groups_of
+from gyrofuse.fleet.logs import find_logs, groups_of, identity
 from gyrofuse.fleet.store import ResultStore
 from gyrofuse.fleet.tasks import Fuse, Row, Task
 from gyrofuse.fleet.work import Log, LogGroups, rows_of
@@ -32,22 +32,23 @@ class GyroArrayDataModule(LightningDataModule):
     """Logs of arrays, read when their turn comes, in groups of any lengths and numbers of sensors: nothing is padded.
 
     Args:
-        paths: Files, folders and patterns, as of `find_logs`.
+        paths: Files, folders and patterns, or one of them, as of `find_logs`.
         manifest: Text file with one of them a line.
         group_size: Logs that a process takes at a time, and whose rows appear together. Short arrays of one shape
             are fitted together: more than one pays where logs are many and short.
         num_workers: Processes that read ahead.
-        done: Names of logs that are left out, though the others stay in their groups.
+        done: Identities of logs (`ResultStore.done`) that are left out, though the others stay in their groups.
         **options: Of `read_recording`: `axis`, `sensors`, `rate`, `unit`, `scale`, `key`, `mounting`.
 
     Raises:
         FileNotFoundError: A name that stands for nothing.
-        ValueError: No log at all, or a number below one.
+        ValueError: No log at all, a number below one, or a rate or scale that is none.
+        TypeError: An option that `read_recording` does not have.
     """
 
     def __init__(
         self,
-        paths: Iterable[str | Path] = (),
+        paths: str | Path | Iterable[str | Path] = (),
         *,
         manifest: str | Path | None = None,
         group_size: int = 1,
@@ -59,11 +60,13 @@ class GyroArrayDataModule(LightningDataModule):
         self.logs = find_logs(paths, manifest=manifest)
         self.groups = groups_of(self.logs, check_positive_integer("group_size", group_size), done)
         self.num_workers = num_workers
-        self.options = options
+        self.options = LogGroups((), options).options  # wrong ones are told now, not by every row
 
     def predict_dataloader(self) -> DataLoader[tuple[Log, ...]]:
         """Groups of logs; Lightning shares them out among processes, each once."""
-        groups = LogGroups(self.groups, self.options)
+        # Lightning's sampler wants one for each process at least; an empty group has no rows.
+        idle = self.trainer.world_size - len(self.groups) if self.trainer and self.groups else 0
+        groups = LogGroups([*self.groups, *[()] * idle], self.options)
         # Of a batch of one group: samplers of distributed runs want batches.
         return DataLoader(groups, batch_size=1, collate_fn=_only, num_workers=self.num_workers)
 
@@ -93,8 +96,11 @@ class ResultWriter(BasePredictionWriter):
     """Writes rows to a table as they arrive: one process opens it, and completes it when all have done their share.
 
     Args:
-        store: The table.
+        store: The table, of the columns and settings of the module's task.
         force: Whether a table of other settings is replaced.
+
+    Raises:
+        ValueError: On setup, where the table is of another task, or of the same with other settings.
     """
 
     def __init__(self, store: ResultStore, *, force: bool = False) -> None:
@@ -106,6 +112,13 @@ class ResultWriter(BasePredictionWriter):
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Open the table, before anyone writes."""
         super().setup(trainer, pl_module, stage)
+        if isinstance(pl_module, FusionModule) and not self.store.holds(
+            pl_module.task.columns, pl_module.task.settings
+        ):
+            raise ValueError(
+                "`store`: expected the columns and settings of the module's task, got others; make it with "
+                "ResultStore(path, task.columns, task.settings)"
+            )
         if trainer.is_global_zero:
             self.store.open(force=self.force)
         trainer.strategy.barrier("opened")
@@ -128,12 +141,12 @@ class ResultWriter(BasePredictionWriter):
         """Add the rows of a group."""
         self.store.write(prediction)
 
-    def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Complete the table."""
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Complete the table; here, since Lightning begins and ends no prediction where nothing is left to do."""
         trainer.strategy.barrier("written")
         if trainer.is_global_zero:
             data = getattr(trainer, "datamodule", None)
-            self.store.finish([str(log) for log in data.logs] if isinstance(data, GyroArrayDataModule) else ())
+            self.store.finish([identity(log) for log in data.logs] if isinstance(data, GyroArrayDataModule) else ())
         trainer.strategy.barrier("finished")
 
 

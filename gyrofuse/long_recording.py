@@ -39,6 +39,7 @@ class LongRecording:
         rate: Sampling rate in Hz, when known.
         unit: Unit of the signal: "deg/s", "rad/s", "counts", "unknown".
         sensors: Name of each sensor; "1", "2", ... by default.
+        path: File that is read, where there is one.
 
     Raises:
         TypeError: `source` cannot be called.
@@ -51,6 +52,7 @@ class LongRecording:
     rate: float | None = None
     unit: str = "unknown"
     sensors: tuple[str, ...] = ()
+    path: Path | None = None
 
     def __post_init__(self) -> None:
         fill = object.__setattr__
@@ -153,6 +155,7 @@ def open_long(
         rate=found.rate if rate is None else rate,
         unit=unit or found.unit,
         sensors=found.sensors,
+        path=Path(path).resolve(),
     )
 
 

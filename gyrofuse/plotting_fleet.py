@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.ticker import Locator
 
-_COLOURS = (_BLUE, "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#969696")
+_COLOURS = (_BLUE, "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#969696", "#8c510a")  # not that of the mean
 _FEWEST_BINS, _MOST_BINS = 5, 60
 
 

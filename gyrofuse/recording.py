@@ -287,10 +287,7 @@ def read_recording(
     paths = [Path(path)] if isinstance(path, str | Path) else [Path(p) for p in path]
     if not paths:
         raise ValueError("`path`: expected at least one file, got none")
-    if rate is not None:
-        check_positive("rate", rate)
-    if scale is not None and not (math.isfinite(scale) and scale != 0):
-        raise ValueError(f"`scale`: expected a finite number other than 0, got {scale!r}")
+    check_reading(rate=rate, scale=scale)
     whole = assemble(paths, axis=axis, rate=rate, unit=unit, scale=scale, key=key, mounting=mounting)
     recording = Recording(
         torch.from_numpy(whole.signal),
@@ -303,6 +300,14 @@ def read_recording(
         notes=whole.notes,
     )
     return recording if sensors is None else recording.select(sensors=sensors)
+
+
+def check_reading(*, rate: float | None = None, scale: float | None = None) -> None:
+    """Raise `ValueError` where an option of `read_recording` is wrong for any log."""
+    if rate is not None:
+        check_positive("rate", rate)
+    if scale is not None and not (math.isfinite(scale) and scale != 0):
+        raise ValueError(f"`scale`: expected a finite number other than 0, got {scale!r}")
 
 
 def _position(names: Sequence[str], sensor: str | int) -> int:

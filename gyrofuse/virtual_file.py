@@ -47,7 +47,8 @@ def write_virtual(
 
     Raises:
         TypeError: `recording` is not a `LongRecording`, or `weights` no floating point tensor.
-        ValueError: The name does not end in .npy, or there is not one weight for each sensor.
+        ValueError: The name does not end in .npy or is that of the recording, or there is not one weight for each
+            sensor.
         FileExistsError: The file exists and `force` is not set.
         FileNotFoundError: The folder does not exist.
         RuntimeError: `fabric` was not launched, or another process failed.
@@ -56,6 +57,8 @@ def write_virtual(
     path = Path(path)
     if path.suffix.lower() != ".npy":
         raise ValueError(f"`path`: expected a name that ends in .npy, got {path.name!r}")
+    if recording.path is not None and path.resolve() == recording.path:
+        raise ValueError(f"`path`: expected another file than the log that is read, got {path}; choose another name")
     check_floating("weights", weights)
     if weights.shape != (recording.n_sensors,):
         raise ValueError(

@@ -120,6 +120,21 @@ def test_a_table_fills_up_and_is_in_order(tmp_path):
     assert list(tmp_path.iterdir()) == [store.path]
 
 
+@pytest.mark.parametrize("task", [Fuse(virtual=True), Fit(), Diagnose(gf.WhiteNoise(1.0))], ids=lambda task: task.name)
+def test_every_column_of_a_table_is_described(tmp_path, task):
+    ResultStore(tmp_path / "r.parquet", task.columns, task.settings).finish([])
+    fields = list(pa.parquet.read_schema(tmp_path / "r.parquet"))
+    told = {field.name: (field.metadata or {}).get(b"description", b"").decode() for field in fields}
+    assert {"log", "path", "size", "modified", *task.columns} <= set(told)
+    assert all(len(words) > 5 for words in told.values())
+    if task.name == "fuse":
+        assert "corrected for the weights having been chosen on this one" in told["gain"]
+        assert told["tau"].endswith(", s")
+    if task.name == "diagnose":
+        assert told["gain"].endswith(", nats")
+    assert "the sensor lacks that lacks most" in told["missing"]
+
+
 def test_a_table_grows_and_new_rows_replace_old_ones(tmp_path):
     store = store_at(tmp_path / "r.parquet")
     store.open()
@@ -192,6 +207,10 @@ def test_only_a_run_of_the_same_settings_goes_on(tmp_path):
     (tmp_path / "t.parquet").write_bytes(b"mine")
     with pytest.raises(FileExistsError, match="no table of a fleet; choose another name"):
         store_at(tmp_path / "t.parquet").open()
+    ResultStore(tmp_path / "u.parquet", {}, {"task": "fuse"}).finish([])
+    with pytest.raises(FileExistsError, match="of other columns, written by another version; choose another name"):
+        store_at(tmp_path / "u.parquet").open()
+    (tmp_path / "u.parquet").unlink()
     with pytest.raises(FileNotFoundError, match="does not exist; create it first"):
         store_at(tmp_path / "no" / "r.parquet").open()
     with pytest.raises(ValueError, match="expected a table that `gyrofuse fleet` wrote"):
@@ -230,6 +249,21 @@ def test_bad_logs_get_rows_and_those_beside_them_theirs(folder):
     np.testing.assert_allclose(rows["a.npz"]["weights"], alone.weights, rtol=1e-9)
     assert rows["a.npz"]["sensors"] == ["1", "2", "3"]
     assert rows["a.npz"]["rate"] == pytest.approx(100.0)
+
+
+def test_rows_say_whether_their_recording_is_long_enough():
+    drifting = gf.parse_model("WN(variance=1e-6) + RW(variance=1)").simulate(
+        64, batch=(5,), generator=torch.Generator().manual_seed(0)
+    )
+    recordings = [array(1), gf.Recording(drifting, rate=100.0), gf.Recording(drifting.flip(0), rate=100.0)]
+    long, *short = rows_of(Fuse("long"), [Log(str(i), r) for i, r in enumerate(recordings)])
+    assert (long["enough"], long["warnings"]) == (True, [])
+    for row, recording in zip(short, recordings[1:], strict=True):
+        data = gf.fit_svo(recording, "long").enough_data()
+        assert (row["enough"], row["warnings"]) == (False, [str(data)])
+        assert row["scale_weights"] == pytest.approx(gf.fit_svo(recording, "long").scale_weights.tolist())
+    (equal,) = rows_of(Fuse(method="equal"), [Log("log", array(1))])
+    assert (equal["enough"], equal["warnings"]) == (None, [])
 
 
 def test_arrays_of_one_shape_are_fitted_together_to_the_same(folder):
@@ -275,9 +309,43 @@ def test_a_diagnosis_says_what_is_left_out():
     assert other["gain"] > 0
 
 
+def test_a_simulation_of_the_same_name_and_other_numbers_is_another_setting():
+    one, same, other = (Diagnose(gf.WhiteNoise(v), source="model.json").settings for v in (1.0, 1.0, 2.0))
+    assert one == same
+    assert one["simulation"] == other["simulation"]
+    assert one != other
+    recording = array(0)
+    warm = gf.Recording(recording.signal, rate=100.0, unit="deg/s", channels={"temperature": recording.time})
+    settings = [Diagnose(r).settings for r in (recording, array(0), array(1), recording.to("rad/s"), warm)]
+    assert settings[0] == settings[1]
+    assert all(settings[0] != s for s in settings[2:])
+    with pytest.raises(TypeError, match=r"`simulation`: expected a Recording or a noise model, got str; read"):
+        Diagnose("model.json")
+
+
+@pytest.mark.parametrize(
+    ("made", "says"),
+    [
+        (lambda: Fuse("longest"), "`scale_weights`: expected 'flat', 'short', 'long'"),
+        (lambda: Fuse((1.0, -1.0)), "`scale_weights`: expected finite numbers >= 0"),
+        (lambda: Fuse(method="foo"), "`method`: expected one of 'auto', 'svo'"),
+        (lambda: Fuse(confidence_level=95), "`confidence_level`: expected a number between 0 and 1"),
+        (lambda: Fit(confidence_level=95), "`confidence_level`: expected a number between 0 and 1"),
+        (lambda: Diagnose(gf.WhiteNoise(1.0), false_alarm=3), "`false_alarm`: expected a number between 0 and 1"),
+    ],
+)
+def test_bad_options_are_refused_when_a_task_is_made(made, says):
+    with pytest.raises(ValueError, match=says):
+        made()
+
+
 def test_relative_noise_is_that_of_known_levels():
     variance = torch.tensor([[1.0, 4.0, 16.0], [4.0, 4.0, 1.0], [torch.nan, 4.0, 4.0]], dtype=torch.float64)
     # Over the medians 4 and 4: ratios of deviations 1/2, 1, 2 and 1, 1, 1/2; a level with a gap has the rest.
     noise = relative_noise(variance[:2])
     np.testing.assert_allclose(noise, np.sqrt([0.5, 1.0, 1.0]))
     assert bool(relative_noise(torch.full((2, 3), torch.nan)).isnan().all())
+    even = torch.tensor([[1.0, 2.0, 4.0, 9.0]], dtype=torch.float64)
+    np.testing.assert_allclose(relative_noise(even), np.sqrt([1 / 3, 2 / 3, 4 / 3, 3.0]))
+    gap = torch.tensor([[1.0, 2.0, torch.nan, 6.0]], dtype=torch.float64)
+    np.testing.assert_allclose(relative_noise(gap), np.sqrt([1 / 2, 1.0, torch.nan, 3.0]))

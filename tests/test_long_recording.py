@@ -380,6 +380,22 @@ def test_the_virtual_gyro_as_a_file(tmp_path: Path):
         gf.write_virtual(recording_of(signal), weights[:3], tmp_path / "a.npy")
 
 
+def test_the_log_that_is_read_is_not_written_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    log = tmp_path / "log.npy"
+    np.save(log, samples().numpy())
+    before = log.read_bytes()
+    (tmp_path / "link.npy").symlink_to(log)
+    monkeypatch.chdir(tmp_path)
+    weights = torch.ones(N_SENSORS).double() / N_SENSORS
+    for opened, path in (("log.npy", log), (log, "log.npy"), ("link.npy", "log.npy"), ("log.npy", "link.npy")):
+        with pytest.raises(
+            ValueError, match=r"`path`: expected another file than the log that is read, got .*; choose"
+        ):
+            gf.write_virtual(gf.open_long(opened), weights, path, force=True)
+    assert log.read_bytes() == before
+    gf.write_virtual(gf.open_long(log), weights, "virtual.npy")
+
+
 def test_a_file_appears_whole_or_not_at_all(tmp_path: Path):
     signal = samples()
 

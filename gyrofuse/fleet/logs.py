@@ -6,20 +6,48 @@ import glob
 import os
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from gyrofuse.io import SUFFIXES
 
 _WILD = "*?["
 
 
-def find_logs(paths: Iterable[str | Path], *, manifest: str | Path | None = None) -> tuple[Path, ...]:
+class State(NamedTuple):
+    """Size of a log in bytes, and when it was last changed, in ns since 1970; None where it is not there to be read."""
+
+    size: int | None = None
+    modified: int | None = None
+
+
+def state_of(log: str | Path) -> State:
+    """Of a file, or of all files of a folder together."""
+    try:
+        files = [Path(log)] if not os.path.isdir(log) else [path for path in Path(log).rglob("*") if path.is_file()]
+        found = [file.stat() for file in files]
+    except OSError:
+        return State()
+    return State(sum(s.st_size for s in found), max((s.st_mtime_ns for s in found), default=None))
+
+
+def identity(log: str | Path) -> str:
+    """A log by its absolute path, whatever it was called and from wherever."""
+    return as_text(os.path.realpath(log))
+
+
+def as_text(text: str) -> str:
+    r"""With bytes that are not UTF-8, as names of files may hold, written out: `\xff`."""
+    return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+
+
+def find_logs(paths: str | Path | Iterable[str | Path], *, manifest: str | Path | None = None) -> tuple[Path, ...]:
     """All logs that names stand for, each once, in their order.
 
     A file is a log whatever its suffix; of a folder, all files below with a suffix that is read, and ROS 2 folders. A
     folder that may not be looked into is listed as it is, so that its row says so.
 
     Args:
-        paths: Files, folders, and patterns such as `"flights/*/imu.npz"`, with `**` for any folders between.
+        paths: Files, folders, and patterns such as `"flights/*/imu.npz"`, with `**` for any folders between; or one.
         manifest: Text file with one such name a line, relative to its own folder; lines that begin with `#` do not
             count. What it names and is not there is listed all the same.
 
@@ -27,14 +55,14 @@ def find_logs(paths: Iterable[str | Path], *, manifest: str | Path | None = None
         FileNotFoundError: A name that is neither there nor a pattern that anything fits, or no such manifest.
         ValueError: No log at all.
     """
-    found: dict[Path, Path] = {}
-    for path in paths:
+    found: dict[str, Path] = {}
+    for path in [paths] if isinstance(paths, str | Path) else paths:
         for log in _logs_of(Path(path)):
-            found.setdefault(log.resolve(), log)
+            found.setdefault(identity(log), log)
     if manifest is not None:
         for path in _listed(Path(manifest)):
             for log in _expanded(path) or [path]:
-                found.setdefault(log.resolve(), log)
+                found.setdefault(identity(log), log)
     if not found:
         raise ValueError(f"`paths`: expected logs ({' '.join(SUFFIXES)}) or folders with some, found none")
     return tuple(found.values())
@@ -49,11 +77,11 @@ def groups_of(logs: Sequence[Path], size: int, done: Collection[str] = ()) -> tu
     Args:
         logs: Of the fleet.
         size: Of a group.
-        done: Names of logs whose rows are there.
+        done: Identities of logs whose rows are there.
     """
     groups = (tuple(logs[i : i + size]) for i in range(0, len(logs), size))
-    left = [part for part in (tuple(log for log in group if str(log) not in done) for group in groups) if part]
-    return tuple(sorted(left, key=lambda group: -sum(map(_size, group))))
+    left = [part for part in (tuple(log for log in group if identity(log) not in done) for group in groups) if part]
+    return tuple(sorted(left, key=lambda group: -sum(state_of(log).size or 0 for log in group)))
 
 
 def _logs_of(path: Path) -> Iterable[Path]:
@@ -67,10 +95,10 @@ def _logs_of(path: Path) -> Iterable[Path]:
 
 
 def _expanded(path: Path) -> list[Path]:
-    """Logs behind a file, a folder or a pattern."""
-    if path.is_dir():
+    """Logs behind a file, a folder or a pattern; a link that leads nowhere is one, and its row will say so."""
+    if os.path.isdir(path):
         return list(_walked(path))
-    if path.exists():
+    if os.path.lexists(path):
         return [path]
     if not any(c in str(path) for c in _WILD):
         return []
@@ -95,12 +123,5 @@ def _is_log(name: str) -> bool:
 
 
 def _listed(manifest: Path) -> list[Path]:
-    lines = [line.strip() for line in manifest.read_text(encoding="utf-8").splitlines()]
+    lines = [line.strip() for line in manifest.read_text(encoding="utf-8", errors="surrogateescape").splitlines()]
     return [manifest.parent / line for line in lines if line and not line.startswith("#")]
-
-
-def _size(log: Path) -> int:
-    try:
-        return log.stat().st_size
-    except OSError:  # its row will say so
-        return 0

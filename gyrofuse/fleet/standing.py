@@ -9,11 +9,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import stats
 
+from gyrofuse.fleet.store import identity_in
+
 NOISY = 2.0  # times the median of an array
 _OUTLIER = 5.0  # robust standard deviations
 _FEWEST = 5  # arrays, to say what is usual
 FEWEST_IN_TIME = 8  # recordings of one array, to say what drifts
 LEVEL = 0.01  # chance of a drift, for all sensors together
+GAIN = "Allan deviation of the plain mean over that of the virtual gyro, geometric mean over averaging times"
 
 
 class NoisySensor(NamedTuple):
@@ -34,6 +37,14 @@ class Outlier(NamedTuple):
     value: float
     usual: float
     deviations: float
+
+
+class Doubt(NamedTuple):
+    """A log whose weights are to be doubted, and why: it felt motion, or is too short for them."""
+
+    log: str
+    axis: str | None
+    why: str
 
 
 class Drift(NamedTuple):
@@ -59,6 +70,7 @@ class Standing:
             the virtual gyro, p value of the J test, p value of the diagnosis.
         noisy: Sensors, the noisiest first.
         outliers: Logs unlike the others.
+        doubts: Logs whose weights are to be doubted.
         drifts: Of weights, the surest first.
         mechanisms: How many logs have each, and unexplained differences.
     """
@@ -69,6 +81,7 @@ class Standing:
     ranked: tuple[tuple[float, Mapping[str, Any]], ...]
     noisy: tuple[NoisySensor, ...]
     outliers: tuple[Outlier, ...]
+    doubts: tuple[Doubt, ...]
     drifts: tuple[Drift, ...]
     mechanisms: tuple[tuple[str, int], ...]
 
@@ -88,6 +101,16 @@ class Standing:
         return sum(value < LEVEL for value in self.values)
 
     @property
+    def n_unidentified(self) -> int:
+        """Fits whose parameters cannot be told apart."""
+        return sum(row.get("identified") is False for _, row in self.ranked)
+
+    @property
+    def n_doubted(self) -> int:
+        """Logs whose weights are to be doubted."""
+        return len({doubt.log for doubt in self.doubts})
+
+    @property
     def n_differ(self) -> int:
         """Recordings that differ from their simulation."""
         return sum(bool(row["mismatch"]) for _, row in self.ranked)
@@ -97,11 +120,15 @@ class Standing:
         lines = [f"{self.n_logs} logs, {len(self.failures)} failed"]
         if self.task == "fuse" and self.values:
             lines.append(
-                f"Allan deviation of the plain mean over that of the virtual gyro, mean over averaging times: median "
-                f"{np.median(self.values):.3g}, {min(self.values):.3g} to {max(self.values):.3g}"
+                f"{GAIN}: median {np.median(self.values):.3g}, {min(self.values):.3g} to {max(self.values):.3g}; "
+                "below 1 is worse than the plain mean"
             )
         if self.task == "fit":
             lines.append(f"{self.n_refused} of {len(self.ranked)} fits refused by the J test at {LEVEL:g}")
+            if self.n_unidentified:
+                lines.append(
+                    f"{self.n_unidentified} of {len(self.ranked)} fits have parameters that cannot be told apart"
+                )
         if self.task == "diagnose":
             lines.append(f"{self.n_differ} of {len(self.ranked)} differ")
         lines += [f"  {name}: {count} logs" for name, count in self.mechanisms]
@@ -110,9 +137,12 @@ class Standing:
             for s in self.too_noisy[:3]
         ]
         lines += [
-            f"unlike the others: {o.log}, {o.what} {o.value:.3g} where {o.usual:.3g} is usual"
+            f"unlike the others: {_place(o)}, {o.what} {o.value:.3g} where {o.usual:.3g} is usual"
             for o in self.outliers[:3]
         ]
+        if self.doubts:
+            lines.append(f"weights to doubt: {self.n_doubted} logs")
+        lines += [f"  {_place(doubt)}: {doubt.why}" for doubt in self.doubts[:3]]
         lines += [
             f"drifts: weight of sensor {d.sensor} of {d.array}, {d.first:.3g} to {d.last:.3g} (p = {d.p_value:.2g})"
             for d in self.drifts[:3]
@@ -142,6 +172,7 @@ class Standing:
             ],
             "noisy": [sensor._asdict() for sensor in self.noisy],
             "outliers": [outlier._asdict() for outlier in self.outliers],
+            "doubts": [doubt._asdict() for doubt in self.doubts],
             "drifts": [drift._asdict() for drift in self.drifts],
             "mechanisms": dict(self.mechanisms),
         }
@@ -153,30 +184,32 @@ def standing_of(task: str, rows: Sequence[Mapping[str, Any]]) -> Standing:
     Logs of sensors with the same names, and of one axis, are taken for recordings of one array or of arrays of one
     kind, in the order of the table.
     """
-    failures = {row["log"]: row["error"] for row in rows if row["status"] != "ok"}
+    failures = {identity_in(row): (row["log"], row["error"]) for row in rows if row["status"] != "ok"}
     good = [row for row in rows if row["status"] == "ok"]
     fused = good if task == "fuse" else []
     mechanisms: dict[str, set[str]] = {}
     for row in good if task == "diagnose" else ():
         for name in [*row["mechanisms"], *(["unexplained"] if row["unexplained"] else [])]:
-            mechanisms.setdefault(name, set()).add(row["log"])
+            mechanisms.setdefault(name, set()).add(identity_in(row))
     return Standing(
         task=task,
-        n_logs=len({row["log"] for row in rows}),
-        failures=tuple(failures.items()),
+        n_logs=len(set(map(identity_in, rows))),
+        failures=tuple(failures.values()),
         ranked=_ranked(task, good),
         noisy=tuple(sorted(_noisy(fused), key=lambda s: -s.relative_noise)),
         outliers=tuple(sorted(_outliers(fused), key=lambda o: -o.deviations)),
+        doubts=tuple(_doubts(fused)),
         drifts=tuple(sorted(_drifts(fused), key=lambda d: d.p_value)),
         mechanisms=tuple(sorted(((name, len(logs)) for name, logs in mechanisms.items()), key=lambda e: -e[1])),
     )
 
 
 def mean_gain(row: Mapping[str, Any]) -> float:
-    """Of a row of fusion: geometric mean over averaging times."""
+    """Of a row of fusion: geometric mean over averaging times, which count as they did in the choice of weights."""
     gain = np.array(row["gain"], dtype=float)
-    known = gain[np.isfinite(gain) & (gain > 0)]
-    return float(np.exp(np.log(known).mean())) if known.size else np.nan
+    counts = np.array(row.get("scale_weights") or np.ones_like(gain), dtype=float)
+    known = np.isfinite(gain) & (gain > 0) & (counts > 0)
+    return float(np.exp(np.average(np.log(gain[known]), weights=counts[known]))) if known.any() else np.nan
 
 
 def _ranked(task: str, rows: Sequence[Mapping[str, Any]]) -> tuple[tuple[float, Mapping[str, Any]], ...]:
@@ -233,6 +266,17 @@ def _outliers(rows: Sequence[Mapping[str, Any]]) -> Iterable[Outlier]:
                     yield Outlier(
                         row["log"], row["axis"], what, float(np.exp(value)), float(np.exp(middle)), float(away)
                     )
+
+
+def _doubts(rows: Iterable[Mapping[str, Any]]) -> Iterable[Doubt]:
+    for row in rows:
+        short = row["warnings"] if row.get("enough") is False else []
+        for why in [*([row["motion"]] if row.get("motion") else []), *short]:
+            yield Doubt(row["log"], row["axis"], why)
+
+
+def _place(found: Outlier | Doubt) -> str:
+    return f"{found.log} axis {found.axis}" if found.axis else found.log
 
 
 def _drifts(rows: Sequence[Mapping[str, Any]]) -> list[Drift]:

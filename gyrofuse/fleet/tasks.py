@@ -1,24 +1,27 @@
-"""What is asked of every log of a fleet: rows of a table.
-
-A column holds `"text"`, `"texts"`, `"number"`, `"numbers"`, `"whole"` numbers or `"truth"` values.
-"""
+"""What is asked of every log of a fleet: rows of a table."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
+from gyrofuse._checks import check_confidence_level
 from gyrofuse._model import Model
+from gyrofuse.fleet.store import Column
+from gyrofuse.fusion import METHODS
 from gyrofuse.gmwm import fit_gmwm
 from gyrofuse.mismatch import diagnose
 from gyrofuse.parsing import parse_model
 from gyrofuse.recording import Recording
+from gyrofuse.scale_weights import normalised, resolve_scale_weights
 from gyrofuse.simulate import ArrayModel
 from gyrofuse.svo import fit_svo
 from gyrofuse.svo_result import SVOResult
@@ -27,6 +30,7 @@ from gyrofuse.units import RATE_UNITS
 Row = dict[str, Any]
 
 _STACKED = 2**15  # samples: shorter arrays are faster together
+_AXIS = Column("text", "axis of the row; none where the log has one signal for each sensor")
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,9 @@ class Fuse:
         method: As of `fit_svo`.
         confidence_level: Of the limits of the weights.
         virtual: Whether the virtual signal is kept as well, in the column `virtual`.
+
+    Raises:
+        TypeError, ValueError: As `fit_svo`, where an option is wrong for any log.
     """
 
     scale_weights: str | tuple[float, ...] = "flat"
@@ -47,12 +54,54 @@ class Fuse:
 
     name: ClassVar[str] = "fuse"
 
+    def __post_init__(self) -> None:
+        # What is wrong with the task is told at once, not by every row.
+        if isinstance(self.scale_weights, str):
+            resolve_scale_weights(self.scale_weights, 1)
+        else:
+            normalised(self.scale_weights)
+            object.__setattr__(self, "scale_weights", tuple(map(float, self.scale_weights)))
+        if self.method not in METHODS:
+            raise ValueError(f"`method`: expected one of {', '.join(map(repr, METHODS))}, got {self.method!r}")
+        check_confidence_level(self.confidence_level)
+
     @property
-    def columns(self) -> dict[str, str]:
+    def columns(self) -> dict[str, Column]:
         """Its own columns, beside those of every task."""
-        own = ("weights", "low", "high", "relative_noise", "tau", "virtual_deviation", "equal_deviation", "gain")
-        kept = {"virtual": "numbers"} if self.virtual else {}
-        return {"axis": "text", **dict.fromkeys(own, "numbers"), "motion": "text", **kept}
+        own = {
+            "axis": _AXIS,
+            "weights": Column("numbers", "weight of each sensor in the virtual gyro, sum 1"),
+            "low": Column("numbers", "lower limits of the weights"),
+            "high": Column("numbers", "upper limits of the weights"),
+            "relative_noise": Column(
+                "numbers",
+                "Allan deviation of each sensor over that of the median sensor of its array, geometric mean over "
+                "averaging times",
+            ),
+            "tau": Column("numbers", "averaging time of each level, s"),
+            "scale_weights": Column("numbers", "how much each averaging time counted in the choice of weights, sum 1"),
+            "virtual_deviation": Column(
+                "numbers", "Allan deviation of the virtual gyro at each averaging time, in the unit of the signal"
+            ),
+            "equal_deviation": Column(
+                "numbers", "Allan deviation of the plain mean at each averaging time, in the unit of the signal"
+            ),
+            "gain": Column(
+                "numbers",
+                "Allan deviation of the plain mean over that of the virtual gyro at each averaging time, to be "
+                "expected in other recordings: corrected for the weights having been chosen on this one; below 1 is "
+                "worse than the plain mean",
+            ),
+            "motion": Column("text", "a warning that the array seems to have moved"),
+            "enough": Column(
+                "truth", "whether the recording is long enough for the weights; none for methods other than svo"
+            ),
+        }
+        return (
+            {**own, "virtual": Column("numbers", "the virtual gyro, in the unit of the signal")}
+            if self.virtual
+            else own
+        )
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -88,11 +137,17 @@ class Fuse:
                 "high": high.tolist(),
                 "relative_noise": relative_noise(one.wavelet_variance).tolist(),
                 "tau": one.tau.tolist(),
+                "scale_weights": one.scale_weights.tolist(),
                 "virtual_deviation": (2 * one.virtual_wavelet_variance).sqrt().tolist(),
                 "equal_deviation": (2 * one.equal_wavelet_variance).sqrt().tolist(),
                 "gain": _gain(one).sqrt().tolist(),
                 "motion": one.motion or None,
+                "enough": None,
             }
+            if one.method == "svo":
+                data = one.enough_data()
+                row["enough"] = bool(data.enough)
+                row["warnings"] = [] if data.enough else [str(data)]
             if virtual is not None:
                 row["virtual"] = virtual[at].tolist()
             rows.append(row)
@@ -114,25 +169,28 @@ class Fit:
     confidence_level: float = 0.95
 
     name: ClassVar[str] = "fit"
-    columns: ClassVar[dict[str, str]] = {
-        "axis": "text",
-        "sensor": "text",
-        "model": "text",
-        "parameters": "texts",
-        "values": "numbers",
-        "low": "numbers",
-        "high": "numbers",
-        "p_value": "number",
-        "converged": "truth",
-        "identified": "truth",
-        "remarks": "texts",
-        "quantities": "texts",
-        "figures": "numbers",
-        "figure_units": "texts",
+    columns: ClassVar[dict[str, Column]] = {
+        "axis": _AXIS,
+        "sensor": Column("text", "sensor of the row"),
+        "model": Column("text", "fitted model as JSON, which model_from_dict reads back"),
+        "parameters": Column("texts", "names of the parameters"),
+        "values": Column(
+            "numbers", "of the parameters: variances per sample in the unit of the signal squared, beta in rad/sample"
+        ),
+        "low": Column("numbers", "lower limits of the values"),
+        "high": Column("numbers", "upper limits of the values"),
+        "p_value": Column("number", "of the J test that the model is complete"),
+        "converged": Column("truth", "whether the fit came to an end"),
+        "identified": Column("truth", "whether the parameters can be told apart at this length"),
+        "remarks": Column("texts", "what cannot be told apart, in words"),
+        "quantities": Column("texts", "names of the quantities of a datasheet"),
+        "figures": Column("numbers", "their values, in the units of figure_units"),
+        "figure_units": Column("texts", "their units"),
     }
 
     def __post_init__(self) -> None:
         parse_model(self.model)
+        check_confidence_level(self.confidence_level)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -180,6 +238,10 @@ class Diagnose:
         simulation: Samples of the same array, or a noise model.
         false_alarm: Probability of a finding where nothing is missing.
         source: What the simulation is called.
+
+    Raises:
+        TypeError: The simulation is neither.
+        ValueError: `false_alarm` is no probability.
     """
 
     simulation: Recording | Model | ArrayModel
@@ -187,23 +249,48 @@ class Diagnose:
     source: str = "simulation"
 
     name: ClassVar[str] = "diagnose"
-    columns: ClassVar[dict[str, str]] = {
-        "axis": "text",
-        "mismatch": "truth",
-        "p_value": "number",
-        "mechanisms": "texts",
-        "sentences": "texts",
-        "unexplained": "texts",
-        "discrepancy_before": "number",
-        "discrepancy_after": "number",
-        "gain": "number",
-        "findings": "text",
+    columns: ClassVar[dict[str, Column]] = {
+        "axis": _AXIS,
+        "mismatch": Column("truth", "whether the log differs from the simulation"),
+        "p_value": Column("number", "of agreement between log and simulation"),
+        "mechanisms": Column("texts", "what the simulation leaves out, by name"),
+        "sentences": Column("texts", "the same in words, with numbers"),
+        "unexplained": Column("texts", "differences that no mechanism accounts for"),
+        "discrepancy_before": Column(
+            "number", "of wavelet cross-covariances per degree of freedom on data held out; 1 is what noise alone gives"
+        ),
+        "discrepancy_after": Column("number", "the same with the repaired simulation"),
+        "gain": Column("number", "log score of the repaired simulation over the given one on data held out, nats"),
+        "findings": Column("text", "the findings as JSON"),
     }
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.simulation, Recording | Model | ArrayModel):
+            raise TypeError(
+                f"`simulation`: expected a Recording or a noise model, got {type(self.simulation).__name__}; read a "
+                "recording with read_recording(path), or a model in JSON with model_from_dict"
+            )
+        if not 0 < self.false_alarm < 1:
+            raise ValueError(f"`false_alarm`: expected a number between 0 and 1 such as 0.01, got {self.false_alarm!r}")
 
     @property
     def settings(self) -> dict[str, Any]:
         """What the rows depend on, ready for JSON."""
-        return {"task": self.name, "simulation": self.source, "false_alarm": self.false_alarm}
+        named = {"task": self.name, "simulation": self.source, "false_alarm": self.false_alarm}
+        return {**named, "simulation_sha256": self._digest}
+
+    @cached_property
+    def _digest(self) -> str:
+        """Of the numbers of the simulation, whose name stays where the simulation changes."""
+        if not isinstance(self.simulation, Recording):
+            return hashlib.sha256(json.dumps(self.simulation.to_dict()).encode()).hexdigest()
+        r = self.simulation
+        held = {"signal": r.signal, "time": r.time, **r.channels}
+        said = [r.rate, r.unit, r.sensors, r.axes, {name: list(values.shape) for name, values in held.items()}]
+        digest = hashlib.sha256(json.dumps(said).encode())
+        for values in held.values():
+            digest.update(values.numpy(force=True).tobytes())
+        return digest.hexdigest()
 
     def rows(self, recordings: Sequence[Recording]) -> list[list[Row]]:
         """Rows of each recording, one for each of its axes."""
@@ -247,7 +334,8 @@ def relative_noise(wavelet_variance: Tensor) -> Tensor:
 
     Of Allan deviations, as the geometric mean over the levels that are known.
     """
-    ratio = (wavelet_variance / wavelet_variance.median(-1, keepdim=True).values).sqrt()
+    # Of an even number the mean of the two in the middle, which torch.median is not.
+    ratio = (wavelet_variance / wavelet_variance.nanquantile(0.5, -1, keepdim=True)).sqrt()
     known = ratio.isfinite() & (ratio > 0)
     log = torch.where(known, ratio, torch.ones_like(ratio)).log().sum(0)
     return torch.where(known.any(0), log / known.sum(0).clamp(min=1), torch.full_like(log, math.nan)).exp()

@@ -5,14 +5,18 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch.utils.data import Dataset
 
+from gyrofuse.fleet.logs import State, as_text, identity, state_of
 from gyrofuse.fleet.tasks import Row, Task
-from gyrofuse.recording import Recording, read_recording
+from gyrofuse.recording import Recording, check_reading, read_recording
+
+_OPTIONS = tuple(signature(read_recording).parameters)[1:]  # without the path
 
 
 @dataclass(frozen=True)
@@ -23,11 +27,15 @@ class Log:
         name: Its path, as given.
         recording: None where it could not be read.
         error: Why.
+        path: Absolute, where it is a file or folder.
+        state: When reading began.
     """
 
     name: str
     recording: Recording | None
     error: str | None = None
+    path: str | None = None
+    state: State = field(default_factory=State)
 
     def to(self, device: torch.device) -> Log:
         """With the signal on a device."""
@@ -42,11 +50,21 @@ class LogGroups(Dataset[tuple[Log, ...]]):
     Args:
         groups: Paths, group by group.
         options: Of `read_recording`.
+
+    Raises:
+        TypeError: An option that it does not have.
+        ValueError: A rate or scale that is none.
     """
 
     def __init__(self, groups: Sequence[Sequence[Path]], options: Mapping[str, Any]) -> None:
         self.groups = tuple(map(tuple, groups))
         self.options = dict(options)
+        unknown = [name for name in options if name not in _OPTIONS]
+        if unknown:
+            raise TypeError(
+                f"`{unknown[0]}`: expected an option of read_recording ({', '.join(_OPTIONS)}); leave it out"
+            )
+        check_reading(rate=self.options.get("rate"), scale=self.options.get("scale"))
 
     def __len__(self) -> int:
         return len(self.groups)
@@ -55,10 +73,11 @@ class LogGroups(Dataset[tuple[Log, ...]]):
         return tuple(self._read(path) for path in self.groups[index])
 
     def _read(self, path: Path) -> Log:
+        log = Log(as_text(str(path)), None, path=identity(path), state=state_of(path))
         try:
-            return Log(str(path), read_recording(path, **self.options))
+            return replace(log, recording=read_recording(path, **self.options))
         except Exception as error:  # whatever a damaged file does to a library, the others are read
-            return Log(str(path), None, _said(error).removeprefix(f"{path}: "))
+            return replace(log, error=_said(error).removeprefix(f"{log.name}: "))
 
 
 @dataclass
@@ -121,7 +140,8 @@ def _alone(task: Task, recording: Recording) -> _Answer:
 
 
 def _whole_rows(log: Log, answer: _Answer) -> list[Row]:
-    common: Row = {"log": log.name, "status": "ok" if answer.error is None else "failed", "error": answer.error}
+    common: Row = {"log": log.name, "path": log.path, **log.state._asdict()}
+    common |= {"status": "ok" if answer.error is None else "failed", "error": answer.error}
     if log.recording is not None:
         r = log.recording
         common |= {
@@ -131,13 +151,12 @@ def _whole_rows(log: Log, answer: _Answer) -> list[Row]:
             "unit": r.unit,
             "missing": float(r.missing.max()),
             "notes": [str(note) for note in r.notes],
-            "warnings": answer.warned,
         }
-    return [{**common, **own} for own in answer.rows or [{}]]
+    return [{**common, **own, "warnings": [*answer.warned, *own.get("warnings", ())]} for own in answer.rows or [{}]]
 
 
 def _said(error: Exception) -> str:
     """One line; what is a defect rather than bad input says its type."""
-    words = " ".join(str(error).split())
+    words = as_text(" ".join(str(error).split()))
     known = isinstance(error, ValueError | TypeError | OSError | ImportError)
     return words if known and words else f"{type(error).__name__}: {words}"
