@@ -81,7 +81,8 @@ def verdict(standing: Standing) -> list[str]:
             for s in standing.too_noisy[:3]
         ]
         if standing.outliers:
-            said.append(f"{len({o.log for o in standing.outliers})} logs are unlike the others.")
+            n_unlike = len({o.log for o in standing.outliers})
+            said.append(f"{n_unlike} {'log is' if n_unlike == 1 else 'logs are'} unlike the others.")
         said += [
             f"The weight of sensor {d.sensor} of {d.array} drifts from {number(d.first, 3)} to {number(d.last, 3)}."
             for d in standing.drifts[:3]
