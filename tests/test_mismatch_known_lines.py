@@ -85,3 +85,20 @@ def test_what_is_missing_is_found_beside_a_tone_that_both_have():
     report = gf.diagnose(stepped, toned())
     assert [finding.mechanism for finding in report.findings] == ["step"]
     assert report.unexplained == ()
+
+
+def test_a_strong_tone_is_not_swallowed_by_what_its_fit_leaves():
+    """A model fitted as if there were no tone is wrong over the whole spectrum: a hump of it is no wandering tone.
+
+    As one, all of its band would be taken off, and the tone with it.
+    """
+    n, g = 2**18, torch.Generator().manual_seed(0)
+    noise = gf.parse_model("WN(variance=3.09e-3) + AR1(phi=0.998,variance=2.1e-7) + RW(variance=2e-10)")
+    tone = 0.0717 * torch.sin(2 * math.pi * 0.113 * torch.arange(n, dtype=torch.float64))
+    recording = gf.Recording(noise.simulate(n, batch=(1,), generator=g) + tone, rate=RATE, unit="deg/s")
+    fitted = gf.parse_model("AR1(phi=0.338,variance=5.18e-3) + RW(variance=2.57e-8)")
+    report = gf.diagnose(recording, fitted)
+    assert report.findings[0].mechanism == "vibration_tone"
+    assert report.findings[0].frequency_hz == pytest.approx(11.3, rel=1e-6)
+    assert "drifting_tone" not in [finding.mechanism for finding in report.findings]
+    assert report.held_out.after < 3 < 300 < report.held_out.before

@@ -133,7 +133,8 @@ def nominated(case: Case, level: float, *, tone: bool) -> tuple[Mode, Seen] | No
         has = bump.variance > _SEEN * bump.variance_sd
     sensors = tuple(int(i) for i in has.nonzero()[:, 0])
     verdict = steadiness(case, bump)
-    if not sensors or verdict.tone != tone or _momentary(case, bump):
+    steady = verdict.tone and bump.width <= _BROAD * bump.centre  # what is all over the spectrum is no tone
+    if not sensors or steady != tone or _momentary(case, bump):
         return None
     gain = bump.variance.clamp(min=0).sqrt().to(torch.complex128) if bump.gain is None else bump.gain
     mode = Mode(bump.centre, bump.width, gain, bump.gain is not None)
