@@ -13,6 +13,7 @@ import typer
 
 from gyrofuse._checks import check_positive_integer
 from gyrofuse._console import progress_bar, say
+from gyrofuse._workers import begin_imports
 from gyrofuse.cli_shared import (
     Axis,
     Force,
@@ -108,16 +109,19 @@ def fleet(
     A log that cannot be used gets a row that says why, and the others theirs; the exit status is 1 where that holds for
     all of them. Stopped at any moment, the same command goes on where it was.
     """
-    from gyrofuse.fleet.logs import groups_of, identity
-    from gyrofuse.fleet.standing import standing_of
-    from gyrofuse.fleet.store import ResultStore, read_results
-    from gyrofuse.lightning_module import GyroArrayDataModule
-
     check_positive_integer("--devices", devices)
     check_positive_integer("--group", group)
     if accelerator not in _ACCELERATORS:
         known = f"{', '.join(_ACCELERATORS[:-1])} or {_ACCELERATORS[-1]}"
         raise ValueError(f"`--accelerator`: expected {known}, got {accelerator!r}")
+    if devices > 1:
+        begin_imports(accelerator)
+
+    from gyrofuse.fleet.logs import groups_of, identity
+    from gyrofuse.fleet.standing import standing_of
+    from gyrofuse.fleet.store import ResultStore, read_results
+    from gyrofuse.lightning_module import GyroArrayDataModule
+
     if out.suffix.lower() != ".parquet":
         raise ValueError(f"`--out`: expected a name that ends in .parquet, got {str(out)!r}")
     for option, kind, given in (

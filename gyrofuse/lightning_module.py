@@ -19,9 +19,11 @@ from typing import Any
 
 from lightning.pytorch import LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.callbacks import BasePredictionWriter, Callback
+from lightning.pytorch.strategies import DDPStrategy
 from torch.utils.data import DataLoader
 
 from gyrofuse._checks import check_positive_integer
+from gyrofuse._workers import parent_lives, start_method
 from gyrofuse.fleet.logs import find_logs, groups_of, identity
 from gyrofuse.fleet.store import ResultStore
 from gyrofuse.fleet.tasks import Fuse, Row, Task
@@ -107,7 +109,6 @@ class ResultWriter(BasePredictionWriter):
         super().__init__(write_interval="batch")
         self.store = store
         self.force = force
-        self._made_by = os.getpid()
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Open the table, before anyone writes."""
@@ -125,7 +126,7 @@ class ResultWriter(BasePredictionWriter):
 
     def on_predict_batch_start(self, *_: Any, **__: Any) -> None:
         """A process whose parent was killed does not work on unseen."""
-        if os.getpid() != self._made_by and os.getppid() != self._made_by:
+        if not parent_lives():
             os._exit(1)
 
     def write_on_batch_end(
@@ -171,14 +172,15 @@ def quiet_trainer(*, devices: int, accelerator: str = "cpu", callbacks: Sequence
     """A trainer for predictions alone, which says nothing and leaves no files behind.
 
     Args:
-        devices: Processes, one for each device; more than one are spawned.
+        devices: Processes, one for each device; more than one are forked from a process that computes nothing, or
+            spawned where that cannot be.
         accelerator: `"cpu"`, `"gpu"` or `"auto"`.
         callbacks: Such as a `ResultWriter`.
     """
     return Trainer(
         devices=devices,
         accelerator=accelerator,
-        strategy="ddp_spawn" if devices > 1 else "auto",
+        strategy=DDPStrategy(start_method=start_method(accelerator)) if devices > 1 else "auto",
         callbacks=[_Quiet(), *callbacks],
         logger=False,
         enable_progress_bar=False,
