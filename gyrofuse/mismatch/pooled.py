@@ -14,7 +14,7 @@ from gyrofuse.mismatch.evidence import Evidence, corrected
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.witnesses import level_of, whitened_difference
 
-_ABSENT = 0.7  # standard deviations of what the simulation has, below which it has nothing
+_ABSENT = 1.5  # standard deviations of what the simulation has, below which it has nothing; less if it is short
 _SHOWN = 0.1  # p value below which the simulation's sensors share something
 _DRAWN, _COUNTED = 4000, 40  # matrices of noise, and those of them beyond which the tail is not counted
 _NEIGHBOURS = 1.1  # bands next to each other are slightly correlated
@@ -88,7 +88,7 @@ def common_source(case: Case) -> Source | None:
         size, u = values.gather(-1, top[:, None])[:, 0], vectors[torch.arange(len(top)), :, top]
         along = torch.einsum("ri,rij,rj->r", u.conj(), had, u).real * size.sign()
         spread = (1 - u.abs().pow(4).sum(-1)).clamp(min=1e-9).sqrt()
-        independent = along < _ABSENT * spread
+        independent = along < _ABSENT * min(1.0, float(s.sum() / d.sum())) * spread
         largest = torch.where(independent, size.abs(), torch.linalg.eigvalsh(apart).abs().amax(-1))
         tails = torch.tensor([_tail(float(x), p, real) for x in largest], dtype=torch.float64)
         run = int((tails * places).argmin())

@@ -102,7 +102,7 @@ def paced(folder: Path, out: Path, devices: int, n_logs: int) -> tuple[float, fl
             for mark in (first, last):
                 if done >= mark:
                     reached.setdefault(mark, (time.perf_counter(), done))
-            time.sleep(0.02)
+            time.sleep(0.1)
     (t0, n0), (t1, n1) = reached[first], reached[last]
     return time.perf_counter() - start, (n1 - n0) / (t1 - t0)
 

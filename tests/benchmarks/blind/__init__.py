@@ -7,13 +7,16 @@ The generator knows nothing of the library that is judged: NumPy and SciPy only.
 - `shapes`, `spectral`, `marginal`, `strange`: the effects. `cases`: the kinds of cases, `make_case`.
 - `seal`, `scoring`, `judge`, `ordinary_view`, `trial`: sealed truths, frozen answers, counts.
 
-The size of an effect, in nats, is the expected log likelihood ratio of the known effect:
+The size of an effect, in nats, is the divergence of the recording from the simulation that the analyst is given:
 
-- a known signal m (tone, step, temperature, warm-up, acceleration, scale factor, clock): 1/2 sum over sensors of
-  m' V^-1 m; for the clock, of what no phase and amplitude of the line can explain;
-- Gaussian noise of another spectrum (resonance, flicker, low-pass, parameters, common mode, episodes, modulated noise):
-  1/2 sum (r - 1 - log r), for common mode with matrices; a wandering tone is taken for noise of its mean spectrum,
-  which bounds its divergence from below;
+- a signal (tone, step, temperature, warm-up, acceleration, scale factor, clock): Whittle's divergence of its spectrum,
+  1/2 sum (r - 1 - log r) over frequencies and sensors, r = 1 + |m|^2/S; for the clock, of what no phase and amplitude
+  of the line can explain. It is less than half the whitened energy, which a known signal would have: its shape is not;
+- Gaussian noise of another spectrum (resonance, common mode, episodes, modulated noise): the same with r the ratio of
+  the spectra, for common mode with matrices; a wandering tone is taken for noise of its mean spectrum, which bounds its
+  divergence from below;
+- of another spectrum over a broad band (flicker, low-pass, parameters), which only the comparison with a simulation of
+  s times as many samples shows: 1/2 sum [(1 + s) log((r + s)/(1 + s)) - log r], which is the above for a model;
 - spikes, a blurred lattice, Laplace noise: number of samples times the divergence of one sample, by quadrature or
   simulation; a trap: by simulation of the forward algorithm;
 - bare clipping, dead band, repeats: one altered sample is proof, and the nats are -log of the chance that none is:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from .analog import OVERSAMPLING, Base
 from .converter import decimate
-from .likelihood import coefficients, distinct_nats, shape_llr, whitened_energy
+from .likelihood import coefficients, distinct_nats, divergence, shape_llr, solve, whitened_energy
 
 Array = NDArray[np.float64]
 Cumulants = tuple[float, float, float]
@@ -40,6 +40,7 @@ class Part:
     look_alikes: tuple[str, ...] = ()
     sensor_nats: tuple[float, ...] = ()
     oracle_law: str = "cumulants"
+    oracle_nats: float | None = None  # expected `llr`; None: `nats`
     oracle_null: Cumulants | None = None  # under the base; None: those of a known signal
     parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
     frequency_hz: float | None = None
@@ -54,8 +55,9 @@ class Part:
 class Bench:
     """An array, its length and the random numbers of the effect."""
 
-    def __init__(self, base: Base, n_samples: int, rng: np.random.Generator) -> None:
-        self.base, self.n, self.rng = base, n_samples, rng
+    def __init__(self, base: Base, n_samples: int, rng: np.random.Generator, share: float = math.inf) -> None:
+        """`share`: length of the simulation over that of the recording, infinite for a model."""
+        self.base, self.n, self.rng, self.share = base, n_samples, rng, share
         self.rate = base.rate
         self.n_sensors = len(base.white)
         self.steps, self.step_rate = OVERSAMPLING * n_samples, OVERSAMPLING * base.rate
@@ -85,32 +87,45 @@ class Bench:
         return decimate(analog, OVERSAMPLING)
 
     def shape(self, mechanism: str, nats: float, unit: Array, **truth: Any) -> tuple[Part, float]:
-        """A known signal of a given shape, at the size where half its whitened energy is `nats`; and that size."""
-        energy = whitened_energy(unit, self.spectrum)
-        size = math.sqrt(2 * nats / energy.sum())
+        """A signal of a given shape, at the size where the divergence of its spectrum is `nats`; and that size."""
+        power = coefficients(unit) ** 2
+
+        def after(size: float) -> Array:
+            return self.spectrum + size**2 * power
+
+        usual = math.sqrt(2 * nats / whitened_energy(unit, self.spectrum).sum())  # of a shape that is known
+        size = solve(nats, lambda x: float(divergence(after(x), self.spectrum).sum()), 0.5 * usual, 1e3 * usual)
         signal = size * unit
-        sensors = tuple(int(i) for i in np.flatnonzero(energy > 0))
+        each = divergence(after(size), self.spectrum)
+        energy = float(whitened_energy(signal, self.spectrum).sum())
+        sensors = tuple(int(i) for i in np.flatnonzero(np.any(unit, axis=1)))
         part = Part(
             mechanism,
             nats,
             sensors,
             lambda recording: shape_llr(recording, signal, self.spectrum),
             signal=signal,
-            sensor_nats=tuple(float(e) for e in size**2 * energy[list(sensors)] / 2),
+            oracle_nats=energy / 2,
+            sensor_nats=tuple(float(each[i]) for i in sensors),
             **truth,
         )
         return part, size
 
-    def frequency_sd(self, nats: float) -> float:
-        """Cramer-Rao standard deviation in Hz of a tone with unknown phases: `nats` are sum a^2 T/(4 S)."""
-        return self.rate / (2 * math.pi) * math.sqrt(6 / nats) / self.n
+    def frequency_sd(self, tone: Array) -> float:
+        """Cramer-Rao standard deviation in Hz of a tone (sensor, time) with unknown phases."""
+        energy = float(whitened_energy(tone, self.spectrum).sum())  # sum over sensors of a^2 T/(2 S)
+        return self.rate / (2 * math.pi) * math.sqrt(12 / energy) / self.n
 
     def looks_like_parameters(self, after: Array, extra: list[Array] | None = None) -> bool:
         """Whether free parameters of the base come within five nats of a spectrum."""
         slower = replace(self.base, phi=self.base.phi**0.9, variance=self.base.variance * self._corner_change(0.9))
         free = [*self.components, *(b - a for a, b in zip(self.components, slower.components(self.n), strict=True))]
         directions = [d / self.spectrum for d in free if np.any(d)]
-        return distinct_nats(after, self.spectrum, directions + (extra or [])) < SEPARABLE
+        return self.distinct(after, directions + (extra or [])) < SEPARABLE
+
+    def distinct(self, after: Array, directions: list[Array]) -> float:
+        """`distinct_nats` from the base, of which a simulation tells as much as its length allows."""
+        return distinct_nats(after, self.spectrum, directions) / (1 + 1 / self.share)
 
     def _corner_change(self, power: float) -> Array:
         """Change of the innovation variance that leaves an AR1's level at low frequency where it was."""

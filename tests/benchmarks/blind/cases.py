@@ -8,6 +8,7 @@ case.truth        what the judge is given, sealed
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -155,7 +156,10 @@ _REAL: dict[str, tuple[Callable[[Bench, float], Part], ...]] = {
 }
 
 KINDS: dict[str, Kind] = {
-    **{name: Kind("mechanism", (effect,)) for name, effect in _MECHANISMS.items()},
+    **{
+        name: Kind("mechanism", (effect,), (("line", True),) if name.startswith("clock") else ())
+        for name, effect in _MECHANISMS.items()
+    },
     **{name: Kind("null", (), tuple(options.items())) for name, options in _NULLS.items()},
     **{f"pair:{name}": Kind("pair", (e,), tuple(o.items())) for name, (e, o) in _PAIRS.items()},
     **{f"two:{name}": Kind("two", tuple(_MECHANISMS[part] for part in parts)) for name, parts in _COMBINED.items()},
@@ -199,7 +203,8 @@ def make_case(
         real = field.background(data, n_samples, of_base)
         rate = real.rate
     base = field.measured_base(real.recording, rate) if real else _base(made, of_base, rate)
-    bench = Bench(base, n_samples, of_effect)
+    share = None if real else _share(made, of_simulation)
+    bench = Bench(base, n_samples, of_effect, share or math.inf)
     parts = [effect(bench, nats) for effect in made.effects if nats is not None]
 
     if real:
@@ -208,7 +213,7 @@ def make_case(
         channels: dict[str, Array] = {}
     else:
         gyro, llrs = _record(bench, parts, of_recording)
-        simulation = _simulation(made, bench, parts, of_simulation)
+        simulation = _simulation(bench, parts, share, of_simulation)
         channels = _channels(made, bench, of_table)
     for part in parts:
         channels |= part.channels
@@ -274,16 +279,22 @@ def _converted(bench: Bench, parts: list[Part], gyro: Array) -> tuple[Array, lis
     return gyro, llrs
 
 
-def _simulation(made: Kind, bench: Bench, parts: list[Part], rng: np.random.Generator) -> dict[str, Any]:
+def _share(made: Kind, rng: np.random.Generator) -> float | None:
+    """Length of the simulation over that of the recording; None for a model, which has no samples."""
     draws = rng.uniform(size=2)
-    lines = [part.simulation for part in parts if part.simulation is not None]
-    plain = not lines and not made.option("lattice") and not made.option("known_tone") and not made.option("share")
-    if made.option("as_model") or (plain and draws[0] < 0.25):
+    samples = any(made.option(name) for name in ("line", "lattice", "known_tone", "share"))  # what no model has
+    if made.option("as_model") or (not samples and draws[0] < 0.25):
+        return None
+    return made.option("share") or float(np.array([1.0, 2.0, 4.0])[int(3 * draws[1])])
+
+
+def _simulation(bench: Bench, parts: list[Part], share: float | None, rng: np.random.Generator) -> dict[str, Any]:
+    if share is None:
         return {"terms": bench.base.terms()}
-    share = made.option("share") or float(np.array([1.0, 2.0, 4.0])[int(3 * draws[1])])
     gyro = bench.base.simulate(int(share * bench.n), rng)
-    for line in lines:
-        gyro = line(gyro)
+    for part in parts:
+        if part.simulation is not None:
+            gyro = part.simulation(gyro)
     return {"gyro": gyro, "fs": bench.rate, "unit": "deg/s"}
 
 
@@ -303,6 +314,7 @@ def _channels(made: Kind, bench: Bench, rng: np.random.Generator) -> dict[str, A
 
 def effect_truth(part: Part, llr: float) -> dict[str, Any]:
     """What the judge is told of one effect."""
+    expected = part.nats if part.oracle_nats is None else part.oracle_nats
     return {
         "mechanism": part.mechanism,
         "class": sorted({part.mechanism, *part.look_alikes}),
@@ -311,7 +323,8 @@ def effect_truth(part: Part, llr: float) -> dict[str, Any]:
         "nats": part.nats,
         "oracle_llr": llr,
         "oracle_law": part.oracle_law,
-        "oracle_null": list(part.oracle_null or (-part.nats, 2 * part.nats, 0.0)),
+        "oracle_nats": expected,
+        "oracle_null": list(part.oracle_null or (-expected, 2 * expected, 0.0)),
         "frequency_hz": part.frequency_hz,
         "frequency_sd_hz": part.frequency_sd_hz,
         "time_s": part.time_s,

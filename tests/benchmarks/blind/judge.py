@@ -153,6 +153,9 @@ def _named(counts: _Counts, prefix: str, truth: Record, answer: Record | None) -
     counts.add(f"{prefix}detected", scoring.detected(answer), of, nats)
     counts.add(f"{prefix}right name", finding is not None and finding["mechanism"] == effect["mechanism"], of, nats)
     right = finding is not None
+    if effect["class"] == [effect["mechanism"]]:
+        named = finding is not None and finding["mechanism"] == effect["mechanism"]
+        counts.add(f"{prefix}right name, where only one is", named, of, nats)
     counts.add(f"{prefix}right class", right, of, nats)
     if scoring.detected(answer):
         counts.add(f"{prefix}right class, of detected", right, of, nats)
@@ -210,8 +213,8 @@ def _held_out(counts: _Counts, figures: Any, truth: Record, answer: Record | Non
     if held.get("before") is not None and held.get("after") is not None:
         counts.add("held-out discrepancy falls", held["after"] < held["before"], of)
     if (truth.get("true_gain") or 0) > 0:
-        figures["gain / gain of the true model", EVERYTHING].append(gain / truth["true_gain"])
-        figures["gain / gain of the true model", of[0]].append(gain / truth["true_gain"])
+        for name in (EVERYTHING, f"{truth['nats']:g} nats", of[0]):
+            figures["gain / gain of the true model", name].append(gain / truth["true_gain"])
 
 
 def _null(counts: _Counts, figures: Any, truth: Record, answer: Record | None, false_alarm: float) -> None:
@@ -237,6 +240,11 @@ def _outside(counts: _Counts, figures: Any, truth: Record, answer: Record | None
     if scoring.detected(answer):
         unexplained = bool((answer or {}).get("unexplained"))
         counts.add("outside: unexplained, of detected", unexplained and not wrong, of, nats)
+        (effect,) = truth["effects"]
+        if effect["class"] == [effect["mechanism"]]:
+            counts.add("outside: unexplained, where nothing looks alike", unexplained and not wrong, of, nats)
+        else:
+            counts.add("outside: unexplained, or its look-alikes listed", not wrong, of, nats)
 
 
 def _unidentifiable(counts: _Counts, figures: Any, truth: Record, answer: Record | None, false_alarm: float) -> None:

@@ -84,6 +84,18 @@ def divergence(after: Array, before: Array) -> Array:
     return (r - 1 - np.log(r)).sum(axis=-1) / 2
 
 
+def comparison(after: Array, before: Array, share: float) -> Array:
+    """What two records, one of each spectrum, tell of their difference: nats of each sensor, (sensor,).
+
+    The second is `share` times as long as the first; an endless one tells its spectrum, and this is `divergence`.
+    """
+    if math.isinf(share):
+        return divergence(after, before)
+    r = after / before
+    both = 1 + (r - 1) / (1 + share)
+    return ((1 + share) * np.log(both) - np.log(r)).sum(axis=-1) / 2
+
+
 def spectral_llr(recording: Array, after: Array, before: Array) -> float:
     """Log likelihood ratio of two Gaussian laws of known spectra."""
     power = coefficients(recording) ** 2
@@ -101,7 +113,7 @@ def solve(nats: float, expected: Callable[[float], float], low: float, high: flo
     ends = [expected(low) - nats, expected(high) - nats]
     if ends[0] > 0 or ends[1] < 0:
         raise ValueError(f"`nats`: expected between {ends[0] + nats:.3g} and {ends[1] + nats:.3g}, got {nats}")
-    return math.exp(brentq(lambda x: expected(math.exp(x)) - nats, math.log(low), math.log(high), xtol=1e-5))
+    return math.exp(brentq(lambda x: expected(math.exp(x)) - nats, math.log(low), math.log(high), xtol=1e-8))
 
 
 def distinct_nats(after: Array, before: Array, directions: list[Array]) -> float:

@@ -53,7 +53,9 @@ def spikes(bench: Bench, nats: float, *, simultaneous: bool | None = None) -> Pa
         return per_sample * bench.n * (1 if together else len(sensors))
 
     height = solve(nats, expected, 0.05, 60.0)
-    at = bench.rng.uniform(size=(1 if together else len(sensors), bench.n)) < share
+    at = np.zeros((1 if together else len(sensors), bench.n), dtype=bool)
+    for row in at:  # as many as expected: their number would scatter the size
+        row[bench.rng.choice(bench.n, round(share * bench.n), replace=False)] = True
     signs = bench.rng.choice([-1.0, 1.0], (len(sensors), bench.n))
     signal = np.zeros((bench.n_sensors, bench.n))
     signal[list(sensors)] = at * signs * height * bench.sigma[list(sensors), None]

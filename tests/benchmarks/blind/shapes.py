@@ -36,14 +36,14 @@ def vibration_tone(bench: Bench, nats: float, *, frequency: float | None = None)
     f = bench.rng.uniform(0.05, 0.45) * bench.rate if frequency is None else frequency
     phase = 2 * np.pi * f / bench.step_rate * np.arange(bench.steps)
     unit = _at_sensors(bench, sensors, phase)
-    part, _ = bench.shape(
+    part, size = bench.shape(
         "vibration_tone",
         nats,
         unit,
         frequency_hz=f,
-        frequency_sd_hz=bench.frequency_sd(nats),
         look_alikes=("drifting_tone", "resonance") if nats < 8 else (),
     )
+    part = replace(part, frequency_sd_hz=bench.frequency_sd(size * unit))
     amplitude = _amplitudes(bench, part)
     part.parameters.update(
         amplitude=quantity(rms(amplitude), "deg/s", amplitude),

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from . import converter, mechanics
 from .analog import OVERSAMPLING, bank_spectrum, relaxator_bank
-from .bench import Bench, Part, quantity, rms
+from .bench import SEPARABLE, Bench, Part, quantity, rms
 from .likelihood import (
     ar1_spectrum,
     coefficients,
-    distinct_nats,
+    comparison,
     divergence,
     expected_power,
     folded,
@@ -32,16 +32,21 @@ def _fine_grid(bench: Bench) -> Array:
     return np.arange(bench.steps + 1) / (2 * bench.steps)
 
 
-def added(bench: Bench, mechanism: str, nats: float, unit: Array) -> tuple[Part, float]:
-    """Noise of spectrum v `unit` (sensor, frequency) added to the base, at the v whose divergence is `nats`; and v."""
+def added(bench: Bench, mechanism: str, nats: float, unit: Array, *, broad: bool = False) -> tuple[Part, float]:
+    """Noise of spectrum v `unit` (sensor, frequency) added to the base, at the v whose divergence is `nats`; and v.
+
+    What is narrow stands out beside its own neighbourhood; of what is `broad` only a comparison with the simulation
+    tells.
+    """
+    share = bench.share if broad else math.inf
     reference = float((bench.spectrum / np.maximum(unit.max(axis=0), 1e-300)).min())
 
     def expected(size: float) -> float:
-        return float(divergence(bench.spectrum + size * unit, bench.spectrum).sum())
+        return float(comparison(bench.spectrum + size * unit, bench.spectrum, share).sum())
 
     size = solve(nats, expected, 1e-9 * reference, 1e6 * reference)
     after = bench.spectrum + size * unit
-    each = divergence(after, bench.spectrum)
+    each = comparison(after, bench.spectrum, share)
     sensors = tuple(int(i) for i in np.flatnonzero(unit.sum(axis=1) > 0))
     look_alikes: tuple[str, ...] = ("parameter_shift",) if bench.looks_like_parameters(after) else ()
     if mechanism in NARROW and (after / bench.spectrum).max() < 2:  # its envelope drowns in the noise of its band
@@ -51,6 +56,7 @@ def added(bench: Bench, mechanism: str, nats: float, unit: Array) -> tuple[Part,
         nats,
         sensors,
         lambda recording: spectral_llr(recording, after, bench.spectrum),
+        oracle_nats=float(divergence(after, bench.spectrum).sum()),
         oracle_null=quadratic_null(after / bench.spectrum),
         sensor_nats=tuple(float(each[i]) for i in sensors),
         look_alikes=look_alikes,
@@ -90,7 +96,7 @@ def power_law(bench: Bench, nats: float, *, mechanism: str = "flicker", exponent
     taus = np.geomspace(OVERSAMPLING / 4, bench.steps / 10, 2 * int(math.log10(4 * bench.n)) + 1)
     variances = taus ** (exponent - 1) / np.sum(taus ** (exponent - 1))
     unit = expected_power(folded(bank_spectrum(_fine_grid(bench), taus, variances), OVERSAMPLING))
-    part, size = added(bench, mechanism, nats, gains[:, None] ** 2 * unit)
+    part, size = added(bench, mechanism, nats, gains[:, None] ** 2 * unit, broad=True)
     signal = np.zeros((bench.n_sensors, bench.n))
     for i in sensors:
         signal[i] = math.sqrt(size) * gains[i] * bench.sampled(relaxator_bank(bench.steps, taus, variances, bench.rng))
@@ -103,9 +109,9 @@ def power_law(bench: Bench, nats: float, *, mechanism: str = "flicker", exponent
     twin = np.broadcast_to(1 / f, after.shape) * bench.base.white[:, None] / after
     own = [component / after for component in bench.components]
     look_alikes = set(part.look_alikes)
-    if any(distinct_nats(after, bench.spectrum, [*own, extra]) < 5 for extra in alone):
+    if any(bench.distinct(after, [*own, extra]) < SEPARABLE for extra in alone):
         look_alikes.add("parameter_shift")
-    if mechanism != "flicker" and distinct_nats(after, bench.spectrum, [*own, twin]) < 5:
+    if mechanism != "flicker" and bench.distinct(after, [*own, twin]) < SEPARABLE:
         look_alikes.add("flicker")
     middle = (f > 10 / bench.n) & (f < 0.1)
     level = math.sqrt(2 * size * float(np.mean((unit * f**exponent)[middle]))) * gains[list(sensors)]
@@ -172,7 +178,10 @@ def low_pass(bench: Bench, nats: float) -> Part:
         passed = folded(OVERSAMPLING * converter.low_pass_gain(nu, corner), OVERSAMPLING)[1:-1]
         return bench.spectrum - chosen * bench.base.white[:, None] * (1 - passed)
 
-    inverse = solve(nats, lambda x: float(divergence(after(1 / x), bench.spectrum).sum()), 1 / 0.49, 1 / 0.004)
+    def expected(inverse: float) -> float:
+        return float(comparison(after(1 / inverse), bench.spectrum, bench.share).sum())
+
+    inverse = solve(nats, expected, 1 / 0.49, 1 / 0.004)
     corner = 1 / inverse
     spectrum = after(corner)
 
@@ -184,9 +193,10 @@ def low_pass(bench: Bench, nats: float) -> Part:
         nats,
         sensors,
         lambda recording: spectral_llr(recording, spectrum, bench.spectrum),
+        oracle_nats=float(divergence(spectrum, bench.spectrum).sum()),
         oracle_null=quadratic_null(spectrum / bench.spectrum),
         analog=filtered,
-        sensor_nats=tuple(float(v) for v in divergence(spectrum, bench.spectrum)[list(sensors)]),
+        sensor_nats=tuple(float(v) for v in comparison(spectrum, bench.spectrum, bench.share)[list(sensors)]),
         look_alikes=("parameter_shift",) if bench.looks_like_parameters(spectrum) else (),
         frequency_hz=corner * bench.step_rate,
         parameters={"corner": quantity(corner * bench.step_rate, "Hz")},
@@ -210,13 +220,14 @@ def parameter_shift(bench: Bench, nats: float, *, only: str | None = None) -> Pa
         white, variance, walk = shifted(size)
         changed = replace(bench.base, white=white, variance=variance, walk=walk)
         spectrum = changed.spectrum(bench.n)
-        each = divergence(spectrum, bench.spectrum)
+        each = comparison(spectrum, bench.spectrum, bench.share)
         factors = dict(zip(names, np.exp(size * weights), strict=True))
         return Part(
             "parameter_shift",
             float(each.sum()),
             sensors,
             lambda recording: spectral_llr(recording, spectrum, bench.spectrum),
+            oracle_nats=float(divergence(spectrum, bench.spectrum).sum()),
             oracle_null=quadratic_null(spectrum / bench.spectrum),
             base=changed,
             sensor_nats=tuple(float(each[i]) for i in sensors),
