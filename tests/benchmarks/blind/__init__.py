@@ -18,7 +18,7 @@ The size of an effect, in nats, is the divergence of the recording from the simu
 - of another spectrum over a broad band (flicker, low-pass, parameters), which only the comparison with a simulation of
   s times as many samples shows: 1/2 sum [(1 + s) log((r + s)/(1 + s)) - log r], which is the above for a model;
 - spikes, a blurred lattice, Laplace noise: number of samples times the divergence of one sample, by quadrature or
-  simulation; a trap: by simulation of the forward algorithm;
+  simulation; a trap: by how far it moves the ratio of the forward algorithm, in simulations;
 - bare clipping, dead band, repeats: one altered sample is proof, and the nats are -log of the chance that none is:
   their expected number. Bare rounding alters every sample.
 """

@@ -108,12 +108,14 @@ def quadratic_null(ratio: Array) -> tuple[float, float, float]:
     return float((c - np.log(ratio)).sum() / 2), float((c**2).sum() / 2), float((c**3).sum())
 
 
-def solve(nats: float, expected: Callable[[float], float], low: float, high: float) -> float:
-    """Size between `low` and `high` at which the rising function `expected` reaches `nats`."""
+def solve(
+    nats: float, expected: Callable[[float], float], low: float, high: float, *, tolerance: float = 1e-8
+) -> float:
+    """Size between `low` and `high` at which the rising function `expected` reaches `nats`, to a relative tolerance."""
     ends = [expected(low) - nats, expected(high) - nats]
     if ends[0] > 0 or ends[1] < 0:
         raise ValueError(f"`nats`: expected between {ends[0] + nats:.3g} and {ends[1] + nats:.3g}, got {nats}")
-    return math.exp(brentq(lambda x: expected(math.exp(x)) - nats, math.log(low), math.log(high), xtol=1e-8))
+    return math.exp(brentq(lambda x: expected(math.exp(x)) - nats, math.log(low), math.log(high), xtol=tolerance))
 
 
 def distinct_nats(after: Array, before: Array, directions: list[Array]) -> float:

@@ -12,9 +12,9 @@ from scipy.fft import idct
 from scipy.stats import norm
 
 from . import clock, converter
-from .analog import OVERSAMPLING
-from .bench import CERTAIN, Bench, Cumulants, Part, quantity, rms
-from .likelihood import coefficients, quadratic_null, solve
+from .analog import OVERSAMPLING, relaxator
+from .bench import CERTAIN, SEPARABLE, Bench, Cumulants, Part, quantity, rms
+from .likelihood import ar1_spectrum, coefficients, grid, quadratic_null, solve
 from .traps import TrapOracle, telegraph
 
 Array = NDArray[np.float64]
@@ -66,6 +66,8 @@ def spikes(bench: Bench, nats: float, *, simultaneous: bool | None = None) -> Pa
         sensors,
         lambda recording: float(log_ratio(innovations(recording, bench.spectrum)[list(sensors)], height).sum()),
         signal=signal,
+        # a shock is seen in all of its sensors together: what one adds depends on what the others show
+        sensor_nats=() if together else (nats / len(sensors),) * len(sensors),
         oracle_law="bound",
         look_alikes=("parameter_shift",) if height < 2 else (),
         parameters={
@@ -124,22 +126,24 @@ def random_telegraph(bench: Bench, nats: float, *, dwell_share: float | None = N
     """A trap in one to three sensors; the nats by simulation with the forward algorithm on block means.
 
     The oracle takes the noise of block means for a short autoregression, so the law of its ratio without the effect is
-    simulated as well, by 100 recordings.
+    simulated as well, by 100 recordings, 40 of which say how large the steps must be.
     """
     sensors = bench.some_sensors(1, 3)
     signal = np.zeros((bench.n_sensors, bench.n))
-    steps, oracles = [], []
+    steps, oracles, distinct = [], [], 0.0
     null = np.zeros(100)
     for i in sensors:
         switches = math.exp(bench.rng.uniform(math.log(50), math.log(150))) if dwell_share is None else 1 / dwell_share
         asymmetry = bench.rng.uniform(0.6, 1.6)
         up, down = bench.n / switches * asymmetry, bench.n / switches / asymmetry
         oracle = TrapOracle(bench.spectrum[i], bench.n, up, down)
-        size = oracle.step_for(nats / len(sensors), float(bench.sigma[i]), bench.rng)
+        noise = bench.base.copies(i, len(null)).simulate(bench.n, bench.rng)
+        quiet = oracle.block_means(noise)
+        size = oracle.step_for(nats / len(sensors), float(bench.sigma[i]), quiet[:40], bench.rng)
+        distinct += _beside_its_twin(bench.spectrum[i], oracle, size, noise[:40], bench.rng)
         path = telegraph(bench.steps, OVERSAMPLING * up, OVERSAMPLING * down, bench.rng)
         signal[i] = size * (bench.sampled(path) - 0.5)
-        quiet = bench.base.copies(i, len(null)).simulate(bench.n, bench.rng)
-        null += oracle.llr(oracle.block_means(quiet), size)
+        null += oracle.llr(quiet, size)
         steps.append(size)
         oracles.append(oracle)
 
@@ -149,8 +153,6 @@ def random_telegraph(bench: Bench, nats: float, *, dwell_share: float | None = N
         return float(sum(o.llr(o.block_means(x[i])[None], s)[0] for i, o, s in pairs))
 
     up_s, down_s = (np.array([getattr(o, name) for o in oracles]) / bench.rate for name in ("up", "down"))
-    halves = np.array(steps) / 2 / bench.sigma[list(sensors)]
-    dwells = np.array([min(oracle.up, oracle.down) for oracle in oracles])
     return Part(
         "random_telegraph",
         nats,
@@ -159,13 +161,31 @@ def random_telegraph(bench: Bench, nats: float, *, dwell_share: float | None = N
         signal=signal,
         sensor_nats=(nats / len(sensors),) * len(sensors),
         oracle_null=cumulants(null, np.full(len(null), 1 / len(null))),
-        look_alikes=("parameter_shift",) if (halves**2 * dwells).min() < 2 else (),
+        look_alikes=("parameter_shift",) if distinct < SEPARABLE else (),
         parameters={
             "half_step": quantity(rms(np.array(steps)) / 2, "deg/s", np.array(steps) / 2),
             "dwell_up": quantity(rms(up_s), "s", up_s),
             "dwell_down": quantity(rms(down_s), "s", down_s),
         },
     )
+
+
+def _beside_its_twin(spectrum: Array, oracle: TrapOracle, size: float, noise: Array, rng: np.random.Generator) -> float:
+    """Nats, as of `TrapOracle.step_for`, between a trap and Gaussian noise of its spectrum, in recordings of noise."""
+    n = noise.shape[-1]
+    rate = 1 / oracle.up + 1 / oracle.down
+    variance = size**2 * oracle.up * oracle.down / (oracle.up + oracle.down) ** 2
+    after = spectrum + ar1_spectrum(grid(n), math.exp(-rate), variance * -math.expm1(-2 * rate))
+    trap = np.stack([telegraph(n, oracle.up, oracle.down, rng) - 0.5 for _ in noise])
+    twin = np.stack([relaxator(n, math.exp(-rate), variance, rng) for _ in noise])
+
+    def told(records: Array) -> Array:
+        power = coefficients(records) ** 2
+        gaussian = (power / spectrum - power / after - np.log(after / spectrum)).sum(axis=-1) / 2
+        return oracle.llr(oracle.block_means(records), size) - gaussian
+
+    as_trap, as_twin = told(noise + size * trap), told(noise + twin)
+    return float((as_trap.mean() - as_twin.mean()) ** 2 / (2 * as_twin.var(ddof=1)))
 
 
 def cumulants(values: Array, weights: Array) -> Cumulants:

@@ -131,16 +131,17 @@ def common_mode(bench: Bench, nats: float) -> Part:
     sensors = bench.some_sensors(3)
     gains = bench.gains(sensors, signed=False) * bench.sigma
 
-    def law(share: float) -> tuple[Array, Array]:
+    def law(share: float, own: Array) -> tuple[Array, Array]:
         """Independent part (sensor, frequency) and log determinant of the cross-spectral matrix, per frequency."""
-        alone = bench.spectrum - share * gains[:, None] ** 2
-        return alone, np.log(alone).sum(axis=0) + np.log1p(share * (gains[:, None] ** 2 / alone).sum(axis=0))
+        alone = bench.spectrum - share * own[:, None] ** 2
+        return alone, np.log(alone).sum(axis=0) + np.log1p(share * (own[:, None] ** 2 / alone).sum(axis=0))
 
-    def expected(share: float) -> float:
-        return float((np.log(bench.spectrum).sum(axis=0) - law(share)[1]).sum() / 2)
+    def expected(share: float, own: Array = gains) -> float:
+        return float((np.log(bench.spectrum).sum(axis=0) - law(share, own)[1]).sum() / 2)
 
     share = solve(nats, expected, 1e-7, 0.6)
-    alone, logdet = law(share)
+    alone, logdet = law(share, gains)
+    without = [expected(share, np.where(np.arange(bench.n_sensors) == i, 0.0, gains)) for i in sensors]
 
     def llr(recording: Array) -> float:
         x = coefficients(recording)
@@ -164,6 +165,7 @@ def common_mode(bench: Bench, nats: float) -> Part:
         oracle_null=(16 * null[0], 16 * null[1], 16 * null[2]),
         signal=level[:, None] * supply,
         base=replace(bench.base, white=bench.base.white - level**2),
+        sensor_nats=tuple(nats - others for others in without),
         parameters={"gain": quantity(rms(level[list(sensors)]), "deg/s", level[list(sensors)])},
     )
 

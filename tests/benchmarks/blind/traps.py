@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_toeplitz
 from scipy.signal import lfilter
 
+from .likelihood import solve
+
 Array = NDArray[np.float64]
 ORDER = 4  # of the autoregression that stands for the noise of block means
 MAX_BLOCKS = 2048
@@ -81,30 +83,25 @@ class TrapOracle:
             weight = weight / scales[t][:, None, None, None]
         return np.log(scales).sum(axis=0) + top[:, :, 0].sum(axis=0)
 
-    def step_for(self, nats: float, unit: float, rng: np.random.Generator, replications: int = 12) -> float:
-        """Step whose mean log likelihood ratio is `nats`, by simulation.
+    def step_for(self, nats: float, unit: float, quiet: Array, rng: np.random.Generator) -> float:
+        """Step at which the trap tells itself from noise as well as a Gaussian effect of so many nats.
 
-        Every step is tried on the same noise and the same paths, between 1e-3 and 20 `unit`: first coarsely, then
-        between the two neighbours; the mean is accurate to some (2 nats/replications)^(1/2).
+        The ratio is not quite that of the laws, since the noise is not quite an autoregression, so that its mean says
+        nothing. How far it moves does: `(E1 - E0)^2 / (2 Var0)`, which is the divergence where the ratio is normal.
+
+        Args:
+            nats: Asked for.
+            unit: Steps are looked for between 1e-3 and 20 of it.
+            quiet: Block means of noise alone, (replication, block); paths are drawn for each, the same for all steps.
+            rng: Of the paths.
         """
-        noise = lfilter(
-            [1.0],
-            np.concatenate([[1.0], -self.prediction]),
-            rng.standard_normal((replications, self.blocks + 200)) * math.sqrt(self.innovation),
-            axis=-1,
-        )[:, 200:]
         up, down = FINE * self.up / self.block, FINE * self.down / self.block
-        fine = np.stack([telegraph(FINE * self.blocks, up, down, rng) for _ in range(replications)])
-        paths = fine.reshape(replications, self.blocks, FINE).mean(axis=-1) - 0.5
-        low, high = 1e-3 * unit, 20 * unit
-        for _ in range(2):
-            steps = np.geomspace(low, high, 8)
-            every = np.repeat(steps, replications)
-            records = np.tile(noise, (8, 1)) + every[:, None] * np.tile(paths, (8, 1))
-            expected = self.llr(records, every).reshape(8, replications).mean(axis=1)
-            above = int(np.argmax(expected > nats))
-            if not above:
-                raise ValueError(f"`nats`: expected between {expected[0]:.3g} and {expected[-1]:.3g}, got {nats}")
-            low, high = steps[above - 1], steps[above]
-        share = (nats - expected[above - 1]) / (expected[above] - expected[above - 1])
-        return float(low * (high / low) ** share)
+        fine = np.stack([telegraph(FINE * self.blocks, up, down, rng) for _ in quiet])
+        paths = fine.reshape(len(quiet), self.blocks, FINE).mean(axis=-1) - 0.5
+
+        def told(step: float) -> float:
+            ratio = self.llr(np.concatenate([quiet, quiet + step * paths]), step)
+            without, with_trap = ratio[: len(quiet)], ratio[len(quiet) :]
+            return float((with_trap.mean() - without.mean()) ** 2 / (2 * without.var(ddof=1)))
+
+        return solve(nats, told, 1e-3 * unit, 20 * unit, tolerance=1e-2)
