@@ -25,6 +25,7 @@ LAYERS = [
         "cli_navigation",
         "cli_shared",
         "_console",
+        "_preload",
         "lightning_module",
     },
     {

@@ -12,9 +12,12 @@ from scipy import integrate, stats
 from torch import Tensor
 
 from gyrofuse import AR1, RandomWalk, WhiteNoise
-from gyrofuse.mismatch import episodes, hysteresis, impulses, modulation, outliers, sweeps
+from gyrofuse.mismatch import episodes, hysteresis, impulses, modulation, oscillating, outliers, shapes, sweeps
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.mechanisms.common_mode import CommonMode
+from gyrofuse.mismatch.mechanisms.drifting_tone import DriftingTone
+from gyrofuse.mismatch.mechanisms.parameter_shift import ParameterShift
+from gyrofuse.mismatch.mechanisms.resonance import Resonance
 from gyrofuse.mismatch.mechanisms.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.variance_change import VarianceChange
 
@@ -205,6 +208,19 @@ def test_a_line_that_moves_is_seen_with_either_sign() -> None:
     assert "from 9.989 Hz to 40.01 Hz" in found.words
     both = Case.of(scene(), case.recording, simulation + 0.17 * gains * phase.cos())
     assert sweeps.sweep_witness(both).p_value > 0.01
+
+
+@pytest.mark.parametrize("amplitude", [0.3, 1.0])
+def test_a_strong_sweep_is_no_resonance(amplitude: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    recording, simulation, _ = drawn(21)
+    t = torch.arange(N, dtype=torch.float64)
+    phase = 2 * math.pi * (0.1 * t + 0.3 * t.square() / (2 * N))
+    case = Case.of(scene(), recording + amplitude * phase.cos(), simulation)
+    named = (Resonance, DriftingTone, CommonMode, ParameterShift)
+    assert [m.name for m in named if m.nominate(case, LEVEL) is not None] == []
+    for module in (shapes, oscillating):  # it is the sweep that tells
+        monkeypatch.setattr(module, "swept", lambda *_: False)
+    assert [m.name for m in named if m.nominate(case, LEVEL) is not None]
 
 
 # Hysteresis.

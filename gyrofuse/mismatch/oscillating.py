@@ -18,6 +18,7 @@ from gyrofuse.mismatch.shape_terms import Bump, CommonBump, oscillation
 from gyrofuse.mismatch.shape_words import spanned
 from gyrofuse.mismatch.shapes import chosen_shape, refit, run_length
 from gyrofuse.mismatch.steadiness import Steadiness, steadiness
+from gyrofuse.mismatch.sweeps import swept
 from gyrofuse.mismatch.witnesses import level_of
 
 _SEEN = 2.3  # standard deviations: one in a hundred by chance
@@ -134,7 +135,7 @@ def nominated(case: Case, level: float, *, tone: bool) -> tuple[Mode, Seen] | No
     sensors = tuple(int(i) for i in has.nonzero()[:, 0])
     verdict = steadiness(case, bump)
     steady = verdict.tone and bump.width <= _BROAD * bump.centre  # what is all over the spectrum is no tone
-    if not sensors or steady != tone or _momentary(case, bump):
+    if not sensors or steady != tone or _momentary(case, bump) or swept(case, bump.nats, level):
         return None
     gain = bump.variance.clamp(min=0).sqrt().to(torch.complex128) if bump.gain is None else bump.gain
     mode = Mode(bump.centre, bump.width, gain, bump.gain is not None)

@@ -24,6 +24,7 @@ from gyrofuse.mismatch.shape_fit import Fit, Ratios, data_model, fair_gain, fit,
 from gyrofuse.mismatch.shape_scan import bump_start, scanned
 from gyrofuse.mismatch.shape_terms import Bump, Common, CommonBump, Flicker, LowPass, Shift, Term
 from gyrofuse.mismatch.side import Side
+from gyrofuse.mismatch.sweeps import swept
 from gyrofuse.mismatch.witnesses import level_of
 
 _RIVAL = 5.0  # nats
@@ -100,6 +101,8 @@ def chosen_shape(case: Case, name: str, level: float) -> Shape | None:
         return None
     best = leading_shape(case)
     if best is None or best.term.name != name or best.p_value > level:
+        return None
+    if swept(case, best.gain, level):
         return None
     # A loop that a temperature draws is no noise, however slow.
     relay = strongest_relay(case) if best.frequency * case.n_samples < _SLOW else None

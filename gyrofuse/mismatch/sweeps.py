@@ -39,21 +39,19 @@ class Sweep(NamedTuple):
         p_value: For having looked at all.
         first, last: Frequencies at the record's ends, cycles per sample; beyond a half they are folded back.
         sensors: In which it was seen.
+        nats: By which the power of most segments is above what noise has on a track.
     """
 
     p_value: float
     first: float
     last: float
     sensors: tuple[int, ...]
+    nats: float
 
 
 def sweep_witness(case: Case) -> Evidence:
     """A line whose frequency moves, that the simulation does not have."""
-    found = _strongest(case.recorded)
-    p_value = found.p_value
-    # Lines that both have leave traces here of any size: what the simulation may show is nothing to surpass.
-    if p_value < _NOTABLE and _strongest(case.simulated).p_value < _NOTABLE:
-        p_value = 1.0
+    found, p_value = _strongest(case.recorded), _p_value(case)
     first, last = (f * case.scene.rate for f in (found.first, found.last))
     return Evidence(
         "sweep",
@@ -62,6 +60,21 @@ def sweep_witness(case: Case) -> Evidence:
         sensors=found.sensors,
         levels=tuple(sorted({level_of(max(f, 1 / case.n_samples)) for f in (found.first, found.last)})),
     )
+
+
+def swept(case: Case, nats: float, level: float) -> bool:
+    """Whether a line whose frequency moves is seen, and tells more than so many nats of the spectrum.
+
+    What it sweeps over has more power, as if noise had been added there or filtered away elsewhere.
+    """
+    return _p_value(case) <= level and _strongest(case.recorded).nats > nats
+
+
+def _p_value(case: Case) -> float:
+    p_value = _strongest(case.recorded).p_value
+    # Lines that both have leave traces here of any size: what the simulation may show is nothing to surpass.
+    seen_in_both = p_value < _NOTABLE and _strongest(case.simulated).p_value < _NOTABLE
+    return 1.0 if seen_in_both else p_value
 
 
 @remembered
@@ -95,7 +108,7 @@ def strongest_sweep(white: Tensor) -> Sweep:
     centred = ((torch.arange(length) - (length - 1) / 2) / length).square()
     signs = _signs(p)
     sizes = signs.abs().sum(-1)
-    best, first, rate, sensors = 0.0, 0.0, 0.0, tuple(range(p))
+    best, first, rate, sensors, nats = 0.0, 0.0, 0.0, tuple(range(p)), 0.0
     for undone in range(_EVERY // 2, moves + _EVERY // 2, _EVERY):
         turn = torch.polar(torch.full((length,), length**-0.5), -math.pi * undone * centred)
         bins = torch.fft.fft(segments * turn)  # (sensor, segment, bin)
@@ -103,7 +116,8 @@ def strongest_sweep(white: Tensor) -> Sweep:
         for move in range(max(undone - _EVERY // 2, 1), min(undone + _EVERY // 2, moves)):
             sums = _tracks(powers.sum(0), move)
             at = sums.flatten().topk(_CANDIDATES).indices
-            tracks = _followed(powers, bins, move, at // length, at % length)  # (sensor, candidate, segment)
+            every = _followed(bins, move, at // length, at % length)  # (sensor, candidate, segment)
+            tracks = every * (every.abs().clamp(max=math.sqrt(_CUT)) / every.abs().clamp(min=1e-20))
             power = (signs @ tracks.flatten(1)).abs().square().view(len(signs), *tracks.shape[1:]).sum(-1)
             which, place = divmod(int((power / sizes[:, None]).argmax()), len(at))
             highest = float(power[which, place] / sizes[which])
@@ -111,10 +125,12 @@ def strongest_sweep(white: Tensor) -> Sweep:
                 best, first = highest, int(at[place]) % length / length
                 rate = (move + int(at[place]) // length / max(count - 1, 1)) / length
                 sensors = tuple(signs[which].abs().nonzero()[:, 0].tolist())
+                whole = (signs[which] @ every[:, place]).abs().square() / sizes[which]
+                nats = count * (float(whole.median()) / math.log(2) - 1)
     tail = float(torch.special.gammaincc(*torch.tensor([count, best], dtype=torch.float64)))
     places = float((moves - 1) * count * length * len(signs))
     start, stop = (abs(math.remainder(f, 1.0)) for f in (first - rate / 2, first + (count - 0.5) * rate))
-    return Sweep(corrected(tail, places), start, stop, sensors)
+    return Sweep(corrected(tail, places), start, stop, sensors, nats)
 
 
 def _signs(p: int) -> Tensor:
@@ -126,13 +142,12 @@ def _signs(p: int) -> Tensor:
     return every[first > 0].to(torch.complex64)
 
 
-def _followed(powers: Tensor, bins: Tensor, move: int, more: Tensor, start: Tensor) -> Tensor:
-    """Values along tracks, cut, `(sensor, candidate, segment)`."""
+def _followed(bins: Tensor, move: int, more: Tensor, start: Tensor) -> Tensor:
+    """Values along tracks, `(sensor, candidate, segment)`."""
     count, length = bins.shape[1:]
     segment = torch.arange(count)
     at = (start[:, None] + move * segment + _drift(more, count)) % length  # (candidate, segment)
-    values, size = bins[:, segment, at], powers[:, segment, at].sqrt()
-    return values * (size / values.abs().clamp(min=1e-20))
+    return bins[:, segment, at]
 
 
 def _drift(more: Tensor, count: int) -> Tensor:

@@ -9,9 +9,10 @@ The generator knows nothing of the library that is judged: NumPy and SciPy only.
 
 The size of an effect, in nats, is the divergence of the recording from the simulation that the analyst is given:
 
-- a signal (tone, step, temperature, warm-up, acceleration, scale factor, clock): Whittle's divergence of its spectrum,
-  1/2 sum (r - 1 - log r) over frequencies and sensors, r = 1 + |m|^2/S; for the clock, of what no phase and amplitude
-  of the line can explain. It is less than half the whitened energy, which a known signal would have: its shape is not;
+- a signal (tone, step, warm-up, clock): Whittle's divergence of its spectrum, 1/2 sum (r - 1 - log r) over frequencies
+  and sensors, r = 1 + |m|^2/S; for the clock, of what no phase and amplitude of the line can explain;
+- a signal whose shape a channel or few numbers give (temperature, acceleration, scale factor, sweep): half its whitened
+  energy m' V^-1 m, summed over sensors;
 - Gaussian noise of another spectrum (resonance, common mode, episodes, modulated noise): the same with r the ratio of
   the spectra, for common mode with matrices; a wandering tone is taken for noise of its mean spectrum, which bounds its
   divergence from below;

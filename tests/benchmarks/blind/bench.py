@@ -86,18 +86,25 @@ class Bench:
         """What the converter makes of an oversampled signal."""
         return decimate(analog, OVERSAMPLING)
 
-    def shape(self, mechanism: str, nats: float, unit: Array, **truth: Any) -> tuple[Part, float]:
-        """A signal of a given shape, at the size where the divergence of its spectrum is `nats`; and that size."""
+    def shape(
+        self, mechanism: str, nats: float, unit: Array, *, known: bool = False, **truth: Any
+    ) -> tuple[Part, float]:
+        """A signal of a given shape, at the size where it is worth `nats`; and that size.
+
+        These are the divergence of its spectrum, or where a channel or few numbers make the shape `known`, half its
+        whitened energy.
+        """
         power = coefficients(unit) ** 2
+        size = math.sqrt(2 * nats / float((power / self.spectrum).sum()))
 
-        def after(size: float) -> Array:
-            return self.spectrum + size**2 * power
+        def worth(size: float) -> Array:
+            return divergence(self.spectrum + size**2 * power, self.spectrum)
 
-        usual = math.sqrt(2 * nats / whitened_energy(unit, self.spectrum).sum())  # of a shape that is known
-        size = solve(nats, lambda x: float(divergence(after(x), self.spectrum).sum()), 0.5 * usual, 1e3 * usual)
+        if not known:
+            size = solve(nats, lambda x: float(worth(x).sum()), 0.5 * size, 1e3 * size)
         signal = size * unit
-        each = divergence(after(size), self.spectrum)
-        energy = float(whitened_energy(signal, self.spectrum).sum())
+        energy = whitened_energy(signal, self.spectrum)
+        each = energy / 2 if known else worth(size)
         sensors = tuple(int(i) for i in np.flatnonzero(np.any(unit, axis=1)))
         part = Part(
             mechanism,
@@ -105,7 +112,7 @@ class Bench:
             sensors,
             lambda recording: shape_llr(recording, signal, self.spectrum),
             signal=signal,
-            oracle_nats=energy / 2,
+            oracle_nats=float(energy.sum()) / 2,
             sensor_nats=tuple(float(each[i]) for i in sensors),
             **truth,
         )

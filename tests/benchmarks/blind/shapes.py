@@ -148,6 +148,7 @@ def temperature_drift(bench: Bench, nats: float) -> Part:
         "temperature_drift",
         nats,
         gains[:, None] * (die - die.mean()),
+        known=True,
         channel="temperature",
         channels={"temperature": thermal.thermometer(inside, bench.rng)},
     )
@@ -204,7 +205,7 @@ def g_sensitivity(bench: Bench, nats: float) -> Part:
     true, seen = _acceleration(bench)
     axes = bench.rng.standard_normal((bench.n_sensors, 3)) * (bench.gains(sensors, signed=False)[:, None])
     part, size = bench.shape(
-        "g_sensitivity", nats, axes @ (true - true.mean(axis=1, keepdims=True)), channel="acceleration",
+        "g_sensitivity", nats, axes @ (true - true.mean(axis=1, keepdims=True)), known=True, channel="acceleration",
         channels={"acceleration": seen},
     )  # fmt: skip
     gain = size * np.linalg.norm(axes[list(sensors)], axis=1)
@@ -228,6 +229,7 @@ def quadratic_coupling(bench: Bench, nats: float) -> Part:
         "quadratic_coupling",
         nats,
         gains[:, None] * bench.sampled(shaking[0] ** 2),
+        known=True,
         frequency_hz=2 * f,
         channel="acceleration",
         channels={"acceleration": seen + 2e-4 * math.sqrt(bench.rate) * bench.rng.standard_normal(seen.shape)},
@@ -253,7 +255,7 @@ def scale_factor(bench: Bench, nats: float, *, constant: bool = False) -> Part:
             "not_identifiable", 0.0, sensors, lambda recording: 0.0, signal=1e-3 * unit, channels=channels,
             channel="reference_rate", look_alikes=("scale_factor",),
         )  # fmt: skip
-    part, size = bench.shape("scale_factor", nats, unit, channel="reference_rate", channels=channels)
+    part, size = bench.shape("scale_factor", nats, unit, known=True, channel="reference_rate", channels=channels)
     error = size * gains[list(sensors)]
     part.parameters.update(error=quantity(1e6 * rms(error), "ppm", 1e6 * error))
     return part

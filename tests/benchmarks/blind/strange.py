@@ -26,7 +26,7 @@ def chirp(bench: Bench, nats: float) -> Part:
     low, high = 0.05 * bench.rate, 0.42 * bench.rate
     phase = 2 * np.pi * bench.duration * (low * t + (high - low) * t**2 / 2)
     unit = bench.gains(sensors)[:, None] * bench.sampled(np.cos(phase + bench.rng.uniform(0, 2 * np.pi)))
-    return bench.shape("chirp", nats, unit, frequency_hz=None)[0]
+    return bench.shape("chirp", nats, unit, known=True)[0]
 
 
 def hysteresis(bench: Bench, nats: float) -> Part:
@@ -38,7 +38,7 @@ def hysteresis(bench: Bench, nats: float) -> Part:
     last = np.maximum.accumulate(np.where(turned != 0, np.arange(bench.n), 0))
     unit = bench.gains(sensors)[:, None] * np.where(turned[last] == 0, -1.0, turned[last])
     channels = {"temperature": thermal.thermometer(inside, bench.rng)}
-    return bench.shape("hysteresis", nats, unit, channel="temperature", channels=channels)[0]
+    return bench.shape("hysteresis", nats, unit, known=True, channel="temperature", channels=channels)[0]
 
 
 def laplace_noise(bench: Bench, nats: float) -> Part:
