@@ -117,7 +117,7 @@ def fleet(
     if devices > 1:
         begin_imports(accelerator)
 
-    from gyrofuse.fleet.logs import groups_of, identity
+    from gyrofuse.fleet.logs import identity
     from gyrofuse.fleet.standing import standing_of
     from gyrofuse.fleet.store import ResultStore, read_results
     from gyrofuse.lightning_module import GyroArrayDataModule
@@ -146,11 +146,11 @@ def fleet(
     options = {name: value for name, value in options.items() if value is not None}
     with outputs(force, [manifest, simulation], json=json_file, report=report) as drafts:
         store = ResultStore(out, asked.columns, {**asked.settings, **options})
-        data = GyroArrayDataModule(paths or [], manifest=manifest, **options)
+        data = GyroArrayDataModule(paths or [], manifest=manifest, group_size=group, **options)
         data.logs = tuple(log for log in data.logs if identity(log) != identity(out))  # its suffix is that of a log
         trainer = _trainer(store, devices, accelerator)
         store.open(force=force)
-        data.groups = groups_of(data.logs, group, store.done(failed=not retry))
+        data.done = store.done(failed=not retry)
         _run(asked, store, data, trainer)
         settings, rows = read_results(out, without=["virtual"])
         standing = standing_of(settings["task"], rows)

@@ -14,6 +14,7 @@ import logging
 import os
 import warnings
 from collections.abc import Collection, Iterable, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -60,9 +61,15 @@ class GyroArrayDataModule(LightningDataModule):
     ) -> None:
         super().__init__()
         self.logs = find_logs(paths, manifest=manifest)
-        self.groups = groups_of(self.logs, check_positive_integer("group_size", group_size), done)
+        self.group_size = check_positive_integer("group_size", group_size)
+        self.done = done
         self.num_workers = num_workers
         self.options = LogGroups((), options).options  # wrong ones are told now, not by every row
+
+    @cached_property
+    def groups(self) -> tuple[tuple[Path, ...], ...]:
+        """Logs that are taken together, without those that are done, as they are when they are first asked for."""
+        return groups_of(self.logs, self.group_size, self.done)
 
     def predict_dataloader(self) -> DataLoader[tuple[Log, ...]]:
         """Groups of logs; Lightning shares them out among processes, each once."""

@@ -88,9 +88,8 @@ def verdict(standing: Standing) -> list[str]:
             for d in standing.drifts[:3]
         ]
         if standing.doubts:
-            said.append(
-                f"The weights of {standing.n_doubted} logs are to be doubted, for motion or too short a recording."
-            )
+            of = "one log" if standing.n_doubted == 1 else f"{standing.n_doubted} logs"
+            said.append(f"The weights of {of} are to be doubted, for motion or too short a recording.")
         if not (standing.too_noisy or standing.outliers or standing.doubts or standing.drifts):
             said.append("No sensor, log or drift of weights stands out.")
     if standing.task == "fit" and standing.values:

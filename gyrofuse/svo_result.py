@@ -121,7 +121,7 @@ class SVOResult(VirtualGyro):
         scale = self.wavelet_variance.rsqrt()
         correlation = scale[..., :, None] * self.wavelet_cross_covariance * scale[..., None, :]
         first, second = torch.triu_indices(len(self.sensors), len(self.sensors), 1).to(scale.device)
-        return correlation[..., first, second].median(-1).values
+        return correlation[..., first, second].quantile(0.5, -1)
 
     @property
     def motion(self) -> str:
