@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import gyrofuse as gf
+from gyrofuse.mismatch import known_lines
 from gyrofuse.mismatch import testimony as court
 from gyrofuse.mismatch.inputs import prepared
 from gyrofuse.mismatch.known_lines import amplitudes, precise, without_lines
@@ -36,6 +37,14 @@ def test_a_frequency_is_made_precise(frequency: float, off: float):
     assert abs(found - frequency) * N < 1e-5
     torch.testing.assert_close(amplitudes(signal, (found,)), torch.full((1, 2, 1), 0.3, dtype=torch.float64))
     torch.testing.assert_close(without_lines(signal, (found,)), torch.full_like(signal, 5.0), atol=1e-6, rtol=0)
+
+
+def test_stretches_make_no_difference(monkeypatch: pytest.MonkeyPatch):
+    signal = recorded(toned(), 1).signal
+    frequencies = (0.0541, 0.2)
+    whole = without_lines(signal, frequencies), amplitudes(signal, frequencies)
+    monkeypatch.setattr(known_lines, "_STRETCH", 1000)
+    torch.testing.assert_close((without_lines(signal, frequencies), amplitudes(signal, frequencies)), whole)
 
 
 @pytest.mark.parametrize("sampled", [False, True])

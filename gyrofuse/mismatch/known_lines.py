@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
 
+_STRETCH = 2**18  # samples at a time
 _STEPS = 3  # of Gauss and Newton: from a quarter of a bin to nothing
 
 
@@ -17,13 +19,14 @@ def without_lines(signal: Tensor, frequencies: tuple[float, ...]) -> Tensor:
     """
     if not frequencies:
         return signal
-    basis = _basis(signal.shape[-1], frequencies)
-    return signal - _coefficients(signal, basis)[..., :-1] @ basis[:-1]
+    own, n = _coefficients(signal, frequencies)[..., :-1], signal.shape[-1]
+    parts = [part - own @ _basis(n, t, frequencies)[:-1] for part, t in _stretches(signal)]
+    return torch.cat(parts, -1)
 
 
 def amplitudes(signal: Tensor, frequencies: tuple[float, ...]) -> Tensor:
     """Of lines in the middle of signals `(..., time)`, `(..., line)`; of variance `2 S / n` in noise of density `S`."""
-    cosine, sine, *_ = _coefficients(signal, _basis(signal.shape[-1], frequencies)).split(len(frequencies), -1)
+    cosine, sine, *_ = _coefficients(signal, frequencies).split(len(frequencies), -1)
     return torch.hypot(cosine, sine)
 
 
@@ -35,7 +38,7 @@ def precise(signal: Tensor, frequencies: tuple[float, ...]) -> tuple[float, ...]
     """
     n, found = signal.shape[-1], frequencies
     for _ in range(_STEPS if frequencies else 0):
-        parts = _coefficients(signal, _basis(n, found)).flatten(0, -2).split(len(found), -1)
+        parts = _coefficients(signal, found).flatten(0, -2).split(len(found), -1)
         cosine, sine, cosine_change, sine_change, _mean = parts
         turn = (cosine_change * sine - sine_change * cosine).sum(0) / (cosine.square() + sine.square()).sum(0)
         steps = (turn / (math.pi * n)).clamp(-0.5 / n, 0.5 / n)
@@ -43,14 +46,26 @@ def precise(signal: Tensor, frequencies: tuple[float, ...]) -> tuple[float, ...]
     return found
 
 
-def _basis(n: int, frequencies: tuple[float, ...]) -> Tensor:
-    """Cosines, sines, both times time from -1 to 1, and a constant, `(4 * line + 1, time)`."""
-    t = torch.arange(n, dtype=torch.float64)
+def _stretches(signal: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """Parts of signals and the numbers of their samples: the basis is as large as many sensors."""
+    t = torch.arange(signal.shape[-1], dtype=torch.float64)
+    return zip(signal.split(_STRETCH, -1), t.split(_STRETCH), strict=True)
+
+
+def _basis(n: int, t: Tensor, frequencies: tuple[float, ...]) -> Tensor:
+    """Cosines, sines, both times time from -1 to 1, and a constant at `t` of `n` samples, `(4 * line + 1, time)`."""
     angle = 2 * math.pi * torch.tensor(frequencies, dtype=torch.float64)[:, None] * t
     steady = torch.cat([angle.cos(), angle.sin()])
-    return torch.cat([steady, steady * (2 * t / n - 1), torch.ones(1, n, dtype=torch.float64)])
+    return torch.cat([steady, steady * (2 * t / n - 1), torch.ones(1, len(t), dtype=torch.float64)])
 
 
-def _coefficients(signal: Tensor, basis: Tensor) -> Tensor:
+def _coefficients(signal: Tensor, frequencies: tuple[float, ...]) -> Tensor:
     """Least squares, `(..., row of the basis)`."""
-    return torch.linalg.solve(basis @ basis.mT, basis @ signal.flatten(0, -2).mT).mT.unflatten(0, signal.shape[:-1])
+    rows, n = 4 * len(frequencies) + 1, signal.shape[-1]
+    gram = torch.zeros(rows, rows, dtype=torch.float64)
+    products = torch.zeros(rows, signal[..., 0].numel(), dtype=torch.float64)
+    for part, t in _stretches(signal):
+        basis = _basis(n, t, frequencies)
+        gram += basis @ basis.mT
+        products += basis @ part.flatten(0, -2).mT
+    return torch.linalg.solve(gram, products).mT.unflatten(0, signal.shape[:-1])
