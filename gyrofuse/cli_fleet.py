@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gyrofuse._checks import check_positive_integer
-from gyrofuse._console import progress_bar, say
+from gyrofuse._console import progress_bar, say, warn
 from gyrofuse._workers import begin_imports
 from gyrofuse.cli_shared import (
     Axis,
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
     from gyrofuse.lightning_module import GyroArrayDataModule
 
 _ACCELERATORS = ("cpu", "gpu", "auto")
+_AT_ONCE = getattr(signal, "SIGKILL", signal.SIGTERM)  # Lightning lets processes finish on SIGTERM
 _LOOK = 0.5  # s between looks at how far a run has come
 
 
@@ -231,6 +233,13 @@ def _run(task: Task, store: ResultStore, data: GyroArrayDataModule, trainer: Tra
         raise (OSError if kind.endswith("Error") else RuntimeError)(words or kind) from None
     except ProcessExitedException as error:
         raise OSError(f"a process ended early ({error}); what is finished is kept, start again to go on") from None
+    except SystemExit as stop:  # from outside: the others would work on, and this process wait for them
+        if trainer.strategy.launcher is not None:
+            trainer.strategy.launcher.kill(_AT_ONCE)
+        warn("stopped; what is finished is kept, start again to go on")
+        if isinstance(stop.__context__, KeyboardInterrupt):  # of which Lightning makes an exit
+            raise KeyboardInterrupt from None
+        raise
 
 
 @contextmanager

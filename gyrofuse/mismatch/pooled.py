@@ -15,6 +15,7 @@ from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.witnesses import level_of, whitened_difference
 
 _ABSENT = 1.5  # standard deviations of what the simulation has, below which it has nothing; less if it is short
+_SURELY = 0.7  # the same, to take for granted that it has nothing
 _SHOWN = 0.1  # p value below which the simulation's sensors share something
 _DRAWN, _COUNTED = 4000, 40  # matrices of noise, and those of them beyond which the tail is not counted
 _NEIGHBOURS = 1.1  # bands next to each other are slightly correlated
@@ -98,7 +99,8 @@ def common_source(case: Case) -> Source | None:
         bands = known.nonzero()[:, 0]
         first, last = int(bands[starts[run]]), int(bands[ends[run] - 1])
         value = corrected(float(tails[run]), 2 * float(places[run]))
-        found.append(Source(value, first, last, (int(place[0]), int(place[1])), bool(independent[run])))
+        absent = bool((along < _SURELY * spread)[run])
+        found.append(Source(value, first, last, (int(place[0]), int(place[1])), absent))
         shown = float(torch.linalg.eigvalsh(had).abs().max())
         nothing &= corrected(_tail(shown, p, real), 2 * len(largest)) > _SHOWN
     best = min(found, key=lambda source: source.p_value)
