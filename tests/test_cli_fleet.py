@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -294,6 +295,24 @@ def test_more_processes_than_logs(run: Run, logs: Path, tmp_path: Path):
     two = subprocess.run(asked, cwd=tmp_path, capture_output=True, text=True, timeout=100)
     assert (two.returncode, two.stderr) == (0, "")
     assert Path("one.parquet").read_bytes() == Path("two.parquet").read_bytes()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="processes of Windows have no SIGTERM to catch")
+def test_a_run_that_is_asked_to_stop_does_not_finish_its_work_first(logs: Path, tmp_path: Path):
+    for i in range(8, 200):  # more than it could do before the test ends
+        shutil.copy(logs / "0.npz", logs / f"{i}.npz")
+    store = ResultStore(tmp_path / "r.parquet", Fuse().columns, {})
+    with subprocess.Popen(
+        command("logs", "--out", "r.parquet", "--devices", 2), cwd=tmp_path, stderr=subprocess.PIPE, text=True
+    ) as process:
+        while store.n_parts < 2 and process.poll() is None:
+            time.sleep(0.005)
+        process.terminate()
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == 128 + signal.SIGTERM
+    assert "stopped; what is finished is kept, start again to go on" in said
+    assert 2 <= store.n_parts < 200
+    assert not store.path.exists()
 
 
 @pytest.mark.parametrize("devices", [1, 2])
