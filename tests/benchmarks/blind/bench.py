@@ -123,12 +123,12 @@ class Bench:
         energy = float(whitened_energy(tone, self.spectrum).sum())  # sum over sensors of a^2 T/(2 S)
         return self.rate / (2 * math.pi) * math.sqrt(12 / energy) / self.n
 
-    def looks_like_parameters(self, after: Array, extra: list[Array] | None = None) -> bool:
+    def looks_like_parameters(self, after: Array) -> bool:
         """Whether free parameters of the base come within five nats of a spectrum."""
         slower = replace(self.base, phi=self.base.phi**0.9, variance=self.base.variance * self._corner_change(0.9))
         free = [*self.components, *(b - a for a, b in zip(self.components, slower.components(self.n), strict=True))]
         directions = [d / self.spectrum for d in free if np.any(d)]
-        return self.distinct(after, directions + (extra or [])) < SEPARABLE
+        return self.distinct(after, directions) < SEPARABLE
 
     def distinct(self, after: Array, directions: list[Array]) -> float:
         """`distinct_nats` from the base, of which a simulation tells as much as its length allows."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,22 @@ def _fine_grid(bench: Bench) -> Array:
     return np.arange(bench.steps + 1) / (2 * bench.steps)
 
 
+def _coloured(
+    bench: Bench, mechanism: str, nats: float, after: Array, sensors: tuple[int, ...], each: Array, **truth: Any
+) -> Part:
+    """Gaussian noise of the spectrum `after` instead of the base's, worth `each` (sensor,) nats."""
+    return Part(
+        mechanism,
+        nats,
+        sensors,
+        lambda recording: spectral_llr(recording, after, bench.spectrum),
+        oracle_nats=float(divergence(after, bench.spectrum).sum()),
+        oracle_null=quadratic_null(after / bench.spectrum),
+        sensor_nats=tuple(float(each[i]) for i in sensors),
+        **truth,
+    )
+
+
 def added(bench: Bench, mechanism: str, nats: float, unit: Array, *, broad: bool = False) -> tuple[Part, float]:
     """Noise of spectrum v `unit` (sensor, frequency) added to the base, at the v whose divergence is `nats`; and v.
 
@@ -51,17 +68,7 @@ def added(bench: Bench, mechanism: str, nats: float, unit: Array, *, broad: bool
     look_alikes: tuple[str, ...] = ("parameter_shift",) if bench.looks_like_parameters(after) else ()
     if mechanism in NARROW and (after / bench.spectrum).max() < 2:  # its envelope drowns in the noise of its band
         look_alikes += tuple(name for name in NARROW if name != mechanism)
-    part = Part(
-        mechanism,
-        nats,
-        sensors,
-        lambda recording: spectral_llr(recording, after, bench.spectrum),
-        oracle_nats=float(divergence(after, bench.spectrum).sum()),
-        oracle_null=quadratic_null(after / bench.spectrum),
-        sensor_nats=tuple(float(each[i]) for i in sensors),
-        look_alikes=look_alikes,
-    )
-    return part, size
+    return _coloured(bench, mechanism, nats, after, sensors, each, look_alikes=look_alikes), size
 
 
 def resonance(bench: Bench, nats: float) -> Part:
@@ -180,25 +187,24 @@ def low_pass(bench: Bench, nats: float) -> Part:
         passed = folded(OVERSAMPLING * converter.low_pass_gain(nu, corner), OVERSAMPLING)[1:-1]
         return bench.spectrum - chosen * bench.base.white[:, None] * (1 - passed)
 
-    def expected(inverse: float) -> float:
-        return float(comparison(after(1 / inverse), bench.spectrum, bench.share).sum())
+    def worth(inverse: float) -> Array:
+        return comparison(after(1 / inverse), bench.spectrum, bench.share)
 
-    inverse = solve(nats, expected, 1 / 0.49, 1 / 0.004)
+    inverse = solve(nats, lambda x: float(worth(x).sum()), 1 / 0.49, 1 / 0.004)
     corner = 1 / inverse
     spectrum = after(corner)
 
     def filtered(analog: Array) -> Array:
         return np.where(chosen, converter.low_pass(analog, corner), analog)
 
-    return Part(
+    return _coloured(
+        bench,
         "low_pass",
         nats,
+        spectrum,
         sensors,
-        lambda recording: spectral_llr(recording, spectrum, bench.spectrum),
-        oracle_nats=float(divergence(spectrum, bench.spectrum).sum()),
-        oracle_null=quadratic_null(spectrum / bench.spectrum),
+        worth(inverse),
         analog=filtered,
-        sensor_nats=tuple(float(v) for v in comparison(spectrum, bench.spectrum, bench.share)[list(sensors)]),
         look_alikes=("parameter_shift",) if bench.looks_like_parameters(spectrum) else (),
         frequency_hz=corner * bench.step_rate,
         parameters={"corner": quantity(corner * bench.step_rate, "Hz")},
@@ -224,15 +230,14 @@ def parameter_shift(bench: Bench, nats: float, *, only: str | None = None) -> Pa
         spectrum = changed.spectrum(bench.n)
         each = comparison(spectrum, bench.spectrum, bench.share)
         factors = dict(zip(names, np.exp(size * weights), strict=True))
-        return Part(
+        return _coloured(
+            bench,
             "parameter_shift",
             float(each.sum()),
+            spectrum,
             sensors,
-            lambda recording: spectral_llr(recording, spectrum, bench.spectrum),
-            oracle_nats=float(divergence(spectrum, bench.spectrum).sum()),
-            oracle_null=quadratic_null(spectrum / bench.spectrum),
+            each,
             base=changed,
-            sensor_nats=tuple(float(each[i]) for i in sensors),
             parameters={f"{name}_factor": quantity(factor, "") for name, factor in factors.items()},
         )
 
