@@ -7,6 +7,7 @@ from functools import partial
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
+from gyrofuse._result import counted
 from gyrofuse.fleet.standing import FEWEST_IN_TIME, GAIN, LEVEL, NOISY, Standing, arrays_of
 from gyrofuse.plotting_fleet import plot_course, plot_spread
 from gyrofuse.report_page import image, number, render
@@ -88,8 +89,8 @@ def verdict(standing: Standing) -> list[str]:
             for d in standing.drifts[:3]
         ]
         if standing.doubts:
-            of = "one log" if standing.n_doubted == 1 else f"{standing.n_doubted} logs"
-            said.append(f"The weights of {of} are to be doubted, for motion or too short a recording.")
+            logs = counted(standing.n_doubted, "log")
+            said.append(f"The weights of {logs} are to be doubted, for motion or too short a recording.")
         if not (standing.too_noisy or standing.outliers or standing.doubts or standing.drifts):
             said.append("No sensor, log or drift of weights stands out.")
     if standing.task == "fit" and standing.values:

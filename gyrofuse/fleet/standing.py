@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import stats
 
+from gyrofuse._result import counted
 from gyrofuse.fleet.store import identity_in
 
 NOISY = 2.0  # times the median of an array
@@ -141,7 +142,7 @@ class Standing:
             for o in self.outliers[:3]
         ]
         if self.doubts:
-            lines.append(f"weights to doubt: {self.n_doubted} logs")
+            lines.append(f"weights to doubt: {counted(self.n_doubted, 'log')}")
         lines += [f"  {_place(doubt)}: {doubt.why}" for doubt in self.doubts[:3]]
         lines += [
             f"drifts: weight of sensor {d.sensor} of {d.array}, {d.first:.3g} to {d.last:.3g} (p = {d.p_value:.2g})"
