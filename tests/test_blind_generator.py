@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import sys
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +25,6 @@ from blind import (
     scoring,
     seal,
     thermal,
-    traps,
     trial,
 )
 from blind.analog import OVERSAMPLING, consumer_base
@@ -169,7 +167,7 @@ def test_oracle_keeps_its_false_alarm_rate():
 
 
 SIZES = [k for k in EFFECTS if cases.KINDS[k].group in ("mechanism", "outside") and k not in
-         ("quantization_bare", "dead_band", "clipping", "stuck_samples", "random_telegraph")]  # fmt: skip
+         ("quantization_bare", "dead_band", "clipping", "stuck_samples")]  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", SIZES)
@@ -269,47 +267,6 @@ def test_box_follows_the_heat_equation():
     time = np.arange(2000) / 10.0
     expected = 20 + 8 * (1 - np.exp(-(time + 0.1) / 25))
     np.testing.assert_allclose(thermal.box(np.full(2000, 20.0), 10.0, 8.0, 25.0), expected, rtol=1e-12)
-
-
-def test_trap_oracle_against_the_sum_over_all_paths():
-    """The forward algorithm on eight blocks, beside the likelihood of each of the 256 paths."""
-    spectrum = np.full(319, 2.0) + 0.5 / np.arange(1, 320)
-    oracle = traps.TrapOracle(spectrum, 320, 2000.0, 1000.0)
-    oracle.blocks = 8
-    means = np.random.default_rng(0).standard_normal((2, 8))
-    step = 1.3
-    taps = np.concatenate([[1.0], -oracle.prediction])
-    total = np.zeros(2)
-    for path in range(256):
-        states = (path >> np.arange(8)) & 1
-        chance = [1 - oracle.up_share, oracle.up_share][states[0]]
-        for a, b in pairwise(states):
-            chance *= oracle.transition[a, b]
-        ratio = np.zeros(2)
-        for t in range(traps.ORDER, 8):
-            window = slice(t, t - traps.ORDER - 1 if t > traps.ORDER else None, -1)
-            seen, said = means[:, window] @ taps, step * (states[window] - 0.5) @ taps
-            ratio += (said * seen - said**2 / 2) / oracle.innovation
-        total += chance * np.exp(ratio)
-    np.testing.assert_allclose(oracle.llr(means, step), np.log(total), rtol=1e-9)
-
-
-def test_a_trap_tells_itself_as_well_as_it_claims():
-    """Means of 10 cases, in units of the distance that 60 nats are; that distance is measured to some 15 % in each."""
-    moved = []
-    for seed in range(10):
-        (effect,) = make_case("random_telegraph", 60.0, seed, n_samples=1024).truth["effects"]
-        mean, variance, _ = effect["oracle_null"]
-        moved.append((effect["oracle_llr"] - mean) / np.sqrt(2 * 60.0 * variance))
-    assert abs(np.mean(moved) - 1) < 5 * np.std(moved) / np.sqrt(10)
-    assert np.std(moved) < 1
-
-
-def test_dwells_of_the_trap():
-    path = traps.telegraph(400_000, 50.0, 150.0, np.random.default_rng(0))
-    switches = np.abs(np.diff(path)).sum()
-    assert abs(path.mean() - 0.25) < 0.02
-    assert abs(switches - 2 * 400_000 / 200) < 4 * np.sqrt(4000)
 
 
 def test_alias_and_constant_rate_leave_nothing_to_find():

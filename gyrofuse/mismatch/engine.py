@@ -27,6 +27,7 @@ from gyrofuse.recording import Recording
 from gyrofuse.simulate import ArrayModel
 
 _LOOKED, _NAMED, _COMPARED, _CHECKED = 0.3, 0.65, 0.75, 0.9  # shares of the work that are done by then
+_AFTER_REPAIRS = 0.1  # of the level: spectra are then compared at levels that repairs have estimated
 _MOST, _OF_A_KIND = 20, 6  # findings: a recording that needs more is another instrument
 
 
@@ -97,7 +98,8 @@ def diagnose(
         while len(links) < _MOST:
             found = [link.finding for link in links]
             open_ones = [m for m in stage if sum(f.mechanism == m.name for f in found) < _OF_A_KIND]
-            nominated = [f for f in (m.nominate(case, level) for m in open_ones) if f and not _known(f, found)]
+            asked = level * _AFTER_REPAIRS if links and stage is STAGES[-1] else level
+            nominated = [f for f in (m.nominate(case, asked) for m in open_ones) if f and not _known(f, found)]
             accepted = None
             for finding in sorted(nominated, key=lambda f: -f.gain):
                 gain = held_out_gain(case, finding.effect)

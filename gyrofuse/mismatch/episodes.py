@@ -48,6 +48,12 @@ class Episodes(NamedTuple):
             within[start:stop] = True
         return within
 
+    def other_way_round(self, n: int) -> Episodes:
+        """With what lies between them as the episodes."""
+        edges = [0, *(e for pair in self.episodes for e in pair), n]
+        between = tuple(Episode(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if a < b)
+        return self._replace(episodes=between, factor=1 / self.factor)
+
 
 def episodes_of(white: Tensor, p_values: Tensor) -> Episodes | None:
     """The likeliest episodes of `(sensor, time)`, `None` where no sensor has any.
@@ -66,13 +72,20 @@ def episodes_of(white: Tensor, p_values: Tensor) -> Episodes | None:
 
 
 def _of_the_concerned(white: Tensor, found: Episodes) -> Tensor:
-    """Factors, 1 in sensors that are nearer to no change than to what those that surely change have in the mean."""
+    """Factors, 1 in sensors that are nearer to no change than to the change of those that have it.
+
+    Those are the sensors that together tell most of one change: of the largest `k` changes `d`, the `k` that make
+    `k mean(d)^2` largest.
+    """
     inside = found.inside(white.shape[-1])
     log_factor, sd = _log_factors(white.square().clamp(max=_CUT), inside)
-    certain = found.factor != 1
-    typical = float(log_factor[certain].mean()) if bool(certain.any()) else 0.0
-    alike = (2 * log_factor - typical) * typical > 0
-    concerned = (alike if typical else certain) | (log_factor.abs() > _BEYOND_DOUBT * sd)
+    typical, most = 0.0, 0.0
+    for sign in (1.0, -1.0):
+        mean = (sign * log_factor).sort(descending=True).values.cumsum(0) / torch.arange(1, len(log_factor) + 1)
+        told = torch.where(mean > 0, mean.square(), 0.0) * torch.arange(1, len(log_factor) + 1)
+        if float(told.max()) > most:
+            most, typical = float(told.max()), sign * float(mean[told.argmax()])
+    concerned = ((2 * log_factor - typical) * typical > 0) | (log_factor.abs() > _BEYOND_DOUBT * sd)
     return torch.where(concerned, log_factor.exp(), 1.0)
 
 
@@ -199,12 +212,11 @@ def _from_start(
         factor = _factors(squares, inside, torch.ones_like(concerned))
         if bool((factor == 1).all()):
             return None, 0.0
+    episodes = Episodes(found, factor)
     if 2 * int(inside.sum()) > n:  # what lasts longer is the rule
-        edges = [0, *(e for pair in found for e in pair), n]
-        found = tuple(Episode(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if a < b)
-        factor, inside = 1 / factor, ~inside
-    score = float(two_level_scores(white, factor, inside).sum()) - 2 * len(found) * math.log(n)
-    return Episodes(found, factor), score
+        episodes = episodes.other_way_round(n)
+    score = float(two_level_scores(white, episodes.factor, episodes.inside(n)).sum())
+    return episodes, score - 2 * len(episodes.episodes) * math.log(n)
 
 
 def _factors(squares: Tensor, inside: Tensor, concerned: Tensor) -> Tensor:

@@ -19,8 +19,8 @@ from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.side import Side
 
 _CONTINUOUS = 0.5  # share of samples with a value of their own
-_NEIGHBOURS = 64  # on either side
-_FEWEST, _FEWEST_AGAIN = 4, 2  # times; of a value that recurs in another sensor as well
+_NEIGHBOURS, _MORE = 64, 4096  # on either side: that tell how dense values are, and how fine
+_FEWEST = 4  # times, of a value that is not known from another sensor
 _OWN = 1e-3  # p value of a value that recurs in the simulation
 
 
@@ -59,7 +59,7 @@ def recurring_values(side: Side) -> tuple[Recurring | None, ...]:
 
 
 def recurring(sensor: int, values: Tensor, value: float | None = None) -> Recurring | None:
-    """The value of `(time,)` that recurs most often, or the one given."""
+    """The value of `(time,)` that recurs most often, or the one given, where it occurs at all."""
     new = torch.ones(len(values), dtype=torch.bool)
     new[1:] = values[1:] != values[:-1]  # what is held is no return
     unique, counts = torch.unique(values[new], return_counts=True)
@@ -70,16 +70,16 @@ def recurring(sensor: int, values: Tensor, value: float | None = None) -> Recurr
         at = min(max(int(torch.searchsorted(unique, value)), 1), len(unique) - 2)
         if float(unique[at]) != value:
             return None
-    if int(counts[at]) < (_FEWEST if value is None else _FEWEST_AGAIN):
+    if value is None and int(counts[at]) < _FEWEST:
         return None
     low, high = max(at - _NEIGHBOURS, 0), min(at + _NEIGHBOURS, len(unique) - 1)
-    gaps = unique[low : high + 1].diff()
+    finest = float(unique[max(at - _MORE, 0) : at + _MORE + 1].diff().min())
     gap = float(unique[at + 1] - unique[at - 1])
     wide = float(unique[high] - unique[low]) - gap
     density = float(counts[low : high + 1].sum() - counts[at]) / max(wide, 1e-300)
     # Values near a lattice finer than the noise, such as that of rounded floats, recur as their neighbours do.
     around = torch.cat([counts[low:at], counts[at + 1 : high + 1]]).to(torch.float64)
-    expected = max(density * float(gaps.min()), float((around * (around - 1)).sum() / around.sum()))
+    expected = max(density * finest, float((around * (around - 1)).sum() / around.sum()))
     return Recurring(
         sensor,
         float(unique[at]),
@@ -88,7 +88,7 @@ def recurring(sensor: int, values: Tensor, value: float | None = None) -> Recurr
         density,
         float(unique[at - 1]),
         float(unique[at + 1]),
-        len(unique),
+        len(unique) if value is None else 1,
     )
 
 

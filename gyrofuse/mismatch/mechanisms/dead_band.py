@@ -43,9 +43,9 @@ class DeadBand(Mechanism):
             return None
         first, p_value = min(missing.values(), key=lambda pair: pair[1])
         found = {i: own for i, (own, p) in missing.items() if p <= level}
-        for i in set(range(case.n_sensors)) - set(found):  # where the same value returns a few times
+        for i in set(range(case.n_sensors)) - set(found):  # where the same value is met at all
             again = recurring(i, case.recording[i], first.value)
-            if again is not None and fits_band(again):
+            if again is not None and again.p_value < level and fits_band(again):
                 found[i] = again
         found = dict(sorted(found.items()))
         numbers = torch.zeros(2, case.n_sensors, dtype=torch.float64)

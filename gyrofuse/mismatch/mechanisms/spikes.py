@@ -22,7 +22,8 @@ _HOUR = 3600.0
 _ALIKE = 5.0  # nats
 _RARE = 2.0  # nats by which a few outliers have to surpass noise that is heavy-tailed throughout
 _PLAIN = 5.0  # sd: outliers that can be taken off one by one
-_PRESENT = 4.0  # nats
+_PRESENT, _OWN_LAW = 4.0, 10.0  # nats of a sensor, as the others or not
+_UNLIKE = 5.0  # nats for each sensor that has a law of its own
 _LIKELY = 0.8  # probability of being hit
 _ROUNDS, _ROUNDS_AGAIN = 40, 10
 _ISOLATED = 0.03  # more frequent ones are another law of the noise
@@ -65,6 +66,9 @@ class Spikes(Mechanism):
         weak = likely_outliers(case.recorded)
         if not weak.shock and weak.apart > -math.log(level):
             hit = tuple(i for i in range(case.n_sensors) if i in hit or float(weak.sensors[i]) > _LIKELY)
+        if hit:  # a sensor that speaks against the law of all of them is there by chance
+            as_others = _gains(z, _shared(z, laws, hit)).sum(-1)
+            hit = tuple(i for i in hit if float(gains[i]) > _OWN_LAW or float(as_others[i]) > 0)
         apart = float(gains[list(hit)].sum())
         laws = _alike(z, laws, hit)
         gain = float(_gains(z, laws)[list(hit)].sum())
@@ -193,13 +197,18 @@ def _gains(z: Tensor, laws: list[Outliers]) -> Tensor:
 
 
 def _alike(z: Tensor, laws: list[Outliers], hit: tuple[int, ...]) -> list[Outliers]:
-    """One law for all sensors concerned, in sd of their noise, where it is as good as one for each (Akaike)."""
+    """One law for all sensors concerned, in sd of their noise, where it is as good as one for each."""
     if len(hit) < 2:
         return laws
-    shared = fitted(torch.cat([z[i] / laws[i].scale for i in hit]))
-    one = [shared.times(law.scale) if i in hit else law for i, law in enumerate(laws)]
-    worse = float((_gains(z, laws) - _gains(z, one))[list(hit)].sum())
-    return one if worse < 3 * (len(hit) - 1) else laws
+    one = [own if i in hit else law for i, (own, law) in enumerate(zip(_shared(z, laws, hit), laws, strict=True))]
+    worse = float((_gains(z, laws) - _gains(z, one)).sum())
+    return one if worse < _UNLIKE * (len(hit) - 1) else laws
+
+
+def _shared(z: Tensor, laws: list[Outliers], hit: tuple[int, ...]) -> list[Outliers]:
+    """The law of some sensors, in sd of their noise, for each."""
+    law = fitted(torch.cat([z[i] / laws[i].scale for i in hit]))
+    return [law.times(own.scale) for own in laws]
 
 
 def _limited(z: Tensor, laws: list[Outliers], hit: tuple[int, ...]) -> list[Outliers]:

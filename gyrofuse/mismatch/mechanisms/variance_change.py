@@ -16,7 +16,8 @@ from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.impulses import levelled, modulation, variance_p_value, variance_p_values
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 
-_FACTOR, _NATS = 1.25, 5.0  # by which a level that goes up and down all the time has to be likelier
+_FACTOR = 1.25  # by which, and by `_NATS`, a level that goes up and down all the time has to be likelier
+_NATS = 5.0
 _SLOWER = 65  # samples: what varies more slowly is not louder
 
 
@@ -46,6 +47,7 @@ class VarianceChange(Mechanism):
         found = episodes_of(white, p_values)
         if found is None or _goes_up_and_down(case, found):
             return None
+        found = _from_the_simulated_level(case, found)
         rate = case.scene.rate
         effect = cls(tuple((e.start / rate, e.stop / rate) for e in found.episodes), found.factor)
         sensors = tuple((found.factor != 1).nonzero()[:, 0].tolist())
@@ -100,6 +102,19 @@ class VarianceChange(Mechanism):
         for start, stop in self.episodes:
             within[round(start * rate) : round(stop * rate)] = True
         return within
+
+
+def _from_the_simulated_level(case: Case, found: Episodes) -> Episodes:
+    """The other way round where the simulation has the level that was taken for the changed one."""
+    inside = found.inside(case.n_samples)
+    squares, simulated = case.white.square(), case.simulated.signal
+    share = case.n_samples / (simulated.shape[0] * simulated.shape[-1])
+
+    def off(part: Tensor) -> float:
+        """Nats by which the level differs from the simulation's."""
+        return float(squares[:, part].mean(-1).log().square().sum() * part.sum() / 4 / (1 + share))
+
+    return found.other_way_round(case.n_samples) if off(~inside) > off(inside) + _NATS else found
 
 
 def _goes_up_and_down(case: Case, found: Episodes) -> bool:

@@ -14,12 +14,13 @@ The size of an effect, in nats, is the divergence of the recording from the simu
 - a signal whose shape a channel or few numbers give (temperature, acceleration, scale factor, sweep): half its whitened
   energy m' V^-1 m, summed over sensors;
 - Gaussian noise of another spectrum (resonance, common mode, episodes, modulated noise): the same with r the ratio of
-  the spectra, for common mode with matrices; a wandering tone is taken for noise of its mean spectrum, which bounds its
-  divergence from below;
+  the spectra, for common mode with matrices;
 - of another spectrum over a broad band (flicker, low-pass, parameters), which only the comparison with a simulation of
   s times as many samples shows: 1/2 sum [(1 + s) log((r + s)/(1 + s)) - log r], which is the above for a model;
+- a wandering tone and a trap are taken for noise of their mean spectrum, which bounds their divergence from below; how
+  far a trap is from such noise is simulated;
 - spikes, a blurred lattice, Laplace noise: number of samples times the divergence of one sample, by quadrature or
-  simulation; a trap: by how far it moves the ratio of the forward algorithm, in simulations;
+  simulation;
 - bare clipping, dead band, repeats: one altered sample is proof, and the nats are -log of the chance that none is:
   their expected number. Bare rounding alters every sample.
 """

@@ -39,6 +39,7 @@ class Part:
     base: Base | None = None
     look_alikes: tuple[str, ...] = ()
     sensor_nats: tuple[float, ...] = ()
+    affected: list[int] | None = None  # those of `sensors` that it turned out to touch; None: all
     oracle_law: str = "cumulants"
     oracle_nats: float | None = None  # expected `llr`; None: `nats`
     oracle_null: Cumulants | None = None  # under the base; None: those of a known signal

@@ -67,7 +67,7 @@ _MECHANISMS: dict[str, Callable[[Bench, float], Part]] = {
     "spikes_shock": _with(marginal.spikes, simultaneous=True),
     "spikes_bus": _with(marginal.spikes, simultaneous=False),
     "variance_change": marginal.variance_change,
-    "random_telegraph": marginal.random_telegraph,
+    "random_telegraph": spectral.random_telegraph,
     "step": shapes.step,
     "temperature_drift": shapes.temperature_drift,
     "warm_up_transient": _with(shapes.warm_up_transient, thermometer="board"),
@@ -96,7 +96,7 @@ _NULLS: dict[str, dict[str, Any]] = {
 
 # each member of a pair is what the other one is mistaken for
 _PAIRS: dict[str, tuple[Callable[[Bench, float], Part], dict[str, Any]]] = {
-    "telegraph_not_ar1": (_with(marginal.random_telegraph, dwell_share=1 / 150), {}),
+    "telegraph_not_ar1": (_with(spectral.random_telegraph, dwell_share=1 / 150), {}),
     "ar1_not_telegraph": (_with(spectral.parameter_shift, only="ar1"), {}),
     "steps_not_walk": (_with(shapes.step, count=8), {}),
     "walk_not_steps": (_with(spectral.parameter_shift, only="walk"), {}),
@@ -315,11 +315,16 @@ def _channels(made: Kind, bench: Bench, rng: np.random.Generator) -> dict[str, A
 def effect_truth(part: Part, llr: float) -> dict[str, Any]:
     """What the judge is told of one effect."""
     expected = part.nats if part.oracle_nats is None else part.oracle_nats
+    kept = [k for k, i in enumerate(part.sensors) if part.affected is None or i in part.affected]
+    parameters = {
+        name: said | {"per_sensor": [said["per_sensor"][k] for k in kept]} if "per_sensor" in said else said
+        for name, said in part.parameters.items()
+    }
     return {
         "mechanism": part.mechanism,
         "class": sorted({part.mechanism, *part.look_alikes}),
-        "sensors": list(part.sensors),
-        "sensor_nats": list(part.sensor_nats),
+        "sensors": [part.sensors[k] for k in kept],
+        "sensor_nats": [part.sensor_nats[k] for k in kept if part.sensor_nats],
         "nats": part.nats,
         "oracle_llr": llr,
         "oracle_law": part.oracle_law,
@@ -330,5 +335,5 @@ def effect_truth(part: Part, llr: float) -> dict[str, Any]:
         "time_s": part.time_s,
         "onset_sd_s": part.onset_sd_s,
         "channel": part.channel,
-        "parameters": part.parameters,
+        "parameters": parameters,
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -12,12 +13,12 @@ from scipy.fft import idct
 from scipy.stats import norm
 
 from . import clock, converter
-from .analog import OVERSAMPLING, relaxator
-from .bench import CERTAIN, SEPARABLE, Bench, Cumulants, Part, quantity, rms
-from .likelihood import ar1_spectrum, coefficients, grid, quadratic_null, solve
-from .traps import TrapOracle, telegraph
+from .analog import OVERSAMPLING
+from .bench import CERTAIN, Bench, Cumulants, Part, quantity, rms
+from .likelihood import coefficients, quadratic_null, solve
 
 Array = NDArray[np.float64]
+Convert = Callable[[Array], Array]
 
 
 def innovations(recording: Array, spectrum: Array) -> Array:
@@ -122,72 +123,6 @@ def variance_change(bench: Bench, nats: float, *, episodes: int = 1) -> Part:
     )
 
 
-def random_telegraph(bench: Bench, nats: float, *, dwell_share: float | None = None) -> Part:
-    """A trap in one to three sensors; the nats by simulation with the forward algorithm on block means.
-
-    The oracle takes the noise of block means for a short autoregression, so the law of its ratio without the effect is
-    simulated as well, by 100 recordings, 40 of which say how large the steps must be.
-    """
-    sensors = bench.some_sensors(1, 3)
-    signal = np.zeros((bench.n_sensors, bench.n))
-    steps, oracles, distinct = [], [], 0.0
-    null = np.zeros(100)
-    for i in sensors:
-        switches = math.exp(bench.rng.uniform(math.log(50), math.log(150))) if dwell_share is None else 1 / dwell_share
-        asymmetry = bench.rng.uniform(0.6, 1.6)
-        up, down = bench.n / switches * asymmetry, bench.n / switches / asymmetry
-        oracle = TrapOracle(bench.spectrum[i], bench.n, up, down)
-        noise = bench.base.copies(i, len(null)).simulate(bench.n, bench.rng)
-        quiet = oracle.block_means(noise)
-        size = oracle.step_for(nats / len(sensors), float(bench.sigma[i]), quiet[:40], bench.rng)
-        distinct += _beside_its_twin(bench.spectrum[i], oracle, size, noise[:40], bench.rng)
-        path = telegraph(bench.steps, OVERSAMPLING * up, OVERSAMPLING * down, bench.rng)
-        signal[i] = size * (bench.sampled(path) - 0.5)
-        null += oracle.llr(quiet, size)
-        steps.append(size)
-        oracles.append(oracle)
-
-    def llr(recording: Array) -> float:
-        x = recording - bench.base.bias[:, None]
-        pairs = zip(sensors, oracles, steps, strict=True)
-        return float(sum(o.llr(o.block_means(x[i])[None], s)[0] for i, o, s in pairs))
-
-    up_s, down_s = (np.array([getattr(o, name) for o in oracles]) / bench.rate for name in ("up", "down"))
-    return Part(
-        "random_telegraph",
-        nats,
-        sensors,
-        llr,
-        signal=signal,
-        sensor_nats=(nats / len(sensors),) * len(sensors),
-        oracle_null=cumulants(null, np.full(len(null), 1 / len(null))),
-        look_alikes=("parameter_shift",) if distinct < SEPARABLE else (),
-        parameters={
-            "half_step": quantity(rms(np.array(steps)) / 2, "deg/s", np.array(steps) / 2),
-            "dwell_up": quantity(rms(up_s), "s", up_s),
-            "dwell_down": quantity(rms(down_s), "s", down_s),
-        },
-    )
-
-
-def _beside_its_twin(spectrum: Array, oracle: TrapOracle, size: float, noise: Array, rng: np.random.Generator) -> float:
-    """Nats, as of `TrapOracle.step_for`, between a trap and Gaussian noise of its spectrum, in recordings of noise."""
-    n = noise.shape[-1]
-    rate = 1 / oracle.up + 1 / oracle.down
-    variance = size**2 * oracle.up * oracle.down / (oracle.up + oracle.down) ** 2
-    after = spectrum + ar1_spectrum(grid(n), math.exp(-rate), variance * -math.expm1(-2 * rate))
-    trap = np.stack([telegraph(n, oracle.up, oracle.down, rng) - 0.5 for _ in noise])
-    twin = np.stack([relaxator(n, math.exp(-rate), variance, rng) for _ in noise])
-
-    def told(records: Array) -> Array:
-        power = coefficients(records) ** 2
-        gaussian = (power / spectrum - power / after - np.log(after / spectrum)).sum(axis=-1) / 2
-        return oracle.llr(oracle.block_means(records), size) - gaussian
-
-    as_trap, as_twin = told(noise + size * trap), told(noise + twin)
-    return float((as_trap.mean() - as_twin.mean()) ** 2 / (2 * as_twin.var(ddof=1)))
-
-
 def cumulants(values: Array, weights: Array) -> Cumulants:
     """First three cumulants of a discrete law."""
     mean = float(values @ weights)
@@ -241,20 +176,27 @@ def quantization(bench: Bench, nats: float) -> Part:
     )
 
 
-def _touched(bench: Bench, mechanism: str, nats: float, sensors: tuple[int, ...], **truth: Any) -> Part:
-    """An effect that one altered sample proves: the nats are the expected number of altered samples."""
-    convert = truth.pop("converter")
-    altered: list[bool] = []
+def _touched(
+    mechanism: str, nats: float, sensors: tuple[int, ...], each: Iterable[float], *, converter: Convert, **truth: Any
+) -> Part:
+    """An effect that one altered sample proves: the nats are the expected number of altered samples, also of `each`.
+
+    A sensor of which no sample was altered is none that it affects.
+    """
+    altered: list[int] = []
 
     def watched(signal: Array) -> Array:
-        converted = convert(signal)
-        altered[:] = [bool(np.any(converted != signal))]
+        converted = converter(signal)
+        altered[:] = np.flatnonzero(np.any(converted != signal, axis=1)).tolist()
         return converted
 
     def llr(recording: Array) -> float:
-        return CERTAIN if altered[0] else -nats
+        return CERTAIN if altered else -nats
 
-    return Part(mechanism, nats, sensors, llr, converter=watched, oracle_law="certain", **truth)
+    return Part(
+        mechanism, nats, sensors, llr,
+        converter=watched, affected=altered, oracle_law="certain", sensor_nats=tuple(each), **truth,
+    )  # fmt: skip
 
 
 def lattice(bench: Bench, nats: float) -> Part:
@@ -262,7 +204,8 @@ def lattice(bench: Bench, nats: float) -> Part:
     step = float(bench.rng.choice([0.00875, 0.01526, 0.0305, 0.061]))
     everyone = tuple(range(bench.n_sensors))
     return _touched(
-        bench, "quantization", CERTAIN, everyone, converter=lambda x: converter.round_to_lattice(x, step),
+        "quantization", CERTAIN, everyone, [CERTAIN] * len(everyone),
+        converter=lambda x: converter.round_to_lattice(x, step),
         parameters={"lsb": quantity(step, "deg/s")},
     )  # fmt: skip
 
@@ -273,12 +216,13 @@ def dead_band(bench: Bench, nats: float) -> Part:
     chosen = np.isin(np.arange(bench.n_sensors), sensors)[:, None]
     z = bench.base.bias[list(sensors)] / bench.sigma[list(sensors)]
 
-    def expected(width: float) -> float:
-        return bench.n * float(np.sum(norm.cdf(width - z) - norm.cdf(-width - z)))
+    def expected(width: float) -> Array:
+        return bench.n * (norm.cdf(width - z) - norm.cdf(-width - z))
 
-    width = float(bench.sigma.mean()) * solve(nats, expected, 1e-9, 3.0)
+    relative = solve(nats, lambda width: float(expected(width).sum()), 1e-9, 3.0)
+    width = relative * float(bench.sigma.mean())
     return _touched(
-        bench, "quantization", nats, sensors, look_alikes=("stuck_samples", "clipping"),
+        "quantization", nats, sensors, expected(relative).tolist(), look_alikes=("stuck_samples", "clipping"),
         converter=lambda x: np.where(chosen, converter.dead_band(x, width), x),
         parameters={"dead_band": quantity(width, "deg/s")},
     )  # fmt: skip
@@ -298,7 +242,8 @@ def clipping(bench: Bench, nats: float) -> Part:
             parameters[name] = quantity(float(own.mean()), "deg/s", own)
         return converter.clip(x, middle - reach, middle + reach)
 
-    return _touched(bench, "clipping", nats, sensors, converter=convert, parameters=parameters)
+    each = [nats / len(sensors)] * len(sensors)
+    return _touched("clipping", nats, sensors, each, converter=convert, parameters=parameters)
 
 
 def stuck_samples(bench: Bench, nats: float) -> Part:
@@ -317,5 +262,6 @@ def stuck_samples(bench: Bench, nats: float) -> Part:
         return out
 
     return _touched(
-        bench, "stuck_samples", nats, sensors, converter=convert, parameters={"probability": quantity(share * run, "")},
+        "stuck_samples", nats, sensors, [nats] * len(sensors), converter=convert,
+        parameters={"probability": quantity(share * run, "")},
     )  # fmt: skip

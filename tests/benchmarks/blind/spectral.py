@@ -24,6 +24,7 @@ from .likelihood import (
     solve,
     spectral_llr,
 )
+from .traps import Trap, beyond_its_twin
 
 Array = NDArray[np.float64]
 NARROW = ("drifting_tone", "resonance")
@@ -129,6 +130,42 @@ def power_law(bench: Bench, nats: float, *, mechanism: str = "flicker", exponent
         parameters={
             # for 1/f noise its standard deviation in each factor e of frequency
             "level": quantity(rms(level), "deg/s", level),
+        },
+    )
+
+
+def random_telegraph(bench: Bench, nats: float, *, dwell_share: float | None = None) -> Part:
+    """A trap in one to three sensors.
+
+    The oracle knows the spectrum, not that there are two levels: a lower bound, which they exceed by some nats.
+    """
+    sensors = bench.some_sensors(1, 3)
+    traps = []
+    for _ in sensors:
+        switches = math.exp(bench.rng.uniform(math.log(50), math.log(150))) if dwell_share is None else 1 / dwell_share
+        asymmetry = bench.rng.uniform(0.6, 1.6)
+        traps.append(Trap(bench.n / switches * asymmetry, bench.n / switches / asymmetry))
+    gains = bench.gains(sensors, signed=False) * bench.sigma
+    unit, signal = np.zeros_like(bench.spectrum), np.zeros((bench.n_sensors, bench.n))
+    for i, trap in zip(sensors, traps, strict=True):
+        unit[i] = gains[i] ** 2 * trap.spectrum(grid(bench.n))
+    part, size = added(bench, "random_telegraph", nats, unit, broad=True)
+    beyond = 0.0
+    for i, trap in zip(sensors, traps, strict=True):
+        gains[i] *= math.sqrt(size)
+        fine = Trap(OVERSAMPLING * trap.up, OVERSAMPLING * trap.down)
+        signal[i] = gains[i] * (bench.sampled(fine.path(bench.steps, bench.rng)) - 0.5)
+        beyond += beyond_its_twin(bench.base, i, bench.n, trap, float(gains[i]), bench.rng)
+    up, down = np.array(traps).T / bench.rate
+    half = gains[list(sensors)] / 2
+    return replace(
+        part,
+        signal=signal,
+        look_alikes=("parameter_shift",) if beyond < SEPARABLE else (),
+        parameters={
+            "half_step": quantity(rms(half), "deg/s", half),
+            "dwell_up": quantity(rms(up), "s", up),
+            "dwell_down": quantity(rms(down), "s", down),
         },
     )
 
