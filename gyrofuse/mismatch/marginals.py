@@ -27,10 +27,11 @@ _ON_LATTICE = 0.999  # of the samples; converters also have end stops
 _GAUSSIAN_ENDS = 5.5  # u s, beyond which a Gaussian has no characteristic function left
 _LOWEST = 3.5  # u s, where a peak found by its flank or its harmonics may still lie
 _DOUBTFUL = 0.05  # p value of a lattice that is not looked at more closely
+_AS_OTHERS = 0.02  # of one that other sensors have
 _PER_STEP = 6  # histogram bins a step, at the finest
 _MOST_BINS = 2**21
 _SAME_STEP, _ALIKE = 1e-3, 0.04  # of steps that are exact, and hidden
-_SIMULATED = 0.05  # p value of a hidden lattice that the simulation has as well
+_SIMULATED = 0.005  # p value of a hidden lattice that the simulation has as well
 _BLOCKS = 32  # whose spread tells how far repeats vary by themselves
 _QUARTERS = 4
 _BY_CHANCE = 3.0  # times the variance expected of quarters
@@ -43,12 +44,15 @@ class Lattice(NamedTuple):
 
     Attributes:
         p_value: Of continuous values that look like it, for having looked at every step.
+        peak: Where the characteristic function tells most of it, 0 where it is exact. Of few steps' width that is
+            below `2 pi/step`, since what blurs the lattice damps high frequencies more.
     """
 
     step: float
     offset: float
     blur: float
     p_value: float
+    peak: float = 0.0
 
 
 def innovation_sd(side: Side) -> Tensor:
@@ -104,7 +108,7 @@ def _hidden_lattice(unique: Tensor, sd: float) -> Lattice:
     best = int(torch.where(wanted, power, 0.0).argmax())
     p_value = corrected(math.exp(-float(power[best])), int(wanted.sum()))
     if p_value > _DOUBTFUL:
-        return Lattice(2 * math.pi / float(u[best]), 0.0, 1.0, p_value)
+        return Lattice(2 * math.pi / float(u[best]), 0.0, 1.0, p_value, float(u[best]))
     while u[best] > _LOWEST / sd and power[best - 1] > power[best]:  # the flank of a peak below
         best -= 1
     frequency = _peak(unique, float(u[best]), float(u[1]))
@@ -113,13 +117,19 @@ def _hidden_lattice(unique: Tensor, sd: float) -> Lattice:
         if frequency / part > _LOWEST / sd and float(lower) > max(0.3 * float(power[best]), 10.0):
             frequency /= part
             break
-    mean = torch.exp(1j * frequency * unique).mean()
-    resultant = math.sqrt(max((n * float(mean.abs()) ** 2 - 1) / (n - 1), 1e-12)) if n > 1 else 1e-6
+    found = _seen_at(unique, frequency, 2 * math.pi / frequency)
+    step = found.step / (1 + (found.step * found.blur) ** 2 / float(unique.var()))
+    return _seen_at(unique, frequency, step)._replace(p_value=p_value)
+
+
+def _seen_at(unique: Tensor, peak: float, step: float) -> Lattice:
+    """A hidden lattice of a step and a peak that are known, with its p value."""
+    n = len(unique)
+    power = float(_power(unique, torch.tensor([peak], dtype=torch.float64)))
+    resultant = math.sqrt(max((power - 1) / (n - 1), 1e-12)) if n > 1 else 1e-6
     blur = math.sqrt(-2 * math.log(min(resultant, 1 - 1e-12))) / (2 * math.pi)
-    # What blurs the lattice damps high frequencies more, which moves the peak of few steps' width.
-    step = 2 * math.pi / frequency / (1 + (2 * math.pi * blur / frequency) ** 2 / float(unique.var()))
     turn = torch.exp(2j * math.pi / step * unique).mean().angle()
-    return Lattice(step, float(turn) / (2 * math.pi) * step, blur, p_value)
+    return Lattice(step, float(turn) / (2 * math.pi) * step, blur, math.exp(-power), peak)
 
 
 def _power(values: Tensor, u: Tensor) -> Tensor:
@@ -155,13 +165,17 @@ def missing_lattices(case: Case, level: float) -> dict[int, Lattice]:
             missing[i] = left
     if not missing:
         return missing
-    steps = [found.step for found in missing.values()]
+    clearest = min(missing.values(), key=lambda found: found.p_value)
     for i, own in enumerate(lattices(case.recorded)):  # a step that is known elsewhere needs less to be believed
-        alike = own is not None and own.p_value < _DOUBTFUL and any(abs(own.step / s - 1) < _ALIKE for s in steps)
-        if i not in missing and own is not None and alike:
-            left = _not_simulated(case, i, own)
-            if left is not None and left.p_value < _DOUBTFUL:
-                missing[i] = left
+        if i in missing or own is None:
+            continue
+        if own.blur > 0 and clearest.blur > 0:
+            own = _seen_at(case.recording[i].unique(), clearest.peak, clearest.step)
+        elif not any(abs(own.step / found.step - 1) < _ALIKE for found in missing.values()):
+            continue
+        left = _not_simulated(case, i, own) if own.p_value < _AS_OTHERS else None
+        if left is not None and left.p_value < _AS_OTHERS:
+            missing[i] = left
     return dict(sorted(missing.items()))
 
 
@@ -171,7 +185,7 @@ def _not_simulated(case: Case, sensor: int, own: Lattice) -> Lattice | None:
     if own.blur == 0:
         other = exact_lattices(case.simulated)[sensor]
         return None if other is not None and other.step > own.step * (1 - _SAME_STEP) else own
-    u, n, m = torch.tensor([2 * math.pi / own.step], dtype=torch.float64), case.n_samples, len(values)
+    u, n, m = torch.tensor([own.peak], dtype=torch.float64), case.n_samples, len(values)
     power, other_power = (float(_power(v - v.mean(), u)) for v in (case.recording[sensor], values))
     if other_power < -math.log(_SIMULATED):
         return own
