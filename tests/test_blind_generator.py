@@ -202,6 +202,26 @@ def test_comparison_is_what_the_best_fit_of_both_records_leaves(share):
     assert abs(np.mean(found) - told) < 5 * np.std(found) / 10
 
 
+@pytest.mark.parametrize("share", [1.0, 4.0, np.inf])
+def test_common_mode_has_the_size_of_a_comparison_of_matrices(share):
+    table = bench.Bench(consumer_base(np.random.default_rng(0), 200.0), 1024, np.random.default_rng(1), share)
+    part = cases.KINDS["common_mode"].effects[0](table, 60.0)
+    gain = np.zeros(6)
+    gain[list(part.sensors)] = part.parameters["gain"]["per_sensor"]
+    before = table.spectrum.T[:, :, None] * np.eye(6)
+    after = before + gain[:, None] * gain - np.diag(gain**2)
+
+    def log_det(matrices):
+        return np.linalg.slogdet(matrices)[1].sum()
+
+    if np.isinf(share):
+        told = (log_det(before) - log_det(after)) / 2
+    else:
+        both = (after + share * before) / (1 + share)
+        told = ((1 + share) * log_det(both) - log_det(after) - share * log_det(before)) / 2
+    assert told == pytest.approx(60.0, rel=1e-6)
+
+
 def test_tone_stands_out_by_its_amplitude():
     case = make_case("vibration_tone", 300.0, 2, n_samples=N)
     (effect,) = case.truth["effects"]

@@ -21,7 +21,7 @@ from gyrofuse.mismatch.shapes import chosen_shape, refit
 
 _WORDS = {"white": "white noise", "ar1": "AR1 noise", "walk": "a random walk"}
 _REST = 0.01  # of a sensor's power that is its own, at least
-_SEEN, _LEAST = 3.0, 1.5  # standard deviations of a sensor's gain, and of the second largest
+_SEEN, _LEAST = 2.5, 1.5  # standard deviations of a sensor's gain, and of the second largest
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,10 +13,10 @@ The size of an effect, in nats, is the divergence of the recording from the simu
   and sensors, r = 1 + |m|^2/S; for the clock, of what no phase and amplitude of the line can explain;
 - a signal whose shape a channel or few numbers give (temperature, acceleration, scale factor, sweep): half its whitened
   energy m' V^-1 m, summed over sensors;
-- Gaussian noise of another spectrum (resonance, common mode, episodes, modulated noise): the same with r the ratio of
-  the spectra, for common mode with matrices;
+- Gaussian noise of another spectrum (resonance, episodes, modulated noise): the same with r the ratio of the spectra;
 - of another spectrum over a broad band (flicker, low-pass, parameters), which only the comparison with a simulation of
-  s times as many samples shows: 1/2 sum [(1 + s) log((r + s)/(1 + s)) - log r], which is the above for a model;
+  s times as many samples shows: 1/2 sum [(1 + s) log((r + s)/(1 + s)) - log r], which is the above for a model; for
+  common mode the same with matrices;
 - a wandering tone and a trap are taken for noise of their mean spectrum, which bounds their divergence from below; how
   far a trap is from such noise is simulated;
 - spikes, a blurred lattice, Laplace noise: number of samples times the divergence of one sample, by quadrature or

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from . import mechanics, thermal
 from .bench import Bench, Part, quantity, rms
 from .clock import sample_times
+from .likelihood import coefficients
 from .spectral import added
 
 Array = NDArray[np.float64]
@@ -214,7 +215,11 @@ def g_sensitivity(bench: Bench, nats: float) -> Part:
 
 
 def quadratic_coupling(bench: Bench, nats: float) -> Part:
-    """The rate answers to the square of one axis' acceleration: a line at twice its frequency, and a slow bias."""
+    """The rate answers to the square of one axis' acceleration: a line at twice its frequency, and a slow bias.
+
+    It does so before the converter, whose average of a square is not the square of an average: the gain is that on the
+    square of what the accelerometer's own converter lets through, as far as it explains the rate.
+    """
     sensors = bench.some_sensors(2)
     f = bench.rng.uniform(0.06, 0.22) * bench.rate
     loudness = 1 + 0.5 * np.sin(2 * np.pi * bench.rng.uniform(1, 4) * np.arange(bench.steps) / bench.steps)
@@ -225,16 +230,18 @@ def quadratic_coupling(bench: Bench, nats: float) -> Part:
     shaking[0] += 0.4 * loudness * np.cos(phase)
     seen = bench.sampled(shaking)
     gains = bench.gains(sensors)
+    course = bench.sampled(shaking[0] ** 2)
     part, size = bench.shape(
         "quadratic_coupling",
         nats,
-        gains[:, None] * bench.sampled(shaking[0] ** 2),
+        gains[:, None] * course,
         known=True,
         frequency_hz=2 * f,
         channel="acceleration",
         channels={"acceleration": seen + 2e-4 * math.sqrt(bench.rate) * bench.rng.standard_normal(seen.shape)},
     )
-    gain = size * gains[list(sensors)]
+    own, of_square = (coefficients(x) / np.sqrt(bench.spectrum[list(sensors)]) for x in (course, seen[0] ** 2))
+    gain = size * gains[list(sensors)] * (own * of_square).sum(axis=1) / (of_square**2).sum(axis=1)
     part.parameters.update(gain=quantity(rms(gain), "deg/s/g^2", gain))
     return part
 

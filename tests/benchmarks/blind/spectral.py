@@ -171,17 +171,28 @@ def random_telegraph(bench: Bench, nats: float, *, dwell_share: float | None = N
 
 
 def common_mode(bench: Bench, nats: float) -> Part:
-    """White noise of one supply in several sensors; each keeps the level that the simulator expects."""
+    """White noise of one supply in several sensors; each keeps the level that the simulator expects.
+
+    That sensors of a simulation have nothing in common is told by as many samples as it has: the nats are those of
+    the comparison, `1/2 sum [(1 + s) log|(R + s S)/(1 + s)| - log|R| - s log|S|]`, with the matrices `R` and `S`.
+    """
     sensors = bench.some_sensors(3)
     gains = bench.gains(sensors, signed=False) * bench.sigma
+    log_before = np.log(bench.spectrum).sum(axis=0)
 
     def law(share: float, own: Array) -> tuple[Array, Array]:
         """Independent part (sensor, frequency) and log determinant of the cross-spectral matrix, per frequency."""
         alone = bench.spectrum - share * own[:, None] ** 2
         return alone, np.log(alone).sum(axis=0) + np.log1p(share * (own[:, None] ** 2 / alone).sum(axis=0))
 
+    def divergence_of(share: float, own: Array) -> float:
+        return float((log_before - law(share, own)[1]).sum() / 2)
+
     def expected(share: float, own: Array = gains) -> float:
-        return float((np.log(bench.spectrum).sum(axis=0) - law(share, own)[1]).sum() / 2)
+        if math.isinf(bench.share):
+            return divergence_of(share, own)
+        # of both together it is that of a smaller share
+        return (1 + bench.share) * -divergence_of(share / (1 + bench.share), own) + divergence_of(share, own)
 
     share = solve(nats, expected, 1e-7, 0.6)
     alone, logdet = law(share, gains)
@@ -192,7 +203,7 @@ def common_mode(bench: Bench, nats: float) -> Part:
         projected = (gains[:, None] * x / alone).sum(axis=0)
         capacity = 1 + share * (gains[:, None] ** 2 / alone).sum(axis=0)
         quadratic = (x**2 / bench.spectrum - x**2 / alone).sum(axis=0) + share * projected**2 / capacity
-        return float((quadratic + np.log(bench.spectrum).sum(axis=0) - logdet).sum() / 2)
+        return float((quadratic + log_before - logdet).sum() / 2)
 
     supply = bench.sampled(math.sqrt(OVERSAMPLING) * bench.rng.standard_normal(bench.steps))
     level = math.sqrt(share) * gains
@@ -206,6 +217,7 @@ def common_mode(bench: Bench, nats: float) -> Part:
         nats,
         sensors,
         llr,
+        oracle_nats=divergence_of(share, gains),
         oracle_null=(16 * null[0], 16 * null[1], 16 * null[2]),
         signal=level[:, None] * supply,
         base=replace(bench.base, white=bench.base.white - level**2),
