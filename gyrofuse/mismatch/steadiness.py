@@ -16,7 +16,7 @@ from torch.nn.functional import interpolate, pad
 
 from gyrofuse.mismatch.bump_fit import Oscillation
 from gyrofuse.mismatch.case import Case
-from gyrofuse.mismatch.wandering import rampless_transform, wandering_log_ratio
+from gyrofuse.mismatch.wandering import rampless_transform, wandering_log_ratio, weights_in_phase
 
 _DRAWN = 60
 _REACH = 6.0  # half widths on either side
@@ -45,12 +45,7 @@ def steadiness(case: Case, bump: Oscillation) -> Steadiness:
     several = int((bump.variance > 3 * bump.variance_sd).sum()) > 1
     if bump.gain is None and several:
         return Steadiness(tone=False, open=False, slow=False)
-    noise = case.base.spectrum(torch.tensor([bump.centre], dtype=torch.float64))[:, 0]
-    if bump.gain is None:
-        weights = torch.zeros_like(noise).to(torch.complex128)
-        weights[int((bump.variance / noise).argmax())] = 1.0
-    else:
-        weights = bump.gain.conj() / noise
+    weights = weights_in_phase(case, bump)
     bins, floor = _baseband(case, bump, weights)
     if len(bins) < _LEAST:
         return Steadiness(tone=False, open=True, slow=False)

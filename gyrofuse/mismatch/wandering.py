@@ -13,6 +13,7 @@ strengths and speeds, or centres, widths and heights.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,8 +27,19 @@ _SHORTEST, _LONGEST, _WINDOWS = 4, 128, 4  # samples of a window, and fewest win
 _STRENGTHS = (0.25, 0.4, 0.6, 1.0, 1.5)  # of the likeliest hump's energy
 _SPEEDS = (0.5, 1.5, 4.0)  # steps from window to window, in half their resolution
 _WIDTHS, _NARROWEST, _WIDEST = 10, 2.0, 0.125  # bins, and share of the band
+_NO_TAILS = 0.2  # of the power of a Lorentzian of like width and height, that a course without far tails lacks
 _OFF = 0.12  # share of the band by which centres are off
 _CENTRES, _HEIGHTS = 9, (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 12.8, 25.0, 50.0, 100.0)
+
+
+def weights_in_phase(case: Case, bump: Oscillation) -> Tensor:
+    """Complex weights `(sensor,)` that sum the sensors in phase, by their noise; the clearest where they have none."""
+    noise = case.base.spectrum(torch.tensor([bump.centre], dtype=torch.float64))[:, 0]
+    if bump.gain is not None:
+        return bump.gain.conj() / noise
+    weights = torch.zeros_like(noise).to(torch.complex128)
+    weights[int((bump.variance / noise).argmax())] = 1.0
+    return weights
 
 
 def wandering_log_ratio(case: Case, bump: Oscillation, weights: Tensor) -> float:
@@ -35,10 +47,20 @@ def wandering_log_ratio(case: Case, bump: Oscillation, weights: Tensor) -> float
     bins = _band(case, bump, weights)
     if len(bins) < _FEWEST:
         return 0.0
-    hump, level, energy = _hump(bins.abs().square())
-    tone = _tone(bins / math.sqrt(level), energy)
-    noise = -len(bins) * math.log(level) - float(bins.abs().square().sum()) / level
-    return tone + noise - hump
+    hump = _hump(bins.abs().square())
+    tone = _tone(bins / math.sqrt(hump.level), hump.energy)
+    noise = -len(bins) * math.log(hump.level) - float(bins.abs().square().sum()) / hump.level
+    return tone + noise - hump.log_mean
+
+
+def share_of_lorentzian(case: Case, bump: Oscillation) -> float:
+    """Power of a hump over that of the Lorentzian that was fitted to it.
+
+    A course of frequencies that keeps near its middle has no far tails.
+    """
+    bins = _band(case, bump, weights_in_phase(case, bump))
+    normal = _hump(bins.abs().square()).normal if len(bins) >= _FEWEST else 0.5
+    return 1 - _NO_TAILS * normal
 
 
 @remembered
@@ -59,26 +81,44 @@ def _band(case: Case, bump: Oscillation, weights: Tensor) -> Tensor:
     return (weights @ rampless_transform(case)[:, inside]) / noise.sqrt()
 
 
-def _hump(power: Tensor) -> tuple[float, float, float]:
-    """Mean log likelihood of Gaussian humps, and level and energy of the likeliest, in units of the level."""
+class Hump(NamedTuple):
+    """A hump on a level.
+
+    Attributes:
+        log_mean: Mean log likelihood of Gaussian humps.
+        level, energy: Of the likeliest, the energy in units of the level.
+        normal: Probability that it has the shape of a normal law, not a Lorentzian one.
+    """
+
+    log_mean: float
+    level: float
+    energy: float
+    normal: float
+
+
+def _hump(power: Tensor) -> Hump:
+    """Humps of powers `(bin,)`."""
     n = len(power)
     k = torch.arange(n, dtype=torch.float64) - (n - 1) / 2
     widths = torch.logspace(math.log10(_NARROWEST), math.log10(_WIDEST * n), _WIDTHS, dtype=torch.float64)
     height = torch.tensor(_HEIGHTS, dtype=torch.float64)[:, None, None]
-    values, best = [], (-math.inf, 1.0, 0.0)
+    values: tuple[list[Tensor], list[Tensor]] = ([], [])  # Lorentzian, normal
+    best = (-math.inf, 1.0, 0.0)
     for centre in torch.linspace(-_OFF * n, _OFF * n, _CENTRES).tolist():
         square = ((k - centre) / widths[:, None]).square()
-        for shape in (1 / (1 + square), (-square / 2).exp()):
+        for of_shape, shape in zip(values, (1 / (1 + square), (-square / 2).exp()), strict=True):
             spectrum = 1 + height * shape  # (height, width, bin)
             level = (power / spectrum).mean(-1)
             value = -n * (level.log() + 1) - spectrum.log().sum(-1)
-            values.append(value.flatten())
+            of_shape.append(value.flatten())
             at = int(value.argmax())
             if float(value.max()) > best[0]:
                 energy = (height * shape).sum(-1)
                 best = float(value.max()), float(level.flatten()[at]), float(energy.flatten()[at])
-    every = torch.cat(values)
-    return float(every.logsumexp(0)) - math.log(len(every)), best[1], best[2]
+    total = torch.stack([torch.cat(of_shape).logsumexp(0) for of_shape in values])
+    count = sum(len(part) for of_shape in values for part in of_shape)
+    log_mean = float(total.logsumexp(0)) - math.log(count)
+    return Hump(log_mean, best[1], best[2], float(total.softmax(0)[1]))
 
 
 def _tone(bins: Tensor, energy: float) -> float:

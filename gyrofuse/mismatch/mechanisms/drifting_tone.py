@@ -14,15 +14,13 @@ from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.gaussian import Addition
 from gyrofuse.mismatch.mechanism import Finding, Mechanism
 from gyrofuse.mismatch.oscillating import Mode, nominated, refitted_mode
+from gyrofuse.mismatch.wandering import share_of_lorentzian
 
 _SHORT = 0.05  # cycles of the width in which a phase that diffuses forgets its frequency
 _LONG = 8.0
 _REACH = 10.0  # half widths of the band that is cleaned
 _FLANK = 6.0
 _FAINT = 0.03  # of the largest gain
-# A course of frequencies has no far tails: its power is between those of a normal law and of a Lorentzian of that half
-# width and height, 0.68 and 1 of the latter.
-_COMPACT = 0.84
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,11 +34,13 @@ class DriftingTone(Addition):
     Attributes:
         mode: Centre, half width, and gains: complex, those of a Lorentzian.
         slow: Whether short windows show its frequency.
+        share: Its power over that of the Lorentzian, whose far tails it need not have.
     """
 
     name: ClassVar[str] = "drifting_tone"
     mode: Mode
     slow: bool
+    share: float = 1.0
 
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:
@@ -48,9 +48,10 @@ class DriftingTone(Addition):
         if seen is None:
             return None
         mode, finding = seen
-        rate, factor = case.scene.rate, math.sqrt(2 * _COMPACT)
+        rate, share = case.scene.rate, share_of_lorentzian(case, finding.bump)
+        factor = math.sqrt(2 * share)
         return finding.of(
-            cls(mode, finding.slow),
+            cls(mode, finding.slow, share),
             f"a tone near {mode.centre * rate:.4g} Hz whose frequency wanders by about {mode.width * rate:.2g} Hz, in "
             f"{finding.where}, of amplitude up to {factor * float(mode.gain.abs().max()):.3g} "
             f"{case.scene.unit}, that the simulation does not have",
@@ -72,7 +73,7 @@ class DriftingTone(Addition):
         turn = 2 * math.pi * torch.rand((), generator=generator, dtype=torch.float64)
         phase = 2 * math.pi * (self.mode.centre + _wandered(steps, phi)).cumsum(0) + turn
         angle = self.mode.gain.angle()[:, None] + phase
-        return math.sqrt(2 * _COMPACT) * self.mode.gain.abs()[:, None] * angle.cos()
+        return math.sqrt(2 * self.share) * self.mode.gain.abs()[:, None] * angle.cos()
 
     def explained(self, case: Case, generator: torch.Generator) -> Case:
         """Its band is filled with the noise around it: another path of its own would differ from the recorded one."""
