@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import json
 import math
@@ -12,7 +13,11 @@ from scipy import stats
 
 import gyrofuse as gf
 from gyrofuse.mismatch import diagnose
+from gyrofuse.mismatch.engine import _known
 from gyrofuse.mismatch.evidence import calibrated
+from gyrofuse.mismatch.inputs import prepared
+from gyrofuse.mismatch.mechanisms.clipping import Clipping
+from gyrofuse.mismatch.mechanisms.unit_scale import UnitScale
 from gyrofuse.mismatch.twins import twin, twin_p_values
 
 MODEL = gf.WhiteNoise(1.0) + gf.AR1(0.999, 1e-4) + gf.RandomWalk(1e-8)
@@ -56,6 +61,20 @@ def test_a_concealed_tone_is_found_named_and_repaired():
     assert not report.unexplained
     assert report.held_out.gain > 10
     assert finding.held_out_gain == pytest.approx(report.held_out.gain)
+
+
+def test_a_fact_on_the_numbers_is_found_once():
+    """What its repair could not take away in some of its sensors is no other one; a second step there would be."""
+    signal = array(3).signal
+    clipped = gf.Recording(signal.clamp(max=signal[:, ::2000].amax()), rate=RATE, unit="deg/s")
+    found = Clipping.nominate(prepared(clipped, array(4), None, generator(0)), 0.01)
+    assert found is not None
+    assert len(found.sensors) > 1
+    fewer = dataclasses.replace(found, sensors=found.sensors[:1])
+    assert _known(fewer, [found])
+    assert not _known(found, [fewer])
+    steps = [dataclasses.replace(f, mechanism="step", effect=UnitScale(2.0)) for f in (fewer, found)]
+    assert not _known(steps[0], steps[1:])
 
 
 def test_what_was_found_is_taken_off_and_simulated_again():

@@ -219,6 +219,20 @@ def test_isolated_outliers_are_spikes() -> None:
     assert float(found.effect.removed(recording, SCENE).abs().max()) < 6.0
 
 
+def test_a_sensor_that_speaks_against_the_outliers_of_a_bus_is_left_out() -> None:
+    """Its own law, of many faint ones, would gain some nats; under that of the others it has none of theirs."""
+    recording, simulation, g = drawn(11)
+    hit = even(3, N, g=g) < 2e-3
+    hit[1] = False
+    sign = (even(3, N, g=g) - 0.5).sign()
+    recording = recording + hit * 6.0 * sign
+    recording[1] += 1.6 * (even(N, g=g) < 0.02) * sign[1]
+    z = impulses.left_out(Case.of(SCENE, recording, simulation).recorded).z[0]
+    laws = [outliers.fitted(row) for row in z]
+    assert float((outliers.mixture(z[1], laws[1]) - outliers.free_gaussian(z[1])).sum()) > 4
+    assert nominated(Case.of(SCENE, recording, simulation), Spikes).sensors == (0, 2)
+
+
 def test_outliers_in_all_sensors_at_once_are_a_shock() -> None:
     recording, simulation, g = drawn(9)
     hit = even(1, N, g=g) < 2e-3

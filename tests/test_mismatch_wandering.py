@@ -12,7 +12,7 @@ from shape_draws import SIGNS, N, array, case, generator, oscillating
 
 from gyrofuse.mismatch.bump_fit import oscillation_of
 from gyrofuse.mismatch.steadiness import steadiness
-from gyrofuse.mismatch.wandering import _courses, wandering_log_ratio
+from gyrofuse.mismatch.wandering import _courses, _hump, wandering_log_ratio
 
 WIDTH, RMS = 60 / N, 9e-4  # half width in cycles per sample; deg/s
 
@@ -48,6 +48,17 @@ def test_courses_have_a_mean_ratio_of_one_in_noise():
     power = torch.empty(4000, 12, 16, dtype=torch.float64).exponential_(generator=generator(910))
     ratios = torch.stack([_courses(p, 4.0 / 12).logsumexp(0).exp() / 15 for p in power])
     assert abs(float(ratios.mean()) - 1) < 4 * float(ratios.std()) / math.sqrt(len(ratios))
+
+
+@pytest.mark.parametrize("normal", [True, False])
+def test_the_shape_of_a_strong_hump_is_told(normal: bool):
+    k = torch.arange(4096, dtype=torch.float64) - 2000
+    shape = torch.exp(-(k / 60).square() / 2) if normal else 1 / (1 + (k / 60).square())
+    noise = torch.empty(4096, dtype=torch.float64).exponential_(generator=generator(920))
+    hump = _hump(3.0 * noise * (1 + 10 * shape))
+    assert hump.normal == pytest.approx(float(normal), abs=1e-3)
+    assert hump.level == pytest.approx(3.0, rel=0.1)
+    assert hump.energy == pytest.approx(10 * float(shape.sum()), rel=0.4)  # widths and heights are a grid of octaves
 
 
 def test_no_room_for_a_band_says_nothing():

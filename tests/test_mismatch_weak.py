@@ -136,6 +136,17 @@ def test_a_level_that_changes_by_little_in_several_sensors_is_named() -> None:
     assert found_all >= 4
 
 
+def test_the_level_that_the_simulation_has_is_the_rule() -> None:
+    """Louder for five eighths of the record: the rest would be a quiet episode, were there no simulation."""
+    recording, simulation, _ = drawn(250)
+    recording[:, 4096:14336] *= math.sqrt(1.3)
+    found = nominated(Case.of(SCENE, recording, simulation), VarianceChange)
+    assert found.sensors == (0, 1, 2)
+    assert covers(found, "start", 40.96)
+    assert covers(found, "stop", 143.36)
+    assert all(found.parameters[f"factor[{i}]"].value > 1.1 for i in range(3))
+
+
 # Dead bands.
 
 
@@ -155,6 +166,14 @@ def test_a_dead_band_is_found_among_values_that_do_not_recur() -> None:
         assert marginal_witness(after).p_value > 0.001
     # Fewer than 12 of 16 at 95 % have probability 9e-4.
     assert inside >= 12
+
+
+def test_one_return_to_a_value_known_from_another_sensor_is_proof() -> None:
+    recording, simulation, _ = drawn(450)
+    recording[0][recording[0].abs() < 8e-4] = 0.0
+    recording[1, int(recording[1].abs().argmin())] = 0.0
+    assert int((recording[0] == 0).sum()) >= 4
+    assert nominated(Case.of(SCENE, recording, simulation), Quantization).sensors == (0, 1)
 
 
 def test_a_value_filled_in_is_no_dead_band() -> None:
@@ -200,3 +219,19 @@ def test_a_hidden_lattice_is_built_in_without_other_power() -> None:
     assert float((y[0] - x[0]).square().mean()) < 0.4 / 12
     assert torch.equal(y[1], x[1])
     assert torch.equal(y[2], x[2].round())
+
+
+def test_a_hidden_lattice_of_one_sensor_is_looked_for_in_the_others() -> None:
+    """The second has n exp(-4 pi^2 blur^2) = 6 nats, where a search of all steps would want 14; the third has none."""
+    found = []
+    for seed in range(10):
+        g = torch.Generator().manual_seed(seed)
+        recording, simulation = normal(3, 16384, g=g), normal(4, 3, 16384, g=g)
+        for i, blur in ((0, 0.35), (1, 0.4475)):
+            recording[i] = recording[i].round() + blur * normal(16384, g=g)
+        level = recording.std(-1, keepdim=True)
+        found.append(nominated(Case.of(SCENE, recording, simulation * level), Quantization).sensors)
+    assert all(0 in sensors for sensors in found)
+    # Power beyond 3.9 has a chance of 0.78, or of 0.02: fewer than 5 of 10 have probability 8e-3, more than 2 9e-4.
+    assert sum(1 in sensors for sensors in found) >= 5
+    assert sum(2 in sensors for sensors in found) <= 2
