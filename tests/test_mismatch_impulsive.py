@@ -233,6 +233,24 @@ def test_a_sensor_that_speaks_against_the_outliers_of_a_bus_is_left_out() -> Non
     assert nominated(Case.of(SCENE, recording, simulation), Spikes).sensors == (0, 2)
 
 
+@pytest.mark.parametrize("tone", [0.0, 5.0])
+def test_outliers_near_the_ends_are_taken_off_and_none_is_put_there(tone: float) -> None:
+    """Also where a steep walk or a tone makes lines, whose skirts reach the ends."""
+    g = torch.Generator().manual_seed(12)
+    walk = (WhiteNoise(1.0) + RandomWalk(4e-3)).simulate(N, batch=(3,), generator=g)
+    clean = walk + tone * torch.cos(0.7 * torch.arange(N, dtype=torch.float64))
+    hit = torch.zeros(3, N, dtype=torch.bool)
+    hit[:2, [50, 120, 200, 5000, N - 184, N - 84]] = True
+    spiky = clean + 12.0 * hit
+    assert not torch.equal(impulses.left_out(Side(spiky[None], bands(N))).at_ends,
+                           impulses.left_out(Side(spiky[None], bands(N))).error)  # fmt: skip
+    rate = torch.tensor([3e-4, 3e-4, 0.0], dtype=torch.float64)
+    effect = Spikes(rate, torch.full_like(rate, 12.0), torch.full_like(rate, 1.0), together=False)
+    change = (effect.removed(spiky, SCENE) - clean).abs()
+    assert float(change[~hit].max()) == 0.0
+    assert float(change[hit].max()) < 6.0
+
+
 def test_outliers_in_all_sensors_at_once_are_a_shock() -> None:
     recording, simulation, g = drawn(9)
     hit = even(1, N, g=g) < 2e-3

@@ -31,6 +31,7 @@ _LEFT = 1 - 1.5 / _WIDEST  # of a sample's own part: the spectrum follows each o
 _LINE = 25.0  # ordinates this far above the spectrum are lines
 _SKIRT = 1 / 8  # share of ordinates of a line, beyond which the stretch around belongs to it
 ENDS = 64  # a line's skirt is felt in so small a part of the record at each end
+_AS_ELSEWHERE = 1.3  # times the sd of the errors, at an end that no line reaches
 _MOST_RECORDS = 2  # of the simulation: as honest as more
 _MAD = 0.6744897501960817
 _TAILS = (3.5, 4.0, 4.5, 5.0, 6.0, 8.0)
@@ -52,16 +53,29 @@ class LeftOut(NamedTuple):
         error: `(record, sensor, time)`, unit of the signal.
         sd: Of the errors, robust, `(record, sensor)`.
         white: Whitened record, `(record, sensor, time)`, robust sd 1.
+        at_ends: Errors where those of the ends are their own; in `error` and `white` their neighbours stand for them
+            if there are lines.
     """
 
     error: Tensor
     sd: Tensor
     white: Tensor
+    at_ends: Tensor
 
     @property
     def z(self) -> Tensor:
         """Errors over their sd."""
         return self.error / self.sd[..., None]
+
+    def correctable(self) -> Tensor:
+        """Errors `(record, sensor, time)` by which single samples may be corrected.
+
+        Those of the ends are zero where the skirts of lines make them larger than elsewhere.
+        """
+        error, m = self.at_ends.clone(), self.at_ends.shape[-1] // ENDS
+        for end in (error[..., :m], error[..., -m:]):
+            end.mul_((_robust_sd(end) < _AS_ELSEWHERE * self.sd)[..., None])
+        return error
 
 
 @remembered
@@ -74,9 +88,9 @@ def left_out(side: Side) -> LeftOut:
     y = torch.where(lines, 0.0, y)
     white, inverse = _back(y / spectrum.sqrt()), 1 / spectrum
     error = _back(y * inverse) / (_LEFT * inverse.mean(-1, keepdim=True))
-    has_lines = lines.any(-1, keepdim=True)
+    has_lines, at_ends = lines.any(-1, keepdim=True), error
     white, error = (torch.where(has_lines, _mirrored(v), v) for v in (white, error))
-    return LeftOut(error, _robust_sd(error), white / _robust_sd(white)[..., None])
+    return LeftOut(error, _robust_sd(error), white / _robust_sd(white)[..., None], at_ends)
 
 
 def _lines(y: Tensor, spectrum: Tensor) -> Tensor:

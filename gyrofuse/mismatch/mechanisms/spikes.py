@@ -159,8 +159,8 @@ class Spikes(Mechanism):
     def removed(self, signal: Tensor, scene: Scene) -> Tensor:
         """Samples that are outliers more likely than not are predicted from all others."""
         case = Case.of(scene, signal, signal[None])
-        expected = left_out(case.recorded)
-        return torch.where(self._outliers(case), signal - expected.error[0], signal)
+        error = left_out(case.recorded).correctable()[0]
+        return torch.where(self._outliers(case, error), signal - error, signal)
 
     def explained(self, case: Case, generator: torch.Generator) -> Case:
         expected = left_out(case.recorded)
@@ -168,8 +168,9 @@ class Spikes(Mechanism):
         if not bool(plain[self.rate > 0].all()):
             return super().explained(case, generator)
         noise = torch.randn(case.recording.shape, generator=generator, dtype=torch.float64) * expected.sd[0][:, None]
-        predicted = case.recording - expected.error[0] + noise
-        return case.with_recording(torch.where(self._outliers(case), predicted, case.recording))
+        error = expected.correctable()[0]
+        predicted = case.recording - error + noise
+        return case.with_recording(torch.where(self._outliers(case, error), predicted, case.recording))
 
     def gains(self, case: Case, fold: int) -> Tensor:
         z, laws = left_out(case.recorded).z[0], self._laws(case)
@@ -183,9 +184,9 @@ class Spikes(Mechanism):
         numbers = torch.stack([self.rate, self.height / sd, self.spread / sd], -1).tolist()
         return [Outliers(*row) for row in numbers]
 
-    def _outliers(self, case: Case) -> Tensor:
-        """Samples that are outliers more likely than not, `(sensor, time)`."""
-        z, laws = left_out(case.recorded).z[0], self._laws(case)
+    def _outliers(self, case: Case, error: Tensor) -> Tensor:
+        """Samples that are outliers more likely than not by their errors, `(sensor, time)`."""
+        z, laws = error / left_out(case.recorded).sd[0][:, None], self._laws(case)
         if self.together:
             return (self.rate[:, None] > 0) & (shock_posterior(z, laws) > 0.5)
         return torch.stack([law.posterior(row) > 0.5 for row, law in zip(z, laws, strict=True)])
