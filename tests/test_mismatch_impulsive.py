@@ -119,6 +119,29 @@ def test_rounding_is_read_off_the_values(step: float, offset: float) -> None:
     assert torch.equal(repaired[:, 2], simulation[:, 2])
 
 
+@pytest.mark.parametrize("step", [1.0, 1.5])
+def test_coarse_rounding_makes_neither_outliers_nor_clipping(step: float) -> None:
+    """Medians of few steps are a matter of luck, and predictions from noise go beyond where any value would."""
+    for seed in range(4):
+        recording, simulation, g = drawn(40 + seed)
+        case = Case.of(SCENE, step * (recording / step).round(), simulation)
+        found = nominated(case, Quantization)
+        assert found.sensors == (0, 1, 2)
+        after = found.effect.explained(case, g)
+        assert impulses.spike_witness(after).p_value > 0.001
+        assert Clipping.nominate(after, LEVEL) is None
+        sd, rms = impulses.left_out(after.recorded).sd[0], impulses.left_out(after.recorded).error[0].std(-1)
+        torch.testing.assert_close(sd, rms, rtol=0.03, atol=0.0)
+
+
+def test_the_smooth_sd_is_that_of_normal_values_and_yields_little_to_outliers() -> None:
+    g = torch.Generator().manual_seed(3)
+    x = 3.0 * normal(200_000, g=g)
+    assert float(impulses._smooth_sd(x)) == pytest.approx(3.0, rel=0.01)
+    x[:200] = 1e3
+    assert float(impulses._smooth_sd(x)) == pytest.approx(3.0, rel=0.02)
+
+
 def test_rounding_that_a_simulation_has_too_is_not_missing() -> None:
     recording, simulation, _ = drawn(2)
     case = Case.of(SCENE, (2 * recording).round() / 2, (2 * simulation).round() / 2)

@@ -34,6 +34,8 @@ ENDS = 64  # a line's skirt is felt in so small a part of the record at each end
 _AS_ELSEWHERE = 1.3  # times the sd of the errors, at an end that no line reaches
 _MOST_RECORDS = 2  # of the simulation: as honest as more
 _MAD = 0.6744897501960817
+_FEW, _COARSE = 4096, 0.3  # samples that show a lattice, and its step in sd of the noise, from which it matters
+_TUNING, _STEPS = 1.5, 20
 _TAILS = (3.5, 4.0, 4.5, 5.0, 6.0, 8.0)
 _HEAVY = 0.05  # p value of tails that the simulation may have as well
 _NOTHING = 0.05  # p value of what need not be compared
@@ -90,7 +92,8 @@ def left_out(side: Side) -> LeftOut:
     error = _back(y * inverse) / (_LEFT * inverse.mean(-1, keepdim=True))
     has_lines, at_ends = lines.any(-1, keepdim=True), error
     white, error = (torch.where(has_lines, _mirrored(v), v) for v in (white, error))
-    return LeftOut(error, _robust_sd(error), white / _robust_sd(white)[..., None], at_ends)
+    stepped = _stepped(side.signal[:_MOST_RECORDS])
+    return LeftOut(error, _sd(error, stepped), white / _sd(white, stepped)[..., None], at_ends)
 
 
 def _lines(y: Tensor, spectrum: Tensor) -> Tensor:
@@ -135,6 +138,30 @@ def _smooth_spectrum(y: Tensor) -> Tensor:
     right = torch.bucketize(k, centre).clamp(1, len(centre) - 1)
     share = (k - centre[right - 1]) / (centre[right] - centre[right - 1])
     return (means[..., right - 1] + share.clamp(0, 1) * (means[..., right] - means[..., right - 1])).exp()
+
+
+def _stepped(signal: Tensor) -> Tensor:
+    """Whether values `(..., time)` have few steps in their noise, `(...)`: medians of such are a matter of luck."""
+    part = signal[..., :_FEW].flatten(0, -2)
+    gaps = torch.stack([g.median() if len(g := row.unique().diff()) else g.new_zeros(()) for row in part])
+    noise = part.diff().square().mean(-1).sqrt() / math.sqrt(2)
+    return (gaps > _COARSE * noise).view(signal.shape[:-1])
+
+
+def _sd(values: Tensor, stepped: Tensor) -> Tensor:
+    """Robust sd; of what has few steps one that moves little with each of them."""
+    return torch.where(stepped, _smooth_sd(values), _robust_sd(values)) if bool(stepped.any()) else _robust_sd(values)
+
+
+def _smooth_sd(values: Tensor) -> Tensor:
+    """The `s` of normal values with the mean of `1 - exp(-(x/s)^2/2c^2)` that they have (Welsch's M estimator)."""
+    squares = values.square()
+    variance = squares.mean(-1, keepdim=True).clamp(min=1e-300)
+    wanted = 1 - _TUNING / math.sqrt(1 + _TUNING**2)
+    for _ in range(_STEPS):
+        seen = -torch.expm1(-squares / (2 * _TUNING**2 * variance)).mean(-1, keepdim=True)
+        variance = variance * (seen / wanted)
+    return variance[..., 0].sqrt()
 
 
 def _robust_sd(values: Tensor) -> Tensor:

@@ -299,6 +299,9 @@ def end_stops(case: Case) -> tuple[EndStop, ...]:
     for i in range(case.n_sensors):
         x, mean, sd = case.recording[i], case.recording[i] - expected.error[0, i], float(expected.sd[0, i])
         resolution = float(_resolution(case)[i])
+        rounded = resolution > _COARSE * sd
+        if rounded:
+            mean, sd = _before_rounding(x, mean, resolution)
         for sign in (1, -1):
             limit = float((sign * x).max())
             at = sign * x == limit
@@ -309,12 +312,21 @@ def end_stops(case: Case) -> tuple[EndStop, ...]:
             beyond = float(torch.special.ndtr((sign * mean - limit - resolution / 2) / sd).sum())
             by_chance = min(5 * resolution / sd, 1.0) ** (runs - 1)
             p = min(math.exp(-beyond), by_chance)
-            if (
-                resolution > _COARSE * sd
-            ):  # tails of rounded noise are not normal: the number at the end has to tell too
+            if rounded:  # tails of rounded noise are not normal: the number at the end has to tell too
                 p = max(p, float(special.pdtrc(runs - 1, _AT_LAST_STEP)))
             found.append(EndStop(i, sign, sign * limit, corrected(p, 4 * case.n_sensors)))
     return tuple(found)
+
+
+def _before_rounding(x: Tensor, mean: Tensor, step: float) -> tuple[Tensor, float]:
+    """Means `(time,)` that rounded values have by regression on their predictions, and sd of what was rounded.
+
+    A prediction from noise has noise of its own, in which it goes beyond where any value would.
+    """
+    middle, about = x.mean(), mean - mean.mean()
+    mean = middle + about * float((about * (x - middle)).mean() / about.square().mean().clamp(min=1e-300))
+    variance = float((x - mean).square().mean())
+    return mean, math.sqrt(max(variance - step**2 / 12, variance / 4))
 
 
 def _simulation_ends(case: Case, sensor: int, sign: int) -> bool:
