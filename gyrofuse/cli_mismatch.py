@@ -88,7 +88,10 @@ def diagnose(
         found, remarks = _diagnosed(part, simulated, (titled(logs), simulation), false_alarm, twins)
         if corrected:
             whole, _ = without_gaps(part, "", 0)
-            found.correct(whole).save(drafts[corrected], force=True)
+            clean = found.correct(whole)
+            clean.save(drafts[corrected], force=True)
+            if torch.equal(clean.signal, whole.signal):
+                remarks.append(f"Nothing was found that can be taken off: {corrected} is the recording as it came.")
         if model_out:
             write_json(drafts[model_out], found.model.to_dict())
         if report:
@@ -114,10 +117,13 @@ def _diagnosed(
 
     with progress_bar("comparing") as show:
         if isinstance(simulation, Recording):
-            simulation, _ = without_gaps(simulation, "", 0)
+            simulation, lacking = without_gaps(simulation, "Simulation: compared", 0)
+        else:
+            lacking = []
         try:
             part, remarks = without_gaps(recording, "Diagnosed", FEWEST)
-            return find_mismatch(part, simulation, false_alarm=false_alarm, twins=twins, progress=show), remarks
+            found = find_mismatch(part, simulation, false_alarm=false_alarm, twins=twins, progress=show)
+            return found, remarks + lacking
         except (ValueError, TypeError) as error:
             message = str(error)
             files = {"`recording`": names[0], "`LOG`": names[0], "`simulation`": str(names[1])}

@@ -112,11 +112,12 @@ def _clarity(finding: Finding, sensor: int) -> float:
 def _part(outcome: Outcome, finding: Finding) -> dict[str, Any]:
     """What the page shows of one finding."""
     scene = outcome.case.scene
+    when = "largest at" if finding.mechanism == "spikes" else "sets in at"
     facts = {
         "sensors": _names(outcome, finding.sensors),
         "averaging times": _times(finding.levels, scene.rate),
         "frequency": "" if finding.frequency_hz is None else f"{number(finding.frequency_hz, 6)} Hz",
-        "sets in at": "" if finding.time_s is None else f"{number(finding.time_s, 6)} s",
+        when: "" if finding.time_s is None else f"{number(finding.time_s, 6)} s",
         "follows": finding.channel or "",
         "p value": chance(finding.p_value),
         "gain held out": "" if finding.held_out_gain is None else f"{finding.held_out_gain:+.1f} nats",

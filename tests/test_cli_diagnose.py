@@ -97,6 +97,19 @@ def test_samples_that_are_missing_leave_the_longest_stretch(run: Run, log: Path)
     assert gf.read_recording("c.npz").n_samples == N - 2001
 
 
+def test_gaps_of_the_simulation_and_a_recording_left_as_it_came_are_told(run: Run, log: Path):
+    simulation = gf.read_recording("sim.npz")
+    simulation.signal[1, 500] = torch.nan
+    simulation.save("sim.npz", force=True)
+    gf.Recording(drawn(N, 8), rate=RATE, unit="deg/s", sensors=("a", "b")).save(log, force=True)
+    done = run("diagnose", log, "--simulation", "sim.npz", "--corrected", "c.npz")
+    assert done.status == 0
+    told = " ".join(done.out.split())
+    assert f"Simulation: compared on 10.02 to {2 * N / RATE:.6g} s alone" in told
+    assert "Nothing was found that can be taken off: c.npz is the recording as it came." in told
+    torch.testing.assert_close(gf.read_recording("c.npz").signal, gf.read_recording(log).signal, rtol=0, atol=0)
+
+
 def test_the_repaired_simulation_simulates_and_agrees(run: Run, log: Path):
     assert run("diagnose", log, "--simulation", "model.json", "--model-out", "m.json").status == 0
     simulated = run("simulate", "m.json", "--samples", N, "--rate", RATE, "--seed", 5, "--out", "s.npz")
