@@ -208,6 +208,19 @@ def test_repeats_beyond_those_of_the_lattice_are_stuck_samples(rounded: bool, to
     settled(case, found, g)
 
 
+def test_repeats_that_chance_would_not_make_may_come_and_go() -> None:
+    recording, simulation, g = drawn(14)
+    at = (even(N, g=g) < 0.006) & (torch.arange(N) < N // 2)
+    for t in at.nonzero()[:, 0].clamp(min=1).tolist():
+        recording[:, t] = recording[:, t - 1]
+    case = Case.of(SCENE, recording, simulation)
+    assert bool(
+        (marginals._repeat_shares(case.recorded.signal)[3] > 0).all()
+    )  # from quarter to quarter more than noise
+    assert marginals.marginal_witness(case).p_value < 1e-4
+    assert nominated(case, StuckSamples).sensors == (0, 1, 2)
+
+
 # Outliers.
 
 

@@ -239,7 +239,8 @@ def repeats(case: Case) -> Repeats:
     expected = other + torch.where(other == 0, _resolution(case) * density, 0.0)
     binomial = expected * (1 - expected).clamp(min=0) + 1 / n_recorded
     variance = torch.maximum(binomial / n_recorded + binomial / n_simulated, fast + other_fast)
-    wander = 2 * (slow + other_slow)  # two paths that differ
+    # Of two paths that differ; what happens by chance varies by no more than about itself.
+    wander = 2 * torch.minimum(slow + other_slow, expected.square())
     return Repeats(share, expected, (variance + wander).sqrt(), wander > variance, n_recorded)
 
 
