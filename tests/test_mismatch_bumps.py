@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from scipy import stats
 from shape_draws import CHANGES, RATE, SIGNS, N, P, array, case, drawn, generator, nominated, oscillating, tensor
 
-from gyrofuse.mismatch.bump_fit import oscillation_of
+from gyrofuse.mismatch.bump_fit import Background, oscillation_of
 from gyrofuse.mismatch.bump_scan import log_ratios
 from gyrofuse.mismatch.bumps import strongest_bump
 from gyrofuse.mismatch.colour import noise
@@ -17,7 +18,9 @@ from gyrofuse.mismatch.hump_scan import _scores, scanned_humps
 from gyrofuse.mismatch.lines import whitened
 from gyrofuse.mismatch.mechanisms.resonance import Resonance
 from gyrofuse.mismatch.oscillating import Mode, excess_along
+from gyrofuse.mismatch.shape_fit import fit, linearised
 from gyrofuse.mismatch.shape_terms import oscillation
+from gyrofuse.mismatch.shapes import compared
 from gyrofuse.mismatch.steadiness import steadiness
 
 
@@ -63,6 +66,15 @@ def test_a_hump_is_where_it_was_put():
     assert abs(int(best.first[at]) + best.width / 2 - 5000) < 60
     assert 60 <= best.width <= 300
     assert float(best.log_ratio.amax()) > 20
+
+
+def test_backgrounds_that_nothing_holds_stay_numbers_that_can_be_worked_out():
+    data = compared(drawn(2, n=4096))
+    lost = replace(Background.start(P), local=tensor(-800, 100)[:, None].expand(2, P))
+    found = fit(data, [lost], rounds=1)
+    assert bool(found.model.isfinite().all())
+    assert bool(found.covariance.isfinite().all())
+    assert bool(linearised(data, found.terms)[1].isfinite().all())
 
 
 def test_a_line_is_no_bump_and_a_bump_of_both_sides_neither():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
@@ -24,6 +24,7 @@ from gyrofuse.mismatch.spectra import Bands, degrees_of_freedom
 _CUT_OFF = 0.6  # of the simulation's power
 _CELLS, _CELL = 24, 5  # on either side, and fewest bins of one
 _FINER, _NARROW = 3, 0.1  # times, and half width in the stretch
+_FARTHEST = 30.0  # that logarithms go
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +77,10 @@ class Background(Term):
         low, high = ground.places[0], ground.places[-1]
         x = (2 * ground.places - low - high) / (high - low)
         return (local[..., 0, :, None] + local[..., 1, :, None] * x).exp()
+
+    def within(self) -> Background:
+        # Where powers are too far apart nothing else would hold them, and numbers could not be worked out.
+        return replace(self, local=self.local.clamp(-_FARTHEST, _FARTHEST))
 
 
 @remembered
