@@ -25,6 +25,7 @@ _CUT_OFF = 0.6  # of the simulation's power
 _CELLS, _CELL = 24, 5  # on either side, and fewest bins of one
 _FINER, _NARROW = 3, 0.1  # times, and half width in the stretch
 _FARTHEST = 30.0  # that logarithms go
+_ITS_OWN = 2.1  # half widths: what is broader, up to as broad as fits are let, is for the whole spectrum to tell
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,4 +164,4 @@ def _best(case: Case, stretch: Stretch, data: Ratios, background: Fit) -> Oscill
     term = best.terms[-1]
     assert isinstance(term, Bump | CommonBump)
     found = Oscillation.of(stretch, term, best.sd(-1), nats)
-    return None if found.centre < 2 * found.width or nats < 0 else found
+    return None if found.centre < _ITS_OWN * found.width or nats < 0 else found

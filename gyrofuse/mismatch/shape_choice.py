@@ -21,6 +21,7 @@ _DOUBT = 1e-3  # p value of what is left by shapes that may be named
 _SMALL = 0.1  # share of what there was to explain that may be left all the same
 _NEW = 8.0  # nats that a shape costs beside its numbers
 _NUMBER = 2.0  # nats for a number of a sensor: those of sensors that have it are alike
+_PART = 4.0  # nats for each further part of the noise whose numbers are others
 _TOUCH = 0.1
 _FORMS = 3  # of filters
 _WIDTHS = (0.06, 0.15, 0.35)  # half width of a bump over its centre
@@ -52,8 +53,10 @@ def best_shapes(data: Ratios, *, differ: bool) -> tuple[Ratios, Fit | None]:
 
 
 def _value(data: Ratios, found: Fit) -> float:
-    """Log likelihood less what shapes and their numbers cost."""
-    return found.gain - sum(cost_of(data, t) + _NEW for t in found.terms)
+    """Log likelihood less what shapes, their numbers and kinds of numbers cost."""
+    shifted = [t.free.any(-1) for t in found.terms if isinstance(t, Shift)]
+    kinds = sum(int(white) + int(ar1 | corner) + int(walk) - 1 for white, ar1, corner, walk in shifted)
+    return found.gain - sum(cost_of(data, t) + _NEW for t in found.terms) - _PART * kinds
 
 
 def cost_of(data: Ratios, term: Term) -> float:
