@@ -38,8 +38,7 @@ from gyrofuse.simulate import ArrayModel
 
 if TYPE_CHECKING:
     from gyrofuse.mismatch import MismatchReport
-
-_RECORDS = 4  # as long as the recording, that are drawn of a repaired simulation
+    from gyrofuse.mismatch.repaired import RepairedModel
 
 
 def diagnose(
@@ -106,7 +105,7 @@ def diagnose(
 
 def _diagnosed(
     recording: Recording,
-    simulation: Recording | Model | ArrayModel,
+    simulation: Recording | Model | ArrayModel | RepairedModel,
     names: tuple[str, Path],
     false_alarm: float,
     twins: int,
@@ -135,15 +134,10 @@ def _diagnosed(
 
 def _simulation(
     path: Path, recording: Recording, axis: str | None, sensors: str | None, rate: float | None, unit: str | None
-) -> Recording | Model | ArrayModel:
+) -> Recording | Model | ArrayModel | RepairedModel:
     """What SIM holds: a model, or a recording of the same sensors and axis."""
     if path.suffix.lower() == ".json":
-        model = read_model(path)
-        if isinstance(model, Model | ArrayModel):
-            return model
-        model.check(recording.rate, recording.unit)
-        drawn = model.simulate(_RECORDS * recording.n_samples, generator=torch.Generator().manual_seed(0))
-        return Recording(drawn, rate=recording.rate, unit=recording.unit)
+        return read_model(path)
     with progress("reading"):
         whole = read_recording(path, rate=rate, unit=None if unit is None else known_unit(unit))
     if axis is not None and axis in whole.axes:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from gyrofuse._checks import same_rate
 from gyrofuse.io import read_streams
 from gyrofuse.io.align import Placed, align
 from gyrofuse.io.clock import Grid, grid_of, regular_grid
@@ -56,6 +57,7 @@ def assemble(
     grids = _grids(streams, rate, source)
     for grid in dict.fromkeys(grids):
         notes += grid.notes
+    notes += _overruled(streams, rate)
     placed, common_rate, align_notes = align(grids, [stream.name for stream in streams], source)
     notes += align_notes
 
@@ -188,6 +190,16 @@ def _grids(streams: Sequence[Stream], rate: float | None, source: str) -> list[G
         known[identity] = grid
         grids.append(grid)
     return grids
+
+
+def _overruled(streams: Sequence[Stream], rate: float | None) -> list[Note]:
+    """Rates that logs without timestamps state, where another one was asked for."""
+    stated = dict.fromkeys(s.rate for s in streams if rate and s.rate and s.time is None)
+    return [
+        Note("clock", "", f"the log states {other:.6g} Hz, {rate:.6g} Hz was asked for")
+        for other in stated
+        if other and rate and not same_rate(other, rate)
+    ]
 
 
 def _clocked(stream: Stream, rate: float | None, source: str) -> Grid:

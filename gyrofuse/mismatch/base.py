@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -17,7 +19,7 @@ from gyrofuse._lag_sums import block_mean_covariances
 from gyrofuse._model import Model
 from gyrofuse._nnls import nonnegative_least_squares
 from gyrofuse.mismatch.spectra import Bands
-from gyrofuse.processes import AR1, QuantizationNoise, RandomWalk, WhiteNoise
+from gyrofuse.processes import AR1, Process, QuantizationNoise, RandomWalk, WhiteNoise
 from gyrofuse.simulate import ArrayModel
 
 _PER_DECADE = 3
@@ -44,13 +46,18 @@ class Base:
 
     def model(self) -> ArrayModel:
         """The same as an array of sensors, without atoms that nowhere matter."""
-        return ArrayModel.from_sensors([self._sensor(row) for row in self._essential()])
+        return ArrayModel.from_sensors([self._sensor(row) for row in self.essential()])
+
+    def shared_model(self, covariances: Tensor) -> ArrayModel:
+        """An array whose sensors share noise, from covariances of every atom, `(atom, sensor, sensor)`."""
+        pairs = zip(self._kinds(), covariances, strict=True)
+        return ArrayModel([(kind(1.0), c) for kind, c in pairs if bool(c.any())])
 
     def block_covariance(self, block: int, n_blocks: int) -> Tensor:
         """Covariances of means over successive blocks, `(sensor, block, block)`, up to a constant."""
         return torch.einsum("sa,aij->sij", self.coefficients, atom_covariances(self.n_samples, block, n_blocks))
 
-    def _essential(self) -> Tensor:
+    def essential(self) -> Tensor:
         """Coefficients without those that give no more than a thousandth of the power anywhere."""
         f = torch.logspace(math.log10(1 / self.n_samples), math.log10(0.5), 100, dtype=torch.float64)
         shares = self.coefficients[..., None] * _atoms(self.n_samples, f)  # (sensor, atom, frequency)
@@ -58,13 +65,13 @@ class Base:
         return torch.where(matters, self.coefficients, 0.0)
 
     def _sensor(self, row: Tensor) -> Model:
-        white, quantized, *shaped, walk = row.tolist()
-        processes: list[Model] = [WhiteNoise(white)]
-        processes += [QuantizationNoise(quantized)] if quantized else []
-        phis = [math.exp(-1 / tau) for tau in _time_constants(self.n_samples)]
-        processes += [AR1(phi, variance) for phi, variance in zip(phis, shaped, strict=True) if variance]
-        processes += [RandomWalk(walk)] if walk else []
-        return Model(processes)
+        white, *others = zip(self._kinds(), row.tolist(), strict=True)
+        return Model([kind(variance) for kind, variance in (white, *(pair for pair in others if pair[1]))])
+
+    def _kinds(self) -> list[Callable[[float], Process]]:
+        """The process of each atom, of its variance."""
+        shaped = (partial(AR1, math.exp(-1 / tau)) for tau in _time_constants(self.n_samples))
+        return [WhiteNoise, QuantizationNoise, *shaped, RandomWalk]
 
 
 def fit_base(power: Tensor, bands: Bands, n_samples: int, dof: Tensor) -> Base:

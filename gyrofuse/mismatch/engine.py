@@ -15,13 +15,15 @@ from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.confirm import held_out, held_out_gain
 from gyrofuse.mismatch.counterfactual import Link, settled
 from gyrofuse.mismatch.evidence import calibrated, corrected, uncorrected
-from gyrofuse.mismatch.inputs import noise_of, prepared
+from gyrofuse.mismatch.inputs import prepared
 from gyrofuse.mismatch.mechanism import Finding
 from gyrofuse.mismatch.mechanisms import STAGES
+from gyrofuse.mismatch.noise_model import noise_of, noise_samples
+from gyrofuse.mismatch.own_effects import with_own_effects
 from gyrofuse.mismatch.remainder import ASKED_FOR_BY, Remainder
 from gyrofuse.mismatch.repaired import RepairedModel
 from gyrofuse.mismatch.report import MismatchReport
-from gyrofuse.mismatch.testimony import combined, testimony
+from gyrofuse.mismatch.testimony import WITNESSES, combined, testimony
 from gyrofuse.mismatch.twins import FEWEST, twin_p_values
 from gyrofuse.recording import Recording
 from gyrofuse.simulate import ArrayModel
@@ -33,7 +35,7 @@ _MOST, _OF_A_KIND = 20, 6  # findings: a recording that needs more is another in
 
 def diagnose(
     recording: Recording | Tensor,
-    simulation: Recording | Tensor | Model | ArrayModel,
+    simulation: Recording | Tensor | Model | ArrayModel | RepairedModel,
     *,
     false_alarm: float = 0.01,
     rate: float | None = None,
@@ -46,7 +48,8 @@ def diagnose(
     Args:
         recording: What a real array gave; its auxiliary channels are used. A tensor is `(sensor, time)`.
         simulation: What a simulator gives for the same array: samples, of any length and without channels, or a noise
-            model, one for all sensors, with batched parameters one for each, or an `ArrayModel`.
+            model, one for all sensors, with batched parameters one for each, or an `ArrayModel`; or a simulation that
+            another diagnosis repaired (`report.model`), whose effects then count as known.
         false_alarm: Probability of a finding where nothing is missing.
         rate: Hz, for recordings given as tensors; 1 by default.
         twins: How many twins of the recording, in which nothing is missing, tell how surprising the witnesses are.
@@ -70,8 +73,10 @@ def diagnose(
         raise ValueError(f"`twins`: expected 0, or {FEWEST} or more, got {twins}; fewer cannot tell a tail")
     if generator is None:
         generator = torch.Generator().manual_seed(0)
+    level = uncorrected(false_alarm, len(WITNESSES))  # what would be a mismatch, had one witness alone said it
     start = prepared(recording, simulation, rate, generator)
-    model = RepairedModel(noise_of(simulation, start), start.scene)
+    start, own = with_own_effects(start, simulation, level, generator)
+    model = RepairedModel(noise_of(simulation, start), start.scene, own, noise_samples(simulation))
     evidence = testimony(start, lambda what, share: progress(what, _LOOKED * share))
     p_value = combined(evidence)
     if twins:
@@ -91,8 +96,6 @@ def diagnose(
         )
     case: Case = start
     links: list[Link] = []
-    # What would have been a mismatch, had one witness alone said it.
-    level = uncorrected(false_alarm, len(evidence))
     for number, stage in enumerate(STAGES):
         progress(", ".join(m.name for m in stage), _LOOKED + (_NAMED - _LOOKED) * number / len(STAGES))
         while len(links) < _MOST:
@@ -116,7 +119,7 @@ def diagnose(
     gains = [link.gain for link in links]
     after = testimony(case, lambda what, share: progress(what, _COMPARED + (_CHECKED - _COMPARED) * share))
     left = [e for e in after if corrected(e.p_value, len(evidence)) <= false_alarm]
-    effects = tuple(f.effect for f in findings)
+    effects = (*own, *(f.effect for f in findings))
     asking = [e.p_value for e in left if e.witness in ASKED_FOR_BY]
     if asking:
         remainder = Remainder.of(case)

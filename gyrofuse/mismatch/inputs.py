@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -13,6 +14,7 @@ from gyrofuse._result import named, numbered
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.known_lines import amplitudes
 from gyrofuse.mismatch.lines import simulated_lines
+from gyrofuse.mismatch.repaired import RepairedModel
 from gyrofuse.recording import Recording
 from gyrofuse.simulate import ArrayModel
 
@@ -25,7 +27,7 @@ _SEARCHES = 4  # for lines
 
 def prepared(
     recording: Recording | Tensor,
-    simulation: Recording | Tensor | Model | ArrayModel,
+    simulation: Recording | Tensor | Model | ArrayModel | RepairedModel,
     rate: float | None,
     generator: torch.Generator,
 ) -> Case:
@@ -41,6 +43,11 @@ def prepared(
         signal = check_signal("recording", recording)
         scene = Scene(1.0 if rate is None else check_positive("rate", rate), "unknown", numbered(signal.shape[-2]))
     signal = _checked("recording", signal, scene)
+    noise_samples = 0
+    if isinstance(simulation, RepairedModel):
+        known = replace(simulation.scene, channels=scene.channels)
+        replace(simulation, scene=known).check(scene.rate, scene.unit)
+        noise_samples, simulation = simulation.noise_samples, simulation.noise
     if isinstance(simulation, Model | ArrayModel):
         drawn = _drawn(simulation, len(signal), signal.shape[-1], generator)
     else:
@@ -53,6 +60,8 @@ def prepared(
     _check_own("recording", signal)
     _check_own("simulation", drawn[0])
     case = Case.of(scene, signal, drawn)
+    if noise_samples:
+        case = replace(case, simulated=replace(case.simulated, told_by=noise_samples))
     return case.knowing(_lines(simulation, case))
 
 
@@ -78,16 +87,6 @@ def _lines(simulation: Recording | Tensor | Model | ArrayModel, case: Case) -> t
             break
     strength = amplitudes(case.simulated.signal, tuple(lines)).mean((0, 1)) if lines else torch.zeros(0)
     return tuple(lines[i] for i in strength.argsort(descending=True).tolist())
-
-
-def noise_of(simulation: Recording | Tensor | Model | ArrayModel, case: Case) -> ArrayModel:
-    """The simulation's noise as a model: the one given, or one that describes its samples."""
-    if isinstance(simulation, ArrayModel):
-        return simulation
-    if isinstance(simulation, Model):
-        rows = simulation.params.expand(case.n_sensors, -1)
-        return ArrayModel.from_sensors([simulation.with_params(row) for row in rows])
-    return case.base.model()
 
 
 def _drawn(model: Model | ArrayModel, n_sensors: int, n_samples: int, generator: torch.Generator) -> Tensor:
@@ -120,7 +119,7 @@ def _samples(simulation: Recording | Tensor, scene: Scene, n_samples: int, *, fr
         signal = check_signal("simulation", simulation)
     else:
         raise TypeError(
-            f"`simulation`: expected a recording, a tensor (sensor, time), a model or an array model, "
+            f"`simulation`: expected a recording, a tensor (sensor, time), a model, an array model or a repaired one, "
             f"got {type(simulation).__name__}"
         )
     signal = _checked("simulation", signal, scene)

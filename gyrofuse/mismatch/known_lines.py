@@ -24,10 +24,15 @@ def without_lines(signal: Tensor, frequencies: tuple[float, ...]) -> Tensor:
     return torch.cat(parts, -1)
 
 
+def line_parts(signal: Tensor, frequencies: tuple[float, ...]) -> Tensor:
+    """Amplitudes and phases of lines in the middle of signals `(..., time)`, complex, `(..., line)`."""
+    cosine, sine, *_ = _coefficients(signal, frequencies).split(len(frequencies), -1)
+    return torch.complex(cosine, -sine)
+
+
 def amplitudes(signal: Tensor, frequencies: tuple[float, ...]) -> Tensor:
     """Of lines in the middle of signals `(..., time)`, `(..., line)`; of variance `2 S / n` in noise of density `S`."""
-    cosine, sine, *_ = _coefficients(signal, frequencies).split(len(frequencies), -1)
-    return torch.hypot(cosine, sine)
+    return line_parts(signal, frequencies).abs()
 
 
 def precise(signal: Tensor, frequencies: tuple[float, ...]) -> tuple[float, ...]:

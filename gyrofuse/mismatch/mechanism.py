@@ -34,6 +34,7 @@ class Mechanism:
 
     name: ClassVar[str]
     happened_once: ClassVar[bool] = False  # at a time of this recording, not in another one
+    proportional_to: ClassVar[str] = ""  # field, where it adds a known path to every record of the same time
     place: ClassVar[int] = 0  # in the chain from sensor to numbers: clipped, rounded, repeated come after all else
 
     @classmethod

@@ -96,12 +96,14 @@ def missing_recurrences(case: Case) -> dict[int, tuple[Recurring, float]]:
     """Values that recur in the recording but not as often in the simulation, by sensor, with p values."""
     missing = {}
     n, other_n = case.n_samples, case.simulated.signal.shape[-1]
-    for own, other in zip(recurring_values(case.recorded), recurring_values(case.simulated), strict=True):
+    others = recurring_values(case.simulated)
+    simulated = any(other is not None and other.p_value < _OWN for other in others)
+    for own, other in zip(recurring_values(case.recorded), others, strict=True):
         if own is None:
             continue
         p = own.p_value
-        if other is not None and other.p_value < _OWN:
-            both = own.times + other.times
+        if simulated:  # in other sensors too few to be seen by themselves
+            both = own.times + (0 if other is None else other.times)
             p = max(p, float(stats.binom.sf(own.times - 1, both, n / (n + other_n))))
         missing[own.sensor] = (own, corrected(p, case.n_sensors))
     return missing

@@ -25,11 +25,13 @@ class RepairedModel:
         noise: Of the array.
         scene: Rate, unit, sensors and auxiliary channels of the recording.
         effects: In the order in which they were found; those of the converter act last.
+        noise_samples: Of a simulation, in each sensor, that the noise was estimated from; 0 where it is known.
     """
 
     noise: ArrayModel
     scene: Scene
     effects: tuple[Mechanism, ...] = ()
+    noise_samples: int = 0
 
     def __add__(self, effect: Mechanism) -> RepairedModel:
         return replace(self, effects=(*self.effects, effect)) if isinstance(effect, Mechanism) else NotImplemented
@@ -91,6 +93,7 @@ class RepairedModel:
         scene = self.scene
         return {
             "noise": self.noise.to_dict(),
+            "noise_samples": self.noise_samples,
             "effects": [
                 {"mechanism": effect.name, "kind": type(effect).__name__, "numbers": _plain(effect)}
                 for effect in self.effects

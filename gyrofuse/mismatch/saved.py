@@ -37,7 +37,7 @@ def repaired_from_dict(description: Mapping[str, Any]) -> RepairedModel:
         ) from None
     if not isinstance(noise, ArrayModel):
         raise ValueError("`description`: expected the noise of an array, got that of a sensor")
-    return RepairedModel(noise, scene, effects)
+    return RepairedModel(noise, scene, effects, int(description.get("noise_samples", 0)))
 
 
 def _effect(entry: Mapping[str, Any]) -> Mechanism:

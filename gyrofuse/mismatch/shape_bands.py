@@ -137,7 +137,7 @@ def _sides(case: Case) -> tuple[Side, Side]:
     """Both sides in narrow bands."""
     scale = case.simulated.signal.shape[-1] / case.n_samples
     fine = narrow_bands(case.n_samples, least=math.ceil(_WIDTH / scale))
-    return Side(case.recorded.noise, fine), Side(case.simulated.noise, fine)
+    return case.recorded.in_bands(fine), case.simulated.in_bands(fine)
 
 
 @remembered
@@ -196,27 +196,27 @@ def _dof(groups: Groups) -> Tensor:
 
 def _simulated_dof(side: Side, groups: Groups) -> Tensor:
     """Of all records of a side; none of shorter ones."""
-    return _dof(groups) * len(side.signal) * (side.signal.shape[-1] == side.bands.n_samples)
+    return _dof(groups) * side.n_records * (side.signal.shape[-1] == side.bands.n_samples)
 
 
 class _Blocks(dict[int, Side]):
     """A side's records cut into blocks, by their length: the same for all folds."""
 
-    def __init__(self, signal: Tensor) -> None:
+    def __init__(self, signal: Tensor, told_by: float) -> None:
         super().__init__()
-        self.signal = signal
+        self.signal, self.told_by = signal, told_by
 
     def __missing__(self, block: int) -> Side:
         n = self.signal.shape[-1] // block * block
         cut = self.signal[..., :n].unflatten(-1, (-1, block)).movedim(-2, -3).flatten(0, 1)
-        self[block] = Side(cut, bands(block))
+        self[block] = Side(cut, bands(block), told_by=self.told_by)
         return self[block]
 
 
 @remembered
 def in_blocks(side: Side) -> _Blocks:
     """Sides by the length of the blocks that they are cut into."""
-    return _Blocks(side.noise)
+    return _Blocks(side.noise, side.told_by)
 
 
 @functools.lru_cache(maxsize=8)

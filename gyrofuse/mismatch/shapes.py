@@ -112,7 +112,7 @@ def chosen_shape(case: Case, name: str, level: float) -> Shape | None:
 def compared(case: Case, per_octave: int = _PER_OCTAVE) -> Ratios:
     """Spectra of a case, without bands that hold a line which is not explained."""
     wanted = narrow_bands(case.n_samples, per_octave)
-    both = deep(case, Side(case.recorded.noise, wanted), Side(case.simulated.noise, wanted))
+    both = deep(case, case.recorded.in_bands(wanted), case.simulated.in_bands(wanted))
     n_slow, usable = len(both.d) - len(wanted.dof), torch.ones_like(both.d)
     scale = case.simulated.signal.shape[-1] / case.n_samples
     if scale < 1:  # the lowest bins of short records hold what leaks from below

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -26,11 +27,24 @@ class Side:
         bands: Bands of frequency of the recording, for both sides.
         lines: Frequencies that the simulation has lines at, cycles per sample: no noise, and left out where noise is
             looked at.
+        told_by: Samples of each sensor that the noise is known from, where they are fewer: those that a model, which
+            these were drawn from, was estimated from.
     """
 
     signal: Tensor
     bands: Bands
     lines: tuple[float, ...] = ()
+    told_by: float = math.inf
+
+    @property
+    def n_records(self) -> float:
+        """Records that tell of the noise."""
+        n_records, _, n = self.signal.shape
+        return min(n_records, self.told_by / n)
+
+    def in_bands(self, bands: Bands) -> Side:
+        """The noise in other bands."""
+        return Side(self.noise, bands, told_by=self.told_by)
 
     @cached_property
     def noise(self) -> Tensor:
@@ -45,14 +59,13 @@ class Side:
     @cached_property
     def dof(self) -> Tensor:
         """What a band is worth, independent complex ordinates, `(band,)`; 0 where records are too short to say."""
-        n_records, _, n = self.signal.shape
-        scale = n / self.bands.n_samples
+        scale = self.signal.shape[-1] / self.bands.n_samples
         if scale == 1:
-            return n_records * self.bands.dof
+            return self.n_records * self.bands.dof
         edges = [round(edge * scale) for edge in self.bands.edges]
         return torch.tensor(
             [
-                n_records * degrees_of_freedom(max(b - a, 1)) if a >= _LEAST_BIN else 0.0
+                self.n_records * degrees_of_freedom(max(b - a, 1)) if a >= _LEAST_BIN else 0.0
                 for a, b in itertools.pairwise(edges)
             ],
             dtype=torch.float64,

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -38,6 +38,7 @@ class SlowEffect(Mechanism):
         log_factors: Of the slow noise beside it, `(sensor, part)`, against the simulation's: for weights.
     """
 
+    proportional_to: ClassVar[str] = "size"
     size: Tensor
     log_factors: Tensor
 

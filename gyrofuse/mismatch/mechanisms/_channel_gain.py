@@ -33,6 +33,7 @@ class ChannelGain(Mechanism):
         kind: Which rows are made from the channel.
     """
 
+    proportional_to: ClassVar[str] = "coupling"
     of_one_band: ClassVar[tuple[str, ...]] = ()
     quantity: ClassVar[str] = "gain"
     channel: str
@@ -73,7 +74,7 @@ class ChannelGain(Mechanism):
         unit, factor = cls._unit(case.scene, name)
         sizes = {i: _size(fit, i, unit, factor) for i in present}
         largest = max(sizes, key=lambda i: abs(sizes[i].value))
-        where = case.scene.named(present, "every sensor")
+        where = f"the output of {case.scene.named(present, 'every sensor')}"
         rows = cls._rows(case.scene, name)[kind]
         busiest = (
             float(torch.fft.rfft(rows - rows.mean(-1, keepdim=True)).abs().square().sum(0).argmax()) / case.n_samples

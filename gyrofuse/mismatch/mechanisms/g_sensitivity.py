@@ -34,7 +34,7 @@ class GSensitivity(ChannelGain):
             return replace(finding, alternatives=("common_mode",))
         if finding is None or not finding.alternatives:
             return finding
-        where = case.scene.named(finding.sensors, "every sensor")
+        where = f"the output of {case.scene.named(finding.sensors, 'every sensor')}"
         return not_identifiable(finding, f"{where} moves with {finding.channel} in one narrow band alone")
 
     @classmethod

@@ -17,6 +17,8 @@ from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.mechanisms.dead_band import DeadBand
 
 _TABLE = 1024  # points of a law
+_EVEN = 3.0  # steps, sd: over more of them all distances from the lattice are as likely
+_TAILS = 6.0  # sd
 _SHARPEST = 0.02  # blur in steps: what an exact lattice is worth is bounded by it
 
 
@@ -78,15 +80,13 @@ class Quantization(Mechanism):
         return Quantization(self.step, offset, torch.where(self.blur > 0, blur, self.blur))
 
     def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
-        """Distances from the lattice get the law that they have in the recording, in the order in which they are.
+        """Values get the law that they have in the recording, in the order in which they are.
 
         Without blur that is rounding. Hidden under noise that the simulation knows already, it adds next to nothing.
         """
-        place = (signal - self.offset[:, None]) / self._divisor
-        nearest = place.round()
-        rows = (place - nearest).movedim(-2, 0).contiguous()
-        moved = torch.stack([_pulled(row, float(blur)) for row, blur in zip(rows, self.blur, strict=True)], -2)
-        return torch.where(self.step[:, None] > 0, (nearest + moved) * self._divisor + self.offset[:, None], signal)
+        place = ((signal - self.offset[:, None]) / self._divisor).movedim(-2, 0)
+        moved = torch.stack([_blurred(row, float(blur)) for row, blur in zip(place, self.blur, strict=True)], -2)
+        return torch.where(self.step[:, None] > 0, moved * self._divisor + self.offset[:, None], signal)
 
     def gains(self, case: Case, fold: int) -> Tensor:
         return held_out_blocks(self._scores(case.recording), fold).sum((0, -1))
@@ -109,6 +109,29 @@ class Quantization(Mechanism):
         information = float((slope.square() / density.clamp(min=1e-12)).mean()) * 1024**2
         spread = float((signal / self.step[sensor]).std())
         return float(self.step[sensor]) / math.sqrt(max(information * len(signal) * spread**2, 1e-300))
+
+
+def _blurred(place: Tensor, blur: float) -> Tensor:
+    """Values, steps, mapped in order to such as were rounded and got a blur."""
+    spread = float(place.std())
+    variance = spread**2 - blur**2 - 1 / 12  # before rounding
+    if blur == 0 or spread > _EVEN or variance <= 0:
+        nearest = place.round()
+        return nearest + _pulled((place - nearest).contiguous(), blur)
+    # Over a few steps their shares are those of a normal variable.
+    middle, reach = float(place.mean()), math.ceil(_TAILS * spread)
+    table = middle + spread * torch.linspace(-_TAILS, _TAILS, _TABLE + 1, dtype=torch.float64)
+    steps = torch.arange(round(middle) - reach, round(middle) + reach + 1, dtype=torch.float64)
+    edges = torch.special.ndtr((torch.cat([steps - 0.5, steps[-1:] + 0.5]) - middle) / math.sqrt(variance))
+    below = torch.special.ndtr((table[:, None] - steps) / blur) @ (edges.diff() / edges.diff().sum())
+    wanted = torch.special.ndtr((table - middle) / spread)
+    # Where values of the one law lie in the other, and from there on as far away as they were.
+    right = torch.searchsorted(below, wanted).clamp(1, _TABLE)
+    share = (wanted - below[right - 1]) / (below[right] - below[right - 1]).clamp(min=1e-300)
+    moved = table[right - 1] + share.clamp(0, 1) * (table[right] - table[right - 1]) - table
+    at = ((place - table[0]) / (table[1] - table[0])).clamp(0, _TABLE - 1e-9)
+    before = at.long()
+    return place + torch.lerp(moved[before], moved[before + 1], at - before)
 
 
 def _pulled(place: Tensor, blur: float) -> Tensor:

@@ -1,0 +1,160 @@
+"""What a simulation has already is not found missing: of a repaired one by its names, of samples by looking."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+import gyrofuse as gf
+from gyrofuse.mismatch.mechanisms.g_sensitivity import GSensitivity
+from gyrofuse.mismatch.mechanisms.quantization import Quantization
+from gyrofuse.mismatch.mechanisms.step import Step
+from gyrofuse.mismatch.repaired import RepairedModel
+
+N, P, RATE = 16384, 3, 100.0
+NOISE = gf.ArrayModel.from_sensors([gf.WhiteNoise(1.0 + i / 10) + gf.AR1(0.99, 1e-3) for i in range(P)])
+SIZE = torch.tensor([0.6, -0.8, 0.0], dtype=torch.float64)
+
+
+def generator(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def shaking() -> Tensor:
+    return gf.AR1(0.9, 1e-2).simulate(N, batch=(1,), generator=generator(7))
+
+
+def following(gain: float) -> Callable[[Tensor], Tensor]:
+    return lambda x: x + gain * SIZE[:, None] * shaking()
+
+
+def stepping(size: float) -> Callable[[Tensor], Tensor]:
+    return lambda x: x + size * SIZE[:, None] * (torch.arange(N) >= 9000)
+
+
+def rounded(x: Tensor) -> Tensor:
+    late = torch.randn(x.shape, generator=generator(8), dtype=torch.float64)
+    return 1.2 * torch.round(x / 1.2) + 0.45 * late
+
+
+def dead(x: Tensor) -> Tensor:
+    return torch.where(x.abs() < 2e-3, 0.0, x)
+
+
+def recording(x: Tensor) -> gf.Recording:
+    return gf.Recording(x, rate=RATE, unit="deg/s", channels={"acceleration": shaking()})
+
+
+def drawn(seed: int, *, records: int = 1) -> Tensor:
+    noise = NOISE.simulate(N, batch=(records,), generator=generator(seed))
+    return noise.movedim(0, 1).flatten(1)
+
+
+def noise_like(change: Callable[[Tensor], Tensor]) -> gf.ArrayModel:
+    """Noise as strong as what hidden rounding leaves."""
+    before, after = drawn(90), change(drawn(90))
+    stronger = (after.diff().var(-1) / before.diff().var(-1)).tolist()
+    sensors = [gf.WhiteNoise(f * (1 + i / 10)) + gf.AR1(0.99, 1e-3) for i, f in enumerate(stronger)]
+    return gf.ArrayModel.from_sensors(sensors)
+
+
+@pytest.mark.parametrize(
+    ("change", "mechanism"),
+    [(following(3.0), "g_sensitivity"), (stepping(2.0), "step"), (dead, "quantization"), (rounded, "quantization")],
+)
+def test_a_simulation_that_was_repaired_is_not_repaired_again(change: Callable[[Tensor], Tensor], mechanism: str):
+    given = recording(change(drawn(1)))
+    simulation = noise_like(change) if change is rounded else NOISE
+    first = gf.diagnose(given, simulation)
+    assert mechanism in {f.mechanism for f in first.findings}
+    again = gf.diagnose(given, first.model)
+    assert not again.mismatch
+    assert [type(e) for e in again.model.effects] == [type(e) for e in first.model.effects]
+    torch.testing.assert_close(again.correct(given).signal, first.correct(given).signal)
+    samples = first.model.simulate(N, generator=generator(3))
+    assert not gf.diagnose(given, recording(samples)).mismatch
+
+
+@pytest.mark.parametrize(("change", "kind"), [(following, GSensitivity), (stepping, Step)])
+def test_more_than_the_simulation_has_is_the_difference(change: Callable[[float], Callable[[Tensor], Tensor]], kind):
+    given = recording(change(5.0)(drawn(11)))
+    found = gf.diagnose(given, recording(change(2.0)(drawn(12))))
+    own, missing = (effect for effect in found.model.effects if isinstance(effect, kind))
+    (finding,) = found.findings
+    assert finding.effect is missing
+    sizes = [getattr(effect, effect.proportional_to).flatten()[:2] for effect in (own, missing)]
+    torch.testing.assert_close(sizes[0] / SIZE[:2], torch.full((2,), 2.0, dtype=torch.float64), rtol=0, atol=0.5)
+    torch.testing.assert_close(sizes[1] / SIZE[:2], torch.full((2,), 3.0, dtype=torch.float64), rtol=0, atol=0.7)
+    for name, entry in finding.parameters.items():
+        if name.startswith(("gain", "size")):
+            assert entry.low < entry.value < entry.high
+
+
+def test_a_simulation_with_the_effect_is_seldom_doubted():
+    false_alarms = 0
+    for seed in range(20):
+        given = recording(following(3.0)(drawn(100 + seed)))
+        simulation = torch.cat([following(3.0)(x) for x in drawn(200 + seed, records=2).split(N, -1)], -1)
+        false_alarms += gf.diagnose(given, recording_of_two(simulation)).mismatch
+    assert false_alarms <= 2  # of 20 at 1 %: one in a thousand
+
+
+def test_a_model_of_samples_is_no_surer_than_they_were():
+    false_alarms = 0
+    for seed in range(20):
+        given = recording(following(3.0)(drawn(300 + seed)))
+        first = gf.diagnose(given, recording_of_two(drawn(400 + seed)))
+        assert first.model.noise_samples == N
+        false_alarms += gf.diagnose(given, first.model).mismatch
+    assert false_alarms <= 2
+
+
+def recording_of_two(x: Tensor) -> gf.Recording:
+    return gf.Recording(x, rate=RATE, unit="deg/s")
+
+
+def test_one_that_is_repaired_has_to_fit_the_recording():
+    model = RepairedModel(NOISE, gf.diagnose(recording(drawn(1)), NOISE).model.scene)
+    follows = model + GSensitivity("acceleration", SIZE[:, None])
+    bare = gf.Recording(drawn(1), rate=RATE, unit="deg/s")
+    with pytest.raises(ValueError, match="`channels`: expected acceleration, which the simulation follows, got none"):
+        gf.diagnose(bare, follows)
+    with pytest.raises(ValueError, match="`rate`: expected that of the repaired simulation, 100 Hz, got 50 Hz"):
+        gf.diagnose(drawn(1), model, rate=50.0)
+    with pytest.raises(ValueError, match="`simulation`: expected 2 sensors as in the recording, got 3"):
+        gf.diagnose(drawn(1)[:2], model, rate=RATE)
+
+
+def test_samples_are_described_with_what_their_sensors_share_and_with_their_lines():
+    r = torch.tensor([[1.0, 0.6, 0.0], [0.6, 1.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    gains = torch.tensor([0.3, -0.2, 0.0], dtype=torch.float64)
+    alone = torch.eye(3, dtype=torch.float64)
+    simulator = gf.ArrayModel([(gf.WhiteNoise(1.0), r), (gf.AR1(0.99, 4e-3), alone), (gf.Sinusoid(1.0, 0.7), gains)])
+    given, samples = (simulator.simulate(n, generator=generator(n)) for n in (N, 4 * N))
+    model = gf.diagnose(given, samples, rate=RATE).model
+    assert not gf.diagnose(given, model, rate=RATE).mismatch
+    expected, found = (m.wavelet_cross_covariance(8) for m in (simulator, model.noise))
+    size = expected.diagonal(dim1=-2, dim2=-1).rsqrt()
+    unit = size[:, :, None] * size[:, None, :]
+    torch.testing.assert_close(found * unit, expected * unit, rtol=0, atol=0.15)
+    (line,) = (matrix for process, matrix in model.noise.components if isinstance(process, gf.Sinusoid))
+    torch.testing.assert_close(line * line[0].sign(), gains, rtol=0, atol=0.03)
+
+
+def test_hidden_rounding_over_a_few_steps_has_the_law_of_rounding_and_later_noise():
+    # Straight from physics: what is rounded, and what comes on top.
+    step, sd, later = 1.0, 0.5, 0.44
+    g = generator(21)
+    n = 2**18
+    clean, late = (torch.randn(n, generator=g, dtype=torch.float64) for _ in range(2))
+    physical = torch.round(sd * clean) + later * late
+    plain = float(physical.std()) * torch.randn(1, n, generator=g, dtype=torch.float64)
+    one = torch.ones(1, dtype=torch.float64)
+    made = Quantization(step * one, 0 * one, later * one).simulated(plain, None, g)[0]  # type: ignore[arg-type]
+    for u in torch.linspace(0.5, 7.0, 27, dtype=torch.float64):
+        expected = torch.exp(1j * u * physical).mean()
+        assert abs(torch.exp(1j * u * made).mean() - expected) < 5 / n**0.5, u
+    assert float(torch.corrcoef(torch.stack([plain[0], made]))[0, 1]) > 0.99
