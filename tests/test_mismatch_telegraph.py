@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from mismatch_draws import LEVEL, nominated
-from scipy import stats
+from scipy import linalg, stats
 from torch import Tensor
 
 from gyrofuse import AR1, RandomWalk, WhiteNoise
@@ -73,26 +73,33 @@ def test_the_rival_has_the_likelihood_of_the_normal_law() -> None:
         assert mine == pytest.approx(log_density(y, np.full(30, y.mean()), matrix), abs=1e-6)
 
 
-def every_path(y: np.ndarray, half: float, up: float, down: float) -> float:
+def every_path(y: np.ndarray, half: float, up: float, down: float, noise: np.ndarray) -> float:
+    """Summed over all paths; of blocks in which the level moves it may be anywhere between."""
     n = len(y)
-    leave, enter = 1 - math.exp(-1 / up), 1 - math.exp(-1 / down)
-    move = {(1, 1): 1 - leave, (1, -1): leave, (-1, 1): enter, (-1, -1): 1 - enter}
-    paths = np.array(list(itertools.product((1, -1), repeat=n + 1)))  # one block ahead of the first
-    prior = np.where(paths[:, 0] == 1, enter, leave) / (leave + enter)
-    for a in range(n):
-        prior = prior * np.array([move[i, j] for i, j in paths[:, [a, a + 1]].tolist()])
-    densities = log_density(y - half * (paths[:, :-1] + paths[:, 1:]) / 2, np.full(n, y.mean()), covariance(n))
-    return float(np.log((prior * np.exp(densities)).sum()))
+    rates = np.array([[-1 / up, 1 / up], [1 / down, -1 / down]])
+    move = linalg.expm(rates)  # from upper and lower, after a block
+    paths = np.array(list(itertools.product((0, 1), repeat=n + 1)))  # one block ahead of the first
+    prior = np.where(paths[:, 0] == 0, up, down) / (up + down)
+    total = 0.0
+    for path, p in zip(paths, prior, strict=True):
+        level, moves = half * (1 - 2 * path), path[:-1] != path[1:]
+        matrix = noise + np.diag(moves * half**2 / 3)
+        density = log_density(y - (level[:-1] + level[1:]) / 2, np.full(n, y.mean()), matrix)
+        total += p * move[path[:-1], path[1:]].prod() * math.exp(float(density))
+    return math.log(total)
 
 
 def test_the_likelihood_of_two_levels_sums_over_all_paths() -> None:
-    y = np.random.default_rng(2).normal(size=10) * 0.7 + np.repeat([1, -1], 5)
-    truth = every_path(y, 1.0, 4.0, 6.0)
+    y = np.random.default_rng(2).normal(size=8) * 0.7 + np.repeat([1, -1], 4)
     numbers = (np.array([1.0, 0.3]), np.array([4.0, 2.0]), np.array([6.0, 9.0]))
-    all_paths = switching_values(y, BACKGROUND, *numbers, 4096).sum(-1)
-    assert all_paths[0] == pytest.approx(truth, abs=1e-9)
-    assert all_paths[1] == pytest.approx(every_path(y, 0.3, 2.0, 9.0), abs=1e-9)
-    assert switching_values(y, BACKGROUND, *numbers, 256).sum(-1)[0] == pytest.approx(truth, abs=0.1)
+    white = Background(WHITE, PHI, 0 * STEPS, 0 * START)
+    # Gains in coloured noise are those of blocks in which no level moves.
+    for background, noise, tolerance in ((white, WHITE * np.eye(8), 1e-9), (BACKGROUND, covariance(8), 0.1)):
+        all_paths = switching_values(y, background, *numbers, 1024).sum(-1)
+        truth = every_path(y, 1.0, 4.0, 6.0, noise)
+        assert all_paths[0] == pytest.approx(truth, abs=tolerance)
+        assert all_paths[1] == pytest.approx(every_path(y, 0.3, 2.0, 9.0, noise), abs=tolerance)
+        assert switching_values(y, background, *numbers, 64).sum(-1)[0] == pytest.approx(truth, abs=0.1)
 
 
 def test_thinning_keeps_the_heavy_and_is_unbiased() -> None:

@@ -128,7 +128,9 @@ def switching_values(y: Array, background: Background, half: Array, up: Array, d
     gains, s = _filter(background, len(y))
     uniform = np.random.default_rng(0).random(len(y))  # the same for all trials, so that their values compare
     n_trials, n_parts = len(half), len(background.phi)
-    leave, enter = -np.expm1(-1 / up)[:, None], -np.expm1(-1 / down)[:, None]
+    # From one block's end to the next one's: who goes and comes back in between has not moved.
+    rate = 1 / up + 1 / down
+    leave, enter = (-np.expm1(-rate) / rate / up)[:, None], (-np.expm1(-rate) / rate / down)[:, None]
     upper = np.tile([False, True], (n_trials, 1))
     weight = np.concatenate([leave, enter], 1) / (leave + enter)
     mean = np.zeros((n_trials, 2, n_parts))
@@ -139,9 +141,11 @@ def switching_values(y: Array, background: Background, half: Array, up: Array, d
         mean = mean * background.phi
         e = value - mean.sum(-1)
         level = np.where(upper, half[:, None], -half[:, None])
-        left = np.concatenate([e - level, e], 1)  # of paths that stay, and of those that move: half way, on average
         moved = weight * np.where(upper, leave, enter)
-        log_l = left**2 * (-0.5 / s[k])
+        # Paths that stay, and those that move: half way on average, and anywhere between the levels.
+        wider = np.concatenate([np.ones_like(e), np.broadcast_to(1 + half[:, None] ** 2 / (3 * s[k]), e.shape)], 1)
+        left = np.concatenate([e - level, e], 1) / wider
+        log_l = left**2 * wider * (-0.5 / s[k]) - np.log(wider) / 2
         largest = log_l.max(1, keepdims=True)
         weight = np.concatenate([weight - moved, moved], 1) * np.exp(log_l - largest)
         total = weight.sum(1, keepdims=True)
