@@ -85,6 +85,7 @@ def diagnose(
         simulated = _simulation(simulation, recording, axis, sensors, rate, unit)
         part = at_rest(recording, resting)
         found, remarks = _diagnosed(part, simulated, (titled(logs), simulation), false_alarm, twins)
+        remarks += _units_taken(recording, simulated, (titled(logs), simulation.name))
         if corrected:
             whole, _ = without_gaps(part, "", 0)
             clean = found.correct(whole)
@@ -130,6 +131,16 @@ def _diagnosed(
             for parameter, told in {**files, **options}.items():
                 message = message.replace(parameter, told)
             raise type(error)(message) from None
+
+
+def _units_taken(recording: Recording, simulation: object, names: tuple[str, str]) -> list[str]:
+    """What was assumed where one of two recordings, or both, state no unit."""
+    if not isinstance(simulation, Recording) or "unknown" not in (recording.unit, simulation.unit):
+        return []
+    if recording.unit == simulation.unit:
+        return [f"Units: neither {names[0]} nor {names[1]} states one; their numbers are compared as they are."]
+    pair = (names[0], simulation.unit) if recording.unit == "unknown" else (names[1], recording.unit)
+    return [f"Units: {pair[0]} states none; its numbers are taken as {pair[1]}."]
 
 
 def _simulation(

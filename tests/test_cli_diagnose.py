@@ -6,6 +6,7 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from conftest import Run
@@ -108,6 +109,19 @@ def test_gaps_of_the_simulation_and_a_recording_left_as_it_came_are_told(run: Ru
     assert f"Simulation: compared on 10.02 to {2 * N / RATE:.6g} s alone" in told
     assert "Nothing was found that can be taken off: c.npz is the recording as it came." in told
     torch.testing.assert_close(gf.read_recording("c.npz").signal, gf.read_recording(log).signal, rtol=0, atol=0)
+
+
+def test_units_that_nobody_states_are_told(run: Run, log: Path):
+    np.savez("bare.npz", gyro=drawn(N, 3).numpy(), fs=RATE)
+    np.savez("other.npz", gyro=drawn(N, 4).numpy(), fs=RATE)
+    for name, against, told in (
+        (log, "bare.npz", "Units: bare.npz states none; its numbers are taken as deg/s."),
+        ("bare.npz", "sim.npz", "Units: bare.npz states none; its numbers are taken as deg/s."),
+        ("bare.npz", "other.npz", "Units: neither bare.npz nor other.npz states one; their numbers are compared"),
+    ):
+        done = run("diagnose", name, "--simulation", against)
+        assert (done.status, told in " ".join(done.out.split())) == (0, True)
+    assert "Units" not in run("diagnose", log, "--simulation", "sim.npz").out
 
 
 def test_the_repaired_simulation_simulates_and_agrees(run: Run, log: Path):

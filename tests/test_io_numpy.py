@@ -50,6 +50,13 @@ class TestRecording:
         np.testing.assert_array_equal(streams[0].channels["acceleration"], table()[:3])
         assert all(stream.channels == {} for stream in streams[1:])
 
+    def test_another_rate_than_the_stated_one_is_told(self, tmp_path: Path):
+        path = save(tmp_path, gyro=table()[:3], fs=50.0)
+        (note,) = [n for n in gf.read_recording(path, rate=40.0).notes if n.kind == "clock"]
+        assert note.sentence == "the log states 50 Hz, 40 Hz was asked for"
+        assert gf.read_recording(path, rate=40.0).rate == 40.0
+        assert not [n for n in gf.read_recording(path, rate=50.0).notes if n.kind == "clock"]
+
     @pytest.mark.parametrize("orient", [np.asarray, np.transpose], ids=["time_last", "time_first"])
     def test_sensors_without_names_are_numbered(self, tmp_path: Path, orient):
         streams = numpy_log.read(save(tmp_path, gyro=orient(table()[:3])))

@@ -199,3 +199,16 @@ def test_sensors_that_add_up_to_nothing_are_refused():
     signal = array(1).signal
     with pytest.raises(ValueError, match="`recording`: expected sensors with noise of their own"):
         diagnose(signal - signal.mean(0), array(2).signal)
+
+
+@pytest.mark.parametrize("step", [3.0, 4.0])
+def test_of_values_that_hardly_leave_a_step_only_the_step_is_told(step: float):
+    g = torch.Generator().manual_seed(1)
+    noise = gf.ArrayModel.from_sensors([gf.WhiteNoise(1.0 + i / 10) + gf.AR1(0.99, 1e-3) for i in range(3)])
+    recording = step * torch.round(noise.simulate(2**15, generator=g) / step)
+    found = diagnose(recording, noise.simulate(2**15, generator=g), rate=100.0)
+    (finding,) = found.findings
+    assert finding.mechanism == "quantization"
+    assert finding.sentence.endswith("the noise of sensors 1, 2, 3 is so much smaller that nothing else can be told")
+    assert not found.unexplained
+    assert found.held_out.after < 2 < found.held_out.before

@@ -97,6 +97,8 @@ def diagnose(
     case: Case = start
     links: list[Link] = []
     for number, stage in enumerate(STAGES):
+        if any(link.finding.hides_others for link in links):
+            break
         progress(", ".join(m.name for m in stage), _LOOKED + (_NAMED - _LOOKED) * number / len(STAGES))
         while len(links) < _MOST:
             found = [link.finding for link in links]
@@ -118,7 +120,8 @@ def diagnose(
     findings = tuple(link.finding for link in links)
     gains = [link.gain for link in links]
     after = testimony(case, lambda what, share: progress(what, _COMPARED + (_CHECKED - _COMPARED) * share))
-    left = [e for e in after if corrected(e.p_value, len(evidence)) <= false_alarm]
+    hidden = any(f.hides_others for f in findings)
+    left = [e for e in after if corrected(e.p_value, len(evidence)) <= false_alarm and not hidden]
     effects = (*own, *(f.effect for f in findings))
     asking = [e.p_value for e in left if e.witness in ASKED_FOR_BY]
     if asking:

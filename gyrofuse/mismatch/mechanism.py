@@ -120,6 +120,7 @@ class Finding:
         gain_without: The same where all other findings are in: what is lost if it alone is left out.
         instead: Its best look-alike on the same blocks; None where nothing in the catalogue looks like it.
         sentence: The same in plain English.
+        hides_others: Whether no more can be told of a recording that has it.
     """
 
     mechanism: str
@@ -137,6 +138,7 @@ class Finding:
     held_out_gain: float | None = None
     gain_without: float | None = None
     instead: Instead | None = None
+    hides_others: bool = False
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, ready for JSON."""

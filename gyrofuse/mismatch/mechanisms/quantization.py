@@ -19,6 +19,7 @@ from gyrofuse.mismatch.mechanisms.dead_band import DeadBand
 _TABLE = 1024  # points of a law
 _EVEN = 3.0  # steps, sd: over more of them all distances from the lattice are as likely
 _TAILS = 6.0  # sd
+_TOO_COARSE = 0.75  # rms change between samples, steps: noise of 0.45 steps and the rounding itself
 _SHARPEST = 0.02  # blur in steps: what an exact lattice is worth is bounded by it
 
 
@@ -58,6 +59,9 @@ class Quantization(Mechanism):
             parameters[f"lsb[{i}]"] = Parameter(value, value - reach, value + reach, case.scene.unit)
         where = case.scene.named(sensors, "all sensors")
         hidden = ", hidden under what was added later" if float(blur.max()) > 0 else ""
+        coarse = _too_coarse(case.recording, found)
+        if coarse:
+            hidden += f"; the noise of {case.scene.named(coarse)} is so much smaller that nothing else can be told"
         return Finding(
             cls.name,
             effect,
@@ -67,6 +71,7 @@ class Quantization(Mechanism):
             parameters,
             levels=(1,),
             gain=float(effect._scores(case.recording).sum()),
+            hides_others=bool(coarse),
         )
 
     def refitted(self, case: Case, fold: int) -> Quantization:
@@ -109,6 +114,12 @@ class Quantization(Mechanism):
         information = float((slope.square() / density.clamp(min=1e-12)).mean()) * 1024**2
         spread = float((signal / self.step[sensor]).std())
         return float(self.step[sensor]) / math.sqrt(max(information * len(signal) * spread**2, 1e-300))
+
+
+def _too_coarse(signal: Tensor, found: dict[int, Lattice]) -> list[int]:
+    """Sensors `(sensor, time)` whose values hardly leave one step of an exact lattice from one sample to the next."""
+    change = signal.diff().square().mean(-1).sqrt()
+    return [i for i, own in found.items() if not own.blur and float(change[i]) < _TOO_COARSE * own.step]
 
 
 def _blurred(place: Tensor, blur: float) -> Tensor:
