@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.stats import beta
+from scipy.stats import beta, norm
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 from blind import (
@@ -74,6 +74,7 @@ def truth(group="mechanism", effects=None, kind="step", nats=30.0):
 def answer(*named, mismatch=True, **fields):
     findings = [{"mechanism": name, "alternatives": [], "sensors": [0, 2], **fields} for name in named]
     held_out = {"before": 1.5, "after": 1.0, "gain": {"value": 14.0, "low": 5.0, "high": 20.0}}
+    held_out["auc"] = {"before": 0.8, "after": 0.56}
     return {"mismatch": mismatch, "findings": findings, "unexplained": [], "held_out": held_out}
 
 
@@ -111,7 +112,10 @@ def test_judge_counts_by_hand():
     assert count("onset within 3 sd of the oracle") == (1, 1)
     assert count("interval covers", "step.step") == (1, 1)
     assert count("held-out score improves") == (4, 4)
-    assert verdict.to_dict()["figures"][0]["median"] == pytest.approx(0.8)  # 0.4 s of 0.5 s
+    assert count("area under the curve after, at most 0.55") == (0, 4)
+    told = {figure["line"]: figure for figure in verdict.to_dict()["figures"]}
+    assert told["onset error / sd of the oracle"]["median"] == pytest.approx(0.8)  # 0.4 s of 0.5 s
+    assert told["oracle has the exact sensors"]["mean"] == pytest.approx(norm.cdf(10**0.5) * norm.cdf(1.0))
     gain = next(f for f in verdict.figures if f.line.startswith("gain"))
     assert np.median(gain.values) == pytest.approx(0.5)
     low, high = verdict.row("false alarm").interval

@@ -185,7 +185,10 @@ def test_equals_are_told_as_such():
         gain_without=12.0,
         instead=Instead("warm_up_transient", 11.0, 2.0),
     )
-    assert otherwise_words(finding) == ("instead of step: warm up transient would do as well, 1.0 nats less (held out)")
+    assert otherwise_words(finding) == (
+        "instead of step: warm up transient cannot be told from it, and would gain 1.0 nats less "
+        "(held out, standard deviation 2.0)"
+    )
     assert otherwise_words(replace(finding, instead=None)) == ""
 
 

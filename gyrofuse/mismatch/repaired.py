@@ -84,8 +84,8 @@ class RepairedModel:
         followed = {str(getattr(effect, "channel", "")) for effect in self.effects} - {"", *scene.channels}
         if followed:
             raise ValueError(
-                f"`channels`: expected {', '.join(sorted(followed))}, which the simulation follows, got none; simulate "
-                "in Python, where `simulate` takes channels"
+                f"`channels`: expected {', '.join(sorted(followed))}, which the simulation follows, got none; to "
+                "diagnose, give a recording that has them; to simulate, use Python, where `simulate` takes channels"
             )
 
     def to_dict(self) -> dict[str, Any]:

@@ -74,9 +74,9 @@ def otherwise_words(finding: Finding) -> str:
         return ""
     less, sd = finding.gain_without - finding.instead.gain, finding.instead.sd
     start = f"instead of {mechanism_words(finding.mechanism)}: {mechanism_words(finding.instead.mechanism)}"
-    if finding.instead.mechanism in finding.alternatives:
-        return f"{start} would do as well, {nats(abs(less))} nats {'less' if less >= 0 else 'more'} (held out)"
-    return f"{start} would gain {nats(less)} nats less (held out, standard deviation {nats(sd)})"
+    alike = "cannot be told from it, and " if finding.instead.mechanism in finding.alternatives else ""
+    more = f"{nats(abs(less))} nats {'less' if less >= 0 else 'more'}"
+    return f"{start} {alike}would gain {more} (held out, standard deviation {nats(sd)})"
 
 
 def fused_words(outcome: Outcome) -> list[str]:

@@ -48,7 +48,7 @@ class Row(NamedTuple):
 
 
 class Figure(NamedTuple):
-    """A median with its quartiles: errors in the oracle's standard deviations, gains as shares of the true one's."""
+    """A mean, a median and quartiles: errors in the oracle's standard deviations, gains as shares of the true one's."""
 
     line: str
     of: str
@@ -58,7 +58,7 @@ class Figure(NamedTuple):
         """Plain numbers."""
         quartiles = np.quantile(self.values, [0.25, 0.5, 0.75])
         return {
-            "line": self.line, "of": self.of, "trials": len(self.values),
+            "line": self.line, "of": self.of, "trials": len(self.values), "mean": float(np.mean(self.values)),
             "lower_quartile": quartiles[0], "median": quartiles[1], "upper_quartile": quartiles[2],
         }  # fmt: skip
 
@@ -89,10 +89,14 @@ class Verdict(NamedTuple):
             lines.append(
                 f"{row.line:36}{row.of:30}{nats:>6}{row.hits:7}{row.trials:7}{share:8.3f}   {low:.3f} .. {high:.3f}"
             )
-        lines += ["", f"{'':36}{'of':30}{'':6}{'trials':>7}{'25 %':>10}{'median':>10}{'75 %':>10}", "-" * 112]
+        lines += [
+            "",
+            f"{'':36}{'of':30}{'':6}{'trials':>7}{'mean':>10}{'25 %':>10}{'median':>10}{'75 %':>10}",
+            "-" * 122,
+        ]
         for figure in map(Figure.to_dict, self.figures):
-            quartiles = (figure["lower_quartile"], figure["median"], figure["upper_quartile"])
-            numbers = "".join(f"{q:10.3g}" for q in quartiles)
+            told = (figure["mean"], figure["lower_quartile"], figure["median"], figure["upper_quartile"])
+            numbers = "".join(f"{value:10.3g}" for value in told)
             lines.append(f"{figure['line']:36}{figure['of']:30}{'':6}{figure['trials']:7}{numbers}")
         return "\n".join(lines)
 
@@ -169,7 +173,7 @@ def _single(counts: _Counts, figures: Any, truth: Record, answer: Record | None,
         (effect,) = truth["effects"]
         counts.add("oracle detects", scoring.oracle_detects(effect, false_alarm), (truth["kind"],), truth["nats"])
         counts.add(f"detected, simulation {_length(truth)}", scoring.detected(answer), (truth["kind"],), truth["nats"])
-        _details(counts, figures, effect, answer)
+        _details(counts, figures, effect, answer, truth["nats"])
         _held_out(counts, figures, truth, answer)
 
 
@@ -179,14 +183,19 @@ def _length(truth: Record) -> str:
     return "a model" if simulated is None else f"{simulated / truth['n_samples']:g} times as long"
 
 
-def _details(counts: _Counts, figures: Any, effect: Record, answer: Record | None, prefix: str = "") -> None:
+def _details(
+    counts: _Counts, figures: Any, effect: Record, answer: Record | None, nats: float | None, prefix: str = ""
+) -> None:
     """What is said of an effect whose name is right."""
     finding, name = scoring.match(effect, answer), effect["mechanism"]
     if finding is None or finding["mechanism"] != name:
         return
     exact, resolved = scoring.right_sensors(effect, finding)
-    counts.add(f"{prefix}exact sensors", exact, (name,))
-    counts.add(f"{prefix}exact sensors, resolved ones", resolved, (name,))
+    counts.add(f"{prefix}exact sensors", exact, (name,), nats)
+    counts.add(f"{prefix}exact sensors, resolved ones", resolved, (name,), nats)
+    chance = scoring.oracle_exact(effect)
+    if chance is not None and nats is not None:
+        figures[f"{prefix}oracle has the exact sensors", f"{nats:g} nats"].append(chance)
     for line, error in (
         ("frequency", scoring.frequency_error(effect, finding)),
         ("onset", scoring.onset_error(effect, finding)),
@@ -212,6 +221,9 @@ def _held_out(counts: _Counts, figures: Any, truth: Record, answer: Record | Non
     counts.add("held-out score improves", gain > 0, of)
     if held.get("before") is not None and held.get("after") is not None:
         counts.add("held-out discrepancy falls", held["after"] < held["before"], of)
+    left = (held.get("auc") or {}).get("after")
+    if left is not None:
+        counts.add("area under the curve after, at most 0.55", left <= 0.55, of)
     if (truth.get("true_gain") or 0) > 0:
         for name in (EVERYTHING, f"{truth['nats']:g} nats", of[0]):
             figures["gain / gain of the true model", name].append(gain / truth["true_gain"])
@@ -268,7 +280,7 @@ def _real(counts: _Counts, figures: Any, truth: Record, answer: Record | None, f
     counts.add("real: right name", finding is not None and finding["mechanism"] == effect["mechanism"], of, nats)
     counts.add("real: right class", finding is not None, of, nats)
     counts.add("real: something else named", bool(scoring.wrong_names(truth, answer)), of, nats)
-    _details(counts, figures, effect, answer, "real: ")
+    _details(counts, figures, effect, answer, nats, "real: ")
 
 
 _GROUPS: dict[str, Callable[[_Counts, Any, Record, Record | None, float], None]] = {

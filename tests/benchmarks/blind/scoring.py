@@ -68,6 +68,17 @@ def right_sensors(effect: Record, finding: Record) -> tuple[bool, bool]:
     return named == true, strong <= named <= true
 
 
+def oracle_exact(effect: Record) -> float | None:
+    """The chance that likelihood ratios which know the effect's size leave out none of its sensors.
+
+    The ratio of a sensor that holds n nats is close to Gaussian, of mean n and variance 2 n; below zero the sensor is
+    left out.
+    """
+    if not effect["sensor_nats"]:
+        return None
+    return math.prod(float(norm.cdf(math.sqrt(max(nats, 0.0) / 2))) for nats in effect["sensor_nats"])
+
+
 def frequency_error(effect: Record, finding: Record) -> float | None:
     """In Cramer-Rao standard deviations."""
     if effect["frequency_sd_hz"] is None or finding.get("frequency_hz") is None:
