@@ -1,0 +1,146 @@
+"""Straight tracks through time and frequency, searched for the most conspicuous one.
+
+Whitened records are cut into segments, in each of which a rate of change is undone before the transform: what is left
+is normal, with power one, in segments and bins. Powers are added up along all straight tracks, by a tree that shares
+the sums of shorter ones (Taylor, 1974). Where the sum over the sensors is large, sums of sensors with either sign are
+asked for, whose power is Gamma distributed on every track, and the tracks that have most of it are fitted.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.evidence import corrected
+from gyrofuse.mismatch.lines import sets_of
+from gyrofuse.mismatch.track_fit import AROUND, Candidate, fitted_track
+
+_SEGMENT = 16  # roots of the record's length
+_EVERY = 4  # bins that a frequency moves within a segment, from one rate that is undone to the next
+_CUT = 8.0  # power of a sensor: a steady line that is crossed is no track
+_CANDIDATES = 128  # of each rate, whose sensors are added with their signs
+_FITTED = 64  # tracks
+_SIGNED = 7  # sensors up to which every sign is tried
+
+
+class Sweep(NamedTuple):
+    """The most conspicuous track.
+
+    Attributes:
+        p_value: For having looked at all.
+        first, last: Frequencies at the record's ends, cycles per sample; beyond a half they are folded back.
+        sensors: In which it was seen.
+        nats: By which the power of most segments is above what noise has on a track.
+    """
+
+    p_value: float
+    first: float
+    last: float
+    sensors: tuple[int, ...]
+    nats: float
+
+
+def strongest_sweep(white: Tensor) -> Sweep:
+    """Of independent whitened samples `(sensor, time)`."""
+    p, n = white.shape
+    length = 2 ** round(math.log2(_SEGMENT * math.sqrt(n)))
+    count = 2 ** int(math.log2(n // length))
+    moves = length // (2 * count)  # bins from segment to segment, for half a cycle per sample over the record
+    signs = _signs(p)
+    kept = _conspicuous(white[:, : count * length].view(p, count, length).to(torch.float32), moves, signs)
+    track = min((fitted_track(candidate, signs, length, _CUT) for candidate in kept), key=lambda track: track.log_tail)
+    places = float((moves - 1) * count * length * len(signs))
+    first, last = (abs(math.remainder(end, 1.0)) for end in track.ends)
+    sensors = tuple(track.signs.nonzero()[:, 0].tolist())
+    nats = count * (float(track.powers.median()) / math.log(2) - 1)
+    return Sweep(corrected(math.exp(track.log_tail), places), first, last, sensors, nats)
+
+
+def _conspicuous(segments: Tensor, moves: int, signs: Tensor) -> list[Candidate]:
+    """The tracks with most power, of segments `(sensor, segment, time)`, up to so many bins from one to the next."""
+    _, count, length = segments.shape
+    centred = ((torch.arange(length) - (length - 1) / 2) / length).square()
+    sizes = signs.abs().sum(-1)
+    kept: list[Candidate] = []
+    for undone in range(_EVERY // 2, moves + _EVERY // 2, _EVERY):
+        turn = torch.polar(torch.full((length,), length**-0.5), -math.pi * undone * centred)
+        bins = torch.fft.fft(segments * turn)  # (sensor, segment, bin)
+        powers = bins.abs().square().clamp(max=_CUT)
+        for move in range(max(undone - _EVERY // 2, 1), min(undone + _EVERY // 2, moves)):
+            sums = _tracks(powers.sum(0), move)
+            at = sums.flatten().topk(min(_CANDIDATES, sums.numel())).indices
+            along = (at % length)[:, None] + move * torch.arange(count) + _drift(at // length, count)
+            values = bins[:, torch.arange(count), along % length]  # (sensor, track, segment)
+            values = values * (math.sqrt(_CUT) / values.abs().clamp(min=math.sqrt(_CUT)))
+            power = (signs @ values.flatten(1)).abs().square().view(len(signs), *along.shape).sum(-1) / sizes[:, None]
+            kept += _best(power, along, bins, undone, signs)
+        kept = sorted(kept, key=lambda candidate: -candidate.power)[:_FITTED]
+    return kept
+
+
+def _signs(p: int) -> Tensor:
+    """Combinations of `p` sensors, each left out, or of either sign against the first one that takes part."""
+    if p > _SIGNED:
+        return sets_of(p)[0].to(torch.complex64)
+    every = torch.tensor(list(itertools.product((0.0, 1.0, -1.0), repeat=p)))
+    first = every.gather(-1, (every != 0).to(torch.int64).argmax(-1, keepdim=True))[:, 0]
+    return every[first > 0].to(torch.complex64)
+
+
+def _best(power: Tensor, along: Tensor, bins: Tensor, undone: int, signs: Tensor) -> list[Candidate]:
+    """The most conspicuous ones of tracks `(combination, track)`, each with its combination of sensors.
+
+    Args:
+        power: Of all combinations of sensors.
+        along: Bins of the tracks, `(track, segment)`.
+        bins: Transforms, `(sensor, segment, bin)`.
+        undone: Bins that a frequency moves within a segment, which were undone before.
+        signs: The combinations, `(combination, sensor)`.
+    """
+    highest, which = power.max(0)
+    around = torch.arange(-AROUND, AROUND)
+    segment = torch.arange(bins.shape[1])[:, None]
+    return [
+        Candidate(
+            float(highest[k]),
+            signs[which[k]],
+            along[k],
+            undone,
+            bins[:, segment, (along[k][:, None] + around) % bins.shape[2]],
+        )
+        for k in highest.topk(min(_FITTED, len(highest))).indices.tolist()
+    ]
+
+
+def _drift(more: Tensor, count: int) -> Tensor:
+    """Bins by which tracks that move by `more` in the end have moved in each segment, as the tree has it."""
+    drift = torch.zeros(len(more), 1, dtype=torch.int64)
+    shifts, size = [more], 1
+    while 2 * size <= count:
+        shifts.append(shifts[-1] // 2)
+        size *= 2
+    for d in shifts[-2::-1] if count > 1 else []:
+        drift = torch.cat([drift, drift + ((d + 1) // 2)[:, None]], -1)
+    return drift
+
+
+def _tracks(powers: Tensor, move: int) -> Tensor:
+    """Sums along tracks that begin at each bin and move by `move` bins a segment, and some more, `(more, bin)`.
+
+    Args:
+        powers: `(segment, bin)`, as many segments as a power of two.
+        move: At least; by the record's end a track has moved up to as many bins more as there are segments, less one.
+    """
+    count, length = powers.shape
+    bins = torch.arange(length)
+    at = (bins + move * torch.arange(count)[:, None]) % length
+    sums = powers.gather(-1, at)[:, None]  # (group, shift, bin)
+    while len(sums) > 1:
+        early, late = sums[::2], sums[1::2]
+        shifts = [early[:, d // 2] + late[:, d // 2].roll(-((d + 1) // 2), -1) for d in range(2 * sums.shape[1])]
+        sums = torch.stack(shifts, 1)
+    return sums[0]

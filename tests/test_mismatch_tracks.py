@@ -1,0 +1,58 @@
+"""Straight tracks through time and frequency: sums along them, their fit, and what noise makes."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+from torch import Tensor
+
+from gyrofuse.mismatch import track_fit, tracks
+
+
+def noise(seed: int, *shape: int) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def phase(n: int, first: float, last: float) -> Tensor:
+    t = torch.arange(n, dtype=torch.float64)
+    return 2 * math.pi * (first * t + (last - first) * t.square() / (2 * n))
+
+
+def test_tracks_are_summed_over_all_segments() -> None:
+    powers = noise(2, 8, 64).square()
+    more = torch.arange(8)
+    sums, drift = tracks._tracks(powers, 3), tracks._drift(more, 8)
+    assert torch.equal(drift[:, -1], more)
+    assert torch.equal(drift[0], torch.zeros(8, dtype=torch.int64))
+    for d in range(8):
+        naive = [sum(float(powers[m, (b + 3 * m + int(drift[d, m])) % 64]) for m in range(8)) for b in range(64)]
+        np.testing.assert_allclose(sums[d].numpy(), naive)
+
+
+@pytest.mark.parametrize(("n", "nats"), [(4096, 44.0), (65536, 50.0)])
+@pytest.mark.parametrize(("first", "last"), [(0.1, 0.4), (0.3127, 0.2731)])
+def test_a_track_is_found_by_what_the_whole_record_has_in_phase(n: int, nats: float, first: float, last: float) -> None:
+    amplitude = 2 * math.sqrt(nats / (3 * n))  # of three sensors
+    gains = torch.tensor([1.0, -1.0, 0.0, 1.0])[:, None]
+    white = noise(3, 4, n) + amplitude * gains * phase(n, first, last).cos()
+    found = tracks.strongest_sweep(white)
+    assert (found.first, found.last) == pytest.approx((first, last), abs=2 / n)
+    assert {0, 1, 3} <= set(found.sensors)
+    assert found.p_value < 1e-3
+
+
+def test_gamma_tails_hold_where_they_are_tiny() -> None:
+    for shape in (1, 4, 16):
+        for power in (0.5, 20.0, 300.0):
+            assert track_fit._log_tail(shape, power) == pytest.approx(stats.gamma(shape).logsf(power), rel=1e-6)
+    assert track_fit._log_tail(16, 0.0) == 0.0
+
+
+@pytest.mark.parametrize("n_sensors", [1, 3])
+def test_noise_shows_no_track_more_often_than_it_says(n_sensors: int) -> None:
+    p_values = [tracks.strongest_sweep(noise(seed, n_sensors, 4096)).p_value for seed in range(40)]
+    alarms = sum(p < 0.05 for p in p_values)
+    assert stats.binomtest(alarms, len(p_values), 0.05, alternative="greater").pvalue > 0.01
+    assert min(p_values) < 0.9  # and says something
