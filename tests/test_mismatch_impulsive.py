@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gyrofuse import AR1, RandomWalk, WhiteNoise
 from gyrofuse.haar import haar_coefficients
-from gyrofuse.mismatch import episodes, impulses, marginals, outlier_limits, outliers
+from gyrofuse.mismatch import episodes, impulses, marginals, noise_level, outlier_limits, outliers
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.confirm import held_out_gain
 from gyrofuse.mismatch.mechanism import Finding, Mechanism
@@ -33,7 +33,7 @@ NOISE = WhiteNoise(1.0) + AR1(0.98, 0.004) + RandomWalk(1e-5)
 WITNESSES = (
     marginals.marginal_witness,
     impulses.spike_witness,
-    impulses.variance_witness,
+    noise_level.variance_witness,
     impulses.jump_witness,
 )
 MECHANISMS: tuple[type[Mechanism], ...] = (
@@ -95,7 +95,7 @@ def test_lines_and_a_resonance_make_neither_spikes_nor_levels() -> None:
         driven = torch.fft.irfft(torch.fft.rfft(normal(3, N, g=g)) * torch.fft.rfft(impulse, n=N), n=N)
         recording = recording + 3 * torch.cos(1.931 * t + seed) + 0.8 * torch.cos(0.731 * t) + 0.1 * driven
         case = Case.of(SCENE, recording, simulation)
-        false += [impulses.spike_witness(case).p_value < 0.01, impulses.variance_witness(case).p_value < 0.01]
+        false += [impulses.spike_witness(case).p_value < 0.01, noise_level.variance_witness(case).p_value < 0.01]
     assert stats.binom.sf(1, 6, 0.01) < 5e-3
     assert (false <= 1).all(), false
 
@@ -404,8 +404,8 @@ def test_the_likeliest_stretches_are_those_of_all_that_are_possible() -> None:
 
 def test_kuipers_law() -> None:
     # Stephens' points of the range of a Brownian bridge.
-    assert impulses._kuiper_p(1.747) == pytest.approx(0.05, abs=5e-4)
-    assert impulses._kuiper_p(2.001) == pytest.approx(0.01, abs=2e-4)
+    assert noise_level._kuiper_p(1.747) == pytest.approx(0.05, abs=5e-4)
+    assert noise_level._kuiper_p(2.001) == pytest.approx(0.01, abs=2e-4)
 
 
 # Telegraph noise.

@@ -12,7 +12,17 @@ from scipy import integrate, stats
 from torch import Tensor
 
 from gyrofuse import AR1, RandomWalk, WhiteNoise
-from gyrofuse.mismatch import episodes, hysteresis, impulses, modulation, oscillating, outliers, shapes, sweeps
+from gyrofuse.mismatch import (
+    episodes,
+    hysteresis,
+    impulses,
+    modulation,
+    noise_level,
+    oscillating,
+    outliers,
+    shapes,
+    sweeps,
+)
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.mechanisms.common_mode import CommonMode
 from gyrofuse.mismatch.mechanisms.drifting_tone import DriftingTone
@@ -66,7 +76,7 @@ def test_noise_with_a_period_is_seen_and_has_no_name() -> None:
     recording, simulation, _ = drawn(1)
     t = torch.arange(N, dtype=torch.float64)
     case = Case.of(scene(), louder(recording, 0.1 * torch.sin(2 * math.pi * 0.0371 * t)), simulation)
-    found = impulses.variance_witness(case)
+    found = noise_level.variance_witness(case)
     assert found.p_value < 1e-6
     assert found.frequency_hz == pytest.approx(3.71, abs=0.01)
     assert VarianceChange.nominate(case, LEVEL) is None
@@ -77,7 +87,7 @@ def test_noise_that_wanders_is_seen_and_has_no_episode() -> None:
     recording, simulation, g = drawn(2)
     wander = AR1(0.997, 0.15**2 * (1 - 0.997**2)).simulate(N, generator=g)
     case = Case.of(scene(), louder(recording, wander), simulation)
-    assert impulses.variance_witness(case).p_value < 1e-6
+    assert noise_level.variance_witness(case).p_value < 1e-6
     assert VarianceChange.nominate(case, LEVEL) is None
 
 
@@ -85,7 +95,7 @@ def test_noise_that_a_simulation_modulates_as_well_is_not_missing() -> None:
     recording, simulation, _ = drawn(3)
     wave = 0.1 * torch.sin(2 * math.pi * 0.0371 * torch.arange(N, dtype=torch.float64))
     case = Case.of(scene(), louder(recording, wave), louder(simulation.flatten(0, 1), wave).view_as(simulation))
-    assert impulses.modulation(case).p_value > 0.01
+    assert noise_level.modulation(case).p_value > 0.01
 
 
 def test_witnesses_are_honest() -> None:
@@ -97,7 +107,7 @@ def test_witnesses_are_honest() -> None:
         t = torch.arange(N, dtype=torch.float64) / N
         case = Case.of(scene(temperature=20 + torch.sin(14 * t + seed)), recording, simulation)
         values = (
-            impulses.modulation(case).p_value,
+            noise_level.modulation(case).p_value,
             sweeps.sweep_witness(case).p_value,
             hysteresis.hysteresis_witness(case).p_value,
         )

@@ -13,7 +13,7 @@ from scipy import stats
 from torch import Tensor
 
 from gyrofuse import WhiteNoise
-from gyrofuse.mismatch import level_scan, shocks
+from gyrofuse.mismatch import episodes, level_scan, shocks
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.confirm import held_out_gain
 from gyrofuse.mismatch.marginals import marginal_witness
@@ -22,6 +22,7 @@ from gyrofuse.mismatch.mechanisms.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.variance_change import VarianceChange
+from gyrofuse.mismatch.noise_level import compared_levels, level_between, levelled
 from gyrofuse.mismatch.outliers import Outliers
 from gyrofuse.mismatch.recurring import band_limits, fits_band, recurring
 
@@ -108,20 +109,80 @@ def test_a_fit_of_shocks_recovers_them_and_says_which_samples_are_hit() -> None:
 # Levels.
 
 
-def test_the_scan_of_levels_is_the_mean_over_stretches_and_factors() -> None:
+@pytest.mark.parametrize("referred", [False, True])
+def test_the_scan_of_levels_is_the_mean_over_stretches_and_factors(referred: bool) -> None:
     g = torch.Generator().manual_seed(4)
-    squares = normal(2, 64, g=g).square()
-    x, n = (squares / squares.sum(-1, keepdim=True)).numpy(), 64
-    by_length = []
-    for m in sorted({round(2 ** (k / 2)) for k in range(11)}):
+    squares, other = normal(2, 64, g=g).square(), normal(2, 100, g=g).square()
+    reference = level_scan.Reference(other.mean(-1) / squares.mean(-1), 100.0) if referred else None
+    energy = (squares.sum(-1, keepdim=True) + referred * other.sum(-1, keepdim=True)).numpy()
+    x, recorded, n = squares.numpy() / energy, 64, 164 if referred else 64
+
+    def mean_ratio(m: int, starts: range) -> float:
         reach = np.minimum(np.array(level_scan._DEVIATIONS) * math.sqrt(2 / m + 2 / (n - m)), math.log(30))
         ratios = []
-        for log_r, a in itertools.product([*reach, *-reach], range(0, n - m + 1, max(m // 8, 1))):
+        for log_r, a in itertools.product([*reach, *-reach], starts):
             share = x[:, a : a + m].sum(-1)
             one = math.exp(-m / 2 * log_r) * (1 - share + share * math.exp(-log_r)) ** (-n / 2)
             ratios.append(((1 + one) / 2).prod())
-        by_length.append(np.mean(ratios))
-    assert level_scan.scanned_levels(squares).log_ratio == pytest.approx(math.log(np.mean(by_length)), abs=1e-9)
+        return float(np.mean(ratios))
+
+    lengths = sorted({round(2 ** (k / 2)) for k in range(11)})
+    by_length = [mean_ratio(m, range(0, recorded - m + 1, max(m // 8, 1))) for m in lengths]
+    found = level_scan.scanned_levels(squares, reference)
+    assert found.log_ratio == pytest.approx(math.log(np.mean(by_length)), abs=1e-9)
+    if reference is not None:
+        throughout = level_scan.other_level(recorded, reference)
+        assert throughout == pytest.approx(math.log(mean_ratio(recorded, range(1))), abs=1e-9)
+
+
+def test_the_simulated_level_counts_as_samples_outside_of_episodes() -> None:
+    g = torch.Generator().manual_seed(5)
+    white, other = normal(2, 400, g=g), normal(2, 300, g=g)
+    white[:, 100:200] *= 1.7
+    reference = level_scan.Reference(other.square().mean(-1) / white.square().mean(-1), 300.0)
+    inside, both = torch.arange(400).div(100, rounding_mode="floor") == 1, torch.cat([white, other], -1)
+    within = torch.nn.functional.pad(inside, (0, 300))
+    for mine, whole in zip(
+        episodes.log_factors(white.square(), inside, reference),
+        episodes.log_factors(both.square(), within, None),
+        strict=True,
+    ):
+        np.testing.assert_allclose(mine, whole, rtol=1e-12)
+    factor = torch.tensor([2.0, 1.0], dtype=torch.float64)
+    scores = episodes.two_level_scores(both, factor, within)[:, :400]
+    torch.testing.assert_close(episodes.two_level_scores(white, factor, inside, reference), scores)
+
+
+def test_the_simulated_level_tells_of_long_episodes() -> None:
+    """Two fifths of the record: the rest tells 0.6 of what is to be told of its level, with the simulation 0.87."""
+    beside, alone = 0.0, 0.0
+    for seed in range(6):
+        recording, simulation, _ = drawn(500 + seed)
+        recording[:, 5000:11500] *= math.sqrt(1.1)
+        case = Case.of(SCENE, recording, simulation)
+        levels = compared_levels(case)
+        assert levels is not None
+        assert levels.p_value < 1e-4
+        beside += levels.scan.log_ratio
+        alone += level_scan.scanned_levels(levelled(case).square()).log_ratio
+        found = nominated(case, VarianceChange)
+        assert len(found.sensors) >= 2  # each tells 9 nats: all three do in 9 of 10
+        assert found.alternatives == ()
+    assert beside > 1.2 * alone
+
+
+def test_another_level_throughout_is_no_episode() -> None:
+    for seed in range(6):
+        recording, simulation, _ = drawn(600 + seed)
+        case = Case.of(SCENE, recording * math.sqrt(1.06), simulation)
+        levels = compared_levels(case)
+        assert levels is not None
+        assert levels.throughout > levels.scan.log_ratio + 5
+        assert levels.p_value == 1.0
+        assert VarianceChange.nominate(case, LEVEL) is None
+        inside = torch.arange(N) < N // 3
+        assert level_between(case, inside) is None
+        assert level_between(case.with_recording(recording), inside) is not None
 
 
 def test_a_level_that_changes_by_little_in_several_sensors_is_named() -> None:

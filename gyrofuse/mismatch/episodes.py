@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.level_scan import scanned_levels
+from gyrofuse.mismatch.level_scan import Reference, scanned_levels
 
 _FINEST_BLOCKS = 16384
 _SHORTEST_BLOCK = 16
@@ -55,30 +55,33 @@ class Episodes(NamedTuple):
         return self._replace(episodes=between, factor=1 / self.factor)
 
 
-def episodes_of(white: Tensor, p_values: Tensor) -> Episodes | None:
+def episodes_of(white: Tensor, p_values: Tensor, reference: Reference | None = None) -> Episodes | None:
     """The likeliest episodes of `(sensor, time)`, `None` where no sensor has any.
 
     Args:
         white: Whitened recording.
         p_values: That its level changes, for each sensor and for all together, `(sensor + 1,)`.
+        reference: What else is known of the level between them.
     """
     best, best_score = None, 0.0
-    scan = scanned_levels(white.square().clamp(max=_CUT))
+    scan = scanned_levels(white.square().clamp(max=_CUT), reference)
     for factor, stretch in ((0.0, None), (0.0, (scan.start, scan.stop)), (_LOUDER, None)):
-        found, score = _from_start(white, p_values, factor, stretch)
+        found, score = _from_start(white, p_values, factor, stretch, reference)
         if found is not None and (best is None or score > best_score):
             best, best_score = found, score
-    return None if best is None else best._replace(factor=_of_the_concerned(white, best), log_ratio=scan.log_ratio)
+    if best is None:
+        return None
+    return best._replace(factor=_of_the_concerned(white, best, reference), log_ratio=scan.log_ratio)
 
 
-def _of_the_concerned(white: Tensor, found: Episodes) -> Tensor:
+def _of_the_concerned(white: Tensor, found: Episodes, reference: Reference | None) -> Tensor:
     """Factors, 1 in sensors that are nearer to no change than to the change of those that have it.
 
     Those are the sensors that together tell most of one change: of the largest `k` changes `d`, the `k` that make
     `k mean(d)^2` largest.
     """
     inside = found.inside(white.shape[-1])
-    log_factor, sd = _log_factors(white.square().clamp(max=_CUT), inside)
+    log_factor, sd = log_factors(white.square().clamp(max=_CUT), inside, reference)
     typical, most = 0.0, 0.0
     for sign in (1.0, -1.0):
         mean = (sign * log_factor).sort(descending=True).values.cumsum(0) / torch.arange(1, len(log_factor) + 1)
@@ -89,20 +92,35 @@ def _of_the_concerned(white: Tensor, found: Episodes) -> Tensor:
     return torch.where(concerned, log_factor.exp(), 1.0)
 
 
-def _log_factors(squares: Tensor, inside: Tensor) -> tuple[Tensor, float]:
+def log_factors(squares: Tensor, inside: Tensor, reference: Reference | None) -> tuple[Tensor, float]:
     """Of the variance inside to that outside, `(sensor,)`, and their sd."""
     n_inside = int(inside.sum())
-    ratio = squares[:, inside].mean(-1) / squares[:, ~inside].mean(-1).clamp(min=1e-300)
-    return ratio.clamp(min=1e-300).log(), math.sqrt(2 / n_inside + 2 / (len(inside) - n_inside))
+    energy, worth = _known(squares, reference)
+    n_outside = len(inside) - n_inside + worth
+    outside = (squares[:, ~inside].sum(-1) + energy) / n_outside
+    ratio = squares[:, inside].mean(-1) / outside.clamp(min=1e-300)
+    return ratio.clamp(min=1e-300).log(), math.sqrt(2 / n_inside + 2 / n_outside)
 
 
-def two_level_scores(white: Tensor, factor: Tensor, inside: Tensor) -> Tensor:
-    """Log likelihood of two levels against their mean, `(sensor, time)`, where `inside` `(time,)` has `factor`."""
-    squares, share = white.square(), inside.to(torch.float64).mean()
-    mean = squares.mean(-1, keepdim=True)
-    quiet = mean / (1 - share + share * factor[:, None])
+def _known(squares: Tensor, reference: Reference | None) -> tuple[Tensor, float]:
+    """Energy `(sensor,)` and samples that a reference adds to what lies outside of episodes."""
+    mean = squares.mean(-1)
+    return (mean * 0.0, 0.0) if reference is None else (mean * reference.level * reference.worth, reference.worth)
+
+
+def _quiet(squares: Tensor, factor: Tensor, inside: Tensor, reference: Reference | None) -> Tensor:
+    """Variance outside of episodes, `(sensor,)`, which in them is so many times as large."""
+    energy, worth = _known(squares, reference)
+    within, without = squares[:, inside].sum(-1), squares[:, ~inside].sum(-1)
+    return (within / factor + without + energy) / (len(inside) + worth)
+
+
+def two_level_scores(white: Tensor, factor: Tensor, inside: Tensor, reference: Reference | None = None) -> Tensor:
+    """Log likelihood of two levels against one, `(sensor, time)`, where `inside` `(time,)` has `factor`."""
+    squares = white.square()
+    one, quiet = (_quiet(squares, f, inside, reference)[:, None] for f in (torch.ones_like(factor), factor))
     level = quiet * torch.where(inside, factor[:, None], 1.0)
-    return (squares / mean - squares / level - (level / mean).log()) / 2
+    return (squares / one - squares / level - (level / one).log()) / 2
 
 
 class Limits(NamedTuple):
@@ -128,7 +146,7 @@ class Told(NamedTuple):
     log_factor_sd: Tensor
 
 
-def told_of_first(white: Tensor, episodes: tuple[Episode, ...]) -> Told:
+def told_of_first(white: Tensor, episodes: tuple[Episode, ...], reference: Reference | None = None) -> Told:
     """Posterior of the first episode's ends and factors, the other episodes given.
 
     With `x` the share of a sensor's energy in `m` of `n` samples, the likelihood of the best factor is
@@ -142,22 +160,26 @@ def told_of_first(white: Tensor, episodes: tuple[Episode, ...]) -> Told:
     Args:
         white: Whitened recording of the sensors concerned, `(sensor, time)`.
         episodes: In order of time.
+        reference: What else is known of their level between episodes.
     """
     end = white.shape[-1]
     others = Episodes(episodes[1:], torch.ones(0)).inside(end)
     squares = torch.where(others, 0.0, white.square().clamp(max=_CUT))
+    energy, worth = _known(white.square().clamp(max=_CUT), reference)
     total = torch.nn.functional.pad(squares.cumsum(-1), (1, 0))
-    n = int((~others).sum())
+    whole = (total[:, -1] + energy)[:, None, None]
+    n_samples = int((~others).sum())
+    n = n_samples + worth
     last = episodes[1].start if len(episodes) > 1 else end
     ranges = [(0, last), (0, last)]
     for _ in range(_REFINEMENTS):
         start, stop = (_grid(low, high) for low, high in ranges)
         m = (stop[None] - start[:, None]).to(torch.float64)  # (start, stop)
-        possible = (m >= _SHORTEST_BLOCK) & (m <= n - _SHORTEST_BLOCK)
+        possible = (m >= _SHORTEST_BLOCK) & (m <= n_samples - _SHORTEST_BLOCK)
         m = torch.where(possible, m, n / 2)
         information = m * (n - m) / (2 * n)
         shrunk = _PRIOR**2 * information / (1 + _PRIOR**2 * information)
-        x = ((total[:, None, stop] - total[:, start, None]) / total[:, -1, None, None]).clamp(1e-12, 1 - 1e-12)
+        x = ((total[:, None, stop] - total[:, start, None]) / whole).clamp(1e-12, 1 - 1e-12)
         inside, outside = (x / m).log(), ((1 - x) / (n - m)).log()
         gain = -(math.log(n) * n + inside * m + outside * (n - m)) / 2
         log_weight = (shrunk * gain + torch.log1p(-shrunk) / 2).sum(0)
@@ -186,7 +208,7 @@ def _quantile(places: Tensor, weight: Tensor, share: float) -> int:
 
 
 def _from_start(
-    white: Tensor, p_values: Tensor, start: float, stretch: tuple[int, int] | None
+    white: Tensor, p_values: Tensor, start: float, stretch: tuple[int, int] | None, reference: Reference | None
 ) -> tuple[Episodes | None, float]:
     """The likeliest episodes from a factor on, or where it is 0 from a stretch or that of the CUSUM's range."""
     n = white.shape[-1]
@@ -200,39 +222,37 @@ def _from_start(
             inside = _widest(_blocks(squares[concerned]).mean(0), n)
         else:
             inside[slice(*stretch)] = True
-        factor = _factors(squares, inside, concerned)
+        factor = _factors(squares, inside, concerned, reference)
     for _ in range(_ROUNDS):
-        log_ratios = _log_ratios(squares, factor, inside)
+        log_ratios = _log_ratios(squares, factor, inside, reference)
         found = _likeliest(log_ratios)
         if not found:
             return None, 0.0
         inside = Episodes(found, factor).inside(n)
         if bool(inside.all()):
             return None, 0.0
-        factor = _factors(squares, inside, torch.ones_like(concerned))
+        factor = _factors(squares, inside, torch.ones_like(concerned), reference)
         if bool((factor == 1).all()):
             return None, 0.0
     episodes = Episodes(found, factor)
-    if 2 * int(inside.sum()) > n:  # what lasts longer is the rule
+    if reference is None and 2 * int(inside.sum()) > n:  # what lasts longer is the rule
         episodes = episodes.other_way_round(n)
-    score = float(two_level_scores(white, episodes.factor, episodes.inside(n)).sum())
+    score = float(two_level_scores(white, episodes.factor, episodes.inside(n), reference).sum())
     return episodes, score - 2 * len(episodes.episodes) * math.log(n)
 
 
-def _factors(squares: Tensor, inside: Tensor, concerned: Tensor) -> Tensor:
+def _factors(squares: Tensor, inside: Tensor, concerned: Tensor, reference: Reference | None) -> Tensor:
     """Of the variance inside to that outside, 1 where it is not certain."""
     n_inside = int(inside.sum())
     if n_inside == 0 or n_inside == len(inside):
         return torch.ones(len(squares), dtype=torch.float64)
-    log_factor, sd = _log_factors(squares, inside)
+    log_factor, sd = log_factors(squares, inside, reference)
     return torch.where(concerned & (log_factor.abs() > _CERTAIN * sd), log_factor.exp(), 1.0)
 
 
-def _log_ratios(squares: Tensor, factor: Tensor, inside: Tensor) -> Tensor:
+def _log_ratios(squares: Tensor, factor: Tensor, inside: Tensor, reference: Reference | None) -> Tensor:
     """`(e^2 (1/v - 1/(r v)) - log r)/2` summed over the sensors, `(time,)`."""
-    share = inside.to(torch.float64).mean()
-    quiet = squares.mean(-1) / (1 - share + share * factor)
-    weight = (1 - 1 / factor) / quiet
+    weight = (1 - 1 / factor) / _quiet(squares, factor, inside, reference)
     return (weight @ squares - factor.log().sum()) / 2
 
 

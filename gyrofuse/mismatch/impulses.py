@@ -1,4 +1,4 @@
-"""What is sudden: outliers, changes of the noise level, jumps.
+"""What is sudden: outliers and jumps.
 
 A record is whitened by its own smooth spectrum in the orthonormal DCT-II, `e = C^T y / sqrt(S)`, which has no ends
 that meet; `C^T y / S` over the mean of `1/S` is the error of a sample predicted from all others, most sensitive to an
@@ -14,13 +14,9 @@ from typing import NamedTuple
 import torch
 from scipy import fft, stats
 from torch import Tensor
-from torch.nn.functional import avg_pool1d
 
 from gyrofuse.mismatch.case import Case
-from gyrofuse.mismatch.episodes import episodes_of
 from gyrofuse.mismatch.evidence import Evidence, corrected, surpassing
-from gyrofuse.mismatch.level_scan import LevelScan, scanned_levels
-from gyrofuse.mismatch.modulation import Modulation, strongest_modulation
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.shocks import WeakOutliers, weak_outliers
 from gyrofuse.mismatch.side import Side
@@ -38,12 +34,6 @@ _FEW, _COARSE = 4096, 0.3  # samples that show a lattice, and its step in sd of 
 _TUNING, _STEPS = 1.5, 20
 _TAILS = (3.5, 4.0, 4.5, 5.0, 6.0, 8.0)
 _HEAVY = 0.05  # p value of tails that the simulation may have as well
-_NOTHING = 0.05  # p value of what need not be compared
-_CUT = 9.0  # squares: an outlier is no change of level
-_BLOCK = 128
-_BURST = 15  # lags
-_CHANGES = 1.62  # range of a stationary CUSUM that one in ten exceeds
-_UNSTEADY = 1e-4  # p value of a simulation's level that changes
 _TOP = 6  # levels at the top that have too few coefficients
 _NEIGHBOURS = 8  # thinned Haar coefficients that are correlated
 
@@ -234,141 +224,6 @@ def spike_witness(case: Case) -> Evidence:
         sensors = tuple((many.sensors > 0.5).nonzero()[:, 0].tolist()) or sensors
         words = f"outliers of {many.size:g} sd {'in several sensors at once' if many.shock else 'in single sensors'}"
     return Evidence("spike", p_value, words, sensors=sensors, levels=(1,), time_s=at / case.scene.rate)
-
-
-def _squares(white: Tensor) -> Tensor:
-    """`min(e^2, 9)` of whitened records `(..., sensor, time)`, and last of all their sum over the sensors."""
-    squares = white.square().clamp(max=_CUT)
-    return torch.cat([squares, _standardised(squares).sum(-2, keepdim=True)], -2)
-
-
-def _ranges(squares: Tensor) -> Tensor:
-    """Range of the CUSUM of `(..., time)` in blocks over its sd: Kuiper's, of a Brownian bridge."""
-    blocks = squares[..., : squares.shape[-1] // _BLOCK * _BLOCK].unflatten(-1, (-1, _BLOCK)).mean(-1)
-    # From first differences, which bursts raise; chance must not lower it below that of independent samples.
-    sd = (blocks.diff(dim=-1).square().mean(-1) / 2).sqrt().maximum(squares.std(-1) / math.sqrt(_BLOCK))
-    path = (blocks - blocks.mean(-1, keepdim=True)).cumsum(-1)
-    return (path.amax(-1) - path.amin(-1)) / (sd * math.sqrt(blocks.shape[-1]))
-
-
-def _kuiper_p(reach: float) -> float:
-    """Of a Brownian bridge's range, `2 sum (4 j^2 x^2 - 1) exp(-2 j^2 x^2)`."""
-    if reach < 0.6:
-        return 1.0
-    terms = [(4 * (j * reach) ** 2 - 1) * math.exp(-2 * (j * reach) ** 2) for j in range(1, 40)]
-    return min(max(2 * sum(terms), 0.0), 1.0)
-
-
-@remembered
-def _scanned(side: Side) -> LevelScan:
-    """Scan of all the records, in which the level would change at the same times."""
-    return scanned_levels(left_out(side).white.flatten(0, 1).square().clamp(max=_CUT))
-
-
-def _divided(case: Case) -> bool:
-    """Whether the simulation's own levels are taken off the recording."""
-    return case.simulated.signal.shape[-1] == case.n_samples and _scanned(case.simulated).p_value < _UNSTEADY
-
-
-def level_profile(case: Case) -> Tensor:
-    """Variance of the noise that the simulation gives each sample, `(sensor, time)`, or 1 where it is steady."""
-    profile = torch.ones(case.n_sensors, 1, dtype=torch.float64)
-    white = left_out(case.simulated).white
-    if not _divided(case):
-        return profile
-    found = episodes_of(white.flatten(0, 1), torch.zeros(white[..., 0].numel() + 1, dtype=torch.float64))
-    if found is None:
-        return profile
-    factor = found.factor.view(white.shape[:-1]).log().mean(0).exp()
-    return torch.where(found.inside(case.n_samples), factor[:, None], 1.0)
-
-
-def levelled(case: Case) -> Tensor:
-    """Whitened recording `(sensor, time)` over the noise level that the simulation has there."""
-    return left_out(case.recorded).white[0] / level_profile(case).sqrt()
-
-
-def variance_p_values(case: Case) -> Tensor:
-    """p values that the noise level changes, in each sensor and in all together, `(sensor + 1,)`.
-
-    Once for episodes, from the range of the CUSUM, once for bursts, from the autocorrelation of the squares.
-    """
-    squares, other = _squares(levelled(case)), _squares(left_out(case.simulated).white)
-    wander = (_ranges(other).amax(0) / _CHANGES).clamp(min=1.0)
-    heavy = (_clustering(other[0]) - 2.5).clamp(min=0)
-    if _divided(case):
-        wander, heavy = torch.ones_like(wander), torch.zeros_like(heavy)
-    episodes = torch.tensor([_kuiper_p(float(r)) for r in _ranges(squares) / wander], dtype=torch.float64)
-    bursts = torch.special.ndtr(heavy - _clustering(squares))
-    both = torch.minimum(episodes, bursts)
-    return 1 - (1 - both).square()
-
-
-def variance_p_value(case: Case) -> float:
-    """p value that the noise level changes anywhere: in one sensor or all, or by little in several."""
-    each = variance_p_values(case)
-    p_value = corrected(float(each.min()), len(each))
-    several = scanned_levels(levelled(case).square().clamp(max=_CUT)).p_value
-    if not _divided(case):
-        several = surpassing(several, _scanned(case.simulated).p_value)
-    return corrected(min(p_value, several), 2)
-
-
-@remembered
-def modulation(case: Case) -> Modulation:
-    """The most conspicuous modulation of the noise level that the simulation does not have."""
-    found = strongest_modulation(levelled(case).square().clamp(max=_CUT))
-    if found.p_value > _NOTHING:
-        return found
-    profile = level_profile(case)
-    white = left_out(case.simulated).white / (profile if _divided(case) else 1.0) ** 0.5
-    other = min(strongest_modulation(record.square().clamp(max=_CUT)).p_value for record in white)
-    return found._replace(p_value=surpassing(found.p_value, other))
-
-
-def _standardised(values: Tensor) -> Tensor:
-    return (values - values.mean(-1, keepdim=True)) / values.std(-1, keepdim=True)
-
-
-def _clustering(squares: Tensor) -> Tensor:
-    """Standard normal sum of the autocorrelations of `(..., time)` at short lags."""
-    x = _standardised(squares)
-    n = x.shape[-1]
-    lags = [(x[..., lag:] * x[..., :-lag]).sum(-1) for lag in range(1, _BURST + 1)]
-    return torch.stack(lags).sum(0) / math.sqrt(n * _BURST)
-
-
-def variance_witness(case: Case) -> Evidence:
-    """Changes of the noise level within the recording: once, in bursts, slowly or with a period."""
-    changed, wave = variance_p_value(case), modulation(case)
-    p_value = corrected(min(changed, wave.p_value), 2)
-    if wave.p_value < changed:
-        high = wave.high * case.scene.rate
-        how = f"with a frequency of {high:.5g} Hz" if wave.period else f"more slowly than {high:.3g} Hz"
-        return Evidence(
-            "variance",
-            p_value,
-            f"a noise level that goes up and down {how} in {case.scene.named(wave.sensors, 'all sensors')}",
-            sensors=wave.sensors,
-            levels=(1,),
-            frequency_hz=high if wave.period else None,
-        )
-    p_values = variance_p_values(case)
-    worst = int(p_values.argmin())
-    every = worst == case.n_sensors
-    squares = levelled(case).square().clamp(max=_CUT)
-    blocks = avg_pool1d(squares.mean(0, keepdim=True) if every else squares[worst : worst + 1], _BLOCK)[0]
-    path = (blocks - blocks.mean()).cumsum(-1)
-    onset = min(int(path.argmin()), int(path.argmax())) + 1
-    where = "all sensors together" if every else f"sensor {case.scene.sensors[worst]}"
-    return Evidence(
-        "variance",
-        p_value,
-        f"a noise level that changes in {where}",
-        sensors=tuple(range(case.n_sensors)) if every else (worst,),
-        levels=(1,),
-        time_s=onset * _BLOCK / case.scene.rate,
-    )
 
 
 def kurtosis_p_values(case: Case) -> Tensor:

@@ -8,11 +8,14 @@ others, whatever that is, its likelihood ratio is
 and `prod (1 + E)/2` over the sensors leaves open which of them take part. Means over stretches and factors have
 expectation one where nothing changes, so that they exceed `x` with probability `1/x` at most (Ville, 1939), and with
 less than `1/70x` by what importance sampling from the same mixture gives for 1 and 6 sensors: `1/20x` is held to.
+
+Where another record is known to have the level that does not change, its samples count with those outside the stretch.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -46,26 +49,63 @@ class LevelScan(NamedTuple):
         return ratio_p_value(self.log_ratio)
 
 
-def scanned_levels(squares: Tensor) -> LevelScan:
-    """Evidence of another level in squares `(sensor, time)` of whitened samples."""
+class Reference(NamedTuple):
+    """Another record, of the level that is compared with.
+
+    Attributes:
+        level: Of the squares of the record looked at, `(sensor,)`; 1 is its own mean.
+        worth: Independent samples from which it is known.
+    """
+
+    level: Tensor
+    worth: float
+
+    def of(self, sensors: Sequence[int]) -> Reference:
+        """For some of the sensors."""
+        return self._replace(level=self.level[list(sensors)])
+
+
+def scanned_levels(squares: Tensor, reference: Reference | None = None) -> LevelScan:
+    """Evidence of a stretch with another level than the rest, and the reference if there is one, has.
+
+    Args:
+        squares: Of whitened samples, `(sensor, time)`.
+        reference: What else is known of the level outside.
+    """
     block = max(squares.shape[-1] // _FINEST, 1)
     blocks = squares[..., : squares.shape[-1] // block * block].unflatten(-1, (-1, block)).sum(-1)
-    total = torch.nn.functional.pad((blocks / blocks.sum(-1, keepdim=True)).cumsum(-1), (1, 0))
     n_blocks = blocks.shape[-1]
-    n = n_blocks * block
-    deviations = torch.tensor(_DEVIATIONS, dtype=torch.float64)
-    logs, best, where = [], -math.inf, (0, n)
+    share, n = _of_all(n_blocks * block, reference)
+    total = torch.nn.functional.pad((share * blocks / blocks.sum(-1, keepdim=True)).cumsum(-1), (1, 0))
+    logs, best, where = [], -math.inf, (0, n_blocks * block)
     lengths = sorted({round(2 ** (k / _LENGTHS)) for k in range(int(_LENGTHS * math.log2(n_blocks / 2)) + 1)})
     for length in lengths:
-        m = length * block
-        reach = (deviations * math.sqrt(2 / m + 2 / (n - m))).clamp(max=math.log(_LARGEST))
-        log_r = torch.cat([reach, -reach])[:, None]
         start = torch.arange(0, n_blocks - length + 1, max(length // _STRIDE, 1))
-        x = total[:, None, start + length] - total[:, None, start]  # (sensor, 1, place)
-        one = -m / 2 * log_r - n / 2 * torch.log1p(x * torch.expm1(-log_r))
-        every = log_half(one).sum(0)  # (factor, place)
+        every = _log_ratios(total[:, start + length] - total[:, start], length * block, n)
         logs.append(torch.logsumexp(every.flatten(), 0) - math.log(every.numel()))
         if float(every.max()) > best:
             best, at = float(every.max()), int(start[int(every.amax(0).argmax())])
             where = (at * block, (at + length) * block)
     return LevelScan(float(torch.logsumexp(torch.stack(logs), 0)) - math.log(len(logs)), *where)
+
+
+def other_level(n_samples: int, reference: Reference) -> float:
+    """Log of the mean likelihood ratio of another level throughout the record than the reference has, nats."""
+    share, n = _of_all(n_samples, reference)
+    every = _log_ratios(share, n_samples, n)
+    return float(torch.logsumexp(every.flatten(), 0)) - math.log(every.numel())
+
+
+def _of_all(n_samples: int, reference: Reference | None) -> tuple[Tensor, float]:
+    """The record's share of all energy, `(sensor, 1)` or what goes for each, and samples of record and reference."""
+    if reference is None:
+        return torch.ones(1, 1, dtype=torch.float64), n_samples
+    return (n_samples / (n_samples + reference.worth * reference.level))[:, None], n_samples + reference.worth
+
+
+def _log_ratios(x: Tensor, m: float, n: float) -> Tensor:
+    """Log of `prod (1 + E)/2`, `(factor, place)`, of shares `(sensor, place)` of the energy in `m` of `n` samples."""
+    deviations = torch.tensor(_DEVIATIONS, dtype=torch.float64)
+    reach = (deviations * math.sqrt(2 / m + 2 / (n - m))).clamp(max=math.log(_LARGEST))
+    log_r = torch.cat([reach, -reach])[:, None]
+    return log_half(-m / 2 * log_r - n / 2 * torch.log1p(x[:, None] * torch.expm1(-log_r))).sum(0)

@@ -10,8 +10,9 @@ from gyrofuse.mismatch.channels import channel_witness
 from gyrofuse.mismatch.clocks import clock_witness
 from gyrofuse.mismatch.evidence import Evidence, corrected
 from gyrofuse.mismatch.hysteresis import hysteresis_witness
-from gyrofuse.mismatch.impulses import jump_witness, spike_witness, variance_witness
+from gyrofuse.mismatch.impulses import jump_witness, spike_witness
 from gyrofuse.mismatch.marginals import marginal_witness
+from gyrofuse.mismatch.noise_level import variance_witness
 from gyrofuse.mismatch.pooled import common_witness
 from gyrofuse.mismatch.shape_scan import shape_witness
 from gyrofuse.mismatch.slow_scans import slow_witness

@@ -12,8 +12,9 @@ from torch import Tensor
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.episodes import episodes_of, two_level_scores
 from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
-from gyrofuse.mismatch.impulses import left_out, levelled, likely_outliers, spike_p_value, variance_p_values
+from gyrofuse.mismatch.impulses import left_out, likely_outliers, spike_p_value
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.noise_level import levelled, variance_p_values
 from gyrofuse.mismatch.outlier_limits import with_limits
 from gyrofuse.mismatch.outliers import Outliers, clustered, fitted, free_gaussian, heavy_tailed, mixture
 from gyrofuse.mismatch.shocks import fitted_shock, shock_posterior, shock_scores

@@ -11,13 +11,23 @@ from torch import Tensor
 from torch.nn.functional import avg_pool1d
 
 from gyrofuse.mismatch.case import Case, Scene
-from gyrofuse.mismatch.episodes import Episodes, Limits, episodes_of, told_of_first, two_level_scores
+from gyrofuse.mismatch.episodes import Episodes, Limits, episodes_of, log_factors, told_of_first, two_level_scores
 from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
-from gyrofuse.mismatch.impulses import levelled, modulation, variance_p_value, variance_p_values
+from gyrofuse.mismatch.level_scan import scanned_levels
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
+from gyrofuse.mismatch.noise_level import (
+    LEVEL_CUT,
+    compared_levels,
+    level_between,
+    levelled,
+    modulation,
+    variance_p_value,
+    variance_p_values,
+)
 
 _FACTOR = 1.25  # by which, and by `_NATS`, a level that goes up and down all the time has to be likelier
 _NATS = 5.0
+_SHORT = 8  # samples
 _SLOWER = 65  # samples: what varies more slowly is not louder
 
 
@@ -44,20 +54,22 @@ class VarianceChange(Mechanism):
         if p_value > level:
             return None
         white = levelled(case)
-        found = episodes_of(white, p_values)
+        found = _against_the_simulation(case, p_values) or episodes_of(white, p_values)
         if found is None or _goes_up_and_down(case, found):
             return None
         found = _from_the_simulated_level(case, found)
+        inside = found.inside(case.n_samples)
+        reference = level_between(case, inside)
         rate = case.scene.rate
         effect = cls(tuple((e.start / rate, e.stop / rate) for e in found.episodes), found.factor)
         sensors = tuple((found.factor != 1).nonzero()[:, 0].tolist())
-        told = told_of_first(white[list(sensors)], found.episodes)
+        told = told_of_first(white[list(sensors)], found.episodes, None if reference is None else reference.of(sensors))
         parameters = {name: _time(limits, rate) for name, limits in (("start", told.start), ("stop", told.stop))}
         for i, value, sd in zip(sensors, told.log_factor.tolist(), told.log_factor_sd.tolist(), strict=True):
             parameters[f"factor[{i}]"] = Parameter(
                 math.exp(value), math.exp(value - Z * sd), math.exp(value + Z * sd), ""
             )
-        gain = float(two_level_scores(white, found.factor, found.inside(case.n_samples)).sum())
+        gain = float(two_level_scores(white, found.factor, inside, reference).sum())
         largest = max(sensors, key=lambda i: abs(math.log(float(found.factor[i]))))
         where = case.scene.named(sensors, "all sensors")
         more = f" and {len(found.episodes) - 1} more times" if len(found.episodes) > 1 else ""
@@ -71,19 +83,18 @@ class VarianceChange(Mechanism):
             sensors,
             parameters,
             levels=(1,),
-            alternatives=("spikes",) if max(e.stop - e.start for e in found.episodes) < 8 else (),
+            alternatives=_alternatives(case, found),
             time_s=parameters["start"].value,
             gain=gain,
         )
 
     def refitted(self, case: Case, fold: int) -> VarianceChange:
         keep = estimation_samples(case.n_samples, fold)
-        squares = levelled(case)[:, keep].square()
-        inside = self._inside(case.n_samples, case.scene.rate)[keep]
-        if not bool(inside.any()) or bool(inside.all()):
+        inside = self._inside(case.n_samples, case.scene.rate)
+        if not bool(inside[keep].any()) or bool(inside[keep].all()):
             return self
-        factor = squares[:, inside].mean(-1) / squares[:, ~inside].mean(-1)
-        return VarianceChange(self.episodes, torch.where(self.factor != 1, factor, 1.0))
+        log_factor, _ = log_factors(levelled(case)[:, keep].square(), inside[keep], level_between(case, inside))
+        return VarianceChange(self.episodes, torch.where(self.factor != 1, log_factor.exp(), 1.0))
 
     def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
         reach = min(_SLOWER, signal.shape[-1] // 2 * 2 - 1)
@@ -95,13 +106,31 @@ class VarianceChange(Mechanism):
 
     def gains(self, case: Case, fold: int) -> Tensor:
         inside = self._inside(case.n_samples, case.scene.rate)
-        return held_out_blocks(two_level_scores(levelled(case), self.factor, inside), fold).sum((0, -1))
+        scores = two_level_scores(levelled(case), self.factor, inside, level_between(case, inside))
+        return held_out_blocks(scores, fold).sum((0, -1))
 
     def _inside(self, n_samples: int, rate: float) -> Tensor:
         within = torch.zeros(n_samples, dtype=torch.bool)
         for start, stop in self.episodes:
             within[round(start * rate) : round(stop * rate)] = True
         return within
+
+
+def _against_the_simulation(case: Case, p_values: Tensor) -> Episodes | None:
+    """Episodes that the simulation's level tells of, where the recording has that between them."""
+    compared = compared_levels(case)
+    if compared is None or compared.p_value == 1:
+        return None
+    found = episodes_of(levelled(case), p_values, compared.reference)
+    return None if found is None or level_between(case, found.inside(case.n_samples)) is None else found
+
+
+def _alternatives(case: Case, found: Episodes) -> tuple[str, ...]:
+    """What else it could be: outliers, where it is short, and another level throughout, where little else speaks."""
+    compared, alone = compared_levels(case), scanned_levels(levelled(case).square().clamp(max=LEVEL_CUT)).log_ratio
+    shifted = compared is not None and compared.scan.log_ratio < compared.throughout + _NATS and alone < _NATS
+    short = max(e.stop - e.start for e in found.episodes) < _SHORT
+    return (*(("spikes",) if short else ()), *(("parameter_shift",) if shifted else ()))
 
 
 def _from_the_simulated_level(case: Case, found: Episodes) -> Episodes:
@@ -120,7 +149,8 @@ def _from_the_simulated_level(case: Case, found: Episodes) -> Episodes:
 def _goes_up_and_down(case: Case, found: Episodes) -> bool:
     """Whether a level that is modulated all the time says more than episodes with a start and a stop."""
     n, wave = case.n_samples, modulation(case)
-    scores = two_level_scores(levelled(case), found.factor, found.inside(n))
+    inside = found.inside(n)
+    scores = two_level_scores(levelled(case), found.factor, inside, level_between(case, inside))
     numbers = 2 * len(found.episodes) + int((found.factor != 1).sum()) / 2
     once = max(found.log_ratio, float(scores.sum()) - numbers * math.log(n))
     always = max(-math.log(max(wave.p_value, 1e-300)), wave.log_ratio)
