@@ -91,6 +91,17 @@ def test_noise_that_wanders_is_seen_and_has_no_episode() -> None:
     assert VarianceChange.nominate(case, LEVEL) is None
 
 
+@pytest.mark.parametrize("seed", [700, 701])
+def test_noise_that_wanders_slowly_is_no_episode_of_another_level(seed: int) -> None:
+    """Louder for a while and nowhere as the simulation: one episode, and other numbers, would say as much."""
+    recording, simulation, g = drawn(seed)
+    phi = math.exp(-10 / N)
+    wander = AR1(phi, 0.07**2 * (1 - phi**2)).simulate(N, generator=g)
+    case = Case.of(scene(), louder(recording, wander), simulation)
+    assert noise_level.variance_witness(case).p_value < 1e-6
+    assert VarianceChange.nominate(case, LEVEL) is None
+
+
 def test_noise_that_a_simulation_modulates_as_well_is_not_missing() -> None:
     recording, simulation, _ = drawn(3)
     wave = 0.1 * torch.sin(2 * math.pi * 0.0371 * torch.arange(N, dtype=torch.float64))

@@ -147,13 +147,19 @@ def _from_the_simulated_level(case: Case, found: Episodes) -> Episodes:
 
 
 def _goes_up_and_down(case: Case, found: Episodes) -> bool:
-    """Whether a level that is modulated all the time says more than episodes with a start and a stop."""
+    """Whether a level that is modulated all the time says more than episodes with a start and a stop.
+
+    By far, but where the level is not the simulation's between episodes either.
+    """
     n, wave = case.n_samples, modulation(case)
     inside = found.inside(n)
-    scores = two_level_scores(levelled(case), found.factor, inside, level_between(case, inside))
+    between = level_between(case, inside)
+    scores = two_level_scores(levelled(case), found.factor, inside, between)
     numbers = 2 * len(found.episodes) + int((found.factor != 1).sum()) / 2
     once = max(found.log_ratio, float(scores.sum()) - numbers * math.log(n))
     always = max(-math.log(max(wave.p_value, 1e-300)), wave.log_ratio)
+    if between is None and compared_levels(case) is not None:
+        return always > once
     return always > _FACTOR * once + _NATS
 
 
