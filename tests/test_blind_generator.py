@@ -285,6 +285,11 @@ def test_box_follows_the_heat_equation():
     np.testing.assert_allclose(thermal.box(np.full(2000, 20.0), 10.0, 8.0, 25.0), expected, rtol=1e-12)
 
 
+def test_a_relay_that_turns_once_is_a_step():
+    for seed, alike in ((707, ["hysteresis", "step"]), (700, ["hysteresis"])):
+        assert cases.make_case("outside:hysteresis", 100.0, seed).truth["effects"][0]["class"] == alike
+
+
 def test_alias_and_constant_rate_leave_nothing_to_find():
     case = make_case("blind:alias", None, 3, n_samples=N)
     (effect,) = case.truth["effects"]

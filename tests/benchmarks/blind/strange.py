@@ -30,15 +30,21 @@ def chirp(bench: Bench, nats: float) -> Part:
 
 
 def hysteresis(bench: Bench, nats: float) -> Part:
-    """A bias that remembers from which side its temperature came: a relay with two thresholds. Nats as for a signal."""
+    """A bias that remembers from which side its temperature came: a relay with two thresholds. Nats as for a signal.
+
+    Turned only once it is a step, and nothing tells otherwise.
+    """
     sensors = bench.some_sensors(2)
     inside = thermal.box(thermal.room(bench.n, bench.rate, bench.rng), bench.rate, 5.0, 30.0)
     low, high = np.quantile(inside, [0.35, 0.65])
     turned = np.where(inside > high, 1.0, np.where(inside < low, -1.0, 0.0))
     last = np.maximum.accumulate(np.where(turned != 0, np.arange(bench.n), 0))
-    unit = bench.gains(sensors)[:, None] * np.where(turned[last] == 0, -1.0, turned[last])
-    channels = {"temperature": thermal.thermometer(inside, bench.rng)}
-    return bench.shape("hysteresis", nats, unit, known=True, channel="temperature", channels=channels)[0]
+    path = np.where(turned[last] == 0, -1.0, turned[last])
+    alike = ("step",) if np.count_nonzero(np.diff(path)) == 1 else ()
+    return bench.shape(
+        "hysteresis", nats, bench.gains(sensors)[:, None] * path, known=True, channel="temperature",
+        channels={"temperature": thermal.thermometer(inside, bench.rng)}, look_alikes=alike,
+    )[0]  # fmt: skip
 
 
 def laplace_noise(bench: Bench, nats: float) -> Part:
