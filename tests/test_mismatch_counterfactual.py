@@ -189,6 +189,8 @@ def test_equals_are_told_as_such():
         "instead of step: warm up transient cannot be told from it, and would gain 1.0 nats less "
         "(held out, standard deviation 2.0)"
     )
+    likelier = replace(finding, instead=Instead("warm_up_transient", 17.0, 2.0))
+    assert "warm up transient is likelier, and would gain 5.0 nats more" in otherwise_words(likelier)
     assert otherwise_words(replace(finding, instead=None)) == ""
 
 

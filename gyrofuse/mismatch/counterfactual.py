@@ -20,7 +20,6 @@ from gyrofuse.mismatch.slow_effect import SlowEffect
 from gyrofuse.mismatch.slow_scans import slow_look
 
 _AS_GOOD_SD, _AS_GOOD = 1.0, 3.0  # differences of gains that are chance: in standard deviations, and in nats
-_BETTER_SD = 2.0
 
 
 class Link(NamedTuple):
@@ -144,7 +143,7 @@ def _better(
     """
     if told.instead is None or told.gain_without is None:
         return None
-    if told.instead.gain <= told.gain_without + _BETTER_SD * told.instead.sd:
+    if not told.instead.beats(told.gain_without):
         return None
     first, *later = links
     gone = [link for link in later if link.finding.mechanism == told.instead.mechanism]

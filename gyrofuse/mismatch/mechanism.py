@@ -14,6 +14,7 @@ from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.folds import spectral_gains
 
 Z = 1.959963984540054  # of 95 % limits
+_BETTER_SD = 2.0
 
 
 class Parameter(NamedTuple):
@@ -99,6 +100,10 @@ class Instead(NamedTuple):
     mechanism: str
     gain: float
     sd: float
+
+    def beats(self, gain: float) -> bool:
+        """Whether it gains more than the finding does, by more than chance."""
+        return self.gain > gain + _BETTER_SD * self.sd
 
 
 @dataclass(frozen=True, eq=False)

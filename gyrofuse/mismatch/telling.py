@@ -75,6 +75,8 @@ def otherwise_words(finding: Finding) -> str:
     less, sd = finding.gain_without - finding.instead.gain, finding.instead.sd
     start = f"instead of {mechanism_words(finding.mechanism)}: {mechanism_words(finding.instead.mechanism)}"
     alike = "cannot be told from it, and " if finding.instead.mechanism in finding.alternatives else ""
+    if finding.instead.beats(finding.gain_without):
+        alike = "is likelier, and "
     more = f"{nats(abs(less))} nats {'less' if less >= 0 else 'more'}"
     return f"{start} {alike}would gain {more} (held out, standard deviation {nats(sd)})"
 
