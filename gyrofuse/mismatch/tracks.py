@@ -76,8 +76,10 @@ def _conspicuous(segments: Tensor, moves: int, signs: Tensor) -> list[Candidate]
             along = (at % length)[:, None] + move * torch.arange(count) + _drift(at // length, count)
             values = bins[:, torch.arange(count), along % length]  # (sensor, track, segment)
             values = values * (math.sqrt(_CUT) / values.abs().clamp(min=math.sqrt(_CUT)))
-            power = (signs @ values.flatten(1)).abs().square().view(len(signs), *along.shape).sum(-1) / sizes[:, None]
-            kept += _best(power, along, bins, undone, signs)
+            both = signs @ torch.view_as_real(values).flatten(1)  # real and imaginary parts
+            power = both.square().view(len(signs), len(along), -1).sum(-1) / sizes[:, None]
+            least = kept[-1].power if len(kept) == _FITTED else 0.0
+            kept += _best(power, along, bins, undone, signs, least)
         kept = sorted(kept, key=lambda candidate: -candidate.power)[:_FITTED]
     return kept
 
@@ -85,13 +87,13 @@ def _conspicuous(segments: Tensor, moves: int, signs: Tensor) -> list[Candidate]
 def _signs(p: int) -> Tensor:
     """Combinations of `p` sensors, each left out, or of either sign against the first one that takes part."""
     if p > _SIGNED:
-        return sets_of(p)[0].to(torch.complex64)
+        return sets_of(p)[0].to(torch.float32)
     every = torch.tensor(list(itertools.product((0.0, 1.0, -1.0), repeat=p)))
     first = every.gather(-1, (every != 0).to(torch.int64).argmax(-1, keepdim=True))[:, 0]
-    return every[first > 0].to(torch.complex64)
+    return every[first > 0]
 
 
-def _best(power: Tensor, along: Tensor, bins: Tensor, undone: int, signs: Tensor) -> list[Candidate]:
+def _best(power: Tensor, along: Tensor, bins: Tensor, undone: int, signs: Tensor, least: float) -> list[Candidate]:
     """The most conspicuous ones of tracks `(combination, track)`, each with its combination of sensors.
 
     Args:
@@ -100,6 +102,7 @@ def _best(power: Tensor, along: Tensor, bins: Tensor, undone: int, signs: Tensor
         bins: Transforms, `(sensor, segment, bin)`.
         undone: Bins that a frequency moves within a segment, which were undone before.
         signs: The combinations, `(combination, sensor)`.
+        least: Power above which a track is among them.
     """
     highest, which = power.max(0)
     around = torch.arange(-AROUND, AROUND)
@@ -113,6 +116,7 @@ def _best(power: Tensor, along: Tensor, bins: Tensor, undone: int, signs: Tensor
             bins[:, segment, (along[k][:, None] + around) % bins.shape[2]],
         )
         for k in highest.topk(min(_FITTED, len(highest))).indices.tolist()
+        if float(highest[k]) > least
     ]
 
 
