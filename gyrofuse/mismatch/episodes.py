@@ -74,6 +74,13 @@ def episodes_of(white: Tensor, p_values: Tensor, reference: Reference | None = N
     return best._replace(factor=_of_the_concerned(white, best, reference), log_ratio=scan.log_ratio)
 
 
+def stretch_of(white: Tensor) -> Episodes:
+    """The likeliest single stretch of a whitened recording `(sensor, time)`, as the scan has it."""
+    scan = scanned_levels(white.square().clamp(max=_CUT))
+    found = Episodes((Episode(scan.start, scan.stop),), torch.ones(len(white), dtype=white.dtype), scan.log_ratio)
+    return found._replace(factor=_of_the_concerned(white, found, None))
+
+
 def _of_the_concerned(white: Tensor, found: Episodes, reference: Reference | None) -> Tensor:
     """Factors, 1 in sensors that are nearer to no change than to the change of those that have it.
 

@@ -11,9 +11,18 @@ from torch import Tensor
 from torch.nn.functional import avg_pool1d
 
 from gyrofuse.mismatch.case import Case, Scene
-from gyrofuse.mismatch.episodes import Episodes, Limits, episodes_of, log_factors, told_of_first, two_level_scores
+from gyrofuse.mismatch.episodes import (
+    Episodes,
+    Limits,
+    Told,
+    episodes_of,
+    log_factors,
+    stretch_of,
+    told_of_first,
+    two_level_scores,
+)
 from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
-from gyrofuse.mismatch.level_scan import scanned_levels
+from gyrofuse.mismatch.level_scan import Reference, scanned_levels
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.noise_level import (
     LEVEL_CUT,
@@ -27,6 +36,7 @@ from gyrofuse.mismatch.noise_level import (
 
 _FACTOR = 1.25  # by which, and by `_NATS`, a level that goes up and down all the time has to be likelier
 _NATS = 5.0
+_KNOWN = 1.0  # standard deviations of a factor's logarithm from 0, wherever the episode is
 _SHORT = 8  # samples
 _SLOWER = 65  # samples: what varies more slowly is not louder
 
@@ -57,19 +67,19 @@ class VarianceChange(Mechanism):
         found = _against_the_simulation(case, p_values) or episodes_of(white, p_values)
         if found is None or _goes_up_and_down(case, found):
             return None
-        found = _from_the_simulated_level(case, found)
-        inside = found.inside(case.n_samples)
-        reference = level_between(case, inside)
+        held = _held(case, found) or _held(case, stretch_of(white))
+        if held is None:
+            return None  # some stretch has another level, but nothing tells which and what level
+        found, reference, told = held
         rate = case.scene.rate
         effect = cls(tuple((e.start / rate, e.stop / rate) for e in found.episodes), found.factor)
         sensors = tuple((found.factor != 1).nonzero()[:, 0].tolist())
-        told = told_of_first(white[list(sensors)], found.episodes, None if reference is None else reference.of(sensors))
         parameters = {name: _time(limits, rate) for name, limits in (("start", told.start), ("stop", told.stop))}
         for i, value, sd in zip(sensors, told.log_factor.tolist(), told.log_factor_sd.tolist(), strict=True):
             parameters[f"factor[{i}]"] = Parameter(
                 math.exp(value), math.exp(value - Z * sd), math.exp(value + Z * sd), ""
             )
-        gain = float(two_level_scores(white, found.factor, inside, reference).sum())
+        gain = float(two_level_scores(white, found.factor, found.inside(case.n_samples), reference).sum())
         largest = max(sensors, key=lambda i: abs(math.log(float(found.factor[i]))))
         where = case.scene.named(sensors, "all sensors")
         more = f" and {len(found.episodes) - 1} more times" if len(found.episodes) > 1 else ""
@@ -114,6 +124,22 @@ class VarianceChange(Mechanism):
         for start, stop in self.episodes:
             within[round(start * rate) : round(stop * rate)] = True
         return within
+
+
+def _held(case: Case, found: Episodes) -> tuple[Episodes, Reference | None, Told] | None:
+    """Episodes whose level is known, with what is known of it and of that between them.
+
+    A few wild samples may be likelier than any other stretch, and yet not likelier than all others together: then
+    nothing tells which stretch has another level.
+    """
+    found, white = _from_the_simulated_level(case, found), levelled(case)
+    sensors = (found.factor != 1).nonzero()[:, 0].tolist()
+    if not sensors:
+        return None
+    reference = level_between(case, found.inside(case.n_samples))
+    told = told_of_first(white[sensors], found.episodes, None if reference is None else reference.of(sensors))
+    known = float((told.log_factor.abs() / told.log_factor_sd).max()) > _KNOWN
+    return (found, reference, told) if known else None
 
 
 def _against_the_simulation(case: Case, p_values: Tensor) -> Episodes | None:
