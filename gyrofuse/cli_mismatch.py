@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import torch
 import typer
 
+from gyrofuse._checks import same_rate
 from gyrofuse._console import progress, progress_bar, say
 from gyrofuse.cli_shared import (
     Axis,
@@ -23,6 +24,7 @@ from gyrofuse.cli_shared import (
     Unit,
     at_rest,
     known_unit,
+    model_grid,
     outputs,
     read,
     read_model,
@@ -82,6 +84,7 @@ def diagnose(
     asked = {"corrected": corrected, "model-out": model_out, "json": json_file, "report": report}
     with outputs(force, [*logs, mounting, simulation], **asked) as drafts:
         recording = _one_axis(read(logs, axis, sensors, rate, unit, scale, key, mounting), titled(logs))
+        recording = _as_the_model(recording, simulation)
         simulated = _simulation(simulation, recording, axis, sensors, rate, unit)
         part = at_rest(recording, resting)
         found, remarks = _diagnosed(part, simulated, (titled(logs), simulation), false_alarm, twins)
@@ -157,6 +160,17 @@ def _simulation(
     if whole.n_sensors > recording.n_sensors and set(names) <= set(whole.sensors):
         whole = whole.select(sensors=names or None)
     return _one_axis(whole, path.name)
+
+
+def _as_the_model(recording: Recording, path: Path) -> Recording:
+    """The recording in the unit of the log that a model in JSON was fitted to, whose rate it has to have."""
+    rate, unit = model_grid(path) if path.suffix.lower() == ".json" else (None, None)
+    if rate is not None and not same_rate(rate, recording.rate):
+        raise ValueError(
+            f"{path}: expected a model for the recording's {recording.rate:g} Hz, got one that was fitted at "
+            f"{rate:g} Hz; fit one at that rate, or resample the log"
+        )
+    return recording if unit is None or recording.unit in ("unknown", unit) else recording.to(unit)
 
 
 def _one_axis(recording: Recording, name: str) -> Recording:

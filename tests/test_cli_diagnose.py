@@ -62,6 +62,21 @@ def test_a_model_and_options(run: Run, log: Path):
     assert strict.out.startswith("Recording and simulation agree")
 
 
+def test_a_model_says_for_which_rate_and_unit_it_is(run: Run, log: Path):
+    fitted = NOISE.to_dict() | {"rate": RATE, "unit": "deg/s"}
+    Path("fitted.json").write_text(json.dumps(fitted))
+    calm = gf.Recording(drawn(N, 3), rate=RATE, unit="deg/s")
+    calm.to("rad/s").save("radians.npz")
+    done = run("diagnose", "radians.npz", "--simulation", "fitted.json")
+    assert (done.status, done.err) == (0, "")
+    assert done.out.startswith("Recording and simulation agree")
+    Path("faster.json").write_text(json.dumps(fitted | {"rate": 2 * RATE}))
+    refused = run("diagnose", log, "--simulation", "faster.json", "--json", "r.json")
+    assert refused.status == 2
+    assert "faster.json: expected a model for the recording's 50 Hz, got one that was fitted at 100 Hz" in refused.err
+    assert not Path("r.json").exists()
+
+
 def test_a_simulation_of_more_sensors_is_cut_to_those_asked_for(run: Run, log: Path):
     done = run("diagnose", log, "--simulation", "sim.npz", "--sensors", "b")
     assert done.status == 0

@@ -74,6 +74,7 @@ def test_a_simulation_that_was_repaired_is_not_repaired_again(change: Callable[[
     assert not again.mismatch
     assert [type(e) for e in again.model.effects] == [type(e) for e in first.model.effects]
     torch.testing.assert_close(again.correct(given).signal, first.correct(given).signal)
+    assert again.benefit("long").factor == pytest.approx(first.benefit("long").factor, rel=1e-6)
     samples = first.model.simulate(N, generator=generator(3))
     assert not gf.diagnose(given, recording(samples)).mismatch
 

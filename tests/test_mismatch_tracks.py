@@ -40,7 +40,15 @@ def test_a_track_is_found_by_what_the_whole_record_has_in_phase(n: int, nats: fl
     found = tracks.strongest_sweep(white)
     assert (found.first, found.last) == pytest.approx((first, last), abs=2 / n)
     assert {0, 1, 3} <= set(found.sensors)
+    assert found.turns == ()
     assert found.p_value < 1e-3
+
+
+def test_a_track_that_folds_back_says_where() -> None:
+    white = noise(5, 2, 8192) + 0.4 * phase(8192, 0.4, 0.6).cos()
+    found = tracks.strongest_sweep(white)
+    assert (found.first, found.last) == pytest.approx((0.4, 0.4), abs=1e-3)
+    assert found.turns == (0.5,)
 
 
 def test_gamma_tails_hold_where_they_are_tiny() -> None:

@@ -16,6 +16,7 @@ from gyrofuse import WhiteNoise
 from gyrofuse.mismatch import episodes, level_scan, shocks
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.confirm import held_out_gain
+from gyrofuse.mismatch.engine import diagnose
 from gyrofuse.mismatch.marginals import marginal_witness
 from gyrofuse.mismatch.mechanism import Finding
 from gyrofuse.mismatch.mechanisms.dead_band import DeadBand
@@ -206,6 +207,17 @@ def test_the_level_that_the_simulation_has_is_the_rule() -> None:
     assert covers(found, "start", 40.96)
     assert covers(found, "stop", 143.36)
     assert all(found.parameters[f"factor[{i}]"].value > 1.1 for i in range(3))
+
+
+def test_what_a_shorter_simulation_cannot_show_is_not_found_again() -> None:
+    effect, factor = VarianceChange(((27.0, 54.0),), torch.ones(3)), torch.full((3,), 1.2)
+    assert VarianceChange(((27.1, 53.9),), factor).repeats(effect)
+    for other in (((27.0, 40.0),), ((60.0, 80.0),), ((0.0, 100.0),)):
+        assert not VarianceChange(other, factor).repeats(effect)
+    recording, simulation, g = drawn(700)
+    recording[:, 5000:11000] *= 1.2
+    report = diagnose(recording, simulation[0, :, : N // 2], generator=g)
+    assert [f.mechanism for f in report.findings].count("variance_change") == 1
 
 
 # Dead bands.

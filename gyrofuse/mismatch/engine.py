@@ -74,8 +74,8 @@ def diagnose(
     if generator is None:
         generator = torch.Generator().manual_seed(0)
     level = uncorrected(false_alarm, len(WITNESSES))  # what would be a mismatch, had one witness alone said it
-    start = prepared(recording, simulation, rate, generator)
-    start, own = with_own_effects(start, simulation, level, generator)
+    given = prepared(recording, simulation, rate, generator)
+    start, own = with_own_effects(given, simulation, level, generator)
     model = RepairedModel(noise_of(simulation, start), start.scene, own, noise_samples(simulation))
     evidence = testimony(start, lambda what, share: progress(what, _LOOKED * share))
     p_value = combined(evidence)
@@ -91,6 +91,7 @@ def diagnose(
             model=model,
             evidence=evidence,
             evidence_after=evidence,
+            recording=given.recording,
             case=start,
             repaired=start,
         )
@@ -139,6 +140,7 @@ def diagnose(
         model=replace(model, effects=effects),
         evidence=evidence,
         evidence_after=after,
+        recording=given.recording,
         case=start,
         repaired=case,
     )
@@ -148,6 +150,8 @@ def _known(finding: Finding, found: list[Finding]) -> bool:
     """Whether the same was found before: what its repair could not take away is not another one."""
     if finding.effect.place:  # a fact on the numbers of some sensors
         return any(f.mechanism == finding.mechanism and set(finding.sensors) <= set(f.sensors) for f in found)
+    if any(finding.effect.repeats(other.effect) for other in found):
+        return True
     return any(
         (finding.mechanism, finding.sensors, finding.channel, finding.time_s, finding.frequency_hz)
         == (other.mechanism, other.sensors, other.channel, other.time_s, other.frequency_hz)

@@ -34,6 +34,7 @@ class Outcome:
     model: RepairedModel
     evidence: tuple[Evidence, ...]
     evidence_after: tuple[Evidence, ...]
+    recording: Tensor
     case: Case
     repaired: Case
 
@@ -75,8 +76,7 @@ class Outcome:
         Raises:
             SingularCovarianceError: Sensors that are copies of each other have no best weights.
         """
-        recording = self.case.recording
-        return benefit(recording, self.model.correct(recording), scale_weights)
+        return benefit(self.recording, self.model.correct(self.recording), scale_weights)
 
     @cached_property
     def variances(self) -> list[VarianceComparison]:

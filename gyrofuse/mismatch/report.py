@@ -30,7 +30,8 @@ class MismatchReport(Outcome):
         model: The repaired simulation; it simulates.
         evidence: What each witness saw before the repair.
         evidence_after: What each witness saw after it.
-        case: Recording and simulation as they came.
+        recording: As it came, `(sensor, time)`.
+        case: Recording and simulation; of a repaired one, its noise, and the recording without its effects.
         repaired: The recording without what can be taken off it, and the simulation with all else.
     """
 

@@ -21,10 +21,12 @@ def sweep_witness(case: Case) -> Evidence:
     """A line whose frequency moves, that the simulation does not have."""
     found, p_value = _strongest(case.recorded), _p_value(case)
     first, last = (f * case.scene.rate for f in (found.first, found.last))
+    where = case.scene.named(found.sensors, "all sensors")
+    by_way = "".join(f", by way of {turn * case.scene.rate:g} Hz" for turn in found.turns)
     return Evidence(
         "sweep",
         p_value,
-        f"a line that moves from {first:.4g} Hz to {last:.4g} Hz in {case.scene.named(found.sensors, 'all sensors')}",
+        f"a line that moves from {first:.4g} Hz to {last:.4g} Hz{by_way} in {where}",
         sensors=found.sensors,
         levels=tuple(sorted({level_of(max(f, 1 / case.n_samples)) for f in (found.first, found.last)})),
     )

@@ -96,9 +96,8 @@ def fused_words(outcome: Outcome) -> list[str]:
 
 def benefit_of(outcome: Outcome) -> Benefit | None:
     """What the correction does for the virtual gyro; None where nothing is taken off, or there are no weights."""
-    recording = outcome.case.recording
-    corrected = outcome.model.correct(recording)
-    if outcome.case.n_sensors < 2 or bool((corrected == recording).all()):
+    corrected = outcome.model.correct(outcome.recording)
+    if outcome.case.n_sensors < 2 or bool((corrected == outcome.recording).all()):
         return None
     try:
         return outcome.benefit()

@@ -24,6 +24,7 @@ _EVERY = 4  # bins that a frequency moves within a segment, from one rate that i
 _CUT = 8.0  # power of a sensor: a steady line that is crossed is no track
 _CANDIDATES = 128  # of each rate, whose sensors are added with their signs
 _FITTED = 64  # tracks
+_AT = 0.01  # halves of a cycle per sample next to which a frequency has not turned yet
 _SIGNED = 7  # sensors up to which every sign is tried
 
 
@@ -33,6 +34,7 @@ class Sweep(NamedTuple):
     Attributes:
         p_value: For having looked at all.
         first, last: Frequencies at the record's ends, cycles per sample; beyond a half they are folded back.
+        turns: Where they are folded in between: a half, or zero.
         sensors: In which it was seen.
         nats: By which the power of most segments is above what noise has on a track.
     """
@@ -42,6 +44,7 @@ class Sweep(NamedTuple):
     last: float
     sensors: tuple[int, ...]
     nats: float
+    turns: tuple[float, ...] = ()
 
 
 def strongest_sweep(white: Tensor) -> Sweep:
@@ -57,7 +60,9 @@ def strongest_sweep(white: Tensor) -> Sweep:
     first, last = (abs(math.remainder(end, 1.0)) for end in track.ends)
     sensors = tuple(track.signs.nonzero()[:, 0].tolist())
     nats = count * (float(track.powers.median()) / math.log(2) - 1)
-    return Sweep(corrected(math.exp(track.log_tail), places), first, last, sensors, nats)
+    low, high = (2 * end for end in sorted(track.ends))  # halves of a cycle per sample
+    turns = tuple(0.5 if k % 2 else 0.0 for k in range(math.ceil(low + _AT), math.floor(high - _AT) + 1))
+    return Sweep(corrected(math.exp(track.log_tail), places), first, last, sensors, nats, turns)
 
 
 def _conspicuous(segments: Tensor, moves: int, signs: Tensor) -> list[Candidate]:

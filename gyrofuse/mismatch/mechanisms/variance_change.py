@@ -38,6 +38,7 @@ _FACTOR = 1.25  # by which, and by `_NATS`, a level that goes up and down all th
 _NATS = 5.0
 _KNOWN = 1.0  # standard deviations of a factor's logarithm from 0, wherever the episode is
 _SHORT = 8  # samples
+_SAME = 0.8  # share of episodes that they have in common with others
 _SLOWER = 65  # samples: what varies more slowly is not louder
 
 
@@ -97,6 +98,13 @@ class VarianceChange(Mechanism):
             time_s=parameters["start"].value,
             gain=gain,
         )
+
+    def repeats(self, other: Mechanism) -> bool:
+        """Whether most of it lies in the other's episodes, and the other way round."""
+        if not isinstance(other, VarianceChange):
+            return False
+        shared = sum(max(min(b, d) - max(a, c), 0.0) for a, b in self.episodes for c, d in other.episodes)
+        return all(shared > _SAME * sum(stop - start for start, stop in e.episodes) for e in (self, other))
 
     def refitted(self, case: Case, fold: int) -> VarianceChange:
         keep = estimation_samples(case.n_samples, fold)
