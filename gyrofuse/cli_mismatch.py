@@ -126,6 +126,9 @@ def _diagnosed(
         try:
             part, remarks = without_gaps(recording, "Diagnosed", FEWEST)
             found = find_mismatch(part, simulation, false_alarm=false_alarm, twins=twins, progress=show)
+            start = float(part.time[0])
+            if start and found.mismatch:
+                remarks.append(f"Times count from the first sample that was diagnosed, at {start:.6g} s of the log.")
             return found, remarks + lacking
         except (ValueError, TypeError) as error:
             message = str(error)
