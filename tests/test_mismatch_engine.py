@@ -82,6 +82,8 @@ def test_what_was_found_is_taken_off_and_simulated_again():
     report, _ = concealed_tone(4 * N)
     left = diagnose(gf.Recording(report.correct(recording.signal), rate=RATE, unit="deg/s"), array(3, 4 * N))
     assert not left.mismatch
+    with pytest.raises(ValueError, match=r"expected the .* Hz of the diagnosis, got 1e\+06 Hz"):
+        report.correct(gf.Recording(recording.signal, rate=1e6, unit="deg/s"))
     again = report.model.simulate(4 * N, generator=generator(4))
     assert not diagnose(recording, gf.Recording(again, rate=RATE, unit="deg/s"), false_alarm=1e-3).mismatch
 

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 from torch import Tensor
 
+from gyrofuse._checks import same_rate
 from gyrofuse._result import cleaned
 from gyrofuse.mismatch.benefit import Benefit, benefit
 from gyrofuse.mismatch.case import Case
@@ -50,7 +51,7 @@ class Outcome:
             The same kind, of the same dtype.
 
         Raises:
-            ValueError: Other sensors than those of the diagnosis.
+            ValueError: Other sensors than those of the diagnosis, or another sampling rate.
         """
         scene = self.model.scene
         signal = recording.signal if isinstance(recording, Recording) else recording
@@ -61,6 +62,11 @@ class Outcome:
             )
         if not isinstance(recording, Recording):
             return self.model.correct(signal.double()).to(signal.dtype)
+        if scene.unit != "unknown" and not same_rate(recording.rate, scene.rate):  # samples alone have no rate
+            raise ValueError(
+                f"`recording`: expected the {scene.rate:g} Hz of the diagnosis, got {recording.rate:g} Hz; correct the "
+                "recording that was diagnosed"
+            )
         other_unit = recording.unit != scene.unit and "unknown" not in (recording.unit, scene.unit)
         converted = recording.to(scene.unit) if other_unit else recording
         own = replace(self.model, scene=replace(scene, channels={**scene.channels, **recording.channels}))
