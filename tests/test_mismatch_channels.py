@@ -10,7 +10,7 @@ from scipy import stats
 
 import gyrofuse as gf
 from gyrofuse.mismatch.case import Case, Scene
-from gyrofuse.mismatch.channels import channel_witness, products, regress, squared_length
+from gyrofuse.mismatch.channels import channel_witness, regress, squared
 from gyrofuse.mismatch.confirm import held_out_gain
 from gyrofuse.mismatch.mechanisms.g_sensitivity import GSensitivity
 from gyrofuse.mismatch.mechanisms.quadratic_coupling import QuadraticCoupling
@@ -99,7 +99,7 @@ def test_a_gain_of_thirty_nats_is_found_with_limits_that_hold():
 def test_a_square_is_told_from_a_gain():
     g = generator(4)
     shaking = acceleration(g)
-    rows = products(shaking)
+    rows = squared(shaking)["each"]
     gains = torch.zeros(4, 6, dtype=torch.float64)
     gains[1, 0] = 1.0
     both = case(g, of_size(rows, gains, 60.0) @ rows, acceleration=shaking)
@@ -114,16 +114,34 @@ def test_a_number_times_the_square_is_found_where_a_matrix_is_not():
     g, found = generator(10), 0
     for _ in range(15):
         shaking = acceleration(g)
-        square = squared_length(shaking)
+        square = squared(shaking)["length"]
         gains = of_size(square, torch.tensor([[1.0], [-1.0], [1.0], [0.0]], dtype=torch.float64), 25.0)
         both = case(g, gains @ square, acceleration=shaking)
-        assert regress(both, square).p_value < 100 * regress(both, products(shaking)).p_value
+        assert regress(both, square).p_value < 100 * regress(both, squared(shaking)["each"]).p_value
         finding = QuadraticCoupling.nominate(both, LEVEL)
         if finding is not None:
             found += 1
             assert finding.effect.kind == "length"
             assert all(entry.value * float(gains[int(name[5])]) > 0 for name, entry in finding.parameters.items())
     assert found >= 13
+
+
+def test_the_square_of_one_axis_is_told_with_its_sign():
+    """Of all products the length of a vector of gains would be told, most of it noise and without a sign."""
+    g, held, told = generator(14), 0, 0
+    for nats in (60.0, 100.0, 300.0, 1000.0, 3600.0):
+        shaking = acceleration(g)
+        square = squared(shaking)["axis 2"]
+        gains = of_size(square, torch.tensor([[1.0], [-1.0], [0.0], [-1.0]], dtype=torch.float64), nats)
+        finding = QuadraticCoupling.nominate(case(g, gains @ square, acceleration=shaking), LEVEL)
+        assert finding.effect.kind == "axis 2"
+        assert "axis 2 of acceleration" in finding.sentence
+        assert finding.sensors == (0, 1, 3)
+        for i in finding.sensors:
+            entry = finding.parameters[f"gain[{i}]"]
+            told += 1
+            held += entry.low <= float(gains[i, 0]) <= entry.high
+    assert stats.binom.cdf(held, told, 0.95) > 1e-3, f"{held} of {told}"
 
 
 def test_a_slow_rate_is_judged_with_as_much_doubt_as_the_simulation_leaves():

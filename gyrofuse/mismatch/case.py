@@ -39,6 +39,11 @@ class Scene:
     sensors: tuple[str, ...]
     channels: Mapping[str, Tensor] = field(default_factory=dict)
 
+    @property
+    def measure(self) -> str:
+        """What numbers are told in: the unit, by its name where that is known."""
+        return "units" if self.unit == "unknown" else self.unit
+
     def named(self, which: Sequence[int], every: str | None = None) -> str:
         """Sensors by their names, for a sentence; all of them by the words `every`, where given."""
         if every is not None and len(which) == len(self.sensors):

@@ -137,7 +137,7 @@ def channel_witness(case: Case) -> Evidence:
         rows = rows.reshape(-1, rows.shape[-1])
         kinds = [("", rows)]
         if name in accelerations(case):
-            kinds += [(" squared", products(rows)), (" squared", squared_length(rows))]
+            kinds += [(" squared", made) for made in squared(rows).values()]
         for words, regressors in kinds:
             fit = regress(case, regressors)
             if fit is not None:
@@ -164,16 +164,16 @@ def rates(case: Case) -> list[str]:
     return _channels(case, "rate")
 
 
-def products(rows: Tensor) -> Tensor:
-    """Squares and products of rows `(row, time)` without their means."""
+def squared(rows: Tensor) -> dict[str, Tensor]:
+    """What may be made of the square of a vector of rows `(row, time)` without their means: by kind, `(any, time)`.
+
+    All products, the squared length, and where there are several rows the square of each.
+    """
     rows = rows - rows.mean(-1, keepdim=True)
+    squares = rows.square()
     upper = torch.triu_indices(len(rows), len(rows))
-    return rows[upper[0]] * rows[upper[1]]
-
-
-def squared_length(rows: Tensor) -> Tensor:
-    """Squared length of a vector of rows `(row, time)` without their means, `(1, time)`."""
-    return (rows - rows.mean(-1, keepdim=True)).square().sum(0, keepdim=True)
+    axes = {f"axis {k + 1}": square[None] for k, square in enumerate(squares)} if len(rows) > 1 else {}
+    return {"each": rows[upper[0]] * rows[upper[1]], "length": squares.sum(0, keepdim=True), **axes}
 
 
 def _channels(case: Case, word: str) -> list[str]:

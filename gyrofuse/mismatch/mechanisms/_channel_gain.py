@@ -18,6 +18,7 @@ from gyrofuse.mismatch.witnesses import level_of
 from gyrofuse.units import GRAVITY
 
 _OF_ONE_BAND = 0.9  # share of the evidence from which a gain might be a line's alone
+_WHOLE = ("each", "length")  # kinds of rows that are made from all of a channel
 _SEEN = 0.04  # chance that a sensor is named which does not follow the channel
 _LATE = 0.25  # share of the evidence a quarter of a cycle late, from which it is no instantaneous coupling
 _SCATTER = 3.0  # standard deviations of what is so by chance
@@ -65,7 +66,7 @@ class ChannelGain(Mechanism):
         ]
         if not tried:
             return None
-        fit, name, kind = min(tried, key=lambda entry: (entry[0].p_value, -entry[0].excess))
+        fit, name, kind = min(tried, key=lambda entry: (entry[0].p_value, _cost(entry[0], case.n_samples)))
         p_value = min(fit.p_value * len(tried), 1.0)
         chance = fit.gains.numel()  # mean of what is seen a quarter of a cycle late, with the variance twice as large
         if p_value > level or fit.quadrature > chance + _SCATTER * math.sqrt(2 * chance) + _LATE * fit.excess:
@@ -82,7 +83,7 @@ class ChannelGain(Mechanism):
         return Finding(
             cls.name,
             cls(name, _only(fit.gains, present), kind),
-            cls.words(abs(sizes[largest].value), name, where, unit),
+            cls.words(abs(sizes[largest].value), name if kind in _WHOLE else f"{kind} of {name}", where, unit),
             p_value,
             present,
             {f"{cls.quantity}[{i}]": entry for i, entry in sizes.items()},
@@ -132,7 +133,7 @@ class ChannelGain(Mechanism):
     @classmethod
     def _unit(cls, scene: Scene, name: str) -> tuple[str, float]:
         """Unit of the numbers given to readers, and what gains are multiplied with for it."""
-        return f"{scene.unit} per unit of {name}", 1.0
+        return f"{scene.measure} per unit of {name}", 1.0
 
 
 def _only(gains: Tensor, sensors: tuple[int, ...]) -> Tensor:
@@ -148,6 +149,11 @@ def gravity_unit(scene: Scene, name: str) -> str | None:
     return next(
         (unit for unit, one in (("g", 1.0), ("m/s^2", GRAVITY)) if abs(math.log(max(size, 1e-9) / one)) < 0.2), None
     )
+
+
+def _cost(fit: ChannelFit, n_samples: int) -> float:
+    """Schwarz's criterion, for where p values are too small to be told apart."""
+    return fit.gains.numel() * math.log(n_samples) - fit.excess
 
 
 def _size(fit: ChannelFit, sensor: int, unit: str, factor: float) -> Parameter:

@@ -9,7 +9,7 @@ from typing import ClassVar
 from torch import Tensor
 
 from gyrofuse.mismatch.case import Case, Scene
-from gyrofuse.mismatch.channels import accelerations, products, squared_length
+from gyrofuse.mismatch.channels import accelerations, squared
 from gyrofuse.mismatch.mechanisms._channel_gain import ChannelGain, gravity_unit
 
 
@@ -17,7 +17,7 @@ from gyrofuse.mismatch.mechanisms._channel_gain import ChannelGain, gravity_unit
 class QuadraticCoupling(ChannelGain):
     """`x_i(t) = a(t)' Q_i a(t)`: lines at twice those of the acceleration, and a bias that follows its mean square.
 
-    Most simply `Q_i` is a number, a gain on the squared length of the acceleration.
+    Most simply `Q_i` is a number, a gain on the squared length of the acceleration or on the square of one axis.
     At twice a line there is no linear coherence with the acceleration, which tells it from a tone.
     """
 
@@ -30,7 +30,7 @@ class QuadraticCoupling(ChannelGain):
 
     @classmethod
     def rows(cls, values: Tensor) -> Mapping[str, Tensor]:
-        return {"each": products(values), "length": squared_length(values)}
+        return squared(values)
 
     @classmethod
     def words(cls, gain: float, channel: str, where: str, unit: str) -> str:
@@ -40,4 +40,4 @@ class QuadraticCoupling(ChannelGain):
     def _unit(cls, scene: Scene, name: str) -> tuple[str, float]:
         unit = gravity_unit(scene, name)
         squared = f" per squared unit of {name}" if unit is None else f"/{unit}^2" if unit == "g" else f"/({unit})^2"
-        return f"{scene.unit}{squared}", 1.0
+        return f"{scene.measure}{squared}", 1.0
