@@ -249,7 +249,7 @@ def _draw_deviations(figure: Figure, outcome: Outcome, variances: list[VarianceC
     panels, scene = _panels(figure, len(variances), sharey=True), outcome.case.scene
     for ax, v in zip(panels, variances, strict=True):
         columns = (v.recorded[:, sensor], v.simulated[:, sensor], v.spread[:, sensor])
-        plot_deviations(*columns, rate=scene.rate, unit=scene.unit, ax=ax)
+        plot_deviations(*columns, rate=scene.rate, unit=scene.measure, ax=ax)
     _said_once(panels)
 
 
@@ -268,5 +268,5 @@ def _draw_blocks(figure: Figure, outcome: Outcome, both: list[Case], sensor: int
     panels, scene = _panels(figure, len(both), sharey=True), outcome.case.scene
     for ax, case in zip(panels, both, strict=True):
         means = block_means(case.recording[sensor])
-        plot_blocks(means, duration=case.n_samples / scene.rate, unit=scene.unit, onsets=onsets, ax=ax)
+        plot_blocks(means, duration=case.n_samples / scene.rate, unit=scene.measure, onsets=onsets, ax=ax)
     _said_once(panels)

@@ -13,6 +13,7 @@ from gyrofuse.mismatch import testimony as court
 from gyrofuse.mismatch.inputs import prepared
 from gyrofuse.mismatch.known_lines import amplitudes, precise, without_lines
 from gyrofuse.mismatch.lines import simulated_lines
+from gyrofuse.mismatch.saved import repaired_from_dict
 
 N, RATE = 16_384, 100.0
 NOISE = gf.parse_model("WN(variance=1e-3) + AR1(phi=0.99,variance=1e-6)")
@@ -82,9 +83,49 @@ def test_a_tone_of_another_size_is_told(factor: float):
 
 def test_a_tone_at_another_frequency_is_named_and_the_missing_one_told():
     report = gf.diagnose(recorded(toned(beta=0.3405), 4), toned())
-    assert [finding.mechanism for finding in report.findings] == ["vibration_tone"]
+    assert [finding.mechanism for finding in report.findings] == ["vibration_tone", "parameter_shift"]
     assert report.findings[0].frequency_hz == pytest.approx(0.3405 / (2 * math.pi) * RATE, rel=1e-5)
-    assert "the line at 5.4112" in report.unexplained[0].words
+    assert "the simulation's tone at 5.4112" in report.findings[1].sentence
+    assert "is not in the recording" in report.findings[1].sentence
+    assert report.unexplained == ()
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+@pytest.mark.parametrize("factor", [0.25, 0.8, 1.5])
+def test_another_size_is_a_number_that_was_wrong(sampled: bool, factor: float):
+    simulation = recorded(toned(), 100) if sampled else toned()
+    report = gf.diagnose(recorded(toned(0.02 * factor), 3), simulation)
+    (finding,) = report.findings
+    assert finding.mechanism == "parameter_shift"
+    assert report.unexplained == ()
+    for i in range(3):
+        said = finding.parameters[f"amplitude[{i}]"]
+        assert said.low < 0.02 * factor < said.high
+        assert said.high - said.low < 0.004
+    drawn = report.model.simulate(N, generator=torch.Generator().manual_seed(1))
+    assert amplitudes(drawn, (0.34 / (2 * math.pi),))[:, 0] == pytest.approx([0.02 * factor] * 3, abs=0.002)
+    again = gf.diagnose(recorded(toned(0.02 * factor), 4), repaired_from_dict(report.model.to_dict()))
+    assert not again.mismatch
+
+
+def test_only_the_sensor_whose_tone_is_another_is_named():
+    signal = recorded(toned(), 7).signal
+    others = recorded(toned(0.03), 7).signal
+    report = gf.diagnose(gf.Recording(torch.stack([signal[0], others[1], signal[2]]), rate=RATE), toned())
+    (finding,) = report.findings
+    assert finding.sensors == (1,)
+    assert finding.effect.amplitude[[0, 2]].tolist() == pytest.approx([0.02, 0.02], rel=1e-2)
+
+
+def test_a_tone_found_in_one_recording_is_known_in_another_whatever_its_phase():
+    """Phases count from when a record began."""
+    first = gf.diagnose(recorded(toned(), 11), NOISE)
+    assert [finding.mechanism for finding in first.findings] == ["vibration_tone"]
+    p_values = [gf.diagnose(recorded(toned(), 20 + seed), first.model).p_value for seed in range(4)]
+    assert min(p_values) > 0.01
+    larger = gf.diagnose(recorded(toned(0.03), 30), first.model)
+    assert [finding.mechanism for finding in larger.findings] == ["parameter_shift"]
+    assert "instead of 0.02" in larger.findings[0].sentence
 
 
 def test_what_is_missing_is_found_beside_a_tone_that_both_have():

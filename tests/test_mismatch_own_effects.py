@@ -159,3 +159,23 @@ def test_hidden_rounding_over_a_few_steps_has_the_law_of_rounding_and_later_nois
         expected = torch.exp(1j * u * physical).mean()
         assert abs(torch.exp(1j * u * made).mean() - expected) < 5 / n**0.5, u
     assert float(torch.corrcoef(torch.stack([plain[0], made]))[0, 1]) > 0.99
+
+
+@pytest.mark.parametrize("loud", [False, True])
+def test_what_happened_once_counts_where_the_recording_has_it(loud: bool):
+    """A step or an episode of one recording is not missed in another."""
+    at = torch.arange(N)
+    inside = (at >= 3000) & (at < 6000)
+
+    def happened(x: Tensor) -> Tensor:
+        return torch.where(inside, 1.3 * x, x) if loud else stepping(0.6)(x)
+
+    name = "variance_change" if loud else "step"
+    first = gf.diagnose(recording(happened(drawn(31))), NOISE)
+    assert [finding.mechanism for finding in first.findings] == [name]
+    again = gf.diagnose(recording(happened(drawn(31))), first.model)
+    assert not again.mismatch
+    assert [effect.name for effect in again.model.effects] == [name]
+    elsewhere = gf.diagnose(recording(drawn(33)), first.model)
+    assert not elsewhere.mismatch
+    assert elsewhere.model.effects == ()

@@ -12,6 +12,7 @@ from mismatch_draws import LEVEL, even, nominated, normal
 from scipy import stats
 from torch import Tensor
 
+import gyrofuse as gf
 from gyrofuse import WhiteNoise
 from gyrofuse.mismatch import episodes, level_scan, shocks
 from gyrofuse.mismatch.case import Case, Scene
@@ -308,3 +309,31 @@ def test_a_hidden_lattice_of_one_sensor_is_looked_for_in_the_others() -> None:
     # Power beyond 3.9 has a chance of 0.78, or of 0.02: fewer than 5 of 10 have probability 8e-3, more than 2 9e-4.
     assert sum(1 in sensors for sensors in found) >= 5
     assert sum(2 in sensors for sensors in found) <= 2
+
+
+@pytest.mark.parametrize("share", [0.5, 1, 1.5, 2])
+def test_a_strong_episode_is_the_only_difference_whatever_the_simulation_s_length(share: float):
+    """It lies at the same share of a longer or shorter simulation, and other witnesses look at noise without it."""
+    noise, n = gf.WhiteNoise(1e-4) + gf.AR1(0.99, 1e-7), 32_768
+    at = torch.arange(n)
+    loud = torch.where((at >= 9000) & (at < 14_000), 1.3, 1.0)
+    signal = noise.simulate(n, batch=(3,), generator=torch.Generator().manual_seed(1)) * loud
+    simulation = noise.simulate(round(share * n), batch=(3,), generator=torch.Generator().manual_seed(2))
+    report = gf.diagnose(gf.Recording(signal, rate=100.0), gf.Recording(simulation, rate=100.0))
+    assert [f.mechanism for f in report.findings] == ["variance_change"]
+    assert report.unexplained == ()
+    told = report.findings[0].parameters
+    assert told["start"].value == pytest.approx(90.0, abs=0.5)
+    assert told["stop"].value == pytest.approx(140.0, abs=0.5)
+    assert all(told[f"factor[{i}]"].value == pytest.approx(1.69, rel=0.08) for i in range(3))
+
+
+def test_strong_noise_that_goes_up_and_down_is_no_episode():
+    n = 32_768
+    t = torch.arange(n, dtype=torch.float64)
+    level = (0.5 * torch.sin(2 * torch.pi * 3.3 * t / n) + 0.2 * torch.sin(2 * torch.pi * 7.1 * t / n)).exp()
+    noise = gf.WhiteNoise(1e-4)
+    signal = noise.simulate(n, batch=(3,), generator=torch.Generator().manual_seed(1)) * level
+    report = gf.diagnose(gf.Recording(signal, rate=100.0), noise)
+    assert "variance_change" not in [f.mechanism for f in report.findings]
+    assert "variance" in [entry.witness for entry in report.unexplained]

@@ -49,7 +49,8 @@ def diagnose(
         recording: What a real array gave; its auxiliary channels are used. A tensor is `(sensor, time)`.
         simulation: What a simulator gives for the same array: samples, of any length and without channels, or a noise
             model, one for all sensors, with batched parameters one for each, or an `ArrayModel`; or a simulation that
-            another diagnosis repaired (`report.model`), whose effects then count as known.
+            another diagnosis repaired (`report.model`), whose effects then count as known; what happened once (a step,
+            an episode) does where the recording has it.
         false_alarm: Probability of a finding where nothing is missing.
         rate: Hz, for recordings given as tensors; 1 by default.
         twins: How many twins of the recording, in which nothing is missing, tell how surprising the witnesses are.

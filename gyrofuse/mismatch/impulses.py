@@ -43,21 +43,18 @@ class LeftOut(NamedTuple):
 
     Attributes:
         error: `(record, sensor, time)`, unit of the signal.
-        sd: Of the errors, robust, `(record, sensor)`.
-        white: Whitened record, `(record, sensor, time)`, robust sd 1.
+        sd: Of the errors between known episodes, robust, `(record, sensor)`.
+        z: Errors over their sd, that of episodes within them, `(record, sensor, time)`.
+        white: Whitened record, `(record, sensor, time)`, robust sd 1, likewise.
         at_ends: Errors where those of the ends are their own; in `error` and `white` their neighbours stand for them
             if there are lines.
     """
 
     error: Tensor
     sd: Tensor
+    z: Tensor
     white: Tensor
     at_ends: Tensor
-
-    @property
-    def z(self) -> Tensor:
-        """Errors over their sd."""
-        return self.error / self.sd[..., None]
 
     def correctable(self) -> Tensor:
         """Errors `(record, sensor, time)` by which single samples may be corrected.
@@ -83,7 +80,11 @@ def left_out(side: Side) -> LeftOut:
     has_lines, at_ends = lines.any(-1, keepdim=True), error
     white, error = (torch.where(has_lines, _mirrored(v), v) for v in (white, error))
     stepped = _stepped(side.signal[:_MOST_RECORDS])
-    return LeftOut(error, _sd(error, stepped), white / _sd(white, stepped)[..., None], at_ends)
+    z = error
+    if side.level is not None:
+        white, z = white / side.level.sqrt(), error / side.level.sqrt()
+    sd = _sd(z, stepped)
+    return LeftOut(error, sd, z / sd[..., None], white / _sd(white, stepped)[..., None], at_ends)
 
 
 def _lines(y: Tensor, spectrum: Tensor) -> Tensor:
@@ -240,7 +241,7 @@ def kurtosis_p_values(case: Case) -> Tensor:
 @remembered
 def _kurtosis_scores(side: Side) -> Tensor:
     """Kurtosis of thinned Haar coefficients as a standard normal variable, `(level, sensor)`; mean of the records."""
-    mean = side.noise[:_MOST_RECORDS]
+    mean = side.steady[:_MOST_RECORDS]
     mean = mean - mean.mean(-1, keepdim=True)
     scores, stride = [], 1
     for level in range(1, int(math.log2(side.signal.shape[-1])) - _TOP + 1):

@@ -35,6 +35,13 @@ def amplitudes(signal: Tensor, frequencies: tuple[float, ...]) -> Tensor:
     return line_parts(signal, frequencies).abs()
 
 
+def resized(signal: Tensor, frequency: float, amplitude: Tensor) -> Tensor:
+    """Signals `(..., sensor, time)` whose line at a frequency has another amplitude `(sensor,)`, in its own phase."""
+    n, own = signal.shape[-1], _coefficients(signal, (frequency,))[..., :2]
+    more = own * (amplitude / torch.hypot(own[..., 0], own[..., 1]).clamp(min=1e-300) - 1)[..., None]
+    return torch.cat([part + more @ _basis(n, t, (frequency,))[:2] for part, t in _stretches(signal)], -1)
+
+
 def precise(signal: Tensor, frequencies: tuple[float, ...]) -> tuple[float, ...]:
     """Frequencies known to a fraction of a bin, made precise by how their phases advance in signals `(..., time)`.
 

@@ -347,15 +347,15 @@ def marginal_witness(case: Case) -> Evidence:
     steps = missing_lattices(case, 1.0)
     same = repeats(case).p_values
     candidates = [
-        (corrected(found.p_value, case.n_sensors), i, f"values on a lattice of {found.step:.4g} {case.scene.unit}")
+        (corrected(found.p_value, case.n_sensors), i, f"values on a lattice of {found.step:.4g} {case.scene.measure}")
         for i, found in steps.items()
     ]
     often = int(same.argmin())
     candidates.append((corrected(float(same[often]), case.n_sensors), often, "samples repeated more often than there"))
     ends = min(end_stops(case), key=lambda end: end.p_value)
-    candidates.append((ends.p_value, ends.sensor, f"values that end at {ends.limit:.6g} {case.scene.unit}"))
+    candidates.append((ends.p_value, ends.sensor, f"values that end at {ends.limit:.6g} {case.scene.measure}"))
     candidates += [
-        (p, i, f"{found.times} times the value {found.value:.6g} {case.scene.unit}, where values do not recur,")
+        (p, i, f"{found.times} times the value {found.value:.6g} {case.scene.measure}, where values do not recur,")
         for i, (found, p) in missing_recurrences(case).items()
     ]
     p, sensor, words = min(candidates)

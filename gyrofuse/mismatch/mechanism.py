@@ -64,6 +64,13 @@ class Mechanism:
         """The case with the mechanism in the simulation, whether or not it could be taken off the recording."""
         return case.built_in(partial(self.simulated, scene=case.scene, generator=generator), self.place)
 
+    def anew(self, case: Case, generator: torch.Generator) -> Case:
+        """The case of another recording, of which a simulation claims that it has the mechanism: as where it was found.
+
+        What has another phase there goes into the simulation.
+        """
+        return self.explained(case, generator)
+
     def spectra(self, matrices: Tensor, f: Tensor) -> Tensor:
         """What becomes of cross-spectral densities `(frequency, sensor, sensor)` at `f` cycles per sample.
 

@@ -73,7 +73,7 @@ class Seen(NamedTuple):
 
     def of(self, effect: Mechanism, sentence: str, amplitude: str, factor: float) -> Finding:
         """The finding, amplitudes `factor` times the rms."""
-        bump, rate, unit = self.bump, self.case.scene.rate, self.case.scene.unit
+        bump, rate, unit = self.bump, self.case.scene.rate, self.case.scene.measure
         centre_sd, width_sd = bump.log_sd
         if effect.name == "drifting_tone" or self.verdict.open:
             centre_sd = math.hypot(centre_sd, wandering_sd(self.case, bump) / bump.centre)

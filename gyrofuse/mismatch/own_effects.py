@@ -30,17 +30,21 @@ def with_own_effects(
 ) -> tuple[Case, tuple[Mechanism, ...]]:
     """The case as far as the simulation's own effects explain it, and these.
 
+    What happened once counts where this recording has it.
+
     Args:
         case: Recording and simulation; of a repaired simulation, its noise.
         simulation: As it was given.
         level: Largest p value of an effect that is looked for in samples.
         generator: Of what is built into the simulation.
     """
+    own: list[Mechanism] = []
     if isinstance(simulation, RepairedModel):
         for effect in simulation.effects:
-            case = effect.explained(case, generator)
-        return case, simulation.effects
-    own: list[Mechanism] = []
+            if not effect.happened_once or held_out_gain(case, effect).as_found > 0:
+                case = effect.anew(case, generator)
+                own.append(effect)
+        return case, tuple(own)
     if case.simulated.signal.shape[-1] == case.n_samples:
         for stage in STAGES:
             kinds = [kind for kind in stage if kind.proportional_to]

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.base import Base, fit_base
+from gyrofuse.mismatch.fast_noise import with_level
 from gyrofuse.mismatch.known_lines import without_lines
 from gyrofuse.mismatch.spectra import Bands, cross_spectra, degrees_of_freedom
 
@@ -29,12 +30,14 @@ class Side:
             looked at.
         told_by: Samples of each sensor that the noise is known from, where they are fewer: those that a model, which
             these were drawn from, was estimated from.
+        level: Variance that episodes which were found give the noise, `(sensor, time)`; 1 between them.
     """
 
     signal: Tensor
     bands: Bands
     lines: tuple[float, ...] = ()
     told_by: float = math.inf
+    level: Tensor | None = None
 
     @property
     def n_records(self) -> float:
@@ -50,6 +53,11 @@ class Side:
     def noise(self) -> Tensor:
         """The signal without the simulation's lines."""
         return without_lines(self.signal, self.lines)
+
+    @cached_property
+    def steady(self) -> Tensor:
+        """The noise as it would be without the episodes that were found."""
+        return self.noise if self.level is None else with_level(self.noise, 1 / self.level)
 
     @cached_property
     def spectra(self) -> Tensor:

@@ -219,7 +219,7 @@ def slow_finding(
         time_s: Onset.
         channel: That it follows.
     """
-    scan, unit = strong.scan, unit or case.scene.unit
+    scan, unit = strong.scan, unit or case.scene.measure
     which = concerned(scan)
     limits = {}
     for i in which:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import Evidence, corrected
-from gyrofuse.mismatch.known_lines import amplitudes
+from gyrofuse.mismatch.line_sizes import LineSizes, line_sizes
 
 _COHERENCE_DOF = 80  # below, sums over pairs have no simple law
 _TAIL = 10.0
@@ -51,36 +51,26 @@ def line_witness(case: Case) -> Evidence:
         levels=(level_of(line.frequency),),
         frequency_hz=f,
     )
-    if not case.simulated.lines:
+    sizes = line_sizes(case)
+    if sizes is None:
         return found
-    both = (found, _other_size(case))
+    both = (found, _other_size(case, sizes))
     return min((replace(e, p_value=corrected(e.p_value, len(both))) for e in both), key=lambda e: e.p_value)
 
 
-def _other_size(case: Case) -> Evidence:
-    """The simulation's line whose amplitude in the recording is the most surprising.
-
-    An amplitude scatters by `sqrt(2 S / n)` where the line stands out, and by less where it does not. That of the
-    simulation is known as well as its records agree on it.
-    """
-    lines = case.simulated.lines
-    own, others = (amplitudes(side.signal, lines) for side in (case.recorded, case.simulated))  # (record, sensor, line)
-    density = case.base.spectrum(torch.tensor(lines, dtype=torch.float64))  # (sensor, line)
-    ours, theirs = (2 * density / side.signal.shape[-1] for side in (case.recorded, case.simulated))
-    if len(others) > 1:
-        theirs = theirs.maximum(others.var(0))
-    z = (own[0] - others.mean(0)) / (ours + theirs / len(others)).sqrt()
-    tails = torch.special.erfc(z.abs() / math.sqrt(2))
-    sensor, at = divmod(int(z.abs().argmax()), len(lines))
-    ratio = float(own[0, sensor, at] / others.mean(0)[sensor, at].clamp(min=1e-300))
-    f = lines[at] * case.scene.rate
+def _other_size(case: Case, sizes: LineSizes) -> Evidence:
+    """The simulation's line whose amplitude in the recording is the most surprising."""
+    sensor, at = sizes.worst
+    ratio = float(sizes.recorded[sensor, at] / sizes.simulated[sensor, at].clamp(min=1e-300))
+    place = case.simulated.lines[at]
+    f, tails = place * case.scene.rate, sizes.tails
     which = (tails[:, at] < 0.05 / tails.numel()).nonzero()[:, 0].tolist() or [sensor]
     return Evidence(
         "line",
-        corrected(float(tails[sensor, at]), tails.numel()),
+        sizes.p_value,
         f"the line at {f:.6g} Hz has {ratio:.3g} times the simulation's amplitude in {case.scene.named([sensor])}",
         sensors=tuple(which),
-        levels=(level_of(lines[at]),),
+        levels=(level_of(place),),
         frequency_hz=f,
     )
 

@@ -24,6 +24,7 @@ from gyrofuse.mismatch.mechanisms.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.step import Step
 from gyrofuse.mismatch.mechanisms.stuck_samples import StuckSamples
 from gyrofuse.mismatch.mechanisms.temperature_drift import TemperatureDrift
+from gyrofuse.mismatch.mechanisms.tone_size import ToneSize
 from gyrofuse.mismatch.mechanisms.unit_scale import UnitScale
 from gyrofuse.mismatch.mechanisms.variance_change import VarianceChange
 from gyrofuse.mismatch.mechanisms.vibration_tone import VibrationTone
@@ -35,7 +36,7 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (Spikes,),
     (ClockSkew,),
     (GSensitivity, QuadraticCoupling, ScaleFactor),
-    (VibrationTone,),
+    (VibrationTone, ToneSize),
     (RandomTelegraph,),
     (TemperatureDrift, WarmUpTransient, Step),
     (VarianceChange,),

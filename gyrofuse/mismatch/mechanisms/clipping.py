@@ -43,7 +43,7 @@ class Clipping(Mechanism):
         sensors = tuple(sorted({end.sensor for end in found}))
         parameters = {
             f"{'high' if end.sign > 0 else 'low'}[{end.sensor}]": Parameter(
-                end.limit, end.limit, end.limit, case.scene.unit
+                end.limit, end.limit, end.limit, case.scene.measure
             )
             for end in found
         }
@@ -54,7 +54,7 @@ class Clipping(Mechanism):
         return Finding(
             cls.name,
             effect,
-            f"values are cut {' and '.join(ends)} in {where}, as at {at.limit:.6g} {case.scene.unit} in sensor "
+            f"values are cut {' and '.join(ends)} in {where}, as at {at.limit:.6g} {case.scene.measure} in sensor "
             f"{case.scene.sensors[at.sensor]}: {100 * share:.2g} % of the samples sit at the limits",
             corrected(at.p_value, 1),
             sensors,

@@ -51,7 +51,7 @@ class CommonMode(Addition):
         shape = chosen_shape(case, cls.name, level)
         if shape is None or not isinstance(shape.term, Common):
             return None
-        term, unit = shape.term, case.scene.unit
+        term, unit = shape.term, case.scene.measure
         gain = torch.complex(*term.local)
         reference = gain[gain.abs().argmax()]
         gain = gain * reference.conj() / reference.abs()

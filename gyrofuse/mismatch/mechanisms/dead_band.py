@@ -49,18 +49,18 @@ class DeadBand(Mechanism):
                 found[i] = again
         found = dict(sorted(found.items()))
         numbers = torch.zeros(2, case.n_sensors, dtype=torch.float64)
-        parameters = {}
+        parameters, unit = {}, case.scene.measure
         for i, own in found.items():
             middle, low, high = band_limits(own)
             numbers[:, i] = torch.tensor([own.value, middle])
-            parameters[f"dead_band[{i}]"] = Parameter(middle, low, high, case.scene.unit)
+            parameters[f"dead_band[{i}]"] = Parameter(middle, low, high, unit)
         effect = cls(numbers[0], numbers[1], case.recording.mean(-1))
         sensors = tuple(found)
         return Finding(
             cls.name,
             effect,
-            f"a dead band: within {float(effect.half_width.max()):.3g} {case.scene.unit} of {first.value:.3g} "
-            f"{case.scene.unit} the rate is put out as {first.value:.3g} in {case.scene.named(sensors, 'all sensors')}",
+            f"a dead band: within {float(effect.half_width.max()):.3g} {unit} of {first.value:.3g} {unit} the rate is "
+            f"put out as {first.value:.3g} in {case.scene.named(sensors, 'all sensors')}",
             p_value,
             sensors,
             parameters,

@@ -54,7 +54,7 @@ class DriftingTone(Addition):
             cls(mode, finding.slow, share),
             f"a tone near {mode.centre * rate:.4g} Hz whose frequency wanders by about {mode.width * rate:.2g} Hz, in "
             f"{finding.where}, of amplitude up to {factor * float(mode.gain.abs().max()):.3g} "
-            f"{case.scene.unit}, that the simulation does not have",
+            f"{case.scene.measure}, that the simulation does not have",
             amplitude="amplitude",
             factor=factor,
         )

@@ -43,7 +43,7 @@ class FlickerNoise(Addition):
         parameters = {}
         for i in sensors:
             parameters[f"level[{i}]"] = spanned(
-                lambda x: math.sqrt(2 * max(x, 0.0)), float(a[i]), float(sd[i]), case.scene.unit
+                lambda x: math.sqrt(2 * max(x, 0.0)), float(a[i]), float(sd[i]), case.scene.measure
             )
         where = case.scene.named(sensors, "all sensors")
         largest = max(math.sqrt(2 * float(a[i])) for i in sensors)
@@ -54,7 +54,7 @@ class FlickerNoise(Addition):
             sensors,
             parameters,
             f"1/f noise in {where} that the simulation does not have, up to {largest:.3g} "
-            f"{case.scene.unit} rms in each factor e of frequency",
+            f"{case.scene.measure} rms in each factor e of frequency",
         )
 
     def density(self, f: Tensor) -> Tensor:

@@ -48,7 +48,7 @@ class GSensitivity(ChannelGain):
     @classmethod
     def _unit(cls, scene: Scene, name: str) -> tuple[str, float]:
         unit = gravity_unit(scene, name)
-        return super()._unit(scene, name) if unit is None else (f"{scene.unit}/{unit}", 1.0)
+        return super()._unit(scene, name) if unit is None else (f"{scene.measure}/{unit}", 1.0)
 
 
 def _beyond_sensors(scene: Scene, finding: Finding) -> bool:

@@ -47,7 +47,7 @@ class ParameterShift(Filter):
             return None
         parameters, words = {}, []
         base = deep_base(case)
-        before, least = _numbers(base, case.scene.rate, case.scene.unit)
+        before, least = _numbers(base, case.scene.rate, case.scene.measure)
         for i in range(case.n_sensors):
             for k, name in enumerate(_PARTS):
                 sd = float(shape.sd[0][k, i])

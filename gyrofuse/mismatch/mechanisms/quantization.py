@@ -56,7 +56,7 @@ class Quantization(Mechanism):
         for i in sensors:
             value = float(step[i])
             reach = Z * effect._step_sd(i, case.recording[i])
-            parameters[f"lsb[{i}]"] = Parameter(value, value - reach, value + reach, case.scene.unit)
+            parameters[f"lsb[{i}]"] = Parameter(value, value - reach, value + reach, case.scene.measure)
         where = case.scene.named(sensors, "all sensors")
         hidden = ", hidden under what was added later" if float(blur.max()) > 0 else ""
         coarse = _too_coarse(case.recording, found)
@@ -65,7 +65,7 @@ class Quantization(Mechanism):
         return Finding(
             cls.name,
             effect,
-            f"the rate is rounded to steps of {_several(step[list(sensors)])} {case.scene.unit} in {where}{hidden}",
+            f"the rate is rounded to steps of {_several(step[list(sensors)])} {case.scene.measure} in {where}{hidden}",
             min(corrected(found[i].p_value, case.n_sensors) for i in sensors),
             sensors,
             parameters,

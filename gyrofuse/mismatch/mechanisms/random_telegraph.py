@@ -56,7 +56,7 @@ class RandomTelegraph(Mechanism):
         parameters = {}
         for i, fit in fits.items():
             found = (
-                ("half_step", effect.half_step, case.scene.unit),
+                ("half_step", effect.half_step, case.scene.measure),
                 ("dwell_up", effect.up, "s"),
                 ("dwell_down", effect.down, "s"),
             )
@@ -69,7 +69,7 @@ class RandomTelegraph(Mechanism):
             cls.name,
             effect,
             f"the rate jumps between two levels in {where}: {2 * float(effect.half_step[largest]):.3g} "
-            f"{case.scene.unit} apart in sensor {case.scene.sensors[largest]}, "
+            f"{case.scene.measure} apart in sensor {case.scene.sensors[largest]}, "
             f"staying {float(effect.up[largest]):.3g} s "
             f"in the upper and {float(effect.down[largest]):.3g} s in the lower one on average",
             p_value,

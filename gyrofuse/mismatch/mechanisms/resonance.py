@@ -35,7 +35,7 @@ class Resonance(Addition):
         if seen is None:
             return None
         mode, finding = seen
-        rate, unit = case.scene.rate, case.scene.unit
+        rate, unit = case.scene.rate, case.scene.measure
         source = "one mode moves" if mode.shared else "modes of their own move"
         return finding.of(
             cls(mode),

@@ -103,7 +103,7 @@ class Spikes(Mechanism):
             effect,
             f"isolated outliers in {where}{', ' + how if len(hit) > 1 else ''}: "
             f"{laws[largest].rate * case.scene.rate * _HOUR:.3g} an hour of {float(effect.amplitude[largest]):.3g} "
-            f"{case.scene.unit} in sensor {case.scene.sensors[largest]}",
+            f"{case.scene.measure} in sensor {case.scene.sensors[largest]}",
             p_value,
             hit,
             parameters,
@@ -133,7 +133,9 @@ class Spikes(Mechanism):
                 law.rate * per_hour, low * per_hour, high * per_hour, "1/h"
             )
             low, high = law.amplitude_limits
-            parameters[f"amplitude[{i}]"] = Parameter(law.amplitude * scale, low * scale, high * scale, case.scene.unit)
+            parameters[f"amplitude[{i}]"] = Parameter(
+                law.amplitude * scale, low * scale, high * scale, case.scene.measure
+            )
         return parameters
 
     def refitted(self, case: Case, fold: int) -> Spikes:

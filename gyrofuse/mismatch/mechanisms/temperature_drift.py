@@ -75,7 +75,7 @@ class TemperatureDrift(SlowEffect):
             words,
             {"lag": lag},
             size="coefficient",
-            unit=f"{case.scene.unit}/K",
+            unit=f"{case.scene.measure}/K",
             channel=channel,
         )
 

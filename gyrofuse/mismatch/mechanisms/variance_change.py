@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool1d
 
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.episodes import (
@@ -21,9 +20,11 @@ from gyrofuse.mismatch.episodes import (
     told_of_first,
     two_level_scores,
 )
+from gyrofuse.mismatch.fast_noise import with_level
 from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.level_scan import Reference, scanned_levels
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
+from gyrofuse.mismatch.modulation import strongest_modulation
 from gyrofuse.mismatch.noise_level import (
     LEVEL_CUT,
     compared_levels,
@@ -36,10 +37,12 @@ from gyrofuse.mismatch.noise_level import (
 
 _FACTOR = 1.25  # by which, and by `_NATS`, a level that goes up and down all the time has to be likelier
 _NATS = 5.0
+_A_LOT = 100.0  # nats from which a level that goes up and down shows beside the episodes that stand for it
+_LEFT, _SHARE = 1e-3, 0.05  # p value of that, and its share of all that is said
+_ONE_MORE, _MORE = 0.4, 3  # share of that which a further episode says, if there is one, and how many may be
 _KNOWN = 1.0  # standard deviations of a factor's logarithm from 0, wherever the episode is
 _SHORT = 8  # samples
 _SAME = 0.8  # share of episodes that they have in common with others
-_SLOWER = 65  # samples: what varies more slowly is not louder
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,17 +118,30 @@ class VarianceChange(Mechanism):
         return VarianceChange(self.episodes, torch.where(self.factor != 1, log_factor.exp(), 1.0))
 
     def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
-        reach = min(_SLOWER, signal.shape[-1] // 2 * 2 - 1)
-        flat = signal.flatten(0, -2)[:, None]
-        padded = torch.nn.functional.pad(flat, (reach // 2, reach // 2), mode="reflect")
-        fast = signal - avg_pool1d(padded, reach, 1)[:, 0].reshape(signal.shape)
-        inside = self._inside(signal.shape[-1], scene.rate)
-        return signal + (self.factor.sqrt() - 1)[:, None] * fast * inside
+        return with_level(signal, self._level(signal.shape[-1], scene.rate))
+
+    def explained(self, case: Case, generator: torch.Generator) -> Case:
+        """At the same share of records that are longer or shorter, so that these have as much of the episodes."""
+        level, n = self._level(case.n_samples, case.scene.rate), case.n_samples
+
+        def of_length(m: int) -> Tensor:
+            return level[:, torch.arange(m) * n // m]
+
+        built = case.built_in(lambda signal: with_level(signal, of_length(signal.shape[-1])))
+        recorded, simulated = (
+            replace(side, level=of_length(side.signal.shape[-1]) * (1.0 if side.level is None else side.level))
+            for side in (built.recorded, built.simulated)
+        )
+        return replace(built, recorded=recorded, simulated=simulated)
 
     def gains(self, case: Case, fold: int) -> Tensor:
         inside = self._inside(case.n_samples, case.scene.rate)
         scores = two_level_scores(levelled(case), self.factor, inside, level_between(case, inside))
         return held_out_blocks(scores, fold).sum((0, -1))
+
+    def _level(self, n_samples: int, rate: float) -> Tensor:
+        """Of the variance, `(sensor, time)`."""
+        return torch.where(self._inside(n_samples, rate), self.factor[:, None], 1.0)
 
     def _inside(self, n_samples: int, rate: float) -> Tensor:
         within = torch.zeros(n_samples, dtype=torch.bool)
@@ -183,7 +199,9 @@ def _from_the_simulated_level(case: Case, found: Episodes) -> Episodes:
 def _goes_up_and_down(case: Case, found: Episodes) -> bool:
     """Whether a level that is modulated all the time says more than episodes with a start and a stop.
 
-    By far, but where the level is not the simulation's between episodes either.
+    By far, but where the level is not the simulation's between episodes either. If a lot is said, where the level still
+    goes up and down beside the episodes, and few further ones do not explain that: gains of modulations take squares
+    for normal, and are wrong where the level changes by much.
     """
     n, wave = case.n_samples, modulation(case)
     inside = found.inside(n)
@@ -192,9 +210,18 @@ def _goes_up_and_down(case: Case, found: Episodes) -> bool:
     numbers = 2 * len(found.episodes) + int((found.factor != 1).sum()) / 2
     once = max(found.log_ratio, float(scores.sum()) - numbers * math.log(n))
     always = max(-math.log(max(wave.p_value, 1e-300)), wave.log_ratio)
-    if between is None and compared_levels(case) is not None:
-        return always > once
-    return always > _FACTOR * once + _NATS
+    if max(always, once) < _A_LOT:
+        known = between is not None or compared_levels(case) is None
+        return always > (_FACTOR * once + _NATS if known else once)
+    white, more = levelled(case), found
+    for _ in range(_MORE):
+        white = white / torch.where(more.inside(n), more.factor[:, None], 1.0).sqrt()
+        rest, more = strongest_modulation(white.square().clamp(max=LEVEL_CUT)), stretch_of(white)
+        if rest.p_value > _LEFT or rest.log_ratio < _SHARE * always:
+            return False
+        if more.log_ratio < _ONE_MORE * rest.log_ratio:
+            return True
+    return True
 
 
 def _time(limits: Limits, rate: float) -> Parameter:

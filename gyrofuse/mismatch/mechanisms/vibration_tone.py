@@ -64,14 +64,14 @@ class VibrationTone(Mechanism):
         parameters = {"frequency": _limits(tone.frequency_hz, spread * case.scene.rate, "Hz")}
         low, value, high = sd[list(present)] * amplitude_limits(snr[list(present)], seen)
         for row in zip(present, value.tolist(), low.tolist(), high.tolist(), strict=True):
-            parameters[f"amplitude[{row[0]}]"] = Parameter(*row[1:], case.scene.unit)
+            parameters[f"amplitude[{row[0]}]"] = Parameter(*row[1:], case.scene.measure)
         largest = max(present, key=lambda i: float(tone.amplitude[i]))
         where = case.scene.named(present, "all sensors")
         return Finding(
             cls.name,
             tone,
             f"a tone at {tone.frequency_hz:.6g} Hz in {where}, of amplitude up to "
-            f"{float(tone.amplitude[largest]):.3g} {case.scene.unit} (sensor {case.scene.sensors[largest]}), "
+            f"{float(tone.amplitude[largest]):.3g} {case.scene.measure} (sensor {case.scene.sensors[largest]}), "
             f"that the simulation does not have; without a filter before sampling it may be one at "
             f"{case.scene.rate - tone.frequency_hz:.6g}, {case.scene.rate + tone.frequency_hz:.6g} .. Hz",
             line.p_value,
@@ -121,6 +121,11 @@ class VibrationTone(Mechanism):
 
     def explained(self, case: Case, generator: torch.Generator) -> Case:
         return case.less(self._path(case.n_samples, case.scene))
+
+    def anew(self, case: Case, generator: torch.Generator) -> Case:
+        """A line that the simulation has: its phase counts from when a record began."""
+        built = self.built_into(case, generator)
+        return built.knowing((*case.simulated.lines, self.frequency_hz / case.scene.rate))
 
     def _path(self, n_samples: int, scene: Scene, turn: float = 0.0) -> Tensor:
         angle = 2 * math.pi * self.frequency_hz * scene.seconds(n_samples) + turn
