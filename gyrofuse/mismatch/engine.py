@@ -151,8 +151,6 @@ def _known(finding: Finding, found: list[Finding]) -> bool:
     """Whether the same was found before: what its repair could not take away is not another one."""
     if finding.effect.place:  # a fact on the numbers of some sensors
         return any(f.mechanism == finding.mechanism and set(finding.sensors) <= set(f.sensors) for f in found)
-    if any(finding.effect.repeats(other.effect) for other in found):
-        return True
     return any(
         (finding.mechanism, finding.sensors, finding.channel, finding.time_s, finding.frequency_hz)
         == (other.mechanism, other.sensors, other.channel, other.time_s, other.frequency_hz)

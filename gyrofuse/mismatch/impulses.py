@@ -80,9 +80,7 @@ def left_out(side: Side) -> LeftOut:
     has_lines, at_ends = lines.any(-1, keepdim=True), error
     white, error = (torch.where(has_lines, _mirrored(v), v) for v in (white, error))
     stepped = _stepped(side.signal[:_MOST_RECORDS])
-    z = error
-    if side.level is not None:
-        white, z = white / side.level.sqrt(), error / side.level.sqrt()
+    z, white = (values / side.level**0.5 for values in (error, white))
     sd = _sd(z, stepped)
     return LeftOut(error, sd, z / sd[..., None], white / _sd(white, stepped)[..., None], at_ends)
 

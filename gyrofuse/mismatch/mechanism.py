@@ -85,10 +85,6 @@ class Mechanism:
         """
         return spectral_gains(case, self.removed(case.recording, case.scene), self.spectra, fold)
 
-    def repeats(self, other: Mechanism) -> bool:
-        """Whether it says again what one that was found before has said, by other numbers."""
-        return False
-
     def refitted(self, case: Case, fold: int) -> Mechanism:
         """The same mechanism with its numbers estimated anew, where it is known to be, without what a fold holds out.
 

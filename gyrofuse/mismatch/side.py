@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.base import Base, fit_base
-from gyrofuse.mismatch.fast_noise import with_level
 from gyrofuse.mismatch.known_lines import without_lines
+from gyrofuse.mismatch.loudness import Loudness
 from gyrofuse.mismatch.spectra import Bands, cross_spectra, degrees_of_freedom
 
 _ORDINATES = 40  # for each sensor, behind a matrix that is inverted
@@ -30,14 +30,14 @@ class Side:
             looked at.
         told_by: Samples of each sensor that the noise is known from, where they are fewer: those that a model, which
             these were drawn from, was estimated from.
-        level: Variance that episodes which were found give the noise, `(sensor, time)`; 1 between them.
+        loud: Episodes that it is known to have.
     """
 
     signal: Tensor
     bands: Bands
     lines: tuple[float, ...] = ()
     told_by: float = math.inf
-    level: Tensor | None = None
+    loud: tuple[Loudness, ...] = ()
 
     @property
     def n_records(self) -> float:
@@ -54,10 +54,18 @@ class Side:
         """The signal without the simulation's lines."""
         return without_lines(self.signal, self.lines)
 
+    @property
+    def level(self) -> Tensor | float:
+        """Variance of the noise in the episodes that it is known to have, `(sensor, time)`; 1 without any."""
+        return math.prod((episodes.variance for episodes in self.loud), start=1.0)
+
     @cached_property
     def steady(self) -> Tensor:
-        """The noise as it would be without the episodes that were found."""
-        return self.noise if self.level is None else with_level(self.noise, 1 / self.level)
+        """The noise as it would be without them."""
+        noise = self.noise
+        for episodes in reversed(self.loud):
+            noise = episodes.taken_off(noise)
+        return noise
 
     @cached_property
     def spectra(self) -> Tensor:

@@ -20,9 +20,9 @@ from gyrofuse.mismatch.episodes import (
     told_of_first,
     two_level_scores,
 )
-from gyrofuse.mismatch.fast_noise import with_level
 from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.level_scan import Reference, scanned_levels
+from gyrofuse.mismatch.loudness import Loudness, corner_of, fast_factor, whitened_factor
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.modulation import strongest_modulation
 from gyrofuse.mismatch.noise_level import (
@@ -42,12 +42,11 @@ _LEFT, _SHARE = 1e-3, 0.05  # p value of that, and its share of all that is said
 _ONE_MORE, _MORE = 0.4, 3  # share of that which a further episode says, if there is one, and how many may be
 _KNOWN = 1.0  # standard deviations of a factor's logarithm from 0, wherever the episode is
 _SHORT = 8  # samples
-_SAME = 0.8  # share of episodes that they have in common with others
 
 
 @dataclass(frozen=True, eq=False)
 class VarianceChange(Mechanism):
-    """`sd_t = sqrt(factor) sd` within episodes, for what is faster than 65 samples.
+    """`S_t(f) = (1 + (factor - 1) f^2/(f^2 + f_c^2)) S(f)` within episodes: what is fast is louder.
 
     Looks like heavy tails; its loud samples lie together. A level that wanders or oscillates all the time has no start
     and no stop: where that is likelier by far it has no name here.
@@ -55,12 +54,14 @@ class VarianceChange(Mechanism):
     Attributes:
         episodes: Starts and stops, s after the first sample.
         factor: `(sensor,)`, of the variance within; 1 where a sensor does not change.
+        corner_hz: `f_c`; 0 where all noise but the mean is louder.
     """
 
     name: ClassVar[str] = "variance_change"
     happened_once: ClassVar[bool] = True
     episodes: tuple[tuple[float, float], ...]
     factor: Tensor
+    corner_hz: float = 0.0
 
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:
@@ -76,21 +77,24 @@ class VarianceChange(Mechanism):
             return None  # some stretch has another level, but nothing tells which and what level
         found, reference, told = held
         rate = case.scene.rate
-        effect = cls(tuple((e.start / rate, e.stop / rate) for e in found.episodes), found.factor)
+        corner = corner_of(case.recorded.noise[0], found.inside(case.n_samples), found.factor)
+        episodes = tuple((e.start / rate, e.stop / rate) for e in found.episodes)
+        factor = torch.where(found.factor != 1, fast_factor(found.factor, corner), 1.0)
+        effect = cls(episodes, factor, corner * rate)
         sensors = tuple((found.factor != 1).nonzero()[:, 0].tolist())
         parameters = {name: _time(limits, rate) for name, limits in (("start", told.start), ("stop", told.stop))}
         for i, value, sd in zip(sensors, told.log_factor.tolist(), told.log_factor_sd.tolist(), strict=True):
-            parameters[f"factor[{i}]"] = Parameter(
-                math.exp(value), math.exp(value - Z * sd), math.exp(value + Z * sd), ""
-            )
+            limits = torch.tensor([value, value - Z * sd, value + Z * sd], dtype=torch.float64).exp()
+            middle, low, high = fast_factor(limits, corner).tolist()
+            parameters[f"factor[{i}]"] = Parameter(middle, low, high, "")
         gain = float(two_level_scores(white, found.factor, found.inside(case.n_samples), reference).sum())
-        largest = max(sensors, key=lambda i: abs(math.log(float(found.factor[i]))))
+        largest = max(sensors, key=lambda i: abs(math.log(float(factor[i]))))
         where = case.scene.named(sensors, "all sensors")
         more = f" and {len(found.episodes) - 1} more times" if len(found.episodes) > 1 else ""
         return Finding(
             cls.name,
             effect,
-            f"the noise's variance is {float(found.factor[largest]):.3g} times the rest (sensor "
+            f"the noise's variance is {float(factor[largest]):.3g} times the rest (sensor "
             f"{case.scene.sensors[largest]}) from {parameters['start'].value:.6g} s "
             f"to {parameters['stop'].value:.6g} s{more} in {where}",
             p_value,
@@ -102,46 +106,36 @@ class VarianceChange(Mechanism):
             gain=gain,
         )
 
-    def repeats(self, other: Mechanism) -> bool:
-        """Whether most of it lies in the other's episodes, and the other way round."""
-        if not isinstance(other, VarianceChange):
-            return False
-        shared = sum(max(min(b, d) - max(a, c), 0.0) for a, b in self.episodes for c, d in other.episodes)
-        return all(shared > _SAME * sum(stop - start for start, stop in e.episodes) for e in (self, other))
-
     def refitted(self, case: Case, fold: int) -> VarianceChange:
         keep = estimation_samples(case.n_samples, fold)
         inside = self._inside(case.n_samples, case.scene.rate)
         if not bool(inside[keep].any()) or bool(inside[keep].all()):
             return self
         log_factor, _ = log_factors(levelled(case)[:, keep].square(), inside[keep], level_between(case, inside))
-        return VarianceChange(self.episodes, torch.where(self.factor != 1, log_factor.exp(), 1.0))
+        fast = fast_factor(log_factor.exp(), self.corner_hz / case.scene.rate)
+        return replace(self, factor=torch.where(self.factor != 1, fast, 1.0))
 
     def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
-        return with_level(signal, self._level(signal.shape[-1], scene.rate))
+        return self._loudness(signal.shape[-1], scene.rate).added(signal)
 
     def explained(self, case: Case, generator: torch.Generator) -> Case:
         """At the same share of records that are longer or shorter, so that these have as much of the episodes."""
-        level, n = self._level(case.n_samples, case.scene.rate), case.n_samples
-
-        def of_length(m: int) -> Tensor:
-            return level[:, torch.arange(m) * n // m]
-
-        built = case.built_in(lambda signal: with_level(signal, of_length(signal.shape[-1])))
+        known = self._loudness(case.n_samples, case.scene.rate)
+        built = case.built_in(lambda signal: known.of_length(signal.shape[-1]).added(signal))
         recorded, simulated = (
-            replace(side, level=of_length(side.signal.shape[-1]) * (1.0 if side.level is None else side.level))
+            replace(side, loud=(*side.loud, known.of_length(side.signal.shape[-1])))
             for side in (built.recorded, built.simulated)
         )
         return replace(built, recorded=recorded, simulated=simulated)
 
     def gains(self, case: Case, fold: int) -> Tensor:
         inside = self._inside(case.n_samples, case.scene.rate)
-        scores = two_level_scores(levelled(case), self.factor, inside, level_between(case, inside))
+        factor = whitened_factor(self.factor, self.corner_hz / case.scene.rate)
+        scores = two_level_scores(levelled(case), factor, inside, level_between(case, inside))
         return held_out_blocks(scores, fold).sum((0, -1))
 
-    def _level(self, n_samples: int, rate: float) -> Tensor:
-        """Of the variance, `(sensor, time)`."""
-        return torch.where(self._inside(n_samples, rate), self.factor[:, None], 1.0)
+    def _loudness(self, n_samples: int, rate: float) -> Loudness:
+        return Loudness(self._inside(n_samples, rate), self.factor, self.corner_hz / rate)
 
     def _inside(self, n_samples: int, rate: float) -> Tensor:
         within = torch.zeros(n_samples, dtype=torch.bool)

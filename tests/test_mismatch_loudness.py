@@ -1,0 +1,66 @@
+"""Episodes as they act on records: from which frequency on they are louder, and what that does to whitened samples."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+import gyrofuse as gf
+from gyrofuse.mismatch.loudness import Loudness, corner_of, fast_factor, fast_share, whitened_factor
+
+N = 2**16
+INSIDE = (torch.arange(N) >= 20_000) & (torch.arange(N) < 40_000)
+
+
+def white(seed: int, n_sensors: int = 3) -> torch.Tensor:
+    return torch.randn(n_sensors, N, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("corner", [2.0**-14, 2.0**-6, 2.0**-4])
+def test_a_whitened_factor_is_the_mean_over_all_frequencies(corner: float):
+    factor = torch.tensor([0.5, 1.0, 1.3, 4.0], dtype=torch.float64)
+    f = (torch.arange(200_000, dtype=torch.float64) + 0.5) / 400_000
+    expected = 1 + (factor - 1) * fast_share(f, corner).mean()
+    torch.testing.assert_close(whitened_factor(factor, corner), expected, rtol=1e-5, atol=0)
+    torch.testing.assert_close(fast_factor(whitened_factor(factor, corner), corner), factor)
+
+
+def test_noise_never_gets_a_negative_power():
+    assert (fast_factor(torch.tensor([1e-3, 0.1], dtype=torch.float64), 2.0**-4) > 0).all()
+
+
+def test_what_is_added_is_as_loud_as_it_says_and_can_be_taken_off():
+    factor = torch.tensor([1.0, 2.0, 0.5], dtype=torch.float64)
+    loud = Loudness(INSIDE, factor, 2.0**-6)
+    noise = white(1)
+    louder = loud.added(noise)
+    torch.testing.assert_close(louder[:, ~INSIDE], noise[:, ~INSIDE])
+    torch.testing.assert_close(louder[0], noise[0])
+    ratio = louder[:, INSIDE].var(-1) / noise[:, INSIDE].var(-1)
+    assert ratio.tolist() == pytest.approx(whitened_factor(factor, 2.0**-6).tolist(), rel=0.02)
+    inner = slice(20_500, 39_500)  # at the ends of an episode filters see what is not louder
+    torch.testing.assert_close(loud.taken_off(louder)[:, inner], noise[:, inner], rtol=0, atol=0.05)
+    assert float((loud.taken_off(louder) - noise).square().mean()) < 1e-4
+
+
+def test_another_length_has_as_large_a_share_of_it():
+    for n in (1000, N // 2, N, 100_000):
+        other = Loudness(INSIDE, torch.ones(1), 0.1).of_length(n)
+        assert len(other.inside) == n
+        assert float(other.inside.double().mean()) == pytest.approx(20_000 / N, abs=2 / n)
+
+
+def test_the_corner_is_where_slow_noise_hides_what_is_louder():
+    factor = torch.full((3,), 1.96, dtype=torch.float64)
+    walk = gf.RandomWalk(4e-3).simulate(N, batch=(3,), generator=torch.Generator().manual_seed(5))  # as strong at 0.01
+    everything = torch.where(INSIDE, 1.4 * white(2), white(2))
+    assert corner_of(everything, INSIDE, factor) <= 2.0**-10
+    beside = torch.where(INSIDE, 1.4 * white(3), white(3)) + walk
+    assert 2.0**-8 <= corner_of(beside, INSIDE, whitened_factor(factor, 0.01)) <= 2.0**-6
+
+
+def test_where_nothing_tells_it_is_a_64th():
+    short = torch.zeros(N, dtype=torch.bool)
+    short[1000:1100] = True
+    assert corner_of(white(4), short, torch.full((3,), 2.0, dtype=torch.float64)) == 1 / 64
+    assert corner_of(white(4), INSIDE, torch.full((3,), 1.001, dtype=torch.float64)) == 1 / 64
