@@ -17,6 +17,7 @@ from gyrofuse.mismatch.colour import filtered, noise, of_phase, quadrature
 from gyrofuse.mismatch.filter_forms import FILTERS, filter_corner, filter_power, filter_response, filter_strength
 from gyrofuse.mismatch.mechanisms.parameter_shift import _numbers
 from gyrofuse.mismatch.pooled import common_witness
+from gyrofuse.mismatch.shape_choice import _regular
 from gyrofuse.mismatch.shape_fit import Ratios, data_model, fair_gain, fit, linearised, log_score
 from gyrofuse.mismatch.shape_law import equivalent, smooth_coherence
 from gyrofuse.mismatch.shape_scan import bump_start, shape_witness
@@ -342,3 +343,16 @@ def test_fits_of_nothing_gain_what_chance_gives():
 def test_shapes_are_searched_once_for_a_case():
     given = drawn(20, CHANGES["levels"][1])
     assert leading_shape(given) is leading_shape(given)
+
+
+@pytest.mark.parametrize(("share", "regular"), [(0.0, True), (0.9, True), (0.999, False)])
+def test_sensors_keep_something_of_their_own_beside_what_is_common(share: float, regular: bool):
+    """Cross-spectra of fewer ordinates than sensors lie in a plane: noise in it alone would be infinitely likely."""
+    data = compared(drawn(21, CHANGES["levels"][1]))
+    found = fit(data, [Flicker.start(data.ground)])
+    signs = torch.tensor([1.0, -1.0] * P, dtype=torch.float64)[:P]
+    plane = share * signs[:, None] * signs + (1 - share) * torch.eye(P, dtype=torch.float64)
+    size = torch.arange(1, P + 1, dtype=torch.float64)
+    model = found.model.clone()
+    model[3] = plane * size[:, None] * size
+    assert _regular(found._replace(model=model)) == regular

@@ -22,6 +22,7 @@ _SMALL = 0.1  # share of what there was to explain that may be left all the same
 _NEW = 8.0  # nats that a shape costs beside its numbers
 _NUMBER = 2.0  # nats for a number of a sensor: those of sensors that have it are alike
 _PART = 4.0  # nats for each further part of the noise whose numbers are others
+_OWN = 0.02  # of a sensor's power in any band, beside what is common
 _TOUCH = 0.1
 _FORMS = 3  # of filters
 _WIDTHS = (0.06, 0.15, 0.35)  # half width of a bump over its centre
@@ -103,7 +104,15 @@ def _varied(data: Ratios, found: Fit) -> Fit:
     forms = [[*others, form] for form in last.variants() if (form.turned, form.inside) != (last.turned, last.inside)]
     # A part is no more than the whole.
     possible = [form for form in forms if bool(log_score(data, data_model(data, form)).isfinite().all())]
-    return max([found, *(fit(data, form) for form in possible)], key=lambda f: _value(data, f))
+    fits = [found, *(f for form in possible if _regular(f := fit(data, form)))]
+    return max(fits, key=lambda f: _value(data, f))
+
+
+def _regular(found: Fit) -> bool:
+    """Whether sensors keep something of their own: a few ordinates lie in a plane, where a likelihood has no bound."""
+    size = found.model.diagonal(dim1=-2, dim2=-1).real.rsqrt()
+    correlation = found.model * (size[:, :, None] * size[:, None, :])
+    return float(torch.linalg.eigvalsh(correlation)[:, 0].min()) > _OWN
 
 
 def _least_t(n_sensors: int) -> float:

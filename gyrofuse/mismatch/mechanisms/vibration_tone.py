@@ -163,12 +163,14 @@ def amplitude_limits(snr: Tensor, seen: float) -> Tensor:
     For amplitudes that were estimated because they are above `seen` (those that are not for having been the largest):
     the square is noncentral chi-square of two degrees of freedom, of which only the tail beyond `seen` comes here.
     Weak ones are there because noise has made them larger; equal tails of that law cover them as often as strong ones.
+    Of the weakest both limits would be zero: none is below what the square less that of the noise says.
     """
     value = (snr.square() - 1).clamp(min=0.0).sqrt()
     limits = value + Z * torch.tensor([[-1.0], [1.0]], dtype=torch.float64)
     weak = snr < _STRONG
     if bool(weak.any()):
-        limits[:, weak] = _tail_limits(snr[weak], seen if float(snr.min()) > seen else 0.0)
+        low, high = _tail_limits(snr[weak], seen if float(snr.min()) > seen else 0.0)
+        limits[:, weak] = torch.stack([low, high.maximum(value[weak])])
     return torch.stack([limits[0], value.clamp(limits[0], limits[1]), limits[1]])
 
 
