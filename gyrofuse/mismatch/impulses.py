@@ -2,8 +2,9 @@
 
 A record is whitened by its own smooth spectrum in the orthonormal DCT-II, `e = C^T y / sqrt(S)`, which has no ends
 that meet; `C^T y / S` over the mean of `1/S` is the error of a sample predicted from all others, most sensitive to an
-outlier of one sample. The smooth spectrum is the geometric mean over narrow bands, so that lines do not raise it, and
-ordinates of lines are left out.
+outlier of one sample. The smooth spectrum is made of geometric means over bands, so that lines do not raise it, and
+ordinates of lines are left out. Bands are as wide as the spectrum allows: a mean of 50 ordinates is a third off, which
+costs a twentieth of an outlier's size, and weak ones half of what they tell.
 """
 
 from __future__ import annotations
@@ -21,9 +22,11 @@ from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.shocks import WeakOutliers, weak_outliers
 from gyrofuse.mismatch.side import Side
 
-_NARROWEST, _WIDEST = 32, 64  # bands, ordinates
-_LOG_CHI2 = -1.2703628454614782  # mean of log chi2_1
-_LEFT = 1 - 1.5 / _WIDEST  # of a sample's own part: the spectrum follows each ordinate by three quarters of its share
+_NARROWEST = 32  # bands, ordinates
+_WIDTHS = ((4, 2048), (8, 512), (16, 64))  # of them: the part of their lowest ordinate, and at most
+_LOG_CHI2, _LOG_CHI2_SD = -1.2703628454614782, math.pi / math.sqrt(2)  # mean and sd of log chi2_1
+_FOLLOWED = 3.0  # sd by which narrower bands have to differ
+_OWN = 1.5  # of an ordinate's share in its band: it is followed by three quarters, interpolated, and squared
 _LINE = 25.0  # ordinates this far above the spectrum are lines
 _SKIRT = 1 / 8  # share of ordinates of a line, beyond which the stretch around belongs to it
 ENDS = 64  # a line's skirt is felt in so small a part of the record at each end
@@ -72,11 +75,11 @@ def left_out(side: Side) -> LeftOut:
     """Of one side, of its first records."""
     signal = side.noise[:_MOST_RECORDS]
     y = torch.from_numpy(fft.dct(signal.numpy(), norm="ortho", axis=-1))[..., 1:]
-    spectrum = _smooth_spectrum(y)
+    spectrum, followed = _smooth_spectrum(y)
     lines = _lines(y, spectrum)
     y = torch.where(lines, 0.0, y)
     white, inverse = _back(y / spectrum.sqrt()), 1 / spectrum
-    error = _back(y * inverse) / (_LEFT * inverse.mean(-1, keepdim=True))
+    error = _back(y * inverse) / (inverse * (1 - followed)).mean(-1, keepdim=True)
     has_lines, at_ends = lines.any(-1, keepdim=True), error
     white, error = (torch.where(has_lines, _mirrored(v), v) for v in (white, error))
     stepped = _stepped(side.signal[:_MOST_RECORDS])
@@ -110,23 +113,43 @@ def _back(ordinates: Tensor) -> Tensor:
     return torch.from_numpy(fft.idct(with_mean.numpy(), norm="ortho", axis=-1))
 
 
-def _smooth_spectrum(y: Tensor) -> Tensor:
-    """Geometric means over narrow bands of ordinates `(..., k)`, interpolated."""
-    n, edges = y.shape[-1], [0]
+def _smooth_spectrum(y: Tensor) -> tuple[Tensor, Tensor]:
+    """Geometric means over bands of ordinates `(..., k)`, interpolated, and how far each ordinate is followed.
+
+    Narrower bands count where they differ from wider ones by more than chance.
+    """
+    log_power = y.square().clamp(min=1e-300).log() - _LOG_CHI2
+    curve, followed = torch.zeros_like(log_power), torch.zeros_like(log_power)
+    for part, most in _WIDTHS:
+        ends = torch.tensor(_edges(y.shape[-1], part, most))
+        width = ends.diff()
+        total = torch.nn.functional.pad((log_power - curve).cumsum(-1), (1, 0))[..., ends]
+        means, sd = total.diff(dim=-1) / width, _LOG_CHI2_SD / width.sqrt()
+        counts = (means.abs() > _FOLLOWED * sd) | bool(part == _WIDTHS[0][0])
+        curve = curve + _interpolated(means * counts, ends)
+        own = (counts / width).repeat_interleave(width, -1)
+        followed = followed.maximum(_OWN * own)
+    return curve.exp(), followed
+
+
+def _edges(n: int, part: int, most: int) -> list[int]:
+    """First ordinates of bands of `n`, and the end."""
+    edges = [0]
     while edges[-1] < n:
-        edges.append(edges[-1] + min(max(edges[-1] // 16, _NARROWEST), _WIDEST))
+        edges.append(edges[-1] + min(max(edges[-1] // part, _NARROWEST), most))
     edges[-1] = n
     if edges[-1] - edges[-2] < _NARROWEST:
         del edges[-2]
-    ends = torch.tensor(edges)
-    log_power = y.square().clamp(min=1e-300).log()
-    total = torch.nn.functional.pad(log_power.cumsum(-1), (1, 0))[..., ends]
-    means = total.diff(dim=-1) / ends.diff() - _LOG_CHI2
+    return edges
+
+
+def _interpolated(means: Tensor, ends: Tensor) -> Tensor:
+    """Values `(..., k)` between the middles of bands that have `means`."""
     centre = (ends[1:] + ends[:-1] - 1) / 2
-    k = torch.arange(n, dtype=torch.float64)
+    k = torch.arange(int(ends[-1]), dtype=torch.float64)
     right = torch.bucketize(k, centre).clamp(1, len(centre) - 1)
-    share = (k - centre[right - 1]) / (centre[right] - centre[right - 1])
-    return (means[..., right - 1] + share.clamp(0, 1) * (means[..., right] - means[..., right - 1])).exp()
+    share = ((k - centre[right - 1]) / (centre[right] - centre[right - 1])).clamp(0, 1)
+    return means[..., right - 1] + share * (means[..., right] - means[..., right - 1])
 
 
 def _stepped(signal: Tensor) -> Tensor:

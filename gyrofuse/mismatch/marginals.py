@@ -35,6 +35,7 @@ _SIMULATED = 0.005  # p value of a hidden lattice that the simulation has as wel
 _BLOCKS = 32  # whose spread tells how far repeats vary by themselves
 _QUARTERS = 4
 _BY_CHANCE = 3.0  # times the variance expected of quarters
+_COUNTED = 20.0  # repeats that are expected, below which they are counted one by one
 _COARSE, _AT_LAST_STEP = 0.05, 4.0  # of the noise; samples that may lie on a lattice's last step by chance
 _FEWEST_AT_END = 3  # samples at an end stop
 
@@ -201,14 +202,18 @@ class Repeats(NamedTuple):
         expected: From the simulation and the recording's own resolution.
         sd: Of the difference, by chance.
         wanders: Whether it varies slowly over a record, more than by chance.
-        n: Samples.
+        events, simulated: How often samples began to repeat, in the recording and the simulation.
+        n, m: Samples of both.
     """
 
     share: Tensor
     expected: Tensor
     sd: Tensor
     wanders: Tensor
+    events: Tensor
+    simulated: Tensor
     n: int
+    m: int
 
     @property
     def p_values(self) -> Tensor:
@@ -216,7 +221,13 @@ class Repeats(NamedTuple):
         z = (self.share - self.expected - 0.5 / self.n) / self.sd
         # A wandering share is known from a few stretches of the record only.
         wandering = torch.from_numpy(stats.t.sf(z.numpy(), _QUARTERS - 1))
-        return torch.where(self.wanders, wandering, torch.special.ndtr(-z))
+        many = torch.where(self.wanders, wandering, torch.special.ndtr(-z))
+        # Few are a matter of counting: against the simulation's, and against what the resolution makes.
+        few, own = self.n * self.expected, (self.events - 1).numpy()
+        compared = stats.binom.sf(own, (self.events + self.simulated).numpy(), self.n / (self.n + self.m))
+        resolved = torch.from_numpy(stats.poisson.sf(own, few.numpy()))
+        counted = torch.where(self.simulated == 0, resolved, 0.0).maximum(torch.from_numpy(compared))
+        return torch.where(few < _COUNTED, counted, many)
 
 
 def repeated(signal: Tensor) -> Tensor:
@@ -228,8 +239,9 @@ def repeated(signal: Tensor) -> Tensor:
 
 def repeats(case: Case) -> Repeats:
     """Repeats of the recording against those of the simulation, block by block."""
-    share, n_recorded, fast, slow = _repeat_shares(case.recorded.signal)
-    other, n_simulated, other_fast, other_slow = _repeat_shares(case.simulated.signal)
+    same, other_same = (repeated(side.signal).movedim(1, 0) for side in (case.recorded, case.simulated))
+    share, n_recorded, fast, slow = _repeat_shares(same)
+    other, n_simulated, other_fast, other_slow = _repeat_shares(other_same)
     # A resolution finer than any lattice that matters, such as that of float32, makes a few.
     differences = case.recording.diff(dim=-1)
     density = 1 / (math.sqrt(2 * math.pi) * differences.square().mean(-1).sqrt())
@@ -241,12 +253,21 @@ def repeats(case: Case) -> Repeats:
     variance = torch.maximum(binomial / n_recorded + binomial / n_simulated, fast + other_fast)
     # Of two paths that differ; what happens by chance varies by no more than about itself.
     wander = 2 * torch.minimum(slow + other_slow, expected.square())
-    return Repeats(share, expected, (variance + wander).sqrt(), wander > variance, n_recorded)
+    events = (_events(same), _events(other_same))
+    return Repeats(share, expected, (variance + wander).sqrt(), wander > variance, *events, n_recorded, n_simulated)
 
 
-def _repeat_shares(signal: Tensor) -> tuple[Tensor, int, Tensor, Tensor]:
-    """Share of repeats `(sensor,)`, of how many samples, and its variances from blocks and from quarters."""
-    same = repeated(signal).movedim(1, 0)  # (sensor, record, sample)
+def _events(same: Tensor) -> Tensor:
+    """How many runs of repeats `(sensor, record, time)` has, `(sensor,)`."""
+    return (same[..., 1:] & ~same[..., :-1]).sum((1, 2))
+
+
+def _repeat_shares(same: Tensor) -> tuple[Tensor, int, Tensor, Tensor]:
+    """Share of repeats `(sensor,)`, of how many samples, and its variances from blocks and from quarters.
+
+    Args:
+        same: Which samples are repeats, `(sensor, record, time)`.
+    """
     n = same.shape[-1] // _BLOCKS
     blocks = same[..., : n * _BLOCKS].unflatten(-1, (_BLOCKS, n)).to(torch.float64).mean(-1)
     quarters = blocks.unflatten(-1, (_QUARTERS, -1)).mean(-1).flatten(1)
