@@ -19,6 +19,7 @@ from gyrofuse.mismatch.mechanisms.parameter_shift import _numbers
 from gyrofuse.mismatch.pooled import common_witness
 from gyrofuse.mismatch.shape_choice import _regular
 from gyrofuse.mismatch.shape_fit import Ratios, data_model, fair_gain, fit, linearised, log_score
+from gyrofuse.mismatch.shape_ground import Parts
 from gyrofuse.mismatch.shape_law import equivalent, smooth_coherence
 from gyrofuse.mismatch.shape_scan import bump_start, shape_witness
 from gyrofuse.mismatch.shape_terms import (
@@ -26,7 +27,7 @@ from gyrofuse.mismatch.shape_terms import (
     Common,
     Flicker,
     LowPass,
-    Parts,
+    PowerLaw,
     Shift,
     Term,
     oscillation,
@@ -127,6 +128,7 @@ def shape_examples(data: Ratios) -> list[Term]:
         Shift.start(ground),
         LowPass.starts(ground, "pole")[2],
         Flicker.start(ground),
+        PowerLaw.like(Flicker.start(ground), ground),
         common,
     ]
 
@@ -356,3 +358,16 @@ def test_sensors_keep_something_of_their_own_beside_what_is_common(share: float,
     model = found.model.clone()
     model[3] = plane * size[:, None] * size
     assert _regular(found._replace(model=model)) == regular
+
+
+@pytest.mark.parametrize("slope", [1.0, 1.5])
+def test_noise_is_flicker_only_if_it_falls_as_flicker_does(slope: float):
+    middle = math.sqrt(0.5 / N)
+    given = drawn(23, lambda x, g: x + 1.5e-3 * noise(N, lambda f: (middle / f) ** slope / middle, P, g))
+    data = compared(given)
+    alone = fit(data, [PowerLaw.like(Flicker.start(data.ground), data.ground)])
+    assert float(alone.terms[0].shared) == pytest.approx(slope, abs=3 * float(alone.sd(0)[1]))
+    assert float(alone.sd(0)[1]) < 0.1
+    assert spectrum_witness(given).p_value < 1e-4
+    found = nominated(given)
+    assert (found is not None and found.mechanism == "flicker") == (slope == 1.0)

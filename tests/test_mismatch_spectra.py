@@ -258,7 +258,7 @@ def test_the_scan_of_shapes_is_the_mean_over_all_of_them():
         )
         for way, ratio in enumerate((up, down, (up + down) / 2)):
             chance = math.exp(float(looked_for.log_chances[way, h]))
-            total += chance * np.mean([np.prod(1 - e + e * ratio) for e in shape_scan._SHARES])
+            total += chance * np.mean([np.prod(1 - e + e * ratio) for e in shape_scan.SHARES])
     found = scanned(given)
     assert found is not None
     assert found.log_ratio == pytest.approx(math.log(total), abs=1e-9)

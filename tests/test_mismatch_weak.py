@@ -14,10 +14,11 @@ from torch import Tensor
 
 import gyrofuse as gf
 from gyrofuse import WhiteNoise
-from gyrofuse.mismatch import episodes, level_scan, shocks
+from gyrofuse.mismatch import episodes, lattices, level_scan, shocks
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.confirm import held_out_gain
 from gyrofuse.mismatch.engine import diagnose
+from gyrofuse.mismatch.evidence import some_of
 from gyrofuse.mismatch.marginals import marginal_witness
 from gyrofuse.mismatch.mechanism import Finding
 from gyrofuse.mismatch.mechanisms.dead_band import DeadBand
@@ -305,6 +306,36 @@ def test_a_hidden_lattice_of_one_sensor_is_looked_for_in_the_others() -> None:
     # Power beyond 3.9 has a chance of 0.78, or of 0.02: fewer than 5 of 10 have probability 8e-3, more than 2 9e-4.
     assert sum(1 in sensors for sensors in found) >= 5
     assert sum(2 in sensors for sensors in found) <= 2
+
+
+def test_a_hidden_lattice_that_no_sensor_shows_alone_is_seen_in_all_of_them_together() -> None:
+    """Each of six has 5 nats, n exp(-4 pi^2 blur^2 V / (V + blur^2)), V = 13/12, where a search would want 14."""
+    alone, together, nothing = [], [], []
+    for seed in range(10):
+        g = torch.Generator().manual_seed(seed)
+        rounded = normal(6, 16384, g=g).round() + 0.5 * normal(6, 16384, g=g)
+        plain, simulation = normal(6, 16384, g=g), normal(2, 6, 16384, g=g)
+        scene = Scene(RATE, "deg/s", tuple("abcdef"))
+        case = Case.of(scene, rounded, simulation * rounded.std())
+        alone.append(min(own.p_value for own in lattices.lattices(case.recorded) if own))
+        together.append(lattices.missing_lattices(case, LEVEL).p_value)
+        nothing.append(lattices.missing_lattices(Case.of(scene, plain, simulation), LEVEL).p_value)
+        step = lattices.shared_lattice(case.recorded).step
+        assert together[-1] > LEVEL or step == pytest.approx(1.0, abs=0.06)
+    assert sum(p < LEVEL for p in together) >= 9
+    assert sum(p < LEVEL for p in alone) <= 5
+    assert sum(p < 0.05 for p in nothing) <= 3  # four of ten have probability 1e-3
+
+
+def test_the_ratio_of_a_lattice_that_some_sensors_have_has_mean_one() -> None:
+    g = torch.Generator().manual_seed(12)
+    power = -torch.rand(3, 200_000, generator=g, dtype=torch.float64).log()
+    x = 2 * (2.0 * power).sqrt()
+    own = x - 2.0 + torch.special.i0e(x).log()
+    assert float(own.exp().mean()) == pytest.approx(1.0, abs=0.03)
+    e = torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)[:, None, None]
+    naive = (1 - e + e * own.exp()).prod(1).mean(0).log()
+    torch.testing.assert_close(some_of(own), naive)
 
 
 @pytest.mark.parametrize("share", [0.5, 1, 1.5, 2])

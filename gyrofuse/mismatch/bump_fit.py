@@ -15,9 +15,10 @@ from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.shape_choice import cost_of
 from gyrofuse.mismatch.shape_fit import Fit, Ratios, fit
+from gyrofuse.mismatch.shape_ground import Ground
 from gyrofuse.mismatch.shape_law import smooth_coherence
 from gyrofuse.mismatch.shape_scan import scanned
-from gyrofuse.mismatch.shape_terms import Bump, CommonBump, Ground, Term
+from gyrofuse.mismatch.shape_terms import Bump, CommonBump, Term
 from gyrofuse.mismatch.side import Side
 from gyrofuse.mismatch.spectra import Bands, degrees_of_freedom
 

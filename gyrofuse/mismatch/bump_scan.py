@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 _NARROWEST = 4  # bins
-_FEWEST_CELLS, _FEWEST_BINS = 3, 24  # of a flank; a cell is half a stretch
+_FEWEST_CELLS, _FEWEST_BINS = 8, 24  # of a flank; a cell is half a stretch
 _LOWEST, _NARROW = 12, 4  # bins, and widths, below a stretch
 _BROADEST = 8  # of them in the spectrum
 _SIZES = (3.2, 5.6, 8.0, 11.2)  # `a`, times the root of `m`

@@ -6,11 +6,13 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import torch
 from torch import Tensor
 
 _LOOSE = 0.05  # of the bound on the probability of a mean ratio
 _BY_CHANCE, _SURELY = 0.05, 1e-3  # p values of what a simulation shows
 _TAIL = 0.25  # share of the twins behind the fitted tail
+SHARES = (0.2, 0.5, 0.9)  # of the sensors that have an effect
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,17 @@ def ratio_p_value(log_ratio: float) -> float:
     less than `1/70x`. To `1/20x` is held.
     """
     return math.exp(min(math.log(_LOOSE) - log_ratio, 0.0))
+
+
+def some_of(log_ratios: Tensor) -> Tensor:
+    """Logarithm of the mean over shares `e` of `prod (1 - e + e E)`, of ratios `log E` `(sensor, ...)`.
+
+    Any of the sensors may have what each has a likelihood ratio of its own for.
+    """
+    if len(log_ratios) == 1:
+        return log_ratios[0]
+    mixed = [torch.logaddexp(log_ratios + math.log(e), log_ratios.new_tensor(math.log1p(-e))).sum(0) for e in SHARES]
+    return torch.stack(mixed).logsumexp(0) - math.log(len(SHARES))
 
 
 def surpassing(own: float, other: float) -> float:

@@ -19,15 +19,16 @@ from torch import Tensor
 from torch.nn.functional import conv1d
 
 from gyrofuse.mismatch.bump_scan import Stretches
+from gyrofuse.mismatch.evidence import some_of
 
 _NARROWEST, _BROADEST = 4.0, 12.0  # half widths: bins, and of them in the spectrum
 _FINER = math.sqrt(2)
 _CELLS = 4  # in a half width
-_REACH = 5.0  # half widths on either side
+_REACH, _LEAST_REACH = 16.0, 5.0  # half widths on either side: half of a hump is lost where only five tell the level
+_SMOOTH = 8.0  # part of the spectrum over which the level may be taken for the same
 _WHOLE = 0.8  # of a shape that has to lie in the spectrum
 _LOWEST, _ABOVE = 12, 8.0  # bins, and half widths, above which centres lie
 _SIZES = (2.0, 3.0, 4.5, 6.5)
-_SHARES = (0.2, 0.5, 0.9)
 
 
 def scanned_humps(power: Tensor, worth: float) -> Iterator[Stretches]:
@@ -52,7 +53,8 @@ def scanned_humps(power: Tensor, worth: float) -> Iterator[Stretches]:
 
 def _scores(cells: Tensor, half: float, worth: float, lowest: int) -> tuple[Tensor, Tensor]:
     """Normal scores of a hump centred on each cell `(sensor, cell)`, and whether enough of it lies in the spectrum."""
-    reach = round(_REACH * half)
+    wide = cells.shape[-1] / _SMOOTH / half
+    reach = round(min(max(wide, _LEAST_REACH), _REACH) * half)
     shape = 1 / (1 + (torch.arange(-reach, reach + 1, dtype=torch.float64) / half).square())
     kernels = torch.stack([torch.ones_like(shape), shape, shape.square()])[:, None]
     used = torch.ones_like(cells[:1])
@@ -80,11 +82,5 @@ def _normal_of_share(standard: Tensor, inside: float, n: float) -> Tensor:
 
 def _log_ratios(score: Tensor) -> Tensor:
     """Of normal scores `(sensor, place)`, `(place,)`."""
-    shares = _SHARES if len(score) > 1 else (1.0,)
-    total = torch.full_like(score[0], -math.inf)
-    for a in _SIZES:
-        one = a * score - a**2 / 2
-        for e in shares:
-            some = one if e == 1 else torch.logaddexp(one + math.log(e), one.new_tensor(math.log(1 - e)))
-            total = torch.logaddexp(total, some.sum(0))
-    return total - math.log(len(_SIZES) * len(shares))
+    ratios = torch.stack([some_of(a * score - a**2 / 2) for a in _SIZES])
+    return ratios.logsumexp(0) - math.log(len(_SIZES))

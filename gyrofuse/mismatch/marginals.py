@@ -1,9 +1,4 @@
-"""Facts about single values: the lattice they sit on, repeats, pile-ups at the extremes.
-
-A lattice `offset + k step` is exact where values recur, and read off them. Hidden under noise that was added after the
-rounding it still shows in the empirical characteristic function `phi(u) = mean exp(i u x)` at `u = 2 pi/step`: beyond
-`5.5/s`, with `s` the sd of a sample given its past, `n |phi|^2` is standard exponential without a lattice.
-"""
+"""Facts about single values: the lattice they sit on, repeats, pile-ups at the extremes."""
 
 from __future__ import annotations
 
@@ -17,181 +12,17 @@ from torch import Tensor
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import Evidence, corrected
 from gyrofuse.mismatch.impulses import left_out
+from gyrofuse.mismatch.lattices import missing_lattices
 from gyrofuse.mismatch.recurring import missing_recurrences
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.side import Side
 
-_FINEST, _FINEST_HIDDEN = 1 / 50, 1 / 20  # steps that matter, of the sd of a sample given its past
-_EXACT = 0.01  # distance from the lattice, steps, that arithmetic explains
-_ON_LATTICE = 0.999  # of the samples; converters also have end stops
-_GAUSSIAN_ENDS = 5.5  # u s, beyond which a Gaussian has no characteristic function left
-_LOWEST = 3.5  # u s, where a peak found by its flank or its harmonics may still lie
-_DOUBTFUL = 0.05  # p value of a lattice that is not looked at more closely
-_AS_OTHERS = 0.02  # of one that other sensors have
-_PER_STEP = 6  # histogram bins a step, at the finest
-_MOST_BINS = 2**21
-_SAME_STEP, _ALIKE = 1e-3, 0.04  # of steps that are exact, and hidden
-_SIMULATED = 0.005  # p value of a hidden lattice that the simulation has as well
 _BLOCKS = 32  # whose spread tells how far repeats vary by themselves
 _QUARTERS = 4
 _BY_CHANCE = 3.0  # times the variance expected of quarters
 _COUNTED = 20.0  # repeats that are expected, below which they are counted one by one
 _COARSE, _AT_LAST_STEP = 0.05, 4.0  # of the noise; samples that may lie on a lattice's last step by chance
 _FEWEST_AT_END = 3  # samples at an end stop
-
-
-class Lattice(NamedTuple):
-    """Values `offset + k step`, blurred by `blur` steps, sd.
-
-    Attributes:
-        p_value: Of continuous values that look like it, for having looked at every step.
-        peak: Where the characteristic function tells most of it, 0 where it is exact. Of few steps' width that is
-            below `2 pi/step`, since what blurs the lattice damps high frequencies more.
-    """
-
-    step: float
-    offset: float
-    blur: float
-    p_value: float
-    peak: float = 0.0
-
-
-def innovation_sd(side: Side) -> Tensor:
-    """Sd of a sample given its past, `exp(integral log S)^(1/2)` (Kolmogorov), `(sensor,)`."""
-    width = torch.tensor(side.bands.edges, dtype=torch.float64).diff()
-    return ((side.power.log() * width).sum(-1) / width.sum() / 2).exp()
-
-
-@remembered
-def exact_lattices(side: Side) -> tuple[Lattice | None, ...]:
-    """The lattice of each sensor's values in the first record that needs no statistics, `None` without."""
-    return tuple(
-        _exact_lattice(values, float(sd)) for values, sd in zip(side.signal[0], innovation_sd(side), strict=True)
-    )
-
-
-@remembered
-def lattices(side: Side) -> tuple[Lattice | None, ...]:
-    """The lattice of each sensor's values in the first record, `None` where nothing looks like one."""
-    every = zip(exact_lattices(side), side.signal[0], innovation_sd(side), strict=True)
-    return tuple(exact or _hidden_lattice(values.unique(), float(sd)) for exact, values, sd in every)
-
-
-def _exact_lattice(values: Tensor, sd: float) -> Lattice | None:
-    """From the gaps between values that recur."""
-    unique, counts = torch.unique(values, return_counts=True)
-    gaps = unique.diff()
-    # A gap far below what matters is the noise of arithmetic.
-    for step in (float(gaps.median()), float(gaps.min())) if len(gaps) > 1 else ():
-        if step < _FINEST * sd:
-            continue
-        k = torch.cat([torch.zeros(1, dtype=torch.float64), (gaps / step).round().cumsum(0)])
-        middle = (counts * k).sum() / counts.sum()
-        mean = (counts * unique).sum() / counts.sum()
-        step = float((counts * (k - middle) * (unique - mean)).sum() / (counts * (k - middle).square()).sum())
-        off = (unique - mean) / step - (k - middle)
-        if float(counts[off.abs() < _EXACT].sum() / counts.sum()) >= _ON_LATTICE:
-            offset = math.remainder(float(mean - middle * step), step)
-            return Lattice(step, offset, 0.0, 0.0)
-    return None
-
-
-def _hidden_lattice(unique: Tensor, sd: float) -> Lattice:
-    """The most conspicuous step in the characteristic function; each value counts once, whatever repeats."""
-    n, low = len(unique), unique[0]
-    bin_width = sd * _FINEST_HIDDEN / _PER_STEP
-    n_bins = min(1 << math.ceil(math.log2(max(4 * float(unique[-1] - low) / bin_width, 64))), _MOST_BINS)
-    place = ((unique - low) / bin_width).long() % n_bins
-    phi = torch.fft.rfft(torch.bincount(place, minlength=n_bins).to(torch.float64)) / n
-    u = 2 * math.pi * torch.arange(len(phi), dtype=torch.float64) / (n_bins * bin_width)
-    wanted = (u > _GAUSSIAN_ENDS / sd) & (u < 2 * math.pi / (_FINEST_HIDDEN * sd))
-    power = n * phi.abs().square()
-    best = int(torch.where(wanted, power, 0.0).argmax())
-    p_value = corrected(math.exp(-float(power[best])), int(wanted.sum()))
-    if p_value > _DOUBTFUL:
-        return Lattice(2 * math.pi / float(u[best]), 0.0, 1.0, p_value, float(u[best]))
-    while u[best] > _LOWEST / sd and power[best - 1] > power[best]:  # the flank of a peak below
-        best -= 1
-    frequency = _peak(unique, float(u[best]), float(u[1]))
-    for part in (4, 3, 2):  # a harmonic may have come out largest
-        lower = _power(unique, torch.tensor([frequency / part], dtype=torch.float64))
-        if frequency / part > _LOWEST / sd and float(lower) > max(0.3 * float(power[best]), 10.0):
-            frequency /= part
-            break
-    found = _seen_at(unique, frequency, 2 * math.pi / frequency)
-    step = found.step / (1 + (found.step * found.blur) ** 2 / float(unique.var()))
-    return _seen_at(unique, frequency, step)._replace(p_value=p_value)
-
-
-def _seen_at(unique: Tensor, peak: float, step: float) -> Lattice:
-    """A hidden lattice of a step and a peak that are known, with its p value."""
-    n = len(unique)
-    power = float(_power(unique, torch.tensor([peak], dtype=torch.float64)))
-    resultant = math.sqrt(max((power - 1) / (n - 1), 1e-12)) if n > 1 else 1e-6
-    blur = math.sqrt(-2 * math.log(min(resultant, 1 - 1e-12))) / (2 * math.pi)
-    turn = torch.exp(2j * math.pi / step * unique).mean().angle()
-    return Lattice(step, float(turn) / (2 * math.pi) * step, blur, math.exp(-power), peak)
-
-
-def _power(values: Tensor, u: Tensor) -> Tensor:
-    """`n |phi(u)|^2`, `(u,)`."""
-    angle = u[:, None] * values
-    return (angle.cos().mean(-1).square() + angle.sin().mean(-1).square()) * len(values)
-
-
-def _peak(values: Tensor, u: float, spacing: float) -> float:
-    """Maximum of the characteristic function within a bin of `u`, by thirds."""
-    reach, values = spacing, values - values.mean()
-    for _ in range(8):
-        grid = u + reach * torch.linspace(-1, 1, 7, dtype=torch.float64)
-        u = float(grid[_power(values, grid).argmax()])
-        reach /= 3
-    return u
-
-
-def off_lattice(values: Tensor, step: float | Tensor, offset: float | Tensor) -> Tensor:
-    """Distances of values from the nearest point of a lattice, steps."""
-    place = (values - offset) / step
-    return place - place.round()
-
-
-def missing_lattices(case: Case, level: float) -> dict[int, Lattice]:
-    """Lattices of the recording, by sensor, that the simulation does not have and could be rounded to."""
-    missing = {}
-    for i, own in enumerate(lattices(case.recorded)):
-        if own is None or corrected(own.p_value, case.n_sensors) > level:
-            continue
-        left = _not_simulated(case, i, own)
-        if left is not None and corrected(left.p_value, case.n_sensors) <= level:
-            missing[i] = left
-    if not missing:
-        return missing
-    clearest = min(missing.values(), key=lambda found: found.p_value)
-    for i, own in enumerate(lattices(case.recorded)):  # a step that is known elsewhere needs less to be believed
-        if i in missing or own is None:
-            continue
-        if own.blur > 0 and clearest.blur > 0:
-            own = _seen_at(case.recording[i].unique(), clearest.peak, clearest.step)
-        elif not any(abs(own.step / found.step - 1) < _ALIKE for found in missing.values()):
-            continue
-        left = _not_simulated(case, i, own) if own.p_value < _AS_OTHERS else None
-        if left is not None and left.p_value < _AS_OTHERS:
-            missing[i] = left
-    return dict(sorted(missing.items()))
-
-
-def _not_simulated(case: Case, sensor: int, own: Lattice) -> Lattice | None:
-    """A lattice of the recording, with the p value of its being no clearer than the simulation's; `None` if exact."""
-    values = case.simulated.signal[:, sensor].flatten()
-    if own.blur == 0:
-        other = exact_lattices(case.simulated)[sensor]
-        return None if other is not None and other.step > own.step * (1 - _SAME_STEP) else own
-    u, n, m = torch.tensor([own.peak], dtype=torch.float64), case.n_samples, len(values)
-    power, other_power = (float(_power(v - v.mean(), u)) for v in (case.recording[sensor], values))
-    if other_power < -math.log(_SIMULATED):
-        return own
-    clearer = max(math.sqrt(power / n) - math.sqrt(other_power / m), 0.0)
-    return own._replace(p_value=max(own.p_value, math.exp(-(clearer**2) / (1 / n + 1 / m))))
 
 
 class Repeats(NamedTuple):
@@ -365,12 +196,11 @@ def _share_at_end(values: Tensor, cell: float) -> float:
 
 def marginal_witness(case: Case) -> Evidence:
     """Lattice, repeats, end stops and returns of single values, against those of the simulation."""
-    steps = missing_lattices(case, 1.0)
-    same = repeats(case).p_values
-    candidates = [
-        (corrected(found.p_value, case.n_sensors), i, f"values on a lattice of {found.step:.4g} {case.scene.measure}")
-        for i, found in steps.items()
-    ]
+    same, candidates = repeats(case).p_values, []
+    rounded = missing_lattices(case, 1.0)
+    if rounded.lattices:
+        at, found = min(rounded.lattices.items(), key=lambda item: item[1].p_value)
+        candidates.append((rounded.p_value, at, f"values on a lattice of {found.step:.4g} {case.scene.measure}"))
     often = int(same.argmin())
     candidates.append((corrected(float(same[often]), case.n_sensors), often, "samples repeated more often than there"))
     ends = min(end_stops(case), key=lambda end: end.p_value)

@@ -17,7 +17,7 @@ from gyrofuse.mismatch.base import Base
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.known_lines import line_parts
 from gyrofuse.mismatch.repaired import RepairedModel
-from gyrofuse.mismatch.shape_terms import Parts
+from gyrofuse.mismatch.shape_ground import Parts
 from gyrofuse.processes import Process, Sinusoid
 from gyrofuse.recording import Recording
 from gyrofuse.simulate import ArrayModel

@@ -23,8 +23,9 @@ from torch import Tensor
 
 from gyrofuse.mismatch.base import Base
 from gyrofuse.mismatch.shape_bands import Deep
+from gyrofuse.mismatch.shape_ground import Ground
 from gyrofuse.mismatch.shape_law import equivalent, equivalent_moments, smooth_coherence
-from gyrofuse.mismatch.shape_terms import Common, Ground, Term
+from gyrofuse.mismatch.shape_terms import Common, Term
 
 _ROUNDS, _ENOUGH = 25, 0.01
 _STEP = 1e-4

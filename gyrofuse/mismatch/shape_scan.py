@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.case import Case
-from gyrofuse.mismatch.evidence import Evidence, ratio_p_value
+from gyrofuse.mismatch.evidence import SHARES, Evidence, ratio_p_value
 from gyrofuse.mismatch.filter_forms import filter_power, filter_strength
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.shape_bands import Narrow, deep_base, narrow, slow
@@ -30,7 +30,6 @@ from gyrofuse.mismatch.witnesses import level_of
 from gyrofuse.processes import AR1
 
 _SIZES = (1.0, 1.6, 2.5, 4.0)
-_SHARES = (0.2, 0.5, 0.9)
 _CORNERS_PER_DECADE = 2
 _FILTERS = (0.01, 0.04, 0.12, 0.35)  # corners, cycles per sample
 _WIDTHS = (0.02, 0.06, 0.18)  # half width of a bump over its centre
@@ -117,18 +116,18 @@ def scanned(case: Case) -> Scan | None:
         for way in (1, -1)
     )
     ways = torch.stack([up, down, torch.logaddexp(up, down) - math.log(2)])  # (way, shape, sensor)
-    e = torch.tensor(_SHARES, dtype=torch.float64)
+    e = torch.tensor(SHARES, dtype=torch.float64)
     log_ratios = torch.logaddexp(torch.log1p(-e), e.log() + ways[..., None]).sum(-2)  # (way, shape, share)
     log_ratios = log_ratios + looked_for.log_chances[..., None]
     way, shape, share = (int(i) for i in torch.unravel_index(log_ratios.argmax(), log_ratios.shape))
     own = torch.maximum(up, down)[shape] if way == 2 else ways[way, shape]
-    sensors = tuple(int(i) for i in (own > math.log(1 / _SHARES[share] - 1)).nonzero()[:, 0]) or (int(own.argmax()),)
+    sensors = tuple(int(i) for i in (own > math.log(1 / SHARES[share] - 1)).nonzero()[:, 0]) or (int(own.argmax()),)
     weight = looked_for.templates[shape, list(sensors)].square().mean(0)
     rises = float((up - down)[shape, list(sensors)].sum()) > 0
     bumps = list(_bump_places(case.n_samples))
     n_shapes = len(looked_for.templates) // len(_SIZES)
     place = shape % n_shapes - (n_shapes - len(bumps))  # bumps come last
-    mean = float(log_ratios.flatten().logsumexp(0)) - math.log(len(_SHARES))
+    mean = float(log_ratios.flatten().logsumexp(0)) - math.log(len(SHARES))
     return Scan(mean, sensors, weight, rises, bumps[place] if place >= 0 else None)
 
 

@@ -22,7 +22,7 @@ from gyrofuse.mismatch.shape_bands import N_SLOW, Groups, deep, deep_base, in_bl
 from gyrofuse.mismatch.shape_choice import QUICK, best_shapes, candidates, convincing, cost_of
 from gyrofuse.mismatch.shape_fit import Fit, Ratios, data_model, fair_gain, fit, log_score, ratios
 from gyrofuse.mismatch.shape_scan import bump_start, scanned
-from gyrofuse.mismatch.shape_terms import Bump, Common, CommonBump, Flicker, LowPass, Shift, Term
+from gyrofuse.mismatch.shape_terms import Bump, Common, CommonBump, Flicker, LowPass, PowerLaw, Shift, Term
 from gyrofuse.mismatch.side import Side
 from gyrofuse.mismatch.sweeps import swept
 from gyrofuse.mismatch.witnesses import level_of
@@ -41,6 +41,7 @@ _SLOW = 64  # cycles per record
 _BROAD = 3.0  # half widths
 _SHARP, _NARROW = 0.1, (0.02, 0.04, 0.08)  # the same, below which bands are too wide for it, and of it there
 _FINE, _NARROWEST = 24, 0.005  # bands in an octave for those, and the least that they show
+_STEEPER, _FLICKER = 4.0, 0.25  # nats that another slope gains, and distance from 1 of flicker noise's
 _OFF = 0.25  # logarithm by which a centre from wide bands may be off
 
 
@@ -162,7 +163,7 @@ def _searched(case: Case) -> Shape | None:
     scan = scanned(case)
     p_seen = 1.0 if scan is None else scan.p_value
     data, chosen = best_shapes(data, differ=p_seen < _DOUBT)
-    if chosen is None or not convincing(data, chosen):
+    if chosen is None or not convincing(data, chosen) or _falls_otherwise(data, chosen):
         return None
     seen = [_told(case, chosen, i) for i in range(len(chosen.terms))]
     nothing = float(log_score(data, data.expected).sum())
@@ -200,6 +201,16 @@ def _searched(case: Case) -> Shape | None:
         tuple(sorted({level_of(float(f)) for f in frequency[score > 0.05 * score.sum()]})),
         _forms(data, term, others, chosen.gain),
     )
+
+
+def _falls_otherwise(data: Ratios, chosen: Fit) -> bool:
+    """Whether what flicker noise was chosen for falls by another power of frequency: that has no name."""
+    for i, term in enumerate(chosen.terms):
+        if isinstance(term, Flicker):
+            found = fit(data, [*_others(chosen, i), PowerLaw.like(term, data.ground)])
+            if found.gain > chosen.gain + _STEEPER and abs(float(found.terms[-1].shared) - 1) > _FLICKER:
+                return True
+    return False
 
 
 def _others(chosen: Fit, i: int) -> list[Term]:

@@ -14,7 +14,8 @@ from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.gaussian import Filter
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Z
 from gyrofuse.mismatch.shape_bands import deep_base
-from gyrofuse.mismatch.shape_terms import Parts, Shift
+from gyrofuse.mismatch.shape_ground import Parts
+from gyrofuse.mismatch.shape_terms import Shift
 from gyrofuse.mismatch.shape_words import found, spanned
 from gyrofuse.mismatch.shapes import chosen_shape, refit
 

@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.case import Case, Scene
-from gyrofuse.mismatch.evidence import corrected
 from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
-from gyrofuse.mismatch.marginals import Lattice, missing_lattices, off_lattice
+from gyrofuse.mismatch.lattices import Lattice, missing_lattices, off_lattice
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.mechanisms.dead_band import DeadBand
 
@@ -44,7 +43,7 @@ class Quantization(Mechanism):
 
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:
-        found = missing_lattices(case, level)
+        p_value, found = missing_lattices(case, level)
         if not found:
             return DeadBand.nominate(case, level)
         none = Lattice(0.0, 0.0, 0.0, 1.0)
@@ -66,7 +65,7 @@ class Quantization(Mechanism):
             cls.name,
             effect,
             f"the rate is rounded to steps of {_several(step[list(sensors)])} {case.scene.measure} in {where}{hidden}",
-            min(corrected(found[i].p_value, case.n_sensors) for i in sensors),
+            p_value,
             sensors,
             parameters,
             levels=(1,),

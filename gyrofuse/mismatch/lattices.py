@@ -1,0 +1,274 @@
+"""The lattice that rounded values sit on.
+
+A lattice `offset + k step` is exact where values recur, and read off them. Hidden under noise that was added after the
+rounding it still shows in the empirical characteristic function `phi(u) = mean exp(i u x)` at `u = 2 pi/step`: where a
+Gaussian of the sd of a sample given its past has none left, `n |phi|^2` is standard exponential without a lattice. One
+of size `k` gives it the likelihood ratio `exp(-k) I0(2 sqrt(k n |phi|^2))`; the mean of that over steps, sizes and
+shares of the sensors, which may have the same converter, has expectation one without a lattice.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.evidence import corrected, ratio_p_value, some_of, surpassing
+from gyrofuse.mismatch.remembered import remembered
+from gyrofuse.mismatch.side import Side
+
+_FINEST, _FINEST_HIDDEN = 1 / 50, 1 / 20  # steps that matter, of the sd of a sample given its past
+_EXACT = 0.01  # distance from the lattice, steps, that arithmetic explains
+_ON_LATTICE = 0.999  # of the samples; converters also have end stops
+_GAUSSIAN_LEFT = 0.003  # `n |phi|^2` of a Gaussian, beyond which it has no characteristic function left
+_LOWEST = 3.5  # u s, where a peak found by its flank or its harmonics may still lie
+_DOUBTFUL = 0.05  # p value of a lattice that is not looked at more closely
+_AS_OTHERS, _AS_LARGE = 0.02, 1 / 16  # p value of one that other sensors have, and its size over their mean
+_PER_STEP = 6  # histogram bins a step, at the finest
+_MOST_BINS = 2**21
+_SAME_STEP, _ALIKE = 1e-3, 0.04  # of steps that are exact, and hidden
+_SIMULATED = 0.005  # p value of a hidden lattice that the simulation has as well
+_SIZES = (4.0, 8.0, 16.0, 32.0)  # of a hidden lattice that several sensors have
+
+
+class Lattice(NamedTuple):
+    """Values `offset + k step`, blurred by `blur` steps, sd.
+
+    Attributes:
+        p_value: Of continuous values that look like it, for having looked at every step.
+        peak: Where the characteristic function tells most of it, 0 where it is exact. Of few steps' width that is
+            below `2 pi/step`, since what blurs the lattice damps high frequencies more.
+    """
+
+    step: float
+    offset: float
+    blur: float
+    p_value: float
+    peak: float = 0.0
+
+
+def innovation_sd(side: Side) -> Tensor:
+    """Sd of a sample given its past, `exp(integral log S)^(1/2)` (Kolmogorov), `(sensor,)`."""
+    width = torch.tensor(side.bands.edges, dtype=torch.float64).diff()
+    return ((side.power.log() * width).sum(-1) / width.sum() / 2).exp()
+
+
+@remembered
+def exact_lattices(side: Side) -> tuple[Lattice | None, ...]:
+    """The lattice of each sensor's values in the first record that needs no statistics, `None` without."""
+    return tuple(
+        _exact_lattice(values, float(sd)) for values, sd in zip(side.signal[0], innovation_sd(side), strict=True)
+    )
+
+
+@remembered
+def lattices(side: Side) -> tuple[Lattice | None, ...]:
+    """The lattice of each sensor's values in the first record, `None` where nothing looks like one."""
+    every = zip(exact_lattices(side), side.signal[0], innovation_sd(side), strict=True)
+    return tuple(exact or _hidden_lattice(values.unique(), float(sd)) for exact, values, sd in every)
+
+
+def _exact_lattice(values: Tensor, sd: float) -> Lattice | None:
+    """From the gaps between values that recur."""
+    unique, counts = torch.unique(values, return_counts=True)
+    gaps = unique.diff()
+    # A gap far below what matters is the noise of arithmetic.
+    for step in (float(gaps.median()), float(gaps.min())) if len(gaps) > 1 else ():
+        if step < _FINEST * sd:
+            continue
+        k = torch.cat([torch.zeros(1, dtype=torch.float64), (gaps / step).round().cumsum(0)])
+        middle = (counts * k).sum() / counts.sum()
+        mean = (counts * unique).sum() / counts.sum()
+        step = float((counts * (k - middle) * (unique - mean)).sum() / (counts * (k - middle).square()).sum())
+        off = (unique - mean) / step - (k - middle)
+        if float(counts[off.abs() < _EXACT].sum() / counts.sum()) >= _ON_LATTICE:
+            offset = math.remainder(float(mean - middle * step), step)
+            return Lattice(step, offset, 0.0, 0.0)
+    return None
+
+
+def _hidden_lattice(unique: Tensor, sd: float) -> Lattice:
+    """The most conspicuous step in the characteristic function; each value counts once, whatever repeats."""
+    lowest = _gaussian_ends(len(unique), sd)
+    u, (power,) = _characteristic([unique], sd)
+    wanted = (u > lowest) & (u < 2 * math.pi / (_FINEST_HIDDEN * sd))
+    best = int(torch.where(wanted, power, 0.0).argmax())
+    p_value = corrected(math.exp(-float(power[best])), int(wanted.sum()))
+    if p_value > _DOUBTFUL:
+        return Lattice(2 * math.pi / float(u[best]), 0.0, 1.0, p_value, float(u[best]))
+    frequency = _peak([unique], _climbed(u, power, best, _LOWEST / sd), float(u[1]))
+    for part in (4, 3, 2):  # a harmonic may have come out largest
+        lower = _power(unique, torch.tensor([frequency / part], dtype=torch.float64))
+        if frequency / part > _LOWEST / sd and float(lower) > max(0.3 * float(power[best]), 10.0):
+            frequency /= part
+            break
+    return _seen_at(unique, frequency, _step_at(unique, frequency))._replace(p_value=p_value)
+
+
+def _climbed(u: Tensor, power: Tensor, at: int, lowest: float) -> float:
+    """The peak below, where `at` is on its flank."""
+    while u[at] > lowest and power[at - 1] > power[at]:
+        at -= 1
+    return float(u[at])
+
+
+def _gaussian_ends(n: int, sd: float) -> float:
+    """The `u` from which on `n` Gaussian values have no characteristic function left."""
+    return math.sqrt(math.log(n / _GAUSSIAN_LEFT)) / sd
+
+
+def _characteristic(rows: list[Tensor], sd: float) -> tuple[Tensor, Tensor]:
+    """`u` and `n |phi(u)|^2`, `(row, u)`, of rows of sorted values, for steps that matter to an sd."""
+    bin_width = sd * _FINEST_HIDDEN / _PER_STEP
+    reach = max(float(row[-1] - row[0]) for row in rows)
+    n_bins = min(1 << math.ceil(math.log2(max(4 * reach / bin_width, 64))), _MOST_BINS)
+    places = [((row - row[0]) / bin_width).long() % n_bins for row in rows]
+    counts = torch.stack([torch.bincount(place, minlength=n_bins) for place in places]).to(torch.float64)
+    n = torch.tensor([len(row) for row in rows], dtype=torch.float64)
+    power = torch.fft.rfft(counts).abs().square() / n[:, None]
+    return 2 * math.pi * torch.arange(power.shape[-1], dtype=torch.float64) / (n_bins * bin_width), power
+
+
+def _step_at(unique: Tensor, peak: float) -> float:
+    """The step behind a peak of the characteristic function, which lies lower the more it is blurred."""
+    found = _seen_at(unique, peak, 2 * math.pi / peak)
+    return found.step / (1 + (found.step * found.blur) ** 2 / float(unique.var()))
+
+
+class SharedLattice(NamedTuple):
+    """The hidden step that several sensors are likeliest to have.
+
+    Attributes:
+        log_ratio: Of the mean over steps, sizes and shares of the sensors, nats.
+        step: Unit of the signal; 0 where nothing was looked at.
+        peak: Where the characteristic functions tell most of it.
+    """
+
+    log_ratio: float
+    step: float
+    peak: float
+
+    @property
+    def p_value(self) -> float:
+        """Of no lattice."""
+        return ratio_p_value(self.log_ratio)
+
+
+@remembered
+def shared_lattice(side: Side) -> SharedLattice:
+    """Of all sensors whose values have no exact lattice, over the first record."""
+    open_ones = [i for i, exact in enumerate(exact_lattices(side)) if exact is None]
+    if len(open_ones) < 2:
+        return SharedLattice(-math.inf, 0.0, 0.0)
+    rows, sd = [side.signal[0, i].unique() for i in open_ones], innovation_sd(side)[open_ones].tolist()
+    u, power = _characteristic(rows, min(sd))
+    lowest = torch.tensor([_gaussian_ends(len(row), s) for row, s in zip(rows, sd, strict=True)], dtype=torch.float64)
+    wanted = (u > lowest.min()) & (u < 2 * math.pi / (_FINEST_HIDDEN * min(sd)))
+    x = 2 * (torch.tensor(_SIZES, dtype=torch.float64)[:, None] * power[:, None]).sqrt()  # (sensor, size, u)
+    own = x + torch.special.i0e(x).log() - torch.tensor(_SIZES, dtype=torch.float64)[:, None]
+    ratios = some_of(torch.where(u > lowest[:, None, None], own, 0.0)).logsumexp(0) - math.log(len(_SIZES))
+    # Steps of any magnitude are as likely.
+    log_ratio = ratios + torch.where(wanted, -u.clamp(min=1e-300).log(), -math.inf).log_softmax(0)
+    best = int(log_ratio.argmax())
+    have = (power[:, best] > -math.log(_AS_OTHERS)).nonzero()[:, 0].tolist() or list(range(len(rows)))
+    top = _climbed(u, power[have].sum(0), best, _LOWEST / min(sd))
+    own_rows = [rows[i] for i in have]
+    peak = _peak(own_rows, top, float(u[1]))
+    step = sum(_step_at(row, peak) for row in own_rows) / len(own_rows)
+    return SharedLattice(float(log_ratio.logsumexp(0)), step, peak)
+
+
+def _seen_at(unique: Tensor, peak: float, step: float) -> Lattice:
+    """A hidden lattice of a step and a peak that are known, with its p value."""
+    n = len(unique)
+    power = float(_power(unique, torch.tensor([peak], dtype=torch.float64)))
+    resultant = math.sqrt(max((power - 1) / (n - 1), 1e-12)) if n > 1 else 1e-6
+    blur = math.sqrt(-2 * math.log(min(resultant, 1 - 1e-12))) / (2 * math.pi)
+    turn = torch.exp(2j * math.pi / step * unique).mean().angle()
+    return Lattice(step, float(turn) / (2 * math.pi) * step, blur, math.exp(-power), peak)
+
+
+def _power(values: Tensor, u: Tensor) -> Tensor:
+    """`n |phi(u)|^2`, `(u,)`."""
+    angle = u[:, None] * values
+    return (angle.cos().mean(-1).square() + angle.sin().mean(-1).square()) * len(values)
+
+
+def _peak(rows: list[Tensor], u: float, spacing: float) -> float:
+    """Maximum of the characteristic functions of rows of values, together, within a bin of `u`, by thirds."""
+    reach, rows = spacing, [row - row.mean() for row in rows]
+    for _ in range(8):
+        grid = u + reach * torch.linspace(-1, 1, 7, dtype=torch.float64)
+        u = float(grid[torch.stack([_power(row, grid) for row in rows]).sum(0).argmax()])
+        reach /= 3
+    return u
+
+
+def off_lattice(values: Tensor, step: float | Tensor, offset: float | Tensor) -> Tensor:
+    """Distances of values from the nearest point of a lattice, steps."""
+    place = (values - offset) / step
+    return place - place.round()
+
+
+class Missing(NamedTuple):
+    """Lattices that the simulation does not have and could be rounded to.
+
+    Attributes:
+        p_value: Of there being none, for having looked at every sensor alone and all together.
+        lattices: By sensor.
+    """
+
+    p_value: float
+    lattices: dict[int, Lattice]
+
+
+def missing_lattices(case: Case, level: float) -> Missing:
+    """Lattices of the recording; none where their p value is not below `level`."""
+    every = lattices(case.recorded)
+    alone = {i: left for i, own in enumerate(every) if own and (left := _not_simulated(case, i, own))}
+    clearest = min(alone.values(), key=lambda found: found.p_value, default=None)
+    p_alone = corrected(clearest.p_value, case.n_sensors) if clearest else 1.0
+    shared = shared_lattice(case.recorded)
+    p_shared = surpassing(shared.p_value, shared_lattice(case.simulated).p_value)
+    p_value = corrected(min(p_alone, p_shared), 2)
+    if p_value > level:
+        return Missing(p_value, {})
+    missing = {i: left for i, left in alone.items() if corrected(left.p_value, 2 * case.n_sensors) <= level}
+    if clearest is None or p_shared < p_alone:
+        clearest, missing = Lattice(shared.step, 0.0, 1.0, p_shared, shared.peak), {}
+    steps = [found.step for found in missing.values()]
+    for i, own in enumerate(every):  # a step that is known elsewhere needs less to be believed
+        if i in missing or own is None:
+            continue
+        if own.blur > 0 and clearest.blur > 0:
+            own = _seen_at(case.recording[i].unique(), clearest.peak, clearest.step)
+        elif not any(abs(own.step / step - 1) < _ALIKE for step in steps):
+            continue
+        left = _not_simulated(case, i, own) if own.p_value < _AS_OTHERS else None
+        if left is not None and left.p_value < _AS_OTHERS:
+            missing[i] = left
+    return Missing(p_value, dict(sorted(_as_large(missing).items())))
+
+
+def _as_large(missing: dict[int, Lattice]) -> dict[int, Lattice]:
+    """Without what has a trace of a hidden lattice by chance, beside others that have it in earnest."""
+    size = {i: -math.log(max(found.p_value, 1e-300)) for i, found in missing.items()}
+    least = _AS_LARGE * sum(size.values()) / max(len(size), 1)
+    return {i: found for i, found in missing.items() if size[i] >= least}
+
+
+def _not_simulated(case: Case, sensor: int, own: Lattice) -> Lattice | None:
+    """A lattice of the recording, with the p value of its being no clearer than the simulation's; `None` if exact."""
+    values = case.simulated.signal[:, sensor].flatten()
+    if own.blur == 0:
+        other = exact_lattices(case.simulated)[sensor]
+        return None if other is not None and other.step > own.step * (1 - _SAME_STEP) else own
+    u, n, m = torch.tensor([own.peak], dtype=torch.float64), case.n_samples, len(values)
+    power, other_power = (float(_power(v - v.mean(), u)) for v in (case.recording[sensor], values))
+    if other_power < -math.log(_SIMULATED):
+        return own
+    clearer = max(math.sqrt(power / n) - math.sqrt(other_power / m), 0.0)
+    return own._replace(p_value=max(own.p_value, math.exp(-(clearer**2) / (1 / n + 1 / m))))
