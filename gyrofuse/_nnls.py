@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import torch
+from scipy.optimize import nnls
 from torch import Tensor
 
 _FULL_EXCHANGES, _MOST = 3, 200
-_ROUNDING = 1e-12
+_ROUNDING, _LOST = 1e-12, 1e-13
 
 
 def nonnegative_least_squares(gram: Tensor, moment: Tensor, start: Tensor | None = None) -> Tensor:
     """Minimise `c' G c / 2 - m' c` over `c >= 0`, by block principal pivoting.
+
+    Of columns that are nearly dependent exchanges may go on for ever: what has not ended is left to active sets.
 
     Args:
         gram: `G`, `(..., unknown, unknown)`, positive semi-definite; `A' A` of a least-squares problem.
@@ -54,4 +57,16 @@ def nonnegative_least_squares(gram: Tensor, moment: Tensor, start: Tensor | None
         todo = todo[n_wrong > 0]
         if not len(todo):
             break
+    for item in todo.tolist():
+        solution[item] = _by_active_sets(correlation[item], target[item])
     return (solution.clamp(min=0) / size.reshape(-1, n)).view_as(moment)
+
+
+def _by_active_sets(gram: Tensor, moment: Tensor) -> Tensor:
+    """The same of one problem, by Lawson and Hanson's method, which ends whatever the columns."""
+    values, vectors = torch.linalg.eigh(gram)
+    kept = values > _LOST * values[-1]
+    root = values[kept].sqrt()
+    design, wanted = root[:, None] * vectors[:, kept].mT, vectors[:, kept].mT @ moment / root
+    found, _ = nnls(design.detach().cpu().numpy(), wanted.detach().cpu().numpy(), maxiter=_MOST * len(moment))
+    return torch.as_tensor(found, dtype=gram.dtype, device=gram.device)
