@@ -18,7 +18,7 @@ from gyrofuse.mismatch import episodes, lattices, level_scan, shocks
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.confirm import held_out_gain
 from gyrofuse.mismatch.engine import diagnose
-from gyrofuse.mismatch.evidence import some_of
+from gyrofuse.mismatch.evidence import SHARES, some_of
 from gyrofuse.mismatch.marginals import marginal_witness
 from gyrofuse.mismatch.mechanism import Finding
 from gyrofuse.mismatch.mechanisms.dead_band import DeadBand
@@ -126,7 +126,7 @@ def test_the_scan_of_levels_is_the_mean_over_stretches_and_factors(referred: boo
         for log_r, a in itertools.product([*reach, *-reach], starts):
             share = x[:, a : a + m].sum(-1)
             one = math.exp(-m / 2 * log_r) * (1 - share + share * math.exp(-log_r)) ** (-n / 2)
-            ratios.append(((1 + one) / 2).prod())
+            ratios.append(np.mean([(1 - e + e * one).prod() for e in SHARES]))
         return float(np.mean(ratios))
 
     lengths = sorted({round(2 ** (k / 2)) for k in range(11)})
@@ -333,7 +333,7 @@ def test_the_ratio_of_a_lattice_that_some_sensors_have_has_mean_one() -> None:
     x = 2 * (2.0 * power).sqrt()
     own = x - 2.0 + torch.special.i0e(x).log()
     assert float(own.exp().mean()) == pytest.approx(1.0, abs=0.03)
-    e = torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)[:, None, None]
+    e = torch.tensor(SHARES, dtype=torch.float64)[:, None, None]
     naive = (1 - e + e * own.exp()).prod(1).mean(0).log()
     torch.testing.assert_close(some_of(own), naive)
 

@@ -22,7 +22,9 @@ from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import Evidence, corrected
 from gyrofuse.mismatch.known_lines import without_lines
 from gyrofuse.mismatch.lines import simulated_lines
+from gyrofuse.mismatch.partakers import partakers
 
+_SEEN = 0.01  # chance that a sensor seems to follow a channel, of those that are taken for sure to begin with
 _LINE = 4  # bins on either side of a line that the simulation has
 _LEAST_DOF = 3.0  # of a simulation's band: below, it does not tell what chance alone would do to a slow channel
 
@@ -37,7 +39,7 @@ class ChannelFit:
         statistic: Twice the log likelihood ratio, chi-square with a degree of freedom for each gain.
         quadrature: The same for gains a quarter of a cycle late, which no instantaneous coupling has.
         share: Largest share of one band in the statistic.
-        own: p values sensor by sensor, `(sensor,)`.
+        squares: Of the gains of each sensor, chi-square with a degree of freedom for each row, `(sensor,)`.
         p_value: Of the array, for having asked it whole and sensor by sensor.
     """
 
@@ -46,7 +48,7 @@ class ChannelFit:
     statistic: float
     quadrature: float
     share: float
-    own: Tensor
+    squares: Tensor
     p_value: float
 
     @property
@@ -109,7 +111,7 @@ def regress(case: Case, rows: Tensor, signal: Tensor | None = None) -> ChannelFi
         statistic=statistic,
         quadrature=float(moment_late @ covariance @ moment_late),
         share=float(contributions.amax() / contributions.sum()) if statistic > 0 else 1.0,
-        own=own,
+        squares=sure,
         p_value=min(p_value, 1.0),
     )
 
@@ -149,7 +151,7 @@ def channel_witness(case: Case) -> Evidence:
         "channel",
         corrected(fit.p_value, len(tried)),
         f"sensors follow {name}{words}",
-        sensors=tuple((fit.own < 0.01 / len(fit.own)).nonzero()[:, 0].tolist()),
+        sensors=partakers(fit.squares, fit.gains.shape[-1], _SEEN).positions,
         channel=name,
     )
 

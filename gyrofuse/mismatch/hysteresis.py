@@ -34,7 +34,7 @@ def hysteresis_witness(case: Case) -> Evidence:
         scan.p_value,
         f"the bias depends on the way by which {scan.family.channel} was reached, most clearly in sensor "
         f"{case.scene.sensors[largest]}",
-        sensors=concerned(scan) or (largest,),
+        sensors=concerned(scan),
         channel=scan.family.channel,
     )
 

@@ -125,7 +125,7 @@ def strong_scan(case: Case, name: str, level: float) -> Strong | None:
     """
     look = slow_look(case)
     scan = look.scan(name)
-    if scan is None or scan.p_value > min(level, _STRONG) or not concerned(scan):
+    if scan is None or scan.p_value > min(level, _STRONG):
         return None
     rivals = {other.family.name: other.gain for other in look.scans if other is not scan}
     rivals["parameter_shift"] = look.wandering

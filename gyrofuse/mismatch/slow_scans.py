@@ -18,6 +18,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import Evidence, calibrated, corrected
+from gyrofuse.mismatch.partakers import partakers
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.slow import Fit, SlowNoise, Told, best_fit, scores, slow_ordinates, told, where
 from gyrofuse.mismatch.slow_families import Family, edges, steps, temperatures, warm_ups
@@ -25,7 +26,7 @@ from gyrofuse.mismatch.slow_families import Family, edges, steps, temperatures, 
 _LOW = 48  # ordinates in which sensors are compared
 _SCANS = 2  # the second with the covariance that the first effect leaves
 _FREE = 5.0  # sd of log factors that nothing is known of
-_PRESENT = 3.0  # standard deviations, noise held: 0.3 % each
+_SEEN = 0.02  # chance that a sensor seems to have a template, of those that are taken for sure to begin with
 _JUMP = 5.0  # standard deviations
 _FEWEST_JUMPS, _MOST_JUMPS = 4, 10
 _TWO_LEVELS = 1.6  # distance of the outermost levels, in jumps
@@ -204,7 +205,7 @@ def slow_witness(case: Case) -> Evidence:
         "slow",
         corrected(scan.p_value, len(look.scans)),
         f"{seen}, most clearly in sensor {case.scene.sensors[largest]}",
-        sensors=concerned(scan) or (largest,),
+        sensors=concerned(scan),
         time_s=seconds if scan.family.name == "step" else None,
         channel=scan.family.channel,
     )
@@ -212,7 +213,7 @@ def slow_witness(case: Case) -> Evidence:
 
 def concerned(scan: Scan) -> tuple[int, ...]:
     """Sensors in which a template is there, once it is there at all."""
-    return tuple((scan.held.abs() > _PRESENT).nonzero()[:, 0].tolist())
+    return partakers(scan.held.square(), 1, _SEEN).positions
 
 
 def jumps_to_and_fro(score: Tensor, gram: Tensor) -> bool:

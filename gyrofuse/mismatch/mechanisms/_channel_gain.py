@@ -14,12 +14,13 @@ from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.channels import ChannelFit, regress
 from gyrofuse.mismatch.folds import estimation_samples, signal_gains
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
+from gyrofuse.mismatch.partakers import partakers
 from gyrofuse.mismatch.witnesses import level_of
 from gyrofuse.units import GRAVITY
 
 _OF_ONE_BAND = 0.9  # share of the evidence from which a gain might be a line's alone
 _WHOLE = ("each", "length")  # kinds of rows that are made from all of a channel
-_SEEN = 0.04  # chance that a sensor is named which does not follow the channel
+_SEEN = 0.04  # chance that a sensor seems to follow the channel, of those that are taken for sure to begin with
 _LATE = 0.25  # share of the evidence a quarter of a cycle late, from which it is no instantaneous coupling
 _SCATTER = 3.0  # standard deviations of what is so by chance
 
@@ -71,7 +72,7 @@ class ChannelGain(Mechanism):
         chance = fit.gains.numel()  # mean of what is seen a quarter of a cycle late, with the variance twice as large
         if p_value > level or fit.quadrature > chance + _SCATTER * math.sqrt(2 * chance) + _LATE * fit.excess:
             return None
-        present = tuple((fit.own < _SEEN / case.n_sensors).nonzero()[:, 0].tolist()) or (int(fit.own.argmin()),)
+        present = partakers(fit.squares, fit.gains.shape[-1], _SEEN).positions
         unit, factor = cls._unit(case.scene, name)
         sizes = {i: _size(fit, i, unit, factor) for i in present}
         largest = max(sizes, key=lambda i: abs(sizes[i].value))

@@ -13,13 +13,14 @@ from torch import Tensor
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.folds import estimation_samples
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
+from gyrofuse.mismatch.partakers import partakers
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.side import Side
 from gyrofuse.mismatch.spectra import hann_transform
 from gyrofuse.mismatch.witnesses import level_of
 
 _ROUNDS = 6
-_SEEN = 0.04  # chance that a sensor is named which has no tone
+_SEEN = 0.04  # chance that a sensor seems to have the tone, of those that are taken for sure to begin with
 _TAIL = 0.025  # beyond either limit
 _STRONG, _FAR, _HALVINGS = 12.0, 6.0, 40  # standard deviations from which a law is normal, and beyond which none is
 _REACH, _GUARD = 64, 3  # bins on either side that tell the noise, and those too near to
@@ -56,8 +57,8 @@ class VibrationTone(Mechanism):
         n, noise = case.n_samples, density_near(case, f)  # (sensor,)
         sd = (2 * noise / n).sqrt()
         snr = tone.amplitude / sd
-        seen = math.sqrt(-2 * math.log(_SEEN / case.n_sensors))
-        present = tuple((snr > seen).nonzero()[:, 0].tolist()) or (int(snr.argmax()),)
+        there = partakers(snr.square(), 2, _SEEN)
+        present, seen = there.positions, math.sqrt(there.least)
         # Noise adds to the squares of amplitudes, but tells nothing of the frequency.
         energy = max(float((snr.square() - 2).clamp(min=0.0)[list(present)].sum()), 1.0)
         spread = math.sqrt(12 / energy) / (2 * math.pi * n)
