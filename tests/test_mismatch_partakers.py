@@ -1,4 +1,4 @@
-"""Which sensors take part: densities against SciPy's, what is taken for chance in which company, how often it is right."""
+"""Which sensors take part: densities against SciPy, what is chance in which company, how often it is right."""
 
 from __future__ import annotations
 
