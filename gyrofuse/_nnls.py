@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from scipy.optimize import nnls
 from torch import Tensor
 
 _FULL_EXCHANGES, _MOST = 3, 200
@@ -64,6 +63,8 @@ def nonnegative_least_squares(gram: Tensor, moment: Tensor, start: Tensor | None
 
 def _by_active_sets(gram: Tensor, moment: Tensor) -> Tensor:
     """The same of one problem, by Lawson and Hanson's method, which ends whatever the columns."""
+    from scipy.optimize import nnls  # rarely needed, and slow to import
+
     values, vectors = torch.linalg.eigh(gram)
     kept = values > _LOST * values[-1]
     root = values[kept].sqrt()
