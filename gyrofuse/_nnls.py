@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 _FULL_EXCHANGES, _MOST = 3, 200
-_ROUNDING, _LOST = 1e-12, 1e-13
+_ROUNDING = 1e-12
+_LOST = 500.0  # roundings of the largest eigenvalue, below which one is lost
 
 
 def nonnegative_least_squares(gram: Tensor, moment: Tensor, start: Tensor | None = None) -> Tensor:
@@ -57,17 +58,25 @@ def nonnegative_least_squares(gram: Tensor, moment: Tensor, start: Tensor | None
         if not len(todo):
             break
     for item in todo.tolist():
-        solution[item] = _by_active_sets(correlation[item], target[item])
+        solution[item] = _by_active_sets(correlation[item], target[item], solution[item])
     return (solution.clamp(min=0) / size.reshape(-1, n)).view_as(moment)
 
 
-def _by_active_sets(gram: Tensor, moment: Tensor) -> Tensor:
-    """The same of one problem, by Lawson and Hanson's method, which ends whatever the columns."""
+def _by_active_sets(gram: Tensor, moment: Tensor, otherwise: Tensor) -> Tensor:
+    """The same of one problem, by Lawson and Hanson's method, which ends whatever the columns, if numbers are finite.
+
+    `otherwise` is the answer where they are not: one item does not stop a batch.
+    """
     from scipy.optimize import nnls  # rarely needed, and slow to import
 
+    if not bool(gram.isfinite().all() & moment.isfinite().all()):
+        return otherwise
     values, vectors = torch.linalg.eigh(gram)
-    kept = values > _LOST * values[-1]
+    kept = values > _LOST * torch.finfo(gram.dtype).eps * values[-1]
     root = values[kept].sqrt()
     design, wanted = root[:, None] * vectors[:, kept].mT, vectors[:, kept].mT @ moment / root
-    found, _ = nnls(design.detach().cpu().numpy(), wanted.detach().cpu().numpy(), maxiter=_MOST * len(moment))
+    try:
+        found, _ = nnls(design.detach().cpu().numpy(), wanted.detach().cpu().numpy(), maxiter=_MOST * len(moment))
+    except RuntimeError:  # too many iterations
+        return otherwise
     return torch.as_tensor(found, dtype=gram.dtype, device=gram.device)

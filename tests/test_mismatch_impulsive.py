@@ -228,6 +228,23 @@ def test_few_repeats_of_coarse_numbers_are_chance() -> None:
     assert float(p_values.min()) > 0.05
 
 
+def test_few_repeats_are_compared_with_those_that_a_quieter_simulation_would_have() -> None:
+    p_values = []
+    for seed in range(12):
+        recording, simulation, _ = drawn(70 + seed)
+        rounded = 2e-3 * (recording / 2e-3).round()
+        noisier = 2e-3 * (8 * simulation / 2e-3).round()
+        p_values.append(marginals.repeats(Case.of(SCENE, rounded, noisier)).p_values)
+    assert float(torch.stack(p_values).min()) > 1e-3
+    recording[1, 40::400] = recording[1, 39:-1:400]
+    fine = 2e-4 * (recording / 2e-4).round()
+    once = simulation.clone()
+    once[0, 1, 5] = once[0, 1, 4]  # one repeat there does not say that the recording's own resolution makes none
+    p_values = marginals.repeats(Case.of(SCENE, fine, once)).p_values
+    assert float(p_values[1]) < 1e-4
+    assert float(p_values[[0, 2]].min()) > 0.01
+
+
 def test_repeats_that_chance_would_not_make_may_come_and_go() -> None:
     recording, simulation, g = drawn(14)
     at = (even(N, g=g) < 0.006) & (torch.arange(N) < N // 2)

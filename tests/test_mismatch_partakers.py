@@ -32,6 +32,13 @@ def test_little_is_chance_beside_much_and_counts_beside_little():
     assert partakers(torch.tensor([0.1, 0.4, 0.2], dtype=torch.float64), 1, chance).positions == (1,)
 
 
+def test_what_is_beyond_doubt_takes_part_beside_anything():
+    strong = torch.tensor([100.0, 70.0, 20.0, 120.0, 50.0, 0.5], dtype=torch.float64).square()
+    assert partakers(strong, 1, 0.04).positions == (0, 1, 2, 3, 4)
+    assert partakers(torch.tensor([1e12, 1e9, 60.0, 2.0], dtype=torch.float64), 2, 0.04).positions == (0, 1, 2)
+    assert partakers(torch.tensor([math.nan, 1.0], dtype=torch.float64), 1, 0.04).positions == (1,)
+
+
 @pytest.mark.parametrize(("dof", "total", "share"), [(1, 60.0, 0.78), (1, 200.0, 0.985), (3, 60.0, 0.65)])
 def test_the_exact_set_is_found_as_often_as_sizes_that_are_alike_allow(dof: int, total: float, share: float):
     """Shares are of 3000 drawn arrays; a threshold of 0.7 % for each sensor finds 0.59, 0.975 and 0.49."""

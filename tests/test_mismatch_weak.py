@@ -317,7 +317,7 @@ def test_a_hidden_lattice_that_no_sensor_shows_alone_is_seen_in_all_of_them_toge
         plain, simulation = normal(6, 16384, g=g), normal(2, 6, 16384, g=g)
         scene = Scene(RATE, "deg/s", tuple("abcdef"))
         case = Case.of(scene, rounded, simulation * rounded.std())
-        alone.append(min(own.p_value for own in lattices.lattices(case.recorded) if own))
+        alone.append(min(own.p_value for own in lattices.lattices(case.recorded)))
         together.append(lattices.missing_lattices(case, LEVEL).p_value)
         nothing.append(lattices.missing_lattices(Case.of(scene, plain, simulation), LEVEL).p_value)
         step = lattices.shared_lattice(case.recorded).step
@@ -325,6 +325,34 @@ def test_a_hidden_lattice_that_no_sensor_shows_alone_is_seen_in_all_of_them_toge
     assert sum(p < LEVEL for p in together) >= 9
     assert sum(p < LEVEL for p in alone) <= 5
     assert sum(p < 0.05 for p in nothing) <= 3  # four of ten have probability 1e-3
+
+
+@pytest.mark.parametrize("kind", ["an episode", "half and half", "outliers", "heavy tails", "common noise"])
+def test_noise_that_is_no_gaussian_of_one_sd_is_no_lattice(kind: str) -> None:
+    """Its quiet or middle part has a characteristic function that reaches further than its variance says."""
+    for seed in range(4):
+        g = torch.Generator().manual_seed(60 + seed)
+        x, simulation = normal(6, 65536, g=g), normal(1, 6, 65536, g=g)
+        if kind == "an episode":
+            x[:, 20_000:33_000] *= 3.0
+        elif kind == "half and half":
+            x[:, 32_768:] *= 2.0
+        elif kind == "outliers":
+            x = torch.where(even(6, 65536, g=g) < 0.01, 10 * x.sign(), x)
+        elif kind == "heavy tails":
+            x = x / (normal(5, 6, 65536, g=g).square().mean(0)).sqrt()
+        else:
+            x = math.sqrt(0.05) * x + math.sqrt(0.95) * normal(1, 65536, g=g)
+        case = Case.of(Scene(RATE, "deg/s", tuple("abcdef")), x, simulation * x.std())
+        assert lattices.missing_lattices(case, LEVEL).p_value > 0.01
+
+
+def test_a_trace_is_no_lattice_beside_hidden_ones_and_exact_ones_are_no_measure() -> None:
+    hidden = [lattices.Lattice(1.0, 0.0, 0.4, math.exp(-n), 6.0) for n in (200.0, 100.0, 4.2, 20.0)]
+    exact = lattices.Lattice(1.0, 0.0, 0.0, 0.0)
+    kept = lattices._as_large({0: exact, 1: hidden[0], 2: hidden[1], 3: hidden[2], 4: hidden[3]})
+    assert sorted(kept) == [0, 1, 2, 4]
+    assert sorted(lattices._as_large({0: exact, 1: exact, 2: hidden[3]})) == [0, 1, 2]
 
 
 def test_the_ratio_of_a_lattice_that_some_sensors_have_has_mean_one() -> None:

@@ -22,7 +22,8 @@ import torch
 from torch import Tensor
 
 _NARROWEST = 4  # bins
-_FEWEST_CELLS, _FEWEST_BINS = 8, 24  # of a flank; a cell is half a stretch
+_CELLS, _FEWEST_CELLS, _FEWEST_BINS = 8, 3, 24  # of a flank; a cell is half a stretch
+_SMOOTH = 8  # part of the spectrum over which noise may be taken for the same
 _LOWEST, _NARROW = 12, 4  # bins, and widths, below a stretch
 _BROADEST = 8  # of them in the spectrum
 _SIZES = (3.2, 5.6, 8.0, 11.2)  # `a`, times the root of `m`
@@ -58,7 +59,7 @@ def scanned_bumps(transform: Tensor, worth: float) -> Iterator[Stretches]:
     cells = pairs @ pairs.mH  # (cell, sensor, sensor)
     while width <= n_bins // _BROADEST:
         half = width // 2
-        reach = max(_FEWEST_CELLS, _FEWEST_BINS // half)
+        reach = max(min(_CELLS, len(cells) // _SMOOTH), _FEWEST_CELLS, _FEWEST_BINS // half)
         first = max(-(-_LOWEST // half) + reach + 1, 2 * _NARROW)
         last = len(cells) - reach - 3
         if last < first:

@@ -128,9 +128,14 @@ def _apart(transform: Tensor, length: int, case: Case) -> Tensor:
 
 def _flanks(power: Tensor, a: int, n: int) -> Tensor:
     """Mean of both flanks, `(sensor,)`, as far as they reach."""
-    gap, wide = n // 2, 3 * n // 2
+    gap, wide = n // 2, _flank(n, power.shape[-1])
     left, right = power[:, max(a - gap - wide, 0) : a - gap], power[:, a + n + gap : a + n + gap + wide]
     return torch.cat([left, right], -1).mean(-1)
+
+
+def _flank(n: int, n_bins: int) -> int:
+    """Bins of a flank beside a stretch of `n`, as those of the scan are."""
+    return max(min(4 * n, n_bins // 8), 3 * n // 2, _FLANK)
 
 
 def band_of(place: Tensor, length: int, case: Case) -> Tensor:
@@ -149,8 +154,9 @@ def _has_it(simulated: tuple[Tensor, int], stretch: Stretch, case: Case) -> bool
     """Whether the simulation has a bump at the same place."""
     transform, length = simulated
     n = max(round(stretch.width * length) // 2, 2) * 2
-    a, gap, wide = round(stretch.frequency * length - (n - 1) / 2), n // 2, max(3 * n // 2, _FLANK)
-    if a < gap + wide or a + n + gap + wide > transform.shape[-1]:
+    a, gap = round(stretch.frequency * length - (n - 1) / 2), n // 2
+    wide = min(_flank(n, transform.shape[-1]), a - gap, transform.shape[-1] - a - n - gap)
+    if wide < max(3 * n // 2, _FLANK):
         return False
     bins = transform.movedim(1, 0)  # (sensor, record, bin)
     inside, left, right = (

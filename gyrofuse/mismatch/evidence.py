@@ -57,8 +57,7 @@ def uncorrected(p: float, places: float) -> float:
 def ratio_p_value(log_ratio: float) -> float:
     """p value of a mean likelihood ratio, from its logarithm.
 
-    It exceeds `x` with probability `1/x` at most (Ville, 1939); for outliers and levels importance sampling gives
-    less than `1/70x`. To `1/20x` is held.
+    It exceeds `x` with probability `1/x` at most (Ville, 1939); by drawn records `1/30x` or less. To `1/20x` is held.
     """
     return math.exp(min(math.log(_LOOSE) - log_ratio, 0.0))
 
@@ -66,7 +65,7 @@ def ratio_p_value(log_ratio: float) -> float:
 def some_of(log_ratios: Tensor) -> Tensor:
     """Logarithm of the mean over shares `e` of `prod (1 - e + e E)`, of ratios `log E` `(sensor, ...)`.
 
-    Any of the sensors may have what each has a likelihood ratio of its own for.
+    Any of the sensors may have what each has a likelihood ratio of its own for; these have to be independent.
     """
     if len(log_ratios) == 1:
         return log_ratios[0]

@@ -28,13 +28,14 @@ def hysteresis_witness(case: Case) -> Evidence:
     scan = strongest_relay(case)
     if scan is None:
         return Evidence("hysteresis", 1.0, "there is no temperature that goes to and fro")
-    largest = int(scan.z.abs().argmax())
+    which = concerned(scan)
+    largest = max(which, key=lambda i: float(scan.z[i].abs()))
     return Evidence(
         "hysteresis",
         scan.p_value,
         f"the bias depends on the way by which {scan.family.channel} was reached, most clearly in sensor "
         f"{case.scene.sensors[largest]}",
-        sensors=concerned(scan),
+        sensors=which,
         channel=scan.family.channel,
     )
 

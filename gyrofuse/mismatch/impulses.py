@@ -1,10 +1,10 @@
 """What is sudden: outliers and jumps.
 
 A record is whitened by its own smooth spectrum in the orthonormal DCT-II, `e = C^T y / sqrt(S)`, which has no ends
-that meet; `C^T y / S` over the mean of `1/S` is the error of a sample predicted from all others, most sensitive to an
-outlier of one sample. The smooth spectrum is made of geometric means over bands, so that lines do not raise it, and
-ordinates of lines are left out. Bands are as wide as the spectrum allows: a mean of 50 ordinates is a third off, which
-costs a twentieth of an outlier's size, and weak ones half of what they tell.
+that meet; `C^T y / S` over the mean of `1/S`, less where `S` follows the ordinates, is the error of a sample predicted
+from all others, most sensitive to an outlier of one sample. The smooth spectrum is made of geometric means over bands,
+so that lines do not raise it, and ordinates of lines are left out. Bands are as wide as the spectrum allows: a mean of
+50 ordinates is a third off, which costs a twentieth of an outlier's size, and weak ones half of what they tell.
 """
 
 from __future__ import annotations
@@ -120,12 +120,12 @@ def _smooth_spectrum(y: Tensor) -> tuple[Tensor, Tensor]:
     """
     log_power = y.square().clamp(min=1e-300).log() - _LOG_CHI2
     curve, followed = torch.zeros_like(log_power), torch.zeros_like(log_power)
-    for part, most in _WIDTHS:
+    for number, (part, most) in enumerate(_WIDTHS):
         ends = torch.tensor(_edges(y.shape[-1], part, most))
         width = ends.diff()
         total = torch.nn.functional.pad((log_power - curve).cumsum(-1), (1, 0))[..., ends]
         means, sd = total.diff(dim=-1) / width, _LOG_CHI2_SD / width.sqrt()
-        counts = (means.abs() > _FOLLOWED * sd) | bool(part == _WIDTHS[0][0])
+        counts = (means.abs() > _FOLLOWED * sd) | (number == 0)
         curve = curve + _interpolated(means * counts, ends)
         own = (counts / width).repeat_interleave(width, -1)
         followed = followed.maximum(_OWN * own)

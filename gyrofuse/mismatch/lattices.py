@@ -1,10 +1,11 @@
 """The lattice that rounded values sit on.
 
 A lattice `offset + k step` is exact where values recur, and read off them. Hidden under noise that was added after the
-rounding it still shows in the empirical characteristic function `phi(u) = mean exp(i u x)` at `u = 2 pi/step`: where a
-Gaussian of the sd of a sample given its past has none left, `n |phi|^2` is standard exponential without a lattice. One
-of size `k` gives it the likelihood ratio `exp(-k) I0(2 sqrt(k n |phi|^2))`; the mean of that over steps, sizes and
-shares of the sensors, which may have the same converter, has expectation one without a lattice.
+rounding it still shows in the empirical characteristic function `phi(u) = mean exp(i u x)` at `u = 2 pi/step`: beyond
+`5.5/s`, with `s` the sd of the middle of what is left of a sample given its past and the other sensors, `n |phi|^2` is
+standard exponential without a lattice, and independent from sensor to sensor. A lattice of size `k` gives it the
+likelihood ratio `exp(-k) I0(2 sqrt(k n |phi|^2))`; the mean of that over steps, sizes and shares of the sensors, which
+may have the same converter, has expectation one without a lattice.
 """
 
 from __future__ import annotations
@@ -17,13 +18,15 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import corrected, ratio_p_value, some_of, surpassing
+from gyrofuse.mismatch.impulses import left_out
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.side import Side
 
 _FINEST, _FINEST_HIDDEN = 1 / 50, 1 / 20  # steps that matter, of the sd of a sample given its past
 _EXACT = 0.01  # distance from the lattice, steps, that arithmetic explains
 _ON_LATTICE = 0.999  # of the samples; converters also have end stops
-_GAUSSIAN_LEFT = 0.003  # `n |phi|^2` of a Gaussian, beyond which it has no characteristic function left
+_ENDS = 5.5  # u s, beyond which noise has no characteristic function left, whatever its tails
+_RIDGE = 1e-9  # of correlations of sensors that are copies of each other
 _LOWEST = 3.5  # u s, where a peak found by its flank or its harmonics may still lie
 _DOUBTFUL = 0.05  # p value of a lattice that is not looked at more closely
 _AS_OTHERS, _AS_LARGE = 0.02, 1 / 16  # p value of one that other sensors have, and its size over their mean
@@ -57,6 +60,20 @@ def innovation_sd(side: Side) -> Tensor:
 
 
 @remembered
+def core_sd(side: Side) -> Tensor:
+    """Sd of the middle of what the past and the other sensors leave of a sample, `(sensor,)`.
+
+    The quiet part of a record, and what is no outlier, have a characteristic function that reaches further than that
+    of a Gaussian of the same variance.
+    """
+    white = left_out(side).white[0]  # of robust sd one
+    rms = white.square().mean(-1).sqrt()
+    correlation = (white @ white.mT) / white.shape[-1] / (rms[:, None] * rms)
+    own = torch.linalg.inv(correlation + _RIDGE * torch.eye(len(white), dtype=white.dtype)).diagonal().rsqrt()
+    return innovation_sd(side) / rms.clamp(min=1.0) * own.clamp(max=1.0)
+
+
+@remembered
 def exact_lattices(side: Side) -> tuple[Lattice | None, ...]:
     """The lattice of each sensor's values in the first record that needs no statistics, `None` without."""
     return tuple(
@@ -65,9 +82,9 @@ def exact_lattices(side: Side) -> tuple[Lattice | None, ...]:
 
 
 @remembered
-def lattices(side: Side) -> tuple[Lattice | None, ...]:
-    """The lattice of each sensor's values in the first record, `None` where nothing looks like one."""
-    every = zip(exact_lattices(side), side.signal[0], innovation_sd(side), strict=True)
+def lattices(side: Side) -> tuple[Lattice, ...]:
+    """The likeliest lattice of each sensor's values in the first record."""
+    every = zip(exact_lattices(side), side.signal[0], core_sd(side), strict=True)
     return tuple(exact or _hidden_lattice(values.unique(), float(sd)) for exact, values, sd in every)
 
 
@@ -92,9 +109,8 @@ def _exact_lattice(values: Tensor, sd: float) -> Lattice | None:
 
 def _hidden_lattice(unique: Tensor, sd: float) -> Lattice:
     """The most conspicuous step in the characteristic function; each value counts once, whatever repeats."""
-    lowest = _gaussian_ends(len(unique), sd)
     u, (power,) = _characteristic([unique], sd)
-    wanted = (u > lowest) & (u < 2 * math.pi / (_FINEST_HIDDEN * sd))
+    wanted = (u > _ENDS / sd) & (u < 2 * math.pi / (_FINEST_HIDDEN * sd))
     best = int(torch.where(wanted, power, 0.0).argmax())
     p_value = corrected(math.exp(-float(power[best])), int(wanted.sum()))
     if p_value > _DOUBTFUL:
@@ -113,11 +129,6 @@ def _climbed(u: Tensor, power: Tensor, at: int, lowest: float) -> float:
     while u[at] > lowest and power[at - 1] > power[at]:
         at -= 1
     return float(u[at])
-
-
-def _gaussian_ends(n: int, sd: float) -> float:
-    """The `u` from which on `n` Gaussian values have no characteristic function left."""
-    return math.sqrt(math.log(n / _GAUSSIAN_LEFT)) / sd
 
 
 def _characteristic(rows: list[Tensor], sd: float) -> tuple[Tensor, Tensor]:
@@ -163,18 +174,23 @@ def shared_lattice(side: Side) -> SharedLattice:
     open_ones = [i for i, exact in enumerate(exact_lattices(side)) if exact is None]
     if len(open_ones) < 2:
         return SharedLattice(-math.inf, 0.0, 0.0)
-    rows, sd = [side.signal[0, i].unique() for i in open_ones], innovation_sd(side)[open_ones].tolist()
-    u, power = _characteristic(rows, min(sd))
-    lowest = torch.tensor([_gaussian_ends(len(row), s) for row, s in zip(rows, sd, strict=True)], dtype=torch.float64)
-    wanted = (u > lowest.min()) & (u < 2 * math.pi / (_FINEST_HIDDEN * min(sd)))
-    x = 2 * (torch.tensor(_SIZES, dtype=torch.float64)[:, None] * power[:, None]).sqrt()  # (sensor, size, u)
-    own = x + torch.special.i0e(x).log() - torch.tensor(_SIZES, dtype=torch.float64)[:, None]
-    ratios = some_of(torch.where(u > lowest[:, None, None], own, 0.0)).logsumexp(0) - math.log(len(_SIZES))
+    rows, sd = [side.signal[0, i].unique() for i in open_ones], core_sd(side)[open_ones]
+    finest = float(sd.min())
+    u, power = _characteristic(rows, finest)
+    last = int(torch.searchsorted(u, 2 * math.pi / (_FINEST_HIDDEN * finest)))
+    u, power = u[:last], power[:, :last]
+    usable = u > _ENDS / sd[:, None]
+    ratios = torch.full_like(u, -math.inf)
+    for size in _SIZES:
+        x = 2 * (size * power).sqrt()
+        own = torch.where(usable, x + torch.special.i0e(x).log() - size, 0.0)
+        ratios = torch.logaddexp(ratios, some_of(own) - math.log(len(_SIZES)))
     # Steps of any magnitude are as likely.
-    log_ratio = ratios + torch.where(wanted, -u.clamp(min=1e-300).log(), -math.inf).log_softmax(0)
+    log_ratio = ratios + torch.where(usable.any(0), -u.clamp(min=1e-300).log(), -math.inf).log_softmax(0)
     best = int(log_ratio.argmax())
-    have = (power[:, best] > -math.log(_AS_OTHERS)).nonzero()[:, 0].tolist() or list(range(len(rows)))
-    top = _climbed(u, power[have].sum(0), best, _LOWEST / min(sd))
+    shown = usable[:, best] & (power[:, best] > -math.log(_AS_OTHERS))
+    have = shown.nonzero()[:, 0].tolist() or usable[:, best].nonzero()[:, 0].tolist()
+    top = _climbed(u, power[have].sum(0), best, _LOWEST / float(sd[have].min()))
     own_rows = [rows[i] for i in have]
     peak = _peak(own_rows, top, float(u[1]))
     step = sum(_step_at(row, peak) for row in own_rows) / len(own_rows)
@@ -228,22 +244,24 @@ class Missing(NamedTuple):
 def missing_lattices(case: Case, level: float) -> Missing:
     """Lattices of the recording; none where their p value is not below `level`."""
     every = lattices(case.recorded)
-    alone = {i: left for i, own in enumerate(every) if own and (left := _not_simulated(case, i, own))}
+    alone = {i: left for i, own in enumerate(every) if (left := _not_simulated(case, i, own))}
     clearest = min(alone.values(), key=lambda found: found.p_value, default=None)
     p_alone = corrected(clearest.p_value, case.n_sensors) if clearest else 1.0
     shared = shared_lattice(case.recorded)
     p_shared = surpassing(shared.p_value, shared_lattice(case.simulated).p_value)
-    p_value = corrected(min(p_alone, p_shared), 2)
+    p_value = corrected(min(p_alone, p_shared), min(case.n_sensors, 2))
     if p_value > level:
         return Missing(p_value, {})
     missing = {i: left for i, left in alone.items() if corrected(left.p_value, 2 * case.n_sensors) <= level}
     if clearest is None or p_shared < p_alone:
         clearest, missing = Lattice(shared.step, 0.0, 1.0, p_shared, shared.peak), {}
-    steps = [found.step for found in missing.values()]
+    steps, sd = [found.step for found in missing.values()], core_sd(case.recorded)
     for i, own in enumerate(every):  # a step that is known elsewhere needs less to be believed
-        if i in missing or own is None:
+        if i in missing:
             continue
         if own.blur > 0 and clearest.blur > 0:
+            if clearest.peak < _LOWEST / float(sd[i]):
+                continue
             own = _seen_at(case.recording[i].unique(), clearest.peak, clearest.step)
         elif not any(abs(own.step / step - 1) < _ALIKE for step in steps):
             continue
@@ -255,9 +273,9 @@ def missing_lattices(case: Case, level: float) -> Missing:
 
 def _as_large(missing: dict[int, Lattice]) -> dict[int, Lattice]:
     """Without what has a trace of a hidden lattice by chance, beside others that have it in earnest."""
-    size = {i: -math.log(max(found.p_value, 1e-300)) for i, found in missing.items()}
+    size = {i: -math.log(max(found.p_value, 1e-300)) for i, found in missing.items() if found.blur > 0}
     least = _AS_LARGE * sum(size.values()) / max(len(size), 1)
-    return {i: found for i, found in missing.items() if size[i] >= least}
+    return {i: found for i, found in missing.items() if size.get(i, least) >= least}
 
 
 def _not_simulated(case: Case, sensor: int, own: Lattice) -> Lattice | None:

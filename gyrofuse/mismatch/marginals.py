@@ -34,7 +34,9 @@ class Repeats(NamedTuple):
         sd: Of the difference, by chance.
         wanders: Whether it varies slowly over a record, more than by chance.
         events, simulated: How often samples began to repeat, in the recording and the simulation.
-        n, m: Samples of both.
+        by_resolution: Share of repeats that the recording's own resolution makes.
+        n: Samples.
+        m: Those of the simulation, as many as would repeat as often with the recording's noise.
     """
 
     share: Tensor
@@ -43,8 +45,9 @@ class Repeats(NamedTuple):
     wanders: Tensor
     events: Tensor
     simulated: Tensor
+    by_resolution: Tensor
     n: int
-    m: int
+    m: Tensor
 
     @property
     def p_values(self) -> Tensor:
@@ -54,11 +57,11 @@ class Repeats(NamedTuple):
         wandering = torch.from_numpy(stats.t.sf(z.numpy(), _QUARTERS - 1))
         many = torch.where(self.wanders, wandering, torch.special.ndtr(-z))
         # Few are a matter of counting: against the simulation's, and against what the resolution makes.
-        few, own = self.n * self.expected, (self.events - 1).numpy()
-        compared = stats.binom.sf(own, (self.events + self.simulated).numpy(), self.n / (self.n + self.m))
-        resolved = torch.from_numpy(stats.poisson.sf(own, few.numpy()))
-        counted = torch.where(self.simulated == 0, resolved, 0.0).maximum(torch.from_numpy(compared))
-        return torch.where(few < _COUNTED, counted, many)
+        few, beyond = self.n * self.expected.maximum(self.by_resolution), (self.events - 1).numpy()
+        share = (self.n / (self.n + self.m)).numpy()
+        compared = torch.from_numpy(stats.binom.sf(beyond, (self.events + self.simulated).numpy(), share))
+        counted = compared.maximum(torch.from_numpy(stats.poisson.sf(beyond, few.numpy())))
+        return torch.where((few < _COUNTED) & ~self.wanders, counted, many)
 
 
 def repeated(signal: Tensor) -> Tensor:
@@ -78,14 +81,24 @@ def repeats(case: Case) -> Repeats:
     density = 1 / (math.sqrt(2 * math.pi) * differences.square().mean(-1).sqrt())
     # Rounded values repeat by chance the more often the less there is of other noise.
     quieter = case.simulated.signal.diff().abs().mean((0, -1)) / differences.abs().mean(-1).clamp(min=1e-300)
-    other = (other * quieter.clamp(min=1.0)).clamp(max=1.0)
-    expected = other + torch.where(other == 0, _resolution(case) * density, 0.0)
+    quieter, by_resolution = quieter.clamp(min=1.0), _resolution(case) * density
+    other = (other * quieter).clamp(max=1.0)
+    expected = other + torch.where(other == 0, by_resolution, 0.0)
     binomial = expected * (1 - expected).clamp(min=0) + 1 / n_recorded
     variance = torch.maximum(binomial / n_recorded + binomial / n_simulated, fast + other_fast)
     # Of two paths that differ; what happens by chance varies by no more than about itself.
     wander = 2 * torch.minimum(slow + other_slow, expected.square())
-    events = (_events(same), _events(other_same))
-    return Repeats(share, expected, (variance + wander).sqrt(), wander > variance, *events, n_recorded, n_simulated)
+    return Repeats(
+        share,
+        expected,
+        (variance + wander).sqrt(),
+        wander > variance,
+        _events(same),
+        _events(other_same),
+        by_resolution,
+        n_recorded,
+        n_simulated / quieter,
+    )
 
 
 def _events(same: Tensor) -> Tensor:

@@ -11,6 +11,8 @@ from torch import Tensor
 
 _SIZES = (0.7, 1.0, 1.4)  # of an effect in a sensor over that in others of its array: built alike, they feel alike
 _ROUNDS, _HALVINGS = 4, 30
+_SURE = 1e-6  # chance that any sensor seems to have it, of one that has it whatever the others have
+_LARGEST = 1e6  # statistic
 
 
 class Partakers(NamedTuple):
@@ -33,20 +35,20 @@ def partakers(statistic: Tensor, dof: int, chance: float) -> Partakers:
     """Those whose statistic is likelier with about as much of the effect as others have than with none.
 
     Without it is chi-square, with it noncentral: where the others have much, a little is chance; where they have
-    little, it is theirs.
+    little, it is theirs. What is beyond doubt by itself is so beside anything.
 
     Args:
         statistic: Squares of estimates in standard deviations, `(sensor,)`.
         dof: Of each.
         chance: That any sensor seems to have it which has not, of those that are taken for sure to begin with.
     """
-    x = statistic.to(torch.float64)
-    largest = x == x.max()
-    least = float(special.chdtri(dof, chance / len(x)))
+    x = statistic.to(torch.float64).nan_to_num(nan=0.0).clamp(max=_LARGEST)
+    largest = torch.arange(len(x)) == x.argmax()
+    least, most = (float(special.chdtri(dof, p / len(x))) for p in (chance, _SURE))
     for _ in range(_ROUNDS):
         taking = (x > least) | largest
         size = float((x[taking] - dof).mean().clamp(min=1.0))
-        least = _least(dof, size)
+        least = min(_least(dof, size), most)
     return Partakers((x > least) | largest, least)
 
 

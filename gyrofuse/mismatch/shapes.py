@@ -76,7 +76,10 @@ class Shape(NamedTuple):
 
 @remembered
 def leading_shape(case: Case) -> Shape | None:
-    """Of the shapes that together explain the spectra the one that acts first; None where they do not."""
+    """Of the shapes that together explain the spectra the one that acts first; None where they do not.
+
+    Nor where one is flicker noise of another slope.
+    """
     return _searched(case)
 
 

@@ -194,7 +194,8 @@ def slow_witness(case: Case) -> Evidence:
     """A step, a warm-up, or a temperature that the recording follows."""
     look = slow_look(case)
     scan = min(look.scans, key=lambda s: s.p_value)
-    largest = int(scan.z.abs().argmax())
+    which = concerned(scan)
+    largest = max(which, key=lambda i: float(scan.z[i].abs()))
     seconds = scan.place / case.scene.rate
     seen = {
         "step": f"the bias steps near {seconds:.4g} s",
@@ -205,7 +206,7 @@ def slow_witness(case: Case) -> Evidence:
         "slow",
         corrected(scan.p_value, len(look.scans)),
         f"{seen}, most clearly in sensor {case.scene.sensors[largest]}",
-        sensors=concerned(scan),
+        sensors=which,
         time_s=seconds if scan.family.name == "step" else None,
         channel=scan.family.channel,
     )
