@@ -154,7 +154,7 @@ def test_hidden_rounding_over_a_few_steps_has_the_law_of_rounding_and_later_nois
     physical = torch.round(sd * clean) + later * late
     plain = float(physical.std()) * torch.randn(1, n, generator=g, dtype=torch.float64)
     one = torch.ones(1, dtype=torch.float64)
-    made = Quantization(step * one, 0 * one, later * one).simulated(plain, None, g)[0]  # type: ignore[arg-type]
+    made = Quantization(step * one, 0 * one, later * one, plain.mean(-1)).simulated(plain, None, g)[0]  # type: ignore[arg-type]
     for u in torch.linspace(0.5, 7.0, 27, dtype=torch.float64):
         expected = torch.exp(1j * u * physical).mean()
         assert abs(torch.exp(1j * u * made).mean() - expected) < 5 / n**0.5, u

@@ -36,7 +36,7 @@ def case(recording: torch.Tensor, seed: int = 2) -> Case:
 
 
 def rounding(step: float) -> Quantization:
-    return Quantization(torch.full((P,), step, dtype=torch.float64), NONE, NONE)
+    return Quantization(torch.full((P,), step, dtype=torch.float64), NONE, NONE, NONE)
 
 
 def test_every_sample_is_held_out_once_and_estimates_never_see_it():

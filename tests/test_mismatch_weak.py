@@ -283,13 +283,28 @@ def test_a_hidden_lattice_is_built_in_without_other_power() -> None:
     g = torch.Generator().manual_seed(7)
     x = normal(3, 200_000, g=g)
     numbers = (torch.tensor(v, dtype=torch.float64) for v in ([1.0, 0.0, 1.0], [0.2, 0.0, 0.0], [0.3, 0.0, 0.0]))
-    effect = Quantization(*numbers)
+    effect = Quantization(*numbers, x.mean(-1))
     y = effect.simulated(x, SCENE, g)
     turn = torch.exp(2j * math.pi * (y[0] - 0.2)).mean().abs()
     assert float(turn) == pytest.approx(math.exp(-2 * math.pi**2 * 0.09), rel=0.03)
     assert float((y[0] - x[0]).square().mean()) < 0.4 / 12
     assert torch.equal(y[1], x[1])
     assert torch.equal(y[2], x[2].round())
+
+
+@pytest.mark.parametrize("bias", [0.0, 0.5])
+def test_a_coarse_hidden_lattice_makes_of_noise_what_it_does_at_the_recording_s_bias(bias: float) -> None:
+    """Of noise of 0.4 steps a bias between two steps makes two values, and one on a step mostly one."""
+    g = torch.Generator().manual_seed(9)
+    made = (0.4 * normal(1, 200_000, g=g) + bias).round() + 0.4 * normal(1, 200_000, g=g)
+    one = torch.ones(1, dtype=torch.float64)
+    effect = Quantization(one, 0 * one, 0.4 * one, made.mean(-1))
+    y = effect.simulated(made.std() * normal(1, 200_000, g=g) + 17.3, Scene(RATE, "deg/s", ("x",)), g)
+    assert float(y.mean()) == pytest.approx(17.3, abs=0.02)
+    physical, mine = (float((v - v.mean()).pow(4).mean() / v.var() ** 2) for v in (made, y))
+    assert (physical < 2.8) == (bias == 0.5)
+    assert mine == pytest.approx(physical, abs=0.06)
+    assert float(y.var() / made.var()) == pytest.approx(1.0, abs=0.02)
 
 
 def test_a_hidden_lattice_of_one_sensor_is_looked_for_in_the_others() -> None:

@@ -255,13 +255,11 @@ def missing_lattices(case: Case, level: float) -> Missing:
     missing = {i: left for i, left in alone.items() if corrected(left.p_value, 2 * case.n_sensors) <= level}
     if clearest is None or p_shared < p_alone:
         clearest, missing = Lattice(shared.step, 0.0, 1.0, p_shared, shared.peak), {}
-    steps, sd = [found.step for found in missing.values()], core_sd(case.recorded)
+    steps = [found.step for found in missing.values()]
     for i, own in enumerate(every):  # a step that is known elsewhere needs less to be believed
         if i in missing:
             continue
         if own.blur > 0 and clearest.blur > 0:
-            if clearest.peak < _LOWEST / float(sd[i]):
-                continue
             own = _seen_at(case.recording[i].unique(), clearest.peak, clearest.step)
         elif not any(abs(own.step / step - 1) < _ALIKE for step in steps):
             continue

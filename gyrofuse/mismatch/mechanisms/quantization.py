@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
@@ -18,6 +18,7 @@ from gyrofuse.mismatch.mechanisms.dead_band import DeadBand
 _TABLE = 1024  # points of a law
 _EVEN = 3.0  # steps, sd: over more of them all distances from the lattice are as likely
 _TAILS = 6.0  # sd
+_LEAST, _HALVINGS = 0.01, 40  # variance of rounded values, steps^2, below which they are on one step
 _TOO_COARSE = 0.75  # rms change between samples, steps: noise of 0.45 steps and the rounding itself
 _SHARPEST = 0.02  # blur in steps: what an exact lattice is worth is bounded by it
 
@@ -33,6 +34,8 @@ class Quantization(Mechanism):
         step: `(sensor,)`, unit of the signal; 0 where a sensor is not rounded.
         offset: `(sensor,)`, likewise: the lattice's point next to 0.
         blur: `(sensor,)`, sd of what was added after the rounding, steps.
+        centre: Mean of the recording, `(sensor,)`, unit of the signal: where it lies between two steps makes what a
+            few of them do to noise. A hidden lattice lies as far from the mean of a simulation, whose bias is its own.
     """
 
     name: ClassVar[str] = "quantization"
@@ -40,6 +43,7 @@ class Quantization(Mechanism):
     step: Tensor
     offset: Tensor
     blur: Tensor
+    centre: Tensor
 
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:
@@ -49,7 +53,7 @@ class Quantization(Mechanism):
         none = Lattice(0.0, 0.0, 0.0, 1.0)
         rows = [found.get(i, none) for i in range(case.n_sensors)]
         step, offset, blur = (torch.tensor([row[k] for row in rows], dtype=torch.float64) for k in range(3))
-        effect = cls(step, offset, blur)._placed(case.recording)
+        effect = cls(step, offset, blur, case.recording.mean(-1))._placed(case.recording)
         sensors = tuple(found)
         parameters = {}
         for i in sensors:
@@ -81,16 +85,18 @@ class Quantization(Mechanism):
         turn = torch.exp(2j * math.pi * off_lattice(signal, self._divisor, self.offset[:, None])).mean(-1)
         offset = self.offset + turn.angle() / (2 * math.pi) * self.step
         blur = torch.sqrt(-2 * turn.abs().clamp(1e-6, 1.0).log()) / (2 * math.pi)
-        return Quantization(self.step, offset, torch.where(self.blur > 0, blur, self.blur))
+        return replace(self, offset=offset, blur=torch.where(self.blur > 0, blur, self.blur))
 
     def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
         """Values get the law that they have in the recording, in the order in which they are.
 
         Without blur that is rounding. Hidden under noise that the simulation knows already, it adds next to nothing.
         """
-        place = ((signal - self.offset[:, None]) / self._divisor).movedim(-2, 0)
+        own = signal.mean(-1, keepdim=True) - self.centre[:, None]
+        offset = self.offset[:, None] + torch.where(self.blur[:, None] > 0, own, 0.0)
+        place = ((signal - offset) / self._divisor).movedim(-2, 0)
         moved = torch.stack([_blurred(row, float(blur)) for row, blur in zip(place, self.blur, strict=True)], -2)
-        return torch.where(self.step[:, None] > 0, moved * self._divisor + self.offset[:, None], signal)
+        return torch.where(self.step[:, None] > 0, moved * self._divisor + offset, signal)
 
     def gains(self, case: Case, fold: int) -> Tensor:
         return held_out_blocks(self._scores(case.recording), fold).sum((0, -1))
@@ -124,16 +130,14 @@ def _too_coarse(signal: Tensor, found: dict[int, Lattice]) -> list[int]:
 def _blurred(place: Tensor, blur: float) -> Tensor:
     """Values, steps, mapped in order to such as were rounded and got a blur."""
     spread = float(place.std())
-    variance = spread**2 - blur**2 - 1 / 12  # before rounding
-    if blur == 0 or spread > _EVEN or variance <= 0:
+    if blur == 0 or spread > _EVEN or spread**2 <= blur**2 + _LEAST:
         nearest = place.round()
         return nearest + _pulled((place - nearest).contiguous(), blur)
     # Over a few steps their shares are those of a normal variable.
     middle, reach = float(place.mean()), math.ceil(_TAILS * spread)
     table = middle + spread * torch.linspace(-_TAILS, _TAILS, _TABLE + 1, dtype=torch.float64)
     steps = torch.arange(round(middle) - reach, round(middle) + reach + 1, dtype=torch.float64)
-    edges = torch.special.ndtr((torch.cat([steps - 0.5, steps[-1:] + 0.5]) - middle) / math.sqrt(variance))
-    below = torch.special.ndtr((table[:, None] - steps) / blur) @ (edges.diff() / edges.diff().sum())
+    below = torch.special.ndtr((table[:, None] - steps) / blur) @ _shares(steps, middle, spread**2 - blur**2)
     wanted = torch.special.ndtr((table - middle) / spread)
     # Where values of the one law lie in the other, and from there on as far away as they were.
     right = torch.searchsorted(below, wanted).clamp(1, _TABLE)
@@ -142,6 +146,19 @@ def _blurred(place: Tensor, blur: float) -> Tensor:
     at = ((place - table[0]) / (table[1] - table[0])).clamp(0, _TABLE - 1e-9)
     before = at.long()
     return place + torch.lerp(moved[before], moved[before + 1], at - before)
+
+
+def _shares(steps: Tensor, middle: float, variance: float) -> Tensor:
+    """Of the steps `(step,)` in rounded normal values around `middle` that have a variance once they are rounded."""
+    edges, low, high = torch.cat([steps - 0.5, steps[-1:] + 0.5]) - middle, 0.0, variance
+    for _ in range(_HALVINGS):
+        before = (low + high) / 2
+        share = torch.special.ndtr(edges / math.sqrt(before)).diff()
+        share = share / share.sum()
+        mean = float(share @ steps)
+        less = float(share @ (steps - mean).square()) < variance
+        low, high = (before, high) if less else (low, before)
+    return share
 
 
 def _pulled(place: Tensor, blur: float) -> Tensor:
