@@ -294,12 +294,16 @@ def test_a_hidden_lattice_is_built_in_without_other_power() -> None:
 
 @pytest.mark.parametrize("bias", [0.0, 0.5])
 def test_a_coarse_hidden_lattice_makes_of_noise_what_it_does_at_the_recording_s_bias(bias: float) -> None:
-    """Of noise of 0.4 steps a bias between two steps makes two values, and one on a step mostly one."""
+    """Of noise of 0.4 steps a bias between two steps makes two values, and one on a step mostly one.
+
+    The simulation has the level that there is on average over all biases.
+    """
     g = torch.Generator().manual_seed(9)
     made = (0.4 * normal(1, 200_000, g=g) + bias).round() + 0.4 * normal(1, 200_000, g=g)
     one = torch.ones(1, dtype=torch.float64)
     effect = Quantization(one, 0 * one, 0.4 * one, made.mean(-1))
-    y = effect.simulated(made.std() * normal(1, 200_000, g=g) + 17.3, Scene(RATE, "deg/s", ("x",)), g)
+    level = math.sqrt(2 * 0.4**2 + 1 / 12)
+    y = effect.simulated(level * normal(1, 200_000, g=g) + 17.3, Scene(RATE, "deg/s", ("x",)), g)
     assert float(y.mean()) == pytest.approx(17.3, abs=0.02)
     physical, mine = (float((v - v.mean()).pow(4).mean() / v.var() ** 2) for v in (made, y))
     assert (physical < 2.8) == (bias == 0.5)

@@ -253,8 +253,8 @@ def missing_lattices(case: Case, level: float) -> Missing:
     if p_value > level:
         return Missing(p_value, {})
     missing = {i: left for i, left in alone.items() if corrected(left.p_value, 2 * case.n_sensors) <= level}
-    if clearest is None or p_shared < p_alone:
-        clearest, missing = Lattice(shared.step, 0.0, 1.0, p_shared, shared.peak), {}
+    if clearest is None or p_shared < p_alone:  # those that show a step of their own keep it
+        clearest = Lattice(shared.step, 0.0, 1.0, p_shared, shared.peak)
     steps = [found.step for found in missing.values()]
     for i, own in enumerate(every):  # a step that is known elsewhere needs less to be believed
         if i in missing:

@@ -18,7 +18,6 @@ from gyrofuse.mismatch.mechanisms.dead_band import DeadBand
 _TABLE = 1024  # points of a law
 _EVEN = 3.0  # steps, sd: over more of them all distances from the lattice are as likely
 _TAILS = 6.0  # sd
-_LEAST, _HALVINGS = 0.01, 40  # variance of rounded values, steps^2, below which they are on one step
 _TOO_COARSE = 0.75  # rms change between samples, steps: noise of 0.45 steps and the rounding itself
 _SHARPEST = 0.02  # blur in steps: what an exact lattice is worth is bounded by it
 
@@ -130,14 +129,16 @@ def _too_coarse(signal: Tensor, found: dict[int, Lattice]) -> list[int]:
 def _blurred(place: Tensor, blur: float) -> Tensor:
     """Values, steps, mapped in order to such as were rounded and got a blur."""
     spread = float(place.std())
-    if blur == 0 or spread > _EVEN or spread**2 <= blur**2 + _LEAST:
+    variance = spread**2 - blur**2 - 1 / 12  # before rounding, which adds a twelfth on average over all biases
+    if blur == 0 or spread > _EVEN or variance <= 0:
         nearest = place.round()
         return nearest + _pulled((place - nearest).contiguous(), blur)
     # Over a few steps their shares are those of a normal variable.
     middle, reach = float(place.mean()), math.ceil(_TAILS * spread)
     table = middle + spread * torch.linspace(-_TAILS, _TAILS, _TABLE + 1, dtype=torch.float64)
     steps = torch.arange(round(middle) - reach, round(middle) + reach + 1, dtype=torch.float64)
-    below = torch.special.ndtr((table[:, None] - steps) / blur) @ _shares(steps, middle, spread**2 - blur**2)
+    edges = torch.special.ndtr((torch.cat([steps - 0.5, steps[-1:] + 0.5]) - middle) / math.sqrt(variance))
+    below = torch.special.ndtr((table[:, None] - steps) / blur) @ (edges.diff() / edges.diff().sum())
     wanted = torch.special.ndtr((table - middle) / spread)
     # Where values of the one law lie in the other, and from there on as far away as they were.
     right = torch.searchsorted(below, wanted).clamp(1, _TABLE)
@@ -146,19 +147,6 @@ def _blurred(place: Tensor, blur: float) -> Tensor:
     at = ((place - table[0]) / (table[1] - table[0])).clamp(0, _TABLE - 1e-9)
     before = at.long()
     return place + torch.lerp(moved[before], moved[before + 1], at - before)
-
-
-def _shares(steps: Tensor, middle: float, variance: float) -> Tensor:
-    """Of the steps `(step,)` in rounded normal values around `middle` that have a variance once they are rounded."""
-    edges, low, high = torch.cat([steps - 0.5, steps[-1:] + 0.5]) - middle, 0.0, variance
-    for _ in range(_HALVINGS):
-        before = (low + high) / 2
-        share = torch.special.ndtr(edges / math.sqrt(before)).diff()
-        share = share / share.sum()
-        mean = float(share @ steps)
-        less = float(share @ (steps - mean).square()) < variance
-        low, high = (before, high) if less else (low, before)
-    return share
 
 
 def _pulled(place: Tensor, blur: float) -> Tensor:
