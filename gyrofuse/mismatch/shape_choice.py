@@ -11,6 +11,7 @@ from scipy import stats
 from torch import Tensor
 
 from gyrofuse.mismatch.filter_forms import FILTERS
+from gyrofuse.mismatch.partakers import partakers
 from gyrofuse.mismatch.shape_fit import Fit, Ratios, data_model, fit, log_score
 from gyrofuse.mismatch.shape_scan import bump_start
 from gyrofuse.mismatch.shape_terms import Bump, Common, CommonBump, Flicker, LowPass, Shift, Term
@@ -22,6 +23,7 @@ _SMALL = 0.1  # share of what there was to explain that may be left all the same
 _NEW = 8.0  # nats that a shape costs beside its numbers
 _NUMBER = 2.0  # nats for a number of a sensor: those of sensors that have it are alike
 _PART = 4.0  # nats for each further part of the noise whose numbers are others
+_SEEN = 0.04  # chance that a sensor seems to have it, of those that are taken for sure to begin with
 _OWN = 0.02  # of a sensor's power in any band, beside what is common
 _TOUCH = 0.1
 _FORMS = 3  # of filters
@@ -50,7 +52,32 @@ def best_shapes(data: Ratios, *, differ: bool) -> tuple[Ratios, Fit | None]:
         if _value(data, top) <= value:
             break
         best, value = top, _value(data, top)
+    if best is not None and data.n_sensors > 1:
+        for i, term in enumerate(best.terms):
+            if not isinstance(term, Common):
+                best = _of_partakers(data, best, i)
     return data, best
+
+
+def _of_partakers(data: Ratios, found: Fit, i: int) -> Fit:
+    """With one of the shapes in the sensors that have about as much of it as others, and in no other."""
+    terms, term = list(found.terms), found.terms[i]
+    whole = fit(data, [*terms[:i], _freed(data, term), *terms[i + 1 :]])
+    every = whole.terms[i]
+    concerned = every.free.any(0).nonzero()[:, 0].tolist()
+    statistic = torch.zeros(data.n_sensors, dtype=torch.float64)
+    for sensor in concerned:
+        free = every.free.clone()
+        free[:, sensor] = False
+        less = replace(every, free=free, local=torch.where(free, every.local, 0.0))
+        without = fit(data, [*whole.terms[:i], less, *whole.terms[i + 1 :]], QUICK)
+        statistic[sensor] = 2 * max(whole.gain - without.gain, 0.0)
+    which = partakers(statistic, int(every.free.sum(0).max()), _SEEN).which
+    # Those it was not seen in get all of its numbers.
+    free = torch.where(term.free.any(0), term.free, every.free) & which
+    if bool((free == term.free).all()):
+        return found
+    return fit(data, [*terms[:i], replace(term, free=free, local=torch.where(free, every.local, 0.0)), *terms[i + 1 :]])
 
 
 def _value(data: Ratios, found: Fit) -> float:
