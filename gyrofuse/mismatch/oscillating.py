@@ -14,6 +14,7 @@ from gyrofuse.mismatch.bumps import Stretch, light_taper
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.folds import estimation_samples
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
+from gyrofuse.mismatch.partakers import partakers
 from gyrofuse.mismatch.shape_terms import Bump, CommonBump, oscillation
 from gyrofuse.mismatch.shape_words import spanned
 from gyrofuse.mismatch.shapes import chosen_shape, refit, run_length
@@ -21,7 +22,7 @@ from gyrofuse.mismatch.steadiness import Steadiness, steadiness
 from gyrofuse.mismatch.sweeps import swept
 from gyrofuse.mismatch.witnesses import level_of
 
-_SEEN = 2.3  # standard deviations: one in a hundred by chance
+_SEEN = 0.04  # chance that a sensor seems to have it, of those that are taken for sure to begin with
 _BAND = 6.0  # half widths on either side
 _PARTS, _MOST_ALIKE = 16, 0.8  # of a record, to see a frequency wander, and the correlation of neighbours
 _FEWEST = 3  # samples of the band in a part
@@ -131,7 +132,7 @@ def nominated(case: Case, level: float, *, tone: bool) -> tuple[Mode, Seen] | No
         # Which sensors it takes is a matter of likelihood: variances are as uncertain as the width is.
         has = shape.term.free.any(0)
     else:
-        has = bump.variance > _SEEN * bump.variance_sd
+        has = partakers((bump.variance / bump.variance_sd).clamp(min=0).square(), 1, _SEEN).which
     sensors = tuple(int(i) for i in has.nonzero()[:, 0])
     verdict = steadiness(case, bump)
     steady = verdict.tone and bump.width <= _BROAD * bump.centre  # what is all over the spectrum is no tone

@@ -67,9 +67,9 @@ class Spikes(Mechanism):
         weak = likely_outliers(case.recorded)
         if not weak.shock and weak.apart > -math.log(level):
             hit = tuple(i for i in range(case.n_sensors) if i in hit or float(weak.sensors[i]) > _LIKELY)
-        if hit:  # a sensor that speaks against the law of all of them is there by chance
+        if hit:  # what the law of all of them is likelier in has it, however little that gains by itself
             as_others = _gains(z, _shared(z, laws, hit)).sum(-1)
-            hit = tuple(i for i in hit if float(gains[i]) > _OWN_LAW or float(as_others[i]) > 0)
+            hit = tuple(i for i in range(case.n_sensors) if float(as_others[i]) > 0 or float(gains[i]) > _OWN_LAW)
         apart = float(gains[list(hit)].sum())
         laws = _alike(z, laws, hit)
         gain = float(_gains(z, laws)[list(hit)].sum())
