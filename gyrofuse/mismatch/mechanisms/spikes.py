@@ -211,8 +211,13 @@ def _alike(z: Tensor, laws: list[Outliers], hit: tuple[int, ...]) -> list[Outlie
 
 def _shared(z: Tensor, laws: list[Outliers], hit: tuple[int, ...]) -> list[Outliers]:
     """The law of some sensors, in sd of their noise, for each."""
-    law = fitted(torch.cat([z[i] / laws[i].scale for i in hit]))
-    return [law.times(own.scale) for own in laws]
+    # Where a law of its own takes half of the noise for outliers its scale is not that of the noise.
+    units = [
+        law.scale if law.rate < _ISOLATED else Outliers.none().scaled(row).scale
+        for row, law in zip(z, laws, strict=True)
+    ]
+    law = fitted(torch.cat([z[i] / units[i] for i in hit]))
+    return [law.times(unit).scaled(row) for row, unit in zip(z, units, strict=True)]
 
 
 def _limited(z: Tensor, laws: list[Outliers], hit: tuple[int, ...]) -> list[Outliers]:
