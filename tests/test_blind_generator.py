@@ -166,7 +166,7 @@ SIZES = [k for k in EFFECTS if cases.KINDS[k].group in ("mechanism", "outside") 
          ("quantization_bare", "dead_band", "clipping", "stuck_samples")]  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", SIZES)
+@pytest.mark.parametrize("kind", [*SIZES, "pair:bursts_not_spikes"])
 def test_oracle_ratio_has_the_claimed_mean(kind):
     """Mean of 8 log likelihood ratios at 60 nats, within 6 standard errors of the normal law and 8 %.
 

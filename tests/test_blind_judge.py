@@ -155,6 +155,9 @@ def test_scores_of_sensors_and_intervals():
     each = {"parameters": {"step[0]": interval, "step[1]": interval, "step[2]": interval, "step": interval}}
     assert scoring.coverage(true, each) == [("step", True), ("step", False), ("step", False)]
     assert scoring.unmatched(true, each) == ["step[1]"]
+    alike = effect(parameters={"rate": {"value": 300.0, "unit": "1/h"}})
+    shared = {"low": 200.0, "high": 250.0, "unit": "1/h"}
+    assert scoring.coverage(alike, {"parameters": {"rate[0]": shared, "rate[2]": shared}}) == [("rate", False)]
     foreign = {"parameters": {"step": {"unit": "rad/s"}, "size": {"unit": "deg/s"}}}
     assert scoring.unmatched(true, foreign) == ["step", "size"]
     weak = effect(oracle_null=[-3.0, 6.0, 0.0])

@@ -20,6 +20,7 @@ from gyrofuse.mismatch.look_alikes import happened_instead, look_alikes
 from gyrofuse.mismatch.mechanism import Finding, Instead, Mechanism
 from gyrofuse.mismatch.mechanisms.common_mode import CommonMode
 from gyrofuse.mismatch.mechanisms.drifting_tone import DriftingTone
+from gyrofuse.mismatch.mechanisms.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.step import Step
 from gyrofuse.mismatch.mechanisms.vibration_tone import VibrationTone, amplitude_limits, line_near
@@ -82,6 +83,16 @@ def test_red_noise_may_be_a_step_that_gains_as_much():
     assert "step" not in alike(stepped, noise, scan.gain + 6)
     assert alike(plain, noise, 10.0) == ()
     assert alike(stepped, VibrationTone.at(stepped, 12.0), scan.gain) == ()
+
+
+def test_red_noise_beside_several_steps_may_be_more_of_them():
+    plain = case_of(3)
+    noise = FlickerNoise(torch.full((SENSORS,), 1e-3, dtype=torch.float64))
+    red = Finding(noise.name, noise, "", 1e-4, (0, 1), {}, gain=10.0)
+    one = Step(torch.ones(SENSORS, dtype=torch.float64), torch.zeros(3, SENSORS, dtype=torch.float64), 10.0)
+    step_found = Finding(one.name, one, "", 1e-9, (0, 1), {}, gain=50.0)
+    assert happened_instead(plain, red, [step_found]) == ()
+    assert happened_instead(plain, red, [step_found, step_found]) == ("step",)
 
 
 def test_what_stands_alone_stays_and_its_loss_is_its_gain():

@@ -62,7 +62,7 @@ def settled(links: list[Link], case: Case, level: float, generator: torch.Genera
         links, case, judged = _pruned(links, case, generator)
         found = []
         for k, (link, (gain, left)) in enumerate(zip(links, judged, strict=True)):
-            told = _compared(link.finding, gain, left)
+            told = _compared(link.finding, gain, left, [other.finding for other in links if other is not link])
             better = None if swapped else _better(links[k:], told, left, level, generator)
             if better is not None:
                 swapped = True
@@ -119,10 +119,10 @@ def _relinked(
     return links, case
 
 
-def _compared(finding: Finding, gain: Gain, left: Case) -> Finding:
-    """A finding with what would be without it, and with its best look-alike."""
+def _compared(finding: Finding, gain: Gain, left: Case, beside: list[Finding]) -> Finding:
+    """A finding beside others, with what would be without it, and with its best look-alike."""
     told = replace(finding, gain_without=gain.total)
-    alike = happened_instead(left, finding)
+    alike = happened_instead(left, finding, beside)
     rivals = [(held_out_gain(left, effect), effect) for effect in look_alikes(left, finding)]
     if rivals:
         best, effect = max(rivals, key=lambda rival: rival[0].total)

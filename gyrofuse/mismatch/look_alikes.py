@@ -8,7 +8,7 @@ outliers by laws of single samples.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import torch
@@ -60,12 +60,18 @@ def look_alikes(case: Case, finding: Finding) -> list[Mechanism]:
     return [rival for rival in found if rival.name not in (effect.name, finding.mechanism)]
 
 
-def happened_instead(case: Case, finding: Finding) -> tuple[str, ...]:
-    """What happened once and gains as much as a finding of more slow noise does: a step is red noise as well."""
+def happened_instead(case: Case, finding: Finding, beside: Sequence[Finding] = ()) -> tuple[str, ...]:
+    """What happened once and gains as much as a finding of more slow noise does: a step is red noise as well.
+
+    And what happened more than once already by the findings `beside`: several more are like a walk.
+    """
     if not isinstance(finding.effect, _RED):
         return ()
     scans = slow_look(case).scans
-    return tuple(s.family.name for s in scans if s.p_value < _MAY_BE and s.gain > finding.gain - _AS_MUCH)
+    once = [s.family.name for s in scans if s.p_value < _MAY_BE and s.gain > finding.gain - _AS_MUCH]
+    happened = [f.mechanism for f in beside if f.effect.happened_once and isinstance(f.effect, SlowEffect)]
+    again = [name for name in happened if happened.count(name) > 1]
+    return tuple(dict.fromkeys((*once, *again)))
 
 
 def _nominated(case: Case, names: tuple[str, ...]) -> Iterator[Mechanism]:

@@ -14,6 +14,7 @@ The size of an effect, in nats, is the divergence of the recording from the simu
 - a signal whose shape a channel or few numbers give (temperature, acceleration, scale factor, sweep): half its whitened
   energy m' V^-1 m, summed over sensors;
 - Gaussian noise of another spectrum (resonance, episodes, modulated noise): the same with r the ratio of the spectra;
+- bursts of such noise at unknown times: the same less log of the number of ways to place them;
 - of another spectrum over a broad band (flicker, low-pass, parameters), which only the comparison with a simulation of
   s times as many samples shows: 1/2 sum [(1 + s) log((r + s)/(1 + s)) - log r], which is the above for a model; for
   common mode the same with matrices;

@@ -79,18 +79,23 @@ def spikes(bench: Bench, nats: float, *, simultaneous: bool | None = None) -> Pa
 
 
 def variance_change(bench: Bench, nats: float, *, episodes: int = 1) -> Part:
-    """White noise that is louder in episodes. Nats: 1/2 (r - 1 - log r) for each of its samples there."""
-    sensors = bench.some_sensors(2)
+    """White noise that is louder in episodes. Nats: 1/2 (r - 1 - log r) for each of its samples there.
+
+    Less, where there are several, what says which of so many places are theirs: that nobody is told.
+    """
+    sensors, told = bench.some_sensors(2), nats
     if episodes == 1:
         length = int(bench.rng.uniform(0.1, 0.4) * bench.n)
         starts = np.array([int(bench.rng.uniform(0.1, 0.5) * bench.n)])
     else:
         length = max(int(0.15 * bench.n / episodes), 8)
-        starts = np.sort(bench.rng.choice(bench.n // (2 * length) - 1, episodes, replace=False)) * 2 * length
+        places = bench.n // (2 * length) - 1
+        starts = np.sort(bench.rng.choice(places, episodes, replace=False)) * 2 * length
+        told += math.log(math.comb(places, episodes))
     loud = np.zeros(bench.n, dtype=bool)
     for start in starts:
         loud[start : start + length] = True
-    per_sample = nats / (len(sensors) * loud.sum())
+    per_sample = told / (len(sensors) * loud.sum())
     ratio = 1 + solve(per_sample, lambda x: (x - math.log1p(x)) / 2, 1e-6, 1e4)
     signal = np.zeros((bench.n_sensors, bench.n))
     extra = bench.sampled(math.sqrt(OVERSAMPLING) * bench.rng.standard_normal((len(sensors), bench.steps)))
@@ -105,6 +110,7 @@ def variance_change(bench: Bench, nats: float, *, episodes: int = 1) -> Part:
         nats,
         sensors,
         llr,
+        oracle_nats=told,
         oracle_null=quadratic_null(np.full(len(sensors) * int(loud.sum()), ratio)),
         signal=signal,
         sensor_nats=(nats / len(sensors),) * len(sensors),

@@ -113,13 +113,14 @@ def _true_value(effect: Record, name: str, unit: str) -> float | None:
 
 
 def coverage(effect: Record, finding: Record) -> list[tuple[str, bool]]:
-    """(name without its sensor, covered) of each stated interval that can be judged."""
-    out = []
+    """(name without its sensor, covered) of each stated interval that can be judged; one for several sensors once."""
+    judged: dict[tuple[str, float, float, float], bool] = {}
     for name, said in (finding.get("parameters") or {}).items():
         true = _true_value(effect, name, said.get("unit") or "")
         if true is not None and said.get("low") is not None and said.get("high") is not None:
-            out.append((name.partition("[")[0], bool(said["low"] <= true <= said["high"])))
-    return out
+            interval = (name.partition("[")[0], said["low"], said["high"], true)
+            judged[interval] = bool(said["low"] <= true <= said["high"])
+    return [(interval[0], covered) for interval, covered in judged.items()]
 
 
 def unmatched(effect: Record, finding: Record) -> list[str]:
