@@ -16,6 +16,7 @@ from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import corrected
 from gyrofuse.mismatch.folds import estimation_samples
 from gyrofuse.mismatch.hysteresis import strongest_relay
+from gyrofuse.mismatch.noise_level import modulation, variance_p_value
 from gyrofuse.mismatch.pooled import common_source
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.shape_bands import N_SLOW, Groups, deep, deep_base, in_blocks, narrow_bands, slow_fold
@@ -42,6 +43,7 @@ _BROAD = 3.0  # half widths
 _SHARP, _NARROW = 0.1, (0.02, 0.04, 0.08)  # the same, below which bands are too wide for it, and of it there
 _FINE, _NARROWEST = 24, 0.005  # bands in an octave for those, and the least that they show
 _STEEPER, _FLICKER = 4.0, 0.25  # nats that another slope gains, and distance from 1 of flicker noise's
+_UNSTEADY = 0.02  # p value of a level that may change
 _OFF = 0.25  # logarithm by which a centre from wide bands may be off
 
 
@@ -96,6 +98,11 @@ def _like_switching(term: Term) -> bool:
     if isinstance(term, Shift):
         return bool((term.local[1:] > 0).any())
     return isinstance(term, Flicker)
+
+
+def _louder(term: Term) -> bool:
+    """Whether it is more white noise: of noise that is louder at times the spectrum shows the mean."""
+    return isinstance(term, Shift) and bool((term.local[0] > 0).any())
 
 
 def chosen_shape(case: Case, name: str, level: float) -> Shape | None:
@@ -190,6 +197,8 @@ def _searched(case: Case) -> Shape | None:
     }
     if _like_switching(term):
         rivals.add("random_telegraph")
+    if _louder(term) and min(modulation(case).p_value, variance_p_value(case)) < _UNSTEADY:
+        rivals.add("variance_change")
     score = (log_score(data, data_model(data, [term])) - log_score(data, data.expected)).clamp(min=0)
     frequency = data.ground.bands.frequency
     told, sd = seen[first]
