@@ -116,11 +116,16 @@ class TwoLevels(NamedTuple):
 
     @property
     def lasts(self) -> bool:
-        """Whether it is over the rival for more than a moment, with dwells between blocks and a few steps."""
+        """Whether it is over the rival for more than a moment."""
         gained = np.sort(self.values[0] - self.rival)[:-_MOMENTS].sum()
+        return bool(gained > 0)
+
+    @property
+    def resolved(self) -> bool:
+        """Whether dwells are between blocks and a few steps."""
         dwells = np.exp(self.theta[0, 1:])  # blocks
         slow, fast = len(self.means.y) / dwells.mean() < _FEWEST_SWITCHES, 1 / (1 / dwells).sum() < _BLOCKS[0]
-        return bool(gained > 0 and not slow and not fast)
+        return not slow and not fast
 
     @property
     def best(self) -> Numbers:

@@ -42,10 +42,13 @@ class RandomTelegraph(Mechanism):
 
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:
-        fits = {i: fit for i, fit in two_levels(case).items() if fit.over > _CHOSEN and fit.lasts}
-        over = _CHOSEN + sum(fit.over - _CHOSEN for fit in fits.values())
+        possible = {i: fit for i, fit in two_levels(case).items() if fit.resolved}
+        own = {i: fit for i, fit in possible.items() if fit.over > _CHOSEN and fit.lasts}
+        over = _CHOSEN + sum(fit.over - _CHOSEN for fit in own.values())
         if over < _PRESENT:
             return None
+        # Beside sensors that jump, excess of another one is likelier to be jumps than anything else.
+        fits = {i: fit for i, fit in possible.items() if i in own or fit.over > 0}
         sensors = tuple(fits)
         gain = float(excess(case).gain[list(sensors)].sum()) + sum(fit.over for fit in fits.values())
         sets = math.comb(case.n_sensors, len(sensors))
