@@ -5,10 +5,15 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.case import Case
+from gyrofuse import AR1, RandomWalk, WhiteNoise
+from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.confirm import held_out_gain
 from gyrofuse.mismatch.mechanism import Finding, Mechanism
 
 LEVEL = 5e-4
+N, RATE = 16384, 100.0
+SCENE = Scene(RATE, "deg/s", ("x", "y", "z"))
+NOISE = WhiteNoise(1.0) + AR1(0.98, 0.004) + RandomWalk(1e-5)
 
 
 def even(*shape: int, g: torch.Generator) -> Tensor:
@@ -23,3 +28,24 @@ def nominated(case: Case, mechanism: type[Mechanism]) -> Finding:
     found = mechanism.nominate(case, LEVEL)
     assert found is not None
     return found
+
+
+def drawn(seed: int, records: int = 4) -> tuple[Tensor, Tensor, torch.Generator]:
+    g = torch.Generator().manual_seed(seed)
+    recording = NOISE.simulate(N, batch=(3,), generator=g)
+    return recording, NOISE.simulate(N, batch=(records, 3), generator=g), g
+
+
+def settled(case: Case, found: Finding, g: torch.Generator) -> Case:
+    """The case after the repair, in which the same is not found again; the repair gains on data held out."""
+    gain = held_out_gain(case, found.effect)
+    assert gain.blocks.shape == (32,)
+    assert gain.total > 1.7 * gain.sd
+    after = found.effect.explained(case, g)
+    assert type(found.effect).nominate(after, LEVEL) is None
+    return after
+
+
+def covers(found: Finding, name: str, truth: float) -> bool:
+    parameter = found.parameters[name]
+    return parameter.low - 1e-9 <= truth <= parameter.high + 1e-9

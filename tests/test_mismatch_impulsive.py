@@ -1,4 +1,4 @@
-"""Rounding, clipping, repeats, outliers, noise levels, telegraph noise: kernels against naive twins, what is found."""
+"""Outliers, noise levels, telegraph noise: kernels against naive twins, what is found."""
 
 from __future__ import annotations
 
@@ -8,16 +8,14 @@ import math
 import numpy as np
 import pytest
 import torch
-from mismatch_draws import LEVEL, even, nominated, normal
+from mismatch_draws import LEVEL, NOISE, RATE, SCENE, N, covers, drawn, even, nominated, normal, settled
 from scipy import fft, optimize, stats
-from torch import Tensor
 
 from gyrofuse import AR1, RandomWalk, WhiteNoise
 from gyrofuse.haar import haar_coefficients
-from gyrofuse.mismatch import episodes, impulses, lattices, marginals, noise_level, outlier_limits, outliers
-from gyrofuse.mismatch.case import Case, Scene
-from gyrofuse.mismatch.confirm import held_out_gain
-from gyrofuse.mismatch.mechanism import Finding, Mechanism
+from gyrofuse.mismatch import episodes, impulses, marginals, noise_level, outlier_limits, outliers
+from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.mechanism import Mechanism
 from gyrofuse.mismatch.mechanisms.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.random_telegraph import RandomTelegraph, _path
@@ -27,9 +25,6 @@ from gyrofuse.mismatch.mechanisms.variance_change import VarianceChange
 from gyrofuse.mismatch.side import Side
 from gyrofuse.mismatch.spectra import bands
 
-N, RATE = 16384, 100.0
-SCENE = Scene(RATE, "deg/s", ("x", "y", "z"))
-NOISE = WhiteNoise(1.0) + AR1(0.98, 0.004) + RandomWalk(1e-5)
 WITNESSES = (
     marginals.marginal_witness,
     impulses.spike_witness,
@@ -44,27 +39,6 @@ MECHANISMS: tuple[type[Mechanism], ...] = (
     VarianceChange,
     RandomTelegraph,
 )
-
-
-def drawn(seed: int, records: int = 4) -> tuple[Tensor, Tensor, torch.Generator]:
-    g = torch.Generator().manual_seed(seed)
-    recording = NOISE.simulate(N, batch=(3,), generator=g)
-    return recording, NOISE.simulate(N, batch=(records, 3), generator=g), g
-
-
-def settled(case: Case, found: Finding, g: torch.Generator) -> Case:
-    """The case after the repair, in which the same is not found again; the repair gains on data held out."""
-    gain = held_out_gain(case, found.effect)
-    assert gain.blocks.shape == (32,)
-    assert gain.total > 1.7 * gain.sd
-    after = found.effect.explained(case, g)
-    assert type(found.effect).nominate(after, LEVEL) is None
-    return after
-
-
-def covers(found: Finding, name: str, truth: float) -> bool:
-    parameter = found.parameters[name]
-    return parameter.low - 1e-9 <= truth <= parameter.high + 1e-9
 
 
 # Nothing is missing.
@@ -98,163 +72,6 @@ def test_lines_and_a_resonance_make_neither_spikes_nor_levels() -> None:
         false += [impulses.spike_witness(case).p_value < 0.01, noise_level.variance_witness(case).p_value < 0.01]
     assert stats.binom.sf(1, 6, 0.01) < 5e-3
     assert (false <= 1).all(), false
-
-
-# Single values.
-
-
-@pytest.mark.parametrize(("step", "offset"), [(1.0, 0.3), (0.2, 0.0), (4.0, 1.0)])
-def test_rounding_is_read_off_the_values(step: float, offset: float) -> None:
-    recording, simulation, g = drawn(1)
-    recording[:2] = ((recording[:2] - offset) / step).round() * step + offset
-    case = Case.of(SCENE, recording, simulation)
-    found = nominated(case, Quantization)
-    assert found.sensors == (0, 1)
-    assert found.alternatives == ()
-    assert found.parameters["lsb[0]"].value == pytest.approx(step, rel=1e-9)
-    after = settled(case, found, g)
-    assert marginals.marginal_witness(after).p_value > 0.001
-    repaired = found.effect.simulated(simulation, SCENE, g)
-    assert float(lattices.off_lattice(repaired[:, :2], step, offset).abs().max()) < 1e-9
-    assert torch.equal(repaired[:, 2], simulation[:, 2])
-
-
-@pytest.mark.parametrize("step", [1.0, 1.5])
-def test_coarse_rounding_makes_neither_outliers_nor_clipping(step: float) -> None:
-    """Medians of few steps are a matter of luck, and predictions from noise go beyond where any value would."""
-    for seed in range(4):
-        recording, simulation, g = drawn(40 + seed)
-        case = Case.of(SCENE, step * (recording / step).round(), simulation)
-        found = nominated(case, Quantization)
-        assert found.sensors == (0, 1, 2)
-        after = found.effect.explained(case, g)
-        assert impulses.spike_witness(after).p_value > 0.001
-        assert Clipping.nominate(after, LEVEL) is None
-        sd, rms = impulses.left_out(after.recorded).sd[0], impulses.left_out(after.recorded).error[0].std(-1)
-        torch.testing.assert_close(sd, rms, rtol=0.03, atol=0.0)
-
-
-def test_the_smooth_sd_is_that_of_normal_values_and_yields_little_to_outliers() -> None:
-    g = torch.Generator().manual_seed(3)
-    x = 3.0 * normal(200_000, g=g)
-    assert float(impulses._smooth_sd(x)) == pytest.approx(3.0, rel=0.01)
-    x[:200] = 1e3
-    assert float(impulses._smooth_sd(x)) == pytest.approx(3.0, rel=0.02)
-
-
-def test_rounding_that_a_simulation_has_too_is_not_missing() -> None:
-    recording, simulation, _ = drawn(2)
-    case = Case.of(SCENE, (2 * recording).round() / 2, (2 * simulation).round() / 2)
-    assert Quantization.nominate(case, LEVEL) is None
-    assert StuckSamples.nominate(case, LEVEL) is None
-    assert marginals.marginal_witness(case).p_value > 0.01
-
-
-def test_a_lattice_hidden_under_later_noise_is_found() -> None:
-    inside = 0
-    for seed in range(6):
-        recording, simulation, g = drawn(10 + seed)
-        recording = 1.5 * (recording / 1.5).round() + 0.45 * normal(3, N, g=g)
-        case = Case.of(SCENE, recording, simulation)
-        found = nominated(case, Quantization)
-        assert found.sensors == (0, 1, 2)
-        inside += sum(covers(found, f"lsb[{i}]", 1.5) for i in range(3))
-    # Fewer than 13 of 18 at 95 % have probability 2e-4.
-    assert inside >= 13
-
-
-def test_the_characteristic_function_is_that_of_the_definition() -> None:
-    g = torch.Generator().manual_seed(3)
-    values = normal(500, g=g)
-    u = torch.tensor([0.5, 3.0, 7.0], dtype=torch.float64)
-    naive = [500 * abs(np.mean(np.exp(1j * v * values.numpy()))) ** 2 for v in u.tolist()]
-    np.testing.assert_allclose(lattices._power(values, u).numpy(), naive, rtol=1e-10)
-
-
-def test_values_cut_at_a_limit_are_clipped() -> None:
-    recording, simulation, g = drawn(4)
-    recording[0].clamp_(max=3.0)
-    recording[2].clamp_(-2.5, 2.0)
-    case = Case.of(SCENE, recording, simulation)
-    found = nominated(case, Clipping)
-    assert found.sensors == (0, 2)
-    assert {name: p.value for name, p in found.parameters.items()} == {"high[0]": 3.0, "high[2]": 2.0, "low[2]": -2.5}
-    settled(case, found, g)
-
-
-def test_clipping_shows_on_a_lattice_as_well() -> None:
-    recording, simulation, _ = drawn(5)
-    recording, simulation = recording.clamp(max=2.0).round(), simulation.round()
-    case = Case.of(SCENE, recording, simulation)
-    assert nominated(case, Clipping).parameters["high[0]"].value == 2.0
-    plain = Case.of(SCENE, drawn(5)[0].round(), simulation)
-    assert Clipping.nominate(plain, LEVEL) is None
-
-
-@pytest.mark.parametrize("rounded", [False, True])
-@pytest.mark.parametrize("together", [False, True])
-def test_repeats_beyond_those_of_the_lattice_are_stuck_samples(rounded: bool, together: bool) -> None:
-    recording, simulation, g = drawn(6)
-    if rounded:
-        recording, simulation = (2 * recording).round() / 2, (2 * simulation).round() / 2
-    p = torch.tensor([0.05, 0.0, 0.05], dtype=torch.float64)
-    stuck = StuckSamples(p, torch.zeros(3, dtype=torch.float64), together)
-    case = Case.of(SCENE, stuck.simulated(recording, SCENE, g), simulation)
-    found = nominated(case, StuckSamples)
-    assert found.sensors == (0, 2)
-    assert covers(found, "probability[0]", 0.05)
-    assert isinstance(found.effect, StuckSamples)
-    assert found.effect.together is together
-    settled(case, found, g)
-
-
-def test_few_repeats_prove_that_samples_stick_where_values_do_not_recur() -> None:
-    recording, simulation, _ = drawn(16)
-    at = torch.tensor([500, 1500, 2500, 3500, 5000, 6000, 7000, 8000])
-    recording[0, at] = recording[0, at - 1]
-    case = Case.of(SCENE, recording, simulation)
-    p = marginals.repeats(case).p_values
-    shares = case.n_samples / (case.n_samples + case.simulated.signal[:, 0].numel())
-    assert float(p[0]) == pytest.approx(shares ** len(at))
-    assert float(p[1:].min()) == 1.0
-    assert nominated(case, StuckSamples).sensors == (0,)
-
-
-def test_few_repeats_of_coarse_numbers_are_chance() -> None:
-    recording, simulation, _ = drawn(17)
-    fine = 2e-4 * (recording / 2e-4).round()  # a repeat in ten thousand samples or so
-    p_values = marginals.repeats(Case.of(SCENE, fine, simulation)).p_values
-    assert int(marginals.repeated(fine).sum()) > 0
-    assert float(p_values.min()) > 0.05
-
-
-def test_few_repeats_are_compared_with_those_that_a_quieter_simulation_would_have() -> None:
-    p_values = []
-    for seed in range(12):
-        recording, simulation, _ = drawn(70 + seed)
-        rounded = 2e-3 * (recording / 2e-3).round()
-        noisier = 2e-3 * (8 * simulation / 2e-3).round()
-        p_values.append(marginals.repeats(Case.of(SCENE, rounded, noisier)).p_values)
-    assert float(torch.stack(p_values).min()) > 1e-3
-    recording[1, 40::400] = recording[1, 39:-1:400]
-    fine = 2e-4 * (recording / 2e-4).round()
-    once = simulation.clone()
-    once[0, 1, 5] = once[0, 1, 4]  # one repeat there does not say that the recording's own resolution makes none
-    p_values = marginals.repeats(Case.of(SCENE, fine, once)).p_values
-    assert float(p_values[1]) < 1e-4
-    assert float(p_values[[0, 2]].min()) > 0.01
-
-
-def test_repeats_that_chance_would_not_make_may_come_and_go() -> None:
-    recording, simulation, g = drawn(14)
-    at = (even(N, g=g) < 0.006) & (torch.arange(N) < N // 2)
-    for t in at.nonzero()[:, 0].clamp(min=1).tolist():
-        recording[:, t] = recording[:, t - 1]
-    case = Case.of(SCENE, recording, simulation)
-    slow = marginals._repeat_shares(marginals.repeated(case.recorded.signal).movedim(1, 0))[3]
-    assert bool((slow > 0).all())  # quarters differ by more than noise
-    assert marginals.marginal_witness(case).p_value < 1e-4
-    assert nominated(case, StuckSamples).sensors == (0, 1, 2)
 
 
 # Outliers.

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 _NARROWEST = 4  # bins
-_CELLS, _FEWEST_CELLS, _FEWEST_BINS = 8, 3, 24  # of a flank; a cell is half a stretch
+_FLANK, _LEAST_FLANK, _FEWEST_BINS = 4.0, 1.5, 24  # of a flank, over the stretch, and bins
 _SMOOTH = 8  # part of the spectrum over which noise may be taken for the same
 _LOWEST, _NARROW = 12, 4  # bins, and widths, below a stretch
 _BROADEST = 8  # of them in the spectrum
@@ -47,6 +47,16 @@ class Stretches(NamedTuple):
     log_ratio: Tensor
 
 
+def flank_of(width: int, n_bins: int) -> int:
+    """Bins on either side with which a stretch of so many is compared, in a spectrum of `n_bins`."""
+    return max(min(round(_FLANK * width), n_bins // _SMOOTH), least_flank(width))
+
+
+def least_flank(width: int) -> int:
+    """Fewest bins on either side that tell what is beside a stretch."""
+    return max(round(_LEAST_FLANK * width), _FEWEST_BINS)
+
+
 def scanned_bumps(transform: Tensor, worth: float) -> Iterator[Stretches]:
     """Stretches of 4, 8, 16, .. bins that overlap by half.
 
@@ -59,7 +69,7 @@ def scanned_bumps(transform: Tensor, worth: float) -> Iterator[Stretches]:
     cells = pairs @ pairs.mH  # (cell, sensor, sensor)
     while width <= n_bins // _BROADEST:
         half = width // 2
-        reach = max(min(_CELLS, len(cells) // _SMOOTH), _FEWEST_CELLS, _FEWEST_BINS // half)
+        reach = flank_of(width, n_bins) // half
         first = max(-(-_LOWEST // half) + reach + 1, 2 * _NARROW)
         last = len(cells) - reach - 3
         if last < first:

@@ -13,7 +13,7 @@ from scipy.signal import windows
 from torch import Tensor
 
 from gyrofuse._transforms import fast_length
-from gyrofuse.mismatch.bump_scan import log_ratios, scanned_bumps
+from gyrofuse.mismatch.bump_scan import flank_of, least_flank, log_ratios, scanned_bumps
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import Evidence, corrected, ratio_p_value
 from gyrofuse.mismatch.hump_scan import scanned_humps
@@ -29,7 +29,6 @@ _TRIES = 6
 _MOST = 3.4  # medians of a modulus: one bin in three thousand is above
 _LINE = 0.6  # of the excess in three bins
 _AS_WELL = 0.01  # p value at which the simulation has it as well
-_FLANK = 24  # bins, at least
 
 
 class Stretch(NamedTuple):
@@ -128,14 +127,9 @@ def _apart(transform: Tensor, length: int, case: Case) -> Tensor:
 
 def _flanks(power: Tensor, a: int, n: int) -> Tensor:
     """Mean of both flanks, `(sensor,)`, as far as they reach."""
-    gap, wide = n // 2, _flank(n, power.shape[-1])
+    gap, wide = n // 2, flank_of(n, power.shape[-1])
     left, right = power[:, max(a - gap - wide, 0) : a - gap], power[:, a + n + gap : a + n + gap + wide]
     return torch.cat([left, right], -1).mean(-1)
-
-
-def _flank(n: int, n_bins: int) -> int:
-    """Bins of a flank beside a stretch of `n`, as those of the scan are."""
-    return max(min(4 * n, n_bins // 8), 3 * n // 2, _FLANK)
 
 
 def band_of(place: Tensor, length: int, case: Case) -> Tensor:
@@ -155,8 +149,8 @@ def _has_it(simulated: tuple[Tensor, int], stretch: Stretch, case: Case) -> bool
     transform, length = simulated
     n = max(round(stretch.width * length) // 2, 2) * 2
     a, gap = round(stretch.frequency * length - (n - 1) / 2), n // 2
-    wide = min(_flank(n, transform.shape[-1]), a - gap, transform.shape[-1] - a - n - gap)
-    if wide < max(3 * n // 2, _FLANK):
+    wide = min(flank_of(n, transform.shape[-1]), a - gap, transform.shape[-1] - a - n - gap)
+    if wide < least_flank(n):
         return False
     bins = transform.movedim(1, 0)  # (sensor, record, bin)
     inside, left, right = (

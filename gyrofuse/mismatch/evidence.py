@@ -62,15 +62,18 @@ def ratio_p_value(log_ratio: float) -> float:
     return math.exp(min(math.log(_LOOSE) - log_ratio, 0.0))
 
 
+def of_shares(log_ratios: Tensor) -> Tensor:
+    """Logarithms of `prod (1 - e + e E)` for shares `e`, `(share, ...)`, of ratios `log E` `(sensor, ...)`."""
+    e = torch.tensor(SHARES, dtype=log_ratios.dtype).view(-1, *[1] * log_ratios.ndim)
+    return torch.logaddexp(log_ratios + e.log(), torch.log1p(-e)).sum(1)
+
+
 def some_of(log_ratios: Tensor) -> Tensor:
-    """Logarithm of the mean over shares `e` of `prod (1 - e + e E)`, of ratios `log E` `(sensor, ...)`.
+    """Logarithm of the mean of that over shares.
 
     Any of the sensors may have what each has a likelihood ratio of its own for; these have to be independent.
     """
-    if len(log_ratios) == 1:
-        return log_ratios[0]
-    mixed = [torch.logaddexp(log_ratios + math.log(e), log_ratios.new_tensor(math.log1p(-e))).sum(0) for e in SHARES]
-    return torch.stack(mixed).logsumexp(0) - math.log(len(SHARES))
+    return log_ratios[0] if len(log_ratios) == 1 else of_shares(log_ratios).logsumexp(0) - math.log(len(SHARES))
 
 
 def surpassing(own: float, other: float) -> float:

@@ -74,23 +74,28 @@ def core_sd(side: Side) -> Tensor:
 
 
 @remembered
+def _distinct(side: Side) -> tuple[tuple[Tensor, Tensor], ...]:
+    """Values of each sensor in the first record, sorted, and how often each is there."""
+    return tuple(torch.unique(row, return_counts=True) for row in side.signal[0])
+
+
+@remembered
 def exact_lattices(side: Side) -> tuple[Lattice | None, ...]:
     """The lattice of each sensor's values in the first record that needs no statistics, `None` without."""
     return tuple(
-        _exact_lattice(values, float(sd)) for values, sd in zip(side.signal[0], innovation_sd(side), strict=True)
+        _exact_lattice(*values, float(sd)) for values, sd in zip(_distinct(side), innovation_sd(side), strict=True)
     )
 
 
 @remembered
 def lattices(side: Side) -> tuple[Lattice, ...]:
     """The likeliest lattice of each sensor's values in the first record."""
-    every = zip(exact_lattices(side), side.signal[0], core_sd(side), strict=True)
-    return tuple(exact or _hidden_lattice(values.unique(), float(sd)) for exact, values, sd in every)
+    every = zip(exact_lattices(side), _distinct(side), core_sd(side), strict=True)
+    return tuple(exact or _hidden_lattice(unique, float(sd)) for exact, (unique, _), sd in every)
 
 
-def _exact_lattice(values: Tensor, sd: float) -> Lattice | None:
+def _exact_lattice(unique: Tensor, counts: Tensor, sd: float) -> Lattice | None:
     """From the gaps between values that recur."""
-    unique, counts = torch.unique(values, return_counts=True)
     gaps = unique.diff()
     # A gap far below what matters is the noise of arithmetic.
     for step in (float(gaps.median()), float(gaps.min())) if len(gaps) > 1 else ():
@@ -174,7 +179,7 @@ def shared_lattice(side: Side) -> SharedLattice:
     open_ones = [i for i, exact in enumerate(exact_lattices(side)) if exact is None]
     if len(open_ones) < 2:
         return SharedLattice(-math.inf, 0.0, 0.0)
-    rows, sd = [side.signal[0, i].unique() for i in open_ones], core_sd(side)[open_ones]
+    rows, sd = [_distinct(side)[i][0] for i in open_ones], core_sd(side)[open_ones]
     finest = float(sd.min())
     u, power = _characteristic(rows, finest)
     last = int(torch.searchsorted(u, 2 * math.pi / (_FINEST_HIDDEN * finest)))
@@ -260,7 +265,7 @@ def missing_lattices(case: Case, level: float) -> Missing:
         if i in missing:
             continue
         if own.blur > 0 and clearest.blur > 0:
-            own = _seen_at(case.recording[i].unique(), clearest.peak, clearest.step)
+            own = _seen_at(_distinct(case.recorded)[i][0], clearest.peak, clearest.step)
         elif not any(abs(own.step / step - 1) < _ALIKE for step in steps):
             continue
         left = _not_simulated(case, i, own) if own.p_value < _AS_OTHERS else None

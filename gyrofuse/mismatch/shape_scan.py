@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.case import Case
-from gyrofuse.mismatch.evidence import SHARES, Evidence, ratio_p_value
+from gyrofuse.mismatch.evidence import SHARES, Evidence, of_shares, ratio_p_value
 from gyrofuse.mismatch.filter_forms import filter_power, filter_strength
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.shape_bands import Narrow, deep_base, narrow, slow
@@ -116,10 +116,8 @@ def scanned(case: Case) -> Scan | None:
         for way in (1, -1)
     )
     ways = torch.stack([up, down, torch.logaddexp(up, down) - math.log(2)])  # (way, shape, sensor)
-    e = torch.tensor(SHARES, dtype=torch.float64)
-    log_ratios = torch.logaddexp(torch.log1p(-e), e.log() + ways[..., None]).sum(-2)  # (way, shape, share)
-    log_ratios = log_ratios + looked_for.log_chances[..., None]
-    way, shape, share = (int(i) for i in torch.unravel_index(log_ratios.argmax(), log_ratios.shape))
+    log_ratios = of_shares(ways.movedim(-1, 0)) + looked_for.log_chances  # (share, way, shape)
+    share, way, shape = (int(i) for i in torch.unravel_index(log_ratios.argmax(), log_ratios.shape))
     own = torch.maximum(up, down)[shape] if way == 2 else ways[way, shape]
     sensors = tuple(int(i) for i in (own > math.log(1 / SHARES[share] - 1)).nonzero()[:, 0]) or (int(own.argmax()),)
     weight = looked_for.templates[shape, list(sensors)].square().mean(0)

@@ -71,7 +71,7 @@ def weak_outliers(z: Tensor) -> WeakOutliers:
     logs = [torch.stack([_log_ratios(z[group], size, rates) for size in _SIZES]) for group in groups]
     alone = [[1 << i for i in range(len(group))] for group in groups]
     single = torch.cat([log[..., own] for log, own in zip(logs, alone, strict=True)], -1)  # (size, rate, sensor)
-    apart = log_half(single).sum(-1)
+    apart = _log_half(single).sum(-1)
     size, rate = divmod(int(apart.argmax()), len(rates))
     sensors, total, together = torch.sigmoid(single[size, rate]), float(_log_mean(apart.flatten())), -math.inf
     several = [[s for s in range(log.shape[-1]) if s.bit_count() > 1] for log in logs]
@@ -119,7 +119,7 @@ def _products(rows: Tensor) -> Tensor:
     return products
 
 
-def log_half(log_ratio: Tensor) -> Tensor:
+def _log_half(log_ratio: Tensor) -> Tensor:
     """`log((1 + E)/2)`."""
     return torch.logaddexp(log_ratio, torch.zeros_like(log_ratio)) - math.log(2)
 
