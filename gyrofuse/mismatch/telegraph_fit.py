@@ -123,9 +123,13 @@ class TwoLevels(NamedTuple):
     @property
     def resolved(self) -> bool:
         """Whether dwells are between blocks and a few steps."""
-        dwells = np.exp(self.theta[0, 1:])  # blocks
-        slow, fast = len(self.means.y) / dwells.mean() < _FEWEST_SWITCHES, 1 / (1 / dwells).sum() < _BLOCKS[0]
-        return not slow and not fast
+        slow = len(self.means.y) / np.exp(self.theta[0, 1:]).mean() < _FEWEST_SWITCHES
+        return not slow and self.tau >= _BLOCKS[0] * self.means.block
+
+    @property
+    def tau(self) -> float:
+        """Time constant, samples."""
+        return float(self.means.block / np.exp(-self.theta[0, 1:]).sum())
 
     @property
     def best(self) -> Numbers:
@@ -166,8 +170,16 @@ def two_levels(case: Case) -> dict[int, TwoLevels]:
     """Fits of the sensors that have such an excess, by their places."""
     found = excess(case)
     loud = [i for i in range(case.n_sensors) if float(found.gain[i]) > _LOUD]
-    fits = (_fitted(case, i, float(found.sd[i]), float(found.tau[i])) for i in loud)
+    fits = (_in_fit_blocks(case, i, float(found.sd[i]), float(found.tau[i])) for i in loud)
     return {i: fit for i, fit in zip(loud, fits, strict=True) if fit is not None}
+
+
+def _in_fit_blocks(case: Case, sensor: int, sd: float, tau: float) -> TwoLevels | None:
+    """Of one sensor, in shorter blocks where levels turn out to change faster than its spectrum had it."""
+    found = _fitted(case, sensor, sd, tau)
+    if found is None or found.tau >= _BLOCKS[0] * found.means.block:
+        return found
+    return _fitted(case, sensor, sd, found.tau) or found
 
 
 def scores(case: Case, sensor: int, numbers: Numbers) -> Array:
