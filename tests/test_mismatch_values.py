@@ -93,6 +93,18 @@ def test_values_cut_at_a_limit_are_clipped() -> None:
     settled(case, found, g)
 
 
+def test_few_samples_at_an_end_prove_it_and_a_repaired_simulation_has_it() -> None:
+    """Cut at the fifth largest and smallest values: a simulation as long has a few beyond them, or none by chance."""
+    for seed in range(8):
+        recording, simulation, g = drawn(200 + seed, records=1)
+        ordered = recording.sort(dim=-1).values
+        recording = recording.clamp(ordered[:, 4:5], ordered[:, -5:-4])
+        case = Case.of(SCENE, recording, simulation)
+        found = nominated(case, Clipping)
+        assert found.sensors == (0, 1, 2)
+        settled(case, found, g)
+
+
 def test_clipping_shows_on_a_lattice_as_well() -> None:
     recording, simulation, _ = drawn(5)
     recording, simulation = recording.clamp(max=2.0).round(), simulation.round()

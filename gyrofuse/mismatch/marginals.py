@@ -22,7 +22,8 @@ _QUARTERS = 4
 _BY_CHANCE = 3.0  # times the variance expected of quarters
 _COUNTED = 20.0  # repeats that are expected, below which they are counted one by one
 _COARSE, _AT_LAST_STEP = 0.05, 4.0  # of the noise; samples that may lie on a lattice's last step by chance
-_FEWEST_AT_END = 3  # samples at an end stop
+_SAME_END = 0.01  # sd of a sample given all others
+_BY_CHANCE_AT_END = 0.005  # p value of so many more at the end than the simulation has
 
 
 class Repeats(NamedTuple):
@@ -172,7 +173,7 @@ def end_stops(case: Case) -> tuple[EndStop, ...]:
             limit = float((sign * x).max())
             at = sign * x == limit
             runs = int((at[1:] & ~at[:-1]).sum()) + int(at[0])
-            if int(at.sum()) < _FEWEST_AT_END or runs < 2 or _simulation_ends(case, i, sign):
+            if runs < 2 or _simulation_ends(case, i, sign):
                 found.append(EndStop(i, sign, sign * limit, 1.0))
                 continue
             beyond = float(torch.special.ndtr((sign * mean - limit - resolution / 2) / sd).sum())
@@ -196,15 +197,32 @@ def _before_rounding(x: Tensor, mean: Tensor, step: float) -> tuple[Tensor, floa
 
 
 def _simulation_ends(case: Case, sensor: int, sign: int) -> bool:
-    """Whether the simulation has an end stop there: half as many samples at its limit, or more."""
+    """Whether the simulation has an end stop there: half as many samples at its limit.
+
+    Or as many as chance allows, if it has any or never goes beyond where the recording ends.
+    """
     cell = 0.99 * float(_resolution(case)[sensor])
-    own, other = (_share_at_end(sign * side.signal[:, sensor], cell) for side in (case.recorded, case.simulated))
-    return other >= 0.5 * own
+    own, other = (_at_end(sign * side.signal[:, sensor], cell) for side in (case.recorded, case.simulated))
+    if own.again and other.again / other.n >= 0.5 * own.again / own.n:
+        return True
+    chance = float(stats.binom.sf(own.again - 1, own.again + other.again, own.n / (own.n + other.n)))
+    within = other.reach < own.reach + _SAME_END * float(left_out(case.recorded).sd[0, sensor])
+    return (other.again > 0 or within) and chance > _BY_CHANCE_AT_END
 
 
-def _share_at_end(values: Tensor, cell: float) -> float:
-    """Mean share of samples less than a cell from each record's largest value."""
-    return float((values >= values.amax(-1, keepdim=True) - cell).to(torch.float64).mean())
+class _End(NamedTuple):
+    """How many samples are less than a cell from each record's largest one beside it, of how many, and how high."""
+
+    again: int
+    n: int
+    reach: float
+
+
+def _at_end(values: Tensor, cell: float) -> _End:
+    """Of `(record, time)`, the height about each record's mean."""
+    top = values.amax(-1, keepdim=True)
+    again = int((values >= top - cell).sum()) - len(values)
+    return _End(again, values.numel(), float((top - values.mean(-1, keepdim=True)).max()))
 
 
 def marginal_witness(case: Case) -> Evidence:
