@@ -16,6 +16,7 @@ from gyrofuse.haar import haar_coefficients
 from gyrofuse.mismatch import episodes, impulses, marginals, noise_level, outlier_limits, outliers
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.mechanism import Mechanism
+from gyrofuse.mismatch.mechanisms import spikes
 from gyrofuse.mismatch.mechanisms.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.random_telegraph import RandomTelegraph, _path
@@ -141,6 +142,16 @@ def test_a_sensor_that_speaks_against_the_outliers_of_a_bus_is_left_out() -> Non
     laws = [outliers.fitted(row) for row in z]
     assert float((outliers.mixture(z[1], laws[1]) - outliers.free_gaussian(z[1])).sum()) > 4
     assert nominated(Case.of(SCENE, recording, simulation), Spikes).sensors == (0, 2)
+
+
+def test_a_law_that_takes_half_of_the_noise_for_outliers_does_not_tell_its_sd() -> None:
+    z, law = normal(3, N, g=torch.Generator().manual_seed(5)), outliers.Outliers(2e-3, 6.0, 0.5)
+    z[:2] += law.height * (even(2, N, g=torch.Generator().manual_seed(6)) < law.rate)
+    wild = outliers.Outliers(0.4, 1.2, 0.3, 0.5)
+    for third in (outliers.Outliers.none(), wild):
+        shared = spikes._shared(z, [law, law, third], (0, 1))
+        assert [one.scale for one in shared] == pytest.approx([1, 1, 1], abs=0.02)
+        assert [one.height for one in shared] == pytest.approx([6, 6, 6], rel=0.1)
 
 
 @pytest.mark.parametrize("tone", [0.0, 5.0])

@@ -26,7 +26,7 @@ from gyrofuse.mismatch.telegraph import (
     gaussian_values,
     switching_values,
 )
-from gyrofuse.mismatch.telegraph_fit import Numbers, excess, scores, two_levels, vertex
+from gyrofuse.mismatch.telegraph_fit import Numbers, _fitted, _in_fit_blocks, excess, scores, two_levels, vertex
 
 N, SCENE = 16384, Scene(100.0, "deg/s", ("x", "y"))
 NOISE = WhiteNoise(1.0) + AR1(0.995, 2e-4) + RandomWalk(1e-7)
@@ -160,6 +160,36 @@ def test_a_lorentzian_is_told_by_its_spectrum() -> None:
     assert float(found.gain[1]) > 40 > 6 > float(found.gain[0])
     assert float(found.sd[1]) == pytest.approx(sd, rel=0.2)
     assert float(found.tau[1]) == pytest.approx(tau, rel=0.6)
+
+
+def test_blocks_get_shorter_where_levels_change_faster_than_the_spectrum_had_it() -> None:
+    case, sd = telegraph(10), float(excess(telegraph(10)).sd[1])
+    tau = 1 / (1 / LEVELS.up + 1 / LEVELS.down)
+    first = _fitted(case, 1, sd, 3 * tau)
+    assert first is not None
+    assert not first.resolved
+    found = _in_fit_blocks(case, 1, sd, 3 * tau)
+    assert found is not None
+    assert found.resolved
+    assert found.means.block < first.means.block
+
+
+def test_beside_a_sensor_that_jumps_another_one_needs_less() -> None:
+    """Of weaker levels, for which two nats over the Gaussian rival would not do alone."""
+    seen = 0
+    for seed in range(30, 36):
+        case = telegraph(seed)
+        g = torch.Generator().manual_seed(2000 + seed)
+        recording = case.recording.clone()
+        recording[0] += 0.6 * LEVELS.half * _path(N, LEVELS.up, LEVELS.down, g)
+        both = Case.of(SCENE, recording, case.simulated.signal)
+        found = RandomTelegraph.nominate(both, LEVEL)
+        fits = {i: fit for i, fit in two_levels(both).items() if fit.resolved}
+        weak = 0 in fits and 0 < fits[0].over < 1.5
+        if found is not None and weak:
+            seen += 1
+            assert found.sensors == (0, 1)
+    assert seen
 
 
 def test_two_levels_are_named_where_noise_is_coloured() -> None:
