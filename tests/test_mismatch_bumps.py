@@ -10,16 +10,16 @@ import torch
 from scipy import stats
 from shape_draws import CHANGES, RATE, SIGNS, N, P, array, case, drawn, generator, nominated, oscillating, tensor
 
-from gyrofuse.mismatch.bump_fit import Background, oscillation_of
+from gyrofuse.mismatch.bump_fit import Background, Oscillation, oscillation_of
 from gyrofuse.mismatch.bump_scan import log_ratios
-from gyrofuse.mismatch.bumps import strongest_bump
+from gyrofuse.mismatch.bumps import Stretch, strongest_bump
 from gyrofuse.mismatch.colour import noise
 from gyrofuse.mismatch.hump_scan import _scores, scanned_humps
 from gyrofuse.mismatch.lines import whitened
 from gyrofuse.mismatch.mechanisms.resonance import Resonance
-from gyrofuse.mismatch.oscillating import Mode, excess_along
+from gyrofuse.mismatch.oscillating import Mode, _seen, excess_along
 from gyrofuse.mismatch.shape_fit import fit, linearised
-from gyrofuse.mismatch.shape_terms import oscillation
+from gyrofuse.mismatch.shape_terms import CommonBump, oscillation
 from gyrofuse.mismatch.shapes import compared
 from gyrofuse.mismatch.steadiness import steadiness
 
@@ -128,6 +128,19 @@ def test_a_mode_of_some_sensors_is_seen_that_a_taper_would_hide():
         given = drawn(720 + seed, lambda x, g: x + 1.9e-3 * has[:, None] * noise(N, mode.profile, P, g))
         seen += strongest_bump(given).p_value < 1e-3
     assert seen >= stats.binom.ppf(1e-3, n_runs, 0.9)
+
+
+def test_squares_of_gains_have_two_degrees_of_freedom():
+    """Of gains 0 with a standard deviation of 0.1 in each part, 20 000 of them: mean 2, and the tail of chi-square."""
+    g = generator(3)
+    local = 0.1 * torch.randn(2, 20_000, generator=g, dtype=torch.float64)
+    free, shared = torch.ones(2, 20_000, dtype=torch.bool), torch.tensor([0.1, 0.01], dtype=torch.float64).log()
+    term = CommonBump(local, free, shared, kind="oscillation")
+    sd = torch.full((2, 20_000), 0.1, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
+    squares, dof = _seen(Oscillation.of(Stretch(0.1, 0.01, 0.0, ()), term, sd, 0.0))
+    assert dof == 2
+    assert float(squares.mean()) == pytest.approx(2, rel=0.04)
+    assert float((squares > stats.chi2.isf(0.01, 2)).double().mean()) == pytest.approx(0.01, abs=0.003)
 
 
 def test_gains_of_a_mode_are_told_whatever_the_level_of_the_noise():

@@ -21,6 +21,7 @@ from gyrofuse.mismatch.mechanism import Finding, Instead, Mechanism
 from gyrofuse.mismatch.mechanisms.common_mode import CommonMode
 from gyrofuse.mismatch.mechanisms.drifting_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.flicker import FlickerNoise
+from gyrofuse.mismatch.mechanisms.parameter_shift import ParameterShift
 from gyrofuse.mismatch.mechanisms.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.step import Step
 from gyrofuse.mismatch.mechanisms.vibration_tone import VibrationTone, amplitude_limits, line_near
@@ -93,6 +94,11 @@ def test_red_noise_beside_several_steps_may_be_more_of_them():
     step_found = Finding(one.name, one, "", 1e-9, (0, 1), {}, gain=50.0)
     assert happened_instead(plain, red, [step_found]) == ()
     assert happened_instead(plain, red, [step_found, step_found]) == ("step",)
+    assert happened_instead(plain, red, [step_found, replace(step_found, sensors=(2, 3))]) == ()
+    factors = torch.zeros(4, SENSORS, dtype=torch.float64)
+    for row, alike in ((0, ()), (3, ("step",))):
+        other = ParameterShift(plain.base, factors.index_fill(0, torch.tensor(row), 0.4))
+        assert happened_instead(plain, replace(red, effect=other), [step_found, step_found]) == alike
 
 
 def test_what_stands_alone_stays_and_its_loss_is_its_gain():

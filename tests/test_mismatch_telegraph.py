@@ -16,6 +16,7 @@ from gyrofuse import AR1, RandomWalk, WhiteNoise
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.confirm import held_out_gain
 from gyrofuse.mismatch.folds import N_JUDGED
+from gyrofuse.mismatch.mechanisms import random_telegraph
 from gyrofuse.mismatch.mechanisms.random_telegraph import RandomTelegraph, _path
 from gyrofuse.mismatch.telegraph import (
     _LARGEST,
@@ -190,6 +191,18 @@ def test_beside_a_sensor_that_jumps_another_one_needs_less() -> None:
             seen += 1
             assert found.sensors == (0, 1)
     assert seen
+
+
+def test_one_event_beside_a_sensor_that_jumps_is_no_telegraph(monkeypatch: pytest.MonkeyPatch) -> None:
+    case = telegraph(10)
+    fit = two_levels(case)[1]
+    values = fit.rival - 0.5
+    values[:2] += 12.0
+    event = fit._replace(values=np.tile(values, (len(fit.values), 1)))
+    assert event.over > 5
+    assert event.momentary
+    monkeypatch.setattr(random_telegraph, "two_levels", lambda _case: {0: event, 1: fit})
+    assert nominated(case, RandomTelegraph).sensors == (1,)
 
 
 def test_two_levels_are_named_where_noise_is_coloured() -> None:

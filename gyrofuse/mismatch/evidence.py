@@ -69,7 +69,7 @@ def of_shares(log_ratios: Tensor) -> Tensor:
 
 
 def some_of(log_ratios: Tensor) -> Tensor:
-    """Logarithm of the mean of that over shares.
+    """Logarithm of the mean of `prod (1 - e + e E)` over shares `e`.
 
     Any of the sensors may have what each has a likelihood ratio of its own for; these have to be independent.
     """

@@ -63,15 +63,26 @@ def look_alikes(case: Case, finding: Finding) -> list[Mechanism]:
 def happened_instead(case: Case, finding: Finding, beside: Sequence[Finding] = ()) -> tuple[str, ...]:
     """What happened once and gains as much as a finding of more slow noise does: a step is red noise as well.
 
-    And what happened more than once already by the findings `beside`: several more are like a walk.
+    And what happened more than once in its sensors by the findings `beside`: several more are like a walk.
     """
     if not isinstance(finding.effect, _RED):
         return ()
     scans = slow_look(case).scans
     once = [s.family.name for s in scans if s.p_value < _MAY_BE and s.gain > finding.gain - _AS_MUCH]
-    happened = [f.mechanism for f in beside if f.effect.happened_once and isinstance(f.effect, SlowEffect)]
-    again = [name for name in happened if happened.count(name) > 1]
+    happened = [
+        f.mechanism
+        for f in beside
+        if f.effect.happened_once and isinstance(f.effect, SlowEffect) and set(f.sensors) & set(finding.sensors)
+    ]
+    again = [name for name in happened if happened.count(name) > 1 and _slow_noise(finding.effect)]
     return tuple(dict.fromkeys((*once, *again)))
+
+
+def _slow_noise(effect: Mechanism) -> bool:
+    """Whether it is noise of low frequencies: of a simulation's parts all but the white one."""
+    if isinstance(effect, ParameterShift):
+        return bool((effect.log_factors[1:] != 0).any())
+    return isinstance(effect, FlickerNoise) or (isinstance(effect, CommonMode) and effect.kind != "white")
 
 
 def _nominated(case: Case, names: tuple[str, ...]) -> Iterator[Mechanism]:

@@ -22,6 +22,8 @@ _QUARTERS = 4
 _BY_CHANCE = 3.0  # times the variance expected of quarters
 _COUNTED = 20.0  # repeats that are expected, below which they are counted one by one
 _COARSE, _AT_LAST_STEP = 0.05, 4.0  # of the noise; samples that may lie on a lattice's last step by chance
+_CELLS = 10.0  # of the resolution in the noise's sd: how far the two largest values are apart on average, with margin
+_PLACE = 1  # of end stops in a converter
 _SAME_END = 0.01  # sd of a sample given all others
 _BY_CHANCE_AT_END = 0.005  # p value of so many more at the end than the simulation has
 
@@ -177,12 +179,17 @@ def end_stops(case: Case) -> tuple[EndStop, ...]:
                 found.append(EndStop(i, sign, sign * limit, 1.0))
                 continue
             beyond = float(torch.special.ndtr((sign * mean - limit - resolution / 2) / sd).sum())
-            by_chance = min(5 * resolution / sd, 1.0) ** (runs - 1)
+            by_chance = min(_CELLS * max(_resolution_near(x, limit), resolution) / sd, 1.0) ** (runs - 1)
             p = min(math.exp(-beyond), by_chance)
             if rounded:  # tails of rounded noise are not normal: the number at the end has to tell too
                 p = max(p, float(special.pdtrc(runs - 1, _AT_LAST_STEP)))
             found.append(EndStop(i, sign, sign * limit, corrected(p, 4 * case.n_sensors)))
     return tuple(found)
+
+
+def _resolution_near(values: Tensor, end: float) -> float:
+    """Smallest difference between two values that are as large: those of few digits are finer near zero."""
+    return float(_finest_gap(values[values.abs() > abs(end) / 2]))
 
 
 def _before_rounding(x: Tensor, mean: Tensor, step: float) -> tuple[Tensor, float]:
@@ -199,15 +206,16 @@ def _before_rounding(x: Tensor, mean: Tensor, step: float) -> tuple[Tensor, floa
 def _simulation_ends(case: Case, sensor: int, sign: int) -> bool:
     """Whether the simulation has an end stop there: half as many samples at its limit.
 
-    Or as many as chance allows, if it has any or never goes beyond where the recording ends.
+    Or as many as chance allows, if it has any, or was given one and stays within.
     """
     cell = 0.99 * float(_resolution(case)[sensor])
     own, other = (_at_end(sign * side.signal[:, sensor], cell) for side in (case.recorded, case.simulated))
-    if own.again and other.again / other.n >= 0.5 * own.again / own.n:
+    if other.again / other.n >= 0.5 * own.again / own.n:
         return True
     chance = float(stats.binom.sf(own.again - 1, own.again + other.again, own.n / (own.n + other.n)))
     within = other.reach < own.reach + _SAME_END * float(left_out(case.recorded).sd[0, sensor])
-    return (other.again > 0 or within) and chance > _BY_CHANCE_AT_END
+    given = any(place == _PLACE for place, _ in case.converter)
+    return (other.again > 0 or (given and within)) and chance > _BY_CHANCE_AT_END
 
 
 class _End(NamedTuple):

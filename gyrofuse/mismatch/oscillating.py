@@ -132,15 +132,21 @@ def nominated(case: Case, level: float, *, tone: bool) -> tuple[Mode, Seen] | No
         # Which sensors it takes is a matter of likelihood: variances are as uncertain as the width is.
         has = shape.term.free.any(0)
     else:
-        has = partakers((bump.variance / bump.variance_sd).clamp(min=0).square(), 1, _SEEN).which
-    sensors = tuple(int(i) for i in has.nonzero()[:, 0])
+        has = partakers(*_seen(bump), _SEEN).which
+    sensors = tuple(has.nonzero()[:, 0].tolist())
     verdict = steadiness(case, bump)
     steady = verdict.tone and bump.width <= _BROAD * bump.centre  # what is all over the spectrum is no tone
-    if not sensors or steady != tone or _momentary(case, bump) or swept(case, bump.nats, level):
+    if steady != tone or _momentary(case, bump) or swept(case, bump.nats, level):
         return None
     gain = bump.variance.clamp(min=0).sqrt().to(torch.complex128) if bump.gain is None else bump.gain
     mode = Mode(bump.centre, bump.width, gain, bump.gain is not None)
     return mode, Seen(case, bump, verdict, sensors, rivals)
+
+
+def _seen(bump: Oscillation) -> tuple[Tensor, int]:
+    """Squares `(sensor,)` of a bump in standard deviations, and their degrees of freedom: of gains two, complex."""
+    squares = (bump.variance / bump.variance_sd).clamp(min=0).square()
+    return (squares, 1) if bump.gain is None else (4 * squares, 2)  # sd of |g|^2 is 2 |g| times that of |g|
 
 
 def _in_band(case: Case, bump: Oscillation) -> tuple[Tensor, float]:

@@ -1,4 +1,8 @@
-"""Which spectral shapes explain ratios of spectra: added while BIC falls, then taken away, from all that may start."""
+"""Which spectral shapes explain ratios of spectra, and which sensors have them.
+
+Shapes are added while BIC falls, then taken away, from all that may start; each is then given to the sensors that have
+about as much of it as others.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +36,10 @@ _CORNER_BINS = (4.0, 0.3)  # corners of common AR1s to start from: bins, cycles 
 
 
 def best_shapes(data: Ratios, *, differ: bool) -> tuple[Ratios, Fit | None]:
-    """Shapes added one at a time while BIC falls, then taken away while it falls; one at least of what does differ."""
+    """Shapes added one at a time while BIC falls, then taken away while it falls; one at least of what does differ.
+
+    Each in the sensors that take part.
+    """
     best: Fit | None = None
     value = -math.inf if differ else 0.0
     for _ in range(_MOST):
@@ -65,13 +72,15 @@ def _of_partakers(data: Ratios, found: Fit, i: int) -> Fit:
     whole = fit(data, [*terms[:i], _freed(data, term), *terms[i + 1 :]])
     every = whole.terms[i]
     concerned = every.free.any(0).nonzero()[:, 0].tolist()
-    statistic = torch.zeros(data.n_sensors, dtype=torch.float64)
+    statistic = torch.full((data.n_sensors,), -1.0, dtype=torch.float64)
     for sensor in concerned:
         free = every.free.clone()
         free[:, sensor] = False
         less = replace(every, free=free, local=torch.where(free, every.local, 0.0))
         without = fit(data, [*whole.terms[:i], less, *whole.terms[i + 1 :]], QUICK)
         statistic[sensor] = 2 * max(whole.gain - without.gain, 0.0)
+    if not bool((statistic > 0).any()):
+        return found
     which = partakers(statistic, int(every.free.sum(0).max()), _SEEN).which
     # Those it was not seen in get all of its numbers.
     free = torch.where(term.free.any(0), term.free, every.free) & which

@@ -16,6 +16,7 @@ from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import corrected
 from gyrofuse.mismatch.folds import estimation_samples
 from gyrofuse.mismatch.hysteresis import strongest_relay
+from gyrofuse.mismatch.mechanism import Z
 from gyrofuse.mismatch.noise_level import modulation, variance_p_value
 from gyrofuse.mismatch.pooled import common_source
 from gyrofuse.mismatch.remembered import remembered
@@ -43,7 +44,7 @@ _BROAD = 3.0  # half widths
 _SHARP, _NARROW = 0.1, (0.02, 0.04, 0.08)  # the same, below which bands are too wide for it, and of it there
 _FINE, _NARROWEST = 24, 0.005  # bands in an octave for those, and the least that they show
 _STEEPER, _FLICKER = 4.0, 0.25  # nats that another slope gains, and distance from 1 of flicker noise's
-_UNSTEADY = 0.02  # p value of a level that may change
+_UNSTEADY = 0.01  # p value, of two, of a level that may change
 _OFF = 0.25  # logarithm by which a centre from wide bands may be off
 
 
@@ -100,9 +101,17 @@ def _like_switching(term: Term) -> bool:
     return isinstance(term, Flicker)
 
 
-def _louder(term: Term) -> bool:
-    """Whether it is more white noise: of noise that is louder at times the spectrum shows the mean."""
-    return isinstance(term, Shift) and bool((term.local[0] > 0).any())
+def _louder(term: Term, sd: tuple[Tensor, Tensor]) -> bool:
+    """Whether it is plainly more white noise: of noise that is louder at times the spectrum shows the mean."""
+    return isinstance(term, Shift) and bool((term.local[0] > Z * sd[0][0]).any())
+
+
+def _in_sensors_of(term: Term, rival: Term) -> Term:
+    """A rival in the sensors that take part."""
+    if isinstance(term, Common) or isinstance(rival, Common):
+        return rival
+    free = rival.free & term.free.any(0)
+    return replace(rival, free=free, local=torch.where(free, rival.local, 0.0)) if bool(free.any()) else rival
 
 
 def chosen_shape(case: Case, name: str, level: float) -> Shape | None:
@@ -193,11 +202,11 @@ def _searched(case: Case) -> Shape | None:
     rivals = {
         rival.name
         for rival in candidates(data, others)
-        if rival.name != term.name and _as_good(data, [*others, rival], chosen, whole)
+        if rival.name != term.name and _as_good(data, [*others, _in_sensors_of(term, rival)], chosen, whole)
     }
     if _like_switching(term):
         rivals.add("random_telegraph")
-    if _louder(term) and min(modulation(case).p_value, variance_p_value(case)) < _UNSTEADY:
+    if _louder(term, seen[first][1]) and min(modulation(case).p_value, variance_p_value(case)) < _UNSTEADY:
         rivals.add("variance_change")
     score = (log_score(data, data_model(data, [term])) - log_score(data, data.expected)).clamp(min=0)
     frequency = data.ground.bands.frequency

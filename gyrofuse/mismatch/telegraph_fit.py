@@ -33,7 +33,7 @@ _HOPELESS = (-5.0, 0.0)  # nats over the rival after each look
 _WIDTHS = ((0.25, 0.6), (0.15, 0.35))  # of stencils: size, times
 _NEAR = 3.0  # nats, over which values count for the parabola
 _SAME = 1e-9
-_MOMENTS = 2  # judged blocks
+_MOMENTS, _EVENT = 2, 8.0  # judged blocks, and nats in them
 _FEWEST_SWITCHES = 16.0
 _LEAST = 0.05  # curvature of a parabola
 
@@ -117,8 +117,12 @@ class TwoLevels(NamedTuple):
     @property
     def lasts(self) -> bool:
         """Whether it is over the rival for more than a moment."""
-        gained = np.sort(self.values[0] - self.rival)[:-_MOMENTS].sum()
-        return bool(gained > 0)
+        return bool(np.sort(self.values[0] - self.rival)[:-_MOMENTS].sum() > 0)
+
+    @property
+    def momentary(self) -> bool:
+        """Whether a moment has more of it than chance would give one."""
+        return bool(np.sort(self.values[0] - self.rival)[-_MOMENTS:].sum() > _EVENT)
 
     @property
     def resolved(self) -> bool:

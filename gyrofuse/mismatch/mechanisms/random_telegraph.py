@@ -18,7 +18,7 @@ from gyrofuse.mismatch.telegraph_fit import Numbers, excess, scores, two_levels
 
 _PRESENT, _CERTAIN = 5.0, 8.0  # nats over the Gaussian rival, of all sensors together
 _GAUSSIAN = ("flicker", "parameter_shift")  # what may have the same spectrum
-_CHOSEN = 1.5  # nats that each sensor costs
+_CHOSEN = 1.5  # nats that each sensor costs that is to show it by itself
 _NUMBERS = 4  # of a sensor: half step, dwells, and the rival's place
 
 
@@ -47,8 +47,8 @@ class RandomTelegraph(Mechanism):
         over = _CHOSEN + sum(fit.over - _CHOSEN for fit in own.values())
         if over < _PRESENT:
             return None
-        # Beside sensors that jump, excess of another one is likelier to be jumps than anything else.
-        fits = {i: fit for i, fit in possible.items() if i in own or fit.over > 0}
+        # Beside sensors that jump, excess of another one is likelier to be jumps than anything else but one event.
+        fits = {i: fit for i, fit in possible.items() if i in own or (fit.over > 0 and not fit.momentary)}
         sensors = tuple(fits)
         gain = float(excess(case).gain[list(sensors)].sum()) + sum(fit.over for fit in fits.values())
         sets = math.comb(case.n_sensors, len(sensors))

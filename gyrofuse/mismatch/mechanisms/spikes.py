@@ -23,7 +23,7 @@ _HOUR = 3600.0
 _ALIKE = 5.0  # nats
 _RARE = 2.0  # nats by which a few outliers have to surpass noise that is heavy-tailed throughout
 _PLAIN = 5.0  # sd: outliers that can be taken off one by one
-_PRESENT, _OWN_LAW = 4.0, 10.0  # nats of a sensor, as the others or not
+_PRESENT, _OWN_LAW = 4.0, 10.0  # nats of a sensor that tells the law of all, and of one that has it whatever they say
 _UNLIKE = 5.0  # nats for each sensor that has a law of its own
 _LIKELY = 0.8  # probability of being hit
 _ROUNDS, _ROUNDS_AGAIN = 40, 10
@@ -211,13 +211,14 @@ def _alike(z: Tensor, laws: list[Outliers], hit: tuple[int, ...]) -> list[Outlie
 
 def _shared(z: Tensor, laws: list[Outliers], hit: tuple[int, ...]) -> list[Outliers]:
     """The law of some sensors, in sd of their noise, for each."""
-    # Where a law of its own takes half of the noise for outliers its scale is not that of the noise.
+    # Where a law of its own takes much of the noise for outliers its scale is not that of the noise.
     units = [
         law.scale if law.rate < _ISOLATED else Outliers.none().scaled(row).scale
         for row, law in zip(z, laws, strict=True)
     ]
     law = fitted(torch.cat([z[i] / units[i] for i in hit]))
-    return [law.times(unit).scaled(row) for row, unit in zip(z, units, strict=True)]
+    scales = [law.times(unit).scaled(row).scale for row, unit in zip(z, units, strict=True)]
+    return [law.times(scale / law.scale) for scale in scales]
 
 
 def _limited(z: Tensor, laws: list[Outliers], hit: tuple[int, ...]) -> list[Outliers]:

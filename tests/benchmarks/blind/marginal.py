@@ -83,7 +83,7 @@ def variance_change(bench: Bench, nats: float, *, episodes: int = 1) -> Part:
 
     Less, where there are several, what says which of so many places are theirs: that nobody is told.
     """
-    sensors, told = bench.some_sensors(2), nats
+    sensors, unknown = bench.some_sensors(2), 0.0
     if episodes == 1:
         length = int(bench.rng.uniform(0.1, 0.4) * bench.n)
         starts = np.array([int(bench.rng.uniform(0.1, 0.5) * bench.n)])
@@ -91,11 +91,11 @@ def variance_change(bench: Bench, nats: float, *, episodes: int = 1) -> Part:
         length = max(int(0.15 * bench.n / episodes), 8)
         places = bench.n // (2 * length) - 1
         starts = np.sort(bench.rng.choice(places, episodes, replace=False)) * 2 * length
-        told += math.log(math.comb(places, episodes))
+        unknown = math.log(math.comb(places, episodes))
     loud = np.zeros(bench.n, dtype=bool)
     for start in starts:
         loud[start : start + length] = True
-    per_sample = told / (len(sensors) * loud.sum())
+    per_sample = (nats + unknown) / (len(sensors) * loud.sum())
     ratio = 1 + solve(per_sample, lambda x: (x - math.log1p(x)) / 2, 1e-6, 1e4)
     signal = np.zeros((bench.n_sensors, bench.n))
     extra = bench.sampled(math.sqrt(OVERSAMPLING) * bench.rng.standard_normal((len(sensors), bench.steps)))
@@ -103,21 +103,20 @@ def variance_change(bench: Bench, nats: float, *, episodes: int = 1) -> Part:
 
     def llr(recording: Array) -> float:
         e = innovations(recording, bench.spectrum)[list(sensors)][:, loud]
-        return float((e**2 * (1 - 1 / ratio) - math.log(ratio)).sum() / 2)
+        return float((e**2 * (1 - 1 / ratio) - math.log(ratio)).sum() / 2) - unknown
 
     truth = Part(
         "variance_change",
         nats,
         sensors,
         llr,
-        oracle_nats=told,
         oracle_null=quadratic_null(np.full(len(sensors) * int(loud.sum()), ratio)),
         signal=signal,
         sensor_nats=(nats / len(sensors),) * len(sensors),
         parameters={"factor": quantity(ratio, "")},
     )
     if episodes > 1:
-        return replace(truth, look_alikes=("spikes",) if length < 64 else ())
+        return replace(truth, look_alikes=("spikes",) if length < 64 else (), oracle_law="bound")
     delta = len(sensors) * math.log(ratio) ** 2 / 2
     start_s = float(starts[0] / bench.rate)
     return replace(
