@@ -69,7 +69,7 @@ def onset_samples(case: Case, look: SlowLook, scan: Scan, size: Tensor) -> tuple
     which = list(concerned(scan))
     size = size[which, None]
     low, high = plausible(look, scan)
-    margin = max(high - low, 4.0 * case.block)
+    margin, coarser = max(high - low, 4.0 * case.block), case.n_samples
     while True:
         first, end = max(int(low - margin), 0), min(int(high + margin), case.n_samples)
         cell = max(-(-(end - first) // _CELLS), 1)
@@ -84,7 +84,8 @@ def onset_samples(case: Case, look: SlowLook, scan: Scan, size: Tensor) -> tuple
         places = first + cell * torch.arange(1, n_cells, dtype=torch.float64)
         mean = places @ weight
         sd = float(((places - mean).square() @ weight).sqrt())
-        if cell == 1 or sd > _FINE * cell:
+        if cell == 1 or sd > _FINE * cell or cell >= coarser:  # places far apart keep cells from getting finer
             return quantiles(places, weight)
+        coarser = cell
         at = (weight > _NEGLIGIBLE * weight.max()).nonzero()[:, 0]
         low, high, margin = float(places[at[0]]), float(places[at[-1]]), _MARGIN * cell
