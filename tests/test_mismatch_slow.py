@@ -305,6 +305,16 @@ def test_the_channel_is_named_and_the_unit_is_by_kelvin():
     assert finding.parameters["coefficient[0]"].unit == "deg/s/K"
 
 
+def test_the_search_for_an_onset_ends_where_two_places_are_likely():
+    """Two halves of a step 1.5 s apart: cells that hold both places in so many do not get finer."""
+    halves = (0.5 * (T >= 9000) + 0.5 * (T >= 9150)).double()
+    found = Step.nominate(case(halves, seed=2), LEVEL)
+    assert found is not None
+    assert 89.5 < found.time_s < 92
+    onset = found.parameters["onset"]
+    assert onset.low <= onset.value <= onset.high
+
+
 def test_the_onset_of_a_large_step_is_known_to_samples():
     at = 6345
     finding = best(case(torch.tensor([8.0, 0, 6, 0])[:, None] * (at <= T).double()))
