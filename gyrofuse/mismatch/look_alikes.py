@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
 
 import torch
 
@@ -133,7 +132,7 @@ def _shapes(case: Case, finding: Finding) -> list[Mechanism]:
         free = term.free if isinstance(term, Common) else term.free & own
         if not bool(free.any()):
             continue
-        tried.append(fit(data, [replace(term, free=free, local=torch.where(free, term.local, 0.0))], _ROUNDS))
+        tried.append(fit(data, [term.only(free)], _ROUNDS))
     best = max(tried, key=lambda f: f.gain - _NUMBER * f.n_free, default=None)
     return [] if best is None else [_of_term(case, best.terms[0])]
 

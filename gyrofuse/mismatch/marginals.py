@@ -17,13 +17,13 @@ from gyrofuse.mismatch.recurring import missing_recurrences
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.side import Side
 
+END_STOPS = 1  # place of a converter's in the chain from sensor to numbers
 _BLOCKS = 32  # whose spread tells how far repeats vary by themselves
 _QUARTERS = 4
 _BY_CHANCE = 3.0  # times the variance expected of quarters
 _COUNTED = 20.0  # repeats that are expected, below which they are counted one by one
 _COARSE, _AT_LAST_STEP = 0.05, 4.0  # of the noise; samples that may lie on a lattice's last step by chance
 _CELLS = 10.0  # of the resolution in the noise's sd: how far the two largest values are apart on average, with margin
-_PLACE = 1  # of end stops in a converter
 _SAME_END = 0.01  # sd of a sample given all others
 _BY_CHANCE_AT_END = 0.005  # p value of so many more at the end than the simulation has
 
@@ -214,7 +214,7 @@ def _simulation_ends(case: Case, sensor: int, sign: int) -> bool:
         return True
     chance = float(stats.binom.sf(own.again - 1, own.again + other.again, own.n / (own.n + other.n)))
     within = other.reach < own.reach + _SAME_END * float(left_out(case.recorded).sd[0, sensor])
-    given = any(place == _PLACE for place, _ in case.converter)
+    given = any(place == END_STOPS for place, _ in case.converter)
     return (other.again > 0 or (given and within)) and chance > _BY_CHANCE_AT_END
 
 

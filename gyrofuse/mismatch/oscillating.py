@@ -22,7 +22,6 @@ from gyrofuse.mismatch.steadiness import Steadiness, steadiness
 from gyrofuse.mismatch.sweeps import swept
 from gyrofuse.mismatch.witnesses import level_of
 
-_SEEN = 0.04  # chance that a sensor seems to have it, of those that are taken for sure to begin with
 _BAND = 6.0  # half widths on either side
 _PARTS, _MOST_ALIKE = 16, 0.8  # of a record, to see a frequency wander, and the correlation of neighbours
 _FEWEST = 3  # samples of the band in a part
@@ -132,7 +131,7 @@ def nominated(case: Case, level: float, *, tone: bool) -> tuple[Mode, Seen] | No
         # Which sensors it takes is a matter of likelihood: variances are as uncertain as the width is.
         has = shape.term.free.any(0)
     else:
-        has = partakers(*_seen(bump), _SEEN).which
+        has = partakers(*_seen(bump)).which
     sensors = tuple(has.nonzero()[:, 0].tolist())
     verdict = steadiness(case, bump)
     steady = verdict.tone and bump.width <= _BROAD * bump.centre  # what is all over the spectrum is no tone

@@ -11,6 +11,7 @@ from torch import Tensor
 
 _SIZES = (0.7, 1.0, 1.4)  # of an effect in a sensor over that in others of its array: built alike, they feel alike
 _ROUNDS, _HALVINGS = 4, 30
+_CHANCE = 0.04  # that any sensor seems to have an effect, to begin with
 _SURE = 1e-6  # chance that any sensor seems to have it, of one that has it whatever the others have
 _LARGEST = 1e6  # statistic
 
@@ -31,7 +32,7 @@ class Partakers(NamedTuple):
         return tuple(self.which.nonzero()[:, 0].tolist())
 
 
-def partakers(statistic: Tensor, dof: int, chance: float) -> Partakers:
+def partakers(statistic: Tensor, dof: int, chance: float = _CHANCE) -> Partakers:
     """Those whose statistic is likelier with about as much of the effect as others have than with none.
 
     Without it is chi-square, with it noncentral: where the others have much, a little is chance; where they have

@@ -27,7 +27,6 @@ _SMALL = 0.1  # share of what there was to explain that may be left all the same
 _NEW = 8.0  # nats that a shape costs beside its numbers
 _NUMBER = 2.0  # nats for a number of a sensor: those of sensors that have it are alike
 _PART = 4.0  # nats for each further part of the noise whose numbers are others
-_SEEN = 0.04  # chance that a sensor seems to have it, of those that are taken for sure to begin with
 _OWN = 0.02  # of a sensor's power in any band, beside what is common
 _TOUCH = 0.1
 _FORMS = 3  # of filters
@@ -68,25 +67,26 @@ def best_shapes(data: Ratios, *, differ: bool) -> tuple[Ratios, Fit | None]:
 
 def _of_partakers(data: Ratios, found: Fit, i: int) -> Fit:
     """With one of the shapes in the sensors that have about as much of it as others, and in no other."""
-    terms, term = list(found.terms), found.terms[i]
-    whole = fit(data, [*terms[:i], _freed(data, term), *terms[i + 1 :]])
+
+    def with_shape(fitted: Fit, term: Term) -> list[Term]:
+        return [*fitted.terms[:i], term, *fitted.terms[i + 1 :]]
+
+    term = found.terms[i]
+    whole = fit(data, with_shape(found, _freed(data, term)))
     every = whole.terms[i]
-    concerned = every.free.any(0).nonzero()[:, 0].tolist()
     statistic = torch.full((data.n_sensors,), -1.0, dtype=torch.float64)
-    for sensor in concerned:
-        free = every.free.clone()
-        free[:, sensor] = False
-        less = replace(every, free=free, local=torch.where(free, every.local, 0.0))
-        without = fit(data, [*whole.terms[:i], less, *whole.terms[i + 1 :]], QUICK)
+    for sensor in every.free.any(0).nonzero()[:, 0].tolist():
+        others = torch.arange(data.n_sensors) != sensor
+        without = fit(data, with_shape(whole, every.only(every.free & others)), QUICK)
         statistic[sensor] = 2 * max(whole.gain - without.gain, 0.0)
     if not bool((statistic > 0).any()):
         return found
-    which = partakers(statistic, int(every.free.sum(0).max()), _SEEN).which
+    which = partakers(statistic, int(every.free.sum(0).max())).which
     # Those it was not seen in get all of its numbers.
     free = torch.where(term.free.any(0), term.free, every.free) & which
     if bool((free == term.free).all()):
         return found
-    return fit(data, [*terms[:i], replace(term, free=free, local=torch.where(free, every.local, 0.0)), *terms[i + 1 :]])
+    return fit(data, with_shape(found, replace(term, local=every.local).only(free)))
 
 
 def _value(data: Ratios, found: Fit) -> float:
@@ -125,7 +125,7 @@ def _pruned(data: Ratios, found: Fit) -> Fit:
             t = torch.where(term.free, (term.local / found.sd_given_shared(i)).abs().nan_to_num(nan=0.0), 0.0)
             keep = term.free & ((t >= threshold) | (t == t.max()))
             changed |= bool((keep != term.free).any())
-            terms.append(replace(term, free=keep, local=torch.where(keep, term.local, 0.0)))
+            terms.append(term.only(keep))
         if changed:
             found = fit(data, terms)
             best = max(best, found, key=lambda f: _value(data, f))

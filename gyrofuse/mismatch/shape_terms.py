@@ -44,6 +44,10 @@ class Term:
         """How far shared numbers may go at once."""
         return torch.full_like(self.shared, 0.7)
 
+    def only(self, free: Tensor) -> Term:
+        """With those local numbers free `(number, sensor)`, the others 0."""
+        return replace(self, free=free, local=torch.where(free, self.local, 0.0))
+
     def within(self) -> Term:
         """With numbers that are allowed."""
         return replace(self, local=self.local.clamp(min=self.lower))

@@ -44,7 +44,7 @@ _BROAD = 3.0  # half widths
 _SHARP, _NARROW = 0.1, (0.02, 0.04, 0.08)  # the same, below which bands are too wide for it, and of it there
 _FINE, _NARROWEST = 24, 0.005  # bands in an octave for those, and the least that they show
 _STEEPER, _FLICKER = 4.0, 0.25  # nats that another slope gains, and distance from 1 of flicker noise's
-_UNSTEADY = 0.01  # p value, of two, of a level that may change
+_UNSTEADY = 0.01  # p value of either sign of a level that may change
 _OFF = 0.25  # logarithm by which a centre from wide bands may be off
 
 
@@ -111,7 +111,7 @@ def _in_sensors_of(term: Term, rival: Term) -> Term:
     if isinstance(term, Common) or isinstance(rival, Common):
         return rival
     free = rival.free & term.free.any(0)
-    return replace(rival, free=free, local=torch.where(free, rival.local, 0.0)) if bool(free.any()) else rival
+    return rival.only(free) if bool(free.any()) else rival
 
 
 def chosen_shape(case: Case, name: str, level: float) -> Shape | None:

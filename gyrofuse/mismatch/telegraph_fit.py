@@ -117,18 +117,28 @@ class TwoLevels(NamedTuple):
     @property
     def lasts(self) -> bool:
         """Whether it is over the rival for more than a moment."""
-        return bool(np.sort(self.values[0] - self.rival)[:-_MOMENTS].sum() > 0)
+        return bool(self._leads[:-_MOMENTS].sum() > 0)
 
     @property
     def momentary(self) -> bool:
         """Whether a moment has more of it than chance would give one."""
-        return bool(np.sort(self.values[0] - self.rival)[-_MOMENTS:].sum() > _EVENT)
+        return bool(self._leads[-_MOMENTS:].sum() > _EVENT)
+
+    @property
+    def _leads(self) -> Array:
+        """Over the rival in each judged block, sorted."""
+        return np.sort(self.values[0] - self.rival)
 
     @property
     def resolved(self) -> bool:
         """Whether dwells are between blocks and a few steps."""
         slow = len(self.means.y) / np.exp(self.theta[0, 1:]).mean() < _FEWEST_SWITCHES
-        return not slow and self.tau >= _BLOCKS[0] * self.means.block
+        return not slow and not self.fast
+
+    @property
+    def fast(self) -> bool:
+        """Whether blocks are too long for it."""
+        return self.tau < _BLOCKS[0] * self.means.block
 
     @property
     def tau(self) -> float:
@@ -181,7 +191,7 @@ def two_levels(case: Case) -> dict[int, TwoLevels]:
 def _in_fit_blocks(case: Case, sensor: int, sd: float, tau: float) -> TwoLevels | None:
     """Of one sensor, in shorter blocks where levels turn out to change faster than its spectrum had it."""
     found = _fitted(case, sensor, sd, tau)
-    if found is None or found.tau >= _BLOCKS[0] * found.means.block:
+    if found is None or not found.fast:
         return found
     return _fitted(case, sensor, sd, found.tau) or found
 

@@ -20,7 +20,6 @@ from gyrofuse.units import GRAVITY
 
 _OF_ONE_BAND = 0.9  # share of the evidence from which a gain might be a line's alone
 _WHOLE = ("each", "length")  # kinds of rows that are made from all of a channel
-_SEEN = 0.04  # chance that a sensor seems to follow the channel, of those that are taken for sure to begin with
 _LATE = 0.25  # share of the evidence a quarter of a cycle late, from which it is no instantaneous coupling
 _SCATTER = 3.0  # standard deviations of what is so by chance
 
@@ -72,7 +71,7 @@ class ChannelGain(Mechanism):
         chance = fit.gains.numel()  # mean of what is seen a quarter of a cycle late, with the variance twice as large
         if p_value > level or fit.quadrature > chance + _SCATTER * math.sqrt(2 * chance) + _LATE * fit.excess:
             return None
-        present = partakers(fit.squares, fit.gains.shape[-1], _SEEN).positions
+        present = partakers(fit.squares, fit.gains.shape[-1]).positions
         unit, factor = cls._unit(case.scene, name)
         sizes = {i: _size(fit, i, unit, factor) for i in present}
         largest = max(sizes, key=lambda i: abs(sizes[i].value))

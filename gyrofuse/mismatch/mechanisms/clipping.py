@@ -13,7 +13,7 @@ from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.evidence import corrected
 from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.impulses import left_out
-from gyrofuse.mismatch.marginals import EndStop, end_stops
+from gyrofuse.mismatch.marginals import END_STOPS, EndStop, end_stops
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
 
 _CELL = 0.02  # width of a cell at the limit, sd: what a sample there is worth is bounded by it
@@ -29,7 +29,7 @@ class Clipping(Mechanism):
     """
 
     name: ClassVar[str] = "clipping"
-    place: ClassVar[int] = 1
+    place: ClassVar[int] = END_STOPS
     low: Tensor
     high: Tensor
     centre: Tensor

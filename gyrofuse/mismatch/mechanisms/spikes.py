@@ -213,7 +213,7 @@ def _shared(z: Tensor, laws: list[Outliers], hit: tuple[int, ...]) -> list[Outli
     """The law of some sensors, in sd of their noise, for each."""
     # Where a law of its own takes much of the noise for outliers its scale is not that of the noise.
     units = [
-        law.scale if law.rate < _ISOLATED else Outliers.none().scaled(row).scale
+        law.scale if law.rate < _ISOLATED else float(row.square().mean().sqrt())
         for row, law in zip(z, laws, strict=True)
     ]
     law = fitted(torch.cat([z[i] / units[i] for i in hit]))

@@ -20,7 +20,6 @@ from gyrofuse.mismatch.spectra import hann_transform
 from gyrofuse.mismatch.witnesses import level_of
 
 _ROUNDS = 6
-_SEEN = 0.04  # chance that a sensor seems to have the tone, of those that are taken for sure to begin with
 _TAIL = 0.025  # beyond either limit
 _STRONG, _FAR, _HALVINGS = 12.0, 6.0, 40  # standard deviations from which a law is normal, and beyond which none is
 _REACH, _GUARD = 64, 3  # bins on either side that tell the noise, and those too near to
@@ -57,7 +56,7 @@ class VibrationTone(Mechanism):
         n, noise = case.n_samples, density_near(case, f)  # (sensor,)
         sd = (2 * noise / n).sqrt()
         snr = tone.amplitude / sd
-        there = partakers(snr.square(), 2, _SEEN)
+        there = partakers(snr.square(), 2)
         present, seen = there.positions, math.sqrt(there.least)
         # Noise adds to the squares of amplitudes, but tells nothing of the frequency.
         energy = max(float((snr.square() - 2).clamp(min=0.0)[list(present)].sum()), 1.0)
