@@ -91,11 +91,13 @@ def calibrated(p_value: float, among: Tensor) -> float:
     """p value from its rank among those of twins `(twin,)`, in which nothing is missing.
 
     Beyond the smallest quarter of them the tail is fitted instead of counted: `-log p` has an exponential tail, with
-    rate one where witnesses are honest. The maximum of its likelihood is the inverse mean excess.
+    rate one where witnesses are honest. What the next excess surpasses with a given probability is told by `k` others
+    exactly: `x` with `(1 + x / sum)^-k`.
     """
     scores, own = -among.clamp(min=1e-300).log(), -math.log(max(p_value, 1e-300))
-    threshold = float(scores.quantile(1 - _TAIL))
-    if own <= threshold:
+    highest = scores.topk(round(_TAIL * len(scores)) + 1).values
+    threshold, k = float(highest[-1]), len(highest) - 1
+    total = float((highest - threshold).sum())
+    if own <= threshold or total == 0:
         return float(((scores >= own).sum() + 1) / (len(scores) + 1))
-    excess = scores[scores > threshold] - threshold
-    return _TAIL * math.exp(-(own - threshold) / float(excess.mean()))
+    return (k + 1) / (len(scores) + 1) * math.exp(-k * math.log1p((own - threshold) / total))
