@@ -86,6 +86,11 @@ def tone_in_hann(x: Tensor, n: int) -> Tensor:
     return sign * (dirichlet(x, n)[0] / 2 + side)
 
 
+def squared_modulus(values: Tensor) -> Tensor:
+    """`|z|^2` of complex values, without the root that `abs` takes: several times as fast."""
+    return values.real.square().addcmul_(values.imag, values.imag)
+
+
 def fast_length(n: int) -> int:
     """Smallest even length >= n with the factors 2, 3 and 5 only: a prime one can be a hundred times slower."""
     best = 1 << max((n - 1).bit_length(), 1)

@@ -12,7 +12,7 @@ from scipy import stats
 from scipy.signal import windows
 from torch import Tensor
 
-from gyrofuse._transforms import fast_length
+from gyrofuse._transforms import fast_length, squared_modulus
 from gyrofuse.mismatch.bump_scan import flank_of, least_flank, log_ratios, scanned_bumps
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import Evidence, corrected, ratio_p_value
@@ -69,10 +69,10 @@ def strongest_bump(case: Case) -> Stretch:
     last = int((0.5 - 2 / case.n_samples) * length)
     transform = transform[:, :last]
     worth = case.n_samples / length / _DEPENDENT
-    scans = list(scanned_humps(_apart(transform, length, case).abs().square(), worth))
+    scans = list(scanned_humps(squared_modulus(_apart(transform, length, case)), worth))
     if case.n_sensors > 1:
         scans += scanned_bumps(transform, worth)
-    power, nothing = transform.abs().square(), Stretch(0.25, 0.5, 1.0, tuple(range(case.n_sensors)))
+    power, nothing = squared_modulus(transform), Stretch(0.25, 0.5, 1.0, tuple(range(case.n_sensors)))
     simulated: tuple[Tensor, int] | None = None
     for _ in range(_TRIES if scans else 0):
         best = max(scans, key=lambda scan: float(scan.log_ratio.amax()))

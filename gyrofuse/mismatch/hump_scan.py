@@ -15,8 +15,8 @@ import math
 from collections.abc import Iterator
 
 import torch
+from scipy import signal
 from torch import Tensor
-from torch.nn.functional import conv1d
 
 from gyrofuse.mismatch.bump_scan import Stretches
 from gyrofuse.mismatch.evidence import some_of
@@ -59,10 +59,8 @@ def _scores(cells: Tensor, half: float, worth: float, lowest: int) -> tuple[Tens
     kernels = torch.stack([torch.ones_like(shape), shape, shape.square()])[:, None]
     used = torch.ones_like(cells[:1])
     used[:, :lowest] = 0
-    count, first, second = conv1d(used[None], kernels, padding=reach)[0]
-    # Sensor by sensor: convolutions of many rows lay out every window of all of them.
-    rows = [conv1d(row[None, None], kernels[:2], padding=reach)[0] for row in cells * used]
-    total, along = torch.stack(rows, 1)
+    count, first, second = _around(used, kernels)[:, 0]
+    total, along = _around(cells * used, kernels[:2])
     count = count.clamp(min=1.0)
     variance = (second - first.square() / count).clamp(min=1e-9) / worth
     standard = (along * count / total.clamp(min=1e-300) - first) / variance.sqrt()
@@ -70,6 +68,12 @@ def _scores(cells: Tensor, half: float, worth: float, lowest: int) -> tuple[Tens
     skewness = float(away.pow(3).sum() / away.square().sum().pow(1.5)) * math.sqrt(len(shape))
     inside = (1 - skewness / math.hypot(skewness, 2.0)) / 2
     return _normal_of_share(standard, inside, len(shape) * worth), count > _WHOLE * len(shape)
+
+
+def _around(rows: Tensor, kernels: Tensor) -> Tensor:
+    """Rows `(row, cell)` weighed with kernels `(kernel, 1, cell)` about each cell, `(kernel, row, cell)`."""
+    every = rows.expand(len(kernels), -1, -1)
+    return torch.from_numpy(signal.oaconvolve(every.numpy(), kernels.numpy(), mode="same", axes=-1))
 
 
 def _normal_of_share(standard: Tensor, inside: float, n: float) -> Tensor:

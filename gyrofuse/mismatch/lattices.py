@@ -16,6 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gyrofuse._transforms import squared_modulus
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import corrected, ratio_p_value, some_of, surpassing
 from gyrofuse.mismatch.impulses import left_out
@@ -144,7 +145,7 @@ def _characteristic(rows: list[Tensor], sd: float) -> tuple[Tensor, Tensor]:
     places = [((row - row[0]) / bin_width).long() % n_bins for row in rows]
     counts = torch.stack([torch.bincount(place, minlength=n_bins) for place in places]).to(torch.float64)
     n = torch.tensor([len(row) for row in rows], dtype=torch.float64)
-    power = torch.fft.rfft(counts).abs().square() / n[:, None]
+    power = squared_modulus(torch.fft.rfft(counts)) / n[:, None]
     return 2 * math.pi * torch.arange(power.shape[-1], dtype=torch.float64) / (n_bins * bin_width), power
 
 

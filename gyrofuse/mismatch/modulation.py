@@ -15,7 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse._transforms import fast_length
+from gyrofuse._transforms import fast_length, squared_modulus
 from gyrofuse.mismatch.evidence import corrected
 from gyrofuse.mismatch.lines import sets_of
 
@@ -67,7 +67,7 @@ def strongest_modulation(squares: Tensor) -> Modulation:
             last = min(first + _CHUNK, high + 1)
             places = torch.arange(round(first * fine), round(last * fine))
             part = transform[:, places]
-            power = torch.cat([(scaled @ part).abs().square(), part.abs().square().sum(0, keepdim=True)])
+            power = torch.cat([squared_modulus(scaled @ part), squared_modulus(part).sum(0, keepdim=True)])
             total += power[:, (torch.arange(first, last) * fine).round().long() - places[0]].sum(-1)
             if first > _FIRST:
                 best, where = power.max(-1)

@@ -82,12 +82,14 @@ def cross_spectra(signal: Tensor, wanted: Bands) -> Tensor:
     signal = signal - signal.mean(-1, keepdim=True)
     transform = torch.fft.rfft(signal, n=2 * n)
     matrices, scale = [], n / wanted.n_samples
-    taper = torch.arange(1, _TAPERS + 1)[:, None]
+    # Half bins around each bin, `(..., sensor, bin, half bin)`, from the first one that has so many below it.
+    first_whole, odd = -(-_TAPERS // 2), _TAPERS % 2
+    around = transform[..., odd:].unfold(-1, 2 * _TAPERS + 1, 2)
     for first, end in itertools.pairwise(wanted.edges):
         a = max(round(first * scale), _FIRST_BIN)
         b = min(max(round(end * scale), a + 1), (n - _TAPERS) // 2)
-        m = 2 * torch.arange(a, b)
-        y = (transform[..., m - taper] - transform[..., m + taper]).flatten(-2)  # (..., sensor, taper * bin)
+        own = around[..., a - first_whole : b - first_whole, :]
+        y = (own[..., :_TAPERS] - own[..., _TAPERS + 1 :].flip(-1)).flatten(-2)  # (..., sensor, bin * taper)
         matrices.append(y @ y.mH / (2 * n * y.shape[-1]))
     return torch.stack(matrices, -3)
 

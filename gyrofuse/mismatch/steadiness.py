@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate, pad
 
+from gyrofuse._transforms import squared_modulus
 from gyrofuse.mismatch.bump_fit import Oscillation
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.wandering import rampless_transform, wandering_log_ratio, weights_in_phase
@@ -50,15 +51,15 @@ def steadiness(case: Case, bump: Oscillation) -> Steadiness:
     if len(bins) < _LEAST:
         return Steadiness(tone=False, open=True, slow=False)
     generator = torch.Generator().manual_seed(0)
-    smooth = _smoothed(bins.abs().square())
-    gaussian = _drawn(smooth, generator)
-    ridge, steady = _scores(bins[None], gaussian)
+    smooth = _smoothed(squared_modulus(bins))
+    usual = _Usual.of(_drawn(smooth, generator))
+    ridge, steady = usual.scores(bins[None])
     if max(float(ridge), float(steady)) > _FIRES:
         return Steadiness(tone=True, open=False, slow=float(ridge) > _FIRES)
     log_ratio = wandering_log_ratio(case, bump, weights)
     # What would not be seen of a tone is no proof of noise.
     would = [
-        float(torch.stack(_scores(tones, gaussian)).amax(0).median())
+        float(torch.stack(usual.scores(tones)).amax(0).median())
         for tones in _tones(bump, smooth, floor, case.n_samples, generator)
     ]
     unsure = abs(log_ratio) < _SURE or (log_ratio < 0 and min(would) < _WOULD_FIRE)
@@ -74,7 +75,7 @@ def _baseband(case: Case, bump: Oscillation, weights: Tensor) -> tuple[Tensor, f
     if 2 * reach < _LEAST:
         return torch.zeros(0, dtype=weights.dtype), 0.0
     bins = weights @ rampless_transform(case)[:, centre - reach : centre + reach]
-    power = bins.abs().square()
+    power = squared_modulus(bins)
     edge = max(len(power) // 8, 1)
     floor = float((power[:edge].mean() + power[-edge:].mean()) / 2)
     tail = 1 / (1 + (reach / max(bump.width * n, 1e-9)) ** 2)
@@ -119,21 +120,39 @@ def _tones(bump: Oscillation, smooth: Tensor, floor: float, n_samples: int, gene
     return made
 
 
-def _scores(bins: Tensor, gaussian: Tensor) -> tuple[Tensor, Tensor]:
-    """How far records lie from Gaussian ones, sds `(record,)`: of short windows' peaks, and of the envelope."""
-    ridge, among = _ridges(bins), _ridges(gaussian)  # (window, record)
-    middle, spread = among.mean(1, keepdim=True), among.std(1, keepdim=True)
-    most = ((among - middle) / spread).amax(0)
-    peak = (((ridge - middle) / spread).amax(0) - most.mean()) / most.std()
-    steady, usual = _steady(bins), _steady(gaussian)
-    return peak, (steady - usual.mean()) / usual.std()
+class _Usual(NamedTuple):
+    """What Gaussian records show.
+
+    Attributes:
+        middle, spread: Of peaks in short windows, `(length, 1)`.
+        most: Of the largest of them in a record, in units of their spread: mean and sd.
+        steady: Of the envelope: mean and sd.
+    """
+
+    middle: Tensor
+    spread: Tensor
+    most: tuple[Tensor, Tensor]
+    steady: tuple[Tensor, Tensor]
+
+    @classmethod
+    def of(cls, bins: Tensor) -> _Usual:
+        """From bins `(record, bin)`."""
+        among, steady = _ridges(bins), _steady(bins)
+        middle, spread = among.mean(1, keepdim=True), among.std(1, keepdim=True)
+        most = ((among - middle) / spread).amax(0)
+        return cls(middle, spread, (most.mean(), most.std()), (steady.mean(), steady.std()))
+
+    def scores(self, bins: Tensor) -> tuple[Tensor, Tensor]:
+        """How far records lie from Gaussian ones, sds `(record,)`: of short windows' peaks, and of the envelope."""
+        most = ((_ridges(bins) - self.middle) / self.spread).amax(0)
+        return (most - self.most[0]) / self.most[1], (_steady(bins) - self.steady[0]) / self.steady[1]
 
 
 def _steady(bins: Tensor) -> Tensor:
     """`2 - E |z|^4 / (E |z|^2)^2`: 0 of Gaussian noise, 1 of a tone."""
     best = bins.shape[-1]
     inner = bins[..., best // 4 : best - best // 4]
-    power = torch.fft.ifft(inner).abs().square()
+    power = squared_modulus(torch.fft.ifft(inner))
     return 2 - power.square().mean(-1) / power.mean(-1).square()
 
 
@@ -144,7 +163,7 @@ def _ridges(bins: Tensor) -> Tensor:
     length = 8
     while length <= max(n // 8, 8):
         windows = z[..., : n // length * length].unflatten(-1, (-1, length))
-        power = torch.fft.fft(windows).abs().square()
+        power = squared_modulus(torch.fft.fft(windows))
         white = power / power.mean(-2, keepdim=True)
         found.append((white.amax(-1) / white.mean(-1)).log().mean(-1))
         length *= 2

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gyrofuse._transforms import squared_modulus
 from gyrofuse.mismatch.evidence import corrected
 from gyrofuse.mismatch.lines import sets_of
 from gyrofuse.mismatch.track_fit import AROUND, Candidate, fitted_track
@@ -67,24 +68,20 @@ def strongest_sweep(white: Tensor) -> Sweep:
 
 def _conspicuous(segments: Tensor, moves: int, signs: Tensor) -> list[Candidate]:
     """The tracks with most power, of segments `(sensor, segment, time)`, up to so many bins from one to the next."""
-    _, count, length = segments.shape
+    length = segments.shape[-1]
     centred = ((torch.arange(length) - (length - 1) / 2) / length).square()
-    sizes = signs.abs().sum(-1)
     kept: list[Candidate] = []
     for undone in range(_EVERY // 2, moves + _EVERY // 2, _EVERY):
         turn = torch.polar(torch.full((length,), length**-0.5), -math.pi * undone * centred)
         bins = torch.fft.fft(segments * turn)  # (sensor, segment, bin)
-        powers = bins.abs().square().clamp(max=_CUT)
-        for move in range(max(undone - _EVERY // 2, 1), min(undone + _EVERY // 2, moves)):
-            sums = _tracks(powers.sum(0), move)
-            at = sums.flatten().topk(min(_CANDIDATES, sums.numel())).indices
-            along = (at % length)[:, None] + move * torch.arange(count) + _drift(at // length, count)
-            values = bins[:, torch.arange(count), along % length]  # (sensor, track, segment)
-            values = values * (math.sqrt(_CUT) / values.abs().clamp(min=math.sqrt(_CUT)))
-            both = signs @ torch.view_as_real(values).flatten(1)  # real and imaginary parts
-            power = both.square().view(len(signs), len(along), -1).sum(-1) / sizes[:, None]
-            least = kept[-1].power if len(kept) == _FITTED else 0.0
-            kept += _best(power, along, bins, undone, signs, least)
+        powers = squared_modulus(bins).clamp(max=_CUT).sum(0)
+        tracks = [
+            _most_power(bins, powers, move, signs)
+            for move in range(max(undone - _EVERY // 2, 1), min(undone + _EVERY // 2, moves))
+        ]
+        least = kept[-1].power if len(kept) == _FITTED else 0.0
+        power, which, along = (torch.cat(part) for part in zip(*tracks, strict=True))
+        kept += _best(power, which, along, bins, undone, signs, least)
         kept = sorted(kept, key=lambda candidate: -candidate.power)[:_FITTED]
     return kept
 
@@ -98,30 +95,51 @@ def _signs(p: int) -> Tensor:
     return every[first > 0]
 
 
-def _best(power: Tensor, along: Tensor, bins: Tensor, undone: int, signs: Tensor, least: float) -> list[Candidate]:
-    """The most conspicuous ones of tracks `(combination, track)`, each with its combination of sensors.
+def _most_power(bins: Tensor, powers: Tensor, move: int, signs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Tracks on which all sensors have most power: that of their likeliest combination, which, and their bins.
 
     Args:
-        power: Of all combinations of sensors.
-        along: Bins of the tracks, `(track, segment)`.
+        bins: Transforms, `(sensor, segment, bin)`.
+        powers: Of all sensors together, `(segment, bin)`.
+        move: Bins from segment to segment, at least.
+        signs: The combinations, `(combination, sensor)`.
+
+    Returns:
+        `(track,)`, `(track,)` and `(track, segment)`.
+    """
+    count, length = powers.shape
+    sums = _tracks(powers, move)
+    at = sums.flatten().topk(min(_CANDIDATES, sums.numel())).indices
+    along = (at % length)[:, None] + move * torch.arange(count) + _drift(at // length, count)
+    values = bins[:, torch.arange(count), along % length]  # (sensor, track, segment)
+    values = values * (math.sqrt(_CUT) / values.abs().clamp(min=math.sqrt(_CUT)))
+    parts = torch.view_as_real(values).movedim(0, 1).flatten(2)  # real and imaginary, of each track
+    products = (parts @ parts.mT).flatten(1)  # of two sensors
+    power = products @ (signs[:, :, None] * signs[:, None]).flatten(1).mT / signs.abs().sum(-1)
+    return (*power.max(-1), along)
+
+
+def _best(
+    power: Tensor, which: Tensor, along: Tensor, bins: Tensor, undone: int, signs: Tensor, least: float
+) -> list[Candidate]:
+    """The most conspicuous ones of tracks that move nearly alike.
+
+    Args:
+        power: Of the likeliest combination of sensors, `(track,)`.
+        which: That combination.
+        along: Bins, `(track, segment)`.
         bins: Transforms, `(sensor, segment, bin)`.
         undone: Bins that a frequency moves within a segment, which were undone before.
         signs: The combinations, `(combination, sensor)`.
         least: Power above which a track is among them.
     """
-    highest, which = power.max(0)
-    around = torch.arange(-AROUND, AROUND)
+    best = power.topk(min(_FITTED, len(power))).indices
+    best = best[power[best] > least]
     segment = torch.arange(bins.shape[1])[:, None]
+    around = (along[best][..., None] + torch.arange(-AROUND, AROUND)) % bins.shape[2]
     return [
-        Candidate(
-            float(highest[k]),
-            signs[which[k]],
-            along[k],
-            undone,
-            bins[:, segment, (along[k][:, None] + around) % bins.shape[2]],
-        )
-        for k in highest.topk(min(_FITTED, len(highest))).indices.tolist()
-        if float(highest[k]) > least
+        Candidate(float(power[k]), signs[which[k]], along[k], undone, bins[:, segment, near])
+        for k, near in zip(best.tolist(), around, strict=True)
     ]
 
 

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gyrofuse._transforms import squared_modulus
 from gyrofuse.mismatch.bump_fit import Oscillation
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.remembered import remembered
@@ -26,7 +27,8 @@ _REACH, _FEWEST = 8.0, 256  # half widths on either side, and bins
 _SHORTEST, _LONGEST, _WINDOWS = 4, 128, 4  # samples of a window, and fewest windows
 _STRENGTHS = (0.25, 0.4, 0.6, 1.0, 1.5)  # of the likeliest hump's energy
 _SPEEDS = (0.5, 1.5, 4.0)  # steps from window to window, in half their resolution
-_WIDTHS, _NARROWEST, _WIDEST = 10, 2.0, 0.125  # bins, and share of the band
+_WIDTHS, _NARROWEST, _WIDEST = 10, 2.0, 0.125  # cells, and share of the band
+_MOST_CELLS = 4096  # of a band, in which humps are looked for
 _NO_TAILS = 0.2  # of the power of a Lorentzian of like width and height, that a course without far tails lacks
 _OFF = 0.12  # share of the band by which centres are off
 _CENTRES, _HEIGHTS = 9, (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 12.8, 25.0, 50.0, 100.0)
@@ -47,7 +49,7 @@ def wandering_log_ratio(case: Case, bump: Oscillation, weights: Tensor) -> float
     bins = _band(case, bump, weights)
     if len(bins) < _FEWEST:
         return 0.0
-    hump = _hump(bins.abs().square())
+    hump = _hump(squared_modulus(bins))
     tone = _tone(bins / math.sqrt(hump.level), hump.energy)
     noise = -len(bins) * math.log(hump.level) - float(bins.abs().square().sum()) / hump.level
     return tone + noise - hump.log_mean
@@ -59,7 +61,7 @@ def share_of_lorentzian(case: Case, bump: Oscillation) -> float:
     A course of frequencies that keeps near its middle has no far tails.
     """
     bins = _band(case, bump, weights_in_phase(case, bump))
-    normal = _hump(bins.abs().square()).normal if len(bins) >= _FEWEST else 0.5
+    normal = _hump(squared_modulus(bins)).normal if len(bins) >= _FEWEST else 0.5
     return 1 - _NO_TAILS * normal
 
 
@@ -98,6 +100,8 @@ class Hump(NamedTuple):
 
 def _hump(power: Tensor) -> Hump:
     """Humps of powers `(bin,)`."""
+    worth = -(-len(power) // _MOST_CELLS)  # bins in a cell
+    power = power[: len(power) // worth * worth].unflatten(0, (-1, worth)).mean(-1)
     n = len(power)
     k = torch.arange(n, dtype=torch.float64) - (n - 1) / 2
     widths = torch.logspace(math.log10(_NARROWEST), math.log10(_WIDEST * n), _WIDTHS, dtype=torch.float64)
@@ -109,11 +113,11 @@ def _hump(power: Tensor) -> Hump:
         for of_shape, shape in zip(values, (1 / (1 + square), (-square / 2).exp()), strict=True):
             spectrum = 1 + height * shape  # (height, width, bin)
             level = (power / spectrum).mean(-1)
-            value = -n * (level.log() + 1) - spectrum.log().sum(-1)
+            value = -worth * (n * (level.log() + 1) + spectrum.log().sum(-1))
             of_shape.append(value.flatten())
             at = int(value.argmax())
             if float(value.max()) > best[0]:
-                energy = (height * shape).sum(-1)
+                energy = worth * (height * shape).sum(-1)
                 best = float(value.max()), float(level.flatten()[at]), float(energy.flatten()[at])
     total = torch.stack([torch.cat(of_shape).logsumexp(0) for of_shape in values])
     count = sum(len(part) for of_shape in values for part in of_shape)
@@ -128,7 +132,7 @@ def _tone(bins: Tensor, energy: float) -> float:
     found, length = [], _SHORTEST
     while length <= min(n // _WINDOWS, _LONGEST):
         windows = z[: n // length * length].unflatten(-1, (-1, length))
-        power = torch.fft.fft(windows, n=2 * length).abs().square() / length  # (window, frequency), in circular order
+        power = squared_modulus(torch.fft.fft(windows, n=2 * length)) / length  # (window, frequency), in circular order
         found.append(_courses(power, energy / len(power)))
         length *= 2
     every = torch.cat(found)

@@ -10,6 +10,7 @@ import torch
 from scipy import stats
 from torch import Tensor
 
+from gyrofuse._transforms import squared_modulus
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.folds import estimation_samples
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
@@ -154,7 +155,7 @@ def line_near(case: Case, f: float, reach: float) -> float:
 def _tapered_power(side: Side) -> tuple[Tensor, int]:
     """Periodogram `(sensor, bin)` of a recording under a Hann taper, and the length it was padded to."""
     transform, length = hann_transform(side.signal[0])
-    return transform.abs().square(), length
+    return squared_modulus(transform), length
 
 
 def amplitude_limits(snr: Tensor, seen: float) -> Tensor:
