@@ -12,7 +12,7 @@ import torch
 from scipy import stats
 
 import gyrofuse as gf
-from gyrofuse.mismatch import diagnose
+from gyrofuse.mismatch import diagnose, discrepancy
 from gyrofuse.mismatch.engine import _known
 from gyrofuse.mismatch.evidence import calibrated
 from gyrofuse.mismatch.inputs import prepared
@@ -132,6 +132,17 @@ def test_other_units_are_a_finding():
     assert "rad/s against deg/s" in report.findings[0].sentence
     assert len(report.findings) == 1
     assert not report.unexplained
+
+
+def test_the_discrepancy_is_that_of_a_diagnosis():
+    recording, simulation = array(5), array(6, 4 * N)
+    louder = gf.Recording(1.2 * simulation.signal, rate=simulation.rate, unit=simulation.unit)
+    alike, other = discrepancy(recording, simulation), discrepancy(recording, louder)
+    assert alike == pytest.approx(diagnose(recording, simulation).held_out.before, rel=1e-12)
+    assert other == pytest.approx(diagnose(recording, louder).held_out.before, rel=1e-12)
+    assert alike < 1.5 < 5 < other
+    with pytest.raises(ValueError, match="sensors"):
+        discrepancy(recording, simulation.select(sensors=[0, 1]))
 
 
 def test_known_units_are_converted():

@@ -119,6 +119,11 @@ def sd_of_sum(blocks: Tensor) -> float:
     return float(blocks.std()) * math.sqrt(len(blocks))
 
 
+def mean_discrepancy(case: Case) -> float:
+    """Of all blocks of the recording, by folds."""
+    return sum(discrepancy(case, fold) for fold in range(N_FOLDS)) / N_FOLDS
+
+
 def discrepancy(case: Case, fold: int) -> float:
     """Squared difference of wavelet cross-covariances over its variance, mean over levels and pairs of sensors.
 

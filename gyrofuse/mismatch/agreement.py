@@ -1,0 +1,47 @@
+"""How far a recording and a simulation are apart, without asking why."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gyrofuse._model import Model
+from gyrofuse.mismatch.confirm import mean_discrepancy
+from gyrofuse.mismatch.evidence import uncorrected
+from gyrofuse.mismatch.inputs import prepared
+from gyrofuse.mismatch.own_effects import with_own_effects
+from gyrofuse.mismatch.repaired import RepairedModel
+from gyrofuse.mismatch.testimony import WITNESSES
+from gyrofuse.recording import Recording
+from gyrofuse.simulate import ArrayModel
+
+_FALSE_ALARM = 0.01  # of an effect that both are said to have
+
+
+def discrepancy(
+    recording: Recording | Tensor,
+    simulation: Recording | Tensor | Model | ArrayModel | RepairedModel,
+    *,
+    rate: float | None = None,
+    generator: torch.Generator | None = None,
+) -> float:
+    """Squared differences of wavelet cross-covariances over their variance, mean over levels and pairs of sensors.
+
+    One is chance alone. It is `held_out.before` of a diagnosis, at a fraction of its cost: to judge simulations by
+    recordings that they were not made from.
+
+    Args:
+        recording: As for `diagnose`.
+        simulation: As for `diagnose`.
+        rate: Hz, for recordings given as tensors; 1 by default.
+        generator: Of a model's samples. By default one with a fixed seed.
+
+    Raises:
+        TypeError: Neither samples nor a model.
+        ValueError: Recording and simulation do not fit each other, are too short, or constant.
+    """
+    if generator is None:
+        generator = torch.Generator().manual_seed(0)
+    given = prepared(recording, simulation, rate, generator)
+    start, _ = with_own_effects(given, simulation, uncorrected(_FALSE_ALARM, len(WITNESSES)), generator)
+    return mean_discrepancy(start)
