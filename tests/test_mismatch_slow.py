@@ -224,6 +224,20 @@ def test_p_values_of_scans_hold_among_twins():
         assert int((p < 0.001).sum()) <= stats.binom.ppf(0.999, 256, 0.004)
 
 
+def test_other_simulations_of_the_same_noise_scatter_by_their_length():
+    given = told(case())
+    coefficients = given.coefficients()
+    values = given.drawn(coefficients.expand(4000, -1, -1), generator(6)).values
+    expected = coefficients @ given.atoms
+    ratio = values / expected
+    sure = given.dof > 2
+    assert bool(sure.any())
+    torch.testing.assert_close(ratio[..., sure].mean(0), torch.ones_like(expected[:, sure]), rtol=0, atol=0.05)
+    scatter = ratio[..., sure].var(0) * given.dof[sure]
+    torch.testing.assert_close(scatter, torch.ones_like(scatter), rtol=0, atol=0.15)
+    assert float(ratio.min()) > 0
+
+
 def test_quantiles_of_places():
     places = torch.linspace(0, 100, 2001, dtype=torch.float64)
     weight = torch.softmax(-((places - 40) / 5).square() / 2, 0)

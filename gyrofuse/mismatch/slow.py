@@ -45,6 +45,7 @@ _LEAST_DOF = 0.25
 _UNSEEN = 8  # ordinates below the bands
 _ALIKE = 1.0  # what each of them is worth that all sensors together tell of one, complex ordinates
 _FIT_ROUNDS = 5
+_LEAST_ROOT = 0.1  # cube root of a chi-square over its mean
 
 _Tuple = TypeVar("_Tuple", bound=tuple[Any, ...])
 
@@ -138,6 +139,15 @@ class Told(NamedTuple):
     def noise(self) -> SlowNoise:
         """Of block means, in parts that may be wrong, each by its own factor."""
         return SlowNoise.around(Base(self.n_samples, self.coefficients()), self.slowest_dof)
+
+    def drawn(self, coefficients: Tensor, generator: torch.Generator) -> Told:
+        """What another simulation of as many samples tells, of noise with coefficients `(..., sensor, atom)`."""
+        expected = coefficients @ self.atoms
+        # Chi-square by its cube root, which is normal (Wilson and Hilferty, 1931).
+        spread = 1 / (9 * self.dof)
+        normal = torch.randn(expected.shape, generator=generator, dtype=torch.float64)
+        root = (1 - spread + normal * spread.sqrt()).clamp(min=_LEAST_ROOT)
+        return self._replace(values=expected * root**3)
 
     def coefficients(self) -> Tensor:
         """Those of each sensor's atoms, `(..., sensor, atom)`, drawn to what all sensors together tell."""

@@ -33,7 +33,6 @@ _TWO_LEVELS = 1.6  # distance of the outermost levels, in jumps
 _TWINS = 256
 _DOUBTED = 0.01  # p values below are held against twins
 _FAR = 1000.0  # of chi-squares, beyond which tails are zero to rounding
-_LEAST = 0.1  # cube root of a chi-square over its mean
 
 
 class Best(NamedTuple):
@@ -135,18 +134,14 @@ class SlowLook:
     def _twins(self) -> tuple[SlowNoise, Tensor, Fit]:
         """Noise as their simulations tell it, ordinates `(twin, sensor, ordinate)`, and fits without an effect.
 
-        A twin's recording has the noise that the simulation tells of; its simulation tells it no better than this one.
+        A twin has noise that may be behind this simulation; its own simulation tells of it no better than this one.
         """
         generator = torch.Generator().manual_seed(0)
-        simulation = self.simulation
-        expected = simulation.coefficients() @ simulation.atoms
-        # Chi-square by its cube root, which is normal (Wilson and Hilferty, 1931).
-        spread = 1 / (9 * simulation.dof)
-        normal = torch.randn(_TWINS, *expected.shape, generator=generator, dtype=torch.float64)
-        values = expected * (1 - spread + normal * spread.sqrt()).clamp(min=_LEAST) ** 3
-        noise = simulation._replace(values=values).noise()
+        given = self.simulation
+        behind = given.drawn(given.coefficients().expand(_TWINS, -1, -1), generator)
+        noise = given.drawn(behind.coefficients(), generator).noise()
         normal = torch.randn(_TWINS, *self.y.shape, generator=generator, dtype=torch.float64)
-        y = self.noise.own.sqrt() * normal
+        y = behind.noise().own.sqrt() * normal
         return noise, y, best_fit(noise, y)
 
 
