@@ -91,11 +91,12 @@ def left_out(side: Side) -> LeftOut:
 def _lines(y: Tensor, spectrum: Tensor) -> Tensor:
     """Ordinates `(..., k)` of lines and of their skirts, at every width."""
     lines = y.square() > _LINE * spectrum
-    n, reach, every = y.shape[-1], 4, torch.arange(y.shape[-1])
+    n, reach = y.shape[-1], 4
     # Two neighbours at least make a skirt.
     while reach < n // ENDS and bool((lines.sum(-1) > 1).any()):
-        total = torch.nn.functional.pad(lines.cumsum(-1), (1, 0))
-        within = total[..., (every + reach + 1).clamp(max=n)] - total[..., (every - reach).clamp(min=0)]
+        total = torch.nn.functional.pad(lines.cumsum(-1), (reach + 1, 0))
+        total = torch.cat([total, total[..., -1:].expand(*total.shape[:-1], reach)], -1)
+        within = total[..., 2 * reach + 1 :] - total[..., :n]
         lines = lines | (within > _SKIRT * (2 * reach + 1))
         reach *= 2
     return lines

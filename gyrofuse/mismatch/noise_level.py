@@ -90,11 +90,13 @@ def level_profile(case: Case) -> Tensor:
     return torch.where(found.inside(case.n_samples), factor[:, None], 1.0)
 
 
+@remembered
 def levelled(case: Case) -> Tensor:
     """Whitened recording `(sensor, time)` over the noise level that the simulation has there."""
     return left_out(case.recorded).white[0] / level_profile(case).sqrt()
 
 
+@remembered
 def variance_p_values(case: Case) -> Tensor:
     """p values that the noise level changes, in each sensor and in all together, `(sensor + 1,)`.
 
@@ -187,7 +189,7 @@ def _clustering(squares: Tensor) -> Tensor:
     """Standard normal sum of the autocorrelations of `(..., time)` at short lags."""
     x = _standardised(squares)
     n = x.shape[-1]
-    lags = [(x[..., lag:] * x[..., :-lag]).sum(-1) for lag in range(1, _BURST + 1)]
+    lags = [torch.linalg.vecdot(x[..., lag:], x[..., :-lag]) for lag in range(1, _BURST + 1)]
     return torch.stack(lags).sum(0) / math.sqrt(n * _BURST)
 
 

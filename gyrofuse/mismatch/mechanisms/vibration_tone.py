@@ -95,18 +95,18 @@ class VibrationTone(Mechanism):
         t = torch.arange(case.n_samples, dtype=torch.float64)[keep]
         signal = case.recording[:, keep]
         signal = signal - signal.mean(-1, keepdim=True)
-        omega, middle = 2 * math.pi * frequency_hz / case.scene.rate, float(t.mean())
+        omega, clock = 2 * math.pi * frequency_hz / case.scene.rate, (t - t.mean()) / case.n_samples
         for _ in range(_ROUNDS):
             angle = omega * t
-            basis = torch.stack([angle.cos(), angle.sin()])
-            gram = basis @ basis.mT
-            at = torch.linalg.solve(gram, basis @ signal.mT)  # (2, sensor)
-            quadrature = at[1][:, None] * basis[0] - at[0][:, None] * basis[1]  # slope of the phase, (sensor, time)
-            slope = quadrature * (t - middle)
-            slope = slope - (torch.linalg.solve(gram, basis @ slope.mT)).mT @ basis
-            left = signal - at.mT @ basis
-            step = (weights * (slope * left).sum(-1)).sum() / (weights * slope.square().sum(-1)).sum()
-            omega += float(step.clamp(-1.0 / case.n_samples, 1.0 / case.n_samples))
+            tone = torch.stack([angle.cos(), angle.sin()])
+            basis = torch.cat([tone, clock * tone])
+            gram, seen = basis @ basis.mT, basis @ signal.mT
+            at = torch.linalg.solve(gram[:2, :2], seen[:2])  # (2, sensor)
+            slope = torch.stack([at[1], -at[0]])  # of the phase, on the clock
+            slope = torch.cat([-torch.linalg.solve(gram[:2, :2], gram[:2, 2:] @ slope), slope])  # (4, sensor)
+            left = seen - gram[:, :2] @ at
+            step = (weights * (slope * left).sum(0)).sum() / (weights * (slope * (gram @ slope)).sum(0)).sum()
+            omega += float(step.clamp(-1.0, 1.0)) / case.n_samples
         return cls(omega * case.scene.rate / (2 * math.pi), at[0], at[1])
 
     def refitted(self, case: Case, fold: int) -> VibrationTone:
