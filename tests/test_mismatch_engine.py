@@ -141,6 +141,8 @@ def test_the_discrepancy_is_that_of_a_diagnosis():
     assert alike == pytest.approx(diagnose(recording, simulation).held_out.before, rel=1e-12)
     assert other == pytest.approx(diagnose(recording, louder).held_out.before, rel=1e-12)
     assert alike < 1.5 < 5 < other
+    model = gf.WhiteNoise(recording.signal.var(-1).mean().item())
+    assert discrepancy(recording, model) == pytest.approx(diagnose(recording, model).held_out.before, rel=1e-12)
     with pytest.raises(ValueError, match="sensors"):
         discrepancy(recording, simulation.select(sensors=[0, 1]))
 
@@ -168,6 +170,19 @@ def test_the_fitted_tail_is_that_of_honest_witnesses():
         assert 0.5 < calibrated(p, uniform) / p < 2
 
 
+@pytest.mark.parametrize("n_samples", [4096, 6144])
+def test_simulations_far_shorter_than_the_recording_are_judged_by(n_samples):
+    noise = gf.WhiteNoise(1.0)
+    recording = noise.simulate(2**16, batch=(2,), generator=generator(5))
+    simulations = noise.simulate(n_samples, batch=(8, 2), generator=generator(6))
+    apart = torch.tensor([discrepancy(recording, simulation) for simulation in simulations])
+    assert 0.3 < float(apart.mean()) < 3
+    held_out = diagnose(recording, simulations[0]).held_out
+    assert held_out.before == pytest.approx(float(apart[0]))
+    assert 0.25 < held_out.auc_before < 0.65
+    assert discrepancy(recording, 1.5 * simulations[0]) > 5
+
+
 @pytest.mark.parametrize("n_twins", [60, 256])
 def test_a_p_value_among_few_twins_keeps_its_level(n_twins):
     own, among = torch.rand(5000, n_twins + 1, generator=generator(4), dtype=torch.float64).split([1, n_twins], -1)
@@ -179,6 +194,9 @@ def test_a_p_value_among_few_twins_keeps_its_level(n_twins):
 
 def test_twins_that_all_say_the_same_tell_no_tail():
     assert calibrated(1e-9, torch.ones(20, dtype=torch.float64)) == pytest.approx(1 / 21)
+    # Where most of them do, the ten others tell it, whose mean excess is one.
+    some = torch.cat([torch.ones(246), torch.full((10,), math.exp(-1))]).to(torch.float64)
+    assert calibrated(math.exp(-5), some) == pytest.approx(11 / 257 * (1 + 5 / 10) ** -10, rel=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -224,6 +224,13 @@ def test_p_values_of_scans_hold_among_twins():
         assert int((p < 0.001).sum()) <= stats.binom.ppf(0.999, 256, 0.004)
 
 
+def test_a_twin_s_recording_and_simulation_have_the_same_noise():
+    noise, y, _ = slow_look(case())._twins
+    told_of, there = noise.own[..., :8].mean(-1).log(), y[..., :8].square().mean(-1).log()  # (twin, sensor)
+    alike = [float(torch.corrcoef(pair)[0, 1]) for pair in torch.stack([told_of, there]).movedim(-1, 0)]
+    assert sum(alike) / SENSORS > 0.1  # 0 within 0.03 were the noise of all twins the same
+
+
 def test_other_simulations_of_the_same_noise_scatter_by_their_length():
     given = told(case())
     coefficients = given.coefficients()

@@ -12,7 +12,7 @@ from shape_draws import SIGNS, N, array, case, generator, oscillating
 
 from gyrofuse.mismatch.bump_fit import oscillation_of
 from gyrofuse.mismatch.steadiness import steadiness
-from gyrofuse.mismatch.wandering import _courses, _hump, wandering_log_ratio
+from gyrofuse.mismatch.wandering import _cell, _courses, _hump, wandering_log_ratio
 
 WIDTH, RMS = 60 / N, 9e-4  # half width in cycles per sample; deg/s
 
@@ -50,15 +50,25 @@ def test_courses_have_a_mean_ratio_of_one_in_noise():
     assert abs(float(ratios.mean()) - 1) < 4 * float(ratios.std()) / math.sqrt(len(ratios))
 
 
+@pytest.mark.parametrize("n_bins", [4096, 12288])
 @pytest.mark.parametrize("normal", [True, False])
-def test_the_shape_of_a_strong_hump_is_told(normal: bool):
-    k = torch.arange(4096, dtype=torch.float64) - 2000
-    shape = torch.exp(-(k / 60).square() / 2) if normal else 1 / (1 + (k / 60).square())
-    noise = torch.empty(4096, dtype=torch.float64).exponential_(generator=generator(920))
+def test_the_shape_of_a_strong_hump_is_told(normal: bool, n_bins: int):
+    k = torch.arange(n_bins, dtype=torch.float64) - 0.49 * n_bins
+    width = 60 * n_bins / 4096
+    shape = torch.exp(-(k / width).square() / 2) if normal else 1 / (1 + (k / width).square())
+    noise = torch.empty(n_bins, dtype=torch.float64).exponential_(generator=generator(920))
     hump = _hump(3.0 * noise * (1 + 10 * shape))
     assert hump.normal == pytest.approx(float(normal), abs=1e-3)
     assert hump.level == pytest.approx(3.0, rel=0.1)
     assert hump.energy == pytest.approx(10 * float(shape.sum()), rel=0.4)  # widths and heights are a grid of octaves
+
+
+def test_half_of_a_band_is_a_whole_number_of_cells():
+    for half in (100, 2048, 2049, 4100, 20_485, 60_000):
+        reach = half - half % _cell(2 * half)
+        assert 2 * half / _cell(2 * half) <= 4096
+        assert 2 * reach % _cell(2 * reach) == 0
+        assert reach > half - half / 1000
 
 
 def test_no_room_for_a_band_says_nothing():

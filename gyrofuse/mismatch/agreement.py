@@ -15,7 +15,7 @@ from gyrofuse.mismatch.testimony import WITNESSES
 from gyrofuse.recording import Recording
 from gyrofuse.simulate import ArrayModel
 
-_FALSE_ALARM = 0.01  # of an effect that both are said to have
+_FALSE_ALARM = 0.01  # as in a diagnosis, of an effect that both are said to have
 
 
 def discrepancy(
@@ -27,8 +27,8 @@ def discrepancy(
 ) -> float:
     """Squared differences of wavelet cross-covariances over their variance, mean over levels and pairs of sensors.
 
-    One is chance alone. It is `held_out.before` of a diagnosis, at a fraction of its cost: to judge simulations by
-    recordings that they were not made from.
+    One is chance alone. It is `held_out.before` of a diagnosis with the usual false alarm, at a fraction of its cost:
+    to judge simulations by recordings that they were not made from.
 
     Args:
         recording: As for `diagnose`.

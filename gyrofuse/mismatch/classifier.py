@@ -23,14 +23,17 @@ _TINY = 1e-300
 
 
 def distinguishability(case: Case, fold: int) -> float:
-    """Area under the ROC curve on windows that a fold holds out, each as long as 1/512 of the recording, or longer."""
+    """Area under the ROC curve on windows that a fold holds out, each as long as 1/512 of the recording, or longer.
+
+    Shorter where the simulation is too short to have one for each block.
+    """
     recorded, simulated = _both(case)
-    per_block = len(recorded) // N_JUDGED
     everything = torch.cat([recorded, simulated])
     everything = (everything - everything.mean(0)) / everything.std(0).clamp(min=1e-12)
     label = torch.arange(len(everything)) < len(recorded)
-    place = torch.cat([torch.arange(len(part)) for part in (recorded, simulated)])
-    judged = in_fold(N_JUDGED, fold)[place // per_block % N_JUDGED]
+    most = len(recorded) // N_JUDGED  # windows of a block
+    place = torch.cat([torch.arange(n) // min(n // N_JUDGED, most) for n in (len(recorded), len(simulated))])
+    judged = in_fold(N_JUDGED, fold)[place % N_JUDGED]
     score = everything[judged] @ _discriminant(everything[~judged], label[~judged])
     return area_under_curve(score[label[judged]], score[~label[judged]])
 
@@ -40,7 +43,7 @@ def _both(case: Case) -> tuple[Tensor, Tensor]:
     """Features of the windows of the recording and of the simulation."""
     records = case.simulated.signal[:_MOST_RECORDS]
     n_windows = min(_WINDOWS, case.n_samples // (_SHORTEST * N_JUDGED) * N_JUDGED)
-    window = case.n_samples // n_windows
+    window = min(case.n_samples // n_windows, records.shape[-1] // N_JUDGED)
     return features(case.recording, window), torch.cat([features(record, window) for record in records])
 
 

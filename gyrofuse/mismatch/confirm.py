@@ -18,6 +18,7 @@ from gyrofuse.mismatch.remembered import remembered
 
 _ACCEPTED_T = 1.0
 _BEYOND_DOUBT = 1e-6
+_FEWEST_SIMULATED = 8  # blocks of a simulation
 _SHORTEST = 8  # a block is so many times as long as its longest wavelet
 
 
@@ -99,7 +100,7 @@ def held_out(start: Case, gains: Sequence[Gain], generator: torch.Generator) -> 
     total, reach = sum(gain.total for gain in gains), 0.0
     if gains:
         reach = Z * sd_of_sum(torch.stack([gain.blocks for gain in gains]).sum(0))
-    before = after = [(discrepancy(start, fold), distinguishability(start, fold)) for fold in range(N_FOLDS)]
+    before = after = [(discrepancy_of_fold(start, fold), distinguishability(start, fold)) for fold in range(N_FOLDS)]
     if gains:
         after = []
         for fold in range(N_FOLDS):
@@ -107,7 +108,7 @@ def held_out(start: Case, gains: Sequence[Gain], generator: torch.Generator) -> 
             for effect in (gain.refitted[fold] for gain in gains):
                 repaired = effect.explained(repaired, generator)
                 simulated = effect.built_into(simulated, generator)  # what was cleaned shows that it was
-            after.append((discrepancy(repaired, fold), distinguishability(simulated, fold)))
+            after.append((discrepancy_of_fold(repaired, fold), distinguishability(simulated, fold)))
     (d, auc), (d_after, auc_after) = (
         torch.tensor(folds, dtype=torch.float64).mean(0).tolist() for folds in (before, after)
     )
@@ -121,15 +122,16 @@ def sd_of_sum(blocks: Tensor) -> float:
 
 def mean_discrepancy(case: Case) -> float:
     """Of all blocks of the recording, by folds."""
-    return sum(discrepancy(case, fold) for fold in range(N_FOLDS)) / N_FOLDS
+    return sum(discrepancy_of_fold(case, fold) for fold in range(N_FOLDS)) / N_FOLDS
 
 
-def discrepancy(case: Case, fold: int) -> float:
+def discrepancy_of_fold(case: Case, fold: int) -> float:
     """Squared difference of wavelet cross-covariances over its variance, mean over levels and pairs of sensors.
 
     On the blocks of the recording that a fold holds out, against all of the simulation, which also tell the variance.
     """
-    recorded = _block_moments(held_out_blocks(case.recording, fold))
+    blocks = _cut(held_out_blocks(case.recording, fold), _length(case))  # (sensor, block, piece, time)
+    recorded = _block_moments(blocks.flatten(1, 2))
     simulated = _simulated_moments(case)
     n_recorded, n_simulated = len(recorded), len(simulated)
     variance = simulated.var(0) * (1 / n_recorded + 1 / n_simulated)
@@ -141,9 +143,17 @@ def discrepancy(case: Case, fold: int) -> float:
 @remembered
 def _simulated_moments(case: Case) -> Tensor:
     """Of all blocks of the simulation, as long as those that are judged, `(block, moment)`."""
-    n = case.n_samples // N_JUDGED
-    usable = case.simulated.signal[..., : case.simulated.signal.shape[-1] // n * n]
-    return _block_moments(usable.unflatten(-1, (-1, n))).flatten(0, 1)
+    return _block_moments(_cut(case.simulated.signal, _length(case))).flatten(0, 1)
+
+
+def _length(case: Case) -> int:
+    """Samples of a block: fewer where a short simulation would not have enough of them to tell their scatter."""
+    return min(case.n_samples // N_JUDGED, case.simulated.signal.shape[-1] // _FEWEST_SIMULATED)
+
+
+def _cut(signal: Tensor, length: int) -> Tensor:
+    """Pieces of a length, `(..., time)` -> `(..., piece, time)`."""
+    return signal[..., : signal.shape[-1] // length * length].unflatten(-1, (-1, length))
 
 
 def _block_moments(blocks: Tensor) -> Tensor:

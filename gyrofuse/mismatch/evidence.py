@@ -91,13 +91,13 @@ def calibrated(p_value: float, among: Tensor) -> float:
     """p value from its rank among those of twins `(twin,)`, in which nothing is missing.
 
     Beyond the smallest quarter of them the tail is fitted instead of counted: `-log p` has an exponential tail, with
-    rate one where witnesses are honest. What the next excess surpasses with a given probability is told by `k` others
-    exactly: `x` with `(1 + x / sum)^-k`.
+    rate one where witnesses are honest. The next one lies beyond all but the `k` highest with `(k + 1) / (n + 1)`, and
+    there beyond `x` with `(1 + x / sum)^-k`, both exactly, the sum that of the `k` excesses.
     """
     scores, own = -among.clamp(min=1e-300).log(), -math.log(max(p_value, 1e-300))
-    highest = scores.topk(round(_TAIL * len(scores)) + 1).values
-    threshold, k = float(highest[-1]), len(highest) - 1
-    total = float((highest - threshold).sum())
-    if own <= threshold or total == 0:
+    threshold = float(scores.topk(round(_TAIL * len(scores)) + 1).values[-1])
+    excess = scores[scores > threshold] - threshold
+    if own <= threshold or not len(excess):
         return float(((scores >= own).sum() + 1) / (len(scores) + 1))
-    return (k + 1) / (len(scores) + 1) * math.exp(-k * math.log1p((own - threshold) / total))
+    beyond = (1 + (own - threshold) / float(excess.sum())) ** -len(excess)
+    return (len(excess) + 1) / (len(scores) + 1) * beyond

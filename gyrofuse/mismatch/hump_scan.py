@@ -61,7 +61,7 @@ def _scores(cells: Tensor, half: float, worth: float, lowest: int) -> tuple[Tens
     used[:, :lowest] = 0
     count, first, second = _around(used, kernels)[:, 0]
     total, along = _around(cells * used, kernels[:2])
-    count = count.clamp(min=1.0)
+    count = count.round().clamp(min=1.0)  # whole, but for the rounding of transforms
     variance = (second - first.square() / count).clamp(min=1e-9) / worth
     standard = (along * count / total.clamp(min=1e-300) - first) / variance.sqrt()
     away = shape - shape.mean()

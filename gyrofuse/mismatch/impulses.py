@@ -95,6 +95,7 @@ def _lines(y: Tensor, spectrum: Tensor) -> Tensor:
     # Two neighbours at least make a skirt.
     while reach < n // ENDS and bool((lines.sum(-1) > 1).any()):
         total = torch.nn.functional.pad(lines.cumsum(-1), (reach + 1, 0))
+        # Windows that would reach beyond an end are cut off there.
         total = torch.cat([total, total[..., -1:].expand(*total.shape[:-1], reach)], -1)
         within = total[..., 2 * reach + 1 :] - total[..., :n]
         lines = lines | (within > _SKIRT * (2 * reach + 1))

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from gyrofuse._transforms import fast_length
 
-_TAPERS = 4
+_TAPERS = 4  # an even number
 _PER_OCTAVE = 4
 _FIRST_BIN = 3  # below, positive and negative frequencies overlap
 
@@ -83,8 +83,8 @@ def cross_spectra(signal: Tensor, wanted: Bands) -> Tensor:
     transform = torch.fft.rfft(signal, n=2 * n)
     matrices, scale = [], n / wanted.n_samples
     # Half bins around each bin, `(..., sensor, bin, half bin)`, from the first one that has so many below it.
-    first_whole, odd = -(-_TAPERS // 2), _TAPERS % 2
-    around = transform[..., odd:].unfold(-1, 2 * _TAPERS + 1, 2)
+    first_whole = _TAPERS // 2
+    around = transform.unfold(-1, 2 * _TAPERS + 1, 2)
     for first, end in itertools.pairwise(wanted.edges):
         a = max(round(first * scale), _FIRST_BIN)
         b = min(max(round(end * scale), a + 1), (n - _TAPERS) // 2)

@@ -49,9 +49,10 @@ def wandering_log_ratio(case: Case, bump: Oscillation, weights: Tensor) -> float
     bins = _band(case, bump, weights)
     if len(bins) < _FEWEST:
         return 0.0
-    hump = _hump(squared_modulus(bins))
+    power = squared_modulus(bins)
+    hump = _hump(power)
     tone = _tone(bins / math.sqrt(hump.level), hump.energy)
-    noise = -len(bins) * math.log(hump.level) - float(bins.abs().square().sum()) / hump.level
+    noise = -len(bins) * math.log(hump.level) - float(power.sum()) / hump.level
     return tone + noise - hump.log_mean
 
 
@@ -77,6 +78,7 @@ def _band(case: Case, bump: Oscillation, weights: Tensor) -> Tensor:
     n = case.n_samples
     centre, reach = round(bump.centre * n), max(round(_REACH * bump.width * n), _FEWEST)
     reach = min(reach, centre - 3, n // 2 - centre - 2)
+    reach -= reach % _cell(2 * reach)
     inside = slice(centre - reach, centre + reach)
     f = torch.arange(inside.start, inside.stop, dtype=torch.float64) / n
     noise = weights.abs().square() @ case.base.spectrum(f) * n
@@ -98,10 +100,15 @@ class Hump(NamedTuple):
     normal: float
 
 
+def _cell(n_bins: int) -> int:
+    """Bins in a cell, a power of two: half of a band may be a whole number of cells, and is one of shorter cells."""
+    return 1 << max((max(n_bins, 1) - 1) // _MOST_CELLS, 0).bit_length()
+
+
 def _hump(power: Tensor) -> Hump:
-    """Humps of powers `(bin,)`."""
-    worth = -(-len(power) // _MOST_CELLS)  # bins in a cell
-    power = power[: len(power) // worth * worth].unflatten(0, (-1, worth)).mean(-1)
+    """Humps of powers `(bin,)`, a whole number of cells, over which a hump is taken for level."""
+    cell = _cell(len(power))
+    power = power.unflatten(0, (-1, cell)).mean(-1)
     n = len(power)
     k = torch.arange(n, dtype=torch.float64) - (n - 1) / 2
     widths = torch.logspace(math.log10(_NARROWEST), math.log10(_WIDEST * n), _WIDTHS, dtype=torch.float64)
@@ -113,11 +120,11 @@ def _hump(power: Tensor) -> Hump:
         for of_shape, shape in zip(values, (1 / (1 + square), (-square / 2).exp()), strict=True):
             spectrum = 1 + height * shape  # (height, width, bin)
             level = (power / spectrum).mean(-1)
-            value = -worth * (n * (level.log() + 1) + spectrum.log().sum(-1))
+            value = -cell * (n * (level.log() + 1) + spectrum.log().sum(-1))
             of_shape.append(value.flatten())
             at = int(value.argmax())
             if float(value.max()) > best[0]:
-                energy = worth * (height * shape).sum(-1)
+                energy = cell * (height * shape).sum(-1)
                 best = float(value.max()), float(level.flatten()[at]), float(energy.flatten()[at])
     total = torch.stack([torch.cat(of_shape).logsumexp(0) for of_shape in values])
     count = sum(len(part) for of_shape in values for part in of_shape)
