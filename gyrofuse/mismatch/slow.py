@@ -138,7 +138,11 @@ class Told(NamedTuple):
 
     def noise(self) -> SlowNoise:
         """Of block means, in parts that may be wrong, each by its own factor."""
-        return SlowNoise.around(Base(self.n_samples, self.coefficients()), self.slowest_dof)
+        return self.noise_of(self.coefficients())
+
+    def noise_of(self, coefficients: Tensor) -> SlowNoise:
+        """The same where the coefficients are known, `(..., sensor, atom)`."""
+        return SlowNoise.around(Base(self.n_samples, coefficients), self.slowest_dof)
 
     def drawn(self, coefficients: Tensor, generator: torch.Generator) -> Told:
         """What another simulation of as many samples tells, of noise with coefficients `(..., sensor, atom)`."""

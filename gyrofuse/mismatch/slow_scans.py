@@ -138,10 +138,10 @@ class SlowLook:
         """
         generator = torch.Generator().manual_seed(0)
         given = self.simulation
-        behind = given.drawn(given.coefficients().expand(_TWINS, -1, -1), generator)
-        noise = given.drawn(behind.coefficients(), generator).noise()
+        behind = given.drawn(given.coefficients().expand(_TWINS, -1, -1), generator).coefficients()
+        noise = given.drawn(behind, generator).noise()
         normal = torch.randn(_TWINS, *self.y.shape, generator=generator, dtype=torch.float64)
-        y = behind.noise().own.sqrt() * normal
+        y = given.noise_of(behind).own.sqrt() * normal
         return noise, y, best_fit(noise, y)
 
 
