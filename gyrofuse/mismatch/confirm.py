@@ -13,10 +13,12 @@ from gyrofuse.covariance import wavelet_cross_covariance
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.classifier import distinguishability
 from gyrofuse.mismatch.folds import N_FOLDS, N_JUDGED, held_out_blocks, in_fold
+from gyrofuse.mismatch.gaussian import Spectral
 from gyrofuse.mismatch.mechanism import Mechanism, Z
 from gyrofuse.mismatch.remembered import remembered
 
 _ACCEPTED_T = 1.0
+_FARTHER = 1.5  # times the discrepancy: 587 arrays with effects that were repaired had at most 1.2
 _BEYOND_DOUBT = 1e-6
 _FEWEST_SIMULATED = 8  # blocks of a simulation
 _SHORTEST = 8  # a block is so many times as long as its longest wavelet
@@ -120,6 +122,26 @@ def sd_of_sum(blocks: Tensor) -> float:
     return float(blocks.std()) * math.sqrt(len(blocks))
 
 
+def leads_away(start: Case, case: Case, gain: Gain, generator: torch.Generator) -> bool:
+    """Whether a simulation with one mechanism more is farther from the recording than the one that came.
+
+    On the blocks that each fold holds out. Likelihoods are those of the noise's smooth spectrum: where the simulation
+    has a hump of its own, which that does not have, another one beside it seems to gain much, and doubles it.
+
+    Args:
+        start: Recording and simulation as they came.
+        case: As far as explained.
+        gain: Of the mechanism.
+        generator: Of what is built into the simulation.
+    """
+    if not any(isinstance(effect, Spectral) for effect in gain.refitted):
+        return False
+    repaired = (effect.explained(case, generator) for effect in gain.refitted)
+    after = sum(discrepancy_of_fold(one, fold) for fold, one in enumerate(repaired)) / N_FOLDS
+    return after > _FARTHER * max(mean_discrepancy(start), 1.0)
+
+
+@remembered
 def mean_discrepancy(case: Case) -> float:
     """Of all blocks of the recording, by folds."""
     return sum(discrepancy_of_fold(case, fold) for fold in range(N_FOLDS)) / N_FOLDS

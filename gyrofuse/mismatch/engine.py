@@ -12,7 +12,7 @@ from torch import Tensor
 from gyrofuse._checks import check_n_samples
 from gyrofuse._model import Model
 from gyrofuse.mismatch.case import Case
-from gyrofuse.mismatch.confirm import held_out, held_out_gain
+from gyrofuse.mismatch.confirm import held_out, held_out_gain, leads_away
 from gyrofuse.mismatch.counterfactual import Link, settled
 from gyrofuse.mismatch.evidence import calibrated, corrected, uncorrected
 from gyrofuse.mismatch.inputs import prepared
@@ -107,16 +107,14 @@ def diagnose(
             open_ones = [m for m in stage if sum(f.mechanism == m.name for f in found) < _OF_A_KIND]
             asked = level * _AFTER_REPAIRS if links and stage is STAGES[-1] else level
             nominated = [f for f in (m.nominate(case, asked) for m in open_ones) if f and not _known(f, found)]
-            accepted = None
             for finding in sorted(nominated, key=lambda f: -f.gain):
                 gain = held_out_gain(case, finding.effect)
-                if gain.confirms(finding.p_value):
-                    accepted = Link(replace(finding, held_out_gain=gain.total), case, gain)
+                if gain.confirms(finding.p_value) and not leads_away(start, case, gain, generator):
+                    links.append(Link(replace(finding, held_out_gain=gain.total), case, gain))
+                    case = finding.effect.explained(case, generator)
                     break
-            if accepted is None:
+            else:
                 break
-            links.append(accepted)
-            case = accepted.finding.effect.explained(case, generator)
     progress("look-alikes", _NAMED)
     links, case = settled(links, case, level, generator)
     findings = tuple(link.finding for link in links)
@@ -129,7 +127,7 @@ def diagnose(
     if asking:
         remainder = Remainder.of(case)
         gain = held_out_gain(case, remainder)
-        if gain.confirms(min(asking)):
+        if gain.confirms(min(asking)) and not leads_away(start, case, gain, generator):
             case, effects = remainder.explained(case, generator), (*effects, remainder)
             gains.append(gain)
     return MismatchReport(

@@ -256,7 +256,7 @@ def missing_lattices(case: Case, level: float) -> Missing:
     shared = shared_lattice(case.recorded)
     p_shared = surpassing(shared.p_value, shared_lattice(case.simulated).p_value)
     p_value = corrected(min(p_alone, p_shared), min(case.n_sensors, 2))
-    if p_value > level:
+    if p_value > level or not (alone or shared.step):
         return Missing(p_value, {})
     missing = {i: left for i, left in alone.items() if corrected(left.p_value, 2 * case.n_sensors) <= level}
     if clearest is None or p_shared < p_alone:  # those that show a step of their own keep it
@@ -284,10 +284,11 @@ def _as_large(missing: dict[int, Lattice]) -> dict[int, Lattice]:
 
 def _not_simulated(case: Case, sensor: int, own: Lattice) -> Lattice | None:
     """A lattice of the recording, with the p value of its being no clearer than the simulation's; `None` if exact."""
-    records = case.simulated.signal[:, sensor]
+    records, other = case.simulated.signal[:, sensor], exact_lattices(case.simulated)[sensor]
     if own.blur == 0:
-        other = exact_lattices(case.simulated)[sensor]
         return None if other is not None and other.step > own.step * (1 - _SAME_STEP) else own
+    if other is not None and abs(other.step / own.step - 1) < _ALIKE:
+        return None  # what is taken off a recording blurs its own
     u, n, m = torch.tensor([own.peak], dtype=torch.float64), case.n_samples, records.numel()
     power = float(_power(case.recording[sensor] - case.recording[sensor].mean(), u))
     # Its records share one lattice, or each lies about its own mean: one that was built in does.

@@ -1,8 +1,9 @@
 """Effects of the catalogue that a simulation has itself.
 
-A repaired simulation names them: they act on its noise as they did when they were found. Samples name nothing. What
-follows a channel of the recording, or happens at one of its moments, is looked for in the recording and asked of the
-simulation: where both have it, it is taken off both, so that no more than their difference is found.
+A repaired simulation names them: they act on its noise as they did when they were found. Samples name nothing. Where
+their values lie on a lattice they were rounded, and are again after all that is built into them. What follows a channel
+of the recording, or happens at one of its moments, is looked for in the recording and asked of the simulation: where
+both have it, it is taken off both, so that no more than their difference is found.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from gyrofuse.mismatch.confirm import held_out_gain
 from gyrofuse.mismatch.folds import N_FOLDS
 from gyrofuse.mismatch.mechanism import Finding, Mechanism
 from gyrofuse.mismatch.mechanisms import STAGES
+from gyrofuse.mismatch.mechanisms.quantization import Quantization
 from gyrofuse.mismatch.repaired import RepairedModel
 
 _MOST = 6  # effects that a simulation is believed to have
@@ -45,6 +47,10 @@ def with_own_effects(
                 case = effect.anew(case, generator)
                 own.append(effect)
         return case, tuple(own)
+    rounding = Quantization.of_simulation(case)
+    if rounding is not None:
+        case = rounding.brought_forward(case, generator)
+        own.append(rounding)
     if case.simulated.signal.shape[-1] == case.n_samples:
         for stage in STAGES:
             kinds = [kind for kind in stage if kind.proportional_to]

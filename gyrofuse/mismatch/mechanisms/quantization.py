@@ -11,7 +11,8 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
-from gyrofuse.mismatch.lattices import Lattice, missing_lattices, off_lattice
+from gyrofuse.mismatch.lattices import Lattice, exact_lattices, missing_lattices, off_lattice
+from gyrofuse.mismatch.lines import whitened
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.mechanisms.dead_band import DeadBand
 
@@ -19,6 +20,7 @@ _TABLE = 1024  # points of a law
 _EVEN = 3.0  # steps, sd: over more of them all distances from the lattice are as likely
 _TAILS = 6.0  # sd
 _TOO_COARSE = 0.75  # rms change between samples, steps: noise of 0.45 steps and the rounding itself
+_STEEPEST, _FLAT = 8.0, 1e-4  # slopes of a logarithm of density over a step
 _SHARPEST = 0.02  # blur in steps: what an exact lattice is worth is bounded by it
 
 
@@ -43,6 +45,31 @@ class Quantization(Mechanism):
     offset: Tensor
     blur: Tensor
     centre: Tensor
+
+    @classmethod
+    def of_simulation(cls, case: Case) -> Quantization | None:
+        """The exact lattices of a simulation's values; None without."""
+        found = exact_lattices(case.simulated)
+        if not any(found):
+            return None
+        rows = [(0.0, 0.0) if own is None else (own.step, own.offset) for own in found]
+        step, offset = torch.tensor(rows, dtype=torch.float64).mT
+        return cls(step, offset, torch.zeros_like(step), case.simulated.signal.mean((0, -1)))
+
+    def brought_forward(self, case: Case, generator: torch.Generator) -> Case:
+        """The case of a simulation that was rounded so, where all that is built in comes before that.
+
+        What was rounded may have been anywhere within half a step. There the noise's density, a normal one given all
+        other samples, is close to exponential, with the slope of its logarithm at the rounded value.
+        """
+        signal = case.simulated.signal
+        slope = -self._divisor * whitened(whitened(signal, case.base), case.base)  # per step
+        slope = slope.clamp(-_STEEPEST, _STEEPEST)
+        slope = torch.where(slope.abs() < _FLAT, _FLAT, slope)
+        share = torch.rand(signal.shape, dtype=signal.dtype, generator=generator)
+        within = torch.log1p(share * torch.expm1(slope)) / slope - 0.5
+        analog = signal + self.step[:, None] * within
+        return self.built_into(replace(case, analog=analog), generator)
 
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:

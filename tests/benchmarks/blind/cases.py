@@ -208,7 +208,9 @@ def make_case(
     parts = [effect(bench, nats) for effect in made.effects if nats is not None]
 
     if real:
-        gyro, llrs = _converted(bench, parts, real.recording)
+        # Within its step any value may have been rounded to what the device gave.
+        analog = real.recording + real.step[:, None] * of_recording.uniform(-0.5, 0.5, real.recording.shape)
+        gyro, llrs = _converted(bench, parts, analog, real.step[:, None])
         simulation: dict[str, Any] = {"gyro": real.simulation, "fs": rate, "unit": "deg/s"}
         channels: dict[str, Array] = {}
     else:
@@ -264,14 +266,20 @@ def _record(bench: Bench, parts: list[Part], rng: np.random.Generator) -> tuple[
     return _converted(bench, parts, bench.sampled(analog))
 
 
-def _converted(bench: Bench, parts: list[Part], gyro: Array) -> tuple[Array, list[float]]:
-    """What parts add to a sampled signal and its converter makes of it, and each one's log likelihood ratio."""
+def _converted(bench: Bench, parts: list[Part], gyro: Array, step: Array | None = None) -> tuple[Array, list[float]]:
+    """What parts add to a sampled signal and its converter makes of it, and each one's log likelihood ratio.
+
+    Args:
+        step: Of a device's own converter, `(sensor, 1)`.
+    """
     for part in parts:
         if part.signal is not None:
             gyro = gyro + part.signal
     for part in parts:
         if part.converter is not None:
             gyro = part.converter(gyro)
+    if step is not None:
+        gyro = round_to_lattice(gyro, step)
     llrs = []
     for part in parts:
         others = [other.signal for other in parts if other is not part and other.signal is not None]

@@ -25,7 +25,7 @@ def low_pass_gain(nu: Array, corner: float) -> Array:
     return 1 / (1 + (np.tan(np.pi * nu) / np.tan(np.pi * corner)) ** 4)
 
 
-def round_to_lattice(signal: Array, step: float) -> Array:
+def round_to_lattice(signal: Array, step: float | Array) -> Array:
     """Rounding of the rate to whole steps."""
     return step * np.round(signal / step)
 

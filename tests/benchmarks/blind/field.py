@@ -23,10 +23,11 @@ _PER_OCTAVE = 4  # bands of the measured spectrum
 
 
 class Background(NamedTuple):
-    """Two stretches, one after the other, `(sensor, time)` in deg/s, and the rate in Hz."""
+    """Two stretches, one after the other, `(sensor, time)` in deg/s, their steps `(sensor,)`, and the rate in Hz."""
 
     recording: Array
     simulation: Array
+    step: Array
     rate: float
     source: str
 
@@ -51,7 +52,7 @@ def background(folder: Path, n_samples: int, rng: np.random.Generator) -> Backgr
         counts, scale, rate = file["counts"][:_GYROSCOPES], file["scale"][:_GYROSCOPES], float(file["fs"])
     start = int(rng.integers(counts.shape[1] - 2 * n_samples + 1))
     both = counts[:, start : start + 2 * n_samples] * scale[:, None]
-    return Background(both[:, :n_samples], both[:, n_samples:], rate, source)
+    return Background(both[:, :n_samples], both[:, n_samples:], scale, rate, source)
 
 
 def measured_base(stretch: Array, rate: float) -> MeasuredBase:
