@@ -11,7 +11,7 @@ from torch import Tensor
 
 import gyrofuse as gf
 from gyrofuse.mismatch.case import Case
-from gyrofuse.mismatch.lattices import exact_lattices
+from gyrofuse.mismatch.lattices import exact_lattices, missing_lattices
 from gyrofuse.mismatch.mechanisms.quantization import Quantization
 
 N, P, RATE = 16384, 3, 100.0
@@ -91,12 +91,12 @@ def test_a_hump_that_the_simulation_has_elsewhere_is_not_doubled(seed: int) -> N
     assert report.held_out.after < 1.2 * max(report.held_out.before, 1.0)
 
 
-def test_a_recording_that_something_was_taken_off_has_the_lattice_of_its_simulation_still() -> None:
+@pytest.mark.parametrize("amplitude", [0.08, 0.38])  # steps; the larger one hides the step itself, J0 is 0
+def test_a_recording_that_something_was_taken_off_has_the_lattice_of_its_simulation_still(amplitude: float) -> None:
     recording, simulation, _ = drawn(5)
-    t = torch.arange(recording.shape[-1])
-    left = 0.02 * torch.cos(0.7 * t + 1.0)  # of a tone that was not quite the one
-    scale = float(recording.diff().std())
-    case = Case.of(SCENE, rounded(recording, scale / 4) - scale * left, rounded(simulation, scale / 4))
-    assert Quantization.nominate(case, 1e-3) is None
-    bare = Case.of(SCENE, rounded(recording, scale / 4) - scale * left, simulation)
-    assert Quantization.nominate(bare, 1e-3) is not None
+    step = float(recording.diff().std()) / 2
+    left = amplitude * step * torch.cos(0.7 * torch.arange(recording.shape[-1]) + 1.0)  # of a tone not quite the one
+    given = rounded(recording, step) - left
+    assert Quantization.nominate(Case.of(SCENE, given, rounded(simulation, step)), 1e-3) is None
+    assert missing_lattices(Case.of(SCENE, given, rounded(simulation, step)), 1.0).lattices == {}
+    assert Quantization.nominate(Case.of(SCENE, given, simulation), 1e-3) is not None

@@ -287,8 +287,8 @@ def _not_simulated(case: Case, sensor: int, own: Lattice) -> Lattice | None:
     records, other = case.simulated.signal[:, sensor], exact_lattices(case.simulated)[sensor]
     if own.blur == 0:
         return None if other is not None and other.step > own.step * (1 - _SAME_STEP) else own
-    if other is not None and abs(other.step / own.step - 1) < _ALIKE:
-        return None  # what is taken off a recording blurs its own
+    if other is not None and abs(own.step * max(round(other.step / own.step), 1) / other.step - 1) < _ALIKE:
+        return None  # what is taken off a recording blurs its own, of which harmonics may be left
     u, n, m = torch.tensor([own.peak], dtype=torch.float64), case.n_samples, records.numel()
     power = float(_power(case.recording[sensor] - case.recording[sensor].mean(), u))
     # Its records share one lattice, or each lies about its own mean: one that was built in does.
