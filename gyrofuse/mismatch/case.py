@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
@@ -64,7 +64,8 @@ class Case:
         recorded: The recording, one record, without what was taken off it.
         simulated: The simulation, with what was built into it: records as long as the recording, or a single shorter
             one.
-        analog: The simulation's samples `(record, sensor, time)` before the converter.
+        analog: The simulation's samples `(record, sensor, time)` before the converter; where they came rounded, as
+            they may have been.
         converter: What it does to them, with the place of each in the chain.
     """
 
@@ -139,6 +140,12 @@ class Case:
         """With another recording `(sensor, time)`: one that was cleaned."""
         return replace(self, recorded=replace(self.recorded, signal=recording[None]))
 
+    def in_unit(self, factor: float) -> Case:
+        """With the simulation's numbers times a factor, after its converter."""
+        converter = tuple((place, partial(_in_unit, act, factor)) for place, act in self.converter)
+        simulated = replace(self.simulated, signal=factor * self.simulated.signal)
+        return replace(self, simulated=simulated, analog=factor * self.analog, converter=converter)
+
     def built_in(self, act: Callable[[Tensor], Tensor], place: int = 0) -> Case:
         """With something that acts on the simulation's samples, after what has a lower place in the chain.
 
@@ -153,6 +160,11 @@ class Case:
         for _, converted in converter:
             signal = converted(signal)
         return replace(self, simulated=replace(self.simulated, signal=signal), analog=analog, converter=converter)
+
+
+def _in_unit(act: Callable[[Tensor], Tensor], factor: float, signal: Tensor) -> Tensor:
+    """What acts in one unit on signals that are in another."""
+    return factor * act(signal / factor)
 
 
 def block_means(signal: Tensor) -> Tensor:

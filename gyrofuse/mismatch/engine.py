@@ -18,6 +18,8 @@ from gyrofuse.mismatch.evidence import calibrated, corrected, uncorrected
 from gyrofuse.mismatch.inputs import prepared
 from gyrofuse.mismatch.mechanism import Finding
 from gyrofuse.mismatch.mechanisms import STAGES
+from gyrofuse.mismatch.mechanisms.quantization import Quantization
+from gyrofuse.mismatch.mechanisms.unit_scale import UnitScale
 from gyrofuse.mismatch.noise_model import noise_of, noise_samples
 from gyrofuse.mismatch.own_effects import with_own_effects
 from gyrofuse.mismatch.remainder import ASKED_FOR_BY, Remainder
@@ -77,7 +79,7 @@ def diagnose(
     level = uncorrected(false_alarm, len(WITNESSES))  # what would be a mismatch, had one witness alone said it
     given = prepared(recording, simulation, rate, generator)
     start, own = with_own_effects(given, simulation, level, generator)
-    model = RepairedModel(noise_of(simulation, start), start.scene, own, noise_samples(simulation))
+    model = RepairedModel(noise_of(simulation, _unrounded(start)), start.scene, own, noise_samples(simulation))
     evidence = testimony(start, lambda what, share: progress(what, _LOOKED * share))
     p_value = combined(evidence)
     if twins:
@@ -122,6 +124,9 @@ def diagnose(
     after = testimony(case, lambda what, share: progress(what, _COMPARED + (_CHECKED - _COMPARED) * share))
     hidden = any(f.hides_others for f in findings)
     left = [e for e in after if corrected(e.p_value, len(evidence)) <= false_alarm and not hidden]
+    for finding in findings:
+        if isinstance(finding.effect, UnitScale):
+            own = tuple(e.in_unit(finding.effect.factor) if isinstance(e, Quantization) else e for e in own)
     effects = (*own, *(f.effect for f in findings))
     asking = [e.p_value for e in left if e.witness in ASKED_FOR_BY]
     if asking:
@@ -143,6 +148,13 @@ def diagnose(
         case=start,
         repaired=case,
     )
+
+
+def _unrounded(case: Case) -> Case:
+    """The simulation before its own rounding, which a model of it does again."""
+    if case.analog is case.simulated.signal:
+        return case
+    return replace(case, simulated=replace(case.simulated, signal=case.analog))
 
 
 def _known(finding: Finding, found: list[Finding]) -> bool:

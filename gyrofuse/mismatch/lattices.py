@@ -282,12 +282,18 @@ def _as_large(missing: dict[int, Lattice]) -> dict[int, Lattice]:
     return {i: found for i, found in missing.items() if size.get(i, least) >= least}
 
 
+def _harmonic(peak: float, step: float, sd: float) -> bool:
+    """Whether a characteristic function of values of an sd that lie about a lattice has a peak there."""
+    base = 2 * math.pi / step
+    return abs(peak - base * max(round(peak / base), 1)) < 1 / sd
+
+
 def _not_simulated(case: Case, sensor: int, own: Lattice) -> Lattice | None:
     """A lattice of the recording, with the p value of its being no clearer than the simulation's; `None` if exact."""
     records, other = case.simulated.signal[:, sensor], exact_lattices(case.simulated)[sensor]
     if own.blur == 0:
         return None if other is not None and other.step > own.step * (1 - _SAME_STEP) else own
-    if other is not None and abs(own.step * max(round(other.step / own.step), 1) / other.step - 1) < _ALIKE:
+    if other is not None and _harmonic(own.peak, other.step, float(case.recording[sensor].std())):
         return None  # what is taken off a recording blurs its own, of which harmonics may be left
     u, n, m = torch.tensor([own.peak], dtype=torch.float64), case.n_samples, records.numel()
     power = float(_power(case.recording[sensor] - case.recording[sensor].mean(), u))

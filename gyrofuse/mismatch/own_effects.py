@@ -49,7 +49,7 @@ def with_own_effects(
         return case, tuple(own)
     rounding = Quantization.of_simulation(case)
     if rounding is not None:
-        case = rounding.brought_forward(case, generator)
+        case = rounding.undone(case, generator)
         own.append(rounding)
     if case.simulated.signal.shape[-1] == case.n_samples:
         for stage in STAGES:

@@ -1,9 +1,11 @@
-"""Rounding of the rate to whole steps: a converter that the simulator left out."""
+"""Rounding of the rate to whole steps: a converter that the simulator left out, or that of the simulation itself."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar
 
 import torch
@@ -11,7 +13,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
-from gyrofuse.mismatch.lattices import Lattice, exact_lattices, missing_lattices, off_lattice
+from gyrofuse.mismatch.lattices import Lattice, exact_lattices, innovation_sd, missing_lattices, off_lattice
 from gyrofuse.mismatch.lines import whitened
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.mechanisms.dead_band import DeadBand
@@ -20,7 +22,9 @@ _TABLE = 1024  # points of a law
 _EVEN = 3.0  # steps, sd: over more of them all distances from the lattice are as likely
 _TAILS = 6.0  # sd
 _TOO_COARSE = 0.75  # rms change between samples, steps: noise of 0.45 steps and the rounding itself
+_UNDONE = 1.25  # sd of a sample given its past: a step's largest at which what was rounded can be told
 _STEEPEST, _FLAT = 8.0, 1e-4  # slopes of a logarithm of density over a step
+_RIDGE = 1e-3  # of correlations
 _SHARPEST = 0.02  # blur in steps: what an exact lattice is worth is bounded by it
 
 
@@ -35,7 +39,7 @@ class Quantization(Mechanism):
         step: `(sensor,)`, unit of the signal; 0 where a sensor is not rounded.
         offset: `(sensor,)`, likewise: the lattice's point next to 0.
         blur: `(sensor,)`, sd of what was added after the rounding, steps.
-        centre: Mean of the recording, `(sensor,)`, unit of the signal: where it lies between two steps makes what a
+        centre: Mean of what was rounded, `(sensor,)`, unit of the signal: where it lies between two steps makes what a
             few of them do to noise. A hidden lattice lies as far from the mean of a simulation, whose bias is its own.
     """
 
@@ -48,28 +52,39 @@ class Quantization(Mechanism):
 
     @classmethod
     def of_simulation(cls, case: Case) -> Quantization | None:
-        """The exact lattices of a simulation's values; None without."""
-        found = exact_lattices(case.simulated)
-        if not any(found):
+        """The exact lattices of a simulation's values, those fine enough to be undone; None without."""
+        side = case.simulated
+        fine = [
+            own if own is not None and own.step < _UNDONE * float(sd) else None
+            for own, sd in zip(exact_lattices(side), innovation_sd(side), strict=True)
+        ]
+        if not any(fine):
             return None
-        rows = [(0.0, 0.0) if own is None else (own.step, own.offset) for own in found]
+        rows = [(0.0, 0.0) if own is None else (own.step, own.offset) for own in fine]
         step, offset = torch.tensor(rows, dtype=torch.float64).mT
-        return cls(step, offset, torch.zeros_like(step), case.simulated.signal.mean((0, -1)))
+        return cls(step, offset, torch.zeros_like(step), side.signal.mean((0, -1)))
 
-    def brought_forward(self, case: Case, generator: torch.Generator) -> Case:
-        """The case of a simulation that was rounded so, where all that is built in comes before that.
+    def undone(self, case: Case, generator: torch.Generator) -> Case:
+        """The case of a simulation that was rounded so: what is built in from now on comes before that.
 
         What was rounded may have been anywhere within half a step. There the noise's density, a normal one given all
         other samples, is close to exponential, with the slope of its logarithm at the rounded value.
         """
-        signal = case.simulated.signal
-        slope = -self._divisor * whitened(whitened(signal, case.base), case.base)  # per step
+        side = case.simulated
+        white = whitened(side.noise, case.base)
+        covariance = (white @ white.mT).mean(0) / white.shape[-1]  # of sensors that share noise
+        slope = -self._divisor * whitened(torch.linalg.solve(_correlation(covariance), white), case.base)  # per step
         slope = slope.clamp(-_STEEPEST, _STEEPEST)
         slope = torch.where(slope.abs() < _FLAT, _FLAT, slope)
-        share = torch.rand(signal.shape, dtype=signal.dtype, generator=generator)
+        share = torch.rand(slope.shape, dtype=slope.dtype, generator=generator)
         within = torch.log1p(share * torch.expm1(slope)) / slope - 0.5
-        analog = signal + self.step[:, None] * within
-        return self.built_into(replace(case, analog=analog), generator)
+        again: Callable[[Tensor], Tensor] = partial(self.simulated, scene=case.scene, generator=generator)
+        converter = (*case.converter, (self.place, again))
+        return replace(case, analog=side.signal + self.step[:, None] * within, converter=converter)
+
+    def in_unit(self, factor: float) -> Quantization:
+        """The same of numbers that are a factor larger."""
+        return replace(self, step=factor * self.step, offset=factor * self.offset, centre=factor * self.centre)
 
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:
@@ -145,6 +160,12 @@ class Quantization(Mechanism):
         information = float((slope.square() / density.clamp(min=1e-12)).mean()) * 1024**2
         spread = float((signal / self.step[sensor]).std())
         return float(self.step[sensor]) / math.sqrt(max(information * len(signal) * spread**2, 1e-300))
+
+
+def _correlation(covariance: Tensor) -> Tensor:
+    """Of a covariance, with a ridge where sensors are copies of each other."""
+    size = covariance.diagonal().rsqrt()
+    return covariance * size[:, None] * size + _RIDGE * torch.eye(len(size), dtype=size.dtype)
 
 
 def _too_coarse(signal: Tensor, found: dict[int, Lattice]) -> list[int]:

@@ -64,6 +64,9 @@ class UnitScale(Mechanism):
     def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
         return self.factor * signal
 
+    def built_into(self, case: Case, generator: torch.Generator) -> Case:
+        return case.in_unit(self.factor)
+
     def spectra(self, matrices: Tensor, f: Tensor) -> Tensor:
         return self.factor**2 * matrices
 
