@@ -9,9 +9,11 @@ import torch
 from torch import Tensor
 
 import gyrofuse as gf
+from gyrofuse.mismatch.inputs import prepared
 from gyrofuse.mismatch.mechanisms.g_sensitivity import GSensitivity
 from gyrofuse.mismatch.mechanisms.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.step import Step
+from gyrofuse.mismatch.own_effects import with_own_effects
 from gyrofuse.mismatch.repaired import RepairedModel
 
 N, P, RATE = 16384, 3, 100.0
@@ -92,6 +94,19 @@ def test_more_than_the_simulation_has_is_the_difference(change: Callable[[float]
     for name, entry in finding.parameters.items():
         if name.startswith(("gain", "size")):
             assert entry.low < entry.value < entry.high
+
+
+@pytest.mark.parametrize("change", [following(0.3), stepping(2.0)])
+def test_a_simulation_without_the_effect_is_not_said_to_have_it(change: Callable[[Tensor], Tensor]):
+    """Chance gives any number some gain in a simulation that knows nothing of it."""
+    said = 0
+    wandering = gf.WhiteNoise(1.0) + gf.RandomWalk(1e-4)
+    for seed in range(30):
+        g = generator(500 + seed)
+        given, simulation = (wandering.simulate(N, batch=(P,), generator=g) for _ in range(2))
+        case = prepared(recording(change(given)), recording(simulation), None, g)
+        said += bool(with_own_effects(case, recording(simulation), 5e-4, g)[1])
+    assert said == 0
 
 
 def test_a_simulation_with_the_effect_is_seldom_doubted():

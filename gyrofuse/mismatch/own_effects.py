@@ -14,6 +14,7 @@ from dataclasses import replace
 from typing import Any, cast
 
 import torch
+from scipy import special
 from torch import Tensor
 
 from gyrofuse.mismatch.case import Case
@@ -68,7 +69,7 @@ def _shared(case: Case, kinds: Iterable[type[Mechanism]], level: float) -> Mecha
     records = case.simulated.signal
     simulated = case.with_recording(_summed(records))
     alone = _resized(found.effect, simulated)
-    if not held_out_gain(simulated, alone).confirms(level):
+    if not _has(simulated, alone, level):
         return None
     both = case.with_recording(_summed(torch.cat([case.recorded.signal, records])))
     same = _scaled(_resized(found.effect, both), 1 / math.sqrt(len(records) + 1))
@@ -77,6 +78,13 @@ def _shared(case: Case, kinds: Iterable[type[Mechanism]], level: float) -> Mecha
     if again is None or (again.mechanism, again.channel) != (found.mechanism, found.channel):
         return same
     return _scaled(alone, 1 / math.sqrt(len(records)))
+
+
+def _has(simulated: Case, effect: Mechanism, level: float) -> bool:
+    """Whether a simulation has an effect whose numbers were fitted to it: chance alone gives each half a nat."""
+    gain = held_out_gain(simulated, effect)
+    numbers = int(getattr(effect, effect.proportional_to).count_nonzero())
+    return gain.confirms(level) and float(special.chdtrc(numbers, 2 * gain.as_found)) < level
 
 
 def _strongest(case: Case, kinds: Iterable[type[Mechanism]], level: float) -> Finding | None:
