@@ -7,6 +7,7 @@ import pytest
 import torch
 from mismatch_draws import LEVEL, SCENE, N, covers, drawn, even, nominated, normal, settled
 
+from gyrofuse import AR1, WhiteNoise
 from gyrofuse.mismatch import impulses, lattices, marginals
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.mechanisms.clipping import Clipping
@@ -202,3 +203,16 @@ def test_repeats_that_chance_would_not_make_may_come_and_go() -> None:
     assert bool((slow > 0).all())  # quarters differ by more than noise
     assert marginals.marginal_witness(case).p_value < 1e-4
     assert nominated(case, StuckSamples).sensors == (0, 1, 2)
+
+
+def test_a_largest_value_that_recurs_on_a_fine_lattice_is_no_end_stop() -> None:
+    """Predictions from noise have noise of their own, which would be expected beyond any largest value."""
+    g = torch.Generator().manual_seed(42)
+    noise = WhiteNoise(1.0) + AR1(0.98, 0.02)
+    recording, simulation = (noise.simulate(65536, batch=(*records, 3), generator=g) for records in ((), (2,)))
+    step = 0.045 * float(recording.diff().std()) / 2**0.5
+    recording, simulation = (step * torch.round(x / step) for x in (recording, simulation))
+    for row in recording:
+        first, second = row.topk(2).indices.tolist()
+        row[second] = row[first]
+    assert min(end.p_value for end in marginals.end_stops(Case.of(SCENE, recording, simulation))) > LEVEL

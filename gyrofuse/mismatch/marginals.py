@@ -169,8 +169,7 @@ def end_stops(case: Case) -> tuple[EndStop, ...]:
         x, mean, sd = case.recording[i], case.recording[i] - expected.error[0, i], float(expected.sd[0, i])
         resolution = float(_resolution(case)[i])
         rounded = resolution > _COARSE * sd
-        if rounded:
-            mean, sd = _before_rounding(x, mean, resolution)
+        mean, sd = _regressed(x, mean, resolution)
         for sign in (1, -1):
             limit = float((sign * x).max())
             at = sign * x == limit
@@ -192,8 +191,8 @@ def _resolution_near(values: Tensor, end: float) -> float:
     return float(_finest_gap(values[values.abs() > abs(end) / 2]))
 
 
-def _before_rounding(x: Tensor, mean: Tensor, step: float) -> tuple[Tensor, float]:
-    """Means `(time,)` that rounded values have by regression on their predictions, and sd of what was rounded.
+def _regressed(x: Tensor, mean: Tensor, step: float) -> tuple[Tensor, float]:
+    """Means `(time,)` that values have by regression on their predictions, and sd of what was rounded to a step.
 
     A prediction from noise has noise of its own, in which it goes beyond where any value would.
     """
