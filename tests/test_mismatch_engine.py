@@ -181,6 +181,8 @@ def test_simulations_far_shorter_than_the_recording_are_judged_by(n_samples):
     assert held_out.before == pytest.approx(float(apart[0]))
     assert 0.25 < held_out.auc_before < 0.65
     assert discrepancy(recording, 1.5 * simulations[0]) > 5
+    louder = diagnose(1.3 * recording, simulations[0])
+    assert [finding.mechanism for finding in louder.findings] == ["parameter_shift"]
 
 
 @pytest.mark.parametrize("n_twins", [60, 256])

@@ -45,6 +45,7 @@ _SHARP, _NARROW = 0.1, (0.02, 0.04, 0.08)  # the same, below which bands are too
 _FINE, _NARROWEST = 24, 0.005  # bands in an octave for those, and the least that they show
 _STEEPER, _FLICKER = 4.0, 0.25  # nats that another slope gains, and distance from 1 of flicker noise's
 _UNSTEADY = 0.01  # p value of either sign of a level that may change
+_FEWEST_SIMULATED = 2  # blocks of a simulation
 _OFF = 0.25  # logarithm by which a centre from wide bands may be off
 
 
@@ -147,8 +148,10 @@ def compared(case: Case, per_octave: int = _PER_OCTAVE) -> Ratios:
 def refit(case: Case, fold: int, term: Term, company: Sequence[Term] = ()) -> Term:
     """A shape with its numbers estimated anew without what a fold holds out, together with those of its company."""
     keep = estimation_samples(case.n_samples, fold)
-    block = run_length(keep)
-    recorded = case.recording[:, keep].unflatten(-1, (-1, block)).movedim(1, 0)
+    run = run_length(keep)
+    block = min(run, case.simulated.signal.shape[-1] // _FEWEST_SIMULATED)
+    runs = case.recording[:, keep].unflatten(-1, (-1, run))[..., : run // block * block]
+    recorded = runs.unflatten(-1, (-1, block)).flatten(1, 2).movedim(1, 0)
     simulated = in_blocks(case.simulated)[block]
     both = deep(case, Side(recorded, simulated.bands), simulated, _slow_without(fold))
     data = ratios(both, deep_base(case), torch.ones_like(both.d), _independent(case))
