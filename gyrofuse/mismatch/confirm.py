@@ -126,10 +126,9 @@ def sd_of_sum(blocks: Tensor) -> float:
 def leads_away(start: Case, case: Case, gain: Gain, generator: torch.Generator) -> bool:
     """Whether a simulation with one mechanism more is farther from the recording than it was, or than it came.
 
-    On the blocks that each fold holds out, and beside lines that both have: filters act on
-    those as well, and tones have mechanisms of their own. Likelihoods are those of the noise's smooth spectrum: where
-    the simulation has a hump of its own, which that does not have, another one beside it seems to gain much, and
-    doubles it.
+    On the blocks that each fold holds out, and beside lines that both have: filters act on those as well, and tones
+    have mechanisms of their own. Likelihoods are those of the noise's smooth spectrum: where the simulation has a hump
+    of its own, which that does not have, another one beside it seems to gain much, and doubles it.
 
     Args:
         start: Recording and simulation as they came.
@@ -145,7 +144,6 @@ def leads_away(start: Case, case: Case, gain: Gain, generator: torch.Generator) 
     return after > _FARTHER * max(before, 1.0)
 
 
-@remembered
 def _noise(case: Case) -> Case:
     """Without the lines that the simulation has."""
     if not case.simulated.lines:
