@@ -20,22 +20,27 @@ _REACH = 6, 8  # steps either way in the first look, and in those that follow
 _FINER = 4.0  # places that continuous frequencies have for each bin at both ends
 
 
-class Candidate(NamedTuple):
-    """A track as the search has it.
+class Candidates(NamedTuple):
+    """Tracks as the search has them.
 
     Attributes:
-        power: Of its segments, of sensors added with their signs.
-        signs: Of the sensors, `(sensor,)`: 0, 1 or -1.
-        along: Bins at the centres of its segments, `(segment,)`, not folded back.
-        undone: Bins that a frequency moves within a segment, which were undone before the transform.
-        bins: Transforms around it, `(sensor, segment, 2 * AROUND)`, in which noise has power one.
+        power: Of their segments, of sensors added with their signs, `(track,)`.
+        signs: Of the sensors, `(track, sensor)`: 0, 1 or -1.
+        along: Bins at the centres of their segments, `(track, segment)`, not folded back.
+        undone: Bins that a frequency moves within a segment, which were undone before the transform, `(track,)`.
+        bins: Transforms around them, `(track, sensor, segment, 2 * AROUND)`, in which noise has power one.
     """
 
-    power: float
+    power: Tensor
     signs: Tensor
     along: Tensor
-    undone: int
+    undone: Tensor
     bins: Tensor
+
+    def strongest(self, most: int) -> Candidates:
+        """So many of them, or all."""
+        best = self.power.topk(min(most, len(self.power))).indices
+        return Candidates(*(of_tracks[best] for of_tracks in self))
 
 
 class Track(NamedTuple):
@@ -55,48 +60,53 @@ class Track(NamedTuple):
     powers: Tensor
 
 
-def fitted_track(found: Candidate, combinations: Tensor, length: int, cut: float) -> Track:
-    """The best straight track next to one that the search has found.
+def fitted_track(found: Candidates, combinations: Tensor, length: int, cut: float) -> Track:
+    """The most conspicuous of the best straight tracks next to those that the search has found.
 
     Args:
-        found: The search's track.
+        found: The search's tracks.
         combinations: Signs of sensors to choose from, `(combination, sensor)`.
         length: Samples of a segment of the search.
         cut: Power of a sensor in a segment of the search that counts as this much where it is more.
     """
-    p, count, width = found.bins.shape
-    ends = _straight(found.along)
-    blocks = _blocks(found, ends, length)  # (sensor, segment, block)
+    tracks, p, count, width = found.bins.shape
+    ends = _straight(found.along)  # (track, end)
+    blocks = _blocks(found, ends, length)  # (track, sensor, segment, block)
     signs, tails, powers = found.signs.to(blocks.dtype), [], torch.zeros(0)
     for joined in sorted({max(count // _CLOSER**k, 1) for k in range(count)}, reverse=True):
         reach = _REACH[joined < count]
         moved = torch.arange(-reach, reach + 1, dtype=torch.float64) * (_STEP * joined / count)
         turns = [torch.polar(torch.ones_like(c), -2 * math.pi * c) for c in _cycles(moved, count, width)]
-        summed = torch.einsum("st,ast,bst->sab", (signs @ blocks.flatten(1)).view(joined, -1), *(
-            t.view(len(moved), joined, -1) for t in turns
-        ))  # fmt: skip
-        start, stop = divmod(int(summed.abs().square().sum(0).argmax()), len(moved))
-        ends = ends + torch.stack([moved[start], moved[stop]])
-        blocks = blocks * (turns[0][start] * turns[1][stop]).view(count, width)
-        parts = blocks.view(p, joined, -1).sum(-1) / math.sqrt(count * width / joined)  # (sensor, segment)
+        added = torch.einsum("cp,cpt->ct", signs, blocks.flatten(2)).view(tracks, joined, -1)
+        of_start, of_stop = (t.view(len(moved), joined, -1) for t in turns)
+        summed = torch.einsum("cst,ast,bst->csab", added, of_start, of_stop)
+        best = summed.abs().square().sum(1).flatten(1).argmax(-1)
+        start, stop = best // len(moved), best % len(moved)
+        ends = ends + torch.stack([moved[start], moved[stop]], -1)
+        blocks = blocks * (turns[0][start] * turns[1][stop]).view(tracks, 1, count, width)
+        parts = blocks.view(tracks, p, joined, -1).sum(-1) / math.sqrt(
+            count * width / joined
+        )  # (track, sensor, segment)
         if joined == count:  # a steady line that is crossed is no track
-            powers = (signs @ parts).abs().square() / signs.abs().sum()
+            powers = torch.einsum("cp,cps->cs", signs, parts).abs().square() / signs.abs().sum(-1, keepdim=True)
             held = math.sqrt(cut) / parts.abs().clamp(min=math.sqrt(cut))
             parts, blocks = parts * held, blocks * held[..., None]
-        combined = (combinations.to(parts.dtype) @ parts).abs().square() / combinations.abs().sum(-1, keepdim=True)
-        which = int(combined.sum(-1).argmax())
+        combined = (combinations.to(parts.dtype) @ parts).abs().square().sum(-1) / combinations.abs().sum(-1)
+        power, which = combined.max(-1)
         signs = combinations[which].to(blocks.dtype)
         places = _FINER * (count / joined) ** 2
-        tails.append(_log_tail(joined, float(combined[which].sum())) + math.log(places))
-    first, last = (float(end) / length for end in ends)
-    return Track(min(tails) + math.log(len(tails)), (first, last), signs.real, powers)
+        tails.append(_log_tail(joined, power) + math.log(places))
+    log_tail, at = (torch.stack(tails).amin(0) + math.log(len(tails))).min(0)
+    k = int(at)
+    first, last = (ends[k] / length).tolist()
+    return Track(float(log_tail), (first, last), signs[k].real, powers[k])
 
 
 def _straight(along: Tensor) -> Tensor:
-    """Bins at the record's ends, of the line through the middles of the first and the last segment."""
-    bins = along.to(torch.float64)
-    half = (bins[-1] - bins[0]) / (2 * max(len(bins) - 1, 1))
-    return torch.stack([bins[0] - half, bins[-1] + half])
+    """Bins at the record's ends `(track, end)`, of the line through the middles of the first and the last segment."""
+    first, last = along[:, 0].to(torch.float64), along[:, -1].to(torch.float64)
+    half = (last - first) / (2 * max(along.shape[1] - 1, 1))
+    return torch.stack([first - half, last + half], -1)
 
 
 def _cycles(ends: Tensor, count: int, width: int) -> tuple[Tensor, Tensor]:
@@ -106,21 +116,20 @@ def _cycles(ends: Tensor, count: int, width: int) -> tuple[Tensor, Tensor]:
     return whole * (share - share**2 / 2), whole * share**2 / 2
 
 
-def _blocks(found: Candidate, ends: Tensor, length: int) -> Tensor:
-    """Samples of the band around a track, whose phase stands still along it, `(sensor, segment, block)`."""
-    _, count, width = found.bins.shape
+def _blocks(found: Candidates, ends: Tensor, length: int) -> Tensor:
+    """Samples of the bands around tracks, whose phase stands still along them, `(track, sensor, segment, block)`."""
+    count, width = found.bins.shape[-2:]
     blocks = torch.fft.ifft(torch.fft.ifftshift(found.bins.to(torch.complex128), -1), norm="ortho")
     within = torch.arange(width, dtype=torch.float64) / width
-    of_bins = found.along[:, None] * (torch.arange(count)[:, None] + within)
-    of_bins = of_bins + found.undone * (within - (length - 1) / (2 * length)).square() / 2
-    start, stop = _cycles(ends, count, width)
-    left = (start[0] + stop[1]).view(count, width) - of_bins
-    return blocks * torch.polar(torch.ones_like(left), -2 * math.pi * left)
+    of_bins = found.along[..., None] * (torch.arange(count)[:, None] + within)
+    of_bins = of_bins + found.undone[:, None, None] * (within - (length - 1) / (2 * length)).square() / 2
+    of_start, of_stop = _cycles(ends[:, 0], count, width)[0], _cycles(ends[:, 1], count, width)[1]
+    left = (of_start + of_stop).view(-1, count, width) - of_bins
+    return blocks * torch.polar(torch.ones_like(left), -2 * math.pi * left)[:, None]
 
 
-def _log_tail(shape: int, power: float) -> float:
-    """Logarithm of the upper tail of a Gamma law of whole shape and scale one."""
-    if power <= 0:
-        return 0.0
+def _log_tail(shape: int, power: Tensor) -> Tensor:
+    """Logarithm of the upper tail of a Gamma law of whole shape and scale one, at each of `(track,)` powers."""
     k = torch.arange(shape, dtype=torch.float64)
-    return min(float(torch.logsumexp(k * math.log(power) - torch.lgamma(k + 1), 0)) - power, 0.0)
+    power = power[:, None].clamp(min=torch.finfo(torch.float64).tiny)
+    return (torch.logsumexp(k * power.log() - torch.lgamma(k + 1), -1) - power[:, 0]).clamp(max=0.0)

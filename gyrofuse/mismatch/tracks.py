@@ -18,7 +18,7 @@ from torch import Tensor
 from gyrofuse._transforms import squared_modulus
 from gyrofuse.mismatch.evidence import corrected
 from gyrofuse.mismatch.lines import sets_of
-from gyrofuse.mismatch.track_fit import AROUND, Candidate, fitted_track
+from gyrofuse.mismatch.track_fit import AROUND, Candidates, fitted_track
 
 _SEGMENT = 16  # roots of the record's length
 _EVERY = 4  # bins that a frequency moves within a segment, from one rate that is undone to the next
@@ -56,7 +56,7 @@ def strongest_sweep(white: Tensor) -> Sweep:
     moves = length // (2 * count)  # bins from segment to segment, for half a cycle per sample over the record
     signs = _signs(p)
     kept = _conspicuous(white[:, : count * length].view(p, count, length).to(torch.float32), moves, signs)
-    track = min((fitted_track(candidate, signs, length, _CUT) for candidate in kept), key=lambda track: track.log_tail)
+    track = fitted_track(kept, signs, length, _CUT)
     places = float((moves - 1) * count * length * len(signs))
     first, last = (abs(math.remainder(end, 1.0)) for end in track.ends)
     sensors = tuple(track.signs.nonzero()[:, 0].tolist())
@@ -66,24 +66,19 @@ def strongest_sweep(white: Tensor) -> Sweep:
     return Sweep(corrected(math.exp(track.log_tail), places), first, last, sensors, nats, turns)
 
 
-def _conspicuous(segments: Tensor, moves: int, signs: Tensor) -> list[Candidate]:
+def _conspicuous(segments: Tensor, moves: int, signs: Tensor) -> Candidates:
     """The tracks with most power, of segments `(sensor, segment, time)`, up to so many bins from one to the next."""
     length = segments.shape[-1]
     centred = ((torch.arange(length) - (length - 1) / 2) / length).square()
-    kept: list[Candidate] = []
+    found: list[Candidates] = []
     for undone in range(_EVERY // 2, moves + _EVERY // 2, _EVERY):
         turn = torch.polar(torch.full((length,), length**-0.5), -math.pi * undone * centred)
         bins = torch.fft.fft(segments * turn)  # (sensor, segment, bin)
         powers = squared_modulus(bins).clamp(max=_CUT).sum(0)
-        tracks = [
-            _most_power(bins, powers, move, signs)
-            for move in range(max(undone - _EVERY // 2, 1), min(undone + _EVERY // 2, moves))
-        ]
-        least = kept[-1].power if len(kept) == _FITTED else 0.0
-        power, which, along = (torch.cat(part) for part in zip(*tracks, strict=True))
-        kept += _best(power, which, along, bins, undone, signs, least)
-        kept = sorted(kept, key=lambda candidate: -candidate.power)[:_FITTED]
-    return kept
+        each = torch.arange(max(undone - _EVERY // 2, 1), min(undone + _EVERY // 2, moves))
+        found.append(_best(*_most_power(bins, powers, each, signs), bins, undone, signs))
+        found = [Candidates(*map(torch.cat, zip(*found, strict=True))).strongest(_FITTED)]
+    return found[0]
 
 
 def _signs(p: int) -> Tensor:
@@ -95,22 +90,23 @@ def _signs(p: int) -> Tensor:
     return every[first > 0]
 
 
-def _most_power(bins: Tensor, powers: Tensor, move: int, signs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _most_power(bins: Tensor, powers: Tensor, moves: Tensor, signs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Tracks on which all sensors have most power: that of their likeliest combination, which, and their bins.
 
     Args:
         bins: Transforms, `(sensor, segment, bin)`.
         powers: Of all sensors together, `(segment, bin)`.
-        move: Bins from segment to segment, at least.
+        moves: Bins from segment to segment, at least, `(move,)`; of each there are as many tracks.
         signs: The combinations, `(combination, sensor)`.
 
     Returns:
         `(track,)`, `(track,)` and `(track, segment)`.
     """
     count, length = powers.shape
-    sums = _tracks(powers, move)
-    at = sums.flatten().topk(min(_CANDIDATES, sums.numel())).indices
-    along = (at % length)[:, None] + move * torch.arange(count) + _drift(at // length, count)
+    sums = _tracks(powers, moves).flatten(1)  # (move, more and bin)
+    at = sums.topk(min(_CANDIDATES, sums.shape[-1])).indices
+    along = (at % length)[..., None] + moves[:, None, None] * torch.arange(count)
+    along = along.flatten(0, 1) + _drift((at // length).flatten(), count)
     values = bins[:, torch.arange(count), along % length]  # (sensor, track, segment)
     values = values * (math.sqrt(_CUT) / values.abs().clamp(min=math.sqrt(_CUT)))
     parts = torch.view_as_real(values).movedim(0, 1).flatten(2)  # real and imaginary, of each track
@@ -119,9 +115,7 @@ def _most_power(bins: Tensor, powers: Tensor, move: int, signs: Tensor) -> tuple
     return (*power.max(-1), along)
 
 
-def _best(
-    power: Tensor, which: Tensor, along: Tensor, bins: Tensor, undone: int, signs: Tensor, least: float
-) -> list[Candidate]:
+def _best(power: Tensor, which: Tensor, along: Tensor, bins: Tensor, undone: int, signs: Tensor) -> Candidates:
     """The most conspicuous ones of tracks that move nearly alike.
 
     Args:
@@ -131,16 +125,11 @@ def _best(
         bins: Transforms, `(sensor, segment, bin)`.
         undone: Bins that a frequency moves within a segment, which were undone before.
         signs: The combinations, `(combination, sensor)`.
-        least: Power above which a track is among them.
     """
     best = power.topk(min(_FITTED, len(power))).indices
-    best = best[power[best] > least]
-    segment = torch.arange(bins.shape[1])[:, None]
     around = (along[best][..., None] + torch.arange(-AROUND, AROUND)) % bins.shape[2]
-    return [
-        Candidate(float(power[k]), signs[which[k]], along[k], undone, bins[:, segment, near])
-        for k, near in zip(best.tolist(), around, strict=True)
-    ]
+    near = bins[:, torch.arange(bins.shape[1])[:, None], around].movedim(0, 1)
+    return Candidates(power[best], signs[which[best]], along[best], torch.full_like(best, undone), near)
 
 
 def _drift(more: Tensor, count: int) -> Tensor:
@@ -155,19 +144,18 @@ def _drift(more: Tensor, count: int) -> Tensor:
     return drift
 
 
-def _tracks(powers: Tensor, move: int) -> Tensor:
-    """Sums along tracks that begin at each bin and move by `move` bins a segment, and some more, `(more, bin)`.
+def _tracks(powers: Tensor, moves: Tensor) -> Tensor:
+    """Sums along tracks that begin at each bin and move by `moves` bins a segment, and some more, `(move, more, bin)`.
 
     Args:
         powers: `(segment, bin)`, as many segments as a power of two.
-        move: At least; by the record's end a track has moved up to as many bins more as there are segments, less one.
+        moves: At least; by the record's end a track has moved up to as many bins more as there are segments, less one.
     """
     count, length = powers.shape
-    bins = torch.arange(length)
-    at = (bins + move * torch.arange(count)[:, None]) % length
-    sums = powers.gather(-1, at)[:, None]  # (group, shift, bin)
-    while len(sums) > 1:
-        early, late = sums[::2], sums[1::2]
-        shifts = [early[:, d // 2] + late[:, d // 2].roll(-((d + 1) // 2), -1) for d in range(2 * sums.shape[1])]
-        sums = torch.stack(shifts, 1)
-    return sums[0]
+    at = (torch.arange(length) + (moves[:, None] * torch.arange(count))[..., None]) % length
+    sums = powers.expand(len(moves), -1, -1).gather(-1, at)[:, :, None]  # (move, group, shift, bin)
+    while sums.shape[1] > 1:
+        early, late = sums[:, ::2], sums[:, 1::2]
+        shifts = [early[:, :, d // 2] + late[:, :, d // 2].roll(-((d + 1) // 2), -1) for d in range(2 * sums.shape[2])]
+        sums = torch.stack(shifts, 2)
+    return sums[:, 0]
