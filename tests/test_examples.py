@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scripts import run_script
 
 import gyrofuse as gf
 
@@ -14,8 +15,15 @@ EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
 
 def run(name: str, *arguments: object, cwd: Path) -> str:
-    command = [sys.executable, str(EXAMPLES / name), *map(str, arguments)]
-    return subprocess.run(command, check=True, capture_output=True, text=True, cwd=cwd).stdout
+    done = run_script(EXAMPLES / name, *arguments, cwd=cwd)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def refused(name: str, *arguments: object, cwd: Path) -> str:
+    done = run_script(EXAMPLES / name, *arguments, cwd=cwd)
+    assert done.returncode == 2
+    return done.stderr
 
 
 def test_fuse_log(tmp_path: Path):
@@ -94,10 +102,8 @@ def test_real_mismatch(tmp_path: Path, shared: Path):
 
 
 def test_real_mismatch_names_the_files_that_it_lacks(tmp_path: Path):
-    command = [sys.executable, str(EXAMPLES / "real_mismatch.py"), "--data", str(tmp_path), "--only", "broad"]
-    done = subprocess.run(command, check=False, capture_output=True, text=True)
-    assert done.returncode == 2
-    assert "expected a folder with broad_trials.npz" in done.stderr
+    told = refused("real_mismatch.py", "--data", tmp_path, "--only", "broad", cwd=tmp_path)
+    assert "expected a folder with broad_trials.npz" in told
 
 
 def test_vibration_flight(tmp_path: Path):
@@ -113,7 +119,9 @@ def test_vibration_flight(tmp_path: Path):
 
 def test_long_recording(tmp_path: Path):
     options = ("--samples", 70_000, "--levels", 10, "--scale-weights", "short")
-    out = run("long_recording.py", *options, "--check", cwd=tmp_path)
+    command = [sys.executable, EXAMPLES / "long_recording.py", *options, "--check"]  # its memory is its own
+    done = subprocess.run([*map(str, command)], check=True, capture_output=True, text=True, cwd=tmp_path)
+    out = done.stdout
     assert float(out.split("Largest difference of a weight")[1].split(",")[0]) < 1e-12
     peak, before = (float(out.split(word)[1].split()[0]) for word in ("Peak memory of a process", "of which"))
     assert before <= peak < 1000  # MB
@@ -123,10 +131,8 @@ def test_long_recording(tmp_path: Path):
 
 
 def test_long_recording_refuses_more_levels_than_samples(tmp_path: Path):
-    command = [sys.executable, str(EXAMPLES / "long_recording.py"), "--samples", "1000", "--levels", "10"]
-    done = subprocess.run(command, check=False, capture_output=True, text=True, cwd=tmp_path)
-    assert done.returncode == 2
-    assert "--levels: expected at most 9 for 1000 samples" in done.stderr
+    told = refused("long_recording.py", "--samples", 1000, "--levels", 10, cwd=tmp_path)
+    assert "--levels: expected at most 9 for 1000 samples" in told
 
 
 def test_train_scale_weights(tmp_path: Path):
@@ -155,8 +161,5 @@ def test_train_scale_weights(tmp_path: Path):
 )
 def test_train_scale_weights_refuses(tmp_path: Path, options: list[str], message: str):
     (tmp_path / "mine.txt").touch()
-    command = [sys.executable, str(EXAMPLES / "train_scale_weights.py"), *options]
-    done = subprocess.run(command, check=False, capture_output=True, text=True, cwd=tmp_path)
-    assert done.returncode == 2
-    assert message in done.stderr
+    assert message in refused("train_scale_weights.py", *options, cwd=tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"mine.txt"}

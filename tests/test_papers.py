@@ -1,37 +1,16 @@
 """The studies of the papers run, print their verdicts and draw their figures."""
 
-import contextlib
-import io
-import runpy
 import subprocess
-import sys
-import warnings
 from pathlib import Path
 
 import pytest
+from scripts import run_script
 
 PAPERS = Path(__file__).resolve().parents[1] / "examples" / "papers"
 
 
 def run(name: str, *arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """Run a study as a command, in this process: it need not load the library again."""
-    command = [str(PAPERS / name), "--quick", *map(str, arguments)]
-    status = 0
-    with (
-        pytest.MonkeyPatch.context() as patch,
-        warnings.catch_warnings(),
-        contextlib.redirect_stdout(io.StringIO()) as out,
-        contextlib.redirect_stderr(io.StringIO()) as err,
-    ):
-        warnings.simplefilter("default")
-        patch.chdir(cwd)
-        patch.syspath_prepend(PAPERS)
-        patch.setattr(sys, "argv", command)
-        try:
-            runpy.run_path(command[0], run_name="__main__")
-        except SystemExit as ended:
-            status = ended.code
-    return subprocess.CompletedProcess(command, status, out.getvalue(), err.getvalue())
+    return run_script(PAPERS / name, "--quick", *arguments, cwd=cwd)
 
 
 def is_png(path: Path) -> bool:

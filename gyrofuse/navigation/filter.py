@@ -32,7 +32,7 @@ from gyrofuse.navigation.attitude import (
     skew,
 )
 from gyrofuse.navigation.sensors import Drawn, UnitErrors
-from gyrofuse.navigation.strapdown import State, step
+from gyrofuse.navigation.strapdown import Frame, State, step
 from gyrofuse.navigation.trajectory import Trajectory
 from gyrofuse.state_space import StateSpace
 
@@ -185,6 +185,7 @@ def fly(
     """
     gnss, alignment = gnss or Gnss(), alignment or Alignment()
     dt, earth = 1 / told.rate, trajectory.earth_rate
+    frame = Frame.of(dt, earth)
     ideal = trajectory.increments(told.rate)
     n_flights, n_samples = drawn.gyro.samples.shape[:2]
     n_samples = min(n_samples, len(ideal.angle))
@@ -212,7 +213,7 @@ def fly(
                 for own, axes, sensor in zip(ideal, drawn, sensors, strict=True)
             )
             before_turn = state.attitude
-            state = step(state, (now[0], now[1]), before, dt, earth)
+            state = step(state, (now[0], now[1]), before, frame)
             before = now[0], now[1]
             pushed = pushed + rotate(before_turn, now[1])
         middle = matrix(multiply(start.attitude, from_rotation_vector(0.5 * rotation_vector(_between(start, state)))))

@@ -37,15 +37,38 @@ class State(NamedTuple):
     position: Tensor
 
 
-def step(state: State, now: tuple[Tensor, Tensor], before: tuple[Tensor, Tensor], dt: float, earth: Tensor) -> State:
+class Frame(NamedTuple):
+    """The navigation frame during an interval, in which the Earth turns it.
+
+    Attributes:
+        dt: s.
+        earth: Rate of the Earth in the frame, rad/s, `(3,)`.
+        half, whole: Quaternions of the frame's turn back, by the interval's middle and its end.
+        down: What gravity adds to a velocity, m/s.
+    """
+
+    dt: float
+    earth: Tensor
+    half: Tensor
+    whole: Tensor
+    down: Tensor
+
+    @classmethod
+    def of(cls, dt: float, earth: Tensor) -> Frame:
+        """Of intervals of `dt` seconds."""
+        down = torch.tensor([0.0, 0.0, dt * GRAVITY], dtype=earth.dtype, device=earth.device)
+        half, whole = (from_rotation_vector(-share * dt * earth) for share in (0.5, 1.0))
+        return cls(dt, earth, half, whole, down)
+
+
+def step(state: State, now: tuple[Tensor, Tensor], before: tuple[Tensor, Tensor], frame: Frame) -> State:
     """One interval on.
 
     Args:
         state: At its start.
         now: Increments of angle (rad) and velocity (m/s) in it, `(..., 3)` each.
         before: Those of the interval before.
-        dt: s.
-        earth: Rate of the Earth in the navigation frame, rad/s, `(3,)`.
+        frame: In which it is told.
 
     Returns:
         The state at its end.
@@ -58,19 +81,18 @@ def step(state: State, now: tuple[Tensor, Tensor], before: tuple[Tensor, Tensor]
     pushed = push + _turned(angle, push)
     pushed = pushed + (torch.linalg.cross(angle_, push) + torch.linalg.cross(push_, angle)) / 12
     gained = rotate(state.attitude, pushed)
-    half = from_rotation_vector((-0.5 * dt * earth).expand_as(angle))
-    gained = rotate(half, gained)  # (5.85): the frame turns as well
-    down = torch.tensor([0.0, 0.0, GRAVITY], dtype=angle.dtype, device=angle.device)
-    gained = gained + dt * down
+    gained = rotate(frame.half, gained) + frame.down  # (5.85): the frame turns as well
+    turned = (frame.dt * frame.earth).expand_as(gained)
     # (5.36), with the velocity in the middle
-    gained = gained - 2 * dt * torch.linalg.cross(earth.expand_as(gained), state.velocity + gained / 2)
+    gained = gained - 2 * torch.linalg.cross(turned, state.velocity + gained / 2)
     velocity = state.velocity + gained
     # (5.38) beside what a push that changes linearly adds, twice integrated: in the frame, which turns with the Earth.
-    still = rotate(conjugate(state.attitude), (dt * earth).expand_as(angle))
+    still = rotate(conjugate(state.attitude), turned)
     change = rotate(state.attitude, push - push_ + torch.linalg.cross(angle - still, push))
-    position = state.position + dt * (state.velocity + gained / 2 - change / 12)
-    whole = from_rotation_vector((-dt * earth).expand_as(angle))
-    attitude = multiply(multiply(whole, state.attitude), from_rotation_vector(turn))  # (5.75), with quaternions
+    position = state.position + frame.dt * (state.velocity + gained / 2 - change / 12)
+    attitude = multiply(
+        multiply(frame.whole.expand_as(state.attitude), state.attitude), from_rotation_vector(turn)
+    )  # (5.75), with quaternions
     return State(attitude / attitude.norm(dim=-1, keepdim=True), velocity, position)
 
 
@@ -106,9 +128,9 @@ def navigate(start: State, angles: Tensor, pushes: Tensor, dt: float, earth: Ten
             f"{tuple(angles.shape)} and {tuple(pushes.shape)}"
         )
     state, states = start, []
-    before = _extrapolated(angles), _extrapolated(pushes)
+    before, frame = (_extrapolated(angles), _extrapolated(pushes)), Frame.of(dt, earth)
     for angle, push in zip(angles.unbind(-2), pushes.unbind(-2), strict=True):
-        state = step(state, (angle, push), before, dt, earth)
+        state = step(state, (angle, push), before, frame)
         before = angle, push
         states.append(state)
     return State(*(torch.stack(parts, -2) for parts in zip(*states, strict=True)))
