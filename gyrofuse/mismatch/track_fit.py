@@ -84,9 +84,8 @@ def fitted_track(found: Candidates, combinations: Tensor, length: int, cut: floa
         start, stop = best // len(moved), best % len(moved)
         ends = ends + torch.stack([moved[start], moved[stop]], -1)
         blocks = blocks * (turns[0][start] * turns[1][stop]).view(tracks, 1, count, width)
-        parts = blocks.view(tracks, p, joined, -1).sum(-1) / math.sqrt(
-            count * width / joined
-        )  # (track, sensor, segment)
+        together = math.sqrt(count * width / joined)
+        parts = blocks.view(tracks, p, joined, -1).sum(-1) / together  # (track, sensor, segment)
         if joined == count:  # a steady line that is crossed is no track
             powers = torch.einsum("cp,cps->cs", signs, parts).abs().square() / signs.abs().sum(-1, keepdim=True)
             held = math.sqrt(cut) / parts.abs().clamp(min=math.sqrt(cut))
