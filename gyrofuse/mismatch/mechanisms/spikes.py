@@ -22,6 +22,7 @@ from gyrofuse.mismatch.shocks import fitted_shock, shock_posterior, shock_scores
 _HOUR = 3600.0
 _ALIKE = 5.0  # nats
 _RARE = 2.0  # nats by which a few outliers have to surpass noise that is heavy-tailed throughout
+_LAW, _TAILS = 1.5, 0.5  # nats that their law, and one of such noise, gain by chance: half of each number but the scale
 _PLAIN = 5.0  # sd: outliers that can be taken off one by one
 _PRESENT, _OWN_LAW = 4.0, 10.0  # nats of a sensor that tells the law of all, and of one that has it whatever they say
 _UNLIKE = 5.0  # nats for each sensor that has a law of its own
@@ -80,7 +81,8 @@ class Spikes(Mechanism):
             hit = tuple(i for i, law in enumerate(laws) if law.rate > 0)
         if not hit or any(laws[i].rate > _ISOLATED for i in hit) or clustered(levelled(case)[list(hit)]):
             return None
-        if (gain if together else apart) < sum(heavy_tailed(z[i]) for i in hit) + _RARE:
+        n_laws = 1 if together else len({laws[i].rate for i in hit})
+        if max(gain - _LAW * n_laws, apart - _LAW * len(hit)) < _heavy_tailed(z, hit) + _RARE:
             return None
         rival = _louder(case)
         if rival > gain + _ALIKE:
@@ -198,6 +200,12 @@ class Spikes(Mechanism):
 def _gains(z: Tensor, laws: list[Outliers]) -> Tensor:
     """Log likelihood over normal laws of their own variance, `(sensor, time)`."""
     return torch.stack([mixture(row, law) - free_gaussian(row) for row, law in zip(z, laws, strict=True)])
+
+
+def _heavy_tailed(z: Tensor, hit: tuple[int, ...]) -> float:
+    """Nats of noise that is heavy-tailed throughout, in each sensor in its way or in all alike, without chance's."""
+    each = sum(heavy_tailed(z[i]) - _TAILS for i in hit)
+    return max(each, heavy_tailed(torch.cat([z[i] / z[i].square().mean().sqrt() for i in hit])) - _TAILS)
 
 
 def _alike(z: Tensor, laws: list[Outliers], hit: tuple[int, ...]) -> list[Outliers]:
