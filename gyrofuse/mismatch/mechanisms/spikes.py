@@ -21,7 +21,7 @@ from gyrofuse.mismatch.shocks import fitted_shock, shock_posterior, shock_scores
 
 _HOUR = 3600.0
 _ALIKE = 5.0  # nats
-_RARE = 2.0  # nats by which a few outliers have to surpass noise that is heavy-tailed throughout
+_RARE = 2.5  # nats by which a few outliers have to surpass noise that is heavy-tailed throughout
 _LAW, _TAILS = 1.5, 0.5  # nats that their law, and one of such noise, gain by chance: half of each number but the scale
 _PLAIN = 5.0  # sd: outliers that can be taken off one by one
 _PRESENT, _OWN_LAW = 4.0, 10.0  # nats of a sensor that tells the law of all, and of one that has it whatever they say
