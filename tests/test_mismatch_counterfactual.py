@@ -86,6 +86,32 @@ def test_red_noise_may_be_a_step_that_gains_as_much():
     assert alike(stepped, VibrationTone.at(stepped, 12.0), scan.gain) == ()
 
 
+def walking(seed: int, *, common: bool, steps: bool) -> torch.Tensor:
+    """Increments of two sensors that have some each, or share them but for their size."""
+    g, gains = generator(seed), torch.tensor([1.0, -0.7], dtype=torch.float64)[:, None]
+    rows = torch.randn(1 if common else 2, N, generator=g, dtype=torch.float64)
+    jumps = torch.where(rows.abs() >= rows.abs().topk(6).values[:, -1:], rows.sign(), 0.0)
+    walk = (gains * (jumps if steps else 0.02 * rows)).cumsum(-1)
+    return torch.cat([walk, torch.zeros(SENSORS - 2, N, dtype=torch.float64)])
+
+
+@pytest.mark.parametrize("common", [True, False])
+def test_several_steps_may_look_like_slow_noise_and_slow_noise_does_not_look_like_steps(common: bool):
+    gain = torch.tensor([1.0, -0.7, 0.0, 0.0], dtype=torch.complex128)
+    told = {}
+    for steps in (True, False):
+        said = 0
+        for seed in range(6):
+            case = case_of(40 + 2 * seed, walking(seed, common=common, steps=steps))
+            effect: Mechanism = FlickerNoise(gain.real)
+            if common:
+                effect = CommonMode("walk", 0.0, gain, case.base, False)
+            finding = Finding(effect.name, effect, "", 1e-4, (0, 1), {}, gain=100.0)
+            said += "step" in happened_instead(case, finding)
+        told[steps] = said
+    assert told == {True: 6, False: 0}
+
+
 def test_red_noise_beside_several_steps_may_be_more_of_them():
     plain = case_of(3)
     noise = FlickerNoise(torch.full((SENSORS,), 1e-3, dtype=torch.float64))

@@ -31,7 +31,7 @@ from gyrofuse.mismatch.shape_fit import Fit, data_model, fit, log_score
 from gyrofuse.mismatch.shape_terms import Common, Flicker, LowPass, Shift, Term
 from gyrofuse.mismatch.shapes import compared
 from gyrofuse.mismatch.slow_effect import SlowEffect, only
-from gyrofuse.mismatch.slow_scans import slow_look
+from gyrofuse.mismatch.slow_scans import slow_look, steps_one_by_one
 
 _ANY = 1.0  # p value: look-alikes need not be surprising
 _NARROWEST = 1.5  # bins: half width of a bump in the place of a line
@@ -41,6 +41,8 @@ _NUMBER = 2.0  # nats for each number of a sensor
 _FILTERS = ("pole", "poles")
 _RED = (ParameterShift, FlickerNoise, CommonMode)
 _MAY_BE, _AS_MUCH = 0.1, 5.0  # p value, and nats below
+_MOST_STEPS = 12
+_SIZES = -3, 6, 200  # of a random walk: decades of its variance, and how many are tried
 
 
 def look_alikes(case: Case, finding: Finding) -> list[Mechanism]:
@@ -62,7 +64,7 @@ def look_alikes(case: Case, finding: Finding) -> list[Mechanism]:
 def happened_instead(case: Case, finding: Finding, beside: Sequence[Finding] = ()) -> tuple[str, ...]:
     """What happened once and gains as much as a finding of more slow noise does: a step is red noise as well.
 
-    And what happened more than once in its sensors by the findings `beside`: several more are like a walk.
+    So are several steps; and what happened more than once in its sensors by the findings `beside` is like a walk.
     """
     if not isinstance(finding.effect, _RED):
         return ()
@@ -73,8 +75,39 @@ def happened_instead(case: Case, finding: Finding, beside: Sequence[Finding] = (
         for f in beside
         if f.effect.happened_once and isinstance(f.effect, SlowEffect) and set(f.sensors) & set(finding.sensors)
     ]
-    again = [name for name in happened if happened.count(name) > 1 and _slow_noise(finding.effect)]
-    return tuple(dict.fromkeys((*once, *again)))
+    if not _slow_noise(finding.effect):
+        return tuple(dict.fromkeys(once))
+    again = [name for name in happened if happened.count(name) > 1]
+    noise = max(finding.gain, _of_walks(case, finding))
+    steps = [Step.name] if _of_steps(case, finding) > noise - _AS_MUCH else []
+    return tuple(dict.fromkeys((*once, *again, *steps)))
+
+
+def _of_walks(case: Case, finding: Finding) -> float:
+    """Nats of random walks in a finding's sensors, of one source or one each, in the ordinates that tell of steps."""
+    look, effect = slow_look(case), finding.effect
+    if isinstance(effect, CommonMode):
+        gains = effect.gain.real[None]
+    else:
+        gains = torch.eye(case.n_sensors, dtype=torch.float64)[list(finding.sensors)]
+    weighted = gains[:, :, None] / look.noise.own  # (source, sensor, ordinate)
+    walk = look.noise.parts[0, -1]
+    size = torch.logspace(*_SIZES, dtype=torch.float64)[:, None, None]
+    # Its variance over the noise's, and what is seen of it over the noise: (size, source, ordinate).
+    over = size * ((gains[:, :, None] * weighted).sum(1) * walk)
+    seen = size * ((weighted * look.y).sum(1).square() * walk)
+    return float((((seen / (1 + over) - over.log1p()).sum(-1) / 2).amax(0) - 1).sum())
+
+
+def _of_steps(case: Case, finding: Finding) -> float:
+    """Nats of several steps in a finding's sensors, less what their places and sizes gain by chance."""
+    score, gram = (products[list(finding.sensors)] for products in slow_look(case).of_steps)
+    cost, told = math.log(score.shape[-1]) + len(score), 0.0
+    for at, _, more in steps_one_by_one(score, gram):
+        if more / 2 < cost or len(at) == _MOST_STEPS:
+            break
+        told += more / 2 - cost
+    return told
 
 
 def _slow_noise(effect: Mechanism) -> bool:

@@ -9,6 +9,7 @@ means without an effect, beside simulations that tell of their noise no better t
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -124,10 +125,17 @@ class SlowLook:
         return torch.ones(len(self.y), dtype=torch.float64) if family.name != "step" else 1.0 - self._to_and_fro
 
     @cached_property
+    def of_steps(self) -> tuple[Tensor, Tensor]:
+        """Products with steps at the edges of blocks, weighted as the simulation's noise has it.
+
+        Those of the data `(sensor, edge)`, and of the steps with each other `(sensor, edge, edge)`.
+        """
+        weight, jumps = 1 / self.noise.own, edges()
+        return (weight * self.y) @ jumps.mT, (weight[:, None] * jumps) @ jumps.mT
+
+    @cached_property
     def _to_and_fro(self) -> Tensor:
-        weight = 1 / self.noise.own
-        jumps = edges()
-        pairs = ((jumps @ (own * y), (jumps * own) @ jumps.mT) for own, y in zip(weight, self.y, strict=True))
+        pairs = zip(*self.of_steps, strict=True)
         return torch.tensor([jumps_to_and_fro(*pair) for pair in pairs], dtype=torch.float64)
 
     @cached_property
@@ -212,29 +220,38 @@ def concerned(scan: Scan) -> tuple[int, ...]:
     return partakers(scan.held.square(), 1, _SEEN).positions
 
 
-def jumps_to_and_fro(score: Tensor, gram: Tensor) -> bool:
-    """Whether a sensor has several jumps that lead between two levels, found one by one.
+def steps_one_by_one(score: Tensor, gram: Tensor) -> Iterator[tuple[list[int], Tensor, float]]:
+    """Steps, each where all sensors together tell most of it beside those before: without end, the caller stops.
 
     Args:
-        score: Weighted products of the data with steps at the edges of blocks, `(edge,)`.
-        gram: Those of the steps with each other, `(edge, edge)`.
+        score: Weighted products of the data with steps at the edges of blocks, `(sensor, edge)`.
+        gram: Those of the steps with each other, `(sensor, edge, edge)`.
+
+    Yields:
+        Edges, sizes `(sensor, step)`, and twice the nats that one more would tell.
     """
     at: list[int] = []
-    jumps = torch.zeros(0, dtype=score.dtype)
-    while len(at) < _MOST_JUMPS:
-        within = gram[at][:, at]
-        jumps = torch.linalg.solve(within, score[at])
-        left = score - gram[:, at] @ jumps
-        information = gram.diagonal() - (gram[:, at] * torch.linalg.solve(within, gram[at]).mT).sum(-1)
-        information[at] = math.inf
-        squares = left.square() / information
-        if float(squares.max()) < _JUMP**2:
+    while True:
+        within = gram[:, at][:, :, at]
+        sizes = torch.linalg.solve(within, score[:, at, None])[..., 0]
+        left = score - (gram[:, :, at] @ sizes[..., None])[..., 0]
+        shared = (gram[:, :, at] * torch.linalg.solve(within, gram[:, at]).mT).sum(-1)
+        information = gram.diagonal(dim1=-2, dim2=-1) - shared
+        information[:, at] = math.inf
+        squares = (left.square() / information).sum(0)
+        yield at, sizes, float(squares.max())
+        at = [*at, int(squares.argmax())]
+
+
+def jumps_to_and_fro(score: Tensor, gram: Tensor) -> bool:
+    """Whether a sensor has several jumps that lead between two levels, by its products `(edge,)`, `(edge, edge)`."""
+    for at, sizes, more in steps_one_by_one(score[None], gram[None]):  # noqa: B007 (the last of them are used)
+        if more < _JUMP**2 or len(at) == _MOST_JUMPS:
             break
-        at.append(int(squares.argmax()))
     if len(at) < _FEWEST_JUMPS:
         return False
-    order = torch.tensor(at[: len(jumps)]).argsort()
-    levels = torch.cat([torch.zeros_like(jumps[:1]), jumps[order].cumsum(0)])
+    jumps = sizes[0]
+    levels = torch.cat([torch.zeros_like(jumps[:1]), jumps[torch.tensor(at).argsort()].cumsum(0)])
     return bool(levels.amax() - levels.amin() < _TWO_LEVELS * jumps.abs().median())
 
 
