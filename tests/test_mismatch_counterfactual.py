@@ -283,6 +283,9 @@ def test_noise_that_a_simulator_of_white_noise_lacks_leaves_a_better_one():
     assert report.held_out.after < report.held_out.before
     names = {"parameter_shift", "flicker"}  # an AR1 has no name of its own
     assert all(names & {f.mechanism, *f.alternatives} for f in report.findings)
+    for finding in report.findings:
+        _, _, apart = finding.sentence.partition("; these data do not tell it apart from ")
+        assert apart == ", ".join(name.replace("_", " ") for name in finding.alternatives)
 
 
 def test_a_bump_at_either_end_of_the_spectrum_is_no_tone():

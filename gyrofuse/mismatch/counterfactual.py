@@ -16,8 +16,10 @@ from gyrofuse.mismatch.confirm import Gain, held_out_gain, sd_of_sum
 from gyrofuse.mismatch.look_alikes import happened_instead, look_alikes
 from gyrofuse.mismatch.mechanism import Finding, Instead, Mechanism
 from gyrofuse.mismatch.mechanisms import STAGES
+from gyrofuse.mismatch.mechanisms.not_identifiable import NOT_IDENTIFIABLE
 from gyrofuse.mismatch.slow_effect import SlowEffect
 from gyrofuse.mismatch.slow_scans import slow_look
+from gyrofuse.mismatch.telling import mechanism_words
 
 _AS_GOOD_SD, _AS_GOOD = 1.0, 3.0  # differences of gains that are chance: in standard deviations, and in nats
 
@@ -130,7 +132,11 @@ def _compared(finding: Finding, gain: Gain, left: Case, beside: list[Finding]) -
         told = replace(told, instead=Instead(effect.name, best.total, sd))
         if best.total > 0 and less < max(_AS_GOOD_SD * sd, _AS_GOOD):
             alike += (effect.name,)
-    return replace(told, alternatives=tuple(dict.fromkeys((*finding.alternatives, *alike))))
+    alternatives = tuple(dict.fromkeys((*finding.alternatives, *alike)))
+    sentence = finding.sentence
+    if alternatives and finding.mechanism != NOT_IDENTIFIABLE:  # which says so itself
+        sentence += f"; these data do not tell it apart from {', '.join(map(mechanism_words, alternatives))}"
+    return replace(told, alternatives=alternatives, sentence=sentence)
 
 
 def _better(

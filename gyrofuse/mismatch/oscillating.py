@@ -95,8 +95,6 @@ class Seen(NamedTuple):
                 parameters[f"phase[{i}]"] = Parameter(turn, turn - reach, turn + reach, "deg")
         other = ("resonance",) if effect.name == "drifting_tone" else ("drifting_tone",)
         alternatives = tuple(sorted({*self.rivals, *(other if self.verdict.open else ())} - {effect.name}))
-        if alternatives:
-            sentence += f"; these data do not tell it apart from {', '.join(alternatives)}"
         return Finding(
             effect.name,
             effect,

@@ -43,8 +43,6 @@ class MismatchReport(Outcome):
         for i, finding in enumerate(self.findings, 1):
             gain = "" if finding.held_out_gain is None else f"; {finding.held_out_gain:+.1f} nats on data held out"
             lines.append(f"{i}. {finding.mechanism}: {finding.sentence} ({p_words(finding.p_value)}{gain})")
-            if finding.alternatives:
-                lines.append(f"   cannot be told apart from {', '.join(finding.alternatives)}")
             lines += [f"   {words}" for words in (otherwise_words(finding),) if words]
             if finding.gain_without is not None and len(self.findings) > 1:
                 lines.append(f"   left out alone, it would cost {nats(finding.gain_without)} nats (held out)")

@@ -27,8 +27,6 @@ def found(
     frequency_hz: float | None = None,
 ) -> Finding:
     """A finding made of a spectral shape."""
-    if shape.alternatives:
-        sentence += f"; these data do not tell it apart from {', '.join(shape.alternatives)}"
     limits = {name: entry for name, entry in parameters.items() if not math.isnan(entry.value)}
     return Finding(
         effect.name,
