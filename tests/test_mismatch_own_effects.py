@@ -101,7 +101,7 @@ def test_a_simulation_without_the_effect_is_not_said_to_have_it(change: Callable
     """Chance gives any number some gain in a simulation that knows nothing of it."""
     said = 0
     wandering = gf.WhiteNoise(1.0) + gf.RandomWalk(1e-4)
-    for seed in range(15):
+    for seed in range(30):
         g = generator(500 + seed)
         given, simulation = (wandering.simulate(N, batch=(P,), generator=g) for _ in range(2))
         case = prepared(recording(change(given)), recording(simulation), None, g)
@@ -111,21 +111,21 @@ def test_a_simulation_without_the_effect_is_not_said_to_have_it(change: Callable
 
 def test_a_simulation_with_the_effect_is_seldom_doubted():
     false_alarms = 0
-    for seed in range(10):
+    for seed in range(20):
         given = recording(following(3.0)(drawn(100 + seed)))
         simulation = torch.cat([following(3.0)(x) for x in drawn(200 + seed, records=2).split(N, -1)], -1)
         false_alarms += gf.diagnose(given, recording_of_two(simulation)).mismatch
-    assert false_alarms <= 1  # of 10 at 1 %: more in four of a thousand
+    assert false_alarms <= 2  # of 20 at 1 %: one in a thousand
 
 
 def test_a_model_of_samples_is_no_surer_than_they_were():
     false_alarms = 0
-    for seed in range(10):
+    for seed in range(20):
         given = recording(following(3.0)(drawn(300 + seed)))
         first = gf.diagnose(given, recording_of_two(drawn(400 + seed)))
         assert first.model.noise_samples == N
         false_alarms += gf.diagnose(given, first.model).mismatch
-    assert false_alarms <= 1
+    assert false_alarms <= 2
 
 
 def recording_of_two(x: Tensor) -> gf.Recording:

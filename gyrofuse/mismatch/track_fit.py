@@ -130,5 +130,5 @@ def _blocks(found: Candidates, ends: Tensor, length: int) -> Tensor:
 def _log_tail(shape: int, power: Tensor) -> Tensor:
     """Logarithm of the upper tail of a Gamma law of whole shape and scale one, at each of `(track,)` powers."""
     k = torch.arange(shape, dtype=torch.float64)
-    power = power[:, None].clamp(min=torch.finfo(torch.float64).tiny)
-    return (torch.logsumexp(k * power.log() - torch.lgamma(k + 1), -1) - power[:, 0]).clamp(max=0.0)
+    log_power = power.clamp(min=torch.finfo(power.dtype).tiny).log()[:, None]
+    return (torch.logsumexp(k * log_power - torch.lgamma(k + 1), -1) - power).clamp(max=0.0)
