@@ -102,12 +102,9 @@ def _of_walks(case: Case, finding: Finding) -> float:
 def _of_steps(case: Case, finding: Finding) -> float:
     """Nats of several steps in a finding's sensors, less what their places and sizes gain by chance."""
     score, gram = (products[list(finding.sensors)] for products in slow_look(case).of_steps)
-    cost, told = math.log(score.shape[-1]) + len(score), 0.0
-    for at, _, more in steps_one_by_one(score, gram):
-        if more / 2 < cost or len(at) == _MOST_STEPS:
-            break
-        told += more / 2 - cost
-    return told
+    cost = math.log(score.shape[-1]) + len(score)
+    _, _, told = steps_one_by_one(score, gram, 2 * cost, _MOST_STEPS)
+    return sum(told) / 2 - cost * len(told)
 
 
 def _slow_noise(effect: Mechanism) -> bool:

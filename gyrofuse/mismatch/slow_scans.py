@@ -9,7 +9,6 @@ means without an effect, beside simulations that tell of their noise no better t
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -220,17 +219,20 @@ def concerned(scan: Scan) -> tuple[int, ...]:
     return partakers(scan.held.square(), 1, _SEEN).positions
 
 
-def steps_one_by_one(score: Tensor, gram: Tensor) -> Iterator[tuple[list[int], Tensor, float]]:
-    """Steps, each where all sensors together tell most of it beside those before: without end, the caller stops.
+def steps_one_by_one(score: Tensor, gram: Tensor, least: float, most: int) -> tuple[list[int], Tensor, list[float]]:
+    """Steps, each where all sensors together tell most of it beside those before.
 
     Args:
         score: Weighted products of the data with steps at the edges of blocks, `(sensor, edge)`.
         gram: Those of the steps with each other, `(sensor, edge, edge)`.
+        least: Twice the nats that a step tells.
+        most: Steps.
 
-    Yields:
-        Edges, sizes `(sensor, step)`, and twice the nats that one more would tell.
+    Returns:
+        Edges, sizes `(sensor, step)`, and twice the nats that each told when it was found.
     """
     at: list[int] = []
+    told: list[float] = []
     while True:
         within = gram[:, at][:, :, at]
         sizes = torch.linalg.solve(within, score[:, at, None])[..., 0]
@@ -239,15 +241,15 @@ def steps_one_by_one(score: Tensor, gram: Tensor) -> Iterator[tuple[list[int], T
         information = gram.diagonal(dim1=-2, dim2=-1) - shared
         information[:, at] = math.inf
         squares = (left.square() / information).sum(0)
-        yield at, sizes, float(squares.max())
-        at = [*at, int(squares.argmax())]
+        if float(squares.max()) < least or len(at) == most:
+            return at, sizes, told
+        at.append(int(squares.argmax()))
+        told.append(float(squares.max()))
 
 
 def jumps_to_and_fro(score: Tensor, gram: Tensor) -> bool:
     """Whether a sensor has several jumps that lead between two levels, by its products `(edge,)`, `(edge, edge)`."""
-    for at, sizes, more in steps_one_by_one(score[None], gram[None]):  # noqa: B007 (the last of them are used)
-        if more < _JUMP**2 or len(at) == _MOST_JUMPS:
-            break
+    at, sizes, _ = steps_one_by_one(score[None], gram[None], _JUMP**2, _MOST_JUMPS)
     if len(at) < _FEWEST_JUMPS:
         return False
     jumps = sizes[0]

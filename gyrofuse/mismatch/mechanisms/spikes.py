@@ -81,7 +81,7 @@ class Spikes(Mechanism):
             hit = tuple(i for i, law in enumerate(laws) if law.rate > 0)
         if not hit or any(laws[i].rate > _ISOLATED for i in hit) or clustered(levelled(case)[list(hit)]):
             return None
-        n_laws = 1 if together else len({laws[i].rate for i in hit})
+        n_laws = 1 if together else _n_laws(laws, hit)
         if max(gain - _LAW * n_laws, apart - _LAW * len(hit)) < _heavy_tailed(z, hit) + _RARE:
             return None
         rival = _louder(case)
@@ -205,6 +205,8 @@ def _gains(z: Tensor, laws: list[Outliers]) -> Tensor:
 def _heavy_tailed(z: Tensor, hit: tuple[int, ...]) -> float:
     """Nats of noise that is heavy-tailed throughout, in each sensor in its way or in all alike, without chance's."""
     each = sum(heavy_tailed(z[i]) - _TAILS for i in hit)
+    if len(hit) < 2:
+        return each
     return max(each, heavy_tailed(torch.cat([z[i] / z[i].square().mean().sqrt() for i in hit])) - _TAILS)
 
 
@@ -229,11 +231,15 @@ def _shared(z: Tensor, laws: list[Outliers], hit: tuple[int, ...]) -> list[Outli
     return [law.times(scale / law.scale) for scale in scales]
 
 
+def _n_laws(laws: list[Outliers], hit: tuple[int, ...]) -> int:
+    """One where the sensors concerned share it."""
+    return len({laws[i].rate for i in hit})
+
+
 def _limited(z: Tensor, laws: list[Outliers], hit: tuple[int, ...]) -> list[Outliers]:
     """With limits; those of one law for all sensors from the values of all."""
-    shared = len({laws[i].rate for i in hit}) == 1
     limited = list(laws)
-    for group in [hit] if shared else [(i,) for i in hit]:
+    for group in [hit] if _n_laws(laws, hit) == 1 else [(i,) for i in hit]:
         unit = laws[group[0]].times(1 / laws[group[0]].scale)
         found = with_limits(torch.cat([z[i] / laws[i].scale for i in group]), unit)
         for i in group:
