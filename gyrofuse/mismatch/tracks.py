@@ -1,9 +1,10 @@
 """Straight tracks through time and frequency, searched for the most conspicuous one.
 
 Whitened records are cut into segments, in each of which a rate of change is undone before the transform: what is left
-is normal, with power one, in segments and bins. Powers are added up along all straight tracks, by a tree that shares
-the sums of shorter ones (Taylor, 1974). Where the sum over the sensors is large, sums of sensors with either sign are
-asked for, whose power is Gamma distributed on every track, and the tracks that have most of it are fitted.
+is normal, with power one, in segments and bins, fine ones so that no line is lost between two. Powers are added up
+along all straight tracks, by a tree that shares the sums of shorter ones (Taylor, 1974). Where the sum over the
+sensors is large, sums of sensors with either sign are asked for, whose power is Gamma distributed on every track, and
+the tracks that have most of it are fitted.
 """
 
 from __future__ import annotations
@@ -21,10 +22,10 @@ from gyrofuse.mismatch.lines import sets_of
 from gyrofuse.mismatch.track_fit import AROUND, Candidates, fitted_track
 
 _SEGMENT = 16  # roots of the record's length
-_EVERY = 4  # bins that a frequency moves within a segment, from one rate that is undone to the next
+_EVERY = 2  # bins that a frequency moves within a segment, from one rate that is undone to the next
+_FINER = 2  # fine bins in a bin
 _CUT = 8.0  # power of a sensor: a steady line that is crossed is no track
-_CANDIDATES = 128  # of each rate, whose sensors are added with their signs
-_FITTED = 64  # tracks
+_SPARSE, _MOST = 16, 256  # bins for each track that is looked at closely, of each rate and in the end; of these most
 _AT = 0.01  # halves of a cycle per sample next to which a frequency has not turned yet
 _SIGNED = 7  # sensors up to which every sign is tried
 
@@ -70,14 +71,19 @@ def _conspicuous(segments: Tensor, moves: int, signs: Tensor) -> Candidates:
     """The tracks with most power, of segments `(sensor, segment, time)`, up to so many bins from one to the next."""
     length = segments.shape[-1]
     centred = ((torch.arange(length) - (length - 1) / 2) / length).square()
+    most, least = min(length // _SPARSE, _MOST), 0.0
     found: list[Candidates] = []
     for undone in range(_EVERY // 2, moves + _EVERY // 2, _EVERY):
         turn = torch.polar(torch.full((length,), length**-0.5), -math.pi * undone * centred)
-        bins = torch.fft.fft(segments * turn)  # (sensor, segment, bin)
+        bins = torch.fft.fft(segments * turn, n=_FINER * length)  # (sensor, segment, fine bin)
         powers = squared_modulus(bins).clamp(max=_CUT).sum(0)
-        each = torch.arange(max(undone - _EVERY // 2, 1), min(undone + _EVERY // 2, moves))
-        found.append(_best(*_most_power(bins, powers, each, signs), bins, undone, signs))
-        found = [Candidates(*map(torch.cat, zip(*found, strict=True))).strongest(_FITTED)]
+        each = torch.arange(max(undone - _EVERY // 2, 1) * _FINER, min(undone + _EVERY // 2, moves) * _FINER)
+        power, which, along = _most_power(bins, powers, each, signs, most)
+        best = power.topk(min(most, len(power))).indices
+        best = best[power[best] > least]
+        found.append(_candidates(power[best], signs[which[best]], along[best], bins, undone))
+        found = [Candidates(*map(torch.cat, zip(*found, strict=True))).strongest(most)]
+        least = float(found[0].power.min()) if len(found[0].power) == most else 0.0
     return found[0]
 
 
@@ -90,23 +96,21 @@ def _signs(p: int) -> Tensor:
     return every[first > 0]
 
 
-def _most_power(bins: Tensor, powers: Tensor, moves: Tensor, signs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _most_power(bins: Tensor, powers: Tensor, moves: Tensor, signs: Tensor, most: int) -> tuple[Tensor, Tensor, Tensor]:
     """Tracks on which all sensors have most power: that of their likeliest combination, which, and their bins.
 
     Args:
         bins: Transforms, `(sensor, segment, bin)`.
         powers: Of all sensors together, `(segment, bin)`.
-        moves: Bins from segment to segment, at least, `(move,)`; of each there are as many tracks.
+        moves: Bins from segment to segment, at least, `(move,)`.
         signs: The combinations, `(combination, sensor)`.
+        most: Tracks of each move.
 
     Returns:
         `(track,)`, `(track,)` and `(track, segment)`.
     """
+    along = torch.cat([_likely(powers, move, most) for move in moves.tolist()])
     count, length = powers.shape
-    sums = _tracks(powers, moves).flatten(1)  # (move, more and bin)
-    at = sums.topk(min(_CANDIDATES, sums.shape[-1])).indices
-    along = (at % length)[..., None] + moves[:, None, None] * torch.arange(count)
-    along = along.flatten(0, 1) + _drift((at // length).flatten(), count)
     values = bins[:, torch.arange(count), along % length]  # (sensor, track, segment)
     values = values * (math.sqrt(_CUT) / values.abs().clamp(min=math.sqrt(_CUT)))
     parts = torch.view_as_real(values).movedim(0, 1).flatten(2)  # real and imaginary, of each track
@@ -115,21 +119,32 @@ def _most_power(bins: Tensor, powers: Tensor, moves: Tensor, signs: Tensor) -> t
     return (*power.max(-1), along)
 
 
-def _best(power: Tensor, which: Tensor, along: Tensor, bins: Tensor, undone: int, signs: Tensor) -> Candidates:
-    """The most conspicuous ones of tracks that move nearly alike.
+def _candidates(power: Tensor, signs: Tensor, along: Tensor, bins: Tensor, undone: int) -> Candidates:
+    """Tracks and what is around them.
 
     Args:
         power: Of the likeliest combination of sensors, `(track,)`.
-        which: That combination.
-        along: Bins, `(track, segment)`.
-        bins: Transforms, `(sensor, segment, bin)`.
+        signs: That combination, `(track, sensor)`.
+        along: Fine bins, `(track, segment)`.
+        bins: Transforms, `(sensor, segment, fine bin)`.
         undone: Bins that a frequency moves within a segment, which were undone before.
-        signs: The combinations, `(combination, sensor)`.
     """
-    best = power.topk(min(_FITTED, len(power))).indices
-    around = (along[best][..., None] + torch.arange(-AROUND, AROUND)) % bins.shape[2]
+    along, bins = along // _FINER, bins[..., ::_FINER]
+    around = (along[..., None] + torch.arange(-AROUND, AROUND)) % bins.shape[2]
     near = bins[:, torch.arange(bins.shape[1])[:, None], around].movedim(0, 1)
-    return Candidates(power[best], signs[which[best]], along[best], torch.full_like(best, undone), near)
+    return Candidates(power, signs, along, torch.full_like(along[:, 0], undone), near)
+
+
+def _likely(powers: Tensor, move: int, most: int) -> Tensor:
+    """Bins of tracks with much power that move by so many from segment to segment, `(track, segment)`.
+
+    Of those that begin alike, which are neighbours, one is enough.
+    """
+    count, length = powers.shape
+    sums = _tracks(powers, move)
+    first = sums.amax(0).topk(min(most, length)).indices
+    more = sums[:, first].argmax(0)
+    return first[:, None] + move * torch.arange(count) + _drift(more, count)
 
 
 def _drift(more: Tensor, count: int) -> Tensor:
@@ -144,18 +159,20 @@ def _drift(more: Tensor, count: int) -> Tensor:
     return drift
 
 
-def _tracks(powers: Tensor, moves: Tensor) -> Tensor:
-    """Sums along tracks that begin at each bin and move by `moves` bins a segment, and some more, `(move, more, bin)`.
+def _tracks(powers: Tensor, move: int) -> Tensor:
+    """Sums along tracks that begin at each bin and move by `move` bins a segment, and some more, `(more, bin)`.
 
     Args:
         powers: `(segment, bin)`, as many segments as a power of two.
-        moves: At least; by the record's end a track has moved up to as many bins more as there are segments, less one.
+        move: At least; by the record's end a track has moved up to as many bins more as there are segments, less one.
     """
-    count, length = powers.shape
-    at = (torch.arange(length) + (moves[:, None] * torch.arange(count))[..., None]) % length
-    sums = powers.expand(len(moves), -1, -1).gather(-1, at)[:, :, None]  # (move, group, shift, bin)
-    while sums.shape[1] > 1:
-        early, late = sums[:, ::2], sums[:, 1::2]
-        shifts = [early[:, :, d // 2] + late[:, :, d // 2].roll(-((d + 1) // 2), -1) for d in range(2 * sums.shape[2])]
-        sums = torch.stack(shifts, 2)
-    return sums[:, 0]
+    length = powers.shape[-1]
+    sums = torch.stack([row.roll(-move * k) for k, row in enumerate(powers)])[:, None]  # (group, shift, bin)
+    while len(sums) > 1:
+        early, late = sums[::2], sums[1::2]
+        sums = powers.new_empty(len(early), 2 * early.shape[1], length)
+        for d in range(sums.shape[1]):
+            first, then, by = early[:, d // 2], late[:, d // 2], (d + 1) // 2
+            torch.add(first[:, : length - by], then[:, by:], out=sums[:, d, : length - by])
+            torch.add(first[:, length - by :], then[:, :by], out=sums[:, d, length - by :])
+    return sums[0]
