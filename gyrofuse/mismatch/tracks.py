@@ -70,13 +70,16 @@ def strongest_sweep(white: Tensor) -> Sweep:
 def _conspicuous(segments: Tensor, moves: int, signs: Tensor) -> Candidates:
     """The tracks with most power, of segments `(sensor, segment, time)`, up to so many bins from one to the next."""
     length = segments.shape[-1]
+    turned = segments.new_zeros(*segments.shape[:-1], _FINER * length, dtype=torch.complex64)
+    bins = torch.empty_like(turned)  # (sensor, segment, fine bin); kept, as memory costs as much as the transform
     centred = ((torch.arange(length) - (length - 1) / 2) / length).square()
     most, least = min(length // _SPARSE, _MOST), 0.0
     found: list[Candidates] = []
     for undone in range(_EVERY // 2, moves + _EVERY // 2, _EVERY):
         turn = torch.polar(torch.full((length,), length**-0.5), -math.pi * undone * centred)
-        bins = torch.fft.fft(segments * turn, n=_FINER * length)  # (sensor, segment, fine bin)
-        powers = squared_modulus(bins).clamp(max=_CUT).sum(0)
+        torch.mul(segments, turn, out=turned[..., :length])
+        torch.fft.fft(turned, out=bins)
+        powers = squared_modulus(bins).clamp_(max=_CUT).sum(0)
         each = torch.arange(max(undone - _EVERY // 2, 1) * _FINER, min(undone + _EVERY // 2, moves) * _FINER)
         power, which, along = _most_power(bins, powers, each, signs, most)
         best = power.topk(min(most, len(power))).indices
