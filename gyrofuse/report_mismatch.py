@@ -167,7 +167,7 @@ def _witnesses(outcome: Outcome) -> list[dict[str, Any]]:
             "p": chance(before.p_value),
             "p_after": chance(after.p_value),
             "words": capital(before.words),
-            "words_after": capital(after.words) if before.witness in left else "",
+            "words_after": capital(after.words),
             "surprised": before.p_value * len(outcome.evidence) < 0.01,
             "left": before.witness in left,
         }

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from gyrofuse import plotting
+from gyrofuse._result import p_words
 from gyrofuse._version import __version__
 
 if TYPE_CHECKING:
@@ -81,6 +82,7 @@ def render(template: str, **context: Any) -> str:
         lstrip_blocks=True,
     )
     environment.filters["number"] = number
+    environment.filters["p_words"] = p_words
     environment.filters["with_unit"] = plotting.with_unit
     environment.filters["scientific"] = lambda value: f"{value:.3e}" if math.isfinite(value) else "-"
     environment.filters["fixed"] = lambda value: f"{value:.4f}" if math.isfinite(value) else "-"

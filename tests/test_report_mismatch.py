@@ -115,6 +115,22 @@ def test_what_is_left_and_what_cannot_be_told_apart_is_said():
     assert told.tags.count("img") == 5  # and the averages over time
 
 
+def test_what_stays_is_said_once() -> None:
+    before = dataclasses.replace(report().evidence[0], p_value=0.0)
+    after = dataclasses.replace(before, words="what it sees after the repair")
+    for stays, told in ((before, "Still unexplained."), (after, "Still unexplained: What it sees after the repair.")):
+        outcome = dataclasses.replace(
+            report(),
+            evidence=(before, *report().evidence[1:]),
+            evidence_after=(stays, *report().evidence_after[1:]),
+            unexplained=(stays,),
+        )
+        shown = page(outcome)
+        row = next(row for row in shown.rows if row[0] == before.witness.replace("_", " "))
+        assert row[-1] == f"{telling.capital(before.words)}. {told}"
+        assert f"{stays.words} (p < 1e-300)." in shown.text
+
+
 def test_agreement_is_told_as_such():
     told = page(report(False))
     assert "Recording and simulation agree" in told.text
