@@ -20,6 +20,7 @@ from shape_draws import (
 )
 from torch import Tensor
 
+import gyrofuse as gf
 from gyrofuse.mismatch.colour import filtered
 from gyrofuse.mismatch.confirm import held_out_gain
 from gyrofuse.mismatch.filter_forms import filter_response, filter_strength
@@ -50,6 +51,16 @@ def test_white_noise_of_which_sensors_share_a_part_is_named_though_no_power_chan
     explained = found.effect.explained(given, g)
     assert shape_witness(explained).p_value > 1e-4
     assert common_witness(explained).p_value > 1e-4
+
+
+def test_noise_of_a_source_that_only_one_sensor_surely_has_may_be_two_levels() -> None:
+    noise, g = gf.WhiteNoise(1.0) + gf.AR1(0.999, 1e-4) + gf.RandomWalk(1e-8), generator(7)
+    recording, simulation = (noise.simulate(N, batch=(P,), generator=g) for _ in range(2))
+    recording[0] += gf.AR1(0.9, 1e-2).simulate(N, generator=g)
+    found = CommonMode.nominate(case(recording, simulation[None]), 1e-2)
+    assert found is not None
+    assert found.sensors == (0, 5)  # by chance, three standard deviations
+    assert "random_telegraph" in found.alternatives
 
 
 @pytest.mark.parametrize("seed", [701, 708])
