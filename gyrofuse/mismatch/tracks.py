@@ -25,7 +25,8 @@ _SEGMENT = 16  # roots of the record's length
 _EVERY = 2  # bins that a frequency moves within a segment, from one rate that is undone to the next
 _FINER = 2  # fine bins in a bin
 _CUT = 8.0  # power of a sensor: a steady line that is crossed is no track
-_SPARSE, _MOST = 16, 256  # bins for each track that is looked at closely, of each rate and in the end; of these most
+_SPARSE = 2**15  # tracks for each that is looked at closely, of those of each rate and in the end
+_LEAST, _MOST = 64, 256  # of these
 _AT = 0.01  # halves of a cycle per sample next to which a frequency has not turned yet
 _SIGNED = 7  # sensors up to which every sign is tried
 
@@ -73,7 +74,7 @@ def _conspicuous(segments: Tensor, moves: int, signs: Tensor) -> Candidates:
     turned = segments.new_zeros(*segments.shape[:-1], _FINER * length, dtype=torch.complex64)
     bins = torch.empty_like(turned)  # (sensor, segment, fine bin); kept, as memory costs as much as the transform
     centred = ((torch.arange(length) - (length - 1) / 2) / length).square()
-    most, least = min(length // _SPARSE, _MOST), 0.0
+    most, least = min(max(moves * segments.shape[1] * length // _SPARSE, _LEAST), _MOST), 0.0
     found: list[Candidates] = []
     for undone in range(_EVERY // 2, moves + _EVERY // 2, _EVERY):
         turn = torch.polar(torch.full((length,), length**-0.5), -math.pi * undone * centred)
