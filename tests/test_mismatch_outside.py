@@ -220,8 +220,8 @@ def test_a_line_that_moves_is_seen_with_either_sign() -> None:
     assert found.p_value < 1e-4
     assert found.sensors == (0, 1)
     first, last = map(float, re.findall(r"from (\S+) Hz to (\S+) Hz", found.words)[0])
-    # 113 nats leave the frequency at either end a standard deviation of 0.15 cycles over the record.
-    assert (first, last) == pytest.approx((10.0, 40.0), abs=3 * 0.15 * RATE / N)
+    # Cycles over the record to which the fit is good: segments with much power are cut, which moves its best place.
+    assert (first, last) == pytest.approx((10.0, 40.0), abs=0.45 * RATE / N)
     both = Case.of(scene(), case.recording, simulation + 0.17 * gains * phase.cos())
     assert sweeps.sweep_witness(both).p_value > 0.01
 

@@ -83,9 +83,8 @@ def _conspicuous(segments: Tensor, moves: int, signs: Tensor) -> Candidates:
         powers = squared_modulus(bins).clamp_(max=_CUT).sum(0)
         each = torch.arange(max(undone - _EVERY // 2, 1) * _FINER, min(undone + _EVERY // 2, moves) * _FINER)
         power, which, along = _most_power(bins, powers, each, signs, most)
-        best = power.topk(min(most, len(power))).indices
-        best = best[power[best] > least]
-        found.append(_candidates(power[best], signs[which[best]], along[best], bins, undone))
+        better = power > least
+        found.append(_candidates(power[better], signs[which[better]], along[better], bins, undone))
         found = [Candidates(*map(torch.cat, zip(*found, strict=True))).strongest(most)]
         least = float(found[0].power.min()) if len(found[0].power) == most else 0.0
     return found[0]
