@@ -223,6 +223,10 @@ class Common(Term):
     kind: str = "white"
     inside: bool = False
 
+    def told(self, sd: Tensor) -> Tensor:
+        """Standard deviations that each sensor's gain is, `(sensor,)`, by those of its parts `(number, sensor)`."""
+        return self.local.square().sum(0).sqrt() / sd.square().nanmean(0).sqrt()
+
     def acting(self, matrix: Tensor) -> Tensor:
         """What comes on top of a matrix `(..., sensor, sensor)` of a source."""
         return matrix - torch.diag_embed(matrix.diagonal(dim1=-2, dim2=-1)) if self.inside else matrix

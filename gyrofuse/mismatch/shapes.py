@@ -41,6 +41,7 @@ _PER_OCTAVE = 4
 _CLEAN = 8  # bins
 _SLOW = 64  # cycles per record
 _BROAD = 3.0  # half widths
+_SHARED = 3.5  # standard deviations of a second gain that chance gives to none of the others
 _SHARP, _NARROW = 0.1, (0.02, 0.04, 0.08)  # the same, below which bands are too wide for it, and of it there
 _FINE, _NARROWEST = 24, 0.005  # bands in an octave for those, and the least that they show
 _STEEPER, _FLICKER = 4.0, 0.25  # nats that another slope gains, and distance from 1 of flicker noise's
@@ -87,13 +88,13 @@ def leading_shape(case: Case) -> Shape | None:
     return _searched(case)
 
 
-def _like_switching(term: Term) -> bool:
+def _like_switching(term: Term, sd: Tensor) -> bool:
     """Whether a sensor that jumps between two levels may have that spectrum: more power below some frequency.
 
     Where jumps can be told from Gaussian noise, they were before spectra were looked at.
     """
-    if isinstance(term, Common):
-        return False
+    if isinstance(term, Common):  # of a source that one sensor alone surely has
+        return term.kind == "ar1" and float(term.told(sd).topk(2).values[-1]) < _SHARED
     if isinstance(term, Bump):
         centre, width = term.shared.exp().tolist()
         return bool(centre < _BROAD * width)
@@ -207,7 +208,7 @@ def _searched(case: Case) -> Shape | None:
         for rival in candidates(data, others)
         if rival.name != term.name and _as_good(data, [*others, _in_sensors_of(term, rival)], chosen, whole)
     }
-    if _like_switching(term):
+    if _like_switching(term, seen[first][1][0]):
         rivals.add("random_telegraph")
     if _louder(term, seen[first][1]) and min(modulation(case).p_value, variance_p_value(case)) < _UNSTEADY:
         rivals.add("variance_change")

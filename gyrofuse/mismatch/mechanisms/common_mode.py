@@ -22,7 +22,6 @@ from gyrofuse.mismatch.shapes import chosen_shape, refit
 _WORDS = {"white": "white noise", "ar1": "AR1 noise", "walk": "a random walk"}
 _REST = 0.01  # of a sensor's power that is its own, at least
 _SEEN, _LEAST = 2.5, 1.5  # standard deviations of a sensor's gain, and of the second largest
-_SURE = 3.5  # of the second largest: chance does not give it to any of the others
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +57,7 @@ class CommonMode(Addition):
         gain = gain * reference.conj() / reference.abs()
         sd = shape.sd[0].square().nanmean(0).sqrt()
         size = gain.abs()
-        second = float((size / sd).topk(2).values[-1])
+        second = float(term.told(shape.sd[0]).topk(2).values[-1])
         if second < _LEAST:  # one sensor has nothing in common
             return None
         least = min(_SEEN, second)
@@ -78,8 +77,6 @@ class CommonMode(Addition):
             parameters["corner"] = spanned(lambda x: math.exp(x) * rate, middle, spread, "Hz")
         against = [i for i in sensors if float(gain[i].real) < 0]
         where = case.scene.named(sensors, "all sensors")
-        if second < _SURE and term.kind == "ar1":  # with one sensor alone it may be two levels as well
-            shape = shape._replace(alternatives=tuple(sorted({*shape.alternatives, "random_telegraph"})))
         sign = f", with the sign reversed in {case.scene.named(against)}" if against else ""
         share = ", as a part of the noise that each has" if term.inside else ""
         return found(
