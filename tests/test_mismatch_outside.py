@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 
 import numpy as np
 import pytest
@@ -219,9 +218,7 @@ def test_a_line_that_moves_is_seen_with_either_sign() -> None:
     found = sweeps.sweep_witness(case)
     assert found.p_value < 1e-4
     assert found.sensors == (0, 1)
-    first, last = map(float, re.findall(r"from (\S+) Hz to (\S+) Hz", found.words)[0])
-    # Cycles over the record to which the fit is good: segments with much power are cut, which moves its best place.
-    assert (first, last) == pytest.approx((10.0, 40.0), abs=0.45 * RATE / N)
+    assert "from 10 Hz to 40 Hz" in found.words
     both = Case.of(scene(), case.recording, simulation + 0.17 * gains * phase.cos())
     assert sweeps.sweep_witness(both).p_value > 0.01
 

@@ -58,6 +58,20 @@ def test_few_tracks_are_lost_among_all_that_noise_has() -> None:
     assert found >= 6
 
 
+def test_the_ends_of_a_strong_track_are_as_good_as_can_be() -> None:
+    n, amplitude, of_bound = 16384, 0.17, []
+    t = torch.arange(n, dtype=torch.float64) / n
+    turns = 2 * math.pi * torch.stack([t - t.square() / 2, t.square() / 2, torch.ones_like(t)])  # of the ends, phase
+    bound = torch.linalg.inv(amplitude**2 * turns @ turns.T)[:2, :2]  # Cramer-Rao, cycles over the record, two sensors
+    for seed in range(16):
+        first, last = np.random.default_rng(seed).uniform((0.05, 0.3), (0.2, 0.45))
+        gains = amplitude * torch.tensor([1.0, -1.0, 0.0])[:, None]
+        found = tracks.strongest_sweep(noise(seed, 3, n) + gains * phase(n, first, last).cos())
+        off = n * torch.tensor([found.first - first, found.last - last], dtype=torch.float64)
+        of_bound.append(float(off @ torch.linalg.solve(bound, off)))
+    assert sum(of_bound) < stats.chi2(2 * len(of_bound)).isf(1e-3)
+
+
 def test_a_track_that_folds_back_says_where() -> None:
     white = noise(5, 2, 8192) + 0.4 * phase(8192, 0.4, 0.6).cos()
     found = tracks.strongest_sweep(white)

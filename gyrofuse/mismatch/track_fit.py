@@ -18,6 +18,7 @@ _CLOSER = 4  # segments that are joined for the next look
 _STEP = 0.25  # bins of a segment, by which either end of a track moves; of longer segments as many
 _REACH = 6, 8  # steps either way in the first look, and in those that follow
 _FINER = 4.0  # places that continuous frequencies have for each bin at both ends
+_FINEST, _NEAR = 0.05, 12  # cycles over the record, by which the ends move in the last look of all; steps either way
 
 
 class Candidates(NamedTuple):
@@ -39,8 +40,11 @@ class Candidates(NamedTuple):
 
     def strongest(self, most: int) -> Candidates:
         """So many of them, or all."""
-        best = self.power.topk(min(most, len(self.power))).indices
-        return Candidates(*(of_tracks[best] for of_tracks in self))
+        return self.at(self.power.topk(min(most, len(self.power))).indices)
+
+    def at(self, which: Tensor) -> Candidates:
+        """Those."""
+        return Candidates(*(of_tracks[which] for of_tracks in self))
 
 
 class Track(NamedTuple):
@@ -88,7 +92,7 @@ def fitted_track(found: Candidates, combinations: Tensor, length: int, cut: floa
         parts = blocks.view(tracks, p, joined, -1).sum(-1) / together  # (track, sensor, segment)
         if joined == count:  # a steady line that is crossed is no track
             powers = torch.einsum("cp,cps->cs", signs, parts).abs().square() / signs.abs().sum(-1, keepdim=True)
-            held = math.sqrt(cut) / parts.abs().clamp(min=math.sqrt(cut))
+            held = _held(parts, cut)
             parts, blocks = parts * held, blocks * held[..., None]
         combined = (combinations.to(parts.dtype) @ parts).abs().square().sum(-1) / combinations.abs().sum(-1)
         power, which = combined.max(-1)
@@ -96,9 +100,30 @@ def fitted_track(found: Candidates, combinations: Tensor, length: int, cut: floa
         places = _FINER * (count / joined) ** 2
         tails.append(_log_tail(joined, power) + math.log(places))
     log_tail, at = (torch.stack(tails).amin(0) + math.log(len(tails))).min(0)
-    k = int(at)
-    first, last = (ends[k] / length).tolist()
-    return Track(float(log_tail), (first, last), signs[k].real, powers[k])
+    best = at[None]
+    first, last = (_in_phase(found.at(best), ends[best], signs[best], length, cut)[0] / length).tolist()
+    return Track(float(log_tail), (first, last), signs[at].real, powers[at])
+
+
+def _in_phase(found: Candidates, ends: Tensor, signs: Tensor, length: int, cut: float) -> Tensor:
+    """Ends of tracks `(track, end)`, next to those given, between which most of the record is in phase.
+
+    What counts of a segment is asked for on the track as it is in the end: that which was cut where the search had the
+    track is less at places that are as far from there as it was from the true one.
+    """
+    count, width = found.bins.shape[-2:]
+    blocks = _blocks(found, ends, length)
+    blocks = blocks * _held(blocks.sum(-1) / math.sqrt(width), cut)[..., None]
+    moved = torch.arange(-_NEAR, _NEAR + 1, dtype=torch.float64) * (_FINEST / count)
+    of_start, of_stop = (torch.polar(torch.ones_like(c), -2 * math.pi * c) for c in _cycles(moved, count, width))
+    added = torch.einsum("cp,cpt->ct", signs, blocks.flatten(2))
+    best = torch.einsum("ct,at,bt->cab", added, of_start, of_stop).abs().flatten(1).argmax(-1)
+    return ends + torch.stack([moved[best // len(moved)], moved[best % len(moved)]], -1)
+
+
+def _held(parts: Tensor, cut: float) -> Tensor:
+    """Factors with which amplitudes of segments are no larger than those of power `cut`."""
+    return math.sqrt(cut) / parts.abs().clamp(min=math.sqrt(cut))
 
 
 def _straight(along: Tensor) -> Tensor:
