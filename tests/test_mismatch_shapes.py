@@ -13,6 +13,7 @@ from shape_draws import BUMP, CHANGES, RATE, SIGNS, WHITE, N, P, array, case, dr
 
 import gyrofuse as gf
 from gyrofuse.mismatch.bumps import bump_witness
+from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.colour import filtered, noise, of_phase, quadrature
 from gyrofuse.mismatch.filter_forms import FILTERS, filter_corner, filter_power, filter_response, filter_strength
 from gyrofuse.mismatch.mechanisms.parameter_shift import _numbers
@@ -32,7 +33,7 @@ from gyrofuse.mismatch.shape_terms import (
     Term,
     oscillation,
 )
-from gyrofuse.mismatch.shapes import compared, leading_shape
+from gyrofuse.mismatch.shapes import _falls_otherwise, compared, leading_shape
 from gyrofuse.mismatch.witnesses import coherence_witness, spectrum_witness
 from gyrofuse.simulate import ArrayModel
 
@@ -360,10 +361,23 @@ def test_sensors_keep_something_of_their_own_beside_what_is_common(share: float,
     assert _regular(found._replace(model=model)) == regular
 
 
+def falling(slope: float) -> Case:
+    """A recording with noise added that falls so."""
+    middle = math.sqrt(0.5 / N)
+    return drawn(23, lambda x, g: x + 1.5e-3 * noise(N, lambda f: (middle / f) ** slope / middle, P, g))
+
+
+@pytest.mark.parametrize("slope", [1.0, 1.2])
+def test_noise_that_is_a_little_steeper_is_no_flicker(slope: float):
+    data = compared(falling(slope))
+    first = fit(data, [Flicker.start(data.ground)])
+    data = data.centred(first.model.diagonal(dim1=-2, dim2=-1).real)
+    assert _falls_otherwise(data, fit(data, first.terms)) == (slope != 1.0)
+
+
 @pytest.mark.parametrize("slope", [1.0, 1.5])
 def test_noise_is_flicker_only_if_it_falls_as_flicker_does(slope: float):
-    middle = math.sqrt(0.5 / N)
-    given = drawn(23, lambda x, g: x + 1.5e-3 * noise(N, lambda f: (middle / f) ** slope / middle, P, g))
+    given = falling(slope)
     data, _ = best_shapes(compared(given), differ=True)
     alone = fit(data, [PowerLaw.like(Flicker.start(data.ground), data.ground)])
     assert float(alone.terms[0].shared) == pytest.approx(slope, abs=3 * float(alone.sd(0)[1]))
