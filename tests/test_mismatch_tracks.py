@@ -26,8 +26,8 @@ def test_tracks_are_summed_over_all_segments() -> None:
     drift = tracks._drift(more, 8)
     assert torch.equal(drift[:, -1], more)
     assert torch.equal(drift[0], torch.zeros(8, dtype=torch.int64))
-    for move in (3, 5):
-        sums = tracks._tracks(powers, move)
+    moves = torch.tensor([3, 5, 11])  # the last one more than once around
+    for move, sums in zip(moves.tolist(), tracks._tracks(powers, moves), strict=True):
         for d in range(8):
             at = [[(b + move * m + int(drift[d, m])) % 64 for m in range(8)] for b in range(64)]
             naive = [sum(float(powers[m, b]) for m, b in enumerate(along)) for along in at]

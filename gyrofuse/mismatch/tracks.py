@@ -112,7 +112,7 @@ def _most_power(bins: Tensor, powers: Tensor, moves: Tensor, signs: Tensor, most
     Returns:
         `(track,)`, `(track,)` and `(track, segment)`.
     """
-    along = torch.cat([_likely(powers, move, most) for move in moves.tolist()])
+    along = _likely(powers, moves, most)
     count, length = powers.shape
     values = bins[:, torch.arange(count), along % length]  # (sensor, track, segment)
     values = values * (math.sqrt(_CUT) / values.abs().clamp(min=math.sqrt(_CUT)))
@@ -138,16 +138,17 @@ def _candidates(power: Tensor, signs: Tensor, along: Tensor, bins: Tensor, undon
     return Candidates(power, signs, along, torch.full_like(along[:, 0], undone), near)
 
 
-def _likely(powers: Tensor, move: int, most: int) -> Tensor:
-    """Bins of tracks with much power that move by so many from segment to segment, `(track, segment)`.
+def _likely(powers: Tensor, moves: Tensor, most: int) -> Tensor:
+    """Bins of so many tracks with much power for each move from segment to segment, `(track, segment)`.
 
     Of those that begin alike, which are neighbours, one is enough.
     """
     count, length = powers.shape
-    sums = _tracks(powers, move)
-    first = sums.amax(0).topk(min(most, length)).indices
-    more = sums[:, first].argmax(0)
-    return first[:, None] + move * torch.arange(count) + _drift(more, count)
+    sums = _tracks(powers, moves)
+    first = sums.amax(1).topk(min(most, length)).indices  # (move, track)
+    more = sums.gather(2, first[:, None].expand(-1, sums.shape[1], -1)).argmax(1)
+    along = first[..., None] + moves[:, None, None] * torch.arange(count)
+    return along.flatten(0, 1) + _drift(more.flatten(), count)
 
 
 def _drift(more: Tensor, count: int) -> Tensor:
@@ -162,20 +163,23 @@ def _drift(more: Tensor, count: int) -> Tensor:
     return drift
 
 
-def _tracks(powers: Tensor, move: int) -> Tensor:
-    """Sums along tracks that begin at each bin and move by `move` bins a segment, and some more, `(more, bin)`.
+def _tracks(powers: Tensor, moves: Tensor) -> Tensor:
+    """Sums along tracks that begin at each bin and move by so many bins a segment, and some more, `(move, more, bin)`.
 
     Args:
         powers: `(segment, bin)`, as many segments as a power of two.
-        move: At least; by the record's end a track has moved up to as many bins more as there are segments, less one.
+        moves: At least, `(move,)`; by the record's end a track has moved up to as many bins more as there are segments,
+            less one.
     """
     length = powers.shape[-1]
-    sums = torch.stack([row.roll(-move * k) for k, row in enumerate(powers)])[:, None]  # (group, shift, bin)
+    each = moves.tolist()
+    sums = torch.stack([torch.stack([row.roll(-move * k) for move in each]) for k, row in enumerate(powers)])
+    sums = sums[:, :, None]  # (group, move, more, bin)
     while len(sums) > 1:
         early, late = sums[::2], sums[1::2]
-        sums = powers.new_empty(len(early), 2 * early.shape[1], length)
-        for d in range(sums.shape[1]):
-            first, then, by = early[:, d // 2], late[:, d // 2], (d + 1) // 2
-            torch.add(first[:, : length - by], then[:, by:], out=sums[:, d, : length - by])
-            torch.add(first[:, length - by :], then[:, :by], out=sums[:, d, length - by :])
+        sums = powers.new_empty(len(early), len(moves), 2 * early.shape[2], length)
+        for d in range(sums.shape[2]):
+            first, then, by = early[:, :, d // 2], late[:, :, d // 2], (d + 1) // 2
+            torch.add(first[..., : length - by], then[..., by:], out=sums[:, :, d, : length - by])
+            torch.add(first[..., length - by :], then[..., :by], out=sums[:, :, d, length - by :])
     return sums[0]
