@@ -51,7 +51,8 @@ def mismatch_page(outcome: Outcome, *, title: str, remarks: Sequence[str] = ()) 
         An HTML page that needs no other file, no network and no script.
     """
     scene, case = outcome.case.scene, outcome.case
-    both = [case, outcome.repaired] if outcome.findings else [case]
+    repaired = outcome.repaired is not case  # if only by a filter that stands for no physics
+    both = [case, outcome.repaired] if repaired else [case]
     variances = outcome.variances[: len(both)]
     sensor = _most_concerned(outcome.findings, variances[0])
     moving = _most_concerned([f for f in outcome.findings if f.time_s is not None], variances[0])
@@ -64,9 +65,10 @@ def mismatch_page(outcome: Outcome, *, title: str, remarks: Sequence[str] = ()) 
         title=title,
         outcome=outcome,
         scene=scene,
-        verdict=verdict(outcome),
+        verdict=[_typeset(sentence) for sentence in verdict(outcome)],
         remarks=remarks,
         parts=[_part(outcome, f) for f in outcome.findings],
+        repaired=repaired,
         level_map=image(_WIDTH, panels * (rows + 0.75), _draw_maps, outcome, [v.z for v in variances]),
         band_map=image(
             _WIDTH,
@@ -125,7 +127,7 @@ def _part(outcome: Outcome, finding: Finding) -> dict[str, Any]:
     }
     return {
         "name": mechanism_words(finding.mechanism),
-        "sentence": capital(finding.sentence),
+        "sentence": _typeset(capital(finding.sentence)),
         "facts": {name: value for name, value in facts.items() if value},
         "parameters": [
             {"name": with_unit(parameter_words(name, scene.sensors), entry.unit), **_resolved(entry)}
@@ -136,6 +138,11 @@ def _part(outcome: Outcome, finding: Finding) -> dict[str, Any]:
             for name in finding.alternatives
         ],
     }
+
+
+def _typeset(sentence: str) -> str:
+    """With arrows that no line is broken in."""
+    return sentence.replace("->", "→")
 
 
 def _times(levels: tuple[int, ...], rate: float) -> str:

@@ -255,6 +255,7 @@ def test_limits_of_amplitudes_are_those_of_the_law():
     for limit, share in ((low, 0.025), (high, 0.975)):
         law = stats.ncx2(2, limit**2)
         assert law.sf(4.5**2) / law.sf(9.0) == pytest.approx(share, rel=1e-6)
+    assert amplitude_limits(torch.tensor([3.01], dtype=torch.float64), 3.0)[0] == 0
 
 
 def test_a_frequency_that_wanders_is_known_as_well_as_its_mean_over_the_record():

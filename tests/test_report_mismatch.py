@@ -145,6 +145,15 @@ def test_a_difference_without_a_name_is_told_as_such():
     told = dataclasses.replace(report(), findings=(), unexplained=report().evidence[:1])
     assert "What the simulation leaves out could not be named." in page(told).text
     assert "Unexplained, as seen by" in page(told).text
+    assert "before and after the repair" in page(told).text, "it is repaired all the same"
+    assert "before and after the repair" not in page(dataclasses.replace(told, repaired=told.case)).text
+
+
+def test_no_line_breaks_within_an_arrow():
+    finding = dataclasses.replace(report().findings[0], sentence="white noise 1 -> 2 deg/s")
+    told = page(dataclasses.replace(report(), findings=(finding,))).text
+    assert told.count("White noise 1 → 2 deg/s.") == 2
+    assert "->" not in told
 
 
 def test_to_html_writes_the_page(tmp_path: Path):

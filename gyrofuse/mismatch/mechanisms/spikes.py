@@ -105,7 +105,7 @@ class Spikes(Mechanism):
             effect,
             f"isolated outliers in {where}{', ' + how if len(hit) > 1 else ''}: "
             f"{laws[largest].rate * case.scene.rate * _HOUR:.3g} an hour of {float(effect.amplitude[largest]):.3g} "
-            f"{case.scene.measure} in sensor {case.scene.sensors[largest]}",
+            f"{case.scene.measure}{f' in sensor {case.scene.sensors[largest]}' if len(hit) > 1 else ''}",
             p_value,
             hit,
             parameters,

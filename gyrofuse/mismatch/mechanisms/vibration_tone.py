@@ -184,7 +184,7 @@ def _tail_limits(snr: Tensor, seen: float) -> Tensor:
         law = stats.ncx2(2, middle.square().numpy())
         share = torch.from_numpy(law.sf(snr.square().numpy()) / law.sf(seen**2))
         low, high = torch.where(share < wanted, middle, low), torch.where(share < wanted, high, middle)
-    return high
+    return torch.where(low > 0, high, 0.0)
 
 
 def _limits(value: float, sd: float, unit: str) -> Parameter:
