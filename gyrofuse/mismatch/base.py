@@ -99,9 +99,9 @@ def fit_base(power: Tensor, bands: Bands, n_samples: int, dof: Tensor) -> Base:
 
 @functools.lru_cache(maxsize=64)
 def _time_constants(n_samples: int) -> tuple[float, ...]:
-    """Of the AR1s, samples: corners from one cycle in the record to a sixth of a cycle a sample."""
+    """Of the AR1s, samples: corners from one cycle in the record to about a sixth of a cycle a sample."""
     decades = math.log10(n_samples / 6)
-    return tuple(n_samples / (2 * math.pi) * 10 ** (-i / _PER_DECADE) for i in range(int(decades * _PER_DECADE) + 1))
+    return tuple(n_samples / (2 * math.pi) * 10 ** (-i / _PER_DECADE) for i in range(round(decades * _PER_DECADE) + 1))
 
 
 def atom_covariances(n_samples: int, block: int, n_blocks: int) -> Tensor:

@@ -13,17 +13,18 @@ from gyrofuse._transforms import fast_length
 def filtered(signal: Tensor, response: Callable[[Tensor], Tensor]) -> Tensor:
     """Signals `(..., sensor, time)` through filters.
 
-    Increments are filtered and added up again, so that a walk's two ends need not meet.
+    They go on as their mirror images at either end, so that a walk has no jump there, and white noise that is made a
+    walk no slope.
 
     Args:
         signal: Records.
         response: Complex gains `(sensor, frequency)` at `f` cycles per sample.
     """
     n = signal.shape[-1]
-    increments = signal.diff(dim=-1, prepend=signal[..., :1])
-    gain = response(torch.arange(n // 2 + 1, dtype=torch.float64) / n)
-    moved = torch.fft.irfft(torch.fft.rfft(increments) * gain, n=n).cumsum(-1)
     middle = signal.mean(-1, keepdim=True)
+    mirrored = torch.cat([signal - middle, (signal - middle).flip(-1)], -1)
+    gain = response(torch.arange(n + 1, dtype=torch.float64) / (2 * n))
+    moved = torch.fft.irfft(torch.fft.rfft(mirrored) * gain, n=2 * n)[..., :n]
     return moved - moved.mean(-1, keepdim=True) + middle * gain[..., :1].real
 
 

@@ -21,6 +21,7 @@ from gyrofuse.mismatch.shape_scan import bump_start
 from gyrofuse.mismatch.shape_terms import Bump, Common, CommonBump, Flicker, LowPass, Shift, Term
 
 _MOST = 4  # shapes at once
+_PASSES, _AGAIN = 3, 3.0  # looks for them, and factor on a power that calls for another one
 QUICK, _KEPT = 6, 3  # rounds of a first look; shapes looked at closely
 _DOUBT = 1e-3  # p value of what is left by shapes that may be named
 _SMALL = 0.1  # share of what there was to explain that may be left all the same
@@ -35,10 +36,26 @@ _CORNER_BINS = (4.0, 0.3)  # corners of common AR1s to start from: bins, cycles 
 
 
 def best_shapes(data: Ratios, *, differ: bool) -> tuple[Ratios, Fit | None]:
-    """Shapes added one at a time while BIC falls, then taken away while it falls; one at least of what does differ.
+    """The shapes that BIC prefers, one at least of what does differ, each in the sensors that take part.
 
-    Each in the sensors that take part.
+    Of powers that are far from those of the simulation the law of F at the latter makes too much or too little: shapes
+    are looked for again at the powers that were found, until they stay about there.
     """
+    best: Fit | None = None
+    for _ in range(_PASSES):
+        before = data.level
+        data, best = _grown(data, differ=differ)
+        if best is None or data.off(before) < _AGAIN:
+            break
+    if best is not None and data.n_sensors > 1:
+        for i, term in enumerate(best.terms):
+            if not isinstance(term, Common):
+                best = _of_partakers(data, best, i)
+    return data, best
+
+
+def _grown(data: Ratios, *, differ: bool) -> tuple[Ratios, Fit | None]:
+    """Shapes added one at a time while BIC falls, then taken away while it falls."""
     best: Fit | None = None
     value = -math.inf if differ else 0.0
     for _ in range(_MOST):
@@ -58,10 +75,6 @@ def best_shapes(data: Ratios, *, differ: bool) -> tuple[Ratios, Fit | None]:
         if _value(data, top) <= value:
             break
         best, value = top, _value(data, top)
-    if best is not None and data.n_sensors > 1:
-        for i, term in enumerate(best.terms):
-            if not isinstance(term, Common):
-                best = _of_partakers(data, best, i)
     return data, best
 
 

@@ -44,6 +44,7 @@ class Ratios:
         sides: `R`, powers of the simulation `(band, sensor)`, `d` and `s`.
         mean: Of `equivalent` powers where nothing differs, `(band,)`.
         extra: What coherences are worth beyond powers, `(band,)`.
+        level: Powers over those of the simulation where the law of F is taken, `(band, sensor)`.
     """
 
     ground: Ground
@@ -53,6 +54,7 @@ class Ratios:
     sides: tuple[Tensor, Tensor, Tensor, Tensor]
     mean: Tensor
     extra: Tensor
+    level: Tensor
 
     @classmethod
     def of(
@@ -67,8 +69,8 @@ class Ratios:
         mean, worth = equivalent_moments(d, s)
         worth = worth * usable * (s > 0)
         extra = (d - worth).clamp(min=0) * (worth > 0) * independent
-        bare = cls(ground, spectra, expected, worth, (*sides[:2], d, s), mean, extra)
-        return bare.centred(torch.ones_like(ground.mean.mT))
+        one = torch.ones_like(ground.mean.mT)
+        return cls(ground, spectra, expected, worth, (*sides[:2], d, s), mean, extra, one).centred(one)
 
     def centred(self, level: Tensor) -> Ratios:
         """With the law of F taken at powers `(band, sensor)` over those of the simulation."""
@@ -77,7 +79,11 @@ class Ratios:
         wanted = level * equivalent(own / power / level, d[:, None], s[:, None]) / self.mean[:, None]
         # Where nothing is simulated ratios have no size.
         scale = (torch.where((self.worth > 0)[:, None], wanted, 1.0) / own).sqrt()
-        return replace(self, observed=spectra * (scale[:, :, None] * scale[:, None, :]))
+        return replace(self, observed=spectra * (scale[:, :, None] * scale[:, None, :]), level=level)
+
+    def off(self, level: Tensor) -> float:
+        """Largest factor, either way, by which other powers `(band, sensor)` are off its own where it is worth any."""
+        return float((self.level / level).log().abs()[self.worth > 0].max().exp())
 
     @property
     def n_sensors(self) -> int:
@@ -147,12 +153,11 @@ def fit(data: Ratios, terms: Sequence[Term], rounds: int = _ROUNDS) -> Fit:
     terms = tuple(term.within() for term in terms)
     free = torch.cat([torch.cat([t.free.flatten(), torch.ones(len(t.shared), dtype=torch.bool)]) for t in terms])
     where = torch.where(free, free.cumsum(0) - 1, -1)
-    precision = torch.cat([_precision(t) for t in terms])
     model, derivatives = linearised(data, terms)
     best = _score(data, model) - _penalty(terms)
     damping, information = 1e-3, torch.eye(len(free), dtype=torch.float64)
     for _ in range(rounds if math.isfinite(best) else 0):
-        vector, reach = _numbers(terms), torch.cat([_reach(t) for t in terms])
+        vector, reach, precision = _numbers(terms), *(torch.cat([f(t) for t in terms]) for f in (_reach, _precision))
         full, slope = _curved(model, derivatives, data.observed, data.worth)
         if bool((data.extra > 0).any()):
             beside = _curved(*_correlated(model, derivatives), _correlations(data.observed), data.extra)
@@ -345,7 +350,8 @@ def _score(data: Ratios, model: Tensor) -> float:
 def _precision(term: Term) -> Tensor:
     own = torch.zeros_like(term.local)
     if term.prior_sd:
-        own = own + torch.tensor(term.prior_sd, dtype=torch.float64)[:, None] ** -2
+        below, above = torch.tensor([term.prior_sd, term.prior_sd_above or term.prior_sd], dtype=torch.float64)
+        own = torch.where(term.local > 0, above[:, None], below[:, None]) ** -2
     return torch.cat([own.flatten(), torch.zeros_like(term.shared)])
 
 

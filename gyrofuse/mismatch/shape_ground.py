@@ -52,15 +52,35 @@ class Parts:
         return torch.stack(self.coefficients) @ _atoms(self.base.n_samples, self.f)
 
     @cached_property
-    def unseen(self) -> Tensor:
-        """Density of a walk that records would not show, less that of the one that there is, `(sensor, place)`.
+    def _slowest(self) -> Tensor:
+        """Density of every atom with coefficient one at one cycle per record, `(atom,)`."""
+        return _atoms(self.base.n_samples, torch.tensor([1 / self.base.n_samples], dtype=self.f.dtype))[:, 0]
 
-        One that grew is told from none before: other numbers, and no physics that was left out.
+    @cached_property
+    def has_walk(self) -> Tensor:
+        """Which sensors have more of a walk than chance makes of none, `(sensor,)`."""
+        return self.coefficients[2] @ self._slowest > _CHANCE * (self.base.coefficients @ self._slowest)
+
+    @cached_property
+    def growing_walk(self) -> Tensor:
+        """Variance of the increments of a walk that grows, `(sensor,)`: of the one there is, or of one not seen.
+
+        One that grew is told from none before: other numbers, and no physics that was left out. What stands for a walk
+        by chance, or in short records, may level off; one that grew does not.
         """
-        n, c = self.base.n_samples, self.base.coefficients
-        slowest = _atoms(n, torch.tensor([1 / n], dtype=c.dtype))
-        lacking = ((_UNSEEN * c - self.coefficients[2]) @ slowest).clamp(min=0)
-        return lacking * _atoms(n, self.f)[-1] / slowest[-1]
+        lacking = (_UNSEEN * self.base.coefficients - self.coefficients[2]) @ self._slowest
+        return self.coefficients[2].sum(-1) + lacking.clamp(min=0) / self._slowest[-1]
+
+    @cached_property
+    def grown(self) -> Tensor:
+        """Density of that walk, `(sensor, place)`."""
+        return self.growing_walk[:, None] * _atoms(self.base.n_samples, self.f)[-1]
+
+    @cached_property
+    def unseen_white(self) -> Tensor:
+        """Variance of white noise that records would not show below the rest, `(sensor,)`; 0 where they show it."""
+        fastest = _atoms(self.base.n_samples, torch.tensor([0.5], dtype=self.f.dtype))[:, 0]
+        return ((_UNSEEN * self.base.coefficients - self.coefficients[0]) @ fastest).clamp(min=0)
 
     @cached_property
     def unseen_ar1(self) -> tuple[float, Tensor]:
@@ -100,7 +120,8 @@ class Parts:
                 increments, `(..., 4, sensor)`.
         """
         white, level, corner, walk = log_factors.clamp(-30, 30).exp()[..., None].unbind(-3)  # (..., sensor, 1)
-        walks = walk * self.densities[2] + (walk - 1).clamp(min=0) * self.unseen
+        whites = white * self.densities[0] + (white - 1).clamp(min=0) * self.unseen_white[:, None]
+        walks = walk.clamp(max=1) * self.densities[2] + (walk - 1).clamp(min=0) * self.grown
         slower, tiny = self.unseen_ar1
         phi = torch.exp(-corner * slower)
         new = (level - 1).clamp(min=0) * AR1._spectrum(self.f, phi, tiny * (1 - phi).square())
@@ -109,7 +130,7 @@ class Parts:
         rate, plateau = self._corners
         phi = torch.exp(-corner[..., None, :, :] * rate)  # (..., atom, sensor, 1)
         coloured = AR1._spectrum(self.f, phi, plateau * (1 - phi).square()).sum(-3)
-        return white * self.densities[0] + level * coloured + new + walks
+        return whites + level * coloured + new + walks
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +168,8 @@ class Ground:
     def matters(self) -> Tensor:
         """Which parts of the noise have a share in some band, `(part, sensor)`."""
         white, coloured, walk = self.parts.densities
-        possible = torch.stack([white, coloured, walk + self.parts.unseen])
+        possible = torch.stack([white, coloured, torch.maximum(walk, self.parts.grown)])
         matters = (self.bands.mean_of(possible) / self.mean).amax(-1) > _MATTERS
+        matters[0] |= self.parts.unseen_white > 0
         matters[1] |= self.parts.unseen_ar1[1][:, 0] > 0
         return matters

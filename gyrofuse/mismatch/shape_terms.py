@@ -29,6 +29,7 @@ class Term:
 
     name: ClassVar[str]
     prior_sd: ClassVar[tuple[float, ...]] = ()  # of local numbers around zero
+    prior_sd_above: ClassVar[tuple[float, ...]] = ()  # the same of those that are positive, where it is another
     lower: ClassVar[float] = -math.inf
     acts: ClassVar[str] = "add"  # or "scale" the noise, or "filter" everything
 
@@ -55,23 +56,37 @@ class Term:
 
 @dataclass(frozen=True, eq=False)
 class Shift(Term):
-    """Other levels and corners: local numbers as in `Parts.shifted`."""
+    """Other levels and corners: local numbers as in `Parts.shifted`.
+
+    Attributes:
+        new: Sensors that have no AR1, `(sensor,)`: the level of one comes with a corner.
+    """
 
     name: ClassVar[str] = "parameter_shift"
     acts: ClassVar[str] = "scale"
+    # Levels that fall are lost below the rest; how far they rise is seen, from next to none included.
     prior_sd: ClassVar[tuple[float, ...]] = (3.0, 3.0, 1.5, 3.0)
+    prior_sd_above: ClassVar[tuple[float, ...]] = (math.inf, math.inf, 1.5, math.inf)
+
+    new: Tensor | None = None
 
     @classmethod
     def start(cls, ground: Ground) -> Shift:
         white, coloured, walk = ground.matters
         free = torch.stack([white, coloured, coloured, walk])
-        return cls(torch.zeros(4, free.shape[-1], dtype=torch.float64), free, torch.zeros(0, dtype=torch.float64))
+        local, shared = torch.zeros(4, free.shape[-1], dtype=torch.float64), torch.zeros(0, dtype=torch.float64)
+        return cls(local, free, shared, ground.parts.unseen_ar1[1][:, 0] > 0)
+
+    def only(self, free: Tensor) -> Shift:
+        if self.new is not None:
+            free = torch.stack([free[0], free[1], free[2] | (free[1] & self.new), free[3]])
+        return replace(self, free=free, local=torch.where(free, self.local, 0.0))
 
     @classmethod
     def starts(cls, ground: Ground) -> list[Shift]:
         """All numbers free, and those of single parts."""
         every = cls.start(ground)
-        single = [replace(every, free=every.free & rows[:, None]) for rows in _SINGLE]
+        single = [every.only(every.free & rows[:, None]) for rows in _SINGLE]
         return [every, *(s for s in single if bool(s.free.any()))]
 
     @classmethod

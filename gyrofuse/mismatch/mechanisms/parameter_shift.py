@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Set
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -46,7 +47,7 @@ class ParameterShift(Filter):
         shape = chosen_shape(case, cls.name, level)
         if shape is None:
             return None
-        parameters, words = {}, []
+        parameters, words, lacking = {}, [], set()
         base = deep_base(case)
         before, least = _numbers(base, case.scene.rate, case.scene.measure)
         for i in range(case.n_sensors):
@@ -66,6 +67,8 @@ class ParameterShift(Filter):
                     if name == "ar1":  # of one plateau, a faster one has more variance
                         factor *= math.exp(float(shape.term.local[2, i]) / 2)
                     before_it = f"{number:.3g}" if number else "none"
+                    if not number and name != "corner":
+                        lacking.add(_WORDS[k])
                     after = f"{(number or least[k][i]) * factor:.3g} {unit}"
                     words.append(f"{_WORDS[k]} of sensor {case.scene.sensors[i]} {before_it} -> {after}")
         sensors = tuple(int(i) for i in shape.term.free.any(0).nonzero()[:, 0])
@@ -75,11 +78,11 @@ class ParameterShift(Filter):
             shape,
             sensors,
             parameters,
-            "the physics is complete, the numbers were wrong: " + ("; ".join(words) or "levels differ slightly"),
+            f"{_said_of(lacking)}: {'; '.join(words) or 'levels differ slightly'}",
         )
 
     def response(self, f: Tensor) -> Tensor:
-        parts = Parts(self.base, f.clamp(min=1 / self.base.n_samples))
+        parts = Parts(self.base, f.clamp(min=0.5 / self.base.n_samples))
         return (parts.shifted(self.log_factors) / parts.densities.sum(0)).sqrt()
 
     def refitted(self, case: Case, fold: int) -> Mechanism:
@@ -87,26 +90,33 @@ class ParameterShift(Filter):
         return replace(self, log_factors=refit(case, fold, term, self.company).local)
 
 
+def _said_of(lacking: Set[str]) -> str:
+    """Whether all kinds of noise that the recording has show in the simulation."""
+    if not lacking:
+        return "the physics is complete, the numbers were wrong"
+    return f"the simulation shows no {' and no '.join(sorted(lacking))} where the recording does"
+
+
 def _numbers(base: Base, rate: float, unit: str) -> tuple[list[list[tuple[float, str]]], list[list[float]]]:
     """Numbers of the parts before, each sensor's with its unit: sds of a sample, corner in Hz, sd of an increment.
 
-    AR1s and walks that are not seen have zeros; the numbers that stand for them come last, of every part.
+    Parts that are not seen have zeros; the numbers that stand for them come last, of every part.
     """
     f = torch.tensor([1 / base.n_samples], dtype=torch.float64)
     parts = Parts(base, f)
-    white = parts.densities[0][:, 0].sqrt()
+    lacks_white = parts.unseen_white > 0
+    white = (parts.densities[0][:, 0] + parts.unseen_white).sqrt()
     variance, corner = parts.moments()
     slower, plateau = parts.unseen_ar1[0], parts.unseen_ar1[1][:, 0]
     lacks, phi = plateau > 0, math.exp(-slower)
     least_rms = (plateau * (1 - phi) / (1 + phi)).sqrt()
     least_corner = torch.full_like(plateau, rate * slower / (2 * math.pi))
-    unseen = parts.unseen[:, 0]
-    walk = ((parts.densities[2][:, 0] + unseen) * 4 * torch.sin(math.pi * f).square()).sqrt()
+    walk = parts.growing_walk.sqrt()
     columns = (
-        (white, f"{unit} per sample"),
+        (torch.where(lacks_white, 0.0, white), f"{unit} per sample"),
         (torch.where(lacks, 0.0, variance.sqrt()), f"{unit} rms"),
         (torch.where(lacks, 0.0, corner * rate), "Hz"),
-        (torch.where(unseen > 0, 0.0, walk), f"{unit} per step"),
+        (torch.where(parts.has_walk, walk, 0.0), f"{unit} per step"),
     )
     numbers = [[(float(x), words) for x in column] for column, words in columns]
     return numbers, [x.tolist() for x in (white, least_rms, least_corner, walk)]

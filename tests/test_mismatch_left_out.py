@@ -1,0 +1,71 @@
+"""Noise that a simulation leaves out altogether, or has a multiple of: it is named, the repaired simulation has it."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+import gyrofuse as gf
+from gyrofuse._transforms import cosine_ordinates
+from gyrofuse.mismatch.base import fit_base
+from gyrofuse.mismatch.colour import filtered
+from gyrofuse.mismatch.spectra import bands
+
+N, RATE, P = 2**14, 100.0, 3
+WHITE = gf.WhiteNoise(1e-3)
+
+
+def recorded(model: gf.Model | gf.Process, seed: int) -> gf.Recording:
+    signal = model.simulate(N, batch=(P,), generator=torch.Generator().manual_seed(seed))
+    return gf.Recording(signal, rate=RATE, unit="deg/s")
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+@pytest.mark.parametrize(
+    ("kind", "truth"),
+    [
+        ("random walk", WHITE + gf.RandomWalk(1e-7)),
+        ("AR1 noise", WHITE + gf.AR1(0.98, 3e-6)),
+        ("random walk", gf.WhiteNoise(5e-4) + gf.RandomWalk(1e-7)),
+    ],
+    ids=["walk", "ar1", "walk_and_less_white"],
+)
+def test_what_white_noise_leaves_out(kind: str, truth: gf.Model, sampled: bool):
+    simulation = recorded(WHITE, 100) if sampled else WHITE
+    report = gf.diagnose(recorded(truth, 1), simulation)
+    assert [finding.mechanism for finding in report.findings] == ["parameter_shift"]
+    sentence = report.findings[0].sentence
+    assert sentence.startswith("the simulation shows no ")
+    assert f" {kind} " in sentence.split(":")[0]
+    assert report.unexplained == ()
+    assert report.held_out is not None
+    assert report.held_out.after < 1.5
+
+
+def test_white_noise_that_is_left_out():
+    memory = gf.AR1(0.9, 1e-4)
+    report = gf.diagnose(recorded(memory + gf.WhiteNoise(1e-4), 3), memory)
+    assert [finding.mechanism for finding in report.findings] == ["parameter_shift"]
+    assert "white noise of sensor 1 none -> " in report.findings[0].sentence
+    said = float(report.findings[0].sentence.split("none -> ")[1].split()[0])
+    assert said == pytest.approx(1e-2, rel=0.1)
+    assert report.unexplained == ()
+
+
+def test_white_noise_that_is_made_a_walk_gets_no_slope():
+    """Its ordinates are as large as those of a walk, from the slowest on."""
+    white = torch.randn(200, N, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    walks = filtered(white, lambda f: (1 / (2 * torch.sin(math.pi * f.clamp(min=0.5 / N)))).expand(200, -1))
+    k = torch.arange(1, 9, dtype=torch.float64)
+    power = cosine_ordinates(walks)[:, 1:9].square().mean(0) * (2 * torch.sin(math.pi * k / (2 * N))).square()
+    assert (power - 1).abs().max() < 4 * math.sqrt(2 / 200)
+
+
+@pytest.mark.parametrize("n", [2**16, 2**17, 2**18])
+def test_fast_noise_is_described_whatever_the_length(n: int):
+    """By AR1s of corners that are near enough to its own."""
+    truth, f = gf.AR1(0.338, 1.0), bands(n).frequency
+    base = fit_base(truth.spectrum(f)[None], bands(n), n, bands(n).dof)
+    assert float((base.spectrum(f)[0] / truth.spectrum(f) - 1).abs().max()) < 0.06
