@@ -16,6 +16,7 @@ from gyrofuse.mismatch.classifier import distinguishability
 from gyrofuse.mismatch.folds import N_FOLDS, N_JUDGED, held_out_blocks, in_fold
 from gyrofuse.mismatch.gaussian import Spectral
 from gyrofuse.mismatch.mechanism import Mechanism, Z
+from gyrofuse.mismatch.remainder import Remainder
 from gyrofuse.mismatch.remembered import remembered
 
 _ACCEPTED_T = 1.0
@@ -109,6 +110,8 @@ def held_out(start: Case, gains: Sequence[Gain], generator: torch.Generator) -> 
         for fold in range(N_FOLDS):
             repaired = simulated = start
             for effect in (gain.refitted[fold] for gain in gains):
+                if isinstance(effect, Remainder):  # of what this fold's numbers leave
+                    effect = effect.refitted(repaired, fold)
                 repaired = effect.explained(repaired, generator)
                 simulated = effect.built_into(simulated, generator)  # what was cleaned shows that it was
             after.append((discrepancy_of_fold(repaired, fold), distinguishability(simulated, fold)))
