@@ -1,4 +1,4 @@
-"""Nothing left out: the same noise with other numbers."""
+"""Noise of the kinds that a base has, with other numbers: of one that the simulation shows none of as well."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ _WORDS = ("white noise", "AR1 noise", "AR1 corner frequency", "random walk")
 
 @dataclass(frozen=True, eq=False)
 class ParameterShift(Filter):
-    """`S_i = a_i W_i(f) + b_i A_i(f / c_i) + d_i R_i(f)`: the simulation's noise with other
-    numbers.
+    """`S_i = a_i W_i(f) + b_i A_i(f / c_i) + d_i R_i(f)`: the simulation's noise with other numbers.
 
     Every band of a sensor's spectrum changes smoothly between levels that its own noise has. A filter turns spectra
     down near the highest frequency alone, more than any level of white noise can follow; what is added keeps apart by
-    its own shape. Where records are short, a changed level and a weak filter are alike.
+    its own shape. Where records are short, a changed level and a weak filter are alike. The factor of a part that the
+    simulation shows none of is over what it would not show, and the sentence says "none".
 
     Attributes:
         base: Noise that the numbers apply to.
