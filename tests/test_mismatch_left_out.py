@@ -54,6 +54,21 @@ def test_white_noise_that_is_left_out():
     assert report.unexplained == ()
 
 
+def test_a_filter_that_is_found_later_leaves_a_tone_as_it_is():
+    """Its amplitude is that of the recording, whatever other numbers make of the noise."""
+    tone = gf.Sinusoid(0.05, 0.34)
+    recording = recorded(gf.WhiteNoise(1e-2) + tone, 4)
+    report = gf.diagnose(recording, WHITE)
+    assert [finding.mechanism for finding in report.findings] == ["vibration_tone", "parameter_shift"]
+    simulated = report.model.simulate(N, generator=torch.Generator().manual_seed(5))
+    t = torch.arange(N, dtype=torch.float64)
+    amplitude = (simulated * torch.polar(torch.ones_like(t), -0.34 * t)).sum(-1).abs() * 2 / N
+    assert (amplitude - 0.05).abs().max() < 4 * 0.1 * math.sqrt(2 / N)
+    assert float(simulated.var(-1).mean()) == pytest.approx(float(recording.signal.var(-1).mean()), rel=0.05)
+    # As the simulation of another recording it agrees.
+    assert not gf.diagnose(recorded(gf.WhiteNoise(1e-2) + tone, 6), report.model).mismatch
+
+
 def test_white_noise_that_is_made_a_walk_gets_no_slope():
     """Its ordinates are as large as those of a walk, from the slowest on."""
     white = torch.randn(200, N, generator=torch.Generator().manual_seed(2), dtype=torch.float64)

@@ -108,11 +108,14 @@ def held_out(start: Case, gains: Sequence[Gain], generator: torch.Generator) -> 
     if gains:
         after = []
         for fold in range(N_FOLDS):
-            repaired = simulated = start
+            repaired, effects = start, []
             for effect in (gain.refitted[fold] for gain in gains):
                 if isinstance(effect, Remainder):  # of what this fold's numbers leave
                     effect = effect.refitted(repaired, fold)
                 repaired = effect.explained(repaired, generator)
+                effects.append(effect)
+            simulated = start
+            for effect in sorted(effects, key=lambda effect: effect.order):
                 simulated = effect.built_into(simulated, generator)  # what was cleaned shows that it was
             after.append((discrepancy_of_fold(repaired, fold), distinguishability(simulated, fold)))
     (d, auc), (d_after, auc_after) = (

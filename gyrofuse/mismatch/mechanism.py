@@ -36,7 +36,15 @@ class Mechanism:
     name: ClassVar[str]
     happened_once: ClassVar[bool] = False  # at a time of this recording, not in another one
     proportional_to: ClassVar[str] = ""  # field, where it adds a known path to every record of the same time
+    taken_off: ClassVar[bool] = (
+        False  # by its repair off the recording, before the rest is compared with the simulation
+    )
     place: ClassVar[int] = 0  # in the chain from sensor to numbers: clipped, rounded, repeated come after all else
+
+    @property
+    def order(self) -> tuple[int, bool]:
+        """When it acts on a simulation: what is taken off was on top of all that the repairs make of its noise."""
+        return self.place, self.taken_off
 
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:

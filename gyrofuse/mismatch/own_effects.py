@@ -43,7 +43,7 @@ def with_own_effects(
     """
     own: list[Mechanism] = []
     if isinstance(simulation, RepairedModel):
-        for effect in simulation.effects:
+        for effect in sorted(simulation.effects, key=lambda effect: effect.taken_off):
             if not effect.happened_once or held_out_gain(case, effect).as_found > 0:
                 case = effect.anew(case, generator)
                 own.append(effect)

@@ -24,7 +24,8 @@ class RepairedModel:
     Attributes:
         noise: Of the array.
         scene: Rate, unit, sensors and auxiliary channels of the recording.
-        effects: In the order in which they were found; those of the converter act last.
+        effects: In the order in which they were found; what was taken off the recording acts on the rest, and the
+            converter last.
         noise_samples: Of a simulation, in each sensor, that the noise was estimated from; 0 where it is known.
     """
 
@@ -60,7 +61,7 @@ class RepairedModel:
         generator = own_generator(generator, None)
         scene = self.scene if channels is None else replace(self.scene, channels=dict(channels))
         signal = self.noise.simulate(n_samples, batch=tuple(batch), generator=generator)
-        for effect in sorted(self.effects, key=lambda effect: effect.place):
+        for effect in sorted(self.effects, key=lambda effect: effect.order):
             signal = effect.simulated(signal, scene, generator)
         return signal
 

@@ -39,6 +39,7 @@ class SlowEffect(Mechanism):
     """
 
     proportional_to: ClassVar[str] = "size"
+    taken_off: ClassVar[bool] = True
     size: Tensor
     log_factors: Tensor
 

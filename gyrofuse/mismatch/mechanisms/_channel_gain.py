@@ -35,6 +35,7 @@ class ChannelGain(Mechanism):
     """
 
     proportional_to: ClassVar[str] = "coupling"
+    taken_off: ClassVar[bool] = True
     of_one_band: ClassVar[tuple[str, ...]] = ()
     quantity: ClassVar[str] = "gain"
     channel: str

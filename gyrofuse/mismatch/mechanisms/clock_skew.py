@@ -36,6 +36,7 @@ class ClockSkew(Mechanism):
     """
 
     name: ClassVar[str] = "clock_skew"
+    taken_off: ClassVar[bool] = True
     sensors: tuple[int, ...]
     skew: float
     losses: tuple[tuple[int, int], ...]

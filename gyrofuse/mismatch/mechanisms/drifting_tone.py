@@ -38,6 +38,7 @@ class DriftingTone(Addition):
     """
 
     name: ClassVar[str] = "drifting_tone"
+    taken_off: ClassVar[bool] = True
     mode: Mode
     slow: bool
     share: float = 1.0

@@ -46,6 +46,7 @@ class Spikes(Mechanism):
     """
 
     name: ClassVar[str] = "spikes"
+    taken_off: ClassVar[bool] = True
     rate: Tensor
     height: Tensor
     spread: Tensor

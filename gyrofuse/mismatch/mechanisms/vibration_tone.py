@@ -38,6 +38,7 @@ class VibrationTone(Mechanism):
     """
 
     name: ClassVar[str] = "vibration_tone"
+    taken_off: ClassVar[bool] = True
     frequency_hz: float
     cosine: Tensor
     sine: Tensor
