@@ -22,7 +22,8 @@ def filtered(signal: Tensor, response: Callable[[Tensor], Tensor]) -> Tensor:
     """
     n = signal.shape[-1]
     middle = signal.mean(-1, keepdim=True)
-    mirrored = torch.cat([signal - middle, (signal - middle).flip(-1)], -1)
+    centred = signal - middle
+    mirrored = torch.cat([centred, centred.flip(-1)], -1)
     gain = response(torch.arange(n + 1, dtype=torch.float64) / (2 * n))
     moved = torch.fft.irfft(torch.fft.rfft(mirrored) * gain, n=2 * n)[..., :n]
     return moved - moved.mean(-1, keepdim=True) + middle * gain[..., :1].real

@@ -36,9 +36,7 @@ class Mechanism:
     name: ClassVar[str]
     happened_once: ClassVar[bool] = False  # at a time of this recording, not in another one
     proportional_to: ClassVar[str] = ""  # field, where it adds a known path to every record of the same time
-    taken_off: ClassVar[bool] = (
-        False  # by its repair off the recording, before the rest is compared with the simulation
-    )
+    taken_off: ClassVar[bool] = False  # the recording by its repair, instead of built into the simulation
     place: ClassVar[int] = 0  # in the chain from sensor to numbers: clipped, rounded, repeated come after all else
 
     @property

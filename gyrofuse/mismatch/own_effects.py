@@ -43,6 +43,7 @@ def with_own_effects(
     """
     own: list[Mechanism] = []
     if isinstance(simulation, RepairedModel):
+        # In the order in which they act; what the converter does a case does again by itself.
         for effect in sorted(simulation.effects, key=lambda effect: effect.taken_off):
             if not effect.happened_once or held_out_gain(case, effect).as_found > 0:
                 case = effect.anew(case, generator)

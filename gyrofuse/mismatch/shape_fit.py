@@ -157,7 +157,8 @@ def fit(data: Ratios, terms: Sequence[Term], rounds: int = _ROUNDS) -> Fit:
     best = _score(data, model) - _penalty(terms)
     damping, information = 1e-3, torch.eye(len(free), dtype=torch.float64)
     for _ in range(rounds if math.isfinite(best) else 0):
-        vector, reach, precision = _numbers(terms), *(torch.cat([f(t) for t in terms]) for f in (_reach, _precision))
+        vector, reach = _numbers(terms), torch.cat([_reach(t) for t in terms])
+        precision = torch.cat([_precision(t) for t in terms])  # another one on either side of 0
         full, slope = _curved(model, derivatives, data.observed, data.worth)
         if bool((data.extra > 0).any()):
             beside = _curved(*_correlated(model, derivatives), _correlations(data.observed), data.extra)

@@ -57,11 +57,6 @@ class Parts:
         return _atoms(self.base.n_samples, torch.tensor([1 / self.base.n_samples], dtype=self.f.dtype))[:, 0]
 
     @cached_property
-    def has_walk(self) -> Tensor:
-        """Which sensors have more of a walk than chance makes of none, `(sensor,)`."""
-        return self.coefficients[2] @ self._slowest > _CHANCE * (self.base.coefficients @ self._slowest)
-
-    @cached_property
     def growing_walk(self) -> Tensor:
         """Variance of the increments of a walk that grows, `(sensor,)`: of the one there is, or of one not seen.
 
@@ -95,6 +90,12 @@ class Parts:
         has = ((self.coefficients[1] @ _atoms(n, f)) / self.base.spectrum(f)).amax(-1, keepdim=True) > _CHANCE
         plateau = _UNSEEN * self.base.spectrum(torch.tensor([middle], dtype=c.dtype))
         return 2 * math.pi * middle, torch.where(has, 0.0, plateau)
+
+    @cached_property
+    def lacks(self) -> Tensor:
+        """Which sensors show no more of a part than chance makes of none, `(part, sensor)`."""
+        has_walk = self.coefficients[2] @ self._slowest > _CHANCE * (self.base.coefficients @ self._slowest)
+        return torch.stack([self.unseen_white > 0, self.unseen_ar1[1][:, 0] > 0, ~has_walk])
 
     @cached_property
     def _corners(self) -> tuple[Tensor, Tensor]:
@@ -170,6 +171,5 @@ class Ground:
         white, coloured, walk = self.parts.densities
         possible = torch.stack([white, coloured, torch.maximum(walk, self.parts.grown)])
         matters = (self.bands.mean_of(possible) / self.mean).amax(-1) > _MATTERS
-        matters[0] |= self.parts.unseen_white > 0
-        matters[1] |= self.parts.unseen_ar1[1][:, 0] > 0
+        matters[:2] |= self.parts.lacks[:2]
         return matters

@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 import torch
 from torch import Tensor
@@ -15,6 +15,7 @@ from gyrofuse.mismatch.filter_forms import FILTERS, filter_corner, filter_power,
 from gyrofuse.mismatch.shape_ground import Ground
 from gyrofuse.processes import AR1
 
+_T = TypeVar("_T", bound="Term")
 _HIGHEST = 3.0  # corner of an analog filter to start from, cycles per sample
 
 
@@ -45,7 +46,7 @@ class Term:
         """How far shared numbers may go at once."""
         return torch.full_like(self.shared, 0.7)
 
-    def only(self, free: Tensor) -> Term:
+    def only(self: _T, free: Tensor) -> _T:
         """With those local numbers free `(number, sensor)`, the others 0."""
         return replace(self, free=free, local=torch.where(free, self.local, 0.0))
 
@@ -75,12 +76,12 @@ class Shift(Term):
         white, coloured, walk = ground.matters
         free = torch.stack([white, coloured, coloured, walk])
         local, shared = torch.zeros(4, free.shape[-1], dtype=torch.float64), torch.zeros(0, dtype=torch.float64)
-        return cls(local, free, shared, ground.parts.unseen_ar1[1][:, 0] > 0)
+        return cls(local, free, shared, ground.parts.lacks[1])
 
     def only(self, free: Tensor) -> Shift:
         if self.new is not None:
             free = torch.stack([free[0], free[1], free[2] | (free[1] & self.new), free[3]])
-        return replace(self, free=free, local=torch.where(free, self.local, 0.0))
+        return super().only(free)
 
     @classmethod
     def starts(cls, ground: Ground) -> list[Shift]:

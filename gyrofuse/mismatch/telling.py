@@ -62,8 +62,8 @@ def verdict(outcome: Outcome) -> list[str]:
     sentences.append(f"Unexplained, as seen by: {left}." if left else "After the repair no witness sees a difference.")
     if any(isinstance(effect, Remainder) for effect in outcome.model.effects):
         sentences.append(
-            "So that the repaired simulation has the recording's spectra all the same, it ends with a filter for each "
-            "sensor that stands for no physics."
+            "So that the repaired simulation has the recording's spectra all the same, the noise of each sensor passes "
+            "a filter that stands for no physics."
         )
     return sentences + fused_words(outcome)
 

@@ -104,19 +104,19 @@ def _numbers(base: Base, rate: float, unit: str) -> tuple[list[list[tuple[float,
     """
     f = torch.tensor([1 / base.n_samples], dtype=torch.float64)
     parts = Parts(base, f)
-    lacks_white = parts.unseen_white > 0
     white = (parts.densities[0][:, 0] + parts.unseen_white).sqrt()
     variance, corner = parts.moments()
     slower, plateau = parts.unseen_ar1[0], parts.unseen_ar1[1][:, 0]
-    lacks, phi = plateau > 0, math.exp(-slower)
+    lacks_white, lacks_ar1, lacks_walk = parts.lacks
+    phi = math.exp(-slower)
     least_rms = (plateau * (1 - phi) / (1 + phi)).sqrt()
     least_corner = torch.full_like(plateau, rate * slower / (2 * math.pi))
     walk = parts.growing_walk.sqrt()
     columns = (
         (torch.where(lacks_white, 0.0, white), f"{unit} per sample"),
-        (torch.where(lacks, 0.0, variance.sqrt()), f"{unit} rms"),
-        (torch.where(lacks, 0.0, corner * rate), "Hz"),
-        (torch.where(parts.has_walk, walk, 0.0), f"{unit} per step"),
+        (torch.where(lacks_ar1, 0.0, variance.sqrt()), f"{unit} rms"),
+        (torch.where(lacks_ar1, 0.0, corner * rate), "Hz"),
+        (torch.where(lacks_walk, 0.0, walk), f"{unit} per step"),
     )
     numbers = [[(float(x), words) for x in column] for column, words in columns]
     return numbers, [x.tolist() for x in (white, least_rms, least_corner, walk)]
