@@ -68,7 +68,7 @@ def effect(**changes):
 def truth(group="mechanism", effects=None, kind="step", nats=30.0):
     effects = [effect()] if effects is None else effects
     whose = {"group": group, "kind": kind, "nats": nats, "effects": effects}
-    return whose | {"true_gain": 28.0, "n_samples": 4096, "simulated": 8192}
+    return whose | {"true_gain": 28.0, "n_samples": 4096, "simulated": 8192, "reach": None}
 
 
 def answer(*named, mismatch=True, **fields):
@@ -123,6 +123,30 @@ def test_judge_counts_by_hand():
     assert high == pytest.approx(beta.ppf(0.975, 2, 3))
     assert "false alarm" in str(verdict)
     json.dumps(verdict.to_dict(), allow_nan=False)
+
+
+def test_judge_of_forms_fits_and_noise_alike_by_hand():
+    form = truth("form", kind="form:several_steps") | {"reach": "one"}
+    left = answer("step") | {"held_out": {"before": 9.0, "after": 2.5}}
+    told = left | {"unexplained": ["shape"]}
+    verdict = judge.judge(
+        [form, form, form, truth("fitted", [], "fitted:gmwm", None), truth("common_noise", [], "common_noise:t5", None),
+         truth("misfit", [], "misfit:no_walk", None)],
+        [answer("step"), left, told, SILENT, answer("spikes"), answer("parameter_shift")],
+    )  # fmt: skip
+
+    def count(line, of="all", nats=None):
+        row = verdict.row(line, of, nats)
+        return row.hits, row.trials
+
+    assert count("form: right class", "in one", 30.0) == (3, 3)
+    assert count("form: discrepancy after, at most 1.5") == (1, 3)
+    assert count("much is left and nothing said to be") == (1, 5)
+    assert count("fitted: false alarm") == (0, 1)
+    assert count("common_noise: false alarm") == (1, 1)
+    assert count("common_noise: something named") == (1, 1)
+    assert count("misfit: detected") == (1, 1)
+    assert count("misfit: other noise named, of detected") == (1, 1)
 
 
 def test_judge_of_the_other_groups():

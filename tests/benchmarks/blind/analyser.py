@@ -34,11 +34,26 @@ def recording_of(arrays: dict[str, Any]) -> gf.Recording:
     return gf.Recording(signal, rate=float(arrays["fs"]), unit=str(arrays["unit"]), channels=channels)
 
 
-def simulation_of(given: dict[str, Any]) -> gf.Recording | gf.ArrayModel:
-    """Samples, or a noise model."""
+def simulation_of(given: dict[str, Any]) -> gf.Recording | gf.Model | gf.ArrayModel:
+    """Samples, a noise model, or one that is fitted to earlier records here."""
+    if "fit" in given:
+        return fitted(given)
     if "terms" not in given:
         return recording_of(given)
     return gf.ArrayModel.from_sensors(noise_models(given["terms"]))
+
+
+def fitted(given: dict[str, Any]) -> gf.Model | gf.ArrayModel:
+    """The noise model that a user would fit to what was recorded earlier."""
+    earlier = [gf.Recording(torch.as_tensor(x), rate=given["fs"]) for x in (given["gyro"], *given["more"])]
+    by, model = given["fit"]["by"], given["fit"]["model"]
+    if by == "array":
+        return gf.fit_array_gmwm(earlier[0], model).model
+    if by == "jointly":
+        return gf.fit_jointly(earlier, model).fit.model
+    if by == "ranked":
+        return gf.ArrayModel.from_sensors([fit.model for fit in gf.rank_models(earlier[0]).best])
+    return gf.fit_gmwm(earlier[0], model, refine=by == "refined").model
 
 
 def noise_models(terms: list[list[list[Any]]]) -> list[gf.Model]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from .analog import OVERSAMPLING, Base
 from .converter import decimate
-from .likelihood import coefficients, distinct_nats, divergence, shape_llr, solve, whitened_energy
+from .likelihood import OutOfReachError, coefficients, distinct_nats, divergence, shape_llr, solve, whitened_energy
 
 Array = NDArray[np.float64]
 Cumulants = tuple[float, float, float]
@@ -51,14 +51,25 @@ class Part:
     channel: str | None = None
     channels: dict[str, Array] = field(default_factory=dict)
     simulation: Callable[[Array], Array] | None = None
+    form: str | None = None  # where it is not that of any equation
 
 
 class Bench:
     """An array, its length and the random numbers of the effect."""
 
-    def __init__(self, base: Base, n_samples: int, rng: np.random.Generator, share: float = math.inf) -> None:
-        """`share`: length of the simulation over that of the recording, infinite for a model."""
-        self.base, self.n, self.rng, self.share = base, n_samples, rng, share
+    def __init__(
+        self,
+        base: Base,
+        n_samples: int,
+        rng: np.random.Generator,
+        share: float = math.inf,
+        reach: str | None = None,
+    ) -> None:
+        """`share`: length of the simulation over that of the recording, infinite for a model.
+
+        `reach`: how many of the sensors an effect is in, "one", "some" or "all"; None where it draws them itself.
+        """
+        self.base, self.n, self.rng, self.share, self.reach = base, n_samples, rng, share, reach
         self.rate = base.rate
         self.n_sensors = len(base.white)
         self.steps, self.step_rate = OVERSAMPLING * n_samples, OVERSAMPLING * base.rate
@@ -71,9 +82,21 @@ class Bench:
         """Standard deviation of the white noise per sensor."""
         return np.sqrt(self.base.white)
 
-    def some_sensors(self, least: int = 1, most: int | None = None) -> tuple[int, ...]:
-        """A random set of sensors, all of them included among the choices."""
-        count = int(self.rng.integers(least, (most or self.n_sensors) + 1))
+    def some_sensors(self, least: int = 1, most: int | None = None, *, shared: bool = False) -> tuple[int, ...]:
+        """A random set of sensors, all of them included among the choices; of an effect that is `shared`, two or more.
+
+        Raises:
+            OutOfReachError: A single sensor shares nothing.
+        """
+        if shared and self.n_sensors < 2:
+            raise OutOfReachError("expected two sensors or more for an effect that sensors share, got one")
+        most = min(most or self.n_sensors, self.n_sensors)
+        least = min(least, most)
+        if self.reach == "one":
+            least = most = 2 if shared else 1
+        elif self.reach == "all":
+            least = most
+        count = int(self.rng.integers(least, most + 1))
         return tuple(sorted(int(i) for i in self.rng.choice(self.n_sensors, count, replace=False)))
 
     def gains(self, sensors: tuple[int, ...], *, signed: bool = True) -> Array:

@@ -145,14 +145,21 @@ def judge(
     for truth, answer, is_hidden in zip(truths, answers, hidden, strict=True):
         counts.add("diagnosis failed", answer is None)
         _GROUPS[truth["group"]](counts, figures, truth, answer, false_alarm)
+        if scoring.detected(answer):
+            counts.add("much is left and nothing said to be", scoring.silent(answer), (truth["group"],), truth["nats"])
         if is_hidden and truth["group"] in ("mechanism", "pair"):
             _named(counts, "concealed: ", truth, answer)
     return Verdict(counts.rows(), [Figure(line, of, tuple(v)) for (line, of), v in figures.items()])
 
 
+def _where(truth: Record) -> tuple[str, ...]:
+    """Kinds of cases beside the effect's own: how many of the sensors have it."""
+    return (truth["kind"],) if truth["reach"] is None else (truth["kind"], f"in {truth['reach']}")
+
+
 def _named(counts: _Counts, prefix: str, truth: Record, answer: Record | None) -> None:
     (effect,) = truth["effects"]
-    of, nats = (truth["kind"],), truth["nats"]
+    of, nats = _where(truth), truth["nats"]
     finding = scoring.match(effect, answer)
     counts.add(f"{prefix}detected", scoring.detected(answer), of, nats)
     counts.add(f"{prefix}right name", finding is not None and finding["mechanism"] == effect["mechanism"], of, nats)
@@ -230,8 +237,29 @@ def _held_out(counts: _Counts, figures: Any, truth: Record, answer: Record | Non
 
 
 def _null(counts: _Counts, figures: Any, truth: Record, answer: Record | None, false_alarm: float) -> None:
-    counts.add("false alarm", scoring.detected(answer), (truth["kind"],))
-    counts.add("null: something named", bool(scoring.findings(answer)), (truth["kind"],))
+    prefix = "" if truth["group"] == "null" else f"{truth['group']}: "
+    counts.add(f"{prefix}false alarm", scoring.detected(answer), (truth["kind"],))
+    counts.add(f"{prefix or 'null: '}something named", bool(scoring.findings(answer)), (truth["kind"],))
+
+
+def _misfit(counts: _Counts, figures: Any, truth: Record, answer: Record | None, false_alarm: float) -> None:
+    """Of a noise model that lacks a process: the recording has what it has not."""
+    counts.add("misfit: detected", scoring.detected(answer), (truth["kind"],))
+    named = any(f["mechanism"] == "parameter_shift" for f in scoring.findings(answer))
+    counts.add("misfit: other noise named, of detected", named, (truth["kind"],)) if scoring.detected(answer) else None
+
+
+def _form(counts: _Counts, figures: Any, truth: Record, answer: Record | None, false_alarm: float) -> None:
+    """Of the catalogue's physics in another form: its name, and what is left once it is explained."""
+    _named(counts, "form: ", truth, answer)
+    (effect,) = truth["effects"]
+    finding = scoring.match(effect, answer)
+    if finding is not None:
+        exact, _ = scoring.right_sensors(effect, finding)
+        counts.add("form: exact sensors", exact, _where(truth), truth["nats"])
+    left = ((answer or {}).get("held_out") or {}).get("after")
+    if scoring.detected(answer) and left is not None:
+        counts.add("form: discrepancy after, at most 1.5", left <= 1.5, _where(truth), truth["nats"])
 
 
 def _two(counts: _Counts, figures: Any, truth: Record, answer: Record | None, false_alarm: float) -> None:
@@ -285,6 +313,10 @@ def _real(counts: _Counts, figures: Any, truth: Record, answer: Record | None, f
 
 _GROUPS: dict[str, Callable[[_Counts, Any, Record, Record | None, float], None]] = {
     "null": _null,
+    "common_noise": _null,
+    "fitted": _null,
+    "misfit": _misfit,
+    "form": _form,
     "mechanism": _single,
     "pair": _single,
     "two": _two,

@@ -17,6 +17,10 @@ from scipy.optimize import brentq
 Array = NDArray[np.float64]
 
 
+class OutOfReachError(ValueError):
+    """An effect cannot have that size, or not on that array: there is no such case."""
+
+
 def grid(n_samples: int) -> Array:
     """Frequencies k/(2T) of the DCT-II in cycles per sample, without the mean."""
     return np.arange(1, n_samples) / (2 * n_samples)
@@ -111,10 +115,14 @@ def quadratic_null(ratio: Array) -> tuple[float, float, float]:
 def solve(
     nats: float, expected: Callable[[float], float], low: float, high: float, *, tolerance: float = 1e-8
 ) -> float:
-    """Size between `low` and `high` at which the rising function `expected` reaches `nats`, to a relative tolerance."""
+    """Size between `low` and `high` at which the rising function `expected` reaches `nats`, to a relative tolerance.
+
+    Raises:
+        OutOfReachError: It does not reach them there.
+    """
     ends = [expected(low) - nats, expected(high) - nats]
     if ends[0] > 0 or ends[1] < 0:
-        raise ValueError(f"`nats`: expected between {ends[0] + nats:.3g} and {ends[1] + nats:.3g}, got {nats}")
+        raise OutOfReachError(f"`nats`: expected between {ends[0] + nats:.3g} and {ends[1] + nats:.3g}, got {nats}")
     return math.exp(brentq(lambda x: expected(math.exp(x)) - nats, math.log(low), math.log(high), xtol=tolerance))
 
 

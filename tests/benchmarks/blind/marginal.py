@@ -15,10 +15,12 @@ from scipy.stats import norm
 from . import clock, converter
 from .analog import OVERSAMPLING
 from .bench import CERTAIN, Bench, Cumulants, Part, quantity, rms
-from .likelihood import coefficients, quadratic_null, solve
+from .likelihood import OutOfReachError, coefficients, quadratic_null, solve
 
 Array = NDArray[np.float64]
 Convert = Callable[[Array], Array]
+MOST_CLIPPED = 0.2  # share of the samples at either end: a front end that clips more is not in use
+MOST_REPEATED = 0.3  # share of the samples: a bus that repeats more carries no signal
 
 
 def innovations(recording: Array, spectrum: Array) -> Array:
@@ -236,7 +238,12 @@ def dead_band(bench: Bench, nats: float) -> Part:
 def clipping(bench: Bench, nats: float) -> Part:
     """A front end that saturates; nats: the expected number of samples at full scale."""
     sensors = bench.some_sensors(2)
-    z = norm.isf(min(nats / (2 * bench.n * len(sensors)), 0.4))
+    beyond = nats / (2 * bench.n * len(sensors))
+    if beyond > MOST_CLIPPED:
+        raise OutOfReachError(
+            f"`nats`: expected at most {MOST_CLIPPED:g} of the samples at either end, got {beyond:.2g}"
+        )
+    z = norm.isf(beyond)
 
     parameters: dict[str, dict[str, Any]] = {}
 
@@ -256,6 +263,8 @@ def stuck_samples(bench: Bench, nats: float) -> Part:
     sensors = bench.some_sensors(2)
     run = int(bench.rng.integers(1, 4))
     share = nats / bench.n
+    if share * run > MOST_REPEATED:
+        raise OutOfReachError(f"`nats`: expected at most {MOST_REPEATED:g} of the samples, got {share * run:.2g}")
     at = bench.rng.uniform(size=bench.n) < share
     for _ in range(run - 1):
         at[1:] |= at[:-1]

@@ -64,5 +64,5 @@ def concealed(truth: dict[str, Any], false_alarm: float = 0.01) -> bool:
     """The same of a case that is made once more from its truth."""
     if truth["group"] == "real":
         return False
-    case = make_case(truth["kind"], truth["nats"], truth["seed"], n_samples=truth["n_samples"], rate=truth["rate_hz"])
+    case = make_case(truth["kind"], truth["nats"], truth["seed"], **truth["asked"])
     return is_concealed(case, false_alarm)

@@ -9,6 +9,7 @@ from scipy.stats import norm
 
 Record = dict[str, Any]
 ABSTAINED = "not_identifiable"
+SILENT = 2.0  # per degree of freedom, where chance gives one: what nobody would call explained
 RESOLVED = 8.0  # nats from which a sensor must be named
 
 
@@ -20,6 +21,12 @@ def findings(answer: Record | None) -> list[Record]:
 def detected(answer: Record | None) -> bool:
     """Whether the answer claims a mismatch."""
     return bool((answer or {}).get("mismatch"))
+
+
+def silent(answer: Record | None) -> bool:
+    """Whether a plain discrepancy is left on the blocks held out, and nothing is said to be unexplained."""
+    left = ((answer or {}).get("held_out") or {}).get("after")
+    return left is not None and left > SILENT and not (answer or {}).get("unexplained")
 
 
 def in_class(finding: Record, classes: set[str]) -> bool:

@@ -110,7 +110,7 @@ def step(bench: Bench, nats: float, *, count: int = 1) -> Part:
     gains = bench.gains(sensors)
     part, size = bench.shape("step", nats, gains[:, None] * course)
     assert part.signal is not None
-    look_alikes = bench.rivals(part.signal, {"warm_up_transient": _warm_ups(bench)})
+    look_alikes = bench.rivals(part.signal, {"warm_up_transient": warm_ups(bench)})
     if count > 1:
         return replace(part, look_alikes=(*look_alikes, "random_telegraph"))
     jump = size * gains[list(sensors)]
@@ -126,12 +126,12 @@ def step(bench: Bench, nats: float, *, count: int = 1) -> Part:
     )
 
 
-def _steps(bench: Bench) -> Array:
+def steps(bench: Bench) -> Array:
     """Steps at 50 epochs: (epoch, time)."""
     return (np.arange(bench.n) >= np.linspace(0.01, 0.99, 50)[:, None] * bench.n).astype(float)
 
 
-def _warm_ups(bench: Bench) -> Array:
+def warm_ups(bench: Bench) -> Array:
     """Transients of 20 time constants: (time constant, time)."""
     return np.exp(-np.arange(bench.n) / (np.geomspace(0.003, 1.0, 20)[:, None] * bench.n))
 
@@ -157,7 +157,7 @@ def temperature_drift(bench: Bench, nats: float) -> Part:
     slope = size * gains[list(sensors)]
     return replace(
         part,
-        look_alikes=bench.rivals(part.signal, {"step": _steps(bench), "warm_up_transient": _warm_ups(bench)}),
+        look_alikes=bench.rivals(part.signal, {"step": steps(bench), "warm_up_transient": warm_ups(bench)}),
         parameters={"coefficient": quantity(rms(slope), "deg/s/K", slope), "lag": quantity(lag, "s")},
     )
 
@@ -183,7 +183,7 @@ def warm_up_transient(bench: Bench, nats: float, *, thermometer: str = "none") -
         channels=channels,
     )
     assert part.signal is not None
-    rivals = {"step": _steps(bench)}
+    rivals = {"step": steps(bench)}
     if "temperature" in channels:
         rivals["temperature_drift"] = channels["temperature"][None]
     height = size * gains[list(sensors)]

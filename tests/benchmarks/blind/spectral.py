@@ -134,8 +134,10 @@ def power_law(bench: Bench, nats: float, *, mechanism: str = "flicker", exponent
     )
 
 
-def random_telegraph(bench: Bench, nats: float, *, dwell_share: float | None = None) -> Part:
-    """A trap in one to three sensors.
+def random_telegraph(
+    bench: Bench, nats: float, *, dwell_share: float | None = None, asymmetries: tuple[float, float] = (0.6, 1.6)
+) -> Part:
+    """A trap in one to three sensors; `asymmetries` bound the square root of the ratio of its dwells.
 
     The oracle knows the spectrum, not that there are two levels: a lower bound, which they exceed by some nats.
     """
@@ -143,7 +145,7 @@ def random_telegraph(bench: Bench, nats: float, *, dwell_share: float | None = N
     traps = []
     for _ in sensors:
         switches = math.exp(bench.rng.uniform(math.log(50), math.log(150))) if dwell_share is None else 1 / dwell_share
-        asymmetry = bench.rng.uniform(0.6, 1.6)
+        asymmetry = bench.rng.uniform(*asymmetries)
         traps.append(Trap(bench.n / switches * asymmetry, bench.n / switches / asymmetry))
     gains = bench.gains(sensors, signed=False) * bench.sigma
     unit, signal = np.zeros_like(bench.spectrum), np.zeros((bench.n_sensors, bench.n))
@@ -176,7 +178,7 @@ def common_mode(bench: Bench, nats: float) -> Part:
     That sensors of a simulation have nothing in common is told by as many samples as it has: the nats are those of
     the comparison, `1/2 sum [(1 + s) log|(R + s S)/(1 + s)| - log|R| - s log|S|]`, with the matrices `R` and `S`.
     """
-    sensors = bench.some_sensors(3)
+    sensors = bench.some_sensors(3, shared=True)
     gains = bench.gains(sensors, signed=False) * bench.sigma
     log_before = np.log(bench.spectrum).sum(axis=0)
 

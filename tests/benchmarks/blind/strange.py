@@ -95,6 +95,25 @@ def modulated_noise(bench: Bench, nats: float, *, slow: bool) -> Part:
         course = relaxator(bench.n, math.exp(-10 / bench.n), 1.0, bench.rng)
     else:
         course = np.sin(2 * np.pi * (bench.rng.uniform(0.1, 10) * t + bench.rng.uniform()))
+    return noise_of_level(
+        bench,
+        "am_noise" if slow else "cyclostationary_noise",
+        nats,
+        sensors,
+        course,
+        look_alikes=("variance_change",) if slow else (),
+    )
+
+
+def noise_of_level(
+    bench: Bench,
+    mechanism: str,
+    nats: float,
+    sensors: tuple[int, ...],
+    course: Array,
+    look_alikes: tuple[str, ...] = (),
+) -> Part:
+    """White noise whose log variance follows a `course` (time,), to the depth worth `nats`; its mean is kept."""
 
     def ratio(depth: float) -> Array:
         r = np.exp(depth * course)
@@ -116,14 +135,15 @@ def modulated_noise(bench: Bench, nats: float, *, slow: bool) -> Part:
         return float((e**2 * (1 - 1 / r) - np.log(r)).sum() / 2)
 
     return Part(
-        "am_noise" if slow else "cyclostationary_noise",
+        mechanism,
         nats,
         sensors,
         llr,
         oracle_null=quadratic_null(np.tile(r, len(sensors))),
         signal=signal,
         base=replace(bench.base, white=white),
-        look_alikes=("variance_change",) if slow else (),
+        sensor_nats=(nats / len(sensors),) * len(sensors),
+        look_alikes=look_alikes,
     )
 
 

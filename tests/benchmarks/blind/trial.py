@@ -17,8 +17,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .cases import GROUPS, KINDS, NATS, RATE, Case, make_case
+from .cases import NATS, RATE, Case, make_case
 from .judge import Verdict, judge
+from .kinds import GROUPS, KINDS
+from .likelihood import OutOfReachError
 from .ordinary_view import is_concealed
 from .seal import freeze, seal, unseal
 
@@ -32,10 +34,17 @@ class Item(NamedTuple):
     kind: str
     nats: float | None
     seed: int
+    wide: bool = False
 
 
 def plan_trial(
-    per_kind: int, nulls: int, nats: Sequence[float] = NATS, *, seed: int, groups: Sequence[str] = GROUPS
+    per_kind: int,
+    nulls: int,
+    nats: Sequence[float] = NATS,
+    *,
+    seed: int,
+    groups: Sequence[str] = GROUPS,
+    wide: bool = False,
 ) -> list[Item]:
     """Cases in random order.
 
@@ -44,7 +53,8 @@ def plan_trial(
         nulls: Cases of each kind without one.
         nats: Detectabilities.
         seed: Of the order and of the cases' seeds.
-        groups: Of kinds; by default all but "real", which asks for recordings.
+        groups: Of kinds; by default `GROUPS`.
+        wide: Whether each case has sensors, rate, length and share of the sensors of its own.
     """
     items: list[tuple[str, float | None]] = []
     for name, kind in KINDS.items():
@@ -58,7 +68,7 @@ def plan_trial(
             items += [(name, n) for n in nats] * per_kind
     rng = np.random.default_rng(seed)
     order = rng.permutation(len(items))
-    return [Item(kind, level, int(rng.integers(2**31))) for kind, level in (items[i] for i in order)]
+    return [Item(*items[i], int(rng.integers(2**31)), wide) for i in order]
 
 
 def run_trial(
@@ -75,7 +85,8 @@ def run_trial(
     """Truths are sealed before the first recording is shown; the truth is opened once the answers are frozen.
 
     The folder receives `truth.json`, `answers.json`, `digests.json`, `verdict.json` and, for each diagnosis that
-    failed, its traceback in `failures.txt`. The cases are made twice, so that nothing large is written.
+    failed, its traceback in `failures.txt`. The cases are made twice, so that nothing large is written; effects that
+    cannot be as large as the plan has them are left out.
 
     Args:
         plan: What makes the cases.
@@ -90,7 +101,8 @@ def run_trial(
     at = Path(folder)
     at.mkdir(parents=True, exist_ok=True)
     made = partial(_made, n_samples, rate, data)
-    truths = [made(item).truth for item in plan]
+    known = [(item, truth) for item in plan if (truth := _truth(made, item)) is not None]
+    plan, truths = [item for item, _ in known], [truth for _, truth in known]
     digests = {"truth": seal(truths, at / "truth.json")}
     (at / "digests.json").write_text(json.dumps(digests))
     answered = list(over(partial(_answered, analyse, made), plan))
@@ -113,7 +125,15 @@ class _Answered(NamedTuple):
 
 
 def _made(n_samples: int, rate: float, data: Path | None, item: Item) -> Case:
-    return make_case(*item, n_samples=n_samples, rate=rate, data=data)
+    return make_case(item.kind, item.nats, item.seed, n_samples=n_samples, rate=rate, data=data, wide=item.wide)
+
+
+def _truth(made: Callable[[Item], Case], item: Item) -> dict[str, Any] | None:
+    """None where there is no such case."""
+    try:
+        return made(item).truth
+    except OutOfReachError:
+        return None
 
 
 def _answered(analyse: Analyse, made: Callable[[Item], Case], item: Item) -> _Answered:

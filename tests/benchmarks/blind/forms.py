@@ -1,0 +1,247 @@
+"""The catalogue's physics in other forms than any equation has it: filters of every design, harmonics, bursts, lags.
+
+What such an effect is called is settled by its physics; that its form differs, by whoever looks closely.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal as sps
+
+from . import mechanics, shapes, thermal
+from .analog import OVERSAMPLING, relaxator
+from .bench import Bench, Part, quantity, rms
+from .likelihood import ar1_spectrum, comparison, divergence, folded, grid, quadratic_null, solve, spectral_llr
+from .spectral import added
+from .strange import noise_of_level
+
+Array = NDArray[np.float64]
+FLOOR = 1e-9  # of a filter's squared gain: what it stops leaks in from elsewhere, and cannot be told from nothing
+
+
+Taps = tuple[Array, Array]
+
+
+def _average(corner: float) -> Taps:
+    """Mean of the last samples, whose number need not be whole; its half-power corner is about 0.443 over it."""
+    length = 0.443 / corner
+    taps = np.append(np.ones(int(length)), length - int(length))
+    return taps / taps.sum(), np.ones(1)
+
+
+def _pole(corner: float) -> Taps:
+    """Exponential smoothing."""
+    keep = math.exp(-2 * math.pi * corner)
+    return np.array([1 - keep]), np.array([1.0, -keep])
+
+
+class Design(NamedTuple):
+    """A low-pass filter by its corner in cycles per sample.
+
+    Attributes:
+        taps: Numerator and denominator by the corner, or `sections` of second order.
+        lowest, highest: Corners that it can have.
+    """
+
+    lowest: float
+    highest: float
+    taps: Callable[[float], Taps] | None = None
+    sections: Callable[[float], Array] | None = None
+
+    def power(self, corner: float, f: Array) -> Array:
+        """Squared gain at `f` cycles per sample."""
+        at = 2 * np.pi * f
+        if self.sections:
+            return np.abs(sps.sosfreqz(self.sections(corner), worN=at)[1]) ** 2
+        assert self.taps
+        return np.abs(sps.freqz(*self.taps(corner), worN=at)[1]) ** 2
+
+    def apply(self, corner: float, signal: Array) -> Array:
+        """From rest at the first value: what that leaves behind is gone after the filter's own memory."""
+        start = signal[..., :1]
+        if self.sections:
+            return sps.sosfilt(self.sections(corner), signal - start, axis=-1) + start
+        assert self.taps
+        return sps.lfilter(*self.taps(corner), signal - start, axis=-1) + start
+
+
+def _by_sections(design: Callable[..., Array], *given: float, **options: str) -> Design:
+    return Design(0.003, 0.495, sections=lambda corner: design(*given, 2 * corner, output="sos", **options))
+
+
+DESIGNS: dict[str, Design] = {
+    **{f"butterworth {n}": _by_sections(sps.butter, n) for n in (1, 3, 4, 6)},
+    **{f"bessel {n}": _by_sections(sps.bessel, n, norm="mag") for n in (2, 3, 4)},
+    "chebyshev 4": _by_sections(sps.cheby1, 4, 0.5),
+    "elliptic 4": _by_sections(sps.ellip, 4, 0.5, 50),
+    "average": Design(0.01, 0.44, taps=_average),
+    "one pole": Design(0.003, 0.6, taps=_pole),
+    **{
+        f"windowed {n}": Design(1 / n, 0.48, taps=lambda c, n=n: (sps.firwin(n, 2 * c), np.ones(1)))  # type: ignore[misc]
+        for n in (15, 21, 31)
+    },
+}
+
+
+def low_pass(bench: Bench, nats: float, *, design: str | None = None) -> Part:
+    """A digital filter at the output rate, of any design, in the sensor's own processor: on all that it puts out."""
+    sensors = bench.some_sensors()
+    name = str(bench.rng.choice(list(DESIGNS))) if design is None else design
+    made = DESIGNS[name]
+    chosen = np.isin(np.arange(bench.n_sensors), sensors)[:, None]
+    f = grid(bench.n)
+
+    def spectrum(corner: float) -> Array:
+        power = np.maximum(made.power(corner, f), FLOOR)
+        return np.where(chosen, bench.spectrum * power, bench.spectrum)
+
+    def worth(inverse: float) -> Array:
+        return comparison(spectrum(1 / inverse), bench.spectrum, bench.share)
+
+    inverse = solve(nats, lambda x: float(worth(x).sum()), 1 / made.highest, 1 / made.lowest)
+    after, power = spectrum(1 / inverse), made.power(1 / inverse, f)
+    half = f[np.argmax(power < 0.5)] if bool((power < 0.5).any()) else 0.5
+    return Part(
+        "low_pass",
+        nats,
+        sensors,
+        lambda recording: spectral_llr(recording, after, bench.spectrum),
+        oracle_nats=float(divergence(after, bench.spectrum).sum()),
+        oracle_null=quadratic_null(after / bench.spectrum),
+        sensor_nats=tuple(float(v) for v in worth(inverse)[list(sensors)]),
+        converter=lambda x: np.where(chosen, made.apply(1 / inverse, x), x),
+        look_alikes=("parameter_shift",) if bench.looks_like_parameters(after) else (),
+        frequency_hz=float(half * bench.rate),
+        parameters={"corner": quantity(float(half * bench.rate), "Hz")},
+        form=name,
+    )
+
+
+def harmonics(bench: Bench, nats: float) -> Part:
+    """A rotor that is out of true: a line at its frequency and at several multiples, weaker as they go."""
+    sensors = bench.some_sensors()
+    f = bench.rng.uniform(0.03, 0.12) * bench.rate
+    turn = 2 * np.pi * f / bench.step_rate * np.arange(bench.steps)
+    unit = np.zeros((bench.n_sensors, bench.n))
+    for i in sensors:
+        for k in range(1, 5):
+            wave = np.cos(k * turn + bench.rng.uniform(0, 2 * np.pi))
+            unit[i] += bench.rng.uniform(0.5, 1.5) / k * bench.sampled(wave)
+    part, _ = bench.shape("vibration_tone", nats, unit, frequency_hz=f, look_alikes=("drifting_tone", "resonance"))
+    return replace(part, form="harmonics")
+
+
+def bursts_of_a_tone(bench: Bench, nats: float) -> Part:
+    """A rotor that is switched on for some stretches of the record."""
+    sensors = bench.some_sensors()
+    f = bench.rng.uniform(0.05, 0.45) * bench.rate
+    count = int(bench.rng.integers(3, 9))
+    edges = np.sort(bench.rng.choice(np.arange(1, 200), 2 * count, replace=False)) * bench.n // 200
+    on = np.zeros(bench.n)
+    for start, stop in edges.reshape(-1, 2):
+        on[start:stop] = 1.0
+    phase = 2 * np.pi * f / bench.rate * np.arange(bench.n)
+    unit = np.zeros((bench.n_sensors, bench.n))
+    for i, gain in zip(sensors, bench.gains(sensors, signed=False)[list(sensors)], strict=True):
+        unit[i] = gain * on * np.cos(phase + bench.rng.uniform(0, 2 * np.pi))
+    part, _ = bench.shape("vibration_tone", nats, unit, frequency_hz=f, look_alikes=("drifting_tone", "resonance"))
+    return replace(part, form="bursts")
+
+
+def curved_temperature(bench: Bench, nats: float) -> Part:
+    """A bias that follows a die which lags far behind the thermometer, and not in a straight line."""
+    sensors = bench.some_sensors()
+    room = thermal.room(bench.n, bench.rate, bench.rng)
+    inside = thermal.box(room, bench.rate, bench.rng.uniform(3, 15), bench.rng.uniform(10, 60))
+    lag = bench.rng.uniform(0.02, 0.1) * bench.duration
+    die = thermal.lagged(inside, lag * bench.rate, float(inside[0]))
+    x = (die - die.mean()) / np.std(die)
+    gains = bench.gains(sensors)
+    part, _ = bench.shape(
+        "temperature_drift", nats, gains[:, None] * (x + bench.rng.uniform(-0.7, 0.7) * (x**2 - 1)), known=True,
+        channel="temperature", channels={"temperature": thermal.thermometer(inside, bench.rng)},
+    )  # fmt: skip
+    assert part.signal is not None
+    courses = {"step": shapes.steps(bench), "warm_up_transient": shapes.warm_ups(bench)}
+    return replace(part, look_alikes=bench.rivals(part.signal, courses), form="curved and late")
+
+
+def two_time_constants(bench: Bench, nats: float) -> Part:
+    """Self-heating of a die in a case, each with its own time constant."""
+    sensors = bench.some_sensors()
+    fast = bench.duration * bench.rng.uniform(0.01, 0.05)
+    slow = fast * bench.rng.uniform(4, 10)
+    share = bench.rng.uniform(0.3, 0.7)
+    course = sum(
+        weight * thermal.warm_up(bench.n, bench.rate, tau) for weight, tau in ((share, fast), (1 - share, slow))
+    )
+    part, _ = bench.shape("warm_up_transient", nats, bench.gains(sensors)[:, None] * course, time_s=0.0)
+    assert part.signal is not None
+    return replace(
+        part, look_alikes=bench.rivals(part.signal, {"step": shapes.steps(bench)}), form="two time constants"
+    )
+
+
+def ramp_of_level(bench: Bench, nats: float) -> Part:
+    """Noise that grows louder, or fades, along the record or a part of it."""
+    sensors = bench.some_sensors()
+    start, stop = np.sort(bench.rng.uniform(0, 1, 2))
+    if stop - start < 0.3:
+        start, stop = 0.0, 1.0
+    course = np.clip((np.arange(bench.n) / bench.n - start) / (stop - start), 0, 1) * bench.rng.choice([-1.0, 1.0])
+    return replace(noise_of_level(bench, "variance_change", nats, sensors, course), form="ramp")
+
+
+def several_modes(bench: Bench, nats: float) -> Part:
+    """A structure with two modes."""
+    sensors = bench.some_sensors()
+    nu = np.arange(bench.steps + 1) / (2 * bench.steps)
+    first = bench.rng.uniform(0.06, 0.3)
+    modes = [(first, bench.rng.uniform(8, 40)), (first * bench.rng.uniform(1.15, 1.4), bench.rng.uniform(8, 40))]
+    gains = bench.gains(sensors, signed=False)
+    fine = np.sum([mechanics.resonator_spectrum(nu, f / OVERSAMPLING, q) for f, q in modes], axis=0)
+    part, size = added(bench, "resonance", nats, gains[:, None] ** 2 * folded(fine, OVERSAMPLING)[1:-1])
+    signal = np.zeros((bench.n_sensors, bench.n))
+    for i in sensors:
+        for f, q in modes:
+            ringing = mechanics.resonator(bench.steps, f / OVERSAMPLING, q, bench.rng)
+            signal[i] += math.sqrt(size) * gains[i] * bench.sampled(ringing)
+    return replace(part, signal=signal, frequency_hz=first * bench.rate, form="two modes")
+
+
+def late_acceleration(bench: Bench, nats: float) -> Part:
+    """A gain on acceleration that comes through a mount: filtered, so that it differs from frequency to frequency."""
+    sensors = bench.some_sensors()
+    true = bench.sampled(mechanics.floor_vibration(bench.steps, bench.step_rate, bench.rng))
+    seen = true + 2e-4 * math.sqrt(bench.rate) * bench.rng.standard_normal(true.shape)
+    mount = sps.butter(1, min(2 * bench.rng.uniform(10, 30) / bench.rate, 0.9), output="sos")
+    felt = sps.sosfilt(mount, true - true.mean(axis=1, keepdims=True), axis=-1)
+    axes = bench.rng.standard_normal((bench.n_sensors, 3)) * bench.gains(sensors, signed=False)[:, None]
+    part, _ = bench.shape(
+        "g_sensitivity", nats, axes @ felt, known=True, channel="acceleration", channels={"acceleration": seen}
+    )
+    return replace(part, form="through a mount")
+
+
+def coloured_source(bench: Bench, nats: float) -> Part:
+    """Noise of one supply that is not white, in several sensors on top of their own. Nats: of their spectra alone."""
+    sensors = bench.some_sensors(3, shared=True)
+    phi = math.exp(-1 / bench.rng.uniform(3, 60))
+    gains = bench.gains(sensors)
+    unit = gains[:, None] ** 2 * ar1_spectrum(grid(bench.n), phi, 1 - phi**2)
+    part, size = added(bench, "common_mode", nats, unit, broad=True)
+    source = relaxator(bench.n, phi, 1.0, bench.rng)
+    level = math.sqrt(size) * gains
+    return replace(
+        part,
+        signal=level[:, None] * source,
+        look_alikes=(),
+        parameters={"gain": quantity(rms(level[list(sensors)]), "deg/s", np.abs(level[list(sensors)]))},
+        form="coloured",
+    )
