@@ -9,6 +9,9 @@ import torch
 from torch import Tensor
 
 
+_BITS = 63  # of the length of a tensor
+
+
 def check_floating(name: str, value: Tensor) -> Tensor:
     """Return `value` when it is a real floating point tensor.
 
@@ -63,7 +66,7 @@ def check_n_levels(n_levels: int | None, n_samples: int) -> int:
     if n_levels is None:
         return largest_level(n_samples)
     n_levels = check_positive_integer("n_levels", n_levels)
-    if 2**n_levels > n_samples:
+    if n_levels >= _BITS or 2**n_levels > n_samples:  # of an absurd number the power would never end
         raise ValueError(
             f"`n_levels`: expected at most {largest_level(n_samples)} for {n_samples} samples "
             f"(2**n_levels <= samples), got {n_levels}; ask for fewer levels or give a longer signal"

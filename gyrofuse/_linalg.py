@@ -70,7 +70,10 @@ def geometric_mean(inverse: Tensor, other: Tensor) -> Tensor:
 
 
 def _cause(matrix: Tensor, correlation: Tensor, names: Sequence[str], tolerance: float) -> str:
-    missing = (~matrix.diagonal().isfinite()).nonzero().flatten().tolist()
+    huge = matrix.diagonal().isinf().nonzero().flatten().tolist()
+    if huge:
+        return f"numbers of sensor(s) {named(names, huge)} are too large to be squared; give them in another unit"
+    missing = matrix.diagonal().isnan().nonzero().flatten().tolist()
     if missing:
         return (
             f"sensor(s) {named(names, missing)} have no complete window at some level; "
@@ -80,7 +83,10 @@ def _cause(matrix: Tensor, correlation: Tensor, names: Sequence[str], tolerance:
         return "some sensors are never recorded together; leave one of them out"
     dead = (matrix.diagonal() <= 0).nonzero().flatten().tolist()
     if dead:
-        return f"sensor(s) {named(names, dead)} never change (dead or stuck); leave them out"
+        return (
+            f"sensor(s) {named(names, dead)} never change (dead or stuck); leave them out, or where their numbers are "
+            "too small to be squared, give them in another unit"
+        )
     equal = (correlation.abs() >= 1 - max(tolerance, 1e-9)).triu(1).nonzero().tolist()
     if equal:
         pairs = ", ".join(f"{names[i]} and {names[k]}" for i, k in equal[:5])

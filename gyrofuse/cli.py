@@ -7,6 +7,7 @@ Bad input ends with one line on stderr and exit status 2, a defect of the progra
 from __future__ import annotations
 
 import atexit
+import csv
 import gc
 import shutil
 import signal
@@ -353,14 +354,21 @@ def _save(recording: Recording, path: Path, **arrays: np.ndarray[Any, Any]) -> N
         names = [f"{sensor}_gyro{end}" for end in ends for sensor in recording.sensors]
         columns = torch.cat([recording.time[None], recording.signal.flatten(0, -2)]).T
         unit = f" [{recording.unit}]" if recording.unit != "unknown" else ""
-        header = ",".join(["time [s]", *(name + unit for name in names)])
-        np.savetxt(path, columns.numpy(), fmt="%.17g", delimiter=",", header=header, comments="", encoding="utf-8")
+        with path.open("w", encoding="utf-8", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerow(["time [s]", *(_cell(name + unit) for name in names)])
+            np.savetxt(file, columns.numpy(), fmt="%.17g", delimiter=",")
         return
     recording.save(path, force=True)
     with zipfile.ZipFile(path, "a") as archive:
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w") as file:
                 np.lib.format.write_array(file, array)
+
+
+def _cell(text: str) -> str:
+    """A name that came with a log, as a cell that no program takes for a formula or for more than one line."""
+    line = "".join(c if c.isprintable() else " " for c in text)
+    return f"'{line}" if line[:1] in ("=", "+", "-", "@") else line
 
 
 def _say_recording(recording: Recording) -> None:

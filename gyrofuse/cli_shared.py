@@ -173,7 +173,7 @@ def read_model(path: Path) -> Model | ArrayModel | RepairedModel:
         from gyrofuse.mismatch.saved import repaired_from_dict
 
         return repaired_from_dict(content)
-    except (ValueError, TypeError, AttributeError) as error:
+    except (ValueError, TypeError, AttributeError, RuntimeError, OverflowError, LookupError) as error:
         raise ValueError(f"{path}: {_NO_MODEL}: {error}") from None
 
 
@@ -181,8 +181,11 @@ def model_grid(path: Path) -> tuple[float | None, str | None]:
     """Rate in Hz and unit of the log that a model in JSON was fitted to, where it says."""
     content = _model_content(path)
     rate, unit = content.get("rate"), content.get("unit")
-    known = isinstance(unit, str) and unit != "unknown"
-    return (rate if isinstance(rate, float | int) else None), (unit if known else None)
+    if rate is not None and (isinstance(rate, bool) or not isinstance(rate, float | int)):
+        raise ValueError(f"{path}: expected 'rate' to be a number of Hz, got {str(rate)[:80]!r}")
+    if unit is not None and not isinstance(unit, str):
+        raise ValueError(f"{path}: expected 'unit' to be a text such as 'deg/s', got {str(unit)[:80]!r}")
+    return rate, (None if unit == "unknown" else unit)
 
 
 def agreed_rate(models: Sequence[Path], rate: float | None) -> float | None:
@@ -222,6 +225,8 @@ def draw(plot: Callable[[Axes], Axes], draft: Path, path: Path, width: float = 7
 def _model_content(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
+    except RecursionError:
+        raise ValueError(f"{path}: {_NO_MODEL}, found lists within lists that do not end") from None
     except ValueError as error:
         raise ValueError(f"{path}: {_NO_MODEL}: {error}") from None
     if not isinstance(content, dict):

@@ -7,6 +7,7 @@ import warnings
 import torch
 from torch import Tensor
 
+from gyrofuse._linalg import check_positive_definite
 from gyrofuse.svo_weights import combine, counting, optimal_weights
 
 # How far below 1 the variance that a sensor would bring may seem, in units of the least, by rounding.
@@ -41,8 +42,14 @@ def inverse_variance_weights(wccv: Tensor, scale_weights: Tensor) -> Tensor:
 
     Returns:
         `(..., sensor)`.
+
+    Raises:
+        SingularCovarianceError: A sensor never changes, or has no complete window at a level that counts.
     """
-    return precision_weights(combine(wccv, scale_weights))
+    combined = combine(counting(wccv, scale_weights), scale_weights)
+    variances = torch.diag_embed(combined.diagonal(dim1=-2, dim2=-1))
+    check_positive_definite("the diagonal of the wavelet cross-covariance combined over scales", variances)
+    return precision_weights(combined)
 
 
 def precision_weights(combined: Tensor) -> Tensor:
@@ -64,10 +71,14 @@ def nonnegative_weights(wccv: Tensor, scale_weights: Tensor) -> Tensor:
     Returns:
         `(..., sensor)`, sum 1, none negative.
 
+    Raises:
+        SingularCovarianceError: `A` is not positive definite (a dead or duplicated sensor, say).
+
     References:
         Lawson & Hanson, Solving Least Squares Problems, chapter 23.
     """
-    combined = combine(wccv, scale_weights)
+    combined = combine(counting(wccv, scale_weights), scale_weights)
+    check_positive_definite("the wavelet cross-covariance combined over scales", combined)
     used = _nonnegative_set(combined.detach().double())
     solved = _solve_within(combined, used, torch.ones_like(combined[..., 0])).clamp(min=0)
     return solved / solved.sum(-1, keepdim=True)

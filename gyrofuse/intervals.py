@@ -19,6 +19,8 @@ from gyrofuse.uncertainty import chi_square_interval, t_quantile
 
 # Products of two sensors have heavier tails than squares: a series has to be longer to be believed.
 _FEWEST_WINDOWS_OF_PAIRS = 64
+_FITTED = 4  # levels at least that a pilot is fitted to, where there are as many
+_SINGULAR = 1e-10  # smallest eigenvalue of a mean correlation matrix that is zero but for rounding
 
 
 def wavelet_variance_interval(
@@ -37,7 +39,8 @@ def wavelet_variance_interval(
         confidence_level: Probability that the interval holds the true value.
 
     Returns:
-        Limits `(..., level, sensor)`, unit of the signal squared; NaN where a level has no complete window.
+        Limits `(..., level, sensor)`, unit of the signal squared; NaN where a level has no complete window, and of a
+        sensor that never changes.
 
     Raises:
         TypeError: `signal` is not a floating point tensor.
@@ -70,7 +73,8 @@ def wavelet_cross_covariance_interval(
         confidence_level: Probability that the interval holds the true value.
 
     Returns:
-        Limits `(..., level, sensor, sensor)`, unit of the signal squared; NaN where a level has no complete window.
+        Limits `(..., level, sensor, sensor)`, unit of the signal squared; NaN where a level has no complete window, and
+        with a sensor that never changes.
 
     Raises:
         TypeError: `signal` is not a floating point tensor.
@@ -99,13 +103,31 @@ def _intervals(items: Tensor, n_levels: int, confidence_level: float) -> tuple[T
     by_model = torch.full_like(wccv, torch.nan), torch.full_like(wccv, torch.nan)
     for n_known in complete[complete > 0].unique().tolist():
         alike = complete == n_known
-        modelled = _by_model(fit_pilot(wccv[alike, :n_known], n_samples), wccv[alike, :n_known], confidence_level)
+        pilot = fit_pilot(_regular(wccv[alike, :n_known]), n_samples)
+        modelled = _by_model(pilot, wccv[alike, :n_known], confidence_level)
         for limit, values in zip(by_model, modelled, strict=True):
             limit[alike, :n_known] = values
     fewest = torch.full_like(windows, _FEWEST_WINDOWS_OF_PAIRS)
     fewest.diagonal(dim1=-2, dim2=-1).fill_(series.FEWEST_WINDOWS)
     low, high = (torch.where(windows >= fewest, s, m) for s, m in zip(by_series, by_model, strict=True))
+    changing = wccv.diagonal(dim1=-2, dim2=-1) > 0
+    known &= changing[..., :, None] & changing[..., None, :]
     return torch.where(known, low, torch.nan), torch.where(known, high, torch.nan)
+
+
+def _regular(wccv: Tensor) -> Tensor:
+    """Covariances that a model can be fitted to: of arrays with copies or stuck sensors, and of records too short for
+    their number of sensors, each sensor's own variance alone; of one that has none, that of white noise.
+    """
+    nu = wccv.diagonal(dim1=-2, dim2=-1)
+    white = torch.exp2(-torch.arange(1, nu.shape[-2] + 1, dtype=nu.dtype, device=nu.device))
+    own = torch.where(nu > 0, nu, white[:, None])
+    size = own.rsqrt()
+    # The levels that any pilot is fitted to.
+    together = (size[..., :, None] * wccv * size[..., None, :])[:, -_FITTED:].mean(1)
+    smallest = torch.linalg.eigvalsh(torch.where(together.isfinite(), together, 0.0))[:, 0]
+    singular = (smallest <= _SINGULAR) | (nu <= 0).any(-1).any(-1)
+    return torch.where(singular[:, None, None, None], torch.diag_embed(own), wccv)
 
 
 def _by_series(

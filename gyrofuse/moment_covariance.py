@@ -72,7 +72,7 @@ def moment_covariance(model: Model, n_samples: int, n_levels: int, *, excess_kur
     """
     n_samples = check_positive_integer("n_samples", n_samples)
     n_levels = check_positive_integer("n_levels", n_levels)
-    if 2**n_levels > n_samples:
+    if n_levels > largest_level(n_samples):
         raise ValueError(
             f"`n_levels`: expected at most {largest_level(n_samples)} for {n_samples} samples "
             f"(2**n_levels <= samples), got {n_levels}; ask for fewer levels or give a longer record"

@@ -29,6 +29,8 @@ _SPELLINGS: dict[str, type[Any]] = {
     **{kind.key: kind for kind in _PROCESSES},
     "gm": AR1,  # first-order Gauss-Markov
 }
+_LONGEST = 1000  # characters of a formula: far more than any model takes, and what a parser can nest
+_MOST = 50  # processes of a model: ten times what any recording has told apart
 _KNOWN = ", ".join(f"{kind.symbol} ({kind.__name__})" for kind in _PROCESSES)
 
 
@@ -39,34 +41,47 @@ def parse_model(formula: str) -> Model:
     What `str` prints of a model with scalar parameters is read back exactly.
 
     Raises:
-        ValueError: Not a formula, an unknown name or parameter, a value outside its domain, or a repetition
-            of a process that may appear once.
+        ValueError: Not a formula, one of more than 1000 characters or 50 processes, an unknown name or parameter, a
+            value outside its domain, or a repetition of a process that may appear once.
     """
+    if len(formula) > _LONGEST:
+        raise ValueError(f"`formula`: expected at most {_LONGEST} characters, got {len(formula)}; add fewer processes")
     text = " ".join(formula.split())
     try:
         tree = ast.parse(text, mode="eval").body
-    except (SyntaxError, ValueError) as error:
-        position = getattr(error, "offset", None) or len(text)
+        return _read(tree, text)
+    except (RecursionError, MemoryError):
+        raise ValueError("`formula`: expected processes joined by +, got brackets or signs nested too deeply") from None
+    except SyntaxError as error:
+        position = error.offset or len(text)
         raise ValueError(
             f"`formula`: cannot read {text!r} near character {position}; "
             'expected processes joined by +, such as "WN + 2*AR1 + RW"'
         ) from None
-    return _read(tree, text)
 
 
 def _read(node: ast.expr, text: str) -> Model:
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
-        return _read(node.left, text) + _read(node.right, text)
+        left, right = _read(node.left, text), _read(node.right, text)
+        _check_count(len(left.processes) + len(right.processes), node, text)
+        return left + right
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mult):
         times = _number(node.left, text)
         if not isinstance(times, int) or times < 1:
             raise _error(node.left, text, f"expected a whole number >= 1, got {times!r}")
-        return times * _read(node.right, text)
+        right = _read(node.right, text)
+        _check_count(times * len(right.processes), node, text)
+        return times * right
     if isinstance(node, ast.Name):
         return _kind(node, text)()
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
         return _process(node.func, node, text)
     raise _error(node, text, f"expected processes joined by +, got {ast.unparse(node)!r}; known: {_KNOWN}")
+
+
+def _check_count(count: int, node: ast.expr, text: str) -> None:
+    if count > _MOST:
+        raise _error(node, text, f"expected at most {_MOST} processes, got {count}")
 
 
 def _process(name: ast.Name, call: ast.Call, text: str) -> Process:
@@ -103,7 +118,8 @@ def _unknown(name: object) -> str:
 def _number(node: ast.expr, text: str) -> Any:
     try:
         value = ast.literal_eval(node)
-    except ValueError:
+        float(value)
+    except (ValueError, TypeError, OverflowError):  # such as an unhashable key, or digits beyond any float
         value = None
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise _error(node, text, f"expected a number, got {ast.unparse(node)!r}")
@@ -121,13 +137,21 @@ def model_from_dict(description: Mapping[str, Any]) -> Model | ArrayModel:
         ValueError: Missing or unknown entries, or a value outside its domain.
     """
     if "components" in description:
-        return ArrayModel([_component(entry) for entry in description["components"]])
+        return ArrayModel([_component(entry) for entry in _entries(description, "components")])
     if "processes" not in description:
         raise ValueError(
             "`description`: expected the entry 'processes' of a model or 'components' of an array, "
             f"got {sorted(description)}"
         )
-    return Model([_process_from_dict(entry) for entry in description["processes"]])
+    return Model([_process_from_dict(entry) for entry in _entries(description, "processes")])
+
+
+def _entries(description: Mapping[str, Any], name: str) -> list[Any]:
+    """A list of dictionaries."""
+    entries = description[name]
+    if not isinstance(entries, list) or not all(isinstance(entry, Mapping) for entry in entries):
+        raise ValueError(f"`description`: expected '{name}' to be a list of dictionaries, got {str(entries)[:80]!r}")
+    return entries
 
 
 def _component(entry: Mapping[str, Any]) -> tuple[Process, Any]:
@@ -151,5 +175,18 @@ def _process_from_dict(entry: Mapping[str, Any]) -> Process:
             f"`description`: {kind.__name__} has no parameter {', '.join(unknown)}; "
             f"known: {', '.join(kind().parameters)}"
         )
-    batched = {k: torch.tensor(v, dtype=torch.float64) for k, v in values.items() if isinstance(v, list)}
-    return kind(**{**values, **batched})
+    return kind(**{parameter: _value(parameter, value) for parameter, value in values.items()})
+
+
+def _value(parameter: str, value: Any) -> Any:
+    """A number, a batch of numbers, or nothing where it is to be estimated."""
+    if value is None:
+        return None
+    try:
+        return torch.tensor(value, dtype=torch.float64) if isinstance(value, list) else value + 0.0
+    except (TypeError, ValueError, OverflowError, RuntimeError):
+        told = str(value)
+        raise ValueError(
+            f"`description`: expected a number for {parameter}, or a list of them, got "
+            f"{told if len(told) < 80 else told[:80] + '...'}"
+        ) from None

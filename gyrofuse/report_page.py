@@ -87,4 +87,6 @@ def render(template: str, **context: Any) -> str:
     environment.filters["scientific"] = lambda value: f"{value:.3e}" if math.isfinite(value) else "-"
     environment.filters["fixed"] = lambda value: f"{value:.4f}" if math.isfinite(value) else "-"
     environment.filters["signed"] = lambda value: f"{value:+.4f}" if math.isfinite(value) else "-"
-    return environment.get_template(template).render(version=__version__, **context)
+    page = environment.get_template(template).render(version=__version__, **context)
+    # Names of files and sensors may hold bytes that are no text: they are written out.
+    return page.encode("utf-8", "backslashreplace").decode()

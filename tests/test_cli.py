@@ -609,6 +609,10 @@ def test_every_method_has_a_report(run: Run, tmp_path: Path, method: cli.Method)
         ("junk.json", [], "junk.json"),
         ("list.json", [], "list.json"),
         ("other.json", [], "other.json"),
+        ("nested.json", [], "lists within lists"),
+        ("text.json", [], "expected 'processes' to be a list"),
+        ("true.json", [], "expected 'rate' to be a number"),
+        ("digits.json", [], "expected a number for variance"),
         ("WN(variance=-1)", [], "`variance`"),
         ("WN + RW", [], "to be estimated"),
         ("WN(variance=1", [], "`formula`"),
@@ -623,12 +627,40 @@ def test_every_method_has_a_report(run: Run, tmp_path: Path, method: cli.Method)
 def test_bad_simulations_are_refused(run: Run, tmp_path: Path, model: str, options: list[str], says: str):
     (tmp_path / "junk.json").write_bytes(b"\xff\xfe{")
     (tmp_path / "list.json").write_text("[1, 2]")
+    (tmp_path / "nested.json").write_text("[" * 100_000)
+    (tmp_path / "text.json").write_text('{"processes": "WN"}')
+    one = {"processes": [{"process": "white_noise", "variance": 1.0}]}
+    (tmp_path / "true.json").write_text(json.dumps(one | {"rate": True}))
+    (tmp_path / "digits.json").write_text(json.dumps(one).replace("1.0", "1" * 400))
     (tmp_path / "other.json").write_text('{"processes": [{"process": "Magic"}]}')
     array = gf.ArrayModel([(gf.WhiteNoise(1.0), [1.0, 2.0])])
     (tmp_path / "array.json").write_text(json.dumps(array.to_dict()))
     before = contents(tmp_path)
     refused(run("simulate", model, "--samples", 100, "--rate", 10, "--out", "a.npz", *options), says)
     assert contents(tmp_path) == before
+
+
+def test_an_absurd_number_of_levels_is_refused(run: Run, log: Path):
+    refused(run("fuse", log, "--levels", "1" + "0" * 30), "`n_levels`: expected at most")
+
+
+def test_names_that_came_with_a_log_stay_cells_of_one_line(run: Run, tmp_path: Path):
+    """A unit or name with a comma, a line end or a formula: the file can be read back, and no cell is a formula."""
+    unit = "x]\n=cmd|' /C calc'!A0,1"
+    gf.Recording(noise(3, 400), rate=100.0, unit=unit, sensors=("=a", "b,c", "d")).save(tmp_path / "log.npz")
+    assert run("fuse", "log.npz", "--out", "o.csv", "--covariance", "none").status == 0
+    lines = (tmp_path / "o.csv").read_text().splitlines()
+    assert len(lines) == 401
+    assert not any(line.startswith(("=", "+", "-", "@")) for line in lines)
+    assert gf.read_recording(tmp_path / "o.csv").n_samples == 400
+
+
+def test_a_page_of_a_file_whose_name_is_no_text(run: Run, tmp_path: Path):
+    gf.Recording(noise(3, 400), rate=100.0).save(tmp_path / "log.npz")
+    (tmp_path / "log.npz").rename(tmp_path / "b\udcff.npz")
+    done = run("fuse", "b\udcff.npz", "--report", "o.html", "--covariance", "none")
+    assert (done.status, done.err) == (0, "")
+    assert "b\\udcff.npz" in (tmp_path / "o.html").read_text()
 
 
 def test_missing_arguments_are_refused(run: Run):

@@ -208,3 +208,31 @@ def test_shrinkage_halves_the_risk_of_long_scale_weights():
     assert shrunk.mean() < 0.7 * svo.mean()
     # Sixty arrays: fewer than 40 would be a chance of 0.7 % if neither were better.
     assert (shrunk < svo).sum() >= 40
+
+
+@pytest.mark.filterwarnings("ignore:no complete window")
+@pytest.mark.parametrize("weights", [gf.inverse_variance_weights, nonnegative_weights])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda x: x.index_fill(0, torch.tensor([0]), 3.0), "sensor\\(s\\) 1 never change"),
+        (lambda x: 1e-170 * x, "too small to be squared"),
+        (lambda x: 1e170 * x, "too large to be squared"),
+        (lambda x: torch.where(torch.arange(256) == 100, torch.nan, x), "no complete window"),
+    ],
+)
+def test_weights_are_never_silently_missing(weights, change, message):
+    signal = torch.from_numpy(np.random.default_rng(1).normal(size=(3, 256)))
+    wccv = gf.wavelet_cross_covariance(change(signal))
+    with pytest.raises(gf.SingularCovarianceError, match=message):
+        weights(wccv, gf.resolve_scale_weights("flat", 8))
+
+
+@pytest.mark.parametrize("weights", [gf.inverse_variance_weights, nonnegative_weights])
+def test_levels_that_do_not_count_may_be_unknown(weights):
+    signal = torch.from_numpy(np.random.default_rng(1).normal(size=(3, 256)))
+    wccv = gf.wavelet_cross_covariance(signal)
+    short = torch.tensor([0.5, 0.5, 0, 0, 0, 0, 0, 0], dtype=torch.float64)
+    expected = weights(wccv, short)
+    wccv[4:] = torch.nan
+    torch.testing.assert_close(weights(wccv, short), expected)

@@ -116,3 +116,22 @@ def test_bad_input_is_named(interval):
         interval(torch.zeros(2, 100), 7)
     with pytest.raises(TypeError, match="`signal`: expected a torch tensor"):
         interval([1.0, 2.0])
+
+
+@pytest.mark.parametrize("kind", ["stuck", "copied", "two samples", "three samples"])
+def test_arrays_that_no_model_fits_have_the_intervals_of_their_single_sensors(kind):
+    """A stuck sensor has none; beside it, or beside a copy, the others' are those that they have alone."""
+    x = torch.from_numpy(np.random.default_rng(3).normal(size=(3, 256)))
+    if kind == "stuck":
+        x[0] = 3.0
+    elif kind == "copied":
+        x[0] = x[1]
+    else:
+        x = x[:, : 2 if kind == "two samples" else 3]
+    alone, pairs = wavelet_variance_interval(x), wavelet_cross_covariance_interval(x)
+    for limit, matrix in zip(alone, pairs, strict=True):
+        assert limit[:, 1:].isfinite().all()
+        assert bool(limit[:, 0].isnan().all()) == (kind == "stuck")
+        assert bool(matrix[:, 0].isnan().all()) == (kind == "stuck")
+        # Several sensors have their series in longer bins than one.
+        torch.testing.assert_close(matrix.diagonal(dim1=-2, dim2=-1), limit, equal_nan=True, rtol=0.05, atol=0)

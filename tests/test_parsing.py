@@ -84,3 +84,35 @@ def test_dictionary_keeps_batches_and_unknowns():
 def test_dictionaries_that_cannot_be_read(description, message):
     with pytest.raises(ValueError, match=message):
         model_from_dict(description)
+
+
+@pytest.mark.parametrize(
+    ("formula", "message"),
+    [
+        ("WN + 999999*AR1", "at most 50 processes, got 999999"),
+        ("9*(9*(9*(9*(9*(9*(9*(9*(AR1))))))))", "at most 50 processes, got 81"),
+        ("+".join(["AR1"] * 51), "at most 50 processes, got 51"),
+        ("+".join(["WN"] * 20_000), "at most 1000 characters, got 59999"),
+        ("-" * 999 + "1", "nested too deeply|expected processes"),
+        ("WN(variance=1" + "0" * 400 + ")", "expected a number"),
+        ("WN(variance={[]: 1})", "expected a number"),
+    ],
+)
+def test_formulas_that_would_never_end_are_refused(formula, message):
+    with pytest.raises(ValueError, match=message):
+        parse_model(formula)
+
+
+@pytest.mark.parametrize(
+    ("description", "message"),
+    [
+        ({"processes": "WN"}, "expected 'processes' to be a list of dictionaries, got 'WN'"),
+        ({"components": [1]}, "expected 'components' to be a list of dictionaries"),
+        ({"processes": [{"process": "WN", "variance": 10**400}]}, "expected a number for variance"),
+        ({"processes": [{"process": "WN", "variance": [1, [2]]}]}, "expected a number for variance"),
+        ({"processes": [{"process": "WN", "variance": "1"}]}, "expected a number for variance"),
+    ],
+)
+def test_descriptions_that_are_none_are_refused(description, message):
+    with pytest.raises(ValueError, match=message):
+        model_from_dict(description)
