@@ -8,7 +8,6 @@ from numbers import Real
 import torch
 from torch import Tensor
 
-
 _BITS = 63  # of the length of a tensor
 
 
