@@ -14,7 +14,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from gyrofuse.io.columns import AXES, TICK, Column, canonical_unit, classify_columns, time_in_seconds
+from gyrofuse.io.columns import AXES, TICK, Column, canonical_unit, classify_columns, time_in_seconds, typical_step
+from gyrofuse.io.limits import LONGEST_NAME, decoded, enumerated, is_rate
 from gyrofuse.io.stream import Array, RecordingError, Stream
 
 _RATE = (
@@ -38,6 +38,8 @@ _RATE = (
 )
 _UNIT = ("unit", "units")
 _SENSORS = ("sensors", "sensornames")
+# Sets of arrays of one length, rate and unit in one file; each set is read with all arrays of its length.
+_MOST_SETS = 256
 # By the group that holds it ("" is the file) and its name in lower case letters.
 _Settings = Mapping[tuple[str, str], Any]
 
@@ -54,6 +56,7 @@ def streams_from_arrays(content: Mapping[str, Any], path: Path, *, key: str | No
     Raises:
         RecordingError: No gyro among the arrays, or nothing of the name `key`.
     """
+    content = {name: value for name, value in content.items() if len(name) <= LONGEST_NAME}
     arrays = {name: value for name, value in content.items() if _length(value) > 1}
     settings = settings_by_group({name: value for name, value in content.items() if name not in arrays})
     columns = {column.name: column for column in classify_columns(list(arrays))}
@@ -68,14 +71,22 @@ def streams_from_arrays(content: Mapping[str, Any], path: Path, *, key: str | No
             alike.setdefault((_length(arrays[name]), stated_rate(settings, name), unit), []).append(name)
     if not alike:
         shapes = {name: getattr(value, "shape", ()) for name, value in content.items()}
-        found = ", ".join(f"{name} {shape}" for name, shape in shapes.items() if set(shape) - {1}) or "no array"
+        found = enumerated(f"{name} {shape}" for name, shape in shapes.items() if set(shape) - {1}) or "no array"
         wanted = "an array (sensor, time) with the name of a gyro (gyro, imu_gyr, gx)"
         wanted += f" in {key!r}" if key else ""
         raise RecordingError(f"{path}: expected {wanted}, found {found}; say with `key` which array holds the gyros")
+    if len(alike) > _MOST_SETS:
+        raise RecordingError(
+            f"{path}: expected gyros of a few rates and lengths, found {len(alike)} different ones; say with `key` "
+            "which array holds the gyros"
+        )
+    beside: dict[int, list[str]] = {}
+    for name, column in columns.items():
+        if column.kind != "gyro":
+            beside.setdefault(_length(arrays[name]), []).append(name)
     streams: list[Stream] = []
     for (length, rate, unit), gyros in alike.items():
-        beside = [n for n, column in columns.items() if column.kind != "gyro" and _length(arrays[n]) == length]
-        rows = {name: _rows(arrays[name], length) for name in (*gyros, *beside)}
+        rows = {name: _rows(arrays[name], length) for name in (*gyros, *beside.get(length, ()))}
         streams += _group(rows, columns, settings, path.stem, rate, unit)
     return streams
 
@@ -93,6 +104,7 @@ def _group(
     clocks: dict[str, tuple[Array, float | None, str]] = {}
     beside: dict[str, Array] = {}
     notes: list[str] = []
+    names_in: dict[int, list[str]] = {}  # by the identity of the setting, which many arrays share
     for name, values in rows.items():
         column = columns[name]
         if column.kind == "time" and len(values) == 1:
@@ -101,7 +113,10 @@ def _group(
         if column.kind != "gyro":
             beside[name] = values
             continue
-        sensors = list(dict.fromkeys(_texts(_nearest(settings, name, _SENSORS))))
+        setting = _nearest(settings, name, _SENSORS)
+        if id(setting) not in names_in:
+            names_in[id(setting)] = list(dict.fromkeys(_texts(setting)))
+        sensors = names_in[id(setting)]
         if len(values) == 4 and len(sensors) != 4 and (row := _clock_row(values)) is not None:
             notes.append(f"row {row} of '{name}' never decreases and is read as its time")
             clocks[column.device] = clock_in_seconds(column, values[row], rate, settings)
@@ -158,6 +173,7 @@ def _channels(
     triads = {found["x"]: found for found in axes.values() if found.keys() >= set(AXES)}
     merged = {found[axis] for found in triads.values() for axis in "yz"}
 
+    known_devices = {*devices}
     channels: dict[str, tuple[dict[str, Array], dict[str, str]]] = {}
     for name, values in beside.items():
         if name in merged:
@@ -166,7 +182,7 @@ def _channels(
         values = np.concatenate([beside[triads[name][axis]] for axis in AXES]) if name in triads else values
         known = column.kind and len(values) == (1 if column.kind == "temperature" else 3)
         label = column.kind if known else name.rpartition("/")[2]
-        owned, units = channels.setdefault(column.device if column.device in devices else devices[0], ({}, {}))
+        owned, units = channels.setdefault(column.device if column.device in known_devices else devices[0], ({}, {}))
         if label in owned:
             label = name
         owned[label] = values[0] if len(values) == 1 else values
@@ -180,7 +196,8 @@ def settings_by_group(values: Mapping[str, Any]) -> _Settings:
     settings = {}
     for path, value in values.items():
         group, _, name = path.rpartition("/")
-        settings[group, re.sub(r"[^a-z]", "", name.lower()).removesuffix("hz")] = value
+        letters = "".join(letter for letter in name.lower() if "a" <= letter <= "z")
+        settings[group, letters.removesuffix("hz")] = value
     return settings
 
 
@@ -191,7 +208,7 @@ def stated_rate(settings: _Settings, name: str) -> float | None:
         rate = float(_text(value) or np.asarray(value, dtype=np.float64).item())
     except (TypeError, ValueError):
         return None
-    return rate if math.isfinite(rate) and rate > 0 else None
+    return rate if is_rate(rate) else None
 
 
 def stated_unit(settings: _Settings, name: str) -> str:
@@ -214,12 +231,12 @@ def _texts(value: Any) -> list[str]:
     flat = np.asarray(value).ravel()
     if flat.dtype.kind not in "USO":
         return []
-    words = [item.decode() if isinstance(item, bytes) else item for item in flat.tolist()]
-    return [word.strip() for word in words if isinstance(word, str)]
+    words = [decoded(item) if isinstance(item, bytes) else item for item in flat.tolist()]
+    return [word[:LONGEST_NAME].strip() for word in words if isinstance(word, str)]
 
 
 def _text(value: Any) -> str:
-    return (*_texts(value), "")[0]
+    return (*_texts(np.asarray(value).ravel()[:1]), "")[0]
 
 
 def _select(columns: Mapping[str, Column], key: str) -> dict[str, Column]:
@@ -260,7 +277,7 @@ def clock_in_seconds(
 ) -> tuple[Array, float | None, str]:
     """Seconds, wrapping period and guess of a clock, whose unit its attribute or the sampling rate may tell."""
     unit = column.unit or _own_unit(settings, column.name)
-    step = float(np.median(np.diff(ticks[np.isfinite(ticks)]))) if np.isfinite(ticks).sum() > 1 else 0.0
+    step = typical_step(ticks)
     if unit not in TICK and rate is not None and step > 0:
-        unit = min(TICK, key=lambda name: abs(math.log(step * TICK[name] * rate)))
+        unit = min(TICK, key=lambda name: abs(math.log(step) + math.log(TICK[name] * rate)))
     return time_in_seconds(replace(column, unit=unit if unit in TICK else ""), ticks)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gyrofuse.io.limits import LONGEST_NAME
 from gyrofuse.io.stream import Array, Stream
 
 AXES = ("x", "y", "z")
@@ -37,7 +38,6 @@ _SHORT = re.compile(r"(?P<word>[gwam])(?P<number>\d*)(?P<axis>[xyz])(?P<last>\d*
 _SHORT_KINDS = {"g": "gyro", "w": "gyro", "a": "acceleration", "m": "magnetic_field"}
 _TIME = re.compile(r"(?:sampletimefine|timestamps?|times?|stamp|clock|ts|t)(?P<number>\d*)", re.IGNORECASE)
 _PLAIN = re.compile(r"(?:s|ch|channel|sensor|signal|imu|device|node)?[_ ]?\d+", re.IGNORECASE)
-_BRACKET = re.compile(r"[\[(]\s*([^\])]*?)\s*[\])]")
 _CAMEL = re.compile(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")
 
 # A name with one of these describes a sensor's data but does not hold them.
@@ -139,12 +139,12 @@ def _classify_bare(column: Column) -> Column:
 
 def _classify(name: str) -> Column:
     stated, index = "", ""
-    for content in _BRACKET.findall(name):
+    text, contents = _without_brackets(name[:LONGEST_NAME])
+    for content in contents:
         if content in ("0", "1", "2"):
             index = AXES[int(content)]
         elif not content.isdigit():
             stated = content
-    text = _BRACKET.sub("_", name)
     for phrase, word in _PHRASES:
         text = phrase.sub(word, text)
     tokens = [token for token in re.split(r"[^0-9A-Za-zµμ]+", _CAMEL.sub("_", text)) if token]
@@ -189,6 +189,19 @@ def _classify(name: str) -> Column:
     return Column(name, kind, _device(rest, numbers, drop), axis, unit)
 
 
+def _without_brackets(name: str) -> tuple[str, list[str]]:
+    """A name with `_` in place of what stands in brackets, and what stands there."""
+    alike = name.replace("[", "(").replace("]", ")")
+    text, contents, begin = "", [], 0
+    while (end := alike.find(")", begin)) >= 0:
+        opened = alike.find("(", begin, end)
+        text += name[begin:opened] + "_" if opened >= 0 else name[begin : end + 1]
+        if opened >= 0:
+            contents.append(name[opened + 1 : end].strip())
+        begin = end + 1
+    return text + name[begin:], contents
+
+
 def _time_column(name: str, tail: list[str], stated: str, rest: list[str], numbers: list[str]) -> Column:
     unit = _TIME_TOKENS.get(stated.lower(), "") or next((_TIME_TOKENS[t] for t in tail[1:] if t in _TIME_TOKENS), "")
     return Column(name, "time", _device(rest, numbers, set(_TIME_TOKENS)), "", unit)
@@ -214,7 +227,7 @@ def time_in_seconds(column: Column, values: NDArray[np.generic]) -> tuple[Array,
     unit, note = column.unit or ("us" if fine else ""), ""  # SampleTimeFine counts microseconds
     if not unit:
         finite = ticks[np.isfinite(ticks)]
-        step = float(np.median(np.abs(np.diff(finite)))) if finite.size > 1 else 0.0
+        step = typical_step(finite, either_way=True)
         whole = finite.size > 0 and bool(np.all(finite[:1000] == np.rint(finite[:1000])))
         start = abs(float(finite[0])) if finite.size else 0.0
         dated = [name for name, tick in TICK.items() if 1e9 <= start * tick <= 2.1e9]
@@ -227,6 +240,13 @@ def time_in_seconds(column: Column, values: NDArray[np.generic]) -> tuple[Array,
         if unit != "s":
             note = f"time column '{column.name}' states no unit: read as {unit} from its median step of {step:g}"
     return ticks * TICK[unit], WRAP_32_BIT * TICK[unit] if fine else None, note
+
+
+def typical_step(ticks: Array, *, either_way: bool = False) -> float:
+    """Median step of a clock, or of the size of its steps, over the readings that are finite; 0 where there is none."""
+    with np.errstate(over="ignore", invalid="ignore"):  # damaged readings may be as far apart as float64 reaches
+        steps = np.diff(ticks[np.isfinite(ticks)])
+        return float(np.median(np.abs(steps) if either_way else steps)) if steps.size else 0.0
 
 
 def streams_from_columns(
@@ -249,31 +269,36 @@ def streams_from_columns(
         notes: Sentences that go with every stream.
     """
     classified = classify_columns(list(columns))
+    by_device: dict[str, list[Column]] = {}
+    for column in classified:
+        by_device.setdefault(column.device, []).append(column)
     devices = list(dict.fromkeys(column.device for column in classified if column.kind == "gyro"))
-    clocks = [column for column in classified if column.kind == "time"]
     # A logger that keeps the time of sampling beside the time of arrival means the former.
+    clocks = [column for column in classified if column.kind == "time"]
     clocks.sort(key=lambda column: "sample" not in column.name.lower())
+    clock_of = {column.device: column for column in reversed(clocks)}  # the first of each device
     streams = []
     for device in devices:
         gyro: dict[str, Array] = {}
         units: list[str] = []
         said = list(notes)
-        for column in classified:
-            if column.kind == "gyro" and column.device == device:
+        for column in by_device[device]:
+            if column.kind == "gyro":
                 if column.axis in gyro:
                     said.append(f"column '{column.name}' repeats axis '{column.axis}' and is left out")
                     continue
                 gyro[column.axis] = np.asarray(columns[column.name], dtype=np.float64)
                 units.append(column.unit)
         # One shared clock or thermometer belongs to no device: the clock serves all, the channel goes with the first.
-        own = (device, "") if device == devices[0] else (device,)
-        clock = next((c for c in clocks if c.device == device), None)
-        clock = clock or next((c for c in clocks if c.device == "" or len(devices) == 1), None)
+        own = by_device[device]
+        if device == devices[0] and device:
+            own = [column for column in classified if column.device in (device, "")]
+        clock = clock_of.get(device) or (clocks[0] if clocks and len(devices) == 1 else clock_of.get(""))
         seconds, period = time, None
         if seconds is None and clock is not None:
             seconds, period, guess = time_in_seconds(clock, columns[clock.name])
             said += [guess] if guess else []
-        channels, channel_units = _channels([c for c in classified if c.device in own], columns)
+        channels, channel_units = _channels(own, columns)
         streams.append(
             Stream(
                 name=device or name,

@@ -14,6 +14,14 @@ class RecordingError(ValueError):
     """A log that cannot be read as a recording: says the file, what was expected, what was found, what to do."""
 
 
+def unexpected(source: object, error: Exception) -> RecordingError:
+    """The error for what no reader foresaw: with the log, and the words of the cause."""
+    return RecordingError(
+        f"{source}: expected a recording, found a log that cannot be made one ({type(error).__name__}: "
+        f"{str(error)[:1000]}); it may be damaged: record, copy or export it again"
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class Stream:
     """The gyros of one device that share one clock, exactly as the log holds them.

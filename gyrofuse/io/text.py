@@ -10,39 +10,34 @@ An empty cell is NaN. Only columns of numbers with a known name are parsed.
 from __future__ import annotations
 
 import csv
-import re
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
 from itertools import islice
 from pathlib import Path
-from typing import TextIO
 
 import numpy as np
 
 from gyrofuse.io.arrays import settings_by_group, stated_rate, stated_unit
 from gyrofuse.io.columns import Column, classify_columns, streams_from_columns, time_in_seconds
+from gyrofuse.io.limits import LONGEST_NAME, Allowance, enumerated
 from gyrofuse.io.stream import Array, RecordingError, Stream
-
-_HEAD = 200  # lines in which the layout is sought: preambles are shorter
-_PROBE = 20  # of these, the last tell the delimiter and which columns hold numbers
-_COMMENT = ("#", "%", "//")
-_SETTING = re.compile(r"([A-Za-z][\w ]*?)\s*[=:][\s,;]*([^\s,;=:][^,;=:]*)")
+from gyrofuse.io.text_layout import COMMENT, Layout, find_layout, lines_of, quoted_cells, without_numbers
 
 
-def read(path: Path, *, key: str | None = None) -> list[Stream]:
+def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) -> list[Stream]:
     """Read the gyros of a text file.
 
     Args:
         path: The file.
         key: The only column to read as a gyro, whatever its name, or the only device.
+        max_bytes: Memory that its numbers may take; by default a quarter of what there is.
 
     Raises:
-        RecordingError: Not text, no rows of numbers, no gyro, or a line that does not fit the others.
+        RecordingError: Not text, no rows of numbers, no gyro, a line that does not fit the others, or too large.
     """
+    allowance = Allowance(path, max_bytes)
     try:
-        layout = _layout(path)
-        columns, time, notes = (_named if layout.names else _unnamed)(path, layout, key)
+        layout = find_layout(path)
+        columns, time, notes = (_named if layout.names else _unnamed)(path, layout, key, allowance)
     except (OSError, csv.Error) as error:
         raise RecordingError(
             f"{path}: expected text, found a file that cannot be read ({error}); export it again"
@@ -54,40 +49,22 @@ def read(path: Path, *, key: str | None = None) -> list[Stream]:
         unit=stated_unit(settings, ""),
         rate=stated_rate(settings, ""),
         time=time,
-        notes=notes,
+        notes=[*layout.notes, *notes],
     )
     if streams[0].n_samples < 2:
         raise RecordingError(f"{path}: expected at least 2 rows of numbers, found 1; record longer")
     return streams
 
 
-@dataclass(frozen=True)
-class _Layout:
-    """How the lines of a file are to be read.
-
-    Attributes:
-        encoding: Of the file.
-        delimiter: Between cells; `None` is white space.
-        names: Of the columns, empty without a header.
-        numeric: Of each column, whether it holds numbers.
-        begin: Lines before the first row of numbers.
-        settings: What comments and the preamble state, by name.
-    """
-
-    encoding: str
-    delimiter: str | None
-    names: tuple[str, ...]
-    numeric: tuple[bool, ...]
-    begin: int
-    settings: dict[str, str]
-
-
-def _named(path: Path, layout: _Layout, key: str | None) -> tuple[dict[str, Array], None, list[str]]:
+def _named(
+    path: Path, layout: Layout, key: str | None, allowance: Allowance
+) -> tuple[dict[str, Array], None, list[str]]:
     """Columns that the header names, and notes."""
     notes: list[str] = []
     chosen: dict[str, int] = {}
     gyros: set[str] = set()
-    for position, column in enumerate(classify_columns(layout.names)):
+    columns_there = classify_columns(layout.names)
+    for position, column in enumerate(columns_there):
         if column.name in chosen:
             notes.append(f"column '{column.name}' stands there twice; the first is read")
         elif column.name == key or (column.kind == "gyro" and key in (None, column.device)):
@@ -101,18 +78,27 @@ def _named(path: Path, layout: _Layout, key: str | None) -> tuple[dict[str, Arra
     if not gyros:
         wanted = "with the name of a gyro (gyro_x, gx)" if key is None else f"or device {key!r} (`key`)"
         raise RecordingError(
-            f"{path}: expected a column {wanted}, found {', '.join(layout.names)}; "
+            f"{path}: expected a column {wanted}, found {enumerated(layout.names)}; "
             "say with `key` which column is the gyro"
         )
-    columns = _numbers(path, layout, chosen)
+    first = layout.names[0]
+    nameless = layout.numeric[0] and first not in chosen and not any(c.kind == "time" for c in columns_there)
+    columns = _numbers(path, layout, {**chosen, **({first: 0} if nameless else {})}, allowance)
+    if nameless and _advances(columns.pop(first)):
+        notes.append(f"column '{first}' rises in equal steps but has no name of a clock; if it is one, call it 'time'")
     if "gyro" not in gyros and key is not None:
         columns["gyro"] = columns.pop(key)
     return columns, None, notes
 
 
-def _unnamed(path: Path, layout: _Layout, key: str | None) -> tuple[dict[str, Array], Array | None, list[str]]:
+def _unnamed(
+    path: Path, layout: Layout, key: str | None, allowance: Allowance
+) -> tuple[dict[str, Array], Array | None, list[str]]:
     """Sensors by their number, the clock where there is one, and notes."""
-    columns = _numbers(path, layout, {f"{i + 1}": i for i, numeric in enumerate(layout.numeric) if numeric})
+    wanted = {f"{i + 1}": i for i, numeric in enumerate(layout.numeric) if numeric}
+    if not wanted:
+        raise without_numbers(path)
+    columns = _numbers(path, layout, wanted, allowance)
     values = list(columns.values())
     notes: list[str] = []
     time = None
@@ -127,7 +113,7 @@ def _unnamed(path: Path, layout: _Layout, key: str | None) -> tuple[dict[str, Ar
     sensors = {str(number): row for number, row in enumerate(values, 1)}
     if key is not None and key not in sensors:
         raise RecordingError(
-            f"{path}: expected a sensor {key!r} (`key`), found no header and the sensors {', '.join(sensors)}; "
+            f"{path}: expected a sensor {key!r} (`key`), found no header and the sensors {enumerated(sensors)}; "
             "name one of these"
         )
     if key is not None:
@@ -144,125 +130,27 @@ def _advances(values: Array) -> bool:
     return bool(np.mean(np.abs(steps - typical) < 0.5 * typical) > 0.9)
 
 
-def _layout(path: Path) -> _Layout:
-    """Find out from the first lines how the file is written."""
-    with path.open("rb") as raw:
-        start = raw.read(4096)
-    encoding = "utf-16" if start[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
-    if encoding == "utf-8-sig" and b"\0" in start:
-        raise RecordingError(f"{path}: expected text, found binary data; check the name or export it again")
-    with path.open(encoding=encoding, errors="replace") as file:
-        head = [line.rstrip("\n") for line in islice(file, _HEAD)]
-
-    rows = [line for line in head if line.strip() and not line.startswith(_COMMENT)][-_PROBE:]
-    delimiter = max((",", "\t", ";", None), key=lambda delimiter: sum(_fitness(row, delimiter) for row in rows))
-    numbers_by_width: Counter[int] = Counter()
-    for row in rows:
-        cells = _cells(row, delimiter)
-        numbers_by_width[len(cells)] += sum(_is_number(cell, delimiter) for cell in cells)
-    if not any(numbers_by_width.values()):
-        raise RecordingError(f"{path}: expected rows of numbers, found none; export the samples as CSV")
-    width = max(numbers_by_width, key=lambda width: numbers_by_width[width])
-
-    table = [
-        (number, cells)
-        for number, line in enumerate(head)
-        if not line.startswith(_COMMENT)
-        and len(cells := _cells(line, delimiter)) in (width, width - 1)  # the last cell may be empty
-    ]
-    while len(table[0][1]) < width or table[0][1][0].endswith(":"):  # preamble
-        del table[0]
-    sample = [cells for _, cells in table[1:][-_PROBE:]] or [table[0][1]]
-    numeric = tuple(_holds_numbers([cells[i] for cells in sample if i < len(cells)], delimiter) for i in range(width))
-    begin, first = table[0]
-    above = head[:begin]
-    if any(number and cell and not _is_number(cell, delimiter) for number, cell in zip(numeric, first, strict=True)):
-        names, begin = first, begin + 1
-        if values := [cell for cell in first if _is_number(cell, delimiter) and not cell.isdigit()]:
-            raise RecordingError(
-                f"{path}, line {begin}: expected names or numbers, found both ({', '.join(first)}); correct the "
-                f"line, {values[0]!r} if it is a header"
-            )
-    else:
-        names = _header_above(path, above, delimiter, width)
-    comments = [line for line in head[begin:] if line.startswith(_COMMENT)]
-    settings = {
-        name: re.sub(r"(?i)\s*hz\W*$", "", value).strip()
-        for line in (*above, *comments)
-        for name, value in _SETTING.findall(line)
-    }
-    return _Layout(encoding, delimiter, tuple(names), numeric, begin, settings)
-
-
-def _header_above(path: Path, above: Sequence[str], delimiter: str | None, width: int) -> list[str]:
-    """The header of a table that begins with numbers: a comment, as np.savetxt writes it, or none."""
-    for line in reversed(above):
-        text = line.lstrip("#%/ ")
-        for cells in (_cells(text, delimiter), text.split()):
-            if len(cells) == width and _names_gyro(cells):
-                return cells
-    text = next((line for line in reversed(above) if line.strip()), "")
-    cells = _cells(text, delimiter)
-    if not text.startswith(_COMMENT) and _names_gyro(cells):
-        raise RecordingError(
-            f"{path}: expected a header of {width} names, one for each cell of a row, found {len(cells)}: "
-            f"{text.strip()}; correct the header"
-        )
-    return []
-
-
-def _names_gyro(names: Iterable[str]) -> bool:
-    return any(column.kind == "gyro" for column in classify_columns(list(names)) if not column.name.isdigit())
-
-
-def _cells(line: str, delimiter: str | None) -> list[str]:
-    """Cells of a line without the empty one that a trailing delimiter makes."""
-    if delimiter is None:
-        return line.split()
-    quoted = '"' in line
-    cells = [
-        cell.strip() for cell in (next(csv.reader([line], delimiter=delimiter)) if quoted else line.split(delimiter))
-    ]
-    return cells[:-1] if len(cells) > 1 and not cells[-1] else cells
-
-
-def _is_number(cell: str, delimiter: str | None) -> bool:
-    try:
-        float(cell if delimiter == "," else cell.replace(",", "."))
-    except ValueError:
-        return False
-    return "_" not in cell
-
-
-def _fitness(line: str, delimiter: str | None) -> float:
-    """How well a delimiter cuts a line into numbers: many of them, and little else."""
-    filled = [_is_number(cell, delimiter) for cell in _cells(line, delimiter) if cell]
-    return sum(filled) ** 2 / max(len(filled), 1)
-
-
-def _holds_numbers(cells: Sequence[str], delimiter: str | None) -> bool:
-    """Whether at least half of the cells that are not empty are numbers; one that is none is an error then."""
-    filled = [_is_number(cell, delimiter) for cell in cells if cell]
-    return 2 * sum(filled) >= len(filled) > 0
-
-
-def _numbers(path: Path, layout: _Layout, chosen: Mapping[str, int]) -> dict[str, Array]:
+def _numbers(path: Path, layout: Layout, chosen: Mapping[str, int], allowance: Allowance) -> dict[str, Array]:
     """Parse the chosen columns, by name and position."""
-    with path.open(encoding=layout.encoding, errors="replace") as file:
-        rows = _Rows(path, layout, file)
-        try:
-            table = np.loadtxt(
-                iter(rows), delimiter=layout.delimiter, comments=None, usecols=[*chosen.values()], ndmin=2
-            )
-        except RecordingError:
-            raise
-        except ValueError as error:
-            found = re.search(r"could not convert string (.*) to float", str(error))
-            raise RecordingError(
-                f"{path}, line {rows.number}: expected numbers in the columns {', '.join(chosen)}, found "
-                f"{found[1] if found else error}; correct the line, or leave the cell empty for a missing sample"
-            ) from error
+    rows = _Rows(path, layout, allowance.left // (8 * len(chosen)))
+    try:
+        table = np.loadtxt(iter(rows), delimiter=layout.delimiter, comments=None, usecols=[*chosen.values()], ndmin=2)
+    except RecordingError:
+        raise
+    except ValueError as error:
+        found = str(error).partition("could not convert string ")[2].rpartition(" to float")[0] or str(error)
+        raise RecordingError(
+            f"{path}, line {rows.number}: expected numbers in the columns {enumerated(chosen)}, found "
+            f"{found[:LONGEST_NAME]}; correct the line{_units_row(layout, rows.number)}, or leave the cell empty for "
+            "a missing sample"
+        ) from error
+    allowance.take("rows of numbers", table.shape)
     return dict(zip(chosen, np.ascontiguousarray(table.T), strict=True))
+
+
+def _units_row(layout: Layout, number: int) -> str:
+    """What to do with a second row of a header."""
+    return " (units belong behind the names: gx [deg/s])" if layout.names and number == layout.begin + 1 else ""
 
 
 class _Rows:
@@ -272,32 +160,25 @@ class _Rows:
         number: Of the line that was last handed out, from 1.
     """
 
-    def __init__(self, path: Path, layout: _Layout, file: TextIO) -> None:
+    def __init__(self, path: Path, layout: Layout, most: int) -> None:
         self.number = layout.begin
         self._path = path
         self._layout = layout
-        self._lines = islice(file, layout.begin, None)
+        self._most = most
 
     def __iter__(self) -> Iterator[str]:
         delimiter, width = self._layout.delimiter, len(self._layout.numeric)
-        for line in self._lines:
+        for line in islice(lines_of(self._path, self._layout.encoding), self._layout.begin, None):
             self.number += 1
             line = line.rstrip("\n ")
-            if not line or line.startswith(_COMMENT):
+            if not line or line.startswith(COMMENT):
                 continue
-            if delimiter is None:
-                n_cells = len(line.split())
-                line = line.replace(",", ".")
-            else:
-                if '"' in line:
-                    cells = next(csv.reader([line], delimiter=delimiter))
-                    line = delimiter.join(cell.replace(delimiter, " ") for cell in cells)
-                n_cells = line.count(delimiter) + 1
-                if n_cells == width + 1 and line[-1] == delimiter:
-                    n_cells, line = width, line[:-1]
-                if delimiter != ",":
-                    line = line.replace(",", ".")
-                line = _fill(line, delimiter)
+            if self.number - self._layout.begin > self._most:
+                raise RecordingError(
+                    f"{self._path}, line {self.number}: expected a log whose numbers fit the memory that it may take, "
+                    "found more rows; allow more with max_bytes=, or save it as .npy and read it with open_long"
+                )
+            n_cells, line = _plain(line, delimiter, width)
             if n_cells != width:
                 raise RecordingError(
                     f"{self._path}, line {self.number}: expected {width} cells as in the other lines, found {n_cells}; "
@@ -306,12 +187,16 @@ class _Rows:
             yield line
 
 
-def _fill(line: str, delimiter: str) -> str:
-    """Write NaN into empty cells."""
-    while f"{delimiter} " in line:
-        line = line.replace(f"{delimiter} ", delimiter)
-    while f" {delimiter}" in line:
-        line = line.replace(f" {delimiter}", delimiter)
-    if delimiter * 2 in line or line[0] == delimiter or line[-1] == delimiter:
-        line = delimiter.join(cell or "nan" for cell in line.split(delimiter))
-    return line
+def _plain(line: str, delimiter: str | None, width: int) -> tuple[int, str]:
+    """Number of cells of a line, and the line as np.loadtxt takes it."""
+    quoted = '"' in line
+    between = delimiter or " "
+    if delimiter and not (quoted or " " in line or between * 2 in line or between in (line[0], line[-1])):
+        n_cells = line.count(between) + 1  # nothing to mend: most lines
+    else:
+        cells = quoted_cells(line, delimiter) if quoted else line.split(delimiter)
+        if delimiter and len(cells) == width + 1 and not cells[-1].strip():
+            del cells[-1]
+        n_cells = len(cells)
+        line = between.join(cell.strip().replace(between, "_") or "nan" for cell in cells)
+    return n_cells, line if delimiter == "," else line.replace(",", ".")
