@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gyrofuse.io import hdf5
+from gyrofuse.io import hdf5, mat5
 from gyrofuse.io.arrays import streams_from_arrays
+from gyrofuse.io.limits import Allowance
 from gyrofuse.io.stream import RecordingError, Stream
 
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _USER_BLOCK = 512  # MATLAB puts its own header before the HDF5 file
 
 
-def read(path: Path, *, key: str | None = None) -> list[Stream]:
+def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) -> list[Stream]:
     """Read the gyros of a .mat file; `gyrofuse.io.arrays` says which names are understood.
 
     Files of version 7.3 are HDF5 and are told apart by their content.
@@ -23,9 +25,10 @@ def read(path: Path, *, key: str | None = None) -> list[Stream]:
     Args:
         path: The file.
         key: The array that holds the gyros (`"imu.gyr"` or `"imu/gyr"` in a struct), or the struct to look in.
+        max_bytes: Memory that the variables may take, packed and unpacked; by default a quarter of what there is.
 
     Raises:
-        RecordingError: Not a MATLAB file, damaged, or without gyro data.
+        RecordingError: Not a MATLAB file, damaged, without gyro data, or too large.
         ImportError: Version 7.3 and h5py is not installed.
     """
     from scipy.io import loadmat
@@ -37,9 +40,16 @@ def read(path: Path, *, key: str | None = None) -> list[Stream]:
     except OSError as error:
         raise RecordingError(f"{path}: expected a MATLAB file, found one that cannot be opened ({error})") from error
     if start.startswith(_HDF5_SIGNATURE) or start.endswith(_HDF5_SIGNATURE):
-        return hdf5.read(path, key=key)
+        return hdf5.read(path, key=key, max_bytes=max_bytes)
+    allowance = Allowance(path, max_bytes)
     try:
-        variables = loadmat(path)
+        if 0 in start[:4]:  # version 4, which has neither cells nor packed variables
+            allowance.take("variables", (-(-path.stat().st_size // 8),))
+            variables = loadmat(path)
+        else:
+            variables = loadmat(io.BytesIO(mat5.plain(path, allowance)))
+    except RecordingError:
+        raise
     except Exception as error:  # a damaged file may fail anywhere in the library
         raise RecordingError(
             f"{path}: expected a MATLAB file of version 5 to 7.3, found one that cannot be read ({error}); "

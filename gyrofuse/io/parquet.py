@@ -7,10 +7,11 @@ from typing import Any
 
 from gyrofuse.io.arrays import settings_by_group, stated_rate, stated_unit
 from gyrofuse.io.columns import classify_columns, streams_from_columns
+from gyrofuse.io.limits import Allowance, decoded, enumerated
 from gyrofuse.io.stream import Array, RecordingError, Stream
 
 
-def read(path: Path, *, key: str | None = None) -> list[Stream]:
+def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) -> list[Stream]:
     """Read the gyros of a Parquet file, whose columns are named as in a CSV file.
 
     `fs` (Hz) and `unit` are taken from the metadata of the schema. A null is NaN.
@@ -18,9 +19,10 @@ def read(path: Path, *, key: str | None = None) -> list[Stream]:
     Args:
         path: The file.
         key: The only column to read as a gyro, whatever its name.
+        max_bytes: Memory that the columns may take; by default a quarter of what there is.
 
     Raises:
-        RecordingError: Not a Parquet file, damaged, empty, or without gyro data.
+        RecordingError: Not a Parquet file, damaged, empty, without gyro data, or too large.
         ImportError: pyarrow is not installed.
     """
     try:
@@ -34,10 +36,13 @@ def read(path: Path, *, key: str | None = None) -> list[Stream]:
             numbers = [f.name for f in schema if pa.types.is_integer(f.type) or pa.types.is_floating(f.type)]
             dates = [f.name for f in schema if pa.types.is_timestamp(f.type) or pa.types.is_duration(f.type)]
             wanted = [column.name for column in classify_columns(numbers) if column.kind or column.name == key]
+            Allowance(path, max_bytes).take("columns", (file.metadata.num_rows, len(wanted) + len(dates)))
             table = file.read(columns=[*wanted, *dates])
             columns = {name: table.column(name).to_numpy() for name in wanted}
             time = _seconds(table.column(dates[0])) if dates else None
-    except (pa.ArrowException, OSError, KeyError) as error:
+    except RecordingError:
+        raise
+    except Exception as error:  # a damaged file may fail anywhere in the library
         raise RecordingError(
             f"{path}: expected a Parquet file, found one that cannot be read ({error}); export it again"
         ) from error
@@ -47,9 +52,7 @@ def read(path: Path, *, key: str | None = None) -> list[Stream]:
         columns = {name: values for name, values in columns.items() if name == key or kinds[name] != "gyro"}
         if key in columns and kinds[key] != "gyro":
             columns["gyro"] = columns.pop(key)
-    settings = settings_by_group(
-        {name.decode(): value.decode(errors="replace") for name, value in (schema.metadata or {}).items()}
-    )
+    settings = settings_by_group(metadata_of(schema))
     streams = streams_from_columns(
         columns,
         name=path.stem if key is None else key,
@@ -60,10 +63,15 @@ def read(path: Path, *, key: str | None = None) -> list[Stream]:
     if not streams or table.num_rows == 0:
         wanted_name = "with the name of a gyro (gyro_x, gx)" if key is None else f"{key!r} (`key`) of numbers"
         raise RecordingError(
-            f"{path}: expected a column {wanted_name}, found {table.num_rows} rows of {', '.join(schema.names)}; "
+            f"{path}: expected a column {wanted_name}, found {table.num_rows} rows of {enumerated(schema.names)}; "
             "say with `key` which column is the gyro"
         )
     return streams
+
+
+def metadata_of(schema: Any) -> dict[str, str]:
+    """What the metadata of a schema state, as text."""
+    return {decoded(name): decoded(value) for name, value in (schema.metadata or {}).items()}
 
 
 def _seconds(column: Any) -> Array:
