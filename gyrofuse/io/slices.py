@@ -1,7 +1,8 @@
 """Logs that are read a stretch of time at a go: .npy, stored .npz, HDF5 and Parquet.
 
 Nothing is kept open or in memory between two reads, not even a memory map, whose pages would count as memory of the
-process for as long as it lives. What `read` is bound to are names and numbers, so that it can be sent to a process.
+process for as long as it lives, and which ends the process where the file is cut short. What `read` is bound to are
+names and numbers, so that it can be sent to a process.
 """
 
 from __future__ import annotations
@@ -19,8 +20,13 @@ import numpy as np
 
 from gyrofuse.io.arrays import settings_by_group, stated_rate, stated_unit
 from gyrofuse.io.columns import classify_columns
+from gyrofuse.io.hdf5 import check_inside, objects, settings_of
+from gyrofuse.io.limits import Allowance, enumerated, is_regular
+from gyrofuse.io.npy import read_header, read_stretch
+from gyrofuse.io.parquet import metadata_of
 from gyrofuse.io.stream import Array, RecordingError
 
+_MOST_SETTING = 2**16  # bytes of an array that is read because it may be a setting: names of sensors at most
 _LOCAL_HEADER = 30  # bytes of a .zip member's own header before its name
 
 
@@ -70,8 +76,10 @@ def open_slices(path: Path, key: str | Sequence[str] | None) -> Slices:
         )
     if key is not None and not isinstance(key, str) and suffix != ".parquet":
         raise RecordingError(f"{path}: expected `key` to name one array, got {key!r}; several go with .parquet only")
-    if not path.is_file():
+    if not path.exists():
         raise FileNotFoundError(f"{path}: no such file")
+    if not is_regular(path):
+        raise RecordingError(f"{path}: expected a file, found a folder, pipe or device; copy the log into a file")
     try:
         return openers[suffix](path, key)
     except (RecordingError, ImportError):
@@ -89,11 +97,11 @@ def _open_npy(path: Path, key: str | None) -> Slices:
 
 
 def _open_npz(path: Path, key: str | None) -> Slices:
-    with zipfile.ZipFile(path) as archive, np.load(path, allow_pickle=False) as content:
+    with zipfile.ZipFile(path) as archive:
         headers = {}
         for info in archive.infolist():
             with archive.open(info) as member:
-                headers[info.filename.removesuffix(".npy")] = (_header(member), info)
+                headers[info.filename.removesuffix(".npy")] = (read_header(member), info)
         name = _choose(path, {n: (dtype, shape) for n, ((shape, _, dtype), _) in headers.items()}, key)
         info = headers[name][1]
         if info.compress_type != zipfile.ZIP_STORED:
@@ -101,7 +109,11 @@ def _open_npz(path: Path, key: str | None) -> Slices:
                 f"{path}: expected `{name}` as it is, found it compressed, which cannot be read by stretches; "
                 "save it with np.savez or np.save, not np.savez_compressed"
             )
-        few = {n: content[n] for n, ((shape, _, _), _) in headers.items() if n != name and prod(shape) <= 1024}
+        few = {}
+        for other, ((shape, _, kind), beside) in headers.items():
+            if other != name and prod(shape) * kind.itemsize <= _MOST_SETTING:
+                with archive.open(beside) as member:
+                    few[other] = np.lib.format.read_array(member, allow_pickle=False)
     with path.open("rb") as file:
         file.seek(info.header_offset)
         name_and_extra = struct.unpack_from("<HH", file.read(_LOCAL_HEADER), _LOCAL_HEADER - 4)
@@ -112,26 +124,14 @@ def _mapped(path: Path, start: int, what: str, settings: dict[str, Any]) -> Slic
     """An array in NumPy's format that begins `start` bytes into a file."""
     with path.open("rb") as file:
         file.seek(start)
-        shape, fortran, dtype = _header(file)
+        shape, fortran, dtype = read_header(file)
         offset = file.tell()
     names = _names(settings.get("sensors"))
     n_sensors, n_samples, time_first = _orientation(path, what, dtype, shape, len(names))
-    layout: dict[str, Any] = {"dtype": dtype, "offset": offset, "shape": shape, "order": "F" if fortran else "C"}
-    np.memmap(path, mode="r", **layout)  # a file cut short is told now, not in the middle of a run
-    return _slices(partial(_read_mapped, path, layout, time_first), n_samples, n_sensors, names, settings, "")
-
-
-def _header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Shape, whether it is in Fortran order, and dtype; the file is left where the numbers begin."""
-    version = np.lib.format.read_magic(file)
-    reader = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, fortran, dtype = reader(file)
-    return shape, fortran, dtype
-
-
-def _read_mapped(path: Path, layout: dict[str, Any], time_first: bool, start: int, stop: int) -> Array:
-    mapped = np.memmap(path, mode="r", **layout)
-    return _rows(mapped, time_first, start, stop)
+    if path.stat().st_size < offset + prod(shape) * dtype.itemsize:  # told now, not in the middle of a run
+        raise EOFError(f"{shape} numbers announced, fewer there")
+    read = partial(read_stretch, path, offset, dtype, n_sensors, n_samples, time_first != fortran)
+    return _slices(path, read, n_samples, n_sensors, names, settings, "")
 
 
 def _open_hdf5(path: Path, key: str | None) -> Slices:
@@ -140,25 +140,24 @@ def _open_hdf5(path: Path, key: str | None) -> Slices:
     except ImportError as error:
         raise ImportError(f'{path}: reading HDF5 needs h5py; pip install "gyrofuse[logs]"') from error
     with h5py.File(path, "r") as file:
-        found: dict[str, Any] = {}
+        datasets: dict[str, Any] = {}
         settings = dict(file.attrs)
-
-        def visit(name: str, item: Any) -> None:
-            settings.update({f"{name}/{key}": value for key, value in item.attrs.items() if np.size(value) == 1})
-            if isinstance(item, h5py.Dataset):
-                found[name] = (item.dtype, item.shape)
-                if item.size is not None and item.size == 1:
+        for name, item in objects(file):
+            settings.update(settings_of(name, item))
+            if isinstance(item, h5py.Dataset) and item.shape is not None:
+                datasets[name] = item
+                if item.size == 1 and item.dtype.itemsize <= _MOST_SETTING:
                     settings[name] = item[()]
-
-        file.visititems(visit)
-        name = _choose(path, found, key)
-        dtype, shape = found[name]
+        name = _choose(path, {name: (item.dtype, item.shape) for name, item in datasets.items()}, key)
+        check_inside(path, name, datasets[name])
+        dtype, shape = datasets[name].dtype, datasets[name].shape
         n_sensors, n_samples, time_first = _orientation(path, f"`{name}`", dtype, shape, 0)
-    read = partial(_read_hdf5, path, name, time_first)
-    return _slices(read, n_samples, n_sensors, (), settings, name)
+        raw_name = datasets[name].name
+    read = partial(_read_hdf5, path, raw_name, time_first)
+    return _slices(path, read, n_samples, n_sensors, (), settings, name)
 
 
-def _read_hdf5(path: Path, name: str, time_first: bool, start: int, stop: int) -> Array:
+def _read_hdf5(path: Path, name: str | bytes, time_first: bool, start: int, stop: int) -> Array:
     import h5py
 
     with h5py.File(path, "r") as file:
@@ -174,7 +173,8 @@ def _open_parquet(path: Path, key: str | Sequence[str] | None) -> Slices:
     with parquet.ParquetFile(path) as file:
         schema, metadata = file.schema_arrow, file.metadata
         numbers = [f.name for f in schema if kinds.is_integer(f.type) or kinds.is_floating(f.type)]
-        ends = np.cumsum([metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)]).tolist()
+        lengths = [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)]
+        ends = np.cumsum(lengths).tolist()
     if key is None:
         gyros = [column for column in classify_columns(numbers) if column.kind == "gyro"]
         wanted = [column.name for column in gyros]
@@ -190,13 +190,14 @@ def _open_parquet(path: Path, key: str | Sequence[str] | None) -> Slices:
         asked = "a column with the name of a gyro (gyro_x, gx)" if key is None else f"columns {wanted} (`key`)"
         raise RecordingError(
             f"{path}: expected {asked} of numbers with at least 2 rows, found {metadata.num_rows} rows of "
-            f"{', '.join(schema.names)}; say with `key` which columns are the sensors"
+            f"{enumerated(schema.names)}; say with `key` which columns are the sensors"
         )
-    settings = {name.decode(): value.decode(errors="replace") for name, value in (schema.metadata or {}).items()}
+    Allowance(path).take("columns of a row group", (max(lengths), len(wanted)))  # which is read whole
+    settings = metadata_of(schema)
     units = {column.unit for column in classify_columns(wanted)} - {""}
     if len(units) == 1:
         settings["unit"] = units.pop()
-    return _slices(partial(_read_parquet, path, wanted, ends), ends[-1], len(wanted), tuple(wanted), settings, "")
+    return _slices(path, partial(_read_parquet, path, wanted, ends), ends[-1], len(wanted), tuple(wanted), settings, "")
 
 
 def _read_parquet(path: Path, names: list[str], ends: list[int], start: int, stop: int) -> Array:
@@ -222,7 +223,7 @@ def _choose(path: Path, found: dict[str, tuple[Any, tuple[int, ...]]], key: str 
     wanted = [name for name in found if name == key] if key is not None else gyros or tables
     if len(wanted) != 1:
         asked = "one array (sensor, time) of numbers" if key is None else f"an array {key!r} (`key`)"
-        listed = ", ".join(f"{name} {shape}" for name, (_, shape) in found.items()) or "nothing"
+        listed = enumerated(f"{name} {shape}" for name, (_, shape) in found.items()) or "nothing"
         raise RecordingError(f"{path}: expected {asked}, found {listed}; name the gyros with `key`")
     return wanted[0]
 
@@ -242,20 +243,32 @@ def _orientation(path: Path, what: str, dtype: Any, shape: tuple[int, ...], n_na
 
 
 def _rows(array: Any, time_first: bool, start: int, stop: int) -> Array:
-    """A stretch of an array of one or two dimensions as `(sensor, time)`, float64 and in memory."""
+    """A stretch of a dataset of one or two dimensions as `(sensor, time)`."""
     if len(array.shape) == 1:
-        part = array[None, start:stop] if isinstance(array, np.ndarray) else array[start:stop][None]
+        part = array[start:stop][None]
     else:
         part = array[start:stop].T if time_first else array[:, start:stop]
-    return np.array(part, dtype=np.float64, order="C")
+    return np.asarray(part)
 
 
 def _names(value: Any) -> tuple[str, ...]:
     return () if value is None else tuple(np.asarray(value).astype(str).ravel().tolist())
 
 
+def _read_named(path: Path, read: Callable[[int, int], Any], start: int, stop: int) -> Array:
+    """A stretch in float64; whatever goes wrong, the error names the file."""
+    try:
+        return np.array(read(start, stop), dtype=np.float64, order="C")
+    except Exception as error:  # a file that is damaged, or was changed since, may fail anywhere in its library
+        raise RecordingError(
+            f"{path}: expected samples {start} to {stop}, found that they cannot be read ({error}); save or export it "
+            "again, and leave it as it is while it is read"
+        ) from error
+
+
 def _slices(
-    read: Callable[[int, int], Array],
+    path: Path,
+    read: Callable[[int, int], Any],
     n_samples: int,
     n_sensors: int,
     names: tuple[str, ...],
@@ -265,7 +278,7 @@ def _slices(
     fits = len(names) == n_sensors == len({*names})
     by_group = settings_by_group(settings)
     return Slices(
-        read=read,
+        read=partial(_read_named, path, read),
         n_samples=n_samples,
         sensors=names if fits else tuple(str(number) for number in range(1, n_sensors + 1)),
         rate=stated_rate(by_group, name),

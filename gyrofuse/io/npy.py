@@ -1,0 +1,82 @@
+"""Arrays in NumPy's file format: their headers, and stretches of their numbers, without a memory map.
+
+A memory map of a file that another process cuts short ends this one without a word; reading is told of it.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+MAGIC = b"\x93NUMPY"
+_LONGEST_HEADER = 10_000  # bytes, as in NumPy, which reads the header whole before it refuses one
+
+
+def read_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Shape, whether it is in Fortran order, and dtype; the file is left where the numbers begin.
+
+    Raises:
+        ValueError: No such header.
+    """
+    begin = file.tell()
+    major = file.read(8)[6:7]
+    wide = major != b"\x01"
+    (length,) = struct.unpack("<I" if wide else "<H", file.read(4 if wide else 2))
+    if length > _LONGEST_HEADER:
+        raise ValueError(f"a header of {length} bytes")
+    file.seek(begin)
+    np.lib.format.read_magic(file)
+    read: Callable[[Any], Any] = (
+        np.lib.format.read_array_header_2_0 if wide else np.lib.format.read_array_header_1_0  # 3.0 is 2.0 in UTF-8
+    )
+    shape, fortran, dtype = read(file)
+    if min(shape, default=0) < 0:
+        raise ValueError(f"a shape of {shape}")
+    return shape, fortran, dtype
+
+
+def read_stretch(
+    path: Path,
+    offset: int,
+    dtype: np.dtype[Any],
+    n_sensors: int,
+    n_samples: int,
+    interleaved: bool,
+    start: int,
+    stop: int,
+) -> NDArray[Any]:
+    """Samples `start` to `stop`, the latter excluded, of an array of one or two dimensions: `(sensor, stop - start)`.
+
+    Args:
+        path: The file.
+        offset: Byte at which the numbers begin.
+        dtype: Type of the numbers.
+        n_sensors: Number of sensors.
+        n_samples: Samples of each sensor.
+        interleaved: Whether all sensors of one instant follow each other in the file, else all instants of one sensor.
+        start: First sample.
+        stop: Where to end, excluded.
+
+    Raises:
+        EOFError: The file ends before.
+    """
+    count = stop - start
+    with path.open("rb") as file:
+        if interleaved:
+            values = _numbers(file, offset + start * n_sensors * dtype.itemsize, dtype, count * n_sensors)
+            return values.reshape(count, n_sensors).T
+        begins = [offset + (sensor * n_samples + start) * dtype.itemsize for sensor in range(n_sensors)]
+        return np.stack([_numbers(file, begin, dtype, count) for begin in begins])
+
+
+def _numbers(file: IO[bytes], begin: int, dtype: np.dtype[Any], count: int) -> NDArray[Any]:
+    file.seek(begin)
+    values = np.fromfile(file, dtype, count)
+    if values.size < count:
+        raise EOFError(f"{count} numbers announced from byte {begin} on, {values.size} there")
+    return values
