@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
+import sqlite3
 from array import array
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 
+from gyrofuse.io.limits import Allowance, enumerated, is_regular
 from gyrofuse.io.stream import Array, RecordingError, Stream
 
 _IMU = "sensor_msgs/msg/Imu"
+_NUMBERS = 9  # of a message that are kept: 3 of its times, 6 of its values
 
 
-def read(path: Path, *, key: str | None = None) -> list[Stream]:
+def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) -> list[Stream]:
     """Read the gyros of a ROS bag in rad/s, one stream per topic of type sensor_msgs/Imu.
 
     A ROS 1 `.bag`, a ROS 2 directory with its `metadata.yaml`, or a `.db3` or `.mcap` file alone; no ROS
@@ -24,9 +29,10 @@ def read(path: Path, *, key: str | None = None) -> list[Stream]:
     Args:
         path: File or directory.
         key: A topic, or the beginning of the topics to read.
+        max_bytes: Memory that the messages may take; by default a quarter of what there is.
 
     Raises:
-        RecordingError: Not a bag, not indexed, truncated, or without the topic asked for.
+        RecordingError: Not a bag, not indexed, truncated, without the topic asked for, or too large.
         ImportError: rosbags is not installed.
     """
     try:
@@ -42,11 +48,20 @@ def read(path: Path, *, key: str | None = None) -> list[Stream]:
     store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
     deserialize = store.deserialize_ros1 if ros1 else store.deserialize_cdr
     messages: dict[str, _Messages] = {}
+    allowance = Allowance(path, max_bytes)
+    odd = [file.name for file in path.iterdir() if not (is_regular(file) or file.is_dir())] if path.is_dir() else []
+    if odd:
+        raise RecordingError(
+            f"{path}: expected the files of a bag, found {enumerated(odd)}, which is no file; remove it"
+        )
     try:
+        for file in sorted(path.glob("*.db3")) if path.is_dir() else [path] if path.suffix.lower() == ".db3" else []:
+            _check_tables(file)
         with (Ros1Reader if ros1 else Ros2Reader)(path) as bag:
             topics = _choose(path, [(c.topic, c.msgtype) for c in bag.connections], key)
             connections = [c for c in bag.connections if c.topic in topics and c.msgtype == _IMU]
             for connection, arrival, raw in bag.messages(connections):
+                allowance.take(f"messages of {connection.topic}", (_NUMBERS,))
                 message = deserialize(raw, _IMU)
                 messages.setdefault(connection.topic, _Messages()).append(message, arrival)
     except RecordingError:
@@ -60,10 +75,20 @@ def read(path: Path, *, key: str | None = None) -> list[Stream]:
     streams = [messages[topic].stream(topic) for topic in sorted(messages) if messages[topic].has_rate]
     if not streams:
         raise RecordingError(
-            f"{path}: expected angular velocities in {', '.join(sorted(topics))}, found none (no message, or "
+            f"{path}: expected angular velocities in {enumerated(sorted(topics))}, found none (no message, or "
             "marked as not measured); choose other topics with `key`"
         )
     return streams
+
+
+def _check_tables(path: Path) -> None:
+    """Raise `ValueError` where what stands in a database is computed when it is read, which may take for ever."""
+    with contextlib.closing(sqlite3.connect(f"file:{quote(str(path))}?immutable=1", uri=True)) as database:
+        for kind, name, command in database.execute("SELECT type, name, sql FROM sqlite_master").fetchall():
+            columns = database.execute("SELECT hidden FROM pragma_table_xinfo(?)", (name,)).fetchall()
+            virtual = str(command).lower().startswith("create virtual")
+            if kind == "view" or virtual or any(hidden for (hidden,) in columns):
+                raise ValueError(f"a table {name!r} that is computed, not stored")
 
 
 def _choose(path: Path, kinds: list[tuple[str, str]], key: str | None) -> set[str]:
@@ -73,7 +98,7 @@ def _choose(path: Path, kinds: list[tuple[str, str]], key: str | None) -> set[st
         name = "/" + key.strip("/")
         topics = topics & {name} or {topic for topic in topics if topic.startswith(name)}
     if not topics:
-        found = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(kinds)) or "no topic"
+        found = enumerated(f"{topic} ({kind})" for topic, kind in sorted(kinds)) or "no topic"
         wanted = "" if key is None else f" named by `key` {key!r}"
         raise RecordingError(
             f"{path}: expected a topic of type {_IMU}{wanted}, found {found}; choose a bag with IMU data"
@@ -108,7 +133,7 @@ class _Messages:
         """The device of this topic."""
         gyro_x, gyro_y, gyro_z, *acceleration = np.array(self.values).reshape(-1, 6).T.copy()
         time, notes = self._time()
-        frames = ", ".join(repr(frame) for frame in self.frames if frame)
+        frames = enumerated(repr(frame) for frame in self.frames if frame)
         return Stream(
             name=topic,
             gyro={"x": gyro_x, "y": gyro_y, "z": gyro_z},

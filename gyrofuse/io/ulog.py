@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from gyrofuse.io.limits import Allowance, enumerated
 from gyrofuse.io.stream import RecordingError, Stream
 
 # Topics with gyro data in rad/s, and their fields along x, y, z.
@@ -20,9 +21,15 @@ _ACCELERATION = ("accelerometer_m_s2[0]", "accelerometer_m_s2[1]", "acceleromete
 # By default the logger thins `sensor_gyro` to about 1 Hz while `sensor_combined` runs at the full rate:
 # a topic this many times slower was logged to look at, not to analyse.
 _THINNED = 10.0
+# pyulog may go back further than it came, and goes through a damaged stretch a byte at a time, reading up to 64 kB for
+# each. It may read this many times the length of the file, or, of a short one, this many bytes, in as many calls as
+# this many times its length: a message takes two for at least three bytes, a damaged byte three.
+_MOST_READINGS, _FEW_BYTES = 10, 2**26
+# Fields of all messages of a log together, nested ones included; PX4 logs have some 10,000.
+_MOST_FIELDS = 2**17
 
 
-def read(path: Path, *, key: str | None = None) -> list[Stream]:
+def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) -> list[Stream]:
     """Read the gyros of a PX4 ULog file in rad/s, one stream per instance of the topic.
 
     `sensor_gyro` is preferred, except where `sensor_combined` was logged more than ten times as fast. A log
@@ -31,9 +38,10 @@ def read(path: Path, *, key: str | None = None) -> list[Stream]:
     Args:
         path: The file.
         key: `"sensor_gyro"` or `"sensor_combined"`; `None` chooses by rate.
+        max_bytes: Memory that the log may take; by default a quarter of what there is.
 
     Raises:
-        RecordingError: Not a ULog file, damaged, or without gyro data.
+        RecordingError: Not a ULog file, damaged, without gyro data, or too large.
         ImportError: pyulog is not installed.
     """
     try:
@@ -42,8 +50,12 @@ def read(path: Path, *, key: str | None = None) -> list[Stream]:
         raise ImportError(f'{path}: reading ULog needs pyulog; pip install "gyrofuse[logs]"') from error
     try:
         # pyulog reports damage with print(); what it found is kept in `file_corruption`
-        with path.open("rb") as file, contextlib.redirect_stdout(io.StringIO()):
-            log = ULog(file)
+        with path.open("rb", buffering=0) as raw, contextlib.redirect_stdout(io.StringIO()):
+            size = path.stat().st_size
+            Allowance(path, max_bytes).take("messages", (-(-size // 8),))
+            log = _bounded(ULog)(_Counted(raw, size))
+    except RecordingError:
+        raise
     except Exception as error:  # a damaged file may fail anywhere in the library
         raise RecordingError(
             f"{path}: expected a PX4 ULog file, found one that cannot be parsed ({error}); "
@@ -53,7 +65,7 @@ def read(path: Path, *, key: str | None = None) -> list[Stream]:
     topics = {name: _instances(log, name) for name in _AXES}
     if not any(topics.values()) or (key is not None and not topics.get(key)):
         wanted = f"a gyro topic ({' or '.join(_AXES)})" + ("" if key is None else f" named by `key`, got {key!r}")
-        found = ", ".join(sorted({data.name for data in log.data_list})) or "no data"
+        found = enumerated(sorted({data.name for data in log.data_list})) or "no data"
         raise RecordingError(f"{path}: expected {wanted}, found {found}; choose another topic, or log the gyros")
     notes = _logger_notes(log)
     if key is None:
@@ -65,6 +77,35 @@ def read(path: Path, *, key: str | None = None) -> list[Stream]:
                 f"sensor_combined at {fast:.4g} Hz is read instead"
             )
     return [_stream(data, notes) for data in topics[key]]
+
+
+class _Counted(io.BufferedReader):
+    """A file of `size` bytes that may be read a number of times and no more."""
+
+    def __init__(self, raw: io.FileIO, size: int) -> None:
+        super().__init__(raw)
+        self._calls, self._bytes = _MOST_READINGS * size, max(_MOST_READINGS * size, _FEW_BYTES)
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        content = super().read(size)
+        self._calls, self._bytes = self._calls - 1, self._bytes - len(content)
+        if min(self._calls, self._bytes) < 0:
+            raise EOFError("the reader goes round in circles: a damaged or zero-filled tail")
+        return content
+
+
+def _bounded(base: Any) -> Any:
+    """pyulog's class, for a log whose messages have a number of fields and no more."""
+    left = [_MOST_FIELDS]
+
+    class Fields(base._MessageAddLogged):
+        def _parse_nested_type(self, prefix: str, name: str, formats: Any) -> None:
+            left[0] -= sum(max(count, 1) for _, count, _ in formats[name].fields) + 1
+            if left[0] < 0:
+                raise EOFError(f"more than {_MOST_FIELDS} fields in its messages")
+            super()._parse_nested_type(prefix, name, formats)
+
+    return type("Bounded", (base,), {"_MessageAddLogged": Fields})
 
 
 def _instances(log: Any, name: str) -> list[Any]:
