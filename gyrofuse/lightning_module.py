@@ -41,7 +41,7 @@ class GyroArrayDataModule(LightningDataModule):
             are fitted together: more than one pays where logs are many and short.
         num_workers: Processes that read ahead.
         done: Identities of logs (`ResultStore.done`) that are left out, though the others stay in their groups.
-        **options: Of `read_recording`: `axis`, `sensors`, `rate`, `unit`, `scale`, `key`, `mounting`.
+        **options: Of `read_recording`: `axis`, `sensors`, `rate`, `unit`, `scale`, `key`, `mounting`, `max_bytes`.
 
     Raises:
         FileNotFoundError: A name that stands for nothing.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from gyrofuse._checks import check_positive, check_signal
 from gyrofuse._output import Outputs
 from gyrofuse._result import listed, numbered
 from gyrofuse.io.assemble import assemble
+from gyrofuse.io.limits import is_rate
 from gyrofuse.io.notes import Note
 from gyrofuse.units import rate_unit_factor
 
@@ -256,6 +258,7 @@ def read_recording(
     scale: float | None = None,
     key: str | None = None,
     mounting: Mapping[str, Any] | str | Path | None = None,
+    max_bytes: float | None = None,
 ) -> Recording:
     """Read a log, or several logs of one array, onto a uniform grid.
 
@@ -274,6 +277,8 @@ def read_recording(
         key: Which recording inside the file, where it holds several.
         mounting: Rotation of each device, `{device: 3 x 3 matrix}` or the path of a JSON file of that, which maps its
             axes to those of the array: `v_array = M v_device`.
+        max_bytes: Memory in bytes that the numbers of each log may take, as the log declares them, which is compared
+            before any is allocated; by default a quarter of the physical memory. A longer log: `open_long`.
 
     Returns:
         The recording, float64, with notes on everything that was found.
@@ -281,14 +286,22 @@ def read_recording(
     Raises:
         FileNotFoundError: No such file.
         RecordingError: The file cannot be read as a recording: says what was expected, what was found, what to do.
-        ValueError: An option that does not fit the log.
+        ValueError: An option that does not fit the log, or a file that is named twice.
         ImportError: A format whose library is not installed (`pip install "gyrofuse[logs]"`).
     """
     paths = [Path(path)] if isinstance(path, str | Path) else [Path(p) for p in path]
     if not paths:
         raise ValueError("`path`: expected at least one file, got none")
+    places = [os.path.abspath(p) for p in paths]
+    twice = next((p for i, p in enumerate(places) if p in places[:i]), None)
+    if twice is not None:
+        raise ValueError(f"`path`: expected each file once, got {twice} twice; name it once")
     check_reading(rate=rate, scale=scale)
-    whole = assemble(paths, axis=axis, rate=rate, unit=unit, scale=scale, key=key, mounting=mounting)
+    if max_bytes is not None:
+        check_positive("max_bytes", max_bytes)
+    whole = assemble(
+        paths, axis=axis, rate=rate, unit=unit, scale=scale, key=key, mounting=mounting, max_bytes=max_bytes
+    )
     recording = Recording(
         torch.from_numpy(whole.signal),
         rate=whole.rate,
@@ -304,8 +317,8 @@ def read_recording(
 
 def check_reading(*, rate: float | None = None, scale: float | None = None) -> None:
     """Raise `ValueError` where an option of `read_recording` is wrong for any log."""
-    if rate is not None:
-        check_positive("rate", rate)
+    if rate is not None and not is_rate(check_positive("rate", rate)):
+        raise ValueError(f"`rate`: expected a sampling rate of 1e-6 to 1e12 Hz, got {rate!r}")
     if scale is not None and not (math.isfinite(scale) and scale != 0):
         raise ValueError(f"`scale`: expected a finite number other than 0, got {scale!r}")
 

@@ -1,11 +1,12 @@
-"""Log files: one module per format, each with `read(path, *, key=None) -> list[Stream]`."""
+"""Log files: one module per format, each with `read(path, *, key=None, max_bytes=None) -> list[Stream]`."""
 
 from __future__ import annotations
 
 from importlib import import_module
 from pathlib import Path
 
-from gyrofuse.io.stream import RecordingError, Stream
+from gyrofuse.io.limits import is_regular
+from gyrofuse.io.stream import RecordingError, Stream, unexpected
 
 _READERS = {
     ".npz": "numpy_log",
@@ -27,32 +28,41 @@ _READERS = {
 SUFFIXES = tuple(_READERS)
 
 
-def read_streams(path: Path, *, key: str | None = None) -> list[Stream]:
+def read_streams(path: Path, *, key: str | None = None, max_bytes: float | None = None) -> list[Stream]:
     """Read the devices of a log, by the suffix of its name.
 
     Args:
         path: A file, or the folder of a ROS 2 bag.
         key: Which recording inside, where a log holds several.
+        max_bytes: Memory that its numbers may take; by default a quarter of what there is.
 
     Raises:
         FileNotFoundError: No such file.
         PermissionError: The file may not be read.
-        RecordingError: A format that is not read, an empty file, or what the format's reader raises.
+        RecordingError: A format that is not read, a pipe or device, an empty file, or what the format's reader raises.
         ImportError: The format's library is not installed.
     """
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file; check the name and the folder")
     if path.is_dir():
-        if not (path / "metadata.yaml").exists():
+        if not is_regular(path / "metadata.yaml"):
             raise RecordingError(f"{path}: expected a log, or a ROS 2 folder with metadata.yaml, found another folder")
         reader = "rosbag"
     elif path.suffix.lower() not in _READERS:
         known = " ".join(SUFFIXES)
         raise RecordingError(f"{path}: expected a log ({known}), found {path.suffix or 'no suffix'!r}; convert it")
+    elif not is_regular(path):
+        raise RecordingError(f"{path}: expected a log, found a pipe or device, which has no end; copy it into a file")
     elif path.stat().st_size == 0:
         raise RecordingError(f"{path}: expected a log, found an empty file; record or copy it again")
     else:
         with path.open("rb"):  # a file that may not be read says so itself
             reader = _READERS[path.suffix.lower()]
-    streams: list[Stream] = import_module(f"gyrofuse.io.{reader}").read(path, key=key)
+    module = import_module(f"gyrofuse.io.{reader}")
+    try:
+        streams: list[Stream] = module.read(path, key=key, max_bytes=max_bytes)
+    except (RecordingError, ImportError):
+        raise
+    except Exception as error:  # what a damaged log does to a reader is never foreseen in full
+        raise unexpected(path, error) from error
     return streams

@@ -16,8 +16,9 @@ from gyrofuse.io import read_streams
 from gyrofuse.io.align import Placed, align
 from gyrofuse.io.clock import Grid, grid_of, regular_grid
 from gyrofuse.io.columns import AXES
+from gyrofuse.io.limits import printable
 from gyrofuse.io.notes import Note
-from gyrofuse.io.stream import Array, RecordingError, Stream
+from gyrofuse.io.stream import Array, RecordingError, Stream, unexpected
 from gyrofuse.units import rate_unit_factor
 
 _UNKNOWN = "unknown"
@@ -45,12 +46,42 @@ def assemble(
     scale: float | None,
     key: str | None,
     mounting: Mapping[str, Any] | str | Path | None,
+    max_bytes: float | None,
 ) -> Assembled:
     """Read the logs and put their devices on one grid; arguments and errors as `gyrofuse.read_recording`."""
     source = ", ".join(str(path) for path in paths)
-    streams = _named([(path, read_streams(path, key=key)) for path in paths])
+    streams = _named([(path, read_streams(path, key=key, max_bytes=max_bytes)) for path in paths])
+    streams = _mount([_printable(stream) for stream in streams], mounting, source)
+    try:
+        return _on_one_grid(streams, source, axis=axis, rate=rate, unit=unit, scale=scale)
+    except RecordingError:
+        raise
+    except Exception as error:  # numbers of a damaged log that no check foresaw
+        raise unexpected(source, error) from error
+
+
+def _printable(stream: Stream) -> Stream:
+    """The stream with names that can be written in any encoding, however the log wrote them."""
+    return replace(
+        stream,
+        name=printable(stream.name),
+        unit=printable(stream.unit),
+        channels={printable(name): values for name, values in stream.channels.items()},
+        channel_units={printable(name): printable(unit) for name, unit in stream.channel_units.items()},
+        notes=tuple(map(printable, stream.notes)),
+    )
+
+
+def _on_one_grid(
+    streams: list[Stream],
+    source: str,
+    *,
+    axis: str | None,
+    rate: float | None,
+    unit: str | None,
+    scale: float | None,
+) -> Assembled:
     notes = [Note("reader", stream.name, sentence) for stream in streams for sentence in stream.notes]
-    streams = _mount(streams, mounting, source)
     streams, axes, axis_notes = _choose_axes(streams, axis, source)
     notes += axis_notes
 
@@ -178,6 +209,7 @@ def _grids(streams: Sequence[Stream], rate: float | None, source: str) -> list[G
         stated = stream.rate if rate is None else rate
         if stream.time is None and (stated is None or not stated > 0):
             found = "neither" if stated is None else f"a rate of {stated!r}"
+            found += f" ({'; '.join(stream.notes)})" if stream.notes else ""
             raise RecordingError(
                 f"{source}: expected timestamps or a sampling rate, found {found}; give the rate with rate= (--rate HZ)"
             )

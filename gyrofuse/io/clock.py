@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrofuse.io.columns import TICK, WRAP_32_BIT
+from gyrofuse.io.limits import is_rate
 from gyrofuse.io.notes import Note, Notebook
 from gyrofuse.io.stream import Array, RecordingError
 
@@ -26,6 +27,8 @@ _WINDOW, _MEMORY = 64, 1024
 # A clock that is behind for more samples than this was set back.
 _SET_BACK = 100
 _MOST_SET_BACKS = 100
+# Seconds, and steps of a clock in a recording, from which on float64 no longer tells one from the next.
+_FARTHEST = 2.0**53
 # A grid with more slots a sample than this is a clock that jumps, not a recording.
 _SPARSEST = 20
 
@@ -88,6 +91,11 @@ def grid_of(
     if kept.size < time.size:
         lost = time.size - kept.size
         book.add("clock", f"{lost} samples without a timestamp were left out", samples=lost)
+    if kept.size and (far := float(np.abs(time[kept]).max())) >= _FARTHEST:
+        raise RecordingError(
+            f"{source}: expected timestamps of a clock, found one of {far:.3g} s in {name}; correct it or remove its "
+            "sample"
+        )
     t, n_wraps, period = _unwrap(time[kept], clock_period)
     if n_wraps:
         book.add("wraps", f"the clock wrapped {n_wraps} times, every {period:.6g} s; unwrapped", wraps=n_wraps)
@@ -106,6 +114,12 @@ def grid_of(
         raise RecordingError(
             f"{source}: expected timestamps that advance, found {t.size} usable ones of {time.size} that do not; "
             "give the rate with rate= (--rate HZ) and a file without timestamps"
+        )
+    usual, span = float(np.median(steps[steps > 0])), float(t[-1] - t[0])
+    if not (is_rate(1 / usual) and span / usual < _FARTHEST):
+        raise RecordingError(
+            f"{source}: expected timestamps of a clock, found steps of {usual:.3g} s in {span:.3g} s of {name}; "
+            "correct the timestamps, or give the rate with rate= (--rate HZ) and a file without them"
         )
     repeats = int((steps == 0).sum())
     step, regular = _typical_step(t)
