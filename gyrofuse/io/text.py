@@ -139,18 +139,19 @@ def _numbers(path: Path, layout: Layout, chosen: Mapping[str, int], allowance: A
         raise
     except ValueError as error:
         found = str(error).partition("could not convert string ")[2].rpartition(" to float")[0] or str(error)
+        hint = _units_row(layout, rows.number, found)
         raise RecordingError(
             f"{path}, line {rows.number}: expected numbers in the columns {enumerated(chosen)}, found "
-            f"{found[:LONGEST_NAME]}; correct the line{_units_row(layout, rows.number)}, or leave the cell empty for "
-            "a missing sample"
+            f"{found[:LONGEST_NAME]}; correct the line{hint}, or leave the cell empty for a missing sample"
         ) from error
     allowance.take("rows of numbers", table.shape)
     return dict(zip(chosen, np.ascontiguousarray(table.T), strict=True))
 
 
-def _units_row(layout: Layout, number: int) -> str:
+def _units_row(layout: Layout, number: int, found: str) -> str:
     """What to do with a second row of a header."""
-    return " (units belong behind the names: gx [deg/s])" if layout.names and number == layout.begin + 1 else ""
+    second = layout.names and number == layout.begin + 1 and not any(letter.isdigit() for letter in found)
+    return " (units belong behind the names: gx [deg/s])" if second else ""
 
 
 class _Rows:
