@@ -13,7 +13,16 @@ from scipy import fft, optimize, stats
 
 from gyrofuse import AR1, RandomWalk, WhiteNoise
 from gyrofuse.haar import haar_coefficients
-from gyrofuse.mismatch import episodes, impulses, marginals, noise_level, outlier_limits, outliers
+from gyrofuse.mismatch import (
+    episodes,
+    haar_kurtosis,
+    impulses,
+    marginals,
+    noise_level,
+    outlier_limits,
+    outliers,
+    prediction_errors,
+)
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.mechanism import Mechanism
 from gyrofuse.mismatch.mechanisms import spikes
@@ -25,6 +34,7 @@ from gyrofuse.mismatch.mechanisms.stuck_samples import StuckSamples
 from gyrofuse.mismatch.mechanisms.variance_change import VarianceChange
 from gyrofuse.mismatch.side import Side
 from gyrofuse.mismatch.spectra import bands
+from gyrofuse.mismatch.stats import brownian_range
 
 WITNESSES = (
     marginals.marginal_witness,
@@ -83,19 +93,19 @@ def test_whitening_is_division_by_the_smooth_spectrum_in_the_cosines() -> None:
     x = normal(2, 600, g=g)
     side = Side(x[None], bands(4096))
     y = fft.dct(x.numpy(), norm="ortho")[:, 1:]
-    spectrum = impulses._smooth_spectrum(torch.from_numpy(y))[0].numpy()
+    spectrum = prediction_errors._smooth_spectrum(torch.from_numpy(y))[0].numpy()
     k, t = np.arange(1, 600)[:, None], np.arange(600)
     basis = math.sqrt(2 / 600) * np.cos(math.pi * k * (t + 0.5) / 600)
     white = (y / np.sqrt(spectrum)) @ basis
     white /= np.sort(np.abs(white))[:, 299:300] / stats.norm.ppf(0.75)  # torch's median is the lower one
-    np.testing.assert_allclose(impulses.left_out(side).white[0].numpy(), white, rtol=1e-9)
+    np.testing.assert_allclose(prediction_errors.left_out(side).white[0].numpy(), white, rtol=1e-9)
     np.testing.assert_allclose(spectrum[:, :32].mean(-1), np.exp(np.log(y[:, :32] ** 2).mean(-1) + 1.27), rtol=0.3)
 
 
 def test_bands_of_the_smooth_spectrum_are_narrow_where_it_asks_for_it() -> None:
     y = normal(2, 2**16, g=torch.Generator().manual_seed(8))
     y[1, 20_000:20_200] *= 3.0
-    spectrum, followed = impulses._smooth_spectrum(y)
+    spectrum, followed = prediction_errors._smooth_spectrum(y)
     quiet = spectrum[0].log()
     assert float(quiet[1000:].std()) < 0.1
     assert float(followed[0].max()) < 1.5 / 32 + 1e-9
@@ -109,7 +119,7 @@ def test_an_outlier_keeps_its_size_in_the_errors_it_leaves() -> None:
     hit = x.clone()
     at = torch.randperm(4096, generator=torch.Generator().manual_seed(10))[:50]  # at even steps they would make lines
     hit[..., at] += 4.0
-    found = impulses.left_out(Side(hit, bands(4096)))
+    found = prediction_errors.left_out(Side(hit, bands(4096)))
     assert float((found.error[0, 0, at] - x[0, 0, at]).mean()) == pytest.approx(4.0, abs=0.1)
 
 
@@ -138,7 +148,7 @@ def test_a_sensor_that_speaks_against_the_outliers_of_a_bus_is_left_out() -> Non
     sign = (even(3, N, g=g) - 0.5).sign()
     recording = recording + hit * 6.0 * sign
     recording[1] += 1.6 * (even(N, g=g) < 0.02) * sign[1]
-    z = impulses.left_out(Case.of(SCENE, recording, simulation).recorded).z[0]
+    z = prediction_errors.left_out(Case.of(SCENE, recording, simulation).recorded).z[0]
     laws = [outliers.fitted(row) for row in z]
     assert float((outliers.mixture(z[1], laws[1]) - outliers.free_gaussian(z[1])).sum()) > 4
     assert nominated(Case.of(SCENE, recording, simulation), Spikes).sensors == (0, 2)
@@ -163,8 +173,8 @@ def test_outliers_near_the_ends_are_taken_off_and_none_is_put_there(tone: float)
     hit = torch.zeros(3, N, dtype=torch.bool)
     hit[:2, [50, 120, 200, 5000, N - 184, N - 84]] = True
     spiky = clean + 12.0 * hit
-    assert not torch.equal(impulses.left_out(Side(spiky[None], bands(N))).at_ends,
-                           impulses.left_out(Side(spiky[None], bands(N))).error)  # fmt: skip
+    assert not torch.equal(prediction_errors.left_out(Side(spiky[None], bands(N))).at_ends,
+                           prediction_errors.left_out(Side(spiky[None], bands(N))).error)  # fmt: skip
     rate = torch.tensor([3e-4, 3e-4, 0.0], dtype=torch.float64)
     effect = Spikes(rate, torch.full_like(rate, 12.0), torch.full_like(rate, 1.0), together=False)
     change = (effect.removed(spiky, SCENE) - clean).abs()
@@ -290,8 +300,8 @@ def test_the_likeliest_stretches_are_those_of_all_that_are_possible() -> None:
 
 def test_kuipers_law() -> None:
     # Stephens' points of the range of a Brownian bridge.
-    assert noise_level._kuiper_p(1.747) == pytest.approx(0.05, abs=5e-4)
-    assert noise_level._kuiper_p(2.001) == pytest.approx(0.01, abs=2e-4)
+    assert brownian_range.kuiper_p_value(1.747) == pytest.approx(0.05, abs=5e-4)
+    assert brownian_range.kuiper_p_value(2.001) == pytest.approx(0.01, abs=2e-4)
 
 
 # Telegraph noise.
@@ -300,15 +310,17 @@ def test_kuipers_law() -> None:
 def test_kurtosis_is_that_of_the_wavelet_coefficients() -> None:
     g = torch.Generator().manual_seed(11)
     x = NOISE.simulate(4096, batch=(2,), generator=g)
-    scores = impulses._kurtosis_scores(Side(x[None], bands(4096)))
+    scores = haar_kurtosis.kurtosis_scores(Side(x[None], bands(4096)))
     for level, w in enumerate(haar_coefficients(x, 6), start=1):
         w = w[..., :: max(2 ** (level - 2), 1) if level > 2 else 1]
         naive = stats.kurtosis(w.numpy(), axis=-1, fisher=False)
-        mine = impulses._normal_kurtosis(torch.from_numpy(naive), impulses._independent(w - w.mean(-1, keepdim=True)))
+        mine = haar_kurtosis.normal_kurtosis(
+            torch.from_numpy(naive), haar_kurtosis.independent_values(w - w.mean(-1, keepdim=True))
+        )
         np.testing.assert_allclose(scores[level - 1].numpy(), mine.numpy(), atol=0.05)
     sample = np.random.default_rng(0).normal(size=200)
     b2 = torch.tensor(stats.kurtosis(sample, fisher=False))
-    score = impulses._normal_kurtosis(b2, torch.tensor(200.0, dtype=torch.float64))
+    score = haar_kurtosis.normal_kurtosis(b2, torch.tensor(200.0, dtype=torch.float64))
     assert float(score) == pytest.approx(float(stats.kurtosistest(sample).statistic), rel=1e-9)
 
 

@@ -8,7 +8,7 @@ import torch
 from mismatch_draws import LEVEL, SCENE, N, covers, drawn, even, nominated, normal, settled
 
 from gyrofuse import AR1, WhiteNoise
-from gyrofuse.mismatch import impulses, lattices, marginals
+from gyrofuse.mismatch import impulses, lattices, marginals, prediction_errors
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.mechanisms.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.quantization import Quantization
@@ -42,16 +42,16 @@ def test_coarse_rounding_makes_neither_outliers_nor_clipping(step: float) -> Non
         after = found.effect.explained(case, g)
         assert impulses.spike_witness(after).p_value > 0.001
         assert Clipping.nominate(after, LEVEL) is None
-        sd, rms = impulses.left_out(after.recorded).sd[0], impulses.left_out(after.recorded).error[0].std(-1)
+        sd, rms = prediction_errors.left_out(after.recorded).sd[0], impulses.left_out(after.recorded).error[0].std(-1)
         torch.testing.assert_close(sd, rms, rtol=0.03, atol=0.0)
 
 
 def test_the_smooth_sd_is_that_of_normal_values_and_yields_little_to_outliers() -> None:
     g = torch.Generator().manual_seed(3)
     x = 3.0 * normal(200_000, g=g)
-    assert float(impulses._smooth_sd(x)) == pytest.approx(3.0, rel=0.01)
+    assert float(prediction_errors.smooth_sd(x)) == pytest.approx(3.0, rel=0.01)
     x[:200] = 1e3
-    assert float(impulses._smooth_sd(x)) == pytest.approx(3.0, rel=0.02)
+    assert float(prediction_errors.smooth_sd(x)) == pytest.approx(3.0, rel=0.02)
 
 
 def test_rounding_that_a_simulation_has_too_is_not_missing() -> None:

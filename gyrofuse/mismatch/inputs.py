@@ -13,6 +13,7 @@ from gyrofuse._model import Model
 from gyrofuse._result import named, numbered
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.known_lines import amplitudes
+from gyrofuse.mismatch.level_spread import with_spread
 from gyrofuse.mismatch.lines import simulated_lines
 from gyrofuse.mismatch.repaired import RepairedModel
 from gyrofuse.recording import Recording
@@ -48,6 +49,7 @@ def prepared(
         known = replace(simulation.scene, channels=scene.channels)
         replace(simulation, scene=known).check(scene.rate, scene.unit)
         noise_samples, simulation = simulation.noise_samples, simulation.noise
+    gaussian = isinstance(simulation, Model | ArrayModel)
     if isinstance(simulation, Model | ArrayModel):
         drawn = _drawn(simulation, len(signal), signal.shape[-1], generator)
     else:
@@ -60,9 +62,8 @@ def prepared(
     _check_own("recording", signal)
     _check_own("simulation", drawn[0])
     case = Case.of(scene, signal, drawn)
-    if noise_samples:
-        case = replace(case, simulated=replace(case.simulated, told_by=noise_samples))
-    return case.knowing(_lines(simulation, case))
+    case = replace(case, simulated=replace(case.simulated, gaussian=gaussian))
+    return with_spread(case.knowing(_lines(simulation, case)), noise_samples)
 
 
 def _lines(simulation: Recording | Tensor | Model | ArrayModel, case: Case) -> tuple[float, ...]:

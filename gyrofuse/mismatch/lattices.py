@@ -6,6 +6,10 @@ rounding it still shows in the empirical characteristic function `phi(u) = mean 
 standard exponential without a lattice, and independent from sensor to sensor. A lattice of size `k` gives it the
 likelihood ratio `exp(-k) I0(2 sqrt(k n |phi|^2))`; the mean of that over steps, sizes and shares of the sensors, which
 may have the same converter, has expectation one without a lattice.
+
+Noise that is a mixture of normal laws of several widths reaches further, but its characteristic function falls all the
+way: at `u` it is not above what it is around `0.6 u`, where a lattice has nothing. With `b^2` the `n |phi|^2` there,
+`(sqrt(n) |phi| - b)^2` is at most standard exponential, by the triangle inequality.
 """
 
 from __future__ import annotations
@@ -19,7 +23,7 @@ from torch import Tensor
 from gyrofuse._transforms import squared_modulus
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import corrected, ratio_p_value, some_of, surpassing
-from gyrofuse.mismatch.impulses import left_out
+from gyrofuse.mismatch.prediction_errors import left_out
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.side import Side
 
@@ -35,6 +39,10 @@ _PER_STEP = 6  # histogram bins a step, at the finest
 _MOST_BINS = 2**21
 _SAME_STEP, _ALIKE = 1e-3, 0.04  # of steps that are exact, and hidden
 _SIMULATED = 0.005  # p value of a hidden lattice that the simulation has as well
+# Share of `u` where a lattice has neither noise nor its peak, which reach 3 and 1.5 of the 5.5 sd either side; and by
+# how many sd what is seen there exceeds chance.
+_TROUGH, _SEEN = (0.56, 0.7), 2.0
+_LOOKED_AT = 8  # places there: about as many are independent
 _SIZES = (4.0, 8.0, 16.0, 32.0)  # of a hidden lattice that several sensors have
 
 
@@ -115,7 +123,8 @@ def _exact_lattice(unique: Tensor, counts: Tensor, sd: float) -> Lattice | None:
 
 def _hidden_lattice(unique: Tensor, sd: float) -> Lattice:
     """The most conspicuous step in the characteristic function; each value counts once, whatever repeats."""
-    u, (power,) = _characteristic([unique], sd)
+    u, every = _characteristic([unique], sd)
+    (power,) = beyond_smooth(u, every)
     wanted = (u > _ENDS / sd) & (u < 2 * math.pi / (_FINEST_HIDDEN * sd))
     best = int(torch.where(wanted, power, 0.0).argmax())
     p_value = corrected(math.exp(-float(power[best])), int(wanted.sum()))
@@ -147,6 +156,20 @@ def _characteristic(rows: list[Tensor], sd: float) -> tuple[Tensor, Tensor]:
     n = torch.tensor([len(row) for row in rows], dtype=torch.float64)
     power = squared_modulus(torch.fft.rfft(counts)) / n[:, None]
     return 2 * math.pi * torch.arange(power.shape[-1], dtype=torch.float64) / (n_bins * bin_width), power
+
+
+def beyond_smooth(u: Tensor, power: Tensor) -> Tensor:
+    """`n |phi(u)|^2` `(row, u)` at even steps from 0 beyond that of noise, which falls from one `u` to the next."""
+    low, high = ((part * torch.arange(len(u))).long() for part in _TROUGH)
+    high = torch.maximum(high, low + 1)
+    total = torch.nn.functional.pad(power.cumsum(-1), (1, 0))
+    return _beyond(power, (total[:, high] - total[:, low]) / (high - low), high - low)
+
+
+def _beyond(power: Tensor, trough: Tensor, count: Tensor | int) -> Tensor:
+    """Of a power what the mean of so many at the trough does not explain."""
+    noise = (trough - 1 - _SEEN / torch.as_tensor(count, dtype=power.dtype).sqrt()).clamp(min=0)
+    return (power.sqrt() - noise.sqrt()).clamp(min=0).square()
 
 
 def _step_at(unique: Tensor, peak: float) -> float:
@@ -184,7 +207,7 @@ def shared_lattice(side: Side) -> SharedLattice:
     finest = float(sd.min())
     u, power = _characteristic(rows, finest)
     last = int(torch.searchsorted(u, 2 * math.pi / (_FINEST_HIDDEN * finest)))
-    u, power = u[:last], power[:, :last]
+    u, power = u[:last], beyond_smooth(u[:last], power[:, :last])
     usable = u > _ENDS / sd[:, None]
     ratios = torch.full_like(u, -math.inf)
     for size in _SIZES:
@@ -210,7 +233,9 @@ def _seen_at(unique: Tensor, peak: float, step: float) -> Lattice:
     resultant = math.sqrt(max((power - 1) / (n - 1), 1e-12)) if n > 1 else 1e-6
     blur = math.sqrt(-2 * math.log(min(resultant, 1 - 1e-12))) / (2 * math.pi)
     turn = torch.exp(2j * math.pi / step * unique).mean().angle()
-    return Lattice(step, float(turn) / (2 * math.pi) * step, blur, math.exp(-power), peak)
+    places = peak * torch.linspace(*_TROUGH, _LOOKED_AT, dtype=torch.float64)
+    told = _beyond(torch.tensor(power), _power(unique - unique.mean(), places).mean(), _LOOKED_AT)
+    return Lattice(step, float(turn) / (2 * math.pi) * step, blur, math.exp(-float(told)), peak)
 
 
 def _power(values: Tensor, u: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ expectation one where nothing changes, so that they exceed `x` with probability 
 `1/30x` or less in 4500 drawn records of 1 to 6 sensors: `1/20x` is held to.
 
 Where another record is known to have the level that does not change, its samples count with those outside the stretch.
+Where levels vary by themselves, ratios are tempered: `E^w`, with `w` the weight of a sample.
 """
 
 from __future__ import annotations
@@ -64,12 +65,13 @@ class Reference(NamedTuple):
         return self._replace(level=self.level[list(sensors)])
 
 
-def scanned_levels(squares: Tensor, reference: Reference | None = None) -> LevelScan:
+def scanned_levels(squares: Tensor, reference: Reference | None = None, weight: Tensor | None = None) -> LevelScan:
     """Evidence of a stretch with another level than the rest, and the reference if there is one, has.
 
     Args:
         squares: Of whitened samples, `(sensor, time)`.
         reference: What else is known of the level outside.
+        weight: What a sample counts for where levels vary by themselves, `(sensor,)`; 1 by default.
     """
     block = max(squares.shape[-1] // _FINEST, 1)
     blocks = squares[..., : squares.shape[-1] // block * block].unflatten(-1, (-1, block)).sum(-1)
@@ -80,7 +82,7 @@ def scanned_levels(squares: Tensor, reference: Reference | None = None) -> Level
     lengths = sorted({round(2 ** (k / _LENGTHS)) for k in range(int(_LENGTHS * math.log2(n_blocks / 2)) + 1)})
     for length in lengths:
         start = torch.arange(0, n_blocks - length + 1, max(length // _STRIDE, 1))
-        every = _log_ratios(total[:, start + length] - total[:, start], length * block, n)
+        every = _log_ratios(total[:, start + length] - total[:, start], length * block, n, weight)
         logs.append(torch.logsumexp(every.flatten(), 0) - math.log(every.numel()))
         if float(every.max()) > best:
             best, at = float(every.max()), int(start[int(every.amax(0).argmax())])
@@ -88,10 +90,10 @@ def scanned_levels(squares: Tensor, reference: Reference | None = None) -> Level
     return LevelScan(float(torch.logsumexp(torch.stack(logs), 0)) - math.log(len(logs)), *where)
 
 
-def other_level(n_samples: int, reference: Reference) -> float:
+def other_level(n_samples: int, reference: Reference, weight: Tensor | None = None) -> float:
     """Log of the mean likelihood ratio of another level throughout the record than the reference has, nats."""
     share, n = _of_all(n_samples, reference)
-    every = _log_ratios(share, n_samples, n)
+    every = _log_ratios(share, n_samples, n, weight)
     return float(torch.logsumexp(every.flatten(), 0)) - math.log(every.numel())
 
 
@@ -102,9 +104,10 @@ def _of_all(n_samples: int, reference: Reference | None) -> tuple[Tensor, float]
     return (n_samples / (n_samples + reference.worth * reference.level))[:, None], n_samples + reference.worth
 
 
-def _log_ratios(x: Tensor, m: float, n: float) -> Tensor:
+def _log_ratios(x: Tensor, m: float, n: float, weight: Tensor | None) -> Tensor:
     """Log ratios `(factor, place)` of shares `(sensor, place)` of the energy in `m` of `n` samples, any sensors."""
+    weight = torch.ones(len(x), dtype=x.dtype) if weight is None else weight
     deviations = torch.tensor(_DEVIATIONS, dtype=torch.float64)
-    reach = (deviations * math.sqrt(2 / m + 2 / (n - m))).clamp(max=math.log(_LARGEST))
+    reach = (deviations * math.sqrt((2 / m + 2 / (n - m)) / float(weight.mean()))).clamp(max=math.log(_LARGEST))
     log_r = torch.cat([reach, -reach])[:, None]
-    return some_of(-m / 2 * log_r - n / 2 * torch.log1p(x[:, None] * torch.expm1(-log_r)))
+    return some_of(weight[:, None, None] * (-m / 2 * log_r - n / 2 * torch.log1p(x[:, None] * torch.expm1(-log_r))))

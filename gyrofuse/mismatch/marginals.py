@@ -11,8 +11,8 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import Evidence, corrected
-from gyrofuse.mismatch.impulses import left_out
 from gyrofuse.mismatch.lattices import missing_lattices
+from gyrofuse.mismatch.prediction_errors import left_out
 from gyrofuse.mismatch.recurring import missing_recurrences
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.side import Side

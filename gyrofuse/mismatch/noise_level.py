@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -10,20 +11,26 @@ from torch import Tensor
 from torch.nn.functional import avg_pool1d
 
 from gyrofuse.mismatch.case import Case
-from gyrofuse.mismatch.episodes import episodes_of
+from gyrofuse.mismatch.episodes import episodes_of, two_level_scores
 from gyrofuse.mismatch.evidence import Evidence, corrected, ratio_p_value, surpassing
-from gyrofuse.mismatch.impulses import left_out
 from gyrofuse.mismatch.level_scan import LevelScan, Reference, other_level, scanned_levels
+from gyrofuse.mismatch.level_spread import LevelSpread, level_spread
 from gyrofuse.mismatch.modulation import Modulation, strongest_modulation
+from gyrofuse.mismatch.normality import SQUARE_CUT, gaussian_sensors
+from gyrofuse.mismatch.prediction_errors import left_out
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.side import Side
+from gyrofuse.mismatch.stats.brownian_range import kuiper_p_value, studentised_range_p_value
+from gyrofuse.mismatch.stats.clustering import LAGS, clustering_p_value
+from gyrofuse.mismatch.stats.local_level import local_level
+from gyrofuse.mismatch.stats.long_run_variance import chi_square_nodes
 
 _NOTHING = 0.05  # p value of what need not be compared
-LEVEL_CUT = 9.0  # squares: an outlier is no change of level
+LEVEL_CUT = SQUARE_CUT
 _BLOCK = 128
-_BURST = 15  # lags
 _CHANGES = 1.62  # range of a stationary CUSUM that one in ten exceeds
 _ANOTHER = 0.01  # p value of a level that the simulation does not have
+_PLACES = 64  # around the record, at which a course of the level is tried: by chance one in so many fits best
 _UNSTEADY = 1e-4  # p value of a simulation's level that changes
 
 
@@ -49,21 +56,19 @@ def _squares(white: Tensor) -> Tensor:
     return torch.cat([squares, _standardised(squares).sum(-2, keepdim=True)], -2)
 
 
-def _ranges(squares: Tensor) -> Tensor:
-    """Range of the CUSUM of `(..., time)` in blocks over its sd: Kuiper's, of a Brownian bridge."""
+def _ranges(squares: Tensor, excess: Tensor | float = 1.0) -> Tensor:
+    """Range of the CUSUM of `(..., time)` in blocks over its sd: Kuiper's, of a Brownian bridge.
+
+    Args:
+        squares: Of whitened samples.
+        excess: Long-run variance of such squares over that of independent ones, `(...,)`.
+    """
     blocks = squares[..., : squares.shape[-1] // _BLOCK * _BLOCK].unflatten(-1, (-1, _BLOCK)).mean(-1)
     # From first differences, which bursts raise; chance must not lower it below that of independent samples.
-    sd = (blocks.diff(dim=-1).square().mean(-1) / 2).sqrt().maximum(squares.std(-1) / math.sqrt(_BLOCK))
+    least = squares.std(-1) * (torch.as_tensor(excess, dtype=squares.dtype) / _BLOCK).sqrt()
+    sd = (blocks.diff(dim=-1).square().mean(-1) / 2).sqrt().maximum(least)
     path = (blocks - blocks.mean(-1, keepdim=True)).cumsum(-1)
     return (path.amax(-1) - path.amin(-1)) / (sd * math.sqrt(blocks.shape[-1]))
-
-
-def _kuiper_p(reach: float) -> float:
-    """Of a Brownian bridge's range, `2 sum (4 j^2 x^2 - 1) exp(-2 j^2 x^2)`."""
-    if reach < 0.6:
-        return 1.0
-    terms = [(4 * (j * reach) ** 2 - 1) * math.exp(-2 * (j * reach) ** 2) for j in range(1, 40)]
-    return min(max(2 * sum(terms), 0.0), 1.0)
 
 
 @remembered
@@ -72,28 +77,45 @@ def _scanned(side: Side) -> LevelScan:
     return scanned_levels(left_out(side).white.flatten(0, 1).square().clamp(max=LEVEL_CUT))
 
 
-def _divided(case: Case) -> bool:
-    """Whether the simulation's own levels are taken off the recording."""
-    return case.simulated.signal.shape[-1] == case.n_samples and _scanned(case.simulated).p_value < _UNSTEADY
+@remembered
+def level_profile(case: Case) -> Tensor | None:
+    """Variance of the noise that the simulation gives each sample, `(sensor, time)`; None where it has no such course.
 
-
-def level_profile(case: Case) -> Tensor:
-    """Variance of the noise that the simulation gives each sample, `(sensor, time)`, or 1 where it is steady."""
-    profile = torch.ones(case.n_sensors, 1, dtype=torch.float64)
+    A level that changes at the same times in both, by one course, fits the recording better where it lies than moved
+    around in it; two that vary by themselves do not.
+    """
+    if case.simulated.signal.shape[-1] != case.n_samples or _scanned(case.simulated).p_value > _UNSTEADY:
+        return None
     white = left_out(case.simulated).white
-    if not _divided(case):
-        return profile
     found = episodes_of(white.flatten(0, 1), torch.zeros(white[..., 0].numel() + 1, dtype=torch.float64))
     if found is None:
-        return profile
+        return None
     factor = found.factor.view(white.shape[:-1]).log().mean(0).exp()
-    return torch.where(found.inside(case.n_samples), factor[:, None], 1.0)
+    inside, recorded = found.inside(case.n_samples), left_out(case.recorded).white[0].clamp(-3.0, 3.0)
+    moved = (inside.roll(place * case.n_samples // _PLACES) for place in range(_PLACES))
+    fits = torch.stack([two_level_scores(recorded, factor, there).sum() for there in moved])
+    return torch.where(inside, factor[:, None], 1.0) if int(fits.argmax()) == 0 else None
+
+
+@remembered
+def own_spread(case: Case) -> LevelSpread:
+    """How much the simulation's level varies, beside a course that the recording has as well."""
+    return level_spread(_simulated_white(case), gaussian_sensors(case.simulated))
+
+
+def _simulated_white(case: Case) -> Tensor:
+    """Whitened simulation `(record, sensor, time)` over the level that both sides have."""
+    profile = level_profile(case)
+    white = left_out(case.simulated).white
+    return white if profile is None else white / profile.sqrt()
 
 
 @remembered
 def levelled(case: Case) -> Tensor:
     """Whitened recording `(sensor, time)` over the noise level that the simulation has there."""
-    return left_out(case.recorded).white[0] / level_profile(case).sqrt()
+    profile = level_profile(case)
+    white = left_out(case.recorded).white[0]
+    return white if profile is None else white / profile.sqrt()
 
 
 @remembered
@@ -102,27 +124,52 @@ def variance_p_values(case: Case) -> Tensor:
 
     Once for episodes, from the range of the CUSUM, once for bursts, from the autocorrelation of the squares.
     """
-    squares, other = _squares(levelled(case)), _squares(left_out(case.simulated).white)
-    wander = (_ranges(other).amax(0) / _CHANGES).clamp(min=1.0)
-    heavy = (_clustering(other[0]) - 2.5).clamp(min=0)
-    if _divided(case):
-        wander, heavy = torch.ones_like(wander), torch.zeros_like(heavy)
-    episodes = torch.tensor([_kuiper_p(float(r)) for r in _ranges(squares) / wander], dtype=torch.float64)
-    bursts = torch.special.ndtr(heavy - _clustering(squares))
+    white, other = levelled(case), _simulated_white(case)
+    squares, simulated = _squares(white), _squares(other)
+    spread = own_spread(case)
+    if bool(gaussian_sensors(case.simulated).all()):
+        wander = (_ranges(simulated).amax(0) / _CHANGES).clamp(min=1.0)
+        heavy = (_clustering(simulated[0]) - 2.5).clamp(min=0)
+        if level_profile(case) is not None:
+            wander, heavy = torch.ones_like(wander), torch.zeros_like(heavy)
+        episodes = torch.tensor([kuiper_p_value(float(r)) for r in _ranges(squares) / wander], dtype=torch.float64)
+        bursts = torch.special.ndtr(heavy - _clustering(squares))
+    else:
+        reach = _ranges(squares, spread.excess).tolist()
+        episodes = torch.tensor([studentised_range_p_value(r, spread.dof) for r in reach], dtype=torch.float64)
+        own, simulated = (_squares(v / local_level(v).sqrt()) for v in (white, other))
+        pairs = zip(own, simulated.movedim(1, 0), strict=True)
+        bursts = torch.tensor([clustering_p_value(x[None], y) for x, y in pairs], dtype=torch.float64)
     both = torch.minimum(episodes, bursts)
     return 1 - (1 - both).square()
+
+
+def _averaged(case: Case, log_ratio: Callable[[Tensor], float]) -> float:
+    """p value of a log mean likelihood ratio that depends on the weight of a sample, over what may be its value."""
+    spread = own_spread(case)
+    if math.isinf(spread.dof):
+        return ratio_p_value(log_ratio(spread.weight))
+    factors, shares = chi_square_nodes(spread.dof)
+    return sum(
+        share * ratio_p_value(log_ratio((factor * spread.weight).clamp(max=1)))
+        for factor, share in zip(factors.tolist(), shares.tolist(), strict=True)
+    )
 
 
 @remembered
 def compared_levels(case: Case) -> Levels | None:
     """The level of the recording beside that of the simulation; None where that has none that is steady."""
-    reference, own = _reference(case), _scanned(case.simulated).p_value
+    reference, weight = _reference(case), own_spread(case).weight
+    own = _scanned(case.simulated).p_value
     if reference is None or own < _UNSTEADY:
         return None
-    scan = scanned_levels(levelled(case).square().clamp(max=LEVEL_CUT), reference)
-    throughout = other_level(case.n_samples, reference)
-    p_value = surpassing(ratio_p_value(scan.log_ratio), own) if scan.log_ratio > throughout else 1.0
-    return Levels(reference, scan, throughout, p_value)
+    squares = levelled(case).square().clamp(max=LEVEL_CUT)
+    scan = scanned_levels(squares, reference, weight)
+    throughout = other_level(case.n_samples, reference, weight)
+    if scan.log_ratio <= throughout:
+        return Levels(reference, scan, throughout, 1.0)
+    p_value = _averaged(case, lambda w: scanned_levels(squares, reference, w).log_ratio)
+    return Levels(reference, scan, throughout, surpassing(p_value, own))
 
 
 def level_between(case: Case, inside: Tensor) -> Reference | None:
@@ -133,7 +180,8 @@ def level_between(case: Case, inside: Tensor) -> Reference | None:
     squares = levelled(case).square().clamp(max=LEVEL_CUT)
     outside = squares[:, ~inside].mean(-1) / squares.mean(-1)
     z = (outside / compared.reference.level).log() / math.sqrt(2 / int((~inside).sum()) + 2 / compared.reference.worth)
-    agrees = torch.special.gammaincc(torch.tensor(len(z) / 2, dtype=z.dtype), z.square().sum() / 2)
+    chi2 = (own_spread(case).weight * z.square()).sum()
+    agrees = torch.special.gammaincc(torch.tensor(len(z) / 2, dtype=z.dtype), chi2 / 2)
     return compared.reference if float(agrees) > _ANOTHER else None
 
 
@@ -162,8 +210,9 @@ def variance_p_value(case: Case) -> float:
     """
     each = variance_p_values(case)
     p_value = corrected(float(each.min()), len(each))
-    several = scanned_levels(levelled(case).square().clamp(max=LEVEL_CUT)).p_value
-    if not _divided(case):
+    squares = levelled(case).square().clamp(max=LEVEL_CUT)
+    several = _averaged(case, lambda w: scanned_levels(squares, None, w).log_ratio)
+    if math.isinf(own_spread(case).dof) and level_profile(case) is None:
         several = surpassing(several, _scanned(case.simulated).p_value)
     compared = compared_levels(case)
     return corrected(min(p_value, several, 1.0 if compared is None else compared.p_value), 3)
@@ -175,9 +224,8 @@ def modulation(case: Case) -> Modulation:
     found = strongest_modulation(levelled(case).square().clamp(max=LEVEL_CUT))
     if found.p_value > _NOTHING:
         return found
-    profile = level_profile(case)
-    white = left_out(case.simulated).white / (profile if _divided(case) else 1.0) ** 0.5
-    other = min(strongest_modulation(record.square().clamp(max=LEVEL_CUT)).p_value for record in white)
+    records = _simulated_white(case)
+    other = min(strongest_modulation(record.square().clamp(max=LEVEL_CUT)).p_value for record in records)
     return found._replace(p_value=surpassing(found.p_value, other))
 
 
@@ -189,8 +237,8 @@ def _clustering(squares: Tensor) -> Tensor:
     """Standard normal sum of the autocorrelations of `(..., time)` at short lags."""
     x = _standardised(squares)
     n = x.shape[-1]
-    lags = [torch.linalg.vecdot(x[..., lag:], x[..., :-lag]) for lag in range(1, _BURST + 1)]
-    return torch.stack(lags).sum(0) / math.sqrt(n * _BURST)
+    lags = [torch.linalg.vecdot(x[..., lag:], x[..., :-lag]) for lag in range(1, LAGS + 1)]
+    return torch.stack(lags).sum(0) / math.sqrt(n * LAGS)
 
 
 def variance_witness(case: Case) -> Evidence:

@@ -107,7 +107,8 @@ def scanned(case: Case) -> Scan | None:
     if float(data.worth.sum()) < 10:
         return None
     looked_for = _shapes(case, data)
-    z = independent(torch.einsum("hsb,sb->hs", looked_for.templates, data.scores), looked_for.templates, data)
+    scores = beside_level(data.scores, data.worth, case.simulated.level_variance)
+    z = independent(torch.einsum("hsb,sb->hs", looked_for.templates, scores), looked_for.templates, data)
     apart = data.coherence[:_LOW].mean(0).sum(-1)  # powers of what sensors share go together
     up, down = (
         way * looked_for.sizes * z
@@ -191,6 +192,7 @@ def _shapes(case: Case, data: Narrow) -> Shapes:
     length = (worth * weak.square()).sum(-1, keepdim=True).sqrt()
     moved = torch.cat([torch.cat([_grown(colour, worth, size), weak * (size / length)]) for size in _SIZES])
     shown = moved[..., len(below.d) :] * data.worth.sqrt()
+    shown = beside_level(shown, data.worth, case.simulated.level_variance)
     sizes = shown.square().sum(-1).sqrt()
     return Shapes(
         shown / sizes[..., None].clamp(min=1e-300),
@@ -198,6 +200,18 @@ def _shapes(case: Case, data: Narrow) -> Shapes:
         moved[..., : len(below.d)],
         log_chances.repeat(1, len(_SIZES)) - math.log(len(_SIZES)),
     )
+
+
+def beside_level(values: Tensor, worth: Tensor, variance: Tensor | float) -> Tensor:
+    """Scores `(..., sensor, band)` whose common level varies by itself, as independent ones of variance one.
+
+    Their covariance is `V = 1 + v l l'` with `l` the root of the worth `(band,)` and `v` the variance `(sensor,)` of a
+    log level; what is returned is `V^(-1/2)` times them.
+    """
+    level, total = worth.sqrt(), worth.sum()
+    share = 1 - (1 + torch.as_tensor(variance, dtype=worth.dtype) * total).rsqrt()
+    along = (values @ level) / total
+    return values - (share * along)[..., None] * level
 
 
 def _densities(n_samples: int, f: Tensor) -> Tensor:

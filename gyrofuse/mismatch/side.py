@@ -31,6 +31,8 @@ class Side:
         told_by: Samples of each sensor that the noise is known from, where they are fewer: those that a model, which
             these were drawn from, was estimated from.
         loud: Episodes that it is known to have.
+        gaussian: Whether a Gaussian model made it.
+        level_variance: Of the log of all power, which varies by itself beyond what Gaussian noise's does, `(sensor,)`.
     """
 
     signal: Tensor
@@ -38,6 +40,8 @@ class Side:
     lines: tuple[float, ...] = ()
     told_by: float = math.inf
     loud: tuple[Loudness, ...] = ()
+    gaussian: bool = False
+    level_variance: Tensor | float = 0.0
 
     @property
     def n_records(self) -> float:

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import Evidence
-from gyrofuse.mismatch.impulses import ENDS, left_out
+from gyrofuse.mismatch.prediction_errors import ENDS, left_out
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.shape_law import decorrelated
 from gyrofuse.mismatch.side import Side

@@ -1,27 +1,74 @@
 """Twins of a recording in which nothing is missing: what witnesses say when recording and simulation agree.
 
-A twin has a recording and a simulation of its own, both drawn from the noise that describes the simulation, as long as
-those given and with the same auxiliary channels: whatever finite lengths and chance do, they do to twins as well.
+A twin has a recording and a simulation of its own, as long as those given and with the same auxiliary channels:
+whatever finite lengths and chance do, they do to twins as well. Both are drawn from the noise that describes the
+simulation; where that is not Gaussian, innovations are drawn from those that it has, in blocks of random length whose
+ends meet (the stationary bootstrap: Politis and Romano, JASA 89 (1994), 1303), the same for all sensors.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
+from scipy import fft
 from torch import Tensor
 
 from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.level_spread import with_spread
+from gyrofuse.mismatch.normality import gaussian_sensors
+from gyrofuse.mismatch.prediction_errors import left_out
+from gyrofuse.mismatch.stats.long_run_variance import long_run_variance
 from gyrofuse.mismatch.testimony import combined, testimony
 
 FEWEST = 50
+_FEWEST_BLOCKS = 8  # in a record, of a level that wanders however slowly: fewer would be the record again
 
 
 def twin(case: Case, generator: torch.Generator) -> Case:
     """A recording and a simulation that agree, drawn from what describes the simulation."""
-    model = case.base.model()
     n_records, _, n = case.simulated.signal.shape
-    recording = model.simulate(case.n_samples, generator=generator)
-    simulation = model.simulate(n, batch=(n_records,), generator=generator)
-    return Case.of(case.scene, recording, simulation).knowing(case.simulated.lines)
+    if bool(gaussian_sensors(case.simulated).all()):
+        model = case.base.model()
+        recording = model.simulate(case.n_samples, generator=generator)
+        simulation = model.simulate(n, batch=(n_records,), generator=generator)
+    else:
+        recording = _resampled(case, 1, case.n_samples, generator)[0]
+        simulation = _resampled(case, n_records, n, generator)
+    drawn = Case.of(case.scene, recording, simulation).knowing(case.simulated.lines)
+    drawn = replace(drawn, simulated=replace(drawn.simulated, gaussian=case.simulated.gaussian))
+    return with_spread(drawn)
+
+
+def block_length(white: Tensor) -> float:
+    """Mean length of blocks of whitened records `(record, sensor, time)` that keep a level that varies, samples.
+
+    So long as the spectrum of the squares takes to be flat; 1 where squares are independent.
+    """
+    n, longest = white.shape[-1], 1.0
+    squares = white.square()
+    for row in squares.movedim(1, 0):
+        found = long_run_variance(row)
+        chance = 1 + 2 * (2 / found.dof) ** 0.5  # two sd of a chi-square over its degrees of freedom
+        if found.value > chance * float(row.var()):
+            longest = max(longest, 2 * len(row) * n / found.dof)
+    return min(longest, n / _FEWEST_BLOCKS)
+
+
+def _resampled(case: Case, n_records: int, n: int, generator: torch.Generator) -> Tensor:
+    """Records `(record, sensor, time)` of the simulation's innovations, in the colour of its noise."""
+    white = left_out(case.simulated).white
+    length, source = block_length(white), white.movedim(1, 0).flatten(1)
+    start = torch.randint(source.shape[-1], (n_records, n), generator=generator)
+    fresh = torch.rand(n_records, n, generator=generator, dtype=torch.float64) < 1 / length
+    fresh[:, 0] = True
+    began = torch.where(fresh, torch.arange(n), 0).cummax(-1).values
+    at = (start.gather(-1, began) + torch.arange(n) - began) % source.shape[-1]
+    drawn = source[:, at].movedim(0, 1) / source.square().mean(-1, keepdim=True).sqrt()
+    places = torch.arange(1, n, dtype=torch.float64) / (2 * n)  # of cosines, cycles per sample
+    size = torch.nn.functional.pad(case.base.spectrum(places).sqrt(), (1, 0))
+    ordinates = torch.from_numpy(fft.dct(drawn.numpy(), norm="ortho", axis=-1)) * size
+    return torch.from_numpy(fft.idct(ordinates.numpy(), norm="ortho", axis=-1))
 
 
 def twin_p_values(case: Case, n_twins: int, generator: torch.Generator) -> Tensor:

@@ -120,7 +120,8 @@ def whitened_difference(one: Tensor, other: Tensor, d: Tensor, s: Tensor) -> Ten
 def power_tails(case: Case) -> Tensor:
     """Two-sided p values of the ratio of powers `(sensor, band)`; NaN where the simulation says nothing."""
     ratio = case.recorded.power / case.simulated.power
-    d, simulated = 2 * case.bands.dof, 2 * case.simulated.dof
+    varies = torch.as_tensor(case.simulated.level_variance).expand(case.n_sensors)[:, None]
+    d, simulated = 2 * case.bands.dof, 2 * case.simulated.dof / (1 + case.simulated.dof * varies)
     law = stats.f(d.numpy(), simulated.clamp(min=1e-9).numpy())
     tails = 2 * torch.from_numpy(law.sf(ratio.numpy())).minimum(torch.from_numpy(law.cdf(ratio.numpy())))
     return tails.clamp(max=1.0).masked_fill(simulated <= 0, math.nan)

@@ -12,9 +12,9 @@ from torch import Tensor
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.evidence import corrected
 from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
-from gyrofuse.mismatch.impulses import left_out
 from gyrofuse.mismatch.marginals import END_STOPS, EndStop, end_stops
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.prediction_errors import left_out
 
 _CELL = 0.02  # width of a cell at the limit, sd: what a sample there is worth is bounded by it
 

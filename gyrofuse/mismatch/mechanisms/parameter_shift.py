@@ -14,6 +14,7 @@ from gyrofuse.mismatch.base import Base
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.gaussian import Filter
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Z
+from gyrofuse.mismatch.power_differs import power_differs
 from gyrofuse.mismatch.shape_bands import deep_base
 from gyrofuse.mismatch.shape_ground import Parts
 from gyrofuse.mismatch.shape_terms import Shift
@@ -44,7 +45,7 @@ class ParameterShift(Filter):
 
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:
-        shape = chosen_shape(case, cls.name, level)
+        shape = chosen_shape(case, cls.name, level) if power_differs(case, level) else None
         if shape is None:
             return None
         parameters, words, lacking = {}, [], set()

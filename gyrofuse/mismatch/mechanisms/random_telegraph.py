@@ -13,7 +13,9 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.folds import N_JUDGED, in_fold
+from gyrofuse.mismatch.impulses import jump_witness
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
+from gyrofuse.mismatch.power_differs import power_differs
 from gyrofuse.mismatch.telegraph_fit import Numbers, excess, scores, two_levels
 
 _PRESENT, _CERTAIN = 5.0, 8.0  # nats over the Gaussian rival, of all sensors together
@@ -42,6 +44,8 @@ class RandomTelegraph(Mechanism):
 
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:
+        if not (power_differs(case, level) or jump_witness(case).p_value <= level):
+            return None
         possible = {i: fit for i, fit in two_levels(case).items() if fit.resolved}
         own = {i: fit for i, fit in possible.items() if fit.over > _CHOSEN and fit.lasts}
         over = _CHOSEN + sum(fit.over - _CHOSEN for fit in own.values())

@@ -12,11 +12,12 @@ from torch import Tensor
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.episodes import episodes_of, two_level_scores
 from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
-from gyrofuse.mismatch.impulses import left_out, likely_outliers, spike_p_value
+from gyrofuse.mismatch.impulses import likely_outliers, spike_p_value
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.noise_level import levelled, variance_p_values
 from gyrofuse.mismatch.outlier_limits import with_limits
 from gyrofuse.mismatch.outliers import Outliers, clustered, fitted, free_gaussian, heavy_tailed, mixture
+from gyrofuse.mismatch.prediction_errors import left_out
 from gyrofuse.mismatch.shocks import fitted_shock, shock_posterior, shock_scores
 
 _HOUR = 3600.0
@@ -66,8 +67,8 @@ class Spikes(Mechanism):
         laws = [fitted(row) for row in z]
         gains = _gains(z, laws).sum(-1)
         hit = tuple((gains > _PRESENT).nonzero()[:, 0].tolist())
-        weak = likely_outliers(case.recorded)
-        if not weak.shock and weak.apart > -math.log(level):
+        weak = likely_outliers(case)
+        if weak is not None and not weak.shock and weak.apart > -math.log(level):
             hit = tuple(i for i in range(case.n_sensors) if i in hit or float(weak.sensors[i]) > _LIKELY)
         if hit:  # what the law of all of them is likelier in has it, however little that gains by itself
             as_others = _gains(z, _shared(z, laws, hit)).sum(-1)
@@ -250,8 +251,8 @@ def _limited(z: Tensor, laws: list[Outliers], hit: tuple[int, ...]) -> list[Outl
 
 def _shock(case: Case, apart: list[Outliers], hit: tuple[int, ...]) -> tuple[list[Outliers], float] | None:
     """Laws of outliers that hit several sensors at once, and what they gain, nats."""
-    z, weak = left_out(case.recorded).z[0], likely_outliers(case.recorded)
-    if weak.shock:
+    z, weak = left_out(case.recorded).z[0], likely_outliers(case)
+    if weak is not None and weak.shock:
         hit = tuple((weak.sensors > 0.5).nonzero()[:, 0].tolist())
         start = [Outliers(weak.rate, weak.size, 0.1 * weak.size)] * len(z)
     else:

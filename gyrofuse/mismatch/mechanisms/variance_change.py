@@ -31,6 +31,7 @@ from gyrofuse.mismatch.noise_level import (
     level_between,
     levelled,
     modulation,
+    own_spread,
     variance_p_value,
     variance_p_values,
 )
@@ -87,7 +88,8 @@ class VarianceChange(Mechanism):
             limits = torch.tensor([value, value - Z * sd, value + Z * sd], dtype=torch.float64).exp()
             middle, low, high = fast_factor(limits, corner).tolist()
             parameters[f"factor[{i}]"] = Parameter(middle, low, high, "")
-        gain = float(two_level_scores(white, found.factor, found.inside(case.n_samples), reference).sum())
+        scores = two_level_scores(white, found.factor, found.inside(case.n_samples), reference)
+        gain = float(own_spread(case).weight @ scores.sum(-1))
         largest = max(sensors, key=lambda i: abs(math.log(float(factor[i]))))
         where = case.scene.named(sensors, "all sensors")
         more = f" and {len(found.episodes) - 1} more times" if len(found.episodes) > 1 else ""
@@ -132,6 +134,7 @@ class VarianceChange(Mechanism):
         inside = self._inside(case.n_samples, case.scene.rate)
         factor = whitened_factor(self.factor, self.corner_hz / case.scene.rate)
         scores = two_level_scores(levelled(case), factor, inside, level_between(case, inside))
+        scores = own_spread(case).weight[:, None] * scores
         return held_out_blocks(scores, fold).sum((0, -1))
 
     def _loudness(self, n_samples: int, rate: float) -> Loudness:

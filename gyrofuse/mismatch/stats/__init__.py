@@ -1,0 +1,1 @@
+"""Statistical kernels: tensors in, numbers out. They know no recording, simulation or mechanism."""

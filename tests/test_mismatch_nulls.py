@@ -1,0 +1,302 @@
+"""Noise that recording and simulation share is no mismatch, whatever its law: kernels, witnesses, names."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from mismatch_draws import LEVEL, even, normal
+from scipy import signal, stats
+from torch import Tensor
+
+import gyrofuse as gf
+from gyrofuse.mismatch import impulses, lattices, noise_level, normality, twins
+from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.inputs import prepared
+from gyrofuse.mismatch.level_spread import level_spread
+from gyrofuse.mismatch.mechanisms.parameter_shift import ParameterShift
+from gyrofuse.mismatch.mechanisms.random_telegraph import RandomTelegraph
+from gyrofuse.mismatch.mechanisms.variance_change import VarianceChange
+from gyrofuse.mismatch.prediction_errors import left_out
+from gyrofuse.mismatch.shape_scan import beside_level, shape_witness
+from gyrofuse.mismatch.stats import predictive_tail
+from gyrofuse.mismatch.stats.brownian_range import kuiper_p_value, studentised_range_p_value
+from gyrofuse.mismatch.stats.clustering import clustering_p_value
+from gyrofuse.mismatch.stats.kurtosis import bounded_kurtosis, kurtosis_p_value
+from gyrofuse.mismatch.stats.local_level import WINDOW, local_level
+from gyrofuse.mismatch.stats.long_run_variance import chi_square_nodes, long_run_variance
+from gyrofuse.mismatch.witnesses import spectrum_witness
+
+N = 8209  # a prime: no length of a block or a transform fits it
+
+
+def wandering(tau: float, n: int, g: torch.Generator) -> Tensor:
+    """A variance `(time,)` whose logarithm is an AR1 of that time constant and sd 1/2."""
+    phi = math.exp(-1 / tau)
+    steps = normal(n, g=g).numpy() * 0.5 * math.sqrt(1 - phi**2)
+    steps[0] /= math.sqrt(1 - phi**2)
+    return torch.from_numpy(signal.lfilter([1.0], [1.0, -phi], steps)).exp()
+
+
+def noise(kind: str, g: torch.Generator, p: int = 2, n: int = N) -> Tensor:
+    """Noise `(sensor, time)` that is not Gaussian of a steady level, but for the first kind."""
+    x = normal(p, n, g=g)
+    if kind == "t5":
+        return x / normal(5, p, n, g=g).square().mean(0).sqrt()
+    if kind == "laplace":
+        return -even(p, n, g=g).log() * x.sign()
+    if kind == "wandering":
+        return x * wandering(100.0, n, g).sqrt()
+    if kind == "spiky":
+        return x + 10 * (even(p, n, g=g) < 5e-4) * x.sign()
+    return x
+
+
+def case_of(kind: str, seed: int, p: int = 2, n: int = N) -> Case:
+    g = torch.Generator().manual_seed(seed)
+    return prepared(noise(kind, g, p, n), noise(kind, g, p, n), None, g)
+
+
+# Kernels.
+
+
+@pytest.mark.parametrize(("phi", "least"), [(0.0, 200.0), (0.9, 30.0)])
+def test_the_long_run_variance_of_an_ar1_is_that_of_its_spectrum_at_zero(phi: float, least: float) -> None:
+    g = torch.Generator().manual_seed(1)
+    scores = []
+    for _ in range(40):
+        x = torch.from_numpy(signal.lfilter([1.0], [1.0, -phi], normal(1, 20011, g=g).numpy()))
+        found = long_run_variance(x)
+        scores.append(float(stats.chi2.cdf(found.dof * found.value * (1 - phi) ** 2, found.dof)))
+        assert found.dof >= 12
+    assert np.median([long_run_variance(normal(1, 20011, g=g)).dof for _ in range(5)]) >= 2 * 64
+    assert stats.kstest(scores, "uniform").pvalue > 1e-3
+
+
+def test_nodes_average_over_a_chi_square_variable() -> None:
+    for dof in (12.0, 200.0):
+        values, weights = chi_square_nodes(dof)
+        assert float(weights.sum()) == pytest.approx(1)
+        assert float((weights * values).sum()) == pytest.approx(1, rel=0.02)
+        # The mean of exp(-t x): the Laplace transform of a Gamma variable: p values are made of its lower tail.
+        for t in (1.0, 20.0):
+            assert float((weights * (-t * values).exp()).sum()) == pytest.approx(
+                (1 + 2 * t / dof) ** (-dof / 2), rel=0.3
+            )
+
+
+def test_a_range_over_a_known_sd_is_kuipers_and_over_an_estimate_is_told_less_by() -> None:
+    assert studentised_range_p_value(2.3, 1e7) == pytest.approx(kuiper_p_value(2.3), rel=0.02)
+    assert studentised_range_p_value(2.3, 12.0) > 3 * kuiper_p_value(2.3)
+
+
+def test_the_local_level_follows_what_changes_slowly_and_no_outlier() -> None:
+    g = torch.Generator().manual_seed(2)
+    x = normal(2, 20000, g=g)
+    x[0, 10000:] *= 4.0
+    x[1, 5000] = 50.0
+    level = local_level(x)
+    assert float(level[0, 12000:].mean() / level[0, :8000].mean()) == pytest.approx(16, rel=0.1)
+    assert float(level[1, 4900:5100].mean()) < 1.2
+    assert float(level[1].std()) == pytest.approx(math.sqrt(2 / WINDOW), rel=0.3)
+
+
+def test_the_influence_of_a_value_is_what_the_kurtosis_moves_by() -> None:
+    x = noise("t5", torch.Generator().manual_seed(3), 1, 2000)
+    found = bounded_kurtosis(x)
+    for place in (10, int(x.abs().argmax())):
+        twice = torch.cat([x, x[:, place : place + 1].expand(1, 4)], -1)  # its weight is raised by 4/2000
+        moved = (bounded_kurtosis(twice).value - found.value) * twice.shape[-1] / 4
+        assert moved == pytest.approx(float(found.influence[0, place]), rel=0.05, abs=0.05)
+
+
+@pytest.mark.parametrize("kind", ["gaussian", "t5", "laplace"])
+def test_equal_kurtoses_are_told_apart_as_often_as_chance_has_it(kind: str) -> None:
+    g = torch.Generator().manual_seed(4)
+    low = sum(kurtosis_p_value(noise(kind, g, 1, 4001), noise(kind, g, 1, 4001)) < 0.05 for _ in range(60))
+    assert stats.binom.sf(8, 60, 0.05) < 1e-2
+    assert low <= 8
+    assert kurtosis_p_value(noise("laplace", g, 1, 4001), noise("gaussian", g, 1, 4001)) < 1e-6
+    assert kurtosis_p_value(normal(1, 4001, g=g).sign() + 0.5 * normal(1, 4001, g=g), normal(1, 4001, g=g)) < 1e-6
+
+
+def test_counts_of_the_same_rate_have_the_binomial_law() -> None:
+    own, other = np.array([0.0, 3.0, 9.0]), np.array([2.0, 2.0, 0.0])
+    mine = predictive_tail.equal_rates_p_value(own, other, 0.5)
+    np.testing.assert_allclose(mine, stats.binom.sf(own - 1, own + other, 1 / 3), rtol=1e-9)
+
+
+def test_the_tail_beyond_the_largest_values_is_paretos() -> None:
+    x = np.linspace(0, 5, 11)
+    for xi in (-0.15, 0.0, 0.4):
+        mine = predictive_tail._log_survival(x, np.array([xi]), np.array([1.3]))
+        np.testing.assert_allclose(mine, stats.genpareto.logsf(x, xi, scale=1.3), rtol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["gaussian", "t5", "laplace", "spiky"])
+def test_tails_that_both_have_are_predicted(kind: str) -> None:
+    g = torch.Generator().manual_seed(5)
+    low = 0
+    for _ in range(15):
+        recorded, simulated = (noise(kind, g, 4, N).numpy() for _ in range(2))
+        low += int((predictive_tail.tail_p_values(recorded, simulated[:, None]) < 0.01).sum())
+    # More than 4 of 60 at 1 % have probability 3e-4.
+    assert low <= 4
+    recorded[0, ::1000] = 12.0 * np.abs(simulated).max()
+    assert predictive_tail.tail_p_values(recorded, simulated[:, None])[0] < 1e-4
+
+
+def test_events_in_clumps_count_for_fewer() -> None:
+    rng = np.random.default_rng(0)
+    alone = rng.random((1, 64_000)) < 0.002
+    clumps = np.zeros((1, 64_000), dtype=bool)
+    for at in rng.integers(0, 63_990, 25):
+        clumps[0, at : at + 5] = True
+    assert predictive_tail.dispersion(alone) < 1.6
+    assert predictive_tail.dispersion(clumps) == pytest.approx(5, rel=0.4)
+
+
+def test_squares_that_come_together_in_both_are_no_bursts() -> None:
+    g = torch.Generator().manual_seed(6)
+
+    def bursting(share: float) -> Tensor:
+        x = normal(1, N, g=g)
+        for at in (even(30, g=g) * (N - 20)).long().tolist():
+            x[:, at : at + 20] *= 1 + share
+        return x.square().clamp(max=9)
+
+    low = sum(clustering_p_value(bursting(1.0), bursting(1.0)) < 0.01 for _ in range(25))
+    assert low <= 3  # four of 25 at 1 % have probability 1e-4
+    assert clustering_p_value(bursting(1.5), bursting(0.0)) < 1e-4
+
+
+def test_levels_that_vary_by_themselves_make_a_sample_count_for_less() -> None:
+    g = torch.Generator().manual_seed(7)
+    x = normal(1, 3, 65536, g=g) * wandering(100.0, 65536, g).sqrt()
+    doubtful = torch.zeros(3, dtype=torch.bool)
+    spread = level_spread(x / x.std(), doubtful)
+    assert spread.dof < 2 * 256
+    assert float(spread.weight.max()) < 0.1
+    sure = level_spread(x, ~doubtful)
+    assert math.isinf(sure.dof)
+    assert sure.weight.tolist() == [1.0, 1.0, 1.0]
+
+
+def test_scores_whose_level_varies_become_independent() -> None:
+    worth = torch.tensor([3.0, 10.0, 50.0, 7.0], dtype=torch.float64)
+    variance = torch.tensor([0.0, 0.3], dtype=torch.float64)
+    one = torch.eye(4, dtype=torch.float64)[:, None].expand(4, 2, 4)
+    root = beside_level(one, worth, variance)  # (band, sensor, band): rows of V^(-1/2)
+    level = worth.sqrt()
+    for i, v in enumerate(variance.tolist()):
+        covariance = torch.eye(4, dtype=torch.float64) + v * level[:, None] * level
+        torch.testing.assert_close(root[:, i] @ covariance @ root[:, i].mT, torch.eye(4, dtype=torch.float64))
+
+
+# Which simulations are Gaussian.
+
+
+def test_a_model_is_gaussian_and_samples_are_what_they_look_like() -> None:
+    g = torch.Generator().manual_seed(8)
+    model = prepared(noise("t5", g), gf.Model([gf.WhiteNoise(1.0)]), None, g)
+    assert bool(normality.gaussian_sensors(model.simulated).all())
+    for kind in ("t5", "laplace", "wandering", "spiky"):
+        assert not bool(normality.gaussian_sensors(case_of(kind, 9).simulated).any()), kind
+    passed = torch.stack([normality.gaussian_sensors(case_of("gaussian", 100 + k).simulated) for k in range(20)])
+    # Nine of ten sensors at least: fewer than 29 of 40 have probability 1e-3.
+    assert int(passed.sum()) >= 29
+
+
+# Witnesses and names.
+
+
+@pytest.mark.parametrize("kind", ["t5", "laplace", "wandering", "spiky"])
+def test_noise_that_both_share_is_no_mismatch(kind: str) -> None:
+    low = {}
+    for seed in range(6):
+        case = case_of(kind, 200 + seed)
+        for witness in (
+            impulses.spike_witness,
+            impulses.jump_witness,
+            noise_level.variance_witness,
+            spectrum_witness,
+            shape_witness,
+        ):
+            low[witness.__name__] = low.get(witness.__name__, 0) + (witness(case).p_value < 0.01)
+    # Two of six at 1 % have probability 1e-3; of five witnesses of four kinds the largest is allowed that.
+    assert max(low.values()) <= 2, low
+    assert sum(low.values()) <= 3, low
+
+
+def test_no_law_that_both_share_gets_a_name() -> None:
+    """Beside a tone, which alone is a mismatch; of modulated noise spectra gained any number of nats."""
+    for seed in range(3):
+        case = case_of("wandering", 300 + seed)
+        tone = 0.3 * torch.cos(0.7 * torch.arange(N, dtype=torch.float64))
+        case = case.with_recording(case.recording + tone)
+        for mechanism in (ParameterShift, RandomTelegraph, VarianceChange):
+            assert mechanism.nominate(case, LEVEL) is None, mechanism.name
+
+
+def test_a_change_of_level_is_seen_beside_tails_that_both_have() -> None:
+    g = torch.Generator().manual_seed(10)
+    recorded, simulated = noise("t5", g, n=16381), noise("t5", g, n=16381)
+    recorded[:, 3000:9000] *= 1.4
+    case = prepared(recorded, simulated, None, g)
+    assert not bool(normality.gaussian_sensors(case.simulated).any())
+    assert noise_level.variance_witness(case).p_value < 1e-4
+    found = VarianceChange.nominate(case, LEVEL)
+    assert found is not None
+    assert found.parameters["start"].value == pytest.approx(3000, abs=400)
+
+
+def test_a_course_of_the_level_that_both_have_is_taken_off_and_one_of_chance_is_not() -> None:
+    g = torch.Generator().manual_seed(11)
+    loud = torch.ones(N, dtype=torch.float64)
+    loud[2000:4000] = 2.0
+    assert noise_level.level_profile(prepared(noise("", g) * loud, noise("", g) * loud, None, g)) is not None
+    assert noise_level.level_profile(prepared(noise("", g) * loud.roll(3000), noise("", g) * loud, None, g)) is None
+
+
+# Twins.
+
+
+def test_twins_have_the_innovations_of_the_simulation() -> None:
+    g = torch.Generator().manual_seed(12)
+    case = case_of("t5", 13, n=16381)
+    assert twins.block_length(left_out(case.simulated).white) == 1
+    twin = twins.twin(case, g)
+    for ours, theirs in ((twin.recording, case.simulated.signal[0]), (twin.simulated.signal[0],) * 2):
+        assert (ours.std(-1) / theirs.std(-1)).tolist() == pytest.approx([1, 1], abs=0.05)
+        assert float(stats.kurtosis(ours.numpy(), axis=-1).min()) > 1.5
+    assert float((twin.recording[0, 1:] * twin.recording[0, :-1]).mean().abs()) < 0.06
+    assert 100 < twins.block_length(left_out(case_of("wandering", 14).simulated).white) <= N / 8
+
+
+# Lattices.
+
+
+def test_a_mixture_of_normal_laws_has_no_lattice_and_one_that_is_rounded_has() -> None:
+    for seed in range(3):
+        g = torch.Generator().manual_seed(20 + seed)
+        wide = torch.where(even(1, 65537, g=g) < 0.5, 4.0, 1.0)
+        mixed = normal(1, 65537, g=g) * wide
+        simulation = normal(1, 65537, g=g) * mixed.std()
+        scene = Scene(100.0, "deg/s", ("x",))
+        assert lattices.missing_lattices(Case.of(scene, mixed, simulation[None]), LEVEL).p_value > 0.01
+        rounded = (mixed / 2).round() * 2 + 0.5 * normal(1, 65537, g=g)
+        found = lattices.missing_lattices(Case.of(scene, rounded, simulation[None]), LEVEL)
+        assert found.p_value < 1e-9
+        assert found.lattices[0].step == pytest.approx(2.0, rel=0.05)
+
+
+def test_contaminated_noise_of_a_real_gyro_is_not_rounded(shared: Path) -> None:
+    recorded = torch.from_numpy(np.load(shared / "data" / "mtig_contaminated_gx.npz")["gyro_x"].astype(np.float64))
+    for first in (0, 300_000):
+        part = recorded[None, first : first + 65537]
+        simulation = part.std() * normal(1, 1, 65537, g=torch.Generator().manual_seed(21))
+        case = Case.of(Scene(100.0, "rad/s", ("x",)), part, simulation)
+        assert lattices.missing_lattices(case, LEVEL).p_value > 0.01
