@@ -132,8 +132,8 @@ def _hidden_lattice(unique: Tensor, sd: float) -> Lattice:
         return Lattice(2 * math.pi / float(u[best]), 0.0, 1.0, p_value, float(u[best]))
     frequency = _peak([unique], _climbed(u, power, best, _LOWEST / sd), float(u[1]))
     for part in (4, 3, 2):  # a harmonic may have come out largest
-        lower = _power(unique, torch.tensor([frequency / part], dtype=torch.float64))
-        if frequency / part > _LOWEST / sd and float(lower) > max(0.3 * float(power[best]), 10.0):
+        lower = _told_at(unique, frequency / part)
+        if frequency / part > _LOWEST / sd and lower > max(0.3 * float(power[best]), 10.0):
             frequency /= part
             break
     return _seen_at(unique, frequency, _step_at(unique, frequency))._replace(p_value=p_value)
@@ -233,15 +233,20 @@ def _seen_at(unique: Tensor, peak: float, step: float) -> Lattice:
     resultant = math.sqrt(max((power - 1) / (n - 1), 1e-12)) if n > 1 else 1e-6
     blur = math.sqrt(-2 * math.log(min(resultant, 1 - 1e-12))) / (2 * math.pi)
     turn = torch.exp(2j * math.pi / step * unique).mean().angle()
-    places = peak * torch.linspace(*_TROUGH, _LOOKED_AT, dtype=torch.float64)
-    told = _beyond(torch.tensor(power), _power(unique - unique.mean(), places).mean(), _LOOKED_AT)
-    return Lattice(step, float(turn) / (2 * math.pi) * step, blur, math.exp(-float(told)), peak)
+    return Lattice(step, float(turn) / (2 * math.pi) * step, blur, math.exp(-_told_at(unique, peak)), peak)
 
 
 def _power(values: Tensor, u: Tensor) -> Tensor:
     """`n |phi(u)|^2`, `(u,)`."""
     angle = u[:, None] * values
     return (angle.cos().mean(-1).square() + angle.sin().mean(-1).square()) * len(values)
+
+
+def _told_at(values: Tensor, u: float) -> float:
+    """`n |phi(u)|^2` beyond that of noise, which falls from one `u` to the next."""
+    places = u * torch.linspace(*_TROUGH, _LOOKED_AT, dtype=torch.float64)
+    power = _power(values - values.mean(), torch.cat([torch.tensor([u], dtype=torch.float64), places]))
+    return float(_beyond(power[0], power[1:].mean(), _LOOKED_AT))
 
 
 def _peak(rows: list[Tensor], u: float, spacing: float) -> float:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.level_spread import with_spread
-from gyrofuse.mismatch.normality import gaussian_sensors
+from gyrofuse.mismatch.normality import SQUARE_CUT, gaussian_sensors
 from gyrofuse.mismatch.prediction_errors import left_out
 from gyrofuse.mismatch.stats.long_run_variance import long_run_variance
 from gyrofuse.mismatch.testimony import combined, testimony
@@ -46,10 +46,10 @@ def block_length(white: Tensor) -> float:
     So long as the spectrum of the squares takes to be flat; 1 where squares are independent.
     """
     n, longest = white.shape[-1], 1.0
-    squares = white.square()
+    squares = white.square().clamp(max=SQUARE_CUT)
     for row in squares.movedim(1, 0):
         found = long_run_variance(row)
-        chance = 1 + 2 * (2 / found.dof) ** 0.5  # two sd of a chi-square over its degrees of freedom
+        chance = 1 + 4 * (2 / found.dof) ** 0.5  # four sd of a chi-square over its degrees of freedom, of any sensor
         if found.value > chance * float(row.var()):
             longest = max(longest, 2 * len(row) * n / found.dof)
     return min(longest, n / _FEWEST_BLOCKS)

@@ -20,7 +20,7 @@ def local_level(values: Tensor) -> Tensor:
     squares = values.square().flatten(0, -2)
     level = squares.mean(-1, keepdim=True).clamp(min=1e-300).expand_as(squares)
     for _ in range(_ROUNDS):
-        level = level * _smooth((squares / level).clamp(max=_CUT)).clamp(min=1e-12)
+        level = _smooth(squares.minimum(_CUT * level)).clamp(min=1e-300)
     return (level / level.mean(-1, keepdim=True)).view(values.shape)
 
 
