@@ -72,6 +72,20 @@ def test_powers_are_those_of_the_definition() -> None:
         assert found.p_value == pytest.approx(-math.expm1(-own), rel=0.1)
 
 
+@pytest.mark.parametrize("p", [2, 8, 9, 12, 17])
+def test_modulation_names_its_sensors_however_many_there_are(p: int) -> None:
+    """Beyond eight sensors not all sets of them are tried."""
+    generator = torch.Generator().manual_seed(p)
+    squares = torch.randn(p, 4096, generator=generator, dtype=torch.float64).square()
+    level = 1 + 0.4 * torch.cos(2 * math.pi * 0.1 * torch.arange(4096))
+    for sensors in ((p - 1,), tuple(range(p))):
+        louder = squares.clone()
+        louder[list(sensors)] *= level
+        found = modulation.strongest_modulation(louder)
+        assert found.period
+        assert found.sensors == sensors
+
+
 def test_noise_with_a_period_is_seen_and_has_no_name() -> None:
     recording, simulation, _ = drawn(1)
     t = torch.arange(N, dtype=torch.float64)

@@ -79,22 +79,22 @@ def strongest_modulation(squares: Tensor) -> Modulation:
     more = (octaves / count).clamp(min=1.0)
     log_ratio = float(((octaves - count * (1 + more.log()) - 1) * (more > 1)).clamp(min=0).sum(0).add(log_chance).max())
     return min(
-        _line(torch.stack(peak), torch.stack(at), shape, log_chance, length),
-        _band(octaves, edges, shape, log_chance, n),
+        _line(torch.stack(peak), torch.stack(at), shape, log_chance, sets, length),
+        _band(octaves, edges, shape, log_chance, sets, n),
         key=lambda found: found.p_value,
     )._replace(log_ratio=log_ratio)
 
 
-def _line(peak: Tensor, at: Tensor, shape: Tensor, log_chance: Tensor, length: int) -> Modulation:
+def _line(peak: Tensor, at: Tensor, shape: Tensor, log_chance: Tensor, sets: Tensor, length: int) -> Modulation:
     """The strongest of peaks `(part, set)` at fine bins."""
     log_p = torch.special.gammaincc(shape.expand_as(peak), peak).clamp(min=1e-300).log() - log_chance
     part, which = divmod(int(log_p.argmin()), len(shape))
     f = int(at[part, which]) / length
     p_value = corrected(math.exp(min(float(log_p[part, which]), 0.0)), 2 * _INDEPENDENT * length / 2)
-    return Modulation(p_value, True, f, f, _sensors(which, len(shape)), 0.0)
+    return Modulation(p_value, True, f, f, _sensors(which, sets), 0.0)
 
 
-def _band(sums: Tensor, edges: list[int], shape: Tensor, log_chance: Tensor, n: int) -> Modulation:
+def _band(sums: Tensor, edges: list[int], shape: Tensor, log_chance: Tensor, sets: Tensor, n: int) -> Modulation:
     """The largest excess of sums over octaves `(octave, set)`, of one or of all that are slower."""
     ends = torch.tensor(edges)
     count = torch.cat([ends.diff(), ends[1:]])[:, None]
@@ -104,12 +104,14 @@ def _band(sums: Tensor, edges: list[int], shape: Tensor, log_chance: Tensor, n: 
     octave, slower = row % len(sums), row >= len(sums)
     p_value = corrected(math.exp(min(float(log_p[row, which]), 0.0)), 2 * len(totals))
     low, high = (1 if slower else edges[octave] + 1) / n, edges[octave + 1] / n
-    return Modulation(p_value, False, low, high, _sensors(which, len(shape)), 0.0)
+    return Modulation(p_value, False, low, high, _sensors(which, sets), 0.0)
 
 
-def _sensors(which: int, n_sets: int) -> tuple[int, ...]:
-    p = round(math.log2(n_sets))
-    return tuple(range(p)) if which == n_sets - 1 else tuple(sets_of(p)[0][which].nonzero()[:, 0].tolist())
+def _sensors(which: int, sets: Tensor) -> tuple[int, ...]:
+    """Sensors of one of the sets `(set, sensor)`; after the last comes the sum over all sensors, whatever the phases."""
+    if which == len(sets):
+        return tuple(range(sets.shape[-1]))
+    return tuple(sets[which].nonzero()[:, 0].tolist())
 
 
 def _decorrelated(squares: Tensor) -> Tensor:
