@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import secrets
 import shutil
-from collections.abc import Collection, Iterable, Iterator
+import zipfile
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
+from typing import IO, Any, Literal
+
+import numpy as np
 
 
 class Outputs:
@@ -121,3 +125,14 @@ def _creating(path: Path) -> Iterator[None]:
         raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist; create it first") from None
     except OSError as error:
         raise OSError(f"{path}: cannot be written there ({error.strerror}); choose another place") from None
+
+
+def write_npz(file: Path | IO[bytes], arrays: Mapping[str, Any], mode: Literal["w", "a"] = "w") -> None:
+    """Write arrays as the members of an .npz, or with mode "a" add them to one.
+
+    `numpy.savez` takes names as keyword arguments, of which `file` and `allow_pickle` are its own.
+    """
+    with zipfile.ZipFile(file, mode) as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)

@@ -13,7 +13,6 @@ import shutil
 import signal
 import sys
 import threading
-import zipfile
 from collections.abc import Sequence
 from enum import Enum
 from pathlib import Path
@@ -25,7 +24,7 @@ import typer
 
 from gyrofuse._checks import check_positive_integer
 from gyrofuse._console import Commands, progress, say, say_table, warn
-from gyrofuse._output import output_folder
+from gyrofuse._output import output_folder, write_npz
 from gyrofuse.cli_fleet import fleet
 from gyrofuse.cli_mismatch import diagnose
 from gyrofuse.cli_models import fit, rank
@@ -359,10 +358,7 @@ def _save(recording: Recording, path: Path, **arrays: np.ndarray[Any, Any]) -> N
             np.savetxt(file, columns.numpy(), fmt="%.17g", delimiter=",")
         return
     recording.save(path, force=True)
-    with zipfile.ZipFile(path, "a") as archive:
-        for name, array in arrays.items():
-            with archive.open(f"{name}.npy", "w") as file:
-                np.lib.format.write_array(file, array)
+    write_npz(path, arrays, "a")
 
 
 def _cell(text: str) -> str:

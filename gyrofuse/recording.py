@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from gyrofuse._checks import check_positive, check_signal
-from gyrofuse._output import Outputs
+from gyrofuse._output import Outputs, write_npz
 from gyrofuse._result import listed, numbered
 from gyrofuse.io.assemble import assemble
 from gyrofuse.io.limits import is_rate
@@ -207,7 +207,7 @@ class Recording:
         if self.axes:
             arrays["axes"] = np.array(self.axes)
         with Outputs([path], force=force) as drafts, drafts[path].open("wb") as file:
-            np.savez(file, **arrays)  # to a name of another case it would append a suffix
+            write_npz(file, arrays)
 
     def summary(self) -> str:
         """What the recording holds, as fixed-width text."""

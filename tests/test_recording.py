@@ -134,6 +134,13 @@ class TestSaved:
         with pytest.raises(FileNotFoundError, match="does not exist"):
             gf.Recording(signal(), rate=1).save(tmp_path / "no" / "r.npz")
 
+    @pytest.mark.parametrize("name", ["file", "allow_pickle", "args", "arr_0"])
+    def test_channels_may_have_any_name(self, tmp_path: Path, name: str):
+        """Names that a function which writes arrays may have for arguments of its own."""
+        values = torch.arange(50, dtype=torch.float64)
+        gf.Recording(signal(), rate=1.0, channels={name: values}).save(tmp_path / "r.npz")
+        torch.testing.assert_close(gf.read_recording(tmp_path / "r.npz").channels[name], values)
+
 
 def write_csv(path: Path, gyro: np.ndarray, start: float, rate: float = 100.0, names: str = "gx,gy,gz") -> Path:
     time = start + np.arange(gyro.shape[1]) / rate

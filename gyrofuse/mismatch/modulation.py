@@ -108,7 +108,7 @@ def _band(sums: Tensor, edges: list[int], shape: Tensor, log_chance: Tensor, set
 
 
 def _sensors(which: int, sets: Tensor) -> tuple[int, ...]:
-    """Sensors of one of the sets `(set, sensor)`; after the last comes the sum over all sensors, whatever the phases."""
+    """Sensors of one of the sets `(set, sensor)`; after the last comes the sum over all sensors, in any phases."""
     if which == len(sets):
         return tuple(range(sets.shape[-1]))
     return tuple(sets[which].nonzero()[:, 0].tolist())
