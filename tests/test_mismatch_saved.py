@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
-from dataclasses import dataclass
-from typing import ClassVar
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, is_dataclass
+from typing import Annotated, Any, ClassVar
 
 import pytest
 import torch
@@ -13,10 +16,36 @@ from torch import Tensor
 
 import gyrofuse as gf
 from gyrofuse.mismatch import saved
+from gyrofuse.mismatch.axes import Axes
 from gyrofuse.mismatch.base import Base
 from gyrofuse.mismatch.case import Scene
 from gyrofuse.mismatch.mechanism import Mechanism
+from gyrofuse.mismatch.mechanisms import CATALOGUE
+from gyrofuse.mismatch.mechanisms.clipping import Clipping
+from gyrofuse.mismatch.mechanisms.clock_skew import ClockSkew
+from gyrofuse.mismatch.mechanisms.common_mode import CommonMode
+from gyrofuse.mismatch.mechanisms.dead_band import DeadBand
+from gyrofuse.mismatch.mechanisms.drifting_tone import DriftingTone
+from gyrofuse.mismatch.mechanisms.flicker import FlickerNoise
+from gyrofuse.mismatch.mechanisms.g_sensitivity import GSensitivity
+from gyrofuse.mismatch.mechanisms.low_pass import LowPassFilter
+from gyrofuse.mismatch.mechanisms.parameter_shift import ParameterShift
+from gyrofuse.mismatch.mechanisms.quadratic_coupling import QuadraticCoupling
+from gyrofuse.mismatch.mechanisms.quantization import Quantization
+from gyrofuse.mismatch.mechanisms.random_telegraph import RandomTelegraph
+from gyrofuse.mismatch.mechanisms.resonance import Resonance
+from gyrofuse.mismatch.mechanisms.scale_factor import ScaleFactor
+from gyrofuse.mismatch.mechanisms.spikes import Spikes
+from gyrofuse.mismatch.mechanisms.step import Step
+from gyrofuse.mismatch.mechanisms.stuck_samples import StuckSamples
+from gyrofuse.mismatch.mechanisms.temperature_drift import TemperatureDrift
+from gyrofuse.mismatch.mechanisms.tone_size import ToneSize
+from gyrofuse.mismatch.mechanisms.unit_scale import UnitScale
+from gyrofuse.mismatch.mechanisms.variance_change import VarianceChange
 from gyrofuse.mismatch.mechanisms.vibration_tone import VibrationTone
+from gyrofuse.mismatch.mechanisms.warm_up_transient import WarmUpTransient
+from gyrofuse.mismatch.oscillating import Mode
+from gyrofuse.mismatch.remainder import Remainder
 from gyrofuse.mismatch.repaired import RepairedModel
 from gyrofuse.mismatch.saved import repaired_from_dict
 
@@ -28,15 +57,62 @@ def numbers(*values: float) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
+def complex_numbers(*values: complex) -> Tensor:
+    return torch.tensor(values, dtype=torch.complex128)
+
+
+BASE = Base(4096, torch.rand(2, 13, generator=torch.Generator().manual_seed(0), dtype=torch.float64))
+MODE = Mode(0.11, 0.01, complex_numbers(0.3 + 0.1j, 0.2), True)
+# One of every class in the catalogue, with numbers that JSON has to round and none that are alike.
+EVERY = (
+    UnitScale(math.degrees(1)),
+    Quantization(numbers(0.3, 0.0), numbers(0.01, 0.0), numbers(0.2, 0.0), numbers(1 / 3, 0.1)),
+    Clipping(numbers(-0.7, -math.inf), numbers(math.inf, 1 / 3), numbers(0.1, 0.2)),
+    StuckSamples(numbers(0.2, 0.1), numbers(0.01, 0.0), True),
+    Spikes(numbers(0.05, 0.0), numbers(7 / 3, 0.0), numbers(0.3, 0.0), True),
+    ClockSkew((1,), 1e-5 / 3, ((200, 2), (300, 1)), 0.07, complex_numbers(0.3j), complex_numbers(0.1)),
+    GSensitivity("acceleration", torch.tensor([[0.1, 0.2, 1 / 3], [0.0, 0.0, 0.0]], dtype=torch.float64)),
+    QuadraticCoupling("acceleration", torch.tensor([[1 / 3], [0.1]], dtype=torch.float64), "axis 2"),
+    ScaleFactor("rate", torch.tensor([[1e-3], [0.0]], dtype=torch.float64)),
+    VibrationTone(7.3, numbers(0.3, 0.0), numbers(0.1, 0.2)),
+    ToneSize(7.3, numbers(0.3, 1 / 3)),
+    RandomTelegraph(numbers(0.3, 0.0), numbers(1 / 3, 1.0), numbers(0.2, 1.0)),
+    TemperatureDrift(numbers(1 / 3, 0.0), torch.zeros(2, 4, dtype=torch.float64), 0.7, "temperature", 0),
+    WarmUpTransient(numbers(1 / 3, 0.0), torch.zeros(2, 4, dtype=torch.float64), 2.3),
+    Step(numbers(0.0, 1 / 3), torch.zeros(2, 4, dtype=torch.float64), 3.3),
+    VarianceChange(((1.5, 3.25), (6.0, 7.0)), numbers(2.0, 1.0), 1 / 3),
+    ParameterShift(BASE, torch.tensor([[0.1, 0.0], [1 / 3, 0.0], [0.0, 0.0], [0.2, 0.1]], dtype=torch.float64)),
+    LowPassFilter("pole", numbers(0.7, 0.0)),
+    Resonance(MODE),
+    DriftingTone(MODE, True, 0.9),
+    FlickerNoise(numbers(1 / 3, 0.0)),
+    CommonMode("ar1", 0.03, complex_numbers(0.1, 0.2j), BASE, True),
+    DeadBand(numbers(0.0, 0.1), numbers(0.2, 0.0), numbers(0.01, 1 / 3)),
+    Remainder(numbers(0.01, 0.1, 0.4), torch.tensor([[0.1, 1 / 3, 0.0], [0.0, 0.2, 0.3]], dtype=torch.float64)),
+)
+
+
 @dataclass(frozen=True, eq=False)
 class Odd(Mechanism):
     name: ClassVar[str] = "odd"
     base: Base
-    limits: Tensor
-    which: Tensor
+    limits: Annotated[Tensor, Axes(("sensor",), infinite=True)]
     spans: tuple[tuple[float, float], ...]
     channel: str
     together: bool
+
+
+CHANNELS = {"acceleration": 3, "rate": 1, "temperature": 1}  # rows
+ODD: tuple[Any, ...] = (None, True, "x", "nan", "inf", -1, 0, 1e308, -1e308, 10**400, [], {}, [[]], ["a"], [1] * 50)
+
+
+def places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Paths to all entries of plain numbers, of long lists to the first two."""
+    if path:
+        yield path
+    entries = value.items() if isinstance(value, dict) else enumerate(value[:2]) if isinstance(value, list) else ()
+    for key, entry in entries:
+        yield from places(entry, (*path, key))
 
 
 def model(*effects: Mechanism) -> RepairedModel:
@@ -52,25 +128,95 @@ def test_simulates_the_same_after_json():
     assert str(again) == f"{again.noise} + vibration_tone"
 
 
+def descendants(kind: type) -> set[type]:
+    return {kind}.union(*(descendants(below) for below in kind.__subclasses__()))
+
+
+def test_the_catalogue_lists_every_mechanism():
+    """Those whose `refitted` is not abstract; and there is an instance of each to be tested."""
+    whole = {
+        kind
+        for kind in descendants(Mechanism)
+        if kind.__module__.startswith("gyrofuse.") and is_dataclass(kind) and hasattr(kind, "name")
+    }
+    assert set(CATALOGUE) == whole
+    assert len(CATALOGUE) == len(whole)
+    assert {type(effect) for effect in EVERY} == whole
+
+
+@pytest.mark.parametrize("effect", EVERY, ids=lambda effect: type(effect).__name__)
+def test_simulates_the_same_bits_after_json(effect: Mechanism):
+    first = model(effect)
+    again = repaired_from_dict(json.loads(json.dumps(first.to_dict(), allow_nan=False)))
+    g = torch.Generator().manual_seed(2)
+    channels = {name: torch.randn(rows, 500, generator=g, dtype=torch.float64) for name, rows in CHANNELS.items()}
+    drawn = [
+        m.simulate(500, batch=(2,), channels=channels, generator=torch.Generator().manual_seed(1))
+        for m in (first, again)
+    ]
+    assert torch.equal(*drawn)
+    plain = model().simulate(500, batch=(2,), generator=torch.Generator().manual_seed(1))
+    assert not torch.equal(drawn[0], plain)
+    assert again.to_dict() == first.to_dict()
+
+
+@pytest.mark.parametrize("effect", EVERY, ids=lambda effect: type(effect).__name__)
+def test_refuses_numbers_that_are_none_of_a_mechanism(effect: Mechanism):
+    """Whatever becomes of any one entry: it is refused in words that name it, or simulates finite samples."""
+    description = json.loads(json.dumps(model(effect).to_dict(), allow_nan=False))
+    for where in places(description["effects"][0]["numbers"]):
+        for odd in ODD:
+            changed = copy.deepcopy(description)
+            owner: Any = changed["effects"][0]["numbers"]
+            for key in where[:-1]:
+                owner = owner[key]
+            owner[where[-1]] = odd
+            try:
+                again = repaired_from_dict(changed)
+            except ValueError as error:
+                said = str(error)
+                assert re.match(r"`description`: expected in effects\.0\S* ", said), (where, odd, said)
+            else:
+                assert hasattr(effect, "channel") or again.simulate(300).isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("effect", "change", "says"),
+    [
+        (Spikes, {"rate": [0.1]}, "effects.0.numbers.rate a list of 2 along the axis sensor, got one of 1"),
+        (Spikes, {"rate": [0.1, "x"]}, "effects.0.numbers.rate a finite number, got 'x'"),
+        (Spikes, {"together": 1}, "effects.0.numbers.together true or false, got 1"),
+        (Step, {"onset_s": "../../x"}, "effects.0.numbers.onset_s a finite number, got '../../x'"),
+        (Step, {"onset_s": "nan"}, "effects.0.numbers.onset_s a finite number, got 'nan'"),
+        (ClockSkew, {"sensors": [7]}, "effects.0 an effect that can be simulated, got IndexError"),
+        (Resonance, {"mode": [1]}, r"effects.0.numbers.mode the numbers of a Mode by their names, got \[1\]"),
+        (VibrationTone, {"frequency_hz": -1e308}, "effects.0 an effect that makes finite samples"),
+        (RandomTelegraph, {"up": [1e-300, 1.0]}, "expected dwells of more than 0.01 samples"),
+        (LowPassFilter, {"kind": "sieve"}, "effects.0 an effect that can be simulated, got KeyError: 'sieve'"),
+    ],
+)
+def test_says_which_number_is_wrong(effect: type[Mechanism], change: dict[str, object], says: str):
+    description = model(next(e for e in EVERY if type(e) is effect)).to_dict()
+    description["effects"][0]["numbers"] |= change
+    with pytest.raises(ValueError, match=says):
+        repaired_from_dict(description)
+
+
 def test_every_kind_of_number_comes_back(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(saved, "STAGES", ((Odd,),))
+    monkeypatch.setattr(saved, "CATALOGUE", (Odd,))
     base = Base(4096, numbers(1.0, 2.0)[:, None])
-    effect = Odd(base, numbers(-math.inf, 2.0), torch.tensor([True, False]), ((0.0, math.inf),), "temperature", True)
+    effect = Odd(base, numbers(-math.inf, 2.0), ((0.0, 1.5),), "temperature", True)
     first = model(effect)
     again = repaired_from_dict(json.loads(json.dumps(first.to_dict(), allow_nan=False)))
     (found,) = again.effects
     assert isinstance(found, Odd)
     assert (found.base.n_samples, found.spans, found.channel, found.together) == (
         4096,
-        *((effect.spans),),
+        effect.spans,
         "temperature",
         True,
     )
-    for got, expected in (
-        (found.base.coefficients, base.coefficients),
-        (found.limits, effect.limits),
-        (found.which, effect.which),
-    ):
+    for got, expected in ((found.base.coefficients, base.coefficients), (found.limits, effect.limits)):
         torch.testing.assert_close(got, expected, rtol=0, atol=0)
     with pytest.raises(ValueError, match="`channels`: expected temperature, which the simulation follows, got none"):
         again.check(50.0, "deg/s")
@@ -87,9 +233,19 @@ def test_check_refuses_another_rate_or_unit():
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"effects": [{"mechanism": "x", "kind": "Gremlin", "numbers": {}}]}, "expected a mechanism among .*'Gremlin'"),
-        ({"effects": [{"mechanism": "x"}]}, "expected the entries noise, effects, rate, unit and sensors"),
-        ({"rate": None}, "expected the entries noise, effects, rate, unit and sensors"),
+        (
+            {"effects": [{"mechanism": "x", "kind": "Gremlin", "numbers": {}}]},
+            "effects.0 a mechanism among .*'Gremlin'",
+        ),
+        ({"effects": [{"mechanism": "x"}]}, "expected in effects.0 a mechanism among .*, got None"),
+        ({"effects": [1]}, "expected in effects.0 an effect, got 1"),
+        ({"effects": {}}, "expected in effects a list, got {}"),
+        ({"rate": None}, "expected in rate a finite number, got None"),
+        ({"rate": -1}, "`rate`: expected a finite number > 0, got -1"),
+        ({"unit": [1]}, r"expected in unit a text, got \[1\]"),
+        ({"sensors": ["a"]}, "expected the names of 2 sensors, as many as the noise is of, got 1"),
+        ({"noise_samples": -1}, "`noise_samples`: expected a whole number >= 0, got -1"),
+        ({"noise_samples": 0.5}, "`noise_samples`: expected a whole number >= 0, got 0.5"),
         ({"noise": gf.WhiteNoise(1.0).to_dict()}, "expected the noise of an array, got that of a sensor"),
     ],
 )

@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -18,6 +19,7 @@ from torch import Tensor
 from gyrofuse._lag_sums import block_mean_covariances
 from gyrofuse._model import Model
 from gyrofuse._nnls import nonnegative_least_squares
+from gyrofuse.mismatch.axes import Axes
 from gyrofuse.mismatch.spectra import Bands
 from gyrofuse.processes import AR1, Process, QuantizationNoise, RandomWalk, WhiteNoise
 from gyrofuse.simulate import ArrayModel
@@ -38,7 +40,7 @@ class Base:
     """
 
     n_samples: int
-    coefficients: Tensor
+    coefficients: Annotated[Tensor, Axes(("sensor", "atom"))]
 
     def spectrum(self, f: Tensor) -> Tensor:
         """Density per sample `(sensor, frequency)` at `f` cycles per sample."""

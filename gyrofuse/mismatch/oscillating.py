@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.axes import ComplexOfSensors
 from gyrofuse.mismatch.bump_fit import Oscillation, likeliest_oscillation, oscillation_of
 from gyrofuse.mismatch.bumps import Stretch, light_taper
 from gyrofuse.mismatch.case import Case
@@ -43,7 +44,7 @@ class Mode:
 
     centre: float
     width: float
-    gain: Tensor
+    gain: ComplexOfSensors
     shared: bool
 
     def profile(self, f: Tensor, resolution: float = 0.0) -> Tensor:

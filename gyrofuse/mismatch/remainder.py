@@ -7,11 +7,12 @@ is no finding: witnesses that asked for it stay in the report as unexplained.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.axes import Axes
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.folds import N_JUDGED, estimation_samples
 from gyrofuse.mismatch.gaussian import Filter
@@ -30,8 +31,8 @@ class Remainder(Filter):
     """
 
     name: ClassVar[str] = "remainder"
-    frequency: Tensor
-    log_gain: Tensor
+    frequency: Annotated[Tensor, Axes(("band",))]
+    log_gain: Annotated[Tensor, Axes(("sensor", "band"))]
 
     @classmethod
     def of(cls, case: Case) -> Remainder:

@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.axes import Axes, OfSensors
 from gyrofuse.mismatch.case import N_BLOCKS, Case, Scene, block_means
 from gyrofuse.mismatch.folds import N_FOLDS, N_JUDGED, in_fold
 from gyrofuse.mismatch.hysteresis import strongest_relay
@@ -40,8 +41,8 @@ class SlowEffect(Mechanism):
 
     proportional_to: ClassVar[str] = "size"
     taken_off: ClassVar[bool] = True
-    size: Tensor
-    log_factors: Tensor
+    size: OfSensors
+    log_factors: Annotated[Tensor, Axes(("sensor", "part"))]
 
     def path(self, n_samples: int, scene: Scene) -> Tensor:
         """For a size of one, `(time,)`."""

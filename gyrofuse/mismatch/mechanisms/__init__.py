@@ -6,10 +6,13 @@ stage the best one is taken first, and the stage is gone through again.
 
 from __future__ import annotations
 
+import itertools
+
 from gyrofuse.mismatch.mechanism import Mechanism
 from gyrofuse.mismatch.mechanisms.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.clock_skew import ClockSkew
 from gyrofuse.mismatch.mechanisms.common_mode import CommonMode
+from gyrofuse.mismatch.mechanisms.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.drifting_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.g_sensitivity import GSensitivity
@@ -29,6 +32,7 @@ from gyrofuse.mismatch.mechanisms.unit_scale import UnitScale
 from gyrofuse.mismatch.mechanisms.variance_change import VarianceChange
 from gyrofuse.mismatch.mechanisms.vibration_tone import VibrationTone
 from gyrofuse.mismatch.mechanisms.warm_up_transient import WarmUpTransient
+from gyrofuse.mismatch.remainder import Remainder
 
 STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (UnitScale,),
@@ -42,3 +46,7 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (VarianceChange,),
     (ParameterShift, LowPassFilter, Resonance, DriftingTone, FlickerNoise, CommonMode),
 )
+
+# Every mechanism that a repaired simulation may have: a dead band is looked for where no lattice is found, the
+# remainder once nothing with a name is left.
+CATALOGUE: tuple[type[Mechanism], ...] = (*itertools.chain(*STAGES), DeadBand, Remainder)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.axes import Axes
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.channels import ChannelFit, regress
 from gyrofuse.mismatch.folds import estimation_samples, signal_gains
@@ -39,7 +40,7 @@ class ChannelGain(Mechanism):
     of_one_band: ClassVar[tuple[str, ...]] = ()
     quantity: ClassVar[str] = "gain"
     channel: str
-    coupling: Tensor
+    coupling: Annotated[Tensor, Axes(("sensor", "row"))]
     kind: str = "each"
 
     @classmethod

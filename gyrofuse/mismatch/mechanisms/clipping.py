@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.axes import Axes, OfSensors
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.evidence import corrected
 from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
@@ -30,9 +31,9 @@ class Clipping(Mechanism):
 
     name: ClassVar[str] = "clipping"
     place: ClassVar[int] = END_STOPS
-    low: Tensor
-    high: Tensor
-    centre: Tensor
+    low: Annotated[Tensor, Axes(("sensor",), infinite=True)]
+    high: Annotated[Tensor, Axes(("sensor",), infinite=True)]
+    centre: OfSensors
 
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.axes import Axes
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.clocks import BLOCKS, best_slope, demodulated, strongest_slip
 from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
@@ -41,8 +42,8 @@ class ClockSkew(Mechanism):
     skew: float
     losses: tuple[tuple[int, int], ...]
     frequency: float
-    slipping: Tensor
-    steady: Tensor
+    slipping: Annotated[Tensor, Axes(("sensor concerned",), complex=True)]
+    steady: Annotated[Tensor, Axes(("sensor concerned",), complex=True)]
 
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:

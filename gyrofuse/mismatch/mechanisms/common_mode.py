@@ -9,6 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.axes import ComplexOfSensors
 from gyrofuse.mismatch.base import Base
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.colour import filtered, noise, of_phase
@@ -42,7 +43,7 @@ class CommonMode(Addition):
     name: ClassVar[str] = "common_mode"
     kind: str
     corner: float
-    gain: Tensor
+    gain: ComplexOfSensors
     own: Base
     inside: bool
 

@@ -9,6 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.axes import OfSensors
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
@@ -32,9 +33,9 @@ class DeadBand(Mechanism):
 
     name: ClassVar[str] = "quantization"
     place: ClassVar[int] = 2
-    value: Tensor
-    half_width: Tensor
-    centre: Tensor
+    value: OfSensors
+    half_width: OfSensors
+    centre: OfSensors
 
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:

@@ -9,6 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.axes import OfSensors
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.colour import noise
 from gyrofuse.mismatch.gaussian import Addition
@@ -31,7 +32,7 @@ class FlickerNoise(Addition):
     """
 
     name: ClassVar[str] = "flicker"
-    level: Tensor
+    level: OfSensors
 
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:

@@ -8,6 +8,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.axes import OfSensors
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.filter_forms import filter_corner, filter_response
 from gyrofuse.mismatch.gaussian import Filter
@@ -31,7 +32,7 @@ class LowPassFilter(Filter):
 
     name: ClassVar[str] = "low_pass"
     kind: str
-    strength: Tensor
+    strength: OfSensors
 
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:

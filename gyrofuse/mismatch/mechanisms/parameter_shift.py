@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Set
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.axes import Axes
 from gyrofuse.mismatch.base import Base
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.gaussian import Filter
@@ -41,7 +42,7 @@ class ParameterShift(Filter):
 
     name: ClassVar[str] = "parameter_shift"
     base: Base
-    log_factors: Tensor
+    log_factors: Annotated[Tensor, Axes(("part", "sensor"))]
 
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:

@@ -11,6 +11,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.axes import OfSensors
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.lattices import Lattice, exact_lattices, innovation_sd, missing_lattices, off_lattice
@@ -45,10 +46,10 @@ class Quantization(Mechanism):
 
     name: ClassVar[str] = "quantization"
     place: ClassVar[int] = 2
-    step: Tensor
-    offset: Tensor
-    blur: Tensor
-    centre: Tensor
+    step: OfSensors
+    offset: OfSensors
+    blur: OfSensors
+    centre: OfSensors
 
     @classmethod
     def of_simulation(cls, case: Case) -> Quantization | None:

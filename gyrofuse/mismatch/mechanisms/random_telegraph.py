@@ -11,6 +11,7 @@ import torch
 from scipy import stats
 from torch import Tensor
 
+from gyrofuse.mismatch.axes import OfSensors
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.folds import N_JUDGED, in_fold
 from gyrofuse.mismatch.impulses import jump_witness
@@ -21,6 +22,7 @@ from gyrofuse.mismatch.telegraph_fit import Numbers, excess, scores, two_levels
 _PRESENT, _CERTAIN = 5.0, 8.0  # nats over the Gaussian rival, of all sensors together
 _GAUSSIAN = ("flicker", "parameter_shift")  # what may have the same spectrum
 _CHOSEN = 1.5  # nats that each sensor costs that is to show it by itself
+_FASTEST = 0.01  # mean dwell, samples: far below one sample a telegraph is white noise, drawn at endless cost
 _NUMBERS = 4  # of a sensor: half step, dwells, and the rival's place
 
 
@@ -38,9 +40,9 @@ class RandomTelegraph(Mechanism):
     """
 
     name: ClassVar[str] = "random_telegraph"
-    half_step: Tensor
-    up: Tensor
-    down: Tensor
+    half_step: OfSensors
+    up: OfSensors
+    down: OfSensors
 
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:
@@ -106,6 +108,8 @@ class RandomTelegraph(Mechanism):
         records = signal.reshape(-1, len(self.half_step), n).clone()
         for i in self.half_step.nonzero()[:, 0].tolist():
             up, down = float(self.up[i]) * scene.rate, float(self.down[i]) * scene.rate
+            if not min(up, down) > _FASTEST:
+                raise ValueError(f"expected dwells of more than {_FASTEST:g} samples, got {min(up, down):.3g}")
             for record in records:
                 record[i] += float(self.half_step[i]) * _path(n, up, down, generator)
         return records.reshape(signal.shape)

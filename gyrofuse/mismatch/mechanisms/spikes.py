@@ -9,6 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.axes import OfSensors
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.episodes import episodes_of, two_level_scores
 from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
@@ -48,9 +49,9 @@ class Spikes(Mechanism):
 
     name: ClassVar[str] = "spikes"
     taken_off: ClassVar[bool] = True
-    rate: Tensor
-    height: Tensor
-    spread: Tensor
+    rate: OfSensors
+    height: OfSensors
+    spread: OfSensors
     together: bool
 
     @property

@@ -9,6 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.axes import OfSensors
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.evidence import corrected
 from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
@@ -32,8 +33,8 @@ class StuckSamples(Mechanism):
 
     name: ClassVar[str] = "stuck_samples"
     place: ClassVar[int] = 3
-    probability: Tensor
-    by_chance: Tensor
+    probability: OfSensors
+    by_chance: OfSensors
     together: bool
 
     @classmethod

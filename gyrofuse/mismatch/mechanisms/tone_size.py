@@ -9,6 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.axes import OfSensors
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.folds import estimation_samples, signal_gains
 from gyrofuse.mismatch.known_lines import resized
@@ -34,7 +35,7 @@ class ToneSize(Mechanism):
 
     name: ClassVar[str] = "parameter_shift"
     frequency_hz: float
-    amplitude: Tensor
+    amplitude: OfSensors
 
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:

@@ -9,6 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.axes import OfSensors
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.episodes import (
     Episodes,
@@ -61,7 +62,7 @@ class VarianceChange(Mechanism):
     name: ClassVar[str] = "variance_change"
     happened_once: ClassVar[bool] = True
     episodes: tuple[tuple[float, float], ...]
-    factor: Tensor
+    factor: OfSensors
     corner_hz: float = 0.0
 
     @classmethod

@@ -11,6 +11,7 @@ from scipy import stats
 from torch import Tensor
 
 from gyrofuse._transforms import squared_modulus
+from gyrofuse.mismatch.axes import OfSensors
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.folds import estimation_samples
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
@@ -40,8 +41,8 @@ class VibrationTone(Mechanism):
     name: ClassVar[str] = "vibration_tone"
     taken_off: ClassVar[bool] = True
     frequency_hz: float
-    cosine: Tensor
-    sine: Tensor
+    cosine: OfSensors
+    sine: OfSensors
 
     @property
     def amplitude(self) -> Tensor:
