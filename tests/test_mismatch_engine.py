@@ -13,11 +13,15 @@ from scipy import stats
 
 import gyrofuse as gf
 from gyrofuse.mismatch import diagnose, discrepancy
+from gyrofuse.mismatch.case import Scene
 from gyrofuse.mismatch.engine import _known
 from gyrofuse.mismatch.evidence import calibrated
 from gyrofuse.mismatch.inputs import prepared
 from gyrofuse.mismatch.mechanisms.clipping import Clipping
+from gyrofuse.mismatch.mechanisms.low_pass import LowPassFilter
+from gyrofuse.mismatch.mechanisms.resonance import Resonance
 from gyrofuse.mismatch.mechanisms.unit_scale import UnitScale
+from gyrofuse.mismatch.oscillating import Mode
 from gyrofuse.mismatch.twins import twin, twin_p_values
 
 MODEL = gf.WhiteNoise(1.0) + gf.AR1(0.999, 1e-4) + gf.RandomWalk(1e-8)
@@ -255,6 +259,30 @@ def test_of_values_that_hardly_leave_a_step_only_the_step_is_told(step: float):
     found = diagnose(recording, noise.simulate(2**15, generator=g), rate=100.0)
     (finding,) = found.findings
     assert finding.mechanism == "quantization"
-    assert finding.sentence.endswith("the noise of sensors 1, 2, 3 is so much smaller that nothing else can be told")
+    assert finding.sentence.endswith(
+        "the noise of sensors 1, 2, 3 is so much smaller that nothing else can be told there"
+    )
     assert not found.unexplained
     assert found.held_out.after < 2 < found.held_out.before
+
+
+@pytest.mark.parametrize("mechanism", ["resonance", "low_pass"])
+def test_beside_a_sensor_that_hardly_leaves_a_step_the_others_are_searched_on(mechanism: str):
+    """And what is left is told as unexplained: the rounded sensor has the same in it, of which no more can be told."""
+    g = torch.Generator().manual_seed(1)
+    scene = Scene(100.0, "unknown", tuple("abcdef"))
+    noise = gf.ArrayModel.from_sensors([gf.WhiteNoise(1.0 + i / 10) + gf.AR1(0.99, 1e-3) for i in range(6)])
+    recording, simulation = (noise.simulate(8191, generator=g) for _ in range(2))
+    effects = {
+        "resonance": Resonance(Mode(0.17, 0.01, torch.full((6,), 0.6, dtype=torch.complex128), True)),
+        "low_pass": LowPassFilter("pole", torch.full((6,), 0.4, dtype=torch.float64)),
+    }
+    recording = effects[mechanism].simulated(recording, scene, g)
+    recording[2] = 4.0 * torch.round(recording[2] / 4.0)
+    found = diagnose(recording, simulation, rate=100.0)
+    rounding, *others = found.findings
+    assert (rounding.mechanism, rounding.sensors, rounding.hides) == ("quantization", (2,), (2,))
+    assert [(f.mechanism, f.sensors) for f in others] == [(mechanism, (0, 1, 3, 4, 5))]
+    assert any("sensor 3" in e.words for e in found.unexplained)
+    assert not any(e.sensors and 2 not in e.sensors for e in found.unexplained)
+    assert float((found.model.effects[0].simulated(simulation, scene, g)[2] % 4.0).diff().abs().max()) < 1e-9

@@ -7,6 +7,7 @@ act on both alike.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -146,6 +147,24 @@ class Case:
         simulated = replace(self.simulated, signal=factor * self.simulated.signal)
         return replace(self, simulated=simulated, analog=factor * self.analog, converter=converter)
 
+    def with_stand_ins(self, sensors: Sequence[int], generator: torch.Generator) -> Case:
+        """With white noise in the place of sensors of which no more can be told, of one law on both sides.
+
+        Nothing differs there any more, while the others keep their positions and are searched on. The converter leaves
+        the noise as it is.
+        """
+        hidden = torch.zeros(self.n_sensors, 1, dtype=torch.bool)
+        hidden[list(sensors)] = True
+        sd = self.recording.diff().std(-1, keepdim=True) / math.sqrt(2)
+        recorded, analog = (
+            torch.where(hidden, sd * torch.randn(old.shape, generator=generator, dtype=torch.float64), old)
+            for old in (self.recorded.signal, self.analog)
+        )
+        simulated = torch.where(hidden, analog, self.simulated.signal)
+        converter = tuple((place, partial(_but_for, act, hidden)) for place, act in self.converter)
+        sides = replace(self.recorded, signal=recorded), replace(self.simulated, signal=simulated)
+        return replace(self, recorded=sides[0], simulated=sides[1], analog=analog, converter=converter)
+
     def built_in(self, act: Callable[[Tensor], Tensor], place: int = 0) -> Case:
         """With something that acts on the simulation's samples, after what has a lower place in the chain.
 
@@ -165,6 +184,11 @@ class Case:
 def _in_unit(act: Callable[[Tensor], Tensor], factor: float, signal: Tensor) -> Tensor:
     """What acts in one unit on signals that are in another."""
     return factor * act(signal / factor)
+
+
+def _but_for(act: Callable[[Tensor], Tensor], hidden: Tensor, signal: Tensor) -> Tensor:
+    """What acts on all sensors but those that are hidden, `(sensor, 1)`."""
+    return torch.where(hidden, signal, act(signal))
 
 
 def block_means(signal: Tensor) -> Tensor:

@@ -105,7 +105,7 @@ def _without(link: Link, later: list[Finding], generator: torch.Generator) -> tu
         return link.gain, link.before
     left = link.before
     for other in later:
-        left = other.effect.explained(left, generator)
+        left = other.explained(left, generator)
     return held_out_gain(left, link.finding.effect), left
 
 
@@ -117,7 +117,7 @@ def _relinked(
     for finding in findings:
         gain = held_out_gain(case, finding.effect)
         links.append(Link(replace(finding, held_out_gain=gain.total), case, gain))
-        case = finding.effect.explained(case, generator)
+        case = finding.explained(case, generator)
     return links, case
 
 
@@ -159,7 +159,7 @@ def _better(
         least = sum((link.gain.total for link in gone), first.gain.total)
         left = first.before
         for other in rest:
-            left = other.effect.explained(left, generator)
+            left = other.explained(left, generator)
     for mechanism in (m for stage in STAGES for m in stage if m.name == told.instead.mechanism):
         found = mechanism.nominate(left, level)
         if found is None:

@@ -138,7 +138,7 @@ class Finding:
         gain_without: The same where all other findings are in: what is lost if it alone is left out.
         instead: Its best look-alike on the same blocks; None where nothing in the catalogue looks like it.
         sentence: The same in plain English.
-        hides_others: Whether no more can be told of a recording that has it.
+        hides: Positions of sensors in which it leaves nothing else to be told.
     """
 
     mechanism: str
@@ -156,7 +156,12 @@ class Finding:
     held_out_gain: float | None = None
     gain_without: float | None = None
     instead: Instead | None = None
-    hides_others: bool = False
+    hides: tuple[int, ...] = ()
+
+    def explained(self, case: Case, generator: torch.Generator) -> Case:
+        """The case with the effect explained, and noise in the place of sensors that it hides all else of."""
+        case = self.effect.explained(case, generator)
+        return case.with_stand_ins(self.hides, generator) if self.hides else case
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, ready for JSON."""

@@ -6,7 +6,8 @@ is no finding: witnesses that asked for it stay in the report as unexplained.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 import torch
@@ -38,6 +39,12 @@ class Remainder(Filter):
     def of(cls, case: Case) -> Remainder:
         """What the spectra ask for."""
         return cls._between(case.recorded, case.simulated)
+
+    def but_for(self, sensors: Sequence[int]) -> Remainder:
+        """The same, with some sensors left as they are."""
+        log_gain = self.log_gain.clone()
+        log_gain[list(sensors)] = 0.0
+        return replace(self, log_gain=log_gain)
 
     @classmethod
     def _between(cls, recorded: Side, simulated: Side) -> Remainder:

@@ -42,7 +42,7 @@ def repaired_from_dict(description: Mapping[str, Any]) -> RepairedModel:
             _value(tuple[str, ...], description["sensors"], "sensors", {}),
         )
         noise_samples = check_n_samples("noise_samples", description.get("noise_samples", 0))
-        entries = _value(tuple[dict, ...], description["effects"], "effects", {})  # type: ignore[type-arg]
+        entries = _value(tuple[dict, ...], description["effects"], "effects", {})
     except (KeyError, TypeError, OverflowError) as error:
         raise ValueError(
             "`description`: expected the entries noise, effects, rate, unit and sensors of a repaired simulation, got "

@@ -106,7 +106,9 @@ class Quantization(Mechanism):
         hidden = ", hidden under what was added later" if float(blur.max()) > 0 else ""
         coarse = _too_coarse(case.recording, found)
         if coarse:
-            hidden += f"; the noise of {case.scene.named(coarse)} is so much smaller that nothing else can be told"
+            hidden += (
+                f"; the noise of {case.scene.named(coarse)} is so much smaller that nothing else can be told there"
+            )
         return Finding(
             cls.name,
             effect,
@@ -116,7 +118,7 @@ class Quantization(Mechanism):
             parameters,
             levels=(1,),
             gain=float(effect._scores(case.recording).sum()),
-            hides_others=bool(coarse),
+            hides=tuple(coarse),
         )
 
     def refitted(self, case: Case, fold: int) -> Quantization:
