@@ -55,6 +55,10 @@ def diagnose(
     twins: Annotated[
         int, typer.Option(metavar="N", help="Hold the false alarm for this very recording, by N twins of it.")
     ] = 0,
+    judge: Annotated[
+        Path | None,
+        typer.Option(metavar="OTHER", help="Another log of the same device: does the repair help there, too?"),
+    ] = None,
     rest: Annotated[
         str | None, typer.Option(metavar="START:STOP", help="Diagnose this stretch alone (seconds).")
     ] = None,
@@ -78,16 +82,27 @@ def diagnose(
     """Find where a log, recorded at rest, differs from a simulation, and which physics that left out.
 
     The verdict comes first; it is no error to find something. Spectra ask for records without gaps: where samples are
-    missing, the longest stretch in which all sensors have theirs is diagnosed, and said.
+    missing, the longest stretch in which all sensors have theirs is diagnosed, and said. With --judge another log of
+    the device, at the same rate and of the same sensors, says how far the simulation is from it before and after the
+    repair, and how far the two logs are apart.
     """
     resting = stretch(rest)
     asked = {"corrected": corrected, "model-out": model_out, "json": json_file, "report": report}
-    with outputs(force, [*logs, mounting, simulation], **asked) as drafts:
+    with outputs(force, [*logs, mounting, simulation, judge], **asked) as drafts:
         recording = _one_axis(read(logs, axis, sensors, rate, unit, scale, key, mounting), titled(logs))
         recording = _as_the_model(recording, simulation)
         simulated = _simulation(simulation, recording, axis, sensors, rate, unit)
+        judging = None
+        if judge is not None:
+            judging = _one_axis(read([judge], axis, sensors, rate, unit, scale, key, mounting), judge.name)
+            judging = _as_the_model(judging, simulation)
         part = at_rest(recording, resting)
-        found, remarks = _diagnosed(part, simulated, (titled(logs), simulation), false_alarm, twins)
+        names = {
+            "`recording`": titled(logs),
+            "`simulation`": str(simulation),
+            "`judge`": "" if judge is None else judge.name,
+        }
+        found, remarks = _diagnosed(part, simulated, judging, names, false_alarm, twins)
         remarks += _units_taken(recording, simulated, (titled(logs), simulation.name))
         if corrected:
             whole, _ = without_gaps(part, "", 0)
@@ -101,8 +116,10 @@ def diagnose(
             with progress("drawing"):
                 found.to_html(drafts[report], title=f"{titled(logs)} against {simulation.name}", remarks=remarks)
         if json_file:
-            names = {"recording": list(recording.source), "simulation": simulation.name}
-            write_json(drafts[json_file], {**names, **found.to_dict()})
+            sources = {"recording": list(recording.source), "simulation": simulation.name}
+            if judge is not None:
+                sources["judge"] = judge.name
+            write_json(drafts[json_file], {**sources, **found.to_dict()})
     say("\n".join([found.summary(), *remarks]))
     say_notes(recording)
 
@@ -110,7 +127,8 @@ def diagnose(
 def _diagnosed(
     recording: Recording,
     simulation: Recording | Model | ArrayModel | RepairedModel,
-    names: tuple[str, Path],
+    judge: Recording | None,
+    names: dict[str, str],
     false_alarm: float,
     twins: int,
 ) -> tuple[MismatchReport, list[str]]:
@@ -125,14 +143,17 @@ def _diagnosed(
             lacking = []
         try:
             part, remarks = without_gaps(recording, "Diagnosed", FEWEST)
-            found = find_mismatch(part, simulation, false_alarm=false_alarm, twins=twins, progress=show)
+            if judge is not None:
+                judge, gaps = without_gaps(judge, f"{names['`judge`']}: judged", 0)
+                lacking += gaps
+            found = find_mismatch(part, simulation, false_alarm=false_alarm, twins=twins, judge=judge, progress=show)
             start = float(part.time[0])
             if start and found.mismatch:
                 remarks.append(f"Times count from the first sample that was diagnosed, at {start:.6g} s of the log.")
             return found, remarks + lacking
         except (ValueError, TypeError) as error:
             message = str(error)
-            files = {"`recording`": names[0], "`LOG`": names[0], "`simulation`": str(names[1])}
+            files = {**names, "`LOG`": names["`recording`"]}
             options = {"`false_alarm`": "`--false-alarm`", "`twins`": "`--twins`"}
             for parameter, told in {**files, **options}.items():
                 message = message.replace(parameter, told)

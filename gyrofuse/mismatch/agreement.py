@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._model import Model
+from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.confirm import mean_discrepancy
 from gyrofuse.mismatch.evidence import uncorrected
 from gyrofuse.mismatch.inputs import prepared
@@ -43,5 +44,16 @@ def discrepancy(
     if generator is None:
         generator = torch.Generator().manual_seed(0)
     given = prepared(recording, simulation, rate, generator)
+    return mean_discrepancy(compared(given, simulation, generator))
+
+
+def compared(given: Case, simulation: object, generator: torch.Generator) -> Case:
+    """A case as a discrepancy sees it: without what the simulation itself has of channels and moments.
+
+    Args:
+        given: Recording and simulation as they came.
+        simulation: As it was given.
+        generator: Of what is built into the simulation.
+    """
     start, _ = with_own_effects(given, simulation, uncorrected(_FALSE_ALARM, len(WITNESSES)), generator)
-    return mean_discrepancy(start)
+    return start

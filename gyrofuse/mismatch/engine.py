@@ -16,6 +16,7 @@ from gyrofuse.mismatch.confirm import held_out, held_out_gain, leads_away
 from gyrofuse.mismatch.counterfactual import Link, settled
 from gyrofuse.mismatch.evidence import calibrated, corrected, uncorrected
 from gyrofuse.mismatch.inputs import prepared
+from gyrofuse.mismatch.judge import checked_judge, judged
 from gyrofuse.mismatch.mechanism import Finding
 from gyrofuse.mismatch.mechanisms import STAGES
 from gyrofuse.mismatch.mechanisms.quantization import Quantization
@@ -44,6 +45,7 @@ def diagnose(
     false_alarm: float = 0.01,
     rate: float | None = None,
     twins: int = 0,
+    judge: Recording | Tensor | None = None,
     generator: torch.Generator | None = None,
     progress: Callable[[str, float], None] = lambda _what, _share: None,
 ) -> MismatchReport:
@@ -60,6 +62,8 @@ def diagnose(
         twins: How many twins of the recording, in which nothing is missing, tell how surprising the witnesses are.
             By default none: their own p values are held to, which are honest for the noise of ordinary sensors. With
             50 or more the error rate holds for this very recording, at so many times the cost of a look.
+        judge: Another recording of the same device, in the same kind, of which nothing is estimated: it says how far
+            the simulation is from it before and after the repair, and how far the recording itself (`judged`).
         generator: Source of the diagnosis's own random numbers: of a model's samples, and of what is built into the
             simulation. By default one with a fixed seed, so that a diagnosis can be repeated.
         progress: Is told what is looked at next, and the share of the work that is done: where something is missing
@@ -69,8 +73,8 @@ def diagnose(
         Verdict, findings, held-out scores, and the repaired simulation.
 
     Raises:
-        TypeError: Neither samples nor a model.
-        ValueError: Recording and simulation do not fit each other, are too short, or constant.
+        TypeError: Neither samples nor a model, or a judge of another kind than the recording.
+        ValueError: Recording, simulation and judge do not fit each other, are too short, or constant.
     """
     if isinstance(false_alarm, bool) or not isinstance(false_alarm, Real) or not 0 < false_alarm < 1:
         raise ValueError(f"`false_alarm`: expected a number between 0 and 1 such as 0.01, got {false_alarm!r}")
@@ -80,6 +84,8 @@ def diagnose(
         generator = torch.Generator().manual_seed(0)
     level = uncorrected(false_alarm, len(WITNESSES))  # what would be a mismatch, had one witness alone said it
     given = prepared(recording, simulation, rate, generator)
+    if judge is not None:
+        judge = checked_judge(judge, recording, rate)
     start, own = with_own_effects(given, simulation, level, generator)
     model = RepairedModel(noise_of(simulation, _unrounded(start)), start.scene, own, noise_samples(simulation))
     evidence = testimony(start, lambda what, share: progress(what, _LOOKED * share))
@@ -87,6 +93,7 @@ def diagnose(
     if twins:
         p_value = calibrated(p_value, twin_p_values(start, twins, generator))
     if p_value > false_alarm:
+        verdict = None if judge is None else judged(judge, recording, simulation, None, rate)
         return MismatchReport(
             mismatch=False,
             p_value=p_value,
@@ -99,6 +106,7 @@ def diagnose(
             recording=given.recording,
             case=start,
             repaired=start,
+            judged=verdict,
         )
     case: Case = start
     links: list[Link] = []
@@ -144,18 +152,24 @@ def diagnose(
         after = testimony(case)
         told = {*_OF_SAMPLES, *(e.witness for e in left)}
         left += [e for e in after if corrected(e.p_value, len(evidence)) <= false_alarm and e.witness not in told]
+    model = replace(model, effects=effects)
+    verdict = None
+    if judge is not None:
+        progress("another recording", _CHECKED)
+        verdict = judged(judge, recording, simulation, model, rate)
     return MismatchReport(
         mismatch=True,
         p_value=p_value,
         findings=findings,
         unexplained=tuple(left),
         held_out=held_out(start, gains, generator),
-        model=replace(model, effects=effects),
+        model=model,
         evidence=evidence,
         evidence_after=after,
         recording=given.recording,
         case=start,
         repaired=case,
+        judged=verdict,
     )
 
 

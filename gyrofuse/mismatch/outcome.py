@@ -15,6 +15,7 @@ from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.comparison import VarianceComparison, compared_variances
 from gyrofuse.mismatch.confirm import HeldOut
 from gyrofuse.mismatch.evidence import Evidence
+from gyrofuse.mismatch.judge import Judged
 from gyrofuse.mismatch.mechanism import Finding
 from gyrofuse.mismatch.repaired import RepairedModel
 from gyrofuse.recording import Recording
@@ -38,6 +39,7 @@ class Outcome:
     recording: Tensor
     case: Case
     repaired: Case
+    judged: Judged | None = None
 
     def correct(self, recording: _Signal) -> _Signal:
         """The recording that was diagnosed, or one that runs along with it, without what can be taken off it.
@@ -100,6 +102,7 @@ class Outcome:
                 "evidence": [entry.to_dict() for entry in self.evidence],
                 "evidence_after": [entry.to_dict() for entry in self.evidence_after],
                 "held_out": self.held_out.to_dict(),
+                "judged": None if self.judged is None else self.judged.to_dict(),
                 "model": self.model.to_dict(),
             }
         )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from gyrofuse._result import p_words
 from gyrofuse.mismatch.outcome import Outcome
-from gyrofuse.mismatch.telling import fused_words, nats, otherwise_words, parameter_words
+from gyrofuse.mismatch.telling import fused_words, judged_words, nats, otherwise_words, parameter_words
 from gyrofuse.plotting_mismatch import plot_map
 from gyrofuse.report_mismatch import mismatch_page
 
@@ -33,12 +33,14 @@ class MismatchReport(Outcome):
         recording: As it came, `(sensor, time)`.
         case: Recording and simulation; of a repaired one, its noise, and the recording without its effects.
         repaired: The recording without what can be taken off it, and the simulation with all else.
+        judged: How far the simulation, the repaired one and the recording are from another recording, where one was
+            given.
     """
 
     def summary(self) -> str:
         """The verdict in sentences, then the numbers."""
         if not self.mismatch:
-            return f"Recording and simulation agree (p = {self.p_value:.2g})."
+            return "\n".join([f"Recording and simulation agree (p = {self.p_value:.2g}).", *judged_words(self)])
         lines = [f"Recording and simulation differ ({p_words(self.p_value)})."]
         for i, finding in enumerate(self.findings, 1):
             gain = "" if finding.held_out_gain is None else f"; {finding.held_out_gain:+.1f} nats on data held out"
@@ -56,7 +58,7 @@ class MismatchReport(Outcome):
             f"gain {h.gain:.1f} nats ({h.low:.1f} to {h.high:.1f}); a classifier tells the two apart with an area "
             f"under the curve of {h.auc_before:.2f} before and {h.auc_after:.2f} after (0.5 = guessing)"
         )
-        return "\n".join([*lines, *fused_words(self)])
+        return "\n".join([*lines, *judged_words(self), *fused_words(self)])
 
     def __str__(self) -> str:
         return self.summary()

@@ -47,6 +47,7 @@ def verdict(outcome: Outcome) -> list[str]:
             f"Recording and simulation agree: p = {outcome.p_value:.2g} if nothing is missing.",
             f"What surprises most among {len(outcome.evidence)} witnesses, {mechanism_words(most.witness)}, is no more "
             f"than chance gives (p = {most.p_value:.2g}).",
+            *(f"{words}." for words in judged_words(outcome)),
         ]
     sentences = [f"Recording and simulation differ: {p_words(outcome.p_value)} if nothing were missing."]
     if all(f.mechanism == "not_identifiable" for f in outcome.findings):
@@ -65,7 +66,7 @@ def verdict(outcome: Outcome) -> list[str]:
             "So that the repaired simulation has the recording's spectra all the same, the noise of each sensor passes "
             "a filter that stands for no physics."
         )
-    return sentences + fused_words(outcome)
+    return [*sentences, *(f"{words}." for words in judged_words(outcome)), *fused_words(outcome)]
 
 
 def otherwise_words(finding: Finding) -> str:
@@ -92,6 +93,24 @@ def fused_words(outcome: Outcome) -> list[str]:
     if factor > 1:
         return [f"{start} with {factor:.3g} times less wavelet variance."]
     return [f"{start} with {1 / factor:.3g} times more wavelet variance."]
+
+
+def judged_words(outcome: Outcome) -> list[str]:
+    """One sentence on what another recording says of the repair, where one was given."""
+    j = outcome.judged
+    if j is None:
+        return []
+    if not outcome.mismatch:
+        verdict = "there was nothing to repair"
+    else:
+        verdict = "the repair helps there" if j.helps else "the repair does not help there"
+    lacks = f" without what follows {' and '.join(j.lacks)}, which it has not," if j.lacks else ""
+    return [
+        f"On another recording, which no number was estimated from,{lacks} the discrepancy is {j.before:.2f} before "
+        f"and {j.after:.2f} after repair, and {j.repeatability:.2f} with the recording itself in the place of the "
+        f"simulation (1 = noise alone); a classifier tells them apart with an area under the curve of "
+        f"{j.auc_before:.2f} before, {j.auc_after:.2f} after and {j.auc_repeatability:.2f} (0.5 = guessing): {verdict}"
+    ]
 
 
 def benefit_of(outcome: Outcome) -> Benefit | None:
