@@ -116,3 +116,16 @@ def test_features_are_finite_for_what_stands_still():
     signal = torch.zeros(P, N, dtype=torch.float64)
     signal[:, ::7] = 1.0
     assert bool(features(signal, 32).isfinite().all())
+
+
+@pytest.mark.parametrize("n", [4096, 4812, 5003])
+def test_a_remainder_is_estimated_anew_from_the_blocks_of_the_shortest_recordings(n: int):
+    """Their last bands are narrower than a bin of a block."""
+    recording, simulation = white(3)[0, :, :n], white(4)[:, :, :n]
+    given = Case.of(SCENE, 1.5 * recording, simulation)
+    found = Remainder.of(given)
+    for fold in range(N_FOLDS):
+        again = found.refitted(given, fold)
+        assert bool(again.log_gain.isfinite().all())
+        assert float(again.log_gain.mean()) == pytest.approx(math.log(1.5), abs=0.2)
+        assert bool(again.gains(given, fold).isfinite().all())

@@ -52,8 +52,9 @@ class Remainder(Filter):
         worth = torch.minimum(recorded.dof, simulated.dof)
         ratio = (recorded.power.clamp(min=1e-300) / simulated.power.clamp(min=1e-300)).log()
         chance = 1 / recorded.dof.clamp(min=1e-9) + 1 / simulated.dof.clamp(min=1e-9)
-        kept = (1 - chance / ratio.square().clamp(min=1e-300)).clamp(min=0.0) * (worth > 0)
-        return cls(recorded.bands.frequency, kept * ratio / 2)
+        kept = (1 - chance / ratio.square().clamp(min=1e-300)).clamp(min=0.0)
+        # Blocks are too short for the slowest bands: without a bin there is no power either.
+        return cls(recorded.bands.frequency, torch.where(worth > 0, kept * ratio / 2, 0.0))
 
     def response(self, f: Tensor) -> Tensor:
         x, at = f.clamp(self.frequency[0], self.frequency[-1]).log(), self.frequency.log()

@@ -83,11 +83,11 @@ def cross_spectra(signal: Tensor, wanted: Bands) -> Tensor:
     transform = torch.fft.rfft(signal, n=2 * n)
     matrices, scale = [], n / wanted.n_samples
     # Half bins around each bin, `(..., sensor, bin, half bin)`, from the first one that has so many below it.
-    first_whole = _TAPERS // 2
+    first_whole, last = _TAPERS // 2, (n - _TAPERS) // 2
     around = transform.unfold(-1, 2 * _TAPERS + 1, 2)
     for first, end in itertools.pairwise(wanted.edges):
-        a = max(round(first * scale), _FIRST_BIN)
-        b = min(max(round(end * scale), a + 1), (n - _TAPERS) // 2)
+        a = min(max(round(first * scale), _FIRST_BIN), last - 1)  # of a short signal the last bands share a bin
+        b = min(max(round(end * scale), a + 1), last)
         own = around[..., a - first_whole : b - first_whole, :]
         y = (own[..., :_TAPERS] - own[..., _TAPERS + 1 :].flip(-1)).flatten(-2)  # (..., sensor, bin * taper)
         matrices.append(y @ y.mH / (2 * n * y.shape[-1]))
