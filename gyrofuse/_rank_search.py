@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from abc import ABC, abstractmethod
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Generic, TypeVar
 
 import torch
@@ -15,6 +16,7 @@ from gyrofuse._composition import Composition
 from gyrofuse._rank_candidates import Key, Kinds
 from gyrofuse._rank_moments import MomentFit, Moments
 from gyrofuse._rank_spectra import NoiseFit, Spectra
+from gyrofuse.processes import AR1, QuantizationNoise, RandomWalk, WhiteNoise
 
 # Penalised likelihoods within a factor of e^2 = 7: the record does not decide.
 EQUIVALENT = 4.0
@@ -52,7 +54,9 @@ class _Search(ABC, Generic[FitT]):
     def run(self, wanted: list[Kinds], searching: bool) -> None:
         """Fit all that are wanted to all records, or search among them for those that matter to each."""
         if searching:
-            self._widen(wanted)
+            known = {compositions.key_of(kinds) for kinds in wanted}
+            self._widen([kinds for kinds in wanted if len(kinds) == 1], known)
+            self._settle(known)
             return
         for kinds in compositions.with_ancestors(wanted):
             self._try_out(kinds, self._everyone)
@@ -68,12 +72,11 @@ class _Search(ABC, Generic[FitT]):
         made_of, fit = self.fits[key]
         return (self._loss(fit) + compositions.charge(made_of, self._n_samples)).nan_to_num(nan=torch.inf)
 
-    def _widen(self, wanted: list[Kinds]) -> None:
+    def _widen(self, first: list[Kinds], known: set[Key]) -> None:
         """From one process to more, for every record the children of its few best, as long as one of them gains."""
-        known = {compositions.key_of(kinds) for kinds in wanted}
         everyone = torch.ones_like(self._everyone, dtype=torch.bool)
         best = torch.full_like(self._everyone, torch.inf, dtype=torch.float64)
-        todo = {compositions.key_of(kinds): (kinds, everyone) for kinds in wanted if len(kinds) == 1}
+        todo = {compositions.key_of(kinds): (kinds, everyone) for kinds in first}
         while todo:
             for kinds, which in todo.values():
                 self._try_out(kinds, which.nonzero()[:, 0])
@@ -88,13 +91,70 @@ class _Search(ABC, Generic[FitT]):
                     following[compositions.key_of(child)] = child, which | other
             todo = following
 
-    def _try_out(self, kinds: Kinds, items: Tensor) -> None:
+    def _settle(self, known: set[Key]) -> None:
+        """Compare the best one of each record with all next to it, until none of these is better.
+
+        Next to a composition are those with a process more or less, and those with one or two processes of one
+        parameter in the place of an AR1, which has two: it is white noise or a random walk at the ends of its range,
+        and much like white and quantisation noise where it alternates weakly. The beam may hold no parent of a
+        composition for whose processes an AR1 stands in.
+        """
+        seen = {key: self._loss(fit).isfinite() for key, (_, fit) in self.fits.items()}
+        while True:
+            keys = list(self.fits)
+            best = torch.stack([self.criterion(key) for key in keys]).argmin(0)
+            unseen = False
+            for b in best.unique().tolist():
+                for kinds, start in self._next_to(keys[b], known):
+                    before = seen.get(compositions.key_of(kinds), torch.zeros_like(best, dtype=torch.bool))
+                    items = ((best == b) & ~before).nonzero()[:, 0]
+                    if len(items):
+                        unseen = True
+                        self._try_out(kinds, items, start)
+                        seen[compositions.key_of(kinds)] = before | (best == b)
+            if not unseen:
+                return
+
+    def _next_to(self, key: Key, known: set[Key]) -> list[tuple[Kinds, tuple[Composition, FitT] | None]]:
+        """Compositions next to one, the smaller ones first, each with what that one's fit leaves for a start."""
+        made_of, fit = self.fits[key]
+        kinds = compositions.kinds_of(made_of)
+        found = []
+        for k, kind in enumerate(kinds):
+            rest = [*kinds[:k], *kinds[k + 1 :]]
+            left = compositions.composition(rest, self.held), self._without(made_of, fit, k)
+            found.append((rest, left))
+            if kind is AR1:
+                lacking = [one for one in (WhiteNoise, QuantizationNoise, RandomWalk) if one not in rest]
+                found += [([*rest, one], left) for one in lacking]
+                found += [([*rest, *two], left) for two in itertools.combinations(lacking, 2)]
+        found += [(child, None) for child in compositions.children(kinds, known)]
+        return [
+            (other, start)
+            for other, start in sorted(found, key=lambda pair: len(pair[0]))
+            if compositions.key_of(other) in known
+        ]
+
+    @staticmethod
+    def _without(made_of: Composition, fit: FitT, k: int) -> FitT:
+        """The fit of a composition less one of its processes, to start from."""
+        linear = [i for i in range(made_of.n_linear) if i != k]
+        shape = [i for i, at in enumerate(made_of.shaped) if at != k]
+        return replace(fit, linear=fit.linear[:, linear], shape=fit.shape[:, shape])
+
+    def _try_out(self, kinds: Kinds, items: Tensor, start: tuple[Composition, FitT] | None = None) -> None:
         """Fit one composition to some records, from each of its parents: from the best of them alone it may be stuck.
 
         Where an AR1 of the best one stands for white noise, say, white noise cannot take its place.
+
+        Args:
+            kinds: Processes.
+            items: Which records.
+            start: Another place to start from: a composition with up to two processes less, and its parameters.
         """
         made_of = compositions.composition(kinds, self.held)
         smaller = [self.fits[key] for key in compositions.parents(kinds) if key in self.fits]
+        smaller += [start] if start else []
         afresh = not smaller or (self.afresh and len(made_of.curved) == 1)
         found = self._whole(self._first(made_of, items), items) if afresh else None
         for parent, fit in smaller:
@@ -103,8 +163,9 @@ class _Search(ABC, Generic[FitT]):
                 climbed = self._climb(made_of, own, *self._start(made_of, own, parent, _part(fit, own)))
                 whole = self._whole(climbed, own)
                 found = whole if found is None else self._better(found, whole)
+        key = compositions.key_of(kinds)
         if found is not None:
-            self.fits[compositions.key_of(kinds)] = made_of, found
+            self.fits[key] = made_of, self._better(self.fits[key][1], found) if key in self.fits else found
 
     def _whole(self, fit: FitT, items: Tensor) -> FitT:
         """Of all records, NaN but for these."""

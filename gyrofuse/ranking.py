@@ -60,7 +60,8 @@ def rank_models(
             `n_samples` given a wavelet variance `(..., level, sensor)` of records that long.
         candidates: Models without values or formulas such as `"WN + AR1"`; by default sums of WN, QN, up to three
             AR1s, RW and DR, with as many sinusoids as there are lines. They are tried from one process on, for
-            every sensor the extensions of its three best, as long as one of them gains.
+            every sensor the extensions of its three best, as long as one of them gains; in the end also those next to
+            the best, with a process less, or with WN, QN, RW or two of them in the place of an AR1.
         n_levels: Number of levels J of the wavelet variance; by default all that hold two windows side by side.
         n_samples: Length of the record behind a wavelet variance.
         max_tones: Most sinusoids looked for by default; none in wavelet variances, which hardly know frequencies.
