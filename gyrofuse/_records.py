@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gyrofuse.moment_covariance import moment_covariance
 from gyrofuse.processes import Model
 from gyrofuse.robust_covariance import robust_moment_covariance
 
@@ -63,12 +64,21 @@ class Records:
             start=torch.zeros((), dtype=torch.float64, device=shares.device),
         )
 
-    def covariances(self, model: Model) -> list[Tensor]:
-        """Covariance of the wavelet variances of each record under a model, `(..., level, level)`."""
+    def covariances(self, model: Model, excess_kurtosis: Tensor | float = 0.0) -> list[Tensor]:
+        """Covariance of the wavelet variances of each record under a model, `(..., level, level)`.
+
+        Args:
+            model: With parameters `(...)`.
+            excess_kurtosis: Of its white noise, a number or `(...)`; for the classic wavelet variance only.
+        """
         same: dict[tuple[int, int], Tensor] = {}
         for length, levels in zip(self.lengths, self.levels, strict=True):
             if (length, levels) not in same:
-                same[length, levels] = robust_moment_covariance(model, length, levels, efficiency=self.efficiency)
+                same[length, levels] = (
+                    moment_covariance(model, length, levels, excess_kurtosis=excess_kurtosis)
+                    if self.efficiency == 1
+                    else robust_moment_covariance(model, length, levels, efficiency=self.efficiency)
+                )
         return [same[key] for key in zip(self.lengths, self.levels, strict=True)]
 
     def covariance(self, model: Model) -> Tensor:

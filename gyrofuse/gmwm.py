@@ -21,6 +21,7 @@ from gyrofuse._drift_sign import rising, signed
 from gyrofuse._model_tones import model_tones
 from gyrofuse._records import Records
 from gyrofuse._result import named, numbered
+from gyrofuse._white_kurtosis import white_excess_kurtosis, with_excess_kurtosis
 from gyrofuse.continuous import fit_moments
 from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.moment_fit import composition_of
@@ -65,6 +66,9 @@ def fit_gmwm(
     known to hardly its order of magnitude and of AR1s that another process could stand for are by profile: every value
     with which the best fit is at most `z^2` worse; near zero they hold the truth somewhat more often than stated. What
     cannot be told apart is said in `remarks`.
+
+    Noise is taken for Gaussian but for its white part, whose excess kurtosis, estimated from the signal's differences
+    as if its samples were independent, counts in the interval of its variance.
 
     `Omega` is updated between fits and held in each. With `continuous`, `r' V(theta)^-1 r` is minimised over both, from
     the optimal fit downhill: a large `V` then excuses any residual, and what the last levels decide comes out large. In
@@ -159,6 +163,9 @@ def fit_gmwm(
         inference = _refined(series[usable], tones, fit, made_of, inference, confidence_level)
     else:
         inference = profiled(inference, MomentSurface(fit, made_of), fit, made_of, confidence_level)
+    if series is not None and efficiency == 1:
+        kappa = white_excess_kurtosis(series[usable], tones, made_of, inference.estimates.params)
+        inference = with_excess_kurtosis(inference, kappa, made_of, length, confidence_level)
     said = remarks(made_of, inference.estimates, length, confidence_level, tones)
     if series is not None:
         estimates = signed(inference.estimates, Model(list(made_of.processes)), rising(series[usable]))

@@ -14,8 +14,10 @@ from gyrofuse import _moment_search as search
 from gyrofuse._checks import check_signal
 from gyrofuse._composition import Composition
 from gyrofuse._drift_sign import drifts_of, signed
+from gyrofuse._model_tones import model_tones
 from gyrofuse._records import Records
 from gyrofuse._result import listed
+from gyrofuse._white_kurtosis import white_excess_kurtosis, with_excess_kurtosis
 from gyrofuse.gmwm import fit_gmwm
 from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.moment_fit import composition_of, fit_items
@@ -162,6 +164,8 @@ def fit_jointly(
     fit = fit_items(nu, frequencies, records, made_of, "optimal")
     inference = infer(fit, made_of, confidence_level)
     inference = profiled(inference, MomentSurface(fit, made_of), fit, made_of, confidence_level)
+    kappa = _excess_kurtosis(signals, usable, made_of, inference.estimates.params)
+    inference = with_excess_kurtosis(inference, kappa, made_of, sum(records.lengths), confidence_level)
 
     whole = first.wavelet_variance.new_full((len(usable), records.n_levels), torch.nan)
     whole[usable] = nu
@@ -186,7 +190,7 @@ def fit_jointly(
         rate=first.rate,
         unit=first.unit,
     )
-    difference = _difference(apart, fit, made_of) + disagreement
+    difference = _difference(apart, fit, made_of, kappa) + disagreement
     present = fit.linear > 0
     known = present.sum(-1) + present[:, made_of.shaped].sum(-1)
     degrees = ((len(signals) - 1) * known).to(difference)
@@ -250,12 +254,27 @@ def _frequencies(
     return (mean, total.rsqrt()), disagreement
 
 
-def _difference(apart: list[Tensor], fit: Fit, made_of: Composition) -> Tensor:
+def _excess_kurtosis(signals: list[Tensor], usable: Tensor, made_of: Composition, params: Tensor) -> Tensor:
+    """Of the white noise of all recordings, of one variance, `(item,)`: the mean, each with as much as it has samples.
+
+    One for all, as the test asks whether they could be of one noise.
+    """
+    lengths = [signal.shape[-1] for signal in signals]
+    total = torch.zeros_like(params[:, 0])
+    for signal, length in zip(signals, lengths, strict=True):
+        series = signal.detach().reshape(-1, length)[usable]
+        own = white_excess_kurtosis(series, model_tones(series, made_of), made_of, params)
+        total = total + own * length / sum(lengths)
+    return total
+
+
+def _difference(apart: list[Tensor], fit: Fit, made_of: Composition, kappa: Tensor) -> Tensor:
     """Objectives of the recordings at the joint fit less those at the best of each, same weights, `(item,)`."""
     size = fit.variance.amax(-1, keepdim=True)
     linear = fit.linear / size
     total = torch.zeros_like(size[:, 0])
-    for variance, covariance in zip(apart, fit.records.covariances(made_of.model(linear, fit.shape)), strict=True):
+    covariances = fit.records.covariances(made_of.model(linear, fit.shape), kappa)
+    for variance, covariance in zip(apart, covariances, strict=True):
         nu, root = variance / size, search.whitening(covariance)
         tau = fit.tau[: nu.shape[-1]]
         residual = nu - made_of.wavelet_variance(tau, linear, fit.shape)

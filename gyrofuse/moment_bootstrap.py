@@ -16,6 +16,7 @@ from gyrofuse._drift_sign import drifts_of
 from gyrofuse._model_tones import model_tones
 from gyrofuse._paths import own_generator
 from gyrofuse._result import ConfidenceInterval, listed
+from gyrofuse._white_kurtosis import white_excess_kurtosis, with_excess_kurtosis
 from gyrofuse.continuous import fit_moments
 from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.moment_inference import Fit, Inference, infer, infer_efficient
@@ -250,6 +251,9 @@ def _fitted(
         refined = refine_whittle(series, made_of, fit.linear, fit.shape, tones=tones)
         there = replace(fit, linear=refined.linear, shape=refined.shape)
         inference = infer_efficient(there, made_of, refined.covariance, refined.edge_sd, result.confidence_level)
+    if result.efficiency == 1:
+        kappa = white_excess_kurtosis(series, tones, made_of, inference.estimates.params)
+        inference = with_excess_kurtosis(inference, kappa, made_of, result.n_samples, result.confidence_level)
     params, covariance = inference.estimates.params, inference.estimates.covariance
     spread = _in_unknowns(made_of, params, covariance)
     batch = records.shape[:2]

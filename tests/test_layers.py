@@ -68,6 +68,7 @@ LAYERS = [
         "_rank_moments",
         "_rank_candidates",
         "_model_tones",
+        "_white_kurtosis",
         "whittle",
     },
     {"parity_energy", "parity_reference", "fault_kinds"},
