@@ -162,6 +162,32 @@ def matrices(fit: ArrayFit, told: Tensor, confidence_level: float) -> tuple[Esti
     return entries, Estimate(*(unvech(part) for part in (rho, *certain)))
 
 
+def covariance_of_numbers(fit: ArrayFit, squared: Tensor, sd: Tensor, made_of: Composition) -> Tensor:
+    """Covariance of entries of the matrices and of `phi` or `beta`, process by process, `(item, number, number)`.
+
+    Args:
+        fit: Where the search ended.
+        squared: Units of the entries, `(item, 1, pair)`.
+        sd: Spread of `phi` and `beta`, `(item, parameter)`; where the search held one, all that is known of it.
+        made_of: Structure of the model.
+    """
+    n_items, n_pairs = len(squared), squared.shape[-1]
+    n_linear = made_of.n_linear * n_pairs
+    moved = [made_of.shaped.index(k) for k in made_of.curved]
+    among = fit.spread.diagonal(dim1=-2, dim2=-1)[:, n_linear:].clamp(min=0).sqrt()
+    # d phi / d x from the two spreads; 0 / 0 where there is none.
+    slope = (sd[:, moved] / among).nan_to_num(nan=0.0)
+    units = torch.cat([squared.expand(-1, made_of.n_linear, -1).flatten(1), slope], -1)
+    whole = torch.diag_embed(torch.cat([torch.zeros(n_items, n_linear).to(sd), sd.square()], -1))
+    place = torch.tensor([*range(n_linear), *(n_linear + i for i in moved)], device=sd.device)
+    whole[:, place[:, None], place] = fit.spread * (units[:, :, None] * units[:, None, :])
+    order = []
+    for k in range(made_of.n_linear):
+        order += range(k * n_pairs, (k + 1) * n_pairs)
+        order += [n_linear + made_of.shaped.index(k)] if k in made_of.shaped else []
+    return whole[:, order][:, :, order]
+
+
 def is_long(phi: Tensor, n_samples: int) -> Tensor:
     """Whether the record holds too few time constants of an AR1, of the shape of `phi`."""
     return phi > math.exp(-FEWEST_TIME_CONSTANTS / n_samples)

@@ -5,14 +5,16 @@ from __future__ import annotations
 import numbers
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields
-from functools import reduce
+from functools import partial, reduce
 from operator import add
 from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.func import jvp
 
 from gyrofuse._checks import check_positive, check_positive_integer
+from gyrofuse._estimation import EstimatedFrom
 from gyrofuse._paths import own_generator
 
 Parameter = float | Tensor | None
@@ -38,13 +40,17 @@ class Model:
 
     Args:
         models: Processes or models, flattened into `processes`.
+        estimated_from: Record that the parameters were estimated from, with their covariance in the order of `params`;
+            None for a model whose numbers are known. A sum of models has none.
 
     Raises:
-        ValueError: No process, or one that may appear once appears again.
+        ValueError: No process, one that may appear once appears again, or a covariance of other parameters.
         TypeError: Not a process or model.
     """
 
-    def __init__(self, models: Iterable[Model]):
+    estimated_from: EstimatedFrom | None = None
+
+    def __init__(self, models: Iterable[Model], *, estimated_from: EstimatedFrom | None = None):
         models = tuple(models)
         for model in models:
             if not isinstance(model, Model):
@@ -59,6 +65,13 @@ class Model:
                     f"`models`: {kind.__name__} appears more than once, and its copies cannot be told apart; "
                     f"use one {kind.__name__} with the sum of the {fields(kind)[0].name}s"
                 )
+        if estimated_from is not None:
+            if not estimated_from.fits(self.params.shape):
+                raise ValueError(
+                    f"`estimated_from`: expected a covariance of parameters {tuple(self.params.shape)}, got shape "
+                    f"{tuple(estimated_from.param_cov.shape)}"  # type: ignore[union-attr]
+                )
+            self.estimated_from = estimated_from
 
     @property
     def processes(self) -> tuple[Process, ...]:
@@ -80,8 +93,12 @@ class Model:
         values = [column for _, columns in self._known() for column in columns.values()]
         return torch.cat(torch.broadcast_tensors(*values), dim=-1)
 
-    def with_params(self, params: Tensor) -> Model:
+    def with_params(self, params: Tensor, *, estimated_from: EstimatedFrom | None = None) -> Model:
         """Return the same sum with parameters `(..., parameter)` in the order of `param_names`.
+
+        Args:
+            params: `(..., parameter)`.
+            estimated_from: Record that these were estimated from; by default they count as known.
 
         Raises:
             ValueError: Wrong number of parameters, or a value outside its domain.
@@ -92,7 +109,8 @@ class Model:
                 f"got shape {tuple(params.shape)}"
             )
         columns = iter(params.unbind(-1))
-        return Model([type(p)(**{name: next(columns) for name in p.parameters}) for p in self.processes])
+        processes = [type(p)(**{name: next(columns) for name in p.parameters}) for p in self.processes]
+        return Model(processes, estimated_from=estimated_from)
 
     def scaled(self, factor: float) -> Model:
         """Return the model of the signal times a factor: in another unit, say.
@@ -102,8 +120,9 @@ class Model:
         """
         factor = check_positive("factor", factor)
         powers = {"variance": 2, "amplitude": 1, "slope": 1}
-        scale = [factor ** powers.get(name.rpartition(".")[2], 0) for name in self.param_names]
-        return self.with_params(self.params * self.params.new_tensor(scale))
+        scale = self.params.new_tensor([factor ** powers.get(name.rpartition(".")[2], 0) for name in self.param_names])
+        told = None if self.estimated_from is None else self.estimated_from.scaled(scale)
+        return self.with_params(self.params * scale, estimated_from=told)
 
     def wavelet_variance(self, n_levels: int) -> Tensor:
         """Theoretical Haar wavelet variance `(..., level)` of levels 1 to `n_levels`, signal^2, float64.
@@ -137,6 +156,18 @@ class Model:
         f = torch.as_tensor(f, dtype=torch.float64, device=device)
         density = _sum([process._spectrum(f.flatten(), **columns) for process, columns in self._known(device)])
         return density.reshape(density.shape[:-1] + f.shape)
+
+    def spectrum_jacobian(self, f: Tensor) -> Tensor:
+        """Derivatives of the spectrum with respect to the parameters, `(..., frequency, parameter)`, float64.
+
+        Args:
+            f: Frequencies `(frequency,)`, cycles per sample.
+
+        Raises:
+            ValueError: A parameter is to be estimated.
+        """
+        slopes = [_slope(p, f, columns, name) for p, columns in self._known(f.device) for name in columns]
+        return torch.stack(torch.broadcast_tensors(*slopes), dim=-1)
 
     @property
     def lines(self) -> tuple[SpectralLine, ...]:
@@ -185,11 +216,14 @@ class Model:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers and lists that `model_from_dict` reads back."""
-        return {
+        plain: dict[str, Any] = {
             "processes": [
                 {"process": type(p).__name__, **{k: _plain(v) for k, v in p.parameters.items()}} for p in self.processes
             ]
         }
+        if self.estimated_from is not None:
+            plain["estimated_from"] = self.estimated_from.to_dict()
+        return plain
 
     def __add__(self, other: Model) -> Model:
         return Model([self, other]) if isinstance(other, Model) else NotImplemented
@@ -295,6 +329,14 @@ def _checked(kind: type, name: str, value: Parameter, *, expected: str, holds: C
     if not bool(fine.all()):
         raise ValueError(f"`{name}` of {kind.__name__}: expected {expected}, got {given[~fine][0].item():.9g}")
     return value
+
+
+def _slope(process: Process, f: Tensor, columns: dict[str, Tensor], name: str) -> Tensor:
+    """Derivative of a process's spectrum with respect to one parameter, `(..., frequency)`."""
+    value = columns[name]
+    spectrum = partial(process._spectrum, f.to(torch.float64))
+    slope: Tensor = jvp(lambda v: spectrum(**{**columns, name: v}), (value,), (torch.ones_like(value),))[1]
+    return slope
 
 
 def _text(value: Parameter) -> str:

@@ -9,8 +9,18 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from gyrofuse._array_inference import FEWEST_TIME_CONSTANTS, ArrayFit, is_long, matrices, shared, told_matrices
+from gyrofuse._array_inference import (
+    FEWEST_TIME_CONSTANTS,
+    ArrayFit,
+    covariance_of_numbers,
+    is_long,
+    matrices,
+    shared,
+    told_matrices,
+)
+from gyrofuse._array_moments import vech
 from gyrofuse._composition import Composition
+from gyrofuse._estimation import EstimatedFrom
 from gyrofuse._records import Records
 from gyrofuse._result import ConfidenceInterval, counted, listed
 from gyrofuse.live import subset_weights
@@ -31,6 +41,7 @@ _BATCHED = (
     "params",
     "params_sd",
     "params_interval",
+    "param_cov",
     "objective",
     "degrees_of_freedom",
     "p_value",
@@ -61,6 +72,9 @@ class ArrayGMWMResult:
         params: `(..., parameter)`.
         params_sd: `(..., parameter)`.
         params_interval: Limits `(..., parameter)`, NaN for `phi` where `remarks` say so.
+        param_cov: Covariance of all numbers of the model, as if no matrix lacked rank: entries of the matrices on and
+            above the diagonal, row after row, and `phi` or `beta`, process by process, `(..., number, number)`. NaN
+            for pairs that are never seen together.
         confidence_level: Of all intervals.
         objective: `r' Omega r` with `r` the entries of measured less fitted wavelet cross-covariance, `(...)`.
         degrees_of_freedom: Moments less parameters, `(...)`.
@@ -86,6 +100,7 @@ class ArrayGMWMResult:
     params: Tensor
     params_sd: Tensor
     params_interval: ConfidenceInterval
+    param_cov: Tensor
     confidence_level: float
     objective: Tensor
     degrees_of_freedom: Tensor
@@ -144,6 +159,7 @@ class ArrayGMWMResult:
             params=placed(params.value),
             params_sd=placed(params.sd),
             params_interval=ConfidenceInterval(placed(params.low), placed(params.high)),
+            param_cov=placed(covariance_of_numbers(fit, vech(squared), params.sd, made_of)),
             objective=placed(fit.objective),
             degrees_of_freedom=placed(fit.degrees.to(theta)),
             p_value=placed(p_value if rest["weighting"] == "optimal" else torch.full_like(p_value, torch.nan)),
@@ -183,7 +199,8 @@ class ArrayGMWMResult:
             of_unit_size = dict.fromkeys(process.parameters, 1.0)
             of_unit_size |= {name: next(shapes) for name in ("phi", "beta") if name in of_unit_size}
             components.append((kind(**of_unit_size), matrix))
-        return ArrayModel(components)
+        told = EstimatedFrom(self.n_samples, self.param_cov[self._of_present()][:, self._of_present()])
+        return ArrayModel(components, estimated_from=told)
 
     def svo_weights(self, scale_weights: ScaleWeights = "flat") -> Tensor:
         """Optimal weights of the array from the fitted wavelet cross-covariance; 0 for sensors without samples.
@@ -283,6 +300,12 @@ class ArrayGMWMResult:
                 value = value.tolist() if value.dtype == torch.bool else listed(value)
             plain[entry.name] = list(value) if isinstance(value, tuple) else value
         return plain | {"remarks": [list(texts) for texts in self.remarks]}
+
+    def _of_present(self) -> Tensor:
+        """Which numbers of the model are those of sensors that have samples, `(number,)`."""
+        both = vech(self._present()[:, None] & self._present())
+        shaped = [any(name in process.parameters for name in ("phi", "beta")) for process in self.processes]
+        return torch.cat([torch.cat([both, both.new_ones(int(is_shaped))]) for is_shaped in shaped])
 
     def _remarks(self, index: tuple[int, ...]) -> tuple[str, ...]:
         n_sensors = self.theta.shape[-1]

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._composition import Composition
+from gyrofuse._estimation import EstimatedFrom
 from gyrofuse._records import Records
 from gyrofuse._result import ConfidenceInterval, cleaned, counted, listed, p_words
 from gyrofuse.datasheet import Datasheet, datasheet
@@ -31,7 +32,7 @@ class GMWMResult:
     """Noise models fitted to wavelet variances; `...` are the leading dimensions of the signal.
 
     Attributes:
-        model: Fitted, with parameters `(..., sensor)`.
+        model: Fitted, with parameters `(..., sensor)`; it knows the record and the covariance that it has them from.
         param_names: Of the parameters, such as `ar1_1.phi`.
         params: `(..., sensor, parameter)`; NaN where nothing could be fitted.
         param_cov: `(..., sensor, parameter, parameter)`; zero rows for variances that are estimated as zero.
@@ -101,13 +102,14 @@ class GMWMResult:
 
         estimates, tested = inference.estimates, rest["weighting"] in ("optimal", "continuous")
         p_value = inference.p_value if tested else torch.full_like(inference.p_value, torch.nan)
-        params = placed(estimates.params, torch.nan)
+        params, param_cov = placed(estimates.params, torch.nan), placed(estimates.covariance, torch.nan)
         said = iter(remarks)
+        told = EstimatedFrom(sum(rest["records"].lengths), param_cov)
         return cls(
-            model=(model := Model(list(made_of.processes))).with_params(params),
+            model=(model := Model(list(made_of.processes))).with_params(params, estimated_from=told),
             param_names=model.param_names,
             params=params,
-            param_cov=placed(estimates.covariance, torch.nan),
+            param_cov=param_cov,
             confidence_interval=ConfidenceInterval(placed(estimates.low, torch.nan), placed(estimates.high, torch.nan)),
             determined=placed(estimates.determined, False),
             identified=placed(torch.tensor([not texts for texts in remarks], device=usable.device), False),

@@ -58,6 +58,21 @@ class JointFit:
     p_value: Tensor
     shift: Tensor
 
+    @property
+    def model(self) -> Model:
+        """The one model."""
+        return self.joint.model
+
+    @property
+    def n_samples(self) -> int:
+        """Length of the recordings, all together."""
+        return self.joint.n_samples
+
+    @property
+    def param_cov(self) -> Tensor:
+        """Covariance of the one model's parameters, `(..., sensor, parameter, parameter)`."""
+        return self.joint.param_cov
+
     def summary(self) -> str:
         """The verdict, and each parameter of every recording beside that of all, sensor by sensor."""
         lines = [

@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from gyrofuse._estimation import EstimatedFrom
 from gyrofuse.processes import (
     AR1,
     Drift,
@@ -136,14 +137,15 @@ def model_from_dict(description: Mapping[str, Any]) -> Model | ArrayModel:
     Raises:
         ValueError: Missing or unknown entries, or a value outside its domain.
     """
+    told = EstimatedFrom.from_dict(description.get("estimated_from"))
     if "components" in description:
-        return ArrayModel([_component(entry) for entry in _entries(description, "components")])
+        return ArrayModel([_component(entry) for entry in _entries(description, "components")], estimated_from=told)
     if "processes" not in description:
         raise ValueError(
             "`description`: expected the entry 'processes' of a model or 'components' of an array, "
             f"got {sorted(description)}"
         )
-    return Model([_process_from_dict(entry) for entry in _entries(description, "processes")])
+    return Model([_process_from_dict(entry) for entry in _entries(description, "processes")], estimated_from=told)
 
 
 def _entries(description: Mapping[str, Any], name: str) -> list[Any]:

@@ -18,6 +18,7 @@ from gyrofuse._checks import (
     check_signal,
     largest_level,
 )
+from gyrofuse._estimation import EstimatedFrom
 from gyrofuse._rank_table import by_moments, by_spectrum
 from gyrofuse._result import ConfidenceInterval, numbered
 from gyrofuse.gmwm import _given, fit_gmwm
@@ -158,7 +159,9 @@ def _one_of(whole: GMWMResult, i: int, sensors: tuple[str, ...], recording: Reco
         whole,
         **own
         | {
-            "model": whole.model.with_params(own["params"]),
+            "model": whole.model.with_params(
+                own["params"], estimated_from=EstimatedFrom(whole.n_samples, own["param_cov"])
+            ),
             "confidence_interval": interval,
             "remarks": (whole.remarks[i],),
             "sensors": sensors,

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._checks import check_positive_integer
+from gyrofuse._estimation import EstimatedFrom
 from gyrofuse._paths import own_generator
 from gyrofuse.processes import Drift, Model, Process
 
@@ -27,17 +28,19 @@ class ArrayModel:
     Args:
         components: Pairs of a process with scalar parameters and either a covariance `(sensor, sensor)`,
             symmetric and positive semi-definite, or gains `(sensor,)`; tensors, arrays or nested lists.
+        estimated_from: Record that the numbers were estimated from, with their covariance in the order of
+            `param_names`; None for an array whose numbers are known. A sum of arrays has none.
 
     Raises:
         TypeError: Not pairs of a process and a matrix.
         ValueError: Not symmetric or not positive semi-definite within rounding, different numbers of sensors,
-            batched parameters, or more than one drift.
+            batched parameters, more than one drift, or a covariance of other parameters.
 
     References:
         [Z] equations (10) and (13).
     """
 
-    def __init__(self, components: Iterable[tuple[Process, Any]]):
+    def __init__(self, components: Iterable[tuple[Process, Any]], *, estimated_from: EstimatedFrom | None = None):
         self.components = tuple(_checked(process, matrix) for process, matrix in components)
         if not self.components:
             raise ValueError("`components`: expected at least one (process, covariance), got none")
@@ -46,10 +49,19 @@ class ArrayModel:
             raise ValueError(f"`components`: expected the same number of sensors in all, got {sizes}")
         if sum(isinstance(process, Drift) for process, _ in self.components) > 1:
             raise ValueError("`components`: expected at most one Drift, got more; add their gains")
+        self.estimated_from = estimated_from
+        if estimated_from is not None and not estimated_from.fits((len(self.param_names),)):
+            raise ValueError(
+                f"`estimated_from`: expected a covariance of the {len(self.param_names)} parameters in `param_names`, "
+                f"got shape {tuple(estimated_from.param_cov.shape)}"  # type: ignore[union-attr]
+            )
 
     @classmethod
     def from_sensors(cls, models: Sequence[Model]) -> ArrayModel:
         """Array of independent sensors, each with a model of its own.
+
+        It is estimated from the records that all its models were estimated from; numbers of different sensors then
+        are uncorrelated. If one of the models counts as known, so does the array.
 
         Raises:
             ValueError: No sensor, batched parameters, or a drift that is to be estimated.
@@ -64,12 +76,27 @@ class ArrayModel:
                 else:
                     noise.append((process, gains))
         # Drifts are deterministic, hence not independent: those of all sensors are one component.
-        return cls(noise + ([(Drift(1.0), torch.stack(drifts).sum(0))] if drifts else []))
+        components = noise + ([(Drift(1.0), torch.stack(drifts).sum(0))] if drifts else [])
+        return cls(components, estimated_from=_together(models, n_drifts=int(bool(drifts))))
 
     @property
     def n_sensors(self) -> int:
         """Number of sensors."""
         return self.components[0][1].shape[-1]
+
+    @property
+    def param_names(self) -> tuple[str, ...]:
+        """Numbers that the spectra depend on, component by component, such as `2.covariance[0,1]` and `2.phi`.
+
+        Of a component with a covariance the entries on and above the diagonal, row after row, then `phi` or `beta` of
+        its process; of one with gains the parameters of its process.
+        """
+        names = []
+        for k, (process, matrix) in enumerate(self.components, 1):
+            if matrix.ndim == 2:
+                names += [f"{k}.covariance[{i},{j}]" for i, j in torch.triu_indices(*matrix.shape).mT.tolist()]
+            names += [f"{k}.{name}" for name in _own_params(process, matrix)]
+        return tuple(names)
 
     def wavelet_cross_covariance(self, n_levels: int) -> Tensor:
         """Wavelet cross-covariance `(level, sensor, sensor)` of levels 1 to `n_levels` in theory, signal^2.
@@ -88,6 +115,31 @@ class ArrayModel:
             ValueError: A parameter is to be estimated.
         """
         return self._mix([process.spectrum(f) for process, _ in self.components])
+
+    def spectrum_jacobian(self, f: Tensor) -> Tensor:
+        """Derivatives of `spectrum` with respect to the numbers in `param_names`.
+
+        Args:
+            f: Frequencies `(frequency,)`, cycles per sample.
+
+        Returns:
+            `(frequency, sensor, sensor, parameter)`, float64.
+
+        Raises:
+            ValueError: A parameter is to be estimated.
+        """
+        slopes = []
+        for process, matrix in self.components:
+            covariance = matrix.outer(matrix) if matrix.ndim == 1 else matrix
+            if matrix.ndim == 2:
+                first, second = torch.triu_indices(*matrix.shape)
+                entries = torch.zeros(*matrix.shape, len(first), dtype=torch.float64)
+                place = torch.arange(len(first))
+                entries[first, second, place] = entries[second, first, place] = 1.0
+                slopes.append(process.spectrum(f)[:, None, None, None] * entries)
+            own = process.spectrum_jacobian(f)[:, list(_own_params(process, matrix).values())]
+            slopes.append(own[:, None, None] * covariance[..., None])
+        return torch.cat(slopes, -1)
 
     def simulate(
         self,
@@ -125,12 +177,15 @@ class ArrayModel:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers and lists that `model_from_dict` reads back."""
-        return {
+        plain: dict[str, Any] = {
             "components": [
                 {**process.to_dict(), ("gains" if matrix.ndim == 1 else "covariance"): matrix.tolist()}
                 for process, matrix in self.components
             ]
         }
+        if self.estimated_from is not None:
+            plain["estimated_from"] = self.estimated_from.to_dict()
+        return plain
 
     def __add__(self, other: ArrayModel) -> ArrayModel:
         if not isinstance(other, ArrayModel):
@@ -144,6 +199,30 @@ class ArrayModel:
         """Sum over components of its term `(...)` times its covariance: `(..., sensor, sensor)`."""
         covariances = torch.stack([m.outer(m) if m.ndim == 1 else m for _, m in self.components])
         return torch.einsum("k...,kab->...ab", torch.stack(terms).to(covariances.device), covariances)
+
+
+def _own_params(process: Process, matrix: Tensor) -> dict[str, int]:
+    """Parameters of a component's process that its matrix does not stand for, with their places among all."""
+    return {
+        name: at
+        for at, name in enumerate(process.parameters)
+        if matrix.ndim == 1 or name in ("phi", "beta")  # a covariance stands for variance or squared amplitude
+    }
+
+
+def _together(models: Sequence[Model], n_drifts: int) -> EstimatedFrom | None:
+    """What independent sensors were estimated from; drifts, which have no spectrum, come last and have no spread."""
+    told = [model.estimated_from for model in models if model.estimated_from is not None]
+    if len(told) < len(models):
+        return None
+    shortest = min(one.n_samples for one in told)
+    blocks = []
+    for model, one in zip(models, told, strict=True):
+        if one.param_cov is None:
+            return EstimatedFrom(shortest)
+        noise = torch.tensor([not isinstance(p, Drift) for p in model.processes for _ in p.parameters])
+        blocks.append(one.param_cov[noise][:, noise])
+    return EstimatedFrom(shortest, torch.block_diag(*blocks, *torch.zeros(n_drifts, 1, 1, dtype=torch.float64)))
 
 
 def _checked(process: Process, matrix: Any) -> tuple[Process, Tensor]:
