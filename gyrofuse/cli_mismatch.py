@@ -59,6 +59,10 @@ def diagnose(
         Path | None,
         typer.Option(metavar="OTHER", help="Another log of the same device: does the repair help there, too?"),
     ] = None,
+    fitted_samples: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="Samples of each sensor that a model was estimated from, if its file lacks it."),
+    ] = None,
     rest: Annotated[
         str | None, typer.Option(metavar="START:STOP", help="Diagnose this stretch alone (seconds).")
     ] = None,
@@ -102,7 +106,7 @@ def diagnose(
             "`simulation`": str(simulation),
             "`judge`": "" if judge is None else judge.name,
         }
-        found, remarks = _diagnosed(part, simulated, judging, names, false_alarm, twins)
+        found, remarks = _diagnosed(part, simulated, judging, names, false_alarm, twins, fitted_samples)
         remarks += _units_taken(recording, simulated, (titled(logs), simulation.name))
         if corrected:
             whole, _ = without_gaps(part, "", 0)
@@ -131,6 +135,7 @@ def _diagnosed(
     names: dict[str, str],
     false_alarm: float,
     twins: int,
+    fitted_samples: int | None,
 ) -> tuple[MismatchReport, list[str]]:
     """The report on the longest whole stretch, and what to say about that; what is wrong names its file."""
     from gyrofuse.mismatch import diagnose as find_mismatch
@@ -146,7 +151,15 @@ def _diagnosed(
             if judge is not None:
                 judge, gaps = without_gaps(judge, f"{names['`judge`']}: judged", 0)
                 lacking += gaps
-            found = find_mismatch(part, simulation, false_alarm=false_alarm, twins=twins, judge=judge, progress=show)
+            found = find_mismatch(
+                part,
+                simulation,
+                false_alarm=false_alarm,
+                twins=twins,
+                fitted_samples=fitted_samples,
+                judge=judge,
+                progress=show,
+            )
             start = float(part.time[0])
             if start and found.mismatch:
                 remarks.append(f"Times count from the first sample that was diagnosed, at {start:.6g} s of the log.")
@@ -154,7 +167,11 @@ def _diagnosed(
         except (ValueError, TypeError) as error:
             message = str(error)
             files = {**names, "`LOG`": names["`recording`"]}
-            options = {"`false_alarm`": "`--false-alarm`", "`twins`": "`--twins`"}
+            options = {
+                "`false_alarm`": "`--false-alarm`",
+                "`twins`": "`--twins`",
+                "`fitted_samples`": "`--fitted-samples`",
+            }
             for parameter, told in {**files, **options}.items():
                 message = message.replace(parameter, told)
             raise type(error)(message) from None

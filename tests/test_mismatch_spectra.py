@@ -245,13 +245,13 @@ def test_the_scan_of_shapes_is_the_mean_over_all_of_them():
     given = walking(22, n=1024)
     data, below = narrow(given), slow(given)
     looked_for = shape_scan._shapes(given, data)
-    z = shape_scan.independent(
-        torch.einsum("hsb,sb->hs", looked_for.templates, data.scores), looked_for.templates, data
-    )
+    sizes = looked_for.scores.norm(dim=-1)
+    templates = looked_for.scores / sizes[..., None].clamp(min=1e-300)
+    z = shape_scan.independent(torch.einsum("hsb,sb->hs", templates, data.scores), templates, data)
     shared = data.coherence[: shape_scan._LOW].mean(0).sum(-1).clamp(min=1)
     total = 0.0
     for h in range(len(z)):
-        a = looked_for.sizes[h]
+        a = sizes[h]
         up, down = (
             np.exp((w * a * z[h] - a**2 / 2 + below.log_ratios(w * looked_for.slow)[h] / shared).numpy())
             for w in (1, -1)

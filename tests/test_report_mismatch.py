@@ -138,7 +138,10 @@ def test_agreement_is_told_as_such():
     assert "Vibration tone" not in told.text
     assert "After the repair" not in told.text
     assert told.tags.count("img") == 4
-    assert str(report(False)) == f"Recording and simulation agree (p = {report(False).p_value:.2g})."
+    (note,) = report(False).notes
+    assert note.startswith("The model's numbers are taken as known exactly")
+    assert note in told.text
+    assert str(report(False)) == f"Recording and simulation agree (p = {report(False).p_value:.2g}).\n{note}"
 
 
 def test_a_difference_without_a_name_is_told_as_such():

@@ -5,23 +5,20 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gyrofuse._model import Model
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.confirm import mean_discrepancy
 from gyrofuse.mismatch.evidence import uncorrected
-from gyrofuse.mismatch.inputs import prepared
+from gyrofuse.mismatch.inputs import Simulation, modelled, prepared
 from gyrofuse.mismatch.own_effects import with_own_effects
-from gyrofuse.mismatch.repaired import RepairedModel
 from gyrofuse.mismatch.testimony import WITNESSES
 from gyrofuse.recording import Recording
-from gyrofuse.simulate import ArrayModel
 
 _FALSE_ALARM = 0.01  # as in a diagnosis, of an effect that both are said to have
 
 
 def discrepancy(
     recording: Recording | Tensor,
-    simulation: Recording | Tensor | Model | ArrayModel | RepairedModel,
+    simulation: Simulation,
     *,
     rate: float | None = None,
     generator: torch.Generator | None = None,
@@ -43,6 +40,7 @@ def discrepancy(
     """
     if generator is None:
         generator = torch.Generator().manual_seed(0)
+    simulation = modelled(simulation)
     given = prepared(recording, simulation, rate, generator)
     return mean_discrepancy(compared(given, simulation, generator))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from numbers import Real
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,7 +16,9 @@ from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.confirm import held_out, held_out_gain, leads_away
 from gyrofuse.mismatch.counterfactual import Link, settled
 from gyrofuse.mismatch.evidence import calibrated, corrected, uncorrected
-from gyrofuse.mismatch.inputs import prepared
+from gyrofuse.mismatch.fit_verdict import KNOWN, FitVerdict, fit_verdict
+from gyrofuse.mismatch.gaussian import Spectral
+from gyrofuse.mismatch.inputs import Simulation, modelled, prepared
 from gyrofuse.mismatch.judge import checked_judge, judged
 from gyrofuse.mismatch.mechanism import Finding
 from gyrofuse.mismatch.mechanisms import STAGES
@@ -40,10 +43,11 @@ _MOST, _OF_A_KIND = 20, 6  # findings: a recording that needs more is another in
 
 def diagnose(
     recording: Recording | Tensor,
-    simulation: Recording | Tensor | Model | ArrayModel | RepairedModel,
+    simulation: Simulation,
     *,
     false_alarm: float = 0.01,
     rate: float | None = None,
+    fitted_samples: int | None = None,
     twins: int = 0,
     judge: Recording | Tensor | None = None,
     generator: torch.Generator | None = None,
@@ -54,11 +58,14 @@ def diagnose(
     Args:
         recording: What a real array gave; its auxiliary channels are used. A tensor is `(sensor, time)`.
         simulation: What a simulator gives for the same array: samples, of any length and without channels, or a noise
-            model, one for all sensors, with batched parameters one for each, or an `ArrayModel`; or a simulation that
-            another diagnosis repaired (`report.model`), whose effects then count as known; what happened once (a step,
-            an episode) does where the recording has it.
+            model, one for all sensors, with batched parameters one for each, or an `ArrayModel`; a fit of any kind
+            (`fit_gmwm`, `fit_array_gmwm`, `fit_jointly`, `rank_models`), which stands for its model; or a simulation
+            that another diagnosis repaired (`report.model`), whose effects then count as known; what happened once (a
+            step, an episode) does where the recording has it.
         false_alarm: Probability of a finding where nothing is missing.
         rate: Hz, for recordings given as tensors; 1 by default.
+        fitted_samples: Samples of each sensor that a model was estimated from, where it does not know: models of fits
+            do, and others count as known. Spectra are compared beside what such numbers may be off.
         twins: How many twins of the recording, in which nothing is missing, tell how surprising the witnesses are.
             By default none: their own p values are held to, which are honest for the noise of ordinary sensors. With
             50 or more the error rate holds for this very recording, at so many times the cost of a look.
@@ -83,6 +90,7 @@ def diagnose(
     if generator is None:
         generator = torch.Generator().manual_seed(0)
     level = uncorrected(false_alarm, len(WITNESSES))  # what would be a mismatch, had one witness alone said it
+    simulation = modelled(simulation, fitted_samples)
     given = prepared(recording, simulation, rate, generator)
     if judge is not None:
         judge = checked_judge(judge, recording, rate)
@@ -94,7 +102,9 @@ def diagnose(
         p_value = calibrated(p_value, twin_p_values(start, twins, generator))
     if p_value > false_alarm:
         verdict = None if judge is None else judged(judge, recording, simulation, None, rate)
-        return MismatchReport(
+        return _reported(
+            simulation,
+            fit_verdict(start, level),
             mismatch=False,
             p_value=p_value,
             findings=(),
@@ -129,6 +139,8 @@ def diagnose(
                 break
     progress("look-alikes", _NAMED)
     links, case = settled(links, case, level, generator)
+    # Spectra as they were before a repair of theirs: what was found until then is no matter of the model's numbers.
+    before = next((link.before for link in links if isinstance(link.finding.effect, Spectral)), case)
     findings = tuple(link.finding for link in links)
     gains = [link.gain for link in links]
     after = testimony(case, lambda what, share: progress(what, _COMPARED + (_CHECKED - _COMPARED) * share))
@@ -157,7 +169,9 @@ def diagnose(
     if judge is not None:
         progress("another recording", _CHECKED)
         verdict = judged(judge, recording, simulation, model, rate)
-    return MismatchReport(
+    return _reported(
+        simulation,
+        fit_verdict(before, level),
         mismatch=True,
         p_value=p_value,
         findings=findings,
@@ -171,6 +185,14 @@ def diagnose(
         repaired=case,
         judged=verdict,
     )
+
+
+def _reported(simulation: object, fit: FitVerdict | None, **found: Any) -> MismatchReport:
+    """The report, with notes on what the simulation's numbers are taken for."""
+    notes = () if fit is None else (fit.words,)
+    if isinstance(simulation, Model | ArrayModel) and simulation.estimated_from is None:
+        notes = (KNOWN,)
+    return MismatchReport(fit=fit, notes=notes, **found)
 
 
 def _unrounded(case: Case) -> Case:

@@ -8,22 +8,71 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import check_positive, check_signal, same_rate
+from gyrofuse._checks import check_positive, check_positive_integer, check_signal, same_rate
+from gyrofuse._estimation import EstimatedFrom
 from gyrofuse._model import Model
 from gyrofuse._result import named, numbered
+from gyrofuse.array_gmwm_result import ArrayGMWMResult
+from gyrofuse.gmwm_result import GMWMResult
+from gyrofuse.joint import JointFit
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.known_lines import amplitudes
 from gyrofuse.mismatch.level_spread import with_spread
 from gyrofuse.mismatch.lines import simulated_lines
 from gyrofuse.mismatch.repaired import RepairedModel
+from gyrofuse.mismatch.spectral_uncertainty import SpectralUncertainty, as_array, own_record
+from gyrofuse.ranking_result import RankResult
 from gyrofuse.recording import Recording
 from gyrofuse.simulate import ArrayModel
 
+# Whatever a diagnosis takes for a simulation.
+Simulation = (
+    Recording | Tensor | Model | ArrayModel | RepairedModel | GMWMResult | ArrayGMWMResult | JointFit | RankResult
+)
 FEWEST = 4096
 # Of a model: records as long as the recording. What is told apart of an effect grows as m/(1 + m), the work as m.
 _FEWEST_RECORDS, _MOST_RECORDS, _MOST_VALUES = 4, 16, 2**23
 _SINGULAR = 1e-10  # of correlation matrices
 _SEARCHES = 4  # for lines
+
+
+def modelled(
+    simulation: Simulation, fitted_samples: int | None = None
+) -> Recording | Tensor | Model | ArrayModel | RepairedModel:
+    """The simulation as samples or a model that knows what it was estimated from; that of a fit is its model.
+
+    Args:
+        simulation: Samples, a model, or a fit.
+        fitted_samples: Of each sensor, that a model without a record of its own was estimated from.
+
+    Raises:
+        ValueError: Not a positive number, samples of a model that says so itself or of what is none, or a ranking
+            without a fit of every sensor.
+    """
+    if isinstance(simulation, RankResult):
+        best = [fit.model for fit in simulation.best if fit is not None]
+        if len(best) < len(simulation.best) or not best:
+            raise ValueError(
+                "`simulation`: expected a ranking with the fit of every sensor in `best`, got one that lacks some; "
+                "rank with `fit=True` and without sensors that cannot be fitted"
+            )
+        own = [m.with_params(m.params[0], estimated_from=own_record(m.estimated_from, 0)) for m in best]
+        simulation = ArrayModel.from_sensors(own)
+    if isinstance(simulation, GMWMResult | ArrayGMWMResult | JointFit):
+        simulation = simulation.model
+    if fitted_samples is None:
+        return simulation
+    check_positive_integer("fitted_samples", fitted_samples)
+    if not isinstance(simulation, Model | ArrayModel) or simulation.estimated_from is not None:
+        what = "one that has its own" if isinstance(simulation, Model | ArrayModel) else type(simulation).__name__
+        raise ValueError(
+            "`fitted_samples`: expected with a noise model that does not know what it was estimated from, got "
+            f"{what}; leave it out"
+        )
+    told = EstimatedFrom(fitted_samples)
+    if isinstance(simulation, Model):
+        return Model([simulation], estimated_from=told)
+    return ArrayModel(simulation.components, estimated_from=told)
 
 
 def prepared(
@@ -62,7 +111,11 @@ def prepared(
     _check_own("recording", signal)
     _check_own("simulation", drawn[0])
     case = Case.of(scene, signal, drawn)
-    case = replace(case, simulated=replace(case.simulated, gaussian=gaussian))
+    uncertainty = None
+    if isinstance(simulation, Model | ArrayModel):
+        array = simulation if isinstance(simulation, ArrayModel) else as_array(simulation, len(signal))
+        uncertainty = SpectralUncertainty.of(array)
+    case = replace(case, simulated=replace(case.simulated, gaussian=gaussian, uncertainty=uncertainty))
     return with_spread(case.knowing(_lines(simulation, case)), noise_samples)
 
 
@@ -120,8 +173,8 @@ def _samples(simulation: Recording | Tensor, scene: Scene, n_samples: int, *, fr
         signal = check_signal("simulation", simulation)
     else:
         raise TypeError(
-            f"`simulation`: expected a recording, a tensor (sensor, time), a model, an array model or a repaired one, "
-            f"got {type(simulation).__name__}"
+            "`simulation`: expected a recording, a tensor (sensor, time), a model, an array model, a repaired one or a "
+            f"fit, got {type(simulation).__name__}"
         )
     signal = _checked("simulation", signal, scene)
     n_records = signal.shape[-1] // n_samples

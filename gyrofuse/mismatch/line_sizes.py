@@ -70,7 +70,9 @@ def line_sizes(case: Case) -> LineSizes | None:
     ours, theirs = (2 * density / side.signal.shape[-1] for side in (case.recorded, case.simulated))
     if len(others) > 1:
         theirs = theirs.maximum(others.var(0))
-    known = (theirs / len(others)).maximum(2 * density / case.simulated.told_by)
+    fitted = case.simulated.uncertainty
+    told_by = case.simulated.told_by if fitted is None else fitted.n_samples
+    known = (theirs / len(others)).maximum(2 * density / told_by)
     noise = (
         2 * density / case.simulated.signal.shape[-1]
     ).sqrt()  # either part's of each record; the modulus has Rayleigh's law

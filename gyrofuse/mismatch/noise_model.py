@@ -18,6 +18,7 @@ from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.known_lines import line_parts
 from gyrofuse.mismatch.repaired import RepairedModel
 from gyrofuse.mismatch.shape_ground import Parts
+from gyrofuse.mismatch.spectral_uncertainty import as_array
 from gyrofuse.processes import Process, Sinusoid
 from gyrofuse.recording import Recording
 from gyrofuse.simulate import ArrayModel
@@ -35,8 +36,7 @@ def noise_of(simulation: Recording | Tensor | Model | ArrayModel | RepairedModel
     if isinstance(simulation, ArrayModel):
         return simulation
     if isinstance(simulation, Model):
-        rows = simulation.params.expand(case.n_sensors, -1)
-        return ArrayModel.from_sensors([simulation.with_params(row) for row in rows])
+        return as_array(simulation, case.n_sensors)
     lines = _lines(case)
     shared = _shared_parts(case)
     noise = case.base.model() if shared is None else _shared_model(case.base, shared)

@@ -15,6 +15,7 @@ from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.comparison import VarianceComparison, compared_variances
 from gyrofuse.mismatch.confirm import HeldOut
 from gyrofuse.mismatch.evidence import Evidence
+from gyrofuse.mismatch.fit_verdict import FitVerdict
 from gyrofuse.mismatch.judge import Judged
 from gyrofuse.mismatch.mechanism import Finding
 from gyrofuse.mismatch.repaired import RepairedModel
@@ -40,6 +41,8 @@ class Outcome:
     case: Case
     repaired: Case
     judged: Judged | None = None
+    fit: FitVerdict | None = None
+    notes: tuple[str, ...] = ()
 
     def correct(self, recording: _Signal) -> _Signal:
         """The recording that was diagnosed, or one that runs along with it, without what can be taken off it.
@@ -103,6 +106,8 @@ class Outcome:
                 "evidence_after": [entry.to_dict() for entry in self.evidence_after],
                 "held_out": self.held_out.to_dict(),
                 "judged": None if self.judged is None else self.judged.to_dict(),
+                "fit": None if self.fit is None else self.fit.to_dict(),
+                "notes": list(self.notes),
                 "model": self.model.to_dict(),
             }
         )

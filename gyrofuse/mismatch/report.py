@@ -35,12 +35,15 @@ class MismatchReport(Outcome):
         repaired: The recording without what can be taken off it, and the simulation with all else.
         judged: How far the simulation, the repaired one and the recording are from another recording, where one was
             given.
+        fit: What spectra say beside the uncertainty of a fitted model; None where the simulation is none.
+        notes: Sentences on what the simulation's numbers are taken for.
     """
 
     def summary(self) -> str:
         """The verdict in sentences, then the numbers."""
         if not self.mismatch:
-            return "\n".join([f"Recording and simulation agree (p = {self.p_value:.2g}).", *judged_words(self)])
+            agree = f"Recording and simulation agree (p = {self.p_value:.2g})."
+            return "\n".join([agree, *self.notes, *judged_words(self)])
         lines = [f"Recording and simulation differ ({p_words(self.p_value)})."]
         for i, finding in enumerate(self.findings, 1):
             gain = "" if finding.held_out_gain is None else f"; {finding.held_out_gain:+.1f} nats on data held out"
@@ -58,7 +61,7 @@ class MismatchReport(Outcome):
             f"gain {h.gain:.1f} nats ({h.low:.1f} to {h.high:.1f}); a classifier tells the two apart with an area "
             f"under the curve of {h.auc_before:.2f} before and {h.auc_after:.2f} after (0.5 = guessing)"
         )
-        return "\n".join([*lines, *judged_words(self), *fused_words(self)])
+        return "\n".join([*lines, *self.notes, *judged_words(self), *fused_words(self)])
 
     def __str__(self) -> str:
         return self.summary()

@@ -59,7 +59,8 @@ class Slow(NamedTuple):
 
     Attributes:
         ratio: Of powers over the simulation's noise, `(sensor, band)`, F distributed where nothing differs.
-        d, s: Complex ordinates of both, `(band,)`; `s` is 0 where nothing is simulated.
+        d, s: Complex ordinates of both, `(band,)`; `s` is 0 where nothing is simulated. Of a model whose numbers may be
+            off `s` is less, `(sensor, band)`.
         places: As of narrow bands.
     """
 
@@ -67,6 +68,10 @@ class Slow(NamedTuple):
     d: Tensor
     s: Tensor
     places: Tensor
+
+    def beside(self, variance: Tensor) -> Slow:
+        """Where log spectra of the simulation may be off, with a variance `(sensor, band)`."""
+        return self._replace(s=torch.where(self.s > 0, 1 / (1 / self.s + variance), 0.0))
 
     def log_ratios(self, log_factors: Tensor) -> Tensor:
         """Log likelihood ratio of powers that are larger by factors `(..., sensor, band)`, `(..., sensor)`."""
@@ -202,21 +207,21 @@ def _simulated_dof(side: Side, groups: Groups) -> Tensor:
 class _Blocks(dict[int, Side]):
     """A side's records cut into blocks, by their length: the same for all folds."""
 
-    def __init__(self, signal: Tensor, told_by: float) -> None:
+    def __init__(self, side: Side) -> None:
         super().__init__()
-        self.signal, self.told_by = signal, told_by
+        self.signal, self.told_by, self.uncertainty = side.noise, side.told_by, side.uncertainty
 
     def __missing__(self, block: int) -> Side:
         n = self.signal.shape[-1] // block * block
         cut = self.signal[..., :n].unflatten(-1, (-1, block)).movedim(-2, -3).flatten(0, 1)
-        self[block] = Side(cut, bands(block), told_by=self.told_by)
+        self[block] = Side(cut, bands(block), told_by=self.told_by, uncertainty=self.uncertainty)
         return self[block]
 
 
 @remembered
 def in_blocks(side: Side) -> _Blocks:
     """Sides by the length of the blocks that they are cut into."""
-    return _Blocks(side.noise, side.told_by)
+    return _Blocks(side)
 
 
 @functools.lru_cache(maxsize=8)

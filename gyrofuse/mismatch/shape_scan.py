@@ -8,24 +8,30 @@ and shares `e` of the sensors that have it, the mean of
 
 has expectation one where nothing differs. The slowest ordinates, too few for normal scores, give their likelihood
 ratio by the law of F.
+
+Numbers of a model that was fitted to a record move all scores of a sensor together. Shapes are then weighed with
+`x = V^-1 h sqrt(w)` for `a z - a^2/2` of `z = x u / |x|_V`, `a^2 = h sqrt(w) x`; with what of them lies outside the
+parameters' tangent space, for components that the model lacks; and the parameters have a chi-square (`shape_errors`).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.case import Case
-from gyrofuse.mismatch.evidence import SHARES, Evidence, of_shares, ratio_p_value
+from gyrofuse.mismatch.evidence import SHARES, Evidence, corrected, of_shares, ratio_p_value
 from gyrofuse.mismatch.filter_forms import filter_power, filter_strength
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.shape_bands import Narrow, deep_base, narrow, slow
+from gyrofuse.mismatch.shape_errors import Errors, estimation_errors, parameters_p_value
 from gyrofuse.mismatch.shape_fit import Ratios
 from gyrofuse.mismatch.shape_terms import Bump, oscillation
+from gyrofuse.mismatch.spectral_uncertainty import SpectralUncertainty
 from gyrofuse.mismatch.witnesses import level_of
 from gyrofuse.processes import AR1
 
@@ -40,20 +46,19 @@ _LOWEST = 40.0  # bins: bumps below are colour
 _COMMON = (0.12, 1.25)  # share of noise whose ratio exceeds one, and how it falls: drawn
 _LOW = 6  # bands
 _ROUNDS = 24
+_LOOKS = 3  # at spectra beside a fitted model: beside its errors, outside of them, and at its parameters
 
 
 class Shapes(NamedTuple):
     """What is looked for.
 
     Attributes:
-        templates: Of unit length under the weights, `(shape, sensor, band)`.
-        sizes: Their lengths, `(shape, sensor)`.
+        scores: By which they move scores, `(shape, sensor, band)`.
         slow: Logarithms of factors in the slowest bands, `(shape, sensor, band)`.
         log_chances: Of the shapes up, down, and either way sensor by sensor, `(3, shape)`.
     """
 
-    templates: Tensor
-    sizes: Tensor
+    scores: Tensor
     slow: Tensor
     log_chances: Tensor
 
@@ -67,6 +72,7 @@ class Scan(NamedTuple):
         weight: Of the bands in it, `(band,)`; and whether it goes up.
         up: Whether powers are larger.
         bump: Centre and half width, cycles per sample, if it is one.
+        looks: Of which it is the most surprising.
     """
 
     log_ratio: float
@@ -74,11 +80,35 @@ class Scan(NamedTuple):
     weight: Tensor
     up: bool
     bump: tuple[float, float] | None
+    looks: int = 1
 
     @property
     def p_value(self) -> float:
         """That of a mean ratio; ratios of a few are more common than the law of large ones has it."""
-        return max(ratio_p_value(self.log_ratio), _COMMON[0] * math.exp(-_COMMON[1] * max(self.log_ratio, -1.0)))
+        p = max(ratio_p_value(self.log_ratio), _COMMON[0] * math.exp(-_COMMON[1] * max(self.log_ratio, -1.0)))
+        return p if self.looks == 1 else corrected(p, self.looks)
+
+
+class Looks(NamedTuple):
+    """Spectra against those of a model.
+
+    Attributes:
+        exact: As if its numbers were known.
+        beside: Beside what they may be off.
+        outside: What no numbers of its processes could make.
+        parameters: p value of the parameters' chi-square.
+    """
+
+    exact: Scan
+    beside: Scan
+    outside: Scan
+    parameters: float
+
+    @property
+    def p_value(self) -> float:
+        """Of all that allows for what the numbers may be off."""
+        looks = (self.beside.p_value, self.outside.p_value, self.parameters)
+        return corrected(min(looks), _LOOKS)
 
 
 def shape_witness(case: Case) -> Evidence:
@@ -91,7 +121,7 @@ def shape_witness(case: Case) -> Evidence:
     f = float((seen.weight * frequency.log()).sum().div(seen.weight.sum()).exp()) * case.scene.rate
     return Evidence(
         "shape",
-        seen.p_value,
+        shape_p_value(case),
         f"power is {'larger' if seen.up else 'smaller'} than the simulation's, most of all around {f:.3g} Hz, in "
         f"{case.scene.named(seen.sensors, 'all sensors')}",
         sensors=seen.sensors,
@@ -102,18 +132,52 @@ def shape_witness(case: Case) -> Evidence:
 
 @remembered
 def scanned(case: Case) -> Scan | None:
-    """The mean likelihood ratio of all shapes, and the likeliest."""
-    data = narrow(case)
-    if float(data.worth.sum()) < 10:
+    """The mean likelihood ratio of all shapes, and the likeliest; beside a fitted model's errors, if there are any."""
+    looks = looked_at(case)
+    if looks is not None:
+        return min(looks.beside, looks.outside, key=lambda scan: scan.p_value)._replace(looks=_LOOKS)
+    return _scan(case, _shapes(case, narrow(case))) if _enough(case) else None
+
+
+@remembered
+def looked_at(case: Case) -> Looks | None:
+    """Spectra against those of a model whose numbers may be off; None where there is no such model."""
+    errors = estimation_errors(case)
+    if errors is None or not _enough(case):
         return None
-    looked_for = _shapes(case, data)
+    shapes = _shapes(case, narrow(case))
+    scans = (_scan(case, shapes), _scan(case, shapes, errors), _scan(case, shapes, errors, outside=True))
+    return Looks(*scans, parameters_p_value(case))
+
+
+def shape_p_value(case: Case) -> float:
+    """p value of all looks at shapes; 1 where there is nothing to compare."""
+    looks, scan = looked_at(case), scanned(case)
+    if looks is not None:
+        return looks.p_value
+    return 1.0 if scan is None else scan.p_value
+
+
+def _enough(case: Case) -> bool:
+    return float(narrow(case).worth.sum()) >= 10
+
+
+def _scan(case: Case, looked_for: Shapes, errors: Errors | None = None, *, outside: bool = False) -> Scan:
+    """Shapes weighed beside errors of the simulation's numbers, where given, or only by what lies outside of them."""
+    data, below, weighed = narrow(case), slow(case), looked_for.scores
     scores = beside_level(data.scores, data.worth, case.simulated.level_variance)
-    z = independent(torch.einsum("hsb,sb->hs", looked_for.templates, scores), looked_for.templates, data)
+    if errors is not None:
+        weighed = errors.outside(weighed) if outside else errors.beside(weighed)
+        uncertainty = cast(SpectralUncertainty, case.simulated.uncertainty)
+        # The slowest ordinates are as far off as their parameters, and of these alone nothing lies outside.
+        variance = uncertainty.variance(below.places.log().mean(-1).exp())
+        below = below.beside(torch.full_like(variance, math.inf) if outside else variance)
+    sizes = (looked_for.scores * weighed).sum(-1).clamp(min=0).sqrt()
+    templates = weighed / weighed.norm(dim=-1, keepdim=True).clamp(min=1e-300)
+    z = independent(torch.einsum("hsb,sb->hs", templates, scores), templates, data, errors)
     apart = data.coherence[:_LOW].mean(0).sum(-1)  # powers of what sensors share go together
     up, down = (
-        way * looked_for.sizes * z
-        - looked_for.sizes.square() / 2
-        + slow(case).log_ratios(way * looked_for.slow) / apart.clamp(min=1)
+        way * sizes * z - sizes.square() / 2 + below.log_ratios(way * looked_for.slow) / apart.clamp(min=1)
         for way in (1, -1)
     )
     ways = torch.stack([up, down, torch.logaddexp(up, down) - math.log(2)])  # (way, shape, sensor)
@@ -121,10 +185,10 @@ def scanned(case: Case) -> Scan | None:
     share, way, shape = (int(i) for i in torch.unravel_index(log_ratios.argmax(), log_ratios.shape))
     own = torch.maximum(up, down)[shape] if way == 2 else ways[way, shape]
     sensors = tuple(int(i) for i in (own > math.log(1 / SHARES[share] - 1)).nonzero()[:, 0]) or (int(own.argmax()),)
-    weight = looked_for.templates[shape, list(sensors)].square().mean(0)
+    weight = templates[shape, list(sensors)].square().mean(0)
     rises = float((up - down)[shape, list(sensors)].sum()) > 0
     bumps = list(_bump_places(case.n_samples))
-    n_shapes = len(looked_for.templates) // len(_SIZES)
+    n_shapes = len(templates) // len(_SIZES)
     place = shape % n_shapes - (n_shapes - len(bumps))  # bumps come last
     mean = float(log_ratios.flatten().logsumexp(0)) - math.log(len(SHARES))
     return Scan(mean, sensors, weight, rises, bumps[place] if place >= 0 else None)
@@ -156,13 +220,19 @@ def bump_start(data: Ratios, model: Tensor, starts: Iterable[tuple[float, float]
     return top
 
 
-def independent(z: Tensor, templates: Tensor, data: Narrow) -> Tensor:
+def independent(z: Tensor, templates: Tensor, data: Narrow, errors: Errors | None = None) -> Tensor:
     """Numbers of sensors `(shape, sensor)`, apart and of variance one: powers of what sensors share go together."""
     cover = torch.einsum("hib,hjb,bij->hij", templates, templates, data.coherence)
     beside = torch.einsum("hib,hib,b->hi", templates[..., 1:], templates[..., :-1], data.together)
     variance = (1 + 2 * beside).clamp(min=0.5)
-    cover = cover - torch.diag_embed(cover.diagonal(dim1=-1, dim2=-2)) + torch.eye(z.shape[-1], dtype=z.dtype)
-    values, vectors = torch.linalg.eigh(cover)
+    cover = cover - torch.diag_embed(cover.diagonal(dim1=-1, dim2=-2))
+    if errors is not None:
+        alone, moved = variance, errors.covariance(templates)
+        variance = variance + moved.diagonal(dim1=-1, dim2=-2)
+        moved = moved - torch.diag_embed(moved.diagonal(dim1=-1, dim2=-2))
+        ratio, size = (alone / variance).sqrt(), variance.rsqrt()
+        cover = cover * ratio[..., :, None] * ratio[..., None, :] + moved * size[..., :, None] * size[..., None, :]
+    values, vectors = torch.linalg.eigh(cover + torch.eye(z.shape[-1], dtype=z.dtype))
     root = (vectors * values.clamp(min=0.05).rsqrt()[..., None, :]) @ vectors.mT
     return (root @ (z / variance.sqrt())[..., None])[..., 0]
 
@@ -192,11 +262,8 @@ def _shapes(case: Case, data: Narrow) -> Shapes:
     length = (worth * weak.square()).sum(-1, keepdim=True).sqrt()
     moved = torch.cat([torch.cat([_grown(colour, worth, size), weak * (size / length)]) for size in _SIZES])
     shown = moved[..., len(below.d) :] * data.worth.sqrt()
-    shown = beside_level(shown, data.worth, case.simulated.level_variance)
-    sizes = shown.square().sum(-1).sqrt()
     return Shapes(
-        shown / sizes[..., None].clamp(min=1e-300),
-        sizes,
+        beside_level(shown, data.worth, case.simulated.level_variance),
         moved[..., : len(below.d)],
         log_chances.repeat(1, len(_SIZES)) - math.log(len(_SIZES)),
     )

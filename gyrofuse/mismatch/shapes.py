@@ -23,7 +23,7 @@ from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.shape_bands import N_SLOW, Groups, deep, deep_base, in_blocks, narrow_bands, slow_fold
 from gyrofuse.mismatch.shape_choice import QUICK, best_shapes, candidates, convincing, cost_of
 from gyrofuse.mismatch.shape_fit import Fit, Ratios, data_model, fair_gain, fit, log_score, ratios
-from gyrofuse.mismatch.shape_scan import bump_start, scanned
+from gyrofuse.mismatch.shape_scan import bump_start, shape_p_value
 from gyrofuse.mismatch.shape_terms import Bump, Common, CommonBump, Flicker, LowPass, PowerLaw, Shift, Term
 from gyrofuse.mismatch.side import Side
 from gyrofuse.mismatch.sweeps import swept
@@ -183,8 +183,7 @@ def _searched(case: Case) -> Shape | None:
     data = compared(case)
     if float(data.worth.sum()) < 50:
         return None
-    scan = scanned(case)
-    p_seen = 1.0 if scan is None else scan.p_value
+    p_seen = shape_p_value(case)
     data, chosen = best_shapes(data, differ=p_seen < _DOUBT)
     if chosen is None or not convincing(data, chosen) or _falls_otherwise(data, chosen):
         return None
@@ -203,6 +202,8 @@ def _searched(case: Case) -> Shape | None:
     p = corrected(float(stats.chi2.sf(2 * max(gain, 0.0), _freedom(data, term))), _PLACES)
     if not others:  # it is all that differs
         p = min(p, p_seen)
+    if case.simulated.uncertainty is not None:  # the fit above takes the simulation's numbers for exact
+        p = max(p, _beside_errors(case, term, p_seen))
     rivals = {
         rival.name
         for rival in candidates(data, others)
@@ -226,6 +227,12 @@ def _searched(case: Case) -> Shape | None:
         tuple(sorted({level_of(float(f)) for f in frequency[score > 0.05 * score.sum()]})),
         _forms(data, term, others, chosen.gain),
     )
+
+
+def _beside_errors(case: Case, term: Term, p_seen: float) -> float:
+    """Least p value of a shape beside what numbers of a fitted simulation may be off."""
+    source = common_source(case) if isinstance(term, Common) else None
+    return p_seen if source is None else min(p_seen, source.p_value)
 
 
 def _falls_otherwise(data: Ratios, chosen: Fit) -> bool:

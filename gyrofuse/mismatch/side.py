@@ -14,6 +14,7 @@ from gyrofuse.mismatch.base import Base, fit_base
 from gyrofuse.mismatch.known_lines import without_lines
 from gyrofuse.mismatch.loudness import Loudness
 from gyrofuse.mismatch.spectra import Bands, cross_spectra, degrees_of_freedom
+from gyrofuse.mismatch.spectral_uncertainty import SpectralUncertainty
 
 _ORDINATES = 40  # for each sensor, behind a matrix that is inverted
 _LEAST_BIN = 3  # of records shorter than the bands are for: below, they say nothing
@@ -30,6 +31,7 @@ class Side:
             looked at.
         told_by: Samples of each sensor that the noise is known from, where they are fewer: those that a model, which
             these were drawn from, was estimated from.
+        uncertainty: Of the model that these were drawn from, where its numbers were estimated.
         loud: Episodes that it is known to have.
         gaussian: Whether a Gaussian model made it.
         level_variance: Of the log of all power, which varies by itself beyond what Gaussian noise's does, `(sensor,)`.
@@ -39,6 +41,7 @@ class Side:
     bands: Bands
     lines: tuple[float, ...] = ()
     told_by: float = math.inf
+    uncertainty: SpectralUncertainty | None = None
     loud: tuple[Loudness, ...] = ()
     gaussian: bool = False
     level_variance: Tensor | float = 0.0
@@ -51,7 +54,7 @@ class Side:
 
     def in_bands(self, bands: Bands) -> Side:
         """The noise in other bands."""
-        return Side(self.noise, bands, told_by=self.told_by)
+        return Side(self.noise, bands, told_by=self.told_by, uncertainty=self.uncertainty)
 
     @cached_property
     def noise(self) -> Tensor:
@@ -90,6 +93,17 @@ class Side:
             ],
             dtype=torch.float64,
         )
+
+    @cached_property
+    def power_dof(self) -> Tensor:
+        """What bands tell of powers beside what a level varies and a model's numbers may be off, `(sensor, band)`.
+
+        Logarithms of powers vary by one over it.
+        """
+        varies = torch.as_tensor(self.level_variance).expand(self.signal.shape[-2])[:, None]
+        if self.uncertainty is not None:
+            varies = varies + self.uncertainty.variance(self.bands.frequency)
+        return self.dof / (1 + self.dof * varies)
 
     @cached_property
     def power(self) -> Tensor:

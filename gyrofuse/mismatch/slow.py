@@ -11,7 +11,8 @@ the noise swallows the effect, without freedom it is taken for one. Hypotheses a
 each.
 
 Spectra in bands say nothing of the first few ordinates, on which slow effects live: what the simulation has there is
-told by its own ordinates, and by what the sensors of an array have in common.
+told by its own ordinates, and by what the sensors of an array have in common. A model that was fitted to a record is
+off as far as its numbers are, all places together; a random walk that it found none of may be there.
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ _UNSEEN = 8  # ordinates below the bands
 _ALIKE = 1.0  # what each of them is worth that all sensors together tell of one, complex ordinates
 _FIT_ROUNDS = 5
 _LEAST_ROOT = 0.1  # cube root of a chi-square over its mean
+_FARTHEST = 5.0  # of a log factor by estimation error: a walk that was found as none may be anything below the rest
 
 _Tuple = TypeVar("_Tuple", bound=tuple[Any, ...])
 
@@ -69,8 +71,11 @@ class SlowNoise:
     ahead: Tensor
 
     @classmethod
-    def around(cls, base: Base, dof: float) -> SlowNoise:
-        """Around a simulation with a base `(..., sensor, atom)`, whose slowest bands are worth `dof`."""
+    def around(cls, base: Base, dof: float, missed: float = 0.0) -> SlowNoise:
+        """Around a simulation with a base `(..., sensor, atom)`, whose slowest bands are worth `dof`.
+
+        A random walk of a share `missed` of its power at two cycles in the record is not unlikely beside it.
+        """
         n_samples, block = base.n_samples, base.n_samples // N_BLOCKS
         constants = torch.tensor(_time_constants(n_samples), dtype=torch.float64)
         none = torch.zeros(1, dtype=torch.float64)
@@ -83,6 +88,7 @@ class SlowNoise:
         beside = [power / replace(base, coefficients=one[None]).spectrum(lowest) * one for one in (flicker, walk)]
         known = math.hypot(_PRIOR_SD, 1 / math.sqrt(max(dof, _LEAST_DOF)))
         centre = torch.tensor([0.0, 0.0, *(c for c, _ in _BESIDE.values())], dtype=torch.float64)
+        centre[-1] = math.log(math.exp(float(centre[-1])) + missed)
         spread = torch.tensor([_PRIOR_SD, known, *(s for _, s in _BESIDE.values())], dtype=torch.float64)
         parts = torch.stack([base.coefficients * fast, base.coefficients * (1 - fast), *beside], -2)
         return cls(n_samples, parts, centre, spread, torch.tensor(_AHEAD, dtype=torch.float64))
@@ -126,8 +132,10 @@ class Told(NamedTuple):
         values: Powers in bands, then mean squares of the first ordinates, `(..., sensor, place)`.
         atoms: What they are for each atom of a base with coefficient one, `(atom, place)`.
         dof: What they are worth, complex ordinates, `(place,)`.
-        slowest_dof: The same of the slowest bands of the recording.
+        slowest_dof: The same of the slowest bands of the recording, beside what a fitted model's numbers may be off.
         n_samples: Of the recording.
+        errors: What independent errors of unit variance in these numbers do to logarithms, `(sensor, place, error)`.
+        missed: Share of the power at two cycles in the record of a random walk that the fit may have missed.
     """
 
     values: Tensor
@@ -135,6 +143,8 @@ class Told(NamedTuple):
     dof: Tensor
     slowest_dof: float
     n_samples: int
+    errors: Tensor
+    missed: float
 
     def noise(self) -> SlowNoise:
         """Of block means, in parts that may be wrong, each by its own factor."""
@@ -142,7 +152,7 @@ class Told(NamedTuple):
 
     def noise_of(self, coefficients: Tensor) -> SlowNoise:
         """The same where the coefficients are known, `(..., sensor, atom)`."""
-        return SlowNoise.around(Base(self.n_samples, coefficients), self.slowest_dof)
+        return SlowNoise.around(Base(self.n_samples, coefficients), self.slowest_dof, self.missed)
 
     def drawn(self, coefficients: Tensor, generator: torch.Generator) -> Told:
         """What another simulation of as many samples tells, of noise with coefficients `(..., sensor, atom)`."""
@@ -151,6 +161,11 @@ class Told(NamedTuple):
         spread = 1 / (9 * self.dof)
         normal = torch.randn(expected.shape, generator=generator, dtype=torch.float64)
         root = (1 - spread + normal * spread.sqrt()).clamp(min=_LEAST_ROOT)
+        if self.errors.shape[-1]:
+            shape = (*expected.shape[:-2], self.errors.shape[-1], 1)
+            errors = torch.randn(shape, generator=generator, dtype=torch.float64)
+            off = (self.errors @ errors[..., None, :, :])[..., 0]  # (..., sensor, place)
+            expected = expected * off.clamp(-_FARTHEST, _FARTHEST).exp()
         return self._replace(values=expected * root**3)
 
     def coefficients(self) -> Tensor:
@@ -173,12 +188,20 @@ def told(case: Case) -> Told:
     atoms = _atom_variances(n, signal.shape[-1] // N_BLOCKS)[:, :_UNSEEN]
     worth = torch.full((_UNSEEN,), len(signal) / 2, dtype=torch.float64)
     seen = dof > 0
+    slowest, missed, errors = float(dof[:_SLOWEST_BANDS].sum()), 0.0, dof.new_zeros(len(signal[0]), 1, 0)
+    if (uncertainty := case.simulated.uncertainty) is not None:
+        ordinates = torch.arange(1, _UNSEEN + 1, dtype=torch.float64) / (2 * signal.shape[-1])
+        errors = uncertainty.errors(torch.cat([bands.frequency[seen], ordinates]))
+        slowest = 1 / (1 / slowest + float(uncertainty.variance(1 / dof.new_tensor([n])).mean()))
+        missed = float(uncertainty.at_zero_power(_LOWEST / dof.new_tensor([n])).mean())
     return Told(
         torch.cat([case.simulated.power[:, seen], first], -1),
         torch.cat([bands.mean_of(every.spectrum(bands.places))[:, seen], atoms], -1),
         torch.cat([dof[seen], worth]),
-        float(dof[:_SLOWEST_BANDS].sum()),
+        slowest,
         n,
+        errors,
+        missed,
     )
 
 

@@ -47,6 +47,7 @@ def verdict(outcome: Outcome) -> list[str]:
             f"Recording and simulation agree: p = {outcome.p_value:.2g} if nothing is missing.",
             f"What surprises most among {len(outcome.evidence)} witnesses, {mechanism_words(most.witness)}, is no more "
             f"than chance gives (p = {most.p_value:.2g}).",
+            *outcome.notes,
             *(f"{words}." for words in judged_words(outcome)),
         ]
     sentences = [f"Recording and simulation differ: {p_words(outcome.p_value)} if nothing were missing."]
@@ -66,7 +67,8 @@ def verdict(outcome: Outcome) -> list[str]:
             "So that the repaired simulation has the recording's spectra all the same, the noise of each sensor passes "
             "a filter that stands for no physics."
         )
-    return [*sentences, *(f"{words}." for words in judged_words(outcome)), *fused_words(outcome)]
+    judged = [f"{words}." for words in judged_words(outcome)]
+    return [*sentences, *outcome.notes, *judged, *fused_words(outcome)]
 
 
 def otherwise_words(finding: Finding) -> str:

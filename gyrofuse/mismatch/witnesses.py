@@ -18,7 +18,10 @@ _TAIL = 10.0
 
 
 def spectrum_witness(case: Case) -> Evidence:
-    """Ratio of powers in each band and sensor, F distributed with both records' degrees of freedom."""
+    """Ratio of powers in each band and sensor, F distributed with both records' degrees of freedom.
+
+    Those of a fitted model are fewer by what its numbers may be off.
+    """
     tails = power_tails(case)
     places = int(tails.isfinite().sum())
     if not places:
@@ -86,10 +89,15 @@ def coherence_witness(case: Case) -> Evidence:
     one, other = case.recorded.coherence, case.simulated.coherence
     upper = torch.triu_indices(case.n_sensors, case.n_sensors, 1)
     # Whitened by what both have in common, entries vary alike and apart, whatever noise the sensors share.
-    white = whitened_difference(one[known], other[known], d[known], simulated[known])
+    sides = one[known], other[known], d[known], simulated[known]
+    white = whitened(sides[0] - sides[1], *sides)
     difference = torch.zeros(len(d), upper.shape[1], dtype=d.dtype)  # (band, pair)
     difference[known] = white.abs().square()[:, upper[0], upper[1]]
-    q = difference.sum(-1) / (1 / d + 1 / simulated.clamp(min=1e-9))
+    variance = 1 / d + 1 / simulated.clamp(min=1e-9)
+    if (fitted := case.simulated.uncertainty) is not None and fitted.shares_noise:
+        errors = whitened(fitted.coherence_errors(case.bands.frequency[known]), *sides)
+        variance[known] += 2 * largest_variance(errors)  # of a complex number; errors may all be in one of its parts
+    q = difference.sum(-1) / variance
     # Gamma distributed but for a slightly heavier tail, here that of a ratio.
     n_pairs = difference.shape[-1]
     tails = stats.f.sf((q / n_pairs).numpy(), 2 * n_pairs, _TAIL * d.minimum(simulated).clamp(min=1.0).numpy())
@@ -109,19 +117,29 @@ def coherence_witness(case: Case) -> Evidence:
     )
 
 
-def whitened_difference(one: Tensor, other: Tensor, d: Tensor, s: Tensor) -> Tensor:
-    """Difference of coherences `(band, sensor, sensor)` of `d` and `s` ordinates, in units of their mean."""
+def whitened(matrices: Tensor, one: Tensor, other: Tensor, d: Tensor, s: Tensor) -> Tensor:
+    """Hermitian matrices `(..., band, sensor, sensor)` in units of the mean of coherences of `d` and `s` ordinates."""
     both = (d[:, None, None] * one + s[:, None, None] * other) / (d + s)[:, None, None]
     root = torch.linalg.cholesky(both)
-    left = torch.linalg.solve_triangular(root, one - other, upper=False)
+    left = torch.linalg.solve_triangular(root, matrices.to(root.dtype), upper=False)
     return torch.linalg.solve_triangular(root, left.mH, upper=False)
+
+
+def largest_variance(errors: Tensor) -> Tensor:
+    """Largest variance of a unit combination of entries beside the diagonal, `(...)`.
+
+    Args:
+        errors: What independent errors of unit variance do to matrices, `(error, ..., sensor, sensor)`.
+    """
+    upper = torch.triu_indices(*errors.shape[-2:], 1)
+    entries = errors[..., upper[0], upper[1]].movedim(0, -2)  # (..., error, pair)
+    return torch.linalg.matrix_norm(torch.cat([entries.real, entries.imag], -1), 2).square()
 
 
 def power_tails(case: Case) -> Tensor:
     """Two-sided p values of the ratio of powers `(sensor, band)`; NaN where the simulation says nothing."""
     ratio = case.recorded.power / case.simulated.power
-    varies = torch.as_tensor(case.simulated.level_variance).expand(case.n_sensors)[:, None]
-    d, simulated = 2 * case.bands.dof, 2 * case.simulated.dof / (1 + case.simulated.dof * varies)
+    d, simulated = 2 * case.bands.dof, 2 * case.simulated.power_dof
     law = stats.f(d.numpy(), simulated.clamp(min=1e-9).numpy())
     tails = 2 * torch.from_numpy(law.sf(ratio.numpy())).minimum(torch.from_numpy(law.cdf(ratio.numpy())))
     return tails.clamp(max=1.0).masked_fill(simulated <= 0, math.nan)
