@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gyrofuse.io.arrays import streams_from_arrays
 from gyrofuse.io.limits import LONGEST_NAME, Allowance, decoded
-from gyrofuse.io.stream import RecordingError, Stream
+from gyrofuse.io.stream import RecordingError, Stream, cause
 
 _DEEPEST = 64  # groups inside each other: the library spends its stack on each
 _MOST_TEXTS = 4096  # texts in a MATLAB cell array that may be names of sensors
@@ -44,7 +44,7 @@ def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) 
         raise
     except Exception as error:  # a damaged file may fail anywhere in the library
         raise RecordingError(
-            f"{path}: expected an HDF5 file, found one that cannot be read ({error}); copy or export it again"
+            f"{path}: expected an HDF5 file, found one that cannot be read ({cause(error)}); copy or export it again"
         ) from error
 
 

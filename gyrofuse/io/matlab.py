@@ -11,7 +11,7 @@ import numpy as np
 from gyrofuse.io import hdf5, mat5
 from gyrofuse.io.arrays import streams_from_arrays
 from gyrofuse.io.limits import Allowance
-from gyrofuse.io.stream import RecordingError, Stream
+from gyrofuse.io.stream import RecordingError, Stream, cause
 
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _USER_BLOCK = 512  # MATLAB puts its own header before the HDF5 file
@@ -38,7 +38,9 @@ def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) 
         with path.open("rb") as file:
             start = file.read(_USER_BLOCK + len(_HDF5_SIGNATURE))
     except OSError as error:
-        raise RecordingError(f"{path}: expected a MATLAB file, found one that cannot be opened ({error})") from error
+        raise RecordingError(
+            f"{path}: expected a MATLAB file, found one that cannot be opened ({cause(error)})"
+        ) from error
     if start.startswith(_HDF5_SIGNATURE) or start.endswith(_HDF5_SIGNATURE):
         return hdf5.read(path, key=key, max_bytes=max_bytes)
     allowance = Allowance(path, max_bytes)
@@ -52,7 +54,7 @@ def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) 
         raise
     except Exception as error:  # a damaged file may fail anywhere in the library
         raise RecordingError(
-            f"{path}: expected a MATLAB file of version 5 to 7.3, found one that cannot be read ({error}); "
+            f"{path}: expected a MATLAB file of version 5 to 7.3, found one that cannot be read ({cause(error)}); "
             "save it again with save(..., '-v7')"
         ) from error
     content: dict[str, Any] = {}

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from math import prod
 from pathlib import Path
 from typing import IO, Any
 
@@ -38,6 +39,25 @@ def read_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     if min(shape, default=0) < 0:
         raise ValueError(f"a shape of {shape}")
     return shape, fortran, dtype
+
+
+def read_numbers(file: IO[bytes], shape: tuple[int, ...], fortran: bool, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """The array behind a header that was read.
+
+    Raises:
+        ValueError: Objects, which would have to be unpickled.
+        EOFError: The file ends before.
+    """
+    if dtype.hasobject:
+        raise ValueError("Python objects, which are not unpickled")
+    content = memoryview(bytearray(prod(shape) * dtype.itemsize))
+    done = 0
+    while done < len(content):
+        if not (n_bytes := file.readinto(content[done:])):  # type: ignore[attr-defined]
+            raise EOFError(f"{len(content)} bytes announced, {done} there")
+        done += n_bytes
+    values: NDArray[Any] = np.frombuffer(content, dtype) if len(content) else np.empty(prod(shape), dtype)
+    return values.reshape(shape, order="F" if fortran else "C")
 
 
 def read_stretch(

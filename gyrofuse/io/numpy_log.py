@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from gyrofuse.io.arrays import settings_by_group, stated_rate, streams_from_arrays
 from gyrofuse.io.columns import AXES, classify_columns
 from gyrofuse.io.limits import LONGEST_NAME, Allowance, decoded
-from gyrofuse.io.npy import MAGIC, read_header
+from gyrofuse.io.npy import MAGIC, read_header, read_numbers
 from gyrofuse.io.numpy_tables import streams_from_tables
-from gyrofuse.io.stream import Array, RecordingError, Stream
+from gyrofuse.io.stream import Array, RecordingError, Stream, cause
 
 _Content = Mapping[str, NDArray[Any]]
 
@@ -60,7 +60,7 @@ def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) 
         raise
     except Exception as error:  # a damaged file may fail anywhere in the library
         raise RecordingError(
-            f"{path}: expected a NumPy file of numbers and text, found one that cannot be read ({error}); "
+            f"{path}: expected a NumPy file of numbers and text, found one that cannot be read ({cause(error)}); "
             "save it again with np.savez or np.save, without objects"
         ) from error
 
@@ -89,10 +89,9 @@ def _members(file: IO[bytes], allowance: Allowance) -> dict[str, NDArray[Any]]:
 
 def _array(file: IO[bytes], what: str, allowance: Allowance) -> NDArray[Any]:
     """The array that a file in NumPy's format holds; bytes become text."""
-    shape, _, dtype = read_header(file)
+    shape, fortran, dtype = read_header(file)
     allowance.take(what, shape, dtype.itemsize)
-    file.seek(0)
-    array: NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
+    array = read_numbers(file, shape, fortran, dtype)
     if array.dtype.kind == "S":
         array = np.array([decoded(item) for item in array.ravel().tolist()], dtype=str).reshape(array.shape)
     return array

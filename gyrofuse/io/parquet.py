@@ -8,7 +8,7 @@ from typing import Any
 from gyrofuse.io.arrays import settings_by_group, stated_rate, stated_unit
 from gyrofuse.io.columns import classify_columns, streams_from_columns
 from gyrofuse.io.limits import Allowance, decoded, enumerated
-from gyrofuse.io.stream import Array, RecordingError, Stream
+from gyrofuse.io.stream import Array, RecordingError, Stream, cause
 
 
 def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) -> list[Stream]:
@@ -44,7 +44,7 @@ def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) 
         raise
     except Exception as error:  # a damaged file may fail anywhere in the library
         raise RecordingError(
-            f"{path}: expected a Parquet file, found one that cannot be read ({error}); export it again"
+            f"{path}: expected a Parquet file, found one that cannot be read ({cause(error)}); export it again"
         ) from error
 
     if key is not None:

@@ -13,7 +13,7 @@ from urllib.parse import quote
 import numpy as np
 
 from gyrofuse.io.limits import Allowance, enumerated, is_regular
-from gyrofuse.io.stream import Array, RecordingError, Stream
+from gyrofuse.io.stream import Array, RecordingError, Stream, cause
 
 _IMU = "sensor_msgs/msg/Imu"
 _NUMBERS = 9  # of a message that are kept: 3 of its times, 6 of its values
@@ -68,7 +68,7 @@ def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) 
         raise
     except Exception as error:  # a damaged bag may fail anywhere in the library
         raise RecordingError(
-            f"{path}: expected an indexed ROS 1 or ROS 2 bag, found one that cannot be read ({error}); "
+            f"{path}: expected an indexed ROS 1 or ROS 2 bag, found one that cannot be read ({cause(error)}); "
             "repair it with `rosbag reindex`, `ros2 bag reindex` or `mcap recover`, or record it again"
         ) from error
 

@@ -22,9 +22,9 @@ from gyrofuse.io.arrays import settings_by_group, stated_rate, stated_unit
 from gyrofuse.io.columns import classify_columns
 from gyrofuse.io.hdf5 import check_inside, objects, settings_of
 from gyrofuse.io.limits import Allowance, enumerated, is_regular
-from gyrofuse.io.npy import read_header, read_stretch
+from gyrofuse.io.npy import read_header, read_numbers, read_stretch
 from gyrofuse.io.parquet import metadata_of
-from gyrofuse.io.stream import Array, RecordingError
+from gyrofuse.io.stream import Array, RecordingError, cause
 
 _MOST_SETTING = 2**16  # bytes of an array that is read because it may be a setting: names of sensors at most
 _LOCAL_HEADER = 30  # bytes of a .zip member's own header before its name
@@ -86,7 +86,7 @@ def open_slices(path: Path, key: str | Sequence[str] | None) -> Slices:
         raise
     except Exception as error:  # a damaged file may fail anywhere in its library
         raise RecordingError(
-            f"{path}: expected a {suffix} file, found one that cannot be read ({error}); save or export it again"
+            f"{path}: expected a {suffix} file, found one that cannot be read ({cause(error)}); save or export it again"
         ) from error
 
 
@@ -110,10 +110,11 @@ def _open_npz(path: Path, key: str | None) -> Slices:
                 "save it with np.savez or np.save, not np.savez_compressed"
             )
         few = {}
-        for other, ((shape, _, kind), beside) in headers.items():
-            if other != name and prod(shape) * kind.itemsize <= _MOST_SETTING:
+        for other, ((shape, order, kind), beside) in headers.items():
+            if other != name and prod(shape) * kind.itemsize <= _MOST_SETTING and not kind.hasobject:
                 with archive.open(beside) as member:
-                    few[other] = np.lib.format.read_array(member, allow_pickle=False)
+                    read_header(member)
+                    few[other] = read_numbers(member, shape, order, kind)
     with path.open("rb") as file:
         file.seek(info.header_offset)
         name_and_extra = struct.unpack_from("<HH", file.read(_LOCAL_HEADER), _LOCAL_HEADER - 4)
@@ -261,8 +262,8 @@ def _read_named(path: Path, read: Callable[[int, int], Any], start: int, stop: i
         return np.array(read(start, stop), dtype=np.float64, order="C")
     except Exception as error:  # a file that is damaged, or was changed since, may fail anywhere in its library
         raise RecordingError(
-            f"{path}: expected samples {start} to {stop}, found that they cannot be read ({error}); save or export it "
-            "again, and leave it as it is while it is read"
+            f"{path}: expected samples {start} to {stop}, found that they cannot be read ({cause(error)}); save or "
+            "export it again, and leave it as it is while it is read"
         ) from error
 
 

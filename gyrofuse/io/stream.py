@@ -14,11 +14,16 @@ class RecordingError(ValueError):
     """A log that cannot be read as a recording: says the file, what was expected, what was found, what to do."""
 
 
+def cause(error: Exception) -> str:
+    """Words of an error, its kind where it has none."""
+    return str(error)[:1000] or type(error).__name__
+
+
 def unexpected(source: object, error: Exception) -> RecordingError:
     """The error for what no reader foresaw: with the log, and the words of the cause."""
     return RecordingError(
-        f"{source}: expected a recording, found a log that cannot be made one ({type(error).__name__}: "
-        f"{str(error)[:1000]}); it may be damaged: record, copy or export it again"
+        f"{source}: expected a recording, found a log that cannot be made one ({type(error).__name__}: {cause(error)}"
+        "); it may be damaged: record, copy or export it again"
     )
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from gyrofuse.io.arrays import settings_by_group, stated_rate, stated_unit
 from gyrofuse.io.columns import Column, classify_columns, streams_from_columns, time_in_seconds
 from gyrofuse.io.limits import LONGEST_NAME, Allowance, enumerated
-from gyrofuse.io.stream import Array, RecordingError, Stream
+from gyrofuse.io.stream import Array, RecordingError, Stream, cause
 from gyrofuse.io.text_layout import COMMENT, Layout, find_layout, lines_of, quoted_cells, without_numbers
 
 
@@ -40,7 +40,7 @@ def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) 
         columns, time, notes = (_named if layout.names else _unnamed)(path, layout, key, allowance)
     except (OSError, csv.Error) as error:
         raise RecordingError(
-            f"{path}: expected text, found a file that cannot be read ({error}); export it again"
+            f"{path}: expected text, found a file that cannot be read ({cause(error)}); export it again"
         ) from error
     settings = settings_by_group(layout.settings)
     streams = streams_from_columns(

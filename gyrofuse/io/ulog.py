@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gyrofuse.io.limits import Allowance, enumerated
-from gyrofuse.io.stream import RecordingError, Stream
+from gyrofuse.io.stream import RecordingError, Stream, cause
 
 # Topics with gyro data in rad/s, and their fields along x, y, z.
 _AXES = {
@@ -58,7 +58,7 @@ def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) 
         raise
     except Exception as error:  # a damaged file may fail anywhere in the library
         raise RecordingError(
-            f"{path}: expected a PX4 ULog file, found one that cannot be parsed ({error}); "
+            f"{path}: expected a PX4 ULog file, found one that cannot be parsed ({cause(error)}); "
             "download the log from the vehicle again"
         ) from error
 
