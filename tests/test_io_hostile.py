@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +16,10 @@ from hostile_logs import CASES, GYRO, MAT_HEADER, TIME, csv, mat_cells, npz
 from logs import made_up, write_hdf5, write_parquet, write_ros1
 
 import gyrofuse as gf
+
+sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
+import fuzz_readers
+
 from gyrofuse.io import mat5, read_streams
 from gyrofuse.io.limits import Allowance, physical_memory
 from gyrofuse.io.stream import RecordingError
@@ -231,3 +240,33 @@ class TestErrors:
                 patch.setattr(place, fail)
                 with pytest.raises(RecordingError, match=r"a\.npz: .* \(ZeroDivisionError: float division by zero\)"):
                     gf.read_recording(path)
+
+
+def _fail(_: object) -> None:
+    raise ZeroDivisionError("float division by zero")
+
+
+def _refuse(_: object) -> None:
+    raise RecordingError("expected a log, found something else")
+
+
+class TestFuzzer:
+    """The fuzzer of `tests/benchmarks` sees what it is there to see."""
+
+    @pytest.mark.parametrize(
+        ("reader", "ended"),
+        [
+            (lambda _: time.sleep(60), "hang"),
+            (lambda _: os.kill(os.getpid(), signal.SIGKILL), "crash"),
+            (_fail, "nameless"),
+            (_refuse, "nameless"),
+            (gf.read_recording, "read"),
+        ],
+    )
+    def test_an_end_is_told_by_its_name(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reader: Callable[[object], object], ended: str
+    ):
+        monkeypatch.setattr(fuzz_readers, "SECONDS", 60 if ended == "read" else 1)
+        monkeypatch.setattr(gf, "read_recording", lambda log, rate=None: reader(log))
+        log = csv(tmp_path, "time,gx,gy,gz")
+        assert fuzz_readers.outcome(log)[0] == ended

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAGIC = b"\x93NUMPY"
+_CHUNK = 2**18  # bytes read at a time: members of an archive pass through a buffer, which should stay in the cache
 _LONGEST_HEADER = 10_000  # bytes, as in NumPy, which reads the header whole before it refuses one
 
 
@@ -53,7 +54,7 @@ def read_numbers(file: IO[bytes], shape: tuple[int, ...], fortran: bool, dtype: 
     content = memoryview(bytearray(prod(shape) * dtype.itemsize))
     done = 0
     while done < len(content):
-        if not (n_bytes := file.readinto(content[done:])):  # type: ignore[attr-defined]
+        if not (n_bytes := file.readinto(content[done : done + _CHUNK])):  # type: ignore[attr-defined]
             raise EOFError(f"{len(content)} bytes announced, {done} there")
         done += n_bytes
     values: NDArray[Any] = np.frombuffer(content, dtype) if len(content) else np.empty(prod(shape), dtype)

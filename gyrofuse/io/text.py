@@ -196,8 +196,10 @@ def _plain(line: str, delimiter: str | None, width: int) -> tuple[int, str]:
         n_cells = line.count(between) + 1  # nothing to mend: most lines
     else:
         cells = quoted_cells(line, delimiter) if quoted else line.split(delimiter)
+        if quoted:
+            cells = [cell.replace(between, "_") for cell in cells]
         if delimiter and len(cells) == width + 1 and not cells[-1].strip():
             del cells[-1]
         n_cells = len(cells)
-        line = between.join(cell.strip().replace(between, "_") or "nan" for cell in cells)
+        line = between.join([cell.strip() or "nan" for cell in cells])
     return n_cells, line if delimiter == "," else line.replace(",", ".")
