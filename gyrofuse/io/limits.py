@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Iterable
-from dataclasses import dataclass
 from math import prod
 from pathlib import Path
 
@@ -40,28 +39,23 @@ def physical_memory() -> int:
     return memory
 
 
-@dataclass
 class Allowance:
     """Memory that the numbers of one log may take; what the log declares is taken off before it is allocated.
 
-    Attributes:
+    Args:
         path: The log.
         max_bytes: Limit; by default a quarter of the physical memory.
-        taken: Bytes taken so far.
     """
 
-    path: Path
-    max_bytes: float | None = None
-    taken: int = 0
-
-    def __post_init__(self) -> None:
-        if self.max_bytes is None:
-            self.max_bytes = _SHARE * physical_memory()
+    def __init__(self, path: Path, max_bytes: float | None = None) -> None:
+        self.path = path
+        self.max_bytes = _SHARE * physical_memory() if max_bytes is None else max_bytes
+        self.taken = 0
 
     @property
     def left(self) -> int:
         """Bytes that may still be taken."""
-        return max(int(self.max_bytes or 0) - self.taken, 0)
+        return max(int(self.max_bytes) - self.taken, 0)
 
     def take(self, what: str, shape: Iterable[int], itemsize: int = 8) -> None:
         """Account for an array that is about to be read, which becomes float64 where it is smaller.
@@ -76,10 +70,10 @@ class Allowance:
         """
         dimensions = tuple(shape)
         self.taken += max(prod(dimensions), 0) * max(itemsize, 8)
-        if self.taken > (self.max_bytes or 0):
+        if self.taken > self.max_bytes:
             declared = " x ".join(map(str, dimensions)) or "1"
             raise RecordingError(
-                f"{self.path}: expected a log whose numbers take at most {(self.max_bytes or 0) / _GIB:.3g} GiB, found "
+                f"{self.path}: expected a log whose numbers take at most {self.max_bytes / _GIB:.3g} GiB, found "
                 f"{what[:LONGEST_NAME]} of {declared} numbers, which brings them to {self.taken / _GIB:.3g} GiB; allow "
                 "more with max_bytes=, read the log by stretches with open_long, or cut it, and where it should be "
                 "smaller, record or copy it again"
