@@ -155,6 +155,10 @@ class TestText:
         with pytest.raises(RecordingError, match=r"found neither \(column 'Zeit \[s\]' rises in equal steps .* 'time'"):
             gf.read_recording(csv(tmp_path, "Zeit [s],gx,gy,gz"))
 
+    def test_a_column_that_is_not_asked_for_may_hold_anything(self, tmp_path: Path):
+        path = csv(tmp_path, "row,gx,gy,gz", "lost,1,2,3")
+        assert gf.read_recording(path, rate=100.0).n_samples == 201
+
     def test_a_clock_of_dates_is_told(self, tmp_path: Path):
         (tmp_path / "a.csv").write_text("time,gx\n" + "".join(f"2024-01-01T00:00:{i:02}Z,{i % 7}\n" for i in range(60)))
         with pytest.raises(RecordingError, match=r"found neither \(column 'time' holds no numbers and is left out\)"):

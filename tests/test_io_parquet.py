@@ -121,3 +121,9 @@ def test_the_missing_library_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(ImportError, match=r'pip install "gyrofuse\[logs\]"'):
         parquet.read(tmp_path / "a.parquet")
+
+
+def test_channels_may_be_written_to(tmp_path):
+    path = write_parquet(tmp_path / "a.parquet", {"gx": made_up()[0, 0], "temperature": made_up()[0, 1]})
+    (stream,) = parquet.read(path)
+    assert stream.channels["temperature"].flags.writeable

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from gyrofuse.io.arrays import settings_by_group, stated_rate, stated_unit
 from gyrofuse.io.columns import classify_columns, streams_from_columns
 from gyrofuse.io.limits import Allowance, decoded, enumerated
@@ -38,7 +40,8 @@ def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) 
             wanted = [column.name for column in classify_columns(numbers) if column.kind or column.name == key]
             Allowance(path, max_bytes).take("columns", (file.metadata.num_rows, len(wanted) + len(dates)))
             table = file.read(columns=[*wanted, *dates])
-            columns = {name: table.column(name).to_numpy() for name in wanted}
+            # pyarrow lends its own memory, which may not be written to: torch warns of that
+            columns = {name: np.require(table.column(name).to_numpy(), requirements="W") for name in wanted}
             time = _seconds(table.column(dates[0])) if dates else None
     except RecordingError:
         raise

@@ -61,7 +61,7 @@ def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) 
             topics = _choose(path, [(c.topic, c.msgtype) for c in bag.connections], key)
             connections = [c for c in bag.connections if c.topic in topics and c.msgtype == _IMU]
             for connection, arrival, raw in bag.messages(connections):
-                message = deserialize(raw, _IMU)
+                message: Any = deserialize(raw, _IMU)
                 allowance.take(f"messages of {connection.topic}", (_NUMBERS + len(message.header.frame_id) // 8,))
                 messages.setdefault(connection.topic, _Messages()).append(message, arrival)
     except RecordingError:

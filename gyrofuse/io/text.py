@@ -20,7 +20,7 @@ from gyrofuse.io.arrays import settings_by_group, stated_rate, stated_unit
 from gyrofuse.io.columns import Column, classify_columns, streams_from_columns, time_in_seconds
 from gyrofuse.io.limits import LONGEST_NAME, Allowance, enumerated
 from gyrofuse.io.stream import Array, RecordingError, Stream, cause
-from gyrofuse.io.text_layout import COMMENT, Layout, find_layout, lines_of, quoted_cells, without_numbers
+from gyrofuse.io.text_layout import COMMENT, Layout, advances, find_layout, lines_of, quoted_cells, without_numbers
 
 
 def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) -> list[Stream]:
@@ -81,11 +81,11 @@ def _named(
             f"{path}: expected a column {wanted}, found {enumerated(layout.names)}; "
             "say with `key` which column is the gyro"
         )
-    first = layout.names[0]
-    nameless = layout.numeric[0] and first not in chosen and not any(c.kind == "time" for c in columns_there)
-    columns = _numbers(path, layout, {**chosen, **({first: 0} if nameless else {})}, allowance)
-    if nameless and _advances(columns.pop(first)):
-        notes.append(f"column '{first}' rises in equal steps but has no name of a clock; if it is one, call it 'time'")
+    if layout.rising and layout.names[0] not in chosen and not any(c.kind == "time" for c in columns_there):
+        notes.append(
+            f"column '{layout.names[0]}' rises in equal steps but has no name of a clock; if it is one, call it 'time'"
+        )
+    columns = _numbers(path, layout, chosen, allowance)
     if "gyro" not in gyros and key is not None:
         columns["gyro"] = columns.pop(key)
     return columns, None, notes
@@ -102,7 +102,7 @@ def _unnamed(
     values = list(columns.values())
     notes: list[str] = []
     time = None
-    if [_advances(column) for column in values] == [True, *[False] * (len(values) - 1)] and len(values) > 1:
+    if [advances(column) for column in values] == [True, *[False] * (len(values) - 1)] and len(values) > 1:
         ticks = values.pop(0)
         said = "there is no header; the first column alone advances in nearly constant steps and is"
         if np.all(np.diff(ticks) == 1):
@@ -119,15 +119,6 @@ def _unnamed(
     if key is not None:
         return {"gyro": sensors[key]}, time, notes
     return (sensors if len(sensors) > 1 else {"gyro": values[0]}), time, notes
-
-
-def _advances(values: Array) -> bool:
-    """Whether values rise strictly and nine of ten steps are nearly the same."""
-    steps = np.diff(values)
-    if steps.size < 2 or not np.all(steps > 0):
-        return False
-    typical = float(np.median(steps))
-    return bool(np.mean(np.abs(steps - typical) < 0.5 * typical) > 0.9)
 
 
 def _numbers(path: Path, layout: Layout, chosen: Mapping[str, int], allowance: Allowance) -> dict[str, Array]:

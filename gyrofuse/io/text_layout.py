@@ -11,9 +11,11 @@ from functools import partial
 from itertools import islice
 from pathlib import Path
 
+import numpy as np
+
 from gyrofuse.io.columns import classify_columns
 from gyrofuse.io.limits import LONGEST_NAME, enumerated
-from gyrofuse.io.stream import RecordingError
+from gyrofuse.io.stream import Array, RecordingError
 
 COMMENT = ("#", "%", "//")
 _HEAD = 200  # lines in which the layout is sought: preambles are shorter
@@ -32,6 +34,7 @@ class Layout:
         numeric: Of each column, whether it holds numbers.
         begin: Lines before the first row of numbers.
         settings: What comments and the preamble state, by name.
+        rising: Whether the first column advances in nearly constant steps, as far as it was looked at.
         notes: What was noticed about the text itself.
     """
 
@@ -41,6 +44,7 @@ class Layout:
     numeric: tuple[bool, ...]
     begin: int
     settings: dict[str, str]
+    rising: bool
     notes: tuple[str, ...]
 
 
@@ -119,7 +123,19 @@ def find_layout(path: Path) -> Layout:
         names = _header_above(path, above, delimiter, width)
     comments = [line for line in head[begin:] if line.startswith(COMMENT)]
     settings = {name: value for line in (*above, *comments) for name, value in _settings(line[:LONGEST_NAME])}
-    return Layout(encoding, delimiter, tuple(names), numeric, begin, settings, notes)
+    clock = [cells[0] for number, cells in table if number >= begin]
+    rising = all(is_number(cell, delimiter) for cell in clock) and advances(np.array([_number(c) for c in clock]))
+    return Layout(encoding, delimiter, tuple(names), numeric, begin, settings, rising, notes)
+
+
+def advances(values: Array) -> bool:
+    """Whether values rise strictly and nine of ten steps are nearly the same."""
+    with np.errstate(over="ignore", invalid="ignore"):  # of what is infinite, or as far apart as float64 reaches
+        steps = np.diff(values)
+    if steps.size < 2 or not np.all(steps > 0):
+        return False
+    typical = float(np.median(steps))
+    return bool(np.mean(np.abs(steps - typical) < 0.5 * typical) > 0.9)
 
 
 def _settings(line: str) -> Iterator[tuple[str, str]]:
@@ -187,6 +203,10 @@ def quoted_cells(line: str, delimiter: str | None) -> list[str]:
     """Cells of a line with quotes, in which a delimiter parts none."""
     text = line if delimiter else " ".join(line.split())
     return [cell.strip() for cell in next(csv.reader([text], delimiter=delimiter or " ", skipinitialspace=True))]
+
+
+def _number(cell: str) -> float:
+    return float(cell.replace(",", "."))
 
 
 def is_number(cell: str, delimiter: str | None) -> bool:
