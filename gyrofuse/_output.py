@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import secrets
 import shutil
 import zipfile
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Literal
 
 import numpy as np
 
+_NO_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF)  # what file systems that cannot sync a folder say
+
 
 class Outputs:
     """Files to be written together; `with Outputs(paths) as drafts` gives the path to write to for each of them.
 
-    When the block ends all take their names; when it fails none appears, and what was there stays.
+    When the block ends all take their names; when it fails none appears, and what was there stays. Without `force` a
+    name that was taken while the block ran stays with whoever took it, and none of these appears.
 
     Args:
         paths: Where the files go.
@@ -26,7 +31,7 @@ class Outputs:
 
     Raises:
         FileNotFoundError: A folder does not exist.
-        FileExistsError: A file exists and `force` is not set.
+        FileExistsError: A file exists and `force` is not set, at the beginning or at the end.
         OSError: A folder cannot be written to.
         ValueError: A file is named twice, is one of `inputs`, or is not a file.
     """
@@ -34,9 +39,10 @@ class Outputs:
     def __init__(self, paths: Iterable[Path], *, force: bool = False, inputs: Iterable[Path] = ()) -> None:
         used = {path.resolve() for path in inputs}
         self._drafts: dict[Path, Path] = {}
+        self._force = force
         try:
             for path in paths:
-                where = path.resolve()
+                where = _target(path)
                 if where in used:
                     raise ValueError(f"{path}: is in use by the same command; choose another name")
                 if where.exists() and not where.is_file():
@@ -44,7 +50,7 @@ class Outputs:
                 _check_absent(path, force)
                 used.add(where)
                 self._drafts[path] = _draft(path)
-                with _creating(path):
+                with creating(path):
                     self._drafts[path].touch(exist_ok=False)
         except BaseException:
             self._discard()
@@ -58,14 +64,29 @@ class Outputs:
     ) -> None:
         try:
             if kind is None:
-                for path, draft in self._drafts.items():
-                    draft.replace(path.resolve())
+                self._publish()
         finally:
             self._discard()
 
+    def _publish(self) -> None:
+        if self._force:
+            for path, draft in self._drafts.items():
+                draft.replace(path.resolve())
+            return
+        placed: list[Path] = []
+        try:
+            for path, draft in self._drafts.items():
+                _place_new(draft, path)
+                placed.append(path.resolve())
+        except BaseException:
+            for where in placed:  # all or none
+                where.unlink()
+            raise
+
     def _discard(self) -> None:
         for draft in self._drafts.values():
-            draft.unlink(missing_ok=True)
+            with suppress(OSError):  # of a folder that takes no changes: what is said of that counts
+                draft.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -93,10 +114,11 @@ def output_folder(path: Path, *, own: Collection[str], force: bool = False) -> I
         if others:
             raise ValueError(f"{path}: holds something else ({others[0]}) and is left alone; choose another folder")
     draft, before = _draft(path), _draft(path)
-    with _creating(path):
+    with creating(path):
         draft.mkdir()
     try:
         yield draft
+        _check_absent(path, force)  # what another run made meanwhile
         if where.exists():
             where.rename(before)
         draft.rename(where)
@@ -105,9 +127,58 @@ def output_folder(path: Path, *, own: Collection[str], force: bool = False) -> I
         shutil.rmtree(draft, ignore_errors=True)
 
 
+def sync_file(path: Path) -> None:
+    """Have a file on the disk before anything that comes later."""
+    file = os.open(path, os.O_RDWR)
+    try:
+        os.fsync(file)
+    finally:
+        os.close(file)
+
+
+def sync_folder(folder: Path) -> None:
+    """The same of the names in a folder, where the system can."""
+    try:
+        entry = os.open(folder, os.O_RDONLY)
+    except OSError:  # Windows opens no folder
+        return
+    try:
+        os.fsync(entry)
+    except OSError as error:
+        if error.errno not in _NO_SYNC:
+            raise
+    finally:
+        os.close(entry)
+
+
 def _draft(path: Path) -> Path:
     """A name beside the file behind `path`, so that renaming it does not leave the file system."""
     return path.resolve().with_name(f".{secrets.token_hex(8)}{path.suffix}")
+
+
+def _target(path: Path) -> Path:
+    """The file behind links."""
+    try:
+        return path.resolve()
+    except RuntimeError:
+        raise ValueError(f"{path}: is a link that leads to itself; choose another name") from None
+
+
+def _place_new(draft: Path, path: Path) -> None:
+    """Give a file its name, which nothing may have taken: a second run of the same command, say, that ended sooner."""
+    where = path.resolve()
+    try:
+        os.link(draft, where)
+    except FileExistsError:
+        _check_absent(path, force=False)
+        raise
+    except OSError:  # a file system without hard links: a name is taken by an empty file, then that is replaced
+        try:
+            where.touch(exist_ok=False)
+        except FileExistsError:
+            _check_absent(path, force=False)
+            raise
+        draft.replace(where)
 
 
 def _check_absent(path: Path, force: bool) -> None:
@@ -116,7 +187,8 @@ def _check_absent(path: Path, force: bool) -> None:
 
 
 @contextmanager
-def _creating(path: Path) -> Iterator[None]:
+def creating(path: Path) -> Iterator[None]:
+    """Say what a folder that takes no new file means for `path`, which is to appear in it."""
     try:
         yield
     except FileNotFoundError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -52,6 +53,57 @@ def test_outputs_follow_links_and_refuse_what_is_used_twice(tmp_path: Path):
         with pytest.raises(OSError, match="the folder /proc takes no new files; choose another place"):
             Outputs([Path("/proc/file.txt")])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["link.txt", "target.txt"]
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_a_name_that_was_taken_meanwhile_stays_taken(tmp_path: Path, monkeypatch, links: bool):
+    def refuse(*_):
+        raise PermissionError(1, "Operation not permitted")  # as of FAT
+
+    if not links:
+        monkeypatch.setattr(os, "link", refuse)
+    free, taken = tmp_path / "free.txt", tmp_path / "taken.txt"
+
+    def write(text: str, force: bool = False) -> None:
+        with Outputs([free, taken], force=force) as drafts:
+            for draft in drafts.values():
+                draft.write_text(text)
+            taken.write_text("of another run")
+
+    with pytest.raises(FileExistsError, match=r"taken.txt: exists already; choose another name"):
+        write("mine")
+    assert contents(tmp_path) == {"taken.txt": b"of another run"}
+    write("mine", force=True)
+    assert contents(tmp_path) == {"free.txt": b"mine", "taken.txt": b"mine"}
+    for path in (free, taken):
+        path.unlink()
+    with Outputs([free]) as drafts:
+        drafts[free].write_text("mine")
+    assert contents(tmp_path) == {"free.txt": b"mine"}
+
+    def write_folder() -> None:
+        with output_folder(tmp_path / "out", own=("a.txt",)) as draft:
+            (draft / "a.txt").write_text("mine")
+            (tmp_path / "out").mkdir()
+            (tmp_path / "out" / "a.txt").write_text("of another run")
+
+    with pytest.raises(FileExistsError, match="out: exists already"):
+        write_folder()
+    assert contents(tmp_path / "out") == {"a.txt": b"of another run"}
+
+
+def test_what_is_wrong_with_a_place_is_said_even_where_nothing_can_be_cleaned_up(tmp_path: Path, monkeypatch):
+    def refuse(*_, **__):
+        raise OSError(30, "Read-only file system", "/its/draft")
+
+    with monkeypatch.context() as patched:
+        for name in ("touch", "unlink"):
+            patched.setattr(Path, name, refuse)
+        with pytest.raises(OSError, match=r"o.txt: cannot be written there \(Read-only file system\); choose another"):
+            Outputs([tmp_path / "o.txt"])
+    (tmp_path / "round.txt").symlink_to("round.txt")
+    with pytest.raises(ValueError, match=r"round\.txt: is a link that leads to itself; choose another name"):
+        Outputs([tmp_path / "round.txt"])
 
 
 def test_output_folder_is_replaced_only_when_it_holds_nothing_else(tmp_path: Path):
