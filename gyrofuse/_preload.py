@@ -10,7 +10,7 @@ collecting = gc.isenabled()
 gc.disable()
 try:
     import gyrofuse.cli
-    import gyrofuse.lightning_module  # noqa: F401
+    import gyrofuse.fleet_run  # noqa: F401
 finally:
     gc.freeze()
     if collecting:

@@ -341,7 +341,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if hasattr(stream, "reconfigure"):  # names in logs may hold what the terminal cannot show
             stream.reconfigure(errors="replace")
     if threading.current_thread() is threading.main_thread():  # ended from outside: leave no draft behind
-        signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+        for number in (signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)):  # SIGHUP: the terminal is gone
+            if signal.getsignal(number) != signal.SIG_IGN:  # as nohup asks
+                signal.signal(number, lambda got, _: sys.exit(128 + got))
     atexit.register(gc.freeze)  # taking apart what was imported, before the process ends anyway, takes a second
     app(arguments)
 

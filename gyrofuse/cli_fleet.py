@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import signal
+import math
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -38,14 +38,13 @@ from gyrofuse.recording import read_recording
 from gyrofuse.simulate import ArrayModel
 
 if TYPE_CHECKING:
-    from lightning.pytorch import Trainer
-
     from gyrofuse.fleet.store import ResultStore
     from gyrofuse.fleet.tasks import Task
-    from gyrofuse.lightning_module import GyroArrayDataModule
 
 _ACCELERATORS = ("cpu", "gpu", "auto")
-_AT_ONCE = getattr(signal, "SIGKILL", signal.SIGTERM)  # Lightning lets processes finish on SIGTERM
+# s; a log of 10^8 samples is fused in a minute and one of 10^6 diagnosed in some, but one on which a library never ends
+# is to cost a night's run no more than a part of the night
+_LIMIT = 3600.0
 _LOOK = 0.5  # s between looks at how far a run has come
 
 
@@ -78,6 +77,12 @@ def fleet(
     group: Annotated[
         int, typer.Option(metavar="N", help="Logs taken at a time; more than one pays where they are many and short.")
     ] = 1,
+    timeout: Annotated[
+        float,
+        typer.Option(
+            metavar="S", help="Seconds that a log may take to be read, and again to be worked on; 0 for any number."
+        ),
+    ] = _LIMIT,
     retry: Annotated[bool, typer.Option("--retry", help="Try logs again that failed before.")] = False,
     scale_weights: Annotated[
         str | None,
@@ -108,20 +113,24 @@ def fleet(
 ) -> None:
     """Fuse, fit or diagnose many logs, on one process or several, into one table with a row for each.
 
-    A log that cannot be used gets a row that says why, and the others theirs; the exit status is 1 where that holds for
-    all of them. Stopped at any moment, the same command goes on where it was.
+    A log that cannot be used gets a row that says why, and the others theirs, even where it ends the process that reads
+    it or never lets it go; the exit status is 1 where that holds for all of them. Stopped at any moment, the same
+    command goes on where it was.
     """
     check_positive_integer("--devices", devices)
     check_positive_integer("--group", group)
     if accelerator not in _ACCELERATORS:
         known = f"{', '.join(_ACCELERATORS[:-1])} or {_ACCELERATORS[-1]}"
         raise ValueError(f"`--accelerator`: expected {known}, got {accelerator!r}")
-    if devices > 1:
-        begin_imports(accelerator)
+    if not (timeout >= 0 and math.isfinite(timeout)):
+        raise ValueError(f"`--timeout`: expected a finite number of seconds >= 0, got {timeout!r}")
+    begin_imports(accelerator)
 
     from gyrofuse.fleet.logs import identity
     from gyrofuse.fleet.standing import standing_of
-    from gyrofuse.fleet.store import ResultStore, read_results
+    from gyrofuse.fleet.store import ResultStore
+    from gyrofuse.fleet.table import read_results
+    from gyrofuse.fleet_run import run_fleet
     from gyrofuse.lightning_module import GyroArrayDataModule
 
     if out.suffix.lower() != ".parquet":
@@ -150,10 +159,19 @@ def fleet(
         store = ResultStore(out, asked.columns, {**asked.settings, **options})
         data = GyroArrayDataModule(paths or [], manifest=manifest, group_size=group, **options)
         data.logs = tuple(log for log in data.logs if identity(log) != identity(out))  # its suffix is that of a log
-        trainer = _trainer(store, devices, accelerator)
+        _check_devices(devices, accelerator)
         store.open(force=force)
-        data.done = store.done(failed=not retry)
-        _run(asked, store, data, trainer)
+        try:
+            with _watched(store, len(data.logs), group):
+                limit = timeout or None
+                run_fleet(
+                    asked, data, store, devices=devices, accelerator=accelerator, timeout=limit, retry=retry, said=warn
+                )
+        except (SystemExit, KeyboardInterrupt):
+            warn("stopped; what is finished is kept, start again to go on")
+            raise
+        finally:
+            store.close()
         settings, rows = read_results(out, without=["virtual"])
         standing = standing_of(settings["task"], rows)
         if json_file:
@@ -201,13 +219,13 @@ def _simulation(path: Path) -> Any:
     return noise
 
 
-def _trainer(store: ResultStore, devices: int, accelerator: str) -> Trainer:
+def _check_devices(devices: int, accelerator: str) -> None:
     from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
-    from gyrofuse.lightning_module import ResultWriter, quiet_trainer
+    from gyrofuse.lightning_module import quiet_trainer
 
     try:
-        return quiet_trainer(devices=devices, accelerator=accelerator, callbacks=[ResultWriter(store)])
+        quiet_trainer(devices=devices, accelerator=accelerator)
     except MisconfigurationException as error:
         raise ValueError(
             f"`--accelerator`: expected {devices} of the kind {accelerator}, which this computer does not have "
@@ -215,44 +233,18 @@ def _trainer(store: ResultStore, devices: int, accelerator: str) -> Trainer:
         ) from None
 
 
-def _run(task: Task, store: ResultStore, data: GyroArrayDataModule, trainer: Trainer) -> None:
-    """Work on what is not done yet, with a bar."""
-    from torch.multiprocessing import ProcessExitedException, ProcessRaisedException
-
-    from gyrofuse.fleet.logs import identity
-    from gyrofuse.lightning_module import FusionModule
-
-    if not data.groups:
-        store.finish([identity(log) for log in data.logs])
-        return
-    try:
-        with _watched(store, store.n_parts, len(data.groups), len(data.logs)):
-            trainer.predict(FusionModule(task), datamodule=data, return_predictions=False)
-    except ProcessRaisedException as error:  # its last line is what was raised
-        kind, _, words = str(error).strip().rpartition("\n")[2].partition(": ")
-        raise (OSError if kind.endswith("Error") else RuntimeError)(words or kind) from None
-    except ProcessExitedException as error:
-        raise OSError(f"a process ended early ({error}); what is finished is kept, start again to go on") from None
-    except SystemExit as stop:  # from outside: the others would work on, and this process wait for them
-        if trainer.strategy.launcher is not None:
-            trainer.strategy.launcher.kill(_AT_ONCE)
-        warn("stopped; what is finished is kept, start again to go on")
-        if isinstance(stop.__context__, KeyboardInterrupt):  # of which Lightning makes an exit
-            raise KeyboardInterrupt from None
-        raise
-
-
 @contextmanager
-def _watched(store: ResultStore, already: int, n_groups: int, n_logs: int) -> Iterator[None]:
-    """Show how many groups of logs are done, whoever does them."""
+def _watched(store: ResultStore, n_logs: int, group: int) -> Iterator[None]:
+    """Show how many groups of logs are done in this run, whoever does them."""
     over = threading.Event()
+    already, n_groups = store.n_parts, math.ceil(n_logs / group)
 
     with progress_bar(f"{n_logs} logs") as show:
 
         def look() -> None:
             while not over.wait(_LOOK):
                 done = max(store.n_parts - already, 0)
-                show(f"{done} of {n_groups} to do", done / n_groups)
+                show(f"{done} groups done", min((already + done) / n_groups, 1.0))
 
         watcher = threading.Thread(target=look, daemon=True)
         watcher.start()

@@ -11,9 +11,10 @@ Example:
 from __future__ import annotations
 
 import logging
-import os
+import multiprocessing
 import warnings
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from datetime import timedelta
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -24,11 +25,14 @@ from lightning.pytorch.strategies import DDPStrategy
 from torch.utils.data import DataLoader
 
 from gyrofuse._checks import check_positive_integer
-from gyrofuse._workers import parent_lives, start_method
+from gyrofuse._workers import end_at_once, end_with_parent, start_method
 from gyrofuse.fleet.logs import find_logs, groups_of, identity
 from gyrofuse.fleet.store import ResultStore
 from gyrofuse.fleet.tasks import Fuse, Row, Task
+from gyrofuse.fleet.watch import Suspect, Watch, close_all
 from gyrofuse.fleet.work import Log, LogGroups, rows_of
+
+_PATIENCE = timedelta(days=365)  # of processes that wait for each other: one may be at a long log
 
 
 class GyroArrayDataModule(LightningDataModule):
@@ -63,19 +67,32 @@ class GyroArrayDataModule(LightningDataModule):
         self.logs = find_logs(paths, manifest=manifest)
         self.group_size = check_positive_integer("group_size", group_size)
         self.done = done
+        self.suspects: Mapping[str, Suspect] = {}
+        self.watch: Watch | None = None
         self.num_workers = num_workers
         self.options = LogGroups((), options).options  # wrong ones are told now, not by every row
 
     @cached_property
     def groups(self) -> tuple[tuple[Path, ...], ...]:
         """Logs that are taken together, without those that are done, as they are when they are first asked for."""
-        return groups_of(self.logs, self.group_size, self.done)
+        alone = [log for log, suspect in self.suspects.items() if suspect.alone]
+        return groups_of(self.logs, self.group_size, self.done, last=self.suspects, alone=alone)
+
+    def leave(self, done: Collection[str], suspects: Mapping[str, Suspect]) -> None:
+        """Say anew what is left.
+
+        Args:
+            done: Identities of logs that are left out.
+            suspects: Logs that a process ended at (`ResultStore.suspects`): they come last.
+        """
+        self.done, self.suspects = done, suspects
+        self.__dict__.pop("groups", None)
 
     def predict_dataloader(self) -> DataLoader[tuple[Log, ...]]:
         """Groups of logs; Lightning shares them out among processes, each once."""
         # Lightning's sampler wants one for each process at least; an empty group has no rows.
         idle = self.trainer.world_size - len(self.groups) if self.trainer and self.groups else 0
-        groups = LogGroups([*self.groups, *[()] * idle], self.options)
+        groups = LogGroups([*self.groups, *[()] * idle], self.options, self.watch)
         # Of a batch of one group: samplers of distributed runs want batches.
         return DataLoader(groups, batch_size=1, collate_fn=_only, num_workers=self.num_workers)
 
@@ -107,15 +124,18 @@ class ResultWriter(BasePredictionWriter):
     Args:
         store: The table, of the columns and settings of the module's task.
         force: Whether a table of other settings is replaced.
+        timeout: Seconds that a log may take to be read, and again to be worked on; then its process ends, and on the
+            next start it has a row that says so. None for any.
 
     Raises:
         ValueError: On setup, where the table is of another task, or of the same with other settings.
     """
 
-    def __init__(self, store: ResultStore, *, force: bool = False) -> None:
+    def __init__(self, store: ResultStore, *, force: bool = False, timeout: float | None = None) -> None:
         super().__init__(write_interval="batch")
         self.store = store
         self.force = force
+        self.watch = Watch(store.parts, timeout)
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Open the table, before anyone writes."""
@@ -127,14 +147,20 @@ class ResultWriter(BasePredictionWriter):
                 "`store`: expected the columns and settings of the module's task, got others; make it with "
                 "ResultStore(path, task.columns, task.settings)"
             )
+        if multiprocessing.parent_process() is not None:  # of whatever trainer
+            end_with_parent(close_all)
         if trainer.is_global_zero:
             self.store.open(force=self.force)
-        trainer.strategy.barrier("opened")
+        passed_over, suspects = trainer.strategy.broadcast((self.store.passed_over, self.store.suspects))
+        data = getattr(trainer, "datamodule", None)
+        if isinstance(data, GyroArrayDataModule):
+            data.watch = self.watch
+            if passed_over or suspects != data.suspects:
+                data.leave({*data.done, *passed_over}, suspects)
 
-    def on_predict_batch_start(self, *_: Any, **__: Any) -> None:
-        """A process whose parent was killed does not work on unseen."""
-        if not parent_lives():
-            os._exit(1)
+    def on_predict_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, *_: Any) -> None:
+        """Note what is worked on."""
+        self.watch.begin([log.place for log in batch])
 
     def write_on_batch_end(
         self,
@@ -148,9 +174,15 @@ class ResultWriter(BasePredictionWriter):
     ) -> None:
         """Add the rows of a group."""
         self.store.write(prediction)
+        self.watch.end()
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """No log is to blame for what ends in an exception."""
+        self.watch.close()
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Complete the table; here, since Lightning begins and ends no prediction where nothing is left to do."""
+        self.watch.close()
         trainer.strategy.barrier("written")
         if trainer.is_global_zero:
             data = getattr(trainer, "datamodule", None)
@@ -158,8 +190,11 @@ class ResultWriter(BasePredictionWriter):
         trainer.strategy.barrier("finished")
 
 
-class _Quiet(Callback):
-    """Keeps Lightning from announcing itself, in spawned processes as well: they unpickle it before they begin."""
+class _Worker(Callback):
+    """Keeps Lightning from announcing itself, and has processes that it starts end when they should.
+
+    They unpickle it before they begin.
+    """
 
     def __init__(self) -> None:
         self.hushed = True  # something to pickle: without it, unpickling does nothing
@@ -167,10 +202,15 @@ class _Quiet(Callback):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self._hush()
+        end_with_parent(close_all)
+
+    def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Later than Lightning's own handlers of signals, which wait for the other processes."""
+        end_at_once(close_all)
 
     @staticmethod
     def _hush() -> None:
-        for name in ("lightning.pytorch", "lightning.fabric"):
+        for name in ("lightning.pytorch", "lightning.fabric", "torch.multiprocessing.spawn"):
             logging.getLogger(name).setLevel(logging.ERROR)
         warnings.filterwarnings("ignore", module=r"lightning\.|torch\.")
 
@@ -187,8 +227,8 @@ def quiet_trainer(*, devices: int, accelerator: str = "cpu", callbacks: Sequence
     return Trainer(
         devices=devices,
         accelerator=accelerator,
-        strategy=DDPStrategy(start_method=start_method(accelerator)) if devices > 1 else "auto",
-        callbacks=[_Quiet(), *callbacks],
+        strategy=DDPStrategy(start_method=start_method(accelerator), timeout=_PATIENCE) if devices > 1 else "auto",
+        callbacks=[_Worker(), *callbacks],
         logger=False,
         enable_progress_bar=False,
         enable_model_summary=False,

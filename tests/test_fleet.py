@@ -60,6 +60,25 @@ def test_a_manifest_names_logs_beside_itself_and_those_that_are_gone(folder):
     assert names(find_logs([], manifest=manifest)) == ["b.npz", "gone.npz", "c.npz"]
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_manifests_of_windows_are_read(folder, encoding):
+    (folder / "é.npz").write_bytes(b"")
+    (folder / "list.txt").write_bytes("a.npz\r\né.npz\r\n".encode(encoding))
+    assert names(find_logs([], manifest=folder / "list.txt")) == ["a.npz", "é.npz"]
+
+
+def test_a_line_that_is_no_name_spoils_itself_alone(folder):
+    (folder / "list.txt").write_bytes(b"a.npz\nb\0.npz\n*\0/*\n\xff\xfe.npz\n" + b"x" * 5000 + b"\n")
+    logs = find_logs([], manifest=folder / "list.txt")
+    assert [log.name.startswith(name) for log, name in zip(logs, ["a", "b", "*", "\udcff", "x"], strict=True)]
+    groups = groups_of(logs, 5)
+    rows = {row["log"].removeprefix(f"{folder}/"): row for row in rows_of(Fuse(), LogGroups(groups, {})[0])}
+    assert rows.pop("a.npz")["status"] == "ok"
+    assert {row["status"] for row in rows.values()} == {"failed"}
+    nul = "expected the name of a file, found one with NUL bytes; save the list as UTF-8"
+    assert [rows[name]["error"] for name in ("b\0.npz", "*\0/*")] == [nul, nul]
+
+
 def test_a_folder_that_may_not_be_read_is_listed(folder, monkeypatch):
     scan = os.scandir
 
@@ -180,12 +199,13 @@ def test_a_part_that_was_cut_short_is_done_again(tmp_path):
     part.write_bytes(part.read_bytes()[:-20])
     (store.parts / "x.draft").write_bytes(b"half")
     store.open()
-    assert len(store.done()) == 1
+    with pytest.warns(UserWarning, match="1 of its parts damaged"):
+        assert len(store.done()) == 1
     assert not list(store.parts.glob("*.draft"))
 
 
 def test_large_tables_are_written_in_pieces(tmp_path, monkeypatch):
-    monkeypatch.setattr("gyrofuse.fleet.store._MOST_LOGS", 3)
+    monkeypatch.setattr("gyrofuse.fleet.table._MOST_LOGS", 3)
     store = store_at(tmp_path / "r.parquet")
     store.open()
     logs = [f"{i:02d}" for i in range(10)]

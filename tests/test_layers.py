@@ -26,6 +26,7 @@ LAYERS = [
         "cli_shared",
         "_console",
         "_preload",
+        "fleet_run",
         "lightning_module",
     },
     {

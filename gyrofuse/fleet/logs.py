@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import glob
 import os
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -25,19 +26,25 @@ def state_of(log: str | Path) -> State:
     try:
         files = [Path(log)] if not os.path.isdir(log) else [path for path in Path(log).rglob("*") if path.is_file()]
         found = [file.stat() for file in files]
-    except OSError:
+    except (OSError, ValueError):  # no name of a file: it holds NUL, say
         return State()
     return State(sum(s.st_size for s in found), max((s.st_mtime_ns for s in found), default=None))
 
 
 def identity(log: str | Path) -> str:
     """A log by its absolute path, whatever it was called and from wherever."""
-    return as_text(os.path.realpath(log))
+    try:
+        return as_text(os.path.realpath(log))
+    except ValueError:  # no name of a file
+        return as_text(os.path.abspath(log))
 
 
 def as_text(text: str) -> str:
-    r"""With bytes that are not UTF-8, as names of files may hold, written out: `\xff`."""
-    return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+    r"""With what UTF-8 cannot hold written out: bytes of names of files as `\xff`, lone surrogates as `\ud800`."""
+    try:
+        return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+    except UnicodeEncodeError:  # surrogates that stand for no byte
+        return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 def find_logs(paths: str | Path | Iterable[str | Path], *, manifest: str | Path | None = None) -> tuple[Path, ...]:
@@ -48,8 +55,9 @@ def find_logs(paths: str | Path | Iterable[str | Path], *, manifest: str | Path 
 
     Args:
         paths: Files, folders, and patterns such as `"flights/*/imu.npz"`, with `**` for any folders between; or one.
-        manifest: Text file with one such name a line, relative to its own folder; lines that begin with `#` do not
-            count. What it names and is not there is listed all the same.
+        manifest: Text file with one such name a line, relative to its own folder, in UTF-8 or, as Windows writes it,
+            with a byte order mark or in UTF-16; lines that begin with `#` do not count. What it names and is not
+            there is listed all the same.
 
     Raises:
         FileNotFoundError: A name that is neither there nor a pattern that anything fits, or no such manifest.
@@ -61,14 +69,16 @@ def find_logs(paths: str | Path | Iterable[str | Path], *, manifest: str | Path 
             found.setdefault(identity(log), log)
     if manifest is not None:
         for path in _listed(Path(manifest)):
-            for log in _expanded(path) or [path]:
+            for log in _expanded_or_itself(path):
                 found.setdefault(identity(log), log)
     if not found:
         raise ValueError(f"`paths`: expected logs ({' '.join(SUFFIXES)}) or folders with some, found none")
     return tuple(found.values())
 
 
-def groups_of(logs: Sequence[Path], size: int, done: Collection[str] = ()) -> tuple[tuple[Path, ...], ...]:
+def groups_of(
+    logs: Sequence[Path], size: int, done: Collection[str] = (), last: Collection[str] = (), alone: Collection[str] = ()
+) -> tuple[tuple[Path, ...], ...]:
     """Logs in groups of up to `size`, as they follow each other, without those that are done; the largest first.
 
     The groups are those of all logs, whatever is done: what is computed together does not depend on where a run was
@@ -78,10 +88,18 @@ def groups_of(logs: Sequence[Path], size: int, done: Collection[str] = ()) -> tu
         logs: Of the fleet.
         size: Of a group.
         done: Identities of logs whose rows are there.
+        last: Identities of logs whose groups come after all others.
+        alone: Identities of logs that are no part of a group.
     """
-    groups = (tuple(logs[i : i + size]) for i in range(0, len(logs), size))
-    left = [part for part in (tuple(log for log in group if identity(log) not in done) for group in groups) if part]
-    return tuple(sorted(left, key=lambda group: -sum(state_of(log).size or 0 for log in group)))
+    known = {log: identity(log) for log in logs}
+    groups = [logs[i : i + size] for i in range(0, len(logs), size)]
+    parts = [tuple(log for log in group if known[log] not in done and known[log] not in alone) for group in groups]
+    parts += [(log,) for log in logs if known[log] in alone and known[log] not in done]
+
+    def place(group: tuple[Path, ...]) -> tuple[bool, int]:
+        return any(known[log] in last for log in group), -sum(state_of(log).size or 0 for log in group)
+
+    return tuple(sorted(filter(None, parts), key=place))
 
 
 def _logs_of(path: Path) -> Iterable[Path]:
@@ -105,6 +123,14 @@ def _expanded(path: Path) -> list[Path]:
     return [log for name in sorted(glob.glob(str(path), recursive=True)) for log in _expanded(Path(name))]
 
 
+def _expanded_or_itself(path: Path) -> list[Path]:
+    """Logs behind a line of a manifest; the line itself where there are none, so that its row says so."""
+    try:
+        return _expanded(path) or [path]
+    except ValueError:  # no name of a file
+        return [path]
+
+
 def _walked(folder: Path) -> Iterator[Path]:
     """Logs below a folder, and folders that cannot be read, sorted by name."""
     unreadable: list[Path] = []
@@ -123,5 +149,11 @@ def _is_log(name: str) -> bool:
 
 
 def _listed(manifest: Path) -> list[Path]:
-    lines = [line.strip() for line in manifest.read_text(encoding="utf-8", errors="surrogateescape").splitlines()]
+    """Names that a manifest lists. A byte that belongs to no character spoils its own line alone."""
+    content = manifest.read_bytes()
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):  # as PowerShell writes it
+        text = content.decode("utf-16", "replace")
+    else:
+        text = content.decode("utf-8-sig", "surrogateescape")
+    lines = [line.strip() for line in text.splitlines()]
     return [manifest.parent / line for line in lines if line and not line.startswith("#")]

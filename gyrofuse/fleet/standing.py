@@ -10,7 +10,7 @@ import numpy as np
 from scipy import stats
 
 from gyrofuse._result import counted
-from gyrofuse.fleet.store import identity_in
+from gyrofuse.fleet.table import identity_in
 
 NOISY = 2.0  # times the median of an array
 _OUTLIER = 5.0  # robust standard deviations

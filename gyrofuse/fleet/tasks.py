@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gyrofuse._checks import check_confidence_level
 from gyrofuse._model import Model
-from gyrofuse.fleet.store import Column
+from gyrofuse.fleet.table import Column
 from gyrofuse.fusion import METHODS
 from gyrofuse.gmwm import fit_gmwm
 from gyrofuse.mismatch import diagnose

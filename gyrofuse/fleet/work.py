@@ -14,6 +14,7 @@ from torch.utils.data import Dataset
 
 from gyrofuse.fleet.logs import State, as_text, identity, state_of
 from gyrofuse.fleet.tasks import Row, Task
+from gyrofuse.fleet.watch import Watch
 from gyrofuse.recording import Recording, check_reading, read_recording
 
 _OPTIONS = tuple(signature(read_recording).parameters)[1:]  # without the path
@@ -37,6 +38,11 @@ class Log:
     path: str | None = None
     state: State = field(default_factory=State)
 
+    @property
+    def place(self) -> Row:
+        """What its rows say of where it is."""
+        return {"log": self.name, "path": self.path, **self.state._asdict()}
+
     def to(self, device: torch.device) -> Log:
         """With the signal on a device."""
         if self.recording is None:
@@ -50,13 +56,17 @@ class LogGroups(Dataset[tuple[Log, ...]]):
     Args:
         groups: Paths, group by group.
         options: Of `read_recording`.
+        watch: Where it is noted which log is being read.
 
     Raises:
         TypeError: An option that it does not have.
         ValueError: A rate or scale that is none.
     """
 
-    def __init__(self, groups: Sequence[Sequence[Path]], options: Mapping[str, Any]) -> None:
+    def __init__(
+        self, groups: Sequence[Sequence[Path]], options: Mapping[str, Any], watch: Watch | None = None
+    ) -> None:
+        self.watch = watch
         self.groups = tuple(map(tuple, groups))
         self.options = dict(options)
         unknown = [name for name in options if name not in _OPTIONS]
@@ -70,14 +80,25 @@ class LogGroups(Dataset[tuple[Log, ...]]):
         return len(self.groups)
 
     def __getitem__(self, index: int) -> tuple[Log, ...]:
-        return tuple(self._read(path) for path in self.groups[index])
+        return tuple(map(self._watched, self.groups[index]))
+
+    def _watched(self, path: Path) -> Log:
+        try:
+            return self._read(path)
+        finally:  # and no sooner: to take apart what a library has left of a log may end the process, too
+            if self.watch is not None:
+                self.watch.end()
 
     def _read(self, path: Path) -> Log:
         log = Log(as_text(str(path)), None, path=identity(path), state=state_of(path))
+        if "\0" in str(path):
+            return replace(log, error="expected the name of a file, found one with NUL bytes; save the list as UTF-8")
+        if self.watch is not None:
+            self.watch.begin([log.place])
         try:
             return replace(log, recording=read_recording(path, **self.options))
         except Exception as error:  # whatever a damaged file does to a library, the others are read
-            return replace(log, error=_said(error).removeprefix(f"{log.name}: "))
+            return replace(log, error=as_text(_said(error)).removeprefix(f"{log.name}: "))
 
 
 @dataclass
@@ -140,8 +161,7 @@ def _alone(task: Task, recording: Recording) -> _Answer:
 
 
 def _whole_rows(log: Log, answer: _Answer) -> list[Row]:
-    common: Row = {"log": log.name, "path": log.path, **log.state._asdict()}
-    common |= {"status": "ok" if answer.error is None else "failed", "error": answer.error}
+    common: Row = {**log.place, "status": "ok" if answer.error is None else "failed", "error": answer.error}
     if log.recording is not None:
         r = log.recording
         common |= {
@@ -152,11 +172,20 @@ def _whole_rows(log: Log, answer: _Answer) -> list[Row]:
             "missing": float(r.missing.max()),
             "notes": [str(note) for note in r.notes],
         }
-    return [{**common, **own, "warnings": [*answer.warned, *own.get("warnings", ())]} for own in answer.rows or [{}]]
+    whole = [{**common, **own, "warnings": [*answer.warned, *own.get("warnings", ())]} for own in answer.rows or [{}]]
+    return [{name: _storable(value) for name, value in row.items()} for row in whole]
+
+
+def _storable(value: Any) -> Any:
+    """Text, alone or in lists, as UTF-8 can hold it: names of sensors come from logs as they are."""
+    if isinstance(value, str):
+        return as_text(value)
+    texts = isinstance(value, list | tuple) and any(isinstance(entry, str) for entry in value[:1])
+    return [_storable(entry) for entry in value] if texts else value
 
 
 def _said(error: Exception) -> str:
     """One line; what is a defect rather than bad input says its type."""
-    words = as_text(" ".join(str(error).split()))
+    words = " ".join(str(error).split())
     known = isinstance(error, ValueError | TypeError | OSError | ImportError)
     return words if known and words else f"{type(error).__name__}: {words}"
