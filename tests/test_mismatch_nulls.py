@@ -221,8 +221,8 @@ def test_a_model_is_gaussian_and_samples_are_what_they_look_like() -> None:
 @pytest.mark.parametrize("kind", ["t5", "laplace", "wandering", "spiky"])
 def test_noise_that_both_share_is_no_mismatch(kind: str) -> None:
     low = {}
-    for seed in range(6):
-        case = case_of(kind, 200 + seed)
+    for seed in range(4):
+        case = case_of(kind, 200 + seed, n=4099)
         for witness in (
             impulses.spike_witness,
             impulses.jump_witness,
@@ -231,15 +231,14 @@ def test_noise_that_both_share_is_no_mismatch(kind: str) -> None:
             shape_witness,
         ):
             low[witness.__name__] = low.get(witness.__name__, 0) + (witness(case).p_value < 0.01)
-    # Two of six at 1 % have probability 1e-3; of five witnesses of four kinds the largest is allowed that.
-    assert max(low.values()) <= 2, low
-    assert sum(low.values()) <= 3, low
+    # More than two of twenty at 1 % have probability 1e-3; all four were low before.
+    assert sum(low.values()) <= 2, low
 
 
 def test_no_law_that_both_share_gets_a_name() -> None:
     """Once something else made it a mismatch; of modulated noise spectra gained any number of nats."""
-    for seed in range(3):
-        case = case_of("wandering", 300 + seed)
+    for seed in range(2):
+        case = case_of("wandering", 300 + seed, n=4099)
         for mechanism in (ParameterShift, RandomTelegraph, VarianceChange):
             assert mechanism.nominate(case, LEVEL) is None, mechanism.name
 
