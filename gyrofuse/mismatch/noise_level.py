@@ -26,7 +26,7 @@ from gyrofuse.mismatch.stats.local_level import local_level
 from gyrofuse.mismatch.stats.long_run_variance import chi_square_nodes
 
 _NOTHING = 0.05  # p value of what need not be compared
-LEVEL_CUT = SQUARE_CUT
+LEVEL_CUT = SQUARE_CUT  # squares: as where it is asked whether levels vary by themselves
 _BLOCK = 128
 _CHANGES = 1.62  # range of a stationary CUSUM that one in ten exceeds
 _ANOTHER = 0.01  # p value of a level that the simulation does not have

@@ -25,7 +25,7 @@ from gyrofuse.mismatch.stats.long_run_variance import long_run_variance
 _CUT = 4.5  # sd: of normal values one in 150,000 is cut
 _LAGS = 8  # thinned Haar coefficients overlap with so many neighbours at most
 _GAUSSIAN = 24.0  # variance of the fourth Hermite polynomial of a normal variable
-_STEPS = 20  # of the scale's fixed point, which converges by a factor of ten each
+_STEPS = 20  # of the scale's fixed point: each leaves of its error the share of the squares that is cut
 
 
 class BoundedKurtosis(NamedTuple):

@@ -8,7 +8,7 @@ from torch.nn.functional import avg_pool1d, pad
 
 WINDOW = 257  # samples: of Gaussian noise their mean square is known to a tenth, bursts of tens of samples stay
 _CUT = 9.0  # of the level found so far: an outlier is no level
-_ROUNDS = 3  # where the level is ten times the mean the first one sees a half of it, the third all but a tenth
+_ROUNDS = 3  # where the level is ten times the mean the first one sees half of it, the second nearly all
 
 
 def local_level(values: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ from torch import Tensor
 # test at 1e-4 would want differences twice as large.
 ORDINATES = (1024, 256, 64, 16, 6)
 _SHARE = 40  # samples of the series for each ordinate: its spectrum is not flat over more than a twentieth of the band
-_HIGHER = 0.1  # p value at which the lowest ordinates are higher; 0.01 let a level that wanders over 1/10 n pass
+_HIGHER = 0.1  # p value at which the lowest ordinates are higher: rather fewer ordinates than too small a variance
 # Tail probabilities between which chi-square is averaged over: p values down to the smallest are told.
 _TAILS = np.concatenate([[0.0], 10.0 ** np.arange(-12, -1), np.arange(0.1, 1.05, 0.1)])
 
