@@ -154,6 +154,14 @@ def test_tails_that_both_have_are_predicted(kind: str) -> None:
     assert predictive_tail.tail_p_values(recorded, simulated[:, None])[0] < 1e-4
 
 
+def test_tails_of_values_that_hardly_leave_a_step_are_numbers() -> None:
+    rng = np.random.default_rng(1)
+    rounded = np.where(rng.random((2, 4096)) < 0.01, 60.0, 0.0)
+    p_values = predictive_tail.tail_p_values(rounded, rounded[:, None])
+    assert (p_values > 0.1).all()
+    assert (predictive_tail.tail_p_values(0 * rounded, 0 * rounded[:, None]) == 1).all()
+
+
 def test_events_in_clumps_count_for_fewer() -> None:
     rng = np.random.default_rng(0)
     alone = rng.random((1, 64_000)) < 0.002

@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 
 LEVELS = (3.5, 4.0, 4.5, 5.0, 6.0, 8.0, 11.0, 16.0, 23.0, 32.0)  # sd; further ones tell no more of any outlier
 _EVENTS = 200  # that tell a tail: its shape to 0.1
+_TINY = 1e-12  # half squares that values on few steps of a converter have in place of 0
 _BLOCKS = 64  # of a record, in which events are counted: long against clumps of some tens of samples
 _CLUMPED = 0.05  # p value of counts that vary by more than Poisson's
 _SHAPES = np.linspace(-0.35, 1.0, 28)  # of `z^2/2`: lighter than a uniform's ... heavier than Cauchy's
@@ -77,10 +78,11 @@ def _predicted(z: Array, counts: Array, clumps: float, n: int) -> Array:
     threshold, excess = half_squares[n_events], half_squares[:n_events] - half_squares[n_events]
     beyond = np.maximum(np.square(LEVELS) / 2 - threshold, 0.0)
     # The Gaussian's: z^2/2 has the density exp(-y)/sqrt(pi y).
-    at = special.erfc(math.sqrt(threshold))
-    gaussian = -(excess + threshold) - np.log(math.pi * (excess + threshold)) / 2 - math.log(at)
-    survival = [special.erfc(np.sqrt(beyond + threshold)) / at]
-    xi, scale = (v.ravel()[:, None] for v in np.meshgrid(_SHAPES, _SCALES * excess.mean(), indexing="ij"))
+    at = _log_erfc(threshold)
+    y = np.maximum(excess + threshold, _TINY)
+    gaussian = -y - np.log(math.pi * y) / 2 - at
+    survival = [np.exp(_log_erfc(beyond + threshold) - at)]
+    xi, scale = (v.ravel()[:, None] for v in np.meshgrid(_SHAPES, _SCALES * max(excess.mean(), _TINY), indexing="ij"))
     log_pareto = _log_survival(excess, xi, scale)
     density = log_pareto * (1 + xi) - np.log(scale)
     log_weight = np.concatenate([[gaussian.sum()], density.sum(-1) - math.log(len(xi))])
@@ -89,6 +91,11 @@ def _predicted(z: Array, counts: Array, clumps: float, n: int) -> Array:
     every = np.concatenate([survival, np.exp(_log_survival(beyond, xi, scale))])
     mean = n * n_events / len(z) * every
     return np.asarray(weight @ _many_p_value(counts, n_events / clumps, np.maximum(mean / clumps, 1e-300)))
+
+
+def _log_erfc(y: Array | float) -> Array:
+    """`log P(z^2/2 > y)` of a standard normal `z`."""
+    return np.asarray(math.log(2) + special.log_ndtr(-np.sqrt(2 * np.asarray(y))))
 
 
 def _log_survival(excess: Array, xi: Array, scale: Array) -> Array:
