@@ -15,14 +15,15 @@ from gyrofuse.mismatch.bump_fit import Oscillation
 from gyrofuse.mismatch.bumps import Stretch
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.confirm import held_out_gain
-from gyrofuse.mismatch.counterfactual import Link, settled
+from gyrofuse.mismatch.counterfactual import Link, same_line, settled
 from gyrofuse.mismatch.look_alikes import happened_instead, look_alikes
-from gyrofuse.mismatch.mechanism import Finding, Instead, Mechanism
+from gyrofuse.mismatch.mechanism import Finding, Instead, Mechanism, Parameter
 from gyrofuse.mismatch.mechanisms.common_mode import CommonMode
 from gyrofuse.mismatch.mechanisms.drifting_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.parameter_shift import ParameterShift
 from gyrofuse.mismatch.mechanisms.quantization import Quantization
+from gyrofuse.mismatch.mechanisms.resonance import Resonance
 from gyrofuse.mismatch.mechanisms.step import Step
 from gyrofuse.mismatch.mechanisms.vibration_tone import VibrationTone, amplitude_limits, line_near
 from gyrofuse.mismatch.mechanisms.warm_up_transient import WarmUpTransient
@@ -180,6 +181,76 @@ def test_a_better_look_alike_takes_the_place():
     assert after.finding.mechanism == "warm_up_transient"
     assert after.finding.instead is not None
     assert after.finding.instead.mechanism == "step"
+
+
+@pytest.mark.parametrize("walk", [0.0, 1e-4])
+def test_limits_of_a_tone_hold_though_its_phase_walks(walk: float):
+    """Twenty tones each: fifteen within 95 % limits or fewer would come once in thousands."""
+    hits, n = 0, 12_007
+    for seed in range(20):
+        g = generator(seed)
+        noise = torch.randn(5, 2, n, generator=g, dtype=torch.float64)
+        steps = math.sqrt(walk) * torch.randn(n, generator=g, dtype=torch.float64)
+        phase = 2 * math.pi * 0.1234 * torch.arange(n, dtype=torch.float64) + steps.cumsum(0)
+        given = Case.of(Scene(100.0, "deg/s", ("a", "b")), noise[0] + 0.25 * phase.cos(), noise[1:])
+        found = VibrationTone.nominate(given, LEVEL)
+        assert found is not None
+        limits = found.parameters["frequency"]
+        hits += limits.low <= 12.34 <= limits.high
+    assert hits > 15
+
+
+def test_a_line_that_wanders_is_told_once_and_not_as_tones():
+    """Each of the tones that were found in it lost to a bump by hundreds of nats, and kept its name."""
+    n, g = 12_007, generator(1)
+    recording = torch.randn(3, n, generator=g, dtype=torch.float64)
+    steps = math.sqrt(3e-3) * torch.randn(n, generator=g, dtype=torch.float64)
+    line = (2 * math.pi * 0.1234 * torch.arange(n, dtype=torch.float64) + steps.cumsum(0)).cos()
+    report = gf.diagnose(recording + 0.3 * line, gf.WhiteNoise(1.0), rate=100.0)
+    (finding,) = report.findings
+    assert finding.mechanism in ("drifting_tone", "resonance")
+    low, high = finding.parameters["frequency"].low, finding.parameters["frequency"].high
+    assert low - 0.05 < 12.34 < high + 0.05
+    assert finding.instead is not None
+    assert not finding.instead.beats(finding.gain_without or 0.0)
+
+
+def test_lines_closer_than_their_width_are_one():
+    given = case_of(1)
+    rate, n, none = RATE, N, torch.zeros(SENSORS, dtype=torch.float64)
+
+    def tone(frequency: float, reach: float, sensors: tuple[int, ...] = (0,)) -> Finding:
+        limits = {"frequency": Parameter(frequency, frequency - reach, frequency + reach, "Hz")}
+        effect = VibrationTone(frequency, none, none)
+        return Finding("vibration_tone", effect, "", 0.0, sensors, limits, frequency_hz=frequency)
+
+    def mode(kind: type[Mechanism], frequency: float, width: float) -> Finding:
+        own = Mode(frequency / rate, width / rate, none.to(torch.complex128), True)
+        effect = DriftingTone(own, True) if kind is DriftingTone else Resonance(own)
+        return Finding(effect.name, effect, "", 0.0, (0,), {}, frequency_hz=frequency)
+
+    f, resolution = 0.1 * rate, rate / n
+    assert same_line(tone(f, 0.0), tone(f + 0.9 * resolution, 0.0), given)
+    assert not same_line(tone(f, 0.0), tone(f + 1.1 * resolution, 0.0), given)
+    assert same_line(tone(f, 0.0), tone(f + 4 * resolution, 5 * resolution), given)
+    assert not same_line(tone(f, 0.0), tone(f, 0.0, (1,)), given)
+    assert same_line(mode(DriftingTone, f, 0.5), tone(f + 0.4, 0.0), given)
+    assert not same_line(mode(Resonance, f, 0.5), tone(f + 0.4, 0.0), given)  # a tone may stand on a resonance
+
+
+def test_a_name_that_is_not_earned_goes_where_nothing_is_found_in_its_place():
+    decay = 1.2 * torch.ones(SENSORS, 1, dtype=torch.float64) * (-torch.arange(N) / (0.15 * N)).exp()
+    start = case_of(7, decay)
+    (true,), _ = chain(start, WarmUpTransient)
+    effect = true.finding.effect
+    assert isinstance(effect, WarmUpTransient)
+    wrong = Step(-0.2 * effect.size, effect.log_factors, 0.1 * N / RATE)
+    finding = replace(true.finding, mechanism="step", effect=wrong, p_value=1e-9)
+    link = Link(finding, start, held_out_gain(start, wrong))
+    never = 0.0  # level at which no look-alike is found
+    after = settled([link], wrong.explained(start, generator(0)), never, generator(0))
+    assert after.links == []
+    torch.testing.assert_close(after.case.recording, start.recording)
 
 
 def test_the_converter_is_judged_on_numbers_as_they_came():

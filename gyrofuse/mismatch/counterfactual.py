@@ -6,6 +6,7 @@ explained. Only what changes is estimated anew.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -14,9 +15,12 @@ import torch
 from gyrofuse.mismatch.case import Case, block_means
 from gyrofuse.mismatch.confirm import Gain, held_out_gain, sd_of_sum
 from gyrofuse.mismatch.look_alikes import happened_instead, look_alikes
-from gyrofuse.mismatch.mechanism import Finding, Instead, Mechanism
+from gyrofuse.mismatch.mechanism import Finding, Instead, Mechanism, Parameter
 from gyrofuse.mismatch.mechanisms import STAGES
+from gyrofuse.mismatch.mechanisms.drifting_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.not_identifiable import NOT_IDENTIFIABLE
+from gyrofuse.mismatch.mechanisms.resonance import Resonance
+from gyrofuse.mismatch.mechanisms.vibration_tone import VibrationTone
 from gyrofuse.mismatch.slow_effect import SlowEffect
 from gyrofuse.mismatch.slow_scans import slow_look
 from gyrofuse.mismatch.telling import mechanism_words
@@ -53,13 +57,16 @@ class Settled(NamedTuple):
 def settled(links: list[Link], case: Case, level: float, generator: torch.Generator) -> Settled:
     """Drop findings that others make needless, and set those that stay against their look-alikes.
 
+    A name is earned: what loses to a look-alike by more than chance takes the name of what is found in its place, or
+    goes and is left to be told as unexplained. So does a line that another finding tells already.
+
     Args:
         links: Findings in order.
         case: With all of them explained.
         level: Largest p value of a look-alike that takes a finding's place.
         generator: Of what is built into simulations.
     """
-    swapped = False
+    swapped = renamed = False
     while True:
         links, case, judged = _pruned(links, case, generator)
         found = []
@@ -72,7 +79,82 @@ def settled(links: list[Link], case: Case, level: float, generator: torch.Genera
                 break
             found.append(link._replace(finding=told))
         else:
-            return Settled(found, case)
+            unearned = _unearned([link.finding for link in found], case)
+            if not unearned:
+                return Settled(found, case)
+            names = set() if renamed else _in_their_place([found[k].finding for k in unearned])
+            links, case = _renamed(links, unearned, names, level, generator)
+            renamed = True
+
+
+def _unearned(findings: list[Finding], case: Case) -> list[int]:
+    """Positions of findings that lose to a look-alike by more than chance, and of lines that another one tells."""
+    twice = {
+        k if _strength(findings[k]) < _strength(findings[j]) else j
+        for j, k in itertools.combinations(range(len(findings)), 2)
+        if same_line(findings[j], findings[k], case)
+    }
+    beaten = {
+        k
+        for k, f in enumerate(findings)
+        if f.instead is not None and f.gain_without is not None and f.instead.beats(f.gain_without)
+    }
+    return sorted(beaten | twice)
+
+
+def _strength(finding: Finding) -> float:
+    return finding.held_out_gain or 0.0
+
+
+def same_line(first: Finding, second: Finding, case: Case) -> bool:
+    """Whether two findings are of one line: closer than its width, for a tone that the record shows or its wander has.
+
+    A tone may stand on a resonance, whose width is none of its own.
+    """
+    if first.frequency_hz is None or second.frequency_hz is None:
+        return False
+    widths = [_line_width(f.effect, f.parameters, case) for f in (first, second)]
+    if None in widths or not set(first.sensors) & set(second.sensors):
+        return False
+    both = any(isinstance(f.effect, Resonance) for f in (first, second))
+    width = (min if both else max)(width for width in widths if width is not None)
+    return abs(first.frequency_hz - second.frequency_hz) < width
+
+
+def _line_width(effect: Mechanism, parameters: dict[str, Parameter], case: Case) -> float | None:
+    """Half width of a line, Hz; None of what is none."""
+    if isinstance(effect, Resonance | DriftingTone):
+        return effect.mode.width * case.scene.rate
+    if isinstance(effect, VibrationTone):
+        limits = parameters["frequency"]
+        return max((limits.high - limits.low) / 2, case.scene.rate / case.n_samples)
+    return None
+
+
+def _in_their_place(findings: list[Finding]) -> set[str]:
+    """Names of what may be found in the place of findings: bumps are named by whether their envelope is steady."""
+    names = {f.instead.mechanism for f in findings if f.instead is not None}
+    bumps = {Resonance.name, DriftingTone.name}
+    return names | bumps if names & bumps or any(isinstance(f.effect, VibrationTone) for f in findings) else names
+
+
+def _renamed(
+    links: list[Link], unearned: list[int], names: set[str], level: float, generator: torch.Generator
+) -> tuple[list[Link], Case]:
+    """The links without some of them, and with what is found of those names instead."""
+    first = unearned[0]
+    kept = [link.finding for k, link in enumerate(links) if k > first and k not in unearned]
+    links, case = _relinked(links[:first], kept, links[first].before, generator)
+    kinds = [m for stage in STAGES for m in stage if m.name in names]
+    for _ in unearned:
+        found = [f for f in (kind.nominate(case, level) for kind in kinds) if f is not None]
+        for finding in sorted(found, key=lambda f: -f.gain):
+            if held_out_gain(case, finding.effect).confirms(finding.p_value):
+                links, case = _relinked(links, [finding], case, generator)
+                break
+        else:
+            break
+    return links, case
 
 
 def _pruned(

@@ -24,6 +24,9 @@ from gyrofuse.mismatch.witnesses import level_of
 _ROUNDS = 6
 _TAIL = 0.025  # beyond either limit
 _STRONG, _FAR, _HALVINGS = 12.0, 6.0, 40  # standard deviations from which a law is normal, and beyond which none is
+_PER_PART = 20.0  # squared amplitude over its variance in a part of a record: there a phase is told to 0.2 rad
+_FEWEST_PARTS, _MOST_PARTS = 4, 32  # of a record, whose phases tell how a tone wanders
+_SIZES, _MOST_DECADES = 60, 4  # of walks that are tried, from a tenth of the noise's variance in the slowest mode on
 _REACH, _GUARD = 64, 3  # bins on either side that tell the noise, and those too near to
 
 
@@ -63,7 +66,7 @@ class VibrationTone(Mechanism):
         present, seen = there.positions, math.sqrt(there.least)
         # Noise adds to the squares of amplitudes, but tells nothing of the frequency.
         energy = max(float((snr.square() - 2).clamp(min=0.0)[list(present)].sum()), 1.0)
-        spread = math.sqrt(12 / energy) / (2 * math.pi * n)
+        spread = math.hypot(math.sqrt(12 / energy) / (2 * math.pi * n), tone.wander(case, noise, energy))
         parameters = {"frequency": _limits(tone.frequency_hz, spread * case.scene.rate, "Hz")}
         low, value, high = sd[list(present)] * amplitude_limits(snr[list(present)], seen)
         for row in zip(present, value.tolist(), low.tolist(), high.tolist(), strict=True):
@@ -84,6 +87,43 @@ class VibrationTone(Mechanism):
             frequency_hz=tone.frequency_hz,
             gain=float(snr.square().sum()) / 2,
         )
+
+    def wander(self, case: Case, noise: Tensor, energy: float) -> float:
+        """Standard deviation that a phase which walks gives to the mean frequency, cycles per sample.
+
+        The phases of `n` parts of the record have the covariance `q min(i, j)` of a walk beside that of the noise. What
+        is left of them beside a straight line tells `q`: the variance is the mean over the values that it may have, in
+        proportion to their likelihoods, with as much weight on none as on all others.
+
+        Args:
+            case: Recording and simulation.
+            noise: Density of the noise near the tone, per sample `(sensor,)`.
+            energy: Sum over sensors of the squared amplitudes in units of the variance that noise gives them.
+        """
+        n = min(int(energy / _PER_PART), _MOST_PARTS)
+        if n < _FEWEST_PARTS:
+            return 0.0
+        length = case.n_samples // n
+        angle = 2 * math.pi * self.frequency_hz * case.scene.seconds(n * length)
+        turned = case.recording[:, : n * length] * torch.polar(torch.ones_like(angle), -angle)
+        weight = torch.complex(self.cosine, self.sine) / noise  # conjugates of the amplitudes
+        phase = (weight @ turned.unflatten(-1, (n, length)).sum(-1)).angle()
+        steps = torch.remainder(phase.diff() + math.pi, 2 * math.pi) - math.pi
+        phase = torch.nn.functional.pad(steps.cumsum(0), (1, 0))
+        place = torch.arange(n, dtype=torch.float64)
+        walk = torch.minimum(place, place[:, None])
+        slope = (place - place.mean()) / (place - place.mean()).square().sum()
+        line = torch.stack([torch.ones_like(place) / math.sqrt(n), slope / slope.norm()])
+        beside = torch.eye(n, dtype=torch.float64) - line.mT @ line
+        values, vectors = torch.linalg.eigh(beside @ walk @ beside)
+        values, left = values[2:], (vectors.mT @ phase)[2:]  # of a line itself there are two zeros
+        own = n / energy  # variance of a phase by the noise
+        sizes = own / values[-1] * torch.logspace(-1, _MOST_DECADES, _SIZES, dtype=torch.float64)
+        variance = torch.cat([torch.zeros(1, dtype=torch.float64), sizes])[:, None] * values + own
+        log_likelihood = -(left.square() / variance + variance.log()).sum(-1) / 2
+        log_likelihood[0] += math.log(_SIZES)
+        expected = log_likelihood.softmax(0)[1:] @ sizes
+        return math.sqrt(float(expected * (slope @ walk @ slope))) / (2 * math.pi * length)
 
     @classmethod
     def at(cls, case: Case, frequency_hz: float) -> VibrationTone:
