@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -12,12 +13,13 @@ import gyrofuse as gf
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.channels import channel_witness, regress, squared
 from gyrofuse.mismatch.confirm import held_out_gain
+from gyrofuse.mismatch.mechanisms._channel_gain import ChannelGain
 from gyrofuse.mismatch.mechanisms.g_sensitivity import GSensitivity
 from gyrofuse.mismatch.mechanisms.quadratic_coupling import QuadraticCoupling
 from gyrofuse.mismatch.mechanisms.scale_factor import ScaleFactor
 
 N = 2**13
-NOISE = gf.WhiteNoise(1.0) + gf.AR1(0.99, 1e-3)
+NOISE = gf.WhiteNoise(1e-4) + gf.AR1(0.99, 1e-7)  # deg/s: of a sensor that may be
 LEVEL = 1e-4
 
 
@@ -231,3 +233,25 @@ def test_a_simulation_needs_the_channel_for_its_whole_length():
     both = case(g, 0.0, acceleration=acceleration(g))
     with pytest.raises(ValueError, match="expected 8193 samples of 'acceleration'"):
         GSensitivity("acceleration", torch.ones(4, 3).double()).simulated(torch.zeros(4, N + 1).double(), both.scene, g)
+
+
+@pytest.mark.parametrize("unit", ["deg/s", "rad/s", "unknown"])
+@pytest.mark.parametrize(
+    ("mechanism", "beyond"), [(GSensitivity, 20.0), (QuadraticCoupling, 10.0)], ids=["linear", "quadratic"]
+)
+def test_what_no_sensor_has_is_no_coupling(mechanism: type[ChannelGain], beyond: float, unit: str):
+    """What is locked to the source of an acceleration may follow it with any gain."""
+    g = generator(3)
+    shaking = acceleration(g)
+    rows = shaking if mechanism is GSensitivity else squared(shaking)["length"]
+    per = {"deg/s": 1.0, "rad/s": math.radians(1), "unknown": 1.0}[unit]
+    for factor, possible in ((0.5, True), (2.0, unit == "unknown")):
+        gains = torch.zeros(4, len(rows), dtype=torch.float64)
+        gains[:2, 0] = factor * beyond * per
+        both = case(g, gains @ rows, acceleration=shaking)
+        both = replace(both, scene=replace(both.scene, unit=unit))
+        finding = mechanism.nominate(both, LEVEL)
+        assert (finding.mechanism == mechanism.name) == possible
+        assert ("this is no " in finding.sentence) != possible
+        assert finding.sensors == (0, 1)
+        assert isinstance(finding.effect, mechanism)

@@ -84,10 +84,10 @@ def checked_judge(judge: Any, recording: Recording | Tensor, rate: float | None)
                     f"{judge.unit} ({error})"
                 ) from None
         for name in {*judge.channels} & {*recording.channels}:
-            rows, expected = judge.channels[name].shape[:-1], recording.channels[name].shape[:-1]
-            if rows != expected:
+            rows, wanted = judge.channels[name].shape[:-1], recording.channels[name].shape[:-1]
+            if rows != wanted:
                 raise ValueError(
-                    f"`judge`: expected the channel {name} with the rows {tuple(expected)} of the recording, got "
+                    f"`judge`: expected the channel {name} with the rows {tuple(wanted)} of the recording, got "
                     f"{tuple(rows)}; leave it out, or give it whole"
                 )
     shapes = [x.signal.shape if isinstance(x, Recording) else x.shape for x in (judge, recording)]
@@ -141,8 +141,16 @@ def judged(
     again, auc_again = apart(recording)
     less = before - after
     helps = float(less.mean()) > _BETTER_SD * float(less.std()) / N_FOLDS**0.5
-    means = (float(folds.mean()) for folds in (before, after, again))
-    return Judged(*means, auc_before, auc_after, auc_again, helps and repaired is not None, lacks)
+    return Judged(
+        before=float(before.mean()),
+        after=float(after.mean()),
+        repeatability=float(again.mean()),
+        auc_before=auc_before,
+        auc_after=auc_after,
+        auc_repeatability=auc_again,
+        helps=helps and repaired is not None,
+        lacks=lacks,
+    )
 
 
 def _drawn(model: RepairedModel, judge: Recording | Tensor, generator: torch.Generator) -> tuple[Any, tuple[str, ...]]:

@@ -15,6 +15,7 @@ from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.channels import ChannelFit, regress
 from gyrofuse.mismatch.folds import estimation_samples, signal_gains
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
+from gyrofuse.mismatch.mechanisms.not_identifiable import NOT_IDENTIFIABLE
 from gyrofuse.mismatch.partakers import partakers
 from gyrofuse.mismatch.witnesses import level_of
 from gyrofuse.units import GRAVITY
@@ -39,6 +40,8 @@ class ChannelGain(Mechanism):
     taken_off: ClassVar[bool] = True
     of_one_band: ClassVar[tuple[str, ...]] = ()
     quantity: ClassVar[str] = "gain"
+    largest: ClassVar[float] = math.inf  # that a sensor has, deg/s per g to the power below
+    power_of_g: ClassVar[int] = 1
     channel: str
     coupling: Annotated[Tensor, Axes(("sensor", "row"))]
     kind: str = "each"
@@ -82,7 +85,7 @@ class ChannelGain(Mechanism):
         busiest = (
             float(torch.fft.rfft(rows - rows.mean(-1, keepdim=True)).abs().square().sum(0).argmax()) / case.n_samples
         )
-        return Finding(
+        finding = Finding(
             cls.name,
             cls(name, _only(fit.gains, present), kind),
             cls.words(abs(sizes[largest].value), name if kind in _WHOLE else f"{kind} of {name}", where, unit),
@@ -93,6 +96,17 @@ class ChannelGain(Mechanism):
             alternatives=cls.of_one_band if fit.share > _OF_ONE_BAND else (),
             channel=name,
             gain=fit.excess / 2,
+        )
+        if gain_in_g(case.scene, finding, cls.power_of_g, sure=True) <= cls.largest:
+            return finding
+        power = "" if cls.power_of_g == 1 else f"^{cls.power_of_g}"
+        what = cls.name.replace("_", " ")
+        return replace(
+            finding,
+            mechanism=NOT_IDENTIFIABLE,
+            alternatives=(),
+            sentence=f"{finding.sentence}; this is no {what}, of which no gyroscope has {cls.largest:g} "
+            f"deg/s/g{power}: what moves {name} moves the output in another way",
         )
 
     def refitted(self, case: Case, fold: int) -> ChannelGain:
@@ -151,6 +165,16 @@ def gravity_unit(scene: Scene, name: str) -> str | None:
     return next(
         (unit for unit, one in (("g", 1.0), ("m/s^2", GRAVITY)) if abs(math.log(max(size, 1e-9) / one)) < 0.2), None
     )
+
+
+def gain_in_g(scene: Scene, finding: Finding, power_of_g: int, *, sure: bool) -> float:
+    """The largest gain of a finding, or its lower limit, deg/s per power of g; 0 where units are not known."""
+    unit, turn = gravity_unit(scene, finding.channel or ""), {"deg/s": 1.0, "rad/s": math.degrees(1)}.get(scene.unit)
+    if unit is None or turn is None:
+        return 0.0
+    gains = finding.parameters.values()
+    size = max(max(gain.low, -gain.high, 0.0) if sure else abs(gain.value) for gain in gains)
+    return size * turn * (GRAVITY if unit == "m/s^2" else 1.0) ** power_of_g
 
 
 def _cost(fit: ChannelFit, n_samples: int) -> float:

@@ -23,6 +23,9 @@ class QuadraticCoupling(ChannelGain):
 
     name: ClassVar[str] = "quadratic_coupling"
     of_one_band: ClassVar[tuple[str, ...]] = ("vibration_tone",)
+    # deg/s/g^2: data sheets and vibration tests have 1e-4 to 1e-1; a hundred times that is no rectification.
+    largest: ClassVar[float] = 10.0
+    power_of_g: ClassVar[int] = 2
 
     @classmethod
     def channels(cls, case: Case) -> list[str]:
