@@ -27,8 +27,9 @@ from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.moment_fit import composition_of
 from gyrofuse.moment_identity import remarks
 from gyrofuse.moment_inference import Fit, Inference, either, infer, infer_efficient
-from gyrofuse.moment_profile import MomentSurface, SpectralSurface, profiled
+from gyrofuse.moment_profile import profiled
 from gyrofuse.processes import Drift, Model, Sinusoid
+from gyrofuse.profile_surfaces import MomentSurface, SpectralSurface
 from gyrofuse.recording import Recording
 from gyrofuse.robust import check_efficiency, robust_wavelet_variance
 from gyrofuse.robust_covariance import check_gaussian
@@ -63,9 +64,10 @@ def fit_gmwm(
     given as rising. AR1s are given from slow to fast, sinusoids from high to low frequency.
 
     Intervals are symmetric in logarithms, `atanh phi` and `logit(beta / pi)`. Those of variances at zero, of what is
-    known to hardly its order of magnitude and of AR1s that another process could stand for are by profile: every value
-    with which the best fit is at most `z^2` worse; near zero they hold the truth somewhat more often than stated. What
-    cannot be told apart is said in `remarks`.
+    known to hardly its order of magnitude, of AR1s that another process could stand for, and of what a straight line
+    from the estimate misjudges, such as AR1s that are alike or hardly shorter than the record, are by profile: every
+    value with which the best fit is at most `z^2` worse; near zero they hold the truth somewhat more often than stated.
+    What cannot be told apart is said in `remarks`.
 
     Noise is taken for Gaussian but for its white part, whose excess kurtosis, estimated from the signal's differences
     as if its samples were independent, counts in the interval of its variance.

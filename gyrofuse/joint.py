@@ -23,8 +23,9 @@ from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.moment_fit import composition_of, fit_items
 from gyrofuse.moment_identity import remarks
 from gyrofuse.moment_inference import Fit, infer
-from gyrofuse.moment_profile import MomentSurface, profiled
+from gyrofuse.moment_profile import profiled
 from gyrofuse.processes import Model, Sinusoid
+from gyrofuse.profile_surfaces import MomentSurface
 from gyrofuse.recording import Recording
 from gyrofuse.uncertainty import chi_square_tail
 

@@ -39,6 +39,14 @@ def uncertain(made_of: Composition, estimates: Estimates, n_samples: int, confid
     return needed
 
 
+def told_apart(made_of: Composition, estimates: Estimates, confidence_level: float) -> Tensor:
+    """Whether all AR1s differ from each other by more than chance, `(item,)`."""
+    apart = torch.ones_like(estimates.params[:, 0], dtype=torch.bool)
+    for where in _twins(made_of, estimates, confidence_level).values():
+        apart &= ~where
+    return apart
+
+
 def remarks(
     made_of: Composition, estimates: Estimates, n_samples: int, confidence_level: float, tones: Tones | None = None
 ) -> list[tuple[str, ...]]:

@@ -90,6 +90,7 @@ LAYERS = [
         "_array_search",
         "_spectral_search",
         "moment_profile",
+        "profile_surfaces",
         "moment_identity",
     },
     {

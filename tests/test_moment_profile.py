@@ -16,7 +16,7 @@ from gyrofuse._cosine_bins import Bins, Noise
 from gyrofuse._profile import crossings, grid
 from gyrofuse._spectral_search import deviance
 from gyrofuse.moment_fit import composition_of
-from gyrofuse.moment_profile import SpectralSurface
+from gyrofuse.profile_surfaces import SpectralSurface
 from gyrofuse.whittle import refine_whittle
 
 
@@ -144,3 +144,33 @@ def test_the_rise_of_the_likelihood_is_that_of_a_fine_grid():
             least = deviance(energy, count, bins, noise, p, x).min()
             own = deviance(fit.energy, fit.count, bins, noise, fit.linear, fit.shape)[i]
             assert found[i].item() == pytest.approx((least - own).item(), abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("model", "unknown", "place"),
+    [
+        (gf.WhiteNoise(1.0) + gf.AR1(0.999, 1e-3), 2, 1),
+        (gf.WhiteNoise(1.0) + gf.AR1(0.98, 0.01) + gf.AR1(0.9, 0.05), 3, 1),
+    ],
+    ids=["a third of the record", "two alike"],
+)
+def test_limits_are_where_the_likelihood_has_fallen_enough(model, unknown, place):
+    """Of an AR1 hardly shorter than the record, and of the slower one of two that are alike: the likelihood is bent.
+
+    A straight line from the estimate has limits where the root of the rise is a fifth off and more.
+    """
+    formula = "WN + " + " + ".join(["AR1"] * (len(model.processes) - 1))
+    signal = signals(8, 3000 if unknown == 2 else 16384, model)
+    fit = gf.fit_gmwm(signal, formula, refine=True)
+    made_of = composition_of(formula, held=True)
+    params = fit.params[:, 0]
+    linear = params[:, [at for at, name in enumerate(fit.param_names) if name.endswith("variance")]]
+    shape = params[:, [at for at, name in enumerate(fit.param_names) if name.endswith("phi")]].atanh()
+    there = refine_whittle(signal[:, 0], made_of, linear, shape)
+    surface = SpectralSurface(there.linear, there.shape, there.energy, there.count, made_of, signal.shape[-1])
+    below = fit.confidence_interval.low[:, 0, place]
+    order = torch.ones(8, dtype=torch.bool)
+    rise = surface.rise(torch.arange(8), unknown, below.atanh(), order)
+    told = below > params[:, place + 2] if unknown == 3 else torch.ones_like(order)
+    assert bool(told.all())
+    torch.testing.assert_close(rise.sqrt(), torch.full_like(rise, 1.96), rtol=0.02, atol=0)
