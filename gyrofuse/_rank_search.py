@@ -119,9 +119,9 @@ class _Search(ABC, Generic[FitT]):
         """Compositions next to one, the smaller ones first, each with what that one's fit leaves for a start."""
         made_of, fit = self.fits[key]
         kinds = compositions.kinds_of(made_of)
-        found = []
+        found: list[tuple[Kinds, tuple[Composition, FitT] | None]] = []
         for k, kind in enumerate(kinds):
-            rest = [*kinds[:k], *kinds[k + 1 :]]
+            rest: Kinds = [*kinds[:k], *kinds[k + 1 :]]
             left = compositions.composition(rest, self.held), self._without(made_of, fit, k)
             found.append((rest, left))
             if kind is AR1:

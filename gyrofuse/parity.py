@@ -39,9 +39,9 @@ def parity_test(
 
     Each window is tested by itself: energies of every sensor's difference from the others at every level against F
     quantiles, with degrees of freedom on the safe side, the spread of the reference added, and Bonferroni's correction
-    for sensors and levels. In a healthy array the chance that a window raises an alarm is `false_alarm` at most. A
-    sensor found faulty is left out and the others are tested again. Two sensors show that they disagree, but not
-    who is wrong.
+    for sensors and levels. In a healthy array of Gaussian noise the chance that a window raises an alarm is
+    `false_alarm` at most; what heavier tails add, the spread of the reference alone knows. A sensor found faulty is
+    left out and the others are tested again. Two sensors show that they disagree, but not who is wrong.
 
     Wavelets look back: a window is compared with what came before it, as far as the longest level reaches. A bias
     shows while that holds its step, so `before` should be the healthy samples that precede the signal; a bias that was
@@ -50,7 +50,8 @@ def parity_test(
     Args:
         signal: `(..., sensor, time)` or a `Recording`; NaN = missing sample. A last window that is not full is left
             out, and a sensor that lacks more than half of a window is not tested in it.
-        reference: `fit_parity` of a healthy stretch; or a fit of one, whose noise is then taken to be stationary.
+        reference: `fit_parity` of a healthy stretch; or a fit of one, whose noise is then taken to be stationary and
+            Gaussian: under heavy tails or a power that wanders healthy windows raise more alarms than stated.
         window: Samples of a window; by default that of the reference, or the whole signal.
         before: `(..., sensor, time)`, what precedes the signal.
         false_alarm: Probability of an alarm in a window of a healthy array, over all sensors, scales and kinds.
