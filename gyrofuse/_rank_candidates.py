@@ -151,6 +151,24 @@ def parents(kinds: Kinds) -> list[Key]:
     return smaller
 
 
+def next_to(kinds: Kinds, among: Iterable[Key]) -> list[tuple[Kinds, int | None]]:
+    """Compositions like one, the smaller ones first, and which of its processes each lacks; None where it lacks none.
+
+    Those with a process less or more, and those with one or two processes of one parameter in the place of an AR1,
+    which has two: it is white noise or a random walk at the ends of its range, and much like white and quantisation
+    noise where it alternates weakly.
+    """
+    known = set(among)
+    found: list[tuple[Kinds, int | None]] = []
+    for k, kind in enumerate(kinds):
+        rest = kinds[:k] + kinds[k + 1 :]
+        lacking = [one for one in (WhiteNoise, QuantizationNoise, RandomWalk) if kind is AR1 and one not in rest]
+        in_its_place = [(), *itertools.combinations(lacking, 1), *itertools.combinations(lacking, 2)]
+        found += [([*rest, *some], k) for some in in_its_place]
+    found += [(child, None) for child in children(kinds, known)]
+    return sorted((pair for pair in found if key_of(pair[0]) in known), key=lambda pair: len(pair[0]))
+
+
 def simplified(
     made_of: Composition, params: Tensor, covariance: Tensor, n_samples: int
 ) -> list[tuple[Kinds, str] | None]:

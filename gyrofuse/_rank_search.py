@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from abc import ABC, abstractmethod
 from dataclasses import fields, replace
@@ -16,7 +15,6 @@ from gyrofuse._composition import Composition
 from gyrofuse._rank_candidates import Key, Kinds
 from gyrofuse._rank_moments import MomentFit, Moments
 from gyrofuse._rank_spectra import NoiseFit, Spectra
-from gyrofuse.processes import AR1, QuantizationNoise, RandomWalk, WhiteNoise
 
 # Penalised likelihoods within a factor of e^2 = 7: the record does not decide.
 EQUIVALENT = 4.0
@@ -94,10 +92,7 @@ class _Search(ABC, Generic[FitT]):
     def _settle(self, known: set[Key]) -> None:
         """Compare the best one of each record with all next to it, until none of these is better.
 
-        Next to a composition are those with a process more or less, and those with one or two processes of one
-        parameter in the place of an AR1, which has two: it is white noise or a random walk at the ends of its range,
-        and much like white and quantisation noise where it alternates weakly. The beam may hold no parent of a
-        composition for whose processes an AR1 stands in.
+        The beam may hold no parent of a composition for whose processes an AR1 stands in.
         """
         seen = {key: self._loss(fit).isfinite() for key, (_, fit) in self.fits.items()}
         while True:
@@ -105,42 +100,24 @@ class _Search(ABC, Generic[FitT]):
             best = torch.stack([self.criterion(key) for key in keys]).argmin(0)
             unseen = False
             for b in best.unique().tolist():
-                for kinds, start in self._next_to(keys[b], known):
+                made_of, fit = self.fits[keys[b]]
+                for kinds, k in compositions.next_to(compositions.kinds_of(made_of), known):
                     before = seen.get(compositions.key_of(kinds), torch.zeros_like(best, dtype=torch.bool))
                     items = ((best == b) & ~before).nonzero()[:, 0]
                     if len(items):
                         unseen = True
-                        self._try_out(kinds, items, start)
+                        self._try_out(kinds, items, None if k is None else self._without(made_of, fit, k))
                         seen[compositions.key_of(kinds)] = before | (best == b)
             if not unseen:
                 return
 
-    def _next_to(self, key: Key, known: set[Key]) -> list[tuple[Kinds, tuple[Composition, FitT] | None]]:
-        """Compositions next to one, the smaller ones first, each with what that one's fit leaves for a start."""
-        made_of, fit = self.fits[key]
+    def _without(self, made_of: Composition, fit: FitT, k: int) -> tuple[Composition, FitT]:
+        """A composition less one of its processes, and what is left of its fit."""
         kinds = compositions.kinds_of(made_of)
-        found: list[tuple[Kinds, tuple[Composition, FitT] | None]] = []
-        for k, kind in enumerate(kinds):
-            rest: Kinds = [*kinds[:k], *kinds[k + 1 :]]
-            left = compositions.composition(rest, self.held), self._without(made_of, fit, k)
-            found.append((rest, left))
-            if kind is AR1:
-                lacking = [one for one in (WhiteNoise, QuantizationNoise, RandomWalk) if one not in rest]
-                found += [([*rest, one], left) for one in lacking]
-                found += [([*rest, *two], left) for two in itertools.combinations(lacking, 2)]
-        found += [(child, None) for child in compositions.children(kinds, known)]
-        return [
-            (other, start)
-            for other, start in sorted(found, key=lambda pair: len(pair[0]))
-            if compositions.key_of(other) in known
-        ]
-
-    @staticmethod
-    def _without(made_of: Composition, fit: FitT, k: int) -> FitT:
-        """The fit of a composition less one of its processes, to start from."""
         linear = [i for i in range(made_of.n_linear) if i != k]
         shape = [i for i, at in enumerate(made_of.shaped) if at != k]
-        return replace(fit, linear=fit.linear[:, linear], shape=fit.shape[:, shape])
+        left = compositions.composition(kinds[:k] + kinds[k + 1 :], self.held)
+        return left, replace(fit, linear=fit.linear[:, linear], shape=fit.shape[:, shape])
 
     def _try_out(self, kinds: Kinds, items: Tensor, start: tuple[Composition, FitT] | None = None) -> None:
         """Fit one composition to some records, from each of its parents: from the best of them alone it may be stuck.
