@@ -138,7 +138,8 @@ class WeightsTest(Answer):
         subject: What the hypothesis would have: `"equal weights"`, or `"leaving out sensor 3"`.
         statistic: `(...)`, the excess over what chance alone gives on average.
         degrees_of_freedom: Numerator and denominator of the F law of the statistic, `(...)` each.
-        p_value: `(...)`, probability of such a statistic or a larger one if the hypothesis holds.
+        p_value: `(...)`, probability of such a statistic or a larger one if the hypothesis holds; where `resolved` is
+            False, exact for scale weights on one level only, and far too large where long levels decide.
         excess: `(...)`, how much larger the wavelet variance, combined over scales, is in this recording with the best
             weights under the hypothesis; a ratio less 1.
         confidence_interval: Limits `(...)` of the true excess over the best weights there are.
@@ -162,8 +163,8 @@ class WeightsTest(Answer):
 
     @property
     def significant(self) -> Tensor:
-        """Whether the hypothesis is refused, `(...)`."""
-        return self.p_value < 1 - self.confidence_level
+        """Whether the hypothesis is refused, `(...)`; a recording too short to judge refuses none."""
+        return self.resolved & (self.p_value < 1 - self.confidence_level)
 
     def summary(self) -> str:
         """What the test says, in a sentence for each item of a batch."""
@@ -173,10 +174,11 @@ class WeightsTest(Answer):
         sentences = []
         for verdict, row in zip(verdicts, _rows(*columns), strict=True):
             f, numerator, denominator, p, excess, lower, upper = row
+            tested = f"; F({numerator:.3g}, {denominator:.3g}) = {f:.3g}, {_p_value(p)}" if verdict[0] else ""
             sentences.append(
                 f"{self.subject[0].upper()}{self.subject[1:]}: {_cost(*verdict)}, {_percent(excess)} more combined "
                 f"wavelet variance in this recording, {100 * self.confidence_level:g} % interval "
-                f"{_percents(lower, upper)}; F({numerator:.3g}, {denominator:.3g}) = {f:.3g}, {_p_value(p)}."
+                f"{_percents(lower, upper)}{tested}."
             )
         return _lines(sentences, self.p_value)
 

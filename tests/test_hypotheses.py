@@ -179,15 +179,15 @@ def fitted(noise: str, kind: str, scale_weights: str) -> SVOResult:
 @pytest.mark.parametrize("noise", ["white", "white and walk", "walk"])
 def test_sizes_on_recordings(noise, scale_weights):
     """At most 5 % of 120 recordings refuse what is true: 14 or so where one true claim in a thousand is refused."""
-    assert fitted(noise, "equal", scale_weights).test_equal().significant.sum() <= at_most(0.05, tests=2)
-    assert fitted(noise, "idle", scale_weights).test_drop(3).significant.sum() <= at_most(0.05, tests=2)
+    assert (fitted(noise, "equal", scale_weights).test_equal().p_value < 0.05).sum() <= at_most(0.05, tests=2)
+    assert (fitted(noise, "idle", scale_weights).test_drop(3).p_value < 0.05).sum() <= at_most(0.05, tests=2)
 
 
 @pytest.mark.parametrize("scale_weights", SCALE_WEIGHTS)
 def test_levels_of_few_observations_do_not_deceive(scale_weights):
     """All 10 levels, the last of which hold one observation and decide: refusals are no more frequent."""
     result = fit_svo(recordings("white and walk", "equal"), scale_weights, n_levels=10)
-    assert result.test_equal().significant.sum() <= at_most(0.05)
+    assert (result.test_equal().p_value < 0.05).sum() <= at_most(0.05)
     if scale_weights == "long":
         assert result.enough_data().resolved.double().mean() < 0.05
 
@@ -344,6 +344,8 @@ def test_sentences():
     assert few.test_equal().summary().startswith("Equal weights: perhaps a loss, ")
     short = fit_svo(scaled(1, 1, 1, n=12), "long")
     assert short.test_equal().summary().startswith("Equal weights: too short a recording to judge, ")
+    assert "F(" not in short.test_equal().summary()  # no verdict, no p-value beside it
+    assert not short.test_equal().significant
     assert short.enough_data().summary().endswith("record longer or use fewer levels.")
     batch = fit_svo(scaled(1, 1, 1).expand(10, 3, 2000))
     lines = batch.test_equal().summary().splitlines()
