@@ -12,7 +12,7 @@ from torch import Tensor
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import Evidence, corrected
 from gyrofuse.mismatch.remembered import remembered
-from gyrofuse.mismatch.witnesses import largest_variance, level_of, whitened
+from gyrofuse.mismatch.witnesses import level_of, whitened_difference
 
 _ABSENT = 1.5  # standard deviations of what the simulation has, below which it has nothing; less if it is short
 _SURELY = 0.7  # the same, to take for granted that it has nothing
@@ -61,16 +61,15 @@ def common_source(case: Case) -> Source | None:
     """The most conspicuous coherence of a run of bands, in phase or not.
 
     The difference of coherence matrices is whitened by what both have in common: its entries then vary by
-    `1/d + 1/s`, whatever noise the sensors share. Errors of a model that was fitted to all sensors come on top, at most
-    as large for every pair as for the worst combination of them. Where the simulation has nothing of what the recording
-    shows, its sensors are independent, and the recording's coherences vary by `1/d` around none.
+    `1/d + 1/s`, whatever noise the sensors share. Where the simulation has nothing of what the recording shows, its
+    sensors are independent, and the recording's coherences vary by `1/d` around none.
     """
-    p, d, s = case.n_sensors, case.recorded.dof, case.simulated.dof
+    p, d, s = case.n_sensors, case.recorded.dof, case.simulated.coherence_dof
     known = (d >= 2 * p) & (s >= 2 * p)
     if p < 2 or int(known.sum()) < 2:
         return None
     one, other, d, s = case.recorded.coherence[known], case.simulated.coherence[known], d[known], s[known]
-    white = whitened(one - other, one, other, d, s)
+    white = whitened_difference(one, other, d, s)
     starts, ends = _runs(len(d))
 
     def sums(matrices: Tensor, worth: Tensor) -> Tensor:
@@ -82,11 +81,6 @@ def common_source(case: Case) -> Source | None:
         return run - torch.diag_embed(run.diagonal(dim1=-2, dim2=-1))
 
     difference, alone, simulated = sums(white, d * s / (d + s)), sums(one, d), sums(other, s)
-    if (fitted := case.simulated.uncertainty) is not None and fitted.shares_noise:
-        errors = whitened(fitted.coherence_errors(case.bands.frequency[known]), one, other, d, s)
-        off = largest_variance(torch.stack([sums(error, d * s / (d + s)) for error in errors]))
-        # Real and imaginary parts of an entry of noise vary by a half.
-        difference = difference / (1 + 2 * _NEIGHBOURS * off).sqrt()[:, None, None]
     found, nothing, places = [], True, _places(len(d))
     for real in (True, False):  # in phase but for signs, or any
         apart, recorded, had = ((m.real.to(m.dtype) if real else m) for m in (difference, alone, simulated))

@@ -105,6 +105,18 @@ class Side:
             varies = varies + self.uncertainty.variance(self.bands.frequency)
         return self.dof / (1 + self.dof * varies)
 
+    @property
+    def coherence_dof(self) -> Tensor:
+        """What bands tell of coherences, `(band,)`: those of a fitted array no more than the record it was fitted to.
+
+        A fit smooths over bands, so that it is known at least as well. To first order it is known better in narrow
+        bands, but where a matrix lacks rank, as those of slow noise often do, coherences are far from linear in it.
+        """
+        if self.uncertainty is None or not self.uncertainty.shares_noise:
+            return self.dof
+        n_records, _, n = self.signal.shape
+        return self.dof * min(self.uncertainty.n_samples / (n_records * n), 1.0)
+
     @cached_property
     def power(self) -> Tensor:
         """Spectral densities per sample, `(sensor, band)`."""

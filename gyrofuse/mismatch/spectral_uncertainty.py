@@ -98,18 +98,6 @@ class SpectralUncertainty:
         """Whether what sensors share was estimated as well."""
         return any(matrix.ndim == 2 for _, matrix in self.model.components)
 
-    def coherence_errors(self, f: Tensor) -> Tensor:
-        """What independent errors of unit variance do to coherences, `(error, frequency, sensor, sensor)`."""
-        found = []
-        for spectra, slopes in _linearised(self.model, f):
-            size = spectra.diagonal(dim1=-2, dim2=-1).rsqrt()
-            scale = (size[:, :, None] * size[:, None, :])[..., None]
-            slope = slopes * scale
-            own = slope.diagonal(dim1=1, dim2=2).mT  # (frequency, sensor, parameter)
-            mean = (own[:, :, None] + own[:, None, :]) / 2
-            found.append((slope - spectra[..., None] * scale * mean) @ self.root)
-        return torch.cat(found).movedim(-1, 0)
-
     def at_zero_power(self, f: Tensor) -> Tensor:
         """Standard deviations of processes that were estimated as zero, over the spectrum, `(sensor, frequency)`."""
         rows = self.rows(f)[..., self.at_zero]

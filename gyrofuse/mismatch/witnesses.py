@@ -80,7 +80,7 @@ def _other_size(case: Case, sizes: LineSizes) -> Evidence:
 
 def coherence_witness(case: Case) -> Evidence:
     """Difference of complex coherences in each band, summed over the pairs of sensors."""
-    d, simulated = case.bands.dof, case.simulated.dof
+    d, simulated = case.bands.dof, case.simulated.coherence_dof
     if case.n_sensors < 2:
         return Evidence("coherence", 1.0, "a single sensor has no pairs")
     known = (d >= _COHERENCE_DOF) & (simulated >= _COHERENCE_DOF)
@@ -89,15 +89,10 @@ def coherence_witness(case: Case) -> Evidence:
     one, other = case.recorded.coherence, case.simulated.coherence
     upper = torch.triu_indices(case.n_sensors, case.n_sensors, 1)
     # Whitened by what both have in common, entries vary alike and apart, whatever noise the sensors share.
-    sides = one[known], other[known], d[known], simulated[known]
-    white = whitened(sides[0] - sides[1], *sides)
+    white = whitened_difference(one[known], other[known], d[known], simulated[known])
     difference = torch.zeros(len(d), upper.shape[1], dtype=d.dtype)  # (band, pair)
     difference[known] = white.abs().square()[:, upper[0], upper[1]]
-    variance = 1 / d + 1 / simulated.clamp(min=1e-9)
-    if (fitted := case.simulated.uncertainty) is not None and fitted.shares_noise:
-        errors = whitened(fitted.coherence_errors(case.bands.frequency[known]), *sides)
-        variance[known] += 2 * largest_variance(errors)  # of a complex number; errors may all be in one of its parts
-    q = difference.sum(-1) / variance
+    q = difference.sum(-1) / (1 / d + 1 / simulated.clamp(min=1e-9))
     # Gamma distributed but for a slightly heavier tail, here that of a ratio.
     n_pairs = difference.shape[-1]
     tails = stats.f.sf((q / n_pairs).numpy(), 2 * n_pairs, _TAIL * d.minimum(simulated).clamp(min=1.0).numpy())
@@ -117,23 +112,12 @@ def coherence_witness(case: Case) -> Evidence:
     )
 
 
-def whitened(matrices: Tensor, one: Tensor, other: Tensor, d: Tensor, s: Tensor) -> Tensor:
-    """Hermitian matrices `(..., band, sensor, sensor)` in units of the mean of coherences of `d` and `s` ordinates."""
+def whitened_difference(one: Tensor, other: Tensor, d: Tensor, s: Tensor) -> Tensor:
+    """Difference of coherences `(band, sensor, sensor)` of `d` and `s` ordinates, in units of their mean."""
     both = (d[:, None, None] * one + s[:, None, None] * other) / (d + s)[:, None, None]
     root = torch.linalg.cholesky(both)
-    left = torch.linalg.solve_triangular(root, matrices.to(root.dtype), upper=False)
+    left = torch.linalg.solve_triangular(root, one - other, upper=False)
     return torch.linalg.solve_triangular(root, left.mH, upper=False)
-
-
-def largest_variance(errors: Tensor) -> Tensor:
-    """Largest variance of a unit combination of entries beside the diagonal, `(...)`.
-
-    Args:
-        errors: What independent errors of unit variance do to matrices, `(error, ..., sensor, sensor)`.
-    """
-    upper = torch.triu_indices(*errors.shape[-2:], 1)
-    entries = errors[..., upper[0], upper[1]].movedim(0, -2)  # (..., error, pair)
-    return torch.linalg.matrix_norm(torch.cat([entries.real, entries.imag], -1), 2).square()
 
 
 def power_tails(case: Case) -> Tensor:

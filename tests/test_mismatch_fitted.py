@@ -1,0 +1,297 @@
+"""Simulations that are models fitted to another record: their sampling error is no physics, what exceeds it is."""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+import gyrofuse as gf
+from gyrofuse._estimation import EstimatedFrom
+from gyrofuse.mismatch.fit_verdict import fit_verdict
+from gyrofuse.mismatch.inputs import modelled, prepared
+from gyrofuse.mismatch.line_sizes import line_sizes
+from gyrofuse.mismatch.pooled import common_witness
+from gyrofuse.mismatch.shape_bands import narrow
+from gyrofuse.mismatch.shape_errors import estimation_errors, parameters_p_value
+from gyrofuse.mismatch.shape_scan import looked_at, shape_witness
+from gyrofuse.mismatch.slow import told
+from gyrofuse.mismatch.spectral_uncertainty import SpectralUncertainty, as_array
+from gyrofuse.mismatch.witnesses import coherence_witness, spectrum_witness
+
+TRUE = gf.parse_model("WN(variance=1.0) + AR1(phi=0.975, variance=0.03) + RW(variance=1e-5)")
+WALKING = gf.parse_model("WN(variance=1.0) + RW(variance=1e-5)")
+FORMULA = "WN + AR1 + RW"
+SHORT, LONG = 4099, 16411
+LEVEL = 1e-3
+N_RUNS = 8
+
+
+def record(n, seed, n_sensors=1):
+    return TRUE.simulate(n, batch=(n_sensors,), generator=torch.Generator().manual_seed(seed))
+
+
+@functools.cache
+def fitted(seed=0, n=SHORT, n_sensors=1):
+    return gf.fit_gmwm(record(n, 1000 + seed, n_sensors), FORMULA)
+
+
+def case(recording, simulation, fitted_samples=None):
+    return prepared(recording, modelled(simulation, fitted_samples), None, torch.Generator().manual_seed(0))
+
+
+@functools.cache
+def against_another(seed):
+    """A recording and a model fitted to another, shorter one."""
+    return case(record(LONG, seed), fitted(seed))
+
+
+def as_if_known(given):
+    return replace(given, simulated=replace(given.simulated, uncertainty=None))
+
+
+def at_most(n, p, chance=1e-3):
+    """Successes of n with probability p that are exceeded with no more than a chance."""
+    total = 0.0
+    for k in range(n + 1):
+        total += math.comb(n, k) * p**k * (1 - p) ** (n - k)
+        if total >= 1 - chance:
+            return k
+    return n
+
+
+# how far spectra may be off
+
+
+def test_log_spectra_of_fits_scatter_by_what_is_said():
+    # Of 120 records variances are known to 13 %.
+    many = gf.fit_gmwm(record(2 * SHORT, 5, 120), FORMULA)
+    f = torch.tensor([2e-3, 0.02, 0.1, 0.4], dtype=torch.float64)
+    seen = many.model.spectrum(f).log().var(0)
+    said = SpectralUncertainty.of(as_array(gf.Model([TRUE], estimated_from=EstimatedFrom(2 * SHORT)), 1)).variance(f)[0]
+    rows = many.model.spectrum_jacobian(f) / many.model.spectrum(f)[..., None]
+    own = torch.einsum("sfp,spq,sfq->sf", rows, many.param_cov, rows).median(0).values
+    assert ((seen / own).log().abs() < 0.45).all()
+    assert ((seen / said).log().abs() < 0.45).all()
+
+
+def test_white_noise_is_known_as_well_as_its_samples_say():
+    white = gf.Model([gf.WhiteNoise(3.0)], estimated_from=EstimatedFrom(1000))
+    assert SpectralUncertainty.of(as_array(white, 1)).variance(torch.tensor([0.1]).double()).item() == pytest.approx(
+        2 / 1000, rel=0.01
+    )
+    root = torch.tensor([[1.0, 0.0], [0.5, 1.0]]).double()
+    both = gf.ArrayModel([(gf.WhiteNoise(1.0), root @ root.mT)], estimated_from=EstimatedFrom(1000))
+    # Covariances of sample covariances, (a_ik a_jl + a_il a_jk) / n.
+    r, a = root @ root.mT, torch.triu_indices(2, 2).mT.tolist()
+    expected = [[(r[i, k] * r[j, m] + r[i, m] * r[j, k]) / 1000 for k, m in a] for i, j in a]
+    torch.testing.assert_close(
+        SpectralUncertainty.of(both).covariance, torch.tensor(expected).double(), rtol=0.01, atol=1e-9
+    )
+
+
+def test_a_variance_at_zero_and_what_a_fit_does_not_tell_have_the_spread_of_the_information():
+    spread = torch.diag(torch.tensor([1e-4, 1e-6, 1e-5, 0.0]).double())
+    flat = TRUE.params * torch.tensor([1.0, 1.0, 1.0, 0.0])
+    found = SpectralUncertainty.of(as_array(TRUE.with_params(flat, estimated_from=EstimatedFrom(SHORT, spread)), 1))
+    told_by_samples = SpectralUncertainty.of(as_array(TRUE.with_params(flat, estimated_from=EstimatedFrom(SHORT)), 1))
+    assert found.at_zero.tolist() == [False, False, False, True]
+    torch.testing.assert_close(found.covariance.diagonal()[:3], spread.diagonal()[:3])
+    assert found.covariance[3, 3] == told_by_samples.covariance[3, 3] > 0
+    assert float(found.at_zero_power(torch.tensor([1.0 / SHORT]).double())) > 0.1
+    lost = spread.clone()
+    lost[1] = lost[:, 1] = torch.nan
+    other = SpectralUncertainty.of(
+        as_array(TRUE.with_params(TRUE.params, estimated_from=EstimatedFrom(SHORT, lost)), 1)
+    )
+    assert other.covariance.isfinite().all()
+    assert other.covariance[0, 0] == spread[0, 0]
+    assert other.covariance[1, 1] > 0
+
+
+def test_one_estimate_for_all_sensors_is_off_alike_and_one_for_each_is_not():
+    f = torch.tensor([0.01, 0.3]).double()
+    shared = gf.Model([TRUE], estimated_from=EstimatedFrom(SHORT))
+    one = SpectralUncertainty.of(as_array(shared, 2)).errors(f)
+    each = TRUE.params.repeat(2, 1)
+    two = SpectralUncertainty.of(as_array(TRUE.with_params(each, estimated_from=EstimatedFrom(SHORT)), 2)).errors(f)
+    for errors, together in ((one, 1.0), (two, 0.0)):
+        variance, across = errors.square().sum(-1), (errors[0] * errors[1]).sum(-1)
+        torch.testing.assert_close(across, together * variance[0], rtol=1e-6, atol=1e-12)
+    torch.testing.assert_close(one.square().sum(-1), two.square().sum(-1), rtol=1e-6, atol=0)
+
+
+# scores beside errors
+
+
+def test_shapes_are_weighed_by_the_inverse_covariance_and_by_what_lies_outside_the_tangents():
+    given = case(record(LONG, 1, 2), fitted(n_sensors=2))
+    errors, n_bands = estimation_errors(given), len(narrow(given).worth)
+    shapes = torch.randn(3, 2, n_bands, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    rows = given.simulated.uncertainty.rows(narrow(given).frequency)
+    for i in range(2):
+        moved = narrow(given).worth.sqrt()[:, None] * rows[i]
+        covariance = moved @ given.simulated.uncertainty.covariance @ moved.mT
+        expected = torch.linalg.solve(torch.eye(n_bands).double() + covariance, shapes[:, i].mT).mT
+        torch.testing.assert_close(errors.beside(shapes)[:, i], expected, rtol=1e-6, atol=1e-8)
+        torch.testing.assert_close(
+            errors.covariance(shapes)[:, i, i], torch.einsum("hb,bc,hc->h", shapes[:, i], covariance, shapes[:, i])
+        )
+        outside = errors.outside(shapes)[:, i]
+        assert float((outside @ moved).abs().max()) < 1e-8 * float((shapes[:, i] @ moved).abs().max())
+        torch.testing.assert_close(errors.outside(outside[:, None].expand(-1, 2, -1))[:, i], outside)
+
+
+def test_the_parameters_chi_square_has_the_law_of_chance():
+    p = [parameters_p_value(against_another(s)) for s in range(N_RUNS)]
+    assert 0.15 < sum(p) / len(p) < 0.85
+    assert sum(x < 0.05 for x in p) <= at_most(len(p), 0.05)
+
+
+# alarms
+
+
+def test_a_model_fitted_to_a_shorter_record_raises_no_alarm_by_its_spectra():
+    cases = [against_another(s) for s in range(N_RUNS)]
+    exact = [looked_at(given).exact.p_value for given in cases]
+    seen = [shape_witness(given).p_value for given in cases]
+    bands = [spectrum_witness(given).p_value for given in cases]
+    assert sum(p < 0.01 for p in exact) > at_most(N_RUNS, 0.01)  # what it would be taken for, were its numbers exact
+    assert sum(p < 0.01 for p in seen) <= at_most(N_RUNS, 0.01)
+    assert sum(p < 0.01 for p in bands) <= at_most(N_RUNS, 0.01)
+
+
+def test_a_model_fitted_to_the_recording_itself_is_held_against_no_more():
+    for s in range(2):
+        x = record(2 * SHORT, 50 + s)
+        given = case(x, gf.fit_gmwm(x, FORMULA))
+        assert shape_witness(given).p_value > 0.05
+        assert spectrum_witness(given).p_value > spectrum_witness(as_if_known(given)).p_value * 0.999
+
+
+def test_what_an_array_was_found_to_share_is_as_uncertain_as_its_fit():
+    root = torch.linalg.cholesky(0.5 * torch.eye(3).double() + 0.5)
+    exact, seen = [], []
+    for s in range(3):
+        fit = gf.fit_array_gmwm(
+            root @ WALKING.simulate(SHORT, batch=(3,), generator=torch.Generator().manual_seed(300 + s)), "WN + RW"
+        )
+        given = case(root @ WALKING.simulate(LONG, batch=(3,), generator=torch.Generator().manual_seed(400 + s)), fit)
+        exact.append(common_witness(as_if_known(given)).p_value)
+        seen += [common_witness(given).p_value, coherence_witness(given).p_value]
+    assert min(exact) < 1e-4  # where the walks' matrix has one direction, found in a quarter of the record
+    assert sum(p < 0.01 for p in seen) <= at_most(6, 0.01)
+
+
+def test_slow_noise_is_as_uncertain_as_the_fit():
+    given = case(record(LONG, 1), fitted(0))
+    known, off = told(as_if_known(given)), told(given)
+    assert off.slowest_dof < known.slowest_dof
+    normal = torch.Generator().manual_seed(0)
+    coefficients = off.coefficients().expand(4000, -1, -1)
+    drawn = (off.drawn(coefficients, normal).values[:, 0] / (coefficients @ off.atoms)[:, 0]).log()
+    n_bands = drawn.shape[-1] - 8
+    said = given.simulated.uncertainty.variance(given.bands.frequency[-n_bands:])[0] + 1 / off.dof[:n_bands]
+    plain = said < 0.2  # elsewhere logarithms of chi-squares are not normal
+    assert plain.sum() > 20
+    assert ((drawn[:, :n_bands].var(0) / said).log().abs() < 0.15)[plain].all()
+    flat = TRUE.params * torch.tensor([1.0, 1.0, 1.0, 0.0])
+    walkless = case(record(LONG, 1), TRUE.with_params(flat, estimated_from=EstimatedFrom(SHORT)))
+    assert told(walkless).noise().centre[-1] > told(as_if_known(walkless)).noise().centre[-1] + 0.5
+
+
+# verdicts
+
+
+def louder(x, factor):
+    """With more white noise."""
+    return x + math.sqrt(factor - 1) * torch.randn(x.shape, generator=torch.Generator().manual_seed(9)).double()
+
+
+def with_bump(x, size):
+    """With a bump around a twentieth of a cycle per sample."""
+    f = torch.fft.rfftfreq(x.shape[-1]).double()
+    shape = size * torch.exp(-((f.clamp(min=1e-9) / 0.05).log() / 0.15).square())
+    noise = torch.randn(x.shape, generator=torch.Generator().manual_seed(9)).double()
+    return x + torch.fft.irfft(torch.fft.rfft(noise) * shape.sqrt(), n=x.shape[-1])
+
+
+def test_a_missing_component_other_numbers_and_the_uncertainty_of_a_fit_are_told_apart():
+    fit = fitted(3)
+    assert fit_verdict(case(with_bump(record(LONG, 3), 1.5), fit), LEVEL).kind == "component_missing"
+    other = fit_verdict(case(louder(record(LONG, 3), 1.25), fit), LEVEL)
+    assert other.kind == "other_numbers"
+    assert "other numbers of the same processes" in other.words
+    within = [fit_verdict(against_another(s), LEVEL) for s in range(6)]
+    assert {v.kind for v in within} <= {"agrees", "within_uncertainty"}
+    assert "within_uncertainty" in {v.kind for v in within}
+    assert all(v.n_samples == SHORT for v in within)
+    assert fit_verdict(case(record(LONG, 3), TRUE), LEVEL) is None
+
+
+def test_a_diagnosis_says_what_the_numbers_of_a_simulation_are_taken_for():
+    fit = fitted(0, n=SHORT + 1)
+    report = gf.diagnose(record(SHORT, 1), fit)
+    assert not report.mismatch
+    assert report.fit is not None
+    assert report.notes == (report.fit.words,)
+    assert f"fitted to {SHORT + 1} samples" in str(report)
+    plain = report.to_dict()
+    assert plain["fit"]["verdict"] in ("agrees", "within_uncertainty")
+    assert plain["fit"]["n_samples"] == SHORT + 1
+    # The noise of the repaired simulation goes on to know where it is from.
+    again = gf.model_from_dict(json.loads(json.dumps(plain["model"]["noise"])))
+    assert again.estimated_from.n_samples == SHORT + 1
+    torch.testing.assert_close(
+        SpectralUncertainty.of(again).covariance, SpectralUncertainty.of(as_array(fit.model, 1)).covariance
+    )
+
+
+# what counts as a fit
+
+
+def test_fits_of_all_kinds_stand_for_their_models():
+    x, y = record(SHORT, 7, 2), record(SHORT, 8, 2)
+    fits = (
+        gf.fit_gmwm(y, FORMULA),
+        gf.fit_array_gmwm(y, "WN + RW"),
+        gf.fit_jointly([y, record(SHORT, 9, 2)], "WN + AR1"),
+        gf.rank_models(y, ["WN + AR1"]),
+    )
+    for fit, n in zip(fits, (SHORT, SHORT, 2 * SHORT, SHORT), strict=True):
+        given = case(x, fit)
+        assert given.simulated.uncertainty.n_samples == n
+        assert given.simulated.in_bands(narrow_of(given)).uncertainty is given.simulated.uncertainty
+    assert case(x, y).simulated.uncertainty is None
+    assert case(x, TRUE).simulated.uncertainty is None
+
+
+def narrow_of(given):
+    return given.simulated.bands
+
+
+def test_samples_behind_a_model_that_does_not_know_them_can_be_told():
+    x, f = record(SHORT, 7), torch.tensor([0.4]).double()
+    told_by = [float(case(x, TRUE, n).simulated.uncertainty.variance(f)) for n in (1000, 4000)]
+    assert told_by[0] / told_by[1] == pytest.approx(4, rel=0.05)
+    assert case(x, gf.ArrayModel.from_sensors([TRUE]), 1000).simulated.uncertainty.n_samples == 1000
+    with pytest.raises(ValueError, match=r"`fitted_samples`: expected with a noise model .* one that has its own"):
+        case(x, fitted(), 1000)
+    with pytest.raises(ValueError, match=r"`fitted_samples`: expected with a noise model .* Tensor; leave it out"):
+        case(x, x, 1000)
+    with pytest.raises(ValueError, match="`fitted_samples`"):
+        case(x, TRUE, 0)
+    with pytest.raises(ValueError, match="`simulation`: expected a ranking with the fit of every sensor"):
+        case(x, gf.rank_models(x, ["WN"], fit=False))
+
+
+def test_tones_of_a_fitted_model_are_as_uncertain_as_the_record():
+    model = gf.WhiteNoise(1.0) + gf.Sinusoid(0.5, 0.9)
+    x = model.simulate(4 * SHORT, batch=(1,), generator=torch.Generator().manual_seed(0))
+    known, off = line_sizes(case(x, model)), line_sizes(case(x, model, SHORT))
+    assert float(off.simulated_sd[0, 0]) == pytest.approx(math.sqrt(2 / SHORT), rel=0.1)
+    assert off.simulated_sd[0, 0] > 1.5 * known.simulated_sd[0, 0]
