@@ -181,7 +181,7 @@ def covariance_of_numbers(fit: ArrayFit, squared: Tensor, sd: Tensor, made_of: C
     whole = torch.diag_embed(torch.cat([torch.zeros(n_items, n_linear).to(sd), sd.square()], -1))
     place = torch.tensor([*range(n_linear), *(n_linear + i for i in moved)], device=sd.device)
     whole[:, place[:, None], place] = fit.spread * (units[:, :, None] * units[:, None, :])
-    order = []
+    order: list[int] = []
     for k in range(made_of.n_linear):
         order += range(k * n_pairs, (k + 1) * n_pairs)
         order += [n_linear + made_of.shaped.index(k)] if k in made_of.shaped else []

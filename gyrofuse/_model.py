@@ -109,7 +109,9 @@ class Model:
                 f"got shape {tuple(params.shape)}"
             )
         columns = iter(params.unbind(-1))
-        processes = [type(p)(**{name: next(columns) for name in p.parameters}) for p in self.processes]
+        kinds: list[type[Any]] = [type(p) for p in self.processes]  # each has a constructor of its own
+        given = [{name: next(columns) for name in p.parameters} for p in self.processes]
+        processes = [kind(**own) for kind, own in zip(kinds, given, strict=True)]
         return Model(processes, estimated_from=estimated_from)
 
     def scaled(self, factor: float) -> Model:

@@ -295,3 +295,21 @@ def test_tones_of_a_fitted_model_are_as_uncertain_as_the_record():
     known, off = line_sizes(case(x, model)), line_sizes(case(x, model, SHORT))
     assert float(off.simulated_sd[0, 0]) == pytest.approx(math.sqrt(2 / SHORT), rel=0.1)
     assert off.simulated_sd[0, 0] > 1.5 * known.simulated_sd[0, 0]
+
+
+def test_a_model_file_and_the_command_line_say_what_a_model_was_fitted_to(run, tmp_path):
+    for name, seed in (("log.npz", 1), ("other.npz", 2)):
+        gf.Recording(record(SHORT, seed), rate=50.0, unit="deg/s", sensors=("1",)).save(tmp_path / name)
+    assert run("fit", "other.npz", "--model", "WN + AR1", "--model-out", "model.json").status == 0
+    description = json.loads((tmp_path / "model.json").read_text())
+    assert description["estimated_from"]["n_samples"] == SHORT
+    done = run("diagnose", "log.npz", "--simulation", "model.json")
+    assert done.status == 0
+    assert f"The model was fitted to {SHORT} samples" in done.out
+    (tmp_path / "old.json").write_text(json.dumps({k: v for k, v in description.items() if k != "estimated_from"}))
+    refused = run("diagnose", "log.npz", "--simulation", "model.json", "--fitted-samples", "100")
+    assert refused.status == 2
+    assert "`--fitted-samples`: expected with a noise model" in refused.err
+    told_by_hand = run("diagnose", "log.npz", "--simulation", "old.json", "--fitted-samples", "5000")
+    assert told_by_hand.status == 0
+    assert "The model was fitted to 5000 samples" in told_by_hand.out

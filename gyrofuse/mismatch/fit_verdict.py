@@ -72,9 +72,13 @@ def fit_verdict(case: Case, level: float) -> FitVerdict | None:
     uncertainty, looks = case.simulated.uncertainty, looked_at(case)
     if uncertainty is None or looks is None:
         return None
-    scans = (looks.exact, looks.beside, looks.outside)
     return FitVerdict(
-        _kind(case, looks, level), uncertainty.n_samples, *(scan.p_value for scan in scans), looks.parameters
+        kind=_kind(case, looks, level),
+        n_samples=uncertainty.n_samples,
+        exact=looks.exact.p_value,
+        beside=looks.beside.p_value,
+        outside=looks.outside.p_value,
+        parameters=looks.parameters,
     )
 
 

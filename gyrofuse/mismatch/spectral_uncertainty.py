@@ -141,7 +141,7 @@ def _zeros(model: ArrayModel) -> Iterator[bool]:
             yield from (i == j and float(matrix[i, i]) == 0 for i, j in torch.triu_indices(*matrix.shape).mT.tolist())
             yield from (False for name in process.parameters if name in ("phi", "beta"))
         else:
-            yield from (name == "variance" and value == 0 for name, value in process.parameters.items())
+            yield from (name == "variance" and bool(value == 0) for name, value in process.parameters.items())
 
 
 def _linearised(model: ArrayModel, f: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
