@@ -46,9 +46,17 @@ class VirtualGyro:
         return self.wavelet_cross_covariance.diagonal(dim1=-2, dim2=-1)
 
     @property
-    def virtual_wavelet_variance(self) -> Tensor:
-        """Wavelet variance `c' Gamma_j c` of the virtual gyro, `(..., level)`."""
+    def in_sample_wavelet_variance(self) -> Tensor:
+        """Wavelet variance `c' Gamma_j c` of the virtual gyro in the recording that it was fitted to, `(..., level)`.
+
+        Weights flatter themselves there.
+        """
         return self._variance_of(self.weights)
+
+    @property
+    def virtual_wavelet_variance(self) -> Tensor:
+        """Wavelet variance of the virtual gyro, `(..., level)`; in sample, where nothing better is known."""
+        return self.in_sample_wavelet_variance
 
     @property
     def equal_wavelet_variance(self) -> Tensor:

@@ -162,7 +162,7 @@ def _story(long: SVOResult, short: SVOResult, truth: Tensor, remarks: list[str])
         "plain mean": (2 * long.equal_wavelet_variance).sqrt(),
         "fused, short": (2 * short.virtual_wavelet_variance).sqrt(),
         "fused, long": (2 * long.virtual_wavelet_variance).sqrt(),
-        "long/mean": _gain(long.weights, long.wavelet_cross_covariance),
+        "long/mean": (long.virtual_wavelet_variance / long.equal_wavelet_variance).sqrt(),
         "in truth": _gain(long.weights, truth),
         "possible": _gain(best, truth),
     }
@@ -172,8 +172,9 @@ def _story(long: SVOResult, short: SVOResult, truth: Tensor, remarks: list[str])
     paragraphs = [
         fill(about, 110),
         "Weights for long averaging times:\n" + "\n".join(weights),
-        f"Allan deviation ({UNIT}) in this recording; then long over mean: in this recording, with the same weights\n"
-        "and the true noise (in truth), with the best weights and the true noise (possible):\n" + "\n".join(levels),
+        f"Allan deviation ({UNIT}), that of fused gyros as expected in other recordings (cross-fitted); then long\n"
+        "over mean: as expected, with the same weights and the true noise (in truth), with the best weights and the\n"
+        "true noise (possible):\n" + "\n".join(levels),
         "\n".join(fill(f"- {sentence}", 110, subsequent_indent="  ") for sentence in verdict(long)),
         fill(against_truth, 110),
     ]
@@ -181,12 +182,13 @@ def _story(long: SVOResult, short: SVOResult, truth: Tensor, remarks: list[str])
 
 
 def _truth_figure(long: SVOResult, short: SVOResult, truth: Tensor) -> Figure:
-    """What the fitted weights gain on this recording and in truth, and how far they are from the best ones."""
+    """What the fitted weights are expected to gain and gain in truth, and how far they are from the best ones."""
     figure = new_figure(7, 7)
     *above, below = figure.subplots(3, 1, height_ratios=[1.3, 1.3, 1])
     for ax, result, name in zip(above, (long, short), ("long", "short"), strict=True):
-        plotting.plot_ratio(result.tau, _gain(result.weights, result.wavelet_cross_covariance), ax=ax)
-        ax.lines[-1].set_label("this recording")
+        ratio = (result.virtual_wavelet_variance / result.equal_wavelet_variance).sqrt()
+        plotting.plot_ratio(result.tau, ratio, ax=ax)
+        ax.lines[-1].set_label("expected in other recordings")
         best = svo_weights(truth, result.scale_weights)
         for weights, dashes, label in ((result.weights, "--", "same weights, true noise"), (best, ":", "best weights")):
             ax.plot(result.tau, _gain(weights, truth), dashes, color="black", linewidth=1.2, label=label, zorder=6)

@@ -1,12 +1,13 @@
 """How many times smaller the wavelet variance of a virtual gyro is than that of the plain mean, level by level.
 
-Both variances come from the same sensors, so that their ratio is known far better than either: Pitman's law of the
-ratio of two correlated variances gives its interval, exact for weights chosen beforehand. Weights fitted to the
-recording flatter themselves in it. Their variance is made larger by that optimism, as in Akaike's final prediction
-error, and as many observations less are left as their fit has used up.
+Both variances come from the same sensors, so that their ratio is known far better than either. Where a level holds
+many windows, the course of the ratio along the recording tells how far it can be off; elsewhere Pitman's law of the
+ratio of two correlated variances does, exact for weights chosen beforehand. Weights fitted to the recording flatter
+themselves in it. Their variance is the one in other recordings (`gyrofuse.cross_fitting`), and as many observations
+less are left as their fit has used up.
 
-References:
-    E. J. G. Pitman, Biometrika 31, 1939; H. Akaike, Annals of the Institute of Statistical Mathematics 21, 1969.
+Reference:
+    E. J. G. Pitman, Biometrika 31, 1939.
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ import torch
 from torch import Tensor
 
 from gyrofuse._result import ConfidenceInterval
-from gyrofuse.hypotheses import Answer, Evidence
+from gyrofuse.cross_fitting import CrossFit
+from gyrofuse.hypotheses import Answer
+from gyrofuse.uncertainty import t_quantile
 
-# Of the correlation between levels: white noise has 1.5, flicker 1.4 and a random walk 1.25.
-_KAPPA = 1.3
 # Degrees of freedom below which the law of a ratio says nothing.
 _FEWEST_SPARE = 0.5
 
@@ -63,7 +64,7 @@ class Gain(Answer):
 
 
 def ratio_to_equal(
-    weights: Tensor, wccv: Tensor, degrees: Tensor, optimism: Tensor, confidence_level: float = 0.95
+    weights: Tensor, wccv: Tensor, degrees: Tensor, fit: CrossFit, confidence_level: float = 0.95
 ) -> tuple[Tensor, ConfidenceInterval]:
     """Ratio of the wavelet variance of the plain mean to that of a virtual gyro, at each level.
 
@@ -71,8 +72,7 @@ def ratio_to_equal(
         weights: `(..., sensor)`, sum 1.
         wccv: `(..., level, sensor, sensor)`.
         degrees: `(..., level)`, independent observations of each level.
-        optimism: `(..., level)`, how much larger the variance of the virtual gyro is in other recordings; a ratio
-            less 1.
+        fit: How the weights compare in other recordings, batched as they are.
         confidence_level: Probability that an interval holds the true ratio.
 
     Returns:
@@ -83,55 +83,20 @@ def ratio_to_equal(
     fused = torch.einsum("...jik,...k->...ji", wccv, weights)  # Gamma_j c: (..., level, sensor)
     virtual = torch.einsum("...i,...ji->...j", weights, fused)
     equal, product = wccv.mean((-1, -2)), fused.mean(-1)
-    left = degrees / (1 + optimism / 2)  # n - p + 1 of n for one level
+    left = degrees * fit.left  # n - p + 1 of n for one level
     unshared = (1 - product.square() / (equal * virtual)).clamp(min=0) + 1 - left / degrees
     spare = (left - 1).clamp(min=0)
     quantile = torch.as_tensor(stats.t.ppf((1 + confidence_level) / 2, spare.cpu().numpy())).to(spare)
     spread = torch.where(spare > _FEWEST_SPARE, 1 + 2 * unshared * quantile.square() / spare, torch.inf)
     factor = spread + (spread.square() - 1).sqrt()
     found = equal / virtual
-    estimate = found / (1 + optimism)
-    # How much of the optimism falls on this level is known roughly: the upper limit does without the correction.
-    return estimate, ConfidenceInterval(estimate / factor, found * factor)
-
-
-def optimism(evidence: Evidence) -> Tensor:
-    """How much larger the wavelet variance of SVO weights is in other recordings than in their own, by level.
-
-    `2 tr(V A)` over all levels together, for `V = Cov(B dA c)`. The share of level j is taken to be that of Gaussian
-    observations, `sum_k omega_k E[c' dGamma_j B dGamma_k c]` with
-
-        E[...] = r_jk (sqrt(nu_j nu_k tr(B Gamma_j) tr(B Gamma_k)) + c' Gamma_j B Gamma_k c) / sqrt(eta_j eta_k)
-
-    where `nu_j = c' Gamma_j c` and `r_jk` is the correlation between levels.
-
-    Returns:
-        `(..., level)`, a ratio less 1; 0 at levels that are not known.
-    """
-    wccv, influence, omega = evidence.wccv, evidence.influence, evidence.scale_weights
-    fused = torch.einsum("...jik,...k->...ji", wccv, evidence.weights)  # Gamma_j c: (..., level, sensor)
-    virtual = torch.einsum("...i,...ji->...j", evidence.weights, fused).clamp(min=0)
-    root = (virtual * torch.einsum("...ik,...jki->...j", influence, wccv).clamp(min=0)).sqrt()
-    error = root[..., :, None] * root[..., None, :] + fused @ influence @ fused.mT  # (..., level, level)
-    scale = evidence.degrees.rsqrt()
-    error = _level_correlation(wccv) * scale[..., :, None] * error * scale[..., None, :]
-    share = error @ omega
-    total = 2 * torch.einsum("...ik,...ki->...", evidence.covariance, evidence.combined)
-    scaled = share * (total / (share @ omega))[..., None]
-    return torch.where(virtual > 0, scaled / virtual, 0.0)
-
-
-def _level_correlation(wccv: Tensor) -> Tensor:
-    """Correlation `(..., level, level)` of wavelet variances between levels.
-
-    `kappa sqrt(nu_k / nu_j) tau_j / tau_k` for `k > j`, with the sensors' mean variance `nu`: what power laws have.
-    """
-    variance = wccv.diagonal(dim1=-2, dim2=-1).mean(-1)
-    slope = variance.log2().diff(dim=-1).nan_to_num(nan=0.0).clamp(-1, 1)
-    fall = torch.nn.functional.pad((1 - slope / 2).cumsum(-1), (1, 0))  # -log2 of sqrt(nu_j) / tau_j
-    correlation = (_KAPPA * torch.exp2(-(fall[..., :, None] - fall[..., None, :]).abs())).clamp(max=1)
-    same = torch.eye(variance.shape[-1], dtype=torch.bool, device=variance.device)
-    return torch.where(same, 1.0, correlation)
+    estimate = found / (1 + fit.optimism)
+    shown = (t_quantile(fit.gain_degrees, confidence_level) * fit.gain_error).exp()
+    by_series = fit.gain_error.isfinite()
+    low = torch.where(by_series, estimate / shown, estimate / factor)
+    # What a few observations tell of the optimism is rough: there the upper limit does without the correction.
+    high = torch.where(by_series, estimate * shown, torch.maximum(found, estimate) * factor)
+    return estimate, ConfidenceInterval(low, high)
 
 
 def _limits(low: float, high: float) -> str:

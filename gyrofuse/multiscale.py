@@ -37,14 +37,19 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from gyrofuse._checks import check_floating, check_positive_integer, check_signal
 from gyrofuse._linalg import check_positive_definite
-from gyrofuse.covariance import wavelet_products
+from gyrofuse.covariance import binned_products
+from gyrofuse.cross_fitting import CrossFit, Fusion, cross_fit
 from gyrofuse.multiscale_result import MultiScaleResult, fuse_bands
+from gyrofuse.pilot import fit_pilot
 from gyrofuse.recording import Recording
 from gyrofuse.scale_weights import ScaleWeights
+from gyrofuse.series import bin_length
 from gyrofuse.svo import fit_svo
+from gyrofuse.uncertainty import degrees_of_freedom
 
 # Observations per sensor that the level below is worth. Out of sample, 4 to 10 are within 2 % of each other.
 _POOLING = 6.0
@@ -56,6 +61,7 @@ _OBSERVATIONS = 30.0
 # What a level without weight still counts: it settles bands that no other level sees.
 _IDLE = 1e-6
 _NODES = 64  # frequencies of an octave
+_DRAWS_AT_ONCE = 25  # programmes of all bands and sensors that are solved together
 
 
 def fit_multiscale(
@@ -107,16 +113,14 @@ def fit_multiscale(
     check_positive_definite(
         "the wavelet cross-covariance of level 1", wccv[..., 0, :, :], single.sensors, dtype=values.dtype
     )
-    shrunk = _shrink(wccv, degrees)
-    optimum = torch.linalg.solve(shrunk, _ones(shrunk)).sum(-1).reciprocal()  # 1 / (1' Gamma_j^-1 1): (..., level)
     omega = single.scale_weights.double()
-    weights = _stacked_weights(shrunk, omega.clamp(min=_IDLE * omega.max()) / optimum, n_bands)
+    weights, optimum = _fitted(wccv, degrees, omega, n_bands)
     with torch.no_grad():
-        virtual, _ = fuse_bands(weights, values)
-        sums, counts = wavelet_products(virtual.unsqueeze(-2), single.n_levels)
+        fit, in_sample = _judged(weights, values, wccv, omega, confidence_level)
     return MultiScaleResult(
         weights=weights.to(values.dtype),
-        virtual_wavelet_variance=(sums / counts)[..., 0, 0].to(values.dtype),
+        in_sample_wavelet_variance=in_sample.to(values.dtype),
+        cross_fit=fit,
         optimal_wavelet_variance=optimum.to(values.dtype),
         single=single,
     )
@@ -209,6 +213,60 @@ class MultiScaleSVO(nn.Module):
         if loaded is not None:
             self.weights = torch.empty_like(loaded, device=self.weights.device)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+
+def _fitted(wccv: Tensor, degrees: Tensor, omega: Tensor, n_bands: int) -> tuple[Tensor, Tensor]:
+    """Weights `(..., band, sensor)` and the optimum `1 / (1' S_j^-1 1)` of every level, `(..., level)`."""
+    shrunk = _shrink(wccv, degrees)
+    optimum = torch.linalg.solve(shrunk, _ones(shrunk)).sum(-1).reciprocal()
+    return _stacked_weights(shrunk, omega.clamp(min=_IDLE * omega.max()) / optimum, n_bands), optimum
+
+
+def _judged(
+    weights: Tensor, values: Tensor, wccv: Tensor, omega: Tensor, confidence_level: float
+) -> tuple[CrossFit, Tensor]:
+    """What the weights leave in other recordings, and their variance `(..., level)` in this one."""
+    n_levels, n_sensors = wccv.shape[-3:-1]
+    n_samples, batch = values.shape[-1], values.shape[:-2]
+    known = wccv.isfinite().all(-1).all(-1).reshape(-1, n_levels).all(0)
+    n_known = int(known.int().cumprod(0).sum())  # of a level that is not, nothing is said
+    items = values.detach().reshape(-1, *values.shape[-2:])
+    length = bin_length(n_samples, n_sensors)
+    parts, variances = [], []
+    for own, item in zip(weights.reshape(-1, *weights.shape[-2:]).split(1), items.split(1), strict=True):
+        sums, counts = binned_products(item, n_known, length)
+        pilot = fit_pilot(sums.sum(1) / counts.sum(1), n_samples)
+        fusion = _fusion(item, length, omega[:n_known], own.shape[-2])
+        # The slowest band governs the levels that the degrees of freedom are for.
+        left = pilot.degrees_of_freedom(own[:, -1:])[..., 0]
+        parts.append(cross_fit(fusion, own, sums, counts, pilot, left, confidence_level))
+        squares, number = fusion.squares_of(own, 0, sums.shape[1], n_known)
+        variances.append(pad(squares.sum(1) / number.sum(1), (0, n_levels - n_known), value=torch.nan))
+    return CrossFit.cat(parts).padded(n_levels).reshape(*batch), torch.cat(variances).reshape(*batch, n_levels)
+
+
+def _fusion(items: Tensor, length: int, omega: Tensor, n_bands: int) -> Fusion:
+    """Weights of bands, as they are fitted to arrays `(item, sensor, time)` whose bins hold `length` samples."""
+    n_levels = len(omega)
+    gains = _octave_gains(n_levels, n_bands).to(omega)
+
+    def weights_of(wccv: Tensor, windows: Tensor) -> Tensor:
+        some = zip(wccv.split(_DRAWS_AT_ONCE, 1), degrees_of_freedom(windows).split(_DRAWS_AT_ONCE, 1), strict=True)
+        return torch.cat([_fitted(moments, degrees, omega, n_bands)[0] for moments, degrees in some], 1)
+
+    def variance_of(weights: Tensor, wccv: Tensor) -> Tensor:
+        own = torch.cat([wccv[..., :-1, :, :] - wccv[..., 1:, :, :] / 4, wccv[..., -1:, :, :]], -3)
+        between = weights.unsqueeze(-3) @ own @ weights.unsqueeze(-3).mT  # (..., octave, band, band)
+        return torch.einsum("...lkm,ljkm->...j", between, gains)
+
+    def squares_of(weights: Tensor, first: int, last: int, levels: int) -> tuple[Tensor, Tensor]:
+        memory = 2 ** (n_bands - 1) + 2**levels  # of the filter, and of the coefficients of what it gives
+        start = max(0, first - -(-memory // length))
+        fused, _ = fuse_bands(weights, items[..., start * length : last * length])
+        sums, counts = binned_products(fused.unsqueeze(-2), levels, length)
+        return sums[:, first - start :, :, 0, 0], counts[:, first - start :, :, 0, 0]
+
+    return Fusion(weights_of, variance_of, squares_of)
 
 
 def _shrink(wccv: Tensor, degrees: Tensor) -> Tensor:

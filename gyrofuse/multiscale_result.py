@@ -12,6 +12,7 @@ from torch import Tensor
 from gyrofuse._checks import check_signal
 from gyrofuse._result import ConfidenceInterval, listed, numbered
 from gyrofuse._tiles import tile_length
+from gyrofuse.cross_fitting import CrossFit
 from gyrofuse.recording import Recording
 from gyrofuse.svo_result import SVOResult, plot_deviations
 
@@ -120,7 +121,9 @@ class MultiScaleResult:
     Attributes:
         weights: `(..., band, sensor)`; each band sums to 1, weights may be negative. Band `k = 1..K` is the difference
             between the means over the last `2**(k-1)` and `2**k` samples, the last band the mean over `2**K`.
-        virtual_wavelet_variance: `(..., level)`, of the recording itself fused with these weights, signal^2.
+        in_sample_wavelet_variance: `(..., level)`, of the recording itself fused with these weights, signal^2; they
+            flatter themselves in it.
+        cross_fit: How that compares with their variance in other recordings.
         optimal_wavelet_variance: `(..., level)`, estimate of the smallest wavelet variance that one vector of weights
             can have at that level alone, `1 / (1' S_j^-1 1)`, signal^2, where `S_j` is `Gamma_j` shrunk towards the
             level below; on the low side at the last levels. No lower bound of `virtual_wavelet_variance`: bands weigh
@@ -129,7 +132,8 @@ class MultiScaleResult:
     """
 
     weights: Tensor
-    virtual_wavelet_variance: Tensor
+    in_sample_wavelet_variance: Tensor
+    cross_fit: CrossFit
     optimal_wavelet_variance: Tensor
     single: SVOResult
 
@@ -208,9 +212,14 @@ class MultiScaleResult:
         """A warning that the array seems to have moved while it was fitted, or an empty string."""
         return self.single.motion
 
+    @property
+    def virtual_wavelet_variance(self) -> Tensor:
+        """Wavelet variance of the virtual gyro in other recordings of the array, cross-fitted, `(..., level)`."""
+        return self.in_sample_wavelet_variance * (1 + self.cross_fit.optimism).to(self.weights)
+
     def interval_of(self, wavelet_variance: Tensor) -> ConfidenceInterval:
-        """Limits of wavelet variances `(..., level)` of the virtual gyro."""
-        return self.single.interval_of(wavelet_variance)
+        """Limits `(..., level)` of `virtual_wavelet_variance`, or of that of another combination as slow as it."""
+        return self.cross_fit.limits_of(wavelet_variance)
 
     def virtual(self, signal: Tensor | Recording) -> Tensor:
         """Fuse a signal with these weights: `(..., sensor, time)` to `(..., time)`.
@@ -223,7 +232,7 @@ class MultiScaleResult:
     def __getitem__(self, item: Any) -> MultiScaleResult:
         """One item, or some, of the leading batch dimensions."""
         single = self.single[item]
-        batched = ("weights", "virtual_wavelet_variance", "optimal_wavelet_variance")
+        batched = ("weights", "in_sample_wavelet_variance", "cross_fit", "optimal_wavelet_variance")
         return replace(self, single=single, **{name: getattr(self, name)[item] for name in batched})
 
     def summary(self) -> str:
@@ -275,8 +284,8 @@ class MultiScaleResult:
             start = f"{self.tau[int(few.nonzero()[0])].item():.6g} {second}"
             most = self.degrees_of_freedom[few].max().item()
             told = (
-                f"Few observations: from {start} on, {most:.2g} or less, fewer than sensors; what is gained there is "
-                "partly fitted to this very recording, and another one has to confirm it."
+                f"Few observations: from {start} on, {most:.2g} or less, fewer than sensors; what is gained there "
+                "follows from a model of the noise, and another recording has to confirm it."
             )
             lines += ["", textwrap.fill(told, 110)]
         if self.motion:
@@ -298,7 +307,8 @@ class MultiScaleResult:
         Raises:
             ValueError: The result holds a batch; index it first.
         """
-        return plot_deviations(self.single, self.virtual_wavelet_variance, ax)
+        virtual = self.virtual_wavelet_variance
+        return plot_deviations(self.single, virtual, self.interval_of(virtual), ax)
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain lists and numbers, ready for JSON (NaN as None)."""
@@ -318,6 +328,7 @@ class MultiScaleResult:
             "wavelet_cross_covariance": listed(self.single.wavelet_cross_covariance),
             "wavelet_variance": listed(self.wavelet_variance),
             "virtual_wavelet_variance": listed(self.virtual_wavelet_variance),
+            "in_sample_wavelet_variance": listed(self.in_sample_wavelet_variance),
             "optimal_wavelet_variance": listed(self.optimal_wavelet_variance),
             "equal_wavelet_variance": listed(self.equal_wavelet_variance),
             "single_wavelet_variance": listed(self.single.virtual_wavelet_variance),

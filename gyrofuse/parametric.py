@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._lag_sums import block_mean_covariances
+from gyrofuse.covariance import wavelet_products
 from gyrofuse.pilot import Pilot, components_of_memories
 
 # The share of the variance that the directions hold, and as many as give its law the right shape.
@@ -146,3 +147,52 @@ def _kernel(n_blocks: int, omega: tuple[float, ...]) -> np.ndarray:
         window[rows, rows + half + np.arange(half)] = 1 / (2 * half)
         kernel += weight / len(window) * window.T @ window
     return kernel
+
+
+def resample_wccv(pilot: Pilot, first_level: int, n_resamples: int, generator: torch.Generator) -> Tensor:
+    """Resamples of the wavelet cross-covariance of the last levels, joint over levels and sensors.
+
+    Of records of means over blocks of `2**first_level` samples: the first of these levels sees two of them. Every item
+    of a batch gets the same draws.
+
+    Args:
+        pilot: A model fitted to the arrays, batch `(item,)`.
+        first_level: Lowest level to draw (counted from 0), at least the pilot's own.
+        n_resamples: Number of resamples.
+        generator: Source of randomness, on the CPU.
+
+    Returns:
+        `(item, resample, level, sensor, sensor)`, signal^2, levels from `first_level` on.
+    """
+    n_levels = pilot.n_levels - first_level
+    roots = _block_roots(pilot.n_samples, first_level, pilot.time_constants)  # (component, block, block)
+    n_items, n_components, n_sensors = pilot.theta.shape[:3]
+    normal = torch.randn(
+        n_components, n_resamples, n_sensors, roots.shape[-1], generator=generator, dtype=pilot.theta.dtype
+    )
+    resamples = pilot.theta.new_empty(n_items, n_resamples, n_levels, n_sensors, n_sensors)
+    members = components_of_memories()
+    for memory in pilot.memory.unique().tolist():
+        root = roots[members[memory]].to(pilot.theta)
+        paths = normal.to(pilot.theta) @ root.mT[:, None]  # unit noise: (component, resample, sensor, block)
+        for item in (pilot.memory == memory).nonzero().flatten().tolist():
+            values, vectors = torch.linalg.eigh(pilot.theta[item])
+            mix = vectors * values.clamp(min=0).sqrt()[:, None, :]  # (component, sensor, sensor)
+            sums, counts = wavelet_products((mix[:, None] @ paths).sum(0), n_levels)
+            resamples[item] = sums / counts
+    return resamples
+
+
+@functools.lru_cache(maxsize=8)
+def _block_roots(n_samples: int, first_level: int, time_constants: tuple[float, ...]) -> Tensor:
+    """Factors `R` `(component, block, block)`: `R z` is a record of block means up to a constant, `z` unit white noise.
+
+    A random walk has no covariance, but its increments have; so have all others.
+    """
+    block = 2**first_level
+    n_blocks = n_samples // block
+    covariances = block_mean_covariances(block, n_blocks + 1, time_constants)
+    mirrored = np.concatenate([covariances[:, 1:2], covariances], 1)  # lags -1, 0, 1, ...
+    increments = 2 * mirrored[:, 1:-1] - mirrored[:, :-2] - mirrored[:, 2:]
+    lag = np.abs(np.arange(n_blocks)[:, None] - np.arange(n_blocks))
+    return _root(torch.from_numpy(increments[:, lag])).cumsum(-2)

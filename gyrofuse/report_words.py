@@ -37,7 +37,6 @@ def verdict(result: Fused) -> list[str]:
         sentences.append(_compared(result, result.equal_wavelet_variance, "the plain mean"))
     sentences.append(_compared(result, result.wavelet_variance.amin(-1), "the best single sensor"))
     if isinstance(result, MultiScaleResult) and bool(_resolved(result).any()):
-        # Beyond, the one vector is fitted to the very recording even more than the bands are.
         one = result.single.virtual_wavelet_variance
         sentences.append(_compared(result, one, "one vector of weights for all scales"))
     return sentences + _few_in_words(result)
@@ -67,7 +66,7 @@ def _few_in_words(result: Fused) -> list[str]:
     left_out = ", so that the comparisons end before" if bool(_resolved(result).any()) else ""
     if result.method in ("svo", "multiscale") and bool((result.scale_weights[few] > 0).any()):
         return [
-            f"{start}{left_out}: what it gains there is partly fitted to this very recording, and another one has to "
+            f"{start}{left_out}: what it gains there follows from a model of the noise, and another recording has to "
             "confirm it."
         ]
     return [f"{start}{left_out or ': the comparisons are an indication and no more'}."]

@@ -16,7 +16,7 @@ from gyrofuse._linalg import check_positive_definite
 from gyrofuse._result import ConfidenceInterval, named, numbered
 from gyrofuse.bootstrap import signal_bootstrap
 from gyrofuse.covariance import binned_products
-from gyrofuse.fusion import METHODS, Chosen, choose_weights
+from gyrofuse.fusion import METHODS, Chosen, choose_weights, judge_weights
 from gyrofuse.influence import bootstrap_inverse_variance_weights_covariance, bootstrap_weights_covariance
 from gyrofuse.pilot import fit_pilot
 from gyrofuse.recording import Recording
@@ -104,12 +104,13 @@ def fit_svo(
     chosen = choose_weights(method, items, wccv, totals, omega)
     n_known = int((totals > 0).all(0).flatten(1).all(1).sum())  # later levels do not count, or this were refused
     known = (sums[:, :, :n_known], counts[:, :, :n_known], omega[:n_known])
+    pilot = fit_pilot(wccv[:, :n_known], values.shape[-1])
+    degrees = pilot.degrees_of_freedom(chosen.weights[:, None])[..., 0]
+    judged = judge_weights(chosen, *known, pilot, degrees, confidence_level)
     if covariance == "none":
         spread, degrees = unknown(chosen.weights), uncertainty.degrees_of_freedom(totals.amin((-1, -2)))
     else:
-        pilot = fit_pilot(wccv[:, :n_known], values.shape[-1])
         spread = _spread(chosen, items, *known, covariance, block_length, confidence_level)
-        degrees = pilot.degrees_of_freedom(chosen.weights[:, None])[..., 0]
         degrees = pad(degrees, (0, len(omega) - n_known), value=1.0)
     low, high = chosen.weights - spread.half_width, chosen.weights + spread.half_width
 
@@ -125,6 +126,7 @@ def fit_svo(
         wavelet_cross_covariance=batched(wccv),
         scale_weights=omega.to(values.dtype),
         degrees_of_freedom=batched(degrees, torch.float64),
+        cross_fit=judged.padded(len(omega)).reshape(*batch),
         method=chosen.method,
         selection=chosen.selection and chosen.selection.reshape(batch),
         positive_definite=None if chosen.positive_definite is None else chosen.positive_definite.reshape(batch),

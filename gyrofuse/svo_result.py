@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from gyrofuse import gain, hypotheses, uncertainty
+from gyrofuse import gain, hypotheses
 from gyrofuse._checks import check_positive, check_signal
 from gyrofuse._result import ConfidenceInterval, listed, named, numbered
 from gyrofuse._virtual_gyro import VirtualGyro
+from gyrofuse.cross_fitting import CrossFit
 from gyrofuse.gain import Gain
 from gyrofuse.hypotheses import EnoughData, Evidence, WeightsTest
 from gyrofuse.recording import Recording
@@ -37,12 +38,13 @@ def fuse(weights: Tensor, signal: Tensor) -> Tensor:
     return (weights.unsqueeze(-2) @ signal).squeeze(-2)  # (..., 1, sensor) @ (..., sensor, time)
 
 
-def plot_deviations(array: SVOResult, virtual: Tensor, ax: Axes | None = None) -> Axes:
+def plot_deviations(array: SVOResult, virtual: Tensor, band: ConfidenceInterval, ax: Axes | None = None) -> Axes:
     """Draw the Allan deviation of every sensor, the plain mean and a virtual gyro, with the latter's band.
 
     Args:
         array: One array; its own weights are not looked at.
         virtual: Wavelet variance of the virtual gyro, `(level,)`.
+        band: Its limits.
         ax: Where to draw; new axes by default.
 
     Returns:
@@ -60,7 +62,7 @@ def plot_deviations(array: SVOResult, virtual: Tensor, ax: Axes | None = None) -
         array.wavelet_variance,
         names=array.sensors,
         virtual=virtual,
-        band=array.interval_of(virtual),
+        band=band,
         equal=array.equal_wavelet_variance,
         unit=array.unit,
         in_seconds=array.rate is not None,
@@ -87,6 +89,7 @@ class SVOResult(VirtualGyro):
         wavelet_cross_covariance: `(..., level, sensor, sensor)`, signal^2.
         scale_weights: `(level,)`, sum 1.
         degrees_of_freedom: `(..., level)`, independent observations of the virtual gyro that a level holds.
+        cross_fit: How the wavelet variance in other recordings compares with that in this one.
         method: How the weights were chosen; `"auto"` where that differs over the batch.
         n_samples: Length of the signal.
         sensors: Name of each sensor.
@@ -106,6 +109,7 @@ class SVOResult(VirtualGyro):
     wavelet_cross_covariance: Tensor
     scale_weights: Tensor
     degrees_of_freedom: Tensor
+    cross_fit: CrossFit
     method: str
     n_samples: int
     sensors: tuple[str, ...]
@@ -139,8 +143,13 @@ class SVOResult(VirtualGyro):
         )
 
     def interval_of(self, wavelet_variance: Tensor) -> ConfidenceInterval:
-        """Limits of wavelet variances `(..., level)` of the virtual gyro, or of another combination as slow as it."""
-        return uncertainty.chi_square_interval(wavelet_variance, self.degrees_of_freedom, self.confidence_level)
+        """Limits `(..., level)` of `virtual_wavelet_variance`, or of that of another combination as slow as it."""
+        return self.cross_fit.limits_of(wavelet_variance)
+
+    @property
+    def virtual_wavelet_variance(self) -> Tensor:
+        """Wavelet variance of the virtual gyro in other recordings of the array, cross-fitted, `(..., level)`."""
+        return self.in_sample_wavelet_variance * (1 + self.cross_fit.optimism).to(self.weights)
 
     @property
     def effective_observations(self) -> Tensor:
@@ -191,31 +200,31 @@ class SVOResult(VirtualGyro):
     def gain_over_equal(self) -> Gain:
         """How many times smaller the wavelet variance is than that of the plain mean, by level, with its interval.
 
-        For these weights in any other recording of the array: SVO weights flatter themselves in their own, for which
-        they are corrected. Weights of other methods are taken as if they had been chosen beforehand.
+        For these weights in any other recording of the array: weights flatter themselves in their own, for which they
+        are corrected, whatever the method. Those of RDVG are taken as if they had been chosen beforehand.
 
         Returns:
             The gain, batched over the leading dimensions.
 
         Raises:
-            ValueError: Equal weights, or SVO weights without covariance.
+            ValueError: Equal weights, whose gain is 1.
         """
         if self.method == "equal":
             raise ValueError(
                 "`gain_over_equal`: expected weights other than equal ones, got method 'equal'; fit with method='svo'"
             )
-        degrees = self.degrees_of_freedom
-        optimism = torch.zeros_like(degrees)
-        if self.method == "svo":
-            optimism = gain.optimism(self._evidence("gain_over_equal"))
         estimate, interval = gain.ratio_to_equal(
-            self.weights.double(), self.wavelet_cross_covariance.double(), degrees, optimism, self.confidence_level
+            self.weights.double(),
+            self.wavelet_cross_covariance.double(),
+            self.degrees_of_freedom,
+            self.cross_fit,
+            self.confidence_level,
         )
         return Gain(
             estimate=estimate,
             confidence_interval=interval,
             confidence_level=self.confidence_level,
-            in_sample=self.equal_wavelet_variance / self.virtual_wavelet_variance,
+            in_sample=self.equal_wavelet_variance / self.in_sample_wavelet_variance,
             tau=self.tau,
             tau_unit="s" if self.rate else "samples",
         )
@@ -240,6 +249,7 @@ class SVOResult(VirtualGyro):
         if self.positive_definite is not None:
             items["positive_definite"] = self.positive_definite[index]
         selection = self.selection and self.selection[index]
+        items["cross_fit"] = self.cross_fit[index]
         return replace(self, axes=(), confidence_interval=interval, selection=selection, **items)
 
     def summary(self) -> str:
@@ -285,7 +295,8 @@ class SVOResult(VirtualGyro):
         Raises:
             ValueError: The result holds a batch; index it first.
         """
-        return plot_deviations(self, self.virtual_wavelet_variance, ax)
+        virtual = self.virtual_wavelet_variance
+        return plot_deviations(self, virtual, self.interval_of(virtual), ax)
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain lists and numbers, ready for JSON (NaN as None)."""
@@ -310,6 +321,7 @@ class SVOResult(VirtualGyro):
             "wavelet_cross_covariance": listed(self.wavelet_cross_covariance),
             "wavelet_variance": listed(self.wavelet_variance),
             "virtual_wavelet_variance": listed(self.virtual_wavelet_variance),
+            "in_sample_wavelet_variance": listed(self.in_sample_wavelet_variance),
             "equal_wavelet_variance": listed(self.equal_wavelet_variance),
         }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import json
 
@@ -12,8 +13,8 @@ from scipy import optimize, stats
 from torch import Tensor
 
 from gyrofuse import ArrayModel, RandomWalk, WhiteNoise, fit_svo, svo_weights
-from gyrofuse.gain import _level_correlation, optimism, ratio_to_equal
-from gyrofuse.hypotheses import Evidence
+from gyrofuse.cross_fitting import CrossFit, certain_fit
+from gyrofuse.gain import ratio_to_equal
 
 # Studies on recordings; the chance that a true claim is refused.
 N_RUNS, N_SENSORS, N_SAMPLES, REFUSED = 120, 4, 1024, 1e-3
@@ -41,7 +42,7 @@ def test_limits_are_those_of_pitmans_test():
     x = drawn(n, 3)
     weights = torch.tensor([0.7, 0.5, -0.2], dtype=torch.float64)
     degrees = torch.tensor([float(n)], dtype=torch.float64)
-    estimate, (low, high) = ratio_to_equal(weights, one_level(x), degrees, torch.zeros(1), 0.9)
+    estimate, (low, high) = ratio_to_equal(weights, one_level(x), degrees, certain_fit(degrees, 0.9), 0.9)
     equal, virtual = x.mean(-1).numpy(), (x @ weights).numpy()
 
     def p_value(ratio: float) -> float:
@@ -61,7 +62,7 @@ def test_coverage_is_exact_for_weights_chosen_beforehand(n):
     weights = torch.tensor([0.7, 0.5, -0.2], dtype=torch.float64)
     x = drawn(4000, n, 3, seed=3) @ torch.linalg.cholesky(covariance).T
     degrees = torch.full((4000, 1), float(n), dtype=torch.float64)
-    _, (low, high) = ratio_to_equal(weights.expand(4000, 3), one_level(x), degrees, torch.zeros_like(degrees))
+    _, (low, high) = ratio_to_equal(weights.expand(4000, 3), one_level(x), degrees, certain_fit(degrees, 0.95))
     truth = covariance.mean() / (weights @ covariance @ weights)
     covered = int(((low <= truth) & (truth <= high)).sum())
     assert stats.binomtest(covered, 4000, 0.95).pvalue > REFUSED
@@ -70,37 +71,18 @@ def test_coverage_is_exact_for_weights_chosen_beforehand(n):
 def test_one_observation_says_nothing():
     x, weights = drawn(1, 3), torch.tensor([0.7, 0.5, -0.2], dtype=torch.float64)
     one = torch.ones(1, dtype=torch.float64)
-    _, (low, high) = ratio_to_equal(weights, one_level(x), one, 0 * one)
+    _, (low, high) = ratio_to_equal(weights, one_level(x), one, certain_fit(one, 0.95))
     assert (low.item(), high.item()) == (0.0, float("inf"))
 
 
 # Fitted weights
 
 
-def fitted_one_level(x: Tensor) -> Evidence:
-    """Evidence of one level of `(..., observation, sensor)`, with the covariance that theory gives the weights."""
-    n, p = x.shape[-2:]
-    gamma, omega = one_level(x), torch.ones(1, dtype=torch.float64)
-    weights = svo_weights(gamma, omega)
-    left, degrees = torch.full_like(weights, n - p + 1), torch.full_like(weights[..., :1], n)
-    bare = Evidence(weights, gamma[..., 0, :, :], left, gamma, omega, degrees, 0.95)
-    covariance = bare.influence * bare.residual[..., None, None] / (n - p + 1)
-    return Evidence(weights, covariance, left, gamma, omega, degrees, 0.95)
-
-
-def test_optimism_of_one_level_is_akaikes():
-    n, p = 30, 4
-    got = optimism(fitted_one_level(drawn(n, p, seed=4)))
-    assert 1 + got.item() == pytest.approx((n + p - 1) / (n - p + 1), rel=1e-10)
-
-
-def test_optimism_adds_up_to_that_of_all_levels():
-    """`sum_j omega_j c' Gamma_j c o_j = 2 tr(V A)`."""
-    result = fit_svo(drawn(2, 4, 800, seed=5).cumsum(-1), "flat", n_levels=6)
-    evidence = result._evidence("test")
-    added = torch.einsum("j,rj,rj->r", evidence.scale_weights, result.virtual_wavelet_variance, optimism(evidence))
-    expected = 2 * torch.einsum("rik,rki->r", evidence.covariance, evidence.combined)
-    torch.testing.assert_close(added, expected, rtol=1e-10, atol=0)
+def fitted_to_one_level(n: int, p: int) -> CrossFit:
+    """What theory says of weights fitted to `n` observations of `p` sensors (Akaike's final prediction error)."""
+    left = n - p + 1
+    sure = certain_fit(torch.full((4000, 1), float(n), dtype=torch.float64), 0.95)
+    return dataclasses.replace(sure, optimism=sure.optimism + 2 * (p - 1) / left, left=sure.left * left / n)
 
 
 @pytest.mark.parametrize("equal_is_best", [True, False])
@@ -108,25 +90,12 @@ def test_optimism_adds_up_to_that_of_all_levels():
 def test_coverage_of_fitted_weights_for_one_level(n, equal_is_best):
     """4000 samples: 95 % or more hold the true ratio for the weights as they were fitted."""
     covariance = torch.eye(4, dtype=torch.float64) if equal_is_best else mixed(4, 6)
-    evidence = fitted_one_level(drawn(4000, n, 4, seed=7) @ torch.linalg.cholesky(covariance).T)
-    _, (low, high) = ratio_to_equal(evidence.weights, evidence.wccv, evidence.degrees, optimism(evidence))
-    truth = covariance.mean() / torch.einsum("ri,ik,rk->r", evidence.weights, covariance, evidence.weights)
+    gamma = one_level(drawn(4000, n, 4, seed=7) @ torch.linalg.cholesky(covariance).T)
+    weights, degrees = svo_weights(gamma, [1.0]), torch.full((4000, 1), float(n), dtype=torch.float64)
+    _, (low, high) = ratio_to_equal(weights, gamma, degrees, fitted_to_one_level(n, 4))
+    truth = covariance.mean() / torch.einsum("ri,ik,rk->r", weights, covariance, weights)
     covered = ((low[:, 0] <= truth) & (truth <= high[:, 0])).sum()
     assert covered >= stats.binom.ppf(REFUSED, 4000, 0.95)
-
-
-@pytest.mark.parametrize("exponent", [0, 1, 2])
-def test_correlation_between_levels_is_that_of_power_laws(exponent):
-    """White noise, flicker and random walk, at levels between which spectra are those of long filters."""
-    n_levels = 9
-    f = torch.linspace(1e-6, 0.5, 2**18, dtype=torch.float64)
-    sine = torch.sin(torch.pi * f)
-    tau = torch.exp2(torch.arange(1, n_levels + 1, dtype=torch.float64))[:, None]
-    through = 4 * torch.sin(torch.pi * f * tau / 2) ** 4 / (tau * sine) ** 2 / sine**exponent
-    moments = through @ through.T
-    exact = moments / (moments.diagonal()[:, None] * moments.diagonal()).sqrt()
-    wccv = torch.diag_embed(through.sum(-1)[:, None].expand(n_levels, 2))
-    torch.testing.assert_close(_level_correlation(wccv), exact, rtol=0, atol=0.08)
 
 
 @functools.cache
@@ -181,7 +150,8 @@ def test_a_gain_batched_in_float32_and_as_json():
     item = fit_svo(signal[1, 2], "short").gain_over_equal()
     torch.testing.assert_close(gain.estimate[1, 2], item.estimate, rtol=1e-6, atol=0)
     for whole, one in zip(gain.confidence_interval, item.confidence_interval, strict=True):
-        torch.testing.assert_close(whole[1, 2], one, rtol=1e-6, atol=0)
+        # Below one degree of freedom a quantile of Student's t makes rounding some hundred times larger.
+        torch.testing.assert_close(whole[1, 2], one, rtol=1e-5, atol=0)
     torch.testing.assert_close(single.estimate.double(), gain.estimate, rtol=1e-3, atol=0)
     values = json.loads(json.dumps(gain.to_dict(), allow_nan=False))
     assert np.shape(values["estimate"]) == (2, 3, 9)
@@ -189,12 +159,13 @@ def test_a_gain_batched_in_float32_and_as_json():
     assert values["tau_unit"] == "samples"
 
 
+@pytest.mark.filterwarnings("ignore:RDVG")
 def test_the_gain_in_the_recording_is_that_of_the_variances():
     result = fit_svo(drawn(4, 600, seed=12), "short")
     gain = result.gain_over_equal()
-    torch.testing.assert_close(gain.in_sample, result.equal_wavelet_variance / result.virtual_wavelet_variance)
-    assert (gain.estimate < gain.in_sample).all()
-    fixed = fit_svo(drawn(4, 600, seed=12), "short", method="inverse_variance").gain_over_equal()
+    torch.testing.assert_close(gain.in_sample, result.equal_wavelet_variance / result.in_sample_wavelet_variance)
+    torch.testing.assert_close(gain.estimate, result.equal_wavelet_variance / result.virtual_wavelet_variance)
+    fixed = fit_svo(drawn(4, 600, seed=12), "short", method="rdvg").gain_over_equal()  # not fitted anew
     torch.testing.assert_close(fixed.estimate, fixed.in_sample)
 
 
@@ -202,10 +173,7 @@ def test_a_level_that_is_not_known_has_no_gain_and_spoils_no_other():
     wccv, omega = torch.stack([mixed(3, seed) for seed in range(3)]), torch.tensor([0.5, 0.0, 0.5]).double()
     weights, degrees = svo_weights(wccv, omega), torch.full((3,), 40.0, dtype=torch.float64)
     known = torch.tensor([1.0, 0.0, 1.0]).double()[:, None, None]
-    evidence = Evidence(weights, 1e-3 * torch.eye(3).double(), degrees, known * wccv, omega, degrees, 0.95)
-    assert optimism(evidence)[1] == 0
-    assert (optimism(evidence)[[0, 2]] > 0).all()
-    estimate, interval = ratio_to_equal(weights, wccv.where(known > 0, torch.nan), degrees, optimism(evidence))
+    estimate, interval = ratio_to_equal(weights, wccv.where(known > 0, torch.nan), degrees, certain_fit(degrees, 0.95))
     for values in (estimate, *interval):
         assert values.isnan().tolist() == [False, True, False]
 
@@ -221,11 +189,8 @@ def test_summary_is_a_table_of_fixed_width():
     assert result.gain_over_equal().summary() == f"{one}\n\n{result[1].gain_over_equal()}"
 
 
-def test_equal_weights_and_unknown_errors_have_no_gain():
-    signal = drawn(3, 400)
+def test_equal_weights_have_no_gain():
     with pytest.raises(
         ValueError, match="`gain_over_equal`: expected weights other than equal ones, got method 'equal'"
     ):
-        fit_svo(signal, method="equal").gain_over_equal()
-    with pytest.raises(ValueError, match="`gain_over_equal`: expected the covariance of the weights, got none"):
-        fit_svo(signal, covariance="none").gain_over_equal()
+        fit_svo(drawn(3, 400), method="equal").gain_over_equal()

@@ -73,7 +73,7 @@ LAYERS = [
         "whittle",
     },
     {"parity_energy", "parity_reference", "fault_kinds"},
-    {"fusion", "weights_spread", "hypotheses", "gain", "selection"},
+    {"fusion", "weights_spread", "cross_fitting", "hypotheses", "gain", "selection"},
     {"competitors", "rdvg", "assisted", "saturation"},
     {"svo_weights"},
     {

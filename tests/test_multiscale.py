@@ -309,7 +309,7 @@ def test_a_result_by_hand():
     assert (result.n_bands, result.n_levels, result.sensors) == (1 + 7, 11, ("1", "2", "3", "4"))
     torch.testing.assert_close(result.virtual(signal), fuse_bands(result.weights, signal)[0])
     expected = wavelet_variance(result.virtual(signal).unsqueeze(-2), 11)[:, 0]
-    torch.testing.assert_close(result.virtual_wavelet_variance, expected)
+    torch.testing.assert_close(result.in_sample_wavelet_variance, expected)
     torch.testing.assert_close(result.equal_wavelet_variance, wavelet_variance(signal.mean(0, keepdim=True), 11)[:, 0])
     torch.testing.assert_close(result.single.weights, fit_svo(signal, "short").weights)
     assert (result.optimal_wavelet_variance[:5] <= 1.01 * result.virtual_wavelet_variance[:5]).all()

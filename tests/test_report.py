@@ -15,6 +15,7 @@ from pages import Page
 from scipy import stats
 
 from gyrofuse import ConfidenceInterval, MultiScaleResult, Recording, SVOResult, fit_multiscale, fit_svo
+from gyrofuse.cross_fitting import certain_fit
 from gyrofuse.fusion import METHODS
 from gyrofuse.io.notes import Note
 from gyrofuse.rdvg import rdvg
@@ -46,6 +47,7 @@ def made_up(ratios: list[float], best: float = 0.9) -> SVOResult:
         confidence_interval=around(0.02),
         wavelet_cross_covariance=wccv,
         degrees_of_freedom=torch.full((len(ratios),), 100.0, dtype=torch.float64),
+        cross_fit=certain_fit(torch.full((len(ratios),), 100.0, dtype=torch.float64), 0.95),
         sensors=("a", "b", "c"),
         rate=100.0,
         unit="deg/s",
@@ -72,7 +74,7 @@ def made_up_bands(virtual: list[float], equal: list[float], degrees: list[float]
         degrees_of_freedom=torch.tensor(degrees, dtype=torch.float64),
     )
     weights = torch.tensor([[0.2, 0.5, 0.3], [1.1, 0.2, -0.3]], dtype=torch.float64)
-    return MultiScaleResult(weights, variance, variance / 2, single)
+    return MultiScaleResult(weights, variance, certain_fit(single.degrees_of_freedom, 0.95), variance / 2, single)
 
 
 def plain(sentences: list[str]) -> list[str]:
