@@ -2,9 +2,10 @@
 
 Six gyros on each axis share a vibration at 11.3 Hz, each by its own amount, and have noise of their own. A recording on
 the ground gives the weights of three virtual gyros (plain mean, SVO, multi-scale) and a noise model of each, white
-noise, an AR1 and a random walk, fitted as it is. `gyrofuse.diagnose` compares the recording with that model, finds the
-tone, and the model is fitted again without it and with the tone as states of the filter. Flights of 235 s, satellites
-away from 160 to 210 s, are then estimated with the error of every virtual gyro and either tuning.
+noise, an AR1 and a random walk, fitted to what it gives. `gyrofuse.diagnose` compares the plain mean with its model and
+finds the tone. The array's noise is then fitted with a tone, and `gyrofuse.virtual_noise` says what each virtual gyro
+makes of it. Flights of 235 s, satellites away from 160 to 210 s, are estimated with the error of every virtual gyro and
+either tuning.
 
     python examples/vibration_flight.py [--flights 40] [--rate 100] [--quick] [--figure flight.png]
 """
@@ -14,7 +15,6 @@ from __future__ import annotations
 import argparse
 import math
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 
@@ -32,13 +32,6 @@ ACCELEROMETER = "WN(variance=1e-4) + RW(variance=1e-11)"
 ALIGNMENT = Alignment(attitude=(0.1 * DEGREE, 0.1 * DEGREE, 0.5 * DEGREE))
 
 
-class Tuning(NamedTuple):
-    """A model that the filter is told, rad/s, and what of it was found."""
-
-    model: gf.Model
-    words: str
-
-
 def array(n_samples: int, batch: tuple[int, ...], rate: float, generator: torch.Generator) -> torch.Tensor:
     """Errors of arrays, deg/s, `(..., sensor, time)`."""
     noise = gf.WhiteNoise(WHITE.square() * rate / 100) + gf.AR1(torch.full_like(SLOW, 0.998), SLOW.square())
@@ -48,22 +41,19 @@ def array(n_samples: int, batch: tuple[int, ...], rate: float, generator: torch.
     return signal + TONE[:, None] * torch.sin(2 * math.pi * TONE_HZ * t + phase)
 
 
-def tunings(virtual: torch.Tensor, rate: float) -> tuple[Tuning, Tuning]:
-    """Of a virtual gyro's recording `(time,)`: fitted as it is, and with what the diagnosis finds."""
-    recording = gf.Recording(virtual[None], rate=rate, unit="deg/s")
-    plain = gf.fit_gmwm(recording, "WN + AR1 + RW").model
-    plain = plain.with_params(plain.params[0])
-    report = gf.diagnose(recording, plain)
-    tones = [f for f in report.findings if f.mechanism == "vibration_tone"]
-    if not tones:
-        return Tuning(plain, "as it is"), Tuning(plain, "nothing found")
-    rest = gf.fit_gmwm(report.correct(recording), "WN + AR1 + RW").model
-    whole = rest.with_params(rest.params[0])
-    for tone in tones:
-        amplitude = max(p.value for name, p in tone.parameters.items() if name.startswith("amplitude"))
-        whole = whole + gf.Sinusoid(amplitude, 2 * math.pi * float(tone.frequency_hz or 0.0) / rate)
-    found = ", ".join(f"{tone.frequency_hz:.4g} Hz" for tone in tones)
-    return Tuning(plain, "as it is"), Tuning(whole, f"with a tone at {found}")
+def fitted(virtual: torch.Tensor, rate: float) -> gf.Model:
+    """Noise model of a virtual gyro's recording `(time,)`, fitted to it as it is."""
+    found = gf.fit_gmwm(gf.Recording(virtual[None], rate=rate, unit="deg/s"), "WN + AR1 + RW").model
+    return found.with_params(found.params[0])
+
+
+def array_model(ground: torch.Tensor, rate: float) -> tuple[gf.ArrayModel, str]:
+    """Noise of the sensors with the tones that a diagnosis of their plain mean finds, and those in words."""
+    mean = ground.mean(-2)
+    report = gf.diagnose(gf.Recording(mean[None], rate=rate, unit="deg/s"), fitted(mean, rate))
+    tones = [f"{f.frequency_hz:.4g} Hz" for f in report.findings if f.mechanism == "vibration_tone"]
+    model = gf.fit_array_gmwm(ground, " + ".join(["WN + AR1 + RW", *["SIN"] * len(tones)])).model
+    return model, f"by the array, tone at {', '.join(tones)}" if tones else "by the array"
 
 
 def errors_of(fused: torch.Tensor, accelerometer: Axes) -> Drawn:
@@ -94,28 +84,40 @@ def main() -> None:
         .simulate(n_samples, n_flights, generator)
         .accelerometer
     )
-    svo, bands = gf.fit_svo(ground, "long"), gf.fit_multiscale(ground, "long")
+    svo, bands = gf.fit_svo(ground, "long", covariance="none"), gf.fit_multiscale(ground, "long")
+    noise, words = array_model(ground, rate)
+    equal = torch.full((N_SENSORS,), 1 / N_SENSORS, dtype=torch.float64)
     virtual = {
-        "plain mean": (ground.mean(-2), aloft.mean(-2)),
-        "SVO": (svo.virtual(ground), svo.virtual(aloft)),
-        "multi-scale": (bands.virtual(ground), bands.virtual(aloft)),
+        "plain mean": (equal, ground.mean(-2), aloft.mean(-2)),
+        "SVO": (svo.weights, svo.virtual(ground), svo.virtual(aloft)),
+        "multi-scale": (bands.weights, bands.virtual(ground), bands.virtual(aloft)),
     }
-    print(f"{n_flights} flights of {trajectory.duration:g} s at {rate:g} Hz; root mean square at the end of the outage")
-    print(f"{'virtual gyro':<14}{'filter tuned':<28}{'position (m)':>14}{'attitude (deg)':>16}{'claimed (m)':>13}")
+    print(
+        f"{n_flights} flights of {trajectory.duration:g} s at {rate:g} Hz; root mean square at the end of the outage,"
+    )
+    print("NEES: squared errors of position and attitude there in units of the claimed covariance, 1 where it is right")
+    print(
+        f"{'virtual gyro':<14}{'filter tuned':<32}{'position (m)':>14}{'claimed (m)':>13}{'attitude (deg)':>16}"
+        f"{'NEES':>7}{'':>7}"
+    )
     courses = {}
-    for name, (resting, flying) in virtual.items():
-        for tuning in tunings(resting[..., resting.isnan().sum() :], rate):
-            told = UnitErrors(tuning.model.scaled(DEGREE), gf.parse_model(ACCELEROMETER), rate)
+    for name, (weights, resting, flying) in virtual.items():
+        for tuning, model in (
+            ("by its recording", fitted(resting, rate)),
+            (words, gf.virtual_noise(weights, noise).model),
+        ):
+            told = UnitErrors(model.scaled(DEGREE), gf.parse_model(ACCELEROMETER), rate)
             own = torch.Generator().manual_seed(1)
-            drawn = errors_of(flying.nan_to_num(), accelerometer)
+            drawn = errors_of(flying, accelerometer)
             out = fly(trajectory, drawn, told, gnss=Gnss(outage=away), alignment=ALIGNMENT, generator=own)
             end = int((out.time - away[1]).abs().argmin())
             position, attitude = (v.square().sum(-1).mean(-1).sqrt() for v in (out.position, out.attitude))
             claimed = out.sd[end, :, 6:9].square().sum(-1).mean().sqrt()
-            courses[f"{name}, {tuning.words}"] = out.time, position
+            nees = out.nees[end].mean(0) / torch.tensor(out.sizes)
+            courses[f"{name}, {tuning}"] = out.time, position
             print(
-                f"{name:<14}{tuning.words:<28}{float(position[end]):>14.3g}{float(attitude[end]) / DEGREE:>16.3g}"
-                f"{float(claimed):>13.3g}",
+                f"{name:<14}{tuning:<32}{float(position[end]):>14.3g}{float(claimed):>13.3g}"
+                f"{float(attitude[end]) / DEGREE:>16.3g}{float(nees[2]):>7.2f}{float(nees[0]):>7.2f}",
                 flush=True,
             )
     if asked.figure:

@@ -66,6 +66,7 @@ from gyrofuse.svo import SVO, fit_svo
 from gyrofuse.svo_result import SVOResult
 from gyrofuse.svo_weights import SVOWeights, svo_weights
 from gyrofuse.virtual_file import write_virtual
+from gyrofuse.virtual_noise import virtual_noise
 
 if TYPE_CHECKING:
     from gyrofuse.metric import WaveletCrossCovariance
@@ -153,6 +154,7 @@ __all__ = [
     "svo_weights",
     "to_c_header",
     "to_kalibr",
+    "virtual_noise",
     "wavelet_cross_covariance",
     "wavelet_cross_covariance_interval",
     "wavelet_variance",

@@ -28,6 +28,7 @@ class VirtualGyro:
     sensors: tuple[str, ...]
     rate: float | None
     unit: str | None
+    _judged_in = "this recording"  # which recordings `virtual_wavelet_variance` is for, in words
 
     @property
     def n_levels(self) -> int:
@@ -73,8 +74,9 @@ class VirtualGyro:
     def _deviation_table(self) -> list[str]:
         """Lines on the Allan deviation of one array by level: the best sensor, the plain mean, the virtual gyro."""
         second = "s" if self.rate else "samples"
+        unit = self.unit or "signal"
         lines = [
-            f"Allan deviation ({self.unit or 'signal'}) at averaging time tau",
+            f"Allan deviation ({unit}) at averaging time tau, of the virtual gyro in {self._judged_in}",
             f"{'level':>5}  {f'tau ({second})':>13}  {'weight':>7}  {'best sensor':>12}  {'equal':>12}  {'virtual':>12}"
             f"  {'virtual/equal':>13}",
         ]

@@ -261,7 +261,7 @@ class MultiScaleResult:
         ]
         lines += [
             "",
-            f"Allan deviation ({unit}) at averaging time tau",
+            f"Allan deviation ({unit}) at averaging time tau, of the virtual gyro and one vector in other recordings",
             f"{'level':>5}  {f'tau ({second})':>13}  {'best sensor':>12}  {'equal':>12}  {'one vector':>12}"
             f"  {'virtual':>12}  {'virtual/equal':>13}",
         ]

@@ -118,6 +118,7 @@ class SVOResult(VirtualGyro):
     unit: str | None = None
     selection: Selection | None = None
     positive_definite: Tensor | None = None
+    _judged_in = "other recordings"
 
     @property
     def agreement(self) -> Tensor:

@@ -51,6 +51,7 @@ LAYERS = [
         "virtual_file",
         "multiscale",
         "multiscale_result",
+        "virtual_noise",
         "live",
         "parity",
         "parity_result",

@@ -23,7 +23,7 @@ def test_summary_is_reproducible_and_fixed_in_width():
     assert text == str(result) == fit_svo(array(), "short").summary()
     lines = text.splitlines()
     assert lines[0] == "Virtual gyro (SVO) of 4 sensors, 3000 samples"
-    start = lines.index("Allan deviation (signal) at averaging time tau") + 1
+    start = lines.index("Allan deviation (signal) at averaging time tau, of the virtual gyro in other recordings") + 1
     table, below = lines[start : start + 1 + result.n_levels], lines[start + 1 + result.n_levels :]
     assert [line.partition(":")[0] for line in below] == ["", "Equal weights", "Sensors", "Recording"]
     assert len({len(line) for line in table}) == 1
