@@ -224,5 +224,6 @@ def _by_draws(fusion: Fusion, wccv: Tensor, totals: Tensor, pilot: Pilot, n_cut:
         ratios.append((seen / met)[..., n_cut:])
     fitted, fixed = ratios  # (item, draw, level)
     inflation = fixed.mean(1) / fitted.mean(1)
-    left = fixed.log().var(1) / fitted.log().var(1)
+    scatter = [(ratio.log() - ratio.log().mean(1, keepdim=True)).square().sum(1) for ratio in (fixed, fitted)]
+    left = scatter[0] / scatter[1]
     return inflation.clamp(min=1), left.clamp(max=1)

@@ -273,7 +273,7 @@ def test_benefit_is_what_fusing_both_gives():
     ):
         fitted = gf.fit_svo(signal, "short")
         torch.testing.assert_close(weights, fitted.weights, rtol=1e-9, atol=1e-12)
-        torch.testing.assert_close(variance, fitted.virtual_wavelet_variance, rtol=1e-9, atol=0)
+        torch.testing.assert_close(variance, fitted.in_sample_wavelet_variance, rtol=1e-9, atol=0)
     assert gained.factor > 1
     assert gained.level_factor.argmax() == 2  # 7.3 Hz of 50 lies in the octave of level 2 or 3
     assert set(gained.to_dict()) == {"scale_weights", "before", "after", "level_factor", "factor"}

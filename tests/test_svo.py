@@ -142,9 +142,9 @@ def test_fit_goes_from_signal_to_weights(omega):
     assert naive.relative_error(result.wavelet_cross_covariance, wccv) < 1e-10
     np.testing.assert_allclose(result.weights, naive.svo_weights(wccv, shape), rtol=1e-9)
     np.testing.assert_allclose(result.virtual(signal), result.weights @ signal, rtol=1e-12)
-    # The virtual signal has the wavelet variance that was promised.
+    # The virtual signal has the wavelet variance that is told for this recording.
     np.testing.assert_allclose(
-        result.virtual_wavelet_variance,
+        result.in_sample_wavelet_variance,
         naive.wavelet_variance(result.virtual(signal)[None], 10)[:, 0],
         rtol=1e-9,
     )
