@@ -6,11 +6,13 @@ import math
 
 import pytest
 import torch
+from scipy import stats
 
 import gyrofuse as gf
 from gyrofuse.mismatch import diagnose
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.classifier import area_under_curve, distinguishability, features
+from gyrofuse.mismatch.confirm import discrepancy_left, discrepancy_p_value, mean_discrepancy
 from gyrofuse.mismatch.folds import N_FOLDS, estimation_samples, held_out_blocks, in_fold
 from gyrofuse.mismatch.mechanisms.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.quantization import Quantization
@@ -129,3 +131,31 @@ def test_a_remainder_is_estimated_anew_from_the_blocks_of_the_shortest_recording
         assert bool(again.log_gain.isfinite().all())
         assert float(again.log_gain.mean()) == pytest.approx(math.log(1.5), abs=0.2)
         assert bool(again.gains(given, fold).isfinite().all())
+
+
+def test_much_that_is_left_on_blocks_held_out_is_told():
+    """Of three sensors with a third more power at all levels; of noise alone nothing, in each of 20 arrays."""
+    rng = torch.Generator().manual_seed(4)
+    scene = Scene(1.0, "unknown", ("a", "b", "c"))
+    noise = torch.randn(21, 2, 3, 16384, dtype=torch.float64, generator=rng)
+    louder = Case.of(scene, 1.15 * noise[20, 0], noise[20, 1:])
+    told = discrepancy_left(louder, mean_discrepancy(louder))
+    assert told is not None
+    assert told.p_value < 1e-6
+    assert 1 in told.levels
+    for recording, simulation in noise[:20]:
+        alike = Case.of(scene, recording, simulation[None])
+        assert discrepancy_left(alike, mean_discrepancy(alike)) is None
+
+
+def test_the_discrepancy_left_has_a_p_value_that_errs_on_the_side_of_chance():
+    """Of 200 arrays of two sensors p is below 5 % in no more than the law of 5 % has in 999 of 1000 studies."""
+    rng = torch.Generator().manual_seed(5)
+    noise = torch.randn(200, 2, 2, 8192, dtype=torch.float64, generator=rng).cumsum(-1) * 0.01
+    noise = noise + torch.randn(noise.shape, dtype=torch.float64, generator=rng)
+    below = 0
+    for recording, simulation in noise:
+        case = Case.of(Scene(1.0, "unknown", ("a", "b")), recording, simulation[None])
+        p = discrepancy_p_value(case, mean_discrepancy(case))
+        below += p < 0.05
+    assert below <= stats.binom.ppf(0.999, 200, 0.05)

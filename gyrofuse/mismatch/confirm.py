@@ -8,11 +8,13 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import torch
+from scipy import stats
 from torch import Tensor
 
 from gyrofuse.covariance import wavelet_cross_covariance
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.classifier import distinguishability
+from gyrofuse.mismatch.evidence import Evidence
 from gyrofuse.mismatch.folds import N_FOLDS, N_JUDGED, held_out_blocks, in_fold
 from gyrofuse.mismatch.gaussian import Spectral
 from gyrofuse.mismatch.mechanism import Mechanism, Z
@@ -24,6 +26,7 @@ _FARTHER = 1.5  # times the discrepancy: 587 arrays with effects that were repai
 _BEYOND_DOUBT = 1e-6
 _FEWEST_SIMULATED = 8  # blocks of a simulation
 _SHORTEST = 8  # a block is so many times as long as its longest wavelet
+_EXPLAINED = 2.0  # discrepancy per degree of freedom, where noise alone gives 1, above which something is left
 
 
 class Gain(NamedTuple):
@@ -150,6 +153,43 @@ def leads_away(start: Case, case: Case, gain: Gain, generator: torch.Generator) 
     return after > _FARTHER * max(before, 1.0)
 
 
+def discrepancy_left(case: Case, after: float) -> Evidence | None:
+    """What wavelet cross-covariances say where much of their difference is left; None where it is not.
+
+    Args:
+        case: Recording and simulation after all repairs.
+        after: Discrepancy on the blocks held out.
+    """
+    if not after > _EXPLAINED:
+        return None
+    moments = _simulated_moments(case)
+    recorded = _block_moments(_cut(case.recording, _length(case)))
+    apart = (recorded.mean(0) - moments.mean(0)).square() / moments.var(0)
+    by_level = apart.view(_levels_of(_length(case)), -1).mean(-1)
+    levels = tuple(int(j) + 1 for j in (by_level > by_level.max() / 2).nonzero()[:, 0])
+    return Evidence(
+        "discrepancy",
+        discrepancy_p_value(case, after),
+        f"wavelet cross-covariances on blocks held out differ by {after:.2f} times what noise alone gives, most of all "
+        f"at {'level' if len(levels) == 1 else 'levels'} {', '.join(map(str, levels))}",
+        sensors=tuple(range(case.n_sensors)),
+        levels=levels,
+    )
+
+
+def discrepancy_p_value(case: Case, discrepancy: float) -> float:
+    """p value of a discrepancy that is one in the mean, from the law of F.
+
+    Degrees of freedom are those of correlated squares, `m^2 / tr R^2` with `R` the correlations of the `m` moments of
+    the simulation's blocks (Satterthwaite, Biometrics Bulletin 2, 1946). That mean is of four folds; it is taken for
+    that of one, which errs on the side of chance.
+    """
+    moments = _simulated_moments(case)
+    n_simulated, n_moments = moments.shape
+    together = torch.corrcoef(moments.mT).nan_to_num().square().sum()
+    return float(stats.f.sf(discrepancy, n_moments**2 / float(together), n_simulated - 1))
+
+
 def _noise(case: Case) -> Case:
     """Without the lines that the simulation has."""
     if not case.simulated.lines:
@@ -195,9 +235,14 @@ def _cut(signal: Tensor, length: int) -> Tensor:
     return signal[..., : signal.shape[-1] // length * length].unflatten(-1, (-1, length))
 
 
+def _levels_of(length: int) -> int:
+    """Wavelet levels of a block that long."""
+    return int(math.log2(length / _SHORTEST))
+
+
 def _block_moments(blocks: Tensor) -> Tensor:
     """Wavelet cross-covariances `(..., block, moment)` of blocks `(..., sensor, block, time)`."""
-    n_levels = int(math.log2(blocks.shape[-1] / _SHORTEST))
+    n_levels = _levels_of(blocks.shape[-1])
     wccv = wavelet_cross_covariance(blocks.movedim(-2, -3), n_levels)  # (..., block, level, sensor, sensor)
     pairs = torch.triu_indices(wccv.shape[-1], wccv.shape[-1])
     return wccv[..., pairs[0], pairs[1]].flatten(-2)

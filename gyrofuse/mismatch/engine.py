@@ -13,7 +13,7 @@ from torch import Tensor
 from gyrofuse._checks import check_n_samples
 from gyrofuse._model import Model
 from gyrofuse.mismatch.case import Case
-from gyrofuse.mismatch.confirm import held_out, held_out_gain, leads_away
+from gyrofuse.mismatch.confirm import discrepancy_left, held_out, held_out_gain, leads_away
 from gyrofuse.mismatch.counterfactual import Link, settled
 from gyrofuse.mismatch.evidence import calibrated, corrected, uncorrected
 from gyrofuse.mismatch.fit_verdict import KNOWN, FitVerdict, fit_verdict
@@ -164,6 +164,9 @@ def diagnose(
         after = testimony(case)
         told = {*_OF_SAMPLES, *(e.witness for e in left)}
         left += [e for e in after if corrected(e.p_value, len(evidence)) <= false_alarm and e.witness not in told]
+    judged_blocks = held_out(start, gains, generator)
+    if not left and (much := discrepancy_left(case, judged_blocks.after)):
+        left = [much]
     model = replace(model, effects=effects)
     verdict = None
     if judge is not None:
@@ -176,7 +179,7 @@ def diagnose(
         p_value=p_value,
         findings=findings,
         unexplained=tuple(left),
-        held_out=held_out(start, gains, generator),
+        held_out=judged_blocks,
         model=model,
         evidence=evidence,
         evidence_after=after,
