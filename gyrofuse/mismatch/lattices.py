@@ -8,7 +8,7 @@ likelihood ratio `exp(-k) I0(2 sqrt(k n |phi|^2))`; the mean of that over steps,
 may have the same converter, has expectation one without a lattice.
 
 Noise that is a mixture of normal laws of several widths reaches further, but its characteristic function falls all the
-way: at `u` it is not above what it is around `0.6 u`, where a lattice has nothing. With `b^2` the `n |phi|^2` there,
+way: at `u` it is not above the least that it is before, where a lattice has a trough. With `b^2` the `n |phi|^2` there,
 `(sqrt(n) |phi| - b)^2` is at most standard exponential, by the triangle inequality.
 """
 
@@ -39,10 +39,10 @@ _PER_STEP = 6  # histogram bins a step, at the finest
 _MOST_BINS = 2**21
 _SAME_STEP, _ALIKE = 1e-3, 0.04  # of steps that are exact, and hidden
 _SIMULATED = 0.005  # p value of a hidden lattice that the simulation has as well
-# Share of `u` where a lattice has neither noise nor its peak, which reach 3 and 1.5 of the 5.5 sd either side; and by
-# how many sd what is seen there exceeds chance.
-_TROUGH, _SEEN = (0.56, 0.7), 2.0
-_LOOKED_AT = 8  # places there: about as many are independent
+# Up to what share of `u` the least power before it is looked for, within what share it is averaged, and what counts as
+# power there: values so near each other are one, which chance alone makes larger in one of 150.
+_BEFORE, _AROUND, _SEEN = 0.8, 0.1, 5.0
+_FROM, _LOOKED_AT = 0.3, 26  # share of a single `u` from which on, and places at which, it is looked for
 _SIZES = (4.0, 8.0, 16.0, 32.0)  # of a hidden lattice that several sensors have
 
 
@@ -124,16 +124,23 @@ def _exact_lattice(unique: Tensor, counts: Tensor, sd: float) -> Lattice | None:
 def _hidden_lattice(unique: Tensor, sd: float) -> Lattice:
     """The most conspicuous step in the characteristic function; each value counts once, whatever repeats."""
     u, every = _characteristic([unique], sd)
-    (power,) = beyond_smooth(u, every)
     wanted = (u > _ENDS / sd) & (u < 2 * math.pi / (_FINEST_HIDDEN * sd))
-    best = int(torch.where(wanted, power, 0.0).argmax())
-    p_value = corrected(math.exp(-float(power[best])), int(wanted.sum()))
+    told, frequency = 0.0, float(u[wanted.nonzero()[0, 0]])
+    # The largest may be on a flank, of a peak that lies lower or of noise; the largest beyond noise is no noise.
+    for power in (every[0], beyond_smooth(every)[0]):
+        best = int(torch.where(wanted, power, 0.0).argmax())
+        if corrected(math.exp(-float(power[best])), int(wanted.sum())) > _DOUBTFUL:
+            continue
+        peak = _peak([unique], _climbed(u, every[0], best, _LOWEST / sd), float(u[1]))
+        beyond = max(_told_at(unique, peak), float(beyond_smooth(every)[0, best]))
+        if beyond > told:
+            told, frequency = beyond, peak
+    p_value = corrected(math.exp(-told), int(wanted.sum()))
     if p_value > _DOUBTFUL:
-        return Lattice(2 * math.pi / float(u[best]), 0.0, 1.0, p_value, float(u[best]))
-    frequency = _peak([unique], _climbed(u, power, best, _LOWEST / sd), float(u[1]))
+        return Lattice(2 * math.pi / frequency, 0.0, 1.0, p_value, frequency)
     for part in (4, 3, 2):  # a harmonic may have come out largest
         lower = _told_at(unique, frequency / part)
-        if frequency / part > _LOWEST / sd and lower > max(0.3 * float(power[best]), 10.0):
+        if frequency / part > _LOWEST / sd and lower > max(0.3 * told, 10.0):
             frequency /= part
             break
     return _seen_at(unique, frequency, _step_at(unique, frequency))._replace(p_value=p_value)
@@ -158,17 +165,19 @@ def _characteristic(rows: list[Tensor], sd: float) -> tuple[Tensor, Tensor]:
     return 2 * math.pi * torch.arange(power.shape[-1], dtype=torch.float64) / (n_bins * bin_width), power
 
 
-def beyond_smooth(u: Tensor, power: Tensor) -> Tensor:
+def beyond_smooth(power: Tensor) -> Tensor:
     """`n |phi(u)|^2` `(row, u)` at even steps from 0 beyond that of noise, which falls from one `u` to the next."""
-    low, high = ((part * torch.arange(len(u))).long() for part in _TROUGH)
-    high = torch.maximum(high, low + 1)
+    places = torch.arange(power.shape[-1])
+    low, high = ((share * places).long() for share in (1 - _AROUND, 1 + _AROUND))
+    high = high.clamp(max=len(places) - 1) + 1
     total = torch.nn.functional.pad(power.cumsum(-1), (1, 0))
-    return _beyond(power, (total[:, high] - total[:, low]) / (high - low), high - low)
+    least = ((total[:, high] - total[:, low]) / (high - low)).cummin(-1).values
+    return _beyond(power, least[:, (_BEFORE * places).long()])
 
 
-def _beyond(power: Tensor, trough: Tensor, count: Tensor | int) -> Tensor:
-    """Of a power what the mean of so many at the trough does not explain."""
-    noise = (trough - 1 - _SEEN / torch.as_tensor(count, dtype=power.dtype).sqrt()).clamp(min=0)
+def _beyond(power: Tensor, least: Tensor) -> Tensor:
+    """Of a power what the least power before it does not explain."""
+    noise = torch.where(least > _SEEN, least - 1, 0.0)
     return (power.sqrt() - noise.sqrt()).clamp(min=0).square()
 
 
@@ -207,7 +216,7 @@ def shared_lattice(side: Side) -> SharedLattice:
     finest = float(sd.min())
     u, power = _characteristic(rows, finest)
     last = int(torch.searchsorted(u, 2 * math.pi / (_FINEST_HIDDEN * finest)))
-    u, power = u[:last], beyond_smooth(u[:last], power[:, :last])
+    u, power = u[:last], beyond_smooth(power[:, :last])
     usable = u > _ENDS / sd[:, None]
     ratios = torch.full_like(u, -math.inf)
     for size in _SIZES:
@@ -244,9 +253,9 @@ def _power(values: Tensor, u: Tensor) -> Tensor:
 
 def _told_at(values: Tensor, u: float) -> float:
     """`n |phi(u)|^2` beyond that of noise, which falls from one `u` to the next."""
-    places = u * torch.linspace(*_TROUGH, _LOOKED_AT, dtype=torch.float64)
+    places = u * torch.linspace(_FROM, _BEFORE, _LOOKED_AT, dtype=torch.float64)
     power = _power(values - values.mean(), torch.cat([torch.tensor([u], dtype=torch.float64), places]))
-    return float(_beyond(power[0], power[1:].mean(), _LOOKED_AT))
+    return float(_beyond(power[0], power[1:].unfold(0, 5, 1).mean(-1).min()))
 
 
 def _peak(rows: list[Tensor], u: float, spacing: float) -> float:
