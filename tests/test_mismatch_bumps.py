@@ -15,10 +15,10 @@ from gyrofuse.mismatch.bump_scan import log_ratios
 from gyrofuse.mismatch.bumps import Stretch, strongest_bump
 from gyrofuse.mismatch.colour import noise
 from gyrofuse.mismatch.hump_scan import _scores, scanned_humps
+from gyrofuse.mismatch.likelihoods.spectral import fit, linearised
 from gyrofuse.mismatch.lines import whitened
 from gyrofuse.mismatch.mechanisms.resonance import Resonance
 from gyrofuse.mismatch.oscillating import Mode, _seen, excess_along
-from gyrofuse.mismatch.shape_fit import fit, linearised
 from gyrofuse.mismatch.shape_terms import CommonBump, oscillation
 from gyrofuse.mismatch.shapes import compared
 from gyrofuse.mismatch.steadiness import steadiness

@@ -12,15 +12,15 @@ from torch import Tensor
 
 from gyrofuse.mismatch.bumps import Stretch, band_of, strongest_bump
 from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.likelihoods.spectral import Fit, Ratios, exact, fit
 from gyrofuse.mismatch.remembered import remembered
-from gyrofuse.mismatch.shape_choice import cost_of
-from gyrofuse.mismatch.shape_fit import Fit, Ratios, fit
 from gyrofuse.mismatch.shape_ground import Ground
 from gyrofuse.mismatch.shape_law import smooth_coherence
 from gyrofuse.mismatch.shape_scan import scanned
 from gyrofuse.mismatch.shape_terms import Bump, CommonBump, Term
 from gyrofuse.mismatch.side import Side
 from gyrofuse.mismatch.spectra import Bands, degrees_of_freedom
+from gyrofuse.mismatch.spectral_choice import cost_of
 
 _CUT_OFF = 0.6  # of the simulation's power
 _CELLS, _CELL = 24, 5  # on either side, and fewest bins of one
@@ -133,8 +133,8 @@ def _in_cells(case: Case, stretch: Stretch) -> Oscillation | None:
     coherence = smooth_coherence(case.simulated.coherence, case.simulated.dof)
     band = int(band_of(torch.tensor(float(centre)), n, case))
     expected = coherence[band].expand(2 * count, -1, -1)
-    sides = Side(case.recorded.noise, local).spectra, ground.mean.mT, dof, torch.full_like(dof, 1e12)
-    data = Ratios.of(ground, sides, expected, torch.ones_like(dof))
+    recorded, simulated = (Side(case.recorded.noise, local).spectra, dof), (ground.mean.mT, exact(dof))
+    data = Ratios.of(ground, recorded, simulated, expected, torch.ones_like(ground.mean.mT))
     background = fit(data, [Background.start(case.n_sensors)])
     return _best(case, stretch, data, background)
 
@@ -148,7 +148,7 @@ def _best(case: Case, stretch: Stretch, data: Ratios, background: Fit) -> Oscill
     level = ground.mean[:, middle] * height.clamp(min=1e-3)
 
     def value(found: Fit) -> float:
-        return found.gain - sum(cost_of(data, t) for t in found.terms)
+        return found.gain - cost_of(found)
 
     tried: list[Fit] = []
     for company, share in itertools.product(([], background.terms), (0.25, 0.6)):

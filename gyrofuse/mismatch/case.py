@@ -68,6 +68,8 @@ class Case:
         analog: The simulation's samples `(record, sensor, time)` before the converter; where they came rounded, as
             they may have been.
         converter: What it does to them, with the place of each in the chain.
+        bent: Complex gains `(sensor, frequency)` of filters that were built in though their form is another one: what
+            is left where they act is a matter of their form.
     """
 
     scene: Scene
@@ -75,6 +77,7 @@ class Case:
     simulated: Side
     analog: Tensor
     converter: tuple[tuple[int, Callable[[Tensor], Tensor]], ...] = ()
+    bent: tuple[Callable[[Tensor], Tensor], ...] = ()
 
     @classmethod
     def of(cls, scene: Scene, recording: Tensor, simulation: Tensor) -> Case:

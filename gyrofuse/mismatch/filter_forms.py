@@ -1,64 +1,170 @@
-"""Low-pass filters of first and second order, digital and analog ones as sampling leaves them."""
+"""Low-pass filters by their form and one number: digital ones, analogue ones as sampling leaves them, averages.
+
+A form is an analogue prototype `H(u)` that halves the power at `u = 1`, of a warped frequency `u = g(f) / g(f_c)`:
+`g = tan(pi f)` of the bilinear transform, or `g = 2 f` of an analogue filter in front of the converter. A Gaussian
+window cuts a FIR filter's ideal step off smoothly. Beside those stand one and two poles `(1 - q) / (1 - q / z)`, and
+the mean over `a` samples.
+"""
 
 from __future__ import annotations
 
+import functools
 import math
+from typing import NamedTuple
 
 import torch
+from scipy import signal
 from torch import Tensor
 
-FILTERS = ("pole", "poles", "bilinear", "sampled", "bilinear2", "sampled2")
+
+class _Form(NamedTuple):
+    """A prototype under a warp.
+
+    Attributes:
+        warp: "tan" or "straight".
+        prototype: "butterworth", "bessel" or "window".
+        order: Of the first two.
+        width: Of a window's step, standard deviation over its middle.
+        power: Of `g(f_c)^-2` that `strength` is.
+    """
+
+    warp: str
+    prototype: str
+    order: int = 1
+    width: float = 0.0
+    power: int = 1
+
+
+_FORMS = {
+    "bilinear": _Form("tan", "butterworth"),
+    "sampled": _Form("straight", "butterworth"),
+    "bilinear2": _Form("tan", "butterworth", 2, power=2),
+    "sampled2": _Form("straight", "butterworth", 2, power=2),
+    **{f"bilinear{n}": _Form("tan", "butterworth", n) for n in (3, 4)},
+    **{f"bessel{n}": _Form("tan", "bessel", n) for n in (2, 3, 4)},
+    # Widths a factor of 1.6 apart: Hamming windows of 11 to 61 taps at a cutoff of a fifth of the rate.
+    **{f"window{k}": _Form("straight", "window", width=0.08 * 1.6**k) for k in range(4)},
+}
 _POLES = {"pole": 1.0, "poles": math.sqrt(2) - 1}
-ORDERS = {"pole": 1, "poles": 2, "bilinear": 1, "sampled": 1, "bilinear2": 2, "sampled2": 2}
+FILTERS = ("pole", "poles", "average", *_FORMS)
+_HALVINGS = 60  # of an interval: double precision
+_LONGEST = 0.9999  # pole: of a time constant of 10^4 samples
 
 
 def filter_strength(kind: str, corner: Tensor) -> Tensor:
     """Number of a filter whose power is halved at `corner` cycles per sample: 0 is none."""
-    if kind in _POLES:  # 2 q (1 - cos) = x (1 - q)^2 at the corner, where one pole lets 1 / (1 + x) pass
-        b = 1 + (1 - torch.cos(2 * math.pi * corner)) / _POLES[kind]
-        return b - (b.square() - 1).sqrt()
-    if kind == "bilinear":
-        return 1 / torch.tan(math.pi * corner).square()
-    if kind == "sampled":
-        return 1 / (2 * corner).square()
-    if kind == "bilinear2":
-        return 1 / torch.tan(math.pi * corner).pow(4)
-    return 1 / (2 * corner).pow(4)
+    if kind in _POLES:
+        return strength_of(kind, torch.sin(math.pi * corner).log())
+    if kind == "average":  # a longer mean passes less, until its first zero
+        low, high = torch.ones_like(corner), 1 / corner
+        for _ in range(_HALVINGS):
+            middle = (low + high) / 2
+            more = filter_power(kind, middle.square() - 1, corner[..., None])[..., 0] > 0.5
+            low, high = torch.where(more, middle, low), torch.where(more, high, middle)
+        return low.square() - 1
+    return strength_of(kind, _warped(kind, corner).log())
 
 
 def filter_corner(kind: str, strength: Tensor) -> Tensor:
     """Cycles per sample at which a filter halves the power; infinite where it never does."""
-    q = strength.clamp(min=1e-300)
+    if kind in _FORMS:
+        form = _FORMS[kind]
+        g = strength.clamp(min=1e-300).pow(-1 / (2 * form.power))
+        return torch.atan(g) / math.pi if form.warp == "tan" else g / 2
     if kind in _POLES:
-        cosine = 1 - _POLES[kind] * (1 - q).square() / (2 * q)
-        return torch.where(cosine >= -1, cosine.clamp(-1, 1).acos() / (2 * math.pi), math.inf)
-    order = 1 / 2 if kind in ("bilinear", "sampled") else 1 / 4
-    if kind.startswith("bilinear"):
-        return torch.atan(q.pow(-order)) / math.pi
-    return q.pow(-order) / 2
+        g = filter_number(kind, strength).exp()
+        return torch.where(g <= 1, g.clamp(max=1).asin() / math.pi, math.inf)
+    a = (1 + strength).sqrt()
+    low, high = torch.zeros_like(a), (1 / a).clamp(max=0.5)
+    falls = filter_power(kind, strength, high[..., None])[..., 0] < 0.5
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        more = filter_power(kind, strength, middle[..., None])[..., 0] > 0.5
+        low, high = torch.where(more, middle, low), torch.where(more, high, middle)
+    return torch.where(falls, low, math.inf)
+
+
+def filter_number(kind: str, strength: Tensor) -> Tensor:
+    """`log g(f_c)`, of which spectra tell about as much wherever the corner lies; of no filter it is large."""
+    q = strength.clamp(min=1e-300)
+    if kind in _POLES:  # power 1 / (1 + x sin^2), once or twice
+        return -(4 * q / (1 - q).square() / _POLES[kind]).log() / 2
+    if kind == "average":  # power 1 - (a^2 - 1) (pi f)^2 / 3 at first
+        return -(q / 3).log() / 2
+    return -q.log() / (2 * _FORMS[kind].power)
+
+
+def strength_of(kind: str, number: Tensor) -> Tensor:
+    """Strength of a filter whose `log g(f_c)` is `number`."""
+    if kind in _POLES:
+        b = 1 + 2 * torch.exp(2 * number) / _POLES[kind]
+        return b - (b.square() - 1).sqrt()
+    if kind == "average":
+        return 3 * torch.exp(-2 * number)
+    return torch.exp(-2 * _FORMS[kind].power * number)
 
 
 def filter_power(kind: str, strength: Tensor, f: Tensor) -> Tensor:
     """Squared response `(..., frequency)` of filters of `strength` `(...,)`."""
-    q = strength[..., None]
     if kind in _POLES:
-        q = q.clamp(max=0.9999)
+        q = strength[..., None].clamp(max=_LONGEST)
         power = (1 - q).square() / ((1 - q).square() + 4 * q * torch.sin(math.pi * f).square())
         return power if kind == "pole" else power.square()
-    at = torch.tan(math.pi * f.clamp(max=0.49999999)) if kind.startswith("bilinear") else 2 * f
-    return 1 / (1 + q * at.square()) if ORDERS[kind] == 1 else 1 / (1 + q * at.pow(4))
+    if kind in _FORMS and _FORMS[kind].prototype == "butterworth":
+        return 1 / (1 + _prototype_frequency(kind, strength, f).pow(2 * _FORMS[kind].order))
+    return filter_response(kind, strength, f).abs().square()
 
 
 def filter_response(kind: str, strength: Tensor, f: Tensor) -> Tensor:
-    """Complex response `(..., frequency)`, causal."""
-    q = strength[..., None]
-    turn = 2 * math.pi * f
+    """Complex response `(..., frequency)`; causal but for a window's, which is told without its delay."""
     if kind in _POLES:
-        q = q.clamp(max=0.9999)
+        q = strength[..., None].clamp(max=_LONGEST)
+        turn = 2 * math.pi * f
         response = (1 - q) / (1 - q * torch.polar(torch.ones_like(turn), -turn))
         return response if kind == "pole" else response.square()
-    at = torch.tan(math.pi * f.clamp(max=0.49999999)) if kind.startswith("bilinear") else 2 * f
-    if ORDERS[kind] == 1:
-        return 1 / (1 + 1j * q.sqrt() * at)
-    s = q.pow(0.25) * at
-    return 1 / torch.complex(1 - s.square(), math.sqrt(2) * s)
+    if kind == "average":
+        a = (1 + strength[..., None]).sqrt()
+        x = math.pi * f.clamp(min=1e-12)
+        return torch.polar(torch.ones_like(a * x), -(a - 1) * x) * (torch.sin(a * x) / (a * torch.sin(x)))
+    form, u = _FORMS[kind], _prototype_frequency(kind, strength, f)
+    if form.prototype == "window":
+        middle, whole = _window(form.width)
+        x = u / middle  # over the middle of the step
+        ends = torch.special.ndtr((1 - x) / form.width) - torch.special.ndtr((-1 - x) / form.width)
+        return torch.complex(ends / whole, torch.zeros_like(ends))
+    response = torch.ones_like(u, dtype=torch.complex128)
+    for pole in _poles(form.prototype, form.order):
+        response = response * (-pole) / (1j * u - pole)
+    return response
+
+
+def _warped(kind: str, f: Tensor) -> Tensor:
+    return torch.tan(math.pi * f.clamp(max=0.49999999)) if _FORMS[kind].warp == "tan" else 2 * f
+
+
+def _prototype_frequency(kind: str, strength: Tensor, f: Tensor) -> Tensor:
+    """`u`, `(..., frequency)`."""
+    return _warped(kind, f) * strength[..., None].clamp(min=0).pow(1 / (2 * _FORMS[kind].power))
+
+
+@functools.lru_cache(maxsize=16)
+def _poles(prototype: str, order: int) -> tuple[complex, ...]:
+    """Of a prototype that halves the power at one."""
+    if prototype == "bessel":
+        return tuple(complex(p) for p in signal.bessel(order, 1.0, analog=True, output="zpk", norm="mag")[1])
+    return tuple(complex(p) for p in signal.butter(order, 1.0, analog=True, output="zpk")[1])
+
+
+@functools.lru_cache(maxsize=16)
+def _window(width: float) -> tuple[float, float]:
+    """Middle of the step of a filter that halves the power at one, and its response at 0 before it is made one."""
+    whole = math.erf(1 / width / math.sqrt(2))
+
+    def response(x: float) -> float:
+        return (math.erf((1 - x) / width / math.sqrt(2)) + math.erf((1 + x) / width / math.sqrt(2))) / 2 / whole
+
+    low, high = 0.0, 1.0 + width
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if response(middle) > math.sqrt(0.5) else (low, middle)
+    return 1 / low, whole

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.colour import filtered
+from gyrofuse.mismatch.likelihoods.spectral import FLOOR
 from gyrofuse.mismatch.mechanism import Mechanism
 from gyrofuse.mismatch.shape_bands import slow_gains
 
@@ -21,16 +22,18 @@ class Spectral(Mechanism):
     Attributes:
         company: Shapes in whose company its numbers were found, and are estimated anew: by itself it would have to
             stand for them as well. No part of what is saved.
+        approximate: Whether its form is not quite that of the recording. No part of what is saved.
     """
 
     company: tuple[Any, ...] = field(default=(), kw_only=True, metadata={"saved": False})
+    approximate: bool = field(default=False, kw_only=True, metadata={"saved": False})
 
     def gains(self, case: Case, fold: int) -> Tensor:
         return super().gains(case, fold) + slow_gains(case, self.spectra, fold)
 
 
 class Filter(Spectral):
-    """A linear filter of each sensor."""
+    """A linear filter of each sensor; recordings have a floor below it, of what leaks and of what is rounded."""
 
     def response(self, f: Tensor) -> Tensor:
         """Complex gains `(sensor, frequency)` at `f` cycles per sample."""
@@ -39,9 +42,13 @@ class Filter(Spectral):
     def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
         return filtered(signal, self.response)
 
+    def built_into(self, case: Case, generator: torch.Generator) -> Case:
+        built = super().built_into(case, generator)
+        return replace(built, bent=(*built.bent, self.response)) if self.approximate else built
+
     def spectra(self, matrices: Tensor, f: Tensor) -> Tensor:
         gain = self.response(f).mT.to(matrices.dtype)  # (frequency, sensor)
-        return matrices * gain[:, :, None] * gain[:, None, :].conj()
+        return matrices * (gain[:, :, None] * gain[:, None, :].conj() + FLOOR * torch.eye(gain.shape[-1]))
 
 
 class Addition(Spectral):

@@ -13,13 +13,14 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 import torch
 
 from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.likelihoods.spectral import Fit, fit
 from gyrofuse.mismatch.mechanism import Finding, Mechanism
 from gyrofuse.mismatch.mechanisms import STAGES
 from gyrofuse.mismatch.mechanisms._channel_gain import ChannelGain
 from gyrofuse.mismatch.mechanisms.common_mode import CommonMode
 from gyrofuse.mismatch.mechanisms.drifting_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.flicker import FlickerNoise
-from gyrofuse.mismatch.mechanisms.low_pass import LowPassFilter
+from gyrofuse.mismatch.mechanisms.low_pass import LowPassFilter, strengths
 from gyrofuse.mismatch.mechanisms.parameter_shift import ParameterShift
 from gyrofuse.mismatch.mechanisms.resonance import Resonance
 from gyrofuse.mismatch.mechanisms.step import Step
@@ -27,18 +28,17 @@ from gyrofuse.mismatch.mechanisms.temperature_drift import TemperatureDrift
 from gyrofuse.mismatch.mechanisms.vibration_tone import VibrationTone, line_near
 from gyrofuse.mismatch.mechanisms.warm_up_transient import WarmUpTransient
 from gyrofuse.mismatch.oscillating import Mode
-from gyrofuse.mismatch.shape_fit import Fit, data_model, fit, log_score
 from gyrofuse.mismatch.shape_terms import Common, Flicker, LowPass, Shift, Term
 from gyrofuse.mismatch.shapes import compared
 from gyrofuse.mismatch.slow_effect import SlowEffect, only
 from gyrofuse.mismatch.slow_scans import slow_look, steps_one_by_one
+from gyrofuse.mismatch.spectral_choice import best_start, filter_starts
 
 _ANY = 1.0  # p value: look-alikes need not be surprising
 _NARROWEST = 1.5  # bins: half width of a bump in the place of a line
 _REACH = 2.0  # half widths in which a line is looked for in the place of a bump
 _ROUNDS = 8
 _NUMBER = 2.0  # nats for each number of a sensor
-_FILTERS = ("pole", "poles")
 _RED = (ParameterShift, FlickerNoise, CommonMode)
 _MAY_BE, _AS_MUCH = 0.1, 5.0  # p value, and nats below
 _MOST_STEPS = 12
@@ -140,19 +140,14 @@ def _slow(case: Case, finding: Finding) -> Iterator[Mechanism]:
 def _shapes(case: Case, finding: Finding) -> list[Mechanism]:
     """The shape of the same sensors' spectra that gains most, less what its numbers cost."""
     data = compared(case)
-    if not float(data.worth.sum()):
+    if not data.n_ordinates:
         return []
     ground, nothing = data.ground, torch.zeros(0, dtype=torch.float64)
     own = torch.zeros(case.n_sensors, dtype=torch.bool)
     own[list(finding.sensors)] = True
-
-    def score(term: Term) -> float:
-        return float(log_score(data, data_model(data, [term])).sum())
-
-    terms: list[Term] = [Flicker.start(ground)]
+    terms: list[Term] = [best_start(data, [], Flicker.starts(ground))[0], filter_starts(data, [])[0]]
     if bool(ground.matters.any()):
-        terms.append(Shift.start(ground))
-    terms.append(max((s for kind in _FILTERS for s in LowPass.starts(ground, kind)), key=score))
+        terms.append(best_start(data, [], Shift.starts(ground)[0])[0])
     if case.n_sensors > 1:
         terms.append(Common.starts(ground, data.observed - data.expected, data.worth, "white", nothing)[0])
     tried: list[Fit] = []
@@ -163,7 +158,7 @@ def _shapes(case: Case, finding: Finding) -> list[Mechanism]:
         if not bool(free.any()):
             continue
         tried.append(fit(data, [term.only(free)], _ROUNDS))
-    best = max(tried, key=lambda f: f.gain - _NUMBER * f.n_free, default=None)
+    best = max(tried, key=lambda f: f.gain - _NUMBER * len(f.information), default=None)
     return [] if best is None else [_of_term(case, best.terms[0])]
 
 
@@ -173,7 +168,7 @@ def _of_term(case: Case, term: Term) -> Mechanism:
     if isinstance(term, Flicker):
         return FlickerNoise(term.local[0])
     if isinstance(term, LowPass):
-        return LowPassFilter(term.kind, term.local[0])
+        return LowPassFilter(term.kind, strengths(term))
     assert isinstance(term, Common)
     return CommonMode(term.kind, 0.0, torch.complex(*term.local), case.base, term.inside)
 

@@ -204,26 +204,6 @@ def _simulated_dof(side: Side, groups: Groups) -> Tensor:
     return _dof(groups) * side.n_records * (side.signal.shape[-1] == side.bands.n_samples)
 
 
-class _Blocks(dict[int, Side]):
-    """A side's records cut into blocks, by their length: the same for all folds."""
-
-    def __init__(self, side: Side) -> None:
-        super().__init__()
-        self.signal, self.told_by, self.uncertainty = side.noise, side.told_by, side.uncertainty
-
-    def __missing__(self, block: int) -> Side:
-        n = self.signal.shape[-1] // block * block
-        cut = self.signal[..., :n].unflatten(-1, (-1, block)).movedim(-2, -3).flatten(0, 1)
-        self[block] = Side(cut, bands(block), told_by=self.told_by, uncertainty=self.uncertainty)
-        return self[block]
-
-
-@remembered
-def in_blocks(side: Side) -> _Blocks:
-    """Sides by the length of the blocks that they are cut into."""
-    return _Blocks(side)
-
-
 @functools.lru_cache(maxsize=8)
 def narrow_bands(n_samples: int, per_octave: int = _PER_OCTAVE, least: int = _WIDTH) -> Bands:
     """A 24th of an octave wide, and no narrower than tapers are, of the shorter records if there are any."""

@@ -1,44 +1,14 @@
-"""What chance does to spectra that are compared: the law of F as a likelihood, coherences of independent sensors."""
+"""What chance does to coherences of independent sensors."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
 
-import numpy as np
 import torch
-from scipy import special, stats
 from torch import Tensor
 
 _ORDINATES = 40  # for each sensor, behind a coherence
-_QUANTILES = 200
-_NEAR_ONE = 1e-8  # nats an ordinate
-
-
-def equivalent(ratio: Tensor, d: Tensor, s: Tensor) -> Tensor:
-    """Power whose gain under Whittle's likelihood of `w` ordinates is that of an F-distributed ratio.
-
-    Both against one: `w (q - 1 - log q) = (d + s) log((s + d r) / (s + d)) - d log r`.
-    """
-    d, s = torch.broadcast_tensors(d, s.clamp(min=1e-6))
-    gain = (d + s) * torch.log1p(d * (ratio - 1) / (s + d)) - d * ratio.clamp(min=1e-300).log()
-    h = (gain * (d + s) / (d * s)).clamp(min=0.0)
-    argument = -torch.exp(-1 - h.clamp(max=700.0)).numpy()
-    low, high = (torch.from_numpy(-special.lambertw(argument, k).real) for k in (0, -1))
-    q = torch.where(ratio < 1, low, high)
-    # At its branch point Lambert's function is lost to rounding: there `q - 1 - log q = h` has a series.
-    root = torch.where(ratio < 1, -1.0, 1.0) * (2 * h).sqrt()
-    q = torch.where(h < _NEAR_ONE, 1 + root + root.square() / 3, q)
-    return torch.where(h > 700, 1 + h + (1 + h).log(), q).clamp(min=1e-12)
-
-
-def equivalent_moments(d: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean of the equivalent of F-distributed ratios, and its square over their variance, `(band,)`."""
-    middle = (np.arange(_QUANTILES) + 0.5) / _QUANTILES
-    s = s.clamp(min=1.0)
-    ratio = stats.f.ppf(middle, 2 * d.numpy()[:, None], 2 * s.clamp(max=1e7).numpy()[:, None])
-    q = equivalent(torch.from_numpy(ratio), d[:, None], s[:, None])
-    return q.mean(-1), q.mean(-1).square() / q.var(-1)
 
 
 def smooth_coherence(coherence: Tensor, dof: Tensor) -> Tensor:

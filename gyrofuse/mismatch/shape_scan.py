@@ -17,7 +17,7 @@ parameters' tangent space, for components that the model lacks; and the paramete
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple, cast
 
 import torch
@@ -29,8 +29,7 @@ from gyrofuse.mismatch.filter_forms import filter_power, filter_strength
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.shape_bands import Narrow, deep_base, narrow, slow
 from gyrofuse.mismatch.shape_errors import Errors, estimation_errors, parameters_p_value
-from gyrofuse.mismatch.shape_fit import Ratios
-from gyrofuse.mismatch.shape_terms import Bump, oscillation
+from gyrofuse.mismatch.shape_terms import oscillation
 from gyrofuse.mismatch.spectral_uncertainty import SpectralUncertainty
 from gyrofuse.mismatch.witnesses import level_of
 from gyrofuse.processes import AR1
@@ -192,32 +191,6 @@ def _scan(case: Case, looked_for: Shapes, errors: Errors | None = None, *, outsi
     place = shape % n_shapes - (n_shapes - len(bumps))  # bumps come last
     mean = float(log_ratios.flatten().logsumexp(0)) - math.log(len(SHARES))
     return Scan(mean, sensors, weight, rises, bumps[place] if place >= 0 else None)
-
-
-def bump_start(data: Ratios, model: Tensor, starts: Iterable[tuple[float, float]], has: Tensor) -> Bump | None:
-    """The bump that what a model leaves is most like; None where nothing is left.
-
-    Args:
-        data: What is to be explained.
-        model: `M` without it.
-        starts: Centres and half widths, cycles per sample.
-        has: Which sensors may have it, `(sensor,)`.
-    """
-    ground = data.ground
-    fitted, seen = (m.diagonal(dim1=-2, dim2=-1).real for m in (model, data.observed))  # (band, sensor)
-    left, worth = seen / fitted - 1, data.worth[:, None]
-    best, top = 0.0, None
-    for centre, width in starts:
-        profile = ground.bands.mean_of(
-            oscillation(ground.places, *torch.tensor([centre, width], dtype=torch.float64).unbind())
-        )
-        template = profile[:, None] / ground.mean.mT / fitted
-        size = (worth * template.square()).sum(0)
-        amount = (worth * left * template).sum(0).clamp(min=0) / size * has  # (sensor,)
-        gain = float((amount.square() * size).sum())
-        if gain > best:
-            best, top = gain, Bump.start(centre, width, amount)
-    return top
 
 
 def independent(z: Tensor, templates: Tensor, data: Narrow, errors: Errors | None = None) -> Tensor:

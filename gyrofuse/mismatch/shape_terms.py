@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import ClassVar, TypeVar
 
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.filter_forms import FILTERS, filter_corner, filter_power, filter_strength
+from gyrofuse.mismatch.filter_forms import filter_power, strength_of
 from gyrofuse.mismatch.shape_ground import Ground
 from gyrofuse.processes import AR1
 
 _T = TypeVar("_T", bound="Term")
-_HIGHEST = 3.0  # corner of an analog filter to start from, cycles per sample
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,9 +26,13 @@ class Term:
     """
 
     name: ClassVar[str]
-    prior_sd: ClassVar[tuple[float, ...]] = ()  # of local numbers around zero
-    prior_sd_above: ClassVar[tuple[float, ...]] = ()  # the same of those that are positive, where it is another
+    prior_scale: ClassVar[tuple[float, ...]] = ()  # of local numbers around zero, heavy tails: `spectral.prior_cost`
+    # Standard deviations of local and shared numbers before any data, which evidence counts: of logarithms, where a
+    # local number is a size. A factor of 4.5, or of 7, either way.
+    local_sd: ClassVar[float] = 1.5
+    shared_sd: ClassVar[float] = 2.0
     lower: ClassVar[float] = -math.inf
+    upper: ClassVar[float] = math.inf
     acts: ClassVar[str] = "add"  # or "scale" the noise, or "filter" everything
 
     local: Tensor
@@ -46,13 +47,21 @@ class Term:
         """How far shared numbers may go at once."""
         return torch.full_like(self.shared, 0.7)
 
+    def local_reach(self) -> Tensor:
+        """How far local numbers may go at once."""
+        return torch.full_like(self.local, math.inf)
+
+    def unit(self) -> Tensor:
+        """Local numbers per unit in which `local_sd` is told: of a size, itself."""
+        return self.local.abs() if self.acts == "add" else torch.ones_like(self.local)
+
     def only(self: _T, free: Tensor) -> _T:
         """With those local numbers free `(number, sensor)`, the others 0."""
         return replace(self, free=free, local=torch.where(free, self.local, 0.0))
 
     def within(self) -> Term:
         """With numbers that are allowed."""
-        return replace(self, local=self.local.clamp(min=self.lower))
+        return replace(self, local=self.local.clamp(min=self.lower, max=self.upper))
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,9 +74,10 @@ class Shift(Term):
 
     name: ClassVar[str] = "parameter_shift"
     acts: ClassVar[str] = "scale"
-    # Levels that fall are lost below the rest; how far they rise is seen, from next to none included.
-    prior_sd: ClassVar[tuple[float, ...]] = (3.0, 3.0, 1.5, 3.0)
-    prior_sd_above: ClassVar[tuple[float, ...]] = (math.inf, math.inf, 1.5, math.inf)
+    # A level that changes by much more than this is rare, but not by how much.
+    prior_scale: ClassVar[tuple[float, ...]] = (1.5, 1.5, 1.5, 1.5)
+    lower: ClassVar[float] = -30.0  # nothing is left, in double precision
+    upper: ClassVar[float] = 30.0
 
     new: Tensor | None = None
 
@@ -85,18 +95,14 @@ class Shift(Term):
 
     @classmethod
     def starts(cls, ground: Ground) -> list[Shift]:
-        """All numbers free, and those of single parts."""
+        """All numbers free, and those of single parts, each with many values, `local` is `(start, 4, sensor)`."""
         every = cls.start(ground)
-        single = [every.only(every.free & rows[:, None]) for rows in _SINGLE]
-        return [every, *(s for s in single if bool(s.free.any()))]
-
-    @classmethod
-    def moved(cls, ground: Ground) -> Iterator[Shift]:
-        """AR1s far from what they were, where no slope leads to: of a simulator that has next to none."""
-        every = cls.start(ground)
-        for level, corner in itertools.product(*_MOVED):
-            local = torch.tensor([0.0, level, corner, 0.0], dtype=torch.float64)[:, None] * every.free
-            yield replace(every, local=local)
+        found = []
+        for rows, values in zip((torch.ones(4, dtype=torch.bool), *_SINGLE), _VALUES, strict=True):
+            one = every.only(every.free & rows[:, None])
+            if bool(one.free.any()):
+                found.append(replace(one, local=torch.tensor(values, dtype=torch.float64)[:, :, None] * one.free))
+        return found
 
     @property
     def parts(self) -> Tensor:
@@ -107,41 +113,49 @@ class Shift(Term):
         return ground.parts.shifted(local) / ground.density
 
 
-_MOVED = ((0.0, 2.0, 4.0, 6.0), (-3.0, -1.5, 0.0, 1.5, 3.0, 4.5))  # log factors of variance and corner
 # White noise, the level of the AR1s, level and corner, the walk.
 _SINGLE = torch.tensor([[1, 0, 0, 0], [0, 1, 0, 0], [0, 1, 1, 0], [0, 0, 0, 1]], dtype=torch.bool)
+_LEVELS = (0.0, -9.0, -4.0, -1.5, -0.5, 0.5, 1.5, 3.0, 5.0, 8.0)  # log factors of a power to start from
+_CORNERS = (-3.0, -1.5, 0.0, 1.5, 3.0, 4.5)  # of a corner: AR1s far from what they were, where no slope leads to
+_MOVED = tuple((0.0, level, corner, 0.0) for level in (0.0, 2.0, 4.0, 6.0) for corner in _CORNERS)
+# Of the AR1s' plateau gone, filters and white noise that falls are told apart by the evidence, not by where it starts.
+_VALUES: tuple[tuple[tuple[float, ...], ...], ...] = (
+    ((0.0, 0.0, 0.0, 0.0), *_MOVED, *((x, 0.0, 0.0, 0.0) for x in _LEVELS), *((x, x, 0.0, x) for x in _LEVELS)),
+    tuple((x, 0.0, 0.0, 0.0) for x in _LEVELS),
+    tuple((0.0, x, 0.0, 0.0) for x in _LEVELS),
+    ((0.0, 0.0, 0.0, 0.0), *_MOVED),
+    tuple((0.0, 0.0, 0.0, x) for x in _LEVELS),
+)
 
 
 @dataclass(frozen=True, eq=False)
 class LowPass(Term):
-    """A filter of each sensor: its local number is the strength, 0 for none."""
+    """A filter of each sensor: its local number is `log g(f_c)` of the form, see `filter_forms`.
+
+    In it the information of a spectrum is about even, from corners far below half the rate to filters that hardly show.
+    """
 
     name: ClassVar[str] = "low_pass"
     acts: ClassVar[str] = "filter"
-    lower: ClassVar[float] = 0.0
+    lower: ClassVar[float] = -8.0  # corner at the rate over 10^4
+    upper: ClassVar[float] = math.log(1000)  # a tangent that is reached at 0.4997 of the rate: no band shows it
 
     kind: str = "pole"
 
     @classmethod
-    def starts(cls, ground: Ground, kind: str) -> list[LowPass]:
-        p = len(ground.mean)
-        free = torch.ones(1, p, dtype=torch.bool)
-        corners = torch.logspace(math.log10(0.45), math.log10(0.004), 10, dtype=torch.float64)
-        nothing = torch.zeros(0, dtype=torch.float64)
-        return [
-            cls(filter_strength(kind, corner).expand(1, p).clone(), free, nothing, kind)
-            for corner in (*corners, *([torch.tensor(1.5)] if kind.startswith("sampled") else []))
-        ]
+    def starts(cls, ground: Ground, kind: str) -> LowPass:
+        """Corners to start from: all in one, `local` is `(start, 1, sensor)`."""
+        numbers = torch.linspace(math.log(0.012), math.log(100), 37, dtype=torch.float64)
+        local = numbers[:, None, None].expand(-1, 1, len(ground.mean)).clone()
+        free = torch.ones(1, len(ground.mean), dtype=torch.bool)
+        return cls(local, free, torch.zeros(0, dtype=torch.float64), kind)
 
-    def others(self) -> list[LowPass]:
-        """The other forms, of the same corners as far as they can have them."""
-        corner = filter_corner(self.kind, self.local)
-        other = {k: corner.clamp(max=_HIGHEST if k.startswith("sampled") else 0.45) for k in FILTERS if k != self.kind}
-        starts = {kind: torch.where(self.free, filter_strength(kind, c), 0.0) for kind, c in other.items()}
-        return [replace(self, kind=kind, local=local) for kind, local in starts.items()]
+    def local_reach(self) -> Tensor:
+        return torch.full_like(self.local, 0.7)  # a factor of two
 
     def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
-        return filter_power(self.kind, local[..., 0, :], ground.places)
+        power = filter_power(self.kind, strength_of(self.kind, local[..., 0, :]), ground.places)
+        return torch.where(self.free[0, :, None], power, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,6 +169,12 @@ class Flicker(Term):
     def start(cls, ground: Ground) -> Flicker:
         unit = (ground.density * ground.places).amin(-1)
         return cls(0.1 * unit[None], torch.ones(1, len(unit), dtype=torch.bool), torch.zeros(0, dtype=torch.float64))
+
+    @classmethod
+    def starts(cls, ground: Ground) -> Flicker:
+        """Levels to start from, `local` is `(start, 1, sensor)`."""
+        start = cls.start(ground)
+        return replace(start, local=torch.logspace(-1, 6, 15, dtype=torch.float64)[:, None, None] * start.local)
 
     def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
         return local[..., 0, :, None] / ground.places
@@ -175,7 +195,7 @@ class PowerLaw(Term):
     @staticmethod
     def _middle(ground: Ground) -> float:
         """`f0`: where level and slope have little to do with each other."""
-        return math.sqrt(0.5 / ground.bands.n_samples)
+        return math.sqrt(float(ground.places[0]) * 0.5)
 
     def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
         falls = (self._middle(ground) / ground.places) ** shared[..., :1]

@@ -30,8 +30,8 @@ def found(
     limits = {name: entry for name, entry in parameters.items() if not math.isnan(entry.value)}
     return Finding(
         effect.name,
-        replace(effect, company=shape.company),
-        sentence,
+        replace(effect, company=shape.company, approximate=not shape.fits),
+        sentence if shape.fits else sentence + _of_another_form(shape),
         shape.p_value,
         sensors,
         limits,
@@ -39,4 +39,12 @@ def found(
         alternatives=shape.alternatives,
         frequency_hz=frequency_hz,
         gain=shape.gain,
+    )
+
+
+def _of_another_form(shape: Shape) -> str:
+    """What is said of a form that the catalogue only approximates."""
+    return (
+        f"; {math.floor(100 * shape.explained)} % of how the spectra differ is explained, the rest is more than "
+        "chance: its form is not quite one of the catalogue"
     )

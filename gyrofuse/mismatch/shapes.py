@@ -1,4 +1,4 @@
-"""Which spectral shapes make a simulation's spectra those of a recording: chosen by BIC, jointly, and their rivals."""
+"""Which spectral shapes make a simulation's spectra those of a recording, jointly by evidence, and their rivals."""
 
 from __future__ import annotations
 
@@ -11,43 +11,48 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from gyrofuse.mismatch.bump_fit import oscillation_of
+from gyrofuse.mismatch.bump_fit import Oscillation, oscillation_of
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import corrected
-from gyrofuse.mismatch.folds import estimation_samples
+from gyrofuse.mismatch.folds import N_FOLDS, N_JUDGED, in_fold
 from gyrofuse.mismatch.hysteresis import strongest_relay
+from gyrofuse.mismatch.likelihoods.spectral import Fit, Ratios, data_model, fit, fitness, log_gain, power_gains
+from gyrofuse.mismatch.likelihoods.spectral_data import block_spectra
 from gyrofuse.mismatch.mechanism import Z
 from gyrofuse.mismatch.noise_level import modulation, variance_p_value
 from gyrofuse.mismatch.pooled import common_source
 from gyrofuse.mismatch.remembered import remembered
-from gyrofuse.mismatch.shape_bands import N_SLOW, Groups, deep, deep_base, in_blocks, narrow_bands, slow_fold
-from gyrofuse.mismatch.shape_choice import QUICK, best_shapes, candidates, convincing, cost_of
-from gyrofuse.mismatch.shape_fit import Fit, Ratios, data_model, fair_gain, fit, log_score, ratios
-from gyrofuse.mismatch.shape_scan import bump_start, shape_p_value
+from gyrofuse.mismatch.shape_bands import deep, deep_base, narrow_bands
+from gyrofuse.mismatch.shape_ground import Ground
+from gyrofuse.mismatch.shape_law import smooth_coherence
+from gyrofuse.mismatch.shape_scan import shape_p_value
 from gyrofuse.mismatch.shape_terms import Bump, Common, CommonBump, Flicker, LowPass, PowerLaw, Shift, Term
-from gyrofuse.mismatch.side import Side
+from gyrofuse.mismatch.spectra import Bands
+from gyrofuse.mismatch.spectral_choice import FITS, best_bump, best_terms, candidates, cost_of, filter_starts
 from gyrofuse.mismatch.sweeps import swept
 from gyrofuse.mismatch.witnesses import level_of
 
 _RIVAL = 5.0  # nats
 _ALIKE = 2.0  # nats between forms of a filter that are both likely
 _FAR = 20.0  # nats behind after a first look that are not made up
-_DOUBT = 1e-3  # p value of what is left by shapes that may be named
-_PLACES = 16.0  # shapes and places that compete
+_QUICK = 8  # rounds of it
+_LARGELY = 0.9  # of the discrepancy, explained by terms that may be named though their form is not the true one
+_PLACES = 16.0  # classes and places that compete
 _ORDER = {"scale": 0, "add": 1, "filter": 2}  # a filter acts on what was added, levels are those of the noise alone
 _PLAIN = 25.0  # nats
-_ALONE = 8.0  # nats that a shape has to bring by itself
-_PER_OCTAVE = 4
+_ALONE = 8.0  # nats that a term has to bring by itself
 _CLEAN = 8  # bins
+_LITTLE = 0.1  # of what the term that would be missed most explains
 _SLOW = 64  # cycles per record
 _BROAD = 3.0  # half widths
-_SHARED = 3.5  # standard deviations of a second gain that chance gives to none of the others
+_SHARED = 5.0  # standard deviations of a second gain, which power and correlation tell, that chance does not give
 _SHARP, _NARROW = 0.1, (0.02, 0.04, 0.08)  # the same, below which bands are too wide for it, and of it there
 _FINE, _NARROWEST = 24, 0.005  # bands in an octave for those, and the least that they show
 _STEEPER, _FLICKER = 4.0, 0.15  # nats that another slope gains, and distance from 1 of flicker noise's
 _UNSTEADY = 0.01  # p value of either sign of a level that may change
-_FEWEST_SIMULATED = 2  # blocks of a simulation
 _OFF = 0.25  # logarithm by which a centre from wide bands may be off
+_ENOUGH = 50.0  # ordinates, to look for the shape of a spectrum
+_BENT = 0.05  # log power: where a filter of another form changed a band, what is left there is its form
 
 
 Form = tuple[LowPass, tuple[Tensor, Tensor]]
@@ -66,6 +71,8 @@ class Shape(NamedTuple):
         frequency: Where it acts most, cycles per sample.
         levels: Wavelet levels where it shows.
         forms: Other forms of a filter that explain about as much, as `term` and `sd`.
+        explained: Share of the discrepancy of powers beyond chance that all terms of the fit explain.
+        fits: Whether what they leave is no more than chance; else the form is another one.
     """
 
     term: Term
@@ -77,6 +84,8 @@ class Shape(NamedTuple):
     frequency: float
     levels: tuple[int, ...]
     forms: tuple[Form, ...]
+    explained: float
+    fits: bool
 
 
 @remembered
@@ -117,12 +126,13 @@ def _in_sensors_of(term: Term, rival: Term) -> Term:
 
 
 def chosen_shape(case: Case, name: str, level: float) -> Shape | None:
-    """The first shape, if it is that one and at p below `level`; narrow bumps that are plain come before it."""
-    bump = oscillation_of(case)
-    if name != "resonance" and bump is not None and bump.stretch.p_value <= level and bump.nats > _PLAIN:
-        return None
+    """The first shape, if it is that one and at p below `level`; narrow bumps that it leaves plain come before it."""
     best = leading_shape(case)
     if best is None or best.term.name != name or best.p_value > level:
+        return None
+    bump = oscillation_of(case)
+    plain = bump is not None and bump.stretch.p_value <= level and bump.nats > _PLAIN
+    if bump is not None and plain and name != "resonance" and _stands_out(case, best, bump):
         return None
     if swept(case, best.gain, level):
         return None
@@ -131,40 +141,76 @@ def chosen_shape(case: Case, name: str, level: float) -> Shape | None:
     return best if relay is None or relay.p_value > level else None
 
 
-def compared(case: Case, per_octave: int = _PER_OCTAVE) -> Ratios:
-    """Spectra of a case, without bands that hold a line which is not explained."""
-    wanted = narrow_bands(case.n_samples, per_octave)
+def _stands_out(case: Case, best: Shape, bump: Oscillation) -> bool:
+    """Whether a bump is there beside shapes: what bends around a filter's corner looks like one without it."""
+    data, terms = _closely(case), [best.term, *best.company]
+    start = best_bump(data, terms, torch.tensor([[bump.centre, bump.width]], dtype=torch.float64))
+    if start is None:
+        return False
+    models = (data_model(data, t).diagonal(dim1=-2, dim2=-1).real for t in (terms, [*terms, start]))
+    before, after = (float(power_gains(data, m).sum()) for m in models)
+    return after - before > _ALONE
+
+
+def compared(case: Case) -> Ratios:
+    """Spectra of both sides in bands of blocks, without those that hold a line which is not explained."""
+    return _kept(case, torch.ones(N_JUDGED, dtype=torch.bool), torch.ones(N_FOLDS, dtype=torch.bool))
+
+
+def _kept(case: Case, blocks: Tensor, folds: Tensor) -> Ratios:
+    """Some blocks `(block,)` of the recording, and those of some folds `(fold,)` of the simulation."""
+    both = block_spectra(case)
+    recorded, (matrices, s) = both.recorded.mean(blocks), both.simulated.mean(folds)
+    usable = torch.ones(len(s), case.n_sensors, dtype=torch.float64)
+    places = both.bands.places.unflatten(0, (len(s), -1))
+    if case.line.p_value < FITS:
+        half = N_JUDGED / case.n_samples  # tapers of a block widen a line so far
+        inside = (places.amin(-1) - 2 * half < case.line.frequency) & (case.line.frequency < places.amax(-1) + 2 * half)
+        usable[inside & (places.amin(-1) > half)] = 0.0
+    for response in case.bent:
+        changed = both.bands.mean_of(response(both.bands.places).abs().square())  # (sensor, band)
+        usable[(changed.clamp(min=1e-300).log().abs() > _BENT).mT] = 0.0
+    return _ratios(case, both.bands, recorded, (matrices, s), usable)
+
+
+def _ratios(
+    case: Case, bands: Bands, recorded: tuple[Tensor, Tensor], simulated: tuple[Tensor, Tensor], usable: Tensor
+) -> Ratios:
+    """Ratios over the simulation's noise."""
+    matrices, s = simulated
+    independent, ground = _independent(case), Ground(deep_base(case), bands)
+    power = matrices.diagonal(dim1=-2, dim2=-1).real
+    size = torch.where(power > 0, power, ground.mean.mT).rsqrt()
+    if independent:
+        expected = torch.eye(case.n_sensors, dtype=matrices.dtype).expand_as(matrices)
+    else:
+        expected = smooth_coherence(matrices * (size[:, :, None] * size[:, None, :]), s)
+    return Ratios.of(ground, recorded, (power, s), expected, usable, independent)
+
+
+@remembered
+def _closely(case: Case) -> Ratios:
+    """Spectra of whole records in narrow bands, which show what blocks do not resolve."""
+    wanted = narrow_bands(case.n_samples, _FINE)
     both = deep(case, case.recorded.in_bands(wanted), case.simulated.in_bands(wanted))
-    n_slow, usable = len(both.d) - len(wanted.dof), torch.ones_like(both.d)
+    n_slow, usable = len(both.d) - len(wanted.dof), torch.ones(len(both.d), case.n_sensors, dtype=torch.float64)
     scale = case.simulated.signal.shape[-1] / case.n_samples
     if scale < 1:  # the lowest bins of short records hold what leaks from below
-        usable[n_slow:] *= torch.tensor(wanted.edges[:-1]) * scale >= _CLEAN
-    if case.line.p_value < _DOUBT:
+        usable[n_slow:] *= (torch.tensor(wanted.edges[:-1]) * scale >= _CLEAN)[:, None]
+    if case.line.p_value < FITS:
         edges = torch.tensor(wanted.edges[1:-1], dtype=torch.float64) / case.n_samples
         place = torch.bucketize(torch.tensor(case.line.frequency, dtype=torch.float64), edges, right=True)
         usable[n_slow + place] = 0.0
-    return ratios(both, deep_base(case), usable, _independent(case))
+    return _ratios(case, both.bands, (both.recorded, both.d), (both.simulated, both.s), usable)
 
 
 def refit(case: Case, fold: int, term: Term, company: Sequence[Term] = ()) -> Term:
-    """A shape with its numbers estimated anew without what a fold holds out, together with those of its company."""
-    keep = estimation_samples(case.n_samples, fold)
-    run = run_length(keep)
-    block = min(run, case.simulated.signal.shape[-1] // _FEWEST_SIMULATED)
-    runs = case.recording[:, keep].unflatten(-1, (-1, run))[..., : run // block * block]
-    recorded = runs.unflatten(-1, (-1, block)).flatten(1, 2).movedim(1, 0)
-    simulated = in_blocks(case.simulated)[block]
-    both = deep(case, Side(recorded, simulated.bands), simulated, _slow_without(fold))
-    data = ratios(both, deep_base(case), torch.ones_like(both.d), _independent(case))
-    found = fit(data, [term, *company])
-    return fit(data.centred(found.model.diagonal(dim1=-2, dim2=-1).real), found.terms).terms[0]
+    """A term with its numbers estimated anew without what a fold holds out, together with those of its company.
 
-
-def _slow_without(fold: int) -> Groups:
-    """Slow ordinates that a fold does not hold out, in groups of an octave."""
-    octaves = [range(2**j, min(2 ** (j + 1), N_SLOW + 1)) for j in range(N_SLOW.bit_length())]
-    groups = (tuple(k for k in octave if slow_fold(k) != fold) for octave in octaves)
-    return tuple(group for group in groups if group)
+    The simulation's blocks are held out as well: its chance is in the numbers that are judged.
+    """
+    data = _kept(case, ~in_fold(N_JUDGED, fold), torch.arange(N_FOLDS) != fold)
+    return fit(data, [term, *company]).terms[0]
 
 
 def _independent(case: Case) -> bool:
@@ -181,24 +227,37 @@ def run_length(keep: Tensor) -> int:
 
 def _searched(case: Case) -> Shape | None:
     data = compared(case)
-    if float(data.worth.sum()) < 50:
+    if data.n_ordinates < _ENOUGH:
         return None
-    p_seen = shape_p_value(case)
-    data, chosen = best_shapes(data, differ=p_seen < _DOUBT)
-    if chosen is None or not convincing(data, chosen) or _falls_otherwise(data, chosen):
+    p_seen = 1.0 if case.bent else shape_p_value(case)  # which looks where a filter's form is off as well
+    chosen = best_terms(data, differ=p_seen < FITS)
+    if chosen is None or _falls_otherwise(data, chosen):
+        return None
+    nothing, left = fitness(data, data.expected), fitness(data, chosen.model)
+    fits = left.p_value > FITS
+    explained = 1 - float(left.excess.clamp(min=0).sum() / nothing.excess.clamp(min=0).sum().clamp(min=1e-9))
+    if not fits and explained < _LARGELY:
         return None
     seen = [_told(case, chosen, i) for i in range(len(chosen.terms))]
-    nothing = float(log_score(data, data.expected).sum())
+
+    losses = (
+        [chosen.gain - max(fit(data, _others(chosen, i)).gain, 0.0) for i in range(len(seen))] if seen[1:] else [0.0]
+    )
+    most = max(range(len(seen)), key=lambda i: losses[i])
 
     def place(i: int) -> tuple[bool, int, float]:
         term, _ = seen[i]
-        alone = float(log_score(data, data_model(data, [term])).sum()) - nothing
-        return alone < _ALONE, _ORDER[term.acts], -alone
+        alone = float(log_gain(data, data_model(data, [term])).sum())
+        # What a little was left for beside a common source or a mode is not to come before it.
+        little = seen[most][0].acts != "filter" and losses[i] < _LITTLE * losses[most]
+        return alone < _ALONE or little, _ORDER[term.acts], -alone
 
     first = min(range(len(seen)), key=place)
     term, others = chosen.terms[first], _others(chosen, first)
-    whole = fair_gain(data, chosen.model)
-    gain = whole - (max(_fairly(data, others), 0.0) if others else 0.0)
+    gain = chosen.gain
+    if others:
+        rest = fit(data, others)
+        gain -= max(rest.gain, 0.0)
     p = corrected(float(stats.chi2.sf(2 * max(gain, 0.0), _freedom(data, term))), _PLACES)
     if not others:  # it is all that differs
         p = min(p, p_seen)
@@ -207,25 +266,30 @@ def _searched(case: Case) -> Shape | None:
     rivals = {
         rival.name
         for rival in candidates(data, others)
-        if rival.name != term.name and _as_good(data, [*others, _in_sensors_of(term, rival)], chosen, whole)
+        if rival.name != term.name and _as_good(data, [*others, _in_sensors_of(term, rival)], chosen)
     }
     if _like_switching(term, seen[first][1][0]):
         rivals.add("random_telegraph")
     if _louder(term, seen[first][1]) and min(modulation(case).p_value, variance_p_value(case)) < _UNSTEADY:
         rivals.add("variance_change")
-    score = (log_score(data, data_model(data, [term])) - log_score(data, data.expected)).clamp(min=0)
+    score = power_gains(data, data_model(data, [term]).diagonal(dim1=-2, dim2=-1).real).sum(-1)
+    if isinstance(term, Common):
+        score = log_gain(data, data_model(data, [term]))
+    score = score.clamp(min=0)
     frequency = data.ground.bands.frequency
     told, sd = seen[first]
     return Shape(
         told,
         tuple(others),
         sd,
-        gain - cost_of(data, term),
+        gain - cost_of(chosen) / len(chosen.terms),
         p,
         tuple(sorted(rivals)),
         float(frequency[score.argmax()]),
         tuple(sorted({level_of(float(f)) for f in frequency[score > 0.05 * score.sum()]})),
         _forms(data, term, others, chosen.gain),
+        explained,
+        fits,
     )
 
 
@@ -261,25 +325,20 @@ def _forms(data: Ratios, term: Term, others: list[Term], gain: float) -> tuple[F
     """Other forms of a filter that are about as likely."""
     if not isinstance(term, LowPass):
         return ()
-    fits = [fit(data, [*others, form]) for form in term.others()]
+    forms = [replace(form, free=term.free) for form in filter_starts(data, others) if form.kind != term.kind]
+    fits = [f for form in forms if (f := fit(data, [*others, form], _QUICK)).gain > gain - _FAR]
+    fits = [fit(data, f.terms) for f in fits]
     return tuple((t, f.sd(-1)) for f in fits if f.gain > gain - _ALIKE and isinstance(t := f.terms[-1], LowPass))
 
 
-def _as_good(data: Ratios, terms: list[Term], chosen: Fit, gain: float) -> bool:
-    """Whether shapes gain about as much as those chosen, a nat less for each number that they do without (Akaike).
+def _as_good(data: Ratios, terms: list[Term], chosen: Fit) -> bool:
+    """Whether terms gain about as much as those chosen, a nat less for each number that they do without (Akaike).
 
     Those that are far from it after a few rounds are not followed.
     """
-    quick = fit(data, terms, QUICK)
-    least = gain - _RIVAL - max(chosen.n_free - quick.n_free, 0)
-    near = quick.gain > chosen.gain - _FAR or fair_gain(data, quick.model) > least + _RIVAL - _FAR
-    return near and _fairly(data, quick.terms) > least
-
-
-def _fairly(data: Ratios, terms: Sequence[Term]) -> float:
-    """Gain of shapes with the numbers that suit them best where the law of F is taken at their own powers."""
-    own = data.centred(fit(data, terms).model.diagonal(dim1=-2, dim2=-1).real)
-    return fair_gain(data, fit(own, terms).model)
+    quick = fit(data, terms, _QUICK)
+    least = chosen.gain - _RIVAL - max(len(chosen.information) - len(quick.information), 0)
+    return quick.gain > least - _FAR and fit(data, quick.terms).gain > least
 
 
 def _freedom(data: Ratios, term: Term) -> int:
@@ -292,17 +351,25 @@ def _freedom(data: Ratios, term: Term) -> int:
     return term.local.numel() + 2 * len(term.shared)
 
 
+def _alone(term: CommonBump) -> Bump:
+    """A common bump's powers, as bumps of each sensor's own."""
+    centre, width = term.shared.exp().tolist()
+    return Bump.start(centre, width, term.local.square().sum(0))
+
+
 def _closer(case: Case, term: Bump | CommonBump, others: list[Term]) -> tuple[Term, tuple[Tensor, Tensor]]:
     """A bump that is no wider than bands are, from narrower ones, and standard deviations of its numbers."""
-    data = compared(case, _FINE)
-    model = data_model(data, others)
+    data = _closely(case)
     seen, frequency = term.shared[0].exp(), data.ground.bands.frequency
     centres = frequency[(frequency / seen).log().abs() < _OFF].tolist()
-    starts = ((centre, share * centre) for centre in centres for share in _NARROW)
-    start = bump_start(data, model, starts, term.free.any(0)) or term
-    local = start.local
+    places = [(centre, share * centre) for centre in centres for share in _NARROW]
+    start = best_bump(data, others, torch.tensor(places, dtype=torch.float64)) if places else None
+    if start is None:
+        start = term if isinstance(term, Bump) else _alone(term)
+    local = start.local * term.free.any(0)
     if isinstance(term, CommonBump):
-        common = CommonBump.start(data.ground, data.observed - model, data.worth, "oscillation", start.shared)
+        excess = data.observed - data_model(data, others)
+        common = CommonBump.start(data.ground, excess, data.worth, "oscillation", start.shared)
         local = common.local * term.free
     found = fit(data, [*others, replace(term, local=local, shared=start.shared, narrowest=_NARROWEST)])
     return found.terms[-1], found.sd(-1)

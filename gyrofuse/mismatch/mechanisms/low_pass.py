@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.axes import OfSensors
 from gyrofuse.mismatch.case import Case
-from gyrofuse.mismatch.filter_forms import filter_corner, filter_response
+from gyrofuse.mismatch.filter_forms import filter_corner, filter_number, filter_response, strength_of
 from gyrofuse.mismatch.gaussian import Filter
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.shape_terms import LowPass
@@ -20,7 +20,7 @@ from gyrofuse.mismatch.shapes import chosen_shape, refit
 
 @dataclass(frozen=True, eq=False)
 class LowPassFilter(Filter):
-    """`S_i -> |H_i(f)|^2 S_i` with `|H|^2 = 1 / (1 + (f / f_c)^(2 n))`, or a digital filter like it, `n` 1 or 2.
+    """`S_i -> |H_i(f)|^2 S_i`: poles, Butterworth and Bessel filters, means over samples, FIR filters.
 
     It multiplies all there is, walks and tones too; the deficit sits in the first levels and grows towards the highest
     frequency. Lower white noise alone would lower all frequencies above the corner alike.
@@ -40,7 +40,7 @@ class LowPassFilter(Filter):
         if shape is None or not isinstance(shape.term, LowPass):
             return None
         term, rate = shape.term, case.scene.rate
-        strength = term.local[0]
+        strength = strengths(term)
         sensors = tuple(int(i) for i in term.free[0].nonzero()[:, 0])
         # Which form it has is not known either; digital ones need not halve the power at all.
         forms = [_limits(form, sd[0][0]) * rate for form, sd in ((term, shape.sd), *shape.forms)]
@@ -69,12 +69,20 @@ class LowPassFilter(Filter):
         return filter_response(self.kind, self.strength, f)
 
     def refitted(self, case: Case, fold: int) -> Mechanism:
-        own = self.strength[None]
-        term = LowPass(own, own > 0, torch.zeros(0, dtype=torch.float64), self.kind)
-        return replace(self, strength=refit(case, fold, term, self.company).local[0])
+        has = self.strength > 0
+        own = torch.where(has, filter_number(self.kind, self.strength), 0.0)[None]
+        term = LowPass(own, has[None], torch.zeros(0, dtype=torch.float64), self.kind)
+        found = refit(case, fold, term, self.company)
+        assert isinstance(found, LowPass)
+        return replace(self, strength=strengths(found))
+
+
+def strengths(term: LowPass) -> Tensor:
+    """Of each sensor's filter, 0 for none, `(sensor,)`."""
+    return torch.where(term.free[0], strength_of(term.kind, term.local[0]), 0.0)
 
 
 def _limits(term: LowPass, sd: Tensor) -> Tensor:
     """Lowest, best and highest corners, cycles per sample, `(3, sensor)`."""
-    steps = torch.tensor([Z, 0.0, -Z], dtype=torch.float64)[:, None]
-    return filter_corner(term.kind, (term.local[0] + steps * sd.nan_to_num(nan=0.0)).clamp(min=0))
+    steps = torch.tensor([-Z, 0.0, Z], dtype=torch.float64)[:, None]
+    return filter_corner(term.kind, strength_of(term.kind, term.local[0] + steps * sd.nan_to_num(nan=0.0)))

@@ -1,0 +1,1 @@
+"""Observation models: what a mechanism makes of a recording, as log likelihoods, scores and information."""

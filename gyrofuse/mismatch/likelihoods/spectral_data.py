@@ -1,0 +1,131 @@
+"""Cross-spectra of a recording and its simulation, additive over the blocks that are held out.
+
+Both sides are cut into blocks of one length, so that resolution and leakage are the same. Below the lowest band of a
+block stand the DCT-II ordinates of whole records, dealt to the blocks. The whole recording, the blocks that a fold
+keeps and those that it holds out are the same sums over another set of blocks; the reference is held out with them, as
+its own chance would otherwise be in what is fitted and in what judges the fit.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gyrofuse._transforms import cosine_ordinates
+from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.folds import N_FOLDS, N_JUDGED
+from gyrofuse.mismatch.remembered import remembered
+from gyrofuse.mismatch.shape_bands import DeepBands, Groups
+from gyrofuse.mismatch.side import Side
+from gyrofuse.mismatch.spectra import Bands, cross_spectra, degrees_of_freedom
+
+# Bins of a block: the lowest band. The four tapers reach two bins down, and below one bin what is slower leaks in.
+_FIRST_BIN = 4
+# Bins of a band at least: the powers of neighbouring bands then correlate by 0.12 (white noise, 6000 blocks).
+_NARROWEST = 6
+_PER_OCTAVE = 6  # bands: a third of an octave holds two, as narrow as smooth spectra need
+_WIDEST = 0.02  # cycles per sample: a band where filters cut off is to show their slope
+_SHARE_OF_END = 3  # bands are a third of the distance to half the rate at most: digital filters have zeros there
+_SLOW_PER_OCTAVE = 4  # groups of ordinates: slow noise has no structure finer than that
+
+
+class Spectra(NamedTuple):
+    """Sums of cross-products of complex ordinates, and how many there are.
+
+    Attributes:
+        products: `(part, band, sensor, sensor)`, complex; a part is a block of the recording, or a fold's of the
+            reference.
+        dof: Independent complex ordinates, `(part, band)`.
+    """
+
+    products: Tensor
+    dof: Tensor
+
+    def mean(self, parts: Tensor) -> tuple[Tensor, Tensor]:
+        """Cross-spectral matrices `(band, sensor, sensor)` and ordinates `(band,)` of some parts `(part,)`."""
+        dof = self.dof[parts].sum(0)
+        return self.products[parts].sum(0) / dof.clamp(min=1e-300)[:, None, None], dof
+
+
+class Compared(NamedTuple):
+    """A recording and its reference in the same bands.
+
+    Attributes:
+        bands: They, below them groups of ordinates of the whole record.
+        recorded: By block, 32 parts.
+        simulated: By the fold that holds it out, 4 parts.
+    """
+
+    bands: DeepBands
+    recorded: Spectra
+    simulated: Spectra
+
+
+@remembered
+def block_spectra(case: Case) -> Compared:
+    """Both sides of a case."""
+    length = case.n_samples // N_JUDGED
+    above, groups = block_bands(length), slow_groups()
+    recorded, simulated = _of_side(case.recorded, case.n_samples), _of_side(case.simulated, case.n_samples)
+    folds = torch.arange(len(recorded.dof)) % N_FOLDS
+    parts = [(simulated.products[folds == k].sum(0), simulated.dof[folds == k].sum(0)) for k in range(N_FOLDS)]
+    return Compared(
+        DeepBands.of(above, case.n_samples, groups),
+        recorded,
+        Spectra(torch.stack([p for p, _ in parts]), torch.stack([d for _, d in parts])),
+    )
+
+
+@functools.lru_cache(maxsize=8)
+def block_bands(length: int) -> Bands:
+    """Bands of a block of so many samples."""
+    last = (length - 4) // 2
+    edges = [_FIRST_BIN]
+    while last - edges[-1] >= 2 * _NARROWEST:
+        a = edges[-1]
+        wide = min(a * (2 ** (1 / _PER_OCTAVE) - 1), _WIDEST * length, (length / 2 - a) / _SHARE_OF_END)
+        edges.append(a + max(round(wide), _NARROWEST))
+    edges.append(last)
+    lower, upper = (torch.tensor(ends, dtype=torch.float64) for ends in (edges[:-1], edges[1:]))
+    dof = torch.tensor([degrees_of_freedom(b - a) for a, b in itertools.pairwise(edges)], dtype=torch.float64)
+    return Bands(length, tuple(edges), (lower * (upper - 1)).sqrt() / length, dof)
+
+
+@functools.lru_cache(maxsize=1)
+def slow_groups() -> Groups:
+    """DCT-II ordinates of a record below its blocks' lowest band: single at the bottom, then a quarter octave each."""
+    end = round(2 * N_JUDGED * (_FIRST_BIN - 0.5))
+    edges = [1]
+    while edges[-1] < end:
+        edges.append(min(max(edges[-1] + 1, round(edges[-1] * 2 ** (1 / _SLOW_PER_OCTAVE))), end))
+    return tuple(tuple(range(a, b)) for a, b in itertools.pairwise(edges))
+
+
+def _of_side(side: Side, n_samples: int) -> Spectra:
+    """A side by the 32 blocks that its samples, or the place of its ordinates, belong to."""
+    noise = side.noise
+    length, (n_records, p, n) = n_samples // N_JUDGED, noise.shape
+    bands, groups = block_bands(length), slow_groups()
+    products = torch.zeros(N_JUDGED, len(groups) + len(bands.dof), p, p, dtype=torch.complex128)
+    dof = torch.zeros(N_JUDGED, len(groups) + len(bands.dof), dtype=torch.float64)
+    for record in noise:
+        blocks = record[:, : n // length * length].unflatten(-1, (-1, length)).movedim(1, 0)
+        place = torch.arange(len(blocks)) % N_JUDGED
+        products[:, len(groups) :].index_add_(0, place, cross_spectra(blocks, bands) * bands.dof[:, None, None])
+        dof[:, len(groups) :].index_add_(0, place, bands.dof.expand(len(blocks), -1))
+        # A record of another length has its ordinates at other frequencies.
+        edges = torch.tensor([g[0] - 0.5 for g in groups] + [groups[-1][-1] + 0.5], dtype=torch.float64)
+        k = torch.arange(1, math.floor(float(edges[-1]) * n / n_samples) + 1)
+        band = torch.bucketize(k * (n_samples / n), edges, right=True) - 1
+        y = cosine_ordinates(record)[:, k].mT
+        at, inside = (k % N_JUDGED)[band >= 0], band >= 0
+        cross = (y[:, :, None] * y[:, None, :])[inside].to(products.dtype) / 2  # a real ordinate is half a complex one
+        products.index_put_((at, band[inside]), cross, accumulate=True)
+        dof.index_put_((at, band[inside]), torch.full((len(at),), 0.5, dtype=torch.float64), accumulate=True)
+    told = side.n_records / n_records  # less than it shows, where a model was estimated from fewer samples
+    return Spectra(products * told, dof * told)
