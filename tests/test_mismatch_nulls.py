@@ -310,3 +310,16 @@ def test_contaminated_noise_of_a_real_gyro_is_not_rounded(shared: Path) -> None:
         simulation = part.std() * normal(1, 1, 65537, g=torch.Generator().manual_seed(21))
         case = Case.of(Scene(100.0, "rad/s", ("x",)), part, simulation)
         assert lattices.missing_lattices(case, LEVEL).p_value > 0.01
+
+
+@pytest.mark.parametrize("taps", [signal.bessel(3, 0.4, norm="mag"), signal.butter(4, 0.3)], ids=["bessel", "butter"])
+@pytest.mark.parametrize("n", [2 * N, 20011])
+def test_a_steep_filter_makes_no_outliers_and_changes_no_level(taps, n: int):
+    """Where it passes next to nothing, the ends of the record leak in; they are no noise that predicts samples."""
+    g = torch.Generator().manual_seed(7)
+    recording, simulation = normal(3, n + 500, g=g), normal(3, n, g=g)
+    recording[0] = torch.from_numpy(signal.lfilter(*taps, recording[0].numpy()))
+    given = prepared(recording[:, 500:], simulation, None, g)
+    assert float(left_out(given.recorded).z[0].abs().max()) < 6
+    assert impulses.spike_witness(given).p_value > LEVEL
+    assert noise_level.variance_witness(given).p_value > LEVEL

@@ -46,13 +46,22 @@ class Modulation(NamedTuple):
     log_ratio: float
 
 
-def strongest_modulation(squares: Tensor) -> Modulation:
-    """Of squares of whitened noise, `(sensor, time)`."""
+def strongest_modulation(squares: Tensor, correlations: Tensor | None = None) -> Modulation:
+    """Of squares of whitened noise.
+
+    Args:
+        squares: `(sensor, time)`.
+        correlations: Autocorrelations that they have though nothing is modulated, `(lag, sensor)` from lag one.
+    """
     rows = _decorrelated(squares)
     p, n = rows.shape
     length = fast_length(_FINER * n)
     fine = length / n
     transform = torch.fft.rfft(rows, n=length) / math.sqrt(n)
+    if correlations is not None and bool(correlations.any()):
+        lags = torch.arange(1, len(correlations) + 1, dtype=squares.dtype)
+        waves = torch.cos(2 * math.pi * torch.arange(transform.shape[-1])[:, None] / length * lags)
+        transform = transform / (1 + 2 * waves @ correlations).clamp(min=_LEAST).sqrt().mT
     sets, log_chance = sets_of(p)
     scaled = (sets / sets.sum(-1, keepdim=True).sqrt()).to(transform.dtype)
     # Half of the error for the sets, half for all sensors whatever their phases.

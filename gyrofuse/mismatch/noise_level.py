@@ -29,6 +29,7 @@ _NOTHING = 0.05  # p value of what need not be compared
 LEVEL_CUT = SQUARE_CUT  # squares: as where it is asked whether levels vary by themselves
 _BLOCK = 128
 _CHANGES = 1.62  # range of a stationary CUSUM that one in ten exceeds
+_CORRELATED = 4.0  # standard deviations of an autocorrelation that chance does not give
 _ANOTHER = 0.01  # p value of a level that the simulation does not have
 _PLACES = 64  # around the record, at which a course of the level is tried: by chance one in so many fits best
 _UNSTEADY = 1e-4  # p value of a simulation's level that changes
@@ -129,11 +130,11 @@ def variance_p_values(case: Case) -> Tensor:
     spread = own_spread(case)
     if bool(gaussian_sensors(case.simulated).all()):
         wander = (_ranges(simulated).amax(0) / _CHANGES).clamp(min=1.0)
-        heavy = (_clustering(simulated[0]) - 2.5).clamp(min=0)
+        heavy = (_clustering(simulated[0], other[0]) - 2.5).clamp(min=0)
         if level_profile(case) is not None:
             wander, heavy = torch.ones_like(wander), torch.zeros_like(heavy)
         episodes = torch.tensor([kuiper_p_value(float(r)) for r in _ranges(squares) / wander], dtype=torch.float64)
-        bursts = torch.special.ndtr(heavy - _clustering(squares))
+        bursts = torch.special.ndtr(heavy - _clustering(squares, white))
     else:
         reach = _ranges(squares, spread.excess).tolist()
         episodes = torch.tensor([studentised_range_p_value(r, spread.dof) for r in reach], dtype=torch.float64)
@@ -221,24 +222,53 @@ def variance_p_value(case: Case) -> float:
 @remembered
 def modulation(case: Case) -> Modulation:
     """The most conspicuous modulation of the noise level that the simulation does not have."""
-    found = strongest_modulation(levelled(case).square().clamp(max=LEVEL_CUT))
+    found = modulation_of(levelled(case))
     if found.p_value > _NOTHING:
         return found
     records = _simulated_white(case)
-    other = min(strongest_modulation(record.square().clamp(max=LEVEL_CUT)).p_value for record in records)
+    other = min(modulation_of(record).p_value for record in records)
     return found._replace(p_value=surpassing(found.p_value, other))
+
+
+def modulation_of(white: Tensor) -> Modulation:
+    """Of whitened samples `(sensor, time)`."""
+    return strongest_modulation(white.square().clamp(max=LEVEL_CUT), correlations_of_squares(white))
+
+
+def correlations_of_squares(white: Tensor) -> Tensor:
+    """Autocorrelations of squares that Gaussian samples `(sensor, time)` have which are still correlated.
+
+    Behind a filter too steep to be whitened; `rho^2` where `rho` is more than chance gives, `(lag, sensor)`.
+    """
+    rho = _autocorrelations(white)
+    return torch.where(rho.abs() < _CORRELATED / math.sqrt(white.shape[-1]), 0.0, rho.square())
 
 
 def _standardised(values: Tensor) -> Tensor:
     return (values - values.mean(-1, keepdim=True)) / values.std(-1, keepdim=True)
 
 
-def _clustering(squares: Tensor) -> Tensor:
-    """Standard normal sum of the autocorrelations of `(..., time)` at short lags."""
-    x = _standardised(squares)
-    n = x.shape[-1]
+def _clustering(squares: Tensor, white: Tensor) -> Tensor:
+    """Standard normal sum of the autocorrelations of squares at short lags, `(sensor + 1,)`.
+
+    Beyond those that Gaussian samples have which are still correlated.
+
+    Args:
+        squares: `(sensor + 1, time)`, of the sum last.
+        white: `(sensor, time)`.
+    """
+    n, of_squares = squares.shape[-1], _autocorrelations(squares)
+    of_samples = correlations_of_squares(white).sum(0)
+    # The sum of standardised squares has the mean of what its sensors have.
+    expected = torch.cat([of_samples, of_samples.mean(-1, keepdim=True)])
+    return math.sqrt(n / LAGS) * (of_squares.sum(0) - expected)
+
+
+def _autocorrelations(values: Tensor) -> Tensor:
+    """Of `(..., time)` at lags from one, `(lag, ...)`."""
+    x = _standardised(values)
     lags = [torch.linalg.vecdot(x[..., lag:], x[..., :-lag]) for lag in range(1, LAGS + 1)]
-    return torch.stack(lags).sum(0) / math.sqrt(n * LAGS)
+    return torch.stack(lags) / x.shape[-1]
 
 
 def variance_witness(case: Case) -> Evidence:

@@ -28,6 +28,8 @@ _LINE = 25.0  # ordinates this far above the spectrum are lines
 _SKIRT = 1 / 8  # share of ordinates of a line, beyond which the stretch around belongs to it
 ENDS = 64  # a line's skirt is felt in so small a part of the record at each end
 _AS_ELSEWHERE = 1.3  # times the sd of the errors, at an end that no line reaches
+_KINK, _KINK_SAMPLES = 2.5, 16  # times the sd of what is next to it, of so many samples: by chance in 1 of 10 000
+_FLOOR = 1e-4  # of the median power: what is 40 dB below half of the ordinates is leakage, and predicts no sample
 MOST_RECORDS = 2  # of the simulation: as honest as more
 _MAD = 0.6744897501960817
 _FEW, _COARSE = 4096, 0.3  # samples that show a lattice, and its step in sd of the noise, from which it matters
@@ -43,7 +45,7 @@ class LeftOut(NamedTuple):
         z: Errors over their sd, that of episodes within them, `(record, sensor, time)`.
         white: Whitened record, `(record, sensor, time)`, robust sd 1, likewise.
         at_ends: Errors where those of the ends are their own; in `error` and `white` their neighbours stand for them
-            if there are lines.
+            where lines or a steep filter are felt there.
     """
 
     error: Tensor
@@ -71,10 +73,11 @@ def left_out(side: Side) -> LeftOut:
     spectrum, followed = _smooth_spectrum(y)
     lines = _lines(y, spectrum)
     y = torch.where(lines, 0.0, y)
-    white, inverse = _back(y / spectrum.sqrt()), 1 / spectrum
+    white = _back(y / spectrum.sqrt())
+    inverse = 1 / spectrum.maximum(_FLOOR * spectrum.median(-1, keepdim=True).values)
     error = _back(y * inverse) / (inverse * (1 - followed)).mean(-1, keepdim=True)
-    has_lines, at_ends = lines.any(-1, keepdim=True), error
-    white, error = (torch.where(has_lines, _mirrored(v), v) for v in (white, error))
+    leaks, at_ends = lines.any(-1, keepdim=True) | _leaks(white), error
+    white, error = (torch.where(leaks, _mirrored(v), v) for v in (white, error))
     stepped = _stepped(side.signal[:MOST_RECORDS])
     z, white = (values / side.level**0.5 for values in (error, white))
     sd = _sd(z, stepped)
@@ -94,6 +97,17 @@ def _lines(y: Tensor, spectrum: Tensor) -> Tensor:
         lines = lines | (within > _SKIRT * (2 * reach + 1))
         reach *= 2
     return lines
+
+
+def _leaks(white: Tensor) -> Tensor:
+    """Whether either end `(..., time)` is plainly larger than what is next to it, `(..., 1)`.
+
+    Where a filter passes next to nothing, the kink that a record's end is to a cosine transform is all that is there.
+    """
+    m = white.shape[-1] // ENDS
+    ends = _robust_sd(torch.stack([white[..., :_KINK_SAMPLES], white[..., -_KINK_SAMPLES:]]))
+    inner = _robust_sd(torch.stack([white[..., m : 2 * m], white[..., -2 * m : -m]]))
+    return (ends > _KINK * inner).any(0)[..., None]
 
 
 def _mirrored(values: Tensor) -> Tensor:

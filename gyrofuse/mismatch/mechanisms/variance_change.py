@@ -25,13 +25,13 @@ from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.level_scan import Reference, scanned_levels
 from gyrofuse.mismatch.loudness import Loudness, corner_of, fast_factor, whitened_factor
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
-from gyrofuse.mismatch.modulation import strongest_modulation
 from gyrofuse.mismatch.noise_level import (
     LEVEL_CUT,
     compared_levels,
     level_between,
     levelled,
     modulation,
+    modulation_of,
     own_spread,
     variance_p_value,
     variance_p_values,
@@ -214,7 +214,7 @@ def _goes_up_and_down(case: Case, found: Episodes) -> bool:
     white, more = levelled(case), found
     for _ in range(_MORE):
         white = white / torch.where(more.inside(n), more.factor[:, None], 1.0).sqrt()
-        rest, more = strongest_modulation(white.square().clamp(max=LEVEL_CUT)), stretch_of(white)
+        rest, more = modulation_of(white), stretch_of(white)
         if rest.p_value > _LEFT or rest.log_ratio < _SHARE * always:
             return False
         if more.log_ratio < _ONE_MORE * rest.log_ratio:
