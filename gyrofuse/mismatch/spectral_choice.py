@@ -7,6 +7,7 @@ approximates is still the nearest physics.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -116,8 +117,12 @@ def candidates(data: Ratios, company: Sequence[Term]) -> Iterator[Term]:
     names = {t.name for t in company}
     ground = data.ground
     if "parameter_shift" not in names and bool(ground.matters.any()):
-        for family in Shift.starts(ground):
-            yield best_start(data, company, family)[0]
+        starts = [best_start(data, company, family)[0] for family in Shift.starts(ground)]
+        yield from starts
+        # Two parts together, each from where it starts alone: from all at once the one may stay in the other's place.
+        for one, other in itertools.combinations(starts, 2):
+            if not bool((one.free & other.free).any()):
+                yield replace(one, local=one.local + other.local, free=one.free | other.free)
     if "low_pass" not in names:
         yield from filter_starts(data, company)[:_FORMS]
     if "flicker" not in names:
