@@ -153,7 +153,7 @@ def test_verdict_warns_where_observations_are_fewer_than_sensors():
     few = dataclasses.replace(result, degrees_of_freedom=torch.tensor([30.0, 2.5, 1.2], dtype=torch.float64))
     (warning,) = (sentence for sentence in verdict(few) if "fewer independent" in sentence)
     start = "From 0.02 s on, the recording holds fewer independent observations (2.5 or less) than there are sensors, "
-    assert warning.startswith(f"{start}so that the comparisons end before: what it gains there is partly fitted")
+    assert warning.startswith(f"{start}so that the comparisons end before: what it gains there follows from a model")
     unweighted = dataclasses.replace(few, scale_weights=torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64))
     assert verdict(unweighted)[-1] == f"{start}so that the comparisons end before."
 

@@ -71,7 +71,8 @@ class Shape(NamedTuple):
         frequency: Where it acts most, cycles per sample.
         levels: Wavelet levels where it shows.
         forms: Other forms of a filter that explain about as much, as `term` and `sd`.
-        explained: Share of the discrepancy of powers beyond chance that all terms of the fit explain.
+        explained: Share of the discrepancy of powers beyond chance that all terms of the fit explain, in the sensors
+            that have any of them.
         fits: Whether what they leave is no more than chance; else the form is another one.
     """
 
@@ -235,7 +236,10 @@ def _searched(case: Case) -> Shape | None:
         return None
     nothing, left = fitness(data, data.expected), fitness(data, chosen.model)
     fits = left.p_value > FITS
-    explained = 1 - float(left.excess.clamp(min=0).sum() / nothing.excess.clamp(min=0).sum().clamp(min=1e-9))
+    # Where no term has a part, what differs has another cause.
+    concerned = torch.stack([t.free.any(0) for t in chosen.terms]).any(0)
+    excess = [float(f.excess[concerned].clamp(min=0).sum()) for f in (left, nothing)]
+    explained = 1 - excess[0] / max(excess[1], 1e-9)
     if not fits and explained < _LARGELY:
         return None
     seen = [_told(case, chosen, i) for i in range(len(chosen.terms))]
