@@ -157,13 +157,6 @@ def cross_fit(
     return CrossFit(optimism, low, high, left, torch.where(shown, gain_error, torch.nan), terms)
 
 
-def certain_fit(degrees: Tensor, confidence_level: float) -> CrossFit:
-    """Of weights chosen beforehand, from the degrees of freedom `(..., level)` of each level alone."""
-    one, nan = torch.ones_like(degrees), torch.full_like(degrees, torch.nan)
-    low, high = chi_square_interval(one, degrees, confidence_level)
-    return CrossFit(torch.zeros_like(one), low, high, one, nan, nan)
-
-
 def _relative_error(squares: Tensor, counts: Tensor, terms: Tensor, other: Tensor | None = None) -> Tensor:
     """Standard error `(item, level)` of the logarithm of a mean of squares, or of its ratio to another, by series."""
     total = counts.sum(1, keepdim=True)

@@ -238,11 +238,6 @@ def normal_scores(one: Tensor, other: Tensor, d: Tensor, s: Tensor) -> Tensor:
     return torch.where(s > 0, torch.where(above < below, size, -size), 0.0).nan_to_num(nan=0.0)
 
 
-def slow_fold(ordinate: int) -> int:
-    """Fold that holds out a slow ordinate."""
-    return (ordinate - 1) % N_FOLDS
-
-
 def slow_gains(case: Case, spectra: Callable[[Tensor, Tensor], Tensor], fold: int) -> Tensor:
     """Gain in log score of the slow ordinates that a fold holds out, dealt to its blocks, `(block,)`, nats.
 
