@@ -9,23 +9,16 @@ import json
 import numpy as np
 import pytest
 import torch
+from certain import certain_fit
 from scipy import optimize, stats
 from torch import Tensor
 
 from gyrofuse import ArrayModel, RandomWalk, WhiteNoise, fit_svo, svo_weights
 from gyrofuse.cross_fitting import CrossFit
 from gyrofuse.gain import ratio_to_equal
-from gyrofuse.uncertainty import chi_square_interval
 
 # Studies on recordings; the chance that a true claim is refused.
 N_RUNS, N_SENSORS, N_SAMPLES, REFUSED = 120, 4, 1024, 1e-3
-
-
-def certain_fit(degrees: Tensor, confidence_level: float) -> CrossFit:
-    """Of weights chosen beforehand, from the degrees of freedom `(..., level)` of each level alone."""
-    one, nan = torch.ones_like(degrees), torch.full_like(degrees, torch.nan)
-    low, high = chi_square_interval(one, degrees, confidence_level)
-    return CrossFit(torch.zeros_like(one), low, high, one, nan, nan)
 
 
 def drawn(*shape: int, seed: int = 1) -> Tensor:

@@ -10,12 +10,12 @@ import time
 import matplotlib
 import pytest
 import torch
+from certain import certain_fit
 from matplotlib import pyplot as plt
 from pages import Page
 from scipy import stats
 
 from gyrofuse import ConfidenceInterval, MultiScaleResult, Recording, SVOResult, fit_multiscale, fit_svo
-from gyrofuse.cross_fitting import certain_fit
 from gyrofuse.fusion import METHODS
 from gyrofuse.io.notes import Note
 from gyrofuse.rdvg import rdvg
