@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -60,15 +61,17 @@ class ArrayModel:
     def from_sensors(cls, models: Sequence[Model]) -> ArrayModel:
         """Array of independent sensors, each with a model of its own.
 
-        It is estimated from the records that all its models were estimated from; numbers of different sensors then
-        are uncorrelated. If one of the models counts as known, so does the array.
+        A batch of one, as the fit of one sensor gives it, is that sensor's. The array is estimated from the records
+        that all its models were estimated from; numbers of different sensors then are uncorrelated. If one of the
+        models counts as known, so does the array.
 
         Raises:
-            ValueError: No sensor, batched parameters, or a drift that is to be estimated.
+            ValueError: No sensor, a batch of more than one, or a drift that is to be estimated.
         """
         noise: list[tuple[Process, Tensor]] = []
         drifts = []
         unit = torch.eye(len(models), dtype=torch.float64)
+        models = [_of_one_sensor(model) for model in models]
         for gains, model in zip(unit, models, strict=True):
             for process in model.processes:
                 if isinstance(process, Drift):
@@ -199,6 +202,18 @@ class ArrayModel:
         """Sum over components of its term `(...)` times its covariance: `(..., sensor, sensor)`."""
         covariances = torch.stack([m.outer(m) if m.ndim == 1 else m for _, m in self.components])
         return torch.einsum("k...,kab->...ab", torch.stack(terms).to(covariances.device), covariances)
+
+
+def _of_one_sensor(model: Model) -> Model:
+    """The model of a batch of one; others as they are."""
+    values = [value for process in model.processes for value in process.parameters.values()]
+    shapes = [value.shape for value in values if isinstance(value, Tensor) and value.ndim]
+    if not shapes or any(shape.numel() != 1 for shape in shapes):
+        return model
+    params, told = model.params.reshape(-1), model.estimated_from
+    if told is not None and told.param_cov is not None:
+        told = replace(told, param_cov=told.param_cov.reshape(len(params), len(params)))
+    return model.with_params(params, estimated_from=told)
 
 
 def _own_params(process: Process, matrix: Tensor) -> dict[str, int]:

@@ -141,3 +141,12 @@ def test_the_jacobian_of_an_array_is_that_of_its_matrices_and_processes():
     assert not jacobian[:, 0, 0, 1].any()
     torch.testing.assert_close(jacobian[:, 0, 1, 3], 0.5 * own.spectrum_jacobian(FREQUENCIES)[:, 0])
     torch.testing.assert_close(jacobian[:, 0, 1, 4], -0.18 * white)
+
+
+def test_fits_of_one_sensor_each_make_an_array():
+    one = gf.fit_gmwm(signals(1, 2000), "WN")
+    array = gf.ArrayModel.from_sensors([one.model, one.model])
+    assert array.estimated_from.n_samples == 2000
+    torch.testing.assert_close(array.estimated_from.param_cov, one.param_cov.reshape(1) * torch.eye(2).double())
+    with pytest.raises(ValueError, match="expected scalar parameters, got a batch"):
+        gf.ArrayModel.from_sensors([gf.WhiteNoise(torch.ones(2)), TRUE])

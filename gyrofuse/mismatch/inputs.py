@@ -20,7 +20,7 @@ from gyrofuse.mismatch.known_lines import amplitudes
 from gyrofuse.mismatch.level_spread import with_spread
 from gyrofuse.mismatch.lines import simulated_lines
 from gyrofuse.mismatch.repaired import RepairedModel
-from gyrofuse.mismatch.spectral_uncertainty import SpectralUncertainty, as_array, own_record
+from gyrofuse.mismatch.spectral_uncertainty import SpectralUncertainty, as_array
 from gyrofuse.ranking_result import RankResult
 from gyrofuse.recording import Recording
 from gyrofuse.simulate import ArrayModel
@@ -56,8 +56,7 @@ def modelled(
                 "`simulation`: expected a ranking with the fit of every sensor in `best`, got one that lacks some; "
                 "rank with `fit=True` and without sensors that cannot be fitted"
             )
-        own = [m.with_params(m.params[0], estimated_from=own_record(m.estimated_from, 0)) for m in best]
-        simulation = ArrayModel.from_sensors(own)
+        simulation = ArrayModel.from_sensors(best)
     if isinstance(simulation, GMWMResult | ArrayGMWMResult | JointFit):
         simulation = simulation.model
     if fitted_samples is None:

@@ -34,7 +34,7 @@ def recording_of(arrays: dict[str, Any]) -> gf.Recording:
     return gf.Recording(signal, rate=float(arrays["fs"]), unit=str(arrays["unit"]), channels=channels)
 
 
-def simulation_of(given: dict[str, Any]) -> gf.Recording | gf.Model | gf.ArrayModel:
+def simulation_of(given: dict[str, Any]) -> gf.Recording | gf.Model | gf.ArrayModel | gf.RankResult:
     """Samples, a noise model, or one that is fitted to earlier records here."""
     if "fit" in given:
         return fitted(given)
@@ -43,16 +43,16 @@ def simulation_of(given: dict[str, Any]) -> gf.Recording | gf.Model | gf.ArrayMo
     return gf.ArrayModel.from_sensors(noise_models(given["terms"]))
 
 
-def fitted(given: dict[str, Any]) -> gf.Model | gf.ArrayModel:
+def fitted(given: dict[str, Any]) -> gf.Model | gf.ArrayModel | gf.RankResult:
     """The noise model that a user would fit to what was recorded earlier."""
     earlier = [gf.Recording(torch.as_tensor(x), rate=given["fs"]) for x in (given["gyro"], *given["more"])]
     by, model = given["fit"]["by"], given["fit"]["model"]
     if by == "array":
         return gf.fit_array_gmwm(earlier[0], model).model
     if by == "jointly":
-        return gf.fit_jointly(earlier, model).fit.model
+        return gf.fit_jointly(earlier, model).model
     if by == "ranked":
-        return gf.ArrayModel.from_sensors([fit.model for fit in gf.rank_models(earlier[0]).best])
+        return gf.rank_models(earlier[0])
     return gf.fit_gmwm(earlier[0], model, refine=by == "refined").model
 
 
