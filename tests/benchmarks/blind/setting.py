@@ -11,6 +11,7 @@ SENSORS = (1, 2, 3, 4, 6, 8, 9, 12, 16)
 RATES = (50.0, 2000.0)  # Hz
 REACHES = ("one", "some", "all")
 SHARES = (0.5, 1.0, 2.0)  # length of a simulation over that of the recording
+SHORTEST = 4096  # samples that a diagnosis asks for, of a simulation as well
 
 
 class Setting(NamedTuple):
@@ -25,8 +26,9 @@ class Setting(NamedTuple):
 
 def drawn(n_samples: int, rng: np.random.Generator) -> Setting:
     """A setting as some user has it, of at most so many samples: a power of two only by chance."""
+    shortest = max(0.4, SHORTEST / min(SHARES) / n_samples)
     return Setting(
-        int(n_samples * rng.uniform(0.4, 1.0)),
+        int(n_samples * rng.uniform(min(shortest, 1.0), 1.0)),
         float(math.exp(rng.uniform(math.log(RATES[0]), math.log(RATES[1])))),
         int(rng.choice(SENSORS)),
         str(rng.choice(REACHES)),
