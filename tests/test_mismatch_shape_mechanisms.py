@@ -38,8 +38,9 @@ from gyrofuse.mismatch.pooled import common_witness
 from gyrofuse.mismatch.shape_scan import shape_witness
 
 
-def test_white_noise_of_which_sensors_share_a_part_is_named_though_no_power_changes():
-    g, share = generator(32), 0.06
+@pytest.mark.parametrize("share", [0.06, 0.75])
+def test_white_noise_of_which_sensors_share_a_part_is_named_though_no_power_changes(share: float) -> None:
+    g = generator(32)
     own, simulation = array((1 - share) * WHITE).simulate(N, generator=g), array().simulate(N, batch=(1,), generator=g)
     gain = (share * WHITE * torch.tensor([1 + i / 20 for i in range(P)], dtype=torch.float64)).sqrt()
     given = case(own + gain[:, None] * torch.randn(1, N, generator=g, dtype=torch.float64), simulation)

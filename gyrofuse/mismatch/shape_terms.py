@@ -243,6 +243,9 @@ class Bump(Term):
         return replace(self, local=self.local.clamp(min=0.0), shared=_bump_within(self.shared, self.narrowest))
 
 
+_MOST = 0.9  # of a sensor's power that a fit starts with in a common source: where correlations still have a slope
+
+
 @dataclass(frozen=True, eq=False)
 class Common(Term):
     """Noise of one source in every sensor: local are the real and imaginary parts of the gains, or real ones alone.
@@ -267,15 +270,21 @@ class Common(Term):
         """What comes on top of a matrix `(..., sensor, sensor)` of a source."""
         return matrix - torch.diag_embed(matrix.diagonal(dim1=-2, dim2=-1)) if self.inside else matrix
 
-    def variants(self) -> list[Common]:
-        """The same in phase or not, on top or inside."""
+    def variants(self, ground: Ground) -> list[Common]:
+        """The same in phase or not, on top or inside; inside with gains of a part that is less than the whole."""
         aligned = self.free.clone()
         aligned[1] = False
         forms = [
             replace(self, free=aligned, local=self.local * aligned),
             replace(self, free=torch.ones_like(self.free)),
         ]
-        return [replace(form, inside=inside) for form in forms for inside in (False, True)]
+        return [*forms, *(replace(form, inside=True)._possible(ground) for form in forms)]
+
+    def _possible(self, ground: Ground) -> Common:
+        """With gains scaled down where the source would have more than `_MOST` of a sensor's power."""
+        source = self.shape(ground, self.shared)
+        part = (self.local.square().sum(0)[:, None] * source / ground.density).amax(-1)
+        return replace(self, local=self.local * (_MOST / part.clamp(min=_MOST)).sqrt())
 
     def shape(self, ground: Ground, shared: Tensor) -> Tensor:
         """Density of the source, `(..., place)`."""

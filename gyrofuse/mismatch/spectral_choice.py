@@ -390,7 +390,8 @@ def _varied(data: Ratios, found: Fit) -> Fit:
     *others, last = found.terms
     if type(last) is not Common:
         return found
-    forms = [[*others, form] for form in last.variants() if (form.turned, form.inside) != (last.turned, last.inside)]
+    other = [form for form in last.variants(data.ground) if (form.turned, form.inside) != (last.turned, last.inside)]
+    forms = [[*others, form] for form in other]
     # A part is no more than the whole.
     possible = [form for form in forms if bool(log_gain(data, data_model(data, form)).isfinite().all())]
     fits = [found, *(f for form in possible if keeps_own(f := fit(data, form)))]
