@@ -23,7 +23,7 @@ from shape_draws import (
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.mismatch.colour import filtered
+from gyrofuse.mismatch.colour import filtered, noise
 from gyrofuse.mismatch.confirm import held_out_gain
 from gyrofuse.mismatch.filter_forms import filter_response, filter_strength
 from gyrofuse.mismatch.mechanism import Mechanism
@@ -108,6 +108,20 @@ def test_a_filter_and_what_it_acts_on_are_found_one_after_the_other():
         given = found.effect.explained(given, generator(2))
         assert len(names) < 4
     assert names == ["drifting_tone", "low_pass"]
+
+
+def test_noise_that_falls_almost_as_flicker_noise_does_has_one_name():
+    """Strong `1/f` noise that is a tenth weaker at the highest frequencies: whatever bends a spectrum would mend it."""
+
+    def almost(f: Tensor) -> Tensor:
+        return (1 - 0.4 * f) / f
+
+    given = drawn(12, lambda x, g: x + 0.05 * noise(N, almost, P, g))
+    found = nominated(given)
+    assert found is not None
+    assert found.mechanism == "flicker"
+    assert "its form is not quite one of the catalogue" in found.sentence
+    assert nominated(found.effect.explained(given, generator(2))) is None
 
 
 def effects() -> dict[str, Mechanism]:

@@ -275,6 +275,18 @@ def test_parts_make_up_the_noise_and_move_as_their_numbers_say():
     )
 
 
+def test_what_an_ar1_of_a_sample_or_two_has_is_white():
+    """Beside white noise chance gives some to it: strong changes of the one must not leave the other behind."""
+    given = drawn(5)
+    coefficients = given.base.coefficients.clone()
+    coefficients[:, -2] = coefficients[:, 0] / 50
+    parts = Parts(replace(given.base, coefficients=coefficients), torch.linspace(0.01, 0.5, 50, dtype=torch.float64))
+    lower = torch.zeros(4, P, dtype=torch.float64)
+    lower[0] = -3.0
+    left = parts.shifted(lower) / parts.densities.sum(0)
+    assert (left[:, -25:] < 1.1 * math.exp(-3)).all()
+
+
 def test_a_walk_that_was_not_seen_may_grow():
     g = generator(8)
     plain = ArrayModel.from_sensors([gf.WhiteNoise(WHITE)] * P)

@@ -68,8 +68,8 @@ class Case:
         analog: The simulation's samples `(record, sensor, time)` before the converter; where they came rounded, as
             they may have been.
         converter: What it does to them, with the place of each in the chain.
-        bent: Complex gains `(sensor, frequency)` of filters that were built in though their form is another one: what
-            is left where they act is a matter of their form.
+        bent: Factors `(sensor, frequency)` by which powers were changed of what was built in though its form is another
+            one: what is left where it acts is a matter of its form.
     """
 
     scene: Scene

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.base import Base
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.colour import filtered
 from gyrofuse.mismatch.likelihoods.spectral import FLOOR
 from gyrofuse.mismatch.mechanism import Mechanism
-from gyrofuse.mismatch.shape_bands import slow_gains
+from gyrofuse.mismatch.shape_bands import deep_base, slow_gains
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +30,14 @@ class Spectral(Mechanism):
     company: tuple[Any, ...] = field(default=(), kw_only=True, metadata={"saved": False})
     approximate: bool = field(default=False, kw_only=True, metadata={"saved": False})
 
+    def factor(self, base: Base, f: Tensor) -> Tensor:
+        """What it makes of the powers of a simulation's noise, `(sensor, frequency)` at `f` cycles per sample."""
+        raise NotImplementedError
+
+    def built_into(self, case: Case, generator: torch.Generator) -> Case:
+        built = super().built_into(case, generator)
+        return replace(built, bent=(*built.bent, partial(self.factor, deep_base(case)))) if self.approximate else built
+
     def gains(self, case: Case, fold: int) -> Tensor:
         return super().gains(case, fold) + slow_gains(case, self.spectra, fold)
 
@@ -42,9 +52,8 @@ class Filter(Spectral):
     def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
         return filtered(signal, self.response)
 
-    def built_into(self, case: Case, generator: torch.Generator) -> Case:
-        built = super().built_into(case, generator)
-        return replace(built, bent=(*built.bent, self.response)) if self.approximate else built
+    def factor(self, base: Base, f: Tensor) -> Tensor:
+        return self.response(f).abs().square()
 
     def spectra(self, matrices: Tensor, f: Tensor) -> Tensor:
         gain = self.response(f).mT.to(matrices.dtype)  # (frequency, sensor)
@@ -57,6 +66,9 @@ class Addition(Spectral):
     def density(self, f: Tensor) -> Tensor:
         """Cross-spectral densities `(frequency, sensor, sensor)` at `f` cycles per sample."""
         raise NotImplementedError
+
+    def factor(self, base: Base, f: Tensor) -> Tensor:
+        return 1 + self.density(f).diagonal(dim1=-2, dim2=-1).real.mT / base.spectrum(f)
 
     def path(self, n_samples: int, generator: torch.Generator) -> Tensor:
         """One record of it, `(sensor, time)`."""

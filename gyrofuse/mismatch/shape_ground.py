@@ -40,8 +40,8 @@ class Parts:
         c = self.base.coefficients
         tau = torch.tensor((0.0, 0.0, *_time_constants(self.base.n_samples), math.inf), dtype=c.dtype)
         walk = (tau >= self.base.n_samples / (2 * math.pi) / _SLOW).expand_as(c)
-        fast = (tau < _FAST) & (tau > 0)
-        height = (c * fast / (1 - torch.exp(-1 / tau.clamp(min=1e-9))).square()).sum(-1, keepdim=True)
+        fast = ((tau < _FAST) & (tau > 0)).expand_as(c)
+        height = (c / (1 - torch.exp(-1 / tau.clamp(min=1e-9))).square())[:, fast[0]].sum(-1, keepdim=True)
         white = (tau == 0) | (fast & (height < _LITTLE * c[:, :1]))
         zero = torch.zeros_like(c)
         return torch.where(white, c, zero), torch.where(white | walk, zero, c), torch.where(walk, c, zero)

@@ -52,7 +52,7 @@ _STEEPER, _FLICKER = 4.0, 0.15  # nats that another slope gains, and distance fr
 _UNSTEADY = 0.01  # p value of either sign of a level that may change
 _OFF = 0.25  # logarithm by which a centre from wide bands may be off
 _ENOUGH = 50.0  # ordinates, to look for the shape of a spectrum
-_BENT = 0.05  # log power: where a filter of another form changed a band, what is left there is its form
+_BENT = 0.05  # log power: where what has another form changed a band, what is left there is its form
 
 
 Form = tuple[LowPass, tuple[Tensor, Tensor]]
@@ -168,8 +168,8 @@ def _kept(case: Case, blocks: Tensor, folds: Tensor) -> Ratios:
         half = N_JUDGED / case.n_samples  # tapers of a block widen a line so far
         inside = (places.amin(-1) - 2 * half < case.line.frequency) & (case.line.frequency < places.amax(-1) + 2 * half)
         usable[inside & (places.amin(-1) > half)] = 0.0
-    for response in case.bent:
-        changed = both.bands.mean_of(response(both.bands.places).abs().square())  # (sensor, band)
+    for factor in case.bent:
+        changed = both.bands.mean_of(factor(both.bands.places))  # (sensor, band)
         usable[(changed.clamp(min=1e-300).log().abs() > _BENT).mT] = 0.0
     return _ratios(case, both.bands, recorded, (matrices, s), usable)
 
@@ -231,11 +231,11 @@ def _searched(case: Case) -> Shape | None:
     if data.n_ordinates < _ENOUGH:
         return None
     p_seen = 1.0 if case.bent else shape_p_value(case)  # which looks where a filter's form is off as well
-    chosen = best_terms(data, differ=p_seen < FITS)
+    chosen, mended = best_terms(data, differ=p_seen < FITS)
     if chosen is None or _falls_otherwise(data, chosen):
         return None
     nothing, left = fitness(data, data.expected), fitness(data, chosen.model)
-    fits = left.p_value > FITS
+    fits = left.p_value > FITS and not mended
     # Where no term has a part, what differs has another cause.
     concerned = torch.stack([t.free.any(0) for t in chosen.terms]).any(0)
     excess = [float(f.excess[concerned].clamp(min=0).sum()) for f in (left, nothing)]

@@ -11,6 +11,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,7 +22,6 @@ from gyrofuse.mismatch.likelihoods.spectral import (
     Ratios,
     data_model,
     fit,
-    fitness,
     log_gain,
     pieces,
     power_gains,
@@ -41,8 +41,8 @@ _FORMS = 3  # of a filter, that are fitted
 _BEHIND = 0.02  # of what the best term gains in a sensor, by which others may be behind
 _HARDLY = 2.5  # number of a filter that changes the power at 0.45 of the rate by a third
 _CLOSER, _BESIDE = 3, 4  # times that a corner is looked for more closely, and places on either side
-_SAME = 0.05  # log power: below it a filter leaves a band as it was
-_MENDED = 0.05  # share of what a filter explains that a second term on its sensors has to add, where both overlap
+_SAME = 0.05  # log power: below it a term leaves a band as it was
+_MENDED = 0.05  # share of what terms explain that one more on their sensors has to add, where they overlap
 _OWN = 0.02  # of a sensor's power in any band, beside what is common
 _WIDTHS = (0.06, 0.15, 0.35)  # half width of a bump over its centre
 _HEIGHTS = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0)  # of a bump over the noise at its centre
@@ -50,29 +50,49 @@ _LOWEST = 16  # cycles per record: bumps below are colour
 _CORNERS = 8  # of common AR1s to start from
 
 
-def best_terms(data: Ratios, *, differ: bool) -> Fit | None:
+class Choice(NamedTuple):
+    """Terms that were chosen.
+
+    Attributes:
+        best: Their joint fit; None where no term pays.
+        mended: Whether a further term would pay that only mends the form of these.
+    """
+
+    best: Fit | None
+    mended: bool
+
+
+def best_terms(data: Ratios, *, differ: bool) -> Choice:
     """The terms of most evidence, one at least of what does differ, each in the sensors that take part."""
     best: Fit | None = None
-    value = -math.inf if differ else 0.0
+    value, mended = -math.inf if differ else 0.0, False
     for _ in range(_MOST):
         now = list(best.terms) if best else []
         tried = [_varied(data, _pruned(data, f)) for f in _likeliest(data, now)]
-        tried = [f for f in tried if best is None or _earned(data, best, f)]
-        top = max(tried, key=lambda f: evidence(data, f), default=None)
-        if top is None or evidence(data, top) <= value:
+        tried = [f for f in tried if evidence(data, f) > value]
+        earned = [f for f in tried if best is None or _earned(data, best, f, f.terms[-1])]
+        mended = len(earned) < len(tried)
+        if not earned:
             break
-        best, value = top, max(evidence(data, top), 0.0)
+        best = max(earned, key=lambda f: evidence(data, f))
+        value = max(evidence(data, best), 0.0)
     while best is not None and len(best.terms) > 1:
-        fewer = [[_freed(data, t) for t in best.terms if t is not gone] for gone in best.terms]
-        top = max((_pruned(data, fit(data, terms)) for terms in fewer), key=lambda f: evidence(data, f))
-        if evidence(data, top) <= value:
+        fewer = []
+        for gone in best.terms:
+            rest = _pruned(data, fit(data, [_freed(data, t) for t in best.terms if t is not gone]))
+            # Of terms that stand for another one's form together, the one that was found first may be one too many.
+            mends = evidence(data, rest) <= value and not _earned(data, rest, best, gone)
+            if mends or evidence(data, rest) > value:
+                fewer.append((rest, mends))
+        if not fewer:
             break
-        best, value = top, evidence(data, top)
+        best, mends = max(fewer, key=lambda entry: evidence(data, entry[0]))
+        value, mended = evidence(data, best), mended or mends
     if best is not None and data.n_sensors > 1:
         for i, term in enumerate(best.terms):
             if not isinstance(term, Common):
                 best = _of_partakers(data, best, i)
-    return best
+    return Choice(best, mended)
 
 
 def evidence(data: Ratios, found: Fit) -> float:
@@ -284,24 +304,20 @@ def _coherent(data: Ratios, before: Tensor, after: Fit) -> bool:
     return gained > _SHARED
 
 
-def _earned(data: Ratios, before: Fit, after: Fit) -> bool:
-    """Whether one more term is physics of its own, and does not mend the form of a filter that it stands beside.
+def _earned(data: Ratios, before: Fit, after: Fit, term: Term) -> bool:
+    """Whether a term that was added is physics of its own, and does not mend the form of those that it stands beside.
 
-    Where a filter's form is one that the catalogue only approximates, whatever bends a spectrum mends it. What is left
-    in bands that the filter leaves as they were is no matter of its form; elsewhere a term has to make the whole fit.
+    Where the form of a filter, or of noise on top, is one that the catalogue only approximates, whatever bends a
+    spectrum mends it. What is left in bands that all of them leave as they were is no matter of their form; elsewhere a
+    term has to add a share of what they explain. Other levels of what the simulation has keep its form.
     """
-    filters = [t for t in before.terms if isinstance(t, LowPass)]
-    if not filters or fitness(data, before.model).p_value > FITS:
-        return True
-    touched = filters[0].free[0] & after.terms[-1].free.any(0)
+    formed = [t.free.any(0) for t in before.terms if not isinstance(t, Shift)]
+    touched = torch.stack([torch.zeros_like(term.free[0]), *formed]).any(0) & term.free.any(0)
     if not bool(touched.any()):
         return True
     gained = power_gains(data, after.power) - power_gains(data, before.power)
     apart = (before.power.log().abs() < _SAME) | ~touched
-    if float((gained * apart).sum()) > _NEW:
-        return True
-    mended = after.gain - before.gain > _MENDED * before.gain
-    return mended and fitness(data, after.model).p_value > FITS
+    return float((gained * apart).sum()) > _NEW or after.gain - before.gain > _MENDED * before.gain
 
 
 def _of_partakers(data: Ratios, found: Fit, i: int) -> Fit:
