@@ -33,9 +33,11 @@ from gyrofuse.mismatch.mechanisms.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.low_pass import LowPassFilter
 from gyrofuse.mismatch.mechanisms.parameter_shift import ParameterShift
 from gyrofuse.mismatch.mechanisms.resonance import Resonance
+from gyrofuse.mismatch.mechanisms.unit_scale import GRAVITY, UnitScale
 from gyrofuse.mismatch.oscillating import Mode
 from gyrofuse.mismatch.pooled import common_witness
 from gyrofuse.mismatch.shape_scan import shape_witness
+from gyrofuse.simulate import ArrayModel
 
 
 @pytest.mark.parametrize("share", [0.06, 0.75])
@@ -108,6 +110,28 @@ def test_a_filter_and_what_it_acts_on_are_found_one_after_the_other():
         given = found.effect.explained(given, generator(2))
         assert len(names) < 4
     assert names == ["drifting_tone", "low_pass"]
+
+
+def test_one_sensor_of_many_that_is_louder_has_nothing_in_common_with_the_others():
+    """Gains of eleven others follow chance, most of all in the few ordinates that show a walk."""
+    g, sensor = generator(40), gf.WhiteNoise(0.1) + gf.AR1(0.9999, 1e-9) + gf.RandomWalk(5e-10)
+    louder = gf.WhiteNoise(0.46) + gf.AR1(0.9999, 5e-9) + gf.RandomWalk(4e-9)
+    recorded = ArrayModel.from_sensors([louder, *[sensor] * 11]).simulate(11291, generator=g)
+    found = nominated(case(recorded, ArrayModel.from_sensors([sensor] * 12).simulate(11291, batch=(1,), generator=g)))
+    assert found is not None
+    assert (found.mechanism, found.sensors) == ("parameter_shift", (0,))
+
+
+def test_less_white_noise_is_no_other_unit_though_it_has_most_bands():
+    def sensors(white: float) -> ArrayModel:
+        return ArrayModel.from_sensors([gf.WhiteNoise(white) + gf.RandomWalk(1e-9)] * 2)
+
+    g = generator(41)
+    simulation = sensors(1e-4).simulate(N, batch=(1,), generator=g)
+    quieter = sensors(1e-4 / GRAVITY**2).simulate(N, generator=g)
+    assert UnitScale.nominate(case(quieter, simulation), 1e-3) is None
+    in_g = sensors(1e-4).simulate(N, generator=g) / GRAVITY
+    assert UnitScale.nominate(case(in_g, simulation), 1e-3) is not None
 
 
 def test_noise_that_falls_almost_as_flicker_noise_does_has_one_name():

@@ -36,7 +36,11 @@ _QUICK, _KEPT = 8, 4  # rounds of a first look; classes looked at closely
 _NEW = 8.0  # nats of evidence that one more term has to bring
 _PART = 4.0  # nats for each further part of the noise whose numbers are others
 _NUMBER = 2.0  # nats for a number of a sensor: those of sensors that have it are alike
-_SHARED = 5.0  # nats that correlations gain by what is said to be common
+_SHARED = 5.0  # nats that correlations gain by what is said to be common, beyond chance
+_IN_COMMON, _FEW = (
+    0.1,
+    0.2,
+)  # share of a second sensor's power for a band to show a source, and least factor of Bartlett
 _FORMS = 3  # of a filter, that are fitted
 _BEHIND = 0.02  # of what the best term gains in a sensor, by which others may be behind
 _HARDLY = 2.5  # number of a filter that changes the power at 0.45 of the rate by a third
@@ -296,12 +300,21 @@ def _given_over(data: Ratios, found: Fit) -> Fit:
 
 
 def _coherent(data: Ratios, before: Tensor, after: Fit) -> bool:
-    """Whether sensors share what a common source gives them: powers alone are had from noise of their own."""
-    if not isinstance(after.terms[-1], Common):
+    """Whether sensors share what a common source gives them: powers alone are had from noise of their own.
+
+    Numbers of gains follow chance, by half a nat each where many ordinates have the source, by more in few of them
+    (Bartlett's factor of independence, at most fivefold); twice that is asked for.
+    """
+    term = after.terms[-1]
+    if not isinstance(term, Common):
         return True
     gained = after.gain - float((log_gain(data, before) + power_gains(data, after.power).sum(-1)).sum())
     gained += float(power_gains(data, before.diagonal(dim1=-2, dim2=-1).real).sum())
-    return gained > _SHARED
+    source = data.ground.bands.mean_of(term.shape(data.ground, term.shared))  # (band,)
+    share = term.local.square().sum(0) * source[:, None] / (data.ground.mean.mT * after.power)
+    has = share.topk(2).values[:, -1] > _IN_COMMON
+    few = (2 * data.n_sensors + 11) / (6 * float(data.d[has].sum()) + 1e-9)
+    return gained > _SHARED + float(term.free[:, 1:].sum()) / max(1 - few, _FEW)
 
 
 def _earned(data: Ratios, before: Fit, after: Fit, term: Term) -> bool:

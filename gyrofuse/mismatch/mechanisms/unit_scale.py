@@ -21,6 +21,7 @@ _UNITS = {
     3600 * 180 / math.pi: "deg/h against rad/s",
     GRAVITY: "m/s^2 against g",
 }
+_ALIKE, _MOST = 0.5, 0.8  # logarithm by which a band may be off, where something else is missing, and share of bands
 _NEAR = 0.25  # of the logarithm: noise levels of sensors of one kind differ by as much
 
 
@@ -38,10 +39,15 @@ class UnitScale(Mechanism):
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:
         known = case.simulated.dof > 0
-        ratios = (case.recorded.power / case.simulated.power)[:, known].log().median(-1).values / 2  # (sensor,)
+        ratios = (case.recorded.power / case.simulated.power)[:, known].log() / 2  # (sensor, band)
+        middle = ratios.median(-1).values
+        # A unit is one factor at all frequencies; other numbers of white noise move most bands, too.
+        alike = ((ratios - middle[:, None]).abs() < _ALIKE).double().mean(-1) > _MOST
+        if not bool(alike.all()):
+            return None
         for size, words in _UNITS.items():
             for sign in (1, -1):
-                if bool(((ratios - sign * math.log(size)).abs() < _NEAR).all()):
+                if bool(((middle - sign * math.log(size)).abs() < _NEAR).all()):
                     return cls._found(
                         case, size**sign, words if sign == 1 else " against ".join(words.split(" against ")[::-1])
                     )
