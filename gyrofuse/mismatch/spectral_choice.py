@@ -37,10 +37,8 @@ _NEW = 8.0  # nats of evidence that one more term has to bring
 _PART = 4.0  # nats for each further part of the noise whose numbers are others
 _NUMBER = 2.0  # nats for a number of a sensor: those of sensors that have it are alike
 _SHARED = 5.0  # nats that correlations gain by what is said to be common, beyond chance
-_IN_COMMON, _FEW = (
-    0.1,
-    0.2,
-)  # share of a second sensor's power for a band to show a source, and least factor of Bartlett
+_IN_COMMON = 0.1  # share of a second sensor's power, for a band to show a source
+_FEW = 0.2  # least factor of Bartlett's
 _FORMS = 3  # of a filter, that are fitted
 _BEHIND = 0.02  # of what the best term gains in a sensor, by which others may be behind
 _HARDLY = 2.5  # number of a filter that changes the power at 0.45 of the rate by a third
