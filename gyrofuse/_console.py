@@ -45,9 +45,21 @@ class Commands(TyperGroup):
             raise typer.Exit(2) from None
 
 
+@contextmanager
+def _written() -> Iterator[None]:
+    """Errors of writing to stdout, by its name: files that a command made are there all the same."""
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise OSError(f"standard output: {error.strerror}; files that were asked for are written") from None
+
+
 def say(text: str) -> None:
     """Print text to stdout as it is, but for what would steer a terminal."""
-    print(_printable(text))
+    with _written():
+        print(_printable(text), flush=True)
 
 
 def say_table(head: Sequence[str], rows: Sequence[Sequence[str]], right: Collection[int] = ()) -> None:
@@ -63,7 +75,8 @@ def say_table(head: Sequence[str], rows: Sequence[Sequence[str]], right: Collect
         table.add_column(Text(_printable(head[i])) if head else "", justify="right" if i in right else "left")
     for row in rows:
         table.add_row(*(Text(_printable(cell)) for cell in row))
-    Console(width=None if sys.stdout.isatty() else 10_000).print(table)
+    with _written():
+        Console(width=None if sys.stdout.isatty() else 10_000).print(table)
 
 
 def progress(what: str) -> AbstractContextManager[Any]:

@@ -55,6 +55,7 @@ from gyrofuse.cli_shared import (
     write_json,
 )
 from gyrofuse.demo import FILES, run_demo
+from gyrofuse.io.limits import physical_memory
 from gyrofuse.multiscale import fit_multiscale
 from gyrofuse.multiscale_result import MultiScaleResult
 from gyrofuse.parsing import parse_model
@@ -100,7 +101,11 @@ def _version(wanted: bool) -> None:
     if wanted:
         from gyrofuse import __version__
 
-        print(f"gyrofuse {__version__}")
+        try:
+            print(f"gyrofuse {__version__}", flush=True)
+        except OSError as error:
+            print(f"error: standard output: {error.strerror}", file=sys.stderr)
+            raise typer.Exit(2) from None
         raise typer.Exit
 
 
@@ -290,6 +295,7 @@ def simulate(
             own = f"{len(each)} sensors" if len(each) > 1 else "a whole array"
             raise ValueError(f"`--sensors`: {model} is a model of {own}; leave the option out")
         batch = () if whole or len(each) > 1 else (1 if sensors is None else sensors,)
+        _check_memory(samples, noise.n_sensors if isinstance(noise, ArrayModel) else max(len(each), *batch, 1))
         with progress("simulating"):
             signal = noise.simulate(samples, batch=batch, generator=generator).flatten(0, -2)
         recording = Recording(signal, rate=rate, unit=unit)
@@ -302,6 +308,16 @@ def simulate(
             drafts[report].write_text(page, encoding="utf-8")
     say("\n".join(map(str, each)))
     say(f"{signal.shape[0]} x {samples} samples at {rate:g} Hz, seed {seed}, in {out}")
+
+
+def _check_memory(samples: int, sensors: int) -> None:
+    """Refuse what cannot be held, before anything is simulated."""
+    needed, there = 8.0 * samples * sensors, physical_memory()
+    if needed > there:
+        raise ValueError(
+            f"`--samples`: expected what fits into {there / 2**30:.3g} GiB of memory, got {samples:.3g} samples of "
+            f"{sensors} sensor(s), {needed / 2**30:.3g} GiB; ask for fewer"
+        )
 
 
 def _each(noise: Any) -> list[Any]:

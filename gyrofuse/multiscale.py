@@ -176,8 +176,13 @@ class MultiScaleSVO(nn.Module):
 
         Args:
             signal: `(..., sensor, time)`, of the dimensions, dtype and device of the chunks to come.
+
+        Raises:
+            TypeError: `signal` is not a floating point tensor.
+            ValueError: It has fewer than two dimensions.
         """
         self._check_fitted()
+        check_signal("signal", signal)
         return signal.new_zeros(*signal.shape[:-1], 2 ** (self.weights.shape[-2] - 1) - 1)
 
     def forward(self, signal: Tensor, state: Tensor | None = None) -> Tensor | tuple[Tensor, Tensor]:

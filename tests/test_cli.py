@@ -719,3 +719,24 @@ def test_a_defect_is_one_line_and_a_traceback_on_demand(
     with pytest.raises(KeyError, match="lost"):
         cli.main(["--debug", "fuse", str(log), "--out", "v.npz"])
     assert list(contents(tmp_path)) == ["log.npz"]
+
+
+def test_simulation_of_more_than_memory_holds_is_refused(run: Run, tmp_path: Path) -> None:
+    out = tmp_path / "much.npz"
+    outcome = run("simulate", "WN(variance=1)", "--rate", 1, "--samples", 10**12, "--sensors", 3, "--out", out)
+    refused(outcome, "`--samples`: expected what fits into ")
+    assert not out.exists()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_a_standard_output_that_takes_nothing_is_named_and_files_are_written(log: Path) -> None:
+    out = log.with_name("fused.npz")
+    for arguments in (["--version"], ["fuse", str(log), "--out", str(out)]):
+        with open("/dev/full", "w") as full:
+            ended = subprocess.run(
+                [sys.executable, "-m", "gyrofuse", *arguments], stdout=full, stderr=subprocess.PIPE, text=True
+            )
+        assert ended.returncode == 2
+        assert ended.stderr.startswith("error: standard output: ")
+        assert len(ended.stderr.splitlines()) == 1
+    assert out.exists()

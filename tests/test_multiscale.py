@@ -500,3 +500,10 @@ def test_a_useless_sensor_is_named():
     signal[2] = signal[0] / 57.3
     with pytest.raises(SingularCovarianceError, match="sensors 1 and 3 are copies"):
         fit_multiscale(signal)
+
+
+def test_a_stream_starts_from_tensors_alone() -> None:
+    svo = MultiScaleSVO()
+    svo.fit(SIGNAL)
+    with pytest.raises(TypeError, match="`signal`"):
+        svo.start(SIGNAL.numpy())  # type: ignore[arg-type]
