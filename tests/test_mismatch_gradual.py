@@ -115,10 +115,11 @@ def test_a_ramp_is_all_that_differs(depth: float):
     assert report.held_out.after < 1.5
 
 
-def test_an_episode_is_none():
-    for seed in (20, 21):
+@pytest.mark.parametrize("louder", [0.5, 1.5])
+def test_an_episode_is_none(louder: float):
+    for seed in (20, 21, 22):
         recording, simulation, g = drawn(seed, records=2)
-        recording[:2, 5000:9000] += 1.5 * normal(2, 4000, g=g)
+        recording[:2, 5000:9000] += louder * normal(2, 4000, g=g)
         case = Case.of(SCENE, recording, simulation)
         assert GradualChange.nominate(case, LEVEL) is None
         assert nominated(case, VarianceChange).sensors == (0, 1)

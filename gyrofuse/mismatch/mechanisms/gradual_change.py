@@ -24,7 +24,7 @@ from gyrofuse.mismatch.episodes import stretch_of
 from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.loudness import Loudness, corner_of, fast_factor, fast_share, whitened_factor
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
-from gyrofuse.mismatch.mechanisms.variance_change import likeliest_episodes, worth_of_modulation
+from gyrofuse.mismatch.mechanisms.variance_change import goes_up_and_down, likeliest_episodes, worth_of_modulation
 from gyrofuse.mismatch.noise_level import compared_levels, levelled, modulation_of, own_spread, variance_p_value
 
 _NATS = 5.0  # by which it has to be likelier than episodes with a start and a stop
@@ -76,6 +76,9 @@ class GradualChange(Mechanism):
         if episodes is not None:
             at_once = course_at_once(white, episodes.inside(case.n_samples), episodes.factor != 1)
             once = worth_of_course(white, at_once, weight, len(episodes.episodes))
+            if not goes_up_and_down(case, episodes):
+                # A single one is a course as well: another that may be it has to gain more than orders do by chance.
+                once += 2 * math.log(case.n_samples)
         if worth < once + _NATS or _goes_up_and_down(case, course, worth):
             return None
         peak = course.share > _MOSTLY

@@ -72,7 +72,7 @@ class VarianceChange(Mechanism):
         if p_value > level:
             return None
         white, found = levelled(case), likeliest_episodes(case)
-        if found is None or _goes_up_and_down(case, found):
+        if found is None or goes_up_and_down(case, found):
             return None
         held = _held(case, found) or _held(case, stretch_of(white))
         if held is None:
@@ -201,7 +201,7 @@ def _from_the_simulated_level(case: Case, found: Episodes) -> Episodes:
     return found.other_way_round(case.n_samples) if off(~inside) > off(inside) + _NATS else found
 
 
-def _goes_up_and_down(case: Case, found: Episodes) -> bool:
+def goes_up_and_down(case: Case, found: Episodes) -> bool:
     """Whether a level that is modulated all the time says more than episodes with a start and a stop.
 
     By far, but where the level is not the simulation's between episodes either. If a lot is said, where the level still
