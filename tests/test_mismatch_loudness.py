@@ -46,8 +46,8 @@ def test_what_is_added_is_as_loud_as_it_says_and_can_be_taken_off():
 def test_another_length_has_as_large_a_share_of_it():
     for n in (1000, N // 2, N, 100_000):
         other = Loudness(INSIDE, torch.ones(1), 0.1).of_length(n)
-        assert len(other.inside) == n
-        assert float(other.inside.double().mean()) == pytest.approx(20_000 / N, abs=2 / n)
+        assert len(other.course) == n
+        assert float(other.course.double().mean()) == pytest.approx(20_000 / N, abs=2 / n)
 
 
 def test_the_corner_is_where_slow_noise_hides_what_is_louder():

@@ -28,6 +28,7 @@ from gyrofuse.mismatch.mechanisms.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.drifting_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.g_sensitivity import GSensitivity
+from gyrofuse.mismatch.mechanisms.gradual_change import GradualChange
 from gyrofuse.mismatch.mechanisms.low_pass import LowPassFilter
 from gyrofuse.mismatch.mechanisms.parameter_shift import ParameterShift
 from gyrofuse.mismatch.mechanisms.quadratic_coupling import QuadraticCoupling
@@ -81,6 +82,7 @@ EVERY = (
     WarmUpTransient(numbers(1 / 3, 0.0), torch.zeros(2, 4, dtype=torch.float64), 2.3),
     Step(numbers(0.0, 1 / 3), torch.zeros(2, 4, dtype=torch.float64), 3.3),
     VarianceChange(((1.5, 3.25), (6.0, 7.0)), numbers(2.0, 1.0), 1 / 3),
+    GradualChange(numbers(0.0, 1 / 3, 9.0), numbers(0.0, 0.7, 1.0), numbers(0.9, 1.0), numbers(1 / 3, 1.0), 0.1),
     ParameterShift(BASE, torch.tensor([[0.1, 0.0], [1 / 3, 0.0], [0.0, 0.0], [0.2, 0.1]], dtype=torch.float64)),
     LowPassFilter("pole", numbers(0.7, 0.0)),
     Resonance(MODE),

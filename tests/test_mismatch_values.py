@@ -216,3 +216,28 @@ def test_a_largest_value_that_recurs_on_a_fine_lattice_is_no_end_stop() -> None:
         first, second = row.topk(2).indices.tolist()
         row[second] = row[first]
     assert min(end.p_value for end in marginals.end_stops(Case.of(SCENE, recording, simulation))) > LEVEL
+
+
+@pytest.mark.parametrize("width", [0.002, 0.02, 0.2, 0.6, 1.0])
+def test_a_dead_band_is_no_repeats_and_no_hidden_lattice_however_wide_it_is(width: float) -> None:
+    """Half of all samples are zero in the widest one, many of them one after the other."""
+    recording, simulation, g = drawn(60, records=2)
+    recording -= recording.mean(-1, keepdim=True) - torch.tensor([[0.0], [0.3], [-0.2]])
+    recording[:2] = torch.where(recording[:2].abs() < width, 0.0, recording[:2])
+    case = Case.of(SCENE, recording, simulation)
+    assert StuckSamples.nominate(case, LEVEL) is None
+    found = nominated(case, Quantization)
+    assert found.sensors == (0, 1)
+    assert covers(found, "dead_band[0]", width)
+    assert covers(found, "dead_band[1]", width)
+    after = found.effect.explained(case, g)
+    assert Quantization.nominate(after, LEVEL) is None
+    assert StuckSamples.nominate(after, LEVEL) is None
+    assert marginals.marginal_witness(after).p_value > 0.001
+
+
+def test_a_value_filled_in_is_no_dead_band() -> None:
+    recording, simulation, g = drawn(61, records=2)
+    recording[0, even(N, g=g) < 0.02] = 0.1
+    found = Quantization.nominate(Case.of(SCENE, recording, simulation), LEVEL)
+    assert found is None or "dead_band[0]" not in found.parameters

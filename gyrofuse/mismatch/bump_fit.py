@@ -133,7 +133,7 @@ def _in_cells(case: Case, stretch: Stretch) -> Oscillation | None:
     coherence = smooth_coherence(case.simulated.coherence, case.simulated.dof)
     band = int(band_of(torch.tensor(float(centre)), n, case))
     expected = coherence[band].expand(2 * count, -1, -1)
-    recorded, simulated = (Side(case.recorded.noise, local).spectra, dof), (ground.mean.mT, exact(dof))
+    recorded, simulated = (Side(case.recorded.steady, local).spectra, dof), (ground.mean.mT, exact(dof))
     data = Ratios.of(ground, recorded, simulated, expected, torch.ones_like(ground.mean.mT))
     background = fit(data, [Background.start(case.n_sensors)])
     return _best(case, stretch, data, background)

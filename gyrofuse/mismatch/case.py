@@ -18,6 +18,7 @@ from torch import Tensor
 from gyrofuse.mismatch.base import Base
 from gyrofuse.mismatch.known_lines import without_lines
 from gyrofuse.mismatch.lines import FoundLine, simulated_lines, strongest_line, whitened
+from gyrofuse.mismatch.loudness import Loudness
 from gyrofuse.mismatch.side import Side
 from gyrofuse.mismatch.spectra import Bands, bands
 
@@ -182,6 +183,15 @@ class Case:
         for _, converted in converter:
             signal = converted(signal)
         return replace(self, simulated=replace(self.simulated, signal=signal), analog=analog, converter=converter)
+
+    def made_louder(self, known: Loudness) -> Case:
+        """With a course of the level built into the simulation, and known of both sides where noise is looked at."""
+        built = self.built_in(lambda signal: known.of_length(signal.shape[-1]).added(signal))
+        recorded, simulated = (
+            replace(side, loud=(*side.loud, known.of_length(side.signal.shape[-1])))
+            for side in (built.recorded, built.simulated)
+        )
+        return replace(built, recorded=recorded, simulated=simulated)
 
 
 def _in_unit(act: Callable[[Tensor], Tensor], factor: float, signal: Tensor) -> Tensor:

@@ -329,16 +329,20 @@ def _harmonic(peak: float, step: float, sd: float) -> bool:
 
 def _not_simulated(case: Case, sensor: int, own: Lattice) -> Lattice | None:
     """A lattice of the recording, with the p value of its being no clearer than the simulation's; `None` if exact."""
-    records, other = case.simulated.signal[:, sensor], exact_lattices(case.simulated)[sensor]
+    other = exact_lattices(case.simulated)[sensor]
     if own.blur == 0:
         return None if other is not None and other.step > own.step * (1 - _SAME_STEP) else own
     if other is not None and _harmonic(own.peak, other.step, float(case.recording[sensor].std())):
         return None  # what is taken off a recording blurs its own, of which harmonics may be left
-    u, n, m = torch.tensor([own.peak], dtype=torch.float64), case.n_samples, records.numel()
-    power = float(_power(case.recording[sensor] - case.recording[sensor].mean(), u))
+    # Each value counts once here as well: where one of them stands for all around it, what is missing shows.
+    values, u = _distinct(case.recorded)[sensor][0], torch.tensor([own.peak], dtype=torch.float64)
+    records = [row.unique() for row in case.simulated.signal[:, sensor]]
+    n, m = len(values), sum(map(len, records))
+    power = float(_power(values - values.mean(), u))
     # Its records share one lattice, or each lies about its own mean: one that was built in does.
-    about = (records.mean(), records.mean(-1, keepdim=True))
-    other_power = max(float(_power((records - mean).flatten(), u)) for mean in about)
+    every = torch.cat(records)
+    about = every - every.mean(), torch.cat([row - row.mean() for row in records])
+    other_power = max(float(_power(centred, u)) for centred in about)
     if other_power < -math.log(_SIMULATED):
         return own
     clearer = max(math.sqrt(power / n) - math.sqrt(other_power / m), 0.0)

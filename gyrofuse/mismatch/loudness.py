@@ -1,10 +1,10 @@
-"""Episodes in which noise is louder, as they act on records, and from which frequency on they do."""
+"""Courses of the level of noise, as they act on records, and from which frequency on they do."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -16,34 +16,39 @@ _FEWEST = 256  # samples of episodes that tell from which frequency on they are 
 _CORNER = 1 / 64  # cycles per sample, for shorter ones
 _HIGHEST = 4  # of the corners that are tried, octaves below one cycle per sample
 _AS_GOOD = 4.0  # difference of chi-squares that is chance
+_STEP = 0.2  # of a log variance between filters: amplitudes in between are then off by a thousandth
 _LEAST = 0.1  # of a whitened factor: the fast noise is not quieter than that
 
 
 @dataclass(frozen=True, eq=False)
 class Loudness:
-    """Density `1 + (r - 1) f^2 / (f^2 + f_c^2)` times what it is outside: white noise that is louder, above a walk.
+    """Density `1 + (r - 1) f^2 / (f^2 + f_c^2)` times what it was: white noise that is louder, above a walk.
+
+    With `r = b q^c` and a course `c` that all sensors have.
 
     Attributes:
-        inside: `(time,)`.
-        factor: `r`, `(sensor,)`, of the variance; 1 where a sensor does not change.
+        course: `c`, `(time,)`, from 0 to 1; of an episode whether a sample is inside.
+        factor: `q`, `(sensor,)`, of the variance where the course is 1; 1 where a sensor does not change.
         corner: `f_c`, cycles per sample: what is slower stays as it is.
+        base: `b`, `(sensor,)`, of the variance where the course is 0.
     """
 
-    inside: Tensor
+    course: Tensor
     factor: Tensor
     corner: float
+    base: Tensor | float = 1.0
 
     @property
     def variance(self) -> Tensor:
         """Of whitened samples, `(sensor, time)`."""
-        return torch.where(self.inside, whitened_factor(self.factor, self.corner)[:, None], 1.0)
+        return whitened_factor(self._log_level().exp(), self.corner)
 
     def of_length(self, n_samples: int) -> Loudness:
         """In a record of another length, at the same share of it."""
-        n = len(self.inside)
+        n = len(self.course)
         if n_samples == n:
             return self
-        return Loudness(self.inside[torch.arange(n_samples) * n // n_samples], self.factor, self.corner)
+        return replace(self, course=self.course[torch.arange(n_samples) * n // n_samples])
 
     def added(self, signal: Tensor) -> Tensor:
         """Signals `(..., sensor, time)` with it."""
@@ -53,9 +58,31 @@ class Loudness:
         """Signals `(..., sensor, time)` that have it, without."""
         return self._times(signal, -0.5)
 
+    def _log_level(self) -> Tensor:
+        """`log r`, `(sensor, time)`."""
+        base = torch.as_tensor(self.base, dtype=self.factor.dtype).expand_as(self.factor)
+        return base.log()[:, None] + self.factor.log()[:, None] * self.course.to(self.factor.dtype)
+
     def _times(self, signal: Tensor, power: float) -> Tensor:
-        louder = filtered(signal, lambda f: (1 + (self.factor - 1)[:, None] * fast_share(f, self.corner)).pow(power))
-        return torch.where(self.inside, louder, signal)
+        """Through a filter for each of several levels, and in between what is in between."""
+        level = self._log_level()
+        low, high = level.amin(-1, keepdim=True), level.amax(-1, keepdim=True)
+        steps = max(math.ceil(float((high - low).max()) / _STEP), 1)
+        place = steps * (level - low) / (high - low).clamp(min=1e-12)
+        total = torch.zeros_like(signal)
+        for step in range(steps + 1):
+            weight = (1 - (place - step).abs()).clamp(min=0)
+            if bool(weight.any()):
+                r = (low + (high - low) * step / steps).exp()
+                total = total + weight * _louder(signal, r, self.corner, power)
+        return total
+
+
+def _louder(signal: Tensor, r: Tensor, corner: float, power: float) -> Tensor:
+    """Signals `(..., sensor, time)` whose fast noise has a variance `(sensor, 1)` times what it was."""
+    if bool((r == 1).all()):
+        return signal
+    return filtered(signal, lambda f: (1 + (r - 1) * fast_share(f, corner)).pow(power))
 
 
 def fast_share(f: Tensor, corner: float) -> Tensor:

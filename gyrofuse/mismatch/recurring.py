@@ -21,6 +21,7 @@ from gyrofuse.mismatch.side import Side
 _CONTINUOUS = 0.5  # share of samples with a value of their own
 _NEIGHBOURS, _MORE = 64, 4096  # on either side: that tell how dense values are, and how fine
 _FEWEST = 4  # times, of a value that is not known from another sensor
+_ANOTHER_LAW = 1.5  # factor by which a law may differ from a normal one across a band
 _OWN = 1e-3  # p value of a value that recurs in the simulation
 
 
@@ -31,8 +32,11 @@ class Recurring(NamedTuple):
         sensor: Position.
         value: It.
         times: How often it was reached, in one or several records.
+        samples: That have it, those included that the one before had it as well.
         expected: By chance.
         density: Of samples around it, per unit of the signal.
+        told_by: Samples that tell it.
+        middle, spread: Mean and standard deviation of all values.
         below, above: The values next to it.
         places: Values that could have recurred.
     """
@@ -40,8 +44,12 @@ class Recurring(NamedTuple):
     sensor: int
     value: float
     times: int
+    samples: int
     expected: float
     density: float
+    told_by: int
+    middle: float
+    spread: float
     below: float
     above: float
     places: int
@@ -63,9 +71,12 @@ def recurring(sensor: int, values: Tensor, value: float | None = None) -> Recurr
     new = torch.ones(len(values), dtype=torch.bool)
     new[1:] = values[1:] != values[:-1]  # what is held is no return
     unique, counts = torch.unique(values[new], return_counts=True)
-    if len(unique) < max(_CONTINUOUS * len(values), 4 * _NEIGHBOURS):
+    if len(unique) < 4 * _NEIGHBOURS:
         return None
     at = int(counts[1:-1].argmax()) + 1  # ends are a matter of limits
+    # However wide a band is, the values beside it are their own.
+    if len(unique) < _CONTINUOUS * int(counts.sum() - counts[at]):
+        return None
     if value is not None:
         at = min(max(int(torch.searchsorted(unique, value)), 1), len(unique) - 2)
         if float(unique[at]) != value:
@@ -76,7 +87,8 @@ def recurring(sensor: int, values: Tensor, value: float | None = None) -> Recurr
     finest = float(unique[max(at - _MORE, 0) : at + _MORE + 1].diff().min())
     gap = float(unique[at + 1] - unique[at - 1])
     wide = float(unique[high] - unique[low]) - gap
-    density = float(counts[low : high + 1].sum() - counts[at]) / max(wide, 1e-300)
+    told_by = int(counts[low : high + 1].sum() - counts[at])
+    density = told_by / max(wide, 1e-300)
     # Values near a lattice finer than the noise, such as that of rounded floats, recur as their neighbours do.
     around = torch.cat([counts[low:at], counts[at + 1 : high + 1]]).to(torch.float64)
     expected = max(density * finest, float((around * (around - 1)).sum() / around.sum()))
@@ -84,8 +96,12 @@ def recurring(sensor: int, values: Tensor, value: float | None = None) -> Recurr
         sensor,
         float(unique[at]),
         int(counts[at]),
+        int((values == unique[at]).sum()),
         expected,
         density,
+        told_by,
+        float(values.mean()),
+        float(values.std()),
         float(unique[at - 1]),
         float(unique[at + 1]),
         len(unique) if value is None else 1,
@@ -121,8 +137,16 @@ def band_limits(found: Recurring) -> tuple[float, float, float]:
 
 
 def fits_band(found: Recurring) -> bool:
-    """Whether as many samples are missing around the value as returned to it: it is not one that was filled in."""
-    missing = 2 * min(found.value - found.below, found.above - found.value) * found.density
-    least, most = stats.chi2.ppf(_OWN, 2 * found.times) / 2, stats.chi2.isf(_OWN, 2 * found.times + 2) / 2
+    """Whether as many samples are missing around the value as returned to it: it is not one that was filled in.
+
+    What is missing is told by the density beside the band, as a normal law has it within; other laws are not far off.
+    """
+    reach, law = min(found.value - found.below, found.above - found.value), stats.norm(found.middle, found.spread)
+    ends = found.value - reach, found.value + reach
+    beside = float(law.pdf(ends[0]) + law.pdf(ends[1])) / 2
+    wide = float(law.cdf(ends[1]) - law.cdf(ends[0])) / beside if beside > 0 else 2 * reach
+    missing = max(wide, 2 * reach) * found.density
+    least = found.times * stats.f.ppf(_OWN, 2 * found.told_by, 2 * found.times)
+    most = found.samples * stats.f.isf(_OWN, 2 * found.told_by, 2 * found.samples)
     # The nearest value that is left lies beyond the band by one on average.
-    return bool(least < missing < most - math.log(_OWN))
+    return bool(least / _ANOTHER_LAW < missing < most * _ANOTHER_LAW - math.log(_OWN))

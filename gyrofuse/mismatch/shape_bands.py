@@ -179,7 +179,7 @@ def slow(case: Case) -> Slow:
 @remembered
 def slow_ordinates(side: Side) -> Tensor:
     """Cosine ordinates that blocks which are judged do not show, `(record, sensor, ordinate)`, from the first."""
-    records = side.noise
+    records = side.steady
     return cosine_ordinates(records.flatten(0, 1))[:, 1 : N_SLOW + 1].clone().unflatten(0, records.shape[:2])
 
 

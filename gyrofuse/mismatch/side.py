@@ -54,7 +54,7 @@ class Side:
 
     def in_bands(self, bands: Bands) -> Side:
         """The noise in other bands."""
-        return Side(self.noise, bands, told_by=self.told_by, uncertainty=self.uncertainty)
+        return Side(self.steady, bands, told_by=self.told_by, uncertainty=self.uncertainty)
 
     @cached_property
     def noise(self) -> Tensor:
@@ -68,7 +68,7 @@ class Side:
 
     @cached_property
     def steady(self) -> Tensor:
-        """The noise as it would be without them."""
+        """The noise as it would be without episodes that it is known to have."""
         noise = self.noise
         for episodes in reversed(self.loud):
             noise = episodes.taken_off(noise)
@@ -76,8 +76,12 @@ class Side:
 
     @cached_property
     def spectra(self) -> Tensor:
-        """Mean cross-spectral matrices of the records, `(band, sensor, sensor)`, per sample."""
-        return cross_spectra(self.noise, self.bands).mean(0)
+        """Mean cross-spectral matrices of the records, `(band, sensor, sensor)`, per sample.
+
+        Of noise of a steady level: power that comes at some times more than at others is known less well than `dof`
+        says, which is of noise that is alike throughout.
+        """
+        return cross_spectra(self.steady, self.bands).mean(0)
 
     @cached_property
     def dof(self) -> Tensor:

@@ -182,7 +182,7 @@ class Told(NamedTuple):
 
 def told(case: Case) -> Told:
     """What the simulation tells."""
-    n, bands, signal, dof = case.n_samples, case.bands, case.simulated.noise, case.simulated.dof
+    n, bands, signal, dof = case.n_samples, case.bands, case.simulated.steady, case.simulated.dof
     every = Base(n, torch.eye(len(_time_constants(n)) + _OTHER_ATOMS, dtype=torch.float64))
     first = slow_ordinates(signal)[..., :_UNSEEN].square().mean(0)
     atoms = _atom_variances(n, signal.shape[-1] // N_BLOCKS)[:, :_UNSEEN]

@@ -82,7 +82,7 @@ class SlowEffect(Mechanism):
         covariance = slow_look(case).noise.covariance(self.log_factors).diff(dim=-1).diff(dim=-2)
         path = block_means(self.path(case.n_samples, case.scene))
         directions = torch.cat([path[None], cosines()[: _SHARES - 1]])
-        y = block_means(case.recorded.noise[0])
+        y = block_means(case.recorded.steady[0])
         both = torch.cat([y[:, None], directions.expand(len(y), -1, -1)], 1).diff().mT
         root = torch.linalg.cholesky(covariance)
         white = torch.linalg.solve_triangular(root, both, upper=False)

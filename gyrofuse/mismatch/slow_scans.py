@@ -187,7 +187,7 @@ def best_place(noise: SlowNoise, y: Tensor, null: Fit, family: Family, heard: Te
 @remembered
 def slow_look(case: Case) -> SlowLook:
     """What is slow in a case, looked at once for the witness and for all mechanisms."""
-    simulation, y = told(case), slow_ordinates(case.recorded.noise[0])
+    simulation, y = told(case), slow_ordinates(case.recorded.steady[0])
     noise, families = simulation.noise(), (steps(case), warm_ups(case), *temperatures(case))
     return SlowLook(simulation, noise, y, best_fit(noise, y), families)
 

@@ -108,7 +108,7 @@ def slow_groups() -> Groups:
 
 def _of_side(side: Side, n_samples: int) -> Spectra:
     """A side by the 32 blocks that its samples, or the place of its ordinates, belong to."""
-    noise = side.noise
+    noise = side.steady
     length, (n_records, p, n) = n_samples // N_JUDGED, noise.shape
     bands, groups = block_bands(length), slow_groups()
     products = torch.zeros(N_JUDGED, len(groups) + len(bands.dof), p, p, dtype=torch.complex128)

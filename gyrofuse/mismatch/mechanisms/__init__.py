@@ -16,6 +16,7 @@ from gyrofuse.mismatch.mechanisms.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.drifting_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.g_sensitivity import GSensitivity
+from gyrofuse.mismatch.mechanisms.gradual_change import GradualChange
 from gyrofuse.mismatch.mechanisms.low_pass import LowPassFilter
 from gyrofuse.mismatch.mechanisms.parameter_shift import ParameterShift
 from gyrofuse.mismatch.mechanisms.quadratic_coupling import QuadraticCoupling
@@ -42,8 +43,9 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (GSensitivity, QuadraticCoupling, ScaleFactor),
     (VibrationTone, ToneSize),
     (RandomTelegraph,),
+    (GradualChange,),  # where noise is louder, what is slow is known less well
     (TemperatureDrift, WarmUpTransient, Step),
-    (VarianceChange,),
+    (VarianceChange,),  # to which large jumps look alike
     (ParameterShift, LowPassFilter, Resonance, DriftingTone, FlickerNoise, CommonMode),
 )
 

@@ -89,9 +89,13 @@ class Quantization(Mechanism):
 
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:
+        # A value that recurs lies on lattices of many steps, which would all be taken for hidden ones.
+        band = DeadBand.nominate(case, level)
+        if band is not None:
+            return band
         p_value, found = missing_lattices(case, level)
         if not found:
-            return DeadBand.nominate(case, level)
+            return None
         none = Lattice(0.0, 0.0, 0.0, 1.0)
         rows = [found.get(i, none) for i in range(case.n_sensors)]
         step, offset, blur = (torch.tensor([row[k] for row in rows], dtype=torch.float64) for k in range(3))

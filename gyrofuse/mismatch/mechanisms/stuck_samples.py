@@ -15,6 +15,7 @@ from gyrofuse.mismatch.evidence import corrected
 from gyrofuse.mismatch.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.marginals import repeated, repeats
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
+from gyrofuse.mismatch.mechanisms.dead_band import DeadBand
 
 _TOGETHER = 0.5  # share of the repeats that all have at once, beyond chance
 
@@ -41,7 +42,8 @@ class StuckSamples(Mechanism):
     def nominate(cls, case: Case, level: float) -> Finding | None:
         found = repeats(case)
         p_values = [corrected(float(p), case.n_sensors) for p in found.p_values]
-        sensors = tuple(i for i, p in enumerate(p_values) if p <= level)
+        band = DeadBand.nominate(case, level)  # puts out its value several times running as well
+        sensors = tuple(i for i, p in enumerate(p_values) if p <= level and (band is None or i not in band.sensors))
         if not sensors:
             return None
         effect = cls._estimated(case, sensors, torch.ones(case.n_samples, dtype=torch.bool))

@@ -36,6 +36,7 @@ from gyrofuse.mismatch.noise_level import (
     variance_p_value,
     variance_p_values,
 )
+from gyrofuse.mismatch.remembered import remembered
 
 _FACTOR = 1.25  # by which, and by `_NATS`, a level that goes up and down all the time has to be likelier
 _NATS = 5.0
@@ -67,12 +68,11 @@ class VarianceChange(Mechanism):
 
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:
-        p_values, p_value = variance_p_values(case), variance_p_value(case)
+        p_value = variance_p_value(case)
         if p_value > level:
             return None
-        white = levelled(case)
-        found = _against_the_simulation(case, p_values) or episodes_of(white, p_values)
-        if found is None or _goes_up_and_down(case, found):
+        white, found = levelled(case), likeliest_episodes(case)
+        if found is None or goes_up_and_down(case, found):
             return None
         held = _held(case, found) or _held(case, stretch_of(white))
         if held is None:
@@ -123,13 +123,7 @@ class VarianceChange(Mechanism):
 
     def explained(self, case: Case, generator: torch.Generator) -> Case:
         """At the same share of records that are longer or shorter, so that these have as much of the episodes."""
-        known = self._loudness(case.n_samples, case.scene.rate)
-        built = case.built_in(lambda signal: known.of_length(signal.shape[-1]).added(signal))
-        recorded, simulated = (
-            replace(side, loud=(*side.loud, known.of_length(side.signal.shape[-1])))
-            for side in (built.recorded, built.simulated)
-        )
-        return replace(built, recorded=recorded, simulated=simulated)
+        return case.made_louder(self._loudness(case.n_samples, case.scene.rate))
 
     def gains(self, case: Case, fold: int) -> Tensor:
         inside = self._inside(case.n_samples, case.scene.rate)
@@ -164,6 +158,19 @@ def _held(case: Case, found: Episodes) -> tuple[Episodes, Reference | None, Told
     return (found, reference, told) if known else None
 
 
+@remembered
+def likeliest_episodes(case: Case) -> Episodes | None:
+    """Those that the simulation's level tells of, if any, or the recording by itself."""
+    p_values = variance_p_values(case)
+    return _against_the_simulation(case, p_values) or episodes_of(levelled(case), p_values)
+
+
+def worth_of_modulation(case: Case) -> float:
+    """Log likelihood ratio of a level that goes up and down all the time, nats."""
+    wave = modulation(case)
+    return max(-math.log(max(wave.p_value, 1e-300)), wave.log_ratio)
+
+
 def _against_the_simulation(case: Case, p_values: Tensor) -> Episodes | None:
     """Episodes that the simulation's level tells of, where the recording has that between them."""
     compared = compared_levels(case)
@@ -194,20 +201,18 @@ def _from_the_simulated_level(case: Case, found: Episodes) -> Episodes:
     return found.other_way_round(case.n_samples) if off(~inside) > off(inside) + _NATS else found
 
 
-def _goes_up_and_down(case: Case, found: Episodes) -> bool:
+def goes_up_and_down(case: Case, found: Episodes) -> bool:
     """Whether a level that is modulated all the time says more than episodes with a start and a stop.
 
     By far, but where the level is not the simulation's between episodes either. If a lot is said, where the level still
     goes up and down beside the episodes, and few further ones do not explain that: gains of modulations take squares
     for normal, and are wrong where the level changes by much.
     """
-    n, wave = case.n_samples, modulation(case)
-    inside = found.inside(n)
+    n, inside, always = case.n_samples, found.inside(case.n_samples), worth_of_modulation(case)
     between = level_between(case, inside)
     scores = two_level_scores(levelled(case), found.factor, inside, between)
     numbers = 2 * len(found.episodes) + int((found.factor != 1).sum()) / 2
     once = max(found.log_ratio, float(scores.sum()) - numbers * math.log(n))
-    always = max(-math.log(max(wave.p_value, 1e-300)), wave.log_ratio)
     if max(always, once) < _A_LOT:
         known = between is not None or compared_levels(case) is None
         return always > (_FACTOR * once + _NATS if known else once)
