@@ -280,6 +280,14 @@ def test_bursts_are_no_spikes() -> None:
     settled(case, found, g)
 
 
+def test_an_episode_may_begin_with_the_last_block_and_end_with_the_record() -> None:
+    """After which a few samples are no block: their sum may be least at the record's end."""
+    log_ratios = torch.full((4096 + 12,), -1.0, dtype=torch.float64)
+    log_ratios[4080:4096], log_ratios[4096:] = 10.0, -40.0
+    for episode in episodes._likeliest(log_ratios):
+        assert 0 <= episode.start < episode.stop <= len(log_ratios)
+
+
 def test_the_likeliest_stretches_are_those_of_all_that_are_possible() -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):

@@ -18,6 +18,7 @@ from gyrofuse.mismatch.confirm import held_out_gain
 from gyrofuse.mismatch.folds import N_JUDGED
 from gyrofuse.mismatch.mechanisms import random_telegraph
 from gyrofuse.mismatch.mechanisms.random_telegraph import RandomTelegraph, _path
+from gyrofuse.mismatch.shapes import chosen_shape
 from gyrofuse.mismatch.telegraph import (
     _LARGEST,
     Background,
@@ -215,6 +216,21 @@ def test_two_levels_are_named_where_noise_is_coloured() -> None:
         within += sum(found.parameters[k].low <= v <= found.parameters[k].high for k, v in truth.items())
     assert named >= 3
     assert within >= 3 * named - 3
+
+
+@pytest.mark.parametrize("half", [3.0, 30.0])
+def test_loud_jumps_are_measured_though_their_likelihood_is_a_narrow_peak(half: float) -> None:
+    g = torch.Generator().manual_seed(60)
+    case = drawn(60, half * _path(N, 160.0, 30.0, g))
+    found = nominated(case, RandomTelegraph)
+    assert found.sensors == (1,)
+    for name, value in (("half_step", half), ("dwell_up", 1.6), ("dwell_down", 0.3)):
+        entry = found.parameters[f"{name}[1]"]
+        assert entry.high < 2.5 * entry.low
+        assert abs(math.log(entry.value / value)) < math.log(entry.high / entry.low)
+    # How many jumps a record has is chance, and with it all power above their rate: no other numbers of the noise.
+    explained = found.effect.explained(case, g)
+    assert chosen_shape(explained, "parameter_shift", LEVEL) is None
 
 
 def test_an_ar1_of_the_same_spectrum_is_not() -> None:

@@ -70,7 +70,7 @@ class Case:
             they may have been.
         converter: What it does to them, with the place of each in the chain.
         bent: Factors `(sensor, frequency)` by which powers were changed of what was built in though its form is another
-            one: what is left where it acts is a matter of its form.
+            one, or by which its own scatter: what is left where it acts is a matter of it.
     """
 
     scene: Scene

@@ -292,7 +292,9 @@ def _likeliest(log_ratios: Tensor) -> tuple[Episode, ...]:
     found: list[Episode] = []
     for start, stop in coarse:
         lower = max(start * size - 2 * size, found[-1].stop if found else 0)
-        a = lower + int(total[lower : start * size + 2 * size + 1].argmin())
+        if lower >= n:
+            break
+        a = lower + int(total[lower : min(start * size + 2 * size + 1, n)].argmin())
         upper = max(stop * size - 2 * size, a + 1)
         last = n if stop == len(sums) else min(stop * size + 2 * size, n)
         b = upper + int(total[upper : last + 1].argmax())

@@ -31,6 +31,8 @@ _BLOCKS = (2.0, 2.5)  # in a time constant: no fewer, and enough
 _MOST_BLOCKS = 2048  # in the record
 _HOPELESS = (-5.0, 0.0)  # nats over the rival after each look
 _WIDTHS = ((0.25, 0.6), (0.15, 0.35))  # of stencils: size, times
+_SPLITS = 10  # rounds
+_LOOKS, _POINTS = 16, 15  # further ones at most, and trials of each
 _NEAR = 3.0  # nats, over which values count for the parabola
 _SAME = 1e-9
 _MOMENTS, _EVENT = 2, 8.0  # judged blocks, and nats in them
@@ -232,7 +234,7 @@ def _fitted(case: Case, sensor: int, sd: float, tau: float) -> TwoLevels | None:
     own = backgrounds(case.recorded.base, means.block, _SHAPED)[sensor]
     shaped = _judged(gaussian_values(means.y, own, np.zeros(1), np.ones(1)))[0] - means.plain
     rival = max(rival, shaped, key=np.sum)
-    trials = _first_trials(*np.exp(start))
+    trials = np.concatenate([_first_trials(*np.exp(start)), _apart(means.y)])
     values = means.switching(trials, _SEARCHING)
     for widths, least in zip(_WIDTHS, _HOPELESS, strict=True):
         total = values.sum(-1)
@@ -240,11 +242,33 @@ def _fitted(case: Case, sensor: int, sd: float, tau: float) -> TwoLevels | None:
             return None
         more = trials[total.argmax()] + _stencil(*widths)
         trials, values = np.concatenate([trials, more]), np.concatenate([values, means.switching(more, _SEARCHING)])
+    trials, values = _closer(means, trials, values)
     used = [np.ones(N_JUDGED), *((~in_fold(N_JUDGED, fold)).numpy().astype(float) for fold in range(N_FOLDS))]
     vertices, covariances = zip(*(vertex(trials, values @ weights) for weights in used), strict=True)
     theta = np.stack(vertices)
     log_sd = tuple(np.sqrt(covariances[0].diagonal()).tolist())
     return TwoLevels(means, theta, means.switching(theta, _JUDGING), rival, log_sd)
+
+
+def _closer(means: Means, trials: Array, values: Array) -> tuple[Array, Array]:
+    """With further trials around the best until it stays and those beside it are near enough for a parabola.
+
+    Of strong jumps the likelihood is a narrow peak, which the first look hardly meets.
+    """
+    size, times = _WIDTHS[-1]
+    for _ in range(_LOOKS):
+        total = values.sum(-1)
+        last = total[-_POINTS:]
+        here, beside = last[0], last[1:7].reshape(3, 2).max(-1)  # of the last centre, and of the better of two faces
+        moved = last.argmax() > 0 and last.max() > here + _NEAR
+        steep = here - beside > 2 * _NEAR
+        if not moved and not steep.any():
+            break
+        if not moved:
+            size, times = (width / 2 if s else width for width, s in ((size, steep[0]), (times, steep[1:].any())))
+        more = trials[total.argmax()] + _stencil(size, times)
+        trials, values = np.concatenate([trials, more]), np.concatenate([values, means.switching(more, _SEARCHING)])
+    return trials, values
 
 
 def _best_gaussian(means: Means, start: Array) -> tuple[Array, Array]:
@@ -263,6 +287,17 @@ def _first_trials(sd: float, tau: float) -> Array:
     shares = ((0.2, 0.7), (0.2, 1.5), (0.35, 1.0), (0.5, 0.7), (0.5, 1.5), (0.65, 1.0), (0.8, 0.7), (0.8, 1.5))
     rows = [(sd / (2 * math.sqrt(p * (1 - p))), c * tau / (1 - p), c * tau / p) for p, c in shares]
     return np.log(rows)
+
+
+def _apart(y: Array) -> Array:
+    """Half step and dwells of means `(block,)` that lie around two levels, `(1, 3)`: of loud jumps what is plain."""
+    middle = (y.max() + y.min()) / 2
+    for _ in range(_SPLITS):
+        middle = (np.median(y[y >= middle]) + np.median(y[y < middle])) / 2
+    above = y >= middle
+    half = (np.median(y[above]) - np.median(y[~above])) / 2
+    runs = max(int(np.count_nonzero(np.diff(above))), 1) / 2
+    return np.log([[half, above.sum() / runs, (~above).sum() / runs]])
 
 
 def _stencil(size: float, times: float) -> Array:

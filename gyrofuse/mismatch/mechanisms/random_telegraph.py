@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar
 
 import torch
@@ -12,12 +13,14 @@ from scipy import stats
 from torch import Tensor
 
 from gyrofuse.mismatch.axes import OfSensors
+from gyrofuse.mismatch.base import Base
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.folds import N_JUDGED, in_fold
 from gyrofuse.mismatch.impulses import jump_witness
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.power_differs import power_differs
 from gyrofuse.mismatch.telegraph_fit import Numbers, excess, scores, two_levels
+from gyrofuse.processes import AR1
 
 _PRESENT, _CERTAIN = 5.0, 8.0  # nats over the Gaussian rival, of all sensors together
 _GAUSSIAN = ("flicker", "parameter_shift")  # what may have the same spectrum
@@ -113,6 +116,23 @@ class RandomTelegraph(Mechanism):
             for record in records:
                 record[i] += float(self.half_step[i]) * _path(n, up, down, generator)
         return records.reshape(signal.shape)
+
+    def built_into(self, case: Case, generator: torch.Generator) -> Case:
+        built = super().built_into(case, generator)
+        scatter = partial(self._scatter, case.base, case.scene.rate)
+        return replace(built, bent=(*built.bent, scatter))
+
+    def _scatter(self, base: Base, rate: float, f: Tensor) -> Tensor:
+        """Factors `(sensor, frequency)` by which powers of two records differ, at `f` cycles per sample.
+
+        All power above the inverse dwells rises and falls with the number of jumps in a record.
+        """
+        up, down = self.up[:, None] * rate, self.down[:, None] * rate
+        phi = torch.exp(-1 / up - 1 / down)
+        variance = 4 * up * down / (up + down).square() * self.half_step[:, None].square()
+        own = AR1._spectrum(f, phi, variance * (1 - phi.square()))
+        jumps = 2 * base.n_samples / (up + down)
+        return 1 + own / (own + base.spectrum(f)) * (2 / jumps).sqrt()
 
     def gains(self, case: Case, fold: int) -> Tensor:
         total = torch.zeros(N_JUDGED, dtype=torch.float64)
