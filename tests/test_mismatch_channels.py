@@ -164,6 +164,34 @@ def test_a_slow_rate_is_judged_with_as_much_doubt_as_the_simulation_leaves():
     assert found >= 8
 
 
+def test_a_slow_rate_is_seen_where_the_simulation_is_too_short_to_say_anything():
+    """By what the recording itself has beside it; a strong effect is not its own noise."""
+    g = generator(15)
+    rate = torch.sin(2 * math.pi * 3.3 * torch.arange(N, dtype=torch.float64) / N)[None]
+    gains = of_size(rate, torch.tensor([[1.0], [0.0], [-1.0], [0.0]], dtype=torch.float64), 3e4)
+    x = NOISE.simulate(N, batch=(2, 4), generator=g)
+    scene = Scene(100.0, "deg/s", ("1", "2", "3", "4"), {"rate": rate})
+    short = Case.of(scene, x[0] + gains @ rate, x[1:, :, : N // 8])
+    finding = ScaleFactor.nominate(short, LEVEL)
+    assert finding.sensors == (0, 2)
+    entry = finding.parameters["error[0]"]
+    assert entry.low < 1e6 * float(gains[0, 0]) < entry.high
+
+
+def test_slow_noise_that_is_louder_than_the_simulation_says_is_no_gain():
+    g, n_runs, hits = generator(16), 60, 0
+    t = torch.arange(N, dtype=torch.float64) / N
+    rate = torch.stack([torch.sin(2 * math.pi * c * t + 1) for c in (2.3, 4.4, 7.1)]).sum(0)[None]
+    for _ in range(n_runs):
+        x = NOISE.simulate(N, batch=(2, 4), generator=g)
+        x[0] += gf.RandomWalk(1e-7).simulate(N, batch=(4,), generator=g)
+        hits += (
+            regress(Case.of(Scene(100.0, "deg/s", ("1", "2", "3", "4"), {"rate": rate}), x[0], x[1:]), rate).p_value
+            < 0.05
+        )
+    assert stats.binom.sf(hits - 1, n_runs, 0.05) > 1e-3, f"{hits} of {n_runs}"
+
+
 def test_a_motion_that_the_simulation_has_too_is_no_gain():
     t, nominated = torch.arange(N, dtype=torch.float64), 0
     for seed in range(12, 22):
