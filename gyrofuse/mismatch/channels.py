@@ -59,41 +59,46 @@ class ChannelFit:
         return self.statistic - self.gains.numel()
 
 
-def regress(case: Case, rows: Tensor, signal: Tensor | None = None) -> ChannelFit | None:
+def regress(case: Case, rows: Tensor, signal: Tensor | None = None, which: Tensor | None = None) -> ChannelFit | None:
     """Regress the recording, or `signal` `(sensor, time)`, on rows `(row, time)`; None where these do not move.
 
-    Twice where there is something: what a strong effect adds to the recording's own spectra is no noise.
+    Twice where there is something: what a strong effect adds to the recording's own spectra is no noise. By default of
+    all sensors, or of those at the positions `which`.
     """
     signal = case.recording if signal is None else signal
+    which = torch.arange(case.n_sensors) if which is None else which
     rows = rows - rows.mean(-1, keepdim=True)
     size = rows.square().mean(-1).sqrt()
     if not bool((size > 1e-12).all()):
         return None
     lines = simulated_lines(case.simulated)
     signal, rows = without_lines(signal, lines), without_lines(rows / size[:, None], lines)
-    fit = _fitted(case, signal, rows, lines, case.recorded)
+    fit = _fitted(case, signal, rows, lines, case.recorded, which)
     if fit is not None and fit.p_value < _AGAIN:
-        left = replace(case.recorded, signal=(signal - fit.gains @ rows)[None])
-        fit = _fitted(case, signal, rows, lines, left) or fit
+        left = signal.clone()
+        left[which] -= fit.gains @ rows
+        fit = _fitted(case, signal, rows, lines, replace(case.recorded, signal=left[None]), which) or fit
     if fit is None:
         return None
     return replace(fit, gains=fit.gains / size, covariance=fit.covariance / size[:, None, None] / size)
 
 
-def _fitted(case: Case, signal: Tensor, rows: Tensor, lines: tuple[float, ...], noise: Side) -> ChannelFit | None:
+def _fitted(
+    case: Case, signal: Tensor, rows: Tensor, lines: tuple[float, ...], noise: Side, which: Tensor
+) -> ChannelFit | None:
     """Generalised least squares beside a noise of the cross-spectra of `noise`; None where rows are hardly apart."""
-    n_sensors, n_rows, n = len(signal), len(rows), signal.shape[-1]
-    y, a = cosine_ordinates(signal), cosine_ordinates(rows)
+    n_sensors, n_rows, n = len(which), len(rows), signal.shape[-1]
+    y, a = cosine_ordinates(signal[which]), cosine_ordinates(rows)
     late = cosine_ordinates(_quarter_late(rows))
     k = torch.arange(n, dtype=torch.float64)
-    weights = case.base.spectrum((k / (2 * n)).clamp(min=1 / (2 * n))).rsqrt()  # (sensor, ordinate)
+    weights = case.base.spectrum((k / (2 * n)).clamp(min=1 / (2 * n)))[which].rsqrt()  # (sensor, ordinate)
     for f in lines:
         weights[:, (k / 2 - f * n).abs() < _LINE] = 0.0
     edges = [1, *(2 * edge for edge in case.bands.edges[1:-1]), n]
     moment, moment_late = (torch.zeros(n_sensors * n_rows, dtype=torch.float64) for _ in range(2))
     matrix = torch.zeros(n_sensors * n_rows, n_sensors * n_rows, dtype=torch.float64)
     parts, informed = [], []
-    inverses = torch.linalg.inv(noise.over(case.base).real)
+    inverses = torch.linalg.inv(noise.over(case.base).real[:, which][:, :, which])
     for inverse, (first, end) in zip(inverses, itertools.pairwise(edges), strict=True):
         w = weights[:, first:end]
         white = (inverse @ (w * y[:, first:end])) * w  # (sensor, ordinate)
