@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 
 import pytest
 import torch
@@ -108,6 +109,14 @@ def test_lost_samples_are_counted_and_found_in_time():
             held += entry is not None and entry.low <= at / 100 <= entry.high
     assert right >= 9
     assert stats.binom.cdf(held, 2 * n_runs, 0.95) > 1e-3, f"{held} of {2 * n_runs}"
+
+
+def test_a_slow_tone_tells_as_well(monkeypatch):
+    """Of hardly more than a cycle in a block."""
+    monkeypatch.setattr(sys.modules[__name__], "TONE", 1.1 * BLOCKS / N)
+    finding = ClockSkew.nominate(case(generator(10), skewed(4e-4, 1), 0.5), LEVEL)
+    assert finding.sensors == (1,)
+    assert finding.parameters["skew"].low < 400 < finding.parameters["skew"].high
 
 
 def test_samples_lost_by_one_sensor_need_no_channel():

@@ -26,7 +26,7 @@ from gyrofuse.mismatch.losses import Loss, losses_of, paths_of, put_back
 from gyrofuse.mismatch.remembered import remembered
 
 BLOCKS = 512
-_FEWEST_CYCLES = 2.0  # of a tone in a block
+_FEWEST_CYCLES = 1.0  # of a tone in a block
 _TONES = 3
 _SURE = 5.0  # nats that a sensor gains from the slip of others, from which it is its own as well
 _CLEARER = 10.0  # times the evidence of any sensor that a channel needs to be the reference
