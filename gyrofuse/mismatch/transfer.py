@@ -24,7 +24,7 @@ from gyrofuse.mismatch.channels import ChannelFit, regress
 _COARSE, _ORDER = 4, 9  # terms of a response, the channel itself included: to find a pole, and in the end
 _CORNERS, _HIGHEST, _LOWEST = 12, 0.25, 8.0  # that are tried, from the highest, cycles per sample, to so many cycles
 _ROUNDS = 40
-_LEAST = 60.0  # statistic, of which a part could be a response's
+_LEAST = 60.0  # statistic beyond chance, at once and a quarter of a cycle late, of which a part could be a response's
 _SENSORS = 4  # that tell the response, those that show most of the channel
 _ALIKE = 0.5  # share of what free responses of each sensor and row explain, from which it is one and the same
 
@@ -89,7 +89,7 @@ def likeliest_transfer(case: Case, rows: Tensor, fit: ChannelFit) -> Transfer | 
         rows: Made of the channel, without means.
         fit: Of plain gains.
     """
-    if fit.excess + fit.quadrature < _LEAST:
+    if fit.excess + fit.quadrature - fit.gains.numel() < _LEAST:
         return None
     which = fit.squares.topk(min(_SENSORS, len(fit.squares))).indices.sort().values
     corners = torch.logspace(math.log10(_HIGHEST), math.log10(_LOWEST / case.n_samples), _CORNERS).tolist()
