@@ -74,7 +74,7 @@ def test_a_wide_case_is_complete_at_every_size_that_exists(kind):
     made = 0
     for seed, nats in enumerate((30.0, *cases.STRONG)):
         try:
-            case = make_case(kind, nats, seed, n_samples=2048, wide=True)
+            case = make_case(kind, nats, seed, n_samples=4096, wide=True)
         except likelihood.OutOfReachError:
             continue
         made += 1
@@ -128,6 +128,24 @@ def test_noise_alike_on_both_sides_has_one_law(law):
 def test_too_large_an_effect_is_no_case():
     with pytest.raises(likelihood.OutOfReachError, match="of the samples"):
         make_case("stuck_samples", 3e5, 0, n_samples=2048)
+
+
+@pytest.mark.parametrize(
+    ("kind", "nats", "what"),
+    [
+        ("clock_skew", 3e4, "an offset of the clock"),
+        ("g_sensitivity", 3e6, "a gain on acceleration"),
+        ("form:late_acceleration", 3e6, "a gain on acceleration"),
+        ("quadratic_coupling", 3e6, "a gain on squared acceleration"),
+        ("scale_factor", 3e7, "a scale error"),
+        ("temperature_drift", 3e7, "a temperature coefficient"),
+        ("warm_up_transient", 3e7, "an output at rest"),
+        ("pair:level_not_low_pass", 3e5, "white noise that is less"),
+    ],
+)
+def test_what_no_sensor_has_is_no_case(kind, nats, what):
+    with pytest.raises(likelihood.OutOfReachError, match=what):
+        make_case(kind, nats, 0, n_samples=16384)
 
 
 def test_seed_kind_and_size_all_change_the_numbers():

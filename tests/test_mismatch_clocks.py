@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 
 import pytest
 import torch
@@ -14,6 +15,7 @@ from gyrofuse.mismatch.clocks import BLOCKS, best_slope, clock_witness, demodula
 from gyrofuse.mismatch.confirm import held_out_gain
 from gyrofuse.mismatch.mechanisms.clock_skew import ClockSkew
 from gyrofuse.mismatch.resampling import resampled
+from gyrofuse.mismatch.witnesses import line_witness
 
 N = 2**14
 NOISE = gf.WhiteNoise(1.0) + gf.AR1(0.99, 1e-3)
@@ -109,10 +111,52 @@ def test_lost_samples_are_counted_and_found_in_time():
     assert stats.binom.cdf(held, 2 * n_runs, 0.95) > 1e-3, f"{held} of {2 * n_runs}"
 
 
+def test_a_slow_tone_tells_as_well(monkeypatch):
+    """Of hardly more than a cycle in a block."""
+    monkeypatch.setattr(sys.modules[__name__], "TONE", 1.1 * BLOCKS / N)
+    finding = ClockSkew.nominate(case(generator(10), skewed(4e-4, 1), 0.5), LEVEL)
+    assert finding.sensors == (1,)
+    assert finding.parameters["skew"].low < 400 < finding.parameters["skew"].high
+
+
 def test_samples_lost_by_one_sensor_need_no_channel():
     finding = ClockSkew.nominate(case(generator(6), lost({N // 2: 1}, 1)), LEVEL)
     assert finding.sensors == (1,)
     assert abs(finding.time_s - N / 200) < 2
+
+
+@pytest.mark.parametrize("true", [{5003: 1}, {3001: 1, 4000: 1, 9777: 1, 12345: 1}, {2222: 2, 10001: 1}])
+@pytest.mark.parametrize("amplitude", [2.0, 6.0])
+def test_a_loud_tone_tells_losses_to_a_few_samples(true, amplitude):
+    """And nothing else is left: a tone of so many nats, an interval wrong, would be a tone of its own."""
+    g = generator(len(true))
+    both = case(g, lost(true, 1), amplitude, channel=True)
+    finding = ClockSkew.nominate(both, LEVEL)
+    assert finding.sensors == (1,)
+    assert finding.parameters["lost"].value == sum(true.values())
+    assert [count for _, count in finding.effect.losses] == list(true.values())
+    for (at, _), expected in zip(finding.effect.losses, true, strict=True):
+        assert abs(at - expected) <= 6 / amplitude + 1
+    left = finding.explained(both, g)
+    assert clock_witness(left).p_value > 1e-3
+    assert line_witness(left).p_value > 1e-3
+
+
+def test_of_many_sensors_those_of_one_clock_are_one_finding():
+    g, n_sensors = generator(9), 12
+    t = torch.arange(N, dtype=torch.float64)
+    ahead = torch.zeros(n_sensors, N, dtype=torch.float64)
+    ahead[[2, 5, 11], N // 3 :] += 1
+    ahead[[2, 5, 11], N // 2 :] += 1
+    x = NOISE.simulate(N, batch=(2, n_sensors), generator=g)
+    x[0] += torch.cos(2 * math.pi * TONE * (t + ahead))
+    x[1] += torch.cos(2 * math.pi * TONE * t)
+    scene = Scene(
+        100.0, "deg/s", tuple(map(str, range(n_sensors))), {"acceleration": torch.cos(2 * math.pi * TONE * t)[None]}
+    )
+    finding = ClockSkew.nominate(Case.of(scene, x[0], x[1:]), LEVEL)
+    assert finding.sensors == (2, 5, 11)
+    assert finding.parameters["lost"].value == 2
 
 
 @pytest.mark.parametrize("ahead", [skewed(80e-6, 1), lost({5000: 1, 11000: 1}, 1)])

@@ -11,7 +11,7 @@ with the channel's.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from scipy import special
@@ -23,10 +23,12 @@ from gyrofuse.mismatch.evidence import Evidence, corrected
 from gyrofuse.mismatch.known_lines import without_lines
 from gyrofuse.mismatch.lines import simulated_lines
 from gyrofuse.mismatch.partakers import partakers
+from gyrofuse.mismatch.side import Side
 
 _SEEN = 0.01  # chance that a sensor seems to follow a channel, of those that are taken for sure to begin with
 _LINE = 4  # bins on either side of a line that the simulation has
-_LEAST_DOF = 3.0  # of a simulation's band: below, it does not tell what chance alone would do to a slow channel
+_AGAIN = 1e-3  # p value from which the noise is what a first fit leaves
+_LEAST_FREE = 0.5  # ordinates of a band beyond those that the fit takes
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,40 +59,56 @@ class ChannelFit:
         return self.statistic - self.gains.numel()
 
 
-def regress(case: Case, rows: Tensor, signal: Tensor | None = None) -> ChannelFit | None:
-    """Regress the recording, or `signal` `(sensor, time)`, on rows `(row, time)`; None where these do not move."""
+def regress(case: Case, rows: Tensor, signal: Tensor | None = None, which: Tensor | None = None) -> ChannelFit | None:
+    """Regress the recording, or `signal` `(sensor, time)`, on rows `(row, time)`; None where these do not move.
+
+    Twice where there is something: what a strong effect adds to the recording's own spectra is no noise. By default of
+    all sensors, or of those at the positions `which`.
+    """
     signal = case.recording if signal is None else signal
-    n_sensors, n_rows, n = len(signal), len(rows), signal.shape[-1]
+    which = torch.arange(case.n_sensors) if which is None else which
     rows = rows - rows.mean(-1, keepdim=True)
     size = rows.square().mean(-1).sqrt()
     if not bool((size > 1e-12).all()):
         return None
     lines = simulated_lines(case.simulated)
-    signal, rows = without_lines(signal, lines), without_lines(rows, lines)
-    y, a = cosine_ordinates(signal), cosine_ordinates(rows / size[:, None])
-    late = cosine_ordinates(_quarter_late(rows / size[:, None]))
+    signal, rows = without_lines(signal, lines), without_lines(rows / size[:, None], lines)
+    fit = _fitted(case, signal, rows, lines, case.recorded, which)
+    if fit is not None and fit.p_value < _AGAIN:
+        left = signal.clone()
+        left[which] -= fit.gains @ rows
+        fit = _fitted(case, signal, rows, lines, replace(case.recorded, signal=left[None]), which) or fit
+    if fit is None:
+        return None
+    return replace(fit, gains=fit.gains / size, covariance=fit.covariance / size[:, None, None] / size)
+
+
+def _fitted(
+    case: Case, signal: Tensor, rows: Tensor, lines: tuple[float, ...], noise: Side, which: Tensor
+) -> ChannelFit | None:
+    """Generalised least squares beside a noise of the cross-spectra of `noise`; None where rows are hardly apart."""
+    n_sensors, n_rows, n = len(which), len(rows), signal.shape[-1]
+    y, a = cosine_ordinates(signal[which]), cosine_ordinates(rows)
+    late = cosine_ordinates(_quarter_late(rows))
     k = torch.arange(n, dtype=torch.float64)
-    weights = case.base.spectrum((k / (2 * n)).clamp(min=1 / (2 * n))).rsqrt()  # (sensor, ordinate)
+    weights = case.base.spectrum((k / (2 * n)).clamp(min=1 / (2 * n)))[which].rsqrt()  # (sensor, ordinate)
     for f in lines:
         weights[:, (k / 2 - f * n).abs() < _LINE] = 0.0
     edges = [1, *(2 * edge for edge in case.bands.edges[1:-1]), n]
     moment, moment_late = (torch.zeros(n_sensors * n_rows, dtype=torch.float64) for _ in range(2))
     matrix = torch.zeros(n_sensors * n_rows, n_sensors * n_rows, dtype=torch.float64)
     parts, informed = [], []
-    known = case.simulated.dof >= _LEAST_DOF
-    inverses = torch.linalg.inv(case.recorded.over(case.base).real)
-    for use, inverse, (first, end) in zip(known, inverses, itertools.pairwise(edges), strict=True):
-        if not use:
-            continue
+    inverses = torch.linalg.inv(noise.over(case.base).real[:, which][:, :, which])
+    for inverse, (first, end) in zip(inverses, itertools.pairwise(edges), strict=True):
         w = weights[:, first:end]
         white = (inverse @ (w * y[:, first:end])) * w  # (sensor, ordinate)
         design = (w[:, None] * a[:, first:end]).flatten(0, 1)  # (sensor * row, ordinate)
-        informed.append(design.square().sum(-1).view(n_sensors, n_rows).sum(-1))
+        informed.append(design.square().sum(-1).view(n_sensors, n_rows).sum(-1) * inverse.diagonal())
         matrix += design @ design.mT * inverse.repeat_interleave(n_rows, 0).repeat_interleave(n_rows, 1)
         parts.append((white @ a[:, first:end].mT).flatten())
         moment += parts[-1]
         moment_late += (white @ late[:, first:end].mT).flatten()
-    if not parts or float(torch.linalg.cond(matrix)) > 1e12:
+    if float(torch.linalg.cond(matrix)) > 1e12:
         return None
     covariance = torch.linalg.inv(matrix)
     gains = covariance @ moment
@@ -99,15 +117,20 @@ def regress(case: Case, rows: Tensor, signal: Tensor | None = None) -> ChannelFi
     blocks = covariance.view(n_sensors, n_rows, n_sensors, n_rows)
     each = gains.view(n_sensors, n_rows)
     own_statistic = torch.stack([each[i] @ torch.linalg.solve(blocks[i, :, i], each[i]) for i in range(n_sensors)])
-    own = _tails(own_statistic, n_rows, torch.stack(informed), case.simulated.dof[known])
+    scores = weights * (y - each @ a)
+    left = [
+        (inverse @ scores[:, first:end]).square() / inverse.diagonal()[:, None]
+        for inverse, (first, end) in zip(inverses, itertools.pairwise(edges), strict=True)
+    ]
+    own = _tails(own_statistic, n_rows, torch.stack(informed), left)
     sure = torch.from_numpy(special.chdtri(n_rows, own.numpy()))  # what would be as rare if the noise were known
     pooled = float(
         special.chdtrc(n_sensors * n_rows, statistic * float(sure.sum() / own_statistic.sum().clamp(min=1e-300)))
     )
     p_value = corrected(min(2 * pooled, 2 * corrected(float(own.amin()), n_sensors)), 1)
     return ChannelFit(
-        gains=each / size,
-        covariance=blocks / size[:, None, None] / size,
+        gains=each,
+        covariance=blocks,
         statistic=statistic,
         quadrature=float(moment_late @ covariance @ moment_late),
         share=float(contributions.amax() / contributions.sum()) if statistic > 0 else 1.0,
@@ -116,18 +139,27 @@ def regress(case: Case, rows: Tensor, signal: Tensor | None = None) -> ChannelFi
     )
 
 
-def _tails(statistic: Tensor, n_rows: int, informed: Tensor, dof: Tensor) -> Tensor:
-    """p values `(sensor,)` of statistics, with noise that the simulation tells no better than its own length allows.
+def _tails(statistic: Tensor, n_rows: int, informed: Tensor, left: list[Tensor]) -> Tensor:
+    """p values `(sensor,)` of statistics, beside the noise that the recording itself has where it tells of the gains.
+
+    A band without the simulation's word on it, or with another level than it says, is judged by what the fit leaves
+    there: the variance of a gain is that of its bands, each with its share (Huber and White), as well known as they are
+    wide (Satterthwaite).
 
     Args:
         statistic: Chi-square if the noise were known, `(sensor,)`.
         n_rows: Its degrees of freedom.
         informed: What each band tells of the gains, `(band, sensor)`.
-        dof: What each band of the simulation is worth, complex ordinates, `(band,)`.
+        left: In each band, squares of what is left, of mean one, `(sensor, ordinate)`; 0 where nothing was used.
     """
     share = informed / informed.sum(0)
-    freedom = 2 / (share.square() / dof[:, None]).sum(0)
-    tails = special.betainc(freedom.numpy() / 2, n_rows / 2, (freedom / (freedom + statistic)).numpy())
+    count = torch.stack([(band > 0).sum(-1) for band in left])
+    free = (count - n_rows * share).clamp(min=0.0)
+    level = torch.stack([band.sum(-1) for band in left]) / free.clamp(min=_LEAST_FREE)
+    noise = (share * level).sum(0)
+    freedom = 1 / (share.square() / free.clamp(min=1e-9)).sum(0)
+    scaled = statistic / noise.clamp(min=1e-300)
+    tails = special.betainc(freedom.numpy() / 2, n_rows / 2, (freedom / (freedom + scaled)).numpy())
     return torch.from_numpy(tails).clamp(min=1e-300)
 
 

@@ -22,12 +22,13 @@ from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import Evidence, ratio_p_value
 from gyrofuse.mismatch.known_lines import without_lines
 from gyrofuse.mismatch.lines import sets_of, simulated_lines, whitened
-from gyrofuse.mismatch.losses import Loss, losses_of, paths_of
+from gyrofuse.mismatch.losses import Loss, losses_of, paths_of, put_back
 from gyrofuse.mismatch.remembered import remembered
 
 BLOCKS = 512
-_FEWEST_CYCLES = 2.0  # of a tone in a block
+_FEWEST_CYCLES = 1.0  # of a tone in a block
 _TONES = 3
+_SURE = 5.0  # nats that a sensor gains from the slip of others, from which it is its own as well
 _CLEARER = 10.0  # times the evidence of any sensor that a channel needs to be the reference
 _CYCLES, _FINER = 4, 32  # slip over the record that is looked for, and steps of a cycle
 
@@ -73,6 +74,7 @@ class _Fit(NamedTuple):
         gain: Over no slip, nats.
         log_ratio: Of the mean likelihood ratio over all sets and places of the kind.
         rest: Cycles over the record by which the others differ from where they were looked for.
+        angle: By which one lost sample turns the tone.
     """
 
     which: int
@@ -83,6 +85,7 @@ class _Fit(NamedTuple):
     gain: float
     log_ratio: float
     rest: float
+    angle: float = 0.0
 
 
 def clock_witness(case: Case) -> Evidence:
@@ -125,7 +128,9 @@ def demodulated(signal: Tensor, f: float) -> Tensor:
     # Least squares of both quadratures: in a block they are not orthogonal.
     image = torch.polar(torch.ones_like(t), -2 * angle).unflatten(-1, (BLOCKS, block)).mean(-1)
     z = (z - z.conj() * image) / (1 - image.abs().square())
-    return z / (z.diff().abs().square().mean(-1, keepdim=True) / 2).sqrt().clamp(min=1e-300)
+    # Of differences, squares of normal noise are exponential; where a loud tone steps, their median hardly moves.
+    noise = z.diff().abs().square().median(-1, keepdim=True).values / (2 * math.log(2))
+    return z / noise.sqrt().clamp(min=1e-300)
 
 
 def best_slope(z: Tensor) -> tuple[float, float]:
@@ -157,12 +162,16 @@ def _of_tone(case: Case, f: float, others: tuple[float, ...]) -> list[Slip]:
         _skewed(z, sets, log_chance, fixed=fixed),
         _lost(z, sets, log_chance, 2 * math.pi * (f + slope / length), fixed=fixed),
     ):
+        inside = sets[fit.which].bool()
+        if fixed and len(sets) <= len(z) + 1:  # of so many sensors not every set was tried
+            inside, more = _with_the_like(z, inside, fit)
+            fit = fit._replace(gain=fit.gain + more)
         tone = f + (slope + fit.rest) / length
         scale = 1 / (tone * length)
         slips.append(
             Slip(
                 tone,
-                tuple(sets[fit.which].nonzero()[:, 0].tolist()),
+                tuple(inside.nonzero()[:, 0].tolist()),
                 fit.slope * scale,
                 0.0 if fit.losses else math.sqrt(fit.variance + slope_variance) * scale,
                 tuple(_in_samples(loss, length // BLOCKS) for loss in fit.losses),
@@ -173,6 +182,15 @@ def _of_tone(case: Case, f: float, others: tuple[float, ...]) -> list[Slip]:
             )
         )
     return slips
+
+
+def _with_the_like(z: Tensor, inside: Tensor, fit: _Fit) -> tuple[Tensor, float]:
+    """A set of sensors `(sensor,)` and all others whose tone the same slip explains as well, and what they gain."""
+    lost = {loss.at: loss.count for loss in fit.losses}
+    back = put_back(z, lost, fit.angle) if lost else z * _turn(-fit.slope)
+    gains = (back.sum(-1).abs().square() - z.sum(-1).abs().square()) / BLOCKS
+    more = ~inside & (gains > math.log(len(z)) + _SURE)
+    return inside | more, float(gains[more].sum())
 
 
 def _in_samples(loss: Loss, block: int) -> Loss:
@@ -230,7 +248,7 @@ def _lost(z: Tensor, sets: Tensor, log_chance: Tensor, angle: float, *, fixed: b
     count = sum(loss.count for loss in losses)
     lost = min(low, count), max(high, count)
     gain -= float(handicap[which])
-    return _Fit(which, 0.0, 0.0, losses, lost, gain, float(torch.logsumexp(ratios, 0)), rests[which])
+    return _Fit(which, 0.0, 0.0, losses, lost, gain, float(torch.logsumexp(ratios, 0)), rests[which], angle)
 
 
 def _slopes() -> Tensor:

@@ -30,6 +30,8 @@ _COARSER = 4  # blocks in which two losses are looked for at once
 _MOST_LOSSES = 16
 _CERTAIN = 3.0  # nats that a further loss must gain beyond chance
 _AS_GOOD = 2.0  # nats within which another number is as good
+_NEAR = 2  # blocks between losses that may be one
+_HOPELESS = 500.0  # nats below the likeliest state at one time, of a loud tone
 _BEYOND = 0.025  # probability of totals beyond a limit
 
 
@@ -109,7 +111,7 @@ def _chain() -> Tensor:
 def _passed(log_likelihood: Tensor, chain: Tensor) -> tuple[Tensor, Tensor]:
     """Log likelihood of all paths `(item,)`, and probabilities `(item, step, state)`, from `(item, step, state)`."""
     peak = log_likelihood.amax(-1, keepdim=True)
-    likelihood = (log_likelihood - peak).exp()
+    likelihood = (log_likelihood - peak).clamp(min=-_HOPELESS).exp()  # some state is always possible
     total, before = peak.sum((-1, -2)), chain[0].expand(len(peak), -1)
     forward = []
     for step in range(_STEPS):
@@ -123,6 +125,7 @@ def _passed(log_likelihood: Tensor, chain: Tensor) -> tuple[Tensor, Tensor]:
         after = (after * likelihood[:, step]) @ chain.mT
         after = after / after.sum(-1, keepdim=True)
         here = forward[step - 1] * after
+        here = torch.where(here.sum(-1, keepdim=True) > 0, here, forward[step - 1])  # of a path that none can be
         states.append(here / here.sum(-1, keepdim=True))
     return total, torch.stack(states[::-1], 1)
 
@@ -152,15 +155,44 @@ def _best_losses(z: Tensor, lost: Tensor, angle: float) -> dict[int, int]:
     """
     starts: list[dict[int, int]] = [{}, _best_pair(z, angle), _steps_of(lost, z.shape[-1])]
     best: dict[int, int] = {}
-    for found in starts:
+    for start in starts:
+        found = _moved(z, start, angle)  # what moving gains is not one more's
         while len(found) < _MOST_LOSSES:
             longer = _moved(z, _with_best(z, found, angle), angle)
             if found and _worth(z, longer, angle) - _worth(z, found, angle) < _CERTAIN:
                 break
             found = longer
+        found = _merged(z, found, angle)
         if not best or _worth(z, found, angle) > _worth(z, best, angle):
             best = found
     return best
+
+
+def _merged(z: Tensor, losses: dict[int, int], angle: float) -> dict[int, int]:
+    """Losses next to each other as one, or none, where all but the blocks between them is told as well.
+
+    In a block in which samples are lost a loud tone has a phase in between, which another loss before it would have.
+    """
+    for first, second in itertools.pairwise(sorted(losses)):
+        if second - first > _NEAR or first not in losses:
+            continue
+        clear = z.clone()
+        clear[:, first - 1 : second + 1] = 0.0
+        others = {at: count for at, count in losses.items() if at not in (first, second)}
+        instead = [others, *({**others, second: count} for count in range(1, _MOST_LOST + 1))]
+        simpler = max(instead, key=lambda losses: _worth(clear, losses, angle))
+        if _worth(clear, simpler, angle) > _worth(clear, losses, angle):
+            moved = _moved_one(z, simpler, second, angle) if second in simpler else simpler
+            return _merged(z, moved, angle)
+    return losses
+
+
+def _moved_one(z: Tensor, losses: dict[int, int], which: int, angle: float) -> dict[int, int]:
+    """Losses, one of them where it is best with its count."""
+    others = {at: count for at, count in losses.items() if at != which}
+    gain = _further(z, others, angle)[:, losses[which] - 1]
+    gain[[at - 1 for at in others]] = -math.inf
+    return {**others, int(gain.argmax()) + 1: losses[which]}
 
 
 def _steps_of(lost: Tensor, n_blocks: int) -> dict[int, int]:
@@ -204,12 +236,12 @@ def _moved(z: Tensor, losses: dict[int, int], angle: float) -> dict[int, int]:
 
 def _further(z: Tensor, losses: dict[int, int], angle: float) -> Tensor:
     """Gain of one loss beside others in all rows, less what its count costs, nats, `(place, count)`."""
-    return _step_gains(_put_back(z, losses, angle), angle).sum(0) - _counts_cost()
+    return _step_gains(put_back(z, losses, angle), angle).sum(0) - _counts_cost()
 
 
 def _gain_of(z: Tensor, losses: dict[int, int], angle: float) -> float:
     """Gain of losses in all rows, nats."""
-    energies = [rows.sum(-1).abs().square().sum() / z.shape[-1] for rows in (_put_back(z, losses, angle), z)]
+    energies = [rows.sum(-1).abs().square().sum() / z.shape[-1] for rows in (put_back(z, losses, angle), z)]
     return float(energies[0] - energies[1])
 
 
@@ -232,7 +264,7 @@ def _step_gains(z: Tensor, angle: float) -> Tensor:
     return (turned.abs().square() - whole[..., None].abs().square()) / z.shape[-1]
 
 
-def _put_back(z: Tensor, losses: dict[int, int], angle: float) -> Tensor:
+def put_back(z: Tensor, losses: dict[int, int], angle: float) -> Tensor:
     """Rows without the steps of the phase that losses made."""
     lost = torch.zeros(z.shape[-1], dtype=torch.float64)
     for at, count in losses.items():

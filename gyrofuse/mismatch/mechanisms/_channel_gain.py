@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated, ClassVar
 
 import torch
@@ -17,23 +17,29 @@ from gyrofuse.mismatch.folds import estimation_samples, signal_gains
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.mechanisms.not_identifiable import NOT_IDENTIFIABLE
 from gyrofuse.mismatch.partakers import partakers
+from gyrofuse.mismatch.transfer import Transfer, likeliest_transfer
 from gyrofuse.mismatch.witnesses import level_of
 from gyrofuse.units import GRAVITY
 
 _OF_ONE_BAND = 0.9  # share of the evidence from which a gain might be a line's alone
 _WHOLE = ("each", "length")  # kinds of rows that are made from all of a channel
 _LATE = 0.25  # share of the evidence a quarter of a cycle late, from which it is no instantaneous coupling
+_AHEAD = 0.04  # cycles by which sensors may be ahead of a channel: as a simple filter of that has it
 _SCATTER = 3.0  # standard deviations of what is so by chance
 
 
 @dataclass(frozen=True, eq=False)
 class ChannelGain(Mechanism):
-    """`x_i(t) = sum_k coupling_ik a_k(t)` with rows `a` made from an auxiliary channel.
+    """`x_i(t) = sum_k coupling_ik (m * a_k)(t)` with rows `a` made from an auxiliary channel.
+
+    The response `m`, which all sensors share, is one for a plain gain; see `Transfer`.
 
     Attributes:
         channel: Its name.
-        coupling: `(sensor, row)`, signal per unit of the rows; 0 for sensors that do not show it.
+        coupling: `(sensor, row)`, signal per unit of the rows where the channel tells most; 0 for sensors that do not
+            show it.
         kind: Which rows are made from the channel.
+        pole, response: Of `m`.
     """
 
     proportional_to: ClassVar[str] = "coupling"
@@ -45,6 +51,14 @@ class ChannelGain(Mechanism):
     channel: str
     coupling: Annotated[Tensor, Axes(("sensor", "row"))]
     kind: str = "each"
+    pole: float = field(default=0.0, metadata={"plain": True})
+    response: Annotated[Tensor, Axes(("term",))] = field(
+        default_factory=lambda: torch.ones(1, dtype=torch.float64), metadata={"plain": True}
+    )
+
+    @property
+    def transfer(self) -> Transfer:
+        return Transfer(self.pole, self.response)
 
     @classmethod
     def channels(cls, case: Case) -> list[str]:
@@ -73,22 +87,39 @@ class ChannelGain(Mechanism):
             return None
         fit, name, kind = min(tried, key=lambda entry: (entry[0].p_value, _cost(entry[0], case.n_samples)))
         p_value = min(fit.p_value * len(tried), 1.0)
+        if p_value > level:
+            return None
+        rows = cls._rows(case.scene, name)[kind]
+        transfer, words = likeliest_transfer(case, rows, fit), ""
+        if transfer is not None:
+            transfer, f, cycles = transfer.scaled(case, rows, fit.gains)
+            if cycles < -_AHEAD:  # what comes first does not come from it
+                return None
+            rows = transfer.applied(rows)
+            fit = regress(case, rows) or fit
+            hertz = f * case.scene.rate
+            words = (
+                f"; it comes {1e3 * cycles / hertz:.3g} ms late near {hertz:.3g} Hz, and not at every frequency "
+                "alike, as through a mount or a filter: its form is not quite that of a gain"
+            )
         chance = fit.gains.numel()  # mean of what is seen a quarter of a cycle late, with the variance twice as large
-        if p_value > level or fit.quadrature > chance + _SCATTER * math.sqrt(2 * chance) + _LATE * fit.excess:
+        if fit.quadrature > chance + _SCATTER * math.sqrt(2 * chance) + _LATE * fit.excess:
             return None
         present = partakers(fit.squares, fit.gains.shape[-1]).positions
         unit, factor = cls._unit(case.scene, name)
         sizes = {i: _size(fit, i, unit, factor) for i in present}
         largest = max(sizes, key=lambda i: abs(sizes[i].value))
         where = f"the output of {case.scene.named(present, 'every sensor')}"
-        rows = cls._rows(case.scene, name)[kind]
         busiest = (
             float(torch.fft.rfft(rows - rows.mean(-1, keepdim=True)).abs().square().sum(0).argmax()) / case.n_samples
         )
+        effect = cls(name, _only(fit.gains, present), kind)
+        if transfer is not None:
+            effect = replace(effect, pole=transfer.pole, response=transfer.weights)
         finding = Finding(
             cls.name,
-            cls(name, _only(fit.gains, present), kind),
-            cls.words(abs(sizes[largest].value), name if kind in _WHOLE else f"{kind} of {name}", where, unit),
+            effect,
+            cls.words(abs(sizes[largest].value), name if kind in _WHOLE else f"{kind} of {name}", where, unit) + words,
             p_value,
             present,
             {f"{cls.quantity}[{i}]": entry for i, entry in sizes.items()},
@@ -113,8 +144,10 @@ class ChannelGain(Mechanism):
         """Regression on the kept samples alone, the others left out of both sides."""
         keep = estimation_samples(case.n_samples, fold)
         weight = keep.to(torch.float64)
-        rows = self._rows(case.scene, self.channel)[self.kind]
+        rows = self._rows(case.scene, self.channel)[self.kind]  # the response stays: of all numbers it has the fewest
         means = [(v * weight).sum(-1, keepdim=True) / weight.sum() for v in (rows, case.recording)]
+        rows = self.transfer.applied(rows - means[0])
+        means[0] = (rows * weight).sum(-1, keepdim=True) / weight.sum()
         fit = regress(case, (rows - means[0]) * weight, (case.recording - means[1]) * weight)
         present = tuple(self.coupling.any(-1).nonzero()[:, 0].tolist())
         return self if fit is None else replace(self, coupling=_only(fit.gains, present))
@@ -138,7 +171,7 @@ class ChannelGain(Mechanism):
                 f"`channels`: expected {n_samples} samples of {self.channel!r}, which {self.name} follows, "
                 f"got {rows.shape[-1]}; give the channel for the whole simulation"
             )
-        return self.coupling @ rows[:, :n_samples]
+        return self.coupling @ self.transfer.applied(rows[:, :n_samples])
 
     @classmethod
     def _rows(cls, scene: Scene, name: str) -> dict[str, Tensor]:

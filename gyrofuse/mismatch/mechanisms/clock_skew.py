@@ -18,6 +18,8 @@ from gyrofuse.mismatch.resampling import resampled
 from gyrofuse.mismatch.witnesses import level_of
 
 _MILLION = 1e6
+_ROUNDS, _BLOCKS_AROUND = 2, 3  # places of losses and amplitudes in turns, and blocks in which each is placed
+_AS_GOOD = 2.0  # nats within which another place is as good
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,18 +56,22 @@ class ClockSkew(Mechanism):
         none = torch.zeros(len(slip.sensors), dtype=torch.complex128)
         losses = tuple((loss.at, loss.count) for loss in slip.losses)
         effect = cls(slip.sensors, slip.skew, losses, slip.frequency, none, none)
-        effect = effect._fitted(case, torch.ones(case.n_samples, dtype=torch.bool))
+        everywhere = torch.ones(case.n_samples, dtype=torch.bool)
+        effect = effect._fitted(case, everywhere)
+        limits = [loss.at_limits for loss in slip.losses]
+        for _ in range(_ROUNDS if losses else 0):
+            effect, limits = effect._placed(case)
+            effect = effect._fitted(case, everywhere)
+        losses = effect.losses
         who = scene.named(slip.sensors, "all sensors")
         against = f"the tone at {slip.frequency * rate:.6g} Hz in "
         against += "the other sensors" if slip.reference is None else slip.reference
         if losses:
-            lost = sum(loss.count for loss in slip.losses)
+            lost = sum(count for _, count in losses)
             parameters = {"lost": Parameter(lost, *slip.lost, "")}
-            for j, loss in enumerate(slip.losses):
-                parameters[f"time_of_loss_{j + 1}"] = Parameter(
-                    loss.at / rate, loss.at_limits[0] / rate, loss.at_limits[1] / rate, "s"
-                )
-            times = ", ".join(f"{loss.at / rate:.4g}" for loss in slip.losses)
+            for j, ((at, _), (first, last)) in enumerate(zip(losses, limits, strict=True)):
+                parameters[f"time_of_loss_{j + 1}"] = Parameter(at / rate, first / rate, last / rate, "s")
+            times = ", ".join(f"{at / rate:.4g}" for at, _ in losses)
             sentence = f"{who} lost {lost} samples against {against}: its phase steps at {times} s"
         else:
             reach = Z * slip.skew_sd
@@ -96,6 +102,31 @@ class ClockSkew(Mechanism):
         # Over many cycles the two quadratures are orthogonal.
         slipping, steady = ((2 * signal.to(carrier.dtype) @ carrier.conj()) / keep.sum() for carrier in turned)
         return replace(self, slipping=slipping, steady=steady)
+
+    def _placed(self, case: Case) -> tuple[ClockSkew, list[tuple[int, int]]]:
+        """Losses at the sample that suits the tone best, each between the blocks around it, and limits of each.
+
+        Until a loss the tone is what it was, from there on what it turns to: a loud tone tells where to a sample.
+        """
+        losses, limits = list(self.losses), []
+        reach = _BLOCKS_AROUND * (case.n_samples // BLOCKS)
+        for j, (at, count) in enumerate(losses):
+            low = max(at - reach, losses[j - 1][0] + 1 if j else 1)
+            high = min(at + reach, losses[j + 1][0] - 1 if j + 1 < len(losses) else case.n_samples - 1)
+            t = torch.arange(low, high, dtype=torch.float64)
+            ahead = float(sum(lost for _, lost in losses[:j]))
+            turn = 2 * math.pi * self.frequency * (t + ahead)
+            before, after = (
+                (self.slipping[:, None] * torch.polar(torch.ones_like(t), turn + extra)).real
+                for extra in (0.0, 2 * math.pi * self.frequency * count)
+            )
+            signal = case.white[list(self.sensors), low:high]
+            told = (signal * (before - after) - (before.square() - after.square()) / 2).sum(0).cumsum(0)
+            told = torch.nn.functional.pad(told, (1, 0))  # of a loss before each sample from `low` to `high`
+            likely = (told >= told.amax() - _AS_GOOD).nonzero()[:, 0]
+            losses[j] = low + int(told.argmax()), count
+            limits.append((low + int(likely[0]), low + int(likely[-1])))
+        return replace(self, losses=tuple(losses)), limits
 
     def refitted(self, case: Case, fold: int) -> ClockSkew:
         keep = estimation_samples(case.n_samples, fold)

@@ -22,12 +22,14 @@ from .analog import Base, consumer_base
 from .bench import Bench, Part
 from .converter import round_to_lattice
 from .kinds import KINDS, Kind, kinds
+from .likelihood import within
 from .setting import Setting, drawn
 
 Array = NDArray[np.float64]
 RATE = 200.0
 NATS = (3.0, 10.0, 30.0, 100.0)
 STRONG = (300.0, 3_000.0, 30_000.0, 300_000.0)  # nats
+MOST_AT_REST = 5.0  # deg/s, standard deviation: beyond, a gyroscope at rest is broken
 
 
 class Case(NamedTuple):
@@ -113,6 +115,7 @@ def make_case(
     if made.option("lattice"):
         gyro = round_to_lattice(gyro, made.option("lattice"))
         simulation["gyro"] = round_to_lattice(simulation["gyro"], made.option("lattice"))
+    within("an output at rest", float(gyro.std(axis=1).max()), MOST_AT_REST, "deg/s")
     recording = {"gyro": gyro, "fs": rate, "unit": "deg/s", **channels}
     effects = [effect_truth(part, llr) for part, llr in zip(parts, llrs, strict=True)]
     finite = all(part.oracle_law != "certain" for part in parts)

@@ -17,7 +17,7 @@ from scipy import signal as sps
 from . import mechanics, shapes, thermal
 from .analog import OVERSAMPLING, relaxator
 from .bench import Bench, Part, quantity, rms
-from .likelihood import ar1_spectrum, comparison, divergence, folded, grid, quadratic_null, solve, spectral_llr
+from .likelihood import ar1_spectrum, comparison, divergence, folded, grid, quadratic_null, solve, spectral_llr, within
 from .spectral import added
 from .strange import noise_of_level
 
@@ -223,9 +223,11 @@ def late_acceleration(bench: Bench, nats: float) -> Part:
     mount = sps.butter(1, min(2 * bench.rng.uniform(10, 30) / bench.rate, 0.9), output="sos")
     felt = sps.sosfilt(mount, true - true.mean(axis=1, keepdims=True), axis=-1)
     axes = bench.rng.standard_normal((bench.n_sensors, 3)) * bench.gains(sensors, signed=False)[:, None]
-    part, _ = bench.shape(
+    part, size = bench.shape(
         "g_sensitivity", nats, axes @ felt, known=True, channel="acceleration", channels={"acceleration": seen}
     )
+    gain = size * np.linalg.norm(axes[list(sensors)], axis=1)
+    within("a gain on acceleration", float(gain.max()), shapes.MOST_PER_G, "deg/s/g")
     return replace(part, form="through a mount")
 
 

@@ -21,6 +21,16 @@ class OutOfReachError(ValueError):
     """An effect cannot have that size, or not on that array: there is no such case."""
 
 
+def within(name: str, size: float, most: float, unit: str) -> None:
+    """Make sure that an effect is of a size that some sensor has.
+
+    Raises:
+        OutOfReachError: It is larger.
+    """
+    if not abs(size) <= most:
+        raise OutOfReachError(f"`nats`: expected {name} of at most {most:g} {unit}".rstrip() + f", got {abs(size):.3g}")
+
+
 def grid(n_samples: int) -> Array:
     """Frequencies k/(2T) of the DCT-II in cycles per sample, without the mean."""
     return np.arange(1, n_samples) / (2 * n_samples)

@@ -12,10 +12,15 @@ from numpy.typing import NDArray
 from . import mechanics, thermal
 from .bench import Bench, Part, quantity, rms
 from .clock import sample_times
-from .likelihood import coefficients
+from .likelihood import OutOfReachError, coefficients, within
 from .spectral import added
 
 Array = NDArray[np.float64]
+MOST_PER_G = 10.0  # deg/s/g: data sheets of the poorest gyroscopes state 0.2, a board that rocks has some more
+MOST_PER_G_SQUARED = 5.0  # deg/s/g^2: rectification is 1e-3 to 0.1
+MOST_PER_KELVIN = 2.0  # deg/s/K: of the poorest gyroscopes, uncompensated, some tenths
+MOST_SCALE_ERROR = 0.2  # share: uncalibrated gyroscopes are off by up to a tenth
+MOST_SKEW = 1e4  # ppm: of the oscillators inside of sensors
 
 
 def _amplitudes(bench: Bench, part: Part) -> Array:
@@ -68,6 +73,10 @@ def drifting_tone(bench: Bench, nats: float) -> Part:
     )
     unit = _at_sensors(bench, sensors, phase)
     course = np.diff(phase) * bench.step_rate / (2 * np.pi)  # Hz
+    if not 0 < course.min() <= course.max() < bench.rate / 2:
+        raise OutOfReachError(
+            f"expected a rotor below half the rate of {bench.rate:.4g} Hz, got {course.min():.4g} to {course.max():.4g}"
+        )
     # half the power in each of the 2n bins of width rate/(2n), as long as the line stays there, two bins blurred
     share, _ = np.histogram(course / bench.rate, bins=(np.arange(bench.n) + 0.5) / (2 * bench.n), density=False)
     share = np.convolve(share / len(course), [0.1, 0.2, 0.4, 0.2, 0.1], "same")
@@ -155,6 +164,7 @@ def temperature_drift(bench: Bench, nats: float) -> Part:
     )
     assert part.signal is not None
     slope = size * gains[list(sensors)]
+    within("a temperature coefficient", float(np.abs(slope).max()), MOST_PER_KELVIN, "deg/s/K")
     return replace(
         part,
         look_alikes=bench.rivals(part.signal, {"step": steps(bench), "warm_up_transient": warm_ups(bench)}),
@@ -210,6 +220,7 @@ def g_sensitivity(bench: Bench, nats: float) -> Part:
         channels={"acceleration": seen},
     )  # fmt: skip
     gain = size * np.linalg.norm(axes[list(sensors)], axis=1)
+    within("a gain on acceleration", float(gain.max()), MOST_PER_G, "deg/s/g")
     part.parameters.update(gain=quantity(rms(gain), "deg/s/g", gain))
     return part
 
@@ -242,6 +253,7 @@ def quadratic_coupling(bench: Bench, nats: float) -> Part:
     )
     own, of_square = (coefficients(x) / np.sqrt(bench.spectrum[list(sensors)]) for x in (course, seen[0] ** 2))
     gain = size * gains[list(sensors)] * (own * of_square).sum(axis=1) / (of_square**2).sum(axis=1)
+    within("a gain on squared acceleration", float(np.abs(gain).max()), MOST_PER_G_SQUARED, "deg/s/g^2")
     part.parameters.update(gain=quantity(rms(gain), "deg/s/g^2", gain))
     return part
 
@@ -264,6 +276,7 @@ def scale_factor(bench: Bench, nats: float, *, constant: bool = False) -> Part:
         )  # fmt: skip
     part, size = bench.shape("scale_factor", nats, unit, known=True, channel="reference_rate", channels=channels)
     error = size * gains[list(sensors)]
+    within("a scale error", float(np.abs(error).max()), MOST_SCALE_ERROR, "of the rate")
     part.parameters.update(error=quantity(1e6 * rms(error), "ppm", 1e6 * error))
     return part
 
@@ -301,6 +314,10 @@ def clock_skew(bench: Bench, nats: float, *, lost: bool = False) -> Part:
             if abs(math.log(size / amplitude)) < 1e-4:
                 break
             ppm *= min(max(size / amplitude, 1e-2), 2.0)
+            # of a line that has slipped off itself no offset tells more
+            within("an offset of the clock", ppm, MOST_SKEW, "ppm")
+        else:
+            raise OutOfReachError(f"`nats`: expected less than a line of half the noise tells, got {nats:g}")
         parameters = {"skew": quantity(ppm, "ppm")}
     seen = 2e-4 * math.sqrt(bench.rate) * bench.rng.standard_normal((3, n)) + 0.05 * np.cos(angle)
     seen[2] += 1.0

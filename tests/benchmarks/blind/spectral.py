@@ -23,11 +23,13 @@ from .likelihood import (
     quadratic_null,
     solve,
     spectral_llr,
+    within,
 )
 from .traps import Trap, beyond_its_twin
 
 Array = NDArray[np.float64]
 NARROW = ("drifting_tone", "resonance")
+MOST_QUIETER = 1e3  # in variance: of gyroscopes that cost ten thousand times as much
 
 
 def _fine_grid(bench: Bench) -> Array:
@@ -292,4 +294,6 @@ def parameter_shift(bench: Bench, nats: float, *, only: str | None = None) -> Pa
             parameters={f"{name}_factor": quantity(factor, "") for name, factor in factors.items()},
         )
 
-    return base(solve(nats, lambda size: base(size).nats, 1e-5, 14.0))
+    size = solve(nats, lambda size: base(size).nats, 1e-5, 14.0)
+    within("white noise that is less by a factor", math.exp(-size * weights[0]), MOST_QUIETER, "")
+    return base(size)
