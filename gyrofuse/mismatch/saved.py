@@ -87,6 +87,8 @@ def _rebuilt(kind: Any, numbers: Any, where: str, lengths: dict[str, int]) -> An
     for entry in fields(kind):
         if not entry.metadata.get("saved", True):
             continue
+        if entry.name not in numbers and entry.default == ():
+            continue  # came with a later release
         if entry.name not in numbers:
             raise _wrong(where, f"an entry {entry.name!r}", sorted(map(str, numbers)))
         values[entry.name] = _value(hints[entry.name], numbers[entry.name], f"{where}.{entry.name}", lengths)
