@@ -49,7 +49,6 @@ _JUMP = 5.0  # standard deviations
 _FEWEST_JUMPS, _MOST_JUMPS = 4, 10
 _TWO_LEVELS = 1.6  # distance of the outermost levels, in jumps
 _TWINS = 256
-_FORM = 3.0  # nats that a further path gains where its physics is of another form
 _FINE = ("warm_up_transient", "temperature_drift")  # families that have places between any two
 PLAUSIBLE = 6.0  # nats below the best place
 _FINER, _CLOSER, _LIKELY = 8, 96, 12  # rounds, places of each, and how many likely ones are enough
@@ -135,7 +134,7 @@ class SlowLook:
         best = []
         for name in dict.fromkeys(s.family.name for s in scans):
             own = [s for s in scans if s.family.name == name]
-            first = max(own, key=lambda s: s.gain - (_FORM if s.design.shape[0] > 1 else 0.0))
+            first = max(own, key=lambda s: s.gain)
             best.append(replace(first, p_value=corrected(min(s.p_value for s in own), len(own))))
         return tuple(best)
 

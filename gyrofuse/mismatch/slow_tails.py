@@ -11,6 +11,7 @@ import math
 import torch
 from torch import Tensor
 
+_FORM = 3.0  # nats: one effect in twenty is of another form than the simplest of its physics
 _FAR = 1000.0  # of chi-squares, beyond which tails are zero to rounding
 
 
@@ -55,8 +56,8 @@ def surprise(z: Tensor, lengths: Tensor, relation: Tensor, places: int) -> tuple
     far = pooled.clamp(max=_FAR)
     here = torch.special.gammaincc(torch.full_like(far, dof / 2), far / 2)
     looked = (expected_exceedances(far, dof, lengths.mean(-1), places) / here).log()
-    # Of each further number of a sensor, which may be as large as its first (Occam's factor).
-    further = (n_columns - 1) / 2 * squares.log1p().sum(-1)
+    # Of a further path, and of its size in each sensor, which may be as large as that of the first (Occam's factor).
+    further = (n_columns - 1) * (_FORM + squares.log1p().sum(-1) / 2)
     gain = pooled / 2 - looked - further
     if n_sensors == 1:
         return gain, -torch.expm1(-together)
