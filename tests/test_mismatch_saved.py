@@ -44,7 +44,7 @@ from gyrofuse.mismatch.mechanisms.tone_size import ToneSize
 from gyrofuse.mismatch.mechanisms.unit_scale import UnitScale
 from gyrofuse.mismatch.mechanisms.variance_change import VarianceChange
 from gyrofuse.mismatch.mechanisms.vibration_tone import VibrationTone
-from gyrofuse.mismatch.mechanisms.warm_up_transient import WarmUpTransient
+from gyrofuse.mismatch.mechanisms.warm_up_transient import Decay, WarmUpTransient
 from gyrofuse.mismatch.oscillating import Mode
 from gyrofuse.mismatch.remainder import Remainder
 from gyrofuse.mismatch.repaired import RepairedModel
@@ -78,8 +78,12 @@ EVERY = (
     VibrationTone(7.3, numbers(0.3, 0.0), numbers(0.1, 0.2)),
     ToneSize(7.3, numbers(0.3, 1 / 3)),
     RandomTelegraph(numbers(0.3, 0.0), numbers(1 / 3, 1.0), numbers(0.2, 1.0)),
-    TemperatureDrift(numbers(1 / 3, 0.0), torch.zeros(2, 4, dtype=torch.float64), 0.7, "temperature", 0),
-    WarmUpTransient(numbers(1 / 3, 0.0), torch.zeros(2, 4, dtype=torch.float64), 2.3),
+    TemperatureDrift(
+        numbers(1 / 3, 0.0), torch.zeros(2, 4, dtype=torch.float64), 0.7, "temperature", 0, (numbers(0.1, 0.0),)
+    ),
+    WarmUpTransient(
+        numbers(1 / 3, 0.0), torch.zeros(2, 4, dtype=torch.float64), 2.3, (Decay(numbers(0.2, 0.0), 20 / 3),)
+    ),
     Step(numbers(0.0, 1 / 3), torch.zeros(2, 4, dtype=torch.float64), 3.3),
     VarianceChange(((1.5, 3.25), (6.0, 7.0)), numbers(2.0, 1.0), 1 / 3),
     GradualChange(numbers(0.0, 1 / 3, 9.0), numbers(0.0, 0.7, 1.0), numbers(0.9, 1.0), numbers(1 / 3, 1.0), 0.1),
@@ -128,6 +132,16 @@ def test_simulates_the_same_after_json():
     torch.testing.assert_close(*drawn, rtol=0, atol=0)
     assert (again.scene.rate, again.scene.unit, again.scene.sensors) == (50.0, "deg/s", ("a", "b"))
     assert str(again) == f"{again.noise} + vibration_tone"
+
+
+def test_what_an_effect_has_of_late_may_be_absent():
+    """Files of earlier releases know one path of a slow effect."""
+    drift = TemperatureDrift(numbers(0.3, 0.0), torch.zeros(2, 4, dtype=torch.float64), 0.7, "temperature", 0)
+    description = model(drift).to_dict()
+    del description["effects"][0]["numbers"]["curvature"]
+    (back,) = repaired_from_dict(description).effects
+    assert isinstance(back, TemperatureDrift)
+    assert back.curvature == ()
 
 
 def descendants(kind: type) -> set[type]:

@@ -24,6 +24,8 @@ from gyrofuse.mismatch.slow import (
     SlowNoise,
     best_fit,
     cell_differences,
+    column_sizes,
+    columns,
     cosines,
     ordinates,
     scores,
@@ -32,15 +34,14 @@ from gyrofuse.mismatch.slow import (
     where,
 )
 from gyrofuse.mismatch.slow_effect import quantiles
-from gyrofuse.mismatch.slow_families import lagged, steps, warm_ups
+from gyrofuse.mismatch.slow_families import double_warm_ups, lagged, steps, warm_ups
 from gyrofuse.mismatch.slow_scans import (
     best_place,
-    curve_length,
-    expected_exceedances,
     jumps_to_and_fro,
     slow_look,
     slow_witness,
 )
+from gyrofuse.mismatch.slow_tails import curve_length, expected_exceedances
 
 N, RATE, SENSORS = 16384, 100.0, 4
 LEVEL = 5e-4
@@ -106,16 +107,31 @@ def test_many_fits_at_once_are_those_one_by_one():
     values = told(now).values * torch.tensor([0.8, 1.0, 1.3], dtype=torch.float64)[:, None, None]
     many, x = told(now)._replace(values=values).noise(), steps(now).templates[200]
     ys = torch.stack([y, y + 0.05 * x, y - 0.1 * x])
-    together = best_fit(many, ys, x)
+    together = best_fit(many, ys, x[None])
     for i in range(3):
         alone = SlowNoise(noise.n_samples, many.coefficients[i], noise.centre, noise.spread, noise.ahead)
-        own = best_fit(alone, ys[i], x)
+        own = best_fit(alone, ys[i], x[None])
         assert torch.allclose(own.size, together.size[i], atol=1e-3)
         assert float(own.value.sum()) == pytest.approx(float(together.value[i].sum()), abs=0.01)
     size, information = scores(ys[0], own.variance, x[None])
     weight = 1 / own.variance
     np.testing.assert_allclose(size[:, 0], (weight * x * ys[0]).sum(-1) / (weight * x * x).sum(-1))
     np.testing.assert_allclose(information[:, 0], (weight * x * x).sum(-1))
+
+
+def test_columns_are_weighted_least_squares():
+    now = case()
+    y, variance = slow_ordinates(now.recording), told(now).noise().own
+    designs = double_warm_ups(now).designs[[0, 90]]
+    z, (size, spread) = columns(y, variance, designs), column_sizes(y, variance, designs)
+    for i in range(SENSORS):
+        for k, design in enumerate(designs):
+            weighted, data = (design / variance[i].sqrt()).mT, y[i] / variance[i].sqrt()
+            direct = torch.linalg.lstsq(weighted, data[:, None]).solution[:, 0]
+            np.testing.assert_allclose(size[i, k], direct, rtol=1e-6)
+            np.testing.assert_allclose(spread[i, k], torch.linalg.inv(weighted.mT @ weighted).diagonal(), rtol=1e-6)
+            told_of = data.square().sum() - (data - weighted @ direct).square().sum()
+            assert float(z[i, k].square().sum()) == pytest.approx(float(told_of), rel=1e-6)
 
 
 def test_tuples_are_chosen_item_by_item():
@@ -319,6 +335,59 @@ def test_an_effect_is_found_by_its_name(mechanism, path: torch.Tensor, place: st
     refitted = finding.effect.refitted(now, 0)
     assert refitted.gains(now, 0).shape == (8,)
     assert float((refitted.size - scale * SIZE)[[0, 2]].abs().max()) < 0.5 * scale
+
+
+def lag_of(seconds: float) -> torch.Tensor:
+    scene = Scene(RATE, "deg/s", ("a",), {"temperature": TEMPERATURE})
+    path = lagged(scene, "temperature", 0, seconds * RATE, N)
+    return path - path[0]
+
+
+BENT = lag_of(7.0) + 0.4 * lag_of(7.0).square()
+DOUBLE = (-T / 400).exp() + 0.6 * (-T / 3000).exp()
+
+
+@pytest.mark.parametrize("strength", [3.0, 30.0, 100.0])
+@pytest.mark.parametrize(
+    ("mechanism", "path", "numbers"),
+    [
+        (TemperatureDrift, BENT, {"coefficient": 1.0, "curvature": 0.4}),
+        (WarmUpTransient, 2 * DOUBLE, {"size": 2.0, "second_size": 1.2}),
+    ],
+)
+def test_an_effect_of_another_form_is_found_with_that_form(mechanism, path, numbers, strength: float):
+    """A bent line, and two time constants: nothing else is made of what one straight line or one decay would leave."""
+    now = case(strength * SIZE[:, None] * path)
+    assert slow_witness(now).p_value < 1e-6
+    finding = best(now)
+    assert finding.mechanism == mechanism.name
+    for name, value in numbers.items():
+        for i in (0, 2, 3):
+            entry = finding.parameters[f"{name}[{i}]"]
+            sd = (entry.high - entry.low) / 3.92
+            assert abs(entry.value - strength * value * float(SIZE[i])) < 4.5 * sd
+    if mechanism is WarmUpTransient:
+        for name, tau in (("time_constant", 4.0), ("second_time_constant", 30.0)):
+            entry = finding.parameters[name]
+            assert abs(entry.value - tau) <= entry.high - entry.low
+        assert "time constants of" in finding.sentence
+    else:
+        assert "in a line that is bent" in finding.sentence
+    assert held_out_gain(now, finding.effect).confirms(finding.p_value)
+    after = finding.effect.explained(now, generator(1))
+    assert slow_witness(after).p_value > 0.01
+    back = finding.effect.simulated(finding.effect.removed(now.recording, now.scene), now.scene, generator(1))
+    assert torch.allclose(back, now.recording)
+
+
+@pytest.mark.parametrize(("mechanism", "path"), [(WarmUpTransient, (-T / 1500).exp()), (TemperatureDrift, lag_of(7.0))])
+def test_of_a_strong_effect_nothing_is_left(mechanism, path: torch.Tensor):
+    """Its place is known far more closely than any grid that is searched to begin with."""
+    now = case(300 * SIZE[:, None] * path)
+    finding = best(now)
+    assert finding.mechanism == mechanism.name
+    assert not {"curvature[0]", "second_size[0]"} & set(finding.parameters)
+    assert slow_witness(finding.effect.explained(now, generator(1))).p_value > 0.01
 
 
 def test_the_channel_is_named_and_the_unit_is_by_kelvin():

@@ -207,12 +207,17 @@ def _compared(finding: Finding, gain: Gain, left: Case, beside: list[Finding]) -
     """A finding beside others, with what would be without it, and with its best look-alike."""
     told = replace(finding, gain_without=gain.total)
     alike = happened_instead(left, finding, beside)
-    rivals = [(held_out_gain(left, effect), effect) for effect in look_alikes(left, finding)]
+    own, alone = finding.effect, gain
+    if isinstance(own, SlowEffect):
+        # Whether there is any is a matter of the noise that would be without; which it is, of the noise beside it.
+        own = own.beside_it(left)
+        alone = held_out_gain(left, own)
+    rivals = [(held_out_gain(left, rival), rival) for rival in look_alikes(left, replace(finding, effect=own))]
     if rivals:
         best, effect = max(rivals, key=lambda rival: rival[0].total)
-        less, sd = gain.total - best.total, _spread(left, finding.effect, gain, effect, best)
-        told = replace(told, instead=Instead(effect.name, best.total, sd))
-        if best.total > 0 and less < max(_AS_GOOD_SD * sd, _AS_GOOD):
+        less, sd = alone.total - best.total, _spread(left, own, alone, effect, best)
+        told = replace(told, instead=Instead(effect.name, gain.total - less, sd))
+        if less < gain.total and less < max(_AS_GOOD_SD * sd, _AS_GOOD):
             alike += (effect.name,)
     alternatives = tuple(dict.fromkeys((*finding.alternatives, *alike)))
     sentence = finding.sentence

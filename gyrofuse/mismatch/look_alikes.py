@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 
 import torch
 
@@ -30,7 +31,7 @@ from gyrofuse.mismatch.mechanisms.warm_up_transient import WarmUpTransient
 from gyrofuse.mismatch.oscillating import Mode
 from gyrofuse.mismatch.shape_terms import Common, Flicker, LowPass, Shift, Term
 from gyrofuse.mismatch.shapes import compared
-from gyrofuse.mismatch.slow_effect import SlowEffect, only
+from gyrofuse.mismatch.slow_effect import SlowEffect
 from gyrofuse.mismatch.slow_scans import slow_look, steps_one_by_one
 from gyrofuse.mismatch.spectral_choice import best_start, filter_starts
 
@@ -126,15 +127,12 @@ def _slow(case: Case, finding: Finding) -> Iterator[Mechanism]:
     """Other paths of the same sensors in the same noise."""
     effect = finding.effect
     assert isinstance(effect, SlowEffect)
+    kinds: tuple[type[Step | WarmUpTransient | TemperatureDrift], ...] = (Step, WarmUpTransient, TemperatureDrift)
     for scan in slow_look(case).scans:
-        size, place = only(scan.fit.size, finding.sensors), scan.place / case.scene.rate
-        if scan.family.name == Step.name:
-            yield Step(size, effect.log_factors, place)
-        elif scan.family.name == WarmUpTransient.name:
-            yield WarmUpTransient(size, effect.log_factors, place)
-        else:
-            family = scan.family
-            yield TemperatureDrift(size, effect.log_factors, place, family.channel or "", family.row)
+        for kind in kinds:
+            if kind.name == scan.family.name:
+                rival = kind.of(scan, case.scene.rate, finding.sensors)
+                yield replace(rival, log_factors=effect.log_factors)
 
 
 def _shapes(case: Case, finding: Finding) -> list[Mechanism]:

@@ -24,6 +24,7 @@ from gyrofuse.mismatch.mechanism import Finding, Mechanism
 from gyrofuse.mismatch.mechanisms import STAGES
 from gyrofuse.mismatch.mechanisms.quantization import Quantization
 from gyrofuse.mismatch.repaired import RepairedModel
+from gyrofuse.mismatch.slow_effect import SlowEffect
 
 _MOST = 6  # effects that a simulation is believed to have
 
@@ -84,7 +85,7 @@ def _shared(case: Case, kinds: Iterable[type[Mechanism]], level: float) -> Mecha
 def _has(simulated: Case, effect: Mechanism, level: float) -> bool:
     """Whether a simulation has an effect whose numbers were fitted to it: chance alone gives each half a nat."""
     gain = held_out_gain(simulated, effect)
-    numbers = int(getattr(effect, effect.proportional_to).count_nonzero())
+    numbers = int(_sizes(effect).count_nonzero())
     return gain.confirms(level) and float(special.chdtrc(numbers, 2 * gain.as_found)) < level
 
 
@@ -100,15 +101,22 @@ def _summed(records: Tensor) -> Tensor:
 
 def _resized(effect: Mechanism, case: Case) -> Mechanism:
     """With the numbers that a case's recording has."""
-    sizes = [getattr(effect.refitted(case, fold), effect.proportional_to) for fold in range(N_FOLDS)]
+    sizes = [_sizes(effect.refitted(case, fold)) for fold in range(N_FOLDS)]
     return _with_size(effect, torch.stack(sizes).mean(0))
 
 
 def _scaled(effect: Mechanism, factor: float) -> Mechanism:
-    return _with_size(effect, factor * getattr(effect, effect.proportional_to))
+    return _with_size(effect, factor * _sizes(effect))
+
+
+def _sizes(effect: Mechanism) -> Tensor:
+    """All numbers that it is proportional to; slow effects may have several paths."""
+    return effect.sizes if isinstance(effect, SlowEffect) else cast(Tensor, getattr(effect, effect.proportional_to))
 
 
 def _with_size(effect: Mechanism, size: Tensor) -> Mechanism:
+    if isinstance(effect, SlowEffect):
+        return effect.with_sizes(size)
     return cast(Mechanism, replace(cast(Any, effect), **{effect.proportional_to: size}))
 
 

@@ -87,7 +87,8 @@ def _rebuilt(kind: Any, numbers: Any, where: str, lengths: dict[str, int]) -> An
     for entry in fields(kind):
         if not entry.metadata.get("saved", True):
             continue
-        if entry.name not in numbers and entry.metadata.get("plain", False):  # saved before there was another kind
+        # Saved before there was another kind, or more than one number.
+        if entry.name not in numbers and (entry.metadata.get("plain", False) or entry.default == ()):
             continue
         if entry.name not in numbers:
             raise _wrong(where, f"an entry {entry.name!r}", sorted(map(str, numbers)))

@@ -47,6 +47,7 @@ _UNSEEN = 8  # ordinates below the bands
 _ALIKE = 1.0  # what each of them is worth that all sensors together tell of one, complex ordinates
 _FIT_ROUNDS = 5
 _LEAST_ROOT = 0.1  # cube root of a chi-square over its mean
+_ALIKE_COLUMNS = 1e-12  # of a column's square: far above rounding, far below what any record tells apart
 _FARTHEST = 5.0  # of a log factor by estimation error: a walk that was found as none may be anything below the rest
 
 _Tuple = TypeVar("_Tuple", bound=tuple[Any, ...])
@@ -116,7 +117,7 @@ class Fit(NamedTuple):
         log_factors: `(..., sensor, part)`.
         value: Logarithm of likelihood times prior, `(..., sensor)`, without constants.
         variance: Of the ordinates, `(..., sensor, ordinate)`.
-        size: `b`, `(..., sensor)`.
+        size: `b`, `(..., sensor, column)`.
     """
 
     log_factors: Tensor
@@ -211,7 +212,7 @@ def best_fit(noise: SlowNoise, y: Tensor, x: Tensor | None = None, start: Tensor
     Args:
         noise: Of `y`.
         y: Ordinates `(..., sensor, ordinate)`.
-        x: Template `(..., 1, ordinate)`.
+        x: Template `(..., column, ordinate)`, each column of a size of its own in every sensor.
         start: Log factors to start from, `(..., sensor, part)`.
     """
     theta = (noise.centre + noise.ahead).expand(*y.shape[:-1], -1) if start is None else start
@@ -221,10 +222,11 @@ def best_fit(noise: SlowNoise, y: Tensor, x: Tensor | None = None, start: Tensor
     for _ in range(_ROUNDS):
         parts = theta.exp()[..., None] * noise.parts
         variance = parts.sum(-2)
-        size, left = torch.zeros_like(y[..., 0]), y
+        size, left = y.new_zeros(*y.shape[:-1], 0), y
         if x is not None:
-            size = (x * y / variance).sum(-1) / (x.square() / variance).sum(-1)
-            left = y - size[..., None] * x
+            root, score = normal_equations(y, variance, x)
+            size = torch.cholesky_solve(score[..., None], root)[..., 0]
+            left = y - size @ x
         power = left.square() / variance
         off = theta - noise.centre
         value = -((power + variance.log()).sum(-1) + (off.square() * precision).sum(-1)) / 2
@@ -239,6 +241,38 @@ def best_fit(noise: SlowNoise, y: Tensor, x: Tensor | None = None, start: Tensor
             break
     assert best is not None
     return best
+
+
+def columns(y: Tensor, variance: Tensor, templates: Tensor) -> Tensor:
+    """What templates of several columns say, each beside those before it, in standard deviations.
+
+    Args:
+        y: Ordinates `(..., sensor, ordinate)`.
+        variance: Of each.
+        templates: `(template, column, ordinate)`.
+
+    Returns:
+        `(..., sensor, template, column)`: their squares add up to twice the log likelihood ratio.
+    """
+    root, score = _normal_equations_of_all(y, variance, templates)
+    return torch.linalg.solve_triangular(root, score[..., None], upper=False)[..., 0]
+
+
+def column_sizes(y: Tensor, variance: Tensor, templates: Tensor) -> tuple[Tensor, Tensor]:
+    """Sizes of the columns of each template alone, and their variances; arguments and shapes as in `columns`."""
+    root, score = _normal_equations_of_all(y, variance, templates)
+    spread = torch.cholesky_inverse(root).diagonal(dim1=-1, dim2=-2)
+    return torch.cholesky_solve(score[..., None], root)[..., 0], spread
+
+
+def normal_equations(y: Tensor, variance: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+    """Of weighted least squares of columns `x` `(..., column, ordinate)` in each sensor.
+
+    Returns:
+        Cholesky root of the columns' products `(..., sensor, column, column)`, and theirs with the data.
+    """
+    weighted = x[..., None, :, :] / variance[..., None, :]  # (..., sensor, column, ordinate)
+    return _root(weighted @ x[..., None, :, :].mT), (weighted @ y[..., None])[..., 0]
 
 
 def scores(y: Tensor, variance: Tensor, templates: Tensor) -> tuple[Tensor, Tensor]:
@@ -298,6 +332,21 @@ def _fitted(values: Tensor, atoms: Tensor, dof: Tensor, start: Tensor) -> Tensor
         free = coefficients > 0
         fitted = coefficients @ atoms
     return coefficients
+
+
+def _normal_equations_of_all(y: Tensor, variance: Tensor, templates: Tensor) -> tuple[Tensor, Tensor]:
+    """As `normal_equations`, of every template `(template, column, ordinate)`."""
+    n_templates, n_columns, _ = templates.shape
+    products = (templates[:, :, None] * templates[:, None]).flatten(0, 2)
+    gram = ((1 / variance) @ products.mT).unflatten(-1, (n_templates, n_columns, n_columns))
+    score = ((y / variance) @ templates.flatten(0, 1).mT).unflatten(-1, (n_templates, n_columns))
+    return _root(gram), score
+
+
+def _root(gram: Tensor) -> Tensor:
+    """Cholesky root of products `(..., column, column)`; columns that are alike but for rounding are kept apart."""
+    size = gram.diagonal(dim1=-1, dim2=-2)
+    return torch.linalg.cholesky(gram + torch.diag_embed(_ALIKE_COLUMNS * size))
 
 
 def _shared_step(information: Tensor, slope: Tensor) -> Tensor:

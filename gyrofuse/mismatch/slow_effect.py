@@ -9,6 +9,7 @@ scatter more.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, NamedTuple
 
@@ -20,22 +21,20 @@ from gyrofuse.mismatch.case import N_BLOCKS, Case, Scene, block_means
 from gyrofuse.mismatch.folds import N_FOLDS, N_JUDGED, in_fold
 from gyrofuse.mismatch.hysteresis import strongest_relay
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
-from gyrofuse.mismatch.slow import cosines, scores
-from gyrofuse.mismatch.slow_families import Family
-from gyrofuse.mismatch.slow_scans import Scan, SlowLook, concerned, slow_look
+from gyrofuse.mismatch.slow import column_sizes, cosines
+from gyrofuse.mismatch.slow_scans import PLAUSIBLE, Scan, SlowLook, between, concerned, explained, slow_look
 
 _STRONG = 5e-4  # a slow effect leaves traces that look like another one: largest p value
 _TOO_CLOSE = 5.0  # nats
-_PLAUSIBLE = 6.0  # nats below the best place
 _SHARES = N_JUDGED // N_FOLDS
 
 
 @dataclass(frozen=True, eq=False)
 class SlowEffect(Mechanism):
-    """`x_i(t) = size_i path(t)`.
+    """`x_i(t) = size_i path(t)`, and further paths of the same physics with sizes of their own.
 
     Attributes:
-        size: `(sensor,)`; 0 in sensors that are not concerned.
+        size: Of the first path, `(sensor,)`; 0 in sensors that are not concerned.
         log_factors: Of the slow noise beside it, `(sensor, part)`, against the simulation's: for weights.
     """
 
@@ -44,8 +43,17 @@ class SlowEffect(Mechanism):
     size: OfSensors
     log_factors: Annotated[Tensor, Axes(("sensor", "part"))]
 
-    def path(self, n_samples: int, scene: Scene) -> Tensor:
-        """For a size of one, `(time,)`."""
+    @property
+    def sizes(self) -> Tensor:
+        """Of each path, `(sensor, path)`."""
+        return self.size[:, None]
+
+    def with_sizes(self, sizes: Tensor) -> SlowEffect:
+        """The same with other sizes `(sensor, path)`."""
+        return replace(self, size=sizes[:, 0])
+
+    def paths(self, n_samples: int, scene: Scene) -> Tensor:
+        """For sizes of one, `(path, time)`."""
         raise NotImplementedError
 
     def simulated(self, signal: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
@@ -59,48 +67,58 @@ class SlowEffect(Mechanism):
 
     def refitted(self, case: Case, fold: int) -> SlowEffect:
         """Sizes by generalised least squares without the whitened differences that the fold holds out."""
-        y, directions = self._whitened(case)
-        x = directions[..., 0] * ~in_fold(y.shape[-1], fold)
-        size = (x * y).sum(-1) / x.square().sum(-1)
-        return replace(self, size=torch.where(size.isfinite() & (self.size != 0), size, 0.0))
+        y, paths, _ = self._whitened(case)
+        kept = ~in_fold(y.shape[-1], fold)
+        # A step may happen in what is held out: then there is nothing to tell its size.
+        sizes = (torch.linalg.pinv(paths * kept[:, None]) @ (y * kept)[..., None])[..., 0]
+        return self.with_sizes(torch.where(self.sizes != 0, sizes, 0.0))
 
     def gains(self, case: Case, fold: int) -> Tensor:
-        y, directions = self._whitened(case)
+        y, paths, slow = self._whitened(case)
         judged = in_fold(y.shape[-1], fold)
-        directions = (self.size[:, None, None] * directions)[:, judged].flatten(0, 1)
+        effect = paths @ self.sizes[..., None]  # (sensor, difference, 1)
+        scale = self.sizes.norm(dim=-1).copysign(self.size)[:, None, None]
+        directions = torch.cat([effect, scale * slow], -1)[:, judged].flatten(0, 1)
         length = directions[:, 0].norm() / math.sqrt(_SHARES)
         axes = torch.linalg.qr(directions).Q
         axes[:, 0] *= (axes[:, 0] @ directions[:, 0]).sign()
         seen = _hadamard(_SHARES) @ (axes.mT @ y[:, judged].flatten())
         return length * seen - length.square() / 2
 
-    def _whitened(self, case: Case) -> tuple[Tensor, Tensor]:
-        """Whitened differences of block means, `(sensor, difference)`, and directions `(sensor, difference, _SHARES)`.
+    def beside_it(self, case: Case) -> SlowEffect:
+        """The same with the noise that a case has once its mechanism is explained there, without any doubt of that."""
+        scan = slow_look(case).scan(self.name)
+        return self if scan is None else replace(self, log_factors=scan.fit.log_factors)
 
-        The first is the path's; the others are slow cosines.
+    def _whitened(self, case: Case) -> tuple[Tensor, Tensor, Tensor]:
+        """Whitened differences of block means: of the data `(sensor, difference)`, of paths and of slow cosines.
+
+        Those are `(sensor, difference, path)`, and `(sensor, difference, _SHARES - 1)`.
         """
         covariance = slow_look(case).noise.covariance(self.log_factors).diff(dim=-1).diff(dim=-2)
-        path = block_means(self.path(case.n_samples, case.scene))
-        directions = torch.cat([path[None], cosines()[: _SHARES - 1]])
+        paths = block_means(self.paths(case.n_samples, case.scene))
+        directions = torch.cat([paths, cosines()[: _SHARES - 1]])
         y = block_means(case.recorded.steady[0])
         both = torch.cat([y[:, None], directions.expand(len(y), -1, -1)], 1).diff().mT
         root = torch.linalg.cholesky(covariance)
         white = torch.linalg.solve_triangular(root, both, upper=False)
-        return white[..., 0], white[..., 1:]
+        return white[..., 0], white[..., 1 : 1 + len(paths)], white[..., 1 + len(paths) :]
 
     def _effect(self, n_samples: int, scene: Scene) -> Tensor:
-        return self.size[:, None] * self.path(n_samples, scene)
+        return self.sizes @ self.paths(n_samples, scene)
 
 
 class Estimate(NamedTuple):
-    """Place and sizes of an effect, over all places that the data leave possible.
+    """Places and sizes of an effect, over all places that the data leave possible.
 
     Attributes:
         place: Median of the places, with 2.5 and 97.5 % quantiles, samples.
-        size, sd: `(sensor,)`.
+        other: The same of the second path, where that has its own; else None.
+        size, sd: `(sensor, path)`.
     """
 
     place: tuple[float, float, float]
+    other: tuple[float, float, float] | None
     size: Tensor
     sd: Tensor
 
@@ -134,7 +152,7 @@ def strong_scan(case: Case, name: str, level: float) -> Strong | None:
     if any(gain > scan.gain + _TOO_CLOSE for gain in rivals.values()):
         return None
     relay = strongest_relay(case)
-    if relay is not None and relay.gain > scan.gain - _TOO_CLOSE:
+    if relay is not None and relay.gain_beside(scan.relation) > scan.gain - _TOO_CLOSE:
         return None
     return Strong(look, scan, tuple(rival for rival, gain in rivals.items() if gain > scan.gain - _TOO_CLOSE))
 
@@ -148,31 +166,31 @@ def log_factors(scan: Scan) -> Tensor:
     return scan.fit.log_factors + 2 * max(float((scan.held[which].norm() / scan.z[which].norm()).log()), 0.0)
 
 
-def plausible(look: SlowLook, scan: Scan) -> tuple[float, float]:
-    """First and last place that the data leave possible, and one more on either side, samples."""
-    gain = _gain(look, scan, scan.family)
-    at = (gain > gain.max() - _PLAUSIBLE).nonzero()[:, 0]
-    places = scan.family.places
-    return float(places[max(int(at[0]) - 1, 0)]), float(places[min(int(at[-1]) + 1, len(places) - 1)])
+def estimate(look: SlowLook, scan: Scan, *, finer: bool = True) -> Estimate:
+    """Mean over the places of a family, each as likely as the data say: the places are the prior.
 
-
-def estimate(look: SlowLook, scan: Scan, fine: Family) -> Estimate:
-    """Mean over the places of a family, each as likely as the data say: the places are the prior."""
-    size, information = scores(look.y, scan.fit.variance, fine.templates)
-    weight = torch.softmax(_gain(look, scan, fine), 0)
-    mean = (size * weight).sum(-1)
-    variance = ((1 / information + size.square()) * weight).sum(-1) - mean.square()
-    return Estimate(quantiles(fine.places, weight), mean, variance.sqrt())
-
-
-def _gain(look: SlowLook, scan: Scan, family: Family) -> Tensor:
-    """Of the sensors concerned, nats, `(template,)`."""
-    size, information = scores(look.y, scan.fit.variance, family.templates)
-    return (size.square() * information)[list(concerned(scan))].sum(0) / 2
+    Args:
+        look: What it is part of.
+        scan: The family, and the noise beside it.
+        finer: Whether there are places between those of the scan.
+    """
+    family, variance, which = scan.family, scan.fit.variance, concerned(scan)
+    if finer:
+        gain = explained(look.y, variance, family.designs, which) / 2
+        best = [p[[scan.best]] for p in family.where]
+        family = between(family, gain > gain.max() - PLAUSIBLE, best)
+    size, spread = column_sizes(look.y, variance, family.designs)  # (sensor, template, path)
+    weight = torch.softmax(explained(look.y, variance, family.designs, which) / 2, 0)
+    mean = (size * weight[:, None]).sum(-2)
+    sd = (((spread + size.square()) * weight[:, None]).sum(-2) - mean.square()).clamp(min=0).sqrt()
+    places, *others = (quantiles(p, weight) for p in family.where)
+    return Estimate(places, others[0] if others else None, mean, sd)
 
 
 def quantiles(places: Tensor, weight: Tensor) -> tuple[float, float, float]:
     """Median, 2.5 and 97.5 % quantiles of places with weights that sum to one."""
+    places, order = places.sort()
+    weight = weight[order]
     below = weight.cumsum(0) - weight / 2
     low, middle, high = (
         float(places[min(int(torch.searchsorted(below, share)), len(places) - 1)])
@@ -181,8 +199,8 @@ def quantiles(places: Tensor, weight: Tensor) -> tuple[float, float, float]:
     return middle, low, high
 
 
-def only(size: Tensor, which: tuple[int, ...]) -> Tensor:
-    """Sizes `(sensor,)` of some sensors, 0 in the others."""
+def only(size: Tensor, which: Sequence[int]) -> Tensor:
+    """Sizes `(sensor, ...)` of some sensors, 0 in the others."""
     kept = torch.zeros_like(size)
     kept[list(which)] = size[list(which)]
     return kept
@@ -202,8 +220,7 @@ def slow_finding(
     words: str,
     place: dict[str, Parameter],
     *,
-    size: str = "size",
-    unit: str | None = None,
+    sizes: Sequence[tuple[str, str]] = (),
     time_s: float | None = None,
     channel: str | None = None,
 ) -> Finding:
@@ -215,25 +232,25 @@ def slow_finding(
         effect: It, with its numbers.
         found: Its sizes.
         words: What the bias does.
-        place: Parameter that says where.
-        size: Name of the sizes.
-        unit: Theirs; by default that of the signal.
+        place: Parameters that say where.
+        sizes: Names and units of the sizes of its paths; by default that of one, in the unit of the signal.
         time_s: Onset.
         channel: That it follows.
     """
-    scan, unit = strong.scan, unit or case.scene.measure
+    scan, sizes = strong.scan, sizes or [("size", case.scene.measure)]
     which = concerned(scan)
     limits = {}
-    for i in which:
-        value, reach = float(found.size[i]), Z * float(found.sd[i])
-        limits[f"{size}[{i}]"] = Parameter(value, value - reach, value + reach, unit)
-    largest = max(which, key=lambda i: abs(float(found.size[i])))
+    for path, (name, unit) in enumerate(sizes[: found.size.shape[-1]]):
+        for i in which:
+            value, reach = float(effect.sizes[i, path]), Z * float(found.sd[i, path])
+            limits[f"{name}[{i}]"] = Parameter(value, value - reach, value + reach, unit)
+    largest = max(which, key=lambda i: abs(float(effect.size[i])))
     # A block is no more than half a wavelet there.
     levels = range(int(math.log2(case.n_samples / N_BLOCKS)) + 1, int(math.log2(case.n_samples)) + 1)
     return Finding(
         effect.name,
         effect,
-        f"the bias of {case.scene.named(which)} {words}, by up to {abs(float(found.size[largest])):.3g} {unit} "
+        f"the bias of {case.scene.named(which)} {words}, by up to {abs(float(effect.size[largest])):.3g} {sizes[0][1]} "
         f"(sensor {case.scene.sensors[largest]})",
         scan.p_value,
         which,

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -14,6 +16,11 @@ from gyrofuse.mismatch.slow import ordinates, slow_ordinates
 
 _TIME_CONSTANTS = 24
 _LAGS = 16
+_APART = 2  # places of the grid between two time constants
+
+
+def _no_more(*_places: Tensor) -> Family:
+    raise NotImplementedError("a family without places between its own")
 
 
 class Family(NamedTuple):
@@ -25,6 +32,9 @@ class Family(NamedTuple):
         places: What tells them apart, `(template,)`, samples: onset, time constant or lag.
         channel: Of a temperature, and its row.
         row: Likewise.
+        beside: A second path of the same physics with a size of its own, for each template; None for none.
+        others: Its places, where it has its own.
+        at: The family of other places, and others; that of steps has no more.
     """
 
     name: str
@@ -32,6 +42,19 @@ class Family(NamedTuple):
     places: Tensor
     channel: str | None = None
     row: int = 0
+    beside: Tensor | None = None
+    others: Tensor | None = None
+    at: Callable[..., Family] = _no_more
+
+    @property
+    def where(self) -> list[Tensor]:
+        """Places, and others where there are."""
+        return [self.places] if self.others is None else [self.places, self.others]
+
+    @property
+    def designs(self) -> Tensor:
+        """All paths of each template, `(template, column, ordinate)`."""
+        return torch.stack([self.templates] if self.beside is None else [self.templates, self.beside], 1)
 
 
 def steps(case: Case) -> Family:
@@ -45,22 +68,44 @@ def steps(case: Case) -> Family:
 
 def warm_ups(case: Case, time_constants: Tensor | None = None) -> Family:
     """Decays `exp(-t / tau)` with time constants `(template,)`, samples; by default from half a block to the record."""
-    if time_constants is None:
-        time_constants = torch.logspace(
-            math.log10(case.block / 2), math.log10(case.n_samples), _TIME_CONSTANTS, dtype=torch.float64
-        )
+    return _decays(case.block, _time_constants(case) if time_constants is None else time_constants)
+
+
+def double_warm_ups(case: Case) -> Family:
+    """Sums of two decays, of a part and of what it stands in, `others` the slower one; samples."""
+    grid = _time_constants(case)
+    fast, slow = torch.triu_indices(len(grid), len(grid), _APART)
+    return _decays(case.block, grid[fast], grid[slow])
+
+
+def _time_constants(case: Case) -> Tensor:
+    low, high = math.log10(case.block / 2), math.log10(case.n_samples)
+    return torch.logspace(low, high, _TIME_CONSTANTS, dtype=torch.float64)
+
+
+def _decays(block: int, time_constants: Tensor, others: Tensor | None = None) -> Family:
+    """Decays in blocks of so many samples, a second one beside each where `others` has its time constant."""
+    templates, *beside = (_decay(block, tau) for tau in (time_constants, others) if tau is not None)
+    at = partial(_decays, block)
+    return Family("warm_up_transient", templates, time_constants, None, 0, beside[0] if beside else None, others, at)
+
+
+def _decay(block: int, time_constants: Tensor) -> Tensor:
     tau = time_constants[:, None]
     # The mean over a block, a geometric sum.
-    mean = torch.expm1(-case.block / tau) / torch.expm1(-1 / tau) / case.block
-    means = mean * (-torch.arange(N_BLOCKS) * case.block / tau).exp()
-    return Family("warm_up_transient", ordinates(means), time_constants)
+    mean = torch.expm1(-block / tau) / torch.expm1(-1 / tau) / block
+    return ordinates(mean * (-torch.arange(N_BLOCKS) * block / tau).exp())
 
 
 def temperatures(case: Case) -> list[Family]:
-    """Each row of each temperature, with lags from none to a quarter of the record."""
+    """Each row of each temperature, in a straight line and a bent one, with lags up to a quarter of the record."""
     lags = torch.logspace(math.log10(case.block / 2), math.log10(case.n_samples / 4), _LAGS - 1, dtype=torch.float64)
     lags = torch.cat([torch.zeros(1, dtype=torch.float64), lags])
-    return [temperature(case.scene, channel, row, lags, case.n_samples) for channel, row in temperature_rows(case)]
+    return [
+        temperature(case.scene, channel, row, case.n_samples, bent, lags)
+        for channel, row in temperature_rows(case)
+        for bent in (False, True)
+    ]
 
 
 def temperature_rows(case: Case) -> list[tuple[str, int]]:
@@ -74,10 +119,13 @@ def temperature_rows(case: Case) -> list[tuple[str, int]]:
     ]
 
 
-def temperature(scene: Scene, channel: str, row: int, lags: Tensor, n_samples: int) -> Family:
-    """One row with lags `(template,)` in samples."""
+def temperature(scene: Scene, channel: str, row: int, n_samples: int, bent: bool, lags: Tensor) -> Family:
+    """One row with lags `(template,)` in samples, its square beside it where it may be bent."""
     paths = torch.stack([lagged(scene, channel, row, float(lag), n_samples) for lag in lags])
-    return Family("temperature_drift", slow_ordinates(paths), lags, channel, row)
+    paths = paths - paths[:, :1]
+    squares = slow_ordinates(paths.square()) if bent else None
+    at = partial(temperature, scene, channel, row, n_samples, bent)
+    return Family("temperature_drift", slow_ordinates(paths), lags, channel, row, squares, at=at)
 
 
 def lagged(scene: Scene, channel: str, row: int, lag: float, n_samples: int) -> Tensor:

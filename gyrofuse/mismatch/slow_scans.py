@@ -9,19 +9,37 @@ means without an effect, beside simulations that tell of their noise no better t
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.optimize import minimize
 from torch import Tensor
 
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import Evidence, calibrated, corrected
 from gyrofuse.mismatch.partakers import partakers
 from gyrofuse.mismatch.remembered import remembered
-from gyrofuse.mismatch.slow import Fit, SlowNoise, Told, best_fit, scores, slow_ordinates, told, where
-from gyrofuse.mismatch.slow_families import Family, edges, steps, temperatures, warm_ups
+from gyrofuse.mismatch.slow import (
+    Fit,
+    SlowNoise,
+    Told,
+    best_fit,
+    columns,
+    normal_equations,
+    scores,
+    slow_ordinates,
+    told,
+    where,
+)
+from gyrofuse.mismatch.slow_families import Family, double_warm_ups, edges, steps, temperatures, warm_ups
+from gyrofuse.mismatch.slow_tails import curve_length, most_extreme, surprise
+
+Array = NDArray[np.float64]
 
 _LOW = 48  # ordinates in which sensors are compared
 _SCANS = 2  # the second with the covariance that the first effect leaves
@@ -31,8 +49,13 @@ _JUMP = 5.0  # standard deviations
 _FEWEST_JUMPS, _MOST_JUMPS = 4, 10
 _TWO_LEVELS = 1.6  # distance of the outermost levels, in jumps
 _TWINS = 256
+_FINE = ("warm_up_transient", "temperature_drift")  # families that have places between any two
+PLAUSIBLE = 6.0  # nats below the best place
+_FINER, _CLOSER, _LIKELY = 8, 96, 12  # rounds, places of each, and how many likely ones are enough
+_LEAST_APART = 0.4  # logarithms of two time constants: closer ones are one with sizes that cancel each other
+# Where the likeliest place is sought: first and last step of its logarithm, nats that do not matter, and how often.
+_SIDE, _SURELY_THERE, _SAME, _TRIES = 0.15, 1e-7, 1e-3, 300
 _DOUBTED = 0.01  # p values below are held against twins
-_FAR = 1000.0  # of chi-squares, beyond which tails are zero to rounding
 
 
 class Best(NamedTuple):
@@ -41,10 +64,12 @@ class Best(NamedTuple):
     Attributes:
         at: Which of them, `(...)`.
         fit: With it.
-        held: Sizes in standard deviations, `(..., sensor)`, with the noise held.
+        held: Sizes in standard deviations, `(..., sensor, column)`, with the noise held, each beside those before it.
         z: The same with what the likelihood ratio leaves of it.
         gain: Of all sensors together, nats, less what it costs to have looked at all places, `(...)`.
         p_value: For having looked at all of them, `(...)`.
+        relation: Correlation of what the sensors have beside it, `(..., sensor, sensor)`.
+        lengths: Of the curve of templates on the sphere, `(..., sensor)`; infinite where only their number counts.
     """
 
     at: Tensor
@@ -53,11 +78,13 @@ class Best(NamedTuple):
     z: Tensor
     gain: Tensor
     p_value: Tensor
+    relation: Tensor
+    lengths: Tensor
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """The best template of a family in a case; attributes as in `Best`."""
+    """The best template of a family in a case, after so many `looks`; other attributes as in `Best`."""
 
     family: Family
     best: int
@@ -66,6 +93,9 @@ class Scan:
     z: Tensor
     gain: float
     p_value: float
+    relation: Tensor
+    lengths: Tensor
+    looks: int
 
     @property
     def place(self) -> float:
@@ -73,8 +103,18 @@ class Scan:
         return float(self.family.places[self.best])
 
     @property
-    def template(self) -> Tensor:
-        return self.family.templates[self.best]
+    def other(self) -> float | None:
+        """Of the second path, where it has a place of its own."""
+        return None if self.family.others is None else float(self.family.others[self.best])
+
+    @property
+    def design(self) -> Tensor:
+        """Paths, `(column, ordinate)`."""
+        return self.family.designs[self.best]
+
+    def gain_beside(self, relation: Tensor) -> float:
+        """Its gain where what the sensors have beside it is correlated so."""
+        return float(surprise(self.z, self.lengths, relation, self.looks)[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,13 +130,22 @@ class SlowLook:
     @cached_property
     def scans(self) -> tuple[Scan, ...]:
         """The best of each mechanism; of temperatures the best channel, for having looked at them all."""
-        scans = [self._scan(family) for family in self.families]
+        scans = self._alike([self._scan(family) for family in self.families])
         best = []
         for name in dict.fromkeys(s.family.name for s in scans):
             own = [s for s in scans if s.family.name == name]
             first = max(own, key=lambda s: s.gain)
-            best.append(replace(first, p_value=corrected(first.p_value, len(own))))
+            best.append(replace(first, p_value=corrected(min(s.p_value for s in own), len(own))))
         return tuple(best)
+
+    @staticmethod
+    def _alike(scans: list[Scan]) -> list[Scan]:
+        """Scans with their gains beside what the sensors have in common where the likeliest of them is explained.
+
+        What a path of another form leaves is common to them as well: weighed by that, the worst would gain most.
+        """
+        relation = max(scans, key=lambda scan: float(scan.fit.value.sum())).relation
+        return [replace(scan, gain=scan.gain_beside(relation), relation=relation) for scan in scans]
 
     def scan(self, name: str) -> Scan | None:
         """That of one mechanism; None where there is nothing to scan."""
@@ -113,11 +162,32 @@ class SlowLook:
 
     def _scan(self, family: Family) -> Scan:
         heard = self._heard(family)
-        found = best_place(self.noise, self.y, self.null, family, heard)
+        found, coarse = best_place(self.noise, self.y, self.null, family, heard), family
+        if float(found.p_value) < _DOUBTED and family.name in _FINE:
+            family, found = self._finer(family, found, heard)
         p_value = float(found.p_value)
         if p_value < _DOUBTED:
-            p_value = max(p_value, calibrated(p_value, best_place(*self._twins, family, heard).p_value))
-        return Scan(family, int(found.at), found.fit, found.held, found.z, float(found.gain), p_value)
+            p_value = max(p_value, calibrated(p_value, best_place(*self._twins, coarse, heard).p_value))
+        best, gain, looks = int(found.at), float(found.gain), len(coarse.places)
+        return Scan(family, best, found.fit, found.held, found.z, gain, p_value, found.relation, found.lengths, looks)
+
+    def _finer(self, family: Family, found: Best, heard: Tensor) -> tuple[Family, Best]:
+        """The likeliest place of all about the best of a grid, with places about as far apart as the data tell.
+
+        Of a strong effect the best place of a grid leaves more than the noise, and the more noise there seems to be the
+        less it tells of the place: both are sought together.
+        """
+        looks, at = len(family.places), int(found.at)
+        best, fit = likeliest(self.noise, self.y, family, at, found.fit)
+        for _ in range(_FINER):
+            told = explained(self.y, fit.variance, family.designs, _concerned(found.held))
+            likely = told > told.max() - 2 * PLAUSIBLE
+            if int(likely.sum()) >= _LIKELY:
+                break
+            family = between(family, likely, best)
+        family = family.at(*(torch.cat([p, b]) for p, b in zip(family.where, best, strict=True)))
+        last = torch.tensor(len(family.places) - 1)
+        return family, _judged(self.y, self.null, family, last, fit, found.lengths, heard, looks)
 
     def _heard(self, family: Family) -> Tensor:
         """Sensors that count: 0 for steps in those that jump to and fro, which is another mechanism."""
@@ -163,32 +233,44 @@ def best_place(noise: SlowNoise, y: Tensor, null: Fit, family: Family, heard: Te
         heard: 1 for sensors that count, else 0, `(sensor,)`.
     """
     best: Best | None = None
-    fit, relation = null, related(y, null.variance)
+    fit, relation, designs, looks = null, related(y, null.variance), family.designs, len(family.places)
+    lengths = y.new_full(y.shape[:-1], math.inf)
     for _ in range(_SCANS):
-        size, information = scores(y, fit.variance, family.templates)
-        lengths = curve_length(fit.variance, family.templates, information)
-        at = _most_extreme(size * information.sqrt() * heard[:, None], lengths, relation)
-        x = family.templates[at][..., None, :]
-        fit = best_fit(noise, y, x, null.log_factors)
-        left = y - fit.size[..., None] * x
-        relation = related(left, fit.variance)
-        held = fit.size * (x.square() / fit.variance).sum(-1).sqrt() * heard
-        # The noise that fits best without the effect may be stronger in all sensors: that leaves less of it.
-        ratio = 2 * (fit.value - null.value).sum(-1).clamp(min=0)
-        share = (ratio / held.square().sum(-1).clamp(min=1e-300)).clamp(max=1)
-        z = held * share.sqrt()[..., None] / _excess(left, fit.variance).sqrt()
-        gain, p_value = _surprise(z, lengths, relation, len(family.places))
-        now = Best(at, fit, held, z, gain, p_value)
-        best = now if best is None else where(p_value < best.p_value, now, best)
+        z = columns(y, fit.variance, designs)
+        if designs.shape[1] == 1:
+            lengths = curve_length(fit.variance, family.templates, scores(y, fit.variance, family.templates)[1])
+        at = most_extreme(z * heard[:, None, None], lengths, relation)
+        fit = best_fit(noise, y, designs[at], null.log_factors)
+        now = _judged(y, null, family, at, fit, lengths, heard, looks)
+        relation = now.relation
+        best = now if best is None else where(now.p_value < best.p_value, now, best)
     assert best is not None
     return best
+
+
+def _judged(
+    y: Tensor, null: Fit, family: Family, at: Tensor, fit: Fit, lengths: Tensor, heard: Tensor, looks: int
+) -> Best:
+    """A template with the noise that it leaves, one of so many `looks` along a curve; see `best_place`."""
+    x = family.designs[at]
+    left = y - fit.size @ x
+    relation = related(left, fit.variance)
+    root, score = normal_equations(y, fit.variance, x)
+    held = torch.linalg.solve_triangular(root, score[..., None], upper=False)[..., 0] * heard[:, None]
+    # The noise that fits best without the effect may be stronger in all sensors: that leaves less of it.
+    ratio = 2 * (fit.value - null.value).sum(-1).clamp(min=0)
+    share = (ratio / held.square().sum((-1, -2)).clamp(min=1e-300)).clamp(max=1)
+    z = held * share.sqrt()[..., None, None] / _excess(left, fit.variance).sqrt()[..., None]
+    gain, p_value = surprise(z, lengths, relation, looks)
+    return Best(at, fit, held, z, gain, p_value, relation, lengths)
 
 
 @remembered
 def slow_look(case: Case) -> SlowLook:
     """What is slow in a case, looked at once for the witness and for all mechanisms."""
     simulation, y = told(case), slow_ordinates(case.recorded.steady[0])
-    noise, families = simulation.noise(), (steps(case), warm_ups(case), *temperatures(case))
+    noise = simulation.noise()
+    families = (steps(case), warm_ups(case), double_warm_ups(case), *temperatures(case))
     return SlowLook(simulation, noise, y, best_fit(noise, y), families)
 
 
@@ -197,7 +279,7 @@ def slow_witness(case: Case) -> Evidence:
     look = slow_look(case)
     scan = min(look.scans, key=lambda s: s.p_value)
     which = concerned(scan)
-    largest = max(which, key=lambda i: float(scan.z[i].abs()))
+    largest = max(which, key=lambda i: float(scan.z[i].norm()))
     seconds = scan.place / case.scene.rate
     seen = {
         "step": f"the bias steps near {seconds:.4g} s",
@@ -216,7 +298,16 @@ def slow_witness(case: Case) -> Evidence:
 
 def concerned(scan: Scan) -> tuple[int, ...]:
     """Sensors in which a template is there, once it is there at all."""
-    return partakers(scan.held.square(), 1, _SEEN).positions
+    return _concerned(scan.held)
+
+
+def _concerned(held: Tensor) -> tuple[int, ...]:
+    return partakers(held.square().sum(-1), held.shape[-1], _SEEN).positions
+
+
+def explained(y: Tensor, variance: Tensor, designs: Tensor, which: Sequence[int]) -> Tensor:
+    """Twice the nats that each template explains in some sensors, `(template,)`."""
+    return columns(y, variance, designs)[list(which)].square().sum((0, -1))
 
 
 def steps_one_by_one(score: Tensor, gram: Tensor, least: float, most: int) -> tuple[list[int], Tensor, list[float]]:
@@ -270,19 +361,42 @@ def related(left: Tensor, variance: Tensor) -> Tensor:
     return (1 - share) * c + share * torch.eye(c.shape[-1], dtype=c.dtype)
 
 
-def curve_length(variance: Tensor, templates: Tensor, information: Tensor) -> Tensor:
-    """Length of the curve of whitened unit templates on the sphere, `(..., sensor)`."""
-    inner = (1 / variance) @ (templates[:-1] * templates[1:]).mT
-    cosine = inner / (information[..., :-1] * information[..., 1:]).sqrt()
-    return cosine.clamp(-1, 1).arccos().sum(-1)
+def likeliest(noise: SlowNoise, y: Tensor, family: Family, start: int, fit: Fit) -> tuple[list[Tensor], Fit]:
+    """The place, `(1,)`, and other of greatest likelihood from one of a family on, with the noise best for each."""
+    shift = float(family.places[family.places > 0].min())  # a lag may be none
+
+    def places(x: Array) -> list[Tensor]:
+        return [torch.tensor([max(math.exp(v) - shift, 0.0)], dtype=torch.float64) for v in x]
+
+    def fitted(x: Array) -> Fit:
+        return best_fit(noise, y, family.at(*places(x)).designs[0], fit.log_factors)
+
+    def loss(x: Array) -> float:
+        if (x < first).any() or (x > last).any() or (len(x) > 1 and x[1] - x[0] < _LEAST_APART):
+            return math.inf
+        return -float(fitted(x).value.sum())
+
+    first, last = (
+        np.array([math.log(float(limit(p)) + shift) for p in family.where]) for limit in (torch.min, torch.max)
+    )
+    x0 = np.array([math.log(float(p[start]) + shift) for p in family.where])
+    simplex = np.vstack([x0, x0 + np.diag(np.where(x0 + _SIDE > last, -_SIDE, _SIDE))])
+    options = {"initial_simplex": simplex, "xatol": _SURELY_THERE, "fatol": _SAME, "maxfev": _TRIES}
+    found = minimize(loss, x0, method="Nelder-Mead", options=options)
+    return places(found.x), fitted(found.x)
 
 
-def expected_exceedances(q: Tensor, dof: int, length: Tensor, places: int) -> Tensor:
-    """How often a chi-square process along a curve exceeds `q`, by Davies (1987), or by the number of its places."""
-    one = torch.special.gammaincc(torch.full_like(q, dof / 2), q / 2)
-    high = q.clamp(min=max(dof - 1, 1e-3))  # below the mode, upcrossings do not count the places
-    log_rate = (dof - 1) / 2 * (high / 2).log() - high / 2 - math.lgamma(dof / 2) - math.log(math.pi) / 2
-    return torch.minimum(one + length * log_rate.exp(), places * one)
+def between(family: Family, likely: Tensor, best: Sequence[Tensor]) -> Family:
+    """The family between the neighbours of those places, and others, that are likely `(template,)`, and the best."""
+    spans = []
+    for places in family.where:
+        every = places.unique()
+        at = torch.searchsorted(every, places[likely])
+        spans.append((every[max(int(at.min()) - 1, 0)], every[min(int(at.max()) + 1, len(every) - 1)]))
+    n = round(_CLOSER ** (1 / len(spans)))
+    grids = [torch.linspace(float(low), float(high), n, dtype=torch.float64) for low, high in spans]
+    grid = torch.meshgrid(*grids, indexing="ij")
+    return family.at(*(torch.cat([p.flatten(), b]) for p, b in zip(grid, best, strict=True)))
 
 
 def _excess(left: Tensor, variance: Tensor) -> Tensor:
@@ -290,34 +404,3 @@ def _excess(left: Tensor, variance: Tensor) -> Tensor:
     size, information = scores(left, variance, edges())
     mean = (size.square() * information).mean(-1)
     return ((mean + mean.mean(-1, keepdim=True)) / 2).clamp(min=1)
-
-
-def _pooled(z: Tensor, relation: Tensor) -> Tensor:
-    """`z' R^-1 z`, `(..., sensor, template)` -> `(..., template)`."""
-    return (z * torch.linalg.solve(relation, z)).sum(-2)
-
-
-def _most_extreme(z: Tensor, lengths: Tensor, relation: Tensor) -> Tensor:
-    """Template that is least expected, all sensors together or one alone, `(...)`."""
-    n_sensors, places = z.shape[-2:]
-    pooled, at = _pooled(z, relation).max(-1)
-    squares, alone_at = z.square().max(-1)  # (..., sensor)
-    together = expected_exceedances(pooled, n_sensors, lengths.mean(-1), places)
-    alone, which = expected_exceedances(squares, 1, lengths, places).min(-1)
-    better = n_sensors * alone < together
-    return torch.where(better, alone_at.gather(-1, which[..., None])[..., 0], at)
-
-
-def _surprise(z: Tensor, lengths: Tensor, relation: Tensor, places: int) -> tuple[Tensor, Tensor]:
-    """Gain of sizes `(..., sensor)` less the price of having looked everywhere, and p value of the best template."""
-    n_sensors = z.shape[-1]
-    pooled = _pooled(z[..., None], relation)[..., 0]
-    together = expected_exceedances(pooled, n_sensors, lengths.mean(-1), places)
-    far = pooled.clamp(max=_FAR)
-    here = torch.special.gammaincc(torch.full_like(far, n_sensors / 2), far / 2)
-    gain = pooled / 2 - (expected_exceedances(far, n_sensors, lengths.mean(-1), places) / here).log()
-    if n_sensors == 1:
-        return gain, -torch.expm1(-together)
-    alone = n_sensors * expected_exceedances(z.square(), 1, lengths, places).amin(-1)
-    # The better of two ways, where exceedances come as in a Poisson process.
-    return gain, -torch.expm1(-2 * torch.minimum(together, alone))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -17,13 +18,11 @@ from gyrofuse.mismatch.slow_effect import (
     log_factors,
     only,
     place,
-    plausible,
     quantiles,
     slow_finding,
     strong_scan,
 )
-from gyrofuse.mismatch.slow_families import steps
-from gyrofuse.mismatch.slow_scans import Scan, SlowLook, concerned
+from gyrofuse.mismatch.slow_scans import PLAUSIBLE, Scan, SlowLook, concerned, explained
 
 _CELLS = 256
 _MARGIN = 24  # cells on either side of the places left
@@ -53,22 +52,31 @@ class Step(SlowEffect):
         if strong is None:
             return None
         look, scan = strong.look, strong.scan
-        found = estimate(look, scan, steps(case))
-        onset = place(onset_samples(case, look, scan, found.size), case.scene.rate)
-        effect = cls(only(found.size, concerned(scan)), log_factors(scan), onset.value)
+        found = estimate(look, scan, finer=False)
+        size = found.size[:, 0]
+        onset = place(onset_samples(case, look, scan, size), case.scene.rate)
+        effect = cls(only(size, concerned(scan)), log_factors(scan), onset.value)
         words = f"steps at {onset.value:.6g} s"
         return slow_finding(case, strong, effect, found, words, {"onset": onset}, time_s=onset.value)
 
-    def path(self, n_samples: int, scene: Scene) -> Tensor:
+    @classmethod
+    def of(cls, scan: Scan, rate: float, which: Sequence[int] | None = None) -> Step:
+        """The best of a scan, in the sensors concerned or in others."""
+        size = only(scan.fit.size, concerned(scan) if which is None else which)
+        return cls(size[:, 0], log_factors(scan), scan.place / rate)
+
+    def paths(self, n_samples: int, scene: Scene) -> Tensor:
         # Times of samples are exact multiples only to rounding.
-        return (torch.arange(n_samples) >= round(self.onset_s * scene.rate)).to(torch.float64)
+        return (torch.arange(n_samples) >= round(self.onset_s * scene.rate)).to(torch.float64)[None]
 
 
 def onset_samples(case: Case, look: SlowLook, scan: Scan, size: Tensor) -> tuple[float, float, float]:
     """Median of the onset with 95 % limits, samples, from ever finer cells around it; the sizes are held."""
     which = list(concerned(scan))
     size = size[which, None]
-    low, high = plausible(look, scan)
+    likely = explained(look.y, scan.fit.variance, scan.family.designs, which) / 2
+    near, places = (likely > likely.max() - PLAUSIBLE).nonzero()[:, 0], scan.family.places
+    low, high = float(places[max(int(near[0]) - 1, 0)]), float(places[min(int(near[-1]) + 1, len(places) - 1)])
     margin, coarser = max(high - low, 4.0 * case.block), case.n_samples
     while True:
         first, end = max(int(low - margin), 0), min(int(high + margin), case.n_samples)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.axes import OfSensors
 from gyrofuse.mismatch.case import N_BLOCKS, Case, Scene
 from gyrofuse.mismatch.mechanism import Finding
 from gyrofuse.mismatch.slow import cosines, ordinates
@@ -18,14 +20,12 @@ from gyrofuse.mismatch.slow_effect import (
     log_factors,
     only,
     place,
-    plausible,
     slow_finding,
     strong_scan,
 )
-from gyrofuse.mismatch.slow_families import lagged, temperature
+from gyrofuse.mismatch.slow_families import lagged
 from gyrofuse.mismatch.slow_scans import Scan, SlowLook, concerned
 
-_PLACES = 48
 _SURROGATES = 200
 _BETTER = 2  # so many surrogates may do as well as the channel
 _DECISIVE = 8.0  # nats that a channel must owe to its shape, for surrogates of the shape to tell anything
@@ -33,22 +33,26 @@ _DECISIVE = 8.0  # nats that a channel must owe to its shape, for surrogates of 
 
 @dataclass(frozen=True, eq=False)
 class TemperatureDrift(SlowEffect):
-    """`x_i(t) = size_i (theta(t) - theta(0))`, `tau d theta / dt = T - theta`, in every sensor `i`.
+    """`x_i(t) = size_i u(t) + curvature_i u(t)^2`, `u = theta(t) - theta(0)`, in every sensor `i`.
 
-    `theta` is what a part has whose heat follows the temperature `T` of a channel with the lag `tau`. A smooth channel
-    fits a random walk by chance: beside the likelihood, surrogates of the channel with random phases must do worse.
+    `theta` is what a part has whose heat follows the temperature `T` of a channel with the lag `tau`:
+    `tau d theta / dt = T - theta`. A smooth channel fits a random walk by chance: beside the likelihood, surrogates of
+    the channel with random phases must do worse.
 
     Attributes:
         size: Coefficients, `(sensor,)`, unit of the signal per unit of temperature.
         lag_s: `tau`, s; 0 for none.
         channel: Name of the channel.
         row: Its row.
+        curvature: Of the square, `(sensor,)`, unit of the signal per unit of temperature squared; none where the line
+            is straight.
     """
 
     name: ClassVar[str] = "temperature_drift"
     lag_s: float
     channel: str
     row: int
+    curvature: tuple[OfSensors, ...] = ()
 
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:
@@ -58,30 +62,43 @@ class TemperatureDrift(SlowEffect):
         look, scan = strong.look, strong.scan
         if not _beats_surrogates(look, scan):
             return None
-        channel, row = scan.family.channel or "", scan.family.row
-        low, high = plausible(look, scan)
-        lags = torch.linspace(low, high, _PLACES, dtype=torch.float64)
-        found = estimate(look, scan, temperature(case.scene, channel, row, lags, case.n_samples))
-        lag = place(found.place, case.scene.rate)
-        if low == 0:
-            lag = lag._replace(low=0.0)
-        effect = cls(only(found.size, concerned(scan)), log_factors(scan), lag.value, channel, row)
-        words = f"follows {channel}" + (f" with a lag of {lag.value:.3g} s" if lag.low > 0 else "")
+        found = estimate(look, scan)
+        effect, lag = cls.of(scan, case.scene.rate), place(found.place, case.scene.rate)
+        if not effect.curvature:
+            effect = replace(effect, size=only(found.size[:, 0], concerned(scan)), lag_s=lag.value)
+        lag = lag._replace(value=effect.lag_s)
+        words = f"follows {effect.channel}" + (f" with a lag of {lag.value:.3g} s" if lag.low > 0 else "")
+        unit = case.scene.measure
         return slow_finding(
             case,
             strong,
             effect,
             found,
-            words,
+            words + (", in a line that is bent" if effect.curvature else ""),
             {"lag": lag},
-            size="coefficient",
-            unit=f"{case.scene.measure}/K",
-            channel=channel,
+            sizes=[("coefficient", f"{unit}/K"), ("curvature", f"{unit}/K^2")],
+            channel=effect.channel,
         )
 
-    def path(self, n_samples: int, scene: Scene) -> Tensor:
+    @classmethod
+    def of(cls, scan: Scan, rate: float, which: Sequence[int] | None = None) -> TemperatureDrift:
+        """The best of a scan, in the sensors concerned or in others."""
+        size, *further = only(scan.fit.size, concerned(scan) if which is None else which).unbind(-1)
+        family = scan.family
+        return cls(size, log_factors(scan), scan.place / rate, family.channel or "", family.row, tuple(further))
+
+    @property
+    def sizes(self) -> Tensor:
+        return torch.stack([self.size, *self.curvature], -1)
+
+    def with_sizes(self, sizes: Tensor) -> TemperatureDrift:
+        size, *further = sizes.unbind(-1)
+        return replace(self, size=size, curvature=tuple(further))
+
+    def paths(self, n_samples: int, scene: Scene) -> Tensor:
         path = lagged(scene, self.channel, self.row, self.lag_s * scene.rate, n_samples)
-        return path - path[0]
+        path = path - path[0]
+        return torch.stack([path, *(path.square() for _ in self.curvature)])
 
 
 def _beats_surrogates(look: SlowLook, scan: Scan) -> bool:
@@ -93,7 +110,9 @@ def _beats_surrogates(look: SlowLook, scan: Scan) -> bool:
     which = list(concerned(scan))
     y, variance = look.y[which], scan.fit.variance[which]
     t = torch.linspace(-1, 1, N_BLOCKS, dtype=torch.float64)
-    left = scan.template @ cosines()
+    # What several paths do together, as in the sensor that shows it best.
+    best = max(which, key=lambda i: float(scan.z[i].norm()))
+    left = scan.fit.size[best] @ scan.design @ cosines()
     left = left - (left @ t) / (t @ t) * t
     transform = torch.fft.rfft(left)
     turn = 2 * math.pi * torch.rand(_SURROGATES, len(transform), generator=generator, dtype=torch.float64)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.axes import OfSensors
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.mechanism import Finding
 from gyrofuse.mismatch.slow_effect import (
@@ -17,19 +18,28 @@ from gyrofuse.mismatch.slow_effect import (
     log_factors,
     only,
     place,
-    plausible,
     slow_finding,
     strong_scan,
 )
-from gyrofuse.mismatch.slow_families import warm_ups
-from gyrofuse.mismatch.slow_scans import concerned
+from gyrofuse.mismatch.slow_scans import Scan, concerned
 
-_PLACES = 200
+
+@dataclass(frozen=True, eq=False)
+class Decay:
+    """A further decay, of what a part that warms up stands in.
+
+    Attributes:
+        size: At the first sample, `(sensor,)`, unit of the signal.
+        time_constant_s: s.
+    """
+
+    size: OfSensors
+    time_constant_s: float
 
 
 @dataclass(frozen=True, eq=False)
 class WarmUpTransient(SlowEffect):
-    """`x_i(t) = size_i exp(-t / tau)` in every sensor `i`, `t` from the first sample.
+    """`x_i(t) = size_i exp(-t / tau)` in every sensor `i`, `t` from the first sample; or a sum of two such decays.
 
     A curve at the beginning that no channel follows, the same in all sensors but for its size. A random walk goes
     anywhere at any time. Temperature that rises after power-on does the same: the channel decides, where there is one.
@@ -37,10 +47,12 @@ class WarmUpTransient(SlowEffect):
     Attributes:
         size: At the first sample, `(sensor,)`, unit of the signal.
         time_constant_s: `tau`, s.
+        slower: A second decay; none by default.
     """
 
     name: ClassVar[str] = "warm_up_transient"
     time_constant_s: float
+    slower: tuple[Decay, ...] = ()
 
     @classmethod
     def nominate(cls, case: Case, level: float) -> Finding | None:
@@ -48,13 +60,38 @@ class WarmUpTransient(SlowEffect):
         if strong is None:
             return None
         look, scan = strong.look, strong.scan
-        low, high = plausible(look, scan)
-        taus = torch.logspace(math.log10(low), math.log10(high), _PLACES, dtype=torch.float64)
-        found = estimate(look, scan, warm_ups(case, taus))
-        tau = place(found.place, case.scene.rate)
-        effect = cls(only(found.size, concerned(scan)), log_factors(scan), tau.value)
+        found, rate = estimate(look, scan), case.scene.rate
+        effect, tau = cls.of(scan, rate), place(found.place, rate)
+        places, unit = {"time_constant": tau}, case.scene.measure
         words = f"decays after the start with a time constant of {tau.value:.3g} s"
-        return slow_finding(case, strong, effect, found, words, {"time_constant": tau}, time_s=0.0)
+        if effect.slower and found.other is not None:
+            first, second = effect.time_constant_s, effect.slower[0].time_constant_s
+            places = {
+                "time_constant": tau._replace(value=first),
+                "second_time_constant": place(found.other, rate)._replace(value=second),
+            }
+            words = f"decays after the start with time constants of {first:.3g} and {second:.3g} s"
+        else:
+            effect = replace(effect, size=only(found.size[:, 0], concerned(scan)), time_constant_s=tau.value)
+        sizes = [("size", unit), ("second_size", unit)]
+        return slow_finding(case, strong, effect, found, words, places, sizes=sizes, time_s=0.0)
 
-    def path(self, n_samples: int, scene: Scene) -> Tensor:
-        return (-scene.seconds(n_samples) / self.time_constant_s).exp()
+    @classmethod
+    def of(cls, scan: Scan, rate: float, which: Sequence[int] | None = None) -> WarmUpTransient:
+        """The best of a scan, in the sensors concerned or in others."""
+        size, *further = only(scan.fit.size, concerned(scan) if which is None else which).unbind(-1)
+        slower = tuple(Decay(other, scan.other / rate) for other in further if scan.other is not None)
+        return cls(size, log_factors(scan), scan.place / rate, slower)
+
+    @property
+    def sizes(self) -> Tensor:
+        return torch.stack([self.size, *(decay.size for decay in self.slower)], -1)
+
+    def with_sizes(self, sizes: Tensor) -> WarmUpTransient:
+        size, *further = sizes.unbind(-1)
+        slower = tuple(replace(decay, size=own) for decay, own in zip(self.slower, further, strict=True))
+        return replace(self, size=size, slower=slower)
+
+    def paths(self, n_samples: int, scene: Scene) -> Tensor:
+        constants = (self.time_constant_s, *(decay.time_constant_s for decay in self.slower))
+        return torch.stack([(-scene.seconds(n_samples) / tau).exp() for tau in constants])
