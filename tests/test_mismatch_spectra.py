@@ -299,3 +299,18 @@ def test_shorter_simulations_say_nothing_of_the_slowest_ordinates():
     assert float(slow(given).log_ratios(torch.ones(2, 3, dtype=torch.float64)).abs().max()) == 0.0
     assert not slow_gains(given, lambda m, f: 2 * m, 0).any()
     assert shape_witness(given).p_value > 1e-3
+
+
+def test_coherences_of_noise_that_is_loud_in_all_sensors_at_once_vary_more() -> None:
+    """Squared coherences of independent sensors have the mean `1 / dof`."""
+    g, n, p = torch.Generator().manual_seed(3), 16384, 12
+    course = gf.AR1(math.exp(-1 / 300), 0.5 * -math.expm1(-2 / 300)).simulate(n, generator=g)  # of the log variance
+    noise = torch.randn(p, n, generator=g, dtype=torch.float64)
+    for signal, largest in ((noise, 0.02), (noise * torch.exp(course / 2), 1.2)):
+        side = Side(signal[None], bands(n))
+        high = side.bands.dof > 100
+        pairs = torch.triu_indices(p, p, 1)
+        mean = (side.coherence.abs().square()[:, pairs[0], pairs[1]].mean(-1) * side.coherence_dof)[high].mean()
+        assert float(mean) == pytest.approx(1.0, abs=0.12)
+        assert float((side.dof / side.coherence_dof)[high].max()) < 1 + largest
+    assert float((side.dof / side.coherence_dof)[high].min()) > 1.4

@@ -64,7 +64,7 @@ def common_source(case: Case) -> Source | None:
     `1/d + 1/s`, whatever noise the sensors share. Where the simulation has nothing of what the recording shows, its
     sensors are independent, and the recording's coherences vary by `1/d` around none.
     """
-    p, d, s = case.n_sensors, case.recorded.dof, case.simulated.coherence_dof
+    p, d, s = case.n_sensors, case.recorded.coherence_dof, case.simulated.coherence_dof
     known = (d >= 2 * p) & (s >= 2 * p)
     if p < 2 or int(known.sum()) < 2:
         return None

@@ -17,6 +17,7 @@ from gyrofuse.mismatch.spectra import Bands, cross_spectra, degrees_of_freedom
 from gyrofuse.mismatch.spectral_uncertainty import SpectralUncertainty
 
 _ORDINATES = 40  # for each sensor, behind a matrix that is inverted
+_BLOCK, _CUT = 32, 25.0  # samples of a level, and squares in means of them: an outlier is no level
 _LEAST_BIN = 3  # of records shorter than the bands are for: below, they say nothing
 
 
@@ -111,15 +112,34 @@ class Side:
 
     @property
     def coherence_dof(self) -> Tensor:
-        """What bands tell of coherences, `(band,)`: those of a fitted array no more than the record it was fitted to.
+        """What bands tell of coherences, `(band,)`: less of noise that is loud in all sensors at the same times.
 
+        And of a fitted array no more than the record it was fitted to.
         A fit smooths over bands, so that it is known at least as well. To first order it is known better in narrow
         bands, but where a matrix lacks rank, as those of slow noise often do, coherences are far from linear in it.
         """
+        dof = self.dof / (1 + self._levels_alike)
         if self.uncertainty is None or not self.uncertainty.shares_noise:
-            return self.dof
+            return dof
         n_records, _, n = self.signal.shape
-        return self.dof * min(self.uncertainty.n_samples / (n_records * n), 1.0)
+        return dof * min(self.uncertainty.n_samples / (n_records * n), 1.0)
+
+    @cached_property
+    def _levels_alike(self) -> float:
+        """Covariance of two sensors' levels over their means, of all pairs: by so much more coherences vary.
+
+        Seen in squares of differences of samples, means over short blocks; chance in them is every sensor's own.
+        """
+        p = self.signal.shape[-2]
+        n = self.signal.shape[-1] // _BLOCK * _BLOCK
+        if p < 2 or self.gaussian or n < 2 * _BLOCK:
+            return 0.0
+        squares = self.steady[..., :n].diff(append=self.steady[..., n - 1 : n]).square()
+        squares = squares.minimum(_CUT * squares.mean((0, -1))[:, None])
+        level = squares.unflatten(-1, (-1, _BLOCK)).mean(-1)  # (record, sensor, block)
+        relative = level / level.mean(-1, keepdim=True).clamp(min=1e-300) - 1
+        covariance = (relative @ relative.mT).mean(0) / relative.shape[-1]
+        return max(float(covariance.sum() - covariance.trace()) / (p * (p - 1)), 0.0)
 
     @cached_property
     def power(self) -> Tensor:

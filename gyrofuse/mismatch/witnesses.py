@@ -80,7 +80,7 @@ def _other_size(case: Case, sizes: LineSizes) -> Evidence:
 
 def coherence_witness(case: Case) -> Evidence:
     """Difference of complex coherences in each band, summed over the pairs of sensors."""
-    d, simulated = case.bands.dof, case.simulated.coherence_dof
+    d, simulated = case.recorded.coherence_dof, case.simulated.coherence_dof
     if case.n_sensors < 2:
         return Evidence("coherence", 1.0, "a single sensor has no pairs")
     known = (d >= _COHERENCE_DOF) & (simulated >= _COHERENCE_DOF)
