@@ -122,6 +122,21 @@ def test_one_sensor_of_many_that_is_louder_has_nothing_in_common_with_the_others
     assert (found.mechanism, found.sensors) == ("parameter_shift", (0,))
 
 
+def test_two_sensors_of_many_that_share_a_third_of_their_noise_are_told_with_possible_gains() -> None:
+    g, p, share = generator(43), 8, 0.35
+    simulation = ArrayModel.from_sensors([gf.WhiteNoise(WHITE) + gf.RandomWalk(1e-9)] * p)
+    recorded = ArrayModel.from_sensors(
+        [gf.WhiteNoise(WHITE * ((1 - share) if i in (2, 5) else 1)) + gf.RandomWalk(1e-9) for i in range(p)]
+    ).simulate(N, generator=g)
+    recorded[[2, 5]] += (share * WHITE) ** 0.5 * torch.randn(1, N, generator=g, dtype=torch.float64)
+    found = nominated(case(recorded, simulation.simulate(N, batch=(1,), generator=g)))
+    assert found is not None
+    assert (found.mechanism, found.sensors) == ("common_mode", (2, 5))
+    gains = [found.parameters[f"gain[{i}]"].value for i in found.sensors]
+    assert max(gains) ** 2 < WHITE
+    assert gains[0] * gains[1] == pytest.approx(share * WHITE, rel=0.2)
+
+
 def test_less_white_noise_is_no_other_unit_though_it_has_most_bands():
     def sensors(white: float) -> ArrayModel:
         return ArrayModel.from_sensors([gf.WhiteNoise(white) + gf.RandomWalk(1e-9)] * 2)

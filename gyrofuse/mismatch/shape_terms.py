@@ -43,6 +43,10 @@ class Term:
         """Factors on spectra, or densities added, `(..., sensor, place)`, of numbers with leading dimensions."""
         raise NotImplementedError
 
+    def prior(self) -> Tensor | None:
+        """Scales of local numbers around zero, `(number, sensor)` or `(number, 1)`, of heavy tails; None without."""
+        return torch.tensor(self.prior_scale, dtype=torch.float64)[:, None] if self.prior_scale else None
+
     def reach(self) -> Tensor:
         """How far shared numbers may go at once."""
         return torch.full_like(self.shared, 0.7)
@@ -243,7 +247,7 @@ class Bump(Term):
         return replace(self, local=self.local.clamp(min=0.0), shared=_bump_within(self.shared, self.narrowest))
 
 
-_MOST = 0.9  # of a sensor's power that a fit starts with in a common source: where correlations still have a slope
+_MOST = 0.95  # of a sensor's noise that a fit starts with in a common source: where correlations still have a slope
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,36 +259,43 @@ class Common(Term):
     Attributes:
         kind: White, AR1 or walk.
         inside: Whether it is a part of what each sensor has, whose power stays, instead of coming on top.
+        whole: Gains at which that part is all that a sensor has, `(sensor,)`. Two sensors alone tell but the product of
+            their gains; with these as scales of a prior they have like parts.
     """
 
     name: ClassVar[str] = "common_mode"
 
     kind: str = "white"
     inside: bool = False
+    whole: Tensor | None = None
+
+    def prior(self) -> Tensor | None:
+        return None if self.whole is None else self.whole[None]
 
     def told(self, sd: Tensor) -> Tensor:
         """Standard deviations that each sensor's gain is, `(sensor,)`, by those of its parts `(number, sensor)`."""
-        return self.local.square().sum(0).sqrt() / sd.square().nanmean(0).sqrt()
+        return (self.local.square().sum(0).sqrt() / sd.square().nanmean(0).sqrt()).nan_to_num(nan=0.0)
 
     def acting(self, matrix: Tensor) -> Tensor:
         """What comes on top of a matrix `(..., sensor, sensor)` of a source."""
         return matrix - torch.diag_embed(matrix.diagonal(dim1=-2, dim2=-1)) if self.inside else matrix
 
-    def variants(self, ground: Ground) -> list[Common]:
-        """The same in phase or not, on top or inside; inside with gains of a part that is less than the whole."""
+    def variants(self, ground: Ground, seen: Tensor) -> list[Common]:
+        """The same in phase or not, on top or inside.
+
+        Inside with gains of a part that is less than the whole, and in the sensors `(sensor,)` that were seen to have
+        it: what chance gives the others would tell how two that are alone share the product of their gains.
+        """
         aligned = self.free.clone()
         aligned[1] = False
         forms = [
             replace(self, free=aligned, local=self.local * aligned),
             replace(self, free=torch.ones_like(self.free)),
         ]
-        return [*forms, *(replace(form, inside=True)._possible(ground) for form in forms)]
-
-    def _possible(self, ground: Ground) -> Common:
-        """With gains scaled down where the source would have more than `_MOST` of a sensor's power."""
-        source = self.shape(ground, self.shared)
-        part = (self.local.square().sum(0)[:, None] * source / ground.density).amax(-1)
-        return replace(self, local=self.local * (_MOST / part.clamp(min=_MOST)).sqrt())
+        whole = (ground.density / self.shape(ground, self.shared)).amin(-1).sqrt()
+        size = (self.local.square().sum(0).sqrt() / whole).clamp(min=_MOST)
+        parts = (replace(form, inside=True, whole=whole, local=form.local * _MOST / size) for form in forms)
+        return [*forms, *(part.only(part.free & seen) for part in parts)]
 
     def shape(self, ground: Ground, shared: Tensor) -> Tensor:
         """Density of the source, `(..., place)`."""

@@ -65,6 +65,7 @@ class Shape(NamedTuple):
         term: It, its numbers those of the joint fit.
         company: The others of that fit.
         sd: Standard deviations of its local `(number, sensor)` and shared numbers; NaN where not free.
+        sd_alone: Of its local numbers, all others held.
         gain: Nats that it adds to the others, without what its numbers cost.
         p_value: Of the same, for all the shapes that compete.
         alternatives: Mechanisms that explain as much in its place.
@@ -79,6 +80,7 @@ class Shape(NamedTuple):
     term: Term
     company: tuple[Term, ...]
     sd: tuple[Tensor, Tensor]
+    sd_alone: Tensor
     gain: float
     p_value: float
     alternatives: tuple[str, ...]
@@ -239,7 +241,8 @@ def _searched(case: Case) -> Shape | None:
     # Where no term has a part, what differs has another cause.
     concerned = torch.stack([t.free.any(0) for t in chosen.terms]).any(0)
     excess = [float(f.excess[concerned].clamp(min=0).sum()) for f in (left, nothing)]
-    explained = 1 - excess[0] / max(excess[1], 1e-9)
+    # Where sensors share what they had before, powers have nothing to explain.
+    explained = 1 - excess[0] / max(excess[1], 1e-9) if nothing.p_value <= FITS else 1.0
     if not fits and explained < _LARGELY:
         return None
     seen = [_told(case, chosen, i) for i in range(len(chosen.terms))]
@@ -272,7 +275,7 @@ def _searched(case: Case) -> Shape | None:
         for rival in candidates(data, others)
         if rival.name != term.name and _as_good(data, [*others, _in_sensors_of(term, rival)], chosen)
     }
-    if _like_switching(term, seen[first][1][0]):
+    if _like_switching(term, chosen.sd_alone(first)):
         rivals.add("random_telegraph")
     if _louder(term, seen[first][1]) and min(modulation(case).p_value, variance_p_value(case)) < _UNSTEADY:
         rivals.add("variance_change")
@@ -286,6 +289,7 @@ def _searched(case: Case) -> Shape | None:
         told,
         tuple(others),
         sd,
+        chosen.sd_alone(first),
         gain - cost_of(chosen) / len(chosen.terms),
         p,
         tuple(sorted(rivals)),

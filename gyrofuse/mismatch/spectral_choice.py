@@ -37,8 +37,9 @@ _NEW = 8.0  # nats of evidence that one more term has to bring
 _PART = 4.0  # nats for each further part of the noise whose numbers are others
 _NUMBER = 2.0  # nats for a number of a sensor: those of sensors that have it are alike
 _SHARED = 5.0  # nats that correlations gain by what is said to be common, beyond chance
-_IN_COMMON = 0.1  # share of a second sensor's power, for a band to show a source
+_IN_COMMON = 0.3  # of the largest share of a second sensor's power, for a band to show a source
 _FEW = 0.2  # least factor of Bartlett's
+_SEEN = 2.5  # standard deviations of a gain
 _FORMS = 3  # of a filter, that are fitted
 _BEHIND = 0.02  # of what the best term gains in a sensor, by which others may be behind
 _HARDLY = 2.5  # number of a filter that changes the power at 0.45 of the rate by a third
@@ -310,7 +311,8 @@ def _coherent(data: Ratios, before: Tensor, after: Fit) -> bool:
     gained += float(power_gains(data, before.diagonal(dim1=-2, dim2=-1).real).sum())
     source = data.ground.bands.mean_of(term.shape(data.ground, term.shared))  # (band,)
     share = term.local.square().sum(0) * source[:, None] / (data.ground.mean.mT * after.power)
-    has = share.topk(2).values[:, -1] > _IN_COMMON
+    second = share.topk(2).values[:, -1]
+    has = second > _IN_COMMON * second.max()
     few = (2 * data.n_sensors + 11) / (6 * float(data.d[has].sum()) + 1e-9)
     return gained > _SHARED + float(term.free[:, 1:].sum()) / max(1 - few, _FEW)
 
@@ -322,6 +324,8 @@ def _earned(data: Ratios, before: Fit, after: Fit, term: Term) -> bool:
     spectrum mends it. What is left in bands that all of them leave as they were is no matter of their form; elsewhere a
     term has to add a share of what they explain. Other levels of what the simulation has keep its form.
     """
+    if isinstance(term, Common):  # which correlations tell
+        return True
     formed = [t.free.any(0) for t in before.terms if not isinstance(t, Shift)]
     touched = torch.stack([torch.zeros_like(term.free[0]), *formed]).any(0) & term.free.any(0)
     if not bool(touched.any()):
@@ -417,7 +421,10 @@ def _varied(data: Ratios, found: Fit) -> Fit:
     *others, last = found.terms
     if type(last) is not Common:
         return found
-    other = [form for form in last.variants(data.ground) if (form.turned, form.inside) != (last.turned, last.inside)]
+    told = last.told(found.sd_alone(-1))
+    seen = (told >= _SEEN) | (told >= told.topk(2).values[-1])
+    every = last.variants(data.ground, seen)
+    other = [form for form in every if (form.turned, form.inside) != (last.turned, last.inside)]
     forms = [[*others, form] for form in other]
     # A part is no more than the whole.
     possible = [form for form in forms if bool(log_gain(data, data_model(data, form)).isfinite().all())]

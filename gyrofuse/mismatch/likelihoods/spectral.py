@@ -233,6 +233,12 @@ class Fit(NamedTuple):
         n = own.local.numel()
         return sd[:n].view_as(own.local), sd[n:]
 
+    def sd_alone(self, term: int) -> Tensor:
+        """The same of local numbers with all others held; what is told of products alone has such ones as well."""
+        places, own = self.places[term][: self.terms[term].local.numel()], self.terms[term]
+        sd = self.information.diagonal()[places.clamp(min=0)].clamp(min=_LEAST).rsqrt()
+        return torch.where(places >= 0, sd, math.nan).view_as(own.local)
+
 
 def fit(data: Ratios, terms: Sequence[Term], rounds: int = _ROUNDS) -> Fit:
     """Fisher scoring of all free numbers together, from where the terms stand."""
@@ -438,8 +444,7 @@ def _value(data: Ratios, model: Tensor, terms: Sequence[Term], paired: bool) -> 
 def _precision(term: Term) -> Tensor:
     """Of the priors of a term's numbers, local then shared: that of a normal law with the same slope."""
     own = torch.zeros_like(term.local)
-    if term.prior_scale:
-        scale = torch.tensor(term.prior_scale, dtype=torch.float64)[:, None]
+    if (scale := term.prior()) is not None:
         own = 2 / (scale.square() + term.local.square())
     return torch.cat([own.flatten(), torch.zeros_like(term.shared)])
 
@@ -448,8 +453,7 @@ def prior_cost(terms: Sequence[Term]) -> float:
     """`log(1 + (x / scale)^2)` of every local number with a scale: a heavy tail, so that strong effects cost little."""
     total = 0.0
     for term in terms:
-        if term.prior_scale:
-            scale = torch.tensor(term.prior_scale, dtype=torch.float64)[:, None]
+        if (scale := term.prior()) is not None:
             total += float(torch.log1p((term.local / scale).square()).sum())
     return total
 

@@ -57,12 +57,12 @@ class CommonMode(Addition):
         reference = gain[gain.abs().argmax()]
         gain = gain * reference.conj() / reference.abs()
         sd = shape.sd[0].square().nanmean(0).sqrt()
-        size = gain.abs()
-        second = float(term.told(shape.sd[0]).topk(2).values[-1])
+        size, told = gain.abs(), term.told(shape.sd_alone)
+        second = float(told.topk(2).values[-1])
         if second < _LEAST:  # one sensor has nothing in common
             return None
         least = min(_SEEN, second)
-        sensors = tuple(i for i in range(len(gain)) if float(size[i]) >= least * float(sd[i]))
+        sensors = tuple(i for i in range(len(gain)) if float(told[i]) >= least)
         parameters = {}
         for i in sensors:
             s, d = float(size[i]), float(sd[i])
@@ -123,8 +123,12 @@ class CommonMode(Addition):
     def refitted(self, case: Case, fold: int) -> Mechanism:
         shared = torch.tensor([math.log(self.corner)] if self.kind == "ar1" else [], dtype=torch.float64)
         local = torch.stack([self.gain.real, self.gain.imag])
-        free = torch.ones_like(local, dtype=torch.bool)
-        free[1] = bool(self.gain.imag.any())
-        term = refit(case, fold, Common(local, free, shared, self.kind, self.inside), self.company)
+        free = (self.gain != 0).expand_as(local).clone()
+        free[1] &= bool(self.gain.imag.any())
+        whole = None
+        if self.inside:
+            f = case.bands.frequency
+            whole = (self.own.spectrum(f) / self._source(f)).amin(-1).sqrt()
+        term = refit(case, fold, Common(local, free, shared, self.kind, self.inside, whole), self.company)
         corner = math.exp(float(term.shared[0])) if self.kind == "ar1" else 0.0
         return replace(self, gain=torch.complex(*term.local), corner=corner)
