@@ -165,6 +165,18 @@ def test_a_model_fitted_to_a_shorter_record_raises_no_alarm_by_its_spectra():
     assert sum(p < 0.01 for p in bands) <= at_most(N_RUNS, 0.01)
 
 
+def test_a_model_says_nothing_of_what_is_slower_than_the_record_it_was_fitted_to():
+    """There a walk that it hardly shows, and that is fitted too large by chance, would stand over everything else."""
+    slow = gf.parse_model("WN(variance=1.0) + AR1(phi=0.9995, variance=4e-7) + RW(variance=2e-7)")
+    g, p_values = torch.Generator().manual_seed(7), []
+    for _ in range(2):
+        earlier, recording = slow.simulate(2048, batch=(8,), generator=g), slow.simulate(8192, batch=(8,), generator=g)
+        given = case(recording, gf.fit_array_gmwm(earlier, FORMULA).model)
+        assert (given.simulated.power_dof[:, given.bands.frequency < 1 / 2048] == 0).all()
+        p_values.append(shape_witness(given).p_value)
+    assert min(p_values) > LEVEL
+
+
 def test_a_model_fitted_to_the_recording_itself_is_held_against_no_more():
     for s in range(2):
         x = record(2 * SHORT, 50 + s)

@@ -151,7 +151,7 @@ def narrow(case: Case) -> Narrow:
     recorded, simulated = _sides(case)
     fine, scale = recorded.bands, case.simulated.signal.shape[-1] / case.n_samples
     clean = scale == 1 or torch.tensor(fine.edges[:-1]) * scale >= _CLEAN
-    d, s = fine.dof, simulated.dof * clean
+    d, s = fine.dof, simulated.dof * clean * (fine.frequency >= case.simulated.slowest_seen)
     total = (d + simulated.dof)[:, None, None]
     both = (d[:, None, None] * recorded.coherence + simulated.dof[:, None, None] * simulated.coherence) / total
     return Narrow(
@@ -173,7 +173,8 @@ def slow(case: Case) -> Slow:
         for side in (case.recorded, case.simulated)
     )
     places = DeepBands.of(case.bands, case.n_samples).deep.unflatten(0, (-1, _PLACES))
-    return Slow(one / other, _dof(SLOW), _simulated_dof(case.simulated, SLOW), places)
+    seen = places.amin(-1) >= case.simulated.slowest_seen
+    return Slow(one / other, _dof(SLOW), _simulated_dof(case.simulated, SLOW) * seen, places)
 
 
 @remembered

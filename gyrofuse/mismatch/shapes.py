@@ -170,6 +170,7 @@ def _kept(case: Case, blocks: Tensor, folds: Tensor) -> Ratios:
         half = N_JUDGED / case.n_samples  # tapers of a block widen a line so far
         inside = (places.amin(-1) - 2 * half < case.line.frequency) & (case.line.frequency < places.amax(-1) + 2 * half)
         usable[inside & (places.amin(-1) > half)] = 0.0
+    usable[places.amin(-1) < case.simulated.slowest_seen] = 0.0
     for factor in case.bent:
         changed = both.bands.mean_of(factor(both.bands.places))  # (sensor, band)
         usable[(changed.clamp(min=1e-300).log().abs() > _BENT).mT] = 0.0

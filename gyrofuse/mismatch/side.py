@@ -53,6 +53,15 @@ class Side:
         n_records, _, n = self.signal.shape
         return min(n_records, self.told_by / n)
 
+    @property
+    def slowest_seen(self) -> float:
+        """Frequency below which a model only continues what the record that it was fitted to shows above, 1/sample.
+
+        Whether noise levels off there its parameters' covariance does not say: an AR1 that outlasts a record is a walk.
+        """
+        known = self.told_by if self.uncertainty is None else min(self.told_by, self.uncertainty.n_samples)
+        return _LEAST_BIN / known
+
     def in_bands(self, bands: Bands) -> Side:
         """The noise in other bands."""
         return Side(self.steady, bands, told_by=self.told_by, uncertainty=self.uncertainty)
@@ -108,7 +117,7 @@ class Side:
         varies = torch.as_tensor(self.level_variance).expand(self.signal.shape[-2])[:, None]
         if self.uncertainty is not None:
             varies = varies + self.uncertainty.variance(self.bands.frequency)
-        return self.dof / (1 + self.dof * varies)
+        return self.dof / (1 + self.dof * varies) * (self.bands.frequency >= self.slowest_seen)
 
     @property
     def coherence_dof(self) -> Tensor:
