@@ -24,6 +24,8 @@ from gyrofuse.mismatch import (
     prediction_errors,
 )
 from gyrofuse.mismatch.case import Case
+from gyrofuse.mismatch.confirm import Gain, leads_away
+from gyrofuse.mismatch.folds import N_FOLDS, N_JUDGED
 from gyrofuse.mismatch.mechanism import Mechanism
 from gyrofuse.mismatch.mechanisms import spikes
 from gyrofuse.mismatch.mechanisms.clipping import Clipping
@@ -264,6 +266,19 @@ def test_a_louder_episode_is_a_change_of_variance() -> None:
             settled(case, found, g)
     # Fewer than 8 of 12 at 95 % have probability 2e-4.
     assert onset >= 8
+
+
+def test_a_quiet_time_that_is_not_there_leads_away() -> None:
+    recording, simulation, g = drawn(31)
+    quieter = recording.clone()
+    quieter[1, N // 5 :] *= 0.2
+    factor = torch.ones(len(recording), dtype=torch.float64)
+    factor[1] = 0.04
+    effect = VarianceChange(((N / 5 / RATE, N / RATE),), factor)
+    for given, away in ((recording, True), (quieter, False)):
+        case = Case.of(SCENE, given, simulation)
+        gain = Gain(torch.zeros(N_JUDGED, dtype=torch.float64), (effect,) * N_FOLDS, 0.0)
+        assert leads_away(case, case, gain, g) is away
 
 
 def test_bursts_are_no_spikes() -> None:

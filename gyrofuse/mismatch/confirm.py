@@ -16,7 +16,6 @@ from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.classifier import distinguishability
 from gyrofuse.mismatch.evidence import Evidence
 from gyrofuse.mismatch.folds import N_FOLDS, N_JUDGED, held_out_blocks, in_fold
-from gyrofuse.mismatch.gaussian import Spectral
 from gyrofuse.mismatch.mechanism import Mechanism, Z
 from gyrofuse.mismatch.remainder import Remainder
 from gyrofuse.mismatch.remembered import remembered
@@ -137,7 +136,8 @@ def leads_away(start: Case, case: Case, gain: Gain, generator: torch.Generator) 
 
     On the blocks that each fold holds out, and beside lines that both have: filters act on those as well, and tones
     have mechanisms of their own. Likelihoods are those of the noise's smooth spectrum: where the simulation has a hump
-    of its own, which that does not have, another one beside it seems to gain much, and doubles it.
+    of its own, which that does not have, another one beside it seems to gain much, and doubles it. A level that jumps
+    seems to be noise that is louder at times.
 
     Args:
         start: Recording and simulation as they came.
@@ -145,7 +145,7 @@ def leads_away(start: Case, case: Case, gain: Gain, generator: torch.Generator) 
         gain: Of the mechanism.
         generator: Of what is built into the simulation.
     """
-    if not any(isinstance(effect, Spectral) for effect in gain.refitted):
+    if not any(effect.changes_noise for effect in gain.refitted):
         return False
     repaired = (_noise(effect.explained(case, generator)) for effect in gain.refitted)
     after = sum(discrepancy_of_fold(one, fold) for fold, one in enumerate(repaired)) / N_FOLDS

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -27,6 +27,7 @@ class Spectral(Mechanism):
         approximate: Whether its form is not quite that of the recording. No part of what is saved.
     """
 
+    changes_noise: ClassVar[bool] = True
     company: tuple[Any, ...] = field(default=(), kw_only=True, metadata={"saved": False})
     approximate: bool = field(default=False, kw_only=True, metadata={"saved": False})
 

@@ -87,7 +87,7 @@ def _louder(signal: Tensor, r: Tensor, corner: float, power: float) -> Tensor:
 
 def fast_share(f: Tensor, corner: float) -> Tensor:
     """Share of a density at `f` that is white noise, above a walk as strong as it at the corner."""
-    return f.square() / (f.square() + corner**2)
+    return f.square() / (f.square() + corner**2).clamp(min=1e-300)  # of a corner at zero the mean stays
 
 
 def whitened_factor(factor: Tensor, corner: float) -> Tensor:

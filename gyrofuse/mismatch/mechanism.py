@@ -35,6 +35,7 @@ class Mechanism:
 
     name: ClassVar[str]
     happened_once: ClassVar[bool] = False  # at a time of this recording, not in another one
+    changes_noise: ClassVar[bool] = False  # levels or spectra of noise: a wrong one leads a simulation away
     proportional_to: ClassVar[str] = ""  # field, where it adds a known path to every record of the same time
     taken_off: ClassVar[bool] = False  # the recording by its repair, instead of built into the simulation
     place: ClassVar[int] = 0  # in the chain from sensor to numbers: clipped, rounded, repeated come after all else

@@ -52,6 +52,7 @@ class GradualChange(Mechanism):
 
     name: ClassVar[str] = "variance_change"
     happened_once: ClassVar[bool] = True
+    changes_noise: ClassVar[bool] = True
     time_s: Annotated[Tensor, Axes(("knot",))]
     share: Annotated[Tensor, Axes(("knot",))]
     base: OfSensors

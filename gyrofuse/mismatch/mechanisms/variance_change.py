@@ -62,6 +62,7 @@ class VarianceChange(Mechanism):
 
     name: ClassVar[str] = "variance_change"
     happened_once: ClassVar[bool] = True
+    changes_noise: ClassVar[bool] = True
     episodes: tuple[tuple[float, float], ...]
     factor: OfSensors
     corner_hz: float = 0.0
