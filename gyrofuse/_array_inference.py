@@ -158,7 +158,8 @@ def matrices(fit: ArrayFit, told: Tensor, confidence_level: float) -> tuple[Esti
     middle = rho.clamp(-1 + 1e-12, 1 - 1e-12).atanh()
     low, high = (torch.where(told, (middle + sign * width).tanh(), torch.nan) for sign in (-1, 1))
     # Every sensor agrees with itself.
-    certain = [torch.where(a == b, one, part) for one, part in ((0.0, rho_sd), (1.0, low), (1.0, high))]
+    itself = (a == b).to(rho.device)
+    certain = [torch.where(itself, one, part) for one, part in ((0.0, rho_sd), (1.0, low), (1.0, high))]
     return entries, Estimate(*(unvech(part) for part in (rho, *certain)))
 
 

@@ -14,6 +14,17 @@ class SingularCovarianceError(ValueError):
     """A covariance matrix of the array is not positive definite, so there are no optimal weights."""
 
 
+def oriented_eigh(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Eigenvalues and eigenvectors of symmetric matrices, the largest entry of each vector positive.
+
+    Its sign is the library's choice, hence another one on another device; where random numbers are mixed by the
+    vectors, so would the result be.
+    """
+    values, vectors = torch.linalg.eigh(matrix)
+    largest = vectors.gather(-2, vectors.abs().argmax(-2, keepdim=True))
+    return values, vectors * torch.where(largest < 0, -1.0, 1.0).to(vectors)
+
+
 def check_positive_definite(
     name: str,
     matrix: Tensor,

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._lag_sums import block_mean_covariances
+from gyrofuse._linalg import oriented_eigh
 from gyrofuse.covariance import wavelet_products
 from gyrofuse.pilot import Pilot, components_of_memories
 
@@ -63,7 +64,7 @@ def _draw(directions: _Directions, theta: Tensor, normal: Tensor) -> tuple[Tenso
     # In this basis of the sensors every component is diagonal, and what they show independent.
     root = _root(expected)
     half = torch.linalg.solve_triangular(root, theta[:, 0], upper=False)
-    share, turn = torch.linalg.eigh(total[0] * torch.linalg.solve_triangular(root, half.mT, upper=False))
+    share, turn = oriented_eigh(total[0] * torch.linalg.solve_triangular(root, half.mT, upper=False))
     basis = root @ turn
     share = torch.stack([share, 1 - share], -1).clamp(min=0)  # of each component: (item, sensor, component)
     joint = torch.einsum("nsk,kab->nsab", share, within / total[:, None, None])
@@ -176,7 +177,7 @@ def resample_wccv(pilot: Pilot, first_level: int, n_resamples: int, generator: t
         root = roots[members[memory]].to(pilot.theta)
         paths = normal.to(pilot.theta) @ root.mT[:, None]  # unit noise: (component, resample, sensor, block)
         for item in (pilot.memory == memory).nonzero().flatten().tolist():
-            values, vectors = torch.linalg.eigh(pilot.theta[item])
+            values, vectors = oriented_eigh(pilot.theta[item])
             mix = vectors * values.clamp(min=0).sqrt()[:, None, :]  # (component, sensor, sensor)
             sums, counts = wavelet_products((mix[:, None] @ paths).sum(0), n_levels)
             resamples[item] = sums / counts

@@ -71,7 +71,7 @@ def combine(wccv: Tensor, omega: Tensor) -> Tensor:
 
 def counting(wccv: Tensor, omega: Tensor) -> Tensor:
     """Levels that count; one that does not may well be unknown (NaN)."""
-    return torch.where(omega[:, None, None] > 0, wccv, 0.0)
+    return torch.where(omega.to(wccv.device)[:, None, None] > 0, wccv, 0.0)
 
 
 def optimal_weights(combined: Tensor) -> Tensor:

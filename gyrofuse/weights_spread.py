@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse import series
+from gyrofuse._linalg import oriented_eigh
 from gyrofuse.parametric import resample_combined
 from gyrofuse.pilot import Pilot, fit_pilot
 from gyrofuse.uncertainty import normal_quantile, t_quantile
@@ -224,7 +225,7 @@ def _resampled(
     certainty = pilot.certainty(center, omega)
     moved = moved * (certainty / (certainty - n_sensors + 1).clamp(min=2)).sqrt()[:, None, None]
     normal = torch.randn(n_resamples, n_sensors, generator=generator, dtype=lower.dtype).to(lower.device)
-    values, vectors = torch.linalg.eigh(lower)
+    values, vectors = oriented_eigh(lower)
     noise = normal @ (vectors * values.clamp(min=0).sqrt()[:, None, :]).mT
     # Their covariance is itself an estimate: chi-square of as many cosines (Wilson & Hilferty) makes them Student's t.
     width = 2 / (9 * terms_below[:, None])

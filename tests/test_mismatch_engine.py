@@ -286,3 +286,19 @@ def test_beside_a_sensor_that_hardly_leaves_a_step_the_others_are_searched_on(me
     assert any("sensor 3" in e.words for e in found.unexplained)
     assert not any(e.sensors and 2 not in e.sensors for e in found.unexplained)
     assert float((found.model.effects[0].simulated(simulation, scene, g)[2] % 4.0).diff().abs().max()) < 1e-9
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_what_lies_on_a_device_is_diagnosed_as_it_is_beside_the_processor():
+    recording, simulation = with_tone(array(1, 2**13), 0.3), array(2, 2**13)
+    model = gf.fit_gmwm(simulation, "WN + RW").model
+    for given in (simulation.signal, model, gf.ArrayModel([(gf.WhiteNoise(1.0), torch.eye(6))])):
+        there = model_on_device(given) if isinstance(given, gf.Model) else given
+        there = there.cuda() if isinstance(there, torch.Tensor) else there
+        expected = diagnose(recording.signal, given, judge=array(3, 2**13).signal)
+        got = diagnose(recording.signal.cuda(), there, judge=array(3, 2**13).signal.cuda())
+        assert got.to_dict() == expected.to_dict()
+
+
+def model_on_device(model: gf.Model) -> gf.Model:
+    return model.with_params(model.params.cuda(), estimated_from=model.estimated_from)

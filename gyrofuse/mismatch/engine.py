@@ -18,7 +18,7 @@ from gyrofuse.mismatch.counterfactual import Link, settled
 from gyrofuse.mismatch.evidence import calibrated, corrected, uncorrected
 from gyrofuse.mismatch.fit_verdict import KNOWN, FitVerdict, fit_verdict
 from gyrofuse.mismatch.gaussian import Spectral
-from gyrofuse.mismatch.inputs import Simulation, modelled, prepared
+from gyrofuse.mismatch.inputs import Simulation, modelled, on_processor, prepared
 from gyrofuse.mismatch.judge import checked_judge, judged
 from gyrofuse.mismatch.mechanism import Finding
 from gyrofuse.mismatch.mechanisms import STAGES
@@ -55,6 +55,8 @@ def diagnose(
 ) -> MismatchReport:
     """Find where a recording and a simulation differ, and which physics the simulation left out.
 
+    It is made in the processor's memory, to which whatever lies on another device is brought.
+
     Args:
         recording: What a real array gave; its auxiliary channels are used. A tensor is `(sensor, time)`.
         simulation: What a simulator gives for the same array: samples, of any length and without channels, or a noise
@@ -90,7 +92,8 @@ def diagnose(
     if generator is None:
         generator = torch.Generator().manual_seed(0)
     level = uncorrected(false_alarm, len(WITNESSES))  # what would be a mismatch, had one witness alone said it
-    simulation = modelled(simulation, fitted_samples)
+    recording, judge = on_processor(recording), on_processor(judge)
+    simulation = on_processor(modelled(simulation, fitted_samples))
     given = prepared(recording, simulation, rate, generator)
     if judge is not None:
         judge = checked_judge(judge, recording, rate)

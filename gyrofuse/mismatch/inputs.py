@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,6 +22,7 @@ from gyrofuse.mismatch.level_spread import with_spread
 from gyrofuse.mismatch.lines import simulated_lines
 from gyrofuse.mismatch.repaired import RepairedModel
 from gyrofuse.mismatch.spectral_uncertainty import SpectralUncertainty, as_array
+from gyrofuse.parsing import model_from_dict
 from gyrofuse.ranking_result import RankResult
 from gyrofuse.recording import Recording
 from gyrofuse.simulate import ArrayModel
@@ -34,6 +36,23 @@ FEWEST = 4096
 _FEWEST_RECORDS, _MOST_RECORDS, _MOST_VALUES = 4, 16, 2**23
 _SINGULAR = 1e-10  # of correlation matrices
 _SEARCHES = 4  # for lines
+
+
+def on_processor(given: Any) -> Any:
+    """Samples or a model in the processor's memory, where a diagnosis is made; anything else as it is."""
+    if isinstance(given, Tensor):
+        return given.cpu()
+    if isinstance(given, Recording):
+        channels = {name: values.cpu() for name, values in given.channels.items()}
+        return replace(given, signal=given.signal.cpu(), time=given.time.cpu(), channels=channels)
+    if isinstance(given, Model):
+        parts: list[Any] = [value for process in given.processes for value in process.parameters.values()]
+    elif isinstance(given, ArrayModel):
+        parts = [part for process, matrix in given.components for part in (matrix, *process.parameters.values())]
+    else:
+        return given
+    elsewhere = any(isinstance(part, Tensor) and part.device.type != "cpu" for part in parts)
+    return model_from_dict(given.to_dict()) if elsewhere else given
 
 
 def modelled(
