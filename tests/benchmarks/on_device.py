@@ -1,6 +1,6 @@
 """What a CUDA device makes of the heavy parts, beside the processor of the same machine.
 
-    python tests/benchmarks/cuda.py [--quick] [--only WCCV]
+    python tests/benchmarks/on_device.py [--quick] [--only WCCV]
 
 Seconds are medians of runs taken in turn, the device waited for at both ends; "off by" is the largest difference from
 the processor's result, over the largest value of it.
