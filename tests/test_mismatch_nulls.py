@@ -21,7 +21,7 @@ from gyrofuse.mismatch.mechanisms.parameter_shift import ParameterShift
 from gyrofuse.mismatch.mechanisms.random_telegraph import RandomTelegraph
 from gyrofuse.mismatch.mechanisms.variance_change import VarianceChange
 from gyrofuse.mismatch.prediction_errors import left_out
-from gyrofuse.mismatch.shape_scan import beside_level, shape_witness
+from gyrofuse.mismatch.shape_scan import beside_levels, shape_witness
 from gyrofuse.mismatch.stats import predictive_tail
 from gyrofuse.mismatch.stats.brownian_range import kuiper_p_value, studentised_range_p_value
 from gyrofuse.mismatch.stats.clustering import clustering_p_value
@@ -198,14 +198,13 @@ def test_levels_that_vary_by_themselves_make_a_sample_count_for_less() -> None:
     assert sure.weight.tolist() == [1.0, 1.0, 1.0]
 
 
-def test_scores_whose_level_varies_become_independent() -> None:
-    worth = torch.tensor([3.0, 10.0, 50.0, 7.0], dtype=torch.float64)
-    variance = torch.tensor([0.0, 0.3], dtype=torch.float64)
+def test_scores_whose_levels_vary_become_independent() -> None:
+    levels = torch.zeros(2, 4, 2, dtype=torch.float64)  # the first sensor's do not
+    levels[1] = torch.tensor([[0.1, 2.0], [1.5, 1.0], [4.0, 0.0], [1.0, 0.2]])
     one = torch.eye(4, dtype=torch.float64)[:, None].expand(4, 2, 4)
-    root = beside_level(one, worth, variance)  # (band, sensor, band): rows of V^(-1/2)
-    level = worth.sqrt()
-    for i, v in enumerate(variance.tolist()):
-        covariance = torch.eye(4, dtype=torch.float64) + v * level[:, None] * level
+    root = beside_levels(one, levels)  # (band, sensor, band): rows of V^(-1/2)
+    for i, moved in enumerate(levels):
+        covariance = torch.eye(4, dtype=torch.float64) + moved @ moved.mT
         torch.testing.assert_close(root[:, i] @ covariance @ root[:, i].mT, torch.eye(4, dtype=torch.float64))
 
 

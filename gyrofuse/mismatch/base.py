@@ -26,6 +26,7 @@ from gyrofuse.simulate import ArrayModel
 
 _PER_DECADE = 3
 _ROUNDS = 5
+_QUICK = 4.0  # samples: time constants of noise that is nearly white
 _NEGLIGIBLE = 1e-3  # of the power in every band
 
 
@@ -45,6 +46,11 @@ class Base:
     def spectrum(self, f: Tensor) -> Tensor:
         """Density per sample `(sensor, frequency)` at `f` cycles per sample."""
         return self.coefficients @ _atoms(self.n_samples, f)
+
+    def fast(self) -> Base:
+        """What of it is white, or nearly."""
+        quick = [True, True, *(tau < _QUICK for tau in _time_constants(self.n_samples)), False]
+        return Base(self.n_samples, torch.where(torch.tensor(quick), self.coefficients, 0.0))
 
     def model(self) -> ArrayModel:
         """The same as an array of sensors, without atoms that nowhere matter."""

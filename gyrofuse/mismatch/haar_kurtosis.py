@@ -82,7 +82,8 @@ def _levelled_coefficients(side: Side) -> Iterator[Tensor]:
     for w in _coefficients(steady - (error - error.clamp(min=-reach, max=reach))):
         at = torch.linspace(0, level.shape[-1] - 1, w.shape[-1]).round().long()
         over = w / level[..., at].sqrt()
-        yield over - over.mean(-1, keepdim=True)
+        over = over - over.mean(-1, keepdim=True)
+        yield over / over.square().mean(-1, keepdim=True).sqrt().clamp(min=1e-300)  # the records' own levels may differ
 
 
 def independent_values(w: Tensor) -> Tensor:

@@ -41,6 +41,7 @@ _FEWEST_CYCLES = 10.0
 _CANDIDATES = 64
 _ALL_SETS = 8  # sensors up to which all sets of them are tried
 _LINE_IN_SIMULATION = 1e-3  # p value
+_RECORDS, _STEADY = 4, 0.3  # records that tell, and variance of a power over its mean's square: of noise one
 
 
 @dataclass(frozen=True)
@@ -120,7 +121,17 @@ def simulated_lines(side: Side) -> tuple[float, ...]:
     for _, f, reach in sorted(found):
         if all(abs(f - other) > far for other, far in kept):
             kept.append((f, reach))
-    return (*side.lines, *precise(side.noise, tuple(f for f, _ in kept)))
+    return (*side.lines, *_steady(side, precise(side.noise, tuple(f for f, _ in kept))))
+
+
+def _steady(side: Side, lines: tuple[float, ...]) -> tuple[float, ...]:
+    """Those whose power is the same in every record: that of a peak of noise, which a model may have, is exponential."""
+    if not side.gaussian or len(side.noise) < _RECORDS or not lines:
+        return lines
+    density = side.base.spectrum(torch.tensor(lines, dtype=torch.float64))  # (sensor, line)
+    power = (amplitudes(side.noise, lines).square() / density).sum(1)  # (record, line)
+    steady = power.var(0) < _STEADY * power.mean(0).square()
+    return tuple(f for f, yes in zip(lines, steady.tolist(), strict=True) if yes)
 
 
 def _reach(z: Tensor) -> float:

@@ -72,10 +72,19 @@ def _ranges(squares: Tensor, excess: Tensor | float = 1.0) -> Tensor:
     return (path.amax(-1) - path.amin(-1)) / (sd * math.sqrt(blocks.shape[-1]))
 
 
+def _white(side: Side) -> Tensor:
+    """Whitened records `(record, sensor, time)`, none of them nearer to zero than rounding leaves known.
+
+    Else a run of values on one step would be a quiet stretch.
+    """
+    expected = left_out(side)
+    return expected.white.sign() * expected.white.abs().maximum(expected.grain[..., None])
+
+
 @remembered
 def _scanned(side: Side) -> LevelScan:
     """Scan of all the records, in which the level would change at the same times."""
-    return scanned_levels(left_out(side).white.flatten(0, 1).square().clamp(max=LEVEL_CUT))
+    return scanned_levels(_white(side).flatten(0, 1).square().clamp(max=LEVEL_CUT))
 
 
 @remembered
@@ -87,12 +96,12 @@ def level_profile(case: Case) -> Tensor | None:
     """
     if case.simulated.signal.shape[-1] != case.n_samples or _scanned(case.simulated).p_value > _UNSTEADY:
         return None
-    white = left_out(case.simulated).white
+    white = _white(case.simulated)
     found = episodes_of(white.flatten(0, 1), torch.zeros(white[..., 0].numel() + 1, dtype=torch.float64))
     if found is None:
         return None
     factor = found.factor.view(white.shape[:-1]).log().mean(0).exp()
-    inside, recorded = found.inside(case.n_samples), left_out(case.recorded).white[0].clamp(-3.0, 3.0)
+    inside, recorded = found.inside(case.n_samples), _white(case.recorded)[0].clamp(-3.0, 3.0)
     moved = (inside.roll(place * case.n_samples // _PLACES) for place in range(_PLACES))
     fits = torch.stack([two_level_scores(recorded, factor, there).sum() for there in moved])
     return torch.where(inside, factor[:, None], 1.0) if int(fits.argmax()) == 0 else None
@@ -107,7 +116,7 @@ def own_spread(case: Case) -> LevelSpread:
 def _simulated_white(case: Case) -> Tensor:
     """Whitened simulation `(record, sensor, time)` over the level that both sides have."""
     profile = level_profile(case)
-    white = left_out(case.simulated).white
+    white = _white(case.simulated)
     return white if profile is None else white / profile.sqrt()
 
 
@@ -115,7 +124,7 @@ def _simulated_white(case: Case) -> Tensor:
 def levelled(case: Case) -> Tensor:
     """Whitened recording `(sensor, time)` over the noise level that the simulation has there."""
     profile = level_profile(case)
-    white = left_out(case.recorded).white[0]
+    white = _white(case.recorded)[0]
     return white if profile is None else white / profile.sqrt()
 
 

@@ -46,6 +46,7 @@ class LeftOut(NamedTuple):
         white: Whitened record, `(record, sensor, time)`, robust sd 1, likewise.
         at_ends: Errors where those of the ends are their own; in `error` and `white` their neighbours stand for them
             where lines or a steep filter are felt there.
+        grain: Modulus below which rounding to few steps leaves nothing known of `white`, `(record, sensor)`.
     """
 
     error: Tensor
@@ -53,6 +54,7 @@ class LeftOut(NamedTuple):
     z: Tensor
     white: Tensor
     at_ends: Tensor
+    grain: Tensor
 
     def correctable(self) -> Tensor:
         """Errors `(record, sensor, time)` by which single samples may be corrected.
@@ -78,10 +80,12 @@ def left_out(side: Side) -> LeftOut:
     error = _back(y * inverse) / (inverse * (1 - followed)).mean(-1, keepdim=True)
     leaks, at_ends = lines.any(-1, keepdim=True) | _leaks(white), error
     white, error = (torch.where(leaks, _mirrored(v), v) for v in (white, error))
-    stepped = _stepped(side.signal[:MOST_RECORDS])
+    step = _step(side.signal[:MOST_RECORDS])
+    stepped = step > _COARSE
     z, white = (values / side.level**0.5 for values in (error, white))
     sd = _sd(z, stepped)
-    return LeftOut(error, sd, z / sd[..., None], white / _sd(white, stepped)[..., None], at_ends)
+    grain = torch.where(stepped, step / math.sqrt(12), 0.0)
+    return LeftOut(error, sd, z / sd[..., None], white / _sd(white, stepped)[..., None], at_ends, grain)
 
 
 def _lines(y: Tensor, spectrum: Tensor) -> Tensor:
@@ -161,12 +165,15 @@ def _interpolated(means: Tensor, ends: Tensor) -> Tensor:
     return means[..., right - 1] + share * (means[..., right] - means[..., right - 1])
 
 
-def _stepped(signal: Tensor) -> Tensor:
-    """Whether values `(..., time)` have few steps in their noise, `(...)`: medians of such are a matter of luck."""
+def _step(signal: Tensor) -> Tensor:
+    """Usual distance of neighbouring values `(..., time)` over the sd of their noise, `(...)`.
+
+    Beyond `_COARSE` there are few steps in the noise, and medians of it a matter of luck.
+    """
     part = signal[..., :_FEW].flatten(0, -2)
     gaps = torch.stack([g.median() if len(g := row.unique().diff()) else g.new_zeros(()) for row in part])
     noise = part.diff().square().mean(-1).sqrt() / math.sqrt(2)
-    return (gaps > _COARSE * noise).view(signal.shape[:-1])
+    return (gaps / noise.clamp(min=1e-300)).view(signal.shape[:-1])
 
 
 def _sd(values: Tensor, stepped: Tensor) -> Tensor:

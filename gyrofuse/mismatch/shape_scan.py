@@ -164,7 +164,7 @@ def _enough(case: Case) -> bool:
 def _scan(case: Case, looked_for: Shapes, errors: Errors | None = None, *, outside: bool = False) -> Scan:
     """Shapes weighed beside errors of the simulation's numbers, where given, or only by what lies outside of them."""
     data, below, weighed = narrow(case), slow(case), looked_for.scores
-    scores = beside_level(data.scores, data.worth, case.simulated.level_variance)
+    scores = beside_levels(data.scores, _levels(case))
     if errors is not None:
         weighed = errors.outside(weighed) if outside else errors.beside(weighed)
         uncertainty = cast(SpectralUncertainty, case.simulated.uncertainty)
@@ -236,22 +236,37 @@ def _shapes(case: Case, data: Narrow) -> Shapes:
     moved = torch.cat([torch.cat([_grown(colour, worth, size), weak * (size / length)]) for size in _SIZES])
     shown = moved[..., len(below.d) :] * data.worth.sqrt()
     return Shapes(
-        beside_level(shown, data.worth, case.simulated.level_variance),
+        beside_levels(shown, _levels(case)),
         moved[..., : len(below.d)],
         log_chances.repeat(1, len(_SIZES)) - math.log(len(_SIZES)),
     )
 
 
-def beside_level(values: Tensor, worth: Tensor, variance: Tensor | float) -> Tensor:
-    """Scores `(..., sensor, band)` whose common level varies by itself, as independent ones of variance one.
+@remembered
+def _levels(case: Case) -> Tensor:
+    """By what a sd of the levels that vary by themselves moves scores, `(sensor, band, level)`.
 
-    Their covariance is `V = 1 + v l l'` with `l` the root of the worth `(band,)` and `v` the variance `(sensor,)` of a
-    log level; what is returned is `V^(-1/2)` times them.
+    Fast and slow noise have levels of their own, which may go together or not.
     """
-    level, total = worth.sqrt(), worth.sum()
-    share = 1 - (1 + torch.as_tensor(variance, dtype=worth.dtype) * total).rsqrt()
-    along = (values @ level) / total
-    return values - (share * along)[..., None] * level
+    data, base = narrow(case), deep_base(case)
+    fast = (base.fast().spectrum(data.frequency) / base.spectrum(data.frequency)).clamp(max=1)
+    sd = torch.as_tensor(case.simulated.level_variance, dtype=torch.float64).sqrt().expand(len(fast))
+    return torch.stack([fast, 1 - fast], -1) * data.worth.sqrt()[:, None] * sd[:, None, None]
+
+
+def beside_levels(values: Tensor, levels: Tensor) -> Tensor:
+    """Scores whose levels vary by themselves, as independent ones of variance one.
+
+    Args:
+        values: `(..., sensor, band)`, of covariance `V = 1 + U U'`.
+        levels: `U`, `(sensor, band, level)`.
+
+    Returns:
+        `V^(-1/2)` times them.
+    """
+    directions, size, _ = torch.linalg.svd(levels, full_matrices=False)
+    along = torch.einsum("...sb,sbl->...sl", values, directions) * (1 - (1 + size.square()).rsqrt())
+    return values - torch.einsum("sbl,...sl->...sb", directions, along)
 
 
 def _densities(n_samples: int, f: Tensor) -> Tensor:

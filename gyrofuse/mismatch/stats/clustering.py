@@ -1,29 +1,24 @@
 """Whether large squares come together more than in another series.
 
 Statistic: mean of `c_t = sum_(lag <= 15) x_t x_(t+lag)` of standardised squares. Null law: Student's `t`, with the
-long-run variance of the other series' `c_t`, which is not below 15, that of independent values; of its difference,
-times `1/n + 1/n'`.
+long-run variances of either series' `c_t`, which are not taken below 15, that of independent values.
 """
 
 from __future__ import annotations
-
-import math
 
 import torch
 from scipy import stats
 from torch import Tensor
 
-from gyrofuse.mismatch.stats.long_run_variance import long_run_variance
+from gyrofuse.mismatch.stats.long_run_variance import equal_means_score
 
 LAGS = 15  # samples: longer bursts are seen by the level's range
 
 
 def clustering_p_value(recorded: Tensor, simulated: Tensor) -> float:
     """One-sided p value of squares `(record, time)` that come together as those of the other ones do."""
-    own, other = _products(recorded), _products(simulated)
-    spread = long_run_variance(other)
-    sd = math.sqrt(max(spread.value, LAGS) * (1 / own.numel() + 1 / other.numel()))
-    return float(stats.t.sf(float(own.mean() - other.mean()) / sd, spread.dof))
+    score, dof = equal_means_score(_products(recorded), _products(simulated), LAGS)
+    return float(stats.t.sf(score, dof))
 
 
 def _products(squares: Tensor) -> Tensor:

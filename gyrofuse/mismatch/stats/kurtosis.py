@@ -7,8 +7,8 @@ Null law: Student's `t` with the degrees of freedom of the long-run variance `L`
 
     u^4 - q - k (u^2 - mean u^2),   k = mean(4 u^4 [inside]) / mean(2 u^2 [inside]),
 
-of the second series alone, whose second term is the error of `s` (Hampel et al., Robust Statistics, 1986, section 4.2);
-times `1/n + 1/n'`. `L` is not below what normal values of the same correlation have.
+whose second term is the error of `s` (Hampel et al., Robust Statistics, 1986, section 4.2), of either series; it is not
+taken below what normal values of the same correlation have.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from gyrofuse.mismatch.stats.long_run_variance import long_run_variance
+from gyrofuse.mismatch.stats.long_run_variance import equal_means_score
 
 _CUT = 4.5  # sd: of normal values one in 150,000 is cut
 _LAGS = 8  # thinned Haar coefficients overlap with so many neighbours at most
@@ -61,11 +61,9 @@ def bounded_kurtosis(values: Tensor) -> BoundedKurtosis:
 def kurtosis_p_value(recorded: Tensor, simulated: Tensor) -> float:
     """Two-sided p value that two series `(record, time)` have the same bounded kurtosis."""
     own, other = bounded_kurtosis(recorded), bounded_kurtosis(simulated)
-    n, m = recorded.numel(), simulated.numel()
-    spread = long_run_variance(other.influence)
-    least = _GAUSSIAN * m / other.independent
-    sd = math.sqrt(max(spread.value, least) * (1 / n + 1 / m))
-    return float(2 * stats.t.sf(abs(own.value - other.value) / sd, spread.dof))
+    least = _GAUSSIAN * simulated.numel() / other.independent
+    score, dof = equal_means_score(own.value + own.influence, other.value + other.influence, least)
+    return float(2 * stats.t.sf(abs(score), dof))
 
 
 def _scale(values: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ whose lowest part is not higher than the rest: where the density has fallen off 
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -52,6 +53,24 @@ def long_run_variance(series: Tensor) -> LongRunVariance:
         if not any(_higher(power[:low], power[low:m], n_records) for low in tried if low < m):
             break
     return LongRunVariance(float(power[:m].mean()), 2.0 * m * n_records)
+
+
+def equal_means_score(own: Tensor, other: Tensor, least: float) -> tuple[float, float]:
+    """Difference of the means of two series `(record, time)` over its sd, and the degrees of freedom of its `t`.
+
+    Each has the long-run variance of its own (Welch, Biometrika 34 (1947), 28): of rare events a series that holds few
+    by chance also looks surer of its mean. That of the first is not taken below that of the second.
+
+    Args:
+        own: Series, or influences of its values plus a statistic of it, which is their mean.
+        other: The same of the other one.
+        least: Below which neither long-run variance is.
+    """
+    spreads = [long_run_variance(series) for series in (own, other)]
+    floor = max(spreads[1].value, least)
+    parts = max(spreads[0].value, floor) / own.numel(), floor / other.numel()
+    dof = sum(parts) ** 2 / sum(part**2 / spread.dof for part, spread in zip(parts, spreads, strict=True))
+    return float(own.mean() - other.mean()) / math.sqrt(sum(parts)), dof
 
 
 def _higher(low: Tensor, rest: Tensor, n_records: int) -> bool:

@@ -3,9 +3,9 @@
 Statistic: exceedances of levels of `|z|`. Null law: predictive. Beyond the simulation's 200th largest value the excess
 of `z^2/2` has a Gaussian's tail, or a generalised Pareto one (Pickands, Ann. Statist. 3 (1975), 119), as likely
 beforehand, its shape uniform and its scale uniform in the logarithm; the count is then negative binomial, since the
-rate beyond the threshold is known from 200 events. A sum of Gaussian noise and outliers has neither tail: where the
-simulation has any exceedance itself, p is at least that of two counts of the same rate, whose prior is Jeffreys' with
-the mean of the simulation's sensors for one half.
+rate beyond the threshold is known from 200 events. A sum of Gaussian noise and outliers has neither tail: up to
+half as far again as the simulation's largest value, p is at least that of two counts of the same rate, whose prior is
+Jeffreys' with the mean of the simulation's sensors for one half.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 
 LEVELS = (3.5, 4.0, 4.5, 5.0, 6.0, 8.0, 11.0, 16.0, 23.0, 32.0)  # sd; further ones tell no more of any outlier
 _EVENTS = 200  # that tell a tail: its shape to 0.1
+_HIGHER = 1.5  # outliers may be so many times as large as the largest of as many: they have no common height
 _TINY = 1e-12  # half squares that values on few steps of a converter have in place of 0
 _BLOCKS = 64  # of a record, in which events are counted: long against clumps of some tens of samples
 _CLUMPED = 0.05  # p value of counts that vary by more than Poisson's
@@ -42,7 +43,7 @@ def tail_p_values(recorded: Array, simulated: Array) -> Array:
     shape = (other + other.mean(0)) / 2 / clumps + 0.5
     compared = _many_p_value(own, shape, shape * n / m)
     expected = np.stack([_predicted(z.ravel(), own[i], clumps[i, 0], n) for i, z in enumerate(simulated)])
-    p = np.where(other.sum(0) > 0, np.maximum(expected, compared), expected)
+    p = np.where(levels < _HIGHER * np.abs(simulated).max(), np.maximum(expected, compared), expected)
     return np.asarray(-np.expm1(len(levels) * np.log1p(-np.minimum(p.min(-1), 1 - 1e-16))))
 
 
