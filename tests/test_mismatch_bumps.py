@@ -14,10 +14,11 @@ from gyrofuse.mismatch.bump_fit import Background, Oscillation, oscillation_of
 from gyrofuse.mismatch.bump_scan import log_ratios
 from gyrofuse.mismatch.bumps import Stretch, strongest_bump
 from gyrofuse.mismatch.colour import noise
-from gyrofuse.mismatch.hump_scan import _scores, scanned_humps
+from gyrofuse.mismatch.hump_scan import _scores, _shape, scanned_humps
 from gyrofuse.mismatch.likelihoods.spectral import fit, linearised
 from gyrofuse.mismatch.lines import whitened
 from gyrofuse.mismatch.mechanisms.resonance import Resonance
+from gyrofuse.mismatch.modulated_ordinates import inflation, level_correlations
 from gyrofuse.mismatch.oscillating import Mode, _seen, excess_along
 from gyrofuse.mismatch.shape_terms import CommonBump, oscillation
 from gyrofuse.mismatch.shapes import compared
@@ -49,7 +50,8 @@ def test_scores_of_humps_are_normal_where_there_is_none(half: float):
     drawn_ones = []
     for seed in range(32, 38):  # of broad humps a record has a few thousand
         power = torch.empty(4, 2**18, dtype=torch.float64).exponential_(generator=generator(seed))
-        scores, whole = _scores(power.unflatten(-1, (-1, cell)).mean(-1), half / cell, float(cell), 3)
+        cells, worth = power.unflatten(-1, (-1, cell)).mean(-1), torch.full((4, 1), float(cell), dtype=torch.float64)
+        scores, whole = _scores(cells, _shape(cells.shape[-1], half / cell), worth, 3)
         drawn_ones.append(scores[:, whole])
     scores = torch.cat(drawn_ones, -1)
     assert abs(float(scores.mean())) < 0.01
@@ -63,11 +65,31 @@ def test_a_hump_is_where_it_was_put():
     power = torch.empty(P, 2**14, dtype=torch.float64).exponential_(generator=generator(33))
     k = torch.arange(2**14)
     power[:3] *= 1 + 1.2 / (1 + ((k - 5000) / 60).square())
-    best = max(scanned_humps(power, 1.0), key=lambda scan: float(scan.log_ratio.amax()))
+    steady = torch.zeros(P, 1, dtype=torch.float64)
+    best = max(scanned_humps(power, 1.0, steady, 1.0), key=lambda scan: float(scan.log_ratio.amax()))
     at = int(best.log_ratio.argmax())
     assert abs(int(best.first[at]) + best.width / 2 - 5000) < 60
     assert 60 <= best.width <= 300
     assert float(best.log_ratio.amax()) > 20
+
+
+@pytest.mark.parametrize("bursts", [True, False])
+def test_bands_of_noise_with_bursts_scatter_by_what_their_squares_tell(bursts: bool):
+    # 400 records with a burst of 20 samples in a thousand, five times as loud; a hump as broad as they are short.
+    n, n_runs, g = 4096, 400, generator(34)
+    loud = (torch.rand(n_runs, n + 20, generator=g) < 1e-3).double().unfold(-1, 20, 1).amax(-1)[:, :n]
+    x = torch.randn(n_runs, n, generator=g, dtype=torch.float64) * (1 + 4 * loud * bursts)
+    power = torch.fft.rfft(x)[:, 1:].abs().square() / n
+    shape = _shape(n // 2, 60.0)
+    weights = shape - shape.mean()
+    sums = (power[:, 200 : 200 + len(weights)] @ weights) / power.mean(-1)
+    expected = inflation(level_correlations(x), weights, 1.0)
+    scatter = float(sums.var() / weights.square().sum())
+    assert float(expected.mean()) == pytest.approx(scatter, rel=0.25)  # 400 draws: 7 % and the correlations' own
+    assert (scatter > 1.8) == bursts
+    # Twice as wide stretches of half as many weights say the same.
+    half = weights[: len(weights) // 2 * 2].unflatten(-1, (-1, 2)).mean(-1)
+    torch.testing.assert_close(inflation(level_correlations(x), half, 2.0), expected, rtol=0.02, atol=0.02)
 
 
 def test_backgrounds_that_nothing_holds_stay_numbers_that_can_be_worked_out():

@@ -21,6 +21,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.modulated_ordinates import inflation
+
 _NARROWEST = 4  # bins
 _FLANK, _LEAST_FLANK, _FEWEST_BINS = 4.0, 1.5, 24  # of a flank, over the stretch, and bins
 _SMOOTH = 8  # part of the spectrum over which noise may be taken for the same
@@ -57,12 +59,14 @@ def least_flank(width: int) -> int:
     return max(round(_LEAST_FLANK * width), _FEWEST_BINS)
 
 
-def scanned_bumps(transform: Tensor, worth: float) -> Iterator[Stretches]:
+def scanned_bumps(transform: Tensor, worth: float, levels: Tensor, width_of_bin: float) -> Iterator[Stretches]:
     """Stretches of 4, 8, 16, .. bins that overlap by half.
 
     Args:
         transform: Of whitened samples of two sensors or more, `(sensor, bin)`.
         worth: Independent ordinates in a bin.
+        levels: Correlations of ordinates of noise whose level varies, `(sensor, distance)`.
+        width_of_bin: In bins of the record, of which those distances are.
     """
     n_bins, width = transform.shape[-1], _NARROWEST
     pairs = transform[:, : n_bins // 2 * 2].unflatten(-1, (-1, 2)).movedim(1, 0)
@@ -74,11 +78,14 @@ def scanned_bumps(transform: Tensor, worth: float) -> Iterator[Stretches]:
         last = len(cells) - reach - 3
         if last < first:
             return
+        flank = torch.full((reach,), -1 / (2 * reach), dtype=torch.float64)
+        contrast = torch.cat([flank, flank.new_tensor([0.0, 0.5, 0.5, 0.0]), flank])  # in halves of a stretch
+        own = worth / float(inflation(levels, contrast, half * width_of_bin).amax())
         logs = []
         for a in range(first, last + 1, _AT_ONCE):
             b = min(a + _AT_ONCE, last + 1)
             inside, beside = _inside(cells, a, b), _beside(cells, a, b, reach)
-            logs.append(log_ratios(inside, beside, width * worth, 2 * reach * half * worth))
+            logs.append(log_ratios(inside, beside, width * own, 2 * reach * half * own))
         yield Stretches(torch.arange(first, last + 1) * half, width, torch.cat(logs))
         cells = cells[: len(cells) // 2 * 2].unflatten(0, (-1, 2)).sum(1)
         width *= 2

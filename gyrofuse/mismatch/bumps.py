@@ -19,6 +19,7 @@ from gyrofuse.mismatch.evidence import Evidence, corrected, ratio_p_value
 from gyrofuse.mismatch.hump_scan import scanned_humps
 from gyrofuse.mismatch.known_lines import without_lines
 from gyrofuse.mismatch.lines import simulated_lines, whitened
+from gyrofuse.mismatch.modulated_ordinates import level_correlations
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.shape_law import decorrelated
 from gyrofuse.mismatch.witnesses import level_of
@@ -69,9 +70,10 @@ def strongest_bump(case: Case) -> Stretch:
     last = int((0.5 - 2 / case.n_samples) * length)
     transform = transform[:, :last]
     worth = case.n_samples / length / _DEPENDENT
-    scans = list(scanned_humps(squared_modulus(_apart(transform, length, case)), worth))
+    levels, width = level_correlations(case.lineless), case.n_samples / length
+    scans = list(scanned_humps(squared_modulus(_apart(transform, length, case)), worth, levels, width))
     if case.n_sensors > 1:
-        scans += scanned_bumps(transform, worth)
+        scans += scanned_bumps(transform, worth, levels, width)
     power, nothing = squared_modulus(transform), Stretch(0.25, 0.5, 1.0, tuple(range(case.n_sensors)))
     simulated: tuple[Tensor, int] | None = None
     for _ in range(_TRIES if scans else 0):

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.bump_scan import Stretches
 from gyrofuse.mismatch.evidence import some_of
+from gyrofuse.mismatch.modulated_ordinates import inflation
 
 _NARROWEST, _BROADEST = 4.0, 12.0  # half widths: bins, and of them in the spectrum
 _FINER = math.sqrt(2)
@@ -31,31 +32,46 @@ _LOWEST, _ABOVE = 12, 8.0  # bins, and half widths, above which centres lie
 _SIZES = (2.0, 3.0, 4.5, 6.5)
 
 
-def scanned_humps(power: Tensor, worth: float) -> Iterator[Stretches]:
+def scanned_humps(power: Tensor, worth: float, levels: Tensor, width: float) -> Iterator[Stretches]:
     """Humps of half widths from four bins, a root of two apart, every half of a half width.
 
     Args:
         power: Of bins `(sensor, bin)`, of sensors that share nothing.
         worth: Independent ordinates in a bin.
+        levels: Correlations of ordinates of noise whose level varies, `(sensor, distance)`.
+        width: Of a bin, in bins of the record, of which those distances are.
     """
     n_bins, half = power.shape[-1], _NARROWEST
     while half <= n_bins / _BROADEST:
         cell = max(int(half / _CELLS), 1)
         cells = power[:, : n_bins // cell * cell].unflatten(-1, (-1, cell)).mean(-1)
-        score, whole = _scores(cells, half / cell, cell * worth, -(-_LOWEST // cell))
+        shape = _shape(cells.shape[-1], half / cell)
+        independent = cell * worth / inflation(levels, shape - shape.mean(), cell * width)[:, None]
+        score, whole = _scores(cells, shape, independent, -(-_LOWEST // cell))
         centre = torch.arange(cells.shape[-1]) * cell + cell // 2
         which = (whole & (centre > _ABOVE * half)).nonzero()[:, 0][:: max(round(half / 2 / cell), 1)]
         if len(which):
-            width = round(2 * half)
-            yield Stretches(centre[which] - width // 2, width, _log_ratios(score[:, which]))
+            whole_width = round(2 * half)
+            yield Stretches(centre[which] - whole_width // 2, whole_width, _log_ratios(score[:, which]))
         half *= _FINER
 
 
-def _scores(cells: Tensor, half: float, worth: float, lowest: int) -> tuple[Tensor, Tensor]:
-    """Normal scores of a hump centred on each cell `(sensor, cell)`, and whether enough of it lies in the spectrum."""
-    wide = cells.shape[-1] / _SMOOTH / half
+def _shape(n_cells: int, half: float) -> Tensor:
+    """A hump of so many cells' half width, with what is around it."""
+    wide = n_cells / _SMOOTH / half
     reach = round(min(max(wide, _LEAST_REACH), _REACH) * half)
-    shape = 1 / (1 + (torch.arange(-reach, reach + 1, dtype=torch.float64) / half).square())
+    return 1 / (1 + (torch.arange(-reach, reach + 1, dtype=torch.float64) / half).square())
+
+
+def _scores(cells: Tensor, shape: Tensor, worth: Tensor, lowest: int) -> tuple[Tensor, Tensor]:
+    """Normal scores of a hump centred on each cell `(sensor, cell)`, and whether enough of it lies in the spectrum.
+
+    Args:
+        cells: Their mean powers, `(sensor, cell)`.
+        shape: Of the hump, cell by cell.
+        worth: Independent ordinates in a cell, `(sensor, 1)`.
+        lowest: Cells that are left out.
+    """
     kernels = torch.stack([torch.ones_like(shape), shape, shape.square()])[:, None]
     used = torch.ones_like(cells[:1])
     used[:, :lowest] = 0
@@ -76,9 +92,9 @@ def _around(rows: Tensor, kernels: Tensor) -> Tensor:
     return torch.from_numpy(signal.oaconvolve(every.numpy(), kernels.numpy(), mode="same", axes=-1))
 
 
-def _normal_of_share(standard: Tensor, inside: float, n: float) -> Tensor:
+def _normal_of_share(standard: Tensor, inside: float, n: Tensor) -> Tensor:
     """Normal score (Paulson) of a standardised Beta variable of mean `inside` and `n` ordinates."""
-    share = (inside + standard * math.sqrt(inside * (1 - inside) / (n + 1))).clamp(1e-9, 1 - 1e-9)
+    share = (inside + standard * (inside * (1 - inside) / (n + 1)).sqrt()).clamp(1e-9, 1 - 1e-9)
     root = (share / inside * (1 - inside) / (1 - share)).pow(1 / 3)
     a, b = 1 / (9 * n * inside), 1 / (9 * n * (1 - inside))
     return ((1 - b) * root - (1 - a)) / (b * root.square() + a).sqrt()

@@ -125,7 +125,7 @@ def simulated_lines(side: Side) -> tuple[float, ...]:
 
 
 def _steady(side: Side, lines: tuple[float, ...]) -> tuple[float, ...]:
-    """Those whose power is the same in every record: that of a peak of noise, which a model may have, is exponential."""
+    """Those of the same power in every record: that of a peak of noise, which a model may have, is exponential."""
     if not side.gaussian or len(side.noise) < _RECORDS or not lines:
         return lines
     density = side.base.spectrum(torch.tensor(lines, dtype=torch.float64))  # (sensor, line)
