@@ -13,7 +13,7 @@ from scipy import signal, stats
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.mismatch import impulses, lattices, noise_level, normality, twins
+from gyrofuse.mismatch import haar_kurtosis, impulses, lattices, noise_level, normality, twins
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.inputs import prepared
 from gyrofuse.mismatch.level_spread import level_spread
@@ -152,6 +152,73 @@ def test_tails_that_both_have_are_predicted(kind: str) -> None:
     assert low <= 4
     recorded[0, ::1000] = 12.0 * np.abs(simulated).max()
     assert predictive_tail.tail_p_values(recorded, simulated[:, None])[0] < 1e-4
+
+
+def test_outliers_that_few_have_by_chance_are_no_taller_tail() -> None:
+    # Ten sd where the simulation's own sensor has none: others show that they come.
+    g = torch.Generator().manual_seed(21)
+    recorded, simulated = normal(3, N, g=g).numpy(), normal(3, N, g=g).numpy()
+    recorded[2, [100, 5000]] = 11.2, -11.5
+    simulated[:2, [70, 3000]] = 10.4, -9.8
+    assert predictive_tail.tail_p_values(recorded, simulated[:, None])[2] > 0.05
+    # Twice as tall they are others.
+    recorded[2, [100, 5000]] = 24.0, -25.0
+    assert predictive_tail.tail_p_values(recorded, simulated[:, None])[2] < 1e-3
+
+
+def burst(n: int, at: tuple[int, ...], g: torch.Generator) -> Tensor:
+    """Noise `(1, time)` that is three times as loud for 20 samples after each place."""
+    x = normal(1, n, g=g)
+    for start in at:
+        x[:, start : start + 20] *= 3.0
+    return x
+
+
+def test_a_simulation_with_few_bursts_by_chance_is_not_surer_of_them() -> None:
+    g = torch.Generator().manual_seed(22)
+    recorded = burst(4500, tuple(range(100, 4500, 450)), g)
+    simulated = burst(4500, (700,), g)
+    assert kurtosis_p_value(recorded, simulated) > 1e-4
+    assert clustering_p_value(recorded.square().clamp(max=9), simulated.square().clamp(max=9)) > 1e-3
+
+
+def test_records_of_another_level_have_the_kurtosis_of_each() -> None:
+    g = torch.Generator().manual_seed(23)
+    recorded = noise("wandering", g)
+    simulated = torch.cat([normal(2, N, g=g), 1.5 * normal(2, N, g=g)], -1) * wandering(100.0, 2 * N, g).sqrt()
+    assert float(haar_kurtosis.kurtosis_p_values(prepared(recorded, simulated, None, g))[0].min()) > 0.01
+
+
+def test_a_run_of_values_on_one_step_is_no_quiet_stretch() -> None:
+    g = torch.Generator().manual_seed(24)
+    recorded, simulated = normal(2, N, g=g).round(), normal(2, N, g=g).round()
+    recorded[0, 3000:3018] = 0.0  # by chance about once in forty million samples, hence no law is met
+    found = prepared(recorded + 0.3, simulated + 0.3, None, g)
+    assert noise_level.variance_p_value(found) > 1e-3
+    # Without a lattice such a stretch is one.
+    quiet = normal(2, N, g=g)
+    quiet[0, 3000:3200] *= 0.3
+    assert noise_level.variance_p_value(prepared(quiet, normal(2, N, g=g), None, g)) < 1e-6
+
+
+def test_fast_noise_may_go_up_and_down_beside_slow_noise_that_does_not() -> None:
+    alarms = 0
+    for seed in range(6):
+        g = torch.Generator().manual_seed(40 + seed)
+        slow = [torch.from_numpy(signal.lfilter([1.0], [1.0, -0.999], normal(4, N, g=g).numpy())) for _ in range(2)]
+        both = [normal(4, N, g=g) * wandering(2000.0, N, g).sqrt() + 0.1 * part for part in slow]
+        alarms += shape_witness(prepared(*both, None, g)).p_value < 1e-3
+    assert alarms == 0
+
+
+def test_a_peak_of_noise_is_no_tone() -> None:
+    g = torch.Generator().manual_seed(25)
+    peak = gf.AR1(phi=-0.9995, variance=2e-4)
+    tone = gf.Sinusoid(amplitude=0.2, beta=0.7)
+    model = gf.WhiteNoise(1.0) + peak + tone
+    found = prepared(model.simulate(N, batch=(2,), generator=g), model, None, g)
+    (line,) = found.simulated.lines
+    assert line == pytest.approx(0.7 / (2 * math.pi), abs=1 / N)
 
 
 def test_tails_of_values_that_hardly_leave_a_step_are_numbers() -> None:
