@@ -21,6 +21,7 @@ _LONG = 8.0
 _REACH = 10.0  # half widths of the band that is cleaned
 _FLANK = 6.0
 _FAINT = 0.03  # of the largest gain
+_EULER = 0.5772156649015329  # by which the mean logarithm of an exponential variable is below that of its mean
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,10 +87,13 @@ class DriftingTone(Addition):
         last = min(round((self.mode.centre + reach) * n), n // 2 - 1)
         flank = max(round(self.mode.width * _FLANK * n), 16)
         bins = torch.arange(n // 2 + 1)
-        beside = ((bins >= first - flank) & (bins < first)) | ((bins > last) & (bins <= last + flank))
+        # An octave below at most: what is slower leaks into the slowest ordinates, and is many times the noise there.
+        beside = ((bins >= max(first - flank, first // 2)) & (bins < first)) | ((bins > last) & (bins <= last + flank))
         beside &= bins > 0
         density = case.base.spectrum(bins.clamp(min=1) / n)
-        level = (transform.abs().square() / density)[:, beside].mean(-1, keepdim=True)
+        # By the mean logarithm of exponential ordinates: a few that hold more would lift a mean, and all of the band.
+        ordinates = (transform.abs().square() / density)[:, beside].clamp(min=1e-300)
+        level = (ordinates.log().mean(-1, keepdim=True) + _EULER).exp()
         parts = torch.randn(2, len(signal), last - first + 1, generator=generator, dtype=torch.float64)
         fresh = torch.complex(parts[0], parts[1]) / math.sqrt(2)
         size = self.mode.gain.abs()
