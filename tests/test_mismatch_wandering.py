@@ -73,6 +73,18 @@ def test_a_band_is_cleaned_to_the_level_of_the_noise_whatever_is_slow():
     assert float((power.mean(-1) - 1).abs().max()) < 5 / math.sqrt(len(bins)) + 0.05  # which the base is off
 
 
+def test_a_strong_tone_leaves_nothing_beside_the_middle_of_its_line():
+    """Its line is seen farther out than any number of its half widths, and falls as no Lorentzian does."""
+    g, width = generator(942), 3 / N
+    records = array().simulate(N, batch=(5,), generator=g)
+    given = case(records[0] + 30 * RMS * SIGNS[:, None] * wandering(g, width), records[1:])
+    mode = Mode(0.2, 1.5 / N, 30 * RMS * SIGNS.to(torch.complex128), True)
+    cleaned = DriftingTone(mode, True).explained(given, g)
+    bins = round(0.2 * N) + torch.arange(-80, 81)
+    power = torch.fft.rfft(cleaned.recording)[:, bins].abs().square() / given.base.spectrum(bins / N) / N
+    assert float(power.mean()) < 2
+
+
 def test_courses_have_a_mean_ratio_of_one_in_noise():
     power = torch.empty(4000, 12, 16, dtype=torch.float64).exponential_(generator=generator(910))
     ratios = torch.stack([_courses(p, 4.0 / 12).logsumexp(0).exp() / 15 for p in power])
