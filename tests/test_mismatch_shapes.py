@@ -448,6 +448,16 @@ def test_noise_that_is_a_little_steeper_is_no_flicker(slope: float):
     assert _falls_otherwise(data, first) == (slope != 1.0)
 
 
+def test_flicker_noise_far_above_the_rest_may_be_bent_by_its_sampling():
+    """Means over samples of noise whose fastest trap dwells for a quarter of one fall faster next to the rate."""
+    data = compared(drawn(24, lambda x, g: x + 0.05 * noise(N, sampled_flicker, P, g)))
+    assert not _falls_otherwise(data, fit(data, [Flicker.start(data.ground)]))
+
+
+def sampled_flicker(f: torch.Tensor) -> torch.Tensor:
+    return torch.sinc(f).square() * (1 - 2 / math.pi * torch.atan(2 * math.pi * f / 4)) / f
+
+
 @pytest.mark.parametrize("slope", [1.0, 1.5])
 def test_noise_is_flicker_only_if_it_falls_as_flicker_does(slope: float):
     given = falling(slope)

@@ -11,15 +11,17 @@ from scipy import stats
 from shape_draws import SIGNS, N, array, case, generator, oscillating
 
 from gyrofuse.mismatch.bump_fit import oscillation_of
+from gyrofuse.mismatch.mechanisms.drifting_tone import DriftingTone
+from gyrofuse.mismatch.oscillating import Mode
 from gyrofuse.mismatch.steadiness import steadiness
 from gyrofuse.mismatch.wandering import _cell, _courses, _hump, wandering_log_ratio
 
 WIDTH, RMS = 60 / N, 9e-4  # half width in cycles per sample; deg/s
 
 
-def wandering(g: torch.Generator) -> torch.Tensor:
+def wandering(g: torch.Generator, width: float = WIDTH) -> torch.Tensor:
     """A tone that goes up and down by a few half widths, eleven times in the record."""
-    knots = torch.randn(1, 1, 12, generator=g, dtype=torch.float64) * 1.5 * WIDTH
+    knots = torch.randn(1, 1, 12, generator=g, dtype=torch.float64) * 1.5 * width
     speed = torch.nn.functional.interpolate(knots, N, mode="linear", align_corners=True)[0]
     return math.sqrt(2) * torch.cos(2 * math.pi * (0.2 + speed).cumsum(-1))
 
@@ -42,6 +44,45 @@ def test_weak_ones_are_told_apart(tone: bool):
     assert seen >= n_runs - 1
     assert right >= stats.binom.ppf(1e-2, seen, 0.9)
     assert wrong == 0
+
+
+@pytest.mark.parametrize("tone", [True, False])
+def test_strong_ones_are_told_apart_that_hardly_wander(tone: bool):
+    """Of a bump a few bins wide the envelope has a few independent values, but no noise is as steady as a tone."""
+    for seed in range(3):
+        g, width = generator(930 + seed), 3 / N
+        records = array().simulate(N, batch=(4,), generator=g)
+        source = wandering(g, width) if tone else oscillating(g, 0.2, width, 1)
+        given = case(records[0] + 8 * RMS * SIGNS[:, None] * source, records[1:])
+        bump = oscillation_of(given)
+        assert bump is not None
+        verdict = steadiness(given, bump)
+        assert verdict.tone == tone
+        assert not (tone and verdict.open)
+
+
+def test_a_band_is_cleaned_to_the_level_of_the_noise_whatever_is_slow():
+    """What a walk leaves in the slowest ordinates is many times the noise, and none of the band's."""
+    records = array().simulate(N, batch=(5,), generator=generator(940))
+    slow = torch.sin(2 * math.pi * torch.arange(N, dtype=torch.float64) / N * 1.7)
+    given = case(records[0] + 0.01 * slow, records[1:])
+    mode = Mode(500 / N, 45 / N, SIGNS.to(torch.complex128), True)
+    cleaned = DriftingTone(mode, True).explained(given, generator(941))
+    bins = torch.arange(60, 940)
+    power = torch.fft.rfft(cleaned.recording)[:, bins].abs().square() / given.base.spectrum(bins / N) / N
+    assert float((power.mean(-1) - 1).abs().max()) < 5 / math.sqrt(len(bins)) + 0.05  # which the base is off
+
+
+def test_a_strong_tone_leaves_nothing_beside_the_middle_of_its_line():
+    """Its line is seen farther out than any number of its half widths, and falls as no Lorentzian does."""
+    g, width = generator(942), 3 / N
+    records = array().simulate(N, batch=(5,), generator=g)
+    given = case(records[0] + 30 * RMS * SIGNS[:, None] * wandering(g, width), records[1:])
+    mode = Mode(0.2, 1.5 / N, 30 * RMS * SIGNS.to(torch.complex128), True)
+    cleaned = DriftingTone(mode, True).explained(given, g)
+    bins = round(0.2 * N) + torch.arange(-80, 81)
+    power = torch.fft.rfft(cleaned.recording)[:, bins].abs().square() / given.base.spectrum(bins / N) / N
+    assert float(power.mean()) < 2
 
 
 def test_courses_have_a_mean_ratio_of_one_in_noise():

@@ -49,6 +49,8 @@ _SHARED = 5.0  # standard deviations of a second gain, which power and correlati
 _SHARP, _NARROW = 0.1, (0.02, 0.04, 0.08)  # the same, below which bands are too wide for it, and of it there
 _FINE, _NARROWEST = 24, 0.005  # bands in an octave for those, and the least that they show
 _STEEPER, _FLICKER = 4.0, 0.15  # nats that another slope gains, and distance from 1 of flicker noise's
+_UNBENT = 0.1  # cycles per sample, up to which means over samples and what is folded change noise by less than a fifth
+_PLAINLY = 2.0  # nats by which slower noise is rather flicker noise than of the slope of all
 _UNSTEADY = 0.01  # p value of either sign of a level that may change
 _OFF = 0.25  # logarithm by which a centre from wide bands may be off
 _ENOUGH = 50.0  # ordinates, to look for the shape of a spectrum
@@ -312,10 +314,25 @@ def _falls_otherwise(data: Ratios, chosen: Fit) -> bool:
     """Whether what flicker noise was chosen for falls by another power of frequency: that has no name."""
     for i, term in enumerate(chosen.terms):
         if isinstance(term, Flicker):
-            found = fit(data, [*_others(chosen, i), PowerLaw.like(term, data.ground)])
-            if found.gain > chosen.gain + _STEEPER and abs(float(found.terms[-1].shared) - 1) > _FLICKER:
+            terms = [*_others(chosen, i), PowerLaw.like(term, data.ground)]
+            found = fit(data, terms)
+            slope = float(found.terms[-1].shared)
+            if found.gain <= chosen.gain + _STEEPER or abs(slope - 1) <= _FLICKER:
+                continue
+            if not _only_bent(data, terms, slope):
                 return True
     return False
+
+
+def _only_bent(data: Ratios, terms: list[Term], slope: float) -> bool:
+    """Whether noise of a power law, the last term, falls as `1/f` well below the rate, and not by the slope of it all.
+
+    Next to the rate any noise is bent by how it is sampled: means over samples lose some of it, and what lies above
+    half the rate is folded onto it. Where it is far above the rest, that alone makes for another slope.
+    """
+    below = fit(data.without((data.ground.bands.frequency > _UNBENT)[:, None]), terms)
+    told, sd = float(below.terms[-1].shared), float(below.sd(-1)[1])
+    return (slope - told) ** 2 - (1 - told) ** 2 > 2 * _PLAINLY * sd**2
 
 
 def _others(chosen: Fit, i: int) -> list[Term]:

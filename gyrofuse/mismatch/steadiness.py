@@ -149,11 +149,17 @@ class _Usual(NamedTuple):
 
 
 def _steady(bins: Tensor) -> Tensor:
-    """`2 - E |z|^4 / (E |z|^2)^2`: 0 of Gaussian noise, 1 of a tone."""
+    """`1 - v^(1/3)`, `v = E |z|^4 / (E |z|^2)^2 - 1`: about 0 of Gaussian noise, 1 of a tone.
+
+    `v` is the relative variance of the squared envelope. Of a narrow bump it is that of a few independent values, as
+    skew as a chi-square of few degrees: its cube root is nearly normal (Wilson and Hilferty), so that standard
+    deviations tell how rare an envelope is that hardly varies at all.
+    """
     best = bins.shape[-1]
     inner = bins[..., best // 4 : best - best // 4]
     power = squared_modulus(torch.fft.ifft(inner))
-    return 2 - power.square().mean(-1) / power.mean(-1).square()
+    variance = power.square().mean(-1) / power.mean(-1).square() - 1
+    return 1 - variance.clamp(min=0).pow(1 / 3)
 
 
 def _ridges(bins: Tensor) -> Tensor:

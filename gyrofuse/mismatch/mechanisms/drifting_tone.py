@@ -19,8 +19,11 @@ from gyrofuse.mismatch.wandering import share_of_lorentzian
 _SHORT = 0.05  # cycles of the width in which a phase that diffuses forgets its frequency
 _LONG = 8.0
 _REACH = 10.0  # half widths of the band that is cleaned
-_FLANK = 6.0
+_FLANK, _FEWEST = 0.6, 64  # of the reach to either side, and bins, that tell the noise beside
+_STEP = 16  # bins
 _FAINT = 0.03  # of the largest gain
+_SPREAD, _SEEN = math.pi / math.sqrt(6), 2.0  # sd of the logarithm of an exponential variable, and how many are seen
+_EULER = 0.5772156649015329  # by which the mean logarithm of an exponential variable is below that of its mean
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,23 +84,45 @@ class DriftingTone(Addition):
         signal, n = case.recording, case.n_samples
         ramp = torch.linspace(0, 1, n, dtype=torch.float64) * (signal[:, -1:] - signal[:, :1])
         transform = torch.fft.rfft(signal - ramp)
-        reach = self.mode.width * _REACH
-        first = max(round((self.mode.centre - reach) * n), 1)
-        last = min(round((self.mode.centre + reach) * n), n // 2 - 1)
-        flank = max(round(self.mode.width * _FLANK * n), 16)
         bins = torch.arange(n // 2 + 1)
-        beside = ((bins >= first - flank) & (bins < first)) | ((bins > last) & (bins <= last + flank))
-        beside &= bins > 0
         density = case.base.spectrum(bins.clamp(min=1) / n)
-        level = (transform.abs().square() / density)[:, beside].mean(-1, keepdim=True)
-        parts = torch.randn(2, len(signal), last - first + 1, generator=generator, dtype=torch.float64)
-        fresh = torch.complex(parts[0], parts[1]) / math.sqrt(2)
         size = self.mode.gain.abs()
         concerned = size > _FAINT * size.amax()  # the others stay as they are
+        power = transform.abs().square() / density
+        first, last = self._band(power[concerned], n)
+        middle = round(self.mode.centre * n)
+        below, above = (max(round(_FLANK * reach), _FEWEST) for reach in (middle - first, last - middle))
+        # An octave below at most: what is slower leaks into the slowest ordinates, and is many times the noise there.
+        beside = ((bins >= max(first - below, first // 2)) & (bins < first)) | ((bins > last) & (bins <= last + above))
+        beside &= bins > 0
+        # By the mean logarithm of exponential ordinates: a few that hold more would lift a mean, and all of the band.
+        level = (power[:, beside].clamp(min=1e-300).log().mean(-1, keepdim=True) + _EULER).exp()
+        parts = torch.randn(2, len(signal), last - first + 1, generator=generator, dtype=torch.float64)
+        fresh = torch.complex(parts[0], parts[1]) / math.sqrt(2)
         filled = fresh * (level * density[:, first : last + 1]).sqrt()
         transform[concerned, first : last + 1] = filled[concerned]
         cleaned = torch.fft.irfft(transform, n=n) + ramp
         return case.with_recording(torch.where(concerned[:, None], cleaned, signal))
+
+    def _band(self, power: Tensor, n_samples: int) -> tuple[int, int]:
+        """First and last bin that are cleaned, of powers `(sensor, bin)` in units of the simulation's noise.
+
+        A strong line is seen far beyond the widths of its middle, and none knows how its flanks fall: either end goes
+        on while there is more next to it than farther off, beyond chance.
+        """
+        logs = power.clamp(min=1e-300).log().mean(0)
+        middle, ends = round(self.mode.centre * n_samples), []
+        for side in (logs[1:middle].flip(0), logs[middle + 1 : n_samples // 2]):  # from the centre outwards
+            end = min(max(round(_REACH * self.mode.width * n_samples), 0), len(side))
+            while True:
+                step, far = (max(round(_FLANK * end), least) for least in (_STEP, _FEWEST))
+                near, beyond = side[end : end + step], side[end + step : end + step + far]
+                chance = _SPREAD * math.sqrt(1 / step + 1 / far)
+                if len(beyond) < far or float(near.mean() - beyond.mean()) < _SEEN * chance:
+                    break
+                end += step
+            ends.append(end)
+        return max(middle - ends[0], 1), min(middle + ends[1], n_samples // 2 - 1)
 
     def refitted(self, case: Case, fold: int) -> Mechanism:
         return replace(self, mode=refitted_mode(case, fold, self.mode))
