@@ -19,7 +19,7 @@ from gyrofuse.mismatch.likelihoods.spectral import fit, linearised
 from gyrofuse.mismatch.lines import whitened
 from gyrofuse.mismatch.mechanisms.resonance import Resonance
 from gyrofuse.mismatch.modulated_ordinates import inflation, level_correlations
-from gyrofuse.mismatch.oscillating import Mode, _seen, excess_along
+from gyrofuse.mismatch.oscillating import Mode, _momentary, _seen, excess_along, wandering_sd
 from gyrofuse.mismatch.shape_terms import CommonBump, oscillation
 from gyrofuse.mismatch.shapes import compared
 from gyrofuse.mismatch.steadiness import steadiness
@@ -197,3 +197,11 @@ def test_what_rings_after_a_blow_is_no_mode_and_no_tone():
     given = drawn(3, lambda x, _: x + 0.3 * SIGNS[:, None] * ring)
     assert strongest_bump(given).p_value < 1e-6
     assert nominated(given) is None
+
+
+def test_a_bump_at_the_end_of_the_spectrum_has_no_band_around_it():
+    given, one = drawn(3), tensor(*(P * [1.0]))
+    stretch = Stretch(1 / N, 1 / N, 1e-9, (0,))
+    bump = Oscillation(stretch, 1 / N, 1 / N, (0.1, 0.1), one, 0.1 * one, None, 10.0)
+    assert not _momentary(given, bump)
+    assert wandering_sd(given, bump) == 0.0

@@ -14,6 +14,8 @@ from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.clocks import BLOCKS, best_slope, clock_witness, demodulated, strongest_slip
 from gyrofuse.mismatch.confirm import held_out_gain
 from gyrofuse.mismatch.mechanisms.clock_skew import ClockSkew
+from gyrofuse.mismatch.mechanisms.resonance import Resonance
+from gyrofuse.mismatch.oscillating import Mode
 from gyrofuse.mismatch.resampling import resampled
 from gyrofuse.mismatch.witnesses import line_witness
 
@@ -204,3 +206,15 @@ def test_without_a_shared_tone_nothing_is_said():
     both = Case.of(Scene(100.0, "deg/s", ("1", "2", "3", "4")), x[0], x[1:])
     assert strongest_slip(both) is None
     assert clock_witness(both).p_value == 1.0
+
+
+def test_what_rings_tells_no_time():
+    """A mode nearly as narrow as a line, built in where the recording has a tone for some of the time."""
+    g, t = generator(30), torch.arange(N, dtype=torch.float64)
+    x = NOISE.simulate(N, batch=(3, 2), generator=g).double()
+    on = ((t > 2000) & (t < 4000) | (t > 9000) & (t < 12000)).double()
+    x[0] += torch.tensor([[1.0], [0.6]]) * on * torch.cos(2 * math.pi * TONE * t)
+    given = Case.of(Scene(100.0, "deg/s", ("1", "2")), x[0], x[1:])
+    gain = torch.tensor([0.5, 0.3], dtype=torch.complex128)
+    rung = Resonance(Mode(TONE, 1.5 / N, gain, True)).explained(given, g)
+    assert clock_witness(rung).p_value > 1e-3

@@ -6,6 +6,9 @@ import pytest
 import torch
 
 import gyrofuse as gf
+from gyrofuse.mismatch.bumps import strongest_bump
+from gyrofuse.mismatch.case import Case, Scene
+from gyrofuse.mismatch.episodes import Episode, Episodes, _of_the_concerned, told_of_first
 from gyrofuse.mismatch.loudness import Loudness, corner_of, fast_factor, fast_share, whitened_factor
 
 N = 2**16
@@ -64,3 +67,35 @@ def test_where_nothing_tells_it_is_a_64th():
     short[1000:1100] = True
     assert corner_of(white(4), short, torch.full((3,), 2.0, dtype=torch.float64)) == 1 / 64
     assert corner_of(white(4), INSIDE, torch.full((3,), 1.001, dtype=torch.float64)) == 1 / 64
+
+
+@pytest.mark.parametrize("true", [9.0, 400.0])
+def test_a_level_is_known_however_loud_it_is(true: float):
+    noise = white(7)
+    noise[1, INSIDE] *= true**0.5
+    noise[:, 100] = 30.0  # an outlier is none of it
+    episodes = Episodes((Episode(20_000, 40_000),), torch.ones(3, dtype=torch.float64))
+    factor = _of_the_concerned(noise, episodes, None)
+    assert factor.tolist() == pytest.approx([1, true, 1], rel=0.04)
+    told = told_of_first(noise[1:2], episodes.episodes)
+    assert float(told.log_factor.exp()) == pytest.approx(true, rel=0.04)
+
+
+def test_a_few_wild_samples_are_no_level():
+    noise = white(8)
+    noise[0, 500:510] = 40.0
+    episodes = Episodes((Episode(500, 510),), torch.ones(3, dtype=torch.float64))
+    assert float(_of_the_concerned(noise, episodes, None)[0]) <= 25.5
+
+
+def test_nothing_bulges_where_a_part_of_the_record_has_all_power():
+    """Its noise fills neighbouring bins alike, as a bump does."""
+    n, least = 8192, []
+    course = (torch.arange(n) >= 3000) & (torch.arange(n) < 3600)
+    for seed in range(6):
+        noise = white(20 + seed, 2)[..., : 3 * n].unflatten(-1, (3, n)).movedim(1, 0)
+        known = Loudness(course, torch.full((2,), 300.0, dtype=torch.float64), 1e-4)
+        recorded = known.added(noise[0])
+        case = Case.of(Scene(100.0, "deg/s", ("1", "2")), recorded, noise[1:]).made_louder(known)
+        least.append(strongest_bump(case).p_value)
+    assert min(least) > 1e-3

@@ -9,16 +9,17 @@ import torch
 from scipy import stats
 
 import gyrofuse as gf
-from gyrofuse.mismatch import diagnose
+from gyrofuse.mismatch import diagnose, engine
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.classifier import area_under_curve, distinguishability, features
-from gyrofuse.mismatch.confirm import discrepancy_left, discrepancy_p_value, mean_discrepancy
+from gyrofuse.mismatch.confirm import discrepancy_left, discrepancy_p_value, held_out, held_out_gain, mean_discrepancy
 from gyrofuse.mismatch.folds import N_FOLDS, estimation_samples, held_out_blocks, in_fold
 from gyrofuse.mismatch.mechanisms.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.step import Step
 from gyrofuse.mismatch.remainder import Remainder
 from gyrofuse.mismatch.repaired import RepairedModel
+from gyrofuse.mismatch.slow_remainder import SlowRemainder
 
 N, P = 8192, 3
 SCENE = Scene(100.0, "deg/s", ("1", "2", "3"))
@@ -159,3 +160,36 @@ def test_the_discrepancy_left_has_a_p_value_that_errs_on_the_side_of_chance():
         p = discrepancy_p_value(case, mean_discrepancy(case))
         below += p < 0.05
     assert below <= stats.binom.ppf(0.999, 200, 0.05)
+
+
+def test_what_is_left_of_a_slow_course_is_taken_off_as_it_goes_on_in_what_is_held_out():
+    model, n = gf.WhiteNoise(1.0) + gf.AR1(0.99, 1e-3) + gf.RandomWalk(1e-7), 8192
+    t, g = torch.arange(n, dtype=torch.float64), generator(1)
+    signal = model.simulate(n, batch=(5, P), generator=g).double()
+    bends = (2 * math.pi * t / 5000).sin() * (-t / 9000).exp()
+    size = torch.zeros(P, 1, dtype=torch.float64)
+    size[0], size[1] = 30.0, -20.0
+    given = Case.of(SCENE, signal[0] + size * bends, signal[1:])
+    course = SlowRemainder.of(given)
+    gain = held_out_gain(given, course)
+    assert gain.confirms(1e-9)
+    judged = held_out(given, [gain], g)
+    assert judged.before > 3
+    assert judged.after < 1.5
+    left = course.removed(given.recording, SCENE) - signal[0]
+    assert float(left[:2].mean(-1, keepdim=True).sub(left[:2]).abs().max()) < 3
+    assert float((course.sizes[2:] != 0).sum()) <= 2  # of the others' noise next to nothing
+
+
+def test_a_slow_course_without_a_name_is_no_finding(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(engine, "STAGES", ())
+    model, n = gf.WhiteNoise(1.0) + gf.RandomWalk(1e-8), 4096
+    t, g = torch.arange(n, dtype=torch.float64), generator(2)
+    recording = model.simulate(n, batch=(1,), generator=g).double() + 30 * (-t / 500).exp()
+    report = diagnose(recording, model.simulate(4 * n, batch=(1,), generator=g), rate=100.0)
+    assert "slow" in [e.witness for e in report.unexplained]
+    assert report.findings == ()
+    assert "slow_remainder" in [e.name for e in report.model.effects]
+    assert report.held_out.low > 0
+    assert report.held_out.auc_after < 0.6 < report.held_out.auc_before
+    assert "slow course that is left" in "".join(gf.mismatch.telling.verdict(report))

@@ -49,6 +49,7 @@ from gyrofuse.mismatch.oscillating import Mode
 from gyrofuse.mismatch.remainder import Remainder
 from gyrofuse.mismatch.repaired import RepairedModel
 from gyrofuse.mismatch.saved import repaired_from_dict
+from gyrofuse.mismatch.slow_remainder import SlowRemainder
 
 NOISE = gf.ArrayModel.from_sensors([gf.WhiteNoise(1.0) + gf.AR1(0.9, 0.1), gf.WhiteNoise(2.0) + gf.AR1(0.8, 0.2)])
 SCENE = Scene(50.0, "deg/s", ("a", "b"))
@@ -94,6 +95,12 @@ EVERY = (
     FlickerNoise(numbers(1 / 3, 0.0)),
     CommonMode("ar1", 0.03, complex_numbers(0.1, 0.2j), BASE, True),
     DeadBand(numbers(0.0, 0.1), numbers(0.2, 0.0), numbers(0.01, 1 / 3)),
+    SlowRemainder(
+        numbers(0.0, 1 / 3),
+        torch.zeros(2, 4, dtype=torch.float64),
+        torch.tensor([[0.1, 1 / 3], [0.0, 0.2]], dtype=torch.float64),
+        1000,
+    ),
     Remainder(numbers(0.01, 0.1, 0.4), torch.tensor([[0.1, 1 / 3, 0.0], [0.0, 0.2, 0.3]], dtype=torch.float64)),
 )
 

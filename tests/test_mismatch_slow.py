@@ -429,6 +429,36 @@ def test_steps_are_found_one_after_the_other():
     assert Step.nominate(now, LEVEL) is None
 
 
+def test_several_large_steps_are_no_walk():
+    """To and fro in one sensor: no single one of them beats more slow noise, all of them do by far."""
+    sizes = {2345: 4.0, 6789: -5.5, 9700: 3.0, 13131: 1.5}
+    effect = torch.zeros(SENSORS, N, dtype=torch.float64)
+    effect[2] = torch.stack([size * (at <= T) for at, size in sizes.items()]).sum(0)
+    now = case(effect, seed=3)
+    found = {}
+    for _ in sizes:
+        finding = Step.nominate(now, LEVEL)
+        assert finding is not None
+        assert finding.sensors == (2,)
+        assert finding.alternatives == ()
+        assert held_out_gain(now, finding.effect).confirms(finding.p_value)
+        found[round(finding.time_s * RATE)] = float(finding.effect.size[2])
+        now = finding.effect.explained(now, generator(1))
+    for (at, size), (true, jump) in zip(sorted(found.items()), sizes.items(), strict=True):
+        assert abs(at - true) <= 12
+        assert size == pytest.approx(jump, abs=0.3)
+    assert Step.nominate(now, LEVEL) is None
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_walk_or_a_path_that_bends_is_not_several_steps(seed: int):
+    walk = gf.RandomWalk(1e-3).simulate(N, batch=(SENSORS,), generator=generator(seed)).double()
+    bends = torch.outer(torch.tensor([3.0, 0, 0, 4.0], dtype=torch.float64), (2 * math.pi * T / 9000 + seed).sin())
+    for effect in (walk, bends):
+        several = slow_look(case(effect, seed=seed)).several_steps
+        assert several is None or several.gain < slow_look(case(effect, seed=seed)).wandering
+
+
 def test_a_stationary_telegraph_is_no_step():
     state = torch.ones(N, dtype=torch.float64)
     for at in (2000, 4500, 6000, 9000, 11000, 14500):

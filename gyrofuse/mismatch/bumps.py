@@ -91,7 +91,7 @@ def strongest_bump(case: Case) -> Stretch:
         line = float(excess.topk(3).values.sum()) > _LINE * float(excess.sum())
         if simulated is None:
             bare = without_lines(case.simulated.signal, simulated_lines(case.simulated))
-            simulated = _transformed(whitened(bare, case.base))
+            simulated = _transformed(whitened(case.simulated.steadied(bare), case.base))
         if not line and not _has_it(simulated, stretch, case):
             return stretch
         for scan in scans:

@@ -71,6 +71,8 @@ class Case:
         converter: What it does to them, with the place of each in the chain.
         bent: Factors `(sensor, frequency)` by which powers were changed of what was built in though its form is another
             one, or by which its own scatter: what is left where it acts is a matter of it.
+        modes: Centre and half width of narrow noise that was built in, cycles per sample: it is no line, however like
+            one it looks.
     """
 
     scene: Scene
@@ -79,6 +81,7 @@ class Case:
     analog: Tensor
     converter: tuple[tuple[int, Callable[[Tensor], Tensor]], ...] = ()
     bent: tuple[Callable[[Tensor], Tensor], ...] = ()
+    modes: tuple[tuple[float, float], ...] = ()
 
     @classmethod
     def of(cls, scene: Scene, recording: Tensor, simulation: Tensor) -> Case:
@@ -121,9 +124,14 @@ class Case:
 
     @cached_property
     def lineless(self) -> Tensor:
-        """Likewise, and without the lines that the simulation has."""
+        """Likewise without the lines that the simulation has, and of a steady level.
+
+        Where a part of the record has nearly all power, neighbouring bins hold the same noise: by chance they bulge.
+        """
         lines = simulated_lines(self.simulated)
-        return whitened(without_lines(self.recording, lines), self.base) if lines else self.white
+        if not lines and not self.recorded.loud:
+            return self.white
+        return whitened(self.recorded.steadied(without_lines(self.recorded.signal, lines))[0], self.base)
 
     @property
     def block(self) -> int:

@@ -28,6 +28,7 @@ from gyrofuse.mismatch.remembered import remembered
 BLOCKS = 512
 _FEWEST_CYCLES = 1.0  # of a tone in a block
 _TONES = 3
+_FLANK = 4.0  # half widths, and bins, on either side of a mode that seem to be lines
 _SURE = 5.0  # nats that a sensor gains from the slip of others, from which it is its own as well
 _CLEARER = 10.0  # times the evidence of any sensor that a channel needs to be the reference
 _CYCLES, _FINER = 4, 32  # slip over the record that is looked for, and steps of a cycle
@@ -110,12 +111,17 @@ def strongest_slip(case: Case) -> Slip | None:
     """The most likely slip of any tone that the recording shares with the simulation."""
     block = case.n_samples // BLOCKS
     lines = simulated_lines(case.simulated)
-    tones = [f for f in lines if f * block >= _FEWEST_CYCLES][:_TONES]
+    tones = [f for f in lines if f * block >= _FEWEST_CYCLES and not _rings(case, f)][:_TONES]
     if not tones:
         return None
     slips = [slip for f in tones for slip in _of_tone(case, f, tuple(other for other in lines if other != f))]
     best = max(slips, key=lambda slip: slip.log_ratio, default=None)
     return None if best is None else replace(best, log_ratio=best.log_ratio - math.log(2 * len(tones)))
+
+
+def _rings(case: Case, f: float) -> bool:
+    """Whether a line of the simulation is noise of a mode that was found: its phase tells no time."""
+    return any(abs(f - centre) < _FLANK * (width + 1 / case.n_samples) for centre, width in case.modes)
 
 
 def demodulated(signal: Tensor, f: float) -> Tensor:

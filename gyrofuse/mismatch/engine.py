@@ -29,6 +29,7 @@ from gyrofuse.mismatch.own_effects import with_own_effects
 from gyrofuse.mismatch.remainder import ASKED_FOR_BY, Remainder
 from gyrofuse.mismatch.repaired import RepairedModel
 from gyrofuse.mismatch.report import MismatchReport
+from gyrofuse.mismatch.slow_remainder import SLOW_ASKED_FOR_BY, SlowRemainder
 from gyrofuse.mismatch.testimony import WITNESSES, combined, testimony
 from gyrofuse.mismatch.twins import FEWEST, twin_p_values
 from gyrofuse.recording import Recording
@@ -153,6 +154,13 @@ def diagnose(
         if isinstance(finding.effect, UnitScale):
             own = tuple(e.in_unit(finding.effect.factor) if isinstance(e, Quantization) else e for e in own)
     effects = (*own, *(f.effect for f in findings))
+    asking = [e.p_value for e in left if e.witness in SLOW_ASKED_FOR_BY]
+    if asking:
+        course = SlowRemainder.of(case).but_for(hidden)
+        gain = held_out_gain(case, course)
+        if gain.confirms(min(asking)) and not leads_away(start, case, gain, generator):
+            case, effects = course.explained(case, generator), (*effects, course)
+            gains.append(gain)
     asking = [e.p_value for e in left if e.witness in ASKED_FOR_BY]
     if asking:
         remainder = Remainder.of(case).but_for(hidden)

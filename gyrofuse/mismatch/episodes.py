@@ -15,6 +15,8 @@ _SHORTEST_BLOCK = 16
 _ROUNDS = 4
 _LOUDER = 3.0  # factor to start from, where no stretch is
 _CUT = 25.0  # squares: an outlier is no episode
+_TELL_A_LEVEL = 64  # samples of a stretch: fewer may all be outliers
+_MEDIAN = 0.4549364231195724  # of the square of a standard normal variable
 _CERTAIN, _BEYOND_DOUBT = 2.5, 3.5  # sd of the log of a factor
 _PRIOR = 0.5  # sd of the log of a factor beforehand
 _GRID, _REFINEMENTS = 160, 3  # starts and stops that are looked at at once, and how often more finely
@@ -88,7 +90,7 @@ def _of_the_concerned(white: Tensor, found: Episodes, reference: Reference | Non
     `k mean(d)^2` largest.
     """
     inside = found.inside(white.shape[-1])
-    log_factor, sd = log_factors(white.square().clamp(max=_CUT), inside, reference)
+    log_factor, sd = log_factors(_without_outliers(white, inside), inside, reference)
     typical, most = 0.0, 0.0
     for sign in (1.0, -1.0):
         mean = (sign * log_factor).sort(descending=True).values.cumsum(0) / torch.arange(1, len(log_factor) + 1)
@@ -97,6 +99,20 @@ def _of_the_concerned(white: Tensor, found: Episodes, reference: Reference | Non
             most, typical = float(told.max()), sign * float(mean[told.argmax()])
     concerned = ((2 * log_factor - typical) * typical > 0) | (log_factor.abs() > _BEYOND_DOUBT * sd)
     return torch.where(concerned, log_factor.exp(), 1.0)
+
+
+def _without_outliers(white: Tensor, inside: Tensor) -> Tensor:
+    """Squares of whitened samples `(sensor, time)`, none larger than an outlier's of the level that is there.
+
+    Of noise that is many times as loud all samples are beyond what the rest of the record calls an outlier.
+    """
+    squares = white.square()
+    limit = torch.full_like(squares, _CUT)
+    for part in (inside, ~inside):
+        if int(part.sum()) >= _TELL_A_LEVEL:
+            level = squares[:, part].median(-1, keepdim=True).values / _MEDIAN
+            limit[:, part] = _CUT * level.clamp(min=1.0)
+    return squares.minimum(limit)
 
 
 def log_factors(squares: Tensor, inside: Tensor, reference: Reference | None) -> tuple[Tensor, float]:
@@ -171,8 +187,9 @@ def told_of_first(white: Tensor, episodes: tuple[Episode, ...], reference: Refer
     """
     end = white.shape[-1]
     others = Episodes(episodes[1:], torch.ones(0)).inside(end)
-    squares = torch.where(others, 0.0, white.square().clamp(max=_CUT))
-    energy, worth = _known(white.square().clamp(max=_CUT), reference)
+    cut = _without_outliers(white, Episodes(episodes, torch.ones(0)).inside(end))
+    squares = torch.where(others, 0.0, cut)
+    energy, worth = _known(cut, reference)
     total = torch.nn.functional.pad(squares.cumsum(-1), (1, 0))
     whole = (total[:, -1] + energy)[:, None, None]
     n_samples = int((~others).sum())

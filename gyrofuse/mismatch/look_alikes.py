@@ -32,7 +32,7 @@ from gyrofuse.mismatch.oscillating import Mode
 from gyrofuse.mismatch.shape_terms import Common, Flicker, LowPass, Shift, Term
 from gyrofuse.mismatch.shapes import compared
 from gyrofuse.mismatch.slow_effect import SlowEffect
-from gyrofuse.mismatch.slow_scans import slow_look, steps_one_by_one
+from gyrofuse.mismatch.slow_scans import MOST_STEPS, slow_look, steps_one_by_one
 from gyrofuse.mismatch.spectral_choice import best_start, filter_starts
 
 _ANY = 1.0  # p value: look-alikes need not be surprising
@@ -42,7 +42,6 @@ _ROUNDS = 8
 _NUMBER = 2.0  # nats for each number of a sensor
 _RED = (ParameterShift, FlickerNoise, CommonMode)
 _MAY_BE, _AS_MUCH = 0.1, 5.0  # p value, and nats below
-_MOST_STEPS = 12
 _SIZES = -3, 6, 200  # of a random walk: decades of its variance, and how many are tried
 
 
@@ -104,7 +103,7 @@ def _of_steps(case: Case, finding: Finding) -> float:
     """Nats of several steps in a finding's sensors, less what their places and sizes gain by chance."""
     score, gram = (products[list(finding.sensors)] for products in slow_look(case).of_steps)
     cost = math.log(score.shape[-1]) + len(score)
-    _, _, told = steps_one_by_one(score, gram, 2 * cost, _MOST_STEPS)
+    _, _, told = steps_one_by_one(score, gram, 2 * cost, MOST_STEPS)
     return sum(told) / 2 - cost * len(told)
 
 

@@ -150,11 +150,13 @@ def _seen(bump: Oscillation) -> tuple[Tensor, int]:
 def _in_band(case: Case, bump: Oscillation) -> tuple[Tensor, float]:
     """Sensors summed in phase, in a band whose middle is the centre, and the power that noise alone has there.
 
-    Complex samples `(time,)`, one for each bin of the band.
+    Complex samples `(time,)`, one for each bin of the band; none at the ends of the spectrum.
     """
     n = case.n_samples
     centre, reach = round(bump.centre * n), max(round(_BAND * bump.width * n), 2 * _PARTS)
     reach = min(reach, centre - 1, n // 2 - centre)
+    if reach < 1:
+        return torch.zeros(0, dtype=torch.complex128), 0.0
     strength = bump.variance.clamp(min=0).sqrt().to(torch.complex128) if bump.gain is None else bump.gain
     noise = case.base.spectrum(torch.tensor([bump.centre], dtype=torch.float64))[:, 0]
     weights = strength.conj() / noise

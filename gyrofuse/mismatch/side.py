@@ -79,7 +79,10 @@ class Side:
     @cached_property
     def steady(self) -> Tensor:
         """The noise as it would be without episodes that it is known to have."""
-        noise = self.noise
+        return self.steadied(self.noise)
+
+    def steadied(self, noise: Tensor) -> Tensor:
+        """Noise `(record, sensor, time)` of this side, without episodes that it is known to have."""
         for episodes in reversed(self.loud):
             noise = episodes.taken_off(noise)
         return noise

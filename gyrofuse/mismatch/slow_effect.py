@@ -130,11 +130,13 @@ class Strong(NamedTuple):
         look: What it is part of.
         scan: It.
         alternatives: Mechanisms that fit as well.
+        log_factors: Of the slow noise beside it, with what else is there, `(sensor, part)`: for weights.
     """
 
     look: SlowLook
     scan: Scan
     alternatives: tuple[str, ...]
+    log_factors: Tensor
 
 
 def strong_scan(case: Case, name: str, level: float) -> Strong | None:
@@ -145,16 +147,24 @@ def strong_scan(case: Case, name: str, level: float) -> Strong | None:
     """
     look = slow_look(case)
     scan = look.scan(name)
-    if scan is None or scan.p_value > min(level, _STRONG):
+    if scan is None:
         return None
     rivals = {other.family.name: other.gain for other in look.scans if other is not scan}
     rivals["parameter_shift"] = look.wandering
-    if any(gain > scan.gain + _TOO_CLOSE for gain in rivals.values()):
-        return None
-    relay = strongest_relay(case)
+    relay, strong = strongest_relay(case), Strong(look, scan, (), log_factors(scan))
     if relay is not None and relay.gain_beside(scan.relation) > scan.gain - _TOO_CLOSE:
         return None
-    return Strong(look, scan, tuple(rival for rival, gain in rivals.items() if gain > scan.gain - _TOO_CLOSE))
+    several = look.several_steps if name == "step" else None
+    if several is not None and several.gain > max(rivals.values()) + _TOO_CLOSE:
+        # Each is lost among the others, as in a walk: beside them it is the step that it is.
+        first = several.first.scan(name)
+        assert first is not None
+        strong = strong._replace(look=several.first, scan=first)
+    elif any(gain > scan.gain + _TOO_CLOSE for gain in rivals.values()):
+        return None
+    else:
+        strong = strong._replace(alternatives=tuple(r for r, gain in rivals.items() if gain > scan.gain - _TOO_CLOSE))
+    return strong if strong.scan.p_value <= min(level, _STRONG) else None
 
 
 def log_factors(scan: Scan) -> Tensor:

@@ -48,6 +48,7 @@ _SEEN = 0.02  # chance that a sensor seems to have a template, of those that are
 _JUMP = 5.0  # standard deviations
 _FEWEST_JUMPS, _MOST_JUMPS = 4, 10
 _TWO_LEVELS = 1.6  # distance of the outermost levels, in jumps
+MOST_STEPS = 12  # one by one: what takes more is another path
 _TWINS = 256
 _FINE = ("warm_up_transient", "temperature_drift")  # families that have places between any two
 PLAUSIBLE = 6.0  # nats below the best place
@@ -117,6 +118,18 @@ class Scan:
         return float(surprise(self.z, self.lengths, relation, self.looks)[0])
 
 
+class SeveralSteps(NamedTuple):
+    """Steps in place of any other effect.
+
+    Attributes:
+        gain: Of all, nats, less what their places and sizes gain by chance.
+        first: A look at the one that tells most, without the others.
+    """
+
+    gain: float
+    first: SlowLook
+
+
 @dataclass(frozen=True, eq=False)
 class SlowLook:
     """All that scans need of a case; what is derived is computed once."""
@@ -159,6 +172,32 @@ class SlowLook:
         free = best_fit(replace(self.noise, spread=spread), self.y, start=self.null.log_factors)
         before, after = (float((self.y.square() / v + v.log()).sum()) / 2 for v in (self.null.variance, free.variance))
         return before - after - len(self.y)
+
+    @cached_property
+    def several_steps(self) -> SeveralSteps | None:
+        """Steps that together leave nothing but noise; None where there is one at most.
+
+        Nor where they go on and on: a path that wanders, or bends, may be cut into ever more of them.
+        """
+        n_sensors, n_edges = self.of_steps[0].shape
+        cost = math.log(n_edges) + n_sensors
+        at, sizes, told = steps_one_by_one(*self.of_steps, 2 * cost, MOST_STEPS)
+        if not told or len(told) == MOST_STEPS:
+            return None
+        # One within a block seems to be two at both ends of it.
+        others = [k for k, place in enumerate(at) if abs(place - at[0]) > 1]
+        if not others:
+            return None
+        paths = edges()
+        fit = best_fit(self.noise, self.y, paths[at], self.null.log_factors)
+        left = self.y - fit.size @ paths[at]
+        before, after = (
+            float((y.square() / v + v.log()).sum()) / 2 for y, v in ((self.y, self.null.variance), (left, fit.variance))
+        )
+        gain = before - after - cost * len(at)
+        alone = self.y - sizes[:, others] @ paths[torch.tensor(at)[others]]
+        families = tuple(family for family in self.families if family.name == "step")
+        return SeveralSteps(gain, replace(self, y=alone, null=best_fit(self.noise, alone), families=families))
 
     def _scan(self, family: Family) -> Scan:
         heard = self._heard(family)

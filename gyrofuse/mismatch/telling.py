@@ -10,6 +10,7 @@ from gyrofuse.mismatch.benefit import Benefit
 from gyrofuse.mismatch.mechanism import Finding
 from gyrofuse.mismatch.outcome import Outcome
 from gyrofuse.mismatch.remainder import Remainder
+from gyrofuse.mismatch.slow_remainder import SlowRemainder
 
 ALIKE = 0.01  # relative change of a variance that is not worth a word
 
@@ -67,6 +68,8 @@ def verdict(outcome: Outcome) -> list[str]:
             "So that the repaired simulation has the recording's spectra all the same, the noise of each sensor passes "
             "a filter that stands for no physics."
         )
+    if any(isinstance(effect, SlowRemainder) for effect in outcome.model.effects):
+        sentences.append("A slow course that is left in this recording is taken off it; it stands for no physics.")
     judged = [f"{words}." for words in judged_words(outcome)]
     return [*sentences, *outcome.notes, *judged, *fused_words(outcome)]
 

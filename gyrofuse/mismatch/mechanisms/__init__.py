@@ -34,6 +34,7 @@ from gyrofuse.mismatch.mechanisms.variance_change import VarianceChange
 from gyrofuse.mismatch.mechanisms.vibration_tone import VibrationTone
 from gyrofuse.mismatch.mechanisms.warm_up_transient import WarmUpTransient
 from gyrofuse.mismatch.remainder import Remainder
+from gyrofuse.mismatch.slow_remainder import SlowRemainder
 
 STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (UnitScale,),
@@ -50,5 +51,5 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
 )
 
 # Every mechanism that a repaired simulation may have: a dead band is looked for where no lattice is found, the
-# remainder once nothing with a name is left.
-CATALOGUE: tuple[type[Mechanism], ...] = (*itertools.chain(*STAGES), DeadBand, Remainder)
+# remainders once nothing with a name is left.
+CATALOGUE: tuple[type[Mechanism], ...] = (*itertools.chain(*STAGES), DeadBand, Remainder, SlowRemainder)

@@ -46,6 +46,10 @@ class Resonance(Addition):
             factor=1.0,
         )
 
+    def built_into(self, case: Case, generator: torch.Generator) -> Case:
+        built = super().built_into(case, generator)
+        return replace(built, modes=(*built.modes, (self.mode.centre, self.mode.width)))
+
     def density(self, f: Tensor) -> Tensor:
         return self.mode.matrix() * self.mode.profile(f, 2 * float(f[1] - f[0]))[:, None, None]
 

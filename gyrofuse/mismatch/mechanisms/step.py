@@ -55,7 +55,7 @@ class Step(SlowEffect):
         found = estimate(look, scan, finer=False)
         size = found.size[:, 0]
         onset = place(onset_samples(case, look, scan, size), case.scene.rate)
-        effect = cls(only(size, concerned(scan)), log_factors(scan), onset.value)
+        effect = cls(only(size, concerned(scan)), strong.log_factors, onset.value)
         words = f"steps at {onset.value:.6g} s"
         return slow_finding(case, strong, effect, found, words, {"onset": onset}, time_s=onset.value)
 
