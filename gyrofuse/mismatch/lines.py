@@ -41,7 +41,7 @@ _FEWEST_CYCLES = 10.0
 _CANDIDATES = 64
 _ALL_SETS = 8  # sensors up to which all sets of them are tried
 _LINE_IN_SIMULATION = 1e-3  # p value
-_RECORDS, _STEADY = 4, 0.3  # records that tell, and variance of a power over its mean's square: of noise one
+_RECORDS, _STEADY = 4, 0.45  # records that tell, and usual power over the largest: a third at most of four of noise
 
 
 @dataclass(frozen=True)
@@ -125,12 +125,13 @@ def simulated_lines(side: Side) -> tuple[float, ...]:
 
 
 def _steady(side: Side, lines: tuple[float, ...]) -> tuple[float, ...]:
-    """Those of the same power in every record: that of a peak of noise, which a model may have, is exponential."""
+    """Those that every record has: the power of a peak of noise, which a model may have, is exponential."""
     if not side.gaussian or len(side.noise) < _RECORDS or not lines:
         return lines
     density = side.base.spectrum(torch.tensor(lines, dtype=torch.float64))  # (sensor, line)
-    power = (amplitudes(side.noise, lines).square() / density).sum(1)  # (record, line)
-    steady = power.var(0) < _STEADY * power.mean(0).square()
+    power = amplitudes(side.noise, lines).square() / density * (side.noise.shape[-1] / 4)  # of noise one on average
+    excess = (power - 1).sum(1)  # (record, line)
+    steady = excess.median(0).values > _STEADY * excess.amax(0)
     return tuple(f for f, yes in zip(lines, steady.tolist(), strict=True) if yes)
 
 
