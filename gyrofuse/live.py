@@ -160,8 +160,8 @@ class LiveSVO(nn.Module):
         batch = self._start(signal)
         n_items, n_sensors, n_samples = batch.numel(), *signal.shape[-2:]
         shape = (*batch, n_sensors)
-        combined = self.combined.expand(*shape, n_sensors).reshape(n_items, n_sensors, n_sensors)
-        gain = (1 / self.time_constant).expand(batch).reshape(n_items, 1)
+        combined = self.combined.double().expand(*shape, n_sensors).reshape(n_items, n_sensors, n_sensors)
+        gain = (1 / self.time_constant.double()).expand(batch).reshape(n_items, 1)
         limit = self.full_scale.expand(shape).reshape(n_items, n_sensors, 1)
         items = signal.reshape(n_items, n_sensors, n_samples)
         state = _State(*(getattr(self, name).reshape(n_items, -1) for name in _STATE))

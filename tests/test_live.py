@@ -309,6 +309,11 @@ def test_float32_under_a_large_offset():
     torch.testing.assert_close(single.double(), exact, rtol=0, atol=1e-4, equal_nan=True)
 
 
+def test_a_module_made_float32_fuses_as_before():
+    signal = array().float()
+    torch.testing.assert_close(LiveSVO(fitted()).float()(signal), LiveSVO(fitted())(signal), rtol=0, atol=1e-5)
+
+
 def test_gradients_reach_the_signal():
     signal = array(64).requires_grad_()
     live = LiveSVO(fitted(), time_constant=30)

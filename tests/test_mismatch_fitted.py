@@ -15,6 +15,7 @@ from gyrofuse._estimation import EstimatedFrom
 from gyrofuse.mismatch.fit_verdict import fit_verdict
 from gyrofuse.mismatch.inputs import modelled, prepared
 from gyrofuse.mismatch.line_sizes import line_sizes
+from gyrofuse.mismatch.noise_level import compared_levels
 from gyrofuse.mismatch.pooled import common_witness
 from gyrofuse.mismatch.shape_bands import narrow
 from gyrofuse.mismatch.shape_errors import estimation_errors, parameters_p_value
@@ -183,6 +184,13 @@ def test_a_model_fitted_to_the_recording_itself_is_held_against_no_more():
         given = case(x, gf.fit_gmwm(x, FORMULA))
         assert shape_witness(given).p_value > 0.05
         assert spectrum_witness(given).p_value > spectrum_witness(as_if_known(given)).p_value * 0.999
+
+
+def test_the_level_of_a_model_is_known_as_well_as_from_the_record_it_was_fitted_to():
+    recording = record(LONG, 7, 2)
+    given = case(recording, WALKING.with_params(WALKING.params * 1.0), SHORT)
+    assert compared_levels(given).reference.worth == SHORT
+    assert compared_levels(case(recording, WALKING)).reference.worth == LONG * len(given.simulated.signal)
 
 
 def test_what_an_array_was_found_to_share_is_as_uncertain_as_its_fit():

@@ -204,7 +204,10 @@ def _reference(case: Case) -> Reference | None:
         return None
     ratio = _log_power(simulated.power, simulated.dof) - _log_power(recorded.power, recorded.dof)
     level = (torch.where(both, ratio, 0.0) @ worth / worth.sum()).exp()
-    return Reference(level, simulated.n_records * simulated.signal.shape[-1])
+    known = simulated.n_records * simulated.signal.shape[-1]
+    if simulated.uncertainty is not None:  # a model's level is known as well as from the record it was fitted to
+        known = min(known, simulated.uncertainty.n_samples)
+    return Reference(level, known)
 
 
 def _log_power(power: Tensor, dof: Tensor) -> Tensor:
