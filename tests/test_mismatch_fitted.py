@@ -186,6 +186,18 @@ def test_a_model_fitted_to_the_recording_itself_is_held_against_no_more():
         assert spectrum_witness(given).p_value > spectrum_witness(as_if_known(given)).p_value * 0.999
 
 
+def test_power_that_a_fit_hardly_tells_may_be_missing():
+    # An AR1 at half the rate, as fits have where nothing tells of one: the recording has a tenth of the power there.
+    model = gf.parse_model("WN(variance=1.0) + AR1(phi=-0.995, variance=1e-3)")
+    cov = torch.diag(torch.tensor([1e-2, 1e3, 1e-2], dtype=torch.float64))
+    recording = gf.parse_model("WN(variance=1.0)").simulate(
+        LONG, batch=(2,), generator=torch.Generator().manual_seed(3)
+    )
+    unsure = case(recording, gf.Model([model], estimated_from=EstimatedFrom(LONG, cov)))
+    assert spectrum_witness(unsure).p_value > 0.01
+    assert spectrum_witness(as_if_known(unsure)).p_value < 1e-6
+
+
 def test_the_level_of_a_model_is_known_as_well_as_from_the_record_it_was_fitted_to():
     recording = record(LONG, 7, 2)
     given = case(recording, WALKING.with_params(WALKING.params * 1.0), SHORT)

@@ -15,6 +15,7 @@ from gyrofuse.mismatch.line_sizes import LineSizes, line_sizes
 
 _COHERENCE_DOF = 80  # below, sums over pairs have no simple law
 _TAIL = 10.0
+_VAGUE = 20.0  # ordinates: a power known from fewer is off by more than a quarter
 
 
 def spectrum_witness(case: Case) -> Evidence:
@@ -121,12 +122,21 @@ def whitened_difference(one: Tensor, other: Tensor, d: Tensor, s: Tensor) -> Ten
 
 
 def power_tails(case: Case) -> Tensor:
-    """Two-sided p values of the ratio of powers `(sensor, band)`; NaN where the simulation says nothing."""
+    """Two-sided p values of the ratio of powers `(sensor, band)`; NaN where the simulation says nothing.
+
+    Powers that are known to hardly their order of magnitude are as likely above as below, which those of few degrees
+    of freedom are not: there the logarithm is normal.
+    """
     ratio = case.recorded.power / case.simulated.power
-    d, simulated = 2 * case.bands.dof, 2 * case.simulated.power_dof
-    law = stats.f(d.numpy(), simulated.clamp(min=1e-9).numpy())
+    d, s = case.bands.dof, case.simulated.power_dof
+    law = stats.f(2 * d.numpy(), 2 * s.clamp(min=1e-9).numpy())
     tails = 2 * torch.from_numpy(law.sf(ratio.numpy())).minimum(torch.from_numpy(law.cdf(ratio.numpy())))
-    return tails.clamp(max=1.0).masked_fill(simulated <= 0, math.nan)
+    varies = torch.special.polygamma(1, d.clamp(min=1e-9)) + 1 / s.clamp(min=1e-9)
+    away = ratio.clamp(min=1e-300).log() - torch.digamma(d.clamp(min=1e-9)) + d.clamp(min=1e-9).log()
+    normal = 2 * torch.special.ndtr(-away.abs() / varies.sqrt())
+    vague = (s < _VAGUE) & (s < case.simulated.dof / 2)
+    tails = torch.where(vague, normal.maximum(tails), tails)
+    return tails.clamp(max=1.0).masked_fill(s <= 0, math.nan)
 
 
 def level_of(frequency: float) -> int:
