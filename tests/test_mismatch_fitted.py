@@ -189,7 +189,7 @@ def test_a_model_fitted_to_the_recording_itself_is_held_against_no_more():
 def test_power_that_a_fit_hardly_tells_may_be_missing():
     # An AR1 at half the rate, as fits have where nothing tells of one: the recording has a tenth of the power there.
     model = gf.parse_model("WN(variance=1.0) + AR1(phi=-0.995, variance=1e-3)")
-    cov = torch.diag(torch.tensor([1e-2, 1e3, 1e-2], dtype=torch.float64))
+    cov = torch.diag(torch.tensor([1e-2, 1e4, 1e2], dtype=torch.float64))
     recording = gf.parse_model("WN(variance=1.0)").simulate(
         LONG, batch=(2,), generator=torch.Generator().manual_seed(3)
     )
