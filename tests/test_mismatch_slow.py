@@ -468,6 +468,16 @@ def test_a_stationary_telegraph_is_no_step():
     assert Step.nominate(case(effect), LEVEL) is None
 
 
+def test_a_loud_source_of_all_sensors_is_no_step():
+    # Where they differ is a hundred-thousandth of it, and falls off otherwise.
+    gains = torch.tensor([1.0, -0.8, 1.3, 0.9], dtype=torch.float64)[:, None]
+    for seed in (21, 22, 23):
+        source = gf.AR1(0.97, 1.0).simulate(N, generator=generator(seed))
+        scan = slow_look(case(300 * gains * source)).scan("step")
+        assert scan.p_value > 1e-3
+        assert scan.gain < 20
+
+
 def test_block_means_of_the_effect_are_gone():
     now = case(SIZE[:, None] * (T >= 9000).double() * 4)
     finding = best(now)

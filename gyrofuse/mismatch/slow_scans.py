@@ -45,6 +45,7 @@ _LOW = 48  # ordinates in which sensors are compared
 _SCANS = 2  # the second with the covariance that the first effect leaves
 _FREE = 5.0  # sd of log factors that nothing is known of
 _SEEN = 0.02  # chance that a sensor seems to have a template, of those that are taken for sure to begin with
+_FAR_ABOVE = 10.0  # times the simulation's variance
 _JUMP = 5.0  # standard deviations
 _FEWEST_JUMPS, _MOST_JUMPS = 4, 10
 _TWO_LEVELS = 1.6  # distance of the outermost levels, in jumps
@@ -226,7 +227,7 @@ class SlowLook:
             family = between(family, likely, best)
         family = family.at(*(torch.cat([p, b]) for p, b in zip(family.where, best, strict=True)))
         last = torch.tensor(len(family.places) - 1)
-        return family, _judged(self.y, self.null, family, last, fit, found.lengths, heard, looks)
+        return family, _judged(self.y, self.noise.own, self.null, family, last, fit, found.lengths, heard, looks)
 
     def _heard(self, family: Family) -> Tensor:
         """Sensors that count: 0 for steps in those that jump to and fro, which is another mechanism."""
@@ -272,7 +273,7 @@ def best_place(noise: SlowNoise, y: Tensor, null: Fit, family: Family, heard: Te
         heard: 1 for sensors that count, else 0, `(sensor,)`.
     """
     best: Best | None = None
-    fit, relation, designs, looks = null, related(y, null.variance), family.designs, len(family.places)
+    fit, relation, designs, looks = null, related(y, null.variance, noise.own), family.designs, len(family.places)
     lengths = y.new_full(y.shape[:-1], math.inf)
     for _ in range(_SCANS):
         z = columns(y, fit.variance, designs)
@@ -280,7 +281,7 @@ def best_place(noise: SlowNoise, y: Tensor, null: Fit, family: Family, heard: Te
             lengths = curve_length(fit.variance, family.templates, scores(y, fit.variance, family.templates)[1])
         at = most_extreme(z * heard[:, None, None], lengths, relation)
         fit = best_fit(noise, y, designs[at], null.log_factors)
-        now = _judged(y, null, family, at, fit, lengths, heard, looks)
+        now = _judged(y, noise.own, null, family, at, fit, lengths, heard, looks)
         relation = now.relation
         best = now if best is None else where(now.p_value < best.p_value, now, best)
     assert best is not None
@@ -288,12 +289,12 @@ def best_place(noise: SlowNoise, y: Tensor, null: Fit, family: Family, heard: Te
 
 
 def _judged(
-    y: Tensor, null: Fit, family: Family, at: Tensor, fit: Fit, lengths: Tensor, heard: Tensor, looks: int
+    y: Tensor, own: Tensor, null: Fit, family: Family, at: Tensor, fit: Fit, lengths: Tensor, heard: Tensor, looks: int
 ) -> Best:
     """A template with the noise that it leaves, one of so many `looks` along a curve; see `best_place`."""
     x = family.designs[at]
     left = y - fit.size @ x
-    relation = related(left, fit.variance)
+    relation = related(left, fit.variance, own)
     root, score = normal_equations(y, fit.variance, x)
     held = torch.linalg.solve_triangular(root, score[..., None], upper=False)[..., 0] * heard[:, None]
     # The noise that fits best without the effect may be stronger in all sensors: that leaves less of it.
@@ -387,8 +388,12 @@ def jumps_to_and_fro(score: Tensor, gram: Tensor) -> bool:
     return bool(levels.amax() - levels.amin() < _TWO_LEVELS * jumps.abs().median())
 
 
-def related(left: Tensor, variance: Tensor) -> Tensor:
-    """Correlation of the sensors' slow noise `(..., sensor, sensor)`, shrunk towards none by as much as is chance."""
+def related(left: Tensor, variance: Tensor, own: Tensor) -> Tensor:
+    """Correlation of the sensors' slow noise `(..., sensor, sensor)`, shrunk towards none by as much as is chance.
+
+    Noise far above the simulation's `own` variance is another one, which sensors may share almost wholly: how little of
+    it they do not share falls off in its own way, so that no ordinate tells it for another.
+    """
     low = (left / variance.sqrt())[..., :_LOW]
     c = low @ low.mT
     size = c.diagonal(dim1=-1, dim2=-2).sqrt()
@@ -397,7 +402,12 @@ def related(left: Tensor, variance: Tensor) -> Tensor:
     squares = c[..., upper[0], upper[1]].square()
     by_chance = (1 - squares).square().sum(-1) / _LOW
     share = (by_chance / squares.sum(-1).clamp(min=1e-300)).clamp(max=1)[..., None, None]
-    return (1 - share) * c + share * torch.eye(c.shape[-1], dtype=c.dtype)
+    c = (1 - share) * c + share * torch.eye(c.shape[-1], dtype=c.dtype)
+    louder = (variance / own)[..., :_LOW].log().mean((-1, -2)).exp()[..., None]
+    if bool((louder <= _FAR_ABOVE).all()):
+        return c
+    values, vectors = torch.linalg.eigh(c)
+    return (vectors * values.maximum(1 - _FAR_ABOVE / louder)[..., None, :]) @ vectors.mT
 
 
 def likeliest(noise: SlowNoise, y: Tensor, family: Family, start: int, fit: Fit) -> tuple[list[Tensor], Fit]:
