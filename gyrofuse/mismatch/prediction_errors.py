@@ -33,6 +33,7 @@ _FLOOR = 1e-4  # of the median power: what is 40 dB below half of the ordinates 
 MOST_RECORDS = 2  # of the simulation: as honest as more
 _MAD = 0.6744897501960817
 _FEW, _COARSE = 4096, 0.3  # samples that show a lattice, and its step in sd of the noise, from which it matters
+_MOST_GRAIN = 0.7  # sd: of what hardly leaves a step the few that do are still told from the others
 _TUNING, _STEPS = 1.5, 20
 
 
@@ -84,7 +85,7 @@ def left_out(side: Side) -> LeftOut:
     stepped = step > _COARSE
     z, white = (values / side.level**0.5 for values in (error, white))
     sd = _sd(z, stepped)
-    grain = torch.where(stepped, step / math.sqrt(12), 0.0)
+    grain = torch.where(stepped, (step / math.sqrt(12)).clamp(max=_MOST_GRAIN), 0.0)
     return LeftOut(error, sd, z / sd[..., None], white / _sd(white, stepped)[..., None], at_ends, grain)
 
 
