@@ -300,7 +300,6 @@ class Diagnose:
         rows = []
         for axis in recording.axes or (None,):
             whole = (recording if axis is None else recording.select(axis=axis)).longest_whole()
-            whole = replace(whole, signal=whole.signal.cpu())  # where its tests run
             found = diagnose(whole, self.simulation, false_alarm=self.false_alarm)
             rows.append(
                 {

@@ -26,10 +26,10 @@ from gyrofuse.mismatch.mechanisms.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.unit_scale import UnitScale
 from gyrofuse.mismatch.noise_model import noise_of, noise_samples
 from gyrofuse.mismatch.own_effects import with_own_effects
-from gyrofuse.mismatch.remainder import ASKED_FOR_BY, Remainder
+from gyrofuse.mismatch.remainder import Remainder
 from gyrofuse.mismatch.repaired import RepairedModel
 from gyrofuse.mismatch.report import MismatchReport
-from gyrofuse.mismatch.slow_remainder import SLOW_ASKED_FOR_BY, SlowRemainder
+from gyrofuse.mismatch.slow_remainder import SlowRemainder
 from gyrofuse.mismatch.testimony import WITNESSES, combined, testimony
 from gyrofuse.mismatch.twins import FEWEST, twin_p_values
 from gyrofuse.recording import Recording
@@ -154,16 +154,11 @@ def diagnose(
         if isinstance(finding.effect, UnitScale):
             own = tuple(e.in_unit(finding.effect.factor) if isinstance(e, Quantization) else e for e in own)
     effects = (*own, *(f.effect for f in findings))
-    asking = [e.p_value for e in left if e.witness in SLOW_ASKED_FOR_BY]
-    if asking:
-        course = SlowRemainder.of(case).but_for(hidden)
-        gain = held_out_gain(case, course)
-        if gain.confirms(min(asking)) and not leads_away(start, case, gain, generator):
-            case, effects = course.explained(case, generator), (*effects, course)
-            gains.append(gain)
-    asking = [e.p_value for e in left if e.witness in ASKED_FOR_BY]
-    if asking:
-        remainder = Remainder.of(case).but_for(hidden)
+    for unnamed in (SlowRemainder, Remainder):
+        asking = [e.p_value for e in left if e.witness in unnamed.asked_for_by]
+        if not asking:
+            continue
+        remainder = unnamed.of(case).but_for(hidden)
         gain = held_out_gain(case, remainder)
         if gain.confirms(min(asking)) and not leads_away(start, case, gain, generator):
             case, effects = remainder.explained(case, generator), (*effects, remainder)

@@ -42,17 +42,21 @@ def on_processor(given: Any) -> Any:
     """Samples or a model in the processor's memory, where a diagnosis is made; anything else as it is."""
     if isinstance(given, Tensor):
         return given.cpu()
+    parts: list[Any]
     if isinstance(given, Recording):
-        channels = {name: values.cpu() for name, values in given.channels.items()}
-        return replace(given, signal=given.signal.cpu(), time=given.time.cpu(), channels=channels)
-    if isinstance(given, Model):
-        parts: list[Any] = [value for process in given.processes for value in process.parameters.values()]
+        parts = [given.signal, given.time, *given.channels.values()]
+    elif isinstance(given, Model):
+        parts = [value for process in given.processes for value in process.parameters.values()]
     elif isinstance(given, ArrayModel):
         parts = [part for process, matrix in given.components for part in (matrix, *process.parameters.values())]
     else:
         return given
-    elsewhere = any(isinstance(part, Tensor) and part.device.type != "cpu" for part in parts)
-    return model_from_dict(given.to_dict()) if elsewhere else given
+    if not any(isinstance(part, Tensor) and part.device.type != "cpu" for part in parts):
+        return given
+    if not isinstance(given, Recording):
+        return model_from_dict(given.to_dict())
+    channels = {name: values.cpu() for name, values in given.channels.items()}
+    return replace(given, signal=given.signal.cpu(), time=given.time.cpu(), channels=channels)
 
 
 def modelled(

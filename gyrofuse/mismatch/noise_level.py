@@ -202,18 +202,12 @@ def _reference(case: Case) -> Reference | None:
     worth = recorded.dof * both
     if not bool(both.any()):
         return None
-    ratio = _log_power(simulated.power, simulated.dof) - _log_power(recorded.power, recorded.dof)
+    ratio = simulated.log_power - recorded.log_power
     level = (torch.where(both, ratio, 0.0) @ worth / worth.sum()).exp()
     known = simulated.n_records * simulated.signal.shape[-1]
     if simulated.uncertainty is not None:  # a model's level is known as well as from the record it was fitted to
         known = min(known, simulated.uncertainty.n_samples)
     return Reference(level, known)
-
-
-def _log_power(power: Tensor, dof: Tensor) -> Tensor:
-    """Unbiased logarithms of densities `(sensor, band)` that come from so many ordinates `(band,)`."""
-    dof = dof.clamp(min=1e-3)
-    return power.log() - torch.digamma(dof) + dof.log()
 
 
 def variance_p_value(case: Case) -> float:

@@ -19,8 +19,6 @@ from gyrofuse.mismatch.folds import N_JUDGED, estimation_samples
 from gyrofuse.mismatch.gaussian import Filter
 from gyrofuse.mismatch.side import Side
 
-ASKED_FOR_BY = ("spectrum", "shape", "bump")  # witnesses
-
 
 @dataclass(frozen=True, eq=False)
 class Remainder(Filter):
@@ -32,6 +30,7 @@ class Remainder(Filter):
     """
 
     name: ClassVar[str] = "remainder"
+    asked_for_by: ClassVar[tuple[str, ...]] = ("spectrum", "shape", "bump")  # witnesses
     frequency: Annotated[Tensor, Axes(("band",))]
     log_gain: Annotated[Tensor, Axes(("sensor", "band"))]
 

@@ -123,6 +123,12 @@ class Side:
         return self.dof / (1 + self.dof * varies) * (self.bands.frequency >= self.slowest_seen)
 
     @property
+    def log_power(self) -> Tensor:
+        """Unbiased logarithms of the densities, `(sensor, band)`."""
+        dof = self.dof.clamp(min=1e-3)
+        return self.power.log() - torch.digamma(dof) + dof.log()
+
+    @property
     def coherence_dof(self) -> Tensor:
         """What bands tell of coherences, `(band,)`: less of noise that is loud in all sensors at the same times.
 

@@ -147,14 +147,14 @@ def strong_scan(case: Case, name: str, level: float) -> Strong | None:
     """
     look = slow_look(case)
     scan = look.scan(name)
-    if scan is None:
+    several = look.several_steps if name == "step" else None
+    if scan is None or (several is None and scan.p_value > min(level, _STRONG)):
         return None
     rivals = {other.family.name: other.gain for other in look.scans if other is not scan}
     rivals["parameter_shift"] = look.wandering
     relay, strong = strongest_relay(case), Strong(look, scan, (), log_factors(scan))
     if relay is not None and relay.gain_beside(scan.relation) > scan.gain - _TOO_CLOSE:
         return None
-    several = look.several_steps if name == "step" else None
     if several is not None and several.gain > max(rivals.values()) + _TOO_CLOSE:
         # Each is lost among the others, as in a walk: beside them it is the step that it is.
         first = several.first.scan(name)

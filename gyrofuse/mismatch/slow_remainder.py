@@ -21,7 +21,6 @@ from gyrofuse.mismatch.slow import best_fit
 from gyrofuse.mismatch.slow_effect import SlowEffect
 from gyrofuse.mismatch.slow_scans import slow_look
 
-SLOW_ASKED_FOR_BY = ("slow", "hysteresis")  # witnesses
 _COSINES = 32  # half cycles in the record: as many as there are blocks, of which each is told by those beside it
 _SHARES = N_JUDGED // N_FOLDS
 _PLAIN = 9.0  # square of a size over its variance: what is less may be noise, and stays
@@ -38,6 +37,7 @@ class SlowRemainder(SlowEffect):
     """
 
     name: ClassVar[str] = "slow_remainder"
+    asked_for_by: ClassVar[tuple[str, ...]] = ("slow", "hysteresis")  # witnesses
     happened_once: ClassVar[bool] = True
     changes_noise: ClassVar[bool] = True  # of the lowest frequencies, where it follows what is none
     proportional_to: ClassVar[str] = ""

@@ -132,7 +132,7 @@ def power_tails(case: Case) -> Tensor:
     law = stats.f(2 * d.numpy(), 2 * s.clamp(min=1e-9).numpy())
     tails = 2 * torch.from_numpy(law.sf(ratio.numpy())).minimum(torch.from_numpy(law.cdf(ratio.numpy())))
     varies = torch.special.polygamma(1, d.clamp(min=1e-9)) + 1 / s.clamp(min=1e-9)
-    away = ratio.clamp(min=1e-300).log() - torch.digamma(d.clamp(min=1e-9)) + d.clamp(min=1e-9).log()
+    away = case.recorded.log_power - case.simulated.power.log()
     normal = 2 * torch.special.ndtr(-away.abs() / varies.sqrt())
     vague = (s < _VAGUE) & (s < case.simulated.dof / 2)
     tails = torch.where(vague, normal.maximum(tails), tails)

@@ -2,8 +2,8 @@
 
     python tests/benchmarks/on_device.py [--quick] [--only WCCV]
 
-Seconds are medians of runs taken in turn, the device waited for at both ends; "off by" is the largest difference from
-the processor's result, over the largest value of it.
+Seconds are medians of several runs, of long fits one, the device waited for at both ends; "off by" is the largest
+difference from the processor's result, over the largest value of it.
 """
 
 from __future__ import annotations
