@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from logs import made_up, write_hdf5
 
+from gyrofuse import open_long
 from gyrofuse.io import hdf5
 from gyrofuse.io.stream import RecordingError
 
@@ -115,3 +116,24 @@ def test_a_published_recording():
     )
     name = next(name for name in trials.files if name.startswith("t24") and not name.endswith("_movement"))
     np.testing.assert_allclose([stream.gyro[a] for a in "xyz"], trials[name][:3], rtol=1e-6, atol=1e-7)
+
+
+def test_a_heap_in_which_the_library_would_go_round_for_ever(tmp_path):
+    path = write_hdf5(tmp_path / "a.h5", {"gyro": made_up()[0], "sensors": list("abc")})
+    content = bytearray(path.read_bytes())
+    at = content.index(b"GCOL") + 16
+    while int.from_bytes(content[at : at + 2], "little"):  # up to the free space, whose index is 0
+        at += 16 + -(-int.from_bytes(content[at + 8 : at + 16], "little") // 8) * 8
+    assert hdf5.read(path)
+    content[at + 8 : at + 16] = bytes(8)
+    path.write_bytes(content)
+    for reader in (hdf5.read, open_long):
+        with pytest.raises(RecordingError, match=rf"a\.h5: expected .*free space of 0 bytes at byte {at}"):
+            reader(path)
+
+
+def test_numbers_that_spell_a_heap_are_no_damage(tmp_path):
+    gyro = np.zeros((3, 4000))
+    gyro[0, :2] = np.frombuffer(b"GCOL\x01\0\0\0" + (1 << 20).to_bytes(8, "little"))
+    (stream,) = hdf5.read(write_hdf5(tmp_path / "a.h5", {"gyro": gyro}))
+    np.testing.assert_array_equal(stream.gyro["x"], gyro[0])

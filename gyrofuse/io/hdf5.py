@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrofuse.io.arrays import streams_from_arrays
+from gyrofuse.io.hdf5_heaps import check_heaps
 from gyrofuse.io.limits import LONGEST_NAME, Allowance, decoded
 from gyrofuse.io.stream import RecordingError, Stream, cause
 
@@ -37,6 +38,7 @@ def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) 
     except ImportError as error:
         raise ImportError(f'{path}: reading HDF5 needs h5py; pip install "gyrofuse[logs]"') from error
     try:
+        check_heaps(path)
         with h5py.File(path, "r") as file:
             # Datasets are read when needed: a file may hold much besides gyros.
             return streams_from_arrays(_content(file, Allowance(path, max_bytes)), path, key=key)

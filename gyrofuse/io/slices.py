@@ -21,6 +21,7 @@ import numpy as np
 from gyrofuse.io.arrays import settings_by_group, stated_rate, stated_unit
 from gyrofuse.io.columns import classify_columns
 from gyrofuse.io.hdf5 import check_inside, objects, settings_of
+from gyrofuse.io.hdf5_heaps import check_heaps
 from gyrofuse.io.limits import Allowance, enumerated, is_regular
 from gyrofuse.io.npy import read_header, read_numbers, read_stretch
 from gyrofuse.io.parquet import metadata_of
@@ -140,6 +141,7 @@ def _open_hdf5(path: Path, key: str | None) -> Slices:
         import h5py
     except ImportError as error:
         raise ImportError(f'{path}: reading HDF5 needs h5py; pip install "gyrofuse[logs]"') from error
+    check_heaps(path)
     with h5py.File(path, "r") as file:
         datasets: dict[str, Any] = {}
         settings = dict(file.attrs)
