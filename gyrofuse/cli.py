@@ -23,7 +23,7 @@ import torch
 import typer
 
 from gyrofuse._checks import check_positive_integer
-from gyrofuse._console import Commands, progress, say, say_table, warn
+from gyrofuse._console import Commands, progress, say, say_table
 from gyrofuse._output import output_folder, write_npz
 from gyrofuse.cli_fleet import fleet
 from gyrofuse.cli_mismatch import diagnose
@@ -191,6 +191,11 @@ def fuse(
         )
     with outputs(force, [*logs, mounting], out=out, figure=figure, json=json_file, report=report) as drafts:
         recording = read(logs, axis, sensors, rate, unit, scale, key, mounting)
+        if recording.axes and recording.n_sensors == 1:
+            raise ValueError(
+                f"{titled(logs)}: expected several devices to fuse, found one with the axes {', '.join(recording.axes)}; "
+                "give the logs of all devices of the array"
+            )
         with progress("fusing"):
             part = at_rest(recording, resting)
             result: SVOResult | MultiScaleResult
@@ -230,9 +235,6 @@ def fuse(
                 drafts[report].write_text(page, encoding="utf-8")
         if json_file:
             write_json(drafts[json_file], result.to_dict())
-    for note in recording.notes:
-        if note.kind == "axes":
-            warn(str(note))
     say("\n".join([result.summary(), *remarks]))
     say_notes(recording)
 

@@ -215,7 +215,8 @@ def _as_the_model(recording: Recording, path: Path) -> Recording:
 
 
 def _one_axis(recording: Recording, name: str) -> Recording:
-    """The recording `(sensor, time)`."""
+    """The recording `(sensor, time)`: of one axis, or all axes of a single device."""
+    recording = recording.axes_as_sensors()
     if recording.signal.ndim == 2:
         return recording
     if len(recording.axes) == 1:

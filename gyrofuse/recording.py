@@ -127,6 +127,15 @@ class Recording:
             signal, names = signal[..., which, :], tuple(names[i] for i in which)
         return replace(self, signal=signal, axes=axes, sensors=names)
 
+    def axes_as_sensors(self) -> Recording:
+        """The axes of a single device as sensors `(axis, time)` of one array; any other recording as it is.
+
+        Each axis is judged by itself then; no virtual gyro can be made of them.
+        """
+        if not self.axes or self.n_sensors > 1:
+            return self
+        return replace(self, signal=self.signal[:, 0], sensors=self.axes, axes=())
+
     def between(self, start: float, stop: float) -> Recording:
         """Keep the stretch from `start` to `stop` seconds after the first sample: the part at rest, say.
 
@@ -262,8 +271,7 @@ def read_recording(
 ) -> Recording:
     """Read a log, or several logs of one array, onto a uniform grid.
 
-    Devices with the same axes give `(axis, sensor, time)`, or `(sensor, time)` of one `axis`. The axes of a single
-    device are its sensors, which makes sense at rest. The rate comes from the timestamps where there are any. Gaps,
+    Devices with the same axes give `(axis, sensor, time)`, or `(sensor, time)` of one `axis`. The rate comes from the timestamps where there are any. Gaps,
     repeats, jitter, wraps, offsets between devices and non-finite samples are found and noted; what is missing is
     NaN, nothing is interpolated.
 

@@ -293,8 +293,8 @@ class Diagnose:
         return digest.hexdigest()
 
     def rows(self, recordings: Sequence[Recording]) -> list[list[Row]]:
-        """Rows of each recording, one for each of its axes."""
-        return [self._rows(recording) for recording in recordings]
+        """Rows of each recording, one for each of its axes; one in all for a single device."""
+        return [self._rows(recording.axes_as_sensors()) for recording in recordings]
 
     def _rows(self, recording: Recording) -> list[Row]:
         rows = []
