@@ -14,12 +14,11 @@ import typer
 from gyrofuse._checks import check_positive, same_rate
 from gyrofuse._console import progress, say_table, warn
 from gyrofuse._output import Outputs
-from gyrofuse.io.columns import canonical_unit
 from gyrofuse.parsing import model_from_dict
 from gyrofuse.processes import Model
 from gyrofuse.recording import Recording, read_recording
 from gyrofuse.simulate import ArrayModel
-from gyrofuse.units import OTHER_UNITS, RATE_UNITS
+from gyrofuse.units import OTHER_UNITS, RATE_UNITS, canonical_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -73,7 +73,7 @@ def datasheet(model: Model, rate: float, unit: str, *, n_levels: int = _LEVELS) 
     Args:
         model: With scalar parameters.
         rate: Sampling rate, Hz.
-        unit: Rate unit of the model: deg/s, mdeg/s, deg/h or rad/s.
+        unit: Rate unit of the model: deg/s, mdeg/s, deg/h, rad/s, mrad/s or rpm, or another spelling of one.
         n_levels: Averaging times looked at, from one sample up; those of the record behind the model, which knows no
             others.
 
@@ -85,6 +85,7 @@ def datasheet(model: Model, rate: float, unit: str, *, n_levels: int = _LEVELS) 
     """
     rate = check_positive("rate", rate)
     degrees = units.rate_unit_factor(unit, "deg/s")
+    unit = units.canonical_unit(unit)
     if model.params.ndim > 1:
         raise ValueError(
             f"`model`: expected scalar parameters, got a batch of shape {tuple(model.params.shape[:-1])}; "

@@ -48,7 +48,7 @@ def to_kalibr(
     Args:
         model: Of a gyro, with scalar parameters; Kalibr takes one for all three axes.
         rate: Sampling rate, Hz.
-        unit: Rate unit of the model: deg/s, mdeg/s, deg/h or rad/s.
+        unit: Rate unit of the model: deg/s, mdeg/s, deg/h, rad/s, mrad/s or rpm, or another spelling of one.
         topic: ROS topic of the IMU's messages.
         accelerometer: Model in m/s^2 at the same rate; without it its two keys are left to be filled in.
         slow: Correlation time from which on an AR(1) counts as a random walk, s.
@@ -64,6 +64,7 @@ def to_kalibr(
     """
     rate, slow = check_positive("rate", rate), check_positive("slow", slow)
     radians = units.rate_unit_factor(unit, "rad/s")
+    unit = units.canonical_unit(unit)
     if not isinstance(topic, str) or not re.fullmatch(r"(/[A-Za-z]\w*)+", topic, re.ASCII):
         raise ValueError(f"`topic`: expected an absolute ROS topic name such as '/imu0', got {topic!r}")
     lines = [
@@ -143,13 +144,14 @@ def to_c_header(model: Model, rate: float, unit: str, name: str = "imu_noise") -
     Args:
         model: With scalar parameters.
         rate: Sampling rate, Hz.
-        unit: Rate unit of the model, which the numbers keep: deg/s, mdeg/s, deg/h or rad/s.
+        unit: Rate unit of the model, which the numbers keep: deg/s, mdeg/s, deg/h, rad/s, mrad/s or rpm.
         name: Prefix of everything defined, a C identifier.
 
     Raises:
         ValueError: A parameter is to be estimated or batched, an unknown unit, or `name` is not an identifier.
     """
     units.rate_unit_factor(unit)
+    unit = units.canonical_unit(unit)
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII) or name in _C_KEYWORDS:
         raise ValueError(f"`name`: expected a C identifier that starts with a letter, got {name!r}")
     _check_scalar("model", model)

@@ -20,7 +20,7 @@ from gyrofuse._result import listed, numbered
 from gyrofuse.io.assemble import assemble
 from gyrofuse.io.limits import is_rate
 from gyrofuse.io.notes import Note
-from gyrofuse.units import rate_unit_factor
+from gyrofuse.units import canonical_unit, rate_unit_factor
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +187,7 @@ class Recording:
         Raises:
             ValueError: Either unit is not a known unit of rate.
         """
-        return replace(self, signal=self.signal * rate_unit_factor(self.unit, unit), unit=unit)
+        return replace(self, signal=self.signal * rate_unit_factor(self.unit, unit), unit=canonical_unit(unit))
 
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write an .npz that `read_recording` reads back: `gyro`, `fs`, `unit`, `sensors`, `time` and the channels.

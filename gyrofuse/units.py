@@ -7,30 +7,104 @@ in u/sqrt(Hz), rate random walk `K` in u/s/sqrt(Hz), quantisation `Q` in u s, ra
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 SECONDS_PER_HOUR = 3600.0
 ARCSECONDS_PER_DEGREE = 3600.0
 GRAVITY = 9.80665  # m/s^2, standard
 
-_DEG_PER_S = {"deg/s": 1.0, "mdeg/s": 1e-3, "deg/h": 1 / SECONDS_PER_HOUR, "rad/s": 180 / math.pi}
+_DEG_PER_S = {
+    "deg/s": 1.0,
+    "mdeg/s": 1e-3,
+    "deg/h": 1 / SECONDS_PER_HOUR,
+    "rad/s": 180 / math.pi,
+    "mrad/s": 0.18 / math.pi,
+    "rpm": 6.0,
+}
+_M_PER_S2 = {"m/s^2": 1.0, "g": GRAVITY, "mg": 1e-3 * GRAVITY, "ug": 1e-6 * GRAVITY}
 RATE_UNITS = tuple(_DEG_PER_S)
-# Of what else sensors give; no datasheet speaks in them.
-OTHER_UNITS = ("m/s^2", "g", "counts")
+# Of what else sensors give; no datasheet of a gyroscope speaks in them.
+OTHER_UNITS = (*_M_PER_S2, "counts")
+
+# Spellings of a unit after `canonical_unit` has taken off what is a matter of taste: capitals, blanks, the signs of
+# multiplication and powers, which Greek mu, `sec` or `hr` or `degree` in place of `s`, `h`, `deg`.
+_SPELLINGS = {
+    "deg/s": "deg/s degs-1 degs degps dps",
+    "mdeg/s": "mdeg/s mdegs-1 mdegs mdegps mdps",
+    "deg/h": "deg/h degh-1 degh degph dph",
+    "rad/s": "rad/s rads-1 rads radps",
+    "mrad/s": "mrad/s mrads-1 mrads mradps",
+    "rpm": "rpm rev/min r/min",
+    "m/s^2": "m/s2 m/s/s ms-2 m/ss mps2",
+    "g": "g g0 gn",
+    "mg": "mg mg0",
+    "ug": "ug ug0",
+    "degC": "degc c celsius",
+    "K": "k kelvin",
+    "uT": "ut",
+    "counts": "count counts lsb raw digit digits adc",
+}
+_CANONICAL = {spelling: unit for unit, spellings in _SPELLINGS.items() for spelling in spellings.split()}
+# In this order: a longer word before one that it holds.
+_ALIKE = (
+    *((sign, "u") for sign in "\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}"),
+    *((sign, "deg") for sign in "\N{DEGREE SIGN}\N{MASCULINE ORDINAL INDICATOR}\N{RING ABOVE}"),
+    *((sign, "") for sign in " \N{NO-BREAK SPACE}\N{MIDDLE DOT}\N{DOT OPERATOR}*^_"),
+    ("\N{SUPERSCRIPT MINUS}\N{SUPERSCRIPT ONE}", "-1"),
+    ("\N{SUPERSCRIPT TWO}", "2"),
+    ("degrees", "deg"),
+    ("degree", "deg"),
+    ("radians", "rad"),
+    ("radian", "rad"),
+    ("seconds", "s"),
+    ("second", "s"),
+    ("sec", "s"),
+    ("hours", "h"),
+    ("hour", "h"),
+    ("hr", "h"),
+    ("per", "/"),
+)
+
+
+def canonical_unit(text: str) -> str:
+    """Return the project's spelling of a unit of rate, acceleration, temperature or field; an unknown one as it came.
+
+    `dps`, `°/sec` and `degrees per second` are `deg/s`, `deg/hr` is `deg/h`, `µg` with either mu is `ug`.
+    """
+    spelling = text.strip().lower()
+    for sign, plain in _ALIKE:
+        spelling = spelling.replace(sign, plain)
+    return _CANONICAL.get(spelling, text.strip())
 
 
 def rate_unit_factor(unit: str, target: str = "deg/s") -> float:
-    """Factor that takes a rate in `unit` to `target`; both among deg/s, mdeg/s, deg/h and rad/s.
+    """Factor that takes a rate in `unit` to `target`, in any spelling that `canonical_unit` knows.
 
     Raises:
         ValueError: An unknown unit.
     """
-    for name, value in (("unit", unit), ("target", target)):
-        if value not in _DEG_PER_S:
+    return _factor(_DEG_PER_S, unit, target)
+
+
+def acceleration_unit_factor(unit: str, target: str = "m/s^2") -> float:
+    """Factor that takes an acceleration in `unit` to `target`, in any spelling that `canonical_unit` knows.
+
+    Raises:
+        ValueError: An unknown unit.
+    """
+    return _factor(_M_PER_S2, unit, target)
+
+
+def _factor(sizes: Mapping[str, float], unit: str, target: str) -> float:
+    """Size of `unit` over that of `target`."""
+    names = [canonical_unit(unit), canonical_unit(target)]
+    for argument, name, given in zip(("unit", "target"), names, (unit, target), strict=True):
+        if name not in sizes:
             raise ValueError(
-                f"`{name}`: expected one of {', '.join(RATE_UNITS)}, got {value!r}; multiply the signal by the factor "
+                f"`{argument}`: expected one of {', '.join(sizes)}, got {given!r}; multiply the signal by the factor "
                 "to one of them, or state the unit where none is"
             )
-    return _DEG_PER_S[unit] / _DEG_PER_S[target]
+    return sizes[names[0]] / sizes[names[1]]
 
 
 def angle_random_walk(variance: float, rate: float) -> float:

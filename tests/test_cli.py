@@ -365,7 +365,7 @@ def test_options_reach_the_noise_fit(
         (("--model", "WN + SIN", "--robust", "0.6"), "SIN"),
         (
             ("--model", "WN", "--unit", "banana"),
-            "`--unit`: expected one of deg/s, mdeg/s, deg/h, rad/s, m/s^2, g, counts",
+            "`--unit`: expected one of deg/s, mdeg/s, deg/h, rad/s, mrad/s, rpm, m/s^2, g, mg, ug, counts",
         ),
         (("--model", "WN", "--weighting", "equal"), "'equal' is not one of 'optimal', 'diagonal', 'identity'"),
     ],

@@ -14,13 +14,47 @@ def test_rate_units():
     assert units.rate_unit_factor("deg/s", "rad/s") == pytest.approx(math.pi / 180)
     assert units.rate_unit_factor("deg/s", "deg/h") == pytest.approx(3600)
     assert units.rate_unit_factor("mdeg/s", "deg/h") == pytest.approx(3.6)
-    for unit in ("deg/s", "mdeg/s", "deg/h", "rad/s"):
+    assert units.rate_unit_factor("rpm") == 6  # 360 deg in a minute
+    assert units.rate_unit_factor("mrad/s", "rad/s") == pytest.approx(1e-3)
+    for unit in units.RATE_UNITS:
         assert units.rate_unit_factor(unit, unit) == 1
 
 
-@pytest.mark.parametrize(("arguments", "name"), [(("dps",), "unit"), (("deg/s", "Hz"), "target")])
+def test_acceleration_units():
+    assert units.acceleration_unit_factor("g") == 9.80665
+    assert units.acceleration_unit_factor("mg", "ug") == pytest.approx(1000)
+    with pytest.raises(ValueError, match=r"`unit`: expected one of m/s\^2, g, mg, ug, got 'deg/s'"):
+        units.acceleration_unit_factor("deg/s")
+
+
+@pytest.mark.parametrize(
+    ("unit", "spellings"),
+    [
+        ("deg/s", "dps|deg/sec|°/s|º/s|deg s^-1|degrees per second|Deg/Sec|deg·s⁻¹"),
+        ("mdeg/s", "mdps|mdeg/sec|m°/s"),
+        ("deg/h", "deg/hr|°/h|º/hr|dph|degrees/hour|deg h^-1"),
+        ("rad/s", "rad/sec|radps|rad s^-1|rad·s⁻¹|radians per second"),
+        ("mrad/s", "mrad/sec|mrad s^-1"),
+        ("rpm", "RPM|rev/min"),
+        ("m/s^2", "m/s/s|m s^-2|m/s²|mps2|m/sec^2"),
+        ("g", "G|g0"),
+        ("mg", "mg"),
+        ("ug", "ug|\N{MICRO SIGN}g|\N{GREEK SMALL LETTER MU}g"),
+        ("degC", "°C|C|Celsius"),
+        ("uT", "\N{MICRO SIGN}T|\N{GREEK SMALL LETTER MU}T"),
+        ("counts", "LSB|raw|digits"),
+        ("furlong", "furlong| furlong "),
+    ],
+)
+def test_spellings(unit, spellings):
+    assert {units.canonical_unit(spelling) for spelling in spellings.split("|")} == {unit}
+    if unit in units.RATE_UNITS:
+        assert {units.rate_unit_factor(spelling, unit) for spelling in spellings.split("|")} == {1.0}
+
+
+@pytest.mark.parametrize(("arguments", "name"), [(("furlong",), "unit"), (("deg/s", "Hz"), "target")])
 def test_unknown_units_are_named(arguments, name):
-    with pytest.raises(ValueError, match=f"`{name}`: expected one of deg/s, mdeg/s, deg/h, rad/s, got"):
+    with pytest.raises(ValueError, match=f"`{name}`: expected one of deg/s, mdeg/s, deg/h, rad/s, mrad/s, rpm, got"):
         units.rate_unit_factor(*arguments)
 
 

@@ -21,9 +21,10 @@ from typing import Any
 
 import numpy as np
 
-from gyrofuse.io.columns import AXES, TICK, Column, canonical_unit, classify_columns, time_in_seconds, typical_step
+from gyrofuse.io.columns import AXES, TICK, Column, classify_columns, time_in_seconds, typical_step
 from gyrofuse.io.limits import LONGEST_NAME, decoded, enumerated, is_rate
 from gyrofuse.io.stream import Array, RecordingError, Stream
+from gyrofuse.units import canonical_unit
 
 _RATE = (
     "fs",

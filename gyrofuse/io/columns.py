@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from gyrofuse.io.limits import LONGEST_NAME
 from gyrofuse.io.stream import Array, Stream
+from gyrofuse.units import canonical_unit
 
 AXES = ("x", "y", "z")
 TICK = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -89,34 +90,6 @@ class Column:
     device: str = ""
     axis: str = ""
     unit: str = ""
-
-
-def canonical_unit(text: str) -> str:
-    """Return the project's spelling of a rate, acceleration or temperature unit; an unknown one as it came."""
-    compact = text.strip().lower().replace(" ", "").replace("·", "").replace("*", "").replace("^", "")
-    compact = compact.replace("**", "").replace("sec", "s").replace("⁻¹", "-1").replace("²", "2")
-    if compact in (
-        "deg/s",
-        "degs-1",
-        "degs",
-        "dps",
-        "°/s",
-        "°s-1",
-        "degree/s",
-        "degrees/s",
-        "degps",
-        "deg/second",
-    ):
-        return "deg/s"
-    if compact in ("rad/s", "rads-1", "rads", "radps", "radian/s", "radians/s"):
-        return "rad/s"
-    if compact in ("m/s2", "m/s/s", "ms-2", "m/ss", "mps2"):
-        return "m/s^2"
-    if compact in ("degc", "°c", "c", "celsius"):
-        return "degC"
-    if compact in ("count", "counts", "lsb", "raw", "digit", "digits", "adc"):
-        return "counts"
-    return text.strip()
 
 
 def classify_columns(names: Sequence[str]) -> list[Column]:
