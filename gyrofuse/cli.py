@@ -193,8 +193,8 @@ def fuse(
         recording = read(logs, axis, sensors, rate, unit, scale, key, mounting)
         if recording.axes and recording.n_sensors == 1:
             raise ValueError(
-                f"{titled(logs)}: expected several devices to fuse, found one with the axes {', '.join(recording.axes)}; "
-                "give the logs of all devices of the array"
+                f"{titled(logs)}: expected several devices to fuse, found one with the axes {', '.join(recording.axes)}"
+                "; give the logs of all devices of the array"
             )
         with progress("fusing"):
             part = at_rest(recording, resting)

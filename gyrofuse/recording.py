@@ -271,9 +271,9 @@ def read_recording(
 ) -> Recording:
     """Read a log, or several logs of one array, onto a uniform grid.
 
-    Devices with the same axes give `(axis, sensor, time)`, or `(sensor, time)` of one `axis`. The rate comes from the timestamps where there are any. Gaps,
-    repeats, jitter, wraps, offsets between devices and non-finite samples are found and noted; what is missing is
-    NaN, nothing is interpolated.
+    Devices with the same axes give `(axis, sensor, time)`, or `(sensor, time)` of one `axis`. The rate comes from the
+    timestamps where there are any. Gaps, repeats, jitter, wraps, offsets between devices and non-finite samples are
+    found and noted; what is missing is NaN, nothing is interpolated.
 
     Args:
         path: One file, a ROS 2 folder, or several files of one array.

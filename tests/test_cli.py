@@ -181,8 +181,8 @@ def test_axes_of_one_device_are_no_array(run: Run, tmp_path: Path):
     done = run("fuse", "imu.npz")
     assert done.status == 2
     assert done.err == (
-        "error: imu.npz: expected several devices to fuse, found one with the axes x, y, z; give the logs of all devices "
-        "of the array\n"
+        "error: imu.npz: expected several devices to fuse, found one with the axes x, y, z; give the logs of all "
+        "devices of the array\n"
     )
 
 

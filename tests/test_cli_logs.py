@@ -101,6 +101,6 @@ def test_a_single_device_has_axes_and_cannot_be_fused(run: Run, shared: Path, lo
     done = run("fuse", path)
     assert (done.status, done.err) == (
         2,
-        f"error: {log}: expected several devices to fuse, found one with the axes x, y, z; give the logs of all devices "
-        "of the array\n",
+        f"error: {log}: expected several devices to fuse, found one with the axes x, y, z; give the logs of all "
+        "devices of the array\n",
     )
