@@ -18,7 +18,7 @@ from gyrofuse.parsing import model_from_dict
 from gyrofuse.processes import Model
 from gyrofuse.recording import Recording, read_recording
 from gyrofuse.simulate import ArrayModel
-from gyrofuse.units import OTHER_UNITS, RATE_UNITS, canonical_unit
+from gyrofuse.units import KNOWN_UNITS, canonical_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -97,11 +97,10 @@ def read(
 
 def known_unit(unit: str) -> str:
     """The unit that `--unit` names, in this project's spelling."""
-    known = (*RATE_UNITS, *OTHER_UNITS)
     name = canonical_unit(unit)
-    if name not in known:
+    if name not in KNOWN_UNITS:
         raise ValueError(
-            f"`--unit`: expected one of {', '.join(known)}, got {unit!r}; give one of them, and with --scale the "
+            f"`--unit`: expected one of {', '.join(KNOWN_UNITS)}, got {unit!r}; give one of them, and with --scale the "
             "factor that brings the numbers of the log to it"
         )
     return name
@@ -265,9 +264,9 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
 
 def unit_note(unit: str) -> list[str]:
     """What to say of a unit that no datasheet can be given in."""
-    if unit in (*RATE_UNITS, *OTHER_UNITS, "unknown"):
+    if unit in (*KNOWN_UNITS, "unknown"):
         return []
-    return [f"Unit {unit!r} is none of {', '.join((*RATE_UNITS, *OTHER_UNITS))}: numbers are in it as they stand."]
+    return [f"Unit {unit!r} is none of {', '.join(KNOWN_UNITS)}: numbers are in it as they stand."]
 
 
 def files_written(*paths: Path | None) -> list[str]:

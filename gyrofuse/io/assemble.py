@@ -19,7 +19,7 @@ from gyrofuse.io.columns import AXES
 from gyrofuse.io.limits import printable
 from gyrofuse.io.notes import Note
 from gyrofuse.io.stream import Array, RecordingError, Stream, unexpected
-from gyrofuse.units import rate_unit_factor
+from gyrofuse.units import unit_factor
 
 _UNKNOWN = "unknown"
 
@@ -249,7 +249,7 @@ def _units(
                 notes.append(Note("unit", stream.name, f"the log states no unit; its numbers are taken as {target}"))
             continue
         try:
-            factors.append(rate_unit_factor(stream.unit, target))
+            factors.append(unit_factor(stream.unit, target))
         except ValueError as error:
             raise RecordingError(
                 f"{source}: expected one unit, found {stream.unit} in {stream.name}, which is no {target}; "
