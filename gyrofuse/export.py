@@ -94,9 +94,8 @@ def to_kalibr(
             f"# accelerometer_random_walk:  # {accelerations[1]}",
         ]
     else:
-        fitted = isinstance(accelerometer, GMWMResult)
-        own = (None, None) if fitted else (gyroscope.rate, "m/s^2")
-        triad = _Triad.of("accelerometer", accelerometer, *own, "m/s^2")
+        rate, unit = (None, None) if isinstance(accelerometer, GMWMResult) else (gyroscope.rate, "m/s^2")
+        triad = _Triad.of("accelerometer", accelerometer, rate, unit, "m/s^2")
         lines.append(f"# Accelerometer, from a model in {triad.unit} per sample:")
         lines += _kalibr_keys(triad, "accelerometer", slow, accelerations)
     return "\n".join(lines) + "\n"
