@@ -47,6 +47,7 @@ _SPELLINGS = {
     "uT": "ut",
     "counts": "count counts lsb raw digit digits adc",
 }
+UNITS = tuple(_SPELLINGS)
 _CANONICAL = {spelling: unit for unit, spellings in _SPELLINGS.items() for spelling in spellings.split()}
 # In this order: a longer word before one that it holds.
 _ALIKE = (

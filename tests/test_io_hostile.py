@@ -149,18 +149,18 @@ class TestText:
         with pytest.raises(
             RecordingError, match=r"line 2: .* found 's'; correct the line \(units belong behind the na"
         ):
-            gf.read_recording(csv(tmp_path, "time,gx,gy,gz\ns,deg/s,deg/s,deg/s"))
+            gf.read_recording(csv(tmp_path, "time,gx,gy,gz\ns,furlong,furlong,furlong"))
 
     def test_a_clock_without_its_name_is_told(self, tmp_path: Path):
-        with pytest.raises(RecordingError, match=r"found neither \(column 'Zeit \[s\]' rises in equal steps .* 'time'"):
-            gf.read_recording(csv(tmp_path, "Zeit [s],gx,gy,gz"))
+        with pytest.raises(RecordingError, match=r"found neither \(column 'Tijd \[s\]' rises in equal steps .* 'time'"):
+            gf.read_recording(csv(tmp_path, "Tijd [s],gx,gy,gz"))
 
     def test_a_column_that_is_not_asked_for_may_hold_anything(self, tmp_path: Path):
         path = csv(tmp_path, "row,gx,gy,gz", "lost,1,2,3")
         assert gf.read_recording(path, rate=100.0).n_samples == 201
 
     def test_a_clock_of_dates_is_told(self, tmp_path: Path):
-        (tmp_path / "a.csv").write_text("time,gx\n" + "".join(f"2024-01-01T00:00:{i:02}Z,{i % 7}\n" for i in range(60)))
+        (tmp_path / "a.csv").write_text("time,gx\n" + "".join(f"01/02/2024 00:00:{i:02},{i % 7}\n" for i in range(60)))
         with pytest.raises(RecordingError, match=r"found neither \(column 'time' holds no numbers and is left out\)"):
             gf.read_recording(tmp_path / "a.csv")
 

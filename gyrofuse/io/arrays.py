@@ -13,7 +13,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from gyrofuse.io.columns import AXES, TICK, Column, classify_columns, time_in_seconds, typical_step
+from gyrofuse.io.column_streams import time_in_seconds
+from gyrofuse.io.columns import AXES, TICK, Column, classify_columns
 from gyrofuse.io.limits import LONGEST_NAME, decoded, enumerated, is_rate
 from gyrofuse.io.stream import Array, RecordingError, Stream
 from gyrofuse.units import canonical_unit
@@ -278,7 +278,4 @@ def clock_in_seconds(
 ) -> tuple[Array, float | None, str]:
     """Seconds, wrapping period and guess of a clock, whose unit its attribute or the sampling rate may tell."""
     unit = column.unit or _own_unit(settings, column.name)
-    step = typical_step(ticks)
-    if unit not in TICK and rate is not None and step > 0:
-        unit = min(TICK, key=lambda name: abs(math.log(step) + math.log(TICK[name] * rate)))
-    return time_in_seconds(replace(column, unit=unit if unit in TICK else ""), ticks)
+    return time_in_seconds(replace(column, unit=unit if unit in TICK else ""), ticks, rate)

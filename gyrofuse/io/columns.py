@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from gyrofuse.io.limits import LONGEST_NAME
-from gyrofuse.io.stream import Array, Stream
-from gyrofuse.units import canonical_unit
+from gyrofuse.units import UNITS, canonical_unit
 
 AXES = ("x", "y", "z")
 TICK = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -27,50 +23,71 @@ _PHRASES = (
     (re.compile(r"(?i)magnetic[_ .]?fields?"), "_mag_"),
     (re.compile(r"(?i)sample[_ .]?time[_ .]?fine"), "_sampletimefine_"),
     (re.compile(r"(?i)seconds[_ .]?elapsed"), "_time_s_"),
+    (re.compile(r"(?<![A-Za-z0-9])As(?=_?[XYZ](?![A-Za-z]))"), "_gyro_"),  # WitMotion's AsX: angular speed
 )
 _WORD = re.compile(
     r"(?P<before>[xyz])?"
-    r"(?:(?P<gyro>gyroscope|gyros?|gyrs?|omega)|(?P<acceleration>accelerometer|acceleration|accel|acc)"
-    r"|(?P<magnetic_field>magnetometer|mag)|(?P<temperature>temperatures?|temp))"
+    r"(?:(?P<gyro>gyroscope|gyroskop|gyros?|gyrs?|omega|drehrate)"
+    r"|(?P<acceleration>accelerometer|acceleration|beschleunigung|accel|accl|acc)"
+    r"|(?P<magnetic_field>magnetometer|magn|mag)|(?P<temperature>temperatures?|temperatur|temp))"
     r"(?P<number>\d*)(?P<after>[xyz])?(?P<last>\d*)",
     re.IGNORECASE,
 )
 _SHORT = re.compile(r"(?P<word>[gwam])(?P<number>\d*)(?P<axis>[xyz])(?P<last>\d*)", re.IGNORECASE)
 _SHORT_KINDS = {"g": "gyro", "w": "gyro", "a": "acceleration", "m": "magnetic_field"}
-_TIME = re.compile(r"(?:sampletimefine|timestamps?|times?|stamp|clock|ts|t)(?P<number>\d*)", re.IGNORECASE)
+_TIME = re.compile(
+    r"(?:sampletimefine|timestamps?|times?|stamp|clock|zeit|zeitstempel|uhrzeit|tow|ts|t)(?P<number>\d*)", re.IGNORECASE
+)
 _PLAIN = re.compile(r"(?:s|ch|channel|sensor|signal|imu|device|node)?[_ ]?\d+", re.IGNORECASE)
 _CAMEL = re.compile(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")
 
 # A name with one of these describes a sensor's data but does not hold them.
 _NOT_DATA = frozenset(
-    "bias clipping clipped id count counter covariance cov std var variance integral dt delta relative error errors "
-    "status samples norm noise scale offset range free movement valid quality".split()
+    "bias clipping clipped coarse id count counter covariance cov std var variance integral dt delta relative error "
+    "errors status samples norm noise scale offset range free movement valid quality".split()
 )
 _FILLERS = frozenset("raw data value values field buffer calibrated cal uncalibrated msg header sample sensor".split())
 _UNIT_TOKENS = {
     "rad": "rad/s",
     "rads": "rad/s",
     "radps": "rad/s",
+    "mrad": "mrad/s",
+    "mrads": "mrad/s",
     "deg": "deg/s",
     "degs": "deg/s",
     "degps": "deg/s",
     "dps": "deg/s",
+    "mdeg": "mdeg/s",
+    "mdps": "mdeg/s",
+    "dph": "deg/h",
+    "degh": "deg/h",
+    "rpm": "rpm",
     "counts": "counts",
     "lsb": "counts",
     "ms2": "m/s^2",
     "mps2": "m/s^2",
     "s2": "m/s^2",
+    "mg": "mg",
+    "ug": "ug",
     "celsius": "degC",
     "degc": "degC",
     "kelvin": "K",
 }
-_UNIT_LEFTOVERS = frozenset({"m", "s", "per", "sec", "g", "c", "k"})
+# Letters that are a unit only at the end of the name of what they measure: `acc_x_g`, `temp_c`.
+_LAST_LETTERS = {("acceleration", "g"): "g", ("temperature", "c"): "degC", ("temperature", "k"): "K"}
+_HOURS = frozenset(("h", "hr", "hour"))
+_UNIT_LEFTOVERS = frozenset({"m", "s", "per", "sec", "g", "c", "k"}) | _HOURS
 _TIME_TOKENS = {
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), "s"),
     **dict.fromkeys(("ms", "msec", "msecs", "millis", "millisecond", "milliseconds"), "ms"),
     **dict.fromkeys(("us", "usec", "usecs", "micros", "microsecond", "microseconds", "µs", "μs"), "us"),
     **dict.fromkeys(("ns", "nsec", "nsecs", "nanosec", "nanos", "nanosecond", "nanoseconds"), "ns"),
 }
+# Names of units that name a clock where nothing, or one of these words, stands beside them: `nsec`, `gps seconds`.
+_CLOCK_UNITS = frozenset(unit for unit in _TIME_TOKENS if len(unit) > 2 and unit != "second")
+_CLOCK_WORDS = frozenset("gps utc unix epoch system elapsed tv of week".split())
+_RATE_WORDS = frozenset(("rate", "rates"))
+_FLIGHT_MECHANICS = {"p": "x", "q": "y", "r": "z"}
 
 
 @dataclass(frozen=True)
@@ -95,12 +112,34 @@ class Column:
 def classify_columns(names: Sequence[str]) -> list[Column]:
     """Say of each name what it holds.
 
-    Bare axes (`x`, `y`, `z`) and bare numbers (`1`, `s2`, `sensor_3`) are gyros only where the log names no sensor.
+    Bare axes (`x`, `y`, `z`) and bare numbers (`1`, `s2`, `sensor_3`) are gyros only where the log names no sensor;
+    `p`, `q` and `r`, the rates of flight mechanics, where it names no other gyro.
     """
     columns = [_classify(str(name)) for name in names]
-    if any(column.kind in ("gyro", "acceleration", "magnetic_field") for column in columns):
+    kinds = {column.kind for column in columns}
+    if "gyro" not in kinds and _FLIGHT_MECHANICS.keys() <= {bare_name(column.name) for column in columns}:
+        return [_classify_body_rate(column) for column in columns]
+    if not kinds.isdisjoint(("gyro", "acceleration", "magnetic_field")):
         return columns
     return [_classify_bare(column) for column in columns]
+
+
+def is_unit(text: str) -> bool:
+    """Whether a text is the unit of a rate, an acceleration, a temperature, a field or a time."""
+    return canonical_unit(text) in UNITS or text.strip().lower() in _TIME_TOKENS
+
+
+def bare_name(name: str) -> str:
+    """A name in small letters without what stands in brackets behind it."""
+    return _without_brackets(name[:LONGEST_NAME])[0].strip(" _").lower()
+
+
+def _classify_body_rate(column: Column) -> Column:
+    axis = _FLIGHT_MECHANICS.get(bare_name(column.name))
+    if axis is None:
+        return column
+    stated = _without_brackets(column.name)[1]
+    return Column(column.name, "gyro", "", axis, canonical_unit(stated[-1]) if stated else "")
 
 
 def _classify_bare(column: Column) -> Column:
@@ -122,7 +161,7 @@ def _classify(name: str) -> Column:
         text = phrase.sub(word, text)
     tokens = [token for token in re.split(r"[^0-9A-Za-zµμ]+", _CAMEL.sub("_", text)) if token]
     lower = [token.lower() for token in tokens]
-    if not tokens or not _NOT_DATA.isdisjoint(lower):
+    if not tokens or not _NOT_DATA.isdisjoint(token.rstrip("0123456789") for token in lower):
         return Column(name)
 
     kind, axis, time_at, numbers, rest = "", index, None, [], []
@@ -152,14 +191,36 @@ def _classify(name: str) -> Column:
     if time_at is not None:
         if kind not in ("", "gyro"):
             return Column(name)
+        if canonical_unit(stated) in ("degC", "K"):  # T [degC]
+            return Column(name, "temperature", unit=canonical_unit(stated))
         return _time_column(name, lower[time_at:], stated, rest, numbers)
-    if not kind and rest and lower[-1] in ("secs", "sec", "seconds") and len(tokens) == 1:
-        return Column(name, "time", unit="s")
+    words = [token.lower() for token in rest]
+    if not kind and not axis and lower[-1] in _CLOCK_UNITS and _CLOCK_WORDS.issuperset(words[:-1]):
+        return Column(name, "time", unit=_TIME_TOKENS[lower[-1]])
+    unit = _unit_of(kind, lower, stated)
+    drop = _UNIT_TOKENS.keys() | (_UNIT_LEFTOVERS if unit and not stated else frozenset())
+    if not kind and axis and not _RATE_WORDS.isdisjoint(words):
+        rest = [token for token in rest if token.lower() not in _RATE_WORDS]
+        if all(_PLAIN.fullmatch(token) or token.lower() in _FILLERS | drop for token in rest):
+            kind, unit = "gyro", _unit_of("gyro", lower, stated)
     if not kind:
         return Column(name)
-    unit = canonical_unit(stated) if stated else next((_UNIT_TOKENS[t] for t in lower if t in _UNIT_TOKENS), "")
-    drop = _UNIT_TOKENS.keys() | (_UNIT_LEFTOVERS if unit and not stated else frozenset())
     return Column(name, kind, _device(rest, numbers, drop), axis, unit)
+
+
+def _unit_of(kind: str, tokens: Sequence[str], stated: str) -> str:
+    """Unit of what is no time, from the brackets or from the tokens of the name."""
+    if stated:
+        # G is a gauss there, not the acceleration of gravity.
+        unit = canonical_unit(stated)
+        return stated if kind == "magnetic_field" and unit in ("g", "mg", "ug") else unit
+    at = next((i for i, token in enumerate(tokens) if token in _UNIT_TOKENS), None)
+    if at is None:
+        return _LAST_LETTERS.get((kind, tokens[-1]), "")
+    unit = _UNIT_TOKENS[tokens[at]]
+    if unit == "deg/s" and not _HOURS.isdisjoint(tokens[at + 1 :]):
+        return "deg/h"
+    return unit
 
 
 def _without_brackets(name: str) -> tuple[str, list[str]]:
@@ -184,125 +245,3 @@ def _device(rest: list[str], numbers: list[str], drop: frozenset[str] | set[str]
     kept = [token for token in rest if token.lower() not in _FILLERS and token.lower() not in drop]
     kept += [number for number in numbers if number]
     return "" if [token.lower() for token in kept] == ["imu"] else "_".join(kept)
-
-
-def time_in_seconds(column: Column, values: NDArray[np.generic]) -> tuple[Array, float | None, str]:
-    """Convert a clock column to seconds.
-
-    Where the name states no unit, the unit is the one in which the values are a date between 2001 and 2036, else the
-    one in which the rate lies between 5 Hz and 5 kHz; fractional values are seconds.
-
-    Returns:
-        Seconds `(time,)`, the period after which the clock wraps (or `None`), and a sentence on what was guessed.
-    """
-    ticks = np.asarray(values, dtype=np.float64)
-    fine = "sampletimefine" in re.sub(r"[^a-z]", "", column.name.lower())
-    unit, note = column.unit or ("us" if fine else ""), ""  # SampleTimeFine counts microseconds
-    if not unit:
-        finite = ticks[np.isfinite(ticks)]
-        step = typical_step(finite, either_way=True)
-        whole = finite.size > 0 and bool(np.all(finite[:1000] == np.rint(finite[:1000])))
-        start = abs(float(finite[0])) if finite.size else 0.0
-        dated = [name for name, tick in TICK.items() if 1e9 <= start * tick <= 2.1e9]
-        if dated:
-            unit = dated[0]
-        elif not whole or step < 0.2:
-            unit = "s"
-        else:
-            unit = "ms" if step < 200 else "us" if step < 200e3 else "ns"
-        if unit != "s":
-            note = f"time column '{column.name}' states no unit: read as {unit} from its median step of {step:g}"
-    return ticks * TICK[unit], WRAP_32_BIT * TICK[unit] if fine else None, note
-
-
-def typical_step(ticks: Array, *, either_way: bool = False) -> float:
-    """Median step of a clock, or of the size of its steps, over the readings that are finite; 0 where there is none."""
-    with np.errstate(over="ignore", invalid="ignore"):  # damaged readings may be as far apart as float64 reaches
-        steps = np.diff(ticks[np.isfinite(ticks)])
-        return float(np.median(np.abs(steps) if either_way else steps)) if steps.size else 0.0
-
-
-def streams_from_columns(
-    columns: Mapping[str, NDArray[np.generic]],
-    *,
-    name: str,
-    unit: str = "unknown",
-    rate: float | None = None,
-    time: Array | None = None,
-    notes: Sequence[str] = (),
-) -> list[Stream]:
-    """Build one stream per device from named one-dimensional columns; none where no column is a gyro's.
-
-    Args:
-        columns: Values `(time,)` by column name, in the order of the log.
-        name: Name of a device that the columns do not name (the file's stem).
-        unit: Unit of gyro columns whose names state none.
-        rate: Sampling rate the log states, Hz.
-        time: Clock in seconds where it is no column.
-        notes: Sentences that go with every stream.
-    """
-    classified = classify_columns(list(columns))
-    by_device: dict[str, list[Column]] = {}
-    for column in classified:
-        by_device.setdefault(column.device, []).append(column)
-    devices = list(dict.fromkeys(column.device for column in classified if column.kind == "gyro"))
-    # A logger that keeps the time of sampling beside the time of arrival means the former.
-    clocks = [column for column in classified if column.kind == "time"]
-    clocks.sort(key=lambda column: "sample" not in column.name.lower())
-    clock_of = {column.device: column for column in reversed(clocks)}  # the first of each device
-    streams = []
-    for device in devices:
-        gyro: dict[str, Array] = {}
-        units: list[str] = []
-        said = list(notes)
-        for column in by_device[device]:
-            if column.kind == "gyro":
-                if column.axis in gyro:
-                    said.append(f"column '{column.name}' repeats axis '{column.axis}' and is left out")
-                    continue
-                gyro[column.axis] = np.asarray(columns[column.name], dtype=np.float64)
-                units.append(column.unit)
-        # One shared clock or thermometer belongs to no device: the clock serves all, the channel goes with the first.
-        own = by_device[device]
-        if device == devices[0] and device:
-            own = [column for column in classified if column.device in (device, "")]
-        clock = clock_of.get(device) or (clocks[0] if clocks and len(devices) == 1 else clock_of.get(""))
-        seconds, period = time, None
-        if seconds is None and clock is not None:
-            seconds, period, guess = time_in_seconds(clock, columns[clock.name])
-            said += [guess] if guess else []
-        channels, channel_units = _channels(own, columns)
-        streams.append(
-            Stream(
-                name=device or name,
-                gyro=gyro,
-                unit=next((u for u in units if u), unit),
-                time=seconds,
-                rate=rate,
-                clock_period=period,
-                channels=channels,
-                channel_units=channel_units,
-                notes=tuple(said),
-            )
-        )
-    return streams
-
-
-def _channels(
-    classified: Sequence[Column], columns: Mapping[str, NDArray[np.generic]]
-) -> tuple[dict[str, Array], dict[str, str]]:
-    channels: dict[str, Array] = {}
-    units: dict[str, str] = {}
-    for kind in ("temperature", "acceleration", "magnetic_field"):
-        found = {column.axis: column for column in classified if column.kind == kind}
-        if not found:
-            continue
-        if set(AXES) <= set(found):
-            channels[kind] = np.stack([np.asarray(columns[found[a].name], dtype=np.float64) for a in AXES])
-        elif kind == "temperature":
-            channels[kind] = np.asarray(columns[next(iter(found.values())).name], dtype=np.float64)
-        else:
-            continue
-        if unit := next(iter(found.values())).unit:
-            units[kind] = unit
-    return channels, units

@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrofuse.io.arrays import clock_in_seconds, settings_by_group, stated_rate
-from gyrofuse.io.columns import WRAP_32_BIT, Column, classify_columns, streams_from_columns
+from gyrofuse.io.column_streams import streams_from_columns
+from gyrofuse.io.columns import WRAP_32_BIT, Column, classify_columns
 from gyrofuse.io.limits import LONGEST_NAME, enumerated, is_rate
 from gyrofuse.io.stream import Array, RecordingError, Stream
 from gyrofuse.units import canonical_unit

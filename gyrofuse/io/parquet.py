@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from gyrofuse.io.arrays import settings_by_group, stated_rate, stated_unit
-from gyrofuse.io.columns import classify_columns, streams_from_columns
+from gyrofuse.io.column_streams import streams_from_columns
+from gyrofuse.io.columns import classify_columns
 from gyrofuse.io.limits import Allowance, decoded, enumerated
 from gyrofuse.io.stream import Array, RecordingError, Stream, cause
 

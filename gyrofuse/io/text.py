@@ -10,16 +10,20 @@ An empty cell is NaN. Only columns of numbers with a known name are parsed.
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
 from gyrofuse.io.arrays import settings_by_group, stated_rate, stated_unit
-from gyrofuse.io.columns import Column, classify_columns, streams_from_columns, time_in_seconds
+from gyrofuse.io.column_streams import streams_from_columns, time_in_seconds
+from gyrofuse.io.columns import Column, classify_columns
+from gyrofuse.io.dates import DAY, seconds_of
 from gyrofuse.io.limits import LONGEST_NAME, Allowance, enumerated
 from gyrofuse.io.stream import Array, RecordingError, Stream, cause
+from gyrofuse.io.text_dialects import translate
 from gyrofuse.io.text_layout import COMMENT, Layout, advances, find_layout, lines_of, quoted_cells, without_numbers
 
 
@@ -37,33 +41,44 @@ def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) 
     allowance = Allowance(path, max_bytes)
     try:
         layout = find_layout(path)
-        columns, time, notes = (_named if layout.names else _unnamed)(path, layout, key, allowance)
+        settings = settings_by_group(layout.settings)
+        rate = stated_rate(settings, "")
+        table = _named(path, layout, key, allowance) if layout.names else _unnamed(path, layout, key, rate, allowance)
     except (OSError, csv.Error) as error:
         raise RecordingError(
             f"{path}: expected text, found a file that cannot be read ({cause(error)}); export it again"
         ) from error
-    settings = settings_by_group(layout.settings)
     streams = streams_from_columns(
-        columns,
+        table.columns,
         name=path.stem if key is None else key,
         unit=stated_unit(settings, ""),
-        rate=stated_rate(settings, ""),
-        time=time,
-        notes=[*layout.notes, *notes],
+        rate=rate,
+        time=table.time,
+        clock_period=table.clock_period,
+        notes=[*layout.notes, *table.notes],
     )
     if streams[0].n_samples < 2:
         raise RecordingError(f"{path}: expected at least 2 rows of numbers, found 1; record longer")
     return streams
 
 
-def _named(
-    path: Path, layout: Layout, key: str | None, allowance: Allowance
-) -> tuple[dict[str, Array], None, list[str]]:
-    """Columns that the header names, and notes."""
+@dataclass(frozen=True, eq=False)
+class _Table:
+    """Columns of numbers by name, the clock where it is none of them, and what there is to say."""
+
+    columns: dict[str, Array]
+    time: Array | None
+    clock_period: float | None
+    notes: list[str]
+
+
+def _named(path: Path, layout: Layout, key: str | None, allowance: Allowance) -> _Table:
+    """Columns that the header names."""
     notes: list[str] = []
     chosen: dict[str, int] = {}
     gyros: set[str] = set()
     columns_there = classify_columns(layout.names)
+    clock = _clock_of_dates(layout, columns_there)
     for position, column in enumerate(columns_there):
         if column.name in chosen:
             notes.append(f"column '{column.name}' stands there twice; the first is read")
@@ -73,8 +88,9 @@ def _named(
         elif column.kind not in ("", "gyro"):
             if layout.numeric[position]:
                 chosen[column.name] = position
-            elif column.kind == "time":
-                notes.append(f"column '{column.name}' holds no numbers and is left out")
+            elif column.kind == "time" and position != clock:
+                beside = "dates beside another clock" if layout.times[position] else "no numbers"
+                notes.append(f"column '{column.name}' holds {beside} and is left out")
     if not gyros:
         wanted = "with the name of a gyro (gyro_x, gx)" if key is None else f"or device {key!r} (`key`)"
         raise RecordingError(
@@ -85,30 +101,51 @@ def _named(
         notes.append(
             f"column '{layout.names[0]}' rises in equal steps but has no name of a clock; if it is one, call it 'time'"
         )
-    columns = _numbers(path, layout, chosen, allowance)
-    if "gyro" not in gyros and key is not None:
+    columns, time, period, said = _with_dates(path, layout, chosen, clock, allowance)
+    columns, meaning = translate(columns, layout.names, layout.settings)
+    if "gyro" not in gyros and key in columns:
         columns["gyro"] = columns.pop(key)
-    return columns, None, notes
+    return _Table(columns, time, period, [*notes, *said, *meaning])
 
 
-def _unnamed(
-    path: Path, layout: Layout, key: str | None, allowance: Allowance
-) -> tuple[dict[str, Array], Array | None, list[str]]:
-    """Sensors by their number, the clock where there is one, and notes."""
+def _clock_of_dates(layout: Layout, columns: Sequence[Column]) -> int | None:
+    """Position of the column of dates or times of day that is the clock, where no clock counts in numbers."""
+    kinds = [column.kind for column in columns] or [""] * len(layout.times)
+    if any(kind == "time" and number for kind, number in zip(kinds, layout.numeric, strict=True)):
+        return None
+    dated = [position for position, times in enumerate(layout.times) if times and kinds[position] in ("time", "")]
+    return next((position for position in dated if kinds[position] == "time"), dated[0] if dated else None)
+
+
+def _with_dates(
+    path: Path, layout: Layout, chosen: Mapping[str, int], clock: int | None, allowance: Allowance
+) -> tuple[dict[str, Array], Array | None, float | None, list[str]]:
+    """Chosen columns, the seconds of the column of dates, after which they wrap, and what to say of it."""
+    name = "" if clock is None else layout.names[clock] if layout.names else str(clock + 1)
+    if clock is None or name in chosen:
+        return _numbers(path, layout, chosen, allowance), None, None, []
+    columns = _numbers(path, layout, {**chosen, name: clock}, allowance)
+    seconds = columns.pop(name)
+    if layout.times[clock] == "date":
+        return columns, seconds, None, [f"column '{name}' holds dates and is read as time; without an offset as UTC"]
+    note = f"column '{name}' holds times of day, which begin again at midnight, and is read as time"
+    return columns, seconds, DAY, [note]
+
+
+def _unnamed(path: Path, layout: Layout, key: str | None, rate: float | None, allowance: Allowance) -> _Table:
+    """Sensors by their number, and the clock where there is one."""
     wanted = {f"{i + 1}": i for i, numeric in enumerate(layout.numeric) if numeric}
     if not wanted:
         raise without_numbers(path)
-    columns = _numbers(path, layout, wanted, allowance)
+    columns, time, period, notes = _with_dates(path, layout, wanted, _clock_of_dates(layout, ()), allowance)
     values = list(columns.values())
-    notes: list[str] = []
-    time = None
-    if [advances(column) for column in values] == [True, *[False] * (len(values) - 1)] and len(values) > 1:
+    if time is None and len(values) > 1 and [advances(v) for v in values] == [True, *[False] * (len(values) - 1)]:
         ticks = values.pop(0)
         said = "there is no header; the first column alone advances in nearly constant steps and is"
         if np.all(np.diff(ticks) == 1):
             notes.append(f"{said} taken as a count of the rows")
         else:
-            time, _, guess = time_in_seconds(Column("1", "time"), ticks)
+            time, _, guess = time_in_seconds(Column("1", "time"), ticks, rate)
             notes += [f"{said} read as time", *([guess] if guess else [])]
     sensors = {str(number): row for number, row in enumerate(values, 1)}
     if key is not None and key not in sensors:
@@ -117,15 +154,23 @@ def _unnamed(
             "name one of these"
         )
     if key is not None:
-        return {"gyro": sensors[key]}, time, notes
-    return (sensors if len(sensors) > 1 else {"gyro": values[0]}), time, notes
+        return _Table({"gyro": sensors[key]}, time, period, notes)
+    return _Table(sensors if len(sensors) > 1 else {"gyro": values[0]}, time, period, notes)
 
 
 def _numbers(path: Path, layout: Layout, chosen: Mapping[str, int], allowance: Allowance) -> dict[str, Array]:
     """Parse the chosen columns, by name and position."""
     rows = _Rows(path, layout, allowance.left // (8 * len(chosen)))
     try:
-        table = np.loadtxt(iter(rows), delimiter=layout.delimiter, comments=None, usecols=[*chosen.values()], ndmin=2)
+        table = np.loadtxt(
+            iter(rows),
+            delimiter=layout.delimiter,
+            comments=None,
+            usecols=[*chosen.values()],
+            ndmin=2,
+            converters={i: seconds_of for i in chosen.values() if layout.times[i] and not layout.numeric[i]},
+            encoding=None,  # converters take text, not bytes
+        )
     except RecordingError:
         raise
     except ValueError as error:

@@ -13,12 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
-from gyrofuse.io.columns import classify_columns
+from gyrofuse.io.columns import classify_columns, is_unit
+from gyrofuse.io.dates import kind_of_times
 from gyrofuse.io.limits import LONGEST_NAME, enumerated
 from gyrofuse.io.stream import Array, RecordingError
+from gyrofuse.io.text_dialects import names_of_message
 
 COMMENT = ("#", "%", "//")
-_HEAD = 200  # lines in which the layout is sought: preambles are shorter
+_HEAD = 600  # lines in which the layout is sought: preambles are shorter, Blackbox Explorer's has 250
 _PROBE = 20  # of these, the last tell the delimiter and which columns hold numbers
 _LONGEST_LINE = 2**17  # characters: 6500 cells of 20; a file without line ends is one line as long as the file
 
@@ -32,6 +34,7 @@ class Layout:
         delimiter: Between cells; `None` is white space.
         names: Of the columns, empty without a header.
         numeric: Of each column, whether it holds numbers.
+        times: Of each column, whether it holds a `"date"`, a `"time of day"`, or `""`.
         begin: Lines before the first row of numbers.
         settings: What comments and the preamble state, by name.
         rising: Whether the first column advances in nearly constant steps, as far as it was looked at.
@@ -42,6 +45,7 @@ class Layout:
     delimiter: str | None
     names: tuple[str, ...]
     numeric: tuple[bool, ...]
+    times: tuple[str, ...]
     begin: int
     settings: dict[str, str]
     rising: bool
@@ -109,7 +113,9 @@ def find_layout(path: Path) -> Layout:
     if not table:
         raise without_numbers(path)
     sample = [cells for _, cells in table[1:][-_PROBE:]] or [table[0][1]]
-    numeric = tuple(_holds_numbers([cells[i] for cells in sample if i < len(cells)], delimiter) for i in range(width))
+    by_column = [[cells[i] for cells in sample if i < len(cells)] for i in range(width)]
+    numeric = tuple(_holds_numbers(cells, delimiter) for cells in by_column)
+    times = tuple(kind_of_times(cells) for cells in by_column)
     begin, first = table[0]
     above = head[:begin]
     if any(number and cell and not is_number(cell, delimiter) for number, cell in zip(numeric, first, strict=True)):
@@ -121,11 +127,20 @@ def find_layout(path: Path) -> Layout:
             )
     else:
         names = _header_above(path, above, delimiter, width)
+    if names and len(table) > 1 and _are_units(table[1][1], numeric, delimiter) and table[1][0] >= begin:
+        begin = table[1][0] + 1
+        names = [
+            name if not unit or "[" in name or "(" in name else f"{name} [{unit}]"
+            for name, unit in zip(names, (cell.strip("[]() ") for cell in table[1][1]), strict=True)
+        ]
+        notes = (*notes, f"line {begin} holds the units of the columns")
+    if not names and (names := list(names_of_message(sample))):
+        notes = (*notes, f"there is no header; the {width} cells of a line are read as those of a sensor_msgs/Imu")
     comments = [line for line in head[begin:] if line.startswith(COMMENT)]
     settings = {name: value for line in (*above, *comments) for name, value in _settings(line[:LONGEST_NAME])}
     clock = [cells[0] for number, cells in table if number >= begin]
     rising = all(is_number(cell, delimiter) for cell in clock) and advances(np.array([_number(c) for c in clock]))
-    return Layout(encoding, delimiter, tuple(names), numeric, begin, settings, rising, notes)
+    return Layout(encoding, delimiter, tuple(names), numeric, times, begin, settings, rising, notes)
 
 
 def advances(values: Array) -> bool:
@@ -138,8 +153,24 @@ def advances(values: Array) -> bool:
     return bool(np.mean(np.abs(steps - typical) < 0.5 * typical) > 0.9)
 
 
+def _are_units(cells: Sequence[str], numeric: Sequence[bool], delimiter: str | None) -> bool:
+    """Whether the cells above columns of numbers are their units: no number, and at least half of them known."""
+    above = [cell.strip("[]() ") for cell, number in zip(cells, numeric, strict=False) if number]
+    filled = [cell for cell in above if cell not in ("", "-")]
+    if len(cells) != len(numeric) or any(is_number(cell, delimiter) for cell in filled):
+        return False
+    return 2 * sum(map(is_unit, filled)) >= len(filled) > 0
+
+
 def _settings(line: str) -> Iterator[tuple[str, str]]:
-    """Names and values of `fs = 100 Hz, unit: deg/s`: a name may have blanks; a value goes on to the next `,;=:`."""
+    """Names and values of `fs = 100 Hz, unit: deg/s`: a name may have blanks; a value goes on to the next `,;=:`.
+
+    `"name","value"` in quotes is one of each.
+    """
+    quoted = line.strip().split('"')
+    if len(quoted) == 5 and not quoted[0] and quoted[2].strip() in (",", ";") and not quoted[4]:
+        yield quoted[1].strip(), _without_hertz(quoted[3].strip())
+        return
     parts = re.split("([,;=:])", line)
     position = 0  # texts are at even positions, what parts them at odd ones
     while position + 2 < len(parts):
@@ -195,6 +226,8 @@ def _names_gyro(names: Iterable[str]) -> bool:
 
 def _cells(line: str, delimiter: str | None) -> list[str]:
     """Cells of a line without the empty one that a trailing delimiter makes."""
+    if delimiter is None and ("[" in line or "(" in line):  # a blank before a unit parts it from no name
+        line = " ".join(line.split()).replace(" [", "[").replace(" (", "(")
     cells = quoted_cells(line, delimiter) if '"' in line else [cell.strip() for cell in line.split(delimiter)]
     return cells[:-1] if delimiter and len(cells) > 1 and not cells[-1] else cells
 
