@@ -151,6 +151,66 @@ def _ulog_message(kind: str, body: bytes) -> bytes:
     return struct.pack("<HB", len(body), ord(kind)) + body
 
 
+# Layouts of messages of ArduPilot logs: number, letters of the types, fields.
+DATAFLASH = {
+    "IMU": (10, "QBffffffIIfBBHH", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,EG,EA,T,GH,AH,GHz,AHz"),
+    "GYR": (11, "QBQfff", "TimeUS,I,SampleUS,GyrX,GyrY,GyrZ"),
+    "ACC": (12, "QBQfff", "TimeUS,I,SampleUS,AccX,AccY,AccZ"),
+    "ISBH": (13, "QHBBHHQf", "TimeUS,N,type,instance,mul,smp_cnt,SampleUS,smp_rate"),
+    "ISBD": (14, "QHHaaa", "TimeUS,N,seqno,x,y,z"),
+    "IMU2": (15, "QffffffIIfBB", "TimeUS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,ErrG,ErrA,Temp,GyHlt,AcHlt"),
+    "MSG": (16, "QZ", "TimeUS,Message"),
+}
+_PACKED = dict(zip("bBhHiIqQfdZa", "b B h H i I q Q f d 64s 64s".split(), strict=True))
+
+
+def write_dataflash(path: Path, messages: Sequence[tuple[Any, ...]]) -> Path:
+    """Write an ArduPilot log, binary or where the name ends in .log text, of messages `(kind, value of each field...)`.
+
+    A field of letter `a` takes 32 whole numbers.
+    """
+    kinds = {"FMT": (128, "BBnNZ", "Type,Length,Name,Format,Columns")}
+    kinds |= {name: DATAFLASH[name] for name in dict.fromkeys(message[0] for message in messages)}
+    layouts = {name: "<" + "".join(_PACKED.get(c, "") for c in letters) for name, (_, letters, _) in kinds.items()}
+    layouts["FMT"] = "<BB4s16s64s"
+    log, lines = bytearray(), []
+    for name, (number, letters, fields) in kinds.items():
+        size = struct.calcsize(layouts[name]) + 3
+        packed = struct.pack(layouts["FMT"], number, size, name.encode(), letters.encode(), fields.encode())
+        log += b"\xa3\x95\x80" + packed
+        lines.append(f"FMT, {number}, {size}, {name}, {letters}, {fields}")
+    for name, *values in messages:
+        plain = [np.array(v, "<i2").tobytes() if isinstance(v, list) else v for v in values]
+        plain = [v.encode() if isinstance(v, str) else v for v in plain]
+        log += b"\xa3\x95" + bytes([kinds[name][0]]) + struct.pack(layouts[name], *plain)
+        cells = ["[" + " ".join(map(str, v)) + "]" if isinstance(v, list) else f"{v}" for v in values]
+        lines.append(", ".join([name, *cells]))
+    path.write_bytes("\r\n".join([*lines, ""]).encode() if path.suffix == ".log" else log)
+    return path
+
+
+def batches(
+    kinds: Sequence[tuple[int, int]] = ((1, 0), (0, 0), (1, 0)),
+    count: int = 64,
+    mul: int = 1000,
+    rate: float = 2000.0,
+    number: int = 0,
+) -> list[tuple[Any, ...]]:
+    """Return messages of ArduPilot's batch sampler, for `write_dataflash`.
+
+    Batches of (kind, instance), a second apart, the first 5 s after the start: sample `s` of batch `b` is `s + 100 b`
+    counts on every axis.
+    """
+    messages: list[tuple[Any, ...]] = []
+    for b, (kind, instance) in enumerate(kinds):
+        start = 5_000_000 + 1_000_000 * b
+        messages.append(("ISBH", start, (number + b) % 65536, kind, instance, mul, count, start, rate))
+        for s in range(-(-count // 32)):
+            values = [32 * s + j + 100 * b for j in range(32)]
+            messages.append(("ISBD", start + s, (number + b) % 65536, s, values, values, values))
+    return messages
+
+
 def write_parquet(path: Path, columns: dict[str, Any], metadata: dict[str, str] | None = None) -> Path:
     """Write columns and the schema's metadata to a Parquet file."""
     import pyarrow as pa

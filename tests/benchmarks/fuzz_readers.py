@@ -113,6 +113,12 @@ def sound_logs(folder: Path) -> list[Path]:
     logs.write_mat73(folder / "new.mat", {"gyro": gyro[0], "fs": 100.0, "unit": "rad/s"})
     logs.write_mat5(folder / "old.mat", {"imu": {"gyr": gyro[0], "fs": 100.0, "names": np.array(["a", 1.0], object)}})
     logs.write_ulog(folder / "plain.ulg", gyro, stamps)
+    inertial = [
+        ("IMU", 2500 * k, i, *gyro[i, :, k], 0, 0, -9.75, 0, 0, 30, 1, 1, 0, 0) for k in range(80) for i in (0, 1)
+    ]
+    logs.write_dataflash(folder / "plain.bin", inertial)
+    logs.write_dataflash(folder / "plain.log", inertial)
+    logs.write_dataflash(folder / "batches.bin", logs.batches())
     logs.write_ros1(folder / "plain.bag", gyro, stamps)
     for mcap in (False, True):
         bag = logs.write_ros2(folder / f"ros2_{mcap}", gyro, stamps, mcap=mcap)
