@@ -96,6 +96,12 @@ def _write_messages(
             bag.write(connection, stamp, serialize(message, msgtype))
 
 
+_FIFO = (
+    "uint64_t timestamp_sample;uint32_t device_id;float dt;float scale;uint8_t samples;"
+    "int16_t[32] x;int16_t[32] y;int16_t[32] z;"
+)
+
+
 def write_ulog(
     path: Path,
     gyro: Array,
@@ -103,13 +109,15 @@ def write_ulog(
     *,
     temperature: Array | None = None,
     combined: tuple[Array, Stamps] | None = None,
+    fifo: Sequence[tuple[str, int, int, float, float, Sequence[tuple[int, int, Any]]]] = (),
     dropouts_ms: Sequence[int] = (),
     other_topics: Sequence[str] = (),
 ) -> Path:
     """Write a PX4 ULog: `gyro` as instances of sensor_gyro, `combined` (axis, time) as sensor_combined.
 
     Rates are stored in single precision and stamps in whole microseconds, as PX4 does; timestamp_sample is `stamps`
-    and timestamp 400 microseconds later.
+    and timestamp 400 microseconds later. `fifo` are topics `(name, instance, device_id, dt, scale, messages)` with
+    messages `(timestamp_sample, samples, counts (axis, 32))`, in microseconds.
     """
     temperature = np.full((len(gyro), gyro.shape[-1]), 25.0) if temperature is None else temperature
     plain = "uint64_t timestamp;"
@@ -118,6 +126,7 @@ def write_ulog(
         + "uint64_t timestamp_sample;uint32_t device_id;float x;float y;float z;float temperature;",
         "sensor_combined": plain + "float[3] gyro_rad;float[3] accelerometer_m_s2;",
         **dict.fromkeys(other_topics, plain),
+        **dict.fromkeys((topic[0] for topic in fifo), plain + _FIFO),
     }
     log = bytearray(b"\x55\x4c\x6f\x67\x01\x12\x35\x01" + struct.pack("<Q", 0))
     log += _ulog_message("B", bytes(40))
@@ -136,7 +145,12 @@ def write_ulog(
         for stamp, rate in zip((combined[1] // 1000).tolist(), combined[0].T.tolist(), strict=True):
             packets.append((stamp, struct.pack("<HQ6f", number, stamp, *rate, 0.0, 0.0, -9.75)))
         number += 1
-    for identity, name in enumerate(other_topics, number):
+    for identity, (name, instance, device, dt, scale, messages) in enumerate(fifo, number):
+        log += _ulog_message("A", struct.pack("<BH", instance, identity) + name.encode())
+        for stamp, samples, counts in messages:
+            body = struct.pack("<HQQI2fB", identity, stamp + 400, stamp, device, dt, scale, samples)
+            packets.append((stamp, body + np.asarray(counts, "<i2").tobytes()))
+    for identity, name in enumerate(other_topics, number + len(fifo)):
         log += _ulog_message("A", struct.pack("<BH", 0, identity) + name.encode())
         packets.append((0, struct.pack("<HQ", identity, 0)))
     for _, body in sorted(packets):

@@ -49,6 +49,19 @@ EXPECTED = {
         first=[0.0, 0.0, 0.005],
         notes=("apart in time (1 of gyro 0, 1 of gyro 1): read is the longest run of this gyro without a gap, 96 s",),
     ),
+    "px4_fifo.ulg": Expected(
+        rate=8000.0,
+        unit="rad/s",
+        sensors=("x", "y", "z"),
+        axes=(),
+        channels=("acceleration", "temperature"),
+        n_samples=32,
+        first=[1 / 1024, -1 / 1024, 7 / 1024],
+        notes=(
+            "sensor_gyro (1 instances, 400 Hz) is not read: sensor_gyro_fifo has every sample",
+            "acceleration has its own clock (4000 Hz): interpolated linearly to the gyro's samples",
+        ),
+    ),
 }
 
 
