@@ -96,6 +96,60 @@ def _write_messages(
             bag.write(connection, stamp, serialize(message, msgtype))
 
 
+def write_topics(
+    path: Path, topics: Sequence[tuple[str, str, Stamps, Array]], *, frame: str = "link", clock_offset: int = 0
+) -> Path:
+    """Write a bag of topics `(name, type, stamps, values (time, number))`: ROS 1 `.bag`, or a ROS 2 `.db3` or `.mcap`.
+
+    An Imu has six values, rates and accelerations; headers are stamped `clock_offset` nanoseconds after arrival.
+    """
+    from rosbags import rosbag1, rosbag2
+    from rosbags.typesys import Stores, get_typestore
+
+    ros1 = path.suffix == ".bag"
+    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+    serialize: Any = store.serialize_ros1 if ros1 else store.serialize_cdr
+    plugin = rosbag2.StoragePlugin.MCAP if path.suffix == ".mcap" else rosbag2.StoragePlugin.SQLITE3
+    folder = path.with_suffix(".folder")
+    bag: Any = rosbag1.Writer(path) if ros1 else rosbag2.Writer(folder, version=9, storage_plugin=plugin)
+    types = store.types
+    vector, zeros = types["geometry_msgs/msg/Vector3"], np.zeros(9)
+    with bag:
+        connections = [bag.add_connection(name, kind, typestore=store) for name, kind, _, _ in topics]
+        rows = [
+            (stamp, n, row)
+            for n, (_, _, stamps, values) in enumerate(topics)
+            for stamp, row in zip(stamps.tolist(), np.asarray(values, np.float64).tolist(), strict=True)
+        ]
+        for stamp, n, row in sorted(rows):
+            kind = topics[n][1]
+            sec, nanosec = divmod(stamp + clock_offset, 10**9)
+            header = types["std_msgs/msg/Header"](
+                stamp=types["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec),
+                frame_id=frame,
+                **({"seq": 0} if ros1 else {}),
+            )
+            name = kind.rpartition("/")[2]
+            content: dict[str, Any] = {
+                "Imu": lambda row: {
+                    "orientation": types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=0.0),
+                    "orientation_covariance": np.array([-1.0, *zeros[1:]]),
+                    "angular_velocity": vector(*row[:3]),
+                    "angular_velocity_covariance": zeros,
+                    "linear_acceleration": vector(*row[3:]),
+                    "linear_acceleration_covariance": zeros,
+                },
+                "Vector3Stamped": lambda row: {"vector": vector(*row)},
+                "MagneticField": lambda row: {"magnetic_field": vector(*row), "magnetic_field_covariance": zeros},
+                "Temperature": lambda row: {"temperature": row[0], "variance": 0.0},
+                "FluidPressure": lambda row: {"fluid_pressure": row[0], "variance": 0.0},
+            }[name](row)
+            bag.write(connections[n], stamp, serialize(types[kind](header=header, **content), kind))
+    if not ros1:
+        next(folder.glob(f"*{path.suffix}")).replace(path)
+    return path
+
+
 _FIFO = (
     "uint64_t timestamp_sample;uint32_t device_id;float dt;float scale;uint8_t samples;"
     "int16_t[32] x;int16_t[32] y;int16_t[32] z;"

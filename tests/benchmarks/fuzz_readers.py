@@ -127,6 +127,10 @@ def sound_logs(folder: Path) -> list[Path]:
         bag = logs.write_ros2(folder / f"ros2_{mcap}", gyro, stamps, mcap=mcap)
         (file,) = [path for path in Path(bag).iterdir() if path.suffix in (".db3", ".mcap")]
         shutil.copy(file, folder / f"plain{file.suffix}")
+    split = [("/gyro", logs.IMU, stamps, rows.T), ("/accel", logs.IMU, stamps[::3], rows.T[::3] * [[0, 0, 0, 1, 1, 1]])]
+    split.append(("/warm", "sensor_msgs/msg/Temperature", stamps[::7], rows[:1, ::7].T))
+    for suffix in (".bag", ".db3", ".mcap"):
+        logs.write_topics(folder / f"split{suffix}", split)
     return sorted(path for path in folder.iterdir() if path.is_file())
 
 

@@ -62,6 +62,29 @@ EXPECTED = {
             "acceleration has its own clock (4000 Hz): interpolated linearly to the gyro's samples",
         ),
     ),
+    "ros1_realsense.bag": Expected(
+        rate=200.0,
+        unit="rad/s",
+        sensors=("x", "y", "z"),
+        axes=(),
+        channels=("acceleration",),
+        n_samples=20,
+        first=[1 / 64, -0.25, -0.25],
+        notes=(
+            "angular velocities exactly zero throughout in /camera/accel/sample: no gyro",
+            "acceleration has its own clock (62.5 Hz): interpolated linearly to the gyro's samples",
+        ),
+    ),
+    "ros2_vector.mcap": Expected(
+        rate=100.0,
+        unit="rad/s",
+        sensors=("x", "y", "z"),
+        axes=(),
+        channels=("magnetic_field", "pressure", "temperature"),
+        n_samples=20,
+        first=[1 / 64, -0.25, -0.25],
+        notes=("magnetic_field is that of /imu/mag", "temperature is that of /imu/temperature"),
+    ),
 }
 
 
