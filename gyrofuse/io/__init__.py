@@ -21,6 +21,8 @@ _READERS = {
     ".hdf5": "hdf5",
     ".hdf": "hdf5",
     ".ulg": "ulog",
+    ".bin": "dataflash",
+    ".log": "dataflash",
     ".bag": "rosbag",
     ".db3": "rosbag",
     ".mcap": "rosbag",
