@@ -3,7 +3,8 @@
 Each dialect is told by its own marks and gives its columns names that `gyrofuse.io.columns` understands, with their
 units; what it decides is said in a note. Sources: Xsens, MT Low-Level Communication Protocol and Xsens DOT User Manual;
 Analog Devices, ADIS16470/ADIS16490 data sheets (output registers); Betaflight, `blackbox.c` and the CSV export of
-Blackbox Explorer; ROS, `sensor_msgs/Imu` and REP 103 (units).
+Blackbox Explorer; ROS, `sensor_msgs/Imu` and REP 103 (units);
+VectorNav, VN-100 User Manual (uncompensated measurements).
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ def translate(columns: _Columns, names: Sequence[str], settings: Mapping[str, st
     """
     notes: list[str] = []
     dialects: tuple[Callable[[_Columns, Sequence[str], Mapping[str, str]], tuple[_Columns, list[str]]], ...]
-    dialects = (_ros, _xsens, _adis, _betaflight)
+    dialects = (_ros, _xsens, _adis, _betaflight, _vectornav)
     for dialect in dialects:
         columns, said = dialect(columns, names, settings)
         notes += said
@@ -193,6 +194,22 @@ def _betaflight(columns: _Columns, names: Sequence[str], settings: Mapping[str, 
         else:
             result["time (us)" if name == "time" else name] = values
     return result, notes
+
+
+def _vectornav(columns: _Columns, names: Sequence[str], settings: Mapping[str, str]) -> tuple[_Columns, list[str]]:
+    """Measurements before and behind the filter on board, which are not two gyros."""
+    before = {name for name in columns if name.lower().startswith("uncomp")}
+    behind = {name for name in columns if name.lower().startswith(("gyro", "angularrate", "acc", "mag"))} - before
+    if not any("gyro" in name.lower() or "rate" in name.lower() for name in before):
+        return columns, []
+    left = [name for name in behind if not name.lower().startswith("uncomp")]
+    result = {name[6:] if name in before else name: v for name, v in columns.items() if name not in left}
+    if not any(name.lower().startswith(("gyro", "angularrate")) for name in left):
+        return result, []
+    return result, [
+        "measurements named UnComp, without the corrections of the filter on board, are taken, and those with them are "
+        "left out"
+    ]
 
 
 def _scale_of_gyro(settings: Mapping[str, str]) -> tuple[str, float, list[str]]:

@@ -187,6 +187,17 @@ READ = [
     ),
     Sample("vectornav.csv", 200.0, "unknown", FIRST, {ACCELERATION: None, TEMPERATURE: "degC"}),
     Sample(
+        "vectornav_instinct.csv",
+        200.0,
+        "unknown",
+        FIRST,
+        {ACCELERATION: None, TEMPERATURE: None},
+        (
+            "named UnComp, without the corrections of the filter on board, are taken",
+            "'TimeStartup' states no unit: read as ns from its median step",
+        ),
+    ),
+    Sample(
         "microcontroller.csv",
         200.0,
         "deg/s",
