@@ -59,6 +59,11 @@ class TestFineTime:
         notes = [str(note) for note in gf.read_recording(tmp_path / "log.csv").notes]
         assert any("the log states 100 Hz, its timestamps say 200 Hz and are believed" in note for note in notes)
 
+    def test_lost_packets_without_a_clock(self, tmp_path: Path):
+        counts = [65533, 65534, 0, 1, 2, 5, 6]
+        (stream,) = read(tmp_path, "// Update Rate: 50.0Hz", "PacketCounter,Gyr_X", *(f"{count},1" for count in counts))
+        assert 50 * (stream.time - stream.time[0]) == pytest.approx([0, 1, 3, 4, 5, 8, 9])
+
     @pytest.mark.parametrize("mark", ["Update Rate: 100.0Hz", "Firmware Version: 1.0", "Colour: red"])
     def test_no_unit_without_the_marks_of_the_maker(self, tmp_path: Path, mark):
         (stream,) = read(tmp_path, f"// {mark}", "PacketCounter,SampleTimeFine,Gyr_X", *rows(int, lambda i: 100 * i, 1))

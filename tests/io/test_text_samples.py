@@ -52,7 +52,11 @@ READ = [
         "rad/s",
         FIRST,
         {ACCELERATION: "m/s^2"},
-        ("those of MT Manager", "'SampleTimeFine' holds no reading and is left out"),
+        (
+            "those of MT Manager",
+            "there is no clock: samples are placed by PacketCounter at the stated 100 Hz",
+            "'SampleTimeFine' holds no reading and is left out",
+        ),
     ),
     Sample(
         "xsens_dot.csv",
