@@ -53,7 +53,7 @@ _CANONICAL = {spelling: unit for unit, spellings in _SPELLINGS.items() for spell
 _ALIKE = (
     *((sign, "u") for sign in "\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}"),
     *((sign, "deg") for sign in "\N{DEGREE SIGN}\N{MASCULINE ORDINAL INDICATOR}\N{RING ABOVE}"),
-    *((sign, "") for sign in " \N{NO-BREAK SPACE}\N{MIDDLE DOT}\N{DOT OPERATOR}*^_"),
+    *((sign, "") for sign in " \N{NO-BREAK SPACE}\N{MIDDLE DOT}\N{DOT OPERATOR}.*^_"),
     ("\N{SUPERSCRIPT MINUS}\N{SUPERSCRIPT ONE}", "-1"),
     ("\N{SUPERSCRIPT TWO}", "2"),
     ("degrees", "deg"),

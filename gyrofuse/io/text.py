@@ -2,9 +2,11 @@
 
 The delimiter is a comma, or a tab, a semicolon or white space, with which numbers may have a decimal comma. Lines that
 begin with `#`, `%` or `//` are comments, and what stands above the header is skipped; in both, `fs = 100` and
-`unit: deg/s` are understood. A header names the columns as `gyrofuse.io.columns` says, and may be a comment. Without
-one the columns are sensors `"1"`, `"2"`, ..., after a clock where the first alone advances in nearly constant steps.
-An empty cell is NaN. Only columns of numbers with a known name are parsed.
+`unit: deg/s` are understood. A header names the columns as `gyrofuse.io.columns` says, and may be a comment; the line
+below it may hold their units. Without one the columns are sensors `"1"`, `"2"`, ..., after a clock where the first
+alone advances in nearly constant steps. A column of dates or times of day (`gyrofuse.io.dates`) is a clock. An empty
+cell is NaN. Only columns of numbers with a known name are parsed. Files of known loggers are read as
+`gyrofuse.io.text_dialects` says.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from gyrofuse.io.columns import Column, classify_columns
 from gyrofuse.io.dates import DAY, seconds_of
 from gyrofuse.io.limits import LONGEST_NAME, Allowance, enumerated
 from gyrofuse.io.stream import Array, RecordingError, Stream, cause
-from gyrofuse.io.text_dialects import translate
+from gyrofuse.io.text_dialects import NEEDED, translate
 from gyrofuse.io.text_layout import COMMENT, Layout, advances, find_layout, lines_of, quoted_cells, without_numbers
 
 
@@ -85,7 +87,7 @@ def _named(path: Path, layout: Layout, key: str | None, allowance: Allowance) ->
         elif column.name == key or (column.kind == "gyro" and key in (None, column.device)):
             chosen[column.name] = position
             gyros.add(column.kind)
-        elif column.kind not in ("", "gyro"):
+        elif column.kind not in ("", "gyro") or column.name.lower() in NEEDED:
             if layout.numeric[position]:
                 chosen[column.name] = position
             elif column.kind == "time" and position != clock:

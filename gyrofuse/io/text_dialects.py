@@ -3,7 +3,8 @@
 Each dialect is told by its own marks and gives its columns names that `gyrofuse.io.columns` understands, with their
 units; what it decides is said in a note. Sources: Xsens, MT Low-Level Communication Protocol and Xsens DOT User Manual;
 Analog Devices, ADIS16470/ADIS16490 data sheets (output registers); Betaflight, `blackbox.c` and the CSV export of
-Blackbox Explorer; ROS, `sensor_msgs/Imu` and REP 103 (units).
+Blackbox Explorer; ROS, `sensor_msgs/Imu` and REP 103 (units);
+VectorNav, VN-100 User Manual (uncompensated measurements).
 """
 
 from __future__ import annotations
@@ -13,11 +14,14 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from gyrofuse.io.columns import AXES, bare_name
+from gyrofuse.io.columns import AXES, bare_name, classify_columns
+from gyrofuse.io.limits import is_rate
 from gyrofuse.io.stream import Array
 
 _Columns = dict[str, Array]
-_WORD = 2**16  # values of a 16-bit register
+_WORD = 2**16  # values of a 16-bit register, and of the packet counter of Xsens
+# Columns that no name of a sensor or clock tells, and that a dialect needs, in small letters.
+NEEDED = frozenset({"packetcounter"})
 
 _VECTOR, _QUATERNION = AXES, (*AXES, "w")
 _IMU = (
@@ -71,7 +75,7 @@ def translate(columns: _Columns, names: Sequence[str], settings: Mapping[str, st
     """
     notes: list[str] = []
     dialects: tuple[Callable[[_Columns, Sequence[str], Mapping[str, str]], tuple[_Columns, list[str]]], ...]
-    dialects = (_ros, _xsens, _adis, _betaflight)
+    dialects = (_ros, _xsens, _adis, _betaflight, _vectornav)
     for dialect in dialects:
         columns, said = dialect(columns, names, settings)
         notes += said
@@ -97,18 +101,35 @@ def _xsens(columns: _Columns, names: Sequence[str], settings: Mapping[str, str])
     if not {"packetcounter", "sampletimefine"} & {name.lower() for name in names}:
         return columns, []
     stated = {name.lower(): value for name, value in settings.items()}
+    columns, notes = _placed_by_packets(columns, stated.get("update rate") or stated.get("outputrate") or "")
     if "devicetag" in stated:
         unit, who = "deg/s", "an Xsens DOT, whose rates are deg/s"
     elif "mt manager version" in stated or ("update rate" in stated and "firmware version" in stated):
         unit, who = "rad/s", "MT Manager of Xsens, whose rates are rad/s unless its settings were changed"
     else:
-        return columns, []
+        return columns, notes
     units = {"gyr": unit, "acc": "m/s^2"}
     named = {
         f"{name} [{units[name[:3].lower()]}]" if name.lower()[:4] in ("gyr_", "acc_") else name: values
         for name, values in columns.items()
     }
-    return named, [f"the file states no unit; its comments are those of {who}"] if list(named) != list(columns) else []
+    if list(named) != list(columns):
+        notes = [f"the file states no unit; its comments are those of {who}", *notes]
+    return named, notes
+
+
+def _placed_by_packets(columns: _Columns, rate: str) -> tuple[_Columns, list[str]]:
+    """Columns with a clock made of the packet counter where there is no other."""
+    counter = next((name for name in columns if name.lower() == "packetcounter"), None)
+    clocks = [column.name for column in classify_columns(list(columns)) if column.kind == "time"]
+    hertz = float(rate) if rate.replace(".", "", 1).isdigit() else 0.0
+    if counter is None or any(np.isfinite(columns[name]).any() for name in clocks) or not is_rate(hertz):
+        return columns, []
+    wrapped = np.diff(columns[counter], prepend=columns[counter][:1]) < -_WORD // 2
+    seconds = (columns[counter] + _WORD * np.cumsum(wrapped)) / hertz
+    kept = {name: values for name, values in columns.items() if name != counter}
+    note = f"there is no clock: samples are placed by {counter} at the stated {hertz:g} Hz"
+    return {**kept, "packet time [s]": seconds}, [note]
 
 
 def _adis(columns: _Columns, names: Sequence[str], settings: Mapping[str, str]) -> tuple[_Columns, list[str]]:
@@ -193,6 +214,22 @@ def _betaflight(columns: _Columns, names: Sequence[str], settings: Mapping[str, 
         else:
             result["time (us)" if name == "time" else name] = values
     return result, notes
+
+
+def _vectornav(columns: _Columns, names: Sequence[str], settings: Mapping[str, str]) -> tuple[_Columns, list[str]]:
+    """Measurements before and behind the filter on board, which are not two gyros."""
+    before = {name for name in columns if name.lower().startswith("uncomp")}
+    behind = {name for name in columns if name.lower().startswith(("gyro", "angularrate", "acc", "mag"))} - before
+    if not any("gyro" in name.lower() or "rate" in name.lower() for name in before):
+        return columns, []
+    left = [name for name in behind if not name.lower().startswith("uncomp")]
+    result = {name[6:] if name in before else name: v for name, v in columns.items() if name not in left}
+    if not any(name.lower().startswith(("gyro", "angularrate")) for name in left):
+        return result, []
+    return result, [
+        "measurements named UnComp, without the corrections of the filter on board, are taken, and those with them are "
+        "left out"
+    ]
 
 
 def _scale_of_gyro(settings: Mapping[str, str]) -> tuple[str, float, list[str]]:

@@ -52,7 +52,11 @@ READ = [
         "rad/s",
         FIRST,
         {ACCELERATION: "m/s^2"},
-        ("those of MT Manager", "'SampleTimeFine' holds no reading and is left out"),
+        (
+            "those of MT Manager",
+            "there is no clock: samples are placed by PacketCounter at the stated 100 Hz",
+            "'SampleTimeFine' holds no reading and is left out",
+        ),
     ),
     Sample(
         "xsens_dot.csv",
@@ -186,6 +190,17 @@ READ = [
         ("columns z, y, x name no sensor", "'time' states no unit: read as ns in which its readings are dates"),
     ),
     Sample("vectornav.csv", 200.0, "unknown", FIRST, {ACCELERATION: None, TEMPERATURE: "degC"}),
+    Sample(
+        "vectornav_instinct.csv",
+        200.0,
+        "unknown",
+        FIRST,
+        {ACCELERATION: None, TEMPERATURE: None},
+        (
+            "named UnComp, without the corrections of the filter on board, are taken",
+            "'TimeStartup' states no unit: read as ns from its median step",
+        ),
+    ),
     Sample(
         "microcontroller.csv",
         200.0,
