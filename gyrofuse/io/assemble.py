@@ -15,7 +15,7 @@ from gyrofuse._checks import same_rate
 from gyrofuse.io import read_streams
 from gyrofuse.io.align import Placed, align
 from gyrofuse.io.clock import Grid, grid_of, regular_grid
-from gyrofuse.io.columns import AXES
+from gyrofuse.io.columns import AXES, CHANNELS
 from gyrofuse.io.limits import printable
 from gyrofuse.io.notes import Note
 from gyrofuse.io.stream import Array, RecordingError, Stream, unexpected
@@ -45,12 +45,15 @@ def assemble(
     unit: str | None,
     scale: float | None,
     key: str | None,
+    quantity: str,
+    columns: Mapping[str, str] | None,
     mounting: Mapping[str, Any] | str | Path | None,
     max_bytes: float | None,
 ) -> Assembled:
     """Read the logs and put their devices on one grid; arguments and errors as `gyrofuse.read_recording`."""
     source = ", ".join(str(path) for path in paths)
-    streams = _named([(path, read_streams(path, key=key, max_bytes=max_bytes)) for path in paths])
+    read = [(p, read_streams(p, key=key, quantity=quantity, columns=columns, max_bytes=max_bytes)) for p in paths]
+    streams = _named(read)
     streams = _mount([_printable(stream) for stream in streams], mounting, source)
     try:
         return _on_one_grid(streams, source, axis=axis, rate=rate, unit=unit, scale=scale)
@@ -153,7 +156,7 @@ def _mount(streams: list[Stream], mounting: Mapping[str, Any] | str | Path | Non
             )
         rates = matrix @ np.stack([stream.gyro[a] for a in AXES])
         channels = {
-            name: matrix @ values if name in ("acceleration", "magnetic_field") else values
+            name: matrix @ values if name in CHANNELS.values() and values.ndim == 2 else values
             for name, values in stream.channels.items()
         }
         turned.append(replace(stream, gyro=dict(zip(AXES, rates, strict=True)), channels=channels))

@@ -54,7 +54,7 @@ _TEXTS = "nNZ"
 _Table = dict[str, Array]
 
 
-def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) -> list[Stream]:
+def read(path: Path, *, key: str | None = None, quantity: str = "rate", max_bytes: float | None = None) -> list[Stream]:
     """Read the gyros of an ArduPilot log in rad/s, one stream per instance.
 
     Raw samples (`GYR`) are preferred to those of the main loop (`IMU`), and both to batches (`ISBH`, `ISBD`). The

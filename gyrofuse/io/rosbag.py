@@ -45,7 +45,7 @@ _ACCELERATION = ("acceleration", "m/s^2")
 _RATE = re.compile(r"gyr|angular_?(?:vel|rate)|(?:^|[/_])omega", re.IGNORECASE)
 
 
-def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) -> list[Stream]:
+def read(path: Path, *, key: str | None = None, quantity: str = "rate", max_bytes: float | None = None) -> list[Stream]:
     """Read the gyros of a ROS bag in rad/s, one stream per topic of type sensor_msgs/Imu with rates.
 
     A ROS 1 `.bag`, a ROS 2 directory with its `metadata.yaml`, or a `.db3` or `.mcap` file alone; no ROS

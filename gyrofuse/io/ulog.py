@@ -37,7 +37,7 @@ _MOST_READINGS, _FEW_BYTES = 10, 2**26
 _MOST_FIELDS = 2**17
 
 
-def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) -> list[Stream]:
+def read(path: Path, *, key: str | None = None, quantity: str = "rate", max_bytes: float | None = None) -> list[Stream]:
     """Read the gyros of a PX4 ULog file in rad/s, one stream per instance of the topic.
 
     `sensor_gyro_fifo` is preferred, which has every sample. Of the others it is `sensor_gyro`, except where
