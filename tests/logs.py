@@ -6,6 +6,7 @@ nanoseconds; device `i` is named `imu{i}` where the format can say so.
 
 from __future__ import annotations
 
+import shutil
 import struct
 from collections.abc import Sequence
 from pathlib import Path
@@ -147,6 +148,7 @@ def write_topics(
             bag.write(connections[n], stamp, serialize(types[kind](header=header, **content), kind))
     if not ros1:
         next(folder.glob(f"*{path.suffix}")).replace(path)
+        shutil.rmtree(folder)
     return path
 
 

@@ -192,7 +192,7 @@ class TestFifo:
         topic = ("sensor_gyro_fifo", 0, 1000, dt, SCALE, counted())
         (stream,) = ulog.read(fifo_log(tmp_path, topic))
         assert stream.name == "sensor_gyro[0]"
-        assert "sensor_gyro_fifo: no two sound samples; not read" in stream.notes
+        assert "sensor_gyro_fifo has no two sound samples; not read" in stream.notes
         with pytest.raises(
             RecordingError, match=r"a\.ulg: expected messages sensor_gyro_fifo of 1 to 32 samples with a"
         ):
@@ -201,7 +201,10 @@ class TestFifo:
     def test_one_that_was_logged_now_and_then_is_not_read(self, tmp_path):
         (stream,) = ulog.read(fifo_log(tmp_path, ("sensor_gyro_fifo", 0, 1000, 125.0, SCALE, counted()[::5])))
         assert stream.name == "sensor_gyro[0]"
-        assert any("sensor_gyro_fifo: messages that cover 20 % of the time; not read" in n for n in stream.notes)
+        assert any(
+            "sensor_gyro_fifo has messages that cover 20 % of the time, which are read with key" in n
+            for n in stream.notes
+        )
 
     def test_gyros_without_one_are_named(self, tmp_path):
         path = fifo_log(tmp_path, ("sensor_gyro_fifo", 1, 1001, 125.0, SCALE, counted()), n_slow=2)

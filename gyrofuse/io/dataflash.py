@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from array import array
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +45,8 @@ _GYRO_BATCH = 1  # `type` of a batch of rates; 0 are accelerations
 _FARTHEST = 1e15
 # A message is at most 255 bytes long: this much at the end of a log is one that was cut off, or the rest of a page.
 _CUT_OFF = 256
-_LONGEST_LINE = 4096  # bytes; a line with all fields of the longest message has some 700
+# Lines that are read, up to 4096 bytes: one with all fields of the longest message has some 700.
+_LINE = re.compile(rb"^(FMT|IMU[23]?|GYR[123]?|ACC[123]?|ISB[HD])[ \t]{0,9},([^\n]{0,4096})", re.MULTILINE)
 _KEY = re.compile(r"(IMU|GYR|ISBH)(?:\[(\d{1,3})\])?")
 
 _TEXTS = "nNZ"
@@ -102,7 +103,7 @@ def _chosen(
         if streams:
             others = [other for other in there if other != source]
             also = [f"{' and '.join(others)} of the same log not read; choose with key="] if others and not key else []
-            return [_with_notes(stream, (*notes, *also)) for stream in streams]
+            return [replace(stream, notes=(*stream.notes, *notes, *also)) for stream in streams]
     named = "" if key is None else f" named by `key` {key!r}"
     found = enumerated(f"{len(table[''])} of {name}" for name, table in tables.items()) or "none of these messages"
     said = f" ({'; '.join(notes)})" if notes else ""
@@ -110,10 +111,6 @@ def _chosen(
         f"{path}: expected at least two messages of a gyro (IMU, GYR, or ISBH with ISBD){named}, found {found}{said}; "
         "log them (LOG_BITMASK), choose another `key`, or download the log again"
     )
-
-
-def _with_notes(stream: Stream, notes: tuple[str, ...]) -> Stream:
-    return Stream(**{**vars(stream), "notes": (*stream.notes, *notes)})
 
 
 # --- Messages ---------------------------------------------------------------------------------------------------------
@@ -173,6 +170,7 @@ def _binary(content: bytes, allowance: Allowance) -> tuple[dict[str, _Table], li
             # A log declares its kinds once, or again and again in the same words.
             if described != _FMT and (old is None or old.declared != kind.declared):
                 sound = kind.is_sound and kind.dtype.itemsize + 3 == declared["length"]
+                allowance.take("declarations", (_FMT_DTYPE.itemsize,))
                 kinds[described], lengths[described] = kind, int(declared["length"]) if sound else 0
                 starts.pop(described, None)
                 if sound and name in _READ:
@@ -196,7 +194,8 @@ def _binary(content: bytes, allowance: Allowance) -> tuple[dict[str, _Table], li
         for i in kind.fields:
             if kind.letters[i] not in _TEXTS:
                 allowance.take(f"numbers of {kind.name}", rows[f"f{i}"].shape)
-                table[kind.columns[i]] = rows[f"f{i}"].astype(np.float64)
+                with np.errstate(invalid="ignore"):  # damage may make a number that is none in a way NumPy reports
+                    table[kind.columns[i]] = rows[f"f{i}"].astype(np.float64)
         tables[kind.name] = table
     return tables, notes
 
@@ -204,28 +203,25 @@ def _binary(content: bytes, allowance: Allowance) -> tuple[dict[str, _Table], li
 def _text(content: bytes, allowance: Allowance) -> tuple[dict[str, _Table], list[str]]:
     """The messages of a text log that are read, and what is wrong with it."""
     kinds, read = dict[str, _Kind](), list[_Kind]()
-    at, bad, end = 0, 0, len(content)
-    while at < end:
-        stop = content.find(b"\n", at)
-        stop = end if stop < 0 else stop
-        line, at = content[at : min(stop, at + _LONGEST_LINE)], stop + 1
-        name = line[: line.find(b",")].strip().decode("latin-1")
+    bad = 0
+    for found in _LINE.finditer(content):
+        name, rest = found[1].decode("ascii"), found[2]
         if name == "FMT":
-            cells = [cell.strip() for cell in decoded(line).split(",")]
-            if len(cells) > 5 and cells[3] in _READ:
-                kind, old = _Kind(cells[3], cells[4], tuple(cells[5:])), kinds.get(cells[3])
+            cells = [cell.strip() for cell in decoded(rest).split(",")]
+            if len(cells) > 4 and cells[2] in _READ:
+                kind, old = _Kind(cells[2], cells[3], tuple(cells[4:])), kinds.get(cells[2])
                 if kind.is_sound and (old is None or old.declared != kind.declared):
-                    allowance.take("declarations", (_LONGEST_LINE // 8,))
+                    allowance.take("declarations", (len(rest),))
                     kinds[kind.name] = kind
                     read.append(kind)
         elif name in kinds:
             kind = kinds[name]
-            values = line.split(b",")[1:]
+            values = rest.split(b",")
             if len(values) != len(kind.columns):
                 bad += 1
                 continue
             allowance.take(f"messages {name}", (len(kind.fields) + 1,))
-            kind.starts.append(at)
+            kind.starts.append(found.start())
             for i in kind.fields:
                 kind.values.append(_number(values[i]))
     notes = [f"{bad} lines have more or fewer fields than declared and were left out: damage"] if bad else []

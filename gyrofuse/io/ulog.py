@@ -93,7 +93,7 @@ def read(path: Path, *, key: str | None = None, quantity: str = "rate", max_byte
                 f"{path}: expected messages {FIFO} of 1 to {MOST_SAMPLES} samples with a time between them, found "
                 f"{enumerated(dict.fromkeys(damage))}; choose another topic with `key`, or download the log again"
             )
-        notes += [f"{FIFO}: {said}; not read" for said in dict.fromkeys(damage)]
+        notes += [f"{FIFO} has {said}; not read" for said in dict.fromkeys(damage)]
     elif topics[FIFO]:
         notes.append(f"{FIFO} ({len(topics[FIFO])} instances) ignored")
     if key is None:

@@ -84,7 +84,11 @@ def _unrolled(data: Any, allowance: Allowance) -> tuple[Array, Array, float, lis
 
 def doubt(stream: Stream | None, covered: float) -> str:
     """Why an instance of a fifo is not read."""
-    return "no two sound samples" if stream is None else f"messages that cover {100 * covered:.2g} % of the time"
+    return (
+        "no two sound samples"
+        if stream is None
+        else f"messages that cover {100 * covered:.2g} % of the time, which are read with key={FIFO}"
+    )
 
 
 def seconds(fields: Any) -> Array:
