@@ -38,8 +38,8 @@ def test_each_instance_is_a_device(tmp_path):
     assert [stream.name for stream in streams] == ["IMU[0]", "IMU[1]"]
     for instance, stream in enumerate(streams):
         np.testing.assert_array_equal(stream.time, (BOOT + 2500 * np.arange(40) + instance) * 1e-6)
-        np.testing.assert_array_equal(stream.gyro["x"], np.float32(0.1 * np.arange(40)))
-        np.testing.assert_array_equal(stream.gyro["y"], np.full(40, instance))
+        np.testing.assert_array_equal(stream.signal["x"], np.float32(0.1 * np.arange(40)))
+        np.testing.assert_array_equal(stream.signal["y"], np.full(40, instance))
         np.testing.assert_array_equal(stream.channels["acceleration"], np.outer([1, 2, -9.75], np.ones(40)))
         np.testing.assert_array_equal(stream.channels["temperature"], 30.0 + np.arange(40))
         assert stream.unit == "rad/s"
@@ -53,7 +53,7 @@ def test_text_holds_what_the_binary_does(tmp_path):
     text = dataflash.read(write_dataflash(tmp_path / "a.log", messages))
     for one, other in zip(binary, text, strict=True):
         np.testing.assert_allclose(one.time, other.time, rtol=0, atol=1e-9)
-        np.testing.assert_allclose([one.gyro[a] for a in "xyz"], [other.gyro[a] for a in "xyz"], rtol=1e-6)
+        np.testing.assert_allclose([one.signal[a] for a in "xyz"], [other.signal[a] for a in "xyz"], rtol=1e-6)
 
 
 def test_the_content_says_which_of_the_two_it_is(tmp_path):
@@ -65,7 +65,7 @@ def test_older_logs_have_a_message_for_each_sensor(tmp_path):
     messages = [("IMU2", BOOT + 20_000 * k, 0.5, k, 0.0, 0.0, 0.0, -9.75, 0, 0, 41.5, 1, 1) for k in range(30)]
     (stream,) = dataflash.read(write_dataflash(tmp_path / "a.bin", messages))
     assert stream.name == "IMU[1]"
-    np.testing.assert_array_equal(stream.gyro["y"], np.arange(30.0))
+    np.testing.assert_array_equal(stream.signal["y"], np.arange(30.0))
     np.testing.assert_array_equal(stream.channels["temperature"], np.full(30, 41.5))
 
 
@@ -74,7 +74,7 @@ def test_raw_samples_come_before_those_of_the_main_loop(tmp_path):
     (stream,) = dataflash.read(path)
     assert stream.name == "GYR[0]"
     np.testing.assert_allclose(np.diff(stream.time), 500e-6, atol=1e-9)
-    np.testing.assert_array_equal(stream.gyro["x"], 0.25 * np.arange(160))
+    np.testing.assert_array_equal(stream.signal["x"], 0.25 * np.arange(160))
     # Accelerations at half the rate: between two of them lies their mean, after the last one nothing.
     np.testing.assert_allclose(stream.channels["acceleration"][0, :-1], np.arange(159.0), atol=1e-6)
     assert np.isnan(stream.channels["acceleration"][0, -1])
@@ -87,7 +87,7 @@ def test_raw_samples_come_before_those_of_the_main_loop(tmp_path):
 def test_batches_are_unrolled_and_divided_by_their_multiplier(tmp_path):
     (stream,) = dataflash.read(write_dataflash(tmp_path / "a.bin", batches()))
     assert (stream.name, stream.rate) == ("ISBH[0]", 2000.0)
-    np.testing.assert_array_equal(stream.gyro["y"], np.arange(64) / 1000)
+    np.testing.assert_array_equal(stream.signal["y"], np.arange(64) / 1000)
     np.testing.assert_allclose(stream.time, BOOT * 1e-6 + np.arange(64) / 2000, atol=1e-12)
     assert any("apart in time (2 of gyro 0): read is the longest run" in note for note in stream.notes)
 
@@ -96,7 +96,7 @@ def test_a_lost_message_parts_a_batch(tmp_path):
     messages = batches(kinds=[(1, 0)], count=160)
     del messages[2]  # the second of five
     (stream,) = dataflash.read(write_dataflash(tmp_path / "a.bin", messages))
-    np.testing.assert_array_equal(stream.gyro["x"], np.arange(64, 160) / 1000)
+    np.testing.assert_array_equal(stream.signal["x"], np.arange(64, 160) / 1000)
 
 
 def test_batches_that_follow_without_a_gap_are_one_run(tmp_path):
@@ -108,7 +108,7 @@ def test_the_gyro_of_the_batches_is_chosen(tmp_path):
     path = write_dataflash(tmp_path / "a.bin", [*batches([(1, 0), (1, 1)], number=65535), *imu()])
     assert [s.name for s in dataflash.read(path)] == ["IMU[0]", "IMU[1]"]
     (stream,) = dataflash.read(path, key="ISBH[1]")
-    np.testing.assert_array_equal(stream.gyro["z"], (100 + np.arange(64)) / 1000)
+    np.testing.assert_array_equal(stream.signal["z"], (100 + np.arange(64)) / 1000)
 
 
 @pytest.mark.parametrize("wrong", [{"mul": 0}, {"rate": float("nan")}, {"rate": 0.0}, {"count": 0}])

@@ -40,7 +40,7 @@ def test_each_imu_topic_is_a_device(tmp_path, write):
     streams = rosbag.read(write(tmp_path, gyro, stamps, acceleration=acceleration))
     assert [stream.name for stream in streams] == ["/imu0/data", "/imu1/data"]
     for device, stream in enumerate(streams):
-        np.testing.assert_allclose([stream.gyro[a] for a in "xyz"], gyro[device], rtol=0, atol=1e-12)
+        np.testing.assert_allclose([stream.signal[a] for a in "xyz"], gyro[device], rtol=0, atol=1e-12)
         np.testing.assert_allclose(stream.channels["acceleration"], acceleration[device], rtol=0, atol=1e-12)
         np.testing.assert_array_equal(stream.time, seconds(stamps))
         assert stream.unit == "rad/s"
@@ -150,7 +150,7 @@ class TestChannelsOfOtherTopics:
     def test_accelerations_of_a_topic_without_rates(self, tmp_path, suffix):
         (stream,) = rosbag.read(write_topics(tmp_path / f"a{suffix}", [gyro_topic(), accel_topic()]))
         assert stream.name == "/camera/gyro/sample"
-        np.testing.assert_array_equal(stream.gyro["x"], np.arange(1.0, 81))
+        np.testing.assert_array_equal(stream.signal["x"], np.arange(1.0, 81))
         # 5 ms apart, and the ramp ends after 400 ms
         np.testing.assert_allclose(stream.channels["acceleration"][0], 5.0 * np.arange(80), atol=1e-3)
         assert stream.channel_units == {"acceleration": "m/s^2"}
@@ -238,7 +238,7 @@ class TestVectors:
         rates = made_up(1)[0].T
         (stream,) = rosbag.read(write_topics(tmp_path / f"a{suffix}", [(topic, VECTOR, regular_stamps(), rates)]))
         assert (stream.name, stream.unit) == (topic, "rad/s")
-        np.testing.assert_array_equal([stream.gyro[a] for a in "xyz"], rates.T)
+        np.testing.assert_array_equal([stream.signal[a] for a in "xyz"], rates.T)
 
     def test_rates_by_the_frame(self, tmp_path):
         topics = [("/vector", VECTOR, regular_stamps(), made_up(1)[0].T)]

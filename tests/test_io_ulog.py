@@ -27,20 +27,20 @@ def test_each_instance_of_sensor_gyro_is_a_device(tmp_path):
     streams = ulog.read(write_ulog(tmp_path / "a.ulg", gyro, stamps, temperature=temperature))
     assert [stream.name for stream in streams] == ["sensor_gyro[0]", "sensor_gyro[1]", "sensor_gyro[2]"]
     for device, stream in enumerate(streams):
-        np.testing.assert_allclose([stream.gyro[a] for a in "xyz"], single(gyro[device]), rtol=0, atol=1e-12)
+        np.testing.assert_allclose([stream.signal[a] for a in "xyz"], single(gyro[device]), rtol=0, atol=1e-12)
         np.testing.assert_allclose(stream.time, seconds(stamps), rtol=0, atol=1e-12)
         np.testing.assert_allclose(stream.channels["temperature"], single(temperature[device]), rtol=0, atol=1e-12)
         assert stream.unit == "rad/s"
         assert stream.channel_units == {"temperature": "degC"}
         assert f"device_id {1000 + device}" in stream.notes
-        assert stream.gyro["x"].dtype == stream.time.dtype == np.float64
+        assert stream.signal["x"].dtype == stream.time.dtype == np.float64
 
 
 def test_a_not_a_number_is_kept(tmp_path):
     gyro = made_up(1)
     gyro[0, 1, 7] = np.nan
     (stream,) = ulog.read(write_ulog(tmp_path / "a.ulg", gyro, regular_stamps()))
-    np.testing.assert_array_equal(np.flatnonzero(np.isnan(stream.gyro["y"])), [7])
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(stream.signal["y"])), [7])
 
 
 def test_sensor_combined_replaces_a_thinned_sensor_gyro(tmp_path):
@@ -48,7 +48,7 @@ def test_sensor_combined_replaces_a_thinned_sensor_gyro(tmp_path):
     path = write_ulog(tmp_path / "a.ulg", made_up(2, 5), regular_stamps(5, rate=1), combined=(combined, stamps))
     (stream,) = ulog.read(path)
     assert stream.name == "sensor_combined[0]"
-    np.testing.assert_allclose([stream.gyro[a] for a in "xyz"], single(combined), rtol=0, atol=1e-12)
+    np.testing.assert_allclose([stream.signal[a] for a in "xyz"], single(combined), rtol=0, atol=1e-12)
     np.testing.assert_allclose(stream.time, stamps // 1000 / 1e6, rtol=0, atol=1e-12)
     np.testing.assert_array_equal(stream.channels["acceleration"], np.outer([0, 0, -9.75], np.ones(60)))
     assert any("sensor_gyro (2 instances) was logged at 1 Hz only" in note for note in stream.notes)
@@ -77,7 +77,7 @@ def test_a_log_cut_off_in_flight_is_read_up_to_the_cut(tmp_path):
     path.write_bytes(path.read_bytes()[:-500])
     (stream,) = ulog.read(path)
     assert 0 < stream.n_samples < 60
-    np.testing.assert_array_equal(stream.gyro["z"], single(gyro[0, 2, : stream.n_samples]))
+    np.testing.assert_array_equal(stream.signal["z"], single(gyro[0, 2, : stream.n_samples]))
 
 
 def test_damage_in_the_middle_is_noted_and_nothing_is_printed(tmp_path, capsys):
@@ -144,9 +144,9 @@ class TestFifo:
         path = fifo_log(tmp_path, ("sensor_gyro_fifo", 0, 1000, 125.0, SCALE, counted()))
         (stream,) = ulog.read(path)
         assert (stream.name, stream.unit, stream.n_samples) == ("sensor_gyro_fifo[0]", "rad/s", 200)
-        np.testing.assert_array_equal(stream.gyro["x"], SCALE * np.arange(200))
-        np.testing.assert_array_equal(stream.gyro["y"], -SCALE * np.arange(200))
-        np.testing.assert_array_equal(stream.gyro["z"], np.full(200, SCALE * 7))
+        np.testing.assert_array_equal(stream.signal["x"], SCALE * np.arange(200))
+        np.testing.assert_array_equal(stream.signal["y"], -SCALE * np.arange(200))
+        np.testing.assert_array_equal(stream.signal["z"], np.full(200, SCALE * 7))
         np.testing.assert_allclose(stream.time, (MICROSECONDS // 1000 + 125 * np.arange(200)) * 1e-6, rtol=0, atol=1e-6)
         assert "device_id 1000" in stream.notes
         assert any("sensor_gyro (1 instances, 100 Hz) is not read" in note for note in stream.notes)
@@ -227,7 +227,7 @@ def test_a_flight_with_one_gyro():
     fields = ULog(str(path)).get_dataset("sensor_combined").data
     assert stream.n_samples == 17070
     for i, axis in enumerate("xyz"):
-        np.testing.assert_array_equal(stream.gyro[axis], fields[f"gyro_rad[{i}]"])
+        np.testing.assert_array_equal(stream.signal[axis], fields[f"gyro_rad[{i}]"])
     np.testing.assert_allclose(stream.time * 1e6, fields["timestamp"], rtol=0, atol=1e-6)
     assert "the logger reports 4 dropouts, 119 ms in total" in stream.notes
 

@@ -164,7 +164,7 @@ def _group(
         streams.append(
             Stream(
                 name=sensor or device or stem,
-                gyro=rates,
+                signal=rates,
                 unit=unit,
                 time=time,
                 rate=rate,

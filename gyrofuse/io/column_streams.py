@@ -146,7 +146,7 @@ def streams_from_columns(
         streams.append(
             Stream(
                 name=device or name,
-                gyro=gyro,
+                signal=gyro,
                 unit=next((u for u in units if u), unit),
                 time=seconds,
                 rate=rate,

@@ -280,7 +280,7 @@ def _instances(source: str, tables: Mapping[str, _Table], notes: list[str]) -> l
         streams.append(
             Stream(
                 name=f"{source}[{instance}]",
-                gyro={axis: table[name] for axis, name in zip(AXES, _RATES, strict=True)},
+                signal={axis: table[name] for axis, name in zip(AXES, _RATES, strict=True)},
                 unit="rad/s",
                 time=table["time"],
                 channels=channels,
@@ -373,7 +373,7 @@ def _batch(tables: Mapping[str, _Table], allowance: Allowance) -> list[Stream]:
         streams.append(
             Stream(
                 name=f"ISBH[{instance}]",
-                gyro=dict(zip(AXES, values[:, run], strict=True)),
+                signal=dict(zip(AXES, values[:, run], strict=True)),
                 unit="rad/s",
                 time=time[run],
                 rate=float(rates[run][0]),

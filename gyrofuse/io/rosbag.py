@@ -260,7 +260,7 @@ class _Messages:
             notes.append(f"{name} is that of {source}{by}" + (f"; {note}" if note else ""))
         return Stream(
             name=topic,
-            gyro=dict(zip("xyz", table[:3], strict=True)),
+            signal=dict(zip("xyz", table[:3], strict=True)),
             unit="rad/s",
             time=time,
             channels=channels,

@@ -182,7 +182,7 @@ def _stream(data: Any, notes: list[str]) -> Stream:
     device = [f"device_id {data.data['device_id'][0]}"] if "device_id" in fields else []
     return Stream(
         name=f"{data.name}[{data.multi_id}]",
-        gyro={axis: fields[name] for axis, name in zip("xyz", _AXES[data.name], strict=True)},
+        signal={axis: fields[name] for axis, name in zip("xyz", _AXES[data.name], strict=True)},
         unit="rad/s",
         # timestamp_sample is when the sensor measured, timestamp when its driver published; microseconds
         time=fields.get("timestamp_sample", fields["timestamp"]) / 1e6,

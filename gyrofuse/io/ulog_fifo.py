@@ -42,7 +42,7 @@ def fifo_stream(data: Any, log: Any, allowance: Allowance) -> tuple[Stream | Non
     device = [f"device_id {device_of(data)}"] if device_of(data) is not None else []
     stream = Stream(
         name=f"{data.name}[{data.multi_id}]",
-        gyro=dict(zip("xyz", rates, strict=True)),
+        signal=dict(zip("xyz", rates, strict=True)),
         unit="rad/s",
         time=time,
         channels=channels,

@@ -59,7 +59,7 @@ EXPECTED = {
         first=[[1 / 1024], [-1 / 1024], [7 / 1024]],
         notes=(
             "sensor_gyro (1 instances, 400 Hz) is not read: sensor_gyro_fifo has every sample",
-            "acceleration has its own clock (4000 Hz): interpolated linearly to the gyro's samples",
+            "acceleration has its own clock (4000 Hz): interpolated linearly to the signal's samples",
         ),
     ),
     "ros1_realsense.bag": Expected(
@@ -72,7 +72,7 @@ EXPECTED = {
         first=[[1 / 64], [-0.25], [-0.25]],
         notes=(
             "angular velocities exactly zero throughout in /camera/accel/sample: no gyro",
-            "acceleration has its own clock (62.5 Hz): interpolated linearly to the gyro's samples",
+            "acceleration has its own clock (62.5 Hz): interpolated linearly to the signal's samples",
         ),
     ),
     "ros2_vector.mcap": Expected(
