@@ -256,6 +256,78 @@ class TestVectors:
         assert [s.name for s in rosbag.read(path, key="/imu/angular_velocity")] == ["/imu/angular_velocity"]
 
 
+class TestAccelerations:
+    """What is said above of rates holds of accelerations, and the other way round."""
+
+    @every_format
+    def test_each_imu_topic_is_a_device(self, tmp_path, write):
+        gyro, acceleration, stamps = made_up(), made_up(seed=1), regular_stamps()
+        path = write(tmp_path, gyro, stamps, acceleration=acceleration)
+        for device, stream in enumerate(rosbag.read(path, quantity="acceleration")):
+            assert (stream.name, stream.unit) == (f"/imu{device}/data", "m/s^2")
+            np.testing.assert_allclose([stream.signal[a] for a in "xyz"], acceleration[device], rtol=0, atol=1e-12)
+            np.testing.assert_allclose(stream.channels["angular_rate"], gyro[device], rtol=0, atol=1e-12)
+            assert stream.channel_units == {"angular_rate": "rad/s"}
+
+    @every_suffix
+    def test_they_keep_their_own_clock(self, tmp_path, suffix):
+        path = write_topics(tmp_path / f"a{suffix}", [gyro_topic(n=81), accel_topic()])
+        (stream,) = rosbag.read(path, quantity="acceleration")
+        assert (stream.name, stream.unit, stream.n_samples) == ("/camera/accel/sample", "m/s^2", 26)
+        np.testing.assert_allclose(np.diff(stream.time), 16e-3, atol=1e-6)
+        np.testing.assert_array_equal(stream.signal["x"], 16.0 * np.arange(26))
+        # rates 1, 2, 3, ... every 5 ms
+        np.testing.assert_allclose(stream.channels["angular_rate"][0], 1 + 3.2 * np.arange(26), atol=1e-3)
+        assert stream.channel_units == {"angular_rate": "rad/s"}
+        assert "linear accelerations exactly zero throughout in /camera/gyro/sample: no accelerometer" in stream.notes
+        assert any("angular_rate is that of /camera/gyro/sample" in note for note in stream.notes)
+
+    @pytest.mark.parametrize("topic", ["/imu/acceleration", "/multisense/imu/accelerometer_vector", "/imu/acc"])
+    def test_vectors_by_the_name_of_the_topic(self, tmp_path, topic):
+        values = made_up(1)[0].T
+        path = write_topics(tmp_path / "a.mcap", [(topic, VECTOR, regular_stamps(), values)])
+        (stream,) = rosbag.read(path, quantity="acceleration")
+        assert (stream.name, stream.unit) == (topic, "m/s^2")
+        np.testing.assert_array_equal([stream.signal[a] for a in "xyz"], values.T)
+        with pytest.raises(
+            RecordingError, match=r'expected angular velocities .*, found none.*quantity="acceleration"'
+        ):
+            rosbag.read(path)
+
+    def test_an_estimate_without_gravity_is_none(self, tmp_path):
+        topics = [("/filter/free_acceleration", VECTOR, regular_stamps(), made_up(1)[0].T)]
+        with pytest.raises(RecordingError, match=r"expected linear accelerations .*, found none.*`key`"):
+            rosbag.read(write_topics(tmp_path / "a.bag", topics), quantity="acceleration")
+
+    @pytest.mark.parametrize(
+        ("quantity", "name", "channel"),
+        [
+            ("rate", "/imu/angular_velocity", "acceleration"),
+            ("acceleration", "/imu/acceleration", "angular_rate"),
+        ],
+    )
+    def test_vectors_of_both(self, tmp_path, quantity, name, channel):
+        rates, accelerations = made_up(2)
+        topics = [
+            ("/imu/angular_velocity", VECTOR, regular_stamps(), rates.T),
+            ("/imu/acceleration", VECTOR, regular_stamps(), accelerations.T),
+        ]
+        path = write_topics(tmp_path / "a.bag", topics)
+        for key in (None, name):
+            (stream,) = rosbag.read(path, quantity=quantity, key=key)
+            assert (stream.name, list(stream.channels)) == (name, [channel])
+            np.testing.assert_array_equal(stream.channels[channel], accelerations if quantity == "rate" else rates)
+
+    def test_a_bag_of_gyros_says_what_reads_them(self, tmp_path):
+        path = write_topics(tmp_path / "a.bag", [gyro_topic()])
+        with pytest.raises(RecordingError, match=r'expected linear accelerations in .*it has gyros.*quantity="rate"'):
+            rosbag.read(path, quantity="acceleration")
+        path = write_topics(tmp_path / "b.bag", [accel_topic()])
+        with pytest.raises(RecordingError, match=r'expected angular velocities in .*quantity="acceleration"'):
+            rosbag.read(path)
+        assert rosbag.read(path, quantity="acceleration")[0].n_samples == 26
+
+
 def test_the_missing_library_is_named(tmp_path, monkeypatch):
     for module in ("rosbags", "rosbags.rosbag1"):
         monkeypatch.setitem(sys.modules, module, None)

@@ -87,7 +87,8 @@ def streams_from_arrays(
         shapes = {name: getattr(value, "shape", ()) for name, value in content.items()}
         found = enumerated(f"{name} {shape}" for name, shape in shapes.items() if set(shape) - {1}) or "no array"
         wanted = f"an array (sensor, time) with the name of {NAMES_OF[quantity]}" + (f" in {key!r}" if key else "")
-        advice = or_else(classified.values(), quantity, "say with `key` which array holds the sensors")
+        kinds = {column.kind for column in classified.values()}
+        advice = or_else(kinds, quantity, "say with `key` which array holds the sensors")
         raise RecordingError(f"{path}: expected {wanted}, found {found}; {advice}")
     if len(alike) > _MOST_SETS:
         raise RecordingError(

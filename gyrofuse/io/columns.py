@@ -167,10 +167,10 @@ def check_columns(wanted: Mapping[str, str]) -> None:
         raise ValueError(f"`columns`: expected each column once, got {twice!r} twice; give it one name")
 
 
-def or_else(columns: Collection[Column], quantity: str, otherwise: str) -> str:
+def or_else(kinds: Collection[str], quantity: str, otherwise: str) -> str:
     """What to do about a log without the quantity that was asked for: take the other one, where it has that."""
-    kinds = {column.kind for column in columns} - {quantity}
-    return otherwise if kinds.isdisjoint(NAMES_OF) else _INSTEAD[quantity]
+    there = NAMES_OF.keys() & {*kinds}
+    return _INSTEAD[quantity] if there and quantity not in there else otherwise
 
 
 def is_unit(text: str) -> bool:

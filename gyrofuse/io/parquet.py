@@ -80,7 +80,8 @@ def read(
     )
     if not streams or table.num_rows == 0:
         what = f"with the name of {NAMES_OF[quantity]}" if key is None else f"{key!r} (`key`) of numbers"
-        advice = or_else(classify_columns(numbers), quantity, "say with `columns` (--map) what the columns are")
+        found = {column.kind for column in classify_columns(numbers)}
+        advice = or_else(found, quantity, "say with `columns` (--map) what the columns are")
         raise RecordingError(
             f"{path}: expected a column {what}, found {table.num_rows} rows of {enumerated(schema.names)}; {advice}"
         )

@@ -122,7 +122,7 @@ def _named(path: Path, layout: Layout, key: str | None, quantity: str, allowance
         advice = "say with `columns` (--map) what the columns are"
         raise RecordingError(
             f"{path}: expected a column {what}, found {enumerated(layout.names)}; "
-            f"{or_else(columns_there, quantity, advice)}"
+            f"{or_else({column.kind for column in columns_there}, quantity, advice)}"
         )
     if layout.rising and layout.names[0] not in chosen and not any(c.kind == "time" for c in columns_there):
         notes.append(

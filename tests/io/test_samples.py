@@ -86,11 +86,31 @@ EXPECTED = {
         notes=("magnetic_field is that of /imu/mag", "temperature is that of /imu/temperature"),
     ),
 }
+ACCELERATIONS = {
+    "ros1_realsense.bag": Expected(
+        rate=62.5,
+        unit="m/s^2",
+        sensors=("/camera/accel/sample",),
+        axes=("x", "y", "z"),
+        channels=("angular_rate",),
+        n_samples=7,
+        first=[[0.0], [0.25], [-9.75]],
+        notes=(
+            "linear accelerations exactly zero throughout in /camera/gyro/sample: no accelerometer",
+            "angular_rate has its own clock (200 Hz): interpolated linearly to the signal's samples",
+        ),
+    ),
+}
+ROWS = [
+    *((name, "rate", expected) for name, expected in EXPECTED.items()),
+    *((name, "acceleration", expected) for name, expected in ACCELERATIONS.items()),
+]
 
 
-@pytest.mark.parametrize("name", EXPECTED)
-def test_a_sample_of_each_dialect(name: str):
-    recording, expected = gf.read_recording(SAMPLES / name), EXPECTED[name]
+@pytest.mark.parametrize(("name", "quantity", "expected"), ROWS, ids=[f"{name}-{what}" for name, what, _ in ROWS])
+def test_a_sample_of_each_dialect(name: str, quantity: str, expected: Expected):
+    recording = gf.read_recording(SAMPLES / name, quantity=quantity)
+    assert recording.quantity == quantity
     assert recording.rate == pytest.approx(expected.rate, rel=1e-3)
     assert (recording.unit, recording.sensors, recording.axes) == (expected.unit, expected.sensors, expected.axes)
     assert tuple(recording.channels) == expected.channels
