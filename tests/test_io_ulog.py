@@ -218,6 +218,80 @@ class TestFifo:
             ulog.read(path, max_bytes=path.stat().st_size + 5000)
 
 
+class TestAccelerations:
+    """The topics of accelerometers are read as those of gyros are."""
+
+    def test_each_instance_of_sensor_accel_is_a_device(self, tmp_path):
+        values, stamps = made_up(2), regular_stamps(start=MICROSECONDS)
+        streams = ulog.read(
+            write_ulog(tmp_path / "a.ulg", values, stamps, topic="sensor_accel"), quantity="acceleration"
+        )
+        assert [(stream.name, stream.unit) for stream in streams] == [(f"sensor_accel[{i}]", "m/s^2") for i in (0, 1)]
+        for device, stream in enumerate(streams):
+            np.testing.assert_array_equal([stream.signal[a] for a in "xyz"], single(values[device]))
+            np.testing.assert_allclose(stream.time, seconds(stamps), rtol=0, atol=1e-12)
+            assert (list(stream.channels), stream.notes) == (["temperature"], (f"device_id {1000 + device}",))
+
+    def test_sensor_combined_has_the_rates_as_a_channel(self, tmp_path):
+        combined = made_up(1)[0], regular_stamps(rate=200)
+        few = regular_stamps(5, rate=1)
+        path = write_ulog(tmp_path / "a.ulg", made_up(2, 5), few, topic="sensor_accel", combined=combined)
+        (stream,) = ulog.read(path, quantity="acceleration")
+        assert (stream.name, stream.unit) == ("sensor_combined[0]", "m/s^2")
+        np.testing.assert_array_equal([stream.signal[a] for a in "xyz"], np.outer([0, 0, -9.75], np.ones(60)))
+        np.testing.assert_array_equal(stream.channels["angular_rate"], single(combined[0]))
+        assert stream.channel_units == {"angular_rate": "rad/s"}
+        assert any("sensor_accel (2 instances) was logged at 1 Hz only" in note for note in stream.notes)
+        assert len(ulog.read(path, quantity="acceleration", key="sensor_accel")) == 2
+        assert [s.name for s in ulog.read(path, quantity="acceleration", key="sensor_accel[1]")] == ["sensor_accel[1]"]
+
+    def test_accelerations_of_sensor_combined_have_times_of_their_own(self, tmp_path):
+        stamps, late = regular_stamps(rate=200), [-1000] * 60
+        late[7] = 2**31 - 1  # marked as invalid
+        ramp = np.outer([1, 2, 3], np.arange(60.0))
+        path = write_ulog(tmp_path / "a.ulg", made_up(0), stamps, combined=(ramp, stamps), relative=late)
+        (stream,) = ulog.read(path, quantity="acceleration")
+        assert np.flatnonzero(np.isnan(stream.time)).tolist() == [7]
+        others = np.arange(60) != 7
+        np.testing.assert_allclose(stream.time[others], (stamps[others] // 1000 - 1000) / 1e6, rtol=0, atol=1e-6)
+        # a fifth of a step before the rates
+        np.testing.assert_allclose(stream.channels["angular_rate"][0, 1:7], np.arange(1, 7) - 0.2, atol=1e-3)
+        (gyro,) = ulog.read(path)
+        np.testing.assert_array_equal(gyro.channels["acceleration"][2, :59], [-9.75] * 59)
+        assert np.isnan(gyro.channels["acceleration"][2, 59])
+        recording = gf.read_recording(path, quantity="acceleration")
+        assert recording.rate == pytest.approx(200, rel=1e-3)
+        assert recording.missing.max() == pytest.approx(1 / 60)
+
+    def test_every_sample_of_a_fifo(self, tmp_path):
+        path = fifo_log(
+            tmp_path,
+            ("sensor_gyro_fifo", 0, 1000, 125.0, SCALE, counted()),
+            ("sensor_accel_fifo", 0, 1000, 250.0, 1.0, counted(dt=250.0, n_messages=10)),
+            topic="sensor_accel",
+        )
+        (stream,) = ulog.read(path, quantity="acceleration")
+        assert (stream.name, stream.unit, stream.n_samples) == ("sensor_accel_fifo[0]", "m/s^2", 100)
+        np.testing.assert_array_equal(stream.signal["x"], np.arange(100.0))
+        np.testing.assert_allclose(np.diff(stream.time), 250e-6, atol=1e-6)
+        np.testing.assert_allclose(stream.channels["angular_rate"][0, :-1], SCALE * 2 * np.arange(99), atol=1e-5)
+        assert "temperature" in stream.channels
+        assert any("sensor_accel (1 instances, 100 Hz) is not read: sensor_accel_fifo" in n for n in stream.notes)
+
+    @pytest.mark.parametrize(
+        ("quantity", "there", "advice"),
+        [
+            ("acceleration", "sensor_gyro", r'an accelerometer topic \(sensor_accel_fifo or .*gyros.*quantity="rate"'),
+            ("rate", "sensor_accel", r'a gyro topic \(sensor_gyro_fifo or .*accelerations.*quantity="acceleration"'),
+        ],
+    )
+    def test_a_log_of_the_other_sensor_says_what_reads_it(self, tmp_path, quantity, there, advice):
+        path = write_ulog(tmp_path / "a.ulg", made_up(1), regular_stamps(), topic=there)
+        for key in (None, there):
+            with pytest.raises(RecordingError, match=rf"a\.ulg: expected {advice}"):
+                ulog.read(path, quantity=quantity, key=key)
+
+
 @needs_shared
 def test_a_flight_with_one_gyro():
     from pyulog import ULog

@@ -87,6 +87,16 @@ EXPECTED = {
     ),
 }
 ACCELERATIONS = {
+    "px4_fifo.ulg": Expected(
+        rate=4000.0,
+        unit="m/s^2",
+        sensors=("sensor_accel_fifo[0]",),
+        axes=("x", "y", "z"),
+        channels=("angular_rate",),
+        n_samples=16,
+        first=[[0.0], [0.0], [7 / 16]],
+        notes=("angular_rate has its own clock (8000 Hz): interpolated linearly to the signal's samples",),
+    ),
     "ros1_realsense.bag": Expected(
         rate=62.5,
         unit="m/s^2",
