@@ -131,6 +131,60 @@ def test_batches_of_a_text_log_are_refused(tmp_path):
         dataflash.read(write_dataflash(tmp_path / "a.log", batches()))
 
 
+class TestAccelerations:
+    """What is said above of rates holds of accelerations."""
+
+    @pytest.mark.parametrize("suffix", [".bin", ".log"])
+    def test_each_instance_is_a_device(self, tmp_path, suffix):
+        streams = dataflash.read(write_dataflash(tmp_path / f"a{suffix}", imu()), quantity="acceleration")
+        assert [(stream.name, stream.unit) for stream in streams] == [("IMU[0]", "m/s^2"), ("IMU[1]", "m/s^2")]
+        for instance, stream in enumerate(streams):
+            np.testing.assert_array_equal([stream.signal[a] for a in "xyz"], np.outer([1, 2, -9.75], np.ones(40)))
+            np.testing.assert_array_equal(stream.channels["angular_rate"][1], np.full(40, instance))
+            np.testing.assert_array_equal(stream.channels["temperature"], 30.0 + np.arange(40))
+            assert stream.channel_units == {"angular_rate": "rad/s", "temperature": "degC"}
+
+    def test_raw_samples_come_before_those_of_the_main_loop(self, tmp_path):
+        path = write_dataflash(tmp_path / "a.bin", [*raw(161), *imu()])
+        (stream,) = dataflash.read(path, quantity="acceleration")
+        assert (stream.name, stream.unit, stream.n_samples) == ("ACC[0]", "m/s^2", 81)
+        np.testing.assert_allclose(np.diff(stream.time), 1e-3, atol=1e-9)
+        np.testing.assert_array_equal(stream.signal["x"], 2.0 * np.arange(81))
+        np.testing.assert_allclose(stream.channels["angular_rate"][0], 0.5 * np.arange(81), atol=1e-6)
+        assert stream.channel_units["angular_rate"] == "rad/s"
+        assert any("IMU of the same log not read; choose with key=" in note for note in stream.notes)
+        assert [s.name for s in dataflash.read(path, quantity="acceleration", key="IMU[1]")] == ["IMU[1]"]
+
+    def test_batches_of_them(self, tmp_path):
+        path = write_dataflash(tmp_path / "a.bin", batches())
+        (stream,) = dataflash.read(path, quantity="acceleration")
+        assert (stream.name, stream.unit, stream.rate) == ("ISBH[0]", "m/s^2", 2000.0)
+        np.testing.assert_array_equal(stream.signal["y"], (100 + np.arange(64)) / 1000)
+        assert any("(1 of accelerometer 0): read is the longest run of this accelerometer" in n for n in stream.notes)
+
+    @pytest.mark.parametrize(
+        ("quantity", "other", "messages"),
+        [
+            ("rate", "acceleration", [message for message in raw() if message[0] == "ACC"]),
+            ("acceleration", "rate", [message for message in raw() if message[0] == "GYR"]),
+            ("rate", "acceleration", batches([(0, 0)])),
+            ("acceleration", "rate", batches([(1, 0)])),
+        ],
+    )
+    def test_a_log_of_the_other_sensor_says_what_reads_it(self, tmp_path, quantity, other, messages):
+        path = write_dataflash(tmp_path / "a.bin", messages)
+        with pytest.raises(RecordingError, match=rf'two messages of an? (gyro|acc).*quantity="{other}"'):
+            dataflash.read(path, quantity=quantity)
+        (stream,) = dataflash.read(path, quantity=other)
+        assert stream.channels == {}
+
+    @pytest.mark.parametrize(("quantity", "key"), [("rate", "ACC"), ("acceleration", "GYR[0]")])
+    def test_a_key_of_the_other_sensor(self, tmp_path, quantity, key):
+        path = write_dataflash(tmp_path / "a.bin", raw())
+        with pytest.raises(RecordingError, match=r"expected `key` \w+, IMU or ISBH.*which are read with quantity="):
+            dataflash.read(path, quantity=quantity, key=key)
+
+
 class TestDamage:
     def test_bytes_between_are_skipped_and_told(self, tmp_path):
         path = write_dataflash(tmp_path / "a.bin", imu())

@@ -86,7 +86,18 @@ EXPECTED = {
         notes=("magnetic_field is that of /imu/mag", "temperature is that of /imu/temperature"),
     ),
 }
+IMU_ACCELERATIONS = Expected(
+    rate=400.0,
+    unit="m/s^2",
+    sensors=("IMU[0]", "IMU[1]"),
+    axes=("x", "y", "z"),
+    channels=("angular_rate[IMU[0]]", "temperature[IMU[0]]", "angular_rate[IMU[1]]", "temperature[IMU[1]]"),
+    n_samples=10,
+    first=[[0.25, 0.25], [-0.5, -0.5], [-9.75, -9.75]],
+)
 ACCELERATIONS = {
+    "ardupilot_imu.bin": IMU_ACCELERATIONS,
+    "ardupilot_imu.log": IMU_ACCELERATIONS,
     "px4_fifo.ulg": Expected(
         rate=4000.0,
         unit="m/s^2",
