@@ -13,7 +13,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from gyrofuse.io.column_streams import time_in_seconds
 from gyrofuse.io.columns import AXES, CHANNELS, NAMES_OF, TICK, Column, classify_columns, or_else, renamed
 from gyrofuse.io.limits import LONGEST_NAME, decoded, enumerated, is_rate
 from gyrofuse.io.stream import Array, RecordingError, Stream
-from gyrofuse.units import canonical_unit
+from gyrofuse.units import canonical_unit, quantity_of
 
 _RATE = (
     "fs",
@@ -77,17 +77,17 @@ def streams_from_arrays(
     if key is not None:
         classified = _select(classified, key.strip("/"), quantity)
 
+    kinds = {column.kind for column in classified.values()}
     # Gyros of one length and one stated rate and unit share a clock and channels.
     alike: dict[tuple[int, float | None, str], list[str]] = {}
     for name, column in classified.items():
         if column.kind == quantity:
-            unit = column.unit or stated_unit(settings, name)
+            unit = column.unit or stated_unit(settings, name, quantity, kinds)
             alike.setdefault((_length(arrays[name]), stated_rate(settings, name), unit), []).append(name)
     if not alike:
         shapes = {name: getattr(value, "shape", ()) for name, value in content.items()}
         found = enumerated(f"{name} {shape}" for name, shape in shapes.items() if set(shape) - {1}) or "no array"
         wanted = f"an array (sensor, time) with the name of {NAMES_OF[quantity]}" + (f" in {key!r}" if key else "")
-        kinds = {column.kind for column in classified.values()}
         advice = or_else(kinds, quantity, "say with `key` which array holds the sensors")
         raise RecordingError(f"{path}: expected {wanted}, found {found}; {advice}")
     if len(alike) > _MOST_SETS:
@@ -227,9 +227,22 @@ def stated_rate(settings: _Settings, name: str) -> float | None:
     return rate if is_rate(rate) else None
 
 
-def stated_unit(settings: _Settings, name: str) -> str:
-    """Return the unit that is stated nearest to the array `name`, `"unknown"` where there is none."""
-    return canonical_unit(_text(_nearest(settings, name, _UNIT))) or "unknown"
+def stated_unit(settings: _Settings, name: str, quantity: str, kinds: Collection[str]) -> str:
+    """Return the unit that is stated nearest to the array `name`, `"unknown"` where there is none.
+
+    A unit of the other quantity that stands in a group around the array is that of other arrays, if there are any.
+
+    Args:
+        settings: What the file states.
+        name: Of the array, or of the group that holds it.
+        quantity: `"rate"` or `"acceleration"`: what the array is.
+        kinds: What the arrays of the file are.
+    """
+    if own := canonical_unit(_own_unit(settings, name)) if name else "":
+        return own
+    unit = canonical_unit(_text(_nearest(settings, name, _UNIT)))
+    measured = quantity_of(unit)
+    return "unknown" if not unit or (measured != quantity and measured in kinds) else unit
 
 
 def _own_unit(settings: _Settings, name: str) -> str:

@@ -73,7 +73,7 @@ def read(
     streams = streams_from_columns(
         read,
         name=path.stem if key is None else key,
-        unit=stated_unit(settings, ""),
+        unit=stated_unit(settings, "", quantity, {column.kind for column in classify_columns(list(read), quantity)}),
         rate=stated_rate(settings, ""),
         time=time,
         quantity=quantity,

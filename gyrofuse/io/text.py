@@ -69,7 +69,9 @@ def read(
     streams = streams_from_columns(
         table.columns,
         name=path.stem if key is None else key,
-        unit=stated_unit(settings, ""),
+        unit=stated_unit(
+            settings, "", quantity, {column.kind for column in classify_columns(list(table.columns), quantity)}
+        ),
         rate=rate,
         time=table.time,
         clock_period=table.clock_period,
