@@ -1,4 +1,4 @@
-"""Parquet files: columns with the names of gyros."""
+"""Parquet files: columns with the names of gyros or accelerometers."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ def read(
 
     Args:
         path: The file.
-        key: The only column to read as a gyro, whatever its name.
+        key: The only column to read, whatever its name.
         quantity: `"rate"` or `"acceleration"`: the sensors to read.
         columns: What columns are, where their names do not say: columns by the names that they should have; the others
             are left out.
         max_bytes: Memory that the columns may take; by default a quarter of what there is.
 
     Raises:
-        RecordingError: Not a Parquet file, damaged, empty, without gyro data, or too large.
+        RecordingError: Not a Parquet file, damaged, empty, without the quantity asked for, or too large.
         ImportError: pyarrow is not installed.
     """
     try:

@@ -42,14 +42,15 @@ def read(
 
     Args:
         path: The file.
-        key: The only column to read as a gyro, whatever its name, or the only device.
+        key: The only column to read, whatever its name, or the only device.
         quantity: `"rate"` or `"acceleration"`: the sensors to read.
         columns: What columns are, where their names do not say: columns by the names that they should have; the others
             are left out.
         max_bytes: Memory that its numbers may take; by default a quarter of what there is.
 
     Raises:
-        RecordingError: Not text, no rows of numbers, no gyro, a line that does not fit the others, or too large.
+        RecordingError: Not text, no rows of numbers, none of the quantity, a line that does not fit the others, or
+            too large.
     """
     allowance = Allowance(path, max_bytes)
     try:
