@@ -16,6 +16,7 @@ AXES = ("x", "y", "z")
 NAMES_OF = {"rate": "a gyro (gyro_x, gx)", "acceleration": "an accelerometer (acc_x, ax)"}
 # Names of channels by what they hold; of two quantities one is the signal and the other a channel.
 CHANNELS = {kind: kind for kind in ("temperature", "acceleration", "magnetic_field")} | {"rate": "angular_rate"}
+OTHER = {"rate": "acceleration", "acceleration": "rate"}  # of the two quantities
 WORD_OF = {"rate": "gyro", "acceleration": "acceleration"}  # a name that says so
 _INSTEAD = {
     "rate": 'it has accelerations, which are read with quantity="acceleration" (--quantity acceleration)',

@@ -20,7 +20,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from gyrofuse.io.columns import AXES, CHANNELS, or_else
+from gyrofuse.io.columns import AXES, CHANNELS, OTHER, or_else
 from gyrofuse.io.limits import LONGEST_NAME, Allowance, enumerated, is_regular
 from gyrofuse.io.resample import at_samples
 from gyrofuse.io.stream import Array, RecordingError, Stream, cause
@@ -80,7 +80,6 @@ _QUANTITIES = {
         re.compile(r"(?<!free)(?<!free_)accel|(?:^|[/_])acc(?:[/_]|$)", re.IGNORECASE),
     ),
 }
-_OTHER = {"rate": "acceleration", "acceleration": "rate"}
 
 
 def read(path: Path, *, key: str | None = None, quantity: str = "rate", max_bytes: float | None = None) -> list[Stream]:
@@ -239,7 +238,7 @@ def _owned(
 ) -> dict[str, list[tuple[str, str, str, _Messages]]]:
     """For each device the channels of other topics: name, unit, topic and messages."""
     owned: dict[str, list[tuple[str, str, str, _Messages]]] = {topic: [] for topic in devices}
-    beside = _OTHER[quantity]
+    beside = OTHER[quantity]
     for topic, other in sorted(messages.items()):
         if topic in owned or (other.kind not in _CHANNELS and (other.has(quantity) or not other.has(beside))):
             continue
@@ -300,7 +299,7 @@ class _Messages:
         time, notes = self._time()
         frames = enumerated(repr(frame) for frame in self.frames if frame)
         channels, units = {}, {}
-        beside = _OTHER[quantity]
+        beside = OTHER[quantity]
         if self.has(beside):
             channels[CHANNELS[beside]], units[CHANNELS[beside]] = self.of(beside).copy(), _QUANTITIES[beside].unit
         elif beside in self.measured:
