@@ -233,11 +233,14 @@ def merged(path, *bags):
 
 class TestVectors:
     @every_suffix
-    @pytest.mark.parametrize("topic", ["/imu/angular_velocity", "/multisense/imu/gyroscope_vector"])
-    def test_rates_by_the_name_of_the_topic(self, tmp_path, suffix, topic):
+    @pytest.mark.parametrize(
+        ("topic", "unit"), [("/imu/angular_velocity", "rad/s"), ("/multisense/imu/gyroscope_vector", "deg/s")]
+    )
+    def test_rates_by_the_name_of_the_topic(self, tmp_path, suffix, topic, unit):
         rates = made_up(1)[0].T
         (stream,) = rosbag.read(write_topics(tmp_path / f"a{suffix}", [(topic, VECTOR, regular_stamps(), rates)]))
-        assert (stream.name, stream.unit) == (topic, "rad/s")
+        assert (stream.name, stream.unit) == (topic, unit)
+        assert any("as multisense_ros publishes it" in note for note in stream.notes) == (unit == "deg/s")
         np.testing.assert_array_equal([stream.signal[a] for a in "xyz"], rates.T)
 
     def test_rates_by_the_frame(self, tmp_path):
@@ -282,12 +285,15 @@ class TestAccelerations:
         assert "linear accelerations exactly zero throughout in /camera/gyro/sample: no accelerometer" in stream.notes
         assert any("angular_rate is that of /camera/gyro/sample" in note for note in stream.notes)
 
-    @pytest.mark.parametrize("topic", ["/imu/acceleration", "/multisense/imu/accelerometer_vector", "/imu/acc"])
-    def test_vectors_by_the_name_of_the_topic(self, tmp_path, topic):
+    @pytest.mark.parametrize(
+        ("topic", "unit"),
+        [("/imu/acceleration", "m/s^2"), ("/multisense/imu/accelerometer_vector", "g"), ("/imu/acc", "m/s^2")],
+    )
+    def test_vectors_by_the_name_of_the_topic(self, tmp_path, topic, unit):
         values = made_up(1)[0].T
         path = write_topics(tmp_path / "a.mcap", [(topic, VECTOR, regular_stamps(), values)])
         (stream,) = rosbag.read(path, quantity="acceleration")
-        assert (stream.name, stream.unit) == (topic, "m/s^2")
+        assert (stream.name, stream.unit) == (topic, unit)
         np.testing.assert_array_equal([stream.signal[a] for a in "xyz"], values.T)
         with pytest.raises(
             RecordingError, match=r'expected angular velocities .*, found none.*quantity="acceleration"'
@@ -317,6 +323,17 @@ class TestAccelerations:
             (stream,) = rosbag.read(path, quantity=quantity, key=key)
             assert (stream.name, list(stream.channels)) == (name, [channel])
             np.testing.assert_array_equal(stream.channels[channel], accelerations if quantity == "rate" else rates)
+
+    def test_units_of_vectors_that_multisense_publishes(self, tmp_path):
+        rates, accelerations = made_up(2)
+        topics = [
+            ("/multisense/imu/gyroscope_vector", VECTOR, regular_stamps(), rates.T),
+            ("/multisense/imu/accelerometer_vector", VECTOR, regular_stamps(), accelerations.T),
+        ]
+        (stream,) = rosbag.read(write_topics(tmp_path / "a.bag", topics), quantity="acceleration")
+        assert (stream.unit, stream.channel_units) == ("g", {"angular_rate": "deg/s"})
+        assert "/multisense/imu/accelerometer_vector is read in g, as multisense_ros publishes it" in stream.notes
+        assert "/multisense/imu/gyroscope_vector is read in deg/s, as multisense_ros publishes it" in stream.notes
 
     def test_a_bag_of_gyros_says_what_reads_them(self, tmp_path):
         path = write_topics(tmp_path / "a.bag", [gyro_topic()])

@@ -27,6 +27,9 @@ from gyrofuse.io.stream import Array, RecordingError, Stream, cause
 
 _IMU = "sensor_msgs/msg/Imu"
 _VECTOR = "geometry_msgs/msg/Vector3Stamped"
+# Vectors that are in other units than those of an Imu, by the last part of the topic: multisense_ros converts what it
+# puts into an Imu, not what it publishes as vectors (imu.cpp).
+_VECTOR_UNITS = {"gyroscope_vector": "deg/s", "accelerometer_vector": "g"}
 _TIMES = 3  # numbers of a message that are kept beside its values
 # What is kept of a message of each type.
 _VALUES: dict[str, Callable[[Any], tuple[float, ...]]] = {
@@ -51,7 +54,7 @@ class _Quantity:
     Attributes:
         words: What an Imu calls them.
         sensor: What measures them.
-        unit: By the definition of the message.
+        unit: By the definition of an Imu.
         values: Where they stand among those kept of an Imu.
         name: A topic or frame that says of a vector that it is one.
     """
@@ -83,7 +86,7 @@ _QUANTITIES = {
 
 
 def read(path: Path, *, key: str | None = None, quantity: str = "rate", max_bytes: float | None = None) -> list[Stream]:
-    """Read the gyros or accelerometers of a ROS bag in rad/s or m/s^2, one stream per topic of type sensor_msgs/Imu.
+    """Read the gyros or accelerometers of a ROS bag, in rad/s or m/s^2, one stream per topic of type sensor_msgs/Imu.
 
     A ROS 1 `.bag`, a ROS 2 directory with its `metadata.yaml`, or a `.db3` or `.mcap` file alone; no ROS
     installation is needed. Time is that of the message headers, or of arrival at the recorder where these are
@@ -213,6 +216,14 @@ def _named(topic: str, frame: str) -> set[str]:
     return set()
 
 
+def _unit(topic: str, kind: str, quantity: str) -> tuple[str, list[str]]:
+    """The unit of a topic's rates or accelerations, and what is said of it."""
+    unit = _VECTOR_UNITS.get(topic.rpartition("/")[2]) if kind == _VECTOR else None
+    if unit is None:
+        return _QUANTITIES[quantity].unit, []
+    return unit, [f"{topic} is read in {unit}, as multisense_ros publishes it"]
+
+
 def _devices(
     messages: dict[str, _Messages], topics: set[str], key: str | None, quantity: str
 ) -> tuple[list[str], list[str]]:
@@ -242,7 +253,7 @@ def _owned(
     for topic, other in sorted(messages.items()):
         if topic in owned or (other.kind not in _CHANNELS and (other.has(quantity) or not other.has(beside))):
             continue
-        name, unit = _CHANNELS.get(other.kind, (CHANNELS[beside], _QUANTITIES[beside].unit))
+        name, unit = _CHANNELS.get(other.kind) or (CHANNELS[beside], _unit(topic, other.kind, beside)[0])
         owner = max(devices, key=lambda device: _alike(device, topic))  # the first one, where several are as much alike
         owned[owner].append((name, unit, topic, other))
     return owned
@@ -299,24 +310,27 @@ class _Messages:
         time, notes = self._time()
         frames = enumerated(repr(frame) for frame in self.frames if frame)
         channels, units = {}, {}
+        unit, guess = _unit(topic, self.kind, quantity)
+        notes += guess
         beside = OTHER[quantity]
         if self.has(beside):
             channels[CHANNELS[beside]], units[CHANNELS[beside]] = self.of(beside).copy(), _QUANTITIES[beside].unit
         elif beside in self.measured:
             notes.append(f"{_QUANTITIES[beside].words} exactly zero throughout: none measured")
-        for name, unit, source, other in others:
+        for name, own_unit, source, other in others:
             if name in channels:
                 notes.append(f"{name} of {source} is left out beside that of another topic")
                 continue
             times, by = self._common_clock(other)
             values = other.table if other.kind in _CHANNELS else other.of(beside)
             channels[name], note = at_samples(*times, values if len(values) > 1 else values[0], name)
-            units[name] = unit
+            units[name] = own_unit
+            notes += _unit(source, other.kind, beside)[1]
             notes.append(f"{name} is that of {source}{by}" + (f"; {note}" if note else ""))
         return Stream(
             name=topic,
             signal=dict(zip(AXES, self.of(quantity).copy(), strict=True)),
-            unit=_QUANTITIES[quantity].unit,
+            unit=unit,
             time=time,
             channels=channels,
             channel_units=units,
