@@ -240,17 +240,21 @@ def inputs(folder: Path, n_inputs: int, rng: np.random.Generator) -> Iterator[tu
 
 
 def read(log: Path | list[Path], answer: Connection) -> None:
-    """Read a log as this process's last deed, and send how it ended."""
+    """Read a log for both quantities as this process's last deed, and send how it ended."""
     resource.setrlimit(resource.RLIMIT_AS, (BYTES, BYTES))
     path = log[0] if isinstance(log, list) else log
-    ended, said = "read", ""
-    try:
-        recording = gf.read_recording(log, rate=100.0 if path.suffix == ".npy" else None)
-        (str(recording) + json.dumps(recording.to_dict(), allow_nan=False)).encode()
-    except (RecordingError, OSError) as error:
-        ended, said = ("refused" if path.name in str(error) else "nameless"), str(error)
-    except BaseException as error:
-        ended, said = "nameless", f"{type(error).__name__}: {error}"
+    ended, said = "refused", ""
+    for quantity in ("rate", "acceleration"):
+        try:
+            recording = gf.read_recording(log, rate=100.0 if path.suffix == ".npy" else None, quantity=quantity)
+            (str(recording) + json.dumps(recording.to_dict(), allow_nan=False)).encode()
+            ended = "read" if ended == "refused" else ended
+        except (RecordingError, OSError) as error:
+            if path.name not in str(error):
+                ended, said = "nameless", str(error)
+            said = said or str(error)
+        except BaseException as error:
+            ended, said = "nameless", f"{type(error).__name__}: {error}"
     if ended != "nameless" and path.suffix in (".npy", ".npz", ".h5", ".parquet"):
         try:
             gf.open_long(path).read(0, 2)
