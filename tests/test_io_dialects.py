@@ -292,6 +292,10 @@ class TestFlightControllers:
         assert stream.channels["acceleration"][:, 0].tolist() == [100 / 2048, 0, 1]
         assert not says or any(says in note for note in stream.notes)
 
+    def test_a_column_by_its_name(self, tmp_path: Path):
+        (stream,) = read(tmp_path, self.NAMES, *rows(int, lambda i: 125 * i, 30, -20, 100, 0, 2048), key="accSmooth[2]")
+        assert (stream.name, stream.gyro[""].tolist()) == ("accSmooth[2]", [2048.0] * 12)
+
     def test_units_of_the_decoder_are_kept(self, tmp_path: Path):
         names = "loopIteration, time (us), gyroADC[0] (rad/s), " + ", ".join(
             f"accSmooth[{i}] (m/s/s)" for i in range(3)
