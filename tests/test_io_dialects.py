@@ -193,6 +193,14 @@ class TestNames:
         (column, _) = classify_columns([name, "gx"])
         assert (column.kind, column.axis, column.unit) == (kind, axis, unit)
 
+    @pytest.mark.parametrize(
+        ("log", "but"), [("Accelerometer", ", though the log is called Accelerometer"), ("Gyroscope", ""), ("x", "")]
+    )
+    def test_a_log_of_another_sensor(self, tmp_path: Path, log, but):
+        (tmp_path / f"{log}.csv").write_text("seconds_elapsed,z,y,x\n0.0,1,2,3\n0.1,1,2,3\n")
+        (stream,) = text.read(tmp_path / f"{log}.csv")
+        assert stream.notes == (f"columns z, y, x name no sensor and are read as a gyro's{but}",)
+
     def test_p_q_r_beside_a_gyro_are_none(self):
         assert [column.kind for column in classify_columns(["p", "q", "r", "gx"])] == ["", "", "", "gyro"]
         assert [column.kind for column in classify_columns(["p", "q", "T [degC]"])] == ["", "", "temperature"]

@@ -109,14 +109,14 @@ def streams_from_columns(
         by_device.setdefault(column.device, []).append(column)
     devices = list(dict.fromkeys(column.device for column in classified if column.kind == "gyro"))
     clocks = [column for column in classified if column.kind == "time"]
-    still = [column.name for column in clocks if not np.isfinite(columns[column.name]).any()]
+    still = dict.fromkeys(column.name for column in clocks if not np.isfinite(columns[column.name]).any())
     clocks = sorted((column for column in clocks if column.name not in still), key=_remoteness)
     clock_of = {column.device: column for column in reversed(clocks)}  # the nearest to the sample of each device
     notes = [
         *notes,
         *joined,
         *(f"time column '{name}' holds no reading and is left out" for name in still),
-        *_guessed_names(classified),
+        *_guessed_names(classified, name),
     ]
     streams = []
     for device in devices:
@@ -163,14 +163,18 @@ def _remoteness(clock: Column) -> int:
     return 0 if "sample" in name else 1 if "header" in name else 2
 
 
-def _guessed_names(columns: Sequence[Column]) -> list[str]:
-    """What is to be said of gyros whose names do not say so."""
+def _guessed_names(columns: Sequence[Column], log: str) -> list[str]:
+    """What is to be said of gyros whose names do not say so, in a log of some name."""
     names = [column.name for column in columns if column.kind == "gyro"]
     bare = [name for name in names if bare_name(name) in ("p", "q", "r")]
     if bare:
         return [f"columns {', '.join(bare)} are read as the rates about x, y, z, as flight mechanics names them"]
     bare = [name for name in names if bare_name(name) in AXES]
-    return [f"columns {', '.join(bare)} name no sensor and are read as a gyro's"] if bare else []
+    if not bare:
+        return []
+    kind = classify_columns([log])[0].kind
+    but = f", though the log is called {log}" if kind in ("acceleration", "magnetic_field") else ""
+    return [f"columns {', '.join(bare)} name no sensor and are read as a gyro's{but}"]
 
 
 def _joined_clocks(
