@@ -23,30 +23,22 @@ import torch
 import typer
 
 from gyrofuse._checks import check_positive_integer
-from gyrofuse._console import Commands, progress, say, say_table, warn
+from gyrofuse._console import Commands, progress, say, say_table
 from gyrofuse._output import output_folder, write_npz
 from gyrofuse.cli_fleet import fleet
 from gyrofuse.cli_mismatch import diagnose
 from gyrofuse.cli_models import fit, rank
 from gyrofuse.cli_navigation import emulate
+from gyrofuse.cli_reading import Logs, Reading, takes_options
 from gyrofuse.cli_shared import (
-    Axis,
     Force,
     Json,
-    Key,
-    Logs,
     Method,
-    Mounting,
-    Rate,
     Report,
-    Scale,
-    Sensors,
-    Unit,
     agreed_rate,
     agreed_unit,
     at_rest,
     outputs,
-    read,
     read_model,
     say_notes,
     scale_weights_of,
@@ -120,22 +112,18 @@ def _common(
 
 
 @app.command()
+@takes_options
 def info(
+    *,
     logs: Logs,
-    axis: Axis = None,
-    sensors: Sensors = None,
-    rate: Rate = None,
-    unit: Unit = None,
-    scale: Scale = None,
-    key: Key = None,
-    mounting: Mounting = None,
+    reading: Reading,
     json_file: Json = None,
     report: Report = None,
     force: Force = False,
 ) -> None:
     """Show what is in a log: sensors, rate, gaps, units, channels."""
-    with outputs(force, [*logs, mounting], json=json_file, report=report) as drafts:
-        recording = read(logs, axis, sensors, rate, unit, scale, key, mounting)
+    with outputs(force, [*logs, reading.mounting], json=json_file, report=report) as drafts:
+        recording = reading.read(logs)
         if json_file:
             write_json(drafts[json_file], recording.to_dict())
         if report:
@@ -146,7 +134,9 @@ def info(
 
 
 @app.command()
+@takes_options
 def fuse(
+    *,
     logs: Logs,
     scale_weights: Annotated[
         str,
@@ -166,13 +156,7 @@ def fuse(
         str | None,
         typer.Option(metavar="START:STOP", help="Choose the weights on this stretch alone (seconds); fuse all of it."),
     ] = None,
-    axis: Axis = None,
-    sensors: Sensors = None,
-    rate: Rate = None,
-    unit: Unit = None,
-    scale: Scale = None,
-    key: Key = None,
-    mounting: Mounting = None,
+    reading: Reading,
     confidence_level: Annotated[float, typer.Option(metavar="P", help="Of all intervals.")] = 0.95,
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the virtual gyro, .npz (with the weights) or .csv.")
@@ -189,8 +173,13 @@ def fuse(
             f"`--covariance`: {covariance.value} has no use, for --method {method.value} gives no intervals of its "
             "weights; leave the option out, or choose another method"
         )
-    with outputs(force, [*logs, mounting], out=out, figure=figure, json=json_file, report=report) as drafts:
-        recording = read(logs, axis, sensors, rate, unit, scale, key, mounting)
+    with outputs(force, [*logs, reading.mounting], out=out, figure=figure, json=json_file, report=report) as drafts:
+        recording = reading.read(logs)
+        if recording.axes and recording.n_sensors == 1:
+            raise ValueError(
+                f"{titled(logs)}: expected several devices to fuse, found one with the axes {', '.join(recording.axes)}"
+                "; give the logs of all devices of the array"
+            )
         with progress("fusing"):
             part = at_rest(recording, resting)
             result: SVOResult | MultiScaleResult
@@ -230,9 +219,6 @@ def fuse(
                 drafts[report].write_text(page, encoding="utf-8")
         if json_file:
             write_json(drafts[json_file], result.to_dict())
-    for note in recording.notes:
-        if note.kind == "axes":
-            warn(str(note))
     say("\n".join([result.summary(), *remarks]))
     say_notes(recording)
 

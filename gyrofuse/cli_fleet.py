@@ -15,19 +15,13 @@ import typer
 from gyrofuse._checks import check_positive_integer
 from gyrofuse._console import progress_bar, say, warn
 from gyrofuse._workers import begin_imports
+from gyrofuse.cli_reading import FileReading, takes_options
 from gyrofuse.cli_shared import (
-    Axis,
     Force,
     Json,
-    Key,
     Method,
-    Rate,
     Report,
-    Scale,
-    Sensors,
-    Unit,
     files_written,
-    known_unit,
     outputs,
     read_model,
     scale_weights_of,
@@ -56,7 +50,9 @@ class Kind(str, Enum):
     diagnose = "diagnose"
 
 
+@takes_options
 def fleet(
+    *,
     paths: Annotated[
         list[str] | None,
         typer.Argument(metavar="PATH...", help='Logs, folders with logs, and patterns such as "flights/*/imu.npz".'),
@@ -101,12 +97,7 @@ def fleet(
     false_alarm: Annotated[
         float | None, typer.Option(metavar="P", show_default="0.01", help="diagnose: where nothing is missing.")
     ] = None,
-    axis: Axis = None,
-    sensors: Sensors = None,
-    rate: Rate = None,
-    unit: Unit = None,
-    scale: Scale = None,
-    key: Key = None,
+    reading: FileReading,
     json_file: Json = None,
     report: Report = None,
     force: Force = False,
@@ -146,15 +137,7 @@ def fleet(
         if given and kind is not task:
             raise ValueError(f"`{option}`: expected with --task {kind.value} alone, got {task.value}; leave it out")
     asked = _task(task, scale_weights, method, virtual, model, simulation, false_alarm)
-    options: dict[str, Any] = {
-        "axis": axis,
-        "sensors": None if sensors is None else sensors.split(","),
-        "rate": rate,
-        "unit": None if unit is None else known_unit(unit),
-        "scale": scale,
-        "key": key,
-    }
-    options = {name: value for name, value in options.items() if value is not None}
+    options = reading.options
     with outputs(force, [manifest, simulation], json=json_file, report=report) as drafts:
         store = ResultStore(out, asked.columns, {**asked.settings, **options})
         data = GyroArrayDataModule(paths or [], manifest=manifest, group_size=group, **options)

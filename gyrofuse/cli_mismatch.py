@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,23 +11,14 @@ import typer
 
 from gyrofuse._checks import same_rate
 from gyrofuse._console import progress, progress_bar, say
+from gyrofuse.cli_reading import Logs, Reading, takes_options
 from gyrofuse.cli_shared import (
-    Axis,
     Force,
     Json,
-    Key,
-    Logs,
-    Mounting,
-    Rate,
     Report,
-    Scale,
-    Sensors,
-    Unit,
     at_rest,
-    known_unit,
     model_grid,
     outputs,
-    read,
     read_model,
     say_notes,
     stretch,
@@ -35,7 +27,7 @@ from gyrofuse.cli_shared import (
     write_json,
 )
 from gyrofuse.processes import Model
-from gyrofuse.recording import Recording, read_recording
+from gyrofuse.recording import Recording
 from gyrofuse.simulate import ArrayModel
 
 if TYPE_CHECKING:
@@ -43,7 +35,9 @@ if TYPE_CHECKING:
     from gyrofuse.mismatch.repaired import RepairedModel
 
 
+@takes_options
 def diagnose(
+    *,
     logs: Logs,
     simulation: Annotated[
         Path,
@@ -66,13 +60,7 @@ def diagnose(
     rest: Annotated[
         str | None, typer.Option(metavar="START:STOP", help="Diagnose this stretch alone (seconds).")
     ] = None,
-    axis: Axis = None,
-    sensors: Sensors = None,
-    rate: Rate = None,
-    unit: Unit = None,
-    scale: Scale = None,
-    key: Key = None,
-    mounting: Mounting = None,
+    reading: Reading,
     corrected: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the log without what can be taken off it, .npz.")
     ] = None,
@@ -92,13 +80,13 @@ def diagnose(
     """
     resting = stretch(rest)
     asked = {"corrected": corrected, "model-out": model_out, "json": json_file, "report": report}
-    with outputs(force, [*logs, mounting, simulation, judge], **asked) as drafts:
-        recording = _one_axis(read(logs, axis, sensors, rate, unit, scale, key, mounting), titled(logs))
+    with outputs(force, [*logs, reading.mounting, simulation, judge], **asked) as drafts:
+        recording = _one_axis(reading.read(logs), titled(logs))
         recording = _as_the_model(recording, simulation)
-        simulated = _simulation(simulation, recording, axis, sensors, rate, unit)
+        simulated = _simulation(simulation, recording, reading)
         judging = None
         if judge is not None:
-            judging = _one_axis(read([judge], axis, sensors, rate, unit, scale, key, mounting), judge.name)
+            judging = _one_axis(reading.read([judge]), judge.name)
             judging = _as_the_model(judging, simulation)
         part = at_rest(recording, resting)
         names = {
@@ -187,17 +175,15 @@ def _units_taken(recording: Recording, simulation: object, names: tuple[str, str
     return [f"Units: {pair[0]} states none; its numbers are taken as {pair[1]}."]
 
 
-def _simulation(
-    path: Path, recording: Recording, axis: str | None, sensors: str | None, rate: float | None, unit: str | None
-) -> Recording | Model | ArrayModel | RepairedModel:
+def _simulation(path: Path, recording: Recording, reading: Reading) -> Recording | Model | ArrayModel | RepairedModel:
     """What SIM holds: a model, or a recording of the same sensors and axis."""
     if path.suffix.lower() == ".json":
         return read_model(path)
-    with progress("reading"):
-        whole = read_recording(path, rate=rate, unit=None if unit is None else known_unit(unit))
-    if axis is not None and axis in whole.axes:
-        whole = whole.select(axis=axis)
-    names = [] if sensors is None else sensors.split(",")
+    # Its own sensors may be fewer or go by other names, and its numbers are in the unit already.
+    whole = replace(reading, axis=None, sensors=None, scale=None, key=None, columns=None, mounting=None).read([path])
+    if reading.axis is not None and reading.axis in whole.axes:
+        whole = whole.select(axis=reading.axis)
+    names = reading.options.get("sensors", [])
     if whole.n_sensors > recording.n_sensors and set(names) <= set(whole.sensors):
         whole = whole.select(sensors=names or None)
     return _one_axis(whole, path.name)
@@ -215,7 +201,8 @@ def _as_the_model(recording: Recording, path: Path) -> Recording:
 
 
 def _one_axis(recording: Recording, name: str) -> Recording:
-    """The recording `(sensor, time)`."""
+    """The recording `(sensor, time)`: of one axis, or all axes of a single device."""
+    recording = recording.axes_as_sensors()
     if recording.signal.ndim == 2:
         return recording
     if len(recording.axes) == 1:

@@ -11,23 +11,15 @@ from typing import Annotated
 import typer
 
 from gyrofuse._console import progress, say
+from gyrofuse.cli_reading import Logs, Reading, takes_options
 from gyrofuse.cli_shared import (
-    Axis,
     Force,
     Json,
-    Key,
-    Logs,
-    Mounting,
-    Rate,
     Report,
-    Scale,
-    Sensors,
-    Unit,
     at_rest,
     draw,
     files_written,
     outputs,
-    read,
     say_notes,
     stretch,
     titled,
@@ -58,7 +50,9 @@ class Weighting(str, Enum):
     identity = "identity"
 
 
+@takes_options
 def fit(
+    *,
     logs: Logs,
     model: Annotated[
         str, typer.Option(metavar="FORMULA", help='Processes to fit, such as "WN + AR1 + RW" or "WN + 2*AR1 + SIN".')
@@ -75,13 +69,7 @@ def fit(
         typer.Option(metavar="EFF", help="Efficiency of the wavelet variance; below 1, such as 0.6, it is robust."),
     ] = 1.0,
     rest: Annotated[str | None, typer.Option(metavar="START:STOP", help="Fit this stretch alone (seconds).")] = None,
-    axis: Axis = None,
-    sensors: Sensors = None,
-    rate: Rate = None,
-    unit: Unit = None,
-    scale: Scale = None,
-    key: Key = None,
-    mounting: Mounting = None,
+    reading: Reading,
     confidence_level: Annotated[float, typer.Option(metavar="P", help="Of all intervals.")] = 0.95,
     kalibr: Annotated[Path | None, typer.Option(metavar="FILE", help="Write Kalibr's imu.yaml, of one sensor.")] = None,
     kalibr_slow: Annotated[
@@ -105,8 +93,8 @@ def fit(
     if refine and robust < 1:
         raise ValueError("`--refine`: the spectral likelihood is not robust; leave out --refine or --robust")
     asked = {"kalibr": kalibr, "header": header, "model-out": model_out, "figure": figure, "json": json_file}
-    with outputs(force, [*logs, mounting], report=report, **asked) as drafts:
-        recording = read(logs, axis, sensors, rate, unit, scale, key, mounting)
+    with outputs(force, [*logs, reading.mounting], report=report, **asked) as drafts:
+        recording = reading.read(logs)
         with progress("fitting"):
             part = at_rest(recording, resting)
             result = fit_gmwm(
@@ -170,7 +158,9 @@ def _exported(
     return written(_known_model(result, option).with_params(params[0]), recording.rate, recording.unit)
 
 
+@takes_options
 def rank(
+    *,
     logs: Logs,
     candidates: Annotated[
         str | None,
@@ -183,13 +173,7 @@ def rank(
         int | None, typer.Option(metavar="J", help="Number of levels; as many as hold two windows by default.")
     ] = None,
     rest: Annotated[str | None, typer.Option(metavar="START:STOP", help="Rank this stretch alone (seconds).")] = None,
-    axis: Axis = None,
-    sensors: Sensors = None,
-    rate: Rate = None,
-    unit: Unit = None,
-    scale: Scale = None,
-    key: Key = None,
-    mounting: Mounting = None,
+    reading: Reading,
     confidence_level: Annotated[float, typer.Option(metavar="P", help="Of all intervals.")] = 0.95,
     figure: Annotated[
         Path | None,
@@ -206,8 +190,8 @@ def rank(
     """
     resting = stretch(rest)
     formulas = None if candidates is None else [formula.strip() for formula in candidates.split(",")]
-    with outputs(force, [*logs, mounting], figure=figure, json=json_file, report=report) as drafts:
-        recording = read(logs, axis, sensors, rate, unit, scale, key, mounting)
+    with outputs(force, [*logs, reading.mounting], figure=figure, json=json_file, report=report) as drafts:
+        recording = reading.read(logs)
         with progress("ranking"):
             asked = at_rest(recording, resting)
             part, remarks = without_gaps(asked, "Ranked", FEWEST_SAMPLES, _WITH_GAPS)

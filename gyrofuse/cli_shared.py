@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gyrofuse._checks import check_positive, same_rate
-from gyrofuse._console import progress, say_table, warn
+from gyrofuse._console import say_table, warn
 from gyrofuse._output import Outputs
 from gyrofuse.parsing import model_from_dict
 from gyrofuse.processes import Model
-from gyrofuse.recording import Recording, read_recording
+from gyrofuse.recording import Recording
 from gyrofuse.simulate import ArrayModel
-from gyrofuse.units import OTHER_UNITS, RATE_UNITS, canonical_unit
+from gyrofuse.units import KNOWN_UNITS, canonical_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,20 +38,6 @@ _SUFFIXES = {
 
 _NO_MODEL = "expected a model in JSON, as to_dict() of a model gives it"
 
-Logs = Annotated[
-    list[Path],
-    typer.Argument(metavar="LOG...", help="The recording. Several files are one array, aligned on their clocks."),
-]
-Axis = Annotated[str | None, typer.Option(metavar="x|y|z", help="Take this axis alone.")]
-Sensors = Annotated[str | None, typer.Option(metavar="A,B,...", help="Take these sensors alone.")]
-Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Sampling rate, where the log does not say.")]
-Unit = Annotated[str | None, typer.Option(metavar="UNIT", help="Unit of the rates, where the log does not say.")]
-Scale = Annotated[float | None, typer.Option(help="Factor that turns what is logged (counts) into the unit.")]
-Key = Annotated[str | None, typer.Option(metavar="NAME", help="Topic, array, group or column that holds the gyros.")]
-Mounting = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE", help="JSON: for each device by name, the 3x3 matrix to the common frame."),
-]
 Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write what is found as JSON.")]
 Report = Annotated[Path | None, typer.Option(metavar="FILE", help="Write a report, one HTML page.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
@@ -71,37 +57,12 @@ class Method(str, Enum):
     rdvg = "rdvg"
 
 
-def read(
-    logs: Sequence[Path],
-    axis: str | None,
-    sensors: str | None,
-    rate: float | None,
-    unit: str | None,
-    scale: float | None,
-    key: str | None,
-    mounting: Path | None,
-) -> Recording:
-    """Read a log with progress shown."""
-    with progress("reading"):
-        return read_recording(
-            logs,
-            axis=axis,
-            sensors=None if sensors is None else sensors.split(","),
-            rate=rate,
-            unit=None if unit is None else known_unit(unit),
-            scale=scale,
-            key=key,
-            mounting=mounting,
-        )
-
-
 def known_unit(unit: str) -> str:
     """The unit that `--unit` names, in this project's spelling."""
-    known = (*RATE_UNITS, *OTHER_UNITS)
     name = canonical_unit(unit)
-    if name not in known:
+    if name not in KNOWN_UNITS:
         raise ValueError(
-            f"`--unit`: expected one of {', '.join(known)}, got {unit!r}; give one of them, and with --scale the "
+            f"`--unit`: expected one of {', '.join(KNOWN_UNITS)}, got {unit!r}; give one of them, and with --scale the "
             "factor that brings the numbers of the log to it"
         )
     return name
@@ -265,9 +226,9 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
 
 def unit_note(unit: str) -> list[str]:
     """What to say of a unit that no datasheet can be given in."""
-    if unit in (*RATE_UNITS, *OTHER_UNITS, "unknown"):
+    if unit in (*KNOWN_UNITS, "unknown"):
         return []
-    return [f"Unit {unit!r} is none of {', '.join((*RATE_UNITS, *OTHER_UNITS))}: numbers are in it as they stand."]
+    return [f"Unit {unit!r} is none of {', '.join(KNOWN_UNITS)}: numbers are in it as they stand."]
 
 
 def files_written(*paths: Path | None) -> list[str]:

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from gyrofuse import units
 from gyrofuse._checks import check_positive
+from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.processes import (
     AR1,
     Drift,
     Model,
+    Process,
     QuantizationNoise,
     RandomWalk,
     Sinusoid,
@@ -27,12 +31,12 @@ _C_KEYWORDS = set(
 
 
 def to_kalibr(
-    model: Model,
-    rate: float,
-    unit: str,
+    model: Model | GMWMResult,
+    rate: float | None = None,
+    unit: str | None = None,
     *,
     topic: str = "/imu0",
-    accelerometer: Model | None = None,
+    accelerometer: Model | GMWMResult | None = None,
     slow: float = 1.0,
 ) -> str:
     """Write Kalibr's `imu.yaml`, which knows white noise and a random walk only.
@@ -45,36 +49,41 @@ def to_kalibr(
     walk too but for a share of `1 - phi`. Variances of several processes add up. Quantisation noise, tones and drifts
     are left out. Comments in the file say of each process what became of it.
 
+    Of a fit of several axes each key is that of the worst one. Kalibr rejects a density of 0: where a fit found none in
+    any axis, its largest upper limit stands in the file, and a comment says so; where there is none either, as in a
+    model without such a process, the key is left to be filled in.
+
     Args:
-        model: Of a gyro, with scalar parameters; Kalibr takes one for all three axes.
-        rate: Sampling rate, Hz.
-        unit: Rate unit of the model: deg/s, mdeg/s, deg/h, rad/s, mrad/s or rpm, or another spelling of one.
+        model: Of a gyro: a model with scalar parameters, or a fit of one or several axes.
+        rate: Sampling rate, Hz; that of the fit by default.
+        unit: Rate unit of the model: deg/s, mdeg/s, deg/h, rad/s, mrad/s or rpm, or another spelling of one; that of
+            the fit by default.
         topic: ROS topic of the IMU's messages.
-        accelerometer: Model in m/s^2 at the same rate; without it its two keys are left to be filled in.
+        accelerometer: Model in m/s^2 at the same rate, or a fit; without it its two keys are left to be filled in.
         slow: Correlation time from which on an AR(1) counts as a random walk, s.
 
     Returns:
-        Text of the file. Kalibr rejects a density of 0, which is what a model without it gets: fill it in then.
+        Text of the file.
 
     Raises:
-        ValueError: A parameter is to be estimated or batched, an unknown unit, or not an absolute topic name.
+        ValueError: A parameter is to be estimated or batched, an unknown unit or one of the other quantity, no rate or
+            unit, or not an absolute topic name.
 
     References:
         Kalibr, https://github.com/ethz-asl/kalibr/wiki/yaml-formats and IMU-Noise-Model.
     """
-    rate, slow = check_positive("rate", rate), check_positive("slow", slow)
-    radians = units.rate_unit_factor(unit, "rad/s")
-    unit = units.canonical_unit(unit)
+    slow = check_positive("slow", slow)
+    gyroscope = _Triad.of("model", model, rate, unit, "rad/s")
     if not isinstance(topic, str) or not re.fullmatch(r"(/[A-Za-z]\w*)+", topic, re.ASCII):
         raise ValueError(f"`topic`: expected an absolute ROS topic name such as '/imu0', got {topic!r}")
     lines = [
         "# IMU noise for Kalibr. Densities are of continuous time, two-sided.",
         f"# An AR1 with a correlation time of {slow:g} s or more counts as a random walk, any other as white noise.",
         f"rostopic: {topic}",
-        f"update_rate: {_yaml_number(rate)}  # Hz",
+        f"update_rate: {_yaml_number(gyroscope.rate)}  # Hz",
         "",
-        f"# Gyroscope, from a model in {unit} per sample:",
-        *_kalibr_keys("model", model, "gyroscope", rate, slow, radians, ("rad/s/sqrt(Hz)", "rad/s^2/sqrt(Hz)")),
+        f"# Gyroscope, from a model in {gyroscope.unit} per sample:",
+        *_kalibr_keys(gyroscope, "gyroscope", slow, ("rad/s/sqrt(Hz)", "rad/s^2/sqrt(Hz)")),
         "",
     ]
     accelerations = ("m/s^2/sqrt(Hz)", "m/s^3/sqrt(Hz)")
@@ -85,47 +94,123 @@ def to_kalibr(
             f"# accelerometer_random_walk:  # {accelerations[1]}",
         ]
     else:
-        lines.append("# Accelerometer, from a model in m/s^2 per sample:")
-        lines += _kalibr_keys("accelerometer", accelerometer, "accelerometer", rate, slow, 1.0, accelerations)
+        rate, unit = (None, None) if isinstance(accelerometer, GMWMResult) else (gyroscope.rate, "m/s^2")
+        triad = _Triad.of("accelerometer", accelerometer, rate, unit, "m/s^2")
+        lines.append(f"# Accelerometer, from a model in {triad.unit} per sample:")
+        lines += _kalibr_keys(triad, "accelerometer", slow, accelerations)
     return "\n".join(lines) + "\n"
 
 
-def _kalibr_keys(
-    name: str, model: Model, sensor: str, rate: float, slow: float, factor: float, key_units: tuple[str, str]
-) -> Iterator[str]:
+@dataclass(frozen=True)
+class _Triad:
+    """Sensors that Kalibr takes for alike.
+
+    Attributes:
+        models: Of each, with scalar parameters.
+        highest: Likewise, each variance of zero at its upper limit; empty where none are known.
+        rate: Hz.
+        unit: Of the models.
+        factor: From it to Kalibr's.
+        confidence_level: Of the limits.
+    """
+
+    models: tuple[Model, ...]
+    highest: tuple[Model, ...]
+    rate: float
+    unit: str
+    factor: float
+    confidence_level: float = 0.95
+
+    @classmethod
+    def of(cls, name: str, given: Model | GMWMResult, rate: float | None, unit: str | None, target: str) -> _Triad:
+        """Of one model or of all sensors of a fit, in the unit that Kalibr has them in."""
+        if isinstance(given, GMWMResult):
+            rate, unit = (given.rate if rate is None else rate), (unit or given.unit)
+        if rate is None or unit is None:
+            lacking = "rate" if rate is None else "unit"
+            raise ValueError(f"`{lacking}`: expected that of `{name}`, which does not say it, got none; give it")
+        factor = units.unit_factor(unit, target)
+        rate, unit = check_positive("rate", rate), units.canonical_unit(unit)
+        if not isinstance(given, GMWMResult):
+            _check_scalar(name, given)
+            return cls((given,), (), rate, unit, factor)
+        params = given.params.flatten(0, -2)
+        fitted = params.isfinite().all(-1)
+        if not bool(fitted.any()):
+            raise ValueError(f"`{name}`: expected a fit, got one in which no sensor could be fitted")
+        variance = torch.tensor([key.endswith("variance") for key in given.param_names])
+        limits = torch.where(variance & (params == 0), given.confidence_interval.high.flatten(0, -2), params)
+        known = limits.isfinite()
+        models, highest = (
+            tuple(given.model.with_params(row) for row in rows[fitted])
+            for rows in (params, torch.where(known, limits, params))
+        )
+        return cls(models, highest, rate, unit, factor, given.confidence_level)
+
+
+def _kalibr_keys(triad: _Triad, sensor: str, slow: float, key_units: tuple[str, str]) -> Iterator[str]:
     """What became of each process, as comments, and the two keys of a sensor."""
-    _check_scalar(name, model)
+    for number, model in enumerate(triad.models, 1):
+        if len(triad.models) > 1:
+            yield f"#  axis {number}:"
+        yield from (f"#   {process!r}: {_fate(process, triad.rate, slow)}" for process in model.processes)
+    found, limits = (
+        [max(own) * triad.factor for own in zip(*(_densities(m, triad.rate, slow) for m in models), strict=True)]
+        for models in (triad.models, triad.highest or triad.models)
+    )
+    worst = " of the worst axis" if len(triad.models) > 1 else ""
+    keys = [f"{sensor}_{name}" for name in ("noise_density", "random_walk")]
+    for key, density, limit, unit in zip(keys, found, limits, key_units, strict=True):
+        if density:
+            yield f"{key}: {density:.9e}  # {unit}{worst}"
+        elif limit:
+            level = f"{100 * triad.confidence_level:g} %"
+            yield f"{key}: {limit:.9e}  # {unit}; none was found, this is the upper {level} limit{worst}"
+        else:
+            yield f"# {key}:  # {unit}; the model has none, and Kalibr demands a number > 0: fill it in"
+
+
+def _densities(model: Model, rate: float, slow: float) -> tuple[float, float]:
+    """Noise density and random walk of continuous time, in the unit of the model."""
     white = walk = 0.0  # variances per sample, of the samples and of the increments
     for process in model.processes:
         first, *more = process.params.tolist()
         if isinstance(process, WhiteNoise):
             white += first
-            fate = "in the noise density"
         elif isinstance(process, RandomWalk):
             walk += first
-            fate = "in the random walk"
         elif isinstance(process, AR1):
-            time = units.correlation_time(first, rate) if first > 0 else None
-            fate = "no correlation time" if time is None else f"correlation time {time:.4g} s"
-            if time is not None and time >= slow:
+            if _is_slow(first, rate, slow):
                 walk += more[0]
-                fate += ", its innovations in the random walk"
             else:
                 white += more[0] / (1 - first) ** 2
-                fate += ", its density at frequency 0 in the noise density"
-        elif isinstance(process, QuantizationNoise):
-            fate = "left out; it has no density at frequency 0"
-        elif isinstance(process, Sinusoid):
-            fate = f"left out; a tone of {units.tone_frequency(more[0], rate):.6g} Hz"
-        elif isinstance(process, Drift):
-            fate = "left out; a ramp is not noise"
-        else:
-            fate = "left out; Kalibr has no such noise"
-        yield f"#   {process!r}: {fate}"
-    densities = (units.angle_random_walk(white, rate) * factor, units.rate_random_walk(walk, rate) * factor)
-    for key, density, unit in zip(("noise_density", "random_walk"), densities, key_units, strict=True):
-        remark = "" if density else "; the model has none, and Kalibr demands a number > 0: fill it in"
-        yield f"{sensor}_{key}: {density:.9e}  # {unit}{remark}"
+    return units.angle_random_walk(white, rate), units.rate_random_walk(walk, rate)
+
+
+def _is_slow(phi: float, rate: float, slow: float) -> bool:
+    """Whether an AR(1) counts as a random walk."""
+    return phi > 0 and units.correlation_time(phi, rate) >= slow
+
+
+def _fate(process: Process, rate: float, slow: float) -> str:
+    """What becomes of a process."""
+    first, *more = process.params.tolist()
+    if isinstance(process, WhiteNoise):
+        return "in the noise density"
+    if isinstance(process, RandomWalk):
+        return "in the random walk"
+    if isinstance(process, AR1):
+        time = f"correlation time {units.correlation_time(first, rate):.4g} s" if first > 0 else "no correlation time"
+        if _is_slow(first, rate, slow):
+            return f"{time}, its innovations in the random walk"
+        return f"{time}, its density at frequency 0 in the noise density"
+    if isinstance(process, QuantizationNoise):
+        return "left out; it has no density at frequency 0"
+    if isinstance(process, Sinusoid):
+        return f"left out; a tone of {units.tone_frequency(more[0], rate):.6g} Hz"
+    if isinstance(process, Drift):
+        return "left out; a ramp is not noise"
+    return "left out; Kalibr has no such noise"
 
 
 def _yaml_number(value: float) -> str:
@@ -144,14 +229,15 @@ def to_c_header(model: Model, rate: float, unit: str, name: str = "imu_noise") -
     Args:
         model: With scalar parameters.
         rate: Sampling rate, Hz.
-        unit: Rate unit of the model, which the numbers keep: deg/s, mdeg/s, deg/h, rad/s, mrad/s or rpm.
+        unit: Unit of the model, of rate or acceleration, which the numbers keep.
         name: Prefix of everything defined, a C identifier.
 
     Raises:
         ValueError: A parameter is to be estimated or batched, an unknown unit, or `name` is not an identifier.
     """
-    units.rate_unit_factor(unit)
+    units.unit_factor(unit, unit)
     unit = units.canonical_unit(unit)
+    sensor = "an accelerometer" if units.quantity_of(unit) == "acceleration" else "a rate sensor"
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII) or name in _C_KEYWORDS:
         raise ValueError(f"`name`: expected a C identifier that starts with a letter, got {name!r}")
     _check_scalar("model", model)
@@ -159,7 +245,7 @@ def to_c_header(model: Model, rate: float, unit: str, name: str = "imu_noise") -
     capital = name.upper()
     guard = f"{capital}_H_INCLUDED"
     lines = [
-        f"/* Noise of a rate sensor in {unit}, one step per sample at {system.rate:g} Hz:",
+        f"/* Noise of {sensor} in {unit}, one step per sample at {system.rate:g} Hz:",
         *(f"   {process!r}" for process in model.processes),
         "",
         "   x_k = F x_(k-1) + w_k,  w_k ~ N(0, Q)",

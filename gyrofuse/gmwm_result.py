@@ -18,7 +18,7 @@ from gyrofuse.datasheet import Datasheet, datasheet
 from gyrofuse.moment_inference import Inference
 from gyrofuse.processes import Model
 from gyrofuse.uncertainty import chi_square_interval
-from gyrofuse.units import RATE_UNITS
+from gyrofuse.units import DATASHEET_UNITS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -186,7 +186,7 @@ class GMWMResult:
             rows.append(f"  {name:<24}{numbers[0]}  [{numbers[1]}, {numbers[2]}]{note}")
         item = sum(i * step for i, step in zip(index, self.identified.stride(), strict=True))
         rows += [f"  {text}" for text in self.remarks[item]]
-        if self.rate and self.unit in RATE_UNITS:
+        if self.rate and self.unit in DATASHEET_UNITS:
             rows += ["  " + line for line in self.datasheet(index).summary().splitlines()[1:]]
         return rows
 

@@ -18,21 +18,22 @@ from gyrofuse._checks import check_positive, check_signal
 from gyrofuse._output import Outputs, write_npz
 from gyrofuse._result import listed, numbered
 from gyrofuse.io.assemble import assemble
+from gyrofuse.io.columns import WORD_OF, check_columns
 from gyrofuse.io.limits import is_rate
 from gyrofuse.io.notes import Note
-from gyrofuse.units import canonical_unit, rate_unit_factor
+from gyrofuse.units import QUANTITIES, canonical_unit, quantity_of, unit_factor
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """An array of gyros on a uniform grid of time; NaN is a missing sample.
+    """An array of gyros, or of accelerometers, on a uniform grid of time; NaN is a missing sample.
 
     Easy to make by hand: `Recording(signal, rate=100.0, unit="deg/s")`.
 
     Attributes:
         signal: `(sensor, time)`, or `(axis, sensor, time)` when every device has the same axes; float32 or float64.
         rate: Sampling rate in Hz.
-        unit: Unit of the signal: "deg/s", "rad/s", "counts", "unknown".
+        unit: Unit of the signal: "deg/s", "rad/s", "m/s^2", "g", "counts", "unknown".
         sensors: Name of each sensor; "1", "2", ... by default.
         time: `(time,)`, seconds from the first slot of the grid; from the rate by default.
         channels: Auxiliary channels on the same grid, time last: `temperature` (time,), `acceleration` (3, time). A
@@ -40,6 +41,7 @@ class Recording:
         axes: Names along the leading dimension, `("x", "y", "z")`; empty when the signal is `(sensor, time)`.
         source: Files it was read from.
         notes: What was found on reading: gaps, repeats, jitter, offsets, cuts, units.
+        quantity: `"rate"` or `"acceleration"`; by default what the unit says, and rate where it says nothing.
 
     Raises:
         TypeError: `signal` is not a floating point tensor.
@@ -55,6 +57,7 @@ class Recording:
     axes: tuple[str, ...] = ()
     source: tuple[str, ...] = ()
     notes: tuple[Note, ...] = ()
+    quantity: str = ""
 
     def __post_init__(self) -> None:
         check_signal("signal", self.signal)
@@ -63,6 +66,13 @@ class Recording:
         fill(self, "rate", check_positive("rate", self.rate))
         fill(self, "sensors", tuple(self.sensors) or numbered(n_sensors))
         fill(self, "axes", tuple(self.axes))
+        measured = quantity_of(self.unit)
+        fill(self, "quantity", self.quantity or measured or "rate")
+        if self.quantity not in QUANTITIES or measured not in (None, self.quantity):
+            known = repr(measured) if measured else " or ".join(map(repr, QUANTITIES))
+            raise ValueError(
+                f"`quantity`: expected {known} for the unit {self.unit!r}, got {self.quantity!r}; correct one of them"
+            )
         if len(self.sensors) != n_sensors:
             raise ValueError(
                 f"`sensors`: expected {n_sensors} names for shape {tuple(self.signal.shape)}, got {len(self.sensors)}"
@@ -127,6 +137,15 @@ class Recording:
             signal, names = signal[..., which, :], tuple(names[i] for i in which)
         return replace(self, signal=signal, axes=axes, sensors=names)
 
+    def axes_as_sensors(self) -> Recording:
+        """The axes of a single device as sensors `(axis, time)` of one array; any other recording as it is.
+
+        Each axis is judged by itself then; no virtual gyro can be made of them.
+        """
+        if not self.axes or self.n_sensors > 1:
+            return self
+        return replace(self, signal=self.signal[:, 0], sensors=self.axes, axes=())
+
     def between(self, start: float, stop: float) -> Recording:
         """Keep the stretch from `start` to `stop` seconds after the first sample: the part at rest, say.
 
@@ -173,17 +192,18 @@ class Recording:
         )
 
     def to(self, unit: str) -> Recording:
-        """Convert to another unit of rate.
+        """Convert to another unit of rate, or of acceleration.
 
         Raises:
-            ValueError: Either unit is not a known unit of rate.
+            ValueError: Either unit is not a known unit, or they are of different quantities.
         """
-        return replace(self, signal=self.signal * rate_unit_factor(self.unit, unit), unit=canonical_unit(unit))
+        return replace(self, signal=self.signal * unit_factor(self.unit, unit), unit=canonical_unit(unit))
 
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write an .npz that `read_recording` reads back: `gyro`, `fs`, `unit`, `sensors`, `time` and the channels.
 
-        The file appears whole or not at all.
+        Accelerations are written as `acceleration`, and read back with `quantity="acceleration"`. The file appears
+        whole or not at all.
 
         Raises:
             ValueError: The name does not end in .npz.
@@ -193,12 +213,13 @@ class Recording:
         path = Path(path)
         if path.suffix.lower() != ".npz":
             raise ValueError(f"`path`: expected a name that ends in .npz, got {path.name!r}")
-        taken = {"gyro", "fs", "unit", "sensors", "time", "axes"} & {*self.channels}
+        main = WORD_OF[self.quantity]
+        taken = {main, "gyro", "fs", "unit", "sensors", "time", "axes"} & {*self.channels}
         if taken:
             raise ValueError(f"`channels`: the names {', '.join(sorted(taken))} mean something else in a file; rename")
         arrays: dict[str, Any] = {name: values.numpy(force=True) for name, values in self.channels.items()}
         arrays |= {
-            "gyro": self.signal.numpy(force=True),
+            main: self.signal.numpy(force=True),
             "fs": np.float64(self.rate),
             "unit": np.str_(self.unit),
             "sensors": np.array(self.sensors),
@@ -212,8 +233,9 @@ class Recording:
     def summary(self) -> str:
         """What the recording holds, as fixed-width text."""
         shape = f"{self.n_sensors} sensors" + (f" on axes {', '.join(self.axes)}" if self.axes else "")
+        kind = "Recording" if self.quantity == "rate" else "Recording of accelerations"
         lines = [
-            f"Recording of {shape}: {self.n_samples} samples at {self.rate:.6g} Hz ({self.duration:.6g} s), {self.unit}"
+            f"{kind} of {shape}: {self.n_samples} samples at {self.rate:.6g} Hz ({self.duration:.6g} s), {self.unit}"
         ]
         if self.source:
             lines.append(f"from {', '.join(self.source)}")
@@ -236,6 +258,7 @@ class Recording:
             "source": list(self.source),
             "sensors": list(self.sensors),
             "axes": list(self.axes),
+            "quantity": self.quantity,
             "unit": self.unit,
             "rate": self.rate,
             "n_samples": self.n_samples,
@@ -257,15 +280,16 @@ def read_recording(
     unit: str | None = None,
     scale: float | None = None,
     key: str | None = None,
+    quantity: str = "rate",
+    columns: Mapping[str, str] | None = None,
     mounting: Mapping[str, Any] | str | Path | None = None,
     max_bytes: float | None = None,
 ) -> Recording:
     """Read a log, or several logs of one array, onto a uniform grid.
 
-    Devices with the same axes give `(axis, sensor, time)`, or `(sensor, time)` of one `axis`. The axes of a single
-    device are its sensors, which makes sense at rest. The rate comes from the timestamps where there are any. Gaps,
-    repeats, jitter, wraps, offsets between devices and non-finite samples are found and noted; what is missing is
-    NaN, nothing is interpolated.
+    Devices with the same axes give `(axis, sensor, time)`, or `(sensor, time)` of one `axis`. The rate comes from the
+    timestamps where there are any. Gaps, repeats, jitter, wraps, offsets between devices and non-finite samples are
+    found and noted; what is missing is NaN, nothing is interpolated.
 
     Args:
         path: One file, a ROS 2 folder, or several files of one array.
@@ -275,6 +299,9 @@ def read_recording(
         unit: Unit to convert to; where the log states none, the unit that its numbers have.
         scale: Factor that turns the log's numbers (counts) into `unit`.
         key: Which recording inside the file, where it holds several.
+        quantity: `"rate"` for the gyros of the log, `"acceleration"` for its accelerometers.
+        columns: What columns or arrays of the log are, where their names do not say: these by the names that they
+            should have, `{"gyro_x": "u3", "time": "t"}`. Others are left out.
         mounting: Rotation of each device, `{device: 3 x 3 matrix}` or the path of a JSON file of that, which maps its
             axes to those of the array: `v_array = M v_device`.
         max_bytes: Memory in bytes that the numbers of each log may take, as the log declares them, which is compared
@@ -296,11 +323,22 @@ def read_recording(
     twice = next((p for i, p in enumerate(places) if p in places[:i]), None)
     if twice is not None:
         raise ValueError(f"`path`: expected each file once, got {twice} twice; name it once")
-    check_reading(rate=rate, scale=scale)
+    check_reading(rate=rate, scale=scale, quantity=quantity)
+    if columns is not None:
+        check_columns(columns)
     if max_bytes is not None:
         check_positive("max_bytes", max_bytes)
     whole = assemble(
-        paths, axis=axis, rate=rate, unit=unit, scale=scale, key=key, mounting=mounting, max_bytes=max_bytes
+        paths,
+        axis=axis,
+        rate=rate,
+        unit=unit,
+        scale=scale,
+        key=key,
+        quantity=quantity,
+        columns=columns,
+        mounting=mounting,
+        max_bytes=max_bytes,
     )
     recording = Recording(
         torch.from_numpy(whole.signal),
@@ -311,12 +349,15 @@ def read_recording(
         axes=whole.axes,
         source=tuple(p.name for p in paths),
         notes=whole.notes,
+        quantity=quantity_of(whole.unit) or quantity,
     )
     return recording if sensors is None else recording.select(sensors=sensors)
 
 
-def check_reading(*, rate: float | None = None, scale: float | None = None) -> None:
+def check_reading(*, rate: float | None = None, scale: float | None = None, quantity: str = "rate") -> None:
     """Raise `ValueError` where an option of `read_recording` is wrong for any log."""
+    if quantity not in QUANTITIES:
+        raise ValueError(f"`quantity`: expected {' or '.join(map(repr, QUANTITIES))}, got {quantity!r}")
     if rate is not None and not is_rate(check_positive("rate", rate)):
         raise ValueError(f"`rate`: expected a sampling rate of 1e-6 to 1e12 Hz, got {rate!r}")
     if scale is not None and not (math.isfinite(scale) and scale != 0):

@@ -12,7 +12,7 @@ from gyrofuse.model_words import model_method, model_verdict, residuals
 from gyrofuse.plotting_models import plot_residuals
 from gyrofuse.recording import Recording
 from gyrofuse.report_page import image, render
-from gyrofuse.units import RATE_UNITS
+from gyrofuse.units import DATASHEET_UNITS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -113,6 +113,6 @@ def _parameter_rows(result: GMWMResult, index: tuple[int, ...]) -> list[dict[str
 
 
 def _datasheet_rows(result: GMWMResult, index: tuple[int, ...]) -> list[dict[str, Any]]:
-    if not (result.rate and result.unit in RATE_UNITS and _fitted(result, index)):
+    if not (result.rate and result.unit in DATASHEET_UNITS and _fitted(result, index)):
         return []
     return [entry._asdict() for entry in result.datasheet(index).entries]

@@ -1,7 +1,8 @@
-"""Datasheet units: from parameters per sample to those of IEEE Std 952, and back.
+"""Units, and from parameters per sample to those of datasheets (IEEE Std 952 and 1293) and back.
 
-With `rate` in Hz and a rate unit `u` (such as deg/s): per-sample variances are in u^2, angle random walk `N`
-in u/sqrt(Hz), rate random walk `K` in u/s/sqrt(Hz), quantisation `Q` in u s, rate ramp `R` in u/s.
+With `rate` in Hz and a unit `u` of rate or acceleration (such as deg/s): per-sample variances are in u^2, angle random
+walk `N` (of an accelerometer: velocity random walk) in u/sqrt(Hz), rate random walk `K` in u/s/sqrt(Hz), quantisation
+`Q` in u s, rate ramp `R` in u/s.
 """
 
 from __future__ import annotations
@@ -22,9 +23,11 @@ _DEG_PER_S = {
     "rpm": 6.0,
 }
 _M_PER_S2 = {"m/s^2": 1.0, "g": GRAVITY, "mg": 1e-3 * GRAVITY, "ug": 1e-6 * GRAVITY}
-RATE_UNITS = tuple(_DEG_PER_S)
-# Of what else sensors give; no datasheet of a gyroscope speaks in them.
-OTHER_UNITS = (*_M_PER_S2, "counts")
+_SIZES = {"rate": _DEG_PER_S, "acceleration": _M_PER_S2}
+QUANTITIES = tuple(_SIZES)
+RATE_UNITS, ACCELERATION_UNITS = tuple(_DEG_PER_S), tuple(_M_PER_S2)
+DATASHEET_UNITS = (*RATE_UNITS, *ACCELERATION_UNITS)
+KNOWN_UNITS = (*DATASHEET_UNITS, "counts")
 
 # Spellings of a unit after `canonical_unit` has taken off what is a matter of taste: capitals, blanks, the signs of
 # multiplication and powers, which Greek mu, `sec` or `hr` or `degree` in place of `s`, `h`, `deg`.
@@ -76,6 +79,21 @@ def canonical_unit(text: str) -> str:
     for sign, plain in _ALIKE:
         spelling = spelling.replace(sign, plain)
     return _CANONICAL.get(spelling, text.strip())
+
+
+def quantity_of(unit: str) -> str | None:
+    """`"rate"` or `"acceleration"`, `None` of a unit of neither, in any spelling that `canonical_unit` knows."""
+    name = canonical_unit(unit)
+    return next((quantity for quantity, sizes in _SIZES.items() if name in sizes), None)
+
+
+def unit_factor(unit: str, target: str) -> float:
+    """Factor that takes a rate or an acceleration in `unit` to `target`, a unit of the same quantity.
+
+    Raises:
+        ValueError: An unknown unit, or one of the other quantity.
+    """
+    return _factor(_SIZES[quantity_of(target) or "rate"], unit, target)
 
 
 def rate_unit_factor(unit: str, target: str = "deg/s") -> float:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from logs import made_up, regular_stamps, write_hdf5, write_parquet, write_ros2
+from logs import batches, made_up, regular_stamps, write_dataflash, write_hdf5, write_parquet, write_ros2, write_ulog
 
 Log = Path | list[Path]
 CASES: dict[str, tuple[Callable[[Path], Log], str | None]] = {}
@@ -393,6 +393,48 @@ def ulog_of_nested_messages(folder: Path) -> Log:
         log += message("F", f"{name}:{fields}".encode())
     (folder / "a.ulg").write_bytes(log + message("A", struct.pack("<BH", 0, 0) + b"sensor_gyro"))
     return folder / "a.ulg"
+
+
+@case("expected messages sensor_gyro_fifo of 1 to 32 samples with a time between them, found no two sound samples")
+def ulog_of_samples_without_end(folder: Path) -> Log:
+    messages = [(8000 * k, 255, np.zeros((3, 32))) for k in range(50)]
+    topic = ("sensor_gyro_fifo", 0, 1000, 125.0, 1e-3, messages)
+    return write_ulog(folder / "a.ulg", made_up(0), regular_stamps(), fifo=[topic])
+
+
+@case("found messages that cover 1e-31 % of the time, which are read with key=sensor_gyro_fifo")
+def ulog_of_samples_at_no_distance(folder: Path) -> Log:
+    messages = [(8000 * k, 8, np.zeros((3, 32))) for k in range(2)]
+    topic = ("sensor_gyro_fifo", 0, 1000, 1e-30, 1e-3, messages)
+    return write_ulog(folder / "a.ulg", made_up(0), regular_stamps(), fifo=[topic])
+
+
+@case("expected at least two messages of a gyro .*found 1 of ISBH, 1 of ISBD")
+def dataflash_of_batches_without_samples(folder: Path) -> Log:
+    head, data = batches([(1, 0)], count=65535)[:2]
+    return write_dataflash(folder / "a.bin", [head, (*data[:3], 65535, *data[4:])])
+
+
+@case("expected at least two messages of a gyro .*found none of these messages")
+def dataflash_of_declarations(folder: Path) -> Log:
+    head = write_dataflash(folder / "a.bin", []).read_bytes()[: 3 + 1]
+    kinds = [struct.pack("<B4s16s64s", 3 + n % 250, b"IMU", b"QBfff", b"TimeUS,I,GyrX,GyrY,GyrZ") for n in range(10**5)]
+    (folder / "a.bin").write_bytes(b"".join(head[:3] + b"\x0a" + kind for kind in kinds))
+    return folder / "a.bin"
+
+
+@case("expected at least two messages of a gyro .*found none of these messages")
+def dataflash_of_magic(folder: Path) -> Log:
+    (folder / "a.bin").write_bytes(b"\xa3\x95\x80" + b"\xa3\x95" * MANY)
+    return folder / "a.bin"
+
+
+@case(None)
+def dataflash_of_empty_lines(folder: Path) -> Log:
+    inertial = [("IMU", 2500 * k, 0, *GYRO[:, k], 0, 0, -9.75, 0, 0, 30, 1, 1, 0, 0) for k in range(100)]
+    path = write_dataflash(folder / "a.log", inertial)
+    path.write_bytes(path.read_bytes() + b"\n" * 20 * MANY + b"IMU," * MANY)
+    return path
 
 
 @case("expected a log, or a ROS 2 folder with metadata.yaml, found another folder")

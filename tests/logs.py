@@ -6,6 +6,7 @@ nanoseconds; device `i` is named `imu{i}` where the format can say so.
 
 from __future__ import annotations
 
+import shutil
 import struct
 from collections.abc import Sequence
 from pathlib import Path
@@ -96,6 +97,67 @@ def _write_messages(
             bag.write(connection, stamp, serialize(message, msgtype))
 
 
+def write_topics(
+    path: Path, topics: Sequence[tuple[str, str, Stamps, Array]], *, frame: str = "link", clock_offset: int = 0
+) -> Path:
+    """Write a bag of topics `(name, type, stamps, values (time, number))`: ROS 1 `.bag`, or a ROS 2 `.db3` or `.mcap`.
+
+    An Imu has six values, rates and accelerations; headers are stamped `clock_offset` nanoseconds after arrival.
+    """
+    from rosbags import rosbag1, rosbag2
+    from rosbags.typesys import Stores, get_typestore
+
+    ros1 = path.suffix == ".bag"
+    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+    serialize: Any = store.serialize_ros1 if ros1 else store.serialize_cdr
+    plugin = rosbag2.StoragePlugin.MCAP if path.suffix == ".mcap" else rosbag2.StoragePlugin.SQLITE3
+    folder = path.with_suffix(".folder")
+    bag: Any = rosbag1.Writer(path) if ros1 else rosbag2.Writer(folder, version=9, storage_plugin=plugin)
+    types = store.types
+    vector, zeros = types["geometry_msgs/msg/Vector3"], np.zeros(9)
+    with bag:
+        connections = [bag.add_connection(name, kind, typestore=store) for name, kind, _, _ in topics]
+        rows = [
+            (stamp, n, row)
+            for n, (_, _, stamps, values) in enumerate(topics)
+            for stamp, row in zip(stamps.tolist(), np.asarray(values, np.float64).tolist(), strict=True)
+        ]
+        for stamp, n, row in sorted(rows):
+            kind = topics[n][1]
+            sec, nanosec = divmod(stamp + clock_offset, 10**9)
+            header = types["std_msgs/msg/Header"](
+                stamp=types["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec),
+                frame_id=frame,
+                **({"seq": 0} if ros1 else {}),
+            )
+            name = kind.rpartition("/")[2]
+            content: dict[str, Any] = {
+                "Imu": lambda row: {
+                    "orientation": types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=0.0),
+                    "orientation_covariance": np.array([-1.0, *zeros[1:]]),
+                    "angular_velocity": vector(*row[:3]),
+                    "angular_velocity_covariance": zeros,
+                    "linear_acceleration": vector(*row[3:]),
+                    "linear_acceleration_covariance": zeros,
+                },
+                "Vector3Stamped": lambda row: {"vector": vector(*row)},
+                "MagneticField": lambda row: {"magnetic_field": vector(*row), "magnetic_field_covariance": zeros},
+                "Temperature": lambda row: {"temperature": row[0], "variance": 0.0},
+                "FluidPressure": lambda row: {"fluid_pressure": row[0], "variance": 0.0},
+            }[name](row)
+            bag.write(connections[n], stamp, serialize(types[kind](header=header, **content), kind))
+    if not ros1:
+        next(folder.glob(f"*{path.suffix}")).replace(path)
+        shutil.rmtree(folder)
+    return path
+
+
+_FIFO = (
+    "uint64_t timestamp_sample;uint32_t device_id;float dt;float scale;uint8_t samples;"
+    "int16_t[32] x;int16_t[32] y;int16_t[32] z;"
+)
+
+
 def write_ulog(
     path: Path,
     gyro: Array,
@@ -103,13 +165,15 @@ def write_ulog(
     *,
     temperature: Array | None = None,
     combined: tuple[Array, Stamps] | None = None,
+    fifo: Sequence[tuple[str, int, int, float, float, Sequence[tuple[int, int, Any]]]] = (),
     dropouts_ms: Sequence[int] = (),
     other_topics: Sequence[str] = (),
 ) -> Path:
     """Write a PX4 ULog: `gyro` as instances of sensor_gyro, `combined` (axis, time) as sensor_combined.
 
     Rates are stored in single precision and stamps in whole microseconds, as PX4 does; timestamp_sample is `stamps`
-    and timestamp 400 microseconds later.
+    and timestamp 400 microseconds later. `fifo` are topics `(name, instance, device_id, dt, scale, messages)` with
+    messages `(timestamp_sample, samples, counts (axis, 32))`, in microseconds.
     """
     temperature = np.full((len(gyro), gyro.shape[-1]), 25.0) if temperature is None else temperature
     plain = "uint64_t timestamp;"
@@ -118,6 +182,7 @@ def write_ulog(
         + "uint64_t timestamp_sample;uint32_t device_id;float x;float y;float z;float temperature;",
         "sensor_combined": plain + "float[3] gyro_rad;float[3] accelerometer_m_s2;",
         **dict.fromkeys(other_topics, plain),
+        **dict.fromkeys((topic[0] for topic in fifo), plain + _FIFO),
     }
     log = bytearray(b"\x55\x4c\x6f\x67\x01\x12\x35\x01" + struct.pack("<Q", 0))
     log += _ulog_message("B", bytes(40))
@@ -136,7 +201,12 @@ def write_ulog(
         for stamp, rate in zip((combined[1] // 1000).tolist(), combined[0].T.tolist(), strict=True):
             packets.append((stamp, struct.pack("<HQ6f", number, stamp, *rate, 0.0, 0.0, -9.75)))
         number += 1
-    for identity, name in enumerate(other_topics, number):
+    for identity, (name, instance, device, dt, scale, messages) in enumerate(fifo, number):
+        log += _ulog_message("A", struct.pack("<BH", instance, identity) + name.encode())
+        for stamp, samples, counts in messages:
+            body = struct.pack("<HQQI2fB", identity, stamp + 400, stamp, device, dt, scale, samples)
+            packets.append((stamp, body + np.asarray(counts, "<i2").tobytes()))
+    for identity, name in enumerate(other_topics, number + len(fifo)):
         log += _ulog_message("A", struct.pack("<BH", 0, identity) + name.encode())
         packets.append((0, struct.pack("<HQ", identity, 0)))
     for _, body in sorted(packets):
@@ -149,6 +219,66 @@ def write_ulog(
 
 def _ulog_message(kind: str, body: bytes) -> bytes:
     return struct.pack("<HB", len(body), ord(kind)) + body
+
+
+# Layouts of messages of ArduPilot logs: number, letters of the types, fields.
+DATAFLASH = {
+    "IMU": (10, "QBffffffIIfBBHH", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,EG,EA,T,GH,AH,GHz,AHz"),
+    "GYR": (11, "QBQfff", "TimeUS,I,SampleUS,GyrX,GyrY,GyrZ"),
+    "ACC": (12, "QBQfff", "TimeUS,I,SampleUS,AccX,AccY,AccZ"),
+    "ISBH": (13, "QHBBHHQf", "TimeUS,N,type,instance,mul,smp_cnt,SampleUS,smp_rate"),
+    "ISBD": (14, "QHHaaa", "TimeUS,N,seqno,x,y,z"),
+    "IMU2": (15, "QffffffIIfBB", "TimeUS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,ErrG,ErrA,Temp,GyHlt,AcHlt"),
+    "MSG": (16, "QZ", "TimeUS,Message"),
+}
+_PACKED = dict(zip("bBhHiIqQfdZa", "b B h H i I q Q f d 64s 64s".split(), strict=True))
+
+
+def write_dataflash(path: Path, messages: Sequence[tuple[Any, ...]]) -> Path:
+    """Write an ArduPilot log, binary or where the name ends in .log text, of messages `(kind, value of each field...)`.
+
+    A field of letter `a` takes 32 whole numbers.
+    """
+    kinds = {"FMT": (128, "BBnNZ", "Type,Length,Name,Format,Columns")}
+    kinds |= {name: DATAFLASH[name] for name in dict.fromkeys(message[0] for message in messages)}
+    layouts = {name: "<" + "".join(_PACKED.get(c, "") for c in letters) for name, (_, letters, _) in kinds.items()}
+    layouts["FMT"] = "<BB4s16s64s"
+    log, lines = bytearray(), []
+    for name, (number, letters, fields) in kinds.items():
+        size = struct.calcsize(layouts[name]) + 3
+        packed = struct.pack(layouts["FMT"], number, size, name.encode(), letters.encode(), fields.encode())
+        log += b"\xa3\x95\x80" + packed
+        lines.append(f"FMT, {number}, {size}, {name}, {letters}, {fields}")
+    for name, *values in messages:
+        plain = [np.array(v, "<i2").tobytes() if isinstance(v, list) else v for v in values]
+        plain = [v.encode() if isinstance(v, str) else v for v in plain]
+        log += b"\xa3\x95" + bytes([kinds[name][0]]) + struct.pack(layouts[name], *plain)
+        cells = ["[" + " ".join(map(str, v)) + "]" if isinstance(v, list) else f"{v}" for v in values]
+        lines.append(", ".join([name, *cells]))
+    path.write_bytes("\r\n".join([*lines, ""]).encode() if path.suffix == ".log" else log)
+    return path
+
+
+def batches(
+    kinds: Sequence[tuple[int, int]] = ((1, 0), (0, 0), (1, 0)),
+    count: int = 64,
+    mul: int = 1000,
+    rate: float = 2000.0,
+    number: int = 0,
+) -> list[tuple[Any, ...]]:
+    """Return messages of ArduPilot's batch sampler, for `write_dataflash`.
+
+    Batches of (kind, instance), a second apart, the first 5 s after the start: sample `s` of batch `b` is `s + 100 b`
+    counts on every axis.
+    """
+    messages: list[tuple[Any, ...]] = []
+    for b, (kind, instance) in enumerate(kinds):
+        start = 5_000_000 + 1_000_000 * b
+        messages.append(("ISBH", start, (number + b) % 65536, kind, instance, mul, count, start, rate))
+        for s in range(-(-count // 32)):
+            values = [32 * s + j + 100 * b for j in range(32)]
+            messages.append(("ISBD", start + s, (number + b) % 65536, s, values, values, values))
+    return messages
 
 
 def write_parquet(path: Path, columns: dict[str, Any], metadata: dict[str, str] | None = None) -> Path:

@@ -153,14 +153,14 @@ def test_weights_of_a_stretch_at_rest_fuse_everything(run: Run, tmp_path: Path):
 
 
 def test_reading_options_reach_the_reader(run: Run, tmp_path: Path):
-    counts = (1000 * noise(3, 500)).round().numpy()
-    np.savez(tmp_path / "counts.npz", rates=counts, acceleration=counts)
-    options = ("--rate", "50", "--unit", "rad/s", "--scale", "0.001", "--key", "rates", "--sensors", "y,z")
+    counts = (1000 * noise(4, 500)).round().numpy()
+    np.savez(tmp_path / "counts.npz", rates=counts, sensors=["1", "2", "3", "4"], acceleration=counts[:3])
+    options = ("--rate", "50", "--unit", "rad/s", "--scale", "0.001", "--key", "rates", "--sensors", "3,1")
     done = run("info", "counts.npz", *options, "--json", "i.json")
     assert done.status == 0
     known = json.loads(Path("i.json").read_text())
-    assert (known["rate"], known["unit"], known["sensors"]) == (50.0, "rad/s", ["y", "z"])
-    np.testing.assert_allclose(known["mean"], 0.001 * counts[1:].mean(1))
+    assert (known["rate"], known["unit"], known["sensors"]) == (50.0, "rad/s", ["3", "1"])
+    np.testing.assert_allclose(known["mean"], 0.001 * counts[[2, 0]].mean(1))
 
 
 def test_three_axes(run: Run, tmp_path: Path):
@@ -169,20 +169,21 @@ def test_three_axes(run: Run, tmp_path: Path):
     result = gf.fit_svo(gf.read_recording("three.npz"))
     assert done.out.startswith(result.summary())
     fused = gf.read_recording("v.npz")
-    assert fused.sensors == ("x", "y", "z")  # one device: its axes are read as its sensors
-    torch.testing.assert_close(fused.signal, result.virtual(gf.read_recording("three.npz")), rtol=0, atol=0)
+    assert (fused.axes, fused.sensors) == (("x", "y", "z"), ("virtual",))
+    torch.testing.assert_close(fused.signal[:, 0], result.virtual(gf.read_recording("three.npz")), rtol=0, atol=0)
     one = run("fuse", "three.npz", "--axis", "y", "--out", "y.csv")
     assert one.out.startswith(result[1].summary().splitlines()[0])
-    torch.testing.assert_close(gf.read_recording("y.csv").signal[0], fused.signal[1], rtol=0, atol=1e-12)
+    torch.testing.assert_close(gf.read_recording("y.csv").signal, fused.signal[1], rtol=0, atol=1e-12)
 
 
-def test_axes_of_one_device_are_fused_with_a_warning(run: Run, tmp_path: Path):
+def test_axes_of_one_device_are_no_array(run: Run, tmp_path: Path):
     np.savez(tmp_path / "imu.npz", imu_gyr=noise(3, 500).numpy(), fs=100.0)
     done = run("fuse", "imu.npz")
-    assert done.status == 0
-    assert done.err.startswith("warning: ")
-    assert "only at rest" in done.err
-    assert done.err.count("\n") == 1
+    assert done.status == 2
+    assert done.err == (
+        "error: imu.npz: expected several devices to fuse, found one with the axes x, y, z; give the logs of all "
+        "devices of the array\n"
+    )
 
 
 def test_info_shows_what_is_in_the_log(run: Run, tmp_path: Path):

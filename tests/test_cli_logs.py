@@ -68,11 +68,6 @@ def test_every_format_gives_the_same_virtual_gyro(run: Run, tmp_path: Path):
         ["xsensdot4_quadrotor.npz", "--axis", "z"],
         ["mimu4444_8imu.npz", "--key", "exp1", "--axis", "x", "--mounting", "mounting.json", "--rest", "0:20"],
         ["raw/xsens_dot1_flight.csv", "raw/xsens_dot2_flight.csv", "--axis", "z"],
-        ["raw/px4_sample.ulg"],
-        ["raw/px4_sample_log_small.ulg"],
-        ["raw/broad_24_tapping.mat"],
-        ["raw/broad_24_tapping.hdf5"],
-        ["raw/mpu6050_gyroscope_v73.mat"],
     ],
 )
 def test_real_logs(run: Run, tmp_path: Path, shared: Path, arguments: list[str]):
@@ -87,3 +82,25 @@ def test_real_logs(run: Run, tmp_path: Path, shared: Path, arguments: list[str])
     np.testing.assert_allclose(weights.sum(-1), 1, rtol=1e-9)
     virtual = gf.read_recording(tmp_path / "virtual.npz").signal
     assert virtual.isfinite().double().mean() > 0.97  # all but the samples that a sensor lacks
+
+
+@pytest.mark.parametrize(
+    "log",
+    [
+        "px4_sample.ulg",
+        "px4_sample_log_small.ulg",
+        "broad_24_tapping.mat",
+        "broad_24_tapping.hdf5",
+        "mpu6050_gyroscope_v73.mat",
+    ],
+)
+def test_a_single_device_has_axes_and_cannot_be_fused(run: Run, shared: Path, log: str):
+    path = str(shared / "data" / "raw" / log)
+    done = run("info", path, "--json", "info.json")
+    assert done.status == 0, done.err
+    done = run("fuse", path)
+    assert (done.status, done.err) == (
+        2,
+        f"error: {log}: expected several devices to fuse, found one with the axes x, y, z; give the logs of all "
+        "devices of the array\n",
+    )

@@ -6,6 +6,7 @@ import math
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,9 @@ import pytest
 import torch
 
 from gyrofuse.export import to_c_header, to_kalibr
+from gyrofuse.gmwm import fit_gmwm
 from gyrofuse.processes import AR1, Drift, Model, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
+from gyrofuse.recording import Recording
 from gyrofuse.state_space import StateSpace, state_space
 
 # Every process with its mean at t = 1, 2, .. and its autocovariance at s, t.
@@ -321,10 +324,10 @@ def test_kalibr_says_what_it_leaves_out():
         "#   QuantizationNoise(variance=1.0): left out",
         "beta=1.5707963267948966): left out; a tone of 2.5 Hz",
         "#   Drift(slope=1e-06): left out; a ramp is not noise",
-        "gyroscope_random_walk: 0.000000000e+00  # rad/s^2/sqrt(Hz); the model has none, and Kalibr demands",
+        "# gyroscope_random_walk:  # rad/s^2/sqrt(Hz); the model has none, and Kalibr demands a number > 0: fill it in",
     ):
         assert line in text
-    assert read_yaml(text)["gyroscope_random_walk"] == 0.0
+    assert "gyroscope_random_walk" not in read_yaml(text)
 
 
 def test_kalibr_with_an_accelerometer():
@@ -335,6 +338,44 @@ def test_kalibr_with_an_accelerometer():
     assert got["accelerometer_noise_density"] == pytest.approx(1e-3)
     assert got["accelerometer_random_walk"] == pytest.approx(1e-4)
     assert "fill in numbers" not in text
+
+
+def fits_of_three_axes(unit, scale, walk):
+    generator = torch.Generator().manual_seed(3)
+    sizes = scale * torch.tensor([1.0, 3.0, 2.0], dtype=torch.float64)[:, None, None]
+    noise = torch.randn(3, 1, 4000, dtype=torch.float64, generator=generator)
+    noise = noise + walk * torch.randn(3, 1, 4000, dtype=torch.float64, generator=generator).cumsum(-1)
+    recording = Recording(sizes * noise, rate=100.0, unit=unit, axes=("x", "y", "z"))
+    return fit_gmwm(recording, "WN + RW")
+
+
+def test_kalibr_of_a_whole_unit_has_the_worst_axis():
+    gyros, accelerometers = fits_of_three_axes("deg/s", 1.0, 0.1), fits_of_three_axes("mg", 1.0, 0.1)
+    got = read_yaml(to_kalibr(gyros, accelerometer=accelerometers))
+    white, walk = gyros.params[:, 0].max(0).values.tolist()
+    assert got["gyroscope_noise_density"] == pytest.approx(math.radians(math.sqrt(white / 100)), rel=1e-9)
+    assert got["gyroscope_random_walk"] == pytest.approx(math.radians(math.sqrt(walk * 100)), rel=1e-9)
+    white, walk = accelerometers.params[:, 0].max(0).values.tolist()
+    assert got["accelerometer_noise_density"] == pytest.approx(9.80665e-3 * math.sqrt(white / 100), rel=1e-9)
+    assert got["accelerometer_random_walk"] == pytest.approx(9.80665e-3 * math.sqrt(walk * 100), rel=1e-9)
+
+
+def test_kalibr_gets_an_upper_limit_where_a_fit_found_nothing():
+    fit = fits_of_three_axes("rad/s", 1.0, 0.0)
+    fit = replace(fit, params=fit.params * torch.tensor([1.0, 0.0], dtype=torch.float64))
+    text = to_kalibr(fit)
+    limit = fit.confidence_interval.high[..., 1].max().item()
+    assert read_yaml(text)["gyroscope_random_walk"] == pytest.approx(math.sqrt(limit * 100), rel=1e-9)
+    assert limit > 0
+    assert "none was found, this is the upper 95 % limit of the worst axis" in text
+
+
+def test_kalibr_of_the_other_quantity_is_refused():
+    accelerometers = fits_of_three_axes("m/s^2", 1.0, 0.1)
+    with pytest.raises(ValueError, match=r"`unit`: expected one of deg/s.*got 'm/s\^2'"):
+        to_kalibr(accelerometers)
+    with pytest.raises(ValueError, match="`rate`: expected that of `model`, which does not say it"):
+        to_kalibr(WhiteNoise(1.0))
 
 
 @pytest.mark.parametrize("rate", [1e-5, 12.5, 200, 1e16])

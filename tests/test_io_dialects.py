@@ -164,12 +164,12 @@ class TestNames:
     @pytest.mark.parametrize(
         ("name", "kind", "axis", "unit"),
         [
-            ("xRate (deg/s)", "gyro", "x", "deg/s"),
-            ("rate_x", "gyro", "x", ""),
-            ("imu1_rate_z_dps", "gyro", "z", "deg/s"),
-            ("gyro_x_deg_h", "gyro", "x", "deg/h"),
-            ("G_x [mdps]", "gyro", "x", "mdeg/s"),
-            ("AsX(°/s)", "gyro", "x", "deg/s"),
+            ("xRate (deg/s)", "rate", "x", "deg/s"),
+            ("rate_x", "rate", "x", ""),
+            ("imu1_rate_z_dps", "rate", "z", "deg/s"),
+            ("gyro_x_deg_h", "rate", "x", "deg/h"),
+            ("G_x [mdps]", "rate", "x", "mdeg/s"),
+            ("AsX(°/s)", "rate", "x", "deg/s"),
             ("axisRate[0]", "", "", ""),
             ("heart_rate", "", "", ""),
             ("rates", "", "", ""),
@@ -202,7 +202,7 @@ class TestNames:
         assert stream.notes == (f"columns z, y, x name no sensor and are read as a gyro's{but}",)
 
     def test_p_q_r_beside_a_gyro_are_none(self):
-        assert [column.kind for column in classify_columns(["p", "q", "r", "gx"])] == ["", "", "", "gyro"]
+        assert [column.kind for column in classify_columns(["p", "q", "r", "gx"])] == ["", "", "", "rate"]
         assert [column.kind for column in classify_columns(["p", "q", "T [degC]"])] == ["", "", "temperature"]
 
 

@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 import pytest
-from logs import made_up, regular_stamps, seconds, write_ros1, write_ros2
+from logs import made_up, regular_stamps, seconds, write_ros1, write_ros2, write_topics
 
 from gyrofuse.io import rosbag
 from gyrofuse.io.stream import RecordingError
@@ -125,6 +125,135 @@ def test_a_ros1_bag_whose_recorder_died_before_the_index(tmp_path):
 def test_a_directory_without_metadata(tmp_path):
     with pytest.raises(RecordingError, match=r"metadata"):
         rosbag.read(tmp_path)
+
+
+IMU, VECTOR = "sensor_msgs/msg/Imu", "geometry_msgs/msg/Vector3Stamped"
+MAGNETIC, WARM, PRESSURE = (f"sensor_msgs/msg/{name}" for name in ("MagneticField", "Temperature", "FluidPressure"))
+every_suffix = pytest.mark.parametrize("suffix", [".bag", ".db3", ".mcap"])
+
+
+def gyro_topic(name="/camera/gyro/sample", n=80, rate=200.0, acceleration=0.0):
+    """Rates 1, 2, 3, ... about x, and accelerations that are all the same."""
+    values = np.column_stack([np.arange(1.0, n + 1), *[np.full(n, 0.5)] * 2, *[np.full(n, acceleration)] * 3])
+    return name, IMU, regular_stamps(n, rate), values
+
+
+def accel_topic(name="/camera/accel/sample", n=26, rate=62.5):
+    """Accelerations 0, 16, 32, ... m/s^2 along x, a ramp of 1 m/s^2 a millisecond; rates are zero."""
+    values = np.zeros((n, 6))
+    values[:, 3], values[:, 5] = 16.0 * np.arange(n), 9.75
+    return name, IMU, regular_stamps(n, rate), values
+
+
+class TestChannelsOfOtherTopics:
+    @every_suffix
+    def test_accelerations_of_a_topic_without_rates(self, tmp_path, suffix):
+        (stream,) = rosbag.read(write_topics(tmp_path / f"a{suffix}", [gyro_topic(), accel_topic()]))
+        assert stream.name == "/camera/gyro/sample"
+        np.testing.assert_array_equal(stream.gyro["x"], np.arange(1.0, 81))
+        # 5 ms apart, and the ramp ends after 400 ms
+        np.testing.assert_allclose(stream.channels["acceleration"][0], 5.0 * np.arange(80), atol=1e-3)
+        assert stream.channel_units == {"acceleration": "m/s^2"}
+        assert "angular velocities exactly zero throughout in /camera/accel/sample: no gyro" in stream.notes
+        assert "linear accelerations exactly zero throughout: none measured" in stream.notes
+        assert any(
+            "acceleration is that of /camera/accel/sample; acceleration has its own clock (62.5 Hz)" in note
+            for note in stream.notes
+        )
+
+    def test_nothing_is_made_up_outside_of_their_time(self, tmp_path):
+        topics = [gyro_topic(), accel_topic(n=11)]
+        (stream,) = rosbag.read(write_topics(tmp_path / "a.bag", topics))
+        np.testing.assert_array_equal(np.isnan(stream.channels["acceleration"][0]), np.arange(80) > 32)
+
+    def test_a_gap_is_not_bridged(self, tmp_path):
+        name, kind, stamps, values = accel_topic()
+        lacking = np.delete(np.arange(26), [10, 11])
+        (stream,) = rosbag.read(
+            write_topics(tmp_path / "a.bag", [gyro_topic(), (name, kind, stamps[lacking], values[lacking])])
+        )
+        missing = np.flatnonzero(np.isnan(stream.channels["acceleration"][0]))
+        np.testing.assert_array_equal(missing, np.arange(29, 39))  # 144 to 192 ms
+
+    def test_a_key_brings_the_accelerations_along(self, tmp_path):
+        path = write_topics(tmp_path / "a.bag", [gyro_topic(), accel_topic(), gyro_topic("/other/imu")])
+        (stream,) = rosbag.read(path, key="/camera/gyro/sample")
+        assert "acceleration" in stream.channels
+        with pytest.raises(RecordingError, match=r"/camera/accel/sample, found none .* exactly zero throughout"):
+            rosbag.read(path, key="/camera/accel/sample")
+
+    @every_suffix
+    def test_field_temperature_and_pressure(self, tmp_path, suffix):
+        stamps = regular_stamps(80, 200.0)
+        topics = [
+            gyro_topic("/imu/data", acceleration=9.5),
+            ("/imu/mag", MAGNETIC, stamps, np.outer(np.arange(80), [1e-6, 2e-6, 3e-6])),
+            ("/imu/temperature", WARM, stamps[::20], np.full((4, 1), 36.5)),
+            ("/imu/pressure", PRESSURE, stamps[::2], np.full((40, 1), 101325.0)),
+        ]
+        (stream,) = rosbag.read(write_topics(tmp_path / f"a{suffix}", topics))
+        assert stream.channels["magnetic_field"].shape == (3, 80)
+        np.testing.assert_allclose(stream.channels["magnetic_field"][2], 3e-6 * np.arange(80))
+        np.testing.assert_array_equal(stream.channels["temperature"][:61], 36.5)
+        assert np.isnan(stream.channels["temperature"][61:]).all()
+        np.testing.assert_array_equal(stream.channels["pressure"][:79], 101325.0)
+        units = {"acceleration": "m/s^2", "magnetic_field": "T", "temperature": "degC", "pressure": "Pa"}
+        assert stream.channel_units == units
+        assert "magnetic_field is that of /imu/mag" in stream.notes
+
+    def test_a_channel_goes_with_the_gyro_whose_name_begins_alike(self, tmp_path):
+        topics = [gyro_topic("/left/imu"), gyro_topic("/right/imu"), accel_topic("/right/accel")]
+        topics.append(("/weather", WARM, regular_stamps(80), np.full((80, 1), 21.0)))
+        left, right = rosbag.read(write_topics(tmp_path / "a.bag", topics))
+        assert (list(left.channels), list(right.channels)) == (["temperature"], ["acceleration"])
+
+    def test_clocks_without_a_common_time_are_compared_by_arrival(self, tmp_path):
+        path = write_topics(tmp_path / "a.bag", [gyro_topic()])
+        other = write_topics(tmp_path / "b.bag", [accel_topic()], clock_offset=10**15)
+        whole = merged(tmp_path / "c.bag", path, other)
+        (stream,) = rosbag.read(whole)
+        np.testing.assert_allclose(stream.channels["acceleration"][0], 5.0 * np.arange(80), atol=1e-3)
+        assert any("by arrival at the recorder" in note for note in stream.notes)
+
+
+def merged(path, *bags):
+    """One ROS 1 bag of the messages of several."""
+    from rosbags.rosbag1 import Reader, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with Writer(path) as out:
+        for bag in bags:
+            with Reader(bag) as source:
+                ways = {c.id: out.add_connection(c.topic, c.msgtype, typestore=store) for c in source.connections}
+                for connection, arrival, raw in source.messages():
+                    out.write(ways[connection.id], arrival, raw)
+    return path
+
+
+class TestVectors:
+    @every_suffix
+    @pytest.mark.parametrize("topic", ["/imu/angular_velocity", "/multisense/imu/gyroscope_vector"])
+    def test_rates_by_the_name_of_the_topic(self, tmp_path, suffix, topic):
+        rates = made_up(1)[0].T
+        (stream,) = rosbag.read(write_topics(tmp_path / f"a{suffix}", [(topic, VECTOR, regular_stamps(), rates)]))
+        assert (stream.name, stream.unit) == (topic, "rad/s")
+        np.testing.assert_array_equal([stream.gyro[a] for a in "xyz"], rates.T)
+
+    def test_rates_by_the_frame(self, tmp_path):
+        topics = [("/vector", VECTOR, regular_stamps(), made_up(1)[0].T)]
+        (stream,) = rosbag.read(write_topics(tmp_path / "a.bag", topics, frame="gyro_link"))
+        assert stream.name == "/vector"
+        with pytest.raises(RecordingError, match=r"expected angular velocities in /vector, found none"):
+            rosbag.read(write_topics(tmp_path / "b.bag", topics, frame="arm"))
+
+    def test_they_are_no_second_device_beside_an_imu(self, tmp_path):
+        topics = [gyro_topic("/imu/data"), ("/imu/angular_velocity", VECTOR, regular_stamps(), made_up(1)[0].T)]
+        path = write_topics(tmp_path / "a.bag", topics)
+        (stream,) = rosbag.read(path)
+        assert stream.name == "/imu/data"
+        assert any("rates in /imu/angular_velocity are not read beside" in note for note in stream.notes)
+        assert [s.name for s in rosbag.read(path, key="/imu/angular_velocity")] == ["/imu/angular_velocity"]
 
 
 def test_the_missing_library_is_named(tmp_path, monkeypatch):

@@ -240,7 +240,7 @@ class TestRefused:
             read(tmp_path, content)
 
     def test_no_gyro(self, tmp_path: Path):
-        with pytest.raises(RecordingError, match=r"name of a gyro \(gyro_x, gx\), found time, volt; say with `key`"):
+        with pytest.raises(RecordingError, match=r"name of a gyro \(gyro_x, gx\), found time, volt; say with `col"):
             read(tmp_path, "time,volt\n0,1\n1,2\n")
 
     @pytest.mark.parametrize("content", ["\n\n", "gx,gy\n", "some words\nand more of them\n", "# fs = 100\n", '"'])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from logs import made_up, regular_stamps, seconds, write_ulog
 
+import gyrofuse as gf
 from gyrofuse.io import ulog
 from gyrofuse.io.stream import RecordingError
 
@@ -117,6 +118,104 @@ def test_the_missing_library_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyulog", None)
     with pytest.raises(ImportError, match=r'pip install "gyrofuse\[logs\]"'):
         ulog.read(tmp_path / "a.ulg")
+
+
+def counted(n_messages=20, samples=10, dt=125.0, start=MICROSECONDS // 1000, first=0):
+    """Messages of a fifo: sample `i` of all has `i`, `-i` and 7 counts."""
+    messages = []
+    for m in range(n_messages):
+        x = first + m * samples + np.arange(32)
+        stamp = start + round(dt * (samples - 1 + m * samples))
+        messages.append((stamp, samples, [x, -x, np.full(32, 7)]))
+    return messages
+
+
+SCALE = 2.0**-10
+
+
+def fifo_log(path, *topics, n_slow=1, **options):
+    return write_ulog(path / "a.ulg", made_up(n_slow), regular_stamps(start=MICROSECONDS), fifo=topics, **options)
+
+
+class TestFifo:
+    """Messages of up to 32 samples (`sensor_gyro_fifo`) become samples at their true rate."""
+
+    def test_every_sample_has_its_time(self, tmp_path):
+        path = fifo_log(tmp_path, ("sensor_gyro_fifo", 0, 1000, 125.0, SCALE, counted()))
+        (stream,) = ulog.read(path)
+        assert (stream.name, stream.unit, stream.n_samples) == ("sensor_gyro_fifo[0]", "rad/s", 200)
+        np.testing.assert_array_equal(stream.gyro["x"], SCALE * np.arange(200))
+        np.testing.assert_array_equal(stream.gyro["y"], -SCALE * np.arange(200))
+        np.testing.assert_array_equal(stream.gyro["z"], np.full(200, SCALE * 7))
+        np.testing.assert_allclose(stream.time, (MICROSECONDS // 1000 + 125 * np.arange(200)) * 1e-6, rtol=0, atol=1e-6)
+        assert "device_id 1000" in stream.notes
+        assert any("sensor_gyro (1 instances, 100 Hz) is not read" in note for note in stream.notes)
+        assert "temperature" in stream.channels
+        assert [stream.name for stream in ulog.read(path, key="sensor_gyro")] == ["sensor_gyro[0]"]
+
+    def test_a_step_that_is_not_quite_what_is_stated(self, tmp_path):
+        messages = counted(dt=124.0, n_messages=60)
+        (stream,) = ulog.read(fifo_log(tmp_path, ("sensor_gyro_fifo", 0, 1000, 125.0, SCALE, messages)))
+        assert (np.diff(stream.time) > 0).all()
+        assert 1 / np.diff(stream.time)[10:].mean() == pytest.approx(1e6 / 124, rel=1e-3)
+
+    def test_a_lost_message_is_a_gap(self, tmp_path):
+        messages = counted()
+        del messages[5]
+        recording = gf.read_recording(fifo_log(tmp_path, ("sensor_gyro_fifo", 0, 1000, 125.0, SCALE, messages)))
+        assert recording.rate == pytest.approx(8000, rel=1e-3)
+        np.testing.assert_array_equal(np.flatnonzero(recording.signal[0].isnan().numpy()), np.arange(50, 60))
+
+    def test_accelerations_become_a_channel(self, tmp_path):
+        path = fifo_log(
+            tmp_path,
+            ("sensor_gyro_fifo", 0, 1000, 125.0, SCALE, counted()),
+            ("sensor_accel_fifo", 0, 2000, 250.0, 1.0, counted(dt=250.0, n_messages=10)),
+            ("sensor_accel_fifo", 1, 2001, 250.0, 1.0, counted(dt=250.0, n_messages=10, first=1000)),
+        )
+        (stream,) = ulog.read(path)
+        np.testing.assert_allclose(stream.channels["acceleration"][0, :199], np.arange(199) / 2, atol=5e-3)
+        assert np.isnan(stream.channels["acceleration"][0, 199])
+        assert any("acceleration has its own clock (4000 Hz)" in note for note in stream.notes)
+        assert stream.channel_units["acceleration"] == "m/s^2"
+
+    @pytest.mark.parametrize("samples", [0, 33, 255])
+    def test_a_message_of_impossibly_many_samples_is_left_out(self, tmp_path, samples):
+        messages = counted()
+        messages[3] = (messages[3][0], samples, messages[3][2])
+        (stream,) = ulog.read(fifo_log(tmp_path, ("sensor_gyro_fifo", 0, 1000, 125.0, SCALE, messages)))
+        assert stream.n_samples == 190
+        assert any("1 of 20 messages sensor_gyro_fifo have no or more than 32 samples" in n for n in stream.notes)
+
+    @pytest.mark.parametrize("dt", [0.0, -1.0, float("nan"), float("inf")])
+    def test_without_a_time_between_samples_another_topic_is_read(self, tmp_path, dt):
+        topic = ("sensor_gyro_fifo", 0, 1000, dt, SCALE, counted())
+        (stream,) = ulog.read(fifo_log(tmp_path, topic))
+        assert stream.name == "sensor_gyro[0]"
+        assert "sensor_gyro_fifo has no two sound samples; not read" in stream.notes
+        with pytest.raises(
+            RecordingError, match=r"a\.ulg: expected messages sensor_gyro_fifo of 1 to 32 samples with a"
+        ):
+            ulog.read(fifo_log(tmp_path, topic, n_slow=0))
+
+    def test_one_that_was_logged_now_and_then_is_not_read(self, tmp_path):
+        (stream,) = ulog.read(fifo_log(tmp_path, ("sensor_gyro_fifo", 0, 1000, 125.0, SCALE, counted()[::5])))
+        assert stream.name == "sensor_gyro[0]"
+        assert any(
+            "sensor_gyro_fifo has messages that cover 20 % of the time, which are read with key" in n
+            for n in stream.notes
+        )
+
+    def test_gyros_without_one_are_named(self, tmp_path):
+        path = fifo_log(tmp_path, ("sensor_gyro_fifo", 1, 1001, 125.0, SCALE, counted()), n_slow=2)
+        (stream,) = ulog.read(path)
+        assert any("gyros that sensor_gyro_fifo lacks (device_id 1000)" in note for note in stream.notes)
+        assert [stream.name for stream in ulog.read(path, key="sensor_gyro[1]")] == ["sensor_gyro[1]"]
+
+    def test_more_than_the_memory_allowed(self, tmp_path):
+        path = fifo_log(tmp_path, ("sensor_gyro_fifo", 0, 1000, 125.0, SCALE, counted()))
+        with pytest.raises(RecordingError, match=r"samples of sensor_gyro_fifo of 20 x 32 x 5 numbers"):
+            ulog.read(path, max_bytes=path.stat().st_size + 5000)
 
 
 @needs_shared

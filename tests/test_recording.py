@@ -149,12 +149,15 @@ def write_csv(path: Path, gyro: np.ndarray, start: float, rate: float = 100.0, n
 
 
 class TestAssembled:
-    def test_one_device_gives_its_axes_as_sensors_and_says_so(self, tmp_path: Path):
+    def test_the_axes_of_one_device_are_no_array(self, tmp_path: Path):
         gyro = signal().numpy()
         recording = gf.read_recording(write_csv(tmp_path / "a.csv", gyro, 0.0))
-        assert recording.sensors == ("x", "y", "z")
-        assert "axes" in kinds(recording)
-        np.testing.assert_allclose(recording.signal.numpy(), gyro, atol=1e-8)
+        assert (recording.axes, recording.sensors) == (("x", "y", "z"), ("a",))
+        np.testing.assert_allclose(recording.signal[:, 0].numpy(), gyro, atol=1e-8)
+        alone = recording.axes_as_sensors()
+        assert (alone.axes, alone.sensors) == ((), ("x", "y", "z"))
+        assert torch.equal(alone.signal, recording.signal[:, 0])
+        assert alone.axes_as_sensors() is alone
 
     def test_several_files_are_one_array(self, tmp_path: Path):
         a, b = signal(3, 400).numpy(), signal(6, 300).numpy()[3:]
@@ -196,7 +199,7 @@ class TestAssembled:
         gyro = signal().numpy()
         gyro[:, 0] = 0
         recording = gf.read_recording(write_csv(tmp_path / "a.csv", gyro, 0.0))
-        assert recording.signal[:, 0].isnan().all()
+        assert recording.signal[..., 0].isnan().all()
         assert "startup" in kinds(recording)
 
     def test_mounting(self, tmp_path: Path):

@@ -25,7 +25,7 @@ from gyrofuse.scale_weights import normalised, resolve_scale_weights
 from gyrofuse.simulate import ArrayModel
 from gyrofuse.svo import fit_svo
 from gyrofuse.svo_result import SVOResult
-from gyrofuse.units import RATE_UNITS
+from gyrofuse.units import DATASHEET_UNITS
 
 Row = dict[str, Any]
 
@@ -208,7 +208,7 @@ class Fit:
         for number, index in enumerate(torch.cartesian_prod(*map(torch.arange, fit.params.shape[:-1])).tolist()):
             at = tuple(index) if isinstance(index, list) else (index,)
             fitted = bool(fit.params[at].isfinite().all())
-            entries = fit.datasheet(at).entries if fitted and recording.unit in RATE_UNITS else ()
+            entries = fit.datasheet(at).entries if fitted and recording.unit in DATASHEET_UNITS else ()
             rows.append(
                 {
                     "axis": recording.axes[at[0]] if recording.axes else None,
@@ -293,8 +293,8 @@ class Diagnose:
         return digest.hexdigest()
 
     def rows(self, recordings: Sequence[Recording]) -> list[list[Row]]:
-        """Rows of each recording, one for each of its axes."""
-        return [self._rows(recording) for recording in recordings]
+        """Rows of each recording, one for each of its axes; one in all for a single device."""
+        return [self._rows(recording.axes_as_sensors()) for recording in recordings]
 
     def _rows(self, recording: Recording) -> list[Row]:
         rows = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
 
@@ -21,19 +22,31 @@ _READERS = {
     ".hdf5": "hdf5",
     ".hdf": "hdf5",
     ".ulg": "ulog",
+    ".bin": "dataflash",
+    ".log": "dataflash",
     ".bag": "rosbag",
     ".db3": "rosbag",
     ".mcap": "rosbag",
 }
 SUFFIXES = tuple(_READERS)
+_TOPICS = ("ulog", "rosbag", "dataflash")  # formats whose messages say themselves what they hold
 
 
-def read_streams(path: Path, *, key: str | None = None, max_bytes: float | None = None) -> list[Stream]:
+def read_streams(
+    path: Path,
+    *,
+    key: str | None = None,
+    quantity: str = "rate",
+    columns: Mapping[str, str] | None = None,
+    max_bytes: float | None = None,
+) -> list[Stream]:
     """Read the devices of a log, by the suffix of its name.
 
     Args:
         path: A file, or the folder of a ROS 2 bag.
         key: Which recording inside, where a log holds several.
+        quantity: `"rate"` or `"acceleration"`: the sensors to read.
+        columns: What columns or arrays are, where their names do not say: these by the names that they should have.
         max_bytes: Memory that its numbers may take; by default a quarter of what there is.
 
     Raises:
@@ -58,9 +71,15 @@ def read_streams(path: Path, *, key: str | None = None, max_bytes: float | None 
     else:
         with path.open("rb"):  # a file that may not be read says so itself
             reader = _READERS[path.suffix.lower()]
+    if columns is not None and reader in _TOPICS:
+        raise RecordingError(
+            f"{path}: expected a log with named columns or arrays (`columns`, --map), found one of topics; choose with "
+            "`key`"
+        )
     module = import_module(f"gyrofuse.io.{reader}")
     try:
-        streams: list[Stream] = module.read(path, key=key, max_bytes=max_bytes)
+        named = {} if columns is None else {"columns": columns}
+        streams: list[Stream] = module.read(path, key=key, quantity=quantity, max_bytes=max_bytes, **named)
     except (RecordingError, ImportError):
         raise
     except Exception as error:  # what a damaged log does to a reader is never foreseen in full

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from gyrofuse.io.column_streams import time_in_seconds
-from gyrofuse.io.columns import AXES, TICK, Column, classify_columns
+from gyrofuse.io.columns import AXES, CHANNELS, NAMES_OF, TICK, Column, classify_columns, or_else, renamed
 from gyrofuse.io.limits import LONGEST_NAME, decoded, enumerated, is_rate
 from gyrofuse.io.stream import Array, RecordingError, Stream
 from gyrofuse.units import canonical_unit
@@ -45,14 +45,24 @@ _MOST_SETS = 256
 _Settings = Mapping[tuple[str, str], Any]
 
 
-def streams_from_arrays(content: Mapping[str, Any], path: Path, *, key: str | None = None) -> list[Stream]:
+def streams_from_arrays(
+    content: Mapping[str, Any],
+    path: Path,
+    *,
+    key: str | None = None,
+    quantity: str = "rate",
+    columns: Mapping[str, str] | None = None,
+) -> list[Stream]:
     """Build the streams of a file of named arrays.
 
     Args:
         content: Arrays, numbers and text by name. An array is anything with `shape` and `dtype` that NumPy
             converts; it is read only when needed.
         path: The file; its stem names a device that the arrays do not name.
-        key: The array that holds the gyros, whatever its name, or the group to look in.
+        key: The array that holds the sensors, whatever its name, or the group to look in.
+        quantity: `"rate"` or `"acceleration"`: the sensors to read.
+        columns: What arrays are, where their names do not say: these by the names that they should have; the others are
+            left out.
 
     Raises:
         RecordingError: No gyro among the arrays, or nothing of the name `key`.
@@ -60,35 +70,38 @@ def streams_from_arrays(content: Mapping[str, Any], path: Path, *, key: str | No
     content = {name: value for name, value in content.items() if len(name) <= LONGEST_NAME}
     arrays = {name: value for name, value in content.items() if _length(value) > 1}
     settings = settings_by_group({name: value for name, value in content.items() if name not in arrays})
-    columns = {column.name: column for column in classify_columns(list(arrays))}
+    if columns is not None:
+        called = renamed(path, list(arrays), columns)
+        arrays = {called[name]: value for name, value in arrays.items() if name in called}
+    classified = {column.name: column for column in classify_columns(list(arrays), quantity)}
     if key is not None:
-        columns = _select(columns, key.strip("/"))
+        classified = _select(classified, key.strip("/"), quantity)
 
     # Gyros of one length and one stated rate and unit share a clock and channels.
     alike: dict[tuple[int, float | None, str], list[str]] = {}
-    for name, column in columns.items():
-        if column.kind == "gyro":
+    for name, column in classified.items():
+        if column.kind == quantity:
             unit = column.unit or stated_unit(settings, name)
             alike.setdefault((_length(arrays[name]), stated_rate(settings, name), unit), []).append(name)
     if not alike:
         shapes = {name: getattr(value, "shape", ()) for name, value in content.items()}
         found = enumerated(f"{name} {shape}" for name, shape in shapes.items() if set(shape) - {1}) or "no array"
-        wanted = "an array (sensor, time) with the name of a gyro (gyro, imu_gyr, gx)"
-        wanted += f" in {key!r}" if key else ""
-        raise RecordingError(f"{path}: expected {wanted}, found {found}; say with `key` which array holds the gyros")
+        wanted = f"an array (sensor, time) with the name of {NAMES_OF[quantity]}" + (f" in {key!r}" if key else "")
+        advice = or_else(classified.values(), quantity, "say with `key` which array holds the sensors")
+        raise RecordingError(f"{path}: expected {wanted}, found {found}; {advice}")
     if len(alike) > _MOST_SETS:
         raise RecordingError(
             f"{path}: expected gyros of a few rates and lengths, found {len(alike)} different ones; say with `key` "
-            "which array holds the gyros"
+            "which array holds the sensors"
         )
     beside: dict[int, list[str]] = {}
-    for name, column in columns.items():
-        if column.kind != "gyro":
+    for name, column in classified.items():
+        if column.kind != quantity:
             beside.setdefault(_length(arrays[name]), []).append(name)
     streams: list[Stream] = []
     for (length, rate, unit), gyros in alike.items():
         rows = {name: _rows(arrays[name], length) for name in (*gyros, *beside.get(length, ()))}
-        streams += _group(rows, columns, settings, path.stem, rate, unit)
+        streams += _group(rows, classified, settings, path.stem, rate, unit, quantity)
     return streams
 
 
@@ -99,6 +112,7 @@ def _group(
     stem: str,
     rate: float | None,
     unit: str,
+    quantity: str,
 ) -> list[Stream]:
     """Streams of arrays `(row, time)` of one length."""
     gyro: dict[tuple[str, str], dict[str, Array]] = {}  # by device and sensor, then by axis
@@ -111,7 +125,7 @@ def _group(
         if column.kind == "time" and len(values) == 1:
             clocks.setdefault(column.device, clock_in_seconds(column, values[0], rate, settings))
             continue
-        if column.kind != "gyro":
+        if column.kind != quantity:
             beside[name] = values
             continue
         setting = _nearest(settings, name, _SENSORS)
@@ -181,8 +195,8 @@ def _channels(
             continue
         column = columns[name]
         values = np.concatenate([beside[triads[name][axis]] for axis in AXES]) if name in triads else values
-        known = column.kind and len(values) == (1 if column.kind == "temperature" else 3)
-        label = column.kind if known else name.rpartition("/")[2]
+        known = column.kind in CHANNELS and len(values) == (1 if column.kind == "temperature" else 3)
+        label = CHANNELS[column.kind] if known else name.rpartition("/")[2]
         owned, units = channels.setdefault(column.device if column.device in known_devices else devices[0], ({}, {}))
         if label in owned:
             label = name
@@ -240,11 +254,11 @@ def _text(value: Any) -> str:
     return (*_texts(np.asarray(value).ravel()[:1]), "")[0]
 
 
-def _select(columns: Mapping[str, Column], key: str) -> dict[str, Column]:
-    """Keep `key` as the only gyro, or what is in the group `key` and the clocks."""
+def _select(columns: Mapping[str, Column], key: str, quantity: str) -> dict[str, Column]:
+    """Keep `key` as the only sensor, or what is in the group `key` and the clocks."""
     if key in columns:
-        kept = {name: column for name, column in columns.items() if name == key or column.kind != "gyro"}
-        return kept | {key: replace(columns[key], kind="gyro")}
+        kept = {name: column for name, column in columns.items() if name == key or column.kind != quantity}
+        return kept | {key: replace(columns[key], kind=quantity)}
     return {n: column for n, column in columns.items() if n.startswith(f"{key}/") or column.kind == "time"}
 
 

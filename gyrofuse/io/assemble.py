@@ -15,11 +15,11 @@ from gyrofuse._checks import same_rate
 from gyrofuse.io import read_streams
 from gyrofuse.io.align import Placed, align
 from gyrofuse.io.clock import Grid, grid_of, regular_grid
-from gyrofuse.io.columns import AXES
+from gyrofuse.io.columns import AXES, CHANNELS
 from gyrofuse.io.limits import printable
 from gyrofuse.io.notes import Note
 from gyrofuse.io.stream import Array, RecordingError, Stream, unexpected
-from gyrofuse.units import rate_unit_factor
+from gyrofuse.units import unit_factor
 
 _UNKNOWN = "unknown"
 
@@ -45,12 +45,15 @@ def assemble(
     unit: str | None,
     scale: float | None,
     key: str | None,
+    quantity: str,
+    columns: Mapping[str, str] | None,
     mounting: Mapping[str, Any] | str | Path | None,
     max_bytes: float | None,
 ) -> Assembled:
     """Read the logs and put their devices on one grid; arguments and errors as `gyrofuse.read_recording`."""
     source = ", ".join(str(path) for path in paths)
-    streams = _named([(path, read_streams(path, key=key, max_bytes=max_bytes)) for path in paths])
+    read = [(p, read_streams(p, key=key, quantity=quantity, columns=columns, max_bytes=max_bytes)) for p in paths]
+    streams = _named(read)
     streams = _mount([_printable(stream) for stream in streams], mounting, source)
     try:
         return _on_one_grid(streams, source, axis=axis, rate=rate, unit=unit, scale=scale)
@@ -82,9 +85,7 @@ def _on_one_grid(
     scale: float | None,
 ) -> Assembled:
     notes = [Note("reader", stream.name, sentence) for stream in streams for sentence in stream.notes]
-    streams, axes, axis_notes = _choose_axes(streams, axis, source)
-    notes += axis_notes
-
+    streams, axes = _choose_axes(streams, axis, source)
     grids = _grids(streams, rate, source)
     for grid in dict.fromkeys(grids):
         notes += grid.notes
@@ -98,11 +99,9 @@ def _on_one_grid(
     devices = list(zip(streams, placed, factors, strict=True))
     if axes:
         signal = np.stack([np.stack([_clean(s, axis, p, f) for s, p, f in devices]) for axis in axes])
-        sensors = tuple(stream.name for stream in streams)
     else:
         signal = np.stack([_clean(s, axis, p, f) for s, p, f in devices for axis in s.gyro])
-        # The axes of a single device are its sensors.
-        sensors = tuple(axis if len(s.gyro) > 1 else s.name for s in streams for axis in s.gyro)
+    sensors = tuple(stream.name for stream in streams)
     return Assembled(signal, common_rate, units, sensors, axes, _channels(streams, placed), tuple(notes))
 
 
@@ -157,7 +156,7 @@ def _mount(streams: list[Stream], mounting: Mapping[str, Any] | str | Path | Non
             )
         rates = matrix @ np.stack([stream.gyro[a] for a in AXES])
         channels = {
-            name: matrix @ values if name in ("acceleration", "magnetic_field") else values
+            name: matrix @ values if name in CHANNELS.values() and values.ndim == 2 else values
             for name, values in stream.channels.items()
         }
         turned.append(replace(stream, gyro=dict(zip(AXES, rates, strict=True)), channels=channels))
@@ -169,9 +168,7 @@ def _is_rotation(matrix: Array) -> bool:
     return np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6) and bool(np.linalg.det(matrix) > 0)
 
 
-def _choose_axes(
-    streams: list[Stream], axis: str | None, source: str
-) -> tuple[list[Stream], tuple[str, ...], list[Note]]:
+def _choose_axes(streams: list[Stream], axis: str | None, source: str) -> tuple[list[Stream], tuple[str, ...]]:
     """Keep one axis, or say which axes lead the array."""
     if axis is not None:
         lacking = [stream for stream in streams if axis not in stream.gyro]
@@ -181,22 +178,15 @@ def _choose_axes(
                 f"{source}: expected axis {axis!r} in every device, found {found} in {lacking[0].name}; "
                 "choose one of those, or none"
             )
-        return [replace(stream, gyro={axis: stream.gyro[axis]}) for stream in streams], (), []
+        return [replace(stream, gyro={axis: stream.gyro[axis]}) for stream in streams], ()
     sets = {tuple(sorted(stream.gyro)) for stream in streams}
-    if len(streams) == 1 and len(streams[0].gyro) > 1:
-        names = ", ".join(streams[0].gyro)
-        sentence = (
-            f"a single device: its axes {names} are taken as the sensors of one array, which makes sense only at rest; "
-            "choose files or a key with several devices to fuse each axis"
-        )
-        return streams, (), [Note("axes", streams[0].name, sentence)]
     if len(sets) > 1:
         found = "; ".join(f"{stream.name}: {', '.join(stream.gyro)}" for stream in streams[:4])
         raise RecordingError(
             f"{source}: expected the same axes in every device, found {found}; choose one with axis= (--axis z)"
         )
     (axes,) = sets
-    return streams, axes if len(axes) > 1 else (), []
+    return streams, axes if len(axes) > 1 else ()
 
 
 def _grids(streams: Sequence[Stream], rate: float | None, source: str) -> list[Grid]:
@@ -262,7 +252,7 @@ def _units(
                 notes.append(Note("unit", stream.name, f"the log states no unit; its numbers are taken as {target}"))
             continue
         try:
-            factors.append(rate_unit_factor(stream.unit, target))
+            factors.append(unit_factor(stream.unit, target))
         except ValueError as error:
             raise RecordingError(
                 f"{source}: expected one unit, found {stream.unit} in {stream.name}, which is no {target}; "

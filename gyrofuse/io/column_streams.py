@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrofuse.io.columns import AXES, TICK, WRAP_32_BIT, Column, bare_name, classify_columns
+from gyrofuse.io.columns import AXES, CHANNELS, TICK, WRAP_32_BIT, Column, bare_name, classify_columns
 from gyrofuse.io.stream import Array, Stream
 
 # SampleTimeFine of Xsens counts 10 kHz ticks of the day on an MTi (MTi Low-Level Communication Protocol), microseconds
@@ -90,24 +90,26 @@ def streams_from_columns(
     time: Array | None = None,
     clock_period: float | None = None,
     notes: Sequence[str] = (),
+    quantity: str = "rate",
 ) -> list[Stream]:
-    """Build one stream per device from named one-dimensional columns; none where no column is a gyro's.
+    """Build one stream per device from named one-dimensional columns; none where no column is of the quantity.
 
     Args:
         columns: Values `(time,)` by column name, in the order of the log.
         name: Name of a device that the columns do not name (the file's stem).
-        unit: Unit of gyro columns whose names state none.
+        unit: Unit of columns of the quantity whose names state none.
         rate: Sampling rate the log states, Hz.
         time: Clock in seconds where it is no column.
         clock_period: Seconds after which the clock wraps, where the log says so (times of day).
         notes: Sentences that go with every stream.
+        quantity: Of the sensors to read; the other one is a channel.
     """
     columns, joined = _joined_clocks(columns)
-    classified = classify_columns(list(columns))
+    classified = classify_columns(list(columns), quantity)
     by_device: dict[str, list[Column]] = {}
     for column in classified:
         by_device.setdefault(column.device, []).append(column)
-    devices = list(dict.fromkeys(column.device for column in classified if column.kind == "gyro"))
+    devices = list(dict.fromkeys(column.device for column in classified if column.kind == quantity))
     clocks = [column for column in classified if column.kind == "time"]
     still = dict.fromkeys(column.name for column in clocks if not np.isfinite(columns[column.name]).any())
     clocks = sorted((column for column in clocks if column.name not in still), key=_remoteness)
@@ -116,7 +118,7 @@ def streams_from_columns(
         *notes,
         *joined,
         *(f"time column '{name}' holds no reading and is left out" for name in still),
-        *_guessed_names(classified, name),
+        *_guessed_names(classified, quantity, name),
     ]
     streams = []
     for device in devices:
@@ -124,7 +126,7 @@ def streams_from_columns(
         units: list[str] = []
         said = list(notes)
         for column in by_device[device]:
-            if column.kind == "gyro":
+            if column.kind == quantity:
                 if column.axis in gyro:
                     said.append(f"column '{column.name}' repeats axis '{column.axis}' and is left out")
                     continue
@@ -140,7 +142,7 @@ def streams_from_columns(
             seconds, wraps, guess = time_in_seconds(clock, columns[clock.name], rate)
             period = wraps or clock_period
             said += [guess] if guess else []
-        channels, channel_units = _channels(own, columns)
+        channels, channel_units = _channels(own, columns, quantity)
         streams.append(
             Stream(
                 name=device or name,
@@ -163,18 +165,19 @@ def _remoteness(clock: Column) -> int:
     return 0 if "sample" in name else 1 if "header" in name else 2
 
 
-def _guessed_names(columns: Sequence[Column], log: str) -> list[str]:
-    """What is to be said of gyros whose names do not say so, in a log of some name."""
-    names = [column.name for column in columns if column.kind == "gyro"]
+def _guessed_names(columns: Sequence[Column], quantity: str, log: str) -> list[str]:
+    """What is to be said of sensors whose names do not say what they are, in a log of some name."""
+    names = [column.name for column in columns if column.kind == quantity]
     bare = [name for name in names if bare_name(name) in ("p", "q", "r")]
     if bare:
         return [f"columns {', '.join(bare)} are read as the rates about x, y, z, as flight mechanics names them"]
     bare = [name for name in names if bare_name(name) in AXES]
     if not bare:
         return []
-    kind = classify_columns([log])[0].kind
-    but = f", though the log is called {log}" if kind in ("acceleration", "magnetic_field") else ""
-    return [f"columns {', '.join(bare)} name no sensor and are read as a gyro's{but}"]
+    sensor = "a gyro's" if quantity == "rate" else "an accelerometer's"
+    other = classify_columns([log], quantity)[0].kind in {"rate", "acceleration", "magnetic_field"} - {quantity}
+    but = f", though the log is called {log}" if other else ""
+    return [f"columns {', '.join(bare)} name no sensor and are read as {sensor}{but}"]
 
 
 def _joined_clocks(
@@ -209,20 +212,22 @@ def _without_unit(name: str) -> str:
 
 
 def _channels(
-    classified: Sequence[Column], columns: Mapping[str, NDArray[np.generic]]
+    classified: Sequence[Column], columns: Mapping[str, NDArray[np.generic]], quantity: str
 ) -> tuple[dict[str, Array], dict[str, str]]:
     channels: dict[str, Array] = {}
     units: dict[str, str] = {}
-    for kind in ("temperature", "acceleration", "magnetic_field"):
+    for kind, name in CHANNELS.items():
+        if kind == quantity:
+            continue
         found = {column.axis: column for column in classified if column.kind == kind}
         if not found:
             continue
         if set(AXES) <= set(found):
-            channels[kind] = np.stack([np.asarray(columns[found[a].name], dtype=np.float64) for a in AXES])
+            channels[name] = np.stack([np.asarray(columns[found[a].name], dtype=np.float64) for a in AXES])
         elif kind == "temperature":
-            channels[kind] = np.asarray(columns[next(iter(found.values())).name], dtype=np.float64)
+            channels[name] = np.asarray(columns[next(iter(found.values())).name], dtype=np.float64)
         else:
             continue
         if unit := next(iter(found.values())).unit:
-            units[kind] = unit
+            units[name] = unit
     return channels, units

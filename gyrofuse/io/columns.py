@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
-from gyrofuse.io.limits import LONGEST_NAME
+from gyrofuse.io.limits import LONGEST_NAME, enumerated
+from gyrofuse.io.stream import RecordingError
 from gyrofuse.units import UNITS, canonical_unit
 
 AXES = ("x", "y", "z")
+# What names of each quantity look like, for messages, and what reads it.
+NAMES_OF = {"rate": "a gyro (gyro_x, gx)", "acceleration": "an accelerometer (acc_x, ax)"}
+# Names of channels by what they hold; of two quantities one is the signal and the other a channel.
+CHANNELS = {kind: kind for kind in ("temperature", "acceleration", "magnetic_field")} | {"rate": "angular_rate"}
+WORD_OF = {"rate": "gyro", "acceleration": "acceleration"}  # a name that says so
+_INSTEAD = {
+    "rate": 'it has accelerations, which are read with quantity="acceleration" (--quantity acceleration)',
+    "acceleration": 'it has gyros, which are read with quantity="rate" (--quantity rate)',
+}
 TICK = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 WRAP_32_BIT = 2.0**32
 
@@ -27,14 +38,14 @@ _PHRASES = (
 )
 _WORD = re.compile(
     r"(?P<before>[xyz])?"
-    r"(?:(?P<gyro>gyroscope|gyroskop|gyros?|gyrs?|omega|drehrate)"
+    r"(?:(?P<rate>gyroscope|gyroskop|gyros?|gyrs?|omega|drehrate)"
     r"|(?P<acceleration>accelerometer|acceleration|beschleunigung|accel|accl|acc)"
     r"|(?P<magnetic_field>magnetometer|magn|mag)|(?P<temperature>temperatures?|temperatur|temp))"
     r"(?P<number>\d*)(?P<after>[xyz])?(?P<last>\d*)",
     re.IGNORECASE,
 )
 _SHORT = re.compile(r"(?P<word>[gwam])(?P<number>\d*)(?P<axis>[xyz])(?P<last>\d*)", re.IGNORECASE)
-_SHORT_KINDS = {"g": "gyro", "w": "gyro", "a": "acceleration", "m": "magnetic_field"}
+_SHORT_KINDS = {"g": "rate", "w": "rate", "a": "acceleration", "m": "magnetic_field"}
 _TIME = re.compile(
     r"(?:sampletimefine|timestamps?|times?|stamp|clock|zeit|zeitstempel|uhrzeit|tow|ts|t)(?P<number>\d*)", re.IGNORECASE
 )
@@ -96,7 +107,7 @@ class Column:
 
     Attributes:
         name: The name as the log has it.
-        kind: `"gyro"`, `"acceleration"`, `"magnetic_field"`, `"temperature"`, `"time"`, or `""` for anything else.
+        kind: `"rate"`, `"acceleration"`, `"magnetic_field"`, `"temperature"`, `"time"`, or `""` for anything else.
         device: What tells this sensor from its siblings (`"imu1"`, `"2"`), `""` where there is nothing.
         axis: `"x"`, `"y"`, `"z"`, or `""`.
         unit: Unit that the name states (`"deg/s"`; for a time `"s"`, `"ms"`, `"us"`, `"ns"`), or `""`.
@@ -109,19 +120,57 @@ class Column:
     unit: str = ""
 
 
-def classify_columns(names: Sequence[str]) -> list[Column]:
+def classify_columns(names: Sequence[str], quantity: str = "rate") -> list[Column]:
     """Say of each name what it holds.
 
-    Bare axes (`x`, `y`, `z`) and bare numbers (`1`, `s2`, `sensor_3`) are gyros only where the log names no sensor;
-    `p`, `q` and `r`, the rates of flight mechanics, where it names no other gyro.
+    Bare axes (`x`, `y`, `z`) and bare numbers (`1`, `s2`, `sensor_3`) are of the quantity that is read, and only where
+    the log names no sensor; `p`, `q` and `r`, the rates of flight mechanics, where it names no other gyro.
     """
     columns = [_classify(str(name)) for name in names]
     kinds = {column.kind for column in columns}
-    if "gyro" not in kinds and _FLIGHT_MECHANICS.keys() <= {bare_name(column.name) for column in columns}:
+    if "rate" not in kinds and _FLIGHT_MECHANICS.keys() <= {bare_name(column.name) for column in columns}:
         return [_classify_body_rate(column) for column in columns]
-    if not kinds.isdisjoint(("gyro", "acceleration", "magnetic_field")):
+    if not kinds.isdisjoint(("rate", "acceleration", "magnetic_field")):
         return columns
-    return [_classify_bare(column) for column in columns]
+    return [_classify_bare(column, quantity) for column in columns]
+
+
+def renamed(path: Path, names: Sequence[str], wanted: Mapping[str, str]) -> dict[str, str]:
+    """What columns are called by their names in the log, where the user says what they are.
+
+    Args:
+        path: The log.
+        names: Of its columns.
+        wanted: Column by the name that it should have, such as `{"gyro_x": "u3", "time": "t"}`.
+
+    Raises:
+        RecordingError: No such column.
+    """
+    absent = [column for column in wanted.values() if column not in names]
+    if absent:
+        raise RecordingError(
+            f"{path}: expected a column {absent[0]!r} (`columns`, --map), found {enumerated(names)}; name one of these"
+        )
+    return {column: name for name, column in wanted.items()}
+
+
+def check_columns(wanted: Mapping[str, str]) -> None:
+    """Raise `ValueError` where a name says nothing of what a column holds, or a column is to have two names."""
+    for name in wanted:
+        if not _classify(str(name)).kind:
+            raise ValueError(
+                f"`columns`: expected names such as gyro_x, acc_z [g], temperature or time, got {name!r}; use one"
+            )
+    columns = list(wanted.values())
+    twice = next((column for column in columns if columns.count(column) > 1), None)
+    if twice is not None:
+        raise ValueError(f"`columns`: expected each column once, got {twice!r} twice; give it one name")
+
+
+def or_else(columns: Collection[Column], quantity: str, otherwise: str) -> str:
+    """What to do about a log without the quantity that was asked for: take the other one, where it has that."""
+    kinds = {column.kind for column in columns} - {quantity}
+    return otherwise if kinds.isdisjoint(NAMES_OF) else _INSTEAD[quantity]
 
 
 def is_unit(text: str) -> bool:
@@ -139,14 +188,14 @@ def _classify_body_rate(column: Column) -> Column:
     if axis is None:
         return column
     stated = _without_brackets(column.name)[1]
-    return Column(column.name, "gyro", "", axis, canonical_unit(stated[-1]) if stated else "")
+    return Column(column.name, "rate", "", axis, canonical_unit(stated[-1]) if stated else "")
 
 
-def _classify_bare(column: Column) -> Column:
+def _classify_bare(column: Column, quantity: str) -> Column:
     bare = column.name.strip()
     if bare.lower() in AXES:
-        return Column(column.name, "gyro", "", bare.lower())
-    return Column(column.name, "gyro", bare) if _PLAIN.fullmatch(bare) else column
+        return Column(column.name, quantity, "", bare.lower())
+    return Column(column.name, quantity, bare) if _PLAIN.fullmatch(bare) else column
 
 
 def _classify(name: str) -> Column:
@@ -170,7 +219,7 @@ def _classify(name: str) -> Column:
         token, following = lower[position], lower[position + 1] if position + 1 < len(tokens) else ""
         position += 1
         if match := _WORD.fullmatch(token):
-            found = next(k for k in ("gyro", "acceleration", "magnetic_field", "temperature") if match[k] is not None)
+            found = next(k for k in ("rate", "acceleration", "magnetic_field", "temperature") if match[k] is not None)
             kind = "temperature" if "temperature" in (kind, found) else kind or found
             axis = axis or match["before"] or match["after"] or ""
             numbers += [match["number"], match["last"]]
@@ -189,7 +238,7 @@ def _classify(name: str) -> Column:
         else:
             rest.append(tokens[position - 1])
     if time_at is not None:
-        if kind not in ("", "gyro"):
+        if kind not in ("", "rate"):
             return Column(name)
         if canonical_unit(stated) in ("degC", "K"):  # T [degC]
             return Column(name, "temperature", unit=canonical_unit(stated))
@@ -202,7 +251,7 @@ def _classify(name: str) -> Column:
     if not kind and axis and not _RATE_WORDS.isdisjoint(words):
         rest = [token for token in rest if token.lower() not in _RATE_WORDS]
         if all(_PLAIN.fullmatch(token) or token.lower() in _FILLERS | drop for token in rest):
-            kind, unit = "gyro", _unit_of("gyro", lower, stated)
+            kind, unit = "rate", _unit_of("rate", lower, stated)
     if not kind:
         return Column(name)
     return Column(name, kind, _device(rest, numbers, drop), axis, unit)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,15 @@ _DEEPEST = 64  # groups inside each other: the library spends its stack on each
 _MOST_TEXTS = 4096  # texts in a MATLAB cell array that may be names of sensors
 
 
-def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) -> list[Stream]:
-    """Read the gyros of an HDF5 file; `gyrofuse.io.arrays` says which names are understood.
+def read(
+    path: Path,
+    *,
+    key: str | None = None,
+    quantity: str = "rate",
+    columns: Mapping[str, str] | None = None,
+    max_bytes: float | None = None,
+) -> list[Stream]:
+    """Read the gyros or accelerometers of an HDF5 file; `gyrofuse.io.arrays` says which names are understood.
 
     Sampling rate, unit and sensor names may be datasets or attributes of the dataset, a group or the file. Links to
     other files are not followed.
@@ -27,6 +34,9 @@ def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) 
     Args:
         path: The file.
         key: The dataset that holds the gyros, or the group to look in.
+        quantity: `"rate"` or `"acceleration"`: the sensors to read.
+        columns: What datasets are, where their names do not say: these by the names that they should have; the others
+            are left out.
         max_bytes: Memory that the datasets may take; by default a quarter of what there is.
 
     Raises:
@@ -41,7 +51,9 @@ def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) 
         check_heaps(path)
         with h5py.File(path, "r") as file:
             # Datasets are read when needed: a file may hold much besides gyros.
-            return streams_from_arrays(_content(file, Allowance(path, max_bytes)), path, key=key)
+            return streams_from_arrays(
+                _content(file, Allowance(path, max_bytes)), path, key=key, quantity=quantity, columns=columns
+            )
     except RecordingError:
         raise
     except Exception as error:  # a damaged file may fail anywhere in the library

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +18,24 @@ _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _USER_BLOCK = 512  # MATLAB puts its own header before the HDF5 file
 
 
-def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) -> list[Stream]:
-    """Read the gyros of a .mat file; `gyrofuse.io.arrays` says which names are understood.
+def read(
+    path: Path,
+    *,
+    key: str | None = None,
+    quantity: str = "rate",
+    columns: Mapping[str, str] | None = None,
+    max_bytes: float | None = None,
+) -> list[Stream]:
+    """Read the gyros or accelerometers of a .mat file; `gyrofuse.io.arrays` says which names are understood.
 
     Files of version 7.3 are HDF5 and are told apart by their content.
 
     Args:
         path: The file.
         key: The array that holds the gyros (`"imu.gyr"` or `"imu/gyr"` in a struct), or the struct to look in.
+        quantity: `"rate"` or `"acceleration"`: the sensors to read.
+        columns: What arrays are, where their names do not say: these by the names that they should have; the others are
+            left out.
         max_bytes: Memory that the variables may take, packed and unpacked; by default a quarter of what there is.
 
     Raises:
@@ -42,7 +53,7 @@ def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) 
             f"{path}: expected a MATLAB file, found one that cannot be opened ({cause(error)})"
         ) from error
     if start.startswith(_HDF5_SIGNATURE) or start.endswith(_HDF5_SIGNATURE):
-        return hdf5.read(path, key=key, max_bytes=max_bytes)
+        return hdf5.read(path, key=key, quantity=quantity, columns=columns, max_bytes=max_bytes)
     allowance = Allowance(path, max_bytes)
     try:
         if 0 in start[:4]:  # version 4, which has neither cells nor packed variables
@@ -61,7 +72,7 @@ def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) 
     for name, value in variables.items():
         if not name.startswith("__"):
             content |= _members(name, value)
-    return streams_from_arrays(content, path, key=key)
+    return streams_from_arrays(content, path, key=key, quantity=quantity, columns=columns)
 
 
 def _members(name: str, value: Any) -> dict[str, Any]:

@@ -11,7 +11,7 @@ class Note:
     """One finding about a recording.
 
     Attributes:
-        kind: `gaps`, `repeats`, `jitter`, `drift`, `wraps`, `clock`, `non_finite`, `startup`, `offset`, `cut`, `axes`,
+        kind: `gaps`, `repeats`, `jitter`, `drift`, `wraps`, `clock`, `non_finite`, `startup`, `offset`, `cut`,
             `unit` or `reader`.
         stream: Device or file it is about; empty when about all.
         sentence: The finding in words, with numbers and units.

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrofuse.io.arrays import settings_by_group, stated_rate, streams_from_arrays
-from gyrofuse.io.columns import AXES, classify_columns
+from gyrofuse.io.columns import AXES, WORD_OF, classify_columns
 from gyrofuse.io.limits import LONGEST_NAME, Allowance, decoded
 from gyrofuse.io.npy import MAGIC, read_header, read_numbers
 from gyrofuse.io.numpy_tables import streams_from_tables
@@ -29,8 +29,15 @@ from gyrofuse.io.stream import Array, RecordingError, Stream, cause
 _Content = Mapping[str, NDArray[Any]]
 
 
-def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) -> list[Stream]:
-    """Read the gyros of an .npz or .npy file.
+def read(
+    path: Path,
+    *,
+    key: str | None = None,
+    quantity: str = "rate",
+    columns: Mapping[str, str] | None = None,
+    max_bytes: float | None = None,
+) -> list[Stream]:
+    """Read the gyros or accelerometers of an .npz or .npy file.
 
     The longer dimension of an .npy array is time, the other one the sensors `"1"`, `"2"`, ...; it states no rate.
     Nothing that would have to be unpickled is read.
@@ -38,6 +45,9 @@ def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) 
     Args:
         path: The file.
         key: Of an .npz file, the array that holds the gyros, whatever its name, or the table to read.
+        quantity: `"rate"` or `"acceleration"`: the sensors to read.
+        columns: What arrays are, where their names do not say: these by the names that they should have; the others are
+            left out.
         max_bytes: Memory that the arrays may take; by default a quarter of what there is.
 
     Raises:
@@ -69,9 +79,11 @@ def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) 
         raise RecordingError(
             f"{path}: expected `fs` to be one sampling rate in Hz, found {found}; correct or leave it out"
         )
-    if "gyro" not in content and content.get("channels", np.empty(0)).dtype.kind == "U":
-        return streams_from_tables(content, path, key)
-    return _recording(content, path, key)
+    if columns is None and "gyro" not in content and content.get("channels", np.empty(0)).dtype.kind == "U":
+        return streams_from_tables(content, path, key, quantity)
+    if columns is not None:
+        return streams_from_arrays(content, path, key=key, quantity=quantity, columns=columns)
+    return _recording(content, path, key, quantity)
 
 
 def _members(file: IO[bytes], allowance: Allowance) -> dict[str, NDArray[Any]]:
@@ -111,14 +123,17 @@ def _bare_array(array: NDArray[Any], path: Path, key: str | None) -> list[Stream
     return [Stream(name, {"": np.array(row, np.float64)}) for name, row in zip(names, rows, strict=True)]
 
 
-def _recording(content: _Content, path: Path, key: str | None) -> list[Stream]:
+def _recording(content: _Content, path: Path, key: str | None, quantity: str) -> list[Stream]:
     """Streams of an .npz recording, or of arrays that only `gyrofuse.io.arrays` understands."""
-    gyro = content.get("gyro")
-    if gyro is None or key not in (None, "gyro"):
-        return streams_from_arrays(content, path, key=key)
+    main = WORD_OF[quantity]
+    gyro = content.get(main)
+    # Accelerations beside gyros are a channel of theirs, whose names and axes say nothing of them.
+    of_gyros = quantity == "acceleration" and "gyro" in content
+    if gyro is None or of_gyros or key not in (None, main):
+        return streams_from_arrays(content, path, key=key, quantity=quantity)
     if gyro.dtype.kind not in "iuf" or gyro.ndim not in (1, 2, 3) or gyro.shape[-1] < 2 or gyro.size == 0:
         raise RecordingError(
-            f"{path}: expected `gyro` to be numbers (sensor, time) or (axis, sensor, time) with at least 2 samples, "
+            f"{path}: expected `{main}` to be numbers (sensor, time) or (axis, sensor, time) with at least 2 samples, "
             f"found {gyro.dtype} {gyro.shape}; save it with time last"
         )
     axes = _axes(content, gyro, path) if gyro.ndim == 3 else [""]
@@ -138,25 +153,29 @@ def _recording(content: _Content, path: Path, key: str | None) -> list[Stream]:
 
     # A group per sensor is what several devices look like in other files.
     rates = rows.reshape(len(axes), n_sensors, n_samples)
-    spread: dict[str, Any] = {f"{i}/gyro/{axis}": rates[k, i] for i in range(n_sensors) for k, axis in enumerate(axes)}
+    spread: dict[str, Any] = {
+        f"{i}/{main}/{axis}": rates[k, i] for i in range(n_sensors) for k, axis in enumerate(axes)
+    }
     if "fs" not in content:
         spread["time/unit"] = np.str_("s")  # with a rate beside it, the clock tells its unit itself
     own: list[dict[str, Array]] = [{} for _ in sensors]
     position_of = {sensor: position for position, sensor in enumerate(sensors)}
     for name, value in content.items():
-        if name in ("gyro", "sensors", "axes"):
+        if name in (main, "sensors", "axes"):
             continue
         owner = _in_brackets(name, position_of)
-        named_gyro = classify_columns(["gyro", name])[1].kind == "gyro"
-        if not (named_gyro or owner):
+        named_alike = classify_columns([main, name])[1].kind == quantity
+        if not (named_alike or owner):
             spread[name] = value
         elif value.dtype.kind in "biuf" and value.shape[-1:] == (n_samples,):
-            # `temperature[imu2]` belongs to the sensor imu2; a second gyro is a channel.
+            # `temperature[imu2]` belongs to the sensor imu2; a second array of the quantity is a channel.
             number, label = (position_of[owner], name.removesuffix(f"[{owner}]")) if owner else (0, name)
             own[number][label] = value.astype(np.float64)
     return [
         replace(stream, name=sensor, channels=stream.channels | channels, notes=(*stream.notes, *notes))
-        for stream, sensor, channels in zip(streams_from_arrays(spread, path), sensors, own, strict=True)
+        for stream, sensor, channels in zip(
+            streams_from_arrays(spread, path, quantity=quantity), sensors, own, strict=True
+        )
     ]
 
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from gyrofuse.io.arrays import clock_in_seconds, settings_by_group, stated_rate
 from gyrofuse.io.column_streams import streams_from_columns
-from gyrofuse.io.columns import WRAP_32_BIT, Column, classify_columns
+from gyrofuse.io.columns import NAMES_OF, WRAP_32_BIT, Column, classify_columns
 from gyrofuse.io.limits import LONGEST_NAME, enumerated, is_rate
 from gyrofuse.io.stream import Array, RecordingError, Stream
 from gyrofuse.units import canonical_unit
@@ -56,13 +56,14 @@ class _Beside:
     column: Column
 
 
-def streams_from_tables(content: _Content, path: Path, key: str | None) -> list[Stream]:
+def streams_from_tables(content: _Content, path: Path, key: str | None, quantity: str = "rate") -> list[Stream]:
     """Streams of the tables of a file.
 
     Args:
         content: Arrays by name.
         path: The file.
         key: Name of the table to read, without the words that all tables begin with or with them.
+        quantity: `"rate"` or `"acceleration"`: the sensors to read.
 
     Raises:
         RecordingError: No table with a gyro, or several recordings of which `key` names none.
@@ -71,11 +72,12 @@ def streams_from_tables(content: _Content, path: Path, key: str | None) -> list[
     units = [canonical_unit(str(unit)) for unit in _per_channel(content, ("units", "unit"), "", channels, path)]
     scale = [float(factor) for factor in _per_channel(content, ("scale",), 1.0, channels, path)]
     values = {name: rows for name, value in content.items() if (rows := _by_device(value, len(channels))) is not None}
-    if not values or len({*channels}) < len(channels) or "gyro" not in {c.kind for c in classify_columns(channels)}:
+    kinds = {column.kind for column in classify_columns(channels, quantity)}
+    if not values or len({*channels}) < len(channels) or quantity not in kinds:
         found = enumerated(f"{name} {value.shape}" for name, value in content.items() if value.ndim)
         raise RecordingError(
-            f"{path}: expected arrays (channel, time) with the rows {enumerated(channels)} and a gyro (gx) among them, "
-            f"found {found}; name each row once in `channels`"
+            f"{path}: expected arrays (channel, time) with the rows {enumerated(channels)} and {NAMES_OF[quantity]} "
+            f"among them, found {found}; name each row once in `channels`"
         )
     labels = _short(values)
     wanted = [name for name in values if key is None or key in (name, labels[name])]
@@ -94,7 +96,7 @@ def streams_from_tables(content: _Content, path: Path, key: str | None) -> list[
     return [
         stream
         for table in tables
-        for stream in _streams(table, path.stem if only else labels[table.name], channels, units, scale, rate)
+        for stream in _streams(table, path.stem if only else labels[table.name], channels, units, scale, rate, quantity)
     ]
 
 
@@ -230,12 +232,13 @@ def _streams(
     units: Sequence[str],
     scale: Sequence[float],
     rate: float | None,
+    quantity: str,
 ) -> list[Stream]:
-    columns = classify_columns(channels)
-    unit = next(unit for unit, column in zip(units, columns, strict=True) if column.kind == "gyro")
+    columns = classify_columns(channels, quantity)
+    unit = next(unit for unit, column in zip(units, columns, strict=True) if column.kind == quantity)
     # A name that states a unit, as columns of text files do; that of a gyro may be a bare axis and stays so.
     stated = [
-        f"{column.name} [{unit}]" if unit and column.kind not in ("", "gyro") else column.name
+        f"{column.name} [{unit}]" if unit and column.kind not in ("", quantity) else column.name
         for column, unit in zip(columns, units, strict=True)
     ]
     counts = table.values.dtype.kind in "iu"
@@ -248,7 +251,13 @@ def _streams(
         name = str(number) if len(table.values) > 1 else label
         first = len(streams)
         streams += streams_from_columns(
-            values, name=name, unit=unit or "unknown", rate=rate, time=table.clock, notes=table.notes
+            values,
+            name=name,
+            unit=unit or "unknown",
+            rate=rate,
+            time=table.clock,
+            notes=table.notes,
+            quantity=quantity,
         )
         other = {column.name: values[column.name] for column in columns if not column.kind}
         if first == 0:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,19 +10,29 @@ import numpy as np
 
 from gyrofuse.io.arrays import settings_by_group, stated_rate, stated_unit
 from gyrofuse.io.column_streams import streams_from_columns
-from gyrofuse.io.columns import classify_columns
+from gyrofuse.io.columns import NAMES_OF, WORD_OF, classify_columns, or_else, renamed
 from gyrofuse.io.limits import Allowance, decoded, enumerated
 from gyrofuse.io.stream import Array, RecordingError, Stream, cause
 
 
-def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) -> list[Stream]:
-    """Read the gyros of a Parquet file, whose columns are named as in a CSV file.
+def read(
+    path: Path,
+    *,
+    key: str | None = None,
+    quantity: str = "rate",
+    columns: Mapping[str, str] | None = None,
+    max_bytes: float | None = None,
+) -> list[Stream]:
+    """Read the gyros or accelerometers of a Parquet file, whose columns are named as in a CSV file.
 
     `fs` (Hz) and `unit` are taken from the metadata of the schema. A null is NaN.
 
     Args:
         path: The file.
         key: The only column to read as a gyro, whatever its name.
+        quantity: `"rate"` or `"acceleration"`: the sensors to read.
+        columns: What columns are, where their names do not say: columns by the names that they should have; the others
+            are left out.
         max_bytes: Memory that the columns may take; by default a quarter of what there is.
 
     Raises:
@@ -38,11 +49,14 @@ def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) 
             schema = file.schema_arrow
             numbers = [f.name for f in schema if pa.types.is_integer(f.type) or pa.types.is_floating(f.type)]
             dates = [f.name for f in schema if pa.types.is_timestamp(f.type) or pa.types.is_duration(f.type)]
-            wanted = [column.name for column in classify_columns(numbers) if column.kind or column.name == key]
+            called = {name: name for name in numbers} if columns is None else renamed(path, schema.names, columns)
+            numbers = [name for name in numbers if name in called]
+            kinds = {c.name: c.kind for c in classify_columns([called[name] for name in numbers], quantity)}
+            wanted = [name for name in numbers if kinds[called[name]] or called[name] == key]
             Allowance(path, max_bytes).take("columns", (file.metadata.num_rows, len(wanted) + len(dates)))
             table = file.read(columns=[*wanted, *dates])
             # pyarrow lends its own memory, which may not be written to: torch warns of that
-            columns = {name: np.require(table.column(name).to_numpy(), requirements="W") for name in wanted}
+            read = {called[name]: np.require(table.column(name).to_numpy(), requirements="W") for name in wanted}
             time = _seconds(table.column(dates[0])) if dates else None
     except RecordingError:
         raise
@@ -52,23 +66,23 @@ def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) 
         ) from error
 
     if key is not None:
-        kinds = {column.name: column.kind for column in classify_columns(wanted)}
-        columns = {name: values for name, values in columns.items() if name == key or kinds[name] != "gyro"}
-        if key in columns and kinds[key] != "gyro":
-            columns["gyro"] = columns.pop(key)
+        read = {name: values for name, values in read.items() if name == key or kinds[name] != quantity}
+        if key in read and kinds[key] != quantity:
+            read[WORD_OF[quantity]] = read.pop(key)
     settings = settings_by_group(metadata_of(schema))
     streams = streams_from_columns(
-        columns,
+        read,
         name=path.stem if key is None else key,
         unit=stated_unit(settings, ""),
         rate=stated_rate(settings, ""),
         time=time,
+        quantity=quantity,
     )
     if not streams or table.num_rows == 0:
-        wanted_name = "with the name of a gyro (gyro_x, gx)" if key is None else f"{key!r} (`key`) of numbers"
+        what = f"with the name of {NAMES_OF[quantity]}" if key is None else f"{key!r} (`key`) of numbers"
+        advice = or_else(classify_columns(numbers), quantity, "say with `columns` (--map) what the columns are")
         raise RecordingError(
-            f"{path}: expected a column {wanted_name}, found {table.num_rows} rows of {enumerated(schema.names)}; "
-            "say with `key` which column is the gyro"
+            f"{path}: expected a column {what}, found {table.num_rows} rows of {enumerated(schema.names)}; {advice}"
         )
     return streams
 

@@ -179,7 +179,7 @@ def _open_parquet(path: Path, key: str | Sequence[str] | None) -> Slices:
         lengths = [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)]
         ends = np.cumsum(lengths).tolist()
     if key is None:
-        gyros = [column for column in classify_columns(numbers) if column.kind == "gyro"]
+        gyros = [column for column in classify_columns(numbers) if column.kind == "rate"]
         wanted = [column.name for column in gyros]
         if len({column.device for column in gyros}) > 1 and len({column.axis for column in gyros}) > 1:
             raise RecordingError(

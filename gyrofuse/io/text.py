@@ -13,15 +13,16 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
+from gyrofuse._result import numbered
 from gyrofuse.io.arrays import settings_by_group, stated_rate, stated_unit
 from gyrofuse.io.column_streams import streams_from_columns, time_in_seconds
-from gyrofuse.io.columns import Column, classify_columns
+from gyrofuse.io.columns import NAMES_OF, WORD_OF, Column, classify_columns, or_else, renamed
 from gyrofuse.io.dates import DAY, seconds_of
 from gyrofuse.io.limits import LONGEST_NAME, Allowance, enumerated
 from gyrofuse.io.stream import Array, RecordingError, Stream, cause
@@ -29,12 +30,22 @@ from gyrofuse.io.text_dialects import NEEDED, translate
 from gyrofuse.io.text_layout import COMMENT, Layout, advances, find_layout, lines_of, quoted_cells, without_numbers
 
 
-def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) -> list[Stream]:
-    """Read the gyros of a text file.
+def read(
+    path: Path,
+    *,
+    key: str | None = None,
+    quantity: str = "rate",
+    columns: Mapping[str, str] | None = None,
+    max_bytes: float | None = None,
+) -> list[Stream]:
+    """Read the gyros or accelerometers of a text file.
 
     Args:
         path: The file.
         key: The only column to read as a gyro, whatever its name, or the only device.
+        quantity: `"rate"` or `"acceleration"`: the sensors to read.
+        columns: What columns are, where their names do not say: columns by the names that they should have; the others
+            are left out.
         max_bytes: Memory that its numbers may take; by default a quarter of what there is.
 
     Raises:
@@ -45,7 +56,12 @@ def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) 
         layout = find_layout(path)
         settings = settings_by_group(layout.settings)
         rate = stated_rate(settings, "")
-        table = _named(path, layout, key, allowance) if layout.names else _unnamed(path, layout, key, rate, allowance)
+        if columns is not None:
+            layout = _renamed(path, layout, columns)
+        if layout.names:
+            table = _named(path, layout, key, quantity, allowance)
+        else:
+            table = _unnamed(path, layout, key, quantity, rate, allowance)
     except (OSError, csv.Error) as error:
         raise RecordingError(
             f"{path}: expected text, found a file that cannot be read ({cause(error)}); export it again"
@@ -58,6 +74,7 @@ def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) 
         time=table.time,
         clock_period=table.clock_period,
         notes=[*layout.notes, *table.notes],
+        quantity=quantity,
     )
     if streams[0].n_samples < 2:
         raise RecordingError(f"{path}: expected at least 2 rows of numbers, found 1; record longer")
@@ -74,38 +91,46 @@ class _Table:
     notes: list[str]
 
 
-def _named(path: Path, layout: Layout, key: str | None, allowance: Allowance) -> _Table:
+def _renamed(path: Path, layout: Layout, columns: Mapping[str, str]) -> Layout:
+    """The layout with the names that columns should have, empty for those without any."""
+    names = layout.names or numbered(len(layout.numeric))
+    called = renamed(path, names, columns)
+    return replace(layout, names=tuple(called.get(name, "") for name in names), rising=False)
+
+
+def _named(path: Path, layout: Layout, key: str | None, quantity: str, allowance: Allowance) -> _Table:
     """Columns that the header names."""
     notes: list[str] = []
     chosen: dict[str, int] = {}
-    gyros: set[str] = set()
-    columns_there = classify_columns(layout.names)
+    wanted: set[str] = set()
+    columns_there = classify_columns(layout.names, quantity)
     clock = _clock_of_dates(layout, columns_there)
     for position, column in enumerate(columns_there):
         if column.name in chosen:
             notes.append(f"column '{column.name}' stands there twice; the first is read")
-        elif column.name == key or (column.kind == "gyro" and key in (None, column.device)):
+        elif column.name == key or (column.kind == quantity and key in (None, column.device)):
             chosen[column.name] = position
-            gyros.add(column.kind)
-        elif column.kind not in ("", "gyro") or column.name.lower() in NEEDED:
+            wanted.add(column.kind)
+        elif column.kind not in ("", quantity) or column.name.lower() in NEEDED:
             if layout.numeric[position]:
                 chosen[column.name] = position
             elif column.kind == "time" and position != clock:
                 beside = "dates beside another clock" if layout.times[position] else "no numbers"
                 notes.append(f"column '{column.name}' holds {beside} and is left out")
-    if not gyros:
-        wanted = "with the name of a gyro (gyro_x, gx)" if key is None else f"or device {key!r} (`key`)"
+    if not wanted:
+        what = f"with the name of {NAMES_OF[quantity]}" if key is None else f"or device {key!r} (`key`)"
+        advice = "say with `columns` (--map) what the columns are"
         raise RecordingError(
-            f"{path}: expected a column {wanted}, found {enumerated(layout.names)}; "
-            "say with `key` which column is the gyro"
+            f"{path}: expected a column {what}, found {enumerated(layout.names)}; "
+            f"{or_else(columns_there, quantity, advice)}"
         )
     if layout.rising and layout.names[0] not in chosen and not any(c.kind == "time" for c in columns_there):
         notes.append(
             f"column '{layout.names[0]}' rises in equal steps but has no name of a clock; if it is one, call it 'time'"
         )
     columns, time, period, said = _with_dates(path, layout, chosen, clock, allowance)
-    if "gyro" not in gyros and key is not None:
-        columns["gyro"] = columns.pop(key)
+    if quantity not in wanted and key is not None:
+        columns[WORD_OF[quantity]] = columns.pop(key)
     columns, meaning = translate(columns, layout.names, layout.settings)
     return _Table(columns, time, period, [*notes, *said, *meaning])
 
@@ -134,7 +159,9 @@ def _with_dates(
     return columns, seconds, DAY, [note]
 
 
-def _unnamed(path: Path, layout: Layout, key: str | None, rate: float | None, allowance: Allowance) -> _Table:
+def _unnamed(
+    path: Path, layout: Layout, key: str | None, quantity: str, rate: float | None, allowance: Allowance
+) -> _Table:
     """Sensors by their number, and the clock where there is one."""
     wanted = {f"{i + 1}": i for i, numeric in enumerate(layout.numeric) if numeric}
     if not wanted:
@@ -156,8 +183,10 @@ def _unnamed(path: Path, layout: Layout, key: str | None, rate: float | None, al
             "name one of these"
         )
     if key is not None:
-        return _Table({"gyro": sensors[key]}, time, period, notes)
-    return _Table(sensors if len(sensors) > 1 else {"gyro": values[0]}, time, period, notes)
+        sensors = {key: sensors[key]}
+    if len(sensors) == 1:
+        sensors = {WORD_OF[quantity]: next(iter(sensors.values()))}
+    return _Table(sensors, time, period, notes)
 
 
 def _numbers(path: Path, layout: Layout, chosen: Mapping[str, int], allowance: Allowance) -> dict[str, Array]:

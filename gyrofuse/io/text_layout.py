@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gyrofuse.io.columns import classify_columns, is_unit
+from gyrofuse.io.columns import NAMES_OF, classify_columns, is_unit
 from gyrofuse.io.dates import kind_of_times
 from gyrofuse.io.limits import LONGEST_NAME, enumerated
 from gyrofuse.io.stream import Array, RecordingError
@@ -208,11 +208,11 @@ def _header_above(path: Path, above: Sequence[str], delimiter: str | None, width
     for line in reversed(above):
         text = line.lstrip("#%/ ")
         for cells in (_cells(text, delimiter), text.split()):
-            if len(cells) == width and _names_gyro(cells):
+            if len(cells) == width and _names_sensor(cells):
                 return cells
     text = next((line for line in reversed(above) if line.strip()), "")
     cells = _cells(text, delimiter)
-    if not text.startswith(COMMENT) and _names_gyro(cells):
+    if not text.startswith(COMMENT) and _names_sensor(cells):
         raise RecordingError(
             f"{path}: expected a header of {width} names, one for each cell of a row, found {len(cells)}: "
             f"{enumerated(cells)}; correct the header"
@@ -220,8 +220,8 @@ def _header_above(path: Path, above: Sequence[str], delimiter: str | None, width
     return []
 
 
-def _names_gyro(names: Iterable[str]) -> bool:
-    return any(column.kind == "gyro" for column in classify_columns(list(names)) if not column.name.isdigit())
+def _names_sensor(names: Iterable[str]) -> bool:
+    return any(column.kind in NAMES_OF for column in classify_columns(list(names)) if not column.name.isdigit())
 
 
 def _cells(line: str, delimiter: str | None) -> list[str]:

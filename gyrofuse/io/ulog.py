@@ -1,9 +1,15 @@
-"""PX4 ULog files: each instance of `sensor_gyro` is a device, or `sensor_combined` is, where it is faster."""
+"""PX4 ULog files: each instance of `sensor_gyro_fifo` or `sensor_gyro` is a device, or `sensor_combined` is.
+
+A message `sensor_gyro_fifo` holds what a sensor gathered since the one before, up to 32 samples (msg/SensorGyroFifo.msg
+of PX4); `sensor_gyro` has their means, `sensor_combined` those of the one gyro that flies.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import io
+import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +17,7 @@ import numpy as np
 
 from gyrofuse.io.limits import Allowance, enumerated
 from gyrofuse.io.stream import RecordingError, Stream, cause
+from gyrofuse.io.ulog_fifo import COVERED, FIFO, FIFO_FIELDS, MOST_SAMPLES, device_of, doubt, fifo_stream
 
 # Topics with gyro data in rad/s, and their fields along x, y, z.
 _AXES = {
@@ -18,6 +25,7 @@ _AXES = {
     "sensor_combined": ("gyro_rad[0]", "gyro_rad[1]", "gyro_rad[2]"),
 }
 _ACCELERATION = ("accelerometer_m_s2[0]", "accelerometer_m_s2[1]", "accelerometer_m_s2[2]")
+_KEY = re.compile(r"(sensor_gyro_fifo|sensor_gyro|sensor_combined)(?:\[(\d{1,3})\])?")
 # By default the logger thins `sensor_gyro` to about 1 Hz while `sensor_combined` runs at the full rate:
 # a topic this many times slower was logged to look at, not to analyse.
 _THINNED = 10.0
@@ -29,15 +37,17 @@ _MOST_READINGS, _FEW_BYTES = 10, 2**26
 _MOST_FIELDS = 2**17
 
 
-def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) -> list[Stream]:
+def read(path: Path, *, key: str | None = None, quantity: str = "rate", max_bytes: float | None = None) -> list[Stream]:
     """Read the gyros of a PX4 ULog file in rad/s, one stream per instance of the topic.
 
-    `sensor_gyro` is preferred, except where `sensor_combined` was logged more than ten times as fast. A log
-    that was cut off (power lost in flight) is read up to the cut.
+    `sensor_gyro_fifo` is preferred, which has every sample. Of the others it is `sensor_gyro`, except where
+    `sensor_combined` was logged more than ten times as fast. A log that was cut off (power lost in flight) is read up
+    to the cut.
 
     Args:
         path: The file.
-        key: `"sensor_gyro"` or `"sensor_combined"`; `None` chooses by rate.
+        key: `"sensor_gyro_fifo"`, `"sensor_gyro"` or `"sensor_combined"`, or an instance of one, `"sensor_gyro[1]"`;
+            `None` chooses.
         max_bytes: Memory that the log may take; by default a quarter of what there is.
 
     Raises:
@@ -52,7 +62,8 @@ def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) 
         # pyulog reports damage with print(); what it found is kept in `file_corruption`
         with path.open("rb", buffering=0) as raw, contextlib.redirect_stdout(io.StringIO()):
             size = path.stat().st_size
-            Allowance(path, max_bytes).take("messages", (-(-size // 8),))
+            allowance = Allowance(path, max_bytes)
+            allowance.take("messages", (-(-size // 8),))
             log = _bounded(ULog)(_Counted(raw, size))
     except RecordingError:
         raise
@@ -62,21 +73,63 @@ def read(path: Path, *, key: str | None = None, max_bytes: float | None = None) 
             "download the log from the vehicle again"
         ) from error
 
-    topics = {name: _instances(log, name) for name in _AXES}
-    if not any(topics.values()) or (key is not None and not topics.get(key)):
-        wanted = f"a gyro topic ({' or '.join(_AXES)})" + ("" if key is None else f" named by `key`, got {key!r}")
+    topics = {name: _instances(log, name) for name in (FIFO, *_AXES)}
+    asked = _KEY.fullmatch(key) if key is not None else None
+    chosen = _named(topics, asked) if asked else []
+    if not any(topics.values()) or (key is not None and not chosen):
+        names = " or ".join(topics)
+        wanted = f"a gyro topic ({names})" + ("" if key is None else f" named by `key`, got {key!r}")
         found = enumerated(sorted({data.name for data in log.data_list})) or "no data"
         raise RecordingError(f"{path}: expected {wanted}, found {found}; choose another topic, or log the gyros")
     notes = _logger_notes(log)
+    if key is None or chosen[0].name == FIFO:
+        fifos = [fifo_stream(data, log, allowance) for data in (topics[FIFO] if key is None else chosen)]
+        sound = [stream for stream, covered in fifos if stream is not None and (key or covered >= COVERED)]
+        if sound:
+            return [_with_notes(stream, notes + _left_out(topics, sound)) for stream in sound]
+        damage = [doubt(stream, covered) for stream, covered in fifos]
+        if key is not None or (fifos and not any(topics[name] for name in _AXES)):
+            raise RecordingError(
+                f"{path}: expected messages {FIFO} of 1 to {MOST_SAMPLES} samples with a time between them, found "
+                f"{enumerated(dict.fromkeys(damage))}; choose another topic with `key`, or download the log again"
+            )
+        notes += [f"{FIFO} has {said}; not read" for said in dict.fromkeys(damage)]
+    elif topics[FIFO]:
+        notes.append(f"{FIFO} ({len(topics[FIFO])} instances) ignored")
     if key is None:
         slow, fast = (max(map(_rate, topics[name]), default=0.0) for name in _AXES)
-        key = "sensor_combined" if fast > _THINNED * slow else "sensor_gyro"
-        if key == "sensor_combined" and topics["sensor_gyro"]:
+        name = "sensor_combined" if fast > _THINNED * slow else "sensor_gyro"
+        if name == "sensor_combined" and topics["sensor_gyro"]:
             notes.append(
                 f"sensor_gyro ({len(topics['sensor_gyro'])} instances) was logged at {slow:.3g} Hz only; "
                 f"sensor_combined at {fast:.4g} Hz is read instead"
             )
-    return [_stream(data, notes) for data in topics[key]]
+        chosen = topics[name]
+    return [_stream(data, notes) for data in chosen]
+
+
+def _named(topics: dict[str, list[Any]], asked: re.Match[str]) -> list[Any]:
+    """The instances that `key` names."""
+    return [data for data in topics[asked[1]] if asked[2] is None or data.multi_id == int(asked[2])]
+
+
+def _with_notes(stream: Stream, notes: list[str]) -> Stream:
+    return replace(stream, notes=(*stream.notes, *notes))
+
+
+def _left_out(topics: dict[str, list[Any]], read: list[Stream]) -> list[str]:
+    """What is in the log beside the samples of the fifos."""
+    notes = []
+    for name in _AXES:
+        if topics[name]:
+            rate = max(map(_rate, topics[name]))
+            notes.append(f"{name} ({len(topics[name])} instances, {rate:.4g} Hz) is not read: {FIFO} has every sample")
+    own = {note for stream in read for note in stream.notes if note.startswith("device_id")}
+    others = [f"device_id {device_of(data)}" for data in topics["sensor_gyro"] if device_of(data) is not None]
+    others = [device for device in others if device not in own]
+    if others:
+        notes.append(f"sensor_gyro has gyros that {FIFO} lacks ({enumerated(others)}); read them with key=sensor_gyro")
+    return notes
 
 
 class _Counted(io.BufferedReader):
@@ -110,7 +163,7 @@ def _bounded(base: Any) -> Any:
 
 def _instances(log: Any, name: str) -> list[Any]:
     """Instances of one topic that hold a time and a rate on each axis."""
-    needed = {"timestamp", *_AXES[name]}
+    needed = FIFO_FIELDS if name == FIFO else {"timestamp", *_AXES[name]}
     return [data for data in log.data_list if data.name == name and needed <= data.data.keys()]
 
 
@@ -154,6 +207,7 @@ def _logger_notes(log: Any) -> list[str]:
         notes.append(f"the logger reports {len(log.dropouts)} dropouts, {total} ms in total")
     if log.file_corruption:
         notes.append("part of the file is damaged and was skipped")
-    if fifo := sum(data.name == "sensor_gyro_fifo" for data in log.data_list):
-        notes.append(f"sensor_gyro_fifo ({fifo} instances) ignored")
+    lacking = sum(data.name == FIFO and not data.data.keys() >= FIFO_FIELDS for data in log.data_list)
+    if lacking:
+        notes.append(f"{FIFO} ({lacking} instances) ignored")
     return notes

@@ -109,6 +109,7 @@ def prepared(
             raise ValueError(
                 f"`rate`: expected none, since the recording has one ({recording.rate:g} Hz), got {rate!r}"
             )
+        recording = recording.axes_as_sensors()
         signal = recording.signal
         scene = Scene(recording.rate, recording.unit, recording.sensors, dict(recording.channels))
     else:
@@ -182,6 +183,7 @@ def _drawn(model: Model | ArrayModel, n_sensors: int, n_samples: int, generator:
 def _samples(simulation: Recording | Tensor, scene: Scene, n_samples: int, *, from_tensor: bool) -> Tensor:
     """Given samples as records `(record, sensor, time)` of the recording's length, or one of their own."""
     if isinstance(simulation, Recording):
+        simulation = simulation.axes_as_sensors()
         signal = simulation.signal
         if not from_tensor and not same_rate(simulation.rate, scene.rate):
             raise ValueError(

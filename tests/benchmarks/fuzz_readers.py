@@ -113,11 +113,24 @@ def sound_logs(folder: Path) -> list[Path]:
     logs.write_mat73(folder / "new.mat", {"gyro": gyro[0], "fs": 100.0, "unit": "rad/s"})
     logs.write_mat5(folder / "old.mat", {"imu": {"gyr": gyro[0], "fs": 100.0, "names": np.array(["a", 1.0], object)}})
     logs.write_ulog(folder / "plain.ulg", gyro, stamps)
+    blocks = [(8000 * k, 8, np.full((3, 32), k)) for k in range(1, 40)]
+    fifos = [(f"sensor_{kind}_fifo", 0, 1000, 1000.0, 1e-3, blocks) for kind in ("gyro", "accel")]
+    logs.write_ulog(folder / "fifo.ulg", gyro, stamps, fifo=fifos)
+    inertial = [
+        ("IMU", 2500 * k, i, *gyro[i, :, k], 0, 0, -9.75, 0, 0, 30, 1, 1, 0, 0) for k in range(80) for i in (0, 1)
+    ]
+    logs.write_dataflash(folder / "plain.bin", inertial)
+    logs.write_dataflash(folder / "plain.log", inertial)
+    logs.write_dataflash(folder / "batches.bin", logs.batches())
     logs.write_ros1(folder / "plain.bag", gyro, stamps)
     for mcap in (False, True):
         bag = logs.write_ros2(folder / f"ros2_{mcap}", gyro, stamps, mcap=mcap)
         (file,) = [path for path in Path(bag).iterdir() if path.suffix in (".db3", ".mcap")]
         shutil.copy(file, folder / f"plain{file.suffix}")
+    split = [("/gyro", logs.IMU, stamps, rows.T), ("/accel", logs.IMU, stamps[::3], rows.T[::3] * [[0, 0, 0, 1, 1, 1]])]
+    split.append(("/warm", "sensor_msgs/msg/Temperature", stamps[::7], rows[:1, ::7].T))
+    for suffix in (".bag", ".db3", ".mcap"):
+        logs.write_topics(folder / f"split{suffix}", split)
     return sorted(path for path in folder.iterdir() if path.is_file())
 
 
