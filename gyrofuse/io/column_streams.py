@@ -111,14 +111,14 @@ def streams_from_columns(
         by_device.setdefault(column.device, []).append(column)
     devices = list(dict.fromkeys(column.device for column in classified if column.kind == quantity))
     clocks = [column for column in classified if column.kind == "time"]
-    still = [column.name for column in clocks if not np.isfinite(columns[column.name]).any()]
+    still = dict.fromkeys(column.name for column in clocks if not np.isfinite(columns[column.name]).any())
     clocks = sorted((column for column in clocks if column.name not in still), key=_remoteness)
     clock_of = {column.device: column for column in reversed(clocks)}  # the nearest to the sample of each device
     notes = [
         *notes,
         *joined,
         *(f"time column '{name}' holds no reading and is left out" for name in still),
-        *_guessed_names(classified, quantity),
+        *_guessed_names(classified, quantity, name),
     ]
     streams = []
     for device in devices:
@@ -165,15 +165,19 @@ def _remoteness(clock: Column) -> int:
     return 0 if "sample" in name else 1 if "header" in name else 2
 
 
-def _guessed_names(columns: Sequence[Column], quantity: str) -> list[str]:
-    """What is to be said of sensors whose names do not say what they are."""
+def _guessed_names(columns: Sequence[Column], quantity: str, log: str) -> list[str]:
+    """What is to be said of sensors whose names do not say what they are, in a log of some name."""
     names = [column.name for column in columns if column.kind == quantity]
     bare = [name for name in names if bare_name(name) in ("p", "q", "r")]
     if bare:
         return [f"columns {', '.join(bare)} are read as the rates about x, y, z, as flight mechanics names them"]
     bare = [name for name in names if bare_name(name) in AXES]
+    if not bare:
+        return []
     sensor = "a gyro's" if quantity == "rate" else "an accelerometer's"
-    return [f"columns {', '.join(bare)} name no sensor and are read as {sensor}"] if bare else []
+    other = classify_columns([log], quantity)[0].kind in {"rate", "acceleration", "magnetic_field"} - {quantity}
+    but = f", though the log is called {log}" if other else ""
+    return [f"columns {', '.join(bare)} name no sensor and are read as {sensor}{but}"]
 
 
 def _joined_clocks(

@@ -129,9 +129,9 @@ def _named(path: Path, layout: Layout, key: str | None, quantity: str, allowance
             f"column '{layout.names[0]}' rises in equal steps but has no name of a clock; if it is one, call it 'time'"
         )
     columns, time, period, said = _with_dates(path, layout, chosen, clock, allowance)
-    columns, meaning = translate(columns, layout.names, layout.settings)
-    if quantity not in wanted and key in columns:
+    if quantity not in wanted and key is not None:
         columns[WORD_OF[quantity]] = columns.pop(key)
+    columns, meaning = translate(columns, layout.names, layout.settings)
     return _Table(columns, time, period, [*notes, *said, *meaning])
 
 
