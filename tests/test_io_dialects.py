@@ -90,8 +90,10 @@ class TestClocks:
     def test_a_stated_rate_decides_the_unit(self, tmp_path: Path):
         (stream,) = read(tmp_path, "# fs = 4000", "time,gx", *rows(lambda i: 250 * i, 1))
         assert np.diff(stream.time) == pytest.approx(250e-6)
+        assert stream.notes == ()  # in no other unit do they agree
+        (stream,) = read(tmp_path, "# fs = 3500", "time,gx", *rows(lambda i: 250 * i, 1))
         assert stream.notes == (
-            "time column 'time' states no unit: read as us from its median step of 250 and the stated 4000 Hz",
+            "time column 'time' states no unit: read as us from its median step of 250 and the stated 3500 Hz",
         )
 
     def test_a_rate_that_contradicts_is_said(self, tmp_path: Path):

@@ -17,6 +17,7 @@ from gyrofuse.io.stream import Array, Stream
 # from one sample to the next would give 1.2 Hz.
 _FINE = {1e-4: 86400.0, 1e-6: WRAP_32_BIT * 1e-6}  # seconds of a tick: after which the clock wraps
 _FINE_STEP = 8000.0
+_AGREES = 0.01  # of a step: a clock that fits a stated rate so well has the unit in which it does
 
 
 def time_in_seconds(
@@ -39,7 +40,7 @@ def time_in_seconds(
     ticks = np.asarray(values, dtype=np.float64)
     if not column.unit and "sampletimefine" in re.sub(r"[^a-z]", "", column.name.lower()):
         return _fine_time_in_seconds(column, ticks, rate)
-    unit, note = column.unit, ""
+    unit, note, certain = column.unit, "", False
     if not unit:
         finite = ticks[np.isfinite(ticks)]
         step = typical_step(finite, either_way=True)
@@ -50,13 +51,15 @@ def time_in_seconds(
         if rate is not None and step > 0:
             unit = min(TICK, key=lambda name: abs(math.log(step) + math.log(TICK[name] * rate)))
             reason += f" and the stated {rate:g} Hz"
+            certain = abs(step * TICK[unit] * rate - 1) < _AGREES
         elif dated:
             unit, reason = dated[0], "in which its readings are dates"
         elif not whole or step < 0.2:
             unit = "s"
         else:
             unit = "ms" if step < 200 else "us" if step < 200e3 else "ns"
-        note = f"time column '{column.name}' states no unit: read as {unit} {reason}"
+        if not certain:
+            note = f"time column '{column.name}' states no unit: read as {unit} {reason}"
     return ticks * TICK[unit], None, note
 
 
