@@ -784,9 +784,8 @@ def test_kalibr_of_a_whole_unit(run: Run, tmp_path: Path):
 
 
 def test_simulated_accelerations(run: Run):
-    done = run(
-        "simulate", "WN(variance=1)", "--rate", 50, "--samples", 100, "--quantity", "acceleration", "--out", "a.npz"
-    )
+    simulate = ("simulate", "WN(variance=1)", "--rate", 50, "--samples", 100, "--quantity", "acceleration")
+    done = run(*simulate, "--out", "a.npz")
     assert done.status == 0, done.err
     recording = gf.read_recording("a.npz", quantity="acceleration")
     assert (recording.quantity, recording.unit, recording.notes) == ("acceleration", "m/s^2", ())
