@@ -387,11 +387,17 @@ def test_units_that_the_log_does_not_state(run: Run):
         assert done.status == 0
         assert "angle random walk N" in done.out
         assert f"in {unit}" in Path("n.h").read_text()
-    for unit in ("m/s^2", "g", "counts"):
-        done = run(*fit, "--unit", unit)
+    for unit in ("m/s^2", "g"):
+        done = run(*fit, "--unit", unit, "--header", "n.h", "--force")
         assert done.status == 0
+        assert "velocity random walk N" in done.out
         assert "angle random walk" not in done.out
-        refused(run(*fit, "--unit", unit, "--header", "other.h"), f"got unit '{unit}'; where the log does not say")
+        assert f"Noise of an accelerometer in {unit}" in Path("n.h").read_text()
+        refused(run(*fit, "--unit", unit, "--kalibr", "k.yaml"), f"got unit '{unit}'; where the log does not say")
+    done = run(*fit, "--unit", "counts")
+    assert done.status == 0
+    assert "random walk" not in done.out
+    refused(run(*fit, "--unit", "counts", "--header", "other.h"), "got unit 'counts'; where the log does not say")
     done = run(*fit, "--unit", "deg/s", "--scale", 0.001, "--header", "other.h")  # and of counts
     assert done.status == 0
     simulate = ("simulate", "WN(variance=1)", "--samples", 100, "--rate", 10, "--out", "s.npz")
