@@ -32,6 +32,20 @@ def numbered(n: int) -> tuple[str, ...]:
     return tuple(str(i + 1) for i in range(n))
 
 
+def place(sensors: Sequence[str], index: Sequence[int], axes: Sequence[str] = ()) -> str:
+    """Name of a sensor with its axis, or its item in a batch: `imu1, axis x`, `a of item 0`.
+
+    Args:
+        sensors: Their names.
+        index: Of the sensor among the leading dimensions.
+        axes: Names along the leading dimension, where there is one.
+    """
+    *batch, sensor = index
+    if len(batch) == 1 and axes:
+        return f"{sensors[sensor]}, axis {axes[batch[0]]}"
+    return sensors[sensor] + (f" of item {', '.join(map(str, batch))}" if batch else "")
+
+
 def chance(p_value: float) -> str:
     """A p value in digits, `-` where there is no test."""
     if math.isnan(p_value):

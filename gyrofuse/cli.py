@@ -29,7 +29,7 @@ from gyrofuse.cli_fleet import fleet
 from gyrofuse.cli_mismatch import diagnose
 from gyrofuse.cli_models import fit, rank
 from gyrofuse.cli_navigation import emulate
-from gyrofuse.cli_reading import Logs, Reading, takes_options
+from gyrofuse.cli_reading import Logs, Quantity, Reading, takes_options
 from gyrofuse.cli_shared import (
     Force,
     Json,
@@ -47,6 +47,7 @@ from gyrofuse.cli_shared import (
     write_json,
 )
 from gyrofuse.demo import FILES, run_demo
+from gyrofuse.io.columns import WORD_OF
 from gyrofuse.io.limits import physical_memory
 from gyrofuse.multiscale import fit_multiscale
 from gyrofuse.multiscale_result import MultiScaleResult
@@ -64,6 +65,7 @@ from gyrofuse.report import (
 from gyrofuse.simulate import ArrayModel
 from gyrofuse.svo import fit_svo
 from gyrofuse.svo_result import SVOResult
+from gyrofuse.units import quantity_of
 
 app = typer.Typer(
     name="gyrofuse",
@@ -208,6 +210,7 @@ def fuse(
                 sensors=("virtual",),
                 time=recording.time,
                 axes=recording.axes,
+                quantity=recording.quantity,
             )
             _save(fused, drafts[out], weights=result.weights.numpy())
         with progress("drawing"):
@@ -249,7 +252,12 @@ def simulate(
     ] = None,
     unit: Annotated[
         str | None,
-        typer.Option(metavar="UNIT", help="Unit of the rates; by default that of a model fitted to a log, or deg/s."),
+        typer.Option(
+            metavar="UNIT", help="Unit of the numbers; by default that of a model fitted to a log, or deg/s or m/s^2."
+        ),
+    ] = None,
+    quantity: Annotated[
+        Quantity | None, typer.Option(help="What the sensors measure; rate where no unit says.")
     ] = None,
     seed: Annotated[
         int | None, typer.Option(metavar="S", min=0, max=2**63 - 1, help="The same seed gives the same recording.")
@@ -269,7 +277,10 @@ def simulate(
             raise ValueError(
                 "`--rate`: expected the sampling rate in Hz, which this model does not say, got none; give it"
             )
-        unit = agreed_unit(source[0] if source else None, unit)
+        base = "m/s^2" if quantity is Quantity.acceleration else "deg/s"
+        unit = agreed_unit(source[0] if source else None, unit) or base
+        if quantity is not None and quantity_of(unit) not in (None, quantity.value):
+            raise ValueError(f"`--quantity`: expected that of {unit}, {quantity_of(unit)}, got {quantity.value}")
         generator = torch.Generator()
         seed = generator.seed() % 2**32 if seed is None else seed
         generator.manual_seed(seed)
@@ -284,7 +295,8 @@ def simulate(
         _check_memory(samples, noise.n_sensors if isinstance(noise, ArrayModel) else max(len(each), *batch, 1))
         with progress("simulating"):
             signal = noise.simulate(samples, batch=batch, generator=generator).flatten(0, -2)
-        recording = Recording(signal, rate=rate, unit=unit)
+        measured = quantity_of(unit) or (quantity or Quantity.rate).value
+        recording = Recording(signal, rate=rate, unit=unit, quantity=measured)
         _save(recording, drafts[out])
         if json_file:
             settings = {"model": noise.to_dict(), "n_samples": samples, "rate": rate, "unit": unit, "seed": seed}
@@ -354,7 +366,7 @@ def _save(recording: Recording, path: Path, **arrays: np.ndarray[Any, Any]) -> N
     """Save a recording as .csv, or as .npz with further arrays."""
     if path.suffix.lower() == ".csv":
         ends = [f"_{axis}" for axis in recording.axes] or [""]
-        names = [f"{sensor}_gyro{end}" for end in ends for sensor in recording.sensors]
+        names = [f"{sensor}_{WORD_OF[recording.quantity]}{end}" for end in ends for sensor in recording.sensors]
         columns = torch.cat([recording.time[None], recording.signal.flatten(0, -2)]).T
         unit = f" [{recording.unit}]" if recording.unit != "unknown" else ""
         with path.open("w", encoding="utf-8", newline="") as file:
@@ -376,6 +388,7 @@ def _say_recording(recording: Recording) -> None:
         ("source", ", ".join(recording.source)),
         ("sensors", str(recording.n_sensors)),
         ("axes", ", ".join(recording.axes) or "-"),
+        ("quantity", recording.quantity),
         ("unit", recording.unit),
         ("rate", f"{number(recording.rate, 8)} Hz"),
         ("samples", str(recording.n_samples)),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from enum import Enum
 from functools import partial
 from pathlib import Path
@@ -11,7 +12,8 @@ from typing import Annotated
 import typer
 
 from gyrofuse._console import progress, say
-from gyrofuse.cli_reading import Logs, Reading, takes_options
+from gyrofuse._result import place
+from gyrofuse.cli_reading import Logs, Quantity, Reading, takes_options
 from gyrofuse.cli_shared import (
     Force,
     Json,
@@ -30,13 +32,14 @@ from gyrofuse.cli_shared import (
 from gyrofuse.export import to_c_header, to_kalibr
 from gyrofuse.gmwm import fit_gmwm
 from gyrofuse.gmwm_result import GMWMResult
+from gyrofuse.io.stream import RecordingError
 from gyrofuse.processes import Model
 from gyrofuse.ranking import rank_models
 from gyrofuse.recording import Recording
-from gyrofuse.report_models import model_report, sensor_name
+from gyrofuse.report_models import model_report
 from gyrofuse.report_ranking import rank_report
 from gyrofuse.tones import FEWEST_SAMPLES
-from gyrofuse.units import RATE_UNITS
+from gyrofuse.units import ACCELERATION_UNITS, DATASHEET_UNITS, RATE_UNITS
 
 _MOST_FITS = 12  # printed in full
 _WITH_GAPS = ", or fit a model with `gyrofuse fit`, which gets along with gaps"
@@ -71,7 +74,7 @@ def fit(
     rest: Annotated[str | None, typer.Option(metavar="START:STOP", help="Fit this stretch alone (seconds).")] = None,
     reading: Reading,
     confidence_level: Annotated[float, typer.Option(metavar="P", help="Of all intervals.")] = 0.95,
-    kalibr: Annotated[Path | None, typer.Option(metavar="FILE", help="Write Kalibr's imu.yaml, of one sensor.")] = None,
+    kalibr: Annotated[Path | None, typer.Option(metavar="FILE", help="Write Kalibr's imu.yaml, of one device.")] = None,
     kalibr_slow: Annotated[
         float, typer.Option(metavar="S", help="AR1s with a correlation time from this on are Kalibr's random walk.")
     ] = 1.0,
@@ -89,7 +92,7 @@ def fit(
     force: Force = False,
 ) -> None:
     """Fit a noise model to every sensor of a log, recorded at rest."""
-    resting = stretch(rest)
+    resting, kalibr_remarks = stretch(rest), list[str]()
     if refine and robust < 1:
         raise ValueError("`--refine`: the spectral likelihood is not robust; leave out --refine or --robust")
     asked = {"kalibr": kalibr, "header": header, "model-out": model_out, "figure": figure, "json": json_file}
@@ -97,21 +100,21 @@ def fit(
         recording = reading.read(logs)
         with progress("fitting"):
             part = at_rest(recording, resting)
-            result = fit_gmwm(
-                part,
-                model,
+            fitted = partial(
+                fit_gmwm,
+                model=model,
                 weighting=weighting.value,
                 confidence_level=confidence_level,
                 n_levels=levels,
                 refine=refine,
                 efficiency=robust,
             )
-        for option, path, written in (
-            ("kalibr", kalibr, partial(to_kalibr, slow=kalibr_slow)),
-            ("header", header, to_c_header),
-        ):
-            if path:
-                drafts[path].write_text(_exported(result, recording, option, written), encoding="utf-8")
+            result = fitted(part)
+            if kalibr:
+                text, kalibr_remarks = _kalibr(result, reading, logs, resting, fitted, kalibr_slow)
+                drafts[kalibr].write_text(text, encoding="utf-8")
+        if header:
+            drafts[header].write_text(_c_header(result, recording), encoding="utf-8")
         if model_out:
             known = _known_model(result, "model-out").to_dict()
             write_json(drafts[model_out], {**known, "rate": recording.rate, "unit": recording.unit})
@@ -125,8 +128,40 @@ def fit(
         if json_file:
             write_json(drafts[json_file], result.to_dict())
     written_files = files_written(kalibr, header, model_out, figure, json_file, report)
-    say("\n".join([result.summary(), *unit_note(recording.unit), *written_files]))
+    say("\n".join([result.summary(), *unit_note(recording.unit), *kalibr_remarks, *written_files]))
     say_notes(recording)
+
+
+def _kalibr(
+    result: GMWMResult,
+    reading: Reading,
+    logs: list[Path],
+    resting: tuple[float, float] | None,
+    fitted: Callable[[Recording], GMWMResult],
+    slow: float,
+) -> tuple[str, list[str]]:
+    """Kalibr's file of the only device, with its accelerometers where the log has some, and what to say of these."""
+    if reading.quantity is not Quantity.rate:
+        raise ValueError(
+            "`--kalibr`: expected the gyros of a log, whose accelerometers are added, got --quantity acceleration; "
+            "leave that out"
+        )
+    if len(result.sensors) > 1:
+        raise ValueError(
+            f"`--kalibr`: expected one device, got {', '.join(result.sensors)}; choose one with --sensors, and --axis "
+            "where one axis is to stand for all"
+        )
+    _check_unit(result, "kalibr")
+    try:
+        # A unit, a factor and a key that were given are those of the gyros.
+        options = replace(reading, quantity=Quantity.acceleration, unit=None, scale=None, key=None, columns=None)
+        accelerations = at_rest(options.read(logs), resting)
+    except RecordingError:
+        return to_kalibr(result, slow=slow), ["No accelerations in the log: Kalibr's file wants them filled in."]
+    if accelerations.unit not in ACCELERATION_UNITS:
+        remark = f"Accelerations are in {accelerations.unit}: Kalibr's file wants their noise filled in."
+        return to_kalibr(result, slow=slow), [remark]
+    return to_kalibr(result, slow=slow, accelerometer=fitted(accelerations)), []
 
 
 def _known_model(result: GMWMResult, option: str) -> Model:
@@ -141,21 +176,25 @@ def _known_model(result: GMWMResult, option: str) -> Model:
     return result.model
 
 
-def _exported(
-    result: GMWMResult, recording: Recording, option: str, written: Callable[[Model, float, str], str]
-) -> str:
-    """A file for other tools, of the only sensor."""
+def _c_header(result: GMWMResult, recording: Recording) -> str:
+    """A Kalman filter's matrices, of the only sensor."""
     params = result.params.flatten(0, -2)
     if len(params) != 1:
         raise ValueError(
-            f"`--{option}`: expected one sensor and axis, got {len(params)}; choose with --sensors and --axis"
+            f"`--header`: expected one sensor and axis, got {len(params)}; choose with --sensors and --axis"
         )
-    if recording.unit not in RATE_UNITS:
+    _check_unit(result, "header")
+    return to_c_header(_known_model(result, "header").with_params(params[0]), recording.rate, recording.unit)
+
+
+def _check_unit(result: GMWMResult, option: str) -> None:
+    """Raise `ValueError` where a file for other tools would be in no known unit."""
+    known = RATE_UNITS if option == "kalibr" else DATASHEET_UNITS
+    if result.unit not in known:
         raise ValueError(
-            f"`--{option}`: expected a log in one of {', '.join(RATE_UNITS)}, got unit {recording.unit!r}; where the "
-            "log does not say, give its unit with --unit, and with --scale the factor to it from other numbers"
+            f"`--{option}`: expected a log in one of {', '.join(known)}, got unit {result.unit or 'unknown'!r}; where "
+            "the log does not say, give its unit with --unit, and with --scale the factor to it from other numbers"
         )
-    return written(_known_model(result, option).with_params(params[0]), recording.rate, recording.unit)
 
 
 @takes_options
@@ -197,7 +236,7 @@ def rank(
             part, remarks = without_gaps(asked, "Ranked", FEWEST_SAMPLES, _WITH_GAPS)
             result = rank_models(part, formulas, confidence_level=confidence_level, n_levels=levels)
         if figure:
-            named = sensor_name(result.sensors, part, result.first_ranked)
+            named = f"Sensor {place(result.sensors, result.first_ranked, result.axes)}"
             draw(partial(result.plot, title=named), drafts[figure], figure)
         if report:
             with progress("drawing"):

@@ -96,7 +96,7 @@ def _single(path: Path) -> Model:
 
 def _gyro(path: Path, unit: str | None) -> Model:
     """In rad/s."""
-    name = agreed_unit(path, unit)
+    name = agreed_unit(path, unit) or "deg/s"
     if name not in RATE_UNITS:
         raise ValueError(f"{path}: expected a model in one of {', '.join(RATE_UNITS)}, found {name}; give --unit")
     return _single(path).scaled(rate_unit_factor(name, "rad/s"))

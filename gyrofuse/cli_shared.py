@@ -164,13 +164,13 @@ def agreed_rate(models: Sequence[Path], rate: float | None) -> float | None:
     return chosen
 
 
-def agreed_unit(model: Path | None, unit: str | None) -> str:
-    """Unit that was asked for, which has to be that of the log that the model was fitted to, or that; deg/s else."""
+def agreed_unit(model: Path | None, unit: str | None) -> str | None:
+    """Unit that was asked for, which has to be that of the log that the model was fitted to, or that."""
     own = None if model is None else model_grid(model)[1]
     asked = None if unit is None else known_unit(unit)
     if None not in (asked, own) and asked != own:
         raise ValueError(f"`--unit`: expected {own}, for which the model was fitted, got {asked}; see {model}")
-    return asked or own or "deg/s"
+    return asked or own
 
 
 def draw(plot: Callable[[Axes], Axes], draft: Path, path: Path, width: float = 7.0, height: float = 4.6) -> None:

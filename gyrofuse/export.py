@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gyrofuse import units
 from gyrofuse._checks import check_positive
+from gyrofuse._result import place
 from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.processes import (
     AR1,
@@ -106,6 +107,7 @@ class _Triad:
     """Sensors that Kalibr takes for alike.
 
     Attributes:
+        names: Of each.
         models: Of each, with scalar parameters.
         highest: Likewise, each variance of zero at its upper limit; empty where none are known.
         rate: Hz.
@@ -114,6 +116,7 @@ class _Triad:
         confidence_level: Of the limits.
     """
 
+    names: tuple[str, ...]
     models: tuple[Model, ...]
     highest: tuple[Model, ...]
     rate: float
@@ -133,7 +136,7 @@ class _Triad:
         rate, unit = check_positive("rate", rate), units.canonical_unit(unit)
         if not isinstance(given, GMWMResult):
             _check_scalar(name, given)
-            return cls((given,), (), rate, unit, factor)
+            return cls(("",), (given,), (), rate, unit, factor)
         params = given.params.flatten(0, -2)
         fitted = params.isfinite().all(-1)
         if not bool(fitted.any()):
@@ -145,14 +148,16 @@ class _Triad:
             tuple(given.model.with_params(row) for row in rows[fitted])
             for rows in (params, torch.where(known, limits, params))
         )
-        return cls(models, highest, rate, unit, factor, given.confidence_level)
+        places = torch.cartesian_prod(*map(torch.arange, given.params.shape[:-1])).reshape(len(params), -1).tolist()
+        names = tuple(place(given.sensors, p, given.axes) for p, ok in zip(places, fitted.tolist(), strict=True) if ok)
+        return cls(names, models, highest, rate, unit, factor, given.confidence_level)
 
 
 def _kalibr_keys(triad: _Triad, sensor: str, slow: float, key_units: tuple[str, str]) -> Iterator[str]:
     """What became of each process, as comments, and the two keys of a sensor."""
-    for number, model in enumerate(triad.models, 1):
+    for name, model in zip(triad.names, triad.models, strict=True):
         if len(triad.models) > 1:
-            yield f"#  axis {number}:"
+            yield f"#  Sensor {name}:"
         yield from (f"#   {process!r}: {_fate(process, triad.rate, slow)}" for process in model.processes)
     found, limits = (
         [max(own) * triad.factor for own in zip(*(_densities(m, triad.rate, slow) for m in models), strict=True)]

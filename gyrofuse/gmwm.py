@@ -187,6 +187,7 @@ def fit_gmwm(
         sensors=tuple(sensors),
         rate=recording.rate if recording else None,
         unit=recording.unit if recording and recording.unit != "unknown" else None,
+        axes=recording.axes if recording else (),
     )
 
 

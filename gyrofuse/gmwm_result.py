@@ -13,7 +13,7 @@ from torch import Tensor
 from gyrofuse._composition import Composition
 from gyrofuse._estimation import EstimatedFrom
 from gyrofuse._records import Records
-from gyrofuse._result import ConfidenceInterval, cleaned, counted, listed, p_words
+from gyrofuse._result import ConfidenceInterval, cleaned, counted, listed, p_words, place
 from gyrofuse.datasheet import Datasheet, datasheet
 from gyrofuse.moment_inference import Inference
 from gyrofuse.processes import Model
@@ -56,6 +56,7 @@ class GMWMResult:
         rate: Hz, where known.
         unit: Of the signal, where known.
         moments: That were matched, `"variance"` or `"log"`.
+        axes: Names along the leading dimension, `("x", "y", "z")`, empty when it has none.
     """
 
     model: Model
@@ -80,6 +81,7 @@ class GMWMResult:
     rate: float | None
     unit: str | None
     moments: str = "variance"
+    axes: tuple[str, ...] = ()
 
     @classmethod
     def build(
@@ -164,8 +166,7 @@ class GMWMResult:
         return self.summary()
 
     def _table(self, index: tuple[int, ...]) -> list[str]:
-        where = f" of item {', '.join(map(str, index[:-1]))}" if len(index) > 1 else ""
-        head = f"sensor {self.sensors[index[-1]]}{where}"
+        head = f"sensor {place(self.sensors, index, self.axes)}"
         if not bool(self.params[index].isfinite().all()):
             return [f"{head}: not fitted"]
         fits = ""
@@ -223,7 +224,7 @@ class GMWMResult:
             confidence_level=self.confidence_level,
             rate=self.rate,
             unit=self.unit,
-            title=f"sensor {self.sensors[index[-1]]}: {self.name}",
+            title=f"sensor {place(self.sensors, index, self.axes)}: {self.name}",
             ax=ax,
         )
 
@@ -252,6 +253,7 @@ class GMWMResult:
             "refined": self.refined,
             "efficiency": self.efficiency,
             "sensors": list(self.sensors),
+            "axes": list(self.axes),
             "rate": self.rate,
             "unit": self.unit,
         }

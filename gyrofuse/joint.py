@@ -16,7 +16,7 @@ from gyrofuse._composition import Composition
 from gyrofuse._drift_sign import drifts_of, signed
 from gyrofuse._model_tones import model_tones
 from gyrofuse._records import Records
-from gyrofuse._result import listed
+from gyrofuse._result import listed, place
 from gyrofuse._white_kurtosis import white_excess_kurtosis, with_excess_kurtosis
 from gyrofuse.gmwm import fit_gmwm
 from gyrofuse.gmwm_result import GMWMResult
@@ -81,8 +81,7 @@ class JointFit:
             f"recordings of {', '.join(str(one.n_samples) for one in self.separate)} samples"
         ]
         for index in itertools.product(*map(range, self.p_value.shape)):
-            where = f" of item {', '.join(map(str, index[:-1]))}" if len(index) > 1 else ""
-            head = f"sensor {self.joint.sensors[index[-1]]}{where}"
+            head = f"sensor {place(self.joint.sensors, index, self.joint.axes)}"
             if not bool(self.p_value[index].isfinite()):
                 lines += ["", f"{head}: not fitted"]
                 continue

@@ -15,7 +15,7 @@ from gyrofuse._composition import Composition
 from gyrofuse._drift_sign import drifts_of
 from gyrofuse._model_tones import model_tones
 from gyrofuse._paths import own_generator
-from gyrofuse._result import ConfidenceInterval, listed
+from gyrofuse._result import ConfidenceInterval, listed, place
 from gyrofuse._white_kurtosis import white_excess_kurtosis, with_excess_kurtosis
 from gyrofuse.continuous import fit_moments
 from gyrofuse.gmwm_result import GMWMResult
@@ -70,8 +70,7 @@ class GMWMBootstrap:
         level = f"{100 * self.confidence_level:g} % studentized"
         lines = [f"Parametric bootstrap of a GMWM fit: {self.n_resamples} resamples"]
         for index in itertools.product(*map(range, self.params.shape[:-1])):
-            where = f" of item {', '.join(map(str, index[:-1]))}" if len(index) > 1 else ""
-            lines += ["", f"sensor {self.sensors[index[-1]]}{where}: {self._head(index)}"]
+            lines += ["", f"sensor {place(self.sensors, index)}: {self._head(index)}"]
             if not bool(self.params[index].isfinite().all()):
                 continue
             lines.append(f"  {'parameter':<24}{'estimate':>13}{'bias':>13}{'std':>13}  {level:^29}")

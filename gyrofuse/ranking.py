@@ -139,6 +139,7 @@ def rank_models(
         n_samples=length,
         from_signal=from_signal,
         sensors=sensors,
+        axes=recording.axes if recording else (),
     )
 
 

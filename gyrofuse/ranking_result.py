@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gyrofuse._rank_candidates import name_of
 from gyrofuse._rank_table import Table
-from gyrofuse._result import chance, counted, listed, p_words, signed
+from gyrofuse._result import chance, counted, listed, p_words, place, signed
 from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.parsing import parse_model
 from gyrofuse.processes import Sinusoid
@@ -67,6 +67,7 @@ class RankResult:
     n_samples: int
     from_signal: bool
     sensors: tuple[str, ...]
+    axes: tuple[str, ...] = ()
 
     @classmethod
     def build(
@@ -249,9 +250,7 @@ class RankResult:
         )
 
     def _place(self, index: tuple[int, ...]) -> str:
-        """Name of a sensor, and its item in a batch."""
-        where = f" of item {', '.join(map(str, index[:-1]))}" if len(index) > 1 else ""
-        return f"{self.sensors[index[-1]]}{where}"
+        return place(self.sensors, index, self.axes)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers and lists; what is not known is None."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from gyrofuse._result import place
 from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.model_words import model_method, model_verdict, residuals
 from gyrofuse.plotting_models import plot_residuals
@@ -34,7 +34,8 @@ def model_report(result: GMWMResult, recording: Recording | None = None, *, titl
     """
     indices = list(itertools.product(*map(range, result.params.shape[:-1])))
     parts = [
-        model_part(result, index, sensor_name(result.sensors, recording, index)) for index in indices[:_MOST_SENSORS]
+        model_part(result, index, f"Sensor {place(result.sensors, index, result.axes)}")
+        for index in indices[:_MOST_SENSORS]
     ]
     return render(
         "models.html.j2",
@@ -65,22 +66,6 @@ def model_part(result: GMWMResult, index: tuple[int, ...], name: str) -> dict[st
         "unit": result.unit,
         "percent": f"{100 * result.confidence_level:g} %",
     }
-
-
-def sensor_name(sensors: Sequence[str], recording: Recording | None, index: tuple[int, ...]) -> str:
-    """What a page calls a sensor.
-
-    Args:
-        sensors: Their names.
-        recording: For the names of its axes.
-        index: Of the sensor among the leading dimensions.
-    """
-    *batch, sensor = index
-    axes = recording.axes if recording else ()
-    name = f"Sensor {sensors[sensor]}"
-    if len(batch) == 1 and axes:
-        return f"{name}, axis {axes[batch[0]]}"
-    return name + (f", item {', '.join(map(str, batch))}" if batch else "")
 
 
 def _fitted(result: GMWMResult, index: tuple[int, ...]) -> bool:

@@ -8,13 +8,13 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from gyrofuse._rank_candidates import charge, n_parameters
-from gyrofuse._result import chance, counted, p_words, signed
+from gyrofuse._result import chance, counted, p_words, place, signed
 from gyrofuse.gmwm_result import REFUSED
 from gyrofuse.model_words import model_method
 from gyrofuse.moment_fit import composition_of
 from gyrofuse.ranking_result import RankResult
 from gyrofuse.recording import Recording
-from gyrofuse.report_models import model_part, sensor_name
+from gyrofuse.report_models import model_part
 from gyrofuse.report_page import number, render
 
 # Pages stay readable; the JSON file holds all.
@@ -119,7 +119,7 @@ def _why_not(result: RankResult, index: tuple[int, ...], row: dict[str, Any]) ->
 
 
 def _part(result: RankResult, recording: Recording | None, n: int, index: tuple[int, ...]) -> dict[str, Any]:
-    name, fit = sensor_name(result.sensors, recording, index), result.best[n]
+    name, fit = f"Sensor {place(result.sensors, index, result.axes)}", result.best[n]
     rows = _rows(result, index)
     return {
         "name": name,

@@ -320,7 +320,7 @@ def test_kalibr_has_a_longest_correlation_time_of_white_noise(run: Run, log: Pat
 def test_fit_writes_kalibr_of_one_sensor(run: Run, log: Path):
     assert run("fit", log, "--model", "WN", "--sensors", "b", "--kalibr", "imu.yaml").status == 0
     assert "gyroscope_noise_density: " in Path("imu.yaml").read_text()
-    refused(run("fit", log, "--model", "WN", "--kalibr", "all.yaml"), "expected one sensor and axis, got 3")
+    refused(run("fit", log, "--model", "WN", "--kalibr", "all.yaml"), "expected one device, got a, b, c")
     assert not Path("all.yaml").exists()
 
 
@@ -387,11 +387,17 @@ def test_units_that_the_log_does_not_state(run: Run):
         assert done.status == 0
         assert "angle random walk N" in done.out
         assert f"in {unit}" in Path("n.h").read_text()
-    for unit in ("m/s^2", "g", "counts"):
-        done = run(*fit, "--unit", unit)
+    for unit in ("m/s^2", "g"):
+        done = run(*fit, "--unit", unit, "--header", "n.h", "--force")
         assert done.status == 0
+        assert "velocity random walk N" in done.out
         assert "angle random walk" not in done.out
-        refused(run(*fit, "--unit", unit, "--header", "other.h"), f"got unit '{unit}'; where the log does not say")
+        assert f"Noise of an accelerometer in {unit}" in Path("n.h").read_text()
+        refused(run(*fit, "--unit", unit, "--kalibr", "k.yaml"), f"got unit '{unit}'; where the log does not say")
+    done = run(*fit, "--unit", "counts")
+    assert done.status == 0
+    assert "random walk" not in done.out
+    refused(run(*fit, "--unit", "counts", "--header", "other.h"), "got unit 'counts'; where the log does not say")
     done = run(*fit, "--unit", "deg/s", "--scale", 0.001, "--header", "other.h")  # and of counts
     assert done.status == 0
     simulate = ("simulate", "WN(variance=1)", "--samples", 100, "--rate", 10, "--out", "s.npz")
@@ -741,3 +747,73 @@ def test_a_standard_output_that_takes_nothing_is_named_and_files_are_written(log
         assert ended.stderr.startswith("error: standard output: ")
         assert len(ended.stderr.splitlines()) == 1
     assert out.exists()
+
+
+def unit_log(path: Path) -> Path:
+    """A log of one device with gyros in deg/s and accelerometers in g."""
+    rates, accelerations = noise(3, 4000), 0.01 * noise(3, 4000) + torch.tensor([[0.0], [0.0], [1.0]])
+    table = np.c_[np.arange(4000) / 100, rates.T, accelerations.T]
+    names = [f"{word}_{axis} [{unit}]" for word, unit in (("gyro", "deg/s"), ("acc", "g")) for axis in "xyz"]
+    np.savetxt(path, table, delimiter=",", header=",".join(["time [s]", *names]), comments="")
+    return path
+
+
+def test_accelerometers_of_a_log(run: Run, tmp_path: Path):
+    log = unit_log(tmp_path / "imu.csv")
+    done = run("info", log, "--quantity", "acceleration", "--json", "i.json")
+    assert done.status == 0, done.err
+    known = json.loads(Path("i.json").read_text())
+    assert (known["quantity"], known["unit"], known["axes"]) == ("acceleration", "g", ["x", "y", "z"])
+    assert list(known["channels"]) == ["angular_rate"]
+    done = run("fit", log, "--quantity", "acceleration", "--model", "WN", "--axis", "z", "--model-out", "z.json")
+    assert done.status == 0, done.err
+    assert "velocity random walk N" in done.out
+    assert "angle random walk" not in done.out
+    assert run("simulate", "z.json", "--samples", 5000, "--out", "sim.csv").status == 0
+    assert gf.read_recording("sim.csv", quantity="acceleration").unit == "g"
+    refused(run("info", "sim.csv"), 'read with quantity="acceleration" (--quantity acceleration)')
+    done = run("rank", log, "--quantity", "acceleration", "--axis", "z", "--candidates", "WN, WN+RW")
+    assert done.status == 0, done.err
+    refused(run("info", log, "--quantity", "force"), "--quantity")
+
+
+def test_kalibr_of_a_whole_unit(run: Run, tmp_path: Path):
+    log = unit_log(tmp_path / "imu.csv")
+    done = run("fit", log, "--model", "WN + RW", "--kalibr", "imu.yaml")
+    assert done.status == 0, done.err
+    gyros, accelerometers = (
+        gf.fit_gmwm(gf.read_recording(log, quantity=quantity), "WN + RW") for quantity in ("rate", "acceleration")
+    )
+    assert Path("imu.yaml").read_text() == gf.to_kalibr(gyros, accelerometer=accelerometers)
+    assert "_walk: 0.0" not in Path("imu.yaml").read_text()
+    refused(run("fit", log, "--quantity", "acceleration", "--model", "WN", "--kalibr", "a.yaml"), "leave that out")
+
+
+def test_simulated_accelerations(run: Run):
+    simulate = ("simulate", "WN(variance=1)", "--rate", 50, "--samples", 100, "--quantity", "acceleration")
+    done = run(*simulate, "--out", "a.npz")
+    assert done.status == 0, done.err
+    recording = gf.read_recording("a.npz", quantity="acceleration")
+    assert (recording.quantity, recording.unit, recording.notes) == ("acceleration", "m/s^2", ())
+    refused(run(*simulate, "--unit", "deg/s", "--out", "b.npz"), "expected that of deg/s, rate")
+
+
+def test_columns_that_are_told_what_they_are(run: Run, tmp_path: Path):
+    values = noise(3, 400).numpy()
+    table = np.c_[np.arange(400) / 50, values.T]
+    np.savetxt(tmp_path / "u.csv", table, delimiter=",", header="t0,u1,u2,u3", comments="")
+    mapping = ("--map", "gyro_x [mdps]=u1", "--map", "gyro_y [mdps]=u3", "--map", "time [s]=t0")
+    done = run("info", "u.csv", *mapping, "--json", "i.json")
+    assert done.status == 0, done.err
+    known = json.loads(Path("i.json").read_text())
+    assert (known["rate"], known["unit"], known["axes"]) == (pytest.approx(50), "mdeg/s", ["x", "y"])
+    np.testing.assert_allclose(np.ravel(known["mean"]), values[[0, 2]].mean(1))
+    refused(run("info", "u.csv", "--map", "gyro_x=u9"), "expected a column 'u9' (`columns`, --map), found t0, u1")
+    refused(run("info", "u.csv", "--map", "gyro_x"), "`--map`: expected NAME=COLUMN")
+    refused(run("info", "u.csv", "--map", "foo=u1"), "`columns`: expected names such as gyro_x")
+    refused(run("info", "u.csv", "--map", "gyro_x=u1", "--map", "gyro_y=u1"), "expected each column once, got 'u1'")
+
+
+def test_a_limit_on_memory(run: Run, tmp_path: Path):
+    log = unit_log(tmp_path / "imu.csv")
+    refused(run("info", log, "--max-bytes", 1000), "allow more with max_bytes=")

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from logs import batches, write_dataflash
 
-from gyrofuse.io import dataflash, dataflash_messages
+from gyrofuse.io import dataflash
+from gyrofuse.io.dataflash_messages import read_binary
 from gyrofuse.io.limits import Allowance
 from gyrofuse.io.stream import RecordingError
 
@@ -271,7 +272,7 @@ def test_values_are_those_of_another_reader(tmp_path):
     with contextlib.closing(mavlink.DFReader_binary(str(path))) as log:
         while (message := log.recv_match(type=["IMU", "GYR", "ACC", "ISBD"])) is not None:
             theirs.setdefault(message.get_type(), []).append(message)
-    tables, _ = dataflash_messages.binary(path.read_bytes(), Allowance(path))
+    tables, _ = read_binary(path.read_bytes(), Allowance(path))
     for name, found in theirs.items():
         for field in set(tables[name]) - {""}:
             values = [getattr(message, field) for message in found]

@@ -90,8 +90,10 @@ class TestClocks:
     def test_a_stated_rate_decides_the_unit(self, tmp_path: Path):
         (stream,) = read(tmp_path, "# fs = 4000", "time,gx", *rows(lambda i: 250 * i, 1))
         assert np.diff(stream.time) == pytest.approx(250e-6)
+        assert stream.notes == ()  # in no other unit do they agree
+        (stream,) = read(tmp_path, "# fs = 3500", "time,gx", *rows(lambda i: 250 * i, 1))
         assert stream.notes == (
-            "time column 'time' states no unit: read as us from its median step of 250 and the stated 4000 Hz",
+            "time column 'time' states no unit: read as us from its median step of 250 and the stated 3500 Hz",
         )
 
     def test_a_rate_that_contradicts_is_said(self, tmp_path: Path):
@@ -193,6 +195,14 @@ class TestNames:
         (column, _) = classify_columns([name, "gx"])
         assert (column.kind, column.axis, column.unit) == (kind, axis, unit)
 
+    @pytest.mark.parametrize(
+        ("log", "but"), [("Accelerometer", ", though the log is called Accelerometer"), ("Gyroscope", ""), ("x", "")]
+    )
+    def test_a_log_of_another_sensor(self, tmp_path: Path, log, but):
+        (tmp_path / f"{log}.csv").write_text("seconds_elapsed,z,y,x\n0.0,1,2,3\n0.1,1,2,3\n")
+        (stream,) = text.read(tmp_path / f"{log}.csv")
+        assert stream.notes == (f"columns z, y, x name no sensor and are read as a gyro's{but}",)
+
     def test_p_q_r_beside_a_gyro_are_none(self):
         assert [column.kind for column in classify_columns(["p", "q", "r", "gx"])] == ["", "", "", "rate"]
         assert [column.kind for column in classify_columns(["p", "q", "T [degC]"])] == ["", "", "temperature"]
@@ -291,6 +301,10 @@ class TestFlightControllers:
         assert np.diff(stream.time) == pytest.approx(125e-6)
         assert stream.channels["acceleration"][:, 0].tolist() == [100 / 2048, 0, 1]
         assert not says or any(says in note for note in stream.notes)
+
+    def test_a_column_by_its_name(self, tmp_path: Path):
+        (stream,) = read(tmp_path, self.NAMES, *rows(int, lambda i: 125 * i, 30, -20, 100, 0, 2048), key="accSmooth[2]")
+        assert (stream.name, stream.gyro[""].tolist()) == ("accSmooth[2]", [2048.0] * 12)
 
     def test_units_of_the_decoder_are_kept(self, tmp_path: Path):
         names = "loopIteration, time (us), gyroADC[0] (rad/s), " + ", ".join(

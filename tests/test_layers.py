@@ -23,6 +23,7 @@ LAYERS = [
         "cli_mismatch",
         "cli_models",
         "cli_navigation",
+        "cli_reading",
         "cli_shared",
         "_console",
         "_preload",

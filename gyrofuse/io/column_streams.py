@@ -17,6 +17,7 @@ from gyrofuse.io.stream import Array, Stream
 # from one sample to the next would give 1.2 Hz.
 _FINE = {1e-4: 86400.0, 1e-6: WRAP_32_BIT * 1e-6}  # seconds of a tick: after which the clock wraps
 _FINE_STEP = 8000.0
+_AGREES = 0.01  # of a step: a clock that fits a stated rate so well has the unit in which it does
 
 
 def time_in_seconds(
@@ -39,7 +40,7 @@ def time_in_seconds(
     ticks = np.asarray(values, dtype=np.float64)
     if not column.unit and "sampletimefine" in re.sub(r"[^a-z]", "", column.name.lower()):
         return _fine_time_in_seconds(column, ticks, rate)
-    unit, note = column.unit, ""
+    unit, note, certain = column.unit, "", False
     if not unit:
         finite = ticks[np.isfinite(ticks)]
         step = typical_step(finite, either_way=True)
@@ -50,13 +51,15 @@ def time_in_seconds(
         if rate is not None and step > 0:
             unit = min(TICK, key=lambda name: abs(math.log(step) + math.log(TICK[name] * rate)))
             reason += f" and the stated {rate:g} Hz"
+            certain = abs(step * TICK[unit] * rate - 1) < _AGREES
         elif dated:
             unit, reason = dated[0], "in which its readings are dates"
         elif not whole or step < 0.2:
             unit = "s"
         else:
             unit = "ms" if step < 200 else "us" if step < 200e3 else "ns"
-        note = f"time column '{column.name}' states no unit: read as {unit} {reason}"
+        if not certain:
+            note = f"time column '{column.name}' states no unit: read as {unit} {reason}"
     return ticks * TICK[unit], None, note
 
 
@@ -111,14 +114,14 @@ def streams_from_columns(
         by_device.setdefault(column.device, []).append(column)
     devices = list(dict.fromkeys(column.device for column in classified if column.kind == quantity))
     clocks = [column for column in classified if column.kind == "time"]
-    still = [column.name for column in clocks if not np.isfinite(columns[column.name]).any()]
+    still = dict.fromkeys(column.name for column in clocks if not np.isfinite(columns[column.name]).any())
     clocks = sorted((column for column in clocks if column.name not in still), key=_remoteness)
     clock_of = {column.device: column for column in reversed(clocks)}  # the nearest to the sample of each device
     notes = [
         *notes,
         *joined,
         *(f"time column '{name}' holds no reading and is left out" for name in still),
-        *_guessed_names(classified, quantity),
+        *_guessed_names(classified, quantity, name),
     ]
     streams = []
     for device in devices:
@@ -165,15 +168,19 @@ def _remoteness(clock: Column) -> int:
     return 0 if "sample" in name else 1 if "header" in name else 2
 
 
-def _guessed_names(columns: Sequence[Column], quantity: str) -> list[str]:
-    """What is to be said of sensors whose names do not say what they are."""
+def _guessed_names(columns: Sequence[Column], quantity: str, log: str) -> list[str]:
+    """What is to be said of sensors whose names do not say what they are, in a log of some name."""
     names = [column.name for column in columns if column.kind == quantity]
     bare = [name for name in names if bare_name(name) in ("p", "q", "r")]
     if bare:
         return [f"columns {', '.join(bare)} are read as the rates about x, y, z, as flight mechanics names them"]
     bare = [name for name in names if bare_name(name) in AXES]
+    if not bare:
+        return []
     sensor = "a gyro's" if quantity == "rate" else "an accelerometer's"
-    return [f"columns {', '.join(bare)} name no sensor and are read as {sensor}"] if bare else []
+    other = classify_columns([log], quantity)[0].kind in {"rate", "acceleration", "magnetic_field"} - {quantity}
+    but = f", though the log is called {log}" if other else ""
+    return [f"columns {', '.join(bare)} name no sensor and are read as {sensor}{but}"]
 
 
 def _joined_clocks(

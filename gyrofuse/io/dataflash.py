@@ -11,11 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrofuse.io.columns import AXES, CHANNELS, OTHER, or_else
-from gyrofuse.io.dataflash_messages import BATCH_FIELDS, FMT, MAGIC, NAMES, Table, binary, text
+from gyrofuse.io.dataflash_messages import BATCH_FIELDS, FMT, MAGIC, Table, read_binary, read_text
 from gyrofuse.io.limits import Allowance, enumerated, is_rate
 from gyrofuse.io.resample import at_samples
 from gyrofuse.io.stream import Array, RecordingError, Stream
 
+# Messages by source: those of one sensor, whose name may end in its number.
+_NAMES = {
+    "IMU": ("IMU", "IMU2", "IMU3"),
+    "GYR": ("GYR", "GYR1", "GYR2", "GYR3"),
+    "ACC": ("ACC", "ACC1", "ACC2", "ACC3"),
+    "ISBH": ("ISBH",),
+}
 _KEY = re.compile(r"(IMU|GYR|ACC|ISBH)(?:\[(\d{1,3})\])?")
 _BATCH = 32  # samples of a message ISBD
 # Microseconds since the controller was switched on, 31 years, beyond which a time is damage.
@@ -81,9 +88,9 @@ def read(path: Path, *, key: str | None = None, quantity: str = "rate", max_byte
     allowance.take("messages", (-(-path.stat().st_size // 8),))
     content = path.read_bytes()
     if MAGIC + bytes([FMT]) in content:
-        tables, notes = binary(content, allowance)
+        tables, notes = read_binary(content, allowance)
     elif content.startswith(b"FMT,") or b"\nFMT," in content:
-        tables, notes = text(content, allowance)
+        tables, notes = read_text(content, allowance)
     else:
         raise RecordingError(
             f"{path}: expected an ArduPilot dataflash log, binary or text, found no message FMT, which declares the "
@@ -103,7 +110,7 @@ def _chosen(
         raise RecordingError(
             f"{path}: expected `key` {raw}, {imu} or {batch}, or an instance of one, {imu}[0], got {key!r}; {advice}"
         )
-    there = [source for source in sensor.sources if any(name in tables for name in NAMES[source])]
+    there = [source for source in sensor.sources if any(name in tables for name in _NAMES[source])]
     for source in there:
         streams = _read_source(source, tables, notes, key, quantity, allowance)
         if streams:
@@ -143,9 +150,9 @@ def _instances(source: str, tables: Mapping[str, Table], quantity: str, notes: l
     """The sensors of messages IMU, GYR or ACC, with the other quantity and temperatures."""
     sensor, other = _SENSORS[quantity], _SENSORS[OTHER[quantity]]
     raw = source != "IMU"
-    own = _by_instance(tables, NAMES[source], sensor.fields, notes)
-    beside = _by_instance(tables, NAMES[other.raw], other.fields, notes) if raw else own
-    warmths = _by_instance(tables, NAMES["IMU"], sensor.fields, notes) if raw else own
+    own = _by_instance(tables, _NAMES[source], sensor.fields, notes)
+    beside = _by_instance(tables, _NAMES[other.raw], other.fields, notes) if raw else own
+    warmths = _by_instance(tables, _NAMES["IMU"], sensor.fields, notes) if raw else own
     streams = []
     for instance, table in sorted(own.items()):
         channels: dict[str, Array] = {}

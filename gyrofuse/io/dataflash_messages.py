@@ -1,4 +1,4 @@
-"""Messages of ArduPilot dataflash logs, binary and text, as tables of numbers.
+"""Messages of ArduPilot logs, by the declarations that stand in the logs themselves.
 
 A binary log is a row of messages, each with two magic bytes and its type in front. Messages of type 128 (`FMT`) declare
 the others: length, name, one letter for the type of each field, names of fields. A text log has one message a line,
@@ -28,14 +28,8 @@ _DTYPES: dict[str, tuple[str, tuple[int, ...]]] = {
     **dict.fromkeys("cC", ("<i2", ())),
     **dict.fromkeys("eEL", ("<i4", ())),
 }
-# Messages by source: those of one sensor, whose name may end in its number.
-NAMES = {
-    "IMU": ("IMU", "IMU2", "IMU3"),
-    "GYR": ("GYR", "GYR1", "GYR2", "GYR3"),
-    "ACC": ("ACC", "ACC1", "ACC2", "ACC3"),
-    "ISBH": ("ISBH",),
-}
-_READ = frozenset((*NAMES["IMU"], *NAMES["GYR"], *NAMES["ACC"], "ISBH", "ISBD"))
+# Messages that are read, and their fields.
+_READ = frozenset("IMU IMU2 IMU3 GYR GYR1 GYR2 GYR3 ACC ACC1 ACC2 ACC3 ISBH ISBD".split())
 _FIELDS = frozenset("GyrX GyrY GyrZ AccX AccY AccZ TimeUS TimeMS SampleUS I T Temp".split())
 BATCH_FIELDS = frozenset("N type instance mul smp_cnt SampleUS smp_rate seqno x y z".split())
 # A message is at most 255 bytes long: this much at the end of a log is one that was cut off, or the rest of a page.
@@ -81,7 +75,7 @@ class _Kind:
         return known and set(self.letters) <= _DTYPES.keys()
 
 
-def binary(content: bytes, allowance: Allowance) -> tuple[dict[str, Table], list[str]]:
+def read_binary(content: bytes, allowance: Allowance) -> tuple[dict[str, Table], list[str]]:
     """The messages of a binary log that are read, and what is wrong with it."""
     lengths, kinds = [0] * 256, dict[int, _Kind]()
     lengths[FMT] = _FMT_DTYPE.itemsize + 3
@@ -132,7 +126,7 @@ def binary(content: bytes, allowance: Allowance) -> tuple[dict[str, Table], list
     return tables, notes
 
 
-def text(content: bytes, allowance: Allowance) -> tuple[dict[str, Table], list[str]]:
+def read_text(content: bytes, allowance: Allowance) -> tuple[dict[str, Table], list[str]]:
     """The messages of a text log that are read, and what is wrong with it."""
     kinds, read = dict[str, _Kind](), list[_Kind]()
     bad = 0

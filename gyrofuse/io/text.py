@@ -12,9 +12,8 @@ cell is NaN. Only columns of numbers with a known name are parsed. Files of know
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +22,12 @@ from gyrofuse._result import numbered
 from gyrofuse.io.arrays import settings_by_group, stated_rate, stated_unit
 from gyrofuse.io.column_streams import streams_from_columns, time_in_seconds
 from gyrofuse.io.columns import NAMES_OF, WORD_OF, Column, classify_columns, or_else, renamed
-from gyrofuse.io.dates import DAY, seconds_of
-from gyrofuse.io.limits import LONGEST_NAME, Allowance, enumerated
+from gyrofuse.io.dates import DAY
+from gyrofuse.io.limits import Allowance, enumerated
 from gyrofuse.io.stream import Array, RecordingError, Stream, cause
 from gyrofuse.io.text_dialects import NEEDED, translate
-from gyrofuse.io.text_layout import COMMENT, Layout, advances, find_layout, lines_of, quoted_cells, without_numbers
+from gyrofuse.io.text_layout import Layout, advances, find_layout, without_numbers
+from gyrofuse.io.text_numbers import numbers_of
 
 
 def read(
@@ -132,9 +132,9 @@ def _named(path: Path, layout: Layout, key: str | None, quantity: str, allowance
             f"column '{layout.names[0]}' rises in equal steps but has no name of a clock; if it is one, call it 'time'"
         )
     columns, time, period, said = _with_dates(path, layout, chosen, clock, allowance)
-    columns, meaning = translate(columns, layout.names, layout.settings)
-    if quantity not in wanted and key in columns:
+    if quantity not in wanted and key is not None:
         columns[WORD_OF[quantity]] = columns.pop(key)
+    columns, meaning = translate(columns, layout.names, layout.settings)
     return _Table(columns, time, period, [*notes, *said, *meaning])
 
 
@@ -153,8 +153,8 @@ def _with_dates(
     """Chosen columns, the seconds of the column of dates, after which they wrap, and what to say of it."""
     name = "" if clock is None else layout.names[clock] if layout.names else str(clock + 1)
     if clock is None or name in chosen:
-        return _numbers(path, layout, chosen, allowance), None, None, []
-    columns = _numbers(path, layout, {**chosen, name: clock}, allowance)
+        return numbers_of(path, layout, chosen, allowance), None, None, []
+    columns = numbers_of(path, layout, {**chosen, name: clock}, allowance)
     seconds = columns.pop(name)
     if layout.times[clock] == "date":
         return columns, seconds, None, [f"column '{name}' holds dates and is read as time; without an offset as UTC"]
@@ -190,86 +190,3 @@ def _unnamed(
     if len(sensors) == 1:
         sensors = {WORD_OF[quantity]: next(iter(sensors.values()))}
     return _Table(sensors, time, period, notes)
-
-
-def _numbers(path: Path, layout: Layout, chosen: Mapping[str, int], allowance: Allowance) -> dict[str, Array]:
-    """Parse the chosen columns, by name and position."""
-    rows = _Rows(path, layout, allowance.left // (8 * len(chosen)))
-    try:
-        table = np.loadtxt(
-            iter(rows),
-            delimiter=layout.delimiter,
-            comments=None,
-            usecols=[*chosen.values()],
-            ndmin=2,
-            converters={i: seconds_of for i in chosen.values() if layout.times[i] and not layout.numeric[i]},
-            encoding=None,  # converters take text, not bytes
-        )
-    except RecordingError:
-        raise
-    except ValueError as error:
-        found = str(error).partition("could not convert string ")[2].rpartition(" to float")[0] or str(error)
-        hint = _units_row(layout, rows.number, found)
-        raise RecordingError(
-            f"{path}, line {rows.number}: expected numbers in the columns {enumerated(chosen)}, found "
-            f"{found[:LONGEST_NAME]}; correct the line{hint}, or leave the cell empty for a missing sample"
-        ) from error
-    allowance.take("rows of numbers", table.shape)
-    return dict(zip(chosen, np.ascontiguousarray(table.T), strict=True))
-
-
-def _units_row(layout: Layout, number: int, found: str) -> str:
-    """What to do with a second row of a header."""
-    second = layout.names and number == layout.begin + 1 and not any(letter.isdigit() for letter in found)
-    return " (units belong behind the names: gx [deg/s])" if second else ""
-
-
-class _Rows:
-    """Lines of numbers as np.loadtxt takes them: cells alone, a decimal point, NaN for an empty cell.
-
-    Attributes:
-        number: Of the line that was last handed out, from 1.
-    """
-
-    def __init__(self, path: Path, layout: Layout, most: int) -> None:
-        self.number = layout.begin
-        self._path = path
-        self._layout = layout
-        self._most = most
-
-    def __iter__(self) -> Iterator[str]:
-        delimiter, width = self._layout.delimiter, len(self._layout.numeric)
-        for line in islice(lines_of(self._path, self._layout.encoding), self._layout.begin, None):
-            self.number += 1
-            line = line.rstrip("\n ")
-            if not line or line.startswith(COMMENT):
-                continue
-            if self.number - self._layout.begin > self._most:
-                raise RecordingError(
-                    f"{self._path}, line {self.number}: expected a log whose numbers fit the memory that it may take, "
-                    "found more rows; allow more with max_bytes=, or save it as .npy and read it with open_long"
-                )
-            n_cells, line = _plain(line, delimiter, width)
-            if n_cells != width:
-                raise RecordingError(
-                    f"{self._path}, line {self.number}: expected {width} cells as in the other lines, found {n_cells}; "
-                    "complete or delete the line"
-                )
-            yield line
-
-
-def _plain(line: str, delimiter: str | None, width: int) -> tuple[int, str]:
-    """Number of cells of a line, and the line as np.loadtxt takes it."""
-    quoted = '"' in line
-    between = delimiter or " "
-    if delimiter and not (quoted or " " in line or between * 2 in line or between in (line[0], line[-1])):
-        n_cells = line.count(between) + 1  # nothing to mend: most lines
-    else:
-        cells = quoted_cells(line, delimiter) if quoted else line.split(delimiter)
-        if quoted:
-            cells = [cell.replace(between, "_") for cell in cells]
-        if delimiter and len(cells) == width + 1 and not cells[-1].strip():
-            del cells[-1]
-        n_cells = len(cells)
-        line = between.join([cell.strip() or "nan" for cell in cells])
-    return n_cells, line if delimiter == "," else line.replace(",", ".")

@@ -226,7 +226,7 @@ def _names_sensor(names: Iterable[str]) -> bool:
 
 def _cells(line: str, delimiter: str | None) -> list[str]:
     """Cells of a line without the empty one that a trailing delimiter makes."""
-    if delimiter is None and ("[" in line or "(" in line):  # a blank before a unit parts it from no name
+    if delimiter is None and line.lstrip()[:1].isalpha():  # a blank before a unit parts it from no name
         line = " ".join(line.split()).replace(" [", "[").replace(" (", "(")
     cells = quoted_cells(line, delimiter) if '"' in line else [cell.strip() for cell in line.split(delimiter)]
     return cells[:-1] if delimiter and len(cells) > 1 and not cells[-1] else cells
