@@ -304,7 +304,7 @@ class TestFlightControllers:
 
     def test_a_column_by_its_name(self, tmp_path: Path):
         (stream,) = read(tmp_path, self.NAMES, *rows(int, lambda i: 125 * i, 30, -20, 100, 0, 2048), key="accSmooth[2]")
-        assert (stream.name, stream.gyro[""].tolist()) == ("accSmooth[2]", [2048.0] * 12)
+        assert (stream.name, stream.signal[""].tolist()) == ("accSmooth[2]", [2048.0] * 12)
 
     def test_units_of_the_decoder_are_kept(self, tmp_path: Path):
         names = "loopIteration, time (us), gyroADC[0] (rad/s), " + ", ".join(

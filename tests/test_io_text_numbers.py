@@ -33,7 +33,7 @@ def test_at_once_as_line_by_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(text_numbers, "_at_once", lambda *given: None)
     (by_line,) = text.read(path)
     for axis in "xy":
-        np.testing.assert_array_equal(at_once.gyro[axis], by_line.gyro[axis])
+        np.testing.assert_array_equal(at_once.signal[axis], by_line.signal[axis])
     np.testing.assert_array_equal(at_once.time, by_line.time)
     assert at_once.notes == by_line.notes
 
@@ -41,7 +41,7 @@ def test_at_once_as_line_by_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_plain_tables_are_parsed_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(text_numbers, "_row_by_row", lambda *given: pytest.fail("line by line"))
     for style in ((",", ".", "\n", "%.6g", False), (";", ",", "\r\n", "%r", True)):
-        assert len(text.read(written(tmp_path / "log.csv", *style))[0].gyro["x"]) == 50
+        assert len(text.read(written(tmp_path / "log.csv", *style))[0].signal["x"]) == 50
 
 
 @pytest.mark.parametrize(
@@ -59,4 +59,4 @@ def test_a_comment_between_rows_is_passed_over(tmp_path: Path):
     path = written(tmp_path / "log.csv", ",", ".", "\n", "%.6g", False)
     path.write_text(path.read_text() + "# stopped\n0.50,1.5,2.5\n")
     (stream,) = text.read(path)
-    assert (len(stream.gyro["x"]), stream.gyro["x"][-1]) == (51, 1.5)
+    assert (len(stream.signal["x"]), stream.signal["x"][-1]) == (51, 1.5)
