@@ -2,7 +2,8 @@
 
 Both sides are cut into blocks of one length, so that resolution and leakage are the same. Below the lowest band of a
 block stand the DCT-II ordinates of whole records, dealt to the blocks, and so they do next to half the rate, where the
-edges of filters are steeper than blocks can show. The whole recording, the blocks that a fold
+edges of filters are steeper than blocks can show: there under a light taper, as the kink that either end of a record
+would be to them is all that stop bands have, the same in all ordinates. The whole recording, the blocks that a fold
 keeps and those that it holds out are the same sums over another set of blocks; the reference is held out with them, as
 its own chance would otherwise be in what is fitted and in what judges the fit.
 """
@@ -18,6 +19,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._transforms import cosine_ordinates
+from gyrofuse.mismatch.bumps import light_taper
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.folds import N_FOLDS, N_JUDGED
 from gyrofuse.mismatch.remembered import remembered
@@ -132,19 +134,21 @@ def _of_side(side: Side, n_samples: int) -> Spectra:
         place = torch.arange(len(blocks)) % N_JUDGED
         products[:, first:end].index_add_(0, place, cross_spectra(blocks, bands) * bands.dof[:, None, None])
         dof[:, first:end].index_add_(0, place, bands.dof.expand(len(blocks), -1))
-        ordinates = cosine_ordinates(record)
-        for start, groups in ((0, below), (end, beyond)):
+        taper = light_taper(n) * math.sqrt(n)
+        tapered = (record - record.mean(-1, keepdim=True)) * taper
+        for start, groups, seen, worth in (
+            (0, below, record, 0.5),  # a real ordinate is half a complex one
+            (end, beyond, tapered, 0.5 / float(taper.pow(4).mean())),
+        ):
             # A record of another length has its ordinates at other frequencies.
             edges = torch.tensor([g[0] - 0.5 for g in groups] + [groups[-1][-1] + 0.5], dtype=torch.float64)
             lowest, highest = (float(edge) * n / n_samples for edge in (edges[0], edges[-1]))
             k = torch.arange(max(math.ceil(lowest), 1), min(math.floor(highest) + 1, n))
             band = torch.bucketize(k * (n_samples / n), edges, right=True) - 1
-            y = ordinates[:, k].mT
+            y = cosine_ordinates(seen)[:, k].mT
             at, inside = (k % N_JUDGED)[band >= 0], band >= 0
-            cross = (y[:, :, None] * y[:, None, :])[inside].to(products.dtype) / 2  # a real ordinate is half a complex
+            cross = (y[:, :, None] * y[:, None, :])[inside].to(products.dtype) * worth
             products.index_put_((at, start + band[inside]), cross, accumulate=True)
-            dof.index_put_(
-                (at, start + band[inside]), torch.full((len(at),), 0.5, dtype=torch.float64), accumulate=True
-            )
+            dof.index_put_((at, start + band[inside]), torch.full((len(at),), worth).to(dof), accumulate=True)
     told = side.n_records / n_records  # less than it shows, where a model was estimated from fewer samples
     return Spectra(products * told, dof * told)
