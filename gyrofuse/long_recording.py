@@ -14,6 +14,7 @@ from torch import Tensor
 from gyrofuse._checks import check_n_samples, check_positive, check_positive_integer, largest_level
 from gyrofuse._result import counted, numbered
 from gyrofuse.io.slices import open_slices
+from gyrofuse.units import check_quantity
 
 Progress = Callable[[str, float], None]
 
@@ -26,7 +27,7 @@ def silent(what: str, share: float) -> None:
 
 @dataclass(frozen=True, eq=False)
 class LongRecording:
-    """An array of gyros on a uniform grid of time whose samples are read when they are needed; NaN is a missing one.
+    """Gyros or accelerometers on a uniform grid of time whose samples are read when needed; NaN is a missing one.
 
     `open_long` makes one from a file. Any function that gives the samples of a stretch makes one as well, as long as
     it gives the same samples whenever it is asked, in whatever process:
@@ -37,7 +38,7 @@ class LongRecording:
         n_sensors: Number of sensors.
         n_samples: Samples of each sensor.
         rate: Sampling rate in Hz, when known.
-        unit: Unit of the signal: "deg/s", "rad/s", "counts", "unknown".
+        unit: Unit of the signal: "deg/s", "rad/s", "m/s^2", "counts", "unknown".
         sensors: Name of each sensor; "1", "2", ... by default.
         path: File that is read, where there is one.
 
@@ -122,7 +123,12 @@ class LongRecording:
 
 
 def open_long(
-    path: str | Path, *, rate: float | None = None, unit: str | None = None, key: str | Sequence[str] | None = None
+    path: str | Path,
+    *,
+    rate: float | None = None,
+    unit: str | None = None,
+    key: str | Sequence[str] | None = None,
+    quantity: str = "rate",
 ) -> LongRecording:
     """Open a log that is larger than memory.
 
@@ -135,8 +141,10 @@ def open_long(
         path: A `.npy` file, an `.npz` file that is not compressed, an `.h5` or `.hdf5`, or a `.parquet` file.
         rate: Sampling rate in Hz; by default what the log states, if anything.
         unit: Unit that the numbers have; by default what the log states, if anything.
-        key: The array of an `.npz` or HDF5 file: `gyro`, or the only one of two dimensions, by default. The columns
-            of a `.parquet` file, one for each sensor: those with the name of a gyro by default.
+        key: The array of an `.npz` or HDF5 file: `gyro` (`acceleration`), or the only one of two dimensions that may be
+            it, by default. The columns of a `.parquet` file, one for each sensor: those with the name of a gyro (an
+            accelerometer) by default.
+        quantity: `"rate"` for the gyros of the log, `"acceleration"` for its accelerometers.
 
     Returns:
         The recording.
@@ -144,10 +152,11 @@ def open_long(
     Raises:
         FileNotFoundError: No such file.
         RecordingError: The file cannot be read by stretches: says what was expected, what was found, what to do.
-        ValueError: A rate that is not positive.
+        ValueError: A rate that is not positive, or no such quantity.
         ImportError: A format whose library is not installed (`pip install "gyrofuse[logs]"`).
     """
-    found = open_slices(Path(path), key)
+    check_quantity(quantity)
+    found = open_slices(Path(path), key, quantity)
     return LongRecording(
         found.read,
         n_sensors=len(found.sensors),

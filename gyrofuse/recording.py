@@ -21,7 +21,7 @@ from gyrofuse.io.assemble import assemble
 from gyrofuse.io.columns import WORD_OF, check_columns
 from gyrofuse.io.limits import is_rate
 from gyrofuse.io.notes import Note
-from gyrofuse.units import QUANTITIES, canonical_unit, quantity_of, unit_factor
+from gyrofuse.units import QUANTITIES, canonical_unit, check_quantity, quantity_of, unit_factor
 
 
 @dataclass(frozen=True, eq=False)
@@ -356,8 +356,7 @@ def read_recording(
 
 def check_reading(*, rate: float | None = None, scale: float | None = None, quantity: str = "rate") -> None:
     """Raise `ValueError` where an option of `read_recording` is wrong for any log."""
-    if quantity not in QUANTITIES:
-        raise ValueError(f"`quantity`: expected {' or '.join(map(repr, QUANTITIES))}, got {quantity!r}")
+    check_quantity(quantity)
     if rate is not None and not is_rate(check_positive("rate", rate)):
         raise ValueError(f"`rate`: expected a sampling rate of 1e-6 to 1e12 Hz, got {rate!r}")
     if scale is not None and not (math.isfinite(scale) and scale != 0):

@@ -87,6 +87,12 @@ def quantity_of(unit: str) -> str | None:
     return next((quantity for quantity, sizes in _SIZES.items() if name in sizes), None)
 
 
+def check_quantity(quantity: str) -> None:
+    """Raise `ValueError` where a log cannot be read for `quantity`."""
+    if quantity not in QUANTITIES:
+        raise ValueError(f"`quantity`: expected {' or '.join(map(repr, QUANTITIES))}, got {quantity!r}")
+
+
 def unit_factor(unit: str, target: str) -> float:
     """Factor that takes a rate or an acceleration in `unit` to `target`, a unit of the same quantity.
 

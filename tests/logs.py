@@ -163,24 +163,28 @@ def write_ulog(
     gyro: Array,
     stamps: Stamps,
     *,
+    topic: str = "sensor_gyro",
     temperature: Array | None = None,
     combined: tuple[Array, Stamps] | None = None,
+    relative: Sequence[int] | None = None,
     fifo: Sequence[tuple[str, int, int, float, float, Sequence[tuple[int, int, Any]]]] = (),
     dropouts_ms: Sequence[int] = (),
     other_topics: Sequence[str] = (),
 ) -> Path:
-    """Write a PX4 ULog: `gyro` as instances of sensor_gyro, `combined` (axis, time) as sensor_combined.
+    """Write a PX4 ULog: `gyro` as instances of `topic`, `combined` (axis, time) as sensor_combined.
 
-    Rates are stored in single precision and stamps in whole microseconds, as PX4 does; timestamp_sample is `stamps`
-    and timestamp 400 microseconds later. `fifo` are topics `(name, instance, device_id, dt, scale, messages)` with
-    messages `(timestamp_sample, samples, counts (axis, 32))`, in microseconds.
+    Numbers are stored in single precision and stamps in whole microseconds, as PX4 does; timestamp_sample is `stamps`
+    and timestamp 400 microseconds later. Accelerations of sensor_combined are -9.75 along z, measured `relative`
+    microseconds after its rates. `fifo` are topics `(name, instance, device_id, dt, scale, messages)` with messages
+    `(timestamp_sample, samples, counts (axis, 32))`, in microseconds.
     """
     temperature = np.full((len(gyro), gyro.shape[-1]), 25.0) if temperature is None else temperature
     plain = "uint64_t timestamp;"
     formats = {
-        "sensor_gyro": plain
-        + "uint64_t timestamp_sample;uint32_t device_id;float x;float y;float z;float temperature;",
-        "sensor_combined": plain + "float[3] gyro_rad;float[3] accelerometer_m_s2;",
+        topic: plain + "uint64_t timestamp_sample;uint32_t device_id;float x;float y;float z;float temperature;",
+        "sensor_combined": plain
+        + "float[3] gyro_rad;float[3] accelerometer_m_s2;"
+        + "int32_t accelerometer_timestamp_relative;",
         **dict.fromkeys(other_topics, plain),
         **dict.fromkeys((topic[0] for topic in fifo), plain + _FIFO),
     }
@@ -191,15 +195,16 @@ def write_ulog(
 
     packets = []
     for device, (rates, warmth) in enumerate(zip(gyro, temperature, strict=True)):
-        log += _ulog_message("A", struct.pack("<BH", device, device) + b"sensor_gyro")
+        log += _ulog_message("A", struct.pack("<BH", device, device) + topic.encode())
         for stamp, rate, warm in zip((stamps // 1000).tolist(), rates.T.tolist(), warmth.tolist(), strict=True):
             body = struct.pack("<HQQI4f", device, stamp + 400, stamp, 1000 + device, *rate, warm)
             packets.append((stamp, body))
     number = len(gyro)
     if combined is not None:
         log += _ulog_message("A", struct.pack("<BH", 0, number) + b"sensor_combined")
-        for stamp, rate in zip((combined[1] // 1000).tolist(), combined[0].T.tolist(), strict=True):
-            packets.append((stamp, struct.pack("<HQ6f", number, stamp, *rate, 0.0, 0.0, -9.75)))
+        late = [0] * len(combined[1]) if relative is None else relative
+        for stamp, rate, offset in zip((combined[1] // 1000).tolist(), combined[0].T.tolist(), late, strict=True):
+            packets.append((stamp, struct.pack("<HQ6fi", number, stamp, *rate, 0.0, 0.0, -9.75, offset)))
         number += 1
     for identity, (name, instance, device, dt, scale, messages) in enumerate(fifo, number):
         log += _ulog_message("A", struct.pack("<BH", instance, identity) + name.encode())

@@ -36,7 +36,7 @@ def test_the_names_of_an_npz_recording():
     )
     assert [stream.name for stream in streams] == sensors.tolist()
     for stream, row in zip(streams, array, strict=True):
-        np.testing.assert_array_equal(stream.gyro[""], row)
+        np.testing.assert_array_equal(stream.signal[""], row)
         np.testing.assert_array_equal(stream.time, time)
         assert (stream.unit, stream.rate) == ("deg/s", 100.0)
     assert streams[0].channels.keys() == {"temperature", "acceleration", "supply"}
@@ -50,14 +50,14 @@ def test_the_names_of_an_npz_recording():
 def test_three_rows_are_axes_in_either_orientation(name, orient):
     (stream,) = read({name: orient(GYRO)})
     assert stream.name == "board"
-    assert list(stream.gyro) == ["x", "y", "z"]
-    np.testing.assert_array_equal(list(stream.gyro.values()), GYRO)
+    assert list(stream.signal) == ["x", "y", "z"]
+    np.testing.assert_array_equal(list(stream.signal.values()), GYRO)
     assert (stream.unit, stream.rate, stream.time) == ("unknown", None, None)
 
 
 def test_sensors_name_three_rows_too():
     streams = read({"gyro": GYRO, "sensors": ["a", "b", "c"]})
-    assert [(stream.name, list(stream.gyro)) for stream in streams] == [("a", [""]), ("b", [""]), ("c", [""])]
+    assert [(stream.name, list(stream.signal)) for stream in streams] == [("a", [""]), ("b", [""]), ("c", [""])]
 
 
 @pytest.mark.parametrize("content", [{}, {"sensors": list("abbab")}], ids=["none", "two of them repeated"])
@@ -71,7 +71,7 @@ def test_one_array_per_axis():
     columns = {f"g{a}": row[:, None] for a, row in zip("xyz", GYRO, strict=True)}
     columns |= {f"a{a}": row for a, row in zip("xyz", 2 * GYRO, strict=True)}
     (stream,) = read(columns)
-    np.testing.assert_array_equal([stream.gyro[a] for a in "xyz"], GYRO)
+    np.testing.assert_array_equal([stream.signal[a] for a in "xyz"], GYRO)
     np.testing.assert_array_equal(stream.channels["acceleration"], 2 * GYRO)
 
 
@@ -80,7 +80,7 @@ def test_a_row_that_never_decreases_is_the_clock(row):
     time = np.linspace(0.005, 0.6, 60)
     (stream,) = read({"gyroBuffer": np.insert(GYRO, row, time, axis=0).T})
     np.testing.assert_array_equal(stream.time, time)
-    np.testing.assert_array_equal(list(stream.gyro.values()), GYRO)
+    np.testing.assert_array_equal(list(stream.signal.values()), GYRO)
     assert f"row {row} of 'gyroBuffer' never decreases and is read as its time" in stream.notes
 
 
@@ -114,7 +114,7 @@ def test_axes_in_a_group_of_their_own():
     content |= {f"imu3/acc/{a}": row for a, row in zip("xyz", 3 * GYRO, strict=True)}
     (stream,) = read(content)
     assert stream.name == "imu3"
-    np.testing.assert_array_equal([stream.gyro[a] for a in "xyz"], GYRO)
+    np.testing.assert_array_equal([stream.signal[a] for a in "xyz"], GYRO)
     np.testing.assert_array_equal(stream.channels["acceleration"], 3 * GYRO)
 
 
@@ -145,14 +145,14 @@ def test_a_rate_that_is_none(value):
 def test_key_names_an_array_whatever_its_name():
     content = {"gyro": GYRO, "omega_filtered": 2 * GYRO, "signal": 3 * GYRO, "temperature": GYRO[0]}
     (stream,) = read(content, key="signal")
-    np.testing.assert_array_equal(list(stream.gyro.values()), 3 * GYRO)
+    np.testing.assert_array_equal(list(stream.signal.values()), 3 * GYRO)
     assert list(stream.channels) == ["temperature"]
 
 
 @pytest.mark.parametrize("sensors", [{}, {"sensors": list("abc")}], ids=["axes", "sensors"])
 def test_a_second_array_of_the_same_device_is_left_out(sensors):
     streams = read({"gyro": GYRO, "raw_gyro": 2 * GYRO} | sensors)
-    np.testing.assert_array_equal([row for stream in streams for row in stream.gyro.values()], GYRO)
+    np.testing.assert_array_equal([row for stream in streams for row in stream.signal.values()], GYRO)
     assert "'raw_gyro' repeats an axis of the same device and is left out" in streams[0].notes
 
 
@@ -161,7 +161,7 @@ def test_non_finite_samples_stay():
     rates[1, 4] = np.inf
     rates[2, 5] = np.nan
     (stream,) = read({"gyro": rates})
-    np.testing.assert_array_equal(list(stream.gyro.values()), rates)
+    np.testing.assert_array_equal(list(stream.signal.values()), rates)
 
 
 @pytest.mark.parametrize(

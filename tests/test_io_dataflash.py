@@ -40,8 +40,8 @@ def test_each_instance_is_a_device(tmp_path):
     assert [stream.name for stream in streams] == ["IMU[0]", "IMU[1]"]
     for instance, stream in enumerate(streams):
         np.testing.assert_array_equal(stream.time, (BOOT + 2500 * np.arange(40) + instance) * 1e-6)
-        np.testing.assert_array_equal(stream.gyro["x"], np.float32(0.1 * np.arange(40)))
-        np.testing.assert_array_equal(stream.gyro["y"], np.full(40, instance))
+        np.testing.assert_array_equal(stream.signal["x"], np.float32(0.1 * np.arange(40)))
+        np.testing.assert_array_equal(stream.signal["y"], np.full(40, instance))
         np.testing.assert_array_equal(stream.channels["acceleration"], np.outer([1, 2, -9.75], np.ones(40)))
         np.testing.assert_array_equal(stream.channels["temperature"], 30.0 + np.arange(40))
         assert stream.unit == "rad/s"
@@ -55,7 +55,7 @@ def test_text_holds_what_the_binary_does(tmp_path):
     text = dataflash.read(write_dataflash(tmp_path / "a.log", messages))
     for one, other in zip(binary, text, strict=True):
         np.testing.assert_allclose(one.time, other.time, rtol=0, atol=1e-9)
-        np.testing.assert_allclose([one.gyro[a] for a in "xyz"], [other.gyro[a] for a in "xyz"], rtol=1e-6)
+        np.testing.assert_allclose([one.signal[a] for a in "xyz"], [other.signal[a] for a in "xyz"], rtol=1e-6)
 
 
 def test_the_content_says_which_of_the_two_it_is(tmp_path):
@@ -67,7 +67,7 @@ def test_older_logs_have_a_message_for_each_sensor(tmp_path):
     messages = [("IMU2", BOOT + 20_000 * k, 0.5, k, 0.0, 0.0, 0.0, -9.75, 0, 0, 41.5, 1, 1) for k in range(30)]
     (stream,) = dataflash.read(write_dataflash(tmp_path / "a.bin", messages))
     assert stream.name == "IMU[1]"
-    np.testing.assert_array_equal(stream.gyro["y"], np.arange(30.0))
+    np.testing.assert_array_equal(stream.signal["y"], np.arange(30.0))
     np.testing.assert_array_equal(stream.channels["temperature"], np.full(30, 41.5))
 
 
@@ -76,7 +76,7 @@ def test_raw_samples_come_before_those_of_the_main_loop(tmp_path):
     (stream,) = dataflash.read(path)
     assert stream.name == "GYR[0]"
     np.testing.assert_allclose(np.diff(stream.time), 500e-6, atol=1e-9)
-    np.testing.assert_array_equal(stream.gyro["x"], 0.25 * np.arange(160))
+    np.testing.assert_array_equal(stream.signal["x"], 0.25 * np.arange(160))
     # Accelerations at half the rate: between two of them lies their mean, after the last one nothing.
     np.testing.assert_allclose(stream.channels["acceleration"][0, :-1], np.arange(159.0), atol=1e-6)
     assert np.isnan(stream.channels["acceleration"][0, -1])
@@ -89,7 +89,7 @@ def test_raw_samples_come_before_those_of_the_main_loop(tmp_path):
 def test_batches_are_unrolled_and_divided_by_their_multiplier(tmp_path):
     (stream,) = dataflash.read(write_dataflash(tmp_path / "a.bin", batches()))
     assert (stream.name, stream.rate) == ("ISBH[0]", 2000.0)
-    np.testing.assert_array_equal(stream.gyro["y"], np.arange(64) / 1000)
+    np.testing.assert_array_equal(stream.signal["y"], np.arange(64) / 1000)
     np.testing.assert_allclose(stream.time, BOOT * 1e-6 + np.arange(64) / 2000, atol=1e-12)
     assert any("apart in time (2 of gyro 0): read is the longest run" in note for note in stream.notes)
 
@@ -98,7 +98,7 @@ def test_a_lost_message_parts_a_batch(tmp_path):
     messages = batches(kinds=[(1, 0)], count=160)
     del messages[2]  # the second of five
     (stream,) = dataflash.read(write_dataflash(tmp_path / "a.bin", messages))
-    np.testing.assert_array_equal(stream.gyro["x"], np.arange(64, 160) / 1000)
+    np.testing.assert_array_equal(stream.signal["x"], np.arange(64, 160) / 1000)
 
 
 def test_batches_that_follow_without_a_gap_are_one_run(tmp_path):
@@ -110,7 +110,7 @@ def test_the_gyro_of_the_batches_is_chosen(tmp_path):
     path = write_dataflash(tmp_path / "a.bin", [*batches([(1, 0), (1, 1)], number=65535), *imu()])
     assert [s.name for s in dataflash.read(path)] == ["IMU[0]", "IMU[1]"]
     (stream,) = dataflash.read(path, key="ISBH[1]")
-    np.testing.assert_array_equal(stream.gyro["z"], (100 + np.arange(64)) / 1000)
+    np.testing.assert_array_equal(stream.signal["z"], (100 + np.arange(64)) / 1000)
 
 
 @pytest.mark.parametrize("wrong", [{"mul": 0}, {"rate": float("nan")}, {"rate": 0.0}, {"count": 0}])
@@ -131,6 +131,60 @@ def test_batches_with_other_than_32_samples_a_message_are_left_out(tmp_path):
 def test_batches_of_a_text_log_are_refused(tmp_path):
     with pytest.raises(RecordingError, match=r"not read from a text log, .* give the \.bin"):
         dataflash.read(write_dataflash(tmp_path / "a.log", batches()))
+
+
+class TestAccelerations:
+    """What is said above of rates holds of accelerations."""
+
+    @pytest.mark.parametrize("suffix", [".bin", ".log"])
+    def test_each_instance_is_a_device(self, tmp_path, suffix):
+        streams = dataflash.read(write_dataflash(tmp_path / f"a{suffix}", imu()), quantity="acceleration")
+        assert [(stream.name, stream.unit) for stream in streams] == [("IMU[0]", "m/s^2"), ("IMU[1]", "m/s^2")]
+        for instance, stream in enumerate(streams):
+            np.testing.assert_array_equal([stream.signal[a] for a in "xyz"], np.outer([1, 2, -9.75], np.ones(40)))
+            np.testing.assert_array_equal(stream.channels["angular_rate"][1], np.full(40, instance))
+            np.testing.assert_array_equal(stream.channels["temperature"], 30.0 + np.arange(40))
+            assert stream.channel_units == {"angular_rate": "rad/s", "temperature": "degC"}
+
+    def test_raw_samples_come_before_those_of_the_main_loop(self, tmp_path):
+        path = write_dataflash(tmp_path / "a.bin", [*raw(161), *imu()])
+        (stream,) = dataflash.read(path, quantity="acceleration")
+        assert (stream.name, stream.unit, stream.n_samples) == ("ACC[0]", "m/s^2", 81)
+        np.testing.assert_allclose(np.diff(stream.time), 1e-3, atol=1e-9)
+        np.testing.assert_array_equal(stream.signal["x"], 2.0 * np.arange(81))
+        np.testing.assert_allclose(stream.channels["angular_rate"][0], 0.5 * np.arange(81), atol=1e-6)
+        assert stream.channel_units["angular_rate"] == "rad/s"
+        assert any("IMU of the same log not read; choose with key=" in note for note in stream.notes)
+        assert [s.name for s in dataflash.read(path, quantity="acceleration", key="IMU[1]")] == ["IMU[1]"]
+
+    def test_batches_of_them(self, tmp_path):
+        path = write_dataflash(tmp_path / "a.bin", batches())
+        (stream,) = dataflash.read(path, quantity="acceleration")
+        assert (stream.name, stream.unit, stream.rate) == ("ISBH[0]", "m/s^2", 2000.0)
+        np.testing.assert_array_equal(stream.signal["y"], (100 + np.arange(64)) / 1000)
+        assert any("(1 of accelerometer 0): read is the longest run of this accelerometer" in n for n in stream.notes)
+
+    @pytest.mark.parametrize(
+        ("quantity", "other", "messages"),
+        [
+            ("rate", "acceleration", [message for message in raw() if message[0] == "ACC"]),
+            ("acceleration", "rate", [message for message in raw() if message[0] == "GYR"]),
+            ("rate", "acceleration", batches([(0, 0)])),
+            ("acceleration", "rate", batches([(1, 0)])),
+        ],
+    )
+    def test_a_log_of_the_other_sensor_says_what_reads_it(self, tmp_path, quantity, other, messages):
+        path = write_dataflash(tmp_path / "a.bin", messages)
+        with pytest.raises(RecordingError, match=rf'two messages of an? (gyro|acc).*quantity="{other}"'):
+            dataflash.read(path, quantity=quantity)
+        (stream,) = dataflash.read(path, quantity=other)
+        assert stream.channels == {}
+
+    @pytest.mark.parametrize(("quantity", "key"), [("rate", "ACC"), ("acceleration", "GYR[0]")])
+    def test_a_key_of_the_other_sensor(self, tmp_path, quantity, key):
+        path = write_dataflash(tmp_path / "a.bin", raw())
+        with pytest.raises(RecordingError, match=r"expected `key` \w+, IMU or ISBH.*which are read with quantity="):
+            dataflash.read(path, quantity=quantity, key=key)
 
 
 class TestDamage:

@@ -261,17 +261,17 @@ class TestMessages:
 class TestRegisters:
     def test_with_and_without_sign(self, tmp_path: Path):
         (stream,) = read(tmp_path, "X_GYRO_OUT,X_GYRO_LOW", "-2,5", "65534,5", "3,-1", "3,65535")
-        assert stream.gyro["x"].tolist() == [-2 * 65536 + 5, -2 * 65536 + 5, 3 * 65536 + 65535, 3 * 65536 + 65535]
+        assert stream.signal["x"].tolist() == [-2 * 65536 + 5, -2 * 65536 + 5, 3 * 65536 + 65535, 3 * 65536 + 65535]
         assert (stream.unit, stream.name) == ("counts", "log")
 
     def test_of_16_bits(self, tmp_path: Path):
         (stream,) = read(tmp_path, "X_GYRO_OUT,Y_GYRO_OUT", "65535,1", "2,3")
-        assert [values.tolist() for values in stream.gyro.values()] == [[-1, 2], [1, 3]]
+        assert [values.tolist() for values in stream.signal.values()] == [[-1, 2], [1, 3]]
         assert stream.notes == ()
 
     def test_of_scaled_numbers(self, tmp_path: Path):
         (stream,) = read(tmp_path, "X_GYRO_OUT,X_GYRO_LOW", "0.25,5", "0.5,5")
-        assert stream.gyro["x"].tolist() == [0.25, 0.5]
+        assert stream.signal["x"].tolist() == [0.25, 0.5]
         assert stream.unit == "unknown"
         assert stream.notes == ("columns X_GYRO_LOW are left out: beside them are no whole numbers of 16 bits",)
 
@@ -297,7 +297,7 @@ class TestFlightControllers:
     def test_scale(self, tmp_path: Path, settings, unit, factor, says):
         cells = rows(int, lambda i: 125 * i, 30, -20, 100, 0, 2048)
         (stream,) = read(tmp_path, *settings, '"acc_1G","2048"', self.NAMES, *cells)
-        assert (stream.unit, stream.gyro["x"][0]) == (unit, pytest.approx(30 * factor))
+        assert (stream.unit, stream.signal["x"][0]) == (unit, pytest.approx(30 * factor))
         assert np.diff(stream.time) == pytest.approx(125e-6)
         assert stream.channels["acceleration"][:, 0].tolist() == [100 / 2048, 0, 1]
         assert not says or any(says in note for note in stream.notes)
@@ -311,4 +311,4 @@ class TestFlightControllers:
             f"accSmooth[{i}] (m/s/s)" for i in range(3)
         )
         (stream,) = read(tmp_path, names, *rows(int, lambda i: 125 * i, 0.5, 1, 2, 3))
-        assert (stream.unit, stream.gyro["x"][0], stream.channel_units) == ("rad/s", 0.5, {"acceleration": "m/s^2"})
+        assert (stream.unit, stream.signal["x"][0], stream.channel_units) == ("rad/s", 0.5, {"acceleration": "m/s^2"})

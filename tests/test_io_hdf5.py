@@ -20,7 +20,7 @@ def test_the_names_of_an_npz_recording(tmp_path):
     content = {"gyro": gyro, "fs": 100.0, "unit": "deg/s", "sensors": list("abcdef"), "temperature": gyro[0]}
     streams = hdf5.read(write_hdf5(tmp_path / "a.h5", content))
     assert [stream.name for stream in streams] == list("abcdef")
-    np.testing.assert_array_equal([stream.gyro[""] for stream in streams], gyro)
+    np.testing.assert_array_equal([stream.signal[""] for stream in streams], gyro)
     assert (streams[0].rate, streams[0].unit, list(streams[0].channels)) == (100.0, "deg/s", ["temperature"])
 
 
@@ -34,8 +34,8 @@ def test_groups_with_attributes(tmp_path):
     assert (first.name, first.rate, first.unit) == ("imu1", 100.0, "rad/s")
     assert (second.name, second.rate, second.unit) == ("imu2", 100.0, "deg/s")
     assert first.channel_units == {"acceleration": "m/s^2"}
-    np.testing.assert_array_equal([first.gyro[a] for a in "xyz"], gyro[0])
-    np.testing.assert_array_equal([second.gyro[a] for a in "xyz"], gyro[1])
+    np.testing.assert_array_equal([first.signal[a] for a in "xyz"], gyro[0])
+    np.testing.assert_array_equal([second.signal[a] for a in "xyz"], gyro[1])
     np.testing.assert_allclose(second.time, np.arange(60) / 100, rtol=0, atol=1e-12)
 
 
@@ -44,7 +44,7 @@ def test_a_table(tmp_path):
     table = np.zeros(60, dtype=[("t", "f8"), ("gx", "f4"), ("gy", "f8"), ("gz", "f8")])
     table["t"], table["gy"], table["gz"] = np.arange(60) / 100, gyro[1], gyro[2]
     (stream,) = hdf5.read(write_hdf5(tmp_path / "a.h5", {"log": table}))
-    np.testing.assert_array_equal(stream.gyro["z"], gyro[2])
+    np.testing.assert_array_equal(stream.signal["z"], gyro[2])
     np.testing.assert_array_equal(stream.time, table["t"])
 
 
@@ -62,8 +62,8 @@ def test_what_is_not_needed_is_not_read(tmp_path, monkeypatch):
 def test_key_is_a_dataset_or_a_group(tmp_path):
     gyro = made_up()
     path = write_hdf5(tmp_path / "a.h5", {"one": {"gyro": gyro[0]}, "two": {"rates": gyro[1]}})
-    np.testing.assert_array_equal(hdf5.read(path, key="one")[0].gyro["x"], gyro[0, 0])
-    np.testing.assert_array_equal(hdf5.read(path, key="/two/rates")[0].gyro["x"], gyro[1, 0])
+    np.testing.assert_array_equal(hdf5.read(path, key="one")[0].signal["x"], gyro[0, 0])
+    np.testing.assert_array_equal(hdf5.read(path, key="/two/rates")[0].signal["x"], gyro[1, 0])
 
 
 @pytest.mark.parametrize("keep", [0.0, 0.2, 0.9])
@@ -115,7 +115,7 @@ def test_a_published_recording():
         ("acceleration", "magnetic_field", "movement", "opt_pos", "opt_quat"), 57746
     )
     name = next(name for name in trials.files if name.startswith("t24") and not name.endswith("_movement"))
-    np.testing.assert_allclose([stream.gyro[a] for a in "xyz"], trials[name][:3], rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose([stream.signal[a] for a in "xyz"], trials[name][:3], rtol=1e-6, atol=1e-7)
 
 
 def test_a_heap_in_which_the_library_would_go_round_for_ever(tmp_path):
@@ -136,4 +136,4 @@ def test_numbers_that_spell_a_heap_are_no_damage(tmp_path):
     gyro = np.zeros((3, 4000))
     gyro[0, :2] = np.frombuffer(b"GCOL\x01\0\0\0" + (1 << 20).to_bytes(8, "little"))
     (stream,) = hdf5.read(write_hdf5(tmp_path / "a.h5", {"gyro": gyro}))
-    np.testing.assert_array_equal(stream.gyro["x"], gyro[0])
+    np.testing.assert_array_equal(stream.signal["x"], gyro[0])

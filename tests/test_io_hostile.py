@@ -143,7 +143,7 @@ class TestText:
         rows = [between.join(f'"{x:.4f}"'.replace(".", decimal) for x in row) for row in zip(TIME, *GYRO, strict=True)]
         (tmp_path / "a.csv").write_text("\n".join([between.join(['"time"', '"gx"', '"gy"', '"gz"']), *rows]))
         (stream,) = read_streams(tmp_path / "a.csv")
-        np.testing.assert_allclose([stream.gyro[axis] for axis in "xyz"], GYRO, atol=6e-5)
+        np.testing.assert_allclose([stream.signal[axis] for axis in "xyz"], GYRO, atol=6e-5)
 
     def test_a_row_of_units_says_where_units_belong(self, tmp_path: Path):
         with pytest.raises(
@@ -181,7 +181,7 @@ class TestNames:
     def test_a_dataset_that_is_not_utf_8_is_read_under_its_name(self, tmp_path: Path):
         make, _ = CASES["h5_names_that_are_not_utf8"]
         (stream,) = read_streams(make(tmp_path))
-        np.testing.assert_array_equal([stream.gyro[axis] for axis in "xyz"], GYRO)
+        np.testing.assert_array_equal([stream.signal[axis] for axis in "xyz"], GYRO)
         np.testing.assert_array_equal(gf.open_long(tmp_path / "a.h5").read(0, 5), GYRO[:, :5])
 
     def test_a_file_that_is_named_twice_is_no_second_device(self, tmp_path: Path):

@@ -22,7 +22,7 @@ def test_arrays_beside_each_other(tmp_path, write):
     content = {"imu_gyr": gyro.T, "imu_acc": acceleration.T, "sampling_rate": 62.5, "unit": "deg/s"}
     (stream,) = matlab.read(write(tmp_path / "a.mat", content))
     assert (stream.name, stream.rate, stream.unit) == ("a", 62.5, "deg/s")
-    np.testing.assert_array_equal([stream.gyro[a] for a in "xyz"], gyro)
+    np.testing.assert_array_equal([stream.signal[a] for a in "xyz"], gyro)
     np.testing.assert_array_equal(stream.channels["acceleration"], acceleration)
 
 
@@ -34,9 +34,9 @@ def test_structs_are_devices(tmp_path, write):
     streams = matlab.read(path)
     assert [(stream.name, stream.rate) for stream in streams] == [("imu0", 50.0), ("imu1", 100.0)]
     for i, stream in enumerate(streams):
-        np.testing.assert_array_equal([stream.gyro[a] for a in "xyz"], gyro[i])
+        np.testing.assert_array_equal([stream.signal[a] for a in "xyz"], gyro[i])
         np.testing.assert_allclose(stream.time, np.arange(60) / 50, rtol=0, atol=1e-12)
-    np.testing.assert_array_equal(matlab.read(path, key="imu1.gyro")[0].gyro["z"], gyro[1, 2])
+    np.testing.assert_array_equal(matlab.read(path, key="imu1.gyro")[0].signal["z"], gyro[1, 2])
 
 
 def test_an_array_of_structs(tmp_path):
@@ -45,7 +45,7 @@ def test_an_array_of_structs(tmp_path):
     array["gyro"] = [gyro[0].T, gyro[1].T]
     streams = matlab.read(write_mat5(tmp_path / "a.mat", {"imu": array}))
     assert [stream.name for stream in streams] == ["imu1", "imu2"]
-    np.testing.assert_array_equal(streams[1].gyro["y"], gyro[1, 1])
+    np.testing.assert_array_equal(streams[1].signal["y"], gyro[1, 1])
 
 
 def test_a_cell_array_names_the_sensors(tmp_path):
@@ -118,7 +118,7 @@ def test_a_published_recording_reads_as_its_hdf5_twin():
     assert (stream.name, stream.rate, stream.unit) == (twin.name, twin.rate, twin.unit)
     assert stream.channels.keys() == twin.channels.keys()
     for axis in "xyz":
-        np.testing.assert_array_equal(stream.gyro[axis], twin.gyro[axis])
+        np.testing.assert_array_equal(stream.signal[axis], twin.signal[axis])
     for name in stream.channels:
         np.testing.assert_array_equal(stream.channels[name], twin.channels[name])
 
@@ -132,6 +132,6 @@ def test_a_published_recording_of_version_73():
     with h5py.File(path) as file:
         time, *gyro = file["gyroBuffer"][()]
     np.testing.assert_array_equal(stream.time, time)
-    np.testing.assert_array_equal([stream.gyro[a] for a in "xyz"], gyro)
+    np.testing.assert_array_equal([stream.signal[a] for a in "xyz"], gyro)
     assert stream.n_samples == 65067
     assert stream.n_samples / (stream.time[-1] - stream.time[0]) == pytest.approx(99.3, abs=0.1)

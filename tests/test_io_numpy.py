@@ -42,8 +42,8 @@ class TestRecording:
         streams = numpy_log.read(path)
         assert [stream.name for stream in streams] == ["a", "b", "c", "d"]
         for stream, row in zip(streams, gyro.astype(np.float32), strict=True):
-            assert stream.gyro[""].dtype == np.float64
-            np.testing.assert_array_equal(stream.gyro[""], row)
+            assert stream.signal[""].dtype == np.float64
+            np.testing.assert_array_equal(stream.signal[""], row)
             np.testing.assert_array_equal(stream.time, time)
             assert (stream.unit, stream.rate) == ("rad/s", 50.0)
         np.testing.assert_array_equal(streams[0].channels["temperature"], time)
@@ -60,32 +60,32 @@ class TestRecording:
     @pytest.mark.parametrize("orient", [np.asarray, np.transpose], ids=["time_last", "time_first"])
     def test_sensors_without_names_are_numbered(self, tmp_path: Path, orient):
         streams = numpy_log.read(save(tmp_path, gyro=orient(table()[:3])))
-        assert [(stream.name, list(stream.gyro)) for stream in streams] == [("1", [""]), ("2", [""]), ("3", [""])]
-        np.testing.assert_array_equal([stream.gyro[""] for stream in streams], table()[:3])
+        assert [(stream.name, list(stream.signal)) for stream in streams] == [("1", [""]), ("2", [""]), ("3", [""])]
+        np.testing.assert_array_equal([stream.signal[""] for stream in streams], table()[:3])
         assert {(stream.unit, stream.rate, stream.time) for stream in streams} == {("unknown", None, None)}
 
     @pytest.mark.parametrize("shape", [(N,), (1, N)])
     def test_a_single_sensor_has_the_name_of_the_file(self, tmp_path: Path, shape):
         (stream,) = numpy_log.read(save(tmp_path, gyro=table()[0].reshape(shape)))
         assert stream.name == "log"
-        np.testing.assert_array_equal(stream.gyro[""], table()[0])
+        np.testing.assert_array_equal(stream.signal[""], table()[0])
 
     def test_names_settle_the_orientation_of_a_short_recording(self, tmp_path: Path):
         gyro = table()[:, :4]
         streams = numpy_log.read(save(tmp_path, gyro=gyro, sensors=list("abcdef")))
-        np.testing.assert_array_equal([stream.gyro[""] for stream in streams], gyro)
+        np.testing.assert_array_equal([stream.signal[""] for stream in streams], gyro)
 
     def test_axes_by_sensors_by_time(self, tmp_path: Path):
         gyro = made_up(4).swapaxes(0, 1)[:2]  # (axis, sensor, time)
         streams = numpy_log.read(save(tmp_path, gyro=gyro, fs=9.5, axes=["y", "z"], sensors=["p", "q", "r", "gyro_1"]))
         assert [stream.name for stream in streams] == ["p", "q", "r", "gyro_1"]
         for i, stream in enumerate(streams):
-            assert list(stream.gyro) == ["y", "z"]
-            np.testing.assert_array_equal([stream.gyro["y"], stream.gyro["z"]], gyro[:, i])
+            assert list(stream.signal) == ["y", "z"]
+            np.testing.assert_array_equal([stream.signal["y"], stream.signal["z"]], gyro[:, i])
 
     def test_three_axes_need_no_names(self, tmp_path: Path):
         streams = numpy_log.read(save(tmp_path, gyro=made_up(2).swapaxes(0, 1)))
-        assert [(stream.name, list(stream.gyro)) for stream in streams] == [("1", list("xyz")), ("2", list("xyz"))]
+        assert [(stream.name, list(stream.signal)) for stream in streams] == [("1", list("xyz")), ("2", list("xyz"))]
 
     def test_channels_of_one_among_several_sensors(self, tmp_path: Path):
         path = save(
@@ -127,9 +127,9 @@ class TestRecording:
     def test_other_names_and_a_key(self, tmp_path: Path):
         path = save(tmp_path, imu_gyr=table()[:3], fs=10.0, drift=table()[0])
         (stream,) = numpy_log.read(path)
-        assert (list(stream.gyro), stream.rate) == (["x", "y", "z"], 10.0)
+        assert (list(stream.signal), stream.rate) == (["x", "y", "z"], 10.0)
         (stream,) = numpy_log.read(path, key="drift")
-        np.testing.assert_array_equal(stream.gyro[""], table()[0])
+        np.testing.assert_array_equal(stream.signal[""], table()[0])
 
     @pytest.mark.parametrize("shape", [(3, 0), (3, 1), (0, 9), (2, 3, 1), (1, 1), (1,), (), (2, 2, 2, 9)])
     def test_too_few_samples_or_odd_dimensions(self, tmp_path: Path, shape):
@@ -167,7 +167,7 @@ class TestTables:
         path = save(tmp_path, counts=counts, channels=ROWS, scale=scale, units=units, fs=100.0)
         (stream,) = numpy_log.read(path)
         assert (stream.name, stream.unit, stream.rate) == ("log", "deg/s", 100.0)
-        np.testing.assert_array_equal([stream.gyro[a] for a in "xyz"], counts[:3] * 0.05)
+        np.testing.assert_array_equal([stream.signal[a] for a in "xyz"], counts[:3] * 0.05)
         np.testing.assert_array_equal(stream.channels["acceleration"], counts[3:] * 0.003)
         assert stream.channel_units == {"acceleration": "g"}
 
@@ -176,13 +176,13 @@ class TestTables:
             tmp_path, data=table()[:3], channels=list("xyz"), units="rad/s", t_us=np.arange(N) * 4000, extra=table()
         )
         (stream,) = numpy_log.read(path)
-        assert (list(stream.gyro), stream.unit) == (["x", "y", "z"], "rad/s")
+        assert (list(stream.signal), stream.unit) == (["x", "y", "z"], "rad/s")
         np.testing.assert_allclose(stream.time, np.arange(N) * 0.004, rtol=1e-15)
         np.testing.assert_array_equal(stream.channels["extra"], table())
 
     def test_unknown_rows_and_no_units(self, tmp_path: Path):
         (stream,) = numpy_log.read(save(tmp_path, data=table()[:2], channels=["gz", "pressure"]))
-        assert (stream.unit, list(stream.gyro), list(stream.channels)) == ("unknown", ["z"], ["pressure"])
+        assert (stream.unit, list(stream.signal), list(stream.channels)) == ("unknown", ["z"], ["pressure"])
         np.testing.assert_array_equal(stream.channels["pressure"], table()[1])
 
     @pytest.mark.parametrize("time_axis", [-1, 0])
@@ -191,7 +191,7 @@ class TestTables:
         path = save(tmp_path, data=np.moveaxis(data, -1, time_axis), channels=ROWS, movement=np.ones(N, np.uint8))
         streams = numpy_log.read(path)
         assert [stream.name for stream in streams] == ["1", "2", "3"]
-        np.testing.assert_array_equal([[s.gyro[a] for a in "xyz"] for s in streams], data[:, :3])
+        np.testing.assert_array_equal([[s.signal[a] for a in "xyz"] for s in streams], data[:, :3])
         assert [list(s.channels) for s in streams] == [["acceleration", "movement"], ["acceleration"], ["acceleration"]]
 
     @pytest.mark.parametrize(
@@ -219,7 +219,7 @@ class TestTables:
                 numpy_log.read(path)
         for key in ("log_b", "b"):
             (stream,) = numpy_log.read(path, key=key)
-            np.testing.assert_array_equal(stream.gyro["x"], table(1)[0])
+            np.testing.assert_array_equal(stream.signal["x"], table(1)[0])
 
     def test_what_is_named_after_a_table_belongs_to_it(self, tmp_path: Path):
         path = save(
@@ -276,14 +276,14 @@ class TestBareArray:
         np.save(tmp_path / "a.npy", orient(table().astype(np.float32)))
         streams = numpy_log.read(tmp_path / "a.npy")
         assert [stream.name for stream in streams] == list("123456")
-        np.testing.assert_array_equal([stream.gyro[""] for stream in streams], table().astype(np.float32))
-        assert {type(stream.gyro[""]) for stream in streams} == {np.ndarray}  # the file is not kept open
+        np.testing.assert_array_equal([stream.signal[""] for stream in streams], table().astype(np.float32))
+        assert {type(stream.signal[""]) for stream in streams} == {np.ndarray}  # the file is not kept open
         assert (streams[0].unit, streams[0].rate, streams[0].time) == ("unknown", None, None)
 
     def test_one_dimension(self, tmp_path: Path):
         np.save(tmp_path / "a.npy", np.array([1, 2, 3], np.int16))
         (stream,) = numpy_log.read(tmp_path / "a.npy")
-        assert (stream.name, stream.gyro[""].tolist()) == ("a", [1, 2, 3])
+        assert (stream.name, stream.signal[""].tolist()) == ("a", [1, 2, 3])
 
     @pytest.mark.parametrize(
         "array",
@@ -357,7 +357,7 @@ class TestRealFiles:
             counts = file["counts"]
         assert (stream.name, stream.unit, stream.rate) == (path.stem, "deg/s", 100.0)
         for a, row in zip("xyz", counts, strict=False):
-            np.testing.assert_array_equal(stream.gyro[a], row * 0.05)
+            np.testing.assert_array_equal(stream.signal[a], row * 0.05)
         np.testing.assert_allclose(stream.channels["acceleration"], counts[3:] * 0.00333, rtol=1e-12)
 
     def test_xsensdot10(self, shared: Path):
@@ -366,8 +366,8 @@ class TestRealFiles:
         with np.load(path) as file:
             data = file["data"]
         assert [stream.name for stream in streams] == [str(number) for number in range(1, 11)]
-        np.testing.assert_array_equal([[s.gyro[a] for a in "xyz"] for s in streams], data[:, :3])
-        assert not np.isfinite(streams[0].gyro["x"]).all()
+        np.testing.assert_array_equal([[s.signal[a] for a in "xyz"] for s in streams], data[:, :3])
+        assert not np.isfinite(streams[0].signal["x"]).all()
 
     def test_xsensdot4(self, shared: Path):
         path = shared / "data" / "xsensdot4_quadrotor.npz"
@@ -380,7 +380,7 @@ class TestRealFiles:
         ]
         assert streams[3].time[0] == pytest.approx(677.533002, abs=1e-9)
         assert np.diff(streams[3].time).min() == 0
-        np.testing.assert_array_equal(read_streams(path, key="DOT7")[0].gyro["z"], streams[3].gyro["z"])
+        np.testing.assert_array_equal(read_streams(path, key="DOT7")[0].signal["z"], streams[3].signal["z"])
 
     def test_px4(self, shared: Path):
         (stream,) = read_streams(shared / "data" / "px4_auav_x21_flight.npz")
@@ -415,14 +415,14 @@ class TestRealFiles:
         with np.load(path) as file:
             counts, scale, ticks = file["exp2"], file["scale"], file["ts2"]
         assert [stream.name for stream in streams] == list("12345678")
-        np.testing.assert_array_equal(streams[6].gyro["y"], counts[:, 6, 4] * scale[4])
+        np.testing.assert_array_equal(streams[6].signal["y"], counts[:, 6, 4] * scale[4])
         np.testing.assert_array_equal(streams[6].time, ticks / 64e6)
         assert streams[6].clock_period == pytest.approx(67.108864)
         assert (streams[6].unit, streams[6].rate) == ("deg/s", 62.5)
 
     def test_mtig(self, shared: Path):
         (stream,) = read_streams(shared / "data" / "mtig_contaminated_gx.npz")
-        assert (list(stream.gyro), stream.unit, stream.rate, stream.n_samples) == (["x"], "rad/s", 100.0, 500_000)
+        assert (list(stream.signal), stream.unit, stream.rate, stream.n_samples) == (["x"], "rad/s", 100.0, 500_000)
 
     def test_clocks_are_no_gyros(self, shared: Path):
         path = shared / "data" / "clocks_stable32.npz"

@@ -21,7 +21,7 @@ def test_columns_by_device(tmp_path):
     streams = parquet.read(path)
     assert [stream.name for stream in streams] == ["imu0", "imu1"]
     for device, stream in enumerate(streams):
-        np.testing.assert_array_equal([stream.gyro[a] for a in "xyz"], gyro[device])
+        np.testing.assert_array_equal([stream.signal[a] for a in "xyz"], gyro[device])
         np.testing.assert_allclose(stream.time, time, rtol=0, atol=1e-12)
         assert (stream.rate, stream.unit) == (100.0, "deg/s")
     np.testing.assert_array_equal(streams[0].channels["temperature"], gyro[0, 0])
@@ -31,7 +31,7 @@ def test_names_with_dots_and_no_metadata(tmp_path):
     gyro = made_up()[0]
     path = write_parquet(tmp_path / "a.parquet", {f"gyro.{a}": row for a, row in zip("xyz", gyro, strict=True)})
     (stream,) = parquet.read(path)
-    np.testing.assert_array_equal([stream.gyro[a] for a in "xyz"], gyro)
+    np.testing.assert_array_equal([stream.signal[a] for a in "xyz"], gyro)
     assert (stream.name, stream.unit, stream.rate, stream.time) == ("a", "unknown", None, None)
 
 
@@ -49,8 +49,8 @@ def test_dates_become_seconds_exactly(tmp_path, unit):
 def test_a_null_is_nan_and_repeats_stay(tmp_path):
     content = {"gx": [1.0, None, 3.0, 3.0], "gy": [1, None, 3, 3], "t": [0.0, 0.01, 0.01, 0.03]}
     (stream,) = parquet.read(write_parquet(tmp_path / "a.parquet", content))
-    np.testing.assert_array_equal(stream.gyro["x"], [1, np.nan, 3, 3])
-    np.testing.assert_array_equal(stream.gyro["y"], [1, np.nan, 3, 3])
+    np.testing.assert_array_equal(stream.signal["x"], [1, np.nan, 3, 3])
+    np.testing.assert_array_equal(stream.signal["y"], [1, np.nan, 3, 3])
     np.testing.assert_array_equal(stream.time, content["t"])
 
 
@@ -70,8 +70,8 @@ def test_only_what_is_needed_is_read(tmp_path, monkeypatch):
 def test_key_names_the_column(tmp_path):
     path = write_parquet(tmp_path / "a.parquet", {"gx": np.zeros(9), "voltage": np.arange(9.0)})
     (stream,) = parquet.read(path, key="voltage")
-    np.testing.assert_array_equal(stream.gyro[""], np.arange(9.0))
-    assert list(parquet.read(path, key="gx")[0].gyro) == ["x"]
+    np.testing.assert_array_equal(stream.signal[""], np.arange(9.0))
+    assert list(parquet.read(path, key="gx")[0].signal) == ["x"]
 
 
 def test_a_key_that_is_no_column(tmp_path):

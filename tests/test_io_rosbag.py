@@ -40,7 +40,7 @@ def test_each_imu_topic_is_a_device(tmp_path, write):
     streams = rosbag.read(write(tmp_path, gyro, stamps, acceleration=acceleration))
     assert [stream.name for stream in streams] == ["/imu0/data", "/imu1/data"]
     for device, stream in enumerate(streams):
-        np.testing.assert_allclose([stream.gyro[a] for a in "xyz"], gyro[device], rtol=0, atol=1e-12)
+        np.testing.assert_allclose([stream.signal[a] for a in "xyz"], gyro[device], rtol=0, atol=1e-12)
         np.testing.assert_allclose(stream.channels["acceleration"], acceleration[device], rtol=0, atol=1e-12)
         np.testing.assert_array_equal(stream.time, seconds(stamps))
         assert stream.unit == "rad/s"
@@ -150,7 +150,7 @@ class TestChannelsOfOtherTopics:
     def test_accelerations_of_a_topic_without_rates(self, tmp_path, suffix):
         (stream,) = rosbag.read(write_topics(tmp_path / f"a{suffix}", [gyro_topic(), accel_topic()]))
         assert stream.name == "/camera/gyro/sample"
-        np.testing.assert_array_equal(stream.gyro["x"], np.arange(1.0, 81))
+        np.testing.assert_array_equal(stream.signal["x"], np.arange(1.0, 81))
         # 5 ms apart, and the ramp ends after 400 ms
         np.testing.assert_allclose(stream.channels["acceleration"][0], 5.0 * np.arange(80), atol=1e-3)
         assert stream.channel_units == {"acceleration": "m/s^2"}
@@ -233,12 +233,15 @@ def merged(path, *bags):
 
 class TestVectors:
     @every_suffix
-    @pytest.mark.parametrize("topic", ["/imu/angular_velocity", "/multisense/imu/gyroscope_vector"])
-    def test_rates_by_the_name_of_the_topic(self, tmp_path, suffix, topic):
+    @pytest.mark.parametrize(
+        ("topic", "unit"), [("/imu/angular_velocity", "rad/s"), ("/multisense/imu/gyroscope_vector", "deg/s")]
+    )
+    def test_rates_by_the_name_of_the_topic(self, tmp_path, suffix, topic, unit):
         rates = made_up(1)[0].T
         (stream,) = rosbag.read(write_topics(tmp_path / f"a{suffix}", [(topic, VECTOR, regular_stamps(), rates)]))
-        assert (stream.name, stream.unit) == (topic, "rad/s")
-        np.testing.assert_array_equal([stream.gyro[a] for a in "xyz"], rates.T)
+        assert (stream.name, stream.unit) == (topic, unit)
+        assert any("as multisense_ros publishes it" in note for note in stream.notes) == (unit == "deg/s")
+        np.testing.assert_array_equal([stream.signal[a] for a in "xyz"], rates.T)
 
     def test_rates_by_the_frame(self, tmp_path):
         topics = [("/vector", VECTOR, regular_stamps(), made_up(1)[0].T)]
@@ -254,6 +257,92 @@ class TestVectors:
         assert stream.name == "/imu/data"
         assert any("rates in /imu/angular_velocity are not read beside" in note for note in stream.notes)
         assert [s.name for s in rosbag.read(path, key="/imu/angular_velocity")] == ["/imu/angular_velocity"]
+
+
+class TestAccelerations:
+    """What is said above of rates holds of accelerations, and the other way round."""
+
+    @every_format
+    def test_each_imu_topic_is_a_device(self, tmp_path, write):
+        gyro, acceleration, stamps = made_up(), made_up(seed=1), regular_stamps()
+        path = write(tmp_path, gyro, stamps, acceleration=acceleration)
+        for device, stream in enumerate(rosbag.read(path, quantity="acceleration")):
+            assert (stream.name, stream.unit) == (f"/imu{device}/data", "m/s^2")
+            np.testing.assert_allclose([stream.signal[a] for a in "xyz"], acceleration[device], rtol=0, atol=1e-12)
+            np.testing.assert_allclose(stream.channels["angular_rate"], gyro[device], rtol=0, atol=1e-12)
+            assert stream.channel_units == {"angular_rate": "rad/s"}
+
+    @every_suffix
+    def test_they_keep_their_own_clock(self, tmp_path, suffix):
+        path = write_topics(tmp_path / f"a{suffix}", [gyro_topic(n=81), accel_topic()])
+        (stream,) = rosbag.read(path, quantity="acceleration")
+        assert (stream.name, stream.unit, stream.n_samples) == ("/camera/accel/sample", "m/s^2", 26)
+        np.testing.assert_allclose(np.diff(stream.time), 16e-3, atol=1e-6)
+        np.testing.assert_array_equal(stream.signal["x"], 16.0 * np.arange(26))
+        # rates 1, 2, 3, ... every 5 ms
+        np.testing.assert_allclose(stream.channels["angular_rate"][0], 1 + 3.2 * np.arange(26), atol=1e-3)
+        assert stream.channel_units == {"angular_rate": "rad/s"}
+        assert "linear accelerations exactly zero throughout in /camera/gyro/sample: no accelerometer" in stream.notes
+        assert any("angular_rate is that of /camera/gyro/sample" in note for note in stream.notes)
+
+    @pytest.mark.parametrize(
+        ("topic", "unit"),
+        [("/imu/acceleration", "m/s^2"), ("/multisense/imu/accelerometer_vector", "g"), ("/imu/acc", "m/s^2")],
+    )
+    def test_vectors_by_the_name_of_the_topic(self, tmp_path, topic, unit):
+        values = made_up(1)[0].T
+        path = write_topics(tmp_path / "a.mcap", [(topic, VECTOR, regular_stamps(), values)])
+        (stream,) = rosbag.read(path, quantity="acceleration")
+        assert (stream.name, stream.unit) == (topic, unit)
+        np.testing.assert_array_equal([stream.signal[a] for a in "xyz"], values.T)
+        with pytest.raises(
+            RecordingError, match=r'expected angular velocities .*, found none.*quantity="acceleration"'
+        ):
+            rosbag.read(path)
+
+    def test_an_estimate_without_gravity_is_none(self, tmp_path):
+        topics = [("/filter/free_acceleration", VECTOR, regular_stamps(), made_up(1)[0].T)]
+        with pytest.raises(RecordingError, match=r"expected linear accelerations .*, found none.*`key`"):
+            rosbag.read(write_topics(tmp_path / "a.bag", topics), quantity="acceleration")
+
+    @pytest.mark.parametrize(
+        ("quantity", "name", "channel"),
+        [
+            ("rate", "/imu/angular_velocity", "acceleration"),
+            ("acceleration", "/imu/acceleration", "angular_rate"),
+        ],
+    )
+    def test_vectors_of_both(self, tmp_path, quantity, name, channel):
+        rates, accelerations = made_up(2)
+        topics = [
+            ("/imu/angular_velocity", VECTOR, regular_stamps(), rates.T),
+            ("/imu/acceleration", VECTOR, regular_stamps(), accelerations.T),
+        ]
+        path = write_topics(tmp_path / "a.bag", topics)
+        for key in (None, name):
+            (stream,) = rosbag.read(path, quantity=quantity, key=key)
+            assert (stream.name, list(stream.channels)) == (name, [channel])
+            np.testing.assert_array_equal(stream.channels[channel], accelerations if quantity == "rate" else rates)
+
+    def test_units_of_vectors_that_multisense_publishes(self, tmp_path):
+        rates, accelerations = made_up(2)
+        topics = [
+            ("/multisense/imu/gyroscope_vector", VECTOR, regular_stamps(), rates.T),
+            ("/multisense/imu/accelerometer_vector", VECTOR, regular_stamps(), accelerations.T),
+        ]
+        (stream,) = rosbag.read(write_topics(tmp_path / "a.bag", topics), quantity="acceleration")
+        assert (stream.unit, stream.channel_units) == ("g", {"angular_rate": "deg/s"})
+        assert "/multisense/imu/accelerometer_vector is read in g, as multisense_ros publishes it" in stream.notes
+        assert "/multisense/imu/gyroscope_vector is read in deg/s, as multisense_ros publishes it" in stream.notes
+
+    def test_a_bag_of_gyros_says_what_reads_them(self, tmp_path):
+        path = write_topics(tmp_path / "a.bag", [gyro_topic()])
+        with pytest.raises(RecordingError, match=r'expected linear accelerations in .*it has gyros.*quantity="rate"'):
+            rosbag.read(path, quantity="acceleration")
+        path = write_topics(tmp_path / "b.bag", [accel_topic()])
+        with pytest.raises(RecordingError, match=r'expected angular velocities in .*quantity="acceleration"'):
+            rosbag.read(path)
+        assert rosbag.read(path, quantity="acceleration")[0].n_samples == 26
 
 
 def test_the_missing_library_is_named(tmp_path, monkeypatch):

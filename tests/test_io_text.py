@@ -39,7 +39,7 @@ def rows(*columns: np.ndarray, delimiter: str = ",", decimal: str = ".") -> str:
 
 
 def axes(stream) -> list[np.ndarray]:
-    return [stream.gyro[axis] for axis in "xyz"]
+    return [stream.signal[axis] for axis in "xyz"]
 
 
 class TestLayout:
@@ -51,7 +51,7 @@ class TestLayout:
     def test_delimiters_and_decimal_commas(self, tmp_path: Path, delimiter, decimal, names):
         header = delimiter.join(names) + "\n" if names else ""
         streams = read(tmp_path, header + rows(TIME, *GYRO, delimiter=delimiter, decimal=decimal))
-        np.testing.assert_array_equal([row for stream in streams for row in stream.gyro.values()], GYRO)
+        np.testing.assert_array_equal([row for stream in streams for row in stream.signal.values()], GYRO)
         assert [stream.name for stream in streams] == (["log"] if names else ["1", "2", "3"])
         for stream in streams:
             np.testing.assert_array_equal(stream.time, TIME)
@@ -65,17 +65,17 @@ class TestLayout:
 
     def test_comma_and_space(self, tmp_path: Path):
         (stream,) = read(tmp_path, "t , gx,  gy\n 0.0, 1.5 , 2\n 0.1,  , 3 \n")
-        np.testing.assert_array_equal([stream.gyro["x"], stream.gyro["y"]], [[1.5, np.nan], [2, 3]])
+        np.testing.assert_array_equal([stream.signal["x"], stream.signal["y"]], [[1.5, np.nan], [2, 3]])
 
     def test_quotes(self, tmp_path: Path):
         (stream,) = read(tmp_path, '"t","remark","gx"\n"0.0","a, b","1"\n"0.1","","2"\n')
-        assert stream.gyro["x"].tolist() == [1, 2]
+        assert stream.signal["x"].tolist() == [1, 2]
 
     @pytest.mark.parametrize("header", ["t,gx,gy", "t,gx,gy,"])
     @pytest.mark.parametrize("end", [",", ", ", ""])
     def test_trailing_delimiter(self, tmp_path: Path, header, end):
         (stream,) = read(tmp_path, f"{header}\n0.0,1,2{end}\n0.1,3,4{end}\n")
-        assert (stream.gyro["x"].tolist(), stream.gyro["y"].tolist()) == ([1, 3], [2, 4])
+        assert (stream.signal["x"].tolist(), stream.signal["y"].tolist()) == ([1, 3], [2, 4])
 
     def test_empty_cells_and_numbers_that_are_not_finite(self, tmp_path: Path):
         (stream,) = read(tmp_path, "gx,gy,gz\n1,,\n,nan,inf\n-inf,NaN,1e-3\n,,\n4,5,6\n")
@@ -92,7 +92,7 @@ class TestLayout:
 
     def test_comments_and_blank_lines_between_rows(self, tmp_path: Path):
         (stream,) = read(tmp_path, "gx\n1\n# gap\n2\n\n% gap\n// gap\n3\n")
-        assert stream.gyro["x"].tolist() == [1, 2, 3]
+        assert stream.signal["x"].tolist() == [1, 2, 3]
 
     def test_preamble(self, tmp_path: Path):
         (stream,) = read(tmp_path, XSENS_DOT + "PacketCounter,SampleTimeFine,Gyr_X,Gyr_Y,Gyr_Z,\n" + 2 * "1,5,2,3,4,\n")
@@ -143,7 +143,7 @@ class TestColumns:
 
     def test_text_columns_are_skipped(self, tmp_path: Path):
         (stream,) = read(tmp_path, "date,state,gx\n2024-01-01 10:00:00,on,1\n2024-01-01 10:00:01,off,2\n")
-        assert stream.gyro["x"].tolist() == [1, 2]
+        assert stream.signal["x"].tolist() == [1, 2]
 
     def test_a_clock_of_dates_is_noted(self, tmp_path: Path):
         (stream,) = read(tmp_path, "timestamp,gx\n10:00:00.00,1\n10:00:00.01,2\n")
@@ -153,15 +153,15 @@ class TestColumns:
 
     def test_a_name_that_stands_there_twice(self, tmp_path: Path):
         (stream,) = read(tmp_path, "gx,gx\n1,5\n2,6\n")
-        assert stream.gyro["x"].tolist() == [1, 2]
+        assert stream.signal["x"].tolist() == [1, 2]
         assert stream.notes == ("column 'gx' stands there twice; the first is read",)
 
     def test_key_names_a_column(self, tmp_path: Path):
         content = "t,volt,gx\n0.0,1,7\n0.1,2,8\n"
         (stream,) = read(tmp_path, content, key="volt")
-        assert (stream.name, list(stream.gyro), stream.gyro[""].tolist()) == ("volt", [""], [1, 2])
+        assert (stream.name, list(stream.signal), stream.signal[""].tolist()) == ("volt", [""], [1, 2])
         (stream,) = read(tmp_path, content, key="gx")
-        assert stream.gyro["x"].tolist() == [7, 8]
+        assert stream.signal["x"].tolist() == [7, 8]
         with pytest.raises(RecordingError, match=r"expected a column or device 'gy' \(`key`\), found t, volt, gx"):
             read(tmp_path, content, key="gy")
 
@@ -174,14 +174,14 @@ class TestColumns:
 class TestNoHeader:
     def test_columns_are_sensors(self, tmp_path: Path):
         streams = read(tmp_path, rows(*GYRO))
-        assert [(stream.name, list(stream.gyro)) for stream in streams] == [("1", [""]), ("2", [""]), ("3", [""])]
-        np.testing.assert_array_equal([stream.gyro[""] for stream in streams], GYRO)
+        assert [(stream.name, list(stream.signal)) for stream in streams] == [("1", [""]), ("2", [""]), ("3", [""])]
+        np.testing.assert_array_equal([stream.signal[""] for stream in streams], GYRO)
         assert streams[0].time is None
 
     def test_one_column_has_the_name_of_the_file(self, tmp_path: Path):
         (stream,) = read(tmp_path, rows(GYRO[0]))
         assert stream.name == "log"
-        np.testing.assert_array_equal(stream.gyro[""], GYRO[0])
+        np.testing.assert_array_equal(stream.signal[""], GYRO[0])
 
     def test_a_clock_is_noted(self, tmp_path: Path):
         (stream,) = read(tmp_path, rows(TIME, GYRO[0]))
@@ -191,7 +191,7 @@ class TestNoHeader:
     def test_a_count_is_no_clock(self, tmp_path: Path):
         first, second = read(tmp_path, rows(np.arange(40), *GYRO[:2]))
         assert first.time is None
-        np.testing.assert_array_equal([first.gyro[""], second.gyro[""]], GYRO[:2])
+        np.testing.assert_array_equal([first.signal[""], second.signal[""]], GYRO[:2])
         assert any("taken as a count of the rows" in note for note in first.notes)
 
     def test_columns_that_all_advance_are_sensors(self, tmp_path: Path):
@@ -199,7 +199,7 @@ class TestNoHeader:
 
     def test_key_is_a_number(self, tmp_path: Path):
         (stream,) = read(tmp_path, rows(TIME, *GYRO), key="2")
-        np.testing.assert_array_equal(stream.gyro[""], GYRO[1])
+        np.testing.assert_array_equal(stream.signal[""], GYRO[1])
         np.testing.assert_array_equal(stream.time, TIME)
         with pytest.raises(
             RecordingError, match=r"expected a sensor '4' \(`key`\), found no header and the sensors 1, 2, 3"

@@ -27,20 +27,20 @@ def test_each_instance_of_sensor_gyro_is_a_device(tmp_path):
     streams = ulog.read(write_ulog(tmp_path / "a.ulg", gyro, stamps, temperature=temperature))
     assert [stream.name for stream in streams] == ["sensor_gyro[0]", "sensor_gyro[1]", "sensor_gyro[2]"]
     for device, stream in enumerate(streams):
-        np.testing.assert_allclose([stream.gyro[a] for a in "xyz"], single(gyro[device]), rtol=0, atol=1e-12)
+        np.testing.assert_allclose([stream.signal[a] for a in "xyz"], single(gyro[device]), rtol=0, atol=1e-12)
         np.testing.assert_allclose(stream.time, seconds(stamps), rtol=0, atol=1e-12)
         np.testing.assert_allclose(stream.channels["temperature"], single(temperature[device]), rtol=0, atol=1e-12)
         assert stream.unit == "rad/s"
         assert stream.channel_units == {"temperature": "degC"}
         assert f"device_id {1000 + device}" in stream.notes
-        assert stream.gyro["x"].dtype == stream.time.dtype == np.float64
+        assert stream.signal["x"].dtype == stream.time.dtype == np.float64
 
 
 def test_a_not_a_number_is_kept(tmp_path):
     gyro = made_up(1)
     gyro[0, 1, 7] = np.nan
     (stream,) = ulog.read(write_ulog(tmp_path / "a.ulg", gyro, regular_stamps()))
-    np.testing.assert_array_equal(np.flatnonzero(np.isnan(stream.gyro["y"])), [7])
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(stream.signal["y"])), [7])
 
 
 def test_sensor_combined_replaces_a_thinned_sensor_gyro(tmp_path):
@@ -48,7 +48,7 @@ def test_sensor_combined_replaces_a_thinned_sensor_gyro(tmp_path):
     path = write_ulog(tmp_path / "a.ulg", made_up(2, 5), regular_stamps(5, rate=1), combined=(combined, stamps))
     (stream,) = ulog.read(path)
     assert stream.name == "sensor_combined[0]"
-    np.testing.assert_allclose([stream.gyro[a] for a in "xyz"], single(combined), rtol=0, atol=1e-12)
+    np.testing.assert_allclose([stream.signal[a] for a in "xyz"], single(combined), rtol=0, atol=1e-12)
     np.testing.assert_allclose(stream.time, stamps // 1000 / 1e6, rtol=0, atol=1e-12)
     np.testing.assert_array_equal(stream.channels["acceleration"], np.outer([0, 0, -9.75], np.ones(60)))
     assert any("sensor_gyro (2 instances) was logged at 1 Hz only" in note for note in stream.notes)
@@ -77,7 +77,7 @@ def test_a_log_cut_off_in_flight_is_read_up_to_the_cut(tmp_path):
     path.write_bytes(path.read_bytes()[:-500])
     (stream,) = ulog.read(path)
     assert 0 < stream.n_samples < 60
-    np.testing.assert_array_equal(stream.gyro["z"], single(gyro[0, 2, : stream.n_samples]))
+    np.testing.assert_array_equal(stream.signal["z"], single(gyro[0, 2, : stream.n_samples]))
 
 
 def test_damage_in_the_middle_is_noted_and_nothing_is_printed(tmp_path, capsys):
@@ -144,9 +144,9 @@ class TestFifo:
         path = fifo_log(tmp_path, ("sensor_gyro_fifo", 0, 1000, 125.0, SCALE, counted()))
         (stream,) = ulog.read(path)
         assert (stream.name, stream.unit, stream.n_samples) == ("sensor_gyro_fifo[0]", "rad/s", 200)
-        np.testing.assert_array_equal(stream.gyro["x"], SCALE * np.arange(200))
-        np.testing.assert_array_equal(stream.gyro["y"], -SCALE * np.arange(200))
-        np.testing.assert_array_equal(stream.gyro["z"], np.full(200, SCALE * 7))
+        np.testing.assert_array_equal(stream.signal["x"], SCALE * np.arange(200))
+        np.testing.assert_array_equal(stream.signal["y"], -SCALE * np.arange(200))
+        np.testing.assert_array_equal(stream.signal["z"], np.full(200, SCALE * 7))
         np.testing.assert_allclose(stream.time, (MICROSECONDS // 1000 + 125 * np.arange(200)) * 1e-6, rtol=0, atol=1e-6)
         assert "device_id 1000" in stream.notes
         assert any("sensor_gyro (1 instances, 100 Hz) is not read" in note for note in stream.notes)
@@ -218,6 +218,80 @@ class TestFifo:
             ulog.read(path, max_bytes=path.stat().st_size + 5000)
 
 
+class TestAccelerations:
+    """The topics of accelerometers are read as those of gyros are."""
+
+    def test_each_instance_of_sensor_accel_is_a_device(self, tmp_path):
+        values, stamps = made_up(2), regular_stamps(start=MICROSECONDS)
+        streams = ulog.read(
+            write_ulog(tmp_path / "a.ulg", values, stamps, topic="sensor_accel"), quantity="acceleration"
+        )
+        assert [(stream.name, stream.unit) for stream in streams] == [(f"sensor_accel[{i}]", "m/s^2") for i in (0, 1)]
+        for device, stream in enumerate(streams):
+            np.testing.assert_array_equal([stream.signal[a] for a in "xyz"], single(values[device]))
+            np.testing.assert_allclose(stream.time, seconds(stamps), rtol=0, atol=1e-12)
+            assert (list(stream.channels), stream.notes) == (["temperature"], (f"device_id {1000 + device}",))
+
+    def test_sensor_combined_has_the_rates_as_a_channel(self, tmp_path):
+        combined = made_up(1)[0], regular_stamps(rate=200)
+        few = regular_stamps(5, rate=1)
+        path = write_ulog(tmp_path / "a.ulg", made_up(2, 5), few, topic="sensor_accel", combined=combined)
+        (stream,) = ulog.read(path, quantity="acceleration")
+        assert (stream.name, stream.unit) == ("sensor_combined[0]", "m/s^2")
+        np.testing.assert_array_equal([stream.signal[a] for a in "xyz"], np.outer([0, 0, -9.75], np.ones(60)))
+        np.testing.assert_array_equal(stream.channels["angular_rate"], single(combined[0]))
+        assert stream.channel_units == {"angular_rate": "rad/s"}
+        assert any("sensor_accel (2 instances) was logged at 1 Hz only" in note for note in stream.notes)
+        assert len(ulog.read(path, quantity="acceleration", key="sensor_accel")) == 2
+        assert [s.name for s in ulog.read(path, quantity="acceleration", key="sensor_accel[1]")] == ["sensor_accel[1]"]
+
+    def test_accelerations_of_sensor_combined_have_times_of_their_own(self, tmp_path):
+        stamps, late = regular_stamps(rate=200), [-1000] * 60
+        late[7] = 2**31 - 1  # marked as invalid
+        ramp = np.outer([1, 2, 3], np.arange(60.0))
+        path = write_ulog(tmp_path / "a.ulg", made_up(0), stamps, combined=(ramp, stamps), relative=late)
+        (stream,) = ulog.read(path, quantity="acceleration")
+        assert np.flatnonzero(np.isnan(stream.time)).tolist() == [7]
+        others = np.arange(60) != 7
+        np.testing.assert_allclose(stream.time[others], (stamps[others] // 1000 - 1000) / 1e6, rtol=0, atol=1e-6)
+        # a fifth of a step before the rates
+        np.testing.assert_allclose(stream.channels["angular_rate"][0, 1:7], np.arange(1, 7) - 0.2, atol=1e-3)
+        (gyro,) = ulog.read(path)
+        np.testing.assert_array_equal(gyro.channels["acceleration"][2, :59], [-9.75] * 59)
+        assert np.isnan(gyro.channels["acceleration"][2, 59])
+        recording = gf.read_recording(path, quantity="acceleration")
+        assert recording.rate == pytest.approx(200, rel=1e-3)
+        assert recording.missing.max() == pytest.approx(1 / 60)
+
+    def test_every_sample_of_a_fifo(self, tmp_path):
+        path = fifo_log(
+            tmp_path,
+            ("sensor_gyro_fifo", 0, 1000, 125.0, SCALE, counted()),
+            ("sensor_accel_fifo", 0, 1000, 250.0, 1.0, counted(dt=250.0, n_messages=10)),
+            topic="sensor_accel",
+        )
+        (stream,) = ulog.read(path, quantity="acceleration")
+        assert (stream.name, stream.unit, stream.n_samples) == ("sensor_accel_fifo[0]", "m/s^2", 100)
+        np.testing.assert_array_equal(stream.signal["x"], np.arange(100.0))
+        np.testing.assert_allclose(np.diff(stream.time), 250e-6, atol=1e-6)
+        np.testing.assert_allclose(stream.channels["angular_rate"][0, :-1], SCALE * 2 * np.arange(99), atol=1e-5)
+        assert "temperature" in stream.channels
+        assert any("sensor_accel (1 instances, 100 Hz) is not read: sensor_accel_fifo" in n for n in stream.notes)
+
+    @pytest.mark.parametrize(
+        ("quantity", "there", "advice"),
+        [
+            ("acceleration", "sensor_gyro", r'an accelerometer topic \(sensor_accel_fifo or .*gyros.*quantity="rate"'),
+            ("rate", "sensor_accel", r'a gyro topic \(sensor_gyro_fifo or .*accelerations.*quantity="acceleration"'),
+        ],
+    )
+    def test_a_log_of_the_other_sensor_says_what_reads_it(self, tmp_path, quantity, there, advice):
+        path = write_ulog(tmp_path / "a.ulg", made_up(1), regular_stamps(), topic=there)
+        for key in (None, there):
+            with pytest.raises(RecordingError, match=rf"a\.ulg: expected {advice}"):
+                ulog.read(path, quantity=quantity, key=key)
+
+
 @needs_shared
 def test_a_flight_with_one_gyro():
     from pyulog import ULog
@@ -227,7 +301,7 @@ def test_a_flight_with_one_gyro():
     fields = ULog(str(path)).get_dataset("sensor_combined").data
     assert stream.n_samples == 17070
     for i, axis in enumerate("xyz"):
-        np.testing.assert_array_equal(stream.gyro[axis], fields[f"gyro_rad[{i}]"])
+        np.testing.assert_array_equal(stream.signal[axis], fields[f"gyro_rad[{i}]"])
     np.testing.assert_allclose(stream.time * 1e6, fields["timestamp"], rtol=0, atol=1e-6)
     assert "the logger reports 4 dropouts, 119 ms in total" in stream.notes
 

@@ -16,7 +16,7 @@ import matplotlib
 import numpy as np
 import pytest
 import torch
-from logs import write_hdf5
+from logs import write_hdf5, write_parquet
 from reference import haar as naive
 from torch import distributed
 
@@ -246,6 +246,50 @@ def test_names_of_arrays_and_columns(tmp_path: Path):
     np.testing.assert_array_equal(two.read(700, 800), signal[[2, 0], 700:800])
     with pytest.raises(gf.RecordingError, match=r"expected columns \['gyro_e'\] \(`key`\) of numbers"):
         gf.open_long(tmp_path / "a.parquet", key="gyro_e")
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".h5", ".parquet"])
+def test_accelerometers_of_a_log_of_both(tmp_path: Path, suffix: str):
+    rates = samples().numpy()
+    accelerations = 2 * rates[:3] + 9.75
+    path = tmp_path / f"log{suffix}"
+    if suffix == ".npz":
+        np.savez(path, gyro=rates, acceleration=accelerations, fs=100.0, unit="deg/s")
+    elif suffix == ".h5":
+        stated = {"gyro": (rates, {"unit": "deg/s"}), "acceleration": (accelerations, {"unit": "m/s^2"})}
+        write_hdf5(path, {"imu": stated}, fs=100.0)
+    else:
+        columns = {f"gyro_{n}": row for n, row in zip("abcd", rates, strict=True)}
+        columns |= {f"acc_{n} [m/s^2]": row for n, row in zip("abc", accelerations, strict=True)}
+        write_parquet(path, columns, {"fs": "100", "unit": "deg/s"})
+    recording = gf.open_long(path, quantity="acceleration")
+    # of an .npz the one unit is that of the gyros
+    assert (recording.rate, recording.unit) == (100.0, "unknown" if suffix == ".npz" else "m/s^2")
+    np.testing.assert_array_equal(recording.read(700, 1700).numpy(), accelerations[:, 700:1700])
+    gyros = gf.open_long(path)
+    assert gyros.unit == "deg/s"
+    np.testing.assert_array_equal(gyros.read(700, 1700).numpy(), rates[:, 700:1700])
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".h5", ".parquet"])
+def test_a_long_log_of_accelerometers_alone(tmp_path: Path, suffix: str):
+    accelerations = samples().numpy()[:3]
+    path = tmp_path / f"log{suffix}"
+    if suffix == ".parquet":
+        write_parquet(path, {f"acc_{axis}": row for axis, row in zip("xyz", accelerations, strict=True)})
+    elif suffix == ".h5":
+        write_hdf5(path, {"accelerometer": accelerations})
+    else:
+        np.savez(path, acc=accelerations)
+    found = gf.open_long(path, quantity="acceleration").read(3, 5)
+    np.testing.assert_array_equal(found.numpy(), accelerations[:, 3:5])
+    with pytest.raises(gf.RecordingError, match=r'it has accelerations, .* with quantity="acceleration"'):
+        gf.open_long(path)
+
+
+def test_no_such_quantity(tmp_path: Path):
+    with pytest.raises(ValueError, match=r"`quantity`: expected 'rate' or 'acceleration', got 'force'"):
+        gf.open_long(saved(tmp_path / "log.npy", samples().numpy()), quantity="force")
 
 
 def test_what_cannot_be_read_by_stretches_is_refused(tmp_path: Path):

@@ -1,8 +1,8 @@
-"""Named arrays, as .mat, .h5 and .npz files hold them: which are gyros, where time runs, what belongs to them.
+"""Named arrays, as .mat, .h5 and .npz files hold them: which are the sensors, where time runs, what belongs to them.
 
 `streams_from_arrays` takes `{"name": array, "group/name": array}` and understands
 
-- `gyro` (sensor, time) with `sensors`, `fs`, `unit`, `time`: the names of an .npz recording;
+- `gyro` or `acceleration` (sensor, time) with `sensors`, `fs`, `unit`, `time`: the names of an .npz recording;
 - arrays whose names `gyrofuse.io.columns` recognises (`imu_gyr`, `imu1/gyro`, `gx`), in either orientation: the
   longer dimension is time. Three rows are x, y, z; four of which the first or the last never decreases are a
   clock and x, y, z; any other number are sensors. `sensors` names the rows whatever their number;
@@ -13,7 +13,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from gyrofuse.io.column_streams import time_in_seconds
 from gyrofuse.io.columns import AXES, CHANNELS, NAMES_OF, TICK, Column, classify_columns, or_else, renamed
 from gyrofuse.io.limits import LONGEST_NAME, decoded, enumerated, is_rate
 from gyrofuse.io.stream import Array, RecordingError, Stream
-from gyrofuse.units import canonical_unit
+from gyrofuse.units import canonical_unit, quantity_of
 
 _RATE = (
     "fs",
@@ -65,7 +65,7 @@ def streams_from_arrays(
             left out.
 
     Raises:
-        RecordingError: No gyro among the arrays, or nothing of the name `key`.
+        RecordingError: None of the quantity among the arrays, or nothing of the name `key`.
     """
     content = {name: value for name, value in content.items() if len(name) <= LONGEST_NAME}
     arrays = {name: value for name, value in content.items() if _length(value) > 1}
@@ -77,21 +77,22 @@ def streams_from_arrays(
     if key is not None:
         classified = _select(classified, key.strip("/"), quantity)
 
-    # Gyros of one length and one stated rate and unit share a clock and channels.
+    kinds = {column.kind for column in classified.values()}
+    # Sensors of one length and one stated rate and unit share a clock and channels.
     alike: dict[tuple[int, float | None, str], list[str]] = {}
     for name, column in classified.items():
         if column.kind == quantity:
-            unit = column.unit or stated_unit(settings, name)
+            unit = column.unit or stated_unit(settings, name, quantity, kinds)
             alike.setdefault((_length(arrays[name]), stated_rate(settings, name), unit), []).append(name)
     if not alike:
         shapes = {name: getattr(value, "shape", ()) for name, value in content.items()}
         found = enumerated(f"{name} {shape}" for name, shape in shapes.items() if set(shape) - {1}) or "no array"
         wanted = f"an array (sensor, time) with the name of {NAMES_OF[quantity]}" + (f" in {key!r}" if key else "")
-        advice = or_else(classified.values(), quantity, "say with `key` which array holds the sensors")
+        advice = or_else(kinds, quantity, "say with `key` which array holds the sensors")
         raise RecordingError(f"{path}: expected {wanted}, found {found}; {advice}")
     if len(alike) > _MOST_SETS:
         raise RecordingError(
-            f"{path}: expected gyros of a few rates and lengths, found {len(alike)} different ones; say with `key` "
+            f"{path}: expected sensors of a few rates and lengths, found {len(alike)} different ones; say with `key` "
             "which array holds the sensors"
         )
     beside: dict[int, list[str]] = {}
@@ -99,8 +100,8 @@ def streams_from_arrays(
         if column.kind != quantity:
             beside.setdefault(_length(arrays[name]), []).append(name)
     streams: list[Stream] = []
-    for (length, rate, unit), gyros in alike.items():
-        rows = {name: _rows(arrays[name], length) for name in (*gyros, *beside.get(length, ()))}
+    for (length, rate, unit), sensors in alike.items():
+        rows = {name: _rows(arrays[name], length) for name in (*sensors, *beside.get(length, ()))}
         streams += _group(rows, classified, settings, path.stem, rate, unit, quantity)
     return streams
 
@@ -115,7 +116,7 @@ def _group(
     quantity: str,
 ) -> list[Stream]:
     """Streams of arrays `(row, time)` of one length."""
-    gyro: dict[tuple[str, str], dict[str, Array]] = {}  # by device and sensor, then by axis
+    axes_of: dict[tuple[str, str], dict[str, Array]] = {}  # by device and sensor, then by axis
     clocks: dict[str, tuple[Array, float | None, str]] = {}
     beside: dict[str, Array] = {}
     notes: list[str] = []
@@ -147,24 +148,24 @@ def _group(
             found = {(column.device, f"{label}[{i}]"): {"": row} for i, row in enumerate(values)}
         if sensors and len(values) != len(sensors):
             notes.append(f"{len(sensors)} sensor names do not fit the {len(values)} rows of '{name}'")
-        if any(not gyro.get(owner, {}).keys().isdisjoint(rates) for owner, rates in found.items()):
+        if any(not axes_of.get(owner, {}).keys().isdisjoint(signal) for owner, signal in found.items()):
             notes.append(f"'{name}' repeats an axis of the same device and is left out")
             continue
-        for owner, rates in found.items():
-            gyro.setdefault(owner, {}).update(rates)
+        for owner, signal in found.items():
+            axes_of.setdefault(owner, {}).update(signal)
 
-    channels = _channels(beside, columns, settings, [device for device, _ in gyro])
+    channels = _channels(beside, columns, settings, [device for device, _ in axes_of])
     no_clock: tuple[Array | None, float | None, str] = (None, None, "")
     shared = clocks.get("") or (next(iter(clocks.values())) if len(clocks) == 1 else no_clock)
     streams = []
-    for (device, sensor), rates in gyro.items():
+    for (device, sensor), signal in axes_of.items():
         time, period, guess = clocks.get(device) or shared
         # A channel goes with the first sensor of its device.
         of_device, units = channels.pop(device, ({}, {}))
         streams.append(
             Stream(
                 name=sensor or device or stem,
-                gyro=rates,
+                signal=signal,
                 unit=unit,
                 time=time,
                 rate=rate,
@@ -180,7 +181,7 @@ def _group(
 def _channels(
     beside: Mapping[str, Array], columns: Mapping[str, Column], settings: _Settings, devices: Sequence[str]
 ) -> dict[str, tuple[dict[str, Array], dict[str, str]]]:
-    """Channels and their units by device; what belongs to no device with a gyro goes with the first."""
+    """Channels and their units by device; what belongs to no device with a sensor goes with the first."""
     axes: dict[tuple[str, str], dict[str, str]] = {}
     for name, values in beside.items():
         if columns[name].axis and len(values) == 1:
@@ -226,9 +227,22 @@ def stated_rate(settings: _Settings, name: str) -> float | None:
     return rate if is_rate(rate) else None
 
 
-def stated_unit(settings: _Settings, name: str) -> str:
-    """Return the unit that is stated nearest to the array `name`, `"unknown"` where there is none."""
-    return canonical_unit(_text(_nearest(settings, name, _UNIT))) or "unknown"
+def stated_unit(settings: _Settings, name: str, quantity: str, kinds: Collection[str]) -> str:
+    """Return the unit that is stated nearest to the array `name`, `"unknown"` where there is none.
+
+    A unit of the other quantity that stands in a group around the array is that of other arrays, if there are any.
+
+    Args:
+        settings: What the file states.
+        name: Of the array, or of the group that holds it.
+        quantity: `"rate"` or `"acceleration"`: what the array is.
+        kinds: What the arrays of the file are.
+    """
+    if own := canonical_unit(_own_unit(settings, name)) if name else "":
+        return own
+    unit = canonical_unit(_text(_nearest(settings, name, _UNIT)))
+    measured = quantity_of(unit)
+    return "unknown" if not unit or (measured != quantity and measured in kinds) else unit
 
 
 def _own_unit(settings: _Settings, name: str) -> str:

@@ -100,7 +100,7 @@ def _on_one_grid(
     if axes:
         signal = np.stack([np.stack([_clean(s, axis, p, f) for s, p, f in devices]) for axis in axes])
     else:
-        signal = np.stack([_clean(s, axis, p, f) for s, p, f in devices for axis in s.gyro])
+        signal = np.stack([_clean(s, axis, p, f) for s, p, f in devices for axis in s.signal])
     sensors = tuple(stream.name for stream in streams)
     return Assembled(signal, common_rate, units, sensors, axes, _channels(streams, placed), tuple(notes))
 
@@ -150,16 +150,16 @@ def _mount(streams: list[Stream], mounting: Mapping[str, Any] | str | Path | Non
             raise ValueError(
                 f"`mounting`: expected a 3 x 3 rotation matrix for {stream.name}, got {mounting[stream.name]}"
             )
-        if set(stream.gyro) != set(AXES):
+        if set(stream.signal) != set(AXES):
             raise ValueError(
-                f"`mounting`: expected axes x, y, z in {stream.name}, found {', '.join(stream.gyro) or 'none'}"
+                f"`mounting`: expected axes x, y, z in {stream.name}, found {', '.join(stream.signal) or 'none'}"
             )
-        rates = matrix @ np.stack([stream.gyro[a] for a in AXES])
+        rotated = matrix @ np.stack([stream.signal[a] for a in AXES])
         channels = {
             name: matrix @ values if name in CHANNELS.values() and values.ndim == 2 else values
             for name, values in stream.channels.items()
         }
-        turned.append(replace(stream, gyro=dict(zip(AXES, rates, strict=True)), channels=channels))
+        turned.append(replace(stream, signal=dict(zip(AXES, rotated, strict=True)), channels=channels))
     return turned
 
 
@@ -171,17 +171,17 @@ def _is_rotation(matrix: Array) -> bool:
 def _choose_axes(streams: list[Stream], axis: str | None, source: str) -> tuple[list[Stream], tuple[str, ...]]:
     """Keep one axis, or say which axes lead the array."""
     if axis is not None:
-        lacking = [stream for stream in streams if axis not in stream.gyro]
+        lacking = [stream for stream in streams if axis not in stream.signal]
         if lacking:
-            found = ", ".join(name for name in lacking[0].gyro if name) or "axes without names"
+            found = ", ".join(name for name in lacking[0].signal if name) or "axes without names"
             raise RecordingError(
                 f"{source}: expected axis {axis!r} in every device, found {found} in {lacking[0].name}; "
                 "choose one of those, or none"
             )
-        return [replace(stream, gyro={axis: stream.gyro[axis]}) for stream in streams], ()
-    sets = {tuple(sorted(stream.gyro)) for stream in streams}
+        return [replace(stream, signal={axis: stream.signal[axis]}) for stream in streams], ()
+    sets = {tuple(sorted(stream.signal)) for stream in streams}
     if len(sets) > 1:
-        found = "; ".join(f"{stream.name}: {', '.join(stream.gyro)}" for stream in streams[:4])
+        found = "; ".join(f"{stream.name}: {', '.join(stream.signal)}" for stream in streams[:4])
         raise RecordingError(
             f"{source}: expected the same axes in every device, found {found}; choose one with axis= (--axis z)"
         )
@@ -265,7 +265,7 @@ def _units(
 def _flaws(stream: Stream) -> list[Note]:
     """Samples of a device that say nothing."""
     notes = []
-    missing = {axis: int((~np.isfinite(values)).sum()) for axis, values in stream.gyro.items()}
+    missing = {axis: int((~np.isfinite(values)).sum()) for axis, values in stream.signal.items()}
     if any(missing.values()):
         which = ", ".join(f"{count} on {axis}" if axis else str(count) for axis, count in missing.items() if count)
         total = float(sum(missing.values()))
@@ -276,8 +276,8 @@ def _flaws(stream: Stream) -> list[Note]:
 
 
 def _clean(stream: Stream, axis: str, place: Placed, factor: float) -> Array:
-    """One gyro on the common grid in the common unit, samples that say nothing as NaN."""
-    values = np.asarray(stream.gyro[axis], dtype=np.float64)
+    """One axis of a device on the common grid in the common unit, samples that say nothing as NaN."""
+    values = np.asarray(stream.signal[axis], dtype=np.float64)
     startup = _starts_from_zero(stream)
     if startup or not np.isfinite(values).all():
         values = np.where(np.isfinite(values), values, np.nan)
@@ -289,9 +289,10 @@ def _clean(stream: Stream, axis: str, place: Placed, factor: float) -> Array:
 
 def _starts_from_zero(stream: Stream) -> bool:
     """Whether a device that has measured something else reports a first row of zeros."""
-    rows = [values[:2] for values in stream.gyro.values()]
-    if "acceleration" in stream.channels:
-        rows += list(stream.channels["acceleration"][:, :2])
+    rows = [values[:2] for values in stream.signal.values()]
+    for name in (CHANNELS["rate"], CHANNELS["acceleration"]):
+        if name in stream.channels:
+            rows += list(stream.channels[name][:, :2])
     return len(rows) > 1 and all(row[0] == 0 for row in rows) and all(row[1] != 0 for row in rows)
 
 

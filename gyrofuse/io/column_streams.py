@@ -125,15 +125,15 @@ def streams_from_columns(
     ]
     streams = []
     for device in devices:
-        gyro: dict[str, Array] = {}
+        signal: dict[str, Array] = {}
         units: list[str] = []
         said = list(notes)
         for column in by_device[device]:
             if column.kind == quantity:
-                if column.axis in gyro:
+                if column.axis in signal:
                     said.append(f"column '{column.name}' repeats axis '{column.axis}' and is left out")
                     continue
-                gyro[column.axis] = np.asarray(columns[column.name], dtype=np.float64)
+                signal[column.axis] = np.asarray(columns[column.name], dtype=np.float64)
                 units.append(column.unit)
         # One shared clock or thermometer belongs to no device: the clock serves all, the channel goes with the first.
         own = by_device[device]
@@ -149,7 +149,7 @@ def streams_from_columns(
         streams.append(
             Stream(
                 name=device or name,
-                gyro=gyro,
+                signal=signal,
                 unit=next((u for u in units if u), unit),
                 time=seconds,
                 rate=rate,

@@ -16,6 +16,7 @@ AXES = ("x", "y", "z")
 NAMES_OF = {"rate": "a gyro (gyro_x, gx)", "acceleration": "an accelerometer (acc_x, ax)"}
 # Names of channels by what they hold; of two quantities one is the signal and the other a channel.
 CHANNELS = {kind: kind for kind in ("temperature", "acceleration", "magnetic_field")} | {"rate": "angular_rate"}
+OTHER = {"rate": "acceleration", "acceleration": "rate"}  # of the two quantities
 WORD_OF = {"rate": "gyro", "acceleration": "acceleration"}  # a name that says so
 _INSTEAD = {
     "rate": 'it has accelerations, which are read with quantity="acceleration" (--quantity acceleration)',
@@ -167,10 +168,10 @@ def check_columns(wanted: Mapping[str, str]) -> None:
         raise ValueError(f"`columns`: expected each column once, got {twice!r} twice; give it one name")
 
 
-def or_else(columns: Collection[Column], quantity: str, otherwise: str) -> str:
+def or_else(kinds: Collection[str], quantity: str, otherwise: str) -> str:
     """What to do about a log without the quantity that was asked for: take the other one, where it has that."""
-    kinds = {column.kind for column in columns} - {quantity}
-    return otherwise if kinds.isdisjoint(NAMES_OF) else _INSTEAD[quantity]
+    there = NAMES_OF.keys() & {*kinds}
+    return _INSTEAD[quantity] if there and quantity not in there else otherwise
 
 
 def is_unit(text: str) -> bool:

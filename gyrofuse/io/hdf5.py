@@ -1,4 +1,4 @@
-"""HDF5 files: datasets with the names of gyros, in any group."""
+"""HDF5 files: datasets with the names of gyros or accelerometers, in any group."""
 
 from __future__ import annotations
 
@@ -33,14 +33,15 @@ def read(
 
     Args:
         path: The file.
-        key: The dataset that holds the gyros, or the group to look in.
+        key: The dataset that holds the sensors, or the group to look in.
         quantity: `"rate"` or `"acceleration"`: the sensors to read.
         columns: What datasets are, where their names do not say: these by the names that they should have; the others
             are left out.
         max_bytes: Memory that the datasets may take; by default a quarter of what there is.
 
     Raises:
-        RecordingError: Not an HDF5 file, damaged, without gyro data, with numbers in other files, or too large.
+        RecordingError: Not an HDF5 file, damaged, without the quantity asked for, with numbers in other files, or too
+            large.
         ImportError: h5py is not installed.
     """
     try:
@@ -50,7 +51,7 @@ def read(
     try:
         check_heaps(path)
         with h5py.File(path, "r") as file:
-            # Datasets are read when needed: a file may hold much besides gyros.
+            # Datasets are read when needed: a file may hold much besides sensors.
             return streams_from_arrays(
                 _content(file, Allowance(path, max_bytes)), path, key=key, quantity=quantity, columns=columns
             )

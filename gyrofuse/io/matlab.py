@@ -1,4 +1,4 @@
-"""MATLAB files, version 5 to 7.3: arrays with the names of gyros, in structs too."""
+"""MATLAB files, version 5 to 7.3: arrays with the names of gyros or accelerometers, in structs too."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ def read(
 
     Args:
         path: The file.
-        key: The array that holds the gyros (`"imu.gyr"` or `"imu/gyr"` in a struct), or the struct to look in.
+        key: The array that holds the sensors (`"imu.gyr"` or `"imu/gyr"` in a struct), or the struct to look in.
         quantity: `"rate"` or `"acceleration"`: the sensors to read.
         columns: What arrays are, where their names do not say: these by the names that they should have; the others are
             left out.
         max_bytes: Memory that the variables may take, packed and unpacked; by default a quarter of what there is.
 
     Raises:
-        RecordingError: Not a MATLAB file, damaged, without gyro data, or too large.
+        RecordingError: Not a MATLAB file, damaged, without the quantity asked for, or too large.
         ImportError: Version 7.3 and h5py is not installed.
     """
     from scipy.io import loadmat

@@ -3,8 +3,8 @@
 An .npz file is one of two things.
 
 - A recording: `gyro` (sensor, time), or (axis, sensor, time) with `axes`, and `fs`, `unit`, `sensors`, `time`; every
-  other array of the same length is a channel, `temperature[imu2]` one of the sensor imu2. Where nothing is named
-  `gyro`, `gyrofuse.io.arrays` says which names are understood.
+  other array of the same length is a channel, `temperature[imu2]` one of the sensor imu2. One of accelerations has
+  `acceleration` in place of `gyro`. Where nothing is named so, `gyrofuse.io.arrays` says which names are understood.
 - Tables with named rows, which `gyrofuse.io.numpy_tables` reads.
 """
 
@@ -44,14 +44,15 @@ def read(
 
     Args:
         path: The file.
-        key: Of an .npz file, the array that holds the gyros, whatever its name, or the table to read.
+        key: Of an .npz file, the array that holds the sensors, whatever its name, or the table to read.
         quantity: `"rate"` or `"acceleration"`: the sensors to read.
         columns: What arrays are, where their names do not say: these by the names that they should have; the others are
             left out.
         max_bytes: Memory that the arrays may take; by default a quarter of what there is.
 
     Raises:
-        RecordingError: Not a NumPy file, damaged, with objects, ambiguous, without gyro data, or too large.
+        RecordingError: Not a NumPy file, damaged, with objects, ambiguous, without the quantity asked for, or too
+            large.
     """
     allowance = Allowance(path, max_bytes)
     try:
@@ -126,21 +127,21 @@ def _bare_array(array: NDArray[Any], path: Path, key: str | None) -> list[Stream
 def _recording(content: _Content, path: Path, key: str | None, quantity: str) -> list[Stream]:
     """Streams of an .npz recording, or of arrays that only `gyrofuse.io.arrays` understands."""
     main = WORD_OF[quantity]
-    gyro = content.get(main)
+    values = content.get(main)
     # Accelerations beside gyros are a channel of theirs, whose names and axes say nothing of them.
     of_gyros = quantity == "acceleration" and "gyro" in content
-    if gyro is None or of_gyros or key not in (None, main):
+    if values is None or of_gyros or key not in (None, main):
         return streams_from_arrays(content, path, key=key, quantity=quantity)
-    if gyro.dtype.kind not in "iuf" or gyro.ndim not in (1, 2, 3) or gyro.shape[-1] < 2 or gyro.size == 0:
+    if values.dtype.kind not in "iuf" or values.ndim not in (1, 2, 3) or values.shape[-1] < 2 or values.size == 0:
         raise RecordingError(
             f"{path}: expected `{main}` to be numbers (sensor, time) or (axis, sensor, time) with at least 2 samples, "
-            f"found {gyro.dtype} {gyro.shape}; save it with time last"
+            f"found {values.dtype} {values.shape}; save it with time last"
         )
-    axes = _axes(content, gyro, path) if gyro.ndim == 3 else [""]
+    axes = _axes(content, values, path, main) if values.ndim == 3 else [""]
     sensors = content.get("sensors", np.empty(0)).astype(str).ravel().tolist()
-    rows = np.atleast_2d(gyro)
+    rows = np.atleast_2d(values)
     # Names settle where time runs, however short the recording; without them the longer dimension is time.
-    if gyro.ndim == 2 and len(sensors) != len(rows) > rows.shape[1]:
+    if values.ndim == 2 and len(sensors) != len(rows) > rows.shape[1]:
         rows = rows.T
     n_sensors, n_samples = rows.shape[-2:]
     notes = [] if len(sensors) in (0, n_sensors) else [f"{len(sensors)} sensor names do not fit {n_sensors} sensors"]
@@ -148,13 +149,14 @@ def _recording(content: _Content, path: Path, key: str | None, quantity: str) ->
         sensors = [str(number) for number in range(1, n_sensors + 1)] if n_sensors > 1 else [path.stem]
     if (time := content.get("time")) is not None and time.size != n_samples:
         raise RecordingError(
-            f"{path}: expected `time` of the length of `gyro` {gyro.shape}, found {time.shape}; save both of one length"
+            f"{path}: expected `time` of the length of `{main}` {values.shape}, found {time.shape}; save both of "
+            "one length"
         )
 
     # A group per sensor is what several devices look like in other files.
-    rates = rows.reshape(len(axes), n_sensors, n_samples)
+    signal = rows.reshape(len(axes), n_sensors, n_samples)
     spread: dict[str, Any] = {
-        f"{i}/{main}/{axis}": rates[k, i] for i in range(n_sensors) for k, axis in enumerate(axes)
+        f"{i}/{main}/{axis}": signal[k, i] for i in range(n_sensors) for k, axis in enumerate(axes)
     }
     if "fs" not in content:
         spread["time/unit"] = np.str_("s")  # with a rate beside it, the clock tells its unit itself
@@ -187,11 +189,11 @@ def _in_brackets(name: str, known: Mapping[str, Any]) -> str:
     return next((text for text in inside if text in known), "")
 
 
-def _axes(content: _Content, gyro: NDArray[Any], path: Path) -> list[str]:
-    axes = [str(axis).strip().lower() for axis in content.get("axes", np.array(AXES[: gyro.shape[0]])).ravel()]
-    if len(axes) != gyro.shape[0] or not {*axes} <= {*AXES} or len({*axes}) < len(axes):
+def _axes(content: _Content, values: NDArray[Any], path: Path, main: str) -> list[str]:
+    axes = [str(axis).strip().lower() for axis in content.get("axes", np.array(AXES[: values.shape[0]])).ravel()]
+    if len(axes) != values.shape[0] or not {*axes} <= {*AXES} or len({*axes}) < len(axes):
         raise RecordingError(
-            f"{path}: expected `gyro` (axis, sensor, time) and in `axes` which of x, y, z its axes are, "
-            f"found {gyro.shape} and {axes}; save one name per axis"
+            f"{path}: expected `{main}` (axis, sensor, time) and in `axes` which of x, y, z its axes are, "
+            f"found {values.shape} and {axes}; save one name per axis"
         )
     return axes

@@ -66,7 +66,7 @@ def streams_from_tables(content: _Content, path: Path, key: str | None, quantity
         quantity: `"rate"` or `"acceleration"`: the sensors to read.
 
     Raises:
-        RecordingError: No table with a gyro, or several recordings of which `key` names none.
+        RecordingError: No table of the quantity, or several recordings of which `key` names none.
     """
     channels = [str(name) for name in content["channels"].ravel()]
     units = [canonical_unit(str(unit)) for unit in _per_channel(content, ("units", "unit"), "", channels, path)]
@@ -236,7 +236,7 @@ def _streams(
 ) -> list[Stream]:
     columns = classify_columns(channels, quantity)
     unit = next(unit for unit, column in zip(units, columns, strict=True) if column.kind == quantity)
-    # A name that states a unit, as columns of text files do; that of a gyro may be a bare axis and stays so.
+    # A name that states a unit, as columns of text files do; that of the sensor may be a bare axis and stays so.
     stated = [
         f"{column.name} [{unit}]" if unit and column.kind not in ("", quantity) else column.name
         for column, unit in zip(columns, units, strict=True)

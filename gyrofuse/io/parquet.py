@@ -1,4 +1,4 @@
-"""Parquet files: columns with the names of gyros."""
+"""Parquet files: columns with the names of gyros or accelerometers."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ def read(
 
     Args:
         path: The file.
-        key: The only column to read as a gyro, whatever its name.
+        key: The only column to read, whatever its name.
         quantity: `"rate"` or `"acceleration"`: the sensors to read.
         columns: What columns are, where their names do not say: columns by the names that they should have; the others
             are left out.
         max_bytes: Memory that the columns may take; by default a quarter of what there is.
 
     Raises:
-        RecordingError: Not a Parquet file, damaged, empty, without gyro data, or too large.
+        RecordingError: Not a Parquet file, damaged, empty, without the quantity asked for, or too large.
         ImportError: pyarrow is not installed.
     """
     try:
@@ -73,14 +73,15 @@ def read(
     streams = streams_from_columns(
         read,
         name=path.stem if key is None else key,
-        unit=stated_unit(settings, ""),
+        unit=stated_unit(settings, "", quantity, {column.kind for column in classify_columns(list(read), quantity)}),
         rate=stated_rate(settings, ""),
         time=time,
         quantity=quantity,
     )
     if not streams or table.num_rows == 0:
         what = f"with the name of {NAMES_OF[quantity]}" if key is None else f"{key!r} (`key`) of numbers"
-        advice = or_else(classify_columns(numbers), quantity, "say with `columns` (--map) what the columns are")
+        found = {column.kind for column in classify_columns(numbers)}
+        advice = or_else(found, quantity, "say with `columns` (--map) what the columns are")
         raise RecordingError(
             f"{path}: expected a column {what}, found {table.num_rows} rows of {enumerated(schema.names)}; {advice}"
         )

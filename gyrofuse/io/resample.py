@@ -11,10 +11,10 @@ _WIDEST = 2.5
 
 
 def at_samples(time: Array, own_time: Array, values: Array, name: str) -> tuple[Array, str]:
-    """Interpolate a channel linearly to the samples of a gyro.
+    """Interpolate a channel linearly to the samples of a device's signal.
 
     Args:
-        time: Clock reading of each sample of the gyro, seconds.
+        time: Clock reading of each sample of the signal, seconds.
         own_time: Clock reading of each sample of the channel `(n,)`, seconds, by the same clock.
         values: The channel, `(..., n)`.
         name: The channel, for the note.
@@ -43,6 +43,6 @@ def at_samples(time: Array, own_time: Array, values: Array, name: str) -> tuple[
     between = np.where(part == 0, ordered_values[..., after - 1], between)
     resampled[..., within] = np.where(part == 1, ordered_values[..., after], between)
     return resampled, (
-        f"{name} has its own clock ({1 / step:.4g} Hz): interpolated linearly to the gyro's samples, NaN outside its "
-        "own and in their gaps"
+        f"{name} has its own clock ({1 / step:.4g} Hz): interpolated linearly to the signal's samples, NaN outside "
+        "its own and in their gaps"
     )

@@ -1,8 +1,9 @@
-"""ROS 1 and ROS 2 bags: every topic of type sensor_msgs/Imu with rates is a device, other topics are its channels.
+"""ROS 1 and ROS 2 bags: topics of type sensor_msgs/Imu are devices, other topics are their channels.
 
 Drivers that sample gyro and accelerometer apart (realsense2_camera: `/camera/gyro/sample`, `/camera/accel/sample`)
 publish two topics of that type, each with zeros for what it does not measure. Others (xsens_mti_driver:
-`/imu/angular_velocity`, multisense_ros: `imu/gyroscope_vector`) publish rates as geometry_msgs/Vector3Stamped.
+`/imu/angular_velocity`, `/imu/acceleration`; multisense_ros: `imu/gyroscope_vector`, `imu/accelerometer_vector`)
+publish each as geometry_msgs/Vector3Stamped.
 """
 
 from __future__ import annotations
@@ -19,12 +20,16 @@ from urllib.parse import quote
 
 import numpy as np
 
+from gyrofuse.io.columns import AXES, CHANNELS, OTHER, or_else
 from gyrofuse.io.limits import LONGEST_NAME, Allowance, enumerated, is_regular
 from gyrofuse.io.resample import at_samples
 from gyrofuse.io.stream import Array, RecordingError, Stream, cause
 
 _IMU = "sensor_msgs/msg/Imu"
 _VECTOR = "geometry_msgs/msg/Vector3Stamped"
+# Vectors that are in other units than those of an Imu, by the last part of the topic: multisense_ros converts what it
+# puts into an Imu, not what it publishes as vectors (imu.cpp).
+_VECTOR_UNITS = {"gyroscope_vector": "deg/s", "accelerometer_vector": "g"}
 _TIMES = 3  # numbers of a message that are kept beside its values
 # What is kept of a message of each type.
 _VALUES: dict[str, Callable[[Any], tuple[float, ...]]] = {
@@ -40,27 +45,64 @@ _CHANNELS = {
     "sensor_msgs/msg/Temperature": ("temperature", "degC"),
     "sensor_msgs/msg/FluidPressure": ("pressure", "Pa"),
 }
-_ACCELERATION = ("acceleration", "m/s^2")
-# A topic or frame that says of a vector that it is a rate.
-_RATE = re.compile(r"gyr|angular_?(?:vel|rate)|(?:^|[/_])omega", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class _Quantity:
+    """What differs between rates and accelerations.
+
+    Attributes:
+        words: What an Imu calls them.
+        sensor: What measures them.
+        unit: By the definition of an Imu.
+        values: Where they stand among those kept of an Imu.
+        name: A topic or frame that says of a vector that it is one.
+    """
+
+    words: str
+    sensor: str
+    unit: str
+    values: slice
+    name: re.Pattern[str]
+
+
+_QUANTITIES = {
+    "rate": _Quantity(
+        "angular velocities",
+        "gyro",
+        "rad/s",
+        slice(0, 3),
+        re.compile(r"gyr|angular_?(?:vel|rate)|(?:^|[/_])omega", re.IGNORECASE),
+    ),
+    # A free acceleration is an estimate, from which gravity is taken (xsens_mti_driver: `/filter/free_acceleration`).
+    "acceleration": _Quantity(
+        "linear accelerations",
+        "accelerometer",
+        "m/s^2",
+        slice(3, 6),
+        re.compile(r"(?<!free)(?<!free_)accel|(?:^|[/_])acc(?:[/_]|$)", re.IGNORECASE),
+    ),
+}
 
 
 def read(path: Path, *, key: str | None = None, quantity: str = "rate", max_bytes: float | None = None) -> list[Stream]:
-    """Read the gyros of a ROS bag in rad/s, one stream per topic of type sensor_msgs/Imu with rates.
+    """Read the gyros or accelerometers of a ROS bag, in rad/s or m/s^2, one stream per topic of type sensor_msgs/Imu.
 
     A ROS 1 `.bag`, a ROS 2 directory with its `metadata.yaml`, or a `.db3` or `.mcap` file alone; no ROS
     installation is needed. Time is that of the message headers, or of arrival at the recorder where these are
-    not stamped. Where no such topic has rates, geometry_msgs/Vector3Stamped is read whose topic or frame names a gyro.
-    Accelerations from a topic without rates, and topics of type sensor_msgs/MagneticField, Temperature and
-    FluidPressure, become channels of the gyro whose name begins most alike, by their own clock.
+    not stamped. Where no such topic has the quantity, geometry_msgs/Vector3Stamped is read whose topic or frame names
+    it. The other quantity of the same messages is a channel; that of a topic which has it alone, and topics of type
+    sensor_msgs/MagneticField, Temperature and FluidPressure, become channels of the device whose name begins most
+    alike, by their own clock.
 
     Args:
         path: File or directory.
         key: A topic, or the beginning of the topics to read.
+        quantity: `"rate"` or `"acceleration"`: the sensors to read.
         max_bytes: Memory that the messages may take; by default a quarter of what there is.
 
     Raises:
-        RecordingError: Not a bag, not indexed, truncated, without the topic asked for, or too large.
+        RecordingError: Not a bag, not indexed, truncated, without the quantity or topic asked for, or too large.
         ImportError: rosbags is not installed.
     """
     try:
@@ -88,16 +130,19 @@ def read(path: Path, *, key: str | None = None, quantity: str = "rate", max_byte
         with (Ros1Reader if ros1 else Ros2Reader)(path) as bag:
             topics = _choose(path, [(c.topic, c.msgtype) for c in bag.connections], key)
             connections = [c for c in bag.connections if _is_read(c.topic, c.msgtype, topics, key)]
-            no_rate: set[str] = set()
+            passed: set[str] = set()  # vectors of something else
             for connection, arrival, raw in bag.messages(connections):
                 topic, kind = connection.topic, connection.msgtype
-                if topic in no_rate:
+                if topic in passed:
                     continue
                 message: Any = deserialize(raw, kind)
-                if kind == _VECTOR and topic not in messages and not _names_rate(topic, message.header.frame_id):
-                    no_rate.add(topic)
-                    continue
-                known = messages.setdefault(topic, _Messages(kind))
+                if topic not in messages:
+                    named = _named(topic, message.header.frame_id) if kind == _VECTOR else set()
+                    if kind == _VECTOR and not named:
+                        passed.add(topic)
+                        continue
+                    messages[topic] = _Messages(kind, measured=named)
+                known = messages[topic]
                 if kind != known.kind:
                     raise ValueError(f"messages of two types in {topic}: {kind} and {known.kind}")
                 known.append(message, arrival)
@@ -110,14 +155,16 @@ def read(path: Path, *, key: str | None = None, quantity: str = "rate", max_byte
             "repair it with `rosbag reindex`, `ros2 bag reindex` or `mcap recover`, or record it again"
         ) from error
 
-    gyros, notes = _gyros(messages, topics, key)
-    if not gyros:
+    devices, notes = _devices(messages, topics, key, quantity)
+    if not devices:
+        there = {kind for kind in _QUANTITIES for topic in topics & messages.keys() if messages[topic].has(kind)}
         raise RecordingError(
-            f"{path}: expected angular velocities in {enumerated(sorted(topics))}, found none (no message, exactly "
-            "zero throughout, or marked as not measured); choose other topics with `key`"
+            f"{path}: expected {_QUANTITIES[quantity].words} in {enumerated(sorted(topics))}, found none (no message, "
+            "exactly zero throughout, or marked as not measured); "
+            f"{or_else(there, quantity, 'choose other topics with `key`')}"
         )
-    channels = _owned(messages, gyros)
-    return [messages[topic].stream(topic, channels[topic], notes) for topic in gyros]
+    channels = _owned(messages, devices, quantity)
+    return [messages[topic].stream(topic, quantity, channels[topic], notes) for topic in devices]
 
 
 def _check_tables(path: Path) -> None:
@@ -146,12 +193,12 @@ def _choose(path: Path, kinds: list[tuple[str, str]], key: str | None) -> set[st
 
 
 def _is_read(topic: str, kind: str, topics: set[str], key: str | None) -> bool:
-    """Whether a topic is a gyro that was asked for or may be a channel of one."""
+    """Whether a topic is a device that was asked for or may be a channel of one."""
     if kind not in _VALUES:
         return False
     if key is None or topic in topics or kind in _CHANNELS:
         return True
-    return kind == _IMU and any(_alike(topic, other) for other in topics)
+    return any(_alike(topic, other) for other in topics)
 
 
 def _alike(topic: str, other: str) -> int:
@@ -160,34 +207,54 @@ def _alike(topic: str, other: str) -> int:
     return next((n for n, (one, two) in enumerate(pairs) if one != two), len(pairs))
 
 
-def _names_rate(topic: str, frame: str) -> bool:
-    return any(_RATE.search(name[:LONGEST_NAME]) for name in (topic, frame))
+def _named(topic: str, frame: str) -> set[str]:
+    """The quantity that a vector's topic names, or else its frame; none where neither does."""
+    for name in (topic[:LONGEST_NAME], frame[:LONGEST_NAME]):
+        for quantity, what in _QUANTITIES.items():
+            if what.name.search(name):
+                return {quantity}
+    return set()
 
 
-def _gyros(messages: dict[str, _Messages], topics: set[str], key: str | None) -> tuple[list[str], list[str]]:
-    """The topics with rates among those asked for, and what is said of the others."""
-    notes = []
+def _unit(topic: str, kind: str, quantity: str) -> tuple[str, list[str]]:
+    """The unit of a topic's rates or accelerations, and what is said of it."""
+    unit = _VECTOR_UNITS.get(topic.rpartition("/")[2]) if kind == _VECTOR else None
+    if unit is None:
+        return _QUANTITIES[quantity].unit, []
+    return unit, [f"{topic} is read in {unit}, as multisense_ros publishes it"]
+
+
+def _devices(
+    messages: dict[str, _Messages], topics: set[str], key: str | None, quantity: str
+) -> tuple[list[str], list[str]]:
+    """The topics with the quantity among those asked for, and what is said of the others."""
+    what, notes = _QUANTITIES[quantity], []
     there = sorted(topics & messages.keys())
-    zero = [topic for topic in there if messages[topic].has_rate and not messages[topic].turns]
+    zero = [topic for topic in there if quantity in messages[topic].measured and not messages[topic].has(quantity)]
     if zero:
-        notes.append(f"angular velocities exactly zero throughout in {enumerated(zero)}: no gyro")
-    gyros = [topic for topic in there if messages[topic].kind == _IMU and messages[topic].turns]
-    vectors = [topic for topic in there if messages[topic].kind == _VECTOR and messages[topic].turns]
-    if not gyros or (key is not None and "/" + key.strip("/") in vectors):
+        notes.append(f"{what.words} exactly zero throughout in {enumerated(zero)}: no {what.sensor}")
+    imus = [topic for topic in there if messages[topic].kind == _IMU and messages[topic].has(quantity)]
+    vectors = [topic for topic in there if messages[topic].kind == _VECTOR and messages[topic].has(quantity)]
+    if not imus or (key is not None and "/" + key.strip("/") in vectors):
         return vectors, notes
     if vectors:
-        notes.append(f"rates in {enumerated(vectors)} are not read beside those of Imu topics; choose them with key=")
-    return gyros, notes
+        notes.append(
+            f"{quantity}s in {enumerated(vectors)} are not read beside those of Imu topics; choose them with key="
+        )
+    return imus, notes
 
 
-def _owned(messages: dict[str, _Messages], gyros: list[str]) -> dict[str, list[tuple[str, str, str, _Messages]]]:
-    """For each gyro the channels of other topics: name, unit, topic and messages."""
-    owned: dict[str, list[tuple[str, str, str, _Messages]]] = {topic: [] for topic in gyros}
+def _owned(
+    messages: dict[str, _Messages], devices: list[str], quantity: str
+) -> dict[str, list[tuple[str, str, str, _Messages]]]:
+    """For each device the channels of other topics: name, unit, topic and messages."""
+    owned: dict[str, list[tuple[str, str, str, _Messages]]] = {topic: [] for topic in devices}
+    beside = OTHER[quantity]
     for topic, other in sorted(messages.items()):
-        if topic in owned or other.kind == _VECTOR or (other.kind == _IMU and (other.turns or not other.accelerates)):
+        if topic in owned or (other.kind not in _CHANNELS and (other.has(quantity) or not other.has(beside))):
             continue
-        name, unit = _CHANNELS.get(other.kind, _ACCELERATION)
-        owner = max(gyros, key=lambda gyro: _alike(gyro, topic))  # the first one, where several are as much alike
+        name, unit = _CHANNELS.get(other.kind) or (CHANNELS[beside], _unit(topic, other.kind, beside)[0])
+        owner = max(devices, key=lambda device: _alike(device, topic))  # the first one, where several are as much alike
         owned[owner].append((name, unit, topic, other))
     return owned
 
@@ -206,8 +273,7 @@ class _Messages:
     values: array[float] = field(default_factory=lambda: array("d"))
     frames: dict[str, None] = field(default_factory=dict)
     width: int = 0  # values of a message
-    has_rate: bool = False
-    has_acceleration: bool = False
+    measured: set[str] = field(default_factory=set)  # quantities that they may hold
 
     def append(self, message: Any, arrival: int) -> None:
         """Add one deserialised message and when it reached the recorder, in nanoseconds."""
@@ -219,49 +285,52 @@ class _Messages:
         self.frames[message.header.frame_id] = None
         if self.kind == _IMU:
             # By the message's definition a covariance that begins with -1 says that the quantity is not measured.
-            self.has_rate |= bool(message.angular_velocity_covariance[0] != -1)
-            self.has_acceleration |= bool(message.linear_acceleration_covariance[0] != -1)
-        else:
-            self.has_rate = self.kind == _VECTOR
+            if message.angular_velocity_covariance[0] != -1:
+                self.measured.add("rate")
+            if message.linear_acceleration_covariance[0] != -1:
+                self.measured.add("acceleration")
 
     @property
     def table(self) -> Array:
         """The values `(value, message)` as they were packed, not copied."""
         return np.frombuffer(self.values, np.float64).reshape(-1, self.width).T
 
-    @property
-    def turns(self) -> bool:
-        """Whether there are rates, and not zeros in their place."""
-        return self.has_rate and bool(np.any(self.table[:3] != 0))
+    def of(self, quantity: str) -> Array:
+        """The rates or accelerations of an Imu or a vector, `(3, message)`, not copied."""
+        return self.table[_QUANTITIES[quantity].values] if self.kind == _IMU else self.table
 
-    @property
-    def accelerates(self) -> bool:
-        """Whether there are accelerations, and not zeros in their place."""
-        return self.has_acceleration and bool(np.any(self.table[3:] != 0))
+    def has(self, quantity: str) -> bool:
+        """Whether there are rates or accelerations, and not zeros in their place."""
+        return quantity in self.measured and bool(np.any(self.of(quantity) != 0))
 
-    def stream(self, topic: str, others: list[tuple[str, str, str, _Messages]], said: list[str]) -> Stream:
+    def stream(
+        self, topic: str, quantity: str, others: list[tuple[str, str, str, _Messages]], said: list[str]
+    ) -> Stream:
         """The device of this topic, with the channels that others hold."""
-        table = self.table.copy()
         time, notes = self._time()
         frames = enumerated(repr(frame) for frame in self.frames if frame)
         channels, units = {}, {}
-        if self.accelerates:
-            channels["acceleration"], units["acceleration"] = table[3:], _ACCELERATION[1]
-        elif self.has_acceleration:
-            notes.append("linear accelerations exactly zero throughout: none measured")
-        for name, unit, source, other in others:
+        unit, guess = _unit(topic, self.kind, quantity)
+        notes += guess
+        beside = OTHER[quantity]
+        if self.has(beside):
+            channels[CHANNELS[beside]], units[CHANNELS[beside]] = self.of(beside).copy(), _QUANTITIES[beside].unit
+        elif beside in self.measured:
+            notes.append(f"{_QUANTITIES[beside].words} exactly zero throughout: none measured")
+        for name, own_unit, source, other in others:
             if name in channels:
                 notes.append(f"{name} of {source} is left out beside that of another topic")
                 continue
             times, by = self._common_clock(other)
-            values = other.table[3:] if other.kind == _IMU else other.table
+            values = other.table if other.kind in _CHANNELS else other.of(beside)
             channels[name], note = at_samples(*times, values if len(values) > 1 else values[0], name)
-            units[name] = unit
+            units[name] = own_unit
+            notes += _unit(source, other.kind, beside)[1]
             notes.append(f"{name} is that of {source}{by}" + (f"; {note}" if note else ""))
         return Stream(
             name=topic,
-            gyro=dict(zip("xyz", table[:3], strict=True)),
-            unit="rad/s",
+            signal=dict(zip(AXES, self.of(quantity).copy(), strict=True)),
+            unit=unit,
             time=time,
             channels=channels,
             channel_units=units,

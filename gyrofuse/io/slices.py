@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import struct
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
 from math import prod
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from gyrofuse.io.arrays import settings_by_group, stated_rate, stated_unit
-from gyrofuse.io.columns import classify_columns
+from gyrofuse.io.columns import NAMES_OF, WORD_OF, classify_columns, or_else
 from gyrofuse.io.hdf5 import check_inside, objects, settings_of
 from gyrofuse.io.hdf5_heaps import check_heaps
 from gyrofuse.io.limits import Allowance, enumerated, is_regular
@@ -28,6 +28,8 @@ from gyrofuse.io.parquet import metadata_of
 from gyrofuse.io.stream import Array, RecordingError, cause
 
 _MOST_SETTING = 2**16  # bytes of an array that is read because it may be a setting: names of sensors at most
+# Type and shape of each array by its name.
+_Found = dict[str, tuple[Any, tuple[int, ...]]]
 _LOCAL_HEADER = 30  # bytes of a .zip member's own header before its name
 
 
@@ -50,19 +52,20 @@ class Slices:
     unit: str
 
 
-def open_slices(path: Path, key: str | Sequence[str] | None) -> Slices:
-    """Find the gyros of a log without reading them.
+def open_slices(path: Path, key: str | Sequence[str] | None, quantity: str = "rate") -> Slices:
+    """Find the gyros or accelerometers of a log without reading them.
 
     Args:
         path: The file; its suffix says the format.
         key: The array of an .npz or HDF5 file, or the columns of a Parquet file, one for each sensor.
+        quantity: `"rate"` or `"acceleration"`: the sensors to read.
 
     Raises:
         FileNotFoundError: No such file.
         RecordingError: A format that has to be read whole, a damaged file, or none or several arrays that could be it.
         ImportError: The library of the format is not installed.
     """
-    openers: dict[str, Callable[[Path, Any], Slices]] = {
+    openers: dict[str, Callable[[Path, Any, str], Slices]] = {
         ".npy": _open_npy,
         ".npz": _open_npz,
         ".h5": _open_hdf5,
@@ -82,7 +85,7 @@ def open_slices(path: Path, key: str | Sequence[str] | None) -> Slices:
     if not is_regular(path):
         raise RecordingError(f"{path}: expected a file, found a folder, pipe or device; copy the log into a file")
     try:
-        return openers[suffix](path, key)
+        return openers[suffix](path, key, quantity)
     except (RecordingError, ImportError):
         raise
     except Exception as error:  # a damaged file may fail anywhere in its library
@@ -91,19 +94,20 @@ def open_slices(path: Path, key: str | Sequence[str] | None) -> Slices:
         ) from error
 
 
-def _open_npy(path: Path, key: str | None) -> Slices:
+def _open_npy(path: Path, key: str | None, quantity: str) -> Slices:
     if key is not None:
         raise RecordingError(f"{path}: expected no `key` for an .npy file, which holds one array, found {key!r}")
-    return _mapped(path, 0, "the array", {})
+    return _mapped(path, 0, "the array", {}, quantity, ())
 
 
-def _open_npz(path: Path, key: str | None) -> Slices:
+def _open_npz(path: Path, key: str | None, quantity: str) -> Slices:
     with zipfile.ZipFile(path) as archive:
         headers = {}
         for info in archive.infolist():
             with archive.open(info) as member:
                 headers[info.filename.removesuffix(".npy")] = (read_header(member), info)
-        name = _choose(path, {n: (dtype, shape) for n, ((shape, _, dtype), _) in headers.items()}, key)
+        found = {n: (dtype, shape) for n, ((shape, _, dtype), _) in headers.items()}
+        name = _choose(path, found, key, quantity)
         info = headers[name][1]
         if info.compress_type != zipfile.ZIP_STORED:
             raise RecordingError(
@@ -119,10 +123,19 @@ def _open_npz(path: Path, key: str | None) -> Slices:
     with path.open("rb") as file:
         file.seek(info.header_offset)
         name_and_extra = struct.unpack_from("<HH", file.read(_LOCAL_HEADER), _LOCAL_HEADER - 4)
-    return _mapped(path, info.header_offset + _LOCAL_HEADER + sum(name_and_extra), f"`{name}`", few)
+    return _mapped(
+        path,
+        info.header_offset + _LOCAL_HEADER + sum(name_and_extra),
+        f"`{name}`",
+        few,
+        quantity,
+        {*_kinds(found, quantity).values()},
+    )
 
 
-def _mapped(path: Path, start: int, what: str, settings: dict[str, Any]) -> Slices:
+def _mapped(
+    path: Path, start: int, what: str, settings: dict[str, Any], quantity: str, kinds: Collection[str]
+) -> Slices:
     """An array in NumPy's format that begins `start` bytes into a file."""
     with path.open("rb") as file:
         file.seek(start)
@@ -133,10 +146,11 @@ def _mapped(path: Path, start: int, what: str, settings: dict[str, Any]) -> Slic
     if path.stat().st_size < offset + prod(shape) * dtype.itemsize:  # told now, not in the middle of a run
         raise EOFError(f"{shape} numbers announced, fewer there")
     read = partial(read_stretch, path, offset, dtype, n_sensors, n_samples, time_first != fortran)
-    return _slices(path, read, n_samples, n_sensors, names, settings, "")
+    unit = stated_unit(settings_by_group(settings), "", quantity, kinds)
+    return _slices(path, read, n_samples, n_sensors, names, settings, "", unit)
 
 
-def _open_hdf5(path: Path, key: str | None) -> Slices:
+def _open_hdf5(path: Path, key: str | None, quantity: str) -> Slices:
     try:
         import h5py
     except ImportError as error:
@@ -151,13 +165,15 @@ def _open_hdf5(path: Path, key: str | None) -> Slices:
                 datasets[name] = item
                 if item.size == 1 and item.dtype.itemsize <= _MOST_SETTING:
                     settings[name] = item[()]
-        name = _choose(path, {name: (item.dtype, item.shape) for name, item in datasets.items()}, key)
+        found = {name: (item.dtype, item.shape) for name, item in datasets.items()}
+        name = _choose(path, found, key, quantity)
         check_inside(path, name, datasets[name])
         dtype, shape = datasets[name].dtype, datasets[name].shape
         n_sensors, n_samples, time_first = _orientation(path, f"`{name}`", dtype, shape, 0)
         raw_name = datasets[name].name
     read = partial(_read_hdf5, path, raw_name, time_first)
-    return _slices(path, read, n_samples, n_sensors, (), settings, name)
+    unit = stated_unit(settings_by_group(settings), name, quantity, {*_kinds(found, quantity).values()})
+    return _slices(path, read, n_samples, n_sensors, (), settings, name, unit)
 
 
 def _read_hdf5(path: Path, name: str | bytes, time_first: bool, start: int, stop: int) -> Array:
@@ -167,7 +183,7 @@ def _read_hdf5(path: Path, name: str | bytes, time_first: bool, start: int, stop
         return _rows(file[name], time_first, start, stop)
 
 
-def _open_parquet(path: Path, key: str | Sequence[str] | None) -> Slices:
+def _open_parquet(path: Path, key: str | Sequence[str] | None, quantity: str) -> Slices:
     try:
         from pyarrow import parquet
         from pyarrow import types as kinds
@@ -178,29 +194,32 @@ def _open_parquet(path: Path, key: str | Sequence[str] | None) -> Slices:
         numbers = [f.name for f in schema if kinds.is_integer(f.type) or kinds.is_floating(f.type)]
         lengths = [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)]
         ends = np.cumsum(lengths).tolist()
+    columns = classify_columns(numbers, quantity)
+    kinds = {column.kind for column in columns}
     if key is None:
-        gyros = [column for column in classify_columns(numbers) if column.kind == "rate"]
-        wanted = [column.name for column in gyros]
-        if len({column.device for column in gyros}) > 1 and len({column.axis for column in gyros}) > 1:
+        columns = [column for column in columns if column.kind == quantity]
+        wanted = [column.name for column in columns]
+        if len({column.device for column in columns}) > 1 and len({column.axis for column in columns}) > 1:
             raise RecordingError(
-                f"{path}: expected one gyro column for each sensor, found several axes of several devices "
+                f"{path}: expected one column for each sensor, found several axes of several devices "
                 f"({', '.join(wanted)}); name those of one axis with `key`"
             )
     else:
         wanted = [key] if isinstance(key, str) else list(key)
     absent = [name for name in wanted if name not in numbers]
     if absent or not wanted or not ends or ends[-1] < 2:
-        asked = "a column with the name of a gyro (gyro_x, gx)" if key is None else f"columns {wanted} (`key`)"
+        asked = f"a column with the name of {NAMES_OF[quantity]}" if key is None else f"columns {wanted} (`key`)"
+        advice = "say with `key` which columns are the sensors"
         raise RecordingError(
             f"{path}: expected {asked} of numbers with at least 2 rows, found {metadata.num_rows} rows of "
-            f"{enumerated(schema.names)}; say with `key` which columns are the sensors"
+            f"{enumerated(schema.names)}; {advice if key is not None else or_else(kinds, quantity, advice)}"
         )
     Allowance(path).take("columns of a row group", (max(lengths), len(wanted)))  # which is read whole
     settings = metadata_of(schema)
-    units = {column.unit for column in classify_columns(wanted)} - {""}
-    if len(units) == 1:
-        settings["unit"] = units.pop()
-    return _slices(path, partial(_read_parquet, path, wanted, ends), ends[-1], len(wanted), tuple(wanted), settings, "")
+    units = {column.unit for column in classify_columns(wanted, quantity)} - {""}
+    unit = units.pop() if len(units) == 1 else stated_unit(settings_by_group(settings), "", quantity, kinds)
+    read = partial(_read_parquet, path, wanted, ends)
+    return _slices(path, read, ends[-1], len(wanted), tuple(wanted), settings, "", unit)
 
 
 def _read_parquet(path: Path, names: list[str], ends: list[int], start: int, stop: int) -> Array:
@@ -219,15 +238,26 @@ def _read_parquet(path: Path, names: list[str], ends: list[int], start: int, sto
     return rows
 
 
-def _choose(path: Path, found: dict[str, tuple[Any, tuple[int, ...]]], key: str | None) -> str:
-    """The array asked for, else `gyro`, else the only one of two dimensions."""
+def _kinds(found: _Found, quantity: str) -> dict[str, str]:
+    """What each array of numbers of two dimensions is, as far as its name says."""
     tables = [name for name, (dtype, shape) in found.items() if dtype.kind in "iuf" and len(shape) == 2]
-    gyros = [name for name in tables if name.rpartition("/")[2] == "gyro"]
-    wanted = [name for name in found if name == key] if key is not None else gyros or tables
+    return {column.name: column.kind for column in classify_columns(tables, quantity)}
+
+
+def _choose(path: Path, found: _Found, key: str | None, quantity: str) -> str:
+    """The array asked for, else `gyro` or `acceleration`, else the only one of two dimensions that may be it."""
+    kinds = _kinds(found, quantity)
+    named = [name for name in kinds if name.rpartition("/")[2] == WORD_OF[quantity]]
+    others = [name for name, kind in kinds.items() if kind in NAMES_OF and kind != quantity]
+    wanted = (
+        [name for name in found if name == key] if key is not None else named or [n for n in kinds if n not in others]
+    )
     if len(wanted) != 1:
         asked = "one array (sensor, time) of numbers" if key is None else f"an array {key!r} (`key`)"
         listed = enumerated(f"{name} {shape}" for name, (_, shape) in found.items()) or "nothing"
-        raise RecordingError(f"{path}: expected {asked}, found {listed}; name the gyros with `key`")
+        advice = f"name the {'gyros' if quantity == 'rate' else 'accelerometers'} with `key`"
+        there = {kinds[name] for name in others} if key is None and not wanted else ()
+        raise RecordingError(f"{path}: expected {asked}, found {listed}; {or_else(there, quantity, advice)}")
     return wanted[0]
 
 
@@ -277,13 +307,13 @@ def _slices(
     names: tuple[str, ...],
     settings: dict[str, Any],
     name: str,
+    unit: str,
 ) -> Slices:
     fits = len(names) == n_sensors == len({*names})
-    by_group = settings_by_group(settings)
     return Slices(
         read=partial(_read_named, path, read),
         n_samples=n_samples,
         sensors=names if fits else tuple(str(number) for number in range(1, n_sensors + 1)),
-        rate=stated_rate(by_group, name),
-        unit=stated_unit(by_group, name),
+        rate=stated_rate(settings_by_group(settings), name),
+        unit=unit,
     )

@@ -1,4 +1,4 @@
-"""What every log reader returns: the gyros of one device, as recorded."""
+"""What every log reader returns: the gyros or accelerometers of one device, as recorded."""
 
 from __future__ import annotations
 
@@ -29,25 +29,27 @@ def unexpected(source: object, error: Exception) -> RecordingError:
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """The gyros of one device that share one clock, exactly as the log holds them.
+    """The gyros or accelerometers of one device that share one clock, exactly as the log holds them.
 
     Nothing is repaired here: gaps, repeats, wraps and non-finite samples are kept for
     `gyrofuse.recording` to find and report.
 
     Attributes:
         name: Device, topic instance, file stem or column the data come from.
-        gyro: Rate of each axis, `{"x": (time,), "y": ..., "z": ...}`; the key is "" where the log names no axis.
-        unit: `"deg/s"`, `"rad/s"`, `"counts"`, or `"unknown"` where the log does not say.
+        signal: Rate or acceleration along each axis, whichever was asked for, `{"x": (time,), "y": ..., "z": ...}`; the
+            key is "" where the log names no axis.
+        unit: `"deg/s"`, `"rad/s"`, `"m/s^2"`, `"counts"`, or `"unknown"` where the log does not say.
         time: Clock reading of each sample in seconds (may wrap, repeat or jump), or `None`.
         rate: Sampling rate that the log states in Hz, or `None`.
         clock_period: Seconds after which the clock wraps (2**32 microseconds, say), or `None` when unknown.
-        channels: Auxiliary channels with time last: `temperature (time,)`, `acceleration (3, time)`.
+        channels: Auxiliary channels with time last: `temperature (time,)`, and `acceleration (3, time)` beside rates or
+            `angular_rate (3, time)` beside accelerations.
         channel_units: Unit of each auxiliary channel, where known.
         notes: What the reader noticed (dropouts the logger reported, columns ignored), one sentence each.
     """
 
     name: str
-    gyro: dict[str, Array]
+    signal: dict[str, Array]
     unit: str = "unknown"
     time: Array | None = None
     rate: float | None = None
@@ -59,4 +61,4 @@ class Stream:
     @property
     def n_samples(self) -> int:
         """Number of samples as recorded."""
-        return next(iter(self.gyro.values())).shape[0]
+        return next(iter(self.signal.values())).shape[0]

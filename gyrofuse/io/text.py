@@ -42,14 +42,15 @@ def read(
 
     Args:
         path: The file.
-        key: The only column to read as a gyro, whatever its name, or the only device.
+        key: The only column to read, whatever its name, or the only device.
         quantity: `"rate"` or `"acceleration"`: the sensors to read.
         columns: What columns are, where their names do not say: columns by the names that they should have; the others
             are left out.
         max_bytes: Memory that its numbers may take; by default a quarter of what there is.
 
     Raises:
-        RecordingError: Not text, no rows of numbers, no gyro, a line that does not fit the others, or too large.
+        RecordingError: Not text, no rows of numbers, none of the quantity, a line that does not fit the others, or
+            too large.
     """
     allowance = Allowance(path, max_bytes)
     try:
@@ -69,7 +70,9 @@ def read(
     streams = streams_from_columns(
         table.columns,
         name=path.stem if key is None else key,
-        unit=stated_unit(settings, ""),
+        unit=stated_unit(
+            settings, "", quantity, {column.kind for column in classify_columns(list(table.columns), quantity)}
+        ),
         rate=rate,
         time=table.time,
         clock_period=table.clock_period,
@@ -122,7 +125,7 @@ def _named(path: Path, layout: Layout, key: str | None, quantity: str, allowance
         advice = "say with `columns` (--map) what the columns are"
         raise RecordingError(
             f"{path}: expected a column {what}, found {enumerated(layout.names)}; "
-            f"{or_else(columns_there, quantity, advice)}"
+            f"{or_else({column.kind for column in columns_there}, quantity, advice)}"
         )
     if layout.rising and layout.names[0] not in chosen and not any(c.kind == "time" for c in columns_there):
         notes.append(

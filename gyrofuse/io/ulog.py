@@ -1,7 +1,8 @@
 """PX4 ULog files: each instance of `sensor_gyro_fifo` or `sensor_gyro` is a device, or `sensor_combined` is.
 
 A message `sensor_gyro_fifo` holds what a sensor gathered since the one before, up to 32 samples (msg/SensorGyroFifo.msg
-of PX4); `sensor_gyro` has their means, `sensor_combined` those of the one gyro that flies.
+of PX4); `sensor_gyro` has their means, `sensor_combined` those of the one gyro that flies. Accelerometers have the same
+topics: `sensor_accel_fifo`, `sensor_accel`, and fields of `sensor_combined`.
 """
 
 from __future__ import annotations
@@ -15,18 +16,18 @@ from typing import Any
 
 import numpy as np
 
+from gyrofuse.io.columns import AXES, CHANNELS, or_else
 from gyrofuse.io.limits import Allowance, enumerated
-from gyrofuse.io.stream import RecordingError, Stream, cause
-from gyrofuse.io.ulog_fifo import COVERED, FIFO, FIFO_FIELDS, MOST_SAMPLES, device_of, doubt, fifo_stream
+from gyrofuse.io.resample import at_samples
+from gyrofuse.io.stream import Array, RecordingError, Stream, cause
+from gyrofuse.io.ulog_fifo import COVERED, FIFO_FIELDS, MOST_SAMPLES, SENSORS, Sensor, device_of, doubt, fifo_stream
 
-# Topics with gyro data in rad/s, and their fields along x, y, z.
-_AXES = {
-    "sensor_gyro": ("x", "y", "z"),
-    "sensor_combined": ("gyro_rad[0]", "gyro_rad[1]", "gyro_rad[2]"),
-}
-_ACCELERATION = ("accelerometer_m_s2[0]", "accelerometer_m_s2[1]", "accelerometer_m_s2[2]")
-_KEY = re.compile(r"(sensor_gyro_fifo|sensor_gyro|sensor_combined)(?:\[(\d{1,3})\])?")
-# By default the logger thins `sensor_gyro` to about 1 Hz while `sensor_combined` runs at the full rate:
+_COMBINED = "sensor_combined"
+_AXES = ("x", "y", "z")  # fields of a topic of one kind of sensor
+_KEY = re.compile(r"([a-z_]{1,32})(?:\[(\d{1,3})\])?")
+# Of sensor_combined: microseconds from `timestamp` to when the accelerations were measured, where they are valid.
+_RELATIVE, _INVALID = "accelerometer_timestamp_relative", 2**31 - 1
+# By default the logger thins topics of one sensor to about 1 Hz while `sensor_combined` runs at the full rate:
 # a topic this many times slower was logged to look at, not to analyse.
 _THINNED = 10.0
 # pyulog may go back further than it came, and goes through a damaged stretch a byte at a time, reading up to 64 kB for
@@ -38,20 +39,20 @@ _MOST_FIELDS = 2**17
 
 
 def read(path: Path, *, key: str | None = None, quantity: str = "rate", max_bytes: float | None = None) -> list[Stream]:
-    """Read the gyros of a PX4 ULog file in rad/s, one stream per instance of the topic.
+    """Read the gyros or accelerometers of a PX4 ULog file in rad/s or m/s^2, one stream per instance of the topic.
 
-    `sensor_gyro_fifo` is preferred, which has every sample. Of the others it is `sensor_gyro`, except where
-    `sensor_combined` was logged more than ten times as fast. A log that was cut off (power lost in flight) is read up
-    to the cut.
+    `sensor_gyro_fifo` (`sensor_accel_fifo`) is preferred, which has every sample. Of the others it is `sensor_gyro`
+    (`sensor_accel`), except where `sensor_combined` was logged more than ten times as fast. A log that was cut off
+    (power lost in flight) is read up to the cut.
 
     Args:
         path: The file.
-        key: `"sensor_gyro_fifo"`, `"sensor_gyro"` or `"sensor_combined"`, or an instance of one, `"sensor_gyro[1]"`;
-            `None` chooses.
+        key: One of these topics, or an instance of one, `"sensor_gyro[1]"`; `None` chooses.
+        quantity: `"rate"` or `"acceleration"`: the sensors to read.
         max_bytes: Memory that the log may take; by default a quarter of what there is.
 
     Raises:
-        RecordingError: Not a ULog file, damaged, without gyro data, or too large.
+        RecordingError: Not a ULog file, damaged, without the quantity asked for, or too large.
         ImportError: pyulog is not installed.
     """
     try:
@@ -73,62 +74,85 @@ def read(path: Path, *, key: str | None = None, quantity: str = "rate", max_byte
             "download the log from the vehicle again"
         ) from error
 
-    topics = {name: _instances(log, name) for name in (FIFO, *_AXES)}
+    sensor = SENSORS[quantity]
+    topics = _topics(log, sensor)
     asked = _KEY.fullmatch(key) if key is not None else None
     chosen = _named(topics, asked) if asked else []
     if not any(topics.values()) or (key is not None and not chosen):
-        names = " or ".join(topics)
-        wanted = f"a gyro topic ({names})" + ("" if key is None else f" named by `key`, got {key!r}")
+        wanted = f"{sensor.topic_of} ({' or '.join(topics)})" + ("" if key is None else f" named by `key`, got {key!r}")
         found = enumerated(sorted({data.name for data in log.data_list})) or "no data"
-        raise RecordingError(f"{path}: expected {wanted}, found {found}; choose another topic, or log the gyros")
-    notes = _logger_notes(log)
-    if key is None or chosen[0].name == FIFO:
-        fifos = [fifo_stream(data, log, allowance) for data in (topics[FIFO] if key is None else chosen)]
+        others = {kind: _topics(log, other) for kind, other in SENSORS.items() if other is not sensor}
+        there = [
+            kind for kind, of in others.items() if (_named(of, asked) if asked else key is None and any(of.values()))
+        ]
+        advice = or_else(there, quantity, f"choose another topic, or log the {sensor.word}s")
+        raise RecordingError(f"{path}: expected {wanted}, found {found}; {advice}")
+    notes = _logger_notes(log, sensor)
+    if key is None or chosen[0].name == sensor.fifo:
+        fifos = [fifo_stream(data, log, sensor, allowance) for data in (topics[sensor.fifo] if key is None else chosen)]
         sound = [stream for stream, covered in fifos if stream is not None and (key or covered >= COVERED)]
         if sound:
-            return [_with_notes(stream, notes + _left_out(topics, sound)) for stream in sound]
-        damage = [doubt(stream, covered) for stream, covered in fifos]
-        if key is not None or (fifos and not any(topics[name] for name in _AXES)):
+            return [_with_notes(stream, notes + _left_out(topics, sensor, sound)) for stream in sound]
+        damage = [doubt(stream, covered, sensor) for stream, covered in fifos]
+        if key is not None or (fifos and not any(topics[name] for name in (sensor.topic, _COMBINED))):
             raise RecordingError(
-                f"{path}: expected messages {FIFO} of 1 to {MOST_SAMPLES} samples with a time between them, found "
-                f"{enumerated(dict.fromkeys(damage))}; choose another topic with `key`, or download the log again"
+                f"{path}: expected messages {sensor.fifo} of 1 to {MOST_SAMPLES} samples with a time between them, "
+                f"found {enumerated(dict.fromkeys(damage))}; choose another topic with `key`, or download the log again"
             )
-        notes += [f"{FIFO} has {said}; not read" for said in dict.fromkeys(damage)]
-    elif topics[FIFO]:
-        notes.append(f"{FIFO} ({len(topics[FIFO])} instances) ignored")
+        notes += [f"{sensor.fifo} has {said}; not read" for said in dict.fromkeys(damage)]
+    elif topics[sensor.fifo]:
+        notes.append(f"{sensor.fifo} ({len(topics[sensor.fifo])} instances) ignored")
     if key is None:
-        slow, fast = (max(map(_rate, topics[name]), default=0.0) for name in _AXES)
-        name = "sensor_combined" if fast > _THINNED * slow else "sensor_gyro"
-        if name == "sensor_combined" and topics["sensor_gyro"]:
+        slow, fast = (max(map(_rate, topics[name]), default=0.0) for name in (sensor.topic, _COMBINED))
+        name = _COMBINED if fast > _THINNED * slow else sensor.topic
+        if name == _COMBINED and topics[sensor.topic]:
             notes.append(
-                f"sensor_gyro ({len(topics['sensor_gyro'])} instances) was logged at {slow:.3g} Hz only; "
-                f"sensor_combined at {fast:.4g} Hz is read instead"
+                f"{sensor.topic} ({len(topics[sensor.topic])} instances) was logged at {slow:.3g} Hz only; "
+                f"{_COMBINED} at {fast:.4g} Hz is read instead"
             )
         chosen = topics[name]
-    return [_stream(data, notes) for data in chosen]
+    return [_stream(data, quantity, notes) for data in chosen]
+
+
+def _topics(log: Any, sensor: Sensor) -> dict[str, list[Any]]:
+    """Instances of each topic of a kind of sensor that hold a time and values on each axis."""
+    needed = {
+        sensor.fifo: FIFO_FIELDS,
+        sensor.topic: {"timestamp", *_AXES},
+        _COMBINED: {"timestamp", *sensor.combined},
+    }
+    return {
+        name: [data for data in log.data_list if data.name == name and fields <= data.data.keys()]
+        for name, fields in needed.items()
+    }
 
 
 def _named(topics: dict[str, list[Any]], asked: re.Match[str]) -> list[Any]:
     """The instances that `key` names."""
-    return [data for data in topics[asked[1]] if asked[2] is None or data.multi_id == int(asked[2])]
+    return [data for data in topics.get(asked[1], []) if asked[2] is None or data.multi_id == int(asked[2])]
 
 
 def _with_notes(stream: Stream, notes: list[str]) -> Stream:
     return replace(stream, notes=(*stream.notes, *notes))
 
 
-def _left_out(topics: dict[str, list[Any]], read: list[Stream]) -> list[str]:
+def _left_out(topics: dict[str, list[Any]], sensor: Sensor, read: list[Stream]) -> list[str]:
     """What is in the log beside the samples of the fifos."""
     notes = []
-    for name in _AXES:
+    for name in (sensor.topic, _COMBINED):
         if topics[name]:
             rate = max(map(_rate, topics[name]))
-            notes.append(f"{name} ({len(topics[name])} instances, {rate:.4g} Hz) is not read: {FIFO} has every sample")
+            notes.append(
+                f"{name} ({len(topics[name])} instances, {rate:.4g} Hz) is not read: {sensor.fifo} has every sample"
+            )
     own = {note for stream in read for note in stream.notes if note.startswith("device_id")}
-    others = [f"device_id {device_of(data)}" for data in topics["sensor_gyro"] if device_of(data) is not None]
+    others = [f"device_id {device_of(data)}" for data in topics[sensor.topic] if device_of(data) is not None]
     others = [device for device in others if device not in own]
     if others:
-        notes.append(f"sensor_gyro has gyros that {FIFO} lacks ({enumerated(others)}); read them with key=sensor_gyro")
+        notes.append(
+            f"{sensor.topic} has {sensor.word}s that {sensor.fifo} lacks ({enumerated(others)}); read them with "
+            f"key={sensor.topic}"
+        )
     return notes
 
 
@@ -161,35 +185,40 @@ def _bounded(base: Any) -> Any:
     return type("Bounded", (base,), {"_MessageAddLogged": Fields})
 
 
-def _instances(log: Any, name: str) -> list[Any]:
-    """Instances of one topic that hold a time and a rate on each axis."""
-    needed = FIFO_FIELDS if name == FIFO else {"timestamp", *_AXES[name]}
-    return [data for data in log.data_list if data.name == name and needed <= data.data.keys()]
-
-
-def _stream(data: Any, notes: list[str]) -> Stream:
+def _stream(data: Any, quantity: str, notes: list[str]) -> Stream:
     """One instance of a topic, with what it holds on the same clock."""
     fields = {name: values.astype(np.float64) for name, values in data.data.items()}
-    channels, units = {}, {}
+    combined = data.name == _COMBINED
+    time = _time(fields, combined, quantity)
+    channels, units, said = {}, {}, []
     # Magnetometer and barometer in `sensor_combined` repeat the values of slower clocks and are left out.
-    if fields.keys() >= set(_ACCELERATION):
-        channels["acceleration"], units["acceleration"] = (
-            np.stack([fields[a] for a in _ACCELERATION]),
-            "m/s^2",
-        )
+    for other, sensor in SENSORS.items():
+        if combined and other != quantity and fields.keys() >= set(sensor.combined):
+            name, values = CHANNELS[other], np.stack([fields[field] for field in sensor.combined])
+            channels[name], note = at_samples(time, _time(fields, combined, other), values, name)
+            units[name] = sensor.unit
+            said += [note] if note else []
     if "temperature" in fields:
         channels["temperature"], units["temperature"] = fields["temperature"], "degC"
     device = [f"device_id {data.data['device_id'][0]}"] if "device_id" in fields else []
+    names = SENSORS[quantity].combined if combined else _AXES
     return Stream(
         name=f"{data.name}[{data.multi_id}]",
-        gyro={axis: fields[name] for axis, name in zip("xyz", _AXES[data.name], strict=True)},
-        unit="rad/s",
-        # timestamp_sample is when the sensor measured, timestamp when its driver published; microseconds
-        time=fields.get("timestamp_sample", fields["timestamp"]) / 1e6,
+        signal={axis: fields[name] for axis, name in zip(AXES, names, strict=True)},
+        unit=SENSORS[quantity].unit,
+        time=time,
         channels=channels,
         channel_units=units,
-        notes=(*device, *notes),
+        notes=(*device, *said, *notes),
     )
+
+
+def _time(fields: dict[str, Array], combined: bool, quantity: str) -> Array:
+    """When the sensor measured, or else when its driver published it, in seconds; NaN where the values are invalid."""
+    stamp = fields.get("timestamp_sample", fields["timestamp"])
+    if combined and quantity == "acceleration" and _RELATIVE in fields:
+        stamp = stamp + np.where(fields[_RELATIVE] == _INVALID, np.nan, fields[_RELATIVE])
+    return stamp / 1e6
 
 
 def _rate(data: Any) -> float:
@@ -199,15 +228,15 @@ def _rate(data: Any) -> float:
     return 1e6 / step if step > 0 else 0.0
 
 
-def _logger_notes(log: Any) -> list[str]:
-    """What the logger itself reports: dropouts, damage, gyro data in a form that is not read."""
+def _logger_notes(log: Any, sensor: Sensor) -> list[str]:
+    """What the logger itself reports: dropouts, damage, data in a form that is not read."""
     notes = []
     if log.dropouts:
         total = sum(dropout.duration for dropout in log.dropouts)
         notes.append(f"the logger reports {len(log.dropouts)} dropouts, {total} ms in total")
     if log.file_corruption:
         notes.append("part of the file is damaged and was skipped")
-    lacking = sum(data.name == FIFO and not data.data.keys() >= FIFO_FIELDS for data in log.data_list)
+    lacking = sum(data.name == sensor.fifo and not data.data.keys() >= FIFO_FIELDS for data in log.data_list)
     if lacking:
-        notes.append(f"{FIFO} ({lacking} instances) ignored")
+        notes.append(f"{sensor.fifo} ({lacking} instances) ignored")
     return notes

@@ -1,16 +1,57 @@
-"""PX4 messages of many samples: what a sensor gathered since the message before (msg/SensorGyroFifo.msg of PX4)."""
+"""PX4 messages of many samples: what a sensor gathered since the one before (`SensorGyroFifo`, `SensorAccelFifo`)."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from gyrofuse.io.columns import AXES, CHANNELS
 from gyrofuse.io.limits import Allowance
 from gyrofuse.io.resample import at_samples
 from gyrofuse.io.stream import Array, Stream
 
-FIFO, _ACCELERATION_FIFO = "sensor_gyro_fifo", "sensor_accel_fifo"
+
+@dataclass(frozen=True)
+class Sensor:
+    """What differs between gyros and accelerometers.
+
+    Attributes:
+        word: What one is called.
+        topic_of: What a topic of one is called.
+        fifo: Topic of all samples.
+        topic: Topic of their means.
+        combined: Fields of `sensor_combined` along x, y, z.
+        unit: Of all of these.
+    """
+
+    word: str
+    topic_of: str
+    fifo: str
+    topic: str
+    combined: tuple[str, str, str]
+    unit: str
+
+
+SENSORS = {
+    "rate": Sensor(
+        "gyro",
+        "a gyro topic",
+        "sensor_gyro_fifo",
+        "sensor_gyro",
+        ("gyro_rad[0]", "gyro_rad[1]", "gyro_rad[2]"),
+        "rad/s",
+    ),
+    "acceleration": Sensor(
+        "accelerometer",
+        "an accelerometer topic",
+        "sensor_accel_fifo",
+        "sensor_accel",
+        ("accelerometer_m_s2[0]", "accelerometer_m_s2[1]", "accelerometer_m_s2[2]"),
+        "m/s^2",
+    ),
+}
 MOST_SAMPLES = 32  # of a message of these
 FIFO_FIELDS = {"timestamp", "dt", "scale", "samples", *(f"{a}[{i}]" for a in "xyz" for i in range(MOST_SAMPLES))}
 _SLOWEST = 1e6  # microseconds between two of its samples: no sensor waits a second to fill one
@@ -21,29 +62,31 @@ COVERED = 0.5
 _LATE = 1.5
 
 
-def fifo_stream(data: Any, log: Any, allowance: Allowance) -> tuple[Stream | None, float]:
-    """An instance of `sensor_gyro_fifo` sample by sample, if any is sound, and the part of the time that it covers."""
-    time, rates, covered, notes = _unrolled(data, allowance)
+def fifo_stream(data: Any, log: Any, sensor: Sensor, allowance: Allowance) -> tuple[Stream | None, float]:
+    """An instance of a sensor's fifo sample by sample, if any is sound, and the part of the time that it covers."""
+    time, values, covered, notes = _unrolled(data, allowance)
     if time.size < 2:
         return None, 0.0
     channels, units = {}, {}
     own = {device_of(data)} - {None}
+    beside = {other.fifo: quantity for quantity, other in SENSORS.items() if other is not sensor}
     for other in log.data_list:
-        if other.name == _ACCELERATION_FIFO and other.multi_id == data.multi_id and other.data.keys() >= FIFO_FIELDS:
-            own_time, values, _, said = _unrolled(other, allowance)
-            channels["acceleration"], note = at_samples(time, own_time, values, "acceleration")
-            units["acceleration"] = "m/s^2"
+        if other.name in beside and other.multi_id == data.multi_id and other.data.keys() >= FIFO_FIELDS:
+            name = CHANNELS[beside[other.name]]
+            own_time, own_values, _, said = _unrolled(other, allowance)
+            channels[name], note = at_samples(time, own_time, own_values, name)
+            units[name] = SENSORS[beside[other.name]].unit
             notes += [*said, *([note] if note else [])]
-        if other.name == "sensor_gyro" and "temperature" in other.data and device_of(other) in own:
-            own_time, values = seconds(other.data), other.data["temperature"].astype(np.float64)
-            channels["temperature"], note = at_samples(time, own_time, values, "temperature")
+        if other.name == sensor.topic and "temperature" in other.data and device_of(other) in own:
+            own_time, warmth = seconds(other.data), other.data["temperature"].astype(np.float64)
+            channels["temperature"], note = at_samples(time, own_time, warmth, "temperature")
             units["temperature"] = "degC"
             notes += [note] if note else []
     device = [f"device_id {device_of(data)}"] if device_of(data) is not None else []
     stream = Stream(
         name=f"{data.name}[{data.multi_id}]",
-        gyro=dict(zip("xyz", rates, strict=True)),
-        unit="rad/s",
+        signal=dict(zip(AXES, values, strict=True)),
+        unit=sensor.unit,
         time=time,
         channels=channels,
         channel_units=units,
@@ -82,12 +125,12 @@ def _unrolled(data: Any, allowance: Allowance) -> tuple[Array, Array, float, lis
     return time, values, covered, notes
 
 
-def doubt(stream: Stream | None, covered: float) -> str:
+def doubt(stream: Stream | None, covered: float, sensor: Sensor) -> str:
     """Why an instance of a fifo is not read."""
     return (
         "no two sound samples"
         if stream is None
-        else f"messages that cover {100 * covered:.2g} % of the time, which are read with key={FIFO}"
+        else f"messages that cover {100 * covered:.2g} % of the time, which are read with key={sensor.fifo}"
     )
 
 

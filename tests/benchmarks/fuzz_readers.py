@@ -239,18 +239,25 @@ def inputs(folder: Path, n_inputs: int, rng: np.random.Generator) -> Iterator[tu
         yield start.suffix, path
 
 
-def read(log: Path | list[Path], answer: Connection) -> None:
-    """Read a log as this process's last deed, and send how it ended."""
-    resource.setrlimit(resource.RLIMIT_AS, (BYTES, BYTES))
-    path = log[0] if isinstance(log, list) else log
-    ended, said = "read", ""
+def _read_for(log: Path | list[Path], path: Path, quantity: str) -> tuple[str, str]:
+    """How the reading of a log for one quantity ended, and what was said."""
     try:
-        recording = gf.read_recording(log, rate=100.0 if path.suffix == ".npy" else None)
+        recording = gf.read_recording(log, rate=100.0 if path.suffix == ".npy" else None, quantity=quantity)
         (str(recording) + json.dumps(recording.to_dict(), allow_nan=False)).encode()
     except (RecordingError, OSError) as error:
-        ended, said = ("refused" if path.name in str(error) else "nameless"), str(error)
+        return ("refused" if path.name in str(error) else "nameless"), str(error)
     except BaseException as error:
-        ended, said = "nameless", f"{type(error).__name__}: {error}"
+        return "nameless", f"{type(error).__name__}: {error}"
+    return "read", ""
+
+
+def read(log: Path | list[Path], answer: Connection) -> None:
+    """Read a log for both quantities as this process's last deed, and send how it ended."""
+    resource.setrlimit(resource.RLIMIT_AS, (BYTES, BYTES))
+    path = log[0] if isinstance(log, list) else log
+    ends = [_read_for(log, path, quantity) for quantity in ("rate", "acceleration")]
+    # nameless where either is, else read where either is
+    ended, said = min(ends, key=lambda end: ("nameless", "read", "refused").index(end[0]))
     if ended != "nameless" and path.suffix in (".npy", ".npz", ".h5", ".parquet"):
         try:
             gf.open_long(path).read(0, 2)

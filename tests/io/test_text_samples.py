@@ -224,7 +224,7 @@ def test_a_sample(sample: Sample):
         notes, rate = [*notes, *map(str, grid.notes)], grid.rate
     assert rate == (sample.rate and pytest.approx(sample.rate, rel=3e-6))
     assert (stream.name, stream.unit, stream.n_samples) == (path.stem, sample.unit, 20)
-    assert {axis: values[0] for axis, values in stream.gyro.items()} == pytest.approx(sample.first, abs=1e-12)
+    assert {axis: values[0] for axis, values in stream.signal.items()} == pytest.approx(sample.first, abs=1e-12)
     assert {name: stream.channel_units.get(name) for name in stream.channels} == dict(sample.channels)
     assert {name: values.shape for name, values in stream.channels.items()} == {
         name: (20,) if name == TEMPERATURE else (3, 20) for name in sample.channels
@@ -260,5 +260,5 @@ def test_counts_of_a_flight_controller_are_g():
 
 def test_the_filtered_gyro_is_read_by_its_name():
     (stream,) = read_streams(SAMPLES / "blackbox_explorer.csv", key="ADC")
-    assert [values[0] for values in stream.gyro.values()] == [2, -4, -1]
+    assert [values[0] for values in stream.signal.values()] == [2, -4, -1]
     assert stream.unit == "deg/s"
