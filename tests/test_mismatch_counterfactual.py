@@ -10,11 +10,11 @@ import torch
 from scipy import stats
 
 import gyrofuse as gf
-from gyrofuse.mismatch import diagnose
+from gyrofuse.mismatch import counterfactual, diagnose
 from gyrofuse.mismatch.bump_fit import Oscillation
 from gyrofuse.mismatch.bumps import Stretch
 from gyrofuse.mismatch.case import Case, Scene
-from gyrofuse.mismatch.confirm import held_out_gain
+from gyrofuse.mismatch.confirm import Gain, held_out_gain, sd_of_sum
 from gyrofuse.mismatch.counterfactual import Link, same_line, settled
 from gyrofuse.mismatch.look_alikes import happened_instead, look_alikes
 from gyrofuse.mismatch.mechanism import Finding, Instead, Mechanism, Parameter
@@ -306,6 +306,21 @@ def test_equals_are_told_as_such():
     likelier = replace(finding, instead=Instead("warm_up_transient", 17.0, 2.0))
     assert "warm up transient is likelier, and would gain 5.0 nats more" in otherwise_words(likelier)
     assert otherwise_words(replace(finding, instead=None)) == ""
+
+
+@pytest.mark.parametrize(("apart", "told"), [(1.5, ("resonance",)), (2.5, ())])
+def test_a_rival_within_two_standard_deviations_is_told(monkeypatch, apart: float, told: tuple[str, ...]):
+    case = case_of(1, tone(12.34, 0.15))
+    finding = VibrationTone.nominate(case, LEVEL)
+    assert finding is not None
+    scatter = 4.0 * (-1.0) ** torch.arange(16)
+    difference = scatter + apart * sd_of_sum(scatter) / len(scatter)
+    (bump,) = look_alikes(case, finding)
+    gains = {finding.effect: Gain(100 + difference, (), 1.0), bump: Gain(100 + 0 * difference, (), 1.0)}
+    monkeypatch.setattr(counterfactual, "look_alikes", lambda *_: [bump])
+    monkeypatch.setattr(counterfactual, "held_out_gain", lambda _, effect: gains[effect])
+    compared = counterfactual._compared(finding, gains[finding.effect], case, [])
+    assert compared.alternatives == told
 
 
 def test_limits_of_amplitudes_hold_among_those_that_were_seen():

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from scipy import stats
+from scipy import signal, stats
 from shape_draws import BUMP, CHANGES, RATE, SIGNS, WHITE, N, P, array, case, drawn, generator, nominated, tensor
 
 import gyrofuse as gf
@@ -29,7 +30,7 @@ from gyrofuse.mismatch.likelihoods.spectral import (
     log_gain,
     power_gains,
 )
-from gyrofuse.mismatch.likelihoods.spectral_data import block_spectra, slow_groups
+from gyrofuse.mismatch.likelihoods.spectral_data import block_spectra, fast_groups, slow_groups
 from gyrofuse.mismatch.mechanisms.parameter_shift import _numbers
 from gyrofuse.mismatch.pooled import common_witness
 from gyrofuse.mismatch.shape_ground import Parts
@@ -120,7 +121,7 @@ def test_blocks_of_both_sides_add_up_and_are_held_out():
     assert both.simulated.products.shape[0] == 4
     every, d = both.recorded.mean(torch.ones(32, dtype=torch.bool))
     length, edges = 8192 // 32, both.bands.edges
-    # A naive twin of the highest band: eigencoefficients of the four sine tapers, block by block.
+    # A naive twin of the blocks' highest band: eigencoefficients of the four sine tapers, block by block.
     t = np.arange(1, length + 1)
     power = np.zeros(P)
     for block in given.recording.numpy().reshape(P, 32, length).swapaxes(0, 1):
@@ -129,7 +130,17 @@ def test_blocks_of_both_sides_add_up_and_are_held_out():
             taper = math.sqrt(2 / length) * np.sin(math.pi * k * t / length)
             seen = np.abs(np.fft.fft(centred * taper)[:, edges[-2] : edges[-1]]) ** 2
             power += seen.mean(-1) / (4 * 32)
-    np.testing.assert_allclose(every[-1].diagonal().real.numpy(), power, rtol=2e-2)
+    last = len(slow_groups()) + len(edges) - 2
+    np.testing.assert_allclose(every[last].diagonal().real.numpy(), power, rtol=2e-2)
+    # Above it stand the ordinates of the record, up to half the rate.
+    taper = torch.from_numpy(signal.windows.tukey(8192, 0.1))
+    taper = taper / taper.square().mean().sqrt()
+    y = cosine_ordinates((given.recording - given.recording.mean(-1, keepdim=True)) * taper)
+    groups = fast_groups(8192)
+    assert groups[-1][-1] == 8191
+    assert groups[0][0] == round(2 * 32 * (edges[-1] - 0.5))
+    for band, group in zip(every[last + 1 :], groups, strict=True):
+        torch.testing.assert_close(band.diagonal().real, y[:, list(group)].square().mean(-1))
     # The slowest ordinate is one real number.
     y = cosine_ordinates(given.recording)[:, 1]
     torch.testing.assert_close(every[0].diagonal().real, y.square())
@@ -140,8 +151,8 @@ def test_blocks_of_both_sides_add_up_and_are_held_out():
     changed = given.recording.clone()
     changed[:, : 8192 // 32] *= 3  # the first block is the first fold's
     one, other = (block_spectra(case(x, given.simulated.signal)) for x in (given.recording, changed))
-    kept, first = ~in_fold(32, 0), len(slow_groups())
-    torch.testing.assert_close(one.recorded.mean(kept)[0][first:], other.recorded.mean(kept)[0][first:])
+    kept, blocks = ~in_fold(32, 0), slice(len(slow_groups()), last + 1)
+    torch.testing.assert_close(one.recorded.mean(kept)[0][blocks], other.recorded.mean(kept)[0][blocks])
 
 
 def test_a_reference_of_another_length_has_its_ordinates_where_their_frequencies_are():
@@ -152,7 +163,7 @@ def test_a_reference_of_another_length_has_its_ordinates_where_their_frequencies
     _, d = both.recorded.mean(torch.ones(32, dtype=torch.bool))
     assert float(s[0]) == 0  # it has no ordinate so slow
     assert float(s[1]) == 0.5  # its first has the frequency of the recording's second
-    assert float(s[-1]) == pytest.approx(float(d[-1]) / 2)
+    assert float(s[-1]) == pytest.approx(float(d[-1]) / 2, rel=1e-3)  # of shorter tapers
 
 
 def test_correlations_gain_what_determinants_and_traces_say():
@@ -246,6 +257,36 @@ def test_filters_halve_the_power_at_their_corner(kind: str):
     torch.testing.assert_close(
         filter_response(kind, strength, f).abs().square(), filter_power(kind, strength, f), rtol=1e-9, atol=1e-14
     )
+
+
+@pytest.mark.parametrize(
+    ("kind", "power"),
+    [
+        # Next to half the rate the image of the step is seen as well.
+        ("window0", lambda at: signal.freqz(signal.firwin(29, 0.9), worN=at)[1]),
+        ("window1", lambda at: signal.freqz(signal.firwin(15, 0.8), worN=at)[1]),
+        ("chebyshev4", lambda at: signal.sosfreqz(signal.cheby1(4, 0.5, 0.94, output="sos"), worN=at)[1]),
+    ],
+)
+def test_filters_are_those_that_are_designed(kind: str, power: Callable[[np.ndarray], np.ndarray]):
+    f = torch.linspace(0.0005, 0.4995, 9981, dtype=torch.float64)
+    designed = torch.from_numpy(np.abs(power(2 * math.pi * f.numpy())) ** 2)
+    half = f[(designed > 0.5).sum() - 1 : (designed > 0.5).sum() + 1].mean()
+    seen = filter_power(kind, filter_strength(kind, half[None]), f)[0]
+    assert float((seen - designed).abs().max()) < (0.05 if kind != "window0" else 0.12)
+    none = filter_power(kind, tensor(0.0), f)
+    torch.testing.assert_close(none, torch.ones_like(none))
+
+
+@pytest.mark.parametrize("corner", [0.465, 0.48])
+def test_filters_next_to_half_the_rate_are_named(corner: float):
+    """Their edge is steeper than blocks can show, and errors of prediction ring next to a record's ends."""
+    sections = signal.cheby1(4, 0.5, 2 * corner, output="sos")
+    g = generator(7)
+    noise = gf.WhiteNoise(1.0)
+    recording = torch.from_numpy(signal.sosfilt(sections, noise.simulate(8500, batch=(1,), generator=g).numpy()))
+    report = gf.diagnose(recording[:, 300:], noise.simulate(16400, batch=(1,), generator=g))
+    assert [f.mechanism for f in report.findings] == ["low_pass"]
 
 
 def test_an_oscillation_has_variance_one_and_its_half_width():

@@ -18,9 +18,10 @@ from gyrofuse.mismatch.case import Case, Scene, block_means
 from gyrofuse.mismatch.confirm import held_out_gain
 from gyrofuse.mismatch.evidence import calibrated
 from gyrofuse.mismatch.mechanisms.step import Step
-from gyrofuse.mismatch.mechanisms.temperature_drift import TemperatureDrift
+from gyrofuse.mismatch.mechanisms.temperature_drift import TemperatureDrift, _beats_surrogates
 from gyrofuse.mismatch.mechanisms.warm_up_transient import WarmUpTransient
 from gyrofuse.mismatch.slow import (
+    Fit,
     SlowNoise,
     best_fit,
     cell_differences,
@@ -34,8 +35,10 @@ from gyrofuse.mismatch.slow import (
     where,
 )
 from gyrofuse.mismatch.slow_effect import quantiles
-from gyrofuse.mismatch.slow_families import double_warm_ups, lagged, steps, warm_ups
+from gyrofuse.mismatch.slow_families import Family, double_warm_ups, lagged, steps, warm_ups
 from gyrofuse.mismatch.slow_scans import (
+    Scan,
+    SlowLook,
     best_place,
     jumps_to_and_fro,
     slow_look,
@@ -394,6 +397,38 @@ def test_the_channel_is_named_and_the_unit_is_by_kelvin():
     finding = best(case(SIZE[:, None] * TEMPERATURE))
     assert finding.channel == "temperature[imu2]"
     assert finding.parameters["coefficient[0]"].unit == "deg/s/K"
+
+
+def of_few_waves(n_sensors: int, nats: float, seed: int, *, follows: bool) -> tuple[SlowLook, Scan]:
+    """Sensors with one path beside white ordinates, and the scan of a channel, which it is or not; both smooth."""
+    g = generator(seed)
+    t = torch.arange(256, dtype=torch.float64) / 256
+    turns = 2 * math.pi * torch.rand(2, 3, generator=g, dtype=torch.float64)
+    sizes = zip((1.0, 0.35, 0.2), turns.mT, strict=True)
+    waves = sum(a * (2 * math.pi * k * t + turn[:, None]).cos() for k, (a, turn) in enumerate(sizes, 1))
+    channel, other = ordinates(torch.as_tensor(waves))
+    path = channel if follows else other
+    sign = 2.0 * torch.randint(2, (n_sensors, 1), generator=g) - 1
+    noise = torch.randn(n_sensors, 255, generator=g, dtype=torch.float64)
+    y = sign * path / path.norm() * math.sqrt(2 * nats / n_sensors) + noise
+    size = (y @ channel / channel.square().sum())[:, None]
+    z = size * channel.norm()
+    fit = Fit(torch.zeros(n_sensors, 0), torch.zeros(n_sensors), torch.ones_like(y), size)
+    family = Family("temperature_drift", channel[None], torch.zeros(1))
+    there = torch.full_like(z, 9.0)  # in every sensor
+    scan = Scan(family, 0, fit, there, z, nats, 0.0, torch.eye(n_sensors), torch.ones(n_sensors), 1)
+    return SlowLook(None, None, y, fit, (family,)), scan  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("n_sensors", "nats"), [(1, 15.0), (12, 15.0)])
+def test_a_channel_that_is_nearly_one_wave_or_in_many_sensors_can_be_followed(n_sensors: int, nats: float):
+    held = sum(_beats_surrogates(*of_few_waves(n_sensors, nats, seed, follows=True)) for seed in range(20))
+    assert held >= 17
+
+
+def test_a_channel_that_many_sensors_do_not_follow_is_no_better_than_its_surrogates():
+    held = sum(_beats_surrogates(*of_few_waves(12, 100.0, seed, follows=False)) for seed in range(20))
+    assert held <= 7
 
 
 def test_the_search_for_an_onset_ends_where_two_places_are_likely():

@@ -25,7 +25,7 @@ from gyrofuse.mismatch.slow_effect import SlowEffect
 from gyrofuse.mismatch.slow_scans import slow_look
 from gyrofuse.mismatch.telling import mechanism_words
 
-_AS_GOOD_SD, _AS_GOOD = 1.0, 3.0  # differences of gains that are chance: in standard deviations, and in nats
+_AS_GOOD_SD, _AS_GOOD = 2.0, 3.0  # differences of gains that are chance: in standard deviations, and in nats
 
 
 class Link(NamedTuple):

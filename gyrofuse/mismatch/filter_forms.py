@@ -2,8 +2,8 @@
 
 A form is an analogue prototype `H(u)` that halves the power at `u = 1`, of a warped frequency `u = g(f) / g(f_c)`:
 `g = tan(pi f)` of the bilinear transform, or `g = 2 f` of an analogue filter in front of the converter. A Gaussian
-window cuts a FIR filter's ideal step off smoothly. Beside those stand one and two poles `(1 - q) / (1 - q / z)`, and
-the mean over `a` samples.
+window cuts a FIR filter's ideal step off smoothly; pass bands with ripples have half a decibel of them. Beside those
+stand one and two poles `(1 - q) / (1 - q / z)`, and the mean over `a` samples.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ class _Form(NamedTuple):
 
     Attributes:
         warp: "tan" or "straight".
-        prototype: "butterworth", "bessel" or "window".
-        order: Of the first two.
+        prototype: "butterworth", "bessel", "chebyshev" or "window".
+        order: Of all but the last.
         width: Of a window's step, standard deviation over its middle.
         power: Of `g(f_c)^-2` that `strength` is.
     """
@@ -42,11 +42,14 @@ _FORMS = {
     "sampled2": _Form("straight", "butterworth", 2, power=2),
     **{f"bilinear{n}": _Form("tan", "butterworth", n) for n in (3, 4)},
     **{f"bessel{n}": _Form("tan", "bessel", n) for n in (2, 3, 4)},
+    "chebyshev4": _Form("tan", "chebyshev", 4),
     # Widths a factor of 1.6 apart: Hamming windows of 11 to 61 taps at a cutoff of a fifth of the rate.
     **{f"window{k}": _Form("straight", "window", width=0.08 * 1.6**k) for k in range(4)},
 }
 _POLES = {"pole": 1.0, "poles": math.sqrt(2) - 1}
 FILTERS = ("pole", "poles", "average", *_FORMS)
+_RIPPLE = 0.5  # dB
+_HIGHEST = 0.495  # corner with ripples, cycles per sample
 _HALVINGS = 60  # of an interval: double precision
 _LONGEST = 0.9999  # pole: of a time constant of 10^4 samples
 
@@ -62,20 +65,28 @@ def filter_strength(kind: str, corner: Tensor) -> Tensor:
             more = filter_power(kind, middle.square() - 1, corner[..., None])[..., 0] > 0.5
             low, high = torch.where(more, middle, low), torch.where(more, high, middle)
         return low.square() - 1
-    return strength_of(kind, _warped(kind, corner).log())
+    number = _warped(kind, corner).log()
+    if _FORMS[kind].prototype == "window":  # its image lets a little more pass
+        low, high = number - 1, number + 1
+        for _ in range(_HALVINGS):
+            number = (low + high) / 2
+            more = filter_power(kind, strength_of(kind, number), corner[..., None])[..., 0] > 0.5
+            low, high = torch.where(more, low, number), torch.where(more, number, high)
+    return strength_of(kind, number)
 
 
 def filter_corner(kind: str, strength: Tensor) -> Tensor:
     """Cycles per sample at which a filter halves the power; infinite where it never does."""
-    if kind in _FORMS:
+    if kind in _FORMS and _FORMS[kind].prototype != "window":
         form = _FORMS[kind]
         g = strength.clamp(min=1e-300).pow(-1 / (2 * form.power))
         return torch.atan(g) / math.pi if form.warp == "tan" else g / 2
     if kind in _POLES:
         g = filter_number(kind, strength).exp()
         return torch.where(g <= 1, g.clamp(max=1).asin() / math.pi, math.inf)
-    a = (1 + strength).sqrt()
-    low, high = torch.zeros_like(a), (1 / a).clamp(max=0.5)
+    # Before a mean's first zero.
+    highest = 1 / (1 + strength).sqrt() if kind == "average" else torch.ones_like(strength)
+    low, high = torch.zeros_like(strength), highest.clamp(max=0.5)
     falls = filter_power(kind, strength, high[..., None])[..., 0] < 0.5
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
@@ -101,6 +112,8 @@ def strength_of(kind: str, number: Tensor) -> Tensor:
         return b - (b.square() - 1).sqrt()
     if kind == "average":
         return 3 * torch.exp(-2 * number)
+    if _FORMS[kind].prototype == "chebyshev":  # beyond, a lower level would pass for one whose edge no band shows
+        number = number.clamp(max=math.log(math.tan(math.pi * _HIGHEST)))
     return torch.exp(-2 * _FORMS[kind].power * number)
 
 
@@ -129,13 +142,22 @@ def filter_response(kind: str, strength: Tensor, f: Tensor) -> Tensor:
     form, u = _FORMS[kind], _prototype_frequency(kind, strength, f)
     if form.prototype == "window":
         middle, whole = _window(form.width)
-        x = u / middle  # over the middle of the step
-        ends = torch.special.ndtr((1 - x) / form.width) - torch.special.ndtr((-1 - x) / form.width)
-        return torch.complex(ends / whole, torch.zeros_like(ends))
+        x, rate = (v / middle for v in (u, _prototype_frequency(kind, strength, torch.ones_like(f[..., :1]))))
+        # A digital response repeats itself: next to half the rate that of the image's step is added.
+        ends = sum((_step(x + k * rate, form.width) for k in (-1, 0, 1)), torch.zeros_like(x))
+        ends = (ends / whole).clamp(max=1)  # a pass band that reaches half the rate leaves no step
+        return torch.complex(ends, torch.zeros_like(ends))
     response = torch.ones_like(u, dtype=torch.complex128)
+    if form.prototype == "chebyshev":
+        response = torch.where(strength[..., None] > 0, _at_rest(form.order), 1.0) * response
     for pole in _poles(form.prototype, form.order):
         response = response * (-pole) / (1j * u - pole)
     return response
+
+
+def _step(x: Tensor, width: float) -> Tensor:
+    """What a window leaves of an ideal filter's pass band, from -1 to 1."""
+    return torch.special.ndtr((1 - x) / width) - torch.special.ndtr((-1 - x) / width)
 
 
 def _warped(kind: str, f: Tensor) -> Tensor:
@@ -152,7 +174,15 @@ def _poles(prototype: str, order: int) -> tuple[complex, ...]:
     """Of a prototype that halves the power at one."""
     if prototype == "bessel":
         return tuple(complex(p) for p in signal.bessel(order, 1.0, analog=True, output="zpk", norm="mag")[1])
+    if prototype == "chebyshev":
+        half = math.cosh(math.acosh(math.sqrt(1 / (10 ** (_RIPPLE / 10) - 1))) / order)
+        return tuple(complex(p) / half for p in signal.cheby1(order, _RIPPLE, 1.0, analog=True, output="zpk")[1])
     return tuple(complex(p) for p in signal.butter(order, 1.0, analog=True, output="zpk")[1])
+
+
+def _at_rest(order: int) -> float:
+    """Response with ripples at frequency 0: with an even number of poles they start from below."""
+    return 1.0 if order % 2 else 10 ** (-_RIPPLE / 20)
 
 
 @functools.lru_cache(maxsize=16)

@@ -6,6 +6,7 @@ weak effect cost as much as the other half can gain.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -42,7 +43,9 @@ def spectral_gains(case: Case, left: Tensor, spectra: Callable[[Tensor, Tensor],
     """Gain in log score of each block held out, `(block,)`, nats.
 
     The likelihood of cosine transforms, whose ordinates are independent for white noise and random walks. They are
-    real: noise that sensors share a quarter of a cycle apart does not count.
+    real: noise that sensors share a quarter of a cycle apart does not count. Blocks are short: next to a filter's edge,
+    in its stop band and at its zeros most of an ordinate's power is what leaks in from elsewhere, so that spectra are
+    seen as a block shows them.
 
     Args:
         case: Recording and simulation without the mechanism.
@@ -51,9 +54,32 @@ def spectral_gains(case: Case, left: Tensor, spectra: Callable[[Tensor, Tensor],
         fold: Which one.
     """
     block = case.n_samples // N_JUDGED
-    f = torch.arange(_FIRST, block, dtype=torch.float64) / (2 * block)
+    f = torch.arange(block + 1, dtype=torch.float64) / (2 * block)
+    f[0] = f[1] / 2  # nothing of a block's mean is in its other ordinates
     plain = torch.diag_embed(case.base.spectrum(f).mT).to(torch.complex128)
-    return _log_scores(left, spectra(plain, f).real, fold) - _log_scores(case.recording, plain.real, fold)
+    after, before = (seen_in_block(matrices.real)[_FIRST:] for matrices in (spectra(plain, f), plain))
+    return _log_scores(left, after, fold) - _log_scores(case.recording, before, fold)
+
+
+def seen_in_block(spectra: Tensor) -> Tensor:
+    """Expected products of a block's cosine ordinates, `(block, ...)`, the first of which is no use.
+
+    With the autocovariance `g` and `a = pi k / n` that of ordinate `k` in a block of `n` samples is
+
+        g_0 + 2 sum_t g_t [(1 - t / n) cos(a t) - sin(a t) / (n sin a)],
+
+    as in the debiased Whittle likelihood (Sykulski et al., Biometrika 106, 2019).
+
+    Args:
+        spectra: Densities at `0, 1, .., n` half cycles per block, `(ordinate, ...)`, real.
+    """
+    n = len(spectra) - 1
+    shape = (-1,) + (1,) * (spectra.ndim - 1)
+    lags = torch.fft.irfft(spectra, n=2 * n, dim=0)[:n]
+    part = torch.arange(n, dtype=spectra.dtype).view(shape) / n
+    even = torch.fft.rfft(lags * (1 - part), n=2 * n, dim=0)[:n].real
+    odd = torch.fft.rfft(lags, n=2 * n, dim=0)[:n].imag
+    return 2 * even - lags[:1] + 2 * odd / (n * torch.sin(math.pi * part).clamp(min=1 / n))
 
 
 def signal_gains(case: Case, taken: Tensor, fold: int) -> Tensor:

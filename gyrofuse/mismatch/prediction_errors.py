@@ -79,7 +79,7 @@ def left_out(side: Side) -> LeftOut:
     white = _back(y / spectrum.sqrt())
     inverse = 1 / spectrum.maximum(_FLOOR * spectrum.median(-1, keepdim=True).values)
     error = _back(y * inverse) / (inverse * (1 - followed)).mean(-1, keepdim=True)
-    leaks, at_ends = lines.any(-1, keepdim=True) | _leaks(white), error
+    leaks, at_ends = lines.any(-1, keepdim=True) | _leaks(white) | _rings(error, white), error
     white, error = (torch.where(leaks, _mirrored(v), v) for v in (white, error))
     step = _step(side.signal[:MOST_RECORDS])
     stepped = step > _COARSE
@@ -113,6 +113,17 @@ def _leaks(white: Tensor) -> Tensor:
     ends = _robust_sd(torch.stack([white[..., :_KINK_SAMPLES], white[..., -_KINK_SAMPLES:]]))
     inner = _robust_sd(torch.stack([white[..., m : 2 * m], white[..., -2 * m : -m]]))
     return (ends > _KINK * inner).any(0)[..., None]
+
+
+def _rings(error: Tensor, white: Tensor) -> Tensor:
+    """Whether either end of the errors `(..., time)` is plainly larger than that of the whitened record, `(..., 1)`.
+
+    Errors weigh ordinates by one over their power. In a narrow stop band, a kink rings for as long as that is narrow,
+    longer than what is next to an end; a louder end is so in the whitened record as well.
+    """
+    m = white.shape[-1] // ENDS
+    ends = [torch.stack([_robust_sd(v[..., :m]), _robust_sd(v[..., -m:])]) / _robust_sd(v) for v in (error, white)]
+    return (ends[0] > _KINK * ends[1]).any(0)[..., None]
 
 
 def _mirrored(values: Tensor) -> Tensor:

@@ -82,25 +82,33 @@ class Slow(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DeepBands(Bands):
-    """Bands of bins, and below them those of a few cosine ordinates of a record.
+    """Bands of bins, and below and above them those of cosine ordinates of a record.
 
     Attributes:
-        deep: Places of the latter.
+        deep, beyond: Places of the latter.
     """
 
     deep: Tensor
+    beyond: Tensor
 
     @classmethod
-    def of(cls, above: Bands, record: int, groups: Groups = SLOW) -> DeepBands:
-        """Bands of bins with groups of ordinates of a record in front."""
-        share = torch.arange(_PLACES, dtype=torch.float64).add(0.5) / _PLACES
-        deep = torch.stack([g[0] - 0.5 + (g[-1] + 1 - g[0]) * share for g in groups]) / (2 * record)
-        frequency, dof = torch.cat([deep.log().mean(-1).exp(), above.frequency]), torch.cat([_dof(groups), above.dof])
-        return cls(above.n_samples, above.edges, frequency, dof, deep.flatten())
+    def of(cls, bins: Bands, record: int, groups: Groups = SLOW, beyond: Groups = ()) -> DeepBands:
+        """Bands of bins between groups of ordinates of a record."""
+        below, above = _places(groups, record), _places(beyond, record)
+        frequency = torch.cat([below.log().mean(-1).exp(), bins.frequency, above.log().mean(-1).exp()])
+        dof = torch.cat([_dof(groups), bins.dof, _dof(beyond)])
+        return cls(bins.n_samples, bins.edges, frequency, dof, below.flatten(), above.flatten())
 
     @property
     def places(self) -> Tensor:
-        return torch.cat([self.deep, super().places])
+        return torch.cat([self.deep, super().places, self.beyond])
+
+
+def _places(groups: Groups, record: int) -> Tensor:
+    """Frequencies whose mean stands for a group of ordinates, cycles per sample, `(group, place)`."""
+    share = torch.arange(_PLACES, dtype=torch.float64).add(0.5) / _PLACES
+    ends = torch.tensor([(g[0] - 0.5, g[-1] + 0.5) for g in groups], dtype=torch.float64).view(-1, 2)
+    return (ends[:, :1] + ends.diff() * share) / (2 * record)
 
 
 class Deep(NamedTuple):

@@ -308,6 +308,9 @@ def main() -> int:
     for kind in [*dict.fromkeys(kind for kind, _ in counts), "all"]:
         row = [sum(n for (k, e), n in counts.items() if e == end and kind in (k, "all")) for end in ends]
         print(f"{kind:16}" + "".join(f"{n:10}" for n in row))
+    # Of the processes that read, with what they share with this one.
+    most = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
+    print(f"largest memory of an input: {most:.2f} GiB")
     return int(any(ended in FAILURES for _, ended in counts))
 
 

@@ -1,7 +1,9 @@
 """Cross-spectra of a recording and its simulation, additive over the blocks that are held out.
 
 Both sides are cut into blocks of one length, so that resolution and leakage are the same. Below the lowest band of a
-block stand the DCT-II ordinates of whole records, dealt to the blocks. The whole recording, the blocks that a fold
+block stand the DCT-II ordinates of whole records, dealt to the blocks, and so they do next to half the rate, where the
+edges of filters are steeper than blocks can show: there under a light taper, as the kink that either end of a record
+would be to them is all that stop bands have, the same in all ordinates. The whole recording, the blocks that a fold
 keeps and those that it holds out are the same sums over another set of blocks; the reference is held out with them, as
 its own chance would otherwise be in what is fitted and in what judges the fit.
 """
@@ -17,6 +19,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._transforms import cosine_ordinates
+from gyrofuse.mismatch.bumps import light_taper
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.folds import N_FOLDS, N_JUDGED
 from gyrofuse.mismatch.remembered import remembered
@@ -31,6 +34,7 @@ _NARROWEST = 6
 _PER_OCTAVE = 6  # bands: a third of an octave holds two, as narrow as smooth spectra need
 _WIDEST = 0.02  # cycles per sample: a band where filters cut off is to show their slope
 _SHARE_OF_END = 3  # bands are a third of the distance to half the rate at most: digital filters have zeros there
+_FEWEST_AT_END = 24  # ordinates of a whole record in a band there, which have no tapers
 _SLOW_PER_OCTAVE = 4  # groups of ordinates: slow noise has no structure finer than that
 
 
@@ -56,7 +60,7 @@ class Compared(NamedTuple):
     """A recording and its reference in the same bands.
 
     Attributes:
-        bands: They, below them groups of ordinates of the whole record.
+        bands: They, below and above them groups of ordinates of the whole record.
         recorded: By block, 32 parts.
         simulated: By the fold that holds it out, 4 parts.
     """
@@ -70,12 +74,12 @@ class Compared(NamedTuple):
 def block_spectra(case: Case) -> Compared:
     """Both sides of a case."""
     length = case.n_samples // N_JUDGED
-    above, groups = block_bands(length), slow_groups()
+    above, below, beyond = block_bands(length), slow_groups(), fast_groups(case.n_samples)
     recorded, simulated = _of_side(case.recorded, case.n_samples), _of_side(case.simulated, case.n_samples)
     folds = torch.arange(len(recorded.dof)) % N_FOLDS
     parts = [(simulated.products[folds == k].sum(0), simulated.dof[folds == k].sum(0)) for k in range(N_FOLDS)]
     return Compared(
-        DeepBands.of(above, case.n_samples, groups),
+        DeepBands.of(above, case.n_samples, below, beyond),
         recorded,
         Spectra(torch.stack([p for p, _ in parts]), torch.stack([d for _, d in parts])),
     )
@@ -83,8 +87,8 @@ def block_spectra(case: Case) -> Compared:
 
 @functools.lru_cache(maxsize=8)
 def block_bands(length: int) -> Bands:
-    """Bands of a block of so many samples."""
-    last = (length - 4) // 2
+    """Bands of a block of so many samples, up to where they would be wider than half the rate is near."""
+    last = length // 2 - _SHARE_OF_END * _NARROWEST
     edges = [_FIRST_BIN]
     while last - edges[-1] >= 2 * _NARROWEST:
         a = edges[-1]
@@ -106,26 +110,45 @@ def slow_groups() -> Groups:
     return tuple(tuple(range(a, b)) for a, b in itertools.pairwise(edges))
 
 
+@functools.lru_cache(maxsize=8)
+def fast_groups(n_samples: int) -> Groups:
+    """DCT-II ordinates of a record above its blocks' highest band, each a third of the distance to half the rate."""
+    length = n_samples // N_JUDGED
+    edges = [round(2 * n_samples * (block_bands(length).edges[-1] - 0.5) / length)]
+    while n_samples - edges[-1] >= 2 * _FEWEST_AT_END:
+        edges.append(edges[-1] + max((n_samples - edges[-1]) // _SHARE_OF_END, _FEWEST_AT_END))
+    edges[-1] = n_samples
+    return tuple(tuple(range(a, b)) for a, b in itertools.pairwise(edges))
+
+
 def _of_side(side: Side, n_samples: int) -> Spectra:
     """A side by the 32 blocks that its samples, or the place of its ordinates, belong to."""
     noise = side.steady
     length, (n_records, p, n) = n_samples // N_JUDGED, noise.shape
-    bands, groups = block_bands(length), slow_groups()
-    products = torch.zeros(N_JUDGED, len(groups) + len(bands.dof), p, p, dtype=torch.complex128)
-    dof = torch.zeros(N_JUDGED, len(groups) + len(bands.dof), dtype=torch.float64)
+    bands, below, beyond = block_bands(length), slow_groups(), fast_groups(n_samples)
+    first, end = len(below), len(below) + len(bands.dof)
+    products = torch.zeros(N_JUDGED, end + len(beyond), p, p, dtype=torch.complex128)
+    dof = torch.zeros(N_JUDGED, end + len(beyond), dtype=torch.float64)
     for record in noise:
         blocks = record[:, : n // length * length].unflatten(-1, (-1, length)).movedim(1, 0)
         place = torch.arange(len(blocks)) % N_JUDGED
-        products[:, len(groups) :].index_add_(0, place, cross_spectra(blocks, bands) * bands.dof[:, None, None])
-        dof[:, len(groups) :].index_add_(0, place, bands.dof.expand(len(blocks), -1))
-        # A record of another length has its ordinates at other frequencies.
-        edges = torch.tensor([g[0] - 0.5 for g in groups] + [groups[-1][-1] + 0.5], dtype=torch.float64)
-        k = torch.arange(1, math.floor(float(edges[-1]) * n / n_samples) + 1)
-        band = torch.bucketize(k * (n_samples / n), edges, right=True) - 1
-        y = cosine_ordinates(record)[:, k].mT
-        at, inside = (k % N_JUDGED)[band >= 0], band >= 0
-        cross = (y[:, :, None] * y[:, None, :])[inside].to(products.dtype) / 2  # a real ordinate is half a complex one
-        products.index_put_((at, band[inside]), cross, accumulate=True)
-        dof.index_put_((at, band[inside]), torch.full((len(at),), 0.5, dtype=torch.float64), accumulate=True)
+        products[:, first:end].index_add_(0, place, cross_spectra(blocks, bands) * bands.dof[:, None, None])
+        dof[:, first:end].index_add_(0, place, bands.dof.expand(len(blocks), -1))
+        taper = light_taper(n) * math.sqrt(n)
+        tapered = (record - record.mean(-1, keepdim=True)) * taper
+        for start, groups, seen, worth in (
+            (0, below, record, 0.5),  # a real ordinate is half a complex one
+            (end, beyond, tapered, 0.5 / float(taper.pow(4).mean())),
+        ):
+            # A record of another length has its ordinates at other frequencies.
+            edges = torch.tensor([g[0] - 0.5 for g in groups] + [groups[-1][-1] + 0.5], dtype=torch.float64)
+            lowest, highest = (float(edge) * n / n_samples for edge in (edges[0], edges[-1]))
+            k = torch.arange(max(math.ceil(lowest), 1), min(math.floor(highest) + 1, n))
+            band = torch.bucketize(k * (n_samples / n), edges, right=True) - 1
+            y = cosine_ordinates(seen)[:, k].mT
+            at, inside = (k % N_JUDGED)[band >= 0], band >= 0
+            cross = (y[:, :, None] * y[:, None, :])[inside].to(products.dtype) * worth
+            products.index_put_((at, start + band[inside]), cross, accumulate=True)
+            dof.index_put_((at, start + band[inside]), torch.full((len(at),), worth).to(dof), accumulate=True)
     told = side.n_records / n_records  # less than it shows, where a model was estimated from fewer samples
     return Spectra(products * told, dof * told)

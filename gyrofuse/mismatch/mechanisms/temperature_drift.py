@@ -28,6 +28,7 @@ from gyrofuse.mismatch.slow_scans import Scan, SlowLook, concerned
 
 _SURROGATES = 200
 _BETTER = 2  # so many surrogates may do as well as the channel
+_RECORDS, _USUAL = 100, 0.9  # of sensors that follow the channel: so many of them are no less like it
 _DECISIVE = 8.0  # nats that a channel must owe to its shape, for surrogates of the shape to tell anything
 
 
@@ -105,6 +106,9 @@ def _beats_surrogates(look: SlowLook, scan: Scan) -> bool:
     """Whether a channel's shape beyond its trend fits better than nearly all such shapes with random phases.
 
     The trend itself, which any drift has, is left out of both; where little is owed to the shape nothing can be said.
+    A shape that is nearly one wave has many surrogates that hardly differ from it, and in many sensors any shape has
+    many sizes to fit noise with: some do as well by chance where all sensors follow the channel. Where they fare no
+    better, all together, than they would then, they are no reason against it.
     """
     generator = torch.Generator().manual_seed(0)
     which = list(concerned(scan))
@@ -118,10 +122,31 @@ def _beats_surrogates(look: SlowLook, scan: Scan) -> bool:
     turn = 2 * math.pi * torch.rand(_SURROGATES, len(transform), generator=generator, dtype=torch.float64)
     surrogates = torch.fft.irfft(transform * torch.polar(torch.ones_like(turn), turn), n=len(left))
     shapes, trend = ordinates(torch.cat([left[None], surrogates])), ordinates(t)
-    slope = trend / variance / (trend.square() / variance).sum(-1, keepdim=True)  # (sensor, ordinate)
-    y = y - (slope * y).sum(-1, keepdim=True) * trend
-    shapes = shapes - (shapes @ slope.mT).mT[..., None] * trend  # (sensor, surrogate, ordinate)
-    information = (shapes.square() / variance[:, None]).sum(-1)
-    score = (shapes @ (y / variance)[..., None])[..., 0]
-    gain = (score.square() / information).sum(0) / 2
-    return float(gain[0]) < _DECISIVE or int((gain[1:] >= gain[0]).sum()) <= _BETTER
+    z, axes = _without_trend(y, variance, shapes, trend)
+    gain = z.square().sum(0) / 2
+    if float(gain[0]) < _DECISIVE or int((gain[1:] >= gain[0]).sum()) <= _BETTER:
+        return True
+    # Sizes of all sensors together are overestimated by their own scatter.
+    followed = z[:, 0] * math.sqrt(max(1 - len(which) / (2 * float(gain[0])), 0.0))
+    noise = torch.randn(_RECORDS, *y.shape, generator=generator, dtype=torch.float64)
+    records = followed[:, None] * axes[:, 0] + noise  # (record, sensor, ordinate), in standard deviations
+    if_followed = (records.movedim(0, 1) @ axes.mT).square().sum(0) / 2  # (record, shape)
+    return float(_of_any_shape(gain)) <= float(_of_any_shape(if_followed).quantile(_USUAL))
+
+
+def _of_any_shape(gain: Tensor) -> Tensor:
+    """Logarithm of the surrogates' likelihoods, summed, over the channel's, by gains `(..., shape)`; it comes first."""
+    return gain[..., 1:].logsumexp(-1) - gain[..., 0]
+
+
+def _without_trend(y: Tensor, variance: Tensor, shapes: Tensor, trend: Tensor) -> tuple[Tensor, Tensor]:
+    """Sizes of shapes `(shape, ordinate)` beside a trend, in standard deviations, and their whitened unit vectors.
+
+    Returns:
+        `(sensor, shape)` and `(sensor, shape, ordinate)`.
+    """
+    sd = variance.sqrt()
+    white = shapes / sd[:, None]
+    line = torch.nn.functional.normalize(trend / sd, dim=-1)[:, :, None]  # (sensor, ordinate, 1)
+    axes = torch.nn.functional.normalize(white - (white @ line) * line.mT, dim=-1)
+    return (axes @ (y / sd)[..., None])[..., 0], axes
