@@ -323,9 +323,7 @@ def read_recording(
     twice = next((p for i, p in enumerate(places) if p in places[:i]), None)
     if twice is not None:
         raise ValueError(f"`path`: expected each file once, got {twice} twice; name it once")
-    check_reading(rate=rate, scale=scale, quantity=quantity)
-    if columns is not None:
-        check_columns(columns)
+    check_reading(rate=rate, scale=scale, quantity=quantity, columns=columns)
     if max_bytes is not None:
         check_positive("max_bytes", max_bytes)
     whole = assemble(
@@ -354,9 +352,17 @@ def read_recording(
     return recording if sensors is None else recording.select(sensors=sensors)
 
 
-def check_reading(*, rate: float | None = None, scale: float | None = None, quantity: str = "rate") -> None:
+def check_reading(
+    *,
+    rate: float | None = None,
+    scale: float | None = None,
+    quantity: str = "rate",
+    columns: Mapping[str, str] | None = None,
+) -> None:
     """Raise `ValueError` where an option of `read_recording` is wrong for any log."""
     check_quantity(quantity)
+    if columns is not None:
+        check_columns(columns)
     if rate is not None and not is_rate(check_positive("rate", rate)):
         raise ValueError(f"`rate`: expected a sampling rate of 1e-6 to 1e12 Hz, got {rate!r}")
     if scale is not None and not (math.isfinite(scale) and scale != 0):

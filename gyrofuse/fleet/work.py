@@ -74,7 +74,8 @@ class LogGroups(Dataset[tuple[Log, ...]]):
             raise TypeError(
                 f"`{unknown[0]}`: expected an option of read_recording ({', '.join(_OPTIONS)}); leave it out"
             )
-        check_reading(**{name: self.options[name] for name in ("rate", "scale", "quantity") if name in self.options})
+        checked = ("rate", "scale", "quantity", "columns")
+        check_reading(**{name: self.options[name] for name in checked if name in self.options})
 
     def __len__(self) -> int:
         return len(self.groups)
