@@ -3,7 +3,7 @@
 A form is an analogue prototype `H(u)` that halves the power at `u = 1`, of a warped frequency `u = g(f) / g(f_c)`:
 `g = tan(pi f)` of the bilinear transform, or `g = 2 f` of an analogue filter in front of the converter. A Gaussian
 window cuts a FIR filter's ideal step off smoothly; pass bands with ripples have half a decibel of them. Beside those
-stand one and two poles `(1 - q) / (1 - q / z)`, and the mean over `a` samples.
+stand one and two poles `(1 - q) / (1 - q / z)`, and the mean over `a` samples, the last of which counts in part.
 """
 
 from __future__ import annotations
@@ -137,8 +137,11 @@ def filter_response(kind: str, strength: Tensor, f: Tensor) -> Tensor:
         return response if kind == "pole" else response.square()
     if kind == "average":
         a = (1 + strength[..., None]).sqrt()
-        x = math.pi * f.clamp(min=1e-12)
-        return torch.polar(torch.ones_like(a * x), -(a - 1) * x) * (torch.sin(a * x) / (a * torch.sin(x)))
+        n, x = a.floor(), math.pi * f.clamp(min=1e-12)
+        one = torch.ones_like(a * x)
+        # Of the last sample a part, where their number is not whole.
+        added = torch.polar(one, -(n - 1) * x) * (torch.sin(n * x) / torch.sin(x))
+        return (added + (a - n) * torch.polar(one, -2 * n * x)) / a
     form, u = _FORMS[kind], _prototype_frequency(kind, strength, f)
     if form.prototype == "window":
         middle, whole = _window(form.width)

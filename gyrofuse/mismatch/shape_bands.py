@@ -26,7 +26,7 @@ SLOW: Groups = ((1, 2), (3, 4), (5, 6, 7, 8))
 _FIRST_BIN = 5  # tapers reach two bins down
 _PER_OCTAVE = 24
 _WIDTH = 5  # bins
-_PLACES = 8
+N_PLACES = 8  # frequencies that stand for a band
 N_SLOW = 3 * N_JUDGED - 1  # cosine ordinates of a record that its blocks do not show
 _CLEAN = 8  # bins of short records, below which they hold what leaks from below
 
@@ -106,7 +106,7 @@ class DeepBands(Bands):
 
 def _places(groups: Groups, record: int) -> Tensor:
     """Frequencies whose mean stands for a group of ordinates, cycles per sample, `(group, place)`."""
-    share = torch.arange(_PLACES, dtype=torch.float64).add(0.5) / _PLACES
+    share = torch.arange(N_PLACES, dtype=torch.float64).add(0.5) / N_PLACES
     ends = torch.tensor([(g[0] - 0.5, g[-1] + 0.5) for g in groups], dtype=torch.float64).view(-1, 2)
     return (ends[:, :1] + ends.diff() * share) / (2 * record)
 
@@ -180,7 +180,7 @@ def slow(case: Case) -> Slow:
         _means(slow_ordinates(side)[..., :last].square().mean(0) / noise, SLOW)
         for side in (case.recorded, case.simulated)
     )
-    places = DeepBands.of(case.bands, case.n_samples).deep.unflatten(0, (-1, _PLACES))
+    places = DeepBands.of(case.bands, case.n_samples).deep.unflatten(0, (-1, N_PLACES))
     seen = places.amin(-1) >= case.simulated.slowest_seen
     return Slow(one / other, _dof(SLOW), _simulated_dof(case.simulated, SLOW) * seen, places)
 

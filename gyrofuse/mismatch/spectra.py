@@ -94,6 +94,21 @@ def cross_spectra(signal: Tensor, wanted: Bands) -> Tensor:
     return torch.stack(matrices, -3)
 
 
+def taper_window(n_samples: int, per_bin: int) -> Tensor:
+    """Mean of the tapers' squared transforms at distances from a bin, `(distance,)`, which go round at the rate.
+
+    The taper of `y_k` is `2 sin(pi k t / T) / sqrt(2 T)`.
+
+    Args:
+        n_samples: T.
+        per_bin: Distances in a bin.
+    """
+    t = torch.arange(n_samples, dtype=torch.float64) / n_samples
+    k = torch.arange(1, _TAPERS + 1, dtype=torch.float64)[:, None]
+    transform = torch.fft.fft(2 * torch.sin(math.pi * k * t) / math.sqrt(2 * n_samples), n=per_bin * n_samples)
+    return (transform.real.square() + transform.imag.square()).mean(0)
+
+
 @functools.lru_cache(maxsize=1024)
 def degrees_of_freedom(width: int) -> float:
     """Of the mean over `width` bins and all tapers, from the covariances of white noise's eigencoefficients.

@@ -13,6 +13,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -23,9 +24,9 @@ from gyrofuse.mismatch.bumps import light_taper
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.folds import N_FOLDS, N_JUDGED
 from gyrofuse.mismatch.remembered import remembered
-from gyrofuse.mismatch.shape_bands import DeepBands, Groups
+from gyrofuse.mismatch.shape_bands import N_PLACES, DeepBands, Groups
 from gyrofuse.mismatch.side import Side
-from gyrofuse.mismatch.spectra import Bands, cross_spectra, degrees_of_freedom
+from gyrofuse.mismatch.spectra import Bands, cross_spectra, degrees_of_freedom, taper_window
 
 # Bins of a block: the lowest band. The four tapers reach two bins down, and below one bin what is slower leaks in.
 _FIRST_BIN = 4
@@ -35,7 +36,33 @@ _PER_OCTAVE = 6  # bands: a third of an octave holds two, as narrow as smooth sp
 _WIDEST = 0.02  # cycles per sample: a band where filters cut off is to show their slope
 _SHARE_OF_END = 3  # bands are a third of the distance to half the rate at most: digital filters have zeros there
 _FEWEST_AT_END = 24  # ordinates of a whole record in a band there, which have no tapers
+_PER_BIN = 4  # frequencies in a bin at which the window of the tapers is laid out
 _SLOW_PER_OCTAVE = 4  # groups of ordinates: slow noise has no structure finer than that
+
+
+@dataclass(frozen=True, eq=False)
+class BlockBands(DeepBands):
+    """Bands of blocks, which show in each what their tapers let in from the others as well.
+
+    Next to a filter's edge, in its stop band and at its zeros that is most of the power.
+
+    Attributes:
+        seen: What each place adds to a band, `(place, band)`; its columns add up to one.
+    """
+
+    seen: Tensor
+
+    @classmethod
+    def of_blocks(cls, bins: Bands, record: int, below: Groups, beyond: Groups) -> BlockBands:
+        """Bands of the bins of blocks between groups of ordinates of a record."""
+        own = DeepBands.of(bins, record, below, beyond)
+        seen = torch.block_diag(*[torch.full((N_PLACES, 1), 1 / N_PLACES, dtype=torch.float64)] * len(own.dof))
+        first = len(below)
+        seen[:, first : first + len(bins.dof)] = _let_in(bins, own.places).mT
+        return cls(own.n_samples, own.edges, own.frequency, own.dof, own.deep, own.beyond, seen)
+
+    def mean_of(self, density: Tensor) -> Tensor:
+        return density @ self.seen
 
 
 class Spectra(NamedTuple):
@@ -73,13 +100,11 @@ class Compared(NamedTuple):
 @remembered
 def block_spectra(case: Case) -> Compared:
     """Both sides of a case."""
-    length = case.n_samples // N_JUDGED
-    above, below, beyond = block_bands(length), slow_groups(), fast_groups(case.n_samples)
     recorded, simulated = _of_side(case.recorded, case.n_samples), _of_side(case.simulated, case.n_samples)
     folds = torch.arange(len(recorded.dof)) % N_FOLDS
     parts = [(simulated.products[folds == k].sum(0), simulated.dof[folds == k].sum(0)) for k in range(N_FOLDS)]
     return Compared(
-        DeepBands.of(above, case.n_samples, below, beyond),
+        compared_bands(case.n_samples),
         recorded,
         Spectra(torch.stack([p for p, _ in parts]), torch.stack([d for _, d in parts])),
     )
@@ -119,6 +144,34 @@ def fast_groups(n_samples: int) -> Groups:
         edges.append(edges[-1] + max((n_samples - edges[-1]) // _SHARE_OF_END, _FEWEST_AT_END))
     edges[-1] = n_samples
     return tuple(tuple(range(a, b)) for a, b in itertools.pairwise(edges))
+
+
+@functools.lru_cache(maxsize=8)
+def compared_bands(n_samples: int) -> BlockBands:
+    """Bands in which recordings of so many samples are compared."""
+    bins = block_bands(n_samples // N_JUDGED)
+    return BlockBands.of_blocks(bins, n_samples, slow_groups(), fast_groups(n_samples))
+
+
+def _let_in(bins: Bands, places: Tensor) -> Tensor:
+    """What each place adds to the bands of blocks, `(band, place)`, by the window of their tapers.
+
+    A place stands for all frequencies that are nearer to it than to another one. Those next to zero are left out, for a
+    block's mean is taken off.
+    """
+    n = bins.n_samples
+    window = torch.fft.rfft(taper_window(n, _PER_BIN))
+    inside = torch.zeros(len(bins.dof), _PER_BIN * n, dtype=torch.float64)
+    for band, (first, end) in enumerate(itertools.pairwise(bins.edges)):
+        inside[band, _PER_BIN * first : _PER_BIN * end : _PER_BIN] = 1.0
+    around = torch.fft.irfft(torch.fft.rfft(inside) * window, n=_PER_BIN * n)
+    half = _PER_BIN * n // 2
+    weights = around[:, : half + 1] + torch.nn.functional.pad(around[:, half + 1 :].flip(-1), (1, 1))
+    frequency = torch.arange(half + 1, dtype=torch.float64) / (_PER_BIN * n)
+    weights = weights * (frequency >= 0.5 / n)
+    nearest = torch.bucketize(frequency, (places[1:] + places[:-1]) / 2)
+    shares = torch.zeros(len(weights), len(places), dtype=torch.float64).index_add_(1, nearest, weights)
+    return shares / shares.sum(-1, keepdim=True)
 
 
 def _of_side(side: Side, n_samples: int) -> Spectra:

@@ -22,6 +22,7 @@ from .spectral import added
 from .strange import noise_of_level
 
 Array = NDArray[np.float64]
+_MEMORY = 4096  # samples: of the slowest filter, whose corner is 0.003 of the rate, after which nothing is left
 FLOOR = 1e-9  # of a filter's squared gain: what it stops leaks in from elsewhere, and cannot be told from nothing
 
 
@@ -63,12 +64,16 @@ class Design(NamedTuple):
         return np.abs(sps.freqz(*self.taps(corner), worN=at)[1]) ** 2
 
     def apply(self, corner: float, signal: Array) -> Array:
-        """From rest at the first value: what that leaves behind is gone after the filter's own memory."""
-        start = signal[..., :1]
+        """A filter that has run for long when the record begins: over its mirrored beginning first."""
+        before = min(_MEMORY, signal.shape[-1] - 1)
+        whole = np.concatenate([signal[..., before:0:-1], signal], axis=-1)
+        start = whole[..., :1]
         if self.sections:
-            return sps.sosfilt(self.sections(corner), signal - start, axis=-1) + start
-        assert self.taps
-        return sps.lfilter(*self.taps(corner), signal - start, axis=-1) + start
+            filtered = sps.sosfilt(self.sections(corner), whole - start, axis=-1)
+        else:
+            assert self.taps
+            filtered = sps.lfilter(*self.taps(corner), whole - start, axis=-1)
+        return (filtered + start)[..., before:]
 
 
 def _by_sections(design: Callable[..., Array], *given: float, **options: str) -> Design:
