@@ -106,7 +106,11 @@ def diagnose(
             write_json(drafts[model_out], found.model.to_dict())
         if report:
             with progress("drawing"):
-                found.to_html(drafts[report], title=f"{titled(logs)} against {simulation.name}", remarks=remarks)
+                said = [f"{titled(logs)}: {note}" for note in recording.notes]
+                if isinstance(simulated, Recording):
+                    said += [f"{simulation.name}: {note}" for note in simulated.notes]
+                title = f"{titled(logs)} against {simulation.name}"
+                found.to_html(drafts[report], title=title, remarks=[*remarks, *said])
         if json_file:
             sources = {"recording": list(recording.source), "simulation": simulation.name}
             if judge is not None:

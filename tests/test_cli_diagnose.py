@@ -200,3 +200,16 @@ def test_files_are_replaced_with_force_only_and_whole_or_not_at_all(
     assert run(*diagnose, "--force", "--report", "r.html").status == 2
     assert Path("r.json").read_text() == "mine"
     assert sorted(path.name for path in Path().iterdir()) == ["log.npz", "model.json", "r.json", "sim.npz"]
+
+
+def test_what_was_guessed_on_reading_stands_on_the_page(run: Run, tmp_path: Path):
+    generator = torch.Generator().manual_seed(2)
+    recorded, simulated = (torch.randn(1, 4200, dtype=torch.float64, generator=generator) for _ in range(2))
+    rows = np.c_[np.arange(4200) / 100, recorded[0]]
+    np.savetxt(tmp_path / "log.csv", rows, delimiter=",", header="fs = 50 Hz\ntime,gx [deg/s]", fmt="%.6f")
+    gf.Recording(simulated, rate=100.0, unit="deg/s").save(tmp_path / "sim.npz")
+    done = run("diagnose", "log.csv", "--simulation", "sim.npz", "--report", "page.html")
+    assert done.status == 0, done.err
+    page = (tmp_path / "page.html").read_text()
+    assert "the log states 50 Hz, its timestamps say 100 Hz and are believed" in page
+    assert "time column &#39;time&#39; states no unit: read as s" in page
