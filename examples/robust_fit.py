@@ -32,7 +32,9 @@ if arguments.log is None:
     recording = gf.Recording(signal + spikes, rate=100.0)
     print(f"simulated: {truth}, {int((spikes > 0).sum())} spikes in {signal.shape[-1]} samples\n")
 else:
-    recording = gf.read_recording(arguments.log)
+    recording = gf.read_recording(arguments.log).axes_as_sensors()
+    if recording.axes:  # of several devices
+        recording = recording.select(axis=recording.axes[0])
 
 options = {"model": arguments.model, "n_levels": arguments.levels}
 classic = gf.fit_gmwm(recording, **options)

@@ -271,6 +271,6 @@ class TestFuzzer:
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reader: Callable[[object], object], ended: str
     ):
         monkeypatch.setattr(fuzz_readers, "SECONDS", 60 if ended == "read" else 1)
-        monkeypatch.setattr(gf, "read_recording", lambda log, rate=None: reader(log))
+        monkeypatch.setattr(gf, "read_recording", lambda log, rate=None, quantity="rate": reader(log))
         log = csv(tmp_path, "time,gx,gy,gz")
         assert fuzz_readers.outcome(log)[0] == ended

@@ -169,7 +169,8 @@ def test_page_of_axes_and_without_units():
     forces = Recording(both, rate=RATE, unit="m/s^2")
     page = Page(model_report(fit_gmwm(forces, "WN + RW"), forces, title="accelerometers"))
     assert "in (m/s^2)" in page.text
-    assert "In datasheet units" not in page.text
+    assert "velocity random walk N" in page.text
+    assert "angle random walk" not in page.text
 
 
 def test_a_page_of_many_sensors_says_what_it_leaves_out(monkeypatch):

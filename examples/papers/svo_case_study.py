@@ -66,7 +66,7 @@ class Array:
 
 def adis(folder: Path, quick: bool) -> Array:
     """Parts of three recordings as one array; each part is cut once more to have something to score on."""
-    records = [gf.read_recording(folder / name) for name in FILES[:3]]
+    records = [gf.read_recording(folder / name).axes_as_sensors() for name in FILES[:3]]
     n_samples = records[0].n_samples // (32 if quick else 2)
     parts = [record.signal[:, half * n_samples :][:, :n_samples] for record in records for half in range(2)]
     signal = torch.cat(parts)[None]
