@@ -187,7 +187,8 @@ def _bounded(base: Any) -> Any:
 
 def _stream(data: Any, quantity: str, notes: list[str]) -> Stream:
     """One instance of a topic, with what it holds on the same clock."""
-    fields = {name: values.astype(np.float64) for name, values in data.data.items()}
+    with np.errstate(invalid="ignore"):  # damaged numbers may be any
+        fields = {name: values.astype(np.float64) for name, values in data.data.items()}
     combined = data.name == _COMBINED
     time = _time(fields, combined, quantity)
     channels, units, said = {}, {}, []
