@@ -220,6 +220,8 @@ def settings_by_group(values: Mapping[str, Any]) -> _Settings:
 def stated_rate(settings: _Settings, name: str) -> float | None:
     """Return the sampling rate in Hz that is stated nearest to the array `name`, `None` where there is none."""
     value = _nearest(settings, name, _RATE)
+    if np.iscomplexobj(value):
+        return None
     try:
         rate = float(_text(value) or np.asarray(value, dtype=np.float64).item())
     except (TypeError, ValueError):
