@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -142,14 +143,11 @@ class _Triad:
         if not bool(fitted.any()):
             raise ValueError(f"`{name}`: expected a fit, got one in which no sensor could be fitted")
         variance = torch.tensor([key.endswith("variance") for key in given.param_names])
-        limits = torch.where(variance & (params == 0), given.confidence_interval.high.flatten(0, -2), params)
-        known = limits.isfinite()
-        models, highest = (
-            tuple(given.model.with_params(row) for row in rows[fitted])
-            for rows in (params, torch.where(known, limits, params))
-        )
-        places = torch.cartesian_prod(*map(torch.arange, given.params.shape[:-1])).reshape(len(params), -1).tolist()
-        names = tuple(place(given.sensors, p, given.axes) for p, ok in zip(places, fitted.tolist(), strict=True) if ok)
+        limits = given.confidence_interval.high.flatten(0, -2)
+        limited = torch.where(variance & (params == 0) & limits.isfinite(), limits, params)
+        models, highest = (tuple(given.model.with_params(row) for row in rows[fitted]) for rows in (params, limited))
+        places = itertools.compress(itertools.product(*map(range, given.params.shape[:-1])), fitted.tolist())
+        names = tuple(place(given.sensors, index, given.axes) for index in places)
         return cls(names, models, highest, rate, unit, factor, given.confidence_level)
 
 

@@ -20,7 +20,7 @@ from gyrofuse._composition import Composition
 from gyrofuse._drift_sign import rising, signed
 from gyrofuse._model_tones import model_tones
 from gyrofuse._records import Records
-from gyrofuse._result import named, numbered
+from gyrofuse._result import named, numbered, place
 from gyrofuse._white_kurtosis import white_excess_kurtosis, with_excess_kurtosis
 from gyrofuse.continuous import fit_moments
 from gyrofuse.gmwm_result import GMWMResult
@@ -278,8 +278,7 @@ def _report(nu: Tensor, usable: Tensor, sensors: tuple[str, ...], strict: bool, 
     """Say which items cannot be fitted."""
     bad = (~usable).nonzero()[:, 0].tolist()
     n_sensors = len(sensors)
-    items = [f" of item {i // n_sensors}" if len(nu) > n_sensors else "" for i in bad]
-    places = [f"sensor {sensors[i % n_sensors]}{item}" for i, item in zip(bad, items, strict=True)]
+    places = [f"sensor {place(sensors, divmod(i, n_sensors) if len(nu) > n_sensors else (i,))}" for i in bad]
     what = (
         "expected wavelet variances that are finite and > 0 at every level (a constant signal has none, nor has one "
         "with infinite samples; squares of huge or tiny numbers leave the range; gaps leave no whole window at the "

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import re
 from array import array
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -111,7 +110,7 @@ def read_binary(content: bytes, allowance: Allowance) -> tuple[dict[str, Table],
         notes.append(f"the last {end - last} bytes are no message: the log was cut off, or its end is damaged")
     octets = np.frombuffer(content, np.uint8)
     tables: dict[str, Table] = {}
-    for kind in _most(read, lambda kind: len(kind.starts), notes):
+    for kind in _most(read, notes):
         begin = np.frombuffer(kind.starts, np.int64)
         dtype = kind.dtype
         allowance.take(f"messages {kind.name}", (begin.size, dtype.itemsize // 8 + 1))
@@ -152,7 +151,7 @@ def read_text(content: bytes, allowance: Allowance) -> tuple[dict[str, Table], l
                 kind.values.append(_number(values[i]))
     notes = [f"{bad} lines have more or fewer fields than declared and were left out: damage"] if bad else []
     tables: dict[str, Table] = {}
-    for kind in _most(read, lambda kind: len(kind.starts), notes):
+    for kind in _most(read, notes):
         rows = np.frombuffer(kind.values, np.float64).reshape(len(kind.starts), len(kind.fields))
         columns = {kind.columns[i]: rows[:, n].copy() for n, i in enumerate(kind.fields)}
         tables[kind.name] = {"": np.array(kind.starts, np.float64), **columns}
@@ -169,14 +168,14 @@ def _number(cell: bytes) -> float:
         return float("nan")
 
 
-def _most(kinds: list[_Kind], count: Callable[[_Kind], int], notes: list[str]) -> list[_Kind]:
+def _most(kinds: list[_Kind], notes: list[str]) -> list[_Kind]:
     """Of the kinds of one name, which a log that was put together from several may have, the one with most messages."""
     chosen: dict[str, _Kind] = {}
     for kind in kinds:
-        if count(kind) > (count(chosen[kind.name]) if kind.name in chosen else 0):
+        if len(kind.starts) > (len(chosen[kind.name].starts) if kind.name in chosen else 0):
             chosen[kind.name] = kind
     for name, kind in chosen.items():
-        left = sum(count(other) for other in kinds if other.name == name) - count(kind)
+        left = sum(len(other.starts) for other in kinds if other.name == name and other is not kind)
         if left:
             notes.append(f"{left} messages {name} declare other fields than most and were left out")
     return list(chosen.values())

@@ -80,10 +80,10 @@ def read(
         raise RecordingError(
             f"{path}: expected `fs` to be one sampling rate in Hz, found {found}; correct or leave it out"
         )
-    if columns is None and "gyro" not in content and content.get("channels", np.empty(0)).dtype.kind == "U":
-        return streams_from_tables(content, path, key, quantity)
     if columns is not None:
         return streams_from_arrays(content, path, key=key, quantity=quantity, columns=columns)
+    if "gyro" not in content and content.get("channels", np.empty(0)).dtype.kind == "U":
+        return streams_from_tables(content, path, key, quantity)
     return _recording(content, path, key, quantity)
 
 
