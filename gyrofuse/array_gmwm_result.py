@@ -275,7 +275,8 @@ class ArrayGMWMResult:
         Raises:
             ValueError: The result holds a batch.
         """
-        from gyrofuse.plotting import _BLUE, _deviation, _finish, plot_allan_deviation
+        from gyrofuse.axes import BLUE, finish
+        from gyrofuse.plotting import allan_deviation, plot_allan_deviation
 
         self._check_single("plot")
         measured, fitted = (
@@ -285,8 +286,8 @@ class ArrayGMWMResult:
         times = torch.exp2(torch.arange(len(measured), dtype=torch.float64)) / (self.rate or 1.0)
         in_seconds = self.rate is not None
         ax = plot_allan_deviation(times, measured, names=self.sensors, unit=self.unit, in_seconds=in_seconds, ax=ax)
-        lines = ax.plot(times, _deviation(fitted), color=_BLUE, linewidth=1.2, linestyle="--", zorder=3)
-        _finish(ax, [ax.lines[0], lines[0]], [f"{len(self.sensors)} sensors", "fitted model"])
+        lines = ax.plot(times, allan_deviation(fitted), color=BLUE, linewidth=1.2, linestyle="--", zorder=3)
+        finish(ax, [ax.lines[0], lines[0]], [f"{len(self.sensors)} sensors", "fitted model"])
         return ax
 
     def to_dict(self) -> dict[str, Any]:

@@ -11,24 +11,35 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from numpy.typing import ArrayLike, NDArray
-from torch import Tensor
+
+from gyrofuse.axes import (
+    BLUE,
+    DASHED,
+    FRAME,
+    GREY,
+    INK,
+    LABEL_SIZE,
+    MOST_LABELS,
+    ORANGE,
+    SHADE,
+    SMALL_SIZE,
+    TICK_SIZE,
+    Array,
+    Numbers,
+    as_array,
+    clean_name,
+    finish,
+    name_ticks,
+    new_axes,
+    with_unit,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
 
-Array = NDArray[np.float64]
-Numbers = ArrayLike | Tensor
 Limits = tuple[Numbers, Numbers]
 
-_BLUE, _ORANGE, _GREY, _INK, _FRAME, _GRID = "#0072b2", "#d55e00", "#969696", "#262626", "#8c8c8c", "#e3e3e3"
-_MEAN: dict[str, Any] = {"color": _ORANGE, "linewidth": 1.5, "linestyle": (0, (5, 2))}
-_SHADE: dict[str, Any] = {"color": _BLUE, "alpha": 0.18, "linewidth": 0}
-_LABEL, _TICK, _SMALL = 9.0, 8.0, 7.0  # font sizes in points
-_MOST_LABELS = 16  # sensors that still get a label each
-_LONGEST_NAME = 18  # characters
 _N_BLOCKS = 600  # of a signal, however long: more than a figure can show
 
 
@@ -60,29 +71,29 @@ def plot_allan_deviation(
     Returns:
         The axes.
     """
-    ax = ax if ax is not None else _new_axes()
-    times, sensors = _array(tau), _deviation(wavelet_variance)
-    thin = 0.9 if len(names) <= _MOST_LABELS else 0.5
-    handles: list[Any] = ax.plot(times, sensors, color=_GREY, linewidth=thin, zorder=2)[:1]
-    labels = [f"sensor {_clean(names[0])}" if len(names) == 1 else f"{len(names)} sensors"]
+    ax = ax if ax is not None else new_axes()
+    times, sensors = as_array(tau), allan_deviation(wavelet_variance)
+    thin = 0.9 if len(names) <= MOST_LABELS else 0.5
+    handles: list[Any] = ax.plot(times, sensors, color=GREY, linewidth=thin, zorder=2)[:1]
+    labels = [f"sensor {clean_name(names[0])}" if len(names) == 1 else f"{len(names)} sensors"]
     if equal is not None:
-        handles += ax.plot(times, _deviation(equal), zorder=4, **_MEAN)
+        handles += ax.plot(times, allan_deviation(equal), zorder=4, **DASHED)
         labels += ["plain mean"]
     if virtual is not None:
-        handles += ax.plot(times, _deviation(virtual), color=_BLUE, linewidth=2.4, zorder=5)
+        handles += ax.plot(times, allan_deviation(virtual), color=BLUE, linewidth=2.4, zorder=5)
         labels += ["virtual gyro"]
     if band is not None:
         low, high = band
-        handles += [ax.fill_between(times, _deviation(low), _deviation(high), zorder=3, **_SHADE)]
+        handles += [ax.fill_between(times, allan_deviation(low), allan_deviation(high), zorder=3, **SHADE)]
         labels += ["its confidence interval"]
     if not np.isfinite(ax.dataLim.get_points()).all():
         # Logarithmic axes do not start from nothing.
         ax.set(xlim=(times[0] / 2, 2 * times[-1]), ylim=(0.1, 1.0))
     ax.set_yscale("log")
     ax.set_ylabel(with_unit("Allan deviation", unit), parse_math=False)
-    _time_axis(ax, in_seconds)
-    _finish(ax, handles, labels)
-    if 1 < len(names) <= _MOST_LABELS:
+    time_axis(ax, in_seconds)
+    finish(ax, handles, labels)
+    if 1 < len(names) <= MOST_LABELS:
         _label_line_ends(ax, times, sensors, names)
     return ax
 
@@ -102,24 +113,24 @@ def plot_ratio(
     Returns:
         The axes.
     """
-    ax = ax if ax is not None else _new_axes()
-    times, ratios = _array(tau), _array(ratio)
-    ax.axhline(1, zorder=3, **_MEAN)
+    ax = ax if ax is not None else new_axes()
+    times, ratios = as_array(tau), as_array(ratio)
+    ax.axhline(1, zorder=3, **DASHED)
     if band is not None:
         low, high = band
-        ax.fill_between(times, _array(low), _array(high), zorder=2, **_SHADE)
+        ax.fill_between(times, as_array(low), as_array(high), zorder=2, **SHADE)
     known = np.isfinite(ratios)
     if known.any():
         # Shade along the line as drawn, straight in log tau, so that the shade ends where the line crosses 1.
         log_times = np.log(times[known])
         fine = np.linspace(log_times[0], log_times[-1], 1000)
         drawn = np.interp(fine, log_times, ratios[known])
-        ax.fill_between(np.exp(fine), drawn, 1, where=drawn < 1, zorder=1, **_SHADE)
-    ax.plot(times, ratios, color=_BLUE, linewidth=2.0, marker="o", markersize=3.5, zorder=5)
+        ax.fill_between(np.exp(fine), drawn, 1, where=drawn < 1, zorder=1, **SHADE)
+    ax.plot(times, ratios, color=BLUE, linewidth=2.0, marker="o", markersize=3.5, zorder=5)
     ax.margins(y=0.12)
     ax.set_ylabel("virtual / plain mean")
-    _time_axis(ax, in_seconds)
-    _finish(ax)
+    time_axis(ax, in_seconds)
+    finish(ax)
     return ax
 
 
@@ -147,30 +158,30 @@ def plot_weights(
     """
     from matplotlib.lines import Line2D
 
-    ax = ax if ax is not None else _new_axes()
-    lows, highs = _array(low), _array(high)
+    ax = ax if ax is not None else new_axes()
+    lows, highs = as_array(low), as_array(high)
     place = np.arange(len(names))
-    size = 5.5 if len(names) <= 2 * _MOST_LABELS else 3.5
+    size = 5.5 if len(names) <= 2 * MOST_LABELS else 3.5
     unsure = (lows <= 0) & (highs >= 0)
-    colors = np.where(unsure, "white", _BLUE)
-    ax.axhline(0, color=_FRAME, linewidth=0.8, zorder=1)
-    ax.vlines(place, lows, highs, color=_BLUE, linewidth=1.6, zorder=3)
-    ax.scatter(place, _array(weights), size**2, colors, edgecolors=_BLUE, zorder=4)
+    colors = np.where(unsure, "white", BLUE)
+    ax.axhline(0, color=FRAME, linewidth=0.8, zorder=1)
+    ax.vlines(place, lows, highs, color=BLUE, linewidth=1.6, zorder=3)
+    ax.scatter(place, as_array(weights), size**2, colors, edgecolors=BLUE, zorder=4)
     handles: list[Any] = []
     labels = []
-    for color, label in ((_BLUE, "interval excludes 0"), ("white", "interval holds 0")):
+    for color, label in ((BLUE, "interval excludes 0"), ("white", "interval holds 0")):
         if (np.isfinite(lows) & (colors == color)).any():
-            handles += [Line2D([], [], marker="o", markersize=size, color=_BLUE, markerfacecolor=color, linestyle="")]
+            handles += [Line2D([], [], marker="o", markersize=size, color=BLUE, markerfacecolor=color, linestyle="")]
             labels += [label]
     if equal:
-        handles += [ax.axhline(1 / len(names), zorder=2, **_MEAN)]
+        handles += [ax.axhline(1 / len(names), zorder=2, **DASHED)]
         labels += [f"plain mean (1/{len(names)})"]
     ax.margins(y=0.12)
     ax.set_xlim(-0.6, len(names) - 0.4)
     ax.set_xlabel("sensor")
     ax.set_ylabel("weight")
-    _name_ticks(ax, names)
-    _finish(ax, handles, labels, loc="lower right", bbox_to_anchor=(1, 1), ncols=3, borderaxespad=0.2)
+    name_ticks(ax, names)
+    finish(ax, handles, labels, loc="lower right", bbox_to_anchor=(1, 1), ncols=3, borderaxespad=0.2)
     ax.grid(visible=False, axis="x")
     return ax
 
@@ -192,30 +203,30 @@ def plot_band_weights(
     """
     from matplotlib.colors import LinearSegmentedColormap
 
-    ax = ax if ax is not None else _new_axes()
-    times, values = _array(tau), _array(weights)
+    ax = ax if ax is not None else new_axes()
+    times, values = as_array(tau), as_array(weights)
     n_bands = len(values)
     # A level reaches half an octave to either side; the last band to the end, or an octave where no level is left.
     starts = np.append(times, 2 * times[-1])[:n_bands] / np.sqrt(2)
     edges = np.append(starts, np.sqrt(2) * max(times[-1], starts[-1] * np.sqrt(2)))
     largest = np.abs(values[np.isfinite(values)]).max(initial=1e-9)
-    colors = LinearSegmentedColormap.from_list("signed", [_ORANGE, "white", _BLUE])
+    colors = LinearSegmentedColormap.from_list("signed", [ORANGE, "white", BLUE])
     mesh = ax.pcolormesh(
         edges, np.arange(len(names) + 1) - 0.5, values.T, cmap=colors, vmin=-largest, vmax=largest, edgecolors="face"
     )
-    _time_axis(ax, in_seconds)
+    time_axis(ax, in_seconds)
     ax.invert_yaxis()  # the first sensor above, as in a table
-    step = -(-len(names) // _MOST_LABELS)
-    ax.set_yticks(range(0, len(names), step), [_clean(name) for name in names[::step]], parse_math=False)
+    step = -(-len(names) // MOST_LABELS)
+    ax.set_yticks(range(0, len(names), step), [clean_name(name) for name in names[::step]], parse_math=False)
     ax.set_ylabel("sensor")
-    _finish(ax)
+    finish(ax)
     ax.grid(visible=False)
     # Beside the axes rather than out of them: figures above keep the same time axis.
     scale = ax.inset_axes((1.02, 0.0, 0.02, 1.0))
     ax.figure.colorbar(mesh, cax=scale)
-    scale.spines["outline"].set(color=_FRAME, linewidth=0.8)
-    scale.set_ylabel("weight", color=_INK, fontsize=_LABEL)
-    scale.tick_params(color=_FRAME, labelcolor=_INK, labelsize=_TICK)
+    scale.spines["outline"].set(color=FRAME, linewidth=0.8)
+    scale.set_ylabel("weight", color=INK, fontsize=LABEL_SIZE)
+    scale.tick_params(color=FRAME, labelcolor=INK, labelsize=TICK_SIZE)
     return ax
 
 
@@ -240,23 +251,23 @@ def plot_signals(
         in_seconds: Whether `time` is in seconds, else in samples.
     """
     top, bottom = figure.subplots(2, 1, sharex=True)
-    styles: tuple[dict[str, Any], ...] = ({"color": _BLUE, "linewidth": 1.2, "zorder": 4}, _MEAN | {"linewidth": 1.0})
-    times, handles = _array(time), []
+    styles: tuple[dict[str, Any], ...] = ({"color": BLUE, "linewidth": 1.2, "zorder": 4}, DASHED | {"linewidth": 1.0})
+    times, handles = as_array(time), []
     for i, (values, style) in enumerate(zip(signals.values(), styles, strict=False)):
-        instants, low, high, average = _in_blocks(times, _array(values))
+        instants, low, high, average = _in_blocks(times, as_array(values))
         known = average[np.isfinite(average)]
         handles += bottom.plot(instants, average - (known.mean() if known.size else 0.0), **style)
         if i == 0:
-            top.fill_between(instants, low, high, color=_BLUE, alpha=0.55, linewidth=0.4)
+            top.fill_between(instants, low, high, color=BLUE, alpha=0.55, linewidth=0.4)
     names = list(signals)
     block = f"{(times[-1] - times[0]) / len(instants):.3g} {'s' if in_seconds else 'samples'}"
-    top.set_title(f"{names[0].capitalize()}, range of the samples", loc="left", fontsize=_LABEL, color=_INK)
-    bottom.set_title(f"Averages over {block}, less the mean", loc="left", fontsize=_LABEL, color=_INK)
+    top.set_title(f"{names[0].capitalize()}, range of the samples", loc="left", fontsize=LABEL_SIZE, color=INK)
+    bottom.set_title(f"Averages over {block}, less the mean", loc="left", fontsize=LABEL_SIZE, color=INK)
     for ax in (top, bottom):
         ax.set_ylabel(with_unit("signal", unit), parse_math=False)
     bottom.set_xlabel("time (s)" if in_seconds else "sample")
-    _finish(top)
-    _finish(bottom, handles, names, loc="lower right", bbox_to_anchor=(1, 1), ncols=2, borderaxespad=0.2)
+    finish(top)
+    finish(bottom, handles, names, loc="lower right", bbox_to_anchor=(1, 1), ncols=2, borderaxespad=0.2)
     figure.align_ylabels()
 
 
@@ -294,7 +305,7 @@ def plot_fusion(
     """
     above, middle, below = figure.subplots(3, 1, height_ratios=[1.1, 2.6, 1.3])
     above.sharex(middle)
-    plot_ratio(tau, _deviation(virtual) / _deviation(equal), in_seconds=in_seconds, ax=above)
+    plot_ratio(tau, allan_deviation(virtual) / allan_deviation(equal), in_seconds=in_seconds, ax=above)
     above.set_xlabel("")
     above.tick_params(labelbottom=False)
     plot_allan_deviation(
@@ -308,7 +319,7 @@ def plot_fusion(
         in_seconds=in_seconds,
         ax=middle,
     )
-    values = _array(weights)
+    values = as_array(weights)
     if values.ndim == 2:
         below.sharex(middle)
         middle.set_xlabel("")
@@ -322,24 +333,9 @@ def plot_fusion(
     figure.align_ylabels([above, middle] if values.ndim == 2 else [above, middle, below])
 
 
-def with_unit(label: str, unit: str | None) -> str:
-    """A label with its unit, where that is known."""
-    return f"{label} ({unit})" if unit and unit != "unknown" else label
-
-
-def _new_axes() -> Axes:
-    import matplotlib.pyplot as plt
-
-    return plt.subplots(figsize=(7.0, 4.6), layout="constrained")[1]
-
-
-def _array(value: Numbers) -> Array:
-    return torch.as_tensor(value).detach().cpu().double().numpy()
-
-
-def _deviation(variance: Numbers) -> Array:
+def allan_deviation(variance: Numbers) -> Array:
     """`sqrt(2 nu)`, NaN where a logarithmic axis has no place for it."""
-    values = _array(variance)
+    values = as_array(variance)
     return np.sqrt(2 * np.where(values > 0, values, np.nan))
 
 
@@ -353,42 +349,10 @@ def _in_blocks(times: Array, values: Array) -> tuple[Array, Array, Array, Array]
     return times[starts], np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts), average
 
 
-def _time_axis(ax: Axes, in_seconds: bool) -> None:
+def time_axis(ax: Axes, in_seconds: bool) -> None:
     ax.set_xscale("log")
     ax.margins(x=0.02)
     ax.set_xlabel("averaging time (s)" if in_seconds else "averaging time (samples)")
-
-
-def _finish(ax: Axes, handles: Sequence[Any] = (), labels: Sequence[str] = (), **place: Any) -> None:
-    """Give axes the common look, and a legend for `handles` at `place`."""
-    ax.spines[["top", "right"]].set_visible(False)
-    ax.spines[["left", "bottom"]].set_color(_FRAME)
-    ax.tick_params(which="both", color=_FRAME, labelcolor=_INK, labelsize=_TICK)
-    for axis in (ax.xaxis, ax.yaxis):
-        axis.label.set(color=_INK, fontsize=_LABEL)
-        axis.get_offset_text().set(color=_INK, fontsize=_TICK)
-    ax.grid(color=_GRID, linewidth=0.7)
-    ax.set_axisbelow(True)
-    if handles:
-        legend = ax.legend(handles, labels, fontsize=_TICK, labelcolor=_INK, frameon=True, framealpha=0.85, **place)
-        legend.get_frame().set(edgecolor="none", facecolor="white")
-        for text in legend.get_texts():
-            text.set_parse_math(False)
-
-
-def _clean(name: str) -> str:
-    """A name that fits a figure: printable and not too long."""
-    text = "".join(c if c.isprintable() else "?" for c in name)
-    return text if len(text) <= _LONGEST_NAME else f"{text[: _LONGEST_NAME - 1]}…"
-
-
-def _name_ticks(ax: Axes, names: Sequence[str]) -> None:
-    """Name the places 0, 1, ... on the x axis; turned when they are long, every n-th when they are many."""
-    step = -(-len(names) // (2 * _MOST_LABELS))
-    shown = [_clean(name) for name in names[::step]]
-    room = ax.get_window_extent().width * 72 / ax.figure.dpi / len(shown)  # points for each
-    turned = max(map(len, shown)) + 1 > room / (0.6 * _TICK)
-    ax.set_xticks(range(0, len(names), step), shown, rotation=90 if turned else 0, fontsize=_TICK, parse_math=False)
 
 
 def _label_line_ends(ax: Axes, times: Array, values: Array, names: Sequence[str]) -> None:
@@ -399,19 +363,19 @@ def _label_line_ends(ax: Axes, times: Array, values: Array, names: Sequence[str]
     bottom, top = np.log(ax.get_ylim())
     ends = np.array([np.log(values[last[column], column]) for column in order])
     height = ax.get_window_extent().height * 72 / ax.figure.dpi  # points
-    places = _spread((ends - bottom) / (top - bottom) * height, gap=1.25 * _SMALL)
+    places = _spread((ends - bottom) / (top - bottom) * height, gap=1.25 * SMALL_SIZE)
     for column, place in zip(order, places, strict=True):
         ax.annotate(
-            _clean(names[column]),
+            clean_name(names[column]),
             xy=(times[last[column]], values[last[column], column]),
             xytext=(1.015, place / height),
             textcoords="axes fraction",
             color="#6b6b6b",
-            fontsize=_SMALL,
+            fontsize=SMALL_SIZE,
             va="center",
             parse_math=False,
             annotation_clip=False,
-            arrowprops={"arrowstyle": "-", "color": _GREY, "linewidth": 0.4, "shrinkA": 0, "shrinkB": 1}
+            arrowprops={"arrowstyle": "-", "color": GREY, "linewidth": 0.4, "shrinkA": 0, "shrinkB": 1}
             | {"relpos": (0, 0.5)},
         )
 

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gyrofuse.plotting import _BLUE, _FRAME, _MEAN, _array, _clean, _finish, _new_axes
+from gyrofuse.axes import BLUE, DASHED, FRAME, as_array, clean_name, finish, new_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.ticker import Locator
 
-_COLOURS = (_BLUE, "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#969696", "#8c510a")  # not that of the mean
+_COLOURS = (BLUE, "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#969696", "#8c510a")  # not that of the mean
 _FEWEST_BINS, _MOST_BINS = 5, 60
 
 
@@ -41,16 +41,16 @@ def plot_spread(
     Returns:
         The axes.
     """
-    ax = ax if ax is not None else _new_axes()
-    known = _array(values)
+    ax = ax if ax is not None else new_axes()
+    known = as_array(values)
     known = known[np.isfinite(known)]
     n_bins = min(max(round(2 * np.sqrt(known.size)), _FEWEST_BINS), _MOST_BINS)
-    ax.hist(known, bins=n_bins, range=limits, color=_BLUE, alpha=0.75)
-    line = ax.axvline(mark, **_MEAN)
+    ax.hist(known, bins=n_bins, range=limits, color=BLUE, alpha=0.75)
+    line = ax.axvline(mark, **DASHED)
     ax.set_xlabel(label)
     ax.set_ylabel(what)
     ax.yaxis.set_major_locator(_whole())
-    _finish(ax, [line], [meaning], loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0.2)
+    finish(ax, [line], [meaning], loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0.2)
     return ax
 
 
@@ -65,22 +65,22 @@ def plot_course(weights: Sequence[Sequence[float]], *, names: Sequence[str], ax:
     Returns:
         The axes.
     """
-    ax = ax if ax is not None else _new_axes()
-    table = _array(weights)
-    ax.axhline(0, color=_FRAME, linewidth=0.8, zorder=1)
+    ax = ax if ax is not None else new_axes()
+    table = as_array(weights)
+    ax.axhline(0, color=FRAME, linewidth=0.8, zorder=1)
     place = np.arange(1, len(table) + 1)
     handles = [
         ax.plot(place, table[:, i], marker=".", linewidth=1.2, color=_COLOURS[i % len(_COLOURS)])[0]
         for i in range(table.shape[1])
     ]
-    handles.append(ax.axhline(1 / table.shape[1], zorder=2, **_MEAN))
+    handles.append(ax.axhline(1 / table.shape[1], zorder=2, **DASHED))
     ax.set_xlabel("log, in the order of the table")
     ax.set_ylabel("weight")
     ax.xaxis.set_major_locator(_whole())
     shown = len(_COLOURS)
-    labels = [*(_clean(name) for name in names[:shown]), "plain mean"]
+    labels = [*(clean_name(name) for name in names[:shown]), "plain mean"]
     kept = [*handles[:-1][:shown], handles[-1]]
-    _finish(ax, kept, labels, loc="lower right", bbox_to_anchor=(1, 1), ncols=min(len(kept), 5), borderaxespad=0.2)
+    finish(ax, kept, labels, loc="lower right", bbox_to_anchor=(1, 1), ncols=min(len(kept), 5), borderaxespad=0.2)
     return ax
 
 

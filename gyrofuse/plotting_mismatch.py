@@ -9,22 +9,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gyrofuse.plotting import (
-    _BLUE,
-    _FRAME,
-    _INK,
-    _LABEL,
-    _MOST_LABELS,
-    _ORANGE,
-    _SHADE,
-    _TICK,
-    _clean,
-    _deviation,
-    _finish,
-    _new_axes,
-    _time_axis,
+from gyrofuse.axes import (
+    BLUE,
+    FRAME,
+    INK,
+    LABEL_SIZE,
+    MOST_LABELS,
+    ORANGE,
+    SHADE,
+    TICK_SIZE,
+    clean_name,
+    finish,
+    new_axes,
     with_unit,
 )
+from gyrofuse.plotting import allan_deviation, time_axis
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -65,11 +64,11 @@ def plot_map(
     """
     from matplotlib.colors import LinearSegmentedColormap
 
-    ax = ax if ax is not None else _new_axes()
+    ax = ax if ax is not None else new_axes()
     values = z.numpy()
     octaves = np.exp2(np.arange(len(values) + 1) - 0.5)
     places = octaves / rate if edges is None else edges.numpy() * rate
-    colours = LinearSegmentedColormap.from_list("signed", [_BLUE, "white", _ORANGE]).with_extremes(bad=_UNKNOWN)
+    colours = LinearSegmentedColormap.from_list("signed", [BLUE, "white", ORANGE]).with_extremes(bad=_UNKNOWN)
     reach = largest if largest is not None else ends_of_colours(z)
     rows = np.arange(len(names) + 1) - 0.5
     mesh = ax.pcolormesh(places, rows, np.ma.masked_invalid(values).T, cmap=colours, vmin=-reach, vmax=reach)
@@ -77,19 +76,19 @@ def plot_map(
     known = np.isfinite(values)
     limit = -float(torch.special.ndtri(torch.tensor(_BY_CHANCE / 2 / max(int(known.sum()), 1), dtype=torch.float64)))
     place, sensor = np.nonzero(known & (np.abs(np.where(known, values, 0.0)) > limit))
-    ax.plot(np.sqrt(places[place] * places[place + 1]), sensor, "o", color=_INK, markersize=2.5)
-    ax.plot(lines_hz, np.full(len(lines_hz), -0.5), color=_ORANGE, **_MARK)
+    ax.plot(np.sqrt(places[place] * places[place + 1]), sensor, "o", color=INK, markersize=2.5)
+    ax.plot(lines_hz, np.full(len(lines_hz), -0.5), color=ORANGE, **_MARK)
     if edges is None:
-        _time_axis(ax, True)
+        time_axis(ax, True)
     else:
         ax.set_xscale("log")
         ax.set_xlabel("frequency (Hz)")
     ax.set_xlim(places[0], places[-1])
     ax.set_ylim(len(names) - 0.5, -0.5)  # the first sensor above, as in a table
-    step = -(-len(names) // _MOST_LABELS)
-    ax.set_yticks(range(0, len(names), step), [_clean(name) for name in names[::step]], parse_math=False)
+    step = -(-len(names) // MOST_LABELS)
+    ax.set_yticks(range(0, len(names), step), [clean_name(name) for name in names[::step]], parse_math=False)
     ax.set_ylabel("sensor")
-    _finish(ax)
+    finish(ax)
     ax.grid(visible=False)
     _colour_scale(ax, mesh)
     return ax
@@ -117,16 +116,16 @@ def plot_deviations(
     Returns:
         The axes.
     """
-    ax = ax if ax is not None else _new_axes()
+    ax = ax if ax is not None else new_axes()
     times = np.exp2(np.arange(len(recorded))) / rate
-    low, high = (_deviation(simulated * (sign * 1.96 * spread).exp()) for sign in (-1, 1))
-    handles: list[Any] = ax.plot(times, _deviation(recorded), "o", color=_INK, markersize=4, zorder=4)
-    handles += ax.plot(times, _deviation(simulated), color=_BLUE, linewidth=1.8, zorder=3)
-    handles += [ax.fill_between(times, low, high, zorder=1, **_SHADE)]
+    low, high = (allan_deviation(simulated * (sign * 1.96 * spread).exp()) for sign in (-1, 1))
+    handles: list[Any] = ax.plot(times, allan_deviation(recorded), "o", color=INK, markersize=4, zorder=4)
+    handles += ax.plot(times, allan_deviation(simulated), color=BLUE, linewidth=1.8, zorder=3)
+    handles += [ax.fill_between(times, low, high, zorder=1, **SHADE)]
     ax.set_yscale("log")
     ax.set_ylabel(with_unit("Allan deviation", unit), parse_math=False)
-    _time_axis(ax, True)
-    _finish(ax, handles, ["recording", "simulation", "where 95 % of recordings lie that agree"])
+    time_axis(ax, True)
+    finish(ax, handles, ["recording", "simulation", "where 95 % of recordings lie that agree"])
     return ax
 
 
@@ -150,20 +149,20 @@ def plot_spectra(
     Returns:
         The axes.
     """
-    ax = ax if ax is not None else _new_axes()
+    ax = ax if ax is not None else new_axes()
     (f, mean, largest), (other_f, other_mean, other_largest) = recorded, simulated
-    handles: list[Any] = ax.plot(f * rate, mean, color=_INK, linewidth=1.1, zorder=4)
-    handles += ax.plot(f * rate, largest, "o", color=_INK, markersize=2.5, zorder=5)
-    handles += ax.plot(other_f * rate, other_mean, color=_BLUE, linewidth=1.1, zorder=3)
-    handles += ax.plot(other_f * rate, other_largest, color=_BLUE, linewidth=0.9, alpha=0.6, zorder=2)
-    ax.plot(lines_hz, np.ones(len(lines_hz)), color=_ORANGE, transform=ax.get_xaxis_transform(), **_MARK)
+    handles: list[Any] = ax.plot(f * rate, mean, color=INK, linewidth=1.1, zorder=4)
+    handles += ax.plot(f * rate, largest, "o", color=INK, markersize=2.5, zorder=5)
+    handles += ax.plot(other_f * rate, other_mean, color=BLUE, linewidth=1.1, zorder=3)
+    handles += ax.plot(other_f * rate, other_largest, color=BLUE, linewidth=0.9, alpha=0.6, zorder=2)
+    ax.plot(lines_hz, np.ones(len(lines_hz)), color=ORANGE, transform=ax.get_xaxis_transform(), **_MARK)
     ax.set_xscale("log")
     ax.set_yscale("log")
     ax.set_ylim(bottom=max(ax.get_ylim()[0], _FLOOR))
     ax.set_xlabel("frequency (Hz)")
     ax.set_ylabel("power over the simulation's")
     labels = ["recording, mean", "recording, largest", "simulation, mean", "simulation, largest"]
-    _finish(ax, handles, labels, ncols=2, loc="lower right")
+    finish(ax, handles, labels, ncols=2, loc="lower right")
     return ax
 
 
@@ -182,15 +181,15 @@ def plot_blocks(
     Returns:
         The axes.
     """
-    ax = ax if ax is not None else _new_axes()
+    ax = ax if ax is not None else new_axes()
     times = (np.arange(len(means)) + 0.5) * duration / len(means)
-    ax.plot(times, means - means.mean(), color=_INK, linewidth=1.0, zorder=3)
+    ax.plot(times, means - means.mean(), color=INK, linewidth=1.0, zorder=3)
     for onset in onsets:
-        ax.axvline(onset, color=_ORANGE, linewidth=1.2, linestyle=(0, (4, 3)), zorder=2)
+        ax.axvline(onset, color=ORANGE, linewidth=1.2, linestyle=(0, (4, 3)), zorder=2)
     ax.set_xlim(0, duration)
     ax.set_xlabel("time (s)")
     ax.set_ylabel(with_unit("average", unit), parse_math=False)
-    _finish(ax)
+    finish(ax)
     return ax
 
 
@@ -198,6 +197,6 @@ def _colour_scale(ax: Axes, mesh: QuadMesh) -> None:
     """Beside the axes rather than out of them, so that maps above each other are alike."""
     scale = ax.inset_axes((1.02, 0.0, 0.02, 1.0))
     ax.figure.colorbar(mesh, cax=scale, extend="both", extendfrac=0.04)
-    scale.spines["outline"].set(color=_FRAME, linewidth=0.8)
-    scale.set_ylabel("standard deviations", color=_INK, fontsize=_LABEL)
-    scale.tick_params(color=_FRAME, labelcolor=_INK, labelsize=_TICK)
+    scale.spines["outline"].set(color=FRAME, linewidth=0.8)
+    scale.set_ylabel("standard deviations", color=INK, fontsize=LABEL_SIZE)
+    scale.tick_params(color=FRAME, labelcolor=INK, labelsize=TICK_SIZE)

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gyrofuse.plotting import _BLUE, _INK, _SHADE, _deviation, _finish, _new_axes, _time_axis, with_unit
+from gyrofuse.axes import BLUE, INK, SHADE, finish, new_axes, with_unit
+from gyrofuse.plotting import allan_deviation, time_axis
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,17 +52,17 @@ def plot_moment_fit(
     Returns:
         The axes.
     """
-    ax = ax if ax is not None else _new_axes()
+    ax = ax if ax is not None else new_axes()
     n_levels = len(wavelet_variance)
     times = np.exp2(np.arange(n_levels)) / (rate or 1.0)
     low, high = limits
-    handles: list[Any] = [ax.fill_between(times, _deviation(low), _deviation(high), zorder=1, **_SHADE)]
+    handles: list[Any] = [ax.fill_between(times, allan_deviation(low), allan_deviation(high), zorder=1, **SHADE)]
     labels = ["interval" if confidence_level is None else f"{100 * confidence_level:g} % interval"]
-    dots: dict[str, Any] = {"color": _INK, "marker": "o", "markersize": 4, "linestyle": "none"}
-    handles += ax.plot(times, _deviation(wavelet_variance), zorder=4, **dots)
+    dots: dict[str, Any] = {"color": INK, "marker": "o", "markersize": 4, "linestyle": "none"}
+    handles += ax.plot(times, allan_deviation(wavelet_variance), zorder=4, **dots)
     labels += ["measured"]
     fitted = model.wavelet_variance(n_levels).to(wavelet_variance)
-    handles += ax.plot(times, _deviation(fitted), color=_BLUE, linewidth=2.2, zorder=3)
+    handles += ax.plot(times, allan_deviation(fitted), color=BLUE, linewidth=2.2, zorder=3)
     labels += ["fitted model"]
     shown = torch.cat([low, high, wavelet_variance, fitted])
     floor = shown[shown > 0].min().item() / 30
@@ -73,18 +74,18 @@ def plot_moment_fit(
             continue
         visible = torch.where(variance > 0, variance, torch.nan)
         style: dict[str, Any] = {"color": _COLOURS[k % len(_COLOURS)], "linestyle": _STYLES[k % len(_STYLES)]}
-        handles += ax.plot(times, _deviation(visible), zorder=2, linewidth=1.1, **style)
+        handles += ax.plot(times, allan_deviation(visible), zorder=2, linewidth=1.1, **style)
         labels += [process.symbol + (f" {seen[process.symbol]}" if process.repeatable else "")]
     ax.set_yscale("log")
     ax.set_ylabel(with_unit("Allan deviation", unit), parse_math=False)
-    _time_axis(ax, rate is not None)
+    time_axis(ax, rate is not None)
     if title:
         ax.set_title(title, loc="left", fontsize=10, parse_math=False)
     # Curves go on to the lower edge, and above all of them there is room for the legend.
     bottom, top = (2 * floor) ** 0.5, (2 * max(shown.nan_to_num().max().item(), floor)) ** 0.5
     room = _LEGEND_ROW * (1 + -(-len(labels) // _LEGEND_COLUMNS))
     ax.set_ylim(bottom, top * (top / bottom) ** (room / (1 - room)))
-    _finish(ax, handles, labels, loc="upper center", ncols=_LEGEND_COLUMNS)
+    finish(ax, handles, labels, loc="upper center", ncols=_LEGEND_COLUMNS)
     return ax
 
 
@@ -99,16 +100,16 @@ def plot_residuals(residuals: Tensor, *, rate: float | None = None, ax: Axes | N
     Returns:
         The axes.
     """
-    ax = ax if ax is not None else _new_axes()
+    ax = ax if ax is not None else new_axes()
     times = np.exp2(np.arange(len(residuals))) / (rate or 1.0)
-    ax.axhline(0.0, color=_BLUE, linewidth=1.2)
+    ax.axhline(0.0, color=BLUE, linewidth=1.2)
     for limit in (-1.96, 1.96):
-        ax.axhline(limit, color=_BLUE, linewidth=0.8, linestyle="--")
-    ax.vlines(times, 0.0, residuals.tolist(), color=_INK, linewidth=1.0)
-    ax.plot(times, residuals.tolist(), "o", color=_INK, markersize=4)
+        ax.axhline(limit, color=BLUE, linewidth=0.8, linestyle="--")
+    ax.vlines(times, 0.0, residuals.tolist(), color=INK, linewidth=1.0)
+    ax.plot(times, residuals.tolist(), "o", color=INK, markersize=4)
     ax.set_ylabel("residual")
-    _time_axis(ax, rate is not None)
-    _finish(ax)
+    time_axis(ax, rate is not None)
+    finish(ax)
     return ax
 
 
@@ -134,17 +135,17 @@ def plot_resampled(
     Returns:
         The axes.
     """
-    ax = ax if ax is not None else _new_axes()
+    ax = ax if ax is not None else new_axes()
     places = np.arange(len(names))
-    ax.axvline(0.0, color=_INK, linewidth=0.8)
+    ax.axvline(0.0, color=INK, linewidth=0.8)
     handles: list[Any] = []
-    for (low, high), shift, color, width in ((percentile, -0.12, _COLOURS[0], 1.6), (studentized, 0.12, _BLUE, 2.6)):
+    for (low, high), shift, color, width in ((percentile, -0.12, _COLOURS[0], 1.6), (studentized, 0.12, BLUE, 2.6)):
         handles.append(ax.hlines(places + shift, low.tolist(), high.tolist(), color=color, linewidth=width))
-    handles += ax.plot(bias.tolist(), places, "o", color=_INK, markersize=4)
+    handles += ax.plot(bias.tolist(), places, "o", color=INK, markersize=4)
     ax.set_yticks(places, names)
     ax.set_ylim(len(names) - 0.5, -0.5)
     ax.set_xlabel("less the estimate, in standard deviations of the resamples")
-    _finish(ax, handles, [f"{percent:g} % percentile", f"{percent:g} % studentized", "mean of the resamples"])
+    finish(ax, handles, [f"{percent:g} % percentile", f"{percent:g} % studentized", "mean of the resamples"])
     return ax
 
 
@@ -174,11 +175,11 @@ def plot_ranking(
     Returns:
         The axes.
     """
-    ax = ax if ax is not None else _new_axes()
+    ax = ax if ax is not None else new_axes()
     values, aside = difference.tolist(), aside or []
     least, most = min([0.0, *values]), max([_LINEAR, *values])
-    ax.axvline(0.0, color=_INK, linewidth=0.8, zorder=1)
-    for named, color in ((("chosen", ""), _BLUE), (("not told from it",), _COLOURS[1]), (("redundant",), _FADED)):
+    ax.axvline(0.0, color=INK, linewidth=0.8, zorder=1)
+    for named, color in ((("chosen", ""), BLUE), (("not told from it",), _COLOURS[1]), (("redundant",), _FADED)):
         places = [k for k, own in enumerate(standings) if own in named]
         if places:
             shown = [values[k] for k in places]
@@ -204,7 +205,7 @@ def plot_ranking(
     if note:
         ax.set_title(note, loc="right", fontsize=8, parse_math=False)
     marked = {"not told from it", "redundant"} & set(standings)
-    _finish(ax, *(ax.get_legend_handles_labels() if marked else ()))
+    finish(ax, *(ax.get_legend_handles_labels() if marked else ()))
     return ax
 
 
@@ -218,4 +219,4 @@ def add_recordings(wavelet_variances: list[Tensor], *, rate: float | None = None
     """
     for variance in wavelet_variances:
         times = np.exp2(np.arange(len(variance))) / (rate or 1.0)
-        ax.plot(times, _deviation(variance), color=_INK, linewidth=0.7, alpha=0.6, zorder=3)
+        ax.plot(times, allan_deviation(variance), color=INK, linewidth=0.7, alpha=0.6, zorder=3)

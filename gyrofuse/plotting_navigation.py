@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
-from gyrofuse.plotting import _BLUE, _FRAME, _SHADE, _array, _finish, _new_axes
+from gyrofuse.axes import BLUE, FRAME, SHADE, as_array, finish, new_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,18 +32,18 @@ def plot_ratio_over_time(
     Returns:
         The axes.
     """
-    ax = ax if ax is not None else _new_axes()
+    ax = ax if ax is not None else new_axes()
     handles: list[Any] = []
     labels: list[str] = []
     if outage is not None:
         handles.append(ax.axvspan(*outage, color="#ececec", zorder=0))
         labels.append("no satellites")
     low, high = limits
-    handles.append(ax.fill_between(_array(time), _array(low), _array(high), zorder=2, **_SHADE))
-    handles.append(ax.plot(_array(time), _array(ratio), color=_BLUE, linewidth=1.5, zorder=3)[0])
+    handles.append(ax.fill_between(as_array(time), as_array(low), as_array(high), zorder=2, **SHADE))
+    handles.append(ax.plot(as_array(time), as_array(ratio), color=BLUE, linewidth=1.5, zorder=3)[0])
     labels += ["interval", "ratio of mean position errors"]
-    ax.axhline(1, color=_FRAME, linewidth=0.8, zorder=1)
+    ax.axhline(1, color=FRAME, linewidth=0.8, zorder=1)
     ax.set_xlabel("time (s)")
     ax.set_ylabel("ratio")
-    _finish(ax, handles, labels, loc="lower left", bbox_to_anchor=(0, 1), ncols=3, borderaxespad=0.2)
+    finish(ax, handles, labels, loc="lower left", bbox_to_anchor=(0, 1), ncols=3, borderaxespad=0.2)
     return ax

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from gyrofuse._result import chance
+from gyrofuse.axes import with_unit
 from gyrofuse.mismatch.case import Case, block_means
 from gyrofuse.mismatch.comparison import VarianceComparison, compared_powers, grouped_spectrum
 from gyrofuse.mismatch.mechanism import Finding, Parameter
@@ -26,7 +27,6 @@ from gyrofuse.mismatch.telling import (
     parameter_words,
     verdict,
 )
-from gyrofuse.plotting import with_unit
 from gyrofuse.plotting_mismatch import ends_of_colours, plot_blocks, plot_deviations, plot_map, plot_spectra
 from gyrofuse.report_page import image, number, render
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from gyrofuse import plotting
+from gyrofuse import axes
 from gyrofuse._result import p_words
 from gyrofuse._version import __version__
 
@@ -83,7 +83,7 @@ def render(template: str, **context: Any) -> str:
     )
     environment.filters["number"] = number
     environment.filters["p_words"] = p_words
-    environment.filters["with_unit"] = plotting.with_unit
+    environment.filters["with_unit"] = axes.with_unit
     environment.filters["scientific"] = lambda value: f"{value:.3e}" if math.isfinite(value) else "-"
     environment.filters["fixed"] = lambda value: f"{value:.4f}" if math.isfinite(value) else "-"
     environment.filters["signed"] = lambda value: f"{value:+.4f}" if math.isfinite(value) else "-"

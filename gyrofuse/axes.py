@@ -1,0 +1,78 @@
+"""Axes of one look: colours, sizes of letters, legends, names on ticks.
+
+Functions draw into the axes they are given, or into new ones of `matplotlib.pyplot` that `plt.show()` displays; nothing
+else of matplotlib's state is touched. The colours are those of Okabe and Ito, which colour-blind readers and grey
+printers tell apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Array = NDArray[np.float64]
+Numbers = ArrayLike | Tensor
+
+BLUE, ORANGE, GREY, INK, FRAME, GRID = "#0072b2", "#d55e00", "#969696", "#262626", "#8c8c8c", "#e3e3e3"
+DASHED: dict[str, Any] = {"color": ORANGE, "linewidth": 1.5, "linestyle": (0, (5, 2))}
+SHADE: dict[str, Any] = {"color": BLUE, "alpha": 0.18, "linewidth": 0}
+LABEL_SIZE, TICK_SIZE, SMALL_SIZE = 9.0, 8.0, 7.0  # of letters, points
+MOST_LABELS = 16  # lines or marks that still get a label each: more overlap
+LONGEST_NAME = 18  # characters of a label, beyond which it is cut
+
+
+def with_unit(label: str, unit: str | None) -> str:
+    """A label with its unit, where that is known."""
+    return f"{label} ({unit})" if unit and unit != "unknown" else label
+
+
+def new_axes() -> Axes:
+    """New axes of pyplot."""
+    import matplotlib.pyplot as plt
+
+    return plt.subplots(figsize=(7.0, 4.6), layout="constrained")[1]
+
+
+def as_array(value: Numbers) -> Array:
+    """Numbers as a NumPy array in double precision."""
+    return torch.as_tensor(value).detach().cpu().double().numpy()
+
+
+def finish(ax: Axes, handles: Sequence[Any] = (), labels: Sequence[str] = (), **place: Any) -> None:
+    """Give axes the common look, and a legend for `handles` at `place`."""
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.spines[["left", "bottom"]].set_color(FRAME)
+    ax.tick_params(which="both", color=FRAME, labelcolor=INK, labelsize=TICK_SIZE)
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.label.set(color=INK, fontsize=LABEL_SIZE)
+        axis.get_offset_text().set(color=INK, fontsize=TICK_SIZE)
+    ax.grid(color=GRID, linewidth=0.7)
+    ax.set_axisbelow(True)
+    if handles:
+        legend = ax.legend(handles, labels, fontsize=TICK_SIZE, labelcolor=INK, frameon=True, framealpha=0.85, **place)
+        legend.get_frame().set(edgecolor="none", facecolor="white")
+        for text in legend.get_texts():
+            text.set_parse_math(False)
+
+
+def clean_name(name: str) -> str:
+    """A name that fits a figure: printable and not too long."""
+    text = "".join(c if c.isprintable() else "?" for c in name)
+    return text if len(text) <= LONGEST_NAME else f"{text[: LONGEST_NAME - 1]}…"
+
+
+def name_ticks(ax: Axes, names: Sequence[str]) -> None:
+    """Name the places 0, 1, ... on the x axis; turned when they are long, every n-th when they are many."""
+    step = -(-len(names) // (2 * MOST_LABELS))
+    shown = [clean_name(name) for name in names[::step]]
+    room = ax.get_window_extent().width * 72 / ax.figure.dpi / len(shown)  # points for each
+    turned = max(map(len, shown)) + 1 > room / (0.6 * TICK_SIZE)
+    ax.set_xticks(range(0, len(names), step), shown, rotation=90 if turned else 0, fontsize=TICK_SIZE, parse_math=False)
