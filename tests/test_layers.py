@@ -6,6 +6,7 @@ import ast
 import os
 import subprocess
 import sys
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -13,119 +14,19 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "gyrofuse"
 
-# From top to bottom; modules of one layer may use each other, as long as nothing goes round in circles. A leading
-# underscore puts a module at the bottom, unless it is named here. A name without a file is one to come.
-LAYERS = [
-    {
-        "__main__",
-        "cli",
-        "cli_fleet",
-        "cli_mismatch",
-        "cli_models",
-        "cli_navigation",
-        "cli_reading",
-        "cli_shared",
-        "_console",
-        "_preload",
-        "fleet_run",
-        "lightning_module",
-    },
-    {
-        "demo",
-        "demo_mismatch",
-        "demo_models",
-        "report",
-        "report_words",
-        "report_models",
-        "report_ranking",
-        "report_fleet",
-        "model_words",
-    },
+# From top to bottom; packages of one floor do not know each other.
+FLOORS = [
+    {"__main__"},
+    {"cli"},
     {"__init__"},
     {"fleet"},
-    {"mismatch", "report_mismatch", "navigation"},
-    {
-        "svo",
-        "svo_result",
-        "svo_stream",
-        "_virtual_gyro",
-        "virtual_file",
-        "multiscale",
-        "multiscale_result",
-        "virtual_noise",
-        "live",
-        "parity",
-        "parity_result",
-        "gmwm",
-        "gmwm_result",
-        "export",
-        "joint",
-        "array_gmwm",
-        "array_gmwm_result",
-        "moment_bootstrap",
-        "ranking",
-        "ranking_result",
-        "_drift_sign",
-        "_rank_table",
-        "_rank_search",
-        "_rank_spectra",
-        "_rank_moments",
-        "_rank_candidates",
-        "_model_tones",
-        "_white_kurtosis",
-        "whittle",
-    },
-    {"parity_energy", "parity_reference", "fault_kinds"},
-    {"fusion", "weights_spread", "cross_fitting", "hypotheses", "gain", "selection"},
-    {"competitors", "rdvg", "assisted", "saturation"},
-    {"svo_weights"},
-    {
-        "intervals",
-        "influence",
-        "parametric",
-        "pilot",
-        "moment_inference",
-        "moment_fit",
-        "continuous",
-        "_moment_search",
-        "_array_fit",
-        "_array_inference",
-        "_array_search",
-        "_spectral_search",
-        "moment_profile",
-        "profile_surfaces",
-        "moment_identity",
-    },
-    {
-        "bootstrap",
-        "series",
-        "block_length",
-        "scale_weights",
-        "moment_covariance",
-        "robust",
-        "robust_covariance",
-        "_records",
-        "tones",
-        "_composition",
-        "_array_moments",
-        "_cosine_bins",
-    },
-    {
-        "covariance",
-        "metric",
-        "uncertainty",
-        "simulate",
-        "parsing",
-        "datasheet",
-        "state_space",
-        "plotting_models",
-        "plotting_mismatch",
-        "plotting_fleet",
-        "plotting_navigation",
-        "report_page",
-    },
-    {"haar", "processes", "recording", "long_recording", "io"},
-    {"units", "plotting"},
+    {"export"},
+    {"mismatch", "navigation"},
+    {"fitting"},
+    {"fusion"},
+    {"wavelets", "noise"},
+    {"io"},
+    {"_base"},
 ]
 HEAVY = {
     "matplotlib",
@@ -143,22 +44,20 @@ HEAVY = {
 }
 
 
-def depth(part: str) -> int:
-    """Layer of a module or folder of the package, counted from the top."""
-    for i, layer in enumerate(LAYERS):
-        if part in layer:
-            return i
-    assert part.startswith("_"), f"gyrofuse.{part} is in no layer: say in LAYERS of {Path(__file__).name} where"
-    return len(LAYERS) - 1
+def floor(package: str) -> int:
+    """Floor of a package, counted from the top."""
+    return next((i for i, packages in enumerate(FLOORS) if package in packages), -1)
 
 
+@cache
 def modules() -> dict[str, Path]:
     """Dotted name inside the package of every module, `io.ulog` say, with its file."""
     paths = sorted(PACKAGE.rglob("*.py"))
     return {".".join(path.relative_to(PACKAGE).with_suffix("").parts): path for path in paths}
 
 
-def imports(name: str, path: Path) -> set[str]:
+@cache
+def imports(name: str, path: Path) -> frozenset[str]:
     """Modules of the package that a module imports, anywhere in it."""
     known, found = modules(), set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -178,20 +77,19 @@ def imports(name: str, path: Path) -> set[str]:
                 if candidate in known:
                     found.add(candidate)
                     break
-    return found - {name}
+    return frozenset(found - {name})
 
 
-def test_every_module_has_a_layer():
-    assert modules()
-    for name in modules():
-        depth(name.split(".")[0])
+def package_of(module: str) -> str:
+    return module.partition(".")[0]
 
 
 @pytest.mark.parametrize("name", modules())
 def test_imports_point_down(name):
-    here = depth(name.split(".")[0])
-    up = [other for other in imports(name, modules()[name]) if depth(other.split(".")[0]) < here]
-    assert not up, f"gyrofuse.{name} imports from above: {up}"
+    here = package_of(name)
+    others = {other for other in imports(name, modules()[name]) if package_of(other) != here}
+    up = sorted(other for other in others if 0 <= floor(package_of(other)) <= floor(here))
+    assert not up, f"gyrofuse.{name} imports from above or beside: {up}"
 
 
 def test_imports_do_not_go_in_circles():
