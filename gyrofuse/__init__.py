@@ -22,9 +22,9 @@ Levels are `j = 1..J` with filters of length `2**j`; NaN is a missing sample. Fo
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from gyrofuse._linalg import SingularCovarianceError
-from gyrofuse._result import ConfidenceInterval
-from gyrofuse._version import __version__ as __version__
+from gyrofuse._base import __version__ as __version__
+from gyrofuse._base.linalg import SingularCovarianceError
+from gyrofuse._base.results import ConfidenceInterval
 from gyrofuse.array_gmwm import fit_array_gmwm
 from gyrofuse.array_gmwm_result import ArrayGMWMResult
 from gyrofuse.bootstrap import block_bootstrap, bootstrap_wccv_covariance, bootstrap_wccv_interval, signal_bootstrap

@@ -9,8 +9,8 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
+from gyrofuse._base.transforms import tone_in_cosines
 from gyrofuse._composition import Composition
-from gyrofuse._transforms import tone_in_cosines
 from gyrofuse.processes import AR1, Drift, Process, QuantizationNoise, RandomWalk, Sinusoid
 
 # Single ordinates up to here, then means over so many bands an octave; towards the highest frequency again so many

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gyrofuse._transforms import tone_in_cosines
+from gyrofuse._base.transforms import tone_in_cosines
 
 _GRID = torch.arange(-24, 25, dtype=torch.float64) / 16  # first look around the peak, in 1/T cycles per sample
 _STEPS = 6

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gyrofuse._transforms import LOW_BINS
+from gyrofuse._base.transforms import LOW_BINS
 
 # Bands at least so many bins and a fraction of their frequency wide, or of the distance from the highest frequency,
 # down to a part of that; the curvature of the background in log frequency is white noise of this intensity (between

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 from torch.func import jvp
 
-from gyrofuse._checks import check_positive, check_positive_integer
+from gyrofuse._base.checks import check_positive, check_positive_integer
+from gyrofuse._base.random import own_generator
 from gyrofuse._estimation import EstimatedFrom
-from gyrofuse._paths import own_generator
 
 Parameter = float | Tensor | None
 

@@ -12,8 +12,8 @@ import math
 import torch
 from torch import Tensor
 
+from gyrofuse._base.nnls import nonnegative_least_squares
 from gyrofuse._composition import Composition, shape_of
-from gyrofuse._nnls import nonnegative_least_squares
 from gyrofuse.processes import AR1
 
 _STEPS, _ENOUGH = 30, 1e-10

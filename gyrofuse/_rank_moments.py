@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from gyrofuse import _moment_search as search
+from gyrofuse._base.nnls import nonnegative_least_squares
 from gyrofuse._composition import Composition
-from gyrofuse._nnls import nonnegative_least_squares
 from gyrofuse._records import Records
 from gyrofuse.moment_fit import damped, misfit
 from gyrofuse.moment_inference import Estimates, Fit, Inference, infer, infer_efficient

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from gyrofuse import _rank_candidates as compositions
+from gyrofuse._base.results import counted
 from gyrofuse._rank_candidates import Key, Kinds
 from gyrofuse._rank_moments import Moments
 from gyrofuse._rank_search import EQUIVALENT, MomentSearch, SpectralSearch
 from gyrofuse._rank_spectra import Lines, decide_lines
-from gyrofuse._result import counted
 from gyrofuse.covariance import wavelet_variance
 from gyrofuse.processes import Drift, Sinusoid
 from gyrofuse.uncertainty import chi_square_tail

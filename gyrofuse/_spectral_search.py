@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor
 
+from gyrofuse._base.nnls import nonnegative_least_squares
 from gyrofuse._cosine_bins import Bins, Noise
-from gyrofuse._nnls import nonnegative_least_squares
 
 _STEPS = 100
 # A step that promises less, in nats, is not worth taking: 0.0001 standard deviations from the top.

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gyrofuse._array_fit import fit_matrices
 from gyrofuse._array_inference import ArrayFit, spread_of_fit
-from gyrofuse._checks import (
+from gyrofuse._base.checks import (
     check_confidence_level,
     check_floating,
     check_length,
@@ -18,11 +18,11 @@ from gyrofuse._checks import (
     infinite_where,
     largest_level,
 )
+from gyrofuse._base.linalg import check_positive_definite
+from gyrofuse._base.results import named, numbered
 from gyrofuse._composition import Composition, shape_of
-from gyrofuse._linalg import check_positive_definite
 from gyrofuse._model_tones import model_tones
 from gyrofuse._records import Records
-from gyrofuse._result import named, numbered
 from gyrofuse.array_gmwm_result import ArrayGMWMResult
 from gyrofuse.covariance import wavelet_products
 from gyrofuse.moment_fit import composition_of

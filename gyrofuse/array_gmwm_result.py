@@ -19,10 +19,10 @@ from gyrofuse._array_inference import (
     told_matrices,
 )
 from gyrofuse._array_moments import vech
+from gyrofuse._base.results import ConfidenceInterval, counted, listed
 from gyrofuse._composition import Composition
 from gyrofuse._estimation import EstimatedFrom
 from gyrofuse._records import Records
-from gyrofuse._result import ConfidenceInterval, counted, listed
 from gyrofuse.live import subset_weights
 from gyrofuse.processes import Model, Process, Sinusoid
 from gyrofuse.scale_weights import ScaleWeights
@@ -275,7 +275,7 @@ class ArrayGMWMResult:
         Raises:
             ValueError: The result holds a batch.
         """
-        from gyrofuse.axes import BLUE, finish
+        from gyrofuse._base.axes import BLUE, finish
         from gyrofuse.plotting import allan_deviation, plot_allan_deviation
 
         self._check_single("plot")

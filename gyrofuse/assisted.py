@@ -13,8 +13,8 @@ import functools
 import torch
 from torch import Tensor
 
+from gyrofuse._base.linalg import geometric_mean
 from gyrofuse._lag_sums import unit_wavelet_variances
-from gyrofuse._linalg import geometric_mean
 
 # Levels with more observations than this in every recording speak for themselves.
 _MOST_OBSERVATIONS = 2**9

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import check_floating, check_positive_integer
+from gyrofuse._base.checks import check_floating, check_positive_integer
 
 # The choice of a length looks at so many means of consecutive entries at most, and leaves so many blocks.
 _MOST_BINS = 2**8

@@ -27,10 +27,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from gyrofuse._base.checks import check_confidence_level, check_n_levels, check_positive_integer, check_signal
+from gyrofuse._base.random import own_generator
+from gyrofuse._base.results import ConfidenceInterval
 from gyrofuse._blocks import BlockSums, moments_over_starts
-from gyrofuse._checks import check_confidence_level, check_n_levels, check_positive_integer, check_signal
-from gyrofuse._paths import own_generator
-from gyrofuse._result import ConfidenceInterval
 from gyrofuse.block_length import alike, check_block_length, default_block_length, n_columns, warn_of_few_columns
 from gyrofuse.covariance import wavelet_products
 

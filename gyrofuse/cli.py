@@ -22,9 +22,10 @@ import numpy as np
 import torch
 import typer
 
-from gyrofuse._checks import check_positive_integer
+from gyrofuse._base.checks import check_positive_integer
+from gyrofuse._base.files import output_folder, write_npz
+from gyrofuse._base.units import quantity_of
 from gyrofuse._console import Commands, progress, say, say_table
-from gyrofuse._output import output_folder, write_npz
 from gyrofuse.cli_fleet import fleet
 from gyrofuse.cli_mismatch import diagnose
 from gyrofuse.cli_models import fit, rank
@@ -65,7 +66,6 @@ from gyrofuse.report import (
 from gyrofuse.simulate import ArrayModel
 from gyrofuse.svo import fit_svo
 from gyrofuse.svo_result import SVOResult
-from gyrofuse.units import quantity_of
 
 app = typer.Typer(
     name="gyrofuse",

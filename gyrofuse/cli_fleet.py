@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gyrofuse._checks import check_positive_integer
+from gyrofuse._base.checks import check_positive_integer
 from gyrofuse._console import progress_bar, say, warn
 from gyrofuse._workers import begin_imports
 from gyrofuse.cli_reading import FileReading, takes_options

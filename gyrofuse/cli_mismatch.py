@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import torch
 import typer
 
-from gyrofuse._checks import same_rate
+from gyrofuse._base.checks import same_rate
 from gyrofuse._console import progress, progress_bar, say
 from gyrofuse.cli_reading import Logs, Reading, takes_options
 from gyrofuse.cli_shared import (

@@ -11,8 +11,9 @@ from typing import Annotated
 
 import typer
 
+from gyrofuse._base.results import place
+from gyrofuse._base.units import ACCELERATION_UNITS, DATASHEET_UNITS, RATE_UNITS
 from gyrofuse._console import progress, say
-from gyrofuse._result import place
 from gyrofuse.cli_reading import Logs, Quantity, Reading, takes_options
 from gyrofuse.cli_shared import (
     Force,
@@ -39,7 +40,6 @@ from gyrofuse.recording import Recording
 from gyrofuse.report_models import model_report
 from gyrofuse.report_ranking import rank_report
 from gyrofuse.tones import FEWEST_SAMPLES
-from gyrofuse.units import ACCELERATION_UNITS, DATASHEET_UNITS, RATE_UNITS
 
 _MOST_FITS = 12  # printed in full
 _WITH_GAPS = ", or fit a model with `gyrofuse fit`, which gets along with gaps"

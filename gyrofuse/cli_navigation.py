@@ -8,7 +8,8 @@ from typing import Annotated
 import torch
 import typer
 
-from gyrofuse._checks import check_positive_integer
+from gyrofuse._base.checks import check_positive_integer
+from gyrofuse._base.units import GRAVITY, RATE_UNITS, rate_unit_factor
 from gyrofuse._console import progress_bar, say
 from gyrofuse.cli_shared import (
     Force,
@@ -23,7 +24,6 @@ from gyrofuse.cli_shared import (
     write_json,
 )
 from gyrofuse.processes import Model
-from gyrofuse.units import GRAVITY, RATE_UNITS, rate_unit_factor
 
 
 def emulate(

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gyrofuse._checks import check_positive, same_rate
+from gyrofuse._base.checks import check_positive, same_rate
+from gyrofuse._base.files import Outputs
+from gyrofuse._base.units import KNOWN_UNITS, canonical_unit
 from gyrofuse._console import say_table, warn
-from gyrofuse._output import Outputs
 from gyrofuse.parsing import model_from_dict
 from gyrofuse.processes import Model
 from gyrofuse.recording import Recording
 from gyrofuse.simulate import ArrayModel
-from gyrofuse.units import KNOWN_UNITS, canonical_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -175,7 +175,7 @@ def agreed_unit(model: Path | None, unit: str | None) -> str | None:
 
 def draw(plot: Callable[[Axes], Axes], draft: Path, path: Path, width: float = 7.0, height: float = 4.6) -> None:
     """A figure of one panel, in the format that the path asks for."""
-    from gyrofuse.report_page import new_figure, save_figure
+    from gyrofuse._base.page import new_figure, save_figure
 
     figure = new_figure(width, height)
     plot(figure.subplots())

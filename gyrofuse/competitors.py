@@ -7,7 +7,7 @@ import warnings
 import torch
 from torch import Tensor
 
-from gyrofuse._linalg import check_positive_definite
+from gyrofuse._base.linalg import check_positive_definite
 from gyrofuse.svo_weights import combine, counting, optimal_weights
 
 # How far below 1 the variance that a sensor would bring may seem, in units of the least, by rounding.

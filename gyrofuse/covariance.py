@@ -12,7 +12,7 @@ import warnings
 import torch
 from torch import Tensor, nn
 
-from gyrofuse._checks import check_floating, check_n_levels, check_signal
+from gyrofuse._base.checks import check_floating, check_n_levels, check_signal
 from gyrofuse._tiles import WaveletProducts, tile_length
 from gyrofuse.haar import haar_coefficients
 

@@ -24,7 +24,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from gyrofuse import series
-from gyrofuse._result import ConfidenceInterval
+from gyrofuse._base.results import ConfidenceInterval
 from gyrofuse.parametric import resample_wccv
 from gyrofuse.pilot import Pilot
 from gyrofuse.uncertainty import chi_square_interval, t_quantile

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import torch
 
-from gyrofuse import units
-from gyrofuse._checks import check_positive
+from gyrofuse._base import units
+from gyrofuse._base.checks import check_positive
 from gyrofuse.processes import (
     AR1,
     Drift,

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from gyrofuse._base.page import number
 from gyrofuse.gmwm import fit_gmwm
 from gyrofuse.recording import Recording
-from gyrofuse.report_page import number
 from gyrofuse.simulate import ArrayModel
 
 if TYPE_CHECKING:

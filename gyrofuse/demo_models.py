@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from gyrofuse._base.page import new_figure, number
+from gyrofuse._base.units import SECONDS_PER_HOUR, angle_random_walk, correlation_time, per_sqrt_hour, rate_unit_factor
 from gyrofuse._rank_candidates import name_of
 from gyrofuse.gmwm_result import REFUSED, GMWMResult
 from gyrofuse.processes import AR1, Model, WhiteNoise
 from gyrofuse.ranking_result import RankResult
-from gyrofuse.report_page import new_figure, number
 from gyrofuse.simulate import ArrayModel
-from gyrofuse.units import SECONDS_PER_HOUR, angle_random_walk, correlation_time, per_sqrt_hour, rate_unit_factor
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

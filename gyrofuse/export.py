@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gyrofuse import units
-from gyrofuse._checks import check_positive
-from gyrofuse._result import place
+from gyrofuse._base import units
+from gyrofuse._base.checks import check_positive
+from gyrofuse._base.results import place
 from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.processes import (
     AR1,

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gyrofuse._result import ConfidenceInterval
+from gyrofuse._base.results import ConfidenceInterval
 from gyrofuse.cross_fitting import CrossFit
 from gyrofuse.hypotheses import Answer
 from gyrofuse.uncertainty import t_quantile

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import (
+from gyrofuse._base.checks import (
     check_confidence_level,
     check_floating,
     check_length,
@@ -16,11 +16,11 @@ from gyrofuse._checks import (
     infinite_where,
     largest_level,
 )
+from gyrofuse._base.results import named, numbered, place
 from gyrofuse._composition import Composition
 from gyrofuse._drift_sign import rising, signed
 from gyrofuse._model_tones import model_tones
 from gyrofuse._records import Records
-from gyrofuse._result import named, numbered, place
 from gyrofuse._white_kurtosis import white_excess_kurtosis, with_excess_kurtosis
 from gyrofuse.continuous import fit_moments
 from gyrofuse.gmwm_result import GMWMResult

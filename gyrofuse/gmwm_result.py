@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from gyrofuse._base.results import ConfidenceInterval, cleaned, counted, listed, p_words, place
+from gyrofuse._base.units import DATASHEET_UNITS
 from gyrofuse._composition import Composition
 from gyrofuse._estimation import EstimatedFrom
 from gyrofuse._records import Records
-from gyrofuse._result import ConfidenceInterval, cleaned, counted, listed, p_words, place
 from gyrofuse.datasheet import Datasheet, datasheet
 from gyrofuse.moment_inference import Inference
 from gyrofuse.processes import Model
 from gyrofuse.uncertainty import chi_square_interval
-from gyrofuse.units import DATASHEET_UNITS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from gyrofuse._checks import check_n_levels, check_positive_integer, check_signal
+from gyrofuse._base.checks import check_n_levels, check_positive_integer, check_signal
 
 
 def haar_coefficients(signal: Tensor, n_levels: int | None = None) -> list[Tensor]:

@@ -26,7 +26,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gyrofuse._result import ConfidenceInterval, listed, named, numbered
+from gyrofuse._base.results import ConfidenceInterval, listed, named, numbered
 
 # An excess of wavelet variance below this is small: 2.5 % of a deviation.
 SMALL_EXCESS = 0.05

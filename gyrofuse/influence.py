@@ -29,9 +29,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from gyrofuse._base.checks import check_floating, check_n_levels, check_positive_integer, check_signal
+from gyrofuse._base.linalg import check_positive_definite
 from gyrofuse._blocks import BlockSums
-from gyrofuse._checks import check_floating, check_n_levels, check_positive_integer, check_signal
-from gyrofuse._linalg import check_positive_definite
 from gyrofuse._sweep import Statistic, Sweeps, joined
 from gyrofuse.block_length import (
     alike,

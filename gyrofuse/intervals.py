@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from gyrofuse import series
-from gyrofuse._checks import check_confidence_level, check_n_levels, check_signal
-from gyrofuse._result import ConfidenceInterval
+from gyrofuse._base.checks import check_confidence_level, check_n_levels, check_signal
+from gyrofuse._base.results import ConfidenceInterval
 from gyrofuse.covariance import binned_products
 from gyrofuse.pilot import Pilot, fit_pilot
 from gyrofuse.uncertainty import chi_square_interval, t_quantile

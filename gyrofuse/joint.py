@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from gyrofuse import _moment_search as search
-from gyrofuse._checks import check_signal
+from gyrofuse._base.checks import check_signal
+from gyrofuse._base.results import listed, place
 from gyrofuse._composition import Composition
 from gyrofuse._drift_sign import drifts_of, signed
 from gyrofuse._model_tones import model_tones
 from gyrofuse._records import Records
-from gyrofuse._result import listed, place
 from gyrofuse._white_kurtosis import white_excess_kurtosis, with_excess_kurtosis
 from gyrofuse.gmwm import fit_gmwm
 from gyrofuse.gmwm_result import GMWMResult

@@ -24,7 +24,7 @@ from lightning.pytorch.callbacks import BasePredictionWriter, Callback
 from lightning.pytorch.strategies import DDPStrategy
 from torch.utils.data import DataLoader
 
-from gyrofuse._checks import check_positive_integer
+from gyrofuse._base.checks import check_positive_integer
 from gyrofuse._workers import end_at_once, end_with_parent, start_method
 from gyrofuse.fleet.logs import find_logs, groups_of, identity
 from gyrofuse.fleet.store import ResultStore

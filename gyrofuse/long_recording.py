@@ -11,10 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import check_n_samples, check_positive, check_positive_integer, largest_level
-from gyrofuse._result import counted, numbered
+from gyrofuse._base.checks import check_n_samples, check_positive, check_positive_integer, largest_level
+from gyrofuse._base.results import counted, numbered
+from gyrofuse._base.units import check_quantity
 from gyrofuse.io.slices import open_slices
-from gyrofuse.units import check_quantity
 
 Progress = Callable[[str, float], None]
 

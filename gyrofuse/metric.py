@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torchmetrics import Metric
 
-from gyrofuse._checks import check_positive_integer, check_signal
+from gyrofuse._base.checks import check_positive_integer, check_signal
 from gyrofuse._tiles import WaveletProducts
 from gyrofuse.covariance import mean_products
 

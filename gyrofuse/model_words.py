@@ -8,10 +8,10 @@ from itertools import groupby
 import torch
 from torch import Tensor
 
-from gyrofuse._result import p_words
+from gyrofuse._base.page import number
+from gyrofuse._base.results import p_words
 from gyrofuse.gmwm_result import REFUSED, GMWMResult
 from gyrofuse.processes import Model, Sinusoid
-from gyrofuse.report_page import number
 
 _DOUBTED = 0.05  # p-values of the J test below
 _WEIGHTS = {

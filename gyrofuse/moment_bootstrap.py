@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import check_positive_integer
+from gyrofuse._base.checks import check_positive_integer
+from gyrofuse._base.random import own_generator
+from gyrofuse._base.results import ConfidenceInterval, listed, place
 from gyrofuse._composition import Composition
 from gyrofuse._drift_sign import drifts_of
 from gyrofuse._model_tones import model_tones
-from gyrofuse._paths import own_generator
-from gyrofuse._result import ConfidenceInterval, listed, place
 from gyrofuse._white_kurtosis import white_excess_kurtosis, with_excess_kurtosis
 from gyrofuse.continuous import fit_moments
 from gyrofuse.gmwm_result import GMWMResult

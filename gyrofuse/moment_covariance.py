@@ -25,7 +25,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gyrofuse._checks import check_positive_integer, largest_level
+from gyrofuse._base.checks import check_positive_integer, largest_level
 from gyrofuse._lag_sums import lag_quadrature, unit_covariances
 from gyrofuse._model import Model, Process
 from gyrofuse.processes import Drift, QuantizationNoise, Sinusoid, WhiteNoise

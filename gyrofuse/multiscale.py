@@ -39,8 +39,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from gyrofuse._checks import check_floating, check_positive_integer, check_signal
-from gyrofuse._linalg import check_positive_definite
+from gyrofuse._base.checks import check_floating, check_positive_integer, check_signal
+from gyrofuse._base.linalg import check_positive_definite
 from gyrofuse.covariance import binned_products
 from gyrofuse.cross_fitting import CrossFit, Fusion, cross_fit
 from gyrofuse.multiscale_result import MultiScaleResult, fuse_bands

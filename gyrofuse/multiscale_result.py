@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import check_signal
-from gyrofuse._result import ConfidenceInterval, listed, numbered
+from gyrofuse._base.checks import check_signal
+from gyrofuse._base.results import ConfidenceInterval, listed, numbered
 from gyrofuse._tiles import tile_length
 from gyrofuse.cross_fitting import CrossFit
 from gyrofuse.recording import Recording

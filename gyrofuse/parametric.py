@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gyrofuse._base.linalg import oriented_eigh
 from gyrofuse._lag_sums import block_mean_covariances
-from gyrofuse._linalg import oriented_eigh
 from gyrofuse.covariance import wavelet_products
 from gyrofuse.pilot import Pilot, components_of_memories
 

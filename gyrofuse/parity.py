@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import check_signal
+from gyrofuse._base.checks import check_signal
 from gyrofuse.fault_kinds import kinds_of
 from gyrofuse.parity_energy import Energies, chunks_of, energies_of, parity_matrix, window_products
 from gyrofuse.parity_reference import ParityReference, check_window, stationary_reference

@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import check_positive_integer, check_signal, largest_level
-from gyrofuse._linalg import check_positive_definite
-from gyrofuse._result import listed, numbered
+from gyrofuse._base.checks import check_positive_integer, check_signal, largest_level
+from gyrofuse._base.linalg import check_positive_definite
+from gyrofuse._base.results import listed, numbered
 from gyrofuse.parity_energy import Products, chunks_of, energies_of, own_variance, parity_matrix, window_products
 from gyrofuse.recording import Recording
 from gyrofuse.uncertainty import degrees_of_freedom

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse._result import listed, numbered
+from gyrofuse._base.results import listed, numbered
 from gyrofuse.fault_kinds import KINDS
 
 if TYPE_CHECKING:

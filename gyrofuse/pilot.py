@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gyrofuse._base.linalg import geometric_mean
 from gyrofuse._lag_sums import covariance_table, unit_wavelet_variances, variance_table
-from gyrofuse._linalg import geometric_mean
 
 # Levels with more observations than this speak for themselves.
 _MOST_OBSERVATIONS = 2**6

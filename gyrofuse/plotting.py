@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gyrofuse.axes import (
+from gyrofuse._base.axes import (
     BLUE,
     DASHED,
     FRAME,

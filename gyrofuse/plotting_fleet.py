@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gyrofuse.axes import BLUE, DASHED, FRAME, as_array, clean_name, finish, new_axes
+from gyrofuse._base.axes import BLUE, DASHED, FRAME, as_array, clean_name, finish, new_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

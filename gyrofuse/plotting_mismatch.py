@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gyrofuse.axes import (
+from gyrofuse._base.axes import (
     BLUE,
     FRAME,
     INK,

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gyrofuse.axes import BLUE, INK, SHADE, finish, new_axes, with_unit
+from gyrofuse._base.axes import BLUE, INK, SHADE, finish, new_axes, with_unit
 from gyrofuse.plotting import allan_deviation, time_axis
 
 if TYPE_CHECKING:

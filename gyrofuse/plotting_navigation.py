@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
-from gyrofuse.axes import BLUE, FRAME, SHADE, as_array, finish, new_axes
+from gyrofuse._base.axes import BLUE, FRAME, SHADE, as_array, finish, new_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from gyrofuse._base.random import ar1_recursion
 from gyrofuse._model import Model, Parameter, Process, SpectralLine, domain
-from gyrofuse._paths import ar1_recursion
 
 __all__ = [
     "AR1",

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse import _rank_candidates as compositions
-from gyrofuse._checks import (
+from gyrofuse._base.checks import (
     check_confidence_level,
     check_floating,
     check_length,
@@ -18,9 +18,9 @@ from gyrofuse._checks import (
     check_signal,
     largest_level,
 )
+from gyrofuse._base.results import ConfidenceInterval, numbered
 from gyrofuse._estimation import EstimatedFrom
 from gyrofuse._rank_table import by_moments, by_spectrum
-from gyrofuse._result import ConfidenceInterval, numbered
 from gyrofuse.gmwm import _given, fit_gmwm
 from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.processes import Model

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from gyrofuse._base.results import chance, counted, listed, p_words, place, signed
 from gyrofuse._rank_candidates import name_of
 from gyrofuse._rank_table import Table
-from gyrofuse._result import chance, counted, listed, p_words, place, signed
 from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.parsing import parse_model
 from gyrofuse.processes import Sinusoid

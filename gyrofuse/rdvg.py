@@ -18,8 +18,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import check_signal, largest_level
-from gyrofuse._result import listed
+from gyrofuse._base.checks import check_signal, largest_level
+from gyrofuse._base.results import listed
 
 
 @dataclass(frozen=True, eq=False)

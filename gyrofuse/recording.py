@@ -14,14 +14,14 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from gyrofuse._checks import check_positive, check_signal
-from gyrofuse._output import Outputs, write_npz
-from gyrofuse._result import listed, numbered
+from gyrofuse._base.checks import check_positive, check_signal
+from gyrofuse._base.files import Outputs, write_npz
+from gyrofuse._base.results import listed, numbered
+from gyrofuse._base.units import QUANTITIES, canonical_unit, check_quantity, quantity_of, unit_factor
 from gyrofuse.io.assemble import assemble
 from gyrofuse.io.columns import WORD_OF, check_columns
 from gyrofuse.io.limits import is_rate
 from gyrofuse.io.notes import Note
-from gyrofuse.units import QUANTITIES, canonical_unit, check_quantity, quantity_of, unit_factor
 
 
 @dataclass(frozen=True, eq=False)

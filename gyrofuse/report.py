@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from gyrofuse import plotting
-from gyrofuse._result import numbered
+from gyrofuse._base.page import image, new_figure, number, render, save_figure
+from gyrofuse._base.results import numbered
 from gyrofuse.covariance import wavelet_variance
 from gyrofuse.multiscale_result import MultiScaleResult
 from gyrofuse.rdvg import rdvg
 from gyrofuse.recording import Recording
-from gyrofuse.report_page import image, new_figure, number, render, save_figure
 from gyrofuse.report_words import ALIKE, Fused, verdict
 from gyrofuse.svo_result import SVOResult
 
@@ -109,7 +110,7 @@ def fusion_report(
             }
         )
     return render(
-        "fusion.html.j2",
+        Path(__file__).parent / "templates" / "fusion.html.j2",
         title=title,
         result=result,
         recording=recording,
@@ -142,7 +143,13 @@ def recording_report(recording: Recording, *, title: str) -> str:
                 "signals": image(7, 4.4, plotting.plot_signals, recording.time, mean, unit=recording.unit),
             }
         )
-    return render("recording.html.j2", title=title, recording=recording, parts=parts, sensors=sensor_rows(recording))
+    return render(
+        Path(__file__).parent / "templates" / "recording.html.j2",
+        title=title,
+        recording=recording,
+        parts=parts,
+        sensors=sensor_rows(recording),
+    )
 
 
 def fusion_figure(result: Fused) -> Figure:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from gyrofuse._result import counted
+from gyrofuse._base.page import image, number, render
+from gyrofuse._base.results import counted
 from gyrofuse.fleet.standing import FEWEST_IN_TIME, GAIN, LEVEL, NOISY, Standing, arrays_of
 from gyrofuse.plotting_fleet import plot_course, plot_spread
-from gyrofuse.report_page import image, number, render
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -44,7 +45,7 @@ def fleet_report(
     heading, meaning = _RANKED_BY[standing.task]
     ranked = [_ranked_row(value, row) for value, row in standing.ranked[:_MOST_ROWS]]
     return render(
-        "fleet.html.j2",
+        Path(__file__).parent / "templates" / "fleet.html.j2",
         title=title,
         asked=_asked(standing.task, settings or {}),
         standing=standing,

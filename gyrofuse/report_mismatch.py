@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 
-from gyrofuse._result import chance
-from gyrofuse.axes import with_unit
+from gyrofuse._base.axes import with_unit
+from gyrofuse._base.page import image, number, render
+from gyrofuse._base.results import chance
 from gyrofuse.mismatch.case import Case, block_means
 from gyrofuse.mismatch.comparison import VarianceComparison, compared_powers, grouped_spectrum
 from gyrofuse.mismatch.mechanism import Finding, Parameter
@@ -28,7 +30,6 @@ from gyrofuse.mismatch.telling import (
     verdict,
 )
 from gyrofuse.plotting_mismatch import ends_of_colours, plot_blocks, plot_deviations, plot_map, plot_spectra
-from gyrofuse.report_page import image, number, render
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -61,7 +62,7 @@ def mismatch_page(outcome: Outcome, *, title: str, remarks: Sequence[str] = ()) 
     panels = len(both)
     rows = 0.5 + 0.22 * min(case.n_sensors, 24)  # inches of a map
     return render(
-        "mismatch.html.j2",
+        Path(__file__).parent / "templates" / "mismatch.html.j2",
         title=title,
         outcome=outcome,
         scene=scene,

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import itertools
 import math
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gyrofuse._result import place
+from gyrofuse._base.page import image, render
+from gyrofuse._base.results import place
+from gyrofuse._base.units import DATASHEET_UNITS
 from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.model_words import model_method, model_verdict, residuals
 from gyrofuse.plotting_models import plot_residuals
 from gyrofuse.recording import Recording
-from gyrofuse.report_page import image, render
-from gyrofuse.units import DATASHEET_UNITS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -38,7 +39,7 @@ def model_report(result: GMWMResult, recording: Recording | None = None, *, titl
         for index in indices[:_MOST_SENSORS]
     ]
     return render(
-        "models.html.j2",
+        Path(__file__).parent / "templates" / "models.html.j2",
         title=title,
         result=result,
         recording=recording,

@@ -5,17 +5,18 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
+from gyrofuse._base.page import number, render
+from gyrofuse._base.results import chance, counted, p_words, place, signed
 from gyrofuse._rank_candidates import charge, n_parameters
-from gyrofuse._result import chance, counted, p_words, place, signed
 from gyrofuse.gmwm_result import REFUSED
 from gyrofuse.model_words import model_method
 from gyrofuse.moment_fit import composition_of
 from gyrofuse.ranking_result import RankResult
 from gyrofuse.recording import Recording
 from gyrofuse.report_models import model_part
-from gyrofuse.report_page import number, render
 
 # Pages stay readable; the JSON file holds all.
 _MOST_SENSORS, _MOST_ROWS = 24, 15
@@ -41,7 +42,7 @@ def rank_report(
     parts = [_part(result, recording, n, index) for n, index in enumerate(indices[:_MOST_SENSORS])]
     fits = [fit for fit in result.best if fit is not None]
     return render(
-        "ranking.html.j2",
+        Path(__file__).parent / "templates" / "ranking.html.j2",
         title=title,
         result=result,
         recording=recording,

@@ -9,8 +9,8 @@ from itertools import groupby
 import torch
 from torch import Tensor
 
+from gyrofuse._base.page import number
 from gyrofuse.multiscale_result import MultiScaleResult, well_observed
-from gyrofuse.report_page import number
 from gyrofuse.svo_result import SVOResult
 
 Fused = SVOResult | MultiScaleResult

@@ -24,7 +24,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import check_n_levels, check_signal
+from gyrofuse._base.checks import check_n_levels, check_signal
 from gyrofuse.covariance import wavelet_variance
 
 # Below, the biweight throws away the shoulders of the Gaussian itself: samples of a hundred often have no solution, and

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from gyrofuse._checks import check_n_samples, check_signal
+from gyrofuse._base.checks import check_n_samples, check_signal
 
 # The top value of a rounded sinusoid is met up to 1/(sqrt 2 - 1) = 2.4 times as often as the one below it, that of
 # noise not even as often; more than this is a pile of clipped values.

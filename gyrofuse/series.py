@@ -20,7 +20,7 @@ import math
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import largest_level
+from gyrofuse._base.checks import largest_level
 
 # More cosines than this gain little: Student's t is within 3 % of normal.
 MOST_TERMS = 48

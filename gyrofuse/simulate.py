@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import check_positive_integer
+from gyrofuse._base.checks import check_positive_integer
+from gyrofuse._base.random import own_generator
 from gyrofuse._estimation import EstimatedFrom
-from gyrofuse._paths import own_generator
 from gyrofuse.processes import Drift, Model, Process
 
 _SYMMETRY = 1e-8  # of the largest entry: printed digits may differ across the diagonal

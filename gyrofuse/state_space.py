@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from gyrofuse._checks import check_floating, check_positive
+from gyrofuse._base.checks import check_floating, check_positive
 from gyrofuse.processes import (
     AR1,
     Drift,

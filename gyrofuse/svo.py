@@ -11,9 +11,9 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from gyrofuse import uncertainty
-from gyrofuse._checks import check_confidence_level, check_n_levels, check_signal
-from gyrofuse._linalg import check_positive_definite
-from gyrofuse._result import ConfidenceInterval, named, numbered
+from gyrofuse._base.checks import check_confidence_level, check_n_levels, check_signal
+from gyrofuse._base.linalg import check_positive_definite
+from gyrofuse._base.results import ConfidenceInterval, named, numbered
 from gyrofuse.bootstrap import signal_bootstrap
 from gyrofuse.covariance import binned_products
 from gyrofuse.fusion import METHODS, Chosen, choose_weights, judge_weights

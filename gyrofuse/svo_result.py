@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from gyrofuse import gain, hypotheses
-from gyrofuse._checks import check_positive, check_signal
-from gyrofuse._result import ConfidenceInterval, listed, named, numbered
+from gyrofuse._base.checks import check_positive, check_signal
+from gyrofuse._base.results import ConfidenceInterval, listed, named, numbered
 from gyrofuse._virtual_gyro import VirtualGyro
 from gyrofuse.cross_fitting import CrossFit
 from gyrofuse.gain import Gain

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import check_n_levels, largest_level
-from gyrofuse._linalg import check_positive_definite
-from gyrofuse._processes import all_or_none, place
-from gyrofuse._result import listed
+from gyrofuse._base.checks import check_n_levels, largest_level
+from gyrofuse._base.distributed import all_or_none, place
+from gyrofuse._base.linalg import check_positive_definite
+from gyrofuse._base.results import listed
 from gyrofuse._virtual_gyro import VirtualGyro
 from gyrofuse.long_recording import LongRecording, Progress, check_long_recording, silent, stretch_of
 from gyrofuse.metric import WaveletCrossCovariance

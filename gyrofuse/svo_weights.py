@@ -10,8 +10,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from gyrofuse._checks import check_floating
-from gyrofuse._linalg import check_positive_definite
+from gyrofuse._base.checks import check_floating
+from gyrofuse._base.linalg import check_positive_definite
 from gyrofuse.scale_weights import ScaleWeights, normalised, resolve_scale_weights
 
 

@@ -23,10 +23,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import check_floating, check_positive_integer
+from gyrofuse._base.checks import check_floating, check_positive_integer
+from gyrofuse._base.transforms import fast_length, taper_kernel, tone_in_hann
 from gyrofuse._line import Line
 from gyrofuse._line_background import place, smooth_background
-from gyrofuse._transforms import fast_length, taper_kernel, tone_in_hann
 
 NoiseSpectrum = Callable[[Tensor], Tensor]
 

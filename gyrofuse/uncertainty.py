@@ -14,7 +14,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gyrofuse._result import ConfidenceInterval
+from gyrofuse._base.results import ConfidenceInterval
 
 _WHITE_NOISE_DEGREES_AT_LEVEL_1 = 4 / 3
 _RANDOM_WALK_DEGREES = 280 / 151

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import check_floating
-from gyrofuse._output import Outputs
-from gyrofuse._processes import all_or_none, place, told_by_first
+from gyrofuse._base.checks import check_floating
+from gyrofuse._base.distributed import all_or_none, place, told_by_first
+from gyrofuse._base.files import Outputs
 from gyrofuse.long_recording import LongRecording, Progress, check_long_recording, silent, stretch_of
 from gyrofuse.svo_result import fuse
 

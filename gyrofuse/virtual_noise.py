@@ -20,7 +20,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse._nnls import nonnegative_least_squares
+from gyrofuse._base.nnls import nonnegative_least_squares
 from gyrofuse.processes import AR1, Drift, Model, Process, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
 from gyrofuse.simulate import ArrayModel
 

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse import series
-from gyrofuse._linalg import oriented_eigh
+from gyrofuse._base.linalg import oriented_eigh
 from gyrofuse.parametric import resample_combined
 from gyrofuse.pilot import Pilot, fit_pilot
 from gyrofuse.uncertainty import normal_quantile, t_quantile

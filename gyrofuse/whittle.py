@@ -22,11 +22,11 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import check_floating, check_positive_integer
+from gyrofuse._base.checks import check_floating, check_positive_integer
+from gyrofuse._base.transforms import cosine_ordinates, ramp_ordinates
 from gyrofuse._composition import Composition
 from gyrofuse._cosine_bins import SINGLE, Bins, Noise
 from gyrofuse._spectral_search import maximise, uncertainty
-from gyrofuse._transforms import cosine_ordinates, ramp_ordinates
 from gyrofuse.processes import Drift, Sinusoid
 from gyrofuse.tones import FEWEST_SAMPLES, Tones, find_tones
 

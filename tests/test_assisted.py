@@ -12,7 +12,7 @@ from torch import Tensor
 
 import gyrofuse as gf
 from gyrofuse import assisted
-from gyrofuse._linalg import geometric_mean
+from gyrofuse._base.linalg import geometric_mean
 from gyrofuse.assisted import assisted_covariance
 from gyrofuse.covariance import wavelet_products
 from gyrofuse.svo_weights import combine, optimal_weights

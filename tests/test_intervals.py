@@ -12,7 +12,7 @@ from scipy import stats
 from torch import Tensor
 
 from gyrofuse import wavelet_cross_covariance, wavelet_cross_covariance_interval, wavelet_variance_interval
-from gyrofuse._checks import check_confidence_level
+from gyrofuse._base.checks import check_confidence_level
 
 N_RUNS, N_SAMPLES, N_LEVELS = 120, 2048, 10
 MIX = np.array([[1.0, 0, 0], [0.6, 0.8, 0], [-0.3, 0.2, 0.9]])

@@ -24,7 +24,7 @@ from scipy import stats
 from torch import Tensor
 
 from gyrofuse import ArrayModel, RandomWalk, SVOResult, WhiteNoise, fit_multiscale, fit_svo, wavelet_cross_covariance
-from gyrofuse._linalg import SingularCovarianceError
+from gyrofuse._base.linalg import SingularCovarianceError
 from gyrofuse.live import LiveSVO, subset_weights
 
 N_SENSORS = 4

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import gyrofuse as gf
-from gyrofuse._transforms import cosine_ordinates
+from gyrofuse._base.transforms import cosine_ordinates
 from gyrofuse.mismatch.base import fit_base
 from gyrofuse.mismatch.colour import filtered
 from gyrofuse.mismatch.spectra import bands

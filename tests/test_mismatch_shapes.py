@@ -13,7 +13,7 @@ from scipy import signal, stats
 from shape_draws import BUMP, CHANGES, RATE, SIGNS, WHITE, N, P, array, case, drawn, generator, nominated, tensor
 
 import gyrofuse as gf
-from gyrofuse._transforms import cosine_ordinates
+from gyrofuse._base.transforms import cosine_ordinates
 from gyrofuse.mismatch.bumps import bump_witness
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.colour import filtered, noise, of_phase, quadrature

@@ -10,7 +10,7 @@ import torch
 from scipy import signal, stats
 
 import gyrofuse as gf
-from gyrofuse._transforms import cosine_ordinates
+from gyrofuse._base.transforms import cosine_ordinates
 from gyrofuse.mismatch import shape_scan
 from gyrofuse.mismatch.base import _time_constants, fit_base
 from gyrofuse.mismatch.case import Case, Scene

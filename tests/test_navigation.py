@@ -12,6 +12,7 @@ from scipy import stats
 from scipy.integrate import solve_ivp
 
 import gyrofuse as gf
+from gyrofuse._base.units import GRAVITY
 from gyrofuse.navigation import (
     Alignment,
     Gnss,
@@ -35,7 +36,6 @@ from gyrofuse.navigation.attitude import (
     skew,
 )
 from gyrofuse.navigation.trajectory import EARTH_RATE
-from gyrofuse.units import GRAVITY
 
 DEGREE = math.pi / 180
 NO_EARTH = torch.zeros(3, dtype=torch.float64)

@@ -13,7 +13,7 @@ from pages import Page
 
 import gyrofuse as gf
 from gyrofuse import report_ranking
-from gyrofuse.report_page import number
+from gyrofuse._base.page import number
 from gyrofuse.report_ranking import rank_report, rank_verdict
 
 MODELS = (

@@ -10,7 +10,7 @@ import pytest
 import torch
 from reference import processes as naive
 
-from gyrofuse._paths import ar1_recursion, own_generator
+from gyrofuse._base.random import ar1_recursion, own_generator
 from gyrofuse.parsing import model_from_dict
 from gyrofuse.processes import AR1, Drift, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
 from gyrofuse.simulate import ArrayModel

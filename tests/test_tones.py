@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse import _transforms, tones
+from gyrofuse import tones
+from gyrofuse._base import transforms as _transforms
 from gyrofuse.tones import find_tones, line_p_value
 
 # Voirol et al., Simulation 1

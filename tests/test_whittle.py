@@ -16,10 +16,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from gyrofuse._base.transforms import cosine_ordinates, ramp_ordinates
 from gyrofuse._composition import Composition
 from gyrofuse._cosine_bins import Bins, Noise
 from gyrofuse._model import Model
-from gyrofuse._transforms import cosine_ordinates, ramp_ordinates
 from gyrofuse.export import state_space
 from gyrofuse.processes import AR1, Drift, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
 from gyrofuse.whittle import WhittleFit, refine_whittle

@@ -6,7 +6,7 @@ import hashlib
 import secrets
 from pathlib import Path
 
-from gyrofuse._output import sync_file, sync_folder
+from gyrofuse._base.files import sync_file, sync_folder
 
 _DIGITS = 32  # hexadecimal digits of a SHA-256 in a name, 128 bits: none is met twice by chance
 DRAFTS = "*.draft"  # files that were being written

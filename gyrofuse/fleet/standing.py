@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import stats
 
-from gyrofuse._result import counted
+from gyrofuse._base.results import counted
 from gyrofuse.fleet.table import identity_in
 
 NOISY = 2.0  # times the median of an array

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from gyrofuse._output import creating, sync_file, sync_folder
+from gyrofuse._base.files import creating, sync_file, sync_folder
 from gyrofuse.fleet.lock import hold, release
 from gyrofuse.fleet.logs import State, state_of
 from gyrofuse.fleet.sealed import DRAFTS, draft_in, read_sealed, write_sealed

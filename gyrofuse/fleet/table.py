@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from gyrofuse._version import __version__
+from gyrofuse._base import __version__
 from gyrofuse.fleet.logs import as_text
 from gyrofuse.fleet.sealed import read_sealed
 

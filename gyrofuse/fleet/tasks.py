@@ -13,7 +13,8 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import check_confidence_level
+from gyrofuse._base.checks import check_confidence_level
+from gyrofuse._base.units import DATASHEET_UNITS
 from gyrofuse._model import Model
 from gyrofuse.fleet.table import Column
 from gyrofuse.fusion import METHODS
@@ -25,7 +26,6 @@ from gyrofuse.scale_weights import normalised, resolve_scale_weights
 from gyrofuse.simulate import ArrayModel
 from gyrofuse.svo import fit_svo
 from gyrofuse.svo_result import SVOResult
-from gyrofuse.units import DATASHEET_UNITS
 
 Row = dict[str, Any]
 

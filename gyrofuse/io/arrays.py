@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 
+from gyrofuse._base.units import canonical_unit, quantity_of
 from gyrofuse.io.column_streams import time_in_seconds
 from gyrofuse.io.columns import AXES, CHANNELS, NAMES_OF, TICK, Column, classify_columns, or_else, renamed
 from gyrofuse.io.limits import LONGEST_NAME, decoded, enumerated, is_rate
 from gyrofuse.io.stream import Array, RecordingError, Stream
-from gyrofuse.units import canonical_unit, quantity_of
 
 _RATE = (
     "fs",

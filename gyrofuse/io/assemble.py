@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from gyrofuse._checks import same_rate
+from gyrofuse._base.checks import same_rate
+from gyrofuse._base.units import unit_factor
 from gyrofuse.io import read_streams
 from gyrofuse.io.align import Placed, align
 from gyrofuse.io.clock import Grid, grid_of, regular_grid
@@ -19,7 +20,6 @@ from gyrofuse.io.columns import AXES, CHANNELS
 from gyrofuse.io.limits import printable
 from gyrofuse.io.notes import Note
 from gyrofuse.io.stream import Array, RecordingError, Stream, unexpected
-from gyrofuse.units import unit_factor
 
 _UNKNOWN = "unknown"
 

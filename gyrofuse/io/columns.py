@@ -7,9 +7,9 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from gyrofuse._base.units import UNITS, canonical_unit
 from gyrofuse.io.limits import LONGEST_NAME, enumerated
 from gyrofuse.io.stream import RecordingError
-from gyrofuse.units import UNITS, canonical_unit
 
 AXES = ("x", "y", "z")
 # What names of each quantity look like, for messages, and what reads it.

@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gyrofuse._base.units import canonical_unit
 from gyrofuse.io.arrays import clock_in_seconds, settings_by_group, stated_rate
 from gyrofuse.io.column_streams import streams_from_columns
 from gyrofuse.io.columns import NAMES_OF, WRAP_32_BIT, Column, classify_columns
 from gyrofuse.io.limits import LONGEST_NAME, enumerated, is_rate
 from gyrofuse.io.stream import Array, RecordingError, Stream
-from gyrofuse.units import canonical_unit
 
 # Devices of one recording; each table is read with all that has its length.
 _MOST_TABLES = 256

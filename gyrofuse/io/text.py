@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gyrofuse._result import numbered
+from gyrofuse._base.results import numbered
 from gyrofuse.io.arrays import settings_by_group, stated_rate, stated_unit
 from gyrofuse.io.column_streams import streams_from_columns, time_in_seconds
 from gyrofuse.io.columns import NAMES_OF, WORD_OF, Column, classify_columns, or_else, renamed

@@ -16,9 +16,9 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
+from gyrofuse._base.nnls import nonnegative_least_squares
 from gyrofuse._lag_sums import block_mean_covariances
 from gyrofuse._model import Model
-from gyrofuse._nnls import nonnegative_least_squares
 from gyrofuse.mismatch.axes import Axes
 from gyrofuse.mismatch.spectra import Bands
 from gyrofuse.processes import AR1, Process, QuantizationNoise, RandomWalk, WhiteNoise

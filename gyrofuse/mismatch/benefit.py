@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gyrofuse._result import cleaned
+from gyrofuse._base.results import cleaned
 from gyrofuse.covariance import wavelet_cross_covariance
 from gyrofuse.scale_weights import ScaleWeights, resolve_scale_weights
 from gyrofuse.svo_weights import svo_weights

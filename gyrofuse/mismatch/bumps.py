@@ -12,7 +12,7 @@ from scipy import stats
 from scipy.signal import windows
 from torch import Tensor
 
-from gyrofuse._transforms import fast_length, squared_modulus
+from gyrofuse._base.transforms import fast_length, squared_modulus
 from gyrofuse.mismatch.bump_scan import flank_of, least_flank, log_ratios, scanned_bumps
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import Evidence, corrected, ratio_p_value

@@ -17,7 +17,7 @@ import torch
 from scipy import special
 from torch import Tensor
 
-from gyrofuse._transforms import cosine_ordinates
+from gyrofuse._base.transforms import cosine_ordinates
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import Evidence, corrected
 from gyrofuse.mismatch.known_lines import without_lines

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from gyrofuse._transforms import fast_length
+from gyrofuse._base.transforms import fast_length
 
 
 def filtered(signal: Tensor, response: Callable[[Tensor], Tensor]) -> Tensor:

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import check_n_samples
+from gyrofuse._base.checks import check_n_samples
 from gyrofuse._model import Model
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.confirm import discrepancy_left, held_out, held_out_gain, leads_away

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from gyrofuse._result import p_words
+from gyrofuse._base.results import p_words
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import corrected
 from gyrofuse.mismatch.shape_scan import Looks, looked_at

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from gyrofuse._transforms import cosine_ordinates
+from gyrofuse._base.transforms import cosine_ordinates
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.lines import whitened
 

@@ -9,10 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import check_positive, check_positive_integer, check_signal, same_rate
+from gyrofuse._base.checks import check_positive, check_positive_integer, check_signal, same_rate
+from gyrofuse._base.results import named, numbered
 from gyrofuse._estimation import EstimatedFrom
 from gyrofuse._model import Model
-from gyrofuse._result import named, numbered
 from gyrofuse.array_gmwm_result import ArrayGMWMResult
 from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.joint import JointFit

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import same_rate
+from gyrofuse._base.checks import same_rate
 from gyrofuse._model import Model
 from gyrofuse.mismatch.agreement import compared
 from gyrofuse.mismatch.classifier import distinguishability

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse._transforms import squared_modulus
+from gyrofuse._base.transforms import squared_modulus
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.evidence import corrected, ratio_p_value, some_of, surpassing
 from gyrofuse.mismatch.prediction_errors import left_out

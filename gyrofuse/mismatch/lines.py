@@ -24,7 +24,7 @@ from scipy import fft, special
 from torch import Tensor
 from torch.nn.functional import max_pool1d
 
-from gyrofuse._transforms import fast_length
+from gyrofuse._base.transforms import fast_length
 from gyrofuse.mismatch.base import Base
 from gyrofuse.mismatch.evidence import corrected
 from gyrofuse.mismatch.known_lines import amplitudes, precise

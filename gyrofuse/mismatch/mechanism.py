@@ -9,7 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse._result import cleaned
+from gyrofuse._base.results import cleaned
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.folds import spectral_gains
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse._transforms import fast_length, squared_modulus
+from gyrofuse._base.transforms import fast_length, squared_modulus
 from gyrofuse.mismatch.evidence import corrected
 from gyrofuse.mismatch.lines import sets_of
 

@@ -8,8 +8,8 @@ from typing import Any, TypeVar
 
 from torch import Tensor
 
-from gyrofuse._checks import same_rate
-from gyrofuse._result import cleaned
+from gyrofuse._base.checks import same_rate
+from gyrofuse._base.results import cleaned
 from gyrofuse.mismatch.benefit import Benefit, benefit
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.comparison import VarianceComparison, compared_variances

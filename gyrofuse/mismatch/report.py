@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gyrofuse._result import p_words
+from gyrofuse._base.results import p_words
 from gyrofuse.mismatch.outcome import Outcome
 from gyrofuse.mismatch.telling import fused_words, judged_words, nats, otherwise_words, parameter_words
 from gyrofuse.plotting_mismatch import plot_map

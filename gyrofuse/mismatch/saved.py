@@ -15,7 +15,7 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import check_n_samples, check_positive
+from gyrofuse._base.checks import check_n_samples, check_positive
 from gyrofuse.mismatch.axes import Axes
 from gyrofuse.mismatch.case import Scene
 from gyrofuse.mismatch.mechanism import Mechanism

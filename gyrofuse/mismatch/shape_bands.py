@@ -13,7 +13,7 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from gyrofuse._transforms import cosine_ordinates
+from gyrofuse._base.transforms import cosine_ordinates
 from gyrofuse.mismatch.base import Base, fit_base
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.folds import N_FOLDS, N_JUDGED

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from gyrofuse._nnls import nonnegative_least_squares
+from gyrofuse._base.nnls import nonnegative_least_squares
 from gyrofuse.mismatch.base import Base, _time_constants, atom_covariances
 from gyrofuse.mismatch.case import N_BLOCKS, Case, block_means
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gyrofuse._transforms import fast_length
+from gyrofuse._base.transforms import fast_length
 
 _TAPERS = 4  # an even number
 _PER_OCTAVE = 4

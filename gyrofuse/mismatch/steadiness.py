@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate, pad
 
-from gyrofuse._transforms import squared_modulus
+from gyrofuse._base.transforms import squared_modulus
 from gyrofuse.mismatch.bump_fit import Oscillation
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.wandering import rampless_transform, wandering_log_ratio, weights_in_phase

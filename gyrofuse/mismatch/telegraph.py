@@ -24,7 +24,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gyrofuse._nnls import nonnegative_least_squares
+from gyrofuse._base.nnls import nonnegative_least_squares
 from gyrofuse.mismatch.base import Base
 
 Array = NDArray[np.float64]

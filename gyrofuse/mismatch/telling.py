@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 
-from gyrofuse._linalg import SingularCovarianceError
-from gyrofuse._result import p_words
+from gyrofuse._base.linalg import SingularCovarianceError
+from gyrofuse._base.results import p_words
 from gyrofuse.mismatch.benefit import Benefit
 from gyrofuse.mismatch.mechanism import Finding
 from gyrofuse.mismatch.outcome import Outcome

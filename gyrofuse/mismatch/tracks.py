@@ -16,7 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse._transforms import squared_modulus
+from gyrofuse._base.transforms import squared_modulus
 from gyrofuse.mismatch.evidence import corrected
 from gyrofuse.mismatch.lines import sets_of
 from gyrofuse.mismatch.track_fit import AROUND, Candidates, fitted_track

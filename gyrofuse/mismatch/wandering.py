@@ -18,7 +18,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse._transforms import squared_modulus
+from gyrofuse._base.transforms import squared_modulus
 from gyrofuse.mismatch.bump_fit import Oscillation
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.remembered import remembered

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import check_confidence_level, check_positive_integer
+from gyrofuse._base.checks import check_confidence_level, check_positive_integer
+from gyrofuse._base.results import ConfidenceInterval, cleaned, listed
 from gyrofuse._model import Model
-from gyrofuse._result import ConfidenceInterval, cleaned, listed
 from gyrofuse.navigation.filter import Alignment, Flown, Gnss, fly
 from gyrofuse.navigation.sensors import UnitErrors
 from gyrofuse.navigation.trajectory import Trajectory, flight

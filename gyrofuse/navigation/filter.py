@@ -21,7 +21,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import check_positive
+from gyrofuse._base.checks import check_positive
 from gyrofuse.navigation.attitude import (
     conjugate,
     from_rotation_vector,

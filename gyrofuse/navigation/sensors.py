@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse._checks import check_positive
+from gyrofuse._base.checks import check_positive
 from gyrofuse._model import Model
 from gyrofuse.processes import AR1, RandomWalk
 from gyrofuse.state_space import StateSpace, state_space

@@ -17,8 +17,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gyrofuse._base.units import GRAVITY
 from gyrofuse.navigation.attitude import conjugate, from_rotation_vector, multiply, rotate
-from gyrofuse.units import GRAVITY
 
 _SMALL = 1e-4  # rad
 

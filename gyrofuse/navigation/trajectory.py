@@ -17,9 +17,9 @@ import torch
 from scipy.interpolate import BSpline, make_interp_spline
 from torch import Tensor
 
-from gyrofuse._checks import check_floating, check_positive
+from gyrofuse._base.checks import check_floating, check_positive
+from gyrofuse._base.units import GRAVITY
 from gyrofuse.navigation.attitude import conjugate, from_euler, rotate
-from gyrofuse.units import GRAVITY
 
 EARTH_RATE = 7.292115e-5  # rad/s
 _DEGREE = 5

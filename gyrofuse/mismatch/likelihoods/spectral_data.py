@@ -19,7 +19,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse._transforms import cosine_ordinates
+from gyrofuse._base.transforms import cosine_ordinates
 from gyrofuse.mismatch.bumps import light_taper
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.folds import N_FOLDS, N_JUDGED

@@ -10,6 +10,7 @@ from typing import Annotated, ClassVar
 import torch
 from torch import Tensor
 
+from gyrofuse._base.units import GRAVITY
 from gyrofuse.mismatch.axes import Axes
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.channels import ChannelFit, regress
@@ -19,7 +20,6 @@ from gyrofuse.mismatch.mechanisms.not_identifiable import NOT_IDENTIFIABLE
 from gyrofuse.mismatch.partakers import partakers
 from gyrofuse.mismatch.transfer import Transfer, likeliest_transfer
 from gyrofuse.mismatch.witnesses import level_of
-from gyrofuse.units import GRAVITY
 
 _OF_ONE_BAND = 0.9  # share of the evidence from which a gain might be a line's alone
 _WHOLE = ("each", "length")  # kinds of rows that are made from all of a channel

@@ -9,7 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from gyrofuse._paths import ar1_recursion
+from gyrofuse._base.random import ar1_recursion
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.gaussian import Addition
 from gyrofuse.mismatch.mechanism import Finding, Mechanism

@@ -9,10 +9,10 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from gyrofuse._base.units import GRAVITY
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.witnesses import power_tails
-from gyrofuse.units import GRAVITY
 
 _UNITS = {
     180 / math.pi: "deg/s against rad/s",

@@ -10,7 +10,7 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from gyrofuse._transforms import squared_modulus
+from gyrofuse._base.transforms import squared_modulus
 from gyrofuse.mismatch.axes import OfSensors
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.folds import estimation_samples

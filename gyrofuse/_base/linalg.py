@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from gyrofuse._result import named
+from gyrofuse._base.results import named
 
 
 class SingularCovarianceError(ValueError):

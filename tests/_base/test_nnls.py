@@ -7,8 +7,8 @@ import pytest
 import torch
 from scipy import optimize
 
-from gyrofuse import _nnls
-from gyrofuse._nnls import nonnegative_least_squares
+from gyrofuse._base import nnls as _nnls
+from gyrofuse._base.nnls import nonnegative_least_squares
 
 
 @pytest.mark.parametrize("n_unknown", [1, 2, 5, 9])

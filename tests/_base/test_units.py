@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from gyrofuse import units
+from gyrofuse._base import units
 
 
 def test_rate_units():

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from gyrofuse._output import Outputs, output_folder
+from gyrofuse._base.files import Outputs, output_folder
 
 
 def contents(folder: Path) -> dict[str, bytes]:

@@ -10,9 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from gyrofuse import axes
-from gyrofuse._result import p_words
-from gyrofuse._version import __version__
+from gyrofuse._base import __version__, axes
+from gyrofuse._base.results import p_words
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -65,17 +64,17 @@ def image(width: float, height: float, draw: Callable[..., None], *arguments: An
     return "data:image/svg+xml;base64," + base64.b64encode(file.getvalue()).decode()
 
 
-def render(template: str, **context: Any) -> str:
-    """Fill in a template of the folder `templates`; what it is given stays text, whatever markup it holds.
+def render(template: Path, **context: Any) -> str:
+    """Fill in a template; what it is given stays text, whatever markup it holds.
 
     Args:
-        template: Name of the file.
+        template: The file; it may use others beside it, and the `base` and `parts` beside this module.
         **context: What the template asks for, all of it.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     environment = Environment(
-        loader=FileSystemLoader(Path(__file__).with_name("templates")),
+        loader=FileSystemLoader([template.parent, Path(__file__).parent]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -87,6 +86,6 @@ def render(template: str, **context: Any) -> str:
     environment.filters["scientific"] = lambda value: f"{value:.3e}" if math.isfinite(value) else "-"
     environment.filters["fixed"] = lambda value: f"{value:.4f}" if math.isfinite(value) else "-"
     environment.filters["signed"] = lambda value: f"{value:+.4f}" if math.isfinite(value) else "-"
-    page = environment.get_template(template).render(version=__version__, **context)
+    page = environment.get_template(template.name).render(version=__version__, **context)
     # Names of files and sensors may hold bytes that are no text: they are written out.
     return page.encode("utf-8", "backslashreplace").decode()

@@ -8,7 +8,7 @@ import torch
 from reference import haar as naive
 
 from gyrofuse import SingularCovarianceError
-from gyrofuse._linalg import check_positive_definite
+from gyrofuse._base.linalg import check_positive_definite
 
 
 def covariance(*rows: np.ndarray) -> torch.Tensor:
