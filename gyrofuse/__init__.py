@@ -39,10 +39,12 @@ from gyrofuse.haar import HaarFilterBank, haar_coefficients
 from gyrofuse.hypotheses import EnoughData, WeightsTest
 from gyrofuse.influence import BootstrapWeightsCovariance, bootstrap_weights_covariance
 from gyrofuse.intervals import wavelet_cross_covariance_interval, wavelet_variance_interval
-from gyrofuse.io.stream import RecordingError
+from gyrofuse.io.chunked import LongRecording, open_long, stretch_of
+from gyrofuse.io.recording import Recording, read_recording
+from gyrofuse.io.saturation import find_saturation, mask_saturated
+from gyrofuse.io.streams import RecordingError
 from gyrofuse.joint import JointFit, fit_jointly
 from gyrofuse.live import LiveSVO, subset_weights
-from gyrofuse.long_recording import LongRecording, open_long, stretch_of
 from gyrofuse.moment_bootstrap import GMWMBootstrap, bootstrap_gmwm
 from gyrofuse.moment_covariance import moment_covariance
 from gyrofuse.multiscale import MultiScaleSVO, fit_multiscale
@@ -55,9 +57,7 @@ from gyrofuse.processes import AR1, Drift, Model, QuantizationNoise, RandomWalk,
 from gyrofuse.ranking import rank_models
 from gyrofuse.ranking_result import RankResult
 from gyrofuse.rdvg import RDVGResult, rdvg, rdvg_weights
-from gyrofuse.recording import Recording, read_recording
 from gyrofuse.robust import robust_wavelet_variance
-from gyrofuse.saturation import find_saturation, mask_saturated
 from gyrofuse.scale_weights import resolve_scale_weights
 from gyrofuse.selection import Selection
 from gyrofuse.simulate import ArrayModel

@@ -25,9 +25,9 @@ from gyrofuse._model_tones import model_tones
 from gyrofuse._records import Records
 from gyrofuse.array_gmwm_result import ArrayGMWMResult
 from gyrofuse.covariance import wavelet_products
+from gyrofuse.io.recording import Recording
 from gyrofuse.moment_fit import composition_of
 from gyrofuse.processes import Drift, Model, Sinusoid
-from gyrofuse.recording import Recording
 
 WEIGHTINGS = ("optimal", "pairwise")
 # Numbers that the weights of all items may take at a time.

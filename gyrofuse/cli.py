@@ -48,13 +48,13 @@ from gyrofuse.cli_shared import (
     write_json,
 )
 from gyrofuse.demo import FILES, run_demo
-from gyrofuse.io.columns import WORD_OF
+from gyrofuse.io.formats.columns import WORD_OF
 from gyrofuse.io.limits import physical_memory
+from gyrofuse.io.recording import Recording
 from gyrofuse.multiscale import fit_multiscale
 from gyrofuse.multiscale_result import MultiScaleResult
 from gyrofuse.parsing import parse_model
 from gyrofuse.processes import Model
-from gyrofuse.recording import Recording
 from gyrofuse.report import (
     fusion_figure,
     fusion_report,

@@ -27,8 +27,8 @@ from gyrofuse.cli_shared import (
     scale_weights_of,
     write_json,
 )
+from gyrofuse.io.recording import read_recording
 from gyrofuse.processes import Model
-from gyrofuse.recording import read_recording
 from gyrofuse.simulate import ArrayModel
 
 if TYPE_CHECKING:

@@ -26,8 +26,8 @@ from gyrofuse.cli_shared import (
     without_gaps,
     write_json,
 )
+from gyrofuse.io.recording import Recording
 from gyrofuse.processes import Model
-from gyrofuse.recording import Recording
 from gyrofuse.simulate import ArrayModel
 
 if TYPE_CHECKING:

@@ -33,10 +33,10 @@ from gyrofuse.cli_shared import (
 from gyrofuse.export import to_c_header, to_kalibr
 from gyrofuse.gmwm import fit_gmwm
 from gyrofuse.gmwm_result import GMWMResult
-from gyrofuse.io.stream import RecordingError
+from gyrofuse.io.recording import Recording
+from gyrofuse.io.streams import RecordingError
 from gyrofuse.processes import Model
 from gyrofuse.ranking import rank_models
-from gyrofuse.recording import Recording
 from gyrofuse.report_models import model_report
 from gyrofuse.report_ranking import rank_report
 from gyrofuse.tones import FEWEST_SAMPLES

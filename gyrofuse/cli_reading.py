@@ -14,7 +14,7 @@ import typer
 
 from gyrofuse._console import progress
 from gyrofuse.cli_shared import known_unit
-from gyrofuse.recording import Recording, read_recording
+from gyrofuse.io.recording import Recording, read_recording
 
 Logs = Annotated[
     list[Path],

@@ -15,9 +15,9 @@ from gyrofuse._base.checks import check_positive, same_rate
 from gyrofuse._base.files import Outputs
 from gyrofuse._base.units import KNOWN_UNITS, canonical_unit
 from gyrofuse._console import say_table, warn
+from gyrofuse.io.recording import Recording
 from gyrofuse.parsing import model_from_dict
 from gyrofuse.processes import Model
-from gyrofuse.recording import Recording
 from gyrofuse.simulate import ArrayModel
 
 if TYPE_CHECKING:

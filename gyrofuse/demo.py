@@ -13,9 +13,9 @@ from torch import Tensor
 from gyrofuse import plotting
 from gyrofuse.demo_mismatch import MOST_SAMPLES, concealed, mismatch_story
 from gyrofuse.demo_models import CANDIDATES, models_figure, models_story, true_models
+from gyrofuse.io.recording import Recording
 from gyrofuse.processes import AR1, WhiteNoise
 from gyrofuse.ranking import rank_models
-from gyrofuse.recording import Recording
 from gyrofuse.report import fusion_figure, fusion_report, new_figure, number, save_figure, verdict
 from gyrofuse.report_ranking import rank_report
 from gyrofuse.simulate import ArrayModel

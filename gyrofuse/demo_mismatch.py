@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gyrofuse._base.page import number
 from gyrofuse.gmwm import fit_gmwm
-from gyrofuse.recording import Recording
+from gyrofuse.io.recording import Recording
 from gyrofuse.simulate import ArrayModel
 
 if TYPE_CHECKING:

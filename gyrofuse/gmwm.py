@@ -24,13 +24,13 @@ from gyrofuse._records import Records
 from gyrofuse._white_kurtosis import white_excess_kurtosis, with_excess_kurtosis
 from gyrofuse.continuous import fit_moments
 from gyrofuse.gmwm_result import GMWMResult
+from gyrofuse.io.recording import Recording
 from gyrofuse.moment_fit import composition_of
 from gyrofuse.moment_identity import remarks
 from gyrofuse.moment_inference import Fit, Inference, either, infer, infer_efficient
 from gyrofuse.moment_profile import profiled
 from gyrofuse.processes import Drift, Model, Sinusoid
 from gyrofuse.profile_surfaces import MomentSurface, SpectralSurface
-from gyrofuse.recording import Recording
 from gyrofuse.robust import check_efficiency, robust_wavelet_variance
 from gyrofuse.robust_covariance import check_gaussian
 from gyrofuse.tones import Tones

@@ -20,13 +20,13 @@ from gyrofuse._records import Records
 from gyrofuse._white_kurtosis import white_excess_kurtosis, with_excess_kurtosis
 from gyrofuse.gmwm import fit_gmwm
 from gyrofuse.gmwm_result import GMWMResult
+from gyrofuse.io.recording import Recording
 from gyrofuse.moment_fit import composition_of, fit_items
 from gyrofuse.moment_identity import remarks
 from gyrofuse.moment_inference import Fit, infer
 from gyrofuse.moment_profile import profiled
 from gyrofuse.processes import Model, Sinusoid
 from gyrofuse.profile_surfaces import MomentSurface
-from gyrofuse.recording import Recording
 from gyrofuse.uncertainty import chi_square_tail
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from gyrofuse._base.checks import check_n_samples, check_positive, check_positive_integer, check_signal
 from gyrofuse._base.linalg import check_positive_definite
-from gyrofuse.saturation import check_full_scale
+from gyrofuse.io.saturation import check_full_scale
 from gyrofuse.scale_weights import ScaleWeights, resolve_scale_weights
 from gyrofuse.svo_result import SVOResult
 

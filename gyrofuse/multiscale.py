@@ -43,9 +43,9 @@ from gyrofuse._base.checks import check_floating, check_positive_integer, check_
 from gyrofuse._base.linalg import check_positive_definite
 from gyrofuse.covariance import binned_products
 from gyrofuse.cross_fitting import CrossFit, Fusion, cross_fit
+from gyrofuse.io.recording import Recording
 from gyrofuse.multiscale_result import MultiScaleResult, fuse_bands
 from gyrofuse.pilot import fit_pilot
-from gyrofuse.recording import Recording
 from gyrofuse.scale_weights import ScaleWeights
 from gyrofuse.series import bin_length
 from gyrofuse.svo import fit_svo

@@ -13,7 +13,7 @@ from gyrofuse._base.checks import check_signal
 from gyrofuse._base.results import ConfidenceInterval, listed, numbered
 from gyrofuse._tiles import tile_length
 from gyrofuse.cross_fitting import CrossFit
-from gyrofuse.recording import Recording
+from gyrofuse.io.recording import Recording
 from gyrofuse.svo_result import SVOResult, plot_deviations
 
 if TYPE_CHECKING:

@@ -15,10 +15,10 @@ from torch import Tensor
 
 from gyrofuse._base.checks import check_signal
 from gyrofuse.fault_kinds import kinds_of
+from gyrofuse.io.recording import Recording
 from gyrofuse.parity_energy import Energies, chunks_of, energies_of, parity_matrix, window_products
 from gyrofuse.parity_reference import ParityReference, check_window, stationary_reference
 from gyrofuse.parity_result import ParityResult
-from gyrofuse.recording import Recording
 from gyrofuse.svo_result import SVOResult
 from gyrofuse.uncertainty import degrees_of_freedom
 

@@ -13,8 +13,8 @@ from torch import Tensor
 from gyrofuse._base.checks import check_positive_integer, check_signal, largest_level
 from gyrofuse._base.linalg import check_positive_definite
 from gyrofuse._base.results import listed, numbered
+from gyrofuse.io.recording import Recording
 from gyrofuse.parity_energy import Products, chunks_of, energies_of, own_variance, parity_matrix, window_products
-from gyrofuse.recording import Recording
 from gyrofuse.uncertainty import degrees_of_freedom
 
 # Observations that a level needs beyond what the weights of a difference take.

@@ -23,9 +23,9 @@ from gyrofuse._estimation import EstimatedFrom
 from gyrofuse._rank_table import by_moments, by_spectrum
 from gyrofuse.gmwm import _given, fit_gmwm
 from gyrofuse.gmwm_result import GMWMResult
+from gyrofuse.io.recording import Recording
 from gyrofuse.processes import Model
 from gyrofuse.ranking_result import RankResult
-from gyrofuse.recording import Recording
 from gyrofuse.tones import FEWEST_SAMPLES
 
 

@@ -14,9 +14,9 @@ from gyrofuse import plotting
 from gyrofuse._base.page import image, new_figure, number, render, save_figure
 from gyrofuse._base.results import numbered
 from gyrofuse.covariance import wavelet_variance
+from gyrofuse.io.recording import Recording
 from gyrofuse.multiscale_result import MultiScaleResult
 from gyrofuse.rdvg import rdvg
-from gyrofuse.recording import Recording
 from gyrofuse.report_words import ALIKE, Fused, verdict
 from gyrofuse.svo_result import SVOResult
 

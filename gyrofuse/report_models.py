@@ -11,9 +11,9 @@ from gyrofuse._base.page import image, render
 from gyrofuse._base.results import place
 from gyrofuse._base.units import DATASHEET_UNITS
 from gyrofuse.gmwm_result import GMWMResult
+from gyrofuse.io.recording import Recording
 from gyrofuse.model_words import model_method, model_verdict, residuals
 from gyrofuse.plotting_models import plot_residuals
-from gyrofuse.recording import Recording
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

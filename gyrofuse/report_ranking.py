@@ -12,10 +12,10 @@ from gyrofuse._base.page import number, render
 from gyrofuse._base.results import chance, counted, p_words, place, signed
 from gyrofuse._rank_candidates import charge, n_parameters
 from gyrofuse.gmwm_result import REFUSED
+from gyrofuse.io.recording import Recording
 from gyrofuse.model_words import model_method
 from gyrofuse.moment_fit import composition_of
 from gyrofuse.ranking_result import RankResult
-from gyrofuse.recording import Recording
 from gyrofuse.report_models import model_part
 
 # Pages stay readable; the JSON file holds all.

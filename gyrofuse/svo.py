@@ -18,8 +18,8 @@ from gyrofuse.bootstrap import signal_bootstrap
 from gyrofuse.covariance import binned_products
 from gyrofuse.fusion import METHODS, Chosen, choose_weights, judge_weights
 from gyrofuse.influence import bootstrap_inverse_variance_weights_covariance, bootstrap_weights_covariance
+from gyrofuse.io.recording import Recording
 from gyrofuse.pilot import fit_pilot
-from gyrofuse.recording import Recording
 from gyrofuse.scale_weights import ScaleWeights, normalised, resolve_scale_weights
 from gyrofuse.series import bin_length
 from gyrofuse.svo_result import SVOResult, fuse

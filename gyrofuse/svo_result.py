@@ -15,7 +15,7 @@ from gyrofuse._virtual_gyro import VirtualGyro
 from gyrofuse.cross_fitting import CrossFit
 from gyrofuse.gain import Gain
 from gyrofuse.hypotheses import EnoughData, Evidence, WeightsTest
-from gyrofuse.recording import Recording
+from gyrofuse.io.recording import Recording
 from gyrofuse.selection import Selection
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from gyrofuse._base.distributed import all_or_none, place
 from gyrofuse._base.linalg import check_positive_definite
 from gyrofuse._base.results import listed
 from gyrofuse._virtual_gyro import VirtualGyro
-from gyrofuse.long_recording import LongRecording, Progress, check_long_recording, silent, stretch_of
+from gyrofuse.io.chunked import LongRecording, Progress, check_long_recording, silent, stretch_of
 from gyrofuse.metric import WaveletCrossCovariance
 from gyrofuse.scale_weights import ScaleWeights, normalised, resolve_scale_weights
 from gyrofuse.svo_result import fuse

@@ -14,7 +14,7 @@ from torch import Tensor
 from gyrofuse._base.checks import check_floating
 from gyrofuse._base.distributed import all_or_none, place, told_by_first
 from gyrofuse._base.files import Outputs
-from gyrofuse.long_recording import LongRecording, Progress, check_long_recording, silent, stretch_of
+from gyrofuse.io.chunked import LongRecording, Progress, check_long_recording, silent, stretch_of
 from gyrofuse.svo_result import fuse
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from gyrofuse.io import SUFFIXES
+from gyrofuse.io.formats import SUFFIXES
 
 _WILD = "*?["
 

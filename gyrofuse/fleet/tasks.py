@@ -19,9 +19,9 @@ from gyrofuse._model import Model
 from gyrofuse.fleet.table import Column
 from gyrofuse.fusion import METHODS
 from gyrofuse.gmwm import fit_gmwm
+from gyrofuse.io.recording import Recording
 from gyrofuse.mismatch import diagnose
 from gyrofuse.parsing import parse_model
-from gyrofuse.recording import Recording
 from gyrofuse.scale_weights import normalised, resolve_scale_weights
 from gyrofuse.simulate import ArrayModel
 from gyrofuse.svo import fit_svo

@@ -15,7 +15,7 @@ from torch.utils.data import Dataset
 from gyrofuse.fleet.logs import State, as_text, identity, state_of
 from gyrofuse.fleet.tasks import Row, Task
 from gyrofuse.fleet.watch import Watch
-from gyrofuse.recording import Recording, check_reading, read_recording
+from gyrofuse.io.recording import Recording, check_reading, read_recording
 
 _OPTIONS = tuple(signature(read_recording).parameters)[1:]  # without the path
 

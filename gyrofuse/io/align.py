@@ -9,7 +9,7 @@ import numpy as np
 
 from gyrofuse.io.clock import Grid, Slots
 from gyrofuse.io.notes import Note, Notebook
-from gyrofuse.io.stream import Array, RecordingError
+from gyrofuse.io.streams import Array, RecordingError
 
 _RATE_TOLERANCE = 5e-3
 

@@ -13,13 +13,13 @@ import numpy as np
 
 from gyrofuse._base.checks import same_rate
 from gyrofuse._base.units import unit_factor
-from gyrofuse.io import read_streams
 from gyrofuse.io.align import Placed, align
 from gyrofuse.io.clock import Grid, grid_of, regular_grid
-from gyrofuse.io.columns import AXES, CHANNELS
+from gyrofuse.io.formats import read_streams
+from gyrofuse.io.formats.columns import AXES, CHANNELS
 from gyrofuse.io.limits import printable
 from gyrofuse.io.notes import Note
-from gyrofuse.io.stream import Array, RecordingError, Stream, unexpected
+from gyrofuse.io.streams import Array, RecordingError, Stream, unexpected
 
 _UNKNOWN = "unknown"
 

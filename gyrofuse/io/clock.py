@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrofuse.io.columns import TICK, WRAP_32_BIT
+from gyrofuse.io.formats.columns import TICK, WRAP_32_BIT
 from gyrofuse.io.limits import is_rate
 from gyrofuse.io.notes import Note, Notebook
-from gyrofuse.io.stream import Array, RecordingError
+from gyrofuse.io.streams import Array, RecordingError
 
 Slots = NDArray[np.int64]
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from math import prod
 from pathlib import Path
 
-from gyrofuse.io.stream import RecordingError
+from gyrofuse.io.streams import RecordingError
 
 # Characters of a name, a cell or a comment that are looked at: no name of a sensor or setting is nearly as long, and
 # what is done with a name may take the square of its length.

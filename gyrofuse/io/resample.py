@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gyrofuse.io.stream import Array
+from gyrofuse.io.streams import Array
 
 # Steps of a channel, in its usual ones, from which on what lies between its samples is missing, not interpolated.
 _WIDEST = 2.5

@@ -18,14 +18,14 @@ from typing import Any
 
 import numpy as np
 
-from gyrofuse.io.arrays import settings_by_group, stated_rate, stated_unit
-from gyrofuse.io.columns import NAMES_OF, WORD_OF, classify_columns, or_else
-from gyrofuse.io.hdf5 import check_inside, objects, settings_of
-from gyrofuse.io.hdf5_heaps import check_heaps
+from gyrofuse.io.formats.arrays import settings_by_group, stated_rate, stated_unit
+from gyrofuse.io.formats.columns import NAMES_OF, WORD_OF, classify_columns, or_else
+from gyrofuse.io.formats.hdf5 import check_inside, objects, settings_of
+from gyrofuse.io.formats.hdf5_heaps import check_heaps
+from gyrofuse.io.formats.numpy.npy import read_header, read_numbers, read_stretch
+from gyrofuse.io.formats.parquet import metadata_of
 from gyrofuse.io.limits import Allowance, enumerated, is_regular
-from gyrofuse.io.npy import read_header, read_numbers, read_stretch
-from gyrofuse.io.parquet import metadata_of
-from gyrofuse.io.stream import Array, RecordingError, cause
+from gyrofuse.io.streams import Array, RecordingError, cause
 
 _MOST_SETTING = 2**16  # bytes of an array that is read because it may be a setting: names of sensors at most
 # Type and shape of each array by its name.

@@ -5,13 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from gyrofuse.io.recording import Recording
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.confirm import mean_discrepancy
 from gyrofuse.mismatch.evidence import uncorrected
 from gyrofuse.mismatch.inputs import Simulation, modelled, prepared
 from gyrofuse.mismatch.own_effects import with_own_effects
 from gyrofuse.mismatch.testimony import WITNESSES
-from gyrofuse.recording import Recording
 
 _FALSE_ALARM = 0.01  # as in a diagnosis, of an effect that both are said to have
 

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gyrofuse._base.checks import check_n_samples
 from gyrofuse._model import Model
+from gyrofuse.io.recording import Recording
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.confirm import discrepancy_left, held_out, held_out_gain, leads_away
 from gyrofuse.mismatch.counterfactual import Link, settled
@@ -32,7 +33,6 @@ from gyrofuse.mismatch.report import MismatchReport
 from gyrofuse.mismatch.slow_remainder import SlowRemainder
 from gyrofuse.mismatch.testimony import WITNESSES, combined, testimony
 from gyrofuse.mismatch.twins import FEWEST, twin_p_values
-from gyrofuse.recording import Recording
 from gyrofuse.simulate import ArrayModel
 
 _LOOKED, _NAMED, _COMPARED, _CHECKED = 0.3, 0.65, 0.75, 0.9  # shares of the work that are done by then

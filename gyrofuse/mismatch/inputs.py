@@ -15,6 +15,7 @@ from gyrofuse._estimation import EstimatedFrom
 from gyrofuse._model import Model
 from gyrofuse.array_gmwm_result import ArrayGMWMResult
 from gyrofuse.gmwm_result import GMWMResult
+from gyrofuse.io.recording import Recording
 from gyrofuse.joint import JointFit
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.known_lines import amplitudes
@@ -24,7 +25,6 @@ from gyrofuse.mismatch.repaired import RepairedModel
 from gyrofuse.mismatch.spectral_uncertainty import SpectralUncertainty, as_array
 from gyrofuse.parsing import model_from_dict
 from gyrofuse.ranking_result import RankResult
-from gyrofuse.recording import Recording
 from gyrofuse.simulate import ArrayModel
 
 # Whatever a diagnosis takes for a simulation.

@@ -14,13 +14,13 @@ from torch import Tensor
 
 from gyrofuse._base.checks import same_rate
 from gyrofuse._model import Model
+from gyrofuse.io.recording import Recording
 from gyrofuse.mismatch.agreement import compared
 from gyrofuse.mismatch.classifier import distinguishability
 from gyrofuse.mismatch.confirm import discrepancy_of_fold
 from gyrofuse.mismatch.folds import N_FOLDS
 from gyrofuse.mismatch.inputs import prepared
 from gyrofuse.mismatch.repaired import RepairedModel
-from gyrofuse.recording import Recording
 from gyrofuse.simulate import ArrayModel
 
 _RECORDS = 4  # of the repaired simulation, each as long as the judge: of its own scatter half that of the judge is left

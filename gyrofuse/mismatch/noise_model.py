@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._model import Model
+from gyrofuse.io.recording import Recording
 from gyrofuse.mismatch.base import Base
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.known_lines import line_parts
@@ -20,7 +21,6 @@ from gyrofuse.mismatch.repaired import RepairedModel
 from gyrofuse.mismatch.shape_ground import Parts
 from gyrofuse.mismatch.spectral_uncertainty import as_array
 from gyrofuse.processes import Process, Sinusoid
-from gyrofuse.recording import Recording
 from gyrofuse.simulate import ArrayModel
 
 _SHARED = 4.0  # standard deviations from which sensors share noise

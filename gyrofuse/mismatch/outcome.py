@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gyrofuse._base.checks import same_rate
 from gyrofuse._base.results import cleaned
+from gyrofuse.io.recording import Recording
 from gyrofuse.mismatch.benefit import Benefit, benefit
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.comparison import VarianceComparison, compared_variances
@@ -19,7 +20,6 @@ from gyrofuse.mismatch.fit_verdict import FitVerdict
 from gyrofuse.mismatch.judge import Judged
 from gyrofuse.mismatch.mechanism import Finding
 from gyrofuse.mismatch.repaired import RepairedModel
-from gyrofuse.recording import Recording
 from gyrofuse.scale_weights import ScaleWeights
 
 _Signal = TypeVar("_Signal", Recording, Tensor)

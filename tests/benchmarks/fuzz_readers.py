@@ -35,7 +35,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 import gyrofuse as gf
-from gyrofuse.io.stream import RecordingError
+from gyrofuse.io.streams import RecordingError
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import logs

@@ -10,7 +10,7 @@ import pytest
 from logs import write_hdf5, write_mat5, write_parquet
 
 import gyrofuse as gf
-from gyrofuse.io import read_streams
+from gyrofuse.io.formats import read_streams
 
 N = 50
 RATES = np.round(np.random.default_rng(0).standard_normal((3, N)), 6)

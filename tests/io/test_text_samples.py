@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import gyrofuse as gf
-from gyrofuse.io import read_streams
 from gyrofuse.io.clock import grid_of
+from gyrofuse.io.formats import read_streams
 
 SAMPLES = Path(__file__).parent / "samples" / "text"
 ACCELERATION, TEMPERATURE = "acceleration", "temperature"

@@ -1,0 +1,101 @@
+"""Parquet files: columns with the names of gyros or accelerometers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gyrofuse.io.formats.arrays import settings_by_group, stated_rate, stated_unit
+from gyrofuse.io.formats.column_streams import streams_from_columns
+from gyrofuse.io.formats.columns import NAMES_OF, WORD_OF, classify_columns, or_else, renamed
+from gyrofuse.io.limits import Allowance, decoded, enumerated
+from gyrofuse.io.streams import Array, RecordingError, Stream, cause
+
+
+def read(
+    path: Path,
+    *,
+    key: str | None = None,
+    quantity: str = "rate",
+    columns: Mapping[str, str] | None = None,
+    max_bytes: float | None = None,
+) -> list[Stream]:
+    """Read the gyros or accelerometers of a Parquet file, whose columns are named as in a CSV file.
+
+    `fs` (Hz) and `unit` are taken from the metadata of the schema. A null is NaN.
+
+    Args:
+        path: The file.
+        key: The only column to read, whatever its name.
+        quantity: `"rate"` or `"acceleration"`: the sensors to read.
+        columns: What columns are, where their names do not say: columns by the names that they should have; the others
+            are left out.
+        max_bytes: Memory that the columns may take; by default a quarter of what there is.
+
+    Raises:
+        RecordingError: Not a Parquet file, damaged, empty, without the quantity asked for, or too large.
+        ImportError: pyarrow is not installed.
+    """
+    try:
+        import pyarrow as pa
+        from pyarrow import parquet
+    except ImportError as error:
+        raise ImportError(f'{path}: reading Parquet needs pyarrow; pip install "gyrofuse[logs]"') from error
+    try:
+        with parquet.ParquetFile(path) as file:
+            schema = file.schema_arrow
+            numbers = [f.name for f in schema if pa.types.is_integer(f.type) or pa.types.is_floating(f.type)]
+            dates = [f.name for f in schema if pa.types.is_timestamp(f.type) or pa.types.is_duration(f.type)]
+            called = {name: name for name in numbers} if columns is None else renamed(path, schema.names, columns)
+            numbers = [name for name in numbers if name in called]
+            kinds = {c.name: c.kind for c in classify_columns([called[name] for name in numbers], quantity)}
+            wanted = [name for name in numbers if kinds[called[name]] or called[name] == key]
+            Allowance(path, max_bytes).take("columns", (file.metadata.num_rows, len(wanted) + len(dates)))
+            table = file.read(columns=[*wanted, *dates])
+            # pyarrow lends its own memory, which may not be written to: torch warns of that
+            read = {called[name]: np.require(table.column(name).to_numpy(), requirements="W") for name in wanted}
+            time = _seconds(table.column(dates[0])) if dates else None
+    except RecordingError:
+        raise
+    except Exception as error:  # a damaged file may fail anywhere in the library
+        raise RecordingError(
+            f"{path}: expected a Parquet file, found one that cannot be read ({cause(error)}); export it again"
+        ) from error
+
+    if key is not None:
+        read = {name: values for name, values in read.items() if name == key or kinds[name] != quantity}
+        if key in read and kinds[key] != quantity:
+            read[WORD_OF[quantity]] = read.pop(key)
+    settings = settings_by_group(metadata_of(schema))
+    streams = streams_from_columns(
+        read,
+        name=path.stem if key is None else key,
+        unit=stated_unit(settings, "", quantity, {column.kind for column in classify_columns(list(read), quantity)}),
+        rate=stated_rate(settings, ""),
+        time=time,
+        quantity=quantity,
+    )
+    if not streams or table.num_rows == 0:
+        what = f"with the name of {NAMES_OF[quantity]}" if key is None else f"{key!r} (`key`) of numbers"
+        found = {column.kind for column in classify_columns(numbers)}
+        advice = or_else(found, quantity, "say with `columns` (--map) what the columns are")
+        raise RecordingError(
+            f"{path}: expected a column {what}, found {table.num_rows} rows of {enumerated(schema.names)}; {advice}"
+        )
+    return streams
+
+
+def metadata_of(schema: Any) -> dict[str, str]:
+    """What the metadata of a schema state, as text."""
+    return {decoded(name): decoded(value) for name, value in (schema.metadata or {}).items()}
+
+
+def _seconds(column: Any) -> Array:
+    """A column of dates or durations in seconds, exact to the last digit of float64."""
+    per_second = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}[column.type.unit]
+    ticks = column.cast("int64").to_numpy()
+    seconds: Array = ticks // per_second + (ticks % per_second) / per_second
+    return seconds

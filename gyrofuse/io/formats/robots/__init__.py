@@ -1,0 +1,1 @@
+"""Logs of robots: ROS bags, PX4 ULog, ArduPilot dataflash."""

@@ -1,0 +1,364 @@
+"""ROS 1 and ROS 2 bags: topics of type sensor_msgs/Imu are devices, other topics are their channels.
+
+Drivers that sample gyro and accelerometer apart (realsense2_camera: `/camera/gyro/sample`, `/camera/accel/sample`)
+publish two topics of that type, each with zeros for what it does not measure. Others (xsens_mti_driver:
+`/imu/angular_velocity`, `/imu/acceleration`; multisense_ros: `imu/gyroscope_vector`, `imu/accelerometer_vector`)
+publish each as geometry_msgs/Vector3Stamped.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import sqlite3
+from array import array
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+
+from gyrofuse.io.formats.columns import AXES, CHANNELS, OTHER, or_else
+from gyrofuse.io.limits import LONGEST_NAME, Allowance, enumerated, is_regular
+from gyrofuse.io.resample import at_samples
+from gyrofuse.io.streams import Array, RecordingError, Stream, cause
+
+_IMU = "sensor_msgs/msg/Imu"
+_VECTOR = "geometry_msgs/msg/Vector3Stamped"
+# Vectors that are in other units than those of an Imu, by the last part of the topic: multisense_ros converts what it
+# puts into an Imu, not what it publishes as vectors (imu.cpp).
+_VECTOR_UNITS = {"gyroscope_vector": "deg/s", "accelerometer_vector": "g"}
+_TIMES = 3  # numbers of a message that are kept beside its values
+# What is kept of a message of each type.
+_VALUES: dict[str, Callable[[Any], tuple[float, ...]]] = {
+    _IMU: lambda m: (*_xyz(m.angular_velocity), *_xyz(m.linear_acceleration)),
+    _VECTOR: lambda m: _xyz(m.vector),
+    "sensor_msgs/msg/MagneticField": lambda m: _xyz(m.magnetic_field),
+    "sensor_msgs/msg/Temperature": lambda m: (m.temperature,),
+    "sensor_msgs/msg/FluidPressure": lambda m: (m.fluid_pressure,),
+}
+# Names and units of the channels, by the definitions of the messages.
+_CHANNELS = {
+    "sensor_msgs/msg/MagneticField": ("magnetic_field", "T"),
+    "sensor_msgs/msg/Temperature": ("temperature", "degC"),
+    "sensor_msgs/msg/FluidPressure": ("pressure", "Pa"),
+}
+
+
+@dataclass(frozen=True)
+class _Quantity:
+    """What differs between rates and accelerations.
+
+    Attributes:
+        words: What an Imu calls them.
+        sensor: What measures them.
+        unit: By the definition of an Imu.
+        values: Where they stand among those kept of an Imu.
+        name: A topic or frame that says of a vector that it is one.
+    """
+
+    words: str
+    sensor: str
+    unit: str
+    values: slice
+    name: re.Pattern[str]
+
+
+_QUANTITIES = {
+    "rate": _Quantity(
+        "angular velocities",
+        "gyro",
+        "rad/s",
+        slice(0, 3),
+        re.compile(r"gyr|angular_?(?:vel|rate)|(?:^|[/_])omega", re.IGNORECASE),
+    ),
+    # A free acceleration is an estimate, from which gravity is taken (xsens_mti_driver: `/filter/free_acceleration`).
+    "acceleration": _Quantity(
+        "linear accelerations",
+        "accelerometer",
+        "m/s^2",
+        slice(3, 6),
+        re.compile(r"(?<!free)(?<!free_)accel|(?:^|[/_])acc(?:[/_]|$)", re.IGNORECASE),
+    ),
+}
+
+
+def read(path: Path, *, key: str | None = None, quantity: str = "rate", max_bytes: float | None = None) -> list[Stream]:
+    """Read the gyros or accelerometers of a ROS bag, in rad/s or m/s^2, one stream per topic of type sensor_msgs/Imu.
+
+    A ROS 1 `.bag`, a ROS 2 directory with its `metadata.yaml`, or a `.db3` or `.mcap` file alone; no ROS
+    installation is needed. Time is that of the message headers, or of arrival at the recorder where these are
+    not stamped. Where no such topic has the quantity, geometry_msgs/Vector3Stamped is read whose topic or frame names
+    it. The other quantity of the same messages is a channel; that of a topic which has it alone, and topics of type
+    sensor_msgs/MagneticField, Temperature and FluidPressure, become channels of the device whose name begins most
+    alike, by their own clock.
+
+    Args:
+        path: File or directory.
+        key: A topic, or the beginning of the topics to read.
+        quantity: `"rate"` or `"acceleration"`: the sensors to read.
+        max_bytes: Memory that the messages may take; by default a quarter of what there is.
+
+    Raises:
+        RecordingError: Not a bag, not indexed, truncated, without the quantity or topic asked for, or too large.
+        ImportError: rosbags is not installed.
+    """
+    try:
+        from rosbags.rosbag1 import Reader as Ros1Reader
+        from rosbags.rosbag2 import Reader as Ros2Reader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise ImportError(f'{path}: reading ROS bags needs rosbags; pip install "gyrofuse[logs]"') from error
+
+    # sensor_msgs/Imu is the same in every ROS 1 and in every ROS 2: a bag without embedded definitions, or
+    # with unreadable ones of other messages, is no obstacle.
+    ros1 = path.suffix == ".bag" and path.is_file()
+    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+    deserialize = store.deserialize_ros1 if ros1 else store.deserialize_cdr
+    messages: dict[str, _Messages] = {}
+    allowance = Allowance(path, max_bytes)
+    odd = [file.name for file in path.iterdir() if not (is_regular(file) or file.is_dir())] if path.is_dir() else []
+    if odd:
+        raise RecordingError(
+            f"{path}: expected the files of a bag, found {enumerated(odd)}, which is no file; remove it"
+        )
+    try:
+        for file in sorted(path.glob("*.db3")) if path.is_dir() else [path] if path.suffix.lower() == ".db3" else []:
+            _check_tables(file)
+        with (Ros1Reader if ros1 else Ros2Reader)(path) as bag:
+            topics = _choose(path, [(c.topic, c.msgtype) for c in bag.connections], key)
+            connections = [c for c in bag.connections if _is_read(c.topic, c.msgtype, topics, key)]
+            passed: set[str] = set()  # vectors of something else
+            for connection, arrival, raw in bag.messages(connections):
+                topic, kind = connection.topic, connection.msgtype
+                if topic in passed:
+                    continue
+                message: Any = deserialize(raw, kind)
+                if topic not in messages:
+                    named = _named(topic, message.header.frame_id) if kind == _VECTOR else set()
+                    if kind == _VECTOR and not named:
+                        passed.add(topic)
+                        continue
+                    messages[topic] = _Messages(kind, measured=named)
+                known = messages[topic]
+                if kind != known.kind:
+                    raise ValueError(f"messages of two types in {topic}: {kind} and {known.kind}")
+                known.append(message, arrival)
+                allowance.take(f"messages of {topic}", (_TIMES + known.width + len(message.header.frame_id) // 8,))
+    except RecordingError:
+        raise
+    except Exception as error:  # a damaged bag may fail anywhere in the library
+        raise RecordingError(
+            f"{path}: expected an indexed ROS 1 or ROS 2 bag, found one that cannot be read ({cause(error)}); "
+            "repair it with `rosbag reindex`, `ros2 bag reindex` or `mcap recover`, or record it again"
+        ) from error
+
+    devices, notes = _devices(messages, topics, key, quantity)
+    if not devices:
+        there = {kind for kind in _QUANTITIES for topic in topics & messages.keys() if messages[topic].has(kind)}
+        raise RecordingError(
+            f"{path}: expected {_QUANTITIES[quantity].words} in {enumerated(sorted(topics))}, found none (no message, "
+            "exactly zero throughout, or marked as not measured); "
+            f"{or_else(there, quantity, 'choose other topics with `key`')}"
+        )
+    channels = _owned(messages, devices, quantity)
+    return [messages[topic].stream(topic, quantity, channels[topic], notes) for topic in devices]
+
+
+def _check_tables(path: Path) -> None:
+    """Raise `ValueError` where what stands in a database is computed when it is read, which may take for ever."""
+    with contextlib.closing(sqlite3.connect(f"file:{quote(str(path))}?immutable=1", uri=True)) as database:
+        for kind, name, command in database.execute("SELECT type, name, sql FROM sqlite_master").fetchall():
+            columns = database.execute("SELECT hidden FROM pragma_table_xinfo(?)", (name,)).fetchall()
+            virtual = str(command).lower().startswith("create virtual")
+            if kind == "view" or virtual or any(hidden for (hidden,) in columns):
+                raise ValueError(f"a table {name!r} that is computed, not stored")
+
+
+def _choose(path: Path, kinds: list[tuple[str, str]], key: str | None) -> set[str]:
+    """Return the topics of Imu or vectors that `key` names or begins, all of them without `key`."""
+    topics = {topic for topic, kind in kinds if kind in (_IMU, _VECTOR)}
+    if key is not None:
+        name = "/" + key.strip("/")
+        topics = topics & {name} or {topic for topic in topics if topic.startswith(name)}
+    if not topics:
+        found = enumerated(f"{topic} ({kind})" for topic, kind in sorted(kinds)) or "no topic"
+        wanted = "" if key is None else f" named by `key` {key!r}"
+        raise RecordingError(
+            f"{path}: expected a topic of type {_IMU}{wanted}, found {found}; choose a bag with IMU data"
+        )
+    return topics
+
+
+def _is_read(topic: str, kind: str, topics: set[str], key: str | None) -> bool:
+    """Whether a topic is a device that was asked for or may be a channel of one."""
+    if kind not in _VALUES:
+        return False
+    if key is None or topic in topics or kind in _CHANNELS:
+        return True
+    return any(_alike(topic, other) for other in topics)
+
+
+def _alike(topic: str, other: str) -> int:
+    """How many parts the names of two topics begin with in common."""
+    pairs = list(zip(topic.strip("/").split("/"), other.strip("/").split("/"), strict=False))
+    return next((n for n, (one, two) in enumerate(pairs) if one != two), len(pairs))
+
+
+def _named(topic: str, frame: str) -> set[str]:
+    """The quantity that a vector's topic names, or else its frame; none where neither does."""
+    for name in (topic[:LONGEST_NAME], frame[:LONGEST_NAME]):
+        for quantity, what in _QUANTITIES.items():
+            if what.name.search(name):
+                return {quantity}
+    return set()
+
+
+def _unit(topic: str, kind: str, quantity: str) -> tuple[str, list[str]]:
+    """The unit of a topic's rates or accelerations, and what is said of it."""
+    unit = _VECTOR_UNITS.get(topic.rpartition("/")[2]) if kind == _VECTOR else None
+    if unit is None:
+        return _QUANTITIES[quantity].unit, []
+    return unit, [f"{topic} is read in {unit}, as multisense_ros publishes it"]
+
+
+def _devices(
+    messages: dict[str, _Messages], topics: set[str], key: str | None, quantity: str
+) -> tuple[list[str], list[str]]:
+    """The topics with the quantity among those asked for, and what is said of the others."""
+    what, notes = _QUANTITIES[quantity], []
+    there = sorted(topics & messages.keys())
+    zero = [topic for topic in there if quantity in messages[topic].measured and not messages[topic].has(quantity)]
+    if zero:
+        notes.append(f"{what.words} exactly zero throughout in {enumerated(zero)}: no {what.sensor}")
+    imus = [topic for topic in there if messages[topic].kind == _IMU and messages[topic].has(quantity)]
+    vectors = [topic for topic in there if messages[topic].kind == _VECTOR and messages[topic].has(quantity)]
+    if not imus or (key is not None and "/" + key.strip("/") in vectors):
+        return vectors, notes
+    if vectors:
+        notes.append(
+            f"{quantity}s in {enumerated(vectors)} are not read beside those of Imu topics; choose them with key="
+        )
+    return imus, notes
+
+
+def _owned(
+    messages: dict[str, _Messages], devices: list[str], quantity: str
+) -> dict[str, list[tuple[str, str, str, _Messages]]]:
+    """For each device the channels of other topics: name, unit, topic and messages."""
+    owned: dict[str, list[tuple[str, str, str, _Messages]]] = {topic: [] for topic in devices}
+    beside = OTHER[quantity]
+    for topic, other in sorted(messages.items()):
+        if topic in owned or (other.kind not in _CHANNELS and (other.has(quantity) or not other.has(beside))):
+            continue
+        name, unit = _CHANNELS.get(other.kind) or (CHANNELS[beside], _unit(topic, other.kind, beside)[0])
+        owner = max(devices, key=lambda device: _alike(device, topic))  # the first one, where several are as much alike
+        owned[owner].append((name, unit, topic, other))
+    return owned
+
+
+def _xyz(vector: Any) -> tuple[float, float, float]:
+    return vector.x, vector.y, vector.z
+
+
+@dataclass
+class _Messages:
+    """The messages of one topic, packed: a long bag holds millions."""
+
+    kind: str
+    stamp: array[int] = field(default_factory=lambda: array("q"))  # sec, nanosec
+    arrival: array[int] = field(default_factory=lambda: array("q"))  # nanoseconds
+    values: array[float] = field(default_factory=lambda: array("d"))
+    frames: dict[str, None] = field(default_factory=dict)
+    width: int = 0  # values of a message
+    measured: set[str] = field(default_factory=set)  # quantities that they may hold
+
+    def append(self, message: Any, arrival: int) -> None:
+        """Add one deserialised message and when it reached the recorder, in nanoseconds."""
+        stamp, values = message.header.stamp, _VALUES[self.kind](message)
+        self.stamp.extend((stamp.sec, stamp.nanosec))
+        self.arrival.append(arrival)
+        self.values.extend(values)
+        self.width = len(values)
+        self.frames[message.header.frame_id] = None
+        if self.kind == _IMU:
+            # By the message's definition a covariance that begins with -1 says that the quantity is not measured.
+            if message.angular_velocity_covariance[0] != -1:
+                self.measured.add("rate")
+            if message.linear_acceleration_covariance[0] != -1:
+                self.measured.add("acceleration")
+
+    @property
+    def table(self) -> Array:
+        """The values `(value, message)` as they were packed, not copied."""
+        return np.frombuffer(self.values, np.float64).reshape(-1, self.width).T
+
+    def of(self, quantity: str) -> Array:
+        """The rates or accelerations of an Imu or a vector, `(3, message)`, not copied."""
+        return self.table[_QUANTITIES[quantity].values] if self.kind == _IMU else self.table
+
+    def has(self, quantity: str) -> bool:
+        """Whether there are rates or accelerations, and not zeros in their place."""
+        return quantity in self.measured and bool(np.any(self.of(quantity) != 0))
+
+    def stream(
+        self, topic: str, quantity: str, others: list[tuple[str, str, str, _Messages]], said: list[str]
+    ) -> Stream:
+        """The device of this topic, with the channels that others hold."""
+        time, notes = self._time()
+        frames = enumerated(repr(frame) for frame in self.frames if frame)
+        channels, units = {}, {}
+        unit, guess = _unit(topic, self.kind, quantity)
+        notes += guess
+        beside = OTHER[quantity]
+        if self.has(beside):
+            channels[CHANNELS[beside]], units[CHANNELS[beside]] = self.of(beside).copy(), _QUANTITIES[beside].unit
+        elif beside in self.measured:
+            notes.append(f"{_QUANTITIES[beside].words} exactly zero throughout: none measured")
+        for name, own_unit, source, other in others:
+            if name in channels:
+                notes.append(f"{name} of {source} is left out beside that of another topic")
+                continue
+            times, by = self._common_clock(other)
+            values = other.table if other.kind in _CHANNELS else other.of(beside)
+            channels[name], note = at_samples(*times, values if len(values) > 1 else values[0], name)
+            units[name] = own_unit
+            notes += _unit(source, other.kind, beside)[1]
+            notes.append(f"{name} is that of {source}{by}" + (f"; {note}" if note else ""))
+        return Stream(
+            name=topic,
+            signal=dict(zip(AXES, self.of(quantity).copy(), strict=True)),
+            unit=unit,
+            time=time,
+            channels=channels,
+            channel_units=units,
+            notes=(*([f"frame_id {frames}"] if frames else []), *notes, *said),
+        )
+
+    def _common_clock(self, other: _Messages) -> tuple[tuple[Array, Array], str]:
+        """Times of the messages of two topics, by the headers where these count by the same clock."""
+        own, others = self._stamps(), other._stamps()
+        overlap = own.max() >= others.min() and others.max() >= own.min()
+        if self._is_stamped(own) and self._is_stamped(others) and overlap:
+            return (own, others), ""
+        return (self._arrivals(), other._arrivals()), ", by arrival at the recorder"
+
+    def _time(self) -> tuple[Array, list[str]]:
+        stamp = self._stamps()
+        if self._is_stamped(stamp):
+            return stamp, []
+        return self._arrivals(), ["the header stamps do not advance; time is that of arrival at the recorder"]
+
+    @staticmethod
+    def _is_stamped(stamp: Array) -> bool:
+        return bool(np.any(stamp != stamp[0]) or (stamp.size == 1 and stamp[0] != 0))
+
+    def _stamps(self) -> Array:
+        seconds, nanoseconds = np.array(self.stamp).reshape(-1, 2).T
+        return np.asarray(seconds + nanoseconds * 1e-9)
+
+    def _arrivals(self) -> Array:
+        whole, rest = np.divmod(np.array(self.arrival), 10**9)
+        return np.asarray(whole + rest * 1e-9)
