@@ -27,18 +27,14 @@ from gyrofuse._base.linalg import SingularCovarianceError
 from gyrofuse._base.results import ConfidenceInterval
 from gyrofuse.array_gmwm import fit_array_gmwm
 from gyrofuse.array_gmwm_result import ArrayGMWMResult
-from gyrofuse.bootstrap import block_bootstrap, bootstrap_wccv_covariance, bootstrap_wccv_interval, signal_bootstrap
 from gyrofuse.competitors import equal_weights, inverse_variance_weights, nonnegative_weights, shrinkage_weights
-from gyrofuse.covariance import CrossCovariance, cross_covariance, wavelet_cross_covariance, wavelet_variance
 from gyrofuse.datasheet import Datasheet, datasheet
 from gyrofuse.export import to_c_header, to_kalibr
 from gyrofuse.gain import Gain
 from gyrofuse.gmwm import fit_gmwm
 from gyrofuse.gmwm_result import GMWMResult
-from gyrofuse.haar import HaarFilterBank, haar_coefficients
 from gyrofuse.hypotheses import EnoughData, WeightsTest
 from gyrofuse.influence import BootstrapWeightsCovariance, bootstrap_weights_covariance
-from gyrofuse.intervals import wavelet_cross_covariance_interval, wavelet_variance_interval
 from gyrofuse.io.chunked import LongRecording, open_long, stretch_of
 from gyrofuse.io.recording import Recording, read_recording
 from gyrofuse.io.saturation import find_saturation, mask_saturated
@@ -57,7 +53,6 @@ from gyrofuse.processes import AR1, Drift, Model, QuantizationNoise, RandomWalk,
 from gyrofuse.ranking import rank_models
 from gyrofuse.ranking_result import RankResult
 from gyrofuse.rdvg import RDVGResult, rdvg, rdvg_weights
-from gyrofuse.robust import robust_wavelet_variance
 from gyrofuse.scale_weights import resolve_scale_weights
 from gyrofuse.selection import Selection
 from gyrofuse.simulate import ArrayModel
@@ -67,11 +62,21 @@ from gyrofuse.svo_result import SVOResult
 from gyrofuse.svo_weights import SVOWeights, svo_weights
 from gyrofuse.virtual_file import write_virtual
 from gyrofuse.virtual_noise import virtual_noise
+from gyrofuse.wavelets.block_bootstrap import (
+    block_bootstrap,
+    bootstrap_wccv_covariance,
+    bootstrap_wccv_interval,
+    signal_bootstrap,
+)
+from gyrofuse.wavelets.covariance import CrossCovariance, cross_covariance, wavelet_cross_covariance, wavelet_variance
+from gyrofuse.wavelets.haar import HaarFilterBank, haar_coefficients
+from gyrofuse.wavelets.intervals import wavelet_cross_covariance_interval, wavelet_variance_interval
+from gyrofuse.wavelets.robust import robust_wavelet_variance
 
 if TYPE_CHECKING:
-    from gyrofuse.metric import WaveletCrossCovariance
     from gyrofuse.mismatch import Finding, MismatchReport, diagnose
     from gyrofuse.svo_stream import StreamedSVOResult, stream_svo
+    from gyrofuse.wavelets.metric import WaveletCrossCovariance
 
 __all__ = [
     "AR1",
@@ -164,7 +169,7 @@ __all__ = [
 
 # Names whose modules load more than torch and numpy.
 _LAZY = {
-    "WaveletCrossCovariance": "gyrofuse.metric",
+    "WaveletCrossCovariance": "gyrofuse.wavelets.metric",
     "diagnose": "gyrofuse.mismatch",
     "Finding": "gyrofuse.mismatch",
     "MismatchReport": "gyrofuse.mismatch",

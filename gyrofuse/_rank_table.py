@@ -13,9 +13,9 @@ from gyrofuse._rank_candidates import Key, Kinds
 from gyrofuse._rank_moments import Moments
 from gyrofuse._rank_search import EQUIVALENT, MomentSearch, SpectralSearch
 from gyrofuse._rank_spectra import Lines, decide_lines
-from gyrofuse.covariance import wavelet_variance
 from gyrofuse.processes import Drift, Sinusoid
-from gyrofuse.uncertainty import chi_square_tail
+from gyrofuse.wavelets.covariance import wavelet_variance
+from gyrofuse.wavelets.equivalent_dof import chi_square_tail
 
 # Two spectra that a record tells apart by less than this many nats on average are the same.
 _SAME = 0.5

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from gyrofuse._blocks import moments_over_starts
+from gyrofuse.wavelets.blocks import moments_over_starts
 
 # Numbers in a tile: with its coefficients and their influences it stays in the last level of cache. Many CPU threads
 # need more to share.

@@ -24,7 +24,7 @@ from gyrofuse._composition import Composition
 from gyrofuse.moment_inference import WEAKLY_DETERMINED, Inference
 from gyrofuse.processes import WhiteNoise
 from gyrofuse.tones import Tones
-from gyrofuse.uncertainty import normal_quantile
+from gyrofuse.wavelets.equivalent_dof import normal_quantile
 
 _LEAST = -2.0  # the excess kurtosis of a fair coin: no variable has less
 

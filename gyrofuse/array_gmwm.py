@@ -24,10 +24,10 @@ from gyrofuse._composition import Composition, shape_of
 from gyrofuse._model_tones import model_tones
 from gyrofuse._records import Records
 from gyrofuse.array_gmwm_result import ArrayGMWMResult
-from gyrofuse.covariance import wavelet_products
 from gyrofuse.io.recording import Recording
 from gyrofuse.moment_fit import composition_of
 from gyrofuse.processes import Drift, Model, Sinusoid
+from gyrofuse.wavelets.covariance import wavelet_products
 
 WEIGHTINGS = ("optimal", "pairwise")
 # Numbers that the weights of all items may take at a time.

@@ -27,7 +27,7 @@ from gyrofuse.live import subset_weights
 from gyrofuse.processes import Model, Process, Sinusoid
 from gyrofuse.scale_weights import ScaleWeights
 from gyrofuse.simulate import ArrayModel
-from gyrofuse.uncertainty import chi_square_tail
+from gyrofuse.wavelets.equivalent_dof import chi_square_tail
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.linalg import geometric_mean
-from gyrofuse._lag_sums import unit_wavelet_variances
+from gyrofuse.wavelets.lag_sums import unit_wavelet_variances
 
 # Levels with more observations than this in every recording speak for themselves.
 _MOST_OBSERVATIONS = 2**9

@@ -23,11 +23,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from gyrofuse import series
 from gyrofuse._base.results import ConfidenceInterval
 from gyrofuse.parametric import resample_wccv
-from gyrofuse.pilot import Pilot
-from gyrofuse.uncertainty import chi_square_interval, t_quantile
+from gyrofuse.wavelets import long_run_variance as series
+from gyrofuse.wavelets.equivalent_dof import chi_square_interval, t_quantile
+from gyrofuse.wavelets.pilot import Pilot
 
 # Windows side by side from which on a level is cut into folds: eight of a fold then, and one lost at either end.
 _FEWEST_TO_CUT = 64
@@ -117,7 +117,7 @@ def cross_fit(
     Args:
         fusion: How the weights were fitted.
         weights: `(item, ...)`, as fitted to the whole recording.
-        sums: `(item, bin, level, sensor, sensor)`, of `gyrofuse.covariance.binned_products`.
+        sums: `(item, bin, level, sensor, sensor)`, of `gyrofuse.wavelets.covariance.binned_products`.
         counts: The same shape.
         pilot: Model of the noise at the last levels, batch `(item,)`.
         degrees: `(item, level)`, independent observations of the virtual gyro that a level holds.

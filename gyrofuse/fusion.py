@@ -10,10 +10,10 @@ from torch import Tensor
 
 from gyrofuse.competitors import precision_weights
 from gyrofuse.cross_fitting import MANY_DRAWS, CrossFit, Fusion, cross_fit
-from gyrofuse.pilot import Pilot
 from gyrofuse.rdvg import rdvg
 from gyrofuse.selection import ESTIMATORS, Selection, select_estimator
 from gyrofuse.svo_weights import counting, optimal_weights
+from gyrofuse.wavelets.pilot import Pilot
 
 # Model-assisted weights take 150 steps for every draw; they overfit little, so that few draws tell by how much.
 _DRAWS_OF_MODELS = 16

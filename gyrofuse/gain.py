@@ -20,7 +20,7 @@ from torch import Tensor
 from gyrofuse._base.results import ConfidenceInterval
 from gyrofuse.cross_fitting import CrossFit
 from gyrofuse.hypotheses import Answer
-from gyrofuse.uncertainty import t_quantile
+from gyrofuse.wavelets.equivalent_dof import t_quantile
 
 # Degrees of freedom below which the law of a ratio says nothing.
 _FEWEST_SPARE = 0.5

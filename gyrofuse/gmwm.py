@@ -31,9 +31,9 @@ from gyrofuse.moment_inference import Fit, Inference, either, infer, infer_effic
 from gyrofuse.moment_profile import profiled
 from gyrofuse.processes import Drift, Model, Sinusoid
 from gyrofuse.profile_surfaces import MomentSurface, SpectralSurface
-from gyrofuse.robust import check_efficiency, robust_wavelet_variance
 from gyrofuse.robust_covariance import check_gaussian
 from gyrofuse.tones import Tones
+from gyrofuse.wavelets.robust import check_efficiency, robust_wavelet_variance
 from gyrofuse.whittle import refine_whittle
 
 WEIGHTINGS = ("optimal", "diagonal", "identity", "continuous")

@@ -18,7 +18,7 @@ from gyrofuse._records import Records
 from gyrofuse.datasheet import Datasheet, datasheet
 from gyrofuse.moment_inference import Inference
 from gyrofuse.processes import Model
-from gyrofuse.uncertainty import chi_square_interval
+from gyrofuse.wavelets.equivalent_dof import chi_square_interval
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

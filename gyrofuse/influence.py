@@ -14,7 +14,7 @@ weights and `B = (I - c 1') A^-1`
 
 are products of the coefficients of the signals `B x` and of the virtual signal `c' x`: one pass over the data.
 
-**Where it is wrong**: as all of this bootstrap (`gyrofuse.bootstrap`), at large scales. Nominal 95 % intervals of
+**Where it is wrong**: as all of this bootstrap (`gyrofuse.wavelets.block_bootstrap`), at large scales. Nominal 95 % intervals of
 weights of four sensors with white noise and random walks, 2**13 samples, 9 levels, blocks of `T^(1/3) = 20`, held the
 truth in 95 % of 300 recordings for short scale weights, 92 to 94 % for flat and **45 to 55 %** for long ones (88 to
 90 % with the default block length). With 12 levels, whose last one has half as many coefficients as there are samples,
@@ -31,9 +31,9 @@ from torch import Tensor
 
 from gyrofuse._base.checks import check_floating, check_n_levels, check_positive_integer, check_signal
 from gyrofuse._base.linalg import check_positive_definite
-from gyrofuse._blocks import BlockSums
 from gyrofuse._sweep import Statistic, Sweeps, joined
-from gyrofuse.block_length import (
+from gyrofuse.scale_weights import ScaleWeights, resolve_scale_weights
+from gyrofuse.wavelets.block_length import (
     alike,
     bin_means,
     check_block_length,
@@ -41,8 +41,8 @@ from gyrofuse.block_length import (
     n_columns,
     warn_of_few_columns,
 )
-from gyrofuse.covariance import wavelet_products
-from gyrofuse.scale_weights import ScaleWeights, resolve_scale_weights
+from gyrofuse.wavelets.blocks import BlockSums
+from gyrofuse.wavelets.covariance import wavelet_products
 
 # Samples x sensors of short recordings that are taken together.
 _GROUP = 2**19
@@ -67,7 +67,7 @@ def bootstrap_weights_covariance(
 
     Too small where scales far beyond the blocks decide: nominal 95 % intervals of weights for long scales, with blocks
     of `T^(1/3)`, hold the truth in 20 to 55 % of recordings. Too small for all when the last level has few
-    coefficients. See the module and `gyrofuse.bootstrap`.
+    coefficients. See the module and `gyrofuse.wavelets.block_bootstrap`.
 
     Args:
         signal: `(..., sensor, time)`, that gave the weights; NaN = missing sample.

@@ -27,7 +27,7 @@ from gyrofuse.moment_inference import Fit, infer
 from gyrofuse.moment_profile import profiled
 from gyrofuse.processes import Model, Sinusoid
 from gyrofuse.profile_surfaces import MomentSurface
-from gyrofuse.uncertainty import chi_square_tail
+from gyrofuse.wavelets.equivalent_dof import chi_square_tail
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -21,7 +21,7 @@ from gyrofuse.continuous import fit_moments
 from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.moment_inference import Fit, Inference, infer, infer_efficient
 from gyrofuse.processes import AR1, Sinusoid
-from gyrofuse.robust import robust_wavelet_variance
+from gyrofuse.wavelets.robust import robust_wavelet_variance
 from gyrofuse.whittle import refine_whittle
 
 if TYPE_CHECKING:

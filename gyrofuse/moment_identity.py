@@ -12,7 +12,7 @@ from gyrofuse._composition import Composition
 from gyrofuse.moment_inference import WEAKLY_DETERMINED, Estimates
 from gyrofuse.processes import AR1, Model, RandomWalk, Sinusoid, WhiteNoise
 from gyrofuse.tones import FEWEST_CYCLES, Tones
-from gyrofuse.uncertainty import normal_quantile
+from gyrofuse.wavelets.equivalent_dof import normal_quantile
 
 # A tone of fewer cycles is a trend, an AR1 of which the record holds fewer time constants a random walk.
 FEWEST_TIME_CONSTANTS = 2.0

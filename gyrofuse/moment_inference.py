@@ -12,7 +12,7 @@ from gyrofuse._composition import Composition
 from gyrofuse._log_moments import log_residual
 from gyrofuse._records import Records
 from gyrofuse.processes import AR1, Drift, Sinusoid
-from gyrofuse.uncertainty import chi_square_tail, normal_quantile
+from gyrofuse.wavelets.equivalent_dof import chi_square_tail, normal_quantile
 
 # Beyond this spread of its logarithm a variance is known to hardly its order of magnitude.
 WEAKLY_DETERMINED = 0.5

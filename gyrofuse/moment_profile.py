@@ -25,7 +25,7 @@ from gyrofuse.moment_identity import told_apart, uncertain
 from gyrofuse.moment_inference import WEAKLY_DETERMINED, Estimates, Fit, Inference
 from gyrofuse.processes import AR1, Drift, Sinusoid
 from gyrofuse.profile_surfaces import MomentSurface, Surface
-from gyrofuse.uncertainty import normal_quantile
+from gyrofuse.wavelets.equivalent_dof import normal_quantile
 
 # Share of `z` by which the square root of the rise at a limit may differ from it: as much as the limit would be off. An
 # interval of 95 % a tenth too short holds 92 %.

@@ -41,15 +41,15 @@ from torch.nn.functional import pad
 
 from gyrofuse._base.checks import check_floating, check_positive_integer, check_signal
 from gyrofuse._base.linalg import check_positive_definite
-from gyrofuse.covariance import binned_products
 from gyrofuse.cross_fitting import CrossFit, Fusion, cross_fit
 from gyrofuse.io.recording import Recording
 from gyrofuse.multiscale_result import MultiScaleResult, fuse_bands
-from gyrofuse.pilot import fit_pilot
 from gyrofuse.scale_weights import ScaleWeights
-from gyrofuse.series import bin_length
 from gyrofuse.svo import fit_svo
-from gyrofuse.uncertainty import degrees_of_freedom
+from gyrofuse.wavelets.covariance import binned_products
+from gyrofuse.wavelets.equivalent_dof import degrees_of_freedom
+from gyrofuse.wavelets.long_run_variance import bin_length
+from gyrofuse.wavelets.pilot import fit_pilot
 
 # Observations per sensor that the level below is worth. Out of sample, 4 to 10 are within 2 % of each other.
 _POOLING = 6.0

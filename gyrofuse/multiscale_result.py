@@ -11,10 +11,10 @@ from torch import Tensor
 
 from gyrofuse._base.checks import check_signal
 from gyrofuse._base.results import ConfidenceInterval, listed, numbered
-from gyrofuse._tiles import tile_length
 from gyrofuse.cross_fitting import CrossFit
 from gyrofuse.io.recording import Recording
 from gyrofuse.svo_result import SVOResult, plot_deviations
+from gyrofuse.wavelets.tiles import tile_length
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.linalg import oriented_eigh
-from gyrofuse._lag_sums import block_mean_covariances
-from gyrofuse.covariance import wavelet_products
-from gyrofuse.pilot import Pilot, components_of_memories
+from gyrofuse.wavelets.covariance import wavelet_products
+from gyrofuse.wavelets.lag_sums import block_mean_covariances
+from gyrofuse.wavelets.pilot import Pilot, components_of_memories
 
 # The share of the variance that the directions hold, and as many as give its law the right shape.
 _HELD, _FEWEST_DIRECTIONS = 0.5, 24

@@ -20,7 +20,7 @@ from gyrofuse.parity_energy import Energies, chunks_of, energies_of, parity_matr
 from gyrofuse.parity_reference import ParityReference, check_window, stationary_reference
 from gyrofuse.parity_result import ParityResult
 from gyrofuse.svo_result import SVOResult
-from gyrofuse.uncertainty import degrees_of_freedom
+from gyrofuse.wavelets.equivalent_dof import degrees_of_freedom
 
 # Observations of a window below which its variance can be small by chance alone.
 _FEWEST_QUIET = 8

@@ -15,7 +15,7 @@ from gyrofuse._base.linalg import check_positive_definite
 from gyrofuse._base.results import listed, numbered
 from gyrofuse.io.recording import Recording
 from gyrofuse.parity_energy import Products, chunks_of, energies_of, own_variance, parity_matrix, window_products
-from gyrofuse.uncertainty import degrees_of_freedom
+from gyrofuse.wavelets.equivalent_dof import degrees_of_freedom
 
 # Observations that a level needs beyond what the weights of a difference take.
 _FEWEST = 4

@@ -13,12 +13,12 @@ from torch import Tensor
 from gyrofuse import plotting
 from gyrofuse._base.page import image, new_figure, number, render, save_figure
 from gyrofuse._base.results import numbered
-from gyrofuse.covariance import wavelet_variance
 from gyrofuse.io.recording import Recording
 from gyrofuse.multiscale_result import MultiScaleResult
 from gyrofuse.rdvg import rdvg
 from gyrofuse.report_words import ALIKE, Fused, verdict
 from gyrofuse.svo_result import SVOResult
+from gyrofuse.wavelets.covariance import wavelet_variance
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure

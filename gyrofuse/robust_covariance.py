@@ -18,11 +18,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gyrofuse._lag_sums import lag_quadrature
 from gyrofuse._model import Model
 from gyrofuse.moment_covariance import _covariances, _grid, _shares, _symmetric, _tables, moment_covariance
 from gyrofuse.processes import Drift, Sinusoid
-from gyrofuse.robust import biweight_of, check_efficiency
+from gyrofuse.wavelets.lag_sums import lag_quadrature
+from gyrofuse.wavelets.robust import biweight_of, check_efficiency
 
 # Orders of less than this are left out.
 _LEAST_ORDER = 1e-3

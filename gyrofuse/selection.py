@@ -24,9 +24,9 @@ from gyrofuse.competitors import (
     nonnegative_weights,
     shrinkage_weights,
 )
-from gyrofuse.covariance import wavelet_products
 from gyrofuse.svo_weights import combine, counting, optimal_weights
-from gyrofuse.uncertainty import degrees_of_freedom
+from gyrofuse.wavelets.covariance import wavelet_products
+from gyrofuse.wavelets.equivalent_dof import degrees_of_freedom
 
 # Weights from cross-covariance `(..., level, sensor, sensor)`, number of coefficients `(..., level)` and scale weights.
 # Levels that the scale weights leave out may help to know the others.

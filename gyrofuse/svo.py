@@ -10,20 +10,20 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from gyrofuse import uncertainty
 from gyrofuse._base.checks import check_confidence_level, check_n_levels, check_signal
 from gyrofuse._base.linalg import check_positive_definite
 from gyrofuse._base.results import ConfidenceInterval, named, numbered
-from gyrofuse.bootstrap import signal_bootstrap
-from gyrofuse.covariance import binned_products
 from gyrofuse.fusion import METHODS, Chosen, choose_weights, judge_weights
 from gyrofuse.influence import bootstrap_inverse_variance_weights_covariance, bootstrap_weights_covariance
 from gyrofuse.io.recording import Recording
-from gyrofuse.pilot import fit_pilot
 from gyrofuse.scale_weights import ScaleWeights, normalised, resolve_scale_weights
-from gyrofuse.series import bin_length
 from gyrofuse.svo_result import SVOResult, fuse
 from gyrofuse.svo_weights import combine, counting
+from gyrofuse.wavelets import equivalent_dof as uncertainty
+from gyrofuse.wavelets.block_bootstrap import signal_bootstrap
+from gyrofuse.wavelets.covariance import binned_products
+from gyrofuse.wavelets.long_run_variance import bin_length
+from gyrofuse.wavelets.pilot import fit_pilot
 from gyrofuse.weights_spread import WeightsSpread, certain, normal_spread, spread_of_weights, unknown
 
 COVARIANCES = ("model", "block_bootstrap", "resampling", "none")

@@ -14,10 +14,10 @@ from gyrofuse._base.linalg import check_positive_definite
 from gyrofuse._base.results import listed
 from gyrofuse._virtual_gyro import VirtualGyro
 from gyrofuse.io.chunked import LongRecording, Progress, check_long_recording, silent, stretch_of
-from gyrofuse.metric import WaveletCrossCovariance
 from gyrofuse.scale_weights import ScaleWeights, normalised, resolve_scale_weights
 from gyrofuse.svo_result import fuse
 from gyrofuse.svo_weights import combine, counting, optimal_weights
+from gyrofuse.wavelets.metric import WaveletCrossCovariance
 
 if TYPE_CHECKING:
     from lightning.fabric import Fabric

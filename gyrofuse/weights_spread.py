@@ -1,7 +1,7 @@
 """How far the weights of a virtual gyro can be off.
 
 Two ways, each where it is right. Where the levels that decide hold many windows side by side, the influence of each
-stretch of the recording on the weights is a series whose own variance tells (`gyrofuse.series`). Where they do not,
+stretch of the recording on the weights is a series whose own variance tells (`gyrofuse.wavelets.long_run_variance`). Where they do not,
 the last levels are drawn again from a pilot model, with the weights fitted anew each time (`gyrofuse.parametric`), and
 lower levels add what their series tells. Where both can be had and the series shows far more than the model allows,
 the series is believed: the noise is none that the model knows.
@@ -17,11 +17,11 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from gyrofuse import series
 from gyrofuse._base.linalg import oriented_eigh
 from gyrofuse.parametric import resample_combined
-from gyrofuse.pilot import Pilot, fit_pilot
-from gyrofuse.uncertainty import normal_quantile, t_quantile
+from gyrofuse.wavelets import long_run_variance as series
+from gyrofuse.wavelets.equivalent_dof import normal_quantile, t_quantile
+from gyrofuse.wavelets.pilot import Pilot, fit_pilot
 
 # Windows side by side from which on the series alone is believed.
 _MANY_WINDOWS = 64
@@ -89,7 +89,7 @@ def spread_of_weights(
     """Spread of weights that are a function of `A = sum_j omega_j Gamma_j`.
 
     Args:
-        sums: `(item, bin, level, sensor, sensor)`, of `gyrofuse.covariance.binned_products`.
+        sums: `(item, bin, level, sensor, sensor)`, of `gyrofuse.wavelets.covariance.binned_products`.
         counts: The same shape.
         scale_weights: `(level,)`.
         n_samples: Length T of the recordings.

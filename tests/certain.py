@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.cross_fitting import CrossFit
-from gyrofuse.uncertainty import chi_square_interval
+from gyrofuse.wavelets.equivalent_dof import chi_square_interval
 
 
 def certain_fit(degrees: Tensor, confidence_level: float) -> CrossFit:

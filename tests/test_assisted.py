@@ -14,8 +14,8 @@ import gyrofuse as gf
 from gyrofuse import assisted
 from gyrofuse._base.linalg import geometric_mean
 from gyrofuse.assisted import assisted_covariance
-from gyrofuse.covariance import wavelet_products
 from gyrofuse.svo_weights import combine, optimal_weights
+from gyrofuse.wavelets.covariance import wavelet_products
 
 R = torch.tensor([2.8, 1.4, 1.0, 2.0], dtype=torch.float64).diag()
 Q = 1e-3 * torch.tensor(

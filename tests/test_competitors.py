@@ -17,9 +17,9 @@ from gyrofuse.competitors import (
     shrinkage_weights,
     shrunk_covariance,
 )
-from gyrofuse.covariance import wavelet_products
 from gyrofuse.svo_weights import combine, optimal_weights
-from gyrofuse.uncertainty import degrees_of_freedom
+from gyrofuse.wavelets.covariance import wavelet_products
+from gyrofuse.wavelets.equivalent_dof import degrees_of_freedom
 
 ONE = torch.ones(1, dtype=torch.float64)
 

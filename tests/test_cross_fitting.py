@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gyrofuse import ArrayModel, RandomWalk, WhiteNoise, fit_multiscale, fit_svo
 from gyrofuse.cross_fitting import CrossFit
-from gyrofuse.intervals import wavelet_variance_interval
+from gyrofuse.wavelets.intervals import wavelet_variance_interval
 
 REFUSED = 1e-3  # the chance that a true claim is refused
 

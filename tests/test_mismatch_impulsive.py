@@ -12,7 +12,6 @@ from mismatch_draws import LEVEL, NOISE, RATE, SCENE, N, covers, drawn, even, no
 from scipy import fft, optimize, stats
 
 from gyrofuse import AR1, RandomWalk, WhiteNoise
-from gyrofuse.haar import haar_coefficients
 from gyrofuse.mismatch import (
     episodes,
     haar_kurtosis,
@@ -37,6 +36,7 @@ from gyrofuse.mismatch.mechanisms.variance_change import VarianceChange
 from gyrofuse.mismatch.side import Side
 from gyrofuse.mismatch.spectra import bands
 from gyrofuse.mismatch.stats import brownian_range
+from gyrofuse.wavelets.haar import haar_coefficients
 
 WITNESSES = (
     marginals.marginal_witness,

@@ -14,8 +14,8 @@ from torch import Tensor
 
 import gyrofuse as gf
 from gyrofuse.moment_covariance import moment_covariance
-from gyrofuse.robust import biweight_of
 from gyrofuse.robust_covariance import robust_moment_covariance
+from gyrofuse.wavelets.robust import biweight_of
 
 Array = NDArray[np.float64]
 MODEL = gf.WhiteNoise(1.0) + gf.RandomWalk(4e-4)

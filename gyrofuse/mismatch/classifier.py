@@ -9,10 +9,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gyrofuse.covariance import wavelet_cross_covariance
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.folds import N_JUDGED, in_fold
 from gyrofuse.mismatch.remembered import remembered
+from gyrofuse.wavelets.covariance import wavelet_cross_covariance
 
 _WINDOWS = 512  # of a recording: the area of so many is told to 0.02, and a window of it still holds four levels
 _SHORTEST = 64  # samples of a window

@@ -11,7 +11,6 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from gyrofuse.covariance import wavelet_cross_covariance
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.classifier import distinguishability
 from gyrofuse.mismatch.evidence import Evidence
@@ -19,6 +18,7 @@ from gyrofuse.mismatch.folds import N_FOLDS, N_JUDGED, held_out_blocks, in_fold
 from gyrofuse.mismatch.mechanism import Mechanism, Z
 from gyrofuse.mismatch.remainder import Remainder
 from gyrofuse.mismatch.remembered import remembered
+from gyrofuse.wavelets.covariance import wavelet_cross_covariance
 
 _ACCEPTED_T = 1.0
 _FARTHER = 1.5  # times the discrepancy: 587 arrays with effects that were repaired had at most 1.2

@@ -30,9 +30,15 @@ from torch.nn.functional import pad
 from gyrofuse._base.checks import check_confidence_level, check_n_levels, check_positive_integer, check_signal
 from gyrofuse._base.random import own_generator
 from gyrofuse._base.results import ConfidenceInterval
-from gyrofuse._blocks import BlockSums, moments_over_starts
-from gyrofuse.block_length import alike, check_block_length, default_block_length, n_columns, warn_of_few_columns
-from gyrofuse.covariance import wavelet_products
+from gyrofuse.wavelets.block_length import (
+    alike,
+    check_block_length,
+    default_block_length,
+    n_columns,
+    warn_of_few_columns,
+)
+from gyrofuse.wavelets.blocks import BlockSums, moments_over_starts
+from gyrofuse.wavelets.covariance import wavelet_products
 
 # Numbers held at a time: products of coefficients, sums looked up, samples of resampled signals.
 _PRODUCTS = 2**21

@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy import stats
 
-from gyrofuse import series
+from gyrofuse.wavelets import long_run_variance as series
 
 
 def test_terms_follow_the_windows():

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.checks import check_n_levels, check_signal
-from gyrofuse.covariance import wavelet_variance
+from gyrofuse.wavelets.covariance import wavelet_variance
 
 # Below, the biweight throws away the shoulders of the Gaussian itself: samples of a hundred often have no solution, and
 # at c = 2.5 it says nothing of the scale.

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.linalg import geometric_mean
-from gyrofuse._lag_sums import covariance_table, unit_wavelet_variances, variance_table
+from gyrofuse.wavelets.lag_sums import covariance_table, unit_wavelet_variances, variance_table
 
 # Levels with more observations than this speak for themselves.
 _MOST_OBSERVATIONS = 2**6

@@ -16,7 +16,8 @@ import torch
 from reference import haar as naive
 from torch import distributed
 
-from gyrofuse import WaveletCrossCovariance, _tiles, wavelet_cross_covariance
+from gyrofuse import WaveletCrossCovariance, wavelet_cross_covariance
+from gyrofuse.wavelets import tiles as _tiles
 
 N_SENSORS, N_LEVELS = 3, 9
 

@@ -1,7 +1,7 @@
 """Confidence intervals of wavelet variances and cross-covariances that hold at every level.
 
-A level with many windows side by side tells its own variance by its series (`gyrofuse.series`), whatever the noise is.
-At the last levels a pilot model (`gyrofuse.pilot`) says how many independent observations they hold, and a chi-square
+A level with many windows side by side tells its own variance by its series (`gyrofuse.wavelets.long_run_variance`), whatever the noise is.
+At the last levels a pilot model (`gyrofuse.wavelets.pilot`) says how many independent observations they hold, and a chi-square
 law the rest.
 """
 
@@ -10,12 +10,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gyrofuse import series
 from gyrofuse._base.checks import check_confidence_level, check_n_levels, check_signal
 from gyrofuse._base.results import ConfidenceInterval
-from gyrofuse.covariance import binned_products
-from gyrofuse.pilot import Pilot, fit_pilot
-from gyrofuse.uncertainty import chi_square_interval, t_quantile
+from gyrofuse.wavelets import long_run_variance as series
+from gyrofuse.wavelets.covariance import binned_products
+from gyrofuse.wavelets.equivalent_dof import chi_square_interval, t_quantile
+from gyrofuse.wavelets.pilot import Pilot, fit_pilot
 
 # Products of two sensors have heavier tails than squares: a series has to be longer to be believed.
 _FEWEST_WINDOWS_OF_PAIRS = 64

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 from reference import processes as naive
 
-from gyrofuse._lag_sums import block_mean_covariances, covariance_table, unit_covariances, unit_wavelet_variances
+from gyrofuse.wavelets.lag_sums import (
+    block_mean_covariances,
+    covariance_table,
+    unit_covariances,
+    unit_wavelet_variances,
+)
 
 TIME_CONSTANTS = (0.7, 2.0, 50.0, 3e5)
 # Autocovariances of the components, of the AR1s less the one at lag 0: no filter sees the difference.

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse import pilot
-from gyrofuse.covariance import wavelet_products
 from gyrofuse.parametric import resample_combined
+from gyrofuse.wavelets import pilot
+from gyrofuse.wavelets.covariance import wavelet_products
 
 N_SAMPLES, N_LEVELS = 4096, 11
 WHITE = torch.tensor([[1.0, 0.3, 0], [0.3, 2.0, -0.4], [0, -0.4, 0.7]]).double()

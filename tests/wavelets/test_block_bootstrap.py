@@ -18,8 +18,6 @@ from torch import Tensor
 from gyrofuse import (
     SingularCovarianceError,
     _sweep,
-    block_length,
-    bootstrap,
     fit_svo,
     influence,
     inverse_variance_weights,
@@ -27,20 +25,22 @@ from gyrofuse import (
     svo_weights,
     wavelet_cross_covariance,
 )
-from gyrofuse._blocks import BlockSums
-from gyrofuse.block_length import check_block_length, default_block_length
-from gyrofuse.bootstrap import (
-    block_bootstrap,
-    bootstrap_wccv_covariance,
-    bootstrap_wccv_interval,
-    signal_bootstrap,
-)
-from gyrofuse.covariance import wavelet_products
 from gyrofuse.influence import (
     BootstrapWeightsCovariance,
     bootstrap_inverse_variance_weights_covariance,
     bootstrap_weights_covariance,
 )
+from gyrofuse.wavelets import block_bootstrap as bootstrap
+from gyrofuse.wavelets import block_length
+from gyrofuse.wavelets.block_bootstrap import (
+    block_bootstrap,
+    bootstrap_wccv_covariance,
+    bootstrap_wccv_interval,
+    signal_bootstrap,
+)
+from gyrofuse.wavelets.block_length import check_block_length, default_block_length
+from gyrofuse.wavelets.blocks import BlockSums
+from gyrofuse.wavelets.covariance import wavelet_products
 
 LEVELS = 3  # where their number does not matter
 LENGTH = 11  # of the blocks; divides none of the numbers of coefficients below
@@ -229,7 +229,7 @@ def test_block_sums_of_chunks(monkeypatch, length):
     series = torch.from_numpy(np.random.default_rng(0).normal(size=(2, 3, 200)))
     whole = BlockSums(length, 200)
     whole.update(series)
-    monkeypatch.setattr("gyrofuse._blocks._CHUNK", 16)
+    monkeypatch.setattr("gyrofuse.wavelets.blocks._CHUNK", 16)
     pieces = BlockSums(length, 200)
     for piece in series.split([0, 1, 2, 60, 130, 7], dim=-1):
         pieces.update(piece)

@@ -14,7 +14,7 @@ from scipy import integrate, optimize, stats
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.robust import biweight, biweight_of, m_variance
+from gyrofuse.wavelets.robust import biweight, biweight_of, m_variance
 
 Array = NDArray[np.float64]
 EFFICIENCIES = (0.5, 0.6, 0.8, 0.95, 0.99)

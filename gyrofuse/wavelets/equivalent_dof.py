@@ -6,7 +6,7 @@ Without a model of the noise, a level with `M_j` coefficients of filter length `
 
 independent observations: at level 1 what white noise has, which is less there than a random walk has; above, what a
 random walk has for large tau, the slowest of the usual gyro errors. That is on the safe side for faster ones (white
-noise comes to 3 M_j / tau_j). `gyrofuse.pilot` knows better for a given recording.
+noise comes to 3 M_j / tau_j). `gyrofuse.wavelets.pilot` knows better for a given recording.
 """
 
 from __future__ import annotations

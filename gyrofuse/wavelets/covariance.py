@@ -13,8 +13,8 @@ import torch
 from torch import Tensor, nn
 
 from gyrofuse._base.checks import check_floating, check_n_levels, check_signal
-from gyrofuse._tiles import WaveletProducts, tile_length
-from gyrofuse.haar import haar_coefficients
+from gyrofuse.wavelets.haar import haar_coefficients
+from gyrofuse.wavelets.tiles import WaveletProducts, tile_length
 
 
 def wavelet_cross_covariance(signal: Tensor, n_levels: int | None = None) -> Tensor:

@@ -1,6 +1,6 @@
 """Sums of wavelet products over long recordings, one cache-sized tile of time after another.
 
-The same pyramid as in `gyrofuse.haar`, arranged so that the data cross the memory bus about once: a tile of time
+The same pyramid as in `gyrofuse.wavelets.haar`, arranged so that the data cross the memory bus about once: a tile of time
 passes through all levels while it is in cache, and the Gram product of its coefficients is taken there. What a
 level needs of the past (the last `h = 2**level` samples of its smooth) is kept from tile to tile, so that chunks of
 any length, and a whole recording in one go, add up to the same sums.

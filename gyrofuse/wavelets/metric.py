@@ -10,8 +10,8 @@ from torch import Tensor
 from torchmetrics import Metric
 
 from gyrofuse._base.checks import check_positive_integer, check_signal
-from gyrofuse._tiles import WaveletProducts
-from gyrofuse.covariance import mean_products
+from gyrofuse.wavelets.covariance import mean_products
+from gyrofuse.wavelets.tiles import WaveletProducts
 
 
 class WaveletCrossCovariance(Metric):

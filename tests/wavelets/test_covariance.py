@@ -13,12 +13,12 @@ from reference import haar as naive
 from gyrofuse import (
     CrossCovariance,
     HaarFilterBank,
-    _tiles,
     cross_covariance,
     haar_coefficients,
     wavelet_cross_covariance,
     wavelet_variance,
 )
+from gyrofuse.wavelets import tiles as _tiles
 
 NO_WINDOW = r"no complete window for some sensors at level\(s\) "
 
