@@ -28,7 +28,6 @@ from gyrofuse._base.results import ConfidenceInterval
 from gyrofuse.array_gmwm import fit_array_gmwm
 from gyrofuse.array_gmwm_result import ArrayGMWMResult
 from gyrofuse.competitors import equal_weights, inverse_variance_weights, nonnegative_weights, shrinkage_weights
-from gyrofuse.datasheet import Datasheet, datasheet
 from gyrofuse.export import to_c_header, to_kalibr
 from gyrofuse.gain import Gain
 from gyrofuse.gmwm import fit_gmwm
@@ -45,18 +44,19 @@ from gyrofuse.moment_bootstrap import GMWMBootstrap, bootstrap_gmwm
 from gyrofuse.moment_covariance import moment_covariance
 from gyrofuse.multiscale import MultiScaleSVO, fit_multiscale
 from gyrofuse.multiscale_result import MultiScaleResult
+from gyrofuse.noise.array_model import ArrayModel
+from gyrofuse.noise.datasheet import Datasheet, datasheet
+from gyrofuse.noise.parsing import model_from_dict, parse_model
+from gyrofuse.noise.processes import AR1, Drift, Model, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
+from gyrofuse.noise.state_space import StateSpace, state_space
 from gyrofuse.parity import parity_test
 from gyrofuse.parity_reference import ParityReference, fit_parity
 from gyrofuse.parity_result import ParityResult
-from gyrofuse.parsing import model_from_dict, parse_model
-from gyrofuse.processes import AR1, Drift, Model, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
 from gyrofuse.ranking import rank_models
 from gyrofuse.ranking_result import RankResult
 from gyrofuse.rdvg import RDVGResult, rdvg, rdvg_weights
 from gyrofuse.scale_weights import resolve_scale_weights
 from gyrofuse.selection import Selection
-from gyrofuse.simulate import ArrayModel
-from gyrofuse.state_space import StateSpace, state_space
 from gyrofuse.svo import SVO, fit_svo
 from gyrofuse.svo_result import SVOResult
 from gyrofuse.svo_weights import SVOWeights, svo_weights

@@ -13,7 +13,7 @@ from gyrofuse._array_search import jacobian
 from gyrofuse._composition import Composition
 from gyrofuse._records import Records
 from gyrofuse.moment_inference import _quadratic, _sandwich
-from gyrofuse.processes import AR1
+from gyrofuse.noise.processes import AR1
 from gyrofuse.wavelets.equivalent_dof import normal_quantile
 
 # Of the largest eigenvalue of a matrix between sensors of unit size, what is as good as none.

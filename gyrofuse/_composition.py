@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gyrofuse.processes import AR1, Drift, Model, Process, Sinusoid, haar_kernel, haar_kernel_slope
+from gyrofuse.noise.processes import AR1, Drift, Model, Process, Sinusoid, haar_kernel, haar_kernel_slope
 
 
 @dataclass(frozen=True, eq=False)

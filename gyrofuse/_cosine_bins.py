@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gyrofuse._base.transforms import tone_in_cosines
 from gyrofuse._composition import Composition
-from gyrofuse.processes import AR1, Drift, Process, QuantizationNoise, RandomWalk, Sinusoid
+from gyrofuse.noise.processes import AR1, Drift, Process, QuantizationNoise, RandomWalk, Sinusoid
 
 # Single ordinates up to here, then means over so many bands an octave; towards the highest frequency again so many
 # bands each time the distance from it halves, which alternating AR1s need.

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.moment_inference import Estimates
-from gyrofuse.processes import Drift, Model
+from gyrofuse.noise.processes import Drift, Model
 
 
 def rising(series: Tensor) -> Tensor:

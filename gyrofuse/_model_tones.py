@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gyrofuse._composition import Composition
 from gyrofuse._rank_spectra import Spectra, detrended, reference_density
-from gyrofuse.processes import Drift, Sinusoid
+from gyrofuse.noise.processes import Drift, Sinusoid
 from gyrofuse.tones import Tones, find_tones
 from gyrofuse.whittle import _of
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gyrofuse._base.nnls import nonnegative_least_squares
 from gyrofuse._composition import Composition, shape_of
-from gyrofuse.processes import AR1
+from gyrofuse.noise.processes import AR1
 
 _STEPS, _ENOUGH = 30, 1e-10
 # The damping after which a step that does not help is taken for rounding.

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from gyrofuse._composition import Composition
-from gyrofuse.parsing import parse_model
-from gyrofuse.processes import AR1, Drift, Model, Process, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
+from gyrofuse.noise.parsing import parse_model
+from gyrofuse.noise.processes import AR1, Drift, Model, Process, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
 
 Kinds = list[type[Process]]
 Key = frozenset[tuple[type[Process], int]]

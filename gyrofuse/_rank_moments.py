@@ -17,7 +17,7 @@ from gyrofuse._composition import Composition
 from gyrofuse._records import Records
 from gyrofuse.moment_fit import damped, misfit
 from gyrofuse.moment_inference import Estimates, Fit, Inference, infer, infer_efficient
-from gyrofuse.processes import AR1
+from gyrofuse.noise.processes import AR1
 
 _REWEIGHTINGS, _UPDATES = 3, 3
 # By how much more than on the way the last weights' fit may miss, in half nats, before it is thought to go to and fro.

@@ -19,7 +19,7 @@ from gyrofuse._base.transforms import ramp_ordinates
 from gyrofuse._composition import Composition
 from gyrofuse._cosine_bins import Bins, Noise
 from gyrofuse._spectral_search import maximise, uncertainty
-from gyrofuse.processes import AR1, Drift, QuantizationNoise, RandomWalk, WhiteNoise
+from gyrofuse.noise.processes import AR1, Drift, QuantizationNoise, RandomWalk, WhiteNoise
 from gyrofuse.tones import NoiseSpectrum, Tones, find_tones, line_p_value
 from gyrofuse.whittle import _LEAST_COUNT, _transformed
 

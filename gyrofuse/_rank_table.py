@@ -13,7 +13,7 @@ from gyrofuse._rank_candidates import Key, Kinds
 from gyrofuse._rank_moments import Moments
 from gyrofuse._rank_search import EQUIVALENT, MomentSearch, SpectralSearch
 from gyrofuse._rank_spectra import Lines, decide_lines
-from gyrofuse.processes import Drift, Sinusoid
+from gyrofuse.noise.processes import Drift, Sinusoid
 from gyrofuse.wavelets.covariance import wavelet_variance
 from gyrofuse.wavelets.equivalent_dof import chi_square_tail
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.moment_covariance import moment_covariance
-from gyrofuse.processes import Model
+from gyrofuse.noise.processes import Model
 from gyrofuse.robust_covariance import robust_moment_covariance
 
 

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from gyrofuse._composition import Composition
 from gyrofuse.moment_inference import WEAKLY_DETERMINED, Inference
-from gyrofuse.processes import WhiteNoise
+from gyrofuse.noise.processes import WhiteNoise
 from gyrofuse.tones import Tones
 from gyrofuse.wavelets.equivalent_dof import normal_quantile
 

@@ -26,7 +26,7 @@ from gyrofuse._records import Records
 from gyrofuse.array_gmwm_result import ArrayGMWMResult
 from gyrofuse.io.recording import Recording
 from gyrofuse.moment_fit import composition_of
-from gyrofuse.processes import Drift, Model, Sinusoid
+from gyrofuse.noise.processes import Drift, Model, Sinusoid
 from gyrofuse.wavelets.covariance import wavelet_products
 
 WEIGHTINGS = ("optimal", "pairwise")

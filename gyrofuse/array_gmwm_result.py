@@ -21,12 +21,12 @@ from gyrofuse._array_inference import (
 from gyrofuse._array_moments import vech
 from gyrofuse._base.results import ConfidenceInterval, counted, listed
 from gyrofuse._composition import Composition
-from gyrofuse._estimation import EstimatedFrom
 from gyrofuse._records import Records
 from gyrofuse.live import subset_weights
-from gyrofuse.processes import Model, Process, Sinusoid
+from gyrofuse.noise.array_model import ArrayModel
+from gyrofuse.noise.estimation import EstimatedFrom
+from gyrofuse.noise.processes import Model, Process, Sinusoid
 from gyrofuse.scale_weights import ScaleWeights
-from gyrofuse.simulate import ArrayModel
 from gyrofuse.wavelets.equivalent_dof import chi_square_tail
 
 if TYPE_CHECKING:

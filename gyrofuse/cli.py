@@ -53,8 +53,9 @@ from gyrofuse.io.limits import physical_memory
 from gyrofuse.io.recording import Recording
 from gyrofuse.multiscale import fit_multiscale
 from gyrofuse.multiscale_result import MultiScaleResult
-from gyrofuse.parsing import parse_model
-from gyrofuse.processes import Model
+from gyrofuse.noise.array_model import ArrayModel
+from gyrofuse.noise.parsing import parse_model
+from gyrofuse.noise.processes import Model
 from gyrofuse.report import (
     fusion_figure,
     fusion_report,
@@ -63,7 +64,6 @@ from gyrofuse.report import (
     save_figure,
     sensor_rows,
 )
-from gyrofuse.simulate import ArrayModel
 from gyrofuse.svo import fit_svo
 from gyrofuse.svo_result import SVOResult
 

@@ -28,8 +28,8 @@ from gyrofuse.cli_shared import (
     write_json,
 )
 from gyrofuse.io.recording import read_recording
-from gyrofuse.processes import Model
-from gyrofuse.simulate import ArrayModel
+from gyrofuse.noise.array_model import ArrayModel
+from gyrofuse.noise.processes import Model
 
 if TYPE_CHECKING:
     from gyrofuse.fleet.store import ResultStore

@@ -27,8 +27,8 @@ from gyrofuse.cli_shared import (
     write_json,
 )
 from gyrofuse.io.recording import Recording
-from gyrofuse.processes import Model
-from gyrofuse.simulate import ArrayModel
+from gyrofuse.noise.array_model import ArrayModel
+from gyrofuse.noise.processes import Model
 
 if TYPE_CHECKING:
     from gyrofuse.mismatch import MismatchReport

@@ -35,7 +35,7 @@ from gyrofuse.gmwm import fit_gmwm
 from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.io.recording import Recording
 from gyrofuse.io.streams import RecordingError
-from gyrofuse.processes import Model
+from gyrofuse.noise.processes import Model
 from gyrofuse.ranking import rank_models
 from gyrofuse.report_models import model_report
 from gyrofuse.report_ranking import rank_report

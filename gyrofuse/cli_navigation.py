@@ -23,7 +23,7 @@ from gyrofuse.cli_shared import (
     read_model,
     write_json,
 )
-from gyrofuse.processes import Model
+from gyrofuse.noise.processes import Model
 
 
 def emulate(

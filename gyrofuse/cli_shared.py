@@ -16,9 +16,9 @@ from gyrofuse._base.files import Outputs
 from gyrofuse._base.units import KNOWN_UNITS, canonical_unit
 from gyrofuse._console import say_table, warn
 from gyrofuse.io.recording import Recording
-from gyrofuse.parsing import model_from_dict
-from gyrofuse.processes import Model
-from gyrofuse.simulate import ArrayModel
+from gyrofuse.noise.array_model import ArrayModel
+from gyrofuse.noise.parsing import model_from_dict
+from gyrofuse.noise.processes import Model
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

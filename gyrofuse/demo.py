@@ -14,11 +14,11 @@ from gyrofuse import plotting
 from gyrofuse.demo_mismatch import MOST_SAMPLES, concealed, mismatch_story
 from gyrofuse.demo_models import CANDIDATES, models_figure, models_story, true_models
 from gyrofuse.io.recording import Recording
-from gyrofuse.processes import AR1, WhiteNoise
+from gyrofuse.noise.array_model import ArrayModel
+from gyrofuse.noise.processes import AR1, WhiteNoise
 from gyrofuse.ranking import rank_models
 from gyrofuse.report import fusion_figure, fusion_report, new_figure, number, save_figure, verdict
 from gyrofuse.report_ranking import rank_report
-from gyrofuse.simulate import ArrayModel
 from gyrofuse.svo import fit_svo
 from gyrofuse.svo_result import SVOResult
 from gyrofuse.svo_weights import svo_weights

@@ -11,7 +11,7 @@ from torch import Tensor
 from gyrofuse._base.page import number
 from gyrofuse.gmwm import fit_gmwm
 from gyrofuse.io.recording import Recording
-from gyrofuse.simulate import ArrayModel
+from gyrofuse.noise.array_model import ArrayModel
 
 if TYPE_CHECKING:
     from gyrofuse.mismatch import MismatchReport

@@ -14,9 +14,9 @@ from gyrofuse._base.page import new_figure, number
 from gyrofuse._base.units import SECONDS_PER_HOUR, angle_random_walk, correlation_time, per_sqrt_hour, rate_unit_factor
 from gyrofuse._rank_candidates import name_of
 from gyrofuse.gmwm_result import REFUSED, GMWMResult
-from gyrofuse.processes import AR1, Model, WhiteNoise
+from gyrofuse.noise.array_model import ArrayModel
+from gyrofuse.noise.processes import AR1, Model, WhiteNoise
 from gyrofuse.ranking_result import RankResult
-from gyrofuse.simulate import ArrayModel
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -14,7 +14,7 @@ from gyrofuse._base import units
 from gyrofuse._base.checks import check_positive
 from gyrofuse._base.results import place
 from gyrofuse.gmwm_result import GMWMResult
-from gyrofuse.processes import (
+from gyrofuse.noise.processes import (
     AR1,
     Drift,
     Model,
@@ -24,7 +24,7 @@ from gyrofuse.processes import (
     Sinusoid,
     WhiteNoise,
 )
-from gyrofuse.state_space import state_space
+from gyrofuse.noise.state_space import state_space
 
 _C_KEYWORDS = set(
     "auto break case char const continue default do double else enum extern float for goto if inline int long register "

@@ -29,7 +29,7 @@ from gyrofuse.moment_fit import composition_of
 from gyrofuse.moment_identity import remarks
 from gyrofuse.moment_inference import Fit, Inference, either, infer, infer_efficient
 from gyrofuse.moment_profile import profiled
-from gyrofuse.processes import Drift, Model, Sinusoid
+from gyrofuse.noise.processes import Drift, Model, Sinusoid
 from gyrofuse.profile_surfaces import MomentSurface, SpectralSurface
 from gyrofuse.robust_covariance import check_gaussian
 from gyrofuse.tones import Tones

@@ -13,11 +13,11 @@ from torch import Tensor
 from gyrofuse._base.results import ConfidenceInterval, cleaned, counted, listed, p_words, place
 from gyrofuse._base.units import DATASHEET_UNITS
 from gyrofuse._composition import Composition
-from gyrofuse._estimation import EstimatedFrom
 from gyrofuse._records import Records
-from gyrofuse.datasheet import Datasheet, datasheet
 from gyrofuse.moment_inference import Inference
-from gyrofuse.processes import Model
+from gyrofuse.noise.datasheet import Datasheet, datasheet
+from gyrofuse.noise.estimation import EstimatedFrom
+from gyrofuse.noise.processes import Model
 from gyrofuse.wavelets.equivalent_dof import chi_square_interval
 
 if TYPE_CHECKING:

@@ -25,7 +25,7 @@ from gyrofuse.moment_fit import composition_of, fit_items
 from gyrofuse.moment_identity import remarks
 from gyrofuse.moment_inference import Fit, infer
 from gyrofuse.moment_profile import profiled
-from gyrofuse.processes import Model, Sinusoid
+from gyrofuse.noise.processes import Model, Sinusoid
 from gyrofuse.profile_surfaces import MomentSurface
 from gyrofuse.wavelets.equivalent_dof import chi_square_tail
 

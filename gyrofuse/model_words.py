@@ -11,7 +11,7 @@ from torch import Tensor
 from gyrofuse._base.page import number
 from gyrofuse._base.results import p_words
 from gyrofuse.gmwm_result import REFUSED, GMWMResult
-from gyrofuse.processes import Model, Sinusoid
+from gyrofuse.noise.processes import Model, Sinusoid
 
 _DOUBTED = 0.05  # p-values of the J test below
 _WEIGHTS = {

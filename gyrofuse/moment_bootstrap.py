@@ -20,7 +20,7 @@ from gyrofuse._white_kurtosis import white_excess_kurtosis, with_excess_kurtosis
 from gyrofuse.continuous import fit_moments
 from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.moment_inference import Fit, Inference, infer, infer_efficient
-from gyrofuse.processes import AR1, Sinusoid
+from gyrofuse.noise.processes import AR1, Sinusoid
 from gyrofuse.wavelets.robust import robust_wavelet_variance
 from gyrofuse.whittle import refine_whittle
 

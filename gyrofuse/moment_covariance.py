@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gyrofuse._base.checks import check_positive_integer, largest_level
-from gyrofuse._model import Model, Process
-from gyrofuse.processes import Drift, QuantizationNoise, Sinusoid, WhiteNoise
+from gyrofuse.noise.model import Model, Process
+from gyrofuse.noise.processes import Drift, QuantizationNoise, Sinusoid, WhiteNoise
 from gyrofuse.wavelets.lag_sums import lag_quadrature, unit_covariances
 
 Array = NDArray[np.float64]

@@ -9,8 +9,8 @@ from gyrofuse import _moment_search as search
 from gyrofuse._composition import Composition, shape_of
 from gyrofuse._records import Records
 from gyrofuse.moment_inference import Fit
-from gyrofuse.parsing import parse_model
-from gyrofuse.processes import Model, Process, Sinusoid
+from gyrofuse.noise.parsing import parse_model
+from gyrofuse.noise.processes import Model, Process, Sinusoid
 
 _REWEIGHTINGS, _UPDATES, _DISTINCT = 3, 3, 3
 # Steps that the best start may take to its minimum; flat valleys need some hundreds.

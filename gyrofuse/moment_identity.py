@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gyrofuse._composition import Composition
 from gyrofuse.moment_inference import WEAKLY_DETERMINED, Estimates
-from gyrofuse.processes import AR1, Model, RandomWalk, Sinusoid, WhiteNoise
+from gyrofuse.noise.processes import AR1, Model, RandomWalk, Sinusoid, WhiteNoise
 from gyrofuse.tones import FEWEST_CYCLES, Tones
 from gyrofuse.wavelets.equivalent_dof import normal_quantile
 

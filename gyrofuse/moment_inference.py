@@ -11,7 +11,7 @@ from torch import Tensor
 from gyrofuse._composition import Composition
 from gyrofuse._log_moments import log_residual
 from gyrofuse._records import Records
-from gyrofuse.processes import AR1, Drift, Sinusoid
+from gyrofuse.noise.processes import AR1, Drift, Sinusoid
 from gyrofuse.wavelets.equivalent_dof import chi_square_tail, normal_quantile
 
 # Beyond this spread of its logarithm a variance is known to hardly its order of magnitude.

@@ -23,7 +23,7 @@ from gyrofuse._composition import Composition
 from gyrofuse._profile import crossings, grid
 from gyrofuse.moment_identity import told_apart, uncertain
 from gyrofuse.moment_inference import WEAKLY_DETERMINED, Estimates, Fit, Inference
-from gyrofuse.processes import AR1, Drift, Sinusoid
+from gyrofuse.noise.processes import AR1, Drift, Sinusoid
 from gyrofuse.profile_surfaces import MomentSurface, Surface
 from gyrofuse.wavelets.equivalent_dof import normal_quantile
 

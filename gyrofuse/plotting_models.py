@@ -14,7 +14,7 @@ from gyrofuse.plotting import allan_deviation, time_axis
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from gyrofuse.processes import Model
+    from gyrofuse.noise.processes import Model
 
 # Okabe and Ito without the blue of the sum.
 _COLOURS = ("#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")

@@ -14,7 +14,7 @@ from gyrofuse._composition import Composition
 from gyrofuse._cosine_bins import Bins, Noise
 from gyrofuse._spectral_search import deviance, maximise
 from gyrofuse.moment_inference import Fit
-from gyrofuse.processes import AR1
+from gyrofuse.noise.processes import AR1
 
 _STARTS, _FIRST_STEPS, _STEPS, _ENOUGH = 2, 6, 5, 1e-3
 _CLIMB = 15

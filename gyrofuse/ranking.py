@@ -19,12 +19,12 @@ from gyrofuse._base.checks import (
     largest_level,
 )
 from gyrofuse._base.results import ConfidenceInterval, numbered
-from gyrofuse._estimation import EstimatedFrom
 from gyrofuse._rank_table import by_moments, by_spectrum
 from gyrofuse.gmwm import _given, fit_gmwm
 from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.io.recording import Recording
-from gyrofuse.processes import Model
+from gyrofuse.noise.estimation import EstimatedFrom
+from gyrofuse.noise.processes import Model
 from gyrofuse.ranking_result import RankResult
 from gyrofuse.tones import FEWEST_SAMPLES
 

@@ -15,8 +15,8 @@ from gyrofuse._base.results import chance, counted, listed, p_words, place, sign
 from gyrofuse._rank_candidates import name_of
 from gyrofuse._rank_table import Table
 from gyrofuse.gmwm_result import GMWMResult
-from gyrofuse.parsing import parse_model
-from gyrofuse.processes import Sinusoid
+from gyrofuse.noise.parsing import parse_model
+from gyrofuse.noise.processes import Sinusoid
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -18,9 +18,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gyrofuse._model import Model
 from gyrofuse.moment_covariance import _covariances, _grid, _shares, _symmetric, _tables, moment_covariance
-from gyrofuse.processes import Drift, Sinusoid
+from gyrofuse.noise.model import Model
+from gyrofuse.noise.processes import Drift, Sinusoid
 from gyrofuse.wavelets.lag_sums import lag_quadrature
 from gyrofuse.wavelets.robust import biweight_of, check_efficiency
 

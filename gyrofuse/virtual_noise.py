@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.nnls import nonnegative_least_squares
-from gyrofuse.processes import AR1, Drift, Model, Process, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
-from gyrofuse.simulate import ArrayModel
+from gyrofuse.noise.array_model import ArrayModel
+from gyrofuse.noise.processes import AR1, Drift, Model, Process, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
 
 # Frequencies of an octave, enough to follow the ripples of a moving mean, and AR1s of an octave of time constants.
 _NODES, _PER_OCTAVE = 16, 2

@@ -27,7 +27,7 @@ from gyrofuse._base.transforms import cosine_ordinates, ramp_ordinates
 from gyrofuse._composition import Composition
 from gyrofuse._cosine_bins import SINGLE, Bins, Noise
 from gyrofuse._spectral_search import maximise, uncertainty
-from gyrofuse.processes import Drift, Sinusoid
+from gyrofuse.noise.processes import Drift, Sinusoid
 from gyrofuse.tones import FEWEST_SAMPLES, Tones, find_tones
 
 # What remains of an ordinate that a tone or the ramp takes all of.

@@ -23,7 +23,7 @@ from gyrofuse.mismatch.oscillating import Mode
 from gyrofuse.mismatch.shape_terms import (
     oscillation,
 )
-from gyrofuse.simulate import ArrayModel
+from gyrofuse.noise.array_model import ArrayModel
 
 N, P, RATE = 16384, 6, 100.0
 

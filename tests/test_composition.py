@@ -7,7 +7,7 @@ import torch
 
 import gyrofuse as gf
 from gyrofuse._composition import Composition, shape_of
-from gyrofuse.processes import AR1, Sinusoid
+from gyrofuse.noise.processes import AR1, Sinusoid
 
 TAU = 2.0 ** torch.arange(1, 21, dtype=torch.float64)
 

@@ -16,8 +16,8 @@ import torch
 from gyrofuse.export import to_c_header, to_kalibr
 from gyrofuse.gmwm import fit_gmwm
 from gyrofuse.io.recording import Recording
-from gyrofuse.processes import AR1, Drift, Model, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
-from gyrofuse.state_space import StateSpace, state_space
+from gyrofuse.noise.processes import AR1, Drift, Model, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
+from gyrofuse.noise.state_space import StateSpace, state_space
 
 # Every process with its mean at t = 1, 2, .. and its autocovariance at s, t.
 ZERO = np.zeros_like

@@ -11,7 +11,6 @@ import pytest
 import torch
 
 import gyrofuse as gf
-from gyrofuse._estimation import EstimatedFrom
 from gyrofuse.mismatch.fit_verdict import fit_verdict
 from gyrofuse.mismatch.inputs import modelled, prepared
 from gyrofuse.mismatch.line_sizes import line_sizes
@@ -23,6 +22,7 @@ from gyrofuse.mismatch.shape_scan import looked_at, shape_witness
 from gyrofuse.mismatch.slow import told
 from gyrofuse.mismatch.spectral_uncertainty import SpectralUncertainty, as_array
 from gyrofuse.mismatch.witnesses import coherence_witness, spectrum_witness
+from gyrofuse.noise.estimation import EstimatedFrom
 
 TRUE = gf.parse_model("WN(variance=1.0) + AR1(phi=0.975, variance=0.03) + RW(variance=1e-5)")
 WALKING = gf.parse_model("WN(variance=1.0) + RW(variance=1e-5)")

@@ -37,7 +37,7 @@ from gyrofuse.mismatch.mechanisms.unit_scale import GRAVITY, UnitScale
 from gyrofuse.mismatch.oscillating import Mode
 from gyrofuse.mismatch.pooled import common_witness
 from gyrofuse.mismatch.shape_scan import shape_witness
-from gyrofuse.simulate import ArrayModel
+from gyrofuse.noise.array_model import ArrayModel
 
 
 @pytest.mark.parametrize("share", [0.06, 0.75])

@@ -48,7 +48,7 @@ from gyrofuse.mismatch.shape_terms import (
 from gyrofuse.mismatch.shapes import _falls_otherwise, compared, leading_shape
 from gyrofuse.mismatch.spectral_choice import best_bump, best_start, keeps_own
 from gyrofuse.mismatch.witnesses import coherence_witness, spectrum_witness
-from gyrofuse.simulate import ArrayModel
+from gyrofuse.noise.array_model import ArrayModel
 
 
 def test_powers_gain_what_the_law_of_f_gives_them():

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from reference import processes as naive
 from torch import Tensor
 
-from gyrofuse._model import Model
 from gyrofuse.moment_covariance import moment_covariance
-from gyrofuse.processes import AR1, Drift, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
+from gyrofuse.noise.model import Model
+from gyrofuse.noise.processes import AR1, Drift, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
 from gyrofuse.wavelets.covariance import wavelet_variance
 from gyrofuse.wavelets.lag_sums import covariance_table
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gyrofuse import AR1, ArrayModel, Drift, RandomWalk, Sinusoid, WhiteNoise, virtual_noise, wavelet_variance
 from gyrofuse.multiscale_result import fuse_bands
-from gyrofuse.state_space import state_space
+from gyrofuse.noise.state_space import state_space
 from gyrofuse.virtual_noise import response
 
 WHITE = torch.tensor([[1.0, 0.2, 0.0], [0.2, 2.0, 0.3], [0.0, 0.3, 1.5]], dtype=torch.float64)

@@ -19,9 +19,9 @@ from torch import Tensor
 from gyrofuse._base.transforms import cosine_ordinates, ramp_ordinates
 from gyrofuse._composition import Composition
 from gyrofuse._cosine_bins import Bins, Noise
-from gyrofuse._model import Model
 from gyrofuse.export import state_space
-from gyrofuse.processes import AR1, Drift, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
+from gyrofuse.noise.model import Model
+from gyrofuse.noise.processes import AR1, Drift, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
 from gyrofuse.whittle import WhittleFit, refine_whittle
 
 Array = NDArray[np.float64]

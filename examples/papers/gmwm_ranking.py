@@ -29,7 +29,7 @@ from torch import Tensor
 import gyrofuse as gf
 from gyrofuse._rank_candidates import Kinds, charge, composition, name_of
 from gyrofuse._rank_spectra import Spectra, summed
-from gyrofuse.processes import Process
+from gyrofuse.noise.processes import Process
 from gyrofuse.tones import FEWEST_CYCLES
 
 N_SAMPLES = {1: 40_000, 2: 160_000, 3: 160_000}

@@ -15,15 +15,15 @@ from torch import Tensor
 
 from gyrofuse._base.checks import check_confidence_level
 from gyrofuse._base.units import DATASHEET_UNITS
-from gyrofuse._model import Model
 from gyrofuse.fleet.table import Column
 from gyrofuse.fusion import METHODS
 from gyrofuse.gmwm import fit_gmwm
 from gyrofuse.io.recording import Recording
 from gyrofuse.mismatch import diagnose
-from gyrofuse.parsing import parse_model
+from gyrofuse.noise.array_model import ArrayModel
+from gyrofuse.noise.model import Model
+from gyrofuse.noise.parsing import parse_model
 from gyrofuse.scale_weights import normalised, resolve_scale_weights
-from gyrofuse.simulate import ArrayModel
 from gyrofuse.svo import fit_svo
 from gyrofuse.svo_result import SVOResult
 

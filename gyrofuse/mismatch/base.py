@@ -17,11 +17,11 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.nnls import nonnegative_least_squares
-from gyrofuse._model import Model
 from gyrofuse.mismatch.axes import Axes
 from gyrofuse.mismatch.spectra import Bands
-from gyrofuse.processes import AR1, Process, QuantizationNoise, RandomWalk, WhiteNoise
-from gyrofuse.simulate import ArrayModel
+from gyrofuse.noise.array_model import ArrayModel
+from gyrofuse.noise.model import Model
+from gyrofuse.noise.processes import AR1, Process, QuantizationNoise, RandomWalk, WhiteNoise
 from gyrofuse.wavelets.lag_sums import block_mean_covariances
 
 _PER_DECADE = 3

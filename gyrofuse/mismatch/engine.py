@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.checks import check_n_samples
-from gyrofuse._model import Model
 from gyrofuse.io.recording import Recording
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.confirm import discrepancy_left, held_out, held_out_gain, leads_away
@@ -33,7 +32,8 @@ from gyrofuse.mismatch.report import MismatchReport
 from gyrofuse.mismatch.slow_remainder import SlowRemainder
 from gyrofuse.mismatch.testimony import WITNESSES, combined, testimony
 from gyrofuse.mismatch.twins import FEWEST, twin_p_values
-from gyrofuse.simulate import ArrayModel
+from gyrofuse.noise.array_model import ArrayModel
+from gyrofuse.noise.model import Model
 
 _LOOKED, _NAMED, _COMPARED, _CHECKED = 0.3, 0.65, 0.75, 0.9  # shares of the work that are done by then
 _AFTER_REPAIRS = 0.1  # of the level: spectra are then compared at levels that repairs have estimated

@@ -11,8 +11,6 @@ from torch import Tensor
 
 from gyrofuse._base.checks import check_positive, check_positive_integer, check_signal, same_rate
 from gyrofuse._base.results import named, numbered
-from gyrofuse._estimation import EstimatedFrom
-from gyrofuse._model import Model
 from gyrofuse.array_gmwm_result import ArrayGMWMResult
 from gyrofuse.gmwm_result import GMWMResult
 from gyrofuse.io.recording import Recording
@@ -23,9 +21,11 @@ from gyrofuse.mismatch.level_spread import with_spread
 from gyrofuse.mismatch.lines import simulated_lines
 from gyrofuse.mismatch.repaired import RepairedModel
 from gyrofuse.mismatch.spectral_uncertainty import SpectralUncertainty, as_array
-from gyrofuse.parsing import model_from_dict
+from gyrofuse.noise.array_model import ArrayModel
+from gyrofuse.noise.estimation import EstimatedFrom
+from gyrofuse.noise.model import Model
+from gyrofuse.noise.parsing import model_from_dict
 from gyrofuse.ranking_result import RankResult
-from gyrofuse.simulate import ArrayModel
 
 # Whatever a diagnosis takes for a simulation.
 Simulation = (

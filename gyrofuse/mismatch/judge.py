@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.checks import same_rate
-from gyrofuse._model import Model
 from gyrofuse.io.recording import Recording
 from gyrofuse.mismatch.agreement import compared
 from gyrofuse.mismatch.classifier import distinguishability
@@ -21,7 +20,8 @@ from gyrofuse.mismatch.confirm import discrepancy_of_fold
 from gyrofuse.mismatch.folds import N_FOLDS
 from gyrofuse.mismatch.inputs import prepared
 from gyrofuse.mismatch.repaired import RepairedModel
-from gyrofuse.simulate import ArrayModel
+from gyrofuse.noise.array_model import ArrayModel
+from gyrofuse.noise.model import Model
 
 _RECORDS = 4  # of the repaired simulation, each as long as the judge: of its own scatter half that of the judge is left
 _BETTER_SD = 2.0  # standard errors of the difference over the folds: one judge of 14 says so by chance

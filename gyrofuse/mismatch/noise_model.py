@@ -12,7 +12,6 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from gyrofuse._model import Model
 from gyrofuse.io.recording import Recording
 from gyrofuse.mismatch.base import Base
 from gyrofuse.mismatch.case import Case
@@ -20,8 +19,9 @@ from gyrofuse.mismatch.known_lines import line_parts
 from gyrofuse.mismatch.repaired import RepairedModel
 from gyrofuse.mismatch.shape_ground import Parts
 from gyrofuse.mismatch.spectral_uncertainty import as_array
-from gyrofuse.processes import Process, Sinusoid
-from gyrofuse.simulate import ArrayModel
+from gyrofuse.noise.array_model import ArrayModel
+from gyrofuse.noise.model import Model
+from gyrofuse.noise.processes import Process, Sinusoid
 
 _SHARED = 4.0  # standard deviations from which sensors share noise
 _RIDGE = 1e-3  # of the information on what is shared

@@ -14,7 +14,7 @@ from gyrofuse._base.checks import check_positive_integer, same_rate
 from gyrofuse._base.random import own_generator
 from gyrofuse.mismatch.case import Scene
 from gyrofuse.mismatch.mechanism import Mechanism
-from gyrofuse.simulate import ArrayModel
+from gyrofuse.noise.array_model import ArrayModel
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,8 +21,8 @@ from gyrofuse.mismatch.case import Scene
 from gyrofuse.mismatch.mechanism import Mechanism
 from gyrofuse.mismatch.mechanisms import CATALOGUE
 from gyrofuse.mismatch.repaired import RepairedModel
-from gyrofuse.parsing import model_from_dict
-from gyrofuse.simulate import ArrayModel
+from gyrofuse.noise.array_model import ArrayModel
+from gyrofuse.noise.parsing import model_from_dict
 
 _TRIED = 256  # samples of the record that every effect has to act on: filters of all forms have died away in so many
 _KINDS = {int: "a whole number", str: "a text", bool: "true or false", dict: "an effect"}

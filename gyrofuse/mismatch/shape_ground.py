@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.base import Base, _atoms, _time_constants
 from gyrofuse.mismatch.spectra import Bands
-from gyrofuse.processes import AR1
+from gyrofuse.noise.processes import AR1
 
 _FAST = 3.0  # samples: AR1s of shorter memory are all but white
 _SLOW = 2.2  # time constants above n / (2 pi) over this look like a walk in every band

@@ -32,7 +32,7 @@ from gyrofuse.mismatch.shape_errors import Errors, estimation_errors, parameters
 from gyrofuse.mismatch.shape_terms import oscillation
 from gyrofuse.mismatch.spectral_uncertainty import SpectralUncertainty
 from gyrofuse.mismatch.witnesses import level_of
-from gyrofuse.processes import AR1
+from gyrofuse.noise.processes import AR1
 
 _SIZES = (1.0, 1.6, 2.5, 4.0)
 _CORNERS_PER_DECADE = 2

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.filter_forms import filter_power, strength_of
 from gyrofuse.mismatch.shape_ground import Ground
-from gyrofuse.processes import AR1
+from gyrofuse.noise.processes import AR1
 
 _T = TypeVar("_T", bound="Term")
 

@@ -18,10 +18,10 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from gyrofuse._estimation import EstimatedFrom
-from gyrofuse._model import Model
-from gyrofuse.processes import Drift
-from gyrofuse.simulate import ArrayModel
+from gyrofuse.noise.array_model import ArrayModel
+from gyrofuse.noise.estimation import EstimatedFrom
+from gyrofuse.noise.model import Model
+from gyrofuse.noise.processes import Drift
 
 _PER_OCTAVE = 16  # frequencies of the information integral: derivatives of log spectra change over octaves
 _AT_ONCE = 32  # frequencies, to bound memory: each has (sensor, sensor, parameter) derivatives

@@ -18,7 +18,7 @@ from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.folds import N_FOLDS, N_JUDGED, in_fold
 from gyrofuse.mismatch.remembered import remembered
 from gyrofuse.mismatch.telegraph import Array, Background, backgrounds, gaussian_values, switching_values
-from gyrofuse.processes import AR1
+from gyrofuse.noise.processes import AR1
 
 _TIMES = 16
 _LONGEST = 1 / 32  # time constants, share of the record: longer, there are too few switches

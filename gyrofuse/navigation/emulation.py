@@ -12,10 +12,10 @@ from torch import Tensor
 
 from gyrofuse._base.checks import check_confidence_level, check_positive_integer
 from gyrofuse._base.results import ConfidenceInterval, cleaned, listed
-from gyrofuse._model import Model
 from gyrofuse.navigation.filter import Alignment, Flown, Gnss, fly
 from gyrofuse.navigation.sensors import UnitErrors
 from gyrofuse.navigation.trajectory import Trajectory, flight
+from gyrofuse.noise.model import Model
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -198,7 +198,7 @@ def emulate(
 
 
 def _accelerometer() -> Model:
-    from gyrofuse.parsing import parse_model
+    from gyrofuse.noise.parsing import parse_model
 
     return parse_model(_ACCELEROMETER)
 

@@ -34,7 +34,7 @@ from gyrofuse.navigation.attitude import (
 from gyrofuse.navigation.sensors import Drawn, UnitErrors
 from gyrofuse.navigation.strapdown import Frame, State, step
 from gyrofuse.navigation.trajectory import Trajectory
-from gyrofuse.state_space import StateSpace
+from gyrofuse.noise.state_space import StateSpace
 
 _TOGETHER = 10  # samples that the covariance is carried over in one go
 _ATTITUDE, _VELOCITY, _POSITION = slice(0, 3), slice(3, 6), slice(6, 9)

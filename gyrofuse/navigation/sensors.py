@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.checks import check_positive
-from gyrofuse._model import Model
-from gyrofuse.processes import AR1, RandomWalk
-from gyrofuse.state_space import StateSpace, state_space
+from gyrofuse.noise.model import Model
+from gyrofuse.noise.processes import AR1, RandomWalk
+from gyrofuse.noise.state_space import StateSpace, state_space
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from gyrofuse.mismatch.impulses import jump_witness
 from gyrofuse.mismatch.mechanism import Finding, Mechanism, Parameter, Z
 from gyrofuse.mismatch.power_differs import power_differs
 from gyrofuse.mismatch.telegraph_fit import Numbers, excess, scores, two_levels
-from gyrofuse.processes import AR1
+from gyrofuse.noise.processes import AR1
 
 _PRESENT, _CERTAIN = 5.0, 8.0  # nats over the Gaussian rival, of all sensors together
 _GAUSSIAN = ("flicker", "parameter_shift")  # what may have the same spectrum

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gyrofuse.parsing import model_from_dict, parse_model
-from gyrofuse.processes import AR1, WhiteNoise
+from gyrofuse.noise.parsing import model_from_dict, parse_model
+from gyrofuse.noise.processes import AR1, WhiteNoise
 
 
 @pytest.mark.parametrize(

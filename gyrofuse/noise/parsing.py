@@ -9,8 +9,9 @@ from typing import Any
 
 import torch
 
-from gyrofuse._estimation import EstimatedFrom
-from gyrofuse.processes import (
+from gyrofuse.noise.array_model import ArrayModel
+from gyrofuse.noise.estimation import EstimatedFrom
+from gyrofuse.noise.processes import (
     AR1,
     Drift,
     Model,
@@ -20,7 +21,6 @@ from gyrofuse.processes import (
     Sinusoid,
     WhiteNoise,
 )
-from gyrofuse.simulate import ArrayModel
 
 # Every class has a constructor of its own, hence no common type to state.
 _PROCESSES: tuple[type[Any], ...] = (WhiteNoise, QuantizationNoise, AR1, RandomWalk, Drift, Sinusoid)

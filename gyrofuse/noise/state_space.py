@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from gyrofuse._base.checks import check_floating, check_positive
-from gyrofuse.processes import (
+from gyrofuse.noise.processes import (
     AR1,
     Drift,
     Model,

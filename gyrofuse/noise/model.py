@@ -15,7 +15,7 @@ from torch.func import jvp
 
 from gyrofuse._base.checks import check_positive, check_positive_integer
 from gyrofuse._base.random import own_generator
-from gyrofuse._estimation import EstimatedFrom
+from gyrofuse.noise.estimation import EstimatedFrom
 
 Parameter = float | Tensor | None
 

@@ -11,8 +11,8 @@ import pytest
 import torch
 from reference import processes as naive
 
-from gyrofuse.parsing import model_from_dict, parse_model
-from gyrofuse.processes import (
+from gyrofuse.noise.parsing import model_from_dict, parse_model
+from gyrofuse.noise.processes import (
     AR1,
     Drift,
     Model,
@@ -24,7 +24,7 @@ from gyrofuse.processes import (
     haar_kernel,
 )
 
-REFERENCE = Path(__file__).resolve().parents[2] / "shared" / "reference"
+REFERENCE = Path(__file__).resolve().parents[3] / "shared" / "reference"
 needs_reference = pytest.mark.skipif(
     not REFERENCE.is_dir(), reason="the published settings are not beside the repository"
 )

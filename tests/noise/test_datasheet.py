@@ -8,8 +8,8 @@ import math
 import pytest
 import torch
 
-from gyrofuse.datasheet import datasheet
-from gyrofuse.processes import AR1, Drift, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
+from gyrofuse.noise.datasheet import datasheet
+from gyrofuse.noise.processes import AR1, Drift, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
 
 
 def values(sheet) -> dict[tuple[str, str], float]:

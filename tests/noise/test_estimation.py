@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import gyrofuse as gf
-from gyrofuse._estimation import EstimatedFrom
+from gyrofuse.noise.estimation import EstimatedFrom
 
 TRUE = gf.parse_model("WN(variance=1.0) + AR1(phi=0.975, variance=0.03) + RW(variance=1e-5)")
 FREQUENCIES = torch.tensor([1e-4, 1e-3, 0.02, 0.1, 0.45], dtype=torch.float64)

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from gyrofuse._base.checks import check_positive_integer
 from gyrofuse._base.random import own_generator
-from gyrofuse._estimation import EstimatedFrom
-from gyrofuse.processes import Drift, Model, Process
+from gyrofuse.noise.estimation import EstimatedFrom
+from gyrofuse.noise.processes import Drift, Model, Process
 
 _SYMMETRY = 1e-8  # of the largest entry: printed digits may differ across the diagonal
 _ROUNDING = 1e-12  # of the largest eigenvalue: how negative rounding alone may make the smallest

@@ -10,7 +10,7 @@ import torch
 
 from gyrofuse._base import units
 from gyrofuse._base.checks import check_positive
-from gyrofuse.processes import (
+from gyrofuse.noise.processes import (
     AR1,
     Drift,
     Model,

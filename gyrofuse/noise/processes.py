@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.random import ar1_recursion
-from gyrofuse._model import Model, Parameter, Process, SpectralLine, domain
+from gyrofuse.noise.model import Model, Parameter, Process, SpectralLine, domain
 
 __all__ = [
     "AR1",

@@ -11,11 +11,11 @@ import torch
 from reference import processes as naive
 
 from gyrofuse._base.random import ar1_recursion, own_generator
-from gyrofuse.parsing import model_from_dict
-from gyrofuse.processes import AR1, Drift, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
-from gyrofuse.simulate import ArrayModel
+from gyrofuse.noise.array_model import ArrayModel
+from gyrofuse.noise.parsing import model_from_dict
+from gyrofuse.noise.processes import AR1, Drift, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
 
-SETTINGS = Path(__file__).resolve().parents[2] / "shared" / "reference" / "paper_settings.json"
+SETTINGS = Path(__file__).resolve().parents[3] / "shared" / "reference" / "paper_settings.json"
 needs_settings = pytest.mark.skipif(
     not SETTINGS.is_file(), reason="the published settings are not beside the repository"
 )
