@@ -28,9 +28,9 @@ from scipy import stats
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.fault_kinds import KINDS
-from gyrofuse.parity import parity_test
-from gyrofuse.parity_reference import ParityReference, fit_parity
+from gyrofuse.fusion.faults.classify import KINDS
+from gyrofuse.fusion.faults.parity import parity_test
+from gyrofuse.fusion.faults.reference import ParityReference, fit_parity
 
 FALSE_ALARM = 0.01
 ONSET = 2  # window at which the fault begins

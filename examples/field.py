@@ -11,10 +11,10 @@ import argparse
 import torch
 
 import gyrofuse as gf
+from gyrofuse.fusion.faults.parity import parity_test
+from gyrofuse.fusion.faults.reference import fit_parity
+from gyrofuse.fusion.live import LiveSVO
 from gyrofuse.io.saturation import find_saturation, mask_saturated
-from gyrofuse.live import LiveSVO
-from gyrofuse.parity import parity_test
-from gyrofuse.parity_reference import fit_parity
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--hours", type=float, default=0.5, help="length of the stream")

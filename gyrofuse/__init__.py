@@ -25,43 +25,48 @@ from typing import TYPE_CHECKING, Any
 from gyrofuse._base import __version__ as __version__
 from gyrofuse._base.linalg import SingularCovarianceError
 from gyrofuse._base.results import ConfidenceInterval
-from gyrofuse.array_gmwm import fit_array_gmwm
-from gyrofuse.array_gmwm_result import ArrayGMWMResult
-from gyrofuse.competitors import equal_weights, inverse_variance_weights, nonnegative_weights, shrinkage_weights
 from gyrofuse.export import to_c_header, to_kalibr
-from gyrofuse.gain import Gain
-from gyrofuse.gmwm import fit_gmwm
-from gyrofuse.gmwm_result import GMWMResult
-from gyrofuse.hypotheses import EnoughData, WeightsTest
-from gyrofuse.influence import BootstrapWeightsCovariance, bootstrap_weights_covariance
+from gyrofuse.fitting.array.gmwm import fit_array_gmwm
+from gyrofuse.fitting.array.result import ArrayGMWMResult
+from gyrofuse.fitting.bootstrap import GMWMBootstrap, bootstrap_gmwm
+from gyrofuse.fitting.gmwm import fit_gmwm
+from gyrofuse.fitting.gmwm_result import GMWMResult
+from gyrofuse.fitting.joint import JointFit, fit_jointly
+from gyrofuse.fitting.moments.covariance import moment_covariance
+from gyrofuse.fitting.ranking.rank import rank_models
+from gyrofuse.fitting.ranking.result import RankResult
+from gyrofuse.fitting.virtual_noise import virtual_noise
+from gyrofuse.fusion.faults.parity import parity_test
+from gyrofuse.fusion.faults.reference import ParityReference, fit_parity
+from gyrofuse.fusion.faults.result import ParityResult
+from gyrofuse.fusion.live import LiveSVO, subset_weights
+from gyrofuse.fusion.multiscale import MultiScaleSVO, fit_multiscale
+from gyrofuse.fusion.multiscale_result import MultiScaleResult
+from gyrofuse.fusion.result import SVOResult
+from gyrofuse.fusion.svo import SVO, fit_svo
+from gyrofuse.fusion.uncertainty.gain import Gain
+from gyrofuse.fusion.uncertainty.influence import BootstrapWeightsCovariance, bootstrap_weights_covariance
+from gyrofuse.fusion.uncertainty.tests import EnoughData, WeightsTest
+from gyrofuse.fusion.virtual_file import write_virtual
+from gyrofuse.fusion.weights.baselines import (
+    equal_weights,
+    inverse_variance_weights,
+    nonnegative_weights,
+    shrinkage_weights,
+)
+from gyrofuse.fusion.weights.rdvg import RDVGResult, rdvg, rdvg_weights
+from gyrofuse.fusion.weights.scale_weights import resolve_scale_weights
+from gyrofuse.fusion.weights.selection import Selection
+from gyrofuse.fusion.weights.svo import SVOWeights, svo_weights
 from gyrofuse.io.chunked import LongRecording, open_long, stretch_of
 from gyrofuse.io.recording import Recording, read_recording
 from gyrofuse.io.saturation import find_saturation, mask_saturated
 from gyrofuse.io.streams import RecordingError
-from gyrofuse.joint import JointFit, fit_jointly
-from gyrofuse.live import LiveSVO, subset_weights
-from gyrofuse.moment_bootstrap import GMWMBootstrap, bootstrap_gmwm
-from gyrofuse.moment_covariance import moment_covariance
-from gyrofuse.multiscale import MultiScaleSVO, fit_multiscale
-from gyrofuse.multiscale_result import MultiScaleResult
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.datasheet import Datasheet, datasheet
 from gyrofuse.noise.parsing import model_from_dict, parse_model
 from gyrofuse.noise.processes import AR1, Drift, Model, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
 from gyrofuse.noise.state_space import StateSpace, state_space
-from gyrofuse.parity import parity_test
-from gyrofuse.parity_reference import ParityReference, fit_parity
-from gyrofuse.parity_result import ParityResult
-from gyrofuse.ranking import rank_models
-from gyrofuse.ranking_result import RankResult
-from gyrofuse.rdvg import RDVGResult, rdvg, rdvg_weights
-from gyrofuse.scale_weights import resolve_scale_weights
-from gyrofuse.selection import Selection
-from gyrofuse.svo import SVO, fit_svo
-from gyrofuse.svo_result import SVOResult
-from gyrofuse.svo_weights import SVOWeights, svo_weights
-from gyrofuse.virtual_file import write_virtual
-from gyrofuse.virtual_noise import virtual_noise
 from gyrofuse.wavelets.block_bootstrap import (
     block_bootstrap,
     bootstrap_wccv_covariance,
@@ -74,8 +79,8 @@ from gyrofuse.wavelets.intervals import wavelet_cross_covariance_interval, wavel
 from gyrofuse.wavelets.robust import robust_wavelet_variance
 
 if TYPE_CHECKING:
+    from gyrofuse.fusion.streaming import StreamedSVOResult, stream_svo
     from gyrofuse.mismatch import Finding, MismatchReport, diagnose
-    from gyrofuse.svo_stream import StreamedSVOResult, stream_svo
     from gyrofuse.wavelets.metric import WaveletCrossCovariance
 
 __all__ = [
@@ -173,8 +178,8 @@ _LAZY = {
     "diagnose": "gyrofuse.mismatch",
     "Finding": "gyrofuse.mismatch",
     "MismatchReport": "gyrofuse.mismatch",
-    "StreamedSVOResult": "gyrofuse.svo_stream",
-    "stream_svo": "gyrofuse.svo_stream",
+    "StreamedSVOResult": "gyrofuse.fusion.streaming",
+    "stream_svo": "gyrofuse.fusion.streaming",
 }
 
 

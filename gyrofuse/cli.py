@@ -48,15 +48,9 @@ from gyrofuse.cli_shared import (
     write_json,
 )
 from gyrofuse.demo import FILES, run_demo
-from gyrofuse.io.formats.columns import WORD_OF
-from gyrofuse.io.limits import physical_memory
-from gyrofuse.io.recording import Recording
-from gyrofuse.multiscale import fit_multiscale
-from gyrofuse.multiscale_result import MultiScaleResult
-from gyrofuse.noise.array_model import ArrayModel
-from gyrofuse.noise.parsing import parse_model
-from gyrofuse.noise.processes import Model
-from gyrofuse.report import (
+from gyrofuse.fusion.multiscale import fit_multiscale
+from gyrofuse.fusion.multiscale_result import MultiScaleResult
+from gyrofuse.fusion.report.page import (
     fusion_figure,
     fusion_report,
     number,
@@ -64,8 +58,14 @@ from gyrofuse.report import (
     save_figure,
     sensor_rows,
 )
-from gyrofuse.svo import fit_svo
-from gyrofuse.svo_result import SVOResult
+from gyrofuse.fusion.result import SVOResult
+from gyrofuse.fusion.svo import fit_svo
+from gyrofuse.io.formats.columns import WORD_OF
+from gyrofuse.io.limits import physical_memory
+from gyrofuse.io.recording import Recording
+from gyrofuse.noise.array_model import ArrayModel
+from gyrofuse.noise.parsing import parse_model
+from gyrofuse.noise.processes import Model
 
 app = typer.Typer(
     name="gyrofuse",

@@ -31,15 +31,15 @@ from gyrofuse.cli_shared import (
     write_json,
 )
 from gyrofuse.export import to_c_header, to_kalibr
-from gyrofuse.gmwm import fit_gmwm
-from gyrofuse.gmwm_result import GMWMResult
+from gyrofuse.fitting.gmwm import fit_gmwm
+from gyrofuse.fitting.gmwm_result import GMWMResult
+from gyrofuse.fitting.ranking.rank import rank_models
+from gyrofuse.fitting.report.page import model_report
+from gyrofuse.fitting.report.ranking import rank_report
+from gyrofuse.fitting.spectral.tones import FEWEST_SAMPLES
 from gyrofuse.io.recording import Recording
 from gyrofuse.io.streams import RecordingError
 from gyrofuse.noise.processes import Model
-from gyrofuse.ranking import rank_models
-from gyrofuse.report_models import model_report
-from gyrofuse.report_ranking import rank_report
-from gyrofuse.tones import FEWEST_SAMPLES
 
 _MOST_FITS = 12  # printed in full
 _WITH_GAPS = ", or fit a model with `gyrofuse fit`, which gets along with gaps"

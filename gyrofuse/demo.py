@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from gyrofuse import plotting
 from gyrofuse.demo_mismatch import MOST_SAMPLES, concealed, mismatch_story
 from gyrofuse.demo_models import CANDIDATES, models_figure, models_story, true_models
+from gyrofuse.fitting.ranking.rank import rank_models
+from gyrofuse.fitting.report.ranking import rank_report
+from gyrofuse.fusion import plots as plotting
+from gyrofuse.fusion.report.page import fusion_figure, fusion_report, new_figure, number, save_figure, verdict
+from gyrofuse.fusion.result import SVOResult
+from gyrofuse.fusion.svo import fit_svo
+from gyrofuse.fusion.weights.svo import svo_weights
 from gyrofuse.io.recording import Recording
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.processes import AR1, WhiteNoise
-from gyrofuse.ranking import rank_models
-from gyrofuse.report import fusion_figure, fusion_report, new_figure, number, save_figure, verdict
-from gyrofuse.report_ranking import rank_report
-from gyrofuse.svo import fit_svo
-from gyrofuse.svo_result import SVOResult
-from gyrofuse.svo_weights import svo_weights
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.page import number
-from gyrofuse.gmwm import fit_gmwm
+from gyrofuse.fitting.gmwm import fit_gmwm
 from gyrofuse.io.recording import Recording
 from gyrofuse.noise.array_model import ArrayModel
 

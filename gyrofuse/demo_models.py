@@ -12,11 +12,11 @@ from torch import Tensor
 
 from gyrofuse._base.page import new_figure, number
 from gyrofuse._base.units import SECONDS_PER_HOUR, angle_random_walk, correlation_time, per_sqrt_hour, rate_unit_factor
-from gyrofuse._rank_candidates import name_of
-from gyrofuse.gmwm_result import REFUSED, GMWMResult
+from gyrofuse.fitting.gmwm_result import REFUSED, GMWMResult
+from gyrofuse.fitting.ranking.candidates import name_of
+from gyrofuse.fitting.ranking.result import RankResult
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.processes import AR1, Model, WhiteNoise
-from gyrofuse.ranking_result import RankResult
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

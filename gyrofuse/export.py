@@ -13,7 +13,7 @@ from torch import Tensor
 from gyrofuse._base import units
 from gyrofuse._base.checks import check_positive
 from gyrofuse._base.results import place
-from gyrofuse.gmwm_result import GMWMResult
+from gyrofuse.fitting.gmwm_result import GMWMResult
 from gyrofuse.noise.processes import (
     AR1,
     Drift,

@@ -23,7 +23,7 @@ from gyrofuse._base.axes import (
     new_axes,
     with_unit,
 )
-from gyrofuse.plotting import allan_deviation, time_axis
+from gyrofuse.fusion.plots import allan_deviation, time_axis
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

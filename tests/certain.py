@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gyrofuse.cross_fitting import CrossFit
+from gyrofuse.fusion.uncertainty.cross_fitting import CrossFit
 from gyrofuse.wavelets.equivalent_dof import chi_square_interval
 
 

@@ -16,14 +16,14 @@ import pytest
 import torch
 
 from gyrofuse import Recording, WhiteNoise, diagnose, fit_gmwm, fit_multiscale, fit_svo, rank_models
+from gyrofuse.fitting.report.page import model_report
+from gyrofuse.fitting.report.ranking import rank_report
 from gyrofuse.fleet import Fuse
 from gyrofuse.fleet.standing import standing_of
 from gyrofuse.fleet.work import Log, rows_of
-from gyrofuse.report import fusion_report, recording_report
+from gyrofuse.fusion.report.page import fusion_report, recording_report
 from gyrofuse.report_fleet import fleet_report
 from gyrofuse.report_mismatch import mismatch_page
-from gyrofuse.report_models import model_report
-from gyrofuse.report_ranking import rank_report
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 HOSTILE = ('"><script>alert(1)</script>', "<b>imu</b>", "<img src=x onerror=alert(2)>", "{{ 7 * 7 }}")

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from gyrofuse.export import to_c_header, to_kalibr
-from gyrofuse.gmwm import fit_gmwm
+from gyrofuse.fitting.gmwm import fit_gmwm
 from gyrofuse.io.recording import Recording
 from gyrofuse.noise.processes import AR1, Drift, Model, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
 from gyrofuse.noise.state_space import StateSpace, state_space

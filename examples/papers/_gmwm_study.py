@@ -17,7 +17,7 @@ from scipy import stats
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.moment_covariance import moment_covariance
+from gyrofuse.fitting.moments.covariance import moment_covariance
 
 N_RUNS = 500
 _AT_ONCE = 2**21  # samples simulated and fitted together

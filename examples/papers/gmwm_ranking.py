@@ -27,10 +27,10 @@ from scipy import stats
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse._rank_candidates import Kinds, charge, composition, name_of
-from gyrofuse._rank_spectra import Spectra, summed
+from gyrofuse.fitting.ranking.candidates import Kinds, charge, composition, name_of
+from gyrofuse.fitting.ranking.spectra import Spectra, summed
+from gyrofuse.fitting.spectral.tones import FEWEST_CYCLES
 from gyrofuse.noise.processes import Process
-from gyrofuse.tones import FEWEST_CYCLES
 
 N_SAMPLES = {1: 40_000, 2: 160_000, 3: 160_000}
 N_RUNS, QUICK_RUNS, QUICK_SAMPLES, QUICK_PROCESSES = 200, 6, 20_000, 2

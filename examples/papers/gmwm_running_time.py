@@ -20,7 +20,7 @@ from _svo_study import arguments, conclusion, figures_written, finish
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.tones import find_tones
+from gyrofuse.fitting.spectral.tones import find_tones
 
 SAMPLES = (10_000, 20_000, 40_000, 80_000, 160_000, 1_000_000, 10_000_000)
 QUICK_SAMPLES = (10_000, 40_000)

@@ -29,7 +29,7 @@ from _svo_study import LINES, arguments, figures_written, finish, n_levels, quad
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.competitors import nonnegative_weights
+from gyrofuse.fusion.weights.baselines import nonnegative_weights
 
 METHODS = ("SVO long", "SVO short", "nonnegative", "multi-scale")  # against equal weights
 FILES = (*(f"adis16405_rec{k}.npz" for k in (1, 2, 3)), "mimu4444_8imu.npz", "xsensdot10_static.npz")

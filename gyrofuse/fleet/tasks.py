@@ -15,17 +15,17 @@ from torch import Tensor
 
 from gyrofuse._base.checks import check_confidence_level
 from gyrofuse._base.units import DATASHEET_UNITS
+from gyrofuse.fitting.gmwm import fit_gmwm
 from gyrofuse.fleet.table import Column
-from gyrofuse.fusion import METHODS
-from gyrofuse.gmwm import fit_gmwm
+from gyrofuse.fusion.result import SVOResult
+from gyrofuse.fusion.svo import fit_svo
+from gyrofuse.fusion.weights.methods import METHODS
+from gyrofuse.fusion.weights.scale_weights import normalised, resolve_scale_weights
 from gyrofuse.io.recording import Recording
 from gyrofuse.mismatch import diagnose
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.model import Model
 from gyrofuse.noise.parsing import parse_model
-from gyrofuse.scale_weights import normalised, resolve_scale_weights
-from gyrofuse.svo import fit_svo
-from gyrofuse.svo_result import SVOResult
 
 Row = dict[str, Any]
 

@@ -11,10 +11,11 @@ from torch import Tensor
 
 from gyrofuse._base.checks import check_positive, check_positive_integer, check_signal, same_rate
 from gyrofuse._base.results import named, numbered
-from gyrofuse.array_gmwm_result import ArrayGMWMResult
-from gyrofuse.gmwm_result import GMWMResult
+from gyrofuse.fitting.array.result import ArrayGMWMResult
+from gyrofuse.fitting.gmwm_result import GMWMResult
+from gyrofuse.fitting.joint import JointFit
+from gyrofuse.fitting.ranking.result import RankResult
 from gyrofuse.io.recording import Recording
-from gyrofuse.joint import JointFit
 from gyrofuse.mismatch.case import Case, Scene
 from gyrofuse.mismatch.known_lines import amplitudes
 from gyrofuse.mismatch.level_spread import with_spread
@@ -25,7 +26,6 @@ from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.estimation import EstimatedFrom
 from gyrofuse.noise.model import Model
 from gyrofuse.noise.parsing import model_from_dict
-from gyrofuse.ranking_result import RankResult
 
 # Whatever a diagnosis takes for a simulation.
 Simulation = (

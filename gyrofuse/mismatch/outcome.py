@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gyrofuse._base.checks import same_rate
 from gyrofuse._base.results import cleaned
+from gyrofuse.fusion.weights.scale_weights import ScaleWeights
 from gyrofuse.io.recording import Recording
 from gyrofuse.mismatch.benefit import Benefit, benefit
 from gyrofuse.mismatch.case import Case
@@ -20,7 +21,6 @@ from gyrofuse.mismatch.fit_verdict import FitVerdict
 from gyrofuse.mismatch.judge import Judged
 from gyrofuse.mismatch.mechanism import Finding
 from gyrofuse.mismatch.repaired import RepairedModel
-from gyrofuse.scale_weights import ScaleWeights
 
 _Signal = TypeVar("_Signal", Recording, Tensor)
 

@@ -21,7 +21,7 @@ from reference import haar as naive
 from torch import distributed
 
 import gyrofuse as gf
-from gyrofuse.svo_stream import measure_stretch
+from gyrofuse.fusion.streaming import measure_stretch
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "long_recording.py"
 N_SENSORS, N_SAMPLES, N_LEVELS = 4, 5000, 7
@@ -139,7 +139,7 @@ def test_levels_by_default():
 
 
 def test_memory_bounds_the_levels(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("gyrofuse.svo_stream._PAST", N_SENSORS * 64)
+    monkeypatch.setattr("gyrofuse.fusion.streaming._PAST", N_SENSORS * 64)
     assert gf.stream_svo(recording_of(samples())).n_levels == 6
     assert gf.stream_svo(recording_of(samples()), n_levels=8).n_levels == 8
 

@@ -17,15 +17,15 @@ from torch import Tensor
 
 from gyrofuse import (
     SingularCovarianceError,
-    _sweep,
     fit_svo,
-    influence,
     inverse_variance_weights,
     resolve_scale_weights,
     svo_weights,
     wavelet_cross_covariance,
 )
-from gyrofuse.influence import (
+from gyrofuse.fusion.uncertainty import influence
+from gyrofuse.fusion.uncertainty import sweep as _sweep
+from gyrofuse.fusion.uncertainty.influence import (
     BootstrapWeightsCovariance,
     bootstrap_inverse_variance_weights_covariance,
     bootstrap_weights_covariance,

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.parametric import resample_combined
+from gyrofuse.fusion.uncertainty.parametric import resample_combined
 from gyrofuse.wavelets import pilot
 from gyrofuse.wavelets.covariance import wavelet_products
 

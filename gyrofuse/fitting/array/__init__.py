@@ -1,0 +1,1 @@
+"""Noise models of whole arrays, with covariances between sensors."""

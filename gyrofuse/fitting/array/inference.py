@@ -1,0 +1,233 @@
+"""What a moment fit of arrays says of its matrices: intervals that respect their range, and the J test."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gyrofuse.fitting.array.moments import array_moment_covariance, pairs, unvech, vech, weights_of
+from gyrofuse.fitting.array.search import jacobian
+from gyrofuse.fitting.moments.inference import _quadratic, _sandwich
+from gyrofuse.fitting.moments.records import Records
+from gyrofuse.fitting.structure import Composition
+from gyrofuse.noise.processes import AR1
+from gyrofuse.wavelets.equivalent_dof import normal_quantile
+
+# Of the largest eigenvalue of a matrix between sensors of unit size, what is as good as none.
+_NOTHING = 1e-5
+# Of a moment of unit size, the same.
+_GONE = 1e-8
+# Standard deviations from zero below which the logarithm of a variance tells nothing.
+_RESOLVED = 0.5
+# Of a memory of which the record holds fewer time constants, the delta method says nothing that holds: one of a seventh
+# of the record looks like anything from a thirtieth to a random walk.
+FEWEST_TIME_CONSTANTS = 50
+
+
+class ArrayFit(NamedTuple):
+    """Where a search ended.
+
+    Attributes:
+        theta: `(item, process, sensor, sensor)`.
+        shape: `x`, `(item, shaped)`.
+        converged: `(item,)`.
+        spread: Covariance of the entries of `theta` and the `x` that moved, `(item, unknown, unknown)`; NaN for entries
+            that no moment tells.
+        objective: `r' Omega r`, `(item,)`.
+        degrees: Of freedom of the J statistic, `(item,)`.
+        dispersion: Variance of the J statistic over that of a chi-square, `(item,)`.
+        rank: Of each matrix, `(item, process)`.
+    """
+
+    theta: Tensor
+    shape: Tensor
+    converged: Tensor
+    spread: Tensor
+    objective: Tensor
+    degrees: Tensor
+    dispersion: Tensor
+    rank: Tensor
+
+
+class Estimate(NamedTuple):
+    """A value with its standard deviation and interval, all of one shape."""
+
+    value: Tensor
+    sd: Tensor
+    low: Tensor
+    high: Tensor
+
+
+def spread_of_fit(
+    gamma: Tensor, theta: Tensor, shape: Tensor, records: Records, made_of: Composition, weighting: str
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Sandwich covariance `(A' O A)^-1 A' O V O A (A' O A)^-1` with `A` the Jacobian, as if no matrix lacked rank.
+
+    Args:
+        gamma: What was fitted, `(item, level, sensor, sensor)`.
+        theta: `(item, process, sensor, sensor)`.
+        shape: `x`, `(item, shaped)`.
+        records: Their length and levels.
+        made_of: Structure of the model.
+        weighting: Of the moments.
+
+    Returns:
+        Covariance, objective, degrees of freedom, dispersion and ranks as in `ArrayFit`.
+    """
+    n_items, n_sensors = len(gamma), gamma.shape[-1]
+    present = vech(gamma).isfinite()
+    covariance = array_moment_covariance(made_of, theta, shape, records)
+    weight = weights_of(covariance, present, weighting)
+    tau = records.tau.to(gamma)
+    columns = made_of.columns(tau, shape)
+    fitted = columns @ vech(theta)
+    residual = torch.where(present, vech(gamma) - fitted, 0.0).flatten(1)
+    # As many levels as processes tell a pair's entries.
+    told = (present.sum(1) >= made_of.n_linear)[:, None].expand(-1, made_of.n_linear, -1).flatten(1)
+    known = torch.cat([told, told.new_ones(n_items, len(made_of.curved))], -1)
+    slopes = jacobian(tau, made_of, theta, shape) * present.flatten(1)[..., None]
+    flat = covariance.reshape(*weight.shape)
+    spread, objective = _sandwich(slopes, known, flat, weight), _quadratic(residual, weight)
+    spread = torch.where(known[:, :, None] & known[:, None, :], spread, torch.nan)
+    eigenvalues = torch.linalg.eigvalsh(theta) * columns.amax(-2)[..., None]  # of moments of unit size
+    lost = ((eigenvalues < _NOTHING * eigenvalues[..., -1:]) | (eigenvalues < _GONE)).sum(-1)
+    degrees = present.flatten(1).sum(-1) - known.sum(-1) + (lost * (lost + 1) // 2).sum(-1)
+    own = [at for at, pair in enumerate(zip(*pairs(n_sensors), strict=True)) if pair[0] == pair[1]]
+    variance = covariance.diagonal(dim1=1, dim2=3).diagonal(dim1=1, dim2=2)
+    rarity = (variance / fitted.square() / 2)[..., own]  # of observations: one over their number, (item, level, sensor)
+    return spread, objective, degrees, _dispersion(rarity, present[..., own], degrees), n_sensors - lost
+
+
+def _dispersion(rarity: Tensor, present: Tensor, degrees: Tensor) -> Tensor:
+    """Variance of `r' V^-1 r` over twice its degrees of freedom, when levels hold few observations.
+
+    Of a covariance `S` of `p` variables with `n` observations, `n tr((S - 1)^2) / 2` has mean `p (p + 1) / 2` and
+    variance `p (p + 1) + p (2 p^2 + 5 p + 5) / n`.
+    """
+    p = present.sum(-1)  # (item, level)
+    mean = torch.where(present, rarity, 0.0).sum(-1) / p.clamp(min=1)
+    return 1 + (p * (2 * p.square() + 5 * p + 5) * mean).sum(-1) / (2 * degrees.clamp(min=1))
+
+
+def matrices(fit: ArrayFit, told: Tensor, confidence_level: float) -> tuple[Estimate, Estimate]:
+    """Entries of the matrices, and correlations, each `(item, process, sensor, sensor)`.
+
+    Intervals are symmetric in the logarithm of variances, in `atanh` of correlations, and in covariances as they are. A
+    variance that is hardly told from zero gets an upper limit only, as do those of a matrix that is not `told`, whose
+    covariances and correlations get none: the bound on its eigenvalues leaves nothing that is symmetric, and a memory
+    found too short makes all variances too large.
+    """
+    n_processes, n_sensors = fit.theta.shape[1], fit.theta.shape[-1]
+    a, b = pairs(n_sensors)
+    n_pairs = len(a)
+    n_linear = n_processes * n_pairs
+    whole = fit.spread[:, :n_linear, :n_linear].unflatten(1, (n_processes, -1)).unflatten(3, (n_processes, -1))
+    spread = whole.diagonal(dim1=1, dim2=3).movedim(-1, 1)  # (item, process, pair, pair)
+    sd = spread.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
+    value = torch.where(sd.isnan(), torch.nan, vech(fit.theta))
+    z, one_sided = normal_quantile((1 + confidence_level) / 2), normal_quantile(confidence_level)
+    low, high = value - z * sd, value + z * sd
+    own = (a == b).nonzero()[:, 0]
+    variance, ratio = value[..., own], sd[..., own] / value[..., own]
+    resolved = ratio < 1 / _RESOLVED
+    told = told[..., None]  # (item, process, 1)
+    low, high = (torch.where(told, limit, torch.nan) for limit in (low, high))
+    two_sided = resolved & told
+    low[..., own] = torch.where(two_sided, variance * torch.exp(-z * ratio), 0 * variance)
+    reach = torch.where(two_sided, z, one_sided) * ratio
+    high[..., own] = variance * torch.where(resolved, torch.exp(reach), 1 + reach)
+    entries = Estimate(*(unvech(part) for part in (value, sd, low, high)))
+
+    # d rho = d theta_ab / s - rho (d theta_aa / theta_aa + d theta_bb / theta_bb) / 2
+    first, second = own[a], own[b]
+    scale = (value[..., first] * value[..., second]).sqrt()
+    rho = (value / scale).clamp(-1, 1)
+    place = torch.arange(n_pairs)
+    slopes = torch.zeros_like(spread)
+    slopes[..., place, place] = 1 / scale
+    slopes[..., place, first] -= rho / (2 * value[..., first])
+    slopes[..., place, second] -= rho / (2 * value[..., second])
+    filled = spread.nan_to_num(nan=0.0)
+    rho_sd = (slopes.nan_to_num(nan=0.0) @ filled * slopes.nan_to_num(nan=0.0)).sum(-1).clamp(min=0).sqrt()
+    rho_sd = torch.where(rho.isnan(), torch.nan, rho_sd)
+    # Towards a correlation of one, which it takes for certain, the scale of atanh ends.
+    width = z * rho_sd / (1 - rho.square()).clamp(min=1e-12)
+    middle = rho.clamp(-1 + 1e-12, 1 - 1e-12).atanh()
+    low, high = (torch.where(told, (middle + sign * width).tanh(), torch.nan) for sign in (-1, 1))
+    # Every sensor agrees with itself.
+    itself = (a == b).to(rho.device)
+    certain = [torch.where(itself, one, part) for one, part in ((0.0, rho_sd), (1.0, low), (1.0, high))]
+    return entries, Estimate(*(unvech(part) for part in (rho, *certain)))
+
+
+def covariance_of_numbers(fit: ArrayFit, squared: Tensor, sd: Tensor, made_of: Composition) -> Tensor:
+    """Covariance of entries of the matrices and of `phi` or `beta`, process by process, `(item, number, number)`.
+
+    Args:
+        fit: Where the search ended.
+        squared: Units of the entries, `(item, 1, pair)`.
+        sd: Spread of `phi` and `beta`, `(item, parameter)`; where the search held one, all that is known of it.
+        made_of: Structure of the model.
+    """
+    n_items, n_pairs = len(squared), squared.shape[-1]
+    n_linear = made_of.n_linear * n_pairs
+    moved = [made_of.shaped.index(k) for k in made_of.curved]
+    among = fit.spread.diagonal(dim1=-2, dim2=-1)[:, n_linear:].clamp(min=0).sqrt()
+    # d phi / d x from the two spreads; 0 / 0 where there is none.
+    slope = (sd[:, moved] / among).nan_to_num(nan=0.0)
+    units = torch.cat([squared.expand(-1, made_of.n_linear, -1).flatten(1), slope], -1)
+    whole = torch.diag_embed(torch.cat([torch.zeros(n_items, n_linear).to(sd), sd.square()], -1))
+    place = torch.tensor([*range(n_linear), *(n_linear + i for i in moved)], device=sd.device)
+    whole[:, place[:, None], place] = fit.spread * (units[:, :, None] * units[:, None, :])
+    order: list[int] = []
+    for k in range(made_of.n_linear):
+        order += range(k * n_pairs, (k + 1) * n_pairs)
+        order += [n_linear + made_of.shaped.index(k)] if k in made_of.shaped else []
+    return whole[:, order][:, :, order]
+
+
+def is_long(phi: Tensor, n_samples: int) -> Tensor:
+    """Whether the record holds too few time constants of an AR1, of the shape of `phi`."""
+    return phi > math.exp(-FEWEST_TIME_CONSTANTS / n_samples)
+
+
+def told_matrices(fit: ArrayFit, made_of: Composition, n_samples: int) -> Tensor:
+    """Whether a matrix has full rank and its process no long memory, `(item, process)`."""
+    told = fit.rank == fit.theta.shape[-1]
+    for k, x in zip(made_of.shaped, fit.shape.unbind(-1), strict=True):
+        if isinstance(made_of.processes[k], AR1):
+            told[:, k] &= ~is_long(x.tanh(), n_samples)
+    return told
+
+
+def shared(fit: ArrayFit, told: Tensor, held_sd: Tensor, made_of: Composition, confidence_level: float) -> Estimate:
+    """Parameters `(item, parameter)` of all sensors, `phi` of AR1s and `beta` of tones, in the order of the model.
+
+    Intervals are symmetric in `atanh phi` and `logit(beta / pi)`. No AR1 has one where the matrix of any of them is
+    not `told`: what that one gets wrong the others make up for.
+    """
+    z = normal_quantile((1 + confidence_level) / 2)
+    n_moving = len(made_of.curved)
+    moving = fit.spread.diagonal(dim1=-2, dim2=-1)[:, fit.spread.shape[-1] - n_moving :].clamp(min=0).sqrt()
+    moved, held = iter(moving.unbind(-1)), iter(held_sd.unbind(-1))
+    memories = [k for k, process in enumerate(made_of.processes) if isinstance(process, AR1)]
+    vague = ~told[:, memories].all(-1)
+    found = []
+    for k, x in zip(made_of.shaped, fit.shape.unbind(-1), strict=True):
+        if isinstance(made_of.processes[k], AR1):
+            width = next(moved)
+            value, slope = x.tanh(), 1 - x.tanh().square()
+            ends = tuple(torch.where(vague, torch.nan, (x + sign * z * width).tanh()) for sign in (-1, 1))
+        else:
+            part = x.sigmoid()
+            slope = torch.pi * part * (1 - part)
+            width = next(moved) if k in made_of.curved else next(held) / slope
+            value = torch.pi * part
+            ends = (torch.pi * (x - z * width).sigmoid(), torch.pi * (x + z * width).sigmoid())
+        found.append(Estimate(value, slope * width, *ends))
+    if not found:
+        return Estimate(*(fit.shape,) * 4)
+    return Estimate(*(torch.stack(column, -1) for column in zip(*found, strict=True)))

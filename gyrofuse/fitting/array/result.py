@@ -1,0 +1,349 @@
+"""A fitted noise model of an array, or a batch of them: matrices with intervals, and how well they fit."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from gyrofuse._base.results import ConfidenceInterval, counted, listed
+from gyrofuse.fitting.array.inference import (
+    FEWEST_TIME_CONSTANTS,
+    ArrayFit,
+    covariance_of_numbers,
+    is_long,
+    matrices,
+    shared,
+    told_matrices,
+)
+from gyrofuse.fitting.array.moments import vech
+from gyrofuse.fitting.moments.records import Records
+from gyrofuse.fitting.structure import Composition
+from gyrofuse.fusion.live import subset_weights
+from gyrofuse.fusion.weights.scale_weights import ScaleWeights
+from gyrofuse.noise.array_model import ArrayModel
+from gyrofuse.noise.estimation import EstimatedFrom
+from gyrofuse.noise.processes import Model, Process, Sinusoid
+from gyrofuse.wavelets.equivalent_dof import chi_square_tail
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_BATCHED = (
+    "theta",
+    "theta_sd",
+    "confidence_interval",
+    "correlation",
+    "correlation_interval",
+    "params",
+    "params_sd",
+    "params_interval",
+    "param_cov",
+    "objective",
+    "degrees_of_freedom",
+    "p_value",
+    "converged",
+    "rank",
+    "wavelet_cross_covariance",
+    "fitted_wavelet_cross_covariance",
+)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ArrayGMWMResult:
+    """Noise models fitted to wavelet cross-covariances; `...` are the leading dimensions of the signal. Index it to get
+    one array of a batch.
+
+    Attributes:
+        processes: Of the sum, without values.
+        theta: Covariance matrices between the sensors `(..., process, sensor, sensor)`: of white noise, of the
+            innovations of an AR1, of the steps of a random walk, of amplitudes in phase of a tone (their squares, twice
+            its variances, on the diagonal; of rank 2 at most, as a tone has two phases). Positive semi-definite. NaN
+            for a sensor without samples and a pair that is never seen together.
+        theta_sd: Standard deviation of every entry, as if no matrix lacked rank.
+        confidence_interval: Limits of every entry. A variance that is hardly told from zero, or in a matrix that lacks
+            rank or of a long memory, has an upper limit only; covariances of such a matrix have none (NaN).
+        correlation: Of the sensors in each process.
+        correlation_interval: Limits of the same, NaN where the matrix lacks rank or is that of a long memory.
+        param_names: Of what all sensors share, such as `ar1_1.phi`.
+        params: `(..., parameter)`.
+        params_sd: `(..., parameter)`.
+        params_interval: Limits `(..., parameter)`, NaN for `phi` where `remarks` say so.
+        param_cov: Covariance of all numbers of the model, as if no matrix lacked rank: entries of the matrices on and
+            above the diagonal, row after row, and `phi` or `beta`, process by process, `(..., number, number)`. NaN
+            for pairs that are never seen together.
+        confidence_level: Of all intervals.
+        objective: `r' Omega r` with `r` the entries of measured less fitted wavelet cross-covariance, `(...)`.
+        degrees_of_freedom: Moments less parameters, `(...)`.
+        p_value: Of the J test, that the model is complete, `(...)`; NaN with other than optimal weights.
+        converged: `(...)`, whether the search came to rest.
+        rank: Of every matrix, `(..., process)`, 0 for an array that could not be fitted.
+        wavelet_cross_covariance: Measured, `(..., level, sensor, sensor)`, signal^2.
+        fitted_wavelet_cross_covariance: Of the model, the same.
+        n_samples: Length of the records.
+        weighting: Of the moments.
+        sensors: Names.
+        rate: Hz, where known.
+        unit: Of the signal, where known.
+    """
+
+    processes: tuple[Process, ...]
+    theta: Tensor
+    theta_sd: Tensor
+    confidence_interval: ConfidenceInterval
+    correlation: Tensor
+    correlation_interval: ConfidenceInterval
+    param_names: tuple[str, ...]
+    params: Tensor
+    params_sd: Tensor
+    params_interval: ConfidenceInterval
+    param_cov: Tensor
+    confidence_level: float
+    objective: Tensor
+    degrees_of_freedom: Tensor
+    p_value: Tensor
+    converged: Tensor
+    rank: Tensor
+    wavelet_cross_covariance: Tensor
+    fitted_wavelet_cross_covariance: Tensor
+    n_samples: int
+    weighting: str
+    sensors: tuple[str, ...]
+    rate: float | None
+    unit: str | None
+
+    @classmethod
+    def build(
+        cls,
+        *,
+        fit: ArrayFit,
+        squared: Tensor,
+        held_sd: Tensor,
+        made_of: Composition,
+        usable: Tensor,
+        records: Records,
+        wavelet_cross_covariance: Tensor,
+        **rest: Any,
+    ) -> ArrayGMWMResult:
+        """Put the arrays that could be fitted back into their places among all, `(item,)` -> `(...)`.
+
+        `squared` are the units of the entries of their matrices, `(item, 1, sensor, sensor)`, `held_sd` the spreads of
+        the frequencies of tones, `(item, tone)`.
+        """
+        batch = wavelet_cross_covariance.shape[:-3]
+
+        def placed(value: Tensor, missing: float | bool = torch.nan) -> Tensor:
+            whole = value.new_full((len(usable), *value.shape[1:]), missing)
+            whole[usable] = value
+            return whole.view((*batch, *value.shape[1:]))
+
+        told = told_matrices(fit, made_of, records.longest)
+        entries, correlation = matrices(fit, told, rest["confidence_level"])
+        params = shared(fit, told, held_sd, made_of, rest["confidence_level"])
+        theta = entries.value * squared
+        columns = made_of.columns(records.tau.to(squared), fit.shape)
+        # A scaled chi-square of the same mean and variance.
+        p_value = chi_square_tail(fit.objective / fit.dispersion, fit.degrees / fit.dispersion)
+        names = Model(list(made_of.processes)).param_names
+        return cls(
+            processes=made_of.processes,
+            theta=placed(theta),
+            theta_sd=placed(entries.sd * squared),
+            confidence_interval=ConfidenceInterval(placed(entries.low * squared), placed(entries.high * squared)),
+            correlation=placed(correlation.value),
+            correlation_interval=ConfidenceInterval(placed(correlation.low), placed(correlation.high)),
+            param_names=tuple(name for name in names if name.endswith((".phi", ".beta"))),
+            params=placed(params.value),
+            params_sd=placed(params.sd),
+            params_interval=ConfidenceInterval(placed(params.low), placed(params.high)),
+            param_cov=placed(covariance_of_numbers(fit, vech(squared), params.sd, made_of)),
+            objective=placed(fit.objective),
+            degrees_of_freedom=placed(fit.degrees.to(theta)),
+            p_value=placed(p_value if rest["weighting"] == "optimal" else torch.full_like(p_value, torch.nan)),
+            converged=placed(fit.converged, False),
+            rank=placed(fit.rank, 0),
+            wavelet_cross_covariance=wavelet_cross_covariance,
+            fitted_wavelet_cross_covariance=placed(torch.einsum("njk,nkab->njab", columns, theta)),
+            n_samples=records.longest,
+            **rest,
+        )
+
+    @property
+    def remarks(self) -> tuple[tuple[str, ...], ...]:
+        """What the record does not tell, in words, for each array, item after item."""
+        return tuple(self._remarks(index) for index in itertools.product(*map(range, self.converged.shape)))
+
+    @property
+    def model(self) -> ArrayModel:
+        """The fitted model, which simulates; of the sensors that have samples.
+
+        Raises:
+            ValueError: The result holds a batch, the array could not be fitted, or a pair of sensors is never seen
+                together.
+        """
+        self._check_single("model")
+        present = self._present()
+        known = self.theta[:, present][:, :, present]
+        if not bool(present.any()) or not bool(known.isfinite().all()):
+            raise ValueError(
+                "`model`: expected a fitted array whose sensors are recorded together, got unknown covariances; "
+                "leave sensors out"
+            )
+        shapes = iter(self.params.tolist())
+        components: list[tuple[Process, Tensor]] = []
+        for process, matrix in zip(self.processes, known, strict=True):
+            kind: type[Any] = type(process)
+            of_unit_size = dict.fromkeys(process.parameters, 1.0)
+            of_unit_size |= {name: next(shapes) for name in ("phi", "beta") if name in of_unit_size}
+            components.append((kind(**of_unit_size), matrix))
+        told = EstimatedFrom(self.n_samples, self.param_cov[self._of_present()][:, self._of_present()])
+        return ArrayModel(components, estimated_from=told)
+
+    def svo_weights(self, scale_weights: ScaleWeights = "flat") -> Tensor:
+        """Optimal weights of the array from the fitted wavelet cross-covariance; 0 for sensors without samples.
+
+        Args:
+            scale_weights: `"flat"`, `"short"`, `"long"`, or one number >= 0 per level.
+
+        Returns:
+            `(..., sensor)`, sum 1, may be negative; NaN for an array that could not be fitted.
+
+        Raises:
+            SingularCovarianceError: The combined covariance is not positive definite, or a pair is never seen together.
+
+        References:
+            [Z] equations (6) and (7).
+        """
+        present = self._present()
+        both = (present[..., :, None] & present[..., None, :])[..., None, :, :]
+        return subset_weights(torch.where(both, self.fitted_wavelet_cross_covariance, 0.0), scale_weights, present)
+
+    def summary(self) -> str:
+        """Deviations of the sensors by process with intervals, largest correlations, and the fit."""
+        name = Composition(self.processes, held=True).name
+        levels, n_sensors = self.wavelet_cross_covariance.shape[-3:-1]
+        head = f"GMWM fit of an array, {name}: {counted(n_sensors, 'sensor')}, {self.n_samples} samples, "
+        head += counted(levels, "level")
+        batch = self.theta.shape[:-3]
+        if batch:
+            return f"{head}\n{batch.numel()} arrays in a batch {tuple(batch)}, {int(self.converged.sum())} converged"
+        if not bool(self._present().any()):
+            return f"{head}\nnot fitted"
+        fits = "" if bool(self.converged) else "not converged, "
+        fits += f"J = {self.objective.item():.4g} with {int(self.degrees_of_freedom)} degrees of freedom"
+        if bool(self.p_value.isfinite()):
+            fits += f", p = {self.p_value.item():.2g}"
+        lines = [head, fits]
+        level = f"{100 * self.confidence_level:g} % interval"
+        shared = zip(self.param_names, self.params, *self.params_interval, strict=True)
+        for label, value, low, high in shared:
+            limits = f"{level} [{low:.6g}, {high:.6g}]" if low.isfinite() else "no interval, see below"
+            lines.append(f"{label:<16}{value:>13.6g}  {limits}")
+        for k, process in enumerate(self.processes):
+            what = "squared amplitudes, twice the variances," if isinstance(process, Sinusoid) else "variances"
+            lines += ["", f"{process.symbol}: {what} with {level}s, correlations"]
+            for i, sensor in enumerate(self.sensors):
+                low, high = (limit[k, i, i].item() for limit in self.confidence_interval)
+                value = self.theta[k, i, i].item()
+                others = " ".join(f"{rho:6.2f}" for rho in self.correlation[k, i].tolist())
+                lines.append(f"  {sensor:<12}{value:>12.5g} [{low:>11.5g}, {high:>11.5g}]  {others}")
+        return "\n".join([*lines, *("", *self.remarks[0]) * bool(self.remarks[0])])
+
+    def __str__(self) -> str:
+        return self.summary()
+
+    def __getitem__(self, index: Any) -> ArrayGMWMResult:
+        """Some arrays of a batch."""
+        if self.theta.ndim == 3:
+            raise IndexError("there is one array, not a batch")
+        chosen: dict[str, Any] = {}
+        for name in _BATCHED:
+            value = getattr(self, name)
+            is_pair = isinstance(value, ConfidenceInterval)
+            chosen[name] = ConfidenceInterval(*(limit[index] for limit in value)) if is_pair else value[index]
+        return replace(self, **chosen)
+
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Draw the sensors' Allan deviations, measured and of the fitted model (dashed).
+
+        Args:
+            ax: Where to draw; a new figure by default.
+
+        Raises:
+            ValueError: The result holds a batch.
+        """
+        from gyrofuse._base.axes import BLUE, finish
+        from gyrofuse.fusion.plots import allan_deviation, plot_allan_deviation
+
+        self._check_single("plot")
+        measured, fitted = (
+            value.diagonal(dim1=-2, dim2=-1)
+            for value in (self.wavelet_cross_covariance, self.fitted_wavelet_cross_covariance)
+        )
+        times = torch.exp2(torch.arange(len(measured), dtype=torch.float64)) / (self.rate or 1.0)
+        in_seconds = self.rate is not None
+        ax = plot_allan_deviation(times, measured, names=self.sensors, unit=self.unit, in_seconds=in_seconds, ax=ax)
+        lines = ax.plot(times, allan_deviation(fitted), color=BLUE, linewidth=1.2, linestyle="--", zorder=3)
+        finish(ax, [ax.lines[0], lines[0]], [f"{len(self.sensors)} sensors", "fitted model"])
+        return ax
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain numbers and lists; what is not known is None."""
+        plain: dict[str, Any] = {"processes": [process.symbol for process in self.processes]}
+        for entry in fields(self)[1:]:
+            value = getattr(self, entry.name)
+            if isinstance(value, ConfidenceInterval):
+                value = {"low": listed(value.low), "high": listed(value.high)}
+            elif isinstance(value, Tensor):
+                value = value.tolist() if value.dtype == torch.bool else listed(value)
+            plain[entry.name] = list(value) if isinstance(value, tuple) else value
+        return plain | {"remarks": [list(texts) for texts in self.remarks]}
+
+    def _of_present(self) -> Tensor:
+        """Which numbers of the model are those of sensors that have samples, `(number,)`."""
+        both = vech(self._present()[:, None] & self._present())
+        shaped = [any(name in process.parameters for name in ("phi", "beta")) for process in self.processes]
+        return torch.cat([torch.cat([both, both.new_ones(int(is_shaped))]) for is_shaped in shaped])
+
+    def _remarks(self, index: tuple[int, ...]) -> tuple[str, ...]:
+        n_sensors = self.theta.shape[-1]
+        if not bool(self._present()[index].any()):
+            return ()
+        shapes = dict(zip(self.param_names, self.params[index].unbind(-1), strict=True))
+        names = dict.fromkeys(name.split(".")[0] for name in Model(list(self.processes)).param_names)
+        found = []
+        for name, rank in zip(names, self.rank[index].tolist(), strict=True):
+            phi = shapes.get(f"{name}.phi")
+            is_vague = phi is not None and bool(is_long(phi, self.n_samples))
+            reasons = [f"matrix of rank {rank} of {n_sensors}"] * (rank < n_sensors)
+            if is_vague:
+                reasons.append(
+                    "hardly told from a random walk at this length, its memory is longer than "
+                    f"1/{FEWEST_TIME_CONSTANTS} of the record"
+                )
+            if reasons:
+                limits = "upper limits only of its variances, no intervals of its covariances and correlations"
+                nor = "" if phi is None else ", nor of any phi"
+                found.append(f"{name}: {' and '.join(reasons)}; {limits}{nor}")
+            if is_vague:
+                found.append(
+                    f"{name}: weights for long times may be no better than those of the measured wavelet "
+                    "cross-covariance"
+                )
+        for name, low, high in zip(self.param_names, *(limit[index] for limit in self.params_interval), strict=True):
+            if name.endswith(".phi") and low <= 0 <= high:
+                found.append(f"{name.split('.')[0]}: indistinguishable from white noise at this length")
+        return tuple(found)
+
+    def _present(self) -> Tensor:
+        """Sensors with samples, `(..., sensor)`."""
+        return self.theta.diagonal(dim1=-2, dim2=-1).isfinite().all(-2)
+
+    def _check_single(self, what: str) -> None:
+        if self.theta.ndim > 3:
+            raise ValueError(
+                f"`{what}`: expected one array, got a batch {tuple(self.theta.shape[:-3])}; index it, result[0]"
+            )

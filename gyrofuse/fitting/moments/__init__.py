@@ -1,0 +1,1 @@
+"""The Generalised Method of Wavelet Moments."""

@@ -1,0 +1,41 @@
+"""The sign of a ramp: wavelet variances and spectra hold its square alone, the samples tell."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from gyrofuse.fitting.moments.inference import Estimates
+from gyrofuse.noise.processes import Drift, Model
+
+
+def rising(series: Tensor) -> Tensor:
+    """1 where a regression on time rises, else -1, of series `(item, time)` that may lack samples."""
+    time = torch.arange(series.shape[-1], dtype=torch.float64, device=series.device)
+    there = series.isfinite()
+    rest = torch.where(there, series.to(torch.float64) - series.nanmean(-1, keepdim=True).to(torch.float64), 0.0)
+    centre = (time * there).sum(-1, keepdim=True) / there.sum(-1, keepdim=True)
+    return torch.where((rest * (time - centre)).sum(-1) < 0, -1.0, 1.0).to(torch.float64)
+
+
+def drifts_of(model: Model) -> Tensor:
+    """Which parameters are slopes, `(parameter,)`."""
+    return torch.tensor([isinstance(p, Drift) for p in model.processes for _ in p.parameters])
+
+
+def signed(estimates: Estimates, model: Model, sign: Tensor) -> Estimates:
+    """Estimates with slopes of these signs, `(item,)`."""
+    column = drifts_of(model).to(sign.device)
+    if not bool(column.any()):
+        return estimates
+    turn = torch.where(column, sign[:, None], 1.0)  # (item, parameter)
+    low, high = estimates.low * turn, estimates.high * turn
+    return replace(
+        estimates,
+        params=estimates.params * turn + 0.0,  # no -0
+        covariance=estimates.covariance * turn[:, :, None] * turn[:, None, :],
+        low=low.minimum(high) + 0.0,
+        high=high.maximum(low) + 0.0,
+    )

@@ -1,0 +1,309 @@
+"""What a moment fit says of its parameters: covariance, intervals that respect their range, and the J test."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gyrofuse.fitting.moments.log_moments import log_residual
+from gyrofuse.fitting.moments.records import Records
+from gyrofuse.fitting.structure import Composition
+from gyrofuse.noise.processes import AR1, Drift, Sinusoid
+from gyrofuse.wavelets.equivalent_dof import chi_square_tail, normal_quantile
+
+# Beyond this spread of its logarithm a variance is known to hardly its order of magnitude.
+WEAKLY_DETERMINED = 0.5
+_NO_CHANCE = 1e-3  # p-value of the J test
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Where a search ended.
+
+    Attributes:
+        variance: Wavelet variances `(item, level)` that were fitted.
+        linear: `p`, `(item, process)`.
+        shape: `x`, `(item, shaped)`.
+        held_sd: Spread of the frequencies `beta` that were held, `(item, sinusoid)`.
+        converged: `(item,)`.
+        omega: Weights `(level,)` or `(level, level)`, or `"optimal"`, `"diagonal"` or `"continuous"`.
+        records: What was measured.
+        moments: `"variance"`, or `"log"` of their logarithms.
+    """
+
+    variance: Tensor
+    linear: Tensor
+    shape: Tensor
+    held_sd: Tensor
+    converged: Tensor
+    omega: str | Tensor
+    records: Records
+    moments: str = "variance"
+
+    @property
+    def tau(self) -> Tensor:
+        """Filter lengths `(level,)`."""
+        return self.records.tau.to(self.variance.device)
+
+
+@dataclass(frozen=True, eq=False)
+class Estimates:
+    """Parameters of the model with their uncertainty.
+
+    Attributes:
+        params: `(item, parameter)`.
+        covariance: `(item, parameter, parameter)`; zero rows for variances at zero.
+        low: `(item, parameter)`.
+        high: `(item, parameter)`; of a variance at zero a one-sided limit.
+        determined: `(item, parameter)`, whether the data say more than its order of magnitude.
+    """
+
+    params: Tensor
+    covariance: Tensor
+    low: Tensor
+    high: Tensor
+    determined: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Inference:
+    """What a moment fit says.
+
+    Attributes:
+        estimates: Parameters with their uncertainty.
+        fitted: Wavelet variances of the fitted model, `(item, level)`.
+        objective: `r' Omega r`, `(item,)`.
+        j_statistic: `r' V^-1 r`, `(item,)`.
+        degrees: Of freedom of the J statistic, its mean, `(item,)`.
+        dispersion: Variance of the J statistic over that of a chi-square of this mean, `(item,)`.
+        converged: `(item,)`.
+    """
+
+    estimates: Estimates
+    fitted: Tensor
+    objective: Tensor
+    j_statistic: Tensor
+    degrees: Tensor
+    dispersion: Tensor
+    converged: Tensor
+
+    @property
+    def p_value(self) -> Tensor:
+        """Of the J test, by a scaled chi-square of the same mean and variance, `(item,)`; NaN without freedom."""
+        return chi_square_tail(self.j_statistic / self.dispersion, self.degrees / self.dispersion)
+
+    @property
+    def refused(self) -> Tensor:
+        """Whether the J test leaves the model no chance, `(item,)`."""
+        return self.p_value < _NO_CHANCE
+
+
+def either(condition: Tensor, one: Any, other: Any) -> Any:
+    """The first for items that meet a condition `(item,)`, the second for the others; tensors, or records of them."""
+    if isinstance(one, Tensor):
+        return torch.where(condition.view(-1, *(1,) * (one.ndim - 1)), one, other)
+    pairs = ((getattr(one, f.name), getattr(other, f.name)) for f in fields(one))
+    return type(one)(*(either(condition, *pair) for pair in pairs))
+
+
+def infer(fit: Fit, made_of: Composition, confidence_level: float) -> Inference:
+    """Sandwich covariance `(A' O A)^-1 A' O V O A (A' O A)^-1`, `A = d nu / d theta` ([V] theorem 2), and the J test.
+
+    Args:
+        fit: Where the search ended.
+        made_of: Structure of the model.
+        confidence_level: Probability that an interval holds the true value.
+    """
+    own = _misfit(fit, made_of)
+    # Jacobian by p, and by x of the unknown shapes: (item, level, unknown)
+    moving = [made_of.shaped.index(k) for k in made_of.curved]
+    jacobian = torch.cat([own.values, own.slopes[..., moving]], -1)
+    present = fit.linear > 0  # (item, process)
+    active = torch.cat([present, present[:, made_of.curved]], -1)
+    spread = _sandwich(jacobian, active, own.covariance, own.weight)
+    # With the variances at zero let off it, how far they might be.
+    free = torch.cat([torch.ones_like(present), present[:, made_of.curved]], -1)
+    edge = _sandwich(jacobian, free, own.covariance, own.weight)
+    estimates = estimated(
+        made_of,
+        fit.linear,
+        fit.shape,
+        _in_logs(spread, fit, made_of),
+        edge.diagonal(dim1=-2, dim2=-1)[:, : made_of.n_linear].clamp(min=0).sqrt(),
+        confidence_level,
+    )
+    degrees = (len(fit.tau) - active.sum(-1)).to(own.j_statistic)
+    return Inference(
+        estimates, own.fitted, own.objective, own.j_statistic, degrees, torch.ones_like(degrees), fit.converged
+    )
+
+
+def infer_efficient(
+    fit: Fit, made_of: Composition, spread: Tensor, edge_sd: Tensor, confidence_level: float
+) -> Inference:
+    """What efficient estimates leave of the moments: the J test at parameters that are no minimum of it.
+
+    An efficient estimate of covariance `S` is uncorrelated with what it leaves (Hausman):
+    `Var r = V - A S A'`, so that `r' V^-1 r` is a sum of squares of normal variables with the eigenvalues of
+    `1 - L^-1 A S A' L^-T`, `V = L L'`, as weights: 0 to 1, where a minimum has zeros and ones alone.
+
+    Args:
+        fit: Moments, and the estimates in the place of where a search ended.
+        made_of: Structure of the model.
+        spread: `S`, of `ln p` of all processes and `x` of all shaped ones, `(item, unknown, unknown)`; what is not
+            known of it takes nothing from the residuals, so that the test refuses too seldom.
+        edge_sd: As in `estimated`.
+        confidence_level: Probability that an interval holds the true value.
+
+    References:
+        J. A. Hausman, Econometrica 46, 1978.
+    """
+    own = _misfit(fit, made_of)
+    jacobian = torch.cat([own.values * fit.linear[:, None], own.slopes], -1)
+    moved = torch.linalg.solve_triangular(own.root, jacobian, upper=False)
+    part = moved @ spread.nan_to_num(nan=0.0, posinf=0.0) @ moved.mT
+    taken = torch.linalg.eigvalsh(torch.where(own.j_statistic.isfinite()[:, None, None], part, 0.0)).clamp(0, 1)
+    degrees = (1 - taken).sum(-1)
+    dispersion = (1 - taken).square().sum(-1) / degrees
+    estimates = estimated(made_of, fit.linear, fit.shape, spread, edge_sd, confidence_level)
+    return Inference(estimates, own.fitted, own.objective, own.j_statistic, degrees, dispersion, fit.converged)
+
+
+@dataclass(frozen=True, eq=False)
+class _Misfit:
+    """Moments against a model.
+
+    Attributes:
+        fitted: `nu(theta)`, `(item, level)`.
+        covariance: `V`, `(item, level, level)`.
+        root: Its Cholesky factor.
+        weight: `Omega`, or one for each item.
+        objective: `r' Omega r`, `(item,)`.
+        j_statistic: `r' V^-1 r`, `(item,)`.
+        values: Derivatives `(item, level, process)` by `p`.
+        slopes: The same by `x` of all shaped processes.
+    """
+
+    fitted: Tensor
+    covariance: Tensor
+    root: Tensor
+    weight: Tensor
+    objective: Tensor
+    j_statistic: Tensor
+    values: Tensor
+    slopes: Tensor
+
+
+def _misfit(fit: Fit, made_of: Composition) -> _Misfit:
+    values, slopes = made_of.columns(fit.tau, fit.shape), made_of.slopes(fit.tau, fit.shape)
+    fitted = (values @ fit.linear[..., None])[..., 0]
+    covariance = fit.records.covariance(made_of.model(fit.linear, fit.shape))
+    residual = fit.variance - fitted
+    if fit.moments == "log":
+        residual, covariance = log_residual(fit.variance, fitted, covariance)
+    root, failed = torch.linalg.cholesky_ex(covariance)
+    whitened = torch.linalg.solve_triangular(root, residual[..., None], upper=False)[..., 0]
+    j_statistic = torch.where(failed > 0, torch.nan, whitened.square().sum(-1))
+    weight = _weight(fit.omega, covariance)
+    objective = _quadratic(residual, weight)
+    slopes = slopes * fit.linear[:, None, made_of.shaped]
+    return _Misfit(fitted, covariance, root, weight, objective, j_statistic, values, slopes)
+
+
+def _quadratic(residual: Tensor, weight: Tensor) -> Tensor:
+    return ((weight @ residual[..., None])[..., 0] * residual).sum(-1)
+
+
+def _weight(omega: str | Tensor, covariance: Tensor) -> Tensor:
+    if isinstance(omega, Tensor):
+        return torch.diag(omega.to(covariance)) if omega.ndim == 1 else omega.to(covariance)
+    if omega == "diagonal":
+        return torch.diag_embed(covariance.diagonal(dim1=-2, dim2=-1).reciprocal())
+    return torch.linalg.inv_ex(covariance)[0]
+
+
+def _in_logs(own: Tensor, fit: Fit, made_of: Composition) -> Tensor:
+    """Covariance `(item, unknown, unknown)` of `ln p` of all processes and `x` of all shaped ones, held ones too."""
+    n_linear, shaped = made_of.n_linear, made_of.shaped
+    scale = torch.where(fit.linear > 0, fit.linear.clamp(min=1e-300).reciprocal(), 0.0)
+    scale = torch.cat([scale, torch.ones_like(own[:, n_linear:, 0])], -1)
+    place = [*range(n_linear), *(n_linear + shaped.index(k) for k in made_of.curved)]
+    size = n_linear + len(shaped)
+    spread = own.new_zeros(len(own), size, size)
+    index = torch.tensor(place, device=own.device)
+    spread[:, index[:, None], index] = own * scale[:, :, None] * scale[:, None, :]
+    held = [n_linear + at for at, k in enumerate(shaped) if k not in made_of.curved]
+    if held:
+        part = fit.shape[:, [at - n_linear for at in held]].sigmoid()
+        spread[:, held, held] = (fit.held_sd / (torch.pi * part * (1 - part))).square()
+    return spread
+
+
+def estimated(
+    made_of: Composition, linear: Tensor, shape: Tensor, spread: Tensor, edge_sd: Tensor, confidence_level: float
+) -> Estimates:
+    """Parameters with intervals that respect their ranges.
+
+    Intervals are symmetric in the logarithm of variances and amplitudes, in `atanh phi` and in `logit(beta / pi)`. A
+    variance estimated as zero lies on the edge of its range: it gets an upper limit only, and an AR1 without variance
+    any `phi`.
+
+    Args:
+        made_of: Structure of the model.
+        linear: `p`, `(item, process)`.
+        shape: `x`, `(item, shaped)`.
+        spread: Covariance of `ln p` of all processes and `x` of all shaped ones, `(item, unknown, unknown)`.
+        edge_sd: Standard deviation of `p` itself with those at zero let off it, `(item, process)`.
+        confidence_level: Probability that an interval holds the true value.
+    """
+    z, one_sided = normal_quantile((1 + confidence_level) / 2), normal_quantile(confidence_level)
+    sd = spread.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
+    found: list[tuple[int, Tensor, Tensor, Tensor, Tensor]] = []  # unknown, low, high, slope, determined
+    at_shaped = made_of.n_linear
+    for k, process in enumerate(made_of.processes):
+        p, ratio = linear[:, k], sd[:, k]
+        present = p > 0
+        low = torch.where(present, p * torch.exp(-z * ratio), 0.0)
+        high = torch.where(present, p * torch.exp(z * ratio), one_sided * edge_sd[:, k])
+        size = (k, low, high, p, present & (ratio < WEAKLY_DETERMINED))
+        if isinstance(process, (Sinusoid, Drift)):  # p is the square of the parameter
+            size = (k, low.sqrt(), high.sqrt(), p.sqrt() / 2, size[-1])
+        if isinstance(process, (AR1, Sinusoid)):
+            x, width = shape[:, at_shaped - made_of.n_linear], sd[:, at_shaped]
+            # Without variance, or fewer than a few cycles of a tone, it may be anything.
+            width = torch.where(present & width.isfinite(), width, torch.inf)
+            known = width < WEAKLY_DETERMINED
+            if isinstance(process, AR1):
+                form = (at_shaped, (x - z * width).tanh(), (x + z * width).tanh(), 1 - x.tanh().square(), known)
+                found += [form, size]
+            else:
+                part = x.sigmoid()
+                low, high = (torch.pi * (x + sign * z * width).sigmoid() for sign in (-1, 1))
+                found += [size, (at_shaped, low, high, torch.pi * part * (1 - part), known)]
+            at_shaped += 1
+        else:
+            found.append(size)
+    lows, highs, slopes, determined = (torch.stack(column, -1) for column in list(zip(*found, strict=True))[1:])
+    index = torch.tensor([unknown for unknown, *_ in found], device=spread.device)
+    covariance = spread[:, index[:, None], index] * slopes[:, :, None] * slopes[:, None, :]
+    return Estimates(made_of.params(linear, shape), covariance, lows, highs, determined)
+
+
+def _sandwich(jacobian: Tensor, active: Tensor, covariance: Tensor, weight: Tensor) -> Tensor:
+    """Covariance `(item, unknown, unknown)` of the unknowns, zero where not active."""
+    columns = jacobian * active[:, None].to(jacobian)
+    size = columns.square().sum(-2).sqrt()
+    size = torch.where(size > 0, size, 1.0)
+    columns = columns / size[:, None]
+    weighted = weight @ columns
+    bread = columns.mT @ weighted
+    scale = bread.diagonal(dim1=-2, dim2=-1).clamp(min=torch.finfo(bread.dtype).tiny).sqrt()
+    off = (~active).to(bread)
+    scaled = bread / scale[:, :, None] / scale[:, None, :] + torch.diag_embed(off)
+    inverse = torch.linalg.inv_ex(scaled)[0] / scale[:, :, None] / scale[:, None, :]
+    spread = inverse @ (weighted.mT @ covariance @ weighted) @ inverse
+    keep = active[:, :, None] & active[:, None, :]
+    return torch.where(keep, spread / size[:, :, None] / size[:, None, :], 0.0)

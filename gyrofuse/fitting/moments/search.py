@@ -1,0 +1,236 @@
+"""Minimum of weighted distances between wavelet variances and those of a model, for many records at once.
+
+Variances are solved for inside (variable projection with non-negative least squares), so that the search runs over the
+few parameters that are not linear: from the best points of a grid, by Levenberg-Marquardt with Kaufman's Jacobian.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import torch
+from torch import Tensor
+
+from gyrofuse._base.nnls import nonnegative_least_squares
+from gyrofuse.fitting.structure import Composition, shape_of
+from gyrofuse.noise.processes import AR1
+
+_STEPS, _ENOUGH = 30, 1e-10
+# The damping after which a step that does not help is taken for rounding.
+_MOST_DAMPING = 1e10
+_PROBLEMS_AT_ONCE = 200_000
+_CLOSE = 1e-3
+
+
+def starting_points(
+    target: Tensor,
+    weight: Tensor,
+    tau: Tensor,
+    made_of: Composition,
+    held: Tensor,
+    n_starts: int,
+    fixed: tuple[int, Tensor] | None = None,
+) -> Tensor:
+    """The best points of a grid that are not neighbours.
+
+    Args:
+        target: Wavelet variances, `(item, level)`.
+        weight: Of each squared residual, `(item, level)`.
+        tau: `(level,)`.
+        made_of: Structure of the model.
+        held: `x` of the sinusoids where these are held, `(item, sinusoid)`.
+        n_starts: How many; fewer where the grid has fewer.
+        fixed: A process, and its `p` `(item,)`; None where all are free.
+
+    Returns:
+        `x` of the shaped processes, `(item, start, shaped)`.
+    """
+    free = made_of.curved
+    n_items = len(target)
+    if not free:
+        return held[:, None]
+    axes, blocks = [], []
+    for kind, group in itertools.groupby(free, key=lambda k: type(made_of.processes[k])):
+        grid = _grid(kind, tau)
+        blocks.append(list(itertools.combinations(range(len(grid)), len(list(group)))))
+        axes.append(grid)
+    index = [tuple(itertools.chain(*parts)) for parts in itertools.product(*blocks)]
+    which = [n for n, block in enumerate(blocks) for _ in block[0]]
+    points = torch.stack([axes[n][torch.tensor([i[d] for i in index])] for d, n in enumerate(which)], -1).to(target)
+    objective = []
+    for part in points.split(max(_PROBLEMS_AT_ONCE // n_items, 1)):
+        # What does not differ between the items is computed once.
+        n_own = n_items if held.shape[-1] else 1
+        values = made_of.columns(tau, _with_held(part[None].expand(n_own, -1, -1), held, made_of))
+        given = (fixed[0], fixed[1][:, None]) if fixed else None
+        objective.append(_solve(values, target[:, None], weight.sqrt()[:, None], given)[1])
+    cost = torch.cat(objective, -1)  # (item, point)
+    place = torch.tensor(index, device=target.device)
+    chosen = []
+    for _ in range(min(n_starts, len(points))):
+        best = cost.argmin(-1)
+        chosen.append(points[best])
+        near = (place - place[best][:, None]).abs().amax(-1) <= 1
+        cost = torch.where(near, torch.inf, cost)
+    return _with_held(torch.stack(chosen, 1), held, made_of)
+
+
+def minimise(
+    target: Tensor,
+    root: Tensor,
+    tau: Tensor,
+    made_of: Composition,
+    start: Tensor,
+    n_steps: int = _STEPS,
+    *,
+    fixed: tuple[int, Tensor] | None = None,
+    still: int | None = None,
+    enough: float = _ENOUGH,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Levenberg-Marquardt on `|W (target - u(x) p)|^2`.
+
+    Args:
+        target: `(problem, level)`.
+        root: `W`, `(problem, level, level)`, or `(problem, level)` where it is diagonal.
+        tau: `(level,)`.
+        made_of: Structure of the model.
+        start: `x`, `(problem, shaped)`.
+        n_steps: At most so many steps.
+        fixed: A process, and its `p` `(problem,)`; None where all are free.
+        still: One of `x` that stays where it starts.
+        enough: Share of the objective by which a step has to lower it to be followed by another.
+
+    Returns:
+        `p` `(problem, linear)`, `x` `(problem, shaped)`, the minimum `(problem,)` and whether it was reached.
+    """
+    moving = [at for at in map(made_of.shaped.index, made_of.curved) if at != still]
+    x = start.clone()
+    linear, objective = _evaluate(target, root, tau, made_of, x, fixed)
+    if not moving:
+        return linear, x, objective, torch.ones_like(objective, dtype=torch.bool)
+    low, high = (ends[moving] for ends in limits(made_of, tau, x))
+    damping = torch.full_like(objective, 1e-3)
+    done = ~objective.isfinite()
+    for _ in range(n_steps):
+        todo = (~done).nonzero()[:, 0]
+        if not len(todo):
+            break
+        y, w, at, p = target[todo], root[todo], x[todo], linear[todo]
+        values, slope = made_of.columns(tau, at), made_of.slopes(tau, at)
+        jacobian = _times(w, slope * p[:, None, made_of.shaped])[..., moving]
+        free = p > 0
+        if fixed:
+            free[:, fixed[0]] = False
+        jacobian = jacobian - _projected(_times(w, values), free, jacobian)
+        residual = _times(w, y[..., None] - values @ p[..., None])
+        gradient = (jacobian.mT @ residual)[..., 0]
+        normal = jacobian.mT @ jacobian
+        size = normal.diagonal(dim1=-2, dim2=-1)
+        # An AR1 whose variance is zero does not move.
+        own_size = torch.where(size > 0, size, 1.0)
+        step = torch.linalg.solve_ex(normal + torch.diag_embed(damping[todo][:, None] * own_size), gradient)[0]
+        tried = at.clone()
+        tried[:, moving] = (at[:, moving] + step.clamp(-2, 2)).clamp(low, high)
+        given = (fixed[0], fixed[1][todo]) if fixed else None
+        new_linear, new_objective = _evaluate(y, w, tau, made_of, tried, given)
+        old = objective[todo]
+        better = new_objective < old
+        gain = old - new_objective
+        x[todo] = torch.where(better[:, None], tried, at)
+        linear[todo] = torch.where(better[:, None], new_linear, p)
+        objective[todo] = torch.where(better, new_objective, old)
+        damping[todo] = torch.where(better, damping[todo] / 5, damping[todo] * 4).clamp(min=1e-12)
+        stuck = (step.abs().amax(-1) < 1e-7) | (damping[todo] > _MOST_DAMPING)
+        done[todo] = torch.where(better, gain <= enough * old, stuck)
+    return linear, x, objective, done & objective.isfinite()
+
+
+def distinct(objective: Tensor, x: Tensor, n_kept: int) -> Tensor:
+    """Indices `(item, kept)` of the best starts of `x` `(item, start, shaped)` that differ from one another."""
+    cost = torch.where(objective.isfinite(), objective, torch.finfo(objective.dtype).max)
+    kept = []
+    for _ in range(min(n_kept, cost.shape[1])):
+        best = cost.argmin(-1)
+        kept.append(best)
+        same = (x - x.gather(1, best[:, None, None].expand(-1, 1, x.shape[-1]))).abs().sum(-1) < _CLOSE
+        same |= torch.arange(cost.shape[1], device=cost.device) == best[:, None]
+        cost = torch.where(same, torch.inf, cost)
+    return torch.stack(kept, 1)
+
+
+def whitening(covariance: Tensor) -> Tensor:
+    """`W` with `W' W = V^-1`, lower triangular; NaN where there is none."""
+    root, failed = torch.linalg.cholesky_ex(covariance)
+    eye = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
+    found = torch.linalg.solve_triangular(root, eye.expand_as(root), upper=False)
+    return torch.where((failed > 0)[:, None, None], torch.nan, found)
+
+
+def _evaluate(
+    target: Tensor, root: Tensor, tau: Tensor, made_of: Composition, x: Tensor, fixed: tuple[int, Tensor] | None
+) -> tuple[Tensor, Tensor]:
+    return _solve(made_of.columns(tau, x), target, root, fixed)
+
+
+def _solve(values: Tensor, target: Tensor, root: Tensor, fixed: tuple[int, Tensor] | None) -> tuple[Tensor, Tensor]:
+    """Variances that fit best, and the distance left; `values` `(..., level, linear)`."""
+    columns, y = _times(root, values), _times(root, target[..., None])
+    others = columns
+    if fixed:
+        k, value = fixed
+        y = y - value[..., None, None] * columns[..., k : k + 1]
+        others = columns.clone()
+        others[..., k] = 0.0  # whose own solution is zero
+    linear = nonnegative_least_squares(others.mT @ others, (others.mT @ y)[..., 0])
+    objective = (y - others @ linear[..., None]).square().sum((-2, -1))
+    if fixed:
+        linear[..., k] = value
+    return linear, objective
+
+
+def _times(root: Tensor, matrix: Tensor) -> Tensor:
+    return root @ matrix if root.ndim == matrix.ndim else root[..., None] * matrix
+
+
+def _projected(columns: Tensor, active: Tensor, matrix: Tensor) -> Tensor:
+    """Projection of `matrix` on the active columns."""
+    size = columns.norm(dim=-2, keepdim=True)
+    columns = columns / torch.where(size > 0, size, 1.0) * active[:, None]
+    gram = columns.mT @ columns + torch.diag_embed((~active).to(columns) + 1e-13)
+    return columns @ torch.linalg.solve_ex(gram, columns.mT @ matrix)[0]
+
+
+def _with_held(free: Tensor, held: Tensor, made_of: Composition) -> Tensor:
+    """`x` of all shaped processes from those of the free ones, `(item, point, free)`, and of the held sinusoids."""
+    if not made_of.held or held.shape[-1] == 0:
+        return free
+    parts, at_free, at_held = [], iter(free.unbind(-1)), iter(held.unbind(-1))
+    for k in made_of.shaped:
+        ar1 = isinstance(made_of.processes[k], AR1)
+        parts.append(next(at_free) if ar1 else next(at_held)[:, None].expand(free.shape[:2]))
+    return torch.stack(parts, -1)
+
+
+def _grid(kind: type, tau: Tensor) -> Tensor:
+    longest = float(tau[-1])
+    if kind is AR1:
+        time_constant = longest / 2.0 ** torch.arange(0, math.log2(3 * longest), dtype=torch.float64)
+        # Two that alternate: rare, but some filters leave them.
+        phi = torch.cat([torch.exp(-1 / time_constant), torch.tensor([-0.3, -0.7], dtype=torch.float64)])
+        return shape_of(phi, AR1)
+    period = 4 * longest / 2.0 ** torch.arange(0, math.log2(2 * longest), 1 / 3, dtype=torch.float64)
+    return (2 / period.clamp(min=2.01)).logit()
+
+
+def limits(made_of: Composition, tau: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+    """Least and largest `x` of the shaped processes, `(shaped,)`."""
+    low, high = [], []
+    for k in made_of.shaped:
+        if isinstance(made_of.processes[k], AR1):
+            low.append(-3.0)
+            high.append(math.atanh(math.exp(-1 / (64 * float(tau[-1])))))
+        else:
+            low.append(math.log(1 / (8 * float(tau[-1]))))
+            high.append(20.0)
+    return x.new_tensor(low), x.new_tensor(high)

@@ -1,0 +1,1 @@
+"""Which noise model a recording asks for."""

@@ -1,0 +1,229 @@
+"""Candidates for the composition of a noise, what each could be simplified to, and which say the same."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gyrofuse.fitting.structure import Composition
+from gyrofuse.noise.parsing import parse_model
+from gyrofuse.noise.processes import AR1, Drift, Model, Process, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
+
+Kinds = list[type[Process]]
+Key = frozenset[tuple[type[Process], int]]
+
+_MOST_AR1S = 3
+_ORDER: tuple[type[Process], ...] = (WhiteNoise, QuantizationNoise, AR1, RandomWalk, Drift, Sinusoid)
+# A variance or a shape known to a factor of e^4 either way is not known.
+_UNKNOWN = 2.0
+# Of Hannan and Quinn; more than 1 for a choice that is right in the end. At 1.5 a process too many pays its way in less
+# than 1 % of records of 10^4 to 10^7 samples, where a charge of ln T turns away many of those that are there.
+_HANNAN_QUINN = 1.5
+# AR1s whose time constants differ by less than a tenth.
+_ALIKE = 0.05
+
+
+def key_of(kinds: Iterable[type[Process]]) -> Key:
+    """What a composition is made of, in no order."""
+    return frozenset(Counter(kinds).items())
+
+
+def composition(kinds: Iterable[type[Process]], held: bool) -> Composition:
+    """In the usual order."""
+    ordered: list[Any] = sorted(kinds, key=_ORDER.index)  # of classes with constructors of their own
+    return Composition(tuple(kind() for kind in ordered), held)
+
+
+def kinds_of(made_of: Composition) -> Kinds:
+    """Types of its processes."""
+    return [type(p) for p in made_of.processes]
+
+
+def name_of(kinds: Iterable[type[Process]]) -> str:
+    """Such as `WN + 2*AR1 + RW`."""
+    return composition(kinds, True).name
+
+
+def n_unknown(kinds: Kinds, held: bool) -> int:
+    """Unknowns of the moments, with frequencies of sinusoids known from elsewhere or not."""
+    return len(kinds) + kinds.count(AR1) + (0 if held else kinds.count(Sinusoid))
+
+
+def n_parameters(made_of: Composition) -> int:
+    """Unknowns of a composition; of a sinusoid amplitude and frequency."""
+    return made_of.n_linear + len(made_of.shaped)
+
+
+def charge(made_of: Composition, n_samples: int) -> float:
+    """What its parameters cost in `-2 ln L`: `2 c ln ln T` each, the slope of a ramp, known to `T^(-3/2)`, `ln T`."""
+    drifts = kinds_of(made_of).count(Drift)
+    each = 2 * _HANNAN_QUINN * math.log(math.log(n_samples))
+    return (n_parameters(made_of) - drifts) * each + drifts * math.log(n_samples)
+
+
+def all_noises(most: int) -> list[Kinds]:
+    """Sums of WN, QN, 0 to 3 AR1s, RW and DR with at least one noise and at most so many parameters."""
+    found = []
+    for n, *others in itertools.product(range(_MOST_AR1S + 1), *((False, True),) * 4):
+        kinds = [
+            kind
+            for kind, there in zip((WhiteNoise, QuantizationNoise, RandomWalk, Drift), others, strict=True)
+            if there
+        ]
+        kinds += [AR1] * n
+        if set(kinds) - {Drift} and len(kinds) + n <= most:
+            found.append(kinds)
+    return found
+
+
+def read_candidates(candidates: Sequence[Model | str]) -> list[Kinds]:
+    """Kinds of the processes of each candidate.
+
+    Raises:
+        TypeError: Not a sequence of models or formulas.
+        ValueError: None, one with values, or the same twice.
+    """
+    if isinstance(candidates, (str, Model)) or not isinstance(candidates, Sequence):
+        raise TypeError(
+            f"`candidates`: expected a sequence of models or formulas such as ['WN', 'WN + AR1'], got "
+            f"{type(candidates).__name__}; put it in a list"
+        )
+    found: dict[Key, Kinds] = {}
+    for candidate in candidates:
+        model = parse_model(candidate) if isinstance(candidate, str) else candidate
+        if not isinstance(model, Model):
+            raise TypeError(
+                f"`candidates`: expected models or formulas such as 'WN + AR1', got {type(model).__name__}; "
+                "write WhiteNoise() + AR1()"
+            )
+        given = [name for name, value in model._named() if value is not None]
+        if given:
+            raise ValueError(
+                f"`candidates`: expected parameters to be estimated, got values of {', '.join(given)}; "
+                "write the process without values"
+            )
+        kinds = [type(p) for p in model.processes]
+        if not set(kinds) - {Drift, Sinusoid}:
+            raise ValueError(f"`candidates`: expected a noise in each, got {name_of(kinds)}; add WN")
+        if key_of(kinds) in found:
+            raise ValueError(f"`candidates`: expected each composition once, got {name_of(kinds)} twice; leave one out")
+        found[key_of(kinds)] = kinds
+    if not found:
+        raise ValueError("`candidates`: expected at least one, got none; leave it out for all that make sense")
+    return list(found.values())
+
+
+def with_ancestors(wanted: Iterable[Kinds]) -> list[Kinds]:
+    """All wanted and those with any of their processes left out, from small to large.
+
+    On the way over a part of them alone a climb may get stuck: with WN tried first, an AR1 that is weak next to it goes
+    unseen, while WN joins an AR1 that had the record to itself.
+    """
+    found: dict[Key, Kinds] = {}
+    for kinds in wanted:
+        numbers = Counter(kinds)
+        for fewer in itertools.product(*(range(n + 1) for n in numbers.values())):
+            part = [kind for kind, n in zip(numbers, fewer, strict=True) for _ in range(n)]
+            if set(part) - {Drift, Sinusoid}:
+                found.setdefault(key_of(part), part)
+    return sorted(found.values(), key=len)
+
+
+def children(kinds: Kinds, among: Iterable[Key]) -> list[Kinds]:
+    """Compositions with one process more."""
+    known = set(among)
+    return [more for kind in _ORDER if key_of(more := [*kinds, kind]) in known]
+
+
+def parents(kinds: Kinds) -> list[Key]:
+    """Compositions with one process less."""
+    smaller = []
+    for kind in dict.fromkeys(kinds):
+        rest = list(kinds)
+        rest.remove(kind)
+        smaller.append(key_of(rest))
+    return smaller
+
+
+def next_to(kinds: Kinds, among: Iterable[Key]) -> list[tuple[Kinds, int | None]]:
+    """Compositions like one, the smaller ones first, and which of its processes each lacks; None where it lacks none.
+
+    Those with a process less or more, and those with one or two processes of one parameter in the place of an AR1,
+    which has two: it is white noise or a random walk at the ends of its range, and much like white and quantisation
+    noise where it alternates weakly.
+    """
+    known = set(among)
+    found: list[tuple[Kinds, int | None]] = []
+    for k, kind in enumerate(kinds):
+        rest = kinds[:k] + kinds[k + 1 :]
+        lacking = [one for one in (WhiteNoise, QuantizationNoise, RandomWalk) if kind is AR1 and one not in rest]
+        in_its_place = [(), *itertools.combinations(lacking, 1), *itertools.combinations(lacking, 2)]
+        found += [([*rest, *some], k) for some in in_its_place]
+    found += [(child, None) for child in children(kinds, known)]
+    return sorted((pair for pair in found if key_of(pair[0]) in known), key=lambda pair: len(pair[0]))
+
+
+def simplified(
+    made_of: Composition, params: Tensor, covariance: Tensor, n_samples: int
+) -> list[tuple[Kinds, str] | None]:
+    """For every item what the fit amounts to with fewer parameters, and why; None where it needs them all.
+
+    Args:
+        made_of: Structure.
+        params: `(item, parameter)`.
+        covariance: `(item, parameter, parameter)`.
+        n_samples: Length T of the record.
+    """
+    sd = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    flags: list[tuple[int, type[Process] | None, str, Tensor]] = []
+    earlier: list[tuple[int, Tensor, Tensor]] = []
+    numbers: Counter[type[Process]] = Counter()
+    at = 0
+    for k, process in enumerate(made_of.processes):
+        kind = type(process)
+        numbers[kind] += 1
+        word = f"{process.symbol} {numbers[kind]}" if process.repeatable else process.symbol
+        if kind is AR1:
+            phi, size, ratio = params[:, at], params[:, at + 1], sd[:, at + 1] / params[:, at + 1]
+            x, x_sd = phi.atanh(), sd[:, at] / (1 - phi.square())
+            flags.append((k, None, f"{word} has no variance", size <= 0))
+            flags.append((k, RandomWalk, f"{word} is a random walk", phi > torch.tensor(-2.0 / n_samples).exp()))
+            flags.append((k, WhiteNoise, f"{word} is white noise", (x.abs() < 2 * x_sd) & (x_sd < _UNKNOWN / 4)))
+            for other, other_x, other_sd in earlier:
+                gap = torch.maximum(2 * torch.hypot(x_sd, other_sd), torch.full_like(x, _ALIKE))
+                known = (x_sd < _UNKNOWN) & (other_sd < _UNKNOWN)
+                alike = ((x - other_x).abs() < gap) & known | ((x - other_x).abs() < _ALIKE)
+                flags.append((k, None, f"{word} is AR1 {other}", alike))
+            earlier.append((numbers[kind], x, x_sd))
+            at += 2
+        else:
+            size, ratio = params[:, at], sd[:, at] / params[:, at]
+            flags.append((k, None, f"{word} has no {'slope' if kind is Drift else 'variance'}", size <= 0))
+            at += 2 if kind is Sinusoid else 1
+        flags.append((k, None, f"{word} is not identified", ~(ratio < _UNKNOWN)))
+    table = torch.stack([flag for *_, flag in flags], -1).tolist()
+    found: list[tuple[Kinds, str] | None] = []
+    for row in table:
+        becomes: dict[int, type[Process] | None] = {}
+        reasons = []
+        for (k, limit, word, _), there in zip(flags, row, strict=True):
+            if there and k not in becomes:
+                becomes[k] = limit
+                reasons.append(word)
+        found.append((_replaced(made_of, becomes), ", ".join(reasons)) if becomes else None)
+    return found
+
+
+def _replaced(made_of: Composition, becomes: dict[int, type[Process] | None]) -> Kinds:
+    kept: Kinds = []
+    for k, process in enumerate(made_of.processes):
+        kind = becomes[k] if k in becomes else type(process)
+        if kind is not None and (kind in (AR1, Sinusoid) or kind not in kept):
+            kept.append(kind)
+    return kept

@@ -1,0 +1,163 @@
+"""Compositions fitted to the wavelet variances of records, each from where smaller ones ended.
+
+Leaner than the fit of one model: without a search for several minima and without polishing, which many compositions
+too large for their record would spend on flat valleys.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gyrofuse._base.nnls import nonnegative_least_squares
+from gyrofuse.fitting.moments import search
+from gyrofuse.fitting.moments.fit import damped, misfit
+from gyrofuse.fitting.moments.inference import Estimates, Fit, Inference, infer, infer_efficient
+from gyrofuse.fitting.moments.records import Records
+from gyrofuse.fitting.structure import Composition
+from gyrofuse.noise.processes import AR1
+
+_REWEIGHTINGS, _UPDATES = 3, 3
+# By how much more than on the way the last weights' fit may miss, in half nats, before it is thought to go to and fro.
+_CHASING = 1.0
+_GRID_POINTS = 48
+_STEPS_NEAR = 10
+
+
+@dataclass(frozen=True, eq=False)
+class MomentFit:
+    """Minimum of `r' V^-1 r`, `V` that of the fit.
+
+    Attributes:
+        linear: `p`, `(item, process)`, signal^2.
+        shape: `x`, `(item, shaped)`.
+        objective: `r' V^-1 r`, `(item,)`.
+        log_det: `ln det V`, of wavelet variances over the largest, `(item,)`.
+        active: Parameters that are not at an edge, `(item,)`.
+    """
+
+    linear: Tensor
+    shape: Tensor
+    objective: Tensor
+    log_det: Tensor
+    active: Tensor
+
+
+class Moments:
+    """Wavelet variances of records.
+
+    Args:
+        variance: `(item, level)`, finite and > 0.
+        n_samples: Length T of the records.
+    """
+
+    def __init__(self, variance: Tensor, n_samples: int) -> None:
+        self.variance, self.n_samples = variance, n_samples
+        self.size = variance.amax(-1, keepdim=True)
+        self._target = variance / self.size
+        levels = variance.shape[-1]
+        self.records = Records((n_samples,), (levels,))
+        self.tau, self.observations = self.records.tau.to(variance), self.records.observations.to(variance)
+        self._diagonal = self.observations.sqrt() / self._target
+
+    def fit(self, made_of: Composition, starts: list[Tensor]) -> MomentFit:
+        """Climb down from each `x` `(item, shaped)` with weights of the fit: one by one, then its own `V`."""
+        target, tau = self._target, self.tau
+        ends = [self._climbed(made_of, start) for start in starts]
+        lowest = torch.stack([objective.nan_to_num(nan=torch.inf) for *_, objective in ends]).argmin(0)
+        items = torch.arange(len(target), device=target.device)
+        linear, x = (torch.stack(column)[lowest, items] for column in list(zip(*ends, strict=True))[:2])
+        passed = []
+        for _ in range(_UPDATES):
+            root = self._whitening(made_of, linear, x)
+            passed.append(misfit(target, root, tau, made_of, linear, x))
+            linear, x, _, _ = search.minimise(target, root, tau, made_of, x)
+        final = misfit(target, self._whitening(made_of, linear, x), tau, made_of, linear, x)
+        chasing = final > torch.stack(passed).amin(0) + _CHASING
+        if bool(chasing.any()):
+            linear[chasing], x[chasing], _ = damped(
+                target[chasing], self.records, made_of, "optimal", linear[chasing], x[chasing]
+            )
+        return self._summed_up(made_of, linear, x, self._whitening(made_of, linear, x))
+
+    def _climbed(self, made_of: Composition, start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """With independent levels, whose weights are first the measured variances, then the fitted ones.
+
+        A fit to chance in the measured ones, such as one long scale that came out small, would have a `V` to match.
+        """
+        root = self._diagonal
+        linear, x, _, _ = search.minimise(self._target, root, self.tau, made_of, start)
+        for _ in range(_REWEIGHTINGS):
+            fitted = made_of.wavelet_variance(self.tau, linear, x)
+            root = (self.observations.sqrt() / fitted.clamp(min=1e-30)).clamp(max=1e15)
+            linear, x, objective, _ = search.minimise(self._target, root, self.tau, made_of, x)
+        return linear, x, objective - 2 * root.log().sum(-1)
+
+    def near(self, made_of: Composition, linear: Tensor, shape: Tensor) -> MomentFit:
+        """Minimum next to a maximum of the likelihood, with the `V` of that."""
+        root = self._whitening(made_of, linear / self.size, shape)
+        linear, x, _, _ = search.minimise(self._target, root, self.tau, made_of, shape, _STEPS_NEAR)
+        # The maximum is the better estimate, and so is its V.
+        return self._summed_up(made_of, linear, x, root)
+
+    def part(self, items: Tensor) -> Moments:
+        """Of some items."""
+        return Moments(self.variance[items], self.n_samples)
+
+    def _summed_up(self, made_of: Composition, linear: Tensor, x: Tensor, root: Tensor) -> MomentFit:
+        target, tau = self._target, self.tau
+        residual = target - made_of.wavelet_variance(tau, linear, x)
+        objective = (root @ residual[..., None]).square().sum((-2, -1))
+        log_det = -2 * root.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        present = linear > 0
+        active = (present.sum(-1) + present[:, made_of.curved].sum(-1)).to(linear)
+        linear, x = made_of.ordered(linear * self.size, x)
+        return MomentFit(linear, x, objective, log_det, active)
+
+    def estimates(self, made_of: Composition, fit: MomentFit) -> Estimates:
+        """Parameters with their uncertainty."""
+        return infer(self._at(fit.linear, fit.shape), made_of, 0.95).estimates
+
+    def against(self, made_of: Composition, p: Tensor, x: Tensor, spread: Tensor, edge_sd: Tensor) -> Inference:
+        """Efficient estimates from elsewhere, with their uncertainty as in `infer_efficient`, and their J test."""
+        return infer_efficient(self._at(p, x), made_of, spread, edge_sd, 0.95)
+
+    def _at(self, linear: Tensor, shape: Tensor) -> Fit:
+        done = torch.ones(len(linear), dtype=torch.bool, device=linear.device)
+        return Fit(self.variance, linear, shape, shape[:, :0], done, "optimal", self.records)
+
+    def roots(self, made_of: Composition) -> list[Tensor]:
+        """Starts of a composition with at most one shaped process: the best points of a grid."""
+        weight = self._diagonal.square()
+        held = self._target.new_empty(len(self._target), 0)
+        found = search.starting_points(self._target, weight, self.tau, made_of, held, 4)
+        return list(found.unbind(1))
+
+    def widened(self, parent: Composition, fit: MomentFit, made_of: Composition) -> Tensor:
+        """Start of a composition with one process more, a further shape where variances with it fit best."""
+        if len(made_of.shaped) == len(parent.shaped):
+            return fit.shape
+        before, after = ([type(m.processes[k]) for k in m.shaped] for m in (parent, made_of))
+        at = next(i for i, kind in enumerate(after) if before[i : i + 1] != [kind])
+        grid = self._grid(isinstance(made_of.processes[made_of.shaped[at]], AR1))
+        tried = fit.shape[:, None].expand(-1, len(grid), -1)
+        new = grid[:, None].expand(len(fit.shape), -1, 1)
+        tried = torch.cat([tried[..., :at], new, tried[..., at:]], -1)  # (item, point, shaped)
+        columns = made_of.columns(self.tau, tried) * self._diagonal[:, None, :, None]
+        wanted = (self._target * self._diagonal)[:, None, :, None]
+        linear = nonnegative_least_squares(columns.mT @ columns, (columns.mT @ wanted)[..., 0])
+        misfit = (wanted - columns @ linear[..., None]).square().sum((-2, -1))
+        return tried[torch.arange(len(tried), device=tried.device), misfit.argmin(-1)]
+
+    def _grid(self, ar1: bool) -> Tensor:
+        longest = float(self.tau[-1])
+        steps = torch.linspace(0, 1, _GRID_POINTS, dtype=torch.float64, device=self.tau.device)
+        if ar1:
+            phi = torch.exp(-1 / (longest * (1 / (3 * longest)) ** steps))
+            return torch.cat([phi, phi.new_tensor([-0.3, -0.7])]).atanh()
+        return (2 / (4 * longest * (2.01 / (4 * longest)) ** steps)).logit()
+
+    def _whitening(self, made_of: Composition, linear: Tensor, x: Tensor) -> Tensor:
+        return search.whitening(self.records.covariance(made_of.model(linear, x)))

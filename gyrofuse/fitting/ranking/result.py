@@ -1,0 +1,279 @@
+"""Compositions of noise processes, ranked."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import Counter
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from gyrofuse._base.results import chance, counted, listed, p_words, place, signed
+from gyrofuse.fitting.gmwm_result import GMWMResult
+from gyrofuse.fitting.ranking.candidates import name_of
+from gyrofuse.fitting.ranking.table import Table
+from gyrofuse.noise.parsing import parse_model
+from gyrofuse.noise.processes import Sinusoid
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_MOST_TABLES, _MOST_ROWS, _MOST_BARS = 12, 8, 12
+_NONE_FITS = 1e-3  # p-value of the J test
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RankResult:
+    """Candidates for every sensor; `...` are the leading dimensions of the signal.
+
+    Attributes:
+        candidates: Names, such as `WN + AR1 + RW`.
+        criterion: `(..., sensor, candidate)`, less is better; NaN where it was not tried, for a candidate with another
+            number of sinusoids than was found, or a sensor that could not be ranked. Of a signal without the part that
+            sinusoids have in it.
+        wvic: Wavelet variance information criterion, the same.
+        p_value: Of the J test, that the candidate is complete, the same; at the parameters of greatest likelihood. Of
+            a signal it is that of the record without its sinusoids, but for the chosen one that of its fit.
+        redundant: Whether the fit amounts to a smaller candidate that explains the record as well, the same.
+        reasons: Why, for every sensor, `...` flattened, and candidate, and why one that was given was not compared;
+            None where there is nothing to say.
+        equivalent: Whether it is as good as the chosen one, and not it, the same as `criterion`.
+        choice: Index of the chosen candidate, `(..., sensor)`; -1 where a sensor could not be ranked.
+        wvic_choice: Index of that with the least WVIC, the same: no advice, as its weights are from each candidate's
+            own covariance, which is large where the candidate fits badly.
+        n_tones: Sinusoids of those compared, the same, -1 as before; None from a wavelet variance.
+        n_lines: Lines that stand out of the noise, the same, at most one more than candidates have sinusoids.
+        best: Fit of the chosen candidate for every sensor, `...` flattened; None where there is none.
+        n_samples: Length of the records.
+        from_signal: Whether the criterion is that of the spectral likelihood, or of the wavelet variance.
+        sensors: Names.
+    """
+
+    candidates: tuple[str, ...]
+    criterion: Tensor
+    wvic: Tensor
+    p_value: Tensor
+    redundant: Tensor
+    reasons: tuple[tuple[str | None, ...], ...]
+    equivalent: Tensor
+    choice: Tensor
+    wvic_choice: Tensor
+    n_tones: Tensor | None
+    n_lines: Tensor | None
+    best: tuple[GMWMResult | None, ...]
+    n_samples: int
+    from_signal: bool
+    sensors: tuple[str, ...]
+    axes: tuple[str, ...] = ()
+
+    @classmethod
+    def build(
+        cls, *, table: Table, usable: Tensor, batch: tuple[int, ...], best: tuple[GMWMResult | None, ...], **rest: Any
+    ) -> RankResult:
+        """Put the items that could be ranked back into their places among all, `(item,)` -> `(..., sensor)`."""
+
+        def placed(value: Tensor, missing: float | bool) -> Tensor:
+            whole = value.new_full((len(usable), *value.shape[1:]), missing)
+            whole[usable] = value
+            return whole.view(*batch, *value.shape[1:])
+
+        reasons = iter(table.reasons)
+        nothing: list[str | None] = [None] * len(table.kinds)
+        return cls(
+            candidates=tuple(map(name_of, table.kinds)),
+            criterion=placed(table.criterion, torch.nan),
+            wvic=placed(table.wvic, torch.nan),
+            p_value=placed(table.p_value, torch.nan),
+            redundant=placed(table.redundant, False),
+            reasons=tuple(tuple(next(reasons) if there else nothing) for there in usable.tolist()),
+            equivalent=placed(table.equivalent, False),
+            choice=placed(table.choice, -1),
+            wvic_choice=placed(table.wvic_choice, -1),
+            n_tones=None if table.n_tones is None else placed(table.n_tones, -1),
+            n_lines=None if table.n_lines is None else placed(table.n_lines, -1),
+            best=best,
+            **rest,
+        )
+
+    @property
+    def difference(self) -> Tensor:
+        """Criterion less that of the chosen candidate, `(..., sensor, candidate)`; a redundant one may be below 0."""
+        return self.criterion - self.criterion.gather(-1, self.choice.clamp(min=0)[..., None])
+
+    @property
+    def names(self) -> tuple[str | None, ...]:
+        """Chosen for every sensor, `...` flattened."""
+        return tuple(self.candidates[c] if c >= 0 else None for c in self.choice.flatten().tolist())
+
+    @property
+    def compared(self) -> str:
+        """How many candidates were compared, such as `3 of 4 candidates`, and `2 and 3` for sensors that differ."""
+        counts = self.criterion.isfinite().sum(-1)[self.choice >= 0].tolist()
+        whole = counted(len(self.candidates), "candidate")
+        least, most = min(counts), max(counts)
+        if least == most:
+            return whole if most == len(self.candidates) else f"{most} of {whole}"
+        *first, last = map(str, counts)
+        told = f"{', '.join(first)} and {last}" if len(counts) <= _MOST_ROWS else f"{least} to {most}"
+        return f"{told} of {whole}"
+
+    @property
+    def wvic_difference(self) -> Tensor:
+        """WVIC less the least, `(..., sensor, candidate)`."""
+        return self.wvic - self.wvic.nan_to_num(nan=torch.inf).amin(-1, keepdim=True)
+
+    def standing(self, index: tuple[int, ...], c: int) -> str:
+        """Where a candidate stands for a sensor: `chosen`, `not told from it`, `redundant`, or nothing to say.
+
+        What has the chosen one's spectrum and amounts to it is not told from it.
+        """
+        if c == int(self.choice[index]):
+            return "chosen"
+        if bool(self.equivalent[index][c]):
+            return "not told from it"
+        return "redundant" if bool(self.redundant[index][c]) else ""
+
+    def compared_to(self, index: tuple[int, ...]) -> list[int]:
+        """Candidates that were compared for a sensor, from the best on."""
+        difference = self.difference[index]
+        order = difference.nan_to_num(nan=torch.inf).argsort().tolist()
+        return [c for c in order if bool(difference[c].isfinite())]
+
+    def set_aside(self, index: tuple[int, ...]) -> list[int]:
+        """Candidates given that were not compared for a sensor; `reasons` says why."""
+        known = self.reasons_of(index)
+        return [c for c, value in enumerate(self.criterion[index].tolist()) if math.isnan(value) and known[c]]
+
+    def doubts(self, index: tuple[int, ...]) -> list[str]:
+        """What speaks against every candidate of a sensor, in sentences."""
+        found = []
+        if self.none_fits(index):
+            largest = p_words(max(self._tested(index)))
+            found.append(f"No candidate fits: the J test refuses all (largest {largest}).")
+        if self.n_lines is not None and self.n_tones is not None and bool(self.n_lines[index] > self.n_tones[index]):
+            found.append("The spectrum has more lines than those compared have sinusoids: allow more of them (SIN).")
+        return found
+
+    def lines_counted(self, index: tuple[int, ...]) -> bool:
+        """Whether `n_lines` of a sensor is their number, or the count ended at one more than candidates have."""
+        return self.n_lines is not None and int(self.n_lines[index]) <= max(map(_n_tones, self.candidates))
+
+    def none_fits(self, index: tuple[int, ...]) -> bool:
+        """Whether the J test refuses all candidates of a sensor that it could be made of."""
+        return max(self._tested(index), default=1.0) < _NONE_FITS
+
+    def _tested(self, index: tuple[int, ...]) -> list[float]:
+        """P-values of the J tests there are, of candidates compared."""
+        p_values = self.p_value[index]
+        return p_values[p_values.isfinite() & self.criterion[index].isfinite()].tolist()
+
+    def reasons_of(self, index: tuple[int, ...]) -> tuple[str | None, ...]:
+        """`reasons` of a sensor, for every candidate."""
+        return self.reasons[sum(i * step for i, step in zip(index, self.choice.stride(), strict=True))]
+
+    def summary(self) -> str:
+        """The best candidates, sensor by sensor; of a large batch how often each was chosen."""
+        by = f"{'spectral likelihood' if self.from_signal else 'likelihood of the wavelet variance'} (Hannan-Quinn)"
+        n_items = self.choice.numel()
+        lines = [f"Noise models ranked by {by}: {self.n_samples} samples, {self.compared}"]
+        if self.choice.ndim > 1:
+            lines.append(f"{n_items} records in a batch {tuple(self.choice.shape[:-1])}")
+        if n_items > _MOST_TABLES:
+            counts = Counter(name or "not ranked" for name in self.names)
+            lines += [f"  {n:>8}  {name}" for name, n in counts.most_common(_MOST_ROWS)]
+            return "\n".join(lines)
+        for index in itertools.product(*map(range, self.choice.shape)):
+            lines += ["", *self._table(index)]
+        return "\n".join(lines)
+
+    def __str__(self) -> str:
+        return self.summary()
+
+    def _table(self, index: tuple[int, ...]) -> list[str]:
+        head = f"sensor {self._place(index)}"
+        if int(self.choice[index]) < 0:
+            return [f"{head}: not ranked"]
+        lines = [f"{head}: {self.candidates[int(self.choice[index])]}"]
+        same = [name for name, there in zip(self.candidates, self.equivalent[index].tolist(), strict=True) if there]
+        if same:
+            lines.append(f"  not told from it: {', '.join(same)}")
+        lines += [f"  {text}" for text in self.doubts(index)]
+        wide = max(map(len, ("candidate", *self.candidates)))
+        lines.append(f"  {'candidate':<{wide}}  {'criterion':>10}  {'WVIC':>8}  {'J test p':>8}")
+        wvic, difference, reasons = self.wvic_difference[index], self.difference[index], self.reasons_of(index)
+        order = self.compared_to(index)
+        for c in order[:_MOST_ROWS]:
+            row = f"  {self.candidates[c]:<{wide}}  {signed(difference[c].item()):>10}  {signed(wvic[c].item()):>8}"
+            row += f"  {chance(self.p_value[index][c].item()):>8}"
+            told = ": ".join(filter(None, (self.standing(index, c), reasons[c])))
+            lines.append(f"{row}  {told}".rstrip())
+        if len(order) > _MOST_ROWS:
+            lines.append(f"  and {len(order) - _MOST_ROWS} more")
+        lines += [f"  {self.candidates[c]:<{wide}}  not compared: {reasons[c]}" for c in self.set_aside(index)]
+        return lines
+
+    @property
+    def first_ranked(self) -> tuple[int, ...]:
+        """Index of the first sensor that could be ranked."""
+        return tuple((self.choice >= 0).nonzero()[0].tolist())
+
+    def plot(self, ax: Axes | None = None, *, title: str | None = None) -> Axes:
+        """Draw the criterion of the first ranked sensor's best candidates over that of the chosen one.
+
+        Args:
+            ax: Where to draw; a new figure by default.
+            title: By default the sensor, and its place in a batch.
+        """
+        from gyrofuse.fitting.plots import plot_ranking
+
+        first = self.first_ranked
+        compared = self.compared_to(first)
+        order = compared[:_MOST_BARS]
+        aside = self.set_aside(first)[: _MOST_BARS - len(order)]
+        notes = [f"{len(order)} best of {len(compared)}"] if len(order) < len(compared) else []
+        before = int((self.choice.flatten() < 0).cumprod(0).sum())
+        if before:
+            notes.append(f"{counted(before, 'sensor')} before it not ranked")
+        p_value = self.p_value[first][int(self.choice[first])].item()
+        return plot_ranking(
+            [self.candidates[c] for c in order],
+            self.difference[first][order],
+            [self.standing(first, c) for c in order],
+            refused=p_value < _NONE_FITS,
+            aside=[self.candidates[c] for c in aside],
+            title=title or f"sensor {self._place(first)}",
+            note=", ".join(notes),
+            ax=ax,
+        )
+
+    def _place(self, index: tuple[int, ...]) -> str:
+        return place(self.sensors, index, self.axes)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain numbers and lists; what is not known is None."""
+        return {
+            "candidates": list(self.candidates),
+            "names": list(self.names),
+            "criterion": listed(self.criterion),
+            "difference": listed(self.difference),
+            "wvic": listed(self.wvic),
+            "p_value": listed(self.p_value),
+            "redundant": self.redundant.tolist(),
+            "reasons": [list(row) for row in self.reasons],
+            "equivalent": self.equivalent.tolist(),
+            "choice": self.choice.tolist(),
+            "wvic_choice": self.wvic_choice.tolist(),
+            "n_tones": None if self.n_tones is None else self.n_tones.tolist(),
+            "n_lines": None if self.n_lines is None else self.n_lines.tolist(),
+            "best": [None if fit is None else fit.to_dict() for fit in self.best],
+            "n_samples": self.n_samples,
+            "from_signal": self.from_signal,
+            "sensors": list(self.sensors),
+        }
+
+
+def _n_tones(candidate: str) -> int:
+    return sum(isinstance(process, Sinusoid) for process in parse_model(candidate).processes)

@@ -1,0 +1,240 @@
+"""Largest likelihoods of compositions for many records, each climbed to from the best with one process less."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import fields, replace
+from typing import Generic, TypeVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.fitting.ranking import candidates as compositions
+from gyrofuse.fitting.ranking.candidates import Key, Kinds
+from gyrofuse.fitting.ranking.moments import MomentFit, Moments
+from gyrofuse.fitting.ranking.spectra import NoiseFit, Spectra
+from gyrofuse.fitting.structure import Composition
+
+# Penalised likelihoods within a factor of e^2 = 7: the record does not decide.
+EQUIVALENT = 4.0
+# Larger compositions are tried as long as the best of a size is at most so much above the best so far.
+_PATIENCE = 6.0
+# Compositions of one size whose children are tried.
+_BEAM = 3
+# Time constants at which the first AR1 starts, as powers of the length.
+_FIRST_AR1 = (-0.2, 0.2, 0.5, 0.8)
+
+FitT = TypeVar("FitT", NoiseFit, MomentFit)
+
+
+class _Search(ABC, Generic[FitT]):
+    """Fits of compositions to some of the records each.
+
+    Args:
+        n_items: How many records.
+        n_samples: Length T of each.
+        device: Where they are.
+
+    Attributes:
+        held: Sinusoids are no part of what is fitted.
+        afresh: Compositions with one shape start from a grid too.
+        fits: Of all records; NaN where a composition was not tried.
+    """
+
+    held: bool
+    afresh: bool
+
+    def __init__(self, n_items: int, n_samples: int, device: torch.device) -> None:
+        self._everyone, self._n_samples = torch.arange(n_items, device=device), n_samples
+        self.fits: dict[Key, tuple[Composition, FitT]] = {}
+
+    def run(self, wanted: list[Kinds], searching: bool) -> None:
+        """Fit all that are wanted to all records, or search among them for those that matter to each."""
+        if searching:
+            known = {compositions.key_of(kinds) for kinds in wanted}
+            self._widen([kinds for kinds in wanted if len(kinds) == 1], known)
+            self._settle(known)
+            return
+        for kinds in compositions.with_ancestors(wanted):
+            self._try_out(kinds, self._everyone)
+
+    def found(self, key: Key) -> tuple[Composition, Tensor, FitT]:
+        """A composition, the records to which it was fitted, and the fit of those."""
+        made_of, fit = self.fits[key]
+        items = self._loss(fit).isfinite().nonzero()[:, 0]
+        return made_of, items, _part(fit, items)
+
+    def criterion(self, key: Key) -> Tensor:
+        """Of Hannan and Quinn, `(item,)`, infinite where it was not tried."""
+        made_of, fit = self.fits[key]
+        return (self._loss(fit) + compositions.charge(made_of, self._n_samples)).nan_to_num(nan=torch.inf)
+
+    def _widen(self, first: list[Kinds], known: set[Key]) -> None:
+        """From one process to more, for every record the children of its few best, as long as one of them gains."""
+        everyone = torch.ones_like(self._everyone, dtype=torch.bool)
+        best = torch.full_like(self._everyone, torch.inf, dtype=torch.float64)
+        todo = {compositions.key_of(kinds): (kinds, everyone) for kinds in first}
+        while todo:
+            for kinds, which in todo.values():
+                self._try_out(kinds, which.nonzero()[:, 0])
+            found = torch.stack([self.criterion(key) for key in todo])  # (candidate, item)
+            going = found.amin(0) < best + _PATIENCE
+            best = torch.minimum(best, found.amin(0))
+            kept = (found.argsort(0).argsort(0) < _BEAM) & found.isfinite() & going
+            following: dict[Key, tuple[Kinds, Tensor]] = {}
+            for (kinds, _), which in zip(todo.values(), kept, strict=True):
+                for child in compositions.children(kinds, known) if bool(which.any()) else ():
+                    _, other = following.get(compositions.key_of(child), (child, torch.zeros_like(which)))
+                    following[compositions.key_of(child)] = child, which | other
+            todo = following
+
+    def _settle(self, known: set[Key]) -> None:
+        """Compare the best one of each record with all next to it, until none of these is better.
+
+        The beam may hold no parent of a composition for whose processes an AR1 stands in.
+        """
+        seen = {key: self._loss(fit).isfinite() for key, (_, fit) in self.fits.items()}
+        while True:
+            keys = list(self.fits)
+            best = torch.stack([self.criterion(key) for key in keys]).argmin(0)
+            unseen = False
+            for b in best.unique().tolist():
+                made_of, fit = self.fits[keys[b]]
+                for kinds, k in compositions.next_to(compositions.kinds_of(made_of), known):
+                    before = seen.get(compositions.key_of(kinds), torch.zeros_like(best, dtype=torch.bool))
+                    items = ((best == b) & ~before).nonzero()[:, 0]
+                    if len(items):
+                        unseen = True
+                        self._try_out(kinds, items, None if k is None else self._without(made_of, fit, k))
+                        seen[compositions.key_of(kinds)] = before | (best == b)
+            if not unseen:
+                return
+
+    def _without(self, made_of: Composition, fit: FitT, k: int) -> tuple[Composition, FitT]:
+        """A composition less one of its processes, and what is left of its fit."""
+        kinds = compositions.kinds_of(made_of)
+        linear = [i for i in range(made_of.n_linear) if i != k]
+        shape = [i for i, at in enumerate(made_of.shaped) if at != k]
+        left = compositions.composition(kinds[:k] + kinds[k + 1 :], self.held)
+        return left, replace(fit, linear=fit.linear[:, linear], shape=fit.shape[:, shape])
+
+    def _try_out(self, kinds: Kinds, items: Tensor, start: tuple[Composition, FitT] | None = None) -> None:
+        """Fit one composition to some records, from each of its parents: from the best of them alone it may be stuck.
+
+        Where an AR1 of the best one stands for white noise, say, white noise cannot take its place.
+
+        Args:
+            kinds: Processes.
+            items: Which records.
+            start: Another place to start from: a composition with up to two processes less, and its parameters.
+        """
+        made_of = compositions.composition(kinds, self.held)
+        smaller = [self.fits[key] for key in compositions.parents(kinds) if key in self.fits]
+        smaller += [start] if start else []
+        afresh = not smaller or (self.afresh and len(made_of.curved) == 1)
+        found = self._whole(self._first(made_of, items), items) if afresh else None
+        for parent, fit in smaller:
+            own = items[self._loss(fit)[items].isfinite()]
+            if len(own):
+                climbed = self._climb(made_of, own, *self._start(made_of, own, parent, _part(fit, own)))
+                whole = self._whole(climbed, own)
+                found = whole if found is None else self._better(found, whole)
+        key = compositions.key_of(kinds)
+        if found is not None:
+            self.fits[key] = made_of, self._better(self.fits[key][1], found) if key in self.fits else found
+
+    def _whole(self, fit: FitT, items: Tensor) -> FitT:
+        """Of all records, NaN but for these."""
+        return type(fit)(*(_among(items, getattr(fit, f.name), len(self._everyone)) for f in fields(fit)))
+
+    def _better(self, one: FitT, other: FitT) -> FitT:
+        """For each record the fit with less loss."""
+        first = ~(self._loss(other) < self._loss(one).nan_to_num(nan=torch.inf))
+        pairs = ((getattr(one, f.name), getattr(other, f.name)) for f in fields(one))
+        return type(one)(*(torch.where(first.view(-1, *(1,) * (a.ndim - 1)), a, b) for a, b in pairs))
+
+    @abstractmethod
+    def _loss(self, fit: FitT) -> Tensor:
+        """Minus twice the log likelihood `(item,)`."""
+
+    @abstractmethod
+    def _first(self, made_of: Composition, items: Tensor) -> FitT:
+        """Fit a composition from no other one's fit."""
+
+    @abstractmethod
+    def _start(self, made_of: Composition, items: Tensor, parent: Composition, fit: FitT) -> tuple[Tensor, ...]:
+        """Where to start, from a parent's fit to the same records."""
+
+    @abstractmethod
+    def _climb(self, made_of: Composition, items: Tensor, *start: Tensor) -> FitT:
+        """Fit from there."""
+
+
+class SpectralSearch(_Search[NoiseFit]):
+    """By the spectral likelihood of records without lines."""
+
+    held, afresh = True, False
+
+    def __init__(self, spectra: Spectra) -> None:
+        super().__init__(len(spectra.energy), spectra.bins.n_samples, spectra.energy.device)
+        self._spectra = spectra
+
+    def _loss(self, fit: NoiseFit) -> Tensor:
+        return -2 * fit.log_likelihood
+
+    def _first(self, made_of: Composition, items: Tensor) -> NoiseFit:
+        spectra = self._spectra.part(items)
+        size = spectra.energy.sum(-1, keepdim=True) / spectra.count.sum(-1, keepdim=True)
+        linear = size.expand(-1, made_of.n_linear)
+        if not made_of.shaped:
+            return spectra.fit(made_of, linear, linear[:, :0])
+        constants = (float(self._n_samples) ** power for power in _FIRST_AR1)
+        ends = [spectra.fit(made_of, linear, torch.full_like(size, math.atanh(math.exp(-1 / c)))) for c in constants]
+        best = ends[0]
+        for other in ends[1:]:
+            best = self._better(best, other)
+        return best
+
+    def _start(self, made_of: Composition, items: Tensor, parent: Composition, fit: NoiseFit) -> tuple[Tensor, ...]:
+        return self._spectra.part(items).widened(parent, fit, made_of)
+
+    def _climb(self, made_of: Composition, items: Tensor, *start: Tensor) -> NoiseFit:
+        linear, shape = start
+        return self._spectra.part(items).fit(made_of, linear, shape)
+
+
+class MomentSearch(_Search[MomentFit]):
+    """By the likelihood of wavelet variances, taken for normal with the `V` of each fit."""
+
+    # The few long scales by which a shape is known are noisy: a smaller composition's fit may lead away from it.
+    held, afresh = False, True
+
+    def __init__(self, moments: Moments) -> None:
+        super().__init__(len(moments.variance), moments.n_samples, moments.variance.device)
+        self._moments = moments
+
+    def _loss(self, fit: MomentFit) -> Tensor:
+        return fit.objective + fit.log_det
+
+    def _first(self, made_of: Composition, items: Tensor) -> MomentFit:
+        moments = self._moments.part(items)
+        return moments.fit(made_of, moments.roots(made_of))
+
+    def _start(self, made_of: Composition, items: Tensor, parent: Composition, fit: MomentFit) -> tuple[Tensor, ...]:
+        return (self._moments.part(items).widened(parent, fit, made_of),)
+
+    def _climb(self, made_of: Composition, items: Tensor, *start: Tensor) -> MomentFit:
+        return self._moments.part(items).fit(made_of, list(start))
+
+
+def _part(fit: FitT, items: Tensor) -> FitT:
+    """Of some records."""
+    return type(fit)(*(getattr(fit, f.name)[items] for f in fields(fit)))
+
+
+def _among(places: Tensor, values: Tensor, n_items: int) -> Tensor:
+    """Values in their places among so many, NaN elsewhere."""
+    whole = values.new_full((n_items, *values.shape[1:]), torch.nan)
+    whole[places] = values
+    return whole

@@ -1,0 +1,1 @@
+"""Pages and sentences about fitted noise models."""

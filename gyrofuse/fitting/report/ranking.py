@@ -1,0 +1,154 @@
+"""Report of ranked noise models as one self-contained HTML page."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from gyrofuse._base.page import number, render
+from gyrofuse._base.results import chance, counted, p_words, place, signed
+from gyrofuse.fitting.gmwm_result import REFUSED
+from gyrofuse.fitting.moments.fit import composition_of
+from gyrofuse.fitting.ranking.candidates import charge, n_parameters
+from gyrofuse.fitting.ranking.result import RankResult
+from gyrofuse.fitting.report.page import model_part
+from gyrofuse.fitting.report.words import model_method
+from gyrofuse.io.recording import Recording
+
+# Pages stay readable; the JSON file holds all.
+_MOST_SENSORS, _MOST_ROWS = 24, 15
+_NO_GAIN = 0.1  # nats
+_MOST_NATS = 15.0  # beyond, a ratio is no number to print
+
+
+def rank_report(
+    result: RankResult, recording: Recording | None = None, *, title: str, remarks: Sequence[str] = ()
+) -> str:
+    """Write the report of noise models ranked for the sensors of a recording.
+
+    Args:
+        result: Of the sensors of one array, or of one per axis.
+        recording: What was ranked, for its notes.
+        title: Heading of the page.
+        remarks: Sentences shown below the verdict.
+
+    Returns:
+        An HTML page that needs no other file, no network and no script.
+    """
+    indices = list(itertools.product(*map(range, result.choice.shape)))
+    parts = [_part(result, recording, n, index) for n, index in enumerate(indices[:_MOST_SENSORS])]
+    fits = [fit for fit in result.best if fit is not None]
+    return render(
+        Path(__file__).parent / "ranking.html.j2",
+        title=title,
+        result=result,
+        recording=recording,
+        parts=parts,
+        remarks=remarks,
+        left_out=len(indices) - len(parts),
+        method=model_method(fits[0]) if fits else None,
+    )
+
+
+def rank_verdict(result: RankResult, index: tuple[int, ...]) -> list[str]:
+    """Say in sentences which model a sensor has, what is as good, and why the next one is not.
+
+    Args:
+        result: Ranked.
+        index: Of the sensor among the leading dimensions.
+    """
+    if int(result.choice[index]) < 0:
+        return ["Not ranked: its record does not vary or has missing samples."]
+    return list(_sentences(result, index))
+
+
+def _sentences(result: RankResult, index: tuple[int, ...]) -> Iterator[str]:
+    names, choice = result.candidates, int(result.choice[index])
+    rows = _rows(result, index)
+    if len(rows) > 1:
+        yield f"{names[choice]} is the best of {len(rows)} candidates tried."
+    else:
+        yield f"{names[choice]} is the only candidate that was tried."
+    aside: dict[str, list[str]] = {}
+    for c in result.set_aside(index):
+        aside.setdefault(str(result.reasons_of(index)[c]), []).append(names[c])
+    for reason, those in aside.items():
+        yield f"Not compared: {', '.join(those)} ({reason})."
+    yield from result.doubts(index)
+    if result.n_lines is not None and (n_lines := int(result.n_lines[index])):
+        found = "One line" if n_lines == 1 else f"{n_lines} lines"
+        if not result.lines_counted(index):
+            found = f"At least {found.lower()}"
+        yield f"{found} stand{'s' if n_lines == 1 else ''} out of the noise in the spectrum."
+    same = [row["name"] for row in rows if row["standing"] == "not told from it"]
+    if same:
+        yield f"The record does not tell it from {', '.join(same)}."
+    for row in rows:
+        if row["reason"] and row["difference"] < 0:
+            better = f"a criterion {-row['difference']:.1f} below, but is more than it takes: {row['reason']}."
+            yield f"{row['name']} has {better}"
+    others = [row for row in rows if row["standing"] in ("", "redundant") and row["difference"] >= 0]
+    if others:
+        which = "The runner-up" if others[0] is rows[1] else "The next one"
+        yield f"{which}, {others[0]['name']}, {_why_not(result, index, others[0])}."
+
+
+def _why_not(result: RankResult, index: tuple[int, ...], row: dict[str, Any]) -> str:
+    """Why the next one lost."""
+    own, chosen = (
+        composition_of(name, held=True) for name in (row["name"], result.candidates[int(result.choice[index])])
+    )
+    more = n_parameters(own) - n_parameters(chosen)
+    charged = (charge(own, result.n_samples) - charge(chosen, result.n_samples)) / 2
+    nats = row["difference"] / 2
+    if more > 0 and abs(charged - nats) < _NO_GAIN:
+        what = f"no likelihood gained for {counted(more, 'more number')}"
+    elif nats < _MOST_NATS:
+        what = f"{number(math.exp(nats), 2)} times less likely, with its numbers charged for"
+    else:
+        what = "beyond any doubt"
+    told = f"has a criterion {row['difference']:.1f} above ({what})"
+    if row["reason"]:
+        return f"{told} and is more than it takes: {row['reason']}"
+    # That is against it only where the chosen one fits.
+    if row["p_value"] < REFUSED <= result.p_value[index][int(result.choice[index])].item():
+        return f"{told}; its wavelet variances do not fit (J test: {p_words(row['p_value'])})"
+    return told
+
+
+def _part(result: RankResult, recording: Recording | None, n: int, index: tuple[int, ...]) -> dict[str, Any]:
+    name, fit = f"Sensor {place(result.sensors, index, result.axes)}", result.best[n]
+    rows = _rows(result, index)
+    return {
+        "name": name,
+        "anchor": f"fit-{n + 1}",
+        "verdict": rank_verdict(result, index),
+        "rows": rows[:_MOST_ROWS],
+        "more": len(rows[_MOST_ROWS:]),
+        "fit": None if fit is None else model_part(fit, (0,), name),
+    }
+
+
+def _rows(result: RankResult, index: tuple[int, ...]) -> list[dict[str, Any]]:
+    """The candidates that were tried, from the best on."""
+    if int(result.choice[index]) < 0:
+        return []
+    rows = []
+    for c in result.compared_to(index):
+        difference = result.difference[index][c].item()
+        rows.append(
+            {
+                "name": result.candidates[c],
+                "difference": difference,
+                "criterion": signed(difference),
+                "wvic": signed(result.wvic_difference[index][c].item()),
+                "p_value": result.p_value[index][c].item(),
+                "p": chance(result.p_value[index][c].item()),
+                "standing": result.standing(index, c),
+                "reason": result.reasons_of(index)[c],
+            }
+        )
+    return sorted(rows, key=lambda row: (row["difference"], row["standing"] != "chosen"))

@@ -1,0 +1,1 @@
+"""Whittle's likelihood of the spectrum, and spectral lines."""

@@ -1,0 +1,60 @@
+"""Tones of a model's sinusoids in records, looked for twice where the first look leaves doubt.
+
+The first look takes the background from the periodogram itself, which bends to follow a tone of few cycles and hides
+it. The second one has the spectrum of noise processes fitted to the record: it can rise, but has no peaks.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields
+
+import torch
+from torch import Tensor
+
+from gyrofuse.fitting.ranking.spectra import Spectra, detrended, reference_density
+from gyrofuse.fitting.spectral.tones import Tones, find_tones
+from gyrofuse.fitting.spectral.whittle import _of
+from gyrofuse.fitting.structure import Composition
+from gyrofuse.noise.processes import Drift, Sinusoid
+
+# A line is beyond doubt with so many cycles in the record and a p value so small.
+_MANY_CYCLES, _BEYOND_CHANCE = 30, 1e-4
+
+
+def model_tones(series: Tensor, made_of: Composition) -> Tones | None:
+    """Find the sinusoids of a model in the spectra of records `(item, time)`, from high to low frequency.
+
+    Returns:
+        `(item, sinusoid)`, float64; None where the model has no sinusoids.
+    """
+    n_tones = sum(isinstance(p, Sinusoid) for p in made_of.processes)
+    if n_tones == 0:
+        return None
+    series = series.to(torch.float64)
+    found = find_tones(series, n_tones)
+    cycles = found.beta * series.shape[-1] / (2 * math.pi)
+    doubtful = ((cycles < _MANY_CYCLES) | ~(found.p_value < _BEYOND_CHANCE)).any(-1)
+    if bool(doubtful.any()):
+        ramp = any(isinstance(p, Drift) for p in made_of.processes)
+        again = _second_look(detrended(series[doubtful]) if ramp else series[doubtful], _of(found, doubtful))
+        for field in fields(Tones):
+            getattr(found, field.name)[doubtful] = getattr(again, field.name)
+    order = found.beta.argsort(-1, descending=True)
+    return Tones(*(value.gather(-1, order) for value in vars(found).values()))
+
+
+def _second_look(series: Tensor, found: Tones) -> Tones:
+    """As many lines as were found, the largest over the spectrum fitted to what is no line.
+
+    The largest slow line beside those found may be a tone that was missed; in the record to which noise is fitted it
+    would raise the spectrum and hide itself, so that it is left out there too. It is a tone if it then stands out more
+    than those found.
+    """
+    n_samples = series.shape[-1]
+    density = reference_density(Spectra(series, found))
+    rest = series - found.waveform(n_samples)
+    missed = find_tones(rest, 1, density, highest=min(2 * math.pi * _MANY_CYCLES / n_samples, math.pi))
+    pairs = zip(vars(found).values(), vars(missed).values(), strict=True)
+    lines = Tones(*(torch.cat(pair, -1) for pair in pairs))
+    return find_tones(series, found.beta.shape[-1], reference_density(Spectra(series, lines)))

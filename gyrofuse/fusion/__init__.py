@@ -1,0 +1,1 @@
+"""An array of gyros as one virtual gyro."""

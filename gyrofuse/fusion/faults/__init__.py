@@ -1,0 +1,1 @@
+"""Which sensor of an array no longer agrees with the others."""

@@ -1,0 +1,336 @@
+"""A fitted multi-scale virtual gyro: weights of every band, what they gain, and the causal filter that applies them."""
+
+from __future__ import annotations
+
+import textwrap
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from gyrofuse._base.checks import check_signal
+from gyrofuse._base.results import ConfidenceInterval, listed, numbered
+from gyrofuse.fusion.result import SVOResult, plot_deviations
+from gyrofuse.fusion.uncertainty.cross_fitting import CrossFit
+from gyrofuse.io.recording import Recording
+from gyrofuse.wavelets.tiles import tile_length
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_MOST_SENSORS = 11  # columns of weights that a line of text holds
+
+
+def fuse_bands(weights: Tensor, signal: Tensor, state: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Fuse every band of a signal with its own weights, causally and without delay.
+
+    With `s_k,t` the mean of the last `2**k` samples and `d_k = s_{k-1} - s_k`,
+
+        y = sum_{k=1..K} c_k' d_k + c_{K+1}' s_K = x_1 + sum_{k=0..K} a_k' s_k(x - x_1),
+
+    where `a_0 = c_1` and `a_k = c_{k+1} - c_k`, as the weights of each band sum to 1. Only differences from the first
+    sensor are filtered; what all sensors have in common passes unchanged, to the last bit. The means come from the
+    pyramid `s_k,t = (s_{k-1,t} + s_{k-1,t-h}) / 2`, `h = 2**(k-1)`, which has no running sum to drift.
+
+    A time at which any sensor lacks its sample gives NaN and is left out of all means; so is the time before the
+    start. A mean that has seen fewer than `2**k` samples is that of those.
+
+    Args:
+        weights: `(..., band, sensor)`, each band sums to 1; the shortest time scale first.
+        signal: `(..., sensor, time)`.
+        state: What the filter has kept of the past, `(..., sensor, 2**(bands - 1) - 1)`, as returned; the start of
+            a stream by default.
+
+    Returns:
+        The virtual signal `(..., time)` and the state after it.
+
+    Raises:
+        TypeError: `signal` is not a floating point tensor.
+        ValueError: `signal` or `state` does not fit the weights.
+    """
+    check_signal("signal", signal)
+    n_bands, n_sensors = weights.shape[-2:]
+    if signal.shape[-2] != n_sensors:
+        raise ValueError(
+            f"`signal`: expected (..., sensor, time) with the {n_sensors} sensors that the weights are for, "
+            f"got shape {tuple(signal.shape)}"
+        )
+    shape = (*signal.shape[:-1], 2 ** (n_bands - 1) - 1)
+    if state is None:
+        state = signal.new_zeros(shape)
+    elif state.shape != shape:
+        raise ValueError(f"`state`: expected shape {shape} for this signal, got {tuple(state.shape)}")
+    # c_1, c_2 - c_1, ...: what each mean adds; the first sensor is the reference.
+    steps = torch.cat([weights[..., :1, 1:], weights[..., 1:, 1:].diff(dim=-2, prepend=weights[..., :1, 1:])], dim=-2)
+    steps = steps.to(signal.dtype)
+    if torch.compiler.is_compiling():
+        return _filter(steps, signal, state)
+    # Tiles of time that pass through all bands while they are in cache, no shorter than the state they carry.
+    tile = max(tile_length(signal.shape[:-1].numel(), signal.device, None), shape[-1])
+    outputs = []
+    for chunk in signal.split(tile, dim=-1):
+        output, state = _filter(steps, chunk, state)
+        outputs.append(output)
+    return torch.cat(outputs, dim=-1), state
+
+
+def _filter(steps: Tensor, signal: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+    """`fuse_bands` with weights as steps `(..., band, sensor - 1)`.
+
+    The state holds, for each pyramid level, the last `h` of its means and, in the last row, of how many samples each
+    mean is taken over.
+    """
+    time = signal.shape[-1]
+    known = signal.isfinite().all(-2, keepdim=True)
+    first = signal[..., :1, :]
+    mean = torch.where(known, signal[..., 1:, :] - first, 0.0)  # (..., sensor - 1, time)
+    count = known.to(signal.dtype)  # (..., 1, time)
+    fused = steps[..., :1, :] @ mean
+    kept = []
+    for band in range(1, steps.shape[-2]):
+        lag = 2 ** (band - 1)
+        before = state[..., lag - 1 : 2 * lag - 1]
+        means = torch.cat([before[..., :-1, :], mean], dim=-1)
+        counts = torch.cat([before[..., -1:, :], count], dim=-1)
+        kept.append(torch.cat([means[..., time:], counts[..., time:]], dim=-2))
+        past, n_past = means[..., :time], counts[..., :time]
+        n_both = count + n_past
+        # Weighted by counts: 1/2 within the stream, 0 before its start.
+        mean = torch.lerp(mean, past, n_past / n_both.clamp(min=1.0))
+        count = n_both
+        fused = fused + steps[..., band : band + 1, :] @ mean
+    virtual = torch.where(known, first + fused, torch.nan).squeeze(-2)
+    return virtual, torch.cat(kept, dim=-1) if kept else state
+
+
+def well_observed(degrees: Tensor, n_sensors: int) -> Tensor:
+    """Levels `(..., level)` that, like all below them, hold no fewer observations than there are sensors.
+
+    Args:
+        degrees: Independent observations, `(..., level)`.
+        n_sensors: Number of sensors.
+    """
+    return (degrees >= n_sensors).int().cumprod(-1).bool()
+
+
+@dataclass(frozen=True, eq=False)
+class MultiScaleResult:
+    """A fitted multi-scale virtual gyro. Batched over the leading dimensions of the signal; index it to get one item.
+
+    Attributes:
+        weights: `(..., band, sensor)`; each band sums to 1, weights may be negative. Band `k = 1..K` is the difference
+            between the means over the last `2**(k-1)` and `2**k` samples, the last band the mean over `2**K`.
+        in_sample_wavelet_variance: `(..., level)`, of the recording itself fused with these weights, signal^2; they
+            flatter themselves in it.
+        cross_fit: How that compares with their variance in other recordings.
+        optimal_wavelet_variance: `(..., level)`, estimate of the smallest wavelet variance that one vector of weights
+            can have at that level alone, `1 / (1' S_j^-1 1)`, signal^2, where `S_j` is `Gamma_j` shrunk towards the
+            level below; on the low side at the last levels. No lower bound of `virtual_wavelet_variance`: bands weigh
+            the time scales within a level apart, and they are chosen from the very recording.
+        single: One vector of weights for all scales, by `fit_svo` from the same recording and scale weights.
+    """
+
+    weights: Tensor
+    in_sample_wavelet_variance: Tensor
+    cross_fit: CrossFit
+    optimal_wavelet_variance: Tensor
+    single: SVOResult
+
+    @property
+    def method(self) -> str:
+        """How the weights were chosen, `"multiscale"`."""
+        return "multiscale"
+
+    @property
+    def n_bands(self) -> int:
+        """Number of bands."""
+        return self.weights.shape[-2]
+
+    @property
+    def n_levels(self) -> int:
+        """Number of levels J."""
+        return self.single.n_levels
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Name of each sensor."""
+        return self.single.sensors
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Names along the leading dimension, empty when it has none."""
+        return self.single.axes
+
+    @property
+    def rate(self) -> float | None:
+        """Sampling rate in Hz, when known."""
+        return self.single.rate
+
+    @property
+    def unit(self) -> str | None:
+        """Unit of the signal, when known."""
+        return self.single.unit
+
+    @property
+    def n_samples(self) -> int:
+        """Length of the signal."""
+        return self.single.n_samples
+
+    @property
+    def scale_weights(self) -> Tensor:
+        """`(level,)`, sum 1: how much each level counts, relative to its optimum."""
+        return self.single.scale_weights
+
+    @property
+    def degrees_of_freedom(self) -> Tensor:
+        """`(..., level)`, independent observations of the virtual gyro that a level holds."""
+        return self.single.degrees_of_freedom
+
+    @property
+    def confidence_level(self) -> float:
+        """Of the intervals."""
+        return self.single.confidence_level
+
+    @property
+    def tau(self) -> Tensor:
+        """Averaging time of each level, and of each band but the last, which holds all that is slower."""
+        return self.single.tau
+
+    @property
+    def wavelet_variance(self) -> Tensor:
+        """Wavelet variance of every sensor, `(..., level, sensor)`."""
+        return self.single.wavelet_variance
+
+    @property
+    def equal_wavelet_variance(self) -> Tensor:
+        """Wavelet variance of the plain mean of the sensors, `(..., level)`."""
+        return self.single.equal_wavelet_variance
+
+    @property
+    def motion(self) -> str:
+        """A warning that the array seems to have moved while it was fitted, or an empty string."""
+        return self.single.motion
+
+    @property
+    def virtual_wavelet_variance(self) -> Tensor:
+        """Wavelet variance of the virtual gyro in other recordings of the array, cross-fitted, `(..., level)`."""
+        return self.in_sample_wavelet_variance * (1 + self.cross_fit.optimism).to(self.weights)
+
+    def interval_of(self, wavelet_variance: Tensor) -> ConfidenceInterval:
+        """Limits `(..., level)` of `virtual_wavelet_variance`, or of that of another combination as slow as it."""
+        return self.cross_fit.limits_of(wavelet_variance)
+
+    def virtual(self, signal: Tensor | Recording) -> Tensor:
+        """Fuse a signal with these weights: `(..., sensor, time)` to `(..., time)`.
+
+        A sample that any sensor lacks is NaN; the signal starts anew, see `MultiScaleSVO` for streams.
+        """
+        values = signal.signal if isinstance(signal, Recording) else signal
+        return fuse_bands(self.weights, values)[0]
+
+    def __getitem__(self, item: Any) -> MultiScaleResult:
+        """One item, or some, of the leading batch dimensions."""
+        single = self.single[item]
+        batched = ("weights", "in_sample_wavelet_variance", "cross_fit", "optimal_wavelet_variance")
+        return replace(self, single=single, **{name: getattr(self, name)[item] for name in batched})
+
+    def summary(self) -> str:
+        """The weights of every band and the gain per level, as fixed-width text."""
+        if self.weights.ndim > 2:
+            names = self.axes or numbered(self.weights.shape[0])
+            parts = [f"[{name}]\n{self[i].summary()}" for i, name in enumerate(names[:8])]
+            if len(names) > 8:
+                parts.append(f"... and {len(names) - 8} more")
+            return "\n\n".join(parts)
+        unit, second = self.unit or "signal", "s" if self.rate else "samples"
+        rate = f", {self.rate:.6g} Hz" if self.rate else ""
+        shown = self.sensors[:_MOST_SENSORS]
+        more = f" (first {len(shown)} of {len(self.sensors)} sensors)" if len(shown) < len(self.sensors) else ""
+        lines = [
+            f"Multi-scale virtual gyro ({self.n_bands} bands) of {len(self.sensors)} sensors, "
+            f"{self.n_samples} samples{rate}",
+            "",
+            f"Weights of each band of time scale tau{more}",
+            f"{f'tau ({second})':>13}  " + " ".join(f"{name[:8]:>8}" for name in shown),
+        ]
+        places = [f"{tau:.6g}" for tau in self.tau[: self.n_bands - 1].tolist()] + ["longer"]
+        lines += [
+            f"{place:>13}  " + " ".join(f"{weight:>+8.4f}" for weight in row[: len(shown)])
+            for place, row in zip(places, self.weights.tolist(), strict=True)
+        ]
+        lines += [
+            "",
+            f"Allan deviation ({unit}) at averaging time tau, of the virtual gyro and one vector in other recordings",
+            f"{'level':>5}  {f'tau ({second})':>13}  {'best sensor':>12}  {'equal':>12}  {'one vector':>12}"
+            f"  {'virtual':>12}  {'virtual/equal':>13}",
+        ]
+        best, equal, one, virtual = (
+            (2 * variance).sqrt()
+            for variance in (
+                self.wavelet_variance.amin(-1),
+                self.equal_wavelet_variance,
+                self.single.virtual_wavelet_variance,
+                self.virtual_wavelet_variance,
+            )
+        )
+        columns = (self.tau, best, equal, one, virtual, virtual / equal)
+        for j, row in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
+            tau, *deviations, ratio = row
+            numbers = "  ".join(f"{value:>12.5g}" for value in deviations)
+            lines.append(f"{j + 1:>5}  {tau:>13.6g}  {numbers}  {ratio:>13.4f}")
+        few = ~well_observed(self.degrees_of_freedom, len(self.sensors)) & self.virtual_wavelet_variance.isfinite()
+        if bool(few.any()):
+            start = f"{self.tau[int(few.nonzero()[0])].item():.6g} {second}"
+            most = self.degrees_of_freedom[few].max().item()
+            told = (
+                f"Few observations: from {start} on, {most:.2g} or less, fewer than sensors; what is gained there "
+                "follows from a model of the noise, and another recording has to confirm it."
+            )
+            lines += ["", textwrap.fill(told, 110)]
+        if self.motion:
+            lines += ["", f"Warning: {self.motion}."]
+        return "\n".join(lines)
+
+    def __str__(self) -> str:
+        return self.summary()
+
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Draw the Allan deviation of every sensor, the plain mean and the virtual gyro, with the latter's band.
+
+        Args:
+            ax: Where to draw; new axes by default.
+
+        Returns:
+            The axes.
+
+        Raises:
+            ValueError: The result holds a batch; index it first.
+        """
+        virtual = self.virtual_wavelet_variance
+        return plot_deviations(self.single, virtual, self.interval_of(virtual), ax)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain lists and numbers, ready for JSON (NaN as None)."""
+        return {
+            "method": self.method,
+            "sensors": list(self.sensors),
+            "axes": list(self.axes),
+            "rate": self.rate,
+            "unit": self.unit,
+            "n_samples": self.n_samples,
+            "motion": self.motion,
+            "n_bands": self.n_bands,
+            "weights": listed(self.weights),
+            "scale_weights": listed(self.scale_weights),
+            "tau": listed(self.tau),
+            "degrees_of_freedom": listed(self.degrees_of_freedom),
+            "wavelet_cross_covariance": listed(self.single.wavelet_cross_covariance),
+            "wavelet_variance": listed(self.wavelet_variance),
+            "virtual_wavelet_variance": listed(self.virtual_wavelet_variance),
+            "in_sample_wavelet_variance": listed(self.in_sample_wavelet_variance),
+            "optimal_wavelet_variance": listed(self.optimal_wavelet_variance),
+            "equal_wavelet_variance": listed(self.equal_wavelet_variance),
+            "single_wavelet_variance": listed(self.single.virtual_wavelet_variance),
+            "single_weights": listed(self.single.weights),
+        }

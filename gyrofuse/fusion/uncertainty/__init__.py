@@ -1,0 +1,1 @@
+"""How far weights, and what they gain, may be off."""

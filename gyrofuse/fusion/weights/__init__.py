@@ -1,0 +1,1 @@
+"""Weights of sensors: the optimal ones, and those they are compared with."""

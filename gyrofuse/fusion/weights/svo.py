@@ -1,0 +1,87 @@
+"""Optimal weights in closed form, as a function and as a layer.
+
+The weights minimise the wavelet variance of the virtual signal, summed over levels with scale weights `omega_j`:
+
+    A = sum_j omega_j Gamma_j,   c = A^-1 1 / (1' A^-1 1)                                   [Z] equations (6), (7)
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from gyrofuse._base.checks import check_floating
+from gyrofuse._base.linalg import check_positive_definite
+from gyrofuse.fusion.weights.scale_weights import ScaleWeights, normalised, resolve_scale_weights
+
+
+def svo_weights(wccv: Tensor, scale_weights: ScaleWeights = "flat") -> Tensor:
+    """Optimal weights of an array from its wavelet cross-covariance; differentiable.
+
+    Args:
+        wccv: `(..., level, sensor, sensor)`, signal^2.
+        scale_weights: `"flat"`, `"short"`, `"long"`, or one number >= 0 per level.
+
+    Returns:
+        `(..., sensor)`, sum 1, may be negative.
+
+    Raises:
+        TypeError: `wccv` is not a floating point tensor.
+        ValueError: Wrong shape or scale weights.
+        SingularCovarianceError: `A` is not positive definite (a dead or duplicated sensor, say).
+
+    References:
+        [Z] equation (7).
+    """
+    omega = resolve_scale_weights(scale_weights, _check_levels(wccv)).to(wccv)
+    combined = combine(counting(wccv, omega), omega)
+    check_positive_definite("the wavelet cross-covariance combined over scales", combined)
+    return optimal_weights(combined)
+
+
+class SVOWeights(nn.Module):
+    """`svo_weights` as a layer, without looking at values: `nn.Sequential(HaarFilterBank(J), CrossCovariance(),
+    SVOWeights("long"))` maps a signal to its weights, differentiable end to end.
+
+    Args:
+        scale_weights: `"flat"`, `"short"`, `"long"`, or one number >= 0 per level.
+    """
+
+    def __init__(self, scale_weights: ScaleWeights = "flat") -> None:
+        super().__init__()
+        self.scale_weights = scale_weights
+        # The values of numbers are looked at here, once.
+        self._numbers = None if isinstance(scale_weights, str) else normalised(scale_weights)
+
+    def forward(self, wccv: Tensor) -> Tensor:
+        """Map `(..., level, sensor, sensor)` to `(..., sensor)`."""
+        n_levels, omega = _check_levels(wccv), self._numbers
+        if omega is None:
+            omega = resolve_scale_weights(self.scale_weights, n_levels)
+        elif len(omega) != n_levels:
+            raise ValueError(f"`wccv`: expected {len(omega)} levels, one for each scale weight, got {n_levels}")
+        omega = omega.to(wccv)
+        return optimal_weights(combine(counting(wccv, omega), omega))
+
+
+def combine(wccv: Tensor, omega: Tensor) -> Tensor:
+    """`A = sum_j omega_j Gamma_j`, [Z] equation (6)."""
+    return torch.einsum("j,...jik->...ik", omega.to(wccv), wccv)
+
+
+def counting(wccv: Tensor, omega: Tensor) -> Tensor:
+    """Levels that count; one that does not may well be unknown (NaN)."""
+    return torch.where(omega.to(wccv.device)[:, None, None] > 0, wccv, 0.0)
+
+
+def optimal_weights(combined: Tensor) -> Tensor:
+    """`c = A^-1 1 / (1' A^-1 1)`, [Z] equation (7)."""
+    solved = torch.linalg.solve(combined, combined.new_ones(combined.shape[-1]).expand(combined.shape[:-1]))
+    return solved / solved.sum(-1, keepdim=True)
+
+
+def _check_levels(wccv: Tensor) -> int:
+    check_floating("wccv", wccv)
+    if wccv.ndim < 3 or wccv.shape[-1] != wccv.shape[-2]:
+        raise ValueError(f"`wccv`: expected (..., level, sensor, sensor), got shape {tuple(wccv.shape)}")
+    return wccv.shape[-3]
