@@ -3,9 +3,9 @@
 Six gyros on each axis share a vibration at 11.3 Hz, each by its own amount, and have noise of their own. A recording on
 the ground gives the weights of three virtual gyros (plain mean, SVO, multi-scale). Another one, in which they do not
 flatter themselves, gives a noise model of each, white noise, an AR1 and a random walk. `gyrofuse.diagnose` compares the
-plain mean with its model and finds the tone. The array's noise is then fitted with a tone, and `gyrofuse.fitting.virtual_noise`
-says what each virtual gyro makes of it. Flights of 235 s, satellites away from 160 to 210 s, are estimated with the
-error of every virtual gyro and either tuning.
+plain mean with its model and finds the tone. The array's noise is then fitted with a tone, and
+`gyrofuse.fitting.virtual_noise` says what each virtual gyro makes of it. Flights of 235 s, satellites away from 160 to
+210 s, are estimated with the error of every virtual gyro and either tuning.
 
     python examples/vibration_flight.py [--flights 40] [--rate 100] [--quick] [--figure flight.png]
 """

@@ -25,7 +25,8 @@ from typing import TYPE_CHECKING, Any
 from gyrofuse._base import __version__ as __version__
 from gyrofuse._base.linalg import SingularCovarianceError
 from gyrofuse._base.results import ConfidenceInterval
-from gyrofuse.export import to_c_header, to_kalibr
+from gyrofuse.export.c_header import to_c_header
+from gyrofuse.export.kalibr import to_kalibr
 from gyrofuse.fitting.array.gmwm import fit_array_gmwm
 from gyrofuse.fitting.array.result import ArrayGMWMResult
 from gyrofuse.fitting.bootstrap import GMWMBootstrap, bootstrap_gmwm

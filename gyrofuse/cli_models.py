@@ -30,7 +30,8 @@ from gyrofuse.cli_shared import (
     without_gaps,
     write_json,
 )
-from gyrofuse.export import to_c_header, to_kalibr
+from gyrofuse.export.c_header import to_c_header
+from gyrofuse.export.kalibr import to_kalibr
 from gyrofuse.fitting.gmwm import fit_gmwm
 from gyrofuse.fitting.gmwm_result import GMWMResult
 from gyrofuse.fitting.ranking.rank import rank_models

@@ -313,6 +313,19 @@ class Process(Model):
         return f"{type(self).__name__}({', '.join(known)})"
 
 
+def check_scalar(name: str, model: Model) -> None:
+    """Raise when the argument `name` is no model, or a batch of models."""
+    if not isinstance(model, Model):
+        raise TypeError(
+            f"`{name}`: expected a model, got {type(model).__name__} {model!r}; a formula has no values: fit it"
+        )
+    if model.params.ndim > 1:
+        raise ValueError(
+            f"`{name}`: expected scalar parameters, got a batch of shape {tuple(model.params.shape[:-1])}; "
+            "pick one item with model.with_params(model.params[i])"
+        )
+
+
 def domain(expected: str, holds: Callable[[Tensor], Tensor]) -> dict[str, Any]:
     """Domain of a parameter, in words and as an elementwise test."""
     return {"expected": expected, "holds": holds}

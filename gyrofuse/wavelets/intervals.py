@@ -1,8 +1,8 @@
 """Confidence intervals of wavelet variances and cross-covariances that hold at every level.
 
-A level with many windows side by side tells its own variance by its series (`gyrofuse.wavelets.long_run_variance`), whatever the noise is.
-At the last levels a pilot model (`gyrofuse.wavelets.pilot`) says how many independent observations they hold, and a chi-square
-law the rest.
+A level with many windows side by side tells its own variance by its series (`gyrofuse.wavelets.long_run_variance`),
+whatever the noise is. At the last levels a pilot model (`gyrofuse.wavelets.pilot`) says how many independent
+observations they hold, and a chi-square law the rest.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Sums of wavelet products over long recordings, one cache-sized tile of time after another.
 
-The same pyramid as in `gyrofuse.wavelets.haar`, arranged so that the data cross the memory bus about once: a tile of time
-passes through all levels while it is in cache, and the Gram product of its coefficients is taken there. What a
-level needs of the past (the last `h = 2**level` samples of its smooth) is kept from tile to tile, so that chunks of
-any length, and a whole recording in one go, add up to the same sums.
+The same pyramid as in `gyrofuse.wavelets.haar`, arranged so that the data cross the memory bus about once: a tile of
+time passes through all levels while it is in cache, and the Gram product of its coefficients is taken there. What a
+level needs of the past (the last `h = 2**level` samples of its smooth) is kept from tile to tile, so that chunks of any
+length, and a whole recording in one go, add up to the same sums.
 
 Inside, time comes before sensor (`(item, time, sensor)`): a lag is then an offset in contiguous memory and the Gram
 product reads its operand once. The factor 1/2 of each level is left out until the end, where `4**-level` is exact.

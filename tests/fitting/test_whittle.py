@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gyrofuse._base.transforms import cosine_ordinates, ramp_ordinates
-from gyrofuse.export import state_space
+from gyrofuse.export.kalibr import state_space
 from gyrofuse.fitting.spectral.bands import Bins, Noise
 from gyrofuse.fitting.spectral.whittle import WhittleFit, refine_whittle
 from gyrofuse.fitting.structure import Composition

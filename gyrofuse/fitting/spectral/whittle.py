@@ -1,10 +1,10 @@
 """Spectral refinement of a noise model: from the moments' estimate to the maximum of a Whittle likelihood.
 
 The orthonormal DCT-II of a record, `y_k = sqrt(2/T) sum_t x_t cos(pi k (t + 1/2) / T)`, makes white noise and random
-walks independent normal variables and AR1s nearly so, without differencing and without a taper. Their log likelihood
-is `-1/2 sum_k (ln 2 pi v_k + y_k^2 / v_k)` with the variances `v_k = sum_m p_m u_mk(x)`, linear in the variances `p` of
-the processes. For the processes here `u_mk` is exact at every length, see `gyrofuse.fitting.spectral.bands`; the mean, `k = 0`,
-is left out.
+walks independent normal variables and AR1s nearly so, without differencing and without a taper. Their log likelihood is
+`-1/2 sum_k (ln 2 pi v_k + y_k^2 / v_k)` with the variances `v_k = sum_m p_m u_mk(x)`, linear in the variances `p` of
+the processes. For the processes here `u_mk` is exact at every length, see `gyrofuse.fitting.spectral.bands`; the mean,
+`k = 0`, is left out.
 
 Tones and a ramp are not noise: they are measured with the fitted spectrum, taken out, and the noise is fitted again.
 

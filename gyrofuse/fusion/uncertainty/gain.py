@@ -1,10 +1,10 @@
 """How many times smaller the wavelet variance of a virtual gyro is than that of the plain mean, level by level.
 
-Both variances come from the same sensors, so that their ratio is known far better than either. Where a level holds
-many windows, the course of the ratio along the recording tells how far it can be off; elsewhere Pitman's law of the
-ratio of two correlated variances does, exact for weights chosen beforehand. Weights fitted to the recording flatter
-themselves in it. Their variance is the one in other recordings (`gyrofuse.fusion.uncertainty.cross_fitting`), and as many observations
-less are left as their fit has used up.
+Both variances come from the same sensors, so that their ratio is known far better than either. Where a level holds many
+windows, the course of the ratio along the recording tells how far it can be off; elsewhere Pitman's law of the ratio of
+two correlated variances does, exact for weights chosen beforehand. Weights fitted to the recording flatter themselves
+in it. Their variance is the one in other recordings (`gyrofuse.fusion.uncertainty.cross_fitting`), and as many
+observations less are left as their fit has used up.
 
 Reference:
     E. J. G. Pitman, Biometrika 31, 1939.

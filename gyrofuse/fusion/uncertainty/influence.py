@@ -14,12 +14,12 @@ weights and `B = (I - c 1') A^-1`
 
 are products of the coefficients of the signals `B x` and of the virtual signal `c' x`: one pass over the data.
 
-**Where it is wrong**: as all of this bootstrap (`gyrofuse.wavelets.block_bootstrap`), at large scales. Nominal 95 % intervals of
-weights of four sensors with white noise and random walks, 2**13 samples, 9 levels, blocks of `T^(1/3) = 20`, held the
-truth in 95 % of 300 recordings for short scale weights, 92 to 94 % for flat and **45 to 55 %** for long ones (88 to
-90 % with the default block length). With 12 levels, whose last one has half as many coefficients as there are samples,
-90 %, **32 to 44 %** and **22 to 38 %**. And it is first order, as (8) of [Z] is: where a sensor's noise rests on a few
-bursts, weights refitted to the resamples of `block_bootstrap` spread wider.
+**Where it is wrong**: as all of this bootstrap (`gyrofuse.wavelets.block_bootstrap`), at large scales. Nominal 95 %
+intervals of weights of four sensors with white noise and random walks, 2**13 samples, 9 levels, blocks of `T^(1/3) =
+20`, held the truth in 95 % of 300 recordings for short scale weights, 92 to 94 % for flat and **45 to 55 %** for long
+ones (88 to 90 % with the default block length). With 12 levels, whose last one has half as many coefficients as there
+are samples, 90 %, **32 to 44 %** and **22 to 38 %**. And it is first order, as (8) of [Z] is: where a sensor's noise
+rests on a few bursts, weights refitted to the resamples of `block_bootstrap` spread wider.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """How far the weights of a virtual gyro can be off.
 
 Two ways, each where it is right. Where the levels that decide hold many windows side by side, the influence of each
-stretch of the recording on the weights is a series whose own variance tells (`gyrofuse.wavelets.long_run_variance`). Where they do not,
-the last levels are drawn again from a pilot model, with the weights fitted anew each time (`gyrofuse.fusion.uncertainty.parametric`), and
-lower levels add what their series tells. Where both can be had and the series shows far more than the model allows,
-the series is believed: the noise is none that the model knows.
+stretch of the recording on the weights is a series whose own variance tells (`gyrofuse.wavelets.long_run_variance`).
+Where they do not, the last levels are drawn again from a pilot model, with the weights fitted anew each time
+(`gyrofuse.fusion.uncertainty.parametric`), and lower levels add what their series tells. Where both can be had and the
+series shows far more than the model allows, the series is believed: the noise is none that the model knows.
 """
 
 from __future__ import annotations

@@ -4,7 +4,8 @@ An .npz file is one of two things.
 
 - A recording: `gyro` (sensor, time), or (axis, sensor, time) with `axes`, and `fs`, `unit`, `sensors`, `time`; every
   other array of the same length is a channel, `temperature[imu2]` one of the sensor imu2. One of accelerations has
-  `acceleration` in place of `gyro`. Where nothing is named so, `gyrofuse.io.formats.arrays` says which names are understood.
+  `acceleration` in place of `gyro`. Where nothing is named so, `gyrofuse.io.formats.arrays` says which names are
+  understood.
 - Tables with named rows, which `gyrofuse.io.formats.numpy.tables` reads.
 """
 

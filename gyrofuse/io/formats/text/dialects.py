@@ -1,10 +1,10 @@
 """What text files of known loggers mean beyond the names of their columns.
 
-Each dialect is told by its own marks and gives its columns names that `gyrofuse.io.formats.columns` understands, with their
-units; what it decides is said in a note. Sources: Xsens, MT Low-Level Communication Protocol and Xsens DOT User Manual;
-Analog Devices, ADIS16470/ADIS16490 data sheets (output registers); Betaflight, `blackbox.c` and the CSV export of
-Blackbox Explorer; ROS, `sensor_msgs/Imu` and REP 103 (units);
-VectorNav, VN-100 User Manual (uncompensated measurements).
+Each dialect is told by its own marks and gives its columns names that `gyrofuse.io.formats.columns` understands, with
+their units; what it decides is said in a note. Sources: Xsens, MT Low-Level Communication Protocol and Xsens DOT User
+Manual; Analog Devices, ADIS16470/ADIS16490 data sheets (output registers); Betaflight, `blackbox.c` and the CSV export
+of Blackbox Explorer; ROS, `sensor_msgs/Imu` and REP 103 (units); VectorNav, VN-100 User Manual (uncompensated
+measurements).
 """
 
 from __future__ import annotations

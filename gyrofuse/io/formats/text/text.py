@@ -1,11 +1,11 @@
 """Text files: CSV and its relatives, with and without a header.
 
 The delimiter is a comma, or a tab, a semicolon or white space, with which numbers may have a decimal comma. Lines that
-begin with `#`, `%` or `//` are comments, and what stands above the header is skipped; in both, `fs = 100` and
-`unit: deg/s` are understood. A header names the columns as `gyrofuse.io.formats.columns` says, and may be a comment; the line
+begin with `#`, `%` or `//` are comments, and what stands above the header is skipped; in both, `fs = 100` and `unit:
+deg/s` are understood. A header names the columns as `gyrofuse.io.formats.columns` says, and may be a comment; the line
 below it may hold their units. Without one the columns are sensors `"1"`, `"2"`, ..., after a clock where the first
-alone advances in nearly constant steps. A column of dates or times of day (`gyrofuse.io.formats.text.dates`) is a clock. An empty
-cell is NaN. Only columns of numbers with a known name are parsed. Files of known loggers are read as
+alone advances in nearly constant steps. A column of dates or times of day (`gyrofuse.io.formats.text.dates`) is a
+clock. An empty cell is NaN. Only columns of numbers with a known name are parsed. Files of known loggers are read as
 `gyrofuse.io.formats.text.dialects` says.
 """
 

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 import torch
 
-from gyrofuse.export import to_c_header, to_kalibr
+from gyrofuse.export.c_header import to_c_header
+from gyrofuse.export.kalibr import to_kalibr
 from gyrofuse.fitting.gmwm import fit_gmwm
 from gyrofuse.io.recording import Recording
 from gyrofuse.noise.processes import AR1, Drift, Model, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
