@@ -1,5 +1,5 @@
 """`python -m gyrofuse`."""
 
-from gyrofuse.cli import main
+from gyrofuse.cli.app import main
 
 main()

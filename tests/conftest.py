@@ -13,7 +13,7 @@ import pytest
 # Before torch is loaded: tests' matrices are small, and beside other tests a second thread only waits for the first.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from gyrofuse import cli
+from gyrofuse.cli import app as cli
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 

@@ -40,7 +40,7 @@ def test_the_continuous_integration_runs_the_test_command_of_the_readme():
 def test_commands_of_the_command_line_exist():
     from typer.main import get_command
 
-    from gyrofuse.cli import app
+    from gyrofuse.cli.app import app
 
     known = get_command(app).commands
     named = set(re.findall(r"^gyrofuse (\w+)", "\n".join(blocks("bash")), re.MULTILINE))

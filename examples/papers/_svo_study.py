@@ -21,7 +21,7 @@ from scipy import stats
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.demo import N_SAMPLES, RATE, UNIT, demo_array
+from gyrofuse.cli.demo.demo import N_SAMPLES, RATE, UNIT, demo_array
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -27,7 +27,7 @@ from gmwm_misspecification import emulation, fit_both
 
 import gyrofuse as gf
 from gyrofuse.navigation import Alignment, Emulation, Gnss, Trajectory, emulate, flight
-from gyrofuse.plotting_navigation import plot_ratio_over_time
+from gyrofuse.navigation.plots import plot_ratio_over_time
 
 QUICK_SAMPLES, QUICK_RUNS = 2**15, 8
 RATE, QUICK_RATE = 100.0, 20.0

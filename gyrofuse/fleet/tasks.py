@@ -16,7 +16,7 @@ from torch import Tensor
 from gyrofuse._base.checks import check_confidence_level
 from gyrofuse._base.units import DATASHEET_UNITS
 from gyrofuse.fitting.gmwm import fit_gmwm
-from gyrofuse.fleet.table import Column
+from gyrofuse.fleet.store.table import Column
 from gyrofuse.fusion.result import SVOResult
 from gyrofuse.fusion.svo import fit_svo
 from gyrofuse.fusion.weights.methods import METHODS

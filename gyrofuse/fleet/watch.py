@@ -16,8 +16,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
-from gyrofuse.fleet.sealed import draft_in
-from gyrofuse.fleet.table import identity_in
+from gyrofuse.fleet.store.sealed import draft_in
+from gyrofuse.fleet.store.table import identity_in
 
 _BEGUN = "*.begun"
 _SUSPECTS = "suspects"

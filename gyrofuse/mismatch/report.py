@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 from gyrofuse._base.results import p_words
 from gyrofuse.mismatch.outcome import Outcome
+from gyrofuse.mismatch.page import mismatch_page
+from gyrofuse.mismatch.plots import plot_map
 from gyrofuse.mismatch.telling import fused_words, judged_words, nats, otherwise_words, parameter_words
-from gyrofuse.plotting_mismatch import plot_map
-from gyrofuse.report_mismatch import mismatch_page
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -94,7 +94,7 @@ class Emulation:
         Returns:
             The axes.
         """
-        from gyrofuse.plotting_navigation import plot_ratio_over_time
+        from gyrofuse.navigation.plots import plot_ratio_over_time
 
         return plot_ratio_over_time(self.time, self.ratio, self.interval, outage=self.outage, ax=ax)
 

@@ -24,8 +24,8 @@ import numpy as np
 
 from gyrofuse.fleet import Fuse, ResultStore, find_logs
 from gyrofuse.fleet.logs import groups_of, identity
+from gyrofuse.fleet.run import LogGroups, rows_of
 from gyrofuse.fleet.tasks import Row
-from gyrofuse.fleet.work import LogGroups, rows_of
 
 N_LOGS = 12
 PAGE = 4096  # bytes that a file system writes at a time

@@ -1,0 +1,202 @@
+"""The whole story on an array whose truth is known: simulate it, fuse it, compare with the truth."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from textwrap import fill
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from gyrofuse.cli.demo.mismatch import MOST_SAMPLES, concealed, mismatch_story
+from gyrofuse.cli.demo.models import CANDIDATES, models_figure, models_story, true_models
+from gyrofuse.fitting.ranking.rank import rank_models
+from gyrofuse.fitting.report.ranking import rank_report
+from gyrofuse.fusion import plots as plotting
+from gyrofuse.fusion.report.page import fusion_figure, fusion_report, new_figure, number, save_figure, verdict
+from gyrofuse.fusion.result import SVOResult
+from gyrofuse.fusion.svo import fit_svo
+from gyrofuse.fusion.weights.svo import svo_weights
+from gyrofuse.io.recording import Recording
+from gyrofuse.noise.array_model import ArrayModel
+from gyrofuse.noise.processes import AR1, WhiteNoise
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+RATE, UNIT, N_SAMPLES, SEED = 10.0, "deg/s", 1_044_000, 20_220_601
+
+# Case 2 of Zhang et al. (section V-B): white noise R and three AR(1) processes with correlated innovations P1, P2, P3,
+# in (deg/s)^2. The matrices are symmetric: rows up to the diagonal.
+_WHITE = (2.805556e-07, 1.977778e-07, 1.361111e-07, 1.063889e-07, 1.069444e-07, 2.538889e-07)
+_PHI = (0.9975214, 0.9998705, 0.9999933)
+_P1 = (
+    (4.00813e-12,),
+    (-1.8061e-13, 1.177847e-11),
+    (-4.477e-13, -1.2905e-13, 1.965775e-11),
+    (-1.04857e-12, -3.74198e-12, 2.02629e-12, 1.309887e-11),
+    (2.54671e-12, -5.1101e-13, -1.75089e-12, 2.3176e-13, 1.928375e-11),
+    (-2.3495e-12, 2.84942e-12, 1.44629e-12, 4.12761e-12, 5.71453e-12, 1.434466e-11),
+)
+_P2 = (
+    (6.713833e-13,),
+    (1.515552e-13, 5.60723e-13),
+    (1.245013e-13, 2.26465e-13, 7.499051e-13),
+    (-7.1179e-15, -7.73724e-14, -1.62687e-14, 1.20792e-13),
+    (4.28489e-14, 2.81054e-14, -5.29317e-14, -1.87305e-14, 7.499327e-13),
+    (9.57757e-14, 1.440987e-13, -9.99575e-14, 6.81702e-14, 2.414762e-13, 6.461646e-13),
+)
+_P3 = (
+    (5.062006e-14,),
+    (-6.4328e-15, 1.612038e-14),
+    (3.26013e-15, -3.18449e-15, 2.102923e-14),
+    (6.978e-15, -3.83634e-15, 9.1458e-16, 7.88177e-15),
+    (1.727949e-14, -7.68214e-15, 3.98505e-15, -1.29179e-15, 5.44267e-14),
+    (7.38584e-15, -1.00044e-15, -1.3776e-15, 5.19119e-15, 3.78632e-15, 4.990004e-14),
+)
+
+FILES = ("report.html", "result.json", "models.html", "models.json", "mismatch.html", "mismatch.json", "figures")
+
+
+def demo_array() -> ArrayModel:
+    """Six gyros of Zhang et al., section V-B, rates in deg/s at 10 Hz."""
+    white = torch.tensor(_WHITE, dtype=torch.float64).diag()
+    return ArrayModel(
+        [(WhiteNoise(1.0), white)]
+        + [(AR1(phi, 1.0), _symmetric(rows)) for phi, rows in zip(_PHI, (_P1, _P2, _P3), strict=True)]
+    )
+
+
+def run_demo(folder: Path, n_samples: int = N_SAMPLES) -> str:
+    """Simulate the array, fuse it, find noise models and a concealed effect, and write all of it down.
+
+    Args:
+        folder: Where to write `FILES`; it exists.
+        n_samples: Length of the simulated recording.
+
+    Returns:
+        What was simulated and found, as text.
+    """
+    from gyrofuse.mismatch import diagnose
+
+    array, generator = demo_array(), torch.Generator().manual_seed(SEED)
+    signal = array.simulate(n_samples, generator=generator)
+    recording = Recording(signal, rate=RATE, unit=UNIT)
+    long, short = (fit_svo(recording, scale_weights) for scale_weights in ("long", "short"))
+    truth = array.wavelet_cross_covariance(long.n_levels)
+    remarks = _remarks(long, truth)
+    title = "Six simulated gyros, fused for long averaging times"
+    virtual = long.virtual(recording)
+    report = fusion_report(long, recording, virtual, title=title, remarks=remarks)
+    together = Recording(
+        torch.cat([signal, virtual[None]]), rate=RATE, unit=UNIT, sensors=(*recording.sensors, "virtual")
+    )
+    models, truths = rank_models(together, CANDIDATES), true_models(array, long.weights)
+    title = "Noise models of six simulated gyros and of the virtual gyro"
+    pages = {"report.html": report, "models.html": rank_report(models, together, title=title)}
+    other = concealed(array, min(n_samples, MOST_SAMPLES), RATE, UNIT, generator)
+    mismatch = diagnose(other, array)
+    mismatch.to_html(folder / "mismatch.html", title="A recording of six gyros, and a simulation that lacks something")
+    for name, page in pages.items():
+        (folder / name).write_text(page, encoding="utf-8")
+    for name, result in (("result.json", long), ("models.json", models), ("mismatch.json", mismatch)):
+        (folder / name).write_text(json.dumps(result.to_dict()) + "\n", encoding="utf-8")
+    figures = folder / "figures"
+    figures.mkdir()
+    drawn = {
+        "long": fusion_figure(long),
+        "short": fusion_figure(short),
+        "truth": _truth_figure(long, short, truth),
+        "models": models_figure(models, truths),
+    }
+    for name, figure in drawn.items():
+        save_figure(figure, figures / f"{name}.png", "png")
+    stories = (_story(long, short, truth, remarks), models_story(models, truths), mismatch_story(other, mismatch))
+    return "\n\n".join(stories)
+
+
+def _symmetric(rows: tuple[tuple[float, ...], ...]) -> Tensor:
+    """Matrix from its rows up to the diagonal."""
+    lower = torch.zeros(len(rows), len(rows), dtype=torch.float64)
+    for i, row in enumerate(rows):
+        lower[i, : i + 1] = torch.tensor(row, dtype=torch.float64)
+    return lower + lower.tril(-1).mT
+
+
+def _gain(weights: Tensor, wccv: Tensor) -> Tensor:
+    """Allan deviation with these weights over that of the plain mean, per level."""
+    return (torch.einsum("i,jik,k->j", weights, wccv, weights) / wccv.mean((-1, -2))).sqrt()
+
+
+def _remarks(long: SVOResult, truth: Tensor) -> list[str]:
+    low, high = long.confidence_interval
+    best = svo_weights(truth, long.scale_weights)
+    held = int(((low <= best) & (best <= high)).sum())
+    fitted, possible = (100 * (1 - _gain(weights, truth)[-1].item()) for weights in (long.weights, best))
+    hours = long.n_samples / RATE / 3600
+    return [
+        f"The array is simulated: six gyros at {RATE:g} Hz for {number(hours, 3)} h ({long.n_samples} samples each) "
+        "with white noise and three drifts that correlate between the sensors, as in Case 2 of Zhang, Cucci, Molinari "
+        "and Guerrier (2022), section V-B. The fit is told nothing about the noise.",
+        f"The truth is known here: the best weights for long averaging times are "
+        f"{', '.join(f'{weight:.3f}' for weight in best.tolist())}; the intervals hold {held} of {len(best)}. "
+        f"With the true noise in place of this recording, the fitted weights make the Allan deviation at "
+        f"{number(long.tau[-1].item())} s {fitted:.0f} % lower than that of the plain mean; the best possible is "
+        f"{possible:.0f} %.",
+    ]
+
+
+def _story(long: SVOResult, short: SVOResult, truth: Tensor, remarks: list[str]) -> str:
+    about, against_truth = remarks
+    best = svo_weights(truth, long.scale_weights)
+    low, high = long.confidence_interval
+    weights = [f"{'sensor':>6}  {'weight':>8}  {'95 % interval':>18}  {'truth':>8}"]
+    for name, *row in zip(long.sensors, *(c.tolist() for c in (long.weights, low, high, best)), strict=True):
+        weight, lowest, highest, true = row
+        weights.append(f"{name:>6}  {weight:>+8.4f}  [{lowest:+.4f}, {highest:+.4f}]  {true:>+8.4f}")
+    columns = {
+        "tau (s)": long.tau,
+        "best sensor": (2 * long.wavelet_variance.amin(-1)).sqrt(),
+        "plain mean": (2 * long.equal_wavelet_variance).sqrt(),
+        "fused, short": (2 * short.virtual_wavelet_variance).sqrt(),
+        "fused, long": (2 * long.virtual_wavelet_variance).sqrt(),
+        "long/mean": (long.virtual_wavelet_variance / long.equal_wavelet_variance).sqrt(),
+        "in truth": _gain(long.weights, truth),
+        "possible": _gain(best, truth),
+    }
+    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    levels = ["  ".join(f"{name:>12}" for name in columns)]
+    levels += ["  ".join(f"{value:>12.4g}" for value in row) for row in rows]
+    paragraphs = [
+        fill(about, 110),
+        "Weights for long averaging times:\n" + "\n".join(weights),
+        f"Allan deviation ({UNIT}), that of fused gyros as expected in other recordings (cross-fitted); then long\n"
+        "over mean: as expected, with the same weights and the true noise (in truth), with the best weights and the\n"
+        "true noise (possible):\n" + "\n".join(levels),
+        "\n".join(fill(f"- {sentence}", 110, subsequent_indent="  ") for sentence in verdict(long)),
+        fill(against_truth, 110),
+    ]
+    return "\n\n".join(paragraphs).replace("\N{NO-BREAK SPACE}", " ")
+
+
+def _truth_figure(long: SVOResult, short: SVOResult, truth: Tensor) -> Figure:
+    """What the fitted weights are expected to gain and gain in truth, and how far they are from the best ones."""
+    figure = new_figure(7, 7)
+    *above, below = figure.subplots(3, 1, height_ratios=[1.3, 1.3, 1])
+    for ax, result, name in zip(above, (long, short), ("long", "short"), strict=True):
+        ratio = (result.virtual_wavelet_variance / result.equal_wavelet_variance).sqrt()
+        plotting.plot_ratio(result.tau, ratio, ax=ax)
+        ax.lines[-1].set_label("expected in other recordings")
+        best = svo_weights(truth, result.scale_weights)
+        for weights, dashes, label in ((result.weights, "--", "same weights, true noise"), (best, ":", "best weights")):
+            ax.plot(result.tau, _gain(weights, truth), dashes, color="black", linewidth=1.2, label=label, zorder=6)
+        ax.legend(fontsize=8, frameon=False, loc="lower left")
+        ax.set_title(f"Fused for {name} averaging times", loc="left", fontsize=9)
+    plotting.plot_weights(long.weights, *long.confidence_interval, names=long.sensors, ax=below)
+    best = svo_weights(truth, long.scale_weights)
+    below.plot(range(len(best)), best, "D", color="black", markerfacecolor="none", markersize=9, zorder=5)
+    below.set_xlabel("sensor, fused for long averaging times; diamonds: best weights for the true noise")
+    figure.align_ylabels()
+    return figure

@@ -1,0 +1,1 @@
+"""The table that a fleet fills, whatever interrupts it."""

@@ -1,0 +1,295 @@
+"""What stands out in a fleet: failed logs, noisy sensors, arrays unlike the others, weights that drift."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from gyrofuse._base.results import counted
+from gyrofuse.fleet.store.table import identity_in
+
+NOISY = 2.0  # times the median of an array
+_OUTLIER = 5.0  # robust standard deviations
+_FEWEST = 5  # arrays, to say what is usual
+FEWEST_IN_TIME = 8  # recordings of one array, to say what drifts
+LEVEL = 0.01  # chance of a drift, for all sensors together
+GAIN = "Allan deviation of the plain mean over that of the virtual gyro, geometric mean over averaging times"
+
+
+class NoisySensor(NamedTuple):
+    """A sensor over all its logs: how many times noisier it is than the median of its array (median of logs)."""
+
+    array: str
+    sensor: str
+    relative_noise: float
+    n_logs: int
+
+
+class Outlier(NamedTuple):
+    """A log whose array is unlike the others: by how many robust standard deviations, and in what."""
+
+    log: str
+    axis: str | None
+    what: str
+    value: float
+    usual: float
+    deviations: float
+
+
+class Doubt(NamedTuple):
+    """A log whose weights are to be doubted, and why: it felt motion, or is too short for them."""
+
+    log: str
+    axis: str | None
+    why: str
+
+
+class Drift(NamedTuple):
+    """A weight that goes up or down from log to log: Kendall's tau, and its p value for all weights looked at."""
+
+    array: str
+    sensor: str
+    first: float
+    last: float
+    tau: float
+    p_value: float
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Of a fleet.
+
+    Attributes:
+        task: `"fuse"`, `"fit"` or `"diagnose"`.
+        n_logs: All of them.
+        failures: Logs that failed, and why.
+        ranked: Rows of arrays or sensors, the most conspicuous first, with the number that they are ranked by: gain of
+            the virtual gyro, p value of the J test, p value of the diagnosis.
+        noisy: Sensors, the noisiest first.
+        outliers: Logs unlike the others.
+        doubts: Logs whose weights are to be doubted.
+        drifts: Of weights, the surest first.
+        mechanisms: How many logs have each, and unexplained differences.
+    """
+
+    task: str
+    n_logs: int
+    failures: tuple[tuple[str, str], ...]
+    ranked: tuple[tuple[float, Mapping[str, Any]], ...]
+    noisy: tuple[NoisySensor, ...]
+    outliers: tuple[Outlier, ...]
+    doubts: tuple[Doubt, ...]
+    drifts: tuple[Drift, ...]
+    mechanisms: tuple[tuple[str, int], ...]
+
+    @property
+    def values(self) -> list[float]:
+        """What is ranked by, of those that have it."""
+        return [value for value, _ in self.ranked if np.isfinite(value)]
+
+    @property
+    def too_noisy(self) -> tuple[NoisySensor, ...]:
+        """Sensors more than `NOISY` times as noisy as the median of their array."""
+        return tuple(sensor for sensor in self.noisy if sensor.relative_noise > NOISY)
+
+    @property
+    def n_refused(self) -> int:
+        """Fits that the J test refuses."""
+        return sum(value < LEVEL for value in self.values)
+
+    @property
+    def n_unidentified(self) -> int:
+        """Fits whose parameters cannot be told apart."""
+        return sum(row.get("identified") is False for _, row in self.ranked)
+
+    @property
+    def n_doubted(self) -> int:
+        """Logs whose weights are to be doubted."""
+        return len({doubt.log for doubt in self.doubts})
+
+    @property
+    def n_differ(self) -> int:
+        """Recordings that differ from their simulation."""
+        return sum(bool(row["mismatch"]) for _, row in self.ranked)
+
+    def summary(self) -> str:
+        """In a few lines."""
+        lines = [f"{self.n_logs} logs, {len(self.failures)} failed"]
+        if self.task == "fuse" and self.values:
+            lines.append(
+                f"{GAIN}: median {np.median(self.values):.3g}, {min(self.values):.3g} to {max(self.values):.3g}; "
+                "below 1 is worse than the plain mean"
+            )
+        if self.task == "fit":
+            lines.append(f"{self.n_refused} of {len(self.ranked)} fits refused by the J test at {LEVEL:g}")
+            if self.n_unidentified:
+                lines.append(
+                    f"{self.n_unidentified} of {len(self.ranked)} fits have parameters that cannot be told apart"
+                )
+        if self.task == "diagnose":
+            lines.append(f"{self.n_differ} of {len(self.ranked)} differ")
+        lines += [f"  {name}: {count} logs" for name, count in self.mechanisms]
+        lines += [
+            f"noisy: sensor {s.sensor} of {s.array}, {s.relative_noise:.3g} times its array's median, {s.n_logs} logs"
+            for s in self.too_noisy[:3]
+        ]
+        lines += [
+            f"unlike the others: {_place(o)}, {o.what} {o.value:.3g} where {o.usual:.3g} is usual"
+            for o in self.outliers[:3]
+        ]
+        if self.doubts:
+            lines.append(f"weights to doubt: {counted(self.n_doubted, 'log')}")
+        lines += [f"  {_place(doubt)}: {doubt.why}" for doubt in self.doubts[:3]]
+        lines += [
+            f"drifts: weight of sensor {d.sensor} of {d.array}, {d.first:.3g} to {d.last:.3g} (p = {d.p_value:.2g})"
+            for d in self.drifts[:3]
+        ]
+        lines += [f"failed: {log}: {error}" for log, error in self.failures[:5]]
+        if len(self.failures) > 5:
+            lines.append(f"... and {len(self.failures) - 5} more that failed")
+        return "\n".join(lines)
+
+    def __str__(self) -> str:
+        return self.summary()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, ready for JSON; of what is ranked, the logs."""
+        return {
+            "task": self.task,
+            "n_logs": self.n_logs,
+            "failures": [{"log": log, "error": error} for log, error in self.failures],
+            "ranked": [
+                {
+                    "log": row["log"],
+                    "axis": row["axis"],
+                    "sensor": row.get("sensor"),
+                    "value": value if np.isfinite(value) else None,
+                }
+                for value, row in self.ranked
+            ],
+            "noisy": [sensor._asdict() for sensor in self.noisy],
+            "outliers": [outlier._asdict() for outlier in self.outliers],
+            "doubts": [doubt._asdict() for doubt in self.doubts],
+            "drifts": [drift._asdict() for drift in self.drifts],
+            "mechanisms": dict(self.mechanisms),
+        }
+
+
+def standing_of(task: str, rows: Sequence[Mapping[str, Any]]) -> Standing:
+    """What stands out among the rows of a fleet's table.
+
+    Logs of sensors with the same names, and of one axis, are taken for recordings of one array or of arrays of one
+    kind, in the order of the table.
+    """
+    failures = {identity_in(row): (row["log"], row["error"]) for row in rows if row["status"] != "ok"}
+    good = [row for row in rows if row["status"] == "ok"]
+    fused = good if task == "fuse" else []
+    mechanisms: dict[str, set[str]] = {}
+    for row in good if task == "diagnose" else ():
+        for name in [*row["mechanisms"], *(["unexplained"] if row["unexplained"] else [])]:
+            mechanisms.setdefault(name, set()).add(identity_in(row))
+    return Standing(
+        task=task,
+        n_logs=len(set(map(identity_in, rows))),
+        failures=tuple(failures.values()),
+        ranked=_ranked(task, good),
+        noisy=tuple(sorted(_noisy(fused), key=lambda s: -s.relative_noise)),
+        outliers=tuple(sorted(_outliers(fused), key=lambda o: -o.deviations)),
+        doubts=tuple(_doubts(fused)),
+        drifts=tuple(sorted(_drifts(fused), key=lambda d: d.p_value)),
+        mechanisms=tuple(sorted(((name, len(logs)) for name, logs in mechanisms.items()), key=lambda e: -e[1])),
+    )
+
+
+def mean_gain(row: Mapping[str, Any]) -> float:
+    """Of a row of fusion: geometric mean over averaging times, which count as they did in the choice of weights."""
+    gain = np.array(row["gain"], dtype=float)
+    counts = np.array(row.get("scale_weights") or np.ones_like(gain), dtype=float)
+    known = np.isfinite(gain) & (gain > 0) & (counts > 0)
+    return float(np.exp(np.average(np.log(gain[known]), weights=counts[known]))) if known.any() else np.nan
+
+
+def _ranked(task: str, rows: Sequence[Mapping[str, Any]]) -> tuple[tuple[float, Mapping[str, Any]], ...]:
+    """Gains fall, p values rise; what has none comes last."""
+    if task == "fuse":
+        valued, sign = [(mean_gain(row), row) for row in rows], -1
+    else:
+        valued, sign = [(float("nan") if row["p_value"] is None else row["p_value"], row) for row in rows], 1
+    return tuple(sorted(valued, key=lambda entry: (np.isnan(entry[0]), sign * entry[0])))
+
+
+def arrays_of(rows: Iterable[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
+    """Rows of arrays with the same sensors and axis, by a name."""
+    arrays: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    for row in rows:
+        arrays.setdefault((tuple(row["sensors"]), row["axis"]), []).append(row)
+    return {_named(sensors, axis): own for (sensors, axis), own in arrays.items()}
+
+
+def _named(sensors: Sequence[str], axis: str | None) -> str:
+    """An array by what its logs have in common."""
+    first = ", ".join(sensors[:3])
+    name = f"array of {len(sensors)} ({first}, ...)" if len(sensors) > 3 else f"array of {first}"
+    return f"{name}, axis {axis}" if axis else name
+
+
+def _noisy(rows: Iterable[Mapping[str, Any]]) -> Iterable[NoisySensor]:
+    for array, own in arrays_of(rows).items():
+        noise = np.array([row["relative_noise"] for row in own], dtype=float)
+        for i, sensor in enumerate(own[0]["sensors"]):
+            known = noise[np.isfinite(noise[:, i]), i]
+            if known.size:
+                yield NoisySensor(array, sensor, float(np.median(known)), len(known))
+
+
+def _outliers(rows: Sequence[Mapping[str, Any]]) -> Iterable[Outlier]:
+    for own in arrays_of(rows).values():
+        if len(own) < _FEWEST:
+            continue
+        shortest = min(len(row["virtual_deviation"]) for row in own)
+        quantities = {
+            "gain over equal weights": [mean_gain(row) for row in own],
+            "Allan deviation of the virtual gyro": [
+                float(np.exp(np.log(np.maximum(row["virtual_deviation"][:shortest], 1e-300)).mean())) for row in own
+            ],
+        }
+        for what, values in quantities.items():
+            log = np.log(np.array(values, dtype=float))
+            middle = np.nanmedian(log)
+            sd = stats.median_abs_deviation(log, scale="normal", nan_policy="omit")
+            for row, value in zip(own, log, strict=True):
+                away = abs(value - middle) / max(sd, 1e-12)
+                if away > _OUTLIER and abs(value - middle) > 1e-6:
+                    yield Outlier(
+                        row["log"], row["axis"], what, float(np.exp(value)), float(np.exp(middle)), float(away)
+                    )
+
+
+def _doubts(rows: Iterable[Mapping[str, Any]]) -> Iterable[Doubt]:
+    for row in rows:
+        short = row["warnings"] if row.get("enough") is False else []
+        for why in [*([row["motion"]] if row.get("motion") else []), *short]:
+            yield Doubt(row["log"], row["axis"], why)
+
+
+def _place(found: Outlier | Doubt) -> str:
+    return f"{found.log} axis {found.axis}" if found.axis else found.log
+
+
+def _drifts(rows: Sequence[Mapping[str, Any]]) -> list[Drift]:
+    found, looked = [], 0
+    for array, own in arrays_of(rows).items():
+        weights = np.array([row["weights"] for row in own], dtype=float)
+        if len(own) < FEWEST_IN_TIME or not np.isfinite(weights).all():
+            continue
+        looked += weights.shape[1]
+        third = max(len(own) // 3, 1)
+        for i, sensor in enumerate(own[0]["sensors"]):
+            tau, p_value = stats.kendalltau(np.arange(len(own)), weights[:, i])
+            first, last = np.median(weights[:third, i]), np.median(weights[-third:, i])
+            found.append(Drift(array, sensor, float(first), float(last), float(tau), float(p_value)))
+    return [d._replace(p_value=min(d.p_value * looked, 1.0)) for d in found if d.p_value * looked < LEVEL]
