@@ -23,6 +23,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from gyrofuse._base import __version__ as __version__
+from gyrofuse._base.deprecation import find_moved_modules
 from gyrofuse._base.linalg import SingularCovarianceError
 from gyrofuse._base.results import ConfidenceInterval
 from gyrofuse.export.c_header import to_c_header
@@ -182,6 +183,9 @@ _LAZY = {
     "StreamedSVOResult": "gyrofuse.fusion.streaming",
     "stream_svo": "gyrofuse.fusion.streaming",
 }
+
+
+find_moved_modules()
 
 
 def __getattr__(name: str) -> Any:

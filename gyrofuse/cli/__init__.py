@@ -1,1 +1,3 @@
 """The command line."""
+
+from gyrofuse.cli.app import main as main
