@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from dataclasses import field, fields, replace
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
+import torch
 from torch import Tensor
+
+_R = TypeVar("_R", bound="Result")
 
 
 class ConfidenceInterval(NamedTuple):
@@ -14,6 +18,83 @@ class ConfidenceInterval(NamedTuple):
 
     low: Tensor
     high: Tensor
+
+
+def batched() -> Any:
+    """A field of a `Result` whose leading dimensions are those of the batch."""
+    return field(metadata={"batched": True})
+
+
+class Result:
+    """Base of results, which are frozen dataclasses: text, plain numbers, and items of a batch.
+
+    A subclass marks the fields that begin with the dimensions of the batch by `batched()`, and says in `_contents`
+    which attributes `to_dict` writes, by default its fields.
+    """
+
+    _contents: ClassVar[tuple[str, ...]] = ()
+
+    def summary(self) -> str:
+        """The result as text of fixed width."""
+        raise NotImplementedError
+
+    def __str__(self) -> str:
+        return self.summary()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain lists and numbers, ready for JSON (NaN and infinities as None)."""
+        names = self._contents or [entry.name for entry in fields(self)]  # type: ignore[arg-type]
+        return {name: plain(getattr(self, name)) for name in names}
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading dimensions of the result; `()` for a single one."""
+        raise NotImplementedError
+
+    def __getitem__(self: _R, index: Any) -> _R:
+        """One item, or some, of the leading batch dimensions."""
+        size = len(index) if isinstance(index, tuple) else 1
+        if size > len(self.batch_shape):
+            raise IndexError(f"expected at most {len(self.batch_shape)} indices for batch shape {self.batch_shape}")
+        entries = [entry.name for entry in fields(self) if entry.metadata.get("batched")]  # type: ignore[arg-type]
+        return replace(self, **{name: _item(getattr(self, name), index) for name in entries})  # type: ignore[type-var]
+
+
+def _item(value: Any, index: Any) -> Any:
+    """An item of what a batched field holds: a tensor, a pair of limits, another result, or nothing."""
+    if isinstance(value, ConfidenceInterval):
+        return ConfidenceInterval(value.low[index], value.high[index])
+    return None if value is None else value[index]
+
+
+def scattered(value: Tensor, usable: Tensor, batch: Sequence[int], missing: float | bool = torch.nan) -> Tensor:
+    """Put the items that could be worked on back into their places among all.
+
+    Args:
+        value: Of those items, `(usable item, ...)`.
+        usable: Which of all items they are, `(item,)`, bool.
+        batch: Dimensions that `item` stands for.
+        missing: Value of the other items.
+
+    Returns:
+        `(*batch, ...)`.
+    """
+    whole = value.new_full((len(usable), *value.shape[1:]), missing)
+    whole[usable] = value
+    return whole.view(*batch, *value.shape[1:])
+
+
+def plain(value: Any) -> Any:
+    """A value as plain lists, dictionaries and numbers, ready for JSON, with None for NaN and infinities."""
+    if isinstance(value, ConfidenceInterval):
+        return {"low": listed(value.low), "high": listed(value.high)}
+    if isinstance(value, Tensor):
+        return listed(value)
+    if hasattr(value, "to_dict"):
+        return cleaned(value.to_dict())
+    if isinstance(value, tuple | list):
+        return [plain(entry) for entry in value]
+    return cleaned(value)
 
 
 def named(names: Sequence[str], which: Sequence[int], most: int = 5) -> str:
