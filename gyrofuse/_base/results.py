@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import field, fields, replace
+from dataclasses import fields, replace
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import torch
@@ -20,18 +20,14 @@ class ConfidenceInterval(NamedTuple):
     high: Tensor
 
 
-def batched() -> Any:
-    """A field of a `Result` whose leading dimensions are those of the batch."""
-    return field(metadata={"batched": True})
-
-
 class Result:
     """Base of results, which are frozen dataclasses: text, plain numbers, and items of a batch.
 
-    A subclass marks the fields that begin with the dimensions of the batch by `batched()`, and says in `_contents`
-    which attributes `to_dict` writes, by default its fields.
+    A subclass names the fields that begin with the dimensions of the batch in `_batched`, and in `_contents` the
+    attributes that `to_dict` writes, by default its fields.
     """
 
+    _batched: ClassVar[tuple[str, ...]] = ()
     _contents: ClassVar[tuple[str, ...]] = ()
 
     def summary(self) -> str:
@@ -56,8 +52,7 @@ class Result:
         size = len(index) if isinstance(index, tuple) else 1
         if size > len(self.batch_shape):
             raise IndexError(f"expected at most {len(self.batch_shape)} indices for batch shape {self.batch_shape}")
-        entries = [entry.name for entry in fields(self) if entry.metadata.get("batched")]  # type: ignore[arg-type]
-        return replace(self, **{name: _item(getattr(self, name), index) for name in entries})  # type: ignore[type-var]
+        return replace(self, **{name: _item(getattr(self, name), index) for name in self._batched})  # type: ignore[type-var]
 
 
 def _item(value: Any, index: Any) -> Any:
