@@ -111,7 +111,7 @@ def test_what_the_unit_feels_gives_the_motion_back_in_an_independent_integration
     np.testing.assert_allclose(out[12:], truth.position[0], atol=2e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.statistical
 def test_an_ideal_unit_gives_the_flight_back():
     position, velocity, attitude = navigated(replace(flight(), latitude=0.8), 100.0, 235.0)
     assert position < 1e-3
