@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from pages import Page
+from reference import published
 
 import gyrofuse as gf
 from gyrofuse.cli import app as cli
@@ -28,9 +29,9 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     return folder, run_demo(folder, n_samples=2**N_LEVELS)
 
 
-@pytest.fixture(scope="module")
-def settings(shared: Path) -> dict:
-    return json.loads((shared / "reference" / "paper_settings.json").read_text())["svo"]
+@pytest.fixture
+def settings() -> dict:
+    return published.table("zhang")
 
 
 def test_array_is_the_published_one(settings: dict):

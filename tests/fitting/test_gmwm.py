@@ -9,6 +9,7 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 import torch
+from reference import published
 from scipy import stats
 from torch import Tensor
 
@@ -57,24 +58,24 @@ def test_j_test_has_its_size_and_power(many):
 
 
 @pytest.mark.parametrize(("axis", "formula"), [("gx", "WN + AR1 + RW"), ("gy", "WN + AR1 + RW + SIN")])
-def test_published_criterion_is_reached_or_beaten(shared, axis, formula):
+def test_published_criterion_is_reached_or_beaten(axis, formula):
     """The same weights, from automatic starts; the published package stops early, at several times the minimum."""
-    published = json.loads((shared / "reference" / "gmwm_fit.json").read_text())[axis]
-    nu = torch.tensor(published["simts"]["simts_wv"], dtype=torch.float64)
-    omega = 1 / torch.tensor(published["simts"]["V_diag"], dtype=torch.float64)
+    simts = published.table("simts")[axis]
+    nu = torch.tensor(simts["wv"], dtype=torch.float64)
+    omega = 1 / torch.tensor(simts["V_diag"], dtype=torch.float64)
     found = gf.fit_gmwm(nu[:, None], formula, weighting=omega, n_samples=20_000)
-    assert found.objective.item() <= published["obj"] * (1 + 1e-6)
-    expected = torch.tensor(published["opt"], dtype=torch.float64)
+    assert found.objective.item() <= simts["obj"] * (1 + 1e-6)
+    expected = torch.tensor(simts["opt"], dtype=torch.float64)
     named = dict(zip(found.param_names, found.params[0].tolist(), strict=True))
     got = [named[name] for name in ("ar1_1.phi", "ar1_1.variance", "white_noise.variance", "random_walk.variance")]
     torch.testing.assert_close(torch.tensor(got, dtype=torch.float64), expected[:4], rtol=1e-4, atol=0)
 
 
 @pytest.mark.parametrize(("axis", "formula"), [("gx", "WN + AR1 + RW"), ("gy", "WN + AR1 + RW + SIN")])
-def test_no_start_finds_a_lower_minimum_of_noisy_copies(shared, axis, formula):
+def test_no_start_finds_a_lower_minimum_of_noisy_copies(axis, formula):
     """20 random starts each for 40 copies."""
-    published = json.loads((shared / "reference" / "gmwm_fit.json").read_text())[axis]["simts"]
-    nu, variance = (torch.tensor(published[key], dtype=torch.float64) for key in ("simts_wv", "V_diag"))
+    simts = published.table("simts")[axis]
+    nu, variance = (torch.tensor(simts[key], dtype=torch.float64) for key in ("wv", "V_diag"))
     generator = torch.Generator().manual_seed(5)
     n = 40
     noise = torch.randn(n, len(nu), generator=generator, dtype=torch.float64)

@@ -10,6 +10,7 @@ import pytest
 import torch
 from reference import haar as naive_haar
 from reference import multiscale as naive
+from reference import published
 
 from gyrofuse import (
     AR1,
@@ -206,9 +207,9 @@ def test_shrinking_keeps_what_is_well_known_and_steadies_what_is_not():
     torch.testing.assert_close(_shrink(wccv, torch.full_like(degrees, 1e12)), wccv, rtol=1e-6, atol=1e-9)
 
 
-def paper_cases(shared, faster: int = 1) -> list[ArrayModel]:
+def paper_cases(faster: int = 1) -> list[ArrayModel]:
     """The arrays of the paper's two studies, with the time scale of everything but white noise divided by `faster`."""
-    settings = json.loads((shared / "reference" / "paper_settings.json").read_text())["svo"]
+    settings = published.table("zhang")
     white, walk, *ar1 = (torch.tensor(settings[name]) for name in ("R", "Q", "P1", "P2", "P3"))
     components = [(WhiteNoise(1.0), white)]
     for phi, covariance in zip(settings["phi"], ar1, strict=True):
@@ -227,9 +228,9 @@ def ratios(model: ArrayModel, weights: torch.Tensor, n_levels: int) -> np.ndarra
 
 
 @pytest.mark.parametrize(("case", "largest"), [(0, 1.11), (1, 1.06)])
-def test_with_true_covariances_every_level_is_near_its_best(shared, case, largest):
+def test_with_true_covariances_every_level_is_near_its_best(case, largest):
     """The largest ratio over 19 levels is 1.11 and 1.06 in the paper's two cases; one vector comes to 3.9 and 1.7."""
-    model = paper_cases(shared)[case]
+    model = paper_cases()[case]
     wccv = model.wavelet_cross_covariance(19)
     optimum = torch.linalg.inv(wccv).sum((1, 2)).reciprocal()
     weights = _stacked_weights(wccv, 1 / optimum, 16)
@@ -239,10 +240,10 @@ def test_with_true_covariances_every_level_is_near_its_best(shared, case, larges
 
 
 @pytest.mark.parametrize(("case", "largest"), [(0, 1.35), (1, 1.25)])
-def test_weights_from_one_record_serve_new_data(shared, case, largest):
+def test_weights_from_one_record_serve_new_data(case, largest):
     """Mean over records of the largest ratio; the paper's two cases with time compressed 16 times, their 15 levels
     here 11. Nothing is told of the model."""
-    model = paper_cases(shared, faster=16)[case]
+    model = paper_cases(faster=16)[case]
     signal = model.simulate(1_044_000 // 16, batch=(12,), generator=torch.Generator().manual_seed(case))
     result = fit_multiscale(signal)
     assert result.n_bands == 12

@@ -15,6 +15,7 @@ import torch
 from contracts import assert_same
 from reference import haar as naive_haar
 from reference import parity as naive
+from reference import published
 from scipy import stats
 from torch import Tensor
 
@@ -108,10 +109,7 @@ N_RUNS = 1000
 @functools.cache
 def null_results(compression: float) -> dict[str, ParityResult]:
     """A thousand arrays like Case 1 of Zhang et al., time compressed: reference and two windows from each."""
-    path = Path(__file__).resolve().parents[3] / "shared" / "reference" / "paper_settings.json"
-    if not path.exists():
-        pytest.skip("needs the settings of the paper's studies in the folder `shared` beside the repository")
-    settings = json.loads(path.read_text())["svo"]
+    settings = published.table("zhang")
     white, walk = (torch.tensor(settings[name], dtype=torch.float64) for name in "RQ")
     array = ArrayModel([(WhiteNoise(1.0), white), (RandomWalk(1.0), walk * compression)])
     signal = array.simulate(1024 + 256, batch=(N_RUNS,), generator=torch.Generator().manual_seed(4))

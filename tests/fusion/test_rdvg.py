@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 import torch
-from reference import haar
+from reference import haar, published
 from reference import rdvg as naive
 from torch import Tensor
 
@@ -33,22 +33,21 @@ def white_and_walk(n_samples: int, batch: int, seed: int) -> tuple[Tensor, Tenso
 
 
 @pytest.mark.parametrize(("key", "n_scales"), [("algorithm_2", 9), ("algorithm_2_remove_last", 8)])
-def test_published_software_is_reproduced_from_its_allan_covariances(shared, key, n_scales):
+def test_published_software_is_reproduced_from_its_allan_covariances(key, n_scales):
     # It drops the last cluster of every size, so that its covariances are not those of the whole record.
-    published = json.loads((shared / "reference" / "synimu_array.json").read_text())
-    covariances = torch.tensor(published["acov_covariance"], dtype=torch.float64)[:n_scales]
+    synimu = published.table("synimu")
+    covariances = torch.tensor(synimu["acov_covariance"], dtype=torch.float64)[:n_scales]
     R, Q = fit_allan_covariances(covariances, 4096)
-    np.testing.assert_allclose(R, published[key]["R"], rtol=1e-12)
-    np.testing.assert_allclose(Q, published[key]["Q"], rtol=1e-12)
+    np.testing.assert_allclose(R, synimu[key]["R"], rtol=1e-12)
+    np.testing.assert_allclose(Q, synimu[key]["Q"], rtol=1e-12)
     if key == "algorithm_2":
-        np.testing.assert_allclose(_weights(Q), published["coef_vaccaro"], rtol=1e-10)
+        np.testing.assert_allclose(_weights(Q), synimu["coef_vaccaro"], rtol=1e-10)
         assert torch.linalg.eigvalsh(Q)[0] < 0
 
 
-def test_allan_covariances_of_published_software_are_those_without_the_last_cluster(shared):
-    published = json.loads((shared / "reference" / "synimu_array.json").read_text())
-    signal = np.loadtxt(shared / "reference" / "input_array.csv", delimiter=",").T
-    for m, expected in list(zip(published["acov_scales"], published["acov_covariance"], strict=True))[3:]:
+def test_allan_covariances_of_published_software_are_those_without_the_last_cluster():
+    synimu, signal = published.table("synimu"), published.array()
+    for m, expected in list(zip(synimu["acov_scales"], synimu["acov_covariance"], strict=True))[3:]:
         shortened = signal[:, : 4096 - m]
         got = [[naive.allan_covariance(a, b, m) for b in shortened] for a in shortened]
         np.testing.assert_allclose(got, expected, rtol=1e-10)

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from reference import processes as naive
+from reference import published
 
 from gyrofuse._base.random import ar1_recursion, own_generator
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.parsing import model_from_dict
 from gyrofuse.noise.processes import AR1, Drift, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
-
-SETTINGS = Path(__file__).resolve().parents[3] / "shared" / "reference" / "paper_settings.json"
-needs_settings = pytest.mark.skipif(
-    not SETTINGS.is_file(), reason="the published settings are not beside the repository"
-)
 
 RANDOM = [
     WhiteNoise(0.7),
@@ -53,7 +48,7 @@ def small_array() -> ArrayModel:
 
 def cases() -> dict[str, ArrayModel]:
     """The two simulated arrays of [Z], sections V-A and V-B."""
-    svo = json.loads(SETTINGS.read_text())["svo"]
+    svo = published.table("zhang")
     white = (WhiteNoise(1.0), svo["R"])
     slow = [(AR1(phi, 1.0), svo[name]) for phi, name in zip(svo["phi"], ("P1", "P2", "P3"), strict=True)]
     return {"case1": ArrayModel([white, (RandomWalk(1.0), svo["Q"])]), "case2": ArrayModel([white, *slow])}
@@ -180,11 +175,10 @@ def test_arguments_are_checked():
 # --- arrays -----------------------------------------------------------------------------------------------
 
 
-@needs_settings
 @pytest.mark.parametrize("case", ["case1", "case2"])
 @pytest.mark.parametrize("scales", ["long", "short"])
 def test_published_arrays_give_the_true_weights(case, scales):
-    svo = json.loads(SETTINGS.read_text())["svo"]
+    svo = published.table("zhang")
     # the printed weights of the scales, three digits, normalised
     omega = torch.tensor(svo[f"scale_weights_{scales}"], dtype=torch.float64)
     gamma = cases()[case].wavelet_cross_covariance(19)
@@ -199,7 +193,6 @@ def test_published_arrays_give_the_true_weights(case, scales):
     )
 
 
-@needs_settings
 @pytest.mark.parametrize("case", ["case1", "case2"])
 def test_100_recordings_of_a_published_array_agree_with_theory(case):
     array = cases()[case]

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from reference import processes as naive
+from reference import published
 
 from gyrofuse.noise.parsing import model_from_dict, parse_model
 from gyrofuse.noise.processes import (
@@ -22,11 +22,6 @@ from gyrofuse.noise.processes import (
     Sinusoid,
     WhiteNoise,
     haar_kernel,
-)
-
-REFERENCE = Path(__file__).resolve().parents[3] / "shared" / "reference"
-needs_reference = pytest.mark.skipif(
-    not REFERENCE.is_dir(), reason="the published settings are not beside the repository"
 )
 
 # Every member of the catalogue, with its second moments E[x_s x_t] for s, t = 1, 2, ..
@@ -44,10 +39,6 @@ CATALOGUE = [
     pytest.param(Sinusoid(0.85, 0.35), lambda s, t: 0.85**2 / 2 * np.cos(0.35 * (s - t)), id="sinusoid"),
 ]
 MEMBERS = [pytest.param(case.values[0], id=case.id) for case in CATALOGUE]
-
-
-def published(name: str) -> dict:
-    return json.loads((REFERENCE / name).read_text())
 
 
 def assert_close(got: torch.Tensor, expected: object, rtol: float = 1e-12, atol: float = 0.0) -> None:
@@ -69,10 +60,9 @@ def test_wavelet_variance_is_the_filtered_second_moment(process, moment):
     assert_close(process.wavelet_variance(8), expected, rtol=1e-9, atol=1e-14)
 
 
-@needs_reference
 @pytest.mark.parametrize("index", range(19))
 def test_wavelet_variance_matches_120_digits_at_25_levels(index):
-    case = published("paper_settings.json")["exact_wavelet_variance"]["cases"][index]
+    case = published.table("exact_wavelet_variance")["cases"][index]
     if case["process"] == "ar1":
         process = AR1(float(case["phi"]), case["innovation_variance"])
     else:
@@ -81,7 +71,6 @@ def test_wavelet_variance_matches_120_digits_at_25_levels(index):
     assert_close(process.wavelet_variance(25), case["wavelet_variance"], rtol=1e-13, atol=1e-40)
 
 
-@needs_reference
 @pytest.mark.parametrize(
     ("process", "key"),
     [
@@ -92,10 +81,9 @@ def test_wavelet_variance_matches_120_digits_at_25_levels(index):
     ],
 )
 def test_wavelet_variance_matches_other_software(process, key):
-    assert_close(process.wavelet_variance(20), published("theo_wv.json")["values"][key], rtol=1e-13)
+    assert_close(process.wavelet_variance(20), published.table("r_wv")["theory"][key], rtol=1e-13)
 
 
-@needs_reference
 @pytest.mark.parametrize(
     ("process", "key"),
     [
@@ -107,7 +95,7 @@ def test_wavelet_variance_matches_other_software(process, key):
     ],
 )
 def test_wavelet_variance_matches_decimal_arithmetic(process, key):
-    assert_close(process.wavelet_variance(20), published("theo_wv.json")["exact_decimal60"][key], rtol=1e-9)
+    assert_close(process.wavelet_variance(20), published.table("r_wv")["decimal"][key], rtol=1e-9)
 
 
 def test_ar1_keeps_its_digits_everywhere():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 
 import numpy as np
@@ -10,6 +9,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from reference import haar as naive
+from reference import published
 from scipy import integrate, optimize, stats
 from torch import Tensor
 
@@ -101,17 +101,16 @@ def test_is_the_scalar_twin(efficiency, gaps):
             assert got[level - 1, sensor].item() == pytest.approx(twin(w, c), rel=1e-10)
 
 
-def test_published_robust_wavelet_variances(shared):
+def test_published_robust_wavelet_variances():
     """R's wv solves the same equation: nine levels to 3e-5, the width of its scalar search.
 
     Its constants for 0.6 and 0.8 are c = 4.9734 and 5.6494, whose efficiency is 0.727 and 0.824; at the last two of
     its levels, with one and two windows side by side, its search ends elsewhere.
     """
-    published = json.loads((shared / "reference" / "wv_wvar_single.json").read_text())
-    series = torch.from_numpy(np.loadtxt(shared / "reference" / "input_single.csv"))[None]
+    series = torch.from_numpy(published.series())[None]
     for key, c in (("robust_eff06", 4.9734), ("robust_eff08", 5.6494)):
         got = [m_variance(w, biweight(c)).item() for w in gf.haar_coefficients(series, 9)]
-        np.testing.assert_allclose(got, published[key]["variance"][:9], rtol=3e-5)
+        np.testing.assert_allclose(got, published.table("r_wv")["robust"][key][:9], rtol=3e-5)
     assert biweight(4.9734).efficiency == pytest.approx(0.727, abs=5e-4)
     assert biweight(5.6494).efficiency == pytest.approx(0.824, abs=5e-4)
 
