@@ -30,14 +30,19 @@ def g(seed: int, n: int) -> Array:
     return np.sqrt(12.0) * (np.array(states) / 2**32 - 0.5)
 
 
+def ar1(phi: float, drive: Array) -> Array:
+    """The recursion `x <- phi x + e` from 0 over the last axis of the innovations."""
+    out, x = np.empty_like(drive), np.zeros(drive.shape[:-1])
+    for t in range(drive.shape[-1]):
+        out[..., t] = x = phi * x + drive[..., t]
+    return out
+
+
 @functools.cache
 def series() -> Array:
     """4096 samples of white noise, AR(1), random walk and a sinusoid."""
-    drive, memory, a = g(2, 4096), np.empty(4096), 0.0
-    for t, e in enumerate(drive):
-        memory[t] = a = 0.95 * a + 0.2 * e
-    t = np.arange(1, 4097)
-    return g(1, 4096) + memory + 0.02 * np.cumsum(g(3, 4096)) + 0.5 * np.sin(0.35 * t + 1)
+    tone = 0.5 * np.sin(0.35 * np.arange(1, 4097) + 1)
+    return g(1, 4096) + ar1(0.95, 0.2 * g(2, 4096)) + 0.02 * np.cumsum(g(3, 4096)) + tone
 
 
 @functools.cache
@@ -46,3 +51,9 @@ def array() -> Array:
     common = 0.03 * np.cumsum(g(30, 4096))
     sizes = zip([1, 1.5, 0.8, 2], [0.02, 0.01, 0.04, 0.005], strict=True)
     return np.stack([s * g(10 + i, 4096) + q * np.cumsum(g(20 + i, 4096)) + common for i, (s, q) in enumerate(sizes)])
+
+
+@functools.cache
+def memories(n: int, n_samples: int) -> Array:
+    """Series of AR(1) of memory 0.8 with innovations of variance 1 (n, n_samples)."""
+    return ar1(0.8, np.stack([g(100 + i, n_samples) for i in range(n)]))
