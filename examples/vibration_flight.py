@@ -19,8 +19,8 @@ from pathlib import Path
 import torch
 
 import gyrofuse as gf
-from gyrofuse.navigation import Alignment, Gnss, Trajectory, UnitErrors, flight, fly
-from gyrofuse.navigation.sensors import Axes, Drawn
+from gyrofuse.navigation import Gnss, InitialUncertainty, Trajectory, UnitErrors, flight, run_filter
+from gyrofuse.navigation.sensors import Axes, ErrorSamples
 
 N_SENSORS, TONE_HZ = 6, 11.3
 DEGREE = math.pi / 180
@@ -29,7 +29,7 @@ SLOW = torch.tensor([6e-4, 1.5e-3, 5e-4, 2e-3, 8e-4, 1e-3], dtype=torch.float64)
 WALK = torch.tensor([4e-5, 1e-5, 6e-5, 1e-5, 3e-5, 2e-5], dtype=torch.float64)  # deg/s per step
 TONE = torch.tensor([0.10, 0.14, -0.06, 0.12, 0.04, 0.09], dtype=torch.float64)  # deg/s
 ACCELEROMETER = "WN(variance=1e-4) + RW(variance=1e-11)"
-ALIGNMENT = Alignment(attitude=(0.1 * DEGREE, 0.1 * DEGREE, 0.5 * DEGREE))
+INITIAL = InitialUncertainty(attitude=(0.1 * DEGREE, 0.1 * DEGREE, 0.5 * DEGREE))
 
 
 def array(n_samples: int, batch: tuple[int, ...], rate: float, generator: torch.Generator) -> torch.Tensor:
@@ -56,10 +56,10 @@ def array_model(bench: torch.Tensor, rate: float) -> tuple[gf.ArrayModel, str]:
     return model, f"by the array, tone at {', '.join(tones)}" if tones else "by the array"
 
 
-def errors_of(fused: torch.Tensor, accelerometer: Axes) -> Drawn:
+def errors_of(fused: torch.Tensor, accelerometer: Axes) -> ErrorSamples:
     """Errors of a unit from those of its virtual gyros, deg/s, `(flight, 3, time)`."""
     samples = fused.transpose(-1, -2) * DEGREE
-    return Drawn(Axes(samples, samples.new_full((*samples.shape, 0), torch.nan)), accelerometer)
+    return ErrorSamples(Axes(samples, samples.new_full((*samples.shape, 0), torch.nan)), accelerometer)
 
 
 def main() -> None:
@@ -109,7 +109,9 @@ def main() -> None:
             told = UnitErrors(model.scaled(DEGREE), gf.parse_model(ACCELEROMETER), rate)
             own = torch.Generator().manual_seed(1)
             drawn = errors_of(flying, accelerometer)
-            out = fly(trajectory, drawn, told, gnss=Gnss(outage=away), alignment=ALIGNMENT, generator=own)
+            out = run_filter(
+                trajectory, drawn, told, gnss=Gnss(outage=away), initial_uncertainty=INITIAL, generator=own
+            )
             end = int((out.time - away[1]).abs().argmin())
             position, attitude = (v.square().sum(-1).mean(-1).sqrt() for v in (out.position, out.attitude))
             claimed = out.sd[end, :, 6:9].square().sum(-1).mean().sqrt()

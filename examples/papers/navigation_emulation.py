@@ -26,7 +26,7 @@ from _svo_study import arguments, conclusion, figures_written, finish
 from gmwm_misspecification import emulation, fit_both
 
 import gyrofuse as gf
-from gyrofuse.navigation import Alignment, Emulation, Gnss, Trajectory, emulate, flight
+from gyrofuse.navigation import Emulation, Gnss, InitialUncertainty, Trajectory, compare_filters, flight
 from gyrofuse.navigation.plots import plot_ratio_over_time
 
 QUICK_SAMPLES, QUICK_RUNS = 2**15, 8
@@ -35,7 +35,7 @@ PAPER_PEAK = 1.1789
 _FLIGHT, _RATIO = "navigation_flight.png", "navigation_ratio.png"
 # m/s^2, of a sample at 100 Hz
 _FAIR, _GOOD = "WN(variance=1e-4) + RW(variance=1e-11)", "WN(variance=1e-8)"
-WELL_ALIGNED = Alignment(attitude=(math.radians(0.05), math.radians(0.05), math.radians(0.2)))
+WELL_ALIGNED = InitialUncertainty(attitude=(math.radians(0.05), math.radians(0.05), math.radians(0.2)))
 
 
 def in_rad(params: torch.Tensor, basic: gf.Model) -> gf.Model:
@@ -67,7 +67,7 @@ class Case:
             params = wrong.params.clone()
             params[:, wrong.param_names.index("random_walk.variance")] = 0
             wrong = wrong.with_params(params)
-        return emulate(
+        return compare_filters(
             wrong,
             right,
             truth=truth,
@@ -75,7 +75,7 @@ class Case:
             rate=rate,
             gnss=self.gnss,
             trajectory=self.trajectory,
-            alignment=WELL_ALIGNED,
+            initial_uncertainty=WELL_ALIGNED,
             n_flights=len(wrong.params),
             generator=torch.Generator().manual_seed(seed),
         )

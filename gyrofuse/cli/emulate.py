@@ -58,8 +58,7 @@ def emulate(
 
     Both get the same errors and the same satellite positions, one a second, and none from 160 to 210 s.
     """
-    from gyrofuse.navigation import emulate as compare
-    from gyrofuse.navigation import read_trajectory
+    from gyrofuse.navigation import compare_filters, read_trajectory
 
     check_positive_integer("--flights", flights)
     given = [path for path in (model, against, truth, accelerometer, trajectory) if path is not None]
@@ -68,7 +67,7 @@ def emulate(
         hz = agreed_rate([*gyros, *([accelerometer] if accelerometer else [])], rate) or 100.0
         told = [_gyro(path, unit) for path in gyros]
         with progress_bar("flying") as show:
-            result = compare(
+            result = compare_filters(
                 told[0],
                 told[1],
                 truth=told[2] if truth else None,

@@ -1,22 +1,33 @@
-"""What error models cost in position and attitude: flights, strapdown navigation and a filter with GNSS."""
+"""Effect of noise models on navigation: strapdown navigation and a Kalman filter with GNSS, over simulated flights."""
 
-from gyrofuse.navigation.emulation import Emulation, emulate
-from gyrofuse.navigation.filter import Alignment, Flown, Gnss, fly
+from gyrofuse._base.deprecation import moved_names
+from gyrofuse.navigation.emulation import Emulation, compare_filters
+from gyrofuse.navigation.filter import FilterErrors, Gnss, InitialUncertainty, run_filter
 from gyrofuse.navigation.sensors import UnitErrors
 from gyrofuse.navigation.strapdown import State, navigate
 from gyrofuse.navigation.trajectory import Trajectory, flight, read_trajectory
 
 __all__ = [
-    "Alignment",
     "Emulation",
-    "Flown",
+    "FilterErrors",
     "Gnss",
+    "InitialUncertainty",
     "State",
     "Trajectory",
     "UnitErrors",
-    "emulate",
+    "compare_filters",
     "flight",
-    "fly",
     "navigate",
     "read_trajectory",
+    "run_filter",
 ]
+
+__getattr__ = moved_names(
+    __name__,
+    {
+        "Alignment": "gyrofuse.navigation.filter.InitialUncertainty",
+        "Flown": "gyrofuse.navigation.filter.FilterErrors",
+        "emulate": "gyrofuse.navigation.emulation.compare_filters",
+        "fly": "gyrofuse.navigation.filter.run_filter",
+    },
+)

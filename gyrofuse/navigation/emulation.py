@@ -1,4 +1,4 @@
-"""What an error model costs in the air: flights with the same errors, filtered with one model and with another."""
+"""Effect of a noise model on navigation: the same flights are estimated by two filters that assume different models."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.checks import check_confidence_level, check_positive_integer
+from gyrofuse._base.deprecation import moved_names, renamed_arguments
 from gyrofuse._base.results import ConfidenceInterval, cleaned, listed
-from gyrofuse.navigation.filter import Alignment, Flown, Gnss, fly
+from gyrofuse.navigation.filter import FilterErrors, Gnss, InitialUncertainty, run_filter
 from gyrofuse.navigation.sensors import UnitErrors
 from gyrofuse.navigation.trajectory import Trajectory, flight
 from gyrofuse.noise.model import Model
@@ -20,19 +21,21 @@ from gyrofuse.noise.model import Model
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_RESAMPLES = 1000
-_FEWEST = 5  # flights, for limits
-_ACCELEROMETER = "WN(variance=1e-4) + RW(variance=1e-11)"  # m/s^2, of a sample
+# Fewest flights for confidence limits. A bootstrap of five has 126 distinct resamples, of four 35: too few for the
+# tails; and a percentile interval is too short by the factor sqrt(1 - 1 / flights), 0.89 at five.
+_MIN_FLIGHTS = 5
+# Noise of a consumer-grade MEMS accelerometer, (m/s^2)^2 per sample: 0.01 m/s^2 white, and a slow random walk.
+_ACCELEROMETER = "WN(variance=1e-4) + RW(variance=1e-11)"
 
 
 class Peak(NamedTuple):
-    """The largest ratio, and limits that know that it was chosen for being the largest.
+    """Largest ratio over time, with limits that account for the choice of its time.
 
     Attributes:
-        time: s.
-        ratio: Of mean position errors.
-        low: Lower limit, by resampling flights and choosing anew each time; NaN with fewer than five flights.
-        high: Upper limit.
+        time: Time of the largest ratio, s.
+        ratio: Ratio of mean position errors.
+        low: Lower limit, from resampled flights with the maximum taken anew in each; NaN with fewer than five flights.
+        high: Upper limit, likewise.
     """
 
     time: float
@@ -43,18 +46,19 @@ class Peak(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Emulation:
-    """Errors of navigation with a filter that is told one model, and with one that is told another.
+    """Errors of two navigation filters that assume different noise models, on the same flights.
 
     Attributes:
-        time: s, `(time,)`.
-        position: Mean length of the position error over flights, m, of the one and of the other, `(2, time)`.
-        attitude: Mean length of the attitude error, rad, likewise.
-        ratio: Of the position errors, the one over the other, `(time,)`.
-        interval: Its limits at each time, by resampling flights, `(time,)` each; NaN with fewer than five flights.
-        peak: The largest ratio of the outage, or anywhere without one.
-        confidence_level: Of all limits.
-        n_flights: Flights.
-        outage: s, as far as the flights go; None without one.
+        time: Time, s, `(time,)`.
+        position: Mean length of the position error over flights, m, of the first and the second filter, `(2, time)`.
+        attitude: Mean length of the attitude error over flights, rad, of both filters, `(2, time)`.
+        ratio: Position error of the first filter over that of the second, `(time,)`.
+        interval: Limits of `ratio` at each time, by resampling flights, `(time,)` each; NaN with fewer than five
+            flights.
+        peak: Largest ratio during the outage, or at any time where there is no outage.
+        confidence_level: Confidence level of all limits.
+        n_flights: Number of flights.
+        outage: Start and end of the interval without satellites within the flights, s; None without one.
     """
 
     time: Tensor
@@ -68,7 +72,7 @@ class Emulation:
     outage: tuple[float, float] | None
 
     def summary(self) -> str:
-        """The costs in a few lines."""
+        """Errors of both filters and their ratio, in a few lines."""
         when, ratio, low, high = self.peak
         where = "during the outage" if self.outage is not None else "at most"
         end = int((self.time - (self.outage[1] if self.outage else float(self.time[-1]))).abs().argmin())
@@ -89,7 +93,7 @@ class Emulation:
         """Draw the ratio of position errors over time with its band.
 
         Args:
-            ax: Where to draw; new axes by default.
+            ax: Axes to draw on; new ones by default.
 
         Returns:
             The axes.
@@ -114,42 +118,44 @@ class Emulation:
         }
 
 
-def emulate(
+@renamed_arguments(against="reference", alignment="initial_uncertainty")
+def compare_filters(
     model: Model,
-    against: Model,
+    reference: Model,
     *,
     truth: Model | None = None,
     accelerometer: Model | None = None,
     rate: float = 100.0,
     trajectory: Trajectory | None = None,
     gnss: Gnss | None = None,
-    alignment: Alignment | None = None,
+    initial_uncertainty: InitialUncertainty | None = None,
     n_flights: int = 500,
     confidence_level: float = 0.95,
     generator: torch.Generator | None = None,
     progress: Callable[[str, float], None] = lambda _what, _share: None,
 ) -> Emulation:
-    """Compare what two noise models of gyros cost in position and attitude.
+    """Compare the position and attitude errors of two navigation filters that assume different gyro noise models.
 
-    The same errors are drawn once, and each flight is estimated twice, by filters that differ in what they are told.
+    Sensor errors are simulated once; each flight is estimated twice, by filters that differ in the assumed model only.
 
     Args:
-        model: Of the gyros, that the first filter is told: of samples, rad/s. Parameters may have a batch dimension,
+        model: Gyro noise model (rad/s per sample) assumed by the first filter. Parameters may have a batch dimension,
             one model for each flight.
-        against: That the second is told.
-        truth: That makes the errors; by default `against`.
-        accelerometer: Noise of the accelerometers, m/s^2, known to both; by default that of a fair MEMS unit.
-        rate: Of the unit, Hz.
-        trajectory: By default a flight of 235 s.
-        gnss: By default one position a second of 1 to 1.5 m, and none from 160 to 210 s.
-        alignment: What is known at first.
-        n_flights: How many.
-        confidence_level: Of the limits of the ratio.
+        reference: Gyro noise model assumed by the second filter, likewise.
+        truth: Gyro noise model that generates the errors; `reference` by default.
+        accelerometer: Noise model of the accelerometers (m/s^2 per sample), which generates their errors and is
+            assumed by both filters; by default that of a consumer-grade MEMS unit.
+        rate: Sampling rate of the inertial unit, Hz.
+        trajectory: True trajectory; by default a flight of 235 s.
+        gnss: Position fixes; by default one a second with errors of 1 to 1.5 m, and none from 160 to 210 s.
+        initial_uncertainty: Standard deviations of the initial errors.
+        n_flights: Number of flights.
+        confidence_level: Confidence level of the limits of the ratio.
         generator: Source of all random numbers.
-        progress: Is told the share done.
+        progress: Callback that gets a description and the share done, 0 to 1.
 
     Returns:
-        Errors over time, and their ratio.
+        Errors of both filters over time, and the ratio of their position errors.
 
     Raises:
         ValueError: Models without a state space, of other batch sizes, numbers out of range, or fixes that are not a
@@ -160,7 +166,7 @@ def emulate(
     """
     check_positive_integer("n_flights", n_flights)
     check_confidence_level(confidence_level)
-    for name, given in (("model", model), ("against", against), ("truth", truth)):
+    for name, given in (("model", model), ("reference", reference), ("truth", truth)):
         if given is not None and given.params.ndim > 1 and given.params.shape[:-1] != (n_flights,):
             raise ValueError(
                 f"`{name}`: expected one model, or one for each of {n_flights} flights, got parameters of shape "
@@ -171,22 +177,22 @@ def emulate(
     gnss.samples_apart(rate)
     shared = _accelerometer() if accelerometer is None else accelerometer
     n_samples = round(path.duration * rate)
-    drawn = UnitErrors(against if truth is None else truth, shared, rate).simulate(n_samples, n_flights, generator)
+    errors = UnitErrors(reference if truth is None else truth, shared, rate).simulate(n_samples, n_flights, generator)
     seed = int(torch.randint(2**62, (), generator=generator))
-    flown = []
-    for number, told in enumerate((model, against)):
+    filtered = []
+    for number, assumed in enumerate((model, reference)):
 
         def half(what: str, share: float, number: int = number) -> None:
             progress(what, (number + share) / 2)
 
-        own = torch.Generator().manual_seed(seed)  # the same fixes and the same alignment for both
-        flown.append(
-            fly(
+        own = torch.Generator().manual_seed(seed)  # the same fixes and the same initial errors for both filters
+        filtered.append(
+            run_filter(
                 path,
-                drawn,
-                UnitErrors(told, shared, rate),
+                errors,
+                UnitErrors(assumed, shared, rate),
                 gnss=gnss,
-                alignment=alignment,
+                initial_uncertainty=initial_uncertainty,
                 generator=own,
                 progress=half,
             )
@@ -194,7 +200,7 @@ def emulate(
     outage = gnss.outage
     if outage is not None:
         outage = (outage[0], min(outage[1], path.duration)) if outage[0] < path.duration else None
-    return _compared(flown[0], flown[1], outage, confidence_level, generator)
+    return _compared(filtered[0], filtered[1], outage, confidence_level, generator)
 
 
 def _accelerometer() -> Model:
@@ -204,15 +210,24 @@ def _accelerometer() -> Model:
 
 
 def _compared(
-    one: Flown, other: Flown, outage: tuple[float, float] | None, level: float, generator: torch.Generator
+    one: FilterErrors,
+    other: FilterErrors,
+    outage: tuple[float, float] | None,
+    level: float,
+    generator: torch.Generator,
+    n_resamples: int = 1000,
 ) -> Emulation:
-    lengths = torch.stack([flown.position.norm(dim=-1) for flown in (one, other)])  # (2, time, flight)
+    """Ratio of the mean position errors, and its limits from a bootstrap over flights.
+
+    With 1000 resamples the probability beyond a 95 % limit has a Monte Carlo standard error of 0.005.
+    """
+    lengths = torch.stack([errors.position.norm(dim=-1) for errors in (one, other)])  # (2, time, flight)
     position = lengths.mean(-1)
     n = lengths.shape[-1]
-    resampled = torch.randint(n, (_RESAMPLES, n), generator=generator)
-    share = torch.zeros(n, _RESAMPLES, dtype=lengths.dtype)
+    resampled = torch.randint(n, (n_resamples, n), generator=generator)
+    share = torch.zeros(n, n_resamples, dtype=lengths.dtype)
     share.scatter_add_(0, resampled.mT, torch.ones_like(share))
-    means = lengths @ share / n  # (2, time, resample): flights stay together, so both share what they have in common
+    means = lengths @ share / n  # (2, time, resample); the same flights are resampled for both filters
     tails = torch.tensor([(1 - level) / 2, (1 + level) / 2], dtype=lengths.dtype)
     ratio, ratios = position[0] / position[1], means[0] / means[1]
     inside = torch.ones_like(one.time, dtype=torch.bool)
@@ -220,14 +235,15 @@ def _compared(
         inside = (one.time > outage[0]) & (one.time <= outage[1])
     at = int(torch.where(inside, ratio, -torch.inf).argmax())
     largest = float(ratio[at])
-    # The largest of many is too large, and that of resampled flights is by as much larger again: turned round.
+    # The maximum over time is biased upwards, and its bootstrap replicates are biased by as much again: the basic
+    # (reversed) bootstrap interval, in logarithms, corrects for it.
     below, above = (largest**2 / ratios[inside].amax(0).quantile(tails.flip(0))).tolist()
     above = max(above, largest)
     low, high = ratios.quantile(tails, dim=-1)
-    if n < _FEWEST:
+    if n < _MIN_FLIGHTS:
         below = above = math.nan
         low, high = (torch.full_like(ratio, torch.nan) for _ in range(2))
-    attitude = torch.stack([flown.attitude.norm(dim=-1).mean(-1) for flown in (one, other)])
+    attitude = torch.stack([errors.attitude.norm(dim=-1).mean(-1) for errors in (one, other)])
     return Emulation(
         time=one.time,
         position=position,
@@ -239,3 +255,6 @@ def _compared(
         n_flights=n,
         outage=outage,
     )
+
+
+__getattr__ = moved_names(__name__, {"emulate": "gyrofuse.navigation.emulation.compare_filters"})

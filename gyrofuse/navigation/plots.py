@@ -23,11 +23,11 @@ def plot_ratio_over_time(
     """Draw a ratio of position errors with its band, the outage shaded.
 
     Args:
-        time: s, `(time,)`.
-        ratio: `(time,)`.
-        limits: `(time,)` each.
-        outage: s.
-        ax: Where to draw; new axes by default.
+        time: Time, s, `(time,)`.
+        ratio: Ratio of mean position errors, `(time,)`.
+        limits: Lower and upper confidence limits of the ratio, `(time,)` each.
+        outage: Start and end of the interval without satellites, s; None without one.
+        ax: Axes to draw on; new ones by default.
 
     Returns:
         The axes.

@@ -1,4 +1,4 @@
-"""Errors of an inertial unit: what simulates them, and what a filter is told about them."""
+"""Noise model of an inertial unit, from which errors are simulated or which a filter assumes."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.checks import check_positive
+from gyrofuse._base.deprecation import moved_names
 from gyrofuse.noise.model import Model
 from gyrofuse.noise.processes import AR1, RandomWalk
 from gyrofuse.noise.state_space import StateSpace, state_space
@@ -19,9 +20,10 @@ class UnitErrors:
     """Noise of the three gyros and three accelerometers of a unit, axes independent and alike.
 
     Attributes:
-        gyro: Of samples of rate, rad/s; parameters may have one batch dimension, a model for each flight.
-        accelerometer: Of samples of specific force, m/s^2; likewise.
-        rate: Of the samples, Hz.
+        gyro: Noise model of the samples of angular rate, rad/s; parameters may have one batch dimension, a model for
+            each flight.
+        accelerometer: Noise model of the samples of specific force, m/s^2; likewise.
+        rate: Sampling rate, Hz.
     """
 
     gyro: Model
@@ -37,41 +39,41 @@ class UnitErrors:
 
     def simulate(
         self, n_samples: int, n_flights: int, generator: torch.Generator, *, with_states: bool = False
-    ) -> Drawn:
-        """Draw errors of so many flights; models with batch dimensions have one flight each.
+    ) -> ErrorSamples:
+        """Simulate errors of flights; of a model with a batch dimension each entry makes the errors of one flight.
 
         Args:
-            n_samples: Of each flight.
-            n_flights: How many.
+            n_samples: Number of samples of each flight.
+            n_flights: Number of flights.
             generator: Source of randomness.
-            with_states: Whether to keep what the processes are made of, to judge a filter's claims by: as much memory
-                again for each of them.
+            with_states: Whether the true states of the processes are kept, to check a filter's covariance against
+                them; each takes as much memory as the samples.
         """
         models = self.gyro, self.accelerometer
-        return Drawn(*(_drawn(model, n_samples, n_flights, generator, with_states) for model in models))
+        return ErrorSamples(*(_simulated(model, n_samples, n_flights, generator, with_states) for model in models))
 
 
 class Axes(NamedTuple):
     """Errors of three axes.
 
     Attributes:
-        samples: `(flight, time, 3)`.
-        states: What the filter's states of the sensors truly are, `(flight, time, 3, state)`; NaN where nobody knows,
-            and none where they were not kept.
+        samples: Errors of the samples, `(flight, time, 3)`.
+        states: True values of the filter's states of these sensors, `(flight, time, 3, state)`; NaN where a process
+            does not give them, and no state where they were not kept.
     """
 
     samples: Tensor
     states: Tensor
 
 
-class Drawn(NamedTuple):
-    """Errors of a unit."""
+class ErrorSamples(NamedTuple):
+    """Simulated errors of an inertial unit."""
 
     gyro: Axes
     accelerometer: Axes
 
 
-def _drawn(model: Model, n_samples: int, n_flights: int, generator: torch.Generator, with_states: bool) -> Axes:
+def _simulated(model: Model, n_samples: int, n_flights: int, generator: torch.Generator, with_states: bool) -> Axes:
     batch = (3,) if model.params.ndim > 1 else (3, n_flights)
     total = torch.zeros(3, n_flights, n_samples, dtype=torch.float64)
     states = []
@@ -84,3 +86,6 @@ def _drawn(model: Model, n_samples: int, n_flights: int, generator: torch.Genera
             states += [path] if known else [torch.full_like(path, torch.nan)] * n_states
     stacked = torch.stack(states, -1) if states else total.new_zeros(*total.shape, 0)
     return Axes(total.permute(1, 2, 0), stacked.permute(1, 2, 0, 3))
+
+
+__getattr__ = moved_names(__name__, {"Drawn": "gyrofuse.navigation.sensors.ErrorSamples"})

@@ -4,9 +4,9 @@ In a frame tangent to the Earth and fixed to it (north, east, down),
 
     C' = C W_ib - W_ie C,   v' = C f + g - 2 w_ie x v,   r' = v.
 
-An interval's increments are integrals in the axes of a body that turns meanwhile: coning and sculling are what the
-order of turns and pushes within it changes, worked out from the interval and the one before (Savage 1998, parts 1 and
-2; Titterton and Weston, chapter 11). Numbers in round brackets are those of Groves, Principles of GNSS, Inertial, and
+The increments of an interval are integrals in the axes of a body that rotates within it. The coning and sculling
+corrections for that rotation are computed from the interval and the one before (Savage 1998, parts 1 and 2; Titterton
+and Weston, chapter 11). Numbers in round brackets are equations of Groves, Principles of GNSS, Inertial, and
 Multisensor Integrated Navigation Systems, second edition, whose Earth-centred frame is here the tangent one.
 """
 
@@ -18,18 +18,16 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.units import GRAVITY
-from gyrofuse.navigation.attitude import conjugate, from_rotation_vector, multiply, rotate
-
-_SMALL = 1e-4  # rad
+from gyrofuse.navigation.attitude import SMALL_ANGLE, conjugate, from_rotation_vector, multiply, rotate
 
 
 class State(NamedTuple):
-    """Of navigation, `(..., component)`.
+    """Navigation state, `(..., component)`.
 
     Attributes:
         attitude: Quaternion, body to navigation frame.
-        velocity: m/s.
-        position: m.
+        velocity: Velocity in the navigation frame, m/s.
+        position: Position in the navigation frame, m.
     """
 
     attitude: Tensor
@@ -38,13 +36,14 @@ class State(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """The navigation frame during an interval, in which the Earth turns it.
+    """Rotation of the navigation frame with the Earth, and gravity, during one interval.
 
     Attributes:
-        dt: s.
+        dt: Length of the interval, s.
         earth: Rate of the Earth in the frame, rad/s, `(3,)`.
-        half, whole: Quaternions of the frame's turn back, by the interval's middle and its end.
-        down: What gravity adds to a velocity, m/s.
+        half: Quaternion of the inverse of the frame's rotation from the start of the interval to its middle.
+        whole: The same for the end of the interval.
+        down: Velocity that gravity adds in the interval, m/s.
     """
 
     dt: float
@@ -55,38 +54,38 @@ class Frame(NamedTuple):
 
     @classmethod
     def of(cls, dt: float, earth: Tensor) -> Frame:
-        """Of intervals of `dt` seconds."""
+        """Frame for intervals of `dt` seconds, with the rate of the Earth `(3,)` in rad/s."""
         down = torch.tensor([0.0, 0.0, dt * GRAVITY], dtype=earth.dtype, device=earth.device)
         half, whole = (from_rotation_vector(-share * dt * earth) for share in (0.5, 1.0))
         return cls(dt, earth, half, whole, down)
 
 
 def step(state: State, now: tuple[Tensor, Tensor], before: tuple[Tensor, Tensor], frame: Frame) -> State:
-    """One interval on.
+    """Integrate one interval.
 
     Args:
-        state: At its start.
-        now: Increments of angle (rad) and velocity (m/s) in it, `(..., 3)` each.
-        before: Those of the interval before.
-        frame: In which it is told.
+        state: State at the start of the interval.
+        now: Increments of angle (rad) and velocity (m/s) in the interval, `(..., 3)` each.
+        before: Increments of the interval before.
+        frame: Rotation of the navigation frame in the interval.
 
     Returns:
-        The state at its end.
+        The state at the end of the interval.
     """
     angle, push = now
     angle_, push_ = before
     # Coning: linear rate over both intervals.
     turn = angle + torch.linalg.cross(angle_, angle) / 12
-    # Rotation while it is pushed, exact for constant rate and force (5.84), and sculling beside it.
+    # Rotation during the acceleration, exact for constant rate and force (5.84), and the sculling correction.
     pushed = push + _turned(angle, push)
     pushed = pushed + (torch.linalg.cross(angle_, push) + torch.linalg.cross(push_, angle)) / 12
     gained = rotate(state.attitude, pushed)
-    gained = rotate(frame.half, gained) + frame.down  # (5.85): the frame turns as well
+    gained = rotate(frame.half, gained) + frame.down  # (5.85): rotation of the frame
     turned = (frame.dt * frame.earth).expand_as(gained)
-    # (5.36), with the velocity in the middle
+    # (5.36), with the velocity at the middle of the interval
     gained = gained - 2 * torch.linalg.cross(turned, state.velocity + gained / 2)
     velocity = state.velocity + gained
-    # (5.38) beside what a push that changes linearly adds, twice integrated: in the frame, which turns with the Earth.
+    # (5.38), and the double integral of a linear change of the specific force in the rotating frame.
     still = rotate(conjugate(state.attitude), turned)
     change = rotate(state.attitude, push - push_ + torch.linalg.cross(angle - still, push))
     position = state.position + frame.dt * (state.velocity + gained / 2 - change / 12)
@@ -97,20 +96,20 @@ def step(state: State, now: tuple[Tensor, Tensor], before: tuple[Tensor, Tensor]
 
 
 def _turned(angle: Tensor, push: Tensor) -> Tensor:
-    """What the turn adds to a push `(..., 3)` in the axes of the interval's start, rate and force constant."""
+    """Correction of a velocity increment `(..., 3)` to the axes at the start, for constant rate and force."""
     size = angle.norm(dim=-1, keepdim=True)
-    square, safe = size.square(), size.clamp(min=_SMALL)
-    one = torch.where(size < _SMALL, 0.5 - square / 24, (1 - torch.cos(safe)) / safe.square())
-    two = torch.where(size < _SMALL, 1 / 6 - square / 120, (1 - torch.sin(safe) / safe) / safe.square())
+    square, safe = size.square(), size.clamp(min=SMALL_ANGLE)
+    one = torch.where(size < SMALL_ANGLE, 0.5 - square / 24, (1 - torch.cos(safe)) / safe.square())
+    two = torch.where(size < SMALL_ANGLE, 1 / 6 - square / 120, (1 - torch.sin(safe) / safe) / safe.square())
     first = torch.linalg.cross(angle, push)
     return one * first + two * torch.linalg.cross(angle, first)
 
 
 def navigate(start: State, angles: Tensor, pushes: Tensor, dt: float, earth: Tensor) -> State:
-    """All intervals, one after the other.
+    """Integrate increments of angle and velocity, interval by interval.
 
     Args:
-        start: The state at first.
+        start: Initial state.
         angles: Increments of angle, rad, `(..., interval, 3)`.
         pushes: Increments of velocity, m/s, `(..., interval, 3)`.
         dt: Length of an interval, s.
@@ -137,7 +136,7 @@ def navigate(start: State, angles: Tensor, pushes: Tensor, dt: float, earth: Ten
 
 
 def _extrapolated(increments: Tensor) -> Tensor:
-    """What the interval before the first would have given, were the change the same."""
+    """Increments of the interval before the first, by linear extrapolation from the first two."""
     if increments.shape[-2] < 2:
         return increments[..., 0, :]
     return 2 * increments[..., 0, :] - increments[..., 1, :]

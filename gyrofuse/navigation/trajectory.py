@@ -1,6 +1,6 @@
 """Trajectories whose rates and specific forces are known exactly.
 
-Position and Euler angles are splines of degree five; what gyros and accelerometers feel follows from their derivatives.
+Position and Euler angles are splines of degree five; angular rate and specific force follow from their derivatives.
 The frame is tangent to the Earth: north, east, down.
 """
 
@@ -21,21 +21,24 @@ from gyrofuse._base.checks import check_floating, check_positive
 from gyrofuse._base.units import GRAVITY
 from gyrofuse.navigation.attitude import conjugate, from_euler, rotate
 
-EARTH_RATE = 7.292115e-5  # rad/s
+EARTH_RATE = 7.292115e-5  # rotation rate of the Earth, rad/s, as WGS 84 defines it
+# Degree of the splines through position and Euler angles: quintic, so that specific force, which takes two derivatives
+# of position, is twice continuously differentiable, as the coning and sculling corrections assume.
 _DEGREE = 5
-_NODES = 6  # of Gauss and Legendre, in an interval
-_SLOWEST = 0.5  # m/s: below, there is no direction of flight
+# Least ground speed, m/s, of a coordinated flight: its yaw is the direction of the ground velocity, which has no
+# meaning near zero. It only decides which trajectories are refused.
+_MIN_GROUND_SPEED = 0.5
 
 
 class Motion(NamedTuple):
-    """At some times, `(time, ...)`.
+    """True motion at a number of times, `(time, ...)`.
 
     Attributes:
-        position: m.
-        velocity: m/s.
+        position: Position in the navigation frame, m.
+        velocity: Velocity in the navigation frame, m/s.
         attitude: Quaternion, body to navigation frame.
-        rate: Of the body against inertial space, in its axes, rad/s.
-        specific_force: In the axes of the body, m/s^2.
+        rate: Angular rate of the body against inertial space, in body axes, rad/s.
+        specific_force: Specific force in body axes, m/s^2.
     """
 
     position: Tensor
@@ -46,11 +49,11 @@ class Motion(NamedTuple):
 
 
 class Increments(NamedTuple):
-    """What an ideal unit gives for each interval: integrals of rate and specific force, `(interval, 3)`.
+    """Output of an ideal unit: integrals of angular rate and specific force over each interval, `(interval, 3)`.
 
     Attributes:
-        angle: rad.
-        velocity: m/s.
+        angle: Increments of angle, rad.
+        velocity: Increments of velocity, m/s.
     """
 
     angle: Tensor
@@ -59,14 +62,14 @@ class Increments(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """A smooth motion through given places.
+    """A smooth motion through given points.
 
     Attributes:
-        time: s, `(point,)`, increasing.
-        position: North, east, down in m, `(point, 3)`.
-        euler: Roll, pitch, yaw in rad, `(point, 3)`, roll and yaw of any number of turns; without them those of a
+        time: Times of the points, s, `(point,)`, increasing.
+        position: Positions north, east, down in m, `(point, 3)`.
+        euler: Roll, pitch, yaw in rad, `(point, 3)`, roll and yaw of any number of turns; by default those of a
             coordinated flight.
-        latitude: rad; with it the Earth turns.
+        latitude: Latitude, rad, for the rotation of the Earth; None for an Earth that does not rotate.
 
     Raises:
         TypeError: Not tensors.
@@ -105,18 +108,22 @@ class Trajectory:
 
     @property
     def duration(self) -> float:
-        """From the first point to the last, s."""
+        """Time from the first point to the last, s."""
         return float(self.time[-1] - self.time[0])
 
     @property
     def earth_rate(self) -> Tensor:
-        """Of the Earth in the navigation frame, rad/s, `(3,)`."""
+        """Rotation rate of the Earth in the navigation frame, rad/s, `(3,)`."""
         if self.latitude is None:
             return torch.zeros(3, dtype=torch.float64)
         return EARTH_RATE * torch.tensor([np.cos(self.latitude), 0.0, -np.sin(self.latitude)], dtype=torch.float64)
 
     def at(self, time: Tensor) -> Motion:
-        """Motion at times `(time,)`, s from the first point."""
+        """Motion at given times.
+
+        Args:
+            time: Times since the first point, s, `(time,)`.
+        """
         t = (time.to(torch.float64) + self.time[0]).numpy()
         position, velocity, acceleration = (torch.from_numpy(self._place(t, nu)) for nu in range(3))
         angles, turning = (torch.from_numpy(self._angles(t, nu)) for nu in range(2))
@@ -128,16 +135,22 @@ class Trajectory:
         force = acceleration - down + 2 * torch.linalg.cross(earth.expand_as(velocity), velocity)
         return Motion(position, velocity, attitude, rate, rotate(to_body, force))
 
-    def increments(self, rate: float) -> Increments:
-        """What an ideal unit of that rate (Hz) gives, interval by interval, by quadrature of high order."""
+    def increments(self, rate: float, n_nodes: int = 6) -> Increments:
+        """Output of an ideal inertial unit, by Gauss-Legendre quadrature of each interval.
+
+        Args:
+            rate: Sampling rate of the unit, Hz.
+            n_nodes: Nodes of the quadrature; with six it is exact for polynomials of degree eleven, twice that of
+                the splines.
+        """
         step = 1 / check_positive("rate", rate)
         n = round(self.duration * rate)
-        nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+        nodes, weights = np.polynomial.legendre.leggauss(n_nodes)
         start = torch.arange(n, dtype=torch.float64)[:, None] * step
         motion = self.at((start + torch.from_numpy((nodes + 1) / 2) * step).flatten())
         share = torch.from_numpy(weights / 2) * step
         angle, velocity = (
-            torch.einsum("ikc,k->ic", values.unflatten(0, (n, _NODES)), share)
+            torch.einsum("ikc,k->ic", values.unflatten(0, (n, n_nodes)), share)
             for values in (motion.rate, motion.specific_force)
         )
         return Increments(angle, velocity)
@@ -188,11 +201,13 @@ def flight() -> Trajectory:
 def read_trajectory(path: str | Path) -> Trajectory:
     """Read a trajectory from a text file with named columns separated by commas.
 
-    Columns: `time` (s), `north`, `east`, `down` (m), and, if there are any, `roll`, `pitch`, `yaw` (rad).
+    Args:
+        path: The file, with the columns `time` (s), `north`, `east`, `down` (m), and optionally `roll`, `pitch`,
+            `yaw` (rad).
 
     Raises:
         FileNotFoundError: No such file.
-        ValueError: Columns are missing, or what `Trajectory` refuses.
+        ValueError: Columns are missing, or values that `Trajectory` refuses.
     """
     first, *lines = Path(path).read_text(encoding="utf-8").splitlines() or [""]
     names = [name.strip().lower() for name in first.split(",")]
@@ -219,12 +234,12 @@ def read_trajectory(path: str | Path) -> Trajectory:
 
 
 def _coordinated(velocity: np.ndarray, acceleration: np.ndarray) -> np.ndarray:
-    """Roll, pitch and yaw of a craft that flies where it points and banks so that it does not slip, `(time, 3)`."""
+    """Roll, pitch and yaw of a coordinated flight, without sideslip, from velocity and acceleration, `(time, 3)`."""
     speed = np.hypot(velocity[:, 0], velocity[:, 1])
-    if speed.min() < _SLOWEST:
+    if speed.min() < _MIN_GROUND_SPEED:
         raise ValueError(
-            f"`position`: expected a flight of more than {_SLOWEST} m/s over ground, got {speed.min():.3g}; give "
-            "`euler` for one that hovers"
+            f"`position`: expected a flight of more than {_MIN_GROUND_SPEED} m/s over ground, got {speed.min():.3g}; "
+            "give `euler` for one that hovers"
         )
     yaw = np.unwrap(np.arctan2(velocity[:, 1], velocity[:, 0]))
     pitch = np.arctan2(-velocity[:, 2], speed)
@@ -233,7 +248,7 @@ def _coordinated(velocity: np.ndarray, acceleration: np.ndarray) -> np.ndarray:
 
 
 def _body_rate(euler: Tensor, turning: Tensor) -> Tensor:
-    """Rate in the body's axes of Euler angles and their derivatives `(..., 3)` (Titterton and Weston, section 3.6)."""
+    """Angular rate in body axes, from Euler angles and their derivatives (Titterton and Weston, section 3.6)."""
     roll, pitch, _ = euler.unbind(-1)
     roll_, pitch_, yaw_ = turning.unbind(-1)
     return torch.stack(

@@ -19,7 +19,7 @@ import torch
 from scipy import stats
 
 import gyrofuse as gf
-from gyrofuse.navigation import Alignment, Gnss, UnitErrors, flight, fly
+from gyrofuse.navigation import Gnss, InitialUncertainty, UnitErrors, flight, run_filter
 
 DEGREE = math.pi / 180
 RATE = 100.0
@@ -59,8 +59,10 @@ def main() -> None:
     trajectory, errors = flight(), unit()
     drawn = errors.simulate(round(trajectory.duration * RATE), n, torch.Generator().manual_seed(0), with_states=True)
     start = time.perf_counter()
-    alignment = Alignment(attitude=(0.1 * DEGREE, 0.1 * DEGREE, 0.5 * DEGREE))
-    out = fly(trajectory, drawn, errors, gnss=Gnss(), alignment=alignment, generator=torch.Generator().manual_seed(1))
+    initial = InitialUncertainty(attitude=(0.1 * DEGREE, 0.1 * DEGREE, 0.5 * DEGREE))
+    out = run_filter(
+        trajectory, drawn, errors, gnss=Gnss(), initial_uncertainty=initial, generator=torch.Generator().manual_seed(1)
+    )
     seconds = time.perf_counter() - start
     for k, (name, size) in enumerate(zip(NAMES, out.sizes, strict=True)):
         told(name, out.nees[..., k], n, size)

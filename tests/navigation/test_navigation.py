@@ -12,18 +12,19 @@ from scipy import stats
 from scipy.integrate import solve_ivp
 
 import gyrofuse as gf
+from gyrofuse import navigation
 from gyrofuse._base.units import GRAVITY
 from gyrofuse.navigation import (
-    Alignment,
     Gnss,
+    InitialUncertainty,
     State,
     Trajectory,
     UnitErrors,
-    emulate,
+    compare_filters,
     flight,
-    fly,
     navigate,
     read_trajectory,
+    run_filter,
 )
 from gyrofuse.navigation.attitude import (
     conjugate,
@@ -195,15 +196,17 @@ def test_a_model_in_another_unit_is_that_of_the_signal_times_a_factor():
         model.scaled(0.0)
 
 
-def flown(told: UnitErrors, n_flights: int = 40):
+def flown(assumed: UnitErrors, n_flights: int = 40):
     trajectory = flight()
-    drawn = unit().simulate(60 * 50, n_flights, torch.Generator().manual_seed(3), with_states=True)
-    alignment = Alignment(attitude=(0.2 * DEGREE, 0.2 * DEGREE, 0.5 * DEGREE))
+    errors = unit().simulate(60 * 50, n_flights, torch.Generator().manual_seed(3), with_states=True)
+    initial = InitialUncertainty(attitude=(0.2 * DEGREE, 0.2 * DEGREE, 0.5 * DEGREE))
     generator = torch.Generator().manual_seed(4)
-    return fly(trajectory, drawn, told, gnss=Gnss(outage=(40.0, 50.0)), alignment=alignment, generator=generator)
+    return run_filter(
+        trajectory, errors, assumed, gnss=Gnss(outage=(40.0, 50.0)), initial_uncertainty=initial, generator=generator
+    )
 
 
-def test_a_filter_that_is_told_the_truth_is_consistent():
+def test_a_filter_that_assumes_the_truth_is_consistent():
     out = flown(unit())
     total, count = float(out.nis.sum()), out.nis.numel() * 3
     low, high = stats.chi2.interval(0.999, count)
@@ -221,22 +224,22 @@ def test_a_filter_that_is_told_the_truth_is_consistent():
 
 
 def test_a_filter_starts_from_where_the_model_does():
-    """A ramp is known from its first sample on: told of it, the filter takes it off."""
+    """A ramp is known from its first sample on: assumed of it, the filter takes it off."""
     gyro = gf.WhiteNoise((0.02 * DEGREE) ** 2) + gf.Drift(2e-4 * DEGREE)
-    told = UnitErrors(gyro, gf.WhiteNoise(0.01**2), 50.0)
-    drawn = told.simulate(60 * 50, 40, torch.Generator().manual_seed(3))
-    alignment = Alignment(attitude=(0.2 * DEGREE, 0.2 * DEGREE, 0.5 * DEGREE))
-    asked = {"gnss": Gnss(outage=(40.0, 50.0)), "alignment": alignment}
-    out = fly(flight(), drawn, told, generator=torch.Generator().manual_seed(4), **asked)
+    assumed = UnitErrors(gyro, gf.WhiteNoise(0.01**2), 50.0)
+    errors = assumed.simulate(60 * 50, 40, torch.Generator().manual_seed(3))
+    initial = InitialUncertainty(attitude=(0.2 * DEGREE, 0.2 * DEGREE, 0.5 * DEGREE))
+    asked = {"gnss": Gnss(outage=(40.0, 50.0)), "initial_uncertainty": initial}
+    out = run_filter(flight(), errors, assumed, generator=torch.Generator().manual_seed(4), **asked)
     low, high = stats.chi2.interval(0.9999, 120)
     end = int((out.time - 50.0).abs().argmin())
     assert all(low < total < high for total in out.nees[end, :, :3].sum(0).tolist())
-    unaware = UnitErrors(gf.WhiteNoise((0.02 * DEGREE) ** 2), told.accelerometer, 50.0)
-    lost = fly(flight(), drawn, unaware, generator=torch.Generator().manual_seed(4), **asked)
+    unaware = UnitErrors(gf.WhiteNoise((0.02 * DEGREE) ** 2), assumed.accelerometer, 50.0)
+    lost = run_filter(flight(), errors, unaware, generator=torch.Generator().manual_seed(4), **asked)
     assert float(lost.nees[end, :, 0].sum()) > 10 * high
 
 
-def test_a_filter_that_is_told_too_little_noise_shows_it():
+def test_a_filter_that_assumes_too_little_noise_shows_it():
     out = flown(unit(0.1))
     assert float(out.nis.sum()) > stats.chi2.isf(0.01, out.nis.numel() * 3)  # the fixes' own errors are most of it
     end = int((out.time - 50.0).abs().argmin())
@@ -262,9 +265,9 @@ def test_the_same_model_costs_the_same_and_a_wrong_one_more():
     wrong = gf.parse_model("AR1(phi=0.18,variance=1e-5) + RW(variance=2e-10)")
     short = Trajectory(flight().time[:8], flight().position[:8])
     asked = {"trajectory": short, "gnss": Gnss(outage=(60.0, 100.0)), "rate": 20.0, "n_flights": 60}
-    same = emulate(truth, truth, **asked)
+    same = compare_filters(truth, truth, **asked)
     torch.testing.assert_close(same.ratio, torch.ones_like(same.ratio), rtol=0, atol=0)
-    other = emulate(wrong, truth, **asked)
+    other = compare_filters(wrong, truth, **asked)
     when, ratio, low, high = other.peak
     assert 60 < when <= 100
     assert 1.0 < low < ratio < high
@@ -278,13 +281,13 @@ def test_an_outage_after_the_flight_is_none():
     wrong = gf.parse_model("AR1(phi=0.18,variance=1e-5) + RW(variance=2e-10)")
     short = Trajectory(flight().time[:6], flight().position[:6])
     asked = {"trajectory": short, "rate": 20.0, "n_flights": 4}
-    none, after = (emulate(wrong, truth, gnss=Gnss(outage=o), **asked) for o in (None, (160.0, 210.0)))
+    none, after = (compare_filters(wrong, truth, gnss=Gnss(outage=o), **asked) for o in (None, (160.0, 210.0)))
     assert after.outage is None
     assert after.peak[:2] == none.peak[:2]
     assert float(after.ratio.max()) == after.peak.ratio
     assert math.isnan(after.peak.low)  # four flights do not tell how far off it may be
     assert after.to_dict()["peak"]["low"] is None
-    assert emulate(wrong, truth, gnss=Gnss(outage=(60.0, 210.0)), **asked).outage == (60.0, 75.0)
+    assert compare_filters(wrong, truth, gnss=Gnss(outage=(60.0, 210.0)), **asked).outage == (60.0, 75.0)
 
 
 def test_limits_of_the_peak_know_that_it_was_chosen():
@@ -293,7 +296,7 @@ def test_limits_of_the_peak_know_that_it_was_chosen():
     more, less = (gf.parse_model(f"AR1(phi=0.18,variance=1e-5) + RW(variance=2e-{k})") for k in (10, 12))
     short = Trajectory(flight().time[:8], flight().position[:8])
     asked = {"trajectory": short, "gnss": Gnss(outage=(60.0, 100.0)), "rate": 20.0, "n_flights": 12, "truth": truth}
-    one, other = emulate(more, less, **asked).peak, emulate(less, more, **asked).peak
+    one, other = compare_filters(more, less, **asked).peak, compare_filters(less, more, **asked).peak
     assert min(one.low, other.low) < 1.0
     assert max(one.ratio, other.ratio) > 1.0
     assert all(peak.low < peak.ratio <= peak.high for peak in (one, other))
@@ -318,7 +321,7 @@ def test_fixes_that_cannot_be_are_refused(options, says):
 def test_fixes_between_samples_are_refused(rate, of_fixes):
     model = gf.WhiteNoise(1e-6)
     with pytest.raises(ValueError, match="`gnss`: expected fixes a whole number of the unit's samples apart"):
-        emulate(model, model, rate=rate, gnss=Gnss(rate=of_fixes), n_flights=2)
+        compare_filters(model, model, rate=rate, gnss=Gnss(rate=of_fixes), n_flights=2)
 
 
 def test_models_for_each_flight_are_those_of_the_flights():
@@ -326,10 +329,10 @@ def test_models_for_each_flight_are_those_of_the_flights():
     each = truth.with_params(truth.params.expand(6, -1).clone())
     short = Trajectory(flight().time[:6], flight().position[:6])
     asked = {"trajectory": short, "gnss": Gnss(outage=None), "rate": 20.0, "n_flights": 6}
-    one, all_ = emulate(truth, truth, **asked), emulate(each, each, truth=truth, **asked)
+    one, all_ = compare_filters(truth, truth, **asked), compare_filters(each, each, truth=truth, **asked)
     torch.testing.assert_close(one.position, all_.position)
     with pytest.raises(ValueError, match="`model`: expected one model, or one for each of 5 flights"):
-        emulate(each, truth, **{**asked, "n_flights": 5})
+        compare_filters(each, truth, **{**asked, "n_flights": 5})
 
 
 def test_bad_trajectories_are_refused(tmp_path):
@@ -400,3 +403,26 @@ def test_at_rest_the_unit_feels_the_earth_turn():
     motion = Trajectory(t, zero, zero, latitude=0.8).at(t[:1])
     torch.testing.assert_close(motion.rate[0], EARTH_RATE * tensor(math.cos(0.8), 0, -math.sin(0.8)))
     torch.testing.assert_close(motion.specific_force[0], tensor(0, 0, -GRAVITY))
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("Alignment", "InitialUncertainty"),
+        ("Flown", "FilterErrors"),
+        ("emulate", "compare_filters"),
+        ("fly", "run_filter"),
+    ],
+)
+def test_old_names_work_with_a_warning(old, new):
+    with pytest.warns(DeprecationWarning, match=f"gyrofuse.navigation.{old} is deprecated .* use .*{new}"):
+        assert getattr(navigation, old) is getattr(navigation, new)
+
+
+def test_old_arguments_work_with_a_warning():
+    model = gf.WhiteNoise(1e-6)
+    short = Trajectory(flight().time[:6], flight().position[:6])
+    asked = {"trajectory": short, "rate": 10.0, "n_flights": 2}
+    with pytest.warns(DeprecationWarning, match="argument `(against|alignment)` is deprecated"):
+        old = compare_filters(model, against=model, alignment=InitialUncertainty(), **asked)
+    torch.testing.assert_close(old.position, compare_filters(model, model, **asked).position)
