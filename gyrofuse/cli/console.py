@@ -1,4 +1,4 @@
-"""What a command says: results on stdout; progress, warnings and errors on stderr."""
+"""Output of commands: results on stdout; progress, warnings and errors on stderr."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Commands(TyperGroup):
 
 @contextmanager
 def _written() -> Iterator[None]:
-    """Errors of writing to stdout, by its name: files that a command made are there all the same."""
+    """Turn an error of writing to stdout into one that names it, and adds that the files of the command are there."""
     try:
         yield
     except BrokenPipeError:
@@ -57,7 +57,7 @@ def _written() -> Iterator[None]:
 
 
 def say(text: str) -> None:
-    """Print text to stdout as it is, but for what would steer a terminal."""
+    """Print text to stdout, without the control characters that terminals act on."""
     with _written():
         print(_printable(text), flush=True)
 
@@ -66,9 +66,9 @@ def say_table(head: Sequence[str], rows: Sequence[Sequence[str]], right: Collect
     """Print a table to stdout, as wide as it needs to be where it does not go to a screen.
 
     Args:
-        head: Heading of each column; none for a table without.
-        rows: Cells, as plain text.
-        right: Columns to align to the right.
+        head: Heading of each column; empty for a table without headings.
+        rows: Cells of each row, as plain text.
+        right: Indices of the columns that are aligned to the right.
     """
     table = Table(box=SIMPLE_HEAD if head else None, show_header=bool(head), pad_edge=False)
     for i in range(len(rows[0])):
@@ -80,13 +80,13 @@ def say_table(head: Sequence[str], rows: Sequence[Sequence[str]], right: Collect
 
 
 def progress(what: str) -> AbstractContextManager[Any]:
-    """Show what takes time, on a terminal only."""
+    """Show that an activity takes time, on a terminal only."""
     return Console(stderr=True).status(f"{what} ...")
 
 
 @contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[str, float], None]]:
-    """Show how far something has come, on a terminal only; gives what is told the next step and the share done."""
+    """Show a progress bar, on a terminal only; yields the callback of the current step and the share done, 0 to 1."""
     console = Console(stderr=True)
     columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:

@@ -1,4 +1,4 @@
-"""Command for what a simulation leaves out."""
+"""Command `diagnose`: effects that a simulation leaves out."""
 
 from __future__ import annotations
 
@@ -11,21 +11,8 @@ import typer
 
 from gyrofuse._base.checks import same_rate
 from gyrofuse.cli.console import progress, progress_bar, say
-from gyrofuse.cli.options import (
-    Force,
-    Json,
-    Report,
-    at_rest,
-    model_grid,
-    outputs,
-    read_model,
-    say_notes,
-    stretch,
-    titled,
-    without_gaps,
-    write_json,
-)
-from gyrofuse.cli.reading import Logs, Reading, takes_options
+from gyrofuse.cli.options import Logs, Reading, Rest, Writing, stretch, takes_options
+from gyrofuse.cli.reading import at_rest, model_grid, read_model, say_notes, titled, without_gaps
 from gyrofuse.io.recording import Recording
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.processes import Model
@@ -57,9 +44,7 @@ def diagnose(
         int | None,
         typer.Option(metavar="N", help="Samples of each sensor that a model was estimated from, if its file lacks it."),
     ] = None,
-    rest: Annotated[
-        str | None, typer.Option(metavar="START:STOP", help="Diagnose this stretch alone (seconds).")
-    ] = None,
+    rest: Rest = None,
     reading: Reading,
     corrected: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the log without what can be taken off it, .npz.")
@@ -67,20 +52,18 @@ def diagnose(
     model_out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the repaired simulation, .json.")
     ] = None,
-    json_file: Json = None,
-    report: Report = None,
-    force: Force = False,
+    writing: Writing,
 ) -> None:
     """Find where a log, recorded at rest, differs from a simulation, and which physics that left out.
 
-    The verdict comes first; it is no error to find something. Spectra ask for records without gaps: where samples are
-    missing, the longest stretch in which all sensors have theirs is diagnosed, and said. With --judge another log of
-    the device, at the same rate and of the same sensors, says how far the simulation is from it before and after the
-    repair, and how far the two logs are apart.
+    The verdict comes first; it is no error to find something. Spectra need records without gaps: where samples are
+    missing, the longest stretch without them is diagnosed, and named. With --judge another log of the device, at the
+    same rate and of the same sensors, shows how far the simulation is from it before and after the repair, and how far
+    the two logs are apart.
     """
     resting = stretch(rest)
-    asked = {"corrected": corrected, "model-out": model_out, "json": json_file, "report": report}
-    with outputs(force, [*logs, reading.mounting, simulation, judge], **asked) as drafts:
+    inputs = [*logs, reading.mounting, simulation, judge]
+    with writing.files(inputs, corrected=corrected, model_out=model_out) as files:
         recording = _one_axis(reading.read(logs), titled(logs))
         recording = _as_the_model(recording, simulation)
         simulated = _simulation(simulation, recording, reading)
@@ -99,23 +82,21 @@ def diagnose(
         if corrected:
             whole, _ = without_gaps(part, "", 0)
             clean = found.correct(whole)
-            clean.save(drafts[corrected], force=True)
+            clean.save(files.draft("corrected"), force=True)
             if torch.equal(clean.signal, whole.signal):
                 remarks.append(f"Nothing was found that can be taken off: {corrected} is the recording as it came.")
-        if model_out:
-            write_json(drafts[model_out], found.model.to_dict())
-        if report:
+        files.write_json(lambda: found.model.to_dict(), "model-out")
+        if writing.report:
             with progress("drawing"):
-                said = [f"{titled(logs)}: {note}" for note in recording.notes]
+                notes = [f"{titled(logs)}: {note}" for note in recording.notes]
                 if isinstance(simulated, Recording):
-                    said += [f"{simulation.name}: {note}" for note in simulated.notes]
+                    notes += [f"{simulation.name}: {note}" for note in simulated.notes]
                 title = f"{titled(logs)} against {simulation.name}"
-                found.to_html(drafts[report], title=title, remarks=[*remarks, *said])
-        if json_file:
-            sources = {"recording": list(recording.source), "simulation": simulation.name}
-            if judge is not None:
-                sources["judge"] = judge.name
-            write_json(drafts[json_file], {**sources, **found.to_dict()})
+                found.to_html(files.draft("report"), title=title, remarks=[*remarks, *notes])
+        sources: dict[str, object] = {"recording": list(recording.source), "simulation": simulation.name}
+        if judge is not None:
+            sources["judge"] = judge.name
+        files.write_json(lambda: {**sources, **found.to_dict()})
     say("\n".join([found.summary(), *remarks]))
     say_notes(recording)
 
@@ -129,7 +110,7 @@ def _diagnosed(
     twins: int,
     fitted_samples: int | None,
 ) -> tuple[MismatchReport, list[str]]:
-    """The report on the longest whole stretch, and what to say about that; what is wrong names its file."""
+    """Report on the longest stretch without gaps, and remarks on it; errors name the file and the option at fault."""
     from gyrofuse.mismatch import diagnose as find_mismatch
     from gyrofuse.mismatch.inputs import FEWEST
 
@@ -164,13 +145,13 @@ def _diagnosed(
                 "`twins`": "`--twins`",
                 "`fitted_samples`": "`--fitted-samples`",
             }
-            for parameter, told in {**files, **options}.items():
-                message = message.replace(parameter, told)
+            for parameter, name in {**files, **options}.items():
+                message = message.replace(parameter, name)
             raise type(error)(message) from None
 
 
 def _units_taken(recording: Recording, simulation: object, names: tuple[str, str]) -> list[str]:
-    """What was assumed where one of two recordings, or both, state no unit."""
+    """Remark on the unit assumed where one of two recordings, or both, state none."""
     if not isinstance(simulation, Recording) or "unknown" not in (recording.unit, simulation.unit):
         return []
     if recording.unit == simulation.unit:
@@ -180,10 +161,10 @@ def _units_taken(recording: Recording, simulation: object, names: tuple[str, str
 
 
 def _simulation(path: Path, recording: Recording, reading: Reading) -> Recording | Model | ArrayModel | RepairedModel:
-    """What SIM holds: a model, or a recording of the same sensors and axis."""
+    """Content of SIM: a model, or a recording of the same sensors and axis."""
     if path.suffix.lower() == ".json":
         return read_model(path)
-    # Its own sensors may be fewer or go by other names, and its numbers are in the unit already.
+    # The simulation may have fewer sensors, or other names, than the log; its numbers are in the unit already.
     whole = replace(reading, axis=None, sensors=None, scale=None, key=None, columns=None, mounting=None).read([path])
     if reading.axis is not None and reading.axis in whole.axes:
         whole = whole.select(axis=reading.axis)
@@ -194,7 +175,7 @@ def _simulation(path: Path, recording: Recording, reading: Reading) -> Recording
 
 
 def _as_the_model(recording: Recording, path: Path) -> Recording:
-    """The recording in the unit of the log that a model in JSON was fitted to, whose rate it has to have."""
+    """The recording, converted to the unit of a model in JSON; raises `ValueError` if their rates differ."""
     rate, unit = model_grid(path) if path.suffix.lower() == ".json" else (None, None)
     if rate is not None and not same_rate(rate, recording.rate):
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Command for what error models cost in the air."""
+"""Command `emulate`: effect of gyro noise models on navigation."""
 
 from __future__ import annotations
 
@@ -11,66 +11,61 @@ import typer
 from gyrofuse._base.checks import check_positive_integer
 from gyrofuse._base.units import GRAVITY, RATE_UNITS, rate_unit_factor
 from gyrofuse.cli.console import progress_bar, say
-from gyrofuse.cli.options import (
-    Force,
-    Json,
-    agreed_rate,
-    agreed_unit,
-    draw,
-    files_written,
-    model_grid,
-    outputs,
-    read_model,
-    write_json,
-)
+from gyrofuse.cli.options import FileWriting, one_panel, takes_options
+from gyrofuse.cli.reading import agreed_rate, agreed_unit, model_grid, read_model
 from gyrofuse.noise.processes import Model
 
 
+@takes_options
 def emulate(
-    model: Annotated[Path, typer.Option(metavar="A.json", help="Noise of the gyros, as the first filter is told it.")],
-    against: Annotated[Path, typer.Option(metavar="B.json", help="As the second filter is told it.")],
+    *,
+    model: Annotated[Path, typer.Option(metavar="A.json", help="Gyro noise model that the first filter assumes.")],
+    against: Annotated[Path, typer.Option(metavar="B.json", help="Gyro noise model that the second filter assumes.")],
     truth: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="What makes the errors; the model of --against by default.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Gyro noise model of the errors; that of --against by default."),
     ] = None,
     accelerometer: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Noise of the accelerometers, m/s^2 or g; of fair ones by default."),
+        typer.Option(
+            metavar="FILE", help="Noise model of the accelerometers, m/s^2 or g; that of consumer MEMS by default."
+        ),
     ] = None,
     trajectory: Annotated[
         Path | None,
         typer.Option(metavar="FILE.csv", help="time (s), north, east, down (m) [, roll, pitch, yaw (rad)]."),
     ] = None,
     rate: Annotated[
-        float | None, typer.Option(metavar="HZ", help="Of the samples; that of the models, or 100, by default.")
+        float | None, typer.Option(metavar="HZ", help="Sampling rate; that of the models, or 100, by default.")
     ] = None,
     unit: Annotated[
-        str | None, typer.Option(metavar="UNIT", help="Of the gyros' models, where they do not say; deg/s by default.")
+        str | None,
+        typer.Option(metavar="UNIT", help="Unit of gyro models that have none; deg/s by default."),
     ] = None,
-    flights: Annotated[int, typer.Option(metavar="N", help="How many flights.")] = 200,
+    flights: Annotated[int, typer.Option(metavar="N", help="Number of flights.")] = 200,
     seed: Annotated[int, typer.Option(metavar="S", min=0, help="The same seed gives the same flights.")] = 0,
     figure: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw the ratio over time, .png, .svg or .pdf.")
     ] = None,
-    json_file: Json = None,
-    force: Force = False,
+    writing: FileWriting,
 ) -> None:
-    """Fly with drawn errors and two filters that are told different noise models: what do they cost?
+    """Compare navigation filters that assume different gyro noise models, on simulated flights.
 
-    Both get the same errors and the same satellite positions, one a second, and none from 160 to 210 s.
+    Both filters get the same errors and the same satellite positions, one a second, and none from 160 to 210 s.
     """
     from gyrofuse.navigation import compare_filters, read_trajectory
 
     check_positive_integer("--flights", flights)
     given = [path for path in (model, against, truth, accelerometer, trajectory) if path is not None]
-    with outputs(force, given, figure=figure, json=json_file) as drafts:
+    with writing.files(given, figure=figure) as files:
         gyros = [path for path in (model, against, truth) if path is not None]
         hz = agreed_rate([*gyros, *([accelerometer] if accelerometer else [])], rate) or 100.0
-        told = [_gyro(path, unit) for path in gyros]
+        models = [_gyro(path, unit) for path in gyros]
         with progress_bar("flying") as show:
             result = compare_filters(
-                told[0],
-                told[1],
-                truth=told[2] if truth else None,
+                models[0],
+                models[1],
+                truth=models[2] if truth else None,
                 accelerometer=_accelerometer(accelerometer) if accelerometer else None,
                 rate=hz,
                 trajectory=read_trajectory(trajectory) if trajectory else None,
@@ -78,15 +73,13 @@ def emulate(
                 generator=torch.Generator().manual_seed(seed),
                 progress=show,
             )
-        if figure:
-            draw(result.plot, drafts[figure], figure, height=3.6)
-        if json_file:
-            write_json(drafts[json_file], {"model": str(model), "against": str(against), **result.to_dict()})
-    say("\n".join([result.summary(), *files_written(figure, json_file)]))
+        files.write_figure(lambda: one_panel(result.plot, height=3.6))
+        files.write_json(lambda: {"model": str(model), "against": str(against), **result.to_dict()})
+    say("\n".join([result.summary(), *files.note]))
 
 
 def _single(path: Path) -> Model:
-    """One model, of one sensor."""
+    """Read the noise model of one sensor."""
     noise = read_model(path)
     if not isinstance(noise, Model) or noise.params.numel() != len(noise.param_names):
         raise ValueError(f"{path}: expected the model of one sensor, found that of several; fit one with --sensors")
@@ -94,7 +87,7 @@ def _single(path: Path) -> Model:
 
 
 def _gyro(path: Path, unit: str | None) -> Model:
-    """In rad/s."""
+    """Read the noise model of a gyro, in rad/s."""
     name = agreed_unit(path, unit) or "deg/s"
     if name not in RATE_UNITS:
         raise ValueError(f"{path}: expected a model in one of {', '.join(RATE_UNITS)}, found {name}; give --unit")
@@ -102,7 +95,7 @@ def _gyro(path: Path, unit: str | None) -> Model:
 
 
 def _accelerometer(path: Path) -> Model:
-    """In m/s^2, which a model that says nothing is in."""
+    """Read the noise model of an accelerometer, in m/s^2, which is also the unit of a model without one."""
     unit = model_grid(path)[1]
     if unit not in (None, "m/s^2", "g"):
         raise ValueError(f"{path}: expected a model of an accelerometer in m/s^2 or g, found one in {unit}")

@@ -1,4 +1,4 @@
-"""Command for many logs at once."""
+"""Command `fleet`: many logs at once."""
 
 from __future__ import annotations
 
@@ -15,17 +15,14 @@ import typer
 from gyrofuse._base.checks import check_positive_integer
 from gyrofuse.cli.console import progress_bar, say, warn
 from gyrofuse.cli.options import (
-    Force,
-    Json,
-    Method,
-    Report,
-    files_written,
-    outputs,
-    read_model,
+    METHOD_NAMES,
+    FileReading,
+    Writing,
+    chosen,
     scale_weights_of,
-    write_json,
+    takes_options,
 )
-from gyrofuse.cli.reading import FileReading, takes_options
+from gyrofuse.cli.reading import read_model
 from gyrofuse.fleet.workers import begin_imports
 from gyrofuse.io.recording import read_recording
 from gyrofuse.noise.array_model import ArrayModel
@@ -36,14 +33,13 @@ if TYPE_CHECKING:
     from gyrofuse.fleet.tasks import Task
 
 _ACCELERATORS = ("cpu", "gpu", "auto")
-# s; a log of 10^8 samples is fused in a minute and one of 10^6 diagnosed in some, but one on which a library never ends
-# is to cost a night's run no more than a part of the night
-_LIMIT = 3600.0
-_LOOK = 0.5  # s between looks at how far a run has come
+# Default of --timeout, s. Far above what sound logs take (10^8 samples are fused in a minute, 10^6 diagnosed in some
+# minutes), and a damaged log, which a library may never finish reading, costs only a part of a night's run.
+_TIMEOUT = 3600.0
 
 
 class Kind(str, Enum):
-    """What is asked of every log."""
+    """Task for every log."""
 
     fuse = "fuse"
     fit = "fit"
@@ -64,7 +60,7 @@ def fleet(
             help="Where the rows go, .parquet (takes gyrofuse[logs]); a run that was stopped goes on there.",
         ),
     ] = Path("results.parquet"),
-    task: Annotated[Kind, typer.Option(help="What is asked of every log.")] = Kind.fuse,
+    task: Annotated[Kind, typer.Option(help="Task for every log.")] = Kind.fuse,
     manifest: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Text file with one path a line, relative to its folder.")
     ] = None,
@@ -78,7 +74,7 @@ def fleet(
         typer.Option(
             metavar="S", help="Seconds that a log may take to be read, and again to be worked on; 0 for any number."
         ),
-    ] = _LIMIT,
+    ] = _TIMEOUT,
     retry: Annotated[bool, typer.Option("--retry", help="Try logs again that failed before.")] = False,
     scale_weights: Annotated[
         str | None,
@@ -86,7 +82,10 @@ def fleet(
             metavar="flat|short|long|W1,W2,...", show_default="flat", help="fuse: which averaging times count."
         ),
     ] = None,
-    method: Annotated[Method | None, typer.Option(show_default="svo", help="fuse: how weights are chosen.")] = None,
+    method: Annotated[
+        str | None,
+        typer.Option(metavar="|".join(METHOD_NAMES), show_default="svo", help="fuse: how weights are chosen."),
+    ] = None,
     virtual: Annotated[bool, typer.Option("--virtual", help="fuse: keep the virtual gyros in the table.")] = False,
     model: Annotated[
         str | None, typer.Option(metavar="FORMULA", show_default="WN + AR1 + RW", help="fit: processes to fit.")
@@ -98,15 +97,13 @@ def fleet(
         float | None, typer.Option(metavar="P", show_default="0.01", help="diagnose: where nothing is missing.")
     ] = None,
     reading: FileReading,
-    json_file: Json = None,
-    report: Report = None,
-    force: Force = False,
+    writing: Writing,
 ) -> None:
     """Fuse, fit or diagnose many logs, on one process or several, into one table with a row for each.
 
-    A log that cannot be used gets a row that says why, and the others theirs, even where it ends the process that reads
-    it or never lets it go; the exit status is 1 where that holds for all of them. Stopped at any moment, the same
-    command goes on where it was.
+    A log that cannot be used gets a row with the reason, also if it crashes or hangs the process that reads it, and the
+    other logs are not affected; the exit status is 1 if no log can be used. A run that was stopped at any moment is
+    resumed by the same command.
     """
     check_positive_integer("--devices", devices)
     check_positive_integer("--group", group)
@@ -122,7 +119,7 @@ def fleet(
     from gyrofuse.fleet.processes import run_fleet
     from gyrofuse.fleet.store.store import ResultStore
     from gyrofuse.fleet.store.table import read_results
-    from gyrofuse.fleet.summary import standing_of
+    from gyrofuse.fleet.summary import summarise
 
     if out.suffix.lower() != ".parquet":
         raise ValueError(f"`--out`: expected a name that ends in .parquet, got {str(out)!r}")
@@ -138,12 +135,12 @@ def fleet(
             raise ValueError(f"`{option}`: expected with --task {kind.value} alone, got {task.value}; leave it out")
     asked = _task(task, scale_weights, method, virtual, model, simulation, false_alarm)
     options = reading.options
-    with outputs(force, [manifest, simulation], json=json_file, report=report) as drafts:
+    with writing.files([manifest, simulation]) as files:
         store = ResultStore(out, asked.columns, {**asked.settings, **options})
         data = GyroArrayDataModule(paths or [], manifest=manifest, group_size=group, **options)
         data.logs = tuple(log for log in data.logs if identity(log) != identity(out))  # its suffix is that of a log
         _check_devices(devices, accelerator)
-        store.open(force=force)
+        store.open(force=writing.force)
         try:
             with _watched(store, len(data.logs), group):
                 limit = timeout or None
@@ -156,23 +153,23 @@ def fleet(
         finally:
             store.close()
         settings, rows = read_results(out, without=["virtual"])
-        standing = standing_of(settings["task"], rows)
-        if json_file:
-            write_json(drafts[json_file], standing.to_dict())
-        if report:
+        summary = summarise(settings["task"], rows)
+        files.write_json(summary.to_dict)
+        if writing.report:
             from gyrofuse.fleet.report import fleet_report
 
-            page = fleet_report(standing, rows, title=f"Fleet in {out.name}", settings=settings)
-            drafts[report].write_text(page, encoding="utf-8")
-    say("\n".join([standing.summary(), *files_written(out, json_file, report)]))
-    if len(standing.failures) == standing.n_logs:
+            title = f"Fleet in {out.name}"
+            files.write_report(lambda: fleet_report(summary, rows, title=title, settings=settings))
+    written = ", ".join(map(str, (out, *files.paths.values())))
+    say(f"{summary.summary()}\nWritten: {written}")
+    if len(summary.failures) == summary.n_logs:
         raise typer.Exit(1)  # for what starts the command and goes on with the table
 
 
 def _task(
     kind: Kind,
     scale_weights: str | None,
-    method: Method | None,
+    method: str | None,
     virtual: bool,
     model: str | None,
     simulation: Path | None,
@@ -181,10 +178,11 @@ def _task(
     from gyrofuse.fleet.tasks import Diagnose, Fit, Fuse
 
     if kind is Kind.fuse:
-        if method is Method.multiscale:
+        name = chosen("--method", method or Fuse.method, METHOD_NAMES)
+        if name == "multiscale":
             raise ValueError("`--method`: expected one with a weight for each sensor, got multiscale; choose another")
         weights = Fuse.scale_weights if scale_weights is None else scale_weights_of(scale_weights)
-        return Fuse(weights, method=(method or Method.svo).value.replace("-", "_"), virtual=virtual)
+        return Fuse(weights, method=name, virtual=virtual)
     if kind is Kind.fit:
         return Fit() if model is None else Fit(model)
     if simulation is None:
@@ -217,19 +215,19 @@ def _check_devices(devices: int, accelerator: str) -> None:
 
 
 @contextmanager
-def _watched(store: ResultStore, n_logs: int, group: int) -> Iterator[None]:
-    """Show how many groups of logs are done in this run, whoever does them."""
+def _watched(store: ResultStore, n_logs: int, group: int, interval: float = 0.5) -> Iterator[None]:
+    """Show how many groups of logs are done in this run, by all processes, updated every `interval` seconds."""
     over = threading.Event()
     already, n_groups = store.n_parts, math.ceil(n_logs / group)
 
     with progress_bar(f"{n_logs} logs") as show:
 
-        def look() -> None:
-            while not over.wait(_LOOK):
+        def update() -> None:
+            while not over.wait(interval):
                 done = max(store.n_parts - already, 0)
                 show(f"{done} groups done", min((already + done) / n_groups, 1.0))
 
-        watcher = threading.Thread(target=look, daemon=True)
+        watcher = threading.Thread(target=update, daemon=True)
         watcher.start()
         try:
             yield

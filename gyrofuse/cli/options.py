@@ -1,29 +1,29 @@
-"""What commands share: options, inputs, outputs."""
+"""Options that commands share, and the files that they write."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, is_dataclass
 from enum import Enum
+from functools import wraps
+from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-from gyrofuse._base.checks import check_positive, same_rate
 from gyrofuse._base.files import Outputs
 from gyrofuse._base.units import KNOWN_UNITS, canonical_unit
-from gyrofuse.cli.console import say_table, warn
-from gyrofuse.io.recording import Recording
-from gyrofuse.noise.array_model import ArrayModel
-from gyrofuse.noise.parsing import model_from_dict
-from gyrofuse.noise.processes import Model
+from gyrofuse.cli.console import progress
+from gyrofuse.fusion.weights.methods import METHODS
+from gyrofuse.io.recording import Recording, read_recording
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-    from gyrofuse.mismatch.repaired import RepairedModel
+    from matplotlib.figure import Figure
 
 _SUFFIXES = {
     "out": (".npz", ".csv"),
@@ -35,26 +35,226 @@ _SUFFIXES = {
     "corrected": (".npz",),
     "header": (".h",),
 }
+METHOD_NAMES = tuple(name.replace("_", "-") for name in (*METHODS, "multiscale"))
 
-_NO_MODEL = "expected a model in JSON, as to_dict() of a model gives it"
+Logs = Annotated[
+    list[Path],
+    typer.Argument(metavar="LOG...", help="The recording. Several files are one array, aligned on their clocks."),
+]
+Rest = Annotated[
+    str | None, typer.Option(metavar="START:STOP", help="Use this stretch of the recording alone (seconds).")
+]
+ModelLevels = Annotated[
+    int | None, typer.Option(metavar="J", help="Number of levels; as many as hold two windows by default.")
+]
+Confidence = Annotated[float, typer.Option(metavar="P", help="Confidence level of all intervals.")]
 
-Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write what is found as JSON.")]
-Report = Annotated[Path | None, typer.Option(metavar="FILE", help="Write a report, one HTML page.")]
-Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
+
+class Quantity(str, Enum):
+    """Kind of sensors that are read from a log."""
+
+    rate = "rate"
+    acceleration = "acceleration"
 
 
-class Method(str, Enum):
-    """How weights are chosen."""
+@dataclass(frozen=True)
+class FileReading:
+    """Options with which each of many logs is read."""
 
-    svo = "svo"
-    multiscale = "multiscale"
-    auto = "auto"
-    model_assisted = "model-assisted"
-    shrinkage = "shrinkage"
-    nonnegative = "nonnegative"
-    inverse_variance = "inverse-variance"
-    equal = "equal"
-    rdvg = "rdvg"
+    quantity: Annotated[Quantity, typer.Option(help="Take the gyros of the log, or its accelerometers.")] = (
+        Quantity.rate
+    )
+    axis: Annotated[str | None, typer.Option(metavar="x|y|z", help="Take this axis alone.")] = None
+    sensors: Annotated[str | None, typer.Option(metavar="A,B,...", help="Take these sensors alone.")] = None
+    rate: Annotated[float | None, typer.Option(metavar="HZ", help="Sampling rate, where the log does not say.")] = None
+    unit: Annotated[
+        str | None, typer.Option(metavar="UNIT", help="Unit of the numbers, where the log does not say.")
+    ] = None
+    scale: Annotated[float | None, typer.Option(help="Factor that turns what is logged (counts) into the unit.")] = None
+    key: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Topic, array, group or column that holds the sensors.")
+    ] = None
+    columns: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--map",
+            metavar="NAME=COLUMN",
+            help="What a column or array is, where its name does not say: gyro_x=u3, time=t. Others are left out.",
+        ),
+    ] = None
+    max_bytes: Annotated[
+        float | None,
+        typer.Option(metavar="N", help="Memory that the numbers of a log may take; a quarter of what there is."),
+    ] = None
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Keyword arguments of `read_recording` that were given."""
+        given = {
+            "quantity": None if self.quantity is Quantity.rate else self.quantity.value,
+            "axis": self.axis,
+            "sensors": None if self.sensors is None else self.sensors.split(","),
+            "rate": self.rate,
+            "unit": None if self.unit is None else known_unit(self.unit),
+            "scale": self.scale,
+            "key": self.key,
+            "columns": _named_columns(self.columns),
+            "max_bytes": self.max_bytes,
+        }
+        return {name: value for name, value in given.items() if value is not None}
+
+
+@dataclass(frozen=True)
+class Reading(FileReading):
+    """Options with which a recording is read, of one log or several."""
+
+    mounting: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="JSON: for each device by name, the 3x3 matrix to the common frame."),
+    ] = None
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Keyword arguments of `read_recording` that were given."""
+        given = super().options
+        return given if self.mounting is None else {**given, "mounting": self.mounting}
+
+    def read(self, logs: Sequence[Path]) -> Recording:
+        """Read the logs as one recording, with progress shown."""
+        with progress("reading"):
+            return read_recording(logs, **self.options)
+
+
+@dataclass(frozen=True)
+class WrittenFiles:
+    """Files that a command was asked to write; they appear together when it has succeeded.
+
+    Attributes:
+        paths: Path of each file by its option, such as `"model-out"`.
+        drafts: Path to write to until then, by path.
+    """
+
+    paths: Mapping[str, Path]
+    drafts: Mapping[Path, Path]
+
+    def draft(self, option: str) -> Path:
+        """Path to write to, of an option that was given."""
+        return self.drafts[self.paths[option]]
+
+    def write(self, option: str, text: Callable[[], str]) -> None:
+        """Write a text, if its option was given."""
+        if option in self.paths:
+            self.draft(option).write_text(text(), encoding="utf-8")
+
+    def write_json(self, content: Callable[[], dict[str, Any]], option: str = "json") -> None:
+        """Write plain numbers as JSON, if the option was given."""
+        self.write(option, lambda: json.dumps(content(), allow_nan=False) + "\n")
+
+    def write_report(self, page: Callable[[], str]) -> None:
+        """Write the page that `--report` asks for, with progress shown."""
+        with progress("drawing"):
+            self.write("report", page)
+
+    def write_figure(self, draw: Callable[[], Figure]) -> None:
+        """Write the figure that `--figure` asks for, in the format of its suffix, with progress shown."""
+        if "figure" in self.paths:
+            from gyrofuse._base.page import save_figure
+
+            with progress("drawing"):
+                save_figure(draw(), self.draft("figure"), self.paths["figure"].suffix[1:].lower())
+
+    @property
+    def note(self) -> list[str]:
+        """A line that names the files, where there are any."""
+        return [f"Written: {', '.join(map(str, self.paths.values()))}"] if self.paths else []
+
+
+@dataclass(frozen=True)
+class FileWriting:
+    """Options of the files that every command can write."""
+
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write what is found as JSON.")] = (
+        None
+    )
+    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False
+
+    @contextmanager
+    def files(self, inputs: Sequence[Path | None] = (), **others: Path | None) -> Iterator[WrittenFiles]:
+        """Files to write, which appear when the block ends without an error.
+
+        Args:
+            inputs: Files that the command reads, which are never replaced.
+            **others: Further files, by option.
+
+        Raises:
+            ValueError: A suffix that is not of the option's formats, or what `Outputs` refuses.
+        """
+        asked = {name.replace("_", "-"): path for name, path in {**others, **self._own}.items() if path is not None}
+        for option, path in asked.items():
+            if path.suffix.lower() not in _SUFFIXES[option]:
+                raise ValueError(
+                    f"`--{option}`: expected a name that ends in {' or '.join(_SUFFIXES[option])}, got {str(path)!r}"
+                )
+        with Outputs(asked.values(), force=self.force, inputs=[path for path in inputs if path]) as drafts:
+            yield WrittenFiles(asked, drafts)
+
+    @property
+    def _own(self) -> dict[str, Path | None]:
+        return {"json": self.json_file}
+
+
+@dataclass(frozen=True)
+class Writing(FileWriting):
+    """Options of the files that most commands can write."""
+
+    report: Annotated[Path | None, typer.Option(metavar="FILE", help="Write a report, one HTML page.")] = None
+
+    @property
+    def _own(self) -> dict[str, Path | None]:
+        return {**super()._own, "report": self.report}
+
+
+def takes_options(command: Callable[..., None]) -> Callable[..., None]:
+    """A command, each of whose parameters of a dataclass is given as one option of the command line for each field."""
+    hints = get_type_hints(command, include_extras=True)
+    groups = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
+    parameters = []
+    for name, parameter in signature(command).parameters.items():
+        if name in groups:
+            kinds = get_type_hints(groups[name], include_extras=True)
+            parameters += [
+                Parameter(one.name, Parameter.KEYWORD_ONLY, default=one.default, annotation=kinds[one.name])
+                for one in fields(groups[name])
+            ]
+        else:
+            parameters.append(parameter.replace(annotation=hints[name], kind=Parameter.KEYWORD_ONLY))
+
+    @wraps(command)
+    def run(**given: Any) -> None:
+        made = {
+            name: group(**{one.name: given.pop(one.name) for one in fields(group)}) for name, group in groups.items()
+        }
+        command(**made, **given)
+
+    run.__signature__ = Signature(parameters)  # type: ignore[attr-defined]  # what typer makes options of
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return run
+
+
+def chosen(option: str, given: str, names: Sequence[str]) -> str:
+    """Python's name (`block_bootstrap`) of a choice on the command line (`block-bootstrap`).
+
+    Args:
+        option: Option that was given, such as `--method`.
+        given: Its value.
+        names: Values that it may have, as on the command line.
+
+    Raises:
+        ValueError: It has another value.
+    """
+    if given not in names:
+        raise ValueError(f"`{option}`: expected one of {', '.join(names)}, got {given!r}")
+    return given.replace("-", "_")
 
 
 def known_unit(unit: str) -> str:
@@ -81,7 +281,7 @@ def scale_weights_of(text: str) -> str | tuple[float, ...]:
 
 
 def stretch(rest: str | None) -> tuple[float, float] | None:
-    """Start and end in seconds of `--rest`."""
+    """Start and end in seconds that `--rest` gives."""
     if rest is None:
         return None
     try:
@@ -93,152 +293,25 @@ def stretch(rest: str | None) -> tuple[float, float] | None:
     return start, stop
 
 
-def at_rest(recording: Recording, resting: tuple[float, float] | None) -> Recording:
-    """The stretch that `--rest` asks for, all without it; where the log ends before it does, that is said."""
-    if resting is None:
-        return recording
-    part = recording.between(*resting)
-    if resting[1] > recording.duration + 1 / recording.rate:
-        warn(
-            f"`--rest`: expected a stretch within 0 to {recording.duration:.6g} s, got {resting[1]:g} s; it ends there"
-        )
-    return part
-
-
-def outputs(force: bool, inputs: Sequence[Path | None] = (), **asked: Path | None) -> Outputs:
-    """Files to write, those asked for, by option; none of the inputs given is ever replaced."""
-    for option, path in asked.items():
-        if path is not None and path.suffix.lower() not in _SUFFIXES[option]:
-            raise ValueError(
-                f"`--{option}`: expected a name that ends in {' or '.join(_SUFFIXES[option])}, got {str(path)!r}"
-            )
-    return Outputs(
-        [path for path in asked.values() if path is not None], force=force, inputs=[path for path in inputs if path]
-    )
-
-
-def titled(logs: Sequence[Path]) -> str:
-    """What a title calls a log of one file or several."""
-    return logs[0].name if len(logs) == 1 else f"{logs[0].name} and {len(logs) - 1} more"
-
-
-def read_model(path: Path) -> Model | ArrayModel | RepairedModel:
-    """A model from JSON: of `to_dict()` of a model or of a fit, or of a simulation that a diagnosis repaired."""
-    content = _model_content(path)
-    try:
-        if "processes" not in content and isinstance(content.get("model"), dict):
-            content = content["model"]
-        if "effects" not in content:
-            return model_from_dict(content)
-        from gyrofuse.mismatch.saved import repaired_from_dict
-
-        return repaired_from_dict(content)
-    except (ValueError, TypeError, AttributeError, RuntimeError, OverflowError, LookupError) as error:
-        raise ValueError(f"{path}: {_NO_MODEL}: {error}") from None
-
-
-def model_grid(path: Path) -> tuple[float | None, str | None]:
-    """Rate in Hz and unit of the log that a model in JSON was fitted to, where it says."""
-    content = _model_content(path)
-    rate, unit = content.get("rate"), content.get("unit")
-    if rate is not None and (isinstance(rate, bool) or not isinstance(rate, float | int)):
-        raise ValueError(f"{path}: expected 'rate' to be a number of Hz, got {str(rate)[:80]!r}")
-    if unit is not None and not isinstance(unit, str):
-        raise ValueError(f"{path}: expected 'unit' to be a text such as 'deg/s', got {str(unit)[:80]!r}")
-    return rate, (None if unit == "unknown" else unit)
-
-
-def agreed_rate(models: Sequence[Path], rate: float | None) -> float | None:
-    """Sampling rate that was asked for, or that of the logs that models were fitted to: all have to be the same."""
-    chosen, by = (None, "") if rate is None else (check_positive("--rate", rate), "--rate")
-    for model in models:
-        own = model_grid(model)[0]
-        if own is not None:
-            check_positive(f"{model}: rate", own)
-        if own is not None and chosen is not None and not same_rate(own, chosen):
-            raise ValueError(
-                f"`{by}`: expected {own:g} Hz, for which the model was fitted, got {chosen:g}; see {model}"
-            )
-        if own is not None and chosen is None:
-            chosen, by = own, str(model)
-    return chosen
-
-
-def agreed_unit(model: Path | None, unit: str | None) -> str | None:
-    """Unit that was asked for, which has to be that of the log that the model was fitted to, or that."""
-    own = None if model is None else model_grid(model)[1]
-    asked = None if unit is None else known_unit(unit)
-    if None not in (asked, own) and asked != own:
-        raise ValueError(f"`--unit`: expected {own}, for which the model was fitted, got {asked}; see {model}")
-    return asked or own
-
-
-def draw(plot: Callable[[Axes], Axes], draft: Path, path: Path, width: float = 7.0, height: float = 4.6) -> None:
-    """A figure of one panel, in the format that the path asks for."""
-    from gyrofuse._base.page import new_figure, save_figure
+def one_panel(plot: Callable[[Axes], Axes], width: float = 7.0, height: float = 4.6) -> Figure:
+    """A figure of one panel, of a width and a height in inches."""
+    from gyrofuse._base.page import new_figure
 
     figure = new_figure(width, height)
     plot(figure.subplots())
-    save_figure(figure, draft, path.suffix[1:].lower())
+    return figure
 
 
-def _model_content(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except RecursionError:
-        raise ValueError(f"{path}: {_NO_MODEL}, found lists within lists that do not end") from None
-    except ValueError as error:
-        raise ValueError(f"{path}: {_NO_MODEL}: {error}") from None
-    if not isinstance(content, dict):
-        raise ValueError(f"{path}: {_NO_MODEL}, found a {type(content).__name__}")
-    return content
-
-
-def without_gaps(recording: Recording, done: str, fewest: int, otherwise: str = "") -> tuple[Recording, list[str]]:
-    """The longest stretch that no sensor lacks a sample of, and what to say about it.
-
-    Args:
-        recording: As read.
-        done: What the command does with it, a participle: "Ranked".
-        fewest: Samples that it needs.
-        otherwise: What else could be done where there are fewer.
-    """
-    part = recording.longest_whole()
-    if part.n_samples == recording.n_samples:
-        return recording, []
-    if part.n_samples < fewest <= recording.n_samples:
-        raise ValueError(
-            f"`LOG`: expected a stretch of at least {fewest} samples that no sensor lacks, got one of "
-            f"{part.n_samples}; choose with --sensors{otherwise}"
-        )
-    start = part.time[0].item()
-    more = "; fewer --sensors may have a longer one" if part.n_sensors > 1 else ""
-    return part, [
-        f"{done} on {start:.6g} to {start + part.duration:.6g} s alone, {part.n_samples} of {recording.n_samples} "
-        f"samples, the longest stretch that no sensor lacks a sample of{more}."
-    ]
-
-
-def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write plain numbers as JSON."""
-    path.write_text(json.dumps(content, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def unit_note(unit: str) -> list[str]:
-    """What to say of a unit that no datasheet can be given in."""
-    if unit in (*KNOWN_UNITS, "unknown"):
-        return []
-    return [f"Unit {unit!r} is none of {', '.join(KNOWN_UNITS)}: numbers are in it as they stand."]
-
-
-def files_written(*paths: Path | None) -> list[str]:
-    """A line that names the files written, where there are any."""
-    names = [str(path) for path in paths if path]
-    return [f"Written: {', '.join(names)}"] if names else []
-
-
-def say_notes(recording: Recording) -> None:
-    """Print what was found in a recording, where there is anything."""
-    rows = [(note.kind.replace("_", " "), note.stream or "-", note.sentence) for note in recording.notes]
-    if rows:
-        say_table(("found", "where", "what"), rows)
+def _named_columns(texts: Sequence[str] | None) -> dict[str, str] | None:
+    """Names and columns that `--map` gives."""
+    if not texts:
+        return None
+    named = {}
+    for text in texts:
+        name, equals, column = (part.strip() for part in text.partition("="))
+        if not (name and equals and column):
+            raise ValueError(f"`--map`: expected NAME=COLUMN, such as gyro_x=u3, got {text!r}")
+        if name in named:
+            raise ValueError(f"`--map`: expected each name once, got {name!r} twice")
+        named[name] = column
+    return named

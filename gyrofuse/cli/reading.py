@@ -1,137 +1,173 @@
-"""How commands read logs: the options that all of them take, said once."""
+"""What commands read: the stretch of a recording that they use, and models in JSON."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
-from enum import Enum
-from functools import wraps
-from inspect import Parameter, Signature, signature
+import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Any
 
-import typer
-
-from gyrofuse.cli.console import progress
+from gyrofuse._base.checks import check_positive, same_rate
+from gyrofuse._base.units import KNOWN_UNITS
+from gyrofuse.cli.console import say_table, warn
 from gyrofuse.cli.options import known_unit
-from gyrofuse.io.recording import Recording, read_recording
+from gyrofuse.io.recording import Recording
+from gyrofuse.noise.array_model import ArrayModel
+from gyrofuse.noise.parsing import model_from_dict
+from gyrofuse.noise.processes import Model
 
-Logs = Annotated[
-    list[Path],
-    typer.Argument(metavar="LOG...", help="The recording. Several files are one array, aligned on their clocks."),
-]
+if TYPE_CHECKING:
+    from gyrofuse.mismatch.repaired import RepairedModel
 
-
-class Quantity(str, Enum):
-    """Which sensors of a log are read."""
-
-    rate = "rate"
-    acceleration = "acceleration"
+_NO_MODEL = "expected a model in JSON, as to_dict() of a model gives it"
 
 
-@dataclass(frozen=True)
-class FileReading:
-    """Options with which each of many logs is read."""
-
-    quantity: Annotated[Quantity, typer.Option(help="Take the gyros of the log, or its accelerometers.")] = (
-        Quantity.rate
-    )
-    axis: Annotated[str | None, typer.Option(metavar="x|y|z", help="Take this axis alone.")] = None
-    sensors: Annotated[str | None, typer.Option(metavar="A,B,...", help="Take these sensors alone.")] = None
-    rate: Annotated[float | None, typer.Option(metavar="HZ", help="Sampling rate, where the log does not say.")] = None
-    unit: Annotated[
-        str | None, typer.Option(metavar="UNIT", help="Unit of the numbers, where the log does not say.")
-    ] = None
-    scale: Annotated[float | None, typer.Option(help="Factor that turns what is logged (counts) into the unit.")] = None
-    key: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Topic, array, group or column that holds the sensors.")
-    ] = None
-    columns: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--map",
-            metavar="NAME=COLUMN",
-            help="What a column or array is, where its name does not say: gyro_x=u3, time=t. Others are left out.",
-        ),
-    ] = None
-    max_bytes: Annotated[
-        float | None,
-        typer.Option(metavar="N", help="Memory that the numbers of a log may take; a quarter of what there is."),
-    ] = None
-
-    @property
-    def options(self) -> dict[str, Any]:
-        """Of `read_recording`, those that were given."""
-        given = {
-            "quantity": None if self.quantity is Quantity.rate else self.quantity.value,
-            "axis": self.axis,
-            "sensors": None if self.sensors is None else self.sensors.split(","),
-            "rate": self.rate,
-            "unit": None if self.unit is None else known_unit(self.unit),
-            "scale": self.scale,
-            "key": self.key,
-            "columns": _named_columns(self.columns),
-            "max_bytes": self.max_bytes,
-        }
-        return {name: value for name, value in given.items() if value is not None}
+def titled(logs: Sequence[Path]) -> str:
+    """Name of a recording of one file or several, for titles and messages."""
+    return logs[0].name if len(logs) == 1 else f"{logs[0].name} and {len(logs) - 1} more"
 
 
-@dataclass(frozen=True)
-class Reading(FileReading):
-    """Options with which a log is read."""
+def at_rest(recording: Recording, resting: tuple[float, float] | None) -> Recording:
+    """The part of a recording that `--rest` asks for, with a warning where the recording ends before it does.
 
-    mounting: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="JSON: for each device by name, the 3x3 matrix to the common frame."),
-    ] = None
-
-    @property
-    def options(self) -> dict[str, Any]:
-        """Of `read_recording`, those that were given."""
-        given = super().options
-        return given if self.mounting is None else {**given, "mounting": self.mounting}
-
-    def read(self, logs: Sequence[Path]) -> Recording:
-        """Read a log with progress shown."""
-        with progress("reading"):
-            return read_recording(logs, **self.options)
+    Args:
+        recording: The whole recording.
+        resting: Start and end in seconds; None for all of it.
+    """
+    if resting is None:
+        return recording
+    part = recording.between(*resting)
+    if resting[1] > recording.duration + 1 / recording.rate:
+        warn(
+            f"`--rest`: expected a stretch within 0 to {recording.duration:.6g} s, got {resting[1]:g} s; it ends there"
+        )
+    return part
 
 
-def takes_options(command: Callable[..., None]) -> Callable[..., None]:
-    """A command whose parameter `reading` is made of options of the command line."""
-    own, hints = signature(command).parameters, get_type_hints(command, include_extras=True)
-    made: type[FileReading] = hints["reading"]
-    kinds = get_type_hints(made, include_extras=True)
-    names = [one.name for one in fields(made)]
-    parameters = []
-    for name, parameter in own.items():
-        if name == "reading":
-            parameters += [
-                Parameter(one.name, Parameter.KEYWORD_ONLY, default=one.default, annotation=kinds[one.name])
-                for one in fields(made)
-            ]
-        else:
-            parameters.append(parameter.replace(annotation=hints[name], kind=Parameter.KEYWORD_ONLY))
+def without_gaps(recording: Recording, done: str, fewest: int, otherwise: str = "") -> tuple[Recording, list[str]]:
+    """The longest stretch without missing samples, and a sentence that names it where it is not the whole recording.
 
-    @wraps(command)
-    def run(**given: Any) -> None:
-        command(reading=made(**{name: given.pop(name) for name in names}), **given)
+    Args:
+        recording: The recording.
+        done: Participle of what the command does with the stretch, such as "Ranked".
+        fewest: Number of samples that the command needs.
+        otherwise: Words that end the message, on what else can be done.
 
-    run.__signature__ = Signature(parameters)  # type: ignore[attr-defined]  # what typer makes options of
-    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    return run
+    Raises:
+        ValueError: The stretch is too short, though the recording is not.
+    """
+    part = recording.longest_whole()
+    if part.n_samples == recording.n_samples:
+        return recording, []
+    if part.n_samples < fewest <= recording.n_samples:
+        raise ValueError(
+            f"`LOG`: expected a stretch of at least {fewest} samples that no sensor lacks, got one of "
+            f"{part.n_samples}; choose with --sensors{otherwise}"
+        )
+    start = part.time[0].item()
+    more = "; fewer --sensors may have a longer one" if part.n_sensors > 1 else ""
+    return part, [
+        f"{done} on {start:.6g} to {start + part.duration:.6g} s alone, {part.n_samples} of {recording.n_samples} "
+        f"samples, the longest stretch that no sensor lacks a sample of{more}."
+    ]
 
 
-def _named_columns(texts: Sequence[str] | None) -> dict[str, str] | None:
-    """Names and columns that `--map` gives."""
-    if not texts:
-        return None
-    named = {}
-    for text in texts:
-        name, equals, column = (part.strip() for part in text.partition("="))
-        if not (name and equals and column):
-            raise ValueError(f"`--map`: expected NAME=COLUMN, such as gyro_x=u3, got {text!r}")
-        if name in named:
-            raise ValueError(f"`--map`: expected each name once, got {name!r} twice")
-        named[name] = column
-    return named
+def unit_note(unit: str) -> list[str]:
+    """A sentence on a unit in which no datasheet can be given."""
+    if unit in (*KNOWN_UNITS, "unknown"):
+        return []
+    return [f"Unit {unit!r} is none of {', '.join(KNOWN_UNITS)}: numbers are in it as they stand."]
+
+
+def say_notes(recording: Recording) -> None:
+    """Print what was found in a recording, where there is anything."""
+    rows = [(note.kind.replace("_", " "), note.stream or "-", note.sentence) for note in recording.notes]
+    if rows:
+        say_table(("found", "where", "what"), rows)
+
+
+def read_model(path: Path) -> Model | ArrayModel | RepairedModel:
+    """Read a model from JSON: `to_dict()` of a model, of a fit, or of a simulation that a diagnosis repaired.
+
+    Raises:
+        ValueError: It is none of these.
+    """
+    content = _model_content(path)
+    try:
+        if "processes" not in content and isinstance(content.get("model"), dict):
+            content = content["model"]
+        if "effects" not in content:
+            return model_from_dict(content)
+        from gyrofuse.mismatch.saved import repaired_from_dict
+
+        return repaired_from_dict(content)
+    except (ValueError, TypeError, AttributeError, RuntimeError, OverflowError, LookupError) as error:
+        raise ValueError(f"{path}: {_NO_MODEL}: {error}") from None
+
+
+def model_grid(path: Path) -> tuple[float | None, str | None]:
+    """Rate in Hz and unit of the log that a model in JSON was fitted to, where the file has them.
+
+    Raises:
+        ValueError: They are not a number and a text.
+    """
+    content = _model_content(path)
+    rate, unit = content.get("rate"), content.get("unit")
+    if rate is not None and (isinstance(rate, bool) or not isinstance(rate, float | int)):
+        raise ValueError(f"{path}: expected 'rate' to be a number of Hz, got {str(rate)[:80]!r}")
+    if unit is not None and not isinstance(unit, str):
+        raise ValueError(f"{path}: expected 'unit' to be a text such as 'deg/s', got {str(unit)[:80]!r}")
+    return rate, (None if unit == "unknown" else unit)
+
+
+def agreed_rate(models: Sequence[Path], rate: float | None) -> float | None:
+    """The one sampling rate, Hz, of `--rate` and of the logs that models were fitted to; None where nothing says.
+
+    Args:
+        models: Files of models.
+        rate: Value of `--rate`, if it was given.
+
+    Raises:
+        ValueError: Two of them differ.
+    """
+    chosen, by = (None, "") if rate is None else (check_positive("--rate", rate), "--rate")
+    for model in models:
+        own = model_grid(model)[0]
+        if own is not None:
+            check_positive(f"{model}: rate", own)
+        if own is not None and chosen is not None and not same_rate(own, chosen):
+            raise ValueError(
+                f"`{by}`: expected {own:g} Hz, for which the model was fitted, got {chosen:g}; see {model}"
+            )
+        if own is not None and chosen is None:
+            chosen, by = own, str(model)
+    return chosen
+
+
+def agreed_unit(model: Path | None, unit: str | None) -> str | None:
+    """The one unit of `--unit` and of the log that a model was fitted to; None where nothing says.
+
+    Args:
+        model: File of the model, if there is one.
+        unit: Value of `--unit`, if it was given.
+
+    Raises:
+        ValueError: The two differ.
+    """
+    own = None if model is None else model_grid(model)[1]
+    asked = None if unit is None else known_unit(unit)
+    if None not in (asked, own) and asked != own:
+        raise ValueError(f"`--unit`: expected {own}, for which the model was fitted, got {asked}; see {model}")
+    return asked or own
+
+
+def _model_content(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except RecursionError:
+        raise ValueError(f"{path}: {_NO_MODEL}, found lists within lists that do not end") from None
+    except ValueError as error:
+        raise ValueError(f"{path}: {_NO_MODEL}: {error}") from None
+    if not isinstance(content, dict):
+        raise ValueError(f"{path}: {_NO_MODEL}, found a {type(content).__name__}")
+    return content

@@ -1,4 +1,4 @@
-"""What stands out in a fleet: failed logs, noisy sensors, arrays unlike the others, weights that drift."""
+"""Summary of a fleet: failed logs, noisy sensors, outlying logs, weights with a trend."""
 
 from __future__ import annotations
 
@@ -12,11 +12,18 @@ from scipy import stats
 from gyrofuse._base.results import counted
 from gyrofuse.fleet.store.table import identity_in
 
-NOISY = 2.0  # times the median of an array
-_OUTLIER = 5.0  # robust standard deviations
-_FEWEST = 5  # arrays, to say what is usual
-FEWEST_IN_TIME = 8  # recordings of one array, to say what drifts
-LEVEL = 0.01  # chance of a drift, for all sensors together
+# Allan deviation of a sensor, in units of the median of its array, above which it is listed as noisy: a convention.
+NOISY = 2.0
+# Distance from the median of the logs, in robust standard deviations (median absolute deviation), above which a log is
+# an outlier: a normal variable exceeds five with probability 6e-7.
+_OUTLIER = 5.0
+# Fewest logs of one array for a median and a robust standard deviation to mean anything: of five, two may be outliers.
+_FEWEST = 5
+# Fewest logs of one array for a test of trend: with eight the smallest two-sided p value of Kendall's test is 2 / 8!.
+# below 1e-4, so that ten and more sensors can be corrected for.
+FEWEST_IN_TIME = 8
+# Significance level of the test of trend, for all weights together (Bonferroni), and of the J test in the table.
+LEVEL = 0.01
 GAIN = "Allan deviation of the plain mean over that of the virtual gyro, geometric mean over averaging times"
 
 

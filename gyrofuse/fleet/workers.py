@@ -32,7 +32,8 @@ def begin_imports(accelerator: str) -> None:
     if start_method(accelerator) == "forkserver":
         from multiprocessing import forkserver
 
-        multiprocessing.set_forkserver_preload(["gyrofuse.cli.preload"])
+        # Forks import the main module, the command line; the second module freezes what both have imported.
+        multiprocessing.set_forkserver_preload(["gyrofuse.cli", "gyrofuse.fleet.preload"])
         forkserver.ensure_running()
 
 

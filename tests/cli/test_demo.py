@@ -15,6 +15,7 @@ from reference import published
 
 import gyrofuse as gf
 from gyrofuse.cli import app as cli
+from gyrofuse.cli.demo import demo
 from gyrofuse.cli.demo.demo import FILES, demo_array, run_demo
 from gyrofuse.cli.demo.models import models_story, true_models
 
@@ -126,7 +127,7 @@ def test_command_writes_its_folder_once(
         shutil.copytree(ran[0], folder, dirs_exist_ok=True)
         return ran[1]
 
-    monkeypatch.setattr(cli, "run_demo", ran_before)
+    monkeypatch.setattr(demo, "run_demo", ran_before)
 
     def status(*options: str) -> int | str | None:
         with pytest.raises(SystemExit) as ended:
@@ -143,7 +144,7 @@ def test_command_writes_its_folder_once(
     assert status() == 2
     assert Path("gyrofuse-demo/result.json").read_text() == "mine"
     assert "gyrofuse-demo: exists already" in capsys.readouterr().err
-    monkeypatch.setattr(cli, "run_demo", lambda folder: run_demo(folder, n_samples=2**N_LEVELS))  # it repeats itself
+    monkeypatch.setattr(demo, "run_demo", lambda folder: run_demo(folder, n_samples=2**N_LEVELS))  # it repeats itself
     assert status("--force") in (0, None)
     assert Path("gyrofuse-demo/result.json").read_bytes() == Path("copy.json").read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["copy.html", "copy.json", "gyrofuse-demo"]
@@ -154,7 +155,7 @@ def test_a_failure_leaves_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (folder / "report.html").write_text("half")
         raise ValueError("no ink")
 
-    monkeypatch.setattr(cli, "run_demo", fail)
+    monkeypatch.setattr(demo, "run_demo", fail)
     with pytest.raises(SystemExit):
         cli.main(["demo", "--out", str(tmp_path / "out"), "--json", str(tmp_path / "copy.json")])
     assert list(tmp_path.iterdir()) == []

@@ -1,17 +1,22 @@
-"""The whole story on an array whose truth is known: simulate it, fuse it, compare with the truth."""
+"""Command `demo`: simulate an array, fuse it, and compare the results with the truth."""
 
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import torch
+import typer
 from torch import Tensor
 
-from gyrofuse.cli.demo.mismatch import MOST_SAMPLES, concealed, mismatch_story
+from gyrofuse._base.files import output_folder
+from gyrofuse.cli.console import progress, say
+from gyrofuse.cli.demo.mismatch import concealed, mismatch_story
 from gyrofuse.cli.demo.models import CANDIDATES, models_figure, models_story, true_models
+from gyrofuse.cli.options import Writing, takes_options
 from gyrofuse.fitting.ranking.rank import rank_models
 from gyrofuse.fitting.report.ranking import rank_report
 from gyrofuse.fusion import plots as plotting
@@ -21,63 +26,58 @@ from gyrofuse.fusion.svo import fit_svo
 from gyrofuse.fusion.weights.svo import svo_weights
 from gyrofuse.io.recording import Recording
 from gyrofuse.noise.array_model import ArrayModel
-from gyrofuse.noise.processes import AR1, WhiteNoise
+from gyrofuse.noise.parsing import model_from_dict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-RATE, UNIT, N_SAMPLES, SEED = 10.0, "deg/s", 1_044_000, 20_220_601
-
-# Case 2 of Zhang et al. (section V-B): white noise R and three AR(1) processes with correlated innovations P1, P2, P3,
-# in (deg/s)^2. The matrices are symmetric: rows up to the diagonal.
-_WHITE = (2.805556e-07, 1.977778e-07, 1.361111e-07, 1.063889e-07, 1.069444e-07, 2.538889e-07)
-_PHI = (0.9975214, 0.9998705, 0.9999933)
-_P1 = (
-    (4.00813e-12,),
-    (-1.8061e-13, 1.177847e-11),
-    (-4.477e-13, -1.2905e-13, 1.965775e-11),
-    (-1.04857e-12, -3.74198e-12, 2.02629e-12, 1.309887e-11),
-    (2.54671e-12, -5.1101e-13, -1.75089e-12, 2.3176e-13, 1.928375e-11),
-    (-2.3495e-12, 2.84942e-12, 1.44629e-12, 4.12761e-12, 5.71453e-12, 1.434466e-11),
-)
-_P2 = (
-    (6.713833e-13,),
-    (1.515552e-13, 5.60723e-13),
-    (1.245013e-13, 2.26465e-13, 7.499051e-13),
-    (-7.1179e-15, -7.73724e-14, -1.62687e-14, 1.20792e-13),
-    (4.28489e-14, 2.81054e-14, -5.29317e-14, -1.87305e-14, 7.499327e-13),
-    (9.57757e-14, 1.440987e-13, -9.99575e-14, 6.81702e-14, 2.414762e-13, 6.461646e-13),
-)
-_P3 = (
-    (5.062006e-14,),
-    (-6.4328e-15, 1.612038e-14),
-    (3.26013e-15, -3.18449e-15, 2.102923e-14),
-    (6.978e-15, -3.83634e-15, 9.1458e-16, 7.88177e-15),
-    (1.727949e-14, -7.68214e-15, 3.98505e-15, -1.29179e-15, 5.44267e-14),
-    (7.38584e-15, -1.00044e-15, -1.3776e-15, 5.19119e-15, 3.78632e-15, 4.990004e-14),
-)
+RATE, UNIT = 10.0, "deg/s"  # Hz, and unit of the signals, of the simulated array, as in the paper
+N_SAMPLES = 1_044_000  # 29 h at 10 Hz, the length of the paper's recordings
+SEED = 20_220_601  # of all random numbers of the demonstration; arbitrary
 
 FILES = ("report.html", "result.json", "models.html", "models.json", "mismatch.html", "mismatch.json", "figures")
 
 
 def demo_array() -> ArrayModel:
-    """Six gyros of Zhang et al., section V-B, rates in deg/s at 10 Hz."""
-    white = torch.tensor(_WHITE, dtype=torch.float64).diag()
-    return ArrayModel(
-        [(WhiteNoise(1.0), white)]
-        + [(AR1(phi, 1.0), _symmetric(rows)) for phi, rows in zip(_PHI, (_P1, _P2, _P3), strict=True)]
-    )
+    """Six gyros of Zhang et al., section V-B, Case 2: rates in deg/s at 10 Hz.
+
+    White noise with covariance R, and three AR(1) processes whose innovations have the covariances P1, P2 and P3.
+    """
+    model = model_from_dict(json.loads(Path(__file__).with_name("array.json").read_text(encoding="utf-8")))
+    assert isinstance(model, ArrayModel)
+    return model
+
+
+@takes_options
+def demo(
+    *,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write to.")] = Path("gyrofuse-demo"),
+    writing: Writing,
+) -> None:
+    """Watch it work on a simulated array.
+
+    Needs no file and no network. The truth is known, and what is found is compared with it. With --force an earlier
+    demonstration in DIR is replaced as well.
+    """
+    with writing.files() as files, output_folder(out, own=FILES, force=writing.force) as folder:
+        with progress("simulating, fusing and drawing"):
+            story = run_demo(folder)
+        for option, name in (("json", "result.json"), ("report", "report.html")):
+            if option in files.paths:
+                shutil.copyfile(folder / name, files.draft(option))
+    pages = {"Report": "report.html", "Noise models": "models.html", "Mismatch": "mismatch.html", "Figures": "figures"}
+    say("\n".join([f"{story}\n", *(f"{name}: {out / file}" for name, file in pages.items())]))
 
 
 def run_demo(folder: Path, n_samples: int = N_SAMPLES) -> str:
-    """Simulate the array, fuse it, find noise models and a concealed effect, and write all of it down.
+    """Simulate the array, fuse it, find noise models and a concealed effect, and write the results.
 
     Args:
-        folder: Where to write `FILES`; it exists.
-        n_samples: Length of the simulated recording.
+        folder: Existing folder, to which `FILES` are written.
+        n_samples: Number of samples of the simulated recording.
 
     Returns:
-        What was simulated and found, as text.
+        Description of the simulation and of the results.
     """
     from gyrofuse.mismatch import diagnose
 
@@ -96,7 +96,7 @@ def run_demo(folder: Path, n_samples: int = N_SAMPLES) -> str:
     models, truths = rank_models(together, CANDIDATES), true_models(array, long.weights)
     title = "Noise models of six simulated gyros and of the virtual gyro"
     pages = {"report.html": report, "models.html": rank_report(models, together, title=title)}
-    other = concealed(array, min(n_samples, MOST_SAMPLES), RATE, UNIT, generator)
+    other = concealed(array, n_samples, RATE, UNIT, generator)
     mismatch = diagnose(other, array)
     mismatch.to_html(folder / "mismatch.html", title="A recording of six gyros, and a simulation that lacks something")
     for name, page in pages.items():
@@ -117,14 +117,6 @@ def run_demo(folder: Path, n_samples: int = N_SAMPLES) -> str:
     return "\n\n".join(stories)
 
 
-def _symmetric(rows: tuple[tuple[float, ...], ...]) -> Tensor:
-    """Matrix from its rows up to the diagonal."""
-    lower = torch.zeros(len(rows), len(rows), dtype=torch.float64)
-    for i, row in enumerate(rows):
-        lower[i, : i + 1] = torch.tensor(row, dtype=torch.float64)
-    return lower + lower.tril(-1).mT
-
-
 def _gain(weights: Tensor, wccv: Tensor) -> Tensor:
     """Allan deviation with these weights over that of the plain mean, per level."""
     return (torch.einsum("i,jik,k->j", weights, wccv, weights) / wccv.mean((-1, -2))).sqrt()
@@ -133,7 +125,7 @@ def _gain(weights: Tensor, wccv: Tensor) -> Tensor:
 def _remarks(long: SVOResult, truth: Tensor) -> list[str]:
     low, high = long.confidence_interval
     best = svo_weights(truth, long.scale_weights)
-    held = int(((low <= best) & (best <= high)).sum())
+    covered = int(((low <= best) & (best <= high)).sum())
     fitted, possible = (100 * (1 - _gain(weights, truth)[-1].item()) for weights in (long.weights, best))
     hours = long.n_samples / RATE / 3600
     return [
@@ -141,7 +133,7 @@ def _remarks(long: SVOResult, truth: Tensor) -> list[str]:
         "with white noise and three drifts that correlate between the sensors, as in Case 2 of Zhang, Cucci, Molinari "
         "and Guerrier (2022), section V-B. The fit is told nothing about the noise.",
         f"The truth is known here: the best weights for long averaging times are "
-        f"{', '.join(f'{weight:.3f}' for weight in best.tolist())}; the intervals hold {held} of {len(best)}. "
+        f"{', '.join(f'{weight:.3f}' for weight in best.tolist())}; the intervals hold {covered} of {len(best)}. "
         f"With the true noise in place of this recording, the fitted weights make the Allan deviation at "
         f"{number(long.tau[-1].item())} s {fitted:.0f} % lower than that of the plain mean; the best possible is "
         f"{possible:.0f} %.",
@@ -182,7 +174,7 @@ def _story(long: SVOResult, short: SVOResult, truth: Tensor, remarks: list[str])
 
 
 def _truth_figure(long: SVOResult, short: SVOResult, truth: Tensor) -> Figure:
-    """What the fitted weights are expected to gain and gain in truth, and how far they are from the best ones."""
+    """Expected and true ratios to the plain mean with the fitted weights, and these weights beside the best ones."""
     figure = new_figure(7, 7)
     *above, below = figure.subplots(3, 1, height_ratios=[1.3, 1.3, 1])
     for ax, result, name in zip(above, (long, short), ("long", "short"), strict=True):

@@ -1,7 +1,8 @@
-"""The demonstration's concealed effect: a recording with a tone that its simulation lacks."""
+"""Concealed effect of the demonstration: a recording with a tone that its simulation lacks."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from textwrap import fill
 from typing import TYPE_CHECKING
 
@@ -16,42 +17,58 @@ from gyrofuse.noise.array_model import ArrayModel
 if TYPE_CHECKING:
     from gyrofuse.mismatch import MismatchReport
 
-MOST_SAMPLES = 2**16
-_TONE_HZ, _AMPLITUDE = 2.137, 0.05  # of the noise from sample to sample
-_SHARES = (1.0, 0.7, 0.2, 1.2, 0.5, 0.0)  # of the amplitude, by sensor
-_MODEL = "WN + AR1"
+_MAX_SAMPLES = 65_536  # of the recording with the tone, 1.8 h at 10 Hz, which keeps the diagnosis short
+_MODEL = "WN + AR1"  # model of the J test, which leaves the tone out
+
+
+@dataclass(frozen=True)
+class Tone:
+    """A sinusoid that all sensors pick up with different amplitudes.
+
+    Attributes:
+        frequency_hz: Frequency, Hz.
+        amplitude: Amplitude in standard deviations of the noise between samples: too weak for the J test and for
+            single wavelet variances.
+        shares: Share of the amplitude in each sensor; the last sensor is free of the tone.
+    """
+
+    frequency_hz: float = 2.137
+    amplitude: float = 0.05
+    shares: tuple[float, ...] = (1.0, 0.7, 0.2, 1.2, 0.5, 0.0)
 
 
 def concealed(array: ArrayModel, n_samples: int, rate: float, unit: str, generator: torch.Generator) -> Recording:
     """A recording of the array with a weak tone.
 
     Args:
-        array: Six sensors.
-        n_samples: Length.
-        rate: Hz.
-        unit: Of the array's signals.
+        array: Noise model of the six sensors.
+        n_samples: Number of samples; at most 65,536 are made.
+        rate: Sampling rate, Hz.
+        unit: Unit of the array's signals.
         generator: Source of randomness.
     """
+    tone, n_samples = Tone(), min(n_samples, _MAX_SAMPLES)
     noise = array.simulate(n_samples, generator=generator)
-    size = _AMPLITUDE * noise.diff().std(-1) / 2**0.5 * torch.tensor(_SHARES, dtype=torch.float64)
-    turn = 2 * torch.pi * _TONE_HZ / rate * torch.arange(n_samples, dtype=torch.float64)
-    return Recording(noise + size[:, None] * turn.cos(), rate=rate, unit=unit)
+    size = tone.amplitude * noise.diff().std(-1) / 2**0.5 * torch.tensor(tone.shares, dtype=torch.float64)
+    phase = 2 * torch.pi * tone.frequency_hz / rate * torch.arange(n_samples, dtype=torch.float64)
+    return Recording(noise + size[:, None] * phase.cos(), rate=rate, unit=unit)
 
 
 def mismatch_story(recording: Recording, report: MismatchReport) -> str:
-    """What the ordinary view shows of the tone, what the diagnosis finds, and what it is worth.
+    """Text: results of the ordinary tests, which miss the tone, and of the diagnosis, which finds it.
 
     Args:
-        recording: With the tone.
-        report: On the recording beside the simulation that lacks it.
+        recording: Recording with the tone.
+        report: Diagnosis of the recording against the simulation without the tone.
     """
-    loudest = _SHARES.index(max(_SHARES))
+    tone = Tone()
+    loudest = tone.shares.index(max(tone.shares))
     fit = fit_gmwm(recording.select(sensors=[loudest]), _MODEL)
     z = report.variances[0].z
     paragraphs = [
         f"A concealed effect: another {number(recording.duration / 3600, 3)} h of the same array hold a tone at "
-        f"{_TONE_HZ:g} Hz with up to {_AMPLITUDE * max(_SHARES):g} of the noise's standard deviation, which the "
-        "simulation of the array leaves out.",
+        f"{tone.frequency_hz:g} Hz with up to {tone.amplitude * max(tone.shares):g} of the noise's standard "
+        "deviation, which the simulation of the array leaves out.",
         f"The ordinary view: the J test of {_MODEL} for sensor {recording.sensors[loudest]}, which has most of it, "
         f"{_judged(fit.p_value)}. Of {int(z.isfinite().sum())} wavelet variances of recording and simulation none is "
         f"further apart than {number(float(z[z.isfinite()].abs().max()), 2)} standard deviations.",

@@ -1,4 +1,4 @@
-"""The demonstration's noise models: what was found for every sensor, with the truth beside it."""
+"""Noise models of the demonstration: the model found for every sensor beside the true one."""
 
 from __future__ import annotations
 
@@ -21,18 +21,19 @@ from gyrofuse.noise.processes import AR1, Model, WhiteNoise
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# What a gyro's noise may be, without tones; the default of `rank_models` is more.
+# Candidate models, without tones, which the array does not have; the default of `rank_models` has more.
 CANDIDATES = ("WN", "WN + RW", "WN + AR1", "WN + AR1 + RW", "WN + 2*AR1", "WN + 2*AR1 + RW", "WN + 3*AR1")
-# Averages of the recording that still tell something: their number at the averaging time of the table.
-_AVERAGES = 100
+# Number of averages in the recording at the averaging time of the table: with 100 the relative standard error of an
+# Allan deviation is about 10 %, so that fitted and true values can be compared.
+_N_AVERAGES = 100
 
 
 def true_models(array: ArrayModel, weights: Tensor) -> list[Model]:
     """Noise of every sensor of an array, and of the virtual gyro that it makes with these weights.
 
     Args:
-        array: Of white noise and AR1s with unit variances, and their covariances between the sensors.
-        weights: `(sensor,)`.
+        array: White noise and AR1s with unit variances, and their covariances between the sensors.
+        weights: Weights of the virtual gyro, `(sensor,)`.
     """
     each = torch.cat([torch.eye(len(weights), dtype=torch.float64), weights[None]])
     sizes = [torch.einsum("si,ik,sk->s", each, matrix, each).tolist() for _, matrix in array.components]
@@ -45,11 +46,11 @@ def true_models(array: ArrayModel, weights: Tensor) -> list[Model]:
 
 
 def models_story(result: RankResult, truths: list[Model]) -> str:
-    """Table of the models found, in datasheet units, with the truth beside them, and what it tells.
+    """Table of the models found beside the true ones, in datasheet units, and a paragraph on it.
 
     Args:
-        result: Ranked, for every sensor, with its fits.
-        truths: As many.
+        result: Ranking of every sensor, with its fits.
+        truths: True model of every sensor.
     """
     fits = [fit for fit in result.best if fit is not None]
     columns = "  ".join(f"{name:>9}" for name in ("fitted", "truth") * 2)
@@ -65,15 +66,15 @@ def models_story(result: RankResult, truths: list[Model]) -> str:
         p_value = number(_p_value(fit), 2)
         lines.append("  ".join([f"{fit.sensors[0]:>7}", f"{name:<22}", *numbers, f"{p_value:>8}"]))
     head = "Noise model of every gyro and of the virtual gyro, as the likelihood of their spectra ranks them:"
-    return "\n".join([head, *(line.rstrip() for line in lines)]) + "\n\n" + fill(_told(fits, result, truths[0]), 110)
+    return "\n".join([head, *(line.rstrip() for line in lines)]) + "\n\n" + fill(_comment(fits, result, truths[0]), 110)
 
 
 def models_figure(result: RankResult, truths: list[Model]) -> Figure:
-    """Allan deviation of every sensor, measured, fitted and in truth.
+    """Allan deviation of every sensor: measured, of the fitted model, and of the true one.
 
     Args:
-        result: Ranked, for every sensor, with its fits.
-        truths: As many.
+        result: Ranking of every sensor, with its fits.
+        truths: True model of every sensor.
     """
     fits = [fit for fit in result.best if fit is not None]
     figure = new_figure(9, 2.7 * ((len(fits) + 1) // 2))
@@ -105,26 +106,26 @@ def _model(fit: GMWMResult) -> Model:
 
 
 def _p_value(fit: GMWMResult) -> float | None:
-    """Of the J test; None where there is none, or the search did not end."""
+    """p value of the J test; None where there is none, or the fit did not converge."""
     p_value = fit.p_value[0].item()
     return p_value if bool(fit.converged[0]) and p_value == p_value else None
 
 
 def _level(fit: GMWMResult) -> int:
-    """Of the averaging time, counted from 0."""
-    return max(int(math.log2(fit.n_samples / _AVERAGES)), 0)
+    """Level of the averaging time of the table, counted from 0."""
+    return max(int(math.log2(fit.n_samples / _N_AVERAGES)), 0)
 
 
 def _quantities(model: Model, fit: GMWMResult) -> list[float]:
-    """Angle random walk, and the Allan deviation where slow noise rules."""
+    """Angle random walk, and the Allan deviation at the averaging time of the table."""
     rate, degrees = fit.rate or 1.0, rate_unit_factor(fit.unit or "deg/s")
     white = sum(process.params.item() for process in model.processes if isinstance(process, WhiteNoise))
     slow = (2 * model.wavelet_variance(_level(fit) + 1)[-1]).sqrt().item()
     return [per_sqrt_hour(angle_random_walk(white, rate)) * degrees, slow * degrees * SECONDS_PER_HOUR]
 
 
-def _told(fits: list[GMWMResult], result: RankResult, truth: Model) -> str:
-    """What the truth is, how many of the models are it, and which the J test refuses."""
+def _comment(fits: list[GMWMResult], result: RankResult, truth: Model) -> str:
+    """The true model, how many sensors it was found for, and which models the J test refuses."""
     slow = [process for process in truth.processes if isinstance(process, AR1)]
     times = [number(correlation_time(process.params[0].item(), fits[0].rate or 1.0), 3) for process in slow]
     name = name_of([type(process) for process in truth.processes])

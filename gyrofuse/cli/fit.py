@@ -1,4 +1,4 @@
-"""Commands for noise models: fit one, rank many."""
+"""Command `fit`: a noise model for every sensor."""
 
 from __future__ import annotations
 
@@ -11,43 +11,33 @@ from typing import Annotated
 
 import typer
 
-from gyrofuse._base.results import place
 from gyrofuse._base.units import ACCELERATION_UNITS, DATASHEET_UNITS, RATE_UNITS
 from gyrofuse.cli.console import progress, say
 from gyrofuse.cli.options import (
-    Force,
-    Json,
-    Report,
-    at_rest,
-    draw,
-    files_written,
-    outputs,
-    say_notes,
+    Confidence,
+    Logs,
+    ModelLevels,
+    Quantity,
+    Reading,
+    Rest,
+    Writing,
+    one_panel,
     stretch,
-    titled,
-    unit_note,
-    without_gaps,
-    write_json,
+    takes_options,
 )
-from gyrofuse.cli.reading import Logs, Quantity, Reading, takes_options
+from gyrofuse.cli.reading import at_rest, say_notes, titled, unit_note
 from gyrofuse.export.c_header import to_c_header
 from gyrofuse.export.kalibr import to_kalibr
 from gyrofuse.fitting.gmwm import fit_gmwm
 from gyrofuse.fitting.gmwm_result import GMWMResult
-from gyrofuse.fitting.ranking.rank import rank_models
 from gyrofuse.fitting.report.page import model_report
-from gyrofuse.fitting.report.ranking import rank_report
-from gyrofuse.fitting.spectral.tones import FEWEST_SAMPLES
 from gyrofuse.io.recording import Recording
 from gyrofuse.io.streams import RecordingError
 from gyrofuse.noise.processes import Model
 
-_MOST_FITS = 12  # printed in full
-_WITH_GAPS = ", or fit a model with `gyrofuse fit`, which gets along with gaps"
-
 
 class Weighting(str, Enum):
-    """How much the levels count."""
+    """Weights of the levels."""
 
     optimal = "optimal"
     diagonal = "diagonal"
@@ -61,9 +51,7 @@ def fit(
     model: Annotated[
         str, typer.Option(metavar="FORMULA", help='Processes to fit, such as "WN + AR1 + RW" or "WN + 2*AR1 + SIN".')
     ],
-    levels: Annotated[
-        int | None, typer.Option(metavar="J", help="Number of levels; as many as hold two windows by default.")
-    ] = None,
+    levels: ModelLevels = None,
     weighting: Annotated[Weighting, typer.Option(help="How much the levels count.")] = Weighting.optimal,
     refine: Annotated[
         bool, typer.Option("--refine", help="Go on to the maximum of the spectral likelihood, a little sharper.")
@@ -72,9 +60,9 @@ def fit(
         float,
         typer.Option(metavar="EFF", help="Efficiency of the wavelet variance; below 1, such as 0.6, it is robust."),
     ] = 1.0,
-    rest: Annotated[str | None, typer.Option(metavar="START:STOP", help="Fit this stretch alone (seconds).")] = None,
+    rest: Rest = None,
     reading: Reading,
-    confidence_level: Annotated[float, typer.Option(metavar="P", help="Of all intervals.")] = 0.95,
+    confidence_level: Confidence = 0.95,
     kalibr: Annotated[Path | None, typer.Option(metavar="FILE", help="Write Kalibr's imu.yaml, of one device.")] = None,
     kalibr_slow: Annotated[
         float, typer.Option(metavar="S", help="AR1s with a correlation time from this on are Kalibr's random walk.")
@@ -88,16 +76,14 @@ def fit(
     figure: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw the fit of the first sensor, .png, .svg or .pdf.")
     ] = None,
-    json_file: Json = None,
-    report: Report = None,
-    force: Force = False,
+    writing: Writing,
 ) -> None:
     """Fit a noise model to every sensor of a log, recorded at rest."""
     resting, kalibr_remarks = stretch(rest), list[str]()
     if refine and robust < 1:
         raise ValueError("`--refine`: the spectral likelihood is not robust; leave out --refine or --robust")
-    asked = {"kalibr": kalibr, "header": header, "model-out": model_out, "figure": figure, "json": json_file}
-    with outputs(force, [*logs, reading.mounting], report=report, **asked) as drafts:
+    others = {"kalibr": kalibr, "header": header, "model_out": model_out, "figure": figure}
+    with writing.files([*logs, reading.mounting], **others) as files:
         recording = reading.read(logs)
         with progress("fitting"):
             part = at_rest(recording, resting)
@@ -113,23 +99,15 @@ def fit(
             result = fitted(part)
             if kalibr:
                 text, kalibr_remarks = _kalibr(result, reading, logs, resting, fitted, kalibr_slow)
-                drafts[kalibr].write_text(text, encoding="utf-8")
-        if header:
-            drafts[header].write_text(_c_header(result, recording), encoding="utf-8")
+                files.write("kalibr", lambda: text)
+        files.write("header", lambda: _c_header(result, recording))
         if model_out:
             known = _known_model(result, "model-out").to_dict()
-            write_json(drafts[model_out], {**known, "rate": recording.rate, "unit": recording.unit})
-        if figure:
-            first = tuple(result.params.isfinite().all(-1).nonzero()[0].tolist())  # that could be fitted
-            draw(partial(result.plot, index=first), drafts[figure], figure)
-        if report:
-            with progress("drawing"):
-                page = model_report(result, part, title=f"Noise of {titled(logs)}")
-            drafts[report].write_text(page, encoding="utf-8")
-        if json_file:
-            write_json(drafts[json_file], result.to_dict())
-    written_files = files_written(kalibr, header, model_out, figure, json_file, report)
-    say("\n".join([result.summary(), *unit_note(recording.unit), *kalibr_remarks, *written_files]))
+            files.write_json(lambda: {**known, "rate": recording.rate, "unit": recording.unit}, "model-out")
+        files.write_figure(lambda: one_panel(partial(result.plot, index=_first_fitted(result))))
+        files.write_report(lambda: model_report(result, part, title=f"Noise of {titled(logs)}"))
+        files.write_json(result.to_dict)
+    say("\n".join([result.summary(), *unit_note(recording.unit), *kalibr_remarks, *files.note]))
     say_notes(recording)
 
 
@@ -141,7 +119,7 @@ def _kalibr(
     fitted: Callable[[Recording], GMWMResult],
     slow: float,
 ) -> tuple[str, list[str]]:
-    """Kalibr's file of the only device, with its accelerometers where the log has some, and what to say of these."""
+    """Kalibr's file of the one device, with its accelerometers where the log has some, and remarks on them."""
     if reading.quantity is not Quantity.rate:
         raise ValueError(
             "`--kalibr`: expected the gyros of a log, whose accelerometers are added, got --quantity acceleration; "
@@ -165,8 +143,13 @@ def _kalibr(
     return to_kalibr(result, slow=slow, accelerometer=fitted(accelerations)), []
 
 
+def _first_fitted(result: GMWMResult) -> tuple[int, ...]:
+    """Index of the first sensor that could be fitted."""
+    return tuple(result.params.isfinite().all(-1).nonzero()[0].tolist())
+
+
 def _known_model(result: GMWMResult, option: str) -> Model:
-    """The fitted model, where all sensors have one."""
+    """The fitted model; raises `ValueError` if a sensor has none."""
     missing = ~result.params.isfinite().all(-1).reshape(-1, len(result.sensors)).all(0)
     if bool(missing.any()):
         names = [name for name, gone in zip(result.sensors, missing.tolist(), strict=True) if gone]
@@ -178,7 +161,7 @@ def _known_model(result: GMWMResult, option: str) -> Model:
 
 
 def _c_header(result: GMWMResult, recording: Recording) -> str:
-    """A Kalman filter's matrices, of the only sensor."""
+    """C header with a Kalman filter's matrices, of the one sensor."""
     params = result.params.flatten(0, -2)
     if len(params) != 1:
         raise ValueError(
@@ -196,59 +179,3 @@ def _check_unit(result: GMWMResult, option: str) -> None:
             f"`--{option}`: expected a log in one of {', '.join(known)}, got unit {result.unit or 'unknown'!r}; where "
             "the log does not say, give its unit with --unit, and with --scale the factor to it from other numbers"
         )
-
-
-@takes_options
-def rank(
-    *,
-    logs: Logs,
-    candidates: Annotated[
-        str | None,
-        typer.Option(
-            metavar="FORMULA,...",
-            help='Compositions to compare, such as "WN+AR1, WN+AR1+RW"; all that make sense by default.',
-        ),
-    ] = None,
-    levels: Annotated[
-        int | None, typer.Option(metavar="J", help="Number of levels; as many as hold two windows by default.")
-    ] = None,
-    rest: Annotated[str | None, typer.Option(metavar="START:STOP", help="Rank this stretch alone (seconds).")] = None,
-    reading: Reading,
-    confidence_level: Annotated[float, typer.Option(metavar="P", help="Of all intervals.")] = 0.95,
-    figure: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Draw the ranking of the first sensor that has one, .png, .svg or .pdf."),
-    ] = None,
-    json_file: Json = None,
-    report: Report = None,
-    force: Force = False,
-) -> None:
-    """Find which noise processes made the signal of every sensor of a log, recorded at rest.
-
-    Spectra ask for records without gaps: where samples are missing, the longest stretch in which all sensors have
-    theirs is ranked, and said.
-    """
-    resting = stretch(rest)
-    formulas = None if candidates is None else [formula.strip() for formula in candidates.split(",")]
-    with outputs(force, [*logs, reading.mounting], figure=figure, json=json_file, report=report) as drafts:
-        recording = reading.read(logs)
-        with progress("ranking"):
-            asked = at_rest(recording, resting)
-            part, remarks = without_gaps(asked, "Ranked", FEWEST_SAMPLES, _WITH_GAPS)
-            result = rank_models(part, formulas, confidence_level=confidence_level, n_levels=levels)
-        if figure:
-            named = f"Sensor {place(result.sensors, result.first_ranked, result.axes)}"
-            draw(partial(result.plot, title=named), drafts[figure], figure)
-        if report:
-            with progress("drawing"):
-                page = rank_report(result, part, title=f"Noise models for {titled(logs)}", remarks=remarks)
-            drafts[report].write_text(page, encoding="utf-8")
-        if json_file:
-            write_json(drafts[json_file], result.to_dict())
-    say("\n".join([result.summary(), *remarks]))
-    fits = [fit for fit in result.best if fit is not None]
-    if len(fits) <= _MOST_FITS:
-        say("\n".join(f"\n{fit}" for fit in fits))
-    if notes := [*unit_note(recording.unit), *files_written(figure, json_file, report)]:
-        say("\n".join(notes))
-    say_notes(recording)
