@@ -42,6 +42,7 @@ _MODULES = {
     "demo_models": "cli.demo.models",
     "fault_kinds": "fusion.faults.classify",
     "fleet.standing": "fleet.summary",
+    "fleet.watch": "fleet.watchdog",
     "fleet.work": "fleet.run",
     "fleet_run": "fleet.processes",
     "gain": "fusion.uncertainty.gain",

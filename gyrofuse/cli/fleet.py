@@ -145,7 +145,14 @@ def fleet(
             with _watched(store, len(data.logs), group):
                 limit = timeout or None
                 run_fleet(
-                    asked, data, store, devices=devices, accelerator=accelerator, timeout=limit, retry=retry, said=warn
+                    asked,
+                    data,
+                    store,
+                    devices=devices,
+                    accelerator=accelerator,
+                    timeout=limit,
+                    retry=retry,
+                    report=warn,
                 )
         except (SystemExit, KeyboardInterrupt):
             warn("stopped; what is finished is kept, start again to go on")

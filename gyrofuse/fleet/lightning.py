@@ -29,27 +29,28 @@ from gyrofuse.fleet.logs import find_logs, groups_of, identity
 from gyrofuse.fleet.run import Log, LogGroups, rows_of
 from gyrofuse.fleet.store.store import ResultStore
 from gyrofuse.fleet.tasks import Fuse, Row, Task
-from gyrofuse.fleet.watch import Suspect, Watch, close_all
+from gyrofuse.fleet.watchdog import Suspect, Watchdog, close_all
 from gyrofuse.fleet.workers import end_at_once, end_with_parent, start_method
 
-_PATIENCE = timedelta(days=365)  # of processes that wait for each other: one may be at a long log
+# Timeout of processes that wait for each other: none in practice, as one may work on a long log for hours.
+_PATIENCE = timedelta(days=365)
 
 
 class GyroArrayDataModule(LightningDataModule):
-    """Logs of arrays, read when their turn comes, in groups of any lengths and numbers of sensors: nothing is padded.
+    """Logs of arrays, read one after the other, in groups of any lengths and numbers of sensors, without padding.
 
     Args:
         paths: Files, folders and patterns, or one of them, as of `find_logs`.
-        manifest: Text file with one of them a line.
+        manifest: Text file with one name a line.
         group_size: Logs that a process takes at a time, and whose rows appear together. Short arrays of one shape
             are fitted together: more than one pays where logs are many and short.
-        num_workers: Processes that read ahead.
+        num_workers: Number of processes that read ahead.
         done: Identities of logs (`ResultStore.done`) that are left out, though the others stay in their groups.
-        **options: Of `read_recording`: `axis`, `sensors`, `rate`, `unit`, `scale`, `key`, `mounting`, `max_bytes`.
+        **options: Keyword arguments of `read_recording`: `axis`, `sensors`, `rate`, `unit`, `scale`, `key`, `mounting`, `max_bytes`.
 
     Raises:
-        FileNotFoundError: A name that stands for nothing.
-        ValueError: No log at all, a number below one, or a rate or scale that is none.
+        FileNotFoundError: A name without files.
+        ValueError: No log at all, a number below one, or a rate or scale that is not positive.
         TypeError: An option that `read_recording` does not have.
     """
 
@@ -68,28 +69,28 @@ class GyroArrayDataModule(LightningDataModule):
         self.group_size = check_positive_integer("group_size", group_size)
         self.done = done
         self.suspects: Mapping[str, Suspect] = {}
-        self.watch: Watch | None = None
+        self.watch: Watchdog | None = None
         self.num_workers = num_workers
-        self.options = LogGroups((), options).options  # wrong ones are told now, not by every row
+        self.options = LogGroups((), options).options  # wrong ones are refused here, and not in every row
 
     @cached_property
     def groups(self) -> tuple[tuple[Path, ...], ...]:
-        """Logs that are taken together, without those that are done, as they are when they are first asked for."""
+        """Groups of logs that are worked on together, without those that are done; fixed at the first use."""
         alone = [log for log, suspect in self.suspects.items() if suspect.alone]
         return groups_of(self.logs, self.group_size, self.done, last=self.suspects, alone=alone)
 
     def leave(self, done: Collection[str], suspects: Mapping[str, Suspect]) -> None:
-        """Say anew what is left.
+        """Form the groups anew from the logs that are left.
 
         Args:
             done: Identities of logs that are left out.
-            suspects: Logs that a process ended at (`ResultStore.suspects`): they come last.
+            suspects: Logs at which a process crashed (`ResultStore.suspects`); they come last.
         """
         self.done, self.suspects = done, suspects
         self.__dict__.pop("groups", None)
 
     def predict_dataloader(self) -> DataLoader[tuple[Log, ...]]:
-        """Groups of logs; Lightning shares them out among processes, each once."""
+        """Groups of logs; Lightning distributes them over the processes, each once."""
         # Lightning's sampler wants one for each process at least; an empty group has no rows.
         idle = self.trainer.world_size - len(self.groups) if self.trainer and self.groups else 0
         groups = LogGroups([*self.groups, *[()] * idle], self.options, self.watch)
@@ -119,13 +120,13 @@ def _only(batch: Sequence[Any]) -> Any:
 
 
 class ResultWriter(BasePredictionWriter):
-    """Writes rows to a table as they arrive: one process opens it, and completes it when all have done their share.
+    """Writes rows to a table as they arrive; one process opens it, and completes it when all have finished.
 
     Args:
-        store: The table, of the columns and settings of the module's task.
+        store: Writer of the table, with the columns and settings of the module's task.
         force: Whether a table of other settings is replaced.
         timeout: Seconds that a log may take to be read, and again to be worked on; then its process ends, and on the
-            next start it has a row that says so. None for any.
+            next start the log gets a row that says so. None for no limit.
 
     Raises:
         ValueError: On setup, where the table is of another task, or of the same with other settings.
@@ -135,7 +136,7 @@ class ResultWriter(BasePredictionWriter):
         super().__init__(write_interval="batch")
         self.store = store
         self.force = force
-        self.watch = Watch(store.parts, timeout)
+        self.watch = Watchdog(store.parts, timeout)
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Open the table, before anyone writes."""
@@ -159,7 +160,7 @@ class ResultWriter(BasePredictionWriter):
                 data.leave({*data.done, *passed_over}, suspects)
 
     def on_predict_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, *_: Any) -> None:
-        """Note what is worked on."""
+        """Record which logs are worked on."""
         self.watch.begin([log.place for log in batch])
 
     def write_on_batch_end(
@@ -177,7 +178,7 @@ class ResultWriter(BasePredictionWriter):
         self.watch.end()
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        """No log is to blame for what ends in an exception."""
+        """Remove the journal: an exception is no crash of a log."""
         self.watch.close()
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
@@ -191,9 +192,9 @@ class ResultWriter(BasePredictionWriter):
 
 
 class _Worker(Callback):
-    """Keeps Lightning from announcing itself, and has processes that it starts end when they should.
+    """Silences Lightning, and ends the processes that it starts together with their parent.
 
-    They unpickle it before they begin.
+    The processes unpickle it before they begin.
     """
 
     def __init__(self) -> None:
@@ -216,13 +217,13 @@ class _Worker(Callback):
 
 
 def quiet_trainer(*, devices: int, accelerator: str = "cpu", callbacks: Sequence[Callback] = ()) -> Trainer:
-    """A trainer for predictions alone, which says nothing and leaves no files behind.
+    """A trainer for predictions alone, without messages and files.
 
     Args:
-        devices: Processes, one for each device; more than one are forked from a process that computes nothing, or
-            spawned where that cannot be.
+        devices: Number of processes, one for each device; more than one are forked from a process that computes
+            nothing, or spawned where that is not possible.
         accelerator: `"cpu"`, `"gpu"` or `"auto"`.
-        callbacks: Such as a `ResultWriter`.
+        callbacks: Callbacks such as a `ResultWriter`.
     """
     return Trainer(
         devices=devices,

@@ -1,4 +1,4 @@
-"""Which logs a fleet has, and in which groups they are worked on."""
+"""The logs of a fleet, and the groups in which they are worked on."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ _WILD = "*?["
 
 
 class State(NamedTuple):
-    """Size of a log in bytes, and when it was last changed, in ns since 1970; None where it is not there to be read."""
+    """Size of a log in bytes, and time of its last change in ns since 1970; None where the log cannot be read."""
 
     size: int | None = None
     modified: int | None = None
 
 
 def state_of(log: str | Path) -> State:
-    """Of a file, or of all files of a folder together."""
+    """State of a file, or of all files of a folder together."""
     try:
         files = [Path(log)] if not os.path.isdir(log) else [path for path in Path(log).rglob("*") if path.is_file()]
         found = [file.stat() for file in files]
@@ -32,7 +32,7 @@ def state_of(log: str | Path) -> State:
 
 
 def identity(log: str | Path) -> str:
-    """A log by its absolute path, whatever it was called and from wherever."""
+    """Identity of a log: its absolute path with links resolved."""
     try:
         return as_text(os.path.realpath(log))
     except ValueError:  # no name of a file
@@ -40,7 +40,7 @@ def identity(log: str | Path) -> str:
 
 
 def as_text(text: str) -> str:
-    r"""With what UTF-8 cannot hold written out: bytes of names of files as `\xff`, lone surrogates as `\ud800`."""
+    r"""Text with all that UTF-8 cannot hold written out: bytes of names of files as `\xff`, lone surrogates as `\ud800`."""
     try:
         return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
     except UnicodeEncodeError:  # surrogates that stand for no byte
@@ -48,10 +48,10 @@ def as_text(text: str) -> str:
 
 
 def find_logs(paths: str | Path | Iterable[str | Path], *, manifest: str | Path | None = None) -> tuple[Path, ...]:
-    """All logs that names stand for, each once, in their order.
+    """All logs of some names, each once, in their order.
 
-    A file is a log whatever its suffix; of a folder, all files below with a suffix that is read, and ROS 2 folders. A
-    folder that may not be looked into is listed as it is, so that its row says so.
+    A file is a log whatever its suffix; of a folder, all files below with a known suffix are, and ROS 2 folders. A
+    folder that cannot be read is listed itself, so that its row says so.
 
     Args:
         paths: Files, folders, and patterns such as `"flights/*/imu.npz"`, with `**` for any folders between; or one.
@@ -60,7 +60,7 @@ def find_logs(paths: str | Path | Iterable[str | Path], *, manifest: str | Path 
             there is listed all the same.
 
     Raises:
-        FileNotFoundError: A name that is neither there nor a pattern that anything fits, or no such manifest.
+        FileNotFoundError: A name or a pattern without files, or a manifest that does not exist.
         ValueError: No log at all.
     """
     found: dict[str, Path] = {}
@@ -79,17 +79,17 @@ def find_logs(paths: str | Path | Iterable[str | Path], *, manifest: str | Path 
 def groups_of(
     logs: Sequence[Path], size: int, done: Collection[str] = (), last: Collection[str] = (), alone: Collection[str] = ()
 ) -> tuple[tuple[Path, ...], ...]:
-    """Logs in groups of up to `size`, as they follow each other, without those that are done; the largest first.
+    """Consecutive logs in groups of up to `size`, without those that are done; the largest groups first.
 
-    The groups are those of all logs, whatever is done: what is computed together does not depend on where a run was
-    stopped. The order shares out the work evenly where processes take groups in turns.
+    The groups are formed of all logs, done or not, so that results do not depend on where a run was stopped. The order
+    balances the work of processes that take groups in turns.
 
     Args:
-        logs: Of the fleet.
-        size: Of a group.
-        done: Identities of logs whose rows are there.
+        logs: Logs of the fleet.
+        size: Number of logs in a group.
+        done: Identities of logs that are left out.
         last: Identities of logs whose groups come after all others.
-        alone: Identities of logs that are no part of a group.
+        alone: Identities of logs that form a group each.
     """
     known = {log: identity(log) for log in logs}
     groups = [logs[i : i + size] for i in range(0, len(logs), size)]
@@ -113,7 +113,7 @@ def _logs_of(path: Path) -> Iterable[Path]:
 
 
 def _expanded(path: Path) -> list[Path]:
-    """Logs behind a file, a folder or a pattern; a link that leads nowhere is one, and its row will say so."""
+    """Logs of a file, a folder or a pattern; a broken link counts as a log, and its row says so."""
     if os.path.isdir(path):
         return list(_walked(path))
     if os.path.lexists(path):
@@ -124,7 +124,7 @@ def _expanded(path: Path) -> list[Path]:
 
 
 def _expanded_or_itself(path: Path) -> list[Path]:
-    """Logs behind a line of a manifest; the line itself where there are none, so that its row says so."""
+    """Logs of a line of a manifest; the line itself where there are none, so that its row says so."""
     try:
         return _expanded(path) or [path]
     except ValueError:  # no name of a file
@@ -149,7 +149,7 @@ def _is_log(name: str) -> bool:
 
 
 def _listed(manifest: Path) -> list[Path]:
-    """Names that a manifest lists. A byte that belongs to no character spoils its own line alone."""
+    """Names in a manifest. An invalid byte affects its own line alone."""
     content = manifest.read_bytes()
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):  # as PowerShell writes it
         text = content.decode("utf-16", "replace")

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gyrofuse._base.axes import BLUE, DASHED, FRAME, as_array, clean_name, finish, new_axes
+from gyrofuse._base.deprecation import moved_names
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.ticker import Locator
 
 _COLOURS = (BLUE, "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#969696", "#8c510a")  # not that of the mean
-_FEWEST_BINS, _MOST_BINS = 5, 60
 
 
-def plot_spread(
+def plot_distribution(
     values: Sequence[float],
     *,
     label: str,
@@ -27,16 +27,16 @@ def plot_spread(
     limits: tuple[float, float] | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw how a number is spread over a fleet.
+    """Draw a histogram of a quantity over a fleet.
 
     Args:
-        values: One for each log; those that are not finite are left out.
-        label: Of their axis.
-        mark: Where a line is drawn.
-        meaning: Of that line.
-        what: Is counted.
-        limits: Of the axis; those of the values by default.
-        ax: Where to draw; new axes by default.
+        values: Value of each log; values that are not finite are left out.
+        label: Label of the horizontal axis.
+        mark: Value at which a vertical line is drawn.
+        meaning: Legend of that line.
+        what: Label of the vertical axis, what is counted.
+        limits: Range of the histogram; that of the values by default.
+        ax: Axes to draw on; new ones by default.
 
     Returns:
         The axes.
@@ -44,7 +44,7 @@ def plot_spread(
     ax = ax if ax is not None else new_axes()
     known = as_array(values)
     known = known[np.isfinite(known)]
-    n_bins = min(max(round(2 * np.sqrt(known.size)), _FEWEST_BINS), _MOST_BINS)
+    n_bins = min(max(round(2 * np.sqrt(known.size)), 5), 60)  # Rice-like rule, within what a 7-inch figure resolves
     ax.hist(known, bins=n_bins, range=limits, color=BLUE, alpha=0.75)
     line = ax.axvline(mark, **DASHED)
     ax.set_xlabel(label)
@@ -54,13 +54,13 @@ def plot_spread(
     return ax
 
 
-def plot_course(weights: Sequence[Sequence[float]], *, names: Sequence[str], ax: Axes | None = None) -> Axes:
+def plot_weights_over_logs(weights: Sequence[Sequence[float]], *, names: Sequence[str], ax: Axes | None = None) -> Axes:
     """Draw the weights of an array from log to log.
 
     Args:
-        weights: `(log, sensor)`.
-        names: Of the sensors.
-        ax: Where to draw; new axes by default.
+        weights: Weights, `(log, sensor)`.
+        names: Names of the sensors.
+        ax: Axes to draw on; new ones by default.
 
     Returns:
         The axes.
@@ -88,3 +88,9 @@ def _whole() -> Locator:
     from matplotlib.ticker import MaxNLocator
 
     return MaxNLocator(integer=True)
+
+
+__getattr__ = moved_names(
+    __name__,
+    {"plot_course": f"{__name__}.plot_weights_over_logs", "plot_spread": f"{__name__}.plot_distribution"},
+)

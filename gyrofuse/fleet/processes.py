@@ -1,4 +1,4 @@
-"""A fleet on processes of its own: a log that ends one, or never lets it go, is passed over, and the run goes on."""
+"""A fleet on processes of its own: a log that crashes or hangs one is passed over, and the run goes on."""
 
 from __future__ import annotations
 
@@ -9,20 +9,22 @@ from typing import TYPE_CHECKING
 
 from torch.multiprocessing import ProcessExitedException, ProcessRaisedException, start_processes
 
+from gyrofuse._base.deprecation import renamed_arguments
 from gyrofuse.fleet.lightning import FusionModule, GyroArrayDataModule, ResultWriter, quiet_trainer
 from gyrofuse.fleet.logs import identity
 from gyrofuse.fleet.store.store import ResultStore
 from gyrofuse.fleet.tasks import Task
-from gyrofuse.fleet.watch import close_all
+from gyrofuse.fleet.watchdog import close_all
 from gyrofuse.fleet.workers import begin_imports, end_with_parent, ended_from_outside, start_method
 
 if TYPE_CHECKING:
     from multiprocessing.process import BaseProcess
 
 _AT_ONCE = getattr(signal, "SIGKILL", signal.SIGTERM)
-_PORT = "MASTER_PORT"  # at which Lightning's processes find each other: each start chooses its own
+_PORT = "MASTER_PORT"  # environment variable of the port of Lightning's processes, which each start chooses anew
 
 
+@renamed_arguments(said="report")
 def run_fleet(
     task: Task,
     data: GyroArrayDataModule,
@@ -32,26 +34,27 @@ def run_fleet(
     accelerator: str = "cpu",
     timeout: float | None = None,
     retry: bool = False,
-    said: Callable[[str], None],
+    report: Callable[[str], None],
 ) -> None:
     """Work on all logs that are not done, and complete the table.
 
-    Reading and computing are left to other processes, even if there is but one: a log that ends its process is tried
-    once more after all others, and then has a row that says so.
+    Reading and computing are done in other processes, even if there is but one: a log that crashes its process is tried
+    once more after all others, and then gets a row that says so.
 
     Args:
-        task: What is asked of every log.
+        task: Task for every log.
         data: The logs.
-        store: Where the rows go, opened.
-        devices: Processes.
-        accelerator: Where they compute, as of `quiet_trainer`.
-        timeout: Seconds that a log may take to be read, and again to be worked on; None for any.
+        store: Writer of the table, opened.
+        devices: Number of processes.
+        accelerator: Accelerator, as of `quiet_trainer`.
+        timeout: Seconds that a log may take to be read, and again to be worked on; None for no limit.
         retry: Whether logs that failed before are tried again.
-        said: Called with what a process that ended says of its log.
+        report: Callback that gets a sentence on each log at which a process crashed.
 
     Raises:
-        OSError: Rows or the table cannot be written, or a process ended at no log; what is finished is kept.
-        RuntimeError: What a process ended with.
+        OSError: Rows or the table cannot be written, or a process ended while it worked on no log; finished rows are
+            kept.
+        RuntimeError: Exception of a process that is no error of the system.
     """
     begin_imports(accelerator)
     since = store.opened if retry else 0
@@ -64,8 +67,8 @@ def run_fleet(
             found = store.settle(_to_blame(error, processes))
             if not found:
                 raise _plain(error) from None
-            for finding in found:
-                said(f"{finding.place['log']}: {finding.words}")
+            for crash in found:
+                report(f"{crash.place['log']}: {crash.words}")
         except (SystemExit, KeyboardInterrupt) as stop:  # from outside: the others would work on
             for process in processes:
                 if process.is_alive() and process.pid is not None:
@@ -91,7 +94,7 @@ def _predict(
     accelerator: str,
     processes: list[BaseProcess],
 ) -> None:
-    """One run of the processes; `processes` is filled with them."""
+    """Run the processes once; the list `processes` is filled with them."""
     if devices == 1:
         given = (task, data, writer, accelerator)
         context = start_processes(_work_alone, given, 1, join=False, start_method=start_method(accelerator))
@@ -110,17 +113,17 @@ def _predict(
 
 
 def _work_alone(_: int, task: Task, data: GyroArrayDataModule, writer: ResultWriter, accelerator: str) -> None:
-    """What a single process does: no others have to be found."""
+    """Work of a single process, without a connection to others."""
     end_with_parent(close_all)
     trainer = quiet_trainer(devices=1, accelerator=accelerator, callbacks=[writer])
     trainer.predict(FusionModule(task), datamodule=data, return_predictions=False)
 
 
 def _to_blame(error: ProcessExitedException | ProcessRaisedException, processes: list[BaseProcess]) -> list[int]:
-    """Processes that ended by themselves and without an exception; the others are ended when one does."""
+    """Processes that crashed; the others are ended when one crashes."""
     if isinstance(error, ProcessExitedException):
         return [] if ended_from_outside(error.exit_code) else [error.error_pid]
-    # What was raised may be that another process is gone.
+    # An exception may be the consequence of the crash of another process.
     raised = error.error_pid
     return [p.pid for p in processes if p.pid not in (None, raised) and not ended_from_outside(p.exitcode)]
 

@@ -1,4 +1,4 @@
-"""Logs in, rows out: a log that cannot be worked on gets a row that says why, and those beside it theirs."""
+"""Rows of logs: a log that cannot be used gets a row with the reason, and the others are not affected."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from torch.utils.data import Dataset
 
 from gyrofuse.fleet.logs import State, as_text, identity, state_of
 from gyrofuse.fleet.tasks import Row, Task
-from gyrofuse.fleet.watch import Watch
+from gyrofuse.fleet.watchdog import Watchdog
 from gyrofuse.io.recording import Recording, check_reading, read_recording
 
-_OPTIONS = tuple(signature(read_recording).parameters)[1:]  # without the path
+_OPTIONS = tuple(name for name in signature(read_recording).parameters if name != "path")
 
 
 @dataclass(frozen=True)
 class Log:
-    """A log as it was read, or why it was not.
+    """A log with its recording, or with the reason why it could not be read.
 
     Attributes:
-        name: Its path, as given.
-        recording: None where it could not be read.
-        error: Why.
-        path: Absolute, where it is a file or folder.
-        state: When reading began.
+        name: Path as given.
+        recording: The recording; None where the log could not be read.
+        error: Reason why it could not be read.
+        path: Absolute path, where the log is a file or folder.
+        state: State of the file when reading began.
     """
 
     name: str
@@ -40,11 +40,11 @@ class Log:
 
     @property
     def place(self) -> Row:
-        """What its rows say of where it is."""
+        """Columns of its rows that identify the log."""
         return {"log": self.name, "path": self.path, **self.state._asdict()}
 
     def to(self, device: torch.device) -> Log:
-        """With the signal on a device."""
+        """The log with its signal on a device."""
         if self.recording is None:
             return self
         return replace(self, recording=replace(self.recording, signal=self.recording.signal.to(device)))
@@ -55,16 +55,16 @@ class LogGroups(Dataset[tuple[Log, ...]]):
 
     Args:
         groups: Paths, group by group.
-        options: Of `read_recording`.
-        watch: Where it is noted which log is being read.
+        options: Keyword arguments of `read_recording`.
+        watch: Watchdog that records which log is being read.
 
     Raises:
-        TypeError: An option that it does not have.
-        ValueError: A rate or scale that is none.
+        TypeError: An option that `read_recording` does not have.
+        ValueError: A rate or scale that is not a positive number.
     """
 
     def __init__(
-        self, groups: Sequence[Sequence[Path]], options: Mapping[str, Any], watch: Watch | None = None
+        self, groups: Sequence[Sequence[Path]], options: Mapping[str, Any], watch: Watchdog | None = None
     ) -> None:
         self.watch = watch
         self.groups = tuple(map(tuple, groups))
@@ -99,12 +99,12 @@ class LogGroups(Dataset[tuple[Log, ...]]):
         try:
             return replace(log, recording=read_recording(path, **self.options))
         except Exception as error:  # whatever a damaged file does to a library, the others are read
-            return replace(log, error=as_text(_said(error)).removeprefix(f"{log.name}: "))
+            return replace(log, error=as_text(_message(error)).removeprefix(f"{log.name}: "))
 
 
 @dataclass
-class _Answer:
-    """Rows of a log without what all rows have, and what was warned of."""
+class _Outcome:
+    """Rows of a log without the common columns, or an error, and the warnings."""
 
     rows: list[Row] = field(default_factory=list)
     error: str | None = None
@@ -114,18 +114,22 @@ class _Answer:
 def rows_of(task: Task, logs: Sequence[Log]) -> list[Row]:
     """Rows of some logs.
 
-    Those of one shape are worked on together where the task can; if that fails, each alone.
+    Recordings of one shape are worked on together where the task can; if that fails, each alone.
+
+    Args:
+        task: The task.
+        logs: Logs, read.
     """
-    answers: dict[str, _Answer] = {log.name: _Answer(error=log.error) for log in logs}
+    outcomes: dict[str, _Outcome] = {log.name: _Outcome(error=log.error) for log in logs}
     for group in _alike(logs):
-        together = _asked(task, [recording for _, recording in group])
+        together = _together(task, [recording for _, recording in group])
         if together is None:
             for name, recording in group:
-                answers[name] = _alone(task, recording)
+                outcomes[name] = _alone(task, recording)
             continue
-        for (name, _), answer in zip(group, together, strict=True):
-            answers[name] = answer
-    return [row for log in logs for row in _whole_rows(log, answers[log.name])]
+        for (name, _), outcome in zip(group, together, strict=True):
+            outcomes[name] = outcome
+    return [row for log in logs for row in _whole_rows(log, outcomes[log.name])]
 
 
 def _alike(logs: Sequence[Log]) -> Iterable[list[tuple[str, Recording]]]:
@@ -136,8 +140,8 @@ def _alike(logs: Sequence[Log]) -> Iterable[list[tuple[str, Recording]]]:
     return groups.values()
 
 
-def _asked(task: Task, recordings: Sequence[Recording]) -> list[_Answer] | None:
-    """Answers to several, None where something is wrong with any."""
+def _together(task: Task, recordings: Sequence[Recording]) -> list[_Outcome] | None:
+    """Outcomes of several recordings together; None if there is an error or a warning."""
     if len(recordings) == 1:
         return None
     with warnings.catch_warnings(record=True) as caught:
@@ -146,23 +150,23 @@ def _asked(task: Task, recordings: Sequence[Recording]) -> list[_Answer] | None:
             rows = task.rows(recordings)
         except Exception:
             return None
-    if caught:  # said of one of them
+    if caught:  # which recording a warning is of is not known
         return None
-    return [_Answer(own) for own in rows]
+    return [_Outcome(own) for own in rows]
 
 
-def _alone(task: Task, recording: Recording) -> _Answer:
+def _alone(task: Task, recording: Recording) -> _Outcome:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
             (rows,) = task.rows([recording])
         except Exception as error:
-            return _Answer(error=_said(error), warned=[str(w.message) for w in caught])
-    return _Answer(rows, warned=[str(w.message) for w in caught])
+            return _Outcome(error=_message(error), warned=[str(w.message) for w in caught])
+    return _Outcome(rows, warned=[str(w.message) for w in caught])
 
 
-def _whole_rows(log: Log, answer: _Answer) -> list[Row]:
-    common: Row = {**log.place, "status": "ok" if answer.error is None else "failed", "error": answer.error}
+def _whole_rows(log: Log, outcome: _Outcome) -> list[Row]:
+    common: Row = {**log.place, "status": "ok" if outcome.error is None else "failed", "error": outcome.error}
     if log.recording is not None:
         r = log.recording
         common |= {
@@ -173,20 +177,20 @@ def _whole_rows(log: Log, answer: _Answer) -> list[Row]:
             "missing": float(r.missing.max()),
             "notes": [str(note) for note in r.notes],
         }
-    whole = [{**common, **own, "warnings": [*answer.warned, *own.get("warnings", ())]} for own in answer.rows or [{}]]
+    whole = [{**common, **own, "warnings": [*outcome.warned, *own.get("warnings", ())]} for own in outcome.rows or [{}]]
     return [{name: _storable(value) for name, value in row.items()} for row in whole]
 
 
 def _storable(value: Any) -> Any:
-    """Text, alone or in lists, as UTF-8 can hold it: names of sensors come from logs as they are."""
+    """Text, alone or in lists, as valid UTF-8: names of sensors come from logs unchecked."""
     if isinstance(value, str):
         return as_text(value)
     texts = isinstance(value, list | tuple) and any(isinstance(entry, str) for entry in value[:1])
     return [_storable(entry) for entry in value] if texts else value
 
 
-def _said(error: Exception) -> str:
-    """One line; what is a defect rather than bad input says its type."""
+def _message(error: Exception) -> str:
+    """Message of an error in one line, with its type where it is a defect and not bad input."""
     words = " ".join(str(error).split())
     known = isinstance(error, ValueError | TypeError | OSError | ImportError)
     return words if known and words else f"{type(error).__name__}: {words}"

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import stats
 
+from gyrofuse._base.deprecation import RenamedAttribute, moved_names
 from gyrofuse._base.results import counted
 from gyrofuse.fleet.store.table import identity_in
 
@@ -19,8 +20,8 @@ NOISY = 2.0
 _OUTLIER = 5.0
 # Fewest logs of one array for a median and a robust standard deviation to mean anything: of five, two may be outliers.
 _FEWEST = 5
-# Fewest logs of one array for a test of trend: with eight the smallest two-sided p value of Kendall's test is 2 / 8!.
-# below 1e-4, so that ten and more sensors can be corrected for.
+# Fewest logs of one array for a test of trend: with eight the smallest two-sided p value of Kendall's test is 2 / 8!,
+# below 1e-4, so that a correction for up to 200 weights leaves it significant.
 FEWEST_IN_TIME = 8
 # Significance level of the test of trend, for all weights together (Bonferroni), and of the J test in the table.
 LEVEL = 0.01
@@ -28,7 +29,7 @@ GAIN = "Allan deviation of the plain mean over that of the virtual gyro, geometr
 
 
 class NoisySensor(NamedTuple):
-    """A sensor over all its logs: how many times noisier it is than the median of its array (median of logs)."""
+    """A sensor, and its Allan deviation over that of the median sensor of its array, as the median over its logs."""
 
     array: str
     sensor: str
@@ -37,7 +38,7 @@ class NoisySensor(NamedTuple):
 
 
 class Outlier(NamedTuple):
-    """A log whose array is unlike the others: by how many robust standard deviations, and in what."""
+    """An outlying log: the quantity, its value here and in the median log, and their robust standardized distance."""
 
     log: str
     axis: str | None
@@ -47,16 +48,17 @@ class Outlier(NamedTuple):
     deviations: float
 
 
-class Doubt(NamedTuple):
-    """A log whose weights are to be doubted, and why: it felt motion, or is too short for them."""
+class WeightWarning(NamedTuple):
+    """A log whose weights are unreliable, and the reason: motion, or too short a recording."""
 
     log: str
     axis: str | None
     why: str
 
 
-class Drift(NamedTuple):
-    """A weight that goes up or down from log to log: Kendall's tau, and its p value for all weights looked at."""
+class WeightTrend(NamedTuple):
+    """A weight with a monotonic trend over the logs: medians of the first and the last third, Kendall's tau and its
+    p value, corrected for the number of weights tested."""
 
     array: str
     sensor: str
@@ -67,20 +69,20 @@ class Drift(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Standing:
-    """Of a fleet.
+class FleetSummary:
+    """Summary of the table of a fleet.
 
     Attributes:
         task: `"fuse"`, `"fit"` or `"diagnose"`.
-        n_logs: All of them.
-        failures: Logs that failed, and why.
-        ranked: Rows of arrays or sensors, the most conspicuous first, with the number that they are ranked by: gain of
-            the virtual gyro, p value of the J test, p value of the diagnosis.
-        noisy: Sensors, the noisiest first.
-        outliers: Logs unlike the others.
-        doubts: Logs whose weights are to be doubted.
-        drifts: Of weights, the surest first.
-        mechanisms: How many logs have each, and unexplained differences.
+        n_logs: Number of logs.
+        failures: Logs that failed, and the reasons.
+        ranked: Rows of arrays or sensors with the number that they are ranked by: gain of the virtual gyro, largest
+            first, or p value of the J test or of the diagnosis, smallest first.
+        noisy: Sensors with their relative noise, largest first.
+        outliers: Outlying logs, the largest distance first.
+        weight_warnings: Logs whose weights are unreliable.
+        trends: Weights with a trend, the smallest p value first.
+        mechanisms: Number of logs with each mechanism, and with unexplained differences.
     """
 
     task: str
@@ -89,13 +91,17 @@ class Standing:
     ranked: tuple[tuple[float, Mapping[str, Any]], ...]
     noisy: tuple[NoisySensor, ...]
     outliers: tuple[Outlier, ...]
-    doubts: tuple[Doubt, ...]
-    drifts: tuple[Drift, ...]
+    weight_warnings: tuple[WeightWarning, ...]
+    trends: tuple[WeightTrend, ...]
     mechanisms: tuple[tuple[str, int], ...]
+
+    doubts = RenamedAttribute("weight_warnings")
+    drifts = RenamedAttribute("trends")
+    n_doubted = RenamedAttribute("n_warned")
 
     @property
     def values(self) -> list[float]:
-        """What is ranked by, of those that have it."""
+        """The finite numbers that rows are ranked by."""
         return [value for value, _ in self.ranked if np.isfinite(value)]
 
     @property
@@ -105,26 +111,26 @@ class Standing:
 
     @property
     def n_refused(self) -> int:
-        """Fits that the J test refuses."""
+        """Number of fits that the J test rejects."""
         return sum(value < LEVEL for value in self.values)
 
     @property
     def n_unidentified(self) -> int:
-        """Fits whose parameters cannot be told apart."""
+        """Number of fits with parameters that are not identified."""
         return sum(row.get("identified") is False for _, row in self.ranked)
 
     @property
-    def n_doubted(self) -> int:
-        """Logs whose weights are to be doubted."""
-        return len({doubt.log for doubt in self.doubts})
+    def n_warned(self) -> int:
+        """Number of logs whose weights are unreliable."""
+        return len({warning.log for warning in self.weight_warnings})
 
     @property
     def n_differ(self) -> int:
-        """Recordings that differ from their simulation."""
+        """Number of recordings that differ from their simulation."""
         return sum(bool(row["mismatch"]) for _, row in self.ranked)
 
     def summary(self) -> str:
-        """In a few lines."""
+        """Summary in a few lines."""
         lines = [f"{self.n_logs} logs, {len(self.failures)} failed"]
         if self.task == "fuse" and self.values:
             lines.append(
@@ -148,12 +154,12 @@ class Standing:
             f"unlike the others: {_place(o)}, {o.what} {o.value:.3g} where {o.usual:.3g} is usual"
             for o in self.outliers[:3]
         ]
-        if self.doubts:
-            lines.append(f"weights to doubt: {counted(self.n_doubted, 'log')}")
-        lines += [f"  {_place(doubt)}: {doubt.why}" for doubt in self.doubts[:3]]
+        if self.weight_warnings:
+            lines.append(f"weights to doubt: {counted(self.n_warned, 'log')}")
+        lines += [f"  {_place(warning)}: {warning.why}" for warning in self.weight_warnings[:3]]
         lines += [
             f"drifts: weight of sensor {d.sensor} of {d.array}, {d.first:.3g} to {d.last:.3g} (p = {d.p_value:.2g})"
-            for d in self.drifts[:3]
+            for d in self.trends[:3]
         ]
         lines += [f"failed: {log}: {error}" for log, error in self.failures[:5]]
         if len(self.failures) > 5:
@@ -164,7 +170,7 @@ class Standing:
         return self.summary()
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers, ready for JSON; of what is ranked, the logs."""
+        """Plain numbers, ready for JSON; of the ranked rows log, axis, sensor and value alone."""
         return {
             "task": self.task,
             "n_logs": self.n_logs,
@@ -180,17 +186,21 @@ class Standing:
             ],
             "noisy": [sensor._asdict() for sensor in self.noisy],
             "outliers": [outlier._asdict() for outlier in self.outliers],
-            "doubts": [doubt._asdict() for doubt in self.doubts],
-            "drifts": [drift._asdict() for drift in self.drifts],
+            "doubts": [warning._asdict() for warning in self.weight_warnings],
+            "drifts": [trend._asdict() for trend in self.trends],
             "mechanisms": dict(self.mechanisms),
         }
 
 
-def standing_of(task: str, rows: Sequence[Mapping[str, Any]]) -> Standing:
-    """What stands out among the rows of a fleet's table.
+def summarise(task: str, rows: Sequence[Mapping[str, Any]]) -> FleetSummary:
+    """Summarise the rows of a fleet's table.
 
-    Logs of sensors with the same names, and of one axis, are taken for recordings of one array or of arrays of one
-    kind, in the order of the table.
+    Logs of sensors with the same names, and of one axis, count as recordings of one array, or of arrays of one kind,
+    in the order of the table.
+
+    Args:
+        task: `"fuse"`, `"fit"` or `"diagnose"`.
+        rows: Rows of the table.
     """
     failures = {identity_in(row): (row["log"], row["error"]) for row in rows if row["status"] != "ok"}
     good = [row for row in rows if row["status"] == "ok"]
@@ -199,21 +209,21 @@ def standing_of(task: str, rows: Sequence[Mapping[str, Any]]) -> Standing:
     for row in good if task == "diagnose" else ():
         for name in [*row["mechanisms"], *(["unexplained"] if row["unexplained"] else [])]:
             mechanisms.setdefault(name, set()).add(identity_in(row))
-    return Standing(
+    return FleetSummary(
         task=task,
         n_logs=len(set(map(identity_in, rows))),
         failures=tuple(failures.values()),
         ranked=_ranked(task, good),
         noisy=tuple(sorted(_noisy(fused), key=lambda s: -s.relative_noise)),
         outliers=tuple(sorted(_outliers(fused), key=lambda o: -o.deviations)),
-        doubts=tuple(_doubts(fused)),
-        drifts=tuple(sorted(_drifts(fused), key=lambda d: d.p_value)),
+        weight_warnings=tuple(_weight_warnings(fused)),
+        trends=tuple(sorted(_trends(fused), key=lambda trend: trend.p_value)),
         mechanisms=tuple(sorted(((name, len(logs)) for name, logs in mechanisms.items()), key=lambda e: -e[1])),
     )
 
 
 def mean_gain(row: Mapping[str, Any]) -> float:
-    """Of a row of fusion: geometric mean over averaging times, which count as they did in the choice of weights."""
+    """Gain of a row of fusion: geometric mean over averaging times, weighted by the scale weights."""
     gain = np.array(row["gain"], dtype=float)
     counts = np.array(row.get("scale_weights") or np.ones_like(gain), dtype=float)
     known = np.isfinite(gain) & (gain > 0) & (counts > 0)
@@ -221,7 +231,7 @@ def mean_gain(row: Mapping[str, Any]) -> float:
 
 
 def _ranked(task: str, rows: Sequence[Mapping[str, Any]]) -> tuple[tuple[float, Mapping[str, Any]], ...]:
-    """Gains fall, p values rise; what has none comes last."""
+    """Rows by falling gain or rising p value; those without come last."""
     if task == "fuse":
         valued, sign = [(mean_gain(row), row) for row in rows], -1
     else:
@@ -230,7 +240,7 @@ def _ranked(task: str, rows: Sequence[Mapping[str, Any]]) -> tuple[tuple[float, 
 
 
 def arrays_of(rows: Iterable[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
-    """Rows of arrays with the same sensors and axis, by a name."""
+    """Rows grouped by sensors and axis, each group under a name."""
     arrays: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
     for row in rows:
         arrays.setdefault((tuple(row["sensors"]), row["axis"]), []).append(row)
@@ -238,7 +248,7 @@ def arrays_of(rows: Iterable[Mapping[str, Any]]) -> dict[str, list[Mapping[str, 
 
 
 def _named(sensors: Sequence[str], axis: str | None) -> str:
-    """An array by what its logs have in common."""
+    """Name of an array, of its sensors and axis."""
     first = ", ".join(sensors[:3])
     name = f"array of {len(sensors)} ({first}, ...)" if len(sensors) > 3 else f"array of {first}"
     return f"{name}, axis {axis}" if axis else name
@@ -276,27 +286,38 @@ def _outliers(rows: Sequence[Mapping[str, Any]]) -> Iterable[Outlier]:
                     )
 
 
-def _doubts(rows: Iterable[Mapping[str, Any]]) -> Iterable[Doubt]:
+def _weight_warnings(rows: Iterable[Mapping[str, Any]]) -> Iterable[WeightWarning]:
     for row in rows:
         short = row["warnings"] if row.get("enough") is False else []
         for why in [*([row["motion"]] if row.get("motion") else []), *short]:
-            yield Doubt(row["log"], row["axis"], why)
+            yield WeightWarning(row["log"], row["axis"], why)
 
 
-def _place(found: Outlier | Doubt) -> str:
+def _place(found: Outlier | WeightWarning) -> str:
     return f"{found.log} axis {found.axis}" if found.axis else found.log
 
 
-def _drifts(rows: Sequence[Mapping[str, Any]]) -> list[Drift]:
-    found, looked = [], 0
+def _trends(rows: Sequence[Mapping[str, Any]]) -> list[WeightTrend]:
+    found, n_tests = [], 0
     for array, own in arrays_of(rows).items():
         weights = np.array([row["weights"] for row in own], dtype=float)
         if len(own) < FEWEST_IN_TIME or not np.isfinite(weights).all():
             continue
-        looked += weights.shape[1]
+        n_tests += weights.shape[1]
         third = max(len(own) // 3, 1)
         for i, sensor in enumerate(own[0]["sensors"]):
             tau, p_value = stats.kendalltau(np.arange(len(own)), weights[:, i])
             first, last = np.median(weights[:third, i]), np.median(weights[-third:, i])
-            found.append(Drift(array, sensor, float(first), float(last), float(tau), float(p_value)))
-    return [d._replace(p_value=min(d.p_value * looked, 1.0)) for d in found if d.p_value * looked < LEVEL]
+            found.append(WeightTrend(array, sensor, float(first), float(last), float(tau), float(p_value)))
+    return [t._replace(p_value=min(t.p_value * n_tests, 1.0)) for t in found if t.p_value * n_tests < LEVEL]
+
+
+__getattr__ = moved_names(
+    __name__,
+    {
+        "Doubt": f"{__name__}.WeightWarning",
+        "Drift": f"{__name__}.WeightTrend",
+        "Standing": f"{__name__}.FleetSummary",
+        "standing_of": f"{__name__}.summarise",
+    },
+)

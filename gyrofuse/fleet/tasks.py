@@ -1,4 +1,4 @@
-"""What is asked of every log of a fleet: rows of a table."""
+"""Tasks of a fleet: the rows of a table that each makes of a log."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ from gyrofuse.noise.parsing import parse_model
 
 Row = dict[str, Any]
 
-_STACKED = 2**15  # samples: shorter arrays are faster together
+# Longest recordings, samples, that are fitted as one batch; above it a batch is not faster than one after the other.
+_MAX_STACKED = 32_768
 _AXIS = Column("text", "axis of the row; none where the log has one signal for each sensor")
 
 
@@ -39,12 +40,13 @@ class Fuse:
 
     Attributes:
         scale_weights: `"flat"`, `"short"`, `"long"`, or one number for each level.
-        method: As of `fit_svo`.
-        confidence_level: Of the limits of the weights.
-        virtual: Whether the virtual signal is kept as well, in the column `virtual`.
+        method: Method of `fit_svo`.
+        confidence_level: Confidence level of the limits of the weights.
+        virtual: Whether the virtual signal is kept, in the column `virtual`.
 
     Raises:
-        TypeError, ValueError: As `fit_svo`, where an option is wrong for any log.
+        TypeError: Scale weights that are neither a name nor numbers.
+        ValueError: An option that `fit_svo` refuses.
     """
 
     scale_weights: str | tuple[float, ...] = "flat"
@@ -55,7 +57,7 @@ class Fuse:
     name: ClassVar[str] = "fuse"
 
     def __post_init__(self) -> None:
-        # What is wrong with the task is told at once, not by every row.
+        # Raised here once, and not in every row.
         if isinstance(self.scale_weights, str):
             resolve_scale_weights(self.scale_weights, 1)
         else:
@@ -67,7 +69,7 @@ class Fuse:
 
     @property
     def columns(self) -> dict[str, Column]:
-        """Its own columns, beside those of every task."""
+        """Columns of this task, in addition to those of every task."""
         own = {
             "axis": _AXIS,
             "weights": Column("numbers", "weight of each sensor in the virtual gyro, sum 1"),
@@ -105,14 +107,14 @@ class Fuse:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What the rows depend on, ready for JSON."""
+        """Settings that the rows depend on, ready for JSON."""
         return {"task": self.name, **asdict(self)}
 
     def rows(self, recordings: Sequence[Recording]) -> list[list[Row]]:
         """Rows of each recording, one for each of its axes; short ones of the same shape are fitted together."""
         first = recordings[0].signal
         alike = len(recordings) > 1 and all(r.signal.shape == first.shape for r in recordings)
-        if not alike or first.shape[-1] > _STACKED:
+        if not alike or first.shape[-1] > _MAX_STACKED:
             return [self._rows(self._fitted(r), r) for r in recordings]
         together = self._fitted(torch.stack([r.signal for r in recordings]))
         return [
@@ -159,9 +161,9 @@ class Fit:
     """A noise model for each sensor of each log.
 
     Attributes:
-        model: Formula, such as `"WN + AR1 + RW"`.
-        refine: Whether the spectral likelihood is gone on to.
-        confidence_level: Of the limits of the parameters.
+        model: Formula of the model, such as `"WN + AR1 + RW"`.
+        refine: Whether the fit is refined by spectral maximum likelihood.
+        confidence_level: Confidence level of the limits of the parameters.
     """
 
     model: str = "WN + AR1 + RW"
@@ -232,16 +234,16 @@ class Fit:
 
 @dataclass(frozen=True)
 class Diagnose:
-    """What a simulation leaves out of each log.
+    """Effects in each log that a simulation leaves out.
 
     Attributes:
         simulation: Samples of the same array, or a noise model.
-        false_alarm: Probability of a finding where nothing is missing.
-        source: What the simulation is called.
+        false_alarm: Probability of a finding where the simulation leaves nothing out.
+        source: Name of the simulation.
 
     Raises:
-        TypeError: The simulation is neither.
-        ValueError: `false_alarm` is no probability.
+        TypeError: The simulation is neither samples nor a model.
+        ValueError: `false_alarm` is not between 0 and 1.
     """
 
     simulation: Recording | Model | ArrayModel
@@ -281,14 +283,14 @@ class Diagnose:
 
     @cached_property
     def _digest(self) -> str:
-        """Of the numbers of the simulation, whose name stays where the simulation changes."""
+        """SHA-256 of the numbers of the simulation, which may change while its name does not."""
         if not isinstance(self.simulation, Recording):
             return hashlib.sha256(json.dumps(self.simulation.to_dict()).encode()).hexdigest()
         r = self.simulation
-        held = {"signal": r.signal, "time": r.time, **r.channels}
-        said = [r.rate, r.unit, r.sensors, r.axes, {name: list(values.shape) for name, values in held.items()}]
-        digest = hashlib.sha256(json.dumps(said).encode())
-        for values in held.values():
+        arrays = {"signal": r.signal, "time": r.time, **r.channels}
+        facts = [r.rate, r.unit, r.sensors, r.axes, {name: list(values.shape) for name, values in arrays.items()}]
+        digest = hashlib.sha256(json.dumps(facts).encode())
+        for values in arrays.values():
             digest.update(values.numpy(force=True).tobytes())
         return digest.hexdigest()
 
@@ -329,11 +331,14 @@ def _gain(result: SVOResult) -> Tensor:
 
 
 def relative_noise(wavelet_variance: Tensor) -> Tensor:
-    """How many times noisier each sensor is than the median of its array, `(level, sensor)` to `(sensor,)`.
+    """Allan deviation of each sensor over that of the median sensor of its array, `(sensor,)`.
 
-    Of Allan deviations, as the geometric mean over the levels that are known.
+    Geometric mean over the levels with known values.
+
+    Args:
+        wavelet_variance: Wavelet variances, `(level, sensor)`.
     """
-    # Of an even number the mean of the two in the middle, which torch.median is not.
+    # torch.median takes the lower of two middle values; this takes their mean.
     ratio = (wavelet_variance / wavelet_variance.nanquantile(0.5, -1, keepdim=True)).sqrt()
     known = ratio.isfinite() & (ratio > 0)
     log = torch.where(known, ratio, torch.ones_like(ratio)).log().sum(0)

@@ -1,4 +1,4 @@
-"""How the processes of a fleet are started: forked from one that has imported what they need and has computed nothing.
+"""Start and end of the processes of a fleet: forked from one that has imported what they need and computed nothing.
 
 Spawned processes import torch and Lightning again, each for itself, which takes seconds; a process that has computed
 may hold threads or a GPU, which its forks do not get.
@@ -16,19 +16,17 @@ from collections.abc import Callable
 from typing import Literal
 
 OUTSIDE = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
-_LOOK = 0.1  # s between looks whether a process that is being made knows its parent
-_FEWEST_LOOKS = 600  # of them, a minute: what is no child by then is none
 
 
 def start_method(accelerator: str) -> Literal["forkserver", "spawn"]:
-    """Way to start processes that compute there."""
+    """Start method of processes that compute on an accelerator (`"cpu"`, `"gpu"` or `"auto"`)."""
     # Forks of a process that has loaded the frameworks of macOS may crash.
     forks = sys.platform == "linux" and accelerator == "cpu"
     return "forkserver" if forks else "spawn"
 
 
 def begin_imports(accelerator: str) -> None:
-    """Have the process that is forked import what is needed, while this one goes on."""
+    """Start the process that the others are forked from, whose imports run beside this process."""
     if start_method(accelerator) == "forkserver":
         from multiprocessing import forkserver
 
@@ -37,32 +35,34 @@ def begin_imports(accelerator: str) -> None:
         forkserver.ensure_running()
 
 
-def end_with_parent(leave: Callable[[], None]) -> None:
-    """Have this process end when whoever started it is gone, whatever it waits for or works on then.
+def end_with_parent(leave: Callable[[], None], poll: float = 0.1, patience: float = 60.0) -> None:
+    """End this process when its parent ends, at once and whatever it waits for or works on.
 
-    Nothing happens in a process that nobody of Python's started.
+    Nothing happens in a process that Python's multiprocessing did not start.
 
     Args:
-        leave: What is done before.
+        leave: Function that is called before.
+        poll: Time between two checks whether this process knows its parent, s: it does not while it is being made.
+        patience: Time after which it counts as a process without a parent, s; to be made takes seconds at most.
     """
 
     def watch() -> None:
-        for _ in range(_FEWEST_LOOKS):  # called while a process is being made, its parent is not yet known
+        for _ in range(round(patience / poll)):
             parent = multiprocessing.parent_process()
             if parent is not None:
                 parent.join()
                 leave()
                 os._exit(1)
-            time.sleep(_LOOK)
+            time.sleep(poll)
 
     threading.Thread(target=watch, daemon=True).start()
 
 
 def end_at_once(leave: Callable[[], None]) -> None:
-    """Have a process that another one started end at once where it is asked to, and not when its work is done.
+    """End a process that another one started at once on a signal to end, and not when its work is done.
 
     Args:
-        leave: What is done before.
+        leave: Function that is called before.
     """
     if multiprocessing.parent_process() is None or threading.current_thread() is not threading.main_thread():
         return
@@ -77,5 +77,5 @@ def end_at_once(leave: Callable[[], None]) -> None:
 
 
 def ended_from_outside(status: int | None) -> bool:
-    """Whether an exit status is that of a process that was asked to end, or that of one that ended well."""
+    """Whether a process with this exit status ended on a signal from outside, or without an error."""
     return status is None or status == 0 or any(status in (-number, 128 + number) for number in OUTSIDE)

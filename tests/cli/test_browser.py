@@ -21,7 +21,7 @@ from gyrofuse.fitting.report.ranking import rank_report
 from gyrofuse.fleet import Fuse
 from gyrofuse.fleet.report import fleet_report
 from gyrofuse.fleet.run import Log, rows_of
-from gyrofuse.fleet.summary import standing_of
+from gyrofuse.fleet.summary import summarise
 from gyrofuse.fusion.report.page import fusion_report, recording_report
 from gyrofuse.mismatch.page import mismatch_page
 
@@ -117,7 +117,7 @@ def page(request: pytest.FixtureRequest, recording: Recording, tmp_path_factory:
     elif request.param == "fleet":
         logs = [Log(f"{HOSTILE[i % 4]}{i}", recording.select(axis="xyz"[i % 3])) for i in range(10)]
         rows = rows_of(Fuse("long"), [*logs, Log("gone.npz", None, "no such file")])
-        html = fleet_report(standing_of("fuse", rows), rows, title=HOSTILE[0])
+        html = fleet_report(summarise("fuse", rows), rows, title=HOSTILE[0])
     elif request.param == "fusion":
         html = fusion_report(result[0], title=HOSTILE[2])
     else:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gyrofuse.fleet.report import fleet_report
-from gyrofuse.fleet.summary import mean_gain, standing_of
+from gyrofuse.fleet.summary import mean_gain, summarise
 
 
 def fused(n: int, *, seed: int = 0, drift: float = 0.0, sensors: tuple[str, ...] = ("s1", "s2", "s3")) -> list[dict]:
@@ -34,14 +34,14 @@ def fused(n: int, *, seed: int = 0, drift: float = 0.0, sensors: tuple[str, ...]
 def test_an_even_fleet_has_nothing_that_stands_out():
     alarms = 0
     for seed in range(100):
-        standing = standing_of("fuse", fused(40, seed=seed))
-        alarms += bool(standing.drifts) + bool(standing.outliers)
+        summary = summarise("fuse", fused(40, seed=seed))
+        alarms += bool(summary.trends) + bool(summary.outliers)
     assert alarms <= 9  # of 200, at 1 % each: more than 9 have a chance of 1e-4
-    assert "unlike the others" not in str(standing_of("fuse", fused(40)))
+    assert "unlike the others" not in str(summarise("fuse", fused(40)))
 
 
 def test_a_drifting_weight_is_told():
-    (drift, *_) = standing_of("fuse", fused(40, drift=0.2)).drifts
+    (drift, *_) = summarise("fuse", fused(40, drift=0.2)).trends
     assert drift.sensor == "s1"
     assert drift.last > drift.first
     assert drift.p_value < 1e-6
@@ -54,12 +54,12 @@ def test_a_noisy_sensor_and_a_strange_log_are_told():
         row["relative_noise"][2] *= 3
     rows[7]["virtual_deviation"] = [5e-3] * 4
     rows[11]["gain"] = [4.0] * 4
-    standing = standing_of("fuse", rows)
-    assert standing.noisy[0].sensor == "s3"
-    assert standing.noisy[0].relative_noise == pytest.approx(4.2, rel=0.05)
-    assert {o.log for o in standing.outliers} == {"log007.npz", "log011.npz"}
-    assert standing.ranked[0][1]["log"] == "log011.npz"
-    text = str(standing)
+    summary = summarise("fuse", rows)
+    assert summary.noisy[0].sensor == "s3"
+    assert summary.noisy[0].relative_noise == pytest.approx(4.2, rel=0.05)
+    assert {o.log for o in summary.outliers} == {"log007.npz", "log011.npz"}
+    assert summary.ranked[0][1]["log"] == "log011.npz"
+    text = str(summary)
     assert "noisy: sensor s3" in text
     assert "unlike the others: log007.npz" in text
 
@@ -80,11 +80,11 @@ def test_the_page_says_what_a_gain_is_and_what_was_asked():
     rows = fused(6)
     rows[2]["gain"] = [0.9] * 4
     settings = {"task": "fuse", "method": "shrinkage", "scale_weights": [0.5, 0.5]}
-    page = fleet_report(standing_of("fuse", rows), rows, title="Fleet", settings=settings)
+    page = fleet_report(summarise("fuse", rows), rows, title="Fleet", settings=settings)
     assert "6 logs, fused (method shrinkage, scale weights 0.5, 0.5)" in page
     assert "For 1 of 6 it is below one: worse than the plain mean." in page
     assert "which count as in the choice of the weights" in page
-    assert "below 1 is worse than the plain mean" in str(standing_of("fuse", rows))
+    assert "below 1 is worse than the plain mean" in str(summarise("fuse", rows))
 
 
 def test_logs_that_moved_or_are_too_short_are_to_be_doubted():
@@ -92,32 +92,30 @@ def test_logs_that_moved_or_are_too_short_are_to_be_doubted():
     rows[1] |= {"axis": "x", "motion": "the sensors agree closely"}
     rows[4] |= {"motion": None, "enough": False, "warnings": ["Recording: too short"]}
     rows[5] |= {"motion": None, "enough": True, "warnings": ["of something else"]}
-    standing = standing_of("fuse", rows)
-    assert [(d.log, d.axis, d.why) for d in standing.doubts] == [
+    summary = summarise("fuse", rows)
+    assert [(d.log, d.axis, d.why) for d in summary.weight_warnings] == [
         ("log001.npz", "x", "the sensors agree closely"),
         ("log004.npz", None, "Recording: too short"),
     ]
-    assert "weights to doubt: 2 logs\n  log001.npz axis x: the sensors agree closely\n  log004.npz: Rec" in str(
-        standing
-    )
-    assert [doubt["log"] for doubt in standing.to_dict()["doubts"]] == ["log001.npz", "log004.npz"]
-    page = fleet_report(standing, rows, title="Fleet")
+    assert "weights to doubt: 2 logs\n  log001.npz axis x: the sensors agree closely\n  log004.npz: Rec" in str(summary)
+    assert [doubt["log"] for doubt in summary.to_dict()["doubts"]] == ["log001.npz", "log004.npz"]
+    page = fleet_report(summary, rows, title="Fleet")
     assert "<h2>Logs to doubt</h2>" in page
     assert "The weights of 2 logs are to be doubted" in page
     assert "No sensor, log or drift" not in page
-    assert "No sensor, log or drift" in fleet_report(standing_of("fuse", fused(6)), fused(6), title="Fleet")
+    assert "No sensor, log or drift" in fleet_report(summarise("fuse", fused(6)), fused(6), title="Fleet")
 
 
 def test_the_ranking_shows_axes_where_any_log_has_them():
     rows = fused(3)
     rows[2] |= {"axis": "z", "gain": [1.01] * 4}  # the last
-    assert '<td class="text">axis z</td>' in fleet_report(standing_of("fuse", rows), rows, title="Fleet")
+    assert '<td class="text">axis z</td>' in fleet_report(summarise("fuse", rows), rows, title="Fleet")
 
 
 def test_no_sensor_is_drawn_like_the_plain_mean():
-    from gyrofuse.fleet.plots import plot_course
+    from gyrofuse.fleet.plots import plot_weights_over_logs
 
-    *sensors, mean = plot_course(np.full((9, 8), 0.125), names="abcdefgh").get_lines()[1:]
+    *sensors, mean = plot_weights_over_logs(np.full((9, 8), 0.125), names="abcdefgh").get_lines()[1:]
     assert len({line.get_color() for line in sensors} | {mean.get_color()}) == 9
 
 
@@ -125,23 +123,23 @@ def test_logs_of_one_name_in_several_folders_are_several():
     rows = [
         {"log": "a.npz", "path": f"/{i}/a.npz", "status": "failed", "error": "empty", "axis": None} for i in range(3)
     ]
-    standing = standing_of("fuse", rows)
-    assert (standing.n_logs, len(standing.failures)) == (3, 3)
+    summary = summarise("fuse", rows)
+    assert (summary.n_logs, len(summary.failures)) == (3, 3)
 
 
 def test_failures_are_counted_and_explained():
     rows = [*fused(3), {"log": "bad.npz", "status": "failed", "error": "empty file", "axis": None}]
-    standing = standing_of("fuse", rows)
-    assert (standing.n_logs, standing.failures) == (4, (("bad.npz", "empty file"),))
-    assert "failed: bad.npz: empty file" in str(standing)
-    nothing = standing_of("fuse", rows[3:])
+    summary = summarise("fuse", rows)
+    assert (summary.n_logs, summary.failures) == (4, (("bad.npz", "empty file"),))
+    assert "failed: bad.npz: empty file" in str(summary)
+    nothing = summarise("fuse", rows[3:])
     assert "1 logs, 1 failed" in str(nothing)
     assert "empty file" in fleet_report(nothing, rows[3:], title="Fleet")
 
 
 def test_the_page_tells_what_stands_out_and_stays_text():
     rows = [*fused(12, drift=0.3), {"log": "<b>bad</b>.npz", "status": "failed", "error": "empty", "axis": None}]
-    page = fleet_report(standing_of("fuse", rows), rows, title="Fleet of <i>mine</i>")
+    page = fleet_report(summarise("fuse", rows), rows, title="Fleet of <i>mine</i>")
     assert "&lt;b&gt;bad&lt;/b&gt;.npz" in page
     assert "<i>mine" not in page
     assert "The weight of sensor s1" in page
@@ -155,16 +153,16 @@ def test_pages_of_fits_and_diagnoses():
         | {"parameters": ["white_noise.variance"], "values": [2.5]}
         for i, p in enumerate([0.5, 0.001, None])
     ]
-    standing = standing_of("fit", fits)
-    assert [row["log"] for _, row in standing.ranked] == ["1", "0", "2"]
-    assert "1 of 3 fits refused" in str(standing)
-    assert "white_noise.variance 2.5" in fleet_report(standing, fits, title="Fits")
+    summary = summarise("fit", fits)
+    assert [row["log"] for _, row in summary.ranked] == ["1", "0", "2"]
+    assert "1 of 3 fits refused" in str(summary)
+    assert "white_noise.variance 2.5" in fleet_report(summary, fits, title="Fits")
     fits[2] |= {"identified": False, "remarks": ["two processes are one"]}
     fits[0] |= {"identified": True, "quantities": ["angle random walk N"], "figures": [0.3]}
     fits[0] |= {"figure_units": ["deg/sqrt(h)"]}
-    standing = standing_of("fit", fits)
-    assert "1 of 3 fits have parameters that cannot be told apart" in str(standing)
-    page = fleet_report(standing, fits, title="Fits", settings={"model": "WN"})
+    summary = summarise("fit", fits)
+    assert "1 of 3 fits have parameters that cannot be told apart" in str(summary)
+    page = fleet_report(summary, fits, title="Fits", settings={"model": "WN"})
     assert "1 of 3 fits have parameters that cannot be told apart." in page
     assert "white_noise.variance 2.5; not identified; two processes are one" in page
     assert "white_noise.variance 2.5; angle random walk N 0.3 deg/sqrt(h)" in page
@@ -175,9 +173,9 @@ def test_pages_of_fits_and_diagnoses():
         {"log": "b", "axis": None, "status": "ok", "error": None, "sensors": ["1"], "p_value": 0.4, "mismatch": False}
         | {"mechanisms": [], "sentences": [], "unexplained": []},
     ]
-    standing = standing_of("diagnose", found)
-    assert dict(standing.mechanisms) == {"vibration_tone": 1, "unexplained": 1}
-    assert "1 of 2 differ" in str(standing)
-    page = fleet_report(standing, found, title="Diagnoses")
+    summary = summarise("diagnose", found)
+    assert dict(summary.mechanisms) == {"vibration_tone": 1, "unexplained": 1}
+    assert "1 of 2 differ" in str(summary)
+    page = fleet_report(summary, found, title="Diagnoses")
     assert "a tone at 12.5 Hz; unexplained: jumps" in page
     assert "agrees" in page

@@ -1,4 +1,4 @@
-"""One run at a time on one table, as long as all of them ask."""
+"""Advisory lock: one run at a time on one table."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from pathlib import Path
 if sys.platform != "win32":
     import fcntl
 
-_TAKEN = (errno.EWOULDBLOCK, errno.EACCES)  # what `flock` says where another process holds the lock
+_TAKEN = (errno.EWOULDBLOCK, errno.EACCES)  # errors of `flock` where another process holds the lock
 _held: dict[Path, int] = {}  # open files behind the locks that this process holds
 
 
 def hold(path: Path, table: Path) -> None:
-    """Take a lock, which the system gives back when the process ends, however it ends.
+    """Take a lock, which the operating system releases when the process ends, however it ends.
 
-    Where the file system or the platform has no such locks nothing is locked.
+    Nothing is locked where the file system or the platform has no such locks.
 
     Args:
-        path: The file that is locked; made where it is absent.
-        table: What is worked on, for the message.
+        path: File that is locked; created if it does not exist.
+        table: Table that is worked on, for the message.
 
     Raises:
         BlockingIOError: Another process holds it.
@@ -52,7 +52,7 @@ def hold(path: Path, table: Path) -> None:
 
 
 def release(path: Path) -> None:
-    """Give it back, where this process holds it."""
+    """Release a lock, if this process holds it."""
     file = _held.pop(path.absolute(), None)
     if file is not None:
         os.close(file)

@@ -1,4 +1,4 @@
-"""Small files named after a digest of what is in them: whatever a power loss or a bad disk does to one is seen."""
+"""Small files named after a digest of their content, which shows damage by a power loss or a bad disk."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from pathlib import Path
 
 from gyrofuse._base.files import sync_file, sync_folder
 
-_DIGITS = 32  # hexadecimal digits of a SHA-256 in a name, 128 bits: none is met twice by chance
-DRAFTS = "*.draft"  # files that were being written
+_DIGITS = 32  # hexadecimal digits of a SHA-256 in a name: 128 bits, so that two contents never share one by chance
+DRAFTS = "*.draft"  # pattern of unfinished files
 
 
 def write_sealed(folder: Path, suffix: str, content: bytes | memoryview) -> Path:
-    """Write a file that is there whole or not at all, also after a power loss; the same content is one file."""
+    """Write a file whole or not at all, also at a power loss; the same content gives the same file."""
     path = folder / f"{hashlib.sha256(content).hexdigest()[:_DIGITS]}{suffix}"
     draft = draft_in(folder)
     try:
@@ -27,7 +27,7 @@ def write_sealed(folder: Path, suffix: str, content: bytes | memoryview) -> Path
 
 
 def read_sealed(path: Path) -> bytes | None:
-    """What a file was written with, None where that is no longer what it holds, or where it cannot be read."""
+    """Content of a file; None if it is not what was written, or cannot be read."""
     try:
         content = path.read_bytes()
     except OSError:
@@ -36,5 +36,5 @@ def read_sealed(path: Path) -> bytes | None:
 
 
 def draft_in(folder: Path) -> Path:
-    """A name for a file that is being written."""
+    """A new name for an unfinished file."""
     return folder / f"{secrets.token_hex(8)}{DRAFTS[1:]}"

@@ -1,7 +1,7 @@
-"""A Parquet file that fills up group by group and can be gone on with, wherever its writing was stopped.
+"""A Parquet table that is written group by group, and can be resumed wherever the writing was stopped.
 
-Rows of a group appear together, as one small Parquet file in a folder beside the table; when all are there they become
-the table. Such a file is named after its content: the same rows are one file, and a damaged one is known.
+The rows of a group are written at once, as a small Parquet file (a part) in a folder beside the table; when all groups
+are done the parts are merged into the table. A part is named after a digest of its content, which shows damage.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ from gyrofuse.fleet.store.table import (
     settings_of,
     sound_rows,
 )
-from gyrofuse.fleet.watch import Finding, Suspect, forget, settle, suspects_in
+from gyrofuse.fleet.watchdog import CrashReport, Suspect, forget, settle, suspects_in
 
 if TYPE_CHECKING:
     import pyarrow
 
-_HEAD = ".head"  # suffix of a part of no rows, which says the settings before any has come
+_HEAD = ".head"  # suffix of a part without rows, which holds the settings before there are others
 _LOCK = "lock"
 _NO_TABLE = "no table of a fleet"
-_MAGIC = b"PAR1"  # what a Parquet file begins with
-_KEY = ["log", "path", "size", "modified", "status"]  # columns that tell a log, and what is known of it
+_MAGIC = b"PAR1"  # first bytes of a Parquet file
+_KEY = ["log", "path", "size", "modified", "status"]  # columns that identify a log and its state
 
 
 class _Source(NamedTuple):
-    """Where rows of a log are, when that was written, ns since 1970; whether they are of the log as it is, and good."""
+    """File with the rows of a log, its time (ns since 1970), whether the log is unchanged since, and whether it worked."""
 
     path: Path
     written: int
@@ -53,15 +53,15 @@ class _Source(NamedTuple):
 
 
 class ResultStore:
-    """Where rows go.
+    """Writer of the table of a fleet.
 
     Args:
         path: The table, `.parquet`.
-        columns: Of the task, by name, beside those that all tasks have; descriptions become metadata of the fields.
-        settings: What the rows depend on: only a run of the same goes on with what is there.
+        columns: Columns of the task, in addition to those of all tasks; descriptions become metadata of the fields.
+        settings: Settings that the rows depend on: a table is resumed only with the same.
 
     Attributes:
-        passed_over: Identities of logs that the last `open` or `settle` passed over: their rows say why.
+        passed_over: Identities of logs that the last `open` or `settle` passed over; their rows hold the reason.
 
     Raises:
         ImportError: pyarrow is not installed.
@@ -75,19 +75,19 @@ class ResultStore:
         self._columns = {**COMMON, **columns}
         self._settings = json.loads(json.dumps(settings))  # as they are read back
         self._held = False  # by this process, or by the one that this store was handed on from
-        self._told: set[Path] = set()  # damaged files that were warned of
+        self._warned: set[Path] = set()  # damaged files that a warning has named
 
     def open(self, *, force: bool = False) -> None:
-        """Make ready for writing, for this run alone.
+        """Open for writing, and lock for this run.
 
-        A log that two processes ended at, or that took too long, gets a row that says so.
+        A log that crashed two processes, or took too long, gets a row that says so.
 
         Args:
             force: Whether a table or parts of other settings are replaced; another file never is.
 
         Raises:
             BlockingIOError: Another run is at work on it.
-            FileExistsError: What is there is of other settings, or no table of a fleet.
+            FileExistsError: The existing file has other settings, or is no table of a fleet.
             FileNotFoundError: The folder does not exist.
             OSError: It cannot be written to.
             ValueError: It is a folder.
@@ -111,15 +111,15 @@ class ResultStore:
         self.settle()
 
     def close(self) -> None:
-        """Let other runs have it; `finish` does so as well."""
+        """Release the lock; `finish` does so as well."""
         release(self.parts / _LOCK)
         self._held = False
 
-    def settle(self, ended: Sequence[int] | None = None) -> list[Finding]:
-        """What processes that have ended say of the logs that they were at; those passed over get their rows.
+    def settle(self, ended: Sequence[int] | None = None) -> list[CrashReport]:
+        """Reports on the logs at which processes crashed; logs that are passed over get their rows.
 
         Args:
-            ended: Processes that ended by themselves, where that is known.
+            ended: Identifiers of the processes that crashed, where they are known.
         """
         found = settle(self.parts, ended)
         for finding in found:
@@ -130,22 +130,30 @@ class ResultStore:
 
     @property
     def suspects(self) -> dict[str, Suspect]:
-        """Logs that a process ended at, by identity: they come last."""
+        """Logs at which a process crashed, by identity; they are worked on last."""
         return suspects_in(self.parts)
 
     def forget(self) -> None:
-        """No log is to blame for processes that were ended from outside."""
+        """Discard the journals of processes that were ended from outside."""
         forget(self.parts)
 
     def holds(self, columns: Mapping[str, Column], settings: Mapping[str, Any]) -> bool:
-        """Whether it is for rows of these columns and settings; settings of reading may be there beside them."""
+        """Whether the table has these columns and settings.
+
+        Args:
+            columns: Columns of a task.
+            settings: Settings of a task; the table may have settings of reading in addition.
+        """
         asked = json.loads(json.dumps(settings))
         return self._columns == {**COMMON, **columns} and asked.items() <= self._settings.items()
 
     def write(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Add all rows of some logs, at once or not at all.
+        """Write all rows of some logs, at once or not at all.
 
-        A log whose rows do not fit the columns has one that says so.
+        A log whose rows do not fit the columns gets one that says so.
+
+        Args:
+            rows: Rows, by column.
 
         Raises:
             OSError: They cannot be written.
@@ -154,13 +162,13 @@ class ResultStore:
             self._write(".parquet", rows)
 
     def done(self, *, failed: bool = True, since: int = 0) -> frozenset[str]:
-        """Identities of the logs whose rows are there; a damaged part does not count and is removed, with a warning.
+        """Identities of the logs whose rows are written; a damaged part does not count and is removed, with a warning.
 
-        A log that has changed since, in size or time, is not done; one that is no longer there stays so.
+        A log that has changed since, in size or time, is not done; a log that no longer exists stays done.
 
         Args:
-            failed: Whether those that failed count as done.
-            since: When the rows of those that failed have to be written to count, ns since 1970.
+            failed: Whether failed logs count as done.
+            since: Earliest time at which the rows of failed logs count, ns since 1970.
         """
         return frozenset(
             log
@@ -170,28 +178,28 @@ class ResultStore:
 
     @property
     def opened(self) -> int:
-        """When it was opened, by the clock of its disk, ns since 1970."""
+        """Time of opening by the clock of the disk, ns since 1970."""
         return (self.parts / _LOCK).stat().st_mtime_ns
 
     @property
     def n_parts(self) -> int:
-        """Groups of logs whose rows are there and not yet in the table."""
+        """Number of groups of logs whose rows are written and not yet in the table."""
         try:
             return sum(name.endswith(".parquet") for name in os.listdir(self.parts))
         except FileNotFoundError:
             return 0
 
     def finish(self, order: Sequence[str]) -> int:
-        """Make the table of the rows, in the order of their logs, and remove the parts; a few parts at a time.
+        """Merge the parts into the table, in the order of the logs, and remove them.
 
         Args:
-            order: Identities of logs; others that the table has stay before them.
+            order: Identities of logs; other logs of the table stay before them.
 
         Returns:
             Number of rows.
 
         Raises:
-            OSError: A part was damaged since the logs that are done were asked for, or the table cannot be written.
+            OSError: A part is damaged, or the table cannot be written.
         """
         from pyarrow import parquet
 
@@ -233,9 +241,9 @@ class ResultStore:
         return self.path.with_name(f"{self.path.name}.damaged")
 
     def _sources(self) -> tuple[dict[str, _Source], list[Path]]:
-        """Where rows of each log are, and damaged files.
+        """File with the rows of each log, and damaged files.
 
-        Rows of a log as it is now come first, then what worked before what failed, then what was written last.
+        Rows of an unchanged log have priority, then rows that worked over failed ones, then later rows.
         """
         found: dict[str, _Source] = {}
         states: dict[str, State] = {}
@@ -256,13 +264,13 @@ class ResultStore:
         return found, damaged
 
     def _files(self) -> list[tuple[int, Path]]:
-        """All files with rows, and when they were written: the table, and parts in the order of that."""
+        """All files with rows and the times of writing: the table, and parts in the order of these times."""
         parts = sorted((part.stat().st_mtime_ns, part) for part in self.parts.glob("*.parquet"))
         return [*([(self.path.stat().st_mtime_ns, self.path)] if self.path.exists() else []), *parts]
 
     def _drop(self, damaged: Sequence[Path]) -> None:
-        new = [path for path in damaged if path not in self._told]
-        self._told.update(new)
+        new = [path for path in damaged if path not in self._warned]
+        self._warned.update(new)
         parts = [path for path in new if path != self.path]
         for path in parts:
             path.unlink(missing_ok=True)
@@ -273,10 +281,10 @@ class ResultStore:
             warnings.warn(f"{self.path}: damaged, {again}, and it is kept as {self._kept}", stacklevel=4)
 
     def _others(self, force: bool) -> list[Path]:
-        """Files of other settings or columns, and damaged heads, which have to go.
+        """Files of other settings or columns, and damaged heads, which are to be removed.
 
         Raises:
-            FileExistsError: There are some that may not be replaced.
+            FileExistsError: There are files that may not be replaced.
         """
         heads, parts = list(self.parts.glob(f"*{_HEAD}")), list(self.parts.glob("*.parquet"))
         first = next((content for part in [*heads, *parts] if (content := read_sealed(part)) is not None), None)
@@ -295,7 +303,7 @@ class ResultStore:
         return [*heads, *parts, *([self.path] if table else [])]
 
     def _difference_to(self, source: Path | bytes) -> str | None:
-        """What tells a table, or a part, from one of these settings and columns."""
+        """Difference of a table or a part from these settings and columns, in words; None without one."""
         found = settings_of(source)
         if found is None:
             return _NO_TABLE

@@ -1,4 +1,4 @@
-"""Parquet tables of a fleet: their columns, and their rows, read back with each page held against its checksum."""
+"""Parquet tables of a fleet: columns, and rows, which are read with the checksum of each page verified."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Column(NamedTuple):
-    """What a column holds: `"text"`, `"number"`, `"whole"` numbers, `"truth"` values, `"texts"` or `"numbers"`."""
+    """Type of a column, `"text"`, `"number"`, `"whole"` number, `"truth"` value, `"texts"` or `"numbers"`; and meaning."""
 
     kind: str
     description: str
@@ -34,13 +34,11 @@ COMMON = {
     "n_samples": Column("whole", "samples of each sensor, missing ones included"),
     "rate": Column("number", "sampling rate in Hz"),
     "unit": Column("text", "of the signal"),
-    "missing": Column("number", "share of its samples that the sensor lacks that lacks most, 0 to 1"),
+    "missing": Column("number", "largest fraction of missing samples over the sensors, 0 to 1"),
     "notes": Column("texts", "what was found on reading: gaps, repeats, jitter, offsets"),
     "warnings": Column("texts", "what the task warned of"),
 }
 _SETTINGS = b"gyrofuse"
-_MOST_OPEN = 4  # files in memory while the table is made
-_MOST_LOGS, _MOST_BYTES = 1000, 2**26  # in a row group of it
 
 
 def read_results(path: str | Path, *, without: Sequence[str] = ()) -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -48,7 +46,7 @@ def read_results(path: str | Path, *, without: Sequence[str] = ()) -> tuple[dict
 
     Args:
         path: The table.
-        without: Columns that are left out.
+        without: Names of columns that are left out.
 
     Raises:
         FileNotFoundError: No such file.
@@ -73,12 +71,12 @@ def read_results(path: str | Path, *, without: Sequence[str] = ()) -> tuple[dict
 
 
 def identity_in(row: Mapping[str, Any]) -> str:
-    """The log of a row; by its name alone where it is no file."""
+    """Identity of the log of a row: its path, or its name where it is not a file."""
     return str(row.get("path") or row["log"])
 
 
 def schema_of(columns: Mapping[str, Column], settings: Mapping[str, Any]) -> pyarrow.Schema:
-    """Of a table: settings and descriptions of the columns are among its metadata."""
+    """Schema of a table, with the settings and the descriptions of the columns as metadata."""
     import pyarrow as pa
 
     kinds = {
@@ -97,7 +95,7 @@ def schema_of(columns: Mapping[str, Column], settings: Mapping[str, Any]) -> pya
 
 
 def settings_of(source: Path | bytes) -> dict[str, Any] | None:
-    """What a table, or its content, says that it was made with; None where nothing is said."""
+    """Settings in the metadata of a table or of its content; None where there are none."""
     import pyarrow as pa
 
     try:
@@ -109,7 +107,7 @@ def settings_of(source: Path | bytes) -> dict[str, Any] | None:
 
 
 def opened(source: str | Path | bytes) -> parquet.ParquetFile:
-    """A table, or its content, whose pages are held against their checksums when they are read."""
+    """A table or its content, opened so that reading verifies the checksums of its pages."""
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -118,7 +116,7 @@ def opened(source: str | Path | bytes) -> parquet.ParquetFile:
 
 
 def content_of(table: pyarrow.Table) -> pyarrow.Buffer:
-    """What a file of a table holds."""
+    """Content of a Parquet file with this table."""
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -130,13 +128,13 @@ def content_of(table: pyarrow.Table) -> pyarrow.Buffer:
 def sound_rows(
     path: Path, schema: pyarrow.Schema, *, sealed: bool, columns: Sequence[str] | None = None
 ) -> tuple[pyarrow.Table, bool]:
-    """Rows of a file that are as they were written, and whether that is all of them.
+    """Undamaged rows of a file, and whether these are all of its rows.
 
     Args:
         path: The file.
-        schema: Its columns.
-        sealed: Whether its name is a digest of it; without one all pages of a row group stand for each other.
-        columns: Those asked for; all by default.
+        schema: Schema of the file.
+        sealed: Whether the file's name is a digest of its content; otherwise a row group with a damaged page is lost.
+        columns: Columns to read; all by default.
     """
     import pyarrow as pa
 
@@ -144,7 +142,7 @@ def sound_rows(
     source = read_sealed(path) if sealed else path
     if source is None:
         return asked.empty_table(), False
-    read = asked if sealed else schema  # a digest speaks for all columns, a page for itself
+    read = asked if sealed else schema  # a digest covers all columns, a checksum one page
     try:
         with opened(source) as file:
             groups = [_row_group(file, i, read) for i in range(file.num_row_groups)]
@@ -164,15 +162,25 @@ def _row_group(file: parquet.ParquetFile, i: int, schema: pyarrow.Schema) -> pya
 
 
 def in_order(
-    logs: Sequence[str], source: Mapping[str, Path], schema: pyarrow.Schema, table: Path
+    logs: Sequence[str],
+    source: Mapping[str, Path],
+    schema: pyarrow.Schema,
+    table: Path,
+    *,
+    max_open: int = 4,
+    max_logs: int = 1000,
+    max_bytes: int = 2**26,
 ) -> Iterator[pyarrow.Table]:
     """Rows of logs in their order, in tables of a size that does not depend on the files that they come from.
 
     Args:
-        logs: Their identities.
-        source: Where the rows of each are.
-        schema: Of all of them.
-        table: The one among the files that is not named after what it holds.
+        logs: Identities of the logs.
+        source: File with the rows of each log.
+        schema: Schema of the rows.
+        table: The one file that is not named after a digest of its content.
+        max_open: Files kept in memory; logs in order are mostly in one file, or in those of as many processes.
+        max_logs: Logs in a table, a row group of the file, which readers take at a time.
+        max_bytes: Size of a table, 64 MiB, which bounds the memory of writer and reader.
 
     Raises:
         OSError: A file no longer holds what it held.
@@ -184,7 +192,7 @@ def in_order(
     for log in logs:
         path = source[log]
         if path not in files:
-            if len(files) == _MOST_OPEN:
+            if len(files) == max_open:
                 del files[next(iter(files))]
             own, _ = sound_rows(path, schema, sealed=path != table)
             places: dict[str, list[int]] = {}
@@ -197,7 +205,7 @@ def in_order(
         rows = own.take(places[log])
         kept.append(rows)
         n_bytes += rows.nbytes
-        if len(kept) > _MOST_LOGS or n_bytes > _MOST_BYTES:
+        if len(kept) > max_logs or n_bytes > max_bytes:
             yield pa.concat_tables(kept).combine_chunks()
             kept, n_bytes = [schema.empty_table()], 0
     if len(kept) > 1:
@@ -207,7 +215,7 @@ def in_order(
 def fitting_rows(
     rows: Sequence[Mapping[str, Any]], columns: Mapping[str, Column], schema: pyarrow.Schema
 ) -> pyarrow.Table:
-    """Rows as a table; a log with one that does not fit has a row that says so, and the others theirs."""
+    """Rows as a table; a log whose rows do not fit the schema gets one row that says so."""
     import pyarrow as pa
 
     whole = [{name: row.get(name) for name in columns} for row in rows]
@@ -234,14 +242,14 @@ def _rows_of_one(rows: list[dict[str, Any]], schema: pyarrow.Schema) -> pyarrow.
 
 
 def _unfit() -> tuple[type[Exception], ...]:
-    """What pyarrow raises of values that are not of the kind of their column."""
+    """Exceptions of pyarrow for values that are not of the type of their column."""
     import pyarrow as pa
 
     return pa.ArrowException, ValueError, TypeError, OverflowError
 
 
 def need_arrow(path: Path) -> None:
-    """Refuse to go on without pyarrow."""
+    """Raise `ImportError` if pyarrow is not installed."""
     try:
         import pyarrow  # noqa: F401
     except ImportError as error:

@@ -1,7 +1,7 @@
-"""Which logs a process is at, written down before it reads them, and an end to it where that takes too long.
+"""Journal of the logs that a process works on, and a watchdog that ends the process at a timeout.
 
-A damaged log may end the process that reads it, within a library in C and without an exception, or never let it go.
-What is written down survives: the next start, or a process that watches this one, knows which log it was.
+A damaged log may crash the process that reads it, in a C library and without an exception, or hang it. The journal,
+written before a log is read, survives: the next start, or the parent process, knows which log it was.
 """
 
 from __future__ import annotations
@@ -16,24 +16,26 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
+from gyrofuse._base.deprecation import moved_names
 from gyrofuse.fleet.store.sealed import draft_in
 from gyrofuse.fleet.store.table import identity_in
 
 _BEGUN = "*.begun"
 _SUSPECTS = "suspects"
-_TWICE = 2  # a single time, the process may have been ended from outside
-_OVER = b"Timeout ("  # what faulthandler writes where the time is over
-_watches: weakref.WeakSet[Watch] = weakref.WeakSet()
+_MAX_CRASHES = 2  # after which a log is passed over; a single crash may be an end from outside, such as of memory
+_TIMEOUT_MARK = b"Timeout ("  # first words of what faulthandler writes at the timeout
+_watchdogs: weakref.WeakSet[Watchdog] = weakref.WeakSet()
 
-Place = Mapping[str, Any]  # of a log: the columns log, path, size and modified of its rows
+Place = Mapping[str, Any]  # columns log, path, size and modified of the rows of a log
 
 
-class Watch:
-    """Of one process, and of those that it hands this to.
+class Watchdog:
+    """Journal and watchdog of a process, and of each process that it is handed to.
 
     Args:
-        folder: Where the notes go.
-        timeout: Seconds that a log may take to be read, and again to be worked on; then the process ends. None for any.
+        folder: Folder of the journals.
+        timeout: Seconds that a log may take to be read, and again to be worked on, after which the process ends; None
+            for no limit.
     """
 
     def __init__(self, folder: Path, timeout: float | None = None) -> None:
@@ -43,7 +45,7 @@ class Watch:
         self._owner = 0
 
     def begin(self, logs: Sequence[Place]) -> None:
-        """Note that these are worked on."""
+        """Record that work on some logs begins, and start the timeout."""
         if not logs:
             return
         file = self._own_file()
@@ -51,12 +53,12 @@ class Watch:
         file.seek(0)
         file.write(json.dumps({"pid": os.getpid(), "timeout": self.timeout, "logs": list(logs)}).encode() + b"\n")
         if self.timeout:
-            # Of C, with no need of the interpreter: a loop within a library may never let go of it.
+            # A thread in C, which needs no interpreter lock: a hanging library may never release it.
             limit = min(self.timeout * len(logs), threading.TIMEOUT_MAX)
             faulthandler.dump_traceback_later(limit, exit=True, file=file)
 
     def end(self) -> None:
-        """Note that they are done."""
+        """Record that the work is done, and stop the timeout."""
         if self._file is None or self._owner != os.getpid():
             return
         if self.timeout:
@@ -64,7 +66,7 @@ class Watch:
         self._file.truncate(0)
 
     def close(self) -> None:
-        """Leave no note behind."""
+        """Remove the journal."""
         if self._file is None or self._owner != os.getpid():
             return
         self.end()
@@ -76,22 +78,22 @@ class Watch:
         return {**self.__dict__, "_file": None}
 
     def _own_file(self) -> BinaryIO:
-        """A file of this process alone: that of the one it was forked from is not touched."""
+        """Journal of this process; that of the process it was forked from is not touched."""
         if self._file is None or self._owner != os.getpid():
             name = draft_in(self.folder).with_suffix(_BEGUN[1:])
             self._file, self._owner = name.open("w+b", buffering=0), os.getpid()
-            _watches.add(self)
+            _watchdogs.add(self)
         return self._file
 
 
 def close_all() -> None:
-    """Leave no note of this process behind: it is ended, and no log is to blame."""
-    for watch in list(_watches):
-        watch.close()
+    """Remove the journals of this process, which ends for a reason that is no log."""
+    for watchdog in list(_watchdogs):
+        watchdog.close()
 
 
 class Suspect(NamedTuple):
-    """A log that was worked on when a process ended: its state, how often that was, and whether it is taken alone."""
+    """A log at which a process crashed: its size and time, the number of crashes, and whether it is now taken alone."""
 
     size: int | None
     modified: int | None
@@ -99,57 +101,60 @@ class Suspect(NamedTuple):
     alone: bool
 
 
-class Finding(NamedTuple):
-    """What a process that ended says of a log: its place, in words, and whether it is passed over."""
+class CrashReport(NamedTuple):
+    """A log at which a process crashed or hung: its place, a sentence, and whether it is passed over from now on."""
 
     place: Place
     words: str
     final: bool
 
 
-def settle(folder: Path, ended: Sequence[int] | None = None) -> list[Finding]:
-    """What the notes that were left behind say of their logs; they are removed.
+def settle(folder: Path, ended: Sequence[int] | None = None) -> list[CrashReport]:
+    """Evaluate the journals that crashed processes have left, and remove them.
 
     Args:
-        folder: Where they are.
-        ended: Processes that have ended by themselves; the notes of others, which were ended, say nothing. By
-            default all do, and how they ended is not known.
+        folder: Folder of the journals.
+        ended: Identifiers of the processes that crashed; the journals of others, which were ended from outside, do not
+            count. By default all count, and the cause of each end is unknown.
     """
     known = suspects_in(folder)
-    found: list[Finding] = []
+    found: list[CrashReport] = []
     for note in sorted(folder.glob(_BEGUN)):
         try:
             first, _, rest = note.read_bytes().partition(b"\n")
-            said = json.loads(first)
-            process, timeout, places = said["pid"], said["timeout"], list(said["logs"])
-        except (OSError, ValueError, KeyError, TypeError):  # empty: it was at no log
+            entry = json.loads(first)
+            process, timeout, places = entry["pid"], entry["timeout"], list(entry["logs"])
+        except (OSError, ValueError, KeyError, TypeError):  # empty: no work was going on
             places = []
         _remove(note)
         if not places or (ended is not None and process not in ended):
             continue
-        late = _OVER in rest
+        late = _TIMEOUT_MARK in rest
         sure = late or ended is not None
         for place in places:
             log, state = identity_in(place), (place["size"], place["modified"])
             before = known.pop(log, None)
             times = 1 + (before.ended if before is not None and before[:2] == state else 0)
             if len(places) > 1:
-                # Which of them it was is not known. Alone they may differ in the last digit: not without a reason.
-                apart = sure or times >= _TWICE
+                # Which of them it was is not known. Results alone may differ in the last digit from those in a batch,
+                # so that logs are taken alone only if the crash is certain or repeated.
+                apart = sure or times >= _MAX_CRASHES
                 known[log] = Suspect(*state, 0 if apart else times, apart)
                 words = "was worked on with others when their process ended"
-                found.append(Finding(place, f"{words}; tried again{' alone' if apart else ''} after the others", False))
+                found.append(
+                    CrashReport(place, f"{words}; tried again{' alone' if apart else ''} after the others", False)
+                )
             elif late:
                 words = (
                     f"took longer than {timeout:g} s; --timeout (`timeout`) gives more, with --retry it is tried again"
                 )
-                found.append(Finding(place, words, True))
-            elif times >= _TWICE:
+                found.append(CrashReport(place, words, True))
+            elif times >= _MAX_CRASHES:
                 words = "ended the process that read it, twice; it is damaged, or too large for the memory"
-                found.append(Finding(place, f"{words} (--retry tries it again)", True))
+                found.append(CrashReport(place, f"{words} (--retry tries it again)", True))
             else:
                 known[log] = Suspect(*state, times, before is not None and before.alone)
-                found.append(Finding(place, "ended the process that read it; tried again after the others", False))
+                found.append(CrashReport(place, "ended the process that read it; tried again after the others", False))
     if found:
         draft = draft_in(folder)
         draft.write_text(json.dumps(known), encoding="utf-8")
@@ -158,7 +163,7 @@ def settle(folder: Path, ended: Sequence[int] | None = None) -> list[Finding]:
 
 
 def suspects_in(folder: Path) -> dict[str, Suspect]:
-    """Logs that a process ended at, by identity; none where that cannot be read: they get their chances anew."""
+    """Logs at which a process crashed, by identity; none where the file cannot be read, and all are tried again."""
     try:
         known = json.loads((folder / _SUSPECTS).read_bytes())
         return {log: Suspect(*entries) for log, entries in known.items()}
@@ -167,7 +172,7 @@ def suspects_in(folder: Path) -> dict[str, Suspect]:
 
 
 def forget(folder: Path) -> None:
-    """Remove all notes, of processes that were ended from outside."""
+    """Remove all journals, of processes that were ended from outside."""
     for note in folder.glob(_BEGUN):
         _remove(note)
 
@@ -175,3 +180,6 @@ def forget(folder: Path) -> None:
 def _remove(note: Path) -> None:
     with suppress(OSError):  # Windows removes no file of a process that lives
         note.unlink()
+
+
+__getattr__ = moved_names(__name__, {"Finding": f"{__name__}.CrashReport", "Watch": f"{__name__}.Watchdog"})

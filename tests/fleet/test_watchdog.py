@@ -18,7 +18,7 @@ from gyrofuse.fleet import Fuse, ResultStore, read_results
 from gyrofuse.fleet.lightning import FusionModule, GyroArrayDataModule, ResultWriter, quiet_trainer
 from gyrofuse.fleet.logs import groups_of, identity, state_of
 from gyrofuse.fleet.processes import run_fleet
-from gyrofuse.fleet.watch import Suspect, Watch, close_all, settle, suspects_in
+from gyrofuse.fleet.watchdog import Suspect, Watchdog, close_all, settle, suspects_in
 from gyrofuse.fleet.workers import end_with_parent
 
 pytest.importorskip("pyarrow")
@@ -33,7 +33,7 @@ def place(log: str, size: int = 1):
 
 def ended_at(folder: Path, *logs, pid: int | None = None) -> None:
     """What a process leaves behind that ended at some logs."""
-    watch, before = Watch(folder), set(folder.iterdir())
+    watch, before = Watchdog(folder), set(folder.iterdir())
     watch.begin(logs)
     (note,) = {*folder.iterdir()} - before
     content = note.read_bytes()
@@ -42,7 +42,7 @@ def ended_at(folder: Path, *logs, pid: int | None = None) -> None:
 
 
 def test_a_note_is_there_while_a_log_is_worked_on(tmp_path):
-    watch = Watch(tmp_path)
+    watch = Watchdog(tmp_path)
     watch.begin([place("a")])
     (note,) = tmp_path.iterdir()
     assert b'"/a"' in note.read_bytes()
@@ -115,7 +115,7 @@ def test_suspects_come_last(tmp_path):
 
 
 def forever(folder: Path) -> None:
-    Watch(folder, timeout=0.1).begin([place("a")])
+    Watchdog(folder, timeout=0.1).begin([place("a")])
     re.match(r"(a+)+$", "a" * 64 + "b")  # of C, and lets no other thread run
 
 
@@ -195,7 +195,7 @@ def test_the_others_are_done_in_one_run(logs: Path, devices: int, group_size: in
     if devices == 2:
         (logs / "endless.npz").unlink()
         data = GyroArrayDataModule(logs, group_size=group_size)
-    run_fleet(task, data, store, devices=devices, timeout=5.0, said=said.append)
+    run_fleet(task, data, store, devices=devices, timeout=5.0, report=said.append)
     found = told(store)
     assert {name: found[name] for name in "012"} == dict.fromkeys("012", "ok")
     assert found["deadly"].startswith("ended the process that read it, twice; it is damaged, or")
