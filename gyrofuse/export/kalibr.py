@@ -14,16 +14,7 @@ from gyrofuse._base.checks import check_positive
 from gyrofuse._base.results import place
 from gyrofuse.fitting.gmwm_result import GMWMResult
 from gyrofuse.noise.model import check_scalar
-from gyrofuse.noise.processes import (
-    AR1,
-    Drift,
-    Model,
-    Process,
-    QuantizationNoise,
-    RandomWalk,
-    Sinusoid,
-    WhiteNoise,
-)
+from gyrofuse.noise.processes import Model
 
 
 def to_kalibr(
@@ -150,7 +141,8 @@ def _kalibr_keys(triad: _Triad, sensor: str, slow: float, key_units: tuple[str, 
     for name, model in zip(triad.names, triad.models, strict=True):
         if len(triad.models) > 1:
             yield f"#  Sensor {name}:"
-        yield from (f"#   {process!r}: {_fate(process, triad.rate, slow)}" for process in model.processes)
+        for process in model.processes:
+            yield f"#   {process!r}: {process._white_and_walk(triad.rate, slow, **process.values).fate}"
     found, limits = (
         [max(own) * triad.factor for own in zip(*(_densities(m, triad.rate, slow) for m in models), strict=True)]
         for models in (triad.models, triad.highest or triad.models)
@@ -169,45 +161,9 @@ def _kalibr_keys(triad: _Triad, sensor: str, slow: float, key_units: tuple[str, 
 
 def _densities(model: Model, rate: float, slow: float) -> tuple[float, float]:
     """Noise density and random walk of continuous time, in the unit of the model."""
-    white = walk = 0.0  # variances per sample, of the samples and of the increments
-    for process in model.processes:
-        first, *more = process.params.tolist()
-        if isinstance(process, WhiteNoise):
-            white += first
-        elif isinstance(process, RandomWalk):
-            walk += first
-        elif isinstance(process, AR1):
-            if _is_slow(first, rate, slow):
-                walk += more[0]
-            else:
-                white += more[0] / (1 - first) ** 2
+    counted = [process._white_and_walk(rate, slow, **process.values) for process in model.processes]
+    white, walk = sum(one.white for one in counted), sum(one.walk for one in counted)
     return units.angle_random_walk(white, rate), units.rate_random_walk(walk, rate)
-
-
-def _is_slow(phi: float, rate: float, slow: float) -> bool:
-    """Whether an AR(1) counts as a random walk."""
-    return phi > 0 and units.correlation_time(phi, rate) >= slow
-
-
-def _fate(process: Process, rate: float, slow: float) -> str:
-    """What becomes of a process."""
-    first, *more = process.params.tolist()
-    if isinstance(process, WhiteNoise):
-        return "in the noise density"
-    if isinstance(process, RandomWalk):
-        return "in the random walk"
-    if isinstance(process, AR1):
-        time = f"correlation time {units.correlation_time(first, rate):.4g} s" if first > 0 else "no correlation time"
-        if _is_slow(first, rate, slow):
-            return f"{time}, its innovations in the random walk"
-        return f"{time}, its density at frequency 0 in the noise density"
-    if isinstance(process, QuantizationNoise):
-        return "left out; it has no density at frequency 0"
-    if isinstance(process, Sinusoid):
-        return f"left out; a tone of {units.tone_frequency(more[0], rate):.6g} Hz"
-    if isinstance(process, Drift):
-        return "left out; a ramp is not noise"
-    return "left out; Kalibr has no such noise"
 
 
 def _yaml_number(value: float) -> str:

@@ -21,7 +21,7 @@ from gyrofuse.fitting.moments.white_kurtosis import white_excess_kurtosis, with_
 from gyrofuse.fitting.spectral.model_tones import model_tones
 from gyrofuse.fitting.spectral.whittle import refine_whittle
 from gyrofuse.fitting.structure import Composition
-from gyrofuse.noise.processes import AR1, Sinusoid
+from gyrofuse.noise.processes import Process
 from gyrofuse.wavelets.robust import robust_wavelet_variance
 
 if TYPE_CHECKING:
@@ -266,40 +266,29 @@ def _sds(result: GMWMResult, made_of: Composition, params: Tensor, usable: Tenso
 def _in_unknowns(made_of: Composition, params: Tensor, covariance: Tensor) -> Tensor:
     """Standard deviations of `u`, `(item, parameter)`; NaN of what is at zero."""
     sd = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
-    slope = torch.stack([_slope(kind, name, value) for (kind, name), value in _columns(made_of, params)], -1)
+    slope = torch.stack([_slope(*which, value) for which, value in _columns(made_of, params)], -1)
     found = sd / slope
     return torch.where((found > 0) & found.isfinite(), found, torch.nan)
 
 
-def _columns(made_of: Composition, params: Tensor) -> list[tuple[tuple[type, str], Tensor]]:
-    names = [(type(p), name) for p in made_of.processes for name in p.parameters]
+def _columns(made_of: Composition, params: Tensor) -> list[tuple[tuple[Process, bool], Tensor]]:
+    """Each parameter `(...)` with its process and whether it is the nonlinear one."""
+    names = [(p, name == p.shape_name) for p in made_of.processes for name in p.parameters]
     return list(zip(names, params.unbind(-1), strict=True))
 
 
-def _slope(kind: type, name: str, value: Tensor) -> Tensor:
+def _slope(process: Process, nonlinear: bool, value: Tensor) -> Tensor:
     """`d value / d u`."""
-    if kind is AR1 and name == "phi":
-        return 1 - value.square()
-    if kind is Sinusoid and name == "beta":
-        return value * (1 - value / torch.pi)
-    return value
+    return process.unconstrained_slope(process.to_unconstrained(value)) if nonlinear else value
 
 
-def _transformed(kind: type, name: str, value: Tensor) -> Tensor:
+def _transformed(process: Process, nonlinear: bool, value: Tensor) -> Tensor:
     """`u`."""
-    if kind is AR1 and name == "phi":
-        return value.atanh()
-    if kind is Sinusoid and name == "beta":
-        return (value / torch.pi).logit()
-    return value.log()
+    return process.to_unconstrained(value) if nonlinear else value.log()
 
 
-def _back(kind: type, name: str, u: Tensor) -> Tensor:
-    if kind is AR1 and name == "phi":
-        return u.tanh()
-    if kind is Sinusoid and name == "beta":
-        return torch.pi * u.sigmoid()
-    return u.exp()
+def _back(process: Process, nonlinear: bool, u: Tensor) -> Tensor:
+    return process.from_unconstrained(u) if nonlinear else u.exp()
 
 
 def _studentized(
@@ -312,13 +301,13 @@ def _studentized(
     percentile: tuple[Tensor, Tensor],
 ) -> tuple[Tensor, Tensor]:
     limits = []
-    for at, ((kind, name), value) in enumerate(_columns(made_of, own)):
-        u = _transformed(kind, name, value)
-        t = (_transformed(kind, name, again[..., at]) - u) / spread[..., at]
+    for at, (which, value) in enumerate(_columns(made_of, own)):
+        u = _transformed(*which, value)
+        t = (_transformed(*which, again[..., at]) - u) / spread[..., at]
         unknown = (~t.isfinite()).double().mean(0) > tail
         t = torch.where(t.isfinite(), t, torch.nan)
-        low = _back(kind, name, u - t.nanquantile(1 - tail, 0) * sd[:, at])
-        high = _back(kind, name, u - t.nanquantile(tail, 0) * sd[:, at])
+        low = _back(*which, u - t.nanquantile(1 - tail, 0) * sd[:, at])
+        high = _back(*which, u - t.nanquantile(tail, 0) * sd[:, at])
         kept = unknown | ~low.isfinite() | ~high.isfinite()
         limits.append((torch.where(kept, percentile[0][:, at], low), torch.where(kept, percentile[1][:, at], high)))
     low, high = (torch.stack(side, -1) for side in zip(*limits, strict=True))

@@ -33,7 +33,7 @@ from gyrofuse.fitting.spectral.tones import Tones
 from gyrofuse.fitting.spectral.whittle import refine_whittle
 from gyrofuse.fitting.structure import Composition
 from gyrofuse.io.recording import Recording
-from gyrofuse.noise.processes import Drift, Model, Sinusoid
+from gyrofuse.noise.processes import Model
 from gyrofuse.wavelets.robust import check_efficiency, robust_wavelet_variance
 
 WEIGHTINGS = ("optimal", "diagonal", "identity", "continuous")
@@ -140,7 +140,7 @@ def fit_gmwm(
     *batch, levels, n_sensors = variance.shape
     sensors = recording.sensors if recording else numbered(n_sensors)
     made_of = composition_of(model, held=series is not None)
-    if all(isinstance(p, Drift | Sinusoid) for p in made_of.processes):
+    if not any(p.gaussian for p in made_of.processes):
         raise ValueError(f"`model`: expected a noise process beside sinusoids and drifts, got {made_of.name}; add WN")
     if efficiency < 1:
         check_gaussian(Model(list(made_of.processes)))

@@ -26,7 +26,7 @@ from gyrofuse.fitting.moments.white_kurtosis import white_excess_kurtosis, with_
 from gyrofuse.fitting.spectral.model_tones import model_tones
 from gyrofuse.fitting.structure import Composition
 from gyrofuse.io.recording import Recording
-from gyrofuse.noise.processes import Model, Sinusoid
+from gyrofuse.noise.processes import Model
 from gyrofuse.wavelets.equivalent_dof import chi_square_tail
 
 if TYPE_CHECKING:
@@ -256,7 +256,7 @@ def _frequencies(
 
     The latter is chi-square with one degree of freedom for each sinusoid and recording but one, `(item,)`.
     """
-    names = [f"sinusoid_{k + 1}.beta" for k in range(sum(isinstance(p, Sinusoid) for p in made_of.processes))]
+    names = [f"sinusoid_{k + 1}.beta" for k in range(sum(p.has_line for p in made_of.processes))]
     if not names:
         return None, separate[0].params.new_zeros(int(usable.sum()))
     at = [separate[0].param_names.index(name) for name in names]

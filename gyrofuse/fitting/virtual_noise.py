@@ -22,7 +22,7 @@ from torch import Tensor
 
 from gyrofuse._base.nnls import nonnegative_least_squares
 from gyrofuse.noise.array_model import ArrayModel
-from gyrofuse.noise.processes import AR1, Drift, Model, Process, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
+from gyrofuse.noise.processes import AR1, Model, Process, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
 
 # Frequencies of an octave, enough to follow the ripples of a moving mean, and AR1s of an octave of time constants.
 _NODES, _PER_OCTAVE = 16, 2
@@ -69,16 +69,16 @@ def virtual_noise(weights: Tensor, array: ArrayModel) -> VirtualNoise:
             f"`weights`: expected (sensor,) or (band, sensor) for the {array.n_sensors} sensors of `array`, "
             f"got shape {tuple(weights.shape)}"
         )
-    if any(isinstance(process, Drift) for process, _ in array.components):
+    if any(process.deterministic for process, _ in array.components):
         raise ValueError("`array`: expected noise, got a Drift, which has no spectrum; leave it out")
     bands = weights.detach().double().cpu().reshape(-1, array.n_sensors)
-    tones = [part for part in array.components if isinstance(part[0], Sinusoid)]
-    noise = [part for part in array.components if not isinstance(part[0], Sinusoid)]
+    tones = [part for part in array.components if part[0].has_line]
+    noise = [part for part in array.components if not part[0].has_line]
     lines = [_tone(process, _square(matrix), bands) for process, matrix in tones]
     if len(bands) == 1:
         left = [(process, (bands[0] @ _square(matrix) @ bands[0]).item()) for process, matrix in noise]
         return VirtualNoise(_sum(_scaled(left) + lines), 0.0)
-    own = [process for process, _ in noise if isinstance(process, AR1)]
+    own = [process for process, _ in noise if process.has_memory()]
     slowest = max([-1 / math.log(float(process.params[0])) for process in own if process.params[0] > 0], default=1.0)
     octaves = max(len(bands), math.ceil(math.log2(max(slowest, 1.0)))) + _SLOWER
     f = torch.exp2(-1 - (torch.arange(octaves * _NODES, dtype=torch.float64) + 0.5) / _NODES)

@@ -21,7 +21,6 @@ from torch import Tensor
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.estimation import EstimatedFrom
 from gyrofuse.noise.model import Model
-from gyrofuse.noise.processes import Drift
 
 _PER_OCTAVE = 16  # frequencies of the information integral: derivatives of log spectra change over octaves
 _AT_ONCE = 32  # frequencies, to bound memory: each has (sensor, sensor, parameter) derivatives
@@ -120,7 +119,7 @@ def as_array(model: Model, n_sensors: int) -> ArrayModel:
     alone = SpectralUncertainty.of(ArrayModel.from_sensors([one]))
     if alone is None:
         return array
-    n_drifts = int(any(isinstance(process, Drift) for process in model.processes))
+    n_drifts = int(any(process.deterministic for process in model.processes))
     noise = len(alone.covariance) - n_drifts
     shared = alone.covariance[:noise, :noise].repeat(n_sensors, n_sensors)
     whole = torch.block_diag(shared, *torch.zeros(n_drifts, 1, 1, dtype=torch.float64))

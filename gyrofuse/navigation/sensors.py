@@ -11,7 +11,6 @@ from torch import Tensor
 from gyrofuse._base.checks import check_positive
 from gyrofuse._base.deprecation import moved_names
 from gyrofuse.noise.model import Model
-from gyrofuse.noise.processes import AR1, RandomWalk
 from gyrofuse.noise.state_space import StateSpace, state_space
 
 
@@ -82,8 +81,7 @@ def _simulated(model: Model, n_samples: int, n_flights: int, generator: torch.Ge
         total += path
         if with_states:
             n_states = state_space(process, 1.0).F.shape[-1]
-            known = isinstance(process, AR1 | RandomWalk)
-            states += [path] if known else [torch.full_like(path, torch.nan)] * n_states
+            states += [path] if n_states == 1 else [torch.full_like(path, torch.nan)] * n_states
     stacked = torch.stack(states, -1) if states else total.new_zeros(*total.shape, 0)
     return Axes(total.permute(1, 2, 0), stacked.permute(1, 2, 0, 3))
 

@@ -48,7 +48,7 @@ class ArrayModel:
         sizes = sorted({matrix.shape[-1] for _, matrix in self.components})
         if len(sizes) > 1:
             raise ValueError(f"`components`: expected the same number of sensors in all, got {sizes}")
-        if sum(isinstance(process, Drift) for process, _ in self.components) > 1:
+        if sum(process.deterministic for process, _ in self.components) > 1:
             raise ValueError("`components`: expected at most one Drift, got more; add their gains")
         self.estimated_from = estimated_from
         if estimated_from is not None and not estimated_from.fits((len(self.param_names),)):
@@ -74,7 +74,7 @@ class ArrayModel:
         models = [_of_one_sensor(model) for model in models]
         for gains, model in zip(unit, models, strict=True):
             for process in model.processes:
-                if isinstance(process, Drift):
+                if process.deterministic:
                     drifts.append(gains * process.params)
                 else:
                     noise.append((process, gains))
@@ -221,7 +221,7 @@ def _own_params(process: Process, matrix: Tensor) -> dict[str, int]:
     return {
         name: at
         for at, name in enumerate(process.parameters)
-        if matrix.ndim == 1 or name in ("phi", "beta")  # a covariance stands for variance or squared amplitude
+        if matrix.ndim == 1 or name == process.shape_name  # a covariance stands for variance or squared amplitude
     }
 
 
@@ -235,7 +235,7 @@ def _together(models: Sequence[Model], n_drifts: int) -> EstimatedFrom | None:
     for model, one in zip(models, told, strict=True):
         if one.param_cov is None:
             return EstimatedFrom(shortest)
-        noise = torch.tensor([not isinstance(p, Drift) for p in model.processes for _ in p.parameters])
+        noise = torch.tensor([not p.deterministic for p in model.processes for _ in p.parameters])
         blocks.append(one.param_cov[noise][:, noise])
     return EstimatedFrom(shortest, torch.block_diag(*blocks, *torch.zeros(n_drifts, 1, 1, dtype=torch.float64)))
 
@@ -254,7 +254,7 @@ def _checked(process: Process, matrix: Any) -> tuple[Process, Tensor]:
     if not bool(matrix.isfinite().all()):
         raise ValueError(f"{name}: expected finite numbers, got NaN or infinity")
     if matrix.ndim == 2:
-        if isinstance(process, Drift):
+        if process.deterministic:
             raise ValueError(f"{name}: a drift is deterministic; give the slopes as gains (sensor,)")
         _check_covariance(name, matrix.detach())
     return process, matrix

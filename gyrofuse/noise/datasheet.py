@@ -4,91 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 
 from gyrofuse._base import units
 from gyrofuse._base.checks import check_positive
-from gyrofuse.noise.processes import (
-    AR1,
-    Drift,
-    Model,
-    Process,
-    QuantizationNoise,
-    RandomWalk,
-    Sinusoid,
-    WhiteNoise,
-)
+from gyrofuse.noise.datasheet_units import DatasheetEntry, DatasheetUnits
+from gyrofuse.noise.model import check_scalar
+from gyrofuse.noise.processes import Model
 
 _WHITE_AFTER = 1.0  # s
 _LEVELS = 40  # where the floor of the Allan deviation is looked for: of any record
-
-
-class DatasheetEntry(NamedTuple):
-    """One number of a datasheet."""
-
-    name: str
-    value: float
-    unit: str
-
-
-class _Row(NamedTuple):
-    """How datasheets give a number: its name, its unit, and the factor to it."""
-
-    name: str
-    unit: str
-    factor: float
-
-    def entry(self, value: float, name: str = "") -> DatasheetEntry:
-        """Of a value in the base unit and in seconds."""
-        return DatasheetEntry(name or self.name, value * self.factor, self.unit)
-
-
-class _Rows(NamedTuple):
-    """All numbers of one quantity.
-
-    Attributes:
-        base: Unit that the factors start from.
-        random_walk, walk, ramp, quantization: Of white noise, random walk, drift and quantisation noise.
-        bias: What is of the quantity itself: bias instability, deviations.
-        density: Unit in which noise densities are given beside the model's own; empty where there is none.
-    """
-
-    base: str
-    random_walk: _Row
-    bias: _Row
-    walk: _Row
-    ramp: _Row
-    quantization: _Row
-    density: str = ""
-
-    def densities(self, size: float) -> dict[str, float]:
-        """That unit with the factor to it from a model's unit, which is `size` base units large."""
-        return {self.density: size * units.unit_factor(self.base, self.density)} if self.density else {}
-
-
-_HOUR = units.SECONDS_PER_HOUR
-_MICRO_G = 1e6 / units.GRAVITY  # micro-g in a m/s^2
-_ROWS = {
-    "rate": _Rows(
-        "deg/s",
-        _Row("angle random walk N", "deg/sqrt(h)", _HOUR**0.5),
-        _Row("", "deg/h", _HOUR),
-        _Row("rate random walk K", "deg/h/sqrt(h)", _HOUR**1.5),
-        _Row("rate ramp R", "deg/h/h", _HOUR**2),
-        _Row("quantization Q", "arcsec", units.ARCSECONDS_PER_DEGREE),
-    ),
-    "acceleration": _Rows(
-        "m/s^2",
-        _Row("velocity random walk N", "m/s/sqrt(h)", _HOUR**0.5),
-        _Row("", "ug", _MICRO_G),
-        _Row("acceleration random walk K", "ug/sqrt(h)", _MICRO_G * _HOUR**0.5),
-        _Row("acceleration ramp R", "ug/h", _MICRO_G * _HOUR),
-        _Row("quantization Q", "m/s", 1.0),
-        density="ug",
-    ),
-}
 
 
 @dataclass(frozen=True)
@@ -146,63 +73,29 @@ def datasheet(model: Model, rate: float, unit: str, *, n_levels: int = _LEVELS) 
     References:
         IEEE Std 952, annex C; for accelerometers IEEE Std 1293, annex.
     """
-    rate = check_positive("rate", rate)
-    unit = units.canonical_unit(unit)
-    rows = _ROWS[units.quantity_of(unit) or "rate"]
-    size = units.unit_factor(unit, rows.base)
-    if model.params.ndim > 1:
-        raise ValueError(
-            f"`model`: expected scalar parameters, got a batch of shape {tuple(model.params.shape[:-1])}; "
-            "pick one item with model.with_params(model.params[i])"
-        )
-    white = list(_random_walk(model, rate, unit, rows, size))
-    entries = [e for process in model.processes for e in _entries(process, rate, unit, rows, size)]
-    return Datasheet(rate, unit, (*white, *entries, *_floor(model, rate, rows, size, n_levels)))
+    sheet = DatasheetUnits(check_positive("rate", rate), units.canonical_unit(unit))
+    units.unit_factor(unit, sheet.base)
+    check_scalar("model", model)
+    entries = [entry for p in model.processes for entry in p._datasheet(sheet, **p.values)]
+    return Datasheet(
+        sheet.rate, sheet.unit, (*_random_walk(model, sheet), *entries, *_bias_instability(model, sheet, n_levels))
+    )
 
 
-def _random_walk(model: Model, rate: float, unit: str, rows: _Rows, size: float) -> Iterator[DatasheetEntry]:
-    """Of white noise, after integration; where there is none, of the AR1s that are white after less than a second."""
-    variance = sum(p.params.tolist()[0] for p in model.processes if isinstance(p, WhiteNoise))
-    name, of = rows.random_walk.name, ""
-    if variance == 0:
-        shaped = [p.params.tolist() for p in model.processes if isinstance(p, AR1)]
-        variance = sum(own / (1 - phi) ** 2 for phi, own in shaped if _short(phi, rate))
-        of = " of AR1s"
-    if variance > 0:
-        density = units.angle_random_walk(variance, rate)
-        yield DatasheetEntry(name + of, density * size * rows.random_walk.factor, rows.random_walk.unit)
-        for inside, factor in {unit: 1.0, **rows.densities(size)}.items():
-            yield DatasheetEntry(name + of, density * factor, f"{inside}/sqrt(Hz)")
+def _random_walk(model: Model, sheet: DatasheetUnits) -> Iterator[DatasheetEntry]:
+    """Of white noise, after integration; where there is none, of processes that are white after a second."""
+    counted = [process for process in model.processes if process.white]
+    note = ""
+    if not any(process.values["variance"] for process in counted):
+        counted = [p for p in model.processes if p.has_memory() and p.time_constant(sheet.rate) < _WHITE_AFTER]
+        note = " of " + " and ".join(dict.fromkeys(f"{process.symbol}s" for process in counted))
+    density = sum(process.spectrum(0.0).item() for process in counted)
+    if density > 0:
+        yield from sheet.random_walk(density, note)
 
 
-def _short(phi: float, rate: float) -> bool:
-    return phi <= 0 or units.correlation_time(phi, rate) < _WHITE_AFTER
-
-
-def _entries(process: Process, rate: float, unit: str, rows: _Rows, size: float) -> Iterator[DatasheetEntry]:
-    first, *rest = process.params.tolist()
-    if isinstance(process, QuantizationNoise):
-        yield rows.quantization.entry(units.quantization(first, rate) * size)
-    elif isinstance(process, RandomWalk):
-        density = units.rate_random_walk(first, rate)
-        yield rows.walk.entry(density * size)
-        yield DatasheetEntry(rows.walk.name, density, f"{unit}/s/sqrt(Hz)")
-    elif isinstance(process, Drift):
-        yield rows.ramp.entry(units.rate_ramp(first, rate) * size)
-    elif isinstance(process, AR1):
-        phi, variance = first, *rest
-        if phi > 0:
-            yield DatasheetEntry("Gauss-Markov correlation time", units.correlation_time(phi, rate), "s")
-        deviation = (variance / ((1 - phi) * (1 + phi))) ** 0.5
-        yield rows.bias.entry(deviation * size, "Gauss-Markov deviation")
-    elif isinstance(process, Sinusoid):
-        amplitude, beta = first, *rest
-        yield DatasheetEntry("tone frequency", units.tone_frequency(beta, rate), "Hz")
-        yield DatasheetEntry("tone amplitude", amplitude, unit)
-
-
-def _floor(model: Model, rate: float, rows: _Rows, size: float, n_levels: int) -> Iterator[DatasheetEntry]:
-    noise = [p for p in model.processes if not isinstance(p, (Sinusoid, Drift))]
+def _bias_instability(model: Model, sheet: DatasheetUnits, n_levels: int) -> Iterator[DatasheetEntry]:
+    noise = [process for process in model.processes if process.gaussian]
     if not noise:
         return
     deviation = (2 * Model(noise).wavelet_variance(n_levels)).sqrt()  # Allan, at 2**(level - 1) samples
@@ -210,6 +103,6 @@ def _floor(model: Model, rate: float, rows: _Rows, size: float, n_levels: int) -
     later = deviation.flip(0).cummin(0).values.flip(0)[2:]
     lowest = torch.where((inner < deviation[:-2]) & (inner < later), inner, torch.inf)
     if torch.isfinite(lowest).any():
-        yield rows.bias.entry(units.bias_instability(float(lowest.min())) * size, "bias instability B")
-        averaging = 2.0 ** (int(lowest.argmin()) + 1) / rate
+        yield sheet.bias("bias instability B", units.bias_instability(float(lowest.min())))
+        averaging = 2.0 ** (int(lowest.argmin()) + 1) / sheet.rate
         yield DatasheetEntry("bias instability reached at", averaging, "s")

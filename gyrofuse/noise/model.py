@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import numbers
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterable, Sequence
 from functools import partial, reduce
 from operator import add
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,6 +14,9 @@ from torch.func import jvp
 from gyrofuse._base.checks import check_positive, check_positive_integer
 from gyrofuse._base.random import own_generator
 from gyrofuse.noise.estimation import EstimatedFrom
+
+if TYPE_CHECKING:
+    from gyrofuse.noise.processes.base import Process
 
 Parameter = float | Tensor | None
 
@@ -63,7 +64,7 @@ class Model:
             if not kind.repeatable and sum(isinstance(other, kind) for other in self._processes) > 1:
                 raise ValueError(
                     f"`models`: {kind.__name__} appears more than once, and its copies cannot be told apart; "
-                    f"use one {kind.__name__} with the sum of the {fields(kind)[0].name}s"
+                    f"use one {kind.__name__} with the sum of the {kind.scale_name}s"
                 )
         if estimated_from is not None:
             if not estimated_from.fits(self.params.shape):
@@ -121,10 +122,14 @@ class Model:
             ValueError: A parameter is to be estimated, or the factor is not positive.
         """
         factor = check_positive("factor", factor)
-        powers = {"variance": 2, "amplitude": 1, "slope": 1}
-        scale = self.params.new_tensor([factor ** powers.get(name.rpartition(".")[2], 0) for name in self.param_names])
-        told = None if self.estimated_from is None else self.estimated_from.scaled(scale)
-        return self.with_params(self.params * scale, estimated_from=told)
+        scales = [
+            (factor if process.squared else factor**2) if name == process.scale_name else 1.0
+            for process in self.processes
+            for name in process.parameters
+        ]
+        scale = self.params.new_tensor(scales)
+        record = None if self.estimated_from is None else self.estimated_from.scaled(scale)
+        return self.with_params(self.params * scale, estimated_from=record)
 
     def wavelet_variance(self, n_levels: int) -> Tensor:
         """Theoretical Haar wavelet variance `(..., level)` of levels 1 to `n_levels`, signal^2, float64.
@@ -220,7 +225,7 @@ class Model:
         """Return plain numbers and lists that `model_from_dict` reads back."""
         plain: dict[str, Any] = {
             "processes": [
-                {"process": type(p).__name__, **{k: _plain(v) for k, v in p.parameters.items()}} for p in self.processes
+                {"process": type(p).__name__, **{k: plain(v) for k, v in p.parameters.items()}} for p in self.processes
             ]
         }
         if self.estimated_from is not None:
@@ -277,42 +282,6 @@ class Model:
         return next(devices, torch.device("cpu"))
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Process(Model):
-    """One equation.
-
-    A subclass is a frozen dataclass whose fields are the parameters; a field's metadata is a `domain`. Its
-    formulas take the parameters as float64 columns `(..., 1)` and `tau = 2, 4, .. 2**n_levels` as `(level,)`.
-    """
-
-    key: ClassVar[str]  # first part of the parameter names
-    symbol: ClassVar[str]  # short name in model formulas
-    repeatable: ClassVar[bool] = False  # may several of them share a model
-
-    _wavelet_variance: ClassVar[Callable[..., Tensor]]
-    _spectrum: ClassVar[Callable[..., Tensor]]
-    _path: ClassVar[Callable[..., Tensor]]
-    _lines: ClassVar[Callable[..., tuple[SpectralLine, ...]]] = staticmethod(lambda **_: ())
-
-    def __post_init__(self) -> None:
-        for entry in fields(self):
-            value = _checked(type(self), entry.name, getattr(self, entry.name), **entry.metadata)
-            object.__setattr__(self, entry.name, value)
-
-    @property
-    def processes(self) -> tuple[Process, ...]:
-        return (self,)
-
-    @property
-    def parameters(self) -> dict[str, Parameter]:
-        """Parameters by name, as given."""
-        return {entry.name: getattr(self, entry.name) for entry in fields(self)}
-
-    def __repr__(self) -> str:
-        known = [f"{name}={_text(value)}" for name, value in self.parameters.items() if value is not None]
-        return f"{type(self).__name__}({', '.join(known)})"
-
-
 def check_scalar(name: str, model: Model) -> None:
     """Raise when the argument `name` is no model, or a batch of models."""
     if not isinstance(model, Model):
@@ -326,26 +295,6 @@ def check_scalar(name: str, model: Model) -> None:
         )
 
 
-def domain(expected: str, holds: Callable[[Tensor], Tensor]) -> dict[str, Any]:
-    """Domain of a parameter, in words and as an elementwise test."""
-    return {"expected": expected, "holds": holds}
-
-
-def _checked(kind: type, name: str, value: Parameter, *, expected: str, holds: Callable[[Tensor], Tensor]) -> Parameter:
-    if value is None:
-        return None
-    if isinstance(value, numbers.Real) and not isinstance(value, bool):
-        value = float(value)
-    elif not isinstance(value, Tensor) or not value.is_floating_point():
-        raise TypeError(f"`{name}` of {kind.__name__}: expected a number or a floating point tensor, got {value!r}")
-    given = torch.as_tensor(value, dtype=torch.float64).detach()
-    # In a batch NaN marks an item that could not be estimated, and it stays NaN.
-    fine = (holds(given) & given.isfinite()) | (given.isnan() & (given.ndim > 0))
-    if not bool(fine.all()):
-        raise ValueError(f"`{name}` of {kind.__name__}: expected {expected}, got {given[~fine][0].item():.9g}")
-    return value
-
-
 def _slope(process: Process, f: Tensor, columns: dict[str, Tensor], name: str) -> Tensor:
     """Derivative of a process's spectrum with respect to one parameter, `(..., frequency)`."""
     value = columns[name]
@@ -354,11 +303,8 @@ def _slope(process: Process, f: Tensor, columns: dict[str, Tensor], name: str) -
     return slope
 
 
-def _text(value: Parameter) -> str:
-    return f"<batch {tuple(value.shape)}>" if isinstance(value, Tensor) and value.ndim else str(_plain(value))
-
-
-def _plain(value: Parameter) -> Any:
+def plain(value: Parameter) -> Any:
+    """A parameter as a number or nested lists."""
     return value.tolist() if isinstance(value, Tensor) else value
 
 

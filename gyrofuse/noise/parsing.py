@@ -11,28 +11,14 @@ import torch
 
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.estimation import EstimatedFrom
-from gyrofuse.noise.processes import (
-    AR1,
-    Drift,
-    Model,
-    Process,
-    QuantizationNoise,
-    RandomWalk,
-    Sinusoid,
-    WhiteNoise,
-)
+from gyrofuse.noise.processes import PROCESSES, Model, Process
 
-# Every class has a constructor of its own, hence no common type to state.
-_PROCESSES: tuple[type[Any], ...] = (WhiteNoise, QuantizationNoise, AR1, RandomWalk, Drift, Sinusoid)
 _SPELLINGS: dict[str, type[Any]] = {
-    **{kind.__name__.lower(): kind for kind in _PROCESSES},
-    **{kind.symbol.lower(): kind for kind in _PROCESSES},
-    **{kind.key: kind for kind in _PROCESSES},
-    "gm": AR1,  # first-order Gauss-Markov
+    name: kind for kind in PROCESSES for name in (kind.__name__.lower(), kind.symbol.lower(), kind.key, *kind.spellings)
 }
 _LONGEST = 1000  # characters of a formula: far more than any model takes, and what a parser can nest
 _MOST = 50  # processes of a model: ten times what any recording has told apart
-_KNOWN = ", ".join(f"{kind.symbol} ({kind.__name__})" for kind in _PROCESSES)
+_KNOWN = ", ".join(f"{kind.symbol} ({kind.__name__})" for kind in PROCESSES)
 
 
 def parse_model(formula: str) -> Model:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -11,16 +12,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from gyrofuse._base.checks import check_floating, check_positive
-from gyrofuse.noise.processes import (
-    AR1,
-    Drift,
-    Model,
-    Process,
-    QuantizationNoise,
-    RandomWalk,
-    Sinusoid,
-    WhiteNoise,
-)
+from gyrofuse.noise.processes import Model
 
 _LARGEST_BLOCK = 256  # samples that one step of the likelihood takes together
 
@@ -193,68 +185,23 @@ def state_space(model: Model, rate: float) -> StateSpace:
     rate = check_positive("rate", rate)
     params = model.params  # of the whole model, for a message with full names
     batch = params.shape[:-1]
-    parts = [_part(process) for process in model.processes]
-    sizes = [0 if part is None else part.F.shape[-1] for part in parts]
-    n_states = sum(sizes)
+    colored = [process for process in model.processes if not process.white]
+    parts = [p._states(**dict(zip(p.parameters, p.params.unbind(-1), strict=True))) for p in colored]
+    n_states = sum(len(part.names) for part in parts)
     F, Q, P0 = (params.new_zeros(*batch, n_states, n_states) for _ in range(3))
     H, x0 = params.new_zeros(*batch, 1, n_states), params.new_zeros(*batch, n_states)
     R = params.new_zeros(*batch, 1, 1)
+    for process in model.processes:
+        R = R + process.params[..., None] if process.white else R
     names: list[str] = []
-    seen: dict[str, int] = {}
-    for process, part in zip(model.processes, parts, strict=True):
-        seen[process.key] = seen.get(process.key, 0) + 1
-        if part is None:
-            R = R + process.params[..., None]
-            continue
-        own = slice(len(names), len(names) + part.F.shape[-1])
+    seen: Counter[str] = Counter()
+    for process, part in zip(colored, parts, strict=True):
+        seen[process.key] += 1
+        own = slice(len(names), len(names) + len(part.names))
         F[..., own, own], Q[..., own, own], P0[..., own, own] = part.F, part.Q, part.P0
-        H[..., 0, own.start] = 1.0
-        x0[..., own] = part.x0
-        name = f"{process.key}_{seen[process.key]}" if process.repeatable else process.key
-        names += [f"{name}.{component}" if component else name for component in part.components]
+        H[..., 0, own] = H.new_tensor(part.output)
+        if part.x0 is not None:
+            x0[..., own] = part.x0
+        prefix = f"{process.key}_{seen[process.key]}" if process.repeatable else process.key
+        names += [f"{prefix}.{name}" if name else prefix for name in part.names]
     return StateSpace(F, Q, H, R, x0, P0, tuple(names), rate)
-
-
-class _Part(NamedTuple):
-    """States of one process, whose first one is what it adds to the signal."""
-
-    components: tuple[str, ...]
-    F: Tensor
-    Q: Tensor
-    x0: Tensor
-    P0: Tensor
-
-
-def _part(process: Process) -> _Part | None:
-    """States of a process; white noise has none."""
-    first, *more = process.params.unbind(-1)
-    zero, one = torch.zeros_like(first), torch.ones_like(first)
-    if isinstance(process, WhiteNoise):
-        return None
-    if isinstance(process, AR1):
-        (variance,) = more
-        stationary = variance / ((1 - first) * (1 + first))
-        return _Part(("",), _matrix([[first]]), _matrix([[variance]]), zero[..., None], _matrix([[stationary]]))
-    if isinstance(process, RandomWalk):
-        return _Part(("",), _matrix([[one]]), _matrix([[first]]), zero[..., None], _matrix([[zero]]))
-    none = _matrix([[zero, zero], [zero, zero]])
-    at_rest = none[..., 0]
-    if isinstance(process, QuantizationNoise):
-        # e_k - e_{k-1} and -e_k: the second is what the next sample takes back
-        F = _matrix([[zero, one], [zero, zero]])
-        Q = _matrix([[first, -first], [-first, first]])
-        return _Part(("", "carried"), F, Q, at_rest, _matrix([[2 * first, -first], [-first, first]]))
-    if isinstance(process, Drift):
-        F = _matrix([[one, one], [zero, one]])
-        return _Part(("", "slope"), F, none, torch.stack([zero, first], -1), none)
-    if isinstance(process, Sinusoid):
-        cos, sin = more[0].cos(), more[0].sin()
-        power = first**2 / 2
-        F = _matrix([[cos, sin], [-sin, cos]])
-        return _Part(("sine", "cosine"), F, none, at_rest, _matrix([[power, zero], [zero, power]]))
-    raise TypeError(f"`model`: {type(process).__name__} has no state space of finite dimension; leave it out")
-
-
-def _matrix(rows: list[list[Tensor]]) -> Tensor:
-    """Matrix `(..., row, column)` of elements `(...)`."""
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)

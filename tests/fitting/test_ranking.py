@@ -74,12 +74,14 @@ def test_score_of_an_ar1_as_by_hand():
     phi, p = torch.tensor([0.5, 0.7, 0.2]), torch.tensor([[1.0, 0.3, 0.01], [0.8, 0.2, 0.0], [0.0, 1.0, 0.02]])
     linear, shape = p.double(), phi.double().atanh()[:, None]
     nothing = torch.zeros(3, dtype=torch.float64)
-    x, start = spectra._best_ar1(parent, NoiseFit(linear, shape, nothing, nothing, nothing))
-    grid = _grid(n).tanh()
+    x, start = spectra._best_shape(parent, NoiseFit(linear, shape, nothing, nothing, nothing), gf.AR1())
+    grid = _grid(gf.AR1, n).tanh()
     energy, step = fft.dct(signal.numpy(), norm="ortho")[:, 1:] ** 2, 1e-6
 
     def variances(phi: float) -> np.ndarray:
-        return spectra.bins.ar1(torch.tensor([phi], dtype=torch.float64))[0][0].numpy()
+        return (
+            gf.AR1.unit_band_variance(spectra.bins, torch.tensor([phi], dtype=torch.float64).atanh()).value[0].numpy()
+        )
 
     sine = np.sin(math.pi * np.arange(1, n) / (2 * n)) ** 2
     for i in range(3):

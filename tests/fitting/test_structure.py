@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import gyrofuse as gf
-from gyrofuse.fitting.structure import Composition, shape_of
+from gyrofuse.fitting.structure import Composition
 from gyrofuse.noise.processes import AR1, Sinusoid
 
 TAU = 2.0 ** torch.arange(1, 21, dtype=torch.float64)
@@ -15,7 +15,7 @@ TAU = 2.0 ** torch.arange(1, 21, dtype=torch.float64)
 def test_columns_are_wavelet_variances_of_unit_size():
     made_of = Composition((gf.WhiteNoise(), gf.AR1(), gf.RandomWalk(), gf.Drift(), gf.Sinusoid()), held=False)
     phi, beta = torch.tensor(0.99, dtype=torch.float64), torch.tensor(0.3, dtype=torch.float64)
-    shape = torch.stack([shape_of(phi, AR1), shape_of(beta, Sinusoid)])
+    shape = torch.stack([AR1.to_unconstrained(phi), Sinusoid.to_unconstrained(beta)])
     linear = torch.tensor([2.0, 0.5, 1e-4, 1e-6, 0.36], dtype=torch.float64)
     expected = gf.WhiteNoise(2.0) + gf.AR1(0.99, 0.5) + gf.RandomWalk(1e-4) + gf.Drift(1e-3) + gf.Sinusoid(0.6, 0.3)
     torch.testing.assert_close(made_of.columns(TAU, shape) @ linear, expected.wavelet_variance(20), rtol=1e-10, atol=0)

@@ -16,7 +16,7 @@ from gyrofuse.fitting.gmwm_result import REFUSED, GMWMResult
 from gyrofuse.fitting.ranking.candidates import name_of
 from gyrofuse.fitting.ranking.result import RankResult
 from gyrofuse.noise.array_model import ArrayModel
-from gyrofuse.noise.processes import AR1, Model, WhiteNoise
+from gyrofuse.noise.processes import Model
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -119,14 +119,14 @@ def _level(fit: GMWMResult) -> int:
 def _quantities(model: Model, fit: GMWMResult) -> list[float]:
     """Angle random walk, and the Allan deviation at the averaging time of the table."""
     rate, degrees = fit.rate or 1.0, rate_unit_factor(fit.unit or "deg/s")
-    white = sum(process.params.item() for process in model.processes if isinstance(process, WhiteNoise))
+    white = sum(process.params.item() for process in model.processes if process.white)
     slow = (2 * model.wavelet_variance(_level(fit) + 1)[-1]).sqrt().item()
     return [per_sqrt_hour(angle_random_walk(white, rate)) * degrees, slow * degrees * SECONDS_PER_HOUR]
 
 
 def _comment(fits: list[GMWMResult], result: RankResult, truth: Model) -> str:
     """The true model, how many sensors it was found for, and which models the J test refuses."""
-    slow = [process for process in truth.processes if isinstance(process, AR1)]
+    slow = [process for process in truth.processes if process.has_memory()]
     times = [number(correlation_time(process.params[0].item(), fits[0].rate or 1.0), 3) for process in slow]
     name = name_of([type(process) for process in truth.processes])
     same = sum(found == name for found in result.names)

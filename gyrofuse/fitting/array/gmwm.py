@@ -24,9 +24,9 @@ from gyrofuse.fitting.array.result import ArrayGMWMResult
 from gyrofuse.fitting.moments.fit import composition_of
 from gyrofuse.fitting.moments.records import Records
 from gyrofuse.fitting.spectral.model_tones import model_tones
-from gyrofuse.fitting.structure import Composition, shape_of
+from gyrofuse.fitting.structure import Composition
 from gyrofuse.io.recording import Recording
-from gyrofuse.noise.processes import Drift, Model, Sinusoid
+from gyrofuse.noise.processes import Model, Sinusoid
 from gyrofuse.wavelets.covariance import wavelet_products
 
 WEIGHTINGS = ("optimal", "pairwise")
@@ -155,7 +155,7 @@ def _held(series: Tensor | None, made_of: Composition, gamma: Tensor) -> tuple[T
     # (item, sensor, tone)
     beta, sd = (value.to(gamma).unflatten(0, series.shape[:2]) for value in (found.beta, found.beta_sd))
     best = sd.amax(-1).nan_to_num(nan=torch.inf).argmin(-1)[:, None, None]
-    return shape_of(beta.take_along_dim(best, 1)[:, 0], Sinusoid), sd.take_along_dim(best, 1)[:, 0]
+    return Sinusoid.to_unconstrained(beta.take_along_dim(best, 1)[:, 0]), sd.take_along_dim(best, 1)[:, 0]
 
 
 def _measured(signal: Tensor, n_levels: int | None) -> Tensor:
@@ -190,7 +190,7 @@ def _given(wccv: Tensor, n_samples: int, n_levels: int | None) -> Tensor:
 
 
 def _check_model(made_of: Composition, n_levels: int) -> None:
-    if any(isinstance(process, Drift) for process in made_of.processes):
+    if any(process.deterministic for process in made_of.processes):
         raise ValueError(
             "`model`: expected noise processes, got a Drift, which is deterministic and has no covariance; "
             "subtract a trend from every sensor"

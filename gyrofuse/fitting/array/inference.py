@@ -13,7 +13,6 @@ from gyrofuse.fitting.array.search import jacobian
 from gyrofuse.fitting.moments.inference import _quadratic, _sandwich
 from gyrofuse.fitting.moments.records import Records
 from gyrofuse.fitting.structure import Composition
-from gyrofuse.noise.processes import AR1
 from gyrofuse.wavelets.equivalent_dof import normal_quantile
 
 # Of the largest eigenvalue of a matrix between sensors of unit size, what is as good as none.
@@ -198,8 +197,8 @@ def told_matrices(fit: ArrayFit, made_of: Composition, n_samples: int) -> Tensor
     """Whether a matrix has full rank and its process no long memory, `(item, process)`."""
     told = fit.rank == fit.theta.shape[-1]
     for k, x in zip(made_of.shaped, fit.shape.unbind(-1), strict=True):
-        if isinstance(made_of.processes[k], AR1):
-            told[:, k] &= ~is_long(x.tanh(), n_samples)
+        if made_of.processes[k].has_memory():
+            told[:, k] &= ~is_long(made_of.processes[k].from_unconstrained(x), n_samples)
     return told
 
 
@@ -213,21 +212,17 @@ def shared(fit: ArrayFit, told: Tensor, held_sd: Tensor, made_of: Composition, c
     n_moving = len(made_of.curved)
     moving = fit.spread.diagonal(dim1=-2, dim2=-1)[:, fit.spread.shape[-1] - n_moving :].clamp(min=0).sqrt()
     moved, held = iter(moving.unbind(-1)), iter(held_sd.unbind(-1))
-    memories = [k for k, process in enumerate(made_of.processes) if isinstance(process, AR1)]
+    memories = [k for k, process in enumerate(made_of.processes) if process.has_memory()]
     vague = ~told[:, memories].all(-1)
     found = []
     for k, x in zip(made_of.shaped, fit.shape.unbind(-1), strict=True):
-        if isinstance(made_of.processes[k], AR1):
-            width = next(moved)
-            value, slope = x.tanh(), 1 - x.tanh().square()
-            ends = tuple(torch.where(vague, torch.nan, (x + sign * z * width).tanh()) for sign in (-1, 1))
-        else:
-            part = x.sigmoid()
-            slope = torch.pi * part * (1 - part)
-            width = next(moved) if k in made_of.curved else next(held) / slope
-            value = torch.pi * part
-            ends = (torch.pi * (x - z * width).sigmoid(), torch.pi * (x + z * width).sigmoid())
-        found.append(Estimate(value, slope * width, *ends))
+        process = made_of.processes[k]
+        slope = process.unconstrained_slope(x)
+        width = next(moved) if k in made_of.curved else next(held) / slope
+        low, high = (process.from_unconstrained(x + sign * z * width) for sign in (-1, 1))
+        if process.has_memory():
+            low, high = (torch.where(vague, torch.nan, limit) for limit in (low, high))
+        found.append(Estimate(process.from_unconstrained(x), slope * width, low, high))
     if not found:
         return Estimate(*(fit.shape,) * 4)
     return Estimate(*(torch.stack(column, -1) for column in zip(*found, strict=True)))

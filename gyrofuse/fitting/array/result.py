@@ -26,7 +26,7 @@ from gyrofuse.fusion.live import subset_weights
 from gyrofuse.fusion.weights.scale_weights import ScaleWeights
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.estimation import EstimatedFrom
-from gyrofuse.noise.processes import Model, Process, Sinusoid
+from gyrofuse.noise.processes import Model, Process
 from gyrofuse.wavelets.equivalent_dof import chi_square_tail
 
 if TYPE_CHECKING:
@@ -243,7 +243,7 @@ class ArrayGMWMResult:
             limits = f"{level} [{low:.6g}, {high:.6g}]" if low.isfinite() else "no interval, see below"
             lines.append(f"{label:<16}{value:>13.6g}  {limits}")
         for k, process in enumerate(self.processes):
-            what = "squared amplitudes, twice the variances," if isinstance(process, Sinusoid) else "variances"
+            what = "squared amplitudes, twice the variances," if process.squared else "variances"
             lines += ["", f"{process.symbol}: {what} with {level}s, correlations"]
             for i, sensor in enumerate(self.sensors):
                 low, high = (limit[k, i, i].item() for limit in self.confidence_interval)

@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gyrofuse._base.checks import check_positive_integer, largest_level
-from gyrofuse.noise.model import Model, Process
-from gyrofuse.noise.processes import Drift, QuantizationNoise, Sinusoid, WhiteNoise
+from gyrofuse.noise.processes import Model, Process
 from gyrofuse.wavelets.lag_sums import lag_quadrature, unit_covariances
 
 Array = NDArray[np.float64]
@@ -88,22 +87,22 @@ def moment_covariance(model: Model, n_samples: int, n_levels: int, *, excess_kur
     tau = torch.exp2(torch.arange(1, n_levels + 1, dtype=torch.float64, device=device))
     windows = n_samples + 1 - torch.minimum(tau[:, None], tau)  # max(M_j, M_k)
     kurtosis = torch.as_tensor(excess_kurtosis, dtype=torch.float64, device=device)
-    if bool((kurtosis != 0).any()) and not any(isinstance(process, WhiteNoise) for process, _ in known):
+    if bool((kurtosis != 0).any()) and not any(process.white for process, _ in known):
         raise ValueError(
             f"`excess_kurtosis`: expected a model with WhiteNoise, whose kurtosis it is, got {model}; "
             "add WhiteNoise or leave `excess_kurtosis` out"
         )
     for process, columns in known:
-        if isinstance(process, Sinusoid):
+        if process.has_line:
             f0 = columns["beta"] / (2 * math.pi)
             density = torch.stack(torch.broadcast_tensors(*(p._spectrum(f0, **values) for p, values in known))).sum(0)
             gain = process._wavelet_variance(tau, torch.ones_like(f0), columns["beta"])  # h = |H(f0)|^2 / 2
             scale = 8 * columns["amplitude"] ** 2 * density
             covariance = covariance + scale[..., None] * _outer(gain) / windows
-        elif isinstance(process, Drift):
+        elif process.deterministic:
             ramp = columns["slope"] * tau / 4
             covariance = covariance + 4 * _outer(ramp) * _symmetric(shares @ tables.means, n_levels)
-        elif isinstance(process, WhiteNoise):
+        elif process.white:
             covariance = covariance + kurtosis[..., None, None] * _outer(columns["variance"] / tau) / windows
     return covariance
 
@@ -194,7 +193,7 @@ def _shares(known: list[tuple[Process, dict[str, Tensor]]], tables: _Tables) -> 
     angle = torch.zeros_like(density[:1])
     for process, columns in known:
         # Its spectrum falls to 0 with the frequency, where nothing of others may be left over.
-        if isinstance(process, QuantizationNoise):
+        if process.white_integral:
             angle = columns["variance"]
         else:
             density = density + process._spectrum(tables.frequencies, **columns)

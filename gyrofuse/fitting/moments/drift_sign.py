@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.fitting.moments.inference import Estimates
-from gyrofuse.noise.processes import Drift, Model
+from gyrofuse.noise.processes import Model
 
 
 def rising(series: Tensor) -> Tensor:
@@ -22,7 +22,7 @@ def rising(series: Tensor) -> Tensor:
 
 def drifts_of(model: Model) -> Tensor:
     """Which parameters are slopes, `(parameter,)`."""
-    return torch.tensor([isinstance(p, Drift) for p in model.processes for _ in p.parameters])
+    return torch.tensor([p.deterministic for p in model.processes for _ in p.parameters])
 
 
 def signed(estimates: Estimates, model: Model, sign: Tensor) -> Estimates:

@@ -8,7 +8,7 @@ from torch import Tensor
 from gyrofuse.fitting.moments import search
 from gyrofuse.fitting.moments.inference import Fit
 from gyrofuse.fitting.moments.records import Records
-from gyrofuse.fitting.structure import Composition, shape_of
+from gyrofuse.fitting.structure import Composition
 from gyrofuse.noise.parsing import parse_model
 from gyrofuse.noise.processes import Model, Process, Sinusoid
 
@@ -39,7 +39,7 @@ def fit_items(
     size = nu.amax(-1, keepdim=True)
     nu = nu / size
     beta, held_sd = frequencies or (nu.new_empty(n_items, 0), nu.new_empty(n_items, 0))
-    held = shape_of(beta.to(nu), Sinusoid)
+    held = Sinusoid.to_unconstrained(beta.to(nu))
     own = omega.to(nu) if isinstance(omega, Tensor) else None
     weight = observations / nu.square() if own is None else (own if own.ndim == 1 else own.diagonal()).expand_as(nu)
     start = search.starting_points(nu, weight, tau, made_of, held, n_starts_for(made_of))  # (item, start, shaped)
@@ -130,7 +130,7 @@ def _root(covariance: Tensor, omega: str | Tensor) -> Tensor:
 
 def n_starts_for(made_of: Composition) -> int:
     """As many as found the lowest minimum of noisy copies every time."""
-    tones = sum(isinstance(made_of.processes[k], Sinusoid) for k in made_of.curved)
+    tones = sum(made_of.processes[k].has_line for k in made_of.curved)
     return min(4 * 4 ** (len(made_of.curved) - 1) if tones else (1, 4, 6, 8)[min(len(made_of.curved), 3)], 32)
 
 

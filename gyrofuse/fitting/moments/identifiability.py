@@ -11,7 +11,7 @@ from torch import Tensor
 from gyrofuse.fitting.moments.inference import WEAKLY_DETERMINED, Estimates
 from gyrofuse.fitting.spectral.tones import FEWEST_CYCLES, Tones
 from gyrofuse.fitting.structure import Composition
-from gyrofuse.noise.processes import AR1, Model, RandomWalk, Sinusoid, WhiteNoise
+from gyrofuse.noise.processes import Model
 from gyrofuse.wavelets.equivalent_dof import normal_quantile
 
 # A tone of fewer cycles is a trend, an AR1 of which the record holds fewer time constants a random walk.
@@ -29,7 +29,8 @@ def uncertain(made_of: Composition, estimates: Estimates, n_samples: int, confid
     needed = ~estimates.determined[:, made_of.places]
     kinds = [type(process) for process in made_of.processes]
     for k, alike in _alike(made_of, estimates, n_samples).items():
-        for kind, where in alike.items():
+        limits = made_of.processes[k].short_limit, made_of.processes[k].long_limit
+        for kind, where in zip(limits, alike, strict=True):
             others = [other for other in range(len(kinds)) if kinds[other] is kind]
             needed[:, [k, _shape_at(made_of, k), *others]] |= where[:, None]
     for (k, other), where in _twins(made_of, estimates, confidence_level).items():
@@ -62,17 +63,18 @@ def remarks(
     params = Model(list(made_of.processes)).param_names
     names = [params[place].split(".")[0] for place in made_of.places[: made_of.n_linear]]
     found: list[tuple[Tensor, str]] = []
-    for k, alike in _alike(made_of, estimates, n_samples).items():
-        white, walk = alike[WhiteNoise], alike[RandomWalk]
+    for k, (white, walk) in _alike(made_of, estimates, n_samples).items():
+        limits = made_of.processes[k].short_limit, made_of.processes[k].long_limit
+        short, long = (limit.with_article("a") if limit else "a trend" for limit in limits)
         found += [
             (white & walk, f"{names[k]}: its memory is unknown at this length"),
-            (white & ~walk, f"{names[k]}: indistinguishable from white noise at this length"),
-            (walk & ~white, f"{names[k]}: indistinguishable from a random walk at this length"),
+            (white & ~walk, f"{names[k]}: indistinguishable from {short} at this length"),
+            (walk & ~white, f"{names[k]}: indistinguishable from {long} at this length"),
         ]
     for (k, other), where in _twins(made_of, estimates, confidence_level).items():
         found.append((where, f"{names[k]} and {names[other]}: indistinguishable from one process at this length"))
     for k, process in enumerate(made_of.processes):
-        if isinstance(process, Sinusoid):
+        if process.has_line:
             beta = estimates.params[:, made_of.places[_shape_at(made_of, k)]]
             few = (beta * n_samples < 2 * math.pi * FEWEST_CYCLES) & ~_absent(made_of, estimates, k)
             found.append((few, f"{names[k]}: fewer than {FEWEST_CYCLES:g} cycles in the record"))
@@ -85,7 +87,7 @@ def remarks(
         for item in where.nonzero()[:, 0].tolist():
             said[item].append(text)
     if tones is not None:
-        sinusoids = [name for k, name in enumerate(names) if isinstance(made_of.processes[k], Sinusoid)]
+        sinusoids = [name for k, name in enumerate(names) if made_of.processes[k].has_line]
         for item, tone in (tones.p_value >= _BY_CHANCE).nonzero().tolist():
             p_value = tones.p_value[item, tone].item()
             said[item].append(f"{sinusoids[tone]}: not told from the noise (p = {p_value:.1g})")
@@ -98,33 +100,37 @@ def remarks(
     return [tuple(texts) for texts in said]
 
 
-def _alike(made_of: Composition, estimates: Estimates, n_samples: int) -> dict[int, dict[type, Tensor]]:
-    """Of each AR1 whether its interval of `phi` reaches white noise, and whether it reaches a random walk."""
-    found: dict[int, dict[type, Tensor]] = {}
+def _alike(made_of: Composition, estimates: Estimates, n_samples: int) -> dict[int, tuple[Tensor, Tensor]]:
+    """For each process with a memory whether its interval of `phi` reaches no memory, and one as long as the record."""
+    found: dict[int, tuple[Tensor, Tensor]] = {}
     for k, process in enumerate(made_of.processes):
-        if isinstance(process, AR1):
+        if process.has_memory():
             place, there = made_of.places[_shape_at(made_of, k)], ~_absent(made_of, estimates, k)
             low, high = estimates.low[:, place], estimates.high[:, place]
-            found[k] = {
-                WhiteNoise: there & (low <= 0) & (high >= 0),
-                RandomWalk: there & (high >= math.exp(-FEWEST_TIME_CONSTANTS / n_samples)),
-            }
+            found[k] = (
+                there & (low <= process.memoryless) & (high >= process.memoryless),
+                there & (high >= math.exp(-FEWEST_TIME_CONSTANTS / n_samples)),
+            )
     return found
 
 
 def _twins(made_of: Composition, estimates: Estimates, confidence_level: float) -> dict[tuple[int, int], Tensor]:
-    """Pairs of AR1s that differ by less than chance, in `atanh phi`."""
+    """Pairs of processes of one class with a memory that differ by less than chance, in `x`."""
     found: dict[tuple[int, int], Tensor] = {}
-    which = [k for k, process in enumerate(made_of.processes) if isinstance(process, AR1)]
+    which = [k for k, process in enumerate(made_of.processes) if process.has_memory()]
     z = normal_quantile((1 + confidence_level) / 2)
     for k, other in itertools.combinations(which, 2):
+        kind = type(made_of.processes[k])
+        if type(made_of.processes[other]) is not kind:
+            continue
         places = [made_of.places[_shape_at(made_of, at)] for at in (k, other)]
         phi = estimates.params[:, places]
-        slope = 1 / (1 - phi.square())
+        x = kind.to_unconstrained(phi)
+        slope = 1 / kind.unconstrained_slope(x)
         slope = torch.stack([slope[:, 0], -slope[:, 1]], -1)
         own = estimates.covariance[:, places][:, :, places]
         variance = (own * slope[:, :, None] * slope[:, None, :]).sum((-2, -1))
-        apart = (phi[:, 0].atanh() - phi[:, 1].atanh()).square()
+        apart = (x[:, 0] - x[:, 1]).square()
         both = ~_absent(made_of, estimates, k) & ~_absent(made_of, estimates, other)
         found[k, other] = both & ~(apart > z**2 * variance)  # also where the variance is unknown
     return found
@@ -146,7 +152,7 @@ def _combined(made_of: Composition, estimates: Estimates) -> dict[tuple[int, int
 
 def _standing_in(made_of: Composition, estimates: Estimates, tones: Tones) -> Tensor:
     """Sinusoids that the moments find beyond doubt larger than the spectrum does, `(item, sinusoid)`."""
-    places = [made_of.places[k] for k, process in enumerate(made_of.processes) if isinstance(process, Sinusoid)]
+    places = [made_of.places[k] for k, process in enumerate(made_of.processes) if process.has_line]
     spread = estimates.covariance.diagonal(dim1=-2, dim2=-1)[:, places] + tones.amplitude_sd.square()
     return estimates.params[:, places] - tones.amplitude > _BEYOND_DOUBT * spread.sqrt()
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from gyrofuse.fitting.moments.log_moments import log_residual
 from gyrofuse.fitting.moments.records import Records
 from gyrofuse.fitting.structure import Composition
-from gyrofuse.noise.processes import AR1, Drift, Sinusoid
+from gyrofuse.noise.processes import Sinusoid
 from gyrofuse.wavelets.equivalent_dof import chi_square_tail, normal_quantile
 
 # Beyond this spread of its logarithm a variance is known to hardly its order of magnitude.
@@ -237,8 +237,8 @@ def _in_logs(own: Tensor, fit: Fit, made_of: Composition) -> Tensor:
     spread[:, index[:, None], index] = own * scale[:, :, None] * scale[:, None, :]
     held = [n_linear + at for at, k in enumerate(shaped) if k not in made_of.curved]
     if held:
-        part = fit.shape[:, [at - n_linear for at in held]].sigmoid()
-        spread[:, held, held] = (fit.held_sd / (torch.pi * part * (1 - part))).square()
+        slope = Sinusoid.unconstrained_slope(fit.shape[:, [at - n_linear for at in held]])
+        spread[:, held, held] = (fit.held_sd / slope).square()
     return spread
 
 
@@ -269,20 +269,16 @@ def estimated(
         low = torch.where(present, p * torch.exp(-z * ratio), 0.0)
         high = torch.where(present, p * torch.exp(z * ratio), one_sided * edge_sd[:, k])
         size = (k, low, high, p, present & (ratio < WEAKLY_DETERMINED))
-        if isinstance(process, (Sinusoid, Drift)):  # p is the square of the parameter
+        if process.squared:  # p is the square of the parameter
             size = (k, low.sqrt(), high.sqrt(), p.sqrt() / 2, size[-1])
-        if isinstance(process, (AR1, Sinusoid)):
+        if process.shape_name is not None:
             x, width = shape[:, at_shaped - made_of.n_linear], sd[:, at_shaped]
             # Without variance, or fewer than a few cycles of a tone, it may be anything.
             width = torch.where(present & width.isfinite(), width, torch.inf)
             known = width < WEAKLY_DETERMINED
-            if isinstance(process, AR1):
-                form = (at_shaped, (x - z * width).tanh(), (x + z * width).tanh(), 1 - x.tanh().square(), known)
-                found += [form, size]
-            else:
-                part = x.sigmoid()
-                low, high = (torch.pi * (x + sign * z * width).sigmoid() for sign in (-1, 1))
-                found += [size, (at_shaped, low, high, torch.pi * part * (1 - part), known)]
+            low, high = (process.from_unconstrained(x + sign * z * width) for sign in (-1, 1))
+            form = (at_shaped, low, high, process.unconstrained_slope(x), known)
+            found += [form, size] if next(iter(process.parameters)) == process.shape_name else [size, form]
             at_shaped += 1
         else:
             found.append(size)

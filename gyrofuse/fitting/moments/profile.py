@@ -24,7 +24,6 @@ from gyrofuse.fitting.moments.inference import WEAKLY_DETERMINED, Estimates, Fit
 from gyrofuse.fitting.moments.profile_limits import crossings, grid
 from gyrofuse.fitting.moments.profile_surfaces import MomentSurface, Surface
 from gyrofuse.fitting.structure import Composition
-from gyrofuse.noise.processes import AR1, Drift, Sinusoid
 from gyrofuse.wavelets.equivalent_dof import normal_quantile
 
 # Share of `z` by which the square root of the rise at a limit may differ from it: as much as the limit would be off. An
@@ -81,7 +80,7 @@ def profiled(
             high[items, place] = torch.where(measured, own + z[items] * sd, high[items, place])
             continue
         if unknown < made_of.n_linear:
-            squared = isinstance(made_of.processes[unknown], (Sinusoid, Drift))
+            squared = made_of.processes[unknown].squared
             sd = sd / own * (2 if squared else 1)
             first, last = _variance_limits(
                 surface, items, unknown, sd, _room(fit, made_of, items, unknown), z[items], in_order[items]
@@ -91,12 +90,12 @@ def profiled(
                 first, last = first.sqrt(), last.sqrt()
         else:
             at = unknown - made_of.n_linear
-            moving = isinstance(made_of.processes[made_of.shaped[at]], AR1)
-            sd = sd / (1 - own.square() if moving else own * (1 - own / torch.pi))
+            process = made_of.processes[made_of.shaped[at]]
+            sd = sd / process.unconstrained_slope(fit.shape[items, at])
             least, most = (float(end[at]) for end in search.limits(made_of, fit.tau, fit.shape))
             first, last = _shape_limits(surface, items, unknown, sd, least, most, z[items], in_order[items])
             width = last - first
-            first, last = (v.tanh() if moving else torch.pi * v.sigmoid() for v in (first, last))
+            first, last = (process.from_unconstrained(x) for x in (first, last))
         first, last = torch.minimum(first, own), torch.maximum(last, own)
         wide, linear = refused[items], (estimates.low[items, place], estimates.high[items, place])
         low[items, place] = torch.where(wide, torch.minimum(first, linear[0]), first)
@@ -120,9 +119,10 @@ def _bent(surface: Surface, made_of: Composition, estimates: Estimates, tau: Ten
     still = [unknown for unknown in range(len(made_of.places)) if not surface.knows(unknown)]
     x_scale = torch.ones_like(shape)
     for at, k in enumerate(made_of.shaped):
-        x_scale[:, at] = 1 - shape[:, at].tanh().square() if isinstance(made_of.processes[k], AR1) else 0.0
+        process = made_of.processes[k]
+        x_scale[:, at] = 0.0 if process.has_line else process.unconstrained_slope(shape[:, at])
     scale = torch.cat([linear, x_scale], -1)
-    tones = [k for k, p in enumerate(made_of.processes) if isinstance(p, (Sinusoid, Drift))]
+    tones = [k for k, p in enumerate(made_of.processes) if not p.gaussian]
     scale[:, [*still, *tones]] = 0.0
     inverse = torch.where(scale > 0, 1 / scale, 0.0)
     spread = estimates.covariance[:, made_of.places][:, :, made_of.places] * inverse[:, :, None] * inverse[:, None, :]
@@ -149,7 +149,7 @@ def _widths(surface: Surface, made_of: Composition, needed: Tensor, confidence_l
     width = surface.linear.new_full((len(needed),), one)
     items = needed.any(-1).nonzero()[:, 0]
     for k, process in enumerate(made_of.processes):
-        if isinstance(process, AR1) and len(items):
+        if process.has_memory() and len(items):
             absent = surface.rise(items, k, torch.zeros_like(width[items]))
             width[items[absent <= two**2]] = two
     return width
@@ -158,7 +158,7 @@ def _widths(surface: Surface, made_of: Composition, needed: Tensor, confidence_l
 def _room(fit: Fit, made_of: Composition, items: Tensor, k: int) -> Tensor:
     """About the largest `p` that the wavelet variances leave room for, `(item,)`."""
     variance, shape = fit.variance[items], fit.shape[items]
-    if isinstance(made_of.processes[k], AR1):
+    if made_of.processes[k].alternates:
         return 2 * variance[:, 0]  # without memory
     ratio = variance / made_of.columns(fit.tau, shape)[..., k].clamp(min=1e-300)
     # The last levels may be small by chance.

@@ -14,7 +14,6 @@ from gyrofuse.fitting.moments.inference import Fit
 from gyrofuse.fitting.spectral.bands import Bins, Noise
 from gyrofuse.fitting.spectral.search import deviance, maximise
 from gyrofuse.fitting.structure import Composition
-from gyrofuse.noise.processes import AR1
 
 _STARTS, _FIRST_STEPS, _STEPS, _ENOUGH = 2, 6, 5, 1e-3
 _CLIMB = 15
@@ -196,9 +195,13 @@ class SpectralSurface:
 
 
 def _in_order(made_of: Composition, shape: Tensor) -> Tensor:
-    """Whether AR1s go from slow to fast, `(item,)`."""
-    at = [at for at, k in enumerate(made_of.shaped) if isinstance(made_of.processes[k], AR1)]
-    return (shape[:, at].diff(dim=-1) <= 0).all(-1)
+    """Whether processes of each class with a memory go from slow to fast, `(item,)`."""
+    in_order = torch.ones(len(shape), dtype=torch.bool, device=shape.device)
+    kinds = [type(made_of.processes[k]) for k in made_of.shaped]
+    for kind in {kind for kind in kinds if kind.has_memory()}:
+        at = [at for at, other in enumerate(kinds) if other is kind]
+        in_order &= (shape[:, at].diff(dim=-1) <= 0).all(-1)
+    return in_order
 
 
 def _first_of(objective: Tensor) -> Tensor:

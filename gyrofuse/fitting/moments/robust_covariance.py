@@ -20,7 +20,6 @@ from torch import Tensor
 
 from gyrofuse.fitting.moments.covariance import _covariances, _grid, _shares, _symmetric, _tables, moment_covariance
 from gyrofuse.noise.model import Model
-from gyrofuse.noise.processes import Drift, Sinusoid
 from gyrofuse.wavelets.lag_sums import lag_quadrature
 from gyrofuse.wavelets.robust import biweight_of, check_efficiency
 
@@ -78,7 +77,7 @@ def check_gaussian(model: Model) -> None:
     Raises:
         ValueError: A sinusoid or a drift.
     """
-    strange = [p.symbol for p in model.processes if isinstance(p, (Sinusoid, Drift))]
+    strange = [p.symbol for p in model.processes if not p.gaussian]
     if strange:
         raise ValueError(
             f"`model`: expected Gaussian processes with a robust wavelet variance, got {' + '.join(strange)}, whose "

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.nnls import nonnegative_least_squares
-from gyrofuse.fitting.structure import Composition, shape_of
-from gyrofuse.noise.processes import AR1
+from gyrofuse.fitting.structure import Composition
+from gyrofuse.noise.processes import Process
 
 _STEPS, _ENOUGH = 30, 1e-10
 # The damping after which a step that does not help is taken for rounding.
@@ -207,30 +207,27 @@ def _with_held(free: Tensor, held: Tensor, made_of: Composition) -> Tensor:
         return free
     parts, at_free, at_held = [], iter(free.unbind(-1)), iter(held.unbind(-1))
     for k in made_of.shaped:
-        ar1 = isinstance(made_of.processes[k], AR1)
-        parts.append(next(at_free) if ar1 else next(at_held)[:, None].expand(free.shape[:2]))
+        found = k in made_of.curved
+        parts.append(next(at_free) if found else next(at_held)[:, None].expand(free.shape[:2]))
     return torch.stack(parts, -1)
 
 
-def _grid(kind: type, tau: Tensor) -> Tensor:
-    longest = float(tau[-1])
-    if kind is AR1:
-        time_constant = longest / 2.0 ** torch.arange(0, math.log2(3 * longest), dtype=torch.float64)
-        # Two that alternate: rare, but some filters leave them.
-        phi = torch.cat([torch.exp(-1 / time_constant), torch.tensor([-0.3, -0.7], dtype=torch.float64)])
-        return shape_of(phi, AR1)
-    period = 4 * longest / 2.0 ** torch.arange(0, math.log2(2 * longest), 1 / 3, dtype=torch.float64)
-    return (2 / period.clamp(min=2.01)).logit()
+def _grid(kind: type[Process], tau: Tensor) -> Tensor:
+    longest, shortest = kind.time_scales(float(tau[-1]))
+    octaves = torch.arange(0, math.log2(longest / shortest), 1 / kind.starts_per_octave, dtype=torch.float64)
+    return with_alternating(kind, kind.from_time_scale(longest / 2.0**octaves))
+
+
+def with_alternating(kind: type[Process], x: Tensor, phi: tuple[float, ...] = (-0.3, -0.7)) -> Tensor:
+    """Starts of a search `(start,)`, with some that alternate in sign: these are rare, but some filters leave them."""
+    return torch.cat([x, kind.to_unconstrained(x.new_tensor(phi))]) if kind.alternates else x
 
 
 def limits(made_of: Composition, tau: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
     """Least and largest `x` of the shaped processes, `(shaped,)`."""
     low, high = [], []
     for k in made_of.shaped:
-        if isinstance(made_of.processes[k], AR1):
-            low.append(-3.0)
-            high.append(math.atanh(math.exp(-1 / (64 * float(tau[-1])))))
-        else:
-            low.append(math.log(1 / (8 * float(tau[-1]))))
-            high.append(20.0)
+        least, most = made_of.processes[k].unconstrained_limits(float(tau[-1]))
+        low.append(least)
+        high.append(most)
     return x.new_tensor(low), x.new_tensor(high)

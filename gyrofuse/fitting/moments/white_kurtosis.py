@@ -23,7 +23,6 @@ from torch import Tensor
 from gyrofuse.fitting.moments.inference import WEAKLY_DETERMINED, Inference
 from gyrofuse.fitting.spectral.tones import Tones
 from gyrofuse.fitting.structure import Composition
-from gyrofuse.noise.processes import WhiteNoise
 from gyrofuse.wavelets.equivalent_dof import normal_quantile
 
 _LEAST = -2.0  # the excess kurtosis of a fair coin: no variable has less
@@ -97,6 +96,6 @@ def with_excess_kurtosis(
 def _white_at(made_of: Composition) -> int | None:
     """Place of the variance of the white noise among the parameters."""
     for k, process in enumerate(made_of.processes):
-        if isinstance(process, WhiteNoise):
+        if process.white:
             return made_of.places[k]
     return None

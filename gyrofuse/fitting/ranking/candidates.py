@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -13,13 +13,12 @@ from torch import Tensor
 
 from gyrofuse.fitting.structure import Composition
 from gyrofuse.noise.parsing import parse_model
-from gyrofuse.noise.processes import AR1, Drift, Model, Process, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
+from gyrofuse.noise.processes import AR1, PROCESSES, Drift, Model, Process, QuantizationNoise, RandomWalk, WhiteNoise
 
 Kinds = list[type[Process]]
 Key = frozenset[tuple[type[Process], int]]
 
 _MOST_AR1S = 3
-_ORDER: tuple[type[Process], ...] = (WhiteNoise, QuantizationNoise, AR1, RandomWalk, Drift, Sinusoid)
 # A variance or a shape known to a factor of e^4 either way is not known.
 _UNKNOWN = 2.0
 # Of Hannan and Quinn; more than 1 for a choice that is right in the end. At 1.5 a process too many pays its way in less
@@ -36,7 +35,7 @@ def key_of(kinds: Iterable[type[Process]]) -> Key:
 
 def composition(kinds: Iterable[type[Process]], held: bool) -> Composition:
     """In the usual order."""
-    ordered: list[Any] = sorted(kinds, key=_ORDER.index)  # of classes with constructors of their own
+    ordered: list[Any] = sorted(kinds, key=PROCESSES.index)  # of classes with constructors of their own
     return Composition(tuple(kind() for kind in ordered), held)
 
 
@@ -52,7 +51,7 @@ def name_of(kinds: Iterable[type[Process]]) -> str:
 
 def n_unknown(kinds: Kinds, held: bool) -> int:
     """Unknowns of the moments, with frequencies of sinusoids known from elsewhere or not."""
-    return len(kinds) + kinds.count(AR1) + (0 if held else kinds.count(Sinusoid))
+    return len(kinds) + sum(kind.shape_name is not None and not (held and kind.has_line) for kind in kinds)
 
 
 def n_parameters(made_of: Composition) -> int:
@@ -62,7 +61,7 @@ def n_parameters(made_of: Composition) -> int:
 
 def charge(made_of: Composition, n_samples: int) -> float:
     """What its parameters cost in `-2 ln L`: `2 c ln ln T` each, the slope of a ramp, known to `T^(-3/2)`, `ln T`."""
-    drifts = kinds_of(made_of).count(Drift)
+    drifts = sum(process.deterministic for process in made_of.processes)
     each = 2 * _HANNAN_QUINN * math.log(math.log(n_samples))
     return (n_parameters(made_of) - drifts) * each + drifts * math.log(n_samples)
 
@@ -109,7 +108,7 @@ def read_candidates(candidates: Sequence[Model | str]) -> list[Kinds]:
                 "write the process without values"
             )
         kinds = [type(p) for p in model.processes]
-        if not set(kinds) - {Drift, Sinusoid}:
+        if not any(kind.gaussian for kind in kinds):
             raise ValueError(f"`candidates`: expected a noise in each, got {name_of(kinds)}; add WN")
         if key_of(kinds) in found:
             raise ValueError(f"`candidates`: expected each composition once, got {name_of(kinds)} twice; leave one out")
@@ -130,7 +129,7 @@ def with_ancestors(wanted: Iterable[Kinds]) -> list[Kinds]:
         numbers = Counter(kinds)
         for fewer in itertools.product(*(range(n + 1) for n in numbers.values())):
             part = [kind for kind, n in zip(numbers, fewer, strict=True) for _ in range(n)]
-            if set(part) - {Drift, Sinusoid}:
+            if any(kind.gaussian for kind in part):
                 found.setdefault(key_of(part), part)
     return sorted(found.values(), key=len)
 
@@ -138,7 +137,7 @@ def with_ancestors(wanted: Iterable[Kinds]) -> list[Kinds]:
 def children(kinds: Kinds, among: Iterable[Key]) -> list[Kinds]:
     """Compositions with one process more."""
     known = set(among)
-    return [more for kind in _ORDER if key_of(more := [*kinds, kind]) in known]
+    return [more for kind in PROCESSES if key_of(more := [*kinds, kind]) in known]
 
 
 def parents(kinds: Kinds) -> list[Key]:
@@ -162,7 +161,7 @@ def next_to(kinds: Kinds, among: Iterable[Key]) -> list[tuple[Kinds, int | None]
     found: list[tuple[Kinds, int | None]] = []
     for k, kind in enumerate(kinds):
         rest = kinds[:k] + kinds[k + 1 :]
-        lacking = [one for one in (WhiteNoise, QuantizationNoise, RandomWalk) if kind is AR1 and one not in rest]
+        lacking = [one for one in kind.stand_ins if one not in rest]
         in_its_place = [(), *itertools.combinations(lacking, 1), *itertools.combinations(lacking, 2)]
         found += [([*rest, *some], k) for some in in_its_place]
     found += [(child, None) for child in children(kinds, known)]
@@ -182,30 +181,32 @@ def simplified(
     """
     sd = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     flags: list[tuple[int, type[Process] | None, str, Tensor]] = []
-    earlier: list[tuple[int, Tensor, Tensor]] = []
+    earlier: defaultdict[type[Process], list[tuple[int, Tensor, Tensor]]] = defaultdict(list)
     numbers: Counter[type[Process]] = Counter()
-    at = 0
     for k, process in enumerate(made_of.processes):
         kind = type(process)
         numbers[kind] += 1
         word = f"{process.symbol} {numbers[kind]}" if process.repeatable else process.symbol
-        if kind is AR1:
-            phi, size, ratio = params[:, at], params[:, at + 1], sd[:, at + 1] / params[:, at + 1]
-            x, x_sd = phi.atanh(), sd[:, at] / (1 - phi.square())
-            flags.append((k, None, f"{word} has no variance", size <= 0))
-            flags.append((k, RandomWalk, f"{word} is a random walk", phi > torch.tensor(-2.0 / n_samples).exp()))
-            flags.append((k, WhiteNoise, f"{word} is white noise", (x.abs() < 2 * x_sd) & (x_sd < _UNKNOWN / 4)))
-            for other, other_x, other_sd in earlier:
+        linear, size = made_of.places[k], params[:, made_of.places[k]]
+        ratio = sd[:, linear] / size
+        flags.append((k, None, f"{word} has no {'slope' if process.deterministic else 'variance'}", size <= 0))
+        if process.has_memory():
+            shape = made_of.places[made_of.n_linear + made_of.shaped.index(k)]
+            phi, x = params[:, shape], kind.to_unconstrained(params[:, shape])
+            x_sd = sd[:, shape] / kind.unconstrained_slope(x)
+            if kind.long_limit is not None:
+                long = phi > torch.tensor(-2.0 / n_samples).exp()
+                flags.append((k, kind.long_limit, f"{word} is {kind.long_limit.with_article('a')}", long))
+            if kind.short_limit is not None:
+                gap = x - kind.to_unconstrained(x.new_tensor(kind.memoryless))
+                short = (gap.abs() < 2 * x_sd) & (x_sd < _UNKNOWN / 4)
+                flags.append((k, kind.short_limit, f"{word} is {kind.short_limit.with_article('a')}", short))
+            for other, other_x, other_sd in earlier[kind]:
                 gap = torch.maximum(2 * torch.hypot(x_sd, other_sd), torch.full_like(x, _ALIKE))
                 known = (x_sd < _UNKNOWN) & (other_sd < _UNKNOWN)
                 alike = ((x - other_x).abs() < gap) & known | ((x - other_x).abs() < _ALIKE)
-                flags.append((k, None, f"{word} is AR1 {other}", alike))
-            earlier.append((numbers[kind], x, x_sd))
-            at += 2
-        else:
-            size, ratio = params[:, at], sd[:, at] / params[:, at]
-            flags.append((k, None, f"{word} has no {'slope' if kind is Drift else 'variance'}", size <= 0))
-            at += 2 if kind is Sinusoid else 1
+                flags.append((k, None, f"{word} is {process.symbol} {other}", alike))
+            earlier[kind].append((numbers[kind], x, x_sd))
         flags.append((k, None, f"{word} is not identified", ~(ratio < _UNKNOWN)))
     table = torch.stack([flag for *_, flag in flags], -1).tolist()
     found: list[tuple[Kinds, str] | None] = []
@@ -224,6 +225,6 @@ def _replaced(made_of: Composition, becomes: dict[int, type[Process] | None]) ->
     kept: Kinds = []
     for k, process in enumerate(made_of.processes):
         kind = becomes[k] if k in becomes else type(process)
-        if kind is not None and (kind in (AR1, Sinusoid) or kind not in kept):
+        if kind is not None and (kind.repeatable or kind not in kept):
             kept.append(kind)
     return kept

@@ -16,8 +16,8 @@ from gyrofuse.fitting.moments import search
 from gyrofuse.fitting.moments.fit import damped, misfit
 from gyrofuse.fitting.moments.inference import Estimates, Fit, Inference, infer, infer_efficient
 from gyrofuse.fitting.moments.records import Records
-from gyrofuse.fitting.structure import Composition
-from gyrofuse.noise.processes import AR1
+from gyrofuse.fitting.structure import Composition, new_shape
+from gyrofuse.noise.processes import Process
 
 _REWEIGHTINGS, _UPDATES = 3, 3
 # By how much more than on the way the last weights' fit may miss, in half nats, before it is thought to go to and fro.
@@ -137,11 +137,10 @@ class Moments:
 
     def widened(self, parent: Composition, fit: MomentFit, made_of: Composition) -> Tensor:
         """Start of a composition with one process more, a further shape where variances with it fit best."""
-        if len(made_of.shaped) == len(parent.shaped):
+        at = new_shape(parent, made_of)
+        if at is None:
             return fit.shape
-        before, after = ([type(m.processes[k]) for k in m.shaped] for m in (parent, made_of))
-        at = next(i for i, kind in enumerate(after) if before[i : i + 1] != [kind])
-        grid = self._grid(isinstance(made_of.processes[made_of.shaped[at]], AR1))
+        grid = self._grid(type(made_of.processes[made_of.shaped[at]]))
         tried = fit.shape[:, None].expand(-1, len(grid), -1)
         new = grid[:, None].expand(len(fit.shape), -1, 1)
         tried = torch.cat([tried[..., :at], new, tried[..., at:]], -1)  # (item, point, shaped)
@@ -151,13 +150,10 @@ class Moments:
         misfit = (wanted - columns @ linear[..., None]).square().sum((-2, -1))
         return tried[torch.arange(len(tried), device=tried.device), misfit.argmin(-1)]
 
-    def _grid(self, ar1: bool) -> Tensor:
-        longest = float(self.tau[-1])
+    def _grid(self, kind: type[Process]) -> Tensor:
+        longest, shortest = kind.time_scales(float(self.tau[-1]))
         steps = torch.linspace(0, 1, _GRID_POINTS, dtype=torch.float64, device=self.tau.device)
-        if ar1:
-            phi = torch.exp(-1 / (longest * (1 / (3 * longest)) ** steps))
-            return torch.cat([phi, phi.new_tensor([-0.3, -0.7])]).atanh()
-        return (2 / (4 * longest * (2.01 / (4 * longest)) ** steps)).logit()
+        return search.with_alternating(kind, kind.from_time_scale(longest * (shortest / longest) ** steps))
 
     def _whitening(self, made_of: Composition, linear: Tensor, x: Tensor) -> Tensor:
         return search.whitening(self.records.covariance(made_of.model(linear, x)))

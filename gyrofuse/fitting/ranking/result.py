@@ -16,7 +16,6 @@ from gyrofuse.fitting.gmwm_result import GMWMResult
 from gyrofuse.fitting.ranking.candidates import name_of
 from gyrofuse.fitting.ranking.table import Table
 from gyrofuse.noise.parsing import parse_model
-from gyrofuse.noise.processes import Sinusoid
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -276,4 +275,4 @@ class RankResult:
 
 
 def _n_tones(candidate: str) -> int:
-    return sum(isinstance(process, Sinusoid) for process in parse_model(candidate).processes)
+    return sum(process.has_line for process in parse_model(candidate).processes)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from dataclasses import fields, replace
 from typing import Generic, TypeVar
@@ -189,8 +188,9 @@ class SpectralSearch(_Search[NoiseFit]):
         linear = size.expand(-1, made_of.n_linear)
         if not made_of.shaped:
             return spectra.fit(made_of, linear, linear[:, :0])
-        constants = (float(self._n_samples) ** power for power in _FIRST_AR1)
-        ends = [spectra.fit(made_of, linear, torch.full_like(size, math.atanh(math.exp(-1 / c)))) for c in constants]
+        process = made_of.processes[made_of.shaped[0]]
+        starts = process.from_time_scale(float(self._n_samples) ** size.new_tensor(_FIRST_AR1))
+        ends = [spectra.fit(made_of, linear, start.expand_as(size)) for start in starts]
         best = ends[0]
         for other in ends[1:]:
             best = self._better(best, other)

@@ -16,12 +16,13 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.transforms import ramp_ordinates
+from gyrofuse.fitting.moments.search import with_alternating
 from gyrofuse.fitting.spectral.bands import Bins, Noise
 from gyrofuse.fitting.spectral.search import maximise, uncertainty
 from gyrofuse.fitting.spectral.tones import NoiseSpectrum, Tones, find_tones, line_p_value
 from gyrofuse.fitting.spectral.whittle import _LEAST_COUNT, _transformed
-from gyrofuse.fitting.structure import Composition
-from gyrofuse.noise.processes import AR1, Drift, QuantizationNoise, RandomWalk, WhiteNoise
+from gyrofuse.fitting.structure import Composition, new_shape
+from gyrofuse.noise.processes import AR1, Process, QuantizationNoise, RandomWalk, WhiteNoise
 
 # Where a further AR1 is looked for: time constants of 1/3 sample and more, this far apart, and some that alternate.
 _SHORTEST, _RATIO, _ALTERNATING = 1 / 3, 1.6, (-0.3, -0.6, -0.8, -0.9, -0.97)
@@ -150,8 +151,8 @@ class Spectra:
     def widened(self, parent: Composition, fit: NoiseFit, made_of: Composition) -> tuple[Tensor, Tensor]:
         """Start for a composition with one process more: the smaller one's maximum, the new process without variance.
 
-        A further AR1 starts where the score, the slope of the likelihood by its variance over its standard deviation,
-        is largest.
+        A further nonlinear parameter starts where the score, the slope of the likelihood by the variance of its process
+        over its standard deviation, is largest.
         """
         linear = fit.linear.new_zeros(len(fit.linear), made_of.n_linear)
         shape = fit.shape.new_zeros(len(fit.shape), len(made_of.shaped))
@@ -161,14 +162,15 @@ class Spectra:
             kind = type(process)
             linear[:, [i for i, other in enumerate(kinds) if other is kind][seen[kind]]] = fit.linear[:, k]
             seen[kind] += 1
-        shape[:, : fit.shape.shape[-1]] = fit.shape
-        if len(made_of.shaped) > len(parent.shaped):
-            shape[:, -1], start = self._best_ar1(parent, fit)
-            linear[:, made_of.shaped[-1]] = start
+        at = new_shape(parent, made_of)
+        shape[:, [i for i in range(len(made_of.shaped)) if i != at]] = fit.shape
+        if at is not None:
+            k = made_of.shaped[at]
+            shape[:, at], linear[:, k] = self._best_shape(parent, fit, made_of.processes[k])
         return linear, shape
 
-    def _best_ar1(self, parent: Composition, fit: NoiseFit) -> tuple[Tensor, Tensor]:
-        """`x` and the variance of the AR1 that the likelihood asks for, both `(item,)`."""
+    def _best_shape(self, parent: Composition, fit: NoiseFit, process: Process) -> tuple[Tensor, Tensor]:
+        """`x` and the variance of a further process that raise the likelihood fastest, both `(item,)`."""
         noise = Noise(parent)
         p, x = fit.linear[:, noise.which], fit.shape
         columns, slopes, _ = noise.columns(self.bins, x)
@@ -182,8 +184,8 @@ class Spectra:
         # Columns of zeros come last: in their places the basis has vectors that mean nothing.
         first = there.sort(descending=True)
         basis = torch.linalg.qr(known.take_along_dim(first.indices, -1))[0] * first.values
-        grid = _grid(self.bins.n_samples).to(p)
-        shapes = self.bins.ar1(grid.tanh())[0].mT * root  # (item, bin, grid)
+        grid = _grid(type(process), self.bins.n_samples).to(p)
+        shapes = process.unit_band_variance(self.bins, grid).value.mT * root  # (item, bin, grid)
         new = shapes - basis @ (basis.mT @ shapes)
         misfit = (self.count / 2).sqrt() * (energy / self.count / variance - 1)
         gradient, information = (new.mT @ misfit[..., None])[..., 0], new.square().sum(-2)
@@ -194,14 +196,13 @@ class Spectra:
 
 
 def _drifts(made_of: Composition) -> list[int]:
-    return [k for k, p in enumerate(made_of.processes) if isinstance(p, Drift)]
+    return [k for k, p in enumerate(made_of.processes) if p.deterministic]
 
 
-def _grid(n_samples: int) -> Tensor:
+def _grid(kind: type[Process], n_samples: int) -> Tensor:
     n = math.ceil(math.log(n_samples / _SHORTEST) / math.log(_RATIO))
     constants = _SHORTEST * _RATIO ** torch.arange(n, dtype=torch.float64)
-    phi = torch.cat([torch.tensor(_ALTERNATING, dtype=torch.float64), torch.exp(-1 / constants)])
-    return phi.atanh()
+    return with_alternating(kind, kind.from_time_scale(constants), _ALTERNATING)
 
 
 @dataclass(frozen=True, eq=False)

@@ -85,7 +85,7 @@ def by_spectrum(series: Tensor, wanted: list[Kinds] | None, levels: int, max_ton
         noises, allowed = compositions.all_noises(levels), list(range(min(max_tones, levels - 1) + 1))
     else:
         noises, allowed = [_without_tones(kinds) for kinds in wanted], sorted({_n_tones(kinds) for kinds in wanted})
-    ramp = any(Drift in kinds for kinds in noises)
+    ramp = any(kind.deterministic for kinds in noises for kind in kinds)
     lines = decide_lines(series, allowed, line_level, ramp)
     moments = Moments(wavelet_variance(lines.rest, levels).mT.to(torch.float64), n_samples)
     searching = wanted is None

@@ -11,7 +11,7 @@ from torch import Tensor
 from gyrofuse._base.page import number
 from gyrofuse._base.results import p_words
 from gyrofuse.fitting.gmwm_result import REFUSED, GMWMResult
-from gyrofuse.noise.processes import Model, Sinusoid
+from gyrofuse.noise.processes import Model
 
 _DOUBTED = 0.05  # p-values of the J test below
 _WEIGHTS = {
@@ -19,14 +19,6 @@ _WEIGHTS = {
     "diagonal": "weighted by the reciprocals of their variances under the fitted model",
     "identity": "all levels weighted alike",
     "given": "with weights that were given",
-}
-_NAMES = {
-    "WN": "white noise",
-    "QN": "quantisation noise",
-    "RW": "the random walk",
-    "DR": "the drift",
-    "AR1": "the AR1",
-    "SIN": "the tone",
 }
 
 
@@ -115,12 +107,12 @@ def _rulers(result: GMWMResult, index: tuple[int, ...]) -> Iterator[str]:
     processes = _model(result, index).processes
     n_levels = result.wavelet_variance.shape[-2]
     shares = torch.stack([process.wavelet_variance(n_levels) for process in processes])  # (process, level)
-    symbols = [process.symbol for process in processes]
-    labels, seen = [], dict.fromkeys(symbols, 0)
-    for symbol in symbols:
-        seen[symbol] += 1
-        labels.append(_NAMES[symbol] + (f" {seen[symbol]}" if symbols.count(symbol) > 1 else ""))
-    runs = [(name, list(levels)) for name, levels in groupby(range(n_levels), lambda j: int(shares[:, j].argmax()))]
+    names = [process.with_article("the") for process in processes]
+    labels, seen = [], dict.fromkeys(names, 0)
+    for name in names:
+        seen[name] += 1
+        labels.append(name + (f" {seen[name]}" if names.count(name) > 1 else ""))
+    runs = [(k, list(levels)) for k, levels in groupby(range(n_levels), lambda j: int(shares[:, j].argmax()))]
     parts = []
     for k, levels in runs:
         first, last = _time(result, levels[0]), _time(result, levels[-1])
@@ -130,7 +122,7 @@ def _rulers(result: GMWMResult, index: tuple[int, ...]) -> Iterator[str]:
 
 def _tones(result: GMWMResult, index: tuple[int, ...]) -> Iterator[str]:
     for process in _model(result, index).processes:
-        if isinstance(process, Sinusoid) and bool((process.params[0] > 0).all()):
+        if process.has_line and bool((process.params[0] > 0).all()):
             amplitude, beta = process.params.tolist()
             cycles = beta / (2 * torch.pi)
             place = f"{number(cycles * result.rate, 6)} Hz" if result.rate else f"{number(cycles, 6)} cycles per sample"

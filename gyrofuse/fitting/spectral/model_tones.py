@@ -16,7 +16,6 @@ from gyrofuse.fitting.ranking.spectra import Spectra, detrended, reference_densi
 from gyrofuse.fitting.spectral.tones import Tones, find_tones
 from gyrofuse.fitting.spectral.whittle import _of
 from gyrofuse.fitting.structure import Composition
-from gyrofuse.noise.processes import Drift, Sinusoid
 
 # A line is beyond doubt with so many cycles in the record and a p value so small.
 _MANY_CYCLES, _BEYOND_CHANCE = 30, 1e-4
@@ -28,7 +27,7 @@ def model_tones(series: Tensor, made_of: Composition) -> Tones | None:
     Returns:
         `(item, sinusoid)`, float64; None where the model has no sinusoids.
     """
-    n_tones = sum(isinstance(p, Sinusoid) for p in made_of.processes)
+    n_tones = sum(p.has_line for p in made_of.processes)
     if n_tones == 0:
         return None
     series = series.to(torch.float64)
@@ -36,7 +35,7 @@ def model_tones(series: Tensor, made_of: Composition) -> Tones | None:
     cycles = found.beta * series.shape[-1] / (2 * math.pi)
     doubtful = ((cycles < _MANY_CYCLES) | ~(found.p_value < _BEYOND_CHANCE)).any(-1)
     if bool(doubtful.any()):
-        ramp = any(isinstance(p, Drift) for p in made_of.processes)
+        ramp = any(p.deterministic for p in made_of.processes)
         again = _second_look(detrended(series[doubtful]) if ramp else series[doubtful], _of(found, doubtful))
         for field in fields(Tones):
             getattr(found, field.name)[doubtful] = getattr(again, field.name)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -44,7 +42,8 @@ def maximise(
     unit = energy.sum(-1, keepdim=True) / count.sum(-1, keepdim=True)
     mean = (energy / count / unit).clamp(min=torch.finfo(energy.dtype).tiny)
     p, x = p / unit, x.clone()
-    end = math.atanh(math.exp(-1 / (_LONGEST * bins.n_samples)))
+    longest = x.new_tensor(float(_LONGEST * bins.n_samples))
+    end = torch.stack([noise.processes[k].from_time_scale(longest) for k in noise.moving] or [longest])[: x.shape[-1]]
     n_linear = p.shape[-1]
     columns, slopes, bends = noise.columns(bins, x)
     deviance = _deviance(mean, count, (columns @ p[..., None])[..., 0])

@@ -24,11 +24,12 @@ from torch import Tensor
 
 from gyrofuse._base.checks import check_floating, check_positive_integer
 from gyrofuse._base.transforms import cosine_ordinates, ramp_ordinates
-from gyrofuse.fitting.spectral.bands import SINGLE, Bins, Noise
+from gyrofuse.fitting.spectral.bands import Bins, Noise
 from gyrofuse.fitting.spectral.search import maximise, uncertainty
 from gyrofuse.fitting.spectral.tones import FEWEST_SAMPLES, Tones, find_tones
 from gyrofuse.fitting.structure import Composition
-from gyrofuse.noise.processes import Drift, Sinusoid
+from gyrofuse.noise.dct_bands import SINGLE
+from gyrofuse.noise.processes import Sinusoid
 
 # What remains of an ordinate that a tone or the ramp takes all of.
 _LEAST_COUNT = 1e-3
@@ -109,7 +110,7 @@ def refine_whittle(
     signal = signal.detach()
     linear, shape = linear.detach().to(torch.float64).clone(), shape.detach().to(torch.float64).clone()
     noise = Noise(made_of)
-    at_tones = [made_of.shaped.index(k) for k in made_of.shaped if isinstance(made_of.processes[k], Sinusoid)]
+    at_tones = [made_of.shaped.index(k) for k in made_of.shaped if made_of.processes[k].has_line]
     started = linear[:, noise.which]
     usable = signal.sum(-1, dtype=torch.float64).isfinite() & (signal != signal[:, :1]).any(-1)
     usable &= (started >= 0).all(-1) & (started.sum(-1) > 0) & started.isfinite().all(-1)
@@ -133,7 +134,7 @@ def _check(signal: Tensor, made_of: Composition, linear: Tensor, shape: Tensor) 
                 f"`{name}`: expected {(len(signal), size)} for {made_of.name} and {len(signal)} records, got "
                 f"{tuple(value.shape)}; give what the moment fit of the same records returned"
             )
-    if all(isinstance(p, (Sinusoid, Drift)) for p in made_of.processes):
+    if not any(p.gaussian for p in made_of.processes):
         raise ValueError(f"`made_of`: expected a noise such as WN, got {made_of.name}; add WhiteNoise()")
 
 
@@ -151,7 +152,7 @@ def _refined(
     n_items, n_samples = signal.shape
     bins = Bins(n_samples, signal.device)
     tone_at = [made_of.shaped[i] for i in at_tones]
-    ramp_at = [k for k, p in enumerate(made_of.processes) if isinstance(p, Drift)]
+    ramp_at = [k for k, p in enumerate(made_of.processes) if p.deterministic]
     p, x = linear[:, noise.which], shape[:, noise.at_x]
     ramp = _Ramp(bins, signal, noise) if ramp_at else None
     tones = None
@@ -177,7 +178,7 @@ def _refined(
     linear[:, noise.which], shape[:, noise.at_x] = p, x
     if tones is not None:
         linear[:, tone_at] = tones.amplitude.square()
-        shape[:, at_tones] = (tones.beta / torch.pi).logit()
+        shape[:, at_tones] = Sinusoid.to_unconstrained(tones.beta)
     linear[:, ramp_at] = slope.square()[:, None]
     linear, shape = made_of.ordered(linear, shape)
     p, x = linear[:, noise.which], shape[:, noise.at_x]
