@@ -31,6 +31,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, TensorDataset
 
 import gyrofuse as gf
+from gyrofuse.fusion.weights.svo import resolve_scale_weights
 
 N_SENSORS = 6
 N_HORIZONS = 33  # of the later stretch: 32 angles, each with the bias of the horizon before
@@ -193,7 +194,7 @@ def draw(path: Path, learnt: Tensor, found: dict[str, Ratio], options: argparse.
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
     tau = 2.0 ** torch.arange(options.levels) / options.rate
     for name, colour in zip(HAND_MADE, ("#999999", "#e69f00", "#009e73"), strict=True):
-        left.plot(tau, gf.resolve_scale_weights(name, options.levels), color=colour, label=name)
+        left.plot(tau, resolve_scale_weights(name, options.levels), color=colour, label=name)
     left.plot(tau, learnt, color="#0072b2", linewidth=2.4, marker="o", label="learnt")
     left.axvline(options.horizon, color="#d55e00", linestyle=":", label="horizon")
     left.set(xscale="log", xlabel="averaging time (s)", ylabel="scale weight")
@@ -266,7 +267,7 @@ def main() -> None:
 
     print(f"{N_SENSORS} gyros; weights from {options.samples / options.rate:g} s, {options.levels} levels")
     print(f"{'averaging time (s)':>20}  {'learnt':>7}" + "".join(f"  {name:>7}" for name in HAND_MADE))
-    columns = [learnt, *(gf.resolve_scale_weights(name, options.levels) for name in HAND_MADE)]
+    columns = [learnt, *(resolve_scale_weights(name, options.levels) for name in HAND_MADE)]
     for level, row in enumerate(torch.stack(columns, -1).tolist()):
         print(f"{2**level / options.rate:>20g}" + "".join(f"  {value:>7.4f}" for value in row))
     print(f"\nAngle after {options.horizon:g} s at rest, {options.test_arrays} arrays not seen before:")

@@ -23,7 +23,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from gyrofuse._base import __version__ as __version__
-from gyrofuse._base.deprecation import find_moved_modules
+from gyrofuse._base.deprecation import find_moved_modules, moved_names
 from gyrofuse._base.linalg import SingularCovarianceError
 from gyrofuse._base.results import ConfidenceInterval
 from gyrofuse.export.c_header import to_c_header
@@ -40,15 +40,9 @@ from gyrofuse.fitting.ranking.result import RankResult
 from gyrofuse.fitting.virtual_noise import virtual_noise
 from gyrofuse.fusion.faults.parity import parity_test
 from gyrofuse.fusion.faults.reference import ParityReference, fit_parity
-from gyrofuse.fusion.faults.result import ParityResult
 from gyrofuse.fusion.live import LiveSVO, subset_weights
 from gyrofuse.fusion.multiscale import MultiScaleSVO, fit_multiscale
-from gyrofuse.fusion.multiscale_result import MultiScaleResult
-from gyrofuse.fusion.result import SVOResult
 from gyrofuse.fusion.svo import SVO, fit_svo
-from gyrofuse.fusion.uncertainty.gain import Gain
-from gyrofuse.fusion.uncertainty.influence import BootstrapWeightsCovariance, bootstrap_weights_covariance
-from gyrofuse.fusion.uncertainty.tests import EnoughData, WeightsTest
 from gyrofuse.fusion.virtual_file import write_virtual
 from gyrofuse.fusion.weights.baselines import (
     equal_weights,
@@ -56,32 +50,24 @@ from gyrofuse.fusion.weights.baselines import (
     nonnegative_weights,
     shrinkage_weights,
 )
-from gyrofuse.fusion.weights.rdvg import RDVGResult, rdvg, rdvg_weights
-from gyrofuse.fusion.weights.scale_weights import resolve_scale_weights
-from gyrofuse.fusion.weights.selection import Selection
+from gyrofuse.fusion.weights.rdvg import rdvg_weights
 from gyrofuse.fusion.weights.svo import SVOWeights, svo_weights
 from gyrofuse.io.chunked import LongRecording, open_long, stretch_of
 from gyrofuse.io.recording import Recording, read_recording
-from gyrofuse.io.saturation import find_saturation, mask_saturated
+from gyrofuse.io.saturation import mask_saturated
 from gyrofuse.io.streams import RecordingError
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.datasheet import Datasheet, datasheet
 from gyrofuse.noise.parsing import model_from_dict, parse_model
 from gyrofuse.noise.processes import AR1, Drift, Model, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
 from gyrofuse.noise.state_space import StateSpace, state_space
-from gyrofuse.wavelets.block_bootstrap import (
-    block_bootstrap,
-    bootstrap_wccv_covariance,
-    bootstrap_wccv_interval,
-    signal_bootstrap,
-)
 from gyrofuse.wavelets.covariance import CrossCovariance, cross_covariance, wavelet_cross_covariance, wavelet_variance
 from gyrofuse.wavelets.haar import HaarFilterBank, haar_coefficients
 from gyrofuse.wavelets.intervals import wavelet_cross_covariance_interval, wavelet_variance_interval
 from gyrofuse.wavelets.robust import robust_wavelet_variance
 
 if TYPE_CHECKING:
-    from gyrofuse.fusion.streaming import StreamedSVOResult, stream_svo
+    from gyrofuse.fusion.streaming import stream_svo
     from gyrofuse.mismatch import Finding, MismatchReport, diagnose
     from gyrofuse.wavelets.metric import WaveletCrossCovariance
 
@@ -90,52 +76,37 @@ __all__ = [
     "SVO",
     "ArrayGMWMResult",
     "ArrayModel",
-    "BootstrapWeightsCovariance",
     "ConfidenceInterval",
     "CrossCovariance",
     "Datasheet",
     "Drift",
-    "EnoughData",
     "Finding",
     "GMWMBootstrap",
     "GMWMResult",
-    "Gain",
     "HaarFilterBank",
     "JointFit",
     "LiveSVO",
     "LongRecording",
     "MismatchReport",
     "Model",
-    "MultiScaleResult",
     "MultiScaleSVO",
     "ParityReference",
-    "ParityResult",
     "QuantizationNoise",
-    "RDVGResult",
     "RandomWalk",
     "RankResult",
     "Recording",
     "RecordingError",
-    "SVOResult",
     "SVOWeights",
-    "Selection",
     "SingularCovarianceError",
     "Sinusoid",
     "StateSpace",
-    "StreamedSVOResult",
     "WaveletCrossCovariance",
-    "WeightsTest",
     "WhiteNoise",
-    "block_bootstrap",
     "bootstrap_gmwm",
-    "bootstrap_wccv_covariance",
-    "bootstrap_wccv_interval",
-    "bootstrap_weights_covariance",
     "cross_covariance",
     "datasheet",
     "diagnose",
     "equal_weights",
-    "find_saturation",
     "fit_array_gmwm",
     "fit_gmwm",
     "fit_jointly",
@@ -152,13 +123,10 @@ __all__ = [
     "parity_test",
     "parse_model",
     "rank_models",
-    "rdvg",
     "rdvg_weights",
     "read_recording",
-    "resolve_scale_weights",
     "robust_wavelet_variance",
     "shrinkage_weights",
-    "signal_bootstrap",
     "state_space",
     "stream_svo",
     "stretch_of",
@@ -180,10 +148,36 @@ _LAZY = {
     "diagnose": "gyrofuse.mismatch",
     "Finding": "gyrofuse.mismatch",
     "MismatchReport": "gyrofuse.mismatch",
-    "StreamedSVOResult": "gyrofuse.fusion.streaming",
     "stream_svo": "gyrofuse.fusion.streaming",
 }
 
+# Names that have left, and where they are now.
+_MOVED = {
+    **{
+        name: f"gyrofuse.fusion.{name}"
+        for name in (
+            "EnoughData",
+            "MultiScaleResult",
+            "ParityResult",
+            "RDVGResult",
+            "SVOResult",
+            "Selection",
+            "StreamedSVOResult",
+            "WeightsTest",
+        )
+    },
+    "BootstrapWeightsCovariance": "gyrofuse.fusion.uncertainty.influence.BootstrapWeightsCovariance",
+    "Gain": "gyrofuse.fusion.VarianceReduction",
+    "block_bootstrap": "gyrofuse.wavelets.block_bootstrap.block_bootstrap",
+    "bootstrap_wccv_covariance": "gyrofuse.wavelets.block_bootstrap.bootstrap_wccv_covariance",
+    "bootstrap_wccv_interval": "gyrofuse.wavelets.block_bootstrap.bootstrap_wccv_interval",
+    "bootstrap_weights_covariance": "gyrofuse.fusion.uncertainty.influence.bootstrap_weights_covariance",
+    "find_saturation": "gyrofuse.io.saturation.find_saturation",
+    "rdvg": "gyrofuse.fusion.weights.rdvg.rdvg",
+    "resolve_scale_weights": "gyrofuse.fusion.weights.svo.resolve_scale_weights",
+    "signal_bootstrap": "gyrofuse.wavelets.block_bootstrap.signal_bootstrap",
+}
+_moved = moved_names(__name__, _MOVED, stacklevel=3)
 
 find_moved_modules()
 
@@ -193,7 +187,7 @@ def __getattr__(name: str) -> Any:
         value = getattr(import_module(_LAZY[name]), name)
         globals()[name] = value
         return value
-    raise AttributeError(f"module 'gyrofuse' has no attribute {name!r}")
+    return _moved(name)
 
 
 def __dir__() -> list[str]:

@@ -25,7 +25,6 @@ from gyrofuse import (
     haar_coefficients,
     inverse_variance_weights,
     rdvg_weights,
-    resolve_scale_weights,
     robust_wavelet_variance,
     svo_weights,
     wavelet_cross_covariance,
@@ -33,6 +32,7 @@ from gyrofuse import (
     wavelet_variance,
     wavelet_variance_interval,
 )
+from gyrofuse.fusion.weights.svo import resolve_scale_weights
 
 LEVELS = 5
 

@@ -15,11 +15,11 @@ from gyrofuse import (
     RandomWalk,
     WhiteNoise,
     haar_coefficients,
-    resolve_scale_weights,
     svo_weights,
     wavelet_cross_covariance,
     wavelet_variance,
 )
+from gyrofuse.fusion.weights.svo import resolve_scale_weights
 from gyrofuse.wavelets import block_length
 from gyrofuse.wavelets.equivalent_dof import degrees_of_freedom
 from gyrofuse.wavelets.long_run_variance import mean_covariance

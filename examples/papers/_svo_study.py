@@ -22,6 +22,8 @@ from torch import Tensor
 
 import gyrofuse as gf
 from gyrofuse.cli.demo.demo import N_SAMPLES, RATE, UNIT, demo_array
+from gyrofuse.fusion.weights.rdvg import rdvg
+from gyrofuse.fusion.weights.svo import resolve_scale_weights
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -121,7 +123,7 @@ class Study:
 
     def combined(self, scale_weights: str) -> Tensor:
         """`A0`, true wavelet cross-covariance combined over scales."""
-        omega = gf.resolve_scale_weights(scale_weights, n_levels(self.n_samples))
+        omega = resolve_scale_weights(scale_weights, n_levels(self.n_samples))
         return torch.einsum("j,jik->ik", omega, self.model.wavelet_cross_covariance(len(omega)))
 
     def excess_risk(self, scale_weights: str) -> Tensor:
@@ -132,7 +134,7 @@ class Study:
 
     def excess_out_of_sample(self, scale_weights: str) -> Tensor:
         """The same in the new arrays, against the best weights in them, `(method,)` of `METHODS`."""
-        omega = gf.resolve_scale_weights(scale_weights, n_levels(self.n_samples))
+        omega = resolve_scale_weights(scale_weights, n_levels(self.n_samples))
         best = self.best[:, :, ("long", "short").index(scale_weights)] @ omega
         return (self.variance @ omega).mean((0, 1)) / best.mean() - 1
 
@@ -157,11 +159,11 @@ def run_study(model: gf.ArrayModel, n_samples: int, n_arrays: int, n_new: int, s
         multiscale = gf.fit_multiscale(signal, n_levels=levels)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # counted instead
-            rdvg = gf.rdvg(signal)
-        n_indefinite += int(not rdvg.positive_definite)
+            reduced = rdvg(signal)
+        n_indefinite += int(not reduced.positive_definite)
         wccv = short.wavelet_cross_covariance
         long = gf.svo_weights(wccv, "long")
-        weights = torch.stack([long, short.weights, rdvg.weights, gf.equal_weights(wccv), assisted.weights])
+        weights = torch.stack([long, short.weights, reduced.weights, gf.equal_weights(wccv), assisted.weights])
         low, high = short.confidence_interval
         found["weights"].append(weights)
         found["held"].append((low <= ideal[1]) & (ideal[1] <= high))

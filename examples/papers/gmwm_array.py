@@ -20,6 +20,7 @@ from _svo_study import arguments, case1, case2, figures_written, finish, n_level
 from torch import Tensor
 
 import gyrofuse as gf
+from gyrofuse.fusion.weights.svo import resolve_scale_weights
 
 _N_ARRAYS, _QUICK_ARRAYS, _N_SAMPLES, _AT_ONCE = 500, 6, 2**16, 10
 CASES = {"Case 1": (case1, "WN + RW"), "Case 2": (case2, "WN + 3*AR1")}
@@ -55,7 +56,7 @@ def run(name: str, n_arrays: int, generator: torch.Generator) -> Runs:
     make, formula = CASES[name]
     model = make(_N_SAMPLES)
     levels = n_levels(_N_SAMPLES)
-    truth = torch.einsum("j,jab->ab", gf.resolve_scale_weights("long", levels), model.wavelet_cross_covariance(levels))
+    truth = torch.einsum("j,jab->ab", resolve_scale_weights("long", levels), model.wavelet_cross_covariance(levels))
     best = gf.svo_weights(model.wavelet_cross_covariance(levels), "long")
     fits, risks = [], []
     for done in range(0, n_arrays, _AT_ONCE):

@@ -29,7 +29,9 @@ from _svo_study import LINES, arguments, figures_written, finish, n_levels, quad
 from torch import Tensor
 
 import gyrofuse as gf
+from gyrofuse.fusion import SVOResult
 from gyrofuse.fusion.weights.baselines import nonnegative_weights
+from gyrofuse.fusion.weights.svo import resolve_scale_weights
 
 METHODS = ("SVO long", "SVO short", "nonnegative", "multi-scale")  # against equal weights
 FILES = (*(f"adis16405_rec{k}.npz" for k in (1, 2, 3)), "mimu4444_8imu.npz", "xsensdot10_static.npz")
@@ -115,7 +117,7 @@ def score(trial: Trial, levels: int) -> tuple[Tensor, Tensor]:
     options = {"n_levels": levels, "covariance": "none"}
     long, short = (gf.fit_svo(trial.fitted, name, **options) for name in ("long", "short"))
     wccv = gf.wavelet_cross_covariance(trial.fitted, levels)
-    nonnegative = nonnegative_weights(wccv, gf.resolve_scale_weights("long", levels))
+    nonnegative = nonnegative_weights(wccv, resolve_scale_weights("long", levels))
     multiscale = gf.fit_multiscale(trial.fitted, n_levels=levels)
     new = gf.wavelet_cross_covariance(trial.scored, levels)
     fixed = [quadratic(w[:, None], new) for w in (long.weights, short.weights, nonnegative)]
@@ -170,14 +172,14 @@ def plot_variances(array: Array, equal: Tensor, ratio: Tensor, path: Path) -> No
     finish(figure, path)
 
 
-def weights_of(array: Array) -> dict[str, gf.SVOResult]:
+def weights_of(array: Array) -> dict[str, SVOResult]:
     """Weights for long and short times with their 95 % intervals, from the first trial."""
     return {
         f"SVO {name}": gf.fit_svo(array.trials[0].fitted, name, n_levels=array.levels) for name in ("long", "short")
     }
 
 
-def print_weights(array: Array, found: dict[str, gf.SVOResult]) -> None:
+def print_weights(array: Array, found: dict[str, SVOResult]) -> None:
     print(f"{'weights':>15}  " + "  ".join(f"{f'{method}, 95 % interval':>27}" for method in found))
     for i, sensor in enumerate(array.sensors):
         cells = []
@@ -187,7 +189,7 @@ def print_weights(array: Array, found: dict[str, gf.SVOResult]) -> None:
         print(f"{sensor:>15}  " + "  ".join(f"{cell:>27}" for cell in cells))
 
 
-def plot_weights(arrays: list[Array], found: list[dict[str, gf.SVOResult]], path: Path) -> None:
+def plot_weights(arrays: list[Array], found: list[dict[str, SVOResult]], path: Path) -> None:
     """[Z] figure 10: weights and their 95 % intervals, on the first axis."""
     figure, axes = plt.subplots(len(arrays), 1, figsize=(8, 2.8 * len(arrays)), layout="constrained")
     for ax, array, results in zip(axes, arrays, found, strict=True):

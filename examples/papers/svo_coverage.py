@@ -29,6 +29,7 @@ from scipy import stats
 from torch import Tensor
 
 import gyrofuse as gf
+from gyrofuse.fusion.weights.svo import resolve_scale_weights
 
 LEVEL = 0.95
 SIZES = (2**13, 2**16)
@@ -156,9 +157,9 @@ def cover(
 
 def scales(levels: int, cut: bool) -> dict[str, Tensor]:
     """Scale weights by name, with those of the paper's record `cut` to these levels or without."""
-    found = {name: gf.resolve_scale_weights(name, levels) for name in ("short", "long")}
+    found = {name: resolve_scale_weights(name, levels) for name in ("short", "long")}
     for name in tuple(found) if cut else ():
-        known = gf.resolve_scale_weights(name, n_levels(N_SAMPLES))[:levels]
+        known = resolve_scale_weights(name, n_levels(N_SAMPLES))[:levels]
         found[f"{name}, cut"] = known / known.sum()
     return found
 

@@ -45,7 +45,7 @@ _MODULES = {
     "fleet.watch": "fleet.watchdog",
     "fleet.work": "fleet.run",
     "fleet_run": "fleet.processes",
-    "gain": "fusion.uncertainty.gain",
+    "gain": "fusion.uncertainty.variance_reduction",
     "gmwm": "fitting.gmwm",
     "gmwm_result": "fitting.gmwm_result",
     "haar": "wavelets.haar",
@@ -94,7 +94,7 @@ _MODULES = {
     "robust": "wavelets.robust",
     "robust_covariance": "fitting.moments.robust_covariance",
     "saturation": "io.saturation",
-    "scale_weights": "fusion.weights.scale_weights",
+    "scale_weights": "fusion.weights.svo",
     "selection": "fusion.weights.selection",
     "series": "wavelets.long_run_variance",
     "simulate": "noise.array_model",
@@ -102,9 +102,9 @@ _MODULES = {
     "svo_result": "fusion.result",
     "svo_stream": "fusion.streaming",
     "tones": "fitting.spectral.tones",
-    "uncertainty": "wavelets.equivalent_dof",
+    "uncertainty": "wavelets.intervals",
     "units": "_base.units",
-    "virtual_file": "fusion.virtual_file",
+    "virtual_file": "fusion.streaming",
     "virtual_noise": "fitting.virtual_noise",
     "weights_spread": "fusion.uncertainty.weights",
     "whittle": "fitting.spectral.whittle",
@@ -145,19 +145,20 @@ def warn_deprecated(old: str, new: str, stacklevel: int = 2) -> None:
     )
 
 
-def moved_names(module: str, names: Mapping[str, str]) -> Callable[[str], Any]:
+def moved_names(module: str, names: Mapping[str, str], stacklevel: int = 2) -> Callable[[str], Any]:
     """The `__getattr__` of a module that some names have left.
 
     Args:
         module: Name of the module.
         names: Where each of them is now, as `"package.module.name"`.
+        stacklevel: Frames between this function and the line that used the name, plus 1: 3 within a `__getattr__`.
     """
 
     def get(name: str) -> Any:
         if name not in names:
             raise AttributeError(f"module {module!r} has no attribute {name!r}")
         home, _, new = names[name].rpartition(".")
-        warn_deprecated(f"{module}.{name}", names[name])
+        warn_deprecated(f"{module}.{name}", names[name], stacklevel)
         return getattr(import_module(home), new)
 
     return get

@@ -20,7 +20,7 @@ from gyrofuse.fleet.store.table import Column
 from gyrofuse.fusion.result import SVOResult
 from gyrofuse.fusion.svo import fit_svo
 from gyrofuse.fusion.weights.methods import METHODS
-from gyrofuse.fusion.weights.scale_weights import normalised, resolve_scale_weights
+from gyrofuse.fusion.weights.svo import normalised, resolve_scale_weights
 from gyrofuse.io.recording import Recording
 from gyrofuse.mismatch import diagnose
 from gyrofuse.noise.array_model import ArrayModel

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from gyrofuse._base.checks import check_n_samples, check_positive, check_positive_integer, check_signal
 from gyrofuse._base.linalg import check_positive_definite
 from gyrofuse.fusion.result import SVOResult
-from gyrofuse.fusion.weights.scale_weights import ScaleWeights, resolve_scale_weights
+from gyrofuse.fusion.weights.svo import ScaleWeights, resolve_scale_weights
 from gyrofuse.io.saturation import check_full_scale
 
 _RAMP_STEPS = 8  # in which a sensor that has returned gets its weight back

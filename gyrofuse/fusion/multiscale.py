@@ -44,7 +44,7 @@ from gyrofuse._base.linalg import check_positive_definite
 from gyrofuse.fusion.multiscale_result import MultiScaleResult, fuse_bands
 from gyrofuse.fusion.svo import fit_svo
 from gyrofuse.fusion.uncertainty.cross_fitting import CrossFit, Fusion, cross_fit
-from gyrofuse.fusion.weights.scale_weights import ScaleWeights
+from gyrofuse.fusion.weights.svo import ScaleWeights
 from gyrofuse.io.recording import Recording
 from gyrofuse.wavelets.covariance import binned_products
 from gyrofuse.wavelets.equivalent_dof import degrees_of_freedom

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from gyrofuse._base.checks import check_positive, check_signal
 from gyrofuse._base.results import ConfidenceInterval, listed, named, numbered
-from gyrofuse.fusion.uncertainty import gain
 from gyrofuse.fusion.uncertainty import tests as hypotheses
+from gyrofuse.fusion.uncertainty import variance_reduction
 from gyrofuse.fusion.uncertainty.cross_fitting import CrossFit
-from gyrofuse.fusion.uncertainty.gain import Gain
 from gyrofuse.fusion.uncertainty.tests import EnoughData, Evidence, WeightsTest
+from gyrofuse.fusion.uncertainty.variance_reduction import VarianceReduction
 from gyrofuse.fusion.virtual_gyro import VirtualGyro
 from gyrofuse.fusion.weights.selection import Selection
 from gyrofuse.io.recording import Recording
@@ -199,7 +199,7 @@ class SVOResult(VirtualGyro):
         """
         return hypotheses.enough_data(self._evidence("enough_data"), check_positive("largest_excess", largest_excess))
 
-    def gain_over_equal(self) -> Gain:
+    def gain_over_equal(self) -> VarianceReduction:
         """How many times smaller the wavelet variance is than that of the plain mean, by level, with its interval.
 
         For these weights in any other recording of the array: weights flatter themselves in their own, for which they
@@ -215,14 +215,14 @@ class SVOResult(VirtualGyro):
             raise ValueError(
                 "`gain_over_equal`: expected weights other than equal ones, got method 'equal'; fit with method='svo'"
             )
-        estimate, interval = gain.ratio_to_equal(
+        estimate, interval = variance_reduction.ratio_to_equal(
             self.weights.double(),
             self.wavelet_cross_covariance.double(),
             self.degrees_of_freedom,
             self.cross_fit,
             self.confidence_level,
         )
-        return Gain(
+        return VarianceReduction(
             estimate=estimate,
             confidence_interval=interval,
             confidence_level=self.confidence_level,

@@ -14,8 +14,14 @@ from gyrofuse._base.linalg import check_positive_definite
 from gyrofuse._base.results import listed
 from gyrofuse.fusion.result import fuse
 from gyrofuse.fusion.virtual_gyro import VirtualGyro
-from gyrofuse.fusion.weights.scale_weights import ScaleWeights, normalised, resolve_scale_weights
-from gyrofuse.fusion.weights.svo import combine, counting, optimal_weights
+from gyrofuse.fusion.weights.svo import (
+    ScaleWeights,
+    combine,
+    counting,
+    normalised,
+    optimal_weights,
+    resolve_scale_weights,
+)
 from gyrofuse.io.chunked import LongRecording, Progress, check_long_recording, silent, stretch_of
 from gyrofuse.wavelets.metric import WaveletCrossCovariance
 

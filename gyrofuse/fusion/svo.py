@@ -20,8 +20,7 @@ from gyrofuse.fusion.uncertainty.influence import (
 )
 from gyrofuse.fusion.uncertainty.weights import WeightsSpread, certain, normal_spread, spread_of_weights, unknown
 from gyrofuse.fusion.weights.methods import METHODS, Chosen, choose_weights, judge_weights
-from gyrofuse.fusion.weights.scale_weights import ScaleWeights, normalised, resolve_scale_weights
-from gyrofuse.fusion.weights.svo import combine, counting
+from gyrofuse.fusion.weights.svo import ScaleWeights, combine, counting, normalised, resolve_scale_weights
 from gyrofuse.io.recording import Recording
 from gyrofuse.wavelets import equivalent_dof as uncertainty
 from gyrofuse.wavelets.block_bootstrap import signal_bootstrap

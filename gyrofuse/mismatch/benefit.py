@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.results import cleaned
-from gyrofuse.fusion.weights.scale_weights import ScaleWeights, resolve_scale_weights
-from gyrofuse.fusion.weights.svo import svo_weights
+from gyrofuse.fusion.weights.svo import ScaleWeights, resolve_scale_weights, svo_weights
 from gyrofuse.wavelets.covariance import wavelet_cross_covariance
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gyrofuse._base.checks import same_rate
 from gyrofuse._base.results import cleaned
-from gyrofuse.fusion.weights.scale_weights import ScaleWeights
+from gyrofuse.fusion.weights.svo import ScaleWeights
 from gyrofuse.io.recording import Recording
 from gyrofuse.mismatch.benefit import Benefit, benefit
 from gyrofuse.mismatch.case import Case

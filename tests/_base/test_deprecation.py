@@ -55,6 +55,14 @@ def test_names_that_left_a_module():
         module.chair  # noqa: B018
 
 
+def test_names_that_left_the_package():
+    for name in gyrofuse._MOVED:
+        with pytest.warns(DeprecationWarning, match=rf"gyrofuse\.{name} is deprecated .* use gyrofuse\.") as warned:
+            assert callable(getattr(gyrofuse, name))
+        assert warned[0].filename == __file__
+        assert name not in gyrofuse.__all__
+
+
 def test_arguments_by_their_old_names():
     @renamed_arguments(old="new")
     def double(new: int) -> int:

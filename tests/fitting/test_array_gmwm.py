@@ -20,6 +20,7 @@ from gyrofuse.fitting.array.moments import array_moment_covariance, unvech, vech
 from gyrofuse.fitting.moments import fit as moment_fit
 from gyrofuse.fitting.moments.fit import composition_of
 from gyrofuse.fitting.moments.records import Records
+from gyrofuse.fusion.weights.svo import resolve_scale_weights
 
 N_SAMPLES, N_RUNS = 4096, 200
 WHITE = torch.tensor([[1.0, 0.2, 0.0], [0.2, 0.5, 0.0], [0.0, 0.0, 2.0]], dtype=torch.float64)
@@ -139,7 +140,7 @@ def test_j_test_has_its_size_and_power(many):
 
 def test_weights_from_the_model_lose_less(many):
     levels = many.wavelet_cross_covariance.shape[-3]
-    omega = gf.resolve_scale_weights("long", levels)
+    omega = resolve_scale_weights("long", levels)
     combined = torch.einsum("j,jab->ab", omega, ARRAY.wavelet_cross_covariance(levels))
     best = gf.svo_weights(ARRAY.wavelet_cross_covariance(levels), "long")
 

@@ -17,7 +17,7 @@ from gyrofuse.fusion.weights.baselines import (
     shrinkage_weights,
     shrunk_covariance,
 )
-from gyrofuse.fusion.weights.svo import combine, optimal_weights
+from gyrofuse.fusion.weights.svo import combine, optimal_weights, resolve_scale_weights
 from gyrofuse.wavelets.covariance import wavelet_products
 from gyrofuse.wavelets.equivalent_dof import degrees_of_freedom
 
@@ -197,7 +197,7 @@ def test_shrinkage_halves_the_risk_of_long_scale_weights():
     signal = model.simulate(8192, batch=(60,), generator=torch.Generator().manual_seed(0))
     sums, counts = wavelet_products(signal, 12)
     wccv, degrees = sums / counts, degrees_of_freedom(counts[..., 0, 0])
-    omega = gf.resolve_scale_weights("long", 12)
+    omega = resolve_scale_weights("long", 12)
     truth = combine(model.wavelet_cross_covariance(12), omega)
     best = optimal_weights(truth)
 
@@ -225,7 +225,7 @@ def test_weights_are_never_silently_missing(weights, change, message):
     signal = torch.from_numpy(np.random.default_rng(1).normal(size=(3, 256)))
     wccv = gf.wavelet_cross_covariance(change(signal))
     with pytest.raises(gf.SingularCovarianceError, match=message):
-        weights(wccv, gf.resolve_scale_weights("flat", 8))
+        weights(wccv, resolve_scale_weights("flat", 8))
 
 
 @pytest.mark.parametrize("weights", [gf.inverse_variance_weights, nonnegative_weights])

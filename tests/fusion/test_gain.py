@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gyrofuse import ArrayModel, RandomWalk, WhiteNoise, fit_svo, svo_weights
 from gyrofuse.fusion.uncertainty.cross_fitting import CrossFit
-from gyrofuse.fusion.uncertainty.gain import ratio_to_equal
+from gyrofuse.fusion.uncertainty.variance_reduction import ratio_to_equal
 
 # Studies on recordings; the chance that a true claim is refused.
 N_RUNS, N_SENSORS, N_SAMPLES, REFUSED = 120, 4, 1024, 1e-3

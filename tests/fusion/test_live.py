@@ -23,8 +23,9 @@ from reference import live as naive
 from scipy import stats
 from torch import Tensor
 
-from gyrofuse import ArrayModel, RandomWalk, SVOResult, WhiteNoise, fit_multiscale, fit_svo, wavelet_cross_covariance
+from gyrofuse import ArrayModel, RandomWalk, WhiteNoise, fit_multiscale, fit_svo, wavelet_cross_covariance
 from gyrofuse._base.linalg import SingularCovarianceError
+from gyrofuse.fusion import SVOResult
 from gyrofuse.fusion.live import LiveSVO, subset_weights
 
 N_SENSORS = 4

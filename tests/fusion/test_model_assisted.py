@@ -14,7 +14,7 @@ import gyrofuse as gf
 from gyrofuse._base.linalg import geometric_mean
 from gyrofuse.fusion.weights import model_assisted as assisted
 from gyrofuse.fusion.weights.model_assisted import assisted_covariance
-from gyrofuse.fusion.weights.svo import combine, optimal_weights
+from gyrofuse.fusion.weights.svo import combine, optimal_weights, resolve_scale_weights
 from gyrofuse.wavelets.covariance import wavelet_products
 
 R = torch.tensor([2.8, 1.4, 1.0, 2.0], dtype=torch.float64).diag()
@@ -114,7 +114,7 @@ def test_weights_gain_most_where_the_record_is_short():
     assisted_wccv = assisted_covariance(wccv, counts)
     truth = WALKS.wavelet_cross_covariance(N_LEVELS)
     for scale_weights, most in (("long", 1 / 3), ("flat", 1 / 3), ("short", 1.1)):
-        omega = gf.resolve_scale_weights(scale_weights, N_LEVELS)
+        omega = resolve_scale_weights(scale_weights, N_LEVELS)
         raw, helped = (excess(v, truth, omega) for v in (wccv, assisted_wccv))
         assert helped.mean() < most * raw.mean()
         if most < 1:
@@ -150,7 +150,7 @@ def with_telegraph(n: int) -> tuple[Tensor, Tensor]:
 def test_little_is_lost_where_the_model_does_not_hold(noise):
     signal, truth = noise(50)
     wccv, counts = moments(signal)
-    long = gf.resolve_scale_weights("long", N_LEVELS)
+    long = resolve_scale_weights("long", N_LEVELS)
     middle = torch.exp(-((torch.arange(1, N_LEVELS + 1) - 7) ** 2) / 2).double()
     assisted_wccv = assisted_covariance(wccv, counts)
     for omega, most in ((long, 1 / 2), (middle / middle.sum(), 1.25)):

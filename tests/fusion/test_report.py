@@ -15,7 +15,8 @@ from matplotlib import pyplot as plt
 from pages import Page
 from scipy import stats
 
-from gyrofuse import ConfidenceInterval, MultiScaleResult, Recording, SVOResult, fit_multiscale, fit_svo
+from gyrofuse import ConfidenceInterval, Recording, fit_multiscale, fit_svo
+from gyrofuse.fusion import MultiScaleResult, SVOResult
 from gyrofuse.fusion.report.page import (
     fusion_figure,
     fusion_report,

@@ -7,7 +7,8 @@ import pytest
 import torch
 from reference import haar as naive
 
-from gyrofuse import SVOWeights, fit_svo, resolve_scale_weights, svo_weights, wavelet_cross_covariance
+from gyrofuse import SVOWeights, fit_svo, svo_weights, wavelet_cross_covariance
+from gyrofuse.fusion.weights.svo import resolve_scale_weights
 
 NAMES = ["flat", "short", "long"]
 

@@ -14,8 +14,9 @@ from torch import Tensor
 import gyrofuse as gf
 from gyrofuse.fusion.weights import selection
 from gyrofuse.fusion.weights.selection import CANDIDATES, ESTIMATORS, Selection, select_estimator
+from gyrofuse.fusion.weights.svo import resolve_scale_weights
 
-LONG = gf.resolve_scale_weights("long", N_LEVELS)
+LONG = resolve_scale_weights("long", N_LEVELS)
 
 
 def array(n_sensors: int, n_samples: int, seed: int = 0) -> Tensor:
@@ -66,7 +67,7 @@ def test_folds_are_those_made_by_hand(scale_weights, down, n_fitted):
     [("short", 19, 16, 0), ("long", 19, 16, 3), ("flat", 19, 16, 3), ("long", 10, 7, 3), ("short", 10, 7, 1)],
 )
 def test_scale_weights_move_no_further_than_they_must(name, n_levels, n_block_levels, down):
-    omega = gf.resolve_scale_weights(name, n_levels)
+    omega = resolve_scale_weights(name, n_levels)
     assert selection._levels_down(omega, n_block_levels, 3) == down
 
 
@@ -113,28 +114,28 @@ def test_the_first_candidate_stays_unless_another_is_clearly_better(means, error
 
 def test_too_few_folds_leave_the_last_candidate():
     signal = array(6, 40)
-    got = select_estimator(signal, gf.resolve_scale_weights("long", 5))
+    got = select_estimator(signal, resolve_scale_weights("long", 5))
     assert got.chosen == 2
     assert got.risk.isnan().all()
     assert got.sentence == "Chosen: svo, for the record is too short to hold data out."
     assert got.to_dict()["risk"] == [None, None, None]
-    tiny = select_estimator(signal[:, :5], gf.resolve_scale_weights("long", 2))
+    tiny = select_estimator(signal[:, :5], resolve_scale_weights("long", 2))
     assert (tiny.chosen, tiny.n_folds) == (2, 0)
 
 
 def test_blocks_without_a_sensor_are_left_out():
     signal = array(3, 8 * 512).expand(2, 3, -1).clone()
     signal[1, 1, 512:1024] = torch.nan
-    got = select_estimator(signal, gf.resolve_scale_weights("long", 12))
+    got = select_estimator(signal, resolve_scale_weights("long", 12))
     assert got.n_folds.tolist() == [8, 7]
     assert got.risk.isfinite().all()
-    alone = select_estimator(signal[0], gf.resolve_scale_weights("long", 12))
+    alone = select_estimator(signal[0], resolve_scale_weights("long", 12))
     torch.testing.assert_close(got.risk[0], alone.risk)
 
 
 def test_float32_gives_what_float64_gives():
     signal = array(3, 4096).float()
-    omega = gf.resolve_scale_weights("long", 12)
+    omega = resolve_scale_weights("long", 12)
     single, exact = (select_estimator(s, omega.to(s.dtype)) for s in (signal, signal.double()))
     torch.testing.assert_close(single.risk, exact.risk, rtol=1e-4, atol=0)
     assert single.chosen == exact.chosen
@@ -166,7 +167,7 @@ def test_long_scale_weights_come_close_to_the_best_candidate_and_far_below_svo()
 
 
 def test_well_determined_levels_cost_nothing():
-    short = gf.resolve_scale_weights("short", N_LEVELS)
+    short = resolve_scale_weights("short", N_LEVELS)
     truth = WALKS.wavelet_cross_covariance(N_LEVELS)
     chosen, got, each = chosen_excess(simulated(10, seed=9), truth, short)
     assert got.levels_down == 0
@@ -236,7 +237,7 @@ def test_the_reason_is_one_sentence_and_the_rest_a_table():
 
 
 def test_bad_options_are_told():
-    signal, omega = array(3, 500), gf.resolve_scale_weights("long", 8)
+    signal, omega = array(3, 500), resolve_scale_weights("long", 8)
     with pytest.raises(ValueError, match=r"`candidates`: expected names among model_assisted, .*, got \['best'\]"):
         select_estimator(signal, omega, ["best"])
     with pytest.raises(ValueError, match=r"`candidates`: expected names .* got \[\]"):

@@ -20,10 +20,10 @@ from gyrofuse import (
     equal_weights,
     fit_svo,
     inverse_variance_weights,
-    resolve_scale_weights,
     svo_weights,
     wavelet_cross_covariance,
 )
+from gyrofuse.fusion.weights.svo import resolve_scale_weights
 
 NAMES = ["flat", "short", "long"]
 GENERATOR = np.random.default_rng(11)

@@ -11,7 +11,8 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from gyrofuse import ArrayModel, RandomWalk, SVOResult, WhiteNoise, fit_svo, svo_weights
+from gyrofuse import ArrayModel, RandomWalk, WhiteNoise, fit_svo, svo_weights
+from gyrofuse.fusion import SVOResult
 from gyrofuse.fusion.uncertainty.tests import Evidence, dropped_sensor_test, enough_data, equal_weights_test, verdicts
 
 # Studies on recordings: as many of this length, 6 levels (the last holds 14 to 30 observations); the chance that a true

@@ -19,7 +19,6 @@ from gyrofuse import (
     SingularCovarianceError,
     fit_svo,
     inverse_variance_weights,
-    resolve_scale_weights,
     svo_weights,
     wavelet_cross_covariance,
 )
@@ -30,6 +29,7 @@ from gyrofuse.fusion.uncertainty.influence import (
     bootstrap_inverse_variance_weights_covariance,
     bootstrap_weights_covariance,
 )
+from gyrofuse.fusion.weights.svo import resolve_scale_weights
 from gyrofuse.wavelets import block_bootstrap as bootstrap
 from gyrofuse.wavelets import block_length
 from gyrofuse.wavelets.block_bootstrap import (

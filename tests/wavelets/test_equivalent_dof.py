@@ -11,7 +11,8 @@ from reference import haar as naive
 from scipy import stats
 from torch import Tensor
 
-from gyrofuse import fit_svo, inverse_variance_weights, resolve_scale_weights, svo_weights
+from gyrofuse import fit_svo, inverse_variance_weights, svo_weights
+from gyrofuse.fusion.weights.svo import resolve_scale_weights
 from gyrofuse.wavelets import equivalent_dof as uncertainty
 
 METHODS = {"svo": svo_weights, "inverse_variance": inverse_variance_weights}

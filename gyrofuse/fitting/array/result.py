@@ -23,7 +23,7 @@ from gyrofuse.fitting.array.moments import vech
 from gyrofuse.fitting.moments.records import Records
 from gyrofuse.fitting.structure import Composition
 from gyrofuse.fusion.live import subset_weights
-from gyrofuse.fusion.weights.scale_weights import ScaleWeights
+from gyrofuse.fusion.weights.svo import ScaleWeights
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.estimation import EstimatedFrom
 from gyrofuse.noise.processes import Model, Process

@@ -32,7 +32,7 @@ from torch import Tensor
 from gyrofuse._base.checks import check_floating, check_n_levels, check_positive_integer, check_signal
 from gyrofuse._base.linalg import check_positive_definite
 from gyrofuse.fusion.uncertainty.sweep import Statistic, Sweeps, joined
-from gyrofuse.fusion.weights.scale_weights import ScaleWeights, resolve_scale_weights
+from gyrofuse.fusion.weights.svo import ScaleWeights, resolve_scale_weights
 from gyrofuse.wavelets.block_length import (
     alike,
     bin_means,

@@ -27,7 +27,7 @@ _FEWEST_SPARE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Gain(Answer):
+class VarianceReduction(Answer):
     """How many times smaller the wavelet variance of the virtual gyro is than that of the plain mean, by level.
 
     Attributes:
