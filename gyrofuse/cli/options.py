@@ -217,7 +217,7 @@ class Writing(FileWriting):
 def takes_options(command: Callable[..., None]) -> Callable[..., None]:
     """A command, each of whose parameters of a dataclass is given as one option of the command line for each field."""
     hints = get_type_hints(command, include_extras=True)
-    groups = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
+    groups: dict[str, Any] = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
     parameters = []
     for name, parameter in signature(command).parameters.items():
         if name in groups:

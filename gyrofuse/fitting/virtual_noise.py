@@ -78,7 +78,7 @@ def virtual_noise(weights: Tensor, array: ArrayModel) -> VirtualNoise:
     if len(bands) == 1:
         left = [(process, (bands[0] @ _square(matrix) @ bands[0]).item()) for process, matrix in noise]
         return VirtualNoise(_sum(_scaled(left) + lines), 0.0)
-    own = [process for process, _ in noise if process.has_memory()]
+    own: list[Process] = [process for process, _ in noise if process.has_memory()]
     slowest = max([-1 / math.log(float(process.params[0])) for process in own if process.params[0] > 0], default=1.0)
     octaves = max(len(bands), math.ceil(math.log2(max(slowest, 1.0)))) + _SLOWER
     f = torch.exp2(-1 - (torch.arange(octaves * _NODES, dtype=torch.float64) + 0.5) / _NODES)
@@ -100,7 +100,7 @@ def response(bands: Tensor, f: Tensor) -> Tensor:
     return bands.to(split).mT @ split
 
 
-def _approximated(f: Tensor, spectrum: Tensor, octaves: int, own: list[AR1]) -> tuple[list[Model], float]:
+def _approximated(f: Tensor, spectrum: Tensor, octaves: int, own: list[Process]) -> tuple[list[Model], float]:
     """Processes whose spectra add up to one, by least squares of the relative difference, and how far they are off."""
     times = torch.exp2(torch.arange(octaves * _PER_OCTAVE, dtype=torch.float64) / _PER_OCTAVE)
     units: list[Process] = [WhiteNoise(1.0), QuantizationNoise(1.0), RandomWalk(1.0)]

@@ -3,9 +3,9 @@
     python tests/benchmarks/same_results.py write NEW.json [--data FOLDER]
     python tests/benchmarks/same_results.py compare OLD.json NEW.json [--tolerance 1e-12]
 
-The first form computes WCCV, weights, intervals, fits, rankings and diagnoses of simulated arrays, and of the recordings
-of a folder where one is given, with the install that Python finds. The second lists what differs by more than the
-tolerance, relative to the largest number of its list, and ends with status 1 where something does.
+The first form computes WCCV, weights, intervals, fits, rankings and diagnoses of simulated arrays, and of the
+recordings of a folder where one is given, with the install that Python finds. The second lists what differs by more
+than the tolerance, relative to the largest number of its list, and ends with status 1 where something does.
 """
 
 from __future__ import annotations

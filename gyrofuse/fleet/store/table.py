@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Column(NamedTuple):
-    """Type of a column, `"text"`, `"number"`, `"whole"` number, `"truth"` value, `"texts"` or `"numbers"`; and meaning."""
+    """Type of a column (`"text"`, `"number"`, `"whole"` number, `"truth"`, `"texts"`, `"numbers"`) and its meaning."""
 
     kind: str
     description: str
