@@ -59,7 +59,17 @@ from gyrofuse.io.streams import RecordingError
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.datasheet import Datasheet, datasheet
 from gyrofuse.noise.parsing import model_from_dict, parse_model
-from gyrofuse.noise.processes import AR1, Drift, Model, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
+from gyrofuse.noise.processes import (
+    AR1,
+    Drift,
+    FlickerNoise,
+    Matern32,
+    Model,
+    QuantizationNoise,
+    RandomWalk,
+    Sinusoid,
+    WhiteNoise,
+)
 from gyrofuse.noise.state_space import StateSpace, state_space
 from gyrofuse.wavelets.covariance import CrossCovariance, cross_covariance, wavelet_cross_covariance, wavelet_variance
 from gyrofuse.wavelets.haar import HaarFilterBank, haar_coefficients
@@ -81,12 +91,14 @@ __all__ = [
     "Datasheet",
     "Drift",
     "Finding",
+    "FlickerNoise",
     "GMWMBootstrap",
     "GMWMResult",
     "HaarFilterBank",
     "JointFit",
     "LiveSVO",
     "LongRecording",
+    "Matern32",
     "MismatchReport",
     "Model",
     "MultiScaleSVO",

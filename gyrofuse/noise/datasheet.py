@@ -10,7 +10,7 @@ import torch
 
 from gyrofuse._base import units
 from gyrofuse._base.checks import check_positive
-from gyrofuse.noise.datasheet_units import DatasheetEntry, DatasheetUnits
+from gyrofuse.noise.datasheet_units import BIAS_INSTABILITY, DatasheetEntry, DatasheetUnits
 from gyrofuse.noise.model import check_scalar
 from gyrofuse.noise.processes import Model
 
@@ -77,9 +77,9 @@ def datasheet(model: Model, rate: float, unit: str, *, n_levels: int = _LEVELS) 
     units.unit_factor(unit, sheet.base)
     check_scalar("model", model)
     entries = [entry for p in model.processes for entry in p._datasheet(sheet, **p.values)]
-    return Datasheet(
-        sheet.rate, sheet.unit, (*_random_walk(model, sheet), *entries, *_bias_instability(model, sheet, n_levels))
-    )
+    if not any(entry.name == BIAS_INSTABILITY for entry in entries):
+        entries += _bias_instability(model, sheet, n_levels)
+    return Datasheet(sheet.rate, sheet.unit, (*_random_walk(model, sheet), *entries))
 
 
 def _random_walk(model: Model, sheet: DatasheetUnits) -> Iterator[DatasheetEntry]:
@@ -103,6 +103,6 @@ def _bias_instability(model: Model, sheet: DatasheetUnits, n_levels: int) -> Ite
     later = deviation.flip(0).cummin(0).values.flip(0)[2:]
     lowest = torch.where((inner < deviation[:-2]) & (inner < later), inner, torch.inf)
     if torch.isfinite(lowest).any():
-        yield sheet.bias("bias instability B", units.bias_instability(float(lowest.min())))
+        yield sheet.bias_instability(units.bias_instability(float(lowest.min())))
         averaging = 2.0 ** (int(lowest.argmin()) + 1) / sheet.rate
         yield DatasheetEntry("bias instability reached at", averaging, "s")

@@ -60,6 +60,7 @@ class _Rows(NamedTuple):
     density: str = ""
 
 
+BIAS_INSTABILITY = "bias instability B"
 _HOUR = units.SECONDS_PER_HOUR
 _MICRO_G = units.unit_factor("m/s^2", "ug")
 _ROWS = {
@@ -130,6 +131,10 @@ class DatasheetUnits:
     def quantization(self, variance: float) -> DatasheetEntry:
         """Size of quantisation noise from the variance `q2`."""
         return self._entry(self._rows.quantization, units.quantization(variance, self.rate))
+
+    def bias_instability(self, size: float) -> DatasheetEntry:
+        """Bias instability `B` of IEEE Std 952, from that in the unit of the model."""
+        return self._entry(self._rows.bias, size, BIAS_INSTABILITY)
 
     def bias(self, name: str, size: float) -> DatasheetEntry:
         """What has the unit of the signal, such as a standard deviation."""

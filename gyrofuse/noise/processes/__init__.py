@@ -16,7 +16,9 @@ from gyrofuse.noise.model import Model, SpectralLine
 from gyrofuse.noise.processes.ar1 import AR1
 from gyrofuse.noise.processes.base import Process, States, WhiteAndWalk
 from gyrofuse.noise.processes.drift import Drift
+from gyrofuse.noise.processes.flicker_noise import FlickerNoise
 from gyrofuse.noise.processes.haar_kernel import haar_kernel
+from gyrofuse.noise.processes.matern32 import Matern32
 from gyrofuse.noise.processes.quantization_noise import QuantizationNoise
 from gyrofuse.noise.processes.random_walk import RandomWalk
 from gyrofuse.noise.processes.sinusoid import Sinusoid
@@ -26,6 +28,8 @@ __all__ = [
     "AR1",
     "PROCESSES",
     "Drift",
+    "FlickerNoise",
+    "Matern32",
     "Model",
     "Process",
     "QuantizationNoise",
@@ -42,7 +46,9 @@ __all__ = [
 PROCESSES: tuple[type[Any], ...] = (
     WhiteNoise,
     QuantizationNoise,
+    FlickerNoise,
     AR1,
+    Matern32,
     RandomWalk,
     Drift,
     Sinusoid,

@@ -49,7 +49,7 @@ def haar_kernel_slope(z: Tensor, tau: Tensor) -> Tensor:
     log_m = sum_before(torch.log1p(-loss / 2))
     log_m_slope = sum_before(-loss_slope / (2 - loss))
     between_slope = torch.exp(2 * log_m) * (1 + 2 * z * log_m_slope)
-    return (_within(half, between_slope) - between_slope) / 2
+    return (within_halves(half, between_slope) - between_slope) / 2
 
 
 def compared_halves(half: Tensor, between: Tensor, not_between: Tensor, correlated: Tensor) -> Tensor:
@@ -64,12 +64,12 @@ def compared_halves(half: Tensor, between: Tensor, not_between: Tensor, correlat
     Returns:
         `(..., level)`.
     """
-    within = 1 / half + _within(half, between)
-    not_within = _within(half, not_between)
+    within = 1 / half + within_halves(half, between)
+    not_within = within_halves(half, not_between)
     return torch.where(correlated, not_between - not_within, within - between) / 2
 
 
-def _within(half: Tensor, between: Tensor) -> Tensor:
+def within_halves(half: Tensor, between: Tensor) -> Tensor:
     """Mean correlation of the pairs of different samples of a half, from that between the halves of its parts."""
     return sum_before(half * between) / half
 
