@@ -13,6 +13,8 @@ import pytest
 # Before torch is loaded: tests' matrices are small, and beside other tests a second thread only waits for the first.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+from made_recordings import make_recordings
+
 from gyrofuse.cli import app as cli
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
@@ -28,10 +30,24 @@ os.environ |= {"MALLOC_TRIM_THRESHOLD_": str(_TRIM), "MALLOC_TOP_PAD_": str(_PAD
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The folder `shared` beside the repository, with `data` and `reference`."""
+    """The folder `shared` beside the repository, with the public recordings in `data`."""
     if not SHARED.is_dir():
-        pytest.skip("needs the recordings and published numbers of the folder `shared` beside the repository")
+        pytest.skip("needs the public recordings of the folder `shared` beside the repository")
     return SHARED
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of small recordings in the layout of the public ones."""
+    folder = tmp_path_factory.mktemp("made")
+    make_recordings(folder)
+    return folder
+
+
+@pytest.fixture(params=["made", "recorded"])
+def data(request: pytest.FixtureRequest) -> Path:
+    """A folder of recordings: small ones that are made here, then the public ones."""
+    return request.getfixturevalue("made") if request.param == "made" else request.getfixturevalue("shared") / "data"
 
 
 class Outcome(NamedTuple):

@@ -159,9 +159,9 @@ def test_recordings_that_do_not_go_together(change, message):
         gf.fit_jointly(change([x[:3] for x in recordings()]), "WN + RW")
 
 
-def test_real_replicates(shared):
+def test_real_replicates(data):
     """Three records of one unit at rest: the model of the paper, and whether its parameters stay."""
-    records = [gf.read_recording(shared / "data" / f"adis16405_rec{i}.npz") for i in (1, 2, 3)]
+    records = [gf.read_recording(data / f"adis16405_rec{i}.npz") for i in (1, 2, 3)]
     result = gf.fit_jointly([record.signal[:1, :200_000] for record in records], "WN + AR1 + RW")
     assert bool(result.joint.converged.all())
     # It changes from record to record by many standard deviations, and the joint one lies between.

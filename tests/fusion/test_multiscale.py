@@ -255,11 +255,11 @@ def test_weights_from_one_record_serve_new_data(case, largest):
     assert (worst < single).all()
 
 
-def test_a_real_array_gains_out_of_sample(shared):
+def test_a_real_array_gains_out_of_sample(data):
     """Ten sensors at rest for two minutes: fitted on one half, judged on the other, all three axes."""
-    data = np.load(shared / "data" / "xsensdot10_static.npz")
-    axes = [list(data["channels"]).index(name) for name in ("gx", "gy", "gz")]
-    halves = torch.from_numpy(data["data"][:, axes]).double().transpose(0, 1).chunk(2, -1)
+    file = np.load(data / "xsensdot10_static.npz")
+    axes = [list(file["channels"]).index(name) for name in ("gx", "gy", "gz")]
+    halves = torch.from_numpy(file["data"][:, axes]).double().transpose(0, 1).chunk(2, -1)
     over_equal, over_one = [], []
     for fit_on, judge_on in (halves, halves[::-1]):
         result = fit_multiscale(fit_on)

@@ -389,17 +389,17 @@ def study() -> ModuleType:
     return module
 
 
-def test_untouched_recordings_raise_no_more_alarms_than_stated(shared: Path):
+def test_untouched_recordings_raise_no_more_alarms_than_stated(data: Path):
     """Five sessions of a board of eight gyros, each tested against its own first half: 3 axes, 600 windows."""
-    count, total = study().false_alarms(study().mimu_sessions(shared / "data" / "mimu4444_8imu.npz", 256, 10))
+    count, total = study().false_alarms(study().mimu_sessions(data / "mimu4444_8imu.npz", 256, 10))
     assert total == 600
     assert count <= stats.binom.ppf(1 - REFUSED, total, 0.01)
 
 
-def test_every_sensor_of_a_real_array_is_named(shared: Path):
+def test_every_sensor_of_a_real_array_is_named(data: Path):
     """A bias of three times the noise per sample, in each sensor and axis of the board."""
     fs = study()
-    session = fs.mimu_sessions(shared / "data" / "mimu4444_8imu.npz", 256, 2)[2]
+    session = fs.mimu_sessions(data / "mimu4444_8imu.npz", 256, 2)[2]
     for sensor in range(8):
         signal = fs.inject(session.pieces[:1], "biased", 3.0, sensor, session, 256)
         faults = parity_test(signal, session.reference).faulty[..., 2:, :].any(-2)  # (piece, axis, sensor)

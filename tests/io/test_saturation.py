@@ -74,10 +74,10 @@ def test_a_constant_is_not_saturated():
     assert find_saturation(torch.ones(2, 50)).isinf().all()
 
 
-def test_the_full_scale_of_a_real_array_is_found(shared: Path):
+def test_the_full_scale_of_a_real_array_is_found(data: Path):
     """The gyros of the board saturate at what 16 bits hold when it is turned by hand."""
-    data = np.load(shared / "data" / "mimu4444_8imu.npz")
-    counts = torch.from_numpy(data["exp1"][:, :, 3:].astype(float)).permute(2, 1, 0)  # (axis, sensor, time)
+    file = np.load(data / "mimu4444_8imu.npz")
+    counts = torch.from_numpy(file["exp1"][:, :, 3:].astype(float)).permute(2, 1, 0)  # (axis, sensor, time)
     full_scale = find_saturation(counts)
     found = full_scale[full_scale.isfinite()]
     assert len(found) > 0

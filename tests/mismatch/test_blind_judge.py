@@ -191,9 +191,8 @@ def test_scores_of_sensors_and_intervals():
 
 
 @pytest.mark.parametrize("kind", cases.kinds("real"))
-def test_effects_in_real_recordings(kind, shared):
+def test_effects_in_real_recordings(kind, data):
     """The background is there in counts, the simulation is its continuation, the effect has its size in its noise."""
-    data = shared / "data"
     n = 4096
     case = make_case(kind, 30.0, 5, n_samples=n, data=data)
     again = make_case(kind, 30.0, 5, n_samples=n, data=data)

@@ -369,8 +369,8 @@ def test_a_mixture_of_normal_laws_has_no_lattice_and_one_that_is_rounded_has() -
         assert found.lattices[0].step == pytest.approx(2.0, rel=0.05)
 
 
-def test_contaminated_noise_of_a_real_gyro_is_not_rounded(shared: Path) -> None:
-    recorded = torch.from_numpy(np.load(shared / "data" / "mtig_contaminated_gx.npz")["gyro_x"].astype(np.float64))
+def test_contaminated_noise_of_a_real_gyro_is_not_rounded(data: Path) -> None:
+    recorded = torch.from_numpy(np.load(data / "mtig_contaminated_gx.npz")["gyro_x"].astype(np.float64))
     for first in (0, 300_000):
         part = recorded[None, first : first + 65537]
         simulation = part.std() * normal(1, 1, 65537, g=torch.Generator().manual_seed(21))
