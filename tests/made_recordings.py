@@ -62,10 +62,9 @@ def _board_of_eight() -> dict[str, object]:
 
 
 def _ten_units_at_rest() -> dict[str, object]:
-    """Ten units of unequal noise with random walks, one row of one of them never finite."""
-    size = np.linspace(1, 2, 10)[:, None, None]
-    data = 0.05 * size * _drawn(gf.WhiteNoise(1.0), (10, 6, 14_000), 31)
-    data += 5e-6 * size[::-1] * _drawn(gf.RandomWalk(1.0), (10, 6, 14_000), 32)
+    """Ten units, quieter ones with larger random walks, one row of one of them never finite."""
+    data = np.linspace(0.05, 0.1, 10)[:, None, None] * _drawn(gf.WhiteNoise(1.0), (10, 6, 14_000), 31)
+    data += np.geomspace(4e-3, 2e-4, 10)[:, None, None] * _drawn(gf.RandomWalk(1.0), (10, 6, 14_000), 41)
     data = data.astype(np.float32)
     data[0, :, -1] = np.nan
     return {"data": data, "channels": _GYRO_FIRST, "units": ["deg/s"] * 3 + ["m/s^2"] * 3, "fs": 120.0}

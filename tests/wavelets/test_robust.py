@@ -222,9 +222,9 @@ def test_bad_arguments(arguments, error, match):
         gf.robust_wavelet_variance(**{"signal": noise(1, 300), **arguments})
 
 
-def test_a_recording_with_wild_samples(data):
+def test_a_recording_with_wild_samples(shared):
     """Short levels are inflated up to 2.2 times by spikes; from level 9 on the two agree, the spikes in both."""
-    signal = torch.from_numpy(np.load(data / "mtig_contaminated_gx.npz")["gyro_x"])[None]
+    signal = torch.from_numpy(np.load(shared / "data" / "mtig_contaminated_gx.npz")["gyro_x"])[None]
     ratio = (gf.wavelet_variance(signal, 12) / gf.robust_wavelet_variance(signal, 12))[:, 0]
     assert ratio[0] > 2
     assert (ratio[:8] > 1.05).all()
