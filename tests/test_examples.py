@@ -58,6 +58,7 @@ def test_stream(tmp_path: Path, chunk: int):
     )
 
 
+@pytest.mark.statistical
 def test_blind_bias(tmp_path: Path):
     """A step looks like a random walk thousands of times as large."""
     out = run("blind_bias.py", "--quick", cwd=tmp_path)
@@ -88,6 +89,7 @@ def test_field(tmp_path: Path):
     assert step < 0.01 * naive
 
 
+@pytest.mark.statistical
 def test_real_mismatch(tmp_path: Path, shared: Path):
     out = run("real_mismatch.py", "--data", shared / "data", "--only", "broad", "--out", "found", cwd=tmp_path)
     table = (tmp_path / "found" / "table.md").read_text()
@@ -106,6 +108,7 @@ def test_real_mismatch_names_the_files_that_it_lacks(tmp_path: Path):
     assert "expected a folder with broad_trials.npz" in told
 
 
+@pytest.mark.statistical
 def test_vibration_flight(tmp_path: Path):
     out = run("vibration_flight.py", "--quick", "--figure", "f.png", cwd=tmp_path)
     rows = {line[:46].strip(): [float(cell) for cell in line[46:].split()] for line in out.splitlines()[3:-1]}

@@ -23,6 +23,7 @@ def row(text: str, *start: str) -> list[str]:
     return found
 
 
+@pytest.mark.statistical
 def test_case1(tmp_path: Path):
     done = run("svo_case1.py", "--out", "figures", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -44,6 +45,7 @@ def test_case1(tmp_path: Path):
     assert float(estimate) == pytest.approx(float(truth), rel=0.02)
 
 
+@pytest.mark.statistical
 def test_case2(tmp_path: Path):
     done = run("svo_case2.py", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -58,6 +60,7 @@ def test_case2(tmp_path: Path):
     assert "does not hold" not in conclusions
 
 
+@pytest.mark.statistical
 def test_coverage(tmp_path: Path):
     done = run("svo_coverage.py", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -80,6 +83,7 @@ def test_coverage(tmp_path: Path):
             assert float(row(study.split("by level")[1], str(level))[1]) > 100 * 48 / 60
 
 
+@pytest.mark.statistical
 def test_case_study(shared: Path, tmp_path: Path):
     done = run("svo_case_study.py", "--data", shared / "data", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -13,6 +13,7 @@ from conftest import Run
 from pages import Page
 
 import gyrofuse as gf
+from gyrofuse.mismatch import engine
 
 N, RATE = 2**13, 50.0
 NOISE = gf.WhiteNoise(1.0) + gf.AR1(0.99, 1e-3)
@@ -52,9 +53,18 @@ def test_prints_the_verdict_and_writes_what_is_asked_for(run: Run, log: Path):
     assert page.text.index("Recording and simulation differ") < page.text.index("Vibration tone")
 
 
-def test_a_model_and_options(run: Run, log: Path):
+def test_a_model_and_options(run: Run, log: Path, monkeypatch: pytest.MonkeyPatch):
+    twins: list[int] = []
+
+    def uniform(case: object, n_twins: int, generator: torch.Generator) -> torch.Tensor:
+        twins.append(n_twins)
+        return torch.rand(n_twins, dtype=torch.float64, generator=generator)
+
+    # Half a minute of diagnoses of twins; tests/mismatch/test_engine.py judges what they tell.
+    monkeypatch.setattr(engine, "twin_p_values", uniform)
     done = run("diagnose", log, "--simulation", "model.json", "--sensors", "b", "--rest", "0:100", "--twins", 50)
     assert done.status == 0
+    assert twins == [50]
     assert "vibration_tone" in done.out
     assert "sensor a" not in done.out
     strict = run("diagnose", log, "--simulation", "model.json", "--false-alarm", 1e-300)

@@ -2,9 +2,11 @@
 
 from pathlib import Path
 
+import pytest
 from test_papers import is_png, row, run
 
 
+@pytest.mark.statistical
 def test_array(tmp_path: Path):
     done = run("gmwm_array.py", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -6,6 +6,7 @@ import pytest
 from test_papers import is_png, row, run
 
 
+@pytest.mark.statistical
 def test_ranking(tmp_path: Path):
     done = run("gmwm_ranking.py", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -18,6 +19,7 @@ def test_ranking(tmp_path: Path):
     assert float(row(done.stdout, "mean:", "chosen")[0]) >= 0.8  # of 54
 
 
+@pytest.mark.statistical
 def test_what_a_short_record_does_not_show(tmp_path: Path):
     done = run("gmwm_ranking.py", "--simulation", 3, "--samples", 4000, "--runs", 1, cwd=tmp_path)
     assert done.returncode == 0, done.stderr

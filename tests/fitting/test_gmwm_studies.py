@@ -12,6 +12,7 @@ def verdicts(text: str) -> dict[str, int]:
     return {name: conclusions.count(f": {name}") for name in ("holds", "does not hold")}
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(("number", "n_conclusions"), [(1, 6), (3, 4)])
 def test_simulations(tmp_path: Path, number: int, n_conclusions: int):
     done = run("gmwm_simulations.py", "--simulation", number, cwd=tmp_path)
@@ -30,6 +31,7 @@ def test_simulations(tmp_path: Path, number: int, n_conclusions: int):
     assert float(last.split("would be said to be ")[1].split()[0]) < 0.5
 
 
+@pytest.mark.statistical
 def test_simulation_2_of_a_length(tmp_path: Path):
     done = run("gmwm_simulations.py", "--simulation", 2, "--samples", 2**18, "--runs", 2, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -50,6 +52,7 @@ def test_calibration_names_the_recordings_that_it_needs(tmp_path: Path):
     assert "broad_trials.npz; name it with --data FOLDER" in done.stderr
 
 
+@pytest.mark.statistical
 def test_running_time(tmp_path: Path):
     done = run("gmwm_running_time.py", "--turns", 1, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -57,6 +60,7 @@ def test_running_time(tmp_path: Path):
     assert len(row(done.stdout, "10000")) >= 11
 
 
+@pytest.mark.statistical
 def test_misspecification(tmp_path: Path):
     done = run("gmwm_misspecification.py", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -70,6 +74,7 @@ def test_misspecification(tmp_path: Path):
     assert "J test without tones: rejects 100.0 %" in done.stdout
 
 
+@pytest.mark.statistical
 def test_likelihood(tmp_path: Path):
     done = run("gmwm_likelihood.py", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -82,6 +87,7 @@ def test_likelihood(tmp_path: Path):
         assert ratios == pytest.approx([1, 1], abs=0.5)
 
 
+@pytest.mark.statistical
 def test_calibration(shared: Path, tmp_path: Path):
     done = run("gmwm_calibration.py", "--data", shared / "data", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -100,6 +106,7 @@ def test_calibration_says_which_recordings_it_lacks(tmp_path: Path, arguments: t
     assert message in done.stderr
 
 
+@pytest.mark.statistical
 def test_navigation_emulation(tmp_path: Path):
     done = run("navigation_emulation.py", "--quick", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -239,6 +239,7 @@ def test_with_true_covariances_every_level_is_near_its_best(case, largest):
     assert ratio.max() < largest + 0.005
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(("case", "largest"), [(0, 1.35), (1, 1.25)])
 def test_weights_from_one_record_serve_new_data(case, largest):
     """Mean over records of the largest ratio; the paper's two cases with time compressed 16 times, their 15 levels

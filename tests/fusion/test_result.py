@@ -71,6 +71,7 @@ def test_motion_is_recognised_and_noise_is_not():
     assert fit_svo(turned, elsewhere).motion == ""
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("n_samples", [4096, 5000])
 @pytest.mark.parametrize("walk", [False, True])
 @pytest.mark.filterwarnings("ignore:the block bootstrap trims all levels")

@@ -176,6 +176,7 @@ def fitted(noise: str, kind: str, scale_weights: str) -> SVOResult:
     return fit_svo(recordings(noise, kind), scale_weights, n_levels=N_LEVELS)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("scale_weights", SCALE_WEIGHTS)
 @pytest.mark.parametrize("noise", ["white", "white and walk", "walk"])
 def test_sizes_on_recordings(noise, scale_weights):
@@ -184,6 +185,7 @@ def test_sizes_on_recordings(noise, scale_weights):
     assert (fitted(noise, "idle", scale_weights).test_drop(3).p_value < 0.05).sum() <= at_most(0.05, tests=2)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("scale_weights", SCALE_WEIGHTS)
 def test_levels_of_few_observations_do_not_deceive(scale_weights):
     """All 10 levels, the last of which hold one observation and decide: refusals are no more frequent."""
@@ -193,12 +195,14 @@ def test_levels_of_few_observations_do_not_deceive(scale_weights):
         assert result.enough_data().resolved.double().mean() < 0.05
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("scale_weights", SCALE_WEIGHTS)
 def test_power_on_recordings(scale_weights):
     """Variances of 1, 1, 1.5 and 2, where equal weights cost 9 %, are told from equal ones 9 times in 10."""
     assert fitted("white and walk", "unequal", scale_weights).test_equal().significant.double().mean() > 0.9
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("scale_weights", SCALE_WEIGHTS)
 @pytest.mark.parametrize("noise", ["white", "white and walk", "walk"])
 def test_coverage_of_excesses_on_recordings(noise, scale_weights):

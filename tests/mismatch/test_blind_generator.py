@@ -253,6 +253,7 @@ UNSIZED = ("quantization_bare", "dead_band", "clipping", "stuck_samples", "form:
 SIZES = [k for k in EFFECTS if kinds.KINDS[k].group in ("mechanism", "outside", "form") and k not in UNSIZED]
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("kind", [*SIZES, "pair:bursts_not_spikes"])
 def test_oracle_ratio_has_the_claimed_mean(kind):
     """Mean of 8 log likelihood ratios at 60 nats, within 6 standard errors of the normal law and 8 %.

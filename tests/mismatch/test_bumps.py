@@ -110,6 +110,7 @@ def test_a_line_is_no_bump_and_a_bump_of_both_sides_neither():
     assert strongest_bump(case(both[0], torch.stack(both[1:]))).p_value > 1e-3
 
 
+@pytest.mark.statistical
 def test_modes_of_single_sensors_that_bands_are_too_wide_for():
     # Half as wide as a quarter of an octave, and too weak for a stretch of bins among all of them.
     mode = Mode(0.2, 0.2 / 2 / 15, tensor(*(P * [1.0])).to(torch.complex128), False)
@@ -175,6 +176,7 @@ def test_gains_of_a_mode_are_told_whatever_the_level_of_the_noise():
     torch.testing.assert_close(found, wanted)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(("name", "tone"), [("tone", True), ("one mode", False)])
 def test_a_source_that_all_share_is_a_tone_or_is_not(name: str, tone: bool):
     n_runs, told = 8, 0
@@ -191,6 +193,7 @@ def test_whitened_walks_do_not_jump_where_they_end():
     assert float(white[:, [0, -1]].abs().max()) < 5 * float(white.std())
 
 
+@pytest.mark.statistical
 def test_what_rings_after_a_blow_is_no_mode_and_no_tone():
     after = torch.arange(N, dtype=torch.float64) - 5000
     ring = (-after.clamp(min=0) / 40).exp() * torch.cos(2 * math.pi * 0.21 * after) * (after > 0)

@@ -59,6 +59,7 @@ def test_in_white_noise_it_is_least_squares():
     assert ((sd * math.sqrt(N) - 1).abs() < 0.1).all()
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("common", [0.0, 0.8])
 def test_chance_is_not_a_gain(common):
     g, n_runs = generator(2), 60
@@ -76,6 +77,7 @@ def test_chance_is_not_a_gain(common):
     assert abs(mean - 12) < 4 * math.sqrt(24 / n_runs) + 0.4
 
 
+@pytest.mark.statistical
 def test_a_gain_of_thirty_nats_is_found_with_limits_that_hold():
     g, found, held, stated = generator(3), 0, 0, 0
     for _ in range(25):
@@ -112,6 +114,7 @@ def test_a_square_is_told_from_a_gain():
     assert channel_witness(both).p_value < LEVEL
 
 
+@pytest.mark.statistical
 def test_a_number_times_the_square_is_found_where_a_matrix_is_not():
     g, found, by_chance = generator(10), 0, 0
     for _ in range(15):
@@ -149,6 +152,7 @@ def test_the_square_of_one_axis_is_told_with_its_sign():
     assert stats.binom.cdf(held, told, 0.95) > 1e-3, f"{held} of {told}"
 
 
+@pytest.mark.statistical
 def test_a_slow_rate_is_judged_with_as_much_doubt_as_the_simulation_leaves():
     g, n_runs, hits, found = generator(11), 40, 0, 0
     rate = torch.sin(2 * math.pi * 5 * torch.arange(N, dtype=torch.float64) / N)[None]
@@ -178,6 +182,7 @@ def test_a_slow_rate_is_seen_where_the_simulation_is_too_short_to_say_anything()
     assert entry.low < 1e6 * float(gains[0, 0]) < entry.high
 
 
+@pytest.mark.statistical
 def test_slow_noise_that_is_louder_than_the_simulation_says_is_no_gain():
     g, n_runs, hits = generator(16), 60, 0
     t = torch.arange(N, dtype=torch.float64) / N
@@ -333,6 +338,7 @@ def test_a_simulation_needs_the_channel_for_its_whole_length():
         GSensitivity("acceleration", torch.ones(4, 3).double()).simulated(torch.zeros(4, N + 1).double(), both.scene, g)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("unit", ["deg/s", "rad/s", "unknown"])
 @pytest.mark.parametrize(
     ("mechanism", "beyond"), [(GSensitivity, 20.0), (QuadraticCoupling, 10.0)], ids=["linear", "quadratic"]

@@ -77,6 +77,7 @@ def test_the_best_slope_is_the_frequency_of_the_tone():
     assert abs(energy / (N / 4 / 0.01) - 1) < 0.2
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("channel", [False, True])
 def test_one_clock_does_not_slip(channel):
     g, n_runs = generator(3), 40
@@ -86,6 +87,7 @@ def test_one_clock_does_not_slip(channel):
     assert min(values) > 1e-4
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("channel", [False, True])
 def test_a_skew_is_found_in_its_sensors_with_limits_that_hold(channel):
     g, held, n_runs, true = generator(4), 0, 15, 80e-6

@@ -96,6 +96,7 @@ def walking(seed: int, *, common: bool, steps: bool) -> torch.Tensor:
     return torch.cat([walk, torch.zeros(SENSORS - 2, N, dtype=torch.float64)])
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("common", [True, False])
 def test_several_steps_may_look_like_slow_noise_and_slow_noise_does_not_look_like_steps(common: bool):
     gain = torch.tensor([1.0, -0.7, 0.0, 0.0], dtype=torch.complex128)
@@ -183,6 +184,7 @@ def test_a_better_look_alike_takes_the_place():
     assert after.finding.instead.mechanism == "step"
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("walk", [0.0, 1e-4])
 def test_limits_of_a_tone_hold_though_its_phase_walks(walk: float):
     """Twenty tones each: fifteen within 95 % limits or fewer would come once in thousands."""
@@ -200,6 +202,7 @@ def test_limits_of_a_tone_hold_though_its_phase_walks(walk: float):
     assert hits > 15
 
 
+@pytest.mark.statistical
 def test_a_line_that_wanders_is_told_once_and_not_as_tones():
     """Each of the tones that were found in it lost to a bump by hundreds of nats, and kept its name."""
     n, g = 12_007, generator(1)
@@ -362,6 +365,7 @@ def test_the_highest_place_near_a_frequency_is_the_line():
     assert abs(line_near(case, 0.1236, 0.001) - 0.1234) < 1 / N
 
 
+@pytest.mark.statistical
 def test_noise_that_a_simulator_of_white_noise_lacks_leaves_a_better_one():
     white = gf.WhiteNoise(1.0)
     recording = (white + gf.AR1(0.9, 2e-2)).simulate(N, batch=(3,), generator=generator(4))

@@ -68,6 +68,7 @@ def at_most(n, p, chance=1e-3):
 # how far spectra may be off
 
 
+@pytest.mark.statistical
 def test_log_spectra_of_fits_scatter_by_what_is_said():
     # Of 120 records variances are known to 13 %.
     many = gf.fit_gmwm(record(2 * SHORT, 5, 120), FORMULA)
@@ -147,6 +148,7 @@ def test_shapes_are_weighed_by_the_inverse_covariance_and_by_what_lies_outside_t
         torch.testing.assert_close(errors.outside(outside[:, None].expand(-1, 2, -1))[:, i], outside)
 
 
+@pytest.mark.statistical
 def test_the_parameters_chi_square_has_the_law_of_chance():
     p = [parameters_p_value(against_another(s)) for s in range(N_RUNS)]
     assert 0.15 < sum(p) / len(p) < 0.85
@@ -166,6 +168,7 @@ def test_a_model_fitted_to_a_shorter_record_raises_no_alarm_by_its_spectra():
     assert sum(p < 0.01 for p in bands) <= at_most(N_RUNS, 0.01)
 
 
+@pytest.mark.statistical
 def test_a_model_says_nothing_of_what_is_slower_than_the_record_it_was_fitted_to():
     """There a walk that it hardly shows, and that is fitted too large by chance, would stand over everything else."""
     slow = gf.parse_model("WN(variance=1.0) + AR1(phi=0.9995, variance=4e-7) + RW(variance=2e-7)")

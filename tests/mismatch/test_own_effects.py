@@ -63,6 +63,7 @@ def noise_like(change: Callable[[Tensor], Tensor]) -> gf.ArrayModel:
     return gf.ArrayModel.from_sensors(sensors)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(
     ("change", "mechanism"),
     [(following(3.0), "g_sensitivity"), (stepping(2.0), "step"), (dead, "quantization"), (rounded, "quantization")],
@@ -81,6 +82,7 @@ def test_a_simulation_that_was_repaired_is_not_repaired_again(change: Callable[[
     assert not gf.diagnose(given, recording(samples)).mismatch
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(("change", "kind"), [(following, GSensitivity), (stepping, Step)])
 def test_more_than_the_simulation_has_is_the_difference(change: Callable[[float], Callable[[Tensor], Tensor]], kind):
     given = recording(change(5.0)(drawn(11)))
@@ -96,6 +98,7 @@ def test_more_than_the_simulation_has_is_the_difference(change: Callable[[float]
             assert entry.low < entry.value < entry.high
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("change", [following(0.3), stepping(2.0)])
 def test_a_simulation_without_the_effect_is_not_said_to_have_it(change: Callable[[Tensor], Tensor]):
     """Chance gives any number some gain in a simulation that knows nothing of it."""
@@ -109,6 +112,7 @@ def test_a_simulation_without_the_effect_is_not_said_to_have_it(change: Callable
     assert said == 0
 
 
+@pytest.mark.statistical
 def test_a_simulation_with_the_effect_is_seldom_doubted():
     false_alarms = 0
     for seed in range(20):
@@ -118,6 +122,7 @@ def test_a_simulation_with_the_effect_is_seldom_doubted():
     assert false_alarms <= 2  # of 20 at 1 %: one in a thousand
 
 
+@pytest.mark.statistical
 def test_a_model_of_samples_is_no_surer_than_they_were():
     false_alarms = 0
     for seed in range(20):

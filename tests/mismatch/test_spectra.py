@@ -121,6 +121,7 @@ def test_the_model_of_a_dictionary_has_its_spectrum():
     assert ((again / fitted - 1).abs() / sd)[:, 3:].max() < 5
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("shared_noise", [0.0, 0.9])
 def test_lines_are_not_found_where_there_are_none(shared_noise):
     n, n_runs = 4096, 200

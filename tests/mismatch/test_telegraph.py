@@ -176,6 +176,7 @@ def test_blocks_get_shorter_where_levels_change_faster_than_the_spectrum_had_it(
     assert found.means.block < first.means.block
 
 
+@pytest.mark.statistical
 def test_beside_a_sensor_that_jumps_another_one_needs_less() -> None:
     """Of weaker levels, a nat over the Gaussian rival, that would not do alone."""
     case, g = telegraph(33), torch.Generator().manual_seed(2033)
@@ -200,6 +201,7 @@ def test_one_event_beside_a_sensor_that_jumps_is_no_telegraph(monkeypatch: pytes
     assert nominated(case, RandomTelegraph).sensors == (1,)
 
 
+@pytest.mark.statistical
 def test_two_levels_are_named_where_noise_is_coloured() -> None:
     within, named, seeds = 0, 0, range(10, 14)
     for seed in seeds:
@@ -218,6 +220,7 @@ def test_two_levels_are_named_where_noise_is_coloured() -> None:
     assert within >= 3 * named - 3
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("half", [3.0, 30.0])
 def test_loud_jumps_are_measured_though_their_likelihood_is_a_narrow_peak(half: float) -> None:
     g = torch.Generator().manual_seed(60)

@@ -47,6 +47,7 @@ def test_a_track_is_found_by_what_the_whole_record_has_in_phase(n: int, nats: fl
     assert found.p_value < 1e-3
 
 
+@pytest.mark.statistical
 def test_few_tracks_are_lost_among_all_that_noise_has() -> None:
     n, found = 65536, 0
     for seed in range(8):
@@ -58,6 +59,7 @@ def test_few_tracks_are_lost_among_all_that_noise_has() -> None:
     assert found >= 6
 
 
+@pytest.mark.statistical
 def test_the_ends_of_a_strong_track_are_as_good_as_can_be() -> None:
     n, amplitude, of_bound = 16384, 0.17, []
     t = torch.arange(n, dtype=torch.float64) / n
@@ -88,6 +90,7 @@ def test_gamma_tails_hold_where_they_are_tiny() -> None:
         assert got[0] == 0.0
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("n_sensors", [1, 3])
 def test_noise_shows_no_track_more_often_than_it_says(n_sensors: int) -> None:
     p_values = [tracks.strongest_sweep(noise(seed, n_sensors, 4096)).p_value for seed in range(40)]

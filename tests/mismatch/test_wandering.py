@@ -26,6 +26,7 @@ def wandering(g: torch.Generator, width: float = WIDTH) -> torch.Tensor:
     return math.sqrt(2) * torch.cos(2 * math.pi * (0.2 + speed).cumsum(-1))
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("tone", [True, False])
 def test_weak_ones_are_told_apart(tone: bool):
     n_runs, right, wrong, seen = 8, 0, 0, 0
@@ -46,6 +47,7 @@ def test_weak_ones_are_told_apart(tone: bool):
     assert wrong == 0
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("tone", [True, False])
 def test_strong_ones_are_told_apart_that_hardly_wander(tone: bool):
     """Of a bump a few bins wide the envelope has a few independent values, but no noise is as steady as a tone."""

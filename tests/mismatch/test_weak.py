@@ -70,6 +70,7 @@ def test_nothing_is_seen_in_noise_even_if_sensors_share_it() -> None:
     assert false <= 6
 
 
+@pytest.mark.statistical
 def test_shocks_too_weak_for_any_sensor_alone_are_named() -> None:
     named = inside = 0
     for seed in range(6):
@@ -211,6 +212,7 @@ def test_the_level_that_the_simulation_has_is_the_rule() -> None:
     assert all(found.parameters[f"factor[{i}]"].value > 1.1 for i in range(3))
 
 
+@pytest.mark.statistical
 def test_what_a_shorter_simulation_cannot_show_is_not_found_again() -> None:
     recording, simulation, g = drawn(700)
     recording[:, 5000:11000] *= 1.2
@@ -327,6 +329,7 @@ def test_a_hidden_lattice_of_one_sensor_is_looked_for_in_the_others() -> None:
     assert sum(2 in sensors for sensors in found) <= 2
 
 
+@pytest.mark.statistical
 def test_a_hidden_lattice_that_no_sensor_shows_alone_is_seen_in_all_of_them_together() -> None:
     """Each of six has 5 nats, n exp(-4 pi^2 blur^2 V / (V + blur^2)), V = 13/12, where a search would want 14."""
     alone, together, nothing = [], [], []
@@ -346,6 +349,7 @@ def test_a_hidden_lattice_that_no_sensor_shows_alone_is_seen_in_all_of_them_toge
     assert sum(p < 0.05 for p in nothing) <= 3  # four of ten have probability 1e-3
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("kind", ["an episode", "half and half", "outliers", "heavy tails", "common noise"])
 def test_noise_that_is_no_gaussian_of_one_sd_is_no_lattice(kind: str) -> None:
     """Its quiet or middle part has a characteristic function that reaches further than its variance says."""
@@ -385,6 +389,7 @@ def test_the_ratio_of_a_lattice_that_some_sensors_have_has_mean_one() -> None:
     torch.testing.assert_close(some_of(own), naive)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("share", [0.5, 1, 1.5, 2])
 def test_a_strong_episode_is_the_only_difference_whatever_the_simulation_s_length(share: float):
     """It lies at the same share of a longer or shorter simulation, and other witnesses look at noise without it."""
@@ -402,6 +407,7 @@ def test_a_strong_episode_is_the_only_difference_whatever_the_simulation_s_lengt
     assert all(told[f"factor[{i}]"].value == pytest.approx(1.69, rel=0.08) for i in range(3))
 
 
+@pytest.mark.statistical
 def test_strong_noise_that_goes_up_and_down_is_no_episode():
     n = 32_768
     t = torch.arange(n, dtype=torch.float64)
