@@ -223,14 +223,14 @@ class Model:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers and lists that `model_from_dict` reads back."""
-        plain: dict[str, Any] = {
+        description: dict[str, Any] = {
             "processes": [
                 {"process": type(p).__name__, **{k: plain(v) for k, v in p.parameters.items()}} for p in self.processes
             ]
         }
         if self.estimated_from is not None:
-            plain["estimated_from"] = self.estimated_from.to_dict()
-        return plain
+            description["estimated_from"] = self.estimated_from.to_dict()
+        return description
 
     def __add__(self, other: Model) -> Model:
         return Model([self, other]) if isinstance(other, Model) else NotImplemented
