@@ -28,10 +28,10 @@ def write_recordings() -> None:
     noise = gf.parse_model("WN(variance=1) + RW(variance=1e-4)")
     array = noise.simulate(2000, batch=(4,), generator=generator)
     gf.Recording(array, rate=100.0, unit="deg/s").save("array.npz")
-    imu = noise.simulate(4096, batch=(3, 1), generator=generator)
+    imu = noise.simulate(2000, batch=(3, 1), generator=generator)
     gf.Recording(imu, rate=100.0, unit="deg/s", sensors=("imu",), axes=("x", "y", "z")).save("imu.npz")
-    measured, simulated = noise.simulate(8192, batch=(2, 3), generator=generator)
-    tone = 0.2 * torch.sin(2 * math.pi * 12.5 * torch.arange(8192) / 100)
+    measured, simulated = noise.simulate(4096, batch=(2, 3), generator=generator)
+    tone = 0.3 * torch.sin(2 * math.pi * 12.5 * torch.arange(4096) / 100)
     gf.Recording(measured + tone, rate=100.0, unit="deg/s").save("measured.npz")
     gf.Recording(simulated, rate=100.0, unit="deg/s").save("simulated.npz")
 
@@ -134,6 +134,6 @@ def test_python_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 def test_links_between_documents_lead_somewhere():
     for path in DOCUMENTS:
-        for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)\s]*)?\)", path.read_text()):
+        for target in re.findall(r"(?:\]\(|src=\")([^)\"#\s]+)", path.read_text()):
             if "://" not in target:
                 assert (path.parent / target).exists(), f"{path.relative_to(ROOT)} links to {target}"
