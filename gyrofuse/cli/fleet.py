@@ -14,14 +14,7 @@ import typer
 
 from gyrofuse._base.checks import check_positive_integer
 from gyrofuse.cli.console import progress_bar, say, warn
-from gyrofuse.cli.options import (
-    METHOD_NAMES,
-    FileReading,
-    Writing,
-    chosen,
-    scale_weights_of,
-    takes_options,
-)
+from gyrofuse.cli.options import METHOD_NAMES, FileReading, Writing, chosen, scale_weights_of, takes_options
 from gyrofuse.cli.reading import read_model
 from gyrofuse.fleet.workers import begin_imports
 from gyrofuse.io.recording import read_recording
@@ -143,14 +136,13 @@ def fleet(
         store.open(force=writing.force)
         try:
             with _watched(store, len(data.logs), group):
-                limit = timeout or None
                 run_fleet(
                     asked,
                     data,
                     store,
                     devices=devices,
                     accelerator=accelerator,
-                    timeout=limit,
+                    timeout=timeout or None,
                     retry=retry,
                     report=warn,
                 )

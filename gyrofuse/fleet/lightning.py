@@ -46,8 +46,7 @@ class GyroArrayDataModule(LightningDataModule):
             are fitted together: more than one pays where logs are many and short.
         num_workers: Number of processes that read ahead.
         done: Identities of logs (`ResultStore.done`) that are left out, though the others stay in their groups.
-        **options: Keyword arguments of `read_recording`: `axis`, `sensors`, `rate`, `unit`, `scale`, `key`, `mounting`,
-        `max_bytes`.
+        **options: Keyword arguments of `read_recording`, such as `axis`, `sensors`, `rate` and `unit`.
 
     Raises:
         FileNotFoundError: A name without files.

@@ -40,7 +40,7 @@ def identity(log: str | Path) -> str:
 
 
 def as_text(text: str) -> str:
-    r"""Text with what UTF-8 cannot hold written out: bytes of file names as `\xff`, lone surrogates as `\ud800`."""
+    r"""Valid UTF-8 of a text: bytes of names of files are written out as `\xff`, lone surrogates as `\ud800`."""
     try:
         return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
     except UnicodeEncodeError:  # surrogates that stand for no byte

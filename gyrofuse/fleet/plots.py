@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gyrofuse._base.axes import BLUE, DASHED, FRAME, as_array, clean_name, finish, new_axes
-from gyrofuse._base.deprecation import moved_names
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -88,9 +87,3 @@ def _whole() -> Locator:
     from matplotlib.ticker import MaxNLocator
 
     return MaxNLocator(integer=True)
-
-
-__getattr__ = moved_names(
-    __name__,
-    {"plot_course": f"{__name__}.plot_weights_over_logs", "plot_spread": f"{__name__}.plot_distribution"},
-)

@@ -157,18 +157,11 @@ def _courses(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     """Figures of weights over the logs of arrays that have several."""
     good = [row for row in rows if row["status"] == "ok"]
     several = [(name, own) for name, own in arrays_of(good).items() if len(own) >= FEWEST_IN_TIME]
-    return [
-        {
-            "name": name,
-            "figure": image(
-                7,
-                3.2,
-                _on_axes,
-                partial(plot_weights_over_logs, [row["weights"] for row in own], names=own[0]["sensors"]),
-            ),
-        }
-        for name, own in several[:_MOST_COURSES]
-    ]
+    courses = []
+    for name, own in several[:_MOST_COURSES]:
+        draw = partial(plot_weights_over_logs, [row["weights"] for row in own], names=own[0]["sensors"])
+        courses.append({"name": name, "figure": image(7, 3.2, _on_axes, draw)})
+    return courses
 
 
 def _on_axes(figure: Figure, draw: Any) -> None:

@@ -122,13 +122,12 @@ def rows_of(task: Task, logs: Sequence[Log]) -> list[Row]:
     """
     outcomes: dict[str, _Outcome] = {log.name: _Outcome(error=log.error) for log in logs}
     for group in _alike(logs):
-        together = _together(task, [recording for _, recording in group])
-        if together is None:
-            for name, recording in group:
-                outcomes[name] = _alone(task, recording)
-            continue
-        for (name, _), outcome in zip(group, together, strict=True):
-            outcomes[name] = outcome
+        names, recordings = zip(*group, strict=True)
+        found = _attempt(task, recordings)
+        if len(group) > 1 and any(outcome.error or outcome.warned for outcome in found):
+            # Which recording an error or a warning is of is not known.
+            found = [outcome for recording in recordings for outcome in _attempt(task, [recording])]
+        outcomes |= dict(zip(names, found, strict=True))
     return [row for log in logs for row in _whole_rows(log, outcomes[log.name])]
 
 
@@ -140,29 +139,17 @@ def _alike(logs: Sequence[Log]) -> Iterable[list[tuple[str, Recording]]]:
     return groups.values()
 
 
-def _together(task: Task, recordings: Sequence[Recording]) -> list[_Outcome] | None:
-    """Outcomes of several recordings together; None if there is an error or a warning."""
-    if len(recordings) == 1:
-        return None
+def _attempt(task: Task, recordings: Sequence[Recording]) -> list[_Outcome]:
+    """Outcomes of recordings that are worked on together; each has the error and the warnings of all."""
+    rows: list[list[Row]] = [[] for _ in recordings]
+    error = None
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
             rows = task.rows(recordings)
-        except Exception:
-            return None
-    if caught:  # which recording a warning is of is not known
-        return None
-    return [_Outcome(own) for own in rows]
-
-
-def _alone(task: Task, recording: Recording) -> _Outcome:
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        try:
-            (rows,) = task.rows([recording])
-        except Exception as error:
-            return _Outcome(error=_message(error), warned=[str(w.message) for w in caught])
-    return _Outcome(rows, warned=[str(w.message) for w in caught])
+        except Exception as failure:
+            error = _message(failure)
+    return [_Outcome(own, error, [str(w.message) for w in caught]) for own in rows]
 
 
 def _whole_rows(log: Log, outcome: _Outcome) -> list[Row]:

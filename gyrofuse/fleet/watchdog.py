@@ -16,7 +16,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
-from gyrofuse._base.deprecation import moved_names
 from gyrofuse.fleet.store.sealed import draft_in
 from gyrofuse.fleet.store.table import identity_in
 
@@ -140,10 +139,9 @@ def settle(folder: Path, ended: Sequence[int] | None = None) -> list[CrashReport
                 # so that logs are taken alone only if the crash is certain or repeated.
                 apart = sure or times >= _MAX_CRASHES
                 known[log] = Suspect(*state, 0 if apart else times, apart)
-                words = "was worked on with others when their process ended"
-                found.append(
-                    CrashReport(place, f"{words}; tried again{' alone' if apart else ''} after the others", False)
-                )
+                again = "tried again alone" if apart else "tried again"
+                words = f"was worked on with others when their process ended; {again} after the others"
+                found.append(CrashReport(place, words, False))
             elif late:
                 words = (
                     f"took longer than {timeout:g} s; --timeout (`timeout`) gives more, with --retry it is tried again"
@@ -180,6 +178,3 @@ def forget(folder: Path) -> None:
 def _remove(note: Path) -> None:
     with suppress(OSError):  # Windows removes no file of a process that lives
         note.unlink()
-
-
-__getattr__ = moved_names(__name__, {"Finding": f"{__name__}.CrashReport", "Watch": f"{__name__}.Watchdog"})

@@ -23,14 +23,7 @@ from torch import Tensor
 
 from gyrofuse._base.checks import check_positive
 from gyrofuse._base.deprecation import moved_names, renamed_arguments
-from gyrofuse.navigation.attitude import (
-    conjugate,
-    from_rotation_vector,
-    matrix,
-    multiply,
-    rotate,
-    rotation_vector,
-)
+from gyrofuse.navigation.attitude import conjugate, from_rotation_vector, matrix, multiply, rotate, rotation_vector
 from gyrofuse.navigation.covariance import (
     ATTITUDE,
     N_NAVIGATION,

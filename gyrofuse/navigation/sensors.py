@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.checks import check_positive
-from gyrofuse._base.deprecation import moved_names
 from gyrofuse.noise.model import Model
 from gyrofuse.noise.state_space import StateSpace, state_space
 
@@ -84,6 +83,3 @@ def _simulated(model: Model, n_samples: int, n_flights: int, generator: torch.Ge
             states += [path] if n_states == 1 else [torch.full_like(path, torch.nan)] * n_states
     stacked = torch.stack(states, -1) if states else total.new_zeros(*total.shape, 0)
     return Axes(total.permute(1, 2, 0), stacked.permute(1, 2, 0, 3))
-
-
-__getattr__ = moved_names(__name__, {"Drawn": "gyrofuse.navigation.sensors.ErrorSamples"})

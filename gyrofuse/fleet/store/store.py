@@ -44,7 +44,7 @@ _KEY = ["log", "path", "size", "modified", "status"]  # columns that identify a 
 
 
 class _Source(NamedTuple):
-    """File with the rows of a log, its time (ns since 1970), whether the log is unchanged, and whether it worked."""
+    """File with the rows of a log, its time in ns since 1970, and whether the log is unchanged and could be used."""
 
     path: Path
     written: int

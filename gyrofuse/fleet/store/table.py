@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Column(NamedTuple):
-    """Type of a column (`"text"`, `"number"`, `"whole"` number, `"truth"`, `"texts"`, `"numbers"`) and its meaning."""
+    """Type of a column (`"text"`, `"number"`, `"whole"`, `"truth"`, `"texts"` or `"numbers"`) and its meaning."""
 
     kind: str
     description: str
