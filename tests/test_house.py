@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 import gyrofuse
-from gyrofuse.noise.model import Process
+from gyrofuse.noise.processes.base import Process
 
 PACKAGE = Path(__file__).resolve().parents[1] / "gyrofuse"
 
