@@ -97,7 +97,7 @@ def main() -> None:
     fabric.launch()
 
     source = Blocks(arguments.samples, arguments.seed)
-    recording = gf.LongRecording(source, N_SENSORS, arguments.samples, rate=RATE, unit="deg/s")
+    recording = gf.ChunkedRecording(source, N_SENSORS, arguments.samples, rate=RATE, unit="deg/s")
     before = peak_memory()
     fabric.barrier()
     began = time.perf_counter()

@@ -52,8 +52,9 @@ from gyrofuse.fusion.weights.baselines import (
 )
 from gyrofuse.fusion.weights.rdvg import rdvg_weights
 from gyrofuse.fusion.weights.svo import SVOWeights, svo_weights
-from gyrofuse.io.chunked import LongRecording, open_long, stretch_of
-from gyrofuse.io.recording import Recording, read_recording
+from gyrofuse.io.chunked import ChunkedRecording, open_recording, shard_bounds
+from gyrofuse.io.reading import read_recording
+from gyrofuse.io.recording import Recording
 from gyrofuse.io.saturation import mask_saturated
 from gyrofuse.io.streams import RecordingError
 from gyrofuse.noise.array_model import ArrayModel
@@ -97,7 +98,7 @@ __all__ = [
     "HaarFilterBank",
     "JointFit",
     "LiveSVO",
-    "LongRecording",
+    "ChunkedRecording",
     "Matern32",
     "MismatchReport",
     "Model",
@@ -131,7 +132,7 @@ __all__ = [
     "model_from_dict",
     "moment_covariance",
     "nonnegative_weights",
-    "open_long",
+    "open_recording",
     "parity_test",
     "parse_model",
     "rank_models",
@@ -141,7 +142,7 @@ __all__ = [
     "shrinkage_weights",
     "state_space",
     "stream_svo",
-    "stretch_of",
+    "shard_bounds",
     "subset_weights",
     "svo_weights",
     "to_c_header",
@@ -165,6 +166,9 @@ _LAZY = {
 
 # Names that have left, and where they are now.
 _MOVED = {
+    "LongRecording": "gyrofuse.io.chunked.ChunkedRecording",
+    "open_long": "gyrofuse.io.chunked.open_recording",
+    "stretch_of": "gyrofuse.io.chunked.shard_bounds",
     **{
         name: f"gyrofuse.fusion.{name}"
         for name in (

@@ -1,4 +1,4 @@
-"""Writers of small logs in every format, from made-up arrays of gyros.
+"""Writers of small logs in every format, from made-up arrays of gyros, and their readers with some options.
 
 Every writer takes `gyro (device, 3, time)` in rad/s and, where the format has a clock, `stamps (time,)` in integer
 nanoseconds; device `i` is named `imu{i}` where the format can say so.
@@ -8,18 +8,32 @@ from __future__ import annotations
 
 import shutil
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gyrofuse.io.formats.request import Request
+from gyrofuse.io.quantities import QUANTITY
+from gyrofuse.io.streams import Stream
+
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 
 MAT73_HEADER = b"MATLAB 7.3 MAT-file, Platform: GLNXA64, Created on: Mon Jan  1 00:00:00 2024 HDF5 schema 1.00 ."
 IMU = "sensor_msgs/msg/Imu"
+
+
+def request(path: Path, quantity: str = "rate", **options: Any) -> Request:
+    """Return the request for a log, with the quantity by its name."""
+    return Request(path, quantity=QUANTITY[quantity], **options)
+
+
+def read_with(reader: Callable[[Request], list[Stream]], path: Path, **options: Any) -> list[Stream]:
+    """Return the streams that a reader finds in a log; options as `request`."""
+    return reader(request(path, **options))
 
 
 def made_up(n_devices: int = 2, n_samples: int = 60, seed: int = 0) -> Array:

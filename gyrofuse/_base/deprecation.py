@@ -52,6 +52,8 @@ _MODULES = {
     "hypotheses": "fusion.uncertainty.tests",
     "influence": "fusion.uncertainty.influence",
     "intervals": "wavelets.intervals",
+    "io.notes": "io.streams",
+    "io.resample": "io.align",
     "io.stream": "io.streams",
     "joint": "fitting.joint",
     "lightning_module": "fleet.lightning",

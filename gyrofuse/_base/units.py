@@ -1,4 +1,4 @@
-"""Units, and from parameters per sample to those of datasheets (IEEE Std 952 and 1293) and back.
+"""Units, and conversion between parameters per sample and those of datasheets (IEEE Std 952 and 1293).
 
 With `rate` in Hz and a unit `u` of rate or acceleration (such as deg/s): per-sample variances are in u^2, angle random
 walk `N` (of an accelerometer: velocity random walk) in u/sqrt(Hz), rate random walk `K` in u/s/sqrt(Hz), quantisation
@@ -12,25 +12,28 @@ from collections.abc import Mapping
 
 SECONDS_PER_HOUR = 3600.0
 ARCSECONDS_PER_DEGREE = 3600.0
-GRAVITY = 9.80665  # m/s^2, standard
+GRAVITY = 9.80665  # standard acceleration of gravity in m/s^2, by definition (CGPM 1901): a unit g
+_PREFIX = {"": 1.0, "m": 1e-3, "u": 1e-6, "n": 1e-9}  # SI prefixes
 
+# Size of each unit of time in seconds, of rate in deg/s, of acceleration in m/s^2.
+SECONDS_PER = {f"{prefix}s": size for prefix, size in _PREFIX.items()}
 _DEG_PER_S = {
-    "deg/s": 1.0,
-    "mdeg/s": 1e-3,
+    "deg/s": _PREFIX[""],
+    "mdeg/s": _PREFIX["m"],
     "deg/h": 1 / SECONDS_PER_HOUR,
     "rad/s": 180 / math.pi,
-    "mrad/s": 0.18 / math.pi,
+    "mrad/s": 180 / math.pi * _PREFIX["m"],
     "rpm": 6.0,
 }
-_M_PER_S2 = {"m/s^2": 1.0, "g": GRAVITY, "mg": 1e-3 * GRAVITY, "ug": 1e-6 * GRAVITY}
+_M_PER_S2 = {"m/s^2": _PREFIX[""], **{f"{prefix}g": _PREFIX[prefix] * GRAVITY for prefix in ("", "m", "u")}}
 _SIZES = {"rate": _DEG_PER_S, "acceleration": _M_PER_S2}
 QUANTITIES = tuple(_SIZES)
 RATE_UNITS, ACCELERATION_UNITS = tuple(_DEG_PER_S), tuple(_M_PER_S2)
 DATASHEET_UNITS = (*RATE_UNITS, *ACCELERATION_UNITS)
 KNOWN_UNITS = (*DATASHEET_UNITS, "counts")
 
-# Spellings of a unit after `canonical_unit` has taken off what is a matter of taste: capitals, blanks, the signs of
-# multiplication and powers, which Greek mu, `sec` or `hr` or `degree` in place of `s`, `h`, `deg`.
+# Spellings of a unit as `canonical_unit` looks them up: in small letters, without blanks and without signs of
+# multiplication and powers, with `u` for a Greek mu and `s`, `h`, `deg` for `sec`, `hr`, `degree`.
 _SPELLINGS = {
     "deg/s": "deg/s degs-1 degs degps dps",
     "mdeg/s": "mdeg/s mdegs-1 mdegs mdegps mdps",
@@ -49,8 +52,8 @@ _SPELLINGS = {
 }
 UNITS = tuple(_SPELLINGS)
 _CANONICAL = {spelling: unit for unit, spellings in _SPELLINGS.items() for spelling in spellings.split()}
-# In this order: a longer word before one that it holds.
-_ALIKE = (
+# Replacements that `canonical_unit` makes, in this order: a longer word before one that it contains.
+_REPLACEMENTS = (
     *((sign, "u") for sign in "\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}"),
     *((sign, "deg") for sign in "\N{DEGREE SIGN}\N{MASCULINE ORDINAL INDICATOR}\N{RING ABOVE}"),
     *((sign, "") for sign in " \N{NO-BREAK SPACE}\N{MIDDLE DOT}\N{DOT OPERATOR}.*^_"),
@@ -71,39 +74,54 @@ _ALIKE = (
 
 
 def canonical_unit(text: str) -> str:
-    """Return the project's spelling of a unit of rate, acceleration, temperature or field; an unknown one as it came.
+    """Return the project's spelling of a unit of rate, acceleration, temperature or magnetic field.
 
     `dps`, `°/sec` and `degrees per second` are `deg/s`, `deg/hr` is `deg/h`, `µg` with either mu is `ug`.
+
+    Args:
+        text: The unit in any spelling; an unknown unit is returned as it is, without blanks around it.
     """
     spelling = text.strip().lower()
-    for sign, plain in _ALIKE:
+    for sign, plain in _REPLACEMENTS:
         spelling = spelling.replace(sign, plain)
     return _CANONICAL.get(spelling, text.strip())
 
 
 def quantity_of(unit: str) -> str | None:
-    """`"rate"` or `"acceleration"`, `None` of a unit of neither, in any spelling that `canonical_unit` knows."""
+    """Return the quantity that a unit measures: `"rate"`, `"acceleration"`, or `None` for neither.
+
+    Args:
+        unit: The unit in any spelling that `canonical_unit` knows.
+    """
     name = canonical_unit(unit)
     return next((quantity for quantity, sizes in _SIZES.items() if name in sizes), None)
 
 
 def check_quantity(quantity: str) -> None:
-    """Raise `ValueError` where a log cannot be read for `quantity`."""
+    """Raise `ValueError` where `quantity` is neither `"rate"` nor `"acceleration"`."""
     if quantity not in QUANTITIES:
         raise ValueError(f"`quantity`: expected {' or '.join(map(repr, QUANTITIES))}, got {quantity!r}")
 
 
 def unit_factor(unit: str, target: str) -> float:
-    """Factor that takes a rate or an acceleration in `unit` to `target`, a unit of the same quantity.
+    """Return the factor that converts numbers in `unit` to `target`.
+
+    Args:
+        unit: Unit of a rate or an acceleration, in any spelling that `canonical_unit` knows.
+        target: Unit of the same quantity.
 
     Raises:
-        ValueError: An unknown unit, or one of the other quantity.
+        ValueError: An unknown unit, or units of different quantities.
     """
     return _factor(_SIZES[quantity_of(target) or "rate"], unit, target)
 
 
 def rate_unit_factor(unit: str, target: str = "deg/s") -> float:
-    """Factor that takes a rate in `unit` to `target`, in any spelling that `canonical_unit` knows.
+    """Return the factor that converts rates in `unit` to `target`.
+
+    Args:
+        unit: Unit of a rate, in any spelling that `canonical_unit` knows.
+        target: Unit of a rate.
 
     Raises:
         ValueError: An unknown unit.
@@ -112,7 +130,11 @@ def rate_unit_factor(unit: str, target: str = "deg/s") -> float:
 
 
 def acceleration_unit_factor(unit: str, target: str = "m/s^2") -> float:
-    """Factor that takes an acceleration in `unit` to `target`, in any spelling that `canonical_unit` knows.
+    """Return the factor that converts accelerations in `unit` to `target`.
+
+    Args:
+        unit: Unit of an acceleration, in any spelling that `canonical_unit` knows.
+        target: Unit of an acceleration.
 
     Raises:
         ValueError: An unknown unit.
@@ -121,7 +143,7 @@ def acceleration_unit_factor(unit: str, target: str = "m/s^2") -> float:
 
 
 def _factor(sizes: Mapping[str, float], unit: str, target: str) -> float:
-    """Size of `unit` over that of `target`."""
+    """Ratio of the size of `unit` to the size of `target`."""
     names = [canonical_unit(unit), canonical_unit(target)]
     for argument, name, given in zip(("unit", "target"), names, (unit, target), strict=True):
         if name not in sizes:

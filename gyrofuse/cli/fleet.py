@@ -17,7 +17,7 @@ from gyrofuse.cli.console import progress_bar, say, warn
 from gyrofuse.cli.options import METHOD_NAMES, FileReading, Writing, chosen, scale_weights_of, takes_options
 from gyrofuse.cli.reading import read_model
 from gyrofuse.fleet.workers import begin_imports
-from gyrofuse.io.recording import read_recording
+from gyrofuse.io.reading import read_recording
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.processes import Model
 

@@ -19,7 +19,8 @@ from gyrofuse._base.files import Outputs
 from gyrofuse._base.units import KNOWN_UNITS, canonical_unit
 from gyrofuse.cli.console import progress
 from gyrofuse.fusion.weights.methods import METHODS
-from gyrofuse.io.recording import Recording, read_recording
+from gyrofuse.io.reading import read_recording
+from gyrofuse.io.recording import Recording
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -17,7 +17,7 @@ from gyrofuse.cli.console import progress, say
 from gyrofuse.cli.options import Quantity, Writing, takes_options
 from gyrofuse.cli.reading import agreed_rate, agreed_unit, read_model
 from gyrofuse.fusion.report.page import recording_report
-from gyrofuse.io.formats.columns import WORD_OF
+from gyrofuse.io.quantities import QUANTITY
 from gyrofuse.io.limits import physical_memory
 from gyrofuse.io.recording import Recording
 from gyrofuse.noise.array_model import ArrayModel
@@ -123,7 +123,7 @@ def save_recording(recording: Recording, path: Path, **arrays: np.ndarray[Any, A
     """
     if path.suffix.lower() == ".csv":
         ends = [f"_{axis}" for axis in recording.axes] or [""]
-        names = [f"{sensor}_{WORD_OF[recording.quantity]}{end}" for end in ends for sensor in recording.sensors]
+        names = [f"{sensor}_{QUANTITY[recording.quantity].array}{end}" for end in ends for sensor in recording.sensors]
         columns = torch.cat([recording.time[None], recording.signal.flatten(0, -2)]).T
         unit = f" [{recording.unit}]" if recording.unit != "unknown" else ""
         with path.open("w", encoding="utf-8", newline="") as file:

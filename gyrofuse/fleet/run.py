@@ -15,7 +15,8 @@ from torch.utils.data import Dataset
 from gyrofuse.fleet.logs import State, as_text, identity, state_of
 from gyrofuse.fleet.tasks import Row, Task
 from gyrofuse.fleet.watchdog import Watchdog
-from gyrofuse.io.recording import Recording, check_reading, read_recording
+from gyrofuse.io.reading import check_reading, read_recording
+from gyrofuse.io.recording import Recording
 
 _OPTIONS = tuple(name for name in signature(read_recording).parameters if name != "path")
 

@@ -22,7 +22,7 @@ from gyrofuse.fusion.weights.svo import (
     optimal_weights,
     resolve_scale_weights,
 )
-from gyrofuse.io.chunked import LongRecording, Progress, check_long_recording, silent, stretch_of
+from gyrofuse.io.chunked import ChunkedRecording, Progress, check_chunked_recording, silent, shard_bounds
 from gyrofuse.wavelets.metric import WaveletCrossCovariance
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ _PAST = 2**24
 
 
 def stream_svo(
-    recording: LongRecording,
+    recording: ChunkedRecording,
     scale_weights: ScaleWeights = "flat",
     n_levels: int | None = None,
     *,
@@ -62,7 +62,7 @@ def stream_svo(
         The weights and the wavelet cross-covariance that they rest on.
 
     Raises:
-        TypeError: `recording` is not a `LongRecording`.
+        TypeError: `recording` is not a `ChunkedRecording`.
         ValueError: Fewer than two sensors, too few samples, no window that all sensors have, or bad options.
         RuntimeError: `fabric` has several processes and was not launched, or another process failed.
         SingularCovarianceError: A dead, duplicated or linearly dependent sensor.
@@ -71,10 +71,10 @@ def stream_svo(
         [Z] equations (5) to (7).
 
     Example:
-        >>> result = stream_svo(open_long("week.npy", rate=200.0), "long")
+        >>> result = stream_svo(open_recording("week.npy", rate=200.0), "long")
         >>> write_virtual(recording, result.weights, "virtual.npy")
     """
-    check_long_recording(recording)
+    check_chunked_recording(recording)
     if recording.n_sensors < 2:
         raise ValueError(f"`recording`: expected at least 2 sensors to fuse, got {recording.n_sensors}")
     asked = n_levels
@@ -87,7 +87,7 @@ def stream_svo(
         metric = measure_stretch(
             recording,
             n_levels,
-            *stretch_of(recording.n_samples, rank, world_size),
+            *shard_bounds(recording.n_samples, rank, world_size),
             chunk_samples=chunk_samples,
             device=None if fabric is None else fabric.device,
             progress=progress,
@@ -118,7 +118,7 @@ def stream_svo(
 
 
 def measure_stretch(
-    recording: LongRecording,
+    recording: ChunkedRecording,
     n_levels: int,
     start: int,
     stop: int,
@@ -236,5 +236,5 @@ class StreamedSVOResult(VirtualGyro):
         }
 
 
-def _most_levels(recording: LongRecording) -> int:
+def _most_levels(recording: ChunkedRecording) -> int:
     return max(1, min(largest_level(recording.n_samples), largest_level(_PAST // recording.n_sensors)))

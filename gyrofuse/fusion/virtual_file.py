@@ -15,14 +15,14 @@ from gyrofuse._base.checks import check_floating
 from gyrofuse._base.distributed import all_or_none, place, told_by_first
 from gyrofuse._base.files import Outputs
 from gyrofuse.fusion.result import fuse
-from gyrofuse.io.chunked import LongRecording, Progress, check_long_recording, silent, stretch_of
+from gyrofuse.io.chunked import ChunkedRecording, Progress, check_chunked_recording, shard_bounds, silent
 
 if TYPE_CHECKING:
     from lightning.fabric import Fabric
 
 
 def write_virtual(
-    recording: LongRecording,
+    recording: ChunkedRecording,
     weights: Tensor,
     path: str | Path,
     *,
@@ -46,14 +46,14 @@ def write_virtual(
         progress: Is told what is done and the share that is, of this process's stretch.
 
     Raises:
-        TypeError: `recording` is not a `LongRecording`, or `weights` no floating point tensor.
+        TypeError: `recording` is not a `ChunkedRecording`, or `weights` no floating point tensor.
         ValueError: The name does not end in .npy or is that of the recording, or there is not one weight for each
             sensor.
         FileExistsError: The file exists and `force` is not set.
         FileNotFoundError: The folder does not exist.
         RuntimeError: `fabric` was not launched, or another process failed.
     """
-    check_long_recording(recording)
+    check_chunked_recording(recording)
     path = Path(path)
     if path.suffix.lower() != ".npy":
         raise ValueError(f"`path`: expected a name that ends in .npy, got {path.name!r}")
@@ -64,7 +64,7 @@ def write_virtual(
         raise ValueError(
             f"`weights`: expected one for each of {recording.n_sensors} sensors, got shape {tuple(weights.shape)}"
         )
-    start, stop = stretch_of(recording.n_samples, *place(fabric))
+    start, stop = shard_bounds(recording.n_samples, *place(fabric))
     values = weights.detach().to("cpu", torch.float64)
     with _draft_for_all(path, recording.n_samples, fabric, force=force) as (draft, offset), draft.open("r+b") as file:
         file.seek(offset + 8 * start)

@@ -1,4 +1,4 @@
-"""Several devices on one grid: clocks are aligned to the nearest sample, never resampled."""
+"""Several devices on one grid: clocks are aligned to the nearest sample, only auxiliary channels are interpolated."""
 
 from __future__ import annotations
 
@@ -7,11 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gyrofuse.io.clock import Grid, Slots
-from gyrofuse.io.notes import Note, Notebook
-from gyrofuse.io.streams import Array, RecordingError
-
-_RATE_TOLERANCE = 5e-3
+from gyrofuse.io.clock import Grid
+from gyrofuse.io.streams import Array, Note, Notebook, RecordingError
+from gyrofuse.io.timestamps import Slots
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +26,12 @@ class Placed:
     kept: Slots
     n_slots: int
 
-    def spread(self, values: Array) -> Array:
-        """Put `(..., time)` of the log on the grid, `(..., slot)`, NaN where no sample is."""
+    def on_grid(self, values: Array) -> Array:
+        """Values on the common grid, `(..., slot)`, NaN in slots without a sample.
+
+        Args:
+            values: Values of the log, `(..., time)`.
+        """
         if self.n_slots == values.shape[-1] == self.kept.size:
             return values
         placed = np.full((*values.shape[:-1], self.n_slots), np.nan)
@@ -47,15 +49,17 @@ def align(grids: Sequence[Grid], names: Sequence[str], source: str) -> tuple[lis
         source: The files, for errors.
 
     Returns:
-        Each device on the common grid, the common rate in Hz, and notes on offsets and cuts.
+        Position of each device on the common grid, the common rate in Hz, and notes on offsets and cuts.
 
     Raises:
         RecordingError: Rates differ by more than half a per cent, or the devices were not recorded together.
     """
     reference = grids[0]
     rate = reference.rate
+    # Clocks differ by 0.01 %, nominal rates of devices by more than this: 100 and 102.4 Hz, say.
+    tolerance = 5e-3
     for grid, name in zip(grids, names, strict=True):
-        if abs(grid.rate / rate - 1) > _RATE_TOLERANCE:
+        if abs(grid.rate / rate - 1) > tolerance:
             raise RecordingError(
                 f"{source}: expected one sampling rate, found {rate:.6g} Hz in {names[0]} and {grid.rate:.6g} Hz in "
                 f"{name}; resample them to one rate, or fuse devices of one rate"
@@ -116,7 +120,7 @@ def align(grids: Sequence[Grid], names: Sequence[str], source: str) -> tuple[lis
                 )
             )
         own, kept = own[inside] - first, grid.kept[inside]
-        # Where a clock slips, two samples may meet in one slot: the first stays.
+        # Where a clock slips, two samples may fall into one slot: the first is kept.
         alone = np.concatenate([[True], np.diff(own) > 0])
         placed.append(Placed(own[alone], kept[alone], last - first + 1))
     return placed, rate, notes
@@ -125,3 +129,42 @@ def align(grids: Sequence[Grid], names: Sequence[str], source: str) -> tuple[lis
 def _no_clock(grids: Sequence[Grid], names: Sequence[str]) -> Note:
     which = ", ".join(name for grid, name in zip(grids, names, strict=True) if not grid.trusted)
     return Note("offset", "", f"no usable timestamps in {which}: all devices are taken to start at their first samples")
+
+
+def at_samples(time: Array, own_time: Array, values: Array, name: str) -> tuple[Array, str]:
+    """Interpolate a channel linearly to the samples of a device's signal.
+
+    Args:
+        time: Clock reading of each sample of the signal, seconds.
+        own_time: Clock reading of each sample of the channel `(n,)`, seconds, by the same clock.
+        values: The channel, `(..., n)`.
+        name: The channel, for the note.
+
+    Returns:
+        The channel `(..., time)`, NaN outside its own samples and in gaps of more than 2.5 of its typical steps, and a
+        note that says so; an empty note where the clocks are the same.
+    """
+    if np.array_equal(time, own_time):
+        return values, ""
+    kept = np.flatnonzero(np.isfinite(own_time))
+    ordered, first = np.unique(own_time[kept], return_index=True)
+    ordered_values = values[..., kept[first]]
+    resampled = np.full((*values.shape[:-1], time.size), np.nan)
+    if ordered.size < 2:
+        return resampled, f"{name} has fewer than two samples with a time of its own and is NaN"
+    steps = np.diff(ordered)
+    step = float(np.median(steps))
+    after = np.clip(np.searchsorted(ordered, time), 1, ordered.size - 1)
+    widest = 2.5  # typical steps of the channel: a single missing sample, with jitter, is bridged, two are not
+    with np.errstate(invalid="ignore", over="ignore"):  # damaged times and values may be any number
+        part = (time - ordered[after - 1]) / steps[after - 1]
+        within = (part >= 0) & (part <= 1) & ((steps[after - 1] <= widest * step) | (part == 0) | (part == 1))
+        after, part = after[within], part[within]
+        between = ordered_values[..., after - 1] * (1 - part) + ordered_values[..., after] * part
+    # At a sample of its own a channel is that sample, whatever its neighbour is.
+    between = np.where(part == 0, ordered_values[..., after - 1], between)
+    resampled[..., within] = np.where(part == 1, ordered_values[..., after], between)
+    return resampled, (
+        f"{name} has its own clock ({1 / step:.4g} Hz): interpolated linearly to the signal's samples, NaN outside "
+        "its own and in their gaps"
+    )

@@ -17,11 +17,12 @@ from gyrofuse.io.align import Placed, align
 from gyrofuse.io.clock import Grid, grid_of, regular_grid
 from gyrofuse.io.formats import read_streams
 from gyrofuse.io.formats.columns import AXES, CHANNELS
+from gyrofuse.io.formats.request import Request
 from gyrofuse.io.limits import printable
-from gyrofuse.io.notes import Note
-from gyrofuse.io.streams import Array, RecordingError, Stream, unexpected
+from gyrofuse.io.quantities import QUANTITY
+from gyrofuse.io.streams import Array, Note, RecordingError, Stream, unexpected
 
-_UNKNOWN = "unknown"
+_UNKNOWN = "unknown"  # the unit of a log that states none
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,28 +39,24 @@ class Assembled:
 
 
 def assemble(
-    paths: Sequence[Path],
+    requests: Sequence[Request],
     *,
     axis: str | None,
     rate: float | None,
     unit: str | None,
     scale: float | None,
-    key: str | None,
-    quantity: str,
-    columns: Mapping[str, str] | None,
     mounting: Mapping[str, Any] | str | Path | None,
-    max_bytes: float | None,
 ) -> Assembled:
     """Read the logs and put their devices on one grid; arguments and errors as `gyrofuse.read_recording`."""
-    source = ", ".join(str(path) for path in paths)
-    read = [(p, read_streams(p, key=key, quantity=quantity, columns=columns, max_bytes=max_bytes)) for p in paths]
+    source = ", ".join(str(request.path) for request in requests)
+    read = [(request.path, read_streams(request)) for request in requests]
     streams = _named(read)
     streams = _mount([_printable(stream) for stream in streams], mounting, source)
     try:
         return _on_one_grid(streams, source, axis=axis, rate=rate, unit=unit, scale=scale)
     except RecordingError:
         raise
-    except Exception as error:  # numbers of a damaged log that no check foresaw
+    except Exception as error:  # the effects of damaged numbers are not all foreseen
         raise unexpected(source, error) from error
 
 
@@ -121,7 +118,7 @@ def _named(read: Sequence[tuple[Path, list[Stream]]]) -> list[Stream]:
 
 
 def _mount(streams: list[Stream], mounting: Mapping[str, Any] | str | Path | None, source: str) -> list[Stream]:
-    """Turn each device's axes into those of the array."""
+    """Rotate the axes of each device to those of the array."""
     if mounting is None:
         return streams
     if isinstance(mounting, str | Path):
@@ -164,12 +161,12 @@ def _mount(streams: list[Stream], mounting: Mapping[str, Any] | str | Path | Non
 
 
 def _is_rotation(matrix: Array) -> bool:
-    """Orthogonal and no mirror: rates are axial vectors."""
+    """Whether a matrix is orthogonal and no reflection, which would change the sign of rates."""
     return np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6) and bool(np.linalg.det(matrix) > 0)
 
 
 def _choose_axes(streams: list[Stream], axis: str | None, source: str) -> tuple[list[Stream], tuple[str, ...]]:
-    """Keep one axis, or say which axes lead the array."""
+    """Streams with the chosen axis alone, or with all axes, and the names of the leading dimension."""
     if axis is not None:
         lacking = [stream for stream in streams if axis not in stream.signal]
         if lacking:
@@ -215,7 +212,7 @@ def _grids(streams: Sequence[Stream], rate: float | None, source: str) -> list[G
 
 
 def _overruled(streams: Sequence[Stream], rate: float | None) -> list[Note]:
-    """Rates that logs without timestamps state, where another one was asked for."""
+    """Notes on rates that logs without timestamps state, where another rate was requested."""
     stated = dict.fromkeys(s.rate for s in streams if rate and s.rate and s.time is None)
     return [
         Note("clock", "", f"the log states {other:.6g} Hz, {rate:.6g} Hz was asked for")
@@ -238,7 +235,7 @@ def _clocked(stream: Stream, rate: float | None, source: str) -> Grid:
 def _units(
     streams: Sequence[Stream], unit: str | None, scale: float | None, source: str
 ) -> tuple[str, list[float], list[Note]]:
-    """The common unit, the factor that brings each device to it, and what was assumed."""
+    """The common unit, the factor that converts each device to it, and notes on assumptions."""
     if scale is not None:
         name = unit or _UNKNOWN
         return name, [scale] * len(streams), [Note("unit", "", f"numbers of the log times {scale:g} are {name}")]
@@ -263,7 +260,7 @@ def _units(
 
 
 def _flaws(stream: Stream) -> list[Note]:
-    """Samples of a device that say nothing."""
+    """Notes on samples of a device that are not measured values."""
     notes = []
     missing = {axis: int((~np.isfinite(values)).sum()) for axis, values in stream.signal.items()}
     if any(missing.values()):
@@ -276,31 +273,31 @@ def _flaws(stream: Stream) -> list[Note]:
 
 
 def _clean(stream: Stream, axis: str, place: Placed, factor: float) -> Array:
-    """One axis of a device on the common grid in the common unit, samples that say nothing as NaN."""
+    """One axis of a device on the common grid in the common unit, samples that are not measured values as NaN."""
     values = np.asarray(stream.signal[axis], dtype=np.float64)
     startup = _starts_from_zero(stream)
     if startup or not np.isfinite(values).all():
         values = np.where(np.isfinite(values), values, np.nan)
     if startup:
         values[0] = np.nan
-    placed = place.spread(values)
+    placed = place.on_grid(values)
     return placed * factor if factor != 1.0 else placed
 
 
 def _starts_from_zero(stream: Stream) -> bool:
     """Whether a device that has measured something else reports a first row of zeros."""
     rows = [values[:2] for values in stream.signal.values()]
-    for name in (CHANNELS["rate"], CHANNELS["acceleration"]):
-        if name in stream.channels:
-            rows += list(stream.channels[name][:, :2])
+    for quantity in QUANTITY.values():
+        if quantity.channel in stream.channels:
+            rows += list(stream.channels[quantity.channel][:, :2])
     return len(rows) > 1 and all(row[0] == 0 for row in rows) and all(row[1] != 0 for row in rows)
 
 
 def _channels(streams: Sequence[Stream], placed: Sequence[Placed]) -> dict[str, Array]:
-    """Auxiliary channels on the common grid; those that several devices have carry the device's name."""
+    """Auxiliary channels on the common grid; a channel of several devices carries the device's name."""
     carriers = Counter(name for stream in streams for name in stream.channels)
     return {
-        name if carriers[name] == 1 else f"{name}[{stream.name}]": place.spread(np.asarray(values, dtype=np.float64))
+        name if carriers[name] == 1 else f"{name}[{stream.name}]": place.on_grid(np.asarray(values, dtype=np.float64))
         for stream, place in zip(streams, placed, strict=True)
         for name, values in stream.channels.items()
     }

@@ -1,9 +1,10 @@
-"""From timestamps to a uniform grid: the rate, and which slot of the grid each sample belongs to.
+"""From timestamps to a uniform grid: the rate, and the slot of the grid to which each sample belongs.
 
 Samples keep the order of the log and are never interpolated. With `u_n = t_n / step - n`, a missing sample raises `u`
-for good, while the jitter of a stamp, or a burst of late ones, comes back: how many samples are missing at a long step
-is read off the lower envelope of `u` after it, against its slowly followed level before it. Where most stamps say
-nothing (arrival times that come in bursts), samples take one slot each, at the long-run rate.
+for good, while `u` returns after the jitter of a stamp or a burst of late ones. The number of samples that are missing
+at a long step is therefore the rise of the lower envelope of `u` after the step above its slowly followed level before
+the step. Where most stamps carry no information (arrival times that come in bursts), samples take one slot each, at the
+long-run rate.
 """
 
 from __future__ import annotations
@@ -13,24 +14,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrofuse.io.formats.columns import TICK, WRAP_32_BIT
-from gyrofuse.io.limits import is_rate
-from gyrofuse.io.notes import Note, Notebook
-from gyrofuse.io.streams import Array, RecordingError
+from gyrofuse.io.streams import Array, Note, Notebook, RecordingError
+from gyrofuse.io.timestamps import Slots, advancing_readings
 
-Slots = NDArray[np.int64]
-
-# A step that differs from the usual one by more than this part of it is looked at.
+# Largest difference of a step from the typical one that jitter explains, in typical steps: above 1/2, which stamps a
+# quarter of a step early and late make together, and well below 1, which a missing sample makes.
 _IRREGULAR = 0.55
-# Samples that the envelope looks ahead, and over which its level follows a wandering rate.
-_WINDOW, _MEMORY = 64, 1024
-# A clock that is behind for more samples than this was set back.
-_SET_BACK = 100
-_MOST_SET_BACKS = 100
-# Seconds, and steps of a clock in a recording, from which on float64 no longer tells one from the next.
-_FARTHEST = 2.0**53
-# A grid with more slots a sample than this is a clock that jumps, not a recording.
-_SPARSEST = 20
+# Samples after a step over which the lower envelope is taken: a burst of late stamps that is shorter is not taken for
+# missing samples.
+_WINDOW = 64
+# Samples over which the level of the envelope follows a wandering rate: 16 windows, so that it hardly follows a burst.
+_MEMORY = 1024
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +37,7 @@ class Grid:
         slots: Slot of each kept sample, increasing from 0.
         kept: Index of each kept sample in the log.
         trusted: Whether the slots come from the timestamps.
-        notes: What was found on the way.
+        notes: Findings about the clock.
     """
 
     start: float
@@ -84,43 +78,11 @@ def grid_of(
         nominal: Sampling rate in Hz that the log states beside the clock.
 
     Raises:
-        RecordingError: Fewer than two usable timestamps, or none that advances.
+        RecordingError: Fewer than two usable timestamps, none that advances, or long pauses.
     """
     book = Notebook(name)
-    kept = np.flatnonzero(np.isfinite(time))
-    if kept.size < time.size:
-        lost = time.size - kept.size
-        book.add("clock", f"{lost} samples without a timestamp were left out", samples=lost)
-    if kept.size and (far := float(np.abs(time[kept]).max())) >= _FARTHEST:
-        raise RecordingError(
-            f"{source}: expected timestamps of a clock, found one of {far:.3g} s in {name}; correct it or remove its "
-            "sample"
-        )
-    t, n_wraps, period = _unwrap(time[kept], clock_period)
-    if n_wraps:
-        book.add("wraps", f"the clock wrapped {n_wraps} times, every {period:.6g} s; unwrapped", wraps=n_wraps)
-    if np.count_nonzero(np.diff(t) < 0) > t.size / 2:
-        raise RecordingError(
-            f"{source}: expected timestamps that advance, found that they mostly run backwards in {name}; sort the log"
-        )
-    t = _undo_set_backs(t, book)
-    ahead = t >= np.maximum.accumulate(t)
-    if not ahead.all():
-        lost = int((~ahead).sum())
-        book.add("clock", f"the clock stepped back: {lost} samples until it caught up were left out", samples=lost)
-        t, kept = t[ahead], kept[ahead]
+    t, kept = advancing_readings(time, clock_period, source, book)
     steps = np.diff(t)
-    if not (steps > 0).any():
-        raise RecordingError(
-            f"{source}: expected timestamps that advance, found {t.size} usable ones of {time.size} that do not; "
-            "give the rate with rate= (--rate HZ) and a file without timestamps"
-        )
-    usual, span = float(np.median(steps[steps > 0])), float(t[-1] - t[0])
-    if not (is_rate(1 / usual) and span / usual < _FARTHEST):
-        raise RecordingError(
-            f"{source}: expected timestamps of a clock, found steps of {usual:.3g} s in {span:.3g} s of {name}; "
-            "correct the timestamps, or give the rate with rate= (--rate HZ) and a file without them"
-        )
     repeats = int((steps == 0).sum())
     step, regular = _typical_step(t)
     trusted = not _in_bursts(t, step, regular, nominal or rate)
@@ -145,11 +107,11 @@ def grid_of(
         )
     if rate is not None:
         seen = 1 / step
-        if abs(seen / rate - 1) > 1e-3:
+        if abs(seen / rate - 1) > 1e-3:  # crystals of clocks are right to 0.01 %
             book.add("clock", f"the clock says {seen:.6g} Hz, {rate:.6g} Hz was asked for", clock_hz=seen, rate_hz=rate)
         step = 1 / rate
 
-    # The first of several samples in one slot stays.
+    # Of several samples in one slot the first is kept.
     first = np.concatenate([[True], slots[1:] > np.maximum.accumulate(slots)[:-1]])
     if trusted:
         if repeats:
@@ -161,7 +123,8 @@ def grid_of(
     slots, kept = slots[first], kept[first]
     start += step * float(slots[0])
     slots = slots - slots[0]
-    if slots[-1] > _SPARSEST * slots.size + 1000:
+    # More than 20 slots a sample, with an allowance for short logs, are a clock that jumps.
+    if slots[-1] > 20 * slots.size + 1000:
         raise RecordingError(
             f"{source}: expected a recording without long pauses, found {slots.size} samples of {name} in "
             f"{slots[-1] * step:.6g} s at {1 / step:.6g} Hz; cut the log where the clock jumps"
@@ -171,42 +134,18 @@ def grid_of(
 
 
 def regular_grid(n_samples: int, rate: float) -> Grid:
-    """The grid of samples without timestamps."""
+    """The grid of samples without timestamps.
+
+    Args:
+        n_samples: Number of samples.
+        rate: Sampling rate in Hz.
+    """
     every = np.arange(n_samples)
     return Grid(0.0, rate, every, every, False, ())
 
 
-def _unwrap(t: Array, period: float | None) -> tuple[Array, int, float]:
-    steps = np.diff(t)
-    down = steps < 0
-    if not down.any():
-        return t, 0, 0.0
-    step = np.median(steps[steps > 0]) if (steps > 0).any() else 0.0
-    periods = [period] if period else [WRAP_32_BIT * TICK[unit] for unit in ("us", "ms", "ns")]
-    for candidate in periods:
-        wrapped = down & (np.abs(steps + candidate - step) < (candidate / 2 if period else 100 * step))
-        if wrapped.any():
-            return t + candidate * np.concatenate([[0], np.cumsum(wrapped)]), int(wrapped.sum()), candidate
-    return t, 0, 0.0
-
-
-def _undo_set_backs(t: Array, book: Notebook) -> Array:
-    """Let a clock that was set back, and does not soon catch up, go on without a gap."""
-    if (np.diff(t) < 0).sum() > _MOST_SET_BACKS:
-        return t
-    for here in (np.flatnonzero(np.diff(t) < 0) + 1).tolist():
-        highest = t[:here].max()
-        behind = t[here:] < highest
-        if behind[:_SET_BACK].all() and behind.size > _SET_BACK:
-            step = float(np.median(np.abs(np.diff(t))))
-            back = t[here - 1] - t[here]
-            t = np.concatenate([t[:here], t[here:] + back + step])
-            book.add("clock", f"the clock was set back by {back:.6g} s; taken to go on without a gap", seconds=back)
-    return t
-
-
 def _typical_step(t: Array) -> tuple[float, NDArray[np.bool_]]:
-    """Step between samples, by least squares pooled over stretches without irregular steps; which steps are regular."""
+    """Step between samples, by least squares pooled over runs of regular steps, and which steps are regular."""
     steps = np.diff(t)
     step = float(np.median(steps[steps > 0]))
     regular = np.abs(steps - step) <= _IRREGULAR * step
@@ -222,7 +161,10 @@ def _typical_step(t: Array) -> tuple[float, NDArray[np.bool_]]:
 
 
 def _in_bursts(t: Array, step: float, regular: NDArray[np.bool_], nominal: float | None) -> bool:
-    """Whether the long-run rate is another than that of the usual steps, and missing samples are not the reason."""
+    """Whether the long-run rate differs from the rate of the typical steps for another reason than missing samples.
+
+    Missing samples make steps of whole multiples of the typical one; stamps in bursts make fractions of it.
+    """
     long_run = (t[-1] - t[0]) / (t.size - 1)
     if abs(long_run / step - 1) < 0.1:
         return False
@@ -234,6 +176,7 @@ def _in_bursts(t: Array, step: float, regular: NDArray[np.bool_], nominal: float
 
 
 def _find_slots(t: Array, step: float) -> Slots:
+    """Slot of each sample by the lower envelope of the module's `u`."""
     order = np.arange(t.size)
     ahead = (t - t[0]) / step - order
     doubtful = np.flatnonzero(np.abs(np.diff(ahead)) > 1 - _IRREGULAR) + 1
@@ -252,7 +195,7 @@ def _find_slots(t: Array, step: float) -> Slots:
             continue
         shift += jump
         if jump < 0 and jumps and jumps[-1][1] == -jump and here - jumps[-1][0] < _WINDOW:
-            jumps.pop()  # late, not missing: it came back
+            jumps.pop()  # the stamps were late: `u` came back
         else:
             jumps.append((here, jump))
     missing = np.zeros(t.size, dtype=np.int64)
@@ -262,7 +205,7 @@ def _find_slots(t: Array, step: float) -> Slots:
 
 
 def _lowest_ahead(values: Array) -> Array:
-    """Minimum over each value and the ones after it, as many as the window holds."""
+    """Minimum over each value and the values after it in a window of `_WINDOW`."""
     lowest, span = values.copy(), 1
     while span < _WINDOW:
         np.minimum(lowest[:-span], lowest[span:], out=lowest[:-span])
@@ -282,7 +225,7 @@ def _fit_line(slots: Slots, t: Array) -> tuple[float, float]:
 
 def _note_jitter(book: Notebook, residual: Array, step: float) -> None:
     scatter = np.diff(residual)
-    # Jitter is what neighbours do not share; a wandering rate is what they do.
+    # Differences of neighbours hold the jitter; a wandering rate, which neighbours share, drops out.
     rms, largest = float(scatter.std() / np.sqrt(2)), float(np.abs(residual).max())
     if rms > 1e-3 * step:
         book.add(

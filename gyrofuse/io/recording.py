@@ -1,9 +1,7 @@
-"""A recording of a gyro array on a uniform grid, and how log files become one."""
+"""A recording of an array of inertial sensors on a uniform grid."""
 
 from __future__ import annotations
 
-import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,20 +13,22 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from gyrofuse._base.checks import check_positive, check_signal
+from gyrofuse._base.deprecation import moved_names
 from gyrofuse._base.files import Outputs, write_npz
 from gyrofuse._base.results import listed, numbered
-from gyrofuse._base.units import QUANTITIES, canonical_unit, check_quantity, quantity_of, unit_factor
-from gyrofuse.io.assemble import assemble
-from gyrofuse.io.formats.columns import WORD_OF, check_columns
-from gyrofuse.io.limits import is_rate
-from gyrofuse.io.notes import Note
+from gyrofuse._base.units import QUANTITIES, canonical_unit, quantity_of, unit_factor
+from gyrofuse.io.quantities import QUANTITY, RATE
+from gyrofuse.io.streams import Note
+
+_MOVED = {name: f"gyrofuse.io.reading.{name}" for name in ("read_recording", "check_reading")}
+__getattr__ = moved_names(__name__, _MOVED)
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
     """An array of gyros, or of accelerometers, on a uniform grid of time; NaN is a missing sample.
 
-    Easy to make by hand: `Recording(signal, rate=100.0, unit="deg/s")`.
+    One can be made by hand: `Recording(signal, rate=100.0, unit="deg/s")`.
 
     Attributes:
         signal: `(sensor, time)`, or `(axis, sensor, time)` when every device has the same axes; float32 or float64.
@@ -39,9 +39,10 @@ class Recording:
         channels: Auxiliary channels on the same grid, time last: `temperature` (time,), `acceleration` (3, time). A
             channel that several devices have carries the device's name: `temperature[imu2]`.
         axes: Names along the leading dimension, `("x", "y", "z")`; empty when the signal is `(sensor, time)`.
-        source: Files it was read from.
-        notes: What was found on reading: gaps, repeats, jitter, offsets, cuts, units.
-        quantity: `"rate"` or `"acceleration"`; by default what the unit says, and rate where it says nothing.
+        source: Files from which it was read.
+        notes: Findings of the reader: gaps, repeats, jitter, offsets, cuts, units.
+        quantity: Quantity that the sensors measure, `"rate"` or `"acceleration"`; by default that of the unit, and a
+            rate where the unit is of neither.
 
     Raises:
         TypeError: `signal` is not a floating point tensor.
@@ -94,7 +95,7 @@ class Recording:
 
     @property
     def n_samples(self) -> int:
-        """Slots of the grid, missing ones included."""
+        """Number of slots of the grid, missing samples included."""
         return self.signal.shape[-1]
 
     @property
@@ -109,7 +110,7 @@ class Recording:
 
     @property
     def missing(self) -> Tensor:
-        """Fraction of samples that each sensor lacks, `(..., sensor)`."""
+        """Fraction of missing samples of each sensor, `(..., sensor)`."""
         return (~self.signal.isfinite()).double().mean(-1)
 
     def select(self, *, axis: str | None = None, sensors: Sequence[str | int] | None = None) -> Recording:
@@ -140,16 +141,18 @@ class Recording:
     def axes_as_sensors(self) -> Recording:
         """The axes of a single device as sensors `(axis, time)` of one array; any other recording as it is.
 
-        Each axis is judged by itself then; no virtual gyro can be made of them.
+        Each axis is analysed by itself; their mean is no virtual gyro.
         """
         if not self.axes or self.n_sensors > 1:
             return self
         return replace(self, signal=self.signal[:, 0], sensors=self.axes, axes=())
 
     def between(self, start: float, stop: float) -> Recording:
-        """Keep the stretch from `start` to `stop` seconds after the first sample: the part at rest, say.
+        """Keep the samples from `start` to `stop` seconds after the first sample, with their `time`.
 
-        `time` goes on counting from where it did before.
+        Args:
+            start: Begin in seconds after the first sample.
+            stop: End in seconds after the first sample.
 
         Raises:
             ValueError: Fewer than two samples lie between.
@@ -164,12 +167,12 @@ class Recording:
         return self._cut(slice(first, last))
 
     def longest_whole(self) -> Recording:
-        """Keep the longest stretch in which no sensor misses a sample; sensors without any are passed over.
+        """Keep the longest run of samples, with their `time`, in which no sensor misses one.
 
-        `time` goes on counting from where it did before.
+        Sensors without any sample are not considered.
 
         Raises:
-            ValueError: There is no time at which all of them have a sample.
+            ValueError: At no time all sensors have a sample.
         """
         known = self.signal.isfinite()
         whole = (known | ~known.any(-1, keepdim=True)).flatten(0, -2).all(0)
@@ -192,7 +195,10 @@ class Recording:
         )
 
     def to(self, unit: str) -> Recording:
-        """Convert to another unit of rate, or of acceleration.
+        """Convert to another unit of the same quantity.
+
+        Args:
+            unit: The unit of the result.
 
         Raises:
             ValueError: Either unit is not a known unit, or they are of different quantities.
@@ -202,8 +208,12 @@ class Recording:
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write an .npz that `read_recording` reads back: `gyro`, `fs`, `unit`, `sensors`, `time` and the channels.
 
-        Accelerations are written as `acceleration`, and read back with `quantity="acceleration"`. The file appears
-        whole or not at all.
+        Accelerations are written as `acceleration`, and read back with `quantity="acceleration"`. A file that cannot be
+        written as a whole is not written at all.
+
+        Args:
+            path: Name of the file, with the suffix .npz.
+            force: Whether a file of that name is replaced.
 
         Raises:
             ValueError: The name does not end in .npz.
@@ -213,8 +223,8 @@ class Recording:
         path = Path(path)
         if path.suffix.lower() != ".npz":
             raise ValueError(f"`path`: expected a name that ends in .npz, got {path.name!r}")
-        main = WORD_OF[self.quantity]
-        taken = {main, "gyro", "fs", "unit", "sensors", "time", "axes"} & {*self.channels}
+        main = QUANTITY[self.quantity].array
+        taken = {main, RATE.array, "fs", "unit", "sensors", "time", "axes"} & {*self.channels}
         if taken:
             raise ValueError(f"`channels`: the names {', '.join(sorted(taken))} mean something else in a file; rename")
         arrays: dict[str, Any] = {name: values.numpy(force=True) for name, values in self.channels.items()}
@@ -231,7 +241,7 @@ class Recording:
             write_npz(file, arrays)
 
     def summary(self) -> str:
-        """What the recording holds, as fixed-width text."""
+        """Size, rate, sensors, channels, missing samples and notes as text."""
         shape = f"{self.n_sensors} sensors" + (f" on axes {', '.join(self.axes)}" if self.axes else "")
         kind = "Recording" if self.quantity == "rate" else "Recording of accelerations"
         lines = [
@@ -252,7 +262,7 @@ class Recording:
         return self.summary()
 
     def to_dict(self) -> dict[str, Any]:
-        """What is known about the recording, without its samples, ready for JSON."""
+        """Properties of the recording without its samples, ready for JSON."""
         mean = self.signal.nanmean(-1)
         return {
             "source": list(self.source),
@@ -269,104 +279,6 @@ class Recording:
             "channels": {name: list(values.shape) for name, values in self.channels.items()},
             "notes": [note.to_dict() for note in self.notes],
         }
-
-
-def read_recording(
-    path: str | Path | Sequence[str | Path],
-    *,
-    axis: str | None = None,
-    sensors: Sequence[str | int] | None = None,
-    rate: float | None = None,
-    unit: str | None = None,
-    scale: float | None = None,
-    key: str | None = None,
-    quantity: str = "rate",
-    columns: Mapping[str, str] | None = None,
-    mounting: Mapping[str, Any] | str | Path | None = None,
-    max_bytes: float | None = None,
-) -> Recording:
-    """Read a log, or several logs of one array, onto a uniform grid.
-
-    Devices with the same axes give `(axis, sensor, time)`, or `(sensor, time)` of one `axis`. The rate comes from the
-    timestamps where there are any. Gaps, repeats, jitter, wraps, offsets between devices and non-finite samples are
-    found and noted; what is missing is NaN, nothing is interpolated.
-
-    Args:
-        path: One file, a ROS 2 folder, or several files of one array.
-        axis: "x", "y" or "z": this axis of every device alone.
-        sensors: Sensors to keep: names, or positions from 0.
-        rate: Sampling rate in Hz; needed where a log states none, and then it comes before the log's own.
-        unit: Unit to convert to; where the log states none, the unit that its numbers have.
-        scale: Factor that turns the log's numbers (counts) into `unit`.
-        key: Which recording inside the file, where it holds several.
-        quantity: `"rate"` for the gyros of the log, `"acceleration"` for its accelerometers.
-        columns: What columns or arrays of the log are, where their names do not say: these by the names that they
-            should have, `{"gyro_x": "u3", "time": "t"}`. Others are left out.
-        mounting: Rotation of each device, `{device: 3 x 3 matrix}` or the path of a JSON file of that, which maps its
-            axes to those of the array: `v_array = M v_device`.
-        max_bytes: Memory in bytes that the numbers of each log may take, as the log declares them, which is compared
-            before any is allocated; by default a quarter of the physical memory. A longer log: `open_long`.
-
-    Returns:
-        The recording, float64, with notes on everything that was found.
-
-    Raises:
-        FileNotFoundError: No such file.
-        RecordingError: The file cannot be read as a recording: says what was expected, what was found, what to do.
-        ValueError: An option that does not fit the log, or a file that is named twice.
-        ImportError: A format whose library is not installed (`pip install "gyrofuse[logs]"`).
-    """
-    paths = [Path(path)] if isinstance(path, str | Path) else [Path(p) for p in path]
-    if not paths:
-        raise ValueError("`path`: expected at least one file, got none")
-    places = [os.path.abspath(p) for p in paths]
-    twice = next((p for i, p in enumerate(places) if p in places[:i]), None)
-    if twice is not None:
-        raise ValueError(f"`path`: expected each file once, got {twice} twice; name it once")
-    check_reading(rate=rate, scale=scale, quantity=quantity, columns=columns)
-    if max_bytes is not None:
-        check_positive("max_bytes", max_bytes)
-    whole = assemble(
-        paths,
-        axis=axis,
-        rate=rate,
-        unit=unit,
-        scale=scale,
-        key=key,
-        quantity=quantity,
-        columns=columns,
-        mounting=mounting,
-        max_bytes=max_bytes,
-    )
-    recording = Recording(
-        torch.from_numpy(whole.signal),
-        rate=whole.rate,
-        unit=whole.unit,
-        sensors=whole.sensors,
-        channels={name: torch.from_numpy(values) for name, values in whole.channels.items()},
-        axes=whole.axes,
-        source=tuple(p.name for p in paths),
-        notes=whole.notes,
-        quantity=quantity_of(whole.unit) or quantity,
-    )
-    return recording if sensors is None else recording.select(sensors=sensors)
-
-
-def check_reading(
-    *,
-    rate: float | None = None,
-    scale: float | None = None,
-    quantity: str = "rate",
-    columns: Mapping[str, str] | None = None,
-) -> None:
-    """Raise `ValueError` where an option of `read_recording` is wrong for any log."""
-    check_quantity(quantity)
-    if columns is not None:
-        check_columns(columns)
-    if rate is not None and not is_rate(check_positive("rate", rate)):
-        raise ValueError(f"`rate`: expected a sampling rate of 1e-6 to 1e12 Hz, got {rate!r}")
-    if scale is not None and not (math.isfinite(scale) and scale != 0):
-        raise ValueError(f"`scale`: expected a finite number other than 0, got {scale!r}")
 
 
 def _position(names: Sequence[str], sensor: str | int) -> int:

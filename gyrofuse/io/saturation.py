@@ -1,4 +1,4 @@
-"""Samples at the end of a sensor's range say only that the rate was beyond it: they are missing samples."""
+"""Saturation: samples at the end of a sensor's range are not measured values and become missing samples."""
 
 from __future__ import annotations
 
@@ -7,22 +7,17 @@ from torch import Tensor, nn
 
 from gyrofuse._base.checks import check_n_samples, check_signal
 
-# The top value of a rounded sinusoid is met up to 1/(sqrt 2 - 1) = 2.4 times as often as the one below it, that of
-# noise not even as often; more than this is a pile of clipped values.
-_PILE = 3.0
-_SMALLEST_PILE = 5
-
 
 def mask_saturated(signal: Tensor, full_scale: float | Tensor, *, guard: int = 1) -> Tensor:
     """Make saturated samples missing: NaN where `|signal| >= full_scale`, and in `guard` samples on either side.
 
     A filter between the clipping and the output smears clipped samples over their neighbours before and after the
-    full scale shows: `guard` should be as long as that filter, one sample for a sensor without.
+    clipped values show: `guard` should be as long as that filter, one sample for a sensor without a filter.
 
     Args:
         signal: `(..., sensor, time)`.
         full_scale: Largest value that a sensor can give, one number or `(..., sensor)`; see `find_saturation`.
-        guard: Samples on either side.
+        guard: Number of samples on either side that become missing as well.
 
     Returns:
         A copy of the signal with NaN in place of those samples.
@@ -38,28 +33,30 @@ def mask_saturated(signal: Tensor, full_scale: float | Tensor, *, guard: int = 1
     clipped = signal.abs() >= limit.unsqueeze(-1)
     if guard and clipped.numel():
         flat = clipped.reshape(1, -1, signal.shape[-1]).to(torch.float32)
-        spread = nn.functional.max_pool1d(flat, 2 * guard + 1, stride=1, padding=guard)
-        clipped = spread.view(clipped.shape) > 0
+        guarded = nn.functional.max_pool1d(flat, 2 * guard + 1, stride=1, padding=guard)
+        clipped = guarded.view(clipped.shape) > 0
     return torch.where(clipped, torch.nan, signal)
 
 
 def find_saturation(signal: Tensor) -> Tensor:
-    """Full scale of every sensor, from the pile of equal values that clipping leaves at the largest or smallest one.
+    """Full scale of every sensor, from the number of equal samples at the largest or smallest value.
 
-    A pile holds at least 5 samples and more than 3 times as many as have the next value: noise has fewer samples at
-    its extremes, a rounded sinusoid 2.4 times as many at most.
+    Clipping is found where at least 5 samples, and more than 3 times as many as at the next value, are equal. Noise has
+    fewer samples at its extremes; a rounded sinusoid takes its top value up to `1 / (sqrt(2) - 1) = 2.4` times as often
+    as the value below.
 
     Args:
         signal: `(..., sensor, time)`; non-finite samples are left out.
 
     Returns:
-        `(..., sensor)`, the smaller size of the two ends that are piled up; infinite where neither is, and where there
-        is no sample.
+        `(..., sensor)`, the smaller size of the ends at which samples are clipped; infinite where neither end is, and
+        for a sensor without samples.
 
     Raises:
         TypeError: `signal` is not a floating point tensor.
     """
     check_signal("signal", signal)
+    fewest, ratio = 5, 3.0  # of equal samples, as above
     full_scale = signal.new_full(signal.shape[:-1], torch.inf)
     if signal.shape[-1] == 0:
         return full_scale
@@ -69,13 +66,21 @@ def find_saturation(signal: Tensor) -> Tensor:
         below = torch.where(value < top, value, -torch.inf)
         second = below.amax(-1, keepdim=True)
         n_top, n_second = (value == top).sum(-1), (value == second).sum(-1)
-        piled = (n_top >= _SMALLEST_PILE) & (n_top > _PILE * n_second) & second.isfinite().squeeze(-1)
-        full_scale = torch.where(piled, torch.minimum(full_scale, top.squeeze(-1).abs()), full_scale)
+        clipped = (n_top >= fewest) & (n_top > ratio * n_second) & second.isfinite().squeeze(-1)
+        full_scale = torch.where(clipped, torch.minimum(full_scale, top.squeeze(-1).abs()), full_scale)
     return full_scale
 
 
 def check_full_scale(value: float | Tensor, sensors: torch.Size) -> Tensor:
-    """Return full scales as a tensor when all are above 0 and go with arrays of shape `sensors`, `(..., sensor)`."""
+    """Return full scales as a tensor.
+
+    Args:
+        value: One full scale, or one for each sensor.
+        sensors: Shape of the sensors, `(..., sensor)`.
+
+    Raises:
+        ValueError: A full scale that is not above 0, or a shape that does not go with `sensors`.
+    """
     limit = torch.as_tensor(value, dtype=torch.float64)
     if not bool((limit > 0).all()):
         raise ValueError(f"`full_scale`: expected numbers > 0, got {limit.tolist()}")

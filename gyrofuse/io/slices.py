@@ -1,8 +1,8 @@
-"""Logs that are read a stretch of time at a go: .npy, stored .npz, HDF5 and Parquet.
+"""Logs that are read by parts of their time: .npy, .npz without compression, HDF5 and Parquet.
 
-Nothing is kept open or in memory between two reads, not even a memory map, whose pages would count as memory of the
-process for as long as it lives, and which ends the process where the file is cut short. What `read` is bound to are
-names and numbers, so that it can be sent to a process.
+Between two reads no file is open and no memory is held, not even a memory map, whose pages would count as memory of the
+process for as long as it lives, and which ends the process where the file is cut short. `read` is bound to names and
+numbers alone, so that it can be sent to another process.
 """
 
 from __future__ import annotations
@@ -18,24 +18,27 @@ from typing import Any
 
 import numpy as np
 
-from gyrofuse.io.formats.arrays import settings_by_group, stated_rate, stated_unit
-from gyrofuse.io.formats.columns import NAMES_OF, WORD_OF, classify_columns, or_else
+from gyrofuse.io.formats.columns import classify_columns
 from gyrofuse.io.formats.hdf5 import check_inside, objects, settings_of
 from gyrofuse.io.formats.hdf5_heaps import check_heaps
 from gyrofuse.io.formats.numpy.npy import read_header, read_numbers, read_stretch
 from gyrofuse.io.formats.parquet import metadata_of
-from gyrofuse.io.limits import Allowance, enumerated, is_regular
+from gyrofuse.io.formats.request import Request
+from gyrofuse.io.formats.settings import settings_by_group, stated_rate, stated_unit
+from gyrofuse.io.limits import enumerated, is_regular
+from gyrofuse.io.quantities import RATE, Quantity
 from gyrofuse.io.streams import Array, RecordingError, cause
 
-_MOST_SETTING = 2**16  # bytes of an array that is read because it may be a setting: names of sensors at most
-# Type and shape of each array by its name.
-_Found = dict[str, tuple[Any, tuple[int, ...]]]
-_LOCAL_HEADER = 30  # bytes of a .zip member's own header before its name
+# Bytes of an array that is read because it may be a setting: names of a thousand sensors take 64 kB.
+_MOST_SETTING = 65_536
+# The header of a member of a .zip file before its name, with the lengths of the name and of the extra field.
+_LOCAL_HEADER = struct.Struct("<26xHH")
+_Found = dict[str, tuple[Any, tuple[int, ...]]]  # type and shape of each array by its name
 
 
 @dataclass(frozen=True)
 class Slices:
-    """A log whose samples are read by stretches.
+    """A log whose samples are read by parts of their time.
 
     Attributes:
         read: Maps `(start, stop)`, positions in time, to the samples `(sensor, stop - start)`.
@@ -52,20 +55,20 @@ class Slices:
     unit: str
 
 
-def open_slices(path: Path, key: str | Sequence[str] | None, quantity: str = "rate") -> Slices:
+def open_slices(path: Path, key: str | Sequence[str] | None, quantity: Quantity = RATE) -> Slices:
     """Find the gyros or accelerometers of a log without reading them.
 
     Args:
         path: The file; its suffix says the format.
         key: The array of an .npz or HDF5 file, or the columns of a Parquet file, one for each sensor.
-        quantity: `"rate"` or `"acceleration"`: the sensors to read.
+        quantity: The quantity whose sensors are read.
 
     Raises:
         FileNotFoundError: No such file.
-        RecordingError: A format that has to be read whole, a damaged file, or none or several arrays that could be it.
+        RecordingError: A format that has to be read whole, a damaged file, no array or several that may be the sensors.
         ImportError: The library of the format is not installed.
     """
-    openers: dict[str, Callable[[Path, Any, str], Slices]] = {
+    openers: dict[str, Callable[[Path, Any, Quantity], Slices]] = {
         ".npy": _open_npy,
         ".npz": _open_npz,
         ".h5": _open_hdf5,
@@ -94,13 +97,13 @@ def open_slices(path: Path, key: str | Sequence[str] | None, quantity: str = "ra
         ) from error
 
 
-def _open_npy(path: Path, key: str | None, quantity: str) -> Slices:
+def _open_npy(path: Path, key: str | None, quantity: Quantity) -> Slices:
     if key is not None:
         raise RecordingError(f"{path}: expected no `key` for an .npy file, which holds one array, found {key!r}")
     return _mapped(path, 0, "the array", {}, quantity, ())
 
 
-def _open_npz(path: Path, key: str | None, quantity: str) -> Slices:
+def _open_npz(path: Path, key: str | None, quantity: Quantity) -> Slices:
     with zipfile.ZipFile(path) as archive:
         headers = {}
         for info in archive.infolist():
@@ -122,19 +125,13 @@ def _open_npz(path: Path, key: str | None, quantity: str) -> Slices:
                     few[other] = read_numbers(member, shape, order, kind)
     with path.open("rb") as file:
         file.seek(info.header_offset)
-        name_and_extra = struct.unpack_from("<HH", file.read(_LOCAL_HEADER), _LOCAL_HEADER - 4)
-    return _mapped(
-        path,
-        info.header_offset + _LOCAL_HEADER + sum(name_and_extra),
-        f"`{name}`",
-        few,
-        quantity,
-        {*_kinds(found, quantity).values()},
-    )
+        name_length, extra_length = _LOCAL_HEADER.unpack(file.read(_LOCAL_HEADER.size))
+        start = file.tell() + name_length + extra_length
+    return _mapped(path, start, f"`{name}`", few, quantity, {*_kinds(found, quantity).values()})
 
 
 def _mapped(
-    path: Path, start: int, what: str, settings: dict[str, Any], quantity: str, kinds: Collection[str]
+    path: Path, start: int, what: str, settings: dict[str, Any], quantity: Quantity, kinds: Collection[str]
 ) -> Slices:
     """An array in NumPy's format that begins `start` bytes into a file."""
     with path.open("rb") as file:
@@ -143,14 +140,14 @@ def _mapped(
         offset = file.tell()
     names = _names(settings.get("sensors"))
     n_sensors, n_samples, time_first = _orientation(path, what, dtype, shape, len(names))
-    if path.stat().st_size < offset + prod(shape) * dtype.itemsize:  # told now, not in the middle of a run
+    if path.stat().st_size < offset + prod(shape) * dtype.itemsize:  # better an error now than in the middle of a run
         raise EOFError(f"{shape} numbers announced, fewer there")
     read = partial(read_stretch, path, offset, dtype, n_sensors, n_samples, time_first != fortran)
     unit = stated_unit(settings_by_group(settings), "", quantity, kinds)
     return _slices(path, read, n_samples, n_sensors, names, settings, "", unit)
 
 
-def _open_hdf5(path: Path, key: str | None, quantity: str) -> Slices:
+def _open_hdf5(path: Path, key: str | None, quantity: Quantity) -> Slices:
     try:
         import h5py
     except ImportError as error:
@@ -183,7 +180,7 @@ def _read_hdf5(path: Path, name: str | bytes, time_first: bool, start: int, stop
         return _rows(file[name], time_first, start, stop)
 
 
-def _open_parquet(path: Path, key: str | Sequence[str] | None, quantity: str) -> Slices:
+def _open_parquet(path: Path, key: str | Sequence[str] | None, quantity: Quantity) -> Slices:
     try:
         from pyarrow import parquet
         from pyarrow import types as kinds
@@ -197,7 +194,7 @@ def _open_parquet(path: Path, key: str | Sequence[str] | None, quantity: str) ->
     columns = classify_columns(numbers, quantity)
     kinds = {column.kind for column in columns}
     if key is None:
-        columns = [column for column in columns if column.kind == quantity]
+        columns = [column for column in columns if column.kind == quantity.name]
         wanted = [column.name for column in columns]
         if len({column.device for column in columns}) > 1 and len({column.axis for column in columns}) > 1:
             raise RecordingError(
@@ -208,13 +205,14 @@ def _open_parquet(path: Path, key: str | Sequence[str] | None, quantity: str) ->
         wanted = [key] if isinstance(key, str) else list(key)
     absent = [name for name in wanted if name not in numbers]
     if absent or not wanted or not ends or ends[-1] < 2:
-        asked = f"a column with the name of {NAMES_OF[quantity]}" if key is None else f"columns {wanted} (`key`)"
+        asked = f"a column with the name of {quantity.named}" if key is None else f"columns {wanted} (`key`)"
         advice = "say with `key` which columns are the sensors"
         raise RecordingError(
             f"{path}: expected {asked} of numbers with at least 2 rows, found {metadata.num_rows} rows of "
-            f"{enumerated(schema.names)}; {advice if key is not None else or_else(kinds, quantity, advice)}"
+            f"{enumerated(schema.names)}; {advice if key is not None else quantity.advice(kinds, advice)}"
         )
-    Allowance(path).take("columns of a row group", (max(lengths), len(wanted)))  # which is read whole
+    # A row group is the smallest part that is read.
+    Request(path).allowance().take("columns of a row group", (max(lengths), len(wanted)))
     settings = metadata_of(schema)
     units = {column.unit for column in classify_columns(wanted, quantity)} - {""}
     unit = units.pop() if len(units) == 1 else stated_unit(settings_by_group(settings), "", quantity, kinds)
@@ -238,31 +236,31 @@ def _read_parquet(path: Path, names: list[str], ends: list[int], start: int, sto
     return rows
 
 
-def _kinds(found: _Found, quantity: str) -> dict[str, str]:
-    """What each array of numbers of two dimensions is, as far as its name says."""
+def _kinds(found: _Found, quantity: Quantity) -> dict[str, str]:
+    """Kind of each array of numbers of two dimensions, by its name."""
     tables = [name for name, (dtype, shape) in found.items() if dtype.kind in "iuf" and len(shape) == 2]
     return {column.name: column.kind for column in classify_columns(tables, quantity)}
 
 
-def _choose(path: Path, found: _Found, key: str | None, quantity: str) -> str:
-    """The array asked for, else `gyro` or `acceleration`, else the only one of two dimensions that may be it."""
+def _choose(path: Path, found: _Found, key: str | None, quantity: Quantity) -> str:
+    """The array asked for, else `gyro` or `acceleration`, else the only array of two dimensions that may be sensors."""
     kinds = _kinds(found, quantity)
-    named = [name for name in kinds if name.rpartition("/")[2] == WORD_OF[quantity]]
-    others = [name for name, kind in kinds.items() if kind in NAMES_OF and kind != quantity]
+    named = [name for name in kinds if name.rpartition("/")[2] == quantity.array]
+    others = [name for name, kind in kinds.items() if kind == quantity.other.name]
     wanted = (
         [name for name in found if name == key] if key is not None else named or [n for n in kinds if n not in others]
     )
     if len(wanted) != 1:
         asked = "one array (sensor, time) of numbers" if key is None else f"an array {key!r} (`key`)"
         listed = enumerated(f"{name} {shape}" for name, (_, shape) in found.items()) or "nothing"
-        advice = f"name the {'gyros' if quantity == 'rate' else 'accelerometers'} with `key`"
+        advice = f"name the {quantity.sensor}s with `key`"
         there = {kinds[name] for name in others} if key is None and not wanted else ()
-        raise RecordingError(f"{path}: expected {asked}, found {listed}; {or_else(there, quantity, advice)}")
+        raise RecordingError(f"{path}: expected {asked}, found {listed}; {quantity.advice(there, advice)}")
     return wanted[0]
 
 
 def _orientation(path: Path, what: str, dtype: Any, shape: tuple[int, ...], n_names: int) -> tuple[int, int, bool]:
-    """Sensors, samples, and whether time comes first: the longer dimension is time, unless names settle it."""
+    """Numbers of sensors and samples, and whether time comes first: time is the longer dimension or has no names."""
     if dtype.kind not in "iuf" or len(shape) not in (1, 2) or min(shape, default=0) < 1 or max(shape) < 2:
         raise RecordingError(
             f"{path}: expected {what} to be numbers (sensor, time) with at least 2 samples, found {dtype} {shape}; "
@@ -276,7 +274,7 @@ def _orientation(path: Path, what: str, dtype: Any, shape: tuple[int, ...], n_na
 
 
 def _rows(array: Any, time_first: bool, start: int, stop: int) -> Array:
-    """A stretch of a dataset of one or two dimensions as `(sensor, time)`."""
+    """Samples of a dataset of one or two dimensions as `(sensor, time)`."""
     if len(array.shape) == 1:
         part = array[start:stop][None]
     else:
@@ -289,7 +287,7 @@ def _names(value: Any) -> tuple[str, ...]:
 
 
 def _read_named(path: Path, read: Callable[[int, int], Any], start: int, stop: int) -> Array:
-    """A stretch in float64; whatever goes wrong, the error names the file."""
+    """Samples in float64; any error becomes one that names the file."""
     try:
         return np.array(read(start, stop), dtype=np.float64, order="C")
     except Exception as error:  # a file that is damaged, or was changed since, may fail anywhere in its library

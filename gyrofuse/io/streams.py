@@ -1,8 +1,9 @@
-"""What every log reader returns: the gyros or accelerometers of one device, as recorded."""
+"""What a log reader returns: the samples of each device as recorded, and notes on what was found."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +16,17 @@ class RecordingError(ValueError):
 
 
 def cause(error: Exception) -> str:
-    """Words of an error, its kind where it has none."""
+    """Message of an error in at most 1000 characters, or its type where it has none."""
     return str(error)[:1000] or type(error).__name__
 
 
 def unexpected(source: object, error: Exception) -> RecordingError:
-    """The error for what no reader foresaw: with the log, and the words of the cause."""
+    """The error for an exception that no reader foresaw.
+
+    Args:
+        source: The log or logs.
+        error: The exception.
+    """
     return RecordingError(
         f"{source}: expected a recording, found a log that cannot be made one ({type(error).__name__}: {cause(error)}"
         "); it may be damaged: record, copy or export it again"
@@ -31,13 +37,12 @@ def unexpected(source: object, error: Exception) -> RecordingError:
 class Stream:
     """The gyros or accelerometers of one device that share one clock, exactly as the log holds them.
 
-    Nothing is repaired here: gaps, repeats, wraps and non-finite samples are kept for
-    `gyrofuse.io.recording` to find and report.
+    Gaps, repeats, wraps and non-finite samples are kept: `gyrofuse.io.assemble` finds and reports them.
 
     Attributes:
-        name: Device, topic instance, file stem or column the data come from.
-        signal: Rate or acceleration along each axis, whichever was asked for, `{"x": (time,), "y": ..., "z": ...}`; the
-            key is "" where the log names no axis.
+        name: Device, topic instance, file stem or column from which the samples come.
+        signal: Samples of the requested quantity along each axis, `{"x": (time,), "y": ..., "z": ...}`; the key is ""
+            where the log names no axis.
         unit: `"deg/s"`, `"rad/s"`, `"m/s^2"`, `"counts"`, or `"unknown"` where the log does not say.
         time: Clock reading of each sample in seconds (may wrap, repeat or jump), or `None`.
         rate: Sampling rate that the log states in Hz, or `None`.
@@ -45,7 +50,7 @@ class Stream:
         channels: Auxiliary channels with time last: `temperature (time,)`, and `acceleration (3, time)` beside rates or
             `angular_rate (3, time)` beside accelerations.
         channel_units: Unit of each auxiliary channel, where known.
-        notes: What the reader noticed (dropouts the logger reported, columns ignored), one sentence each.
+        notes: Remarks of the reader (dropouts that the logger reported, columns left out), one sentence each.
     """
 
     name: str
@@ -62,3 +67,46 @@ class Stream:
     def n_samples(self) -> int:
         """Number of samples as recorded."""
         return next(iter(self.signal.values())).shape[0]
+
+
+@dataclass(frozen=True)
+class Note:
+    """One finding about a recording.
+
+    Attributes:
+        kind: `gaps`, `repeats`, `jitter`, `drift`, `wraps`, `clock`, `non_finite`, `startup`, `offset`, `cut`,
+            `unit` or `reader`.
+        stream: Device or file that the finding concerns; empty when it concerns all.
+        sentence: The finding in words, with numbers and units.
+        numbers: The numbers of the sentence by name.
+    """
+
+    kind: str
+    stream: str
+    sentence: str
+    numbers: dict[str, float] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return f"{self.stream}: {self.sentence}" if self.stream else self.sentence
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON."""
+        return {
+            "kind": self.kind,
+            "stream": self.stream,
+            "sentence": self.sentence,
+            "numbers": self.numbers,
+        }
+
+
+class Notebook:
+    """Collects the notes about one stream."""
+
+    def __init__(self, stream: str) -> None:
+        self.stream = stream
+        self.notes: list[Note] = []
+
+    def add(self, kind: str, sentence: str, **numbers: float) -> None:
+        """Note a finding with its numbers."""
+        plain = {name: float(value) for name, value in numbers.items()}
+        self.notes.append(Note(kind, self.stream, sentence, plain))

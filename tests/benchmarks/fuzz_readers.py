@@ -3,8 +3,8 @@
     python tests/benchmarks/fuzz_readers.py [--quick] [--inputs N] [--seed S] [--keep FOLDER]
 
 The inputs are sound logs with their bytes changed at random, sound formats with senseless content, and the logs of
-`tests/hostile_logs.py`, as they are and with their bytes changed. Each is read by `read_recording`, and by `open_long`
-where that reads the format, in a process of its own with a limit in time and in memory. Counted are
+`tests/hostile_logs.py`, as they are and with their bytes changed. Each is read by `read_recording`, and by
+`open_recording` where that reads the format, in a process of its own with a limit in time and in memory. Counted are
 
 - read: a recording came out, and its summary and JSON as well;
 - refused: a `RecordingError` or `OSError` that names the file;
@@ -260,12 +260,12 @@ def read(log: Path | list[Path], answer: Connection) -> None:
     ended, said = min(ends, key=lambda end: ("nameless", "read", "refused").index(end[0]))
     if ended != "nameless" and path.suffix in (".npy", ".npz", ".h5", ".parquet"):
         try:
-            gf.open_long(path).read(0, 2)
+            gf.open_recording(path).read(0, 2)
         except (RecordingError, OSError) as error:
             if path.name not in str(error):
-                ended, said = "nameless", f"open_long: {error}"
+                ended, said = "nameless", f"open_recording: {error}"
         except BaseException as error:
-            ended, said = "nameless", f"open_long: {type(error).__name__}: {error}"
+            ended, said = "nameless", f"open_recording: {type(error).__name__}: {error}"
     answer.send((ended, said))
 
 

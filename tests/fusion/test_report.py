@@ -29,7 +29,7 @@ from gyrofuse.fusion.report.page import (
 )
 from gyrofuse.fusion.weights.methods import METHODS
 from gyrofuse.fusion.weights.rdvg import rdvg
-from gyrofuse.io.notes import Note
+from gyrofuse.io.streams import Note
 
 SCRIPT, BOLD = '"><script>alert(1)</script>', "<b>x</b>.csv"
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from logs import made_up
+from logs import made_up, request
 
 from gyrofuse.io.formats.arrays import streams_from_arrays
 from gyrofuse.io.streams import RecordingError
@@ -14,7 +14,7 @@ GYRO = made_up(1)[0]  # (axis, time)
 
 
 def read(content, key=None):
-    return streams_from_arrays(content, PATH, key=key)
+    return streams_from_arrays(content, request(PATH, key=key))
 
 
 def test_the_names_of_an_npz_recording():

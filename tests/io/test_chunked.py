@@ -37,8 +37,8 @@ def samples(*, gaps: bool = False) -> torch.Tensor:
     return torch.from_numpy(signal)
 
 
-def recording_of(signal: torch.Tensor, **about: object) -> gf.LongRecording:
-    return gf.LongRecording(lambda start, stop: signal[:, start:stop], *signal.shape, **about)
+def recording_of(signal: torch.Tensor, **about: object) -> gf.ChunkedRecording:
+    return gf.ChunkedRecording(lambda start, stop: signal[:, start:stop], *signal.shape, **about)
 
 
 def launched(rank: int = 0, world_size: int = 1) -> SimpleNamespace:
@@ -49,7 +49,7 @@ def launched(rank: int = 0, world_size: int = 1) -> SimpleNamespace:
 @pytest.mark.parametrize("n_samples", [1, 7, 100, 101])
 @pytest.mark.parametrize("world_size", [1, 2, 3, 8])
 def test_stretches_follow_each_other(n_samples: int, world_size: int):
-    stretches = [gf.stretch_of(n_samples, rank, world_size) for rank in range(world_size)]
+    stretches = [gf.shard_bounds(n_samples, rank, world_size) for rank in range(world_size)]
     assert stretches[0][0] == 0
     assert stretches[-1][1] == n_samples
     assert all(before[1] == after[0] for before, after in itertools.pairwise(stretches))
@@ -74,7 +74,7 @@ def test_chunks_of_any_length_give_the_weights_of_the_whole(chunk_samples: int |
 def test_stretches_add_up(world_size: int, gaps: bool):
     signal = samples(gaps=gaps)
     parts = [
-        measure_stretch(recording_of(signal), N_LEVELS, *gf.stretch_of(N_SAMPLES, rank, world_size), chunk_samples=97)
+        measure_stretch(recording_of(signal), N_LEVELS, *gf.shard_bounds(N_SAMPLES, rank, world_size), chunk_samples=97)
         for rank in range(world_size)
     ]
     for part in parts[1:]:
@@ -92,7 +92,7 @@ def test_a_process_reads_its_stretch_and_what_it_looks_back_on():
         read.append((start, stop))
         return signal[:, start:stop]
 
-    recording = gf.LongRecording(source, N_SENSORS, N_SAMPLES)
+    recording = gf.ChunkedRecording(source, N_SENSORS, N_SAMPLES)
     measure_stretch(recording, N_LEVELS, 2000, 3000, chunk_samples=300)
     assert read[0][0] == 2000 - 2**N_LEVELS + 1
     assert read[-1][1] == 3000
@@ -195,7 +195,7 @@ def saved(path: Path, signal: np.ndarray) -> Path:
 @pytest.mark.parametrize("suffix", [".npy", ".npz", ".h5", ".parquet"])
 def test_files(tmp_path: Path, suffix: str):
     signal = samples(gaps=True).numpy()
-    recording = gf.open_long(saved(tmp_path / f"log{suffix}", signal))
+    recording = gf.open_recording(saved(tmp_path / f"log{suffix}", signal))
     assert (recording.n_sensors, recording.n_samples) == signal.shape
     for start, stop in ((0, 1), (700, 1700), (776, 777), (2480, 2520), (4999, 5000), (0, 5000), (10, 10)):
         got = recording.read(start, stop)
@@ -206,7 +206,7 @@ def test_files(tmp_path: Path, suffix: str):
         assert "5000 samples at 100 Hz (50 s), deg/s" in str(recording)
     names = {".npz": "abcd", ".parquet": ["gyro_a", "gyro_b", "gyro_c", "gyro_d"]}
     assert recording.sensors == tuple(names.get(suffix, "1234"))
-    assert gf.open_long(tmp_path / f"log{suffix}", rate=7.0, unit="rad/s").rate == 7.0
+    assert gf.open_recording(tmp_path / f"log{suffix}", rate=7.0, unit="rad/s").rate == 7.0
     again = pickle.loads(pickle.dumps(recording))  # for processes that are sent it
     np.testing.assert_array_equal(again.read(5, 9).numpy(), signal[:, 5:9])
 
@@ -227,7 +227,7 @@ def test_arrays_of_other_layouts(tmp_path: Path, kind: str, suffix: str):
         write_hdf5(path, {"angular": stored})
     else:
         (np.save if suffix == ".npy" else np.savez)(path, stored)
-    recording = gf.open_long(path)
+    recording = gf.open_recording(path)
     assert recording.n_sensors == 3
     np.testing.assert_array_equal(recording.read(100, 3000).numpy(), values[:, 100:3000])
     assert (recording.rate, recording.unit) == (None, "unknown")
@@ -236,16 +236,16 @@ def test_arrays_of_other_layouts(tmp_path: Path, kind: str, suffix: str):
 def test_names_of_arrays_and_columns(tmp_path: Path):
     signal = samples().numpy()
     np.savez(tmp_path / "a.npz", first=signal, second=-signal)
-    np.testing.assert_array_equal(gf.open_long(tmp_path / "a.npz", key="second").read(3, 5), -signal[:, 3:5])
+    np.testing.assert_array_equal(gf.open_recording(tmp_path / "a.npz", key="second").read(3, 5), -signal[:, 3:5])
     with pytest.raises(
         gf.RecordingError, match=r"a.npz: expected one array .* found first .* name the gyros with `key`"
     ):
-        gf.open_long(tmp_path / "a.npz")
+        gf.open_recording(tmp_path / "a.npz")
     saved(tmp_path / "a.parquet", signal)
-    two = gf.open_long(tmp_path / "a.parquet", key=["gyro_c", "gyro_a"])
+    two = gf.open_recording(tmp_path / "a.parquet", key=["gyro_c", "gyro_a"])
     np.testing.assert_array_equal(two.read(700, 800), signal[[2, 0], 700:800])
     with pytest.raises(gf.RecordingError, match=r"expected columns \['gyro_e'\] \(`key`\) of numbers"):
-        gf.open_long(tmp_path / "a.parquet", key="gyro_e")
+        gf.open_recording(tmp_path / "a.parquet", key="gyro_e")
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".h5", ".parquet"])
@@ -262,11 +262,11 @@ def test_accelerometers_of_a_log_of_both(tmp_path: Path, suffix: str):
         columns = {f"gyro_{n}": row for n, row in zip("abcd", rates, strict=True)}
         columns |= {f"acc_{n} [m/s^2]": row for n, row in zip("abc", accelerations, strict=True)}
         write_parquet(path, columns, {"fs": "100", "unit": "deg/s"})
-    recording = gf.open_long(path, quantity="acceleration")
+    recording = gf.open_recording(path, quantity="acceleration")
     # of an .npz the one unit is that of the gyros
     assert (recording.rate, recording.unit) == (100.0, "unknown" if suffix == ".npz" else "m/s^2")
     np.testing.assert_array_equal(recording.read(700, 1700).numpy(), accelerations[:, 700:1700])
-    gyros = gf.open_long(path)
+    gyros = gf.open_recording(path)
     assert gyros.unit == "deg/s"
     np.testing.assert_array_equal(gyros.read(700, 1700).numpy(), rates[:, 700:1700])
 
@@ -281,15 +281,15 @@ def test_a_long_log_of_accelerometers_alone(tmp_path: Path, suffix: str):
         write_hdf5(path, {"accelerometer": accelerations})
     else:
         np.savez(path, acc=accelerations)
-    found = gf.open_long(path, quantity="acceleration").read(3, 5)
+    found = gf.open_recording(path, quantity="acceleration").read(3, 5)
     np.testing.assert_array_equal(found.numpy(), accelerations[:, 3:5])
     with pytest.raises(gf.RecordingError, match=r'it has accelerations, .* with quantity="acceleration"'):
-        gf.open_long(path)
+        gf.open_recording(path)
 
 
 def test_no_such_quantity(tmp_path: Path):
     with pytest.raises(ValueError, match=r"`quantity`: expected 'rate' or 'acceleration', got 'force'"):
-        gf.open_long(saved(tmp_path / "log.npy", samples().numpy()), quantity="force")
+        gf.open_recording(saved(tmp_path / "log.npy", samples().numpy()), quantity="force")
 
 
 def test_what_cannot_be_read_by_stretches_is_refused(tmp_path: Path):
@@ -298,20 +298,20 @@ def test_what_cannot_be_read_by_stretches_is_refused(tmp_path: Path):
     with pytest.raises(
         gf.RecordingError, match=r"packed.npz: expected `gyro` as it is, found it compressed.*np.savez or"
     ):
-        gf.open_long(tmp_path / "packed.npz")
+        gf.open_recording(tmp_path / "packed.npz")
     np.save(tmp_path / "deep.npy", signal[None])
     with pytest.raises(gf.RecordingError, match=r"deep.npy: expected the array to be numbers \(sensor, time\)"):
-        gf.open_long(tmp_path / "deep.npy")
+        gf.open_recording(tmp_path / "deep.npy")
     np.save(tmp_path / "cut.npy", signal)
     os.truncate(tmp_path / "cut.npy", 10_000)
     with pytest.raises(gf.RecordingError, match=r"cut.npy: expected a .npy file, found one that cannot be read"):
-        gf.open_long(tmp_path / "cut.npy")
+        gf.open_recording(tmp_path / "cut.npy")
     with pytest.raises(gf.RecordingError, match=r"log.csv: expected one of .npy, .* found '.csv'; save it as .npy"):
-        gf.open_long(tmp_path / "log.csv")
+        gf.open_recording(tmp_path / "log.csv")
     with pytest.raises(FileNotFoundError, match=r"absent.npy: no such file"):
-        gf.open_long(tmp_path / "absent.npy")
+        gf.open_recording(tmp_path / "absent.npy")
     with pytest.raises(gf.RecordingError, match=r"expected no `key` for an .npy file"):
-        gf.open_long(tmp_path / "deep.npy", key="gyro")
+        gf.open_recording(tmp_path / "deep.npy", key="gyro")
 
 
 def one_of_two(rank: int, port: int, folder: str) -> None:
@@ -331,7 +331,7 @@ def one_of_two(rank: int, port: int, folder: str) -> None:
                 return signal[:, start:stop]
 
             path, said = Path(folder, f"{failing}.npy"), "nothing"
-            recording = gf.LongRecording(source, N_SENSORS, N_SAMPLES)
+            recording = gf.ChunkedRecording(source, N_SENSORS, N_SAMPLES)
             try:
                 gf.write_virtual(recording, torch.ones(4).double() / 4, path, chunk_samples=300, fabric=fabric)
                 assert np.load(path).shape == (N_SAMPLES,)  # there as soon as this process goes on
@@ -369,27 +369,27 @@ def test_two_processes_are_both_done_or_both_told(tmp_path: Path):
 def test_bad_recordings_are_named():
     signal = samples()
     with pytest.raises(TypeError, match=r"`source`: expected a function of \(start, stop\), got str"):
-        gf.LongRecording("log.npy", 2, 10)
+        gf.ChunkedRecording("log.npy", 2, 10)
     with pytest.raises(ValueError, match="`n_samples`: expected a whole number >= 1, got 0"):
-        gf.LongRecording(lambda *_: signal, 2, 0)
+        gf.ChunkedRecording(lambda *_: signal, 2, 0)
     with pytest.raises(ValueError, match="`sensors`: expected 4 names, got 2"):
         recording_of(signal, sensors=("a", "b"))
     with pytest.raises(ValueError, match="`rate`: expected a finite number > 0"):
         recording_of(signal, rate=0.0)
     with pytest.raises(ValueError, match="`stop`: expected start <= stop <= 5000"):
         recording_of(signal).read(4000, 5001)
-    wrong = gf.LongRecording(lambda start, stop: signal[:3, start:stop], N_SENSORS, N_SAMPLES)
+    wrong = gf.ChunkedRecording(lambda start, stop: signal[:3, start:stop], N_SENSORS, N_SAMPLES)
     with pytest.raises(ValueError, match=r"`source`: expected \(sensor, time\) of shape \(4, 10\) .* got \(3, 10\)"):
         wrong.read(0, 10)
     with pytest.raises(TypeError, match=r"`source`: expected real numbers, got torch\.bool"):
-        gf.LongRecording(lambda start, stop: signal[:, start:stop] > 0, N_SENSORS, N_SAMPLES).read(0, 10)
+        gf.ChunkedRecording(lambda start, stop: signal[:, start:stop] > 0, N_SENSORS, N_SAMPLES).read(0, 10)
     with pytest.raises(ValueError, match="`rank`: expected a whole number from 0 to 1, got 2"):
-        gf.stretch_of(10, 2, 2)
+        gf.shard_bounds(10, 2, 2)
 
 
 def test_bad_fits_are_named():
     signal = samples()
-    with pytest.raises(TypeError, match="`recording`: expected a LongRecording, got Tensor"):
+    with pytest.raises(TypeError, match="`recording`: expected a ChunkedRecording, got Tensor"):
         gf.stream_svo(signal)
     with pytest.raises(ValueError, match="`recording`: expected at least 2 sensors to fuse, got 1"):
         gf.stream_svo(recording_of(signal[:1]))
@@ -399,7 +399,7 @@ def test_bad_fits_are_named():
         gf.stream_svo(recording_of(signal[:, :3]))
     with pytest.raises(ValueError, match="`chunk_samples`: expected a whole number >= 1, got 0"):
         gf.stream_svo(recording_of(signal), chunk_samples=0)
-    nothing = gf.LongRecording(lambda *_: pytest.fail("was read before the options were looked at"), 4, N_SAMPLES)
+    nothing = gf.ChunkedRecording(lambda *_: pytest.fail("was read before the options were looked at"), 4, N_SAMPLES)
     with pytest.raises(ValueError, match="`scale_weights`: expected 'flat'"):
         gf.stream_svo(nothing, "broad")
     twice = torch.cat([signal, signal[:1]])
@@ -440,9 +440,9 @@ def test_the_log_that_is_read_is_not_written_over(tmp_path: Path, monkeypatch: p
         with pytest.raises(
             ValueError, match=r"`path`: expected another file than the log that is read, got .*; choose"
         ):
-            gf.write_virtual(gf.open_long(opened), weights, path, force=True)
+            gf.write_virtual(gf.open_recording(opened), weights, path, force=True)
     assert log.read_bytes() == before
-    gf.write_virtual(gf.open_long(log), weights, "virtual.npy")
+    gf.write_virtual(gf.open_recording(log), weights, "virtual.npy")
 
 
 def test_a_file_appears_whole_or_not_at_all(tmp_path: Path):
@@ -453,7 +453,7 @@ def test_a_file_appears_whole_or_not_at_all(tmp_path: Path):
             raise OSError("the disk is gone")
         return signal[:, start:stop]
 
-    recording = gf.LongRecording(source, N_SENSORS, N_SAMPLES)
+    recording = gf.ChunkedRecording(source, N_SENSORS, N_SAMPLES)
     path = tmp_path / "virtual.npy"
     np.save(path, np.arange(3))
     with pytest.raises(OSError, match="the disk is gone"):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from logs import read_with
 
 import gyrofuse as gf
 from gyrofuse.io.formats.columns import classify_columns
@@ -17,7 +18,7 @@ from gyrofuse.io.formats.text.dialects import names_of_message
 def read(folder: Path, *lines: str, key: str | None = None):
     path = folder / "log.csv"
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return text.read(path, key=key)
+    return read_with(text.read, path, key=key)
 
 
 def rows(*cells: object, n: int = 12) -> list[str]:
@@ -200,7 +201,7 @@ class TestNames:
     )
     def test_a_log_of_another_sensor(self, tmp_path: Path, log, but):
         (tmp_path / f"{log}.csv").write_text("seconds_elapsed,z,y,x\n0.0,1,2,3\n0.1,1,2,3\n")
-        (stream,) = text.read(tmp_path / f"{log}.csv")
+        (stream,) = read_with(text.read, tmp_path / f"{log}.csv")
         assert stream.notes == (f"columns z, y, x name no sensor and are read as a gyro's{but}",)
 
     def test_p_q_r_beside_a_gyro_are_none(self):

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hostile_logs import CASES, GYRO, MAT_HEADER, TIME, csv, mat_cells, npz
-from logs import made_up, write_hdf5, write_parquet, write_ros1
+from logs import made_up, read_with, write_hdf5, write_parquet, write_ros1
 
 import gyrofuse as gf
 
@@ -82,7 +82,7 @@ class TestMemory:
         path = write_parquet(tmp_path / "a.parquet", {"gx": GYRO[0]})
         monkeypatch.setattr("gyrofuse.io.limits.physical_memory", lambda: 1000)
         with pytest.raises(RecordingError, match="found columns of a row group of 200 x 1 numbers"):
-            gf.open_long(path)
+            gf.open_recording(path)
 
 
 class TestCutShortWhileRead:
@@ -96,7 +96,7 @@ class TestCutShortWhileRead:
 
         monkeypatch.setattr(np, "memmap", mapped)
         assert gf.read_recording(path, rate=100.0).signal.shape == (3, 200)
-        np.testing.assert_array_equal(gf.open_long(path).read(10, 20), GYRO[:, 10:20])
+        np.testing.assert_array_equal(gf.open_recording(path).read(10, 20), GYRO[:, 10:20])
 
     @pytest.mark.parametrize("suffix", [".npy", ".npz", ".h5", ".parquet"])
     def test_a_long_recording_says_so(self, tmp_path: Path, suffix: str):
@@ -109,7 +109,7 @@ class TestCutShortWhileRead:
             write_hdf5(path, {"gyro": GYRO})
         else:
             write_parquet(path, {"gx": GYRO[0]})
-        recording = gf.open_long(path)
+        recording = gf.open_recording(path)
         recording.read(0, 200)
         with path.open("r+b") as file:
             file.truncate(300)
@@ -120,7 +120,7 @@ class TestCutShortWhileRead:
     @pytest.mark.parametrize("turned", [False, True])
     def test_stretches_are_those_of_the_array(self, tmp_path: Path, order: str, turned: bool):
         np.save(tmp_path / "a.npy", np.asarray(GYRO.T if turned else GYRO, order=order, dtype=">f4"))
-        recording = gf.open_long(tmp_path / "a.npy")
+        recording = gf.open_recording(tmp_path / "a.npy")
         np.testing.assert_array_equal(recording.read(17, 90), GYRO[:, 17:90].astype(np.float32))
 
 
@@ -142,7 +142,7 @@ class TestText:
     def test_quoted_cells_between_blanks(self, tmp_path: Path, between: str, decimal: str):
         rows = [between.join(f'"{x:.4f}"'.replace(".", decimal) for x in row) for row in zip(TIME, *GYRO, strict=True)]
         (tmp_path / "a.csv").write_text("\n".join([between.join(['"time"', '"gx"', '"gy"', '"gz"']), *rows]))
-        (stream,) = read_streams(tmp_path / "a.csv")
+        (stream,) = read_with(read_streams, tmp_path / "a.csv")
         np.testing.assert_allclose([stream.signal[axis] for axis in "xyz"], GYRO, atol=6e-5)
 
     def test_a_row_of_units_says_where_units_belong(self, tmp_path: Path):
@@ -180,9 +180,9 @@ class TestNames:
 
     def test_a_dataset_that_is_not_utf_8_is_read_under_its_name(self, tmp_path: Path):
         make, _ = CASES["h5_names_that_are_not_utf8"]
-        (stream,) = read_streams(make(tmp_path))
+        (stream,) = read_with(read_streams, make(tmp_path))
         np.testing.assert_array_equal([stream.signal[axis] for axis in "xyz"], GYRO)
-        np.testing.assert_array_equal(gf.open_long(tmp_path / "a.h5").read(0, 5), GYRO[:, :5])
+        np.testing.assert_array_equal(gf.open_recording(tmp_path / "a.h5").read(0, 5), GYRO[:, :5])
 
     def test_a_file_that_is_named_twice_is_no_second_device(self, tmp_path: Path):
         path = npz(tmp_path, gyro=GYRO, fs=100.0)

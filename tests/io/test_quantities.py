@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from logs import write_hdf5, write_mat5, write_parquet
+from logs import read_with, write_hdf5, write_mat5, write_parquet
 
 import gyrofuse as gf
 from gyrofuse.io.formats import read_streams
@@ -75,7 +75,7 @@ def test_gyros_of_a_log_of_both(tmp_path: Path, suffix: str):
 @every_format
 def test_a_unit_of_the_other_quantity_says_nothing_of_this_one(tmp_path: Path, suffix: str):
     path = write(tmp_path / f"a{suffix}", "rate", "acceleration", units=False)
-    (gyro,), (accelerometer,) = read_streams(path), read_streams(path, quantity="acceleration")
+    (gyro,), (accelerometer,) = read_with(read_streams, path), read_with(read_streams, path, quantity="acceleration")
     assert (gyro.unit, accelerometer.unit) == ("deg/s", "unknown")
 
 

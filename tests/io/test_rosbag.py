@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 import pytest
-from logs import made_up, regular_stamps, seconds, write_ros1, write_ros2, write_topics
+from logs import made_up, read_with, regular_stamps, seconds, write_ros1, write_ros2, write_topics
 
 from gyrofuse.io.formats.robots import rosbag
 from gyrofuse.io.streams import RecordingError
@@ -37,7 +37,7 @@ every_file = pytest.mark.parametrize("write", [ros1, sqlite_alone, mcap_alone])
 @every_format
 def test_each_imu_topic_is_a_device(tmp_path, write):
     gyro, acceleration, stamps = made_up(), made_up(seed=1), regular_stamps()
-    streams = rosbag.read(write(tmp_path, gyro, stamps, acceleration=acceleration))
+    streams = read_with(rosbag.read, write(tmp_path, gyro, stamps, acceleration=acceleration))
     assert [stream.name for stream in streams] == ["/imu0/data", "/imu1/data"]
     for device, stream in enumerate(streams):
         np.testing.assert_allclose([stream.signal[a] for a in "xyz"], gyro[device], rtol=0, atol=1e-12)
@@ -51,7 +51,7 @@ def test_each_imu_topic_is_a_device(tmp_path, write):
 @every_format
 def test_arrival_stands_in_for_headers_without_stamps(tmp_path, write):
     stamps = regular_stamps()
-    stream, _ = rosbag.read(write(tmp_path, made_up(), stamps, stamped=False))
+    stream, _ = read_with(rosbag.read, write(tmp_path, made_up(), stamps, stamped=False))
     np.testing.assert_array_equal(stream.time, seconds(stamps))
     assert any("arrival" in note for note in stream.notes)
 
@@ -59,41 +59,41 @@ def test_arrival_stands_in_for_headers_without_stamps(tmp_path, write):
 def test_repeated_and_missing_stamps_stay(tmp_path):
     stamps = np.delete(regular_stamps(61), 30)
     stamps[10] = stamps[9]
-    stream, _ = rosbag.read(ros1(tmp_path, made_up(), stamps))
+    stream, _ = read_with(rosbag.read, ros1(tmp_path, made_up(), stamps))
     np.testing.assert_array_equal(stream.time, seconds(stamps))
 
 
 def test_a_quantity_marked_as_not_measured_is_no_channel(tmp_path):
-    stream, _ = rosbag.read(ros1(tmp_path, made_up(), regular_stamps()))
+    stream, _ = read_with(rosbag.read, ros1(tmp_path, made_up(), regular_stamps()))
     assert stream.channels == {}
 
 
 @pytest.mark.parametrize("key", ["/imu1/data", "imu1", "/imu1"])
 def test_key_is_a_topic_or_its_beginning(tmp_path, key):
-    (stream,) = rosbag.read(ros2(tmp_path, made_up(), regular_stamps()), key=key)
+    (stream,) = read_with(rosbag.read, ros2(tmp_path, made_up(), regular_stamps()), key=key)
     assert stream.name == "/imu1/data"
 
 
 def test_a_key_that_is_no_topic(tmp_path):
     with pytest.raises(RecordingError, match=r"named by `key` '/gps', found /imu0/data \(sensor_msgs/msg/Imu\)"):
-        rosbag.read(ros1(tmp_path, made_up(), regular_stamps()), key="/gps")
+        read_with(rosbag.read, ros1(tmp_path, made_up(), regular_stamps()), key="/gps")
 
 
 @every_format
 def test_a_bag_without_an_imu_says_what_it_holds(tmp_path, write):
     path = write(tmp_path, made_up(1), regular_stamps(), msgtype="std_msgs/msg/Header")
     with pytest.raises(RecordingError, match=r"sensor_msgs/msg/Imu, found /imu0/data \(std_msgs/msg/Header\)"):
-        rosbag.read(path)
+        read_with(rosbag.read, path)
 
 
 def test_rates_that_are_marked_as_not_measured(tmp_path):
     with pytest.raises(RecordingError, match=r"expected angular velocities in /imu0/data, found none"):
-        rosbag.read(ros1(tmp_path, made_up(1), regular_stamps(), measured=False))
+        read_with(rosbag.read, ros1(tmp_path, made_up(1), regular_stamps(), measured=False))
 
 
 def test_topics_without_messages(tmp_path):
     with pytest.raises(RecordingError, match=r"expected angular velocities in /imu0/data, /imu1/data, found none"):
-        rosbag.read(mcap(tmp_path, made_up(n_samples=0), regular_stamps(0)))
+        read_with(rosbag.read, mcap(tmp_path, made_up(n_samples=0), regular_stamps(0)))
 
 
 @every_file
@@ -102,7 +102,7 @@ def test_a_truncated_bag(tmp_path, write, keep):
     path = write(tmp_path, made_up(n_samples=600), regular_stamps(600))
     path.write_bytes(path.read_bytes()[: int(keep * path.stat().st_size)])
     with pytest.raises(RecordingError, match=f"{path.name}: expected .*found .*(reindex|IMU data)"):
-        rosbag.read(path)
+        read_with(rosbag.read, path)
 
 
 @every_file
@@ -110,7 +110,7 @@ def test_the_right_name_with_the_wrong_content(tmp_path, write):
     path = write(tmp_path, made_up(), regular_stamps())
     path.write_bytes(b"time,gx,gy,gz\n0,1,2,3\n" * 50)
     with pytest.raises(RecordingError, match=f"{path.name}: expected an indexed ROS 1 or ROS 2 bag"):
-        rosbag.read(path)
+        read_with(rosbag.read, path)
 
 
 def test_a_ros1_bag_whose_recorder_died_before_the_index(tmp_path):
@@ -119,12 +119,12 @@ def test_a_ros1_bag_whose_recorder_died_before_the_index(tmp_path):
     at = content.index(b"index_pos=") + len(b"index_pos=")
     path.write_bytes(content[:at] + bytes(8) + content[at + 8 :])
     with pytest.raises(RecordingError, match=r"not indexed.*rosbag reindex"):
-        rosbag.read(path)
+        read_with(rosbag.read, path)
 
 
 def test_a_directory_without_metadata(tmp_path):
     with pytest.raises(RecordingError, match=r"metadata"):
-        rosbag.read(tmp_path)
+        read_with(rosbag.read, tmp_path)
 
 
 IMU, VECTOR = "sensor_msgs/msg/Imu", "geometry_msgs/msg/Vector3Stamped"
@@ -148,7 +148,7 @@ def accel_topic(name="/camera/accel/sample", n=26, rate=62.5):
 class TestChannelsOfOtherTopics:
     @every_suffix
     def test_accelerations_of_a_topic_without_rates(self, tmp_path, suffix):
-        (stream,) = rosbag.read(write_topics(tmp_path / f"a{suffix}", [gyro_topic(), accel_topic()]))
+        (stream,) = read_with(rosbag.read, write_topics(tmp_path / f"a{suffix}", [gyro_topic(), accel_topic()]))
         assert stream.name == "/camera/gyro/sample"
         np.testing.assert_array_equal(stream.signal["x"], np.arange(1.0, 81))
         # 5 ms apart, and the ramp ends after 400 ms
@@ -163,24 +163,25 @@ class TestChannelsOfOtherTopics:
 
     def test_nothing_is_made_up_outside_of_their_time(self, tmp_path):
         topics = [gyro_topic(), accel_topic(n=11)]
-        (stream,) = rosbag.read(write_topics(tmp_path / "a.bag", topics))
+        (stream,) = read_with(rosbag.read, write_topics(tmp_path / "a.bag", topics))
         np.testing.assert_array_equal(np.isnan(stream.channels["acceleration"][0]), np.arange(80) > 32)
 
     def test_a_gap_is_not_bridged(self, tmp_path):
         name, kind, stamps, values = accel_topic()
         lacking = np.delete(np.arange(26), [10, 11])
-        (stream,) = rosbag.read(
-            write_topics(tmp_path / "a.bag", [gyro_topic(), (name, kind, stamps[lacking], values[lacking])])
+        (stream,) = read_with(
+            rosbag.read,
+            write_topics(tmp_path / "a.bag", [gyro_topic(), (name, kind, stamps[lacking], values[lacking])]),
         )
         missing = np.flatnonzero(np.isnan(stream.channels["acceleration"][0]))
         np.testing.assert_array_equal(missing, np.arange(29, 39))  # 144 to 192 ms
 
     def test_a_key_brings_the_accelerations_along(self, tmp_path):
         path = write_topics(tmp_path / "a.bag", [gyro_topic(), accel_topic(), gyro_topic("/other/imu")])
-        (stream,) = rosbag.read(path, key="/camera/gyro/sample")
+        (stream,) = read_with(rosbag.read, path, key="/camera/gyro/sample")
         assert "acceleration" in stream.channels
         with pytest.raises(RecordingError, match=r"/camera/accel/sample, found none .* exactly zero throughout"):
-            rosbag.read(path, key="/camera/accel/sample")
+            read_with(rosbag.read, path, key="/camera/accel/sample")
 
     @every_suffix
     def test_field_temperature_and_pressure(self, tmp_path, suffix):
@@ -191,7 +192,7 @@ class TestChannelsOfOtherTopics:
             ("/imu/temperature", WARM, stamps[::20], np.full((4, 1), 36.5)),
             ("/imu/pressure", PRESSURE, stamps[::2], np.full((40, 1), 101325.0)),
         ]
-        (stream,) = rosbag.read(write_topics(tmp_path / f"a{suffix}", topics))
+        (stream,) = read_with(rosbag.read, write_topics(tmp_path / f"a{suffix}", topics))
         assert stream.channels["magnetic_field"].shape == (3, 80)
         np.testing.assert_allclose(stream.channels["magnetic_field"][2], 3e-6 * np.arange(80))
         np.testing.assert_array_equal(stream.channels["temperature"][:61], 36.5)
@@ -204,14 +205,14 @@ class TestChannelsOfOtherTopics:
     def test_a_channel_goes_with_the_gyro_whose_name_begins_alike(self, tmp_path):
         topics = [gyro_topic("/left/imu"), gyro_topic("/right/imu"), accel_topic("/right/accel")]
         topics.append(("/weather", WARM, regular_stamps(80), np.full((80, 1), 21.0)))
-        left, right = rosbag.read(write_topics(tmp_path / "a.bag", topics))
+        left, right = read_with(rosbag.read, write_topics(tmp_path / "a.bag", topics))
         assert (list(left.channels), list(right.channels)) == (["temperature"], ["acceleration"])
 
     def test_clocks_without_a_common_time_are_compared_by_arrival(self, tmp_path):
         path = write_topics(tmp_path / "a.bag", [gyro_topic()])
         other = write_topics(tmp_path / "b.bag", [accel_topic()], clock_offset=10**15)
         whole = merged(tmp_path / "c.bag", path, other)
-        (stream,) = rosbag.read(whole)
+        (stream,) = read_with(rosbag.read, whole)
         np.testing.assert_allclose(stream.channels["acceleration"][0], 5.0 * np.arange(80), atol=1e-3)
         assert any("by arrival at the recorder" in note for note in stream.notes)
 
@@ -238,25 +239,27 @@ class TestVectors:
     )
     def test_rates_by_the_name_of_the_topic(self, tmp_path, suffix, topic, unit):
         rates = made_up(1)[0].T
-        (stream,) = rosbag.read(write_topics(tmp_path / f"a{suffix}", [(topic, VECTOR, regular_stamps(), rates)]))
+        (stream,) = read_with(
+            rosbag.read, write_topics(tmp_path / f"a{suffix}", [(topic, VECTOR, regular_stamps(), rates)])
+        )
         assert (stream.name, stream.unit) == (topic, unit)
         assert any("as multisense_ros publishes it" in note for note in stream.notes) == (unit == "deg/s")
         np.testing.assert_array_equal([stream.signal[a] for a in "xyz"], rates.T)
 
     def test_rates_by_the_frame(self, tmp_path):
         topics = [("/vector", VECTOR, regular_stamps(), made_up(1)[0].T)]
-        (stream,) = rosbag.read(write_topics(tmp_path / "a.bag", topics, frame="gyro_link"))
+        (stream,) = read_with(rosbag.read, write_topics(tmp_path / "a.bag", topics, frame="gyro_link"))
         assert stream.name == "/vector"
         with pytest.raises(RecordingError, match=r"expected angular velocities in /vector, found none"):
-            rosbag.read(write_topics(tmp_path / "b.bag", topics, frame="arm"))
+            read_with(rosbag.read, write_topics(tmp_path / "b.bag", topics, frame="arm"))
 
     def test_they_are_no_second_device_beside_an_imu(self, tmp_path):
         topics = [gyro_topic("/imu/data"), ("/imu/angular_velocity", VECTOR, regular_stamps(), made_up(1)[0].T)]
         path = write_topics(tmp_path / "a.bag", topics)
-        (stream,) = rosbag.read(path)
+        (stream,) = read_with(rosbag.read, path)
         assert stream.name == "/imu/data"
         assert any("rates in /imu/angular_velocity are not read beside" in note for note in stream.notes)
-        assert [s.name for s in rosbag.read(path, key="/imu/angular_velocity")] == ["/imu/angular_velocity"]
+        assert [s.name for s in read_with(rosbag.read, path, key="/imu/angular_velocity")] == ["/imu/angular_velocity"]
 
 
 class TestAccelerations:
@@ -266,7 +269,7 @@ class TestAccelerations:
     def test_each_imu_topic_is_a_device(self, tmp_path, write):
         gyro, acceleration, stamps = made_up(), made_up(seed=1), regular_stamps()
         path = write(tmp_path, gyro, stamps, acceleration=acceleration)
-        for device, stream in enumerate(rosbag.read(path, quantity="acceleration")):
+        for device, stream in enumerate(read_with(rosbag.read, path, quantity="acceleration")):
             assert (stream.name, stream.unit) == (f"/imu{device}/data", "m/s^2")
             np.testing.assert_allclose([stream.signal[a] for a in "xyz"], acceleration[device], rtol=0, atol=1e-12)
             np.testing.assert_allclose(stream.channels["angular_rate"], gyro[device], rtol=0, atol=1e-12)
@@ -275,7 +278,7 @@ class TestAccelerations:
     @every_suffix
     def test_they_keep_their_own_clock(self, tmp_path, suffix):
         path = write_topics(tmp_path / f"a{suffix}", [gyro_topic(n=81), accel_topic()])
-        (stream,) = rosbag.read(path, quantity="acceleration")
+        (stream,) = read_with(rosbag.read, path, quantity="acceleration")
         assert (stream.name, stream.unit, stream.n_samples) == ("/camera/accel/sample", "m/s^2", 26)
         np.testing.assert_allclose(np.diff(stream.time), 16e-3, atol=1e-6)
         np.testing.assert_array_equal(stream.signal["x"], 16.0 * np.arange(26))
@@ -292,18 +295,18 @@ class TestAccelerations:
     def test_vectors_by_the_name_of_the_topic(self, tmp_path, topic, unit):
         values = made_up(1)[0].T
         path = write_topics(tmp_path / "a.mcap", [(topic, VECTOR, regular_stamps(), values)])
-        (stream,) = rosbag.read(path, quantity="acceleration")
+        (stream,) = read_with(rosbag.read, path, quantity="acceleration")
         assert (stream.name, stream.unit) == (topic, unit)
         np.testing.assert_array_equal([stream.signal[a] for a in "xyz"], values.T)
         with pytest.raises(
             RecordingError, match=r'expected angular velocities .*, found none.*quantity="acceleration"'
         ):
-            rosbag.read(path)
+            read_with(rosbag.read, path)
 
     def test_an_estimate_without_gravity_is_none(self, tmp_path):
         topics = [("/filter/free_acceleration", VECTOR, regular_stamps(), made_up(1)[0].T)]
         with pytest.raises(RecordingError, match=r"expected linear accelerations .*, found none.*`key`"):
-            rosbag.read(write_topics(tmp_path / "a.bag", topics), quantity="acceleration")
+            read_with(rosbag.read, write_topics(tmp_path / "a.bag", topics), quantity="acceleration")
 
     @pytest.mark.parametrize(
         ("quantity", "name", "channel"),
@@ -320,7 +323,7 @@ class TestAccelerations:
         ]
         path = write_topics(tmp_path / "a.bag", topics)
         for key in (None, name):
-            (stream,) = rosbag.read(path, quantity=quantity, key=key)
+            (stream,) = read_with(rosbag.read, path, quantity=quantity, key=key)
             assert (stream.name, list(stream.channels)) == (name, [channel])
             np.testing.assert_array_equal(stream.channels[channel], accelerations if quantity == "rate" else rates)
 
@@ -330,7 +333,7 @@ class TestAccelerations:
             ("/multisense/imu/gyroscope_vector", VECTOR, regular_stamps(), rates.T),
             ("/multisense/imu/accelerometer_vector", VECTOR, regular_stamps(), accelerations.T),
         ]
-        (stream,) = rosbag.read(write_topics(tmp_path / "a.bag", topics), quantity="acceleration")
+        (stream,) = read_with(rosbag.read, write_topics(tmp_path / "a.bag", topics), quantity="acceleration")
         assert (stream.unit, stream.channel_units) == ("g", {"angular_rate": "deg/s"})
         assert "/multisense/imu/accelerometer_vector is read in g, as multisense_ros publishes it" in stream.notes
         assert "/multisense/imu/gyroscope_vector is read in deg/s, as multisense_ros publishes it" in stream.notes
@@ -338,15 +341,15 @@ class TestAccelerations:
     def test_a_bag_of_gyros_says_what_reads_them(self, tmp_path):
         path = write_topics(tmp_path / "a.bag", [gyro_topic()])
         with pytest.raises(RecordingError, match=r'expected linear accelerations in .*it has gyros.*quantity="rate"'):
-            rosbag.read(path, quantity="acceleration")
+            read_with(rosbag.read, path, quantity="acceleration")
         path = write_topics(tmp_path / "b.bag", [accel_topic()])
         with pytest.raises(RecordingError, match=r'expected angular velocities in .*quantity="acceleration"'):
-            rosbag.read(path)
-        assert rosbag.read(path, quantity="acceleration")[0].n_samples == 26
+            read_with(rosbag.read, path)
+        assert read_with(rosbag.read, path, quantity="acceleration")[0].n_samples == 26
 
 
 def test_the_missing_library_is_named(tmp_path, monkeypatch):
     for module in ("rosbags", "rosbags.rosbag1"):
         monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(ImportError, match=r'pip install "gyrofuse\[logs\]"'):
-        rosbag.read(tmp_path / "a.bag")
+        read_with(rosbag.read, tmp_path / "a.bag")

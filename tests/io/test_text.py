@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from logs import made_up
+from logs import made_up, read_with
 
 from gyrofuse.io.formats import read_streams
 from gyrofuse.io.formats.text import text
@@ -28,7 +28,7 @@ def write(folder: Path, content: str, encoding: str = "utf-8") -> Path:
 
 
 def read(folder: Path, content: str, key: str | None = None):
-    return text.read(write(folder, content), key=key)
+    return read_with(text.read, write(folder, content), key=key)
 
 
 def rows(*columns: np.ndarray, delimiter: str = ",", decimal: str = ".") -> str:
@@ -61,7 +61,7 @@ class TestLayout:
     @pytest.mark.parametrize("newline", ["\n", "\r\n", "\r"])
     def test_encodings_and_line_ends(self, tmp_path: Path, encoding, newline):
         content = ("t,gx,gy,gz\n" + rows(TIME, *GYRO)).replace("\n", newline)
-        (stream,) = text.read(write(tmp_path, content, encoding))
+        (stream,) = read_with(text.read, write(tmp_path, content, encoding))
         np.testing.assert_array_equal(axes(stream), GYRO)
 
     def test_comma_and_space(self, tmp_path: Path):
@@ -115,7 +115,7 @@ class TestLayout:
 
     def test_header_as_a_comment(self, tmp_path: Path):
         np.savetxt(tmp_path / "a.txt", np.vstack([TIME, GYRO]).T, header="t gx gy gz", fmt="%.17g")
-        (stream,) = text.read(tmp_path / "a.txt")
+        (stream,) = read_with(text.read, tmp_path / "a.txt")
         np.testing.assert_array_equal(axes(stream), GYRO)
 
     def test_euroc(self, tmp_path: Path):
@@ -257,17 +257,17 @@ class TestRefused:
         path = tmp_path / "log.csv"
         path.write_bytes(bytes(range(256)))
         with pytest.raises(RecordingError, match=r"log\.csv: expected text, found binary data"):
-            text.read(path)
+            read_with(text.read, path)
 
     def test_a_directory(self, tmp_path: Path):
         with pytest.raises(RecordingError, match="found a file that cannot be read"):
-            text.read(tmp_path)
+            read_with(text.read, tmp_path)
 
 
 class TestRealFiles:
     @pytest.mark.parametrize(("number", "n_samples", "start"), [(1, 22903, 677.583), (2, 22864, 677.516336)])
     def test_xsens_dot(self, shared: Path, number, n_samples, start):
-        (stream,) = read_streams(shared / "data" / "raw" / f"xsens_dot{number}_flight.csv")
+        (stream,) = read_with(read_streams, shared / "data" / "raw" / f"xsens_dot{number}_flight.csv")
         assert (stream.n_samples, stream.unit, stream.rate) == (n_samples, "unknown", None)
         assert stream.time[0] == pytest.approx(start, abs=1e-9)
         assert stream.clock_period == pytest.approx(2**32 * 1e-6)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from logs import read_with
 
 from gyrofuse.io.formats.text import numbers as text_numbers
 from gyrofuse.io.formats.text import text
@@ -30,9 +31,9 @@ def written(path: Path, delimiter: str, decimal: str, end: str, style: str, trai
 @pytest.mark.parametrize("style", [s for s in STYLES if s[0] != s[1]])
 def test_at_once_as_line_by_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, style: tuple[str, ...]):
     path = written(tmp_path / "log.csv", *style)
-    (at_once,) = text.read(path)
+    (at_once,) = read_with(text.read, path)
     monkeypatch.setattr(text_numbers, "_at_once", lambda *given: None)
-    (by_line,) = text.read(path)
+    (by_line,) = read_with(text.read, path)
     for axis in "xy":
         np.testing.assert_array_equal(at_once.signal[axis], by_line.signal[axis])
     np.testing.assert_array_equal(at_once.time, by_line.time)
@@ -42,7 +43,7 @@ def test_at_once_as_line_by_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_plain_tables_are_parsed_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(text_numbers, "_row_by_row", lambda *given: pytest.fail("line by line"))
     for style in ((",", ".", "\n", "%.6g", False), (";", ",", "\r\n", "%r", True)):
-        assert len(text.read(written(tmp_path / "log.csv", *style))[0].signal["x"]) == 50
+        assert len(read_with(text.read, written(tmp_path / "log.csv", *style))[0].signal["x"]) == 50
 
 
 @pytest.mark.parametrize(
@@ -53,11 +54,11 @@ def test_an_odd_line_is_named(tmp_path: Path, row: str, found: str):
     path = written(tmp_path / "log.csv", ",", ".", "\n", "%.6g", False)
     path.write_text(path.read_text() + row + "\n")
     with pytest.raises(RecordingError, match=found):
-        text.read(path)
+        read_with(text.read, path)
 
 
 def test_a_comment_between_rows_is_passed_over(tmp_path: Path):
     path = written(tmp_path / "log.csv", ",", ".", "\n", "%.6g", False)
     path.write_text(path.read_text() + "# stopped\n0.50,1.5,2.5\n")
-    (stream,) = text.read(path)
+    (stream,) = read_with(text.read, path)
     assert (len(stream.signal["x"]), stream.signal["x"][-1]) == (51, 1.5)

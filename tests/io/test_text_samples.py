@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from logs import read_with
 
 import gyrofuse as gf
 from gyrofuse.io.clock import grid_of
@@ -214,7 +215,7 @@ READ = [
 @pytest.mark.parametrize("sample", READ, ids=lambda sample: sample.file)
 def test_a_sample(sample: Sample):
     path = SAMPLES / sample.file
-    (stream,) = read_streams(path)
+    (stream,) = read_with(read_streams, path)
     notes, rate = list(stream.notes), stream.rate
     if stream.time is not None:
         grid = grid_of(
@@ -245,7 +246,7 @@ def test_every_sample_is_read_and_told_of():
 
 
 def test_the_acceleration_of_a_register_is_32_bits():
-    (stream,) = read_streams(SAMPLES / "adis_evaluation.csv")
+    (stream,) = read_with(read_streams, SAMPLES / "adis_evaluation.csv")
     assert stream.channels[ACCELERATION][:, 0].tolist() == [
         1 * 65536 + 64627,
         -3 * 65536 + 58893,
@@ -254,11 +255,11 @@ def test_the_acceleration_of_a_register_is_32_bits():
 
 
 def test_counts_of_a_flight_controller_are_g():
-    (stream,) = read_streams(SAMPLES / "blackbox_explorer.csv")
+    (stream,) = read_with(read_streams, SAMPLES / "blackbox_explorer.csv")
     assert stream.channels[ACCELERATION][2].mean() == pytest.approx(1, abs=0.02)
 
 
 def test_the_filtered_gyro_is_read_by_its_name():
-    (stream,) = read_streams(SAMPLES / "blackbox_explorer.csv", key="ADC")
+    (stream,) = read_with(read_streams, SAMPLES / "blackbox_explorer.csv", key="ADC")
     assert [values[0] for values in stream.signal.values()] == [2, -4, -1]
     assert stream.unit == "deg/s"

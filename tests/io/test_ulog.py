@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from logs import made_up, regular_stamps, seconds, write_ulog
+from logs import made_up, read_with, regular_stamps, seconds, write_ulog
 
 import gyrofuse as gf
 from gyrofuse.io.formats.robots import ulog
@@ -24,7 +24,7 @@ def single(values):
 def test_each_instance_of_sensor_gyro_is_a_device(tmp_path):
     gyro, stamps = made_up(3), regular_stamps(start=MICROSECONDS)
     temperature = 30 + made_up(3, seed=1)[:, 0]
-    streams = ulog.read(write_ulog(tmp_path / "a.ulg", gyro, stamps, temperature=temperature))
+    streams = read_with(ulog.read, write_ulog(tmp_path / "a.ulg", gyro, stamps, temperature=temperature))
     assert [stream.name for stream in streams] == ["sensor_gyro[0]", "sensor_gyro[1]", "sensor_gyro[2]"]
     for device, stream in enumerate(streams):
         np.testing.assert_allclose([stream.signal[a] for a in "xyz"], single(gyro[device]), rtol=0, atol=1e-12)
@@ -39,34 +39,37 @@ def test_each_instance_of_sensor_gyro_is_a_device(tmp_path):
 def test_a_not_a_number_is_kept(tmp_path):
     gyro = made_up(1)
     gyro[0, 1, 7] = np.nan
-    (stream,) = ulog.read(write_ulog(tmp_path / "a.ulg", gyro, regular_stamps()))
+    (stream,) = read_with(ulog.read, write_ulog(tmp_path / "a.ulg", gyro, regular_stamps()))
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(stream.signal["y"])), [7])
 
 
 def test_sensor_combined_replaces_a_thinned_sensor_gyro(tmp_path):
     combined, stamps = made_up(1)[0], regular_stamps(rate=200)
     path = write_ulog(tmp_path / "a.ulg", made_up(2, 5), regular_stamps(5, rate=1), combined=(combined, stamps))
-    (stream,) = ulog.read(path)
+    (stream,) = read_with(ulog.read, path)
     assert stream.name == "sensor_combined[0]"
     np.testing.assert_allclose([stream.signal[a] for a in "xyz"], single(combined), rtol=0, atol=1e-12)
     np.testing.assert_allclose(stream.time, stamps // 1000 / 1e6, rtol=0, atol=1e-12)
     np.testing.assert_array_equal(stream.channels["acceleration"], np.outer([0, 0, -9.75], np.ones(60)))
     assert any("sensor_gyro (2 instances) was logged at 1 Hz only" in note for note in stream.notes)
-    assert [stream.name for stream in ulog.read(path, key="sensor_gyro")] == ["sensor_gyro[0]", "sensor_gyro[1]"]
+    assert [stream.name for stream in read_with(ulog.read, path, key="sensor_gyro")] == [
+        "sensor_gyro[0]",
+        "sensor_gyro[1]",
+    ]
 
 
 def test_sensor_gyro_is_the_array_at_a_comparable_rate(tmp_path):
     combined = (made_up(1)[0], regular_stamps(rate=400))
     path = write_ulog(tmp_path / "a.ulg", made_up(2), regular_stamps(rate=100), combined=combined)
-    assert [stream.name for stream in ulog.read(path)] == ["sensor_gyro[0]", "sensor_gyro[1]"]
-    assert [stream.name for stream in ulog.read(path, key="sensor_combined")] == ["sensor_combined[0]"]
+    assert [stream.name for stream in read_with(ulog.read, path)] == ["sensor_gyro[0]", "sensor_gyro[1]"]
+    assert [stream.name for stream in read_with(ulog.read, path, key="sensor_combined")] == ["sensor_combined[0]"]
 
 
 def test_dropouts_and_ignored_topics_are_noted(tmp_path):
     path = write_ulog(
         tmp_path / "a.ulg", made_up(1), regular_stamps(), dropouts_ms=(20, 35), other_topics=("sensor_gyro_fifo",)
     )
-    (stream,) = ulog.read(path)
+    (stream,) = read_with(ulog.read, path)
     assert "the logger reports 2 dropouts, 55 ms in total" in stream.notes
     assert "sensor_gyro_fifo (1 instances) ignored" in stream.notes
 
@@ -75,7 +78,7 @@ def test_a_log_cut_off_in_flight_is_read_up_to_the_cut(tmp_path):
     gyro = made_up(1)
     path = write_ulog(tmp_path / "a.ulg", gyro, regular_stamps())
     path.write_bytes(path.read_bytes()[:-500])
-    (stream,) = ulog.read(path)
+    (stream,) = read_with(ulog.read, path)
     assert 0 < stream.n_samples < 60
     np.testing.assert_array_equal(stream.signal["z"], single(gyro[0, 2, : stream.n_samples]))
 
@@ -85,7 +88,7 @@ def test_damage_in_the_middle_is_noted_and_nothing_is_printed(tmp_path, capsys):
     content = bytearray(path.read_bytes())
     content[len(content) // 2 : len(content) // 2 + 300] = bytes(300)
     path.write_bytes(content)
-    assert "part of the file is damaged and was skipped" in ulog.read(path)[0].notes
+    assert "part of the file is damaged and was skipped" in read_with(ulog.read, path)[0].notes
     assert capsys.readouterr().out == ""
 
 
@@ -94,30 +97,30 @@ def test_a_file_that_is_no_ulog(tmp_path, content):
     path = tmp_path / "bad.ulg"
     path.write_bytes(content)
     with pytest.raises(RecordingError, match=r"bad\.ulg: expected a PX4 ULog file, found .*again"):
-        ulog.read(path)
+        read_with(ulog.read, path)
 
 
 def test_a_missing_file(tmp_path):
     with pytest.raises(RecordingError, match=r"none\.ulg"):
-        ulog.read(tmp_path / "none.ulg")
+        read_with(ulog.read, tmp_path / "none.ulg")
 
 
 def test_a_log_without_gyro_says_what_it_holds(tmp_path):
     path = write_ulog(tmp_path / "a.ulg", made_up(0), regular_stamps(), other_topics=("battery", "gps"))
     with pytest.raises(RecordingError, match=r"a\.ulg: expected a gyro topic .*found battery, gps"):
-        ulog.read(path)
+        read_with(ulog.read, path)
 
 
 def test_a_key_that_is_not_in_the_log(tmp_path):
     path = write_ulog(tmp_path / "a.ulg", made_up(1), regular_stamps())
     with pytest.raises(RecordingError, match=r"named by `key`, got 'sensor_combined', found sensor_gyro"):
-        ulog.read(path, key="sensor_combined")
+        read_with(ulog.read, path, key="sensor_combined")
 
 
 def test_the_missing_library_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyulog", None)
     with pytest.raises(ImportError, match=r'pip install "gyrofuse\[logs\]"'):
-        ulog.read(tmp_path / "a.ulg")
+        read_with(ulog.read, tmp_path / "a.ulg")
 
 
 def counted(n_messages=20, samples=10, dt=125.0, start=MICROSECONDS // 1000, first=0):
@@ -142,7 +145,7 @@ class TestFifo:
 
     def test_every_sample_has_its_time(self, tmp_path):
         path = fifo_log(tmp_path, ("sensor_gyro_fifo", 0, 1000, 125.0, SCALE, counted()))
-        (stream,) = ulog.read(path)
+        (stream,) = read_with(ulog.read, path)
         assert (stream.name, stream.unit, stream.n_samples) == ("sensor_gyro_fifo[0]", "rad/s", 200)
         np.testing.assert_array_equal(stream.signal["x"], SCALE * np.arange(200))
         np.testing.assert_array_equal(stream.signal["y"], -SCALE * np.arange(200))
@@ -151,11 +154,11 @@ class TestFifo:
         assert "device_id 1000" in stream.notes
         assert any("sensor_gyro (1 instances, 100 Hz) is not read" in note for note in stream.notes)
         assert "temperature" in stream.channels
-        assert [stream.name for stream in ulog.read(path, key="sensor_gyro")] == ["sensor_gyro[0]"]
+        assert [stream.name for stream in read_with(ulog.read, path, key="sensor_gyro")] == ["sensor_gyro[0]"]
 
     def test_a_step_that_is_not_quite_what_is_stated(self, tmp_path):
         messages = counted(dt=124.0, n_messages=60)
-        (stream,) = ulog.read(fifo_log(tmp_path, ("sensor_gyro_fifo", 0, 1000, 125.0, SCALE, messages)))
+        (stream,) = read_with(ulog.read, fifo_log(tmp_path, ("sensor_gyro_fifo", 0, 1000, 125.0, SCALE, messages)))
         assert (np.diff(stream.time) > 0).all()
         assert 1 / np.diff(stream.time)[10:].mean() == pytest.approx(1e6 / 124, rel=1e-3)
 
@@ -173,7 +176,7 @@ class TestFifo:
             ("sensor_accel_fifo", 0, 2000, 250.0, 1.0, counted(dt=250.0, n_messages=10)),
             ("sensor_accel_fifo", 1, 2001, 250.0, 1.0, counted(dt=250.0, n_messages=10, first=1000)),
         )
-        (stream,) = ulog.read(path)
+        (stream,) = read_with(ulog.read, path)
         np.testing.assert_allclose(stream.channels["acceleration"][0, :199], np.arange(199) / 2, atol=5e-3)
         assert np.isnan(stream.channels["acceleration"][0, 199])
         assert any("acceleration has its own clock (4000 Hz)" in note for note in stream.notes)
@@ -183,23 +186,25 @@ class TestFifo:
     def test_a_message_of_impossibly_many_samples_is_left_out(self, tmp_path, samples):
         messages = counted()
         messages[3] = (messages[3][0], samples, messages[3][2])
-        (stream,) = ulog.read(fifo_log(tmp_path, ("sensor_gyro_fifo", 0, 1000, 125.0, SCALE, messages)))
+        (stream,) = read_with(ulog.read, fifo_log(tmp_path, ("sensor_gyro_fifo", 0, 1000, 125.0, SCALE, messages)))
         assert stream.n_samples == 190
         assert any("1 of 20 messages sensor_gyro_fifo have no or more than 32 samples" in n for n in stream.notes)
 
     @pytest.mark.parametrize("dt", [0.0, -1.0, float("nan"), float("inf")])
     def test_without_a_time_between_samples_another_topic_is_read(self, tmp_path, dt):
         topic = ("sensor_gyro_fifo", 0, 1000, dt, SCALE, counted())
-        (stream,) = ulog.read(fifo_log(tmp_path, topic))
+        (stream,) = read_with(ulog.read, fifo_log(tmp_path, topic))
         assert stream.name == "sensor_gyro[0]"
         assert "sensor_gyro_fifo has no two sound samples; not read" in stream.notes
         with pytest.raises(
             RecordingError, match=r"a\.ulg: expected messages sensor_gyro_fifo of 1 to 32 samples with a"
         ):
-            ulog.read(fifo_log(tmp_path, topic, n_slow=0))
+            read_with(ulog.read, fifo_log(tmp_path, topic, n_slow=0))
 
     def test_one_that_was_logged_now_and_then_is_not_read(self, tmp_path):
-        (stream,) = ulog.read(fifo_log(tmp_path, ("sensor_gyro_fifo", 0, 1000, 125.0, SCALE, counted()[::5])))
+        (stream,) = read_with(
+            ulog.read, fifo_log(tmp_path, ("sensor_gyro_fifo", 0, 1000, 125.0, SCALE, counted()[::5]))
+        )
         assert stream.name == "sensor_gyro[0]"
         assert any(
             "sensor_gyro_fifo has messages that cover 20 % of the time, which are read with key" in n
@@ -208,14 +213,14 @@ class TestFifo:
 
     def test_gyros_without_one_are_named(self, tmp_path):
         path = fifo_log(tmp_path, ("sensor_gyro_fifo", 1, 1001, 125.0, SCALE, counted()), n_slow=2)
-        (stream,) = ulog.read(path)
+        (stream,) = read_with(ulog.read, path)
         assert any("gyros that sensor_gyro_fifo lacks (device_id 1000)" in note for note in stream.notes)
-        assert [stream.name for stream in ulog.read(path, key="sensor_gyro[1]")] == ["sensor_gyro[1]"]
+        assert [stream.name for stream in read_with(ulog.read, path, key="sensor_gyro[1]")] == ["sensor_gyro[1]"]
 
     def test_more_than_the_memory_allowed(self, tmp_path):
         path = fifo_log(tmp_path, ("sensor_gyro_fifo", 0, 1000, 125.0, SCALE, counted()))
         with pytest.raises(RecordingError, match=r"samples of sensor_gyro_fifo of 20 x 32 x 5 numbers"):
-            ulog.read(path, max_bytes=path.stat().st_size + 5000)
+            read_with(ulog.read, path, max_bytes=path.stat().st_size + 5000)
 
 
 class TestAccelerations:
@@ -223,8 +228,8 @@ class TestAccelerations:
 
     def test_each_instance_of_sensor_accel_is_a_device(self, tmp_path):
         values, stamps = made_up(2), regular_stamps(start=MICROSECONDS)
-        streams = ulog.read(
-            write_ulog(tmp_path / "a.ulg", values, stamps, topic="sensor_accel"), quantity="acceleration"
+        streams = read_with(
+            ulog.read, write_ulog(tmp_path / "a.ulg", values, stamps, topic="sensor_accel"), quantity="acceleration"
         )
         assert [(stream.name, stream.unit) for stream in streams] == [(f"sensor_accel[{i}]", "m/s^2") for i in (0, 1)]
         for device, stream in enumerate(streams):
@@ -236,27 +241,29 @@ class TestAccelerations:
         combined = made_up(1)[0], regular_stamps(rate=200)
         few = regular_stamps(5, rate=1)
         path = write_ulog(tmp_path / "a.ulg", made_up(2, 5), few, topic="sensor_accel", combined=combined)
-        (stream,) = ulog.read(path, quantity="acceleration")
+        (stream,) = read_with(ulog.read, path, quantity="acceleration")
         assert (stream.name, stream.unit) == ("sensor_combined[0]", "m/s^2")
         np.testing.assert_array_equal([stream.signal[a] for a in "xyz"], np.outer([0, 0, -9.75], np.ones(60)))
         np.testing.assert_array_equal(stream.channels["angular_rate"], single(combined[0]))
         assert stream.channel_units == {"angular_rate": "rad/s"}
         assert any("sensor_accel (2 instances) was logged at 1 Hz only" in note for note in stream.notes)
-        assert len(ulog.read(path, quantity="acceleration", key="sensor_accel")) == 2
-        assert [s.name for s in ulog.read(path, quantity="acceleration", key="sensor_accel[1]")] == ["sensor_accel[1]"]
+        assert len(read_with(ulog.read, path, quantity="acceleration", key="sensor_accel")) == 2
+        assert [s.name for s in read_with(ulog.read, path, quantity="acceleration", key="sensor_accel[1]")] == [
+            "sensor_accel[1]"
+        ]
 
     def test_accelerations_of_sensor_combined_have_times_of_their_own(self, tmp_path):
         stamps, late = regular_stamps(rate=200), [-1000] * 60
         late[7] = 2**31 - 1  # marked as invalid
         ramp = np.outer([1, 2, 3], np.arange(60.0))
         path = write_ulog(tmp_path / "a.ulg", made_up(0), stamps, combined=(ramp, stamps), relative=late)
-        (stream,) = ulog.read(path, quantity="acceleration")
+        (stream,) = read_with(ulog.read, path, quantity="acceleration")
         assert np.flatnonzero(np.isnan(stream.time)).tolist() == [7]
         others = np.arange(60) != 7
         np.testing.assert_allclose(stream.time[others], (stamps[others] // 1000 - 1000) / 1e6, rtol=0, atol=1e-6)
         # a fifth of a step before the rates
         np.testing.assert_allclose(stream.channels["angular_rate"][0, 1:7], np.arange(1, 7) - 0.2, atol=1e-3)
-        (gyro,) = ulog.read(path)
+        (gyro,) = read_with(ulog.read, path)
         np.testing.assert_array_equal(gyro.channels["acceleration"][2, :59], [-9.75] * 59)
         assert np.isnan(gyro.channels["acceleration"][2, 59])
         recording = gf.read_recording(path, quantity="acceleration")
@@ -270,7 +277,7 @@ class TestAccelerations:
             ("sensor_accel_fifo", 0, 1000, 250.0, 1.0, counted(dt=250.0, n_messages=10)),
             topic="sensor_accel",
         )
-        (stream,) = ulog.read(path, quantity="acceleration")
+        (stream,) = read_with(ulog.read, path, quantity="acceleration")
         assert (stream.name, stream.unit, stream.n_samples) == ("sensor_accel_fifo[0]", "m/s^2", 100)
         np.testing.assert_array_equal(stream.signal["x"], np.arange(100.0))
         np.testing.assert_allclose(np.diff(stream.time), 250e-6, atol=1e-6)
@@ -289,7 +296,7 @@ class TestAccelerations:
         path = write_ulog(tmp_path / "a.ulg", made_up(1), regular_stamps(), topic=there)
         for key in (None, there):
             with pytest.raises(RecordingError, match=rf"a\.ulg: expected {advice}"):
-                ulog.read(path, quantity=quantity, key=key)
+                read_with(ulog.read, path, quantity=quantity, key=key)
 
 
 @needs_shared
@@ -297,7 +304,7 @@ def test_a_flight_with_one_gyro():
     from pyulog import ULog
 
     path = SHARED / "raw" / "px4_sample.ulg"
-    (stream,) = ulog.read(path)
+    (stream,) = read_with(ulog.read, path)
     fields = ULog(str(path)).get_dataset("sensor_combined").data
     assert stream.n_samples == 17070
     for i, axis in enumerate("xyz"):
@@ -309,7 +316,7 @@ def test_a_flight_with_one_gyro():
 @needs_shared
 def test_a_flight_whose_sensor_gyro_is_thinned():
     path = SHARED / "raw" / "px4_sample_log_small.ulg"
-    (stream,) = ulog.read(path)
+    (stream,) = read_with(ulog.read, path)
     assert (stream.name, stream.n_samples) == ("sensor_combined[0]", 1298)
     assert 1 / np.median(np.diff(stream.time)) == pytest.approx(204.6, abs=0.1)
-    assert [stream.n_samples for stream in ulog.read(path, key="sensor_gyro")] == [6, 6, 6]
+    assert [stream.n_samples for stream in read_with(ulog.read, path, key="sensor_gyro")] == [6, 6, 6]

@@ -9,15 +9,16 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrofuse.io.formats.columns import AXES, CHANNELS, TICK, WRAP_32_BIT, Column, bare_name, classify_columns
+from gyrofuse._base.units import SECONDS_PER
+from gyrofuse.io.formats.columns import AXES, CHANNELS, Column, bare_name, classify_columns
+from gyrofuse.io.quantities import QUANTITY, RATE, Quantity
 from gyrofuse.io.streams import Array, Stream
+from gyrofuse.io.timestamps import COUNTER_32_BIT, DAY
 
-# SampleTimeFine of Xsens counts 10 kHz ticks of the day on an MTi (MTi Low-Level Communication Protocol), microseconds
-# in 32 bits on a DOT (Xsens DOT User Manual). A DOT gives at most 120 Hz, 8333 microseconds; an MTi with as many ticks
-# from one sample to the next would give 1.2 Hz.
-_FINE = {1e-4: 86400.0, 1e-6: WRAP_32_BIT * 1e-6}  # seconds of a tick: after which the clock wraps
-_FINE_STEP = 8000.0
-_AGREES = 0.01  # of a step: a clock that fits a stated rate so well has the unit in which it does
+# SampleTimeFine of Xsens counts the day in ticks of 10 kHz on an MTi (MTi Low-Level Communication Protocol),
+# microseconds in 32 bits on a DOT (Xsens DOT User Manual). Seconds per tick, and the period of the clock by that.
+_MTI_TICK, _DOT_TICK = 1e-4, SECONDS_PER["us"]
+_FINE_PERIODS = {_MTI_TICK: DAY, _DOT_TICK: COUNTER_32_BIT * _DOT_TICK}
 
 
 def time_in_seconds(
@@ -25,17 +26,17 @@ def time_in_seconds(
 ) -> tuple[Array, float | None, str]:
     """Convert a clock column to seconds.
 
-    Where the name states no unit, the unit is the one that fits the sampling rate that the log states, else the one in
-    which the values are a date between 2001 and 2036, else the one in which the rate lies between 5 Hz and 5 kHz;
+    Where the name states no unit, it is the unit that fits the sampling rate that the log states, else the unit in
+    which the values are a date between 2001 and 2036, else the unit in which the rate lies between 5 Hz and 5 kHz;
     fractional values are seconds.
 
     Args:
-        column: What the name says.
+        column: Meaning of the column's name.
         values: Readings `(time,)` in the unit of the clock.
         rate: Sampling rate in Hz that the log states.
 
     Returns:
-        Seconds `(time,)`, the period after which the clock wraps (or `None`), and a sentence on what was guessed.
+        Seconds `(time,)`, the period after which the clock wraps (or `None`), and a sentence on the guess, if any.
     """
     ticks = np.asarray(values, dtype=np.float64)
     if not column.unit and "sampletimefine" in re.sub(r"[^a-z]", "", column.name.lower()):
@@ -46,12 +47,14 @@ def time_in_seconds(
         step = typical_step(finite, either_way=True)
         whole = finite.size > 0 and bool(np.all(finite[:1000] == np.rint(finite[:1000])))
         start = abs(float(finite[0])) if finite.size else 0.0
-        dated = [name for name, tick in TICK.items() if 1e9 <= start * tick <= 2.1e9]
+        dated = [name for name, tick in SECONDS_PER.items() if 1e9 <= start * tick <= 2.1e9]
         reason = f"from its median step of {step:g}"
         if rate is not None and step > 0:
-            unit = min(TICK, key=lambda name: abs(math.log(step) + math.log(TICK[name] * rate)))
+            unit = min(SECONDS_PER, key=lambda name: abs(math.log(step) + math.log(SECONDS_PER[name] * rate)))
             reason += f" and the stated {rate:g} Hz"
-            certain = abs(step * TICK[unit] * rate - 1) < _AGREES
+            certain = (
+                abs(step * SECONDS_PER[unit] * rate - 1) < 0.01
+            )  # clocks of loggers are right to far better than 1 %
         elif dated:
             unit, reason = dated[0], "in which its readings are dates"
         elif not whole or step < 0.2:
@@ -60,25 +63,30 @@ def time_in_seconds(
             unit = "ms" if step < 200 else "us" if step < 200e3 else "ns"
         if not certain:
             note = f"time column '{column.name}' states no unit: read as {unit} {reason}"
-    return ticks * TICK[unit], None, note
+    return ticks * SECONDS_PER[unit], None, note
 
 
 def _fine_time_in_seconds(column: Column, ticks: Array, rate: float | None) -> tuple[Array, float | None, str]:
     """Seconds of a SampleTimeFine, whose tick depends on the device."""
     step = typical_step(ticks, either_way=True)
     if rate is not None and step > 0:
-        tick = min(_FINE, key=lambda seconds: abs(math.log(step * seconds) + math.log(rate)))
+        tick = min(_FINE_PERIODS, key=lambda seconds: abs(math.log(step * seconds) + math.log(rate)))
         reason = f"a step of {step:g} is nearest to the stated {rate:g} Hz then"
     else:
-        tick = 1e-6 if step >= _FINE_STEP else 1e-4
-        other = 1e-4 if tick == 1e-6 else 1e-6
+        # A DOT gives at most 120 Hz, 8333 microseconds; an MTi with 8000 ticks between samples would give 1.25 Hz.
+        tick, other = (_DOT_TICK, _MTI_TICK) if step >= 8000 else (_MTI_TICK, _DOT_TICK)
         reason = f"a step of {step:g} would be a rate of {1 / max(step * other, other):.3g} Hz otherwise"
-    what = "microseconds, as an Xsens DOT" if tick == 1e-6 else "ticks of 10 kHz, as an Xsens MTi"
-    return ticks * tick, _FINE[tick], f"time column '{column.name}' is read as {what} counts them: {reason}"
+    what = "microseconds, as an Xsens DOT" if tick == _DOT_TICK else "ticks of 10 kHz, as an Xsens MTi"
+    return ticks * tick, _FINE_PERIODS[tick], f"time column '{column.name}' is read as {what} counts them: {reason}"
 
 
 def typical_step(ticks: Array, *, either_way: bool = False) -> float:
-    """Median step of a clock, or of the size of its steps, over the readings that are finite; 0 where there is none."""
+    """Median step between the finite readings of a clock, 0 where there is none.
+
+    Args:
+        ticks: Readings `(time,)`.
+        either_way: Whether a step back counts by its size.
+    """
     with np.errstate(over="ignore", invalid="ignore"):  # damaged readings may be as far apart as float64 reaches
         steps = np.diff(ticks[np.isfinite(ticks)])
         return float(np.median(np.abs(steps) if either_way else steps)) if steps.size else 0.0
@@ -93,7 +101,7 @@ def streams_from_columns(
     time: Array | None = None,
     clock_period: float | None = None,
     notes: Sequence[str] = (),
-    quantity: str = "rate",
+    quantity: Quantity = RATE,
 ) -> list[Stream]:
     """Build one stream per device from named one-dimensional columns; none where no column is of the quantity.
 
@@ -101,11 +109,11 @@ def streams_from_columns(
         columns: Values `(time,)` by column name, in the order of the log.
         name: Name of a device that the columns do not name (the file's stem).
         unit: Unit of columns of the quantity whose names state none.
-        rate: Sampling rate the log states, Hz.
-        time: Clock in seconds where it is no column.
+        rate: Sampling rate in Hz that the log states.
+        time: Clock `(time,)` in seconds where it is no column.
         clock_period: Seconds after which the clock wraps, where the log says so (times of day).
-        notes: Sentences that go with every stream.
-        quantity: Of the sensors to read; the other one is a channel.
+        notes: Sentences for the notes of every stream.
+        quantity: The quantity that is read; the other one is a channel.
     """
     columns, joined = _joined_clocks(columns)
     classified = classify_columns(list(columns), quantity)
@@ -114,13 +122,13 @@ def streams_from_columns(
         by_device.setdefault(column.device, []).append(column)
     devices = list(dict.fromkeys(column.device for column in classified if column.kind == quantity))
     clocks = [column for column in classified if column.kind == "time"]
-    still = dict.fromkeys(column.name for column in clocks if not np.isfinite(columns[column.name]).any())
-    clocks = sorted((column for column in clocks if column.name not in still), key=_remoteness)
-    clock_of = {column.device: column for column in reversed(clocks)}  # the nearest to the sample of each device
+    empty = dict.fromkeys(column.name for column in clocks if not np.isfinite(columns[column.name]).any())
+    clocks = sorted((column for column in clocks if column.name not in empty), key=_remoteness)
+    clock_of = {column.device: column for column in reversed(clocks)}  # for each device the clock nearest to the sample
     notes = [
         *notes,
         *joined,
-        *(f"time column '{name}' holds no reading and is left out" for name in still),
+        *(f"time column '{name}' holds no reading and is left out" for name in empty),
         *_guessed_names(classified, quantity, name),
     ]
     streams = []
@@ -129,7 +137,7 @@ def streams_from_columns(
         units: list[str] = []
         said = list(notes)
         for column in by_device[device]:
-            if column.kind == quantity:
+            if column.kind == quantity.name:
                 if column.axis in signal:
                     said.append(f"column '{column.name}' repeats axis '{column.axis}' and is left out")
                     continue
@@ -163,30 +171,35 @@ def streams_from_columns(
 
 
 def _remoteness(clock: Column) -> int:
-    """How far from the sample a clock is read: a logger may keep the time of arrival beside that of sampling."""
+    """Rank of a clock, 0 for one that is read with the sample: a logger may store the time of arrival as well."""
     name = clock.name.lower()
     return 0 if "sample" in name else 1 if "header" in name else 2
 
 
-def _guessed_names(columns: Sequence[Column], quantity: str, log: str) -> list[str]:
-    """What is to be said of sensors whose names do not say what they are, in a log of some name."""
-    names = [column.name for column in columns if column.kind == quantity]
+def _guessed_names(columns: Sequence[Column], quantity: Quantity, log: str) -> list[str]:
+    """Note on columns whose names were guessed to be sensors.
+
+    Args:
+        columns: All columns of the log.
+        quantity: The quantity that is read.
+        log: Name of the log.
+    """
+    names = [column.name for column in columns if column.kind == quantity.name]
     bare = [name for name in names if bare_name(name) in ("p", "q", "r")]
     if bare:
         return [f"columns {', '.join(bare)} are read as the rates about x, y, z, as flight mechanics names them"]
     bare = [name for name in names if bare_name(name) in AXES]
     if not bare:
         return []
-    sensor = "a gyro's" if quantity == "rate" else "an accelerometer's"
-    other = classify_columns([log], quantity)[0].kind in {"rate", "acceleration", "magnetic_field"} - {quantity}
+    other = classify_columns([log], quantity)[0].kind in {*QUANTITY, "magnetic_field"} - {quantity.name}
     but = f", though the log is called {log}" if other else ""
-    return [f"columns {', '.join(bare)} name no sensor and are read as {sensor}{but}"]
+    return [f"columns {', '.join(bare)} name no sensor and are read as {quantity.a_sensor}'s{but}"]
 
 
 def _joined_clocks(
     columns: Mapping[str, NDArray[np.generic]],
 ) -> tuple[Mapping[str, NDArray[np.generic]], list[str]]:
-    """Columns with one clock in place of whole seconds and the fraction beside them, and what was joined."""
+    """Join clocks that are split into whole seconds and a fraction; return the columns and notes on the joined ones."""
     clocks = [column for column in classify_columns(list(columns)) if column.kind == "time"]
     whole = {_without_unit(column.name): column for column in clocks if column.unit == "s"}
     joined = dict(columns)
@@ -196,8 +209,8 @@ def _joined_clocks(
         if part.unit not in ("ms", "us", "ns") or seconds is None or seconds.name not in joined:
             continue
         count = np.asarray(columns[seconds.name], dtype=np.float64)
-        fraction = np.asarray(columns[part.name], dtype=np.float64) * TICK[part.unit]
-        with np.errstate(invalid="ignore"):  # of what is no number
+        fraction = np.asarray(columns[part.name], dtype=np.float64) * SECONDS_PER[part.unit]
+        with np.errstate(invalid="ignore"):  # NaN
             if np.any(count != np.rint(count)) or np.any((fraction < 0) | (fraction >= 1)):
                 continue
         name = f"{_without_unit(part.name).strip('_ .')} [s]"
@@ -215,12 +228,12 @@ def _without_unit(name: str) -> str:
 
 
 def _channels(
-    classified: Sequence[Column], columns: Mapping[str, NDArray[np.generic]], quantity: str
+    classified: Sequence[Column], columns: Mapping[str, NDArray[np.generic]], quantity: Quantity
 ) -> tuple[dict[str, Array], dict[str, str]]:
     channels: dict[str, Array] = {}
     units: dict[str, str] = {}
     for kind, name in CHANNELS.items():
-        if kind == quantity:
+        if kind == quantity.name:
             continue
         found = {column.axis: column for column in classified if column.kind == kind}
         if not found:

@@ -1,31 +1,27 @@
-"""Names of columns and datasets: what they hold, of which device, on which axis, in which unit."""
+"""Names of columns and datasets: the quantity, device, axis and unit that they state."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from gyrofuse._base.units import UNITS, canonical_unit
 from gyrofuse.io.limits import LONGEST_NAME, enumerated
+from gyrofuse.io.quantities import ACCELERATION, RATE, Quantity
 from gyrofuse.io.streams import RecordingError
 
 AXES = ("x", "y", "z")
-# What names of each quantity look like, for messages, and what reads it.
-NAMES_OF = {"rate": "a gyro (gyro_x, gx)", "acceleration": "an accelerometer (acc_x, ax)"}
-# Names of channels by what they hold; of two quantities one is the signal and the other a channel.
-CHANNELS = {kind: kind for kind in ("temperature", "acceleration", "magnetic_field")} | {"rate": "angular_rate"}
-OTHER = {"rate": "acceleration", "acceleration": "rate"}  # of the two quantities
-WORD_OF = {"rate": "gyro", "acceleration": "acceleration"}  # a name that says so
-_INSTEAD = {
-    "rate": 'it has accelerations, which are read with quantity="acceleration" (--quantity acceleration)',
-    "acceleration": 'it has gyros, which are read with quantity="rate" (--quantity rate)',
+# Name of the auxiliary channel of each kind of column.
+CHANNELS = {
+    "temperature": "temperature",
+    ACCELERATION.name: ACCELERATION.channel,
+    "magnetic_field": "magnetic_field",
+    RATE.name: RATE.channel,
 }
-TICK = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-WRAP_32_BIT = 2.0**32
 
-# Words of several tokens become one token before a name is split.
+# Phrases of several words, each replaced by one word before a name is split into words.
 _PHRASES = (
     (re.compile(r"(?i)ang(?:ular)?[_ .]?(?:vel(?:ocity)?|rate)s?"), "_gyro_"),
     (re.compile(r"(?i)(?:rotation|body)[_ .]?rates?"), "_gyro_"),
@@ -53,7 +49,7 @@ _TIME = re.compile(
 _PLAIN = re.compile(r"(?:s|ch|channel|sensor|signal|imu|device|node)?[_ ]?\d+", re.IGNORECASE)
 _CAMEL = re.compile(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")
 
-# A name with one of these describes a sensor's data but does not hold them.
+# Words of columns that describe the data of a sensor and do not hold them.
 _NOT_DATA = frozenset(
     "bias clipping clipped coarse id count counter covariance cov std var variance integral dt delta relative error "
     "errors status samples norm noise scale offset range free movement valid quality".split()
@@ -85,7 +81,7 @@ _UNIT_TOKENS = {
     "degc": "degC",
     "kelvin": "K",
 }
-# Letters that are a unit only at the end of the name of what they measure: `acc_x_g`, `temp_c`.
+# Letters that are a unit only at the end of the name of a quantity: `acc_x_g`, `temp_c`.
 _LAST_LETTERS = {("acceleration", "g"): "g", ("temperature", "c"): "degC", ("temperature", "k"): "K"}
 _HOURS = frozenset(("h", "hr", "hour"))
 _UNIT_LEFTOVERS = frozenset({"m", "s", "per", "sec", "g", "c", "k"}) | _HOURS
@@ -95,7 +91,7 @@ _TIME_TOKENS = {
     **dict.fromkeys(("us", "usec", "usecs", "micros", "microsecond", "microseconds", "µs", "μs"), "us"),
     **dict.fromkeys(("ns", "nsec", "nsecs", "nanosec", "nanos", "nanosecond", "nanoseconds"), "ns"),
 }
-# Names of units that name a clock where nothing, or one of these words, stands beside them: `nsec`, `gps seconds`.
+# Units of time that alone, or with some of the words below, are the name of a clock: `nsec`, `gps seconds`.
 _CLOCK_UNITS = frozenset(unit for unit in _TIME_TOKENS if len(unit) > 2 and unit != "second")
 _CLOCK_WORDS = frozenset("gps utc unix epoch system elapsed tv of week".split())
 _RATE_WORDS = frozenset(("rate", "rates"))
@@ -104,12 +100,12 @@ _FLIGHT_MECHANICS = {"p": "x", "q": "y", "r": "z"}
 
 @dataclass(frozen=True)
 class Column:
-    """What one name says.
+    """Meaning of the name of a column.
 
     Attributes:
         name: The name as the log has it.
         kind: `"rate"`, `"acceleration"`, `"magnetic_field"`, `"temperature"`, `"time"`, or `""` for anything else.
-        device: What tells this sensor from its siblings (`"imu1"`, `"2"`), `""` where there is nothing.
+        device: Part of the name that distinguishes this sensor from others (`"imu1"`, `"2"`), or `""`.
         axis: `"x"`, `"y"`, `"z"`, or `""`.
         unit: Unit that the name states (`"deg/s"`; for a time `"s"`, `"ms"`, `"us"`, `"ns"`), or `""`.
     """
@@ -121,11 +117,15 @@ class Column:
     unit: str = ""
 
 
-def classify_columns(names: Sequence[str], quantity: str = "rate") -> list[Column]:
-    """Say of each name what it holds.
+def classify_columns(names: Sequence[str], quantity: Quantity = RATE) -> list[Column]:
+    """Find out from each name what the column holds.
 
-    Bare axes (`x`, `y`, `z`) and bare numbers (`1`, `s2`, `sensor_3`) are of the quantity that is read, and only where
-    the log names no sensor; `p`, `q` and `r`, the rates of flight mechanics, where it names no other gyro.
+    Bare axes (`x`, `y`, `z`) and bare numbers (`1`, `s2`, `sensor_3`) are taken for `quantity`, and only where the log
+    names no sensor; `p`, `q` and `r`, the rates of flight mechanics, are rates where the log names no other gyro.
+
+    Args:
+        names: Names of all columns of the log.
+        quantity: The quantity that is read.
     """
     columns = [_classify(str(name)) for name in names]
     kinds = {column.kind for column in columns}
@@ -137,12 +137,12 @@ def classify_columns(names: Sequence[str], quantity: str = "rate") -> list[Colum
 
 
 def renamed(path: Path, names: Sequence[str], wanted: Mapping[str, str]) -> dict[str, str]:
-    """What columns are called by their names in the log, where the user says what they are.
+    """Names that columns are to have, by their names in the log.
 
     Args:
         path: The log.
-        names: Of its columns.
-        wanted: Column by the name that it should have, such as `{"gyro_x": "u3", "time": "t"}`.
+        names: Names of its columns.
+        wanted: Columns of the log by the names that they should have, `{"gyro_x": "u3", "time": "t"}`.
 
     Raises:
         RecordingError: No such column.
@@ -156,7 +156,14 @@ def renamed(path: Path, names: Sequence[str], wanted: Mapping[str, str]) -> dict
 
 
 def check_columns(wanted: Mapping[str, str]) -> None:
-    """Raise `ValueError` where a name says nothing of what a column holds, or a column is to have two names."""
+    """Check the argument `columns` of `read_recording`.
+
+    Args:
+        wanted: Columns of the log by the names that they should have.
+
+    Raises:
+        ValueError: A name that `classify_columns` does not recognise, or a column with two names.
+    """
     for name in wanted:
         if not _classify(str(name)).kind:
             raise ValueError(
@@ -168,19 +175,13 @@ def check_columns(wanted: Mapping[str, str]) -> None:
         raise ValueError(f"`columns`: expected each column once, got {twice!r} twice; give it one name")
 
 
-def or_else(kinds: Collection[str], quantity: str, otherwise: str) -> str:
-    """What to do about a log without the quantity that was asked for: take the other one, where it has that."""
-    there = NAMES_OF.keys() & {*kinds}
-    return _INSTEAD[quantity] if there and quantity not in there else otherwise
-
-
 def is_unit(text: str) -> bool:
-    """Whether a text is the unit of a rate, an acceleration, a temperature, a field or a time."""
+    """Whether a text is a unit of rate, acceleration, temperature, magnetic field or time."""
     return canonical_unit(text) in UNITS or text.strip().lower() in _TIME_TOKENS
 
 
 def bare_name(name: str) -> str:
-    """A name in small letters without what stands in brackets behind it."""
+    """The name in small letters, without its brackets and their content."""
     return _without_brackets(name[:LONGEST_NAME])[0].strip(" _").lower()
 
 
@@ -192,11 +193,11 @@ def _classify_body_rate(column: Column) -> Column:
     return Column(column.name, "rate", "", axis, canonical_unit(stated[-1]) if stated else "")
 
 
-def _classify_bare(column: Column, quantity: str) -> Column:
+def _classify_bare(column: Column, quantity: Quantity) -> Column:
     bare = column.name.strip()
     if bare.lower() in AXES:
-        return Column(column.name, quantity, "", bare.lower())
-    return Column(column.name, quantity, bare) if _PLAIN.fullmatch(bare) else column
+        return Column(column.name, quantity.name, "", bare.lower())
+    return Column(column.name, quantity.name, bare) if _PLAIN.fullmatch(bare) else column
 
 
 def _classify(name: str) -> Column:
@@ -259,9 +260,9 @@ def _classify(name: str) -> Column:
 
 
 def _unit_of(kind: str, tokens: Sequence[str], stated: str) -> str:
-    """Unit of what is no time, from the brackets or from the tokens of the name."""
+    """Unit of a column that is no clock, from the brackets or from the words of its name."""
     if stated:
-        # G is a gauss there, not the acceleration of gravity.
+        # In the name of a magnetic field G is a gauss, not the acceleration of gravity.
         unit = canonical_unit(stated)
         return stated if kind == "magnetic_field" and unit in ("g", "mg", "ug") else unit
     at = next((i for i, token in enumerate(tokens) if token in _UNIT_TOKENS), None)
@@ -274,7 +275,7 @@ def _unit_of(kind: str, tokens: Sequence[str], stated: str) -> str:
 
 
 def _without_brackets(name: str) -> tuple[str, list[str]]:
-    """A name with `_` in place of what stands in brackets, and what stands there."""
+    """A name with `_` in place of each pair of brackets, and the contents of the brackets."""
     alike = name.replace("[", "(").replace("]", ")")
     text, contents, begin = "", [], 0
     while (end := alike.find(")", begin)) >= 0:

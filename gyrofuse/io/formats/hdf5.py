@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,39 +11,31 @@ from numpy.typing import NDArray
 
 from gyrofuse.io.formats.arrays import streams_from_arrays
 from gyrofuse.io.formats.hdf5_heaps import check_heaps
-from gyrofuse.io.limits import LONGEST_NAME, Allowance, decoded
+from gyrofuse.io.formats.request import Request
+from gyrofuse.io.limits import DEEPEST_NESTING, LONGEST_NAME, Allowance, decoded
 from gyrofuse.io.streams import RecordingError, Stream, cause
 
-_DEEPEST = 64  # groups inside each other: the library spends its stack on each
-_MOST_TEXTS = 4096  # texts in a MATLAB cell array that may be names of sensors
+# Texts of a MATLAB cell array, and characters of a text, that may be names of sensors: each text costs a read of the
+# library, and no array has nearly as many sensors.
+_MOST_TEXTS = 4096
 
 
-def read(
-    path: Path,
-    *,
-    key: str | None = None,
-    quantity: str = "rate",
-    columns: Mapping[str, str] | None = None,
-    max_bytes: float | None = None,
-) -> list[Stream]:
+def read(request: Request) -> list[Stream]:
     """Read the gyros or accelerometers of an HDF5 file; `gyrofuse.io.formats.arrays` says which names are understood.
 
     Sampling rate, unit and sensor names may be datasets or attributes of the dataset, a group or the file. Links to
     other files are not followed.
 
     Args:
-        path: The file.
-        key: The dataset that holds the sensors, or the group to look in.
-        quantity: `"rate"` or `"acceleration"`: the sensors to read.
-        columns: What datasets are, where their names do not say: these by the names that they should have; the others
-            are left out.
-        max_bytes: Memory that the datasets may take; by default a quarter of what there is.
+        request: The file and the part of it to read. Its `key` is the dataset that holds the sensors, or the group to
+            look in.
 
     Raises:
         RecordingError: Not an HDF5 file, damaged, without the quantity asked for, with numbers in other files, or too
             large.
         ImportError: h5py is not installed.
     """
+    path = request.path
     try:
         import h5py
     except ImportError as error:
@@ -52,9 +44,7 @@ def read(
         check_heaps(path)
         with h5py.File(path, "r") as file:
             # Datasets are read when needed: a file may hold much besides sensors.
-            return streams_from_arrays(
-                _content(file, Allowance(path, max_bytes)), path, key=key, quantity=quantity, columns=columns
-            )
+            return streams_from_arrays(_content(file, request.allowance()), request)
     except RecordingError:
         raise
     except Exception as error:  # a damaged file may fail anywhere in the library
@@ -64,7 +54,7 @@ def read(
 
 
 def objects(file: Any) -> Iterator[tuple[str, Any]]:
-    """Groups and datasets of an HDF5 file with their names, each once; links that are no objects are passed over."""
+    """Groups and datasets of an HDF5 file with their names, each once; soft and external links are not followed."""
     import h5py
 
     seen = set()
@@ -76,7 +66,7 @@ def objects(file: Any) -> Iterator[tuple[str, Any]]:
             continue
         seen.add((info.fileno, info.addr))
         yield name, item
-        if isinstance(item, h5py.Group) and depth < _DEEPEST:
+        if isinstance(item, h5py.Group) and depth < DEEPEST_NESTING:
             prefix = f"{name}/" if name else ""
             names = sorted((raw if isinstance(raw, bytes) else raw.encode() for raw in item), reverse=True)
             hard = [raw for raw in names if item.id.links.get_info(raw).type == h5py.h5l.TYPE_HARD]
@@ -84,14 +74,25 @@ def objects(file: Any) -> Iterator[tuple[str, Any]]:
 
 
 def settings_of(name: str, item: Any) -> dict[str, Any]:
-    """Attributes of one value, as if they were members of what they describe."""
+    """Attributes of one value, named as members of the group or dataset that they describe.
+
+    Args:
+        name: Name of the group or dataset, `""` for the file.
+        item: The group or dataset.
+    """
     prefix = f"{name}/" if name else ""
     attributes = [(key if isinstance(key, str) else decoded(key), value) for key, value in item.attrs.items()]
     return {prefix + key: value for key, value in attributes if np.size(value) == 1}
 
 
 def check_inside(path: Path, name: str, item: Any) -> None:
-    """Raise `RecordingError` where the numbers of a dataset lie in other files: any file could be read so."""
+    """Raise `RecordingError` where the numbers of a dataset lie in other files: it could name any file.
+
+    Args:
+        path: The file.
+        name: Name of the dataset.
+        item: The dataset.
+    """
     elsewhere = item.external or (item.is_virtual and [s for s in item.virtual_sources() if s.file_name != "."])
     if elsewhere:
         raise RecordingError(
@@ -120,7 +121,7 @@ def _content(file: Any, allowance: Allowance) -> dict[str, Any]:
 
     content: dict[str, Any] = {}
     for name, item in objects(file):
-        if name.startswith("#") or len(name) > LONGEST_NAME:  # where MATLAB keeps what its cells refer to
+        if name.startswith("#") or len(name) > LONGEST_NAME:  # a group of MATLAB for the content of its cells
             continue
         content.update(settings_of(name, item))
         if not isinstance(item, h5py.Dataset):
@@ -136,7 +137,7 @@ def _content(file: Any, allowance: Allowance) -> dict[str, Any]:
 
 
 def _matlab_texts(file: Any, dataset: _Dataset, allowance: Allowance) -> list[str]:
-    """Rows of text that MATLAB keeps as 16 bit codes, or as a cell array of such."""
+    """Rows of text that MATLAB stores as 16 bit codes, or as a cell array of such rows."""
     import h5py
 
     if dataset.dtype == h5py.ref_dtype:

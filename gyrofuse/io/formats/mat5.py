@@ -1,8 +1,8 @@
-"""Elements of a MATLAB file of version 5: what SciPy is going to read, looked through before it does.
+"""Elements of a MATLAB file of version 5, checked before SciPy reads them.
 
-SciPy descends into cells and structs on the stack of the C language, and makes room for dimensions before it looks
-whether there is anything to fill it: a file of a few kB can end the process. Here the elements are followed as SciPy
-follows them, by the number of entries that each announces.
+SciPy descends into cells and structs on the stack of the C language, and allocates the dimensions that a variable
+announces before it looks whether the file has its numbers: a file of a few kB can end the process. Here the elements
+are followed as SciPy follows them, by the number of entries that each announces.
 
 Reference: MAT-File Format, The MathWorks, chapter 1 (level 5).
 """
@@ -11,24 +11,57 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from enum import IntEnum
 from math import prod
 from pathlib import Path
 
-from gyrofuse.io.limits import Allowance
+from gyrofuse.io.limits import DEEPEST_NESTING, Allowance
 
 _HEADER = 128  # bytes of text and version before the first element
-_MATRIX, _COMPRESSED = 14, 15
-_NUMBERS = {*range(1, 8), 9, 12, 13}  # types of elements that hold numbers
-_DATA = _NUMBERS | {16, 17, 18}  # and those that hold text in UTF
-_CELL, _STRUCT, _OBJECT, _CHAR, _SPARSE, _FUNCTION, _OPAQUE = 1, 2, 3, 4, 5, 16, 17  # classes of matrices
-_NUMERIC = range(6, 16)
-_COMPLEX = 0x800  # flag of a matrix with an imaginary part
-_DEEPEST = 64  # cells and structs inside each other; SciPy takes about 2 kB of stack for each
+
+
+class _Type(IntEnum):
+    """Type of an element (table 1-1 of the reference)."""
+
+    INT8 = 1
+    UINT8 = 2
+    INT16 = 3
+    UINT16 = 4
+    INT32 = 5
+    UINT32 = 6
+    SINGLE = 7
+    DOUBLE = 9
+    INT64 = 12
+    UINT64 = 13
+    MATRIX = 14
+    COMPRESSED = 15
+    UTF8 = 16
+    UTF16 = 17
+    UTF32 = 18
+
+
+class _Class(IntEnum):
+    """Class of a matrix (table 1-3 of the reference, and those of later releases)."""
+
+    CELL = 1
+    STRUCT = 2
+    OBJECT = 3
+    CHAR = 4
+    SPARSE = 5
+    DOUBLE = 6
+    UINT64 = 15
+    FUNCTION = 16
+    OPAQUE = 17
+
+
+_DATA = set(_Type) - {_Type.MATRIX, _Type.COMPRESSED}  # numbers and text
+_NUMBERS = _DATA - {_Type.UTF8, _Type.UTF16, _Type.UTF32}
+_INTEGERS = {_Type.INT32, _Type.UINT32}
 
 
 def plain(path: Path, allowance: Allowance) -> bytes:
-    """A file of version 5 with its elements unpacked, when SciPy can read it without harm.
+    """A file of version 5 with its elements unpacked, after a check that SciPy can read it without harm.
 
     Args:
         path: The file.
@@ -54,12 +87,12 @@ def _unpacked(content: bytes, order: str, allowance: Allowance) -> Iterator[byte
         kind, size = struct.unpack_from(f"{order}II", content, position)
         body = content[position + 8 : position + 8 + size]
         position += 8 + size
-        if kind == _COMPRESSED:
+        if kind == _Type.COMPRESSED:
             stream = zlib.decompressobj()
             element = stream.decompress(body, allowance.left + 1)
             allowance.take("a packed variable", (-(-len(element) // 8),))
             yield element
-        elif kind == _MATRIX:
+        elif kind == _Type.MATRIX:
             yield struct.pack(f"{order}II", kind, len(body)) + body
         else:
             raise ValueError(f"an element of type {kind} where a variable was expected")
@@ -74,71 +107,72 @@ class _Walk:
 
     def check(self) -> None:
         """Go through the variable and all inside it, without recursion."""
-        left = [1]  # matrices that are still to come, at each depth
+        left = [1]  # number of matrices that follow, at each depth
         while left:
             if left[-1] == 0:
                 left.pop()
                 continue
             left[-1] -= 1
             left.append(self._matrix())
-            if len(left) > _DEEPEST:
-                raise ValueError(f"cells or structs more than {_DEEPEST} deep inside each other")
+            if len(left) > DEEPEST_NESTING:
+                raise ValueError(f"cells or structs more than {DEEPEST_NESTING} deep inside each other")
 
     def _matrix(self) -> int:
         """Go past a matrix up to the matrices inside it, and say how many there are."""
         kind, size = self._integers(8)
-        if kind != _MATRIX:
+        if kind != _Type.MATRIX:
             raise ValueError(f"an element of type {kind} where a matrix was expected")
         if size == 0:
             return 0
         _, _, flags, _ = self._integers(16)
         what = flags & 0xFF
-        if what == _OPAQUE:
+        if what == _Class.OPAQUE:
             for _ in range(3):  # a name, the kind of object and its class
                 self._data(_DATA)
             return 1
-        shape = struct.unpack(f"{self._order}{len(dims) // 4}i", dims) if (dims := self._data({5, 6})) else ()
+        shape = struct.unpack(f"{self._order}{len(dims) // 4}i", dims) if (dims := self._data(_INTEGERS)) else ()
         if min(shape, default=0) < 0:
             raise ValueError(f"dimensions of {shape}")
         name = bytes(self._data(_DATA)).decode("latin-1")
         n_fields = self._fields(what)
-        if what != _SPARSE:
+        if what != _Class.SPARSE:
             self._allowance.take(f"a variable {name}".rstrip(), (*shape, max(n_fields, 1)))
-        if what in (_CELL, _STRUCT, _OBJECT):
+        if what in (_Class.CELL, _Class.STRUCT, _Class.OBJECT):
             return prod(shape) * n_fields
-        if what == _FUNCTION:
+        if what == _Class.FUNCTION:
             return 1
-        if what not in (_CHAR, _SPARSE, *_NUMERIC):
+        if not _Class.CHAR <= what <= _Class.UINT64:
             raise ValueError(f"a matrix of class {what}")
-        parts = 1 if what == _CHAR else (3 if what == _SPARSE else 1) + bool(flags & _COMPLEX)
+        is_complex = bool(flags & 0x800)  # the bit of a matrix with an imaginary part
+        parts = 1 if what == _Class.CHAR else (3 if what == _Class.SPARSE else 1) + is_complex
         for _ in range(parts):
-            self._data(_DATA if what == _CHAR else _NUMBERS)
+            self._data(_DATA if what == _Class.CHAR else _NUMBERS)
         return 0
 
     def _fields(self, what: int) -> int:
         """Matrices that each entry of a matrix of this class holds."""
-        if what not in (_STRUCT, _OBJECT):
-            return int(what == _CELL)
-        if what == _OBJECT:
+        if what not in (_Class.STRUCT, _Class.OBJECT):
+            return int(what == _Class.CELL)
+        if what == _Class.OBJECT:
             self._data(_DATA)  # the name of its class
-        (length,) = struct.unpack(f"{self._order}i", self._data({5, 6}))
+        (length,) = struct.unpack(f"{self._order}i", self._data(_INTEGERS))
         names = self._data(_DATA)
         if length < 1:
             raise ValueError(f"names of fields of {length} characters")
         return len(names) // length
 
-    def _data(self, kinds: set[int]) -> memoryview:
+    def _data(self, kinds: Collection[int]) -> memoryview:
         """The content of the next element, which is no matrix."""
         (kind,) = self._integers(4)
         if kind >> 16:  # up to 4 bytes, within the tag
-            kind, size, room = kind & 0xFFFF, kind >> 16, 4
+            kind, size, space = kind & 0xFFFF, kind >> 16, 4
         else:
             (size,) = self._integers(4)
-            room = -(-size // 8) * 8
-        if kind not in kinds or size > room:
+            space = -(-size // 8) * 8
+        if kind not in kinds or size > space:
             raise ValueError(f"an element of type {kind} and {size} bytes where there is none")
         content = self._take(size)
-        self._position += room - size
+        self._position += space - size
         return content
 
     def _integers(self, n_bytes: int) -> tuple[int, ...]:

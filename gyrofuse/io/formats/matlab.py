@@ -3,40 +3,27 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from gyrofuse.io.formats import hdf5, mat5
 from gyrofuse.io.formats.arrays import streams_from_arrays
-from gyrofuse.io.limits import Allowance
+from gyrofuse.io.formats.request import Request
 from gyrofuse.io.streams import RecordingError, Stream, cause
 
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
-_USER_BLOCK = 512  # MATLAB puts its own header before the HDF5 file
 
 
-def read(
-    path: Path,
-    *,
-    key: str | None = None,
-    quantity: str = "rate",
-    columns: Mapping[str, str] | None = None,
-    max_bytes: float | None = None,
-) -> list[Stream]:
+def read(request: Request) -> list[Stream]:
     """Read the gyros or accelerometers of a .mat file; `gyrofuse.io.formats.arrays` says which names are understood.
 
-    Files of version 7.3 are HDF5 and are told apart by their content.
+    Files of version 7.3 are HDF5, which their content shows.
 
     Args:
-        path: The file.
-        key: The array that holds the sensors (`"imu.gyr"` or `"imu/gyr"` in a struct), or the struct to look in.
-        quantity: `"rate"` or `"acceleration"`: the sensors to read.
-        columns: What arrays are, where their names do not say: these by the names that they should have; the others are
-            left out.
-        max_bytes: Memory that the variables may take, packed and unpacked; by default a quarter of what there is.
+        request: The file and the part of it to read. Its `key` is the array that holds the sensors (`"imu.gyr"` or
+            `"imu/gyr"` in a struct), or the struct to look in.
 
     Raises:
         RecordingError: Not a MATLAB file, damaged, without the quantity asked for, or too large.
@@ -44,17 +31,20 @@ def read(
     """
     from scipy.io import loadmat
 
-    key = key.replace(".", "/") if key else key
+    path = request.path
+    if request.key:
+        request = replace(request, key=request.key.replace(".", "/"))
+    user_block = 512  # bytes that MATLAB writes before an HDF5 file
     try:
         with path.open("rb") as file:
-            start = file.read(_USER_BLOCK + len(_HDF5_SIGNATURE))
+            start = file.read(user_block + len(_HDF5_SIGNATURE))
     except OSError as error:
         raise RecordingError(
             f"{path}: expected a MATLAB file, found one that cannot be opened ({cause(error)})"
         ) from error
     if start.startswith(_HDF5_SIGNATURE) or start.endswith(_HDF5_SIGNATURE):
-        return hdf5.read(path, key=key, quantity=quantity, columns=columns, max_bytes=max_bytes)
-    allowance = Allowance(path, max_bytes)
+        return hdf5.read(request)
+    allowance = request.allowance()
     try:
         if 0 in start[:4]:  # version 4, which has neither cells nor packed variables
             allowance.take("variables", (-(-path.stat().st_size // 8),))
@@ -72,11 +62,11 @@ def read(
     for name, value in variables.items():
         if not name.startswith("__"):
             content |= _members(name, value)
-    return streams_from_arrays(content, path, key=key, quantity=quantity, columns=columns)
+    return streams_from_arrays(content, request)
 
 
 def _members(name: str, value: Any) -> dict[str, Any]:
-    """The variable itself; of a struct its fields, `name/field`, and of an array of structs `name1/field`."""
+    """A variable by its name; the fields of a struct by `name/field`, of an array of structs by `name1/field`."""
     if not isinstance(value, np.ndarray):  # sparse matrices, function handles
         return {}
     if value.dtype.names:
@@ -86,7 +76,7 @@ def _members(name: str, value: Any) -> dict[str, Any]:
             for field in value.dtype.names:
                 members |= _members(f"{owner}/{field}", struct[field])
         return members
-    if value.dtype.kind == "O":  # a cell array: only text in it is of use
+    if value.dtype.kind == "O":  # a cell array, of which only text is used
         cells = [cell for cell in value.ravel() if isinstance(cell, np.ndarray) and cell.dtype.kind == "U"]
         return {name: [text for cell in cells for text in cell.ravel().tolist()]}
     return {name: value}

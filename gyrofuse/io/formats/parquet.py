@@ -2,43 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gyrofuse.io.formats.arrays import settings_by_group, stated_rate, stated_unit
+from gyrofuse._base.units import SECONDS_PER
 from gyrofuse.io.formats.column_streams import streams_from_columns
-from gyrofuse.io.formats.columns import NAMES_OF, WORD_OF, classify_columns, or_else, renamed
-from gyrofuse.io.limits import Allowance, decoded, enumerated
+from gyrofuse.io.formats.columns import classify_columns, renamed
+from gyrofuse.io.formats.request import Request
+from gyrofuse.io.formats.settings import settings_by_group, stated_rate, stated_unit
+from gyrofuse.io.limits import decoded, enumerated
 from gyrofuse.io.streams import Array, RecordingError, Stream, cause
 
 
-def read(
-    path: Path,
-    *,
-    key: str | None = None,
-    quantity: str = "rate",
-    columns: Mapping[str, str] | None = None,
-    max_bytes: float | None = None,
-) -> list[Stream]:
+def read(request: Request) -> list[Stream]:
     """Read the gyros or accelerometers of a Parquet file, whose columns are named as in a CSV file.
 
     `fs` (Hz) and `unit` are taken from the metadata of the schema. A null is NaN.
 
     Args:
-        path: The file.
-        key: The only column to read, whatever its name.
-        quantity: `"rate"` or `"acceleration"`: the sensors to read.
-        columns: What columns are, where their names do not say: columns by the names that they should have; the others
-            are left out.
-        max_bytes: Memory that the columns may take; by default a quarter of what there is.
+        request: The file and the part of it to read. Its `key` is the only column to read, whatever its name.
 
     Raises:
         RecordingError: Not a Parquet file, damaged, empty, without the quantity asked for, or too large.
         ImportError: pyarrow is not installed.
     """
+    path, key, quantity, columns = request.path, request.key, request.quantity, request.columns
     try:
         import pyarrow as pa
         from pyarrow import parquet
@@ -53,9 +42,9 @@ def read(
             numbers = [name for name in numbers if name in called]
             kinds = {c.name: c.kind for c in classify_columns([called[name] for name in numbers], quantity)}
             wanted = [name for name in numbers if kinds[called[name]] or called[name] == key]
-            Allowance(path, max_bytes).take("columns", (file.metadata.num_rows, len(wanted) + len(dates)))
+            request.allowance().take("columns", (file.metadata.num_rows, len(wanted) + len(dates)))
             table = file.read(columns=[*wanted, *dates])
-            # pyarrow lends its own memory, which may not be written to: torch warns of that
+            # The arrays of pyarrow may not be written to, of which torch warns.
             read = {called[name]: np.require(table.column(name).to_numpy(), requirements="W") for name in wanted}
             time = _seconds(table.column(dates[0])) if dates else None
     except RecordingError:
@@ -66,9 +55,9 @@ def read(
         ) from error
 
     if key is not None:
-        read = {name: values for name, values in read.items() if name == key or kinds[name] != quantity}
-        if key in read and kinds[key] != quantity:
-            read[WORD_OF[quantity]] = read.pop(key)
+        read = {name: values for name, values in read.items() if name == key or kinds[name] != quantity.name}
+        if key in read and kinds[key] != quantity.name:
+            read[quantity.array] = read.pop(key)
     settings = settings_by_group(metadata_of(schema))
     streams = streams_from_columns(
         read,
@@ -79,9 +68,9 @@ def read(
         quantity=quantity,
     )
     if not streams or table.num_rows == 0:
-        what = f"with the name of {NAMES_OF[quantity]}" if key is None else f"{key!r} (`key`) of numbers"
+        what = f"with the name of {quantity.named}" if key is None else f"{key!r} (`key`) of numbers"
         found = {column.kind for column in classify_columns(numbers)}
-        advice = or_else(found, quantity, "say with `columns` (--map) what the columns are")
+        advice = quantity.advice(found, "say with `columns` (--map) what the columns are")
         raise RecordingError(
             f"{path}: expected a column {what}, found {table.num_rows} rows of {enumerated(schema.names)}; {advice}"
         )
@@ -89,13 +78,13 @@ def read(
 
 
 def metadata_of(schema: Any) -> dict[str, str]:
-    """What the metadata of a schema state, as text."""
+    """The metadata of a schema as text, by name."""
     return {decoded(name): decoded(value) for name, value in (schema.metadata or {}).items()}
 
 
 def _seconds(column: Any) -> Array:
     """A column of dates or durations in seconds, exact to the last digit of float64."""
-    per_second = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}[column.type.unit]
+    per_second = round(1 / SECONDS_PER[column.type.unit])
     ticks = column.cast("int64").to_numpy()
     seconds: Array = ticks // per_second + (ticks % per_second) / per_second
     return seconds

@@ -1,6 +1,7 @@
-"""Arrays in NumPy's file format: their headers, and stretches of their numbers, without a memory map.
+"""Arrays in NumPy's file format: their headers, and parts of their numbers.
 
-A memory map of a file that another process cuts short ends this one without a word; reading is told of it.
+Files are read without a memory map: where another process cuts a mapped file short, the reading process ends without an
+error, while reading from a file raises one.
 """
 
 from __future__ import annotations
@@ -15,21 +16,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAGIC = b"\x93NUMPY"
-_CHUNK = 2**18  # bytes read at a time: members of an archive pass through a buffer, which should stay in the cache
-_LONGEST_HEADER = 10_000  # bytes, as in NumPy, which reads the header whole before it refuses one
 
 
 def read_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Shape, whether it is in Fortran order, and dtype; the file is left where the numbers begin.
+    """Read a header up to where the numbers begin.
+
+    Args:
+        file: File at the beginning of the header.
+
+    Returns:
+        Shape, whether the array is in Fortran order, and dtype.
 
     Raises:
         ValueError: No such header.
     """
+    longest = 10_000  # bytes: NumPy's own limit, which it checks only after it has read the header
     begin = file.tell()
     major = file.read(8)[6:7]
     wide = major != b"\x01"
     (length,) = struct.unpack("<I" if wide else "<H", file.read(4 if wide else 2))
-    if length > _LONGEST_HEADER:
+    if length > longest:
         raise ValueError(f"a header of {length} bytes")
     file.seek(begin)
     np.lib.format.read_magic(file)
@@ -43,7 +49,13 @@ def read_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
 
 
 def read_numbers(file: IO[bytes], shape: tuple[int, ...], fortran: bool, dtype: np.dtype[Any]) -> NDArray[Any]:
-    """The array behind a header that was read.
+    """Read the array behind a header.
+
+    Args:
+        file: File at the beginning of the numbers.
+        shape: Shape of the array.
+        fortran: Whether the array is in Fortran order.
+        dtype: Type of the numbers.
 
     Raises:
         ValueError: Objects, which would have to be unpickled.
@@ -51,10 +63,11 @@ def read_numbers(file: IO[bytes], shape: tuple[int, ...], fortran: bool, dtype: 
     """
     if dtype.hasobject:
         raise ValueError("Python objects, which are not unpickled")
+    chunk = 2**18  # bytes at a time: members of an archive pass through a buffer, which should stay in the cache
     content = memoryview(bytearray(prod(shape) * dtype.itemsize))
     done = 0
     while done < len(content):
-        if not (n_bytes := file.readinto(content[done : done + _CHUNK])):  # type: ignore[attr-defined]
+        if not (n_bytes := file.readinto(content[done : done + chunk])):  # type: ignore[attr-defined]
             raise EOFError(f"{len(content)} bytes announced, {done} there")
         done += n_bytes
     values: NDArray[Any] = np.frombuffer(content, dtype) if len(content) else np.empty(prod(shape), dtype)
@@ -71,7 +84,7 @@ def read_stretch(
     start: int,
     stop: int,
 ) -> NDArray[Any]:
-    """Samples `start` to `stop`, the latter excluded, of an array of one or two dimensions: `(sensor, stop - start)`.
+    """Read samples `start` to `stop - 1` of an array of one or two dimensions: `(sensor, stop - start)`.
 
     Args:
         path: The file.
@@ -79,9 +92,9 @@ def read_stretch(
         dtype: Type of the numbers.
         n_sensors: Number of sensors.
         n_samples: Samples of each sensor.
-        interleaved: Whether all sensors of one instant follow each other in the file, else all instants of one sensor.
-        start: First sample.
-        stop: Where to end, excluded.
+        interleaved: Whether all sensors of one instant follow each other in the file, not all instants of one sensor.
+        start: Position of the first sample.
+        stop: Position after the last sample.
 
     Raises:
         EOFError: The file ends before.

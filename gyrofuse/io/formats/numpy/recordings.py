@@ -20,42 +20,35 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrofuse.io.formats.arrays import settings_by_group, stated_rate, streams_from_arrays
-from gyrofuse.io.formats.columns import AXES, WORD_OF, classify_columns
+from gyrofuse.io.formats.arrays import streams_from_arrays
+from gyrofuse.io.formats.columns import AXES, classify_columns
 from gyrofuse.io.formats.numpy.npy import MAGIC, read_header, read_numbers
 from gyrofuse.io.formats.numpy.tables import streams_from_tables
+from gyrofuse.io.formats.request import Request
+from gyrofuse.io.formats.settings import settings_by_group, stated_rate
 from gyrofuse.io.limits import LONGEST_NAME, Allowance, decoded
+from gyrofuse.io.quantities import ACCELERATION, RATE
 from gyrofuse.io.streams import Array, RecordingError, Stream, cause
 
 _Content = Mapping[str, NDArray[Any]]
 
 
-def read(
-    path: Path,
-    *,
-    key: str | None = None,
-    quantity: str = "rate",
-    columns: Mapping[str, str] | None = None,
-    max_bytes: float | None = None,
-) -> list[Stream]:
+def read(request: Request) -> list[Stream]:
     """Read the gyros or accelerometers of an .npz or .npy file.
 
     The longer dimension of an .npy array is time, the other one the sensors `"1"`, `"2"`, ...; it states no rate.
-    Nothing that would have to be unpickled is read.
+    Arrays that would have to be unpickled are not read.
 
     Args:
-        path: The file.
-        key: Of an .npz file, the array that holds the sensors, whatever its name, or the table to read.
-        quantity: `"rate"` or `"acceleration"`: the sensors to read.
-        columns: What arrays are, where their names do not say: these by the names that they should have; the others are
-            left out.
-        max_bytes: Memory that the arrays may take; by default a quarter of what there is.
+        request: The file and the part of it to read. Its `key` is the array of an .npz file that holds the sensors,
+            whatever its name, or the table to read.
 
     Raises:
         RecordingError: Not a NumPy file, damaged, with objects, ambiguous, without the quantity asked for, or too
             large.
     """
-    allowance = Allowance(path, max_bytes)
+    path = request.path
+    allowance = request.allowance()
     try:
         with path.open("rb") as file:
             magic = file.read(6)
@@ -66,7 +59,7 @@ def read(
                 )
             file.seek(0)
             if magic == MAGIC:
-                return _bare_array(_array(file, "an array", allowance), path, key)
+                return _bare_array(_array(file, "an array", allowance), request)
             content = _members(file, allowance)
     except RecordingError:
         raise
@@ -81,15 +74,15 @@ def read(
         raise RecordingError(
             f"{path}: expected `fs` to be one sampling rate in Hz, found {found}; correct or leave it out"
         )
-    if columns is not None:
-        return streams_from_arrays(content, path, key=key, quantity=quantity, columns=columns)
+    if request.columns is not None:
+        return streams_from_arrays(content, request)
     if "gyro" not in content and content.get("channels", np.empty(0)).dtype.kind == "U":
-        return streams_from_tables(content, path, key, quantity)
-    return _recording(content, path, key, quantity)
+        return streams_from_tables(content, request)
+    return _recording(content, request)
 
 
 def _members(file: IO[bytes], allowance: Allowance) -> dict[str, NDArray[Any]]:
-    """Arrays of an archive by name; what is no array is passed over."""
+    """Arrays of an archive by name; other members are left out."""
     content = {}
     with zipfile.ZipFile(file) as archive:
         for info in archive.infolist():
@@ -102,7 +95,7 @@ def _members(file: IO[bytes], allowance: Allowance) -> dict[str, NDArray[Any]]:
 
 
 def _array(file: IO[bytes], what: str, allowance: Allowance) -> NDArray[Any]:
-    """The array that a file in NumPy's format holds; bytes become text."""
+    """The array of a file in NumPy's format; bytes become text."""
     shape, fortran, dtype = read_header(file)
     allowance.take(what, shape, dtype.itemsize)
     array = read_numbers(file, shape, fortran, dtype)
@@ -111,7 +104,8 @@ def _array(file: IO[bytes], what: str, allowance: Allowance) -> NDArray[Any]:
     return array
 
 
-def _bare_array(array: NDArray[Any], path: Path, key: str | None) -> list[Stream]:
+def _bare_array(array: NDArray[Any], request: Request) -> list[Stream]:
+    path, key = request.path, request.key
     if array.dtype.kind not in "iuf" or array.ndim not in (1, 2) or max(array.shape) < 2 or array.size == 0:
         raise RecordingError(
             f"{path}: expected numbers (sensor, time) with at least 2 samples, found {array.dtype} {array.shape}; "
@@ -125,14 +119,14 @@ def _bare_array(array: NDArray[Any], path: Path, key: str | None) -> list[Stream
     return [Stream(name, {"": np.array(row, np.float64)}) for name, row in zip(names, rows, strict=True)]
 
 
-def _recording(content: _Content, path: Path, key: str | None, quantity: str) -> list[Stream]:
+def _recording(content: _Content, request: Request) -> list[Stream]:
     """Streams of an .npz recording, or of arrays that only `gyrofuse.io.formats.arrays` understands."""
-    main = WORD_OF[quantity]
+    path, main = request.path, request.quantity.array
     values = content.get(main)
-    # Accelerations beside gyros are a channel of theirs, whose names and axes say nothing of them.
-    of_gyros = quantity == "acceleration" and "gyro" in content
-    if values is None or of_gyros or key not in (None, main):
-        return streams_from_arrays(content, path, key=key, quantity=quantity)
+    # Accelerations beside gyros are a channel of the gyros; `sensors` and `axes` are not the names of their rows.
+    of_gyros = request.quantity is ACCELERATION and RATE.array in content
+    if values is None or of_gyros or request.key not in (None, main):
+        return streams_from_arrays(content, request)
     if values.dtype.kind not in "iuf" or values.ndim not in (1, 2, 3) or values.shape[-1] < 2 or values.size == 0:
         raise RecordingError(
             f"{path}: expected `{main}` to be numbers (sensor, time) or (axis, sensor, time) with at least 2 samples, "
@@ -141,7 +135,7 @@ def _recording(content: _Content, path: Path, key: str | None, quantity: str) ->
     axes = _axes(content, values, path, main) if values.ndim == 3 else [""]
     sensors = content.get("sensors", np.empty(0)).astype(str).ravel().tolist()
     rows = np.atleast_2d(values)
-    # Names settle where time runs, however short the recording; without them the longer dimension is time.
+    # Names of the rows show which dimension is time, however short the recording; without them it is the longer one.
     if values.ndim == 2 and len(sensors) != len(rows) > rows.shape[1]:
         rows = rows.T
     n_sensors, n_samples = rows.shape[-2:]
@@ -154,22 +148,22 @@ def _recording(content: _Content, path: Path, key: str | None, quantity: str) ->
             "one length"
         )
 
-    # A group per sensor is what several devices look like in other files.
+    # One group for each sensor, as files of several devices have it.
     signal = rows.reshape(len(axes), n_sensors, n_samples)
-    spread: dict[str, Any] = {
+    grouped: dict[str, Any] = {
         f"{i}/{main}/{axis}": signal[k, i] for i in range(n_sensors) for k, axis in enumerate(axes)
     }
     if "fs" not in content:
-        spread["time/unit"] = np.str_("s")  # with a rate beside it, the clock tells its unit itself
+        grouped["time/unit"] = np.str_("s")  # beside a rate, the unit of the clock follows from its steps
     own: list[dict[str, Array]] = [{} for _ in sensors]
     position_of = {sensor: position for position, sensor in enumerate(sensors)}
     for name, value in content.items():
         if name in (main, "sensors", "axes"):
             continue
         owner = _in_brackets(name, position_of)
-        named_alike = classify_columns([main, name])[1].kind == quantity
+        named_alike = classify_columns([main, name])[1].kind == request.quantity.name
         if not (named_alike or owner):
-            spread[name] = value
+            grouped[name] = value
         elif value.dtype.kind in "biuf" and value.shape[-1:] == (n_samples,):
             # `temperature[imu2]` belongs to the sensor imu2; a second array of the quantity is a channel.
             number, label = (position_of[owner], name.removesuffix(f"[{owner}]")) if owner else (0, name)
@@ -177,7 +171,7 @@ def _recording(content: _Content, path: Path, key: str | None, quantity: str) ->
     return [
         replace(stream, name=sensor, channels=stream.channels | channels, notes=(*stream.notes, *notes))
         for stream, sensor, channels in zip(
-            streams_from_arrays(spread, path, quantity=quantity), sensors, own, strict=True
+            streams_from_arrays(grouped, replace(request, key=None)), sensors, own, strict=True
         )
     ]
 

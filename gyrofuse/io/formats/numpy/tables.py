@@ -1,13 +1,13 @@
-"""Tables with named rows in an .npz file: which of them are devices of one recording, and what belongs to each.
+"""Tables with named rows in an .npz file: the devices of a recording, with their clocks and channels.
 
 Where `channels` names the rows (`gx`, `ay`, `temp`), tables are arrays (channel, time), (device, channel, time), or
-time first. `units` and `scale` hold one value for all rows or one for each, and integers times `scale` are in
-`units`. What belongs to a table `a1` is named after it: a clock `a1_t_us` or, by its number, `ts1`, the ticks per
-second of which are `ts_hz`; a channel `a1_movement`. Names without an owner serve every table of their length.
+time first. `units` and `scale` hold one value for all rows or one for each, and integers times `scale` are in `units`.
+A clock or channel of a table `a1` is named after it: a clock `a1_t_us` or, by its number, `ts1`, with its ticks per
+second in `ts_hz`; a channel `a1_movement`. Arrays without a table in their name serve every table of their length.
 
 Several tables are the devices of one recording where each holds one device and their clocks show that they ran
-together: the clocks are the same, or they count from an instant before the recording and the time that all of
-them cover is more than half of what any of them covers. Clocks that start at zero or are set back cannot show it.
+together: the clocks are equal, or they count from an instant before the recording and the time that all of them cover
+is more than half of the time that any of them covers. Clocks that start at zero or are set back cannot show it.
 Otherwise the tables are recordings on their own, and `key` must name one.
 """
 
@@ -23,20 +23,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrofuse._base.units import canonical_unit
-from gyrofuse.io.formats.arrays import clock_in_seconds, settings_by_group, stated_rate
+from gyrofuse.io.formats.arrays import clock_in_seconds
 from gyrofuse.io.formats.column_streams import streams_from_columns
-from gyrofuse.io.formats.columns import NAMES_OF, WRAP_32_BIT, Column, classify_columns
-from gyrofuse.io.limits import LONGEST_NAME, enumerated, is_rate
+from gyrofuse.io.formats.columns import Column, classify_columns
+from gyrofuse.io.formats.request import Request
+from gyrofuse.io.formats.settings import settings_by_group, stated_rate
+from gyrofuse.io.limits import LONGEST_NAME, MOST_DEVICES, enumerated, is_rate
+from gyrofuse.io.quantities import Quantity
 from gyrofuse.io.streams import Array, RecordingError, Stream
+from gyrofuse.io.timestamps import COUNTER_32_BIT
 
-# Devices of one recording; each table is read with all that has its length.
-_MOST_TABLES = 256
 _Content = Mapping[str, NDArray[Any]]
 
 
 @dataclass(frozen=True, eq=False)
 class _Table:
-    """One array with named rows and what belongs to it."""
+    """One array with named rows, its clock and its channels."""
 
     name: str
     values: NDArray[Any]  # (device, channel, time), as stored
@@ -48,7 +50,7 @@ class _Table:
 
 @dataclass(frozen=True)
 class _Beside:
-    """An array that is no table: its name, the table it is named after (or ""), the rest of the name, its meaning."""
+    """An array that is no table: its name, the table in its name (or ""), the rest of the name, its meaning."""
 
     name: str
     owner: str
@@ -56,27 +58,27 @@ class _Beside:
     column: Column
 
 
-def streams_from_tables(content: _Content, path: Path, key: str | None, quantity: str = "rate") -> list[Stream]:
+def streams_from_tables(content: _Content, request: Request) -> list[Stream]:
     """Streams of the tables of a file.
 
     Args:
         content: Arrays by name.
-        path: The file.
-        key: Name of the table to read, without the words that all tables begin with or with them.
-        quantity: `"rate"` or `"acceleration"`: the sensors to read.
+        request: The file and the part of it to read. Its `key` is the name of a table, with or without the words with
+            which the names of all tables begin.
 
     Raises:
         RecordingError: No table of the quantity, or several recordings of which `key` names none.
     """
+    path, key, quantity = request.path, request.key, request.quantity
     channels = [str(name) for name in content["channels"].ravel()]
     units = [canonical_unit(str(unit)) for unit in _per_channel(content, ("units", "unit"), "", channels, path)]
     scale = [float(factor) for factor in _per_channel(content, ("scale",), 1.0, channels, path)]
     values = {name: rows for name, value in content.items() if (rows := _by_device(value, len(channels))) is not None}
     kinds = {column.kind for column in classify_columns(channels, quantity)}
-    if not values or len({*channels}) < len(channels) or quantity not in kinds:
+    if not values or len({*channels}) < len(channels) or quantity.name not in kinds:
         found = enumerated(f"{name} {value.shape}" for name, value in content.items() if value.ndim)
         raise RecordingError(
-            f"{path}: expected arrays (channel, time) with the rows {enumerated(channels)} and {NAMES_OF[quantity]} "
+            f"{path}: expected arrays (channel, time) with the rows {enumerated(channels)} and {quantity.named} "
             f"among them, found {found}; name each row once in `channels`"
         )
     labels = _short(values)
@@ -86,8 +88,8 @@ def streams_from_tables(content: _Content, path: Path, key: str | None, quantity
     beside = _beside(content, values)
     settings = settings_by_group(content)
     only = len(values) == 1
-    tables = [_table(name, values[name], content, beside, settings, path, only=only) for name in wanted[:_MOST_TABLES]]
-    if len(wanted) > _MOST_TABLES or (len(tables) > 1 and not _ran_together(tables)):
+    tables = [_table(name, values[name], content, beside, settings, path, only=only) for name in wanted[:MOST_DEVICES]]
+    if len(wanted) > MOST_DEVICES or (len(tables) > 1 and not _ran_together(tables)):
         raise RecordingError(
             f"{path}: expected one recording, found several recordings inside ({enumerated(values)}); name one with "
             "key= (--key NAME)"
@@ -158,7 +160,7 @@ def _table(
     *,
     only: bool,
 ) -> _Table:
-    """Gather what belongs to a table: what is named after it, and what is named after none and has its length."""
+    """A table with the clock and the channels that bear its name, or no table's name and have its length."""
     length = values.shape[-1]
     number = name[len(name.rstrip("0123456789")) :]
     clocks: list[tuple[int, _Beside]] = []  # its own first
@@ -202,13 +204,13 @@ def _table(
             )
         hertz = float(per_second.item())
         seconds = ticks / hertz
-        in_32_bit = ticks.dtype.kind in "iu" and ticks.min() >= 0 and ticks.max() < WRAP_32_BIT
-        period = WRAP_32_BIT / hertz if in_32_bit else None
+        in_32_bit = ticks.dtype.kind in "iu" and ticks.min() >= 0 and ticks.max() < COUNTER_32_BIT
+        period = COUNTER_32_BIT / hertz if in_32_bit else None
     return _Table(name, values, seconds, period, channels, tuple(notes))
 
 
 def _ran_together(tables: Sequence[_Table]) -> bool:
-    """Whether the tables are the devices of one recording; the module says when."""
+    """Whether the tables are the devices of one recording, by the rule of the module's docstring."""
     clocks = []
     for table in tables:
         if table.clock is None or len(table.values) > 1:
@@ -232,13 +234,13 @@ def _streams(
     units: Sequence[str],
     scale: Sequence[float],
     rate: float | None,
-    quantity: str,
+    quantity: Quantity,
 ) -> list[Stream]:
     columns = classify_columns(channels, quantity)
-    unit = next(unit for unit, column in zip(units, columns, strict=True) if column.kind == quantity)
-    # A name that states a unit, as columns of text files do; that of the sensor may be a bare axis and stays so.
+    unit = next(unit for unit, column in zip(units, columns, strict=True) if column.kind == quantity.name)
+    # Names with their units, as in text files; the name of a sensor may be a bare axis and stays one.
     stated = [
-        f"{column.name} [{unit}]" if unit and column.kind not in ("", quantity) else column.name
+        f"{column.name} [{unit}]" if unit and column.kind not in ("", quantity.name) else column.name
         for column, unit in zip(columns, units, strict=True)
     ]
     counts = table.values.dtype.kind in "iu"

@@ -17,10 +17,11 @@ from gyrofuse.io.limits import Allowance, decoded
 from gyrofuse.io.streams import Array
 
 MAGIC = b"\xa3\x95"
-FMT = 128
+FMT = 128  # type of the message that declares the others
 _FMT_DTYPE = np.dtype([("type", "u1"), ("length", "u1"), ("name", "S4"), ("format", "S16"), ("columns", "S64")])
+BATCH = 32  # samples of a message ISBD, by its declaration in ArduPilot
 _DTYPES: dict[str, tuple[str, tuple[int, ...]]] = {
-    "a": ("<i2", (32,)),
+    "a": ("<i2", (BATCH,)),
     **{letter: (kind, ()) for letter, kind in zip("bBhHiIqQ", "i1 u1 <i2 <u2 <i4 <u4 <i8 <u8".split(), strict=True)},
     **{letter: (kind, ()) for letter, kind in zip("gfdnNZM", "<f2 <f4 <f8 S4 S16 S64 u1".split(), strict=True)},
     # Fixed-point numbers: no field that is read is one.
@@ -31,19 +32,17 @@ _DTYPES: dict[str, tuple[str, tuple[int, ...]]] = {
 _READ = frozenset("IMU IMU2 IMU3 GYR GYR1 GYR2 GYR3 ACC ACC1 ACC2 ACC3 ISBH ISBD".split())
 _FIELDS = frozenset("GyrX GyrY GyrZ AccX AccY AccZ TimeUS TimeMS SampleUS I T Temp".split())
 BATCH_FIELDS = frozenset("N type instance mul smp_cnt SampleUS smp_rate seqno x y z".split())
-# A message is at most 255 bytes long: this much at the end of a log is one that was cut off, or the rest of a page.
-_CUT_OFF = 256
-# Lines that are read, up to 4096 bytes: one with all fields of the longest message has some 700.
+# Lines that are read, of up to 4096 bytes: a line with all fields of the longest message has some 700.
 _LINE = re.compile(rb"^(FMT|IMU[23]?|GYR[123]?|ACC[123]?|ISB[HD])[ \t]{0,9},([^\n]{0,4096})", re.MULTILINE)
 _TEXTS = "nNZ"
 
-# Fields of one kind of message by name, `(n,)` or `(n, 32)`; "" is where in the log each message begins.
+# Fields of one kind of message by name, `(n,)` or `(n, 32)`; "" is the position in the log at which a message begins.
 Table = dict[str, Array]
 
 
 @dataclass(eq=False)
 class _Kind:
-    """A kind of message as its FMT declares it, and where its messages begin or what they hold."""
+    """A kind of message as its FMT declares it, with the positions and, of a text log, the values of its messages."""
 
     name: str
     letters: str
@@ -53,7 +52,7 @@ class _Kind:
 
     @property
     def declared(self) -> tuple[str, str, tuple[str, ...]]:
-        """What the FMT says."""
+        """Content of the FMT."""
         return self.name, self.letters, self.columns
 
     @property
@@ -75,7 +74,15 @@ class _Kind:
 
 
 def read_binary(content: bytes, allowance: Allowance) -> tuple[dict[str, Table], list[str]]:
-    """The messages of a binary log that are read, and what is wrong with it."""
+    """Read the messages of a binary log.
+
+    Args:
+        content: The log.
+        allowance: Memory that the messages may take.
+
+    Returns:
+        Tables by name of message, and notes on damage.
+    """
     lengths, kinds = [0] * 256, dict[int, _Kind]()
     lengths[FMT] = _FMT_DTYPE.itemsize + 3
     read: list[_Kind] = []
@@ -92,7 +99,7 @@ def read_binary(content: bytes, allowance: Allowance) -> tuple[dict[str, Table],
             name, letters, columns = (decoded(bytes(declared[part])) for part in ("name", "format", "columns"))
             kind, described = _Kind(name, letters, tuple(columns.split(","))), int(declared["type"])
             old = kinds.get(described)
-            # A log declares its kinds once, or again and again in the same words.
+            # A log may declare a kind several times in the same words.
             if described != FMT and (old is None or old.declared != kind.declared):
                 sound = kind.is_sound and kind.dtype.itemsize + 3 == declared["length"]
                 allowance.take("declarations", (_FMT_DTYPE.itemsize,))
@@ -106,7 +113,7 @@ def read_binary(content: bytes, allowance: Allowance) -> tuple[dict[str, Table],
         skipped, at = skipped + at - last, at + length
         last = at
     notes = [f"{skipped} bytes between messages are none and were skipped: damage"] if skipped else []
-    if end - last > _CUT_OFF:
+    if end - last > 256:  # bytes: a message has at most 255, and a sound log may end with the rest of a page
         notes.append(f"the last {end - last} bytes are no message: the log was cut off, or its end is damaged")
     octets = np.frombuffer(content, np.uint8)
     tables: dict[str, Table] = {}
@@ -126,7 +133,15 @@ def read_binary(content: bytes, allowance: Allowance) -> tuple[dict[str, Table],
 
 
 def read_text(content: bytes, allowance: Allowance) -> tuple[dict[str, Table], list[str]]:
-    """The messages of a text log that are read, and what is wrong with it."""
+    """Read the messages of a text log.
+
+    Args:
+        content: The log.
+        allowance: Memory that the messages may take.
+
+    Returns:
+        Tables by name of message, and notes on damage.
+    """
     kinds, read = dict[str, _Kind](), list[_Kind]()
     bad = 0
     for found in _LINE.finditer(content):
@@ -155,7 +170,7 @@ def read_text(content: bytes, allowance: Allowance) -> tuple[dict[str, Table], l
         rows = np.frombuffer(kind.values, np.float64).reshape(len(kind.starts), len(kind.fields))
         columns = {kind.columns[i]: rows[:, n].copy() for n, i in enumerate(kind.fields)}
         tables[kind.name] = {"": np.array(kind.starts, np.float64), **columns}
-    # What Mission Planner writes for the arrays of a batch depends on what it runs on: numbers of 16 bits or of 8.
+    # Mission Planner writes the arrays of a batch as numbers of 16 bits or of 8, depending on the system it runs on.
     if tables.pop("ISBD", None) is not None:
         notes.append("batches (ISBD) are not read from a text log, whose arrays are not to be relied on; give the .bin")
     return tables, notes
@@ -169,7 +184,7 @@ def _number(cell: bytes) -> float:
 
 
 def _most(kinds: list[_Kind], notes: list[str]) -> list[_Kind]:
-    """Of the kinds of one name, which a log that was put together from several may have, the one with most messages."""
+    """The kind with most messages of each name: a log that was joined from several may declare a name repeatedly."""
     chosen: dict[str, _Kind] = {}
     for kind in kinds:
         if len(kind.starts) > (len(chosen[kind.name].starts) if kind.name in chosen else 0):

@@ -20,18 +20,19 @@ from urllib.parse import quote
 
 import numpy as np
 
-from gyrofuse.io.formats.columns import AXES, CHANNELS, OTHER, or_else
-from gyrofuse.io.limits import LONGEST_NAME, Allowance, enumerated, is_regular
-from gyrofuse.io.resample import at_samples
+from gyrofuse.io.align import at_samples
+from gyrofuse.io.formats.columns import AXES
+from gyrofuse.io.formats.request import Request
+from gyrofuse.io.limits import LONGEST_NAME, enumerated, is_regular
+from gyrofuse.io.quantities import ACCELERATION, QUANTITY, RATE, Quantity
 from gyrofuse.io.streams import Array, RecordingError, Stream, cause
 
 _IMU = "sensor_msgs/msg/Imu"
 _VECTOR = "geometry_msgs/msg/Vector3Stamped"
-# Vectors that are in other units than those of an Imu, by the last part of the topic: multisense_ros converts what it
-# puts into an Imu, not what it publishes as vectors (imu.cpp).
+# Units of vectors that differ from those of an Imu, by the last part of the topic: multisense_ros converts the values
+# of an Imu, not those that it publishes as vectors (imu.cpp).
 _VECTOR_UNITS = {"gyroscope_vector": "deg/s", "accelerometer_vector": "g"}
-_TIMES = 3  # numbers of a message that are kept beside its values
-# What is kept of a message of each type.
+# Values of a message of each type.
 _VALUES: dict[str, Callable[[Any], tuple[float, ...]]] = {
     _IMU: lambda m: (*_xyz(m.angular_velocity), *_xyz(m.linear_acceleration)),
     _VECTOR: lambda m: _xyz(m.vector),
@@ -47,64 +48,33 @@ _CHANNELS = {
 }
 
 
-@dataclass(frozen=True)
-class _Quantity:
-    """What differs between rates and accelerations.
-
-    Attributes:
-        words: What an Imu calls them.
-        sensor: What measures them.
-        unit: By the definition of an Imu.
-        values: Where they stand among those kept of an Imu.
-        name: A topic or frame that says of a vector that it is one.
-    """
-
-    words: str
-    sensor: str
-    unit: str
-    values: slice
-    name: re.Pattern[str]
-
-
-_QUANTITIES = {
-    "rate": _Quantity(
-        "angular velocities",
-        "gyro",
-        "rad/s",
-        slice(0, 3),
-        re.compile(r"gyr|angular_?(?:vel|rate)|(?:^|[/_])omega", re.IGNORECASE),
-    ),
-    # A free acceleration is an estimate, from which gravity is taken (xsens_mti_driver: `/filter/free_acceleration`).
-    "acceleration": _Quantity(
-        "linear accelerations",
-        "accelerometer",
-        "m/s^2",
-        slice(3, 6),
-        re.compile(r"(?<!free)(?<!free_)accel|(?:^|[/_])acc(?:[/_]|$)", re.IGNORECASE),
-    ),
+# Topics or frames whose name says that a vector is of a quantity. A free acceleration is an estimate, without gravity
+# (xsens_mti_driver: `/filter/free_acceleration`).
+_NAMES = {
+    RATE: re.compile(r"gyr|angular_?(?:vel|rate)|(?:^|[/_])omega", re.IGNORECASE),
+    ACCELERATION: re.compile(r"(?<!free)(?<!free_)accel|(?:^|[/_])acc(?:[/_]|$)", re.IGNORECASE),
 }
 
 
-def read(path: Path, *, key: str | None = None, quantity: str = "rate", max_bytes: float | None = None) -> list[Stream]:
+def read(request: Request) -> list[Stream]:
     """Read the gyros or accelerometers of a ROS bag, in rad/s or m/s^2, one stream per topic of type sensor_msgs/Imu.
 
-    A ROS 1 `.bag`, a ROS 2 directory with its `metadata.yaml`, or a `.db3` or `.mcap` file alone; no ROS
-    installation is needed. Time is that of the message headers, or of arrival at the recorder where these are
-    not stamped. Where no such topic has the quantity, geometry_msgs/Vector3Stamped is read whose topic or frame names
-    it. The other quantity of the same messages is a channel; that of a topic which has it alone, and topics of type
-    sensor_msgs/MagneticField, Temperature and FluidPressure, become channels of the device whose name begins most
-    alike, by their own clock.
+    A ROS 1 `.bag`, a ROS 2 directory with its `metadata.yaml`, or a `.db3` or `.mcap` file alone; no ROS installation
+    is needed. Time is the stamp of the message headers, or the arrival at the recorder where headers are not stamped.
+    Where no such topic has the quantity, topics of type geometry_msgs/Vector3Stamped are read whose name or frame names
+    the quantity. The other quantity of the same messages is a channel. A topic with the other quantity alone, and
+    topics of type sensor_msgs/MagneticField, Temperature and FluidPressure, become channels of the device whose name
+    has the longest beginning in common with theirs, by their own clock.
 
     Args:
-        path: File or directory.
-        key: A topic, or the beginning of the topics to read.
-        quantity: `"rate"` or `"acceleration"`: the sensors to read.
-        max_bytes: Memory that the messages may take; by default a quarter of what there is.
+        request: The file or folder and the part of it to read. Its `key` is a topic, or the beginning of the topics to
+            read.
 
     Raises:
         RecordingError: Not a bag, not indexed, truncated, without the quantity or topic asked for, or too large.
         ImportError: rosbags is not installed.
     """
+    path, key, quantity = request.path, request.key, request.quantity
     try:
         from rosbags.rosbag1 import Reader as Ros1Reader
         from rosbags.rosbag2 import Reader as Ros2Reader
@@ -112,13 +82,13 @@ def read(path: Path, *, key: str | None = None, quantity: str = "rate", max_byte
     except ImportError as error:
         raise ImportError(f'{path}: reading ROS bags needs rosbags; pip install "gyrofuse[logs]"') from error
 
-    # sensor_msgs/Imu is the same in every ROS 1 and in every ROS 2: a bag without embedded definitions, or
-    # with unreadable ones of other messages, is no obstacle.
+    # The definition of sensor_msgs/Imu is the same in every ROS 1 and in every ROS 2, so that a bag is read although it
+    # has no definitions of its messages, or unreadable ones.
     ros1 = path.suffix == ".bag" and path.is_file()
     store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
     deserialize = store.deserialize_ros1 if ros1 else store.deserialize_cdr
     messages: dict[str, _Messages] = {}
-    allowance = Allowance(path, max_bytes)
+    allowance = request.allowance()
     odd = [file.name for file in path.iterdir() if not (is_regular(file) or file.is_dir())] if path.is_dir() else []
     if odd:
         raise RecordingError(
@@ -146,7 +116,7 @@ def read(path: Path, *, key: str | None = None, quantity: str = "rate", max_byte
                 if kind != known.kind:
                     raise ValueError(f"messages of two types in {topic}: {kind} and {known.kind}")
                 known.append(message, arrival)
-                allowance.take(f"messages of {topic}", (_TIMES + known.width + len(message.header.frame_id) // 8,))
+                allowance.take(f"messages of {topic}", (known.width_with_times + len(message.header.frame_id) // 8,))
     except RecordingError:
         raise
     except Exception as error:  # a damaged bag may fail anywhere in the library
@@ -157,18 +127,18 @@ def read(path: Path, *, key: str | None = None, quantity: str = "rate", max_byte
 
     devices, notes = _devices(messages, topics, key, quantity)
     if not devices:
-        there = {kind for kind in _QUANTITIES for topic in topics & messages.keys() if messages[topic].has(kind)}
+        there = {q.name for q in QUANTITY.values() for topic in topics & messages.keys() if messages[topic].has(q)}
         raise RecordingError(
-            f"{path}: expected {_QUANTITIES[quantity].words} in {enumerated(sorted(topics))}, found none (no message, "
+            f"{path}: expected {quantity.in_words} in {enumerated(sorted(topics))}, found none (no message, "
             "exactly zero throughout, or marked as not measured); "
-            f"{or_else(there, quantity, 'choose other topics with `key`')}"
+            f"{quantity.advice(there, 'choose other topics with `key`')}"
         )
     channels = _owned(messages, devices, quantity)
     return [messages[topic].stream(topic, quantity, channels[topic], notes) for topic in devices]
 
 
 def _check_tables(path: Path) -> None:
-    """Raise `ValueError` where what stands in a database is computed when it is read, which may take for ever."""
+    """Raise `ValueError` where a table of a database is computed when it is read, which may take for ever."""
     with contextlib.closing(sqlite3.connect(f"file:{quote(str(path))}?immutable=1", uri=True)) as database:
         for kind, name, command in database.execute("SELECT type, name, sql FROM sqlite_master").fetchall():
             columns = database.execute("SELECT hidden FROM pragma_table_xinfo(?)", (name,)).fetchall()
@@ -202,59 +172,59 @@ def _is_read(topic: str, kind: str, topics: set[str], key: str | None) -> bool:
 
 
 def _alike(topic: str, other: str) -> int:
-    """How many parts the names of two topics begin with in common."""
+    """Number of parts at the beginning of two topics that are equal."""
     pairs = list(zip(topic.strip("/").split("/"), other.strip("/").split("/"), strict=False))
     return next((n for n, (one, two) in enumerate(pairs) if one != two), len(pairs))
 
 
-def _named(topic: str, frame: str) -> set[str]:
+def _named(topic: str, frame: str) -> set[Quantity]:
     """The quantity that a vector's topic names, or else its frame; none where neither does."""
     for name in (topic[:LONGEST_NAME], frame[:LONGEST_NAME]):
-        for quantity, what in _QUANTITIES.items():
-            if what.name.search(name):
+        for quantity, pattern in _NAMES.items():
+            if pattern.search(name):
                 return {quantity}
     return set()
 
 
-def _unit(topic: str, kind: str, quantity: str) -> tuple[str, list[str]]:
-    """The unit of a topic's rates or accelerations, and what is said of it."""
+def _unit(topic: str, kind: str, quantity: Quantity) -> tuple[str, list[str]]:
+    """The unit of a topic's rates or accelerations, and a note where it is not the SI unit."""
     unit = _VECTOR_UNITS.get(topic.rpartition("/")[2]) if kind == _VECTOR else None
     if unit is None:
-        return _QUANTITIES[quantity].unit, []
+        return quantity.unit, []
     return unit, [f"{topic} is read in {unit}, as multisense_ros publishes it"]
 
 
 def _devices(
-    messages: dict[str, _Messages], topics: set[str], key: str | None, quantity: str
+    messages: dict[str, _Messages], topics: set[str], key: str | None, quantity: Quantity
 ) -> tuple[list[str], list[str]]:
-    """The topics with the quantity among those asked for, and what is said of the others."""
-    what, notes = _QUANTITIES[quantity], []
+    """The topics with the quantity among the topics asked for, and notes on the others."""
+    notes = []
     there = sorted(topics & messages.keys())
     zero = [topic for topic in there if quantity in messages[topic].measured and not messages[topic].has(quantity)]
     if zero:
-        notes.append(f"{what.words} exactly zero throughout in {enumerated(zero)}: no {what.sensor}")
+        notes.append(f"{quantity.in_words} exactly zero throughout in {enumerated(zero)}: no {quantity.sensor}")
     imus = [topic for topic in there if messages[topic].kind == _IMU and messages[topic].has(quantity)]
     vectors = [topic for topic in there if messages[topic].kind == _VECTOR and messages[topic].has(quantity)]
     if not imus or (key is not None and "/" + key.strip("/") in vectors):
         return vectors, notes
     if vectors:
         notes.append(
-            f"{quantity}s in {enumerated(vectors)} are not read beside those of Imu topics; choose them with key="
+            f"{quantity.name}s in {enumerated(vectors)} are not read beside those of Imu topics; choose them with key="
         )
     return imus, notes
 
 
 def _owned(
-    messages: dict[str, _Messages], devices: list[str], quantity: str
+    messages: dict[str, _Messages], devices: list[str], quantity: Quantity
 ) -> dict[str, list[tuple[str, str, str, _Messages]]]:
     """For each device the channels of other topics: name, unit, topic and messages."""
     owned: dict[str, list[tuple[str, str, str, _Messages]]] = {topic: [] for topic in devices}
-    beside = OTHER[quantity]
+    beside = quantity.other
     for topic, other in sorted(messages.items()):
         if topic in owned or (other.kind not in _CHANNELS and (other.has(quantity) or not other.has(beside))):
             continue
-        name, unit = _CHANNELS.get(other.kind) or (CHANNELS[beside], _unit(topic, other.kind, beside)[0])
-        owner = max(devices, key=lambda device: _alike(device, topic))  # the first one, where several are as much alike
+        name, unit = _CHANNELS.get(other.kind) or (beside.channel, _unit(topic, other.kind, beside)[0])
+        owner = max(devices, key=lambda device: _alike(device, topic))  # the first of several with as many
         owned[owner].append((name, unit, topic, other))
     return owned
 
@@ -273,10 +243,10 @@ class _Messages:
     values: array[float] = field(default_factory=lambda: array("d"))
     frames: dict[str, None] = field(default_factory=dict)
     width: int = 0  # values of a message
-    measured: set[str] = field(default_factory=set)  # quantities that they may hold
+    measured: set[Quantity] = field(default_factory=set)  # quantities of which the values may be
 
     def append(self, message: Any, arrival: int) -> None:
-        """Add one deserialised message and when it reached the recorder, in nanoseconds."""
+        """Add one deserialised message and its time of arrival at the recorder in nanoseconds."""
         stamp, values = message.header.stamp, _VALUES[self.kind](message)
         self.stamp.extend((stamp.sec, stamp.nanosec))
         self.arrival.append(arrival)
@@ -286,25 +256,32 @@ class _Messages:
         if self.kind == _IMU:
             # By the message's definition a covariance that begins with -1 says that the quantity is not measured.
             if message.angular_velocity_covariance[0] != -1:
-                self.measured.add("rate")
+                self.measured.add(RATE)
             if message.linear_acceleration_covariance[0] != -1:
-                self.measured.add("acceleration")
+                self.measured.add(ACCELERATION)
+
+    @property
+    def width_with_times(self) -> int:
+        """Numbers that are stored of a message: its values, seconds and nanoseconds of its stamp, its arrival."""
+        return self.width + 3
 
     @property
     def table(self) -> Array:
         """The values `(value, message)` as they were packed, not copied."""
         return np.frombuffer(self.values, np.float64).reshape(-1, self.width).T
 
-    def of(self, quantity: str) -> Array:
+    def of(self, quantity: Quantity) -> Array:
         """The rates or accelerations of an Imu or a vector, `(3, message)`, not copied."""
-        return self.table[_QUANTITIES[quantity].values] if self.kind == _IMU else self.table
+        if self.kind != _IMU:
+            return self.table
+        return self.table[:3] if quantity is RATE else self.table[3:]
 
-    def has(self, quantity: str) -> bool:
+    def has(self, quantity: Quantity) -> bool:
         """Whether there are rates or accelerations, and not zeros in their place."""
         return quantity in self.measured and bool(np.any(self.of(quantity) != 0))
 
     def stream(
-        self, topic: str, quantity: str, others: list[tuple[str, str, str, _Messages]], said: list[str]
+        self, topic: str, quantity: Quantity, others: list[tuple[str, str, str, _Messages]], said: list[str]
     ) -> Stream:
         """The device of this topic, with the channels that others hold."""
         time, notes = self._time()
@@ -312,11 +289,11 @@ class _Messages:
         channels, units = {}, {}
         unit, guess = _unit(topic, self.kind, quantity)
         notes += guess
-        beside = OTHER[quantity]
+        beside = quantity.other
         if self.has(beside):
-            channels[CHANNELS[beside]], units[CHANNELS[beside]] = self.of(beside).copy(), _QUANTITIES[beside].unit
+            channels[beside.channel], units[beside.channel] = self.of(beside).copy(), beside.unit
         elif beside in self.measured:
-            notes.append(f"{_QUANTITIES[beside].words} exactly zero throughout: none measured")
+            notes.append(f"{beside.in_words} exactly zero throughout: none measured")
         for name, own_unit, source, other in others:
             if name in channels:
                 notes.append(f"{name} of {source} is left out beside that of another topic")
@@ -338,7 +315,7 @@ class _Messages:
         )
 
     def _common_clock(self, other: _Messages) -> tuple[tuple[Array, Array], str]:
-        """Times of the messages of two topics, by the headers where these count by the same clock."""
+        """Times of the messages of two topics: of their headers where one clock stamps both, or else of arrival."""
         own, others = self._stamps(), other._stamps()
         overlap = own.max() >= others.min() and others.max() >= own.min()
         if self._is_stamped(own) and self._is_stamped(others) and overlap:

@@ -1,8 +1,8 @@
 """Cells that are dates or times of day, in seconds.
 
-Understood are `2024-01-31T23:59:59.010Z` (ISO 8601; a blank for the `T`, `/` for the `-`, any number of digits of a
+These forms are read: `2024-01-31T23:59:59.010Z` (ISO 8601; a blank for the `T`, `/` for the `-`, up to 12 digits of a
 second, an offset from UTC or none), `31.01.2024 23:59:59,010`, `31-Jan-2024 23:59:59.010` (MATLAB) and, without a date,
-`23:59:59.010`. Which of `01/02/2024` is the month nobody knows, and it is not read.
+`23:59:59.010`. `01/02/2024` is not read, because either number may be the month.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from datetime import date
 from functools import lru_cache
 
-DAY = 86400.0  # seconds after which times of day begin again; a day with a leap second is longer, and rare
+from gyrofuse.io.timestamps import DAY
 
 _TIME = r"(?P<hour>\d{1,2}):(?P<minute>\d\d):(?P<second>\d\d)(?:[.,:](?P<fraction>\d{1,12}))?"
 _DATES = (
@@ -23,13 +23,15 @@ _DATES = (
 _WITH_DATE = tuple(re.compile(rf"{day}[T _]{_TIME} ?(?P<offset>Z|UTC|[+-]\d\d:?\d\d)?") for day in _DATES)
 _OF_DAY = re.compile(_TIME)
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
-_LONGEST = 48  # characters: no way to write a date is longer
-_EPOCH = date(1970, 1, 1).toordinal()
 _ABSENT = frozenset(("", "nan", "null", "none", "nat", "na"))
 
 
 def kind_of_times(cells: Sequence[str]) -> str:
-    """`"date"` or `"time of day"` where at least half of the cells that are not empty are such, else `""`."""
+    """Return `"date"` or `"time of day"` where at least half of the filled cells of a column are one, else `""`.
+
+    Args:
+        cells: Some cells of the column.
+    """
     filled = [cell for cell in cells if cell.lower() not in _ABSENT]
     if not filled:
         return ""
@@ -39,10 +41,13 @@ def kind_of_times(cells: Sequence[str]) -> str:
 
 
 def seconds_of(cell: str) -> float:
-    """Seconds since 1970 of a date, or since midnight of a time of day; NaN of an empty cell.
+    """Seconds from 1970 to a date, or from midnight to a time of day; NaN for an empty cell.
+
+    Args:
+        cell: Text of the cell.
 
     Raises:
-        ValueError: The cell is neither.
+        ValueError: The cell is neither a date nor a time of day.
     """
     if cell.strip().lower() in _ABSENT:
         return float("nan")
@@ -56,7 +61,7 @@ def seconds_of(cell: str) -> float:
     fraction = parts["fraction"] or "0"
     whole = 3600 * hour + 60 * minute + second
     if "year" in parts:
-        whole += 86400 * _day_number(int(parts["year"]), parts["month"], int(parts["day"]))
+        whole += round(DAY) * _day_number(int(parts["year"]), parts["month"], int(parts["day"]))
         offset = (parts["offset"] or "Z").replace(":", "")
         if offset[0] in "+-":
             away = 3600 * int(offset[1:3]) + 60 * int(offset[3:5])
@@ -65,7 +70,8 @@ def seconds_of(cell: str) -> float:
 
 
 def _match(pattern: re.Pattern[str], cell: str) -> re.Match[str] | None:
-    return pattern.fullmatch(cell.strip()) if len(cell) <= _LONGEST else None
+    longest = 48  # characters, with blanks around: the longest of these dates has 40
+    return pattern.fullmatch(cell.strip()) if len(cell) <= longest else None
 
 
 def _dated(cell: str) -> re.Match[str] | None:
@@ -76,4 +82,4 @@ def _dated(cell: str) -> re.Match[str] | None:
 def _day_number(year: int, month: str, day: int) -> int:
     """Days since 1970."""
     number = int(month) if month.isdigit() else _MONTHS.index(month.lower()) + 1
-    return date(year, number, day).toordinal() - _EPOCH
+    return (date(year, number, day) - date(1970, 1, 1)).days

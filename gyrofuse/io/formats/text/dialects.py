@@ -1,16 +1,16 @@
-"""What text files of known loggers mean beyond the names of their columns.
+"""Text files of known loggers, whose columns mean more than their names say.
 
-Each dialect is told by its own marks and gives its columns names that `gyrofuse.io.formats.columns` understands, with
-their units; what it decides is said in a note. Sources: Xsens, MT Low-Level Communication Protocol and Xsens DOT User
-Manual; Analog Devices, ADIS16470/ADIS16490 data sheets (output registers); Betaflight, `blackbox.c` and the CSV export
-of Blackbox Explorer; ROS, `sensor_msgs/Imu` and REP 103 (units); VectorNav, VN-100 User Manual (uncompensated
+Each dialect is recognised by marks of its own. Its columns get names that `gyrofuse.io.formats.columns` understands,
+with their units, and a note says what was decided. Sources: Xsens, MT Low-Level Communication Protocol and Xsens DOT
+User Manual; Analog Devices, ADIS16470/ADIS16490 data sheets (output registers); Betaflight, `blackbox.c` and the CSV
+export of Blackbox Explorer; ROS, `sensor_msgs/Imu` and REP 103 (units); VectorNav, VN-100 User Manual (uncompensated
 measurements).
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -19,27 +19,28 @@ from gyrofuse.io.limits import is_rate
 from gyrofuse.io.streams import Array
 
 _Columns = dict[str, Array]
-_WORD = 2**16  # values of a 16-bit register, and of the packet counter of Xsens
-# Columns that no name of a sensor or clock tells, and that a dialect needs, in small letters.
+_WORD = 65_536  # number of values of a 16-bit register, and of the packet counter of Xsens
+# Columns that a dialect needs although they have no name of a sensor or clock, in small letters.
 NEEDED = frozenset({"packetcounter"})
 
-_VECTOR, _QUATERNION = AXES, (*AXES, "w")
-_IMU = (
-    *(f"orientation.{part}" for part in _QUATERNION),
-    *(f"orientation_covariance{i}" for i in range(9)),
-    *(f"angular_velocity.{axis}" for axis in _VECTOR),
-    *(f"angular_velocity_covariance{i}" for i in range(9)),
-    *(f"linear_acceleration.{axis}" for axis in _VECTOR),
-    *(f"linear_acceleration_covariance{i}" for i in range(9)),
+# Fields of a sensor_msgs/Imu with their components; a covariance has nine.
+_FIELDS = {"orientation": (*AXES, "w"), "angular_velocity": AXES, "linear_acceleration": AXES}
+_IMU = tuple(
+    name
+    for field, parts in _FIELDS.items()
+    for name in (*(f"{field}.{part}" for part in parts), *(f"{field}_covariance{i}" for i in range(9)))
 )
 _STAMP = ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id")
 
 
 def names_of_message(rows: Sequence[Sequence[str]]) -> tuple[str, ...]:
-    """Names of the cells of a sensor_msgs/Imu, as `ros2 topic echo --csv` prints it without a header; none of others.
+    """Names of the cells of a sensor_msgs/Imu, as `ros2 topic echo --csv` prints it without a header.
 
     Args:
         rows: Cells of some lines.
+
+    Returns:
+        One name for each cell, none where the lines are no such messages.
     """
     widths = {len(row) for row in rows}
     if widths == {len(_IMU)}:
@@ -63,27 +64,25 @@ def names_of_message(rows: Sequence[Sequence[str]]) -> tuple[str, ...]:
 
 
 def translate(columns: _Columns, names: Sequence[str], settings: Mapping[str, str]) -> tuple[_Columns, list[str]]:
-    """Give the columns of a known dialect the names that say what they hold.
+    """Give the columns of a known dialect names that `gyrofuse.io.formats.columns` understands.
 
     Args:
-        columns: Values by name, of the columns that were read.
-        names: All columns of the file.
-        settings: What comments and the preamble state.
+        columns: Values `(time,)` of the columns that were read, by name.
+        names: Names of all columns of the file.
+        settings: Settings in comments and the preamble, by name.
 
     Returns:
-        Columns, and what there is to say.
+        Values by their new names, and notes.
     """
     notes: list[str] = []
-    dialects: tuple[Callable[[_Columns, Sequence[str], Mapping[str, str]], tuple[_Columns, list[str]]], ...]
-    dialects = (_ros, _xsens, _adis, _betaflight, _vectornav)
-    for dialect in dialects:
+    for dialect in (_ros, _xsens, _adis, _betaflight, _vectornav):
         columns, said = dialect(columns, names, settings)
         notes += said
     return columns, notes
 
 
 def _ros(columns: _Columns, names: Sequence[str], settings: Mapping[str, str]) -> tuple[_Columns, list[str]]:
-    """Columns of a sensor_msgs/Imu, told by its covariances."""
+    """Columns of a sensor_msgs/Imu, recognised by its covariances."""
     whole = {name.lower().removeprefix("field.").rstrip("0123456789_") for name in names}
     if not {"angular_velocity_covariance", "angular_velocity.x"} <= whole:
         return columns, []
@@ -97,7 +96,7 @@ def _ros(columns: _Columns, names: Sequence[str], settings: Mapping[str, str]) -
 
 
 def _xsens(columns: _Columns, names: Sequence[str], settings: Mapping[str, str]) -> tuple[_Columns, list[str]]:
-    """Units of Xsens, which stand nowhere in the file: rad/s of an MTi or MTw, deg/s of a DOT."""
+    """Units of Xsens, which the file does not state: rad/s of an MTi or MTw, deg/s of a DOT."""
     if not {"packetcounter", "sampletimefine"} & {name.lower() for name in names}:
         return columns, []
     stated = {name.lower(): value for name, value in settings.items()}
@@ -133,7 +132,7 @@ def _placed_by_packets(columns: _Columns, rate: str) -> tuple[_Columns, list[str
 
 
 def _adis(columns: _Columns, names: Sequence[str], settings: Mapping[str, str]) -> tuple[_Columns, list[str]]:
-    """Output registers of an ADIS164xx, of which OUT and LOW are one number of 32 bits in two's complement."""
+    """Output registers of an ADIS164xx: OUT and LOW together are one number of 32 bits in two's complement."""
     registers = {name.strip().upper(): name for name in columns}
     pairs = {high: high.removesuffix("OUT") + "LOW" for high in registers if high.endswith(("GYRO_OUT", "ACCL_OUT"))}
     if not any(high.endswith("GYRO_OUT") for high in pairs):
@@ -217,7 +216,7 @@ def _betaflight(columns: _Columns, names: Sequence[str], settings: Mapping[str, 
 
 
 def _vectornav(columns: _Columns, names: Sequence[str], settings: Mapping[str, str]) -> tuple[_Columns, list[str]]:
-    """Measurements before and behind the filter on board, which are not two gyros."""
+    """Measurements before and after the filter on board, which are of one gyro."""
     before = {name for name in columns if name.lower().startswith("uncomp")}
     behind = {name for name in columns if name.lower().startswith(("gyro", "angularrate", "acc", "mag"))} - before
     if not any("gyro" in name.lower() or "rate" in name.lower() for name in before):
@@ -233,7 +232,7 @@ def _vectornav(columns: _Columns, names: Sequence[str], settings: Mapping[str, s
 
 
 def _scale_of_gyro(settings: Mapping[str, str]) -> tuple[str, float, list[str]]:
-    """Unit of the logged rates, the factor that brings them to it, and what is to be said."""
+    """Unit of the logged rates, the factor that converts them to it, and notes."""
     try:
         (scale,) = struct.unpack(">f", int(settings.get("gyro_scale", ""), 16).to_bytes(4, "big"))
     except (ValueError, OverflowError):

@@ -1,4 +1,4 @@
-"""How a text file is written: its encoding, its delimiter, its header, and what its comments state."""
+"""The layout of a text file: its encoding, delimiter and header, and the settings in its comments."""
 
 from __future__ import annotations
 
@@ -13,32 +13,33 @@ from pathlib import Path
 
 import numpy as np
 
-from gyrofuse.io.formats.columns import NAMES_OF, classify_columns, is_unit
+from gyrofuse.io.formats.columns import classify_columns, is_unit
 from gyrofuse.io.formats.text.dates import kind_of_times
 from gyrofuse.io.formats.text.dialects import names_of_message
 from gyrofuse.io.limits import LONGEST_NAME, enumerated
+from gyrofuse.io.quantities import QUANTITY
 from gyrofuse.io.streams import Array, RecordingError
 
 COMMENT = ("#", "%", "//")
-_HEAD = 600  # lines in which the layout is sought: preambles are shorter, Blackbox Explorer's has 250
-_PROBE = 20  # of these, the last tell the delimiter and which columns hold numbers
-_LONGEST_LINE = 2**17  # characters: 6500 cells of 20; a file without line ends is one line as long as the file
+_HEAD = 600  # lines in which the layout is sought: preambles are shorter, that of Blackbox Explorer has 250
+_PROBE = 20  # last lines of the head, which show the delimiter and the columns of numbers
+_LONGEST_LINE = 131_072  # characters: 6500 cells of 20; a file without line ends is one line as long as the file
 
 
 @dataclass(frozen=True)
 class Layout:
-    """How the lines of a file are to be read.
+    """The layout of the lines of a file.
 
     Attributes:
-        encoding: Of the file.
-        delimiter: Between cells; `None` is white space.
-        names: Of the columns, empty without a header.
-        numeric: Of each column, whether it holds numbers.
-        times: Of each column, whether it holds a `"date"`, a `"time of day"`, or `""`.
-        begin: Lines before the first row of numbers.
-        settings: What comments and the preamble state, by name.
-        rising: Whether the first column advances in nearly constant steps, as far as it was looked at.
-        notes: What was noticed about the text itself.
+        encoding: Encoding of the file.
+        delimiter: Character between cells; `None` is white space.
+        names: Names of the columns, empty without a header.
+        numeric: Whether each column holds numbers.
+        times: `"date"`, `"time of day"` or `""` for each column.
+        begin: Number of lines before the first row of numbers.
+        settings: Settings in comments and the preamble, by name.
+        rising: Whether the first column advances in nearly constant steps in the head of the file.
+        notes: Remarks on the encoding and the header.
     """
 
     encoding: str
@@ -53,15 +54,20 @@ class Layout:
 
 
 def without_numbers(path: Path) -> RecordingError:
-    """The error of a file whose lines are no rows of numbers."""
+    """The error of a file without rows of numbers."""
     return RecordingError(f"{path}: expected rows of numbers, found none; export the samples as CSV")
 
 
 def lines_of(path: Path, encoding: str, errors: str = "replace") -> Iterator[str]:
     """Lines of a file.
 
+    Args:
+        path: The file.
+        encoding: Encoding of the file.
+        errors: Treatment of bytes that are not of the encoding, as in `open`.
+
     Raises:
-        RecordingError: One is so long that it is none.
+        RecordingError: A line that is too long to be a row of numbers.
     """
     with path.open(encoding=encoding, errors=errors) as file:
         for number, line in enumerate(iter(partial(file.readline, _LONGEST_LINE), ""), 1):
@@ -74,7 +80,7 @@ def lines_of(path: Path, encoding: str, errors: str = "replace") -> Iterator[str
 
 
 def _head(path: Path) -> tuple[str, list[str], tuple[str, ...]]:
-    """Encoding, the first lines, and what is to be said about the encoding."""
+    """Encoding, the first lines, and notes on the encoding."""
     with path.open("rb") as raw:
         start = raw.read(4096)
     encoding = "utf-16" if start[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
@@ -90,7 +96,14 @@ def _head(path: Path) -> tuple[str, list[str], tuple[str, ...]]:
 
 
 def find_layout(path: Path) -> Layout:
-    """Find out from the first lines how the file is written."""
+    """Find the layout of a file from its first lines.
+
+    Args:
+        path: The file.
+
+    Raises:
+        RecordingError: Not text, no rows of numbers, or a header that does not fit them.
+    """
     encoding, head, notes = _head(path)
     rows = [line for line in head if line.strip() and not line.startswith(COMMENT)][-_PROBE:]
     delimiter = max((",", "\t", ";", None), key=lambda delimiter: sum(_fitness(row, delimiter) for row in rows))
@@ -144,8 +157,8 @@ def find_layout(path: Path) -> Layout:
 
 
 def advances(values: Array) -> bool:
-    """Whether values rise strictly and nine of ten steps are nearly the same."""
-    with np.errstate(over="ignore", invalid="ignore"):  # of what is infinite, or as far apart as float64 reaches
+    """Whether values `(time,)` rise strictly and nine of ten steps are nearly the same."""
+    with np.errstate(over="ignore", invalid="ignore"):  # values that are infinite or as far apart as float64 reaches
         steps = np.diff(values)
     if steps.size < 2 or not np.all(steps > 0):
         return False
@@ -163,16 +176,16 @@ def _are_units(cells: Sequence[str], numeric: Sequence[bool], delimiter: str | N
 
 
 def _settings(line: str) -> Iterator[tuple[str, str]]:
-    """Names and values of `fs = 100 Hz, unit: deg/s`: a name may have blanks; a value goes on to the next `,;=:`.
+    """Names and values of `fs = 100 Hz, unit: deg/s`: a name may have blanks; a value ends at the next `,;=:`.
 
-    `"name","value"` in quotes is one of each.
+    `"name","value"` in quotes is one setting.
     """
     quoted = line.strip().split('"')
     if len(quoted) == 5 and not quoted[0] and quoted[2].strip() in (",", ";") and not quoted[4]:
         yield quoted[1].strip(), _without_hertz(quoted[3].strip())
         return
     parts = re.split("([,;=:])", line)
-    position = 0  # texts are at even positions, what parts them at odd ones
+    position = 0  # texts are at even positions, separators at odd ones
     while position + 2 < len(parts):
         name = _last_words(parts[position]) if parts[position + 1] in "=:" else ""
         position += 2
@@ -221,19 +234,24 @@ def _header_above(path: Path, above: Sequence[str], delimiter: str | None, width
 
 
 def _names_sensor(names: Iterable[str]) -> bool:
-    return any(column.kind in NAMES_OF for column in classify_columns(list(names)) if not column.name.isdigit())
+    return any(column.kind in QUANTITY for column in classify_columns(list(names)) if not column.name.isdigit())
 
 
 def _cells(line: str, delimiter: str | None) -> list[str]:
     """Cells of a line without the empty one that a trailing delimiter makes."""
-    if delimiter is None and line.lstrip()[:1].isalpha():  # a blank before a unit parts it from no name
+    if delimiter is None and line.lstrip()[:1].isalpha():  # a blank before a unit is no delimiter
         line = " ".join(line.split()).replace(" [", "[").replace(" (", "(")
     cells = quoted_cells(line, delimiter) if '"' in line else [cell.strip() for cell in line.split(delimiter)]
     return cells[:-1] if delimiter and len(cells) > 1 and not cells[-1] else cells
 
 
 def quoted_cells(line: str, delimiter: str | None) -> list[str]:
-    """Cells of a line with quotes, in which a delimiter parts none."""
+    """Cells of a line with quotes, within which delimiters are text.
+
+    Args:
+        line: The line.
+        delimiter: Character between cells; `None` is white space.
+    """
     text = line if delimiter else " ".join(line.split())
     return [cell.strip() for cell in next(csv.reader([text], delimiter=delimiter or " ", skipinitialspace=True))]
 
@@ -243,6 +261,7 @@ def _number(cell: str) -> float:
 
 
 def is_number(cell: str, delimiter: str | None) -> bool:
+    """Whether a cell is a number; a decimal comma counts where the delimiter is no comma."""
     if len(cell) > LONGEST_NAME:
         return False
     try:
@@ -253,12 +272,12 @@ def is_number(cell: str, delimiter: str | None) -> bool:
 
 
 def _fitness(line: str, delimiter: str | None) -> float:
-    """How well a delimiter cuts a line into numbers: many of them, and little else."""
+    """Score of a delimiter for a line: high where it makes many cells and most of them are numbers."""
     filled = [is_number(cell, delimiter) for cell in _cells(line, delimiter) if cell]
     return sum(filled) ** 2 / max(len(filled), 1)
 
 
 def _holds_numbers(cells: Sequence[str], delimiter: str | None) -> bool:
-    """Whether at least half of the cells that are not empty are numbers; one that is none is an error then."""
+    """Whether at least half of the filled cells of a column are numbers; any other cell of it is an error then."""
     filled = [is_number(cell, delimiter) for cell in cells if cell]
     return 2 * sum(filled) >= len(filled) > 0

@@ -1,4 +1,4 @@
-"""The rows of a text file as numbers: at once, or line by line where a line needs more than that."""
+"""The rows of a text file as numbers: with pyarrow where it accepts every line, or else line by line."""
 
 from __future__ import annotations
 
@@ -13,11 +13,18 @@ from gyrofuse.io.formats.text.layout import COMMENT, Layout, lines_of, quoted_ce
 from gyrofuse.io.limits import LONGEST_NAME, Allowance, enumerated
 from gyrofuse.io.streams import Array, RecordingError
 
-_SHORTEST_CELL = 2  # bytes, with its delimiter: so many rows a file has at most
-
 
 def numbers_of(path: Path, layout: Layout, chosen: Mapping[str, int], allowance: Allowance) -> dict[str, Array]:
-    """Parse the chosen columns, by name and position.
+    """Parse the chosen columns of a text file.
+
+    Args:
+        path: The file.
+        layout: Layout of its lines.
+        chosen: Positions of the columns by name.
+        allowance: Memory that the numbers may take.
+
+    Returns:
+        Values `(time,)` by name.
 
     Raises:
         RecordingError: A line that does not fit the others or holds no numbers, or more rows than memory may take.
@@ -30,9 +37,10 @@ def numbers_of(path: Path, layout: Layout, chosen: Mapping[str, int], allowance:
 
 
 def _at_once(path: Path, layout: Layout, positions: list[int], allowance: Allowance) -> list[Array] | None:
-    """Columns as pyarrow parses them; None where it is not there, or does not take every line as it stands."""
+    """Columns as pyarrow parses them; None where it is not installed, or does not accept every line."""
     width = len(layout.numeric)
-    most = path.stat().st_size // (_SHORTEST_CELL * width) * width * 8
+    shortest = 2  # bytes of a cell with its delimiter, which bounds the number of rows
+    most = path.stat().st_size // (shortest * width) * width * 8
     plain = layout.delimiter is not None and layout.encoding != "utf-16" and all(layout.numeric[i] for i in positions)
     if not plain or most > allowance.left:
         return None
@@ -41,7 +49,7 @@ def _at_once(path: Path, layout: Layout, positions: list[int], allowance: Allowa
         from pyarrow import csv
     except ImportError:
         return None
-    # It takes a row with one more cell than the others for damaged; an empty one behind the last delimiter is usual.
+    # pyarrow refuses rows with one cell more than the names; an empty cell after the last delimiter is usual in logs.
     for decimal, n_cells in [(d, n) for d in (".", ",") if d != layout.delimiter for n in (width, width + 1)]:
         names = [str(i) for i in range(n_cells)]
         try:
@@ -58,13 +66,13 @@ def _at_once(path: Path, layout: Layout, positions: list[int], allowance: Allowa
             )
         except (pa.ArrowException, OSError, ValueError):
             continue
-        # pyarrow lends its own memory, which may not be written to: torch warns of that
+        # The arrays of pyarrow may not be written to, of which torch warns.
         return [np.require(table.column(names[i]).to_numpy(), np.float64, "W") for i in positions]
     return None
 
 
 def _row_by_row(path: Path, layout: Layout, chosen: Mapping[str, int], allowance: Allowance) -> dict[str, Array]:
-    """Parse the chosen columns, by name and position."""
+    """Columns as NumPy parses them, line by line."""
     rows = _Rows(path, layout, allowance.left // (8 * len(chosen)))
     try:
         table = np.loadtxt(
@@ -90,16 +98,16 @@ def _row_by_row(path: Path, layout: Layout, chosen: Mapping[str, int], allowance
 
 
 def _units_row(layout: Layout, number: int, found: str) -> str:
-    """What to do with a second row of a header."""
+    """Advice on a second row of a header, `""` where the line is none."""
     second = layout.names and number == layout.begin + 1 and not any(letter.isdigit() for letter in found)
     return " (units belong behind the names: gx [deg/s])" if second else ""
 
 
 class _Rows:
-    """Lines of numbers as np.loadtxt takes them: cells alone, a decimal point, NaN for an empty cell.
+    """Lines of numbers for np.loadtxt: cells alone, a decimal point, NaN for an empty cell.
 
     Attributes:
-        number: Of the line that was last handed out, from 1.
+        number: Number of the line that was returned last, from 1.
     """
 
     def __init__(self, path: Path, layout: Layout, most: int) -> None:
@@ -118,7 +126,7 @@ class _Rows:
             if self.number - self._layout.begin > self._most:
                 raise RecordingError(
                     f"{self._path}, line {self.number}: expected a log whose numbers fit the memory that it may take, "
-                    "found more rows; allow more with max_bytes=, or save it as .npy and read it with open_long"
+                    "found more rows; allow more with max_bytes=, or save it as .npy and read it with open_recording"
                 )
             n_cells, line = _plain(line, delimiter, width)
             if n_cells != width:
@@ -130,7 +138,7 @@ class _Rows:
 
 
 def _plain(line: str, delimiter: str | None, width: int) -> tuple[int, str]:
-    """Number of cells of a line, and the line as np.loadtxt takes it."""
+    """Number of cells of a line, and the line for np.loadtxt."""
     quoted = '"' in line
     between = delimiter or " "
     if delimiter and not (quoted or " " in line or between * 2 in line or between in (line[0], line[-1])):

@@ -19,50 +19,38 @@ from pathlib import Path
 import numpy as np
 
 from gyrofuse._base.results import numbered
-from gyrofuse.io.formats.arrays import settings_by_group, stated_rate, stated_unit
 from gyrofuse.io.formats.column_streams import streams_from_columns, time_in_seconds
-from gyrofuse.io.formats.columns import NAMES_OF, WORD_OF, Column, classify_columns, or_else, renamed
-from gyrofuse.io.formats.text.dates import DAY
+from gyrofuse.io.formats.columns import Column, classify_columns, renamed
+from gyrofuse.io.formats.request import Request
+from gyrofuse.io.formats.settings import settings_by_group, stated_rate, stated_unit
 from gyrofuse.io.formats.text.dialects import NEEDED, translate
 from gyrofuse.io.formats.text.layout import Layout, advances, find_layout, without_numbers
 from gyrofuse.io.formats.text.numbers import numbers_of
 from gyrofuse.io.limits import Allowance, enumerated
 from gyrofuse.io.streams import Array, RecordingError, Stream, cause
+from gyrofuse.io.timestamps import DAY
 
 
-def read(
-    path: Path,
-    *,
-    key: str | None = None,
-    quantity: str = "rate",
-    columns: Mapping[str, str] | None = None,
-    max_bytes: float | None = None,
-) -> list[Stream]:
+def read(request: Request) -> list[Stream]:
     """Read the gyros or accelerometers of a text file.
 
     Args:
-        path: The file.
-        key: The only column to read, whatever its name, or the only device.
-        quantity: `"rate"` or `"acceleration"`: the sensors to read.
-        columns: What columns are, where their names do not say: columns by the names that they should have; the others
-            are left out.
-        max_bytes: Memory that its numbers may take; by default a quarter of what there is.
+        request: The file and the part of it to read. Its `key` is the only column to read, whatever its name, or the
+            only device.
 
     Raises:
-        RecordingError: Not text, no rows of numbers, none of the quantity, a line that does not fit the others, or
-            too large.
+        RecordingError: Not text, no rows of numbers, none of the quantity, a line that does not fit the others, or too
+            large.
     """
-    allowance = Allowance(path, max_bytes)
+    path, key, quantity, columns = request.path, request.key, request.quantity, request.columns
+    allowance = request.allowance()
     try:
         layout = find_layout(path)
         settings = settings_by_group(layout.settings)
         rate = stated_rate(settings, "")
         if columns is not None:
             layout = _renamed(path, layout, columns)
-        if layout.names:
-            table = _named(path, layout, key, quantity, allowance)
-        else:
-            table = _unnamed(path, layout, key, quantity, rate, allowance)
+        table = _named(request, layout, allowance) if layout.names else _unnamed(request, layout, rate, allowance)
     except (OSError, csv.Error) as error:
         raise RecordingError(
             f"{path}: expected text, found a file that cannot be read ({cause(error)}); export it again"
@@ -86,7 +74,7 @@ def read(
 
 @dataclass(frozen=True, eq=False)
 class _Table:
-    """Columns of numbers by name, the clock where it is none of them, and what there is to say."""
+    """Columns of numbers by name, the clock where it is none of the columns, and notes."""
 
     columns: dict[str, Array]
     time: Array | None
@@ -101,8 +89,9 @@ def _renamed(path: Path, layout: Layout, columns: Mapping[str, str]) -> Layout:
     return replace(layout, names=tuple(called.get(name, "") for name in names), rising=False)
 
 
-def _named(path: Path, layout: Layout, key: str | None, quantity: str, allowance: Allowance) -> _Table:
+def _named(request: Request, layout: Layout, allowance: Allowance) -> _Table:
     """Columns that the header names."""
+    path, key, quantity = request.path, request.key, request.quantity
     notes: list[str] = []
     chosen: dict[str, int] = {}
     wanted: set[str] = set()
@@ -111,29 +100,29 @@ def _named(path: Path, layout: Layout, key: str | None, quantity: str, allowance
     for position, column in enumerate(columns_there):
         if column.name in chosen:
             notes.append(f"column '{column.name}' stands there twice; the first is read")
-        elif column.name == key or (column.kind == quantity and key in (None, column.device)):
+        elif column.name == key or (column.kind == quantity.name and key in (None, column.device)):
             chosen[column.name] = position
             wanted.add(column.kind)
-        elif column.kind not in ("", quantity) or column.name.lower() in NEEDED:
+        elif column.kind not in ("", quantity.name) or column.name.lower() in NEEDED:
             if layout.numeric[position]:
                 chosen[column.name] = position
             elif column.kind == "time" and position != clock:
                 beside = "dates beside another clock" if layout.times[position] else "no numbers"
                 notes.append(f"column '{column.name}' holds {beside} and is left out")
     if not wanted:
-        what = f"with the name of {NAMES_OF[quantity]}" if key is None else f"or device {key!r} (`key`)"
+        what = f"with the name of {quantity.named}" if key is None else f"or device {key!r} (`key`)"
         advice = "say with `columns` (--map) what the columns are"
         raise RecordingError(
             f"{path}: expected a column {what}, found {enumerated(layout.names)}; "
-            f"{or_else({column.kind for column in columns_there}, quantity, advice)}"
+            f"{quantity.advice({column.kind for column in columns_there}, advice)}"
         )
     if layout.rising and layout.names[0] not in chosen and not any(c.kind == "time" for c in columns_there):
         notes.append(
             f"column '{layout.names[0]}' rises in equal steps but has no name of a clock; if it is one, call it 'time'"
         )
     columns, time, period, said = _with_dates(path, layout, chosen, clock, allowance)
-    if quantity not in wanted and key is not None:
-        columns[WORD_OF[quantity]] = columns.pop(key)
+    if quantity.name not in wanted and key is not None:
+        columns[quantity.array] = columns.pop(key)
     columns, meaning = translate(columns, layout.names, layout.settings)
     return _Table(columns, time, period, [*notes, *said, *meaning])
 
@@ -150,7 +139,7 @@ def _clock_of_dates(layout: Layout, columns: Sequence[Column]) -> int | None:
 def _with_dates(
     path: Path, layout: Layout, chosen: Mapping[str, int], clock: int | None, allowance: Allowance
 ) -> tuple[dict[str, Array], Array | None, float | None, list[str]]:
-    """Chosen columns, the seconds of the column of dates, after which they wrap, and what to say of it."""
+    """Chosen columns, the clock of the column of dates in seconds, the period after which it wraps, and notes."""
     name = "" if clock is None else layout.names[clock] if layout.names else str(clock + 1)
     if clock is None or name in chosen:
         return numbers_of(path, layout, chosen, allowance), None, None, []
@@ -162,10 +151,9 @@ def _with_dates(
     return columns, seconds, DAY, [note]
 
 
-def _unnamed(
-    path: Path, layout: Layout, key: str | None, quantity: str, rate: float | None, allowance: Allowance
-) -> _Table:
+def _unnamed(request: Request, layout: Layout, rate: float | None, allowance: Allowance) -> _Table:
     """Sensors by their number, and the clock where there is one."""
+    path, key = request.path, request.key
     wanted = {f"{i + 1}": i for i, numeric in enumerate(layout.numeric) if numeric}
     if not wanted:
         raise without_numbers(path)
@@ -188,5 +176,5 @@ def _unnamed(
     if key is not None:
         sensors = {key: sensors[key]}
     if len(sensors) == 1:
-        sensors = {WORD_OF[quantity]: next(iter(sensors.values()))}
+        sensors = {request.quantity.array: next(iter(sensors.values()))}
     return _Table(sensors, time, period, notes)
