@@ -120,7 +120,7 @@ def streams_from_columns(
     by_device: dict[str, list[Column]] = {}
     for column in classified:
         by_device.setdefault(column.device, []).append(column)
-    devices = list(dict.fromkeys(column.device for column in classified if column.kind == quantity))
+    devices = list(dict.fromkeys(column.device for column in classified if column.kind == quantity.name))
     clocks = [column for column in classified if column.kind == "time"]
     empty = dict.fromkeys(column.name for column in clocks if not np.isfinite(columns[column.name]).any())
     clocks = sorted((column for column in clocks if column.name not in empty), key=_remoteness)
