@@ -205,7 +205,14 @@ def _grids(streams: Sequence[Stream], rate: float | None, source: str) -> list[G
             grid = known.get(identity) or regular_grid(stream.n_samples, stated)
         else:
             identity = (id(stream.time), -1.0)
-            grid = known.get(identity) or _clocked(stream, rate, source)
+            grid = known.get(identity) or grid_of(
+                np.asarray(stream.time, dtype=np.float64),
+                name=stream.name,
+                source=source,
+                clock_period=stream.clock_period,
+                rate=rate,
+                nominal=stream.rate,
+            )
         known[identity] = grid
         grids.append(grid)
     return grids
@@ -219,17 +226,6 @@ def _overruled(streams: Sequence[Stream], rate: float | None) -> list[Note]:
         for other in stated
         if other and rate and not same_rate(other, rate)
     ]
-
-
-def _clocked(stream: Stream, rate: float | None, source: str) -> Grid:
-    return grid_of(
-        np.asarray(stream.time, dtype=np.float64),
-        name=stream.name,
-        source=source,
-        clock_period=stream.clock_period,
-        rate=rate,
-        nominal=stream.rate,
-    )
 
 
 def _units(

@@ -16,7 +16,7 @@ class Quantity:
         channel: Name of an auxiliary channel of it.
         sensor: The instrument that measures it.
         a_sensor: The instrument with its article.
-        example: Names of its columns, for messages.
+        named: The instrument with examples of the names of its columns, for messages.
         unit: SI unit, in which robots log it.
         in_words: Its name in the definition of sensor_msgs/Imu, plural.
         instead: Advice for a log that holds this quantity and not the requested one.
@@ -27,15 +27,10 @@ class Quantity:
     channel: str
     sensor: str
     a_sensor: str
-    example: str
+    named: str
     unit: str
     in_words: str
     instead: str
-
-    @property
-    def named(self) -> str:
-        """The instrument with examples of the names of its columns, for messages."""
-        return f"{self.a_sensor} ({self.example})"
 
     @property
     def other(self) -> Quantity:
@@ -58,7 +53,7 @@ RATE = Quantity(
     channel="angular_rate",
     sensor="gyro",
     a_sensor="a gyro",
-    example="gyro_x, gx",
+    named="a gyro (gyro_x, gx)",
     unit="rad/s",
     in_words="angular velocities",
     instead='it has gyros, which are read with quantity="rate" (--quantity rate)',
@@ -69,7 +64,7 @@ ACCELERATION = Quantity(
     channel="acceleration",
     sensor="accelerometer",
     a_sensor="an accelerometer",
-    example="acc_x, ax",
+    named="an accelerometer (acc_x, ax)",
     unit="m/s^2",
     in_words="linear accelerations",
     instead='it has accelerations, which are read with quantity="acceleration" (--quantity acceleration)',

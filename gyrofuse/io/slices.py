@@ -27,7 +27,7 @@ from gyrofuse.io.formats.request import Request
 from gyrofuse.io.formats.settings import settings_by_group, stated_rate, stated_unit
 from gyrofuse.io.limits import enumerated, is_regular
 from gyrofuse.io.quantities import RATE, Quantity
-from gyrofuse.io.streams import Array, RecordingError, cause
+from gyrofuse.io.streams import Array, RecordingError, cause, needed, reading
 
 # Bytes of an array that is read because it may be a setting: names of a thousand sensors take 64 kB.
 _MOST_SETTING = 65_536
@@ -87,14 +87,8 @@ def open_slices(path: Path, key: str | Sequence[str] | None, quantity: Quantity 
         raise FileNotFoundError(f"{path}: no such file")
     if not is_regular(path):
         raise RecordingError(f"{path}: expected a file, found a folder, pipe or device; copy the log into a file")
-    try:
+    with reading(path, f"a {suffix} file", "save or export it again"):
         return openers[suffix](path, key, quantity)
-    except (RecordingError, ImportError):
-        raise
-    except Exception as error:  # a damaged file may fail anywhere in its library
-        raise RecordingError(
-            f"{path}: expected a {suffix} file, found one that cannot be read ({cause(error)}); save or export it again"
-        ) from error
 
 
 def _open_npy(path: Path, key: str | None, quantity: Quantity) -> Slices:
@@ -148,10 +142,8 @@ def _mapped(
 
 
 def _open_hdf5(path: Path, key: str | None, quantity: Quantity) -> Slices:
-    try:
+    with needed(path, "HDF5", "h5py"):
         import h5py
-    except ImportError as error:
-        raise ImportError(f'{path}: reading HDF5 needs h5py; pip install "gyrofuse[logs]"') from error
     check_heaps(path)
     with h5py.File(path, "r") as file:
         datasets: dict[str, Any] = {}
@@ -181,11 +173,9 @@ def _read_hdf5(path: Path, name: str | bytes, time_first: bool, start: int, stop
 
 
 def _open_parquet(path: Path, key: str | Sequence[str] | None, quantity: Quantity) -> Slices:
-    try:
+    with needed(path, "Parquet", "pyarrow"):
         from pyarrow import parquet
         from pyarrow import types as kinds
-    except ImportError as error:
-        raise ImportError(f'{path}: reading Parquet needs pyarrow; pip install "gyrofuse[logs]"') from error
     with parquet.ParquetFile(path) as file:
         schema, metadata = file.schema_arrow, file.metadata
         numbers = [f.name for f in schema if kinds.is_integer(f.type) or kinds.is_floating(f.type)]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,6 +20,40 @@ class RecordingError(ValueError):
 def cause(error: Exception) -> str:
     """Message of an error in at most 1000 characters, or its type where it has none."""
     return str(error)[:1000] or type(error).__name__
+
+
+@contextmanager
+def reading(path: object, expected: str, remedy: str) -> Iterator[None]:
+    """Raise any error of the body as a `RecordingError`: a damaged log may fail anywhere in the library that reads it.
+
+    Args:
+        path: The log.
+        expected: Description of a sound log.
+        remedy: Advice on a log that cannot be read.
+    """
+    try:
+        yield
+    except (RecordingError, ImportError):
+        raise
+    except Exception as error:
+        raise RecordingError(
+            f"{path}: expected {expected}, found one that cannot be read ({cause(error)}); {remedy}"
+        ) from error
+
+
+@contextmanager
+def needed(path: object, what: str, library: str) -> Iterator[None]:
+    """Name the log in the error of a library that is imported in the body and not installed.
+
+    Args:
+        path: The log.
+        what: Name of its format.
+        library: Name of the library.
+    """
+    try:
+        yield
+    except ImportError as error:
+        raise ImportError(f'{path}: reading {what} needs {library}; pip install "gyrofuse[logs]"') from error
 
 
 def unexpected(source: object, error: Exception) -> RecordingError:

@@ -56,30 +56,22 @@ _NOT_DATA = frozenset(
 )
 _FILLERS = frozenset("raw data value values field buffer calibrated cal uncalibrated msg header sample sensor".split())
 _UNIT_TOKENS = {
-    "rad": "rad/s",
-    "rads": "rad/s",
-    "radps": "rad/s",
-    "mrad": "mrad/s",
-    "mrads": "mrad/s",
-    "deg": "deg/s",
-    "degs": "deg/s",
-    "degps": "deg/s",
-    "dps": "deg/s",
-    "mdeg": "mdeg/s",
-    "mdps": "mdeg/s",
-    "dph": "deg/h",
-    "degh": "deg/h",
-    "rpm": "rpm",
-    "counts": "counts",
-    "lsb": "counts",
-    "ms2": "m/s^2",
-    "mps2": "m/s^2",
-    "s2": "m/s^2",
-    "mg": "mg",
-    "ug": "ug",
-    "celsius": "degC",
-    "degc": "degC",
-    "kelvin": "K",
+    token: unit
+    for unit, tokens in {
+        "rad/s": "rad rads radps",
+        "mrad/s": "mrad mrads",
+        "deg/s": "deg degs degps dps",
+        "mdeg/s": "mdeg mdps",
+        "deg/h": "dph degh",
+        "rpm": "rpm",
+        "counts": "counts lsb",
+        "m/s^2": "ms2 mps2 s2",
+        "mg": "mg",
+        "ug": "ug",
+        "degC": "celsius degc",
+        "K": "kelvin",
+    }.items()
+    for token in tokens.split()
 }
 # Letters that are a unit only at the end of the name of a quantity: `acc_x_g`, `temp_c`.
 _LAST_LETTERS = {("acceleration", "g"): "g", ("temperature", "c"): "degC", ("temperature", "k"): "K"}

@@ -13,7 +13,7 @@ from gyrofuse.io.formats.arrays import streams_from_arrays
 from gyrofuse.io.formats.hdf5_heaps import check_heaps
 from gyrofuse.io.formats.request import Request
 from gyrofuse.io.limits import DEEPEST_NESTING, LONGEST_NAME, Allowance, decoded
-from gyrofuse.io.streams import RecordingError, Stream, cause
+from gyrofuse.io.streams import RecordingError, Stream, needed, reading
 
 # Texts of a MATLAB cell array, and characters of a text, that may be names of sensors: each text costs a read of the
 # library, and no array has nearly as many sensors.
@@ -36,21 +36,13 @@ def read(request: Request) -> list[Stream]:
         ImportError: h5py is not installed.
     """
     path = request.path
-    try:
+    with needed(path, "HDF5", "h5py"):
         import h5py
-    except ImportError as error:
-        raise ImportError(f'{path}: reading HDF5 needs h5py; pip install "gyrofuse[logs]"') from error
-    try:
+    with reading(path, "an HDF5 file", "copy or export it again"):
         check_heaps(path)
         with h5py.File(path, "r") as file:
             # Datasets are read when needed: a file may hold much besides sensors.
             return streams_from_arrays(_content(file, request.allowance()), request)
-    except RecordingError:
-        raise
-    except Exception as error:  # a damaged file may fail anywhere in the library
-        raise RecordingError(
-            f"{path}: expected an HDF5 file, found one that cannot be read ({cause(error)}); copy or export it again"
-        ) from error
 
 
 def objects(file: Any) -> Iterator[tuple[str, Any]]:

@@ -21,42 +21,20 @@ from gyrofuse.io.limits import DEEPEST_NESTING, Allowance
 _HEADER = 128  # bytes of text and version before the first element
 
 
-class _Type(IntEnum):
-    """Type of an element (table 1-1 of the reference)."""
-
-    INT8 = 1
-    UINT8 = 2
-    INT16 = 3
-    UINT16 = 4
-    INT32 = 5
-    UINT32 = 6
-    SINGLE = 7
-    DOUBLE = 9
-    INT64 = 12
-    UINT64 = 13
-    MATRIX = 14
-    COMPRESSED = 15
-    UTF8 = 16
-    UTF16 = 17
-    UTF32 = 18
-
-
-class _Class(IntEnum):
-    """Class of a matrix (table 1-3 of the reference, and those of later releases)."""
-
-    CELL = 1
-    STRUCT = 2
-    OBJECT = 3
-    CHAR = 4
-    SPARSE = 5
-    DOUBLE = 6
-    UINT64 = 15
-    FUNCTION = 16
-    OPAQUE = 17
-
-
-_DATA = set(_Type) - {_Type.MATRIX, _Type.COMPRESSED}  # numbers and text
-_NUMBERS = _DATA - {_Type.UTF8, _Type.UTF16, _Type.UTF32}
+# Types of elements (table 1-1 of the reference), from 1 on.
+_Type = IntEnum(
+    "_Type",
+    "INT8 UINT8 INT16 UINT16 INT32 UINT32 SINGLE RESERVED8 DOUBLE RESERVED10 RESERVED11 INT64 UINT64 MATRIX COMPRESSED "
+    "UTF8 UTF16 UTF32",
+)
+# Classes of matrices (table 1-3 of the reference, and those of later releases), from 1 on.
+_Class = IntEnum(
+    "_Class",
+    "CELL STRUCT OBJECT CHAR SPARSE DOUBLE SINGLE INT8 UINT8 INT16 UINT16 INT32 UINT32 INT64 UINT64 FUNCTION OPAQUE",
+)
+_TEXT = {_Type.UTF8, _Type.UTF16, _Type.UTF32}
+_NUMBERS = {kind for kind in _Type if kind < _Type.MATRIX and not kind.name.startswith("RESERVED")}
+_DATA = _NUMBERS | _TEXT
 _INTEGERS = {_Type.INT32, _Type.UINT32}
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from gyrofuse.io.formats import hdf5, mat5
 from gyrofuse.io.formats.arrays import streams_from_arrays
 from gyrofuse.io.formats.request import Request
-from gyrofuse.io.streams import RecordingError, Stream, cause
+from gyrofuse.io.streams import RecordingError, Stream, cause, reading
 
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
@@ -45,19 +45,12 @@ def read(request: Request) -> list[Stream]:
     if start.startswith(_HDF5_SIGNATURE) or start.endswith(_HDF5_SIGNATURE):
         return hdf5.read(request)
     allowance = request.allowance()
-    try:
+    with reading(path, "a MATLAB file of version 5 to 7.3", "save it again with save(..., '-v7')"):
         if 0 in start[:4]:  # version 4, which has neither cells nor packed variables
             allowance.take("variables", (-(-path.stat().st_size // 8),))
             variables = loadmat(path)
         else:
             variables = loadmat(io.BytesIO(mat5.plain(path, allowance)))
-    except RecordingError:
-        raise
-    except Exception as error:  # a damaged file may fail anywhere in the library
-        raise RecordingError(
-            f"{path}: expected a MATLAB file of version 5 to 7.3, found one that cannot be read ({cause(error)}); "
-            "save it again with save(..., '-v7')"
-        ) from error
     content: dict[str, Any] = {}
     for name, value in variables.items():
         if not name.startswith("__"):

@@ -12,7 +12,7 @@ from gyrofuse.io.formats.columns import classify_columns, renamed
 from gyrofuse.io.formats.request import Request
 from gyrofuse.io.formats.settings import settings_by_group, stated_rate, stated_unit
 from gyrofuse.io.limits import decoded, enumerated
-from gyrofuse.io.streams import Array, RecordingError, Stream, cause
+from gyrofuse.io.streams import Array, RecordingError, Stream, needed, reading
 
 
 def read(request: Request) -> list[Stream]:
@@ -28,31 +28,22 @@ def read(request: Request) -> list[Stream]:
         ImportError: pyarrow is not installed.
     """
     path, key, quantity, columns = request.path, request.key, request.quantity, request.columns
-    try:
+    with needed(path, "Parquet", "pyarrow"):
         import pyarrow as pa
         from pyarrow import parquet
-    except ImportError as error:
-        raise ImportError(f'{path}: reading Parquet needs pyarrow; pip install "gyrofuse[logs]"') from error
-    try:
-        with parquet.ParquetFile(path) as file:
-            schema = file.schema_arrow
-            numbers = [f.name for f in schema if pa.types.is_integer(f.type) or pa.types.is_floating(f.type)]
-            dates = [f.name for f in schema if pa.types.is_timestamp(f.type) or pa.types.is_duration(f.type)]
-            called = {name: name for name in numbers} if columns is None else renamed(path, schema.names, columns)
-            numbers = [name for name in numbers if name in called]
-            kinds = {c.name: c.kind for c in classify_columns([called[name] for name in numbers], quantity)}
-            wanted = [name for name in numbers if kinds[called[name]] or called[name] == key]
-            request.allowance().take("columns", (file.metadata.num_rows, len(wanted) + len(dates)))
-            table = file.read(columns=[*wanted, *dates])
-            # The arrays of pyarrow may not be written to, of which torch warns.
-            read = {called[name]: np.require(table.column(name).to_numpy(), requirements="W") for name in wanted}
-            time = _seconds(table.column(dates[0])) if dates else None
-    except RecordingError:
-        raise
-    except Exception as error:  # a damaged file may fail anywhere in the library
-        raise RecordingError(
-            f"{path}: expected a Parquet file, found one that cannot be read ({cause(error)}); export it again"
-        ) from error
+    with reading(path, "a Parquet file", "export it again"), parquet.ParquetFile(path) as file:
+        schema = file.schema_arrow
+        numbers = [f.name for f in schema if pa.types.is_integer(f.type) or pa.types.is_floating(f.type)]
+        dates = [f.name for f in schema if pa.types.is_timestamp(f.type) or pa.types.is_duration(f.type)]
+        called = {name: name for name in numbers} if columns is None else renamed(path, schema.names, columns)
+        numbers = [name for name in numbers if name in called]
+        kinds = {c.name: c.kind for c in classify_columns([called[name] for name in numbers], quantity)}
+        wanted = [name for name in numbers if kinds[called[name]] or called[name] == key]
+        request.allowance().take("columns", (file.metadata.num_rows, len(wanted) + len(dates)))
+        table = file.read(columns=[*wanted, *dates])
+        # The arrays of pyarrow may not be written to, of which torch warns.
+        read = {called[name]: np.require(table.column(name).to_numpy(), requirements="W") for name in wanted}
+        time = _seconds(table.column(dates[0])) if dates else None
 
     if key is not None:
         read = {name: values for name, values in read.items() if name == key or kinds[name] != quantity.name}

@@ -11,17 +11,7 @@ from gyrofuse._base.units import canonical_unit, quantity_of
 from gyrofuse.io.limits import LONGEST_NAME, decoded, is_rate
 from gyrofuse.io.quantities import Quantity
 
-_RATE = (
-    "fs",
-    "rate",
-    "samplingrate",
-    "samplerate",
-    "samplingfrequency",
-    "samplefrequency",
-    "samplefreq",
-    "outputrate",
-    "updaterate",
-)
+_RATE = ("fs rate samplingrate samplerate samplingfrequency samplefrequency samplefreq outputrate updaterate").split()
 _UNIT = ("unit", "units")
 _SENSORS = ("sensors", "sensornames")
 # Numbers and text by the group that holds them ("" is the file) and their name in lower case letters.

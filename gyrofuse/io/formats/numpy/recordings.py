@@ -28,7 +28,7 @@ from gyrofuse.io.formats.request import Request
 from gyrofuse.io.formats.settings import settings_by_group, stated_rate
 from gyrofuse.io.limits import LONGEST_NAME, Allowance, decoded
 from gyrofuse.io.quantities import ACCELERATION, RATE
-from gyrofuse.io.streams import Array, RecordingError, Stream, cause
+from gyrofuse.io.streams import Array, RecordingError, Stream, reading
 
 _Content = Mapping[str, NDArray[Any]]
 
@@ -49,25 +49,18 @@ def read(request: Request) -> list[Stream]:
     """
     path = request.path
     allowance = request.allowance()
-    try:
-        with path.open("rb") as file:
-            magic = file.read(6)
-            if magic[:2] != b"PK" and magic != MAGIC:
-                raise RecordingError(
-                    f"{path}: expected a NumPy file, found something else; save it with np.savez or np.save, or name "
-                    "it by its format"
-                )
-            file.seek(0)
-            if magic == MAGIC:
-                return _bare_array(_array(file, "an array", allowance), request)
-            content = _members(file, allowance)
-    except RecordingError:
-        raise
-    except Exception as error:  # a damaged file may fail anywhere in the library
-        raise RecordingError(
-            f"{path}: expected a NumPy file of numbers and text, found one that cannot be read ({cause(error)}); "
-            "save it again with np.savez or np.save, without objects"
-        ) from error
+    sound = "a NumPy file of numbers and text"
+    with reading(path, sound, "save it again with np.savez or np.save, without objects"), path.open("rb") as file:
+        magic = file.read(6)
+        if magic[:2] != b"PK" and magic != MAGIC:
+            raise RecordingError(
+                f"{path}: expected a NumPy file, found something else; save it with np.savez or np.save, or name "
+                "it by its format"
+            )
+        file.seek(0)
+        if magic == MAGIC:
+            return _bare_array(_array(file, "an array", allowance), request)
+        content = _members(file, allowance)
 
     if "fs" in content and stated_rate(settings_by_group(content), "") is None:
         found = str(content["fs"])[:LONGEST_NAME]

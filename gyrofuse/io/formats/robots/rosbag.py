@@ -11,42 +11,15 @@ from __future__ import annotations
 import contextlib
 import re
 import sqlite3
-from array import array
-from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-import numpy as np
-
-from gyrofuse.io.align import at_samples
-from gyrofuse.io.formats.columns import AXES
 from gyrofuse.io.formats.request import Request
+from gyrofuse.io.formats.robots.rosbag_messages import CHANNEL_TYPES, IMU, VALUES, VECTOR, Messages, unit_of
 from gyrofuse.io.limits import LONGEST_NAME, enumerated, is_regular
 from gyrofuse.io.quantities import ACCELERATION, QUANTITY, RATE, Quantity
-from gyrofuse.io.streams import Array, RecordingError, Stream, cause
-
-_IMU = "sensor_msgs/msg/Imu"
-_VECTOR = "geometry_msgs/msg/Vector3Stamped"
-# Units of vectors that differ from those of an Imu, by the last part of the topic: multisense_ros converts the values
-# of an Imu, not those that it publishes as vectors (imu.cpp).
-_VECTOR_UNITS = {"gyroscope_vector": "deg/s", "accelerometer_vector": "g"}
-# Values of a message of each type.
-_VALUES: dict[str, Callable[[Any], tuple[float, ...]]] = {
-    _IMU: lambda m: (*_xyz(m.angular_velocity), *_xyz(m.linear_acceleration)),
-    _VECTOR: lambda m: _xyz(m.vector),
-    "sensor_msgs/msg/MagneticField": lambda m: _xyz(m.magnetic_field),
-    "sensor_msgs/msg/Temperature": lambda m: (m.temperature,),
-    "sensor_msgs/msg/FluidPressure": lambda m: (m.fluid_pressure,),
-}
-# Names and units of the channels, by the definitions of the messages.
-_CHANNELS = {
-    "sensor_msgs/msg/MagneticField": ("magnetic_field", "T"),
-    "sensor_msgs/msg/Temperature": ("temperature", "degC"),
-    "sensor_msgs/msg/FluidPressure": ("pressure", "Pa"),
-}
-
+from gyrofuse.io.streams import RecordingError, Stream, needed, reading
 
 # Topics or frames whose name says that a vector is of a quantity. A free acceleration is an estimate, without gravity
 # (xsens_mti_driver: `/filter/free_acceleration`).
@@ -75,26 +48,26 @@ def read(request: Request) -> list[Stream]:
         ImportError: rosbags is not installed.
     """
     path, key, quantity = request.path, request.key, request.quantity
-    try:
+    with needed(path, "ROS bags", "rosbags"):
         from rosbags.rosbag1 import Reader as Ros1Reader
         from rosbags.rosbag2 import Reader as Ros2Reader
         from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise ImportError(f'{path}: reading ROS bags needs rosbags; pip install "gyrofuse[logs]"') from error
 
     # The definition of sensor_msgs/Imu is the same in every ROS 1 and in every ROS 2, so that a bag is read although it
     # has no definitions of its messages, or unreadable ones.
     ros1 = path.suffix == ".bag" and path.is_file()
     store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
     deserialize = store.deserialize_ros1 if ros1 else store.deserialize_cdr
-    messages: dict[str, _Messages] = {}
+    messages: dict[str, Messages] = {}
+    n_times = 3  # numbers beside the values of a message: seconds and nanoseconds of its stamp, its arrival
     allowance = request.allowance()
     odd = [file.name for file in path.iterdir() if not (is_regular(file) or file.is_dir())] if path.is_dir() else []
     if odd:
         raise RecordingError(
             f"{path}: expected the files of a bag, found {enumerated(odd)}, which is no file; remove it"
         )
-    try:
+    remedy = "repair it with `rosbag reindex`, `ros2 bag reindex` or `mcap recover`, or record it again"
+    with reading(path, "an indexed ROS 1 or ROS 2 bag", remedy):
         for file in sorted(path.glob("*.db3")) if path.is_dir() else [path] if path.suffix.lower() == ".db3" else []:
             _check_tables(file)
         with (Ros1Reader if ros1 else Ros2Reader)(path) as bag:
@@ -107,23 +80,16 @@ def read(request: Request) -> list[Stream]:
                     continue
                 message: Any = deserialize(raw, kind)
                 if topic not in messages:
-                    named = _named(topic, message.header.frame_id) if kind == _VECTOR else set()
-                    if kind == _VECTOR and not named:
+                    named = _named(topic, message.header.frame_id) if kind == VECTOR else set()
+                    if kind == VECTOR and not named:
                         passed.add(topic)
                         continue
-                    messages[topic] = _Messages(kind, measured=named)
+                    messages[topic] = Messages(kind, measured=named)
                 known = messages[topic]
                 if kind != known.kind:
                     raise ValueError(f"messages of two types in {topic}: {kind} and {known.kind}")
                 known.append(message, arrival)
-                allowance.take(f"messages of {topic}", (known.width_with_times + len(message.header.frame_id) // 8,))
-    except RecordingError:
-        raise
-    except Exception as error:  # a damaged bag may fail anywhere in the library
-        raise RecordingError(
-            f"{path}: expected an indexed ROS 1 or ROS 2 bag, found one that cannot be read ({cause(error)}); "
-            "repair it with `rosbag reindex`, `ros2 bag reindex` or `mcap recover`, or record it again"
-        ) from error
+                allowance.take(f"messages of {topic}", (known.width + n_times + len(message.header.frame_id) // 8,))
 
     devices, notes = _devices(messages, topics, key, quantity)
     if not devices:
@@ -149,7 +115,7 @@ def _check_tables(path: Path) -> None:
 
 def _choose(path: Path, kinds: list[tuple[str, str]], key: str | None) -> set[str]:
     """Return the topics of Imu or vectors that `key` names or begins, all of them without `key`."""
-    topics = {topic for topic, kind in kinds if kind in (_IMU, _VECTOR)}
+    topics = {topic for topic, kind in kinds if kind in (IMU, VECTOR)}
     if key is not None:
         name = "/" + key.strip("/")
         topics = topics & {name} or {topic for topic in topics if topic.startswith(name)}
@@ -157,16 +123,16 @@ def _choose(path: Path, kinds: list[tuple[str, str]], key: str | None) -> set[st
         found = enumerated(f"{topic} ({kind})" for topic, kind in sorted(kinds)) or "no topic"
         wanted = "" if key is None else f" named by `key` {key!r}"
         raise RecordingError(
-            f"{path}: expected a topic of type {_IMU}{wanted}, found {found}; choose a bag with IMU data"
+            f"{path}: expected a topic of type {IMU}{wanted}, found {found}; choose a bag with IMU data"
         )
     return topics
 
 
 def _is_read(topic: str, kind: str, topics: set[str], key: str | None) -> bool:
     """Whether a topic is a device that was asked for or may be a channel of one."""
-    if kind not in _VALUES:
+    if kind not in VALUES:
         return False
-    if key is None or topic in topics or kind in _CHANNELS:
+    if key is None or topic in topics or kind in CHANNEL_TYPES:
         return True
     return any(_alike(topic, other) for other in topics)
 
@@ -186,16 +152,8 @@ def _named(topic: str, frame: str) -> set[Quantity]:
     return set()
 
 
-def _unit(topic: str, kind: str, quantity: Quantity) -> tuple[str, list[str]]:
-    """The unit of a topic's rates or accelerations, and a note where it is not the SI unit."""
-    unit = _VECTOR_UNITS.get(topic.rpartition("/")[2]) if kind == _VECTOR else None
-    if unit is None:
-        return quantity.unit, []
-    return unit, [f"{topic} is read in {unit}, as multisense_ros publishes it"]
-
-
 def _devices(
-    messages: dict[str, _Messages], topics: set[str], key: str | None, quantity: Quantity
+    messages: dict[str, Messages], topics: set[str], key: str | None, quantity: Quantity
 ) -> tuple[list[str], list[str]]:
     """The topics with the quantity among the topics asked for, and notes on the others."""
     notes = []
@@ -203,8 +161,8 @@ def _devices(
     zero = [topic for topic in there if quantity in messages[topic].measured and not messages[topic].has(quantity)]
     if zero:
         notes.append(f"{quantity.in_words} exactly zero throughout in {enumerated(zero)}: no {quantity.sensor}")
-    imus = [topic for topic in there if messages[topic].kind == _IMU and messages[topic].has(quantity)]
-    vectors = [topic for topic in there if messages[topic].kind == _VECTOR and messages[topic].has(quantity)]
+    imus = [topic for topic in there if messages[topic].kind == IMU and messages[topic].has(quantity)]
+    vectors = [topic for topic in there if messages[topic].kind == VECTOR and messages[topic].has(quantity)]
     if not imus or (key is not None and "/" + key.strip("/") in vectors):
         return vectors, notes
     if vectors:
@@ -215,127 +173,15 @@ def _devices(
 
 
 def _owned(
-    messages: dict[str, _Messages], devices: list[str], quantity: Quantity
-) -> dict[str, list[tuple[str, str, str, _Messages]]]:
+    messages: dict[str, Messages], devices: list[str], quantity: Quantity
+) -> dict[str, list[tuple[str, str, str, Messages]]]:
     """For each device the channels of other topics: name, unit, topic and messages."""
-    owned: dict[str, list[tuple[str, str, str, _Messages]]] = {topic: [] for topic in devices}
+    owned: dict[str, list[tuple[str, str, str, Messages]]] = {topic: [] for topic in devices}
     beside = quantity.other
     for topic, other in sorted(messages.items()):
-        if topic in owned or (other.kind not in _CHANNELS and (other.has(quantity) or not other.has(beside))):
+        if topic in owned or (other.kind not in CHANNEL_TYPES and (other.has(quantity) or not other.has(beside))):
             continue
-        name, unit = _CHANNELS.get(other.kind) or (beside.channel, _unit(topic, other.kind, beside)[0])
+        name, unit = CHANNEL_TYPES.get(other.kind) or (beside.channel, unit_of(topic, other.kind, beside)[0])
         owner = max(devices, key=lambda device: _alike(device, topic))  # the first of several with as many
         owned[owner].append((name, unit, topic, other))
     return owned
-
-
-def _xyz(vector: Any) -> tuple[float, float, float]:
-    return vector.x, vector.y, vector.z
-
-
-@dataclass
-class _Messages:
-    """The messages of one topic, packed: a long bag holds millions."""
-
-    kind: str
-    stamp: array[int] = field(default_factory=lambda: array("q"))  # sec, nanosec
-    arrival: array[int] = field(default_factory=lambda: array("q"))  # nanoseconds
-    values: array[float] = field(default_factory=lambda: array("d"))
-    frames: dict[str, None] = field(default_factory=dict)
-    width: int = 0  # values of a message
-    measured: set[Quantity] = field(default_factory=set)  # quantities of which the values may be
-
-    def append(self, message: Any, arrival: int) -> None:
-        """Add one deserialised message and its time of arrival at the recorder in nanoseconds."""
-        stamp, values = message.header.stamp, _VALUES[self.kind](message)
-        self.stamp.extend((stamp.sec, stamp.nanosec))
-        self.arrival.append(arrival)
-        self.values.extend(values)
-        self.width = len(values)
-        self.frames[message.header.frame_id] = None
-        if self.kind == _IMU:
-            # By the message's definition a covariance that begins with -1 says that the quantity is not measured.
-            if message.angular_velocity_covariance[0] != -1:
-                self.measured.add(RATE)
-            if message.linear_acceleration_covariance[0] != -1:
-                self.measured.add(ACCELERATION)
-
-    @property
-    def width_with_times(self) -> int:
-        """Numbers that are stored of a message: its values, seconds and nanoseconds of its stamp, its arrival."""
-        return self.width + 3
-
-    @property
-    def table(self) -> Array:
-        """The values `(value, message)` as they were packed, not copied."""
-        return np.frombuffer(self.values, np.float64).reshape(-1, self.width).T
-
-    def of(self, quantity: Quantity) -> Array:
-        """The rates or accelerations of an Imu or a vector, `(3, message)`, not copied."""
-        if self.kind != _IMU:
-            return self.table
-        return self.table[:3] if quantity is RATE else self.table[3:]
-
-    def has(self, quantity: Quantity) -> bool:
-        """Whether there are rates or accelerations, and not zeros in their place."""
-        return quantity in self.measured and bool(np.any(self.of(quantity) != 0))
-
-    def stream(
-        self, topic: str, quantity: Quantity, others: list[tuple[str, str, str, _Messages]], said: list[str]
-    ) -> Stream:
-        """The device of this topic, with the channels that others hold."""
-        time, notes = self._time()
-        frames = enumerated(repr(frame) for frame in self.frames if frame)
-        channels, units = {}, {}
-        unit, guess = _unit(topic, self.kind, quantity)
-        notes += guess
-        beside = quantity.other
-        if self.has(beside):
-            channels[beside.channel], units[beside.channel] = self.of(beside).copy(), beside.unit
-        elif beside in self.measured:
-            notes.append(f"{beside.in_words} exactly zero throughout: none measured")
-        for name, own_unit, source, other in others:
-            if name in channels:
-                notes.append(f"{name} of {source} is left out beside that of another topic")
-                continue
-            times, by = self._common_clock(other)
-            values = other.table if other.kind in _CHANNELS else other.of(beside)
-            channels[name], note = at_samples(*times, values if len(values) > 1 else values[0], name)
-            units[name] = own_unit
-            notes += _unit(source, other.kind, beside)[1]
-            notes.append(f"{name} is that of {source}{by}" + (f"; {note}" if note else ""))
-        return Stream(
-            name=topic,
-            signal=dict(zip(AXES, self.of(quantity).copy(), strict=True)),
-            unit=unit,
-            time=time,
-            channels=channels,
-            channel_units=units,
-            notes=(*([f"frame_id {frames}"] if frames else []), *notes, *said),
-        )
-
-    def _common_clock(self, other: _Messages) -> tuple[tuple[Array, Array], str]:
-        """Times of the messages of two topics: of their headers where one clock stamps both, or else of arrival."""
-        own, others = self._stamps(), other._stamps()
-        overlap = own.max() >= others.min() and others.max() >= own.min()
-        if self._is_stamped(own) and self._is_stamped(others) and overlap:
-            return (own, others), ""
-        return (self._arrivals(), other._arrivals()), ", by arrival at the recorder"
-
-    def _time(self) -> tuple[Array, list[str]]:
-        stamp = self._stamps()
-        if self._is_stamped(stamp):
-            return stamp, []
-        return self._arrivals(), ["the header stamps do not advance; time is that of arrival at the recorder"]
-
-    @staticmethod
-    def _is_stamped(stamp: Array) -> bool:
-        return bool(np.any(stamp != stamp[0]) or (stamp.size == 1 and stamp[0] != 0))
-
-    def _stamps(self) -> Array:
-        seconds, nanoseconds = np.array(self.stamp).reshape(-1, 2).T
-        return np.asarray(seconds + nanoseconds * 1e-9)
-
-    def _arrivals(self) -> Array:
-        whole, rest = np.divmod(np.array(self.arrival), 10**9)
-        return np.asarray(whole + rest * 1e-9)

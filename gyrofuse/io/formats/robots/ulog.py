@@ -31,7 +31,7 @@ from gyrofuse.io.formats.robots.ulog_fifo import (
 )
 from gyrofuse.io.limits import enumerated
 from gyrofuse.io.quantities import ACCELERATION, Quantity
-from gyrofuse.io.streams import Array, RecordingError, Stream, cause
+from gyrofuse.io.streams import Array, RecordingError, Stream, needed, reading
 
 _COMBINED = "sensor_combined"
 _KEY = re.compile(r"([a-z_]{1,32})(?:\[(\d{1,3})\])?")
@@ -66,24 +66,17 @@ def read(request: Request) -> list[Stream]:
         ImportError: pyulog is not installed.
     """
     path, key = request.path, request.key
-    try:
+    with needed(path, "ULog", "pyulog"):
         from pyulog import ULog
-    except ImportError as error:
-        raise ImportError(f'{path}: reading ULog needs pyulog; pip install "gyrofuse[logs]"') from error
-    try:
-        # pyulog reports damage with print(), and in `file_corruption`
-        with path.open("rb", buffering=0) as raw, contextlib.redirect_stdout(io.StringIO()):
-            size = path.stat().st_size
-            allowance = request.allowance()
-            allowance.take("messages", (-(-size // 8),))
-            log = _bounded(ULog)(_Counted(raw, size))
-    except RecordingError:
-        raise
-    except Exception as error:  # a damaged file may fail anywhere in the library
-        raise RecordingError(
-            f"{path}: expected a PX4 ULog file, found one that cannot be parsed ({cause(error)}); "
-            "download the log from the vehicle again"
-        ) from error
+    with (
+        reading(path, "a PX4 ULog file", "download the log from the vehicle again"),
+        path.open("rb", buffering=0) as raw,
+        contextlib.redirect_stdout(io.StringIO()),  # pyulog prints damage, which is in `file_corruption` as well
+    ):
+        size = path.stat().st_size
+        allowance = request.allowance()
+        allowance.take("messages", (-(-size // 8),))
+        log = _bounded(ULog)(_Counted(raw, size))
 
     topics = TOPICS[request.quantity]
     instances = _instances(log, topics)
