@@ -29,7 +29,7 @@ _MEMORY = 1024
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Where the samples of one device lie on a uniform grid of its own.
+    """Positions of the samples of one device on a uniform grid of its own.
 
     Attributes:
         start: Clock reading at slot 0, seconds.

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Quantity:
-    """What differs between angular rates and accelerations.
+    """Angular rate or acceleration, with its names in logs and in messages.
 
     Attributes:
         name: `"rate"` or `"acceleration"`, as arguments and the kinds of columns have it.

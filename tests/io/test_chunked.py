@@ -22,6 +22,7 @@ from torch import distributed
 
 import gyrofuse as gf
 from gyrofuse.fusion.streaming import measure_stretch
+from gyrofuse.io import chunked, recording
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "long_recording.py"
 N_SENSORS, N_SAMPLES, N_LEVELS = 4, 5000, 7
@@ -460,3 +461,15 @@ def test_a_file_appears_whole_or_not_at_all(tmp_path: Path):
         gf.write_virtual(recording, torch.ones(4).double() / 4, path, chunk_samples=500, force=True)
     assert np.load(path).tolist() == [0, 1, 2]
     assert [entry.name for entry in tmp_path.iterdir()] == ["virtual.npy"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [("LongRecording", "ChunkedRecording"), ("open_long", "open_recording"), ("stretch_of", "shard_bounds")],
+)
+def test_old_names_work_with_a_warning(old, new):
+    for module in (gf, chunked):
+        with pytest.warns(DeprecationWarning, match=rf"{old} is deprecated .*; use gyrofuse\.io\.chunked\.{new}$"):
+            assert getattr(module, old) is getattr(chunked, new)
+    with pytest.warns(DeprecationWarning, match=r"use gyrofuse\.io\.reading\.read_recording$"):
+        assert recording.read_recording is gf.read_recording

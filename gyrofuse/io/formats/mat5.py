@@ -1,7 +1,7 @@
 """Elements of a MATLAB file of version 5, checked before SciPy reads them.
 
 SciPy descends into cells and structs on the stack of the C language, and allocates the dimensions that a variable
-announces before it looks whether the file has its numbers: a file of a few kB can end the process. Here the elements
+announces before it has found its numbers in the file: a file of a few kB can end the process. Here the elements
 are followed as SciPy follows them, by the number of entries that each announces.
 
 Reference: MAT-File Format, The MathWorks, chapter 1 (level 5).
