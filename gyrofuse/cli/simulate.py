@@ -17,8 +17,8 @@ from gyrofuse.cli.console import progress, say
 from gyrofuse.cli.options import Quantity, Writing, takes_options
 from gyrofuse.cli.reading import agreed_rate, agreed_unit, read_model
 from gyrofuse.fusion.report.page import recording_report
-from gyrofuse.io.quantities import QUANTITY
 from gyrofuse.io.limits import physical_memory
+from gyrofuse.io.quantities import QUANTITY
 from gyrofuse.io.recording import Recording
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.parsing import parse_model

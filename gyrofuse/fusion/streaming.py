@@ -22,7 +22,7 @@ from gyrofuse.fusion.weights.svo import (
     optimal_weights,
     resolve_scale_weights,
 )
-from gyrofuse.io.chunked import ChunkedRecording, Progress, check_chunked_recording, silent, shard_bounds
+from gyrofuse.io.chunked import ChunkedRecording, Progress, check_chunked_recording, shard_bounds, silent
 from gyrofuse.wavelets.metric import WaveletCrossCovariance
 
 if TYPE_CHECKING:
