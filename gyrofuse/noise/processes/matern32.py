@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
-from torch.func import jvp
 from torch.nn.functional import softplus
 
 from gyrofuse._base import units
@@ -100,30 +99,32 @@ class Matern32(Process):
 
     @classmethod
     def unit_band_variance(cls, bands: DCTBands, x: Tensor | None) -> BandVariance:
-        """Exact value; derivatives by forward differentiation.
+        """Exact value and slope; the curvature is that of a process without ends.
 
-        As the autocovariance is `(1 + a phi d/dphi) phi^k`, so is the variance of an ordinate that operator on the
-        one of `AR1` in its stationary form, `(1 - phi^2)/D - (4 c^2/T) E`, `E = phi (1 - phi)^2 (1 -+ phi^T) / D^2`.
+        As the autocovariance is `(1 + a phi d/dphi) phi^k`, so is the variance of an ordinate that operator on the one
+        of a stationary `AR1` of variance 1, `(1 - phi^2) / D - (4 c^2 / T) K`, with `K = A (1 -+ phi^T)`, `-` for even
+        and `+` for odd `k`, and `A = sinh(a/2)^2 / (4 (sinh(a/2)^2 + s^2)^2)`. As `a l^2 phi^l` is what the
+        autocovariance loses with `a`, its derivative is `-a` times the second derivative of that with respect to `a`.
         """
         assert x is not None
-
-        def value(x: Tensor) -> Tensor:
-            decay = softplus(-2 * x)[:, None, None]
-            phi, loss = torch.exp(-decay), -torch.expm1(-decay)
-            d, d_slope = loss.square() + 4 * phi * bands.sine, 4 * bands.sine - 2 * loss
-            mirrored = bands.sign * torch.exp(-decay * bands.n_samples)
-            end = phi * loss.square() * (1 - mirrored)
-            # phi times the derivative of `end`
-            end_slope = phi * loss * (1 - 3 * phi) * (1 - mirrored) - phi * loss.square() * bands.n_samples * mirrored
-            ends = end + decay * (end_slope - 2 * phi * end * d_slope / d)
-            return bands.mean_of(_density(decay, bands.sine) - bands.ends * ends / d.square())
-
-        def slope(x: Tensor) -> tuple[Tensor, Tensor]:
-            found, moved = jvp(value, (x,), (torch.ones_like(x),))
-            return moved, found
-
-        moved, curvature, found = jvp(slope, (x,), (torch.ones_like(x),), has_aux=True)
-        return BandVariance(found, moved, curvature)
+        decay = softplus(-2 * x)[:, None, None]
+        phi, loss, sine, n = torch.exp(-decay), -torch.expm1(-decay), bands.sine, bands.n_samples
+        half, sinh = loss.square() / (4 * phi), loss * (1 + phi) / (2 * phi)  # sinh(a/2)^2, sinh a
+        cosh, total = 1 + 2 * half, half + sine
+        bend = sine * (3 - 2 * sine) - (1 - 2 * sine) * half
+        loss_rate = sinh * bend / (4 * total**3)  # minus the second derivative of (1 - phi^2) / D
+        loss_slope = (cosh * bend - sinh**2 * (1 - 2 * sine) / 2) / (4 * total**3) - 3 * sinh**2 * bend / (8 * total**4)
+        # A and 1 -+ phi^T, each with its first two derivatives with respect to ln phi
+        a = half / (4 * total**2), -sinh * (sine - half) / (8 * total**3)
+        a_second = cosh * (sine - half) / (8 * total**3) + sinh**2 * (half - 2 * sine) / (8 * total**4)
+        fading = bands.sign * torch.exp(-decay * n)
+        first = a[1] * (1 - fading) - a[0] * n * fading
+        second = a_second * (1 - fading) - 2 * a[1] * n * fading - a[0] * n**2 * fading
+        value = _density(decay, sine) - bands.ends * (a[0] * (1 - fading) + decay * first)
+        slope = decay * (loss_rate + bands.ends * second)
+        moved, moved_slope = -2 * loss, 4 * phi * loss  # da / dx and its derivative
+        curvature = (loss_rate + decay * loss_slope) * moved**2 + slope * moved_slope
+        return BandVariance(bands.mean_of(value), bands.mean_of(slope * moved), bands.mean_of(curvature))
 
     @staticmethod
     def _path(n_samples: int, shape: torch.Size, generator: torch.Generator, phi: Tensor, variance: Tensor) -> Tensor:
