@@ -17,7 +17,17 @@ from gyrofuse.export.c_header import to_c_header
 from gyrofuse.export.kalibr import to_kalibr
 from gyrofuse.fitting.gmwm import fit_gmwm
 from gyrofuse.io.recording import Recording
-from gyrofuse.noise.processes import AR1, Drift, Model, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
+from gyrofuse.noise.processes import (
+    AR1,
+    Drift,
+    FlickerNoise,
+    Matern32,
+    Model,
+    QuantizationNoise,
+    RandomWalk,
+    Sinusoid,
+    WhiteNoise,
+)
 from gyrofuse.noise.state_space import StateSpace, state_space
 
 # Every process with its mean at t = 1, 2, .. and its autocovariance at s, t.
@@ -27,6 +37,11 @@ CATALOGUE = {
     "quantization_noise": (QuantizationNoise(0.3), ZERO, lambda s, t: 0.3 * (2.0 * (s == t) - (abs(s - t) == 1))),
     "ar1": (AR1(0.97, 0.02), ZERO, lambda s, t: 0.02 / (1 - 0.97**2) * 0.97 ** abs(s - t)),
     "ar1_negative": (AR1(-0.6, 0.2), ZERO, lambda s, t: 0.2 / 0.64 * (-0.6) ** abs(s - t)),
+    "matern32": (
+        Matern32(0.97, 0.02),
+        ZERO,
+        lambda s, t: 0.02 * (1 - math.log(0.97) * abs(s - t)) * 0.97 ** abs(s - t),
+    ),
     "drift": (Drift(-0.02), lambda t: -0.02 * t, lambda s, t: 0.0 * s * t),
     "random_walk": (RandomWalk(0.04), ZERO, lambda s, t: 0.04 * np.minimum(s, t)),
     "sinusoid": (Sinusoid(0.85, 0.35), ZERO, lambda s, t: 0.85**2 / 2 * np.cos(0.35 * (s - t))),
@@ -317,6 +332,26 @@ def test_what_kalibr_gets_for_an_autoregression_is_no_less_noise(phi):
     true = AR1(phi, 1.0).wavelet_variance(30)
     assert (WhiteNoise(1 / (1 - phi) ** 2).wavelet_variance(30) >= true * (1 - 1e-12)).all()
     assert (RandomWalk(1.0).wavelet_variance(30) >= true * phi * (1 - 1e-12)).all()
+
+
+@pytest.mark.parametrize("phi", [0.1, 0.9, 0.99, 0.9999])
+def test_what_kalibr_gets_for_a_second_order_process_is_no_less_noise(phi):
+    process, f = Matern32(phi, 0.3), torch.linspace(1e-6, 0.5, 20001, dtype=torch.float64)
+    slow = process._white_and_walk(100.0, 1e-9, **process.values)
+    fast = process._white_and_walk(100.0, 1e9, **process.values)
+    assert "below a random walk" in slow.fate
+    assert "density at frequency 0" in fast.fate
+    assert (process.spectrum(f) <= RandomWalk(slow.walk).spectrum(f) * (1 + 1e-9)).all()
+    assert (process.spectrum(f) <= WhiteNoise(fast.white).spectrum(f) * (1 + 1e-9)).all()
+
+
+def test_kalibr_gets_a_random_walk_for_flicker_noise():
+    process = FlickerNoise(0.3)
+    walk = process._white_and_walk(64.0, 2.0, **process.values).walk
+    # 128 samples are 2 s, level 8
+    expected = RandomWalk(walk).wavelet_variance(8)[-1].item()
+    assert process.wavelet_variance(8)[-1].item() == pytest.approx(expected, rel=1e-3)
+    assert "its Allan deviation at 2 s" in to_kalibr(process + WhiteNoise(1.0), 64.0, "rad/s", slow=2.0)
 
 
 def test_kalibr_says_what_it_leaves_out():

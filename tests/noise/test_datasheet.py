@@ -9,7 +9,16 @@ import pytest
 import torch
 
 from gyrofuse.noise.datasheet import datasheet
-from gyrofuse.noise.processes import AR1, Drift, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
+from gyrofuse.noise.processes import (
+    AR1,
+    Drift,
+    FlickerNoise,
+    Matern32,
+    QuantizationNoise,
+    RandomWalk,
+    Sinusoid,
+    WhiteNoise,
+)
 
 
 def values(sheet) -> dict[tuple[str, str], float]:
@@ -44,6 +53,23 @@ def test_bias_instability_is_the_floor_of_the_allan_deviation():
     got = values(datasheet(WhiteNoise(1.0) + RandomWalk(3 * 4.0**-10), 10.0, "deg/s"))
     assert got["bias instability B", "deg/h"] == pytest.approx(3600 * math.sqrt(2 * 2**-10) / 0.66428, rel=1e-5)
     assert got["bias instability reached at", "s"] == pytest.approx(102.4)
+
+
+def test_flicker_noise_is_the_bias_instability():
+    got = values(datasheet(WhiteNoise(1.0) + FlickerNoise(0.01**2) + RandomWalk(1e-12), 10.0, "deg/s"))
+    assert got["bias instability B", "deg/h"] == pytest.approx(36.0)
+    assert ("bias instability reached at", "s") not in got
+    floor = (2 * FlickerNoise(0.01**2).wavelet_variance(30)[-1]).sqrt().item()
+    assert floor == pytest.approx(0.01 * math.sqrt(2 * math.log(2) / math.pi))
+
+
+def test_second_order_process_by_hand():
+    got = values(datasheet(WhiteNoise(1.0) + Matern32(math.exp(-1 / 5000), 1e-4), 100.0, "deg/s"))
+    assert got["2nd-order Gauss-Markov time", "s"] == pytest.approx(50.0)
+    assert got["2nd-order Gauss-Markov sigma", "deg/h"] == pytest.approx(36.0)
+    quick = datasheet(Matern32(math.exp(-1 / 50), 1e-4), 100.0, "deg/s")
+    density = 2 / 50 * 1e-4 * 50**2 * 2 / 100  # 4 s2 time constant, in samples, over the rate
+    assert values(quick)["angle random walk N of GM2s", "deg/s/sqrt(Hz)"] == pytest.approx(density**0.5, rel=1e-3)
 
 
 def test_a_dip_that_is_undercut_later_is_no_floor():

@@ -15,6 +15,8 @@ from gyrofuse.noise.parsing import model_from_dict, parse_model
 from gyrofuse.noise.processes import (
     AR1,
     Drift,
+    FlickerNoise,
+    Matern32,
     Model,
     Process,
     QuantizationNoise,
@@ -34,6 +36,11 @@ CATALOGUE = [
     ),
     pytest.param(AR1(0.9, 0.5), lambda s, t: 0.5 / (1 - 0.81) * 0.9 ** abs(s - t), id="ar1"),
     pytest.param(AR1(-0.6, 2.0), lambda s, t: 2 / 0.64 * (-0.6) ** abs(s - t), id="ar1_negative"),
+    pytest.param(
+        Matern32(0.9, 0.5), lambda s, t: 0.5 * (1 - math.log(0.9) * abs(s - t)) * 0.9 ** abs(s - t), id="matern32"
+    ),
+    # Its second moments but for a constant, which no wavelet sees.
+    pytest.param(FlickerNoise(0.4), lambda s, t: -0.8 / math.pi * naive.odd_harmonic(abs(s - t)), id="flicker_noise"),
     pytest.param(Drift(-0.02), lambda s, t: 4e-4 * s * t, id="drift"),
     pytest.param(RandomWalk(0.04), lambda s, t: 0.04 * np.minimum(s, t), id="random_walk"),
     pytest.param(Sinusoid(0.85, 0.35), lambda s, t: 0.85**2 / 2 * np.cos(0.35 * (s - t)), id="sinusoid"),
@@ -128,7 +135,7 @@ def test_kernel_takes_damped_oscillations(z):
 # --- spectrum ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("process", [m for m in MEMBERS if m.id != "drift"])
+@pytest.mark.parametrize("process", [m for m in MEMBERS if m.id not in ("drift", "flicker_noise")])
 def test_spectrum_and_lines_through_the_gain_give_the_wavelet_variance(process):
     n = 4096
     f = (np.arange(n) + 0.5) / n - 0.5  # the midpoint rule is exact to rounding for smooth periodic functions
@@ -141,7 +148,7 @@ def test_spectrum_and_lines_through_the_gain_give_the_wavelet_variance(process):
 
 @pytest.mark.parametrize(
     ("process", "variance"),
-    [(WhiteNoise(0.7), 0.7), (QuantizationNoise(0.3), 0.6), (AR1(0.9, 0.5), 0.5 / 0.19)],
+    [(WhiteNoise(0.7), 0.7), (QuantizationNoise(0.3), 0.6), (AR1(0.9, 0.5), 0.5 / 0.19), (Matern32(0.9, 0.5), 0.5)],
 )
 def test_spectrum_integrates_to_the_variance(process, variance):
     f = (torch.arange(4096, dtype=torch.float64) + 0.5) / 4096 - 0.5
@@ -241,6 +248,7 @@ def test_number_of_levels_is_checked(process):
         (QuantizationNoise, {"variance": math.nan}, "`variance` of QuantizationNoise.*got nan"),
         (AR1, {"phi": 1.0}, "`phi` of AR1: expected a number strictly between -1 and 1, got 1"),
         (AR1, {"phi": torch.tensor([0.5, -1.5])}, "`phi` of AR1.*got -1.5"),
+        (Matern32, {"phi": -0.5}, "`phi` of Matern32: expected a number strictly between 0 and 1, got -0.5"),
         (Drift, {"slope": math.inf}, "`slope` of Drift: expected a finite number"),
         (Sinusoid, {"amplitude": -0.1}, "`amplitude` of Sinusoid"),
         (Sinusoid, {"beta": 0.0}, r"`beta` of Sinusoid: expected a number in \(0, pi\], got 0"),
@@ -300,6 +308,11 @@ def test_parameter_names_number_what_may_repeat():
         "sinusoid_1.amplitude",
         "sinusoid_1.beta",
     )
+    assert (Matern32() + FlickerNoise()).param_names == (
+        "matern32_1.phi",
+        "matern32_1.variance",
+        "flicker_noise.variance",
+    )
     assert AR1().param_names == ("ar1_1.phi", "ar1_1.variance")
     assert str(2 * AR1() + WhiteNoise()) == "AR1() + AR1() + WhiteNoise()"
     assert str(AR1() * 2) == str(sum([AR1(), AR1()])) == "AR1() + AR1()"
@@ -317,7 +330,7 @@ def test_with_params_takes_a_batch_of_estimates():
         model.with_params(params[:, :2])
 
 
-@pytest.mark.parametrize("kind", [WhiteNoise, QuantizationNoise, RandomWalk, Drift])
+@pytest.mark.parametrize("kind", [WhiteNoise, QuantizationNoise, FlickerNoise, RandomWalk, Drift])
 def test_copies_that_cannot_be_told_apart_are_refused(kind):
     with pytest.raises(ValueError, match=f"{kind.__name__} appears more than once.*use one {kind.__name__}"):
         2 * kind()

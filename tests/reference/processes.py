@@ -49,6 +49,13 @@ def exact_ar1_wavelet_variance(phi: float, level: int) -> float:
     return float(numerator / (tau**2 * (1 - z) ** 2 * (1 - z**2)))
 
 
+def odd_harmonic(n: Array) -> Array:
+    """`sum_{m=1}^n 1 / (2m - 1)`, term by term."""
+    n = np.asarray(n)
+    sums = np.concatenate([[0.0], np.cumsum(1 / (2.0 * np.arange(1, n.max() + 1) - 1))])
+    return sums[n.astype(int)]
+
+
 def squared_gain(level: int, f: Array) -> Array:
     """`|H_j(f)|^2 = 4 sin^4(pi f tau/2) / (tau^2 sin^2(pi f))`."""
     tau = 2**level
