@@ -151,7 +151,7 @@ def test_every_column_of_a_table_is_described(tmp_path, task):
         assert told["tau"].endswith(", s")
     if task.name == "diagnose":
         assert told["gain"].endswith(", nats")
-    assert "the sensor lacks that lacks most" in told["missing"]
+    assert "largest fraction of missing samples" in told["missing"]
 
 
 def test_a_table_grows_and_new_rows_replace_old_ones(tmp_path):
@@ -205,7 +205,7 @@ def test_a_part_that_was_cut_short_is_done_again(tmp_path):
 
 
 def test_large_tables_are_written_in_pieces(tmp_path, monkeypatch):
-    monkeypatch.setattr("gyrofuse.fleet.store.table._MOST_LOGS", 3)
+    monkeypatch.setattr("gyrofuse.fleet.store.table._MAX_LOGS", 3)
     store = store_at(tmp_path / "r.parquet")
     store.open()
     logs = [f"{i:02d}" for i in range(10)]

@@ -126,7 +126,7 @@ def test_a_table_without_all_rows_is_told(store):
 
 
 def test_a_damaged_table_is_told_kept_and_mended(tmp_path, monkeypatch):
-    monkeypatch.setattr("gyrofuse.fleet.store.table._MOST_LOGS", 2)
+    monkeypatch.setattr("gyrofuse.fleet.store.table._MAX_LOGS", 2)
     store = store_at(tmp_path / "r.parquet")
 
     def fill(logs) -> None:

@@ -1,10 +1,11 @@
-"""What stands out in a fleet, and the page that tells it."""
+"""The summary of a fleet, and its page."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
+from gyrofuse.fleet import summary as fleet_summary
 from gyrofuse.fleet.report import fleet_report
 from gyrofuse.fleet.summary import mean_gain, summarise
 
@@ -179,3 +180,24 @@ def test_pages_of_fits_and_diagnoses():
     page = fleet_report(summary, found, title="Diagnoses")
     assert "a tone at 12.5 Hz; unexplained: jumps" in page
     assert "agrees" in page
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("Standing", "FleetSummary"),
+        ("Drift", "WeightTrend"),
+        ("Doubt", "WeightWarning"),
+        ("standing_of", "summarise"),
+    ],
+)
+def test_old_names_work_with_a_warning(old: str, new: str):
+    with pytest.warns(DeprecationWarning, match=rf"gyrofuse.fleet.summary.{old} is deprecated .* use .*{new}"):
+        assert getattr(fleet_summary, old) is getattr(fleet_summary, new)
+
+
+def test_old_attributes_work_with_a_warning():
+    found = summarise("fuse", fused(3))
+    for old, new in (("drifts", "trends"), ("doubts", "weight_warnings"), ("n_doubted", "n_warned")):
+        with pytest.warns(DeprecationWarning, match=f"FleetSummary.{old} is deprecated"):
+            assert getattr(found, old) == getattr(found, new)

@@ -39,6 +39,8 @@ COMMON = {
     "warnings": Column("texts", "what the task warned of"),
 }
 _SETTINGS = b"gyrofuse"
+# Most logs in a table that is written at once, a row group of the file: a damaged page costs no more than these.
+_MAX_LOGS = 1000
 
 
 def read_results(path: str | Path, *, without: Sequence[str] = ()) -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -168,7 +170,6 @@ def in_order(
     table: Path,
     *,
     max_open: int = 4,
-    max_logs: int = 1000,
     max_bytes: int = 2**26,
 ) -> Iterator[pyarrow.Table]:
     """Rows of logs in their order, in tables of a size that does not depend on the files that they come from.
@@ -179,7 +180,6 @@ def in_order(
         schema: Schema of the rows.
         table: The one file that is not named after a digest of its content.
         max_open: Files kept in memory; logs in order are mostly in one file, or in those of as many processes.
-        max_logs: Logs in a table, a row group of the file, which readers take at a time.
         max_bytes: Size of a table, 64 MiB, which bounds the memory of writer and reader.
 
     Raises:
@@ -205,7 +205,7 @@ def in_order(
         rows = own.take(places[log])
         kept.append(rows)
         n_bytes += rows.nbytes
-        if len(kept) > max_logs or n_bytes > max_bytes:
+        if len(kept) > _MAX_LOGS or n_bytes > max_bytes:
             yield pa.concat_tables(kept).combine_chunks()
             kept, n_bytes = [schema.empty_table()], 0
     if len(kept) > 1:
