@@ -61,21 +61,27 @@ def test_every_format_gives_the_same_virtual_gyro(run: Run, tmp_path: Path):
         np.testing.assert_allclose(weights, expected, rtol=1e-5, err_msg=name)  # the ULog holds float32
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["xsensdot10_static.npz"],
+BOARD = ["mimu4444_8imu.npz", "--key", "exp1", "--axis", "x", "--mounting", "mounting.json", "--rest", "0:20"]
+
+
+@pytest.mark.parametrize("arguments", [["xsensdot10_static.npz"], BOARD], ids=["units", "board"])
+def test_arrays_are_fused(run: Run, tmp_path: Path, data: Path, arguments: list[str]):
+    check_fused(run, tmp_path, data, arguments)
+
+
+def test_real_logs(run: Run, tmp_path: Path, shared: Path, subtests: pytest.Subtests):
+    for arguments in (
         ["xsensdot4_quadrotor.npz", "--axis", "z"],
-        ["mimu4444_8imu.npz", "--key", "exp1", "--axis", "x", "--mounting", "mounting.json", "--rest", "0:20"],
         ["raw/xsens_dot1_flight.csv", "raw/xsens_dot2_flight.csv", "--axis", "z"],
-    ],
-)
-def test_real_logs(run: Run, tmp_path: Path, shared: Path, arguments: list[str]):
+    ):
+        with subtests.test(log=arguments[0]):
+            check_fused(run, tmp_path, shared / "data", [*arguments, "--force"])
+
+
+def check_fused(run: Run, tmp_path: Path, data: Path, arguments: list[str]) -> None:
     back = [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]
     (tmp_path / "mounting.json").write_text(json.dumps({str(i): back for i in (2, 4, 6, 8)}))
-    files = [
-        str(shared / "data" / a) if a.endswith((".npz", ".csv", ".ulg", ".mat", ".hdf5")) else a for a in arguments
-    ]
+    files = [str(data / a) if a.endswith((".npz", ".csv")) else a for a in arguments]
     done = run("fuse", *files, "--json", "result.json", "--out", "virtual.npz")
     assert done.status == 0, done.err
     weights = np.array(json.loads((tmp_path / "result.json").read_text())["weights"])
@@ -84,19 +90,28 @@ def test_real_logs(run: Run, tmp_path: Path, shared: Path, arguments: list[str])
     assert virtual.isfinite().double().mean() > 0.97  # all but the samples that a sensor lacks
 
 
-@pytest.mark.parametrize(
-    "log",
-    [
-        "px4_sample.ulg",
-        "px4_sample_log_small.ulg",
-        "broad_24_tapping.mat",
-        "broad_24_tapping.hdf5",
-        "mpu6050_gyroscope_v73.mat",
-    ],
-)
-def test_a_single_device_has_axes_and_cannot_be_fused(run: Run, shared: Path, log: str):
-    path = str(shared / "data" / "raw" / log)
-    done = run("info", path, "--json", "info.json")
+SINGLE_DEVICES = [
+    "px4_sample.ulg",
+    "px4_sample_log_small.ulg",
+    "broad_24_tapping.mat",
+    "broad_24_tapping.hdf5",
+    "mpu6050_gyroscope_v73.mat",
+]
+
+
+def test_single_devices_have_axes_and_cannot_be_fused(run: Run, shared: Path, subtests: pytest.Subtests):
+    for log in SINGLE_DEVICES:
+        with subtests.test(log=log):
+            check_single_device(run, shared / "data" / "raw" / log)
+
+
+def test_a_single_device_has_axes_and_cannot_be_fused(run: Run, made: Path):
+    check_single_device(run, made / "adis16405_rec1.npz")
+
+
+def check_single_device(run: Run, path: Path) -> None:
+    log = path.name
+    done = run("info", path, "--json", f"{log}.json")
     assert done.status == 0, done.err
     done = run("fuse", path)
     assert (done.status, done.err) == (

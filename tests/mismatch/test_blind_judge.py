@@ -190,8 +190,7 @@ def test_scores_of_sensors_and_intervals():
     assert scoring.oracle_detects(effect(nats=30.0, oracle_llr=5.0, oracle_law="bound"), 0.01)
 
 
-@pytest.mark.parametrize("kind", cases.kinds("real"))
-def test_effects_in_real_recordings(kind, data):
+def check_effect_in_recording(kind: str, data: Path) -> None:
     """The background is there in counts, the simulation is its continuation, the effect has its size in its noise."""
     n = 4096
     case = make_case(kind, 30.0, 5, n_samples=n, data=data)
@@ -212,6 +211,12 @@ def test_effects_in_real_recordings(kind, data):
     if case.truth["effects"]:
         (effect,) = case.truth["effects"]
         assert sum(effect["sensor_nats"] or [30.0]) == pytest.approx(30, rel=1e-6)
+
+
+def test_effects_in_real_recordings(data: Path, subtests: pytest.Subtests):
+    for kind in cases.kinds("real"):
+        with subtests.test(kind=kind):
+            check_effect_in_recording(kind, data)
 
 
 def test_real_recordings_are_asked_for():
