@@ -43,7 +43,7 @@ def _single_unit_at_rest(number: int) -> dict[str, object]:
 
 
 def _board_of_eight() -> dict[str, object]:
-    """Five sessions of 20 orientations at rest and a turn by hand beyond the full scale; every other unit at the back."""
+    """Five sessions: 20 orientations at rest, a turn by hand beyond the full scale; every other unit at the back."""
     made: dict[str, object] = {"channels": _ACCELEROMETER_FIRST, "fs": 62.5, "ts_hz": 64e6}
     made |= {"scale": [2.0**-11] * 3 + [1 / 16.4] * 3, "units": ["g"] * 3 + ["deg/s"] * 3}
     for session in range(1, 6):

@@ -172,7 +172,7 @@ def test_light_and_dark(browser: Browser, page: Path):
     """Dark ink on a light page, and the other way round where the reader prefers it."""
     light, dark = (
         [sum(map(int, re.findall(r"\d+", colour)[:3])) for colour in measured["colours"]]
-        for measured in (browser.measure(page, f"--blink-settings=preferredColorScheme={scheme}") for scheme in (1, 0))
+        for measured in (browser.measure(page), browser.measure(page, "--blink-settings=preferredColorScheme=0"))
     )
     assert light[0] > 700 > 150 > light[1]
     assert dark[0] < 150 < 600 < dark[1]

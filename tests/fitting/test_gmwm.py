@@ -31,6 +31,7 @@ def many() -> gf.GMWMResult:
     return gf.fit_gmwm(signals(200, 10_000, seed=3), FORMULA)
 
 
+@pytest.mark.statistical
 def test_intervals_hold_the_truth(many):
     """95 % intervals of every parameter, tone included: within the 99.9 % binomial bounds of 200 runs."""
     low, high = many.confidence_interval
@@ -71,6 +72,7 @@ def test_published_criterion_is_reached_or_beaten(axis, formula):
     torch.testing.assert_close(torch.tensor(got, dtype=torch.float64), expected[:4], rtol=1e-4, atol=0)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(("axis", "formula"), [("gx", "WN + AR1 + RW"), ("gy", "WN + AR1 + RW + SIN")])
 def test_no_start_finds_a_lower_minimum_of_noisy_copies(axis, formula):
     """20 random starts each for 40 copies."""

@@ -146,6 +146,7 @@ def with_telegraph(n: int) -> tuple[Tensor, Tensor]:
     return signal, WALKS.wavelet_cross_covariance(N_LEVELS) + telegraph[:, None, None] * three
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("noise", [with_tone, with_telegraph])
 def test_little_is_lost_where_the_model_does_not_hold(noise):
     signal, truth = noise(50)

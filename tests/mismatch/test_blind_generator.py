@@ -43,6 +43,7 @@ def test_generator_knows_nothing_of_the_library():
         ), path
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("kind", MADE)
 def test_case_is_complete_and_repeatable(kind):
     n = 2048
@@ -68,6 +69,7 @@ def test_case_is_complete_and_repeatable(kind):
 WIDE = [name for name in MADE if kinds.KINDS[name].group in ("mechanism", *kinds.WIDER) and "telegraph" not in name]
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("kind", WIDE)
 def test_a_wide_case_is_complete_at_every_size_that_exists(kind):
     """Sensors, rate, length and reach of its own: whatever is drawn, shapes, truth and number of sensors agree."""

@@ -143,6 +143,7 @@ def test_coherent_or_not_is_told_of_a_bump():
     assert (turned.real.sign() == SIGNS.sign()).all()
 
 
+@pytest.mark.statistical
 def test_a_mode_of_some_sensors_is_seen_that_a_taper_would_hide():
     # Under a Hann taper, which costs half of the ordinates, none of these is seen at that level.
     mode, n_runs, seen = Mode(0.3, 0.01, torch.ones(P, dtype=torch.complex128), False), 10, 0

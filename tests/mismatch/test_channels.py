@@ -134,6 +134,7 @@ def test_a_number_times_the_square_is_found_where_a_matrix_is_not():
     assert by_chance <= 2  # of 15 with 2 % each, more have probability 3e-3
 
 
+@pytest.mark.statistical
 def test_the_square_of_one_axis_is_told_with_its_sign():
     """Of all products the length of a vector of gains would be told, most of it noise and without a sign."""
     g, held, told = generator(14), 0, 0
@@ -246,6 +247,7 @@ def through(mount: str, rows: torch.Tensor) -> torch.Tensor:
     return torch.from_numpy(signal.lfilter(numerator, denominator, rows.numpy(), axis=-1))
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("mount", ["first", "second", "ringing", "delay"])
 def test_what_comes_through_a_mount_is_a_gain_of_another_form(mount):
     """Named, said to be of another form, and taken off but for some per cent of its evidence."""

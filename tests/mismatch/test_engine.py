@@ -137,6 +137,7 @@ def test_models_and_samples_of_any_length_serve_as_simulations():
         assert [f.mechanism for f in report.findings] == ["vibration_tone"]
 
 
+@pytest.mark.statistical
 def test_other_units_are_a_finding():
     recording = array(1)
     report = diagnose(gf.Recording(recording.signal * math.pi / 180, rate=RATE), array(2, 4 * N).signal)

@@ -92,6 +92,7 @@ def test_steady_noise_gains_what_an_order_gains_by_chance():
     assert max(worth) < 5
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("depth", [0.8, 3.0])
 def test_a_level_that_changes_bit_by_bit_is_a_change_of_variance_of_another_form(form: str, depth: float):
@@ -104,6 +105,7 @@ def test_a_level_that_changes_bit_by_bit_is_a_change_of_variance_of_another_form
     assert VarianceChange.nominate(after, LEVEL) is None
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("depth", [0.6, 1.5, 4.0])
 def test_a_ramp_is_all_that_differs(depth: float):
     """Its mean level is the simulation's; spectra that take it for steady noise, or its level for another, differ."""

@@ -57,6 +57,7 @@ MECHANISMS: tuple[type[Mechanism], ...] = (
 # Nothing is missing.
 
 
+@pytest.mark.statistical
 def test_witnesses_and_nominations_are_silent_where_nothing_is_missing() -> None:
     false = np.zeros(len(WITNESSES))
     for seed in range(20):
@@ -196,6 +197,7 @@ def test_outliers_in_all_sensors_at_once_are_a_shock() -> None:
     assert torch.equal(simulated[0] != 0, simulated[1] != 0)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(("height", "rate"), [(5.0, 3e-3), (3.2, 2e-3)])
 def test_limits_of_rate_and_amplitude_hold(height: float, rate: float) -> None:
     inside = np.zeros(2)
@@ -250,6 +252,7 @@ def test_the_law_of_outliers_is_normalised() -> None:
 # Levels of noise.
 
 
+@pytest.mark.statistical
 def test_a_louder_episode_is_a_change_of_variance() -> None:
     onset = 0
     for seed in range(6):

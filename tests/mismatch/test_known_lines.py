@@ -48,6 +48,7 @@ def test_stretches_make_no_difference(monkeypatch: pytest.MonkeyPatch):
     torch.testing.assert_close((without_lines(signal, frequencies), amplitudes(signal, frequencies)), whole)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("sampled", [False, True])
 def test_a_tone_that_both_have_is_no_mismatch(sampled: bool):
     """Of the same size, and of any phase: sensors agree at its frequency in the one as in the other, and by chance."""

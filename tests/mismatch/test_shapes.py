@@ -75,6 +75,7 @@ def test_powers_gain_what_the_law_of_f_gives_them():
     assert float(gain[4]) == 0  # no reference
 
 
+@pytest.mark.statistical
 def test_deviances_have_the_mean_that_chance_gives_and_no_more():
     n_runs, excess, worse = 30, 0.0, 0
     for s in range(n_runs):
@@ -278,6 +279,7 @@ def test_filters_are_those_that_are_designed(kind: str, power: Callable[[np.ndar
     torch.testing.assert_close(none, torch.ones_like(none))
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("corner", [0.465, 0.48])
 def test_filters_next_to_half_the_rate_are_named(corner: float):
     """Their edge is steeper than blocks can show, and errors of prediction ring next to a record's ends."""
@@ -403,6 +405,7 @@ def test_noise_of_a_density_and_its_quadrature():
     assert ahead[100:-100].mean().imag == pytest.approx(1.0, abs=1e-9)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("witness", [shape_witness, bump_witness, common_witness])
 def test_witnesses_of_shapes_are_honest(witness):
     n_runs = 40
@@ -410,6 +413,7 @@ def test_witnesses_of_shapes_are_honest(witness):
     assert sum(x < 0.05 for x in p) <= stats.binom.isf(1e-3, n_runs, 0.05)
 
 
+@pytest.mark.statistical
 def test_witnesses_of_shapes_are_honest_with_common_noise_in_both():
     n_runs, p = 24, []
     for s in range(n_runs):
@@ -421,6 +425,7 @@ def test_witnesses_of_shapes_are_honest_with_common_noise_in_both():
     assert sum(x < 0.05 for x in p) <= stats.binom.isf(1e-3, n_runs, 0.2)
 
 
+@pytest.mark.statistical
 def test_small_changes_of_all_bands_are_seen_where_single_bands_say_nothing():
     n_runs, pooled, single = 15, 0, 0
     for s in range(n_runs):
@@ -449,6 +454,7 @@ def test_a_short_simulation_has_little_to_say():
     assert nominated(given) is None
 
 
+@pytest.mark.statistical
 def test_fits_of_nothing_gain_what_chance_gives():
     gains = []
     for s in range(12):

@@ -307,6 +307,7 @@ def best(now: Case):
 SIZE = torch.tensor([0.8, 0.0, -0.5, 0.4], dtype=torch.float64)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(
     ("mechanism", "path", "place", "at", "size"),
     [
@@ -350,6 +351,7 @@ BENT = lag_of(7.0) + 0.4 * lag_of(7.0).square()
 DOUBLE = (-T / 400).exp() + 0.6 * (-T / 3000).exp()
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("strength", [3.0, 30.0, 100.0])
 @pytest.mark.parametrize(
     ("mechanism", "path", "numbers"),
@@ -383,6 +385,7 @@ def test_an_effect_of_another_form_is_found_with_that_form(mechanism, path, numb
     assert torch.allclose(back, now.recording)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(("mechanism", "path"), [(WarmUpTransient, (-T / 1500).exp()), (TemperatureDrift, lag_of(7.0))])
 def test_of_a_strong_effect_nothing_is_left(mechanism, path: torch.Tensor):
     """Its place is known far more closely than any grid that is searched to begin with."""
@@ -450,6 +453,7 @@ def test_the_onset_of_a_large_step_is_known_to_samples():
     assert p.low * RATE <= at <= p.high * RATE
 
 
+@pytest.mark.statistical
 def test_steps_are_found_one_after_the_other():
     one, other = (T >= 4000).double(), (T >= 12000).double()
     effect = torch.stack([2 * one, 1.5 * other, 0 * T, -1.5 * one])
@@ -464,6 +468,7 @@ def test_steps_are_found_one_after_the_other():
     assert Step.nominate(now, LEVEL) is None
 
 
+@pytest.mark.statistical
 def test_several_large_steps_are_no_walk():
     """To and fro in one sensor: no single one of them beats more slow noise, all of them do by far."""
     sizes = {2345: 4.0, 6789: -5.5, 9700: 3.0, 13131: 1.5}

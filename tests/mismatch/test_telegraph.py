@@ -164,6 +164,7 @@ def test_a_lorentzian_is_told_by_its_spectrum() -> None:
     assert float(found.tau[1]) == pytest.approx(tau, rel=0.6)
 
 
+@pytest.mark.statistical
 def test_blocks_get_shorter_where_levels_change_faster_than_the_spectrum_had_it() -> None:
     case, sd = telegraph(10), float(excess(telegraph(10)).sd[1])
     tau = 1 / (1 / LEVELS.up + 1 / LEVELS.down)

@@ -189,6 +189,7 @@ def test_another_level_throughout_is_no_episode() -> None:
         assert level_between(case.with_recording(recording), inside) is not None
 
 
+@pytest.mark.statistical
 def test_a_level_that_changes_by_little_in_several_sensors_is_named() -> None:
     found_all = 0
     for seed in range(6):
@@ -313,6 +314,7 @@ def test_a_coarse_hidden_lattice_makes_of_noise_what_it_does_at_the_recording_s_
     assert float(y.var() / made.var()) == pytest.approx(1.0, abs=0.02)
 
 
+@pytest.mark.statistical
 def test_a_hidden_lattice_of_one_sensor_is_looked_for_in_the_others() -> None:
     """The second has n exp(-4 pi^2 blur^2) = 6 nats, where a search of all steps would want 14; the third has none."""
     found = []

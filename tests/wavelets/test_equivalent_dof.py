@@ -128,6 +128,7 @@ def fewest_covered(n: int, tests: int, confidence_level: float = 0.95) -> int:
     return int(stats.binom.ppf(REFUSED / tests, n, confidence_level))
 
 
+@pytest.mark.statistical
 def test_coverage_of_the_virtual_gyro():
     """The band that the plot shows holds the truth for fixed weights: 200 arrays, 12 levels judged at once."""
     result, truth = fit_svo(arrays("white and walk"), method="equal"), true_wccv("white and walk", 12).mean((-1, -2))
