@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -167,10 +168,7 @@ def test_flicker_noise_through_the_gain_gives_its_wavelet_variance():
         def density(f: float, level: int = level) -> float:
             return 2 * naive.squared_gain(level, f) * process.spectrum(f).item()
 
-        parts = [
-            scipy.integrate.quad(density, max(a, 1e-15), b, epsrel=1e-12)[0]
-            for a, b in zip(zeros[:-1], zeros[1:], strict=True)
-        ]
+        parts = [scipy.integrate.quad(density, max(a, 1e-15), b, epsrel=1e-12)[0] for a, b in itertools.pairwise(zeros)]
         assert nu == pytest.approx(sum(parts), rel=1e-10)
     assert process.wavelet_variance(40)[-1].item() == pytest.approx(0.7 * math.log(2) / math.pi, rel=1e-12)
 
