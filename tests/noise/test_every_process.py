@@ -211,7 +211,7 @@ def test_second_order_paths_have_their_autocovariance():
     assert error < 5 * 0.5 * math.sqrt(2 / 100000)
 
 
-@pytest.mark.slow
+@pytest.mark.statistical
 @pytest.mark.parametrize(
     "truth",
     [
