@@ -28,15 +28,11 @@ from gyrofuse._base.linalg import SingularCovarianceError
 from gyrofuse._base.results import ConfidenceInterval
 from gyrofuse.export.c_header import to_c_header
 from gyrofuse.export.kalibr import to_kalibr
-from gyrofuse.fitting.array.gmwm import fit_array_gmwm
-from gyrofuse.fitting.array.result import ArrayGMWMResult
-from gyrofuse.fitting.bootstrap import GMWMBootstrap, bootstrap_gmwm
-from gyrofuse.fitting.gmwm import fit_gmwm
-from gyrofuse.fitting.gmwm_result import GMWMResult
-from gyrofuse.fitting.joint import JointFit, fit_jointly
-from gyrofuse.fitting.moments.covariance import moment_covariance
-from gyrofuse.fitting.ranking.rank import rank_models
-from gyrofuse.fitting.ranking.result import RankResult
+from gyrofuse.fitting.array.gmwm import fit_array_gmwm, fit_array_gmwm_moments
+from gyrofuse.fitting.bootstrap import bootstrap_gmwm
+from gyrofuse.fitting.gmwm import fit_gmwm, fit_gmwm_moments
+from gyrofuse.fitting.joint import fit_gmwm_joint
+from gyrofuse.fitting.ranking.rank import rank_models, rank_models_moments
 from gyrofuse.fitting.virtual_noise import virtual_noise
 from gyrofuse.fusion.faults.parity import parity_test
 from gyrofuse.fusion.faults.reference import ParityReference, fit_parity
@@ -85,7 +81,6 @@ if TYPE_CHECKING:
 __all__ = [
     "AR1",
     "SVO",
-    "ArrayGMWMResult",
     "ArrayModel",
     "ChunkedRecording",
     "ConfidenceInterval",
@@ -94,10 +89,7 @@ __all__ = [
     "Drift",
     "Finding",
     "FlickerNoise",
-    "GMWMBootstrap",
-    "GMWMResult",
     "HaarFilterBank",
-    "JointFit",
     "LiveSVO",
     "Matern32",
     "MismatchReport",
@@ -106,7 +98,6 @@ __all__ = [
     "ParityReference",
     "QuantizationNoise",
     "RandomWalk",
-    "RankResult",
     "Recording",
     "RecordingError",
     "SVOWeights",
@@ -121,8 +112,10 @@ __all__ = [
     "diagnose",
     "equal_weights",
     "fit_array_gmwm",
+    "fit_array_gmwm_moments",
     "fit_gmwm",
-    "fit_jointly",
+    "fit_gmwm_joint",
+    "fit_gmwm_moments",
     "fit_multiscale",
     "fit_parity",
     "fit_svo",
@@ -130,12 +123,12 @@ __all__ = [
     "inverse_variance_weights",
     "mask_saturated",
     "model_from_dict",
-    "moment_covariance",
     "nonnegative_weights",
     "open_recording",
     "parity_test",
     "parse_model",
     "rank_models",
+    "rank_models_moments",
     "rdvg_weights",
     "read_recording",
     "robust_wavelet_variance",
@@ -166,6 +159,11 @@ _LAZY = {
 
 # Names that have left, and where they are now.
 _MOVED = {
+    **{
+        name: f"gyrofuse.fitting.{name}"
+        for name in ("ArrayGMWMResult", "GMWMBootstrap", "GMWMResult", "JointFit", "RankResult", "moment_covariance")
+    },
+    "fit_jointly": "gyrofuse.fitting.joint.fit_gmwm_joint",
     "LongRecording": "gyrofuse.io.chunked.ChunkedRecording",
     "open_long": "gyrofuse.io.chunked.open_recording",
     "stretch_of": "gyrofuse.io.chunked.shard_bounds",

@@ -17,6 +17,7 @@ from scipy import stats
 from torch import Tensor
 
 import gyrofuse as gf
+from gyrofuse.fitting import GMWMResult
 from gyrofuse.fitting.moments.covariance import moment_covariance
 
 N_RUNS = 500
@@ -111,7 +112,7 @@ class Runs:
     variance: Tensor
 
 
-def fits(results: list[gf.GMWMResult]) -> Fits:
+def fits(results: list[GMWMResult]) -> Fits:
     """Results of records `(run, 1, time)`, one after the other."""
 
     def joined(values: list[Tensor]) -> Tensor:
@@ -130,7 +131,7 @@ def fits(results: list[gf.GMWMResult]) -> Fits:
 def simulate_and_fit(model: gf.Model, n_samples: int, n_runs: int, generator: torch.Generator) -> Runs:
     """Fit the true kind of model to `n_runs` records, with and without refinement."""
     at_once = max(1, _AT_ONCE // n_samples)
-    found: dict[bool, list[gf.GMWMResult]] = {False: [], True: []}
+    found: dict[bool, list[GMWMResult]] = {False: [], True: []}
     for done in range(0, n_runs, at_once):
         signal = model.simulate(n_samples, batch=(min(at_once, n_runs - done), 1), generator=generator)
         with warnings.catch_warnings():

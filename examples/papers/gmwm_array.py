@@ -20,6 +20,7 @@ from _svo_study import arguments, case1, case2, figures_written, finish, n_level
 from torch import Tensor
 
 import gyrofuse as gf
+from gyrofuse.fitting import ArrayGMWMResult
 from gyrofuse.fusion.weights.svo import resolve_scale_weights
 
 _N_ARRAYS, _QUICK_ARRAYS, _N_SAMPLES, _AT_ONCE = 500, 6, 2**16, 10
@@ -38,7 +39,7 @@ class Runs:
     """
 
     components: list[tuple[gf.Model, Tensor]]
-    fits: list[gf.ArrayGMWMResult]
+    fits: list[ArrayGMWMResult]
     risks: Tensor
 
     def all(self, name: str) -> Tensor:
@@ -97,7 +98,7 @@ def print_runs(name: str, runs: Runs) -> None:
     print(f"{'process':<12}{'bias':>8}{'spread':>9}{'variances':>11}{'covariances':>13}{'correlations':>14}")
     spread = runs.all("theta").std(0)
     bias = (runs.all("theta").mean(0) - truth) / spread
-    ratio = spread / runs.all("theta_sd").median(0).values
+    ratio = spread / runs.all("theta_std_err").median(0).values
     sd = truth.diagonal(dim1=-2, dim2=-1).sqrt()
     held = [
         torch.where(low.isnan(), torch.nan, ((low <= value) & (value <= high)).double()).nanmean(0)

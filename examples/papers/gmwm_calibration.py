@@ -27,6 +27,7 @@ from _svo_study import arguments, conclusion, figures_written, finish
 from torch import Tensor
 
 import gyrofuse as gf
+from gyrofuse.fitting import GMWMResult
 
 ADIS, BROAD = tuple(f"adis16405_rec{k}.npz" for k in (1, 2, 3)), "broad_trials.npz"
 BASIC = "AR1 + RW"
@@ -39,11 +40,11 @@ class Fitted:
     """A recording of one sensor, with the fits of the basic model and of the one with tones where there are any."""
 
     name: str
-    basic: gf.GMWMResult
-    toned: gf.GMWMResult | None
+    basic: GMWMResult
+    toned: GMWMResult | None
 
     @property
-    def results(self) -> tuple[gf.GMWMResult, ...]:
+    def results(self) -> tuple[GMWMResult, ...]:
         """One or both."""
         return (self.basic,) if self.toned is None else (self.basic, self.toned)
 
@@ -107,12 +108,12 @@ def print_table(title: str, recordings: list[Fitted]) -> None:
     print("misfit: root mean square of ln(measured / fitted wavelet variance)")
 
 
-def misfit(result: gf.GMWMResult) -> float:
+def misfit(result: GMWMResult) -> float:
     """Root mean square of the logarithm of measured over fitted wavelet variance."""
     return float((result.wavelet_variance / result.fitted_wavelet_variance).log().square().mean().sqrt())
 
 
-def apart(one: gf.GMWMResult, other: gf.GMWMResult) -> list[str]:
+def apart(one: GMWMResult, other: GMWMResult) -> list[str]:
     """Parameters of the basic model whose intervals do not overlap."""
     first, second = one.confidence_interval, other.confidence_interval
     names = [name for name in one.param_names if name in other.param_names and not name.startswith("sinusoid")]

@@ -23,6 +23,7 @@ from scipy import optimize
 from torch import Tensor
 
 import gyrofuse as gf
+from gyrofuse.fitting import GMWMResult
 
 N_SAMPLES, N_RUNS = 10_000, 200
 QUICK_SAMPLES, QUICK_RUNS = 1024, 3
@@ -67,7 +68,7 @@ def _kinds(names: tuple[str, ...]) -> tuple[Tensor, ...]:
     return tuple(torch.tensor([name.endswith(kind) for name in names]) for kind in (".phi", ".beta"))
 
 
-def maximum_likelihood(signal: Tensor, start: gf.GMWMResult, scale: Tensor) -> tuple[Tensor, bool]:
+def maximum_likelihood(signal: Tensor, start: GMWMResult, scale: Tensor) -> tuple[Tensor, bool]:
     """Parameters at the maximum of the exact likelihood of a record `(time,)`, searched for from a moment fit.
 
     Args:

@@ -31,6 +31,7 @@ from _gmwm_study import (
 from _svo_study import arguments, conclusion, figures_written, finish
 
 import gyrofuse as gf
+from gyrofuse.fitting import GMWMResult
 
 QUICK_SAMPLES, QUICK_RUNS = 2**15, 8
 KINDS = ("without tones", "with tones")
@@ -47,7 +48,7 @@ def emulation(n_samples: int) -> gf.Model:
 
 def fit_both(model: gf.Model, n_samples: int, n_runs: int, generator: torch.Generator) -> list[Fits]:
     """Fits of `KINDS`."""
-    found: list[list[gf.GMWMResult]] = [[], []]
+    found: list[list[GMWMResult]] = [[], []]
     at_once = max(1, 2**21 // n_samples)
     for done in range(0, n_runs, at_once):
         signal = model.simulate(n_samples, batch=(min(at_once, n_runs - done), 1), generator=generator)

@@ -27,7 +27,7 @@ from scipy import stats
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.fitting.ranking.candidates import Kinds, charge, composition, name_of
+from gyrofuse.fitting.ranking.candidates import Kinds, composition, name_of, penalty
 from gyrofuse.fitting.ranking.spectra import Spectra, summed
 from gyrofuse.fitting.spectral.tones import FEWEST_CYCLES
 from gyrofuse.noise.processes import Process
@@ -97,7 +97,7 @@ def share_with_noise(noise: gf.Model, n_samples: int) -> tuple[float, str]:
     kinds = kinds_at(noise, n_samples)
     drawn, truth = drawn_spectra(noise, n_samples)
     own = (drawn.energy / truth + drawn.bins.count * truth.log()).sum(-1)
-    own += charge(composition(kinds, held=True), n_samples)
+    own += penalty(composition(kinds, held=True), n_samples)
     shares = [(1.0, "-")]
     for rival in rivals(kinds):
         variance = closest(rival, drawn)
@@ -105,7 +105,7 @@ def share_with_noise(noise: gf.Model, n_samples: int) -> tuple[float, str]:
         if gf.Drift in rival:
             energy = drawn.without_ramp(variance)[2]
         other = (energy / variance + drawn.bins.count * variance.log()).sum(-1)
-        other += charge(composition(rival, held=True), n_samples)
+        other += penalty(composition(rival, held=True), n_samples)
         shares.append(((other > own).double().mean().item(), name_of(rival)))
     return min(shares)
 
@@ -190,7 +190,7 @@ def rates(part: Part, n_samples: int, n_runs: int, generator: torch.Generator) -
     for first in range(0, n_runs, max(_AT_ONCE // n_samples, 1)):
         n = min(max(_AT_ONCE // n_samples, 1), n_runs - first)
         signal: Tensor = part.model.simulate(n_samples, batch=(n, 1), generator=generator)
-        ranked = gf.rank_models(signal, line_level=_LINE_LEVEL, fit=False)
+        ranked = gf.rank_models(signal, line_alpha=_LINE_LEVEL, fit=False)
         place = ranked.candidates.index(part.name) if part.name in ranked.candidates else -2
         right += int((ranked.choice == place).sum())
         wvic += int((ranked.wvic_choice == place).sum())

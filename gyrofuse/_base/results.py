@@ -76,7 +76,7 @@ def scattered(value: Tensor, usable: Tensor, batch: Sequence[int], missing: floa
     """
     whole = value.new_full((len(usable), *value.shape[1:]), missing)
     whole[usable] = value
-    return whole.view(*batch, *value.shape[1:])
+    return whole.view((*batch, *value.shape[1:]))
 
 
 def plain(value: Any) -> Any:

@@ -11,11 +11,13 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.checks import check_positive_integer
+from gyrofuse._base.chunks import items_at_once
+from gyrofuse._base.deprecation import RenamedAttribute
 from gyrofuse._base.random import own_generator
-from gyrofuse._base.results import ConfidenceInterval, listed, place
+from gyrofuse._base.results import ConfidenceInterval, Result, place, scattered
 from gyrofuse.fitting.gmwm_result import GMWMResult
-from gyrofuse.fitting.moments.continuous import fit_moments
-from gyrofuse.fitting.moments.drift_sign import drifts_of
+from gyrofuse.fitting.moments.fit import fit_batch
+from gyrofuse.fitting.moments.identifiability import drifts_of
 from gyrofuse.fitting.moments.inference import Fit, Inference, infer, infer_efficient
 from gyrofuse.fitting.moments.white_kurtosis import white_excess_kurtosis, with_excess_kurtosis
 from gyrofuse.fitting.spectral.model_tones import model_tones
@@ -27,36 +29,37 @@ from gyrofuse.wavelets.robust import robust_wavelet_variance
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_SAMPLES_AT_ONCE = 2**22
+# Fewest resamples: the 2.5 % quantile of fewer lies beyond the smallest of them.
 _FEWEST = 20
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class GMWMBootstrap:
-    """What fits to simulated records say about a fit; `...` are the leading dimensions of the signal.
+class GMWMBootstrap(Result):
+    """Fits to simulated records beside the fit they were simulated from; `...` are the leading dimensions of the
+    signal.
 
     Attributes:
-        param_names: Of the parameters.
+        param_names: Names of the parameters.
         params: Estimates `(..., sensor, parameter)` that were simulated from.
         bias: Mean of the resampled estimates less the estimate, `(..., sensor, parameter)`.
-        std: Standard deviation of the resampled estimates, the same; NaN of fewer than two.
+        std_err: Standard deviation of the resampled estimates, the same; NaN of fewer than two.
         percentile: Interval between quantiles of the resampled estimates.
         studentized: Interval by quantiles of `(u* - u) / sd*`, with `u` the logarithm of variances and amplitudes,
-            `atanh phi`, `logit(beta / pi)`. That of the percentiles where a standard deviation is unknown, as in the
-            resamples that leave a process out, in more of them than an interval leaves on one side.
-        confidence_level: Of both.
-        p_value: That the model is complete, `(..., sensor)`: share of resamples whose J statistic is at least that of
-            the fit, `(1 + number) / (1 + resamples)`. For any weighting; with equal weights, whose estimates are poor,
-            it rejects too often (14 % of complete models at 5 %, 1024 samples of white noise and a random walk).
-        n_resamples: Records simulated for each item.
-        n_failed: How many of them could not be fitted, `(..., sensor)`; they are left out.
-        sensors: Names.
+            `atanh phi`, `logit(beta / pi)`. It is that of the percentiles where a standard deviation is unknown, as in
+            resamples without one of the processes, in more of them than an interval leaves on one side.
+        confidence_level: Probability that either interval holds the true value.
+        p_value: P value of the test that the model is complete, `(..., sensor)`: share of resamples whose J statistic
+            is at least that of the fit, `(1 + number) / (1 + resamples)`. It holds for any weighting but the identity,
+            whose poor estimates make it reject complete models too often.
+        n_resamples: Number of records simulated for each item.
+        n_failed: Number of them that could not be fitted and are left out, `(..., sensor)`.
+        sensors: Names of the sensors.
     """
 
     param_names: tuple[str, ...]
     params: Tensor
     bias: Tensor
-    std: Tensor
+    std_err: Tensor
     percentile: ConfidenceInterval
     studentized: ConfidenceInterval
     confidence_level: float
@@ -64,6 +67,14 @@ class GMWMBootstrap:
     n_resamples: int
     n_failed: Tensor
     sensors: tuple[str, ...]
+
+    std = RenamedAttribute("std_err")
+    _batched = ("params", "bias", "std_err", "percentile", "studentized", "p_value", "n_failed")
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading dimensions before the sensors; `()` for a single array."""
+        return tuple(self.params.shape[:-2])
 
     def summary(self) -> str:
         """Bias, spread and interval of every parameter, sensor by sensor, or why there are none."""
@@ -74,7 +85,7 @@ class GMWMBootstrap:
             if not bool(self.params[index].isfinite().all()):
                 continue
             lines.append(f"  {'parameter':<24}{'estimate':>13}{'bias':>13}{'std':>13}  {level:^29}")
-            columns = (self.params, self.bias, self.std, *self.studentized)
+            columns = (self.params, self.bias, self.std_err, *self.studentized)
             for name, *row in zip(self.param_names, *(column[index].tolist() for column in columns), strict=True):
                 value, bias, std, low, high = row
                 limits = f"[{low:>13.6g}, {high:>13.6g}]" if math.isfinite(low) else f"{'-':^29}"
@@ -82,9 +93,6 @@ class GMWMBootstrap:
                 shown = (f"{number:>13.3g}" if math.isfinite(number) else f"{'-':>13}" for number in (bias, std))
                 lines.append(f"  {name:<24}{value:>13.6g}{''.join(shown)}  {limits}{note}")
         return "\n".join(lines)
-
-    def __str__(self) -> str:
-        return self.summary()
 
     def _head(self, index: tuple[int, ...]) -> str:
         """The p-value of one sensor, or why there is none, and how many resamples were lost."""
@@ -99,8 +107,8 @@ class GMWMBootstrap:
         """Draw bias and both intervals of one sensor's parameters, less the estimates, in standard deviations.
 
         Args:
-            ax: Where to draw; new axes by default.
-            index: Of the sensor among the leading dimensions; the first by default.
+            ax: Axes to draw on; new ones by default.
+            index: Index of the sensor among the leading dimensions; the first by default.
 
         Returns:
             The axes.
@@ -108,7 +116,7 @@ class GMWMBootstrap:
         from gyrofuse.fitting.plots import plot_resampled
 
         index = (0,) * (self.params.ndim - 1) if index is None else index
-        own, std = self.params[index], self.std[index]
+        own, std = self.params[index], self.std_err[index]
         known = std > 0  # a variance at zero in every resample has no scale
         percentile, studentized = (
             tuple(((limit[index] - own) / std)[known] for limit in interval)
@@ -119,20 +127,8 @@ class GMWMBootstrap:
         return plot_resampled(names, bias, percentile, studentized, percent=100 * self.confidence_level, ax=ax)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain numbers and lists; what is not known is None."""
-        return {
-            "param_names": list(self.param_names),
-            "params": listed(self.params),
-            "bias": listed(self.bias),
-            "std": listed(self.std),
-            "percentile": {"low": listed(self.percentile.low), "high": listed(self.percentile.high)},
-            "studentized": {"low": listed(self.studentized.low), "high": listed(self.studentized.high)},
-            "confidence_level": self.confidence_level,
-            "p_value": listed(self.p_value),
-            "n_resamples": self.n_resamples,
-            "n_failed": self.n_failed.tolist(),
-            "sensors": list(self.sensors),
-        }
+        """Everything as plain lists and numbers, ready for JSON (NaN and infinities as None)."""
+        return {"std" if name == "std_err" else name: value for name, value in super().to_dict().items()}
 
 
 def bootstrap_gmwm(
@@ -144,14 +140,14 @@ def bootstrap_gmwm(
 ) -> GMWMBootstrap:
     """Fit records simulated from a fitted model as the signal was fitted.
 
-    They are Gaussian, as long as the signal and without gaps, and the frequencies of sinusoids are looked for in their
-    spectra. A variance estimated as zero is zero in all of them, so that its interval says nothing: those of the fit
-    itself do. Memory does not grow with the number of resamples but for `resample x parameter` estimates.
+    The records are Gaussian, as long as the signal and without gaps, and the frequencies of sinusoids are estimated
+    from their spectra. A variance estimated as zero is zero in all of them, so that its bootstrap interval is void:
+    that of the fit itself is valid. Memory grows with the number of resamples by `resample x parameter` estimates only.
 
     Args:
-        result: Of `fit_gmwm`.
-        n_resamples: Records for each item; 200 give standard deviations within a tenth, intervals want 1000.
-        weighting: The weights, where the fit was given its own.
+        result: Result of `fit_gmwm`.
+        n_resamples: Number of records for each item; 200 give standard errors within a tenth, intervals need 1000.
+        weighting: Weights `Omega`, where the fit was given weights of its own.
         generator: Source of randomness; by default a fresh one.
 
     Returns:
@@ -188,11 +184,11 @@ def bootstrap_gmwm(
     model = result.model.with_params(params[usable])
     made_of = Composition(model.processes, held=True)
     n_items = int(usable.sum())
-    size = max(_SAMPLES_AT_ONCE // (n_items * result.n_samples), 1)
+    size = items_at_once(n_items * result.n_samples)
     drawn = []
     for first in range(0, n_resamples, size):
-        batch = min(size, n_resamples - first)
-        records = model.simulate(result.n_samples, batch=(batch,), generator=generator)  # (resample, item, time)
+        some = min(size, n_resamples - first)
+        records = model.simulate(result.n_samples, batch=(some,), generator=generator)  # (resample, item, time)
         drawn.append(_fitted(records, result, made_of, omega))
     again, spread, distance = (torch.cat(parts) for parts in zip(*drawn, strict=True))
     # Moments hold squares of slopes: what falls is resampled as if it rose, and turned back at the end.
@@ -211,27 +207,24 @@ def bootstrap_gmwm(
     larger = (distance >= result.j_statistic.flatten()[usable]).sum(0)
     p_value = torch.where(n_failed < n_resamples, (1 + larger) / (1 + n_resamples - n_failed), torch.nan)
 
-    def placed(value: Tensor) -> Tensor:
-        missing = 0 if value.dtype == torch.int64 else torch.nan
-        whole = value.new_full((len(usable), *value.shape[1:]), missing)
-        whole[usable] = value
-        return whole.view(*result.params.shape[:-1], *value.shape[1:])
+    batch = result.params.shape[:-1]
 
     def turned(limits: tuple[Tensor, Tensor]) -> ConfidenceInterval:
         low, high = (limit * turn for limit in limits)
-        return ConfidenceInterval(placed(torch.where(turn < 0, high, low)), placed(torch.where(turn < 0, low, high)))
+        ends = torch.where(turn < 0, high, low), torch.where(turn < 0, low, high)
+        return ConfidenceInterval(*(scattered(end, usable, batch) for end in ends))
 
     return GMWMBootstrap(
         param_names=result.param_names,
         params=result.params,
-        bias=placed((mean - own) * turn),
-        std=placed(std),
+        bias=scattered((mean - own) * turn, usable, batch),
+        std_err=scattered(std, usable, batch),
         percentile=turned(percentile),
         studentized=turned(studentized),
         confidence_level=result.confidence_level,
-        p_value=placed(p_value.to(own)),
+        p_value=scattered(p_value.to(own), usable, batch),
         n_resamples=n_resamples,
-        n_failed=placed(n_failed),
+        n_failed=scattered(n_failed, usable, batch, 0),
         sensors=result.sensors,
     )
 
@@ -244,7 +237,7 @@ def _fitted(
     variance = robust_wavelet_variance(series[:, None], levels, efficiency=result.records.efficiency)[..., 0]
     tones = model_tones(series, made_of)
     frequencies = None if tones is None else (tones.beta, tones.beta_sd)
-    fit: Fit = fit_moments(variance, frequencies, result.records, made_of, omega, result.moments)
+    fit: Fit = fit_batch(variance, frequencies, result.records, made_of, omega)
     inference: Inference = infer(fit, made_of, result.confidence_level)
     if result.refined:
         refined = refine_whittle(series, made_of, fit.linear, fit.shape, tones=tones)

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from torch import Tensor
 
-from gyrofuse._base.results import ConfidenceInterval, cleaned, counted, listed, p_words, place
+from gyrofuse._base.deprecation import RenamedAttribute
+from gyrofuse._base.results import ConfidenceInterval, Result, counted, p_words, place, plain, scattered
 from gyrofuse._base.units import DATASHEET_UNITS
 from gyrofuse.fitting.moments.inference import Inference
-from gyrofuse.fitting.moments.records import Records
+from gyrofuse.fitting.moments.records import SampleDesign
 from gyrofuse.fitting.structure import Composition
 from gyrofuse.noise.datasheet import Datasheet, datasheet
 from gyrofuse.noise.estimation import EstimatedFrom
@@ -23,39 +25,43 @@ from gyrofuse.wavelets.equivalent_dof import chi_square_interval
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_MOST_TABLES = 12  # items that a summary prints in full
-REFUSED = 0.01  # p-values of the J test below
+T = TypeVar("T")
+
+# P value of the J test below which a model counts as incomplete: one complete model in a hundred does.
+REFUSED = 0.01
+# Largest number of items whose tables a summary prints in full: what a few pages of a terminal hold.
+MOST_TABLES = 12
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class GMWMResult:
+class GMWMResult(Result):
     """Noise models fitted to wavelet variances; `...` are the leading dimensions of the signal.
 
     Attributes:
-        model: Fitted, with parameters `(..., sensor)`; it knows the record and the covariance that it has them from.
-        param_names: Of the parameters, such as `ar1_1.phi`.
-        params: `(..., sensor, parameter)`; NaN where nothing could be fitted.
-        param_cov: `(..., sensor, parameter, parameter)`; zero rows for variances that are estimated as zero.
+        model: Fitted model with parameters `(..., sensor)`; it carries the length of the record and the covariance of
+            its parameters.
+        param_names: Names of the parameters, such as `ar1_1.phi`.
+        params: Parameters, `(..., sensor, parameter)`; NaN where nothing could be fitted.
+        param_cov: Their covariance, `(..., sensor, parameter, parameter)`; zero rows for variances estimated as zero.
         confidence_interval: Limits `(..., sensor, parameter)`. A variance at zero has an upper limit only.
-        confidence_level: Of these.
-        determined: `(..., sensor, parameter)`; where False the data say hardly more than the order of magnitude.
-        identified: `(..., sensor)`; False where parameters cannot be told apart at this length.
-        remarks: What cannot, in words, for each sensor, item after item.
+        confidence_level: Probability that an interval holds the true value.
+        determined: `(..., sensor, parameter)`; False where hardly the order of magnitude is known.
+        identified: `(..., sensor)`; False where the record does not identify some parameters.
+        notes: Parameters that are not identified, in words, for each sensor, item after item.
         objective: `r' Omega r` with `r = nu - nu(theta)`, `(..., sensor)`.
         j_statistic: `r' V^-1 r` at these parameters, `(..., sensor)`.
-        p_value: Of the J test, that the model is complete, `(..., sensor)`; NaN where the model has as many
-            parameters as there are levels, or the weights are not `V^-1`. Where the parameters are refined, by
-            a chi-square of the mean and variance that the J statistic has there.
+        p_value: P value of the J test, that the model is complete, `(..., sensor)`; NaN where the model has as many
+            parameters as there are levels, or the weights are not `V^-1`. Of refined parameters by a chi-square of the
+            mean and variance that the J statistic has there.
         converged: `(..., sensor)`; of the likelihood where it refined the parameters, else of the moments.
-        wavelet_variance: Measured, `(..., level, sensor)`, signal^2.
-        fitted_wavelet_variance: Of the model, the same.
-        records: Length of the record, or of those that the fit was to jointly, and the wavelet variances' efficiency.
-        weighting: Of the moments.
+        wavelet_variance: Measured wavelet variance, `(..., level, sensor)`, signal^2.
+        fitted_wavelet_variance: Wavelet variance of the model, the same.
+        records: Lengths of the records, their levels, and the efficiency of the wavelet variance.
+        weighting: Weighting of the moments.
         refined: Whether the parameters are those of the spectral likelihood.
-        sensors: Names.
-        rate: Hz, where known.
-        unit: Of the signal, where known.
-        moments: That were matched, `"variance"` or `"log"`.
+        sensors: Names of the sensors.
+        rate: Sampling rate in Hz, where known.
+        unit: Unit of the signal, where known.
         axes: Names along the leading dimension, `("x", "y", "z")`, empty when it has none.
     """
 
@@ -67,28 +73,42 @@ class GMWMResult:
     confidence_level: float
     determined: Tensor
     identified: Tensor
-    remarks: tuple[tuple[str, ...], ...]
+    notes: tuple[tuple[str, ...], ...]
     objective: Tensor
     j_statistic: Tensor
     p_value: Tensor
     converged: Tensor
     wavelet_variance: Tensor
     fitted_wavelet_variance: Tensor
-    records: Records
+    records: SampleDesign
     weighting: str
     refined: bool
     sensors: tuple[str, ...]
     rate: float | None
     unit: str | None
-    moments: str = "variance"
     axes: tuple[str, ...] = ()
+
+    remarks = RenamedAttribute("notes")
+    _batched = (
+        "params",
+        "param_cov",
+        "confidence_interval",
+        "determined",
+        "identified",
+        "objective",
+        "j_statistic",
+        "p_value",
+        "converged",
+        "wavelet_variance",
+        "fitted_wavelet_variance",
+    )
 
     @classmethod
     def build(
         cls,
         *,
         inference: Inference,
-        remarks: list[tuple[str, ...]],
+        notes: list[tuple[str, ...]],
         made_of: Composition,
         usable: Tensor,
         wavelet_variance: Tensor,
@@ -96,34 +116,53 @@ class GMWMResult:
         **rest: Any,
     ) -> GMWMResult:
         """Put the items that could be fitted back into their places among all, `(item,)` -> `(..., sensor)`."""
-
-        def placed(value: Tensor, missing: float | bool) -> Tensor:
-            whole = value.new_full((len(usable), *value.shape[1:]), missing)
-            whole[usable] = value
-            return whole.view(*batch, *value.shape[1:])
-
-        estimates, tested = inference.estimates, rest["weighting"] in ("optimal", "continuous")
+        estimates = inference.estimates
+        tested = rest["weighting"] == "optimal"
         p_value = inference.p_value if tested else torch.full_like(inference.p_value, torch.nan)
-        params, param_cov = placed(estimates.params, torch.nan), placed(estimates.covariance, torch.nan)
-        said = iter(remarks)
-        told = EstimatedFrom(sum(rest["records"].lengths), param_cov)
+        params = scattered(estimates.params, usable, batch)
+        param_cov = scattered(estimates.covariance, usable, batch)
+        own_notes = iter(notes)
+        source = EstimatedFrom(sum(rest["records"].lengths), param_cov)
         return cls(
-            model=(model := Model(list(made_of.processes))).with_params(params, estimated_from=told),
+            model=(model := Model(list(made_of.processes))).with_params(params, estimated_from=source),
             param_names=model.param_names,
             params=params,
             param_cov=param_cov,
-            confidence_interval=ConfidenceInterval(placed(estimates.low, torch.nan), placed(estimates.high, torch.nan)),
-            determined=placed(estimates.determined, False),
-            identified=placed(torch.tensor([not texts for texts in remarks], device=usable.device), False),
-            remarks=tuple(next(said) if ok else () for ok in usable.tolist()),
-            objective=placed(inference.objective, torch.nan),
-            j_statistic=placed(inference.j_statistic, torch.nan),
-            p_value=placed(p_value, torch.nan),
-            converged=placed(inference.converged, False),
+            confidence_interval=ConfidenceInterval(
+                scattered(estimates.low, usable, batch), scattered(estimates.high, usable, batch)
+            ),
+            determined=scattered(estimates.determined, usable, batch, False),
+            identified=scattered(torch.tensor([not texts for texts in notes]).to(usable), usable, batch, False),
+            notes=tuple(next(own_notes) if ok else () for ok in usable.tolist()),
+            objective=scattered(inference.objective, usable, batch),
+            j_statistic=scattered(inference.j_statistic, usable, batch),
+            p_value=scattered(p_value, usable, batch),
+            converged=scattered(inference.converged, usable, batch, False),
             wavelet_variance=wavelet_variance.view(*batch, -1).mT,
-            fitted_wavelet_variance=placed(inference.fitted, torch.nan).mT,
+            fitted_wavelet_variance=scattered(inference.fitted, usable, batch).mT,
             **rest,
         )
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading dimensions before the sensors; `()` for a single array."""
+        return tuple(self.params.shape[:-2])
+
+    def __getitem__(self, index: Any) -> GMWMResult:
+        """One item, or some, of the leading batch dimensions."""
+        some = super().__getitem__(index)
+        source = EstimatedFrom(self.n_samples, some.param_cov)
+        return replace(
+            some,
+            model=self.model.with_params(some.params, estimated_from=source),
+            notes=items_of(self.notes, self.converged.shape, index),
+            axes=axes_of(self.axes, index),
+        )
+
+    @property
+    def std_err(self) -> Tensor:
+        """Standard errors of the parameters, `(..., sensor, parameter)`; zero for variances estimated as zero."""
+        return self.param_cov.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
 
     @property
     def n_samples(self) -> int:
@@ -146,13 +185,12 @@ class GMWMResult:
         kind = "GMWM fit, refined by spectral likelihood," if self.refined else "GMWM fit"
         robust = f", robust, efficiency {self.efficiency:g}" if self.efficiency < 1 else ""
         matched = f", {self.weighting} weighting" if self.weighting != "optimal" else ""
-        matched += ", log moments" if self.moments == "log" else ""
         levels = self.wavelet_variance.shape[-2]
         lines = [f"{kind} of {self.name}: {self.n_samples} samples, {counted(levels, 'level')}{matched}{robust}"]
         n_items = self.params.shape[:-1].numel()
         if batch:
             lines.append(f"{n_items} fits in a batch {tuple(batch)}, {int(self.converged.sum())} converged")
-        if n_items > _MOST_TABLES:
+        if n_items > MOST_TABLES:
             tested = self.p_value.isfinite()
             if bool(tested.any()):
                 refused = int((self.p_value[tested] < REFUSED).sum())
@@ -161,9 +199,6 @@ class GMWMResult:
         for index in itertools.product(*map(range, self.params.shape[:-1])):
             lines += ["", *self._table(index)]
         return "\n".join(lines)
-
-    def __str__(self) -> str:
-        return self.summary()
 
     def _table(self, index: tuple[int, ...]) -> list[str]:
         head = f"sensor {place(self.sensors, index, self.axes)}"
@@ -186,7 +221,7 @@ class GMWMResult:
             numbers = [f"{number:>13.{digits}g}" for number in (value, first, last)]
             rows.append(f"  {name:<24}{numbers[0]}  [{numbers[1]}, {numbers[2]}]{note}")
         item = sum(i * step for i, step in zip(index, self.identified.stride(), strict=True))
-        rows += [f"  {text}" for text in self.remarks[item]]
+        rows += [f"  {text}" for text in self.notes[item]]
         if self.rate and self.unit in DATASHEET_UNITS:
             rows += ["  " + line for line in self.datasheet(index).summary().splitlines()[1:]]
         return rows
@@ -195,7 +230,7 @@ class GMWMResult:
         """One sensor's model in datasheet units, where rate and unit of rate are known.
 
         Args:
-            index: Of the sensor among the leading dimensions.
+            index: Index of the sensor among the leading dimensions.
         """
         own, levels = self.model.with_params(self.params[index]), self.wavelet_variance.shape[-2]
         return datasheet(own, self.rate or 1.0, self.unit or "", n_levels=levels)
@@ -204,8 +239,8 @@ class GMWMResult:
         """Draw one sensor's Allan deviation with intervals, the fitted model and each of its components.
 
         Args:
-            ax: Where to draw; a new figure by default.
-            index: Of the sensor among the leading dimensions; the first by default.
+            ax: Axes to draw on; a new figure by default.
+            index: Index of the sensor among the leading dimensions; the first by default.
         """
         from gyrofuse.fitting.plots import plot_moment_fit
 
@@ -213,10 +248,9 @@ class GMWMResult:
         measured = self.wavelet_variance.mT[index]
         model = self.model.with_params(self.params[index])
         covariance = self.records.covariance(model)
-        spread = covariance.diagonal()
         # Degrees of freedom of the model: a variance that came out small by chance would seem to have none.
-        degrees = 2 * model.wavelet_variance(len(measured)).square() / spread
-        limits = chi_square_interval(measured, degrees, self.confidence_level)
+        dof = 2 * model.wavelet_variance(len(measured)).square() / covariance.diagonal()
+        limits = chi_square_interval(measured, dof, self.confidence_level)
         return plot_moment_fit(
             measured,
             limits,
@@ -229,34 +263,34 @@ class GMWMResult:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain numbers and lists; what is not known is None."""
-        low, high = self.confidence_interval
-        return {
-            "model": cleaned(self.model.to_dict()),
-            "param_names": list(self.param_names),
-            "params": listed(self.params),
-            "param_cov": listed(self.param_cov),
-            "confidence_interval": {"low": listed(low), "high": listed(high)},
-            "confidence_level": self.confidence_level,
-            "determined": self.determined.tolist(),
-            "identified": self.identified.tolist(),
-            "remarks": [list(texts) for texts in self.remarks],
-            "objective": listed(self.objective),
-            "j_statistic": listed(self.j_statistic),
-            "p_value": listed(self.p_value),
-            "converged": self.converged.tolist(),
-            "wavelet_variance": listed(self.wavelet_variance),
-            "fitted_wavelet_variance": listed(self.fitted_wavelet_variance),
-            "n_samples": self.n_samples,
-            "weighting": self.weighting,
-            "moments": self.moments,
-            "refined": self.refined,
-            "efficiency": self.efficiency,
-            "sensors": list(self.sensors),
-            "axes": list(self.axes),
-            "rate": self.rate,
-            "unit": self.unit,
-        }
+        """Everything as plain lists and numbers, ready for JSON (NaN and infinities as None)."""
+        named = [entry.name for entry in fields(self) if entry.name not in ("notes", "records")]
+        known = {name: plain(getattr(self, name)) for name in named}
+        others = {"remarks": self.notes, "n_samples": self.n_samples, "efficiency": self.efficiency}
+        return known | {name: plain(value) for name, value in others.items()} | {"moments": "variance"}
+
+
+def items_of(values: Sequence[T], shape: Sequence[int], index: Any) -> tuple[T, ...]:
+    """What items of a batch have, where it is listed item after item.
+
+    Args:
+        values: One for each item of all dimensions.
+        shape: Dimensions of the batch.
+        index: Index into the first dimensions.
+    """
+    places = torch.arange(len(values)).view(*shape)[index]
+    return tuple(values[i] for i in places.flatten().tolist())
+
+
+def axes_of(axes: tuple[str, ...], index: Any) -> tuple[str, ...]:
+    """Names along the leading dimension after indexing; none where one of them was taken.
+
+    Args:
+        axes: Names, as many as the leading dimension is long, or none.
+        index: Index into the first dimensions.
+    """
+    places = torch.arange(len(axes))[index[0] if isinstance(index, tuple) else index] if axes else torch.tensor(0)
+    return tuple(axes[i] for i in places.tolist()) if places.ndim else ()
 
 
 def _digits(value: float, width: float) -> int:

@@ -11,17 +11,17 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.checks import check_signal
-from gyrofuse._base.results import listed, place
+from gyrofuse._base.deprecation import RenamedAttribute
+from gyrofuse._base.results import Result, place, scattered
 from gyrofuse.fitting.gmwm import fit_gmwm
 from gyrofuse.fitting.gmwm_result import GMWMResult
 from gyrofuse.fitting.moments import search
-from gyrofuse.fitting.moments.drift_sign import drifts_of, signed
-from gyrofuse.fitting.moments.fit import composition_of, fit_items
-from gyrofuse.fitting.moments.identifiability import remarks
+from gyrofuse.fitting.moments.fit import composition_of, fit_batch
+from gyrofuse.fitting.moments.identifiability import drifts_of, notes, signed
 from gyrofuse.fitting.moments.inference import Fit, infer
 from gyrofuse.fitting.moments.profile import profiled
-from gyrofuse.fitting.moments.profile_surfaces import MomentSurface
-from gyrofuse.fitting.moments.records import Records
+from gyrofuse.fitting.moments.profile_objectives import MomentProfile
+from gyrofuse.fitting.moments.records import SampleDesign
 from gyrofuse.fitting.moments.white_kurtosis import white_excess_kurtosis, with_excess_kurtosis
 from gyrofuse.fitting.spectral.model_tones import model_tones
 from gyrofuse.fitting.structure import Composition
@@ -32,32 +32,45 @@ from gyrofuse.wavelets.equivalent_dof import chi_square_tail
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Below this p-value the recordings are said to differ.
+# P value below which the recordings count as different: one in a hundred that agree does.
 _DIFFERENT = 0.01
-_STEPS = 200
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class JointFit:
+class JointFit(Result):
     """One model for several recordings, beside those of each; `...` are the leading dimensions of the signals.
 
     Attributes:
-        joint: The one model. Its J test is that of the pooled wavelet variances.
-        separate: Of each recording alone.
-        statistic: How much better the recordings are fitted apart than together, `(..., sensor)`.
-        degrees: Of freedom of the statistic, `(..., sensor)`: parameters of the joint fit that are not zero, once for
-            each recording but one.
-        p_value: Of the test that all recordings have the same parameters, `(..., sensor)`.
-        shift: Parameters of each recording less those of the joint fit, in standard deviations of the former,
+        joint: Fit of one model to all recordings. Its J test is that of the pooled wavelet variances.
+        separate: Fits of each recording alone.
+        statistic: Objectives at the joint fit less those at the fits of each recording, `(..., sensor)`.
+        dof: Degrees of freedom of the statistic, `(..., sensor)`: parameters of the joint fit that are not zero, once
+            for each recording but one.
+        p_value: P value of the test that all recordings have the same parameters, `(..., sensor)`.
+        shift: Parameters of each recording less those of the joint fit, in standard errors of the recording's fit,
             `(recording, ..., sensor, parameter)`; NaN where a variance is zero.
     """
 
     joint: GMWMResult
     separate: tuple[GMWMResult, ...]
     statistic: Tensor
-    degrees: Tensor
+    dof: Tensor
     p_value: Tensor
     shift: Tensor
+
+    degrees = RenamedAttribute("dof")
+    _batched = ("joint", "statistic", "dof", "p_value")
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading dimensions before the sensors; `()` for a single array."""
+        return tuple(self.p_value.shape[:-1])
+
+    def __getitem__(self, index: Any) -> JointFit:
+        """One item, or some, of the leading batch dimensions."""
+        one_by_one = (part[index] for part in self.shift)
+        separate = tuple(one[index] for one in self.separate)
+        return replace(super().__getitem__(index), separate=separate, shift=torch.stack(list(one_by_one)))
 
     @property
     def model(self) -> Model:
@@ -95,12 +108,9 @@ class JointFit:
                 lines.append(f"  {name:<24}" + "".join(f"{value:>14.6g}" for value in values) + f"{largest:>16}")
         return "\n".join(lines)
 
-    def __str__(self) -> str:
-        return self.summary()
-
     def _verdict(self, index: tuple[int, ...]) -> str:
         p = self.p_value[index].item()
-        told = f"chi-square = {self.statistic[index].item():.4g}, {int(self.degrees[index])} degrees, p = {p:.2g}"
+        told = f"chi-square = {self.statistic[index].item():.4g}, {int(self.dof[index])} degrees, p = {p:.2g}"
         if p >= _DIFFERENT:
             return f"the recordings agree ({told})"
         return f"not stationary between the recordings ({told}); the joint fit is an average"
@@ -109,8 +119,8 @@ class JointFit:
         """Draw the joint fit of one sensor and the Allan deviations of the recordings.
 
         Args:
-            ax: Where to draw; a new figure by default.
-            index: Of the sensor among the leading dimensions; the first by default.
+            ax: Axes to draw on; a new figure by default.
+            index: Index of the sensor among the leading dimensions; the first by default.
         """
         from gyrofuse.fitting.plots import add_recordings
 
@@ -120,18 +130,11 @@ class JointFit:
         return ax
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain numbers and lists; what is not known is None."""
-        return {
-            "joint": self.joint.to_dict(),
-            "separate": [one.to_dict() for one in self.separate],
-            "statistic": listed(self.statistic),
-            "degrees": listed(self.degrees),
-            "p_value": listed(self.p_value),
-            "shift": listed(self.shift),
-        }
+        """Everything as plain lists and numbers, ready for JSON (NaN and infinities as None)."""
+        return {"degrees" if name == "dof" else name: value for name, value in super().to_dict().items()}
 
 
-def fit_jointly(
+def fit_gmwm_joint(
     recordings: Sequence[Tensor | Recording],
     model: Model | str,
     *,
@@ -141,16 +144,15 @@ def fit_jointly(
     """Fit one noise model to several recordings of the same sensors, and test whether they agree.
 
     The wavelet variances are pooled, each level weighted by its number of coefficients, and fitted with the covariance
-    of that mean. Recordings agree when fitting each by itself, with the weights of the joint fit, brings the objectives
-    down by no more than chance does: their difference is chi-square with as many degrees of freedom as there are
-    parameters, once for each recording but one. Where the J test refuses the model itself, the difference is too large
-    as well.
+    of that mean. If the recordings agree, fits of each recording with the weights of the joint fit lower the sum of the
+    objectives by a chi-square variable with as many degrees of freedom as there are parameters, once for each recording
+    but one. Where the J test rejects the model itself, the difference is too large as well.
 
     Args:
-        recordings: At least two `(..., sensor, time)` or `Recording`s of the same sensors in the same unit at the same
-            rate; their lengths may differ.
+        recordings: List of at least two `(..., sensor, time)` or `Recording`s of the same sensors in the same unit at
+            the same rate; their lengths may differ.
         model: As for `fit_gmwm`.
-        n_levels: Most levels of each; by default all that hold two windows side by side in it.
+        n_levels: Largest number of levels of each; by default all that hold two non-overlapping windows in it.
         confidence_level: Probability that an interval holds the true value.
 
     Returns:
@@ -167,7 +169,7 @@ def fit_jointly(
     signals = _checked(recordings)
     separate = tuple(fit_gmwm(one, model, n_levels=n_levels, confidence_level=confidence_level) for one in recordings)
     first = separate[0]
-    records = Records(
+    records = SampleDesign(
         tuple(signal.shape[-1] for signal in signals), tuple(one.wavelet_variance.shape[-2] for one in separate)
     )
     made_of = composition_of(model, held=True)
@@ -176,26 +178,23 @@ def fit_jointly(
     apart = [variance[usable] for variance in apart]
     nu = records.pooled(apart)
     frequencies, disagreement = _frequencies(separate, made_of, usable)
-    fit = fit_items(nu, frequencies, records, made_of, "optimal")
+    fit = fit_batch(nu, frequencies, records, made_of, "optimal")
     inference = infer(fit, made_of, confidence_level)
-    inference = profiled(inference, MomentSurface(fit, made_of), fit, made_of, confidence_level)
+    inference = profiled(inference, MomentProfile(fit, made_of), fit, made_of, confidence_level)
     kappa = _excess_kurtosis(signals, usable, made_of, inference.estimates.params)
     inference = with_excess_kurtosis(inference, kappa, made_of, sum(records.lengths), confidence_level)
 
-    whole = first.wavelet_variance.new_full((len(usable), records.n_levels), torch.nan)
-    whole[usable] = nu
-    said = remarks(made_of, inference.estimates, records.longest, confidence_level)
     model_of = Model(list(made_of.processes))
-    # Ramps of the recordings, with their signs, say which way their mean goes.
+    # The sign of a drift is that of the sum of the slopes of the recordings.
     every = torch.stack([one.params.flatten(0, -2)[usable] for one in separate]).sum(0)
     slopes = every[:, drifts_of(model_of)].sum(-1)
     sign = torch.where(slopes < 0, -1.0, 1.0).to(torch.float64)
     joint = GMWMResult.build(
         inference=replace(inference, estimates=signed(inference.estimates, model_of, sign)),
-        remarks=said,
+        notes=notes(made_of, inference.estimates, records.longest, confidence_level),
         made_of=made_of,
         usable=usable,
-        wavelet_variance=whole,
+        wavelet_variance=scattered(nu, usable, (len(usable),)),
         batch=first.params.shape[:-1],
         records=records,
         weighting="optimal",
@@ -208,19 +207,14 @@ def fit_jointly(
     difference = _difference(apart, fit, made_of, kappa) + disagreement
     present = fit.linear > 0
     known = present.sum(-1) + present[:, made_of.shaped].sum(-1)
-    degrees = ((len(signals) - 1) * known).to(difference)
-
-    def placed(value: Tensor) -> Tensor:
-        every = value.new_full((len(usable),), torch.nan)
-        every[usable] = value
-        return every.view(first.params.shape[:-1])
-
+    dof = ((len(signals) - 1) * known).to(difference)
+    batch = first.params.shape[:-1]
     return JointFit(
         joint=joint,
         separate=separate,
-        statistic=placed(difference),
-        degrees=placed(degrees),
-        p_value=placed(chi_square_tail(difference, degrees)),
+        statistic=scattered(difference, usable, batch),
+        dof=scattered(dof, usable, batch),
+        p_value=scattered(chi_square_tail(difference, dof), usable, batch),
         shift=torch.stack([_shift(one, joint) for one in separate]),
     )
 
@@ -252,9 +246,10 @@ def _checked(recordings: Sequence[Tensor | Recording]) -> list[Tensor]:
 def _frequencies(
     separate: tuple[GMWMResult, ...], made_of: Composition, usable: Tensor
 ) -> tuple[tuple[Tensor, Tensor] | None, Tensor]:
-    """Mean `beta` of the sinusoids over the recordings and its spread, `(item, sinusoid)`, and how far they disagree.
+    """Mean `beta` of the sinusoids over the recordings and its standard error, `(item, sinusoid)`, and a test of it.
 
-    The latter is chi-square with one degree of freedom for each sinusoid and recording but one, `(item,)`.
+    The test statistic, that the frequencies agree, is chi-square with one degree of freedom for each sinusoid and
+    recording but one, `(item,)`.
     """
     names = [f"sinusoid_{k + 1}.beta" for k in range(sum(p.has_line for p in made_of.processes))]
     if not names:
@@ -270,9 +265,9 @@ def _frequencies(
 
 
 def _excess_kurtosis(signals: list[Tensor], usable: Tensor, made_of: Composition, params: Tensor) -> Tensor:
-    """Of the white noise of all recordings, of one variance, `(item,)`: the mean, each with as much as it has samples.
+    """Excess kurtosis of the white noise of all recordings, `(item,)`: the mean weighted by their lengths.
 
-    One for all, as the test asks whether they could be of one noise.
+    It is the same for all, as under the hypothesis of the test they have one noise.
     """
     lengths = [signal.shape[-1] for signal in signals]
     total = torch.zeros_like(params[:, 0])
@@ -294,11 +289,11 @@ def _difference(apart: list[Tensor], fit: Fit, made_of: Composition, kappa: Tens
         tau = fit.tau[: nu.shape[-1]]
         residual = nu - made_of.wavelet_variance(tau, linear, fit.shape)
         together = (root @ residual[..., None]).square().sum((-2, -1))
-        _, _, alone, _ = search.minimise(nu, root, tau, made_of, fit.shape, _STEPS)
+        _, _, alone, _ = search.minimise(nu, root, tau, made_of, fit.shape, n_steps=200)
         total = total + together - alone
     return total.clamp(min=0)
 
 
 def _shift(one: GMWMResult, joint: GMWMResult) -> Tensor:
-    sd = one.param_cov.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
-    return torch.where(sd > 0, (one.params - joint.params) / sd, torch.nan)
+    """Parameters of one recording less those of the joint fit, in its standard errors."""
+    return torch.where(one.std_err > 0, (one.params - joint.params) / one.std_err, torch.nan)

@@ -19,10 +19,8 @@ if TYPE_CHECKING:
 # Okabe and Ito without the blue of the sum.
 _COLOURS = ("#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 _STYLES = ("--", "-.", ":")
-# Of a legend, a row as a share of the axes' height.
-_LEGEND_COLUMNS, _LEGEND_ROW = 4, 0.07
 _FADED = "#b8b8b8"
-# Of the criterion, up to which its axis is linear.
+# Difference of criteria up to which their axis is linear: beyond, candidates are out of question.
 _LINEAR = 10.0
 
 
@@ -40,14 +38,14 @@ def plot_moment_fit(
     """Draw a measured Allan deviation `sqrt(2 nu)` with intervals, that of the fitted model, and its components.
 
     Args:
-        wavelet_variance: `(level,)`, signal^2.
-        limits: Lower and upper limits of it, `(level,)` each.
-        model: Fitted, with scalar parameters.
-        confidence_level: Of the limits, for the legend.
-        rate: Hz; without it the averaging times are in samples.
+        wavelet_variance: Measured wavelet variance `(level,)`, signal^2.
+        limits: Its lower and upper limits, `(level,)` each.
+        model: Fitted model with scalar parameters.
+        confidence_level: Probability that the limits hold the true value, for the legend.
+        rate: Sampling rate in Hz; without it the averaging times are in samples.
         unit: Unit of the signal.
-        title: Of the axes.
-        ax: Where to draw; new axes by default.
+        title: Title of the axes.
+        ax: Axes to draw on; new ones by default.
 
     Returns:
         The axes.
@@ -81,11 +79,12 @@ def plot_moment_fit(
     time_axis(ax, rate is not None)
     if title:
         ax.set_title(title, loc="left", fontsize=10, parse_math=False)
-    # Curves go on to the lower edge, and above all of them there is room for the legend.
+    # Curves go on to the lower edge; above them there is space for the legend, 7 % of the height for each of its rows.
+    columns, row = 4, 0.07
     bottom, top = (2 * floor) ** 0.5, (2 * max(shown.nan_to_num().max().item(), floor)) ** 0.5
-    room = _LEGEND_ROW * (1 + -(-len(labels) // _LEGEND_COLUMNS))
-    ax.set_ylim(bottom, top * (top / bottom) ** (room / (1 - room)))
-    finish(ax, handles, labels, loc="upper center", ncols=_LEGEND_COLUMNS)
+    space = row * (1 + -(-len(labels) // columns))
+    ax.set_ylim(bottom, top * (top / bottom) ** (space / (1 - space)))
+    finish(ax, handles, labels, loc="upper center", ncols=columns)
     return ax
 
 
@@ -93,9 +92,9 @@ def plot_residuals(residuals: Tensor, *, rate: float | None = None, ax: Axes | N
     """Draw wavelet variances measured less fitted, in standard deviations, with the range of 95 % of them.
 
     Args:
-        residuals: `(level,)`.
-        rate: Hz; without it the averaging times are in samples.
-        ax: Where to draw; new axes by default.
+        residuals: Residuals, `(level,)`, in standard deviations.
+        rate: Sampling rate in Hz; without it the averaging times are in samples.
+        ax: Axes to draw on; new ones by default.
 
     Returns:
         The axes.
@@ -125,12 +124,12 @@ def plot_resampled(
     """Draw how far the parameters of resamples are from the estimates, in standard deviations of the resamples.
 
     Args:
-        names: Of the parameters.
-        bias: `(parameter,)`.
-        percentile: Lower and upper limits, `(parameter,)` each.
-        studentized: The same.
-        percent: Probability of both intervals.
-        ax: Where to draw; new axes by default.
+        names: Names of the parameters.
+        bias: Mean of the resampled estimates less the estimate, `(parameter,)`.
+        percentile: Lower and upper limits by percentiles, `(parameter,)` each.
+        studentized: Lower and upper studentized limits, `(parameter,)` each.
+        percent: Probability of both intervals, %.
+        ax: Axes to draw on; new ones by default.
 
     Returns:
         The axes.
@@ -163,14 +162,14 @@ def plot_ranking(
     """Draw the criteria of candidates over that of the chosen one.
 
     Args:
-        names: Of the candidates, from the best on.
-        difference: Of their criteria, `(candidate,)`.
-        standings: Of each `chosen`, `not told from it`, `redundant` or nothing.
-        refused: Whether the J test refuses the chosen one.
+        names: Names of the candidates, from the best on.
+        difference: Criteria less that of the chosen one, `(candidate,)`.
+        standings: Standing of each: `chosen`, `not told from it`, `redundant` or nothing.
+        refused: Whether the J test rejects the chosen one.
         aside: Candidates that were not compared.
-        title: Of the axes.
-        note: On what is not shown, to the right of the title.
-        ax: Where to draw; new axes by default.
+        title: Title of the axes.
+        note: Note on what is not shown, to the right of the title.
+        ax: Axes to draw on; new ones by default.
 
     Returns:
         The axes.
@@ -198,7 +197,7 @@ def plot_ranking(
     ticks = [-t for t in decades if t <= -least] + [0.0, _LINEAR / 2] + [t for t in decades if t <= 4 * most]
     ax.set_xticks(sorted(ticks), [f"{t:.6g}" for t in sorted(ticks)])
     ax.set_xticks([], minor=True)
-    ax.set_xlim(1.5 * least - 0.1 * _LINEAR, 4 * most)  # room for the numbers
+    ax.set_xlim(1.5 * least - 0.1 * _LINEAR, 4 * most)  # space for the numbers
     ax.set_xlabel("criterion over that of the chosen model (half nats)")
     if title:
         ax.set_title(title, loc="left", fontsize=10, parse_math=False)
@@ -213,9 +212,9 @@ def add_recordings(wavelet_variances: list[Tensor], *, rate: float | None = None
     """Add the Allan deviations of several recordings to the figure of their joint fit.
 
     Args:
-        wavelet_variances: `(level,)` of each.
-        rate: Hz; without it the averaging times are in samples.
-        ax: Of `plot_moment_fit`.
+        wavelet_variances: Wavelet variance `(level,)` of each recording.
+        rate: Sampling rate in Hz; without it the averaging times are in samples.
+        ax: Axes that `plot_moment_fit` returned.
     """
     for variance in wavelet_variances:
         times = np.exp2(np.arange(len(variance))) / (rate or 1.0)

@@ -1,4 +1,4 @@
-"""The noise that a virtual gyro is left with, as a model that a filter can be told.
+"""Noise of a virtual gyro, as a model that a filter can assume.
 
 A virtual gyro is a known linear filter of its sensors, so that the noise of the sensors makes its own. One vector of
 weights `c` leaves every process of an array with the variance `c' Theta c`, exactly. Bands have the response
@@ -24,19 +24,15 @@ from gyrofuse._base.nnls import nonnegative_least_squares
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.processes import AR1, Model, Process, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
 
-# Frequencies of an octave, enough to follow the ripples of a moving mean, and AR1s of an octave of time constants.
-_NODES, _PER_OCTAVE = 16, 2
-# Octaves below the slowest band and the slowest AR1, in which a random walk is all that still changes.
-_SLOWER = 4
-# Share of the power at every frequency below which a process is a rounding of the others.
-_NEGLIGIBLE = 1e-6
+# Frequencies in an octave: enough to follow the ripples of a moving mean.
+_NODES = 16
 
 
 class VirtualNoise(NamedTuple):
     """Noise of a virtual gyro.
 
     Attributes:
-        model: What it is, signal units, one step per sample.
+        model: Noise model, signal units, one step per sample.
         deviation: Largest relative difference between the power of the model and the true power in any octave of
             frequency; 0 for one vector of weights, whose model is exact.
     """
@@ -62,7 +58,7 @@ def virtual_noise(weights: Tensor, array: ArrayModel) -> VirtualNoise:
     Example:
         >>> bands = fit_multiscale(recording)
         >>> noise = virtual_noise(bands.weights, fit_array_gmwm(recording, "WN + AR1 + RW").model)
-        >>> told = UnitErrors(noise.model.scaled(math.radians(1)), accelerometer, rate)
+        >>> assumed = UnitErrors(noise.model.scaled(math.radians(1)), accelerometer, rate)
     """
     if weights.ndim not in (1, 2) or weights.shape[-1] != array.n_sensors:
         raise ValueError(
@@ -80,7 +76,8 @@ def virtual_noise(weights: Tensor, array: ArrayModel) -> VirtualNoise:
         return VirtualNoise(_sum(_scaled(left) + lines), 0.0)
     own: list[Process] = [process for process, _ in noise if process.has_memory()]
     slowest = max([-1 / math.log(float(process.params[0])) for process in own if process.params[0] > 0], default=1.0)
-    octaves = max(len(bands), math.ceil(math.log2(max(slowest, 1.0)))) + _SLOWER
+    # Four octaves below the slowest band and the slowest AR1 only a random walk still changes.
+    octaves = max(len(bands), math.ceil(math.log2(max(slowest, 1.0)))) + 4
     f = torch.exp2(-1 - (torch.arange(octaves * _NODES, dtype=torch.float64) + 0.5) / _NODES)
     through = response(bands, f)  # (sensor, frequency)
     spectrum = torch.zeros_like(f)
@@ -102,15 +99,17 @@ def response(bands: Tensor, f: Tensor) -> Tensor:
 
 def _approximated(f: Tensor, spectrum: Tensor, octaves: int, own: list[Process]) -> tuple[list[Model], float]:
     """Processes whose spectra add up to one, by least squares of the relative difference, and how far they are off."""
-    times = torch.exp2(torch.arange(octaves * _PER_OCTAVE, dtype=torch.float64) / _PER_OCTAVE)
+    per_octave = 2  # AR1s in an octave of time constants: the spectrum of any one between them is followed
+    times = torch.exp2(torch.arange(octaves * per_octave, dtype=torch.float64) / per_octave)
     units: list[Process] = [WhiteNoise(1.0), QuantizationNoise(1.0), RandomWalk(1.0)]
     units += [AR1(math.exp(-1 / time), 1.0) for time in times.tolist()] + own
     relative = torch.stack([unit.spectrum(f) for unit in units], -1) / spectrum[:, None]  # (frequency, process)
     size = relative.square().mean(0).sqrt()
     design = relative / size
     shares = nonnegative_least_squares(design.mT @ design, design.sum(0))
-    shares = torch.where((design * shares).amax(0) > _NEGLIGIBLE, shares, 0.0)
-    # In every octave, to a filter that integrates what counts is the power.
+    # A millionth of the power at every frequency is a rounding of the other processes.
+    shares = torch.where((design * shares).amax(0) > 1e-6, shares, 0.0)
+    # A filter that integrates depends on the power in every octave.
     power = (design @ shares * spectrum).unflatten(0, (octaves, _NODES)) * f.unflatten(0, (octaves, _NODES))
     exact = (spectrum * f).unflatten(0, (octaves, _NODES)).sum(-1)
     off = (power.sum(-1) / exact - 1).abs().max().item()

@@ -223,7 +223,7 @@ class Fit:
                     "p_value": float(fit.p_value[at]),
                     "converged": bool(fit.converged[at]),
                     "identified": bool(fit.identified[at]),
-                    "remarks": list(fit.remarks[number]),
+                    "remarks": list(fit.notes[number]),
                     "quantities": [entry.name for entry in entries],
                     "figures": [entry.value for entry in entries],
                     "figure_units": [entry.unit for entry in entries],

@@ -62,7 +62,7 @@ def diagnose(
         recording: What a real array gave; its auxiliary channels are used. A tensor is `(sensor, time)`.
         simulation: What a simulator gives for the same array: samples, of any length and without channels, or a noise
             model, one for all sensors, with batched parameters one for each, or an `ArrayModel`; a fit of any kind
-            (`fit_gmwm`, `fit_array_gmwm`, `fit_jointly`, `rank_models`), which stands for its model; or a simulation
+            (`fit_gmwm`, `fit_array_gmwm`, `fit_gmwm_joint`, `rank_models`), which stands for its model; or a simulation
             that another diagnosis repaired (`report.model`), whose effects then count as known; what happened once (a
             step, an episode) does where the recording has it.
         false_alarm: Probability of a finding where nothing is missing.

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 import gyrofuse as gf
+from gyrofuse.fitting import GMWMResult
 from gyrofuse.fitting import bootstrap as moment_bootstrap
 
 MODEL = gf.WhiteNoise(1.0) + gf.RandomWalk(1e-2)
@@ -25,7 +26,7 @@ def signals(n: int = 2, n_samples: int = 2048) -> Tensor:
 
 
 @pytest.fixture(scope="module")
-def fitted() -> gf.GMWMResult:
+def fitted() -> GMWMResult:
     return gf.fit_gmwm(signals(), "WN + RW")
 
 
@@ -35,7 +36,7 @@ def test_it_is_what_a_loop_over_fits_gives(fitted):
     records = fitted.model.simulate(2048, batch=(30,), generator=seeded(1))
     again = gf.fit_gmwm(records, "WN + RW")
     torch.testing.assert_close(found.bias, again.params.mean(0) - fitted.params, rtol=1e-6, atol=1e-12)
-    torch.testing.assert_close(found.std, again.params.std(0), rtol=1e-6, atol=1e-12)
+    torch.testing.assert_close(found.std_err, again.params.std(0), rtol=1e-6, atol=1e-12)
     torch.testing.assert_close(found.percentile.high, again.params.quantile(0.975, 0), rtol=1e-6, atol=1e-12)
     larger = (again.j_statistic >= fitted.j_statistic).sum(0)
     torch.testing.assert_close(found.p_value, (1 + larger) / 31, check_dtype=False)
@@ -51,17 +52,17 @@ def test_chunks_do_not_matter(fitted, monkeypatch):
     whole = gf.bootstrap_gmwm(fitted, 20, generator=seeded(1))
     monkeypatch.setattr(moment_bootstrap, "_SAMPLES_AT_ONCE", 1)
     parts = gf.bootstrap_gmwm(fitted, 20, generator=seeded(1))
-    assert parts.std.shape == whole.std.shape
+    assert parts.std_err.shape == whole.std_err.shape
     # Other records, as draws come in another order, of the same law: within 4 standard errors of a ratio of two.
-    assert ((parts.std / whole.std).log().abs() < 4 / 20**0.5).all()
+    assert ((parts.std_err / whole.std_err).log().abs() < 4 / 20**0.5).all()
 
 
 def test_spread_is_that_of_theory(fitted):
     """Within 4 standard errors, 14 %, and 10 % for the linearisation."""
     found = gf.bootstrap_gmwm(fitted, 400, generator=seeded(2))
     said = fitted.param_cov.diagonal(dim1=-2, dim2=-1).sqrt()
-    assert ((found.std / said - 1).abs() < 0.24).all(), found.std / said
-    assert (found.bias.abs() < 0.3 * found.std).all()
+    assert ((found.std_err / said - 1).abs() < 0.24).all(), found.std_err / said
+    assert (found.bias.abs() < 0.3 * found.std_err).all()
 
 
 @pytest.mark.parametrize("weighting", ["optimal", "diagonal", "identity"])
@@ -85,7 +86,7 @@ def test_refined_fits_and_tones_are_fitted_the_same_way():
     again = gf.bootstrap_gmwm(found, 40, generator=seeded(7))
     assert again.n_failed.tolist() == [0]
     said = found.param_cov.diagonal(dim1=-2, dim2=-1).sqrt()
-    assert ((again.std / said).log().abs() < 4 / 80**0.5).all()
+    assert ((again.std_err / said).log().abs() < 4 / 80**0.5).all()
 
 
 def test_it_speaks_and_leaves_out_what_was_not_fitted():
@@ -94,8 +95,8 @@ def test_it_speaks_and_leaves_out_what_was_not_fitted():
     with pytest.warns(UserWarning, match="constant signal"):
         fitted = gf.fit_gmwm(signal, "WN + RW")
     found = gf.bootstrap_gmwm(fitted, 20, generator=seeded())
-    assert found.std[0].isfinite().all()
-    assert found.std[1].isnan().all()
+    assert found.std_err[0].isfinite().all()
+    assert found.std_err[1].isnan().all()
     assert "random_walk.variance" in str(found)
     assert json.loads(json.dumps(found.to_dict()))["p_value"][1] is None
 
@@ -124,7 +125,7 @@ def test_where_nothing_can_be_stated_it_says_why(fitted, monkeypatch):
     assert ", 19 not fitted" in text
     assert "nan" not in text
     assert found.p_value.isfinite().tolist() == [False, True]
-    assert found.std.isnan().all()  # of one resample there is no spread
+    assert found.std_err.isnan().all()  # of one resample there is no spread
 
 
 def test_a_variance_at_zero_is_referred_to_the_fit():
@@ -142,7 +143,7 @@ def test_figure_shows_intervals_in_standard_deviations(fitted):
     labels = [text.get_text() for text in ax.get_legend().get_texts()]
     assert labels == ["95 % percentile", "95 % studentized", "mean of the resamples"]
     drawn = torch.as_tensor(np.array([line[:, 0] for line in ax.collections[1].get_segments()]))
-    low, high = ((limit[1] - found.params[1]) / found.std[1] for limit in found.studentized)
+    low, high = ((limit[1] - found.params[1]) / found.std_err[1] for limit in found.studentized)
     torch.testing.assert_close(drawn, torch.stack([low, high], -1))
 
 

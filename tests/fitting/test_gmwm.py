@@ -14,6 +14,7 @@ from scipy import stats
 from torch import Tensor
 
 import gyrofuse as gf
+from gyrofuse.fitting import GMWMResult
 from gyrofuse.fitting.moments import search
 from gyrofuse.fitting.moments.fit import composition_of
 
@@ -26,7 +27,7 @@ def signals(n: int, n_samples: int = 8192, model: gf.Model = SIMULATION, seed: i
 
 
 @pytest.fixture(scope="module")
-def many() -> gf.GMWMResult:
+def many() -> GMWMResult:
     """200 records of 10 000 samples."""
     return gf.fit_gmwm(signals(200, 10_000, seed=3), FORMULA)
 
@@ -64,7 +65,7 @@ def test_published_criterion_is_reached_or_beaten(axis, formula):
     simts = published.table("simts")[axis]
     nu = torch.tensor(simts["wv"], dtype=torch.float64)
     omega = 1 / torch.tensor(simts["V_diag"], dtype=torch.float64)
-    found = gf.fit_gmwm(nu[:, None], formula, weighting=omega, n_samples=20_000)
+    found = gf.fit_gmwm_moments(nu[:, None], 20_000, formula, weighting=omega)
     assert found.objective.item() <= simts["obj"] * (1 + 1e-6)
     expected = torch.tensor(simts["opt"], dtype=torch.float64)
     named = dict(zip(found.param_names, found.params[0].tolist(), strict=True))
@@ -82,7 +83,7 @@ def test_no_start_finds_a_lower_minimum_of_noisy_copies(axis, formula):
     n = 40
     noise = torch.randn(n, len(nu), generator=generator, dtype=torch.float64)
     copies = nu * (noise * (variance.sqrt() / nu).clamp(max=0.5)).exp()
-    found = gf.fit_gmwm(copies.unsqueeze(-1), formula, weighting=1 / variance, n_samples=20_000)
+    found = gf.fit_gmwm_moments(copies.unsqueeze(-1), 20_000, formula, weighting=1 / variance)
     made_of = composition_of(formula, held=False)
     tau = 2.0 ** torch.arange(1, len(nu) + 1, dtype=torch.float64)
     best = torch.full((n,), torch.inf, dtype=torch.float64)
@@ -190,6 +191,8 @@ def test_one_bad_item_fails_alone():
         ({"model": "WN + FLICKER"}, "FLICKER"),
         ({"model": gf.WhiteNoise(1.0) + gf.AR1()}, "got values of white_noise.variance"),
         ({"model": "WN", "weighting": "best"}, "`weighting`: expected one of 'optimal'"),
+        ({"model": "WN", "weighting": "continuous"}, "`weighting`: .* got 'continuous'; 'optimal' has the smallest"),
+        ({"model": "WN", "moments": "log"}, "`moments`: expected 'variance', got 'log'; .* leave `moments` out"),
         ({"model": "WN", "weighting": torch.ones(3)}, r"expected \(12,\) or \(12, 12\)"),
         ({"model": "WN", "weighting": -torch.ones(12)}, "weights >= 0"),
         ({"model": "WN", "confidence_level": 1.0}, "`confidence_level`"),
@@ -206,9 +209,9 @@ def test_bad_wavelet_variances_are_told(value):
     nu = torch.ones(10, 1, dtype=torch.float64)
     nu[3] = value
     with pytest.raises(ValueError, match="finite and > 0 at every level"):
-        gf.fit_gmwm(nu, "WN", n_samples=2048)
+        gf.fit_gmwm_moments(nu, 2048, "WN")
     with pytest.raises(ValueError, match="at most 11 levels for 2048 samples"):
-        gf.fit_gmwm(torch.ones(12, 1), "WN", n_samples=2048)
+        gf.fit_gmwm_moments(torch.ones(12, 1), 2048, "WN")
 
 
 def test_result_speaks_draws_and_simulates_again():
@@ -278,21 +281,92 @@ def test_infinite_samples_are_no_measurement():
     with pytest.raises(ValueError, match="infinite samples"):
         gf.fit_gmwm(signal, "WN", strict=True)
     with pytest.raises(ValueError, match=r"`signal`: .* infinite samples"):
-        gf.fit_jointly([signal[:1], signal[1:]], "WN")
+        gf.fit_gmwm_joint([signal[:1], signal[1:]], "WN")
     signal[1, 7] = math.nan
     assert gf.fit_gmwm(signal, "WN").converged.all()
 
 
-def test_lengths_are_for_wavelet_variances_alone():
+def test_a_signal_is_no_wavelet_variance():
     signal = torch.randn(2, 1000, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
-    recording = gf.Recording(signal, rate=1.0)
-    for function in (gf.fit_gmwm, lambda values, model, **options: gf.rank_models(values, [model], **options)):
+    for function, model in ((gf.fit_gmwm_moments, "WN"), (gf.rank_models_moments, ["WN"])):
+        message = r"`wavelet_variance`: expected a wavelet variance .* got shape \(2, 1000\), that of"
+        with pytest.raises(ValueError, match=message):
+            function(signal, 1000, model)
+        with pytest.raises(TypeError, match="`wavelet_variance`: expected a torch tensor, got Recording"):
+            function(gf.Recording(signal, rate=1.0), 1000, model)
+
+
+def test_wavelet_variances_go_to_the_functions_for_signals_with_a_warning():
+    signal = torch.randn(2, 1000, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
+    variance = gf.wavelet_variance(signal)
+    calls = {
+        "fit_gmwm": lambda values: gf.fit_gmwm(values, "WN + RW", n_samples=1000),
+        "rank_models": lambda values: gf.rank_models(values, ["WN"], n_samples=1000, fit=False),
+    }
+    for name, call in calls.items():
+        with pytest.warns(DeprecationWarning, match=f"`n_samples` of {name} is deprecated .* use {name}_moments"):
+            call(variance)
         with pytest.raises(ValueError, match=r"`n_samples`: expected None with a Recording, .* got 1000; leave it out"):
-            function(recording, "WN", n_samples=1000)
-        with pytest.raises(
-            ValueError, match=r"`signal`: expected a wavelet variance .* got shape \(2, 1000\), that of"
-        ):
-            function(signal, "WN", n_samples=1000)
+            call(gf.Recording(signal, rate=1.0))
+    expected = gf.fit_gmwm_moments(variance, 1000, "WN + RW")
+    with pytest.warns(DeprecationWarning, match="n_samples"):
+        torch.testing.assert_close(calls["fit_gmwm"](variance).params, expected.params, rtol=0, atol=0)
+    wccv = gf.wavelet_cross_covariance(signal)
+    with pytest.warns(DeprecationWarning, match="use fit_array_gmwm_moments"):
+        found = gf.fit_array_gmwm(wccv, "WN", n_samples=1000)
+    assert torch.equal(found.theta, gf.fit_array_gmwm_moments(wccv, 1000, "WN").theta)
+
+
+def test_old_names_of_fits_work_with_a_warning():
+    signal = torch.randn(2, 1000, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
+    with pytest.warns(DeprecationWarning, match="argument `moments` of fit_gmwm"):
+        found = gf.fit_gmwm(signal, "WN + RW", moments="variance")
+    with pytest.warns(DeprecationWarning, match="GMWMResult.remarks is deprecated .* use notes"):
+        assert found.remarks == found.notes
+    with pytest.warns(DeprecationWarning, match="use gyrofuse.fitting.GMWMResult"):
+        assert gf.GMWMResult is GMWMResult
+    with pytest.warns(DeprecationWarning, match="fit_gmwm_joint"):
+        joint = gf.fit_jointly([signal, signal], "WN")
+    with pytest.warns(DeprecationWarning, match="use dof"):
+        assert torch.equal(joint.degrees, joint.dof)
+    again = gf.bootstrap_gmwm(found, 20)
+    with pytest.warns(DeprecationWarning, match="use std_err"):
+        assert torch.equal(again.std, again.std_err)
+    array = gf.fit_array_gmwm(signal, "WN")
+    for old, new in {"theta_sd": "theta_std_err", "params_sd": "params_std_err", "degrees_of_freedom": "dof"}.items():
+        with pytest.warns(DeprecationWarning, match=f"use {new}"):
+            assert torch.equal(getattr(array, old), getattr(array, new))
+    with pytest.warns(DeprecationWarning, match="`max_tones` is deprecated .* use `max_sinusoids`"):
+        ranked = gf.rank_models(signal, ["WN"], max_tones=1, fit=False)
+    with pytest.warns(DeprecationWarning, match="use n_sinusoids"):
+        assert torch.equal(ranked.n_tones, ranked.n_sinusoids)
+
+
+def test_results_are_indexed_by_the_dimensions_of_the_batch():
+    """What an item of a batch holds is what a fit of the item alone holds, and prints alike."""
+    signal = torch.randn(3, 2, 1000, dtype=torch.float64, generator=torch.Generator().manual_seed(4)).cumsum(-1)
+    axes = gf.Recording(signal, rate=1.0, axes=("x", "y", "z"))
+    fits = gf.fit_gmwm(axes, "WN + AR1 + RW")
+    joints = gf.fit_gmwm_joint([signal, signal[..., :800]], "WN + RW")
+    ranked = gf.rank_models(axes, ["RW", "WN + RW"])
+    again = gf.bootstrap_gmwm(fits, 20, generator=torch.Generator().manual_seed(1))
+    for result in (fits, joints, ranked, again):
+        assert result.batch_shape == (3,)
+        one = result[1]
+        assert one.batch_shape == ()
+        assert result[1:].batch_shape == (2,)
+        assert result[1:][0].to_dict() == one.to_dict()
+        with pytest.raises(IndexError, match="expected at most 0 indices"):
+            one[0]
+    assert torch.equal(fits[1].params, fits.params[1])
+    assert fits[1].notes == fits.notes[2:4]
+    assert (fits[1].axes, fits[1:].axes) == ((), ("y", "z"))
+    assert torch.equal(fits[1].model.params, fits.params[1])
+    assert ranked[2].best == ranked.best[4:]
+    assert torch.equal(joints[1].shift, joints.shift[:, 1])
+    assert torch.equal(fits.std_err, fits.param_cov.diagonal(dim1=-2, dim2=-1).sqrt())
+    alone = gf.fit_gmwm(gf.Recording(signal[1], rate=1.0), "WN + AR1 + RW")
+    assert str(alone) == str(fits[1])
 
 
 def test_limits_of_tones_are_printed_with_the_digits_they_need():
@@ -340,7 +414,7 @@ def test_a_drift_has_the_sign_of_the_signal(refine: bool):
     if not refine:
         again = gf.bootstrap_gmwm(fit, 20, generator=g)
         assert ((again.percentile.low[:, at] < slopes) & (slopes < again.percentile.high[:, at])).all()
-        joint = gf.fit_jointly([falling, falling], "WN + DR").joint
+        joint = gf.fit_gmwm_joint([falling, falling], "WN + DR").joint
         assert (joint.params[:, at].sign() == slopes.sign()).all()
 
 

@@ -87,10 +87,10 @@ def test_an_amplitude_that_stands_in_for_a_missing_process_is_told():
     signal = records(gf.AR1(-0.6, 1.0) + gf.Sinusoid(0.5, 2.7), 4)
     told = "sinusoid_1: the spectrum holds an amplitude of 0."
     found = gf.fit_gmwm(signal, "WN + SIN")
-    assert all(any(text.startswith(told) for text in texts) for texts in found.remarks)
+    assert all(any(text.startswith(told) for text in texts) for texts in found.notes)
     assert "refine the fit" in found.summary()
     for fit in (gf.fit_gmwm(signal, "AR1 + SIN"), gf.fit_gmwm(signal, "WN + SIN", refine=True)):
-        assert not any("stands in" in text for texts in fit.remarks for text in texts)
+        assert not any("stands in" in text for texts in fit.notes for text in texts)
 
 
 def test_ranked_and_fitted_agree_on_whether_a_model_is_complete():

@@ -12,8 +12,9 @@ from scipy import stats
 from torch import Tensor
 
 import gyrofuse as gf
+from gyrofuse.fitting import JointFit
 from gyrofuse.fitting.moments.covariance import moment_covariance
-from gyrofuse.fitting.moments.records import Records
+from gyrofuse.fitting.moments.records import SampleDesign
 
 TRUTH = gf.WhiteNoise(1.0) + gf.RandomWalk(1e-3)
 LENGTHS = (4096, 1500, 4096)
@@ -28,12 +29,12 @@ def recordings() -> tuple[Tensor, ...]:
 
 
 @functools.cache
-def joint() -> gf.JointFit:
-    return gf.fit_jointly(recordings(), "WN + RW")
+def joint() -> JointFit:
+    return gf.fit_gmwm_joint(recordings(), "WN + RW")
 
 
 def test_pooled_variances_and_their_covariance_are_those_of_loops():
-    records = Records((900, 300), (7, 5))
+    records = SampleDesign((900, 300), (7, 5))
     parts = [torch.rand(7, generator=torch.Generator().manual_seed(1)).double() + 1, torch.ones(5).double()]
     counts = np.zeros((2, 7))
     for r, (length, levels) in enumerate([(900, 7), (300, 5)]):
@@ -49,14 +50,14 @@ def test_pooled_variances_and_their_covariance_are_those_of_loops():
                 covariance[j, k] += share[j] * share[k] * own[r][j, k]
     np.testing.assert_allclose(records.pooled(parts), pooled, rtol=1e-12)
     np.testing.assert_allclose(records.covariance(TRUTH), covariance, rtol=1e-12)
-    np.testing.assert_allclose(Records((900, 900), (7, 7)).covariance(TRUTH), own[0] / 2, rtol=1e-12)
+    np.testing.assert_allclose(SampleDesign((900, 900), (7, 7)).covariance(TRUTH), own[0] / 2, rtol=1e-12)
     np.testing.assert_allclose(records.observations, np.maximum(3 * counts.sum(0) / 2 ** np.arange(1, 8), 1))
 
 
 def test_recordings_of_the_same_noise_agree_as_often_as_they_should():
     result = joint()
     assert bool(result.joint.converged.all())
-    assert (result.degrees[result.joint.params[:, 1] > 0] == 4).all()
+    assert (result.dof[result.joint.params[:, 1] > 0] == 4).all()
     for level in (0.05, 0.2):
         rejected = int((result.p_value < level).sum())
         assert stats.binomtest(rejected, N_RUNS, level).pvalue > 1e-3, (level, rejected)
@@ -78,7 +79,7 @@ def test_joint_intervals_hold_the_truth_and_are_narrower():
 def test_a_recording_with_other_noise_is_told():
     first, second, third = recordings()
     changed = [first, second, 1.1 * third]
-    result = gf.fit_jointly([x[:50] for x in changed], "WN + RW")
+    result = gf.fit_gmwm_joint([x[:50] for x in changed], "WN + RW")
     assert (result.p_value < 0.01).sum() >= 48
     white = result.shift[..., 0]
     assert (white[2] > 0).all()
@@ -88,8 +89,8 @@ def test_a_recording_with_other_noise_is_told():
 
 def test_sensors_and_axes_keep_their_places():
     first, second, _ = recordings()
-    alone = gf.fit_jointly([first[3:4], second[3:4]], "WN + RW")
-    axes = gf.fit_jointly([first[:6].view(2, 3, -1), second[:6].view(2, 3, -1)], "WN + RW")
+    alone = gf.fit_gmwm_joint([first[3:4], second[3:4]], "WN + RW")
+    axes = gf.fit_gmwm_joint([first[:6].view(2, 3, -1), second[:6].view(2, 3, -1)], "WN + RW")
     torch.testing.assert_close(axes.joint.params[1, 0], alone.joint.params[0], rtol=1e-6, atol=0)
     torch.testing.assert_close(axes.statistic[1, 0], alone.statistic[0], rtol=1e-5, atol=1e-8)
     assert axes.shift.shape == (2, 2, 3, 2)
@@ -98,7 +99,7 @@ def test_sensors_and_axes_keep_their_places():
 
 def test_copies_of_one_recording_give_its_own_fit():
     signal = recordings()[0][:4]
-    alone, twice = gf.fit_gmwm(signal, "WN + RW"), gf.fit_jointly([signal, signal], "WN + RW")
+    alone, twice = gf.fit_gmwm(signal, "WN + RW"), gf.fit_gmwm_joint([signal, signal], "WN + RW")
     torch.testing.assert_close(twice.joint.params, alone.params, rtol=1e-5, atol=0)
     torch.testing.assert_close(twice.joint.param_cov, alone.param_cov / 2, rtol=1e-3, atol=0)
     assert (twice.statistic < 1e-6).all()
@@ -113,27 +114,27 @@ def test_frequencies_are_averaged_and_compared():
         ]
         for second in (0.3, 0.302)
     )
-    same = gf.fit_jointly(still, "WN + SIN")
+    same = gf.fit_gmwm_joint(still, "WN + SIN")
     beta = same.joint.param_names.index("sinusoid_1.beta")
-    assert (same.degrees == 3).all()
+    assert (same.dof == 3).all()
     assert stats.binomtest(int((same.p_value < 0.05).sum()), 40, 0.05).pvalue > 1e-3
     low, high = (limit[:, beta] for limit in same.joint.confidence_interval)
     assert stats.binomtest(int(((low <= 0.3) & (high >= 0.3)).sum()), 40, 0.95).pvalue > 1e-3
-    assert (gf.fit_jointly(faster, "WN + SIN").p_value < 1e-3).all()
+    assert (gf.fit_gmwm_joint(faster, "WN + SIN").p_value < 1e-3).all()
 
 
 @pytest.mark.filterwarnings("ignore:`signal`")
 def test_a_sensor_that_is_dead_in_one_recording_fails_alone():
     first, second = recordings()[0][:3].clone(), recordings()[1][:3].clone()
     second[1] = 0.5
-    result = gf.fit_jointly([first, second], "WN + RW")
+    result = gf.fit_gmwm_joint([first, second], "WN + RW")
     assert result.p_value.isfinite().tolist() == [True, False, True]
     assert "sensor 2: not fitted" in result.summary()
     assert result.to_dict()["p_value"][1] is None
 
 
 def test_plot_and_dictionary():
-    result = gf.fit_jointly([gf.Recording(x[:2], rate=10.0, unit="deg/s") for x in recordings()], "WN + RW")
+    result = gf.fit_gmwm_joint([gf.Recording(x[:2], rate=10.0, unit="deg/s") for x in recordings()], "WN + RW")
     figure, ax = plt.subplots()
     assert result.plot(ax, index=(1,)) is ax
     assert len(ax.lines) >= 3 + 2
@@ -156,13 +157,13 @@ def test_plot_and_dictionary():
 )
 def test_recordings_that_do_not_go_together(change, message):
     with pytest.raises(ValueError, match=message):
-        gf.fit_jointly(change([x[:3] for x in recordings()]), "WN + RW")
+        gf.fit_gmwm_joint(change([x[:3] for x in recordings()]), "WN + RW")
 
 
 def test_real_replicates(data):
     """Three records of one unit at rest: the model of the paper, and whether its parameters stay."""
     records = [gf.read_recording(data / f"adis16405_rec{i}.npz") for i in (1, 2, 3)]
-    result = gf.fit_jointly([record.signal[:1, :200_000] for record in records], "WN + AR1 + RW")
+    result = gf.fit_gmwm_joint([record.signal[:1, :200_000] for record in records], "WN + AR1 + RW")
     assert bool(result.joint.converged.all())
     # It changes from record to record by many standard deviations, and the joint one lies between.
     phi = torch.stack([one.params[..., 1] for one in result.separate])

@@ -13,8 +13,8 @@ from torch import Tensor
 import gyrofuse as gf
 from gyrofuse.fitting.moments import search
 from gyrofuse.fitting.moments.fit import composition_of
-from gyrofuse.fitting.moments.profile_limits import crossings, grid
-from gyrofuse.fitting.moments.profile_surfaces import SpectralSurface
+from gyrofuse.fitting.moments.profile import profile_grid, profile_limits
+from gyrofuse.fitting.moments.profile_objectives import SpectralProfile
 from gyrofuse.fitting.spectral.bands import Bins, Noise
 from gyrofuse.fitting.spectral.search import deviance
 from gyrofuse.fitting.spectral.whittle import refine_whittle
@@ -24,7 +24,7 @@ def signals(n: int, n_samples: int, model: gf.Model, seed: int = 0) -> Tensor:
     return model.simulate(n_samples, batch=(n,), generator=torch.Generator().manual_seed(seed))[:, None]
 
 
-def test_crossings_are_the_outermost():
+def test_limits_are_the_outermost():
     """A parabola, one with a second valley, and one that never rises on the right."""
     own = torch.tensor([0.0, 0.0, 0.0], dtype=torch.float64)
 
@@ -34,8 +34,8 @@ def test_crossings_are_the_outermost():
         return torch.stack([at.square(), two, flat])[which, torch.arange(len(at))]
 
     ends = torch.full_like(own, 10.0)
-    values = grid(own, torch.ones_like(own), -ends, ends)
-    low, high = crossings(rise, own, values, torch.full_like(own, 2.0))
+    values = profile_grid(own, torch.ones_like(own), -ends, ends)
+    low, high = profile_limits(rise, own, values, torch.full_like(own, 2.0))
     torch.testing.assert_close(low, torch.full_like(own, -2.0), rtol=0, atol=0.02)
     assert high[0].item() == pytest.approx(2.0, abs=0.02)
     assert high[1].item() == pytest.approx(6 + math.sqrt(3) / 2, abs=0.05)
@@ -91,7 +91,7 @@ def test_what_is_well_determined_keeps_its_interval():
     found = gf.fit_gmwm(signals(4, 8192, model), "WN + RW")
     assert bool(found.determined.all())
     assert bool(found.identified.all())
-    assert found.remarks == ((),) * 4
+    assert found.notes == ((),) * 4
     low, high = found.confidence_interval
     torch.testing.assert_close((low * high).sqrt(), found.params, rtol=1e-9, atol=0)
 
@@ -107,14 +107,14 @@ def test_what_is_well_determined_keeps_its_interval():
 )
 def test_what_cannot_be_told_apart_is_said(model, formula, n_samples, said):
     found = gf.fit_gmwm(signals(8, n_samples, model, seed=2), formula)
-    heard = [any(said in text for text in texts) for texts in found.remarks]
+    heard = [any(said in text for text in texts) for texts in found.notes]
     absent = [bool((found.params[i, 0] == 0).any()) for i in range(8)]
-    assert sum(h or a for h, a in zip(heard, absent, strict=True)) >= 7, found.remarks
+    assert sum(h or a for h, a in zip(heard, absent, strict=True)) >= 7, found.notes
     assert any(heard)
-    assert found.identified[:, 0].tolist() == [not texts for texts in found.remarks]
+    assert found.identified[:, 0].tolist() == [not texts for texts in found.notes]
     i = heard.index(True)
     assert said in found.summary()
-    assert json.loads(json.dumps(found.to_dict()))["remarks"][i] == list(found.remarks[i])
+    assert json.loads(json.dumps(found.to_dict()))["remarks"][i] == list(found.notes[i])
 
 
 def test_memory_that_is_unknown_has_no_limits():
@@ -132,7 +132,7 @@ def test_the_rise_of_the_likelihood_is_that_of_a_fine_grid():
     made_of = composition_of("WN + RW", held=True)
     start = torch.tensor([[1.0, 1e-3]], dtype=torch.float64).expand(2, -1)
     fit = refine_whittle(signal, made_of, start, start.new_empty(2, 0))
-    surface = SpectralSurface(fit.linear, fit.shape, fit.energy, fit.count, made_of, 1024)
+    surface = SpectralProfile(fit.linear, fit.shape, fit.energy, fit.count, made_of, 1024)
     bins, noise = Bins(1024, torch.device("cpu")), Noise(made_of)
     white = torch.linspace(0.5, 2.0, 4000, dtype=torch.float64)
     for value in (0.0, 1e-4, 1e-2):
@@ -167,7 +167,7 @@ def test_limits_are_where_the_likelihood_has_fallen_enough(model, unknown, place
     linear = params[:, [at for at, name in enumerate(fit.param_names) if name.endswith("variance")]]
     shape = params[:, [at for at, name in enumerate(fit.param_names) if name.endswith("phi")]].atanh()
     there = refine_whittle(signal[:, 0], made_of, linear, shape)
-    surface = SpectralSurface(there.linear, there.shape, there.energy, there.count, made_of, signal.shape[-1])
+    surface = SpectralProfile(there.linear, there.shape, there.energy, there.count, made_of, signal.shape[-1])
     below = fit.confidence_interval.low[:, 0, place]
     order = torch.ones(8, dtype=torch.bool)
     rise = surface.rise(torch.arange(8), unknown, below.atanh(), order)

@@ -47,9 +47,11 @@ def test_the_true_composition_is_chosen():
 
 def test_two_tones_and_none():
     both = PARTS["WN"] + TONE + gf.Sinusoid(0.5, 1.1)
-    assert (gf.rank_models(signals(both, 6), fit=False).n_tones == 2).all()
+    assert (gf.rank_models(signals(both, 6), fit=False).n_sinusoids == 2).all()
     # 0.1 % a record: more than 2 of 60 once in 30 000 times.
-    assert int((gf.rank_models(signals(PARTS["WN"], 60, 512), ["WN", "WN + SIN"], fit=False).n_tones > 0).sum()) <= 2
+    assert (
+        int((gf.rank_models(signals(PARTS["WN"], 60, 512), ["WN", "WN + SIN"], fit=False).n_sinusoids > 0).sum()) <= 2
+    )
 
 
 def test_bic_of_white_noise_and_of_a_walk():
@@ -143,10 +145,10 @@ def test_wavelet_variances_alone():
     signal = signals(PARTS["WN + RW"], 20)[:, 0]
     variance = gf.wavelet_variance(signal, 11)  # 20 sensors
     names = ["WN", "RW", "WN + RW", "WN + AR1 + RW", "WN + QN + RW"]
-    found = gf.rank_models(variance, names, n_samples=4096)
+    found = gf.rank_models_moments(variance, 4096, names)
     assert found.names.count("WN + RW") >= 15
-    assert found.n_tones is None
-    fit = gf.fit_gmwm(variance[:, :1], "WN + RW", n_samples=4096)
+    assert found.n_sinusoids is None
+    fit = gf.fit_gmwm_moments(variance[:, :1], 4096, "WN + RW")
     residual = (variance[:, 0] - fit.fitted_wavelet_variance[:, 0]).numpy()
     spread = moment_covariance(fit.model.with_params(fit.params[0]), 4096, 11).numpy()
     distance = residual @ np.linalg.solve(spread, residual)
@@ -155,7 +157,7 @@ def test_wavelet_variances_alone():
     assert found.criterion[0, 2].item() == pytest.approx(by_hand, abs=0.02)
     assert found.wvic[0, 2].item() == pytest.approx(distance + 4, abs=0.02)
     assert found.p_value[0, 2].item() == pytest.approx(stats.chi2.sf(distance, 9), abs=0.01)
-    searched = gf.rank_models(variance[:, :8], n_samples=4096, fit=False)
+    searched = gf.rank_models_moments(variance[:, :8], 4096, fit=False)
     assert searched.names.count("WN + RW") >= 5  # fewer once in 2700 times at 95 %
 
 
@@ -227,7 +229,7 @@ def test_weak_ramps_are_told_from_walks():
     weak = signals(PARTS["WN"] + gf.Drift(1.4e-4), 20)  # 10 standard deviations
     assert gf.rank_models(weak, fit=False).names.count("WN + DR") >= 15
     variance = gf.wavelet_variance(signals(PARTS["WN"] + gf.Drift(3e-4), 20)[:, 0], 11)
-    found = gf.rank_models(variance, ["WN", "WN + RW", "WN + DR", "WN + RW + DR"], n_samples=4096, fit=False)
+    found = gf.rank_models_moments(variance, 4096, ["WN", "WN + RW", "WN + DR", "WN + RW + DR"], fit=False)
     assert found.names.count("WN + DR") >= 15
 
 
@@ -300,9 +302,9 @@ def test_one_order_of_processes():
 def test_the_search_leaves_out_what_has_too_many_parameters_with_the_sinusoid(levels):
     signal = signals(PARTS["WN + AR1 + SIN"], 1)[0]
     found = gf.rank_models(signal, n_levels=levels)
-    assert found.n_tones.tolist() == [min(levels - 1, 1)]
+    assert found.n_sinusoids.tolist() == [min(levels - 1, 1)]
     assert found.names[0] is not None
-    assert found.best[0].params.shape[-1] - found.n_tones[0] <= levels
+    assert found.best[0].params.shape[-1] - found.n_sinusoids[0] <= levels
     aside = [found.candidates[c] for c in found.set_aside((0,))]
     assert ("WN + AR1 + SIN" in aside) == (levels == 3)
     assert ("WN + RW + SIN" in aside) == (levels == 2)
@@ -346,8 +348,8 @@ def test_items_that_cannot_be_ranked():
         assert gf.rank_models(signal, ["WN", "RW"], fit=False).names == ("WN", None, None)
     with pytest.raises(ValueError, match="`signal`: expected records that vary and have no missing samples"):
         gf.rank_models(signal[1:2])
-    with pytest.raises(ValueError, match="`signal`: expected wavelet variances that are finite and > 0"):
-        gf.rank_models(torch.zeros(4, 1), n_samples=512)
+    with pytest.raises(ValueError, match="`wavelet_variance`: expected wavelet variances that are finite and > 0"):
+        gf.rank_models_moments(torch.zeros(4, 1), 512)
 
 
 def test_default_candidates():
@@ -370,8 +372,8 @@ def test_default_candidates():
         ({"candidates": ["SIN + DR"]}, ValueError, "`candidates`: expected a noise in each, got DR \\+ SIN"),
         ({"candidates": ["WN(variance=1)"]}, ValueError, "got values of white_noise.variance"),
         ({"candidates": ["WN + 5*AR1"]}, ValueError, "at most as many parameters as the 8 levels, got 11"),
-        ({"line_level": 0.0}, ValueError, "`line_level`: expected a probability"),
-        ({"max_tones": -1}, ValueError, "`max_tones`: expected a whole number >= 0"),
+        ({"line_alpha": 0.0}, ValueError, "`line_alpha`: expected a probability"),
+        ({"max_sinusoids": -1}, ValueError, "`max_sinusoids`: expected a whole number >= 0"),
         ({"n_levels": 0}, ValueError, "`n_levels`: expected a whole number >= 1"),
         ({"confidence_level": 1.0}, ValueError, "`confidence_level`: expected a number between 0 and 1"),
     ],
@@ -387,9 +389,9 @@ def test_refusals_of_signals():
     with pytest.raises(ValueError, match="`signal`: expected at least 32 samples, got 20"):
         gf.rank_models(torch.randn(1, 20))
     with pytest.raises(ValueError, match=r"expected a wavelet variance .* of at most 9 levels"):
-        gf.rank_models(torch.ones(10, 1), n_samples=512)
+        gf.rank_models_moments(torch.ones(10, 1), 512)
     with pytest.raises(ValueError, match="`n_levels`: expected 1 to 5"):
-        gf.rank_models(torch.ones(5, 1), n_samples=512, n_levels=6)
+        gf.rank_models_moments(torch.ones(5, 1), 512, n_levels=6)
 
 
 def test_the_summary_says_when_no_candidate_fits():
@@ -418,11 +420,11 @@ def test_weak_processes_in_wavelet_variances_are_climbed_to_from_every_side():
     )
     variance = gf.wavelet_variance(torch.cat([signal, more]))
     names = ["WN", "WN + AR1", "WN + 2*AR1"]
-    found = gf.rank_models(variance, names, n_samples=8192, fit=False)
+    found = gf.rank_models_moments(variance, 8192, names, fit=False)
     assert set(found.names) == {"WN + AR1"}
-    whole = gf.rank_models(variance, [*names, "AR1", "2*AR1"], n_samples=8192, fit=False)
+    whole = gf.rank_models_moments(variance, 8192, [*names, "AR1", "2*AR1"], fit=False)
     assert (found.criterion - whole.criterion[:, :3]).max() < 0.1
-    alone = gf.fit_gmwm(variance, "WN + AR1", n_samples=8192)
+    alone = gf.fit_gmwm_moments(variance, 8192, "WN + AR1")
     size = variance.amax(0)
     for s, params in enumerate(alone.params):
         fitted = alone.model.with_params(params)

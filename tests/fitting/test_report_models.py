@@ -11,7 +11,8 @@ import torch
 from matplotlib import pyplot as plt
 from pages import Page
 
-from gyrofuse import AR1, GMWMResult, RandomWalk, Recording, Sinusoid, WhiteNoise, fit_gmwm
+from gyrofuse import AR1, RandomWalk, Recording, Sinusoid, WhiteNoise, fit_gmwm, fit_gmwm_moments
+from gyrofuse.fitting import GMWMResult
 from gyrofuse.fitting.moments.covariance import moment_covariance
 from gyrofuse.fitting.plots import plot_residuals
 from gyrofuse.fitting.report import page as report_models
@@ -84,7 +85,7 @@ def test_verdict_says_what_cannot_be_told_apart():
     result = fit_gmwm(signal, "WN + AR1")
     told = "Not identified: ar1_1 (indistinguishable from a random walk at this length)."
     found = [told in model_verdict(result, index) for index in ((0, 0), (0, 1), (1, 0), (1, 1))]
-    assert found == [False, True, True, False] == [bool(texts) for texts in result.remarks]
+    assert found == [False, True, True, False] == [bool(texts) for texts in result.notes]
     assert model_report(result, title="remarks").count(told) == 2
 
 
@@ -103,7 +104,7 @@ def test_verdict_says_why_there_is_no_test():
     variance = fit("WN + RW").wavelet_variance
     untested = plain(model_verdict(fit_gmwm(recording(), "WN", weighting="identity"), (0,)))
     assert "was not tested: the J test asks for optimal weighting" in untested
-    full = plain(model_verdict(fit_gmwm(variance, "WN + RW", n_samples=2**14, n_levels=2), (0,)))
+    full = plain(model_verdict(fit_gmwm_moments(variance, 2**14, "WN + RW", n_levels=2), (0,)))
     assert "cannot be tested: it has as many parameters as there are levels" in full
 
 

@@ -13,6 +13,7 @@ from pages import Page
 
 import gyrofuse as gf
 from gyrofuse._base.page import number
+from gyrofuse.fitting import RankResult
 from gyrofuse.fitting.report import ranking as report_ranking
 from gyrofuse.fitting.report.ranking import rank_report, rank_verdict
 
@@ -31,7 +32,7 @@ def recording() -> gf.Recording:
 
 
 @functools.cache
-def ranked() -> gf.RankResult:
+def ranked() -> RankResult:
     return gf.rank_models(recording(), CANDIDATES)
 
 
@@ -67,7 +68,7 @@ def test_the_runner_up_lost_by_odds_and_for_a_reason():
     assert f"and is more than it takes: {reason}." in words
 
 
-def compared(*rows: tuple[str, float, float]) -> gf.RankResult:
+def compared(*rows: tuple[str, float, float]) -> RankResult:
     """A ranking of these candidates with the first one chosen: name, criterion and p value."""
     n = len(rows)
     generator = torch.Generator().manual_seed(0)
@@ -195,7 +196,7 @@ def test_a_line_without_a_candidate_for_it_is_told():
     assert told in plain(rank_verdict(result, (0,)))
     assert told in result.summary()
     assert told not in plain(rank_verdict(result, (1,)))
-    assert result.n_tones.tolist() == [0, 0]
+    assert result.n_sinusoids.tolist() == [0, 0]
     assert result.n_lines.tolist() == [1, 0]
 
 
@@ -252,9 +253,9 @@ def test_best_fits_keep_their_own_remarks():
     signal = torch.stack([quick, slow])
     result = gf.rank_models(signal, ["WN + AR1"])
     alone = gf.fit_gmwm(signal, "WN + AR1", refine=True, n_levels=result.best[0].wavelet_variance.shape[-2])
-    assert [fit.remarks for fit in result.best] == [(texts,) for texts in alone.remarks]
-    assert alone.remarks[0] == ()
-    assert alone.remarks[1] == ("ar1_1: indistinguishable from a random walk at this length",)
+    assert [fit.notes for fit in result.best] == [(texts,) for texts in alone.notes]
+    assert alone.notes[0] == ()
+    assert alone.notes[1] == ("ar1_1: indistinguishable from a random walk at this length",)
     assert rank_verdict(result, (0,))[0] == "WN + AR1 is the only candidate that was tried."
     page = Page(rank_report(result, title="remarks"))
     assert page.text.count("Not identified: ar1_1 (indistinguishable from a random walk at this length).") == 1
@@ -274,7 +275,7 @@ def test_a_sensor_that_could_not_be_ranked_and_a_ranking_without_fits():
 
 def test_a_ranking_of_wavelet_variances():
     variance = gf.wavelet_variance(recording().signal[1:], 10)
-    result = gf.rank_models(variance, ["WN", "WN + AR1"], n_samples=2**13)
+    result = gf.rank_models_moments(variance, 2**13, ["WN", "WN + AR1"])
     page = Page(rank_report(result, title="moments"))
     assert "likelihood of the wavelet variances" in page.text
     assert "stands out of the noise" not in page.text

@@ -13,8 +13,8 @@ from scipy import stats
 from torch import Tensor
 
 import gyrofuse as gf
+from gyrofuse.fitting import GMWMResult
 from gyrofuse.fitting.moments.covariance import moment_covariance
-from gyrofuse.fitting.moments.robust_covariance import robust_moment_covariance
 from gyrofuse.wavelets.robust import biweight_of
 
 Array = NDArray[np.float64]
@@ -57,18 +57,18 @@ CASES = [
 @pytest.mark.parametrize(("model", "second_moment"), CASES, ids=[str(model) for model, _ in CASES])
 def test_is_the_exact_sum(model, second_moment, efficiency):
     """1 % of the standard deviations of the two levels."""
-    got = robust_moment_covariance(model, 200, 6, efficiency=efficiency).numpy()
+    got = moment_covariance(model, 200, 6, efficiency=efficiency).numpy()
     expected = exact(second_moment, 6, efficiency)
     size = np.sqrt(np.diag(expected))
     assert np.abs((got - expected) / np.outer(size, size)).max() < 0.01
 
 
 def test_lies_between_the_classic_and_that_of_independent_coefficients():
-    classic, robust = moment_covariance(MODEL, 10_000, 9), robust_moment_covariance(MODEL, 10_000, 9)
+    classic, robust = moment_covariance(MODEL, 10_000, 9), moment_covariance(MODEL, 10_000, 9, efficiency=0.6)
     ratio = (robust / classic).diagonal()
     assert (ratio > 1.25).all()
     assert (ratio < 1 / 0.6).all()
-    assert torch.equal(robust_moment_covariance(MODEL, 10_000, 9, efficiency=1), classic)
+    assert torch.equal(moment_covariance(MODEL, 10_000, 9, efficiency=1), classic)
     assert int(torch.linalg.cholesky_ex(robust)[1]) == 0
 
 
@@ -76,7 +76,7 @@ def test_is_that_of_simulated_records():
     """1000 records, 16 windows at the last level: within 4 standard errors and 6 % of the variances."""
     n_samples, n_levels = 2048, 7
     nu = gf.robust_wavelet_variance(simulated(1000, n_samples, seed=7), n_levels)[..., 0]
-    expected = robust_moment_covariance(MODEL, n_samples, n_levels)
+    expected = moment_covariance(MODEL, n_samples, n_levels, efficiency=0.6)
     size = expected.diagonal().sqrt()
     got = torch.cov(nu.T) / size / size[:, None]
     expected = expected / size / size[:, None]
@@ -86,12 +86,14 @@ def test_is_that_of_simulated_records():
 
 def test_batches_and_gradients():
     params = torch.tensor([[1.0, 4e-4], [2.0, 1e-3], [0.5, 0.0]], dtype=torch.float64)
-    got = robust_moment_covariance(MODEL.with_params(params), 300, 5)
+    got = moment_covariance(MODEL.with_params(params), 300, 5, efficiency=0.6)
     for own, one in zip(params, got, strict=True):
-        torch.testing.assert_close(one, robust_moment_covariance(MODEL.with_params(own), 300, 5), rtol=1e-10, atol=0)
+        torch.testing.assert_close(
+            one, moment_covariance(MODEL.with_params(own), 300, 5, efficiency=0.6), rtol=1e-10, atol=0
+        )
 
     def of(values: Tensor) -> Tensor:
-        return robust_moment_covariance(MODEL.with_params(values), 40, 3)
+        return moment_covariance(MODEL.with_params(values), 40, 3, efficiency=0.6)
 
     assert torch.autograd.gradcheck(of, params[1].clone().requires_grad_())
 
@@ -99,13 +101,13 @@ def test_batches_and_gradients():
 @pytest.mark.parametrize("other", [gf.Sinusoid(0.5, 0.3), gf.Drift(0.1)])
 def test_only_gaussian_processes(other):
     with pytest.raises(ValueError, match="`model`: expected Gaussian processes with a robust wavelet variance"):
-        robust_moment_covariance(MODEL + other, 300, 4)
+        moment_covariance(MODEL + other, 300, 4, efficiency=0.6)
     with pytest.raises(ValueError, match="`model`: expected Gaussian processes"):
         gf.fit_gmwm(simulated(1, 1024), "WN + SIN" if isinstance(other, gf.Sinusoid) else "WN + DR", efficiency=0.6)
 
 
 @pytest.fixture(scope="module")
-def many() -> gf.GMWMResult:
+def many() -> GMWMResult:
     """200 records of 2048 samples."""
     return gf.fit_gmwm(simulated(200, 2048, seed=3), "WN + RW", efficiency=0.6)
 
@@ -149,10 +151,10 @@ def test_what_a_robust_fit_says_of_itself(many):
     assert alone.to_dict()["efficiency"] == many.efficiency == 0.6
     # A robust wavelet variance may be given instead of the signal.
     nu = gf.robust_wavelet_variance(simulated(1, 2048, seed=3)[0], 7)
-    given = gf.fit_gmwm(nu, "WN + RW", n_samples=2048, efficiency=0.6)
+    given = gf.fit_gmwm_moments(nu, 2048, "WN + RW", efficiency=0.6)
     torch.testing.assert_close(given.param_cov, alone.param_cov)
     # Without the higher orders intervals would be narrower.
-    classic = gf.fit_gmwm(nu, "WN + RW", n_samples=2048)
+    classic = gf.fit_gmwm_moments(nu, 2048, "WN + RW")
     assert (classic.param_cov.diagonal(dim1=-2, dim2=-1) < 0.9 * given.param_cov.diagonal(dim1=-2, dim2=-1)).all()
 
 

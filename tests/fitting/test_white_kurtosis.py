@@ -94,7 +94,7 @@ def test_intervals_hold_under_heavy_and_light_tails(refine):
 
 def test_equal_recordings_with_heavy_tails_are_not_refused():
     """At 5 % more than 7 of 50 once in 300 times; without the tails in the covariance 13 would be expected."""
-    fit = gf.fit_jointly([records("t", 50, 1), records("t", 50, 2)], "WN + RW")
+    fit = gf.fit_gmwm_joint([records("t", 50, 1), records("t", 50, 2)], "WN + RW")
     assert int((fit.p_value < 0.05).sum()) <= stats.binom.ppf(0.99, 50, 0.05)
     low, high = fit.joint.confidence_interval
     assert int(((low <= 1) & (high >= 1))[:, 0, 0].sum()) >= stats.binom.ppf(0.001, 50, 0.95)

@@ -294,7 +294,7 @@ def test_fits_of_all_kinds_stand_for_their_models():
     fits = (
         gf.fit_gmwm(y, FORMULA),
         gf.fit_array_gmwm(y, "WN + RW"),
-        gf.fit_jointly([y, record(SHORT, 9, 2)], "WN + AR1"),
+        gf.fit_gmwm_joint([y, record(SHORT, 9, 2)], "WN + AR1"),
         gf.rank_models(y, ["WN + AR1"]),
     )
     for fit, n in zip(fits, (SHORT, SHORT, 2 * SHORT, SHORT), strict=True):

@@ -27,7 +27,7 @@ def test_fits_hand_on_the_record_and_the_covariance_that_their_model_has():
     fit = gf.fit_gmwm(x, "WN + AR1 + RW")
     assert fit.model.estimated_from.n_samples == fit.n_samples == 5003
     torch.testing.assert_close(fit.model.estimated_from.param_cov, fit.param_cov, rtol=0, atol=0)
-    joint = gf.fit_jointly([x, x[:, :4100]], "WN + AR1 + RW")
+    joint = gf.fit_gmwm_joint([x, x[:, :4100]], "WN + AR1 + RW")
     assert joint.model.estimated_from.n_samples == joint.n_samples == 9103
     torch.testing.assert_close(joint.model.estimated_from.param_cov, joint.param_cov, rtol=0, atol=0)
     best = gf.rank_models(x, ["WN + AR1", "WN + AR1 + RW"]).best
@@ -46,8 +46,8 @@ def test_the_covariance_of_an_array_has_the_spreads_of_its_entries_and_shared_pa
     for k in range(3):
         for i in range(3):
             for j in range(i, 3):
-                assert sd[f"{k + 1}.covariance[{i},{j}]"] == pytest.approx(float(fit.theta_sd[k, i, j]))
-    assert sd["2.phi"] == pytest.approx(float(fit.params_sd[0]))
+                assert sd[f"{k + 1}.covariance[{i},{j}]"] == pytest.approx(float(fit.theta_std_err[k, i, j]))
+    assert sd["2.phi"] == pytest.approx(float(fit.params_std_err[0]))
     assert torch.linalg.eigvalsh(fit.param_cov)[0] > -1e-9 * fit.param_cov.diagonal().max()
     missing = x.clone()
     missing[1] = torch.nan

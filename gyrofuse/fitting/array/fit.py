@@ -1,4 +1,4 @@
-"""Search for the matrices of arrays, with weights that follow the fit."""
+"""Search for the matrices of arrays, with weights that are updated with the fit."""
 
 from __future__ import annotations
 
@@ -11,37 +11,27 @@ from gyrofuse.fitting.array import search as array_search
 from gyrofuse.fitting.array.moments import array_moment_covariance, vech, weights_of
 from gyrofuse.fitting.moments import search
 from gyrofuse.fitting.moments.fit import n_starts_for
-from gyrofuse.fitting.moments.records import Records
+from gyrofuse.fitting.moments.records import SampleDesign
 from gyrofuse.fitting.structure import Composition
 
-# Most steps with weights that follow the fit, the first of them with rough ones, and most steps after these.
-_UPDATES, _ROUGH, _POLISHING = 20, 6, 100
-# Changes of the fitted moments, chi-squares, with which these steps have come to rest.
-_NEAR, _AT_REST = 1e-5, 1e-9
-# Change of the fitted moments, chi-square, beyond which a minimum for weights that stay is another one.
-_FAR = 0.1
-# Starts, by how much their `x` differ in all, and the steps after which the best of them goes on alone.
-_DISTINCT, _APART, _TRIAL = 5, 0.5, 12
-# Part of the lowest level that each process begins with at least, although a sensor shows nothing of it.
-_SEED = 1e-2
+# Largest number of steps with the weights of a fit that has come to rest. Flat valleys need some tens.
+_POLISHING = 100
 
 
 class _Problem(NamedTuple):
-    """What is fitted to what.
+    """Moments and the model that is fitted to them.
 
     Attributes:
-        moments: `(item, level, pair)` of unit size, 0 where there are none.
-        present: Where there are, the same.
-        records: Their length and levels.
+        moments: Moments `(item, level, pair)` of unit size, 0 where there are none.
+        present: Whether a moment was measured, `(item, level, pair)`.
+        records: Length and levels of the records.
         made_of: Structure of the model.
-        weighting: Of the moments.
     """
 
     moments: Tensor
     present: Tensor
-    records: Records
+    records: SampleDesign
     made_of: Composition
-    weighting: str
 
     @property
     def tau(self) -> Tensor:
@@ -60,69 +50,81 @@ class _Problem(NamedTuple):
     def step(self, weight: Tensor, root: Tensor, shape: Tensor, exact: bool) -> tuple[Tensor, Tensor]:
         return array_search.step_downhill(self.moments, weight, self.tau, self.made_of, root, shape, exact)
 
-    def misfit(self, root: Tensor, shape: Tensor) -> Tensor:
+    def objective(self, root: Tensor, shape: Tensor) -> Tensor:
         """`r' V^-1 r + ln det V`, which compares fits with different weights, `(item,)`."""
-        weight = weights_of(self.covariance(root, shape), self.present, "optimal")
+        weight = weights_of(self.covariance(root, shape), self.present)
         distance = _squared(weight, self.moments - self.fitted(root, shape))
         return distance - torch.logdet(weight + torch.diag_embed((~self.present.flatten(1)).to(weight)))
 
 
 def fit_matrices(
-    gamma: Tensor, held: Tensor, records: Records, made_of: Composition, weighting: str
+    gamma: Tensor, held: Tensor, records: SampleDesign, made_of: Composition
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Fit matrices to wavelet cross-covariances of sensors of unit size.
 
     Args:
-        gamma: `(item, level, sensor, sensor)`, NaN where there is none.
-        held: `x` of the tones, `(item, tone)`.
-        records: Length and levels.
+        gamma: Wavelet cross-covariances `(item, level, sensor, sensor)`, NaN where there is none.
+        held: `x` of the sinusoids, `(item, sinusoid)`.
+        records: Length and levels of the records.
         made_of: Structure of the model.
-        weighting: Of the moments.
 
     Returns:
         `Theta` `(item, process, sensor, sensor)`, `x` `(item, shaped)`, and whether the search came to rest.
     """
     present = vech(gamma).isfinite()
-    problem = _Problem(torch.where(present, vech(gamma), 0.0), present, records, made_of, weighting)
+    problem = _Problem(torch.where(present, vech(gamma), 0.0), present, records, made_of)
     root, shape = _starts(gamma, held, records, made_of)  # (item, start, ...)
     n_items, n_starts = shape.shape[:2]
     root, shape = root.flatten(0, 1), shape.flatten(0, 1)
     if n_starts > 1:
         each = torch.arange(n_items, device=gamma.device)
         every = problem.some(each.repeat_interleave(n_starts))
-        root, shape, _ = _follow(every, root, shape, _ROUGH, _TRIAL)
-        score = every.misfit(root, shape).nan_to_num(nan=torch.inf)
+        # Enough steps for the start next to the lowest minimum to have the lowest objective.
+        root, shape, _ = _follow(every, root, shape, n_rough=6, n_steps=12)
+        score = every.objective(root, shape).nan_to_num(nan=torch.inf)
         best = score.view(n_items, -1).argmin(-1) + n_starts * each
         root, shape = root[best], shape[best]
-    root, shape, _ = _follow(problem, root, shape, 0 if n_starts > 1 else _ROUGH, _UPDATES)
+    root, shape, _ = _follow(problem, root, shape, n_rough=0 if n_starts > 1 else 6, n_steps=20)
     root, shape, rests = _settle(problem, root, shape)
     theta = root @ root
-    # AR1s from slow to fast, tones from high to low frequency.
+    # AR1s from slow to fast, sinusoids from high to low frequency.
     place = torch.arange(made_of.n_linear, dtype=shape.dtype, device=shape.device).expand(len(shape), -1)
     order, shape = made_of.ordered(place, shape)
     return theta.take_along_dim(order.long()[..., None, None], 1), shape, rests
 
 
-def _follow(problem: _Problem, root: Tensor, shape: Tensor, rough: int, most: int) -> tuple[Tensor, Tensor, Tensor]:
-    """`S` and `x` after steps with weights of where these start, and whether they came to rest.
+def _follow(
+    problem: _Problem, root: Tensor, shape: Tensor, n_rough: int, n_steps: int, at_rest: float = 1e-5
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Steps whose weights are those of the fit before each of them.
 
-    The first `rough` steps have the weights of pairs. A minimum for weights that stay would be far off where the data
-    hardly tell a memory, and the next one far off on the other side. Weights of the mean of the covariances so far, of
-    which the latest counts half, keep steps from going to and fro between two fits of which each has the other's
-    weights.
+    A minimum for fixed weights would be far off where a time constant is hardly determined, and the next one far off on
+    the other side. The weights are those of the mean of the covariances so far, of which the latest counts half, which
+    damps oscillations between two fits of which each has the other's weights.
+
+    Args:
+        problem: Moments and the model.
+        root: `S` to start from, `(item, process, sensor, sensor)`.
+        shape: `x` to start from, `(item, shaped)`.
+        n_rough: Number of first steps in which pairs of sensors count as independent: rough, and cheap to get near.
+        n_steps: Largest number of steps.
+        at_rest: Change of the fitted moments, as a chi-square, below which they have come to rest.
+
+    Returns:
+        `S`, `x` and whether they came to rest, `(item,)`.
     """
     root, shape, fitted = root.clone(), shape.clone(), torch.zeros_like(problem.moments)
     todo = torch.arange(len(shape), device=shape.device)
     rests = torch.zeros_like(todo, dtype=torch.bool)
     mean = shape.new_empty(0)
-    for step in range(most):
+    for step in range(n_steps):
         own, at, x = problem.some(todo), root[todo], shape[todo]
         covariance = own.covariance(at, x)
-        mean = (mean + covariance) / 2 if step > rough else covariance
-        weight = weights_of(mean, own.present, own.weighting if step >= rough else "pairwise")
+        mean = (mean + covariance) / 2 if step > n_rough else covariance
+        weight = weights_of(mean, own.present, pairwise=step < n_rough)
         at, x = own.step(weight, at, x, exact=False)
         new = own.fitted(at, x)
-        near = (_squared(weight, new - fitted[todo]) < _NEAR) & (step >= rough)
+        near = (_squared(weight, new - fitted[todo]) < at_rest) & (step >= n_rough)
         root[todo], shape[todo], fitted[todo], rests[todo] = at, x, new, near
         todo, mean = todo[~near], mean[~near]
         if not len(todo):
@@ -130,13 +132,25 @@ def _follow(problem: _Problem, root: Tensor, shape: Tensor, rough: int, most: in
     return root, shape, rests
 
 
-def _settle(problem: _Problem, root: Tensor, shape: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """`S` and `x` of the minimum for the weights of where it starts, and whether the steps came to rest.
+def _settle(
+    problem: _Problem, root: Tensor, shape: Tensor, at_rest: float = 1e-9, far: float = 0.1
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Minimum for the weights of the point where the search starts.
 
-    Where that minimum is another one, which happens with a memory that the data hardly tell, its misfit is far larger
-    with its own weights; there weights go on following the fit.
+    Where that minimum is another one, which happens with a time constant that is hardly determined, its objective is
+    far larger with its own weights; there the weights go on following the fit.
+
+    Args:
+        problem: Moments and the model.
+        root: `S` to start from, `(item, process, sensor, sensor)`.
+        shape: `x` to start from, `(item, shaped)`.
+        at_rest: Change of the fitted moments, as a chi-square, below which they have come to rest.
+        far: Distance of the minimum from the start, as a chi-square, beyond which it is another one.
+
+    Returns:
+        `S`, `x` and whether they came to rest, `(item,)`.
     """
-    weight = weights_of(problem.covariance(root, shape), problem.present, problem.weighting)
+    weight = weights_of(problem.covariance(root, shape), problem.present)
     start = problem.fitted(root, shape)
     found, x = root.clone(), shape.clone()
     todo = torch.arange(len(shape), device=shape.device)
@@ -145,13 +159,13 @@ def _settle(problem: _Problem, root: Tensor, shape: Tensor) -> tuple[Tensor, Ten
         own = problem.some(todo)
         before = own.fitted(found[todo], x[todo])
         found[todo], x[todo] = own.step(weight[todo], found[todo], x[todo], exact=True)
-        rests[todo] = _squared(weight[todo], own.fitted(found[todo], x[todo]) - before) < _AT_REST
+        rests[todo] = _squared(weight[todo], own.fitted(found[todo], x[todo]) - before) < at_rest
         todo = (~rests).nonzero()[:, 0]
         if not len(todo):
             break
-    far = (_squared(weight, problem.fitted(found, x) - start) > _FAR).nonzero()[:, 0]
-    if len(far):
-        found[far], x[far], rests[far] = _follow(problem.some(far), root[far], shape[far], 0, _POLISHING)
+    other = (_squared(weight, problem.fitted(found, x) - start) > far).nonzero()[:, 0]
+    if len(other):
+        found[other], x[other], rests[other] = _follow(problem.some(other), root[other], shape[other], 0, _POLISHING)
     return found, x, rests
 
 
@@ -161,8 +175,31 @@ def _squared(weight: Tensor, move: Tensor) -> Tensor:
     return ((weight @ flat[..., None])[..., 0] * flat).sum(-1)
 
 
-def _starts(gamma: Tensor, held: Tensor, records: Records, made_of: Composition) -> tuple[Tensor, Tensor]:
-    """`S` of uncorrelated sensors and `x`, `(item, start, ...)`: of each sensor's own fits, those that suit all."""
+def _starts(
+    gamma: Tensor,
+    held: Tensor,
+    records: SampleDesign,
+    made_of: Composition,
+    *,
+    n_distinct: int = 5,
+    apart: float = 0.5,
+    least_share: float = 1e-2,
+) -> tuple[Tensor, Tensor]:
+    """Starting points: uncorrelated sensors with the `x` of single sensors' fits that fit all sensors best.
+
+    Args:
+        gamma: Wavelet cross-covariances `(item, level, sensor, sensor)`.
+        held: `x` of the sinusoids, `(item, sinusoid)`.
+        records: Length and levels of the records.
+        made_of: Structure of the model.
+        n_distinct: Number of starting points with several AR1s or sinusoids to be found; one is enough otherwise.
+        apart: Smallest distance between the `x` of two of them, the sum of absolute differences.
+        least_share: Smallest share of a sensor's lowest level that each process starts with, as a matrix of zero would
+            not move.
+
+    Returns:
+        `S` and `x`, `(item, start, ...)`.
+    """
     tau = records.tau.to(gamma)
     nu = gamma.diagonal(dim1=-2, dim2=-1).mT  # (item, sensor, level)
     n_items, n_sensors, _ = nu.shape
@@ -184,11 +221,11 @@ def _starts(gamma: Tensor, held: Tensor, records: Records, made_of: Composition)
     linear = linear.view(n_items, n, n_sensors, -1)
     score = (objective.view(n_items, n, n_sensors) * known[:, None]).sum(-1).nan_to_num(nan=torch.inf)
     kept = []
-    for _ in range(_DISTINCT if len(made_of.curved) > 1 else 1):
+    for _ in range(n_distinct if len(made_of.curved) > 1 else 1):
         kept.append(score.argmin(-1))
-        near = (own - own.take_along_dim(kept[-1][:, None, None], 1)).abs().sum(-1) < _APART
+        near = (own - own.take_along_dim(kept[-1][:, None, None], 1)).abs().sum(-1) < apart
         score = torch.where(near, torch.inf, score)
     best = torch.stack(kept, -1)  # (item, start)
     linear, shape = linear.take_along_dim(best[..., None, None], 1), own.take_along_dim(best[..., None], 1)
-    least = _SEED * (nu[:, None, :, :, None] / made_of.columns(tau, shape)[:, :, None]).amin(-2)
+    least = least_share * (nu[:, None, :, :, None] / made_of.columns(tau, shape)[:, :, None]).amin(-2)
     return torch.diag_embed(torch.maximum(linear, least).sqrt().mT), shape

@@ -10,30 +10,25 @@ from torch import Tensor
 from gyrofuse._base.checks import (
     check_confidence_level,
     check_floating,
-    check_length,
     check_n_levels,
-    check_signal,
+    check_positive_integer,
     infinite_where,
     largest_level,
 )
+from gyrofuse._base.chunks import items_at_once
 from gyrofuse._base.linalg import check_positive_definite
 from gyrofuse._base.results import named, numbered
 from gyrofuse.fitting.array.fit import fit_matrices
-from gyrofuse.fitting.array.inference import ArrayFit, spread_of_fit
+from gyrofuse.fitting.array.inference import ArrayFit, covariance_of_fit
 from gyrofuse.fitting.array.result import ArrayGMWMResult
 from gyrofuse.fitting.moments.fit import composition_of
-from gyrofuse.fitting.moments.records import Records
+from gyrofuse.fitting.moments.records import SampleDesign, deprecate_moments
 from gyrofuse.fitting.spectral.model_tones import model_tones
 from gyrofuse.fitting.structure import Composition
 from gyrofuse.io.recording import Recording
+from gyrofuse.io.signals import KnownSignal, as_recording
 from gyrofuse.noise.processes import Model, Sinusoid
 from gyrofuse.wavelets.covariance import wavelet_products
-
-WEIGHTINGS = ("optimal", "pairwise")
-# Numbers that the weights of all items may take at a time.
-_NUMBERS_AT_ONCE = 4_000_000
-# Largest correlation that entries (i, k) and (k, i) may differ by: float32 rounds to some 1e-7.
-_ASYMMETRIC = 1e-5
 
 
 def fit_array_gmwm(
@@ -49,31 +44,30 @@ def fit_array_gmwm(
 
     `theta = argmin r' Omega r`, `r = vech(Gamma_j - sum_k f_k(tau_j) Theta_k)` over all levels, with `Omega = V^-1` of
     the fitted model and its finite length,
-    `Cov(gamma_ab,j, gamma_cd,l) = sum_km Q_jl[k,m] (Theta_k,ac Theta_m,bd + Theta_k,ad Theta_m,bc)`, followed until
-    it rests. Matrices are positive by construction; `phi` of an AR1 and the frequency of a tone are of all sensors. The
-    matrix of a tone is that of squared amplitudes in phase, `a_i a_k cos(phase_i - phase_k)`, which is all that wavelet
-    moments see; its frequency comes from the sensor that shows it most sharply. A tone has two phases, so that of three
-    or more sensors its matrix has rank 2 at most. The search knows no such bound, and at that edge entries are not
-    normal: amplitudes of three or more sensors have upper limits only.
+    `Cov(gamma_ab,j, gamma_cd,l) = sum_km Q_jl[k,m] (Theta_k,ac Theta_m,bd + Theta_k,ad Theta_m,bc)`, updated until the
+    fit comes to rest. Matrices are positive semi-definite by construction; `phi` of an AR1 and the frequency of a
+    sinusoid are shared by all sensors. The matrix of a sinusoid is that of its in-phase squared amplitudes,
+    `a_i a_k cos(phase_i - phase_k)`, which is all that wavelet moments depend on; its frequency comes from the sensor
+    with the smallest standard error of it. A sinusoid has two phases, so that for three or more sensors its matrix has
+    rank 2 at most. The search knows no such bound, and at that edge entries are not normal: amplitudes of three or more
+    sensors have upper limits only.
 
-    A memory longer than a fiftieth of the record is hardly told from a random walk. Its matrix often lacks rank, its
-    variances have upper limits only, its covariances and correlations no limits at all, nor has any `phi`; weights for
-    long times may be no better than those of the measured moments. `remarks` say where. In about one of a
-    hundred records a long memory is found shorter than that, with limits that do not hold.
+    An AR1 with a time constant above a fiftieth of the record hardly differs from a random walk. Its matrix often lacks
+    rank, its variances have upper limits only, its covariances, correlations and every `phi` no limits at all; weights
+    for long times may be no better than those of the measured moments. `notes` say where. In rare records a long time
+    constant is estimated shorter than that, with limits that do not hold.
 
     Missing samples leave out moments without any complete window; the others count as those of a complete record. A
     sensor without samples has NaN everywhere, and a pair that is never seen together a NaN covariance.
 
     Args:
-        signal: `(..., sensor, time)`, NaN = missing sample, or a `Recording`; an array with infinite samples is not
-            fitted. With `n_samples` given a wavelet cross-covariance `(..., level, sensor, sensor)` of records that
-            long.
+        signal: Signal `(..., sensor, time)`, NaN = missing sample, or a `Recording`; an array with infinite samples is
+            not fitted. The weights of all moments are one matrix: some twenty sensors are feasible.
         model: Processes without values, such as `WhiteNoise() + AR1() + RandomWalk()`, or `"WN + AR1 + RW"`.
-        n_levels: Number of levels J; by default all that hold two windows side by side.
+        n_levels: Number of levels J; by default all that hold two non-overlapping windows.
         confidence_level: Probability that an interval holds the true value.
-        weighting: `"optimal"`, or `"pairwise"`: of each pair of sensors the inverse covariance of its own levels, less
-            efficient, and feasible for more than some twenty sensors; without a J test.
-        n_samples: Length of the record behind a wavelet cross-covariance.
+        weighting: Deprecated; only `"optimal"` is left.
+        n_samples: Deprecated; see `fit_array_gmwm_moments`.
 
     Returns:
         Matrices `(..., process, sensor, sensor)` with intervals, shared parameters, and how well the model fits.
@@ -87,67 +81,117 @@ def fit_array_gmwm(
     References:
         [V] section III, for one sensor.
     """
-    recording = signal if isinstance(signal, Recording) else None
-    values = signal.signal if isinstance(signal, Recording) else signal
     check_confidence_level(confidence_level)
-    if weighting not in WEIGHTINGS:
-        raise ValueError(f"`weighting`: expected one of {', '.join(map(repr, WEIGHTINGS))}, got {weighting!r}")
-    if n_samples is None:
-        check_signal("signal", values)
-        length, wccv = values.shape[-1], _measured(values.detach(), n_levels)
-    else:
-        check_floating("signal", values)
-        length = check_length(n_samples, recorded=recording is not None)
-        wccv = _given(values.detach(), length, n_levels)
+    if weighting != "optimal":
+        raise ValueError(
+            f"`weighting`: expected 'optimal', got {weighting!r}; weights of single pairs of sensors were less "
+            "efficient and are gone, fit arrays of more than some twenty sensors in groups"
+        )
+    if n_samples is not None:
+        deprecate_moments(signal, n_samples, "fit_array_gmwm")
+        return fit_array_gmwm_moments(
+            signal,  # type: ignore[arg-type]
+            n_samples,
+            model,
+            n_levels=n_levels,
+            confidence_level=confidence_level,
+        )
+    known = as_recording(signal)
+    values = known.values.detach()
+    wccv = _measured(values, n_levels)
+    return _fit(wccv, values.reshape(-1, *values.shape[-2:]), values.shape[-1], model, known, confidence_level)
+
+
+def fit_array_gmwm_moments(
+    wavelet_cross_covariance: Tensor,
+    n_samples: int,
+    model: Model | str,
+    *,
+    n_levels: int | None = None,
+    confidence_level: float = 0.95,
+) -> ArrayGMWMResult:
+    """Fit a sum of noise processes to wavelet cross-covariances whose signals are not at hand; see `fit_array_gmwm`.
+
+    Frequencies of sinusoids are then fitted to the moments.
+
+    Args:
+        wavelet_cross_covariance: `(..., level, sensor, sensor)`, signal^2, as `wavelet_cross_covariance` returns it.
+        n_samples: Length of the records behind it.
+        model: As for `fit_array_gmwm`.
+        n_levels: Number of levels J; by default all that are given.
+        confidence_level: Probability that an interval holds the true value.
+
+    Returns:
+        Matrices `(..., process, sensor, sensor)` with intervals, shared parameters, and how well the model fits.
+
+    Raises:
+        TypeError: `wavelet_cross_covariance` is not a floating point tensor.
+        ValueError: No wavelet cross-covariance of records that long, or as for `fit_array_gmwm`.
+        SingularCovarianceError: A duplicated or linearly dependent sensor.
+    """
+    check_confidence_level(confidence_level)
+    n_samples = check_positive_integer("n_samples", n_samples)
+    check_floating("wavelet_cross_covariance", wavelet_cross_covariance)
+    wccv = _given(wavelet_cross_covariance.detach(), n_samples, n_levels)
+    known = KnownSignal(wccv, numbered(wccv.shape[-1]))
+    return _fit(wccv, None, n_samples, model, known, confidence_level)
+
+
+def _fit(
+    wccv: Tensor,
+    series: Tensor | None,
+    n_samples: int,
+    model: Model | str,
+    known: KnownSignal,
+    confidence_level: float,
+) -> ArrayGMWMResult:
+    """Fit `(..., level, sensor, sensor)`, with the help of the signals `(item, sensor, time)` if at hand."""
     levels, n_sensors = wccv.shape[-3:-1]
-    sensors = tuple(recording.sensors) if recording else numbered(n_sensors)
-    made_of = composition_of(model, held=n_samples is None)
+    argument = "wavelet_cross_covariance" if series is None else "signal"
+    made_of = composition_of(model, held=series is not None)
     _check_model(made_of, levels)
     wccv = wccv.to(torch.float64)
     gamma = wccv.reshape(-1, levels, n_sensors, n_sensors)
-    usable = _usable(gamma, sensors)
-    series = values.detach().reshape(-1, n_sensors, length)[usable] if n_samples is None else None
+    usable = _usable(argument, gamma, known.sensors)
     gamma = gamma[usable]
     whole = gamma[:, 0].isfinite().all(-1).all(-1)
-    check_positive_definite("`signal`: the wavelet cross-covariance at level 1", gamma[whole, 0], sensors)
+    check_positive_definite(f"`{argument}`: the wavelet cross-covariance at level 1", gamma[whole, 0], known.sensors)
     # In units of each sensor, so that no sensor is small to rounding.
     nu = gamma.diagonal(dim1=-2, dim2=-1)
     size = nu.log().nanmean(-2).nan_to_num(nan=0.0).div(2).exp()  # (item, sensor)
     squared = (size[:, :, None] * size[:, None, :])[:, None]
     scaled = gamma / squared
-    held, held_sd = _held(series, made_of, scaled)
-    records = Records((length,), (levels,))
-    fit = _fit(scaled, held, records, made_of, weighting)
+    held, held_sd = _held(None if series is None else series[usable], made_of, scaled)
+    records = SampleDesign((n_samples,), (levels,))
     return ArrayGMWMResult.build(
-        fit=fit,
+        fit=_fit_in_parts(scaled, held, records, made_of),
         squared=squared,
         held_sd=held_sd,
         made_of=made_of,
         usable=usable,
         wavelet_cross_covariance=wccv,
         records=records,
-        weighting=weighting,
         confidence_level=confidence_level,
-        sensors=sensors,
-        rate=recording.rate if recording else None,
-        unit=recording.unit if recording and recording.unit != "unknown" else None,
+        sensors=known.sensors,
+        rate=known.rate,
+        unit=known.unit,
     )
 
 
-def _fit(gamma: Tensor, held: Tensor, records: Records, made_of: Composition, weighting: str) -> ArrayFit:
+def _fit_in_parts(gamma: Tensor, held: Tensor, records: SampleDesign, made_of: Composition) -> ArrayFit:
     """Fit arrays `(item, level, sensor, sensor)`, some at a time."""
     moments = gamma.shape[1] * gamma.shape[2] * (gamma.shape[2] + 1) // 2
-    at_once = max(_NUMBERS_AT_ONCE // moments**2, 1)
+    at_once = items_at_once(moments**2)
     found = []
     for some, known in zip(gamma.split(at_once), held.split(at_once), strict=True):
-        theta, shape, converged = fit_matrices(some, known, records, made_of, weighting)
-        spread = spread_of_fit(some, theta, shape, records, made_of, weighting)
-        found.append((theta, shape, converged & spread[1].isfinite(), *spread))
+        theta, shape, converged = fit_matrices(some, known, records, made_of)
+        inference = covariance_of_fit(some, theta, shape, records, made_of)
+        found.append((theta, shape, converged & inference[1].isfinite(), *inference))
     return ArrayFit(*(torch.cat(parts) for parts in zip(*found, strict=True)))
 
 
 def _held(series: Tensor | None, made_of: Composition, gamma: Tensor) -> tuple[Tensor, Tensor]:
-    """`x` of the sinusoids, and the spread of beta, of the sensor that shows them most sharply, `(item, tone)`."""
+    """`x` of the sinusoids and the standard error of `beta`, `(item, sinusoid)`, of the sensor with the smallest."""
     found = model_tones(series.flatten(0, 1), made_of) if series is not None else None
     if series is None or found is None:
         empty = gamma.new_empty(len(gamma), 0)
@@ -172,18 +216,20 @@ def _measured(signal: Tensor, n_levels: int | None) -> Tensor:
 
 
 def _given(wccv: Tensor, n_samples: int, n_levels: int | None) -> Tensor:
+    """A wavelet cross-covariance with `n_levels` of its levels, checked."""
     most = largest_level(n_samples)
     if wccv.ndim < 3 or wccv.shape[-1] != wccv.shape[-2] or not 1 <= wccv.shape[-3] <= most:
         raise ValueError(
-            f"`signal`: expected a wavelet cross-covariance (..., level, sensor, sensor) of at most {most} levels for "
-            f"{n_samples} samples, got shape {tuple(wccv.shape)}; without `n_samples` it is taken for a signal"
+            f"`wavelet_cross_covariance`: expected (..., level, sensor, sensor) of at most {most} levels for "
+            f"{n_samples} samples, got shape {tuple(wccv.shape)}; for a signal there is fit_array_gmwm"
         )
     if n_levels is not None and not 1 <= n_levels <= wccv.shape[-3]:
         raise ValueError(f"`n_levels`: expected 1 to {wccv.shape[-3]}, the levels given, got {n_levels}")
     size = wccv.diagonal(dim1=-2, dim2=-1).sqrt()
-    if bool(((wccv - wccv.mT).abs() > _ASYMMETRIC * size[..., :, None] * size[..., None, :]).any()):
+    asymmetric = 1e-5  # difference of two entries, as a correlation: a hundred times what float32 rounds
+    if bool(((wccv - wccv.mT).abs() > asymmetric * size[..., :, None] * size[..., None, :]).any()):
         raise ValueError(
-            "`signal`: expected a symmetric wavelet cross-covariance, got one whose entries (i, k) and (k, i) differ; "
+            "`wavelet_cross_covariance`: expected a symmetric one, got one whose entries (i, k) and (k, i) differ; "
             "give that of `wavelet_cross_covariance`, or the mean of it and its transpose"
         )
     return wccv[..., :n_levels, :, :]
@@ -203,8 +249,8 @@ def _check_model(made_of: Composition, n_levels: int) -> None:
         )
 
 
-def _usable(gamma: Tensor, sensors: tuple[str, ...]) -> Tensor:
-    """Arrays `(item,)` that can be fitted; says which cannot."""
+def _usable(argument: str, gamma: Tensor, sensors: tuple[str, ...]) -> Tensor:
+    """Arrays that can be fitted, `(item,)`; warns of those that cannot."""
     nu = gamma.diagonal(dim1=-2, dim2=-1)
     # A moment counts where it was measured; a variance of zero or an infinite entry is no noise.
     usable = (
@@ -221,6 +267,6 @@ def _usable(gamma: Tensor, sensors: tuple[str, ...]) -> Tensor:
         f"with windows at every level, got others in array(s) {named(places, range(len(places)))}"
     )
     if not bool(usable.any()):
-        raise ValueError(f"`signal`: {what}; leave sensors out or ask for fewer `n_levels`")
-    warnings.warn(f"`signal`: {what}; their results are NaN and not converged", stacklevel=3)
+        raise ValueError(f"`{argument}`: {what}; leave sensors out or ask for fewer `n_levels`")
+    warnings.warn(f"`{argument}`: {what}; their results are NaN and not converged", stacklevel=4)
     return usable

@@ -1,4 +1,4 @@
-"""What a moment fit of arrays says of its matrices: intervals that respect their range, and the J test."""
+"""Inference for the matrices of a moment fit of arrays: intervals that respect their range, and the J test."""
 
 from __future__ import annotations
 
@@ -10,68 +10,70 @@ from torch import Tensor
 
 from gyrofuse.fitting.array.moments import array_moment_covariance, pairs, unvech, vech, weights_of
 from gyrofuse.fitting.array.search import jacobian
-from gyrofuse.fitting.moments.inference import _quadratic, _sandwich
-from gyrofuse.fitting.moments.records import Records
+from gyrofuse.fitting.moments.inference import quadratic, sandwich
+from gyrofuse.fitting.moments.records import SampleDesign
 from gyrofuse.fitting.structure import Composition
 from gyrofuse.wavelets.equivalent_dof import normal_quantile
 
-# Of the largest eigenvalue of a matrix between sensors of unit size, what is as good as none.
-_NOTHING = 1e-5
-# Of a moment of unit size, the same.
-_GONE = 1e-8
-# Standard deviations from zero below which the logarithm of a variance tells nothing.
-_RESOLVED = 0.5
-# Of a memory of which the record holds fewer time constants, the delta method says nothing that holds: one of a seventh
-# of the record looks like anything from a thirtieth to a random walk.
+# Time constants of an AR1 in the record below which its parameters count as unidentified: an AR1 with a time constant
+# of a seventh of the record is estimated anywhere from a thirtieth of it to a random walk, and the delta method fails.
 FEWEST_TIME_CONSTANTS = 50
 
 
 class ArrayFit(NamedTuple):
-    """Where a search ended.
+    """Fit of arrays in units of their sensors.
 
     Attributes:
-        theta: `(item, process, sensor, sensor)`.
-        shape: `x`, `(item, shaped)`.
-        converged: `(item,)`.
-        spread: Covariance of the entries of `theta` and the `x` that moved, `(item, unknown, unknown)`; NaN for entries
-            that no moment tells.
+        theta: Matrices, `(item, process, sensor, sensor)`.
+        shape: Nonlinear parameters `x`, `(item, shaped)`.
+        converged: Whether the search came to rest, `(item,)`.
+        covariance: Covariance of the entries of `theta` and the `x` that were fitted, `(item, unknown, unknown)`; NaN
+            for entries that no moment determines.
         objective: `r' Omega r`, `(item,)`.
-        degrees: Of freedom of the J statistic, `(item,)`.
+        dof: Degrees of freedom of the J statistic, `(item,)`.
         dispersion: Variance of the J statistic over that of a chi-square, `(item,)`.
-        rank: Of each matrix, `(item, process)`.
+        rank: Rank of each matrix, `(item, process)`.
     """
 
     theta: Tensor
     shape: Tensor
     converged: Tensor
-    spread: Tensor
+    covariance: Tensor
     objective: Tensor
-    degrees: Tensor
+    dof: Tensor
     dispersion: Tensor
     rank: Tensor
 
 
 class Estimate(NamedTuple):
-    """A value with its standard deviation and interval, all of one shape."""
+    """A value with its standard error and interval, all of one shape."""
 
     value: Tensor
-    sd: Tensor
+    std_err: Tensor
     low: Tensor
     high: Tensor
 
 
-def spread_of_fit(
-    gamma: Tensor, theta: Tensor, shape: Tensor, records: Records, made_of: Composition, weighting: str
+def covariance_of_fit(
+    gamma: Tensor,
+    theta: Tensor,
+    shape: Tensor,
+    records: SampleDesign,
+    made_of: Composition,
+    *,
+    rounding: float = 1e-5,
+    negligible: float = 1e-8,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Sandwich covariance `(A' O A)^-1 A' O V O A (A' O A)^-1` with `A` the Jacobian, as if no matrix lacked rank.
 
     Args:
-        gamma: What was fitted, `(item, level, sensor, sensor)`.
-        theta: `(item, process, sensor, sensor)`.
-        shape: `x`, `(item, shaped)`.
-        records: Their length and levels.
+        gamma: Wavelet cross-covariance that was fitted, `(item, level, sensor, sensor)`.
+        theta: Matrices, `(item, process, sensor, sensor)`.
+        shape: Nonlinear parameters `x`, `(item, shaped)`.
+        records: Length and levels of the records.
         made_of: Structure of the model.
-        weighting: Of the moments.
+        rounding: Share of the largest eigenvalue of a matrix below which another one counts as zero.
+        negligible: Share of a moment that the same eigenvalue adds to it, below which it counts as zero.
 
     Returns:
         Covariance, objective, degrees of freedom, dispersion and ranks as in `ArrayFit`.
@@ -79,28 +81,28 @@ def spread_of_fit(
     n_items, n_sensors = len(gamma), gamma.shape[-1]
     present = vech(gamma).isfinite()
     covariance = array_moment_covariance(made_of, theta, shape, records)
-    weight = weights_of(covariance, present, weighting)
+    weight = weights_of(covariance, present)
     tau = records.tau.to(gamma)
     columns = made_of.columns(tau, shape)
     fitted = columns @ vech(theta)
     residual = torch.where(present, vech(gamma) - fitted, 0.0).flatten(1)
-    # As many levels as processes tell a pair's entries.
-    told = (present.sum(1) >= made_of.n_linear)[:, None].expand(-1, made_of.n_linear, -1).flatten(1)
-    known = torch.cat([told, told.new_ones(n_items, len(made_of.curved))], -1)
+    # The entries of a pair are determined by at least as many levels as there are processes.
+    entries = (present.sum(1) >= made_of.n_linear)[:, None].expand(-1, made_of.n_linear, -1).flatten(1)
+    known = torch.cat([entries, entries.new_ones(n_items, len(made_of.curved))], -1)
     slopes = jacobian(tau, made_of, theta, shape) * present.flatten(1)[..., None]
     flat = covariance.reshape(*weight.shape)
-    spread, objective = _sandwich(slopes, known, flat, weight), _quadratic(residual, weight)
+    spread, objective = sandwich(slopes, known, flat, weight), quadratic(residual, weight)
     spread = torch.where(known[:, :, None] & known[:, None, :], spread, torch.nan)
     eigenvalues = torch.linalg.eigvalsh(theta) * columns.amax(-2)[..., None]  # of moments of unit size
-    lost = ((eigenvalues < _NOTHING * eigenvalues[..., -1:]) | (eigenvalues < _GONE)).sum(-1)
-    degrees = present.flatten(1).sum(-1) - known.sum(-1) + (lost * (lost + 1) // 2).sum(-1)
+    lost = ((eigenvalues < rounding * eigenvalues[..., -1:]) | (eigenvalues < negligible)).sum(-1)
+    dof = present.flatten(1).sum(-1) - known.sum(-1) + (lost * (lost + 1) // 2).sum(-1)
     own = [at for at, pair in enumerate(zip(*pairs(n_sensors), strict=True)) if pair[0] == pair[1]]
     variance = covariance.diagonal(dim1=1, dim2=3).diagonal(dim1=1, dim2=2)
     rarity = (variance / fitted.square() / 2)[..., own]  # of observations: one over their number, (item, level, sensor)
-    return spread, objective, degrees, _dispersion(rarity, present[..., own], degrees), n_sensors - lost
+    return spread, objective, dof, _dispersion(rarity, present[..., own], dof), n_sensors - lost
 
 
-def _dispersion(rarity: Tensor, present: Tensor, degrees: Tensor) -> Tensor:
+def _dispersion(rarity: Tensor, present: Tensor, dof: Tensor) -> Tensor:
     """Variance of `r' V^-1 r` over twice its degrees of freedom, when levels hold few observations.
 
     Of a covariance `S` of `p` variables with `n` observations, `n tr((S - 1)^2) / 2` has mean `p (p + 1) / 2` and
@@ -108,22 +110,30 @@ def _dispersion(rarity: Tensor, present: Tensor, degrees: Tensor) -> Tensor:
     """
     p = present.sum(-1)  # (item, level)
     mean = torch.where(present, rarity, 0.0).sum(-1) / p.clamp(min=1)
-    return 1 + (p * (2 * p.square() + 5 * p + 5) * mean).sum(-1) / (2 * degrees.clamp(min=1))
+    return 1 + (p * (2 * p.square() + 5 * p + 5) * mean).sum(-1) / (2 * dof.clamp(min=1))
 
 
-def matrices(fit: ArrayFit, told: Tensor, confidence_level: float) -> tuple[Estimate, Estimate]:
+def matrices(fit: ArrayFit, identified: Tensor, confidence_level: float) -> tuple[Estimate, Estimate]:
     """Entries of the matrices, and correlations, each `(item, process, sensor, sensor)`.
 
     Intervals are symmetric in the logarithm of variances, in `atanh` of correlations, and in covariances as they are. A
-    variance that is hardly told from zero gets an upper limit only, as do those of a matrix that is not `told`, whose
-    covariances and correlations get none: the bound on its eigenvalues leaves nothing that is symmetric, and a memory
-    found too short makes all variances too large.
+    variance that hardly differs from zero gets an upper limit only, as do those of a matrix that is not identified,
+    whose covariances and correlations get none: the bound on its eigenvalues leaves nothing that is symmetric, and a
+    time constant estimated too short makes all variances too large.
+
+    Args:
+        fit: Fit of the arrays.
+        identified: Whether each matrix is identified, `(item, process)`, see `identified_matrices`.
+        confidence_level: Probability that an interval holds the true value.
+
+    Returns:
+        Entries and correlations.
     """
     n_processes, n_sensors = fit.theta.shape[1], fit.theta.shape[-1]
     a, b = pairs(n_sensors)
     n_pairs = len(a)
     n_linear = n_processes * n_pairs
-    whole = fit.spread[:, :n_linear, :n_linear].unflatten(1, (n_processes, -1)).unflatten(3, (n_processes, -1))
+    whole = fit.covariance[:, :n_linear, :n_linear].unflatten(1, (n_processes, -1)).unflatten(3, (n_processes, -1))
     spread = whole.diagonal(dim1=1, dim2=3).movedim(-1, 1)  # (item, process, pair, pair)
     sd = spread.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
     value = torch.where(sd.isnan(), torch.nan, vech(fit.theta))
@@ -131,10 +141,10 @@ def matrices(fit: ArrayFit, told: Tensor, confidence_level: float) -> tuple[Esti
     low, high = value - z * sd, value + z * sd
     own = (a == b).nonzero()[:, 0]
     variance, ratio = value[..., own], sd[..., own] / value[..., own]
-    resolved = ratio < 1 / _RESOLVED
-    told = told[..., None]  # (item, process, 1)
-    low, high = (torch.where(told, limit, torch.nan) for limit in (low, high))
-    two_sided = resolved & told
+    resolved = ratio < 2  # beyond, the logarithm of a variance has no useful interval
+    identified = identified[..., None]  # (item, process, 1)
+    low, high = (torch.where(identified, limit, torch.nan) for limit in (low, high))
+    two_sided = resolved & identified
     low[..., own] = torch.where(two_sided, variance * torch.exp(-z * ratio), 0 * variance)
     reach = torch.where(two_sided, z, one_sided) * ratio
     high[..., own] = variance * torch.where(resolved, torch.exp(reach), 1 + reach)
@@ -152,35 +162,36 @@ def matrices(fit: ArrayFit, told: Tensor, confidence_level: float) -> tuple[Esti
     filled = spread.nan_to_num(nan=0.0)
     rho_sd = (slopes.nan_to_num(nan=0.0) @ filled * slopes.nan_to_num(nan=0.0)).sum(-1).clamp(min=0).sqrt()
     rho_sd = torch.where(rho.isnan(), torch.nan, rho_sd)
-    # Towards a correlation of one, which it takes for certain, the scale of atanh ends.
-    width = z * rho_sd / (1 - rho.square()).clamp(min=1e-12)
-    middle = rho.clamp(-1 + 1e-12, 1 - 1e-12).atanh()
-    low, high = (torch.where(told, (middle + sign * width).tanh(), torch.nan) for sign in (-1, 1))
-    # Every sensor agrees with itself.
+    # At a correlation of one, estimated without error, the scale of atanh ends.
+    end = 1e-12
+    width = z * rho_sd / (1 - rho.square()).clamp(min=end)
+    middle = rho.clamp(-1 + end, 1 - end).atanh()
+    low, high = (torch.where(identified, (middle + sign * width).tanh(), torch.nan) for sign in (-1, 1))
+    # The correlation of a sensor with itself is one.
     itself = (a == b).to(rho.device)
     certain = [torch.where(itself, one, part) for one, part in ((0.0, rho_sd), (1.0, low), (1.0, high))]
     return entries, Estimate(*(unvech(part) for part in (rho, *certain)))
 
 
-def covariance_of_numbers(fit: ArrayFit, squared: Tensor, sd: Tensor, made_of: Composition) -> Tensor:
+def covariance_of_numbers(fit: ArrayFit, squared: Tensor, std_err: Tensor, made_of: Composition) -> Tensor:
     """Covariance of entries of the matrices and of `phi` or `beta`, process by process, `(item, number, number)`.
 
     Args:
-        fit: Where the search ended.
+        fit: Fit of the arrays.
         squared: Units of the entries, `(item, 1, pair)`.
-        sd: Spread of `phi` and `beta`, `(item, parameter)`; where the search held one, all that is known of it.
+        std_err: Standard errors of `phi` and `beta`, `(item, parameter)`, also of those that were not fitted.
         made_of: Structure of the model.
     """
     n_items, n_pairs = len(squared), squared.shape[-1]
     n_linear = made_of.n_linear * n_pairs
     moved = [made_of.shaped.index(k) for k in made_of.curved]
-    among = fit.spread.diagonal(dim1=-2, dim2=-1)[:, n_linear:].clamp(min=0).sqrt()
-    # d phi / d x from the two spreads; 0 / 0 where there is none.
-    slope = (sd[:, moved] / among).nan_to_num(nan=0.0)
+    among = fit.covariance.diagonal(dim1=-2, dim2=-1)[:, n_linear:].clamp(min=0).sqrt()
+    # d phi / d x from the two standard errors; 0 / 0 where there is none.
+    slope = (std_err[:, moved] / among).nan_to_num(nan=0.0)
     units = torch.cat([squared.expand(-1, made_of.n_linear, -1).flatten(1), slope], -1)
-    whole = torch.diag_embed(torch.cat([torch.zeros(n_items, n_linear).to(sd), sd.square()], -1))
-    place = torch.tensor([*range(n_linear), *(n_linear + i for i in moved)], device=sd.device)
-    whole[:, place[:, None], place] = fit.spread * (units[:, :, None] * units[:, None, :])
+    whole = torch.diag_embed(torch.cat([torch.zeros(n_items, n_linear).to(std_err), std_err.square()], -1))
+    place = torch.tensor([*range(n_linear), *(n_linear + i for i in moved)], device=std_err.device)
+    whole[:, place[:, None], place] = fit.covariance * (units[:, :, None] * units[:, None, :])
     order: list[int] = []
     for k in range(made_of.n_linear):
         order += range(k * n_pairs, (k + 1) * n_pairs)
@@ -189,31 +200,40 @@ def covariance_of_numbers(fit: ArrayFit, squared: Tensor, sd: Tensor, made_of: C
 
 
 def is_long(phi: Tensor, n_samples: int) -> Tensor:
-    """Whether the record holds too few time constants of an AR1, of the shape of `phi`."""
+    """Whether a record of `n_samples` holds too few time constants of an AR1 of this `phi`, of the shape of `phi`."""
     return phi > math.exp(-FEWEST_TIME_CONSTANTS / n_samples)
 
 
-def told_matrices(fit: ArrayFit, made_of: Composition, n_samples: int) -> Tensor:
-    """Whether a matrix has full rank and its process no long memory, `(item, process)`."""
-    told = fit.rank == fit.theta.shape[-1]
+def identified_matrices(fit: ArrayFit, made_of: Composition, n_samples: int) -> Tensor:
+    """Whether a matrix has full rank and its process no long time constant, `(item, process)`."""
+    identified = fit.rank == fit.theta.shape[-1]
     for k, x in zip(made_of.shaped, fit.shape.unbind(-1), strict=True):
         if made_of.processes[k].has_memory():
-            told[:, k] &= ~is_long(made_of.processes[k].from_unconstrained(x), n_samples)
-    return told
+            identified[:, k] &= ~is_long(made_of.processes[k].from_unconstrained(x), n_samples)
+    return identified
 
 
-def shared(fit: ArrayFit, told: Tensor, held_sd: Tensor, made_of: Composition, confidence_level: float) -> Estimate:
+def shared(
+    fit: ArrayFit, identified: Tensor, held_sd: Tensor, made_of: Composition, confidence_level: float
+) -> Estimate:
     """Parameters `(item, parameter)` of all sensors, `phi` of AR1s and `beta` of tones, in the order of the model.
 
-    Intervals are symmetric in `atanh phi` and `logit(beta / pi)`. No AR1 has one where the matrix of any of them is
-    not `told`: what that one gets wrong the others make up for.
+    Intervals are symmetric in `atanh phi` and `logit(beta / pi)`. No AR1 has one where the matrix of any of them is not
+    identified, as an error in one is compensated by the others.
+
+    Args:
+        fit: Fit of the arrays.
+        identified: Whether each matrix is identified, `(item, process)`.
+        held_sd: Standard errors of frequencies that the moments did not fit, `(item, sinusoid)`.
+        made_of: Structure of the model.
+        confidence_level: Probability that an interval holds the true value.
     """
     z = normal_quantile((1 + confidence_level) / 2)
     n_moving = len(made_of.curved)
-    moving = fit.spread.diagonal(dim1=-2, dim2=-1)[:, fit.spread.shape[-1] - n_moving :].clamp(min=0).sqrt()
+    moving = fit.covariance.diagonal(dim1=-2, dim2=-1)[:, fit.covariance.shape[-1] - n_moving :].clamp(min=0).sqrt()
     moved, held = iter(moving.unbind(-1)), iter(held_sd.unbind(-1))
     memories = [k for k, process in enumerate(made_of.processes) if process.has_memory()]
-    vague = ~told[:, memories].all(-1)
+    vague = ~identified[:, memories].all(-1)
     found = []
     for k, x in zip(made_of.shaped, fit.shape.unbind(-1), strict=True):
         process = made_of.processes[k]

@@ -9,11 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gyrofuse.fitting.moments.records import Records
+from gyrofuse.fitting.moments.records import SampleDesign
 from gyrofuse.fitting.structure import Composition
-
-# Of the size of each moment, what keeps covariances of moments that hardly differ regular.
-_RIDGE = 1e-11
 
 
 def pairs(n_sensors: int) -> tuple[Tensor, Tensor]:
@@ -37,7 +34,7 @@ def unvech(entries: Tensor) -> Tensor:
     return entries[..., place.to(entries.device)]
 
 
-def array_moment_covariance(made_of: Composition, theta: Tensor, shape: Tensor, records: Records) -> Tensor:
+def array_moment_covariance(made_of: Composition, theta: Tensor, shape: Tensor, records: SampleDesign) -> Tensor:
     """Covariance of the estimated WCCV of a Gaussian array, for the finite length of its record.
 
     `Cov(gamma_ab,j, gamma_cd,l) = sum_km Q_jl[k,m] (Theta_k,ac Theta_m,bd + Theta_k,ad Theta_m,bc)` over the processes,
@@ -64,7 +61,7 @@ def array_moment_covariance(made_of: Composition, theta: Tensor, shape: Tensor, 
     return covariance.view(-1, records.n_levels, records.n_levels, len(a), len(a)).transpose(2, 3)
 
 
-def _table(made_of: Composition, size: Tensor, shape: Tensor, records: Records) -> Tensor:
+def _table(made_of: Composition, size: Tensor, shape: Tensor, records: SampleDesign) -> Tensor:
     """`Q` of processes of these sizes, `(item, process, process, level, level)`.
 
     A sum of two processes has `V = 2 (Q_kk + Q_mm + 2 Q_km)`. Of their true sizes, so that what a small process loses
@@ -85,30 +82,37 @@ def _table(made_of: Composition, size: Tensor, shape: Tensor, records: Records) 
     return table
 
 
-def weights_of(covariance: Tensor, present: Tensor, weighting: str) -> Tensor:
-    """Weights of the moments: `V^-1`, or with `"pairwise"` that of each pair's own levels; 0 where there is none.
+def weights_of(covariance: Tensor, present: Tensor, *, pairwise: bool = False) -> Tensor:
+    """Weights of the moments: `V^-1`, 0 where there is none.
 
     Args:
-        covariance: `(item, level, pair, level, pair)`.
-        present: `(item, level, pair)`, moments that were measured.
-        weighting: `"optimal"` or `"pairwise"`.
+        covariance: `V`, `(item, level, pair, level, pair)`.
+        present: Moments that were measured, `(item, level, pair)`.
+        pairwise: Whether pairs of sensors count as independent, each with the inverse covariance of its own levels.
 
     Returns:
         `(item, moment, moment)`, moments of one level side by side.
     """
     n_items, n_levels, n_pairs = present.shape
-    if weighting == "pairwise":
+    if pairwise:
         own = covariance.diagonal(dim1=2, dim2=4).movedim(-1, 1)  # (item, pair, level, level)
         inverse = _inverse(own, present.mT)
         return torch.diag_embed(inverse.movedim(1, -1), dim1=2, dim2=4).reshape(n_items, n_levels * n_pairs, -1)
     return _inverse(covariance.reshape(n_items, n_levels * n_pairs, -1), present.flatten(1))
 
 
-def _inverse(covariance: Tensor, present: Tensor) -> Tensor:
-    """Inverse over the moments that are present, zero elsewhere; NaN where there is none."""
+def _inverse(covariance: Tensor, present: Tensor, ridge: float = 1e-11) -> Tensor:
+    """Inverse over the moments that are present, zero elsewhere; NaN where there is none.
+
+    Args:
+        covariance: Covariance matrix, `(..., moment, moment)`.
+        present: Moments that were measured, `(..., moment)`.
+        ridge: Share of the variance of each moment that is added to it, as its covariance is rounded: moments that
+            hardly differ would have no inverse.
+    """
     size = covariance.diagonal(dim1=-2, dim2=-1)
     scale = torch.where(present, size.clamp(min=torch.finfo(size.dtype).tiny).rsqrt(), 0.0)
-    regular = torch.where(present, 1 + _RIDGE, 1.0) - (scale.square() * size)
+    regular = torch.where(present, 1 + ridge, 1.0) - (scale.square() * size)
     correlation = scale[..., :, None] * covariance * scale[..., None, :] + torch.diag_embed(regular)
     root, failed = torch.linalg.cholesky_ex(correlation)
     inverse = torch.cholesky_inverse(torch.where((failed > 0)[..., None, None], torch.nan, root))

@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from gyrofuse._base.results import ConfidenceInterval, counted, listed
+from gyrofuse._base.deprecation import RenamedAttribute
+from gyrofuse._base.results import ConfidenceInterval, Result, counted, plain, scattered
 from gyrofuse.fitting.array.inference import (
     FEWEST_TIME_CONSTANTS,
     ArrayFit,
     covariance_of_numbers,
+    identified_matrices,
     is_long,
     matrices,
     shared,
-    told_matrices,
 )
 from gyrofuse.fitting.array.moments import vech
-from gyrofuse.fitting.moments.records import Records
+from gyrofuse.fitting.moments.records import SampleDesign
 from gyrofuse.fitting.structure import Composition
 from gyrofuse.fusion.live import subset_weights
 from gyrofuse.fusion.weights.svo import ScaleWeights
@@ -32,78 +33,58 @@ from gyrofuse.wavelets.equivalent_dof import chi_square_tail
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_BATCHED = (
-    "theta",
-    "theta_sd",
-    "confidence_interval",
-    "correlation",
-    "correlation_interval",
-    "params",
-    "params_sd",
-    "params_interval",
-    "param_cov",
-    "objective",
-    "degrees_of_freedom",
-    "p_value",
-    "converged",
-    "rank",
-    "wavelet_cross_covariance",
-    "fitted_wavelet_cross_covariance",
-)
-
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ArrayGMWMResult:
-    """Noise models fitted to wavelet cross-covariances; `...` are the leading dimensions of the signal. Index it to get
-    one array of a batch.
+class ArrayGMWMResult(Result):
+    """Noise models fitted to wavelet cross-covariances; `...` are the leading dimensions of the signal.
 
     Attributes:
-        processes: Of the sum, without values.
+        processes: Processes of the sum, without values.
         theta: Covariance matrices between the sensors `(..., process, sensor, sensor)`: of white noise, of the
-            innovations of an AR1, of the steps of a random walk, of amplitudes in phase of a tone (their squares, twice
-            its variances, on the diagonal; of rank 2 at most, as a tone has two phases). Positive semi-definite. NaN
-            for a sensor without samples and a pair that is never seen together.
-        theta_sd: Standard deviation of every entry, as if no matrix lacked rank.
-        confidence_interval: Limits of every entry. A variance that is hardly told from zero, or in a matrix that lacks
-            rank or of a long memory, has an upper limit only; covariances of such a matrix have none (NaN).
-        correlation: Of the sensors in each process.
-        correlation_interval: Limits of the same, NaN where the matrix lacks rank or is that of a long memory.
-        param_names: Of what all sensors share, such as `ar1_1.phi`.
-        params: `(..., parameter)`.
-        params_sd: `(..., parameter)`.
-        params_interval: Limits `(..., parameter)`, NaN for `phi` where `remarks` say so.
+            innovations of an AR1, of the steps of a random walk, of in-phase amplitudes of a sinusoid (their squares,
+            twice its variances, on the diagonal; of rank 2 at most, as a sinusoid has two phases). Positive
+            semi-definite. NaN for a sensor without samples and a pair that is never seen together.
+        theta_std_err: Standard errors of the entries, as if no matrix lacked rank.
+        confidence_interval: Limits of the entries. A variance that hardly differs from zero, or belongs to a matrix
+            that lacks rank or to a long memory, has an upper limit only; covariances of such a matrix have none (NaN).
+        correlation: Correlations between the sensors in each process.
+        correlation_interval: Limits of the correlations, NaN where the matrix lacks rank or belongs to a long memory.
+        param_names: Names of the parameters that all sensors share, such as `ar1_1.phi`.
+        params: Shared parameters, `(..., parameter)`.
+        params_std_err: Standard errors of the shared parameters, `(..., parameter)`.
+        params_interval: Limits `(..., parameter)`, NaN for `phi` where `notes` say so.
         param_cov: Covariance of all numbers of the model, as if no matrix lacked rank: entries of the matrices on and
             above the diagonal, row after row, and `phi` or `beta`, process by process, `(..., number, number)`. NaN
             for pairs that are never seen together.
-        confidence_level: Of all intervals.
+        confidence_level: Probability that an interval holds the true value.
         objective: `r' Omega r` with `r` the entries of measured less fitted wavelet cross-covariance, `(...)`.
-        degrees_of_freedom: Moments less parameters, `(...)`.
-        p_value: Of the J test, that the model is complete, `(...)`; NaN with other than optimal weights.
-        converged: `(...)`, whether the search came to rest.
-        rank: Of every matrix, `(..., process)`, 0 for an array that could not be fitted.
-        wavelet_cross_covariance: Measured, `(..., level, sensor, sensor)`, signal^2.
-        fitted_wavelet_cross_covariance: Of the model, the same.
+        dof: Degrees of freedom, moments less parameters, `(...)`.
+        p_value: P value of the J test, that the model is complete, `(...)`.
+        converged: Whether the search came to rest, `(...)`.
+        rank: Rank of every matrix, `(..., process)`, 0 for an array that could not be fitted.
+        wavelet_cross_covariance: Measured wavelet cross-covariance, `(..., level, sensor, sensor)`, signal^2.
+        fitted_wavelet_cross_covariance: Wavelet cross-covariance of the model, the same.
         n_samples: Length of the records.
-        weighting: Of the moments.
-        sensors: Names.
-        rate: Hz, where known.
-        unit: Of the signal, where known.
+        weighting: Weighting of the moments, always `"optimal"`.
+        sensors: Names of the sensors.
+        rate: Sampling rate in Hz, where known.
+        unit: Unit of the signal, where known.
     """
 
     processes: tuple[Process, ...]
     theta: Tensor
-    theta_sd: Tensor
+    theta_std_err: Tensor
     confidence_interval: ConfidenceInterval
     correlation: Tensor
     correlation_interval: ConfidenceInterval
     param_names: tuple[str, ...]
     params: Tensor
-    params_sd: Tensor
+    params_std_err: Tensor
     params_interval: ConfidenceInterval
     param_cov: Tensor
     confidence_level: float
     objective: Tensor
-    degrees_of_freedom: Tensor
+    dof: Tensor
     p_value: Tensor
     converged: Tensor
     rank: Tensor
@@ -115,6 +96,29 @@ class ArrayGMWMResult:
     rate: float | None
     unit: str | None
 
+    theta_sd = RenamedAttribute("theta_std_err")
+    params_sd = RenamedAttribute("params_std_err")
+    degrees_of_freedom = RenamedAttribute("dof")
+    remarks = RenamedAttribute("notes")
+    _batched = (
+        "theta",
+        "theta_std_err",
+        "confidence_interval",
+        "correlation",
+        "correlation_interval",
+        "params",
+        "params_std_err",
+        "params_interval",
+        "param_cov",
+        "objective",
+        "dof",
+        "p_value",
+        "converged",
+        "rank",
+        "wavelet_cross_covariance",
+        "fitted_wavelet_cross_covariance",
+    )
+
     @classmethod
     def build(
         cls,
@@ -124,57 +128,68 @@ class ArrayGMWMResult:
         held_sd: Tensor,
         made_of: Composition,
         usable: Tensor,
-        records: Records,
+        records: SampleDesign,
         wavelet_cross_covariance: Tensor,
         **rest: Any,
     ) -> ArrayGMWMResult:
         """Put the arrays that could be fitted back into their places among all, `(item,)` -> `(...)`.
 
-        `squared` are the units of the entries of their matrices, `(item, 1, sensor, sensor)`, `held_sd` the spreads of
-        the frequencies of tones, `(item, tone)`.
+        Args:
+            fit: Fit of the arrays in units of their sensors.
+            squared: Units of the entries of their matrices, `(item, 1, sensor, sensor)`.
+            held_sd: Standard errors of frequencies that the moments did not fit, `(item, sinusoid)`.
+            made_of: Structure of the model.
+            usable: Which arrays of all they are, `(item,)`, bool.
+            records: Length and levels of the records.
+            wavelet_cross_covariance: Measured, of all arrays, `(..., level, sensor, sensor)`.
+            **rest: Fields that are no results of the fit.
         """
         batch = wavelet_cross_covariance.shape[:-3]
 
         def placed(value: Tensor, missing: float | bool = torch.nan) -> Tensor:
-            whole = value.new_full((len(usable), *value.shape[1:]), missing)
-            whole[usable] = value
-            return whole.view((*batch, *value.shape[1:]))
+            return scattered(value, usable, batch, missing)
 
-        told = told_matrices(fit, made_of, records.longest)
-        entries, correlation = matrices(fit, told, rest["confidence_level"])
-        params = shared(fit, told, held_sd, made_of, rest["confidence_level"])
+        identified = identified_matrices(fit, made_of, records.longest)
+        entries, correlation = matrices(fit, identified, rest["confidence_level"])
+        params = shared(fit, identified, held_sd, made_of, rest["confidence_level"])
         theta = entries.value * squared
         columns = made_of.columns(records.tau.to(squared), fit.shape)
         # A scaled chi-square of the same mean and variance.
-        p_value = chi_square_tail(fit.objective / fit.dispersion, fit.degrees / fit.dispersion)
+        p_value = chi_square_tail(fit.objective / fit.dispersion, fit.dof / fit.dispersion)
         names = Model(list(made_of.processes)).param_names
         return cls(
             processes=made_of.processes,
             theta=placed(theta),
-            theta_sd=placed(entries.sd * squared),
+            theta_std_err=placed(entries.std_err * squared),
             confidence_interval=ConfidenceInterval(placed(entries.low * squared), placed(entries.high * squared)),
             correlation=placed(correlation.value),
             correlation_interval=ConfidenceInterval(placed(correlation.low), placed(correlation.high)),
             param_names=tuple(name for name in names if name.endswith((".phi", ".beta"))),
             params=placed(params.value),
-            params_sd=placed(params.sd),
+            params_std_err=placed(params.std_err),
             params_interval=ConfidenceInterval(placed(params.low), placed(params.high)),
-            param_cov=placed(covariance_of_numbers(fit, vech(squared), params.sd, made_of)),
+            param_cov=placed(covariance_of_numbers(fit, vech(squared), params.std_err, made_of)),
             objective=placed(fit.objective),
-            degrees_of_freedom=placed(fit.degrees.to(theta)),
-            p_value=placed(p_value if rest["weighting"] == "optimal" else torch.full_like(p_value, torch.nan)),
+            dof=placed(fit.dof.to(theta)),
+            p_value=placed(p_value),
             converged=placed(fit.converged, False),
             rank=placed(fit.rank, 0),
             wavelet_cross_covariance=wavelet_cross_covariance,
             fitted_wavelet_cross_covariance=placed(torch.einsum("njk,nkab->njab", columns, theta)),
             n_samples=records.longest,
+            weighting="optimal",
             **rest,
         )
 
     @property
-    def remarks(self) -> tuple[tuple[str, ...], ...]:
-        """What the record does not tell, in words, for each array, item after item."""
-        return tuple(self._remarks(index) for index in itertools.product(*map(range, self.converged.shape)))
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading dimensions of the arrays; `()` for a single one."""
+        return tuple(self.theta.shape[:-3])
+
+    @property
+    def notes(self) -> tuple[tuple[str, ...], ...]:
+        """What the record does not determine, in words, for each array, item after item."""
+        return tuple(self._notes(index) for index in itertools.product(*map(range, self.converged.shape)))
 
     @property
     def model(self) -> ArrayModel:
@@ -199,8 +214,8 @@ class ArrayGMWMResult:
             of_unit_size = dict.fromkeys(process.parameters, 1.0)
             of_unit_size |= {name: next(shapes) for name in ("phi", "beta") if name in of_unit_size}
             components.append((kind(**of_unit_size), matrix))
-        told = EstimatedFrom(self.n_samples, self.param_cov[self._of_present()][:, self._of_present()])
-        return ArrayModel(components, estimated_from=told)
+        source = EstimatedFrom(self.n_samples, self.param_cov[self._of_present()][:, self._of_present()])
+        return ArrayModel(components, estimated_from=source)
 
     def svo_weights(self, scale_weights: ScaleWeights = "flat") -> Tensor:
         """Optimal weights of the array from the fitted wavelet cross-covariance; 0 for sensors without samples.
@@ -250,27 +265,13 @@ class ArrayGMWMResult:
                 value = self.theta[k, i, i].item()
                 others = " ".join(f"{rho:6.2f}" for rho in self.correlation[k, i].tolist())
                 lines.append(f"  {sensor:<12}{value:>12.5g} [{low:>11.5g}, {high:>11.5g}]  {others}")
-        return "\n".join([*lines, *("", *self.remarks[0]) * bool(self.remarks[0])])
-
-    def __str__(self) -> str:
-        return self.summary()
-
-    def __getitem__(self, index: Any) -> ArrayGMWMResult:
-        """Some arrays of a batch."""
-        if self.theta.ndim == 3:
-            raise IndexError("there is one array, not a batch")
-        chosen: dict[str, Any] = {}
-        for name in _BATCHED:
-            value = getattr(self, name)
-            is_pair = isinstance(value, ConfidenceInterval)
-            chosen[name] = ConfidenceInterval(*(limit[index] for limit in value)) if is_pair else value[index]
-        return replace(self, **chosen)
+        return "\n".join([*lines, *("", *self.notes[0]) * bool(self.notes[0])])
 
     def plot(self, ax: Axes | None = None) -> Axes:
         """Draw the sensors' Allan deviations, measured and of the fitted model (dashed).
 
         Args:
-            ax: Where to draw; a new figure by default.
+            ax: Axes to draw on; a new figure by default.
 
         Raises:
             ValueError: The result holds a batch.
@@ -291,16 +292,10 @@ class ArrayGMWMResult:
         return ax
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain numbers and lists; what is not known is None."""
-        plain: dict[str, Any] = {"processes": [process.symbol for process in self.processes]}
-        for entry in fields(self)[1:]:
-            value = getattr(self, entry.name)
-            if isinstance(value, ConfidenceInterval):
-                value = {"low": listed(value.low), "high": listed(value.high)}
-            elif isinstance(value, Tensor):
-                value = value.tolist() if value.dtype == torch.bool else listed(value)
-            plain[entry.name] = list(value) if isinstance(value, tuple) else value
-        return plain | {"remarks": [list(texts) for texts in self.remarks]}
+        """Everything as plain lists and numbers, ready for JSON (NaN and infinities as None)."""
+        old = {"theta_std_err": "theta_sd", "params_std_err": "params_sd", "dof": "degrees_of_freedom"}
+        known = {old.get(e.name, e.name): plain(getattr(self, e.name)) for e in fields(self) if e.name != "processes"}
+        return {"processes": [process.symbol for process in self.processes]} | known | {"remarks": plain(self.notes)}
 
     def _of_present(self) -> Tensor:
         """Which numbers of the model are those of sensors that have samples, `(number,)`."""
@@ -308,7 +303,7 @@ class ArrayGMWMResult:
         shaped = [any(name in process.parameters for name in ("phi", "beta")) for process in self.processes]
         return torch.cat([torch.cat([both, both.new_ones(int(is_shaped))]) for is_shaped in shaped])
 
-    def _remarks(self, index: tuple[int, ...]) -> tuple[str, ...]:
+    def _notes(self, index: tuple[int, ...]) -> tuple[str, ...]:
         n_sensors = self.theta.shape[-1]
         if not bool(self._present()[index].any()):
             return ()

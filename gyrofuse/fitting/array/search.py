@@ -9,22 +9,24 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from gyrofuse._base.optimize import Trial, descend
 from gyrofuse.fitting.array.moments import pairs, unvech, vech
 from gyrofuse.fitting.moments import search
 from gyrofuse.fitting.structure import Composition
 
-# The longest step of an `x`, and the difference that tells how its slopes change.
-_STRIDE, _APART = 1.0, 1e-4
-# Damping of a step, relative to the scaled curvatures, one after the other until it leads downhill.
-_DAMPINGS = (0.0, 1e-4, 1e-2, 1.0, 1e2)
-# Of a curvature, what is as good as none.
-_FLAT = 1e-10
-# What an eigenvalue adds to a moment of unit size at least: from nothing at all there is no way back.
-_LEAST = 1e-10
-
 
 def step_downhill(
-    gamma: Tensor, weight: Tensor, tau: Tensor, made_of: Composition, root: Tensor, shape: Tensor, exact: bool
+    gamma: Tensor,
+    weight: Tensor,
+    tau: Tensor,
+    made_of: Composition,
+    root: Tensor,
+    shape: Tensor,
+    exact: bool,
+    *,
+    longest_step: float = 1.0,
+    flat: float = 1e-10,
+    least: float = 1e-10,
 ) -> tuple[Tensor, Tensor]:
     """One damped Newton step on `r' W r`, `r = gamma - sum_k u_k(x) Theta_k`.
 
@@ -35,13 +37,16 @@ def step_downhill(
         made_of: Structure of the model.
         root: `S`, `(item, process, sensor, sensor)`.
         shape: `x`, `(item, shaped)`.
-        exact: With all second derivatives, which also leave saddles; else with those that are never negative, whose
-            steps are shorter far from a minimum.
+        exact: Whether all second derivatives are used, which also leave saddles; else those that are never negative,
+            whose steps are shorter far from a minimum.
+        longest_step: Largest change of an `x`, which is nearly linear that far.
+        flat: Curvature, relative to the scaled ones, that is added to each: below it a direction is rounding.
+        least: Smallest contribution of an eigenvalue of `Theta` to a moment of unit size: a step of `S` cannot leave
+            zero itself.
 
     Returns:
         `S` and `x`, as they were where no step leads downhill.
     """
-    root, shape = root.clone(), shape.clone()
     moving = [made_of.shaped.index(k) for k in made_of.curved]
     low, high = (ends[moving] for ends in search.limits(made_of, tau, shape))
     distance = _distance(gamma, weight, tau, made_of, root, shape)
@@ -52,23 +57,25 @@ def step_downhill(
     finite = distance.isfinite() & scaled.isfinite().flatten(1).all(-1)
     curvature, vectors = torch.linalg.eigh(torch.where(finite[:, None, None], scaled, 0.0))
     # Where the distance bends down a step leads away from the saddle, as long as if it bent up.
-    curvature = curvature.abs() + _FLAT
+    curvature = curvature.abs() + flat
     downhill = (vectors.mT @ (unit * gradient)[..., None])[..., 0]
-    todo = finite.nonzero()[:, 0]
-    for damping in _DAMPINGS:
-        at, x = root[todo], shape[todo]
-        step = unit[todo] * (vectors[todo] @ (downhill[todo] / (curvature[todo] + damping))[..., None])[..., 0]
+    undamped = 1e-6  # damping, relative to the scaled curvatures, that counts as none: of the first attempt
+
+    def attempt(todo: Tensor, state: list[Tensor], old: Tensor, damping: Tensor) -> Trial:
+        at, x = state
+        damped = curvature[todo] + torch.where(damping > undamped, damping, 0.0)[:, None]
+        step = unit[todo] * (vectors[todo] @ (downhill[todo] / damped)[..., None])[..., 0]
         n_linear = step.shape[-1] - len(moving)
-        tried = at + _in_basis(step[:, :n_linear].unflatten(-1, (root.shape[1], -1)))
+        tried = at + _in_basis(step[:, :n_linear].unflatten(-1, (at.shape[1], -1)))
         moved = x.clone()
-        moved[:, moving] = (x[:, moving] + step[:, n_linear:].clamp(-_STRIDE, _STRIDE)).clamp(low, high)
-        better = _distance(gamma[todo], weight[todo], tau, made_of, tried, moved) <= distance[todo]
-        root[todo] = torch.where(better[:, None, None, None], tried, at)
-        shape[todo] = torch.where(better[:, None], moved, x)
-        todo = todo[~better]
-        if not len(todo):
-            break
-    return square_root(root @ root, _LEAST / made_of.columns(tau, shape).amax(-2)), shape
+        moved[:, moving] = (x[:, moving] + step[:, n_linear:].clamp(-longest_step, longest_step)).clamp(low, high)
+        new = _distance(gamma[todo], weight[todo], tau, made_of, tried, moved)
+        return Trial((tried, moved), new, new <= old, new <= old)
+
+    # The damping rises until a step leads downhill, at most to 100 times the curvatures.
+    start = torch.where(finite, distance, torch.nan)
+    (root, shape), _, _ = descend((root, shape), start, attempt, n_steps=5, ease=1, tighten=100, damping=undamped)
+    return square_root(root @ root, least / made_of.columns(tau, shape).amax(-2)), shape
 
 
 def square_root(theta: Tensor, least: Tensor) -> Tensor:
@@ -136,8 +143,9 @@ def _quadratic(
     if exact:
         for at, k in enumerate(made_of.curved):
             mixed[:, k, :, at] -= torch.einsum("nqa,nq->na", moves[:, k], downhill[:, n_processes + at])
-        ahead, behind = (made_of.slopes(tau, shape + sign * _APART)[..., moving] for sign in (1, -1))
-        second = (ahead - behind) / (2 * _APART)
+        apart = 1e-4  # in `x`, of the two slopes: rounding and the third derivative both leave 1e-8 of the second
+        ahead, behind = (made_of.slopes(tau, shape + sign * apart)[..., moving] for sign in (1, -1))
+        second = (ahead - behind) / (2 * apart)
         curved.diagonal(dim1=1, dim2=2).sub_((along * (second.mT @ weighted)).sum(-1))
     top = torch.cat([linear.flatten(3).flatten(1, 2), mixed.flatten(1, 2)], -1)
     bends = torch.cat([top, torch.cat([mixed.flatten(1, 2).mT, curved], -1)], -2)
@@ -146,9 +154,9 @@ def _quadratic(
 
 def _free(weight: Tensor, n_pairs: int) -> Tensor:
     """1 for directions of the basis between sensors with moments, else 0, `(item, basis)`: the others stay."""
-    told = (weight.diagonal(dim1=-2, dim2=-1).unflatten(-1, (-1, n_pairs)) > 0).any(1)
+    measured = (weight.diagonal(dim1=-2, dim2=-1).unflatten(-1, (-1, n_pairs)) > 0).any(1)
     first, second = pairs(int((2 * n_pairs) ** 0.5))
-    own = told[:, first == second]
+    own = measured[:, first == second]
     return (own[:, first] & own[:, second]).to(weight)
 
 

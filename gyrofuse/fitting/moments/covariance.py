@@ -12,6 +12,15 @@ The sums are those of a fixed family of components, tabulated once for each leng
 `phi = tanh(v / 2)` the spectrum of an AR1 of unit variance is `cosh(w) / cosh(v - w)`: one bump, moved along. AR1s
 evenly spaced in `v`, white noise among them, and the random walk that they become for large `v` interpolate any smooth
 spectrum from its values at as many frequencies. Hence `V` is a quadratic form in these values.
+
+Robust wavelet variances of efficiency `e(c)` are averages of a bounded `chi`. To first order in the influence function,
+with the expansion `chi - a = sum_k a_2k h_2k` in normalised Hermite polynomials and the correlations `rho_jk(lag)`
+between the coefficients of levels `j` and `k`
+
+    Cov(nu_j, nu_k) = 2 nu_j nu_k / (M_j M_k) sum_lag n_jk(lag) sum_k (a_2k / a_2)^2 rho_jk(lag)^2k
+
+because `E h_m(X) h_n(Y) = rho^n` for `m = n`, else 0. The first order is the classic covariance whatever `chi`; for
+independent coefficients the orders add up to `1 / e(c)`, for the correlated ones of overlapping windows to less.
 """
 
 from __future__ import annotations
@@ -28,15 +37,23 @@ from torch import Tensor
 from gyrofuse._base.checks import check_positive_integer, largest_level
 from gyrofuse.noise.processes import Model, Process
 from gyrofuse.wavelets.lag_sums import lag_quadrature, unit_covariances
+from gyrofuse.wavelets.robust import biweight_of, check_efficiency
 
 Array = NDArray[np.float64]
 
-# Spacing of the grid of v, and its ends: phi = -0.989, and a memory of eight records. Between them the spectrum of any
-# other AR1 is followed to 2e-3, up and down, so that sums over it come out better.
-_SPACING, _LOWEST, _LONGEST = 0.65, -5.2, 8
+# Spacing of the grid of `v`: between its AR1s the spectrum of any other AR1 is followed to 2e-3, up and down, so that
+# sums over it come out better.
+_SPACING = 0.65
 
 
-def moment_covariance(model: Model, n_samples: int, n_levels: int, *, excess_kurtosis: Tensor | float = 0.0) -> Tensor:
+def moment_covariance(
+    model: Model,
+    n_samples: int,
+    n_levels: int,
+    *,
+    excess_kurtosis: Tensor | float = 0.0,
+    efficiency: float = 1.0,
+) -> Tensor:
     """Covariance matrix of the estimated Haar wavelet variances of a record, for its finite length.
 
     The sum, for `M = max(M_j, M_k)`, of
@@ -50,24 +67,30 @@ def moment_covariance(model: Model, n_samples: int, n_levels: int, *, excess_kur
 
     Noise terms are exact within 1 % for processes as smooth in frequency as AR1s with `phi > -0.9`, 5 % down to
     -0.99. That of a tone takes its line for narrow: it is right to 2 % from some fifteen cycles in the record on, to a
-    half with two of them. How the mean square of a tone depends on its phase is left out. Differentiable in the
-    parameters.
+    half with two of them. How the mean square of a tone depends on its phase is left out. That of robust wavelet
+    variances is of first order in their errors and needs some ten non-overlapping windows at the last level. The
+    covariance is differentiable in the parameters.
 
     Args:
         model: Known processes, parameters with batch dimensions `(...)`.
         n_samples: Length T of the record.
         n_levels: Levels J, `2**J <= n_samples`.
-        excess_kurtosis: `kappa` of the samples of the white noise, a number or `(...)`.
+        excess_kurtosis: Excess kurtosis `kappa` of the samples of the white noise, a number or `(...)`; for the classic
+            wavelet variance only.
+        efficiency: Efficiency of the robust wavelet variance; 1 is the classic one.
 
     Returns:
         `(..., level, level)`, signal^4, float64. NaN where a parameter is.
 
     Raises:
-        ValueError: A parameter is to be estimated, `n_levels` is below 1 or too large for `n_samples`, or
-            `excess_kurtosis` is given to a model without white noise.
+        ValueError: A parameter is to be estimated, `n_levels` is below 1 or too large for `n_samples`,
+            `excess_kurtosis` is given to a model without white noise, `efficiency` is out of range, or below 1 for a
+            model with a sinusoid or a drift.
 
     References:
-        [V] theorem 1, for the noise; Percival & Walden, Wavelet Methods for Time Series Analysis, section 8.3.
+        [V] theorem 1, for the noise; Percival & Walden, Wavelet Methods for Time Series Analysis, section 8.3; for
+        robust variances D. Mondal, D. B. Percival, Annals of the Institute of Statistical Mathematics 64, 2012,
+        section 4.
     """
     n_samples = check_positive_integer("n_samples", n_samples)
     n_levels = check_positive_integer("n_levels", n_levels)
@@ -78,6 +101,8 @@ def moment_covariance(model: Model, n_samples: int, n_levels: int, *, excess_kur
         )
     known = model._known()
     device = model._device()
+    if check_efficiency(efficiency) < 1:
+        check_gaussian(model)
     tables = _Tables(*(table.to(device) for table in _tables(n_samples, n_levels)))
     shares = _shares(known, tables)  # (..., component)
     first, second = tables.pairs
@@ -104,7 +129,48 @@ def moment_covariance(model: Model, n_samples: int, n_levels: int, *, excess_kur
             covariance = covariance + 4 * _outer(ramp) * _symmetric(shares @ tables.means, n_levels)
         elif process.white:
             covariance = covariance + kurtosis[..., None, None] * _outer(columns["variance"] / tau) / windows
-    return covariance
+    if efficiency == 1:
+        return covariance
+    return covariance + _higher_orders(model.wavelet_variance(n_levels), shares, n_samples, efficiency)
+
+
+def _higher_orders(nu: Tensor, shares: Tensor, n_samples: int, efficiency: float, least: float = 1e-3) -> Tensor:
+    """What the orders above the first add to the covariance of robust wavelet variances, `(..., level, level)`.
+
+    Args:
+        nu: Wavelet variance of the model, `(..., level)`.
+        shares: Share of each component in the model, `(..., component)`.
+        n_samples: Length T of the record.
+        efficiency: Efficiency of the robust wavelet variance, below 1.
+        least: Orders whose `(a_2k / a_2)^2` is below are left out: a thousandth of the classic covariance at most.
+    """
+    orders = [order for order in biweight_of(efficiency).orders[1:] if order > least]
+    n_levels = nu.shape[-1]
+    entries = []
+    for table in _lag_tables(n_samples, n_levels):
+        scale = nu[..., table.levels[0]] * nu[..., table.levels[1]]
+        rho = (shares @ table.covariances.to(nu.device)).square() / scale[..., None]
+        rho = rho.clamp(max=1)  # (..., lag), squared
+        series = torch.zeros_like(rho)
+        for order in reversed(orders):
+            series = (series + order) * rho
+        entries.append(2 * scale * ((series * rho) @ table.weights.to(nu.device)))
+    return _symmetric(torch.stack(entries, -1), n_levels)
+
+
+def check_gaussian(model: Model) -> None:
+    """Refuse processes whose coefficients are not Gaussian.
+
+    Raises:
+        ValueError: A sinusoid or a drift.
+    """
+    strange = [p.symbol for p in model.processes if not p.gaussian]
+    if strange:
+        raise ValueError(
+            f"`model`: expected Gaussian processes with a robust wavelet variance, got {' + '.join(strange)}, whose "
+            "coefficients have another scale (a tone alone seems 40 % stronger); leave them out or give "
+            "`efficiency=1`"
+        )
 
 
 class _Tables(NamedTuple):
@@ -148,10 +214,42 @@ def _tables(n_samples: int, n_levels: int) -> _Tables:
     return _Tables(*(torch.from_numpy(np.ascontiguousarray(array)) for array in arrays))
 
 
+class _LagTable(NamedTuple):
+    """Covariances of the coefficients of a pair of levels, the first the higher.
+
+    Attributes:
+        levels: Their indices.
+        covariances: `(component, lag)`.
+        weights: `(lag,)`, numbers of pairs included, over `M_j M_k`.
+    """
+
+    levels: tuple[int, int]
+    covariances: Tensor
+    weights: Tensor
+
+
+@functools.lru_cache(maxsize=2)
+def _lag_tables(n_samples: int, n_levels: int) -> tuple[_LagTable, ...]:
+    v = _grid(n_samples)
+    tables = []
+    for j in range(n_levels):
+        for k in range(j + 1):
+            lags, weights, alone = lag_quadrature(2**j, 2**k, n_samples)
+            smooth, turning = np.split(_covariances(2**j, 2**k, lags, alone, v), [len(lags)], axis=1)
+            weights = weights / ((n_samples - 2 ** (j + 1) + 1) * (n_samples - 2 ** (k + 1) + 1))
+            # Stretches: what alternates has one sign at half the lags.
+            stretch = smooth[:, ~alone]
+            covariances = np.hstack([smooth[:, alone], stretch + turning, stretch - turning])
+            half = weights[~alone] / 2
+            both = np.concatenate([weights[alone], half, half])
+            tables.append(_LagTable((j, k), torch.from_numpy(covariances), torch.from_numpy(both)))
+    return tuple(tables)
+
+
 def _grid(n_samples: int) -> Array:
-    """Values of `v` of the AR1s."""
-    steps = math.ceil(math.log(2 * _LONGEST * n_samples) / _SPACING)  # the time constant is e^v / 2
-    return _SPACING * np.arange(round(_LOWEST / _SPACING), steps + 1, dtype=np.float64)
+    """Values of `v` of the AR1s, from `phi = -0.989` (`v = -5.2`) to a time constant of eight records (`e^v / 2`)."""
+    steps = math.ceil(math.log(2 * 8 * n_samples) / _SPACING)
+    return _SPACING * np.arange(round(-5.2 / _SPACING), steps + 1, dtype=np.float64)
 
 
 def _covariances(h: int, k: int, lags: Array, alone: NDArray[np.bool_], v: Array) -> Array:

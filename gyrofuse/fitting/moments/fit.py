@@ -7,31 +7,40 @@ from torch import Tensor
 
 from gyrofuse.fitting.moments import search
 from gyrofuse.fitting.moments.inference import Fit
-from gyrofuse.fitting.moments.records import Records
+from gyrofuse.fitting.moments.records import SampleDesign
 from gyrofuse.fitting.structure import Composition
 from gyrofuse.noise.parsing import parse_model
 from gyrofuse.noise.processes import Model, Process, Sinusoid
 
-_REWEIGHTINGS, _UPDATES, _DISTINCT = 3, 3, 3
-# Steps that the best start may take to its minimum; flat valleys need some hundreds.
-_POLISHING = 500
-# Where whole steps do not come to rest, as each is -1 to -7 times the last: a part of them; how many, with how many
-# steps of the search in each, and the relative move of wavelet variances below which they are at rest.
-_PART, _DAMPED, _STEPS_EACH, _AT_REST = 0.25, 60, 5, 1e-2
+# Rounds of reweighting, of a fit with independent levels and again of one with the covariance of the fit: the weights
+# change by a few per cent in the third, which moves estimates by far less than their standard errors.
+N_REWEIGHTINGS = 3
 
 
-def fit_items(
-    nu: Tensor, frequencies: tuple[Tensor, Tensor] | None, records: Records, made_of: Composition, omega: str | Tensor
+def fit_batch(
+    nu: Tensor,
+    frequencies: tuple[Tensor, Tensor] | None,
+    records: SampleDesign,
+    made_of: Composition,
+    omega: str | Tensor,
+    *,
+    n_distinct: int = 3,
+    n_polishing: int = 500,
 ) -> Fit:
     """Fit all items at once.
 
     Args:
         nu: Wavelet variances `(item, level)`.
-        frequencies: `beta` of the sinusoids and its spread where the moments need not find it, `(item, sinusoid)`,
-            from high to low.
-        records: What was measured.
+        frequencies: `beta` of the sinusoids and its standard error where the moments do not fit it, `(item, sinusoid)`,
+            from high to low; None where they do.
+        records: Lengths and levels of the records.
         made_of: Structure of the model.
         omega: Weights `(level,)` or `(level, level)`, or `"optimal"` or `"diagonal"`.
+        n_distinct: Number of distinct minima that are followed to the weights of the fit.
+        n_polishing: Largest number of steps of the best of them; flat valleys need some hundreds.
+
+    Returns:
+        The fit, with AR1s from slow to fast and sinusoids from high to low frequency.
     """
     n_items = len(nu)
     tau, observations = records.tau.to(nu), records.observations.to(nu)
@@ -52,34 +61,30 @@ def fit_items(
     linear, x, objective, _ = search.minimise(
         each(nu, n_starts), each(root, n_starts), tau, made_of, start.flatten(0, 1)
     )
-    for _ in range(_REWEIGHTINGS if own is None else 0):
-        fitted = made_of.wavelet_variance(tau, linear, x)
-        root = (observations.sqrt() / fitted.clamp(min=1e-30)).clamp(max=1e15)
-        linear, x, objective, _ = search.minimise(each(nu, n_starts), root, tau, made_of, x)
-        # Distances with different weights: the likelihood of independent normal variances makes them comparable.
-        objective = objective - 2 * root.log().sum(-1)
-    kept = search.distinct(objective.view(n_items, -1), x.view(n_items, n_starts, -1), _DISTINCT)
+    if own is None:
+        linear, x, objective = reweighted(each(nu, n_starts), observations, tau, made_of, linear, x)
+    kept = search.distinct(objective.view(n_items, -1), x.view(n_items, n_starts, -1), n_distinct)
     n_kept = kept.shape[1]
     chosen = (torch.arange(n_items, device=nu.device)[:, None] * n_starts + kept).flatten()
     linear, x, objective = linear[chosen], x[chosen], objective[chosen]
     passed = []
     if own is None:
-        for _ in range(_UPDATES):
+        for _ in range(N_REWEIGHTINGS):
             root = _root(records.covariance(made_of.model(linear, x)), omega)
-            passed.append(misfit(each(nu, n_kept), root, tau, made_of, linear, x))
+            passed.append(objective_of(each(nu, n_kept), root, tau, made_of, linear, x))
             linear, x, distance, _ = search.minimise(each(nu, n_kept), root, tau, made_of, x)
         objective = distance - _log_det(root)
     best = objective.view(n_items, n_kept).nan_to_num(nan=torch.inf).argmin(-1)
     best = best + n_kept * torch.arange(n_items, device=nu.device)
     root = root[best] if own is None else root
-    linear, x, _, reached = search.minimise(nu, root, tau, made_of, x[best], _POLISHING)
+    linear, x, _, reached = search.minimise(nu, root, tau, made_of, x[best], n_polishing)
     if own is None:
-        final = misfit(nu, _root(records.covariance(made_of.model(linear, x)), omega), tau, made_of, linear, x)
+        final = objective_of(nu, _root(records.covariance(made_of.model(linear, x)), omega), tau, made_of, linear, x)
         least = torch.stack([value.view(n_items, n_kept).amin(-1) for value in passed]).amin(0)
-        chasing = final > least + len(tau)
-        if bool(chasing.any()):
-            linear[chasing], x[chasing], reached[chasing] = damped(
-                nu[chasing], records, made_of, omega, linear[chasing], x[chasing]
+        oscillating = final > least + len(tau)
+        if bool(oscillating.any()):
+            linear[oscillating], x[oscillating], reached[oscillating] = relaxed_gmm(
+                nu[oscillating], records, made_of, omega, linear[oscillating], x[oscillating]
             )
     linear, x = made_of.ordered(linear, x)
     return Fit(
@@ -93,27 +98,85 @@ def fit_items(
     )
 
 
-def damped(
-    nu: Tensor, records: Records, made_of: Composition, omega: str | Tensor, linear: Tensor, x: Tensor
+def reweighted(
+    nu: Tensor, observations: Tensor, tau: Tensor, made_of: Composition, linear: Tensor, x: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """A part of the way to the fit with the weights of the last one, again and again; whether that came to rest.
+    """Fits with independent levels, whose weights are those of the fit before.
 
-    Where no parameters fit, whole steps may lead from one bad fit to another and back.
+    A fit to chance in the measured variances, such as one long scale that came out small, would have a `V` to match.
+
+    Args:
+        nu: Wavelet variances over the largest, `(problem, level)`.
+        observations: Degrees of freedom of each level, `(level,)`.
+        tau: Filter lengths, `(level,)`.
+        made_of: Structure of the model.
+        linear: `p` of the first fit, `(problem, process)`.
+        x: Its nonlinear parameters, `(problem, shaped)`.
+
+    Returns:
+        `p`, `x`, and the objective as minus twice the log likelihood of independent normal variances, which compares
+        fits with different weights, `(problem,)`.
+    """
+    least, most_weight = 1e-30, 1e15  # of a fitted variance, and of a root weight: their squares stay in range
+    for _ in range(N_REWEIGHTINGS):
+        fitted = made_of.wavelet_variance(tau, linear, x)
+        root = (observations.sqrt() / fitted.clamp(min=least)).clamp(max=most_weight)
+        linear, x, distance, _ = search.minimise(nu, root, tau, made_of, x)
+    return linear, x, distance - _log_det(root)
+
+
+def relaxed_gmm(
+    nu: Tensor,
+    records: SampleDesign,
+    made_of: Composition,
+    omega: str | Tensor,
+    linear: Tensor,
+    x: Tensor,
+    *,
+    relaxation: float = 0.25,
+    n_rounds: int = 60,
+    at_rest: float = 1e-2,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Under-relaxation where iterated reweighting oscillates between bad fits, as where no parameters fit.
+
+    Args:
+        nu: Wavelet variances over the largest, `(item, level)`.
+        records: Lengths and levels of the records.
+        made_of: Structure of the model.
+        omega: `"optimal"` or `"diagonal"`.
+        linear: `p` to start from, `(item, process)`.
+        x: `x` to start from, `(item, shaped)`.
+        relaxation: Part of every step that is taken: whole steps of -1 to -7 times the last do not come to rest, a
+            quarter of them does.
+        n_rounds: Largest number of reweightings.
+        at_rest: Relative change of the fitted wavelet variances below which a fit has come to rest.
+
+    Returns:
+        `p`, `x` and whether they came to rest, `(item,)`.
     """
     tau = records.tau.to(nu)
-    for _ in range(_DAMPED):
+    for _ in range(n_rounds):
         before = made_of.wavelet_variance(tau, linear, x)
         root = _root(records.covariance(made_of.model(linear, x)), omega)
-        whole_linear, whole_x, _, _ = search.minimise(nu, root, tau, made_of, x, _STEPS_EACH)
+        whole_linear, whole_x, _, _ = search.minimise(nu, root, tau, made_of, x, n_steps=5)
         moved = (made_of.wavelet_variance(tau, whole_linear, whole_x) / before - 1).abs().amax(-1)
-        if bool((moved < _AT_REST).all()):
+        if bool((moved < at_rest).all()):
             break
-        linear, x = linear.lerp(whole_linear, _PART), x.lerp(whole_x, _PART)
-    return whole_linear, whole_x, moved < _AT_REST
+        linear, x = linear.lerp(whole_linear, relaxation), x.lerp(whole_x, relaxation)
+    return whole_linear, whole_x, moved < at_rest
 
 
-def misfit(target: Tensor, root: Tensor, tau: Tensor, made_of: Composition, linear: Tensor, x: Tensor) -> Tensor:
-    """`r' V^-1 r + ln det V`: a V too large would make its own fit look good."""
+def objective_of(target: Tensor, root: Tensor, tau: Tensor, made_of: Composition, linear: Tensor, x: Tensor) -> Tensor:
+    """`r' V^-1 r + ln det V`, `(problem,)`: a V too large would make its own fit look good.
+
+    Args:
+        target: Wavelet variances `(problem, level)`.
+        root: `W` with `W' W = V^-1`, `(problem, level, level)`, or `(problem, level)` where it is diagonal.
+        tau: Filter lengths, `(level,)`.
+        made_of: Structure of the model.
+        linear: `p`, `(problem, process)`.
+        x: `x`, `(problem, shaped)`.
+    """
     residual = target - made_of.wavelet_variance(tau, linear, x)
     whitened = root * residual if root.ndim == 2 else (root @ residual[..., None])[..., 0]
     return whitened.square().sum(-1) - _log_det(root)
@@ -129,13 +192,22 @@ def _root(covariance: Tensor, omega: str | Tensor) -> Tensor:
 
 
 def n_starts_for(made_of: Composition) -> int:
-    """As many as found the lowest minimum of noisy copies every time."""
+    """Number of starting points: as many as found the lowest minimum of noisy copies every time."""
     tones = sum(made_of.processes[k].has_line for k in made_of.curved)
     return min(4 * 4 ** (len(made_of.curved) - 1) if tones else (1, 4, 6, 8)[min(len(made_of.curved), 3)], 32)
 
 
 def composition_of(model: Model | str, held: bool) -> Composition:
-    """Structure of a model without values; `held` as there."""
+    """Structure of a model without values.
+
+    Args:
+        model: Processes without values, or a formula.
+        held: Whether frequencies of sinusoids are known from elsewhere.
+
+    Raises:
+        TypeError: Neither a model nor a formula.
+        ValueError: A model with values.
+    """
     model = parse_model(model) if isinstance(model, str) else model
     if not isinstance(model, Model):
         raise TypeError(f"`model`: expected a model or a formula such as 'WN + AR1 + RW', got {type(model).__name__}")

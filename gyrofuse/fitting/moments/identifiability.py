@@ -1,9 +1,13 @@
-"""Which parameters of a fitted model a record of that length cannot tell apart, and how to say so."""
+"""Which parameters of a fitted model a record of that length identifies, and how to say so.
+
+Wavelet variances and spectra hold the square of a drift's slope: its sign comes from the samples.
+"""
 
 from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -14,56 +18,61 @@ from gyrofuse.fitting.structure import Composition
 from gyrofuse.noise.processes import Model
 from gyrofuse.wavelets.equivalent_dof import normal_quantile
 
-# A tone of fewer cycles is a trend, an AR1 of which the record holds fewer time constants a random walk.
+# Time constants in the record below which an AR1 is called indistinguishable from a random walk: with two of them the
+# autocorrelation over the record is still e^-2.
 FEWEST_TIME_CONSTANTS = 2.0
-_BY_CHANCE = 0.05  # p value above which a line may be noise
-_BEYOND_DOUBT = 5.0  # standard deviations between two measurements of one amplitude
-_ONE_FOR_THE_OTHER = 0.95  # correlation beyond which two parameters are known in combination only
 
 
-def uncertain(made_of: Composition, estimates: Estimates, n_samples: int, confidence_level: float) -> Tensor:
-    """Unknowns whose limits want a profile, `(item, unknown)`: `p` of the processes first, then `x`.
+def weakly_identified(made_of: Composition, estimates: Estimates, n_samples: int, confidence_level: float) -> Tensor:
+    """Unknowns that the record identifies weakly, `(item, unknown)`: `p` of the processes first, then `x`.
 
-    Variances at zero, what is weakly determined, and processes that others of the model could take the place of.
+    Variances at zero, unknowns known to hardly their order of magnitude, and processes that others of the model could
+    replace.
+
+    Args:
+        made_of: Structure of the model.
+        estimates: Estimates with symmetric intervals.
+        n_samples: Length T of the records.
+        confidence_level: Probability that an interval holds the true value.
     """
     needed = ~estimates.determined[:, made_of.places]
     kinds = [type(process) for process in made_of.processes]
-    for k, alike in _alike(made_of, estimates, n_samples).items():
+    for k, reached in _near_equivalent(made_of, estimates, n_samples).items():
         limits = made_of.processes[k].short_limit, made_of.processes[k].long_limit
-        for kind, where in zip(limits, alike, strict=True):
+        for kind, where in zip(limits, reached, strict=True):
             others = [other for other in range(len(kinds)) if kinds[other] is kind]
             needed[:, [k, _shape_at(made_of, k), *others]] |= where[:, None]
-    for (k, other), where in _twins(made_of, estimates, confidence_level).items():
+    for (k, other), where in _exchangeable(made_of, estimates, confidence_level).items():
         needed[:, [k, other, _shape_at(made_of, k), _shape_at(made_of, other)]] |= where[:, None]
     for k in made_of.shaped:  # the shape of what is not there may be anything
         needed[:, _shape_at(made_of, k)] &= ~_absent(made_of, estimates, k)
     return needed
 
 
-def told_apart(made_of: Composition, estimates: Estimates, confidence_level: float) -> Tensor:
-    """Whether all AR1s differ from each other by more than chance, `(item,)`."""
+def ar1s_differ(made_of: Composition, estimates: Estimates, confidence_level: float) -> Tensor:
+    """Whether all AR1s differ significantly from each other, `(item,)`."""
     apart = torch.ones_like(estimates.params[:, 0], dtype=torch.bool)
-    for where in _twins(made_of, estimates, confidence_level).values():
+    for where in _exchangeable(made_of, estimates, confidence_level).values():
         apart &= ~where
     return apart
 
 
-def remarks(
+def notes(
     made_of: Composition, estimates: Estimates, n_samples: int, confidence_level: float, tones: Tones | None = None
 ) -> list[tuple[str, ...]]:
-    """What cannot be told apart at this length, in words, for each item.
+    """Parameters that are not identified at this length, in words, for each item.
 
     Args:
         made_of: Structure of the model.
-        estimates: With their final intervals.
+        estimates: Estimates with their final intervals.
         n_samples: Length T of the records.
-        confidence_level: Of these.
-        tones: Behind the sinusoids, in their order; None where the moments found these.
+        confidence_level: Probability that an interval holds the true value.
+        tones: Spectral lines of the sinusoids, in their order; None where the moments found these.
     """
     params = Model(list(made_of.processes)).param_names
     names = [params[place].split(".")[0] for place in made_of.places[: made_of.n_linear]]
     found: list[tuple[Tensor, str]] = []
-    for k, (white, walk) in _alike(made_of, estimates, n_samples).items():
+    for k, (white, walk) in _near_equivalent(made_of, estimates, n_samples).items():
         limits = made_of.processes[k].short_limit, made_of.processes[k].long_limit
         short, long = (limit.with_article("a") if limit else "a trend" for limit in limits)
         found += [
@@ -71,7 +80,7 @@ def remarks(
             (white & ~walk, f"{names[k]}: indistinguishable from {short} at this length"),
             (walk & ~white, f"{names[k]}: indistinguishable from {long} at this length"),
         ]
-    for (k, other), where in _twins(made_of, estimates, confidence_level).items():
+    for (k, other), where in _exchangeable(made_of, estimates, confidence_level).items():
         found.append((where, f"{names[k]} and {names[other]}: indistinguishable from one process at this length"))
     for k, process in enumerate(made_of.processes):
         if process.has_line:
@@ -82,26 +91,26 @@ def remarks(
         (where, f"{params[one]} and {params[other]}: known in combination only")
         for (one, other), where in _combined(made_of, estimates).items()
     ]
-    said: list[list[str]] = [[] for _ in estimates.params]
+    found_by_item: list[list[str]] = [[] for _ in estimates.params]
     for where, text in found:
         for item in where.nonzero()[:, 0].tolist():
-            said[item].append(text)
+            found_by_item[item].append(text)
     if tones is not None:
         sinusoids = [name for k, name in enumerate(names) if made_of.processes[k].has_line]
-        for item, tone in (tones.p_value >= _BY_CHANCE).nonzero().tolist():
+        for item, tone in (tones.p_value >= 0.05).nonzero().tolist():
             p_value = tones.p_value[item, tone].item()
-            said[item].append(f"{sinusoids[tone]}: not told from the noise (p = {p_value:.1g})")
-        for item, tone in _standing_in(made_of, estimates, tones).nonzero().tolist():
+            found_by_item[item].append(f"{sinusoids[tone]}: not told from the noise (p = {p_value:.1g})")
+        for item, tone in _larger_than_in_spectrum(made_of, estimates, tones).nonzero().tolist():
             held = tones.amplitude[item, tone].item()
-            said[item].append(
+            found_by_item[item].append(
                 f"{sinusoids[tone]}: the spectrum holds an amplitude of {held:.2g} at this frequency, the rest stands "
                 "in for what the model lacks; refine the fit"
             )
-    return [tuple(texts) for texts in said]
+    return [tuple(texts) for texts in found_by_item]
 
 
-def _alike(made_of: Composition, estimates: Estimates, n_samples: int) -> dict[int, tuple[Tensor, Tensor]]:
-    """For each process with a memory whether its interval of `phi` reaches no memory, and one as long as the record."""
+def _near_equivalent(made_of: Composition, estimates: Estimates, n_samples: int) -> dict[int, tuple[Tensor, Tensor]]:
+    """For each process with a memory, whether its interval contains no memory, and one as long as the record."""
     found: dict[int, tuple[Tensor, Tensor]] = {}
     for k, process in enumerate(made_of.processes):
         if process.has_memory():
@@ -114,8 +123,8 @@ def _alike(made_of: Composition, estimates: Estimates, n_samples: int) -> dict[i
     return found
 
 
-def _twins(made_of: Composition, estimates: Estimates, confidence_level: float) -> dict[tuple[int, int], Tensor]:
-    """Pairs of processes of one class with a memory that differ by less than chance, in `x`."""
+def _exchangeable(made_of: Composition, estimates: Estimates, confidence_level: float) -> dict[tuple[int, int], Tensor]:
+    """Pairs of processes of one class with a memory that do not differ significantly, in `x`."""
     found: dict[tuple[int, int], Tensor] = {}
     which = [k for k, process in enumerate(made_of.processes) if process.has_memory()]
     z = normal_quantile((1 + confidence_level) / 2)
@@ -136,31 +145,62 @@ def _twins(made_of: Composition, estimates: Estimates, confidence_level: float) 
     return found
 
 
-def _combined(made_of: Composition, estimates: Estimates) -> dict[tuple[int, int], Tensor]:
-    """Pairs of variances, both weakly determined, of which one rises as the other falls."""
+def _combined(
+    made_of: Composition, estimates: Estimates, least_correlation: float = 0.95
+) -> dict[tuple[int, int], Tensor]:
+    """Pairs of weakly determined variances whose estimates are correlated beyond `least_correlation`, of either
+    sign."""
     found: dict[tuple[int, int], Tensor] = {}
     spread = estimates.covariance.diagonal(dim1=-2, dim2=-1)
     for k, other in itertools.combinations(range(made_of.n_linear), 2):
         one, two = made_of.places[k], made_of.places[other]
         size = spread[:, [one, two]].prod(-1)
         weak = (spread[:, [one, two]] > (WEAKLY_DETERMINED * estimates.params[:, [one, two]]).square()).all(-1)
-        found[one, two] = (
-            weak & (size > 0) & (estimates.covariance[:, one, two].square() > _ONE_FOR_THE_OTHER**2 * size)
-        )
+        found[one, two] = weak & (size > 0) & (estimates.covariance[:, one, two].square() > least_correlation**2 * size)
     return found
 
 
-def _standing_in(made_of: Composition, estimates: Estimates, tones: Tones) -> Tensor:
-    """Sinusoids that the moments find beyond doubt larger than the spectrum does, `(item, sinusoid)`."""
+def _larger_than_in_spectrum(made_of: Composition, estimates: Estimates, tones: Tones) -> Tensor:
+    """Sinusoids with an amplitude five standard errors larger than in the spectrum, `(item, sinusoid)`."""
     places = [made_of.places[k] for k, process in enumerate(made_of.processes) if process.has_line]
-    spread = estimates.covariance.diagonal(dim1=-2, dim2=-1)[:, places] + tones.amplitude_sd.square()
-    return estimates.params[:, places] - tones.amplitude > _BEYOND_DOUBT * spread.sqrt()
+    variance = estimates.covariance.diagonal(dim1=-2, dim2=-1)[:, places] + tones.amplitude_sd.square()
+    return estimates.params[:, places] - tones.amplitude > 5.0 * variance.sqrt()
 
 
 def _shape_at(made_of: Composition, k: int) -> int:
-    """The unknown `x` of a process."""
+    """Index of the unknown `x` of a process."""
     return made_of.n_linear + made_of.shaped.index(k)
 
 
 def _absent(made_of: Composition, estimates: Estimates, k: int) -> Tensor:
     return estimates.params[:, made_of.places[k]] == 0
+
+
+def rising(series: Tensor) -> Tensor:
+    """Sign of the slope of a regression on time, `(item,)`, of series `(item, time)`, NaN = missing sample."""
+    time = torch.arange(series.shape[-1], dtype=torch.float64, device=series.device)
+    there = series.isfinite()
+    rest = torch.where(there, series.to(torch.float64) - series.nanmean(-1, keepdim=True).to(torch.float64), 0.0)
+    centre = (time * there).sum(-1, keepdim=True) / there.sum(-1, keepdim=True)
+    return torch.where((rest * (time - centre)).sum(-1) < 0, -1.0, 1.0).to(torch.float64)
+
+
+def drifts_of(model: Model) -> Tensor:
+    """Whether a parameter is the slope of a drift, `(parameter,)`."""
+    return torch.tensor([p.deterministic for p in model.processes for _ in p.parameters])
+
+
+def signed(estimates: Estimates, model: Model, sign: Tensor) -> Estimates:
+    """Estimates whose drifts have slopes of these signs, `(item,)`."""
+    column = drifts_of(model).to(sign.device)
+    if not bool(column.any()):
+        return estimates
+    turn = torch.where(column, sign[:, None], 1.0)  # (item, parameter)
+    low, high = estimates.low * turn, estimates.high * turn
+    return replace(
+        estimates,
+        params=estimates.params * turn + 0.0,  # no -0
+        covariance=estimates.covariance * turn[:, :, None] * turn[:, None, :],
+        low=low.minimum(high) + 0.0,
+        high=high.maximum(low) + 0.0,
+    )

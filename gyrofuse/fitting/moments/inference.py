@@ -1,4 +1,4 @@
-"""What a moment fit says of its parameters: covariance, intervals that respect their range, and the J test."""
+"""Inference for the parameters of a moment fit: covariance, intervals that respect their range, and the J test."""
 
 from __future__ import annotations
 
@@ -8,30 +8,28 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gyrofuse.fitting.moments.log_moments import log_residual
-from gyrofuse.fitting.moments.records import Records
+from gyrofuse.fitting.moments.records import SampleDesign
 from gyrofuse.fitting.structure import Composition
 from gyrofuse.noise.processes import Sinusoid
 from gyrofuse.wavelets.equivalent_dof import chi_square_tail, normal_quantile
 
-# Beyond this spread of its logarithm a variance is known to hardly its order of magnitude.
+# Standard error of the logarithm of a variance above which it is known to hardly its order of magnitude: its 95 %
+# interval then spans a factor of e^2 = 7.
 WEAKLY_DETERMINED = 0.5
-_NO_CHANCE = 1e-3  # p-value of the J test
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Where a search ended.
+    """Fit of the moments.
 
     Attributes:
         variance: Wavelet variances `(item, level)` that were fitted.
-        linear: `p`, `(item, process)`.
-        shape: `x`, `(item, shaped)`.
-        held_sd: Spread of the frequencies `beta` that were held, `(item, sinusoid)`.
-        converged: `(item,)`.
-        omega: Weights `(level,)` or `(level, level)`, or `"optimal"`, `"diagonal"` or `"continuous"`.
-        records: What was measured.
-        moments: `"variance"`, or `"log"` of their logarithms.
+        linear: Linear parameters `p`, `(item, process)`.
+        shape: Nonlinear parameters `x`, `(item, shaped)`.
+        held_sd: Standard errors of the frequencies `beta` that were not fitted, `(item, sinusoid)`.
+        converged: Whether a minimum was reached, `(item,)`.
+        omega: Weights `(level,)` or `(level, level)`, or `"optimal"` or `"diagonal"`.
+        records: Lengths and levels of the records.
     """
 
     variance: Tensor
@@ -40,8 +38,7 @@ class Fit:
     held_sd: Tensor
     converged: Tensor
     omega: str | Tensor
-    records: Records
-    moments: str = "variance"
+    records: SampleDesign
 
     @property
     def tau(self) -> Tensor:
@@ -54,11 +51,11 @@ class Estimates:
     """Parameters of the model with their uncertainty.
 
     Attributes:
-        params: `(item, parameter)`.
-        covariance: `(item, parameter, parameter)`; zero rows for variances at zero.
-        low: `(item, parameter)`.
-        high: `(item, parameter)`; of a variance at zero a one-sided limit.
-        determined: `(item, parameter)`, whether the data say more than its order of magnitude.
+        params: Parameters, `(item, parameter)`.
+        covariance: Their covariance, `(item, parameter, parameter)`; zero rows for variances at zero.
+        low: Lower limits, `(item, parameter)`.
+        high: Upper limits, `(item, parameter)`; one-sided for a variance at zero.
+        determined: Whether more than the order of magnitude is known, `(item, parameter)`.
     """
 
     params: Tensor
@@ -70,14 +67,14 @@ class Estimates:
 
 @dataclass(frozen=True, eq=False)
 class Inference:
-    """What a moment fit says.
+    """Result of a moment fit, item by item.
 
     Attributes:
         estimates: Parameters with their uncertainty.
         fitted: Wavelet variances of the fitted model, `(item, level)`.
         objective: `r' Omega r`, `(item,)`.
         j_statistic: `r' V^-1 r`, `(item,)`.
-        degrees: Of freedom of the J statistic, its mean, `(item,)`.
+        dof: Degrees of freedom of the J statistic, its mean, `(item,)`.
         dispersion: Variance of the J statistic over that of a chi-square of this mean, `(item,)`.
         converged: `(item,)`.
     """
@@ -86,23 +83,23 @@ class Inference:
     fitted: Tensor
     objective: Tensor
     j_statistic: Tensor
-    degrees: Tensor
+    dof: Tensor
     dispersion: Tensor
     converged: Tensor
 
     @property
     def p_value(self) -> Tensor:
-        """Of the J test, by a scaled chi-square of the same mean and variance, `(item,)`; NaN without freedom."""
-        return chi_square_tail(self.j_statistic / self.dispersion, self.degrees / self.dispersion)
+        """P value of the J test, by a scaled chi-square, `(item,)`; NaN without degrees of freedom."""
+        return chi_square_tail(self.j_statistic / self.dispersion, self.dof / self.dispersion)
 
     @property
     def refused(self) -> Tensor:
-        """Whether the J test leaves the model no chance, `(item,)`."""
-        return self.p_value < _NO_CHANCE
+        """Whether the J test rejects the model beyond doubt, p < 0.001, `(item,)`."""
+        return self.p_value < 1e-3
 
 
 def either(condition: Tensor, one: Any, other: Any) -> Any:
-    """The first for items that meet a condition `(item,)`, the second for the others; tensors, or records of them."""
+    """The first for items that meet a condition `(item,)`, the second for others; tensors or dataclasses of them."""
     if isinstance(one, Tensor):
         return torch.where(condition.view(-1, *(1,) * (one.ndim - 1)), one, other)
     pairs = ((getattr(one, f.name), getattr(other, f.name)) for f in fields(one))
@@ -113,20 +110,20 @@ def infer(fit: Fit, made_of: Composition, confidence_level: float) -> Inference:
     """Sandwich covariance `(A' O A)^-1 A' O V O A (A' O A)^-1`, `A = d nu / d theta` ([V] theorem 2), and the J test.
 
     Args:
-        fit: Where the search ended.
+        fit: Fit of the moments.
         made_of: Structure of the model.
         confidence_level: Probability that an interval holds the true value.
     """
-    own = _misfit(fit, made_of)
+    own = _residual_of(fit, made_of)
     # Jacobian by p, and by x of the unknown shapes: (item, level, unknown)
     moving = [made_of.shaped.index(k) for k in made_of.curved]
     jacobian = torch.cat([own.values, own.slopes[..., moving]], -1)
     present = fit.linear > 0  # (item, process)
     active = torch.cat([present, present[:, made_of.curved]], -1)
-    spread = _sandwich(jacobian, active, own.covariance, own.weight)
-    # With the variances at zero let off it, how far they might be.
+    spread = sandwich(jacobian, active, own.covariance, own.weight)
+    # Standard errors of variances at zero, if they could be negative.
     free = torch.cat([torch.ones_like(present), present[:, made_of.curved]], -1)
-    edge = _sandwich(jacobian, free, own.covariance, own.weight)
+    edge = sandwich(jacobian, free, own.covariance, own.weight)
     estimates = estimated(
         made_of,
         fit.linear,
@@ -135,23 +132,21 @@ def infer(fit: Fit, made_of: Composition, confidence_level: float) -> Inference:
         edge.diagonal(dim1=-2, dim2=-1)[:, : made_of.n_linear].clamp(min=0).sqrt(),
         confidence_level,
     )
-    degrees = (len(fit.tau) - active.sum(-1)).to(own.j_statistic)
-    return Inference(
-        estimates, own.fitted, own.objective, own.j_statistic, degrees, torch.ones_like(degrees), fit.converged
-    )
+    dof = (len(fit.tau) - active.sum(-1)).to(own.j_statistic)
+    return Inference(estimates, own.fitted, own.objective, own.j_statistic, dof, torch.ones_like(dof), fit.converged)
 
 
 def infer_efficient(
     fit: Fit, made_of: Composition, spread: Tensor, edge_sd: Tensor, confidence_level: float
 ) -> Inference:
-    """What efficient estimates leave of the moments: the J test at parameters that are no minimum of it.
+    """Inference at efficient estimates, which are no minimum of the moments' objective.
 
     An efficient estimate of covariance `S` is uncorrelated with what it leaves (Hausman):
     `Var r = V - A S A'`, so that `r' V^-1 r` is a sum of squares of normal variables with the eigenvalues of
     `1 - L^-1 A S A' L^-T`, `V = L L'`, as weights: 0 to 1, where a minimum has zeros and ones alone.
 
     Args:
-        fit: Moments, and the estimates in the place of where a search ended.
+        fit: Moments, and the estimates in the place of the minimum.
         made_of: Structure of the model.
         spread: `S`, of `ln p` of all processes and `x` of all shaped ones, `(item, unknown, unknown)`; what is not
             known of it takes nothing from the residuals, so that the test refuses too seldom.
@@ -161,20 +156,20 @@ def infer_efficient(
     References:
         J. A. Hausman, Econometrica 46, 1978.
     """
-    own = _misfit(fit, made_of)
+    own = _residual_of(fit, made_of)
     jacobian = torch.cat([own.values * fit.linear[:, None], own.slopes], -1)
     moved = torch.linalg.solve_triangular(own.root, jacobian, upper=False)
     part = moved @ spread.nan_to_num(nan=0.0, posinf=0.0) @ moved.mT
     taken = torch.linalg.eigvalsh(torch.where(own.j_statistic.isfinite()[:, None, None], part, 0.0)).clamp(0, 1)
-    degrees = (1 - taken).sum(-1)
-    dispersion = (1 - taken).square().sum(-1) / degrees
+    dof = (1 - taken).sum(-1)
+    dispersion = (1 - taken).square().sum(-1) / dof
     estimates = estimated(made_of, fit.linear, fit.shape, spread, edge_sd, confidence_level)
-    return Inference(estimates, own.fitted, own.objective, own.j_statistic, degrees, dispersion, fit.converged)
+    return Inference(estimates, own.fitted, own.objective, own.j_statistic, dof, dispersion, fit.converged)
 
 
 @dataclass(frozen=True, eq=False)
-class _Misfit:
-    """Moments against a model.
+class _MomentResidual:
+    """Measured moments, a model, and their difference.
 
     Attributes:
         fitted: `nu(theta)`, `(item, level)`.
@@ -197,23 +192,21 @@ class _Misfit:
     slopes: Tensor
 
 
-def _misfit(fit: Fit, made_of: Composition) -> _Misfit:
+def _residual_of(fit: Fit, made_of: Composition) -> _MomentResidual:
     values, slopes = made_of.columns(fit.tau, fit.shape), made_of.slopes(fit.tau, fit.shape)
     fitted = (values @ fit.linear[..., None])[..., 0]
     covariance = fit.records.covariance(made_of.model(fit.linear, fit.shape))
     residual = fit.variance - fitted
-    if fit.moments == "log":
-        residual, covariance = log_residual(fit.variance, fitted, covariance)
     root, failed = torch.linalg.cholesky_ex(covariance)
     whitened = torch.linalg.solve_triangular(root, residual[..., None], upper=False)[..., 0]
     j_statistic = torch.where(failed > 0, torch.nan, whitened.square().sum(-1))
     weight = _weight(fit.omega, covariance)
-    objective = _quadratic(residual, weight)
+    objective = quadratic(residual, weight)
     slopes = slopes * fit.linear[:, None, made_of.shaped]
-    return _Misfit(fitted, covariance, root, weight, objective, j_statistic, values, slopes)
+    return _MomentResidual(fitted, covariance, root, weight, objective, j_statistic, values, slopes)
 
 
-def _quadratic(residual: Tensor, weight: Tensor) -> Tensor:
+def quadratic(residual: Tensor, weight: Tensor) -> Tensor:
     return ((weight @ residual[..., None])[..., 0] * residual).sum(-1)
 
 
@@ -256,7 +249,7 @@ def estimated(
         linear: `p`, `(item, process)`.
         shape: `x`, `(item, shaped)`.
         spread: Covariance of `ln p` of all processes and `x` of all shaped ones, `(item, unknown, unknown)`.
-        edge_sd: Standard deviation of `p` itself with those at zero let off it, `(item, process)`.
+        edge_sd: Standard error of `p` itself, as if a `p` at zero could be negative, `(item, process)`.
         confidence_level: Probability that an interval holds the true value.
     """
     z, one_sided = normal_quantile((1 + confidence_level) / 2), normal_quantile(confidence_level)
@@ -288,7 +281,7 @@ def estimated(
     return Estimates(made_of.params(linear, shape), covariance, lows, highs, determined)
 
 
-def _sandwich(jacobian: Tensor, active: Tensor, covariance: Tensor, weight: Tensor) -> Tensor:
+def sandwich(jacobian: Tensor, active: Tensor, covariance: Tensor, weight: Tensor) -> Tensor:
     """Covariance `(item, unknown, unknown)` of the unknowns, zero where not active."""
     columns = jacobian * active[:, None].to(jacobian)
     size = columns.square().sum(-2).sqrt()

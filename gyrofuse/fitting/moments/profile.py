@@ -1,71 +1,73 @@
-"""Confidence limits by profile: how far an unknown may go until the best fit with it held is too bad for chance.
+"""Confidence limits by profile: the values of an unknown with which the best fit is not significantly worse.
 
-For variances near zero, and whatever else the data say little about, the distance from the estimate in standard
-deviations says little: the objective is no parabola there, and may have several valleys. Here an interval holds every
-value for which
+For variances near zero and other weakly identified unknowns a standard error is of little use: the objective is no
+parabola there, and may have several minima. Here an interval holds every value with a deviance increase
 
     rise(value) = min over the others with the unknown at `value` - min over all <= z^2
 
-with the `z` of two limits also where there is one: a variance's interval ends at zero where zero itself is not ruled
-out.
+with the `z` of two limits also where there is one: the interval of a variance ends at zero where zero itself is not
+rejected.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from gyrofuse.fitting.moments import search
-from gyrofuse.fitting.moments.identifiability import told_apart, uncertain
+from gyrofuse.fitting.moments.identifiability import ar1s_differ, weakly_identified
 from gyrofuse.fitting.moments.inference import WEAKLY_DETERMINED, Estimates, Fit, Inference
-from gyrofuse.fitting.moments.profile_limits import crossings, grid
-from gyrofuse.fitting.moments.profile_surfaces import MomentSurface, Surface
+from gyrofuse.fitting.moments.profile_objectives import MomentProfile, ProfileObjective
 from gyrofuse.fitting.structure import Composition
 from gyrofuse.wavelets.equivalent_dof import normal_quantile
 
-# Share of `z` by which the square root of the rise at a limit may differ from it: as much as the limit would be off. An
-# interval of 95 % a tenth too short holds 92 %.
-_BENT = 0.1
-# Nats below the estimate, or below what there is room for, and times the latter: where variances are looked at.
-_BELOW, _MOST_ROOM = 9.0, 32.0
+# Nats by which the logarithm of a variance may fall below its estimate, or the largest one possible: e^-9, a ten
+# thousandth, which no record tells from zero.
+_TO_ZERO = 9.0
+
+# Deviance increase of items `(n,)` at values `(n,)`.
+Rise = Callable[[Tensor, Tensor], Tensor]
 
 
 def profiled(
     inference: Inference,
-    surface: Surface,
+    surface: ProfileObjective,
     fit: Fit,
     made_of: Composition,
     confidence_level: float,
     which: Tensor | None = None,
 ) -> Inference:
-    """Replace the limits of what is uncertain, see `moment_identity.uncertain`, by those of the profile.
+    """Replace the limits of weakly identified unknowns by those of the profile.
 
-    Where the model does not fit, what is minimised may rise steeply without any meaning: the wider one of both
-    intervals is kept.
+    Where the model does not fit, a steep objective has no meaning: the wider one of both intervals is kept.
 
     Args:
-        inference: Estimates, and whether the model fits.
-        surface: What was minimised.
-        fit: Of the moments.
+        inference: Estimates with symmetric intervals, and the J test.
+        surface: Objective that was minimised.
+        fit: Fit of the moments.
         made_of: Structure of the model.
         confidence_level: Probability that an interval holds the true value.
-        which: Items, `(item,)`; all by default.
+        which: Items that may change, `(item,)`, bool; all by default.
+
+    References:
+        Profile likelihood intervals: D. J. Venzon, S. H. Moolgavkar, Applied Statistics 37, 1988.
     """
     estimates, refused = inference.estimates, inference.refused
-    needed = uncertain(made_of, estimates, fit.records.longest, confidence_level)
+    needed = weakly_identified(made_of, estimates, fit.records.longest, confidence_level)
     needed |= _bent(surface, made_of, estimates, fit.tau, confidence_level)
     needed &= estimates.params.isfinite().all(-1, keepdim=True)
-    if fit.omega != "optimal" and isinstance(surface, MomentSurface):
-        # What is minimised here is not what was minimised there: an estimate off its edge lies elsewhere.
+    if fit.omega != "optimal" and isinstance(surface, MomentProfile):
+        # The fit minimised another objective: an estimate that is not zero is no minimum of this one.
         needed[:, : made_of.n_linear] &= fit.linear == 0
         needed[:, made_of.n_linear :] = False
     if which is not None:
         needed &= which[:, None]
-    z = _widths(surface, made_of, needed, confidence_level)
-    in_order = told_apart(made_of, estimates, confidence_level)
+    z = _quantiles(surface, made_of, needed, confidence_level)
+    in_order = ar1s_differ(made_of, estimates, confidence_level)
     low, high, determined = estimates.low.clone(), estimates.high.clone(), estimates.determined.clone()
     sds = estimates.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
     for unknown, place in enumerate(made_of.places):
@@ -74,7 +76,7 @@ def profiled(
             continue
         own, sd = estimates.params[items, place], sds[items, place]
         if not surface.knows(unknown):
-            # Amplitudes of tones and slopes of ramps are measured, nearly normal; what is at zero keeps its limit.
+            # Amplitudes of sinusoids and slopes of drifts are nearly normal; one at zero keeps its limit.
             measured = (unknown < made_of.n_linear) & (own > 0)
             low[items, place] = torch.where(measured, (own - z[items] * sd).clamp(min=0), low[items, place])
             high[items, place] = torch.where(measured, own + z[items] * sd, high[items, place])
@@ -83,7 +85,7 @@ def profiled(
             squared = made_of.processes[unknown].squared
             sd = sd / own * (2 if squared else 1)
             first, last = _variance_limits(
-                surface, items, unknown, sd, _room(fit, made_of, items, unknown), z[items], in_order[items]
+                surface, items, unknown, sd, _largest_variance(fit, made_of, items, unknown), z[items], in_order[items]
             )
             width = (last / first).log()
             if squared:
@@ -104,18 +106,35 @@ def profiled(
     return replace(inference, estimates=replace(estimates, low=low, high=high, determined=determined))
 
 
-def _bent(surface: Surface, made_of: Composition, estimates: Estimates, tau: Tensor, confidence_level: float) -> Tensor:
-    """Unknowns of which a limit is not as far from the estimate as a straight line has it, `(item, unknown)`.
+def _bent(
+    surface: ProfileObjective,
+    made_of: Composition,
+    estimates: Estimates,
+    tau: Tensor,
+    confidence_level: float,
+    tolerance: float = 0.1,
+) -> Tensor:
+    """Unknowns whose limit is not where a parabola puts it, `(item, unknown)`.
 
-    From the estimate to where an unknown has its limit and the others what they are then expected to be, the objective
-    rises by `z^2` where it is a parabola. Where AR1s are alike, or hardly shorter than the record, it is none.
+    Between the estimate and the point where an unknown has its limit, and the others their conditional means, the
+    objective rises by `z^2` if it is a parabola. With similar AR1s, or time constants near the length of the record, it
+    is none.
+
+    Args:
+        surface: Objective that was minimised.
+        made_of: Structure of the model.
+        estimates: Estimates with symmetric intervals.
+        tau: Filter lengths, `(level,)`.
+        confidence_level: Probability that an interval holds the true value.
+        tolerance: Relative difference between `z` and the square root of the rise, about the relative error of the
+            limit: an interval of 95 % that is a tenth too short holds 92 %.
 
     References:
         D. M. Bates, D. G. Watts, Nonlinear Regression Analysis and Its Applications, 1988, chapter 6.
     """
     z = normal_quantile((1 + confidence_level) / 2)
     n_linear, linear, shape = made_of.n_linear, surface.linear, surface.shape
-    # Of ln p and x, from the parameters' own: tones and ramps stay where they are.
+    # Of ln p and x, from those of the parameters: sinusoids and drifts stay where they are.
     still = [unknown for unknown in range(len(made_of.places)) if not surface.knows(unknown)]
     x_scale = torch.ones_like(shape)
     for at, k in enumerate(made_of.shaped):
@@ -132,18 +151,18 @@ def _bent(surface: Surface, made_of: Composition, estimates: Estimates, tau: Ten
     for unknown in range(sd.shape[-1]):
         step = z * spread[:, unknown] / sd[:, unknown, None]
         for sign in (-1, 1):
-            p = linear * (sign * step[:, :n_linear]).clamp(-_BELOW, _BELOW).exp()
+            p = linear * (sign * step[:, :n_linear]).clamp(-_TO_ZERO, _TO_ZERO).exp()
             x = (shape + sign * step[:, n_linear:]).clamp(least, most)
             rise = surface.divergence(p, x)
-            bent[:, unknown] |= (rise.sqrt() / z - 1).abs() > _BENT
+            bent[:, unknown] |= (rise.sqrt() / z - 1).abs() > tolerance
     return bent & (sd > 0)
 
 
-def _widths(surface: Surface, made_of: Composition, needed: Tensor, confidence_level: float) -> Tensor:
-    """Square root of the rise that chance makes, `(item,)`.
+def _quantiles(surface: ProfileObjective, made_of: Composition, needed: Tensor, confidence_level: float) -> Tensor:
+    """Quantile `z` of the square root of the deviance increase, `(item,)`.
 
-    An AR1 that may as well be absent leaves its memory free to be what suits the record best: its two unknowns come and
-    go together, and the rise is more nearly that of two.
+    An AR1 that may as well be absent leaves its `phi` unidentified: its two unknowns vanish together, and the deviance
+    increase has nearly two degrees of freedom.
     """
     one, two = normal_quantile((1 + confidence_level) / 2), math.sqrt(-2 * math.log1p(-confidence_level))
     width = surface.linear.new_full((len(needed),), one)
@@ -155,8 +174,8 @@ def _widths(surface: Surface, made_of: Composition, needed: Tensor, confidence_l
     return width
 
 
-def _room(fit: Fit, made_of: Composition, items: Tensor, k: int) -> Tensor:
-    """About the largest `p` that the wavelet variances leave room for, `(item,)`."""
+def _largest_variance(fit: Fit, made_of: Composition, items: Tensor, k: int) -> Tensor:
+    """About the largest `p` that the wavelet variances allow, `(item,)`."""
     variance, shape = fit.variance[items], fit.shape[items]
     if made_of.processes[k].alternates:
         return 2 * variance[:, 0]  # without memory
@@ -166,29 +185,113 @@ def _room(fit: Fit, made_of: Composition, items: Tensor, k: int) -> Tensor:
 
 
 def _variance_limits(
-    surface: Surface, items: Tensor, k: int, sd: Tensor, room: Tensor, z: Tensor, in_order: Tensor
+    surface: ProfileObjective, items: Tensor, k: int, sd: Tensor, largest: Tensor, z: Tensor, in_order: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Of a variance, zero or infinite where there is none; looked for on a logarithmic scale."""
+    """Limits of a variance, on a logarithmic scale; zero or infinite where there is none."""
     own = surface.linear[items, k]
-    least = torch.where(own > 0, own, room).minimum(room).log() - _BELOW
-    values = grid(own.log(), sd, least, (_MOST_ROOM * room).maximum(3 * own).log())
+    least = torch.where(own > 0, own, largest).minimum(largest).log() - _TO_ZERO
+    values = profile_grid(own.log(), sd, least, (32 * largest).maximum(3 * own).log())
     values[:, 0] = -torch.inf
 
     def rise(which: Tensor, at: Tensor) -> Tensor:
         return surface.rise(items[which], k, at.exp(), in_order[which])
 
-    low, high = crossings(rise, own.log(), values, z)
+    low, high = profile_limits(rise, own.log(), values, z)
     return low.exp(), high.exp()
 
 
 def _shape_limits(
-    surface: Surface, items: Tensor, unknown: int, sd: Tensor, least: float, most: float, z: Tensor, in_order: Tensor
+    surface: ProfileObjective,
+    items: Tensor,
+    unknown: int,
+    sd: Tensor,
+    least: float,
+    most: float,
+    z: Tensor,
+    in_order: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Of `x`, infinite where there is none."""
+    """Limits of an `x`, infinite where there is none."""
     x = surface.shape[items, unknown - surface.linear.shape[-1]]
-    values = grid(x, sd, torch.full_like(x, least), torch.full_like(x, most))
+    values = profile_grid(x, sd, torch.full_like(x, least), torch.full_like(x, most))
 
     def rise(which: Tensor, at: Tensor) -> Tensor:
         return surface.rise(items[which], unknown, at, in_order[which])
 
-    return crossings(rise, x, values, z)
+    return profile_limits(rise, x, values, z)
+
+
+def profile_grid(own: Tensor, sd: Tensor, least: Tensor, most: Tensor) -> Tensor:
+    """First values of a profile, `(item, value)`, ascending: ten over the whole range, four near the estimate."""
+    share = torch.linspace(0, 1, 10, dtype=own.dtype, device=own.device)
+    wide = least[:, None] + (most - least)[:, None] * share
+    near = own[:, None] + sd[:, None] * own.new_tensor((-3.0, -1.5, 1.5, 3.0))
+    near = torch.where(near.isfinite(), near, least[:, None]).clamp(least[:, None], most[:, None])
+    return torch.cat([wide, near], -1).sort(-1)[0]
+
+
+def profile_limits(rise: Rise, own: Tensor, values: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+    """Outermost limits of the values with a deviance increase of at most `z^2`.
+
+    Args:
+        rise: Deviance increase of items `(n,)` at values `(n,)`.
+        own: Estimate, whose deviance increase is zero, `(item,)`.
+        values: First values, `(item, value)`; more follow about the two limits.
+        z: Normal quantile, `(item,)`.
+
+    Returns:
+        Lower and upper end, `(item,)`, infinite where the grid ends before.
+    """
+    everyone = torch.arange(len(own), device=own.device)
+    values = torch.cat([values, own[:, None]], -1)
+    height = torch.where(values == own[:, None], -z[:, None], _heights(rise, everyone, values, z))
+    values, order = values.sort(-1)
+    height = height.gather(-1, order)
+    held, n = height <= 0, values.shape[-1]
+    place = torch.arange(n, device=own.device)
+    ends = []
+    for sign, at in ((-1, torch.where(held, place, n).amin(-1)), (1, torch.where(held, place, -1).amax(-1))):
+        crossed = ((at + sign >= 0) & (at + sign < n)).nonzero()[:, 0]
+        pair = torch.stack([at, at + sign], -1)[crossed]
+        limit = torch.full_like(own, sign * torch.inf)
+        limit[crossed] = _closer(
+            rise, crossed, values[crossed].gather(-1, pair), height[crossed].gather(-1, pair), z[crossed]
+        )
+        ends.append(limit)
+    return ends[0], ends[1]
+
+
+def _closer(
+    rise: Rise, items: Tensor, ends: Tensor, heights: Tensor, z: Tensor, n_between: int = 4, n_rounds: int = 2
+) -> Tensor:
+    """Root between a value within the limit and one beyond it, the nearest to the second, `(item,)`.
+
+    Args:
+        rise: Deviance increase of items at values.
+        items: Items, `(item,)`.
+        ends: The two values, `(item, 2)`.
+        heights: Square root of the deviance increase there, less `z`, `(item, 2)`.
+        z: Normal quantile, `(item,)`.
+        n_between: Number of values between the two in each round.
+        n_rounds: Number of rounds: two of four values, and linear interpolation, divide the interval by 25.
+    """
+    inside, outside = ends.unbind(-1)
+    inside = torch.where(inside.isinf(), outside - _TO_ZERO, inside)
+    outside = torch.where(outside.isinf(), inside - _TO_ZERO, outside)
+    share = torch.linspace(0, 1, n_between + 2, dtype=ends.dtype, device=ends.device)
+    place = torch.arange(n_between + 2, device=ends.device)
+    for _ in range(n_rounds if len(items) else 0):
+        values = inside[:, None] + (outside - inside)[:, None] * share
+        found = _heights(rise, items, values[:, 1:-1], z)
+        found = torch.cat([heights[:, :1], found, heights[:, 1:]], -1)
+        last = torch.where(found <= 0, place, 0).amax(-1, keepdim=True)
+        pair = torch.cat([last, last + 1], -1)
+        (inside, outside), heights = values.gather(-1, pair).unbind(-1), found.gather(-1, pair)
+    below, above = heights.unbind(-1)
+    return inside + (outside - inside) * (below / (below - above)).clamp(0, 1)
+
+
+def _heights(rise: Rise, items: Tensor, values: Tensor, z: Tensor) -> Tensor:
+    """Square root of the deviance increase at values `(item, value)` less `z`; infinite where it is not known."""
+    n_items, n = values.shape
+    found = rise(items.repeat_interleave(n), values.flatten()).sqrt().view(n_items, n)
+    return (found - z[:, None]).nan_to_num(nan=torch.inf)

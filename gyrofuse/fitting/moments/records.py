@@ -1,4 +1,4 @@
-"""Lengths of records and how their wavelet variances were estimated: what the covariance of these depends on."""
+"""Design of a sample of wavelet variances: lengths and levels of its records, and the estimator."""
 
 from __future__ import annotations
 
@@ -7,19 +7,21 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gyrofuse._base.checks import check_floating, check_length, largest_level
+from gyrofuse._base.deprecation import warn_deprecated
 from gyrofuse.fitting.moments.covariance import moment_covariance
-from gyrofuse.fitting.moments.robust_covariance import robust_moment_covariance
+from gyrofuse.io.recording import Recording
 from gyrofuse.noise.processes import Model
 
 
 @dataclass(frozen=True)
-class Records:
+class SampleDesign:
     """One record, or several whose wavelet variances are pooled: averaged with as many coefficients as each has.
 
     Attributes:
         lengths: Samples T of each record.
         levels: Levels that each of them adds to, at least one of them to all.
-        efficiency: Of robust wavelet variances; 1 for the classic ones.
+        efficiency: Efficiency of robust wavelet variances; 1 for the classic ones.
     """
 
     lengths: tuple[int, ...]
@@ -43,7 +45,7 @@ class Records:
 
     @property
     def observations(self) -> Tensor:
-        """Degrees of freedom `(level,)` of white noise, three for each window side by side."""
+        """Degrees of freedom `(level,)` of white noise, three for each non-overlapping window."""
         return (3 * self._counts.sum(0) / self.tau).clamp(min=1)
 
     @property
@@ -68,16 +70,15 @@ class Records:
         """Covariance of the wavelet variances of each record under a model, `(..., level, level)`.
 
         Args:
-            model: With parameters `(...)`.
-            excess_kurtosis: Of its white noise, a number or `(...)`; for the classic wavelet variance only.
+            model: Model with parameters `(...)`.
+            excess_kurtosis: Excess kurtosis of its white noise, a number or `(...)`; for the classic wavelet variance
+                only.
         """
         same: dict[tuple[int, int], Tensor] = {}
         for length, levels in zip(self.lengths, self.levels, strict=True):
             if (length, levels) not in same:
-                same[length, levels] = (
-                    moment_covariance(model, length, levels, excess_kurtosis=excess_kurtosis)
-                    if self.efficiency == 1
-                    else robust_moment_covariance(model, length, levels, efficiency=self.efficiency)
+                same[length, levels] = moment_covariance(
+                    model, length, levels, excess_kurtosis=excess_kurtosis, efficiency=self.efficiency
                 )
         return [same[key] for key in zip(self.lengths, self.levels, strict=True)]
 
@@ -95,10 +96,54 @@ class Records:
 
     @property
     def _shares(self) -> Tensor:
-        """What each record adds to the mean, `(record, level)`."""
+        """Weight of each record in the mean, `(record, level)`."""
         counts = self._counts
         return counts / counts.sum(0)
 
     def _whole(self, values: Tensor) -> Tensor:
         """Zeros at the levels, last of the dimensions, that a record does not have."""
         return torch.nn.functional.pad(values, (0, self.n_levels - values.shape[-1]))
+
+
+def check_wavelet_variance(wavelet_variance: Tensor, n_samples: int, n_levels: int | None) -> Tensor:
+    """A wavelet variance `(..., level, sensor)` with `n_levels` of its levels.
+
+    Args:
+        wavelet_variance: What was given.
+        n_samples: Length of the records behind it.
+        n_levels: Number of levels; all by default.
+
+    Raises:
+        TypeError: Not a floating point tensor.
+        ValueError: Shape of a signal, more levels than the records have, or fewer than `n_levels`.
+    """
+    shape, most = tuple(check_floating("wavelet_variance", wavelet_variance).shape), largest_level(n_samples)
+    if shape[-1:] == (n_samples,):
+        raise ValueError(
+            f"`wavelet_variance`: expected a wavelet variance (..., level, sensor), got shape {shape}, that of a "
+            f"signal of {n_samples} samples; give the signal to the function for signals, or sensors one by one"
+        )
+    if len(shape) < 2 or not 1 <= shape[-2] <= most:
+        raise ValueError(
+            f"`wavelet_variance`: expected a wavelet variance (..., level, sensor) of at most {most} levels for "
+            f"{n_samples} samples, got shape {shape}; for a signal there is a function of its own"
+        )
+    if n_levels is not None and not 1 <= n_levels <= shape[-2]:
+        raise ValueError(f"`n_levels`: expected 1 to {shape[-2]}, the levels given, got {n_levels}")
+    return wavelet_variance[..., :n_levels, :]
+
+
+def deprecate_moments(signal: Tensor | Recording, n_samples: int, function: str, stacklevel: int = 3) -> None:
+    """Warn that a function for signals was given moments and the length of the records behind them.
+
+    Args:
+        signal: What it was given.
+        n_samples: Length.
+        function: Name of the function, whose twin for moments ends in `_moments`.
+        stacklevel: Frames between the warning and the line that called the function.
+
+    Raises:
+        ValueError: `signal` is a recording, or `n_samples` no length.
+    """
+    check_length(n_samples, recorded=isinstance(signal, Recording))
+    warn_deprecated(f"argument `n_samples` of {function}", f"{function}_moments", stacklevel=stacklevel)

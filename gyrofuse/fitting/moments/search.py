@@ -12,15 +12,11 @@ import math
 import torch
 from torch import Tensor
 
+from gyrofuse._base.chunks import items_at_once
 from gyrofuse._base.nnls import nonnegative_least_squares
+from gyrofuse._base.optimize import Trial, descend
 from gyrofuse.fitting.structure import Composition
 from gyrofuse.noise.processes import Process
-
-_STEPS, _ENOUGH = 30, 1e-10
-# The damping after which a step that does not help is taken for rounding.
-_MOST_DAMPING = 1e10
-_PROBLEMS_AT_ONCE = 200_000
-_CLOSE = 1e-3
 
 
 def starting_points(
@@ -59,7 +55,7 @@ def starting_points(
     which = [n for n, block in enumerate(blocks) for _ in block[0]]
     points = torch.stack([axes[n][torch.tensor([i[d] for i in index])] for d, n in enumerate(which)], -1).to(target)
     objective = []
-    for part in points.split(max(_PROBLEMS_AT_ONCE // n_items, 1)):
+    for part in points.split(items_at_once(n_items * len(tau) * len(made_of.processes))):
         # What does not differ between the items is computed once.
         n_own = n_items if held.shape[-1] else 1
         values = made_of.columns(tau, _with_held(part[None].expand(n_own, -1, -1), held, made_of))
@@ -82,11 +78,13 @@ def minimise(
     tau: Tensor,
     made_of: Composition,
     start: Tensor,
-    n_steps: int = _STEPS,
+    n_steps: int = 30,
     *,
     fixed: tuple[int, Tensor] | None = None,
     still: int | None = None,
-    enough: float = _ENOUGH,
+    enough: float = 1e-10,
+    shortest_step: float = 1e-7,
+    longest_step: float = 2.0,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Levenberg-Marquardt on `|W (target - u(x) p)|^2`.
 
@@ -100,24 +98,22 @@ def minimise(
         fixed: A process, and its `p` `(problem,)`; None where all are free.
         still: One of `x` that stays where it starts.
         enough: Share of the objective by which a step has to lower it to be followed by another.
+        shortest_step: Change of `x` below which a step that does not lower the objective fails for rounding.
+        longest_step: Largest change of an `x` in one step: `atanh phi` and `logit` are nearly linear that far.
 
     Returns:
         `p` `(problem, linear)`, `x` `(problem, shaped)`, the minimum `(problem,)` and whether it was reached.
     """
     moving = [at for at in map(made_of.shaped.index, made_of.curved) if at != still]
-    x = start.clone()
-    linear, objective = _evaluate(target, root, tau, made_of, x, fixed)
+    linear, objective = _evaluate(target, root, tau, made_of, start, fixed)
     if not moving:
-        return linear, x, objective, torch.ones_like(objective, dtype=torch.bool)
-    low, high = (ends[moving] for ends in limits(made_of, tau, x))
-    damping = torch.full_like(objective, 1e-3)
-    done = ~objective.isfinite()
-    for _ in range(n_steps):
-        todo = (~done).nonzero()[:, 0]
-        if not len(todo):
-            break
-        y, w, at, p = target[todo], root[todo], x[todo], linear[todo]
-        values, slope = made_of.columns(tau, at), made_of.slopes(tau, at)
+        return linear, start.clone(), objective, torch.ones_like(objective, dtype=torch.bool)
+    low, high = (ends[moving] for ends in limits(made_of, tau, start))
+
+    def attempt(todo: Tensor, state: list[Tensor], old: Tensor, damping: Tensor) -> Trial:
+        x, p = state
+        y, w = target[todo], root[todo]
+        values, slope = made_of.columns(tau, x), made_of.slopes(tau, x)
         jacobian = _times(w, slope * p[:, None, made_of.shaped])[..., moving]
         free = p > 0
         if fixed:
@@ -129,31 +125,27 @@ def minimise(
         size = normal.diagonal(dim1=-2, dim2=-1)
         # An AR1 whose variance is zero does not move.
         own_size = torch.where(size > 0, size, 1.0)
-        step = torch.linalg.solve_ex(normal + torch.diag_embed(damping[todo][:, None] * own_size), gradient)[0]
-        tried = at.clone()
-        tried[:, moving] = (at[:, moving] + step.clamp(-2, 2)).clamp(low, high)
+        step = torch.linalg.solve_ex(normal + torch.diag_embed(damping[:, None] * own_size), gradient)[0]
+        tried = x.clone()
+        tried[:, moving] = (x[:, moving] + step.clamp(-longest_step, longest_step)).clamp(low, high)
         given = (fixed[0], fixed[1][todo]) if fixed else None
-        new_linear, new_objective = _evaluate(y, w, tau, made_of, tried, given)
-        old = objective[todo]
-        better = new_objective < old
-        gain = old - new_objective
-        x[todo] = torch.where(better[:, None], tried, at)
-        linear[todo] = torch.where(better[:, None], new_linear, p)
-        objective[todo] = torch.where(better, new_objective, old)
-        damping[todo] = torch.where(better, damping[todo] / 5, damping[todo] * 4).clamp(min=1e-12)
-        stuck = (step.abs().amax(-1) < 1e-7) | (damping[todo] > _MOST_DAMPING)
-        done[todo] = torch.where(better, gain <= enough * old, stuck)
+        new_linear, new = _evaluate(y, w, tau, made_of, tried, given)
+        better = new < old
+        last = torch.where(better, old - new <= enough * old, step.abs().amax(-1) < shortest_step)
+        return Trial((tried, new_linear), new, better, last)
+
+    (x, linear), objective, done = descend((start, linear), objective, attempt, n_steps=n_steps, ease=5, tighten=4)
     return linear, x, objective, done & objective.isfinite()
 
 
-def distinct(objective: Tensor, x: Tensor, n_kept: int) -> Tensor:
+def distinct(objective: Tensor, x: Tensor, n_kept: int, close: float = 1e-3) -> Tensor:
     """Indices `(item, kept)` of the best starts of `x` `(item, start, shaped)` that differ from one another."""
     cost = torch.where(objective.isfinite(), objective, torch.finfo(objective.dtype).max)
     kept = []
     for _ in range(min(n_kept, cost.shape[1])):
         best = cost.argmin(-1)
         kept.append(best)
-        same = (x - x.gather(1, best[:, None, None].expand(-1, 1, x.shape[-1]))).abs().sum(-1) < _CLOSE
+        same = (x - x.gather(1, best[:, None, None].expand(-1, 1, x.shape[-1]))).abs().sum(-1) < close
         same |= torch.arange(cost.shape[1], device=cost.device) == best[:, None]
         cost = torch.where(same, torch.inf, cost)
     return torch.stack(kept, 1)

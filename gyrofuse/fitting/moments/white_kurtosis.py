@@ -25,8 +25,6 @@ from gyrofuse.fitting.spectral.tones import Tones
 from gyrofuse.fitting.structure import Composition
 from gyrofuse.wavelets.equivalent_dof import normal_quantile
 
-_LEAST = -2.0  # the excess kurtosis of a fair coin: no variable has less
-
 
 def white_excess_kurtosis(series: Tensor, tones: Tones | None, made_of: Composition, params: Tensor) -> Tensor:
     """Excess kurtosis of the samples of the white noise, `(item,)`, if that is what is not Gaussian.
@@ -36,9 +34,9 @@ def white_excess_kurtosis(series: Tensor, tones: Tones | None, made_of: Composit
 
     Args:
         series: `(item, time)`, NaN = missing sample.
-        tones: Of the sinusoids, which are taken out; None where there are none.
+        tones: Spectral lines of the sinusoids, which are subtracted; None where there are none.
         made_of: Structure of the model.
-        params: Fitted, `(item, parameter)`.
+        params: Fitted parameters, `(item, parameter)`.
 
     Returns:
         -2 or more; 0 where the model has no white noise, or its variance is zero.
@@ -54,7 +52,7 @@ def white_excess_kurtosis(series: Tensor, tones: Tones | None, made_of: Composit
     cumulant = steps.pow(4).nanmean(-1) - 3 * steps.square().nanmean(-1).square()
     variance = params[:, at]
     kappa = cumulant / (2 * variance.square())
-    return torch.where(kappa.isfinite(), kappa, 0.0).clamp(min=_LEAST)
+    return torch.where(kappa.isfinite(), kappa, 0.0).clamp(min=-2.0)  # that of a fair coin: no variable has less
 
 
 def with_excess_kurtosis(
@@ -65,11 +63,11 @@ def with_excess_kurtosis(
     Limits move by as much as an independent error of `ln s2` widens them.
 
     Args:
-        inference: Estimates with their final intervals.
+        inference: Inference with final intervals.
         kappa: Excess kurtosis of the white noise, `(item,)`.
         made_of: Structure of the model.
         n_samples: Length of the records, all together.
-        confidence_level: Of the intervals.
+        confidence_level: Probability that an interval holds the true value.
     """
     at, estimates = _white_at(made_of), inference.estimates
     if at is None:
@@ -94,7 +92,7 @@ def with_excess_kurtosis(
 
 
 def _white_at(made_of: Composition) -> int | None:
-    """Place of the variance of the white noise among the parameters."""
+    """Index of the variance of the white noise among the parameters."""
     for k, process in enumerate(made_of.processes):
         if process.white:
             return made_of.places[k]

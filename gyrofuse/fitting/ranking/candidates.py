@@ -1,4 +1,4 @@
-"""Candidates for the composition of a noise, what each could be simplified to, and which say the same."""
+"""Candidates for the composition of a noise, their simplifications, and their neighbours."""
 
 from __future__ import annotations
 
@@ -18,23 +18,20 @@ from gyrofuse.noise.processes import AR1, PROCESSES, Drift, Model, Process, Quan
 Kinds = list[type[Process]]
 Key = frozenset[tuple[type[Process], int]]
 
-_MOST_AR1S = 3
-# A variance or a shape known to a factor of e^4 either way is not known.
-_UNKNOWN = 2.0
-# Of Hannan and Quinn; more than 1 for a choice that is right in the end. At 1.5 a process too many pays its way in less
-# than 1 % of records of 10^4 to 10^7 samples, where a charge of ln T turns away many of those that are there.
+# Factor `c` of the penalty of Hannan and Quinn, above 1 for a consistent choice. At 1.5 a superfluous process is chosen
+# in less than 1 % of records of 10^4 to 10^7 samples, where the penalty `ln T` of BIC misses many of the weak ones.
 _HANNAN_QUINN = 1.5
-# AR1s whose time constants differ by less than a tenth.
-_ALIKE = 0.05
+# Standard error of the logarithm of a variance, or of `x`, above which it is unknown: a factor of e^4 either way.
+_UNKNOWN = 2.0
 
 
 def key_of(kinds: Iterable[type[Process]]) -> Key:
-    """What a composition is made of, in no order."""
+    """Numbers of the processes of each kind, without an order."""
     return frozenset(Counter(kinds).items())
 
 
 def composition(kinds: Iterable[type[Process]], held: bool) -> Composition:
-    """In the usual order."""
+    """Structure of a model with these processes, in the usual order."""
     ordered: list[Any] = sorted(kinds, key=PROCESSES.index)  # of classes with constructors of their own
     return Composition(tuple(kind() for kind in ordered), held)
 
@@ -45,7 +42,7 @@ def kinds_of(made_of: Composition) -> Kinds:
 
 
 def name_of(kinds: Iterable[type[Process]]) -> str:
-    """Such as `WN + 2*AR1 + RW`."""
+    """Name of a composition, such as `WN + 2*AR1 + RW`."""
     return composition(kinds, True).name
 
 
@@ -59,17 +56,22 @@ def n_parameters(made_of: Composition) -> int:
     return made_of.n_linear + len(made_of.shaped)
 
 
-def charge(made_of: Composition, n_samples: int) -> float:
-    """What its parameters cost in `-2 ln L`: `2 c ln ln T` each, the slope of a ramp, known to `T^(-3/2)`, `ln T`."""
+def penalty(made_of: Composition, n_samples: int) -> float:
+    """Penalty of its parameters in `-2 ln L`: `2 c ln ln T` each, and `ln T` for a slope, known to `T^(-3/2)`."""
     drifts = sum(process.deterministic for process in made_of.processes)
     each = 2 * _HANNAN_QUINN * math.log(math.log(n_samples))
     return (n_parameters(made_of) - drifts) * each + drifts * math.log(n_samples)
 
 
-def all_noises(most: int) -> list[Kinds]:
-    """Sums of WN, QN, 0 to 3 AR1s, RW and DR with at least one noise and at most so many parameters."""
+def all_noises(most: int, most_ar1s: int = 3) -> list[Kinds]:
+    """Sums of WN, QN, AR1s, RW and DR with at least one noise.
+
+    Args:
+        most: Largest number of parameters.
+        most_ar1s: Largest number of AR1s: more are not identified in records of feasible length.
+    """
     found = []
-    for n, *others in itertools.product(range(_MOST_AR1S + 1), *((False, True),) * 4):
+    for n, *others in itertools.product(range(most_ar1s + 1), *((False, True),) * 4):
         kinds = [
             kind
             for kind, there in zip((WhiteNoise, QuantizationNoise, RandomWalk, Drift), others, strict=True)
@@ -121,8 +123,8 @@ def read_candidates(candidates: Sequence[Model | str]) -> list[Kinds]:
 def with_ancestors(wanted: Iterable[Kinds]) -> list[Kinds]:
     """All wanted and those with any of their processes left out, from small to large.
 
-    On the way over a part of them alone a climb may get stuck: with WN tried first, an AR1 that is weak next to it goes
-    unseen, while WN joins an AR1 that had the record to itself.
+    Along a part of them alone a search may get stuck: from WN, an AR1 that is weak beside it is missed, while from the
+    AR1 alone, WN is found.
     """
     found: dict[Key, Kinds] = {}
     for kinds in wanted:
@@ -171,15 +173,16 @@ def next_to(kinds: Kinds, among: Iterable[Key]) -> list[tuple[Kinds, int | None]
 def simplified(
     made_of: Composition, params: Tensor, covariance: Tensor, n_samples: int
 ) -> list[tuple[Kinds, str] | None]:
-    """For every item what the fit amounts to with fewer parameters, and why; None where it needs them all.
+    """For every item, the composition with fewer parameters that the fit amounts to, and why; None where there is none.
 
     Args:
-        made_of: Structure.
-        params: `(item, parameter)`.
-        covariance: `(item, parameter, parameter)`.
+        made_of: Structure of the model.
+        params: Parameters, `(item, parameter)`.
+        covariance: Their covariance, `(item, parameter, parameter)`.
         n_samples: Length T of the record.
     """
     sd = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    alike = 0.05  # difference of two `atanh phi` below which time constants differ by less than a tenth
     flags: list[tuple[int, type[Process] | None, str, Tensor]] = []
     earlier: defaultdict[type[Process], list[tuple[int, Tensor, Tensor]]] = defaultdict(list)
     numbers: Counter[type[Process]] = Counter()
@@ -202,10 +205,10 @@ def simplified(
                 short = (gap.abs() < 2 * x_sd) & (x_sd < _UNKNOWN / 4)
                 flags.append((k, kind.short_limit, f"{word} is {kind.short_limit.with_article('a')}", short))
             for other, other_x, other_sd in earlier[kind]:
-                gap = torch.maximum(2 * torch.hypot(x_sd, other_sd), torch.full_like(x, _ALIKE))
+                gap = torch.maximum(2 * torch.hypot(x_sd, other_sd), torch.full_like(x, alike))
                 known = (x_sd < _UNKNOWN) & (other_sd < _UNKNOWN)
-                alike = ((x - other_x).abs() < gap) & known | ((x - other_x).abs() < _ALIKE)
-                flags.append((k, None, f"{word} is {process.symbol} {other}", alike))
+                same = ((x - other_x).abs() < gap) & known | ((x - other_x).abs() < alike)
+                flags.append((k, None, f"{word} is {process.symbol} {other}", same))
             earlier[kind].append((numbers[kind], x, x_sd))
         flags.append((k, None, f"{word} is not identified", ~(ratio < _UNKNOWN)))
     table = torch.stack([flag for *_, flag in flags], -1).tolist()

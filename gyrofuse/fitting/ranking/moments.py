@@ -13,17 +13,11 @@ from torch import Tensor
 
 from gyrofuse._base.nnls import nonnegative_least_squares
 from gyrofuse.fitting.moments import search
-from gyrofuse.fitting.moments.fit import damped, misfit
+from gyrofuse.fitting.moments.fit import N_REWEIGHTINGS, objective_of, relaxed_gmm, reweighted
 from gyrofuse.fitting.moments.inference import Estimates, Fit, Inference, infer, infer_efficient
-from gyrofuse.fitting.moments.records import Records
+from gyrofuse.fitting.moments.records import SampleDesign
 from gyrofuse.fitting.structure import Composition, new_shape
 from gyrofuse.noise.processes import Process
-
-_REWEIGHTINGS, _UPDATES = 3, 3
-# By how much more than on the way the last weights' fit may miss, in half nats, before it is thought to go to and fro.
-_CHASING = 1.0
-_GRID_POINTS = 48
-_STEPS_NEAR = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +52,7 @@ class Moments:
         self.size = variance.amax(-1, keepdim=True)
         self._target = variance / self.size
         levels = variance.shape[-1]
-        self.records = Records((n_samples,), (levels,))
+        self.records = SampleDesign((n_samples,), (levels,))
         self.tau, self.observations = self.records.tau.to(variance), self.records.observations.to(variance)
         self._diagonal = self.observations.sqrt() / self._target
 
@@ -70,35 +64,28 @@ class Moments:
         items = torch.arange(len(target), device=target.device)
         linear, x = (torch.stack(column)[lowest, items] for column in list(zip(*ends, strict=True))[:2])
         passed = []
-        for _ in range(_UPDATES):
+        for _ in range(N_REWEIGHTINGS):
             root = self._whitening(made_of, linear, x)
-            passed.append(misfit(target, root, tau, made_of, linear, x))
+            passed.append(objective_of(target, root, tau, made_of, linear, x))
             linear, x, _, _ = search.minimise(target, root, tau, made_of, x)
-        final = misfit(target, self._whitening(made_of, linear, x), tau, made_of, linear, x)
-        chasing = final > torch.stack(passed).amin(0) + _CHASING
-        if bool(chasing.any()):
-            linear[chasing], x[chasing], _ = damped(
-                target[chasing], self.records, made_of, "optimal", linear[chasing], x[chasing]
+        final = objective_of(target, self._whitening(made_of, linear, x), tau, made_of, linear, x)
+        # An objective one half nat above the best one on the way: reweighting oscillates.
+        oscillating = final > torch.stack(passed).amin(0) + 1.0
+        if bool(oscillating.any()):
+            linear[oscillating], x[oscillating], _ = relaxed_gmm(
+                target[oscillating], self.records, made_of, "optimal", linear[oscillating], x[oscillating]
             )
         return self._summed_up(made_of, linear, x, self._whitening(made_of, linear, x))
 
     def _climbed(self, made_of: Composition, start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """With independent levels, whose weights are first the measured variances, then the fitted ones.
-
-        A fit to chance in the measured ones, such as one long scale that came out small, would have a `V` to match.
-        """
-        root = self._diagonal
-        linear, x, _, _ = search.minimise(self._target, root, self.tau, made_of, start)
-        for _ in range(_REWEIGHTINGS):
-            fitted = made_of.wavelet_variance(self.tau, linear, x)
-            root = (self.observations.sqrt() / fitted.clamp(min=1e-30)).clamp(max=1e15)
-            linear, x, objective, _ = search.minimise(self._target, root, self.tau, made_of, x)
-        return linear, x, objective - 2 * root.log().sum(-1)
+        """Fit with independent levels, whose weights are first the measured variances, then the fitted ones."""
+        linear, x, _, _ = search.minimise(self._target, self._diagonal, self.tau, made_of, start)
+        return reweighted(self._target, self.observations, self.tau, made_of, linear, x)
 
     def near(self, made_of: Composition, linear: Tensor, shape: Tensor) -> MomentFit:
         """Minimum next to a maximum of the likelihood, with the `V` of that."""
         root = self._whitening(made_of, linear / self.size, shape)
-        linear, x, _, _ = search.minimise(self._target, root, self.tau, made_of, shape, _STEPS_NEAR)
+        linear, x, _, _ = search.minimise(self._target, root, self.tau, made_of, shape, n_steps=10)
         # The maximum is the better estimate, and so is its V.
         return self._summed_up(made_of, linear, x, root)
 
@@ -150,9 +137,10 @@ class Moments:
         misfit = (wanted - columns @ linear[..., None]).square().sum((-2, -1))
         return tried[torch.arange(len(tried), device=tried.device), misfit.argmin(-1)]
 
-    def _grid(self, kind: type[Process]) -> Tensor:
+    def _grid(self, kind: type[Process], n_points: int = 48) -> Tensor:
+        """`x` of a process on all scales of the record, some three points an octave."""
         longest, shortest = kind.time_scales(float(self.tau[-1]))
-        steps = torch.linspace(0, 1, _GRID_POINTS, dtype=torch.float64, device=self.tau.device)
+        steps = torch.linspace(0, 1, n_points, dtype=torch.float64, device=self.tau.device)
         return search.with_alternating(kind, kind.from_time_scale(longest * (shortest / longest) ** steps))
 
     def _whitening(self, made_of: Composition, linear: Tensor, x: Tensor) -> Tensor:

@@ -5,14 +5,15 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from gyrofuse._base.results import chance, counted, listed, p_words, place, signed
-from gyrofuse.fitting.gmwm_result import GMWMResult
+from gyrofuse._base.deprecation import RenamedAttribute
+from gyrofuse._base.results import Result, chance, counted, p_words, place, plain, scattered, signed
+from gyrofuse.fitting.gmwm_result import MOST_TABLES, GMWMResult, axes_of, items_of
 from gyrofuse.fitting.ranking.candidates import name_of
 from gyrofuse.fitting.ranking.table import Table
 from gyrofuse.noise.parsing import parse_model
@@ -20,35 +21,42 @@ from gyrofuse.noise.parsing import parse_model
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_MOST_TABLES, _MOST_ROWS, _MOST_BARS = 12, 8, 12
-_NONE_FITS = 1e-3  # p-value of the J test
+# Largest numbers of candidates in the table of a sensor, and of bars in a figure: what a screen holds.
+_MOST_ROWS = 8
+_MOST_BARS = 12
+# P value of the J test below which no candidate fits: small, as the largest p value of several candidates is judged.
+_NONE_FITS = 1e-3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RankResult:
-    """Candidates for every sensor; `...` are the leading dimensions of the signal.
+class RankResult(Result):
+    """Ranked candidates for every sensor; `...` are the leading dimensions of the signal.
 
     Attributes:
         candidates: Names, such as `WN + AR1 + RW`.
-        criterion: `(..., sensor, candidate)`, less is better; NaN where it was not tried, for a candidate with another
-            number of sinusoids than was found, or a sensor that could not be ranked. Of a signal without the part that
-            sinusoids have in it.
+        criterion: Criterion, `(..., sensor, candidate)`, less is better; NaN where a candidate was not tried, as it has
+            another number of sinusoids than were found, or the sensor could not be ranked. Of a signal without its
+            sinusoids.
         wvic: Wavelet variance information criterion, the same.
-        p_value: Of the J test, that the candidate is complete, the same; at the parameters of greatest likelihood. Of
-            a signal it is that of the record without its sinusoids, but for the chosen one that of its fit.
+        p_value: P value of the J test, that the candidate is complete, the same; at the parameters of greatest
+            likelihood. Of a signal it is that of the record without its sinusoids, but for the chosen one that of its
+            fit.
         redundant: Whether the fit amounts to a smaller candidate that explains the record as well, the same.
-        reasons: Why, for every sensor, `...` flattened, and candidate, and why one that was given was not compared;
-            None where there is nothing to say.
-        equivalent: Whether it is as good as the chosen one, and not it, the same as `criterion`.
+        reasons: Reason why a candidate is redundant or was not compared, for every sensor, `...` flattened, and
+            candidate; None where there is none.
+        equivalent: Whether a candidate is as good as the chosen one, and not it, the same as `criterion`.
         choice: Index of the chosen candidate, `(..., sensor)`; -1 where a sensor could not be ranked.
-        wvic_choice: Index of that with the least WVIC, the same: no advice, as its weights are from each candidate's
-            own covariance, which is large where the candidate fits badly.
-        n_tones: Sinusoids of those compared, the same, -1 as before; None from a wavelet variance.
-        n_lines: Lines that stand out of the noise, the same, at most one more than candidates have sinusoids.
+        wvic_choice: Index of the candidate with the smallest WVIC, `(..., sensor)`. For comparison only: WVIC weights
+            each candidate by its own covariance and so favours bad fits.
+        n_sinusoids: Number of sinusoids of the candidates compared, `(..., sensor)`, -1 as in `choice`; None of a
+            wavelet variance.
+        n_lines: Number of spectral lines that stand out of the noise, `(..., sensor)`, at most one more than candidates
+            have sinusoids.
         best: Fit of the chosen candidate for every sensor, `...` flattened; None where there is none.
         n_samples: Length of the records.
         from_signal: Whether the criterion is that of the spectral likelihood, or of the wavelet variance.
-        sensors: Names.
+        sensors: Names of the sensors.
+        axes: Names along the leading dimension, empty when it has none.
     """
 
     candidates: tuple[str, ...]
@@ -60,7 +68,7 @@ class RankResult:
     equivalent: Tensor
     choice: Tensor
     wvic_choice: Tensor
-    n_tones: Tensor | None
+    n_sinusoids: Tensor | None
     n_lines: Tensor | None
     best: tuple[GMWMResult | None, ...]
     n_samples: int
@@ -68,34 +76,52 @@ class RankResult:
     sensors: tuple[str, ...]
     axes: tuple[str, ...] = ()
 
+    n_tones = RenamedAttribute("n_sinusoids")
+    _batched = (
+        "criterion",
+        "wvic",
+        "p_value",
+        "redundant",
+        "equivalent",
+        "choice",
+        "wvic_choice",
+        "n_sinusoids",
+        "n_lines",
+    )
+
     @classmethod
     def build(
         cls, *, table: Table, usable: Tensor, batch: tuple[int, ...], best: tuple[GMWMResult | None, ...], **rest: Any
     ) -> RankResult:
         """Put the items that could be ranked back into their places among all, `(item,)` -> `(..., sensor)`."""
-
-        def placed(value: Tensor, missing: float | bool) -> Tensor:
-            whole = value.new_full((len(usable), *value.shape[1:]), missing)
-            whole[usable] = value
-            return whole.view(*batch, *value.shape[1:])
-
         reasons = iter(table.reasons)
         nothing: list[str | None] = [None] * len(table.kinds)
         return cls(
             candidates=tuple(map(name_of, table.kinds)),
-            criterion=placed(table.criterion, torch.nan),
-            wvic=placed(table.wvic, torch.nan),
-            p_value=placed(table.p_value, torch.nan),
-            redundant=placed(table.redundant, False),
+            criterion=scattered(table.criterion, usable, batch),
+            wvic=scattered(table.wvic, usable, batch),
+            p_value=scattered(table.p_value, usable, batch),
+            redundant=scattered(table.redundant, usable, batch, False),
             reasons=tuple(tuple(next(reasons) if there else nothing) for there in usable.tolist()),
-            equivalent=placed(table.equivalent, False),
-            choice=placed(table.choice, -1),
-            wvic_choice=placed(table.wvic_choice, -1),
-            n_tones=None if table.n_tones is None else placed(table.n_tones, -1),
-            n_lines=None if table.n_lines is None else placed(table.n_lines, -1),
+            equivalent=scattered(table.equivalent, usable, batch, False),
+            choice=scattered(table.choice, usable, batch, -1),
+            wvic_choice=scattered(table.wvic_choice, usable, batch, -1),
+            n_sinusoids=None if table.n_sinusoids is None else scattered(table.n_sinusoids, usable, batch, -1),
+            n_lines=None if table.n_lines is None else scattered(table.n_lines, usable, batch, -1),
             best=best,
             **rest,
         )
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading dimensions before the sensors; `()` for a single array."""
+        return tuple(self.choice.shape[:-1])
+
+    def __getitem__(self, index: Any) -> RankResult:
+        """One item, or some, of the leading batch dimensions."""
+        shape = self.choice.shape
+        reasons, best = items_of(self.reasons, shape, index), items_of(self.best, shape, index)
+        return replace(super().__getitem__(index), reasons=reasons, best=best, axes=axes_of(self.axes, index))
 
     @property
     def difference(self) -> Tensor:
@@ -152,13 +178,17 @@ class RankResult:
         if self.none_fits(index):
             largest = p_words(max(self._tested(index)))
             found.append(f"No candidate fits: the J test refuses all (largest {largest}).")
-        if self.n_lines is not None and self.n_tones is not None and bool(self.n_lines[index] > self.n_tones[index]):
+        if (
+            self.n_lines is not None
+            and self.n_sinusoids is not None
+            and bool(self.n_lines[index] > self.n_sinusoids[index])
+        ):
             found.append("The spectrum has more lines than those compared have sinusoids: allow more of them (SIN).")
         return found
 
     def lines_counted(self, index: tuple[int, ...]) -> bool:
         """Whether `n_lines` of a sensor is their number, or the count ended at one more than candidates have."""
-        return self.n_lines is not None and int(self.n_lines[index]) <= max(map(_n_tones, self.candidates))
+        return self.n_lines is not None and int(self.n_lines[index]) <= max(map(_n_sinusoids, self.candidates))
 
     def none_fits(self, index: tuple[int, ...]) -> bool:
         """Whether the J test refuses all candidates of a sensor that it could be made of."""
@@ -180,16 +210,13 @@ class RankResult:
         lines = [f"Noise models ranked by {by}: {self.n_samples} samples, {self.compared}"]
         if self.choice.ndim > 1:
             lines.append(f"{n_items} records in a batch {tuple(self.choice.shape[:-1])}")
-        if n_items > _MOST_TABLES:
+        if n_items > MOST_TABLES:
             counts = Counter(name or "not ranked" for name in self.names)
             lines += [f"  {n:>8}  {name}" for name, n in counts.most_common(_MOST_ROWS)]
             return "\n".join(lines)
         for index in itertools.product(*map(range, self.choice.shape)):
             lines += ["", *self._table(index)]
         return "\n".join(lines)
-
-    def __str__(self) -> str:
-        return self.summary()
 
     def _table(self, index: tuple[int, ...]) -> list[str]:
         head = f"sensor {self._place(index)}"
@@ -223,8 +250,8 @@ class RankResult:
         """Draw the criterion of the first ranked sensor's best candidates over that of the chosen one.
 
         Args:
-            ax: Where to draw; a new figure by default.
-            title: By default the sensor, and its place in a batch.
+            ax: Axes to draw on; a new figure by default.
+            title: Title; by default the sensor, and its place in a batch.
         """
         from gyrofuse.fitting.plots import plot_ranking
 
@@ -252,27 +279,11 @@ class RankResult:
         return place(self.sensors, index, self.axes)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain numbers and lists; what is not known is None."""
-        return {
-            "candidates": list(self.candidates),
-            "names": list(self.names),
-            "criterion": listed(self.criterion),
-            "difference": listed(self.difference),
-            "wvic": listed(self.wvic),
-            "p_value": listed(self.p_value),
-            "redundant": self.redundant.tolist(),
-            "reasons": [list(row) for row in self.reasons],
-            "equivalent": self.equivalent.tolist(),
-            "choice": self.choice.tolist(),
-            "wvic_choice": self.wvic_choice.tolist(),
-            "n_tones": None if self.n_tones is None else self.n_tones.tolist(),
-            "n_lines": None if self.n_lines is None else self.n_lines.tolist(),
-            "best": [None if fit is None else fit.to_dict() for fit in self.best],
-            "n_samples": self.n_samples,
-            "from_signal": self.from_signal,
-            "sensors": list(self.sensors),
-        }
+        """Everything as plain lists and numbers, ready for JSON (NaN and infinities as None)."""
+        named = [entry.name for entry in fields(self) if entry.name not in ("n_sinusoids", "axes")]
+        others = {"names": self.names, "difference": self.difference, "n_tones": self.n_sinusoids}
+        return {name: plain(value) for name, value in ({name: getattr(self, name) for name in named} | others).items()}
 
 
-def _n_tones(candidate: str) -> int:
+def _n_sinusoids(candidate: str) -> int:
     return sum(process.has_line for process in parse_model(candidate).processes)

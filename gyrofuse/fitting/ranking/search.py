@@ -15,14 +15,8 @@ from gyrofuse.fitting.ranking.moments import MomentFit, Moments
 from gyrofuse.fitting.ranking.spectra import NoiseFit, Spectra
 from gyrofuse.fitting.structure import Composition
 
-# Penalised likelihoods within a factor of e^2 = 7: the record does not decide.
+# Difference of two criteria below which candidates are equivalent: penalised likelihoods within a factor of e^2 = 7.
 EQUIVALENT = 4.0
-# Larger compositions are tried as long as the best of a size is at most so much above the best so far.
-_PATIENCE = 6.0
-# Compositions of one size whose children are tried.
-_BEAM = 3
-# Time constants at which the first AR1 starts, as powers of the length.
-_FIRST_AR1 = (-0.2, 0.2, 0.5, 0.8)
 
 FitT = TypeVar("FitT", NoiseFit, MomentFit)
 
@@ -67,7 +61,7 @@ class _Search(ABC, Generic[FitT]):
     def criterion(self, key: Key) -> Tensor:
         """Of Hannan and Quinn, `(item,)`, infinite where it was not tried."""
         made_of, fit = self.fits[key]
-        return (self._loss(fit) + compositions.charge(made_of, self._n_samples)).nan_to_num(nan=torch.inf)
+        return (self._loss(fit) + compositions.penalty(made_of, self._n_samples)).nan_to_num(nan=torch.inf)
 
     def _widen(self, first: list[Kinds], known: set[Key]) -> None:
         """From one process to more, for every record the children of its few best, as long as one of them gains."""
@@ -78,9 +72,11 @@ class _Search(ABC, Generic[FitT]):
             for kinds, which in todo.values():
                 self._try_out(kinds, which.nonzero()[:, 0])
             found = torch.stack([self.criterion(key) for key in todo])  # (candidate, item)
-            going = found.amin(0) < best + _PATIENCE
+            # Larger compositions are tried while the best of a size is at most six above the best of all so far.
+            going = found.amin(0) < best + 6.0
             best = torch.minimum(best, found.amin(0))
-            kept = (found.argsort(0).argsort(0) < _BEAM) & found.isfinite() & going
+            # The extensions of the three best of a size.
+            kept = (found.argsort(0).argsort(0) < 3) & found.isfinite() & going
             following: dict[Key, tuple[Kinds, Tensor]] = {}
             for (kinds, _), which in zip(todo.values(), kept, strict=True):
                 for child in compositions.children(kinds, known) if bool(which.any()) else ():
@@ -189,7 +185,9 @@ class SpectralSearch(_Search[NoiseFit]):
         if not made_of.shaped:
             return spectra.fit(made_of, linear, linear[:, :0])
         process = made_of.processes[made_of.shaped[0]]
-        starts = process.from_time_scale(float(self._n_samples) ** size.new_tensor(_FIRST_AR1))
+        # Time constants of the first process with a memory, spread over all scales.
+        powers = size.new_tensor((-0.2, 0.2, 0.5, 0.8))
+        starts = process.from_time_scale(float(self._n_samples) ** powers)
         ends = [spectra.fit(made_of, linear, start.expand_as(size)) for start in starts]
         best = ends[0]
         for other in ends[1:]:

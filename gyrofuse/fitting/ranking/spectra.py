@@ -1,4 +1,4 @@
-"""What the spectra of records say about compositions: how many lines stand in them, and the likelihood of each noise.
+"""Spectra of records against compositions: the number of spectral lines, and the likelihood of each noise.
 
 The orthonormal DCT-II and its bands are those of the spectral refinement. Lines are taken out of a record once, its
 bands are summed once, and all compositions are fitted to these few numbers.
@@ -20,30 +20,24 @@ from gyrofuse.fitting.moments.search import with_alternating
 from gyrofuse.fitting.spectral.bands import Bins, Noise
 from gyrofuse.fitting.spectral.search import maximise, uncertainty
 from gyrofuse.fitting.spectral.tones import NoiseSpectrum, Tones, find_tones, line_p_value
-from gyrofuse.fitting.spectral.whittle import _LEAST_COUNT, _transformed
+from gyrofuse.fitting.spectral.whittle import LEAST_COUNT, ordinates_left
 from gyrofuse.fitting.structure import Composition, new_shape
 from gyrofuse.noise.processes import AR1, Process, QuantizationNoise, RandomWalk, WhiteNoise
 
-# Where a further AR1 is looked for: time constants of 1/3 sample and more, this far apart, and some that alternate.
-_SHORTEST, _RATIO, _ALTERNATING = 1 / 3, 1.6, (-0.3, -0.6, -0.8, -0.9, -0.97)
-_RAMP_ROUNDS = 2
-# Nats that are worth no further step when criteria are compared.
+# Gain in nats below which a fit needs no further step: criteria that differ by nats are compared.
 _ENOUGH = 1e-3
-# Flexible enough for the noise around a line.
-_REFERENCE = (WhiteNoise(), QuantizationNoise(), RandomWalk())
-_REFERENCE_AR1S = 2
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseFit:
-    """Where the likelihood of a composition without sinusoids is largest.
+    """Maximum of the likelihood of a composition without sinusoids.
 
     Attributes:
-        linear: `p`, `(item, process)`, with the squared slope of a drift.
-        shape: `x = atanh phi`, `(item, AR1)`.
-        slope: Of the ramp, `(item,)`; 0 without one.
-        slope_sd: `(item,)`.
-        log_likelihood: `(item,)`, nats.
+        linear: Linear parameters `p`, `(item, process)`, with the squared slope of a drift.
+        shape: Nonlinear parameters `x = atanh phi`, `(item, AR1)`.
+        slope: Slope of the drift, `(item,)`; 0 without one.
+        slope_sd: Standard error of the slope, `(item,)`.
+        log_likelihood: Log likelihood, `(item,)`, nats.
     """
 
     linear: Tensor
@@ -54,7 +48,7 @@ class NoiseFit:
 
 
 def gathered(parts: list[tuple[Tensor, Spectra]]) -> Spectra:
-    """Spectra of the items at all places, the last of those at one."""
+    """Spectra of all items; where several parts hold an item, those of the last."""
     whole = copy(parts[0][1])
     n_items = int(torch.cat([places for places, _ in parts]).max()) + 1
     for name in ("energy", "cross", "count"):
@@ -66,7 +60,7 @@ def gathered(parts: list[tuple[Tensor, Spectra]]) -> Spectra:
 
 
 def summed(bins: Bins, values: Tensor) -> Tensor:
-    """Sums `(item, bin)` of what is given for ordinates `(item, k)`."""
+    """Sums over bins, `(item, bin)`, of values at ordinates, `(item, k)`."""
     return torch.stack([values[:, a:b].sum(-1) for a, b in itertools.pairwise(bins.edges)], -1)
 
 
@@ -75,14 +69,14 @@ class Spectra:
 
     Args:
         series: `(item, time)`, finite.
-        tones: That are taken out, of every item.
+        tones: Spectral lines of every item, which are subtracted.
     """
 
     def __init__(self, series: Tensor, tones: Tones | None = None) -> None:
         self.bins = Bins(series.shape[-1], series.device)
         shown = ramp_ordinates(self.bins.n_samples, series.device)[None]
         energy, cross = [], []
-        for values in _transformed(series, tones, None):
+        for values in ordinates_left(series, tones, None):
             energy.append(summed(self.bins, values.square()))
             cross.append(summed(self.bins, values * shown))
         self.energy, self.cross = torch.cat(energy), torch.cat(cross)  # (item, bin)
@@ -90,16 +84,16 @@ class Spectra:
         count = self.bins.count.expand(len(series), -1)
         if tones is not None:
             count = count - self.bins.taken_by(tones.beta, tones.phase)
-        self.count = count.clamp(min=_LEAST_COUNT)
+        self.count = count.clamp(min=LEAST_COUNT)
 
     def part(self, items: Tensor) -> Spectra:
-        """Of some items."""
+        """Spectra of some items."""
         some = copy(self)
         some.energy, some.cross, some.count = self.energy[items], self.cross[items], self.count[items]
         return some
 
     def fit(self, made_of: Composition, linear: Tensor, shape: Tensor) -> NoiseFit:
-        """Climb from `p` and `x` to the maximum next to them, the slope of a ramp solved for."""
+        """Maximum of the likelihood next to `p` and `x`; the slope of a drift is solved for."""
         noise = Noise(made_of)
         ramp_at = _drifts(made_of)
         p, x = linear[:, noise.which], shape
@@ -107,7 +101,8 @@ class Spectra:
         p = torch.where((p.sum(-1, keepdim=True) > 0) & p.isfinite().all(-1, keepdim=True), p, size)
         energy = self.energy
         slope = slope_sd = size.new_zeros(len(p))
-        for _ in range(_RAMP_ROUNDS if ramp_at else 1):
+        # Slope and noise depend on each other: twice each.
+        for _ in range(2 if ramp_at else 1):
             if ramp_at:
                 slope, slope_sd, energy = self.without_ramp(noise.variances(self.bins, p, x))
             p, x, _ = maximise(energy, self.count, self.bins, noise, p, x, enough=_ENOUGH)
@@ -122,14 +117,14 @@ class Spectra:
         return NoiseFit(whole, x, slope, slope_sd, log_likelihood)
 
     def without_ramp(self, variance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Slope by weighted least squares, its standard deviation, and the energy that it leaves."""
+        """Slope by weighted least squares, its standard error, and the power without the drift."""
         information = (self.ramp / variance).sum(-1)
         slope = (self.cross / variance).sum(-1) / information
         energy = self.energy - 2 * slope[:, None] * self.cross + slope.square()[:, None] * self.ramp
         return slope, information.rsqrt(), energy.clamp(min=torch.finfo(energy.dtype).tiny)
 
     def variances(self, made_of: Composition, fit: NoiseFit) -> Tensor:
-        """Of the noise without its ramp, `(item, bin)`."""
+        """Variances of the ordinates of the noise without its drift, `(item, bin)`."""
         noise = Noise(made_of)
         return noise.variances(self.bins, fit.linear[:, noise.which], fit.shape)
 
@@ -200,9 +195,11 @@ def _drifts(made_of: Composition) -> list[int]:
 
 
 def _grid(kind: type[Process], n_samples: int) -> Tensor:
-    n = math.ceil(math.log(n_samples / _SHORTEST) / math.log(_RATIO))
-    constants = _SHORTEST * _RATIO ** torch.arange(n, dtype=torch.float64)
-    return with_alternating(kind, kind.from_time_scale(constants), _ALTERNATING)
+    """`x` of a further process: time constants from 1/3 sample to the record, and some that alternate."""
+    shortest, ratio, alternating = 1 / 3, 1.6, (-0.3, -0.6, -0.8, -0.9, -0.97)
+    n = math.ceil(math.log(n_samples / shortest) / math.log(ratio))
+    constants = shortest * ratio ** torch.arange(n, dtype=torch.float64)
+    return with_alternating(kind, kind.from_time_scale(constants), alternating)
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,19 +207,19 @@ class Lines:
     """Spectral lines decided on.
 
     Attributes:
-        n_tones: How many were taken out, `(item,)`.
+        n_sinusoids: How many were taken out, `(item,)`.
         n_found: How many stand out of the noise, one more than the most allowed at most, `(item,)`.
         rest: Records without them, `(item, time)`, float64.
         spectra: Of the records without them.
     """
 
-    n_tones: Tensor
+    n_sinusoids: Tensor
     n_found: Tensor
     rest: Tensor
     spectra: Spectra
 
 
-def decide_lines(series: Tensor, allowed: list[int], level: float, ramp: bool) -> Lines:
+def decide_lines(series: Tensor, allowed: list[int], alpha: float, ramp: bool) -> Lines:
     """Take lines out of records one after the other, as long as the largest is more than noise.
 
     Before each test the noise is fitted to the record without the line in question, so that a line does not hide
@@ -231,15 +228,15 @@ def decide_lines(series: Tensor, allowed: list[int], level: float, ramp: bool) -
     Args:
         series: `(item, time)`, finite and not constant.
         allowed: Numbers of tones; of these the largest not above the number found, or else the smallest.
-        level: Of each test.
+        alpha: Probability that each test takes noise for a line.
         ramp: Whether records may have one, which would hide tones of few cycles.
     """
     rest = series.to(torch.float64).clone()
     searched = detrended(rest) if ramp else rest.clone()
     clean = searched.clone()
     parts = []
-    n_tones = torch.zeros(len(series), dtype=torch.long, device=series.device)
-    n_found = torch.zeros_like(n_tones)
+    n_sinusoids = torch.zeros(len(series), dtype=torch.long, device=series.device)
+    n_found = torch.zeros_like(n_sinusoids)
     todo = torch.arange(len(series), device=series.device)
     density: NoiseSpectrum | None = None
     for k in range(1, max(allowed) + 2):
@@ -247,8 +244,8 @@ def decide_lines(series: Tensor, allowed: list[int], level: float, ramp: bool) -
         part = Spectra(series[todo], tones)
         noise, fit = _reference(part)
         p_value = line_p_value(clean[todo], _density(noise, fit.linear, fit.shape))
-        n_found[todo[p_value < level]] = k
-        line = (p_value < level) | (k <= min(allowed))
+        n_found[todo[p_value < alpha]] = k
+        line = (p_value < alpha) | (k <= min(allowed))
         todo = todo[line]
         if not len(todo) or k > max(allowed):
             break
@@ -256,13 +253,13 @@ def decide_lines(series: Tensor, allowed: list[int], level: float, ramp: bool) -
         wave = tones.waveform(series.shape[-1])[line]
         clean[todo] = searched[todo] - wave
         if k in allowed:
-            n_tones[todo] = k
+            n_sinusoids[todo] = k
             rest[todo] = series[todo] - wave
             parts.append((todo, part.part(line)))
-    plain = (n_tones == 0).nonzero()[:, 0]
+    plain = (n_sinusoids == 0).nonzero()[:, 0]
     if len(plain):
         parts.insert(0, (plain, Spectra(rest[plain])))
-    return Lines(n_tones, n_found, rest, gathered(parts))
+    return Lines(n_sinusoids, n_found, rest, gathered(parts))
 
 
 def detrended(series: Tensor) -> Tensor:
@@ -273,12 +270,12 @@ def detrended(series: Tensor) -> Tensor:
 
 
 def _reference(spectra: Spectra) -> tuple[Noise, NoiseFit]:
-    """A noise that follows nearly any smooth spectrum."""
-    parent = Composition(_REFERENCE, True)
+    """A noise that follows nearly any smooth spectrum: white and quantisation noise, a random walk and two AR1s."""
+    parent = Composition((WhiteNoise(), QuantizationNoise(), RandomWalk()), True)
     start = (spectra.energy / spectra.count).mean(-1, keepdim=True)
-    linear = start.expand(-1, len(_REFERENCE)).clone()
+    linear = start.expand(-1, parent.n_linear).clone()
     fit = spectra.fit(parent, linear, linear[:, :0])
-    for _ in range(_REFERENCE_AR1S):
+    for _ in range(2):
         made_of = Composition((*parent.processes, AR1()), True)
         parent, fit = made_of, spectra.fit(made_of, *spectra.widened(parent, fit, made_of))
     return Noise(parent), fit

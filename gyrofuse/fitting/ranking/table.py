@@ -17,24 +17,19 @@ from gyrofuse.noise.processes import Drift, Sinusoid
 from gyrofuse.wavelets.covariance import wavelet_variance
 from gyrofuse.wavelets.equivalent_dof import chi_square_tail
 
-# Two spectra that a record tells apart by less than this many nats on average are the same.
-_SAME = 0.5
-# Processes without variance leave WVIC as it is: of such candidates the smallest.
-_TIE = 1e-3
-
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """What a candidate makes of some of the records.
+    """Fit of a candidate to some of the records.
 
     Attributes:
         kinds: Its processes.
-        items: Which records, `(item,)`.
-        criterion: `(item,)`, less is better.
-        wvic: `(item,)`.
-        p_value: Of the J test at the parameters of greatest likelihood, `(item,)`.
-        simpler: What it amounts to with fewer parameters, and why.
-        fitted: Variances of bins or levels, `(item, bin)`.
+        items: Indices of the records, `(item,)`.
+        criterion: Criterion, `(item,)`, less is better.
+        wvic: Wavelet variance information criterion, `(item,)`.
+        p_value: P value of the J test at the parameters of greatest likelihood, `(item,)`.
+        simpler: Composition with fewer parameters that the fit amounts to, and why; None where there is none.
+        fitted: Fitted variances of bins or levels, `(item, bin)`.
     """
 
     kinds: Kinds
@@ -48,20 +43,20 @@ class Entry:
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Of candidates and records.
+    """Candidates against records.
 
     Attributes:
         kinds: Processes of the candidates.
-        criterion: `(item, candidate)`; NaN where it was not tried, for it has another number of sinusoids.
-        wvic: The same.
-        p_value: The same.
-        reasons: Why a candidate is redundant, or was not compared, `[item][candidate]`.
-        redundant: `(item, candidate)`.
-        equivalent: To the chosen one, without it, `(item, candidate)`.
-        choice: `(item,)`.
-        wvic_choice: `(item,)`.
-        n_tones: Sinusoids taken out, `(item,)`; None where none were looked for.
-        n_lines: That stand out of the noise, one more than candidates have sinusoids at most, the same.
+        criterion: Criterion, `(item, candidate)`; NaN where a candidate has another number of sinusoids.
+        wvic: Wavelet variance information criterion, the same.
+        p_value: P value of the J test, the same.
+        reasons: Reason why a candidate is redundant, or was not compared, `[item][candidate]`.
+        redundant: Whether a candidate is redundant, `(item, candidate)`.
+        equivalent: Whether a candidate is equivalent to the chosen one, and not it, `(item, candidate)`.
+        choice: Index of the chosen candidate, `(item,)`.
+        wvic_choice: Index of the candidate with the smallest WVIC, `(item,)`.
+        n_sinusoids: Number of sinusoids subtracted, `(item,)`; None where none were searched.
+        n_lines: Number of significant spectral lines, at most one more than candidates have sinusoids, the same.
     """
 
     kinds: list[Kinds]
@@ -73,24 +68,35 @@ class Table:
     equivalent: Tensor
     choice: Tensor
     wvic_choice: Tensor
-    n_tones: Tensor | None
+    n_sinusoids: Tensor | None
     n_lines: Tensor | None
 
 
-def by_spectrum(series: Tensor, wanted: list[Kinds] | None, levels: int, max_tones: int, line_level: float) -> Table:
-    """Rank for records `(item, time)`."""
+def by_spectrum(
+    series: Tensor, wanted: list[Kinds] | None, levels: int, max_sinusoids: int, line_alpha: float
+) -> Table:
+    """Rank candidates by the spectral likelihood.
+
+    Args:
+        series: Records `(item, time)`.
+        wanted: Processes of the candidates; None for all.
+        levels: Number of levels J of the wavelet variance.
+        max_sinusoids: Largest number of sinusoids, where all candidates are tried.
+        line_alpha: Probability that noise alone shows a spectral line.
+    """
     n_samples = series.shape[-1]
     if wanted is None:
         # A level is left for a noise.
-        noises, allowed = compositions.all_noises(levels), list(range(min(max_tones, levels - 1) + 1))
+        noises, allowed = compositions.all_noises(levels), list(range(min(max_sinusoids, levels - 1) + 1))
     else:
-        noises, allowed = [_without_tones(kinds) for kinds in wanted], sorted({_n_tones(kinds) for kinds in wanted})
+        noises = [_without_sinusoids(kinds) for kinds in wanted]
+        allowed = sorted({_n_sinusoids(kinds) for kinds in wanted})
     ramp = any(kind.deterministic for kinds in noises for kind in kinds)
-    lines = decide_lines(series, allowed, line_level, ramp)
+    lines = decide_lines(series, allowed, line_alpha, ramp)
     moments = Moments(wavelet_variance(lines.rest, levels).mT.to(torch.float64), n_samples)
     searching = wanted is None
     if wanted is None:
-        wanted = [[*kinds, *[Sinusoid] * n] for n in lines.n_tones.unique().tolist() for kinds in noises]
+        wanted = [[*kinds, *[Sinusoid] * n] for n in lines.n_sinusoids.unique().tolist() for kinds in noises]
     search = SpectralSearch(lines.spectra)
     search.run(noises, searching)
     entries: dict[Key, Entry] = {}
@@ -113,10 +119,10 @@ def by_spectrum(series: Tensor, wanted: list[Kinds] | None, levels: int, max_ton
         )
     placed = []
     for kinds in wanted:
-        tones: Kinds = [Sinusoid] * _n_tones(kinds)
-        entry = entries.get(compositions.key_of(_without_tones(kinds)))
+        tones: Kinds = [Sinusoid] * _n_sinusoids(kinds)
+        entry = entries.get(compositions.key_of(_without_sinusoids(kinds)))
         if entry is not None:
-            which = (lines.n_tones[entry.items] == len(tones)).nonzero()[:, 0]
+            which = (lines.n_sinusoids[entry.items] == len(tones)).nonzero()[:, 0]
             if len(which) or not searching:
                 simpler = [s and ([*s[0], *tones], s[1]) for s in entry.simpler]
                 fits_in = compositions.n_unknown(kinds, held=True) <= levels
@@ -128,18 +134,26 @@ def by_spectrum(series: Tensor, wanted: list[Kinds] | None, levels: int, max_ton
 
 def _set_aside(table: Table, lines: Lines, most: int | None, levels: int) -> None:
     """Say why candidates were not compared: those for other sinusoids, at most so many, where any were given."""
-    for own, n_tones, n_found in zip(table.reasons, lines.n_tones.tolist(), lines.n_found.tolist(), strict=True):
+    for own, n_sinusoids, n_found in zip(
+        table.reasons, lines.n_sinusoids.tolist(), lines.n_found.tolist(), strict=True
+    ):
         for c, kinds in enumerate(table.kinds):
-            n, size = _n_tones(kinds), compositions.n_unknown(kinds, held=True)
-            if n == n_tones and size > levels:
+            n, size = _n_sinusoids(kinds), compositions.n_unknown(kinds, held=True)
+            if n == n_sinusoids and size > levels:
                 own[c] = f"{size} parameters, but {counted(levels, 'level')}"
-            elif n != n_tones and most is not None:
+            elif n != n_sinusoids and most is not None:
                 found = ("at least " if n_found > most else "") + counted(n_found, "line")
                 own[c] = f"the spectrum has {found}, the model {n or 'none'}"
 
 
 def by_moments(variance: Tensor, wanted: list[Kinds] | None, n_samples: int) -> Table:
-    """Rank for wavelet variances `(item, level)`."""
+    """Rank candidates by the likelihood of wavelet variances.
+
+    Args:
+        variance: Wavelet variances `(item, level)`.
+        wanted: Processes of the candidates; None for all.
+        n_samples: Length of the records.
+    """
     n_items, levels = variance.shape
     moments = Moments(variance, n_samples)
     search = MomentSearch(moments)
@@ -195,14 +209,15 @@ def _tabulated(entries: list[Entry], count: Tensor, n_items: int, lines: Lines |
     choice = criterion.masked_fill(redundant, torch.inf).nan_to_num(nan=torch.inf).argmin(-1)
     equivalent = _equivalent(entries, criterion, redundant, choice, count)
     sizes = torch.tensor([float(len(entry.kinds)) for entry in entries]).to(wvic)
-    wvic_choice = (wvic + _TIE * sizes).nan_to_num(nan=torch.inf).argmin(-1)
+    # A process without variance does not change WVIC: a thousandth a process chooses the smallest.
+    wvic_choice = (wvic + 1e-3 * sizes).nan_to_num(nan=torch.inf).argmin(-1)
     kinds = [entry.kinds for entry in entries]
-    found = (None, None) if lines is None else (lines.n_tones, lines.n_found)
+    found = (None, None) if lines is None else (lines.n_sinusoids, lines.n_found)
     return Table(kinds, criterion, wvic, p_value, reasons, redundant, equivalent, choice, wvic_choice, *found)
 
 
 def _equivalent(entries: list[Entry], criterion: Tensor, redundant: Tensor, choice: Tensor, count: Tensor) -> Tensor:
-    """Not told from the best: a criterion as good, or the same spectrum by other processes."""
+    """Whether a candidate has a criterion as good as the best, or its spectrum by other processes."""
     best = criterion.gather(-1, choice[:, None])
     near = (criterion <= best + EQUIVALENT) & ~redundant
     same = torch.zeros_like(near)
@@ -215,15 +230,16 @@ def _equivalent(entries: list[Entry], criterion: Tensor, redundant: Tensor, choi
             if (Drift in entry.kinds) != (Drift in chosen.kinds) or len(entry.kinds) > len(chosen.kinds):
                 continue  # a ramp shows in no spectrum; any other has that of a larger one
             ratio = entry.fitted / spectrum[entry.items]
+            # Kullback-Leibler divergence: the mean log-likelihood ratio of the two spectra, in nats.
             apart = (count / 2 * (ratio - 1 - ratio.log())).sum(-1)
-            same[entry.items, c] |= which[entry.items] & (apart < _SAME)
+            same[entry.items, c] |= which[entry.items] & (apart < 0.5)
     found = near | same
     return found.scatter(-1, choice[:, None], False)
 
 
-def _n_tones(kinds: Kinds) -> int:
+def _n_sinusoids(kinds: Kinds) -> int:
     return kinds.count(Sinusoid)
 
 
-def _without_tones(kinds: Kinds) -> Kinds:
+def _without_sinusoids(kinds: Kinds) -> Kinds:
     return [kind for kind in kinds if kind is not Sinusoid]

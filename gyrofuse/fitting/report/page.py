@@ -18,16 +18,16 @@ from gyrofuse.io.recording import Recording
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Pages stay readable; the JSON file holds all.
-_MOST_SENSORS = 24
+# Largest number of sensors on a page, which stays readable; the JSON file holds all.
+MOST_SENSORS = 24
 
 
 def model_report(result: GMWMResult, recording: Recording | None = None, *, title: str) -> str:
     """Write the report of noise models fitted to the sensors of a recording.
 
     Args:
-        result: Of the sensors of one array, or of one per axis.
-        recording: What was fitted, for its notes.
+        result: Fit of the sensors of one array, or of one per axis.
+        recording: Recording that was fitted, for its notes.
         title: Heading of the page.
 
     Returns:
@@ -36,7 +36,7 @@ def model_report(result: GMWMResult, recording: Recording | None = None, *, titl
     indices = list(itertools.product(*map(range, result.params.shape[:-1])))
     parts = [
         model_part(result, index, f"Sensor {place(result.sensors, index, result.axes)}")
-        for index in indices[:_MOST_SENSORS]
+        for index in indices[:MOST_SENSORS]
     ]
     return render(
         Path(__file__).parent / "models.html.j2",
@@ -54,9 +54,9 @@ def model_part(result: GMWMResult, index: tuple[int, ...], name: str) -> dict[st
     """What a page shows of the model of one sensor.
 
     Args:
-        result: Fitted.
-        index: Of the sensor among the leading dimensions.
-        name: What the page calls it.
+        result: Result of a fit.
+        index: Index of the sensor among the leading dimensions.
+        name: Name of the sensor on the page.
     """
     return {
         "name": name,

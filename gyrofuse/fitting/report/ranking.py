@@ -12,16 +12,14 @@ from gyrofuse._base.page import number, render
 from gyrofuse._base.results import chance, counted, p_words, place, signed
 from gyrofuse.fitting.gmwm_result import REFUSED
 from gyrofuse.fitting.moments.fit import composition_of
-from gyrofuse.fitting.ranking.candidates import charge, n_parameters
+from gyrofuse.fitting.ranking.candidates import n_parameters, penalty
 from gyrofuse.fitting.ranking.result import RankResult
-from gyrofuse.fitting.report.page import model_part
+from gyrofuse.fitting.report.page import MOST_SENSORS, model_part
 from gyrofuse.fitting.report.words import model_method
 from gyrofuse.io.recording import Recording
 
-# Pages stay readable; the JSON file holds all.
-_MOST_SENSORS, _MOST_ROWS = 24, 15
-_NO_GAIN = 0.1  # nats
-_MOST_NATS = 15.0  # beyond, a ratio is no number to print
+# Largest number of candidates in a table: a page stays readable, the JSON file holds all.
+_MOST_ROWS = 15
 
 
 def rank_report(
@@ -30,8 +28,8 @@ def rank_report(
     """Write the report of noise models ranked for the sensors of a recording.
 
     Args:
-        result: Of the sensors of one array, or of one per axis.
-        recording: What was ranked, for its notes.
+        result: Ranking for the sensors of one array, or of one per axis.
+        recording: Recording that was ranked, for its notes.
         title: Heading of the page.
         remarks: Sentences shown below the verdict.
 
@@ -39,7 +37,7 @@ def rank_report(
         An HTML page that needs no other file, no network and no script.
     """
     indices = list(itertools.product(*map(range, result.choice.shape)))
-    parts = [_part(result, recording, n, index) for n, index in enumerate(indices[:_MOST_SENSORS])]
+    parts = [_part(result, recording, n, index) for n, index in enumerate(indices[:MOST_SENSORS])]
     fits = [fit for fit in result.best if fit is not None]
     return render(
         Path(__file__).parent / "ranking.html.j2",
@@ -57,8 +55,8 @@ def rank_verdict(result: RankResult, index: tuple[int, ...]) -> list[str]:
     """Say in sentences which model a sensor has, what is as good, and why the next one is not.
 
     Args:
-        result: Ranked.
-        index: Of the sensor among the leading dimensions.
+        result: Ranking.
+        index: Index of the sensor among the leading dimensions.
     """
     if int(result.choice[index]) < 0:
         return ["Not ranked: its record does not vary or has missing samples."]
@@ -102,11 +100,12 @@ def _why_not(result: RankResult, index: tuple[int, ...], row: dict[str, Any]) ->
         composition_of(name, held=True) for name in (row["name"], result.candidates[int(result.choice[index])])
     )
     more = n_parameters(own) - n_parameters(chosen)
-    charged = (charge(own, result.n_samples) - charge(chosen, result.n_samples)) / 2
+    charged = (penalty(own, result.n_samples) - penalty(chosen, result.n_samples)) / 2
     nats = row["difference"] / 2
-    if more > 0 and abs(charged - nats) < _NO_GAIN:
+    # Likelihoods that differ by less than 0.1 nats are equal; ratios above e^15 are beyond doubt.
+    if more > 0 and abs(charged - nats) < 0.1:
         what = f"no likelihood gained for {counted(more, 'more number')}"
-    elif nats < _MOST_NATS:
+    elif nats < 15.0:
         what = f"{number(math.exp(nats), 2)} times less likely, with its numbers charged for"
     else:
         what = "beyond any doubt"

@@ -13,7 +13,8 @@ from gyrofuse._base.results import p_words
 from gyrofuse.fitting.gmwm_result import REFUSED, GMWMResult
 from gyrofuse.noise.processes import Model
 
-_DOUBTED = 0.05  # p-values of the J test below
+# P value of the J test below which a model is in doubt: one complete model in twenty is.
+_DOUBTED = 0.05
 _WEIGHTS = {
     "optimal": "weighted by the inverse of their covariance under the fitted model",
     "diagonal": "weighted by the reciprocals of their variances under the fitted model",
@@ -26,8 +27,8 @@ def model_verdict(result: GMWMResult, index: tuple[int, ...]) -> list[str]:
     """Say in sentences how well the model of one sensor fits and what it consists of.
 
     Args:
-        result: Fitted.
-        index: Of the sensor among the leading dimensions.
+        result: Result of a fit.
+        index: Index of the sensor among the leading dimensions.
     """
     if not bool(result.params[index].isfinite().all()):
         return ["Nothing could be fitted: its wavelet variance is missing or zero at some level."]
@@ -38,7 +39,7 @@ def model_method(result: GMWMResult) -> str:
     """Say in sentences how a model was fitted.
 
     Args:
-        result: Fitted.
+        result: Result of a fit.
     """
     weights = _WEIGHTS[result.weighting]
     sentences = [
@@ -48,7 +49,7 @@ def model_method(result: GMWMResult) -> str:
     ]
     if result.efficiency < 1:
         sentences.append(
-            f"Wavelet variances are robust, of efficiency {result.efficiency:g}: wild samples, up to one in "
+            f"Wavelet variances are robust, of efficiency {result.efficiency:g}: outliers, up to one in "
             "two thousand, hardly move them; their covariance is their own, and intervals are those of clean noise."
         )
     if result.refined:
@@ -98,7 +99,7 @@ def _completeness(result: GMWMResult, index: tuple[int, ...]) -> Iterator[str]:
     else:
         remedy = "add a process or look for a disturbance"
         if result.efficiency < 1:
-            remedy = "add a process; where more than one sample in a thousand is wild, slow levels have them too"
+            remedy = "add a process; where more than one sample in a thousand is an outlier, slow levels have them too"
         yield f"The model is not complete ({told}): {where}. Intervals hold only for what the model knows; {remedy}."
 
 
@@ -142,8 +143,8 @@ def _weak(result: GMWMResult, index: tuple[int, ...]) -> Iterator[str]:
     if weak:
         yield f"Hardly known beyond the order of magnitude: {', '.join(weak)}."
     item = sum(i * step for i, step in zip(index, result.identified.stride(), strict=True))
-    for remark in result.remarks[item]:
-        names_of, _, what = remark.partition(": ")
+    for note in result.notes[item]:
+        names_of, _, what = note.partition(": ")
         yield f"Not identified: {names_of} ({what})."
 
 

@@ -10,9 +10,6 @@ from torch import Tensor
 
 from gyrofuse._base.transforms import tone_in_cosines
 
-_GRID = torch.arange(-24, 25, dtype=torch.float64) / 16  # first look around the peak, in 1/T cycles per sample
-_STEPS = 6
-
 
 @dataclass(frozen=True, eq=False)
 class Line:
@@ -43,17 +40,27 @@ class Line:
         """Frequency, amplitude, and phase as a sine on the centred clock."""
         return self.beta, torch.hypot(self.cosine, self.sine), torch.atan2(self.cosine, self.sine)
 
-    def fitted(self, values: Tensor, weights: Tensor, n: int, search: bool) -> Line:
-        """Weighted least squares: Gauss-Newton in `beta`, the two amplitudes solved for."""
+    def fitted(self, values: Tensor, weights: Tensor, n: int, search: bool, n_steps: int = 6) -> Line:
+        """Weighted least squares: Gauss-Newton in `beta`, the two amplitudes solved for.
+
+        Args:
+            values: Coefficients of the DCT-II, `(item, bin)`.
+            weights: Reciprocal variances, `(item, bin)`.
+            n: Length of the record.
+            search: Whether to search around `beta` first.
+            n_steps: Number of Gauss-Newton steps: they converge quadratically from a sixteenth of a cycle.
+        """
         cycle = 2 * math.pi / n
         lowest = cycle / 2
         beta = self.beta
         if search:
-            grid = (beta[:, None] + cycle * _GRID.to(beta.device)).clamp(lowest, math.pi - lowest)
+            # A sixteenth of a cycle apart, to one and a half cycles on either side of the peak.
+            offsets = torch.arange(-24, 25, dtype=torch.float64, device=beta.device) / 16
+            grid = (beta[:, None] + cycle * offsets).clamp(lowest, math.pi - lowest)
             explained = _project(grid, self.k, values, weights, n).explained
             beta = grid.gather(-1, explained.argmax(-1, keepdim=True))[:, 0]
         best = _project(beta[:, None], self.k, values, weights, n)
-        for _ in range(_STEPS):
+        for _ in range(n_steps):
             moved = beta + best.step[:, 0].clamp(-cycle / 8, cycle / 8)
             moved = moved.clamp(lowest, math.pi - lowest)
             trial = _project(moved[:, None], self.k, values, weights, n)

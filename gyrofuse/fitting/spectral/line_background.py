@@ -13,14 +13,8 @@ from torch import Tensor
 
 from gyrofuse._base.transforms import LOW_BINS
 
-# Bands at least so many bins and a fraction of their frequency wide, or of the distance from the highest frequency,
-# down to a part of that; the curvature of the background in log frequency is white noise of this intensity (between
-# white noise and a random walk it reaches 1 within an octave).
-_BAND, _BAND_FRACTION, _TOP, _CURVATURE = 6, 0.18, 1 / 32, 0.3
-# Variance of the log of the median of n neighbouring Hann ordinates, times n: twice that of independent ones, which
-# every other one nearly is.
-_MEDIAN_VARIANCE = 2 / math.log(2) ** 2
-_ENOUGH_ORDINATES = 2**10  # for the median of a band
+# Smallest distance from the highest frequency, as a share of it, that widths of bands and the coordinate go down to.
+_TOP = 1 / 32
 
 
 def smooth_background(power: Tensor, places: Tensor, first: int, last: int) -> tuple[Tensor, Tensor]:
@@ -35,7 +29,7 @@ def smooth_background(power: Tensor, places: Tensor, first: int, last: int) -> t
         last: Last bin of the highest band.
 
     Returns:
-        Log density `(item, bin)` and its variance `(bin,)`, where it is known to `1 / variance` looks.
+        Log density `(item, bin)` and its variance `(bin,)`, which is that of `1 / variance` ordinates.
     """
     highest = power.shape[-1]
     smoother = _smoother(first, last, highest)
@@ -67,8 +61,8 @@ def smooth_background(power: Tensor, places: Tensor, first: int, last: int) -> t
 
 
 def _stride(n_bins: int) -> int:
-    """Of the ordinates that the median of a band looks at."""
-    return max(n_bins // _ENOUGH_ORDINATES, 1)
+    """Stride of the ordinates in the median of a band, of which a thousand know it to some 5 %."""
+    return max(n_bins // 2**10, 1)
 
 
 def _log_of_median(ordinates: Tensor) -> Tensor:
@@ -105,12 +99,20 @@ class _Smoother:
 @functools.lru_cache(maxsize=16)
 def _smoother(first: int, last: int, highest: int) -> _Smoother:
     """Smoothing spline: minimises `sum_b (y_b - s_b)^2 / v_b + integral (s'')^2 / q` over `place`."""
+    # Bands of at least six bins and of a fraction of their frequency, or of the distance from the highest one.
+    fewest_bins, fraction = 6, 0.18
+    # Intensity of the white noise that the curvature of the background is in log frequency: between white noise and a
+    # random walk the squared curvature reaches 1 within an octave.
+    intensity = 0.3
+    # Variance of the log of the median of n neighbouring Hann ordinates, times n: twice that of independent ones, which
+    # every other one nearly is.
+    median_variance = 2 / math.log(2) ** 2
     edges = []
     low = first
     while low <= last:
         distance = max(min(low, highest - low), highest * _TOP)
-        high = low + max(_BAND, math.ceil(_BAND_FRACTION * min(low, distance)))
-        if last + 1 - high < max(_BAND, (high - low) // 2):
+        high = low + max(fewest_bins, math.ceil(fraction * min(low, distance)))
+        if last + 1 - high < max(fewest_bins, (high - low) // 2):
             high = last + 1
         edges.append((low, high))
         low = high
@@ -123,11 +125,9 @@ def _smoother(first: int, last: int, highest: int) -> _Smoother:
         row = np.array([1 / gap[i], -1 / gap[i] - 1 / gap[i + 1], 1 / gap[i + 1]]) / width
         curvature[i, i : i + 3] = row * math.sqrt(width)
     n_bins = np.array([b - a for a, b in edges])
-    variance = np.array(
-        [_MEDIAN_VARIANCE * (1 if _stride(n) == 1 else 0.5) / (n / _stride(n)) for n in n_bins.tolist()]
-    )
+    variance = np.array([median_variance * (1 if _stride(n) == 1 else 0.5) / (n / _stride(n)) for n in n_bins.tolist()])
     data = np.zeros((len(x), len(edges)))
     data[1:-1] = np.diag(1 / variance)
-    precision = curvature.T @ curvature / _CURVATURE + np.pad(np.diag(1 / variance), 1)
+    precision = curvature.T @ curvature / intensity + np.pad(np.diag(1 / variance), 1)
     covariance = np.linalg.inv(precision)
     return _Smoother(edges, x, covariance @ data, covariance.diagonal().copy())

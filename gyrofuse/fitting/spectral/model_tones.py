@@ -1,6 +1,6 @@
-"""Tones of a model's sinusoids in records, looked for twice where the first look leaves doubt.
+"""Spectral lines of a model's sinusoids in records, found a second time where the first leaves doubt.
 
-The first look takes the background from the periodogram itself, which bends to follow a tone of few cycles and hides
+The first search takes the background from the periodogram itself, which bends to follow a line of few cycles and hides
 it. The second one has the spectrum of noise processes fitted to the record: it can rise, but has no peaks.
 """
 
@@ -14,11 +14,12 @@ from torch import Tensor
 
 from gyrofuse.fitting.ranking.spectra import Spectra, detrended, reference_density
 from gyrofuse.fitting.spectral.tones import Tones, find_tones
-from gyrofuse.fitting.spectral.whittle import _of
+from gyrofuse.fitting.spectral.whittle import items_of
 from gyrofuse.fitting.structure import Composition
 
-# A line is beyond doubt with so many cycles in the record and a p value so small.
-_MANY_CYCLES, _BEYOND_CHANCE = 30, 1e-4
+# Cycles in the record below which a spectral line is slow: the background taken from the periodogram bends to follow
+# it.
+_MANY_CYCLES = 30
 
 
 def model_tones(series: Tensor, made_of: Composition) -> Tones | None:
@@ -33,22 +34,21 @@ def model_tones(series: Tensor, made_of: Composition) -> Tones | None:
     series = series.to(torch.float64)
     found = find_tones(series, n_tones)
     cycles = found.beta * series.shape[-1] / (2 * math.pi)
-    doubtful = ((cycles < _MANY_CYCLES) | ~(found.p_value < _BEYOND_CHANCE)).any(-1)
+    doubtful = ((cycles < _MANY_CYCLES) | ~(found.p_value < 1e-4)).any(-1)
     if bool(doubtful.any()):
         ramp = any(p.deterministic for p in made_of.processes)
-        again = _second_look(detrended(series[doubtful]) if ramp else series[doubtful], _of(found, doubtful))
+        again = _second_search(detrended(series[doubtful]) if ramp else series[doubtful], items_of(found, doubtful))
         for field in fields(Tones):
             getattr(found, field.name)[doubtful] = getattr(again, field.name)
     order = found.beta.argsort(-1, descending=True)
     return Tones(*(value.gather(-1, order) for value in vars(found).values()))
 
 
-def _second_look(series: Tensor, found: Tones) -> Tones:
-    """As many lines as were found, the largest over the spectrum fitted to what is no line.
+def _second_search(series: Tensor, found: Tones) -> Tones:
+    """The largest spectral lines over a noise spectrum fitted to the record without them, as many as were found.
 
-    The largest slow line beside those found may be a tone that was missed; in the record to which noise is fitted it
-    would raise the spectrum and hide itself, so that it is left out there too. It is a tone if it then stands out more
-    than those found.
+    The largest slow line beside those found may have been missed. In the record to which noise is fitted it would raise
+    the spectrum and hide itself, so that it is subtracted there too; it is kept if it then exceeds those found.
     """
     n_samples = series.shape[-1]
     density = reference_density(Spectra(series, found))

@@ -6,14 +6,8 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.nnls import nonnegative_least_squares
+from gyrofuse._base.optimize import Trial, descend
 from gyrofuse.fitting.spectral.bands import Bins, Noise
-
-_STEPS = 100
-# A step that promises less, in nats, is not worth taking: 0.0001 standard deviations from the top.
-_ENOUGH = 1e-8
-_DAMPING, _MOST_DAMPING = 1e-3, 1e10
-_LARGEST_STEP = 1.0  # of atanh phi
-_LONGEST = 32  # time constant of an AR1 at the end of its range, in records
 
 
 def maximise(
@@ -24,13 +18,12 @@ def maximise(
     p: Tensor,
     x: Tensor,
     held: int | None = None,
-    enough: float = _ENOUGH,
-    n_steps: int = _STEPS,
+    enough: float = 1e-8,
+    n_steps: int = 100,
+    longest_step: float = 1.0,
+    longest_memory: float = 32,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Damped scoring; returns `p`, `x` and whether the top was reached, `(item,)`.
-
-    One of the unknowns, `p` first, may be `held` where it is; `enough` nats are worth no further step, of at
-    most `n_steps`.
+    """Damped scoring.
 
     With the observed information where it is positive definite: near the top of a flat likelihood it ends in a few
     steps, for which the Fisher information takes hundreds.
@@ -38,36 +31,48 @@ def maximise(
     A step maximises the quadratic model over `p >= 0`: with `x` eliminated it is a non-negative least-squares problem,
     so that a variance is 0 exactly where raising it does not help, and leaves 0 where it does. The `x` of an AR1
     without variance stays where it is, as does one at the end of its range that would go on.
+
+    Args:
+        energy: Sums of squared ordinates, `(item, bin)`.
+        count: Number of ordinates in each sum, `(item, bin)`.
+        bins: Bins of the ordinates.
+        noise: Processes of the model that have a spectrum.
+        p: Variances to start from, `(item, process)`.
+        x: Values `atanh phi` to start from, `(item, AR1)`.
+        held: Index of an unknown that stays where it starts, among `p` followed by `x`; None where all move.
+        enough: Gain in nats below which a step is not worth taking; 1e-8 nats are 1e-4 standard deviations from the
+            top.
+        n_steps: Largest number of steps.
+        longest_step: Largest change of `x` in one step; the likelihood is nearly quadratic that far.
+        longest_memory: Time constant of an AR1 at the end of its range, in records: a ramp, for all a record shows.
+
+    Returns:
+        `p`, `x` and whether the top was reached, `(item,)`.
     """
     unit = energy.sum(-1, keepdim=True) / count.sum(-1, keepdim=True)
     mean = (energy / count / unit).clamp(min=torch.finfo(energy.dtype).tiny)
-    p, x = p / unit, x.clone()
-    longest = x.new_tensor(float(_LONGEST * bins.n_samples))
+    longest = x.new_tensor(float(longest_memory * bins.n_samples))
     end = torch.stack([noise.processes[k].from_time_scale(longest) for k in noise.moving] or [longest])[: x.shape[-1]]
     n_linear = p.shape[-1]
     columns, slopes, bends = noise.columns(bins, x)
-    deviance = _deviance(mean, count, (columns @ p[..., None])[..., 0])
-    damping = torch.full_like(deviance, _DAMPING)
-    done = ~deviance.isfinite()
-    reached = torch.zeros_like(done)
-    for _ in range(n_steps):
-        todo = (~done).nonzero()[:, 0]
-        if not len(todo):
-            break
-        u, own_p, own_x = columns[todo], p[todo], x[todo]
-        gradient, information, observed = _score(mean[todo], count[todo], u, slopes[todo], bends[todo], own_p, noise)
+    start = _deviance(mean, count, (columns @ (p / unit)[..., None])[..., 0])
+    reached = torch.zeros_like(start, dtype=torch.bool)
+
+    def attempt(todo: Tensor, state: list[Tensor], old: Tensor, damping: Tensor) -> Trial:
+        own_p, own_x, u, own_slopes, own_bends = state
+        gradient, information, observed = _score(mean[todo], count[todo], u, own_slopes, own_bends, own_p, noise)
         by_x = gradient[:, n_linear:]
         moving = (own_p[:, noise.moving] > 0) & ~((own_x >= end) & (by_x > 0)) & ~((own_x <= -end) & (by_x < 0))
-        active = torch.cat([torch.ones_like(own_p, dtype=torch.bool), moving], -1).to(p)
+        active = torch.cat([torch.ones_like(own_p, dtype=torch.bool), moving], -1).to(own_p)
         if held is not None:
             active[:, held] = 0.0
         gradient = gradient * active
         size = information.diagonal(dim1=-2, dim2=-1) * active
-        more = torch.diag_embed(damping[todo, None] * size + (1 - active))
+        more = torch.diag_embed(damping[:, None] * size + (1 - active))
         both = active[:, :, None] * active[:, None, :]
         damped = observed * both + more
-        hollow = torch.linalg.cholesky_ex(damped)[1] > 0
-        damped = torch.where(hollow[:, None, None], information * both + more, damped)
+        indefinite = torch.linalg.cholesky_ex(damped)[1] > 0
+        damped = torch.where(indefinite[:, None, None], information * both + more, damped)
         # x = C^-1 (g_x - B' (p - p_0)) eliminated
         corner, side = damped[:, n_linear:, n_linear:], damped[:, :n_linear, n_linear:]
         solved = torch.linalg.solve_ex(corner, torch.cat([side.mT, gradient[:, n_linear:, None]], -1))[0]
@@ -76,17 +81,16 @@ def maximise(
         new_p = nonnegative_least_squares(gram, moment)
         step_p = new_p - own_p
         step_x = solved[..., -1] - (solved[..., :-1] @ step_p[..., None])[..., 0]
-        new_x = (own_x + step_x.clamp(-_LARGEST_STEP, _LARGEST_STEP)).clamp(-end, end)
-        promised = (gradient * torch.cat([step_p, step_x], -1)).sum(-1) * (1 + damping[todo])
+        new_x = (own_x + step_x.clamp(-longest_step, longest_step)).clamp(-end, end)
+        promised = (gradient * torch.cat([step_p, step_x], -1)).sum(-1) * (1 + damping)
         new_columns, new_slopes, new_bends = noise.columns(bins, new_x)
         new = _deviance(mean[todo], count[todo], (new_columns @ new_p[..., None])[..., 0])
-        better = new < deviance[todo]
-        at = todo[better]
-        p[at], x[at], deviance[at] = new_p[better], new_x[better], new[better]
-        columns[at], slopes[at], bends[at] = new_columns[better], new_slopes[better], new_bends[better]
-        damping[todo] = torch.where(better, damping[todo] / 10, damping[todo] * 10).clamp(min=1e-12)
         reached[todo] = promised < enough
-        done[todo] = (promised < enough) | (damping[todo] > _MOST_DAMPING) | ~promised.isfinite()
+        last = reached[todo] | ~promised.isfinite()
+        return Trial((new_p, new_x, new_columns, new_slopes, new_bends), new, new < old, last)
+
+    state = (p / unit, x, columns, slopes, bends)
+    (p, x, *_), _, _ = descend(state, start, attempt, n_steps=n_steps, ease=10, tighten=10)
     return p * unit, x, reached
 
 

@@ -24,24 +24,22 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.checks import check_floating, check_positive_integer
+from gyrofuse._base.chunks import CACHE, items_at_once
 from gyrofuse._base.transforms import fast_length, taper_kernel, tone_in_hann
 from gyrofuse.fitting.spectral.line import Line
 from gyrofuse.fitting.spectral.line_background import place, smooth_background
 
 NoiseSpectrum = Callable[[Tensor], Tensor]
 
+# Fewest samples of a record: 16 for a spectral line, and as many for the noise around it.
 FEWEST_SAMPLES = 32
-# Cycles from 0 and from half the sampling rate: lines are looked for beyond the first number. Below the second the
-# tone's amplitude, phase and frequency cannot be told apart, nor from a trend.
-_FIRST_CYCLE, FEWEST_CYCLES = 2, 3
-# Bins on either side of a line: of the DCT for its fit, of the Hann periodogram for its removal.
-_HALF_WIDTH, _LINE_HALF_WIDTH = 32, 64
-# Samples of a batch transformed at a time.
-_CHUNK = 2**20
-# The few dozen coefficients of a fit need no second transform: sums over blocks of time, with so many powers of time
-# within a block, give them to 1e-10.
-_BLOCKS, _POWERS = 256, 8
-_SWEEPS = 3
+# Cycles in the record, and from half the sampling rate, below which amplitude, phase and frequency of a line are not
+# identified, nor distinguished from a trend.
+FEWEST_CYCLES = 3
+# Cycles from 0 and from half the sampling rate from which on lines are searched: the width of the taper's main lobe.
+_FIRST_CYCLE = 2
+# Bins of the DCT on either side of a line that its fit uses: its power further out is below a hundredth.
+_HALF_WIDTH = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +170,7 @@ def _records(signal: Tensor, noise_spectrum: NoiseSpectrum | None, highest: floa
         density = _density(noise_spectrum, f, signal)
         fine, kernel = (torch.from_numpy(v).to(signal.device) for v in taper_kernel(n_samples, length))
         low = _density(noise_spectrum, fine, signal) @ kernel.T
-    size = max(_CHUNK // n_samples, 1)
+    size = items_at_once(n_samples, CACHE)
     for first in range(0, len(items), size):
         part = slice(first, first + size)
         own = None if density is None or low is None else (density[part], low[part])
@@ -247,7 +245,8 @@ class _Records:
             lines.append(self._coefficients(2 * math.pi / self._length * peak.to(torch.float64)))
             p_values.append(p_value)
             self._fit(lines, len(lines) - 1, search=True)
-            for _ in range(_SWEEPS if len(lines) > 1 else 0):
+            # Three rounds, until none of the lines sees the others.
+            for _ in range(3 if len(lines) > 1 else 0):
                 for i in range(len(lines)):
                     self._fit(lines, i)
         self._set_background(self._power())  # without the lines
@@ -298,20 +297,24 @@ class _Records:
         return 1 / variance
 
     def _coefficients(self, beta: Tensor) -> Line:
-        """DCT-II coefficients around frequencies `(item,)`."""
+        """DCT-II coefficients around frequencies `(item,)`, without another transform.
+
+        Sums over 256 blocks of time, with eight powers of time within a block, give them to 1e-10.
+        """
+        most_blocks, n_powers = 256, 8
         n, device = self._n, beta.device
         middle = (beta * n / math.pi).round().clamp(1, n - 1)  # (item,)
-        size = -(-n // _BLOCKS)
+        size = -(-n // most_blocks)
         n_blocks = -(-n // size)
         blocks = torch.nn.functional.pad(self._signal, (0, n_blocks * size - n)).unflatten(-1, (n_blocks, size))
         within = torch.arange(size, dtype=torch.float64, device=device) - (size - 1) / 2
         centre = torch.arange(n_blocks, dtype=torch.float64, device=device) * size + size / 2  # of t + 1/2
         omega = math.pi / n * middle
         carrier = torch.polar(torch.ones_like(within), -omega[:, None] * within)  # (item, time in block)
-        power = torch.arange(_POWERS, dtype=torch.float64, device=device)
+        power = torch.arange(n_powers, dtype=torch.float64, device=device)
         powers = (within[:, None] * (2 / size)) ** power  # (time in block, power)
         table = torch.view_as_real(carrier[..., None] * powers).flatten(-2)
-        moments = torch.view_as_complex((blocks @ table).unflatten(-1, (_POWERS, 2)))  # (item, block, power)
+        moments = torch.view_as_complex((blocks @ table).unflatten(-1, (n_powers, 2)))  # (item, block, power)
         moments = moments * torch.polar(torch.ones_like(centre), -omega[:, None] * centre)[..., None]
         offset = torch.arange(-_HALF_WIDTH, _HALF_WIDTH + 1, dtype=torch.float64, device=device)
         delta = math.pi / n * offset
@@ -347,10 +350,11 @@ class _Records:
         self._add_to_spectrum(fitted, -1)
         lines[which] = fitted
 
-    def _add_to_spectrum(self, line: Line, sign: int) -> None:
+    def _add_to_spectrum(self, line: Line, sign: int, half_width: int = 64) -> None:
+        """Add a line, or with `sign=-1` subtract it, at `half_width` bins on either side, where its side lobes end."""
         n, length = self._n, self._length
         centre = (line.beta * length / (2 * math.pi)).round().long()
-        reach = torch.arange(-_LINE_HALF_WIDTH, _LINE_HALF_WIDTH + 1, device=centre.device)
+        reach = torch.arange(-half_width, half_width + 1, device=centre.device)
         index = centre[:, None] + reach
         inside = (index >= 0) & (index < self._spectrum.shape[-1])
         omega = 2 * math.pi / length * index.to(torch.float64)

@@ -18,11 +18,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from gyrofuse._base.checks import check_floating, check_positive_integer
+from gyrofuse._base.chunks import CACHE, items_at_once
+from gyrofuse._base.results import scattered
 from gyrofuse._base.transforms import cosine_ordinates, ramp_ordinates
 from gyrofuse.fitting.spectral.bands import Bins, Noise
 from gyrofuse.fitting.spectral.search import maximise, uncertainty
@@ -31,32 +34,31 @@ from gyrofuse.fitting.structure import Composition
 from gyrofuse.noise.dct_bands import SINGLE
 from gyrofuse.noise.processes import Sinusoid
 
-# What remains of an ordinate that a tone or the ramp takes all of.
-_LEAST_COUNT = 1e-3
-_CHUNK = 2**19  # samples transformed at a time: few enough for the cache
+# Degrees of freedom left to an ordinate that a spectral line or the drift takes all of: none, but for a division by it.
+LEAST_COUNT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class WhittleFit:
-    """Where the likelihood is largest; NaN and not converged for items that could not be fitted.
+    """Maximum of the likelihood; NaN and not converged for items that could not be fitted.
 
     The unknowns are `ln p` of the processes followed by `x` of the shaped ones, as `Composition` has them.
 
     Attributes:
-        linear: `p`, `(item, process)`: variances, squared amplitudes, the squared slope. A variance is 0 where raising
-            it would not raise the likelihood.
-        shape: `x`, `(item, shaped)`.
-        covariance: Of the unknowns, from the Fisher information, `(item, unknown, unknown)`; zero rows for a variance
-            at 0 and for the `x` of its AR1. NaN where the data do not tell unknowns apart.
-        edge_sd: Standard deviation of `p` itself when variances at 0 are let off it, for upper limits,
+        linear: Linear parameters `p`, `(item, process)`: variances, squared amplitudes, the squared slope. A variance
+            is 0 where raising it would not raise the likelihood.
+        shape: Nonlinear parameters `x`, `(item, shaped)`.
+        covariance: Covariance of the unknowns, from the Fisher information, `(item, unknown, unknown)`; zero rows for a
+            variance at 0 and for the `x` of its AR1. NaN where unknowns are not identified.
+        edge_sd: Standard error of `p` itself, as if variances at 0 could be negative, for upper limits,
             `(item, process)`.
-        tones: From high to low frequency as in `shape`, `(item, tone)`; None without sinusoids.
-        slope: Of the ramp, with its sign, `(item,)`, signal per sample; 0 without one.
-        slope_sd: With the noise as fitted, `(item,)`: too small where a random walk was estimated as 0.
-        log_likelihood: Of what is left without tones and ramp, `(item,)`, nats.
-        energy: Sums of squared ordinates of that, `(item, bin)`, and
-        count: ordinates less the degrees of freedom of tones and ramp.
-        converged: `(item,)`.
+        tones: Spectral lines from high to low frequency as in `shape`, `(item, tone)`; None without sinusoids.
+        slope: Slope of the drift, with its sign, `(item,)`, signal per sample; 0 without one.
+        slope_sd: Its standard error over the fitted noise, `(item,)`: too small where a random walk was estimated as 0.
+        log_likelihood: Log likelihood of the record without sinusoids and drift, `(item,)`, nats.
+        energy: Sums of squared ordinates of that record, `(item, bin)`.
+        count: Ordinates in each sum less the degrees of freedom of sinusoids and drift, `(item, bin)`.
+        converged: Whether a maximum was reached, `(item,)`.
     """
 
     linear: Tensor
@@ -84,19 +86,18 @@ def refine_whittle(
     """Maximise the Whittle likelihood of records from where a moment fit ended.
 
     Scoring for the variances, which stay >= 0 by non-negative least squares in each step, and for `atanh phi`,
-    damped so that no step lowers the likelihood. The search finds the maximum next to the start only, and a weak tone
-    that the start takes for noise stays noise. AR1s that alternate quickly, `phi` below -0.9, show at the ends of a
-    record, which the likelihood sees in part only: at 4000 samples and `phi = -0.95` estimates scatter a tenth more and
-    `atanh phi` is a quarter of its standard deviation too large.
+    damped so that no step lowers the likelihood. The search finds the maximum next to the start only, and a weak line
+    that the start takes for noise stays noise. AR1s that alternate quickly, `phi` below -0.9, depend on the ends of a
+    record, which the likelihood contains in part only: estimates scatter somewhat more.
 
     Args:
-        signal: `(item, time)`, at least 32 samples. An item with missing samples is not fitted.
+        signal: Records `(item, time)` of at least 32 samples. An item with missing samples is not fitted.
         made_of: Structure of the model.
-        linear: `p` to start from, `(item, process)`; zeros may leave the edge again.
+        linear: `p` to start from, `(item, process)`; a zero may become positive again.
         shape: `x` to start from, `(item, shaped)`; frequencies of sinusoids are found anew.
-        tones: Of the sinusoids, from high to low frequency, `(item, tone)`: kept in records where others are found,
-            as a start that takes a tone for noise would hide it. By default nothing is known of them.
-        n_rounds: How often tones and ramp are measured and the noise is fitted; once where there are none.
+        tones: Known spectral lines of the sinusoids, from high to low frequency, `(item, tone)`: kept in records where
+            others are found, as a start that takes a line for noise would hide it. None by default.
+        n_rounds: Number of rounds of measuring sinusoids and drift and fitting the noise; one where there are none.
 
     Returns:
         The fit, float64.
@@ -115,7 +116,7 @@ def refine_whittle(
     usable = signal.sum(-1, dtype=torch.float64).isfinite() & (signal != signal[:, :1]).any(-1)
     usable &= (started >= 0).all(-1) & (started.sum(-1) > 0) & started.isfinite().all(-1)
     usable &= shape[:, noise.at_x].isfinite().all(-1)
-    known = None if tones is None else _of(tones, usable)
+    known = None if tones is None else items_of(tones, usable)
     whole = _refined(signal[usable], made_of, noise, at_tones, linear[usable], shape[usable], known, n_rounds)
     return _placed(whole, usable)
 
@@ -148,7 +149,7 @@ def _refined(
     known: Tones | None,
     n_rounds: int,
 ) -> WhittleFit:
-    """The same for items that can be fitted."""
+    """`refine_whittle` for items that can be fitted."""
     n_items, n_samples = signal.shape
     bins = Bins(n_samples, signal.device)
     tone_at = [made_of.shaped[i] for i in at_tones]
@@ -167,13 +168,13 @@ def _refined(
             tones = tones if known is None else _kept(known, tones, n_samples)
         if ramp is not None:
             slope, slope_sd, taken = ramp.measured(signal, tones, p, x)
-        energy = bins.energy(_transformed(signal, tones, slope if ramp is not None else None))
+        energy = bins.energy(ordinates_left(signal, tones, slope if ramp is not None else None))
         count = bins.count.expand(n_items, -1).clone()
         if ramp is not None:
             count[:, : taken.shape[-1]] -= taken
         if tones is not None:
             count -= bins.taken_by(tones.beta, tones.phase)
-        count = count.clamp(min=_LEAST_COUNT)
+        count = count.clamp(min=LEAST_COUNT)
         p, x, reached = maximise(energy, count, bins, noise, p, x)
     linear[:, noise.which], shape[:, noise.at_x] = p, x
     if tones is not None:
@@ -189,16 +190,16 @@ def _refined(
     return WhittleFit(linear, shape, covariance, edge, tones, slope, slope_sd, log_likelihood, energy, count, reached)
 
 
-def _transformed(signal: Tensor, tones: Tones | None, slope: Tensor | None) -> Iterator[Tensor]:
-    """Ordinates `(item, k)` of what tones and ramp leave, for some items at a time."""
+def ordinates_left(signal: Tensor, tones: Tones | None, slope: Tensor | None) -> Iterator[Tensor]:
+    """Ordinates `(item, k)` of records without spectral lines and drift, for some items at a time."""
     n = signal.shape[-1]
     time = torch.arange(n, dtype=torch.float64, device=signal.device)
-    size = max(_CHUNK // n, 1)
+    size = items_at_once(n, CACHE)
     for first in range(0, max(len(signal), 1), size):
         part = slice(first, first + size)
         rest = signal[part].to(torch.float64)
         if tones is not None:
-            rest = rest - _of(tones, part).waveform(n)
+            rest = rest - items_of(tones, part).waveform(n)
         if slope is not None:
             rest = rest - slope[part, None] * time
         yield cosine_ordinates(rest)
@@ -213,26 +214,27 @@ class _Ramp:
         self._bins, self._noise = bins, noise
 
     def measured(self, signal: Tensor, tones: Tones | None, p: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Slope without the tones, its standard deviation, and the degrees of freedom that it takes by ordinate."""
-        first = torch.cat([rest[:, 1 : len(self.shown) + 1] for rest in _transformed(signal, tones, None)])
+        """Slope without the sinusoids, its standard error, and the degrees of freedom that it takes by ordinate."""
+        first = torch.cat([rest[:, 1 : len(self.shown) + 1] for rest in ordinates_left(signal, tones, None)])
         weight = 1 / self._noise.variances(self._bins, p, x)[:, : len(self.shown)]
         information = (weight * self.shown.square()).sum(-1)
         slope = (weight * self.shown * first).sum(-1) / information
         return slope, information.rsqrt(), weight * self.shown.square() / information[:, None]
 
 
-def _of(tones: Tones, part: slice | Tensor) -> Tones:
+def items_of(tones: Tones, part: slice | Tensor) -> Tones:
+    """Spectral lines of some items."""
     return Tones(*(getattr(tones, f.name)[part] for f in fields(Tones)))
 
 
 def _kept(known: Tones, found: Tones, n_samples: int) -> Tones:
-    """Those found where they are the known ones, within half a cycle in the record, and else the known ones."""
+    """Lines found that agree with the known ones, within half a cycle in the record, and else the known ones."""
     same = ((found.beta - known.beta).abs() < math.pi / n_samples).all(-1, keepdim=True)
     return Tones(*(torch.where(same, getattr(found, f.name), getattr(known, f.name)) for f in fields(Tones)))
 
 
 def _measured_tones(signal: Tensor, slope: Tensor, n_tones: int, noise: Noise, p: Tensor, x: Tensor) -> Tones:
-    """Tones from high to low frequency over the noise as fitted."""
+    """Spectral lines from high to low frequency over the fitted noise."""
     if not len(signal):
         return Tones(*(p.new_empty(0, n_tones) for _ in fields(Tones)))
     rest = signal.to(torch.float64)
@@ -254,7 +256,7 @@ def _assembled(
     slope_sd: Tensor,
     ramp_at: list[int],
 ) -> tuple[Tensor, Tensor]:
-    """Covariance of all unknowns, those of tones and ramp on the diagonal, and `edge_sd` of all processes."""
+    """Covariance of all unknowns, sinusoids and drift on the diagonal, and `edge_sd` of all processes."""
     n_unknown = made_of.n_linear + len(made_of.shaped)
     covariance = own.new_zeros(len(slope), n_unknown, n_unknown)
     edge = own.new_zeros(len(slope), made_of.n_linear)
@@ -278,25 +280,9 @@ def _assembled(
 def _placed(fit: WhittleFit, usable: Tensor) -> WhittleFit:
     """Put items back into their places among all."""
 
-    def placed(value: Tensor) -> Tensor:
-        missing = False if value.dtype == torch.bool else torch.nan
-        whole = value.new_full((len(usable), *value.shape[1:]), missing)
-        whole[usable] = value
-        return whole
+    def placed(value: Any) -> Any:
+        if isinstance(value, Tensor):
+            return scattered(value, usable, usable.shape, False if value.dtype == torch.bool else torch.nan)
+        return None if value is None else Tones(*(placed(part) for part in vars(value).values()))
 
-    tones = fit.tones
-    if tones is not None:
-        tones = Tones(*(placed(getattr(tones, f.name)) for f in fields(Tones)))
-    return WhittleFit(
-        placed(fit.linear),
-        placed(fit.shape),
-        placed(fit.covariance),
-        placed(fit.edge_sd),
-        tones,
-        placed(fit.slope),
-        placed(fit.slope_sd),
-        placed(fit.log_likelihood),
-        placed(fit.energy),
-        placed(fit.count),
-        placed(fit.converged),
-    )
+    return WhittleFit(*(placed(value) for value in vars(fit).values()))

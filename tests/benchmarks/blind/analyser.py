@@ -7,6 +7,7 @@ from typing import Any
 import torch
 
 import gyrofuse as gf
+from gyrofuse.fitting import RankResult
 
 _PROCESSES = {
     "white_noise": gf.WhiteNoise,
@@ -34,7 +35,7 @@ def recording_of(arrays: dict[str, Any]) -> gf.Recording:
     return gf.Recording(signal, rate=float(arrays["fs"]), unit=str(arrays["unit"]), channels=channels)
 
 
-def simulation_of(given: dict[str, Any]) -> gf.Recording | gf.Model | gf.ArrayModel | gf.RankResult:
+def simulation_of(given: dict[str, Any]) -> gf.Recording | gf.Model | gf.ArrayModel | RankResult:
     """Samples, a noise model, or one that is fitted to earlier records here."""
     if "fit" in given:
         return fitted(given)
@@ -43,14 +44,14 @@ def simulation_of(given: dict[str, Any]) -> gf.Recording | gf.Model | gf.ArrayMo
     return gf.ArrayModel.from_sensors(noise_models(given["terms"]))
 
 
-def fitted(given: dict[str, Any]) -> gf.Model | gf.ArrayModel | gf.RankResult:
+def fitted(given: dict[str, Any]) -> gf.Model | gf.ArrayModel | RankResult:
     """The noise model that a user would fit to what was recorded earlier."""
     earlier = [gf.Recording(torch.as_tensor(x), rate=given["fs"]) for x in (given["gyro"], *given["more"])]
     by, model = given["fit"]["by"], given["fit"]["model"]
     if by == "array":
         return gf.fit_array_gmwm(earlier[0], model).model
     if by == "jointly":
-        return gf.fit_jointly(earlier, model).model
+        return gf.fit_gmwm_joint(earlier, model).model
     if by == "ranked":
         return gf.rank_models(earlier[0])
     return gf.fit_gmwm(earlier[0], model, refine=by == "refined").model

@@ -1,4 +1,4 @@
-"""What a fit minimises, as profiles need it: how far it rises where one unknown is held."""
+"""Objectives of fits, as profiles need them: their increase where one unknown is held fixed."""
 
 from __future__ import annotations
 
@@ -15,14 +15,13 @@ from gyrofuse.fitting.spectral.bands import Bins, Noise
 from gyrofuse.fitting.spectral.search import deviance, maximise
 from gyrofuse.fitting.structure import Composition
 
-_STARTS, _FIRST_STEPS, _STEPS, _ENOUGH = 2, 6, 5, 1e-3
-_CLIMB = 15
-# AR1s from which the likelihood is climbed besides: `x` of one that is nearly white, and time constants in a record.
-_NO_MEMORY, _SHARE_OF_RECORD, _OFF_ZERO = 0.25, 30, 1e-6
+# Gain, as a share of the objective or in nats, below which a profile needs no further step: 1e-3 of the `z^2` that it
+# is compared with.
+_ENOUGH = 1e-3
 
 
-class Surface(Protocol):
-    """What a fit minimises. Unknowns are `p` of the processes first, then `x` of the shaped ones.
+class ProfileObjective(Protocol):
+    """Objective of a fit. Unknowns are `p` of the processes first, then `x` of the shaped ones.
 
     Attributes:
         linear: `p` at the minimum, `(item, process)`.
@@ -33,27 +32,31 @@ class Surface(Protocol):
     shape: Tensor
 
     def knows(self, unknown: int) -> bool:
-        """Whether the unknown is one of this surface's."""
+        """Whether the objective depends on the unknown."""
 
     def rise(self, items: Tensor, unknown: int, value: Tensor, in_order: Tensor | None = None) -> Tensor:
-        """How much higher the minimum lies with the unknown at `value` `(item,)`, for the items `(item,)`.
+        """Deviance increase: minimum with the unknown fixed less the minimum with all free, `(item,)`.
 
-        Where `in_order`, `(item,)`, of the minima with the AR1s in the order of the estimates: another one may be the
-        estimates themselves with two of them exchanged.
+        Args:
+            items: Items, `(item,)`.
+            unknown: Index of the unknown.
+            value: Value at which it is fixed, `(item,)`.
+            in_order: Items whose AR1s have to stay in the order of the estimates, `(item,)`: another minimum may be
+                that of the estimates with two of them exchanged.
         """
 
     def divergence(self, linear: Tensor, shape: Tensor) -> Tensor:
-        """What the objective would be at a point, had the model at the minimum been measured exactly, `(item,)`."""
+        """Objective at a point, had the model at the minimum been measured without error, `(item,)`."""
 
 
-class MomentSurface:
-    """`r' V^-1 r` with `V` of the fit that holds the unknown, as a test of that value needs it.
+class MomentProfile:
+    """`r' V^-1 r` with `V` of the fit with the fixed unknown, as a test of its value needs it.
 
     The residuals are those of cube roots, which are nearly normal at few degrees of freedom: the variance itself is at
-    most `sqrt(eta / 2)` standard deviations below its mean, which rules out nothing where `eta` is two.
+    most `sqrt(eta / 2)` standard deviations below its mean, which rejects nothing where `eta` is two.
 
     Args:
-        fit: Where the search ended.
+        fit: Fit of the moments.
         made_of: Structure of the model.
     """
 
@@ -77,18 +80,18 @@ class MomentSurface:
         start = own_x[:, None]
         if made_of.curved:
             held = own_x[:, [i for i, k in enumerate(made_of.shaped) if k not in made_of.curved]]
-            others = search.starting_points(target, weight, tau, made_of, held, _STARTS, fixed)
+            others = search.starting_points(target, weight, tau, made_of, held, 2, fixed)
             start = torch.cat([start, others], 1)
         if still is not None:
             start[..., still] = value[:, None]
-        linear, x, least = self._lowest(target, weight.sqrt(), start, _FIRST_STEPS, fixed, still, in_order)
+        linear, x, least = self._lowest(target, weight.sqrt(), start, 6, fixed, still, in_order)
         for _ in range(2):
             as_normal, root = self._normal(target, linear, x)
-            linear, x, least = self._lowest(as_normal, root, x[:, None], _STEPS, fixed, still)
-        _, _, free = self._lowest(as_normal, root, torch.stack([x, own_x], 1), _STEPS, None, None)
+            linear, x, least = self._lowest(as_normal, root, x[:, None], 5, fixed, still)
+        _, _, free = self._lowest(as_normal, root, torch.stack([x, own_x], 1), 5, None, None)
         if in_order is not None:
             least = torch.where(in_order & ~_in_order(made_of, x), torch.inf, least)
-        # With V of a fit that is far off the free one may be as bad; then the estimate, with its own V, is the measure.
+        # With V of a fit that is far off the free one may be as bad: compare with the estimate and its own V then.
         own_linear = self.linear[items] / self._size[items, None]
         own, own_root = self._normal(target, own_linear, own_x)
         off = (own_root @ (own - made_of.wavelet_variance(tau, own_linear, own_x))[..., None]).square().sum((-2, -1))
@@ -117,7 +120,7 @@ class MomentSurface:
         still: int | None,
         in_order: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """The lowest of the minima next to the starts `(item, start, shaped)`, of those in order where there are."""
+        """Lowest of the minima next to the starts `(item, start, shaped)`, among those in order where there are any."""
         n_items, n = start.shape[:2]
         linear, x, objective, _ = search.minimise(
             target.repeat_interleave(n, 0),
@@ -137,8 +140,8 @@ class MomentSurface:
         return linear[best], x[best], objective[best]
 
 
-class SpectralSurface:
-    """Minus twice the spectral log likelihood of what tones and ramps leave; their own unknowns are not profiled.
+class SpectralProfile:
+    """Minus twice the spectral log likelihood of the noise without sinusoids and drifts, which are not profiled.
 
     Args:
         linear: `p` at the maximum, `(item, process)`.
@@ -157,7 +160,8 @@ class SpectralSurface:
         self._noise, self._bins = Noise(made_of), Bins(n_samples, linear.device)
         self._unknowns = [*self._noise.which, *(made_of.n_linear + at for at in self._noise.at_x)]
         self._least = deviance(energy, count, self._bins, self._noise, *self._at(slice(None)))
-        self._starts = [_NO_MEMORY, math.atanh(math.exp(-_SHARE_OF_RECORD / n_samples))]
+        # AR1s of other minima: one that is nearly white, and one with a time constant of a thirtieth of the record.
+        self._starts = [0.25, math.atanh(math.exp(-30 / n_samples))]
 
     def knows(self, unknown: int) -> bool:
         return unknown in self._unknowns
@@ -166,8 +170,8 @@ class SpectralSurface:
         held = self._unknowns.index(unknown)
         energy, count = self._energy[items], self._count[items]
         p, x = self._at(items)
-        # Somewhat off zero, as nothing could be left once the unknown is taken away.
-        p = p.maximum(_OFF_ZERO * energy.sum(-1, keepdim=True) / count.sum(-1, keepdim=True))
+        # A millionth above zero: without the fixed unknown, no variance at all could be left.
+        p = p.maximum(1e-6 * energy.sum(-1, keepdim=True) / count.sum(-1, keepdim=True))
         p_and_x = torch.cat([p, x], -1)
         starts: list[tuple[int, Tensor | float]] = [(held, value)]
         starts += itertools.product(range(p.shape[-1], p_and_x.shape[-1]), self._starts)
@@ -177,7 +181,7 @@ class SpectralSurface:
             unknowns[:, at] = start
             unknowns[:, held] = value
             at_p, at_x = unknowns.split([p.shape[-1], x.shape[-1]], -1)
-            at_p, at_x, _ = maximise(energy, count, self._bins, self._noise, at_p, at_x, held, _ENOUGH, _CLIMB)
+            at_p, at_x, _ = maximise(energy, count, self._bins, self._noise, at_p, at_x, held, _ENOUGH, 15)
             height = deviance(energy, count, self._bins, self._noise, at_p, at_x)
             if in_order is not None:
                 turned = (at_x.diff(dim=-1) > 0).any(-1)
@@ -211,7 +215,7 @@ def _first_of(objective: Tensor) -> Tensor:
 
 
 def _as_normal(variance: Tensor, expected: Tensor, covariance: Tensor) -> Tensor:
-    """As many standard deviations off as a normal variable was: the cube root of a chi-square is nearly normal.
+    """Wavelet variances as if they were normal: the cube root of a chi-square nearly is.
 
     References:
         E. B. Wilson, M. M. Hilferty, PNAS 17, 1931.
