@@ -53,6 +53,7 @@ _MODULES = {
     "intervals": "wavelets.intervals",
     "io.notes": "io.streams",
     "io.resample": "io.align",
+    "io.slices": "io.formats.slices",
     "io.stream": "io.streams",
     "joint": "fitting.joint",
     "lightning_module": "fleet.lightning",

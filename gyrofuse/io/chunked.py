@@ -15,8 +15,8 @@ from gyrofuse._base.checks import check_n_samples, check_positive, check_positiv
 from gyrofuse._base.deprecation import moved_names
 from gyrofuse._base.results import counted, numbered
 from gyrofuse._base.units import check_quantity
+from gyrofuse.io.formats.slices import open_slices
 from gyrofuse.io.quantities import QUANTITY
-from gyrofuse.io.slices import open_slices
 
 _MOVED = {"LongRecording": "ChunkedRecording", "open_long": "open_recording", "stretch_of": "shard_bounds"}
 __getattr__ = moved_names(__name__, {old: f"{__name__}.{new}" for old, new in _MOVED.items()})

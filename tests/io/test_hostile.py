@@ -20,7 +20,8 @@ import gyrofuse as gf
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 import fuzz_readers
 
-from gyrofuse.io.formats import mat5, read_streams
+from gyrofuse.io.formats import read_streams
+from gyrofuse.io.formats.matlab import mat5
 from gyrofuse.io.limits import Allowance, physical_memory
 from gyrofuse.io.streams import RecordingError
 

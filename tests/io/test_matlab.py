@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from logs import made_up, read_with, write_hdf5, write_mat5, write_mat73
 
-from gyrofuse.io.formats import hdf5, matlab
+from gyrofuse.io.formats import hdf5
+from gyrofuse.io.formats.matlab import matlab
 from gyrofuse.io.streams import RecordingError
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"

@@ -23,7 +23,7 @@ _READERS = {
     ".txt": "text.text",
     ".parquet": "parquet",
     ".pq": "parquet",
-    ".mat": "matlab",
+    ".mat": "matlab.matlab",
     ".h5": "hdf5",
     ".hdf5": "hdf5",
     ".hdf": "hdf5",

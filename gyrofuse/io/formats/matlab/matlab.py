@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from gyrofuse.io.formats import hdf5, mat5
+from gyrofuse.io.formats import hdf5
 from gyrofuse.io.formats.arrays import streams_from_arrays
+from gyrofuse.io.formats.matlab import mat5
 from gyrofuse.io.formats.request import Request
 from gyrofuse.io.streams import RecordingError, Stream, cause, reading
 
