@@ -58,6 +58,7 @@ def test_the_p_value_is_that_of_a_weighted_sum_of_squares():
     assert found.p_value[0, 0].item() == pytest.approx((drawn >= found.j_statistic[0, 0].item()).mean(), abs=0.01)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("tone", [False, True])
 def test_complete_models_are_refused_as_often_as_stated(tone):
     """Of 120 records at 5 %: 0 to 15 but for one time in a thousand."""

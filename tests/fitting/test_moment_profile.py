@@ -96,6 +96,7 @@ def test_what_is_well_determined_keeps_its_interval():
     torch.testing.assert_close((low * high).sqrt(), found.params, rtol=1e-9, atol=0)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(
     ("model", "formula", "n_samples", "said"),
     [
@@ -146,6 +147,7 @@ def test_the_rise_of_the_likelihood_is_that_of_a_fine_grid():
             assert found[i].item() == pytest.approx((least - own).item(), abs=0.01)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(
     ("model", "unknown", "place"),
     [

@@ -140,6 +140,7 @@ def test_the_search_ends_where_nothing_next_to_it_is_better():
     assert (least <= alike.criterion.amin(-1) + 1e-2).all()
 
 
+@pytest.mark.statistical
 def test_wavelet_variances_alone():
     """Criteria as by hand, and the true composition; fewer than 15 of 20 once in 3000 times at 95 %."""
     signal = signals(PARTS["WN + RW"], 20)[:, 0]

@@ -91,6 +91,7 @@ def test_a_tone_at_another_frequency_is_named_and_the_missing_one_told():
     assert report.unexplained == ()
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("sampled", [False, True])
 @pytest.mark.parametrize("factor", [0.25, 0.8, 1.5])
 def test_another_size_is_a_number_that_was_wrong(sampled: bool, factor: float):
@@ -118,6 +119,7 @@ def test_only_the_sensor_whose_tone_is_another_is_named():
     assert finding.effect.amplitude[[0, 2]].tolist() == pytest.approx([0.02, 0.02], rel=1e-2)
 
 
+@pytest.mark.statistical
 def test_a_tone_found_in_one_recording_is_known_in_another_whatever_its_phase():
     """Phases count from when a record began."""
     first = gf.diagnose(recorded(toned(), 11), NOISE)
@@ -138,6 +140,7 @@ def test_what_is_missing_is_found_beside_a_tone_that_both_have():
     assert report.unexplained == ()
 
 
+@pytest.mark.statistical
 def test_a_strong_tone_is_not_swallowed_by_what_its_fit_leaves():
     """A model fitted as if there were no tone is wrong over the whole spectrum: a hump of it is no wandering tone.
 

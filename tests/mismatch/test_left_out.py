@@ -22,6 +22,7 @@ def recorded(model: gf.Model | gf.Process, seed: int) -> gf.Recording:
     return gf.Recording(signal, rate=RATE, unit="deg/s")
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("sampled", [False, True])
 @pytest.mark.parametrize(
     ("kind", "truth"),

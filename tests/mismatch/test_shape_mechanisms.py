@@ -40,6 +40,7 @@ from gyrofuse.mismatch.shape_scan import shape_witness
 from gyrofuse.noise.array_model import ArrayModel
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("share", [0.06, 0.75])
 def test_white_noise_of_which_sensors_share_a_part_is_named_though_no_power_changes(share: float) -> None:
     g = generator(32)
@@ -69,6 +70,7 @@ def test_noise_of_one_sensor_alone_is_of_no_common_source_and_may_be_two_levels(
     assert "random_telegraph" in found.alternatives
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("seed", [701, 708])
 def test_a_number_that_pays_by_chance_makes_no_sensor_take_part(seed: int):
     """Three sensors of six have 30 nats each; a number of another one would gain more than its two nats."""
@@ -78,6 +80,7 @@ def test_a_number_that_pays_by_chance_makes_no_sensor_take_part(seed: int):
     assert found.sensors == (0, 1, 2)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("name", CHANGES)
 def test_what_is_missing_is_named_measured_and_explained(name: str):
     mechanism, change, truth = CHANGES[name]
@@ -99,6 +102,7 @@ def test_what_is_missing_is_named_measured_and_explained(name: str):
     assert nominated(explained, 1e-4) is None  # a tenth of the level that the first one was held to
 
 
+@pytest.mark.statistical
 def test_a_filter_and_what_it_acts_on_are_found_one_after_the_other():
     def change(x: Tensor, g: torch.Generator) -> Tensor:
         q = filter_strength("bilinear2", tensor(*(P * [0.3])))
@@ -112,6 +116,7 @@ def test_a_filter_and_what_it_acts_on_are_found_one_after_the_other():
     assert names == ["drifting_tone", "low_pass"]
 
 
+@pytest.mark.statistical
 def test_one_sensor_of_many_that_is_louder_has_nothing_in_common_with_the_others():
     """Gains of eleven others follow chance, most of all in the few ordinates that show a walk."""
     g, sensor = generator(40), gf.WhiteNoise(0.1) + gf.AR1(0.9999, 1e-9) + gf.RandomWalk(5e-10)
@@ -122,6 +127,7 @@ def test_one_sensor_of_many_that_is_louder_has_nothing_in_common_with_the_others
     assert (found.mechanism, found.sensors) == ("parameter_shift", (0,))
 
 
+@pytest.mark.statistical
 def test_two_sensors_of_many_that_share_a_third_of_their_noise_are_told_with_possible_gains() -> None:
     g, p, share = generator(43), 8, 0.35
     simulation = ArrayModel.from_sensors([gf.WhiteNoise(WHITE) + gf.RandomWalk(1e-9)] * p)

@@ -505,6 +505,7 @@ def sampled_flicker(f: torch.Tensor) -> torch.Tensor:
     return torch.sinc(f).square() * (1 - 2 / math.pi * torch.atan(2 * math.pi * f / 4)) / f
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("slope", [1.0, 1.5])
 def test_noise_is_flicker_only_if_it_falls_as_flicker_does(slope: float):
     given = falling(slope)

@@ -145,6 +145,7 @@ def covered_weights(noise: str, scale_weights: str, n_levels: int, method: str =
     return ((low <= truth) & (truth <= high)).sum(0)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("noise", ["white", "walk", "white and walk"])
 @pytest.mark.parametrize(("scale_weights", "n_levels"), [("flat", 6), ("short", 11), ("long", 9), ("long", 11)])
 def test_coverage_of_weights(noise, scale_weights, n_levels):
@@ -157,6 +158,7 @@ def test_coverage_of_weights(noise, scale_weights, n_levels):
     assert (covered >= fewest_covered(N_RUNS, N_SENSORS)).all(), covered.tolist()
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("scale_weights", ["short", "long"])
 def test_coverage_of_inverse_variance_weights(scale_weights):
     """The same, judged alike."""
