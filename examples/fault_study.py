@@ -30,7 +30,7 @@ from torch import Tensor
 import gyrofuse as gf
 from gyrofuse.fusion.faults.classify import KINDS
 from gyrofuse.fusion.faults.parity import parity_test
-from gyrofuse.fusion.faults.reference import ParityReference, fit_parity
+from gyrofuse.fusion.faults.reference import ParityReference, fit_parity_reference
 
 FALSE_ALARM = 0.01
 ONSET = 2  # window at which the fault begins
@@ -71,7 +71,7 @@ def mimu_pieces(path: Path) -> tuple[list[Tensor], float]:
 
 def mimu_sessions(path: Path, window: int, n_pieces: int) -> list[Session]:
     experiments, rate = mimu_pieces(path)
-    return [Session(fit_parity(list(e[:10]), window), e[10 : 10 + n_pieces], rate) for e in experiments]
+    return [Session(fit_parity_reference(list(e[:10]), window), e[10 : 10 + n_pieces], rate) for e in experiments]
 
 
 def mimu_other_sessions(path: Path, window: int, extra_spread: float) -> list[Session]:
@@ -79,7 +79,11 @@ def mimu_other_sessions(path: Path, window: int, extra_spread: float) -> list[Se
     experiments, rate = mimu_pieces(path)
     return [
         Session(
-            fit_parity([*torch.cat(experiments[:k] + experiments[k + 1 :])], window, extra_spread=extra_spread), e, rate
+            fit_parity_reference(
+                [*torch.cat(experiments[:k] + experiments[k + 1 :])], window, extra_spread=extra_spread
+            ),
+            e,
+            rate,
         )
         for k, e in enumerate(experiments)
     ]
@@ -94,7 +98,7 @@ def xsens_sessions(path: Path, window: int, n_pieces: int) -> list[Session]:
     sessions = []
     for healthy, rest in ((gyro[..., :half], gyro[..., half:]), (gyro[..., half:], gyro[..., :half])):
         pieces = rest[..., : rest.shape[-1] // length * length].unflatten(-1, (-1, length)).movedim(-2, 0)
-        sessions.append(Session(fit_parity(healthy, window), pieces[:n_pieces], float(data["fs"])))
+        sessions.append(Session(fit_parity_reference(healthy, window), pieces[:n_pieces], float(data["fs"])))
     return sessions
 
 
@@ -104,7 +108,7 @@ def simulated_sessions(window: int, n_pieces: int) -> list[Session]:
     array = gf.ArrayModel([(gf.WhiteNoise(1.0), white.diag()), (gf.RandomWalk(1.0), walk.diag())])
     signal = array.simulate(12_000 + 4 * window * n_pieces, generator=torch.Generator().manual_seed(1))
     pieces = signal[:, 12_000:].unflatten(-1, (n_pieces, -1)).movedim(-2, 0)
-    return [Session(fit_parity(signal[:, :12_000], window), pieces, 50.0)]
+    return [Session(fit_parity_reference(signal[:, :12_000], window), pieces, 50.0)]
 
 
 def inject(pieces: Tensor, kind: str, strength: float, sensor: int, session: Session, window: int) -> Tensor:

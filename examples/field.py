@@ -12,7 +12,7 @@ import torch
 
 import gyrofuse as gf
 from gyrofuse.fusion.faults.parity import parity_test
-from gyrofuse.fusion.faults.reference import fit_parity
+from gyrofuse.fusion.faults.reference import fit_parity_reference
 from gyrofuse.fusion.live import LiveSVO
 from gyrofuse.io.saturation import find_saturation, mask_saturated
 
@@ -51,8 +51,9 @@ full_scale = find_saturation(stream)
 print("Full scale found (deg/s):", ", ".join(f"{value:g}" for value in full_scale.tolist()))
 stream = mask_saturated(stream, full_scale)
 
-live = LiveSVO(gf.fit_svo(calibration, "long"))
-reference = fit_parity(calibration, window)
+live = LiveSVO("long")
+live.fit(calibration)
+reference = fit_parity_reference(calibration, window)
 live(calibration)  # the stream follows the calibration: its offsets are known from there
 print(live)
 
@@ -60,7 +61,7 @@ faulty = torch.zeros(6, dtype=torch.bool)
 history, virtual = calibration[:, -16 * window :], []
 for chunk in stream.split(20 * window, dim=-1):
     watched = torch.where(faulty[:, None], torch.nan, chunk)
-    result = parity_test(watched, reference, before=history, false_alarm=1e-4)
+    result = parity_test(watched, reference, history=history, false_alarm=1e-4)
     for fault in result.faults:
         start = sum(len(part) for part in virtual) / rate + fault.start / rate
         print(f"{start:8.1f} s: {fault.sentence}")

@@ -35,11 +35,10 @@ from gyrofuse.fitting.joint import fit_gmwm_joint
 from gyrofuse.fitting.ranking.rank import rank_models, rank_models_moments
 from gyrofuse.fitting.virtual_noise import virtual_noise
 from gyrofuse.fusion.faults.parity import parity_test
-from gyrofuse.fusion.faults.reference import ParityReference, fit_parity
-from gyrofuse.fusion.live import LiveSVO, subset_weights
+from gyrofuse.fusion.faults.reference import ParityReference, fit_parity_reference
+from gyrofuse.fusion.live import LiveSVO
 from gyrofuse.fusion.multiscale import MultiScaleSVO, fit_multiscale
 from gyrofuse.fusion.svo import SVO, fit_svo
-from gyrofuse.fusion.virtual_file import write_virtual
 from gyrofuse.fusion.weights.baselines import (
     equal_weights,
     inverse_variance_weights,
@@ -47,6 +46,7 @@ from gyrofuse.fusion.weights.baselines import (
     shrinkage_weights,
 )
 from gyrofuse.fusion.weights.rdvg import rdvg_weights
+from gyrofuse.fusion.weights.subsets import subset_weights
 from gyrofuse.fusion.weights.svo import SVOWeights, svo_weights
 from gyrofuse.io.chunked import ChunkedRecording, open_recording, shard_bounds
 from gyrofuse.io.reading import read_recording
@@ -74,7 +74,7 @@ from gyrofuse.wavelets.intervals import wavelet_cross_covariance_interval, wavel
 from gyrofuse.wavelets.robust import robust_wavelet_variance
 
 if TYPE_CHECKING:
-    from gyrofuse.fusion.streaming import stream_svo
+    from gyrofuse.fusion.streaming import stream_svo, write_virtual
     from gyrofuse.mismatch import Finding, MismatchReport, diagnose
     from gyrofuse.wavelets.metric import WaveletCrossCovariance
 
@@ -117,7 +117,7 @@ __all__ = [
     "fit_gmwm_joint",
     "fit_gmwm_moments",
     "fit_multiscale",
-    "fit_parity",
+    "fit_parity_reference",
     "fit_svo",
     "haar_coefficients",
     "inverse_variance_weights",
@@ -155,6 +155,7 @@ _LAZY = {
     "Finding": "gyrofuse.mismatch",
     "MismatchReport": "gyrofuse.mismatch",
     "stream_svo": "gyrofuse.fusion.streaming",
+    "write_virtual": "gyrofuse.fusion.streaming",
 }
 
 # Names that have left, and where they are now.
@@ -186,6 +187,7 @@ _MOVED = {
     "bootstrap_wccv_covariance": "gyrofuse.wavelets.block_bootstrap.bootstrap_wccv_covariance",
     "bootstrap_wccv_interval": "gyrofuse.wavelets.block_bootstrap.bootstrap_wccv_interval",
     "bootstrap_weights_covariance": "gyrofuse.fusion.uncertainty.influence.bootstrap_weights_covariance",
+    "fit_parity": "gyrofuse.fusion.faults.reference.fit_parity_reference",
     "find_saturation": "gyrofuse.io.saturation.find_saturation",
     "rdvg": "gyrofuse.fusion.weights.rdvg.rdvg",
     "resolve_scale_weights": "gyrofuse.fusion.weights.svo.resolve_scale_weights",

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.fusion.uncertainty.cross_fitting import CrossFit
-from gyrofuse.wavelets.equivalent_dof import chi_square_interval
+from gyrofuse.wavelets.intervals import chi_square_interval
 
 
 def certain_fit(degrees: Tensor, confidence_level: float) -> CrossFit:

@@ -100,8 +100,8 @@ def chain() -> nn.Module:
 
 def multiscale() -> nn.Module:
     """A fitted multi-scale virtual gyro."""
-    module = MultiScaleSVO(4)
-    module.fit(signal_of(3000, seed=9), n_levels=LEVELS)
+    module = MultiScaleSVO(4, n_levels=LEVELS)
+    module.fit(signal_of(3000, seed=9))
     return module
 
 

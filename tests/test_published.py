@@ -21,7 +21,7 @@ from gyrofuse import (
 )
 from gyrofuse.fusion.weights.svo import resolve_scale_weights
 from gyrofuse.wavelets import block_length
-from gyrofuse.wavelets.equivalent_dof import degrees_of_freedom
+from gyrofuse.wavelets.intervals import equivalent_dof
 from gyrofuse.wavelets.long_run_variance import mean_covariance
 from gyrofuse.wavelets.pilot import fit_pilot
 
@@ -205,7 +205,7 @@ def test_allantools_degrees_of_freedom(name, process, python_packages):
     """
     expected = np.array(python_packages["degrees_of_freedom"][name])
     pilot = fit_pilot(process.wavelet_variance(11).reshape(1, 11, 1, 1), 4096)
-    got = pilot.degrees_of_freedom(torch.ones(1, 1, 1, dtype=torch.float64))[0, :, 0].numpy()
+    got = pilot.dof(torch.ones(1, 1, 1, dtype=torch.float64))[0, :, 0].numpy()
     np.testing.assert_allclose(got[6:], expected[6:], rtol=0.015)
 
 
@@ -214,6 +214,6 @@ def test_allantools_least_degrees_of_freedom(python_packages):
     degrees = python_packages["degrees_of_freedom"]
     expected = np.minimum(degrees["white_noise"], degrees["random_walk"])
     counts = 4097 - torch.exp2(torch.arange(1.0, 12, dtype=torch.float64))
-    got = degrees_of_freedom(counts).numpy()
+    got = equivalent_dof(counts).numpy()
     np.testing.assert_allclose(got[1:9], expected[1:9], rtol=0.06)
     assert (got < 1.06 * expected).all()

@@ -24,11 +24,12 @@ class Result:
     """Base of results, which are frozen dataclasses: text, plain numbers, and items of a batch.
 
     A subclass names the fields that begin with the dimensions of the batch in `_batched`, and in `_contents` the
-    attributes that `to_dict` writes, by default its fields.
+    attributes that `to_dict` writes, by default its fields; in `_keys` the keys of those that have another name there.
     """
 
     _batched: ClassVar[tuple[str, ...]] = ()
     _contents: ClassVar[tuple[str, ...]] = ()
+    _keys: ClassVar[dict[str, str]] = {}
 
     def summary(self) -> str:
         """The result as text of fixed width."""
@@ -40,7 +41,7 @@ class Result:
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain lists and numbers, ready for JSON (NaN and infinities as None)."""
         names = self._contents or [entry.name for entry in fields(self)]  # type: ignore[arg-type]
-        return {name: plain(getattr(self, name)) for name in names}
+        return {self._keys.get(name, name): plain(getattr(self, name)) for name in names}
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -56,9 +57,11 @@ class Result:
 
 
 def _item(value: Any, index: Any) -> Any:
-    """An item of what a batched field holds: a tensor, a pair of limits, another result, or nothing."""
+    """An item of what a batched field holds: a tensor, a pair of limits or others, another result, or nothing."""
     if isinstance(value, ConfidenceInterval):
         return ConfidenceInterval(value.low[index], value.high[index])
+    if isinstance(value, tuple):
+        return tuple(part[index] for part in value)
     return None if value is None else value[index]
 
 

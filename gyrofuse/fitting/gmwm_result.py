@@ -20,7 +20,7 @@ from gyrofuse.fitting.structure import Composition
 from gyrofuse.noise.datasheet import Datasheet, datasheet
 from gyrofuse.noise.estimation import EstimatedFrom
 from gyrofuse.noise.processes import Model
-from gyrofuse.wavelets.equivalent_dof import chi_square_interval
+from gyrofuse.wavelets.intervals import chi_square_interval
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

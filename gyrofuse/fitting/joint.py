@@ -27,7 +27,7 @@ from gyrofuse.fitting.spectral.model_tones import model_tones
 from gyrofuse.fitting.structure import Composition
 from gyrofuse.io.recording import Recording
 from gyrofuse.noise.processes import Model
-from gyrofuse.wavelets.equivalent_dof import chi_square_tail
+from gyrofuse.wavelets.intervals import chi_square_tail
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

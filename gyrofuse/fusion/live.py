@@ -1,14 +1,14 @@
-"""Fusing a stream in which sensors leave and return: weights for the live ones, offsets that keep the output in place.
+"""Fusing a stream in which sensors leave and return: weights of the live sensors, and bumpless transfer by offsets.
 
 Sensor i feels the common rate, its own offset and noise, `x_i = rate + b_i + noise`. With weights `c_S` for the set S
 of live sensors the virtual signal is
 
     y = sum_i c_S,i (x_i - b_i),   b_i <- b_i + a (x_i - b_i - y)
 
-The offsets `b` are learnt from differences `x_i - y` alone, which the common rate is not in: it passes with a gain of
-exactly 1, whatever the set is. As `sum_i c_S,i (x_i - b_i - y) = 0`, learning leaves `sum_i c_S,i b_i` as it is: while
-the set stays the same, the output is the weighted sum of the live sensors minus a constant, with nothing of the
-learning in it, and when the set changes the new constant makes the two outputs meet.
+The offsets `b` are learnt from differences `x_i - y` alone, which do not hold the common rate: the rate passes with a
+gain of exactly 1, whatever the set is. As `sum_i c_S,i (x_i - b_i - y) = 0`, learning leaves `sum_i c_S,i b_i` as it
+is: while the set stays the same, the output is the weighted sum of the live sensors minus a constant, independent of
+the learning, and when the set changes the new constant joins the two outputs without a step.
 """
 
 from __future__ import annotations
@@ -19,83 +19,55 @@ import torch
 from torch import Tensor, nn
 
 from gyrofuse._base.checks import check_n_samples, check_positive, check_positive_integer, check_signal
+from gyrofuse._base.deprecation import warn_deprecated
 from gyrofuse._base.linalg import check_positive_definite
 from gyrofuse.fusion.result import SVOResult
-from gyrofuse.fusion.weights.svo import ScaleWeights, resolve_scale_weights
+from gyrofuse.fusion.svo import fit_svo
+from gyrofuse.fusion.weights.subsets import solve_subsets
+from gyrofuse.fusion.weights.svo import ScaleWeights, check_scale_weights
+from gyrofuse.io.recording import Recording
 from gyrofuse.io.saturation import check_full_scale
+from gyrofuse.wavelets.moments import combined_covariance
 
-_RAMP_STEPS = 8  # in which a sensor that has returned gets its weight back
-_BLOCK = 2**17  # sensor samples worked on at a time
-# A level of fewer observations than this does not tell how long to average.
-_TELLING = 4.0
-
-
-def subset_weights(wccv: Tensor, scale_weights: ScaleWeights, live: Tensor) -> Tensor:
-    """Optimal weights of any live subset of an array, from the covariance of all of it; differentiable.
-
-    `c_S = A_SS^-1 1 / (1' A_SS^-1 1)` with `A = sum_j omega_j Gamma_j`: what a fit without the other sensors gives.
-    A subset that comes up again and again, as when it varies over time, is solved once.
-
-    Args:
-        wccv: `(..., level, sensor, sensor)`, signal^2.
-        scale_weights: `"flat"`, `"short"`, `"long"`, or one number >= 0 per level.
-        live: `(..., sensor)`, bool; its leading dimensions broadcast with those of `wccv`, so that
-            `(time, sensor)` goes with one array.
-
-    Returns:
-        `(..., sensor)`, sum 1, 0 for a sensor that is not live; NaN where none is.
-
-    Raises:
-        TypeError: `wccv` is not a floating point tensor, or `live` is not boolean.
-        ValueError: Wrong shape or scale weights.
-        SingularCovarianceError: `A_SS` is not positive definite.
-
-    References:
-        [Z] equation (7).
-    """
-    if wccv.ndim < 3 or wccv.shape[-1] != wccv.shape[-2]:
-        raise ValueError(f"`wccv`: expected (..., level, sensor, sensor), got shape {tuple(wccv.shape)}")
-    if live.dtype != torch.bool:
-        raise TypeError(f"`live`: expected a boolean tensor, got {live.dtype}; compare with something")
-    if live.shape[-1:] != wccv.shape[-1:]:
-        raise ValueError(f"`live`: expected (..., sensor) with {wccv.shape[-1]} sensors, got shape {tuple(live.shape)}")
-    omega = resolve_scale_weights(scale_weights, wccv.shape[-3]).to(wccv)
-    return _solve_subsets(_combined(wccv, omega), live, check=True)
+# Number of steps in which the weight of a sensor that has returned grows: each moves the output by an eighth of what a
+# jump would.
+_RAMP_STEPS = 8
 
 
 class LiveSVO(nn.Module):
     """A virtual gyro of a stream in which sensors leave and return, without a step in its output.
 
-    A missing (non-finite) sample takes its sensor out for as long as it lasts; the others go on with their own optimal
+    A missing (non-finite) sample takes its sensor out while it lasts; the others are fused with their own optimal
     weights. Output is NaN while no sensor is live. A sensor that is back after at most `hold` samples has its weight
-    again at once, with the offset it left with. After longer its offset may have moved: it is watched for `settle`
-    samples, which give its offset anew, and its weight then grows over as many again. Sensors that come back when
-    no other is there to compare with are taken with the offsets they had.
+    again at once, with the offset it left with. After a longer absence its offset may have moved: it is estimated
+    again from `settle` samples, and the weight then grows over as many samples. Sensors that come back when no other is
+    live keep their old offsets.
 
-    Until a sensor first leaves, the output is that of plain SVO. Later it is plain SVO less a constant: what the offset
-    of a sensor did while it was away, nobody saw, and the output is kept where it was. Chunks of any length give what
-    the whole stream gives at once.
+    Until a sensor first leaves, the output is that of plain SVO. Later it is plain SVO less a constant, as the
+    drift of an offset during an absence is unknown. Chunks of any length give the same output as the whole stream at
+    once.
 
-    Differences between sensors also hold what their scale factors differ by, times the rate: under fast rotation the
-    offsets, and with them the output after a change of the set, are off by a fraction of that.
+    Differences between sensors also hold the difference of their scale factors times the rate: under fast rotation the
+    offsets, and with them the output after a change of the set, are off by a fraction of it.
 
     Args:
-        result: Fit of the array at rest, `method` `"svo"`, `"inverse_variance"` or `"equal"`.
+        scale_weights: `"flat"`, `"short"`, `"long"`, or one number >= 0 per level.
+        method: `"svo"`, `"inverse_variance"` or `"equal"`.
+        n_levels: Number of levels J of the fit.
         time_constant: Samples over which offsets are averaged. By default a quarter of the wavelet length at which a
-            sensor that leaves would step the output least, by the fit: half the averaging time of the smallest Allan
-            deviation, since an exponential average looks back twice as far as its time constant.
-        hold: Longest absence in samples after which a sensor is trusted; `time_constant` by default.
-        settle: Samples that a sensor is watched after a longer absence; `time_constant` by default.
-        full_scale: Values of this size or above are missing, one number or `(..., sensor)`. Without guard samples:
-            `mask_saturated` has those.
+            sensor that leaves would step the output least: half the averaging time of the smallest Allan deviation, as
+            an exponential average reaches back twice its time constant.
+        hold: Longest absence in samples after which a sensor keeps its offset; `time_constant` by default.
+        settle: Samples from which the offset is estimated after a longer absence; `time_constant` by default.
+        full_scale: Values of this size or above are missing, one number or `(..., sensor)`. No guard samples as
+            by `mask_saturated`.
 
     Raises:
-        TypeError: `result` is not an `SVOResult`.
-        ValueError: A result of another method, a number out of range, or full scales of another shape than the sensors.
-        SingularCovarianceError: The combined covariance of the result is not positive definite.
+        TypeError, ValueError: Bad scale weights, or a number out of range.
 
     Example:
-        >>> live = LiveSVO(fit_svo(calibration, "long"))
+        >>> live = LiveSVO("long")
+        >>> live.fit(calibration)  # (..., sensor, time)
         >>> for chunk in chunks:  # each (..., sensor, time)
         ...     virtual = live(chunk)  # (..., time)
     """
@@ -110,36 +82,94 @@ class LiveSVO(nn.Module):
 
     def __init__(
         self,
-        result: SVOResult,
+        scale_weights: ScaleWeights | SVOResult = "flat",
         *,
+        method: str = "svo",
+        n_levels: int | None = None,
         time_constant: float | None = None,
         hold: int | None = None,
         settle: int | None = None,
         full_scale: float | Tensor | None = None,
+        result: SVOResult | None = None,
     ) -> None:
         super().__init__()
+        if isinstance(scale_weights, SVOResult):
+            result, scale_weights = scale_weights, scale_weights.scale_weights
+        check_scale_weights(scale_weights)
+        self.scale_weights, self.method, self.n_levels = scale_weights, method, n_levels
+        self._time_constant = time_constant and max(check_positive("time_constant", time_constant), 1.0)
+        self._hold = None if hold is None else check_n_samples("hold", hold)
+        self._settle = None if settle is None else check_positive_integer("settle", settle)
+        self._limit = torch.inf if full_scale is None else full_scale
+        for name in ("combined", "time_constant", "full_scale", *_STATE):
+            self.register_buffer(name, torch.empty(0, dtype=torch.float64))
+        if result is not None:
+            warn_deprecated("LiveSVO(result)", "LiveSVO.from_result(result)")
+            self._take(result)
+
+    @classmethod
+    def from_result(cls, result: SVOResult, **options: Any) -> LiveSVO:
+        """A layer with the weights of a fit.
+
+        Args:
+            result: Fit of the array at rest, by method `"svo"`, `"inverse_variance"` or `"equal"`.
+            **options: `time_constant`, `hold`, `settle` and `full_scale`, as for the constructor.
+
+        Raises:
+            TypeError: `result` is not an `SVOResult`.
+            ValueError: A result of another method, a number out of range, or full scales of another shape than the
+                sensors.
+            SingularCovarianceError: The combined covariance of the result is not positive definite.
+        """
         if not isinstance(result, SVOResult):
             raise TypeError(
                 f"`result`: expected an SVOResult, got {type(result).__name__}; "
                 "fit the array at rest with fit_svo(signal)"
             )
+        layer = cls(result.scale_weights, n_levels=result.n_levels, **options)
+        layer._take(result)
+        return layer
+
+    def fit(self, signal: Tensor | Recording) -> SVOResult:
+        """Choose the weights from a recording at rest and keep them; the stream begins anew.
+
+        Args:
+            signal: `(..., sensor, time)` or a `Recording`.
+
+        Returns:
+            The result of `fit_svo`.
+
+        Raises:
+            TypeError, ValueError, SingularCovarianceError: As `fit_svo` and `from_result`.
+        """
+        result = fit_svo(signal, self.scale_weights, method=self.method, n_levels=self.n_levels)
+        self._take(result)
+        return result
+
+    def _take(self, result: SVOResult) -> None:
         combined = _covariance_of(result)
-        if time_constant is None:
+        if self._time_constant is None:
             time = _tracking_time(result, combined)
         else:
-            time = torch.full_like(combined[..., 0, 0], max(check_positive("time_constant", time_constant), 1.0))
-        longest = round(time.max().item())
-        self.hold = longest if hold is None else check_n_samples("hold", hold)
-        self.settle = longest if settle is None else check_positive_integer("settle", settle)
-        limit = check_full_scale(torch.inf if full_scale is None else full_scale, combined.shape[:-1])
-        self.register_buffer("combined", combined)
-        self.register_buffer("time_constant", time)
-        self.register_buffer("full_scale", limit.to(combined))
-        for name in _STATE:
-            self.register_buffer(name, combined.new_empty(0))
+            time = torch.full_like(combined[..., 0, 0], self._time_constant)
+        limit = check_full_scale(self._limit, combined.shape[:-1]).to(combined)
+        with torch.inference_mode(False):  # so that they can be used in training later
+            self.combined, self.time_constant, self.full_scale = (v.detach().clone() for v in (combined, time, limit))
+        self.method = result.method
+        self.reset()
+
+    @property
+    def hold(self) -> int:
+        """Longest absence in samples after which a sensor keeps its offset."""
+        return round(self.time_constant.max().item()) if self._hold is None else self._hold
+
+    @property
+    def settle(self) -> int:
+        """Samples from which the offset of a sensor is estimated after a longer absence."""
+        return round(self.time_constant.max().item()) if self._settle is None else self._settle
 
     def reset(self) -> None:
-        """Forget the stream: offsets, and which sensors were there."""
+        """Begin another stream: without offsets, and with no sensor seen yet."""
         for name in _STATE:
             setattr(self, name, self.combined.new_empty(0))
 
@@ -153,9 +183,12 @@ class LiveSVO(nn.Module):
             `(..., time)`.
 
         Raises:
+            RuntimeError: No weights yet.
             TypeError: `signal` is not a floating point tensor.
             ValueError: Another number of sensors, or another batch shape than before.
         """
+        if self.combined.numel() == 0:
+            raise RuntimeError("LiveSVO has no weights yet: call fit(signal), or load a state_dict")
         check_signal("signal", signal)
         batch = self._start(signal)
         n_items, n_sensors, n_samples = batch.numel(), *signal.shape[-2:]
@@ -166,7 +199,8 @@ class LiveSVO(nn.Module):
         items = signal.reshape(n_items, n_sensors, n_samples)
         state = _State(*(getattr(self, name).reshape(n_items, -1) for name in _STATE))
         fused = [signal.new_empty(n_items, 0)]
-        for block in items.split(max(_BLOCK // max(n_items * n_sensors, 1), 1), dim=-1):
+        # 2**17 samples of sensors at a time: 1 MiB, so that all that is computed from them stays in cache.
+        for block in items.split(max(131_072 // max(n_items * n_sensors, 1), 1), dim=-1):
             if block.shape[-1]:
                 live = block.isfinite() & (block.abs() < limit)
                 virtual, state = self._advance(torch.where(live, block, 0.0).double(), live, combined, gain, state)
@@ -176,7 +210,9 @@ class LiveSVO(nn.Module):
         return torch.cat(fused, -1).view(*batch, n_samples)
 
     def extra_repr(self) -> str:
-        """Show the numbers that were given or found."""
+        """Show the scale weights, or the numbers once they are fitted."""
+        if self.combined.numel() == 0:
+            return f"scale_weights={self.scale_weights!r}"
         times = self.time_constant.flatten().tolist()
         time = f"{times[0]:.6g}" if len(set(times)) == 1 else f"{min(times):.6g}..{max(times):.6g}"
         return f"n_sensors={self.combined.shape[-1]}, time_constant={time}, hold={self.hold}, settle={self.settle}"
@@ -226,7 +262,7 @@ class LiveSVO(nn.Module):
 
         fused = torch.einsum("tnp,npt->nt", weights[segment], signal)
         with torch.no_grad():
-            # Trusted sensors share one gain, which keeps sum_i c_i b_i; those that settle have a plain mean.
+            # Settled sensors share one gain, which keeps sum_i c_i b_i; the others have a plain mean.
             shared = torch.maximum(1 / n_tracked.clamp(min=1).to(gain), gain)
             mean = 1 / age.clamp(min=1).to(gain)
             rate = torch.where(stage > 1, shared.unsqueeze(-2), torch.where(stage == 1, mean, 0.0))
@@ -241,7 +277,7 @@ class LiveSVO(nn.Module):
         return virtual, _State(offsets, gap, age[..., -1], n_tracked[..., -1:])
 
     def _ages(self, live: Tensor, state: _State) -> tuple[Tensor, Tensor]:
-        """Live samples of each sensor since it was last away for too long, `(item, sensor, time)`; and its last gap."""
+        """Live samples of each sensor since its last long absence, `(item, sensor, time)`; and its last gap."""
         time = torch.arange(live.shape[-1], device=live.device)
         seen = live.cumsum(-1)
         before = -1 - state.gap.unsqueeze(-1)
@@ -254,7 +290,7 @@ class LiveSVO(nn.Module):
             latest = torch.where(anew, time, -1).cummax(-1).values
             counted = torch.gather(origin, -1, latest.clamp(min=0))
             age = seen - torch.where(latest >= 0, counted, -state.age.unsqueeze(-1))
-            # Where no live sensor is trusted, the live ones have to be: those that were there before, if any.
+            # Where no live sensor has settled, live sensors count as settled: those with old offsets, if any.
             alone = live.any(-2) & ~(live & (age > self.settle)).any(-2)  # (item, time)
             if not bool(alone.any()):
                 return age, time[-1] - last[..., -1]
@@ -276,12 +312,12 @@ class LiveSVO(nn.Module):
             further = stage > step
             sets.append(torch.where(further.any(-1, keepdim=True), further, sets[-1]))
         some = sets[0].any(-1, keepdim=True)
-        weights = _solve_subsets(combined.unsqueeze(-3), torch.stack(sets, -2)).mean(-2)
+        weights = solve_subsets(combined.unsqueeze(-3), torch.stack(sets, -2)).mean(-2)
         return torch.where(some, weights, 0.0)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
         # The shape of the stream is known only from what is loaded.
-        for name in _STATE:
+        for name in ("combined", "time_constant", "full_scale", *_STATE):
             loaded = state_dict.get(prefix + name)
             if loaded is not None:
                 setattr(self, name, torch.empty_like(loaded, device=self.combined.device))
@@ -289,12 +325,12 @@ class LiveSVO(nn.Module):
 
 
 class _State(NamedTuple):
-    """What a stream carries on.
+    """State of a stream.
 
     Attributes:
         offsets: `(item, sensor)`.
         gap: Samples since each sensor was last live, `(item, sensor)`.
-        age: Live samples since it was last away for too long, `(item, sensor)`.
+        age: Live samples since its last absence of more than `hold` samples, `(item, sensor)`.
         n_tracked: Samples so far with a live sensor, `(item, 1)`.
     """
 
@@ -331,42 +367,12 @@ def _averages(values: Tensor, rate: Tensor, starts: Tensor, segment: Tensor) -> 
 
 
 def _expands(shape: torch.Size, to: torch.Size) -> bool:
-    pairs = zip(reversed(shape), reversed(to), strict=False)
-    return len(shape) <= len(to) and all(own in (1, other) for own, other in pairs)
-
-
-def _solve_subsets(combined: Tensor, live: Tensor, *, check: bool = False) -> Tensor:
-    """Weights `(..., sensor)` of live subsets, each distinct one solved once."""
-    batch = torch.broadcast_shapes(combined.shape[:-2], live.shape[:-1])
-    n_sensors = combined.shape[-1]
-    item = torch.arange(combined[..., 0, 0].numel(), device=live.device).view(combined.shape[:-2]).expand(batch)
-    item, masks = item.reshape(-1), live.expand(*batch, n_sensors).reshape(-1, n_sensors)
-    code = item
-    for word in masks.split(32, dim=-1):
-        bits = (word.long() << torch.arange(word.shape[-1], device=word.device)).sum(-1)
-        code = torch.unique((code << 32) | bits, return_inverse=True)[1]
-    one = torch.zeros(int(code.max()) + 1 if code.numel() else 0, dtype=torch.int64, device=code.device)
-    one[code] = torch.arange(len(code), device=code.device)  # any one of each kind
-    mask = masks[one]
-    both = mask[:, :, None] & mask[:, None, :]
-    matrix = torch.where(
-        both, combined.reshape(-1, n_sensors, n_sensors)[item[one]], torch.diag_embed(~mask).to(combined)
-    )
-    if check:
-        check_positive_definite("the wavelet cross-covariance of live sensors combined over scales", matrix)
-    solved = torch.linalg.solve(matrix, mask.to(combined))
-    weights = solved / solved.sum(-1, keepdim=True)
-    return weights[code].view(*batch, n_sensors)
-
-
-def _combined(wccv: Tensor, omega: Tensor) -> Tensor:
-    """`A = sum_j omega_j Gamma_j`, [Z] equation (6); levels that do not count may be unknown (NaN)."""
-    return torch.einsum("j,...jik->...ik", omega, torch.where(omega[:, None, None] > 0, wccv, 0.0))
+    return len(shape) <= len(to) and all(n in (1, m) for n, m in zip(reversed(shape), reversed(to), strict=False))
 
 
 def _covariance_of(result: SVOResult) -> Tensor:
     """The matrix whose optimal weights, of all sensors and of any subset, are those of the result's method."""
-    combined = _combined(result.wavelet_cross_covariance.double(), result.scale_weights.double())
+    combined = combined_covariance(result.wavelet_cross_covariance.double(), result.scale_weights)
     check_positive_definite("the wavelet cross-covariance combined over scales", combined, result.sensors)
     if result.method == "svo":
         return combined
@@ -384,10 +390,11 @@ def _tracking_time(result: SVOResult, combined: Tensor) -> Tensor:
     """Time constant in samples for which a sensor that leaves steps the output least, at least 1."""
     n_sensors = combined.shape[-1]
     others = ~torch.eye(n_sensors, dtype=torch.bool, device=combined.device)
-    step = _solve_subsets(combined.unsqueeze(-3), others) - _solve_subsets(
+    step = solve_subsets(combined.unsqueeze(-3), others) - solve_subsets(
         combined, torch.ones_like(others[0])
     ).unsqueeze(-2)
     variance = torch.einsum("...ai,...jik,...ak->...j", step, result.wavelet_cross_covariance.double(), step)
-    telling = (result.degrees_of_freedom >= _TELLING) & variance.isfinite()
-    level = torch.where(telling, variance, torch.inf).argmin(-1) + 1
+    # A level of fewer than four observations has its smallest variance by chance.
+    judged = (result.dof >= 4) & variance.isfinite()
+    level = torch.where(judged, variance, torch.inf).argmin(-1) + 1
     return torch.exp2(level.double() - 2).clamp(min=1.0)

@@ -19,14 +19,11 @@ responses of the bands, and `D_l` is what that octave, `[2**-(l+1), 2**-l]` cycl
 
     D_l = Gamma_l - Gamma_{l+1} / 4,   |H_l|^2 - |H_{l+1}|^2 / 4 = |H_l|^2 (1 - cos^4(pi f tau_l / 2)) >= 0.
 
-A Haar filter lets slower noise through too, a quarter of what the next level's lets through. With that taken off, the
-covariance between bands follows from the wavelet cross-covariance alone, without a model: weights from the true `Gamma`
-of the arrays of [Z] come within 1.10 (white noise and random walks) and 1.06 (AR1s) of every level's optimum, where one
-vector comes to 3.9 and 1.7.
+A Haar filter also passes slower noise, a quarter of the power that the next level's filter passes. With that
+subtracted, the covariance between bands follows from the wavelet cross-covariance alone, without a model.
 
-The last levels hold fewer observations than sensors. The shapes of neighbouring levels are alike, so each is shrunk
-towards the one below it, as if that were worth another 6 observations per sensor: the top bands lean on what is known,
-and levels with data of their own keep it.
+The last levels hold fewer observations than sensors. Cross-covariances of neighbouring levels are similar up to their
+size, so each level is shrunk towards the level below it, with the weight of 6 further observations per sensor.
 """
 
 from __future__ import annotations
@@ -36,32 +33,33 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import pad
 
 from gyrofuse._base.checks import check_floating, check_positive_integer, check_signal
+from gyrofuse._base.deprecation import warn_deprecated
 from gyrofuse._base.linalg import check_positive_definite
+from gyrofuse.fusion.layer import FittedLayer
 from gyrofuse.fusion.multiscale_result import MultiScaleResult, fuse_bands
 from gyrofuse.fusion.svo import fit_svo
 from gyrofuse.fusion.uncertainty.cross_fitting import CrossFit, Fusion, cross_fit
 from gyrofuse.fusion.weights.svo import ScaleWeights
 from gyrofuse.io.recording import Recording
-from gyrofuse.wavelets.covariance import binned_products
-from gyrofuse.wavelets.equivalent_dof import degrees_of_freedom
+from gyrofuse.io.signals import as_recording
+from gyrofuse.wavelets.intervals import equivalent_dof
 from gyrofuse.wavelets.long_run_variance import bin_length
+from gyrofuse.wavelets.moments import Moments
 from gyrofuse.wavelets.pilot import fit_pilot
 
-# Observations per sensor that the level below is worth. Out of sample, 4 to 10 are within 2 % of each other.
+# Weight of the level below when a level is shrunk towards it, in observations per sensor. Wavelet variances out of
+# sample are within 2 % of each other for 4 to 10.
 _POOLING = 6.0
-# The least share of a level that is noise of its own octave: it is 7/8 in white noise, 1/2 in a random walk, 0 in a
-# drift, and less than 0 only by chance.
+# Fraction of a level's noise that is of its own octave, at least: 7/8 for white noise, 1/2 for a random walk, 0 for a
+# drift, and below 0 only by chance.
 _LEAST_OWN = 0.05
-# A band of its own wants a level of this many observations.
-_OBSERVATIONS = 30.0
-# What a level without weight still counts: it settles bands that no other level sees.
+# Relative importance of a level without scale weight, small enough not to move the others: it determines the weights of
+# bands that no other level depends on.
 _IDLE = 1e-6
-_NODES = 64  # frequencies of an octave
-_DRAWS_AT_ONCE = 25  # programmes of all bands and sensors that are solved together
 
 
 def fit_multiscale(
@@ -78,12 +76,12 @@ def fit_multiscale(
 
     Args:
         signal: `(..., sensor, time)` of at least two sensors, or a `Recording`; NaN = missing sample.
-        scale_weights: How much each level counts, relative to the best it can have: `"flat"`, `"short"`, `"long"`, or
+        scale_weights: How much each level counts, relative to its optimum: `"flat"`, `"short"`, `"long"`, or
             one number >= 0 per level.
-        n_bands: Number of bands K + 1; the filter then remembers `2**K` samples. By default as many as there are
-            levels with 30 observations, plus one for what is slower.
+        n_bands: Number of bands K + 1; the filter then remembers `2**K` samples. By default one
+            for each level with at least 30 observations, and one for all that is slower.
         n_levels: Number of levels J, as for `fit_svo`.
-        confidence_level: Of every interval in the result.
+        confidence_level: Confidence level of every interval in the result.
 
     Returns:
         The weights of every band, and the wavelet variances before and after.
@@ -100,10 +98,10 @@ def fit_multiscale(
     if n_bands is not None:
         n_bands = check_positive_integer("n_bands", n_bands)
     single = fit_svo(signal, scale_weights, n_levels=n_levels, confidence_level=confidence_level, covariance="none")
-    values = signal.signal if isinstance(signal, Recording) else signal
-    degrees = single.degrees_of_freedom
+    values, dof = as_recording(signal).values, single.dof
     if n_bands is None:
-        n_bands = 1 + int((degrees >= _OBSERVATIONS).reshape(-1, single.n_levels).all(0).sum())
+        # The weights of p sensors need several observations each.
+        n_bands = 1 + int((dof >= 30).reshape(-1, single.n_levels).all(0).sum())
     if n_bands > single.n_levels + 1:
         raise ValueError(
             f"`n_bands`: expected at most {single.n_levels + 1} for {single.n_levels} levels, got {n_bands}; "
@@ -114,27 +112,34 @@ def fit_multiscale(
         "the wavelet cross-covariance of level 1", wccv[..., 0, :, :], single.sensors, dtype=values.dtype
     )
     omega = single.scale_weights.double()
-    weights, optimum = _fitted(wccv, degrees, omega, n_bands)
+    weights, optimum = _fitted(wccv, dof, omega, n_bands)
     with torch.no_grad():
-        fit, in_sample = _judged(weights, values, wccv, omega, confidence_level)
+        fit, in_sample = _cross_fitted(weights, values, wccv, omega, confidence_level)
     return MultiScaleResult(
         weights=weights.to(values.dtype),
-        in_sample_wavelet_variance=in_sample.to(values.dtype),
+        fused_wavelet_variance=in_sample.to(values.dtype),
         cross_fit=fit,
         optimal_wavelet_variance=optimum.to(values.dtype),
         single=single,
     )
 
 
-class MultiScaleSVO(nn.Module):
+class MultiScaleSVO(FittedLayer):
     """A multi-scale virtual gyro as a layer: `fit` chooses the weights of every band, `forward` fuses.
 
-    The weights are a buffer: they are saved in `state_dict`, follow `.to(...)`, and are not trained. A stream in chunks
-    of any length carries its state from chunk to chunk and gives what one go gives. Without a state every call starts
-    anew: until `2**k` samples have come, the mean over them is that of the samples so far.
+    The weights are a buffer: they are saved in `state_dict`, follow `.to(...)`, and are not trained. `forward` starts
+    anew with every call: until `2**k` samples have come, the mean over them is that of the samples so far. A stream in
+    chunks of any length goes through `stream`, which carries a state from chunk to chunk and gives the same output as
+    the whole stream at once.
 
     Args:
         n_bands: Number of bands K + 1; from the recording by default, see `fit_multiscale`.
+        scale_weights: How much each level counts, see `fit_multiscale`.
+        n_levels: Number of levels J.
+        confidence_level: Confidence level of the intervals in the result of `fit`.
+
+    Raises:
+        TypeError, ValueError: Bad scale weights, or a number of bands that is not a whole number of at least 1.
 
     Example:
         >>> svo = MultiScaleSVO()
@@ -142,23 +147,29 @@ class MultiScaleSVO(nn.Module):
         >>> virtual = svo(signal)  # (..., time)
         >>> state = svo.start(signal)
         >>> for chunk in signal.split(100, dim=-1):
-        ...     virtual, state = svo(chunk, state)
+        ...     virtual, state = svo.stream(chunk, state)
     """
 
-    weights: Tensor
-
-    def __init__(self, n_bands: int | None = None) -> None:
-        super().__init__()
+    def __init__(
+        self,
+        n_bands: int | None = None,
+        scale_weights: ScaleWeights = "flat",
+        *,
+        n_levels: int | None = None,
+        confidence_level: float = 0.95,
+    ) -> None:
+        super().__init__(scale_weights, n_levels=n_levels, confidence_level=confidence_level)
         self.n_bands = None if n_bands is None else check_positive_integer("n_bands", n_bands)
-        self.register_buffer("weights", torch.empty(0, 0, dtype=torch.float64))
 
-    def fit(self, signal: Tensor | Recording, scale_weights: ScaleWeights = "flat", **options: Any) -> MultiScaleResult:
+    def fit(
+        self, signal: Tensor | Recording, scale_weights: ScaleWeights | None = None, **options: Any
+    ) -> MultiScaleResult:
         """Choose the weights from a recording at rest and keep them.
 
         Args:
             signal: `(..., sensor, time)` or a `Recording`.
-            scale_weights: How much each level counts, see `fit_multiscale`.
-            **options: As for `fit_multiscale`.
+            scale_weights: Scale weights of the constructor; deprecated here.
+            **options: Options of the constructor; deprecated here.
 
         Returns:
             The result of `fit_multiscale`.
@@ -166,9 +177,11 @@ class MultiScaleSVO(nn.Module):
         Raises:
             TypeError, ValueError, SingularCovarianceError: As `fit_multiscale`; the weights then stay as they were.
         """
-        result = fit_multiscale(signal, scale_weights, n_bands=self.n_bands, **options)
-        with torch.inference_mode(False):  # so that they can be used in training later
-            self.weights = result.weights.detach().clone()
+        if scale_weights is not None or options:
+            warn_deprecated("MultiScaleSVO.fit with options", "MultiScaleSVO(n_bands, scale_weights, ...)")
+        chosen = self.scale_weights if scale_weights is None else scale_weights
+        result = fit_multiscale(signal, chosen, n_bands=self.n_bands, **(self.options | options))
+        self.keep(result.weights)
         return result
 
     def start(self, signal: Tensor) -> Tensor:
@@ -178,74 +191,92 @@ class MultiScaleSVO(nn.Module):
             signal: `(..., sensor, time)`, of the dimensions, dtype and device of the chunks to come.
 
         Raises:
+            RuntimeError: No weights yet.
             TypeError: `signal` is not a floating point tensor.
             ValueError: It has fewer than two dimensions.
         """
-        self._check_fitted()
+        self.check_fitted()
         check_signal("signal", signal)
         return signal.new_zeros(*signal.shape[:-1], 2 ** (self.weights.shape[-2] - 1) - 1)
 
-    def forward(self, signal: Tensor, state: Tensor | None = None) -> Tensor | tuple[Tensor, Tensor]:
-        """Fuse `(..., sensor, time)` into `(..., time)`; given the state of a stream, return it too, moved on.
+    def stream(self, signal: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Fuse the next chunk of a stream.
 
-        A time at which any sensor lacks its sample gives NaN, and is left out of what follows.
+        Args:
+            signal: `(..., sensor, time)`, right after the chunk before.
+            state: State of the stream, from `start` or from the call before.
+
+        Returns:
+            The virtual signal `(..., time)`, as `forward`, and the state after it.
 
         Raises:
+            RuntimeError: No weights yet.
             TypeError: `signal` is not a floating point tensor, or `state` not one of its dtype.
             ValueError: `signal` or `state` does not fit the weights.
         """
-        self._check_fitted()
+        self.check_fitted()
         check_signal("signal", signal)
-        if state is not None and check_floating("state", state).dtype != signal.dtype:
+        if check_floating("state", state).dtype != signal.dtype:
             raise TypeError(
                 f"`state`: expected {signal.dtype} as the signal has, got {state.dtype}; give chunks of one dtype, or "
                 f"convert with state.to({signal.dtype})"
             )
-        virtual, after = fuse_bands(self.weights, signal, state)
-        return virtual if state is None else (virtual, after)
+        return fuse_bands(self.weights, signal, state)
+
+    def forward(self, signal: Tensor, state: Tensor | None = None) -> Tensor:
+        """Fuse a signal.
+
+        A time at which any sensor lacks its sample gives NaN, and is left out of all later means.
+
+        Args:
+            signal: `(..., sensor, time)`.
+            state: State of a stream; deprecated, use `stream`.
+
+        Returns:
+            `(..., time)`.
+
+        Raises:
+            RuntimeError: No weights yet.
+            TypeError: `signal` is not a floating point tensor.
+            ValueError: `signal` does not fit the weights.
+        """
+        if state is not None:
+            warn_deprecated("MultiScaleSVO(...)(signal, state)", "MultiScaleSVO(...).stream(signal, state)", 4)
+            return self.stream(signal, state)  # type: ignore[return-value]
+        self.check_fitted()
+        return fuse_bands(self.weights, signal)[0]
 
     def extra_repr(self) -> str:
         """Show the number of bands."""
         return f"n_bands={self.n_bands}"
 
-    def _check_fitted(self) -> None:
-        if self.weights.numel() == 0:
-            raise RuntimeError("MultiScaleSVO has no weights yet: call fit(signal), or load a state_dict")
 
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
-        # The numbers of bands and sensors are known only from what is loaded.
-        loaded = state_dict.get(prefix + "weights")
-        if loaded is not None:
-            self.weights = torch.empty_like(loaded, device=self.weights.device)
-        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
-
-
-def _fitted(wccv: Tensor, degrees: Tensor, omega: Tensor, n_bands: int) -> tuple[Tensor, Tensor]:
+def _fitted(wccv: Tensor, dof: Tensor, omega: Tensor, n_bands: int) -> tuple[Tensor, Tensor]:
     """Weights `(..., band, sensor)` and the optimum `1 / (1' S_j^-1 1)` of every level, `(..., level)`."""
-    shrunk = _shrink(wccv, degrees)
+    shrunk = _shrink(wccv, dof)
     optimum = torch.linalg.solve(shrunk, _ones(shrunk)).sum(-1).reciprocal()
     return _stacked_weights(shrunk, omega.clamp(min=_IDLE * omega.max()) / optimum, n_bands), optimum
 
 
-def _judged(
+def _cross_fitted(
     weights: Tensor, values: Tensor, wccv: Tensor, omega: Tensor, confidence_level: float
 ) -> tuple[CrossFit, Tensor]:
-    """What the weights leave in other recordings, and their variance `(..., level)` in this one."""
+    """Cross-fit of the weights, and their wavelet variance `(..., level)` in this recording."""
     n_levels, n_sensors = wccv.shape[-3:-1]
     n_samples, batch = values.shape[-1], values.shape[:-2]
     known = wccv.isfinite().all(-1).all(-1).reshape(-1, n_levels).all(0)
-    n_known = int(known.int().cumprod(0).sum())  # of a level that is not, nothing is said
+    n_known = int(known.int().cumprod(0).sum())  # the result is NaN at the other levels
     items = values.detach().reshape(-1, *values.shape[-2:])
     length = bin_length(n_samples, n_sensors)
     parts, variances = [], []
     for own, item in zip(weights.reshape(-1, *weights.shape[-2:]).split(1), items.split(1), strict=True):
-        sums, counts = binned_products(item, n_known, length)
-        pilot = fit_pilot(sums.sum(1) / counts.sum(1), n_samples)
+        moments = Moments.of(item, n_known, length)
+        pilot = fit_pilot(moments.wccv, n_samples)
         fusion = _fusion(item, length, omega[:n_known], own.shape[-2])
-        # The slowest band governs the levels that the degrees of freedom are for.
-        left = pilot.degrees_of_freedom(own[:, -1:])[..., 0]
-        parts.append(cross_fit(fusion, own, sums, counts, pilot, left, confidence_level))
-        squares, number = fusion.squares_of(own, 0, sums.shape[1], n_known)
+        # Degrees of freedom matter at the last levels, where the slowest band dominates.
+        dof = pilot.dof(own[:, -1:])[..., 0]
+        parts.append(cross_fit(fusion, own, moments, pilot, dof, confidence_level))
+        squares, number = fusion.squares_of(own, 0, moments.sums.shape[1], n_known)
         variances.append(pad(squares.sum(1) / number.sum(1), (0, n_levels - n_known), value=torch.nan))
     return CrossFit.cat(parts).padded(n_levels).reshape(*batch), torch.cat(variances).reshape(*batch, n_levels)
 
@@ -256,8 +287,8 @@ def _fusion(items: Tensor, length: int, omega: Tensor, n_bands: int) -> Fusion:
     gains = _octave_gains(n_levels, n_bands).to(omega)
 
     def weights_of(wccv: Tensor, windows: Tensor) -> Tensor:
-        some = zip(wccv.split(_DRAWS_AT_ONCE, 1), degrees_of_freedom(windows).split(_DRAWS_AT_ONCE, 1), strict=True)
-        return torch.cat([_fitted(moments, degrees, omega, n_bands)[0] for moments, degrees in some], 1)
+        some = zip(wccv.split(25, 1), equivalent_dof(windows).split(25, 1), strict=True)  # draws that fit into memory
+        return torch.cat([_fitted(drawn, dof, omega, n_bands)[0] for drawn, dof in some], 1)
 
     def variance_of(weights: Tensor, wccv: Tensor) -> Tensor:
         own = torch.cat([wccv[..., :-1, :, :] - wccv[..., 1:, :, :] / 4, wccv[..., -1:, :, :]], -3)
@@ -265,36 +296,36 @@ def _fusion(items: Tensor, length: int, omega: Tensor, n_bands: int) -> Fusion:
         return torch.einsum("...lkm,ljkm->...j", between, gains)
 
     def squares_of(weights: Tensor, first: int, last: int, levels: int) -> tuple[Tensor, Tensor]:
-        memory = 2 ** (n_bands - 1) + 2**levels  # of the filter, and of the coefficients of what it gives
+        memory = 2 ** (n_bands - 1) + 2**levels  # of the filter, and of the coefficients of its output
         start = max(0, first - -(-memory // length))
         fused, _ = fuse_bands(weights, items[..., start * length : last * length])
-        sums, counts = binned_products(fused.unsqueeze(-2), levels, length)
-        return sums[:, first - start :, :, 0, 0], counts[:, first - start :, :, 0, 0]
+        moments = Moments.of(fused.unsqueeze(-2), levels, length)
+        return moments.sums[:, first - start :, :, 0, 0], moments.counts[:, first - start :, :, 0, 0]
 
     return Fusion(weights_of, variance_of, squares_of)
 
 
-def _shrink(wccv: Tensor, degrees: Tensor) -> Tensor:
+def _shrink(wccv: Tensor, dof: Tensor) -> Tensor:
     """Each level's cross-covariance `(..., level, sensor, sensor)`, shrunk towards the shape of the level below.
 
     `S_j = (eta_j Gamma_j + m s_j S_{j-1}) / (eta_j + m)`, with `s_j = tr(S_{j-1}^-1 Gamma_j) / p` the size of level j
     in units of the level below: the mean of an inverse Wishart law given `eta_j` observations.
     """
-    worth = _POOLING * wccv.shape[-1]
+    pooling = _POOLING * wccv.shape[-1]  # m
     shrunk = [wccv[..., 0, :, :]]
-    for level, eta in zip(wccv.unbind(-3)[1:], degrees.unbind(-1)[1:], strict=True):
-        # A level that nothing is known of, which then does not count, is as the one below.
+    for level, eta in zip(wccv.unbind(-3)[1:], dof.unbind(-1)[1:], strict=True):
+        # An unknown level, whose scale weight is 0, is replaced by the level below.
         known = torch.where(level.isfinite().all(-1, keepdim=True).all(-2, keepdim=True), level, shrunk[-1])
         root, sizes = _in_units_of(shrunk[-1], known)
         sizes = sizes.clamp(min=0)  # gaps can make a level indefinite
         common = sizes.mean(-1, keepdim=True)
-        sizes = (eta[..., None] * sizes + worth * common) / (eta[..., None] + worth)
+        sizes = (eta[..., None] * sizes + pooling * common) / (eta[..., None] + pooling)
         shrunk.append((root * sizes[..., None, :]) @ root.mT)
     return torch.stack(shrunk, dim=-3)
 
 
 def _own_octaves(wccv: Tensor) -> Tensor:
-    """`D_l = Gamma_l - Gamma_{l+1} / 4`, kept positive definite; all of it at the last level."""
+    """`D_l = Gamma_l - Gamma_{l+1} / 4`, kept positive definite; `Gamma_l` at the last level."""
     below, above = wccv[..., :-1, :, :], wccv[..., 1:, :, :]
     root, sizes = _in_units_of(below, above)
     own = (root * (1 - sizes / 4).clamp(min=_LEAST_OWN)[..., None, :]) @ root.mT
@@ -330,9 +361,9 @@ def _octave_gains(n_levels: int, n_bands: int) -> Tensor:
     """Cross-band wavelet covariance `(octave, level, band, band)` of unit noise in each octave, float64.
 
     `g_jl = Re int |H_j|^2 b b* df` over the octave `[2**-(l+1), 2**-l]` and its mirror image, over its width. Means of
-    many samples turn fast at high frequencies, where they are next to nothing: few nodes do.
+    many samples oscillate fast at high frequencies, where they are next to nothing: 64 nodes are enough.
     """
-    nodes, shares = (torch.from_numpy(values) for values in np.polynomial.legendre.leggauss(_NODES))
+    nodes, shares = (torch.from_numpy(values) for values in np.polynomial.legendre.leggauss(64))
     octave = torch.arange(1, n_levels + 1, dtype=torch.float64)
     phase = torch.pi * torch.exp2(-octave)[:, None] * (3 + nodes) / 4  # pi f: (octave, node)
     length = torch.exp2(torch.arange(n_bands, dtype=torch.float64))[:, None]

@@ -1,25 +1,22 @@
-"""A fitted multi-scale virtual gyro: weights of every band, what they gain, and the causal filter that applies them."""
+"""A fitted multi-scale virtual gyro: weights of every band, and the causal filter that applies them."""
 
 from __future__ import annotations
 
 import textwrap
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from gyrofuse._base.checks import check_signal
-from gyrofuse._base.results import ConfidenceInterval, listed, numbered
-from gyrofuse.fusion.result import SVOResult, plot_deviations
+from gyrofuse._base.deprecation import RenamedAttribute
+from gyrofuse.fusion.result import SVOResult
 from gyrofuse.fusion.uncertainty.cross_fitting import CrossFit
+from gyrofuse.fusion.virtual_gyro import CrossFittedGyro
 from gyrofuse.io.recording import Recording
+from gyrofuse.io.signals import as_recording
 from gyrofuse.wavelets.tiles import tile_length
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-_MOST_SENSORS = 11  # columns of weights that a line of text holds
 
 
 def fuse_bands(weights: Tensor, signal: Tensor, state: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -39,8 +36,7 @@ def fuse_bands(weights: Tensor, signal: Tensor, state: Tensor | None = None) -> 
     Args:
         weights: `(..., band, sensor)`, each band sums to 1; the shortest time scale first.
         signal: `(..., sensor, time)`.
-        state: What the filter has kept of the past, `(..., sensor, 2**(bands - 1) - 1)`, as returned; the start of
-            a stream by default.
+        state: Past of the filter, `(..., sensor, 2**(bands - 1) - 1)`, as returned; the start of a stream by default.
 
     Returns:
         The virtual signal `(..., time)` and the state after it.
@@ -61,7 +57,7 @@ def fuse_bands(weights: Tensor, signal: Tensor, state: Tensor | None = None) -> 
         state = signal.new_zeros(shape)
     elif state.shape != shape:
         raise ValueError(f"`state`: expected shape {shape} for this signal, got {tuple(state.shape)}")
-    # c_1, c_2 - c_1, ...: what each mean adds; the first sensor is the reference.
+    # Weights a_0, a_1, ... of the means: c_1, c_2 - c_1, ...; the first sensor is the reference.
     steps = torch.cat([weights[..., :1, 1:], weights[..., 1:, 1:].diff(dim=-2, prepend=weights[..., :1, 1:])], dim=-2)
     steps = steps.to(signal.dtype)
     if torch.compiler.is_compiling():
@@ -104,38 +100,52 @@ def _filter(steps: Tensor, signal: Tensor, state: Tensor) -> tuple[Tensor, Tenso
     return virtual, torch.cat(kept, dim=-1) if kept else state
 
 
-def well_observed(degrees: Tensor, n_sensors: int) -> Tensor:
-    """Levels `(..., level)` that, like all below them, hold no fewer observations than there are sensors.
+def well_observed(dof: Tensor, n_sensors: int) -> Tensor:
+    """Levels that, like all levels below them, hold no fewer observations than there are sensors.
 
     Args:
-        degrees: Independent observations, `(..., level)`.
+        dof: Independent observations, `(..., level)`.
         n_sensors: Number of sensors.
+
+    Returns:
+        `(..., level)`, bool.
     """
-    return (degrees >= n_sensors).int().cumprod(-1).bool()
+    return (dof >= n_sensors).int().cumprod(-1).bool()
 
 
 @dataclass(frozen=True, eq=False)
-class MultiScaleResult:
+class MultiScaleResult(CrossFittedGyro):
     """A fitted multi-scale virtual gyro. Batched over the leading dimensions of the signal; index it to get one item.
 
     Attributes:
         weights: `(..., band, sensor)`; each band sums to 1, weights may be negative. Band `k = 1..K` is the difference
             between the means over the last `2**(k-1)` and `2**k` samples, the last band the mean over `2**K`.
-        in_sample_wavelet_variance: `(..., level)`, of the recording itself fused with these weights, signal^2; they
-            flatter themselves in it.
-        cross_fit: How that compares with their variance in other recordings.
+        fused_wavelet_variance: `(..., level)`, wavelet variance of the recording itself fused with these weights,
+            signal^2; too small, as the weights were chosen in it.
+        cross_fit: How the wavelet variance in other recordings compares with that in this one.
         optimal_wavelet_variance: `(..., level)`, estimate of the smallest wavelet variance that one vector of weights
             can have at that level alone, `1 / (1' S_j^-1 1)`, signal^2, where `S_j` is `Gamma_j` shrunk towards the
-            level below; on the low side at the last levels. No lower bound of `virtual_wavelet_variance`: bands weigh
-            the time scales within a level apart, and they are chosen from the very recording.
+            level below; too small at the last levels. No lower bound of `virtual_wavelet_variance`: bands weigh the
+            time scales within a level separately, and weights are chosen from the same recording.
         single: One vector of weights for all scales, by `fit_svo` from the same recording and scale weights.
     """
 
     weights: Tensor
-    in_sample_wavelet_variance: Tensor
+    fused_wavelet_variance: Tensor
     cross_fit: CrossFit
     optimal_wavelet_variance: Tensor
     single: SVOResult
+
+    degrees_of_freedom = RenamedAttribute("dof")
+    _batched = ("weights", "fused_wavelet_variance", "cross_fit", "optimal_wavelet_variance", "single")
+    _contents = tuple(
+        (
+            "method sensors axes rate unit n_samples motion n_bands weights scale_weights tau dof "
+            "wavelet_cross_covariance wavelet_variance virtual_wavelet_variance in_sample_wavelet_variance "
+            "optimal_wavelet_variance equal_wavelet_variance single_wavelet_variance single_weights"
+        ).split()
+    )
+    _keys: ClassVar[dict[str, str]] = {"dof": "degrees_of_freedom"}
 
     @property
     def method(self) -> str:
@@ -148,9 +158,19 @@ class MultiScaleResult:
         return self.weights.shape[-2]
 
     @property
-    def n_levels(self) -> int:
-        """Number of levels J."""
-        return self.single.n_levels
+    def wavelet_cross_covariance(self) -> Tensor:
+        """`(..., level, sensor, sensor)`, signal^2."""
+        return self.single.wavelet_cross_covariance
+
+    @property
+    def single_wavelet_variance(self) -> Tensor:
+        """Wavelet variance of one vector of weights for all scales, in other recordings, `(..., level)`."""
+        return self.single.virtual_wavelet_variance
+
+    @property
+    def single_weights(self) -> Tensor:
+        """One vector of weights for all scales, `(..., sensor)`."""
+        return self.single.weights
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -183,154 +203,69 @@ class MultiScaleResult:
         return self.single.scale_weights
 
     @property
-    def degrees_of_freedom(self) -> Tensor:
+    def dof(self) -> Tensor:
         """`(..., level)`, independent observations of the virtual gyro that a level holds."""
-        return self.single.degrees_of_freedom
+        return self.single.dof
 
     @property
     def confidence_level(self) -> float:
-        """Of the intervals."""
+        """Confidence level of the intervals."""
         return self.single.confidence_level
 
     @property
-    def tau(self) -> Tensor:
-        """Averaging time of each level, and of each band but the last, which holds all that is slower."""
-        return self.single.tau
-
-    @property
-    def wavelet_variance(self) -> Tensor:
-        """Wavelet variance of every sensor, `(..., level, sensor)`."""
-        return self.single.wavelet_variance
-
-    @property
-    def equal_wavelet_variance(self) -> Tensor:
-        """Wavelet variance of the plain mean of the sensors, `(..., level)`."""
-        return self.single.equal_wavelet_variance
+    def in_sample_wavelet_variance(self) -> Tensor:
+        """Wavelet variance of the recording itself fused with these weights, `(..., level)`."""
+        return self.fused_wavelet_variance
 
     @property
     def motion(self) -> str:
         """A warning that the array seems to have moved while it was fitted, or an empty string."""
         return self.single.motion
 
-    @property
-    def virtual_wavelet_variance(self) -> Tensor:
-        """Wavelet variance of the virtual gyro in other recordings of the array, cross-fitted, `(..., level)`."""
-        return self.in_sample_wavelet_variance * (1 + self.cross_fit.optimism).to(self.weights)
-
-    def interval_of(self, wavelet_variance: Tensor) -> ConfidenceInterval:
-        """Limits `(..., level)` of `virtual_wavelet_variance`, or of that of another combination as slow as it."""
-        return self.cross_fit.limits_of(wavelet_variance)
-
     def virtual(self, signal: Tensor | Recording) -> Tensor:
         """Fuse a signal with these weights: `(..., sensor, time)` to `(..., time)`.
 
         A sample that any sensor lacks is NaN; the signal starts anew, see `MultiScaleSVO` for streams.
+
+        Args:
+            signal: `(..., sensor, time)`, or a `Recording`.
+
+        Raises:
+            TypeError: Neither a floating point tensor nor a `Recording`.
+            ValueError: Another number of sensors.
         """
-        values = signal.signal if isinstance(signal, Recording) else signal
-        return fuse_bands(self.weights, values)[0]
+        return fuse_bands(self.weights, as_recording(signal).values)[0]
 
-    def __getitem__(self, item: Any) -> MultiScaleResult:
-        """One item, or some, of the leading batch dimensions."""
-        single = self.single[item]
-        batched = ("weights", "in_sample_wavelet_variance", "cross_fit", "optimal_wavelet_variance")
-        return replace(self, single=single, **{name: getattr(self, name)[item] for name in batched})
-
-    def summary(self) -> str:
-        """The weights of every band and the gain per level, as fixed-width text."""
-        if self.weights.ndim > 2:
-            names = self.axes or numbered(self.weights.shape[0])
-            parts = [f"[{name}]\n{self[i].summary()}" for i, name in enumerate(names[:8])]
-            if len(names) > 8:
-                parts.append(f"... and {len(names) - 8} more")
-            return "\n\n".join(parts)
-        unit, second = self.unit or "signal", "s" if self.rate else "samples"
-        rate = f", {self.rate:.6g} Hz" if self.rate else ""
-        shown = self.sensors[:_MOST_SENSORS]
+    def _summary_of_one(self) -> str:
+        shown = self.sensors[:11]  # columns of weights in a line of text
         more = f" (first {len(shown)} of {len(self.sensors)} sensors)" if len(shown) < len(self.sensors) else ""
         lines = [
-            f"Multi-scale virtual gyro ({self.n_bands} bands) of {len(self.sensors)} sensors, "
-            f"{self.n_samples} samples{rate}",
+            self._headline(f"Multi-scale virtual gyro ({self.n_bands} bands)"),
             "",
             f"Weights of each band of time scale tau{more}",
-            f"{f'tau ({second})':>13}  " + " ".join(f"{name[:8]:>8}" for name in shown),
+            f"{f'tau ({self.time_unit})':>13}  " + " ".join(f"{name[:8]:>8}" for name in shown),
         ]
         places = [f"{tau:.6g}" for tau in self.tau[: self.n_bands - 1].tolist()] + ["longer"]
         lines += [
             f"{place:>13}  " + " ".join(f"{weight:>+8.4f}" for weight in row[: len(shown)])
             for place, row in zip(places, self.weights.tolist(), strict=True)
         ]
-        lines += [
-            "",
-            f"Allan deviation ({unit}) at averaging time tau, of the virtual gyro and one vector in other recordings",
-            f"{'level':>5}  {f'tau ({second})':>13}  {'best sensor':>12}  {'equal':>12}  {'one vector':>12}"
-            f"  {'virtual':>12}  {'virtual/equal':>13}",
-        ]
-        best, equal, one, virtual = (
-            (2 * variance).sqrt()
-            for variance in (
-                self.wavelet_variance.amin(-1),
-                self.equal_wavelet_variance,
-                self.single.virtual_wavelet_variance,
-                self.virtual_wavelet_variance,
-            )
-        )
-        columns = (self.tau, best, equal, one, virtual, virtual / equal)
-        for j, row in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
-            tau, *deviations, ratio = row
-            numbers = "  ".join(f"{value:>12.5g}" for value in deviations)
-            lines.append(f"{j + 1:>5}  {tau:>13.6g}  {numbers}  {ratio:>13.4f}")
-        few = ~well_observed(self.degrees_of_freedom, len(self.sensors)) & self.virtual_wavelet_variance.isfinite()
+        columns = {
+            "best sensor": self.wavelet_variance.amin(-1),
+            "equal": self.equal_wavelet_variance,
+            "one vector": self.single_wavelet_variance,
+            "virtual": self.virtual_wavelet_variance,
+        }
+        lines += ["", *self._deviation_table("of the virtual gyro and one vector in other recordings", columns)]
+        few = ~well_observed(self.dof, len(self.sensors)) & self.virtual_wavelet_variance.isfinite()
         if bool(few.any()):
-            start = f"{self.tau[int(few.nonzero()[0])].item():.6g} {second}"
-            most = self.degrees_of_freedom[few].max().item()
-            told = (
+            start = f"{self.tau[int(few.nonzero()[0])].item():.6g} {self.time_unit}"
+            most = self.dof[few].max().item()
+            caution = (
                 f"Few observations: from {start} on, {most:.2g} or less, fewer than sensors; what is gained there "
                 "follows from a model of the noise, and another recording has to confirm it."
             )
-            lines += ["", textwrap.fill(told, 110)]
+            lines += ["", textwrap.fill(caution, 110)]
         if self.motion:
             lines += ["", f"Warning: {self.motion}."]
         return "\n".join(lines)
-
-    def __str__(self) -> str:
-        return self.summary()
-
-    def plot(self, ax: Axes | None = None) -> Axes:
-        """Draw the Allan deviation of every sensor, the plain mean and the virtual gyro, with the latter's band.
-
-        Args:
-            ax: Where to draw; new axes by default.
-
-        Returns:
-            The axes.
-
-        Raises:
-            ValueError: The result holds a batch; index it first.
-        """
-        virtual = self.virtual_wavelet_variance
-        return plot_deviations(self.single, virtual, self.interval_of(virtual), ax)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Everything as plain lists and numbers, ready for JSON (NaN as None)."""
-        return {
-            "method": self.method,
-            "sensors": list(self.sensors),
-            "axes": list(self.axes),
-            "rate": self.rate,
-            "unit": self.unit,
-            "n_samples": self.n_samples,
-            "motion": self.motion,
-            "n_bands": self.n_bands,
-            "weights": listed(self.weights),
-            "scale_weights": listed(self.scale_weights),
-            "tau": listed(self.tau),
-            "degrees_of_freedom": listed(self.degrees_of_freedom),
-            "wavelet_cross_covariance": listed(self.single.wavelet_cross_covariance),
-            "wavelet_variance": listed(self.wavelet_variance),
-            "virtual_wavelet_variance": listed(self.virtual_wavelet_variance),
-            "in_sample_wavelet_variance": listed(self.in_sample_wavelet_variance),
-            "optimal_wavelet_variance": listed(self.optimal_wavelet_variance),
-            "equal_wavelet_variance": listed(self.equal_wavelet_variance),
-            "single_wavelet_variance": listed(self.single.virtual_wavelet_variance),
-            "single_weights": listed(self.single.weights),
-        }

@@ -1,23 +1,25 @@
-"""Weights from a recording that is larger than memory, by one process or by many that each take a stretch of time."""
+"""Recordings larger than memory: their weights, and their virtual gyro as a file, by one process or by many."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from gyrofuse._base.checks import check_n_levels, largest_level
-from gyrofuse._base.distributed import all_or_none, place
-from gyrofuse._base.linalg import check_positive_definite
-from gyrofuse._base.results import listed
+from gyrofuse._base.checks import check_floating, check_n_levels, largest_level
+from gyrofuse._base.distributed import all_or_none, place, told_by_first
+from gyrofuse._base.files import Outputs
 from gyrofuse.fusion.result import fuse
 from gyrofuse.fusion.virtual_gyro import VirtualGyro
 from gyrofuse.fusion.weights.svo import (
     ScaleWeights,
-    combine,
-    counting,
+    checked_combination,
     normalised,
     optimal_weights,
     resolve_scale_weights,
@@ -27,10 +29,11 @@ from gyrofuse.wavelets.metric import WaveletCrossCovariance
 
 if TYPE_CHECKING:
     from lightning.fabric import Fabric
-    from matplotlib.axes import Axes
 
-# Numbers of the past that the longest wavelet looks back on, unless more levels are asked for: 128 MiB.
-_PAST = 2**24
+
+# Samples of all sensors that the longest wavelet may reach back over, unless more levels are asked for (2**24): 128
+# MiB.
+_PAST = 16_777_216
 
 
 def stream_svo(
@@ -52,11 +55,11 @@ def stream_svo(
         recording: What is read.
         scale_weights: `"flat"`, `"short"`, `"long"`, or one number >= 0 per level.
         n_levels: Number of levels J. By default as many as there are scale weights, else the largest with
-            `2**J <= n_samples` whose past fits into 128 MiB, and for which there are complete windows.
+            `2**J <= n_samples` whose `2**J` samples of every sensor fit into 128 MiB, and which has complete windows.
         chunk_samples: Samples of each sensor that are read at a time; by default 16 MiB.
         fabric: The processes, `lightning.fabric.Fabric(...)` after its `launch()`; all of them call this function
             with the same recording, and all get the result. By default this process alone.
-        progress: Is told what is done and the share that is, of this process's stretch.
+        progress: Called with a word for the work and the fraction of this process's stretch that is done.
 
     Returns:
         The weights and the wavelet cross-covariance that they rest on.
@@ -81,7 +84,7 @@ def stream_svo(
     if asked is None and not isinstance(scale_weights, str):
         asked = len(normalised(scale_weights))
     n_levels = check_n_levels(asked if asked is not None else _most_levels(recording), recording.n_samples)
-    resolve_scale_weights(scale_weights, n_levels)  # what is wrong with them is told now, not after hours
+    resolve_scale_weights(scale_weights, n_levels)  # wrong scale weights are an error now, not after hours
     rank, world_size = place(fabric)
     with all_or_none("`recording`: was not read to its end", world_size):
         metric = measure_stretch(
@@ -103,13 +106,10 @@ def stream_svo(
             f"got {int(windows[:n_levels].sum())}; record longer or leave sensors out"
         )
     wccv = sums[:n_levels] / counts[:n_levels]
-    omega = resolve_scale_weights(scale_weights, n_levels)
-    combined = combine(counting(wccv, omega), omega)
-    check_positive_definite("the wavelet cross-covariance combined over scales", combined, recording.sensors)
     return StreamedSVOResult(
-        weights=optimal_weights(combined),
+        weights=optimal_weights(checked_combination(wccv, scale_weights, recording.sensors)),
         wavelet_cross_covariance=wccv,
-        scale_weights=omega,
+        scale_weights=resolve_scale_weights(scale_weights, n_levels),
         n_samples=recording.n_samples,
         sensors=recording.sensors,
         rate=recording.rate,
@@ -135,10 +135,10 @@ def measure_stretch(
         recording: What is read.
         n_levels: Number of levels J.
         start: First sample of the stretch.
-        stop: Where the next one begins.
+        stop: First sample after the stretch.
         chunk_samples: Samples of each sensor that are read at a time; by default 16 MiB.
         device: Where the arithmetic is done; the CPU by default.
-        progress: Is told what is done and the share that is.
+        progress: Called with a word for the work and the fraction that is done.
 
     Raises:
         ValueError: `chunk_samples` is not a whole number of at least 1.
@@ -176,65 +176,125 @@ class StreamedSVOResult(VirtualGyro):
     rate: float | None = None
     unit: str | None = None
 
+    _contents = tuple(
+        (
+            "method sensors rate unit n_samples weights scale_weights tau wavelet_cross_covariance wavelet_variance "
+            "virtual_wavelet_variance equal_wavelet_variance"
+        ).split()
+    )
+
+    @property
+    def method(self) -> str:
+        """How the weights were chosen, `"svo"`."""
+        return "svo"
+
     def virtual(self, signal: Tensor) -> Tensor:
-        """Fuse a chunk `(..., sensor, time)` into `(..., time)`; a sample that any sensor lacks is NaN."""
+        """Fuse a chunk into `(..., time)`; a sample that any sensor lacks is NaN.
+
+        Args:
+            signal: `(..., sensor, time)`.
+        """
         return fuse(self.weights.to(signal), signal)
 
-    def summary(self) -> str:
-        """The weights and the gain over equal weights per level, as fixed-width text."""
+    def _summary_of_one(self) -> str:
         width = max(6, *(len(sensor) for sensor in self.sensors))
         lines = [
-            self._headline("SVO, streamed"),
+            self._headline("Virtual gyro (SVO, streamed)"),
             "",
             f"{'sensor':<{width}}  {'weight':>10}",
             *(f"{s:<{width}}  {w:>+10.5f}" for s, w in zip(self.sensors, self.weights.tolist(), strict=True)),
             "",
-            *self._deviation_table(),
+            *self._plain_table("this recording"),
         ]
         return "\n".join(lines)
 
-    def __str__(self) -> str:
-        return self.summary()
 
-    def plot(self, ax: Axes | None = None) -> Axes:
-        """Draw the Allan deviation of every sensor, the plain mean and the virtual gyro.
+def write_virtual(
+    recording: ChunkedRecording,
+    weights: Tensor,
+    path: str | Path,
+    *,
+    chunk_samples: int | None = None,
+    fabric: Fabric | None = None,
+    force: bool = False,
+    progress: Progress = silent,
+) -> None:
+    """Fuse a long recording with given weights into a `.npy` file `(time,)`, float64, chunk by chunk.
 
-        Args:
-            ax: Where to draw; new axes by default.
+    Each process writes its stretch of time. The file appears whole or not at all; a sample that any sensor lacks is
+    NaN.
 
-        Returns:
-            The axes.
-        """
-        from gyrofuse.fusion import plots as plotting
+    Args:
+        recording: Recording that is fused.
+        weights: `(sensor,)`.
+        path: Name of the file, on a file system that all processes share.
+        chunk_samples: Samples of each sensor that are read at a time; by default 16 MiB.
+        fabric: The processes, as for `stream_svo`.
+        force: Whether an existing file may be replaced.
+        progress: Called with a word for the work and the fraction of this process's stretch that is done.
 
-        return plotting.plot_allan_deviation(
-            self.tau,
-            self.wavelet_variance,
-            names=self.sensors,
-            virtual=self.virtual_wavelet_variance,
-            equal=self.equal_wavelet_variance,
-            unit=self.unit,
-            in_seconds=self.rate is not None,
-            ax=ax,
+    Raises:
+        TypeError: `recording` is not a `ChunkedRecording`, or `weights` no floating point tensor.
+        ValueError: The name does not end in .npy or is that of the recording, or there is not one weight for each
+            sensor.
+        FileExistsError: The file exists and `force` is not set.
+        FileNotFoundError: The folder does not exist.
+        RuntimeError: `fabric` was not launched, or another process failed.
+    """
+    check_chunked_recording(recording)
+    path = Path(path)
+    if path.suffix.lower() != ".npy":
+        raise ValueError(f"`path`: expected a name that ends in .npy, got {path.name!r}")
+    if recording.path is not None and path.resolve() == recording.path:
+        raise ValueError(f"`path`: expected another file than the log that is read, got {path}; choose another name")
+    check_floating("weights", weights)
+    if weights.shape != (recording.n_sensors,):
+        raise ValueError(
+            f"`weights`: expected one for each of {recording.n_sensors} sensors, got shape {tuple(weights.shape)}"
         )
+    start, stop = shard_bounds(recording.n_samples, *place(fabric))
+    values = weights.detach().to("cpu", torch.float64)
+    with _draft_for_all(path, recording.n_samples, fabric, force=force) as (draft, offset), draft.open("r+b") as file:
+        file.seek(offset + 8 * start)
+        for end, chunk in recording.chunks(start, stop, chunk_samples):
+            file.write(fuse(values, chunk).numpy().astype("<f8", copy=False).data)
+            progress("writing", (end - start) / (stop - start))
 
-    def to_dict(self) -> dict[str, Any]:
-        """Everything as plain lists and numbers, ready for JSON (NaN as None)."""
-        return {
-            "method": "svo",
-            "sensors": list(self.sensors),
-            "rate": self.rate,
-            "unit": self.unit,
-            "n_samples": self.n_samples,
-            "weights": listed(self.weights),
-            "scale_weights": listed(self.scale_weights),
-            "tau": listed(self.tau),
-            "wavelet_cross_covariance": listed(self.wavelet_cross_covariance),
-            "wavelet_variance": listed(self.wavelet_variance),
-            "virtual_wavelet_variance": listed(self.virtual_wavelet_variance),
-            "equal_wavelet_variance": listed(self.equal_wavelet_variance),
-        }
+
+@contextmanager
+def _draft_for_all(path: Path, n_samples: int, fabric: Fabric | None, *, force: bool) -> Iterator[tuple[Path, int]]:
+    """A `.npy` file (time,) that all processes write to, and where its numbers begin.
+
+    It takes its name when all of them are done, and vanishes when one fails.
+    """
+    rank, world_size = place(fabric)
+    with ExitStack() as stack:
+        found: tuple[Path, int] | Exception | None = None
+        if rank == 0:
+            try:
+                draft = stack.enter_context(Outputs([path], force=force))[path]
+                found = draft, _make_npy(draft, n_samples)
+            except (OSError, ValueError) as error:
+                found = error  # sent to the other processes, which would wait for ever
+        found = told_by_first(found, world_size)
+        if isinstance(found, Exception):
+            raise found
+        with all_or_none(f"{path}: was not written", world_size):
+            yield found
+    if fabric is not None:
+        fabric.barrier()  # the file has its name before anyone goes on
+
+
+def _make_npy(draft: Path, n_samples: int) -> int:
+    """Make a file of the final size, and return where its numbers begin."""
+    with draft.open("wb") as file:
+        header = {"descr": "<f8", "fortran_order": False, "shape": (n_samples,)}
+        np.lib.format.write_array_header_1_0(file, header)
+        offset = file.tell()
+        file.truncate(offset + 8 * n_samples)
+    return offset
 
 
 def _most_levels(recording: ChunkedRecording) -> int:
+    """The largest number of levels whose `2**J` samples of every sensor fit into 128 MiB."""
     return max(1, min(largest_level(recording.n_samples), largest_level(_PAST // recording.n_sensors)))

@@ -13,8 +13,7 @@ from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.side import Side
 from gyrofuse.mismatch.spectra import hann_transform
 from gyrofuse.wavelets.covariance import wavelet_variance
-from gyrofuse.wavelets.equivalent_dof import normal_quantile
-from gyrofuse.wavelets.intervals import wavelet_variance_interval
+from gyrofuse.wavelets.intervals import normal_quantile, wavelet_variance_interval
 
 _LEVEL = 0.95
 _FEWEST_WINDOWS = 2  # of the last level that is compared

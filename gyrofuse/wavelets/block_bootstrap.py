@@ -6,12 +6,9 @@ sensors and levels, are drawn with replacement, the last one cut to fit; each le
 covariance of such sums over all draws, what endless resamples give, are known without drawing.
 
 **Where it is wrong.** A block keeps correlation up to lag `l`, and products of coefficients are correlated up to lag
-`tau_j = 2**j`: at levels with `tau_j` far above `l` the spread comes out too small. Nominal 95 % intervals of the
-wavelet variance of white noise and a random walk, 2**13 samples, 8 levels, blocks of `T^(1/3) = 20`, held the truth in
-94 % of 300 recordings at level 1, 88 % at level 5 and **58 %** at level 8 (87 % with the default block length).
-Trimming has its price too. Where the last level has fewer than half of the `T` samples the spread is too small at *all*
-levels, in variance by about `2 M_J / T`, and the last levels themselves are beyond it: with 12 levels of 2**13 samples
-60 % at level 11, **10 %** at level 12. The Gaussian intervals of `fit_svo(covariance="model")` have neither flaw.
+`tau_j = 2**j`: at levels with `tau_j` far above `l` the variance is too small. Trimming makes it smaller still: where
+the last level has fewer than half of the `T` samples the variance is too small at *all* levels, by about `2 M_J / T`,
+and that of the last levels themselves says nothing. The intervals of `fit_svo(covariance="model")` have neither flaw.
 
 Missing samples: blocks bring their gaps along, and a resampled moment is the mean of the products that it has; in
 closed form, to first order.
@@ -31,19 +28,20 @@ from gyrofuse._base.checks import check_confidence_level, check_n_levels, check_
 from gyrofuse._base.random import own_generator
 from gyrofuse._base.results import ConfidenceInterval
 from gyrofuse.wavelets.block_length import (
+    BlockSums,
     alike,
     check_block_length,
     default_block_length,
+    moments_over_starts,
     n_columns,
     warn_of_few_columns,
 )
-from gyrofuse.wavelets.blocks import BlockSums, moments_over_starts
 from gyrofuse.wavelets.covariance import wavelet_products
+from gyrofuse.wavelets.haar import coefficients_by_level
 
-# Numbers held at a time: products of coefficients, sums looked up, samples of resampled signals.
-_PRODUCTS = 2**21
-_LOOKUPS = 2**20
-_RESAMPLED = 2**24
+# Numbers of float64 held at a time, be they products of coefficients, sums looked up or resampled signals: 16 MiB, more
+# than the cache and little beside a recording.
+_AT_ONCE = 2_097_152
 
 
 def block_bootstrap(
@@ -56,8 +54,8 @@ def block_bootstrap(
 ) -> Tensor:
     """Resample the wavelet cross-covariance by blocks of wavelet coefficients, [Z] Algorithm 1.
 
-    Too narrow at scales beyond the blocks: nominal 95 % intervals of levels with `tau_j` far above `l` hold the truth
-    in 15 to 60 % of recordings. Too narrow everywhere when the last level has few coefficients. See the module.
+    Too narrow at levels with `tau_j` far above the block length, and at all levels when the last level has few
+    coefficients; see the module.
     Block sums are differences of cumulative sums of centred products, right to about 1e-10. Memory: a few
     times that of the signal.
 
@@ -110,7 +108,7 @@ def signal_bootstrap(
 
     For jointly stationary signals only: where a signal wanders (random walk, drift) the blocks meet in jumps that it
     does not have. Even then every window across a seam is no window of the recording, so that at scales beyond the
-    blocks the resamples are off in size and not only too narrow. Takes a wavelet cross-covariance for every resample.
+    blocks the resamples are biased and not only too narrow. Costs one wavelet cross-covariance for every resample.
 
     Args:
         signal: `(..., sensor, time)`, any unit; NaN = missing sample.
@@ -138,7 +136,7 @@ def signal_bootstrap(
     for length, items in alike(lengths):
         starts, _ = draw_starts(seed, n_resamples, n_levels, n_samples, length)
         some = values[items]
-        at_once = max(1, _RESAMPLED // some.numel())
+        at_once = max(1, _AT_ONCE // some.numel())
         for first in range(0, n_resamples, at_once):
             which = starts[first : first + at_once, :, None] + torch.arange(length)  # (resample, block, time)
             times = which.flatten(1)[:, :n_samples].to(signal.device)
@@ -153,9 +151,8 @@ def bootstrap_wccv_covariance(
     """Covariance of the entries of the wavelet cross-covariance: `block_bootstrap` for endless resamples.
 
     `V* / T` of [Z] (his `V*` is `T` times the covariance). For small arrays and few levels: memory is a few times
-    `time * level * sensor * (sensor + 1) / 2` numbers. Too small at scales beyond the blocks: nominal 95 % intervals of
-    levels with `tau_j` far above `l` hold the truth in 15 to 60 % of recordings. Too small everywhere when the last
-    level has few coefficients. See the module.
+    `time * level * sensor * (sensor + 1) / 2` numbers. Too small at levels with `tau_j` far above the block length, and
+    at all levels when the last level has few coefficients; see the module.
 
     Args:
         signal: `(..., sensor, time)`, any unit; NaN = missing sample.
@@ -196,8 +193,8 @@ def bootstrap_wccv_interval(
 ) -> ConfidenceInterval:
     """Interval of each entry of the wavelet cross-covariance, by the normal law and `block_bootstrap`'s limit.
 
-    Too narrow at scales beyond the blocks: nominal 95 % intervals of levels with `tau_j` far above `l` hold the truth
-    in 15 to 60 % of recordings. Too narrow everywhere when the last level has few coefficients. See the module.
+    Too narrow at levels with `tau_j` far above the block length, and at all levels when the last level has few
+    coefficients; see the module.
     The normal law is poor where a level holds few independent coefficients; limits of a variance may be negative.
     For variances alone, give each sensor as an array of one, `signal.unsqueeze(-2)`.
 
@@ -237,7 +234,18 @@ def bootstrap_wccv_interval(
 
 
 def draw_starts(seed: int, n_resamples: int, n_levels: int, columns: int, length: int) -> tuple[Tensor, Tensor]:
-    """Starts of the blocks `(resample, block)` and of the completing stretches `(resample, level)`."""
+    """Draw where blocks start.
+
+    Args:
+        seed: Of the draw.
+        n_resamples: Number of resamples H.
+        n_levels: Number of levels J.
+        columns: Times that all levels share.
+        length: Length of a block.
+
+    Returns:
+        Starts of the blocks `(resample, block)` and of the completing stretches `(resample, level)`.
+    """
     generator = torch.Generator().manual_seed(seed)
     n_blocks = -(-columns // length)
     starts = torch.randint(columns - length + 1, (n_resamples, n_blocks), generator=generator)
@@ -248,9 +256,9 @@ def closed_form(influences: list[Tensor], columns: int, length: int) -> Tensor:
     """Second moment about the estimate of resampled sums of influences, over all draws.
 
     Args:
-        influences: `(item, row, M_j)` of each level, which sum to 0 over all times; each level has rows of its own.
+        influences: `(item, row, M_j)` of each level, which sum to 0 over all times; every level has its own rows.
         columns: Times that all levels share.
-        length: Of a block.
+        length: Length of a block.
 
     Returns:
         `(item, row, row)`, rows of all levels in order.
@@ -292,8 +300,8 @@ class _Products(NamedTuple):
 def _products_by_level(values: Tensor, n_levels: int) -> Iterator[Iterator[_Products]]:
     """Products of each level in turn, some pairs at a time, of signals `(item, sensor, time)`."""
     pairs = torch.triu_indices(values.shape[1], values.shape[1], device=values.device)
-    at_once = max(1, _PRODUCTS // (len(values) * values.shape[-1]))
-    for w in _coefficients(values, n_levels):
+    at_once = max(1, _AT_ONCE // (len(values) * values.shape[-1]))
+    for w in coefficients_by_level(values.double(), n_levels):
         yield (_products(w, *some) for some in pairs.split(at_once, dim=-1))
 
 
@@ -306,17 +314,6 @@ def _products(w: Tensor, first: Tensor, second: Tensor) -> _Products:
     counts = exist.sum(-1, keepdim=True, dtype=torch.float64)
     means = torch.where(exist, products, 0.0).sum(-1, keepdim=True) / counts
     return _Products(torch.where(exist, products - means, 0.0), means, counts, exist.to(torch.float64))
-
-
-def _coefficients(values: Tensor, n_levels: int) -> Iterator[Tensor]:
-    """Wavelet coefficients `(item, sensor, M_j)` of each level in turn, float64, by their first sample; NaN = none."""
-    known = torch.where(values.isfinite(), values, torch.nan).to(torch.float64)
-    smooth = known - known.nanmean(-1, keepdim=True)
-    for level in range(n_levels):
-        lag = 2**level
-        past, now = smooth[..., :-lag], smooth[..., lag:]
-        yield (now - past) / 2
-        smooth = (now + past) / 2
 
 
 def _stretches(series: Tensor, length: int) -> Tensor:
@@ -332,7 +329,7 @@ def _resampled_sums(series: Tensor, columns: int, length: int, starts: Tensor, c
     missing = series.shape[-1] - columns
     ends = torch.full_like(starts, length)
     ends[:, n_whole:] = rest  # the last block is cut to fit
-    at_once = max(1, _LOOKUPS // (series.shape[0] * series.shape[1] * starts.shape[1]))
+    at_once = max(1, _AT_ONCE // (series.shape[0] * series.shape[1] * starts.shape[1]))
     sums = [
         (total[..., to] - total[..., since]).sum(-1)
         for since, to in zip(starts.split(at_once), (starts + ends).split(at_once), strict=True)
@@ -355,7 +352,7 @@ def _checked(signal: Tensor, n_levels: int | None) -> tuple[Tensor, int]:
 
 
 def _lengths_for_coefficients(values: Tensor, n_levels: int, block_length: int | None) -> Tensor:
-    """Block length of each item for blocks of coefficients, which the times that all levels share have to bear."""
+    """Block length of each item for blocks of coefficients, no longer than the times that all levels share."""
     warn_of_few_columns(values.shape[-1], n_levels, stacklevel=4)
     if block_length is not None:
         return torch.full((len(values),), check_block_length(block_length, values.shape[-1], n_levels))
@@ -363,11 +360,11 @@ def _lengths_for_coefficients(values: Tensor, n_levels: int, block_length: int |
 
 
 def _lengths(values: Tensor, n_levels: int, n_entries: int, block_length: int | None) -> Tensor:
-    """Block length of each item, by default for the squared coefficients of the level that asks for the longest."""
+    """Block length of each item, by default the longest that the squared coefficients of any level need."""
     if block_length is not None:
         return torch.full((len(values),), check_block_length(block_length, n_entries))
     longest = torch.ones(len(values), dtype=torch.int64)
-    for w in _coefficients(values, n_levels):
+    for w in coefficients_by_level(values.double(), n_levels):
         power = w.square().nan_to_num_(nan=0.0)
         relative = (power / power.mean(-1, keepdim=True)).nan_to_num_(nan=0.0)  # (item, sensor, time)
         series = relative.sum(-2, keepdim=True)[..., :n_entries]

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from gyrofuse._base.checks import check_floating, check_n_levels, check_signal
 from gyrofuse.wavelets.haar import haar_coefficients
-from gyrofuse.wavelets.tiles import WaveletProducts, tile_length
+from gyrofuse.wavelets.moments import Moments
 
 
 def wavelet_cross_covariance(signal: Tensor, n_levels: int | None = None) -> Tensor:
@@ -92,8 +92,8 @@ def cross_covariance(coefficients: list[Tensor]) -> Tensor:
         check_floating("coefficients", level)
         known = level.isfinite()
         filled = torch.where(known, level, 0.0)
-        counted = known.to(level.dtype)
-        levels.append((filled @ filled.transpose(-1, -2)) / (counted @ counted.transpose(-1, -2)))
+        present = known.to(level.dtype)
+        levels.append((filled @ filled.transpose(-1, -2)) / (present @ present.transpose(-1, -2)))
     return torch.stack(levels, dim=-3)
 
 
@@ -101,16 +101,29 @@ class CrossCovariance(nn.Module):
     """`cross_covariance` as a layer: a list of coefficients to the wavelet cross-covariance."""
 
     def forward(self, coefficients: list[Tensor]) -> Tensor:
-        """Map the list over level of `(..., sensor, time_j)` to `(..., level, sensor, sensor)`."""
+        """Map coefficients to their wavelet cross-covariance.
+
+        Args:
+            coefficients: List over level of `(..., sensor, time_j)`.
+
+        Returns:
+            `(..., level, sensor, sensor)`.
+
+        Raises:
+            TypeError, ValueError: As `cross_covariance`.
+        """
         return cross_covariance(coefficients)
 
 
 def mean_products(sums: Tensor, counts: Tensor) -> Tensor:
-    """Divide sums of products by their counts, warning once about levels that hold none.
+    """Divide sums of products by their counts, with one warning that names the levels without any product.
 
     Args:
-        sums: `(..., level, sensor, sensor)`.
-        counts: The same shape.
+        sums: Sums of products, `(..., level, sensor, sensor)`.
+        counts: Number of products in each sum, of the same shape.
+
+    Returns:
+        Means of the same shape, NaN without any product.
     """
     empty = (counts == 0).movedim(-3, 0).flatten(1).any(1).nonzero().flatten() + 1
     if empty.numel():
@@ -123,39 +136,14 @@ def mean_products(sums: Tensor, counts: Tensor) -> Tensor:
 
 
 def wavelet_products(signal: Tensor, n_levels: int) -> tuple[Tensor, Tensor]:
-    """Sums and counts `(..., level, sensor, sensor)` of a whole recording, float64."""
-    sums, counts = binned_products(signal, n_levels)
-    return sums.squeeze(-4), counts.squeeze(-4)
-
-
-def binned_products(signal: Tensor, n_levels: int, bin_length: int | None = None) -> tuple[Tensor, Tensor]:
-    """Sums and counts `(..., bin, level, sensor, sensor)` of the products in each bin of time, float64.
+    """Sums of products of wavelet coefficients over a whole recording.
 
     Args:
         signal: `(..., sensor, time)`.
         n_levels: Number of levels J.
-        bin_length: Samples of a bin, a power of two; by default the whole recording is one bin. A coefficient belongs
-            to the bin of its newest sample.
+
+    Returns:
+        Sums and counts, `(..., level, sensor, sensor)` each, float64.
     """
-    *batch, n_sensors, length = signal.shape
-    items = signal.reshape(-1, n_sensors, length)
-    # As many short recordings at a time as fill one tile.
-    group = max(1, tile_length(n_sensors, signal.device, None) // max(length, 1))
-    sums: list[Tensor] = []
-    counts: list[Tensor] = []
-    for some in items.split(group):
-        products = WaveletProducts(
-            some.shape[0],
-            n_sensors,
-            n_levels,
-            dtype=signal.dtype,
-            device=signal.device,
-            length=length,
-            bin_length=bin_length,
-        )
-        products.update(some)
-        for parts, total in zip((sums, counts), products.totals(), strict=True):
-            parts.append(total.permute(1, 2, 0, 3, 4))  # (item, bin, level, sensor, sensor)
-    n_bins = sums[0].shape[1]
-    shape = (*batch, n_bins, n_levels, n_sensors, n_sensors)
-    return torch.cat(sums).view(shape), torch.cat(counts).view(shape)
+    moments = Moments.of(signal, n_levels)
+    return moments.sums.squeeze(-4), moments.counts.squeeze(-4)

@@ -13,6 +13,8 @@ The pyramid only averages, so it is well conditioned; differences of long cumula
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -45,6 +47,24 @@ def haar_coefficients(signal: Tensor, n_levels: int | None = None) -> list[Tenso
     return _pyramid(signal, _kernel(signal), check_n_levels(n_levels, signal.shape[-1]))
 
 
+def coefficients_by_level(signal: Tensor, n_levels: int) -> Iterator[Tensor]:
+    """Coefficients of one level after the other, so that no more than one level is in memory.
+
+    Args:
+        signal: `(..., time)`; a non-finite sample is missing.
+        n_levels: Number of levels J.
+
+    Yields:
+        `(..., time - 2**j + 1)` for `j = 1..J`; NaN where the window holds a missing sample.
+    """
+    known = torch.where(signal.isfinite(), signal, torch.nan)
+    smooth = known - known.nanmean(-1, keepdim=True)
+    for level in range(n_levels):
+        past, now = smooth[..., : -(2**level)], smooth[..., 2**level :]
+        yield (now - past) / 2
+        smooth = (now + past) / 2
+
+
 class HaarFilterBank(nn.Module):
     """`haar_coefficients` as fixed, depthwise, dilated conv1d layers without trainable parameters.
 
@@ -63,7 +83,17 @@ class HaarFilterBank(nn.Module):
         self.register_buffer("kernel", _kernel(torch.empty(0, dtype=torch.float64)), persistent=False)
 
     def forward(self, signal: Tensor) -> list[Tensor]:
-        """Map `(..., sensor, time)` to the list over level of `(..., sensor, time - 2**j + 1)`."""
+        """Map a signal to its coefficients.
+
+        Args:
+            signal: `(..., sensor, time)`.
+
+        Returns:
+            A list over level of `(..., sensor, time - 2**j + 1)`.
+
+        Raises:
+            TypeError, ValueError: As `haar_coefficients`.
+        """
         check_signal("signal", signal)
         check_n_levels(self.n_levels, signal.shape[-1])
         return _pyramid(signal, self.kernel.to(signal.dtype), self.n_levels)

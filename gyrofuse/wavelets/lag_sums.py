@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# Lags summed one by one between two corners of s(lag); wider stretches are integrated.
+# Number of lags between two corners of s(lag) up to which they are summed one by one; the sum over a wider stretch is
+# an integral by Gauss-Legendre with 8 nodes, exact to rounding for the functions between corners.
 _ONE_BY_ONE = 48
-_NODES, _NODE_WEIGHTS = np.polynomial.legendre.leggauss(8)
 
 
 @functools.lru_cache(maxsize=8)
@@ -138,6 +138,7 @@ def lag_quadrature(h: int, k: int, n_samples: int) -> tuple[Array, Array, NDArra
     Lags that are alone stand for themselves, the others, not all of them whole numbers, for stretches of a smooth
     function.
     """
+    nodes, node_weights = np.polynomial.legendre.leggauss(8)
     first, last = 2 * h - n_samples, n_samples - 2 * k
     # Stretches between the corners of s(lag) grow with the distance from a corner, as fast as its memory may fade.
     corners = {a * h - b * k for a in range(3) for b in range(3)} | {2 * h - 2 * k}
@@ -152,9 +153,9 @@ def lag_quadrature(h: int, k: int, n_samples: int) -> tuple[Array, Array, NDArra
     single = np.concatenate([start + np.arange(n) for start, n in zip(low[narrow], width[narrow], strict=True)])
     # Sum over low <= lag < high of a smooth function, by its integral and half the ends (Euler-Maclaurin).
     low, width = low[~narrow, None], width[~narrow, None]
-    at = np.concatenate([single, np.hstack([low, low + width * (1 + _NODES) / 2, low + width]).ravel()])
+    at = np.concatenate([single, np.hstack([low, low + width * (1 + nodes) / 2, low + width]).ravel()])
     ends = np.full_like(low, 0.5)
-    weights = np.concatenate([np.ones_like(single), np.hstack([ends, width / 2 * _NODE_WEIGHTS, -ends]).ravel()])
+    weights = np.concatenate([np.ones_like(single), np.hstack([ends, width / 2 * node_weights, -ends]).ravel()])
     # Newest samples t and t - lag both inside the record and each with a whole window.
     pairs = np.minimum(n_samples, n_samples + at) - np.maximum(2 * h - 1, 2 * k - 1 + at)
     return at, weights * np.maximum(pairs, 0), np.arange(len(at)) < len(single)

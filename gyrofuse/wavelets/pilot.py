@@ -1,9 +1,9 @@
 """A rough model of an array's noise at its last levels, fitted to its wavelet cross-covariance (WCCV).
 
-White noise and one component with memory, each with a covariance matrix between the sensors: what falls and what rises
-with the scale. The memory is that of a random walk, or where that is far from likely of an AR1, whose noise turns level
-at the last levels. It says how far these can be off, where few observations leave nothing else to go by; a richer model
-would fit their noise, and its intervals come out a tenth too narrow.
+The model is white noise and one component with memory, each with a covariance matrix between the sensors. The memory is
+that of a random walk or, where an AR1 is much more likely, that of an AR1 whose wavelet variance levels off at the last
+levels. The model gives the sampling distribution of the last levels, which hold too few observations to show it
+themselves. A model of more components would overfit them.
 """
 
 from __future__ import annotations
@@ -17,13 +17,15 @@ from torch import Tensor
 
 from gyrofuse._base.linalg import geometric_mean
 from gyrofuse.wavelets.lag_sums import covariance_table, unit_wavelet_variances, variance_table
+from gyrofuse.wavelets.long_run_variance import MANY_WINDOWS
+from gyrofuse.wavelets.moments import filter_lengths
 
-# Levels with more observations than this speak for themselves.
-_MOST_OBSERVATIONS = 2**6
-_ITERATIONS = 60
-# Time constants of AR1s that may stand for the memory, as parts of the record, and how much more likely (nats) than a
-# random walk they have to be.
-_TIME_CONSTANTS, _EVIDENCE = (1 / 4, 1 / 16), 3.0
+# Number of levels at least that the model is fitted to, where there are as many: two components with two unknowns each
+# at a sensor need four.
+FEWEST_LEVELS = 4
+# Time constants of the AR1s that may describe the memory, as fractions of the recording: a longer one cannot be told
+# from a random walk within the recording, a shorter one levels off before the last levels.
+_TIME_CONSTANTS = (0.25, 0.0625)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,11 +35,11 @@ class Pilot:
     Attributes:
         theta: `(..., 2, sensor, sensor)`, positive semi-definite: white noise, and the variance of an AR1 or that of
             the steps of a random walk.
-        memory: `(...)`, which memory the second component has: 0 the random walk's, 1, 2, ... those of AR1s.
+        memory: `(...)`, process of the second component: 0 the random walk, 1, 2, ... the AR1s.
         n_samples: Length of the record.
         first_level: Lowest level (counted from 0) that the model was fitted to.
         n_levels: Levels J.
-        observations: `(..., level)`, degrees of freedom of each level that the fit rests on; 0 elsewhere.
+        observations: `(..., level)`, degrees of freedom of each level that was fitted; 0 at the others.
     """
 
     theta: Tensor
@@ -54,13 +56,13 @@ class Pilot:
 
     @property
     def time_constants(self) -> tuple[float, ...]:
-        """Those of the AR1s that `memory` may name, in samples."""
+        """Time constants of the AR1s that `memory` may name, in samples."""
         return _time_constants(self.n_samples)
 
     @property
     def wavelet_cross_covariance(self) -> Tensor:
-        """`(..., level, sensor, sensor)` of the model at every level, trustworthy from `first_level` on."""
-        return _model(self.theta, self.unit)
+        """`(..., level, sensor, sensor)` of the model at every level; fitted from `first_level` on."""
+        return mixture(self.theta, self.unit)
 
     @property
     def unit(self) -> Tensor:
@@ -80,7 +82,7 @@ class Pilot:
         straight = torch.einsum("...jlkm,...kac,...mbd->...jablcd", table, self.theta, self.theta)
         return straight + straight.transpose(-1, -2)
 
-    def degrees_of_freedom(self, weights: Tensor) -> Tensor:
+    def dof(self, weights: Tensor) -> Tensor:
         """Equivalent degrees of freedom `2 nu_j^2 / Var nu_j` of the wavelet variance of combinations of sensors.
 
         Args:
@@ -95,25 +97,27 @@ class Pilot:
         half = torch.einsum("...jkm,...kn,...mn->...jn", table.to(self.theta)[self.memory], shares, shares)
         return (self.unit @ shares).square() / half
 
-    def certainty(self, weights: Tensor, scale_weights: Tensor) -> Tensor:
+    def dof_of_fit(self, weights: Tensor, scale_weights: Tensor) -> Tensor:
         """Degrees of freedom of the fitted wavelet variance of a combination of sensors, `2 s^2 / Var s`.
 
-        Levels count as independent, as in the likelihood; they are not, and at the last ones a half or less is left.
+        Levels are taken to be independent, as in the likelihood. They are correlated, so that the true number is
+        smaller, at the last levels by half or more.
 
         Args:
             weights: `(..., sensor)`.
-            scale_weights: `(level,)`, which add the levels from `first_level` on up to `s = sum_j omega_j nu_j`.
+            scale_weights: `omega`, `(level,)`, of the sum `s = sum_j omega_j nu_j` over the levels from `first_level`
+                on.
 
         Returns:
             `(...)`.
         """
         shares = torch.einsum("...i,...kio,...o->...k", weights, self.theta, weights)
         parts = self.unit * shares[..., None, :]  # of each component in nu_j: (..., level, component)
-        # Fisher information of the logarithms of the shares, levels taken for independent.
+        # Fisher information of the logarithms of the shares.
         precision = self.observations / (2 * parts.sum(-1).square())
         information = torch.einsum("...j,...jk,...jm->...km", precision, parts, parts)
         size = information.diagonal(dim1=-2, dim2=-1)
-        # A component without a share has no information, and no slope either.
+        # A component without a share has neither information nor slope: a relative 1e-9 keeps the matrix regular.
         information = information + torch.diag_embed(1e-9 * size.sum(-1, keepdim=True).expand_as(size))
         slope = torch.einsum("j,...jk->...k", scale_weights[self.first_level :], parts[..., self.first_level :, :])
         return 2 * slope.sum(-1).square() / (slope * torch.linalg.solve(information, slope)).sum(-1)
@@ -124,27 +128,29 @@ def fit_pilot(wccv: Tensor, n_samples: int, levels_below: int = 2) -> Pilot:
 
     Maximises the Wishart likelihood `-sum_j eta_j (ln det S_j + tr(S_j^-1 Gamma_j)) / 2` with
     `S_j = Theta_0 / tau_j + Theta_1 u_j`, `u_j = (tau_j^2 + 2) / (12 tau_j)` for a random walk, and
-    `eta_j = 2 M_j / tau_j`, levels taken for independent, over the last levels, and over some more where Akaike's
-    criterion says that these fit as well.
+    `eta_j = 2 M_j / tau_j`, levels taken to be independent, over the last levels, and over some more where Akaike's
+    criterion prefers that.
 
     Args:
         wccv: `(..., level, sensor, sensor)`, signal^2, float64.
         n_samples: Length T of the record.
-        levels_below: How many more levels may help. They make the fit more certain, and bend it where a tone or a
-            filter shows in them.
+        levels_below: Number of further levels that may be fitted too. They make the fit more certain, but biased where
+            they hold a tone or the mark of a filter.
 
     Returns:
         The fitted model, batched as `wccv`.
     """
     n_levels, n_sensors = wccv.shape[-3], wccv.shape[-1]
-    level = torch.arange(1, n_levels + 1, dtype=torch.float64)
-    observations = (n_samples - torch.exp2(level) + 1) / torch.exp2(level)
-    first = max(min(int((observations > _MOST_OBSERVATIONS).sum()), n_levels - 4), 0)
+    tau = filter_lengths(n_levels)
+    observations = (n_samples - tau + 1) / tau
+    # Levels with more than 64 non-overlapping windows are judged by their own series and need no model.
+    first = max(min(int((observations > MANY_WINDOWS).sum()), n_levels - FEWEST_LEVELS), 0)
     below = max(first - levels_below, 0)
+    # More than 300 degrees of freedom would let one level decide the fit of a model that is only rough.
     eta = (2 * observations).clamp(1, 300).to(wccv.device)
     unit = _unit_variances(n_samples, n_levels).to(wccv)  # (memory, level, component)
 
-    # In units of each sensor, so that no sensor is small to rounding.
+    # In units of each sensor, so that no sensor is lost to rounding.
     nu = wccv.diagonal(dim1=-2, dim2=-1)
     size = nu.clamp(min=1e-12 * nu.amax(-2, keepdim=True))[..., first:, :].log().mean(-2).exp().sqrt()
     scale = size[..., :, None] * size[..., None, :]
@@ -161,12 +167,14 @@ def fit_pilot(wccv: Tensor, n_samples: int, levels_below: int = 2) -> Pilot:
         theta = torch.where(fits[..., None, None, None], wide, theta)
         likelihood = torch.maximum(likelihood, wide_likelihood)
         start = torch.where(fits, below, start)
-    likelihood[..., 1:] -= _EVIDENCE
+    # An AR1 is chosen when it is 3 nats (20 times) more likely than the random walk: of the two AR1s one is better by
+    # chance, and the random walk gives the wider intervals.
+    likelihood[..., 1:] -= 3.0
     memory = likelihood.argmax(-1)
     theta = torch.take_along_dim(theta, memory[..., None, None, None, None], -4).squeeze(-4)
     start = torch.take_along_dim(start, memory[..., None], -1)
-    rests = torch.where(torch.arange(n_levels, device=wccv.device) >= start, eta, 0.0)
-    return Pilot(theta * scale[..., None, :, :], memory, n_samples, first, n_levels, rests)
+    fitted = torch.where(torch.arange(n_levels, device=wccv.device) >= start, eta, 0.0)
+    return Pilot(theta * scale[..., None, :, :], memory, n_samples, first, n_levels, fitted)
 
 
 def _maximise(gamma: Tensor, unit: Tensor, eta: Tensor) -> tuple[Tensor, Tensor]:
@@ -176,9 +184,8 @@ def _maximise(gamma: Tensor, unit: Tensor, eta: Tensor) -> tuple[Tensor, Tensor]
     identity = torch.eye(gamma.shape[-1], dtype=gamma.dtype, device=gamma.device)
     start = gamma.diagonal(dim1=-2, dim2=-1).mean((-1, -2)) / height.shape[-1]  # (..., 1)
     theta = (start[..., None, None, None] * identity).expand(*gamma.shape[:-4], *height.shape, *identity.shape)
-    for _ in range(_ITERATIONS):
-        theta = _step(theta, gamma, shape, eta)
-    return theta / height[..., None, None], _likelihood(_model(theta, shape), gamma, eta)
+    theta = climb_likelihood(theta, gamma, shape, eta[:, None] * shape)
+    return theta / height[..., None, None], _likelihood(mixture(theta, shape), gamma, eta)
 
 
 def _likelihood(model: Tensor, gamma: Tensor, eta: Tensor) -> Tensor:
@@ -186,20 +193,50 @@ def _likelihood(model: Tensor, gamma: Tensor, eta: Tensor) -> Tensor:
     return -(eta * misfit).sum(-1) / 2
 
 
-def _step(theta: Tensor, gamma: Tensor, shape: Tensor, eta: Tensor) -> Tensor:
-    """One step up the likelihood: `Theta` becomes the geometric mean of `D^-1` and `Theta N Theta`.
+def climb_likelihood(
+    theta: Tensor, gamma: Tensor, unit: Tensor, weight: Tensor, n_steps: int = 60, n_parameters: float = 0.0
+) -> Tensor:
+    """Maximise the Wishart likelihood of a sum of components by minorisation-maximisation (MM).
 
-    `D` and `N` are the two halves of the gradient; the step minimises a bound of the misfit that touches it at `Theta`,
-    so that it never raises it, and keeps the matrices positive.
+    Of `-sum_j eta_j (ln det S_j + tr(S_j^-1 Gamma_j)) / 2` with `S_j = sum_k f_jk Theta_k`. Each step replaces
+    `Theta_k` by the geometric mean of `D_k^-1` and `Theta_k N_k Theta_k`, where `D` and `N` are the two halves of the
+    gradient. It minimises a bound of the misfit that touches it at `Theta`, so that the likelihood never falls and the
+    matrices stay positive.
+
+    Args:
+        theta: Start, `(..., component, sensor, sensor)`, positive definite.
+        gamma: `Gamma_j`, `(..., level, sensor, sensor)`.
+        unit: `f_jk`, `(..., level, component)`, of order 1.
+        weight: `eta_j f_jk`, `(..., level, component)`.
+        n_steps: Number of steps. After 60 the intervals of the last levels no longer change.
+        n_parameters: Penalty `-n_parameters ln tr Theta_k` of each component, which removes the components that the
+            data do not need.
+
+    Returns:
+        The matrices after the last step, in the shape of `theta`.
     """
-    precision = torch.cholesky_inverse(torch.linalg.cholesky(_model(theta, shape)))  # (..., level, sensor, sensor)
-    weighted = eta[:, None] * shape  # (..., level, component)
-    down = torch.einsum("...jk,...jio->...kio", weighted, precision)  # D
-    up = torch.einsum("...jk,...jio->...kio", weighted, precision @ gamma @ precision)  # N
-    return geometric_mean(down, theta @ up @ theta)
+    identity = torch.eye(gamma.shape[-1], dtype=gamma.dtype, device=gamma.device)
+    for _ in range(n_steps):
+        precision = torch.cholesky_inverse(torch.linalg.cholesky(mixture(theta, unit)))  # (..., level, sensor, sensor)
+        down = torch.einsum("...jk,...jio->...kio", weight, precision)  # D
+        up = torch.einsum("...jk,...jio->...kio", weight, precision @ gamma @ precision)  # N
+        if n_parameters:
+            trace = theta.diagonal(dim1=-2, dim2=-1).sum(-1).clamp(min=1e-100)
+            down = down + (2 * n_parameters / trace)[..., None, None] * identity
+        theta = geometric_mean(down, theta @ up @ theta)
+    return theta
 
 
-def _model(theta: Tensor, unit: Tensor) -> Tensor:
+def mixture(theta: Tensor, unit: Tensor) -> Tensor:
+    """Covariances of a sum of components at every level.
+
+    Args:
+        theta: `(..., component, sensor, sensor)`.
+        unit: Wavelet variances of the components at unit size, `(..., level, component)`.
+
+    Returns:
+        `(..., level, sensor, sensor)`.
+    """
     return torch.einsum("...jk,...kio->...jio", unit, theta)
 
 
@@ -215,10 +252,10 @@ def _unit_variances(n_samples: int, n_levels: int) -> Tensor:
 
 
 def _by_memory(table: np.ndarray) -> Tensor:
-    """A table over pairs of all components `(..., component, component)`, `(memory, ..., 2, 2)` of those that meet."""
+    """Parts `(memory, ..., 2, 2)` of a table over pairs of all components `(..., component, component)`."""
     return torch.stack([torch.from_numpy(table[..., pair, :][..., pair]) for pair in components_of_memories()])
 
 
 def components_of_memories() -> list[list[int]]:
-    """Which components each memory has among white noise, the AR1s, and a random walk."""
+    """Indices of the components of each memory among white noise, the AR1s, and a random walk."""
     return [[0, len(_TIME_CONSTANTS) + 1]] + [[0, k + 1] for k in range(len(_TIME_CONSTANTS))]

@@ -17,10 +17,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-# Samples x sensors of one tile for each CPU thread: a tile and its coefficients take 4 MiB in float64 and stay in the
-# last level of cache; smaller tiles fit closer to the core but spend more time on calls than they gain.
-_CPU_TILE = 2**18
-_GPU_TILE = 2**24
+# Samples x sensors of one tile for each CPU thread (2**18): a tile and its coefficients take 4 MiB in float64 and stay
+# in the last level of cache; smaller tiles would take more time for calls than they save.
+_CPU_TILE = 262_144
+# The same for a GPU: one tile takes 256 MiB, enough work for every multiprocessor at each level.
+_GPU_TILE = 16_777_216
+# Samples of a tile at least, however many recordings are advanced together: half of it is the longest lag within a
+# tile.
 _SHORTEST_TILE = 16
 
 

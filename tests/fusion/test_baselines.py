@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -17,9 +19,10 @@ from gyrofuse.fusion.weights.baselines import (
     shrinkage_weights,
     shrunk_covariance,
 )
-from gyrofuse.fusion.weights.svo import combine, optimal_weights, resolve_scale_weights
+from gyrofuse.fusion.weights.svo import optimal_weights, resolve_scale_weights
 from gyrofuse.wavelets.covariance import wavelet_products
-from gyrofuse.wavelets.equivalent_dof import degrees_of_freedom
+from gyrofuse.wavelets.intervals import equivalent_dof
+from gyrofuse.wavelets.moments import combined_covariance
 
 ONE = torch.ones(1, dtype=torch.float64)
 
@@ -110,7 +113,7 @@ def test_a_sensor_on_the_verge_and_equal_sensors_do_no_harm():
 def test_a_search_cut_short_is_told_and_stays_feasible(monkeypatch):
     # In two turns the second array, whose sensors leave one by one, does not come to its end.
     A = torch.stack([torch.eye(8).double(), covariances(1, 8, common=8.0, seed=1)[0]])
-    monkeypatch.setattr(competitors, "_MOST_TURNS", 2)
+    monkeypatch.setattr(competitors, "_nonnegative_set", partial(competitors._nonnegative_set, most_turns=2))
     with pytest.warns(UserWarning, match="1 of 2 not at their optimum"):
         got = nonnegative_weights(A[:, None], ONE)
     assert bool((got >= 0).all())
@@ -196,9 +199,9 @@ def test_shrinkage_halves_the_risk_of_long_scale_weights():
     model = gf.ArrayModel([(gf.WhiteNoise(1.0), R.diag()), (gf.RandomWalk(1.0), Q)])
     signal = model.simulate(8192, batch=(60,), generator=torch.Generator().manual_seed(0))
     sums, counts = wavelet_products(signal, 12)
-    wccv, degrees = sums / counts, degrees_of_freedom(counts[..., 0, 0])
+    wccv, degrees = sums / counts, equivalent_dof(counts[..., 0, 0])
     omega = resolve_scale_weights("long", 12)
-    truth = combine(model.wavelet_cross_covariance(12), omega)
+    truth = combined_covariance(model.wavelet_cross_covariance(12), omega)
     best = optimal_weights(truth)
 
     def excess(weights: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ from gyrofuse import ArrayModel, RandomWalk, WhiteNoise, fit_svo, svo_weights
 from gyrofuse.fusion import svo
 from gyrofuse.fusion.uncertainty.cross_fitting import CrossFit
 from gyrofuse.fusion.uncertainty.variance_reduction import ratio_to_equal
-from gyrofuse.fusion.uncertainty.weights import unknown
+from gyrofuse.fusion.uncertainty.weights import undefined_uncertainty
 
 # Studies on recordings; the chance that a true claim is refused.
 N_RUNS, N_SENSORS, N_SAMPLES, REFUSED = 120, 4, 1024, 1e-3
@@ -117,7 +117,7 @@ def recordings(kind: str) -> tuple[ArrayModel, Tensor]:
 @pytest.fixture
 def weights_without_law(monkeypatch: pytest.MonkeyPatch):
     """Fits leave out the covariance of the weights, most of their time, which an interval of the gain does not use."""
-    monkeypatch.setattr(svo, "_spread", lambda chosen, *_: unknown(chosen.weights))
+    monkeypatch.setattr(svo, "_uncertainty", lambda fitted, *_: undefined_uncertainty(fitted.weights))
 
 
 @pytest.mark.statistical

@@ -26,7 +26,8 @@ from torch import Tensor
 from gyrofuse import ArrayModel, RandomWalk, WhiteNoise, fit_multiscale, fit_svo, wavelet_cross_covariance
 from gyrofuse._base.linalg import SingularCovarianceError
 from gyrofuse.fusion import SVOResult
-from gyrofuse.fusion.live import LiveSVO, subset_weights
+from gyrofuse.fusion.live import LiveSVO
+from gyrofuse.fusion.weights.subsets import subset_weights
 
 N_SENSORS = 4
 
@@ -130,7 +131,7 @@ def test_it_is_its_naive_twin(time_constant, hold, settle):
     signal[:, 400:460] = torch.nan  # all away for long, back one by one
     for k in range(4):
         signal[k, 460 : 460 + 25 * k] = torch.nan
-    live = LiveSVO(fitted(), time_constant=time_constant, hold=hold, settle=settle)
+    live = LiveSVO.from_result(fitted(), time_constant=time_constant, hold=hold, settle=settle)
     expected = naive.fuse(signal.numpy(), live.combined.numpy(), time_constant, hold, settle)
     assert np.isnan(expected).sum() >= 60
     np.testing.assert_allclose(live(signal), expected, rtol=0, atol=1e-9, equal_nan=True)
@@ -140,14 +141,14 @@ def test_it_is_its_naive_twin(time_constant, hold, settle):
 def test_the_whole_array_is_plain_svo(method):
     result = fit_svo(array(), "long", method=method)
     signal = array(2000, seed=5) + 7
-    torch.testing.assert_close(LiveSVO(result)(signal), result.virtual(signal), rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(LiveSVO.from_result(result)(signal), result.virtual(signal), rtol=1e-10, atol=1e-10)
 
 
 def test_a_common_rate_passes_exactly_whatever_the_set():
     signal = dropped(array(5000), 0.05)
     time = torch.arange(5000, dtype=torch.float64)
     rate = 300 * torch.sin(time / 40) + 0.1 * time
-    live = LiveSVO(fitted(), time_constant=50)
+    live = LiveSVO.from_result(fitted(), time_constant=50)
     at_rest = live(signal)
     live.reset()
     moving = live(signal + rate)
@@ -158,7 +159,7 @@ def test_a_common_rate_passes_exactly_whatever_the_set():
 @pytest.mark.parametrize("chunk", [1, 17, 999])
 def test_chunks_are_one_stream(chunk):
     signal = dropped(array(300 if chunk == 1 else 3000), 0.05)
-    live = LiveSVO(fitted(), time_constant=40, hold=10)
+    live = LiveSVO.from_result(fitted(), time_constant=40, hold=10)
     whole = live(signal)
     live.reset()
     parts = torch.cat([live(part) for part in signal.split(chunk, -1)])
@@ -166,7 +167,7 @@ def test_chunks_are_one_stream(chunk):
 
 
 def test_an_empty_chunk_changes_nothing():
-    live = LiveSVO(fitted())
+    live = LiveSVO.from_result(fitted())
     assert live(array()[:, :0]).shape == (0,)
     first = live(array()[:, :100])
     assert live(array()[:, :0]).shape == (0,)
@@ -201,7 +202,7 @@ def test_leaving_and_returning_does_not_step_the_output(gone_for, moved):
     the live sensors would, the step is over 2.
     """
     result, signal = offset_streams()
-    live = LiveSVO(result, time_constant=500)
+    live = LiveSVO.from_result(result, time_constant=500)
     away = slice(3000, 3000 + gone_for)
     stream = signal.clone()
     stream[:, 1, away] = torch.nan
@@ -227,11 +228,11 @@ def test_a_returning_sensor_is_watched_before_it_counts():
     stream = signal[0].clone()
     stream[1, 2000:4000] = torch.nan
     stream[1, 4000:] += 1000
-    live = LiveSVO(result, time_constant=300)
+    live = LiveSVO.from_result(result, time_constant=300)
     output = live(stream)
     assert output[2000:].diff().abs().max() < 6 * output[1000:2000].diff().std()
     # within hold nobody asks: that is what `hold` is for
-    live = LiveSVO(result, time_constant=300, hold=2000)
+    live = LiveSVO.from_result(result, time_constant=300, hold=2000)
     assert live(stream).diff().abs().max() > 100
 
 
@@ -243,7 +244,7 @@ def test_random_losses_hardly_make_the_output_wander():
     signal = noise.simulate(2**13, batch=(60,), generator=generator)
     result = fit_svo(noise.simulate(2**15, generator=generator), "long")
     gone = torch.rand(signal.shape, generator=generator) < 0.02
-    output = LiveSVO(result)(torch.where(gone, torch.nan, signal))
+    output = LiveSVO.from_result(result)(torch.where(gone, torch.nan, signal))
     plain = result.virtual(signal)
     assert output.isfinite().all()
 
@@ -257,7 +258,7 @@ def test_sensors_that_were_never_seen_together_start_where_they_can():
     """A sensor that comes later joins without a step, and one sensor alone is what it is."""
     signal = array(4000) + 10 * torch.arange(4.0, dtype=torch.float64)[:, None]
     signal[1:, :1000] = torch.nan
-    live = LiveSVO(fitted(), time_constant=100)
+    live = LiveSVO.from_result(fitted(), time_constant=100)
     output = live(signal)
     torch.testing.assert_close(output[:1000], signal[0, :1000], rtol=0, atol=1e-9)
     assert step_at(output, 1100, 100).abs() < 1
@@ -269,27 +270,27 @@ def test_full_scale_takes_a_sensor_out():
     high[2, 1000:1100] = 77.0
     clean = high.clone()
     clean[2, 1000:1100] = torch.nan
-    live = LiveSVO(fitted(), full_scale=77.0)
-    plain = LiveSVO(fitted())
+    live = LiveSVO.from_result(fitted(), full_scale=77.0)
+    plain = LiveSVO.from_result(fitted())
     assert torch.equal(live(high), plain(clean))
     infinite = torch.where(high == 77.0, torch.inf, high)
-    assert torch.equal(LiveSVO(fitted())(infinite), LiveSVO(fitted())(clean))
+    assert torch.equal(LiveSVO.from_result(fitted())(infinite), LiveSVO.from_result(fitted())(clean))
 
 
 def test_batches_of_fits_and_of_streams():
     signals = torch.stack([array(seed=k) for k in range(3)])
     together = fit_svo(signals, "long")
     stream = dropped(signals, 0.05)
-    output = LiveSVO(together, time_constant=30)(stream)
+    output = LiveSVO.from_result(together, time_constant=30)(stream)
     for k in range(3):
-        alone = LiveSVO(together[k], time_constant=30)(stream[k])
+        alone = LiveSVO.from_result(together[k], time_constant=30)(stream[k])
         torch.testing.assert_close(output[k], alone, rtol=0, atol=1e-9, equal_nan=True)
-    one_fit = LiveSVO(together[0], time_constant=30)(stream.expand(2, 3, 4, 3000))
+    one_fit = LiveSVO.from_result(together[0], time_constant=30)(stream.expand(2, 3, 4, 3000))
     assert one_fit.shape == (2, 3, 3000)
 
 
 def member() -> Member:
-    return Member("LiveSVO", lambda: LiveSVO(fitted(), time_constant=30), tolerance=1e-9)
+    return Member("LiveSVO", lambda: LiveSVO.from_result(fitted(), time_constant=30), tolerance=1e-9)
 
 
 def test_it_keeps_what_every_operation_keeps():
@@ -304,20 +305,22 @@ def test_it_keeps_what_every_operation_keeps():
 
 def test_float32_under_a_large_offset():
     signal = dropped(array(3000) + 1000, 0.03)
-    exact = LiveSVO(fitted(), time_constant=30)(signal.float().double())
-    single = LiveSVO(fitted(), time_constant=30)(signal.float())
+    exact = LiveSVO.from_result(fitted(), time_constant=30)(signal.float().double())
+    single = LiveSVO.from_result(fitted(), time_constant=30)(signal.float())
     assert single.dtype == torch.float32
     torch.testing.assert_close(single.double(), exact, rtol=0, atol=1e-4, equal_nan=True)
 
 
 def test_a_module_made_float32_fuses_as_before():
     signal = array().float()
-    torch.testing.assert_close(LiveSVO(fitted()).float()(signal), LiveSVO(fitted())(signal), rtol=0, atol=1e-5)
+    torch.testing.assert_close(
+        LiveSVO.from_result(fitted()).float()(signal), LiveSVO.from_result(fitted())(signal), rtol=0, atol=1e-5
+    )
 
 
 def test_gradients_reach_the_signal():
     signal = array(64).requires_grad_()
-    live = LiveSVO(fitted(), time_constant=30)
+    live = LiveSVO.from_result(fitted(), time_constant=30)
     live(signal).sum().backward()
     torch.testing.assert_close(signal.grad, fitted().weights[:, None].expand(4, 64), rtol=1e-9, atol=1e-12)
 
@@ -325,11 +328,14 @@ def test_gradients_reach_the_signal():
 def test_state_goes_round():
     """A module loaded from another's state goes on where that one is, whatever it has seen itself."""
     signal = dropped(array(2000), 0.05)
-    live = LiveSVO(fitted(), time_constant=30)
+    live = LiveSVO.from_result(fitted(), time_constant=30)
     live(signal[:, :1000])
     state = copy.deepcopy(live.state_dict())
     rest = live(signal[:, 1000:])
-    for other in (LiveSVO(fitted(), time_constant=30), LiveSVO(fit_svo(array(seed=2)), time_constant=30)):
+    for other in (
+        LiveSVO.from_result(fitted(), time_constant=30),
+        LiveSVO.from_result(fit_svo(array(seed=2)), time_constant=30),
+    ):
         other.load_state_dict(state)
         torch.testing.assert_close(other(signal[:, 1000:]), rest, rtol=0, atol=0, equal_nan=True)
     assert list(live.parameters()) == []
@@ -344,11 +350,11 @@ def test_the_time_constant_is_where_a_missing_sensor_matters_least():
     for ratio in (20.0, 100.0):
         noise = ArrayModel([(WhiteNoise(1.0), identity), (RandomWalk(ratio**-2), identity)])
         signal = noise.simulate(20_000, batch=(40,), generator=torch.Generator().manual_seed(1))
-        found = LiveSVO(fit_svo(signal, "long")).time_constant
+        found = LiveSVO.from_result(fit_svo(signal, "long")).time_constant
         expected = 2 * 3**0.5 * ratio / 4
         assert (found.log2() - np.log2(expected)).abs().median() < 1
     walk = ArrayModel([(WhiteNoise(1e-6), identity), (RandomWalk(1.0), identity)]).simulate(2000)
-    assert LiveSVO(fit_svo(walk)).time_constant.item() == 1
+    assert LiveSVO.from_result(fit_svo(walk)).time_constant.item() == 1
 
 
 def test_it_is_never_worse_to_average_longer_than_that():
@@ -364,10 +370,10 @@ def test_it_is_never_worse_to_average_longer_than_that():
     signal = noise.simulate(3000, batch=(100,), generator=generator)
     stream = signal.clone()
     stream[:, 0, 2000:] = torch.nan
-    default = LiveSVO(result).time_constant.item()
+    default = LiveSVO.from_result(result).time_constant.item()
 
     def step(time_constant: float) -> float:
-        output = LiveSVO(result, time_constant=time_constant)(stream)
+        output = LiveSVO.from_result(result, time_constant=time_constant)(stream)
         ideal = (signal - signal[..., 1975:2025].mean(-1, keepdim=True))[:, 1:].mean(1)[:, 2000:2100].mean(-1)
         return ((output[:, 2000:2100].mean(-1) - output[:, 1975:2000].mean(-1)) - ideal).square().mean().item()
 
@@ -390,11 +396,11 @@ def test_it_is_never_worse_to_average_longer_than_that():
 )
 def test_bad_numbers_are_named(options, message):
     with pytest.raises(ValueError, match=message):
-        LiveSVO(fitted(), **options)
+        LiveSVO.from_result(fitted(), **options)
 
 
 def test_bad_streams_are_named():
-    live = LiveSVO(fitted())
+    live = LiveSVO.from_result(fitted())
     with pytest.raises(
         ValueError, match=r"`signal`: expected .* with the 4 sensors that were fitted, got shape \(3, 9"
     ):
@@ -408,13 +414,13 @@ def test_bad_streams_are_named():
         live(array()[:, :9].expand(2, 4, 9))
     live.reset()
     live(array()[:, :9].expand(2, 4, 9))
-    batched = LiveSVO(fit_svo(array().expand(3, 4, 3000)))
+    batched = LiveSVO.from_result(fit_svo(array().expand(3, 4, 3000)))
     with pytest.raises(ValueError, match=r"`signal`: expected batch shape \(3,\) as fitted, got \(\)"):
         batched(array())
 
 
 def test_full_scales_of_another_batch_than_the_stream_are_named():
-    live = LiveSVO(fitted(), full_scale=torch.full((2, N_SENSORS), 100.0))
+    live = LiveSVO.from_result(fitted(), full_scale=torch.full((2, N_SENSORS), 100.0))
     assert live(array()[:, :9].expand(2, N_SENSORS, 9)).shape == (2, 9)
     live.reset()
     for batch in ((), (3,)):
@@ -425,9 +431,9 @@ def test_full_scales_of_another_batch_than_the_stream_are_named():
 @pytest.mark.parametrize("result", [array(100), fit_multiscale(array())])
 def test_what_is_no_fit_is_named(result):
     with pytest.raises(TypeError, match=f"`result`: expected an SVOResult, got {type(result).__name__}; fit the array"):
-        LiveSVO(result)
+        LiveSVO.from_result(result)
 
 
 def test_other_methods_have_no_weights_of_subsets():
     with pytest.raises(ValueError, match=r"`result`: expected a fit by 'svo', .* got 'rdvg'"):
-        LiveSVO(replace(fitted(), method="rdvg"))
+        LiveSVO.from_result(replace(fitted(), method="rdvg"))

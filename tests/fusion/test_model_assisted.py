@@ -14,8 +14,9 @@ import gyrofuse as gf
 from gyrofuse._base.linalg import geometric_mean
 from gyrofuse.fusion.weights import model_assisted as assisted
 from gyrofuse.fusion.weights.model_assisted import assisted_covariance
-from gyrofuse.fusion.weights.svo import combine, optimal_weights, resolve_scale_weights
+from gyrofuse.fusion.weights.svo import optimal_weights, resolve_scale_weights
 from gyrofuse.wavelets.covariance import wavelet_products
+from gyrofuse.wavelets.moments import combined_covariance
 
 R = torch.tensor([2.8, 1.4, 1.0, 2.0], dtype=torch.float64).diag()
 Q = 1e-3 * torch.tensor(
@@ -37,26 +38,25 @@ def simulated(n: int, seed: int = 0, model: gf.ArrayModel = WALKS) -> Tensor:
 
 def excess(wccv: Tensor, truth: Tensor, scale_weights: Tensor) -> Tensor:
     """Risk of the weights from `wccv` over the least, less one."""
-    A = combine(truth, scale_weights)
-    best, weights = optimal_weights(A), optimal_weights(combine(wccv, scale_weights))
+    A = combined_covariance(truth, scale_weights)
+    best, weights = optimal_weights(A), optimal_weights(combined_covariance(wccv, scale_weights))
     return torch.einsum("...i,ik,...k->...", weights, A, weights) / (best @ A @ best) - 1
 
 
 # The fit
 
 
-def fitted(n_iterations: int, monkeypatch: pytest.MonkeyPatch) -> tuple[Tensor, ...]:
+def fitted(n_steps: int, monkeypatch: pytest.MonkeyPatch) -> tuple[Tensor, ...]:
     """The last eight levels of an array, all components, after so many steps."""
     wccv, counts = moments(simulated(1)[0])
     gamma, eta = wccv[5:], (2 * counts * torch.exp2(-torch.arange(1.0, 14)))[5:].clamp(1, 300)
     unit = assisted._unit_variances(N_LEVELS)[5:]
     own = torch.arange(8) < 4
-    monkeypatch.setattr(assisted, "_ITERATIONS", n_iterations)
     kept: list[Tensor] = []
-    mix = assisted._mix
-    monkeypatch.setattr(assisted, "_mix", lambda unit, theta: kept.append(theta) or mix(unit, theta))
-    model, score = assisted._fit(gamma, eta, unit, own)
-    monkeypatch.setattr(assisted, "_mix", mix)
+    mixture = assisted.mixture
+    monkeypatch.setattr(assisted, "mixture", lambda theta, unit: kept.append(theta) or mixture(theta, unit))
+    model, score = assisted._fit(gamma, eta, unit, own, n_steps)
+    monkeypatch.setattr(assisted, "mixture", mixture)
     return gamma, eta, unit / unit.amax(0), own, kept[-1], model, score
 
 
@@ -71,7 +71,7 @@ def test_no_step_lowers_the_penalised_likelihood(monkeypatch):
 
 
 def test_components_that_the_data_do_not_ask_for_go(monkeypatch):
-    *_, theta, _, _ = fitted(assisted._ITERATIONS, monkeypatch)
+    *_, theta, _, _ = fitted(150, monkeypatch)
     size = theta.diagonal(dim1=-2, dim2=-1).sum(-1)
     assert (size > 1e-6 * size.max()).sum() <= 4  # of seven, where the truth has two
 

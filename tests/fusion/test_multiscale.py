@@ -126,11 +126,11 @@ def test_a_stream_equals_one_go(length, gaps):
     svo = fitted(6)
     state, streamed = svo.start(signal), []
     for chunk in signal.split(length, dim=-1):
-        virtual, state = svo(chunk, state)
+        virtual, state = svo.stream(chunk, state)
         streamed.append(virtual)
     torch.testing.assert_close(torch.cat(streamed), svo(signal), rtol=1e-13, atol=1e-13, equal_nan=True)
     assert state.shape == svo.start(signal).shape == (3, 2**5 - 1)
-    virtual, same = svo(signal[:, :0], state)
+    virtual, same = svo.stream(signal[:, :0], state)
     assert virtual.shape == (0,)
     assert torch.equal(same, state)
 
@@ -178,9 +178,7 @@ def test_weights_equal_their_twin(n_bands):
     signal = array(3, 2000)
     result = fit_multiscale(signal, "long", n_bands=n_bands, n_levels=7)
     single = fit_svo(signal, "long", n_levels=7, covariance="none")
-    wccv = naive.shrunk(
-        naive_haar.wavelet_cross_covariance(signal.numpy(), 7), single.degrees_of_freedom.numpy(), _POOLING
-    )
+    wccv = naive.shrunk(naive_haar.wavelet_cross_covariance(signal.numpy(), 7), single.dof.numpy(), _POOLING)
     optimum = 1 / np.linalg.inv(wccv).sum((1, 2))
     expected = naive.weights(wccv, single.scale_weights.numpy() / optimum, n_bands)
     np.testing.assert_allclose(result.weights, expected, rtol=1e-4, atol=1e-5)
@@ -200,7 +198,7 @@ def test_levels_of_one_shape_need_one_vector_of_weights():
 
 def test_shrinking_keeps_what_is_well_known_and_steadies_what_is_not():
     wccv = wavelet_cross_covariance(array(6, 2**14), 13)
-    degrees = fit_svo(array(6, 2**14), n_levels=13).degrees_of_freedom
+    degrees = fit_svo(array(6, 2**14), n_levels=13).dof
     got = _shrink(wccv, degrees)
     torch.testing.assert_close(got[:4], wccv[:4], rtol=0.05, atol=0.02 * wccv[:4].abs().max().item())
     assert torch.linalg.cond(wccv[-1]) > 10 * torch.linalg.cond(got[-1])
@@ -328,8 +326,8 @@ def test_summary_is_reproducible_and_fixed_in_width():
         start = next(i for i, line in enumerate(lines) if line.startswith("Allan deviation (signal) at averaging time"))
         table, below = lines[start + 1 : start + 2 + result.n_levels], lines[start + 2 + result.n_levels :]
         assert len({len(line) for line in table}) == 1
-        few = int((result.degrees_of_freedom < n_sensors).nonzero()[0])
-        most = f"{result.degrees_of_freedom[few].item():.2g}"
+        few = int((result.dof < n_sensors).nonzero()[0])
+        most = f"{result.dof[few].item():.2g}"
         assert below[0] == ""
         assert below[1].startswith(f"Few observations: from {2**few} samples on, {most} or less, fewer than sensors; ")
         assert len(below) == 3
@@ -403,10 +401,21 @@ def test_a_recording_brings_its_names_rate_and_unit():
 SIGNAL, LONGER = array(3, 300), array(3, 457, seed=50)
 
 
+class Stream(torch.nn.Module):
+    """The stream of a layer as a module, for what calls `forward`."""
+
+    def __init__(self, layer: MultiScaleSVO) -> None:
+        super().__init__()
+        self.layer = layer
+
+    def forward(self, signal: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return self.layer.stream(signal, state)
+
+
 def test_a_stream_exports_with_its_state():
     svo = fitted()
     chunk = torch.export.Dim("chunk", min=1, max=2**20)
-    program = torch.export.export(svo, (SIGNAL, svo.start(SIGNAL)), dynamic_shapes=({1: chunk}, None)).module()
+    program = torch.export.export(Stream(svo), (SIGNAL, svo.start(SIGNAL)), dynamic_shapes=({1: chunk}, None)).module()
     virtual, state = program(LONGER, svo.start(LONGER))
     more, state = program(LONGER[:, :3], state)
     torch.testing.assert_close(torch.cat([virtual, more]), svo(torch.cat([LONGER, LONGER[:, :3]], dim=-1)))
@@ -414,8 +423,8 @@ def test_a_stream_exports_with_its_state():
 
 def test_a_fitted_module_keeps_its_weights():
     signal = array()
-    svo = MultiScaleSVO(6)
-    result = svo.fit(signal, "short", n_levels=8)
+    svo = MultiScaleSVO(6, "short", n_levels=8)
+    result = svo.fit(signal)
     assert torch.equal(svo.weights, result.weights)
     assert svo.weights.shape == (6, 4)
     assert torch.equal(svo(signal), result.virtual(signal))
@@ -476,13 +485,13 @@ def test_other_signals_than_the_weights_are_for_are_named():
     with pytest.raises(TypeError, match=r"`signal`: expected float32 or float64, got torch.int16"):
         svo(SIGNAL.to(torch.int16))
     with pytest.raises(ValueError, match=r"`state`: expected shape \(3, 15\) for this signal, got \(3, 7\)"):
-        svo(SIGNAL, torch.zeros(3, 7, dtype=SIGNAL.dtype))
+        svo.stream(SIGNAL, torch.zeros(3, 7, dtype=SIGNAL.dtype))
     with pytest.raises(
         TypeError, match=r"`state`: expected torch\.float32 as the signal has, got torch\.float64; give"
     ):
-        svo(SIGNAL.float(), svo.start(SIGNAL.double()))
+        svo.stream(SIGNAL.float(), svo.start(SIGNAL.double()))
     with pytest.raises(TypeError, match="`state`: expected a torch tensor, got list"):
-        svo(SIGNAL, [0.0])
+        svo.stream(SIGNAL, [0.0])  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("n_bands", [0, 1.5, True])

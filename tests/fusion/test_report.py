@@ -47,7 +47,7 @@ def made_up(ratios: list[float], best: float = 0.9) -> SVOResult:
         weights_cov=1e-4 * torch.eye(3, dtype=torch.float64),
         confidence_interval=around(0.02),
         wavelet_cross_covariance=wccv,
-        degrees_of_freedom=torch.full((len(ratios),), 100.0, dtype=torch.float64),
+        dof=torch.full((len(ratios),), 100.0, dtype=torch.float64),
         cross_fit=certain_fit(torch.full((len(ratios),), 100.0, dtype=torch.float64), 0.95),
         sensors=("a", "b", "c"),
         rate=100.0,
@@ -72,10 +72,10 @@ def made_up_bands(virtual: list[float], equal: list[float], degrees: list[float]
     single = dataclasses.replace(
         made_up([0.9] * n),
         wavelet_cross_covariance=3 * mean[:, None, None] * torch.eye(3, dtype=torch.float64),
-        degrees_of_freedom=torch.tensor(degrees, dtype=torch.float64),
+        dof=torch.tensor(degrees, dtype=torch.float64),
     )
     weights = torch.tensor([[0.2, 0.5, 0.3], [1.1, 0.2, -0.3]], dtype=torch.float64)
-    return MultiScaleResult(weights, variance, certain_fit(single.degrees_of_freedom, 0.95), variance / 2, single)
+    return MultiScaleResult(weights, variance, certain_fit(single.dof, 0.95), variance / 2, single)
 
 
 def plain(sentences: list[str]) -> list[str]:
@@ -151,7 +151,7 @@ def test_verdict_begins_with_motion():
 def test_verdict_warns_where_observations_are_fewer_than_sensors():
     result = made_up([0.9, 0.9, 0.9])
     assert not any("fewer independent" in sentence for sentence in verdict(result))
-    few = dataclasses.replace(result, degrees_of_freedom=torch.tensor([30.0, 2.5, 1.2], dtype=torch.float64))
+    few = dataclasses.replace(result, dof=torch.tensor([30.0, 2.5, 1.2], dtype=torch.float64))
     (warning,) = (sentence for sentence in verdict(few) if "fewer independent" in sentence)
     start = "From 0.02 s on, the recording holds fewer independent observations (2.5 or less) than there are sensors, "
     assert warning.startswith(f"{start}so that the comparisons end before: what it gains there follows from a model")
@@ -162,7 +162,7 @@ def test_verdict_warns_where_observations_are_fewer_than_sensors():
 def test_verdict_takes_range_and_maximum_from_the_levels_that_are_well_observed():
     result = dataclasses.replace(
         made_up([0.9, 1.2, 0.8, 0.5, 1.9, 0.4]),
-        degrees_of_freedom=torch.tensor([90.0, 50.0, 30.0, 2.5, 3.5, 1.0], dtype=torch.float64),
+        dof=torch.tensor([90.0, 50.0, 30.0, 2.5, 3.5, 1.0], dtype=torch.float64),
         method="nonnegative",
     )
     *_, against_mean, against_best, few = plain(verdict(result))
@@ -175,7 +175,7 @@ def test_verdict_takes_range_and_maximum_from_the_levels_that_are_well_observed(
         "From 0.08 s on, the recording holds fewer independent observations (3.5 or less) than there are sensors, "
         "so that the comparisons end before."
     )
-    nowhere = dataclasses.replace(result, degrees_of_freedom=torch.full((6,), 2.0, dtype=torch.float64))
+    nowhere = dataclasses.replace(result, dof=torch.full((6,), 2.0, dtype=torch.float64))
     *_, against_mean, _, few = plain(verdict(nowhere))
     assert against_mean.endswith(
         "0.01 s, 0.04 to 0.08 s and 0.32 s, by up to 60 % (at 0.32 s). It is higher at 0.02 s and 0.16 s, by up to "

@@ -349,8 +349,8 @@ def test_the_layers_chained_equal_the_fit():
 
 def test_a_fitted_module_keeps_its_weights_and_fuses():
     signal = array()
-    svo = SVO("short")
-    result = svo.fit(signal, n_levels=8)
+    svo = SVO("short", n_levels=8)
+    result = svo.fit(signal)
     assert torch.equal(svo.weights, result.weights)
     assert torch.equal(svo(signal), result.virtual(signal))
     assert list(svo.parameters()) == []

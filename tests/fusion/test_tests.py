@@ -13,7 +13,13 @@ from torch import Tensor
 
 from gyrofuse import ArrayModel, RandomWalk, WhiteNoise, fit_svo, svo_weights
 from gyrofuse.fusion import SVOResult
-from gyrofuse.fusion.uncertainty.tests import Evidence, dropped_sensor_test, enough_data, equal_weights_test, verdicts
+from gyrofuse.fusion.uncertainty.tests import (
+    WeightsInference,
+    dropped_sensor_test,
+    enough_data,
+    equal_weights_test,
+    verdicts,
+)
 
 # Studies on recordings: as many of this length, 6 levels (the last holds 14 to 30 observations); the chance that a true
 # claim is refused.
@@ -37,16 +43,17 @@ def within(count: int, claim: float, n: int) -> bool:
 # One level of independent observations: linear regression, exact
 
 
-def one_level(observations: Tensor) -> Evidence:
-    """Evidence of `(..., observation, sensor)` with the covariance that theory gives the weights."""
+def one_level(observations: Tensor) -> WeightsInference:
+    """WeightsInference of `(..., observation, sensor)` with the covariance that theory gives the weights."""
     n, p = observations.shape[-2:]
     gamma = (observations.mT @ observations / n)[..., None, :, :]
     omega = torch.ones(1, dtype=torch.float64)
     weights = svo_weights(gamma, omega)
     left = torch.full_like(weights, n - p + 1)
-    evidence = Evidence(weights, gamma[..., 0, :, :], left, gamma, omega, torch.full_like(weights[..., :1], n), 0.95)
-    covariance = evidence.influence * evidence.residual[..., None, None] / (n - p + 1)
-    return Evidence(weights, covariance, left, gamma, omega, evidence.degrees, 0.95)
+    dof = torch.full_like(weights[..., :1], n)
+    inference = WeightsInference(weights, gamma[..., 0, :, :], left, gamma, omega, dof, 0.95)
+    covariance = inference.influence * inference.residual[..., None, None] / (n - p + 1)
+    return WeightsInference(weights, covariance, left, gamma, omega, dof, 0.95)
 
 
 def drawn(*shape: int, covariance: Tensor | None = None, seed: int = 1) -> Tensor:
@@ -69,7 +76,7 @@ def test_equal_weights_are_tested_as_in_a_regression():
     null, full = float((x.numpy() @ equal) @ (x.numpy() @ equal)), residual_of(x.numpy(), equal, contrasts)
     statistic = (null - full) / (p - 1) / (full / (n - p + 1))
     assert got.statistic.item() == pytest.approx(statistic, rel=1e-10)
-    assert [d.item() for d in got.degrees_of_freedom] == pytest.approx([p - 1, n - p + 1], rel=1e-10)
+    assert [d.item() for d in got.dof] == pytest.approx([p - 1, n - p + 1], rel=1e-10)
     assert got.p_value.item() == pytest.approx(stats.f.sf(statistic, p - 1, n - p + 1), rel=1e-9)
     assert got.excess.item() == pytest.approx(null / full - 1, rel=1e-10)
 
@@ -77,25 +84,25 @@ def test_equal_weights_are_tested_as_in_a_regression():
 def test_a_sensor_is_tested_as_in_a_regression():
     n, p, sensor = 25, 5, 2
     x = drawn(n, p, seed=2)
-    evidence = one_level(x)
-    got = dropped_sensor_test(evidence, sensor, "3")
+    inference = one_level(x)
+    got = dropped_sensor_test(inference, sensor, "3")
     start, contrasts = np.eye(p)[0], np.eye(p)[:, 1:] - np.eye(p)[:, :1]
     others = np.delete(contrasts, sensor - 1, axis=1)  # no way to give this sensor a weight
     null, full = residual_of(x.numpy(), start, others), residual_of(x.numpy(), start, contrasts)
-    t = evidence.weights[sensor] / evidence.covariance[sensor, sensor].sqrt()
+    t = inference.weights[sensor] / inference.covariance[sensor, sensor].sqrt()
     assert got.statistic.item() == pytest.approx((null - full) / (full / (n - p + 1)), rel=1e-9)
     assert got.statistic.item() == pytest.approx(t.item() ** 2, rel=1e-10)
     assert got.p_value.item() == pytest.approx(2 * stats.t.sf(abs(t.item()), n - p + 1), rel=1e-9)
-    without = np.delete(np.delete(evidence.combined.numpy(), sensor, 0), sensor, 1)
-    ratio = np.linalg.inv(evidence.combined.numpy()).sum() / np.linalg.inv(without).sum()
+    without = np.delete(np.delete(inference.combined.numpy(), sensor, 0), sensor, 1)
+    ratio = np.linalg.inv(inference.combined.numpy()).sum() / np.linalg.inv(without).sum()
     assert got.excess.item() == pytest.approx(ratio - 1, rel=1e-9)
 
 
 @pytest.mark.parametrize(("n", "p"), [(6, 4), (30, 4), (12, 2)])
 def test_size_is_exact_for_one_level(n, p):
     """4000 samples of equal sensors: 5 % of each test come out below 5 %."""
-    evidence = one_level(drawn(4000, n, p, seed=3))
-    assert within(int((equal_weights_test(evidence).p_value < 0.05).sum()), 0.05, 4000)
+    inference = one_level(drawn(4000, n, p, seed=3))
+    assert within(int((equal_weights_test(inference).p_value < 0.05).sum()), 0.05, 4000)
 
 
 def idle_last(n_sensors: int = N_SENSORS) -> Tensor:
@@ -109,8 +116,8 @@ def idle_last(n_sensors: int = N_SENSORS) -> Tensor:
 
 
 def test_size_of_the_test_of_a_sensor_is_exact_for_one_level():
-    evidence = one_level(drawn(4000, 12, 4, covariance=idle_last(), seed=5))
-    assert within(int((dropped_sensor_test(evidence, 3, "4").p_value < 0.05).sum()), 0.05, 4000)
+    inference = one_level(drawn(4000, 12, 4, covariance=idle_last(), seed=5))
+    assert within(int((dropped_sensor_test(inference, 3, "4").p_value < 0.05).sum()), 0.05, 4000)
 
 
 @pytest.mark.parametrize("variances", [(1, 1, 3, 3), (1, 2, 3, 100)])
@@ -118,12 +125,12 @@ def test_size_of_the_test_of_a_sensor_is_exact_for_one_level():
 def test_coverage_of_the_excess_for_one_level(n, variances):
     """4000 samples: limits of 95 % miss the true excess above and below by 2.5 % each, the lower ones at most so."""
     covariance = torch.diag(torch.tensor(variances, dtype=torch.float64))
-    evidence = one_level(drawn(4000, n, 4, covariance=covariance, seed=6))
+    inference = one_level(drawn(4000, n, 4, covariance=covariance, seed=6))
     best = 1 / torch.linalg.inv(covariance).sum()
     without = torch.linalg.inv(covariance[:3, :3]).sum()
     for test, truth in (
-        (equal_weights_test(evidence), covariance.mean() / best - 1),
-        (dropped_sensor_test(evidence, 3, "4"), 1 / without / best - 1),
+        (equal_weights_test(inference), covariance.mean() / best - 1),
+        (dropped_sensor_test(inference, 3, "4"), 1 / without / best - 1),
     ):
         low, high = test.confidence_interval
         assert within(int((low > truth).sum()), 0.025, 4000)
@@ -147,8 +154,8 @@ def test_limits_of_the_excess_are_quantiles_of_its_law():
 
 
 def test_no_excess_found_is_no_evidence_of_less_than_none():
-    evidence = one_level(drawn(500, 20, 4, seed=7))
-    low, high = equal_weights_test(evidence).confidence_interval
+    inference = one_level(drawn(500, 20, 4, seed=7))
+    low, high = equal_weights_test(inference).confidence_interval
     assert (low >= 0).all()
     assert (high > 0.05).all()
 
@@ -221,8 +228,8 @@ def test_coverage_of_excesses_on_recordings(noise, scale_weights):
 
 def test_observations_of_one_level_are_counted():
     n, p = 40, 4
-    evidence = one_level(drawn(n, p))
-    data = enough_data(evidence, 0.05)
+    inference = one_level(drawn(n, p))
+    data = enough_data(inference, 0.05)
     np.testing.assert_allclose(data.effective_observations, n, rtol=1e-10)
     assert data.deciding_observations.item() == pytest.approx(n)
     assert data.expected_excess.item() == pytest.approx((p - 1) / (n - p + 1))
@@ -230,7 +237,7 @@ def test_observations_of_one_level_are_counted():
     assert (p - 1) / (longer - p + 1) == pytest.approx(0.05)
     assert data.resolved
     assert not data.enough
-    relaxed = enough_data(evidence, 0.2)
+    relaxed = enough_data(inference, 0.2)
     assert relaxed.enough
     assert relaxed.times_longer == 1
 
@@ -243,22 +250,22 @@ def test_weights_are_resolved_by_two_observations_a_sensor(n, resolved):
 def test_errors_of_weights_cost_what_is_expected_of_them():
     """The mean excess over the best weights, with true covariances, of 4000 samples of one level: within 10 %."""
     p, n = 4, 40
-    evidence = one_level(drawn(4000, n, p, seed=10))
-    actual = p * evidence.weights.square().sum(-1) - 1
-    expected = enough_data(evidence, 0.05).expected_excess
+    inference = one_level(drawn(4000, n, p, seed=10))
+    actual = p * inference.weights.square().sum(-1) - 1
+    expected = enough_data(inference, 0.05).expected_excess
     assert actual.mean().item() == pytest.approx(expected.mean().item(), rel=0.1)
 
 
 def test_deciding_levels_by_hand():
     result = fit_svo(drawn(3, 4, 500, seed=11).cumsum(-1), "long", n_levels=5)[0]
-    evidence = result._evidence("test")
+    inference = result._inference("test")
     added = [
-        (omega * np.trace(evidence.influence.numpy() @ gamma)) ** 2 / eta
+        (omega * np.trace(inference.influence.numpy() @ gamma)) ** 2 / eta
         for omega, gamma, eta in zip(
-            evidence.scale_weights.numpy(), evidence.wccv.numpy(), evidence.degrees.numpy(), strict=True
+            inference.scale_weights.numpy(), inference.wccv.numpy(), inference.degrees.numpy(), strict=True
         )
     ]
-    expected = sum(added) / sum(a / eta for a, eta in zip(added, evidence.degrees.numpy(), strict=True))
+    expected = sum(added) / sum(a / eta for a, eta in zip(added, inference.degrees.numpy(), strict=True))
     assert result.enough_data().deciding_observations.item() == pytest.approx(expected, rel=1e-9)
 
 
@@ -370,7 +377,7 @@ def test_sentences():
 )
 def test_verdicts_in_a_summary(variances, n, answers):
     result = fit_svo(scaled(*variances, n=n), "short")
-    lines = verdicts(result._evidence("test"), result.sensors)
+    lines = verdicts(result._inference("test"), result.sensors)
     assert len(lines) == 3
     for line, answer in zip(lines, answers, strict=True):
         assert answer in line

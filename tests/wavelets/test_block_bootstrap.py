@@ -38,8 +38,7 @@ from gyrofuse.wavelets.block_bootstrap import (
     bootstrap_wccv_interval,
     signal_bootstrap,
 )
-from gyrofuse.wavelets.block_length import check_block_length, default_block_length
-from gyrofuse.wavelets.blocks import BlockSums
+from gyrofuse.wavelets.block_length import BlockSums, check_block_length, default_block_length
 from gyrofuse.wavelets.covariance import wavelet_products
 
 LEVELS = 3  # where their number does not matter
@@ -108,8 +107,7 @@ def test_resampled_signals_are_those_of_remark_c(gaps):
 def test_few_at_a_time_is_all_at_once(monkeypatch):
     signal = array()
     whole = [f(signal, 6, block_length=LENGTH, generator=generator()) for f in (block_bootstrap, signal_bootstrap)]
-    for name in ("_PRODUCTS", "_LOOKUPS", "_RESAMPLED"):
-        monkeypatch.setattr(bootstrap, name, 2000)
+    monkeypatch.setattr(bootstrap, "_AT_ONCE", 2000)
     for f, expected in zip((block_bootstrap, signal_bootstrap), whole, strict=True):
         torch.testing.assert_close(f(signal, 6, block_length=LENGTH, generator=generator()), expected)
 
@@ -229,7 +227,7 @@ def test_block_sums_of_chunks(monkeypatch, length):
     series = torch.from_numpy(np.random.default_rng(0).normal(size=(2, 3, 200)))
     whole = BlockSums(length, 200)
     whole.update(series)
-    monkeypatch.setattr("gyrofuse.wavelets.blocks._CHUNK", 16)
+    monkeypatch.setattr("gyrofuse.wavelets.block_length._STARTS_AT_ONCE", 16)
     pieces = BlockSums(length, 200)
     for piece in series.split([0, 1, 2, 60, 130, 7], dim=-1):
         pieces.update(piece)

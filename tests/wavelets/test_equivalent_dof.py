@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gyrofuse import fit_svo, inverse_variance_weights, svo_weights
 from gyrofuse.fusion.weights.svo import resolve_scale_weights
-from gyrofuse.wavelets import equivalent_dof as uncertainty
+from gyrofuse.wavelets import intervals as uncertainty
 
 METHODS = {"svo": svo_weights, "inverse_variance": inverse_variance_weights}
 
@@ -41,7 +41,7 @@ def exact_degrees(weights: np.ndarray, n_coefficients: int) -> float:
 def test_degrees_are_those_of_the_least_favourable_of_white_noise_and_random_walk(level):
     counts = torch.zeros(9, dtype=torch.float64)
     counts[level - 1] = 1e6
-    got = uncertainty.degrees_of_freedom(counts)[level - 1].item()
+    got = uncertainty.equivalent_dof(counts)[level - 1].item()
     haar = np.repeat([1.0, -1.0], 2 ** (level - 1))
     least = min(exact_degrees(haar, 10**6), exact_degrees(haar.cumsum(), 10**6))
     assert 0.89 * least < got <= least * (1 + 1e-3)
@@ -51,7 +51,7 @@ def test_degrees_are_those_of_the_least_favourable_of_white_noise_and_random_wal
 
 def test_degrees_are_at_least_one_and_follow_the_batch():
     counts = torch.tensor([[100.0, 97.0, 0.0], [3.0, 1.0, 0.0]])
-    degrees = uncertainty.degrees_of_freedom(counts)
+    degrees = uncertainty.equivalent_dof(counts)
     k = 280 / 151
     expected = [[4 / 3 * 50, k * 97 / 4, 1.0], [2.0, 1.0, 1.0]]
     np.testing.assert_allclose(degrees, expected, rtol=1e-6)
@@ -94,7 +94,7 @@ def test_the_unit_of_the_signal_does_not_matter(method, size):
     signal = torch.from_numpy(naive.array(4, 400))
     one, other = (fit_svo(x, "short", method=method) for x in (signal, size * signal))
     torch.testing.assert_close(one.weights_cov, other.weights_cov, rtol=1e-6, atol=1e-12)
-    torch.testing.assert_close(one.degrees_of_freedom, other.degrees_of_freedom, rtol=1e-6, atol=0)
+    torch.testing.assert_close(one.dof, other.dof, rtol=1e-6, atol=0)
 
 
 # Coverage

@@ -14,7 +14,7 @@ from gyrofuse.wavelets import long_run_variance as series
 
 def test_terms_follow_the_windows():
     windows = torch.tensor([1.0, 16.0, 70.0, 1e6])
-    assert series.number_of_terms(windows).tolist() == [2, 4, 17, series.MOST_TERMS]
+    assert series.n_basis(windows).tolist() == [2, 4, 17, series.MOST_BASIS]
 
 
 @pytest.mark.parametrize(("n_samples", "n_sensors", "n_levels"), [(100, 6, 6), (8192, 6, 13), (4_000_000, 12, 21)])
@@ -23,7 +23,7 @@ def test_bins_are_powers_of_two_within_twice_the_data(n_samples, n_sensors, n_le
     assert length & (length - 1) == 0
     n_bins = math.ceil(n_samples / length)
     assert n_bins * n_levels * n_sensors**2 <= 2 * n_samples * n_sensors + n_levels * n_sensors**2
-    assert n_bins <= 8 * series.MOST_TERMS
+    assert n_bins <= 8 * series.MOST_BASIS
 
 
 def test_one_bin_for_each_sample_is_the_cosine_transform():

@@ -56,10 +56,10 @@ def test_every_step_raises_the_likelihood():
     unit = unit / unit.amax(0)
     eta = torch.full((N_LEVELS,), 20.0, dtype=torch.float64)
     theta = torch.eye(3, dtype=torch.float64).repeat(2, 1, 1)
-    before = pilot._likelihood(pilot._model(theta, unit), gamma, eta)
+    before = pilot._likelihood(pilot.mixture(theta, unit), gamma, eta)
     for _ in range(30):
-        theta = pilot._step(theta, gamma, unit, eta)
-        after = pilot._likelihood(pilot._model(theta, unit), gamma, eta)
+        theta = pilot.climb_likelihood(theta, gamma, unit, eta[:, None] * unit, n_steps=1)
+        after = pilot._likelihood(pilot.mixture(theta, unit), gamma, eta)
         assert after >= before - 1e-9 * abs(before)
         before = after
     assert (torch.linalg.eigvalsh(theta) > -1e-12).all()
@@ -71,7 +71,7 @@ def test_degrees_are_those_of_the_estimates():
     nu = (sums / counts)[..., 0, 0]  # (run, level)
     found = 2 * true_wccv()[:, 0, 0].square() / nu.var(0)
     fitted = random_walk(first_level=0)
-    expected = fitted.degrees_of_freedom(torch.tensor([[1.0, 0, 0]]).double())[:, 0]
+    expected = fitted.dof(torch.tensor([[1.0, 0, 0]]).double())[:, 0]
     # A chi-square variable has the excess kurtosis 12 / eta.
     error = ((2 + 12 / expected) / 1500).sqrt()
     assert ((found / expected - 1).abs() < 4 * error).all(), (found / expected).tolist()

@@ -13,7 +13,7 @@ from gyrofuse.fitting.array.search import jacobian
 from gyrofuse.fitting.moments.inference import quadratic, sandwich
 from gyrofuse.fitting.moments.records import SampleDesign
 from gyrofuse.fitting.structure import Composition
-from gyrofuse.wavelets.equivalent_dof import normal_quantile
+from gyrofuse.wavelets.intervals import normal_quantile
 
 # Time constants of an AR1 in the record below which its parameters count as unidentified: an AR1 with a time constant
 # of a seventh of the record is estimated anywhere from a thirtieth of it to a random walk, and the delta method fails.

@@ -23,12 +23,12 @@ from gyrofuse.fitting.array.inference import (
 from gyrofuse.fitting.array.moments import vech
 from gyrofuse.fitting.moments.records import SampleDesign
 from gyrofuse.fitting.structure import Composition
-from gyrofuse.fusion.live import subset_weights
+from gyrofuse.fusion.weights.subsets import subset_weights
 from gyrofuse.fusion.weights.svo import ScaleWeights
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.estimation import EstimatedFrom
 from gyrofuse.noise.processes import Model, Process
-from gyrofuse.wavelets.equivalent_dof import chi_square_tail
+from gyrofuse.wavelets.intervals import chi_square_tail
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

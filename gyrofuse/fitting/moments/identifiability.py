@@ -16,7 +16,7 @@ from gyrofuse.fitting.moments.inference import WEAKLY_DETERMINED, Estimates
 from gyrofuse.fitting.spectral.tones import FEWEST_CYCLES, Tones
 from gyrofuse.fitting.structure import Composition
 from gyrofuse.noise.processes import Model
-from gyrofuse.wavelets.equivalent_dof import normal_quantile
+from gyrofuse.wavelets.intervals import normal_quantile
 
 # Time constants in the record below which an AR1 is called indistinguishable from a random walk: with two of them the
 # autocorrelation over the record is still e^-2.

@@ -11,7 +11,7 @@ from torch import Tensor
 from gyrofuse.fitting.moments.records import SampleDesign
 from gyrofuse.fitting.structure import Composition
 from gyrofuse.noise.processes import Sinusoid
-from gyrofuse.wavelets.equivalent_dof import chi_square_tail, normal_quantile
+from gyrofuse.wavelets.intervals import chi_square_tail, normal_quantile
 
 # Standard error of the logarithm of a variance above which it is known to hardly its order of magnitude: its 95 %
 # interval then spans a factor of e^2 = 7.

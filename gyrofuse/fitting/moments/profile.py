@@ -23,7 +23,7 @@ from gyrofuse.fitting.moments.identifiability import ar1s_differ, weakly_identif
 from gyrofuse.fitting.moments.inference import WEAKLY_DETERMINED, Estimates, Fit, Inference
 from gyrofuse.fitting.moments.profile_objectives import MomentProfile, ProfileObjective
 from gyrofuse.fitting.structure import Composition
-from gyrofuse.wavelets.equivalent_dof import normal_quantile
+from gyrofuse.wavelets.intervals import normal_quantile
 
 # Nats by which the logarithm of a variance may fall below its estimate, or the largest one possible: e^-9, a ten
 # thousandth, which no record tells from zero.

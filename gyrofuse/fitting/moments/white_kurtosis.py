@@ -23,7 +23,7 @@ from torch import Tensor
 from gyrofuse.fitting.moments.inference import WEAKLY_DETERMINED, Inference
 from gyrofuse.fitting.spectral.tones import Tones
 from gyrofuse.fitting.structure import Composition
-from gyrofuse.wavelets.equivalent_dof import normal_quantile
+from gyrofuse.wavelets.intervals import normal_quantile
 
 
 def white_excess_kurtosis(series: Tensor, tones: Tones | None, made_of: Composition, params: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from gyrofuse.fitting.ranking.search import EQUIVALENT, MomentSearch, SpectralSe
 from gyrofuse.fitting.ranking.spectra import Lines, decide_lines
 from gyrofuse.noise.processes import Drift, Sinusoid
 from gyrofuse.wavelets.covariance import wavelet_variance
-from gyrofuse.wavelets.equivalent_dof import chi_square_tail
+from gyrofuse.wavelets.intervals import chi_square_tail
 
 
 @dataclass(frozen=True, eq=False)

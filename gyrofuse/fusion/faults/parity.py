@@ -1,93 +1,91 @@
-"""Parity test: which sensor of an array disagrees with the others, since when and how.
+"""Parity test: detection and isolation of faulty sensors of an array.
 
-The test compares the energy of every sensor's difference from the optimal fusion of the others (`parity_energy`) at
-every level in a window with that of a healthy reference: more of it is a fault, and the sensor whose own difference has
-most too much is the one at fault. A sensor that is stuck shows in its own wavelet variance, which motion can only add
-to. What kind of fault it is, `fault_kinds` tells from its shape.
+The test compares the energy of every sensor's difference from the optimal fusion of the others (`residuals`) at every
+level in a window with that of a nominal reference: an excess is a fault, and the sensor with the largest excess is
+isolated. A stuck sensor has too small a wavelet variance of its own, which motion could only raise. The kind of fault
+follows from the shape of the difference (`classify`).
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from gyrofuse._base.checks import check_signal
+from gyrofuse._base.deprecation import renamed_arguments
 from gyrofuse.fusion.faults.classify import kinds_of
 from gyrofuse.fusion.faults.reference import ParityReference, check_window, stationary_reference
 from gyrofuse.fusion.faults.residuals import Energies, chunks_of, energies_of, parity_matrix, window_products
 from gyrofuse.fusion.faults.result import ParityResult
 from gyrofuse.fusion.result import SVOResult
 from gyrofuse.io.recording import Recording
-from gyrofuse.wavelets.equivalent_dof import degrees_of_freedom
-
-# Observations of a window below which its variance can be small by chance alone.
-_FEWEST_QUIET = 8
+from gyrofuse.io.signals import as_recording
+from gyrofuse.wavelets.intervals import equivalent_dof
 
 
+@renamed_arguments(before="history", gain_tolerance="scale_factor_tolerance")
 def parity_test(
     signal: Tensor | Recording,
     reference: ParityReference | SVOResult,
     *,
     window: int | None = None,
-    before: Tensor | Recording | None = None,
+    history: Tensor | Recording | None = None,
     false_alarm: float = 0.01,
-    gain_tolerance: float = 0.0,
+    scale_factor_tolerance: float = 0.0,
 ) -> ParityResult:
-    """Test an array, at rest or moving, for sensors that are frozen, biased, drifting, noisier or sign-flipped.
+    """Test an array, at rest or moving, for stuck-at faults, biases, drifts, noise changes and inverted signs.
 
     Each window is tested by itself: energies of every sensor's difference from the others at every level against F
-    quantiles, with degrees of freedom on the safe side, the spread of the reference added, and Bonferroni's correction
-    for sensors and levels. In a healthy array of Gaussian noise the chance that a window raises an alarm is
-    `false_alarm` at most; what heavier tails add, the spread of the reference alone knows. A sensor found faulty is
-    left out and the others are tested again. Two sensors show that they disagree, but not who is wrong.
+    quantiles, with conservative degrees of freedom, the variation of the noise power in the reference added, and
+    Bonferroni's correction for sensors and levels. In a nominal array of Gaussian noise the probability that a window
+    raises an alarm is at most `false_alarm`; heavier tails are covered as far as windows of the reference show them. A
+    faulty sensor is left out and the others are tested again. Of two sensors a fault is detected, but not isolated.
 
-    Wavelets look back: a window is compared with what came before it, as far as the longest level reaches. A bias
-    shows while that holds its step, so `before` should be the healthy samples that precede the signal; a bias that was
-    there from the start is not seen, nor is a turned sign at rest of a sensor without bias.
+    Wavelets reach back: a window is compared with the samples before it, as far as the longest level. A bias shows
+    while its step is within reach, so `history` should hold the nominal samples that precede the signal. A bias from
+    the start on is not detected, nor is an inverted sign at rest of a sensor without bias.
 
     Args:
         signal: `(..., sensor, time)` or a `Recording`; NaN = missing sample. A last window that is not full is left
             out, and a sensor that lacks more than half of a window is not tested in it.
-        reference: `fit_parity` of a healthy stretch; or a fit of one, whose noise is then taken to be stationary and
-            Gaussian: under heavy tails or a power that wanders healthy windows raise more alarms than stated.
+        reference: `fit_parity_reference` of a nominal stretch; or `fit_svo` of one, whose noise is then taken to be
+            stationary and Gaussian: with heavy tails or varying power the false-alarm rate is larger than stated.
         window: Samples of a window; by default that of the reference, or the whole signal.
-        before: `(..., sensor, time)`, what precedes the signal.
-        false_alarm: Probability of an alarm in a window of a healthy array, over all sensors, scales and kinds.
-        gain_tolerance: By how much scale factors may differ, 0.01 say, without being a fault while the array turns.
+        history: `(..., sensor, time)`, samples that precede the signal.
+        false_alarm: Probability of an alarm in a window of a nominal array, over all sensors, scales and kinds.
+        scale_factor_tolerance: Relative difference of scale factors, 0.01 say, that is no fault while the array turns.
 
     Returns:
-        The result, batched over `(..., window)`. It names the sensors and windows that could not be tested.
+        The result, batched over `(..., window)`, with the sensors and windows that could not be tested.
 
     Raises:
-        TypeError: `signal` or `before` is neither a floating point tensor nor a `Recording`, or `reference` is neither
+        TypeError: `signal` or `history` is neither a floating point tensor nor a `Recording`, or `reference` is neither
             a `ParityReference` nor an `SVOResult`.
         ValueError: Shapes that do not fit, a window longer than the signal, numbers out of range, or so many missing
             samples that no window could be tested.
 
     Example:
-        >>> healthy = fit_parity(calibration, window=512)
-        >>> print(parity_test(signal, healthy, before=calibration))
+        >>> reference = fit_parity_reference(calibration, window=512)
+        >>> print(parity_test(signal, reference, history=calibration))
     """
-    of = signal if isinstance(signal, Recording) else None
-    values = signal.signal if isinstance(signal, Recording) else signal
-    check_signal("signal", values)
+    known_as = as_recording(signal)
+    values = known_as.values
     if not isinstance(reference, ParityReference | SVOResult):
         raise TypeError(
             f"`reference`: expected a ParityReference or an SVOResult, got {type(reference).__name__}; "
-            "learn one from a healthy stretch with fit_parity(healthy, window)"
+            "fit one to a stretch without faults with fit_parity_reference(signal, window)"
         )
     known = reference.window if isinstance(reference, ParityReference) else 0
     window = check_window((known or values.shape[-1]) if window is None else window, values.shape[-1], "signal")
-    healthy = reference if isinstance(reference, ParityReference) else _stationary(reference, window)
-    _check_shape(values, healthy)
-    for name, value in (("false_alarm", false_alarm), ("gain_tolerance", gain_tolerance)):
+    nominal = reference if isinstance(reference, ParityReference) else _stationary(reference, window)
+    _check_shape(values, nominal)
+    for name, value in (("false_alarm", false_alarm), ("scale_factor_tolerance", scale_factor_tolerance)):
         if not 0 <= value < 1:
             raise ValueError(f"`{name}`: expected a number from 0 to 1 such as 0.01, got {value!r}")
     parts = [
-        _test(chunk, healthy, window, false_alarm, gain_tolerance)
-        for chunk in chunks_of(values, window, healthy.n_levels, _history(values, before))
+        _test(chunk, nominal, window, false_alarm, scale_factor_tolerance)
+        for chunk in chunks_of(values, window, nominal.n_levels, _history(values, history))
     ]
     columns = _Columns(*(torch.cat(column, values.ndim - 2) for column in zip(*parts, strict=True)))
     if not bool(columns.tested.any()):
@@ -100,10 +98,10 @@ def parity_test(
         **columns._asdict(),
         window=window,
         false_alarm=false_alarm,
-        sensors=of.sensors if of else healthy.sensors,
-        axes=of.axes if of else (),
-        rate=of.rate if of else None,
-        unit=of.unit if of and of.unit != "unknown" else None,
+        sensors=known_as.sensors if isinstance(signal, Recording) else nominal.sensors,
+        axes=known_as.axes,
+        rate=known_as.rate,
+        unit=known_as.unit,
     )
 
 
@@ -121,8 +119,12 @@ class _Columns(NamedTuple):
 
 
 class _Side(NamedTuple):
-    """Of each window, level and sensor: a variance in units of what it should be, how likely one as far off is, and the
-    log likelihood ratio, which orders what p-values of 0 cannot.
+    """One tail of the test for each window, level and sensor, `(..., window, level, sensor)`.
+
+    Attributes:
+        ratio: Variance in units of its nominal value.
+        p: Its p-value.
+        evidence: Log likelihood ratio, which ranks cases whose p-values are 0 to rounding.
     """
 
     ratio: Tensor
@@ -131,16 +133,16 @@ class _Side(NamedTuple):
 
 
 def _test(
-    chunk: Tensor, reference: ParityReference, window: int, false_alarm: float, gain_tolerance: float
+    chunk: Tensor, reference: ParityReference, window: int, false_alarm: float, scale_factor_tolerance: float
 ) -> _Columns:
-    """Name one sensor of each window, leave it out and look again, until no more are found."""
+    """Isolate one sensor of each window, leave it out and test again, until no more are found."""
     products = window_products(chunk, window, reference.n_levels)
-    # Long wavelets look back beyond a window, whose own samples have to be there all the same.
+    # Long wavelets reach back beyond a window, of which half of the samples are required all the same.
     gamma, live = reference.wavelet_cross_covariance, products.live & _present(chunk, window, products.live)
     columns, n_tests = None, torch.ones_like(live[..., 0], dtype=torch.float64)
     for _ in reference.sensors:
         matrix, weights = parity_matrix(gamma, live)
-        energies = energies_of(products, gamma, matrix, weights, reference.own_variance, gain_tolerance)
+        energies = energies_of(products, matrix, weights, reference.own_variance, scale_factor_tolerance)
         loud, quiet = _loud(energies, reference, live), _quiet(energies, reference, live)
         if columns is None:
             n_tests = loud.p.isfinite().sum((-2, -1)) + quiet.p.isfinite().sum((-2, -1))
@@ -150,26 +152,26 @@ def _test(
         if columns is None:
             columns = _nothing(p_values, loud.p.isfinite().any(-2))
         columns = columns._replace(p_values=torch.where(live, p_values, columns.p_values))
-        # Of two sensors either may be the one that is off; only one that is stuck gives itself away.
+        # Of two sensors only a stuck one can be isolated.
         stuck = p_quiet.amin(-2) < false_alarm
-        nameable = live & (p_values < false_alarm) & ((live.sum(-1, keepdim=True) > 2) | stuck)
-        if not bool(nameable.any()):
+        isolable = live & (p_values < false_alarm) & ((live.sum(-1, keepdim=True) > 2) | stuck)
+        if not bool(isolable.any()):
             break
         evidence_loud = torch.where(p_loud < false_alarm, loud.evidence, -1.0)
         evidence_quiet = torch.where(p_quiet < false_alarm, quiet.evidence, -1.0)
-        evidence = torch.where(nameable, torch.maximum(evidence_loud, evidence_quiet).amax(-2), -1.0)
-        named = torch.zeros_like(live).scatter_(-1, evidence.argmax(-1, keepdim=True), True) & nameable
+        evidence = torch.where(isolable, torch.maximum(evidence_loud, evidence_quiet).amax(-2), -1.0)
+        isolated = torch.zeros_like(live).scatter_(-1, evidence.argmax(-1, keepdim=True), True) & isolable
         level = torch.where(stuck, evidence_quiet.argmax(-2), evidence_loud.argmax(-2))
         ratio = torch.where(stuck.unsqueeze(-2), quiet.ratio, loud.ratio).gather(-2, level.unsqueeze(-2)).squeeze(-2)
-        kind, size = kinds_of(chunk, window, named, level, gamma, matrix, stuck)
+        kind, size = kinds_of(chunk, window, isolated, level, gamma, matrix, stuck)
         columns = columns._replace(
-            faulty=columns.faulty | named,
-            kind=torch.where(named, kind, columns.kind),
-            level=torch.where(named, level, columns.level),
-            statistic=torch.where(named, ratio, columns.statistic),
-            size=torch.where(named, size, columns.size),
+            faulty=columns.faulty | isolated,
+            kind=torch.where(isolated, kind, columns.kind),
+            level=torch.where(isolated, level, columns.level),
+            statistic=torch.where(isolated, ratio, columns.statistic),
+            size=torch.where(isolated, size, columns.size),
         )
-        live = live & ~named
+        live = live & ~isolated
     assert columns is not None
     return columns
 
@@ -193,47 +195,49 @@ def _adjusted(p: Tensor, n_tests: Tensor) -> Tensor:
 def _loud(energies: Energies, reference: ParityReference, live: Tensor) -> _Side:
     """Too much energy of a difference.
 
-    `e_i` is the residual of a regression on the p - 2 parities of the others: that many of the reference's observations
-    are spent, and a new one varies by what the coefficients are off as well, as in Hotelling's T^2.
+    `e_i` is the residual of a regression on the p - 2 parities of the others: these use up as many of the reference's
+    observations, and errors of the coefficients add to a new residual, as in Hotelling's T^2.
     """
-    degrees = reference.degrees_of_freedom[..., None, :, None]  # (..., 1, level, 1)
-    left = degrees - (live.sum(-1) - 2).clamp(min=0)[..., None, None]
-    ratio = energies.parity * (left / degrees) / (1 + energies.rest / degrees)
+    dof = reference.dof[..., None, :, None]  # (..., 1, level, 1)
+    left = dof - (live.sum(-1) - 2).clamp(min=0)[..., None, None]
+    ratio = energies.parity * (left / dof) / (1 + energies.rest / dof)
     tested = (energies.counts > 0).unsqueeze(-1) & (live.sum(-1, keepdim=True) > 1).unsqueeze(-1)
     return _side("sf", ratio, _observed(energies), left, reference.spread, reference, tested & live.unsqueeze(-2))
 
 
 def _quiet(energies: Energies, reference: ParityReference, live: Tensor) -> _Side:
     """Too little energy of a sensor itself."""
-    observed, degrees = _observed(energies), reference.degrees_of_freedom[..., None, :, None]
-    tested = (observed >= _FEWEST_QUIET) & live.unsqueeze(-2)
-    return _side("cdf", energies.own, observed, degrees, reference.own_spread, reference, tested)
+    observed, dof = _observed(energies), reference.dof[..., None, :, None]
+    # The variance of fewer than 8 observations may be small by chance.
+    tested = (observed >= 8) & live.unsqueeze(-2)
+    return _side("cdf", energies.own, observed, dof, reference.own_spread, reference, tested)
 
 
 def _observed(energies: Energies) -> Tensor:
     """Independent observations of each window, `(..., window, level, 1)`."""
-    return degrees_of_freedom(energies.counts).unsqueeze(-1)
+    return equivalent_dof(energies.counts).unsqueeze(-1)
 
 
 def _side(
     tail: str,
     ratio: Tensor,
     observed: Tensor,
-    degrees: Tensor,
+    dof: Tensor,
     spread: Tensor,
     reference: ParityReference,
     tested: Tensor,
 ) -> _Side:
-    """Chance of a variance ratio in a healthy array.
+    """P-value of a variance ratio in a nominal array.
 
-    An F law, whose degrees of freedom the spread lowers: `2/eta` is the relative variance of a variance. Powers that
-    themselves vary have longer tails, and how far they vary is known from some windows only: where they do, the
-    logarithm of the ratio is held against Student's t as well, and the larger chance counts.
+    An F law with degrees of freedom `eta` such that `2/eta` is the relative variance of a variance, including the
+    variation of the noise power. A varying power has longer tails, and its variation is known from few windows: where
+    it varies more than sampling, the logarithm of the ratio is compared with Student's t as well, and the larger
+    p-value counts.
     """
     from scipy import stats
 
     spread, n_windows = spread.unsqueeze(-3), reference.n_windows[..., None, :, None]
-    above, below = 2 / observed + spread, 2 / degrees + spread / n_windows  # relative variances
+    above, below = 2 / observed + spread, 2 / dof + spread / n_windows  # relative variances
     deviation = torch.log1p(above + below).sqrt()
     score = ratio.clamp(min=1e-300).log() / deviation + deviation / 2
     chances = []
@@ -246,9 +250,7 @@ def _side(
 
 
 def _stationary(result: SVOResult, window: int) -> ParityReference:
-    return stationary_reference(
-        result.wavelet_cross_covariance, result.degrees_of_freedom, result.sensors, window, name="reference"
-    )
+    return stationary_reference(result.wavelet_cross_covariance, result.dof, result.sensors, window, name="reference")
 
 
 def _check_shape(values: Tensor, reference: ParityReference) -> None:
@@ -264,15 +266,14 @@ def _check_shape(values: Tensor, reference: ParityReference) -> None:
         )
 
 
-def _history(values: Tensor, before: Tensor | Recording | None) -> Tensor | None:
+def _history(values: Tensor, history: Tensor | Recording | None) -> Tensor | None:
     """Samples before the signal, of its batch shape."""
-    if before is None:
+    if history is None:
         return None
-    history: Any = before.signal if isinstance(before, Recording) else before
-    check_signal("before", history)
-    if history.shape[:-1] != values.shape[:-1]:
+    earlier = as_recording(history, "history").values
+    if earlier.shape[:-1] != values.shape[:-1]:
         raise ValueError(
-            f"`before`: expected the shape {tuple(values.shape[:-1])} of the signal but for time, "
-            f"got {tuple(history.shape[:-1])}"
+            f"`history`: expected the shape {tuple(values.shape[:-1])} of the signal but for time, "
+            f"got {tuple(earlier.shape[:-1])}"
         )
-    return history.to(values)
+    return earlier.to(values)

@@ -1,15 +1,15 @@
-"""What the parity test found: which sensor, since when, and what is wrong with it."""
+"""Result of the parity test: faulty sensors with the kind of fault and the time."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from gyrofuse._base.results import listed, numbered
+from gyrofuse._base.results import Result, numbered, plain
 from gyrofuse.fusion.faults.classify import KINDS
 
 if TYPE_CHECKING:
@@ -23,13 +23,13 @@ class Fault(NamedTuple):
         sensor: Its name.
         kind: One of `KINDS`.
         item: Index of the batch item, `()` without a batch.
-        start: Where the first window begins, seconds or samples.
-        stop: Where the last window ends.
-        tau: Averaging time at which it shows most, seconds or samples.
-        size: Step (signal), slope (signal per second or sample), or how many times more the difference from the other
-            sensors varies; NaN for other kinds.
-        p_value: The smallest of its windows, adjusted for all that was tested in one.
-        sentence: The same in words.
+        start: Begin of the first window, seconds or samples.
+        stop: End of the last window.
+        tau: Averaging time at which the fault shows most, seconds or samples.
+        size: Step (signal), slope (signal per second or sample), or factor on the standard deviation of the difference
+            from the other sensors; NaN for other kinds.
+        p_value: Smallest p-value of the windows, adjusted for all tests of a window.
+        sentence: The fault in words.
     """
 
     sensor: str
@@ -44,22 +44,22 @@ class Fault(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class ParityResult:
+class ParityResult(Result):
     """Outcome of a parity test, batched over `(..., window)`.
 
     Attributes:
-        faulty: `(..., window, sensor)`, the sensors named.
-        kind: `(..., window, sensor)`, index of `fault_kinds.KINDS`, -1 where none is named.
+        faulty: `(..., window, sensor)`, bool, the isolated sensors.
+        kind: `(..., window, sensor)`, index of `KINDS`, -1 where the sensor is not isolated.
         level: `(..., window, sensor)`, from 0, at which the fault shows most; -1 likewise.
-        statistic: `(..., window, sensor)`, energy there in units of that of a healthy array; NaN likewise.
+        statistic: `(..., window, sensor)`, energy at that level in units of that of a nominal array; NaN likewise.
         size: `(..., window, sensor)`, as in `Fault`, per sample.
-        p_values: `(..., window, sensor)`, adjusted for all tests of a window; of a sensor that was not named, without
-            those that were.
-        p_value: `(..., window)`, of the array.
-        tested: `(..., window, sensor)`, whether a sensor was held against the others at one level at least; where it
-            was not, for want of samples, its `p_values` of 1 say nothing.
+        p_values: `(..., window, sensor)`, adjusted for all tests of a window; for a sensor that is not isolated, in the
+            array without the isolated ones.
+        p_value: `(..., window)`, p-value of the array.
+        tested: `(..., window, sensor)`, whether a sensor was tested at one level at least; where it was not, for want
+            of samples, its `p_values` are 1.
         window: Samples of a window.
-        false_alarm: Stated probability of an alarm in a window of a healthy array.
+        false_alarm: Stated probability of an alarm in a window of a nominal array.
         sensors: Name of each sensor.
         axes: Names along the leading dimension, empty when it has none.
         rate: Sampling rate in Hz, when known.
@@ -80,26 +80,37 @@ class ParityResult:
     axes: tuple[str, ...] = ()
     rate: float | None = None
     unit: str | None = None
+    _batched = ("faulty", "kind", "level", "statistic", "size", "p_values", "p_value", "tested")
+    _contents = tuple("sensors axes rate unit window false_alarm start alarm p_value p_values faulty tested".split())
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading dimensions before `window`; `()` for a single array."""
+        return tuple(self.p_value.shape[:-1])
+
+    def __getitem__(self, index: Any) -> ParityResult:
+        """One item, or some, of the leading batch dimensions."""
+        return replace(super().__getitem__(index), axes=())
 
     @property
     def alarm(self) -> Tensor:
-        """Windows `(..., window)` that a healthy array would hardly show."""
+        """Windows `(..., window)` whose p-value is below `false_alarm`."""
         return self.p_value < self.false_alarm
 
     @property
     def start(self) -> Tensor:
-        """Where each window begins, `(window,)`; seconds, or samples without a rate."""
+        """Begin of each window, `(window,)`; seconds, or samples without a rate."""
         return torch.arange(self.p_value.shape[-1], dtype=torch.float64) * self.window / (self.rate or 1.0)
 
     @property
     def faults(self) -> list[Fault]:
-        """Every fault found, windows in a row with the same sensor and kind as one."""
+        """All faults; consecutive windows of the same sensor and kind are one fault."""
         found = []
         kind = self.kind.movedim(-1, -2)  # (..., sensor, window)
         same = kind[..., 1:] == kind[..., :-1]
-        named = kind >= 0
-        begins = named & ~torch.nn.functional.pad(same & named[..., 1:], (1, 0))
-        ends = named & ~torch.nn.functional.pad(same & named[..., 1:], (0, 1))
+        isolated = kind >= 0
+        begins = isolated & ~torch.nn.functional.pad(same & isolated[..., 1:], (1, 0))
+        ends = isolated & ~torch.nn.functional.pad(same & isolated[..., 1:], (0, 1))
         for first, last in zip(begins.nonzero().tolist(), ends.nonzero().tolist(), strict=True):
             found.append(self._fault(tuple(first[:-2]), first[-2], first[-1], last[-1]))
         return found
@@ -137,7 +148,7 @@ class ParityResult:
         return self.axes[item[0]] if self.axes and len(item) == 1 else ", ".join(map(str, item))
 
     def summary(self) -> str:
-        """What was found, in sentences."""
+        """The faults and the untested windows, in sentences."""
         n_windows = self.p_value.numel()
         seconds = f" ({self.window / self.rate:.6g} s)" if self.rate else ""
         lines = [
@@ -148,11 +159,11 @@ class ParityResult:
         lines += [f"- {fault.sentence}" for fault in faults[:20]]
         if len(faults) > 20:
             lines.append(f"- ... and {len(faults) - 20} more")
-        n_unnamed = int((self.alarm & ~self.faulty.any(-1)).sum())
-        if n_unnamed:
-            lines.append(f"- In {n_unnamed} window(s) two sensors disagree; it takes a third to tell which is wrong.")
+        n_detected = int((self.alarm & ~self.faulty.any(-1)).sum())
+        if n_detected:
+            lines.append(f"- In {n_detected} window(s) two sensors disagree; it takes a third to tell which is wrong.")
         untested = self._untested()
-        if not faults and not n_unnamed:
+        if not faults and not n_detected:
             where = ", as far as they were tested" if untested else ""
             lines.append(f"- No sensor stands out{where} (smallest p = {self.p_value.min().item():.2g}).")
         lines += [f"- {gap}" for gap in untested[:20]]
@@ -161,7 +172,7 @@ class ParityResult:
         return "\n".join(lines)
 
     def _untested(self) -> list[str]:
-        """Sensors that could not be tested, and the windows of that, in words; sensors with the same windows as one."""
+        """Sensors and windows that could not be tested, in words; sensors with the same windows in one sentence."""
         missing = ~self.tested.movedim(-1, -2).cpu()  # (..., sensor, window)
         gaps: dict[tuple[tuple[int, ...], tuple[int, ...]], list[int]] = {}
         for *item, sensor in missing.any(-1).nonzero().tolist():
@@ -193,32 +204,12 @@ class ParityResult:
             who = "all sensors"
         return f"{f'[{self._item(item)}] ' if item else ''}Not tested: {who} {when}; too few samples to compare."
 
-    def __str__(self) -> str:
-        return self.summary()
-
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain lists and numbers, ready for JSON (NaN as None)."""
-        return {
-            "sensors": list(self.sensors),
-            "axes": list(self.axes),
-            "rate": self.rate,
-            "unit": self.unit,
-            "window": self.window,
-            "false_alarm": self.false_alarm,
-            "start": listed(self.start),
-            "alarm": self.alarm.tolist(),
-            "p_value": listed(self.p_value),
-            "p_values": listed(self.p_values),
-            "faulty": self.faulty.tolist(),
-            "tested": self.tested.tolist(),
-            "faults": [
-                {**fault._asdict(), "item": list(fault.item), "size": fault.size if math.isfinite(fault.size) else None}
-                for fault in self.faults
-            ],
-        }
+        return super().to_dict() | {"faults": [plain(fault._asdict()) for fault in self.faults]}
 
     def plot(self, ax: Axes | None = None) -> Axes:
-        """Draw how unlikely each sensor is over time; windows with a fault are outlined, untested ones are blue.
+        """Draw the p-value of each sensor over time; windows with a fault are outlined, untested windows are blue.
 
         Args:
             ax: Where to draw; new axes by default.
@@ -231,10 +222,8 @@ class ParityResult:
         """
         import matplotlib.pyplot as plt
 
-        if self.p_value.ndim > 1:
-            raise ValueError(
-                f"expected one array to plot, got a batch {tuple(self.p_value.shape[:-1])}; test one array at a time"
-            )
+        if self.batch_shape:
+            raise ValueError(f"expected one array to plot, got a batch {self.batch_shape}; index the result, result[0]")
         if ax is None:
             ax = plt.subplots(figsize=(7.0, 3.2), layout="constrained")[1]
         strength = -self.p_values.clamp(min=1e-12).log10()

@@ -16,6 +16,7 @@ from gyrofuse.fusion import plots as plotting
 from gyrofuse.fusion.multiscale_result import MultiScaleResult
 from gyrofuse.fusion.report.words import ALIKE, Fused, verdict
 from gyrofuse.fusion.result import SVOResult
+from gyrofuse.fusion.weights.methods import METHODS, MULTISCALE
 from gyrofuse.fusion.weights.rdvg import rdvg
 from gyrofuse.io.recording import Recording
 from gyrofuse.wavelets.covariance import wavelet_variance
@@ -34,34 +35,6 @@ __all__ = [
     "verdict",
 ]
 
-_METHODS = {
-    "svo": "Scale-wise variance optimisation (SVO): the weights minimise the wavelet variance of the virtual gyro, "
-    "summed over scales with the scale weights of the table (Zhang, Cucci, Molinari, Guerrier, IEEE Transactions on "
-    "Signal Processing 70, 2022, equations 6 and 7). They sum to 1 and may be negative.",
-    "inverse_variance": "Inverse variance: every sensor is weighted by the reciprocal of its wavelet variance, summed "
-    "over scales with the scale weights of the table; correlation between sensors is ignored.",
-    "model_assisted": "Model-assisted SVO: the weights minimise the wavelet variance of the virtual gyro, summed over "
-    "scales with the scale weights of the table, where the last scales, of few observations, are those of a smooth "
-    "noise model fitted to the others.",
-    "shrinkage": "SVO with shrinkage: the weights minimise the wavelet variance of the virtual gyro, summed over "
-    "scales with the scale weights of the table, where scales of few observations are drawn towards those beside them.",
-    "auto": "SVO, model-assisted SVO or SVO with shrinkage, whichever does best on data held out: the weights minimise "
-    "the wavelet variance of the virtual gyro, summed over scales with the scale weights of the table.",
-    "nonnegative": "Nonnegative SVO: the weights minimise the wavelet variance of the virtual gyro, summed over scales "
-    "with the scale weights of the table, and none is negative.",
-    "multiscale": "Multi-scale virtual gyro: every sensor is split, causally and without delay, into bands of time "
-    "scales that add up to it, and each band is fused with its own weights, which sum to 1 and may be negative. "
-    "Together they minimise the wavelet variance of the virtual gyro relative to the least that one vector of weights "
-    "for that level alone would leave, averaged with the scale weights of the table. The weights come without "
-    "intervals, and so do the ratios: "
-    "virtual gyro and plain mean are made of the same samples, so that their ratio is known better than the interval "
-    "of either says, but weights flatter themselves in the recording that they were chosen from.",
-    "rdvg": "Reduced-drift virtual gyro (Vaccaro and Zaki, Sensors 17, 2017): the weights minimise the random walk in "
-    "a model of white noise and random walk. Nothing makes the estimated covariance of the random walks, Q, positive "
-    "definite; where it is not, the weights follow the formula but minimise nothing.",
-    "equal": "Equal weights: the virtual gyro is the plain mean of the sensors.",
-}
-
 
 def fusion_report(
     result: Fused,
@@ -74,8 +47,8 @@ def fusion_report(
     """Write the report of a fused array.
 
     Args:
-        result: Of one array, or of one per axis.
-        recording: What was fused, for its notes and the plain mean in the figure of the signals.
+        result: Result of one array, or of one array for each axis.
+        recording: Recording that was fused, for its notes and the plain mean in the figure of the signals.
         virtual: Virtual signal `(time,)`, or `(axis, time)` for a result with axes, to be drawn.
         title: Heading of the page.
         remarks: Sentences shown below the verdict.
@@ -116,7 +89,7 @@ def fusion_report(
         recording=recording,
         parts=parts,
         remarks=remarks,
-        method=_METHODS[result.method],
+        method=METHODS.get(result.method, MULTISCALE),
         selection=result.selection if isinstance(result, SVOResult) else None,
         percent=f"{100 * result.confidence_level:g} %",
         second="s" if result.rate else "samples",
@@ -156,7 +129,7 @@ def fusion_figure(result: Fused) -> Figure:
     """Draw gain, Allan deviations and weights of a fused array in one figure, axes side by side.
 
     Args:
-        result: Of one array, or of one per axis.
+        result: Result of one array, or of one array for each axis.
 
     Returns:
         A figure unknown to pyplot; save it with `save_figure`.
@@ -256,7 +229,7 @@ def _level_rows(result: Fused) -> list[dict[str, Any]]:
         "virtual": (2 * virtual).sqrt(),
         "low": (2 * low).sqrt(),
         "high": (2 * high).sqrt(),
-        "degrees": result.degrees_of_freedom,
+        "degrees": result.dof,
     }
     if isinstance(result, MultiScaleResult):
         columns |= {

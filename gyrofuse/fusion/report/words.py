@@ -1,4 +1,4 @@
-"""What a fused array comes to, in sentences: who carries it, where it wins and where it loses."""
+"""A fused array in sentences: which sensors carry it, and where it is better or worse than others."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from gyrofuse.fusion.result import SVOResult
 
 Fused = SVOResult | MultiScaleResult
 
-ALIKE = 0.005  # relative difference between Allan deviations that is not worth a word
-_MOST_NAMED = 8  # sensors listed in one sentence
+# Relative difference between Allan deviations up to which they are called equal: far below their standard errors.
+ALIKE = 0.005
 
 
 def verdict(result: Fused) -> list[str]:
-    """Say in sentences which sensors carry the virtual gyro, where it wins and where it loses.
+    """Sentences on which sensors carry the virtual gyro, and where its Allan deviation is lower and higher.
 
-    Levels that hold fewer observations than there are sensors are left out of where it wins and loses, and a sentence
-    says so, unless no level holds more.
+    Levels with fewer observations than sensors are left out of the comparisons, and a sentence says so, unless all
+    levels are such.
 
     Args:
-        result: Of one array.
+        result: Result of one array.
     """
     sentences = [f"Beware: {result.motion}."] if result.motion else []
     if isinstance(result, MultiScaleResult):
@@ -44,7 +44,7 @@ def verdict(result: Fused) -> list[str]:
 
 def _resolved(result: Fused) -> Tensor:
     """Levels `(level,)` that are known and, like all below them, hold no fewer observations than there are sensors."""
-    return well_observed(result.degrees_of_freedom, len(result.sensors)) & result.virtual_wavelet_variance.isfinite()
+    return well_observed(result.dof, len(result.sensors)) & result.virtual_wavelet_variance.isfinite()
 
 
 def _judged(result: Fused) -> Tensor:
@@ -58,7 +58,7 @@ def _few_in_words(result: Fused) -> list[str]:
     few = ~_resolved(result) & result.virtual_wavelet_variance.isfinite()
     if not bool(few.any()):
         return []
-    most = number(result.degrees_of_freedom[few].max().item(), 2)
+    most = number(result.dof[few].max().item(), 2)
     start = (
         f"From {_time(result, int(few.nonzero()[0]))} on, the recording holds fewer independent observations "
         f"({most} or less) than there are sensors"
@@ -138,11 +138,11 @@ def _weights_in_words(result: SVOResult) -> list[str]:
     return sentences
 
 
-def _listed(result: SVOResult, which: Sequence[int]) -> str:
+def _listed(result: SVOResult, which: Sequence[int], most: int = 8) -> str:
     """Sensors with their weights, as far as a sentence can bear."""
-    shown = [f"{result.sensors[i]} (weight {result.weights[i].item():.3f})" for i in which[:_MOST_NAMED]]
-    if len(which) > _MOST_NAMED:
-        shown.append(f"{len(which) - _MOST_NAMED} more")
+    shown = [f"{result.sensors[i]} (weight {result.weights[i].item():.3f})" for i in which[:most]]
+    if len(which) > most:
+        shown.append(f"{len(which) - most} more")
     return _joined(shown)
 
 

@@ -14,12 +14,9 @@ weights and `B = (I - c 1') A^-1`
 
 are products of the coefficients of the signals `B x` and of the virtual signal `c' x`: one pass over the data.
 
-**Where it is wrong**: as all of this bootstrap (`gyrofuse.wavelets.block_bootstrap`), at large scales. Nominal 95 %
-intervals of weights of four sensors with white noise and random walks, 2**13 samples, 9 levels, blocks of `T^(1/3) =
-20`, held the truth in 95 % of 300 recordings for short scale weights, 92 to 94 % for flat and **45 to 55 %** for long
-ones (88 to 90 % with the default block length). With 12 levels, whose last one has half as many coefficients as there
-are samples, 90 %, **32 to 44 %** and **22 to 38 %**. And it is first order, as (8) of [Z] is: where a sensor's noise
-rests on a few bursts, weights refitted to the resamples of `block_bootstrap` spread wider.
+**Where it is wrong**: at large scales, as all of this bootstrap (`gyrofuse.wavelets.block_bootstrap`). It is of first
+order, as (8) of [Z] is: where a sensor's noise comes in a few bursts, weights fitted to the resamples of
+`block_bootstrap` vary more.
 """
 
 from __future__ import annotations
@@ -32,8 +29,9 @@ from torch import Tensor
 from gyrofuse._base.checks import check_floating, check_n_levels, check_positive_integer, check_signal
 from gyrofuse._base.linalg import check_positive_definite
 from gyrofuse.fusion.uncertainty.sweep import Statistic, Sweeps, joined
-from gyrofuse.fusion.weights.svo import ScaleWeights, resolve_scale_weights
+from gyrofuse.fusion.weights.svo import ScaleWeights, influence_matrix, resolve_scale_weights
 from gyrofuse.wavelets.block_length import (
+    BlockSums,
     alike,
     bin_means,
     check_block_length,
@@ -41,12 +39,12 @@ from gyrofuse.wavelets.block_length import (
     n_columns,
     warn_of_few_columns,
 )
-from gyrofuse.wavelets.blocks import BlockSums
 from gyrofuse.wavelets.covariance import wavelet_products
+from gyrofuse.wavelets.moments import combined_covariance, filter_lengths
 
-# Samples x sensors of short recordings that are taken together.
-_GROUP = 2**19
-# Longest windows in what is swept at a time, when all of a recording is there.
+# Samples of all sensors in short recordings that are swept together (2**19): 4 MiB, which stay in cache.
+_GROUP = 524_288
+# Number of the longest windows in a stretch that is swept at a time: a stretch looks ahead by one of them, an eighth.
 _WINDOWS = 8
 
 
@@ -62,12 +60,10 @@ def bootstrap_weights_covariance(
     """Covariance of estimated SVO weights by the moving block bootstrap in closed form.
 
     `Sigma* / T` of [Z] for endless resamples, in one pass over the data. In recordings of 2**14 samples or more,
-    stretches that complete a level start at every 2nd, 4th, ... time, which moves the result by less than a few parts
-    in a thousand. Memory: about twice that of the signal.
+    stretches that complete a level start at every 2nd, 4th, ... time. Memory: about twice that of the signal.
 
-    Too small where scales far beyond the blocks decide: nominal 95 % intervals of weights for long scales, with blocks
-    of `T^(1/3)`, hold the truth in 20 to 55 % of recordings. Too small for all when the last level has few
-    coefficients. See the module and `gyrofuse.wavelets.block_bootstrap`.
+    Too small where scales far beyond the blocks dominate, and for all scale weights when the last level has few
+    coefficients; see the module and `gyrofuse.wavelets.block_bootstrap`.
 
     Args:
         signal: `(..., sensor, time)`, that gave the weights; NaN = missing sample.
@@ -124,8 +120,8 @@ def bootstrap_inverse_variance_weights_covariance(
 class BootstrapWeightsCovariance:
     """`bootstrap_weights_covariance` of a recording that comes in chunks, for weights known beforehand.
 
-    Takes what a first pass over the recording gave. Blocks are counted from the length of the recording, which has to
-    be known too. Holds a few times `2**n_levels` samples. As wrong at large scales as the function.
+    The moments and weights come from a first pass over the recording, whose length has to be known, as the number of
+    blocks follows from it. Holds a few times `2**n_levels` samples. As wrong at large scales as the function.
 
     Args:
         wccv: `(..., level, sensor, sensor)`.
@@ -212,16 +208,15 @@ class BootstrapWeightsCovariance:
 
 
 def _svo(wccv: Tensor, weights: Tensor, counts: Tensor | None, omega: Tensor, n_samples: int) -> Statistic:
-    """SVO weights: influences `-omega_j B W (W' c) / M_j`; where samples are missing, on means of what there is."""
-    counting = torch.where(omega[:, None, None] > 0, wccv, 0.0)
-    combined = torch.einsum("j,njik->nik", omega, counting)
-    inverse = torch.linalg.inv(combined)
-    minus = weights[:, :, None] * inverse.sum(-2, keepdim=True) - inverse  # -B = -(I - c 1') A^-1
-    # The last weight makes up for the others, as all sum to 1.
+    """SVO weights: influences `-omega_j B W (W' c) / M_j`; with missing samples, on the means of known products."""
+    used = torch.where(omega[:, None, None] > 0, wccv, 0.0)
+    combined = combined_covariance(wccv, omega)
+    minus = -influence_matrix(combined, weights)  # -B
+    # The last weight is 1 less the others.
     minus, unit = minus[:, :-1], torch.eye(weights.shape[1] - 1, dtype=torch.float64, device=omega.device)
     jacobian = torch.cat([unit, -torch.ones_like(unit[:1])]) if len(unit) else unit.new_zeros(1, 0)
     layout = jacobian.expand(len(wccv), -1, -1), tuple(omega.nonzero().flatten().tolist()), len(omega)
-    size = omega * torch.exp2(-2 * _levels(omega))
+    size = omega / filter_lengths(len(omega)).to(omega).square()
     if counts is None:
         factor = (size / _n_coefficients(omega, n_samples)).tolist()
 
@@ -232,7 +227,7 @@ def _svo(wccv: Tensor, weights: Tensor, counts: Tensor | None, omega: Tensor, n_
         return Statistic(torch.cat([minus, weights[:, None, :]], dim=1), influence, estimate, *layout)
 
     share = weights[:, None, None, :] / counts  # c_k / count_ik: (item, level, sensor i, sensor k)
-    products, means = size[:, None, None] * share, omega[:, None, None] * share * counting
+    products, means = size[:, None, None] * share, omega[:, None, None] * share * used
 
     def influence_with_gaps(d: Tensor, level: int, series: Tensor) -> None:
         flat = d.flatten(2)
@@ -245,12 +240,12 @@ def _svo(wccv: Tensor, weights: Tensor, counts: Tensor | None, omega: Tensor, n_
 
 
 def _inverse_variance(wccv: Tensor, weights: Tensor, counts: Tensor | None, omega: Tensor, n_samples: int) -> Statistic:
-    """Weights `c_i ~ 1 / A_ii`: influences on `A_ii = sum_j omega_j gamma_ii,j`, and how the weights follow."""
+    """Weights `c_i ~ 1 / A_ii`: influences on `A_ii = sum_j omega_j gamma_ii,j`, and the derivative of the weights."""
     variance = torch.where(omega[:, None] > 0, wccv.diagonal(dim1=-2, dim2=-1), 0.0)  # (item, level, sensor)
     combined = torch.einsum("j,nji->ni", omega, variance)
     jacobian = (weights[:, :, None] * weights[:, None, :] - torch.diag_embed(weights)) / combined[:, None, :]
     layout = jacobian, tuple(omega.nonzero().flatten().tolist()), len(omega)
-    size = omega * torch.exp2(-2 * _levels(omega))
+    size = omega / filter_lengths(len(omega)).to(omega).square()
     if counts is None:
         factor = (size / _n_coefficients(omega, n_samples)).tolist()
 
@@ -270,13 +265,9 @@ def _inverse_variance(wccv: Tensor, weights: Tensor, counts: Tensor | None, omeg
     return Statistic(None, influence_with_gaps, torch.zeros_like(combined), *layout)
 
 
-def _levels(omega: Tensor) -> Tensor:
-    return torch.arange(1, len(omega) + 1, dtype=torch.float64, device=omega.device)
-
-
 def _n_coefficients(omega: Tensor, n_samples: int) -> Tensor:
     """Coefficients `M_j` of each level of a recording without gaps, `(level,)`."""
-    return n_samples + 1 - torch.exp2(_levels(omega))
+    return n_samples + 1 - filter_lengths(len(omega)).to(omega)
 
 
 def _weights_covariance(
@@ -346,8 +337,7 @@ def _checked_levels(
 
 
 def _check_combined(wccv: Tensor, omega: Tensor) -> None:
-    counting = torch.where(omega[:, None, None] > 0, wccv, 0.0).to(torch.float64)
-    combined = torch.einsum("j,...jik->...ik", omega, counting)
+    combined = combined_covariance(wccv.double(), omega)
     check_positive_definite("the wavelet cross-covariance combined over scales", combined, dtype=wccv.dtype)
 
 

@@ -1,4 +1,4 @@
-"""Parametric bootstrap: what the last levels would show in other recordings of the same noise.
+"""Parametric bootstrap: draws of the moments of the last levels from a model of the noise.
 
 The combined covariance `A = sum_j omega_j Gamma_j` of a record `X` of block means is the quadratic form `X Q X'` with a
 kernel `Q` over time that large scales make smooth: a few dozen directions in time carry it. In these the components
@@ -21,9 +21,6 @@ from gyrofuse.wavelets.covariance import wavelet_products
 from gyrofuse.wavelets.lag_sums import block_mean_covariances
 from gyrofuse.wavelets.pilot import Pilot, components_of_memories
 
-# The share of the variance that the directions hold, and as many as give its law the right shape.
-_HELD, _FEWEST_DIRECTIONS = 0.5, 24
-
 
 def resample_combined(
     pilot: Pilot, scale_weights: Tensor, n_samples: int, n_resamples: int, generator: torch.Generator
@@ -34,7 +31,7 @@ def resample_combined(
 
     Args:
         pilot: A model fitted to the arrays, batch `(item,)`.
-        scale_weights: `(level,)`; those of lower levels do not matter.
+        scale_weights: `(level,)`; scale weights of levels that the pilot was not fitted to do not matter.
         n_samples: Length of each resampled record.
         n_resamples: Number of resamples.
         generator: Source of randomness, on the CPU.
@@ -45,13 +42,13 @@ def resample_combined(
     omega = tuple(scale_weights[pilot.first_level :].tolist())
     n_sensors = pilot.theta.shape[-1]
     found = _directions(n_samples, pilot.first_level, omega, pilot.time_constants)
-    most = max(directions.within.shape[-1] for directions in found)  # so that memories do not matter to the draws
+    most = max(directions.within.shape[-1] for directions in found)  # the same draws whatever the memory
     normal = torch.randn(n_sensors, n_resamples, most, generator=generator, dtype=pilot.theta.dtype)
     normal = normal.to(pilot.theta.device)
     resamples = pilot.theta.new_empty(len(pilot.theta), n_resamples, n_sensors, n_sensors)
     expected = pilot.theta.new_empty(len(pilot.theta), n_sensors, n_sensors)
     for memory in pilot.memory.unique().tolist():
-        # One after the other: what one draws fits the cache, what many draw is new memory every time.
+        # One item after the other: its draws fit the cache.
         for item in (pilot.memory == memory).nonzero():
             resamples[item], expected[item] = _draw(found[memory], pilot.theta[item], normal)
     return resamples, expected
@@ -61,7 +58,7 @@ def _draw(directions: _Directions, theta: Tensor, normal: Tensor) -> tuple[Tenso
     within = torch.from_numpy(directions.within).to(theta)  # K_k: (component, direction, direction)
     total = torch.einsum("kaa->k", within)
     expected = torch.einsum("k,nkio->nio", total, theta)
-    # In this basis of the sensors every component is diagonal, and what they show independent.
+    # In this basis of the sensors every component is diagonal, and the signals along it are independent.
     root = _root(expected)
     half = torch.linalg.solve_triangular(root, theta[:, 0], upper=False)
     share, turn = oriented_eigh(total[0] * torch.linalg.solve_triangular(root, half.mT, upper=False))
@@ -71,7 +68,7 @@ def _draw(directions: _Directions, theta: Tensor, normal: Tensor) -> tuple[Tenso
     drawn = normal[..., : within.shape[-1]] @ _root(joint).mT  # (item, sensor, resample, direction)
     drawn = drawn.transpose(-3, -2).contiguous()
     products = basis[:, None] @ (drawn @ drawn.mT) @ basis[:, None].mT
-    # What the other directions lack in variance, the ones kept make up for.
+    # The directions kept are scaled up to the variance of all directions.
     size = theta.diagonal(dim1=-2, dim2=-1).sum(-1)  # (item, component)
     kept, whole = (
         torch.einsum("nk,km,nm->n", size, torch.from_numpy(inner).to(size), size)
@@ -83,7 +80,7 @@ def _draw(directions: _Directions, theta: Tensor, normal: Tensor) -> tuple[Tenso
 
 
 def _root(matrix: Tensor) -> Tensor:
-    """Cholesky factor. What hardly any component moves in makes the matrix singular to rounding."""
+    """Cholesky factor; a relative 1e-12 on the diagonal keeps directions of hardly any variance regular."""
     size = matrix.diagonal(dim1=-2, dim2=-1)
     return torch.linalg.cholesky(matrix + torch.diag_embed(1e-12 * size + 1e-14 * size.amax(-1, keepdim=True)))
 
@@ -93,7 +90,7 @@ class _Directions(NamedTuple):
 
     Attributes:
         within: Matrices `K_k`, `(component, direction, direction)`.
-        rest: What the other directions add, `(component,)`.
+        rest: Sum of the diagonals over the other directions, `(component,)`.
         kept: Inner products of the matrices, `(component, component)`.
         whole: The same with all directions.
     """
@@ -121,15 +118,22 @@ def _directions(
     return [_few(components[pair]) for pair in components_of_memories()]
 
 
-def _few(within: np.ndarray) -> _Directions:
-    """Of matrices `K_k` in all directions, the directions that matter to every component alike."""
+def _few(within: np.ndarray, held_fraction: float = 0.5, fewest: int = 24) -> _Directions:
+    """The directions that hold most of the variance of every component, of matrices `K_k` in all directions.
+
+    Args:
+        within: `(component, direction, direction)`.
+        held_fraction: Fraction of the variance of each quadratic form that the directions hold at least; the rest is
+            made up for by a factor.
+        fewest: Number of directions at least, which give the law of the quadratic form its shape.
+    """
     total = within.trace(axis1=1, axis2=2)
     # Each of them may turn out to be the largest.
     _, vectors = np.linalg.eigh((within / total[:, None, None]).sum(0))
     turned = vectors.T[::-1] @ within @ vectors[:, ::-1]
     # The variance of a quadratic form is that of its squared entries: as many directions as hold most of it.
     held = (turned**2).cumsum(1).cumsum(2).diagonal(axis1=1, axis2=2)  # (component, direction)
-    n = max(int((held < _HELD * held[:, -1:]).any(0).sum()) + 1, _FEWEST_DIRECTIONS)
+    n = max(int((held < held_fraction * held[:, -1:]).any(0).sum()) + 1, fewest)
     reduced = turned[:, :n, :n]
     kept, whole = (np.einsum("kab,mab->km", x, x) for x in (reduced, turned))
     return _Directions(reduced, total - reduced.trace(axis1=1, axis2=2), kept, whole)
@@ -153,8 +157,8 @@ def _kernel(n_blocks: int, omega: tuple[float, ...]) -> np.ndarray:
 def resample_wccv(pilot: Pilot, first_level: int, n_resamples: int, generator: torch.Generator) -> Tensor:
     """Resamples of the wavelet cross-covariance of the last levels, joint over levels and sensors.
 
-    Of records of means over blocks of `2**first_level` samples: the first of these levels sees two of them. Every item
-    of a batch gets the same draws.
+    Recordings are drawn as means over blocks of `2**first_level` samples, two of which make a window of the first
+    level. Every item of a batch gets the same draws.
 
     Args:
         pilot: A model fitted to the arrays, batch `(item,)`.

@@ -20,20 +20,23 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from gyrofuse.wavelets.blocks import moments_over_starts
+from gyrofuse.wavelets.block_length import moments_over_starts
 
-# Numbers in a tile: with its coefficients and their influences it stays in the last level of cache. Many CPU threads
-# need more to share.
-_CPU_TILE = 2**19
-_CPU_TILE_PER_THREAD = 2**18
-_GPU_TILE = 2**24
-# More of these leave the long levels fewer rounds, but make the short ones look further ahead.
+# Numbers in a tile on a CPU (2**19, 4 MiB): with its coefficients and their influences it stays in the last level of
+# cache.
+_CPU_TILE = 524_288
+# Numbers in a tile for each CPU thread, where that is more: many threads need more work to share.
+_CPU_TILE_PER_THREAD = 262_144
+# Numbers in a tile on a GPU (2**24, 128 MiB): enough work for every multiprocessor at each level.
+_GPU_TILE = 16_777_216
+# Number of levels that are swept in tiles of consecutive time. A tile needs `2**12` samples after its end, which stay
+# few beside a tile; fewer short levels would leave the long ones more rounds.
 _SHORT_LEVELS = 12
-# Stretches that complete a level start at every `step`-th time, which leaves at least so many steps in a recording:
-# between neighbouring starts a stretch hardly changes.
-_FEWEST_STEPS = 2**13
-# Samples swept at a time at least.
-_SHORTEST_STRETCH = 2**16
+# Number of steps in a recording at least: stretches that complete a level start at every `step`-th time, and between
+# neighbouring starts a stretch hardly changes, so that the covariance moves by a few parts in a thousand at most.
+_FEWEST_STEPS = 8_192
+# Samples swept at a time at least: many times the look-ahead of the short levels.
+_SHORTEST_STRETCH = 65_536
 
 
 class Statistic(NamedTuple):

@@ -1,4 +1,4 @@
-"""What a user asks of SVO weights: would equal ones do, does a sensor earn its place, is the recording long enough?
+"""Tests of SVO weights: are equal weights as good, is a sensor needed, is the recording long enough?
 
 SVO weights are coefficients of a regression, that of one combination of the sensors on the differences between them:
 `c' A c` is its residual. A hypothesis that fixes `k` of the `p - 1` coefficients makes the residual larger, by the
@@ -19,62 +19,58 @@ References:
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from gyrofuse._base.results import ConfidenceInterval, listed, named, numbered
+from gyrofuse._base.deprecation import RenamedAttribute
+from gyrofuse._base.results import ConfidenceInterval, Result, named, numbered
+from gyrofuse.fusion.weights.svo import influence_matrix
+from gyrofuse.wavelets.moments import combined_covariance
 
-# An excess of wavelet variance below this is small: 2.5 % of a deviation.
+# Excess of the combined wavelet variance, a ratio less 1, up to which a loss is called small: 2.5 % of a deviation,
+# below what two recordings of one array differ by.
 SMALL_EXCESS = 0.05
-# Weights are resolved when each rests on so many observations for each sensor,
-_OBSERVATIONS_PER_SENSOR = 2
-# and the levels that decide hold one for each.
-_DECIDING_PER_SENSOR = 1
-# scipy knows no F law of infinitely many degrees of freedom; so many are as good.
-_MANY = 1e8
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
-    """SVO weights with all that tells how far they can be trusted, in float64.
+class WeightsInference:
+    """SVO weights with what inference on them needs, in float64.
 
     Attributes:
         weights: `(..., sensor)`.
-        covariance: `(..., sensor, sensor)` of the estimated weights themselves.
-        weights_degrees: `(..., sensor)`, degrees of freedom of each of their variances.
+        covariance: `(..., sensor, sensor)`, covariance of the estimated weights themselves.
+        weights_dof: `(..., sensor)`, degrees of freedom of the variance of each weight.
         wccv: `(..., level, sensor, sensor)`, zero where a level does not count.
         scale_weights: `(level,)`.
-        degrees: `(..., level)`, independent observations of each level.
-        confidence_level: Of intervals.
+        dof: `(..., level)`, independent observations of each level.
+        confidence_level: Confidence level of intervals.
     """
 
     weights: Tensor
     covariance: Tensor
-    weights_degrees: Tensor
+    weights_dof: Tensor
     wccv: Tensor
     scale_weights: Tensor
-    degrees: Tensor
+    dof: Tensor
     confidence_level: float
 
     @property
     def combined(self) -> Tensor:
         """`A`, `(..., sensor, sensor)`."""
-        return torch.einsum("j,...jik->...ik", self.scale_weights, self.wccv)
+        return combined_covariance(self.wccv, self.scale_weights)
 
     @property
     def residual(self) -> Tensor:
         """`c' A c`, `(...)`."""
-        return quadratic(self.weights, self.combined)
+        return _quadratic(self.weights, self.combined)
 
     @property
     def influence(self) -> Tensor:
         """`B = (I - c 1') A^-1`, `(..., sensor, sensor)`."""
-        inverse = torch.linalg.inv(self.combined)
-        return inverse - self.weights[..., :, None] * inverse.sum(-2, keepdim=True)
+        return influence_matrix(self.combined, self.weights)
 
     @property
     def unit_variance(self) -> Tensor:
@@ -83,12 +79,12 @@ class Evidence:
 
     @property
     def noise(self) -> Tensor:
-        """`V A / c' A c`, `(..., sensor, sensor)`; its trace is the excess that chance gives all weights on average."""
+        """`V A / c' A c`, `(..., sensor, sensor)`; its trace is the mean excess by sampling error of all weights."""
         return self.covariance @ self.combined / self.residual[..., None, None]
 
     @property
     def observations(self) -> Tensor:
-        """Independent observations that each weight rests on, `(..., sensor)`.
+        """Effective number of independent observations of each weight, `(..., sensor)`.
 
         For one level of n of them `V_ii = B_ii c' A c / (n - p + 1)`.
         """
@@ -96,80 +92,74 @@ class Evidence:
         return self.unit_variance / self.covariance.diagonal(dim1=-2, dim2=-1) + n_sensors - 1
 
     @property
-    def deciding(self) -> Tensor:
-        """Observations of the levels that decide how well the weights are known, `(...)`, in the harmonic mean.
+    def dominant(self) -> Tensor:
+        """Observations of the levels that dominate the variance of the weights, `(...)`, in the harmonic mean.
 
         A level adds about `(omega_j tr(B Gamma_j))^2 / eta_j` to the variance of the weights. Where levels of few
-        observations decide, that variance itself is known no better than these few tell.
+        observations dominate, that variance has hardly more degrees of freedom than these.
         """
         trace = torch.einsum("...ik,...jki->...j", self.influence, self.wccv)
-        added = (self.scale_weights * trace).square() / self.degrees
-        return added.sum(-1) / (added / self.degrees).sum(-1)
+        added = (self.scale_weights * trace).square() / self.dof
+        return added.sum(-1) / (added / self.dof).sum(-1)
 
     @property
     def resolved(self) -> Tensor:
-        """Whether there are observations enough to rely on the covariance of the weights, `(...)`."""
+        """Whether the covariance of the weights is reliable, `(...)`.
+
+        Each weight has at least two observations for each sensor, and the dominant levels have one for each sensor.
+        """
         n_sensors = self.weights.shape[-1]
-        enough = self.observations.amin(-1) >= _OBSERVATIONS_PER_SENSOR * n_sensors
-        return enough & (self.deciding >= _DECIDING_PER_SENSOR * n_sensors)
+        return (self.observations.amin(-1) >= 2 * n_sensors) & (self.dominant >= n_sensors)
 
 
 @dataclass(frozen=True, eq=False)
-class Answer(ABC):
-    """What the answers below share: text for each item of a batch, and plain numbers."""
-
-    @abstractmethod
-    def summary(self) -> str:
-        """The answer in words and numbers."""
-
-    def __str__(self) -> str:
-        return self.summary()
-
-    def to_dict(self) -> dict[str, Any]:
-        """Everything as plain lists and numbers, ready for JSON (NaN and infinities as None)."""
-        return {field.name: _plain(getattr(self, field.name)) for field in fields(self)}
-
-
-@dataclass(frozen=True, eq=False)
-class WeightsTest(Answer):
+class WeightsTest(Result):
     """A test of a hypothesis about the best weights, and what it costs to act on the hypothesis.
 
     Attributes:
-        subject: What the hypothesis would have: `"equal weights"`, or `"leaving out sensor 3"`.
-        statistic: `(...)`, the excess over what chance alone gives on average.
-        degrees_of_freedom: Numerator and denominator of the F law of the statistic, `(...)` each.
-        p_value: `(...)`, probability of such a statistic or a larger one if the hypothesis holds; where `resolved` is
-            False, exact for scale weights on one level only, and far too large where long levels decide.
-        excess: `(...)`, how much larger the wavelet variance, combined over scales, is in this recording with the best
-            weights under the hypothesis; a ratio less 1.
-        confidence_interval: Limits `(...)` of the true excess over the best weights there are.
-        confidence_level: Of the interval; a p-value below one minus this is called significant.
-        resolved: `(...)`, whether the recording holds enough observations to rely on any of this.
+        subject: The hypothesis: `"equal weights"`, or `"leaving out sensor 3"`.
+        statistic: `(...)`, excess over its mean by chance under the hypothesis.
+        dof: Numerator and denominator degrees of freedom of the F law of the statistic, `(...)` each.
+        p_value: `(...)`, probability of such a statistic or a larger one under the hypothesis; where `resolved` is
+            False, exact for scale weights on one level only, and far too large where long levels dominate.
+        excess: `(...)`, wavelet variance, combined over scales, of the best weights under the hypothesis over that of
+            the SVO weights in this recording, less 1.
+        confidence_interval: Limits `(...)` of the true excess over the best weights.
+        confidence_level: Confidence level of the interval; a p-value below one minus it is significant.
+        resolved: `(...)`, whether the recording holds enough observations for the test.
     """
 
     subject: str
     statistic: Tensor
-    degrees_of_freedom: tuple[Tensor, Tensor]
+    dof: tuple[Tensor, Tensor]
     p_value: Tensor
     excess: Tensor
     confidence_interval: ConfidenceInterval
     confidence_level: float
     resolved: Tensor
+    degrees_of_freedom = RenamedAttribute("dof")
+    _batched = ("statistic", "dof", "p_value", "excess", "confidence_interval", "resolved")
+    _keys: ClassVar[dict[str, str]] = {"dof": "degrees_of_freedom"}
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading dimensions; `()` for a single array."""
+        return tuple(self.p_value.shape)
 
     @property
     def small(self) -> Tensor:
-        """Whether acting on the hypothesis costs little, at most 5 %, `(...)`."""
+        """Whether the loss under the hypothesis is small, less than 5 %, `(...)`."""
         return self.confidence_interval.high < SMALL_EXCESS
 
     @property
     def significant(self) -> Tensor:
-        """Whether the hypothesis is refused, `(...)`; a recording too short to judge refuses none."""
+        """Whether the hypothesis is rejected, `(...)`; never by a recording that is too short."""
         return self.resolved & (self.p_value < 1 - self.confidence_level)
 
     def summary(self) -> str:
         """What the test says, in a sentence for each item of a batch."""
         low, high = self.confidence_interval
-        columns = (self.statistic, *self.degrees_of_freedom, self.p_value, self.excess, low, high)
+        columns = (self.statistic, *self.dof, self.p_value, self.excess, low, high)
         verdicts = zip(*(v.reshape(-1).tolist() for v in (self.resolved, self.small, self.significant)), strict=True)
         sentences = []
         for verdict, row in zip(verdicts, _rows(*columns), strict=True):
@@ -180,23 +170,23 @@ class WeightsTest(Answer):
                 f"wavelet variance in this recording, {100 * self.confidence_level:g} % interval "
                 f"{_percents(lower, upper)}{tested}."
             )
-        return _lines(sentences, self.p_value)
+        return _lines(sentences, self.batch_shape)
 
 
 @dataclass(frozen=True, eq=False)
-class EnoughData(Answer):
+class EnoughData(Result):
     """Whether a recording is long enough for the weights that were fitted to it.
 
     Attributes:
-        effective_observations: `(..., sensor)`, number of independent observations that each weight rests on.
-        deciding_observations: `(...)`, how many the levels that decide hold.
-        expected_excess: `(...)`, how much larger the wavelet variance, combined over scales, is on average with
-            weights estimated from such a recording than with the best ones; a ratio less 1.
-        largest_excess: What is asked of `expected_excess`.
-        times_longer: `(...)`, how many times as long a recording, with the same levels, would meet that; 1 if this one
-            does.
-        resolved: `(...)`, whether every weight rests on two observations for each sensor, and the levels that decide
-            hold one; where not, all other figures are no more than a hint.
+        effective_observations: `(..., sensor)`, effective number of independent observations of each weight.
+        deciding_observations: `(...)`, observations of the levels that dominate the variance of the weights.
+        expected_excess: `(...)`, mean wavelet variance, combined over scales, of weights estimated from such a
+            recording over that of the best weights, less 1.
+        largest_excess: Required limit of `expected_excess`.
+        times_longer: `(...)`, factor on the length of the recording, with the same levels, at which the limit is met;
+            1 if it is met already.
+        resolved: `(...)`, whether every weight has two observations for each sensor, and the dominant levels one;
+            otherwise all other figures are rough.
         enough: `(...)`, resolved and no more than the largest excess.
     """
 
@@ -207,16 +197,24 @@ class EnoughData(Answer):
     times_longer: Tensor
     resolved: Tensor
     enough: Tensor
+    _batched = tuple(
+        "effective_observations deciding_observations expected_excess times_longer resolved enough".split()
+    )
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading dimensions; `()` for a single array."""
+        return tuple(self.enough.shape)
 
     def summary(self) -> str:
         """The answer, in a sentence for each item of a batch."""
         n_sensors = self.effective_observations.shape[-1]
         columns = (self.effective_observations.amin(-1), self.deciding_observations, self.expected_excess)
         sentences = []
-        for observations, deciding, excess, times, resolved in _rows(*columns, self.times_longer, self.resolved):
+        for observations, dominant, excess, times, resolved in _rows(*columns, self.times_longer, self.resolved):
             costs = f"{observations:.0f} observations for {n_sensors} weights, whose errors cost {_percent(excess)}"
             if not resolved:
-                few = min(observations, deciding)
+                few = min(observations, dominant)
                 sentence = (
                     f"too short, {few:.2g} observations decide {n_sensors} weights; record longer or use fewer levels"
                 )
@@ -225,39 +223,53 @@ class EnoughData(Answer):
             else:
                 sentence = f"rather short, {costs}; {_percent(self.largest_excess)} takes {times:.2g} times as long"
             sentences.append(f"Recording: {sentence}.")
-        return _lines(sentences, self.enough)
+        return _lines(sentences, self.batch_shape)
 
 
-def equal_weights_test(evidence: Evidence) -> WeightsTest:
-    """Test whether equal weights are the best."""
-    noise, weights = evidence.noise, evidence.weights
+def equal_weights_test(inference: WeightsInference) -> WeightsTest:
+    """Test whether equal weights are the best.
+
+    Args:
+        inference: SVO weights with their covariance.
+    """
+    noise, weights = inference.noise, inference.weights
     by_chance = noise.diagonal(dim1=-2, dim2=-1).sum(-1)
-    # Box: p - 1 where all differences between sensors are known equally well, fewer where some are known worse.
+    # Box: p - 1 where all differences between sensors are equally well known, fewer otherwise.
     numerator = by_chance.square() / torch.einsum("...ik,...ki->...", noise, noise)
-    excess = quadratic(weights - 1 / weights.shape[-1], evidence.combined) / evidence.residual
-    return _tested("equal weights", evidence, excess, by_chance, numerator, evidence.weights_degrees.amin(-1))
+    excess = _quadratic(weights - 1 / weights.shape[-1], inference.combined) / inference.residual
+    return _tested("equal weights", inference, excess, by_chance, numerator, inference.weights_dof.amin(-1))
 
 
-def dropped_sensor_test(evidence: Evidence, sensor: int, name: str) -> WeightsTest:
+def dropped_sensor_test(inference: WeightsInference, sensor: int, name: str) -> WeightsTest:
     """Test whether the best weight of a sensor is zero: Student's t, squared.
 
     Without sensor i the excess is `1' A^-1 1 / 1' A_-i^-1 1 - 1 = c_i^2 / (B_ii c' A c)`, `A_-i` being `A` without it.
+
+    Args:
+        inference: SVO weights with their covariance.
+        sensor: Index of the sensor.
+        name: Name of the sensor.
     """
-    unit = evidence.unit_variance[..., sensor]
-    excess = evidence.weights[..., sensor].square() / unit
-    by_chance = evidence.covariance[..., sensor, sensor] / unit
-    degrees = evidence.weights_degrees[..., sensor]
-    return _tested(f"leaving out sensor {name}", evidence, excess, by_chance, torch.ones_like(excess), degrees)
+    unit = inference.unit_variance[..., sensor]
+    excess = inference.weights[..., sensor].square() / unit
+    by_chance = inference.covariance[..., sensor, sensor] / unit
+    dof = inference.weights_dof[..., sensor]
+    return _tested(f"leaving out sensor {name}", inference, excess, by_chance, torch.ones_like(excess), dof)
 
 
-def enough_data(evidence: Evidence, largest_excess: float) -> EnoughData:
-    """Ask whether weights rest on enough observations for errors that cost no more than `largest_excess` on average."""
+def enough_data(inference: WeightsInference, largest_excess: float) -> EnoughData:
+    """Test whether the recording is long enough.
+
+    Args:
+        inference: SVO weights with their covariance.
+        largest_excess: Mean loss by errors of the weights, a ratio less 1, that is acceptable.
+    """
     # (p - 1) / (n - p + 1) for one level of n observations, so that n grows like 1 + 1 / excess.
-    excess = evidence.noise.diagonal(dim1=-2, dim2=-1).sum(-1)
-    resolved = evidence.resolved
+    excess = inference.noise.diagonal(dim1=-2, dim2=-1).sum(-1)
+    resolved = inference.resolved
     return EnoughData(
-        effective_observations=evidence.observations,
-        deciding_observations=evidence.deciding,
+        effective_observations=inference.observations,
+        deciding_observations=inference.dominant,
         expected_excess=excess,
         largest_excess=largest_excess,
         times_longer=((1 + 1 / largest_excess) / (1 + 1 / excess)).clamp(min=1),
@@ -266,15 +278,20 @@ def enough_data(evidence: Evidence, largest_excess: float) -> EnoughData:
     )
 
 
-def verdicts(evidence: Evidence, names: tuple[str, ...]) -> list[str]:
-    """Answers for one virtual gyro, a line of text for each question."""
-    data = enough_data(evidence, SMALL_EXCESS)
+def verdicts(inference: WeightsInference, names: tuple[str, ...]) -> list[str]:
+    """Results of all tests for one virtual gyro, one line of text each.
+
+    Args:
+        inference: SVO weights with their covariance, without batch dimensions.
+        names: Name of each sensor.
+    """
+    data = enough_data(inference, SMALL_EXCESS)
     if not data.resolved:
         return [str(data)]
-    equal = equal_weights_test(evidence)
+    equal = equal_weights_test(inference)
     answer = "good enough" if equal.small else "not good enough" if equal.significant else "perhaps good enough"
     low, high = (limit.item() for limit in equal.confidence_interval)
-    drops = [dropped_sensor_test(evidence, i, name) for i, name in enumerate(names)]
+    drops = [dropped_sensor_test(inference, i, name) for i, name in enumerate(names)]
     idle = [i for i, drop in enumerate(drops) if drop.small]
     unsure = [i for i, drop in enumerate(drops) if not (drop.small or drop.significant)]
     parts = [f"{named(names, idle)} could be left out"] if idle else []
@@ -287,30 +304,31 @@ def verdicts(evidence: Evidence, names: tuple[str, ...]) -> list[str]:
 
 
 def _tested(
-    subject: str, evidence: Evidence, excess: Tensor, by_chance: Tensor, numerator: Tensor, denominator: Tensor
+    subject: str, inference: WeightsInference, excess: Tensor, by_chance: Tensor, numerator: Tensor, denominator: Tensor
 ) -> WeightsTest:
     from scipy import stats
 
-    level = evidence.confidence_level
-    denominator = torch.minimum(denominator.to(excess), evidence.deciding).clamp(1.0, _MANY)
+    level = inference.confidence_level
+    denominator = torch.minimum(denominator.to(excess), inference.dominant)
+    denominator = denominator.clamp(1.0, 1e8)  # scipy has no F law of infinitely many degrees of freedom
     statistic = excess / by_chance
     p_value = stats.f.sf(*(values.cpu().numpy() for values in (statistic, numerator, denominator)))
     return WeightsTest(
         subject=subject,
         statistic=statistic,
-        degrees_of_freedom=(numerator, denominator),
+        dof=(numerator, denominator),
         p_value=torch.as_tensor(p_value).to(excess),
         excess=excess,
         confidence_interval=_excess_interval(excess, by_chance, numerator, denominator, level),
         confidence_level=level,
-        resolved=evidence.resolved,
+        resolved=inference.resolved,
     )
 
 
 def _excess_interval(
     excess: Tensor, by_chance: Tensor, numerator: Tensor, denominator: Tensor, confidence_level: float
 ) -> ConfidenceInterval:
-    """Limits of the true excess: those with which the one found would just be as far out as the tails allow.
+    """Limits of the true excess: the values under which the excess found is a quantile at either tail.
 
     With a true excess `e` and `n` observations, of which `n - k` are left for the residual, the numerator has the
     cumulants of `k - n` squares of normal variables and of `n` that are `1 + e` times as large. Lee matches three of
@@ -339,22 +357,14 @@ def _excess_interval(
             low, high = np.where(above, middle, low), np.where(above, high, middle)
         return np.where(probability(found, np.zeros_like(found)) <= wanted, 0.0, np.exp(high))
 
-    # Less than half of all recordings show without any true excess is no evidence of less than none.
+    # An excess below its median under a true excess of 0 is taken as that median for the upper limit.
     least = t * stats.f.ppf(0.5, k, m)
     low, high = solved(g, 1 - tail), solved(np.maximum(g, least), tail)
     return ConfidenceInterval(torch.as_tensor(low).to(excess), torch.as_tensor(high).to(excess))
 
 
-def quadratic(vector: Tensor, matrix: Tensor) -> Tensor:
+def _quadratic(vector: Tensor, matrix: Tensor) -> Tensor:
     return torch.einsum("...i,...ik,...k->...", vector, matrix, vector)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Tensor):
-        return listed(value)
-    if isinstance(value, ConfidenceInterval):
-        return {"low": listed(value.low), "high": listed(value.high)}
-    return [_plain(item) for item in value] if isinstance(value, tuple) else value
 
 
 def _rows(*columns: Tensor) -> list[tuple[float, ...]]:
@@ -362,9 +372,9 @@ def _rows(*columns: Tensor) -> list[tuple[float, ...]]:
     return list(zip(*(column.reshape(-1).tolist() for column in columns), strict=True))
 
 
-def _lines(sentences: list[str], like: Tensor, most: int = 8) -> str:
+def _lines(sentences: list[str], batch: tuple[int, ...], most: int = 8) -> str:
     """Sentences of a batch, numbered."""
-    if like.ndim == 0:
+    if not batch:
         return sentences[0]
     lines = [f"[{name}] {sentence}" for name, sentence in zip(numbered(len(sentences)), sentences, strict=True)]
     return "\n".join(lines[:most] + ([f"... and {len(lines) - most} more"] if len(lines) > most else []))

@@ -1,10 +1,10 @@
-"""How many times smaller the wavelet variance of a virtual gyro is than that of the plain mean, level by level.
+"""Variance reduction: the ratio of the wavelet variance of the plain mean to that of a virtual gyro, level by level.
 
 Both variances come from the same sensors, so that their ratio is known far better than either. Where a level holds many
-windows, the course of the ratio along the recording tells how far it can be off; elsewhere Pitman's law of the ratio of
-two correlated variances does, exact for weights chosen beforehand. Weights fitted to the recording flatter themselves
-in it. Their variance is the one in other recordings (`gyrofuse.fusion.uncertainty.cross_fitting`), and as many
-observations less are left as their fit has used up.
+windows, the interval follows from the variation of the ratio along the recording; elsewhere from Pitman's law of the
+ratio of two correlated variances, exact for weights chosen beforehand. For weights fitted to the recording the variance
+is that in other recordings (`gyrofuse.fusion.uncertainty.cross_fitting`), and the observations are reduced by those
+that the fit has used up.
 
 Reference:
     E. J. G. Pitman, Biometrika 31, 1939.
@@ -17,27 +17,26 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gyrofuse._base.results import ConfidenceInterval
+from gyrofuse._base.deprecation import moved_names
+from gyrofuse._base.results import ConfidenceInterval, Result
 from gyrofuse.fusion.uncertainty.cross_fitting import CrossFit
-from gyrofuse.fusion.uncertainty.tests import Answer
-from gyrofuse.wavelets.equivalent_dof import t_quantile
+from gyrofuse.wavelets.intervals import t_quantile
 
-# Degrees of freedom below which the law of a ratio says nothing.
-_FEWEST_SPARE = 0.5
+__getattr__ = moved_names(__name__, {"Gain": "gyrofuse.fusion.VarianceReduction"})
 
 
 @dataclass(frozen=True, eq=False)
-class VarianceReduction(Answer):
-    """How many times smaller the wavelet variance of the virtual gyro is than that of the plain mean, by level.
+class VarianceReduction(Result):
+    """Wavelet variance of the plain mean over that of the virtual gyro, by level.
 
     Attributes:
-        estimate: `(..., level)`, of the ratio for these weights in any other recording of the same array; above 1
-            where they gain.
-        confidence_interval: Limits `(..., level)`; 0 and infinity where a level holds too few observations to say.
-        confidence_level: Of the intervals.
-        in_sample: `(..., level)`, the ratio in the recording that the weights were fitted to, which flatters them.
+        estimate: `(..., level)`, ratio for these weights in any other recording of the same array; above 1 where the
+            virtual gyro has the smaller variance.
+        confidence_interval: Limits `(..., level)`; 0 and infinity where a level holds too few observations.
+        confidence_level: Confidence level of the intervals.
+        in_sample: `(..., level)`, ratio in the recording that the weights were fitted to, which is too large.
         tau: `(level,)`, averaging time.
-        tau_unit: Of the averaging time.
+        tau_unit: Unit of the averaging time.
     """
 
     estimate: Tensor
@@ -47,8 +46,15 @@ class VarianceReduction(Answer):
     tau: Tensor
     tau_unit: str
 
+    _batched = ("estimate", "confidence_interval", "in_sample")
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading dimensions; `()` for a single array."""
+        return tuple(self.estimate.shape[:-1])
+
     def summary(self) -> str:
-        """The gain by level as a table of fixed width, for each item of a batch."""
+        """The ratio by level as a table of fixed width, for each item of a batch."""
         interval = f"{100 * self.confidence_level:g} % interval"
         head = f"{'level':>5}  {f'tau ({self.tau_unit})':>13}  {'gain':>8}  {interval:>20}"
         columns = (self.tau.expand_as(self.estimate), self.estimate, *self.confidence_interval)
@@ -56,23 +62,23 @@ class VarianceReduction(Answer):
         tables = []
         for rows in zip(*(column.reshape(-1, len(self.tau)).tolist() for column in columns), strict=True):
             lines = [
-                f"{j:>5}  {tau:>13.6g}  {gain:>8.3f}  {_limits(low, high):>20}"
-                for j, tau, gain, low, high in zip(levels, *rows, strict=True)
+                f"{j:>5}  {tau:>13.6g}  {ratio:>8.3f}  {_limits(low, high):>20}"
+                for j, tau, ratio, low, high in zip(levels, *rows, strict=True)
             ]
             tables.append("\n".join([head, *lines]))
         return "\n\n".join(tables)
 
 
 def ratio_to_equal(
-    weights: Tensor, wccv: Tensor, degrees: Tensor, fit: CrossFit, confidence_level: float = 0.95
+    weights: Tensor, wccv: Tensor, dof: Tensor, fit: CrossFit, confidence_level: float = 0.95
 ) -> tuple[Tensor, ConfidenceInterval]:
     """Ratio of the wavelet variance of the plain mean to that of a virtual gyro, at each level.
 
     Args:
         weights: `(..., sensor)`, sum 1.
         wccv: `(..., level, sensor, sensor)`.
-        degrees: `(..., level)`, independent observations of each level.
-        fit: How the weights compare in other recordings, batched as they are.
+        dof: `(..., level)`, independent observations of each level.
+        fit: Cross-fit of the weights, batched as the weights.
         confidence_level: Probability that an interval holds the true ratio.
 
     Returns:
@@ -83,19 +89,20 @@ def ratio_to_equal(
     fused = torch.einsum("...jik,...k->...ji", wccv, weights)  # Gamma_j c: (..., level, sensor)
     virtual = torch.einsum("...i,...ji->...j", weights, fused)
     equal, product = wccv.mean((-1, -2)), fused.mean(-1)
-    left = degrees * fit.left  # n - p + 1 of n for one level
-    unshared = (1 - product.square() / (equal * virtual)).clamp(min=0) + 1 - left / degrees
+    left = dof * fit.left  # n - p + 1 of n for one level
+    unshared = (1 - product.square() / (equal * virtual)).clamp(min=0) + 1 - left / dof
     spare = (left - 1).clamp(min=0)
     quantile = torch.as_tensor(stats.t.ppf((1 + confidence_level) / 2, spare.cpu().numpy())).to(spare)
-    spread = torch.where(spare > _FEWEST_SPARE, 1 + 2 * unshared * quantile.square() / spare, torch.inf)
-    factor = spread + (spread.square() - 1).sqrt()
+    # With half a degree of freedom or less the quantile is beyond any use: no limits.
+    arc = torch.where(spare > 0.5, 1 + 2 * unshared * quantile.square() / spare, torch.inf)
+    factor = arc + (arc.square() - 1).sqrt()
     found = equal / virtual
     estimate = found / (1 + fit.optimism)
-    shown = (t_quantile(fit.gain_degrees, confidence_level) * fit.gain_error).exp()
-    by_series = fit.gain_error.isfinite()
-    low = torch.where(by_series, estimate / shown, estimate / factor)
-    # What a few observations tell of the optimism is rough: there the upper limit does without the correction.
-    high = torch.where(by_series, estimate * shown, torch.maximum(found, estimate) * factor)
+    step = (t_quantile(fit.reduction_dof, confidence_level) * fit.reduction_error).exp()
+    by_series = fit.reduction_error.isfinite()
+    low = torch.where(by_series, estimate / step, estimate / factor)
+    # A few observations give a rough optimism only: there the upper limit is not corrected for it.
+    high = torch.where(by_series, estimate * step, torch.maximum(found, estimate) * factor)
     return estimate, ConfidenceInterval(low, high)
 
 

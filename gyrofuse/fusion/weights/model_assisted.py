@@ -1,9 +1,9 @@
-"""Wavelet cross-covariance (WCCV) with a model's help where the record is too short to tell it.
+"""Wavelet cross-covariance (WCCV) whose last levels are those of a fitted model.
 
-The last levels hold fewer observations than the array has sensors, yet the long scale weights look at them most. There
+The last levels hold fewer observations than the array has sensors, yet long scale weights depend on them most. There
 the WCCV is replaced by that of a sum of white noise, AR1s and a random walk, each with a covariance matrix between the
-sensors, fitted to the higher levels. A model of many matrices fits noise and a model of few may not hold, so both are
-kept to what the data ask for: a matrix pays for its entries, and where the model begins is chosen by the data as well.
+sensors, fitted to all levels from some level on. A model of many matrices fits noise and a model of few may be wrong:
+each matrix is penalised by its number of entries, and the level where the model begins is chosen by Akaike's criterion.
 """
 
 from __future__ import annotations
@@ -13,18 +13,12 @@ import functools
 import torch
 from torch import Tensor
 
-from gyrofuse._base.linalg import geometric_mean
 from gyrofuse.wavelets.lag_sums import unit_wavelet_variances
+from gyrofuse.wavelets.pilot import climb_likelihood, mixture
 
-# Levels with more observations than this in every recording speak for themselves.
-_MOST_OBSERVATIONS = 2**9
-# More of them add nothing to the likelihood: a model that is off by a few per cent shall not be driven by one level.
-_MOST_DEGREES = 300.0
-# AR1s with time constants spread over so many octaves, up to half the longest filter.
-_N_AR1, _OCTAVES = 5, 8
-_ITERATIONS = 150
-# Relative size under which a component has left the model, and variance that keeps matrices regular.
-_GONE, _FLOOR = 1e-6, 1e-6
+# Relative variance below which a component has left the model, and which keeps matrices regular: small beside the share
+# of any component that matters, large beside rounding.
+_NEGLIGIBLE = 1e-6
 
 
 def assisted_covariance(wccv: Tensor, counts: Tensor) -> Tensor:
@@ -44,17 +38,19 @@ def assisted_covariance(wccv: Tensor, counts: Tensor) -> Tensor:
     n_levels, n_sensors = wccv.shape[-3], wccv.shape[-1]
     level = torch.arange(n_levels, device=wccv.device)
     observations = counts * torch.exp2(-level.double() - 1)
-    # The model begins where few observations are left; a level before can keep its own covariance only if that is well
-    # determined, and three levels are the model's.
-    first = (observations > _MOST_OBSERVATIONS).sum(-1).clamp(max=max(n_levels - 3, 0))  # (...)
+    # The model begins at or after the first level with no more than 512 observations, above which a level needs none;
+    # levels before it keep their own covariance, for which they need as many observations as sensors; the last three
+    # levels are always the model's.
+    first = (observations > 512).sum(-1).clamp(max=max(n_levels - 3, 0))  # (...)
     last = torch.maximum(first, (observations >= n_sensors).sum(-1).clamp(max=n_levels - 3))
     known = (counts > 0) & (wccv.diagonal(dim1=-2, dim2=-1) > 0).all(-1)
-    # An unknown level is next to nothing of uncorrelated noise, which keeps the fit regular where all are unknown.
-    eta = torch.where(known, (2 * observations).clamp(1.0, _MOST_DEGREES), _FLOOR)
-    lowest, highest = int(first.min()), int(last.max())  # of all items: levels below are nobody's
+    # No more than 300 degrees of freedom, so that one level does not decide the fit of a model that is off by a few per
+    # cent. An unknown level counts as a trace of uncorrelated noise, which keeps the fit regular.
+    eta = torch.where(known, (2 * observations).clamp(1.0, 300.0), _NEGLIGIBLE)
+    lowest, highest = int(first.min()), int(last.max())  # over the batch
     level, eta, known = level[lowest:], eta[..., lowest:], known[..., lowest:]
 
-    # In units of each sensor, so that no sensor is small to rounding.
+    # In units of each sensor, so that no sensor is lost to rounding.
     inside = level >= first[..., None]
     measured = torch.where(known[..., None, None], wccv[..., lowest:, :, :], 0.0).double()
     variance = torch.where(inside[..., None], measured.diagonal(dim1=-2, dim2=-1), 0.0).amax(-2)
@@ -83,19 +79,17 @@ def assisted_covariance(wccv: Tensor, counts: Tensor) -> Tensor:
     return torch.cat([wccv[..., :lowest, :, :], best], dim=-3)
 
 
-def _fit(gamma: Tensor, eta: Tensor, unit: Tensor, own: Tensor) -> tuple[Tensor, Tensor]:
+def _fit(gamma: Tensor, eta: Tensor, unit: Tensor, own: Tensor, n_steps: int = 150) -> tuple[Tensor, Tensor]:
     """Covariances of a model `(..., level, sensor, sensor)` and half of Akaike's criterion `(...)`.
 
-    Each step replaces `Theta_k` by the geometric mean of `D_k^-1` and `Theta_k N_k Theta_k`, where `D` and `N` are the
-    two halves of the gradient of the Wishart likelihood `-sum_j eta_j (ln det S_j + tr(S_j^-1 Gamma_j)) / 2` of
-    `S_j = sum_k f_k(tau_j) Theta_k`, which never lowers it and keeps matrices positive. To the likelihood comes
-    `-p(p+1)/2 ln tr Theta_k`, one for each entry: it drives out the components that the data do not ask for.
+    By `climb_likelihood` of `S_j = sum_k f_k(tau_j) Theta_k`, with the penalty `-p(p+1)/2 ln tr Theta_k`.
 
     Args:
         gamma: `(..., level, sensor, sensor)`.
         eta: `(..., level)`, degrees of freedom, 0 for levels to leave out.
         unit: `(level, component)`, wavelet variances `f_k(tau_j)`.
-        own: `(..., level)`, levels whose misfit is counted from that of their own covariance.
+        own: `(..., level)`, levels whose misfit is taken relative to that of their own covariance.
+        n_steps: Number of steps; the penalty makes them slower than those of a pilot.
     """
     n_sensors, n_components = gamma.shape[-1], unit.shape[-1]
     n_parameters = n_sensors * (n_sensors + 1) / 2
@@ -106,38 +100,29 @@ def _fit(gamma: Tensor, eta: Tensor, unit: Tensor, own: Tensor) -> tuple[Tensor,
     size = (gamma.diagonal(dim1=-2, dim2=-1).mean(-1) * counting[..., 0]).sum(-1) / counting[..., 0].sum(-1)
     identity = torch.eye(n_sensors, dtype=gamma.dtype, device=gamma.device)
     theta = (size / n_components)[..., None, None, None] * identity.expand(n_components, n_sensors, n_sensors)
-    for _ in range(_ITERATIONS):
-        precision = torch.cholesky_inverse(torch.linalg.cholesky(_mix(unit, theta)))
-        down = torch.einsum("...jk,...jio->...kio", weight, precision)
-        up = torch.einsum("...jk,...jio->...kio", weight, precision @ gamma @ precision)
-        trace = theta.diagonal(dim1=-2, dim2=-1).sum(-1).clamp(min=1e-100)
-        down = down + (2 * n_parameters / trace)[..., None, None] * identity
-        theta = geometric_mean(down, theta @ up @ theta)
-    model = _mix(unit, theta)
+    theta = climb_likelihood(theta, gamma, unit, weight, n_steps, n_parameters=n_parameters)
+    model = mixture(theta, unit)
     lower = torch.linalg.cholesky(model)
     trace_ratio = torch.cholesky_solve(gamma, lower).diagonal(dim1=-2, dim2=-1).sum(-1)
     log_det = 2 * lower.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     least = torch.where(own, torch.logdet(gamma) + n_sensors, 0.0)
     misfit = (eta * (trace_ratio + log_det - least)).sum(-1)
     size = theta.diagonal(dim1=-2, dim2=-1).sum(-1)
-    n_matrices = (size > _GONE * size.amax(-1, keepdim=True)).sum(-1)
+    n_matrices = (size > _NEGLIGIBLE * size.amax(-1, keepdim=True)).sum(-1)
     return model, misfit / 2 + n_parameters * n_matrices
 
 
 def _positive(matrix: Tensor) -> Tensor:
-    """The nearest regular covariances: entries that average over different samples may not be one."""
+    """The nearest regular covariances; entries that average over different samples may form an indefinite matrix."""
     values, vectors = torch.linalg.eigh(matrix)
-    least = _FLOOR * matrix.diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True)
+    least = _NEGLIGIBLE * matrix.diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True)
     return (vectors * torch.maximum(values, least)[..., None, :]) @ vectors.mT
-
-
-def _mix(unit: Tensor, theta: Tensor) -> Tensor:
-    return torch.einsum("...jk,...kio->...jio", unit, theta)
 
 
 @functools.lru_cache(maxsize=32)
 def _unit_variances(n_levels: int) -> Tensor:
     """Wavelet variances `(level, component)` of unit white noise, AR1s and random walk."""
+    # Five AR1s, two octaves apart, up to half the longest filter: a sum of them is smooth between neighbouring ones.
     longest = n_levels - 1
-    time_constants = torch.logspace(max(longest - _OCTAVES, 0), longest, _N_AR1, base=2.0, dtype=torch.float64)
+    time_constants = torch.logspace(max(longest - 8, 0), longest, 5, base=2.0, dtype=torch.float64)
     return torch.from_numpy(unit_wavelet_variances(n_levels, tuple(time_constants.tolist())))

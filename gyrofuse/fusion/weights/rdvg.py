@@ -1,4 +1,4 @@
-"""The random-drift virtual gyro (RDVG): weights that are optimal for white noise and random walks alone.
+"""The reduced-drift virtual gyro (RDVG): weights that are optimal for white noise and random walks alone.
 
 Vaccaro and Zaki fit white noise of variances `R_i` and random walks of covariance `Q` to the Allan covariances of the
 array, over non-overlapping clusters of `m` samples, `M = N/m` of them:
@@ -6,38 +6,43 @@ array, over non-overlapping clusters of `m` samples, `M = N/m` of them:
     AC_ij(m) = 1/(2(M-1)) sum_k (ybar_i,k+1 - ybar_i,k)(ybar_j,k+1 - ybar_j,k),   E AC_ij(m) = delta_ij R_i/m + Q_ij m/3
 
 by generalised least squares over the scales `m = 2, 4, ..., 2^J`, `J = floor(log2 N) - 3`, sensor by sensor and then
-pair by pair. The weights `Q^-1 1 / (1' Q^-1 1)` look at the random walks only. Nothing makes `Q` positive definite.
+pair by pair. The weights `Q^-1 1 / (1' Q^-1 1)` depend on the random walks only. `Q` may not be positive definite.
 """
 
 from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from gyrofuse._base.checks import check_signal, largest_level
-from gyrofuse._base.results import listed
+from gyrofuse._base.results import Result
 
 
 @dataclass(frozen=True, eq=False)
-class RDVGResult:
-    """Weights by RDVG and the noise they rest on. Batched over the leading dimensions of the signal.
+class RDVGResult(Result):
+    """Weights by RDVG and the noise model behind them. Batched over the leading dimensions of the signal.
 
     Attributes:
         weights: `(..., sensor)`, sum 1, may be negative; NaN where `Q` is singular.
         R: `(..., sensor)`, variance of the white noise, signal^2.
         Q: `(..., sensor, sensor)`, covariance of the steps of the random walks, signal^2 per sample.
-        positive_definite: `(...)`, whether `Q` is a covariance. Where it is not, the weights are what the formula
-            gives, but they minimise nothing.
+        positive_definite: `(...)`, whether `Q` is positive definite. Otherwise the weights follow the formula, but
+            minimise nothing.
     """
 
     weights: Tensor
     R: Tensor
     Q: Tensor
     positive_definite: Tensor
+    _batched = ("weights", "R", "Q", "positive_definite")
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading dimensions; `()` for a single array."""
+        return tuple(self.positive_definite.shape)
 
     def summary(self) -> str:
         """Weights and variances as text; the first item of a batch."""
@@ -49,25 +54,13 @@ class RDVGResult:
             lines.append(f"Q is not positive definite in {n_failed} of {n_items}: the weights there minimise nothing")
         return "\n".join(lines)
 
-    def __str__(self) -> str:
-        return self.summary()
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain numbers and lists, NaN as None."""
-        return {
-            "weights": listed(self.weights),
-            "R": listed(self.R),
-            "Q": listed(self.Q),
-            "positive_definite": self.positive_definite.tolist(),
-        }
-
     @staticmethod
     def _first(values: Tensor) -> list[float]:
         return values.reshape(-1, values.shape[-1])[0].tolist()
 
 
 def rdvg_weights(signal: Tensor) -> Tensor:
-    """Weights of an array by RDVG; see `rdvg`, which also tells where they can be trusted.
+    """Weights of an array by RDVG; see `rdvg`, which also returns whether they minimise anything.
 
     Args:
         signal: `(..., sensor, time)`.
@@ -84,17 +77,17 @@ def rdvg_weights(signal: Tensor) -> Tensor:
 def rdvg(signal: Tensor) -> RDVGResult:
     """White noise and random walks of an array by Allan covariances, and the weights they lead to.
 
-    As published, with what the publication leaves open settled so: where no scale lies below an eighth of the one
-    with the smallest Allan variance, the shortest scale alone gives the first guess of `R`; an `R_i` or `Q_ii` that
-    comes out negative stays so in the result, but weighs the pairs with its first guess, which is positive.
+    As published, with two cases that the publication leaves open: where no scale lies below an eighth of the scale with
+    the smallest Allan variance, the shortest scale alone gives the first guess of `R`; a negative `R_i` or `Q_ii` stays
+    in the result, but its first guess, which is positive, weighs the pairs.
 
     Args:
         signal: `(..., sensor, time)`, any unit, at least 32 samples. Missing (non-finite) samples: clusters that
             hold one are left out, pair by pair.
 
     Returns:
-        Weights, `R`, `Q`, and whether `Q` is positive definite. Where it is not, one warning counts the items and
-        nothing is raised, for the other items of a batch are good.
+        Weights, `R`, `Q`, and whether `Q` is positive definite. Otherwise one warning counts the items, and
+        nothing is raised, as the other items of a batch are good.
 
     Raises:
         TypeError: `signal` is not a floating point tensor.
@@ -172,7 +165,7 @@ def fit_allan_covariances(covariances: Tensor, n_samples: int) -> tuple[Tensor, 
     white, walk = _sampling_covariances(size, n_samples)
     variances = covariances.diagonal(dim1=-2, dim2=-1).mT  # (..., sensor, scale)
 
-    # A first guess: white noise where it rules, and the random walk that puts the minimum where it was found.
+    # A first guess: white noise from the short scales, and the random walk that puts the minimum where it was found.
     smallest = size[variances.argmin(-1, keepdim=True)]
     short = (size < smallest / 8) | (size == size[0])
     both = short[..., :, None] & short[..., None, :]
@@ -181,13 +174,13 @@ def fit_allan_covariances(covariances: Tensor, n_samples: int) -> tuple[Tensor, 
     Q0 = 3 * R0 / smallest[..., 0].square()
 
     regressors = torch.stack([1 / size, size / 3], dim=-1)  # (scale, parameter)
-    spread = _scaled(white, R0.square()) + _scaled(walk, Q0.square())
-    R, own = _least_squares(spread, regressors, variances).unbind(-1)
+    sampling = _scaled(white, R0.square()) + _scaled(walk, Q0.square())
+    R, own = _least_squares(sampling, regressors, variances).unbind(-1)
 
     # Pairs: half the covariance, with products in place of squares and Q_ij taken as 0.
     positive_R, positive_Q = torch.where(R > 0, R, R0), torch.where(own > 0, own, Q0)
-    spread = _scaled(white, _products(positive_R) / 2) + _scaled(walk, _products(positive_Q) / 2)
-    Q = _least_squares(spread, regressors[:, 1:], covariances.movedim(-3, -1))[..., 0]
+    sampling = _scaled(white, _products(positive_R) / 2) + _scaled(walk, _products(positive_Q) / 2)
+    Q = _least_squares(sampling, regressors[:, 1:], covariances.movedim(-3, -1))[..., 0]
     return R, Q - torch.diag_embed(Q.diagonal(dim1=-2, dim2=-1) - own)
 
 
@@ -203,7 +196,7 @@ def _sampling_covariances(size: Tensor, n_samples: int) -> tuple[Tensor, Tensor]
 
 def _least_squares(covariance: Tensor, regressors: Tensor, values: Tensor) -> Tensor:
     """`(X' C^-1 X)^-1 X' C^-1 y` for `C (..., scale, scale)`, `X (..., scale, parameter)`, `y (..., scale)`."""
-    # The scales differ by many orders of magnitude: put all of them on one footing first.
+    # In units of each scale's standard error, as the scales differ by many orders of magnitude.
     unit = covariance.diagonal(dim1=-2, dim2=-1).rsqrt()
     whitened = unit[..., None] * regressors
     weighted = torch.linalg.solve(unit[..., :, None] * covariance * unit[..., None, :], whitened)

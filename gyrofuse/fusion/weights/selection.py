@@ -1,66 +1,41 @@
-"""Which way of weighing the sensors suits a record: judged on data that the weights were not fitted to.
+"""Choice between methods by held-out risk: the variance that weights leave in data that they were not fitted to.
 
-The levels that long scale weights look at do not fit into a part of the record. So time is compressed: with the record
-cut into `2^s` blocks, weights are fitted to one block with the scale weights moved `s` levels down, where a level holds
-as many observations in a block as `s` levels higher in the record, and judged by the other blocks, `c' A c` with their
-covariance `A`. Scale weights of levels that blocks do hold need no such move: then fewer blocks are left out than used.
+The levels that long scale weights depend on do not fit into a part of the recording. So time is compressed: with the
+recording cut into `2^s` blocks, weights are fitted to one block with the scale weights moved `s` levels down, where a
+level holds as many observations in a block as `s` levels higher in the recording, and judged by the other blocks,
+`c' A c` with their covariance `A`. Where blocks hold the levels of the scale weights, these are not moved, and more
+blocks are fitted to than left out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from gyrofuse._base.checks import check_signal, largest_level
-from gyrofuse._base.results import listed
-from gyrofuse.fusion.weights.baselines import (
-    equal_weights,
-    inverse_variance_weights,
-    nonnegative_weights,
-    shrinkage_weights,
-)
-from gyrofuse.fusion.weights.model_assisted import assisted_covariance
-from gyrofuse.fusion.weights.svo import combine, counting, optimal_weights
+from gyrofuse._base.results import Result
+from gyrofuse.fusion.weights.methods import ESTIMATORS
 from gyrofuse.wavelets.covariance import wavelet_products
-from gyrofuse.wavelets.equivalent_dof import degrees_of_freedom
+from gyrofuse.wavelets.moments import combined_covariance
 
-# Weights from cross-covariance `(..., level, sensor, sensor)`, number of coefficients `(..., level)` and scale weights.
-# Levels that the scale weights leave out may help to know the others.
-ESTIMATORS: dict[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
-    "model_assisted": lambda wccv, counts, omega: _weigh(assisted_covariance(wccv, counts), omega),
-    "shrinkage": lambda wccv, counts, omega: shrinkage_weights(wccv, omega, degrees_of_freedom(counts)),
-    "svo": lambda wccv, counts, omega: _weigh(wccv, omega),
-    "nonnegative": lambda wccv, counts, omega: nonnegative_weights(counting(wccv, omega), omega),
-    "inverse_variance": lambda wccv, counts, omega: inverse_variance_weights(counting(wccv, omega), omega),
-    "equal": lambda wccv, counts, omega: equal_weights(wccv),
-}
 # The smoothest first: it is kept unless another one is clearly better.
 CANDIDATES = ("model_assisted", "shrinkage", "svo")
 
-_N_BLOCKS = 8
-# Levels that a block holds hardly an observation of, and the share of the scale weights that may fall on them.
-_LEVELS_TO_SPARE, _SHARE_TO_SPARE = 2, 0.05
-_FEWEST_FOLDS = 3
-# How many standard errors another candidate has to be better by. One is common, but folds share their blocks and the
-# levels moved to are not the ones asked for: with one, a level with a tone or rare jumps leads astray.
-_ERRORS = 3.0
-
 
 @dataclass(frozen=True, eq=False)
-class Selection:
-    """Held-out risks of several ways of weighing the sensors, and the one chosen. Batched as the signal.
+class Selection(Result):
+    """Held-out risks of several methods, and the method chosen. Batched as the signal.
 
     Attributes:
-        candidates: Their names, the one that is preferred when none is better first.
+        candidates: Names of the methods; the first is preferred unless another is better.
         risk: `(..., candidate)`, held-out `c' A c` over that of the first candidate, geometric mean over the folds;
             NaN where the record is too short for folds.
         standard_error: `(..., candidate)`, of the logarithm of `risk`.
         chosen: `(...)`, index of the candidate chosen: the first, or the best of those whose risk is lower by more than
-            three standard errors; the last where the record is too short to tell.
+            three standard errors; the last where the recording is too short for folds.
         n_folds: `(...)`, folds that could be used.
         n_blocks: Blocks that the record was cut into.
         levels_down: How many levels down the scale weights were moved.
@@ -74,16 +49,22 @@ class Selection:
     n_blocks: int
     levels_down: int
 
-    def __getitem__(self, index: Any) -> Selection:
-        """One item, or some, of the leading batch dimensions."""
-        batched = ("risk", "standard_error", "chosen", "n_folds")
-        return replace(self, **{name: getattr(self, name)[index] for name in batched})
+    _batched = ("risk", "standard_error", "chosen", "n_folds")
+    _contents = tuple("candidates risk standard_error chosen n_folds n_blocks levels_down sentence".split())
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading dimensions; `()` for a single array."""
+        return tuple(self.chosen.shape)
 
     def reshape(self, batch: Sequence[int]) -> Selection:
-        """The same items in other batch dimensions."""
-        batched = ("risk", "standard_error", "chosen", "n_folds")
+        """The same items in other batch dimensions.
+
+        Args:
+            batch: Dimensions of the new batch.
+        """
         n = self.chosen.ndim
-        values = {name: getattr(self, name) for name in batched}
+        values = {name: getattr(self, name) for name in self._batched}
         return replace(self, **{name: v.reshape((*batch, *v.shape[n:])) for name, v in values.items()})
 
     @property
@@ -117,37 +98,21 @@ class Selection:
             lines.append(f"  {name:<17}{self._change(i) if i else 'the measure':>18}{mark}")
         return "\n".join([*lines, self.sentence])
 
-    def __str__(self) -> str:
-        return self.summary()
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain numbers and lists, NaN as None."""
-        return {
-            "candidates": list(self.candidates),
-            "risk": listed(self.risk),
-            "standard_error": listed(self.standard_error),
-            "chosen": self.chosen.tolist(),
-            "n_folds": self.n_folds.tolist(),
-            "n_blocks": self.n_blocks,
-            "levels_down": self.levels_down,
-            "sentence": self.sentence,
-        }
-
     def _change(self, candidate: int) -> str:
         risk, error = (v.flatten()[candidate].item() for v in (self.risk, self.standard_error))
         return f"{100 * (risk - 1):+.3g} +- {100 * risk * error:.2g} %"
 
 
 def select_estimator(
-    signal: Tensor, scale_weights: Tensor, candidates: Sequence[str] = CANDIDATES, *, n_blocks: int = _N_BLOCKS
+    signal: Tensor, scale_weights: Tensor, candidates: Sequence[str] = CANDIDATES, *, n_blocks: int = 8
 ) -> Selection:
-    """Choose between ways of weighing the sensors by their risk on held-out blocks of time.
+    """Choose between methods by their risk on held-out blocks of time.
 
     Args:
         signal: `(..., sensor, time)`; NaN = missing sample.
         scale_weights: `(level,)`, sum 1, of the levels of the whole record.
-        candidates: Names in `ESTIMATORS`, the preferred one first.
-        n_blocks: Blocks of time, a power of two.
+        candidates: Names in `gyrofuse.fusion.weights.methods.ESTIMATORS`, the preferred one first.
+        n_blocks: Blocks of time, a power of two. Eight move long scale weights three levels down at most.
 
     Returns:
         Risks, choice and reason.
@@ -180,8 +145,8 @@ def select_estimator(
     fitted = ((block - block[:, None]) % n_blocks < n_fitted).to(sums)  # (fold, block)
     train, n_products = _pool(fitted, sums, counts)
     test, _ = _pool(1 - fitted, sums, counts)
-    held_out = combine(test, omega)
-    usable = _positive_definite(combine(train, omega)) & _positive_definite(held_out)  # (..., fold)
+    held_out = combined_covariance(test, omega)
+    usable = _positive_definite(combined_covariance(train, omega)) & _positive_definite(held_out)  # (..., fold)
     train = torch.where(usable[..., None, None, None], train, torch.eye(train.shape[-1]).to(train))
     n_products = torch.where(usable[..., None], n_products, 1.0)
     risks = []
@@ -193,24 +158,31 @@ def select_estimator(
 
 
 def _choose(relative: Tensor, usable: Tensor, candidates: tuple[str, ...], n_blocks: int, down: int) -> Selection:
-    """The first candidate, unless others are clearly better; then the best of these."""
+    """The first candidate, unless others are clearly better; then the best of these.
+
+    Clearly is by three standard errors. One is common in cross-validation, but folds share their blocks, and the levels
+    moved to are not those of the scale weights: with one, a tone or rare jumps at a single level decide.
+    """
     n_folds = usable.sum(-1)
     counted = torch.where(usable[..., None], relative, 0.0)
     mean = counted.sum(-2) / n_folds[..., None]
     squares = torch.where(usable[..., None], (relative - mean[..., None, :]).square(), 0.0).sum(-2)
     error = (squares / ((n_folds - 1) * n_folds)[..., None]).sqrt()
-    enough = n_folds >= _FEWEST_FOLDS
+    enough = n_folds >= 3  # the standard error of fewer folds is hardly known
     mean, error = (torch.where(enough[..., None], v, torch.nan) for v in (mean, error))
-    better = torch.where(mean < -_ERRORS * error, mean, torch.inf)
+    better = torch.where(mean < -3.0 * error, mean, torch.inf)
     better[..., 0] = 0.0
     chosen = torch.where(enough, better.argmin(-1), len(candidates) - 1)
     return Selection(candidates, mean.exp(), error, chosen, n_folds, n_blocks, down)
 
 
 def _levels_down(omega: Tensor, n_block_levels: int, most: int) -> int:
-    """The least move after which the blocks hold the levels that count."""
+    """The least move after which less than 5 % of the scale weights fall on the last two levels of a block or beyond.
+
+    A block holds hardly an observation at its last two levels.
+    """
     for down in range(most):
-        if omega[max(n_block_levels - _LEVELS_TO_SPARE, 0) + down :].sum() < _SHARE_TO_SPARE:
+        if omega[max(n_block_levels - 2, 0) + down :].sum() < 0.05:
             return down
     return most
 
@@ -218,16 +190,12 @@ def _levels_down(omega: Tensor, n_block_levels: int, most: int) -> int:
 def _pool(which: Tensor, sums: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
     """Cross-covariance over the blocks of each fold and how many products the pair of fewest has, `(..., level)`.
 
-    A level that some pair has no product of is zero.
+    A level at which some pair has no product is zero.
     """
     total = torch.einsum("fb,...bjik->...fjik", which, sums)
     number = torch.einsum("fb,...bjik->...fjik", which, counts)
     fewest = number.amin((-1, -2))
     return torch.where((fewest > 0)[..., None, None], total / number, 0.0), fewest
-
-
-def _weigh(wccv: Tensor, omega: Tensor) -> Tensor:
-    return optimal_weights(combine(counting(wccv, omega), omega))
 
 
 def _positive_definite(matrix: Tensor) -> Tensor:

@@ -3,6 +3,8 @@
 The weights minimise the wavelet variance of the virtual signal, summed over levels with scale weights `omega_j`:
 
     A = sum_j omega_j Gamma_j,   c = A^-1 1 / (1' A^-1 1)                                   [Z] equations (6), (7)
+
+Scale weights say how much each level counts: a name, or one number >= 0 per level, of which the sum does not matter.
 """
 
 from __future__ import annotations
@@ -15,8 +17,9 @@ from torch import Tensor, nn
 
 from gyrofuse._base.checks import check_floating
 from gyrofuse._base.linalg import check_positive_definite
+from gyrofuse.wavelets.moments import combined_covariance
 
-# How much each scale counts when an array is fused: a name, or one number >= 0 per level.
+# How much each scale counts: `"flat"`, `"short"`, `"long"`, or one number >= 0 per level.
 ScaleWeights = str | Sequence[float] | Tensor
 
 
@@ -38,15 +41,14 @@ def svo_weights(wccv: Tensor, scale_weights: ScaleWeights = "flat") -> Tensor:
     References:
         [Z] equation (7).
     """
-    omega = resolve_scale_weights(scale_weights, _check_levels(wccv)).to(wccv)
-    combined = combine(counting(wccv, omega), omega)
-    check_positive_definite("the wavelet cross-covariance combined over scales", combined)
-    return optimal_weights(combined)
+    return optimal_weights(checked_combination(wccv, scale_weights))
 
 
 class SVOWeights(nn.Module):
-    """`svo_weights` as a layer, without looking at values: `nn.Sequential(HaarFilterBank(J), CrossCovariance(),
-    SVOWeights("long"))` maps a signal to its weights, differentiable end to end.
+    """`svo_weights` as a layer, without checks of values in `forward`.
+
+    `nn.Sequential(HaarFilterBank(J), CrossCovariance(), SVOWeights("long"))` maps a signal to its weights,
+    differentiable end to end.
 
     Args:
         scale_weights: `"flat"`, `"short"`, `"long"`, or one number >= 0 per level.
@@ -55,18 +57,28 @@ class SVOWeights(nn.Module):
     def __init__(self, scale_weights: ScaleWeights = "flat") -> None:
         super().__init__()
         self.scale_weights = scale_weights
-        # The values of numbers are looked at here, once.
+        # The values of numbers are checked here, once.
         self._numbers = None if isinstance(scale_weights, str) else normalised(scale_weights)
 
     def forward(self, wccv: Tensor) -> Tensor:
-        """Map `(..., level, sensor, sensor)` to `(..., sensor)`."""
-        n_levels, omega = _check_levels(wccv), self._numbers
+        """Map a wavelet cross-covariance to weights.
+
+        Args:
+            wccv: `(..., level, sensor, sensor)`.
+
+        Returns:
+            `(..., sensor)`, sum 1.
+
+        Raises:
+            TypeError: `wccv` is not a floating point tensor.
+            ValueError: Wrong shape, or another number of levels than scale weights.
+        """
+        n_levels, omega = check_levels(wccv), self._numbers
         if omega is None:
             omega = resolve_scale_weights(self.scale_weights, n_levels)
         elif len(omega) != n_levels:
             raise ValueError(f"`wccv`: expected {len(omega)} levels, one for each scale weight, got {n_levels}")
-        omega = omega.to(wccv)
-        return optimal_weights(combine(counting(wccv, omega), omega))
+        return optimal_weights(combined_covariance(wccv, omega))
 
 
 def resolve_scale_weights(scale_weights: ScaleWeights, n_levels: int) -> Tensor:
@@ -107,6 +119,19 @@ def resolve_scale_weights(scale_weights: ScaleWeights, n_levels: int) -> Tensor:
     return weights
 
 
+def check_scale_weights(scale_weights: ScaleWeights) -> None:
+    """Check scale weights before the number of levels is known.
+
+    Args:
+        scale_weights: As for `svo_weights`.
+
+    Raises:
+        TypeError: Neither a name nor numbers.
+        ValueError: An unknown name, or numbers that are negative, not finite or all zero.
+    """
+    resolve_scale_weights(scale_weights, 1 if isinstance(scale_weights, str) else len(normalised(scale_weights)))
+
+
 def normalised(scale_weights: Sequence[float] | Tensor) -> Tensor:
     """Numbers as scale weights that sum to 1, one for each level.
 
@@ -135,23 +160,67 @@ def normalised(scale_weights: Sequence[float] | Tensor) -> Tensor:
     return weights / weights.sum()
 
 
-def combine(wccv: Tensor, omega: Tensor) -> Tensor:
-    """`A = sum_j omega_j Gamma_j`, [Z] equation (6)."""
-    return torch.einsum("j,...jik->...ik", omega.to(wccv), wccv)
-
-
-def counting(wccv: Tensor, omega: Tensor) -> Tensor:
-    """Levels that count; one that does not may well be unknown (NaN)."""
-    return torch.where(omega.to(wccv.device)[:, None, None] > 0, wccv, 0.0)
-
-
 def optimal_weights(combined: Tensor) -> Tensor:
-    """`c = A^-1 1 / (1' A^-1 1)`, [Z] equation (7)."""
+    """`c = A^-1 1 / (1' A^-1 1)`, [Z] equation (7).
+
+    Args:
+        combined: `A`, `(..., sensor, sensor)`.
+
+    Returns:
+        `(..., sensor)`, sum 1.
+    """
     solved = torch.linalg.solve(combined, combined.new_ones(combined.shape[-1]).expand(combined.shape[:-1]))
     return solved / solved.sum(-1, keepdim=True)
 
 
-def _check_levels(wccv: Tensor) -> int:
+def influence_matrix(combined: Tensor, weights: Tensor) -> Tensor:
+    """`B = (I - c 1') A^-1`, by which optimal weights follow a change of `A`: `dc = -B dA c`.
+
+    Args:
+        combined: `A`, `(..., sensor, sensor)`.
+        weights: `c`, `(..., sensor)`.
+
+    Returns:
+        `(..., sensor, sensor)`.
+
+    References:
+        [Z] Theorem 2.
+    """
+    inverse = torch.linalg.inv(combined)
+    return inverse - weights[..., :, None] * inverse.sum(-2, keepdim=True)
+
+
+def checked_combination(wccv: Tensor, scale_weights: ScaleWeights, labels: Sequence[str] | None = None) -> Tensor:
+    """`A = sum_j omega_j Gamma_j`, [Z] equation (6), positive definite.
+
+    Args:
+        wccv: `(..., level, sensor, sensor)`; a level whose scale weight is 0 may be unknown (NaN).
+        scale_weights: As for `svo_weights`.
+        labels: Names of the sensors, for the message.
+
+    Returns:
+        `(..., sensor, sensor)`.
+
+    Raises:
+        TypeError: `wccv` is not a floating point tensor.
+        ValueError: Wrong shape or scale weights.
+        SingularCovarianceError: `A` is not positive definite.
+    """
+    combined = combined_covariance(wccv, resolve_scale_weights(scale_weights, check_levels(wccv)))
+    check_positive_definite("the wavelet cross-covariance combined over scales", combined, labels)
+    return combined
+
+
+def check_levels(wccv: Tensor) -> int:
+    """Number of levels of a wavelet cross-covariance.
+
+    Args:
+        wccv: `(..., level, sensor, sensor)`.
+
+    Raises:
+        TypeError: Not a floating point tensor.
+        ValueError: Another shape.
+    """
     check_floating("wccv", wccv)
     if wccv.ndim < 3 or wccv.shape[-1] != wccv.shape[-2]:
         raise ValueError(f"`wccv`: expected (..., level, sensor, sensor), got shape {tuple(wccv.shape)}")
