@@ -262,10 +262,10 @@ def test_deciding_levels_by_hand():
     added = [
         (omega * np.trace(inference.influence.numpy() @ gamma)) ** 2 / eta
         for omega, gamma, eta in zip(
-            inference.scale_weights.numpy(), inference.wccv.numpy(), inference.degrees.numpy(), strict=True
+            inference.scale_weights.numpy(), inference.wccv.numpy(), inference.dof.numpy(), strict=True
         )
     ]
-    expected = sum(added) / sum(a / eta for a, eta in zip(added, inference.degrees.numpy(), strict=True))
+    expected = sum(added) / sum(a / eta for a, eta in zip(added, inference.dof.numpy(), strict=True))
     assert result.enough_data().deciding_observations.item() == pytest.approx(expected, rel=1e-9)
 
 

@@ -134,7 +134,7 @@ def test_certainty_is_that_of_the_fit():
     model = torch.einsum("i,njio,o->nj", weights, fitted.wavelet_cross_covariance, weights)
     combined = model[:, fitted.first_level :] @ omega[fitted.first_level :]
     found = 2 * combined.mean() ** 2 / combined.var()
-    said = fitted.certainty(weights.expand(300, 3), omega).median()
+    said = fitted.dof_of_fit(weights.expand(300, 3), omega).median()
     assert 0.2 < found / said < 1.2, (found.item(), said.item())
 
 
