@@ -132,3 +132,22 @@ _SAME_RATE = 1e-3
 def same_rate(first: float, second: float) -> bool:
     """Whether two sampling rates are the same, as far as rates that are read from time stamps can tell."""
     return abs(first / second - 1) <= _SAME_RATE
+
+
+def own_generator(generator: torch.Generator | None, device: torch.device | str | None) -> torch.Generator:
+    """Return `generator`, or a fresh one seeded by the operating system; never the global one.
+
+    Raises:
+        ValueError: `generator` lives on another device than `device`.
+    """
+    if generator is None:
+        generator = torch.Generator(device or "cpu")
+        generator.seed()
+        return generator
+    wanted = generator.device if device is None else torch.device(device)
+    if wanted.type != generator.device.type or wanted.index not in (None, generator.device.index):
+        raise ValueError(
+            f"`generator`: expected a generator on device {str(wanted)!r}, got one on "
+            f"{str(generator.device)!r}; make it with torch.Generator(device={str(wanted)!r})"
+        )
+    return generator

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from gyrofuse._base.checks import check_positive_integer
+from gyrofuse._base.checks import check_positive_integer, own_generator
 from gyrofuse._base.chunks import items_at_once
 from gyrofuse._base.deprecation import RenamedAttribute
-from gyrofuse._base.random import own_generator
 from gyrofuse._base.results import ConfidenceInterval, Result, place, scattered
 from gyrofuse.fitting.gmwm_result import GMWMResult
 from gyrofuse.fitting.moments.fit import fit_batch

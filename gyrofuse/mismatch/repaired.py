@@ -10,8 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gyrofuse._base.checks import check_positive_integer, same_rate
-from gyrofuse._base.random import own_generator
+from gyrofuse._base.checks import check_positive_integer, own_generator, same_rate
 from gyrofuse.mismatch.case import Scene
 from gyrofuse.mismatch.mechanism import Mechanism
 from gyrofuse.noise.array_model import ArrayModel

@@ -9,8 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gyrofuse._base.checks import check_positive_integer
-from gyrofuse._base.random import own_generator
+from gyrofuse._base.checks import check_positive_integer, own_generator
 from gyrofuse.noise.estimation import EstimatedFrom
 from gyrofuse.noise.processes import Drift, Model, Process
 

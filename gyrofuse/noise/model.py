@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 from torch.func import jvp
 
-from gyrofuse._base.checks import check_positive, check_positive_integer
-from gyrofuse._base.random import own_generator
+from gyrofuse._base.checks import check_positive, check_positive_integer, own_generator
 from gyrofuse.noise.estimation import EstimatedFrom
 
 Parameter = float | Tensor | None

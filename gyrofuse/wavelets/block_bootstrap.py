@@ -24,8 +24,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from gyrofuse._base.checks import check_confidence_level, check_n_levels, check_positive_integer, check_signal
-from gyrofuse._base.random import own_generator
+from gyrofuse._base.checks import (
+    check_confidence_level,
+    check_n_levels,
+    check_positive_integer,
+    check_signal,
+    own_generator,
+)
 from gyrofuse._base.results import ConfidenceInterval
 from gyrofuse.wavelets.block_length import (
     BlockSums,

@@ -10,10 +10,11 @@ import torch
 from reference import processes as naive
 from reference import published
 
-from gyrofuse._base.random import ar1_recursion, own_generator
+from gyrofuse._base.checks import own_generator
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.parsing import model_from_dict
 from gyrofuse.noise.processes import AR1, Drift, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
+from gyrofuse.noise.processes.ar1_recursion import ar1_recursion
 
 RANDOM = [
     WhiteNoise(0.7),

@@ -186,7 +186,9 @@ def _ranked(
     """Fit the chosen candidate of every sensor, by `fitted` of items and a model, and put all into their places."""
     best: list[GMWMResult | None] = [None] * len(usable)
     places = usable.nonzero()[:, 0]
-    for c in table.choice.unique().tolist() if fitted else ():
+    for c in table.choice.unique().tolist():
+        if fitted is None:
+            break
         which = places[table.choice == c]
         model = compositions.composition(table.kinds[c], held=True)  # its processes in the order of the table
         whole = fitted(which, Model(list(model.processes)))

@@ -9,12 +9,12 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from gyrofuse._base.random import ar1_recursion
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.gaussian import Addition
 from gyrofuse.mismatch.mechanism import Finding, Mechanism
 from gyrofuse.mismatch.oscillating import Mode, nominated, refitted_mode
 from gyrofuse.mismatch.wandering import share_of_lorentzian
+from gyrofuse.noise.processes.ar1_recursion import ar1_recursion
 
 _SHORT = 0.05  # cycles of the width in which a phase that diffuses forgets its frequency
 _LONG = 8.0

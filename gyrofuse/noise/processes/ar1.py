@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base import units
-from gyrofuse._base.random import ar1_recursion
 from gyrofuse.noise.datasheet_units import DatasheetEntry, DatasheetUnits
 from gyrofuse.noise.dct_bands import BandVariance, DCTBands
 from gyrofuse.noise.model import Parameter
+from gyrofuse.noise.processes.ar1_recursion import ar1_recursion
 from gyrofuse.noise.processes.base import NON_NEGATIVE, STATIONARY, Process, States, WhiteAndWalk, matrix, normal
 from gyrofuse.noise.processes.haar_kernel import SMALLEST, haar_kernel, haar_kernel_slope
 from gyrofuse.noise.processes.quantization_noise import QuantizationNoise

@@ -11,10 +11,10 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from gyrofuse._base import units
-from gyrofuse._base.random import ar1_recursion
 from gyrofuse.noise.datasheet_units import DatasheetEntry, DatasheetUnits
 from gyrofuse.noise.dct_bands import BandVariance, DCTBands
 from gyrofuse.noise.model import Parameter
+from gyrofuse.noise.processes.ar1_recursion import ar1_recursion
 from gyrofuse.noise.processes.base import DECAY, NON_NEGATIVE, Process, States, WhiteAndWalk, matrix, normal
 from gyrofuse.noise.processes.haar_kernel import compared_halves, sum_before, within_halves
 from gyrofuse.noise.processes.random_walk import RandomWalk

@@ -1,4 +1,4 @@
-"""What sample paths are made of: a generator of one's own and the AR(1) recursion."""
+"""The recursion of a first-order autoregression, in parallel along time."""
 
 from __future__ import annotations
 
@@ -7,25 +7,6 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 _BLOCK = 64  # samples that one triangular product advances at once
-
-
-def own_generator(generator: torch.Generator | None, device: torch.device | str | None) -> torch.Generator:
-    """Return `generator`, or a fresh one seeded by the operating system; never the global one.
-
-    Raises:
-        ValueError: `generator` lives on another device than `device`.
-    """
-    if generator is None:
-        generator = torch.Generator(device or "cpu")
-        generator.seed()
-        return generator
-    wanted = generator.device if device is None else torch.device(device)
-    if wanted.type != generator.device.type or wanted.index not in (None, generator.device.index):
-        raise ValueError(
-            f"`generator`: expected a generator on device {str(wanted)!r}, got one on "
-            f"{str(generator.device)!r}; make it with torch.Generator(device={str(wanted)!r})"
-        )
-    return generator
 
 
 def ar1_recursion(innovations: Tensor, phi: Tensor) -> Tensor:
