@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from reference import haar as naive
-from test_assisted import N_LEVELS, WALKS, excess, moments, simulated, with_telegraph, with_tone
+from test_model_assisted import N_LEVELS, WALKS, excess, moments, simulated, with_telegraph, with_tone
 from torch import Tensor
 
 import gyrofuse as gf
