@@ -27,7 +27,7 @@ def to_c_header(model: Model, rate: float, unit: str, name: str = "imu_noise") -
     states.
 
     Args:
-        model: With scalar parameters.
+        model: Noise model with scalar parameters.
         rate: Sampling rate, Hz.
         unit: Unit of the model, of rate or acceleration, which the numbers keep.
         name: Prefix of everything defined, a C identifier.

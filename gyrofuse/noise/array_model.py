@@ -209,10 +209,10 @@ def _of_one_sensor(model: Model) -> Model:
     shapes = [value.shape for value in values if isinstance(value, Tensor) and value.ndim]
     if not shapes or any(shape.numel() != 1 for shape in shapes):
         return model
-    params, told = model.params.reshape(-1), model.estimated_from
-    if told is not None and told.param_cov is not None:
-        told = replace(told, param_cov=told.param_cov.reshape(len(params), len(params)))
-    return model.with_params(params, estimated_from=told)
+    params, record = model.params.reshape(-1), model.estimated_from
+    if record is not None and record.param_cov is not None:
+        record = replace(record, param_cov=record.param_cov.reshape(len(params), len(params)))
+    return model.with_params(params, estimated_from=record)
 
 
 def _own_params(process: Process, matrix: Tensor) -> dict[str, int]:
@@ -225,13 +225,13 @@ def _own_params(process: Process, matrix: Tensor) -> dict[str, int]:
 
 
 def _together(models: Sequence[Model], n_drifts: int) -> EstimatedFrom | None:
-    """What independent sensors were estimated from; drifts, which have no spectrum, come last and have no spread."""
-    told = [model.estimated_from for model in models if model.estimated_from is not None]
-    if len(told) < len(models):
+    """What independent sensors were estimated from; drifts, which have no spectrum, come last and have variance 0."""
+    records = [model.estimated_from for model in models if model.estimated_from is not None]
+    if len(records) < len(models):
         return None
-    shortest = min(one.n_samples for one in told)
+    shortest = min(one.n_samples for one in records)
     blocks = []
-    for model, one in zip(models, told, strict=True):
+    for model, one in zip(models, records, strict=True):
         if one.param_cov is None:
             return EstimatedFrom(shortest)
         noise = torch.tensor([not p.deterministic for p in model.processes for _ in p.parameters])

@@ -56,12 +56,12 @@ def datasheet(model: Model, rate: float, unit: str, *, n_levels: int = _LEVELS) 
     Where no white noise is left, angle or velocity random walk is that of AR1s with a correlation time below one
     second.
 
-    Bias instability is the lowest local minimum of the Allan deviation, without tones and drifts, over 0.664,
-    on octave averaging times, of those that longer averaging does not get below; a model whose Allan deviation has no
-    such floor has none, as one without a random walk, which falls in the end.
+    Bias instability is that of the flicker noise of the model. Without flicker noise it is the lowest local minimum of
+    the Allan deviation, without sinusoids and drifts, over 0.664, at octave averaging times; the minimum counts only if
+    the Allan deviation at all longer averaging times is larger.
 
     Args:
-        model: With scalar parameters.
+        model: Noise model with scalar parameters.
         rate: Sampling rate, Hz.
         unit: Unit of the model: deg/s, mdeg/s, deg/h, rad/s, mrad/s, rpm; m/s^2, g, mg, ug; or another spelling.
         n_levels: Averaging times looked at, from one sample up; those of the record behind the model, which knows no

@@ -40,7 +40,7 @@ class DCTBands:
 
     Args:
         n_samples: Length T of the record.
-        device: Where the tensors are.
+        device: Device of the tensors.
 
     Attributes:
         edges: First ordinate of each band, and the one after the last.

@@ -123,15 +123,15 @@ def model_from_dict(description: Mapping[str, Any]) -> Model | ArrayModel:
     Raises:
         ValueError: Missing or unknown entries, or a value outside its domain.
     """
-    told = EstimatedFrom.from_dict(description.get("estimated_from"))
+    record = EstimatedFrom.from_dict(description.get("estimated_from"))
     if "components" in description:
-        return ArrayModel([_component(entry) for entry in _entries(description, "components")], estimated_from=told)
+        return ArrayModel([_component(entry) for entry in _entries(description, "components")], estimated_from=record)
     if "processes" not in description:
         raise ValueError(
             "`description`: expected the entry 'processes' of a model or 'components' of an array, "
             f"got {sorted(description)}"
         )
-    return Model([_process_from_dict(entry) for entry in _entries(description, "processes")], estimated_from=told)
+    return Model([_process_from_dict(entry) for entry in _entries(description, "processes")], estimated_from=record)
 
 
 def _entries(description: Mapping[str, Any], name: str) -> list[Any]:
@@ -173,8 +173,8 @@ def _value(parameter: str, value: Any) -> Any:
     try:
         return torch.tensor(value, dtype=torch.float64) if isinstance(value, list) else value + 0.0
     except (TypeError, ValueError, OverflowError, RuntimeError):
-        told = str(value)
+        given = str(value)
         raise ValueError(
             f"`description`: expected a number for {parameter}, or a list of them, got "
-            f"{told if len(told) < 80 else told[:80] + '...'}"
+            f"{given if len(given) < 80 else given[:80] + '...'}"
         ) from None

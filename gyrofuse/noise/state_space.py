@@ -87,43 +87,43 @@ class StateSpace:
         log_root = block.root.diagonal(dim1=-2, dim2=-1).log()
         mean, covariance = self.x0[..., None], self.P0  # (..., state, 1), (..., state, state)
         eye = torch.eye(len(self.states), dtype=torch.float64, device=self.F.device)
-        misfits, determinants = [], []
+        distances, determinants = [], []
         for start, z in zip(range(0, n_samples, length), whitened.unbind(-2), strict=True):
             rows = min(length, n_samples - start)
             observe = block.observe[..., :rows, :]
             innovation = z[..., :rows, None] - observe @ mean
             # Their covariance is I + O P O'; by the matrix inversion lemma only the state's dimension is inverted.
-            told = observe.mT @ innovation
+            score = observe.mT @ innovation
             ratio = eye + covariance @ (observe.mT @ observe)
             after = torch.linalg.solve(ratio, covariance)  # of x_0, given the block
-            learnt = after @ told
-            misfits.append((innovation.square().sum(-2) - (told * learnt).sum(-2))[..., 0])
+            gained = after @ score
+            distances.append((innovation.square().sum(-2) - (score * gained).sum(-2))[..., 0])
             determinants.append(ratio)
             if rows == length:
-                mean = block.advance @ mean + block.decorrelated @ learnt + block.shared @ innovation
+                mean = block.advance @ mean + block.decorrelated @ gained + block.shared @ innovation
                 covariance = block.decorrelated @ after @ block.decorrelated.mT + block.rest
                 covariance = (covariance + covariance.mT) / 2
-        misfit = torch.stack(misfits, -1).sum(-1)
-        spread = torch.logdet(torch.stack(determinants, -3)).sum(-1)
+        distance = torch.stack(distances, -1).sum(-1)
+        log_det = torch.logdet(torch.stack(determinants, -3)).sum(-1)
         for rows in {length, n_samples % length} - {0}:
             times = n_samples // length if rows == length else 1
-            spread = spread + 2 * times * log_root[..., :rows].sum(-1)
-        return -(misfit + spread + n_samples * math.log(2 * math.pi)) / 2
+            log_det = log_det + 2 * times * log_root[..., :rows].sum(-1)
+        return -(distance + log_det + n_samples * math.log(2 * math.pi)) / 2
 
     def _block(self, length: int) -> _Block:
         """`length` samples as one observation of the state before them."""
         F, Q, H, R = self.F, self.Q, self.H, self.R
         eye = torch.eye(len(self.states), dtype=F.dtype, device=F.device).expand_as(F)
         # F^i and the covariance of x_i given x_0, i = 1..length, twice as many at a time
-        power, spread = F[..., None, :, :], Q[..., None, :, :]
+        power, noise_cov = F[..., None, :, :], Q[..., None, :, :]
         while power.shape[-3] < length:
-            spread = torch.cat([spread, spread + power @ spread[..., -1:, :, :] @ power.mT], -3)
+            noise_cov = torch.cat([noise_cov, noise_cov + power @ noise_cov[..., -1:, :, :] @ power.mT], -3)
             power = torch.cat([power, power @ power[..., -1:, :, :]], -3)
-        power, spread = power[..., :length, :, :], spread[..., :length, :, :]
+        power, noise_cov = power[..., :length, :, :], noise_cov[..., :length, :, :]
         before = torch.cat([eye[..., None, :, :], power[..., :-1, :, :]], -3)  # F^0 .. F^(length-1)
         output = H[..., None, :, :]
         seen, seen_before = (output @ power)[..., 0, :], (output @ before)[..., 0, :]  # H F^i: (..., length, state)
-        reached = spread @ output.mT  # Cov(x_i, y_i): (..., length, state, 1)
+        reached = noise_cov @ output.mT  # Cov(x_i, y_i): (..., length, state, 1)
         # Cov(y_i, y_k) = H F^(k-i) Cov(x_i, y_i), k >= i. Row i of the product over i and lag moves right by i: in rows
         # that are one shorter, what follows begins one later in each.
         by_lag = pad(reached[..., 0] @ seen_before.mT, (0, length))  # (..., i, lag)
@@ -145,7 +145,7 @@ class StateSpace:
         shared = (before.flip(-3) @ reached)[..., 0].mT
         shared = torch.linalg.solve_triangular(root.mT, shared, upper=True, left=False)
         advance = power[..., -1, :, :]
-        rest = spread[..., -1, :, :] - shared @ shared.mT
+        rest = noise_cov[..., -1, :, :] - shared @ shared.mT
         return _Block(root, observe, advance, shared, advance - shared @ observe, rest)
 
 
@@ -172,8 +172,9 @@ class _Block(NamedTuple):
 def state_space(model: Model, rate: float) -> StateSpace:
     """Write a model as a linear system with one step per sample.
 
-    A random walk and an AR(1) take one state, quantisation noise, a tone and a drift two, white noise none. The
-    parameters are those of samples, so that nothing is discretised and nothing approximated.
+    A random walk and an AR(1) take one state, quantisation noise, a sinusoid, a drift and a second-order Gauss-Markov
+    process two, white noise none. The parameters are those of samples, so that nothing is discretised. Flicker noise
+    alone is approximated: by 12 AR1s and a random walk, with its spectrum within 0.4 % from 2e-6 cycles per sample on.
 
     Args:
         model: Parameters may have batch dimensions `(...)`; the matrices keep them and are differentiable.
