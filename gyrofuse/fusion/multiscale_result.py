@@ -158,7 +158,7 @@ class MultiScaleResult(CrossFittedGyro):
         return self.weights.shape[-2]
 
     @property
-    def wavelet_cross_covariance(self) -> Tensor:
+    def wavelet_cross_covariance(self) -> Tensor:  # type: ignore[override]  # read through from `single`
         """`(..., level, sensor, sensor)`, signal^2."""
         return self.single.wavelet_cross_covariance
 
@@ -173,32 +173,32 @@ class MultiScaleResult(CrossFittedGyro):
         return self.single.weights
 
     @property
-    def sensors(self) -> tuple[str, ...]:
+    def sensors(self) -> tuple[str, ...]:  # type: ignore[override]  # read through from `single`
         """Name of each sensor."""
         return self.single.sensors
 
     @property
-    def axes(self) -> tuple[str, ...]:
+    def axes(self) -> tuple[str, ...]:  # type: ignore[override]  # read through from `single`
         """Names along the leading dimension, empty when it has none."""
         return self.single.axes
 
     @property
-    def rate(self) -> float | None:
+    def rate(self) -> float | None:  # type: ignore[override]  # read through from `single`
         """Sampling rate in Hz, when known."""
         return self.single.rate
 
     @property
-    def unit(self) -> str | None:
+    def unit(self) -> str | None:  # type: ignore[override]  # read through from `single`
         """Unit of the signal, when known."""
         return self.single.unit
 
     @property
-    def n_samples(self) -> int:
+    def n_samples(self) -> int:  # type: ignore[override]  # read through from `single`
         """Length of the signal."""
         return self.single.n_samples
 
     @property
-    def scale_weights(self) -> Tensor:
+    def scale_weights(self) -> Tensor:  # type: ignore[override]  # read through from `single`
         """`(level,)`, sum 1: how much each level counts, relative to its optimum."""
         return self.single.scale_weights
 
