@@ -29,24 +29,14 @@ class VirtualGyro(Result):
         unit: Unit of the signal, when known.
     """
 
-    if TYPE_CHECKING:
-
-        @property
-        def weights(self) -> Tensor: ...
-        @property
-        def wavelet_cross_covariance(self) -> Tensor: ...
-        @property
-        def scale_weights(self) -> Tensor: ...
-        @property
-        def n_samples(self) -> int: ...
-        @property
-        def sensors(self) -> tuple[str, ...]: ...
-        @property
-        def axes(self) -> tuple[str, ...]: ...
-        @property
-        def rate(self) -> float | None: ...
-        @property
-        def unit(self) -> str | None: ...
+    weights: Tensor
+    wavelet_cross_covariance: Tensor
+    scale_weights: Tensor
+    n_samples: int
+    sensors: tuple[str, ...]
+    axes: tuple[str, ...]
+    rate: float | None
+    unit: str | None
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
