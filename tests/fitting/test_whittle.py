@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gyrofuse._base.transforms import cosine_ordinates, ramp_ordinates
-from gyrofuse.export.kalibr import state_space
 from gyrofuse.fitting.spectral.bands import Bins, Noise
 from gyrofuse.fitting.spectral.whittle import WhittleFit, refine_whittle
 from gyrofuse.fitting.structure import Composition
 from gyrofuse.noise.model import Model
 from gyrofuse.noise.processes import AR1, Drift, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
+from gyrofuse.noise.state_space import state_space
 
 Array = NDArray[np.float64]
 
