@@ -13,9 +13,6 @@ from gyrofuse._base.checks import check_positive_integer, own_generator
 from gyrofuse.noise.estimation import EstimatedFrom
 from gyrofuse.noise.processes import Drift, Model, Process
 
-_SYMMETRY = 1e-8  # of the largest entry: printed digits may differ across the diagonal
-_ROUNDING = 1e-12  # of the largest eigenvalue: how negative rounding alone may make the smallest
-
 
 class ArrayModel:
     """Noise of an array: independent components, each a process with a matrix over the sensors.
@@ -260,14 +257,16 @@ def _checked(process: Process, matrix: Any) -> tuple[Process, Tensor]:
 
 
 def _check_covariance(name: str, matrix: Tensor) -> None:
+    symmetry = 1e-8  # share of the largest entry: printed digits may differ across the diagonal
+    rounding = 1e-12  # share of the largest eigenvalue: how negative rounding alone may make the smallest
     asymmetry = (matrix - matrix.mT).abs().max()
-    if asymmetry > _SYMMETRY * matrix.abs().max():
+    if asymmetry > symmetry * matrix.abs().max():
         raise ValueError(
             f"{name}: expected a symmetric matrix, got entries that differ from their mirror images "
             f"by {asymmetry.item():.3g}"
         )
     eigenvalues = torch.linalg.eigvalsh(matrix)
-    if eigenvalues[0] < -_ROUNDING * eigenvalues.abs().max():
+    if eigenvalues[0] < -rounding * eigenvalues.abs().max():
         raise ValueError(
             f"{name}: expected a positive semi-definite matrix, got eigenvalues from "
             f"{eigenvalues[0].item():.3g} to {eigenvalues[-1].item():.3g}"

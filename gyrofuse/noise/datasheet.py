@@ -14,8 +14,11 @@ from gyrofuse.noise.datasheet_units import BIAS_INSTABILITY, DatasheetEntry, Dat
 from gyrofuse.noise.model import check_scalar
 from gyrofuse.noise.processes import Model
 
-_WHITE_AFTER = 1.0  # s
-_LEVELS = 40  # where the floor of the Allan deviation is looked for: of any record
+# Correlation time in seconds below which a process counts as white where there is no white noise: the random walk of an
+# angle is read off the Allan deviation at 1 s (IEEE Std 952).
+_WHITE_AFTER = 1.0
+# Levels over which the floor of the Allan deviation is looked for: 2^40 samples are more than any record has.
+_LEVELS = 40
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,6 @@ from torch import Tensor
 
 # Ordinates that are bands of their own, from the lowest frequency up: there spectra change most from one to the next.
 SINGLE = 48
-# Bands of an octave above these.
-_PER_OCTAVE = 16
-# Bands for each halving of the distance from the highest frequency, where AR1s that alternate in sign have their peak.
-_PER_OCTAVE_FROM_TOP = 8
-# How often that distance is halved.
-_OCTAVES_FROM_TOP = 4
 
 
 class BandVariance(NamedTuple):
@@ -75,8 +69,11 @@ def _edges(n_samples: int) -> list[int]:
     """First ordinate of each band, and the one after the last."""
     single = min(SINGLE, n_samples - 1)
     half = n_samples // 2
-    rising = math.ceil(_PER_OCTAVE * math.log2(max(half / (single + 1), 1)))
-    places = [round((single + 1) * 2 ** (i / _PER_OCTAVE)) for i in range(rising)]
-    falling = _PER_OCTAVE_FROM_TOP * _OCTAVES_FROM_TOP
-    places += [n_samples - round(half * 2 ** (-i / _PER_OCTAVE_FROM_TOP)) for i in range(falling + 1)]
+    per_octave = 16  # over so narrow a band the quadrature of two places is good to third order in 4 %
+    rising = math.ceil(per_octave * math.log2(max(half / (single + 1), 1)))
+    places = [round((single + 1) * 2 ** (i / per_octave)) for i in range(rising)]
+    # Each time the distance from the highest frequency halves, where AR1s that alternate in sign have their peak.
+    per_halving, n_halvings = 8, 4
+    falling = range(per_halving * n_halvings + 1)
+    places += [n_samples - round(half * 2 ** (-i / per_halving)) for i in falling]
     return [*range(1, single + 1), *sorted({k for k in places if single < k < n_samples}), n_samples]

@@ -17,7 +17,7 @@ _SPELLINGS: dict[str, type[Any]] = {
     name: kind for kind in PROCESSES for name in (kind.__name__.lower(), kind.symbol.lower(), kind.key, *kind.spellings)
 }
 _LONGEST = 1000  # characters of a formula: far more than any model takes, and what a parser can nest
-_MOST = 50  # processes of a model: ten times what any recording has told apart
+_MOST = 50  # processes of a model: ten times what any recording determines
 _KNOWN = ", ".join(f"{kind.symbol} ({kind.__name__})" for kind in PROCESSES)
 
 

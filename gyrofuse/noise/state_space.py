@@ -14,7 +14,8 @@ from torch.nn.functional import pad
 from gyrofuse._base.checks import check_floating, check_positive
 from gyrofuse.noise.processes import Model
 
-_LARGEST_BLOCK = 256  # samples that one step of the likelihood takes together
+# Largest number of samples that one step of the likelihood takes together: their covariance is factored once.
+_LARGEST_BLOCK = 256
 
 
 @dataclass(frozen=True, eq=False)

@@ -141,6 +141,8 @@ def test_states_have_names():
         "quantization_noise.carried",
         "ar1_1",
         "ar1_2",
+        "matern32_1",
+        "matern32_1.derivative",
         "drift",
         "drift.slope",
         "random_walk",
@@ -150,7 +152,7 @@ def test_states_have_names():
         "sinusoid_2.cosine",
     )
     assert system.rate == 100.0
-    assert (system.F.shape, system.H.shape, system.R.shape) == ((11, 11), (1, 11), (1, 1))
+    assert (system.F.shape, system.H.shape, system.R.shape) == ((13, 13), (1, 13), (1, 1))
 
 
 def test_matrices_keep_batch_dimensions():
@@ -488,9 +490,10 @@ def test_header_says_units_and_states():
     for line in (
         "Noise of a rate sensor in mdeg/s, one step per sample at 50 Hz",
         "state 2: ar1_1, mdeg/s",
-        "state 5: drift.slope, mdeg/s per sample",
+        "state 5: matern32_1.derivative, mdeg/s",
+        "state 7: drift.slope, mdeg/s per sample",
         "#ifndef IMU_NOISE_H_INCLUDED",
-        "static const double imu_noise_Q[11][11]",
+        "static const double imu_noise_Q[13][13]",
         "/* variance of v, (mdeg/s)^2 */",
     ):
         assert line in header

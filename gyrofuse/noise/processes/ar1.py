@@ -14,7 +14,7 @@ from gyrofuse.noise.datasheet_units import DatasheetEntry, DatasheetUnits
 from gyrofuse.noise.dct_bands import BandVariance, DCTBands
 from gyrofuse.noise.model import Parameter
 from gyrofuse.noise.processes.ar1_recursion import ar1_recursion
-from gyrofuse.noise.processes.base import NON_NEGATIVE, STATIONARY, Process, States, WhiteAndWalk, matrix, normal
+from gyrofuse.noise.processes.base import NON_NEGATIVE, Process, States, WhiteAndWalk, domain, matrix, normal
 from gyrofuse.noise.processes.haar_kernel import SMALLEST, haar_kernel, haar_kernel_slope
 from gyrofuse.noise.processes.quantization_noise import QuantizationNoise
 from gyrofuse.noise.processes.random_walk import RandomWalk
@@ -42,7 +42,7 @@ class AR1(Process):
     stand_ins = (WhiteNoise, QuantizationNoise, RandomWalk)
     short_limit = WhiteNoise
     long_limit = RandomWalk
-    phi: Parameter = field(default=None, metadata=STATIONARY)
+    phi: Parameter = field(default=None, metadata=domain("a number strictly between -1 and 1", lambda v: v.abs() < 1))
     variance: Parameter = field(default=None, metadata=NON_NEGATIVE)
 
     @staticmethod

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import numbers
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
@@ -227,11 +226,6 @@ def domain(expected: str, holds: Callable[[Tensor], Tensor]) -> dict[str, Any]:
 
 
 NON_NEGATIVE = domain("a finite number >= 0", lambda v: v >= 0)
-STATIONARY = domain("a number strictly between -1 and 1", lambda v: v.abs() < 1)
-DECAY = domain("a number strictly between 0 and 1", lambda v: (v > 0) & (v < 1))
-FINITE = domain("a finite number", torch.isfinite)
-# pi rounded to float32 lies just above pi
-ANGLE = domain("a number in (0, pi]", lambda v: (v > 0) & (v <= math.pi * (1 + 1e-7)))
 
 
 def _checked(kind: type, name: str, value: Parameter, *, expected: str, holds: Callable[[Tensor], Tensor]) -> Parameter:

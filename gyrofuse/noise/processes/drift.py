@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gyrofuse.noise.datasheet_units import DatasheetEntry, DatasheetUnits
 from gyrofuse.noise.model import Parameter
-from gyrofuse.noise.processes.base import FINITE, Process, States, WhiteAndWalk, matrix, sample_numbers
+from gyrofuse.noise.processes.base import Process, States, WhiteAndWalk, domain, matrix, sample_numbers
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -28,7 +28,7 @@ class Drift(Process):
     squared = True
     gaussian = False
     deterministic = True
-    slope: Parameter = field(default=None, metadata=FINITE)
+    slope: Parameter = field(default=None, metadata=domain("a finite number", torch.isfinite))
 
     @staticmethod
     def _wavelet_variance(tau: Tensor, slope: Tensor) -> Tensor:

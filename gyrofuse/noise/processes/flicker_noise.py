@@ -92,7 +92,7 @@ class FlickerNoise(Process):
         """AR1s, one for each factor of 4 in time constant up to 4e6 samples, and a random walk for all slower ones.
 
         The autocovariance is exactly `(2/pi) variance int_0^inf phi(y)^k dy` with `phi = tanh(y)^2`: this is the
-        midpoint rule, which gives the spectrum within 0.4 % from 2e-7 cycles per sample on.
+        midpoint rule, which gives the spectrum within 0.4 % from 2e-6 and 2 % from 2e-7 cycles per sample on.
         """
         spacing, n_ar1s = math.log(2), 12
         share = 2 / math.pi * spacing

@@ -15,7 +15,7 @@ from gyrofuse.noise.datasheet_units import DatasheetEntry, DatasheetUnits
 from gyrofuse.noise.dct_bands import BandVariance, DCTBands
 from gyrofuse.noise.model import Parameter
 from gyrofuse.noise.processes.ar1_recursion import ar1_recursion
-from gyrofuse.noise.processes.base import DECAY, NON_NEGATIVE, Process, States, WhiteAndWalk, matrix, normal
+from gyrofuse.noise.processes.base import NON_NEGATIVE, Process, States, WhiteAndWalk, domain, matrix, normal
 from gyrofuse.noise.processes.haar_kernel import compared_halves, sum_before, within_halves
 from gyrofuse.noise.processes.random_walk import RandomWalk
 from gyrofuse.noise.processes.white_noise import WhiteNoise
@@ -46,7 +46,9 @@ class Matern32(Process):
     stand_ins = (WhiteNoise, RandomWalk)
     short_limit = WhiteNoise
     memoryless = 0.01  # successive samples have a correlation of 0.056
-    phi: Parameter = field(default=None, metadata=DECAY)
+    phi: Parameter = field(
+        default=None, metadata=domain("a number strictly between 0 and 1", lambda v: (v > 0) & (v < 1))
+    )
     variance: Parameter = field(default=None, metadata=NON_NEGATIVE)
 
     @staticmethod

@@ -12,7 +12,7 @@ from torch import Tensor
 from gyrofuse._base import units
 from gyrofuse.noise.datasheet_units import DatasheetEntry, DatasheetUnits
 from gyrofuse.noise.model import Parameter, SpectralLine
-from gyrofuse.noise.processes.base import ANGLE, NON_NEGATIVE, Process, States, WhiteAndWalk, matrix, sample_numbers
+from gyrofuse.noise.processes.base import NON_NEGATIVE, Process, States, WhiteAndWalk, domain, matrix, sample_numbers
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -39,7 +39,10 @@ class Sinusoid(Process):
     has_line = True
     starts_per_octave = 3  # the wavelet variance of a sinusoid changes within a third of an octave
     amplitude: Parameter = field(default=None, metadata=NON_NEGATIVE)
-    beta: Parameter = field(default=None, metadata=ANGLE)
+    # pi rounded to float32 lies just above pi
+    beta: Parameter = field(
+        default=None, metadata=domain("a number in (0, pi]", lambda v: (v > 0) & (v <= math.pi * (1 + 1e-7)))
+    )
 
     @staticmethod
     def to_unconstrained(value: Tensor) -> Tensor:
