@@ -25,7 +25,8 @@ from gyrofuse.fusion.multiscale import fit_multiscale
 from gyrofuse.fusion.multiscale_result import MultiScaleResult
 from gyrofuse.fusion.report.page import fusion_figure, fusion_report
 from gyrofuse.fusion.result import SVOResult
-from gyrofuse.fusion.svo import COVARIANCES, fit_svo
+from gyrofuse.fusion.svo import fit_svo
+from gyrofuse.fusion.weights.methods import COVARIANCES
 from gyrofuse.io.recording import Recording
 
 _COVARIANCE_NAMES = tuple(name.replace("_", "-") for name in COVARIANCES)
