@@ -53,7 +53,7 @@ def fleet_report(
         verdict=verdict(summary),
         heading=heading,
         meaning=meaning,
-        spread=_distribution(summary.task, GAIN if summary.task == "fuse" else meaning, summary.values)
+        distribution=_distribution(summary.task, GAIN if summary.task == "fuse" else meaning, summary.values)
         if len(summary.values) > 1
         else None,
         ranked=ranked,

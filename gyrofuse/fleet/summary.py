@@ -57,8 +57,16 @@ class WeightWarning(NamedTuple):
 
 
 class WeightTrend(NamedTuple):
-    """A weight with a monotonic trend over the logs: medians of the first and the last third, Kendall's tau and its
-    p value, corrected for the number of weights tested."""
+    """A weight with a monotonic trend over the logs.
+
+    Attributes:
+        array: Name of the array.
+        sensor: Name of the sensor.
+        first: Median weight in the first third of the logs.
+        last: Median weight in the last third of the logs.
+        tau: Kendall's rank correlation of weight and order of the logs.
+        p_value: p value of tau, corrected for the number of weights tested (Bonferroni).
+    """
 
     array: str
     sensor: str
