@@ -123,7 +123,7 @@ def biweight_of(efficiency: float) -> Biweight:
     """The squared biweight of a given efficiency, by bisection in `ln c`: where `c >= 3` it grows with `c`.
 
     Args:
-        efficiency: `e(c)`, 0.5 or more (`c = 3` has less) and below 1 (which `c = 1000` reaches to 1e-5).
+        efficiency: `e(c)`, 0.5 or more (`c = 3` has less) and below 1 (which `c = 1000` reaches to 2e-10).
     """
     low, high = math.log(3.0), math.log(1e3)
     for _ in range(60):
@@ -142,7 +142,7 @@ def biweight(c: float) -> Biweight:
     nodes, node_weights = np.polynomial.legendre.leggauss(200)
     half = min(c, 10.0) / 2
     x = half * (1 + nodes)
-    n_orders = 12  # even Hermite polynomials, whose coefficients have fallen to 1e-4 of the first by then
+    n_orders = 12  # even Hermite polynomials, whose coefficients have fallen to 2e-4 of the first by then
     density = node_weights * half * np.sqrt(2 / np.pi) * np.exp(-x * x / 2)  # of both signs
     chi = x**2 * (1 - (x / c) ** 2) ** 4
     mean = chi @ density
