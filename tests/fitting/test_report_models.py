@@ -176,7 +176,7 @@ def test_page_of_axes_and_without_units():
 
 
 def test_a_page_of_many_sensors_says_what_it_leaves_out(monkeypatch):
-    monkeypatch.setattr(report_models, "_MOST_SENSORS", 2)
+    monkeypatch.setattr(report_models, "MOST_SENSORS", 2)
     signal = torch.randn(5, 256, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     page = Page(model_report(fit_gmwm(signal, "WN"), title="many"))
     assert page.tags.count("img") == 2

@@ -282,7 +282,7 @@ def test_a_ranking_of_wavelet_variances():
 
 
 def test_a_page_of_many_says_what_it_leaves_out(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(report_ranking, "_MOST_SENSORS", 1)
+    monkeypatch.setattr(report_ranking, "MOST_SENSORS", 1)
     monkeypatch.setattr(report_ranking, "_MOST_ROWS", 1)
     result = ranked()
     page = Page(rank_report(result, recording(), title="many"))

@@ -93,7 +93,7 @@ def profiled(
         else:
             at = unknown - made_of.n_linear
             process = made_of.processes[made_of.shaped[at]]
-            sd = sd / process.unconstrained_slope(fit.shape[items, at])
+            sd = sd / process.unconstrained_slope(surface.shape[items, at])
             least, most = (float(end[at]) for end in search.limits(made_of, fit.tau, fit.shape))
             first, last = _shape_limits(surface, items, unknown, sd, least, most, z[items], in_order[items])
             width = last - first
