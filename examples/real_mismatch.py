@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.mismatch import discrepancy
+from gyrofuse.mismatch import MismatchReport, discrepancy
 
 BASE = "WN + AR1 + RW"
 AXES = "xyz"
@@ -64,7 +64,7 @@ class Outcome:
     """
 
     study: Study
-    report: gf.MismatchReport
+    report: MismatchReport
     before: float
     after: float
     elsewhere: str = field(default="blocks held out")

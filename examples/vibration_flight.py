@@ -19,6 +19,7 @@ from pathlib import Path
 import torch
 
 import gyrofuse as gf
+from gyrofuse.fitting import virtual_noise
 from gyrofuse.navigation import Gnss, InitialUncertainty, Trajectory, UnitErrors, flight, run_filter
 from gyrofuse.navigation.sensors import Axes, ErrorSamples
 
@@ -104,7 +105,7 @@ def main() -> None:
     for name, (weights, resting, flying) in virtual.items():
         for tuning, model in (
             ("by its recording", fitted(resting, rate)),
-            (words, gf.virtual_noise(weights, noise).model),
+            (words, virtual_noise(weights, noise).model),
         ):
             told = UnitErrors(model.scaled(DEGREE), gf.parse_model(ACCELEROMETER), rate)
             own = torch.Generator().manual_seed(1)

@@ -28,33 +28,26 @@ from gyrofuse._base.linalg import SingularCovarianceError
 from gyrofuse._base.results import ConfidenceInterval
 from gyrofuse.export.c_header import to_c_header
 from gyrofuse.export.kalibr import to_kalibr
-from gyrofuse.fitting.array.gmwm import fit_array_gmwm, fit_array_gmwm_moments
+from gyrofuse.fitting.array.gmwm import fit_array_gmwm
 from gyrofuse.fitting.bootstrap import bootstrap_gmwm
 from gyrofuse.fitting.gmwm import fit_gmwm, fit_gmwm_moments
 from gyrofuse.fitting.joint import fit_gmwm_joint
-from gyrofuse.fitting.ranking.rank import rank_models, rank_models_moments
-from gyrofuse.fitting.virtual_noise import virtual_noise
+from gyrofuse.fitting.ranking.rank import rank_models
 from gyrofuse.fusion.faults.parity import parity_test
-from gyrofuse.fusion.faults.reference import ParityReference, fit_parity_reference
+from gyrofuse.fusion.faults.reference import fit_parity_reference
 from gyrofuse.fusion.live import LiveSVO
 from gyrofuse.fusion.multiscale import MultiScaleSVO, fit_multiscale
 from gyrofuse.fusion.svo import SVO, fit_svo
-from gyrofuse.fusion.weights.baselines import (
-    equal_weights,
-    inverse_variance_weights,
-    nonnegative_weights,
-    shrinkage_weights,
-)
+from gyrofuse.fusion.weights.baselines import equal_weights, inverse_variance_weights, nonnegative_weights
 from gyrofuse.fusion.weights.rdvg import rdvg_weights
-from gyrofuse.fusion.weights.subsets import subset_weights
 from gyrofuse.fusion.weights.svo import SVOWeights, svo_weights
-from gyrofuse.io.chunked import ChunkedRecording, open_recording, shard_bounds
+from gyrofuse.io.chunked import ChunkedRecording, open_recording
 from gyrofuse.io.reading import read_recording
 from gyrofuse.io.recording import Recording
 from gyrofuse.io.saturation import mask_saturated
 from gyrofuse.io.streams import RecordingError
 from gyrofuse.noise.array_model import ArrayModel
-from gyrofuse.noise.datasheet import Datasheet, datasheet
+from gyrofuse.noise.datasheet import datasheet
 from gyrofuse.noise.parsing import model_from_dict, parse_model
 from gyrofuse.noise.processes import (
     AR1,
@@ -67,15 +60,15 @@ from gyrofuse.noise.processes import (
     Sinusoid,
     WhiteNoise,
 )
-from gyrofuse.noise.state_space import StateSpace, state_space
-from gyrofuse.wavelets.covariance import CrossCovariance, cross_covariance, wavelet_cross_covariance, wavelet_variance
+from gyrofuse.noise.state_space import state_space
+from gyrofuse.wavelets.covariance import CrossCovariance, wavelet_cross_covariance, wavelet_variance
 from gyrofuse.wavelets.haar import HaarFilterBank, haar_coefficients
 from gyrofuse.wavelets.intervals import wavelet_cross_covariance_interval, wavelet_variance_interval
 from gyrofuse.wavelets.robust import robust_wavelet_variance
 
 if TYPE_CHECKING:
     from gyrofuse.fusion.streaming import stream_svo, write_virtual
-    from gyrofuse.mismatch import Finding, MismatchReport, diagnose
+    from gyrofuse.mismatch import diagnose
     from gyrofuse.wavelets.metric import WaveletCrossCovariance
 
 __all__ = [
@@ -85,17 +78,13 @@ __all__ = [
     "ChunkedRecording",
     "ConfidenceInterval",
     "CrossCovariance",
-    "Datasheet",
     "Drift",
-    "Finding",
     "FlickerNoise",
     "HaarFilterBank",
     "LiveSVO",
     "Matern32",
-    "MismatchReport",
     "Model",
     "MultiScaleSVO",
-    "ParityReference",
     "QuantizationNoise",
     "RandomWalk",
     "Recording",
@@ -103,16 +92,13 @@ __all__ = [
     "SVOWeights",
     "SingularCovarianceError",
     "Sinusoid",
-    "StateSpace",
     "WaveletCrossCovariance",
     "WhiteNoise",
     "bootstrap_gmwm",
-    "cross_covariance",
     "datasheet",
     "diagnose",
     "equal_weights",
     "fit_array_gmwm",
-    "fit_array_gmwm_moments",
     "fit_gmwm",
     "fit_gmwm_joint",
     "fit_gmwm_moments",
@@ -128,19 +114,14 @@ __all__ = [
     "parity_test",
     "parse_model",
     "rank_models",
-    "rank_models_moments",
     "rdvg_weights",
     "read_recording",
     "robust_wavelet_variance",
-    "shard_bounds",
-    "shrinkage_weights",
     "state_space",
     "stream_svo",
-    "subset_weights",
     "svo_weights",
     "to_c_header",
     "to_kalibr",
-    "virtual_noise",
     "wavelet_cross_covariance",
     "wavelet_cross_covariance_interval",
     "wavelet_variance",
@@ -152,14 +133,21 @@ __all__ = [
 _LAZY = {
     "WaveletCrossCovariance": "gyrofuse.wavelets.metric",
     "diagnose": "gyrofuse.mismatch",
-    "Finding": "gyrofuse.mismatch",
-    "MismatchReport": "gyrofuse.mismatch",
     "stream_svo": "gyrofuse.fusion.streaming",
     "write_virtual": "gyrofuse.fusion.streaming",
 }
 
 # Names that have left, and where they are now.
 _MOVED = {
+    "Datasheet": "gyrofuse.noise.Datasheet",
+    "Finding": "gyrofuse.mismatch.Finding",
+    "MismatchReport": "gyrofuse.mismatch.MismatchReport",
+    "ParityReference": "gyrofuse.fusion.ParityReference",
+    "StateSpace": "gyrofuse.noise.StateSpace",
+    "cross_covariance": "gyrofuse.wavelets.cross_covariance",
+    "shrinkage_weights": "gyrofuse.fusion.shrinkage_weights",
+    "subset_weights": "gyrofuse.fusion.subset_weights",
+    "virtual_noise": "gyrofuse.fitting.virtual_noise",
     **{
         name: f"gyrofuse.fitting.{name}"
         for name in ("ArrayGMWMResult", "GMWMBootstrap", "GMWMResult", "JointFit", "RankResult", "moment_covariance")

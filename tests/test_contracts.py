@@ -16,7 +16,6 @@ from gyrofuse import (
     MultiScaleSVO,
     SVOWeights,
     WaveletCrossCovariance,
-    cross_covariance,
     equal_weights,
     fit_array_gmwm,
     fit_gmwm,
@@ -33,6 +32,7 @@ from gyrofuse import (
     wavelet_variance_interval,
 )
 from gyrofuse.fusion.weights.svo import resolve_scale_weights
+from gyrofuse.wavelets import cross_covariance
 
 LEVELS = 5
 

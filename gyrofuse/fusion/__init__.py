@@ -9,8 +9,10 @@ from gyrofuse.fusion.multiscale_result import MultiScaleResult
 from gyrofuse.fusion.result import SVOResult
 from gyrofuse.fusion.uncertainty.tests import EnoughData, WeightsTest
 from gyrofuse.fusion.uncertainty.variance_reduction import VarianceReduction
+from gyrofuse.fusion.weights.baselines import shrinkage_weights
 from gyrofuse.fusion.weights.rdvg import RDVGResult
 from gyrofuse.fusion.weights.selection import Selection
+from gyrofuse.fusion.weights.subsets import subset_weights
 
 if TYPE_CHECKING:
     from gyrofuse.fusion.streaming import StreamedSVOResult
@@ -26,6 +28,8 @@ __all__ = [
     "StreamedSVOResult",
     "VarianceReduction",
     "WeightsTest",
+    "shrinkage_weights",
+    "subset_weights",
 ]
 
 

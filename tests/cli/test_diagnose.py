@@ -13,7 +13,7 @@ from conftest import Run
 from pages import Page
 
 import gyrofuse as gf
-from gyrofuse.mismatch import engine
+from gyrofuse.mismatch import MismatchReport, engine
 
 N, RATE = 2**13, 50.0
 NOISE = gf.WhiteNoise(1.0) + gf.AR1(0.99, 1e-3)
@@ -206,7 +206,7 @@ def test_files_are_replaced_with_force_only_and_whole_or_not_at_all(
     refused = run(*diagnose)
     assert (refused.status, refused.out) == (2, "")
     assert "r.json: exists already" in refused.err
-    monkeypatch.setattr(gf.MismatchReport, "to_html", lambda *_, **__: Path("nowhere/x").write_text(""))
+    monkeypatch.setattr(MismatchReport, "to_html", lambda *_, **__: Path("nowhere/x").write_text(""))
     assert run(*diagnose, "--force", "--report", "r.html").status == 2
     assert Path("r.json").read_text() == "mine"
     assert sorted(path.name for path in Path().iterdir()) == ["log.npz", "model.json", "r.json", "sim.npz"]

@@ -13,7 +13,7 @@ from scipy import stats
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.fitting import ArrayGMWMResult
+from gyrofuse.fitting import ArrayGMWMResult, fit_array_gmwm_moments
 from gyrofuse.fitting.array import search
 from gyrofuse.fitting.array.fit import _Problem
 from gyrofuse.fitting.array.inference import covariance_of_fit
@@ -350,7 +350,7 @@ def test_float32_and_moments_alone_give_the_same():
     assert single.theta.dtype == torch.float64
     torch.testing.assert_close(single.theta, found.theta, rtol=1e-3, atol=1e-6)
     wccv = gf.wavelet_cross_covariance(signal)
-    moments = gf.fit_array_gmwm_moments(wccv, N_SAMPLES, "WN + RW", n_levels=9)
+    moments = fit_array_gmwm_moments(wccv, N_SAMPLES, "WN + RW", n_levels=9)
     torch.testing.assert_close(moments.theta, found.theta, rtol=1e-9, atol=0)
 
 
@@ -415,9 +415,9 @@ def test_what_cannot_be_fitted_is_said(options, words):
 def test_levels_of_given_moments_are_checked():
     wccv = gf.wavelet_cross_covariance(signals(1)[0], 6)
     with pytest.raises(ValueError, match=r"`wavelet_cross_covariance`: expected .* of at most 12 levels"):
-        gf.fit_array_gmwm_moments(signals(1)[0], N_SAMPLES, "WN + RW")
+        fit_array_gmwm_moments(signals(1)[0], N_SAMPLES, "WN + RW")
     with pytest.raises(ValueError, match=r"`n_levels`: expected 1 to 6, the levels given, got 7"):
-        gf.fit_array_gmwm_moments(wccv, N_SAMPLES, "WN + RW", n_levels=7)
+        fit_array_gmwm_moments(wccv, N_SAMPLES, "WN + RW", n_levels=7)
     with pytest.raises(TypeError, match=r"`signal`: expected a torch tensor"):
         gf.fit_array_gmwm([[1.0, 2.0]], "WN + RW")
 
@@ -435,10 +435,10 @@ def test_the_sensor_that_spoils_an_array_is_named(value):
 
 def test_given_moments_are_symmetric_and_not_a_recording():
     wccv = gf.wavelet_cross_covariance(signals(1)[0].float(), 6)  # rounds
-    assert bool(gf.fit_array_gmwm_moments(wccv, N_SAMPLES, "WN + RW").converged)
+    assert bool(fit_array_gmwm_moments(wccv, N_SAMPLES, "WN + RW").converged)
     wccv[2, 0, 1] *= 1.5
     with pytest.raises(ValueError, match="`wavelet_cross_covariance`: expected a symmetric one"):
-        gf.fit_array_gmwm_moments(wccv, N_SAMPLES, "WN + RW")
+        fit_array_gmwm_moments(wccv, N_SAMPLES, "WN + RW")
     with pytest.raises(ValueError, match="`n_samples`: expected None with a Recording"):
         gf.fit_array_gmwm(gf.Recording(signals(1)[0], rate=1.0), "WN + RW", n_samples=N_SAMPLES)
 

@@ -14,7 +14,7 @@ from scipy import stats
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.fitting import GMWMResult
+from gyrofuse.fitting import GMWMResult, fit_array_gmwm_moments, rank_models_moments
 from gyrofuse.fitting.moments import search
 from gyrofuse.fitting.moments.fit import composition_of
 
@@ -288,7 +288,7 @@ def test_infinite_samples_are_no_measurement():
 
 def test_a_signal_is_no_wavelet_variance():
     signal = torch.randn(2, 1000, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
-    for function, model in ((gf.fit_gmwm_moments, "WN"), (gf.rank_models_moments, ["WN"])):
+    for function, model in ((gf.fit_gmwm_moments, "WN"), (rank_models_moments, ["WN"])):
         message = r"`wavelet_variance`: expected a wavelet variance .* got shape \(2, 1000\), that of"
         with pytest.raises(ValueError, match=message):
             function(signal, 1000, model)
@@ -314,7 +314,7 @@ def test_wavelet_variances_go_to_the_functions_for_signals_with_a_warning():
     wccv = gf.wavelet_cross_covariance(signal)
     with pytest.warns(DeprecationWarning, match="use fit_array_gmwm_moments"):
         found = gf.fit_array_gmwm(wccv, "WN", n_samples=1000)
-    assert torch.equal(found.theta, gf.fit_array_gmwm_moments(wccv, 1000, "WN").theta)
+    assert torch.equal(found.theta, fit_array_gmwm_moments(wccv, 1000, "WN").theta)
 
 
 def test_old_names_of_fits_work_with_a_warning():

@@ -13,6 +13,7 @@ from scipy import fft, stats
 from torch import Tensor
 
 import gyrofuse as gf
+from gyrofuse.fitting import rank_models_moments
 from gyrofuse.fitting.moments.covariance import moment_covariance
 from gyrofuse.fitting.ranking.candidates import all_noises, composition, key_of, simplified
 from gyrofuse.fitting.ranking.spectra import NoiseFit, Spectra, _grid
@@ -146,7 +147,7 @@ def test_wavelet_variances_alone():
     signal = signals(PARTS["WN + RW"], 20)[:, 0]
     variance = gf.wavelet_variance(signal, 11)  # 20 sensors
     names = ["WN", "RW", "WN + RW", "WN + AR1 + RW", "WN + QN + RW"]
-    found = gf.rank_models_moments(variance, 4096, names)
+    found = rank_models_moments(variance, 4096, names)
     assert found.names.count("WN + RW") >= 15
     assert found.n_sinusoids is None
     fit = gf.fit_gmwm_moments(variance[:, :1], 4096, "WN + RW")
@@ -158,7 +159,7 @@ def test_wavelet_variances_alone():
     assert found.criterion[0, 2].item() == pytest.approx(by_hand, abs=0.02)
     assert found.wvic[0, 2].item() == pytest.approx(distance + 4, abs=0.02)
     assert found.p_value[0, 2].item() == pytest.approx(stats.chi2.sf(distance, 9), abs=0.01)
-    searched = gf.rank_models_moments(variance[:, :8], 4096, fit=False)
+    searched = rank_models_moments(variance[:, :8], 4096, fit=False)
     assert searched.names.count("WN + RW") >= 5  # fewer once in 2700 times at 95 %
 
 
@@ -230,7 +231,7 @@ def test_weak_ramps_are_told_from_walks():
     weak = signals(PARTS["WN"] + gf.Drift(1.4e-4), 20)  # 10 standard deviations
     assert gf.rank_models(weak, fit=False).names.count("WN + DR") >= 15
     variance = gf.wavelet_variance(signals(PARTS["WN"] + gf.Drift(3e-4), 20)[:, 0], 11)
-    found = gf.rank_models_moments(variance, 4096, ["WN", "WN + RW", "WN + DR", "WN + RW + DR"], fit=False)
+    found = rank_models_moments(variance, 4096, ["WN", "WN + RW", "WN + DR", "WN + RW + DR"], fit=False)
     assert found.names.count("WN + DR") >= 15
 
 
@@ -350,7 +351,7 @@ def test_items_that_cannot_be_ranked():
     with pytest.raises(ValueError, match="`signal`: expected records that vary and have no missing samples"):
         gf.rank_models(signal[1:2])
     with pytest.raises(ValueError, match="`wavelet_variance`: expected wavelet variances that are finite and > 0"):
-        gf.rank_models_moments(torch.zeros(4, 1), 512)
+        rank_models_moments(torch.zeros(4, 1), 512)
 
 
 def test_default_candidates():
@@ -390,9 +391,9 @@ def test_refusals_of_signals():
     with pytest.raises(ValueError, match="`signal`: expected at least 32 samples, got 20"):
         gf.rank_models(torch.randn(1, 20))
     with pytest.raises(ValueError, match=r"expected a wavelet variance .* of at most 9 levels"):
-        gf.rank_models_moments(torch.ones(10, 1), 512)
+        rank_models_moments(torch.ones(10, 1), 512)
     with pytest.raises(ValueError, match="`n_levels`: expected 1 to 5"):
-        gf.rank_models_moments(torch.ones(5, 1), 512, n_levels=6)
+        rank_models_moments(torch.ones(5, 1), 512, n_levels=6)
 
 
 def test_the_summary_says_when_no_candidate_fits():
@@ -421,9 +422,9 @@ def test_weak_processes_in_wavelet_variances_are_climbed_to_from_every_side():
     )
     variance = gf.wavelet_variance(torch.cat([signal, more]))
     names = ["WN", "WN + AR1", "WN + 2*AR1"]
-    found = gf.rank_models_moments(variance, 8192, names, fit=False)
+    found = rank_models_moments(variance, 8192, names, fit=False)
     assert set(found.names) == {"WN + AR1"}
-    whole = gf.rank_models_moments(variance, 8192, [*names, "AR1", "2*AR1"], fit=False)
+    whole = rank_models_moments(variance, 8192, [*names, "AR1", "2*AR1"], fit=False)
     assert (found.criterion - whole.criterion[:, :3]).max() < 0.1
     alone = gf.fit_gmwm_moments(variance, 8192, "WN + AR1")
     size = variance.amax(0)

@@ -13,7 +13,7 @@ from pages import Page
 
 import gyrofuse as gf
 from gyrofuse._base.page import number
-from gyrofuse.fitting import RankResult
+from gyrofuse.fitting import RankResult, rank_models_moments
 from gyrofuse.fitting.report import ranking as report_ranking
 from gyrofuse.fitting.report.ranking import rank_report, rank_verdict
 
@@ -275,7 +275,7 @@ def test_a_sensor_that_could_not_be_ranked_and_a_ranking_without_fits():
 
 def test_a_ranking_of_wavelet_variances():
     variance = gf.wavelet_variance(recording().signal[1:], 10)
-    result = gf.rank_models_moments(variance, 2**13, ["WN", "WN + AR1"])
+    result = rank_models_moments(variance, 2**13, ["WN", "WN + AR1"])
     page = Page(rank_report(result, title="moments"))
     assert "likelihood of the wavelet variances" in page.text
     assert "stands out of the noise" not in page.text

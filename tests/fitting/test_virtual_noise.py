@@ -9,7 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from gyrofuse import AR1, ArrayModel, Drift, RandomWalk, Sinusoid, WhiteNoise, virtual_noise, wavelet_variance
+from gyrofuse import AR1, ArrayModel, Drift, RandomWalk, Sinusoid, WhiteNoise, wavelet_variance
+from gyrofuse.fitting import virtual_noise
 from gyrofuse.fitting.virtual_noise import response
 from gyrofuse.fusion.multiscale_result import fuse_bands
 from gyrofuse.noise.state_space import state_space

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import gyrofuse as gf
+from gyrofuse.fusion import shrinkage_weights
 from gyrofuse.fusion.weights.svo import resolve_scale_weights
 
 
@@ -27,10 +28,10 @@ def test_weights_take_names_and_any_sum(weights):
 
 def test_shrunk_weights_take_names_too():
     wccv, dof = gf.wavelet_cross_covariance(array(), 6), torch.full((2, 6), 50.0, dtype=torch.float64)
-    expected = gf.shrinkage_weights(wccv, "long", dof)
-    torch.testing.assert_close(gf.shrinkage_weights(wccv, 3 * resolve_scale_weights("long", 6), dof), expected)
+    expected = shrinkage_weights(wccv, "long", dof)
+    torch.testing.assert_close(shrinkage_weights(wccv, 3 * resolve_scale_weights("long", 6), dof), expected)
     with pytest.warns(DeprecationWarning, match="`degrees` is deprecated .* use `dof`"):
-        torch.testing.assert_close(gf.shrinkage_weights(wccv, "long", degrees=dof), expected)
+        torch.testing.assert_close(shrinkage_weights(wccv, "long", degrees=dof), expected)
 
 
 def test_options_of_a_layer_belong_to_its_constructor():

@@ -22,7 +22,7 @@ from torch import distributed
 
 import gyrofuse as gf
 from gyrofuse.fusion.streaming import measure_stretch
-from gyrofuse.io import chunked, recording
+from gyrofuse.io import chunked, recording, shard_bounds
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "long_recording.py"
 N_SENSORS, N_SAMPLES, N_LEVELS = 4, 5000, 7
@@ -50,7 +50,7 @@ def launched(rank: int = 0, world_size: int = 1) -> SimpleNamespace:
 @pytest.mark.parametrize("n_samples", [1, 7, 100, 101])
 @pytest.mark.parametrize("world_size", [1, 2, 3, 8])
 def test_stretches_follow_each_other(n_samples: int, world_size: int):
-    stretches = [gf.shard_bounds(n_samples, rank, world_size) for rank in range(world_size)]
+    stretches = [shard_bounds(n_samples, rank, world_size) for rank in range(world_size)]
     assert stretches[0][0] == 0
     assert stretches[-1][1] == n_samples
     assert all(before[1] == after[0] for before, after in itertools.pairwise(stretches))
@@ -75,7 +75,7 @@ def test_chunks_of_any_length_give_the_weights_of_the_whole(chunk_samples: int |
 def test_stretches_add_up(world_size: int, gaps: bool):
     signal = samples(gaps=gaps)
     parts = [
-        measure_stretch(recording_of(signal), N_LEVELS, *gf.shard_bounds(N_SAMPLES, rank, world_size), chunk_samples=97)
+        measure_stretch(recording_of(signal), N_LEVELS, *shard_bounds(N_SAMPLES, rank, world_size), chunk_samples=97)
         for rank in range(world_size)
     ]
     for part in parts[1:]:
@@ -385,7 +385,7 @@ def test_bad_recordings_are_named():
     with pytest.raises(TypeError, match=r"`source`: expected real numbers, got torch\.bool"):
         gf.ChunkedRecording(lambda start, stop: signal[:, start:stop] > 0, N_SENSORS, N_SAMPLES).read(0, 10)
     with pytest.raises(ValueError, match="`rank`: expected a whole number from 0 to 1, got 2"):
-        gf.shard_bounds(10, 2, 2)
+        shard_bounds(10, 2, 2)
 
 
 def test_bad_fits_are_named():

@@ -12,7 +12,7 @@ import torch
 from scipy import stats
 
 import gyrofuse as gf
-from gyrofuse.mismatch import diagnose, discrepancy
+from gyrofuse.mismatch import MismatchReport, diagnose, discrepancy
 from gyrofuse.mismatch.case import Scene
 from gyrofuse.mismatch.engine import _known
 from gyrofuse.mismatch.evidence import calibrated
@@ -43,7 +43,7 @@ def with_tone(recording: gf.Recording, amplitude: float) -> gf.Recording:
 
 
 @functools.cache
-def concealed_tone() -> tuple[gf.MismatchReport, list[tuple[str, float]]]:
+def concealed_tone() -> tuple[MismatchReport, list[tuple[str, float]]]:
     """A tone, diagnosed with a simulation four times as long, and what progress was told."""
     told: list[tuple[str, float]] = []
     simulation = array(2, 4 * N)
@@ -93,7 +93,7 @@ def test_what_was_found_is_taken_off_and_simulated_again():
 
 
 @functools.cache
-def agreement() -> gf.MismatchReport:
+def agreement() -> MismatchReport:
     return diagnose(array(5), array(6, 4 * N))
 
 

@@ -14,7 +14,7 @@ from pages import Page
 from reference import haar as naive
 
 import gyrofuse as gf
-from gyrofuse.mismatch import telling
+from gyrofuse.mismatch import Finding, MismatchReport, telling
 from gyrofuse.mismatch.case import Case
 from gyrofuse.mismatch.comparison import compared_powers, compared_variances, grouped_spectrum
 from gyrofuse.mismatch.evidence import Evidence
@@ -42,7 +42,7 @@ def recorded(with_tone: bool = True) -> gf.Recording:
 
 
 @functools.cache
-def report(with_tone: bool = True) -> gf.MismatchReport:
+def report(with_tone: bool = True) -> MismatchReport:
     return gf.diagnose(recorded(with_tone), NOISE)
 
 
@@ -50,13 +50,13 @@ def sides(recording: torch.Tensor, simulation: torch.Tensor) -> Case:
     return prepared(recording, simulation, None, torch.Generator().manual_seed(0))
 
 
-def page(told: gf.MismatchReport, **options: object) -> Page:
+def page(told: MismatchReport, **options: object) -> Page:
     return Page(mismatch_page(told, title="A title", **options))
 
 
 def test_exported_and_named_alike():
-    assert isinstance(report(), gf.MismatchReport)
-    assert isinstance(report().findings[0], gf.Finding)
+    assert isinstance(report(), MismatchReport)
+    assert isinstance(report().findings[0], Finding)
     assert report().mismatch
     assert not report(False).mismatch
 

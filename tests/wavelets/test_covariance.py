@@ -10,14 +10,8 @@ import pytest
 import torch
 from reference import haar as naive
 
-from gyrofuse import (
-    CrossCovariance,
-    HaarFilterBank,
-    cross_covariance,
-    haar_coefficients,
-    wavelet_cross_covariance,
-    wavelet_variance,
-)
+from gyrofuse import CrossCovariance, HaarFilterBank, haar_coefficients, wavelet_cross_covariance, wavelet_variance
+from gyrofuse.wavelets import cross_covariance
 from gyrofuse.wavelets import tiles as _tiles
 
 NO_WINDOW = r"no complete window for some sensors at level\(s\) "
