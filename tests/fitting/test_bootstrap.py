@@ -50,7 +50,7 @@ def test_it_is_what_a_loop_over_fits_gives(fitted):
 
 def test_chunks_do_not_matter(fitted, monkeypatch):
     whole = gf.bootstrap_gmwm(fitted, 20, generator=seeded(1))
-    monkeypatch.setattr(moment_bootstrap, "_SAMPLES_AT_ONCE", 1)
+    monkeypatch.setattr(moment_bootstrap, "items_at_once", lambda numbers: 1)
     parts = gf.bootstrap_gmwm(fitted, 20, generator=seeded(1))
     assert parts.std_err.shape == whole.std_err.shape
     # Other records, as draws come in another order, of the same law: within 4 standard errors of a ratio of two.

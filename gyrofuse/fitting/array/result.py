@@ -248,7 +248,7 @@ class ArrayGMWMResult(Result):
         if not bool(self._present().any()):
             return f"{head}\nnot fitted"
         fits = "" if bool(self.converged) else "not converged, "
-        fits += f"J = {self.objective.item():.4g} with {int(self.degrees_of_freedom)} degrees of freedom"
+        fits += f"J = {self.objective.item():.4g} with {int(self.dof)} degrees of freedom"
         if bool(self.p_value.isfinite()):
             fits += f", p = {self.p_value.item():.2g}"
         lines = [head, fits]
