@@ -103,7 +103,10 @@ def rank_models(
     items = known.values.detach().reshape(-1, length)
     usable = items.sum(-1, dtype=torch.float64).isfinite() & (items != items[:, :1]).any(-1)
     if not bool(usable.all()):
-        what = "a stretch without, or the wavelet variance to rank_models_moments)"
+        what = (
+            "`signal`: expected records that vary and have no missing samples or infinite ones (of records with gaps "
+            "give a stretch without, or the wavelet variance to rank_models_moments)"
+        )
         _report(what, usable)
     _check_sizes(wanted, levels, held=True)
     table = by_spectrum(items[usable], wanted, levels, max_sinusoids, line_alpha)
