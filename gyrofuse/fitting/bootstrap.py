@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from torch import Tensor
@@ -69,6 +69,7 @@ class GMWMBootstrap(Result):
 
     std = RenamedAttribute("std_err")
     _batched = ("params", "bias", "std_err", "percentile", "studentized", "p_value", "n_failed")
+    _keys: ClassVar = {"std_err": "std"}
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -124,10 +125,6 @@ class GMWMBootstrap(Result):
         names = [name for name, there in zip(self.param_names, known.tolist(), strict=True) if there]
         bias = (self.bias[index] / std)[known]
         return plot_resampled(names, bias, percentile, studentized, percent=100 * self.confidence_level, ax=ax)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Everything as plain lists and numbers, ready for JSON (NaN and infinities as None)."""
-        return {"std" if name == "std_err" else name: value for name, value in super().to_dict().items()}
 
 
 def bootstrap_gmwm(

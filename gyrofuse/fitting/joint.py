@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -60,6 +60,7 @@ class JointFit(Result):
 
     degrees = RenamedAttribute("dof")
     _batched = ("joint", "statistic", "dof", "p_value")
+    _keys: ClassVar = {"dof": "degrees"}
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -128,10 +129,6 @@ class JointFit(Result):
         ax = self.joint.plot(ax, index=index)
         add_recordings([one.wavelet_variance.mT[index] for one in self.separate], rate=self.joint.rate, ax=ax)
         return ax
-
-    def to_dict(self) -> dict[str, Any]:
-        """Everything as plain lists and numbers, ready for JSON (NaN and infinities as None)."""
-        return {"degrees" if name == "dof" else name: value for name, value in super().to_dict().items()}
 
 
 def fit_gmwm_joint(

@@ -12,8 +12,9 @@ from gyrofuse.fitting.structure import Composition
 from gyrofuse.noise.parsing import parse_model
 from gyrofuse.noise.processes import Model, Process, Sinusoid
 
-# Rounds of reweighting, of a fit with independent levels and again of one with the covariance of the fit: the weights
-# change by a few per cent in the third, which moves estimates by far less than their standard errors.
+# Rounds of reweighting, of a fit with independent levels and again of one with the covariance of the fit. After three,
+# nine of ten estimates of white noise, an AR1 and a random walk in 8192 samples are within 0.01 standard errors of those
+# after eight.
 N_REWEIGHTINGS = 3
 
 
