@@ -13,8 +13,8 @@ from gyrofuse.noise.parsing import parse_model
 from gyrofuse.noise.processes import Model, Process, Sinusoid
 
 # Rounds of reweighting, of a fit with independent levels and again of one with the covariance of the fit. After three,
-# nine of ten estimates of white noise, an AR1 and a random walk in 8192 samples are within 0.01 standard errors of those
-# after eight.
+# nine of ten estimates of white noise, an AR1 and a random walk in 8192 samples are within 0.01 standard errors of
+# those after eight.
 N_REWEIGHTINGS = 3
 
 
