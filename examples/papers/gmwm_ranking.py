@@ -27,7 +27,7 @@ from scipy import stats
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.fitting.ranking.candidates import Kinds, composition, name_of, penalty
+from gyrofuse.fitting.ranking.candidates import Kinds, name_of, penalty, structure_of
 from gyrofuse.fitting.ranking.spectra import Spectra, summed
 from gyrofuse.fitting.spectral.tones import FEWEST_CYCLES
 from gyrofuse.noise.processes import Process
@@ -97,7 +97,7 @@ def share_with_noise(noise: gf.Model, n_samples: int) -> tuple[float, str]:
     kinds = kinds_at(noise, n_samples)
     drawn, truth = drawn_spectra(noise, n_samples)
     own = (drawn.energy / truth + drawn.bins.count * truth.log()).sum(-1)
-    own += penalty(composition(kinds, held=True), n_samples)
+    own += penalty(structure_of(kinds, held=True), n_samples)
     shares = [(1.0, "-")]
     for rival in rivals(kinds):
         variance = closest(rival, drawn)
@@ -105,7 +105,7 @@ def share_with_noise(noise: gf.Model, n_samples: int) -> tuple[float, str]:
         if gf.Drift in rival:
             energy = drawn.without_ramp(variance)[2]
         other = (energy / variance + drawn.bins.count * variance.log()).sum(-1)
-        other += penalty(composition(rival, held=True), n_samples)
+        other += penalty(structure_of(rival, held=True), n_samples)
         shares.append(((other > own).double().mean().item(), name_of(rival)))
     return min(shares)
 
@@ -139,16 +139,16 @@ def drawn_spectra(noise: gf.Model, n_samples: int) -> tuple[Spectra, Tensor]:
 def closest(kinds: Kinds, drawn: Spectra) -> Tensor:
     """Variances `(1, bin)` of the noise of these kinds that is closest to the mean of records, a ramp taken out."""
     n_samples = drawn.bins.n_samples
-    made_of = composition([kind for kind in kinds if kind is not gf.Drift], held=True)
+    structure = structure_of([kind for kind in kinds if kind is not gf.Drift], held=True)
     mean = drawn.part(torch.tensor([0]))
     mean.energy = drawn.energy.mean(0, keepdim=True)
     grid = torch.linspace(0.05, 0.95, 8, dtype=torch.float64) * math.log(n_samples)
-    starts = list(itertools.combinations((-1 / grid.exp()).exp().atanh().tolist(), len(made_of.shaped)))
+    starts = list(itertools.combinations((-1 / grid.exp()).exp().atanh().tolist(), len(structure.nonlinear)))
     variance = mean.energy
     for _ in range(_RAMP_ROUNDS if gf.Drift in kinds else 1):
-        linear = (mean.energy.sum() / n_samples).expand(1, made_of.n_linear)
-        fits = [mean.fit(made_of, linear, torch.tensor([start], dtype=torch.float64).view(1, -1)) for start in starts]
-        variance = mean.variances(made_of, max(fits, key=lambda fit: fit.log_likelihood.item()))
+        linear = (mean.energy.sum() / n_samples).expand(1, structure.n_linear)
+        fits = [mean.fit(structure, linear, torch.tensor([start], dtype=torch.float64).view(1, -1)) for start in starts]
+        variance = mean.variances(structure, max(fits, key=lambda fit: fit.log_likelihood.item()))
         if gf.Drift in kinds:
             mean.energy = drawn.without_ramp(variance)[2].mean(0, keepdim=True)
     return variance
@@ -205,7 +205,7 @@ def rates(part: Part, n_samples: int, n_runs: int, generator: torch.Generator) -
 def study(number: int, n_samples: int, n_runs: int, most: int, seed: int, shown: int) -> list[tuple[Part, Rates]]:
     """Print the table of a simulation and return its identified parts, but for those that a shorter record shows."""
     print(f"\nSimulation {number}: {n_samples} samples, {n_runs} records of each composition")
-    print(f"{'true composition':<26}{'chosen':>8}{'or equivalent':>15}{'WVIC':>8}{'at most':>10}  most often instead")
+    print(f"{'true structure_of':<26}{'chosen':>8}{'or equivalent':>15}{'WVIC':>8}{'at most':>10}  most often instead")
     found = []
     known = [part.share >= _IDENTIFIED for part in parts(SIMULATIONS[number], shown, most)] if shown else []
     for k, part in enumerate(parts(SIMULATIONS[number], n_samples, most)):
@@ -230,7 +230,7 @@ def main() -> None:
     parser = arguments(__doc__)
     parser.add_argument("--simulation", type=int, choices=list(SIMULATIONS), help="this one alone")
     parser.add_argument("--samples", type=int, help="length of the records; 40 000 and 160 000 by default")
-    parser.add_argument("--not-shown-by", type=int, default=0, help="only compositions that this length does not show")
+    parser.add_argument("--not-shown-by", type=int, default=0, help="only structures that this length does not show")
     parser.add_argument("--runs", type=int, help=f"records of each composition; {N_RUNS} by default")
     options = parser.parse_args()
     which = [options.simulation] if options.simulation else ([1] if options.quick else list(SIMULATIONS))

@@ -21,7 +21,7 @@ from gyrofuse.fitting.moments.inference import Fit, Inference, infer, infer_effi
 from gyrofuse.fitting.moments.white_kurtosis import white_excess_kurtosis, with_excess_kurtosis
 from gyrofuse.fitting.spectral.model_tones import model_tones
 from gyrofuse.fitting.spectral.whittle import refine_whittle
-from gyrofuse.fitting.structure import Composition
+from gyrofuse.fitting.structure import ModelStructure
 from gyrofuse.noise.processes import Process
 from gyrofuse.wavelets.robust import robust_wavelet_variance
 
@@ -178,14 +178,14 @@ def bootstrap_gmwm(
         raise ValueError("`result`: expected at least one fitted sensor, got none; fit another signal or model")
     generator = own_generator(generator, params.device)
     model = result.model.with_params(params[usable])
-    made_of = Composition(model.processes, held=True)
+    structure = ModelStructure(model.processes, held=True)
     n_items = int(usable.sum())
     size = items_at_once(n_items * result.n_samples)
     drawn = []
     for first in range(0, n_resamples, size):
         some = min(size, n_resamples - first)
         records = model.simulate(result.n_samples, batch=(some,), generator=generator)  # (resample, item, time)
-        drawn.append(_fitted(records, result, made_of, omega))
+        drawn.append(_fitted(records, result, structure, omega))
     again, spread, distance = (torch.cat(parts) for parts in zip(*drawn, strict=True))
     # Moments hold squares of slopes: what falls is resampled as if it rose, and turned back at the end.
     turn = torch.where(drifts_of(model).to(params.device) & (params[usable] < 0), -1.0, 1.0).to(torch.float64)
@@ -199,7 +199,7 @@ def bootstrap_gmwm(
     std = torch.where((n_resamples - n_failed > 1)[:, None], std, torch.nan)
     tail = (1 - result.confidence_level) / 2
     percentile = again.nanquantile(tail, 0), again.nanquantile(1 - tail, 0)
-    studentized = _studentized(made_of, own, again, spread, _sds(result, made_of, own, usable), tail, percentile)
+    studentized = _studentized(structure, own, again, spread, _sds(result, structure, own, usable), tail, percentile)
     larger = (distance >= result.j_statistic.flatten()[usable]).sum(0)
     p_value = torch.where(n_failed < n_resamples, (1 + larger) / (1 + n_resamples - n_failed), torch.nan)
 
@@ -226,43 +226,43 @@ def bootstrap_gmwm(
 
 
 def _fitted(
-    records: Tensor, result: GMWMResult, made_of: Composition, omega: str | Tensor
+    records: Tensor, result: GMWMResult, structure: ModelStructure, omega: str | Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Estimates and standard deviations `(resample, item, parameter)`, J statistics `(resample, item)`."""
     levels, series = result.wavelet_variance.shape[-2], records.flatten(0, 1)
     variance = robust_wavelet_variance(series[:, None], levels, efficiency=result.records.efficiency)[..., 0]
-    tones = model_tones(series, made_of)
+    tones = model_tones(series, structure)
     frequencies = None if tones is None else (tones.beta, tones.beta_sd)
-    fit: Fit = fit_batch(variance, frequencies, result.records, made_of, omega)
-    inference: Inference = infer(fit, made_of, result.confidence_level)
+    fit: Fit = fit_batch(variance, frequencies, result.records, structure, omega)
+    inference: Inference = infer(fit, structure, result.confidence_level)
     if result.refined:
-        refined = refine_whittle(series, made_of, fit.linear, fit.shape, tones=tones)
+        refined = refine_whittle(series, structure, fit.linear, fit.shape, tones=tones)
         there = replace(fit, linear=refined.linear, shape=refined.shape)
-        inference = infer_efficient(there, made_of, refined.covariance, refined.edge_sd, result.confidence_level)
+        inference = infer_efficient(there, structure, refined.covariance, refined.edge_sd, result.confidence_level)
     if result.efficiency == 1:
-        kappa = white_excess_kurtosis(series, tones, made_of, inference.estimates.params)
-        inference = with_excess_kurtosis(inference, kappa, made_of, result.n_samples, result.confidence_level)
+        kappa = white_excess_kurtosis(series, tones, structure, inference.estimates.params)
+        inference = with_excess_kurtosis(inference, kappa, structure, result.n_samples, result.confidence_level)
     params, covariance = inference.estimates.params, inference.estimates.covariance
-    spread = _in_unknowns(made_of, params, covariance)
+    spread = _in_unknowns(structure, params, covariance)
     batch = records.shape[:2]
     return params.unflatten(0, batch), spread.unflatten(0, batch), inference.j_statistic.unflatten(0, batch)
 
 
-def _sds(result: GMWMResult, made_of: Composition, params: Tensor, usable: Tensor) -> Tensor:
-    return _in_unknowns(made_of, params, result.param_cov.flatten(0, -3)[usable])
+def _sds(result: GMWMResult, structure: ModelStructure, params: Tensor, usable: Tensor) -> Tensor:
+    return _in_unknowns(structure, params, result.param_cov.flatten(0, -3)[usable])
 
 
-def _in_unknowns(made_of: Composition, params: Tensor, covariance: Tensor) -> Tensor:
+def _in_unknowns(structure: ModelStructure, params: Tensor, covariance: Tensor) -> Tensor:
     """Standard deviations of `u`, `(item, parameter)`; NaN of what is at zero."""
     sd = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
-    slope = torch.stack([_slope(*which, value) for which, value in _columns(made_of, params)], -1)
+    slope = torch.stack([_slope(*which, value) for which, value in _columns(structure, params)], -1)
     found = sd / slope
     return torch.where((found > 0) & found.isfinite(), found, torch.nan)
 
 
-def _columns(made_of: Composition, params: Tensor) -> list[tuple[tuple[Process, bool], Tensor]]:
+def _columns(structure: ModelStructure, params: Tensor) -> list[tuple[tuple[Process, bool], Tensor]]:
     """Each parameter `(...)` with its process and whether it is the nonlinear one."""
-    names = [(p, name == p.shape_name) for p in made_of.processes for name in p.parameters]
+    names = [(p, name == p.shape_name) for p in structure.processes for name in p.parameters]
     return list(zip(names, params.unbind(-1), strict=True))
 
 
@@ -281,7 +281,7 @@ def _back(process: Process, nonlinear: bool, u: Tensor) -> Tensor:
 
 
 def _studentized(
-    made_of: Composition,
+    structure: ModelStructure,
     own: Tensor,
     again: Tensor,
     spread: Tensor,
@@ -290,7 +290,7 @@ def _studentized(
     percentile: tuple[Tensor, Tensor],
 ) -> tuple[Tensor, Tensor]:
     limits = []
-    for at, (which, value) in enumerate(_columns(made_of, own)):
+    for at, (which, value) in enumerate(_columns(structure, own)):
         u = _transformed(*which, value)
         t = (_transformed(*which, again[..., at]) - u) / spread[..., at]
         unknown = (~t.isfinite()).double().mean(0) > tail

@@ -29,7 +29,7 @@ from gyrofuse.fitting.moments.white_kurtosis import white_excess_kurtosis, with_
 from gyrofuse.fitting.spectral.model_tones import model_tones
 from gyrofuse.fitting.spectral.tones import Tones
 from gyrofuse.fitting.spectral.whittle import refine_whittle
-from gyrofuse.fitting.structure import Composition
+from gyrofuse.fitting.structure import ModelStructure
 from gyrofuse.io.recording import Recording
 from gyrofuse.io.signals import KnownSignal, as_recording
 from gyrofuse.noise.processes import Model
@@ -189,16 +189,16 @@ def _fit(
 ) -> GMWMResult:
     """Fit wavelet variances `(..., level, sensor)`, with the help of their signals `(item, time)` if at hand."""
     *batch, levels, n_sensors = variance.shape
-    made_of = composition_of(model, held=series is not None)
-    if not any(p.gaussian for p in made_of.processes):
-        raise ValueError(f"`model`: expected a noise process beside sinusoids and drifts, got {made_of.name}; add WN")
+    structure = composition_of(model, held=series is not None)
+    if not any(p.gaussian for p in structure.processes):
+        raise ValueError(f"`model`: expected a noise process beside sinusoids and drifts, got {structure.name}; add WN")
     if records.efficiency < 1:
-        check_gaussian(Model(list(made_of.processes)))
-    n_unknown = made_of.n_linear + len(made_of.curved)
+        check_gaussian(Model(list(structure.processes)))
+    n_unknown = structure.n_linear + len(structure.free_nonlinear)
     if n_unknown > levels:
         raise ValueError(
             f"`model`: expected at most as many parameters as the {levels} levels, got {n_unknown} in "
-            f"{made_of.name}; record longer or leave processes out"
+            f"{structure.name}; record longer or leave processes out"
         )
     name, omega = _weighting(weighting, levels)
     nu = variance.mT.reshape(-1, levels)  # (item, level)
@@ -207,25 +207,25 @@ def _fit(
         argument = "wavelet_variance" if series is None else "signal"
         _report(argument, nu, usable, known.sensors, strict, records.efficiency)
     series = None if series is None else series[usable]
-    tones = None if series is None else model_tones(series, made_of)
+    tones = None if series is None else model_tones(series, structure)
     frequencies = None if tones is None else (tones.beta, tones.beta_sd)
-    fit = fit_batch(nu[usable], frequencies, records, made_of, omega)
-    inference = infer(fit, made_of, confidence_level)
+    fit = fit_batch(nu[usable], frequencies, records, structure, omega)
+    inference = infer(fit, structure, confidence_level)
     if refine and series is not None:
-        inference = _refined(series, tones, fit, made_of, inference, confidence_level)
+        inference = _refined(series, tones, fit, structure, inference, confidence_level)
     else:
-        inference = profiled(inference, MomentProfile(fit, made_of), fit, made_of, confidence_level)
+        inference = profiled(inference, MomentProfile(fit, structure), fit, structure, confidence_level)
     if series is not None and records.efficiency == 1:
-        kappa = white_excess_kurtosis(series, tones, made_of, inference.estimates.params)
-        inference = with_excess_kurtosis(inference, kappa, made_of, records.longest, confidence_level)
-    own_notes = notes(made_of, inference.estimates, records.longest, confidence_level, tones)
+        kappa = white_excess_kurtosis(series, tones, structure, inference.estimates.params)
+        inference = with_excess_kurtosis(inference, kappa, structure, records.longest, confidence_level)
+    own_notes = notes(structure, inference.estimates, records.longest, confidence_level, tones)
     if series is not None:
-        estimates = signed(inference.estimates, Model(list(made_of.processes)), rising(series))
+        estimates = signed(inference.estimates, Model(list(structure.processes)), rising(series))
         inference = replace(inference, estimates=estimates)
     return GMWMResult.build(
         inference=inference,
         notes=own_notes,
-        made_of=made_of,
+        structure=structure,
         usable=usable,
         wavelet_variance=nu,
         batch=(*batch, n_sensors),
@@ -244,12 +244,12 @@ def _refined(
     series: Tensor,
     tones: Tones | None,
     fit: Fit,
-    made_of: Composition,
+    structure: ModelStructure,
     inference: Inference,
     confidence_level: float,
 ) -> Inference:
     """Inference at the maximum of the spectral likelihood, and from the moments where none is found."""
-    whittle = refine_whittle(series, made_of, fit.linear, fit.shape, tones=tones)
+    whittle = refine_whittle(series, structure, fit.linear, fit.shape, tones=tones)
     kept = ~whittle.converged
     if bool(kept.any()):
         warnings.warn(
@@ -259,10 +259,10 @@ def _refined(
         )
     linear, shape = either(kept, fit.linear, whittle.linear), either(kept, fit.shape, whittle.shape)
     there = replace(fit, linear=linear, shape=shape, converged=torch.ones_like(kept))
-    better = infer_efficient(there, made_of, whittle.covariance, whittle.edge_sd, confidence_level)
-    likelihood = SpectralProfile(linear, shape, whittle.energy, whittle.count, made_of, series.shape[-1])
-    better = profiled(better, likelihood, fit, made_of, confidence_level, ~kept)
-    own = profiled(inference, MomentProfile(fit, made_of), fit, made_of, confidence_level, kept)
+    better = infer_efficient(there, structure, whittle.covariance, whittle.edge_sd, confidence_level)
+    likelihood = SpectralProfile(linear, shape, whittle.energy, whittle.count, structure, series.shape[-1])
+    better = profiled(better, likelihood, fit, structure, confidence_level, ~kept)
+    own = profiled(inference, MomentProfile(fit, structure), fit, structure, confidence_level, kept)
     return either(kept, own, better)
 
 

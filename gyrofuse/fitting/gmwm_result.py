@@ -16,7 +16,7 @@ from gyrofuse._base.results import ConfidenceInterval, Result, counted, p_words,
 from gyrofuse._base.units import DATASHEET_UNITS
 from gyrofuse.fitting.moments.inference import Inference
 from gyrofuse.fitting.moments.records import SampleDesign
-from gyrofuse.fitting.structure import Composition
+from gyrofuse.fitting.structure import ModelStructure
 from gyrofuse.noise.datasheet import Datasheet, datasheet
 from gyrofuse.noise.estimation import EstimatedFrom
 from gyrofuse.noise.processes import Model
@@ -109,7 +109,7 @@ class GMWMResult(Result):
         *,
         inference: Inference,
         notes: list[tuple[str, ...]],
-        made_of: Composition,
+        structure: ModelStructure,
         usable: Tensor,
         wavelet_variance: Tensor,
         batch: tuple[int, ...],
@@ -124,7 +124,7 @@ class GMWMResult(Result):
         own_notes = iter(notes)
         source = EstimatedFrom(sum(rest["records"].lengths), param_cov)
         return cls(
-            model=(model := Model(list(made_of.processes))).with_params(params, estimated_from=source),
+            model=(model := Model(list(structure.processes))).with_params(params, estimated_from=source),
             param_names=model.param_names,
             params=params,
             param_cov=param_cov,
@@ -177,7 +177,7 @@ class GMWMResult(Result):
     @property
     def name(self) -> str:
         """Of the model, such as `AR1 + RW + 3*SIN`."""
-        return Composition(self.model.processes, held=True).name
+        return ModelStructure(self.model.processes, held=True).name
 
     def summary(self) -> str:
         """Parameters with intervals, sensor by sensor, and in datasheet units where rate and unit of rate are known."""

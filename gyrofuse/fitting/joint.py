@@ -24,7 +24,7 @@ from gyrofuse.fitting.moments.profile_objectives import MomentProfile
 from gyrofuse.fitting.moments.records import SampleDesign
 from gyrofuse.fitting.moments.white_kurtosis import white_excess_kurtosis, with_excess_kurtosis
 from gyrofuse.fitting.spectral.model_tones import model_tones
-from gyrofuse.fitting.structure import Composition
+from gyrofuse.fitting.structure import ModelStructure
 from gyrofuse.io.recording import Recording
 from gyrofuse.noise.processes import Model
 from gyrofuse.wavelets.intervals import chi_square_tail
@@ -169,27 +169,27 @@ def fit_gmwm_joint(
     records = SampleDesign(
         tuple(signal.shape[-1] for signal in signals), tuple(one.wavelet_variance.shape[-2] for one in separate)
     )
-    made_of = composition_of(model, held=True)
+    structure = composition_of(model, held=True)
     apart = [one.wavelet_variance.mT.flatten(0, -2) for one in separate]  # (item, level) each
     usable = torch.stack([one.params.flatten(0, -2).isfinite().all(-1) for one in separate]).all(0)
     apart = [variance[usable] for variance in apart]
     nu = records.pooled(apart)
-    frequencies, disagreement = _frequencies(separate, made_of, usable)
-    fit = fit_batch(nu, frequencies, records, made_of, "optimal")
-    inference = infer(fit, made_of, confidence_level)
-    inference = profiled(inference, MomentProfile(fit, made_of), fit, made_of, confidence_level)
-    kappa = _excess_kurtosis(signals, usable, made_of, inference.estimates.params)
-    inference = with_excess_kurtosis(inference, kappa, made_of, sum(records.lengths), confidence_level)
+    frequencies, disagreement = _frequencies(separate, structure, usable)
+    fit = fit_batch(nu, frequencies, records, structure, "optimal")
+    inference = infer(fit, structure, confidence_level)
+    inference = profiled(inference, MomentProfile(fit, structure), fit, structure, confidence_level)
+    kappa = _excess_kurtosis(signals, usable, structure, inference.estimates.params)
+    inference = with_excess_kurtosis(inference, kappa, structure, sum(records.lengths), confidence_level)
 
-    model_of = Model(list(made_of.processes))
+    model_of = Model(list(structure.processes))
     # The sign of a drift is that of the sum of the slopes of the recordings.
     every = torch.stack([one.params.flatten(0, -2)[usable] for one in separate]).sum(0)
     slopes = every[:, drifts_of(model_of)].sum(-1)
     sign = torch.where(slopes < 0, -1.0, 1.0).to(torch.float64)
     joint = GMWMResult.build(
         inference=replace(inference, estimates=signed(inference.estimates, model_of, sign)),
-        notes=notes(made_of, inference.estimates, records.longest, confidence_level),
-        made_of=made_of,
+        notes=notes(structure, inference.estimates, records.longest, confidence_level),
+        structure=structure,
         usable=usable,
         wavelet_variance=scattered(nu, usable, (len(usable),)),
         batch=first.params.shape[:-1],
@@ -201,9 +201,9 @@ def fit_gmwm_joint(
         rate=first.rate,
         unit=first.unit,
     )
-    difference = _difference(apart, fit, made_of, kappa) + disagreement
+    difference = _difference(apart, fit, structure, kappa) + disagreement
     present = fit.linear > 0
-    known = present.sum(-1) + present[:, made_of.shaped].sum(-1)
+    known = present.sum(-1) + present[:, structure.nonlinear].sum(-1)
     dof = ((len(signals) - 1) * known).to(difference)
     batch = first.params.shape[:-1]
     return JointFit(
@@ -241,14 +241,14 @@ def _checked(recordings: Sequence[Tensor | Recording]) -> list[Tensor]:
 
 
 def _frequencies(
-    separate: tuple[GMWMResult, ...], made_of: Composition, usable: Tensor
+    separate: tuple[GMWMResult, ...], structure: ModelStructure, usable: Tensor
 ) -> tuple[tuple[Tensor, Tensor] | None, Tensor]:
     """Mean `beta` of the sinusoids over the recordings and its standard error, `(item, sinusoid)`, and a test of it.
 
     The test statistic, that the frequencies agree, is chi-square with one degree of freedom for each sinusoid and
     recording but one, `(item,)`.
     """
-    names = [f"sinusoid_{k + 1}.beta" for k in range(sum(p.has_line for p in made_of.processes))]
+    names = [f"sinusoid_{k + 1}.beta" for k in range(sum(p.has_line for p in structure.processes))]
     if not names:
         return None, separate[0].params.new_zeros(int(usable.sum()))
     at = [separate[0].param_names.index(name) for name in names]
@@ -261,7 +261,7 @@ def _frequencies(
     return (mean, total.rsqrt()), disagreement
 
 
-def _excess_kurtosis(signals: list[Tensor], usable: Tensor, made_of: Composition, params: Tensor) -> Tensor:
+def _excess_kurtosis(signals: list[Tensor], usable: Tensor, structure: ModelStructure, params: Tensor) -> Tensor:
     """Excess kurtosis of the white noise of all recordings, `(item,)`: the mean weighted by their lengths.
 
     It is the same for all, as under the hypothesis of the test they have one noise.
@@ -270,23 +270,23 @@ def _excess_kurtosis(signals: list[Tensor], usable: Tensor, made_of: Composition
     total = torch.zeros_like(params[:, 0])
     for signal, length in zip(signals, lengths, strict=True):
         series = signal.detach().reshape(-1, length)[usable]
-        own = white_excess_kurtosis(series, model_tones(series, made_of), made_of, params)
+        own = white_excess_kurtosis(series, model_tones(series, structure), structure, params)
         total = total + own * length / sum(lengths)
     return total
 
 
-def _difference(apart: list[Tensor], fit: Fit, made_of: Composition, kappa: Tensor) -> Tensor:
+def _difference(apart: list[Tensor], fit: Fit, structure: ModelStructure, kappa: Tensor) -> Tensor:
     """Objectives of the recordings at the joint fit less those at the best of each, same weights, `(item,)`."""
     size = fit.variance.amax(-1, keepdim=True)
     linear = fit.linear / size
     total = torch.zeros_like(size[:, 0])
-    covariances = fit.records.covariances(made_of.model(linear, fit.shape), kappa)
+    covariances = fit.records.covariances(structure.model(linear, fit.shape), kappa)
     for variance, covariance in zip(apart, covariances, strict=True):
         nu, root = variance / size, search.whitening(covariance)
         tau = fit.tau[: nu.shape[-1]]
-        residual = nu - made_of.wavelet_variance(tau, linear, fit.shape)
+        residual = nu - structure.wavelet_variance(tau, linear, fit.shape)
         together = (root @ residual[..., None]).square().sum((-2, -1))
-        _, _, alone, _ = search.minimise(nu, root, tau, made_of, fit.shape, n_steps=200)
+        _, _, alone, _ = search.minimise(nu, root, tau, structure, fit.shape, n_steps=200)
         total = total + together - alone
     return total.clamp(min=0)
 

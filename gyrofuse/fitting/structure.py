@@ -17,7 +17,7 @@ from gyrofuse.noise.processes import Model, Process
 
 
 @dataclass(frozen=True, eq=False)
-class Composition:
+class ModelStructure:
     """Processes of a model and which of their parameters a fit of moments finds.
 
     Attributes:
@@ -40,12 +40,12 @@ class Composition:
         return len(self.processes)
 
     @property
-    def curved(self) -> list[int]:
+    def free_nonlinear(self) -> list[int]:
         """Processes with a nonlinear parameter that is unknown."""
-        return [k for k in self.shaped if not (self.held and self.processes[k].has_line)]
+        return [k for k in self.nonlinear if not (self.held and self.processes[k].has_line)]
 
     @property
-    def shaped(self) -> list[int]:
+    def nonlinear(self) -> list[int]:
         """Processes with a nonlinear parameter, unknown or held."""
         return [k for k, p in enumerate(self.processes) if p.shape_name is not None]
 
@@ -102,17 +102,17 @@ class Composition:
     def ordered(self, linear: Tensor, shape: Tensor) -> tuple[Tensor, Tensor]:
         """The same with processes of one class from slow to fast, and sinusoids from high to low frequency."""
         linear, shape = linear.clone(), shape.clone()
-        for kind in {type(self.processes[k]) for k in self.shaped}:
-            which = [k for k in self.shaped if type(self.processes[k]) is kind]
+        for kind in {type(self.processes[k]) for k in self.nonlinear}:
+            which = [k for k in self.nonlinear if type(self.processes[k]) is kind]
             if len(which) > 1:
-                at = [self.shaped.index(k) for k in which]
+                at = [self.nonlinear.index(k) for k in which]
                 order = shape[..., at].argsort(dim=-1, descending=True)
                 shape[..., at] = shape[..., at].gather(-1, order)
                 linear[..., which] = linear[..., which].gather(-1, order)
         return linear, shape
 
 
-def new_shape(smaller: Composition, larger: Composition) -> int | None:
+def new_shape(smaller: ModelStructure, larger: ModelStructure) -> int | None:
     """Where a sum with one process more has a further nonlinear parameter, among its `x`; None where it has not."""
-    before, after = ([type(m.processes[k]) for k in m.shaped] for m in (smaller, larger))
+    before, after = ([type(m.processes[k]) for k in m.nonlinear] for m in (smaller, larger))
     return next((i for i, kind in enumerate(after) if before[i : i + 1] != [kind]), None)

@@ -71,11 +71,11 @@ def test_covariance_of_moments_is_that_of_quadratic_forms():
     lags = np.abs(time[:, None] - time)
     over_time = [np.eye(n_samples), phi**lags / (1 - phi**2), np.minimum(time[:, None], time).astype(float)]
     expected = naive_moment_covariance(list(zip(over_time, theta, strict=True)), levels)
-    made_of = composition_of("WN + AR1 + RW", held=False)
+    structure = composition_of("WN + AR1 + RW", held=False)
     shape = torch.tensor([[math.atanh(phi)]], dtype=torch.float64)
-    got = array_moment_covariance(made_of, torch.from_numpy(theta)[None], shape, SampleDesign((n_samples,), (levels,)))[
-        0
-    ]
+    got = array_moment_covariance(
+        structure, torch.from_numpy(theta)[None], shape, SampleDesign((n_samples,), (levels,))
+    )[0]
     scale = np.sqrt(np.einsum("jqjq->jq", expected))
     error = np.abs(got.numpy() - expected) / (scale[:, :, None, None] * scale)
     assert error.max() < 0.01  # what the covariance of one sensor promises
@@ -83,7 +83,7 @@ def test_covariance_of_moments_is_that_of_quadratic_forms():
 
 def test_derivatives_are_those_of_the_distance():
     """Slopes of slopes are differences of step 1e-4: their error, of its square, is below 1e-7 of the largest."""
-    made_of = composition_of("WN + AR1 + RW", held=False)
+    structure = composition_of("WN + AR1 + RW", held=False)
     generator = torch.Generator().manual_seed(2)
     tau = 2.0 ** torch.arange(1, 7, dtype=torch.float64)
     root = torch.randn(1, 3, 2, 2, generator=generator, dtype=torch.float64)
@@ -92,11 +92,11 @@ def test_derivatives_are_those_of_the_distance():
     gamma = torch.randn(1, 6, 3, generator=generator, dtype=torch.float64)
     half = torch.randn(18, 18, generator=generator, dtype=torch.float64)
     weight = (half @ half.T)[None]
-    gradient, bends, _ = search._quadratic(gamma, weight, tau, made_of, root, shape, exact=True)
+    gradient, bends, _ = search._quadratic(gamma, weight, tau, structure, root, shape, exact=True)
 
     def distance(unknown: Tensor) -> Tensor:
         moved = root + search._in_basis(unknown[:9].view(1, 3, 3))
-        return search._distance(gamma, weight, tau, made_of, moved, shape + unknown[9:]).sum()
+        return search._distance(gamma, weight, tau, structure, moved, shape + unknown[9:]).sum()
 
     nowhere = torch.zeros(10, dtype=torch.float64)
     torch.testing.assert_close(-2 * gradient[0], torch.func.grad(distance)(nowhere), rtol=1e-7, atol=0)
@@ -106,11 +106,11 @@ def test_derivatives_are_those_of_the_distance():
 
 def test_mean_and_spread_are_those_of_theory(many):
     """Mean within 0.2 standard deviations and 3.5 standard errors of the truth, spread within 3.5 of theory."""
-    made_of = composition_of("WN + RW", held=False)
+    structure = composition_of("WN + RW", held=False)
     levels = many.wavelet_cross_covariance.shape[-3]
     gamma = ARRAY.wavelet_cross_covariance(levels)
     nothing = torch.empty(1, 0, dtype=torch.float64)
-    spread, *_ = covariance_of_fit(gamma[None], TRUTH[None], nothing, SampleDesign((N_SAMPLES,), (levels,)), made_of)
+    spread, *_ = covariance_of_fit(gamma[None], TRUTH[None], nothing, SampleDesign((N_SAMPLES,), (levels,)), structure)
     theory = unvech(spread[0].diagonal().sqrt().view(2, 6))
     bias = (many.theta.mean(0) - TRUTH) / theory
     assert (bias.abs() < 0.2 + 3.5 / math.sqrt(N_RUNS)).all(), bias
@@ -217,12 +217,12 @@ def test_without_a_walk_its_variances_are_next_to_nothing():
     white = gf.ArrayModel([(gf.WhiteNoise(1.0), WHITE)])
     found = gf.fit_array_gmwm(signals(20, white), "WN + RW")
     assert bool(found.converged.all())
-    made_of = composition_of("WN + RW", held=False)
+    structure = composition_of("WN + RW", held=False)
     levels = found.wavelet_cross_covariance.shape[-3]
     gamma = white.wavelet_cross_covariance(levels)
     truth = torch.stack([WHITE, 1e-12 * torch.eye(3, dtype=torch.float64)])
     nothing = torch.empty(1, 0, dtype=torch.float64)
-    spread, *_ = covariance_of_fit(gamma[None], truth[None], nothing, SampleDesign((N_SAMPLES,), (levels,)), made_of)
+    spread, *_ = covariance_of_fit(gamma[None], truth[None], nothing, SampleDesign((N_SAMPLES,), (levels,)), structure)
     sd = unvech(spread[0].diagonal().sqrt().view(2, 6))[1].diagonal()
     walk = found.theta[:, 1].diagonal(dim1=-2, dim2=-1)
     assert int((walk > 3 * sd).sum()) <= stats.binom.ppf(0.9995, walk.numel(), 0.1)

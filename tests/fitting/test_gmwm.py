@@ -84,14 +84,14 @@ def test_no_start_finds_a_lower_minimum_of_noisy_copies(axis, formula):
     noise = torch.randn(n, len(nu), generator=generator, dtype=torch.float64)
     copies = nu * (noise * (variance.sqrt() / nu).clamp(max=0.5)).exp()
     found = gf.fit_gmwm_moments(copies.unsqueeze(-1), 20_000, formula, weighting=1 / variance)
-    made_of = composition_of(formula, held=False)
+    structure = composition_of(formula, held=False)
     tau = 2.0 ** torch.arange(1, len(nu) + 1, dtype=torch.float64)
     best = torch.full((n,), torch.inf, dtype=torch.float64)
     for _ in range(20):
-        start = torch.rand(n, len(made_of.shaped), generator=generator, dtype=torch.float64)
+        start = torch.rand(n, len(structure.nonlinear), generator=generator, dtype=torch.float64)
         start[:, 0] = 8 * start[:, 0] - 1
         start[:, 1:] = 12 * start[:, 1:] - 9
-        least = search.minimise(copies, variance.rsqrt().expand(n, -1), tau, made_of, start, 200)[2]
+        least = search.minimise(copies, variance.rsqrt().expand(n, -1), tau, structure, start, 200)[2]
         best = torch.minimum(best, least)
     assert (found.objective[:, 0] <= best * (1 + 1e-6)).all(), (found.objective[:, 0] / best).max()
 

@@ -39,15 +39,15 @@ def test_the_p_value_is_that_of_a_weighted_sum_of_squares():
     """Weights by finite differences of the model, and the tail by simulation."""
     signal = records(NOISE, 1)
     found = gf.fit_gmwm(signal, "WN + AR1 + RW", refine=True)
-    made_of = composition_of("WN + AR1 + RW", held=True)
+    structure = composition_of("WN + AR1 + RW", held=True)
     own = found.params[0, 0]
     linear, shape = own[[0, 2, 3]][None], own[1].atanh()[None, None]
-    spread = refine_whittle(signal[:, 0], made_of, linear, shape).covariance[0].numpy()
+    spread = refine_whittle(signal[:, 0], structure, linear, shape).covariance[0].numpy()
     unknown = torch.cat([linear[0].log(), shape[0]])
     tau = 2.0 ** torch.arange(1, found.wavelet_variance.shape[-2] + 1, dtype=torch.float64)
 
     def moments(u: torch.Tensor) -> np.ndarray:
-        return made_of.wavelet_variance(tau, u[:3].exp(), u[3:]).numpy()
+        return structure.wavelet_variance(tau, u[:3].exp(), u[3:]).numpy()
 
     step = 1e-5 * torch.eye(4, dtype=torch.float64)
     jacobian = np.stack([(moments(unknown + h) - moments(unknown - h)) / 2e-5 for h in step], -1)

@@ -46,15 +46,15 @@ def test_a_held_variance_stays_and_the_others_fit_around_it():
     """Against bounded least squares of the other columns."""
     from scipy.optimize import nnls
 
-    made_of = composition_of("WN + RW + QN", held=False)
+    structure = composition_of("WN + RW + QN", held=False)
     tau = 2.0 ** torch.arange(1, 10, dtype=torch.float64)
     generator = torch.Generator().manual_seed(1)
     target = torch.rand(5, 9, generator=generator, dtype=torch.float64) + 0.1
     value = torch.linspace(0, 1e-2, 5, dtype=torch.float64)
     shape = target.new_empty(5, 0)
-    linear, _, objective, _ = search.minimise(target, 1 / target, tau, made_of, shape, fixed=(1, value))
+    linear, _, objective, _ = search.minimise(target, 1 / target, tau, structure, shape, fixed=(1, value))
     torch.testing.assert_close(linear[:, 1], value)
-    columns = made_of.columns(tau, shape)
+    columns = structure.columns(tau, shape)
     for i in range(5):
         weighted = (columns[i] / target[i, :, None]).numpy()
         rest = 1 - weighted[:, 1] * value[i].item()
@@ -130,11 +130,11 @@ def test_memory_that_is_unknown_has_no_limits():
 def test_the_rise_of_the_likelihood_is_that_of_a_fine_grid():
     """White noise and a walk held at some value: the best of 4000 levels of the white noise."""
     signal = signals(2, 1024, gf.WhiteNoise(1.0) + gf.RandomWalk(1e-3))[:, 0]
-    made_of = composition_of("WN + RW", held=True)
+    structure = composition_of("WN + RW", held=True)
     start = torch.tensor([[1.0, 1e-3]], dtype=torch.float64).expand(2, -1)
-    fit = refine_whittle(signal, made_of, start, start.new_empty(2, 0))
-    surface = SpectralProfile(fit.linear, fit.shape, fit.energy, fit.count, made_of, 1024)
-    bins, noise = Bins(1024, torch.device("cpu")), Noise(made_of)
+    fit = refine_whittle(signal, structure, start, start.new_empty(2, 0))
+    surface = SpectralProfile(fit.linear, fit.shape, fit.energy, fit.count, structure, 1024)
+    bins, noise = Bins(1024, torch.device("cpu")), Noise(structure)
     white = torch.linspace(0.5, 2.0, 4000, dtype=torch.float64)
     for value in (0.0, 1e-4, 1e-2):
         found = surface.rise(torch.arange(2), 1, torch.full((2,), value, dtype=torch.float64))
@@ -164,12 +164,12 @@ def test_limits_are_where_the_likelihood_has_fallen_enough(model, unknown, place
     formula = "WN + " + " + ".join(["AR1"] * (len(model.processes) - 1))
     signal = signals(8, 3000 if unknown == 2 else 16384, model)
     fit = gf.fit_gmwm(signal, formula, refine=True)
-    made_of = composition_of(formula, held=True)
+    structure = composition_of(formula, held=True)
     params = fit.params[:, 0]
     linear = params[:, [at for at, name in enumerate(fit.param_names) if name.endswith("variance")]]
     shape = params[:, [at for at, name in enumerate(fit.param_names) if name.endswith("phi")]].atanh()
-    there = refine_whittle(signal[:, 0], made_of, linear, shape)
-    surface = SpectralProfile(there.linear, there.shape, there.energy, there.count, made_of, signal.shape[-1])
+    there = refine_whittle(signal[:, 0], structure, linear, shape)
+    surface = SpectralProfile(there.linear, there.shape, there.energy, there.count, structure, signal.shape[-1])
     below = fit.confidence_interval.low[:, 0, place]
     order = torch.ones(8, dtype=torch.bool)
     rise = surface.rise(torch.arange(8), unknown, below.atanh(), order)

@@ -1,4 +1,4 @@
-"""Ranking of compositions: that the true one is chosen, that smaller ones are seen in larger, and the criteria."""
+"""Ranking of structures: that the true one is chosen, that smaller ones are seen in larger, and the criteria."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torch import Tensor
 import gyrofuse as gf
 from gyrofuse.fitting import rank_models_moments
 from gyrofuse.fitting.moments.covariance import moment_covariance
-from gyrofuse.fitting.ranking.candidates import all_noises, composition, key_of, simplified
+from gyrofuse.fitting.ranking.candidates import all_noises, key_of, simplified, structure_of
 from gyrofuse.fitting.ranking.spectra import NoiseFit, Spectra, _grid
 
 
@@ -73,7 +73,7 @@ def test_score_of_an_ar1_as_by_hand():
     n = 48
     signal = signals(PARTS["WN + AR1"], 3, n)[:, 0]
     spectra = Spectra(signal)
-    parent = composition([gf.WhiteNoise, gf.AR1, gf.RandomWalk], held=True)
+    parent = structure_of([gf.WhiteNoise, gf.AR1, gf.RandomWalk], held=True)
     phi, p = torch.tensor([0.5, 0.7, 0.2]), torch.tensor([[1.0, 0.3, 0.01], [0.8, 0.2, 0.0], [0.0, 1.0, 0.02]])
     linear, shape = p.double(), phi.double().atanh()[:, None]
     nothing = torch.zeros(3, dtype=torch.float64)
@@ -171,7 +171,7 @@ def test_wvic_keeps_more():
 
 
 def test_what_a_fit_amounts_to():
-    made_of = composition([gf.WhiteNoise, gf.AR1, gf.AR1, gf.RandomWalk], held=True)
+    structure = structure_of([gf.WhiteNoise, gf.AR1, gf.AR1, gf.RandomWalk], held=True)
     phi, short, long = 0.9, 0.001, math.exp(-1 / 800)
     rows = {
         (1.0, phi, 1.0, 0.5, 1.0, 1.0): None,
@@ -188,13 +188,13 @@ def test_what_a_fit_amounts_to():
     }
     params = torch.tensor(list(rows), dtype=torch.float64)
     covariance = torch.diag_embed(torch.full_like(params, 1e-6))
-    found = simplified(made_of, params, covariance, 1000)
+    found = simplified(structure, params, covariance, 1000)
     for got, expected in zip(found, rows.values(), strict=True):
         if expected is None:
             assert got is None
         else:
             assert got is not None
-            assert (composition(got[0], held=True).name, got[1]) == expected
+            assert (structure_of(got[0], held=True).name, got[1]) == expected
 
 
 def test_redundant_and_equivalent_are_named():

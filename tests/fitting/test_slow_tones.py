@@ -58,16 +58,16 @@ def test_a_slow_tone_on_a_steep_spectrum_is_found():
 
 def test_refinement_keeps_the_tone():
     """The moments' noise takes a part of the tone for an AR1, over which other lines would stand out."""
-    made_of = composition_of("2*AR1 + 2*SIN", held=True)
+    structure = composition_of("2*AR1 + 2*SIN", held=True)
     series = records(TRUTH, 4, N_SAMPLES, seed=2)
     tones = found_in(series, "2*AR1 + 2*SIN")
     steep = torch.tensor([1.92e-8, 5.278666e-4, 6e-4, 0.0], dtype=torch.float64).expand(4, -1)
     shape = torch.tensor([math.atanh(0.9999), math.atanh(0.11), 0.0, 0.0], dtype=torch.float64).expand(4, -1)
-    found = refine_whittle(series, made_of, steep, shape, tones=tones).tones
+    found = refine_whittle(series, structure, steep, shape, tones=tones).tones
     assert found is not None
     assert ((found.beta - tones.beta).abs() < math.pi / N_SAMPLES).all()
     torch.testing.assert_close(found.beta[:, 1], torch.full((4,), 6.4e-4, dtype=torch.float64), rtol=0.1, atol=0)
-    without = refine_whittle(series, made_of, steep, shape).tones
+    without = refine_whittle(series, structure, steep, shape).tones
     assert without is not None
     assert bool((without.beta.amin(-1) > 1e-3).any())
 

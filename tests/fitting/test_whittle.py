@@ -19,7 +19,7 @@ from torch import Tensor
 from gyrofuse._base.transforms import cosine_ordinates, ramp_ordinates
 from gyrofuse.fitting.spectral.bands import Bins, Noise
 from gyrofuse.fitting.spectral.whittle import WhittleFit, refine_whittle
-from gyrofuse.fitting.structure import Composition
+from gyrofuse.fitting.structure import ModelStructure
 from gyrofuse.noise.model import Model
 from gyrofuse.noise.processes import AR1, Drift, QuantizationNoise, RandomWalk, Sinusoid, WhiteNoise
 from gyrofuse.noise.state_space import state_space
@@ -30,9 +30,9 @@ Array = NDArray[np.float64]
 NOISE = WhiteNoise(1.0) + AR1(0.975, 0.03) + RandomWalk(4e-4)
 LINEAR, X = [1.0, 0.03, 4e-4], math.atanh(0.975)
 AMPLITUDE, BETA = 0.85, 0.35
-THREE = Composition((WhiteNoise(), AR1(), RandomWalk()), True)
-WITH_TONE = Composition((WhiteNoise(), AR1(), RandomWalk(), Sinusoid()), True)
-WITH_WALK = Composition((WhiteNoise(), RandomWalk()), True)
+THREE = ModelStructure((WhiteNoise(), AR1(), RandomWalk()), True)
+WITH_TONE = ModelStructure((WhiteNoise(), AR1(), RandomWalk(), Sinusoid()), True)
+WITH_WALK = ModelStructure((WhiteNoise(), RandomWalk()), True)
 
 
 def seeded(seed: int) -> torch.Generator:
@@ -118,7 +118,7 @@ def test_variances_of_ordinates_are_exact(process, n):
     transform = dct(n)
     expected = np.diag(transform @ dense(process, n) @ transform.T)
     np.testing.assert_allclose(spectrum(process, n), expected, rtol=1e-9)
-    noise = Noise(Composition((process,), True))
+    noise = Noise(ModelStructure((process,), True))
     x = rows([math.atanh(float(process.phi))], 1) if isinstance(process, AR1) else rows([], 1)
     found = noise.variances(Bins(n, torch.device("cpu")), rows([1.0], 1), x)[0]
     np.testing.assert_allclose(found, expected, rtol=1e-9)
@@ -131,7 +131,7 @@ def test_bands_are_means_of_ordinates(process, n):
     assert bins.edges[0] == 1
     assert bins.edges[-1] == n
     assert bins.count.sum() == n - 1
-    noise = Noise(Composition((process,), True))
+    noise = Noise(ModelStructure((process,), True))
     x = rows([math.atanh(float(process.phi))], 1) if isinstance(process, AR1) else rows([], 1)
     found = noise.variances(bins, rows([1.0], 1), x)[0]
     means = np.add.reduceat(spectrum(process, n), np.array(bins.edges[:-1]) - 1) / bins.count.numpy()
@@ -196,14 +196,14 @@ def test_maximum_is_near_that_of_the_exact_likelihood(walk):
     n, n_items = 2000, 3
     values = [1.0, 0.1, 4e-3] if walk else [1.0, 0.3]
     model: Model = WhiteNoise(1.0) + (AR1(0.9, 0.1) + RandomWalk(4e-3) if walk else AR1(0.9, 0.3))
-    made_of = Composition(tuple(type(p)() for p in model.processes), True)
+    structure = ModelStructure(tuple(type(p)() for p in model.processes), True)
     signal = model.simulate(n, batch=(n_items,), generator=seeded(21))
-    fit = refine_whittle(signal, made_of, rows(values, n_items), rows([math.atanh(0.9)], n_items))
+    fit = refine_whittle(signal, structure, rows(values, n_items), rows([math.atanh(0.9)], n_items))
     for i in range(n_items):
 
         def cost(q: Array, record: Tensor = signal[i]) -> tuple[float, Array]:
             at = torch.tensor(q, requires_grad=True)
-            own = made_of.model(at[:-1].exp(), at[-1:])
+            own = structure.model(at[:-1].exp(), at[-1:])
             system = state_space(own, 1.0)
             # A parabola in the level
             here, above, below = (system.kalman_log_likelihood(record + d) for d in (0.0, 1.0, -1.0))
@@ -252,8 +252,8 @@ def test_variances_leave_zero():
 def test_an_ar1_without_variance_has_any_phi():
     """In over-differenced noise an AR1 of positive phi has no place."""
     signal = (QuantizationNoise(1.0) + WhiteNoise(1.0)).simulate(3000, batch=(40,), generator=seeded(8))
-    made_of = Composition((QuantizationNoise(), WhiteNoise(), AR1()), True)
-    fit = refine_whittle(signal, made_of, rows([1.0, 1.0, 0.0], 40), rows([2.0], 40))
+    structure = ModelStructure((QuantizationNoise(), WhiteNoise(), AR1()), True)
+    fit = refine_whittle(signal, structure, rows([1.0, 1.0, 0.0], 40), rows([2.0], 40))
     still = fit.linear[:, 2] == 0
     assert 5 < still.sum() < 35
     assert (fit.covariance[still][:, [2, 3]] == 0).all()
@@ -310,7 +310,7 @@ def test_a_ramp_is_measured_and_taken_out(tone):
         beta = 2 * math.pi * 6.3 / n
         signal += Sinusoid(1.5, beta).simulate(n, batch=(n_items,), generator=generator)
         processes, linear, x = [*processes, Sinusoid()], [*linear, 2.25], [0.0]
-    fit = refine_whittle(signal, Composition(tuple(processes), True), rows(linear, n_items), rows(x, n_items))
+    fit = refine_whittle(signal, ModelStructure(tuple(processes), True), rows(linear, n_items), rows(x, n_items))
     assert fit.converged.all()
     assert_rms((fit.slope - slope) / fit.slope_sd, most=1.1)
     torch.testing.assert_close(fit.linear[:, 2], fit.slope**2)
@@ -331,9 +331,9 @@ def test_two_ar1s_and_two_tones_come_in_order():
     signal = noise.simulate(n, batch=(n_items,), generator=generator)
     for amplitude, beta in ((0.015, 8e-3), (0.25, 0.056)):
         signal += Sinusoid(amplitude, beta).simulate(n, batch=(n_items,), generator=generator)
-    made_of = Composition((AR1(), AR1(), Sinusoid(), Sinusoid()), True)
+    structure = ModelStructure((AR1(), AR1(), Sinusoid(), Sinusoid()), True)
     x = [math.atanh(0.2), math.atanh(0.999), 0.0, 0.0]
-    fit = refine_whittle(signal, made_of, rows([5e-4, 3e-7, 1.0, 1.0], n_items), rows(x, n_items))
+    fit = refine_whittle(signal, structure, rows([5e-4, 3e-7, 1.0, 1.0], n_items), rows(x, n_items))
     assert fit.converged.all()
     assert fit.tones is not None
     torch.testing.assert_close(fit.tones.beta, torch.pi * fit.shape[:, 2:].sigmoid())
@@ -433,7 +433,7 @@ def test_arguments_that_cannot_be_used():
         refine_whittle(signal, WITH_TONE, linear[:, :3], x)
     with pytest.raises(ValueError, match=r"`shape`: expected \(4, 2\) .*got \(3, 2\); give what"):
         refine_whittle(signal, WITH_TONE, linear, x[:3])
-    with pytest.raises(ValueError, match="`made_of`: expected a noise such as WN, got SIN; add WhiteNoise"):
-        refine_whittle(signal, Composition((Sinusoid(),), True), linear[:, :1], x[:, :1])
+    with pytest.raises(ValueError, match="`structure`: expected a noise such as WN, got SIN; add WhiteNoise"):
+        refine_whittle(signal, ModelStructure((Sinusoid(),), True), linear[:, :1], x[:, :1])
     with pytest.raises(ValueError, match="`n_rounds`: expected a whole number >= 1, got 0"):
         refine_whittle(signal, WITH_TONE, linear, x, n_rounds=0)

@@ -12,7 +12,7 @@ from gyrofuse.fitting.array.moments import array_moment_covariance, vech, weight
 from gyrofuse.fitting.moments import search
 from gyrofuse.fitting.moments.fit import n_starts_for
 from gyrofuse.fitting.moments.records import SampleDesign
-from gyrofuse.fitting.structure import Composition
+from gyrofuse.fitting.structure import ModelStructure
 
 # Largest number of steps with the weights of a fit that has come to rest. Flat valleys need some tens.
 _POLISHING = 100
@@ -25,13 +25,13 @@ class _Problem(NamedTuple):
         moments: Moments `(item, level, pair)` of unit size, 0 where there are none.
         present: Whether a moment was measured, `(item, level, pair)`.
         records: Length and levels of the records.
-        made_of: Structure of the model.
+        structure: Structure of the model.
     """
 
     moments: Tensor
     present: Tensor
     records: SampleDesign
-    made_of: Composition
+    structure: ModelStructure
 
     @property
     def tau(self) -> Tensor:
@@ -42,13 +42,13 @@ class _Problem(NamedTuple):
 
     def fitted(self, root: Tensor, shape: Tensor) -> Tensor:
         """Moments of the model, `(item, level, pair)`."""
-        return self.made_of.columns(self.tau, shape) @ vech(root @ root)
+        return self.structure.columns(self.tau, shape) @ vech(root @ root)
 
     def covariance(self, root: Tensor, shape: Tensor) -> Tensor:
-        return array_moment_covariance(self.made_of, root @ root, shape, self.records)
+        return array_moment_covariance(self.structure, root @ root, shape, self.records)
 
     def step(self, weight: Tensor, root: Tensor, shape: Tensor, exact: bool) -> tuple[Tensor, Tensor]:
-        return array_search.step_downhill(self.moments, weight, self.tau, self.made_of, root, shape, exact)
+        return array_search.step_downhill(self.moments, weight, self.tau, self.structure, root, shape, exact)
 
     def objective(self, root: Tensor, shape: Tensor) -> Tensor:
         """`r' V^-1 r + ln det V`, which compares fits with different weights, `(item,)`."""
@@ -58,7 +58,7 @@ class _Problem(NamedTuple):
 
 
 def fit_matrices(
-    gamma: Tensor, held: Tensor, records: SampleDesign, made_of: Composition
+    gamma: Tensor, held: Tensor, records: SampleDesign, structure: ModelStructure
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Fit matrices to wavelet cross-covariances of sensors of unit size.
 
@@ -66,14 +66,14 @@ def fit_matrices(
         gamma: Wavelet cross-covariances `(item, level, sensor, sensor)`, NaN where there is none.
         held: `x` of the sinusoids, `(item, sinusoid)`.
         records: Length and levels of the records.
-        made_of: Structure of the model.
+        structure: Structure of the model.
 
     Returns:
         `Theta` `(item, process, sensor, sensor)`, `x` `(item, shaped)`, and whether the search came to rest.
     """
     present = vech(gamma).isfinite()
-    problem = _Problem(torch.where(present, vech(gamma), 0.0), present, records, made_of)
-    root, shape = _starts(gamma, held, records, made_of)  # (item, start, ...)
+    problem = _Problem(torch.where(present, vech(gamma), 0.0), present, records, structure)
+    root, shape = _starts(gamma, held, records, structure)  # (item, start, ...)
     n_items, n_starts = shape.shape[:2]
     root, shape = root.flatten(0, 1), shape.flatten(0, 1)
     if n_starts > 1:
@@ -88,8 +88,8 @@ def fit_matrices(
     root, shape, rests = _settle(problem, root, shape)
     theta = root @ root
     # AR1s from slow to fast, sinusoids from high to low frequency.
-    place = torch.arange(made_of.n_linear, dtype=shape.dtype, device=shape.device).expand(len(shape), -1)
-    order, shape = made_of.ordered(place, shape)
+    place = torch.arange(structure.n_linear, dtype=shape.dtype, device=shape.device).expand(len(shape), -1)
+    order, shape = structure.ordered(place, shape)
     return theta.take_along_dim(order.long()[..., None, None], 1), shape, rests
 
 
@@ -179,7 +179,7 @@ def _starts(
     gamma: Tensor,
     held: Tensor,
     records: SampleDesign,
-    made_of: Composition,
+    structure: ModelStructure,
     *,
     n_distinct: int = 5,
     apart: float = 0.5,
@@ -191,7 +191,7 @@ def _starts(
         gamma: Wavelet cross-covariances `(item, level, sensor, sensor)`.
         held: `x` of the sinusoids, `(item, sinusoid)`.
         records: Length and levels of the records.
-        made_of: Structure of the model.
+        structure: Structure of the model.
         n_distinct: Number of starting points with several AR1s or sinusoids to be found; one is enough otherwise.
         apart: Smallest distance between the `x` of two of them, the sum of absolute differences.
         least_share: Smallest share of a sensor's lowest level that each process starts with, as a matrix of zero would
@@ -208,24 +208,24 @@ def _starts(
     weight = records.observations.to(nu) / nu.square()  # as of white noise
     everywhere = held[:, None].expand(-1, n_sensors, -1).flatten(0, 1)
     own = search.starting_points(
-        nu.flatten(0, 1), weight.flatten(0, 1), tau, made_of, everywhere, n_starts_for(made_of)
+        nu.flatten(0, 1), weight.flatten(0, 1), tau, structure, everywhere, n_starts_for(structure)
     )  # (item sensor, start, shaped)
     target, root = (v.flatten(0, 1)[:, None].expand(-1, own.shape[1], -1).flatten(0, 1) for v in (nu, weight.sqrt()))
     n, n_shaped = n_sensors * own.shape[1], own.shape[2]
-    own = search.minimise(target, root, tau, made_of, own.flatten(0, 1))[1].view(n_items, n, n_shaped)
-    _, own = made_of.ordered(own.new_zeros(n_items, n, made_of.n_linear), own)
+    own = search.minimise(target, root, tau, structure, own.flatten(0, 1))[1].view(n_items, n, n_shaped)
+    _, own = structure.ordered(own.new_zeros(n_items, n, structure.n_linear), own)
     # Each of them in every sensor: (item, candidate, sensor)
     target, root = (v[:, None].expand(-1, n, -1, -1).flatten(0, 2) for v in (nu, weight.sqrt()))
     shape = own[:, :, None].expand(-1, -1, n_sensors, -1).flatten(0, 2)
-    linear, _, objective, _ = search.minimise(target, root, tau, made_of, shape, 0)
+    linear, _, objective, _ = search.minimise(target, root, tau, structure, shape, 0)
     linear = linear.view(n_items, n, n_sensors, -1)
     score = (objective.view(n_items, n, n_sensors) * known[:, None]).sum(-1).nan_to_num(nan=torch.inf)
     kept = []
-    for _ in range(n_distinct if len(made_of.curved) > 1 else 1):
+    for _ in range(n_distinct if len(structure.free_nonlinear) > 1 else 1):
         kept.append(score.argmin(-1))
         near = (own - own.take_along_dim(kept[-1][:, None, None], 1)).abs().sum(-1) < apart
         score = torch.where(near, torch.inf, score)
     best = torch.stack(kept, -1)  # (item, start)
     linear, shape = linear.take_along_dim(best[..., None, None], 1), own.take_along_dim(best[..., None], 1)
-    least = least_share * (nu[:, None, :, :, None] / made_of.columns(tau, shape)[:, :, None]).amin(-2)
+    least = least_share * (nu[:, None, :, :, None] / structure.columns(tau, shape)[:, :, None]).amin(-2)
     return torch.diag_embed(torch.maximum(linear, least).sqrt().mT), shape

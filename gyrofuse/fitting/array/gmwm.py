@@ -24,7 +24,7 @@ from gyrofuse.fitting.array.result import ArrayGMWMResult
 from gyrofuse.fitting.moments.fit import composition_of
 from gyrofuse.fitting.moments.records import SampleDesign, deprecate_moments
 from gyrofuse.fitting.spectral.model_tones import model_tones
-from gyrofuse.fitting.structure import Composition
+from gyrofuse.fitting.structure import ModelStructure
 from gyrofuse.io.recording import Recording
 from gyrofuse.io.signals import KnownSignal, as_recording
 from gyrofuse.noise.processes import Model, Sinusoid
@@ -148,8 +148,8 @@ def _fit(
     """Fit `(..., level, sensor, sensor)`, with the help of the signals `(item, sensor, time)` if at hand."""
     levels, n_sensors = wccv.shape[-3:-1]
     argument = "wavelet_cross_covariance" if series is None else "signal"
-    made_of = composition_of(model, held=series is not None)
-    _check_model(made_of, levels)
+    structure = composition_of(model, held=series is not None)
+    _check_model(structure, levels)
     wccv = wccv.to(torch.float64)
     gamma = wccv.reshape(-1, levels, n_sensors, n_sensors)
     usable = _usable(argument, gamma, known.sensors)
@@ -161,13 +161,13 @@ def _fit(
     size = nu.log().nanmean(-2).nan_to_num(nan=0.0).div(2).exp()  # (item, sensor)
     squared = (size[:, :, None] * size[:, None, :])[:, None]
     scaled = gamma / squared
-    held, held_sd = _held(None if series is None else series[usable], made_of, scaled)
+    held, held_sd = _held(None if series is None else series[usable], structure, scaled)
     records = SampleDesign((n_samples,), (levels,))
     return ArrayGMWMResult.build(
-        fit=_fit_in_parts(scaled, held, records, made_of),
+        fit=_fit_in_parts(scaled, held, records, structure),
         squared=squared,
         held_sd=held_sd,
-        made_of=made_of,
+        structure=structure,
         usable=usable,
         wavelet_cross_covariance=wccv,
         records=records,
@@ -178,21 +178,21 @@ def _fit(
     )
 
 
-def _fit_in_parts(gamma: Tensor, held: Tensor, records: SampleDesign, made_of: Composition) -> ArrayFit:
+def _fit_in_parts(gamma: Tensor, held: Tensor, records: SampleDesign, structure: ModelStructure) -> ArrayFit:
     """Fit arrays `(item, level, sensor, sensor)`, some at a time."""
     moments = gamma.shape[1] * gamma.shape[2] * (gamma.shape[2] + 1) // 2
     at_once = items_at_once(moments**2)
     found = []
     for some, known in zip(gamma.split(at_once), held.split(at_once), strict=True):
-        theta, shape, converged = fit_matrices(some, known, records, made_of)
-        inference = covariance_of_fit(some, theta, shape, records, made_of)
+        theta, shape, converged = fit_matrices(some, known, records, structure)
+        inference = covariance_of_fit(some, theta, shape, records, structure)
         found.append((theta, shape, converged & inference[1].isfinite(), *inference))
     return ArrayFit(*(torch.cat(parts) for parts in zip(*found, strict=True)))
 
 
-def _held(series: Tensor | None, made_of: Composition, gamma: Tensor) -> tuple[Tensor, Tensor]:
+def _held(series: Tensor | None, structure: ModelStructure, gamma: Tensor) -> tuple[Tensor, Tensor]:
     """`x` of the sinusoids and the standard error of `beta`, `(item, sinusoid)`, of the sensor with the smallest."""
-    found = model_tones(series.flatten(0, 1), made_of) if series is not None else None
+    found = model_tones(series.flatten(0, 1), structure) if series is not None else None
     if series is None or found is None:
         empty = gamma.new_empty(len(gamma), 0)
         return empty, empty
@@ -235,17 +235,17 @@ def _given(wccv: Tensor, n_samples: int, n_levels: int | None) -> Tensor:
     return wccv[..., :n_levels, :, :]
 
 
-def _check_model(made_of: Composition, n_levels: int) -> None:
-    if any(process.deterministic for process in made_of.processes):
+def _check_model(structure: ModelStructure, n_levels: int) -> None:
+    if any(process.deterministic for process in structure.processes):
         raise ValueError(
             "`model`: expected noise processes, got a Drift, which is deterministic and has no covariance; "
             "subtract a trend from every sensor"
         )
-    n_unknown = made_of.n_linear + len(made_of.curved)
+    n_unknown = structure.n_linear + len(structure.free_nonlinear)
     if n_unknown > n_levels:
         raise ValueError(
             f"`model`: expected at most as many parameters of a sensor as the {n_levels} levels, got {n_unknown} in "
-            f"{made_of.name}; record longer or leave processes out"
+            f"{structure.name}; record longer or leave processes out"
         )
 
 

@@ -12,7 +12,7 @@ from gyrofuse.fitting.array.moments import array_moment_covariance, pairs, unvec
 from gyrofuse.fitting.array.search import jacobian
 from gyrofuse.fitting.moments.inference import quadratic, sandwich
 from gyrofuse.fitting.moments.records import SampleDesign
-from gyrofuse.fitting.structure import Composition
+from gyrofuse.fitting.structure import ModelStructure
 from gyrofuse.wavelets.intervals import normal_quantile
 
 # Time constants of an AR1 in the record below which its parameters count as unidentified: an AR1 with a time constant
@@ -59,7 +59,7 @@ def covariance_of_fit(
     theta: Tensor,
     shape: Tensor,
     records: SampleDesign,
-    made_of: Composition,
+    structure: ModelStructure,
     *,
     rounding: float = 1e-5,
     negligible: float = 1e-8,
@@ -71,7 +71,7 @@ def covariance_of_fit(
         theta: Matrices, `(item, process, sensor, sensor)`.
         shape: Nonlinear parameters `x`, `(item, shaped)`.
         records: Length and levels of the records.
-        made_of: Structure of the model.
+        structure: Structure of the model.
         rounding: Share of the largest eigenvalue of a matrix below which another one counts as zero.
         negligible: Share of a moment that the same eigenvalue adds to it, below which it counts as zero.
 
@@ -80,16 +80,16 @@ def covariance_of_fit(
     """
     n_items, n_sensors = len(gamma), gamma.shape[-1]
     present = vech(gamma).isfinite()
-    covariance = array_moment_covariance(made_of, theta, shape, records)
+    covariance = array_moment_covariance(structure, theta, shape, records)
     weight = weights_of(covariance, present)
     tau = records.tau.to(gamma)
-    columns = made_of.columns(tau, shape)
+    columns = structure.columns(tau, shape)
     fitted = columns @ vech(theta)
     residual = torch.where(present, vech(gamma) - fitted, 0.0).flatten(1)
     # The entries of a pair are determined by at least as many levels as there are processes.
-    entries = (present.sum(1) >= made_of.n_linear)[:, None].expand(-1, made_of.n_linear, -1).flatten(1)
-    known = torch.cat([entries, entries.new_ones(n_items, len(made_of.curved))], -1)
-    slopes = jacobian(tau, made_of, theta, shape) * present.flatten(1)[..., None]
+    entries = (present.sum(1) >= structure.n_linear)[:, None].expand(-1, structure.n_linear, -1).flatten(1)
+    known = torch.cat([entries, entries.new_ones(n_items, len(structure.free_nonlinear))], -1)
+    slopes = jacobian(tau, structure, theta, shape) * present.flatten(1)[..., None]
     flat = covariance.reshape(*weight.shape)
     spread, objective = sandwich(slopes, known, flat, weight), quadratic(residual, weight)
     spread = torch.where(known[:, :, None] & known[:, None, :], spread, torch.nan)
@@ -173,29 +173,29 @@ def matrices(fit: ArrayFit, identified: Tensor, confidence_level: float) -> tupl
     return entries, Estimate(*(unvech(part) for part in (rho, *certain)))
 
 
-def covariance_of_numbers(fit: ArrayFit, squared: Tensor, std_err: Tensor, made_of: Composition) -> Tensor:
+def covariance_of_numbers(fit: ArrayFit, squared: Tensor, std_err: Tensor, structure: ModelStructure) -> Tensor:
     """Covariance of entries of the matrices and of `phi` or `beta`, process by process, `(item, number, number)`.
 
     Args:
         fit: Fit of the arrays.
         squared: Units of the entries, `(item, 1, pair)`.
         std_err: Standard errors of `phi` and `beta`, `(item, parameter)`, also of those that were not fitted.
-        made_of: Structure of the model.
+        structure: Structure of the model.
     """
     n_items, n_pairs = len(squared), squared.shape[-1]
-    n_linear = made_of.n_linear * n_pairs
-    moved = [made_of.shaped.index(k) for k in made_of.curved]
+    n_linear = structure.n_linear * n_pairs
+    moved = [structure.nonlinear.index(k) for k in structure.free_nonlinear]
     among = fit.covariance.diagonal(dim1=-2, dim2=-1)[:, n_linear:].clamp(min=0).sqrt()
     # d phi / d x from the two standard errors; 0 / 0 where there is none.
     slope = (std_err[:, moved] / among).nan_to_num(nan=0.0)
-    units = torch.cat([squared.expand(-1, made_of.n_linear, -1).flatten(1), slope], -1)
+    units = torch.cat([squared.expand(-1, structure.n_linear, -1).flatten(1), slope], -1)
     whole = torch.diag_embed(torch.cat([torch.zeros(n_items, n_linear).to(std_err), std_err.square()], -1))
     place = torch.tensor([*range(n_linear), *(n_linear + i for i in moved)], device=std_err.device)
     whole[:, place[:, None], place] = fit.covariance * (units[:, :, None] * units[:, None, :])
     order: list[int] = []
-    for k in range(made_of.n_linear):
+    for k in range(structure.n_linear):
         order += range(k * n_pairs, (k + 1) * n_pairs)
-        order += [n_linear + made_of.shaped.index(k)] if k in made_of.shaped else []
+        order += [n_linear + structure.nonlinear.index(k)] if k in structure.nonlinear else []
     return whole[:, order][:, :, order]
 
 
@@ -204,17 +204,17 @@ def is_long(phi: Tensor, n_samples: int) -> Tensor:
     return phi > math.exp(-FEWEST_TIME_CONSTANTS / n_samples)
 
 
-def identified_matrices(fit: ArrayFit, made_of: Composition, n_samples: int) -> Tensor:
+def identified_matrices(fit: ArrayFit, structure: ModelStructure, n_samples: int) -> Tensor:
     """Whether a matrix has full rank and its process no long time constant, `(item, process)`."""
     identified = fit.rank == fit.theta.shape[-1]
-    for k, x in zip(made_of.shaped, fit.shape.unbind(-1), strict=True):
-        if made_of.processes[k].has_memory():
-            identified[:, k] &= ~is_long(made_of.processes[k].from_unconstrained(x), n_samples)
+    for k, x in zip(structure.nonlinear, fit.shape.unbind(-1), strict=True):
+        if structure.processes[k].has_memory():
+            identified[:, k] &= ~is_long(structure.processes[k].from_unconstrained(x), n_samples)
     return identified
 
 
 def shared(
-    fit: ArrayFit, identified: Tensor, held_sd: Tensor, made_of: Composition, confidence_level: float
+    fit: ArrayFit, identified: Tensor, held_sd: Tensor, structure: ModelStructure, confidence_level: float
 ) -> Estimate:
     """Parameters `(item, parameter)` of all sensors, `phi` of AR1s and `beta` of tones, in the order of the model.
 
@@ -225,20 +225,20 @@ def shared(
         fit: Fit of the arrays.
         identified: Whether each matrix is identified, `(item, process)`.
         held_sd: Standard errors of frequencies that the moments did not fit, `(item, sinusoid)`.
-        made_of: Structure of the model.
+        structure: Structure of the model.
         confidence_level: Probability that an interval holds the true value.
     """
     z = normal_quantile((1 + confidence_level) / 2)
-    n_moving = len(made_of.curved)
+    n_moving = len(structure.free_nonlinear)
     moving = fit.covariance.diagonal(dim1=-2, dim2=-1)[:, fit.covariance.shape[-1] - n_moving :].clamp(min=0).sqrt()
     moved, held = iter(moving.unbind(-1)), iter(held_sd.unbind(-1))
-    memories = [k for k, process in enumerate(made_of.processes) if process.has_memory()]
+    memories = [k for k, process in enumerate(structure.processes) if process.has_memory()]
     vague = ~identified[:, memories].all(-1)
     found = []
-    for k, x in zip(made_of.shaped, fit.shape.unbind(-1), strict=True):
-        process = made_of.processes[k]
+    for k, x in zip(structure.nonlinear, fit.shape.unbind(-1), strict=True):
+        process = structure.processes[k]
         slope = process.unconstrained_slope(x)
-        width = next(moved) if k in made_of.curved else next(held) / slope
+        width = next(moved) if k in structure.free_nonlinear else next(held) / slope
         low, high = (process.from_unconstrained(x + sign * z * width) for sign in (-1, 1))
         if process.has_memory():
             low, high = (torch.where(vague, torch.nan, limit) for limit in (low, high))

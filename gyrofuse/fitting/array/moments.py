@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.fitting.moments.records import SampleDesign
-from gyrofuse.fitting.structure import Composition
+from gyrofuse.fitting.structure import ModelStructure
 
 
 def pairs(n_sensors: int) -> tuple[Tensor, Tensor]:
@@ -34,7 +34,7 @@ def unvech(entries: Tensor) -> Tensor:
     return entries[..., place.to(entries.device)]
 
 
-def array_moment_covariance(made_of: Composition, theta: Tensor, shape: Tensor, records: SampleDesign) -> Tensor:
+def array_moment_covariance(structure: ModelStructure, theta: Tensor, shape: Tensor, records: SampleDesign) -> Tensor:
     """Covariance of the estimated WCCV of a Gaussian array, for the finite length of its record.
 
     `Cov(gamma_ab,j, gamma_cd,l) = sum_km Q_jl[k,m] (Theta_k,ac Theta_m,bd + Theta_k,ad Theta_m,bc)` over the processes,
@@ -42,7 +42,7 @@ def array_moment_covariance(made_of: Composition, theta: Tensor, shape: Tensor, 
     (`moment_covariance`). A tone counts through its products with the noise.
 
     Args:
-        made_of: Structure of the model.
+        structure: Structure of the model.
         theta: Matrices of the processes at unit size, `(item, process, sensor, sensor)`, positive.
         shape: `x` of the shaped processes, `(item, shaped)`.
         records: Their length and levels.
@@ -51,7 +51,7 @@ def array_moment_covariance(made_of: Composition, theta: Tensor, shape: Tensor, 
         `(item, level, pair, level, pair)`, signal^4.
     """
     size = theta.diagonal(dim1=-2, dim2=-1).mean(-1)  # (item, process)
-    table = _table(made_of, size, shape, records)
+    table = _table(structure, size, shape, records)
     part = theta / size[..., None, None]
     a, b = pairs(theta.shape[-1])
     straight = part[:, :, None, a[:, None], a] * part[:, None, :, b[:, None], b]
@@ -61,7 +61,7 @@ def array_moment_covariance(made_of: Composition, theta: Tensor, shape: Tensor, 
     return covariance.view(-1, records.n_levels, records.n_levels, len(a), len(a)).transpose(2, 3)
 
 
-def _table(made_of: Composition, size: Tensor, shape: Tensor, records: SampleDesign) -> Tensor:
+def _table(structure: ModelStructure, size: Tensor, shape: Tensor, records: SampleDesign) -> Tensor:
     """`Q` of processes of these sizes, `(item, process, process, level, level)`.
 
     A sum of two processes has `V = 2 (Q_kk + Q_mm + 2 Q_km)`. Of their true sizes, so that what a small process loses
@@ -72,7 +72,7 @@ def _table(made_of: Composition, size: Tensor, shape: Tensor, records: SampleDes
     chosen = torch.zeros(len(first), n_processes, dtype=size.dtype, device=size.device)
     chosen[torch.arange(len(first)), first] = 1
     chosen[torch.arange(len(first)), second] = 1
-    model = made_of.model(size[:, None] * chosen, shape[:, None].expand(-1, len(first), -1))
+    model = structure.model(size[:, None] * chosen, shape[:, None].expand(-1, len(first), -1))
     sums = records.covariance(model)  # (item, pair of processes, level, level)
     table = sums.new_empty(len(size), n_processes, n_processes, records.n_levels, records.n_levels)
     table[:, first, second] = table[:, second, first] = sums

@@ -22,7 +22,7 @@ from gyrofuse.fitting.array.inference import (
 )
 from gyrofuse.fitting.array.moments import vech
 from gyrofuse.fitting.moments.records import SampleDesign
-from gyrofuse.fitting.structure import Composition
+from gyrofuse.fitting.structure import ModelStructure
 from gyrofuse.fusion.weights.subsets import subset_weights
 from gyrofuse.fusion.weights.svo import ScaleWeights
 from gyrofuse.noise.array_model import ArrayModel
@@ -126,7 +126,7 @@ class ArrayGMWMResult(Result):
         fit: ArrayFit,
         squared: Tensor,
         held_sd: Tensor,
-        made_of: Composition,
+        structure: ModelStructure,
         usable: Tensor,
         records: SampleDesign,
         wavelet_cross_covariance: Tensor,
@@ -138,7 +138,7 @@ class ArrayGMWMResult(Result):
             fit: Fit of the arrays in units of their sensors.
             squared: Units of the entries of their matrices, `(item, 1, sensor, sensor)`.
             held_sd: Standard errors of frequencies that the moments did not fit, `(item, sinusoid)`.
-            made_of: Structure of the model.
+            structure: Structure of the model.
             usable: Which arrays of all they are, `(item,)`, bool.
             records: Length and levels of the records.
             wavelet_cross_covariance: Measured, of all arrays, `(..., level, sensor, sensor)`.
@@ -149,16 +149,16 @@ class ArrayGMWMResult(Result):
         def placed(value: Tensor, missing: float | bool = torch.nan) -> Tensor:
             return scattered(value, usable, batch, missing)
 
-        identified = identified_matrices(fit, made_of, records.longest)
+        identified = identified_matrices(fit, structure, records.longest)
         entries, correlation = matrices(fit, identified, rest["confidence_level"])
-        params = shared(fit, identified, held_sd, made_of, rest["confidence_level"])
+        params = shared(fit, identified, held_sd, structure, rest["confidence_level"])
         theta = entries.value * squared
-        columns = made_of.columns(records.tau.to(squared), fit.shape)
+        columns = structure.columns(records.tau.to(squared), fit.shape)
         # A scaled chi-square of the same mean and variance.
         p_value = chi_square_tail(fit.objective / fit.dispersion, fit.dof / fit.dispersion)
-        names = Model(list(made_of.processes)).param_names
+        names = Model(list(structure.processes)).param_names
         return cls(
-            processes=made_of.processes,
+            processes=structure.processes,
             theta=placed(theta),
             theta_std_err=placed(entries.std_err * squared),
             confidence_interval=ConfidenceInterval(placed(entries.low * squared), placed(entries.high * squared)),
@@ -168,7 +168,7 @@ class ArrayGMWMResult(Result):
             params=placed(params.value),
             params_std_err=placed(params.std_err),
             params_interval=ConfidenceInterval(placed(params.low), placed(params.high)),
-            param_cov=placed(covariance_of_numbers(fit, vech(squared), params.std_err, made_of)),
+            param_cov=placed(covariance_of_numbers(fit, vech(squared), params.std_err, structure)),
             objective=placed(fit.objective),
             dof=placed(fit.dof.to(theta)),
             p_value=placed(p_value),
@@ -238,7 +238,7 @@ class ArrayGMWMResult(Result):
 
     def summary(self) -> str:
         """Deviations of the sensors by process with intervals, largest correlations, and the fit."""
-        name = Composition(self.processes, held=True).name
+        name = ModelStructure(self.processes, held=True).name
         levels, n_sensors = self.wavelet_cross_covariance.shape[-3:-1]
         head = f"GMWM fit of an array, {name}: {counted(n_sensors, 'sensor')}, {self.n_samples} samples, "
         head += counted(levels, "level")
@@ -300,8 +300,8 @@ class ArrayGMWMResult(Result):
     def _of_present(self) -> Tensor:
         """Which numbers of the model are those of sensors that have samples, `(number,)`."""
         both = vech(self._present()[:, None] & self._present())
-        shaped = [any(name in process.parameters for name in ("phi", "beta")) for process in self.processes]
-        return torch.cat([torch.cat([both, both.new_ones(int(is_shaped))]) for is_shaped in shaped])
+        nonlinear = [any(name in process.parameters for name in ("phi", "beta")) for process in self.processes]
+        return torch.cat([torch.cat([both, both.new_ones(int(is_shaped))]) for is_shaped in nonlinear])
 
     def _notes(self, index: tuple[int, ...]) -> tuple[str, ...]:
         n_sensors = self.theta.shape[-1]

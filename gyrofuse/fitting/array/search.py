@@ -12,14 +12,14 @@ from torch import Tensor
 from gyrofuse._base.optimize import Trial, descend
 from gyrofuse.fitting.array.moments import pairs, unvech, vech
 from gyrofuse.fitting.moments import search
-from gyrofuse.fitting.structure import Composition
+from gyrofuse.fitting.structure import ModelStructure
 
 
 def step_downhill(
     gamma: Tensor,
     weight: Tensor,
     tau: Tensor,
-    made_of: Composition,
+    structure: ModelStructure,
     root: Tensor,
     shape: Tensor,
     exact: bool,
@@ -34,7 +34,7 @@ def step_downhill(
         gamma: Moments `(item, level, pair)` of unit size; those without weight may be anything finite.
         weight: `W`, `(item, moment, moment)`.
         tau: `(level,)`.
-        made_of: Structure of the model.
+        structure: Structure of the model.
         root: `S`, `(item, process, sensor, sensor)`.
         shape: `x`, `(item, shaped)`.
         exact: Whether all second derivatives are used, which also leave saddles; else those that are never negative,
@@ -47,10 +47,10 @@ def step_downhill(
     Returns:
         `S` and `x`, as they were where no step leads downhill.
     """
-    moving = [made_of.shaped.index(k) for k in made_of.curved]
-    low, high = (ends[moving] for ends in search.limits(made_of, tau, shape))
-    distance = _distance(gamma, weight, tau, made_of, root, shape)
-    gradient, bends, size = _quadratic(gamma, weight, tau, made_of, root, shape, exact)
+    moving = [structure.nonlinear.index(k) for k in structure.free_nonlinear]
+    low, high = (ends[moving] for ends in search.limits(structure, tau, shape))
+    distance = _distance(gamma, weight, tau, structure, root, shape)
+    gradient, bends, size = _quadratic(gamma, weight, tau, structure, root, shape, exact)
     # What no moment depends on does not move.
     unit = torch.where(size > 0, size, 1.0).rsqrt()
     scaled = unit[..., :, None] * bends * unit[..., None, :]
@@ -69,13 +69,13 @@ def step_downhill(
         tried = at + _in_basis(step[:, :n_linear].unflatten(-1, (at.shape[1], -1)))
         moved = x.clone()
         moved[:, moving] = (x[:, moving] + step[:, n_linear:].clamp(-longest_step, longest_step)).clamp(low, high)
-        new = _distance(gamma[todo], weight[todo], tau, made_of, tried, moved)
+        new = _distance(gamma[todo], weight[todo], tau, structure, tried, moved)
         return Trial((tried, moved), new, new <= old, new <= old)
 
     # The damping rises until a step leads downhill, at most to 100 times the curvatures.
     start = torch.where(finite, distance, torch.nan)
     (root, shape), _, _ = descend((root, shape), start, attempt, n_steps=5, ease=1, tighten=100, damping=undamped)
-    return square_root(root @ root, least / made_of.columns(tau, shape).amax(-2)), shape
+    return square_root(root @ root, least / structure.columns(tau, shape).amax(-2)), shape
 
 
 def square_root(theta: Tensor, least: Tensor) -> Tensor:
@@ -84,25 +84,27 @@ def square_root(theta: Tensor, least: Tensor) -> Tensor:
     return (vectors * torch.maximum(values, least[..., None]).sqrt()[..., None, :]) @ vectors.mT
 
 
-def _distance(gamma: Tensor, weight: Tensor, tau: Tensor, made_of: Composition, root: Tensor, shape: Tensor) -> Tensor:
-    residual = (gamma - made_of.columns(tau, shape) @ vech(root @ root)).flatten(1)
+def _distance(
+    gamma: Tensor, weight: Tensor, tau: Tensor, structure: ModelStructure, root: Tensor, shape: Tensor
+) -> Tensor:
+    residual = (gamma - structure.columns(tau, shape) @ vech(root @ root)).flatten(1)
     return ((weight @ residual[..., None])[..., 0] * residual).sum(-1)
 
 
-def jacobian(tau: Tensor, made_of: Composition, theta: Tensor, shape: Tensor) -> Tensor:
+def jacobian(tau: Tensor, structure: ModelStructure, theta: Tensor, shape: Tensor) -> Tensor:
     """Derivatives of the moments by the entries of `Theta` and by `x`, `(item, moment, unknown)`."""
     n_items, n_pairs = len(theta), vech(theta).shape[-1]
-    values = made_of.columns(tau, shape)
+    values = structure.columns(tau, shape)
     eye = torch.eye(n_pairs, dtype=theta.dtype, device=theta.device)
     linear = torch.einsum("njk,qr->njqkr", values, eye).reshape(n_items, len(tau) * n_pairs, -1)
-    moving = [made_of.shaped.index(k) for k in made_of.curved]
-    slopes = made_of.slopes(tau, shape)[..., moving]
-    curved = torch.einsum("njs,nsq->njqs", slopes, vech(theta)[:, made_of.curved]).flatten(1, 2)
-    return torch.cat([linear, curved], -1)
+    moving = [structure.nonlinear.index(k) for k in structure.free_nonlinear]
+    slopes = structure.slopes(tau, shape)[..., moving]
+    free_nonlinear = torch.einsum("njs,nsq->njqs", slopes, vech(theta)[:, structure.free_nonlinear]).flatten(1, 2)
+    return torch.cat([linear, free_nonlinear], -1)
 
 
 def _quadratic(
-    gamma: Tensor, weight: Tensor, tau: Tensor, made_of: Composition, root: Tensor, shape: Tensor, exact: bool
+    gamma: Tensor, weight: Tensor, tau: Tensor, structure: ModelStructure, root: Tensor, shape: Tensor, exact: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Half of the gradient downhill and of the second derivatives, by `S` in the basis and by `x`, item by item.
 
@@ -112,8 +114,8 @@ def _quadratic(
     n_items, n_levels, n_pairs = gamma.shape
     n_processes = root.shape[1]
     theta = vech(root @ root)
-    moving = [made_of.shaped.index(k) for k in made_of.curved]
-    values, slopes = made_of.columns(tau, shape), made_of.slopes(tau, shape)[..., moving]
+    moving = [structure.nonlinear.index(k) for k in structure.free_nonlinear]
+    values, slopes = structure.columns(tau, shape), structure.slopes(tau, shape)[..., moving]
     residual = gamma - values @ theta
     weighted = (weight @ residual.flatten(1)[..., None]).view_as(gamma)
     both = torch.cat([values, slopes], -1)  # (item, level, k), k: processes, then shapes
@@ -126,10 +128,10 @@ def _quadratic(
     side = root[:, :, None] @ _basis(root)
     free = _free(weight, n_pairs)
     moves = vech(side + side.mT).mT * free[:, None, None]
-    along = theta[:, made_of.curved]
+    along = theta[:, structure.free_nonlinear]
     linear = torch.einsum("nkqa,nkqmr,nmrb->nkamb", moves, full[:, :n_processes, :, :n_processes], moves)
     mixed = torch.einsum("nkqa,nkqsr,nsr->nkas", moves, full[:, :n_processes, :, n_processes:], along)
-    curved = torch.einsum("nsq,nsqtr,ntr->nst", along, full[:, n_processes:, :, n_processes:], along)
+    free_nonlinear = torch.einsum("nsq,nsqtr,ntr->nst", along, full[:, n_processes:, :, n_processes:], along)
     gradient = torch.cat(
         [
             torch.einsum("nkqa,nkq->nka", moves, downhill[:, :n_processes]).flatten(1),
@@ -138,17 +140,17 @@ def _quadratic(
         -1,
     )
     both_free = (free[:, :, None] * free[:, None])[:, None]
-    plain = torch.cat([torch.einsum("nkaka->nka", linear).flatten(1), torch.einsum("nss->ns", curved)], -1)
+    plain = torch.cat([torch.einsum("nkaka->nka", linear).flatten(1), torch.einsum("nss->ns", free_nonlinear)], -1)
     linear.diagonal(dim1=1, dim2=3).add_((_bend(root, downhill[:, :n_processes], exact) * both_free).movedim(1, -1))
     if exact:
-        for at, k in enumerate(made_of.curved):
+        for at, k in enumerate(structure.free_nonlinear):
             mixed[:, k, :, at] -= torch.einsum("nqa,nq->na", moves[:, k], downhill[:, n_processes + at])
         apart = 1e-4  # in `x`, of the two slopes: rounding and the third derivative both leave 1e-8 of the second
-        ahead, behind = (made_of.slopes(tau, shape + sign * apart)[..., moving] for sign in (1, -1))
+        ahead, behind = (structure.slopes(tau, shape + sign * apart)[..., moving] for sign in (1, -1))
         second = (ahead - behind) / (2 * apart)
-        curved.diagonal(dim1=1, dim2=2).sub_((along * (second.mT @ weighted)).sum(-1))
+        free_nonlinear.diagonal(dim1=1, dim2=2).sub_((along * (second.mT @ weighted)).sum(-1))
     top = torch.cat([linear.flatten(3).flatten(1, 2), mixed.flatten(1, 2)], -1)
-    bends = torch.cat([top, torch.cat([mixed.flatten(1, 2).mT, curved], -1)], -2)
+    bends = torch.cat([top, torch.cat([mixed.flatten(1, 2).mT, free_nonlinear], -1)], -2)
     return gradient, bends, torch.maximum(plain, bends.diagonal(dim1=-2, dim2=-1).abs())
 
 

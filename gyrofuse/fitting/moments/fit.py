@@ -8,7 +8,7 @@ from torch import Tensor
 from gyrofuse.fitting.moments import search
 from gyrofuse.fitting.moments.inference import Fit
 from gyrofuse.fitting.moments.records import SampleDesign
-from gyrofuse.fitting.structure import Composition
+from gyrofuse.fitting.structure import ModelStructure
 from gyrofuse.noise.parsing import parse_model
 from gyrofuse.noise.processes import Model, Process, Sinusoid
 
@@ -22,7 +22,7 @@ def fit_batch(
     nu: Tensor,
     frequencies: tuple[Tensor, Tensor] | None,
     records: SampleDesign,
-    made_of: Composition,
+    structure: ModelStructure,
     omega: str | Tensor,
     *,
     n_distinct: int = 3,
@@ -35,7 +35,7 @@ def fit_batch(
         frequencies: `beta` of the sinusoids and its standard error where the moments do not fit it, `(item, sinusoid)`,
             from high to low; None where they do.
         records: Lengths and levels of the records.
-        made_of: Structure of the model.
+        structure: Structure of the model.
         omega: Weights `(level,)` or `(level, level)`, or `"optimal"` or `"diagonal"`.
         n_distinct: Number of distinct minima that are followed to the weights of the fit.
         n_polishing: Largest number of steps of the best of them; flat valleys need some hundreds.
@@ -52,7 +52,7 @@ def fit_batch(
     held = Sinusoid.to_unconstrained(beta.to(nu))
     own = omega.to(nu) if isinstance(omega, Tensor) else None
     weight = observations / nu.square() if own is None else (own if own.ndim == 1 else own.diagonal()).expand_as(nu)
-    start = search.starting_points(nu, weight, tau, made_of, held, n_starts_for(made_of))  # (item, start, shaped)
+    start = search.starting_points(nu, weight, tau, structure, held, n_starts_for(structure))  # (item, start, shaped)
     n_starts = start.shape[1]
 
     def each(value: Tensor, n: int) -> Tensor:
@@ -60,10 +60,10 @@ def fit_batch(
 
     root = weight.sqrt() if own is None or own.ndim == 1 else torch.linalg.cholesky(own).mT.expand(n_items, -1, -1)
     linear, x, objective, _ = search.minimise(
-        each(nu, n_starts), each(root, n_starts), tau, made_of, start.flatten(0, 1)
+        each(nu, n_starts), each(root, n_starts), tau, structure, start.flatten(0, 1)
     )
     if own is None:
-        linear, x, objective = reweighted(each(nu, n_starts), observations, tau, made_of, linear, x)
+        linear, x, objective = reweighted(each(nu, n_starts), observations, tau, structure, linear, x)
     kept = search.distinct(objective.view(n_items, -1), x.view(n_items, n_starts, -1), n_distinct)
     n_kept = kept.shape[1]
     chosen = (torch.arange(n_items, device=nu.device)[:, None] * n_starts + kept).flatten()
@@ -71,23 +71,25 @@ def fit_batch(
     passed = []
     if own is None:
         for _ in range(N_REWEIGHTINGS):
-            root = _root(records.covariance(made_of.model(linear, x)), omega)
-            passed.append(objective_of(each(nu, n_kept), root, tau, made_of, linear, x))
-            linear, x, distance, _ = search.minimise(each(nu, n_kept), root, tau, made_of, x)
+            root = _root(records.covariance(structure.model(linear, x)), omega)
+            passed.append(objective_of(each(nu, n_kept), root, tau, structure, linear, x))
+            linear, x, distance, _ = search.minimise(each(nu, n_kept), root, tau, structure, x)
         objective = distance - _log_det(root)
     best = objective.view(n_items, n_kept).nan_to_num(nan=torch.inf).argmin(-1)
     best = best + n_kept * torch.arange(n_items, device=nu.device)
     root = root[best] if own is None else root
-    linear, x, _, reached = search.minimise(nu, root, tau, made_of, x[best], n_polishing)
+    linear, x, _, reached = search.minimise(nu, root, tau, structure, x[best], n_polishing)
     if own is None:
-        final = objective_of(nu, _root(records.covariance(made_of.model(linear, x)), omega), tau, made_of, linear, x)
+        final = objective_of(
+            nu, _root(records.covariance(structure.model(linear, x)), omega), tau, structure, linear, x
+        )
         least = torch.stack([value.view(n_items, n_kept).amin(-1) for value in passed]).amin(0)
         oscillating = final > least + len(tau)
         if bool(oscillating.any()):
             linear[oscillating], x[oscillating], reached[oscillating] = relaxed_gmm(
-                nu[oscillating], records, made_of, omega, linear[oscillating], x[oscillating]
+                nu[oscillating], records, structure, omega, linear[oscillating], x[oscillating]
             )
-    linear, x = made_of.ordered(linear, x)
+    linear, x = structure.ordered(linear, x)
     return Fit(
         variance=nu * size,
         linear=linear * size,
@@ -100,7 +102,7 @@ def fit_batch(
 
 
 def reweighted(
-    nu: Tensor, observations: Tensor, tau: Tensor, made_of: Composition, linear: Tensor, x: Tensor
+    nu: Tensor, observations: Tensor, tau: Tensor, structure: ModelStructure, linear: Tensor, x: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Fits with independent levels, whose weights are those of the fit before.
 
@@ -110,7 +112,7 @@ def reweighted(
         nu: Wavelet variances over the largest, `(problem, level)`.
         observations: Degrees of freedom of each level, `(level,)`.
         tau: Filter lengths, `(level,)`.
-        made_of: Structure of the model.
+        structure: Structure of the model.
         linear: `p` of the first fit, `(problem, process)`.
         x: Its nonlinear parameters, `(problem, shaped)`.
 
@@ -120,16 +122,16 @@ def reweighted(
     """
     least, most_weight = 1e-30, 1e15  # of a fitted variance, and of a root weight: their squares stay in range
     for _ in range(N_REWEIGHTINGS):
-        fitted = made_of.wavelet_variance(tau, linear, x)
+        fitted = structure.wavelet_variance(tau, linear, x)
         root = (observations.sqrt() / fitted.clamp(min=least)).clamp(max=most_weight)
-        linear, x, distance, _ = search.minimise(nu, root, tau, made_of, x)
+        linear, x, distance, _ = search.minimise(nu, root, tau, structure, x)
     return linear, x, distance - _log_det(root)
 
 
 def relaxed_gmm(
     nu: Tensor,
     records: SampleDesign,
-    made_of: Composition,
+    structure: ModelStructure,
     omega: str | Tensor,
     linear: Tensor,
     x: Tensor,
@@ -143,7 +145,7 @@ def relaxed_gmm(
     Args:
         nu: Wavelet variances over the largest, `(item, level)`.
         records: Lengths and levels of the records.
-        made_of: Structure of the model.
+        structure: Structure of the model.
         omega: `"optimal"` or `"diagonal"`.
         linear: `p` to start from, `(item, process)`.
         x: `x` to start from, `(item, shaped)`.
@@ -157,28 +159,30 @@ def relaxed_gmm(
     """
     tau = records.tau.to(nu)
     for _ in range(n_rounds):
-        before = made_of.wavelet_variance(tau, linear, x)
-        root = _root(records.covariance(made_of.model(linear, x)), omega)
-        whole_linear, whole_x, _, _ = search.minimise(nu, root, tau, made_of, x, n_steps=5)
-        moved = (made_of.wavelet_variance(tau, whole_linear, whole_x) / before - 1).abs().amax(-1)
+        before = structure.wavelet_variance(tau, linear, x)
+        root = _root(records.covariance(structure.model(linear, x)), omega)
+        whole_linear, whole_x, _, _ = search.minimise(nu, root, tau, structure, x, n_steps=5)
+        moved = (structure.wavelet_variance(tau, whole_linear, whole_x) / before - 1).abs().amax(-1)
         if bool((moved < at_rest).all()):
             break
         linear, x = linear.lerp(whole_linear, relaxation), x.lerp(whole_x, relaxation)
     return whole_linear, whole_x, moved < at_rest
 
 
-def objective_of(target: Tensor, root: Tensor, tau: Tensor, made_of: Composition, linear: Tensor, x: Tensor) -> Tensor:
+def objective_of(
+    target: Tensor, root: Tensor, tau: Tensor, structure: ModelStructure, linear: Tensor, x: Tensor
+) -> Tensor:
     """`r' V^-1 r + ln det V`, `(problem,)`: a V too large would make its own fit look good.
 
     Args:
         target: Wavelet variances `(problem, level)`.
         root: `W` with `W' W = V^-1`, `(problem, level, level)`, or `(problem, level)` where it is diagonal.
         tau: Filter lengths, `(level,)`.
-        made_of: Structure of the model.
+        structure: Structure of the model.
         linear: `p`, `(problem, process)`.
         x: `x`, `(problem, shaped)`.
     """
-    residual = target - made_of.wavelet_variance(tau, linear, x)
+    residual = target - structure.wavelet_variance(tau, linear, x)
     whitened = root * residual if root.ndim == 2 else (root @ residual[..., None])[..., 0]
     return whitened.square().sum(-1) - _log_det(root)
 
@@ -192,13 +196,16 @@ def _root(covariance: Tensor, omega: str | Tensor) -> Tensor:
     return covariance.diagonal(dim1=-2, dim2=-1).rsqrt() if omega == "diagonal" else search.whitening(covariance)
 
 
-def n_starts_for(made_of: Composition) -> int:
+def n_starts_for(structure: ModelStructure) -> int:
     """Number of starting points: as many as found the lowest minimum of noisy copies every time."""
-    tones = sum(made_of.processes[k].has_line for k in made_of.curved)
-    return min(4 * 4 ** (len(made_of.curved) - 1) if tones else (1, 4, 6, 8)[min(len(made_of.curved), 3)], 32)
+    tones = sum(structure.processes[k].has_line for k in structure.free_nonlinear)
+    return min(
+        4 * 4 ** (len(structure.free_nonlinear) - 1) if tones else (1, 4, 6, 8)[min(len(structure.free_nonlinear), 3)],
+        32,
+    )
 
 
-def composition_of(model: Model | str, held: bool) -> Composition:
+def composition_of(model: Model | str, held: bool) -> ModelStructure:
     """Structure of a model without values.
 
     Args:
@@ -221,4 +228,4 @@ def composition_of(model: Model | str, held: bool) -> Composition:
     # Processes of a kind side by side, in the order in which the kinds first appear.
     kinds = list(dict.fromkeys(map(type, model.processes)))
     processes: list[Process] = sorted(model.processes, key=lambda p: kinds.index(type(p)))
-    return Composition(tuple(processes), held)
+    return ModelStructure(tuple(processes), held)

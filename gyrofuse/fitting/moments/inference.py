@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.fitting.moments.records import SampleDesign
-from gyrofuse.fitting.structure import Composition
+from gyrofuse.fitting.structure import ModelStructure
 from gyrofuse.noise.processes import Sinusoid
 from gyrofuse.wavelets.intervals import chi_square_tail, normal_quantile
 
@@ -106,30 +106,30 @@ def either(condition: Tensor, one: Any, other: Any) -> Any:
     return type(one)(*(either(condition, *pair) for pair in pairs))
 
 
-def infer(fit: Fit, made_of: Composition, confidence_level: float) -> Inference:
+def infer(fit: Fit, structure: ModelStructure, confidence_level: float) -> Inference:
     """Sandwich covariance `(A' O A)^-1 A' O V O A (A' O A)^-1`, `A = d nu / d theta` ([V] theorem 2), and the J test.
 
     Args:
         fit: Fit of the moments.
-        made_of: Structure of the model.
+        structure: Structure of the model.
         confidence_level: Probability that an interval holds the true value.
     """
-    own = _residual_of(fit, made_of)
+    own = _residual_of(fit, structure)
     # Jacobian by p, and by x of the unknown shapes: (item, level, unknown)
-    moving = [made_of.shaped.index(k) for k in made_of.curved]
+    moving = [structure.nonlinear.index(k) for k in structure.free_nonlinear]
     jacobian = torch.cat([own.values, own.slopes[..., moving]], -1)
     present = fit.linear > 0  # (item, process)
-    active = torch.cat([present, present[:, made_of.curved]], -1)
+    active = torch.cat([present, present[:, structure.free_nonlinear]], -1)
     spread = sandwich(jacobian, active, own.covariance, own.weight)
     # Standard errors of variances at zero, if they could be negative.
-    free = torch.cat([torch.ones_like(present), present[:, made_of.curved]], -1)
+    free = torch.cat([torch.ones_like(present), present[:, structure.free_nonlinear]], -1)
     edge = sandwich(jacobian, free, own.covariance, own.weight)
     estimates = estimated(
-        made_of,
+        structure,
         fit.linear,
         fit.shape,
-        _in_logs(spread, fit, made_of),
-        edge.diagonal(dim1=-2, dim2=-1)[:, : made_of.n_linear].clamp(min=0).sqrt(),
+        _in_logs(spread, fit, structure),
+        edge.diagonal(dim1=-2, dim2=-1)[:, : structure.n_linear].clamp(min=0).sqrt(),
         confidence_level,
     )
     dof = (len(fit.tau) - active.sum(-1)).to(own.j_statistic)
@@ -137,7 +137,7 @@ def infer(fit: Fit, made_of: Composition, confidence_level: float) -> Inference:
 
 
 def infer_efficient(
-    fit: Fit, made_of: Composition, spread: Tensor, edge_sd: Tensor, confidence_level: float
+    fit: Fit, structure: ModelStructure, spread: Tensor, edge_sd: Tensor, confidence_level: float
 ) -> Inference:
     """Inference at efficient estimates, which are no minimum of the moments' objective.
 
@@ -147,7 +147,7 @@ def infer_efficient(
 
     Args:
         fit: Moments, and the estimates in the place of the minimum.
-        made_of: Structure of the model.
+        structure: Structure of the model.
         spread: `S`, of `ln p` of all processes and `x` of all shaped ones, `(item, unknown, unknown)`; what is not
             known of it takes nothing from the residuals, so that the test refuses too seldom.
         edge_sd: As in `estimated`.
@@ -156,14 +156,14 @@ def infer_efficient(
     References:
         J. A. Hausman, Econometrica 46, 1978.
     """
-    own = _residual_of(fit, made_of)
+    own = _residual_of(fit, structure)
     jacobian = torch.cat([own.values * fit.linear[:, None], own.slopes], -1)
     moved = torch.linalg.solve_triangular(own.root, jacobian, upper=False)
     part = moved @ spread.nan_to_num(nan=0.0, posinf=0.0) @ moved.mT
     taken = torch.linalg.eigvalsh(torch.where(own.j_statistic.isfinite()[:, None, None], part, 0.0)).clamp(0, 1)
     dof = (1 - taken).sum(-1)
     dispersion = (1 - taken).square().sum(-1) / dof
-    estimates = estimated(made_of, fit.linear, fit.shape, spread, edge_sd, confidence_level)
+    estimates = estimated(structure, fit.linear, fit.shape, spread, edge_sd, confidence_level)
     return Inference(estimates, own.fitted, own.objective, own.j_statistic, dof, dispersion, fit.converged)
 
 
@@ -192,17 +192,17 @@ class _MomentResidual:
     slopes: Tensor
 
 
-def _residual_of(fit: Fit, made_of: Composition) -> _MomentResidual:
-    values, slopes = made_of.columns(fit.tau, fit.shape), made_of.slopes(fit.tau, fit.shape)
+def _residual_of(fit: Fit, structure: ModelStructure) -> _MomentResidual:
+    values, slopes = structure.columns(fit.tau, fit.shape), structure.slopes(fit.tau, fit.shape)
     fitted = (values @ fit.linear[..., None])[..., 0]
-    covariance = fit.records.covariance(made_of.model(fit.linear, fit.shape))
+    covariance = fit.records.covariance(structure.model(fit.linear, fit.shape))
     residual = fit.variance - fitted
     root, failed = torch.linalg.cholesky_ex(covariance)
     whitened = torch.linalg.solve_triangular(root, residual[..., None], upper=False)[..., 0]
     j_statistic = torch.where(failed > 0, torch.nan, whitened.square().sum(-1))
     weight = _weight(fit.omega, covariance)
     objective = quadratic(residual, weight)
-    slopes = slopes * fit.linear[:, None, made_of.shaped]
+    slopes = slopes * fit.linear[:, None, structure.nonlinear]
     return _MomentResidual(fitted, covariance, root, weight, objective, j_statistic, values, slopes)
 
 
@@ -218,17 +218,17 @@ def _weight(omega: str | Tensor, covariance: Tensor) -> Tensor:
     return torch.linalg.inv_ex(covariance)[0]
 
 
-def _in_logs(own: Tensor, fit: Fit, made_of: Composition) -> Tensor:
+def _in_logs(own: Tensor, fit: Fit, structure: ModelStructure) -> Tensor:
     """Covariance `(item, unknown, unknown)` of `ln p` of all processes and `x` of all shaped ones, held ones too."""
-    n_linear, shaped = made_of.n_linear, made_of.shaped
+    n_linear, nonlinear = structure.n_linear, structure.nonlinear
     scale = torch.where(fit.linear > 0, fit.linear.clamp(min=1e-300).reciprocal(), 0.0)
     scale = torch.cat([scale, torch.ones_like(own[:, n_linear:, 0])], -1)
-    place = [*range(n_linear), *(n_linear + shaped.index(k) for k in made_of.curved)]
-    size = n_linear + len(shaped)
+    place = [*range(n_linear), *(n_linear + nonlinear.index(k) for k in structure.free_nonlinear)]
+    size = n_linear + len(nonlinear)
     spread = own.new_zeros(len(own), size, size)
     index = torch.tensor(place, device=own.device)
     spread[:, index[:, None], index] = own * scale[:, :, None] * scale[:, None, :]
-    held = [n_linear + at for at, k in enumerate(shaped) if k not in made_of.curved]
+    held = [n_linear + at for at, k in enumerate(nonlinear) if k not in structure.free_nonlinear]
     if held:
         slope = Sinusoid.unconstrained_slope(fit.shape[:, [at - n_linear for at in held]])
         spread[:, held, held] = (fit.held_sd / slope).square()
@@ -236,7 +236,7 @@ def _in_logs(own: Tensor, fit: Fit, made_of: Composition) -> Tensor:
 
 
 def estimated(
-    made_of: Composition, linear: Tensor, shape: Tensor, spread: Tensor, edge_sd: Tensor, confidence_level: float
+    structure: ModelStructure, linear: Tensor, shape: Tensor, spread: Tensor, edge_sd: Tensor, confidence_level: float
 ) -> Estimates:
     """Parameters with intervals that respect their ranges.
 
@@ -245,7 +245,7 @@ def estimated(
     any `phi`.
 
     Args:
-        made_of: Structure of the model.
+        structure: Structure of the model.
         linear: `p`, `(item, process)`.
         shape: `x`, `(item, shaped)`.
         spread: Covariance of `ln p` of all processes and `x` of all shaped ones, `(item, unknown, unknown)`.
@@ -255,8 +255,8 @@ def estimated(
     z, one_sided = normal_quantile((1 + confidence_level) / 2), normal_quantile(confidence_level)
     sd = spread.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
     found: list[tuple[int, Tensor, Tensor, Tensor, Tensor]] = []  # unknown, low, high, slope, determined
-    at_shaped = made_of.n_linear
-    for k, process in enumerate(made_of.processes):
+    at_shaped = structure.n_linear
+    for k, process in enumerate(structure.processes):
         p, ratio = linear[:, k], sd[:, k]
         present = p > 0
         low = torch.where(present, p * torch.exp(-z * ratio), 0.0)
@@ -265,7 +265,7 @@ def estimated(
         if process.squared:  # p is the square of the parameter
             size = (k, low.sqrt(), high.sqrt(), p.sqrt() / 2, size[-1])
         if process.shape_name is not None:
-            x, width = shape[:, at_shaped - made_of.n_linear], sd[:, at_shaped]
+            x, width = shape[:, at_shaped - structure.n_linear], sd[:, at_shaped]
             # Without variance, or fewer than a few cycles of a tone, it may be anything.
             width = torch.where(present & width.isfinite(), width, torch.inf)
             known = width < WEAKLY_DETERMINED
@@ -278,7 +278,7 @@ def estimated(
     lows, highs, slopes, determined = (torch.stack(column, -1) for column in list(zip(*found, strict=True))[1:])
     index = torch.tensor([unknown for unknown, *_ in found], device=spread.device)
     covariance = spread[:, index[:, None], index] * slopes[:, :, None] * slopes[:, None, :]
-    return Estimates(made_of.params(linear, shape), covariance, lows, highs, determined)
+    return Estimates(structure.params(linear, shape), covariance, lows, highs, determined)
 
 
 def sandwich(jacobian: Tensor, active: Tensor, covariance: Tensor, weight: Tensor) -> Tensor:

@@ -22,7 +22,7 @@ from gyrofuse.fitting.moments import search
 from gyrofuse.fitting.moments.identifiability import ar1s_differ, weakly_identified
 from gyrofuse.fitting.moments.inference import WEAKLY_DETERMINED, Estimates, Fit, Inference
 from gyrofuse.fitting.moments.profile_objectives import MomentProfile, ProfileObjective
-from gyrofuse.fitting.structure import Composition
+from gyrofuse.fitting.structure import ModelStructure
 from gyrofuse.wavelets.intervals import normal_quantile
 
 # Nats by which the logarithm of a variance may fall below its estimate, or the largest one possible: e^-9, a ten
@@ -37,7 +37,7 @@ def profiled(
     inference: Inference,
     surface: ProfileObjective,
     fit: Fit,
-    made_of: Composition,
+    structure: ModelStructure,
     confidence_level: float,
     which: Tensor | None = None,
 ) -> Inference:
@@ -49,7 +49,7 @@ def profiled(
         inference: Estimates with symmetric intervals, and the J test.
         surface: Objective that was minimised.
         fit: Fit of the moments.
-        made_of: Structure of the model.
+        structure: Structure of the model.
         confidence_level: Probability that an interval holds the true value.
         which: Items that may change, `(item,)`, bool; all by default.
 
@@ -57,44 +57,50 @@ def profiled(
         Profile likelihood intervals: D. J. Venzon, S. H. Moolgavkar, Applied Statistics 37, 1988.
     """
     estimates, refused = inference.estimates, inference.refused
-    needed = weakly_identified(made_of, estimates, fit.records.longest, confidence_level)
-    needed |= _bent(surface, made_of, estimates, fit.tau, confidence_level)
+    needed = weakly_identified(structure, estimates, fit.records.longest, confidence_level)
+    needed |= _bent(surface, structure, estimates, fit.tau, confidence_level)
     needed &= estimates.params.isfinite().all(-1, keepdim=True)
     if fit.omega != "optimal" and isinstance(surface, MomentProfile):
         # The fit minimised another objective: an estimate that is not zero is no minimum of this one.
-        needed[:, : made_of.n_linear] &= fit.linear == 0
-        needed[:, made_of.n_linear :] = False
+        needed[:, : structure.n_linear] &= fit.linear == 0
+        needed[:, structure.n_linear :] = False
     if which is not None:
         needed &= which[:, None]
-    z = _quantiles(surface, made_of, needed, confidence_level)
-    in_order = ar1s_differ(made_of, estimates, confidence_level)
+    z = _quantiles(surface, structure, needed, confidence_level)
+    in_order = ar1s_differ(structure, estimates, confidence_level)
     low, high, determined = estimates.low.clone(), estimates.high.clone(), estimates.determined.clone()
     sds = estimates.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
-    for unknown, place in enumerate(made_of.places):
+    for unknown, place in enumerate(structure.places):
         items = needed[:, unknown].nonzero()[:, 0]
         if not len(items):
             continue
         own, sd = estimates.params[items, place], sds[items, place]
         if not surface.knows(unknown):
             # Amplitudes of sinusoids and slopes of drifts are nearly normal; one at zero keeps its limit.
-            measured = (unknown < made_of.n_linear) & (own > 0)
+            measured = (unknown < structure.n_linear) & (own > 0)
             low[items, place] = torch.where(measured, (own - z[items] * sd).clamp(min=0), low[items, place])
             high[items, place] = torch.where(measured, own + z[items] * sd, high[items, place])
             continue
-        if unknown < made_of.n_linear:
-            squared = made_of.processes[unknown].squared
+        if unknown < structure.n_linear:
+            squared = structure.processes[unknown].squared
             sd = sd / own * (2 if squared else 1)
             first, last = _variance_limits(
-                surface, items, unknown, sd, _largest_variance(fit, made_of, items, unknown), z[items], in_order[items]
+                surface,
+                items,
+                unknown,
+                sd,
+                _largest_variance(fit, structure, items, unknown),
+                z[items],
+                in_order[items],
             )
             width = (last / first).log()
             if squared:
                 first, last = first.sqrt(), last.sqrt()
         else:
-            at = unknown - made_of.n_linear
-            process = made_of.processes[made_of.shaped[at]]
+            at = unknown - structure.n_linear
+            process = structure.processes[structure.nonlinear[at]]
             sd = sd / process.unconstrained_slope(surface.shape[items, at])
-            least, most = (float(end[at]) for end in search.limits(made_of, fit.tau, fit.shape))
+            least, most = (float(end[at]) for end in search.limits(structure, fit.tau, fit.shape))
             first, last = _shape_limits(surface, items, unknown, sd, least, most, z[items], in_order[items])
             width = last - first
             first, last = (process.from_unconstrained(x) for x in (first, last))
@@ -108,7 +114,7 @@ def profiled(
 
 def _bent(
     surface: ProfileObjective,
-    made_of: Composition,
+    structure: ModelStructure,
     estimates: Estimates,
     tau: Tensor,
     confidence_level: float,
@@ -122,7 +128,7 @@ def _bent(
 
     Args:
         surface: Objective that was minimised.
-        made_of: Structure of the model.
+        structure: Structure of the model.
         estimates: Estimates with symmetric intervals.
         tau: Filter lengths, `(level,)`.
         confidence_level: Probability that an interval holds the true value.
@@ -133,20 +139,22 @@ def _bent(
         D. M. Bates, D. G. Watts, Nonlinear Regression Analysis and Its Applications, 1988, chapter 6.
     """
     z = normal_quantile((1 + confidence_level) / 2)
-    n_linear, linear, shape = made_of.n_linear, surface.linear, surface.shape
+    n_linear, linear, shape = structure.n_linear, surface.linear, surface.shape
     # Of ln p and x, from those of the parameters: sinusoids and drifts stay where they are.
-    still = [unknown for unknown in range(len(made_of.places)) if not surface.knows(unknown)]
+    still = [unknown for unknown in range(len(structure.places)) if not surface.knows(unknown)]
     x_scale = torch.ones_like(shape)
-    for at, k in enumerate(made_of.shaped):
-        process = made_of.processes[k]
+    for at, k in enumerate(structure.nonlinear):
+        process = structure.processes[k]
         x_scale[:, at] = 0.0 if process.has_line else process.unconstrained_slope(shape[:, at])
     scale = torch.cat([linear, x_scale], -1)
-    tones = [k for k, p in enumerate(made_of.processes) if not p.gaussian]
+    tones = [k for k, p in enumerate(structure.processes) if not p.gaussian]
     scale[:, [*still, *tones]] = 0.0
     inverse = torch.where(scale > 0, 1 / scale, 0.0)
-    spread = estimates.covariance[:, made_of.places][:, :, made_of.places] * inverse[:, :, None] * inverse[:, None, :]
+    spread = (
+        estimates.covariance[:, structure.places][:, :, structure.places] * inverse[:, :, None] * inverse[:, None, :]
+    )
     sd = spread.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
-    least, most = search.limits(made_of, tau, shape)
+    least, most = search.limits(structure, tau, shape)
     bent = torch.zeros_like(sd, dtype=torch.bool)
     for unknown in range(sd.shape[-1]):
         step = z * spread[:, unknown] / sd[:, unknown, None]
@@ -158,7 +166,7 @@ def _bent(
     return bent & (sd > 0)
 
 
-def _quantiles(surface: ProfileObjective, made_of: Composition, needed: Tensor, confidence_level: float) -> Tensor:
+def _quantiles(surface: ProfileObjective, structure: ModelStructure, needed: Tensor, confidence_level: float) -> Tensor:
     """Quantile `z` of the square root of the deviance increase, `(item,)`.
 
     An AR1 that may as well be absent leaves its `phi` unidentified: its two unknowns vanish together, and the deviance
@@ -167,19 +175,19 @@ def _quantiles(surface: ProfileObjective, made_of: Composition, needed: Tensor, 
     one, two = normal_quantile((1 + confidence_level) / 2), math.sqrt(-2 * math.log1p(-confidence_level))
     width = surface.linear.new_full((len(needed),), one)
     items = needed.any(-1).nonzero()[:, 0]
-    for k, process in enumerate(made_of.processes):
+    for k, process in enumerate(structure.processes):
         if process.has_memory() and len(items):
             absent = surface.rise(items, k, torch.zeros_like(width[items]))
             width[items[absent <= two**2]] = two
     return width
 
 
-def _largest_variance(fit: Fit, made_of: Composition, items: Tensor, k: int) -> Tensor:
+def _largest_variance(fit: Fit, structure: ModelStructure, items: Tensor, k: int) -> Tensor:
     """About the largest `p` that the wavelet variances allow, `(item,)`."""
     variance, shape = fit.variance[items], fit.shape[items]
-    if made_of.processes[k].alternates:
+    if structure.processes[k].alternates:
         return 2 * variance[:, 0]  # without memory
-    ratio = variance / made_of.columns(fit.tau, shape)[..., k].clamp(min=1e-300)
+    ratio = variance / structure.columns(fit.tau, shape)[..., k].clamp(min=1e-300)
     # The last levels may be small by chance.
     return ratio.sort(-1)[0][:, :3].amax(-1)
 

@@ -13,7 +13,7 @@ from gyrofuse.fitting.moments import search
 from gyrofuse.fitting.moments.inference import Fit
 from gyrofuse.fitting.spectral.bands import Bins, Noise
 from gyrofuse.fitting.spectral.search import deviance, maximise
-from gyrofuse.fitting.structure import Composition
+from gyrofuse.fitting.structure import ModelStructure
 
 # Gain, as a share of the objective or in nats, below which a profile needs no further step: 1e-3 of the `z^2` that it
 # is compared with.
@@ -57,30 +57,30 @@ class MomentProfile:
 
     Args:
         fit: Fit of the moments.
-        made_of: Structure of the model.
+        structure: Structure of the model.
     """
 
-    def __init__(self, fit: Fit, made_of: Composition) -> None:
+    def __init__(self, fit: Fit, structure: ModelStructure) -> None:
         self.linear, self.shape = fit.linear, fit.shape
         # Scaled so that no record is small to rounding.
         self._size = fit.variance.amax(-1)
         self._target, self._tau = fit.variance / self._size[:, None], fit.tau
-        self._made_of, self._records = made_of, fit.records
+        self._made_of, self._records = structure, fit.records
 
     def knows(self, unknown: int) -> bool:
         at = unknown - self._made_of.n_linear
-        return at < 0 or self._made_of.shaped[at] in self._made_of.curved
+        return at < 0 or self._made_of.nonlinear[at] in self._made_of.free_nonlinear
 
     def rise(self, items: Tensor, unknown: int, value: Tensor, in_order: Tensor | None = None) -> Tensor:
-        made_of, tau = self._made_of, self._tau
+        structure, tau = self._made_of, self._tau
         target, own_x = self._target[items], self.shape[items]
-        at = unknown - made_of.n_linear
+        at = unknown - structure.n_linear
         fixed, still = ((unknown, value / self._size[items]), None) if at < 0 else (None, at)
         weight = self._records.observations.to(target) / target.square()
         start = own_x[:, None]
-        if made_of.curved:
-            held = own_x[:, [i for i, k in enumerate(made_of.shaped) if k not in made_of.curved]]
-            others = search.starting_points(target, weight, tau, made_of, held, 2, fixed)
+        if structure.free_nonlinear:
+            held = own_x[:, [i for i, k in enumerate(structure.nonlinear) if k not in structure.free_nonlinear]]
+            others = search.starting_points(target, weight, tau, structure, held, 2, fixed)
             start = torch.cat([start, others], 1)
         if still is not None:
             start[..., still] = value[:, None]
@@ -90,18 +90,18 @@ class MomentProfile:
             linear, x, least = self._lowest(as_normal, root, x[:, None], 5, fixed, still)
         _, _, free = self._lowest(as_normal, root, torch.stack([x, own_x], 1), 5, None, None)
         if in_order is not None:
-            least = torch.where(in_order & ~_in_order(made_of, x), torch.inf, least)
+            least = torch.where(in_order & ~_in_order(structure, x), torch.inf, least)
         # With V of a fit that is far off the free one may be as bad: compare with the estimate and its own V then.
         own_linear = self.linear[items] / self._size[items, None]
         own, own_root = self._normal(target, own_linear, own_x)
-        off = (own_root @ (own - made_of.wavelet_variance(tau, own_linear, own_x))[..., None]).square().sum((-2, -1))
+        off = (own_root @ (own - structure.wavelet_variance(tau, own_linear, own_x))[..., None]).square().sum((-2, -1))
         return (least - free).maximum(least - off - len(tau)).clamp(min=0)
 
     def divergence(self, linear: Tensor, shape: Tensor) -> Tensor:
-        made_of, tau, size = self._made_of, self._tau, self._size[:, None]
-        exact = made_of.wavelet_variance(tau, self.linear / size, self.shape)
+        structure, tau, size = self._made_of, self._tau, self._size[:, None]
+        exact = structure.wavelet_variance(tau, self.linear / size, self.shape)
         as_normal, root = self._normal(exact, linear / size, shape)
-        residual = as_normal - made_of.wavelet_variance(tau, linear / size, shape)
+        residual = as_normal - structure.wavelet_variance(tau, linear / size, shape)
         return (root @ residual[..., None]).square().sum((-2, -1))
 
     def _normal(self, target: Tensor, linear: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -148,17 +148,17 @@ class SpectralProfile:
         shape: `x` there, `(item, shaped)`.
         energy: Sums of squared ordinates, `(item, bin)`.
         count: Ordinates, `(item, bin)`.
-        made_of: Structure of the model.
+        structure: Structure of the model.
         n_samples: Length T of the records.
     """
 
     def __init__(
-        self, linear: Tensor, shape: Tensor, energy: Tensor, count: Tensor, made_of: Composition, n_samples: int
+        self, linear: Tensor, shape: Tensor, energy: Tensor, count: Tensor, structure: ModelStructure, n_samples: int
     ) -> None:
         self.linear, self.shape = linear, shape
         self._energy, self._count = energy, count
-        self._noise, self._bins = Noise(made_of), Bins(n_samples, linear.device)
-        self._unknowns = [*self._noise.which, *(made_of.n_linear + at for at in self._noise.at_x)]
+        self._noise, self._bins = Noise(structure), Bins(n_samples, linear.device)
+        self._unknowns = [*self._noise.which, *(structure.n_linear + at for at in self._noise.at_x)]
         self._least = deviance(energy, count, self._bins, self._noise, *self._at(slice(None)))
         # AR1s of other minima: one that is nearly white, and one with a time constant of a thirtieth of the record.
         self._starts = [0.25, math.atanh(math.exp(-30 / n_samples))]
@@ -198,10 +198,10 @@ class SpectralProfile:
         return self.linear[items][:, self._noise.which], self.shape[items][:, self._noise.at_x]
 
 
-def _in_order(made_of: Composition, shape: Tensor) -> Tensor:
+def _in_order(structure: ModelStructure, shape: Tensor) -> Tensor:
     """Whether processes of each class with a memory go from slow to fast, `(item,)`."""
     in_order = torch.ones(len(shape), dtype=torch.bool, device=shape.device)
-    kinds = [type(made_of.processes[k]) for k in made_of.shaped]
+    kinds = [type(structure.processes[k]) for k in structure.nonlinear]
     for kind in {kind for kind in kinds if kind.has_memory()}:
         at = [at for at, other in enumerate(kinds) if other is kind]
         in_order &= (shape[:, at].diff(dim=-1) <= 0).all(-1)

@@ -15,7 +15,7 @@ from torch import Tensor
 from gyrofuse._base.chunks import items_at_once
 from gyrofuse._base.nnls import nonnegative_least_squares
 from gyrofuse._base.optimize import Trial, descend
-from gyrofuse.fitting.structure import Composition
+from gyrofuse.fitting.structure import ModelStructure
 from gyrofuse.noise.processes import Process
 
 
@@ -23,7 +23,7 @@ def starting_points(
     target: Tensor,
     weight: Tensor,
     tau: Tensor,
-    made_of: Composition,
+    structure: ModelStructure,
     held: Tensor,
     n_starts: int,
     fixed: tuple[int, Tensor] | None = None,
@@ -34,7 +34,7 @@ def starting_points(
         target: Wavelet variances, `(item, level)`.
         weight: Of each squared residual, `(item, level)`.
         tau: `(level,)`.
-        made_of: Structure of the model.
+        structure: Structure of the model.
         held: `x` of the sinusoids where these are held, `(item, sinusoid)`.
         n_starts: How many; fewer where the grid has fewer.
         fixed: A process, and its `p` `(item,)`; None where all are free.
@@ -42,12 +42,12 @@ def starting_points(
     Returns:
         `x` of the shaped processes, `(item, start, shaped)`.
     """
-    free = made_of.curved
+    free = structure.free_nonlinear
     n_items = len(target)
     if not free:
         return held[:, None]
     axes, blocks = [], []
-    for kind, group in itertools.groupby(free, key=lambda k: type(made_of.processes[k])):
+    for kind, group in itertools.groupby(free, key=lambda k: type(structure.processes[k])):
         grid = _grid(kind, tau)
         blocks.append(list(itertools.combinations(range(len(grid)), len(list(group)))))
         axes.append(grid)
@@ -55,10 +55,10 @@ def starting_points(
     which = [n for n, block in enumerate(blocks) for _ in block[0]]
     points = torch.stack([axes[n][torch.tensor([i[d] for i in index])] for d, n in enumerate(which)], -1).to(target)
     objective = []
-    for part in points.split(items_at_once(n_items * len(tau) * len(made_of.processes))):
+    for part in points.split(items_at_once(n_items * len(tau) * len(structure.processes))):
         # What does not differ between the items is computed once.
         n_own = n_items if held.shape[-1] else 1
-        values = made_of.columns(tau, _with_held(part[None].expand(n_own, -1, -1), held, made_of))
+        values = structure.columns(tau, _with_held(part[None].expand(n_own, -1, -1), held, structure))
         given = (fixed[0], fixed[1][:, None]) if fixed else None
         objective.append(_solve(values, target[:, None], weight.sqrt()[:, None], given)[1])
     cost = torch.cat(objective, -1)  # (item, point)
@@ -69,14 +69,14 @@ def starting_points(
         chosen.append(points[best])
         near = (place - place[best][:, None]).abs().amax(-1) <= 1
         cost = torch.where(near, torch.inf, cost)
-    return _with_held(torch.stack(chosen, 1), held, made_of)
+    return _with_held(torch.stack(chosen, 1), held, structure)
 
 
 def minimise(
     target: Tensor,
     root: Tensor,
     tau: Tensor,
-    made_of: Composition,
+    structure: ModelStructure,
     start: Tensor,
     n_steps: int = 30,
     *,
@@ -92,7 +92,7 @@ def minimise(
         target: `(problem, level)`.
         root: `W`, `(problem, level, level)`, or `(problem, level)` where it is diagonal.
         tau: `(level,)`.
-        made_of: Structure of the model.
+        structure: Structure of the model.
         start: `x`, `(problem, shaped)`.
         n_steps: At most so many steps.
         fixed: A process, and its `p` `(problem,)`; None where all are free.
@@ -104,17 +104,17 @@ def minimise(
     Returns:
         `p` `(problem, linear)`, `x` `(problem, shaped)`, the minimum `(problem,)` and whether it was reached.
     """
-    moving = [at for at in map(made_of.shaped.index, made_of.curved) if at != still]
-    linear, objective = _evaluate(target, root, tau, made_of, start, fixed)
+    moving = [at for at in map(structure.nonlinear.index, structure.free_nonlinear) if at != still]
+    linear, objective = _evaluate(target, root, tau, structure, start, fixed)
     if not moving:
         return linear, start.clone(), objective, torch.ones_like(objective, dtype=torch.bool)
-    low, high = (ends[moving] for ends in limits(made_of, tau, start))
+    low, high = (ends[moving] for ends in limits(structure, tau, start))
 
     def attempt(todo: Tensor, state: list[Tensor], old: Tensor, damping: Tensor) -> Trial:
         x, p = state
         y, w = target[todo], root[todo]
-        values, slope = made_of.columns(tau, x), made_of.slopes(tau, x)
-        jacobian = _times(w, slope * p[:, None, made_of.shaped])[..., moving]
+        values, slope = structure.columns(tau, x), structure.slopes(tau, x)
+        jacobian = _times(w, slope * p[:, None, structure.nonlinear])[..., moving]
         free = p > 0
         if fixed:
             free[:, fixed[0]] = False
@@ -129,7 +129,7 @@ def minimise(
         tried = x.clone()
         tried[:, moving] = (x[:, moving] + step.clamp(-longest_step, longest_step)).clamp(low, high)
         given = (fixed[0], fixed[1][todo]) if fixed else None
-        new_linear, new = _evaluate(y, w, tau, made_of, tried, given)
+        new_linear, new = _evaluate(y, w, tau, structure, tried, given)
         better = new < old
         last = torch.where(better, old - new <= enough * old, step.abs().amax(-1) < shortest_step)
         return Trial((tried, new_linear), new, better, last)
@@ -160,9 +160,9 @@ def whitening(covariance: Tensor) -> Tensor:
 
 
 def _evaluate(
-    target: Tensor, root: Tensor, tau: Tensor, made_of: Composition, x: Tensor, fixed: tuple[int, Tensor] | None
+    target: Tensor, root: Tensor, tau: Tensor, structure: ModelStructure, x: Tensor, fixed: tuple[int, Tensor] | None
 ) -> tuple[Tensor, Tensor]:
-    return _solve(made_of.columns(tau, x), target, root, fixed)
+    return _solve(structure.columns(tau, x), target, root, fixed)
 
 
 def _solve(values: Tensor, target: Tensor, root: Tensor, fixed: tuple[int, Tensor] | None) -> tuple[Tensor, Tensor]:
@@ -193,13 +193,13 @@ def _projected(columns: Tensor, active: Tensor, matrix: Tensor) -> Tensor:
     return columns @ torch.linalg.solve_ex(gram, columns.mT @ matrix)[0]
 
 
-def _with_held(free: Tensor, held: Tensor, made_of: Composition) -> Tensor:
+def _with_held(free: Tensor, held: Tensor, structure: ModelStructure) -> Tensor:
     """`x` of all shaped processes from those of the free ones, `(item, point, free)`, and of the held sinusoids."""
-    if not made_of.held or held.shape[-1] == 0:
+    if not structure.held or held.shape[-1] == 0:
         return free
     parts, at_free, at_held = [], iter(free.unbind(-1)), iter(held.unbind(-1))
-    for k in made_of.shaped:
-        found = k in made_of.curved
+    for k in structure.nonlinear:
+        found = k in structure.free_nonlinear
         parts.append(next(at_free) if found else next(at_held)[:, None].expand(free.shape[:2]))
     return torch.stack(parts, -1)
 
@@ -215,11 +215,11 @@ def with_alternating(kind: type[Process], x: Tensor, phi: tuple[float, ...] = (-
     return torch.cat([x, kind.to_unconstrained(x.new_tensor(phi))]) if kind.alternates else x
 
 
-def limits(made_of: Composition, tau: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+def limits(structure: ModelStructure, tau: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
     """Least and largest `x` of the shaped processes, `(shaped,)`."""
     low, high = [], []
-    for k in made_of.shaped:
-        least, most = made_of.processes[k].unconstrained_limits(float(tau[-1]))
+    for k in structure.nonlinear:
+        least, most = structure.processes[k].unconstrained_limits(float(tau[-1]))
         low.append(least)
         high.append(most)
     return x.new_tensor(low), x.new_tensor(high)

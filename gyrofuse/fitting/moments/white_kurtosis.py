@@ -22,11 +22,11 @@ from torch import Tensor
 
 from gyrofuse.fitting.moments.inference import WEAKLY_DETERMINED, Inference
 from gyrofuse.fitting.spectral.tones import Tones
-from gyrofuse.fitting.structure import Composition
+from gyrofuse.fitting.structure import ModelStructure
 from gyrofuse.wavelets.intervals import normal_quantile
 
 
-def white_excess_kurtosis(series: Tensor, tones: Tones | None, made_of: Composition, params: Tensor) -> Tensor:
+def white_excess_kurtosis(series: Tensor, tones: Tones | None, structure: ModelStructure, params: Tensor) -> Tensor:
     """Excess kurtosis of the samples of the white noise, `(item,)`, if that is what is not Gaussian.
 
     The differences of white noise have the fourth cumulant `2 kappa s2^2`, and the cumulants of independent processes
@@ -35,13 +35,13 @@ def white_excess_kurtosis(series: Tensor, tones: Tones | None, made_of: Composit
     Args:
         series: `(item, time)`, NaN = missing sample.
         tones: Spectral lines of the sinusoids, which are subtracted; None where there are none.
-        made_of: Structure of the model.
+        structure: Structure of the model.
         params: Fitted parameters, `(item, parameter)`.
 
     Returns:
         -2 or more; 0 where the model has no white noise, or its variance is zero.
     """
-    at = _white_at(made_of)
+    at = _white_at(structure)
     if at is None:
         return params.new_zeros(len(params))
     rest = series.to(torch.float64)
@@ -56,7 +56,7 @@ def white_excess_kurtosis(series: Tensor, tones: Tones | None, made_of: Composit
 
 
 def with_excess_kurtosis(
-    inference: Inference, kappa: Tensor, made_of: Composition, n_samples: int, confidence_level: float
+    inference: Inference, kappa: Tensor, structure: ModelStructure, n_samples: int, confidence_level: float
 ) -> Inference:
     """An inference for Gaussian noise with `kappa / n_samples` added to the variance of `ln s2`.
 
@@ -65,11 +65,11 @@ def with_excess_kurtosis(
     Args:
         inference: Inference with final intervals.
         kappa: Excess kurtosis of the white noise, `(item,)`.
-        made_of: Structure of the model.
+        structure: Structure of the model.
         n_samples: Length of the records, all together.
         confidence_level: Probability that an interval holds the true value.
     """
-    at, estimates = _white_at(made_of), inference.estimates
+    at, estimates = _white_at(structure), inference.estimates
     if at is None:
         return inference
     z, more = normal_quantile((1 + confidence_level) / 2), kappa / n_samples
@@ -91,9 +91,9 @@ def with_excess_kurtosis(
     )
 
 
-def _white_at(made_of: Composition) -> int | None:
+def _white_at(structure: ModelStructure) -> int | None:
     """Index of the variance of the white noise among the parameters."""
-    for k, process in enumerate(made_of.processes):
+    for k, process in enumerate(structure.processes):
         if process.white:
-            return made_of.places[k]
+            return structure.places[k]
     return None

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gyrofuse.fitting.structure import Composition
+from gyrofuse.fitting.structure import ModelStructure
 from gyrofuse.noise.parsing import parse_model
 from gyrofuse.noise.processes import AR1, PROCESSES, Drift, Model, Process, QuantizationNoise, RandomWalk, WhiteNoise
 
@@ -30,20 +30,20 @@ def key_of(kinds: Iterable[type[Process]]) -> Key:
     return frozenset(Counter(kinds).items())
 
 
-def composition(kinds: Iterable[type[Process]], held: bool) -> Composition:
+def structure_of(kinds: Iterable[type[Process]], held: bool) -> ModelStructure:
     """Structure of a model with these processes, in the usual order."""
     ordered: list[Any] = sorted(kinds, key=PROCESSES.index)  # of classes with constructors of their own
-    return Composition(tuple(kind() for kind in ordered), held)
+    return ModelStructure(tuple(kind() for kind in ordered), held)
 
 
-def kinds_of(made_of: Composition) -> Kinds:
+def kinds_of(structure: ModelStructure) -> Kinds:
     """Types of its processes."""
-    return [type(p) for p in made_of.processes]
+    return [type(p) for p in structure.processes]
 
 
 def name_of(kinds: Iterable[type[Process]]) -> str:
-    """Name of a composition, such as `WN + 2*AR1 + RW`."""
-    return composition(kinds, True).name
+    """Name of a structure, such as `WN + 2*AR1 + RW`."""
+    return structure_of(kinds, True).name
 
 
 def n_unknown(kinds: Kinds, held: bool) -> int:
@@ -51,16 +51,16 @@ def n_unknown(kinds: Kinds, held: bool) -> int:
     return len(kinds) + sum(kind.shape_name is not None and not (held and kind.has_line) for kind in kinds)
 
 
-def n_parameters(made_of: Composition) -> int:
-    """Unknowns of a composition; of a sinusoid amplitude and frequency."""
-    return made_of.n_linear + len(made_of.shaped)
+def n_parameters(structure: ModelStructure) -> int:
+    """Unknowns of a structure; of a sinusoid amplitude and frequency."""
+    return structure.n_linear + len(structure.nonlinear)
 
 
-def penalty(made_of: Composition, n_samples: int) -> float:
+def penalty(structure: ModelStructure, n_samples: int) -> float:
     """Penalty of its parameters in `-2 ln L`: `2 c ln ln T` each, and `ln T` for a slope, known to `T^(-3/2)`."""
-    drifts = sum(process.deterministic for process in made_of.processes)
+    drifts = sum(process.deterministic for process in structure.processes)
     each = 2 * _HANNAN_QUINN * math.log(math.log(n_samples))
-    return (n_parameters(made_of) - drifts) * each + drifts * math.log(n_samples)
+    return (n_parameters(structure) - drifts) * each + drifts * math.log(n_samples)
 
 
 def all_noises(most: int, most_ar1s: int = 3) -> list[Kinds]:
@@ -137,13 +137,13 @@ def with_ancestors(wanted: Iterable[Kinds]) -> list[Kinds]:
 
 
 def children(kinds: Kinds, among: Iterable[Key]) -> list[Kinds]:
-    """Compositions with one process more."""
+    """ModelStructures with one process more."""
     known = set(among)
     return [more for kind in PROCESSES if key_of(more := [*kinds, kind]) in known]
 
 
 def parents(kinds: Kinds) -> list[Key]:
-    """Compositions with one process less."""
+    """ModelStructures with one process less."""
     smaller = []
     for kind in dict.fromkeys(kinds):
         rest = list(kinds)
@@ -153,7 +153,7 @@ def parents(kinds: Kinds) -> list[Key]:
 
 
 def next_to(kinds: Kinds, among: Iterable[Key]) -> list[tuple[Kinds, int | None]]:
-    """Compositions like one, the smaller ones first, and which of its processes each lacks; None where it lacks none.
+    """Structures like one, the smaller ones first, and which of its processes each lacks; None where it lacks none.
 
     Those with a process less or more, and those with one or two processes of one parameter in the place of an AR1,
     which has two: it is white noise or a random walk at the ends of its range, and much like white and quantisation
@@ -171,12 +171,12 @@ def next_to(kinds: Kinds, among: Iterable[Key]) -> list[tuple[Kinds, int | None]
 
 
 def simplified(
-    made_of: Composition, params: Tensor, covariance: Tensor, n_samples: int
+    structure: ModelStructure, params: Tensor, covariance: Tensor, n_samples: int
 ) -> list[tuple[Kinds, str] | None]:
     """For every item, the composition with fewer parameters that the fit amounts to, and why; None where there is none.
 
     Args:
-        made_of: Structure of the model.
+        structure: Structure of the model.
         params: Parameters, `(item, parameter)`.
         covariance: Their covariance, `(item, parameter, parameter)`.
         n_samples: Length T of the record.
@@ -186,15 +186,15 @@ def simplified(
     flags: list[tuple[int, type[Process] | None, str, Tensor]] = []
     earlier: defaultdict[type[Process], list[tuple[int, Tensor, Tensor]]] = defaultdict(list)
     numbers: Counter[type[Process]] = Counter()
-    for k, process in enumerate(made_of.processes):
+    for k, process in enumerate(structure.processes):
         kind = type(process)
         numbers[kind] += 1
         word = f"{process.symbol} {numbers[kind]}" if process.repeatable else process.symbol
-        linear, size = made_of.places[k], params[:, made_of.places[k]]
+        linear, size = structure.places[k], params[:, structure.places[k]]
         ratio = sd[:, linear] / size
         flags.append((k, None, f"{word} has no {'slope' if process.deterministic else 'variance'}", size <= 0))
         if process.has_memory():
-            shape = made_of.places[made_of.n_linear + made_of.shaped.index(k)]
+            shape = structure.places[structure.n_linear + structure.nonlinear.index(k)]
             phi, x = params[:, shape], kind.to_unconstrained(params[:, shape])
             x_sd = sd[:, shape] / kind.unconstrained_slope(x)
             if kind.long_limit is not None:
@@ -220,13 +220,13 @@ def simplified(
             if there and k not in becomes:
                 becomes[k] = limit
                 reasons.append(word)
-        found.append((_replaced(made_of, becomes), ", ".join(reasons)) if becomes else None)
+        found.append((_replaced(structure, becomes), ", ".join(reasons)) if becomes else None)
     return found
 
 
-def _replaced(made_of: Composition, becomes: dict[int, type[Process] | None]) -> Kinds:
+def _replaced(structure: ModelStructure, becomes: dict[int, type[Process] | None]) -> Kinds:
     kept: Kinds = []
-    for k, process in enumerate(made_of.processes):
+    for k, process in enumerate(structure.processes):
         kind = becomes[k] if k in becomes else type(process)
         if kind is not None and (kind.repeatable or kind not in kept):
             kept.append(kind)

@@ -1,4 +1,4 @@
-"""Which noise processes made a record: compositions ranked by the likelihood of its spectrum."""
+"""Which noise processes made a record: structures ranked by the likelihood of its spectrum."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from gyrofuse._base.results import numbered
 from gyrofuse.fitting.gmwm import fit_gmwm, fit_gmwm_moments
 from gyrofuse.fitting.gmwm_result import GMWMResult
 from gyrofuse.fitting.moments.records import check_wavelet_variance, deprecate_moments
-from gyrofuse.fitting.ranking import candidates as compositions
+from gyrofuse.fitting.ranking import candidates as structures
 from gyrofuse.fitting.ranking.candidates import Kinds
 from gyrofuse.fitting.ranking.result import RankResult
 from gyrofuse.fitting.ranking.table import Table, by_moments, by_spectrum
@@ -42,7 +42,7 @@ def rank_models(
     fit: bool = True,
     n_samples: int | None = None,
 ) -> RankResult:
-    """Rank compositions of noise processes by how well they explain every sensor.
+    """Rank structures of noise processes by how well they explain every sensor.
 
     The number of sinusoids comes first, by tests of the largest spectral line against the fitted noise; the noise
     without them follows, by the criterion of Hannan and Quinn, `-2 ln L + 3 p ln ln T` with the spectral (Whittle)
@@ -84,7 +84,7 @@ def rank_models(
         raise ValueError(f"`line_alpha`: expected a probability between 0 and 1 such as 0.001, got {line_alpha!r}")
     if isinstance(max_sinusoids, bool) or not isinstance(max_sinusoids, int) or max_sinusoids < 0:
         raise ValueError(f"`max_sinusoids`: expected a whole number >= 0, got {max_sinusoids!r}")
-    wanted = None if candidates is None else compositions.read_candidates(candidates)
+    wanted = None if candidates is None else structures.read_candidates(candidates)
     if n_samples is not None:
         deprecate_moments(signal, n_samples, "rank_models", stacklevel=4)
         return rank_models_moments(
@@ -128,7 +128,7 @@ def rank_models_moments(
     confidence_level: float = 0.95,
     fit: bool = True,
 ) -> RankResult:
-    """Rank compositions of noise processes for wavelet variances whose signals are not at hand; see `rank_models`.
+    """Rank structures of noise processes for wavelet variances whose signals are not at hand; see `rank_models`.
 
     `-2 ln L` is then `r' V^-1 r + ln det V` with `r = nu - nu(theta)`. Wavelet variances hardly determine frequencies,
     so that there are no sinusoids among the default candidates.
@@ -149,7 +149,7 @@ def rank_models_moments(
         ValueError: No wavelet variance of records that long, bad candidates, or no item that can be ranked.
     """
     check_confidence_level(confidence_level)
-    wanted = None if candidates is None else compositions.read_candidates(candidates)
+    wanted = None if candidates is None else structures.read_candidates(candidates)
     n_samples = check_positive_integer("n_samples", n_samples)
     values = check_wavelet_variance(wavelet_variance, n_samples, n_levels).detach().to(torch.float64)
     *batch, levels, n_sensors = values.shape
@@ -169,11 +169,11 @@ def rank_models_moments(
 
 def _check_sizes(wanted: list[Kinds] | None, levels: int, held: bool) -> None:
     """Refuse candidates with more parameters than levels."""
-    largest = max(wanted or [[]], key=lambda kinds: compositions.n_unknown(kinds, held))
-    if (size := compositions.n_unknown(largest, held)) > levels:
+    largest = max(wanted or [[]], key=lambda kinds: structures.n_unknown(kinds, held))
+    if (size := structures.n_unknown(largest, held)) > levels:
         raise ValueError(
             f"`candidates`: expected at most as many parameters as the {levels} levels, got {size} in "
-            f"{compositions.name_of(largest)}; record longer or leave it out"
+            f"{structures.name_of(largest)}; record longer or leave it out"
         )
 
 
@@ -193,7 +193,7 @@ def _ranked(
         if fitted is None:
             break
         which = places[table.choice == c]
-        model = compositions.composition(table.kinds[c], held=True)  # its processes in the order of the table
+        model = structures.structure_of(table.kinds[c], held=True)  # its processes in the order of the table
         whole = fitted(which, Model(list(model.processes)))
         # With the sinusoids in the model, not taken out: one J test for the table and the fit.
         table.p_value[table.choice == c, c] = whole.p_value[:, 0]

@@ -1,4 +1,4 @@
-"""Compositions of noise processes, ranked."""
+"""ModelStructures of noise processes, ranked."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Largest likelihoods of compositions for many records, each climbed to from the best with one process less."""
+"""Largest likelihoods of structures for many records, each climbed to from the best with one process less."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Generic, TypeVar
 import torch
 from torch import Tensor
 
-from gyrofuse.fitting.ranking import candidates as compositions
+from gyrofuse.fitting.ranking import candidates as structures
 from gyrofuse.fitting.ranking.candidates import Key, Kinds
 from gyrofuse.fitting.ranking.moments import MomentFit, Moments
 from gyrofuse.fitting.ranking.spectra import NoiseFit, Spectra
-from gyrofuse.fitting.structure import Composition
+from gyrofuse.fitting.structure import ModelStructure
 
 # Difference of two criteria below which candidates are equivalent: penalised likelihoods within a factor of e^2 = 7.
 EQUIVALENT = 4.0
@@ -22,7 +22,7 @@ FitT = TypeVar("FitT", NoiseFit, MomentFit)
 
 
 class _Search(ABC, Generic[FitT]):
-    """Fits of compositions to some of the records each.
+    """Fits of structures to some of the records each.
 
     Args:
         n_items: How many records.
@@ -31,8 +31,8 @@ class _Search(ABC, Generic[FitT]):
 
     Attributes:
         held: Sinusoids are no part of what is fitted.
-        afresh: Compositions with one shape start from a grid too.
-        fits: Of all records; NaN where a composition was not tried.
+        afresh: ModelStructures with one shape start from a grid too.
+        fits: Of all records; NaN where a structure was not tried.
     """
 
     held: bool
@@ -40,54 +40,54 @@ class _Search(ABC, Generic[FitT]):
 
     def __init__(self, n_items: int, n_samples: int, device: torch.device) -> None:
         self._everyone, self._n_samples = torch.arange(n_items, device=device), n_samples
-        self.fits: dict[Key, tuple[Composition, FitT]] = {}
+        self.fits: dict[Key, tuple[ModelStructure, FitT]] = {}
 
     def run(self, wanted: list[Kinds], searching: bool) -> None:
         """Fit all that are wanted to all records, or search among them for those that matter to each."""
         if searching:
-            known = {compositions.key_of(kinds) for kinds in wanted}
+            known = {structures.key_of(kinds) for kinds in wanted}
             self._widen([kinds for kinds in wanted if len(kinds) == 1], known)
             self._settle(known)
             return
-        for kinds in compositions.with_ancestors(wanted):
+        for kinds in structures.with_ancestors(wanted):
             self._try_out(kinds, self._everyone)
 
-    def found(self, key: Key) -> tuple[Composition, Tensor, FitT]:
-        """A composition, the records to which it was fitted, and the fit of those."""
-        made_of, fit = self.fits[key]
+    def found(self, key: Key) -> tuple[ModelStructure, Tensor, FitT]:
+        """A structure, the records to which it was fitted, and the fit of those."""
+        structure, fit = self.fits[key]
         items = self._loss(fit).isfinite().nonzero()[:, 0]
-        return made_of, items, _part(fit, items)
+        return structure, items, _part(fit, items)
 
     def criterion(self, key: Key) -> Tensor:
         """Of Hannan and Quinn, `(item,)`, infinite where it was not tried."""
-        made_of, fit = self.fits[key]
-        return (self._loss(fit) + compositions.penalty(made_of, self._n_samples)).nan_to_num(nan=torch.inf)
+        structure, fit = self.fits[key]
+        return (self._loss(fit) + structures.penalty(structure, self._n_samples)).nan_to_num(nan=torch.inf)
 
     def _widen(self, first: list[Kinds], known: set[Key]) -> None:
         """From one process to more, for every record the children of its few best, as long as one of them gains."""
         everyone = torch.ones_like(self._everyone, dtype=torch.bool)
         best = torch.full_like(self._everyone, torch.inf, dtype=torch.float64)
-        todo = {compositions.key_of(kinds): (kinds, everyone) for kinds in first}
+        todo = {structures.key_of(kinds): (kinds, everyone) for kinds in first}
         while todo:
             for kinds, which in todo.values():
                 self._try_out(kinds, which.nonzero()[:, 0])
             found = torch.stack([self.criterion(key) for key in todo])  # (candidate, item)
-            # Larger compositions are tried while the best of a size is at most six above the best of all so far.
+            # Larger structures are tried while the best of a size is at most six above the best of all so far.
             going = found.amin(0) < best + 6.0
             best = torch.minimum(best, found.amin(0))
             # The extensions of the three best of a size.
             kept = (found.argsort(0).argsort(0) < 3) & found.isfinite() & going
             following: dict[Key, tuple[Kinds, Tensor]] = {}
             for (kinds, _), which in zip(todo.values(), kept, strict=True):
-                for child in compositions.children(kinds, known) if bool(which.any()) else ():
-                    _, other = following.get(compositions.key_of(child), (child, torch.zeros_like(which)))
-                    following[compositions.key_of(child)] = child, which | other
+                for child in structures.children(kinds, known) if bool(which.any()) else ():
+                    _, other = following.get(structures.key_of(child), (child, torch.zeros_like(which)))
+                    following[structures.key_of(child)] = child, which | other
             todo = following
 
     def _settle(self, known: set[Key]) -> None:
         """Compare the best one of each record with all next to it, until none of these is better.
 
-        The beam may hold no parent of a composition for whose processes an AR1 stands in.
+        The beam may hold no parent of a structure for whose processes an AR1 stands in.
         """
         seen = {key: self._loss(fit).isfinite() for key, (_, fit) in self.fits.items()}
         while True:
@@ -95,49 +95,49 @@ class _Search(ABC, Generic[FitT]):
             best = torch.stack([self.criterion(key) for key in keys]).argmin(0)
             unseen = False
             for b in best.unique().tolist():
-                made_of, fit = self.fits[keys[b]]
-                for kinds, k in compositions.next_to(compositions.kinds_of(made_of), known):
-                    before = seen.get(compositions.key_of(kinds), torch.zeros_like(best, dtype=torch.bool))
+                structure, fit = self.fits[keys[b]]
+                for kinds, k in structures.next_to(structures.kinds_of(structure), known):
+                    before = seen.get(structures.key_of(kinds), torch.zeros_like(best, dtype=torch.bool))
                     items = ((best == b) & ~before).nonzero()[:, 0]
                     if len(items):
                         unseen = True
-                        self._try_out(kinds, items, None if k is None else self._without(made_of, fit, k))
-                        seen[compositions.key_of(kinds)] = before | (best == b)
+                        self._try_out(kinds, items, None if k is None else self._without(structure, fit, k))
+                        seen[structures.key_of(kinds)] = before | (best == b)
             if not unseen:
                 return
 
-    def _without(self, made_of: Composition, fit: FitT, k: int) -> tuple[Composition, FitT]:
-        """A composition less one of its processes, and what is left of its fit."""
-        kinds = compositions.kinds_of(made_of)
-        linear = [i for i in range(made_of.n_linear) if i != k]
-        shape = [i for i, at in enumerate(made_of.shaped) if at != k]
-        left = compositions.composition(kinds[:k] + kinds[k + 1 :], self.held)
+    def _without(self, structure: ModelStructure, fit: FitT, k: int) -> tuple[ModelStructure, FitT]:
+        """A structure less one of its processes, and what is left of its fit."""
+        kinds = structures.kinds_of(structure)
+        linear = [i for i in range(structure.n_linear) if i != k]
+        shape = [i for i, at in enumerate(structure.nonlinear) if at != k]
+        left = structures.structure_of(kinds[:k] + kinds[k + 1 :], self.held)
         return left, replace(fit, linear=fit.linear[:, linear], shape=fit.shape[:, shape])
 
-    def _try_out(self, kinds: Kinds, items: Tensor, start: tuple[Composition, FitT] | None = None) -> None:
-        """Fit one composition to some records, from each of its parents: from the best of them alone it may be stuck.
+    def _try_out(self, kinds: Kinds, items: Tensor, start: tuple[ModelStructure, FitT] | None = None) -> None:
+        """Fit one structure to some records, from each of its parents: from the best of them alone it may be stuck.
 
         Where an AR1 of the best one stands for white noise, say, white noise cannot take its place.
 
         Args:
             kinds: Processes.
             items: Which records.
-            start: Another place to start from: a composition with up to two processes less, and its parameters.
+            start: Another place to start from: a structure with up to two processes less, and its parameters.
         """
-        made_of = compositions.composition(kinds, self.held)
-        smaller = [self.fits[key] for key in compositions.parents(kinds) if key in self.fits]
+        structure = structures.structure_of(kinds, self.held)
+        smaller = [self.fits[key] for key in structures.parents(kinds) if key in self.fits]
         smaller += [start] if start else []
-        afresh = not smaller or (self.afresh and len(made_of.curved) == 1)
-        found = self._whole(self._first(made_of, items), items) if afresh else None
+        afresh = not smaller or (self.afresh and len(structure.free_nonlinear) == 1)
+        found = self._whole(self._first(structure, items), items) if afresh else None
         for parent, fit in smaller:
             own = items[self._loss(fit)[items].isfinite()]
             if len(own):
-                climbed = self._climb(made_of, own, *self._start(made_of, own, parent, _part(fit, own)))
+                climbed = self._climb(structure, own, *self._start(structure, own, parent, _part(fit, own)))
                 whole = self._whole(climbed, own)
                 found = whole if found is None else self._better(found, whole)
-        key = compositions.key_of(kinds)
+        key = structures.key_of(kinds)
         if found is not None:
-            self.fits[key] = made_of, self._better(self.fits[key][1], found) if key in self.fits else found
+            self.fits[key] = structure, self._better(self.fits[key][1], found) if key in self.fits else found
 
     def _whole(self, fit: FitT, items: Tensor) -> FitT:
         """Of all records, NaN but for these."""
@@ -154,15 +154,15 @@ class _Search(ABC, Generic[FitT]):
         """Minus twice the log likelihood `(item,)`."""
 
     @abstractmethod
-    def _first(self, made_of: Composition, items: Tensor) -> FitT:
-        """Fit a composition from no other one's fit."""
+    def _first(self, structure: ModelStructure, items: Tensor) -> FitT:
+        """Fit a structure from no other one's fit."""
 
     @abstractmethod
-    def _start(self, made_of: Composition, items: Tensor, parent: Composition, fit: FitT) -> tuple[Tensor, ...]:
+    def _start(self, structure: ModelStructure, items: Tensor, parent: ModelStructure, fit: FitT) -> tuple[Tensor, ...]:
         """Where to start, from a parent's fit to the same records."""
 
     @abstractmethod
-    def _climb(self, made_of: Composition, items: Tensor, *start: Tensor) -> FitT:
+    def _climb(self, structure: ModelStructure, items: Tensor, *start: Tensor) -> FitT:
         """Fit from there."""
 
 
@@ -178,34 +178,36 @@ class SpectralSearch(_Search[NoiseFit]):
     def _loss(self, fit: NoiseFit) -> Tensor:
         return -2 * fit.log_likelihood
 
-    def _first(self, made_of: Composition, items: Tensor) -> NoiseFit:
+    def _first(self, structure: ModelStructure, items: Tensor) -> NoiseFit:
         spectra = self._spectra.part(items)
         size = spectra.energy.sum(-1, keepdim=True) / spectra.count.sum(-1, keepdim=True)
-        linear = size.expand(-1, made_of.n_linear)
-        if not made_of.shaped:
-            return spectra.fit(made_of, linear, linear[:, :0])
-        process = made_of.processes[made_of.shaped[0]]
+        linear = size.expand(-1, structure.n_linear)
+        if not structure.nonlinear:
+            return spectra.fit(structure, linear, linear[:, :0])
+        process = structure.processes[structure.nonlinear[0]]
         # Time constants of the first process with a memory, spread over all scales.
         powers = size.new_tensor((-0.2, 0.2, 0.5, 0.8))
         starts = process.from_time_scale(float(self._n_samples) ** powers)
-        ends = [spectra.fit(made_of, linear, start.expand_as(size)) for start in starts]
+        ends = [spectra.fit(structure, linear, start.expand_as(size)) for start in starts]
         best = ends[0]
         for other in ends[1:]:
             best = self._better(best, other)
         return best
 
-    def _start(self, made_of: Composition, items: Tensor, parent: Composition, fit: NoiseFit) -> tuple[Tensor, ...]:
-        return self._spectra.part(items).widened(parent, fit, made_of)
+    def _start(
+        self, structure: ModelStructure, items: Tensor, parent: ModelStructure, fit: NoiseFit
+    ) -> tuple[Tensor, ...]:
+        return self._spectra.part(items).widened(parent, fit, structure)
 
-    def _climb(self, made_of: Composition, items: Tensor, *start: Tensor) -> NoiseFit:
+    def _climb(self, structure: ModelStructure, items: Tensor, *start: Tensor) -> NoiseFit:
         linear, shape = start
-        return self._spectra.part(items).fit(made_of, linear, shape)
+        return self._spectra.part(items).fit(structure, linear, shape)
 
 
 class MomentSearch(_Search[MomentFit]):
     """By the likelihood of wavelet variances, taken for normal with the `V` of each fit."""
 
-    # The few long scales by which a shape is known are noisy: a smaller composition's fit may lead away from it.
+    # The few long scales by which a shape is known are noisy: a smaller structure's fit may lead away from it.
     held, afresh = False, True
 
     def __init__(self, moments: Moments) -> None:
@@ -215,15 +217,17 @@ class MomentSearch(_Search[MomentFit]):
     def _loss(self, fit: MomentFit) -> Tensor:
         return fit.objective + fit.log_det
 
-    def _first(self, made_of: Composition, items: Tensor) -> MomentFit:
+    def _first(self, structure: ModelStructure, items: Tensor) -> MomentFit:
         moments = self._moments.part(items)
-        return moments.fit(made_of, moments.roots(made_of))
+        return moments.fit(structure, moments.roots(structure))
 
-    def _start(self, made_of: Composition, items: Tensor, parent: Composition, fit: MomentFit) -> tuple[Tensor, ...]:
-        return (self._moments.part(items).widened(parent, fit, made_of),)
+    def _start(
+        self, structure: ModelStructure, items: Tensor, parent: ModelStructure, fit: MomentFit
+    ) -> tuple[Tensor, ...]:
+        return (self._moments.part(items).widened(parent, fit, structure),)
 
-    def _climb(self, made_of: Composition, items: Tensor, *start: Tensor) -> MomentFit:
-        return self._moments.part(items).fit(made_of, list(start))
+    def _climb(self, structure: ModelStructure, items: Tensor, *start: Tensor) -> MomentFit:
+        return self._moments.part(items).fit(structure, list(start))
 
 
 def _part(fit: FitT, items: Tensor) -> FitT:

@@ -1,7 +1,7 @@
-"""Spectra of records against compositions: the number of spectral lines, and the likelihood of each noise.
+"""Spectra of records against structures: the number of spectral lines, and the likelihood of each noise.
 
 The orthonormal DCT-II and its bands are those of the spectral refinement. Lines are taken out of a record once, its
-bands are summed once, and all compositions are fitted to these few numbers.
+bands are summed once, and all structures are fitted to these few numbers.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from gyrofuse.fitting.spectral.bands import Bins, Noise
 from gyrofuse.fitting.spectral.search import maximise, uncertainty
 from gyrofuse.fitting.spectral.tones import NoiseSpectrum, Tones, find_tones, line_p_value
 from gyrofuse.fitting.spectral.whittle import LEAST_COUNT, ordinates_left
-from gyrofuse.fitting.structure import Composition, new_shape
+from gyrofuse.fitting.structure import ModelStructure, new_shape
 from gyrofuse.noise.processes import AR1, Process, QuantizationNoise, RandomWalk, WhiteNoise
 
 # Gain in nats below which a fit needs no further step: criteria that differ by nats are compared.
@@ -30,7 +30,7 @@ _ENOUGH = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class NoiseFit:
-    """Maximum of the likelihood of a composition without sinusoids.
+    """Maximum of the likelihood of a structure without sinusoids.
 
     Attributes:
         linear: Linear parameters `p`, `(item, process)`, with the squared slope of a drift.
@@ -92,10 +92,10 @@ class Spectra:
         some.energy, some.cross, some.count = self.energy[items], self.cross[items], self.count[items]
         return some
 
-    def fit(self, made_of: Composition, linear: Tensor, shape: Tensor) -> NoiseFit:
+    def fit(self, structure: ModelStructure, linear: Tensor, shape: Tensor) -> NoiseFit:
         """Maximum of the likelihood next to `p` and `x`; the slope of a drift is solved for."""
-        noise = Noise(made_of)
-        ramp_at = _drifts(made_of)
+        noise = Noise(structure)
+        ramp_at = _drifts(structure)
         p, x = linear[:, noise.which], shape
         size = self.energy.sum(-1, keepdim=True) / self.count.sum(-1, keepdim=True)
         p = torch.where((p.sum(-1, keepdim=True) > 0) & p.isfinite().all(-1, keepdim=True), p, size)
@@ -113,7 +113,7 @@ class Spectra:
         whole = linear.clone()
         whole[:, noise.which] = p
         whole[:, ramp_at] = slope.square()[:, None]
-        whole, x = made_of.ordered(whole, x)
+        whole, x = structure.ordered(whole, x)
         return NoiseFit(whole, x, slope, slope_sd, log_likelihood)
 
     def without_ramp(self, variance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -123,48 +123,48 @@ class Spectra:
         energy = self.energy - 2 * slope[:, None] * self.cross + slope.square()[:, None] * self.ramp
         return slope, information.rsqrt(), energy.clamp(min=torch.finfo(energy.dtype).tiny)
 
-    def variances(self, made_of: Composition, fit: NoiseFit) -> Tensor:
+    def variances(self, structure: ModelStructure, fit: NoiseFit) -> Tensor:
         """Variances of the ordinates of the noise without its drift, `(item, bin)`."""
-        noise = Noise(made_of)
+        noise = Noise(structure)
         return noise.variances(self.bins, fit.linear[:, noise.which], fit.shape)
 
-    def spread(self, made_of: Composition, fit: NoiseFit) -> tuple[Tensor, Tensor]:
+    def spread(self, structure: ModelStructure, fit: NoiseFit) -> tuple[Tensor, Tensor]:
         """Covariance of `(ln p, x)` `(item, unknown, unknown)` and the `sd` of `p` off its edge `(item, process)`."""
-        noise = Noise(made_of)
+        noise = Noise(structure)
         own, edge = uncertainty(self.count, self.bins, noise, fit.linear[:, noise.which], fit.shape)
-        n_linear = made_of.n_linear
-        whole = own.new_zeros(len(own), *(n_linear + len(made_of.shaped),) * 2)
+        n_linear = structure.n_linear
+        whole = own.new_zeros(len(own), *(n_linear + len(structure.nonlinear),) * 2)
         place = torch.tensor([*noise.which, *range(n_linear, whole.shape[-1])], device=own.device)
         whole[:, place[:, None], place] = own
         edges = own.new_zeros(len(own), n_linear)
         edges[:, noise.which] = edge
-        for k in _drifts(made_of):
+        for k in _drifts(structure):
             whole[:, k, k] = (2 * fit.slope_sd / fit.slope).square()
             edges[:, k] = 2 * fit.slope.abs() * fit.slope_sd
         return whole, edges
 
-    def widened(self, parent: Composition, fit: NoiseFit, made_of: Composition) -> tuple[Tensor, Tensor]:
-        """Start for a composition with one process more: the smaller one's maximum, the new process without variance.
+    def widened(self, parent: ModelStructure, fit: NoiseFit, structure: ModelStructure) -> tuple[Tensor, Tensor]:
+        """Start for a structure with one process more: the smaller one's maximum, the new process without variance.
 
         A further nonlinear parameter starts where the score, the slope of the likelihood by the variance of its process
         over its standard deviation, is largest.
         """
-        linear = fit.linear.new_zeros(len(fit.linear), made_of.n_linear)
-        shape = fit.shape.new_zeros(len(fit.shape), len(made_of.shaped))
-        kinds = [type(p) for p in made_of.processes]
+        linear = fit.linear.new_zeros(len(fit.linear), structure.n_linear)
+        shape = fit.shape.new_zeros(len(fit.shape), len(structure.nonlinear))
+        kinds = [type(p) for p in structure.processes]
         seen: Counter[type] = Counter()
         for k, process in enumerate(parent.processes):
             kind = type(process)
             linear[:, [i for i, other in enumerate(kinds) if other is kind][seen[kind]]] = fit.linear[:, k]
             seen[kind] += 1
-        at = new_shape(parent, made_of)
-        shape[:, [i for i in range(len(made_of.shaped)) if i != at]] = fit.shape
+        at = new_shape(parent, structure)
+        shape[:, [i for i in range(len(structure.nonlinear)) if i != at]] = fit.shape
         if at is not None:
-            k = made_of.shaped[at]
-            shape[:, at], linear[:, k] = self._best_shape(parent, fit, made_of.processes[k])
+            k = structure.nonlinear[at]
+            shape[:, at], linear[:, k] = self._best_shape(parent, fit, structure.processes[k])
         return linear, shape
 
-    def _best_shape(self, parent: Composition, fit: NoiseFit, process: Process) -> tuple[Tensor, Tensor]:
+    def _best_shape(self, parent: ModelStructure, fit: NoiseFit, process: Process) -> tuple[Tensor, Tensor]:
         """`x` and the variance of a further process that raise the likelihood fastest, both `(item,)`."""
         noise = Noise(parent)
         p, x = fit.linear[:, noise.which], fit.shape
@@ -190,8 +190,8 @@ class Spectra:
         return grid[best[:, 0]], start
 
 
-def _drifts(made_of: Composition) -> list[int]:
-    return [k for k, p in enumerate(made_of.processes) if p.deterministic]
+def _drifts(structure: ModelStructure) -> list[int]:
+    return [k for k, p in enumerate(structure.processes) if p.deterministic]
 
 
 def _grid(kind: type[Process], n_samples: int) -> Tensor:
@@ -271,13 +271,13 @@ def detrended(series: Tensor) -> Tensor:
 
 def _reference(spectra: Spectra) -> tuple[Noise, NoiseFit]:
     """A noise that follows nearly any smooth spectrum: white and quantisation noise, a random walk and two AR1s."""
-    parent = Composition((WhiteNoise(), QuantizationNoise(), RandomWalk()), True)
+    parent = ModelStructure((WhiteNoise(), QuantizationNoise(), RandomWalk()), True)
     start = (spectra.energy / spectra.count).mean(-1, keepdim=True)
     linear = start.expand(-1, parent.n_linear).clone()
     fit = spectra.fit(parent, linear, linear[:, :0])
     for _ in range(2):
-        made_of = Composition((*parent.processes, AR1()), True)
-        parent, fit = made_of, spectra.fit(made_of, *spectra.widened(parent, fit, made_of))
+        structure = ModelStructure((*parent.processes, AR1()), True)
+        parent, fit = structure, spectra.fit(structure, *spectra.widened(parent, fit, structure))
     return Noise(parent), fit
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.results import counted
-from gyrofuse.fitting.ranking import candidates as compositions
+from gyrofuse.fitting.ranking import candidates as structures
 from gyrofuse.fitting.ranking.candidates import Key, Kinds
 from gyrofuse.fitting.ranking.moments import Moments
 from gyrofuse.fitting.ranking.search import EQUIVALENT, MomentSearch, SpectralSearch
@@ -28,7 +28,7 @@ class Entry:
         criterion: Criterion, `(item,)`, less is better.
         wvic: Wavelet variance information criterion, `(item,)`.
         p_value: P value of the J test at the parameters of greatest likelihood, `(item,)`.
-        simpler: Composition with fewer parameters that the fit amounts to, and why; None where there is none.
+        simpler: ModelStructure with fewer parameters that the fit amounts to, and why; None where there is none.
         fitted: Fitted variances of bins or levels, `(item, bin)`.
     """
 
@@ -87,7 +87,7 @@ def by_spectrum(
     n_samples = series.shape[-1]
     if wanted is None:
         # A level is left for a noise.
-        noises, allowed = compositions.all_noises(levels), list(range(min(max_sinusoids, levels - 1) + 1))
+        noises, allowed = structures.all_noises(levels), list(range(min(max_sinusoids, levels - 1) + 1))
     else:
         noises = [_without_sinusoids(kinds) for kinds in wanted]
         allowed = sorted({_n_sinusoids(kinds) for kinds in wanted})
@@ -100,13 +100,13 @@ def by_spectrum(
     search = SpectralSearch(lines.spectra)
     search.run(noises, searching)
     entries: dict[Key, Entry] = {}
-    for key, kinds in {compositions.key_of(k): k for k in noises}.items():
+    for key, kinds in {structures.key_of(k): k for k in noises}.items():
         if key not in search.fits:
             continue
-        made_of, items, fit = search.found(key)
+        structure, items, fit = search.found(key)
         spectra = lines.spectra.part(items)
-        own = moments.part(items).near(made_of, fit.linear, fit.shape)
-        there = moments.part(items).against(made_of, fit.linear, fit.shape, *spectra.spread(made_of, fit))
+        own = moments.part(items).near(structure, fit.linear, fit.shape)
+        there = moments.part(items).against(structure, fit.linear, fit.shape, *spectra.spread(structure, fit))
         estimates = there.estimates
         entries[key] = Entry(
             kinds=kinds,
@@ -114,18 +114,18 @@ def by_spectrum(
             criterion=search.criterion(key)[items],
             wvic=own.objective + 2 * own.active,
             p_value=there.p_value,
-            simpler=compositions.simplified(made_of, estimates.params, estimates.covariance, n_samples),
-            fitted=spectra.variances(made_of, fit),
+            simpler=structures.simplified(structure, estimates.params, estimates.covariance, n_samples),
+            fitted=spectra.variances(structure, fit),
         )
     placed = []
     for kinds in wanted:
         tones: Kinds = [Sinusoid] * _n_sinusoids(kinds)
-        entry = entries.get(compositions.key_of(_without_sinusoids(kinds)))
+        entry = entries.get(structures.key_of(_without_sinusoids(kinds)))
         if entry is not None:
             which = (lines.n_sinusoids[entry.items] == len(tones)).nonzero()[:, 0]
             if len(which) or not searching:
                 simpler = [s and ([*s[0], *tones], s[1]) for s in entry.simpler]
-                fits_in = compositions.n_unknown(kinds, held=True) <= levels
+                fits_in = structures.n_unknown(kinds, held=True) <= levels
                 placed.append(_part(entry, kinds, which if fits_in else which[:0], simpler))
     table = _tabulated(placed, lines.spectra.bins.count, len(series), lines)
     _set_aside(table, lines, None if searching else max(allowed), levels)
@@ -138,7 +138,7 @@ def _set_aside(table: Table, lines: Lines, most: int | None, levels: int) -> Non
         table.reasons, lines.n_sinusoids.tolist(), lines.n_found.tolist(), strict=True
     ):
         for c, kinds in enumerate(table.kinds):
-            n, size = _n_sinusoids(kinds), compositions.n_unknown(kinds, held=True)
+            n, size = _n_sinusoids(kinds), structures.n_unknown(kinds, held=True)
             if n == n_sinusoids and size > levels:
                 own[c] = f"{size} parameters, but {counted(levels, 'level')}"
             elif n != n_sinusoids and most is not None:
@@ -157,15 +157,15 @@ def by_moments(variance: Tensor, wanted: list[Kinds] | None, n_samples: int) -> 
     n_items, levels = variance.shape
     moments = Moments(variance, n_samples)
     search = MomentSearch(moments)
-    noises = compositions.all_noises(levels) if wanted is None else wanted
+    noises = structures.all_noises(levels) if wanted is None else wanted
     search.run(noises, wanted is None)
     entries = []
     for kinds in noises:
-        key = compositions.key_of(kinds)
+        key = structures.key_of(kinds)
         if key not in search.fits:
             continue
-        made_of, items, fit = search.found(key)
-        estimates = moments.part(items).estimates(made_of, fit)
+        structure, items, fit = search.found(key)
+        estimates = moments.part(items).estimates(structure, fit)
         entries.append(
             Entry(
                 kinds=kinds,
@@ -173,8 +173,8 @@ def by_moments(variance: Tensor, wanted: list[Kinds] | None, n_samples: int) -> 
                 criterion=search.criterion(key)[items],
                 wvic=fit.objective + 2 * fit.active,
                 p_value=chi_square_tail(fit.objective, levels - fit.active),
-                simpler=compositions.simplified(made_of, estimates.params, estimates.covariance, n_samples),
-                fitted=made_of.wavelet_variance(moments.tau, fit.linear, fit.shape),
+                simpler=structures.simplified(structure, estimates.params, estimates.covariance, n_samples),
+                fitted=structure.wavelet_variance(moments.tau, fit.linear, fit.shape),
             )
         )
     return _tabulated(entries, moments.observations, n_items, None)
@@ -198,12 +198,12 @@ def _tabulated(entries: list[Entry], count: Tensor, n_items: int, lines: Lines |
     for c, entry in enumerate(entries):
         for whole, own in ((criterion, entry.criterion), (wvic, entry.wvic), (p_value, entry.p_value)):
             whole[entry.items, c] = own
-    place = {compositions.key_of(entry.kinds): c for c, entry in enumerate(entries)}
+    place = {structures.key_of(entry.kinds): c for c, entry in enumerate(entries)}
     redundant = torch.zeros(n_items, len(entries), dtype=torch.bool, device=empty.device)
     reasons: list[list[str | None]] = [[None] * len(entries) for _ in range(n_items)]
     for c, entry in enumerate(entries):
         for i, simpler in zip(entry.items.tolist(), entry.simpler, strict=True):
-            other = place.get(compositions.key_of(simpler[0])) if simpler else None
+            other = place.get(structures.key_of(simpler[0])) if simpler else None
             if simpler and other is not None and bool(criterion[i, other] <= criterion[i, c] + EQUIVALENT):
                 redundant[i, c], reasons[i][c] = True, simpler[1]
     choice = criterion.masked_fill(redundant, torch.inf).nan_to_num(nan=torch.inf).argmin(-1)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.transforms import tone_in_cosines
-from gyrofuse.fitting.structure import Composition
+from gyrofuse.fitting.structure import ModelStructure
 from gyrofuse.noise.dct_bands import SINGLE, DCTBands
 from gyrofuse.noise.processes import Process
 
@@ -27,11 +27,11 @@ class Noise:
         at_x: Places of these among the shaped processes.
     """
 
-    def __init__(self, made_of: Composition) -> None:
-        self.which = [k for k, p in enumerate(made_of.processes) if p.gaussian]
-        self.processes: list[Process] = [made_of.processes[k] for k in self.which]
+    def __init__(self, structure: ModelStructure) -> None:
+        self.which = [k for k, p in enumerate(structure.processes) if p.gaussian]
+        self.processes: list[Process] = [structure.processes[k] for k in self.which]
         self.moving = [i for i, p in enumerate(self.processes) if p.shape_name is not None]
-        self.at_x = [made_of.shaped.index(self.which[i]) for i in self.moving]
+        self.at_x = [structure.nonlinear.index(self.which[i]) for i in self.moving]
 
     def columns(self, bins: Bins, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Variances `u` `(item, band, process)` for `p = 1`, and their first and second derivatives `(item, band, x)`.

@@ -15,20 +15,20 @@ from torch import Tensor
 from gyrofuse.fitting.ranking.spectra import Spectra, detrended, reference_density
 from gyrofuse.fitting.spectral.tones import Tones, find_tones
 from gyrofuse.fitting.spectral.whittle import items_of
-from gyrofuse.fitting.structure import Composition
+from gyrofuse.fitting.structure import ModelStructure
 
 # Cycles in the record below which a spectral line is slow: the background taken from the periodogram bends to follow
 # it.
 _MANY_CYCLES = 30
 
 
-def model_tones(series: Tensor, made_of: Composition) -> Tones | None:
+def model_tones(series: Tensor, structure: ModelStructure) -> Tones | None:
     """Find the sinusoids of a model in the spectra of records `(item, time)`, from high to low frequency.
 
     Returns:
         `(item, sinusoid)`, float64; None where the model has no sinusoids.
     """
-    n_tones = sum(p.has_line for p in made_of.processes)
+    n_tones = sum(p.has_line for p in structure.processes)
     if n_tones == 0:
         return None
     series = series.to(torch.float64)
@@ -36,7 +36,7 @@ def model_tones(series: Tensor, made_of: Composition) -> Tones | None:
     cycles = found.beta * series.shape[-1] / (2 * math.pi)
     doubtful = ((cycles < _MANY_CYCLES) | ~(found.p_value < 1e-4)).any(-1)
     if bool(doubtful.any()):
-        ramp = any(p.deterministic for p in made_of.processes)
+        ramp = any(p.deterministic for p in structure.processes)
         again = _second_search(detrended(series[doubtful]) if ramp else series[doubtful], items_of(found, doubtful))
         for field in fields(Tones):
             getattr(found, field.name)[doubtful] = getattr(again, field.name)

@@ -30,7 +30,7 @@ from gyrofuse._base.transforms import cosine_ordinates, ramp_ordinates
 from gyrofuse.fitting.spectral.bands import Bins, Noise
 from gyrofuse.fitting.spectral.search import maximise, uncertainty
 from gyrofuse.fitting.spectral.tones import FEWEST_SAMPLES, Tones, find_tones
-from gyrofuse.fitting.structure import Composition
+from gyrofuse.fitting.structure import ModelStructure
 from gyrofuse.noise.dct_bands import SINGLE
 from gyrofuse.noise.processes import Sinusoid
 
@@ -42,7 +42,7 @@ LEAST_COUNT = 1e-3
 class WhittleFit:
     """Maximum of the likelihood; NaN and not converged for items that could not be fitted.
 
-    The unknowns are `ln p` of the processes followed by `x` of the shaped ones, as `Composition` has them.
+    The unknowns are `ln p` of the processes followed by `x` of the shaped ones, as `ModelStructure` has them.
 
     Attributes:
         linear: Linear parameters `p`, `(item, process)`: variances, squared amplitudes, the squared slope. A variance
@@ -76,7 +76,7 @@ class WhittleFit:
 
 def refine_whittle(
     signal: Tensor,
-    made_of: Composition,
+    structure: ModelStructure,
     linear: Tensor,
     shape: Tensor,
     *,
@@ -92,7 +92,7 @@ def refine_whittle(
 
     Args:
         signal: Records `(item, time)` of at least 32 samples. An item with missing samples is not fitted.
-        made_of: Structure of the model.
+        structure: Structure of the model.
         linear: `p` to start from, `(item, process)`; a zero may become positive again.
         shape: `x` to start from, `(item, shaped)`; frequencies of sinusoids are found anew.
         tones: Known spectral lines of the sinusoids, from high to low frequency, `(item, tone)`: kept in records where
@@ -107,41 +107,41 @@ def refine_whittle(
         ValueError: Shapes that do not fit each other, too few samples, or a model without noise.
     """
     n_rounds = check_positive_integer("n_rounds", n_rounds)
-    _check(signal, made_of, linear, shape)
+    _check(signal, structure, linear, shape)
     signal = signal.detach()
     linear, shape = linear.detach().to(torch.float64).clone(), shape.detach().to(torch.float64).clone()
-    noise = Noise(made_of)
-    at_tones = [made_of.shaped.index(k) for k in made_of.shaped if made_of.processes[k].has_line]
+    noise = Noise(structure)
+    at_tones = [structure.nonlinear.index(k) for k in structure.nonlinear if structure.processes[k].has_line]
     started = linear[:, noise.which]
     usable = signal.sum(-1, dtype=torch.float64).isfinite() & (signal != signal[:, :1]).any(-1)
     usable &= (started >= 0).all(-1) & (started.sum(-1) > 0) & started.isfinite().all(-1)
     usable &= shape[:, noise.at_x].isfinite().all(-1)
     known = None if tones is None else items_of(tones, usable)
-    whole = _refined(signal[usable], made_of, noise, at_tones, linear[usable], shape[usable], known, n_rounds)
+    whole = _refined(signal[usable], structure, noise, at_tones, linear[usable], shape[usable], known, n_rounds)
     return _placed(whole, usable)
 
 
-def _check(signal: Tensor, made_of: Composition, linear: Tensor, shape: Tensor) -> None:
+def _check(signal: Tensor, structure: ModelStructure, linear: Tensor, shape: Tensor) -> None:
     check_floating("signal", signal)
     if signal.ndim != 2 or signal.shape[-1] < FEWEST_SAMPLES:
         raise ValueError(
             f"`signal`: expected (item, time) with at least {FEWEST_SAMPLES} samples, got shape "
             f"{tuple(signal.shape)}; flatten the batch, or record longer"
         )
-    for name, value, size in (("linear", linear, made_of.n_linear), ("shape", shape, len(made_of.shaped))):
+    for name, value, size in (("linear", linear, structure.n_linear), ("shape", shape, len(structure.nonlinear))):
         check_floating(name, value)
         if value.shape != (len(signal), size):
             raise ValueError(
-                f"`{name}`: expected {(len(signal), size)} for {made_of.name} and {len(signal)} records, got "
+                f"`{name}`: expected {(len(signal), size)} for {structure.name} and {len(signal)} records, got "
                 f"{tuple(value.shape)}; give what the moment fit of the same records returned"
             )
-    if not any(p.gaussian for p in made_of.processes):
-        raise ValueError(f"`made_of`: expected a noise such as WN, got {made_of.name}; add WhiteNoise()")
+    if not any(p.gaussian for p in structure.processes):
+        raise ValueError(f"`structure`: expected a noise such as WN, got {structure.name}; add WhiteNoise()")
 
 
 def _refined(
     signal: Tensor,
-    made_of: Composition,
+    structure: ModelStructure,
     noise: Noise,
     at_tones: list[int],
     linear: Tensor,
@@ -152,8 +152,8 @@ def _refined(
     """`refine_whittle` for items that can be fitted."""
     n_items, n_samples = signal.shape
     bins = Bins(n_samples, signal.device)
-    tone_at = [made_of.shaped[i] for i in at_tones]
-    ramp_at = [k for k, p in enumerate(made_of.processes) if p.deterministic]
+    tone_at = [structure.nonlinear[i] for i in at_tones]
+    ramp_at = [k for k, p in enumerate(structure.processes) if p.deterministic]
     p, x = linear[:, noise.which], shape[:, noise.at_x]
     ramp = _Ramp(bins, signal, noise) if ramp_at else None
     tones = None
@@ -181,12 +181,12 @@ def _refined(
         linear[:, tone_at] = tones.amplitude.square()
         shape[:, at_tones] = Sinusoid.to_unconstrained(tones.beta)
     linear[:, ramp_at] = slope.square()[:, None]
-    linear, shape = made_of.ordered(linear, shape)
+    linear, shape = structure.ordered(linear, shape)
     p, x = linear[:, noise.which], shape[:, noise.at_x]
     own, edge_sd = uncertainty(count, bins, noise, p, x)
     variance = noise.variances(bins, p, x)
     log_likelihood = -(bins.count * (2 * math.pi * variance).log() + energy / variance).sum(-1) / 2
-    covariance, edge = _assembled(own, edge_sd, made_of, noise, at_tones, tones, slope, slope_sd, ramp_at)
+    covariance, edge = _assembled(own, edge_sd, structure, noise, at_tones, tones, slope, slope_sd, ramp_at)
     return WhittleFit(linear, shape, covariance, edge, tones, slope, slope_sd, log_likelihood, energy, count, reached)
 
 
@@ -248,7 +248,7 @@ def _measured_tones(signal: Tensor, slope: Tensor, n_tones: int, noise: Noise, p
 def _assembled(
     own: Tensor,
     edge_sd: Tensor,
-    made_of: Composition,
+    structure: ModelStructure,
     noise: Noise,
     at_tones: list[int],
     tones: Tones | None,
@@ -257,15 +257,15 @@ def _assembled(
     ramp_at: list[int],
 ) -> tuple[Tensor, Tensor]:
     """Covariance of all unknowns, sinusoids and drift on the diagonal, and `edge_sd` of all processes."""
-    n_unknown = made_of.n_linear + len(made_of.shaped)
+    n_unknown = structure.n_linear + len(structure.nonlinear)
     covariance = own.new_zeros(len(slope), n_unknown, n_unknown)
-    edge = own.new_zeros(len(slope), made_of.n_linear)
-    place = torch.tensor([*noise.which, *(made_of.n_linear + i for i in noise.at_x)], device=own.device)
+    edge = own.new_zeros(len(slope), structure.n_linear)
+    place = torch.tensor([*noise.which, *(structure.n_linear + i for i in noise.at_x)], device=own.device)
     covariance[:, place[:, None], place] = own
     edge[:, noise.which] = edge_sd
     if tones is not None:
         for n, i in enumerate(at_tones):
-            k, wide = made_of.shaped[i], made_of.n_linear + i
+            k, wide = structure.nonlinear[i], structure.n_linear + i
             amplitude, sd = tones.amplitude[:, n], tones.amplitude_sd[:, n]
             part = tones.beta[:, n] / torch.pi
             covariance[:, k, k] = (2 * sd / amplitude).square()  # of ln a^2
