@@ -1,4 +1,4 @@
-"""What processes that share a piece of work tell each other, beyond tensors that add up."""
+"""Helpers for torch.distributed: ranks, broadcast of objects, and errors that reach all processes."""
 
 from __future__ import annotations
 
@@ -12,8 +12,11 @@ if TYPE_CHECKING:
     from lightning.fabric import Fabric
 
 
-def place(fabric: Fabric | None) -> tuple[int, int]:
-    """Which process this is, and of how many.
+def rank_and_size(fabric: Fabric | None) -> tuple[int, int]:
+    """Rank of this process, and the number of processes.
+
+    Args:
+        fabric: Of Lightning; one process without.
 
     Raises:
         RuntimeError: Several processes were asked for and not started.
@@ -28,21 +31,26 @@ def place(fabric: Fabric | None) -> tuple[int, int]:
     return fabric.global_rank, fabric.world_size
 
 
-def told_by_first(value: Any, world_size: int) -> Any:
-    """What the first process gives, in all of them."""
+def broadcast_from_first(value: Any, world_size: int) -> Any:
+    """The value of the first process, in all of them.
+
+    Args:
+        value: Any object that can be pickled; only that of the first process counts.
+        world_size: Number of processes.
+    """
     if world_size > 1:
-        told = [value]
-        distributed.broadcast_object_list(told, src=0)
-        return told[0]
+        gathered = [value]
+        distributed.broadcast_object_list(gathered, src=0)
+        return gathered[0]
     return value
 
 
 @contextmanager
 def all_or_none(otherwise: str, world_size: int) -> Iterator[None]:
-    """Work that is worth something if all processes do their share: nobody waits for one that fails.
+    """Work that only counts if all processes finish it: where one fails, the others raise instead of waiting.
 
     Args:
-        otherwise: What is to be said if one fails, a clause: "x.npy was not written".
+        otherwise: Consequence of a failure, for the message: "x.npy was not written".
         world_size: Number of processes.
 
     Raises:
@@ -51,17 +59,17 @@ def all_or_none(otherwise: str, world_size: int) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        _told_of(True, world_size)
+        _failures(True, world_size)
         raise
-    if failed := [str(rank) for rank, whether in enumerate(_told_of(False, world_size)) if whether]:
+    if failed := [str(rank) for rank, whether in enumerate(_failures(False, world_size)) if whether]:
         raise RuntimeError(
             f"{otherwise}, for process(es) {', '.join(failed)} of {world_size} failed; their own errors say why"
         )
 
 
-def _told_of(failed: bool, world_size: int) -> list[bool]:
-    """Who failed, in all processes."""
-    told = [failed] * world_size
+def _failures(failed: bool, world_size: int) -> list[bool]:
+    """Whether each process failed, gathered from all."""
+    gathered = [failed] * world_size
     if world_size > 1:
-        distributed.all_gather_object(told, failed)
-    return told
+        distributed.all_gather_object(gathered, failed)
+    return gathered

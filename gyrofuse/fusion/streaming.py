@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.checks import check_floating, check_n_levels, largest_level
-from gyrofuse._base.distributed import all_or_none, place, told_by_first
+from gyrofuse._base.distributed import all_or_none, broadcast_from_first, rank_and_size
 from gyrofuse._base.files import Outputs
 from gyrofuse.fusion.result import fuse
 from gyrofuse.fusion.virtual_gyro import VirtualGyro
@@ -85,7 +85,7 @@ def stream_svo(
         asked = len(normalised(scale_weights))
     n_levels = check_n_levels(asked if asked is not None else _most_levels(recording), recording.n_samples)
     resolve_scale_weights(scale_weights, n_levels)  # wrong scale weights are an error now, not after hours
-    rank, world_size = place(fabric)
+    rank, world_size = rank_and_size(fabric)
     with all_or_none("`recording`: was not read to its end", world_size):
         metric = measure_stretch(
             recording,
@@ -252,7 +252,7 @@ def write_virtual(
         raise ValueError(
             f"`weights`: expected one for each of {recording.n_sensors} sensors, got shape {tuple(weights.shape)}"
         )
-    start, stop = shard_bounds(recording.n_samples, *place(fabric))
+    start, stop = shard_bounds(recording.n_samples, *rank_and_size(fabric))
     values = weights.detach().to("cpu", torch.float64)
     with _draft_for_all(path, recording.n_samples, fabric, force=force) as (draft, offset), draft.open("r+b") as file:
         file.seek(offset + 8 * start)
@@ -267,7 +267,7 @@ def _draft_for_all(path: Path, n_samples: int, fabric: Fabric | None, *, force: 
 
     It takes its name when all of them are done, and vanishes when one fails.
     """
-    rank, world_size = place(fabric)
+    rank, world_size = rank_and_size(fabric)
     with ExitStack() as stack:
         found: tuple[Path, int] | Exception | None = None
         if rank == 0:
@@ -276,7 +276,7 @@ def _draft_for_all(path: Path, n_samples: int, fabric: Fabric | None, *, force: 
                 found = draft, _make_npy(draft, n_samples)
             except (OSError, ValueError) as error:
                 found = error  # sent to the other processes, which would wait for ever
-        found = told_by_first(found, world_size)
+        found = broadcast_from_first(found, world_size)
         if isinstance(found, Exception):
             raise found
         with all_or_none(f"{path}: was not written", world_size):

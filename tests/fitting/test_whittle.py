@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gyrofuse._base.transforms import cosine_ordinates, ramp_ordinates
-from gyrofuse.fitting.spectral.bands import Bins, Noise
+from gyrofuse.fitting.spectral.bands import BandSpectrum, Bins
 from gyrofuse.fitting.spectral.whittle import WhittleFit, refine_whittle
 from gyrofuse.fitting.structure import ModelStructure
 from gyrofuse.noise.model import Model
@@ -118,7 +118,7 @@ def test_variances_of_ordinates_are_exact(process, n):
     transform = dct(n)
     expected = np.diag(transform @ dense(process, n) @ transform.T)
     np.testing.assert_allclose(spectrum(process, n), expected, rtol=1e-9)
-    noise = Noise(ModelStructure((process,), True))
+    noise = BandSpectrum(ModelStructure((process,), True))
     x = rows([math.atanh(float(process.phi))], 1) if isinstance(process, AR1) else rows([], 1)
     found = noise.variances(Bins(n, torch.device("cpu")), rows([1.0], 1), x)[0]
     np.testing.assert_allclose(found, expected, rtol=1e-9)
@@ -131,7 +131,7 @@ def test_bands_are_means_of_ordinates(process, n):
     assert bins.edges[0] == 1
     assert bins.edges[-1] == n
     assert bins.count.sum() == n - 1
-    noise = Noise(ModelStructure((process,), True))
+    noise = BandSpectrum(ModelStructure((process,), True))
     x = rows([math.atanh(float(process.phi))], 1) if isinstance(process, AR1) else rows([], 1)
     found = noise.variances(bins, rows([1.0], 1), x)[0]
     means = np.add.reduceat(spectrum(process, n), np.array(bins.edges[:-1]) - 1) / bins.count.numpy()

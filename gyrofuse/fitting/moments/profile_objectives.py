@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gyrofuse.fitting.moments import search
 from gyrofuse.fitting.moments.inference import Fit
-from gyrofuse.fitting.spectral.bands import Bins, Noise
+from gyrofuse.fitting.spectral.bands import BandSpectrum, Bins
 from gyrofuse.fitting.spectral.search import deviance, maximise
 from gyrofuse.fitting.structure import ModelStructure
 
@@ -157,7 +157,7 @@ class SpectralProfile:
     ) -> None:
         self.linear, self.shape = linear, shape
         self._energy, self._count = energy, count
-        self._noise, self._bins = Noise(structure), Bins(n_samples, linear.device)
+        self._noise, self._bins = BandSpectrum(structure), Bins(n_samples, linear.device)
         self._unknowns = [*self._noise.which, *(structure.n_linear + at for at in self._noise.at_x)]
         self._least = deviance(energy, count, self._bins, self._noise, *self._at(slice(None)))
         # AR1s of other minima: one that is nearly white, and one with a time constant of a thirtieth of the record.

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gyrofuse._base.transforms import ramp_ordinates
 from gyrofuse.fitting.moments.search import with_alternating
-from gyrofuse.fitting.spectral.bands import Bins, Noise
+from gyrofuse.fitting.spectral.bands import BandSpectrum, Bins
 from gyrofuse.fitting.spectral.search import maximise, uncertainty
 from gyrofuse.fitting.spectral.tones import NoiseSpectrum, Tones, find_tones, line_p_value
 from gyrofuse.fitting.spectral.whittle import LEAST_COUNT, ordinates_left
@@ -94,7 +94,7 @@ class Spectra:
 
     def fit(self, structure: ModelStructure, linear: Tensor, shape: Tensor) -> NoiseFit:
         """Maximum of the likelihood next to `p` and `x`; the slope of a drift is solved for."""
-        noise = Noise(structure)
+        noise = BandSpectrum(structure)
         ramp_at = _drifts(structure)
         p, x = linear[:, noise.which], shape
         size = self.energy.sum(-1, keepdim=True) / self.count.sum(-1, keepdim=True)
@@ -125,12 +125,12 @@ class Spectra:
 
     def variances(self, structure: ModelStructure, fit: NoiseFit) -> Tensor:
         """Variances of the ordinates of the noise without its drift, `(item, bin)`."""
-        noise = Noise(structure)
+        noise = BandSpectrum(structure)
         return noise.variances(self.bins, fit.linear[:, noise.which], fit.shape)
 
     def spread(self, structure: ModelStructure, fit: NoiseFit) -> tuple[Tensor, Tensor]:
         """Covariance of `(ln p, x)` `(item, unknown, unknown)` and the `sd` of `p` off its edge `(item, process)`."""
-        noise = Noise(structure)
+        noise = BandSpectrum(structure)
         own, edge = uncertainty(self.count, self.bins, noise, fit.linear[:, noise.which], fit.shape)
         n_linear = structure.n_linear
         whole = own.new_zeros(len(own), *(n_linear + len(structure.nonlinear),) * 2)
@@ -166,7 +166,7 @@ class Spectra:
 
     def _best_shape(self, parent: ModelStructure, fit: NoiseFit, process: Process) -> tuple[Tensor, Tensor]:
         """`x` and the variance of a further process that raise the likelihood fastest, both `(item,)`."""
-        noise = Noise(parent)
+        noise = BandSpectrum(parent)
         p, x = fit.linear[:, noise.which], fit.shape
         columns, slopes, _ = noise.columns(self.bins, x)
         variance = (columns @ p[..., None])[..., 0]
@@ -269,7 +269,7 @@ def detrended(series: Tensor) -> Tensor:
     return series - series.mean(-1, keepdim=True) - slope[:, None] * time
 
 
-def _reference(spectra: Spectra) -> tuple[Noise, NoiseFit]:
+def _reference(spectra: Spectra) -> tuple[BandSpectrum, NoiseFit]:
     """A noise that follows nearly any smooth spectrum: white and quantisation noise, a random walk and two AR1s."""
     parent = ModelStructure((WhiteNoise(), QuantizationNoise(), RandomWalk()), True)
     start = (spectra.energy / spectra.count).mean(-1, keepdim=True)
@@ -278,7 +278,7 @@ def _reference(spectra: Spectra) -> tuple[Noise, NoiseFit]:
     for _ in range(2):
         structure = ModelStructure((*parent.processes, AR1()), True)
         parent, fit = structure, spectra.fit(structure, *spectra.widened(parent, fit, structure))
-    return Noise(parent), fit
+    return BandSpectrum(parent), fit
 
 
 def reference_density(spectra: Spectra) -> NoiseSpectrum:
@@ -287,5 +287,5 @@ def reference_density(spectra: Spectra) -> NoiseSpectrum:
     return _density(noise, fit.linear, fit.shape)
 
 
-def _density(noise: Noise, linear: Tensor, shape: Tensor) -> NoiseSpectrum:
+def _density(noise: BandSpectrum, linear: Tensor, shape: Tensor) -> NoiseSpectrum:
     return lambda f: noise.density(f, linear, shape)

@@ -17,7 +17,7 @@ from gyrofuse.noise.processes import Process
 _TONE_HALF_WIDTH = 32  # ordinates on either side of a sinusoid over which it takes degrees of freedom
 
 
-class Noise:
+class BandSpectrum:
     """The processes of a model that have a continuous spectrum.
 
     Attributes:

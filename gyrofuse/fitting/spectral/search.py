@@ -7,14 +7,14 @@ from torch import Tensor
 
 from gyrofuse._base.nnls import nonnegative_least_squares
 from gyrofuse._base.optimize import Trial, descend
-from gyrofuse.fitting.spectral.bands import Bins, Noise
+from gyrofuse.fitting.spectral.bands import BandSpectrum, Bins
 
 
 def maximise(
     energy: Tensor,
     count: Tensor,
     bins: Bins,
-    noise: Noise,
+    noise: BandSpectrum,
     p: Tensor,
     x: Tensor,
     held: int | None = None,
@@ -94,7 +94,7 @@ def maximise(
     return p * unit, x, reached
 
 
-def deviance(energy: Tensor, count: Tensor, bins: Bins, noise: Noise, p: Tensor, x: Tensor) -> Tensor:
+def deviance(energy: Tensor, count: Tensor, bins: Bins, noise: BandSpectrum, p: Tensor, x: Tensor) -> Tensor:
     """Minus twice the log likelihood, but for what does not depend on the model, `(item,)`."""
     mean = (energy / count).clamp(min=torch.finfo(energy.dtype).tiny)
     return _deviance(mean, count, noise.variances(bins, p, x))
@@ -107,7 +107,7 @@ def _deviance(mean: Tensor, count: Tensor, variance: Tensor) -> Tensor:
 
 
 def _score(
-    mean: Tensor, count: Tensor, columns: Tensor, slopes: Tensor, bends: Tensor, p: Tensor, noise: Noise
+    mean: Tensor, count: Tensor, columns: Tensor, slopes: Tensor, bends: Tensor, p: Tensor, noise: BandSpectrum
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Gradient of the log likelihood by `(p, x)`, `(item, unknown)`, and its expected and its observed curvature.
 
@@ -132,7 +132,7 @@ def _score(
     return gradient, information, observed
 
 
-def uncertainty(count: Tensor, bins: Bins, noise: Noise, p: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+def uncertainty(count: Tensor, bins: Bins, noise: BandSpectrum, p: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
     """Covariance of `(ln p, x)`, `(item, unknown, unknown)`, and the `sd` of `p` off its edge, `(item, process)`."""
     columns, slopes, bends = noise.columns(bins, x)
     variance = (columns @ p[..., None])[..., 0]

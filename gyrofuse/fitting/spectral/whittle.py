@@ -27,7 +27,7 @@ from gyrofuse._base.checks import check_floating, check_positive_integer
 from gyrofuse._base.chunks import CACHE, items_at_once
 from gyrofuse._base.results import scattered
 from gyrofuse._base.transforms import cosine_ordinates, ramp_ordinates
-from gyrofuse.fitting.spectral.bands import Bins, Noise
+from gyrofuse.fitting.spectral.bands import BandSpectrum, Bins
 from gyrofuse.fitting.spectral.search import maximise, uncertainty
 from gyrofuse.fitting.spectral.tones import FEWEST_SAMPLES, Tones, find_tones
 from gyrofuse.fitting.structure import ModelStructure
@@ -110,7 +110,7 @@ def refine_whittle(
     _check(signal, structure, linear, shape)
     signal = signal.detach()
     linear, shape = linear.detach().to(torch.float64).clone(), shape.detach().to(torch.float64).clone()
-    noise = Noise(structure)
+    noise = BandSpectrum(structure)
     at_tones = [structure.nonlinear.index(k) for k in structure.nonlinear if structure.processes[k].has_line]
     started = linear[:, noise.which]
     usable = signal.sum(-1, dtype=torch.float64).isfinite() & (signal != signal[:, :1]).any(-1)
@@ -142,7 +142,7 @@ def _check(signal: Tensor, structure: ModelStructure, linear: Tensor, shape: Ten
 def _refined(
     signal: Tensor,
     structure: ModelStructure,
-    noise: Noise,
+    noise: BandSpectrum,
     at_tones: list[int],
     linear: Tensor,
     shape: Tensor,
@@ -208,7 +208,7 @@ def ordinates_left(signal: Tensor, tones: Tones | None, slope: Tensor | None) ->
 class _Ramp:
     """A ramp `slope * t` by weighted least squares on the first ordinates, where all but 1e-6 of it shows."""
 
-    def __init__(self, bins: Bins, signal: Tensor, noise: Noise) -> None:
+    def __init__(self, bins: Bins, signal: Tensor, noise: BandSpectrum) -> None:
         n_first = min(SINGLE, bins.n_samples - 1)
         self.shown = ramp_ordinates(bins.n_samples, signal.device)[1 : n_first + 1]
         self._bins, self._noise = bins, noise
@@ -233,7 +233,7 @@ def _kept(known: Tones, found: Tones, n_samples: int) -> Tones:
     return Tones(*(torch.where(same, getattr(found, f.name), getattr(known, f.name)) for f in fields(Tones)))
 
 
-def _measured_tones(signal: Tensor, slope: Tensor, n_tones: int, noise: Noise, p: Tensor, x: Tensor) -> Tones:
+def _measured_tones(signal: Tensor, slope: Tensor, n_tones: int, noise: BandSpectrum, p: Tensor, x: Tensor) -> Tones:
     """Spectral lines from high to low frequency over the fitted noise."""
     if not len(signal):
         return Tones(*(p.new_empty(0, n_tones) for _ in fields(Tones)))
@@ -249,7 +249,7 @@ def _assembled(
     own: Tensor,
     edge_sd: Tensor,
     structure: ModelStructure,
-    noise: Noise,
+    noise: BandSpectrum,
     at_tones: list[int],
     tones: Tones | None,
     slope: Tensor,
