@@ -36,8 +36,8 @@ FLOORS = [
 ]
 MOST_ENTRIES = 14  # of a folder, __init__.py and folders inside it included
 MOST_LINES = 400  # of a file
-MOST_NUMBERS = 600  # at module level, in all files
-MOST_SWITCHES = 75  # `isinstance` of a process outside `noise`
+MOST_NUMBERS = 200  # at module level, in all files
+MOST_SWITCHES = 5  # `isinstance` of a process outside `noise`
 HEAVY = {
     "matplotlib",
     "lightning",
