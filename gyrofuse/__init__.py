@@ -16,7 +16,9 @@ Names, dimensions and units, the same everywhere; `...` are batch dimensions:
 Levels are `j = 1..J` with filters of length `2**j`; NaN is a missing sample. Formulas are numbered as in
 
 - [Z] Zhang, Cucci, Molinari, Guerrier, Scale-wise Variance Minimization for Optimal Virtual Signals: An Approach for
-  Redundant Gyroscopes, IEEE Transactions on Signal Processing 70, 2022.
+  Redundant Gyroscopes, IEEE Transactions on Signal Processing 70, 2022,
+- [V] Voirol, Cucci, Karemera, Chu, Molinari, Guerrier, Accounting for Vibration Noise in Stochastic Measurement Errors,
+  arXiv:2303.18167, 2023.
 """
 
 from importlib import import_module

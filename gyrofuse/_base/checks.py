@@ -126,6 +126,8 @@ def check_confidence_level(value: float) -> float:
     return number
 
 
+# Relative difference of two sampling rates up to which they count as one: ten times the 0.01 % that the crystals of
+# clocks are wrong by.
 _SAME_RATE = 1e-3
 
 

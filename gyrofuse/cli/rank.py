@@ -38,7 +38,7 @@ def rank(
         str | None,
         typer.Option(
             metavar="FORMULA,...",
-            help='ModelStructures to compare, such as "WN+AR1, WN+AR1+RW"; all that make sense by default.',
+            help='Models to compare, such as "WN+AR1, WN+AR1+RW"; all that make sense by default.',
         ),
     ] = None,
     levels: ModelLevels = None,

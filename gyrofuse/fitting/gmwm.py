@@ -53,7 +53,7 @@ def fit_gmwm(
 ) -> GMWMResult:
     """Fit a sum of noise processes to the wavelet variance of every sensor.
 
-    `theta = argmin (nu - nu(theta))' Omega (nu - nu(theta))` over the levels ([V] equation 5), with `Omega = V^-1` of
+    `theta = argmin (nu - nu(theta))' Omega (nu - nu(theta))` over the levels ([V] equation (4)), with `Omega = V^-1` of
     the fitted model (`optimal`), the reciprocal variances (`diagonal`), the identity, or weights of your own. `Omega`
     is updated between fits and held in each.
 
@@ -64,9 +64,11 @@ def fit_gmwm(
     sinusoids from high to low frequency.
 
     Intervals are symmetric in the logarithm of variances and amplitudes, in `atanh phi` and in `logit(beta / pi)`.
-    Where such an interval fails, its limits are those of the profile of the objective, all values with which the best
-    fit is at most `z^2` worse: for variances at zero, parameters known to hardly their order of magnitude, AR1s that
-    another process could stand for, and objectives that are no parabola. Near zero these intervals hold the truth
+    Where such an interval is unreliable, the limits are those of the profiled objective: all values at which its
+    minimum over the other parameters exceeds the global minimum by at most `z^2`, `z` the normal quantile (`z^2` the
+    chi-square quantile of two degrees of freedom where the model may have an AR1 too many). This is so for variances at
+    zero, parameters of which hardly the order of magnitude is known, AR1s whose interval includes the white-noise or
+    random-walk limit, and objectives that are not nearly quadratic. Near zero these intervals hold the true value
     somewhat more often than stated. Parameters that the record does not identify are named in `notes`.
 
     Noise is assumed Gaussian except for its white part, whose excess kurtosis, estimated from the differences of the
@@ -80,11 +82,11 @@ def fit_gmwm(
         confidence_level: Probability that an interval holds the true value.
         n_levels: Number of levels J; by default all that hold two non-overlapping windows.
         refine: Whether to go on from the moments to the maximum of the spectral (Whittle) likelihood, whose estimates
-            are somewhat more accurate. The fit has to start near that maximum, and the signal may have no missing
-            samples. The J test is that of the refined parameters.
-        efficiency: Efficiency of the wavelet variance: 1 for the mean square of the coefficients; below 1 for
-            `robust_wavelet_variance`, with its own covariance in weights, intervals and J test, by default with levels
-            of at least 16 windows. Gaussian processes only: it is not consistent for sinusoids and drifts. Outliers
+            are somewhat more accurate. Where the search from the moments reaches no maximum, or samples are missing,
+            the fit to the moments is kept, with a warning. The J test is that of the refined parameters.
+        efficiency: Efficiency of the wavelet variance: 1 for the mean square of the coefficients; a value below 1
+            switches to `robust_wavelet_variance` of that efficiency, with its own covariance in weights, intervals and
+            J test, by default with levels of at least 16 windows. Gaussian processes only: it is not consistent for sinusoids and drifts. Outliers
             then do not count as white noise, but intervals are those of clean noise; with one outlier in 2000 samples
             or more, slow processes come out too large, and the J test rejects the model.
         strict: Whether to raise when an item cannot be fitted, instead of marking it.

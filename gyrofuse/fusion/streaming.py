@@ -71,7 +71,7 @@ def stream_svo(
         SingularCovarianceError: A dead, duplicated or linearly dependent sensor.
 
     References:
-        [Z] equations (5) to (7).
+        [Z] equations (4) to (7).
 
     Example:
         >>> result = stream_svo(open_recording("week.npy", rate=200.0), "long")

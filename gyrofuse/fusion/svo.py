@@ -57,9 +57,9 @@ def fit_svo(
     Args:
         signal: `(..., sensor, time)` of at least two sensors, or a `Recording`; NaN = missing sample.
         scale_weights: `"flat"`, `"short"`, `"long"`, or one number >= 0 per level.
-        method: `"svo"`; `"auto"` chooses between SVO, `"model_assisted"` (last levels of a smooth model) and
-            `"shrinkage"` (last levels shrunk towards neighbouring levels) by held-out risk; `"nonnegative"` keeps every
-            weight >= 0; `"inverse_variance"` ignores correlation; `"equal"`, and `"rdvg"` of Vaccaro and Zaki, whose
+        method: `"svo"`; `"auto"` is `"model_assisted"` (last levels of a smooth model) unless the held-out risk of
+            `"shrinkage"` (last levels shrunk towards neighbouring levels) or SVO is lower by three standard errors, and
+            SVO where the recording is too short for held-out blocks; `"nonnegative"` keeps every weight >= 0; `"inverse_variance"` ignores correlation; `"equal"`, and `"rdvg"` of Vaccaro and Zaki, whose
             model is white noise and random walk, are for comparison.
         confidence_level: Confidence level of every interval in the result.
         covariance: What the intervals rest on. `"model"`: the variation along the recording where levels hold many
@@ -154,7 +154,7 @@ class SVO(FittedLayer):
         scale_weights: `"flat"`, `"short"`, `"long"`, or one number >= 0 per level.
         method: As for `fit_svo`, and so are all options below.
         confidence_level: Confidence level of the intervals in the result of `fit`.
-        covariance: What the intervals rest on.
+        covariance: What the intervals rest on: `"model"`, `"block_bootstrap"`, `"resampling"` or `"none"`.
         block_length: Block length of the two bootstraps.
         n_levels: Number of levels J.
 

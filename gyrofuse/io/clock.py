@@ -123,7 +123,8 @@ def grid_of(
     slots, kept = slots[first], kept[first]
     start += step * float(slots[0])
     slots = slots - slots[0]
-    # More than 20 slots a sample, with an allowance for short logs, are a clock that jumps.
+    # A grid of more than 20 slots a sample, 95 % of it empty, is a clock that jumps; the limit also keeps the memory of
+    # the grid within 20 times that of the log. 1000 slots more let short logs have a pause.
     if slots[-1] > 20 * slots.size + 1000:
         raise RecordingError(
             f"{source}: expected a recording without long pauses, found {slots.size} samples of {name} in "
@@ -166,12 +167,18 @@ def _in_bursts(t: Array, step: float, regular: NDArray[np.bool_], nominal: float
     Missing samples make steps of whole multiples of the typical one; stamps in bursts make fractions of it.
     """
     long_run = (t[-1] - t[0]) / (t.size - 1)
+    # Steps within a tenth of the long-run one are those of the sensor, with less than a tenth of the samples missing.
     if abs(long_run / step - 1) < 0.1:
         return False
+    # Half of that tenth: the stated rate is nearer to the long-run rate than to that of the typical steps.
     if nominal is not None and abs(long_run * nominal - 1) < 0.05:
         return True
     odd = np.diff(t)[~regular] / step
+    # A quarter of a step is halfway between whole multiples and the fractions farthest from them. Steps below a half,
+    # within a burst, are near the multiple 0, which missing samples never make.
     fractional = (np.abs(odd - np.rint(odd)) > 0.25) | (odd < 0.5)
+    # Of multiples without a pattern half are fractional; a quarter is halfway between that and none. Fewer irregular
+    # steps than one in twenty are pauses rather than bursts.
     return bool(odd.size > 0.05 * t.size and fractional.mean() > 0.25)
 
 

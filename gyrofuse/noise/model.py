@@ -192,8 +192,11 @@ class Model:
     ) -> Tensor:
         """Draw independent sample paths, differentiable in the parameters.
 
-        An AR(1) is stationary from its first sample on, a random walk starts with its first increment, a
-        drift is `slope * t` with `t = 1..n_samples`, a sinusoid has a uniform random phase per path.
+        AR(1) and Matern 3/2 processes are stationary from the first sample on, as is quantisation noise, the
+        differences of white noise that begins one sample earlier. A random walk starts with its first increment.
+        Flicker noise, which has no stationary level, has differences of their exact law and mean 0 over a path of at
+        least twice the length, of which the first `n_samples` are returned. A drift is `slope * t` with
+        `t = 1..n_samples`, a sinusoid has a uniform random phase per path.
 
         Args:
             n_samples: Samples of each path.

@@ -1,7 +1,7 @@
 """Wavelet variance (WV) and wavelet cross-covariance (WCCV) of arrays.
 
 `gamma_{ik,j} = (1/M_j) sum_t W_{i,j,t} W_{k,j,t}` over the `M_j = T - 2**j + 1` windows inside the recording, no mean
-removed ([Z] equation (5)). Two paths compute it: tiles of time in cache for data, and differentiable operations on
+removed ([Z] section II). Two paths compute it: tiles of time in cache for data, and differentiable operations on
 the coefficients for gradients. They are one definition, tested against each other.
 """
 
@@ -36,7 +36,7 @@ def wavelet_cross_covariance(signal: Tensor, n_levels: int | None = None) -> Ten
         ValueError: The shape is not `(..., sensor, time)`, or the signal is too short for `n_levels`.
 
     References:
-        [Z] equation (5).
+        [Z] section II, the estimator between equations (6) and (7).
     """
     check_signal("signal", signal)
     n_levels = check_n_levels(n_levels, signal.shape[-1])
@@ -64,7 +64,7 @@ def wavelet_variance(signal: Tensor, n_levels: int | None = None) -> Tensor:
         ValueError: The shape is not `(..., sensor, time)`, or the signal is too short for `n_levels`.
 
     References:
-        [Z] equation (4); Percival & Walden, Wavelet Methods for Time Series Analysis, equation (306b).
+        [Z] section II; Percival & Walden, Wavelet Methods for Time Series Analysis, equation (306b).
     """
     check_signal("signal", signal)
     # A sensor on its own is an array of one, whose only entry is the variance.

@@ -41,7 +41,7 @@ def haar_coefficients(signal: Tensor, n_levels: int | None = None) -> list[Tenso
         ValueError: The shape is not `(..., sensor, time)`, or the signal is too short for `n_levels`.
 
     References:
-        [Z] section II, equations (2)-(3); Percival & Walden, Wavelet Methods for Time Series Analysis, ch. 5.
+        [Z] section II; Percival & Walden, Wavelet Methods for Time Series Analysis, ch. 5.
     """
     check_signal("signal", signal)
     return _pyramid(signal, _kernel(signal), check_n_levels(n_levels, signal.shape[-1]))

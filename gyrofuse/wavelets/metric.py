@@ -32,7 +32,7 @@ class WaveletCrossCovariance(Metric):
         ValueError: `n_sensors` or `n_levels` is not a whole number of at least 1.
 
     References:
-        [Z] equation (5).
+        [Z] section II, the estimator between equations (6) and (7).
 
     Example:
         >>> metric = WaveletCrossCovariance(n_sensors=6, n_levels=12)

@@ -104,7 +104,7 @@ class Moments:
 
 
 def combined_covariance(wccv: Tensor, scale_weights: Tensor) -> Tensor:
-    """`A = sum_j omega_j Gamma_j`, [Z] equation (6); differentiable.
+    """`A = sum_j omega_j Gamma_j`, [Z] equation (4); differentiable.
 
     Args:
         wccv: `(..., level, sensor, sensor)`; a level whose scale weight is 0 may be unknown (NaN).

@@ -37,7 +37,8 @@ class Pilot:
             the steps of a random walk.
         memory: `(...)`, process of the second component: 0 the random walk, 1, 2, ... the AR1s.
         n_samples: Length of the record.
-        first_level: Lowest level (counted from 0) that the model was fitted to.
+        first_level: Lowest level (counted from 0) that the model is always fitted to. Where Akaike's criterion prefers
+            it, the fit begins up to `levels_below` levels lower, item by item, as `observations` shows.
         n_levels: Levels J.
         observations: `(..., level)`, degrees of freedom of each level that was fitted; 0 at the others.
     """
@@ -61,7 +62,7 @@ class Pilot:
 
     @property
     def wavelet_cross_covariance(self) -> Tensor:
-        """`(..., level, sensor, sensor)` of the model at every level; fitted from `first_level` on."""
+        """`(..., level, sensor, sensor)` of the model at every level; fitted at those that have `observations`."""
         return mixture(self.theta, self.unit)
 
     @property
@@ -117,7 +118,9 @@ class Pilot:
         precision = self.observations / (2 * parts.sum(-1).square())
         information = torch.einsum("...j,...jk,...jm->...km", precision, parts, parts)
         size = information.diagonal(dim1=-2, dim2=-1)
-        # A component without a share has neither information nor slope: a relative 1e-9 keeps the matrix regular.
+        # A component without a share has neither information nor slope, and the matrix is singular. A ridge of a
+        # relative 1e-9 is allowed here, as it enters no estimate: the result is a number of degrees of freedom that the
+        # independence of levels makes wrong by much more.
         information = information + torch.diag_embed(1e-9 * size.sum(-1, keepdim=True).expand_as(size))
         slope = torch.einsum("j,...jk->...k", scale_weights[self.first_level :], parts[..., self.first_level :, :])
         return 2 * slope.sum(-1).square() / (slope * torch.linalg.solve(information, slope)).sum(-1)
@@ -128,7 +131,7 @@ def fit_pilot(wccv: Tensor, n_samples: int, levels_below: int = 2) -> Pilot:
 
     Maximises the Wishart likelihood `-sum_j eta_j (ln det S_j + tr(S_j^-1 Gamma_j)) / 2` with
     `S_j = Theta_0 / tau_j + Theta_1 u_j`, `u_j = (tau_j^2 + 2) / (12 tau_j)` for a random walk, and
-    `eta_j = 2 M_j / tau_j`, levels taken to be independent, over the last levels, and over some more where Akaike's
+    `eta_j = 2 M_j / tau_j` for the `M_j = T - tau_j + 1` windows of a level, within 1 to 300, levels taken to be independent, over the last levels, and over some more where Akaike's
     criterion prefers that.
 
     Args:

@@ -230,7 +230,7 @@ class ArrayGMWMResult(Result):
             SingularCovarianceError: The combined covariance is not positive definite, or a pair is never seen together.
 
         References:
-            [Z] equations (6) and (7).
+            [Z] equations (4) and (7).
         """
         present = self._present()
         both = (present[..., :, None] & present[..., None, :])[..., None, :, :]

@@ -137,13 +137,13 @@ def with_ancestors(wanted: Iterable[Kinds]) -> list[Kinds]:
 
 
 def children(kinds: Kinds, among: Iterable[Key]) -> list[Kinds]:
-    """ModelStructures with one process more."""
+    """Structures with one process more."""
     known = set(among)
     return [more for kind in PROCESSES if key_of(more := [*kinds, kind]) in known]
 
 
 def parents(kinds: Kinds) -> list[Key]:
-    """ModelStructures with one process less."""
+    """Structures with one process less."""
     smaller = []
     for kind in dict.fromkeys(kinds):
         rest = list(kinds)

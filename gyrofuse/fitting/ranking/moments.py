@@ -1,4 +1,4 @@
-"""ModelStructures fitted to the wavelet variances of records, each from where smaller ones ended.
+"""Structures fitted to the wavelet variances of records, each from where smaller ones ended.
 
 Leaner than the fit of one model: without a search for several minima and without polishing, which many structures
 too large for their record would spend on flat valleys.

@@ -1,4 +1,4 @@
-"""ModelStructures of noise processes, ranked."""
+"""Structures of noise processes, ranked."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Largest likelihoods of structures for many records, each climbed to from the best with one process less."""
+"""Largest likelihoods of structures for many records, each climbed to from every one with one process less."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class _Search(ABC, Generic[FitT]):
 
     Attributes:
         held: Sinusoids are no part of what is fitted.
-        afresh: ModelStructures with one shape start from a grid too.
+        afresh: Structures with one shape start from a grid too.
         fits: Of all records; NaN where a structure was not tried.
     """
 
@@ -72,10 +72,13 @@ class _Search(ABC, Generic[FitT]):
             for kinds, which in todo.values():
                 self._try_out(kinds, which.nonzero()[:, 0])
             found = torch.stack([self.criterion(key) for key in todo])  # (candidate, item)
-            # Larger structures are tried while the best of a size is at most six above the best of all so far.
+            # Larger structures are tried while the best of a size is at most six above the best of all so far: a little
+            # less than one parameter costs (6.7 at 10^4 samples, 8.3 at 10^7). A size all of whose structures fit no
+            # better than smaller ones thus ends the search.
             going = found.amin(0) < best + 6.0
             best = torch.minimum(best, found.amin(0))
-            # The extensions of the three best of a size.
+            # The extensions of the three best of a size: where an AR1 stands for two processes, the best of a size
+            # may not be among the parents of the best structure. `_settle` looks for what the three miss.
             kept = (found.argsort(0).argsort(0) < 3) & found.isfinite() & going
             following: dict[Key, tuple[Kinds, Tensor]] = {}
             for (kinds, _), which in zip(todo.values(), kept, strict=True):

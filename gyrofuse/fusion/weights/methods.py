@@ -20,8 +20,9 @@ from gyrofuse.wavelets.moments import combined_covariance
 # Methods of `fit_svo`, each with the sentences that explain it in a report.
 METHODS = {
     "auto": (
-        "SVO, model-assisted SVO or SVO with shrinkage, whichever does best on data held out: the weights minimise "
-        "the wavelet variance of the virtual gyro, summed over scales with the scale weights of the table."
+        "Model-assisted SVO, unless SVO with shrinkage or plain SVO does better on data held out by three standard "
+        "errors, and plain SVO where the recording is too short to hold data out: the weights minimise the wavelet "
+        "variance of the virtual gyro, summed over scales with the scale weights of the table."
     ),
     "svo": (
         "Scale-wise variance optimisation (SVO): the weights minimise the wavelet variance of the virtual gyro, "

@@ -2,7 +2,7 @@
 
 The weights minimise the wavelet variance of the virtual signal, summed over levels with scale weights `omega_j`:
 
-    A = sum_j omega_j Gamma_j,   c = A^-1 1 / (1' A^-1 1)                                   [Z] equations (6), (7)
+    A = sum_j omega_j Gamma_j,   c = A^-1 1 / (1' A^-1 1)                                   [Z] equations (4), (7)
 
 Scale weights say how much each level counts: a name, or one number >= 0 per level, of which the sum does not matter.
 """
@@ -191,7 +191,7 @@ def influence_matrix(combined: Tensor, weights: Tensor) -> Tensor:
 
 
 def checked_combination(wccv: Tensor, scale_weights: ScaleWeights, labels: Sequence[str] | None = None) -> Tensor:
-    """`A = sum_j omega_j Gamma_j`, [Z] equation (6), positive definite.
+    """`A = sum_j omega_j Gamma_j`, [Z] equation (4), positive definite.
 
     Args:
         wccv: `(..., level, sensor, sensor)`; a level whose scale weight is 0 may be unknown (NaN).

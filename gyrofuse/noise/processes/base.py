@@ -203,7 +203,12 @@ class Process(Model):
 
     @staticmethod
     def unit_wavelet_variance_slope(tau: Tensor, x: Tensor) -> Tensor:
-        """Its derivative with respect to `x`, `(..., level)`."""
+        """Derivative of `unit_wavelet_variance` with respect to `x`, `(..., level)`.
+
+        Args:
+            tau: Filter lengths, `(level,)`, samples.
+            x: Unconstrained nonlinear parameter, `(..., 1)`.
+        """
         raise NotImplementedError
 
     @classmethod

@@ -147,5 +147,9 @@ def seconds(fields: Any) -> Array:
 
 
 def device_of(data: Any) -> int | None:
-    """Number of the sensor in an instance of a topic, if it has one."""
+    """PX4 `device_id` of a topic instance; None if the message has no such field.
+
+    Args:
+        data: Instance of a topic, as `pyulog` reads it.
+    """
     return int(data.data["device_id"][0]) if "device_id" in data.data else None
