@@ -86,9 +86,10 @@ def fit_gmwm(
             the fit to the moments is kept, with a warning. The J test is that of the refined parameters.
         efficiency: Efficiency of the wavelet variance: 1 for the mean square of the coefficients; a value below 1
             switches to `robust_wavelet_variance` of that efficiency, with its own covariance in weights, intervals and
-            J test, by default with levels of at least 16 windows. Gaussian processes only: it is not consistent for sinusoids and drifts. Outliers
-            then do not count as white noise, but intervals are those of clean noise; with one outlier in 2000 samples
-            or more, slow processes come out too large, and the J test rejects the model.
+            J test, by default with levels of at least 16 windows. Gaussian processes only: it is not consistent for
+            sinusoids and drifts. Outliers then do not count as white noise, but intervals are those of clean noise;
+            with one outlier in 2000 samples or more, slow processes come out too large, and the J test rejects the
+            model.
         strict: Whether to raise when an item cannot be fitted, instead of marking it.
         n_samples: Deprecated; see `fit_gmwm_moments`.
         moments: Deprecated; only `"variance"` is left.

@@ -14,6 +14,7 @@ from torch import Tensor
 from gyrofuse._base.deprecation import RenamedAttribute
 from gyrofuse._base.results import ConfidenceInterval, Result, counted, p_words, place, plain, scattered
 from gyrofuse._base.units import DATASHEET_UNITS
+from gyrofuse.fitting.j_test import REJECTED
 from gyrofuse.fitting.moments.inference import Inference
 from gyrofuse.fitting.moments.records import SampleDesign
 from gyrofuse.fitting.structure import ModelStructure
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-# P value of the J test below which a model counts as incomplete: one complete model in a hundred does.
-REFUSED = 0.01
 # Largest number of items whose tables a summary prints in full: what a few pages of a terminal hold.
 MOST_TABLES = 12
 
@@ -193,8 +192,8 @@ class GMWMResult(Result):
         if n_items > MOST_TABLES:
             tested = self.p_value.isfinite()
             if bool(tested.any()):
-                refused = int((self.p_value[tested] < REFUSED).sum())
-                lines.append(f"the J test refuses {refused} of {int(tested.sum())} models (p < {REFUSED:g})")
+                refused = int((self.p_value[tested] < REJECTED).sum())
+                lines.append(f"the J test refuses {refused} of {int(tested.sum())} models (p < {REJECTED:g})")
             return "\n".join(lines)
         for index in itertools.product(*map(range, self.params.shape[:-1])):
             lines += ["", *self._table(index)]

@@ -153,7 +153,7 @@ def plot_ranking(
     difference: Tensor,
     standings: list[str],
     *,
-    refused: bool = False,
+    rejected: bool = False,
     aside: list[str] | None = None,
     title: str | None = None,
     note: str | None = None,
@@ -165,7 +165,7 @@ def plot_ranking(
         names: Names of the candidates, from the best on.
         difference: Criteria less that of the chosen one, `(candidate,)`.
         standings: Standing of each: `chosen`, `not told from it`, `redundant` or nothing.
-        refused: Whether the J test rejects the chosen one.
+        rejected: Whether the J test clearly rejects the chosen one.
         aside: Candidates that were not compared.
         title: Title of the axes.
         note: Note on what is not shown, to the right of the title.
@@ -184,7 +184,7 @@ def plot_ranking(
             shown = [values[k] for k in places]
             ax.hlines(places, 0.0, shown, color=color, linewidth=5, zorder=2)
             ax.plot(shown, places, "o", color=color, markersize=8, zorder=3, label=named[-1] or "candidate")
-    chosen = "chosen, though the J test refuses it" if refused else "chosen"
+    chosen = "chosen, though the J test refuses it" if rejected else "chosen"
     for k, (value, standing) in enumerate(zip(values, standings, strict=True)):
         text = chosen if standing == "chosen" else f"{value:+.1f}"
         ax.annotate(text, (max(value, 0.0), k), (9, 0), textcoords="offset points", va="center", fontsize=8)

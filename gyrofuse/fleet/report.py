@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from gyrofuse._base.page import image, number, render
 from gyrofuse._base.results import counted
+from gyrofuse.fitting.j_test import REJECTED
 from gyrofuse.fleet.plots import plot_distribution, plot_weights_over_logs
 from gyrofuse.fleet.summary import FEWEST_IN_TIME, GAIN, LEVEL, NOISY, FleetSummary, arrays_of
 
@@ -96,7 +97,9 @@ def verdict(summary: FleetSummary) -> list[str]:
         if not (summary.too_noisy or summary.outliers or summary.weight_warnings or summary.trends):
             sentences.append("No sensor, log or drift of weights stands out.")
     if summary.task == "fit" and summary.values:
-        sentences.append(f"{summary.n_refused} of {len(summary.ranked)} fits are refused by the J test at {LEVEL:g}.")
+        sentences.append(
+            f"{summary.n_refused} of {len(summary.ranked)} fits are refused by the J test at {REJECTED:g}."
+        )
     if summary.n_unidentified:
         sentences.append(
             f"{summary.n_unidentified} of {len(summary.ranked)} fits have parameters that cannot be told apart."
@@ -146,7 +149,8 @@ def _plain(value: Any) -> str:
 
 
 def _distribution(task: str, label: str, values: Sequence[float]) -> str:
-    mark, meaning = (1.0, "plain mean") if task == "fuse" else (LEVEL, f"{LEVEL:g}")
+    level = REJECTED if task == "fit" else LEVEL
+    mark, meaning = (1.0, "plain mean") if task == "fuse" else (level, f"{level:g}")
     limits = None if task == "fuse" else (0.0, 1.0)
     what = "recordings of arrays" if task == "fuse" else "fits" if task == "fit" else "recordings"
     draw = partial(plot_distribution, values, label=label, mark=mark, meaning=meaning, what=what, limits=limits)

@@ -11,6 +11,7 @@ from scipy import stats
 
 from gyrofuse._base.deprecation import RenamedAttribute, moved_names
 from gyrofuse._base.results import counted
+from gyrofuse.fitting.j_test import REJECTED
 from gyrofuse.fleet.store.table import identity_in
 
 # Allan deviation of a sensor, in units of the median of its array, above which it is listed as noisy: a convention.
@@ -23,7 +24,7 @@ _FEWEST = 5
 # Fewest logs of one array for a test of trend: with eight the smallest two-sided p value of Kendall's test is 2 / 8!,
 # below 1e-4, so that a correction for up to 200 weights leaves it significant.
 FEWEST_IN_TIME = 8
-# Significance level of the test of trend, for all weights together (Bonferroni), and of the J test in the table.
+# Significance level of the test of trend, for all weights together (Bonferroni), and of p values in figures.
 LEVEL = 0.01
 GAIN = "Allan deviation of the plain mean over that of the virtual gyro, geometric mean over averaging times"
 
@@ -120,7 +121,7 @@ class FleetSummary:
     @property
     def n_refused(self) -> int:
         """Number of fits that the J test rejects."""
-        return sum(value < LEVEL for value in self.values)
+        return sum(value < REJECTED for value in self.values)
 
     @property
     def n_unidentified(self) -> int:
@@ -146,7 +147,7 @@ class FleetSummary:
                 "below 1 is worse than the plain mean"
             )
         if self.task == "fit":
-            lines.append(f"{self.n_refused} of {len(self.ranked)} fits refused by the J test at {LEVEL:g}")
+            lines.append(f"{self.n_refused} of {len(self.ranked)} fits refused by the J test at {REJECTED:g}")
             if self.n_unidentified:
                 lines.append(
                     f"{self.n_unidentified} of {len(self.ranked)} fits have parameters that cannot be told apart"

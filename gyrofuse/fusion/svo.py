@@ -59,8 +59,9 @@ def fit_svo(
         scale_weights: `"flat"`, `"short"`, `"long"`, or one number >= 0 per level.
         method: `"svo"`; `"auto"` is `"model_assisted"` (last levels of a smooth model) unless the held-out risk of
             `"shrinkage"` (last levels shrunk towards neighbouring levels) or SVO is lower by three standard errors, and
-            SVO where the recording is too short for held-out blocks; `"nonnegative"` keeps every weight >= 0; `"inverse_variance"` ignores correlation; `"equal"`, and `"rdvg"` of Vaccaro and Zaki, whose
-            model is white noise and random walk, are for comparison.
+            SVO where the recording is too short for held-out blocks; `"nonnegative"` keeps every weight >= 0;
+            `"inverse_variance"` ignores correlation; `"equal"`, and `"rdvg"` of Vaccaro and Zaki, whose model is white
+            noise and random walk, are for comparison.
         confidence_level: Confidence level of every interval in the result.
         covariance: What the intervals rest on. `"model"`: the variation along the recording where levels hold many
             windows, a fitted model elsewhere; right at every level. `"block_bootstrap"`: the bootstrap of [Z] in closed

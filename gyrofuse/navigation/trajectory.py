@@ -171,7 +171,7 @@ class Trajectory:
 
 
 def flight() -> Trajectory:
-    """A flight of 235 s at 17 to 21 m/s: one and a half circles to the right, climbing by 88 m, then descending by 39 m."""
+    """A flight of 235 s at 17 to 21 m/s: one and a half circles to the right, a climb of 88 m, a descent of 39 m."""
     # s, north, east, up: m
     points = torch.tensor(
         [

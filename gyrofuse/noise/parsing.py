@@ -24,9 +24,8 @@ _KNOWN = ", ".join(f"{kind.symbol} ({kind.__name__})" for kind in PROCESSES)
 def parse_model(formula: str) -> Model:
     """Read a model such as `"WN + 2*AR1 + RW + SIN"` or `"WN(variance=1e-4) + AR1(phi=0.99, variance=1e-6)"`.
 
-    Names are WN, QN, AR1 (or GM, Gauss-Markov), GM2 (Matern 3/2), RW, FN, DR, SIN or the processes' full names, in either
-    case.
-    What `str` prints of a model with scalar parameters is read back exactly.
+    Names are WN, QN, AR1 (or GM, Gauss-Markov), GM2 (Matern 3/2), RW, FN, DR, SIN or the full names of the
+    processes, in either case. What `str` prints of a model with scalar parameters is read back exactly.
 
     Raises:
         ValueError: Not a formula, one of more than 1000 characters or 50 processes, an unknown name or parameter, a

@@ -131,8 +131,8 @@ def fit_pilot(wccv: Tensor, n_samples: int, levels_below: int = 2) -> Pilot:
 
     Maximises the Wishart likelihood `-sum_j eta_j (ln det S_j + tr(S_j^-1 Gamma_j)) / 2` with
     `S_j = Theta_0 / tau_j + Theta_1 u_j`, `u_j = (tau_j^2 + 2) / (12 tau_j)` for a random walk, and
-    `eta_j = 2 M_j / tau_j` for the `M_j = T - tau_j + 1` windows of a level, within 1 to 300, levels taken to be independent, over the last levels, and over some more where Akaike's
-    criterion prefers that.
+    `eta_j = 2 M_j / tau_j` for the `M_j = T - tau_j + 1` windows of a level, but at least 1 and at most 300. Levels are
+    taken to be independent. The fit is to the last levels, and to some more where Akaike's criterion prefers that.
 
     Args:
         wccv: `(..., level, sensor, sensor)`, signal^2, float64.

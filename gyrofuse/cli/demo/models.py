@@ -12,7 +12,8 @@ from torch import Tensor
 
 from gyrofuse._base.page import new_figure, number
 from gyrofuse._base.units import SECONDS_PER_HOUR, angle_random_walk, correlation_time, per_sqrt_hour, rate_unit_factor
-from gyrofuse.fitting.gmwm_result import REFUSED, GMWMResult
+from gyrofuse.fitting.gmwm_result import GMWMResult
+from gyrofuse.fitting.j_test import REJECTED
 from gyrofuse.fitting.ranking.candidates import name_of
 from gyrofuse.fitting.ranking.result import RankResult
 from gyrofuse.noise.array_model import ArrayModel
@@ -131,7 +132,7 @@ def _comment(fits: list[GMWMResult], result: RankResult, truth: Model) -> str:
     name = name_of([type(process) for process in truth.processes])
     same = sum(found == name for found in result.names)
     tests = {fit.sensors[0]: _p_value(fit) for fit in fits}
-    refused = [sensor for sensor, p_value in tests.items() if p_value is not None and p_value < REFUSED]
+    refused = [sensor for sensor, p_value in tests.items() if p_value is not None and p_value < REJECTED]
     untested = [sensor for sensor, p_value in tests.items() if p_value is None]
     doubts = f"The J test refuses the model of {', '.join(refused)}." if refused else "The J test refuses none of them."
     if untested:

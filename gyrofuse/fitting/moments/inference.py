@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gyrofuse.fitting.j_test import CLEARLY_REJECTED
 from gyrofuse.fitting.moments.records import SampleDesign
 from gyrofuse.fitting.structure import ModelStructure
 from gyrofuse.noise.processes import Sinusoid
@@ -93,9 +94,9 @@ class Inference:
         return chi_square_tail(self.j_statistic / self.dispersion, self.dof / self.dispersion)
 
     @property
-    def refused(self) -> Tensor:
-        """Whether the J test rejects the model beyond doubt, p < 0.001, `(item,)`."""
-        return self.p_value < 1e-3
+    def clearly_rejected(self) -> Tensor:
+        """Whether the J test clearly rejects the model, `(item,)`."""
+        return self.p_value < CLEARLY_REJECTED
 
 
 def either(condition: Tensor, one: Any, other: Any) -> Any:

@@ -56,7 +56,7 @@ def profiled(
     References:
         Profile likelihood intervals: D. J. Venzon, S. H. Moolgavkar, Applied Statistics 37, 1988.
     """
-    estimates, refused = inference.estimates, inference.refused
+    estimates, rejected = inference.estimates, inference.clearly_rejected
     needed = weakly_identified(structure, estimates, fit.records.longest, confidence_level)
     needed |= _bent(surface, structure, estimates, fit.tau, confidence_level)
     needed &= estimates.params.isfinite().all(-1, keepdim=True)
@@ -105,7 +105,7 @@ def profiled(
             width = last - first
             first, last = (process.from_unconstrained(x) for x in (first, last))
         first, last = torch.minimum(first, own), torch.maximum(last, own)
-        wide, linear = refused[items], (estimates.low[items, place], estimates.high[items, place])
+        wide, linear = rejected[items], (estimates.low[items, place], estimates.high[items, place])
         low[items, place] = torch.where(wide, torch.minimum(first, linear[0]), first)
         high[items, place] = torch.where(wide, torch.maximum(last, linear[1]), last)
         determined[items, place] = width < 2 * z[items] * WEAKLY_DETERMINED

@@ -14,6 +14,7 @@ from torch import Tensor
 from gyrofuse._base.deprecation import RenamedAttribute
 from gyrofuse._base.results import Result, chance, counted, p_words, place, plain, scattered, signed
 from gyrofuse.fitting.gmwm_result import MOST_TABLES, GMWMResult, axes_of, items_of
+from gyrofuse.fitting.j_test import CLEARLY_REJECTED
 from gyrofuse.fitting.ranking.candidates import name_of
 from gyrofuse.fitting.ranking.table import Table
 from gyrofuse.noise.parsing import parse_model
@@ -24,8 +25,6 @@ if TYPE_CHECKING:
 # Largest numbers of candidates in the table of a sensor, and of bars in a figure: what a screen holds.
 _MOST_ROWS = 8
 _MOST_BARS = 12
-# P value of the J test below which no candidate fits: small, as the largest p value of several candidates is judged.
-_NONE_FITS = 1e-3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -191,8 +190,8 @@ class RankResult(Result):
         return self.n_lines is not None and int(self.n_lines[index]) <= max(map(_n_sinusoids, self.candidates))
 
     def none_fits(self, index: tuple[int, ...]) -> bool:
-        """Whether the J test refuses all candidates of a sensor that it could be made of."""
-        return max(self._tested(index), default=1.0) < _NONE_FITS
+        """Whether the J test clearly rejects all candidates of a sensor that it could be made of."""
+        return max(self._tested(index), default=1.0) < CLEARLY_REJECTED
 
     def _tested(self, index: tuple[int, ...]) -> list[float]:
         """P-values of the J tests there are, of candidates compared."""
@@ -268,7 +267,7 @@ class RankResult(Result):
             [self.candidates[c] for c in order],
             self.difference[first][order],
             [self.standing(first, c) for c in order],
-            refused=p_value < _NONE_FITS,
+            rejected=p_value < CLEARLY_REJECTED,
             aside=[self.candidates[c] for c in aside],
             title=title or f"sensor {self._place(first)}",
             note=", ".join(notes),

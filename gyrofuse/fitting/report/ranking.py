@@ -10,7 +10,7 @@ from typing import Any
 
 from gyrofuse._base.page import number, render
 from gyrofuse._base.results import chance, counted, p_words, place, signed
-from gyrofuse.fitting.gmwm_result import REFUSED
+from gyrofuse.fitting.j_test import REJECTED
 from gyrofuse.fitting.moments.fit import composition_of
 from gyrofuse.fitting.ranking.candidates import n_parameters, penalty
 from gyrofuse.fitting.ranking.result import RankResult
@@ -113,7 +113,7 @@ def _why_not(result: RankResult, index: tuple[int, ...], row: dict[str, Any]) ->
     if row["reason"]:
         return f"{told} and is more than it takes: {row['reason']}"
     # That is against it only where the chosen one fits.
-    if row["p_value"] < REFUSED <= result.p_value[index][int(result.choice[index])].item():
+    if row["p_value"] < REJECTED <= result.p_value[index][int(result.choice[index])].item():
         return f"{told}; its wavelet variances do not fit (J test: {p_words(row['p_value'])})"
     return told
 

@@ -10,11 +10,10 @@ from torch import Tensor
 
 from gyrofuse._base.page import number
 from gyrofuse._base.results import p_words
-from gyrofuse.fitting.gmwm_result import REFUSED, GMWMResult
+from gyrofuse.fitting.gmwm_result import GMWMResult
+from gyrofuse.fitting.j_test import DOUBTED, REJECTED
 from gyrofuse.noise.processes import Model
 
-# P value of the J test below which a model is in doubt: one complete model in twenty is.
-_DOUBTED = 0.05
 _WEIGHTS = {
     "optimal": "weighted by the inverse of their covariance under the fitted model",
     "diagonal": "weighted by the reciprocals of their variances under the fitted model",
@@ -78,7 +77,7 @@ def _completeness(result: GMWMResult, index: tuple[int, ...]) -> Iterator[str]:
     p_value = result.p_value[index].item()
     if not bool(result.converged[index]):
         yield "Beware: the search for the best fit to the wavelet variances did not end; what it found is shown."
-        if p_value < _DOUBTED:
+        if p_value < DOUBTED:
             return  # the best may fit
     if p_value != p_value:
         if result.weighting != "optimal":
@@ -87,14 +86,14 @@ def _completeness(result: GMWMResult, index: tuple[int, ...]) -> Iterator[str]:
             yield "Whether the model is complete cannot be tested: it has as many parameters as there are levels."
         return
     told = f"J test: {p_words(p_value)}"
-    if p_value >= _DOUBTED:
+    if p_value >= DOUBTED:
         yield f"The model explains the wavelet variances at all scales within what chance allows ({told})."
         return
     off = residuals(result, index)
     worst = int(off.abs().argmax())
     size = f"{abs(off[worst].item()):.1f} standard deviations {'above' if off[worst] > 0 else 'below'} the model's"
     where = f"at {_time(result, worst)} the measured wavelet variance is {size}"
-    if p_value >= REFUSED:
+    if p_value >= REJECTED:
         yield f"The model is in doubt ({told}): {where}."
     else:
         remedy = "add a process or look for a disturbance"
