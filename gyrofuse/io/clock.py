@@ -101,7 +101,7 @@ def grid_of(
     if nominal is not None and rate is None and abs(step * nominal - 1) > 0.01:
         book.add(
             "clock",
-            f"the log states {nominal:.6g} Hz, its timestamps say {1 / step:.6g} Hz and are believed",
+            f"the log states {nominal:.6g} Hz, the timestamps give {1 / step:.6g} Hz, which is used",
             clock_hz=1 / step,
             stated_hz=nominal,
         )
@@ -118,7 +118,7 @@ def grid_of(
             book.add("repeats", f"{repeats} timestamps repeat the one before; the first sample stays", samples=repeats)
         twice = int((~first).sum()) - repeats
         if twice > 0:
-            book.add("repeats", f"{twice} samples fell on a taken place of the grid and were left out", samples=twice)
+            book.add("repeats", f"{twice} samples fell into an occupied slot and were left out", samples=twice)
         _note_jitter(book, residual, step)
     slots, kept = slots[first], kept[first]
     start += step * float(slots[0])

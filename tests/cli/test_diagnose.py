@@ -221,5 +221,5 @@ def test_what_was_guessed_on_reading_stands_on_the_page(run: Run, tmp_path: Path
     done = run("diagnose", "log.csv", "--simulation", "sim.npz", "--report", "page.html")
     assert done.status == 0, done.err
     page = (tmp_path / "page.html").read_text()
-    assert "the log states 50 Hz, its timestamps say 100 Hz and are believed" in page
+    assert "the log states 50 Hz, the timestamps give 100 Hz, which is used" in page
     assert "time column &#39;time&#39; states no unit: read as s" in page
