@@ -15,7 +15,7 @@ from gyrofuse.fitting.moments import search
 from gyrofuse.fitting.moments.fit import composition_of
 from gyrofuse.fitting.moments.profile import profile_grid, profile_limits
 from gyrofuse.fitting.moments.profile_objectives import SpectralProfile
-from gyrofuse.fitting.spectral.bands import Bins, Noise
+from gyrofuse.fitting.spectral.bands import BandSpectrum, Bins
 from gyrofuse.fitting.spectral.search import deviance
 from gyrofuse.fitting.spectral.whittle import refine_whittle
 
@@ -134,7 +134,7 @@ def test_the_rise_of_the_likelihood_is_that_of_a_fine_grid():
     start = torch.tensor([[1.0, 1e-3]], dtype=torch.float64).expand(2, -1)
     fit = refine_whittle(signal, structure, start, start.new_empty(2, 0))
     surface = SpectralProfile(fit.linear, fit.shape, fit.energy, fit.count, structure, 1024)
-    bins, noise = Bins(1024, torch.device("cpu")), Noise(structure)
+    bins, noise = Bins(1024, torch.device("cpu")), BandSpectrum(structure)
     white = torch.linspace(0.5, 2.0, 4000, dtype=torch.float64)
     for value in (0.0, 1e-4, 1e-2):
         found = surface.rise(torch.arange(2), 1, torch.full((2,), value, dtype=torch.float64))
