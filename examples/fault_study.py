@@ -74,14 +74,12 @@ def mimu_sessions(path: Path, window: int, n_pieces: int) -> list[Session]:
     return [Session(fit_parity_reference(list(e[:10]), window), e[10 : 10 + n_pieces], rate) for e in experiments]
 
 
-def mimu_other_sessions(path: Path, window: int, extra_spread: float) -> list[Session]:
+def mimu_other_sessions(path: Path, window: int, extra_sd: float) -> list[Session]:
     """The same with the reference from the other experiments."""
     experiments, rate = mimu_pieces(path)
     return [
         Session(
-            fit_parity_reference(
-                [*torch.cat(experiments[:k] + experiments[k + 1 :])], window, extra_spread=extra_spread
-            ),
+            fit_parity_reference([*torch.cat(experiments[:k] + experiments[k + 1 :])], window, extra_sd=extra_sd),
             e,
             rate,
         )

@@ -154,7 +154,7 @@ def test_noise_that_varies_by_itself_is_no_fault_to_who_has_seen_it():
     calm, rest = signal[..., : 40 * 128], signal[..., 40 * 128 :]
     assert claimed(parity_test(rest, fit_reference(calm, 128)).alarm, 0.01)
     stationary = torch.randn(4, 40 * 128, dtype=torch.float64, generator=generator)
-    assert claimed(parity_test(rest, fit_reference(stationary, 128, extra_spread=0.8)).alarm, 0.01)
+    assert claimed(parity_test(rest, fit_reference(stationary, 128, extra_sd=0.8)).alarm, 0.01)
     for blind in (fit_reference(stationary, 128), fit_svo(calm[0], covariance="none")):
         assert parity_test(rest[0], blind, window=128).alarm.double().mean() > 0.5
 
@@ -537,9 +537,9 @@ def test_the_reference_says_what_it_rests_on():
         ),
         (lambda: fit_reference(healthy(), 0), ValueError, "`window`: expected a whole number >= 1, got 0"),
         (
-            lambda: fit_reference(healthy(), 9, extra_spread=-1),
+            lambda: fit_reference(healthy(), 9, extra_sd=-1),
             ValueError,
-            "`extra_spread`: expected a finite .* got -1",
+            "`extra_sd`: expected a finite .* got -1",
         ),
         (lambda: fit_reference([], 9), ValueError, "`signal`: expected at least one stretch, got none"),
         (

@@ -202,7 +202,9 @@ def _loud(energies: Energies, reference: ParityReference, live: Tensor) -> _Side
     left = dof - (live.sum(-1) - 2).clamp(min=0)[..., None, None]
     ratio = energies.parity * (left / dof) / (1 + energies.rest / dof)
     tested = (energies.counts > 0).unsqueeze(-1) & (live.sum(-1, keepdim=True) > 1).unsqueeze(-1)
-    return _side("sf", ratio, _observed(energies), left, reference.spread, reference, tested & live.unsqueeze(-2))
+    return _side(
+        "sf", ratio, _observed(energies), left, reference.power_variance, reference, tested & live.unsqueeze(-2)
+    )
 
 
 def _quiet(energies: Energies, reference: ParityReference, live: Tensor) -> _Side:
@@ -210,7 +212,7 @@ def _quiet(energies: Energies, reference: ParityReference, live: Tensor) -> _Sid
     observed, dof = _observed(energies), reference.dof[..., None, :, None]
     # The variance of fewer than 8 observations may be small by chance.
     tested = (observed >= 8) & live.unsqueeze(-2)
-    return _side("cdf", energies.own, observed, dof, reference.own_spread, reference, tested)
+    return _side("cdf", energies.own, observed, dof, reference.own_power_variance, reference, tested)
 
 
 def _observed(energies: Energies) -> Tensor:
@@ -223,7 +225,7 @@ def _side(
     ratio: Tensor,
     observed: Tensor,
     dof: Tensor,
-    spread: Tensor,
+    power_variance: Tensor,
     reference: ParityReference,
     tested: Tensor,
 ) -> _Side:
@@ -236,15 +238,15 @@ def _side(
     """
     from scipy import stats
 
-    spread, n_windows = spread.unsqueeze(-3), reference.n_windows[..., None, :, None]
-    above, below = 2 / observed + spread, 2 / dof + spread / n_windows  # relative variances
+    power_variance, n_windows = power_variance.unsqueeze(-3), reference.n_windows[..., None, :, None]
+    above, below = 2 / observed + power_variance, 2 / dof + power_variance / n_windows  # relative variances
     deviation = torch.log1p(above + below).sqrt()
     score = ratio.clamp(min=1e-300).log() / deviation + deviation / 2
     chances = []
     for law, *arguments in ((stats.f, ratio, 2 / above, 2 / below), (stats.t, score, (n_windows - 1).clamp(min=1))):
         chance = getattr(law, tail)(*(value.cpu().numpy() for value in arguments))
         chances.append(torch.as_tensor(chance).to(ratio))
-    chance = torch.where(spread > 2 / observed, torch.maximum(*chances), chances[0])
+    chance = torch.where(power_variance > 2 / observed, torch.maximum(*chances), chances[0])
     evidence = (ratio - 1 - ratio.clamp(min=1e-300).log()) / above
     return _Side(ratio, torch.where(tested, chance, torch.nan), evidence)
 

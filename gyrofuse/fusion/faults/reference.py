@@ -43,27 +43,33 @@ class ParityReference(Result):
     Attributes:
         wavelet_cross_covariance: `(..., level, sensor, sensor)`, signal^2, of the levels that are tested.
         dof: `(..., level)`, independent observations of each level.
-        spread: `(..., level, sensor)`, variance between nominal windows of the relative energy of the sensor's
+        power_variance: `(..., level, sensor)`, variance between nominal windows of the relative energy of the sensor's
             difference from the others, less the variance by sampling.
         own_variance: `(..., level, sensor)`, wavelet variance of the sensors themselves, without common motion.
-        own_spread: `(..., level, sensor)`, as `spread` for the energy of the sensor itself.
-        n_windows: `(..., level)`, effective number of windows behind `spread`.
+        own_power_variance: `(..., level, sensor)`, as `power_variance` for the energy of the sensor itself.
+        n_windows: `(..., level)`, effective number of windows behind `power_variance`.
         window: Length of the windows in samples; 0 without windows.
         sensors: Name of each sensor.
     """
 
     wavelet_cross_covariance: Tensor
     dof: Tensor
-    spread: Tensor
+    power_variance: Tensor
     own_variance: Tensor
-    own_spread: Tensor
+    own_power_variance: Tensor
     n_windows: Tensor
     window: int
     sensors: tuple[str, ...]
     degrees_of_freedom = RenamedAttribute("dof")
-    _batched = ("wavelet_cross_covariance", "dof", "spread", "own_variance", "own_spread", "n_windows")
-    _contents = tuple("sensors window wavelet_cross_covariance dof spread own_variance own_spread n_windows".split())
-    _keys: ClassVar[dict[str, str]] = {"dof": "degrees_of_freedom"}
+    spread = RenamedAttribute("power_variance")
+    own_spread = RenamedAttribute("own_power_variance")
+    _batched = ("wavelet_cross_covariance", "dof", "power_variance", "own_variance", "own_power_variance", "n_windows")
+    _contents = ("sensors", "window", *_batched)
+    _keys: ClassVar[dict[str, str]] = {
+        "dof": "degrees_of_freedom",
+        "power_variance": "spread",
+        "own_power_variance": "own_spread",
+    }
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -79,38 +85,36 @@ class ParityReference(Result):
         """Observations and variation of the noise power by level, as fixed-width text."""
         windows = f"windows of {self.window} samples" if self.window else "no windows: noise is taken to be stationary"
         dof = self.dof.reshape(-1, self.n_levels).amin(0)
-        spread = torch.maximum(self.spread, self.own_spread).amax(-1).reshape(-1, self.n_levels).amax(0).sqrt()
+        variance = torch.maximum(self.power_variance, self.own_power_variance).amax(-1)
+        sd = variance.reshape(-1, self.n_levels).amax(0).sqrt()
         return "\n".join(
             [
                 f"Healthy array of {len(self.sensors)} sensors, {windows}",
                 f"{'level':>5}  {'observations':>12}  {'noise power varies by':>21}",
-                *(
-                    f"{j + 1:>5}  {dof[j].item():>12.1f}  {100 * spread[j].item():>19.1f} %"
-                    for j in range(self.n_levels)
-                ),
+                *(f"{j + 1:>5}  {dof[j].item():>12.1f}  {100 * sd[j].item():>19.1f} %" for j in range(self.n_levels)),
             ]
         )
 
 
-@renamed_arguments(healthy="signal")
+@renamed_arguments(healthy="signal", extra_spread="extra_sd")
 def fit_parity_reference(
     signal: Tensor | Recording | Sequence[Tensor | Recording],
     window: int,
     *,
-    extra_spread: float = 0.0,
+    extra_sd: float = 0.0,
     n_levels: int | None = None,
 ) -> ParityReference:
     """Fit the reference of the parity test to an array without faults, at rest.
 
     The reference is the wavelet cross-covariance, and the variance of the noise power of each sensor between windows at
-    each scale: real sensors are not quite stationary. Forty windows give it, a hundred give it better, and so do
-    windows of different conditions.
+    each scale: real sensors are not quite stationary. At least forty windows are needed, better a hundred and of
+    different conditions.
 
     Args:
         signal: `(..., sensor, time)` or a `Recording`, or several of them; NaN = missing sample. Windows that lack a
             sensor, and a last window that is not full, are left out.
         window: Samples of the windows that will be tested.
-        extra_spread: Standard deviation of the relative noise power between sessions, 0.3 say, where all of `signal` is
+        extra_sd: Standard deviation of the relative noise power between sessions, 0.3 say, where all of `signal` is
             of one session.
         n_levels: Number of levels at most. By default up to sixteen windows, as far as they hold enough observations.
 
@@ -133,8 +137,8 @@ def fit_parity_reference(
                 f"and {tuple(value.shape)}"
             )
         window = check_window(window, value.shape[-1], "signal")
-    if not 0 <= extra_spread < math.inf:
-        raise ValueError(f"`extra_spread`: expected a finite number >= 0 such as 0.3, got {extra_spread!r}")
+    if not 0 <= extra_sd < math.inf:
+        raise ValueError(f"`extra_sd`: expected a finite number >= 0 such as 0.3, got {extra_sd!r}")
     most = largest_level(window) + _LOOK_BACK if n_levels is None else check_positive_integer("n_levels", n_levels)
     most = max(min(most, *(largest_level(value.shape[-1]) for value in values)), 1)
     chunks = [chunk for value in values for chunk in chunks_of(value.detach(), window, most)]
@@ -156,10 +160,16 @@ def fit_parity_reference(
     products = Products(means[..., tested, :, :], counts[..., tested], torch.ones_like(live))
     gamma = plain.wavelet_cross_covariance
     energies = energies_of(products, *parity_matrix(gamma, products.live), plain.own_variance)
-    spread, n_windows = _spread(energies.parity, products.counts)
-    own_spread, _ = _spread(energies.own, products.counts)
-    extra = extra_spread**2
-    return replace(plain, spread=spread + extra, own_spread=own_spread + extra, n_windows=n_windows, window=window)
+    power_variance, n_windows = _power_variance(energies.parity, products.counts)
+    own_power_variance, _ = _power_variance(energies.own, products.counts)
+    extra = extra_sd**2
+    return replace(
+        plain,
+        power_variance=power_variance + extra,
+        own_power_variance=own_power_variance + extra,
+        n_windows=n_windows,
+        window=window,
+    )
 
 
 def stationary_reference(
@@ -204,9 +214,9 @@ def stationary_reference(
     return ParityReference(
         wavelet_cross_covariance=kept,
         dof=dof,
-        spread=zeros,
+        power_variance=zeros,
         own_variance=own_variance(kept),
-        own_spread=zeros,
+        own_power_variance=zeros,
         n_windows=torch.ones_like(dof),
         window=0,
         sensors=tuple(sensors),
@@ -226,7 +236,9 @@ def check_window(window: int, n_samples: int, name: str) -> int:
     """
     window = check_positive_integer("window", window)
     if window == 1:
-        raise ValueError("`window`: expected at least 2 samples, for one shows no course; got 1; give a longer window")
+        raise ValueError(
+            "`window`: expected at least 2 samples, got 1; a single sample has no variation: give a longer window"
+        )
     if window > n_samples:
         raise ValueError(
             f"`window`: expected at most the {n_samples} samples of `{name}`, got {window}; give a shorter window"
@@ -234,7 +246,7 @@ def check_window(window: int, n_samples: int, name: str) -> int:
     return window
 
 
-def _spread(energy: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
+def _power_variance(energy: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
     """Variance of relative energies between windows beyond that of sampling.
 
     Args:
@@ -257,5 +269,5 @@ def _spread(energy: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
     clear = torch.where((n_windows >= 2) & (variance > sampling * largest), variance - sampling, 0.0)
     # At levels that cannot show a variance it is the mean of the others, weighted by their precision.
     known = sampling.clamp(min=torch.finfo(sampling.dtype).tiny).reciprocal().square()
-    spread = torch.maximum(clear, (known * clear).sum(-2, keepdim=True) / known.sum(-2, keepdim=True))
-    return spread, n_windows.squeeze(-1)
+    power_variance = torch.maximum(clear, (known * clear).sum(-2, keepdim=True) / known.sum(-2, keepdim=True))
+    return power_variance, n_windows.squeeze(-1)
