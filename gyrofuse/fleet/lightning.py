@@ -161,7 +161,7 @@ class ResultWriter(BasePredictionWriter):
 
     def on_predict_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, *_: Any) -> None:
         """Record which logs are worked on."""
-        self.watch.begin([log.place for log in batch])
+        self.watch.begin([log.entry for log in batch])
 
     def write_on_batch_end(
         self,

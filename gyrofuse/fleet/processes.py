@@ -68,7 +68,7 @@ def run_fleet(
             if not found:
                 raise _plain(error) from None
             for crash in found:
-                report(f"{crash.place['log']}: {crash.words}")
+                report(f"{crash.entry['log']}: {crash.words}")
         except (SystemExit, KeyboardInterrupt) as stop:  # from outside: the others would work on
             for process in processes:
                 if process.is_alive() and process.pid is not None:

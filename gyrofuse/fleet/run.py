@@ -40,7 +40,7 @@ class Log:
     state: State = field(default_factory=State)
 
     @property
-    def place(self) -> Row:
+    def entry(self) -> Row:
         """Columns of its rows that identify the log."""
         return {"log": self.name, "path": self.path, **self.state._asdict()}
 
@@ -96,7 +96,7 @@ class LogGroups(Dataset[tuple[Log, ...]]):
         if "\0" in str(path):
             return replace(log, error="expected the name of a file, found one with NUL bytes; save the list as UTF-8")
         if self.watch is not None:
-            self.watch.begin([log.place])
+            self.watch.begin([log.entry])
         try:
             return replace(log, recording=read_recording(path, **self.options))
         except Exception as error:  # whatever a damaged file does to a library, the others are read
@@ -154,7 +154,7 @@ def _attempt(task: Task, recordings: Sequence[Recording]) -> list[_Outcome]:
 
 
 def _whole_rows(log: Log, outcome: _Outcome) -> list[Row]:
-    common: Row = {**log.place, "status": "ok" if outcome.error is None else "failed", "error": outcome.error}
+    common: Row = {**log.entry, "status": "ok" if outcome.error is None else "failed", "error": outcome.error}
     if log.recording is not None:
         r = log.recording
         common |= {

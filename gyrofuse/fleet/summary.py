@@ -167,7 +167,7 @@ class FleetSummary:
             lines.append(f"weights to doubt: {counted(self.n_warned, 'log')}")
         lines += [f"  {_place(warning)}: {warning.why}" for warning in self.weight_warnings[:3]]
         lines += [
-            f"drifts: weight of sensor {d.sensor} of {d.array}, {d.first:.3g} to {d.last:.3g} (p = {d.p_value:.2g})"
+            f"trend: weight of sensor {d.sensor} of {d.array}, {d.first:.3g} to {d.last:.3g} (p = {d.p_value:.2g})"
             for d in self.trends[:3]
         ]
         lines += [f"failed: {log}: {error}" for log, error in self.failures[:5]]

@@ -25,7 +25,7 @@ _MAX_CRASHES = 2  # after which a log is passed over; a single crash may be an e
 _TIMEOUT_MARK = b"Timeout ("  # first words of what faulthandler writes at the timeout
 _watchdogs: weakref.WeakSet[Watchdog] = weakref.WeakSet()
 
-Place = Mapping[str, Any]  # columns log, path, size and modified of the rows of a log
+LogEntry = Mapping[str, Any]  # columns log, path, size and modified of the rows of a log
 
 
 class Watchdog:
@@ -43,7 +43,7 @@ class Watchdog:
         self._file: BinaryIO | None = None
         self._owner = 0
 
-    def begin(self, logs: Sequence[Place]) -> None:
+    def begin(self, logs: Sequence[LogEntry]) -> None:
         """Record that work on some logs begins, and start the timeout."""
         if not logs:
             return
@@ -96,14 +96,14 @@ class Suspect(NamedTuple):
 
     size: int | None
     modified: int | None
-    ended: int
+    n_crashes: int
     alone: bool
 
 
 class CrashReport(NamedTuple):
-    """A log at which a process crashed or hung: its place, a sentence, and whether it is passed over from now on."""
+    """A log at which a process crashed or hung: its entry, a sentence, and whether it is passed over from now on."""
 
-    place: Place
+    entry: LogEntry
     words: str
     final: bool
 
@@ -121,38 +121,38 @@ def settle(folder: Path, ended: Sequence[int] | None = None) -> list[CrashReport
     for note in sorted(folder.glob(_BEGUN)):
         try:
             first, _, rest = note.read_bytes().partition(b"\n")
-            entry = json.loads(first)
-            process, timeout, places = entry["pid"], entry["timeout"], list(entry["logs"])
+            journal = json.loads(first)
+            process, timeout, logs = journal["pid"], journal["timeout"], list(journal["logs"])
         except (OSError, ValueError, KeyError, TypeError):  # empty: no work was going on
-            places = []
+            logs = []
         _remove(note)
-        if not places or (ended is not None and process not in ended):
+        if not logs or (ended is not None and process not in ended):
             continue
         late = _TIMEOUT_MARK in rest
         sure = late or ended is not None
-        for place in places:
-            log, state = identity_in(place), (place["size"], place["modified"])
+        for entry in logs:
+            log, state = identity_in(entry), (entry["size"], entry["modified"])
             before = known.pop(log, None)
-            times = 1 + (before.ended if before is not None and before[:2] == state else 0)
-            if len(places) > 1:
+            times = 1 + (before.n_crashes if before is not None and before[:2] == state else 0)
+            if len(logs) > 1:
                 # Which of them it was is not known. Results alone may differ in the last digit from those in a batch,
                 # so that logs are taken alone only if the crash is certain or repeated.
                 apart = sure or times >= _MAX_CRASHES
                 known[log] = Suspect(*state, 0 if apart else times, apart)
                 again = "tried again alone" if apart else "tried again"
                 words = f"was worked on with others when their process ended; {again} after the others"
-                found.append(CrashReport(place, words, False))
+                found.append(CrashReport(entry, words, False))
             elif late:
                 words = (
                     f"took longer than {timeout:g} s; --timeout (`timeout`) gives more, with --retry it is tried again"
                 )
-                found.append(CrashReport(place, words, True))
+                found.append(CrashReport(entry, words, True))
             elif times >= _MAX_CRASHES:
                 words = "ended the process that read it, twice; it is damaged, or too large for the memory"
-                found.append(CrashReport(place, f"{words} (--retry tries it again)", True))
+                found.append(CrashReport(entry, f"{words} (--retry tries it again)", True))
             else:
                 known[log] = Suspect(*state, times, before is not None and before.alone)
-                found.append(CrashReport(place, "ended the process that read it; tried again after the others", False))
+                found.append(CrashReport(entry, "ended the process that read it; tried again after the others", False))
     if found:
         draft = draft_in(folder)
         draft.write_text(json.dumps(known), encoding="utf-8")

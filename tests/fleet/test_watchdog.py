@@ -27,7 +27,7 @@ forks = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 DEADLY, ENDLESS = 1001, 1002  # samples
 
 
-def place(log: str, size: int = 1):
+def entry(log: str, size: int = 1):
     return {"log": log, "path": f"/{log}", "size": size, "modified": 2}
 
 
@@ -43,56 +43,56 @@ def ended_at(folder: Path, *logs, pid: int | None = None) -> None:
 
 def test_a_note_is_there_while_a_log_is_worked_on(tmp_path):
     watch = Watchdog(tmp_path)
-    watch.begin([place("a")])
+    watch.begin([entry("a")])
     (note,) = tmp_path.iterdir()
     assert b'"/a"' in note.read_bytes()
-    watch.begin([place("b"), place("c")])
+    watch.begin([entry("b"), entry("c")])
     assert b'"/a"' not in note.read_bytes()
     watch.end()
     assert note.read_bytes() == b""
-    watch.begin([place("d")])
+    watch.begin([entry("d")])
     close_all()
     assert not list(tmp_path.iterdir())
 
 
 def test_a_log_found_twice_is_passed_over(tmp_path):
-    ended_at(tmp_path, place("a"))
+    ended_at(tmp_path, entry("a"))
     (found,) = settle(tmp_path)
     assert (found.final, found.words) == (False, "ended the process that read it; tried again after the others")
     assert suspects_in(tmp_path) == {"/a": Suspect(1, 2, 1, alone=False)}
     assert settle(tmp_path) == []
-    ended_at(tmp_path, place("a"))
+    ended_at(tmp_path, entry("a"))
     (found,) = settle(tmp_path)
     assert found.final
     assert found.words.startswith("ended the process that read it, twice;")
     assert suspects_in(tmp_path) == {}
-    ended_at(tmp_path, place("b"))
+    ended_at(tmp_path, entry("b"))
     settle(tmp_path)
-    ended_at(tmp_path, place("b", size=9))  # another log by now
+    ended_at(tmp_path, entry("b", size=9))  # another log by now
     assert not settle(tmp_path)[0].final
 
 
 def test_processes_that_were_ended_are_not_to_blame(tmp_path):
-    ended_at(tmp_path, place("a"), pid=1)
-    ended_at(tmp_path, place("b"), pid=2)
+    ended_at(tmp_path, entry("a"), pid=1)
+    ended_at(tmp_path, entry("b"), pid=2)
     assert settle(tmp_path, [7]) == []
     assert (list(tmp_path.glob("*.begun")), suspects_in(tmp_path)) == ([], {})
-    ended_at(tmp_path, place("a"), pid=1)
-    assert [found.place["log"] for found in settle(tmp_path, [1])] == ["a"]
+    ended_at(tmp_path, entry("a"), pid=1)
+    assert [found.entry["log"] for found in settle(tmp_path, [1])] == ["a"]
 
 
 def test_of_a_group_each_is_tried_alone(tmp_path):
-    ended_at(tmp_path, place("a"), place("b"))
+    ended_at(tmp_path, entry("a"), entry("b"))
     settle(tmp_path)  # from outside, perhaps: they stay together
     assert not any(suspect.alone for suspect in suspects_in(tmp_path).values())
-    ended_at(tmp_path, place("a"), place("b"))
+    ended_at(tmp_path, entry("a"), entry("b"))
     assert not any(found.final for found in settle(tmp_path))
     assert suspects_in(tmp_path) == {f"/{log}": Suspect(1, 2, 0, alone=True) for log in "ab"}
     for final in (False, True):
-        ended_at(tmp_path, place("b"))
+        ended_at(tmp_path, entry("b"))
         assert settle(tmp_path)[0].final == final
     assert suspects_in(tmp_path) == {"/a": Suspect(1, 2, 0, alone=True)}
-    ended_at(tmp_path, place("c"), place("d"), pid=1)
+    ended_at(tmp_path, entry("c"), entry("d"), pid=1)
     settle(tmp_path, [1])
     assert suspects_in(tmp_path)["/c"].alone
 
@@ -115,7 +115,7 @@ def test_suspects_come_last(tmp_path):
 
 
 def forever(folder: Path) -> None:
-    Watchdog(folder, timeout=0.1).begin([place("a")])
+    Watchdog(folder, timeout=0.1).begin([entry("a")])
     re.match(r"(a+)+$", "a" * 64 + "b")  # of C, and lets no other thread run
 
 

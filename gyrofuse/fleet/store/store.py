@@ -124,8 +124,8 @@ class ResultStore:
         found = settle(self.parts, ended)
         for finding in found:
             if finding.final:
-                self.write([{**finding.place, "status": "failed", "error": finding.words}])
-        self.passed_over = frozenset(identity_in(finding.place) for finding in found if finding.final)
+                self.write([{**finding.entry, "status": "failed", "error": finding.words}])
+        self.passed_over = frozenset(identity_in(finding.entry) for finding in found if finding.final)
         return found
 
     @property
