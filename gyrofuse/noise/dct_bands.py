@@ -39,8 +39,8 @@ class DCTBands:
     Attributes:
         edges: First ordinate of each band, and the one after the last.
         count: Number of ordinates, `(band,)`.
-        sine: `s^2` at two places of each band, its middle -+ the standard deviation of its places: the mean there is
-            that of all to third order, `(2, band)`.
+        sine_squared: `s^2` at two places of each band, its middle -+ the standard deviation of its places: the mean
+            there is that of all to third order, `(2, band)`.
         ends: `4 c^2 / T`, `(2, band)`.
         frequency: Cycles per sample, `(2, band)`.
         sign: Mean of `(-1)^k`, `(band,)`.
@@ -54,7 +54,7 @@ class DCTBands:
         middle, width = (edges[:-1] + edges[1:] - 1) / 2, ((self.count.square() - 1) / 12).sqrt()
         k = torch.stack([middle - width, middle + width])
         angle = math.pi / (2 * n_samples) * k
-        self.sine, self.ends = angle.sin().square(), 4 / n_samples * angle.cos().square()
+        self.sine_squared, self.ends = angle.sin().square(), 4 / n_samples * angle.cos().square()
         self.frequency = k / (2 * n_samples)
         first_even = 1 - 2 * torch.remainder(edges[:-1], 2)
         self.sign = torch.where(torch.remainder(self.count, 2) == 1, first_even / self.count, 0.0)

@@ -100,7 +100,7 @@ def test_band_variances_have_their_slopes(kind, x):
     torch.testing.assert_close(own.slope / own.value, numeric, rtol=1e-5, atol=1e-6)
     if x > 3:
         return  # a memory longer than the record is all ends, which are left out of the curvature
-    inner = bands.mean_of(bands.ends / bands.sine) < 1e-4
+    inner = bands.mean_of(bands.ends / bands.sine_squared) < 1e-4
     numeric = (above.slope - below.slope) / (2 * h) / own.value
     torch.testing.assert_close((own.curvature / own.value)[:, inner], numeric[:, inner], rtol=0.03, atol=0.05)
 

@@ -97,7 +97,7 @@ class AR1(Process):
         edge = z * (1 - z) / (1 + z)
         edge_slope = (1 - 2 * z - z.square()) / (1 + z).square()
         h, h_slope = edge * mirrored, edge_slope * mirrored + edge * mirrored_slope
-        d, d_slope = (1 - z).square() + 4 * z * bands.sine, 4 * bands.sine - 2 * (1 - z)
+        d, d_slope = (1 - z).square() + 4 * z * bands.sine_squared, 4 * bands.sine_squared - 2 * (1 - z)
         value = (1 - bands.ends * h / d) / d
         slope = (-d_slope - bands.ends * (h_slope - 2 * h * d_slope / d)) / d.square()
         inside = (1 - z) * (1 + z)  # d phi / dx

@@ -62,11 +62,11 @@ class FlickerNoise(Process):
 
             a = s/2 int_0^inf e^(-2T t) cosh t / (sinh^2 t + s^2) dt,   b = 1/2 int ... sinh t / ...
         """
-        n, sine = bands.n_samples, bands.sine.sqrt()
-        cosine = (1 - bands.sine).sqrt()
+        n, sine = bands.n_samples, bands.sine_squared.sqrt()
+        cosine = (1 - bands.sine_squared).sqrt()
         nodes, weights = (torch.from_numpy(v).to(sine) for v in np.polynomial.laguerre.laggauss(32))
         t = (nodes / (2 * n))[:, None, None]
-        weight = weights[:, None, None] / (4 * n) / (t.sinh().square() + bands.sine)
+        weight = weights[:, None, None] / (4 * n) / (t.sinh().square() + bands.sine_squared)
         a, b = sine * (weight * t.cosh()).sum(0), (weight * t.sinh()).sum(0)
         odd = (1 - bands.sign) / 2
         value = 2 / (math.pi * sine) * (math.pi / 4 - bands.sign * a - odd / (2 * n * sine))

@@ -110,19 +110,19 @@ class Matern32(Process):
         """
         assert x is not None
         decay = softplus(-2 * x)[:, None, None]
-        phi, loss, sine, n = torch.exp(-decay), -torch.expm1(-decay), bands.sine, bands.n_samples
+        phi, loss, s2, n = torch.exp(-decay), -torch.expm1(-decay), bands.sine_squared, bands.n_samples
         half, sinh = loss.square() / (4 * phi), loss * (1 + phi) / (2 * phi)  # sinh(a/2)^2, sinh a
-        cosh, total = 1 + 2 * half, half + sine
-        bend = sine * (3 - 2 * sine) - (1 - 2 * sine) * half
+        cosh, total = 1 + 2 * half, half + s2
+        bend = s2 * (3 - 2 * s2) - (1 - 2 * s2) * half
         loss_rate = sinh * bend / (4 * total**3)  # minus the second derivative of (1 - phi^2) / D
-        loss_slope = (cosh * bend - sinh**2 * (1 - 2 * sine) / 2) / (4 * total**3) - 3 * sinh**2 * bend / (8 * total**4)
+        loss_slope = (cosh * bend - sinh**2 * (1 - 2 * s2) / 2) / (4 * total**3) - 3 * sinh**2 * bend / (8 * total**4)
         # A and 1 -+ phi^T, each with its first two derivatives with respect to ln phi
-        a = half / (4 * total**2), -sinh * (sine - half) / (8 * total**3)
-        a_second = cosh * (sine - half) / (8 * total**3) + sinh**2 * (half - 2 * sine) / (8 * total**4)
+        a = half / (4 * total**2), -sinh * (s2 - half) / (8 * total**3)
+        a_second = cosh * (s2 - half) / (8 * total**3) + sinh**2 * (half - 2 * s2) / (8 * total**4)
         fading = bands.sign * torch.exp(-decay * n)
         first = a[1] * (1 - fading) - a[0] * n * fading
         second = a_second * (1 - fading) - 2 * a[1] * n * fading - a[0] * n**2 * fading
-        value = _density(decay, sine) - bands.ends * (a[0] * (1 - fading) + decay * first)
+        value = _density(decay, s2) - bands.ends * (a[0] * (1 - fading) + decay * first)
         slope = decay * (loss_rate + bands.ends * second)
         moved, moved_slope = -2 * loss, 4 * phi * loss  # da / dx and its derivative
         curvature = (loss_rate + decay * loss_slope) * moved**2 + slope * moved_slope
@@ -175,8 +175,8 @@ def _lags(decay: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
     return log_mean, 1 + 2 * sum_before(half * (-decay * half).sigmoid())
 
 
-def _density(decay: Tensor, sine: Tensor) -> Tensor:
-    """Spectral density of the process of variance 1, for `sine = sin(pi f)^2`, in a form that keeps its digits.
+def _density(decay: Tensor, s2: Tensor) -> Tensor:
+    """Spectral density of the process of variance 1, for `s2 = sin(pi f)^2`, in a form that keeps its digits.
 
     `sum_k (1 + a |k|) phi^|k| cos(2 pi f k)` with `D = (1 - phi)^2 + 4 phi s^2` is
     `((1 - phi)^2 (1 - phi^2 + 2 a phi) + 4 phi s^2 (1 - phi^2 - a (1 + phi^2))) / D^2`.
@@ -187,8 +187,8 @@ def _density(decay: Tensor, sine: Tensor) -> Tensor:
     bend = torch.where(  # 1 - phi^2 - a (1 + phi^2), of order a^3
         decay < 0.3, -2 / 3 * phi * decay**3 * series, loss * (1 + phi) - decay * (1 + phi**2)
     )
-    power = loss**2 * (loss * (1 + phi) + 2 * decay * phi) + 4 * phi * sine * bend
-    return power / (loss**2 + 4 * phi * sine) ** 2
+    power = loss**2 * (loss * (1 + phi) + 2 * decay * phi) + 4 * phi * s2 * bend
+    return power / (loss**2 + 4 * phi * s2) ** 2
 
 
 def _innovations(decay: Tensor, phi: Tensor) -> tuple[Tensor, Tensor, Tensor]:

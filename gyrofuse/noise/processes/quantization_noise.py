@@ -45,7 +45,7 @@ class QuantizationNoise(Process):
     @classmethod
     def unit_band_variance(cls, bands: DCTBands, x: Tensor | None) -> BandVariance:
         """`4 s^2 + 4 c^2 / T`: exact, as the covariance is that of second differences and more at the two ends."""
-        return BandVariance(bands.mean_of(4 * bands.sine + bands.ends))
+        return BandVariance(bands.mean_of(4 * bands.sine_squared + bands.ends))
 
     @staticmethod
     def _states(variance: Tensor) -> States:

@@ -43,7 +43,7 @@ class RandomWalk(Process):
     @classmethod
     def unit_band_variance(cls, bands: DCTBands, x: Tensor | None) -> BandVariance:
         """`1 / (4 s^2)`: exact, and that of the spectrum."""
-        return BandVariance(bands.mean_of(0.25 / bands.sine))
+        return BandVariance(bands.mean_of(0.25 / bands.sine_squared))
 
     @staticmethod
     def _states(variance: Tensor) -> States:
