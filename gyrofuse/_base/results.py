@@ -1,4 +1,4 @@
-"""What every result shares."""
+"""Base class of results, and text for messages and tables."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def numbered(n: int) -> tuple[str, ...]:
     return tuple(str(i + 1) for i in range(n))
 
 
-def place(sensors: Sequence[str], index: Sequence[int], axes: Sequence[str] = ()) -> str:
+def sensor_label(sensors: Sequence[str], index: Sequence[int], axes: Sequence[str] = ()) -> str:
     """Name of a sensor with its axis, or its item in a batch: `imu1, axis x`, `a of item 0`.
 
     Args:
@@ -125,7 +125,7 @@ def place(sensors: Sequence[str], index: Sequence[int], axes: Sequence[str] = ()
     return sensors[sensor] + (f" of item {', '.join(map(str, batch))}" if batch else "")
 
 
-def chance(p_value: float) -> str:
+def format_p_value(p_value: float) -> str:
     """A p value in digits, `-` where there is no test."""
     if math.isnan(p_value):
         return "-"
@@ -134,7 +134,7 @@ def chance(p_value: float) -> str:
 
 def p_words(p_value: float) -> str:
     """A p value in a sentence."""
-    return f"p = {chance(p_value)}" if p_value > 0 else f"p {chance(p_value)}"
+    return f"p = {format_p_value(p_value)}" if p_value > 0 else f"p {format_p_value(p_value)}"
 
 
 def signed(value: float) -> str:

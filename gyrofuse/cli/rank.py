@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from gyrofuse._base.results import place
+from gyrofuse._base.results import sensor_label
 from gyrofuse.cli.console import progress, say
 from gyrofuse.cli.options import (
     Confidence,
@@ -65,7 +65,7 @@ def rank(
             result = rank_models(part, formulas, confidence_level=confidence_level, n_levels=levels)
         files.write_figure(
             lambda: one_panel(
-                partial(result.plot, title=f"Sensor {place(result.sensors, result.first_ranked, result.axes)}")
+                partial(result.plot, title=f"Sensor {sensor_label(result.sensors, result.first_ranked, result.axes)}")
             )
         )
         title = f"Noise models for {titled(logs)}"

@@ -11,7 +11,7 @@ import torch
 
 from gyrofuse._base import units
 from gyrofuse._base.checks import check_positive
-from gyrofuse._base.results import place
+from gyrofuse._base.results import sensor_label
 from gyrofuse.fitting.gmwm_result import GMWMResult
 from gyrofuse.noise.model import check_scalar
 from gyrofuse.noise.processes import Model
@@ -134,7 +134,7 @@ class _Triad:
         limited = torch.where(variance & (params == 0) & limits.isfinite(), limits, params)
         models, highest = (tuple(given.model.with_params(row) for row in rows[fitted]) for rows in (params, limited))
         places = itertools.compress(itertools.product(*map(range, given.params.shape[:-1])), fitted.tolist())
-        names = tuple(place(given.sensors, index, given.axes) for index in places)
+        names = tuple(sensor_label(given.sensors, index, given.axes) for index in places)
         return cls(names, models, highest, rate, unit, factor, given.confidence_level)
 
 

@@ -13,10 +13,10 @@ from torch import Tensor
 from gyrofuse._base.checks import check_positive_integer, own_generator
 from gyrofuse._base.chunks import items_at_once
 from gyrofuse._base.deprecation import RenamedAttribute
-from gyrofuse._base.results import ConfidenceInterval, Result, place, scattered
+from gyrofuse._base.results import ConfidenceInterval, Result, scattered, sensor_label
 from gyrofuse.fitting.gmwm_result import GMWMResult
+from gyrofuse.fitting.moments.drift_sign import drifts_of
 from gyrofuse.fitting.moments.fit import fit_batch
-from gyrofuse.fitting.moments.identifiability import drifts_of
 from gyrofuse.fitting.moments.inference import Fit, Inference, infer, infer_efficient
 from gyrofuse.fitting.moments.white_kurtosis import white_excess_kurtosis, with_excess_kurtosis
 from gyrofuse.fitting.spectral.model_tones import model_tones
@@ -81,7 +81,7 @@ class GMWMBootstrap(Result):
         level = f"{100 * self.confidence_level:g} % studentized"
         lines = [f"Parametric bootstrap of a GMWM fit: {self.n_resamples} resamples"]
         for index in itertools.product(*map(range, self.params.shape[:-1])):
-            lines += ["", f"sensor {place(self.sensors, index)}: {self._head(index)}"]
+            lines += ["", f"sensor {sensor_label(self.sensors, index)}: {self._head(index)}"]
             if not bool(self.params[index].isfinite().all()):
                 continue
             lines.append(f"  {'parameter':<24}{'estimate':>13}{'bias':>13}{'std':>13}  {level:^29}")

@@ -16,11 +16,12 @@ from gyrofuse._base.checks import (
     largest_level,
 )
 from gyrofuse._base.deprecation import warn_deprecated
-from gyrofuse._base.results import named, numbered, place
+from gyrofuse._base.results import named, numbered, sensor_label
 from gyrofuse.fitting.gmwm_result import GMWMResult
 from gyrofuse.fitting.moments.covariance import check_gaussian
+from gyrofuse.fitting.moments.drift_sign import rising, with_drift_sign
 from gyrofuse.fitting.moments.fit import composition_of, fit_batch
-from gyrofuse.fitting.moments.identifiability import notes, rising, signed
+from gyrofuse.fitting.moments.identifiability import notes
 from gyrofuse.fitting.moments.inference import Fit, Inference, either, infer, infer_efficient
 from gyrofuse.fitting.moments.profile import profiled
 from gyrofuse.fitting.moments.profile_objectives import MomentProfile, SpectralProfile
@@ -223,7 +224,7 @@ def _fit(
         inference = with_excess_kurtosis(inference, kappa, structure, records.longest, confidence_level)
     own_notes = notes(structure, inference.estimates, records.longest, confidence_level, tones)
     if series is not None:
-        estimates = signed(inference.estimates, Model(list(structure.processes)), rising(series))
+        estimates = with_drift_sign(inference.estimates, Model(list(structure.processes)), rising(series))
         inference = replace(inference, estimates=estimates)
     return GMWMResult.build(
         inference=inference,
@@ -307,7 +308,7 @@ def _report(
     """Raise or warn about items that cannot be fitted."""
     bad = (~usable).nonzero()[:, 0].tolist()
     n_sensors = len(sensors)
-    places = [f"sensor {place(sensors, divmod(i, n_sensors) if len(nu) > n_sensors else (i,))}" for i in bad]
+    places = [f"sensor {sensor_label(sensors, divmod(i, n_sensors) if len(nu) > n_sensors else (i,))}" for i in bad]
     what = (
         "expected wavelet variances that are finite and > 0 at every level (a constant signal has none, nor has one "
         "with infinite samples; squares of huge or tiny numbers leave the range; gaps leave no whole window at the "

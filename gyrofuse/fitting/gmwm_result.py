@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.deprecation import RenamedAttribute
-from gyrofuse._base.results import ConfidenceInterval, Result, counted, p_words, place, plain, scattered
+from gyrofuse._base.results import ConfidenceInterval, Result, counted, p_words, plain, scattered, sensor_label
 from gyrofuse._base.units import DATASHEET_UNITS
 from gyrofuse.fitting.j_test import REJECTED
 from gyrofuse.fitting.moments.inference import Inference
@@ -200,7 +200,7 @@ class GMWMResult(Result):
         return "\n".join(lines)
 
     def _table(self, index: tuple[int, ...]) -> list[str]:
-        head = f"sensor {place(self.sensors, index, self.axes)}"
+        head = f"sensor {sensor_label(self.sensors, index, self.axes)}"
         if not bool(self.params[index].isfinite().all()):
             return [f"{head}: not fitted"]
         fits = ""
@@ -257,7 +257,7 @@ class GMWMResult(Result):
             confidence_level=self.confidence_level,
             rate=self.rate,
             unit=self.unit,
-            title=f"sensor {place(self.sensors, index, self.axes)}: {self.name}",
+            title=f"sensor {sensor_label(self.sensors, index, self.axes)}: {self.name}",
             ax=ax,
         )
 

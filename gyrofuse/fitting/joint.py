@@ -12,12 +12,13 @@ from torch import Tensor
 
 from gyrofuse._base.checks import check_signal
 from gyrofuse._base.deprecation import RenamedAttribute
-from gyrofuse._base.results import Result, place, scattered
+from gyrofuse._base.results import Result, scattered, sensor_label
 from gyrofuse.fitting.gmwm import fit_gmwm
 from gyrofuse.fitting.gmwm_result import GMWMResult
 from gyrofuse.fitting.moments import search
+from gyrofuse.fitting.moments.drift_sign import drifts_of, with_drift_sign
 from gyrofuse.fitting.moments.fit import composition_of, fit_batch
-from gyrofuse.fitting.moments.identifiability import drifts_of, notes, signed
+from gyrofuse.fitting.moments.identifiability import notes
 from gyrofuse.fitting.moments.inference import Fit, infer
 from gyrofuse.fitting.moments.profile import profiled
 from gyrofuse.fitting.moments.profile_objectives import MomentProfile
@@ -95,7 +96,7 @@ class JointFit(Result):
             f"recordings of {', '.join(str(one.n_samples) for one in self.separate)} samples"
         ]
         for index in itertools.product(*map(range, self.p_value.shape)):
-            head = f"sensor {place(self.joint.sensors, index, self.joint.axes)}"
+            head = f"sensor {sensor_label(self.joint.sensors, index, self.joint.axes)}"
             if not bool(self.p_value[index].isfinite()):
                 lines += ["", f"{head}: not fitted"]
                 continue
@@ -111,10 +112,10 @@ class JointFit(Result):
 
     def _verdict(self, index: tuple[int, ...]) -> str:
         p = self.p_value[index].item()
-        told = f"chi-square = {self.statistic[index].item():.4g}, {int(self.dof[index])} degrees, p = {p:.2g}"
+        test_text = f"chi-square = {self.statistic[index].item():.4g}, {int(self.dof[index])} degrees, p = {p:.2g}"
         if p >= _DIFFERENT:
-            return f"the recordings agree ({told})"
-        return f"not stationary between the recordings ({told}); the joint fit is an average"
+            return f"the recordings agree ({test_text})"
+        return f"not stationary between the recordings ({test_text}); the joint fit is an average"
 
     def plot(self, ax: Axes | None = None, *, index: tuple[int, ...] | None = None) -> Axes:
         """Draw the joint fit of one sensor and the Allan deviations of the recordings.
@@ -187,7 +188,7 @@ def fit_gmwm_joint(
     slopes = every[:, drifts_of(model_of)].sum(-1)
     sign = torch.where(slopes < 0, -1.0, 1.0).to(torch.float64)
     joint = GMWMResult.build(
-        inference=replace(inference, estimates=signed(inference.estimates, model_of, sign)),
+        inference=replace(inference, estimates=with_drift_sign(inference.estimates, model_of, sign)),
         notes=notes(structure, inference.estimates, records.longest, confidence_level),
         structure=structure,
         usable=usable,

@@ -164,7 +164,7 @@ def plot_ranking(
     Args:
         names: Names of the candidates, from the best on.
         difference: Criteria less that of the chosen one, `(candidate,)`.
-        standings: Standing of each: `chosen`, `not told from it`, `redundant` or nothing.
+        standings: Standing of each: `chosen`, `equivalent`, `redundant` or nothing.
         rejected: Whether the J test clearly rejects the chosen one.
         aside: Candidates that were not compared.
         title: Title of the axes.
@@ -178,7 +178,7 @@ def plot_ranking(
     values, aside = difference.tolist(), aside or []
     least, most = min([0.0, *values]), max([_LINEAR, *values])
     ax.axvline(0.0, color=INK, linewidth=0.8, zorder=1)
-    for named, color in ((("chosen", ""), BLUE), (("not told from it",), _COLOURS[1]), (("redundant",), _FADED)):
+    for named, color in ((("chosen", ""), BLUE), (("equivalent",), _COLOURS[1]), (("redundant",), _FADED)):
         places = [k for k, own in enumerate(standings) if own in named]
         if places:
             shown = [values[k] for k in places]
@@ -203,7 +203,7 @@ def plot_ranking(
         ax.set_title(title, loc="left", fontsize=10, parse_math=False)
     if note:
         ax.set_title(note, loc="right", fontsize=8, parse_math=False)
-    marked = {"not told from it", "redundant"} & set(standings)
+    marked = {"equivalent", "redundant"} & set(standings)
     finish(ax, *(ax.get_legend_handles_labels() if marked else ()))
     return ax
 

@@ -11,7 +11,7 @@ import torch
 
 from gyrofuse._base.axes import with_unit
 from gyrofuse._base.page import image, number, render
-from gyrofuse._base.results import chance
+from gyrofuse._base.results import format_p_value
 from gyrofuse.mismatch.case import Case, block_means
 from gyrofuse.mismatch.comparison import VarianceComparison, compared_powers, grouped_spectrum
 from gyrofuse.mismatch.mechanism import Finding, Parameter
@@ -122,7 +122,7 @@ def _part(outcome: Outcome, finding: Finding) -> dict[str, Any]:
         "frequency": "" if finding.frequency_hz is None else f"{number(finding.frequency_hz, 6)} Hz",
         when: "" if finding.time_s is None else f"{number(finding.time_s, 6)} s",
         "follows": finding.channel or "",
-        "p value": chance(finding.p_value),
+        "p value": format_p_value(finding.p_value),
         "gain held out": "" if finding.held_out_gain is None else f"{finding.held_out_gain:+.1f} nats",
         "lost if left out alone": "" if finding.gain_without is None else f"{nats(finding.gain_without)} nats",
     }
@@ -172,8 +172,8 @@ def _witnesses(outcome: Outcome) -> list[dict[str, Any]]:
     return [
         {
             "name": mechanism_words(before.witness),
-            "p": chance(before.p_value),
-            "p_after": chance(after.p_value),
+            "p": format_p_value(before.p_value),
+            "p_after": format_p_value(after.p_value),
             "words": capital(before.words),
             "words_after": capital(after.words),
             "surprised": before.p_value * len(outcome.evidence) < 0.01,

@@ -50,7 +50,7 @@ def test_verdict_names_the_model_the_line_and_what_is_as_good():
     assert "stands out" not in right
     for index, words in enumerate((left, right)):
         same = [name for name, there in zip(CANDIDATES, result.equivalent[index].tolist(), strict=True) if there]
-        assert ("The record does not tell it from" in words) == bool(same)
+        assert ("Equivalent to it:" in words) == bool(same)
         assert all(name in words for name in same)
 
 
@@ -109,14 +109,14 @@ def test_one_candidate_has_one_standing():
     base = compared(("WN + AR1", 0.0, 0.5), ("2*AR1", 1.0, 0.0), ("WN", 9.0, math.nan))
     marks = torch.tensor([[False, True, False]])
     result = replace(base, redundant=marks, equivalent=marks, reasons=((None, "AR1 2 is white noise", None),))
-    assert [result.standing((0,), c) for c in range(3)] == ["chosen", "not told from it", ""]
-    told = "not told from it: AR1 2 is white noise"
+    assert [result.standing((0,), c) for c in range(3)] == ["chosen", "equivalent", ""]
+    told = "equivalent: AR1 2 is white noise"
     assert told in result.summary()
     assert "redundant:" not in result.summary()
     assert any(row[-1] == told for row in Page(rank_report(result, title="one")).rows)
     with mpl.rc_context({"backend": "agg"}):
         ax = result.plot()
-    assert [text.get_text() for text in ax.get_legend().get_texts()] == ["candidate", "not told from it"]
+    assert [text.get_text() for text in ax.get_legend().get_texts()] == ["candidate", "equivalent"]
     words = plain(rank_verdict(result, (0,)))
     assert "The next one, WN, has" in words  # third in the table
     assert "runner-up" not in words

@@ -92,10 +92,10 @@ def test_what_may_be_noise_is_said():
     """5 % of the records without a tone seem to have one."""
     signal = records(gf.WhiteNoise(1.0) + gf.RandomWalk(1e-3), 40, 4096)[:, None]
     found = gf.fit_gmwm(signal, "WN + RW + SIN")
-    said = [[text for text in texts if "not told from the noise (p = " in text] for texts in found.notes]
+    said = [[text for text in texts if "not significant against the noise (p = " in text] for texts in found.notes]
     assert sum(map(len, said)) >= stats.binom.ppf(1e-3, 40, 0.95)
     i = next(i for i, texts in enumerate(said) if texts)
-    assert said[i][0].startswith("sinusoid_1: not told from the noise (p = ")
+    assert said[i][0].startswith("sinusoid_1: not significant against the noise (p = ")
     assert not bool(found.identified[i, 0])
     assert said[i][0] in gf.fit_gmwm(signal[i], "WN + RW + SIN").summary()
     assert said[i][0] in json.loads(json.dumps(found.to_dict()))["remarks"][i]
@@ -108,7 +108,7 @@ def test_the_tone_that_may_be_noise_is_named():
     found = gf.fit_gmwm(signal, "WN + RW + 2*SIN")
     for beta, texts in zip(found.params[:, 0, [3, 5]].tolist(), found.notes, strict=True):
         wrong = 1 if abs(beta[1] - 0.35) < 1e-2 else 2
-        told = [text.split(":")[0] for text in texts if "not told from the noise" in text]
+        told = [text.split(":")[0] for text in texts if "not significant against the noise" in text]
         assert told in ([f"sinusoid_{wrong}"], []), (beta, texts)
 
 

@@ -17,7 +17,7 @@ from gyrofuse.wavelets.intervals import normal_quantile
 
 # Time constants of an AR1 in the record below which its parameters count as unidentified: an AR1 with a time constant
 # of a seventh of the record is estimated anywhere from a thirtieth of it to a random walk, and the delta method fails.
-FEWEST_TIME_CONSTANTS = 50
+RELIABLE_TIME_CONSTANTS = 50
 
 
 class ArrayFit(NamedTuple):
@@ -201,7 +201,7 @@ def covariance_of_numbers(fit: ArrayFit, squared: Tensor, std_err: Tensor, struc
 
 def is_long(phi: Tensor, n_samples: int) -> Tensor:
     """Whether a record of `n_samples` holds too few time constants of an AR1 of this `phi`, of the shape of `phi`."""
-    return phi > math.exp(-FEWEST_TIME_CONSTANTS / n_samples)
+    return phi > math.exp(-RELIABLE_TIME_CONSTANTS / n_samples)
 
 
 def identified_matrices(fit: ArrayFit, structure: ModelStructure, n_samples: int) -> Tensor:

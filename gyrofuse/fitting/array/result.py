@@ -12,7 +12,7 @@ from torch import Tensor
 from gyrofuse._base.deprecation import RenamedAttribute
 from gyrofuse._base.results import ConfidenceInterval, Result, counted, plain, scattered
 from gyrofuse.fitting.array.inference import (
-    FEWEST_TIME_CONSTANTS,
+    RELIABLE_TIME_CONSTANTS,
     ArrayFit,
     covariance_of_numbers,
     identified_matrices,
@@ -317,7 +317,7 @@ class ArrayGMWMResult(Result):
             if is_vague:
                 reasons.append(
                     "hardly told from a random walk at this length, its memory is longer than "
-                    f"1/{FEWEST_TIME_CONSTANTS} of the record"
+                    f"1/{RELIABLE_TIME_CONSTANTS} of the record"
                 )
             if reasons:
                 limits = "upper limits only of its variances, no intervals of its covariances and correlations"

@@ -1,13 +1,9 @@
-"""Which parameters of a fitted model a record of that length identifies, and how to say so.
-
-Wavelet variances and spectra hold the square of a drift's slope: its sign comes from the samples.
-"""
+"""Which parameters of a fitted model a record of that length identifies, and how to say so."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -20,7 +16,7 @@ from gyrofuse.wavelets.intervals import normal_quantile
 
 # Time constants in the record below which an AR1 is called indistinguishable from a random walk: with two of them the
 # autocorrelation over the record is still e^-2.
-FEWEST_TIME_CONSTANTS = 2.0
+DISTINGUISHABLE_TIME_CONSTANTS = 2.0
 
 
 def weakly_identified(
@@ -103,7 +99,7 @@ def notes(
         # At 0.05 a line that is nothing but noise stays without this note in one record of twenty.
         for item, tone in (tones.p_value >= 0.05).nonzero().tolist():
             p_value = tones.p_value[item, tone].item()
-            found_by_item[item].append(f"{sinusoids[tone]}: not told from the noise (p = {p_value:.1g})")
+            found_by_item[item].append(f"{sinusoids[tone]}: not significant against the noise (p = {p_value:.1g})")
         for item, tone in _larger_than_in_spectrum(structure, estimates, tones).nonzero().tolist():
             held = tones.amplitude[item, tone].item()
             found_by_item[item].append(
@@ -124,7 +120,7 @@ def _near_equivalent(
             low, high = estimates.low[:, place], estimates.high[:, place]
             found[k] = (
                 there & (low <= process.memoryless) & (high >= process.memoryless),
-                there & (high >= math.exp(-FEWEST_TIME_CONSTANTS / n_samples)),
+                there & (high >= math.exp(-DISTINGUISHABLE_TIME_CONSTANTS / n_samples)),
             )
     return found
 
@@ -162,11 +158,11 @@ def _combined(
     better than the worst known one, `sqrt(1.95 / 0.05)`.
     """
     found: dict[tuple[int, int], Tensor] = {}
-    spread = estimates.covariance.diagonal(dim1=-2, dim2=-1)
+    variances = estimates.covariance.diagonal(dim1=-2, dim2=-1)
     for k, other in itertools.combinations(range(structure.n_linear), 2):
         one, two = structure.places[k], structure.places[other]
-        size = spread[:, [one, two]].prod(-1)
-        weak = (spread[:, [one, two]] > (WEAKLY_DETERMINED * estimates.params[:, [one, two]]).square()).all(-1)
+        size = variances[:, [one, two]].prod(-1)
+        weak = (variances[:, [one, two]] > (WEAKLY_DETERMINED * estimates.params[:, [one, two]]).square()).all(-1)
         found[one, two] = weak & (size > 0) & (estimates.covariance[:, one, two].square() > least_correlation**2 * size)
     return found
 
@@ -189,33 +185,3 @@ def _shape_at(structure: ModelStructure, k: int) -> int:
 
 def _absent(structure: ModelStructure, estimates: Estimates, k: int) -> Tensor:
     return estimates.params[:, structure.places[k]] == 0
-
-
-def rising(series: Tensor) -> Tensor:
-    """Sign of the slope of a regression on time, `(item,)`, of series `(item, time)`, NaN = missing sample."""
-    time = torch.arange(series.shape[-1], dtype=torch.float64, device=series.device)
-    there = series.isfinite()
-    rest = torch.where(there, series.to(torch.float64) - series.nanmean(-1, keepdim=True).to(torch.float64), 0.0)
-    centre = (time * there).sum(-1, keepdim=True) / there.sum(-1, keepdim=True)
-    return torch.where((rest * (time - centre)).sum(-1) < 0, -1.0, 1.0).to(torch.float64)
-
-
-def drifts_of(model: Model) -> Tensor:
-    """Whether a parameter is the slope of a drift, `(parameter,)`."""
-    return torch.tensor([p.deterministic for p in model.processes for _ in p.parameters])
-
-
-def signed(estimates: Estimates, model: Model, sign: Tensor) -> Estimates:
-    """Estimates whose drifts have slopes of these signs, `(item,)`."""
-    column = drifts_of(model).to(sign.device)
-    if not bool(column.any()):
-        return estimates
-    turn = torch.where(column, sign[:, None], 1.0)  # (item, parameter)
-    low, high = estimates.low * turn, estimates.high * turn
-    return replace(
-        estimates,
-        params=estimates.params * turn + 0.0,  # no -0
-        covariance=estimates.covariance * turn[:, :, None] * turn[:, None, :],
-        low=low.minimum(high) + 0.0,
-        high=high.maximum(low) + 0.0,
-    )

@@ -121,7 +121,7 @@ def infer(fit: Fit, structure: ModelStructure, confidence_level: float) -> Infer
     jacobian = torch.cat([own.values, own.slopes[..., moving]], -1)
     present = fit.linear > 0  # (item, process)
     active = torch.cat([present, present[:, structure.free_nonlinear]], -1)
-    spread = sandwich(jacobian, active, own.covariance, own.weight)
+    covariance = sandwich(jacobian, active, own.covariance, own.weight)
     # Standard errors of variances at zero, if they could be negative.
     free = torch.cat([torch.ones_like(present), present[:, structure.free_nonlinear]], -1)
     edge = sandwich(jacobian, free, own.covariance, own.weight)
@@ -129,7 +129,7 @@ def infer(fit: Fit, structure: ModelStructure, confidence_level: float) -> Infer
         structure,
         fit.linear,
         fit.shape,
-        _in_logs(spread, fit, structure),
+        _in_logs(covariance, fit, structure),
         edge.diagonal(dim1=-2, dim2=-1)[:, : structure.n_linear].clamp(min=0).sqrt(),
         confidence_level,
     )
@@ -138,7 +138,7 @@ def infer(fit: Fit, structure: ModelStructure, confidence_level: float) -> Infer
 
 
 def infer_efficient(
-    fit: Fit, structure: ModelStructure, spread: Tensor, edge_sd: Tensor, confidence_level: float
+    fit: Fit, structure: ModelStructure, covariance: Tensor, edge_sd: Tensor, confidence_level: float
 ) -> Inference:
     """Inference at efficient estimates, which are no minimum of the moments' objective.
 
@@ -149,7 +149,7 @@ def infer_efficient(
     Args:
         fit: Moments, and the estimates in the place of the minimum.
         structure: Structure of the model.
-        spread: `S`, of `ln p` of all processes and `x` of all shaped ones, `(item, unknown, unknown)`; what is not
+        covariance: `S`, of `ln p` of all processes and `x` of all shaped ones, `(item, unknown, unknown)`; what is not
             known of it takes nothing from the residuals, so that the test refuses too seldom.
         edge_sd: As in `estimated`.
         confidence_level: Probability that an interval holds the true value.
@@ -160,11 +160,11 @@ def infer_efficient(
     own = _residual_of(fit, structure)
     jacobian = torch.cat([own.values * fit.linear[:, None], own.slopes], -1)
     moved = torch.linalg.solve_triangular(own.root, jacobian, upper=False)
-    part = moved @ spread.nan_to_num(nan=0.0, posinf=0.0) @ moved.mT
+    part = moved @ covariance.nan_to_num(nan=0.0, posinf=0.0) @ moved.mT
     taken = torch.linalg.eigvalsh(torch.where(own.j_statistic.isfinite()[:, None, None], part, 0.0)).clamp(0, 1)
     dof = (1 - taken).sum(-1)
     dispersion = (1 - taken).square().sum(-1) / dof
-    estimates = estimated(structure, fit.linear, fit.shape, spread, edge_sd, confidence_level)
+    estimates = estimated(structure, fit.linear, fit.shape, covariance, edge_sd, confidence_level)
     return Inference(estimates, own.fitted, own.objective, own.j_statistic, dof, dispersion, fit.converged)
 
 
@@ -226,18 +226,23 @@ def _in_logs(own: Tensor, fit: Fit, structure: ModelStructure) -> Tensor:
     scale = torch.cat([scale, torch.ones_like(own[:, n_linear:, 0])], -1)
     place = [*range(n_linear), *(n_linear + nonlinear.index(k) for k in structure.free_nonlinear)]
     size = n_linear + len(nonlinear)
-    spread = own.new_zeros(len(own), size, size)
+    covariance = own.new_zeros(len(own), size, size)
     index = torch.tensor(place, device=own.device)
-    spread[:, index[:, None], index] = own * scale[:, :, None] * scale[:, None, :]
+    covariance[:, index[:, None], index] = own * scale[:, :, None] * scale[:, None, :]
     held = [n_linear + at for at, k in enumerate(nonlinear) if k not in structure.free_nonlinear]
     if held:
         slope = Sinusoid.unconstrained_slope(fit.shape[:, [at - n_linear for at in held]])
-        spread[:, held, held] = (fit.held_sd / slope).square()
-    return spread
+        covariance[:, held, held] = (fit.held_sd / slope).square()
+    return covariance
 
 
 def estimated(
-    structure: ModelStructure, linear: Tensor, shape: Tensor, spread: Tensor, edge_sd: Tensor, confidence_level: float
+    structure: ModelStructure,
+    linear: Tensor,
+    shape: Tensor,
+    covariance: Tensor,
+    edge_sd: Tensor,
+    confidence_level: float,
 ) -> Estimates:
     """Parameters with intervals that respect their ranges.
 
@@ -249,12 +254,12 @@ def estimated(
         structure: Structure of the model.
         linear: `p`, `(item, process)`.
         shape: `x`, `(item, shaped)`.
-        spread: Covariance of `ln p` of all processes and `x` of all shaped ones, `(item, unknown, unknown)`.
+        covariance: Covariance of `ln p` of all processes and `x` of all shaped ones, `(item, unknown, unknown)`.
         edge_sd: Standard error of `p` itself, as if a `p` at zero could be negative, `(item, process)`.
         confidence_level: Probability that an interval holds the true value.
     """
     z, one_sided = normal_quantile((1 + confidence_level) / 2), normal_quantile(confidence_level)
-    sd = spread.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
+    sd = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
     found: list[tuple[int, Tensor, Tensor, Tensor, Tensor]] = []  # unknown, low, high, slope, determined
     at_shaped = structure.n_linear
     for k, process in enumerate(structure.processes):
@@ -277,9 +282,9 @@ def estimated(
         else:
             found.append(size)
     lows, highs, slopes, determined = (torch.stack(column, -1) for column in list(zip(*found, strict=True))[1:])
-    index = torch.tensor([unknown for unknown, *_ in found], device=spread.device)
-    covariance = spread[:, index[:, None], index] * slopes[:, :, None] * slopes[:, None, :]
-    return Estimates(structure.params(linear, shape), covariance, lows, highs, determined)
+    index = torch.tensor([unknown for unknown, *_ in found], device=covariance.device)
+    of_params = covariance[:, index[:, None], index] * slopes[:, :, None] * slopes[:, None, :]
+    return Estimates(structure.params(linear, shape), of_params, lows, highs, determined)
 
 
 def sandwich(jacobian: Tensor, active: Tensor, covariance: Tensor, weight: Tensor) -> Tensor:
@@ -294,6 +299,6 @@ def sandwich(jacobian: Tensor, active: Tensor, covariance: Tensor, weight: Tenso
     off = (~active).to(bread)
     scaled = bread / scale[:, :, None] / scale[:, None, :] + torch.diag_embed(off)
     inverse = torch.linalg.inv_ex(scaled)[0] / scale[:, :, None] / scale[:, None, :]
-    spread = inverse @ (weighted.mT @ covariance @ weighted) @ inverse
+    of_scaled = inverse @ (weighted.mT @ covariance @ weighted) @ inverse
     keep = active[:, :, None] & active[:, None, :]
-    return torch.where(keep, spread / size[:, :, None] / size[:, None, :], 0.0)
+    return torch.where(keep, of_scaled / size[:, :, None] / size[:, None, :], 0.0)

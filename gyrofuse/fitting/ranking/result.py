@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.deprecation import RenamedAttribute
-from gyrofuse._base.results import Result, chance, counted, p_words, place, plain, scattered, signed
+from gyrofuse._base.results import Result, counted, format_p_value, p_words, plain, scattered, sensor_label, signed
 from gyrofuse.fitting.gmwm_result import MOST_TABLES, GMWMResult, axes_of, items_of
 from gyrofuse.fitting.j_test import CLEARLY_REJECTED
 from gyrofuse.fitting.ranking.candidates import name_of
@@ -141,8 +141,8 @@ class RankResult(Result):
         if least == most:
             return whole if most == len(self.candidates) else f"{most} of {whole}"
         *first, last = map(str, counts)
-        told = f"{', '.join(first)} and {last}" if len(counts) <= _MOST_ROWS else f"{least} to {most}"
-        return f"{told} of {whole}"
+        numbers = f"{', '.join(first)} and {last}" if len(counts) <= _MOST_ROWS else f"{least} to {most}"
+        return f"{numbers} of {whole}"
 
     @property
     def wvic_difference(self) -> Tensor:
@@ -150,14 +150,14 @@ class RankResult(Result):
         return self.wvic - self.wvic.nan_to_num(nan=torch.inf).amin(-1, keepdim=True)
 
     def standing(self, index: tuple[int, ...], c: int) -> str:
-        """Where a candidate stands for a sensor: `chosen`, `not told from it`, `redundant`, or nothing to say.
+        """Where a candidate stands for a sensor: `chosen`, `equivalent`, `redundant`, or nothing to say.
 
-        What has the chosen one's spectrum and amounts to it is not told from it.
+        Equivalent: its fit has the same spectrum as the chosen one.
         """
         if c == int(self.choice[index]):
             return "chosen"
         if bool(self.equivalent[index][c]):
-            return "not told from it"
+            return "equivalent"
         return "redundant" if bool(self.redundant[index][c]) else ""
 
     def compared_to(self, index: tuple[int, ...]) -> list[int]:
@@ -224,7 +224,7 @@ class RankResult(Result):
         lines = [f"{head}: {self.candidates[int(self.choice[index])]}"]
         same = [name for name, there in zip(self.candidates, self.equivalent[index].tolist(), strict=True) if there]
         if same:
-            lines.append(f"  not told from it: {', '.join(same)}")
+            lines.append(f"  equivalent: {', '.join(same)}")
         lines += [f"  {text}" for text in self.doubts(index)]
         wide = max(map(len, ("candidate", *self.candidates)))
         lines.append(f"  {'candidate':<{wide}}  {'criterion':>10}  {'WVIC':>8}  {'J test p':>8}")
@@ -232,9 +232,9 @@ class RankResult(Result):
         order = self.compared_to(index)
         for c in order[:_MOST_ROWS]:
             row = f"  {self.candidates[c]:<{wide}}  {signed(difference[c].item()):>10}  {signed(wvic[c].item()):>8}"
-            row += f"  {chance(self.p_value[index][c].item()):>8}"
-            told = ": ".join(filter(None, (self.standing(index, c), reasons[c])))
-            lines.append(f"{row}  {told}".rstrip())
+            row += f"  {format_p_value(self.p_value[index][c].item()):>8}"
+            phrase = ": ".join(filter(None, (self.standing(index, c), reasons[c])))
+            lines.append(f"{row}  {phrase}".rstrip())
         if len(order) > _MOST_ROWS:
             lines.append(f"  and {len(order) - _MOST_ROWS} more")
         lines += [f"  {self.candidates[c]:<{wide}}  not compared: {reasons[c]}" for c in self.set_aside(index)]
@@ -275,7 +275,7 @@ class RankResult(Result):
         )
 
     def _place(self, index: tuple[int, ...]) -> str:
-        return place(self.sensors, index, self.axes)
+        return sensor_label(self.sensors, index, self.axes)
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain lists and numbers, ready for JSON (NaN and infinities as None)."""

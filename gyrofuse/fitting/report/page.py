@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gyrofuse._base.page import image, render
-from gyrofuse._base.results import place
+from gyrofuse._base.results import sensor_label
 from gyrofuse._base.units import DATASHEET_UNITS
 from gyrofuse.fitting.gmwm_result import GMWMResult
 from gyrofuse.fitting.plots import plot_residuals
@@ -35,7 +35,7 @@ def model_report(result: GMWMResult, recording: Recording | None = None, *, titl
     """
     indices = list(itertools.product(*map(range, result.params.shape[:-1])))
     parts = [
-        model_part(result, index, f"Sensor {place(result.sensors, index, result.axes)}")
+        model_part(result, index, f"Sensor {sensor_label(result.sensors, index, result.axes)}")
         for index in indices[:MOST_SENSORS]
     ]
     return render(

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gyrofuse._base.page import number, render
-from gyrofuse._base.results import chance, counted, p_words, place, signed
+from gyrofuse._base.results import counted, format_p_value, p_words, sensor_label, signed
 from gyrofuse.fitting.j_test import REJECTED
 from gyrofuse.fitting.moments.fit import composition_of
 from gyrofuse.fitting.ranking.candidates import n_parameters, penalty
@@ -81,9 +81,9 @@ def _sentences(result: RankResult, index: tuple[int, ...]) -> Iterator[str]:
         if not result.lines_counted(index):
             found = f"At least {found.lower()}"
         yield f"{found} stand{'s' if n_lines == 1 else ''} out of the noise in the spectrum."
-    same = [row["name"] for row in rows if row["standing"] == "not told from it"]
+    same = [row["name"] for row in rows if row["standing"] == "equivalent"]
     if same:
-        yield f"The record does not tell it from {', '.join(same)}."
+        yield f"Equivalent to it: {', '.join(same)}."
     for row in rows:
         if row["reason"] and row["difference"] < 0:
             better = f"a criterion {-row['difference']:.1f} below, but is more than it takes: {row['reason']}."
@@ -109,17 +109,17 @@ def _why_not(result: RankResult, index: tuple[int, ...], row: dict[str, Any]) ->
         what = f"{number(math.exp(nats), 2)} times less likely, with its numbers charged for"
     else:
         what = "beyond any doubt"
-    told = f"has a criterion {row['difference']:.1f} above ({what})"
+    phrase = f"has a criterion {row['difference']:.1f} above ({what})"
     if row["reason"]:
-        return f"{told} and is more than it takes: {row['reason']}"
+        return f"{phrase} and is more than it takes: {row['reason']}"
     # That is against it only where the chosen one fits.
     if row["p_value"] < REJECTED <= result.p_value[index][int(result.choice[index])].item():
-        return f"{told}; its wavelet variances do not fit (J test: {p_words(row['p_value'])})"
-    return told
+        return f"{phrase}; its wavelet variances do not fit (J test: {p_words(row['p_value'])})"
+    return phrase
 
 
 def _part(result: RankResult, recording: Recording | None, n: int, index: tuple[int, ...]) -> dict[str, Any]:
-    name, fit = f"Sensor {place(result.sensors, index, result.axes)}", result.best[n]
+    name, fit = f"Sensor {sensor_label(result.sensors, index, result.axes)}", result.best[n]
     rows = _rows(result, index)
     return {
         "name": name,
@@ -145,7 +145,7 @@ def _rows(result: RankResult, index: tuple[int, ...]) -> list[dict[str, Any]]:
                 "criterion": signed(difference),
                 "wvic": signed(result.wvic_difference[index][c].item()),
                 "p_value": result.p_value[index][c].item(),
-                "p": chance(result.p_value[index][c].item()),
+                "p": format_p_value(result.p_value[index][c].item()),
                 "standing": result.standing(index, c),
                 "reason": result.reasons_of(index)[c],
             }

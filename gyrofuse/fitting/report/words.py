@@ -85,21 +85,22 @@ def _completeness(result: GMWMResult, index: tuple[int, ...]) -> Iterator[str]:
         else:
             yield "Whether the model is complete cannot be tested: it has as many parameters as there are levels."
         return
-    told = f"J test: {p_words(p_value)}"
+    test_text = f"J test: {p_words(p_value)}"
     if p_value >= DOUBTED:
-        yield f"The model explains the wavelet variances at all scales within what chance allows ({told})."
+        yield f"The model explains the wavelet variances at all scales within what chance allows ({test_text})."
         return
     off = residuals(result, index)
     worst = int(off.abs().argmax())
     size = f"{abs(off[worst].item()):.1f} standard deviations {'above' if off[worst] > 0 else 'below'} the model's"
     where = f"at {_time(result, worst)} the measured wavelet variance is {size}"
     if p_value >= REJECTED:
-        yield f"The model is in doubt ({told}): {where}."
+        yield f"The model is in doubt ({test_text}): {where}."
     else:
         remedy = "add a process or look for a disturbance"
         if result.efficiency < 1:
             remedy = "add a process; where more than one sample in a thousand is an outlier, slow levels have them too"
-        yield f"The model is not complete ({told}): {where}. Intervals hold only for what the model knows; {remedy}."
+        limits = "Intervals hold only for what the model knows"
+        yield f"The model is not complete ({test_text}): {where}. {limits}; {remedy}."
 
 
 def _rulers(result: GMWMResult, index: tuple[int, ...]) -> Iterator[str]:

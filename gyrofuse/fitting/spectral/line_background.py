@@ -17,14 +17,14 @@ from gyrofuse._base.transforms import LOW_BINS
 _TOP = 1 / 32
 
 
-def smooth_background(power: Tensor, places: Tensor, first: int, last: int) -> tuple[Tensor, Tensor]:
+def smooth_background(power: Tensor, coordinates: Tensor, first: int, last: int) -> tuple[Tensor, Tensor]:
     """Smooth log density under a periodogram, and the variance of that estimate.
 
-    Medians of bands, whose logs a spline smooths; straight lines over `place` between the bands.
+    Medians of bands, whose logs a spline smooths; straight lines over `frequency_coordinate` between the bands.
 
     Args:
         power: `(item, bin)`, the bins from 1 up to half the transform's length.
-        places: `place` of each bin, `(bin,)`.
+        coordinates: `frequency_coordinate` of each bin, `(bin,)`.
         first: First bin of the lowest band.
         last: Last bin of the highest band.
 
@@ -33,7 +33,7 @@ def smooth_background(power: Tensor, places: Tensor, first: int, last: int) -> t
     """
     highest = power.shape[-1]
     smoother = _smoother(first, last, highest)
-    matrix, at = (torch.from_numpy(v).to(power) for v in (smoother.matrix, smoother.places))
+    matrix, at = (torch.from_numpy(v).to(power) for v in (smoother.matrix, smoother.coordinates))
     centre = at[1:-1]
     logs = power.new_empty(len(power), len(smoother.edges))
     for b, (low, high) in enumerate(smoother.edges):
@@ -44,7 +44,7 @@ def smooth_background(power: Tensor, places: Tensor, first: int, last: int) -> t
         for b, (low, high) in enumerate(smoother.edges):
             if low > LOW_BINS:
                 break
-            bins = places[low - 1 : high - 1]
+            bins = coordinates[low - 1 : high - 1]
             slope = (smooth[:, b + 2] - smooth[:, b]) / (at[b + 2] - at[b])
             tilt = torch.exp(slope[:, None] * (bins - centre[b]))
             logs[:, b] = _log_of_median(power[:, low - 1 : high - 1] / tilt)
@@ -53,10 +53,10 @@ def smooth_background(power: Tensor, places: Tensor, first: int, last: int) -> t
     corners = torch.cat([smooth, torch.from_numpy(smoother.variance).to(power)[None]])
     slopes = corners.diff(dim=-1) / at.diff()
     lines = power.new_empty(len(corners), highest)
-    cuts = [0, *torch.searchsorted(places, at[1:-1]).tolist(), highest]
+    cuts = [0, *torch.searchsorted(coordinates, at[1:-1]).tolist(), highest]
     for b, (low, high) in enumerate(itertools.pairwise(cuts)):
         offset = corners[:, b] - slopes[:, b] * at[b]
-        torch.addcmul(offset[:, None], slopes[:, b, None], places[None, low:high], out=lines[:, low:high])
+        torch.addcmul(offset[:, None], slopes[:, b, None], coordinates[None, low:high], out=lines[:, low:high])
     return lines[:-1], lines[-1]
 
 
@@ -74,7 +74,7 @@ def _log_of_median(ordinates: Tensor) -> Tensor:
     return (ordinates.kthvalue(rank, dim=-1).values / expected).log()
 
 
-def place(k: Tensor, highest: int) -> Tensor:
+def frequency_coordinate(k: Tensor, highest: int) -> Tensor:
     """Coordinate of the background: log frequency, at high frequencies rather the log distance from the highest."""
     return k.log() - ((1 + _TOP) * highest - k).log()
 
@@ -85,20 +85,20 @@ class _Smoother:
 
     Attributes:
         edges: First bin of each band and the one after its last.
-        places: `(point,)`: the lowest bin, the middles of the bands, the highest bin.
+        coordinates: `frequency_coordinate` `(point,)` of the lowest bin, the middles of the bands, the highest bin.
         matrix: `(point, band)`.
         variance: Of the smoothed log, `(point,)`.
     """
 
     edges: list[tuple[int, int]]
-    places: np.ndarray
+    coordinates: np.ndarray
     matrix: np.ndarray
     variance: np.ndarray
 
 
 @functools.lru_cache(maxsize=16)
 def _smoother(first: int, last: int, highest: int) -> _Smoother:
-    """Smoothing spline: minimises `sum_b (y_b - s_b)^2 / v_b + integral (s'')^2 / q` over `place`."""
+    """Smoothing spline: minimises `sum_b (y_b - s_b)^2 / v_b + integral (s'')^2 / q` over `frequency_coordinate`."""
     # Bands of at least six bins and of a fraction of their frequency, or of the distance from the highest one.
     fewest_bins, fraction = 6, 0.18
     # Intensity of the white noise that the curvature of the background is in log frequency: between white noise and a
@@ -117,7 +117,7 @@ def _smoother(first: int, last: int, highest: int) -> _Smoother:
         edges.append((low, high))
         low = high
     middles = [(a + b - 1) / 2 if a > LOW_BINS else float(np.exp(np.log(np.arange(a, b)).mean())) for a, b in edges]
-    x = place(torch.tensor([1.0, *middles, float(highest)], dtype=torch.float64), highest).numpy()
+    x = frequency_coordinate(torch.tensor([1.0, *middles, float(highest)], dtype=torch.float64), highest).numpy()
     gap = np.diff(x)
     curvature = np.zeros((len(x) - 2, len(x)))
     for i in range(len(x) - 2):

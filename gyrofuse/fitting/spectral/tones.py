@@ -27,7 +27,7 @@ from gyrofuse._base.checks import check_floating, check_positive_integer
 from gyrofuse._base.chunks import CACHE, items_at_once
 from gyrofuse._base.transforms import fast_length, taper_kernel, tone_in_hann
 from gyrofuse.fitting.spectral.line import Line
-from gyrofuse.fitting.spectral.line_background import place, smooth_background
+from gyrofuse.fitting.spectral.line_background import frequency_coordinate, smooth_background
 
 NoiseSpectrum = Callable[[Tensor], Tensor]
 
@@ -228,7 +228,7 @@ class _Records:
         self._spectrum = torch.fft.rfft(self._signal * taper, n=self._length)
         self._highest = self._length // 2
         k = torch.arange(1, self._highest + 1, dtype=torch.float64, device=device)
-        self._place = place(k, self._highest)
+        self._coordinate = frequency_coordinate(k, self._highest)
         if self._density is not None:
             log_size = 2 * self._unit.log()
             self._log_s = self._density[0].log() - log_size
@@ -292,7 +292,7 @@ class _Records:
         """Smooth density of the noise from the periodogram; returns degrees of freedom by bin, or None when given."""
         if self._density is not None:
             return None
-        self._log_s, variance = smooth_background(power, self._place, self._first, self._last)
+        self._log_s, variance = smooth_background(power, self._coordinate, self._first, self._last)
         self._log_seen = self._log_s
         return 1 / variance
 
@@ -333,8 +333,8 @@ class _Records:
         """`1/S` at the bins of a fit, `S` interpolated as a power law."""
         position = (line.k * (self._length / (2 * self._n))).clamp(min=0.25)
         index = position.floor().long().clamp(1, self._log_s.shape[-1] - 1) - 1
-        low, high = self._place[index], self._place[index + 1]
-        weight = (place(position, self._highest) - low) / (high - low)
+        low, high = self._coordinate[index], self._coordinate[index + 1]
+        weight = (frequency_coordinate(position, self._highest) - low) / (high - low)
         log_s = torch.lerp(self._log_s.gather(-1, index), self._log_s.gather(-1, index + 1), weight)
         return torch.where(line.inside, torch.exp(-log_s), 0.0)
 

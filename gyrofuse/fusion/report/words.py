@@ -78,12 +78,12 @@ def _ends_in_words(result: MultiScaleResult) -> list[str]:
     longest = int(resolved.nonzero().max()) if bool(resolved.any()) else 0
     sentences = [_gained_at(result, 0, "the shortest averaging time")]
     if longest:
-        told = "the longest averaging time with no fewer observations than sensors"
-        sentences.append(_gained_at(result, longest, told))
+        phrase = "the longest averaging time with no fewer observations than sensors"
+        sentences.append(_gained_at(result, longest, phrase))
     return sentences
 
 
-def _gained_at(result: MultiScaleResult, level: int, told: str) -> str:
+def _gained_at(result: MultiScaleResult, level: int, phrase: str) -> str:
     """Allan deviation of the virtual gyro at one averaging time, with its interval, beside that of equal weights."""
     virtual, equal = result.virtual_wavelet_variance, result.equal_wavelet_variance
     ends = (virtual, *result.interval_of(virtual), equal)
@@ -95,7 +95,7 @@ def _gained_at(result: MultiScaleResult, level: int, told: str) -> str:
     else:
         standing = f"is that of equal weights within {_percent(ALIKE)}"
     return (
-        f"At {_time(result, level)}, {told}, the Allan deviation {standing}: "
+        f"At {_time(result, level)}, {phrase}, the Allan deviation {standing}: "
         f"{number(deviation)}{unit}, {100 * result.confidence_level:g} % interval {number(low)} to "
         f"{number(high)}, against {number(mean)}."
     )
