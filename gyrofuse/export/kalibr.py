@@ -29,14 +29,14 @@ def to_kalibr(
     """Write Kalibr's `imu.yaml`, which knows white noise and a random walk only.
 
     White noise gives `gyroscope_noise_density` and a random walk `gyroscope_random_walk`, in rad/s/sqrt(Hz) and
-    rad/s^2/sqrt(Hz), both of continuous time. An AR(1) resembles a random walk over times shorter than its
+    rad/s^2/sqrt(Hz), both of continuous time. An AR(1) behaves like a random walk over times shorter than its
     correlation time and like white noise over longer ones: a slow one adds its innovations to the random walk, a fast
     one its spectral density at frequency 0, `variance / (1 - phi)^2`, to the white noise. For `phi >= 0` this errs on
     the side of more noise: the white noise has at least the wavelet variance of the AR(1) at every level, the random
-    walk too but for a share of `1 - phi`. Variances of several processes add up. Flicker noise counts as
-    the random walk that has its Allan deviation at an averaging time of `slow`, a second-order Gauss-Markov process as
-    the smallest random walk or white noise whose spectrum is nowhere below its own. Quantisation noise, sinusoids and
-    drifts are left out. Comments in the file say of each process what became of it.
+    walk at least `phi` times it. Variances of several processes add up. Flicker noise counts as the random walk that
+    has its Allan deviation at an averaging time of `slow`, a second-order Gauss-Markov process as the smallest random
+    walk or white noise whose spectrum is nowhere below its own. Quantisation noise, sinusoids and drifts are left out.
+    Comments in the file say of each process what became of it.
 
     Of a fit of several axes each key is that of the worst one. Kalibr rejects a density of 0: where a fit found none in
     any axis, its largest upper limit stands in the file, and a comment says so; where there is none either, as in a

@@ -31,13 +31,21 @@ class EstimatedFrom:
         check_positive_integer("n_samples", self.n_samples)
 
     def scaled(self, scale: Tensor) -> EstimatedFrom:
-        """For parameters times factors `(parameter,)`."""
+        """The record behind the model whose parameters are multiplied by factors.
+
+        Args:
+            scale: Factors, `(parameter,)`.
+        """
         if self.param_cov is None:
             return self
         return replace(self, param_cov=self.param_cov * (scale[:, None] * scale))
 
     def fits(self, shape: Sequence[int]) -> bool:
-        """Whether the covariance is that of parameters of a shape `(..., parameter)`."""
+        """Whether the covariance is that of parameters of a shape.
+
+        Args:
+            shape: Shape of the parameters, `(..., parameter)`.
+        """
         return self.param_cov is None or tuple(self.param_cov.shape) == (*shape, *shape[-1:])
 
     def to_dict(self) -> dict[str, Any]:
@@ -50,6 +58,9 @@ class EstimatedFrom:
     @classmethod
     def from_dict(cls, description: Mapping[str, Any] | None) -> EstimatedFrom | None:
         """Read back what `to_dict` gave; None stays None.
+
+        Args:
+            description: Output of `to_dict`.
 
         Raises:
             ValueError: Without the entry `n_samples`, or it is no positive integer.

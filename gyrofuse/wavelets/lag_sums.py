@@ -34,8 +34,8 @@ def covariance_table(n_samples: int, n_levels: int, time_constants: tuple[float,
 
     Args:
         n_samples: Length T of the record.
-        n_levels: Levels J.
-        time_constants: Of the AR1s, in samples, `-1/ln(phi)`.
+        n_levels: Number of levels J.
+        time_constants: Time constants `-1/ln(phi)` of the AR1s, samples.
 
     Returns:
         `(level, level, component, component)`, read-only. White noise has unit variance, an AR1 has unit variance, a
@@ -52,7 +52,16 @@ def covariance_table(n_samples: int, n_levels: int, time_constants: tuple[float,
 
 @functools.lru_cache(maxsize=8)
 def variance_table(n_samples: int, n_levels: int, time_constants: tuple[float, ...]) -> Array:
-    """`Q_jj` of the same, `(level, component, component)`, for a fraction of the work."""
+    """The diagonal `Q_jj` of `covariance_table`, for a fraction of the work.
+
+    Args:
+        n_samples: Length T of the record.
+        n_levels: Number of levels J.
+        time_constants: Time constants `-1/ln(phi)` of the AR1s, samples.
+
+    Returns:
+        `(level, component, component)`, read-only.
+    """
     table = np.stack([_entry(j, j, n_samples, time_constants) for j in range(n_levels)])
     table.setflags(write=False)
     return table
@@ -66,12 +75,30 @@ def _entry(j: int, k: int, n_samples: int, time_constants: tuple[float, ...]) ->
 
 
 def unit_wavelet_variances(n_levels: int, time_constants: tuple[float, ...]) -> Array:
-    """Wavelet variances `(level, component)` of the same components."""
+    """Wavelet variances of the components of `covariance_table`.
+
+    Args:
+        n_levels: Number of levels J.
+        time_constants: Time constants `-1/ln(phi)` of the AR1s, samples.
+
+    Returns:
+        `(level, component)`.
+    """
     return np.stack([unit_covariances(2**j, 2**j, np.zeros(1), time_constants)[:, 0] for j in range(n_levels)])
 
 
 def unit_covariances(h: int, k: int, lags: Array, time_constants: tuple[float, ...]) -> Array:
-    """Cross-covariances `(component, lag)` of coefficients of filter lengths `2h` and `2k`, the first `lag` later."""
+    """Cross-covariances of wavelet coefficients of two filter lengths, of the components of `covariance_table`.
+
+    Args:
+        h: Half the filter length of the first coefficient, samples.
+        k: Half the filter length of the second coefficient, samples.
+        lags: Time from the second coefficient to the first, `(lag,)`, samples.
+        time_constants: Time constants `-1/ln(phi)` of the AR1s, samples.
+
+    Returns:
+        `(component, lag)`.
+    """
     taps = np.array([1.0, -2.0, 1.0])
     # Pairs of taps as far apart as each other count once.
     shifts, copies = np.unique((-h * np.arange(3)[:, None] + k * np.arange(3)).ravel(), return_inverse=True)
@@ -92,9 +119,17 @@ def unit_covariances(h: int, k: int, lags: Array, time_constants: tuple[float, .
 
 
 def block_mean_covariances(block: int, n_blocks: int, time_constants: tuple[float, ...]) -> Array:
-    """Autocovariances `(component, lag)` of the means of successive blocks of samples, lags in blocks.
+    """Autocovariances of the means of successive blocks, of the components of `covariance_table`.
 
-    That of the random walk is a generalised one: right for everything that does not see a constant.
+    The autocovariance of the random walk is a generalised one: right for all sums whose weights add up to zero.
+
+    Args:
+        block: Length of a block, samples.
+        n_blocks: Number of lags, in blocks, from 0 on.
+        time_constants: Time constants `-1/ln(phi)` of the AR1s, samples.
+
+    Returns:
+        `(component, lag)`.
     """
     lag = np.arange(n_blocks, dtype=float)
     covariances = np.zeros((len(time_constants) + 2, n_blocks))
@@ -133,10 +168,19 @@ def _exponential(x: float, distance: Array, weights: Array, *, fine: bool) -> Ar
 
 
 def lag_quadrature(h: int, k: int, n_samples: int) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Lags, the weights at which a function of them is summed, the numbers of pairs included, and which are alone.
+    """Nodes and weights of the sum of `n_jl(lag) f(lag)` over all lags, for `f` that is smooth far from its corners.
 
-    Lags that are alone stand for themselves, the others, not all of them whole numbers, for stretches of a smooth
-    function.
+    Near the corners each lag is a node; a longer stretch between them is an integral by Gauss-Legendre, whose nodes are
+    not whole numbers, with half the values at its ends (Euler-Maclaurin).
+
+    Args:
+        h: Half the filter length of the first coefficient, samples.
+        k: Half the filter length of the second coefficient, samples.
+        n_samples: Length T of the record.
+
+    Returns:
+        Lags `(node,)`, samples; their weights, times the number of pairs of coefficients that far apart; and whether a
+        node stands for a single lag.
     """
     nodes, node_weights = np.polynomial.legendre.leggauss(8)
     first, last = 2 * h - n_samples, n_samples - 2 * k

@@ -90,6 +90,13 @@ def test_renamed_attributes_and_arguments():
     assert torch.equal(test[1].p_value, test.p_value[1])
     assert torch.equal(test[1].dof[0], test.dof[0][1])
     reference = gf.fit_parity_reference(signal[0], 100)
+    for old, new in (("spread", "power_variance"), ("own_spread", "own_power_variance")):
+        with pytest.warns(DeprecationWarning, match=f"ParityReference.{old} is deprecated .* use {new}"):
+            assert torch.equal(getattr(reference, old), getattr(reference, new))
+        assert reference.to_dict()[old] == getattr(reference, new).tolist()
+    with pytest.warns(DeprecationWarning, match="argument `extra_spread` is deprecated .* use `extra_sd`"):
+        allowed = gf.fit_parity_reference(signal[0], 100, extra_spread=0.3)
+    assert torch.allclose(allowed.power_variance, reference.power_variance + 0.09)
     with pytest.warns(DeprecationWarning, match="gyrofuse.fit_parity is deprecated"):
         old_reference = gf.fit_parity(signal[0], 100)
     assert old_reference.to_dict() == reference.to_dict()

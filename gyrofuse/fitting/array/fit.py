@@ -21,6 +21,9 @@ _POLISHING = 100
 class _Problem(NamedTuple):
     """Moments and the model that is fitted to them.
 
+    Methods take `root`, the square roots `S` of the matrices `Theta`, `(item, process, sensor, sensor)`, and `shape`,
+    the `x` of the processes with a nonlinear parameter, `(item, shaped)`.
+
     Attributes:
         moments: Moments `(item, level, pair)` of unit size, 0 where there are none.
         present: Whether a moment was measured, `(item, level, pair)`.
@@ -38,6 +41,7 @@ class _Problem(NamedTuple):
         return self.records.tau.to(self.moments)
 
     def some(self, items: Tensor) -> _Problem:
+        """The problem of some items, given by their indices."""
         return self._replace(moments=self.moments[items], present=self.present[items])
 
     def fitted(self, root: Tensor, shape: Tensor) -> Tensor:
@@ -45,9 +49,11 @@ class _Problem(NamedTuple):
         return self.structure.columns(self.tau, shape) @ vech(root @ root)
 
     def covariance(self, root: Tensor, shape: Tensor) -> Tensor:
+        """Covariance of the moments under the model, see `array_moment_covariance`."""
         return array_moment_covariance(self.structure, root @ root, shape, self.records)
 
     def step(self, weight: Tensor, root: Tensor, shape: Tensor, exact: bool) -> tuple[Tensor, Tensor]:
+        """`S` and `x` after a step down the objective with fixed weights, see `step_downhill`."""
         return array_search.step_downhill(self.moments, weight, self.tau, self.structure, root, shape, exact)
 
     def objective(self, root: Tensor, shape: Tensor) -> Tensor:

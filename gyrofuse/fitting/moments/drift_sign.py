@@ -12,7 +12,11 @@ from gyrofuse.noise.processes import Model
 
 
 def rising(series: Tensor) -> Tensor:
-    """Sign of the slope of a regression on time, `(item,)`, of series `(item, time)`, NaN = missing sample."""
+    """Sign of the slope of a regression on time, `(item,)`.
+
+    Args:
+        series: Records, `(item, time)`; NaN = missing sample.
+    """
     time = torch.arange(series.shape[-1], dtype=torch.float64, device=series.device)
     there = series.isfinite()
     rest = torch.where(there, series.to(torch.float64) - series.nanmean(-1, keepdim=True).to(torch.float64), 0.0)
@@ -21,12 +25,22 @@ def rising(series: Tensor) -> Tensor:
 
 
 def drifts_of(model: Model) -> Tensor:
-    """Whether a parameter is the slope of a drift, `(parameter,)`."""
+    """Whether each parameter is the slope of a drift, `(parameter,)`, bool.
+
+    Args:
+        model: Model whose parameters are asked about.
+    """
     return torch.tensor([p.deterministic for p in model.processes for _ in p.parameters])
 
 
 def with_drift_sign(estimates: Estimates, model: Model, sign: Tensor) -> Estimates:
-    """Estimates whose drifts have slopes of these signs, `(item,)`."""
+    """Estimates with the signs of their drifts.
+
+    Args:
+        estimates: Estimates with slopes that are not negative.
+        model: Model of the estimates.
+        sign: Sign of the slopes, `(item,)`: 1 or -1.
+    """
     column = drifts_of(model).to(sign.device)
     if not bool(column.any()):
         return estimates

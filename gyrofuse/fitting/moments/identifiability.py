@@ -48,7 +48,13 @@ def weakly_identified(
 
 
 def ar1s_differ(structure: ModelStructure, estimates: Estimates, confidence_level: float) -> Tensor:
-    """Whether all AR1s differ significantly from each other, `(item,)`."""
+    """Whether all AR1s differ significantly from each other, `(item,)`.
+
+    Args:
+        structure: Structure of the model.
+        estimates: Estimates with their covariance.
+        confidence_level: Probability that an interval holds the true value.
+    """
     apart = torch.ones_like(estimates.params[:, 0], dtype=torch.bool)
     for where in _exchangeable(structure, estimates, confidence_level).values():
         apart &= ~where

@@ -288,7 +288,14 @@ def estimated(
 
 
 def sandwich(jacobian: Tensor, active: Tensor, covariance: Tensor, weight: Tensor) -> Tensor:
-    """Covariance `(item, unknown, unknown)` of the unknowns, zero where not active."""
+    """Covariance of the unknowns, `(item, unknown, unknown)`, zero where not active.
+
+    Args:
+        jacobian: Derivatives of the moments with respect to the unknowns, `(item, level, unknown)`.
+        active: Unknowns that are estimated, `(item, unknown)`, bool.
+        covariance: Covariance of the moments, `(item, level, level)`.
+        weight: Weight matrix of the fit, `(item, level, level)` or `(level, level)`.
+    """
     columns = jacobian * active[:, None].to(jacobian)
     size = columns.square().sum(-2).sqrt()
     size = torch.where(size > 0, size, 1.0)

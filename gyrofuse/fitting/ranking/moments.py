@@ -107,9 +107,11 @@ class Moments:
         """Parameters with their uncertainty."""
         return infer(self._at(fit.linear, fit.shape), structure, 0.95).estimates
 
-    def against(self, structure: ModelStructure, p: Tensor, x: Tensor, spread: Tensor, edge_sd: Tensor) -> Inference:
+    def against(
+        self, structure: ModelStructure, p: Tensor, x: Tensor, covariance: Tensor, edge_sd: Tensor
+    ) -> Inference:
         """Efficient estimates from elsewhere, with their uncertainty as in `infer_efficient`, and their J test."""
-        return infer_efficient(self._at(p, x), structure, spread, edge_sd, 0.95)
+        return infer_efficient(self._at(p, x), structure, covariance, edge_sd, 0.95)
 
     def _at(self, linear: Tensor, shape: Tensor) -> Fit:
         done = torch.ones(len(linear), dtype=torch.bool, device=linear.device)

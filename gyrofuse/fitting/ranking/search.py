@@ -90,7 +90,7 @@ class _Search(ABC, Generic[FitT]):
     def _settle(self, known: set[Key]) -> None:
         """Compare the best one of each record with all next to it, until none of these is better.
 
-        The beam may hold no parent of a structure for whose processes an AR1 stands in.
+        The three structures kept may all lack a process that an AR1 replaced.
         """
         seen = {key: self._loss(fit).isfinite() for key, (_, fit) in self.fits.items()}
         while True:

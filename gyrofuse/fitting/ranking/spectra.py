@@ -128,7 +128,7 @@ class Spectra:
         noise = BandSpectrum(structure)
         return noise.variances(self.bins, fit.linear[:, noise.which], fit.shape)
 
-    def spread(self, structure: ModelStructure, fit: NoiseFit) -> tuple[Tensor, Tensor]:
+    def covariance(self, structure: ModelStructure, fit: NoiseFit) -> tuple[Tensor, Tensor]:
         """Covariance of `(ln p, x)` `(item, unknown, unknown)` and the `sd` of `p` off its edge `(item, process)`."""
         noise = BandSpectrum(structure)
         own, edge = uncertainty(self.count, self.bins, noise, fit.linear[:, noise.which], fit.shape)

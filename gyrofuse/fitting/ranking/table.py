@@ -106,7 +106,7 @@ def by_spectrum(
         structure, items, fit = search.found(key)
         spectra = lines.spectra.part(items)
         own = moments.part(items).near(structure, fit.linear, fit.shape)
-        there = moments.part(items).against(structure, fit.linear, fit.shape, *spectra.spread(structure, fit))
+        there = moments.part(items).against(structure, fit.linear, fit.shape, *spectra.covariance(structure, fit))
         estimates = there.estimates
         entries[key] = Entry(
             kinds=kinds,

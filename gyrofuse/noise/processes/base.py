@@ -37,7 +37,7 @@ class States(NamedTuple):
 
 
 class WhiteAndWalk(NamedTuple):
-    """A process as software has it that knows white noise and random walks only.
+    """Approximation of a process by white noise and a random walk.
 
     Attributes:
         white: Variance of the white noise, signal^2.
@@ -52,7 +52,7 @@ class WhiteAndWalk(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Process(Model):
-    """One equation.
+    """Base class of noise processes.
 
     A subclass is a frozen dataclass whose fields are the parameters; a field's metadata is a `domain`. One of them, its
     `scale_name`, is the size: wavelet variance and spectrum are proportional to the scale parameter `p`, which is that
@@ -168,37 +168,66 @@ class Process(Model):
 
     @staticmethod
     def to_unconstrained(value: Tensor) -> Tensor:
-        """`x` of a nonlinear parameter."""
+        """Unconstrained `x` of a nonlinear parameter.
+
+        Args:
+            value: Nonlinear parameter, `(...)`.
+        """
         raise NotImplementedError
 
     @staticmethod
     def from_unconstrained(x: Tensor) -> Tensor:
-        """Nonlinear parameter of an `x`."""
+        """Nonlinear parameter of an unconstrained `x`.
+
+        Args:
+            x: Unconstrained nonlinear parameter, `(...)`.
+        """
         raise NotImplementedError
 
     @staticmethod
     def unconstrained_slope(x: Tensor) -> Tensor:
-        """Derivative of the nonlinear parameter with respect to `x`."""
+        """Derivative of the nonlinear parameter with respect to `x`.
+
+        Args:
+            x: Unconstrained nonlinear parameter, `(...)`.
+        """
         raise NotImplementedError
 
     @classmethod
     def from_time_scale(cls, time: Tensor) -> Tensor:
-        """`x` of a time constant, in samples; of a sinusoid that of a period."""
+        """`x` of a time constant; of a sinusoid that of a period.
+
+        Args:
+            time: Time constants or periods, `(...)`, samples.
+        """
         return cls.to_unconstrained(torch.exp(-1 / time))
 
     @staticmethod
     def time_scales(longest: float) -> tuple[float, float]:
-        """Longest and shortest time scale, in samples, that wavelet variances up to a filter length show."""
+        """Longest and shortest time scale, in samples, that wavelet variances up to a filter length show.
+
+        Args:
+            longest: Longest filter length, samples.
+        """
         return longest, 1 / 3
 
     @staticmethod
     def unconstrained_limits(longest: float) -> tuple[float, float]:
-        """Least and largest `x` of a search over wavelet variances up to a filter length."""
+        """Least and largest `x` of a search over wavelet variances up to a filter length.
+
+        Args:
+            longest: Longest filter length, samples.
+        """
         raise NotImplementedError
 
     @classmethod
     def unit_wavelet_variance(cls, tau: Tensor, x: Tensor | None) -> Tensor:
-        """Haar wavelet variance `(..., level)` of `p = 1`."""
+        """Haar wavelet variance `(..., level)` of `p = 1`.
+
+        Args:
+            tau: Filter lengths, `(level,)`, samples.
+            x: Unconstrained nonlinear parameter, `(..., 1)`; None for a process without.
+        """
         return cls._wavelet_variance(tau, **cls.from_scale_and_shape(torch.ones_like(tau[:1]), x))
 
     @staticmethod
@@ -213,9 +242,13 @@ class Process(Model):
 
     @classmethod
     def unit_band_variance(cls, bands: DCTBands, x: Tensor | None) -> BandVariance:
-        """Mean variance of the DCT ordinates of `p = 1` in bands, for `x` `(item,)`: the spectrum, unless better known.
+        """Mean variance of the DCT ordinates of `p = 1` in bands: the spectrum, unless better known.
 
         Exact for processes whose ordinates have the variance of the spectrum at their frequency, as white noise.
+
+        Args:
+            bands: Bands of the ordinates.
+            x: Unconstrained nonlinear parameter, `(item,)`; None for a process without.
         """
         return BandVariance(bands.mean_of(cls._spectrum(bands.frequency, torch.ones_like(bands.frequency[..., :1]))))
 
