@@ -30,7 +30,7 @@ class _Search(ABC, Generic[FitT]):
         device: Where they are.
 
     Attributes:
-        held: Sinusoids are no part of what is fitted.
+        held: Whether frequencies of sinusoids are fixed beforehand.
         afresh: Structures with one shape start from a grid too.
         fits: Of all records; NaN where a structure was not tried.
     """
