@@ -97,7 +97,7 @@ class LiveSVO(nn.Module):
             result, scale_weights = scale_weights, scale_weights.scale_weights
         check_scale_weights(scale_weights)
         self.scale_weights, self.method, self.n_levels = scale_weights, method, n_levels
-        self._time_constant = time_constant and max(check_positive("time_constant", time_constant), 1.0)
+        self._time_constant = None if time_constant is None else check_positive("time_constant", time_constant)
         self._hold = None if hold is None else check_n_samples("hold", hold)
         self._settle = None if settle is None else check_positive_integer("settle", settle)
         self._limit = torch.inf if full_scale is None else full_scale
@@ -151,7 +151,7 @@ class LiveSVO(nn.Module):
         if self._time_constant is None:
             time = _tracking_time(result, combined)
         else:
-            time = torch.full_like(combined[..., 0, 0], self._time_constant)
+            time = torch.full_like(combined[..., 0, 0], max(self._time_constant, 1.0))
         limit = check_full_scale(self._limit, combined.shape[:-1]).to(combined)
         with torch.inference_mode(False):  # so that they can be used in training later
             self.combined, self.time_constant, self.full_scale = (v.detach().clone() for v in (combined, time, limit))

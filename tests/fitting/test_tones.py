@@ -325,7 +325,7 @@ def test_a_batch_is_its_items(monkeypatch):
         together = find_tones(signal, 2, spectrum)
         assert together.beta.shape == (2, 3, 2)
         with monkeypatch.context() as patch:
-            patch.setattr(tones, "_CHUNK", 4 * signal.shape[-1])  # in two parts
+            patch.setattr(tones, "CACHE", 4 * signal.shape[-1])  # in two parts
             assert_same(find_tones(signal, 2, spectrum), together, rtol=1e-8, atol=1e-300)
         own = None if spectrum is None else (lambda f: models.spectrum(f)[1, 2])
         alone = find_tones(signal[1, 2], 2, own)
