@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor
 
-from gyrofuse._base.checks import check_signal
 from gyrofuse._base.deprecation import RenamedAttribute
 from gyrofuse._base.results import Result, scattered, sensor_label
 from gyrofuse.fitting.gmwm import fit_gmwm
@@ -27,6 +26,7 @@ from gyrofuse.fitting.moments.white_kurtosis import white_excess_kurtosis, with_
 from gyrofuse.fitting.spectral.model_tones import model_tones
 from gyrofuse.fitting.structure import ModelStructure
 from gyrofuse.io.recording import Recording
+from gyrofuse.io.signals import as_recording
 from gyrofuse.noise.processes import Model
 from gyrofuse.wavelets.intervals import chi_square_tail
 
@@ -221,10 +221,7 @@ def _checked(recordings: Sequence[Tensor | Recording]) -> list[Tensor]:
     if isinstance(recordings, (Tensor, Recording)) or len(recordings) < 2:
         got = "one" if isinstance(recordings, (Tensor, Recording)) else str(len(recordings))
         raise ValueError(f"`recordings`: expected a list of at least two, got {got}; a single one is for fit_gmwm")
-    signals = [
-        check_signal(f"recordings[{i}]", one.signal if isinstance(one, Recording) else one)
-        for i, one in enumerate(recordings)
-    ]
+    signals = [as_recording(one, f"recordings[{i}]").values for i, one in enumerate(recordings)]
     for i, signal in enumerate(signals[1:], 1):
         if signal.shape[:-1] != signals[0].shape[:-1]:
             raise ValueError(

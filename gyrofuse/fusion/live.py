@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from gyrofuse._base.checks import check_n_samples, check_positive, check_positive_integer, check_signal
 from gyrofuse._base.deprecation import warn_deprecated
 from gyrofuse._base.linalg import check_positive_definite
+from gyrofuse.fusion.layer import FittedModule
 from gyrofuse.fusion.result import SVOResult
 from gyrofuse.fusion.svo import fit_svo
 from gyrofuse.fusion.weights.subsets import solve_subsets
@@ -34,7 +35,26 @@ from gyrofuse.wavelets.moments import combined_covariance
 _RAMP_STEPS = 8
 
 
-class LiveSVO(nn.Module):
+class _State(NamedTuple):
+    """State of a stream.
+
+    Attributes:
+        offsets: `(item, sensor)`.
+        gap: Samples since each sensor was last live, `(item, sensor)`.
+        age: Live samples since its last absence of more than `hold` samples, `(item, sensor)`.
+        n_tracked: Samples so far with a live sensor, `(item, 1)`.
+    """
+
+    offsets: Tensor
+    gap: Tensor
+    age: Tensor
+    n_tracked: Tensor
+
+
+_STATE = _State._fields
+
+
+class LiveSVO(FittedModule):
     """A virtual gyro of a stream in which sensors leave and return, without a step in its output.
 
     A missing (non-finite) sample takes its sensor out while it lasts; the others are fused with their own optimal
@@ -72,6 +92,7 @@ class LiveSVO(nn.Module):
         ...     virtual = live(chunk)  # (..., time)
     """
 
+    _fitted = ("combined", "time_constant", "full_scale", *_STATE)
     combined: Tensor
     time_constant: Tensor
     full_scale: Tensor
@@ -101,7 +122,7 @@ class LiveSVO(nn.Module):
         self._hold = None if hold is None else check_n_samples("hold", hold)
         self._settle = None if settle is None else check_positive_integer("settle", settle)
         self._limit = torch.inf if full_scale is None else full_scale
-        for name in ("combined", "time_constant", "full_scale", *_STATE):
+        for name in self._fitted:
             self.register_buffer(name, torch.empty(0, dtype=torch.float64))
         if result is not None:
             warn_deprecated("LiveSVO(result)", "LiveSVO.from_result(result)")
@@ -187,8 +208,7 @@ class LiveSVO(nn.Module):
             TypeError: `signal` is not a floating point tensor.
             ValueError: Another number of sensors, or another batch shape than before.
         """
-        if self.combined.numel() == 0:
-            raise RuntimeError("LiveSVO has no weights yet: call fit(signal), or load a state_dict")
+        self.check_fitted()
         check_signal("signal", signal)
         batch = self._start(signal)
         n_items, n_sensors, n_samples = batch.numel(), *signal.shape[-2:]
@@ -314,33 +334,6 @@ class LiveSVO(nn.Module):
         some = sets[0].any(-1, keepdim=True)
         weights = solve_subsets(combined.unsqueeze(-3), torch.stack(sets, -2)).mean(-2)
         return torch.where(some, weights, 0.0)
-
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
-        # The shape of the stream is known only from what is loaded.
-        for name in ("combined", "time_constant", "full_scale", *_STATE):
-            loaded = state_dict.get(prefix + name)
-            if loaded is not None:
-                setattr(self, name, torch.empty_like(loaded, device=self.combined.device))
-        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
-
-
-class _State(NamedTuple):
-    """State of a stream.
-
-    Attributes:
-        offsets: `(item, sensor)`.
-        gap: Samples since each sensor was last live, `(item, sensor)`.
-        age: Live samples since its last absence of more than `hold` samples, `(item, sensor)`.
-        n_tracked: Samples so far with a live sensor, `(item, 1)`.
-    """
-
-    offsets: Tensor
-    gap: Tensor
-    age: Tensor
-    n_tracked: Tensor
-
-
-_STATE = _State._fields
 
 
 def _averages(values: Tensor, rate: Tensor, starts: Tensor, segment: Tensor) -> tuple[Tensor, Tensor]:
