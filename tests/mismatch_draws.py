@@ -6,13 +6,13 @@ import torch
 from torch import Tensor
 
 from gyrofuse import AR1, RandomWalk, WhiteNoise
-from gyrofuse.mismatch.case import Case, Scene
-from gyrofuse.mismatch.confirm import held_out_gain
-from gyrofuse.mismatch.mechanism import Finding, Mechanism
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
+from gyrofuse.mismatch.selection.held_out import held_out_gain
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 
 LEVEL = 5e-4
 N, RATE = 16384, 100.0
-SCENE = Scene(RATE, "deg/s", ("x", "y", "z"))
+SCENE = RecordingInfo(RATE, "deg/s", ("x", "y", "z"))
 NOISE = WhiteNoise(1.0) + AR1(0.98, 0.004) + RandomWalk(1e-5)
 
 
@@ -24,8 +24,8 @@ def normal(*shape: int, g: torch.Generator) -> Tensor:
     return torch.randn(shape, generator=g, dtype=torch.float64)
 
 
-def nominated(case: Case, mechanism: type[Mechanism]) -> Finding:
-    found = mechanism.nominate(case, LEVEL)
+def nominated(comparison: Comparison, mechanism: type[Mechanism]) -> Finding:
+    found = mechanism.detect_and_fit(comparison, LEVEL)
     assert found is not None
     return found
 
@@ -36,13 +36,13 @@ def drawn(seed: int, records: int = 4) -> tuple[Tensor, Tensor, torch.Generator]
     return recording, NOISE.simulate(N, batch=(records, 3), generator=g), g
 
 
-def settled(case: Case, found: Finding, g: torch.Generator) -> Case:
+def settled(comparison: Comparison, found: Finding, g: torch.Generator) -> Comparison:
     """The case after the repair, in which the same is not found again; the repair gains on data held out."""
-    gain = held_out_gain(case, found.effect)
+    gain = held_out_gain(comparison, found.effect)
     assert gain.blocks.shape == (32,)
     assert gain.total > 1.7 * gain.sd
-    after = found.effect.explained(case, g)
-    assert type(found.effect).nominate(after, LEVEL) is None
+    after = found.effect.repair(comparison, g)
+    assert type(found.effect).detect_and_fit(after, LEVEL) is None
     return after
 
 

@@ -9,20 +9,20 @@ import torch
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.mismatch.case import Case, Scene
-from gyrofuse.mismatch.colour import filtered, noise
-from gyrofuse.mismatch.filter_forms import filter_response, filter_strength
-from gyrofuse.mismatch.mechanism import Finding
-from gyrofuse.mismatch.mechanisms.common_mode import CommonMode
-from gyrofuse.mismatch.mechanisms.drifting_tone import DriftingTone
-from gyrofuse.mismatch.mechanisms.flicker import FlickerNoise
-from gyrofuse.mismatch.mechanisms.low_pass import LowPassFilter
-from gyrofuse.mismatch.mechanisms.parameter_shift import ParameterShift
-from gyrofuse.mismatch.mechanisms.resonance import Resonance
-from gyrofuse.mismatch.oscillating import Mode
-from gyrofuse.mismatch.shape_terms import (
+from gyrofuse.mismatch.likelihoods.components import (
     oscillation,
 )
+from gyrofuse.mismatch.likelihoods.filter_forms import filter_response, filter_strength
+from gyrofuse.mismatch.mechanisms.mechanism import Finding
+from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
+from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
+from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
+from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode
+from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
+from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
+from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.filters import filtered, noise
 from gyrofuse.noise.array_model import ArrayModel
 
 N, P, RATE = 16384, 6, 100.0
@@ -38,8 +38,10 @@ def generator(seed: int) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def case(recording: Tensor, simulation: Tensor) -> Case:
-    return Case.of(Scene(RATE, "deg/s", tuple(map(str, range(recording.shape[-2])))), recording, simulation)
+def comparison(recording: Tensor, simulation: Tensor) -> Comparison:
+    return Comparison.of(
+        RecordingInfo(RATE, "deg/s", tuple(map(str, range(recording.shape[-2])))), recording, simulation
+    )
 
 
 def array(white: float = WHITE, phi: float = 0.99) -> ArrayModel:
@@ -51,14 +53,14 @@ def tensor(*values: float) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
-def drawn(seed: int, change: Callable[[Tensor, torch.Generator], Tensor] | None = None, n: int = N) -> Case:
+def drawn(seed: int, change: Callable[[Tensor, torch.Generator], Tensor] | None = None, n: int = N) -> Comparison:
     g = generator(seed)
     recording, simulation = array().simulate(n, generator=g), array().simulate(n, batch=(4,), generator=g)
-    return case(recording if change is None else change(recording, g), simulation)
+    return comparison(recording if change is None else change(recording, g), simulation)
 
 
-def nominated(given: Case, level: float = 1e-3) -> Finding | None:
-    found = [f for f in (m.nominate(given, level) for m in CATALOGUE) if f is not None]
+def nominated(given: Comparison, level: float = 1e-3) -> Finding | None:
+    found = [f for f in (m.detect_and_fit(given, level) for m in CATALOGUE) if f is not None]
     return max(found, key=lambda f: f.gain, default=None)
 
 

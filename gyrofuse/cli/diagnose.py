@@ -19,7 +19,7 @@ from gyrofuse.noise.processes import Model
 
 if TYPE_CHECKING:
     from gyrofuse.mismatch import MismatchReport
-    from gyrofuse.mismatch.repaired import RepairedModel
+    from gyrofuse.mismatch.repair.repaired_model import RepairedModel
 
 
 @takes_options
@@ -112,7 +112,7 @@ def _diagnosed(
 ) -> tuple[MismatchReport, list[str]]:
     """Report on the longest stretch without gaps, and remarks on it; errors name the file and the option at fault."""
     from gyrofuse.mismatch import diagnose as find_mismatch
-    from gyrofuse.mismatch.inputs import FEWEST
+    from gyrofuse.mismatch.repair.inputs import FEWEST
 
     with progress_bar("comparing") as show:
         if isinstance(simulation, Recording):

@@ -17,7 +17,7 @@ from gyrofuse.noise.parsing import model_from_dict
 from gyrofuse.noise.processes import Model
 
 if TYPE_CHECKING:
-    from gyrofuse.mismatch.repaired import RepairedModel
+    from gyrofuse.mismatch.repair.repaired_model import RepairedModel
 
 _NO_MODEL = "expected a model in JSON, as to_dict() of a model gives it"
 
@@ -98,7 +98,7 @@ def read_model(path: Path) -> Model | ArrayModel | RepairedModel:
             content = content["model"]
         if "effects" not in content:
             return model_from_dict(content)
-        from gyrofuse.mismatch.saved import repaired_from_dict
+        from gyrofuse.mismatch.repair.serialise import repaired_from_dict
 
         return repaired_from_dict(content)
     except (ValueError, TypeError, AttributeError, RuntimeError, OverflowError, LookupError) as error:

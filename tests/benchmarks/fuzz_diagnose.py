@@ -29,7 +29,7 @@ import torch
 from numpy.typing import NDArray
 
 import gyrofuse as gf
-from gyrofuse.mismatch.saved import repaired_from_dict
+from gyrofuse.mismatch.repair.serialise import repaired_from_dict
 
 Array = NDArray[np.float64]
 

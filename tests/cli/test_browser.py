@@ -23,7 +23,7 @@ from gyrofuse.fleet.report import fleet_report
 from gyrofuse.fleet.run import Log, rows_of
 from gyrofuse.fleet.summary import summarise
 from gyrofuse.fusion.report.page import fusion_report, recording_report
-from gyrofuse.mismatch.page import mismatch_page
+from gyrofuse.mismatch.reporting.page import mismatch_page
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 HOSTILE = ('"><script>alert(1)</script>', "<b>imu</b>", "<img src=x onerror=alert(2)>", "{{ 7 * 7 }}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from conftest import Run
 from pages import Page
 
 import gyrofuse as gf
-from gyrofuse.mismatch import MismatchReport, engine
+from gyrofuse.mismatch import MismatchReport
 
 N, RATE = 2**13, 50.0
 NOISE = gf.WhiteNoise(1.0) + gf.AR1(0.99, 1e-3)
@@ -61,7 +62,7 @@ def test_a_model_and_options(run: Run, log: Path, monkeypatch: pytest.MonkeyPatc
         return torch.rand(n_twins, dtype=torch.float64, generator=generator)
 
     # Half a minute of diagnoses of twins; tests/mismatch/test_engine.py judges what they tell.
-    monkeypatch.setattr(engine, "twin_p_values", uniform)
+    monkeypatch.setattr(sys.modules["gyrofuse.mismatch.diagnose"], "twin_p_values", uniform)
     done = run("diagnose", log, "--simulation", "model.json", "--sensors", "b", "--rest", "0:100", "--twins", 50)
     assert done.status == 0
     assert twins == [50]

@@ -8,21 +8,21 @@ from dataclasses import replace
 import pytest
 import torch
 from scipy import stats
-from shape_draws import CHANGES, RATE, SIGNS, N, P, array, case, drawn, generator, nominated, oscillating, tensor
+from shape_draws import CHANGES, RATE, SIGNS, N, P, array, comparison, drawn, generator, nominated, oscillating, tensor
 
-from gyrofuse.mismatch.bump_fit import Background, Oscillation, oscillation_of
-from gyrofuse.mismatch.bump_scan import log_ratios
-from gyrofuse.mismatch.bumps import Stretch, strongest_bump
-from gyrofuse.mismatch.colour import noise
-from gyrofuse.mismatch.hump_scan import _scores, _shape, scanned_humps
+from gyrofuse.mismatch.detectors.spectra.modulated_ordinates import inflation, level_correlations
+from gyrofuse.mismatch.detectors.spectra.own_peak_scan import _scores, _shape, scanned_own_peaks
+from gyrofuse.mismatch.detectors.spectra.peak_fit import Background, Oscillation, oscillation_of
+from gyrofuse.mismatch.detectors.spectra.peaks import Stretch, strongest_peak
+from gyrofuse.mismatch.detectors.spectra.shared_peak_scan import log_ratios
+from gyrofuse.mismatch.likelihoods.components import CommonBump, oscillation
 from gyrofuse.mismatch.likelihoods.spectral import fit, linearised
-from gyrofuse.mismatch.lines import whitened
-from gyrofuse.mismatch.mechanisms.resonance import Resonance
-from gyrofuse.mismatch.modulated_ordinates import inflation, level_correlations
-from gyrofuse.mismatch.oscillating import Mode, _momentary, _seen, excess_along, wandering_sd
-from gyrofuse.mismatch.shape_terms import CommonBump, oscillation
-from gyrofuse.mismatch.shapes import compared
-from gyrofuse.mismatch.steadiness import steadiness
+from gyrofuse.mismatch.mechanisms.spectra.joint_fit import compared
+from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode, _momentary, _seen, excess_along, wandering_sd
+from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
+from gyrofuse.mismatch.mechanisms.spectra.steadiness import steadiness
+from gyrofuse.mismatch.signals.filters import noise
+from gyrofuse.mismatch.signals.lines import whitened
 
 
 @pytest.mark.parametrize("p", [1, 3, 6])
@@ -66,7 +66,7 @@ def test_a_hump_is_where_it_was_put():
     k = torch.arange(2**14)
     power[:3] *= 1 + 1.2 / (1 + ((k - 5000) / 60).square())
     steady = torch.zeros(P, 1, dtype=torch.float64)
-    best = max(scanned_humps(power, 1.0, steady, 1.0), key=lambda scan: float(scan.log_ratio.amax()))
+    best = max(scanned_own_peaks(power, 1.0, steady, 1.0), key=lambda scan: float(scan.log_ratio.amax()))
     at = int(best.log_ratio.argmax())
     assert abs(int(best.first[at]) + best.width / 2 - 5000) < 60
     assert 60 <= best.width <= 300
@@ -104,10 +104,10 @@ def test_backgrounds_that_nothing_holds_stay_numbers_that_can_be_worked_out():
 def test_a_line_is_no_bump_and_a_bump_of_both_sides_neither():
     t = torch.arange(N, dtype=torch.float64)
     line = drawn(9, lambda x, g: x + 0.002 * torch.cos(2 * math.pi * 0.1234 * t))
-    assert strongest_bump(line).p_value > 1e-3
+    assert strongest_peak(line).p_value > 1e-3
     g = generator(10)
     both = [array().simulate(N, generator=g) + 0.005 * oscillating(g, 0.1, 0.002, P) for _ in range(3)]
-    assert strongest_bump(case(both[0], torch.stack(both[1:]))).p_value > 1e-3
+    assert strongest_peak(comparison(both[0], torch.stack(both[1:]))).p_value > 1e-3
 
 
 @pytest.mark.statistical
@@ -118,13 +118,13 @@ def test_modes_of_single_sensors_that_bands_are_too_wide_for():
     named, inside = 0, []
     for seed in range(6):
         given = drawn(700 + seed, lambda x, g: x + 3.6e-3 * has[:, None] * noise(N, mode.profile, P, g))
-        found = Resonance.nominate(given, 1e-3)
+        found = Resonance.detect_and_fit(given, 1e-3)
         if found is None:
             continue
         named += 1
         f, q = found.parameters["frequency"], found.parameters["quality_factor"]
         inside += [f.low <= 0.2 * RATE <= f.high, q.low <= 15 <= q.high]
-        again = found.effect.refitted(given, 0)
+        again = found.effect.fit_without(given, 0)
         assert isinstance(again, Resonance)
         assert isinstance(found.effect, Resonance)
         assert ((again.mode.gain != 0) <= (found.effect.mode.gain != 0)).all()
@@ -150,7 +150,7 @@ def test_a_mode_of_some_sensors_is_seen_that_a_taper_would_hide():
     has = tensor(1, 0, 0, 1, 0, 1)
     for seed in range(n_runs):
         given = drawn(720 + seed, lambda x, g: x + 1.9e-3 * has[:, None] * noise(N, mode.profile, P, g))
-        seen += strongest_bump(given).p_value < 1e-3
+        seen += strongest_peak(given).p_value < 1e-3
     assert seen >= stats.binom.ppf(1e-3, n_runs, 0.9)
 
 
@@ -182,15 +182,15 @@ def test_gains_of_a_mode_are_told_whatever_the_level_of_the_noise():
 def test_a_source_that_all_share_is_a_tone_or_is_not(name: str, tone: bool):
     n_runs, told = 8, 0
     for seed in range(n_runs):
-        bump = oscillation_of(given := drawn(740 + seed, CHANGES[name][1]))
-        told += bump is not None and steadiness(given, bump).tone == tone
+        peak = oscillation_of(given := drawn(740 + seed, CHANGES[name][1]))
+        told += peak is not None and steadiness(given, peak).tone == tone
     assert told >= stats.binom.ppf(1e-3, n_runs, 0.95)
 
 
 def test_whitened_walks_do_not_jump_where_they_end():
     g = generator(42)
     walk = torch.randn(P, N, generator=g, dtype=torch.float64).cumsum(-1)
-    white = whitened(walk, case(walk, torch.randn(4, P, N, generator=g, dtype=torch.float64).cumsum(-1)).base)
+    white = whitened(walk, comparison(walk, torch.randn(4, P, N, generator=g, dtype=torch.float64).cumsum(-1)).base)
     assert float(white[:, [0, -1]].abs().max()) < 5 * float(white.std())
 
 
@@ -199,13 +199,13 @@ def test_what_rings_after_a_blow_is_no_mode_and_no_tone():
     after = torch.arange(N, dtype=torch.float64) - 5000
     ring = (-after.clamp(min=0) / 40).exp() * torch.cos(2 * math.pi * 0.21 * after) * (after > 0)
     given = drawn(3, lambda x, _: x + 0.3 * SIGNS[:, None] * ring)
-    assert strongest_bump(given).p_value < 1e-6
+    assert strongest_peak(given).p_value < 1e-6
     assert nominated(given) is None
 
 
 def test_a_bump_at_the_end_of_the_spectrum_has_no_band_around_it():
     given, one = drawn(3), tensor(*(P * [1.0]))
     stretch = Stretch(1 / N, 1 / N, 1e-9, (0,))
-    bump = Oscillation(stretch, 1 / N, 1 / N, (0.1, 0.1), one, 0.1 * one, None, 10.0)
-    assert not _momentary(given, bump)
-    assert wandering_sd(given, bump) == 0.0
+    peak = Oscillation(stretch, 1 / N, 1 / N, (0.1, 0.1), one, 0.1 * one, None, 10.0)
+    assert not _momentary(given, peak)
+    assert wandering_sd(given, peak) == 0.0

@@ -10,13 +10,13 @@ import torch
 from scipy import signal, stats
 
 import gyrofuse as gf
-from gyrofuse.mismatch.case import Case, Scene
-from gyrofuse.mismatch.channels import channel_witness, regress, squared
-from gyrofuse.mismatch.confirm import held_out_gain
-from gyrofuse.mismatch.mechanisms._channel_gain import ChannelGain
-from gyrofuse.mismatch.mechanisms.g_sensitivity import GSensitivity
-from gyrofuse.mismatch.mechanisms.quadratic_coupling import QuadraticCoupling
-from gyrofuse.mismatch.mechanisms.scale_factor import ScaleFactor
+from gyrofuse.mismatch.detectors.slow.channels import channel_test, regress, squared
+from gyrofuse.mismatch.mechanisms.signals.channel_gain import ChannelGain
+from gyrofuse.mismatch.mechanisms.signals.g_sensitivity import GSensitivity
+from gyrofuse.mismatch.mechanisms.signals.quadratic_coupling import QuadraticCoupling
+from gyrofuse.mismatch.mechanisms.signals.scale_factor import ScaleFactor
+from gyrofuse.mismatch.selection.held_out import held_out_gain
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 
 N = 2**13
 NOISE = gf.WhiteNoise(1e-4) + gf.AR1(0.99, 1e-7)  # deg/s: of a sensor that may be
@@ -33,9 +33,9 @@ def acceleration(g: torch.Generator, n_rows: int = 3) -> torch.Tensor:
     return shaking
 
 
-def case(g: torch.Generator, added: torch.Tensor | float = 0.0, **channels: torch.Tensor) -> Case:
+def comparison(g: torch.Generator, added: torch.Tensor | float = 0.0, **channels: torch.Tensor) -> Comparison:
     x = NOISE.simulate(N, batch=(5, 4), generator=g)
-    return Case.of(Scene(100.0, "deg/s", ("1", "2", "3", "4"), channels), x[0] + added, x[1:])
+    return Comparison.of(RecordingInfo(100.0, "deg/s", ("1", "2", "3", "4"), channels), x[0] + added, x[1:])
 
 
 def of_size(rows: torch.Tensor, gains: torch.Tensor, nats: float) -> torch.Tensor:
@@ -50,7 +50,7 @@ def test_in_white_noise_it_is_least_squares():
     g = generator(1)
     x = torch.randn(2, 3, N, generator=g, dtype=torch.float64)
     rows = torch.randn(2, N, generator=g, dtype=torch.float64)
-    fit = regress(Case.of(Scene(1.0, "x", ("1", "2", "3")), x[0], x[1:]), rows)
+    fit = regress(Comparison.of(RecordingInfo(1.0, "x", ("1", "2", "3")), x[0], x[1:]), rows)
     rows = rows - rows.mean(-1, keepdim=True)
     least_squares = torch.linalg.lstsq(rows.mT, (x[0] - x[0].mean(-1, keepdim=True)).mT).solution.mT
     # The lowest bands are left out, and weights are estimated.
@@ -68,7 +68,7 @@ def test_chance_is_not_a_gain(common):
         shared = NOISE.simulate(N, batch=(2, 1), generator=g)
         x = math.sqrt(1 - common) * NOISE.simulate(N, batch=(2, 4), generator=g) + math.sqrt(common) * shared
         rows = acceleration(g)
-        fit = regress(Case.of(Scene(1.0, "x", ("1", "2", "3", "4")), x[0], x[1:]), rows)
+        fit = regress(Comparison.of(RecordingInfo(1.0, "x", ("1", "2", "3", "4")), x[0], x[1:]), rows)
         values.append(fit.p_value)
         statistics.append(fit.statistic)
     hits = sum(p < 0.05 for p in values)
@@ -85,7 +85,7 @@ def test_a_gain_of_thirty_nats_is_found_with_limits_that_hold():
         gains = torch.randn(4, 3, generator=g, dtype=torch.float64)
         gains[2:] = 0
         gains = of_size(shaking, gains, 30.0)
-        finding = GSensitivity.nominate(case(g, gains @ shaking, acceleration=shaking), LEVEL)
+        finding = GSensitivity.detect_and_fit(comparison(g, gains @ shaking, acceleration=shaking), LEVEL)
         if finding is None:
             continue
         found += 1
@@ -106,12 +106,12 @@ def test_a_square_is_told_from_a_gain():
     rows = squared(shaking)["each"]
     gains = torch.zeros(4, 6, dtype=torch.float64)
     gains[1, 0] = 1.0
-    both = case(g, of_size(rows, gains, 60.0) @ rows, acceleration=shaking)
-    finding = QuadraticCoupling.nominate(both, LEVEL)
+    both = comparison(g, of_size(rows, gains, 60.0) @ rows, acceleration=shaking)
+    finding = QuadraticCoupling.detect_and_fit(both, LEVEL)
     assert finding.sensors == (1,)
     assert finding.parameters["gain[1]"].unit == "deg/s/g^2"
-    assert GSensitivity.nominate(both, LEVEL) is None
-    assert channel_witness(both).p_value < LEVEL
+    assert GSensitivity.detect_and_fit(both, LEVEL) is None
+    assert channel_test(both).p_value < LEVEL
 
 
 @pytest.mark.statistical
@@ -121,9 +121,9 @@ def test_a_number_times_the_square_is_found_where_a_matrix_is_not():
         shaking = acceleration(g)
         square = squared(shaking)["length"]
         gains = of_size(square, torch.tensor([[1.0], [-1.0], [1.0], [0.0]], dtype=torch.float64), 25.0)
-        both = case(g, gains @ square, acceleration=shaking)
+        both = comparison(g, gains @ square, acceleration=shaking)
         assert regress(both, square).p_value < 100 * regress(both, squared(shaking)["each"]).p_value
-        finding = QuadraticCoupling.nominate(both, LEVEL)
+        finding = QuadraticCoupling.detect_and_fit(both, LEVEL)
         if finding is not None:
             found += 1
             assert finding.effect.kind == "length"
@@ -142,7 +142,7 @@ def test_the_square_of_one_axis_is_told_with_its_sign():
         shaking = acceleration(g)
         square = squared(shaking)["axis 2"]
         gains = of_size(square, torch.tensor([[1.0], [-1.0], [0.0], [-1.0]], dtype=torch.float64), nats)
-        finding = QuadraticCoupling.nominate(case(g, gains @ square, acceleration=shaking), LEVEL)
+        finding = QuadraticCoupling.detect_and_fit(comparison(g, gains @ square, acceleration=shaking), LEVEL)
         assert finding.effect.kind == "axis 2"
         assert "axis 2 of acceleration" in finding.sentence
         assert finding.sensors == (0, 1, 3)
@@ -160,11 +160,11 @@ def test_a_slow_rate_is_judged_with_as_much_doubt_as_the_simulation_leaves():
     gains = of_size(rate, torch.tensor([[1.0], [0.0], [-1.0], [0.0]], dtype=torch.float64), 60.0)
     for run in range(n_runs):
         x = NOISE.simulate(N, batch=(2, 4), generator=g)
-        scene = Scene(100.0, "deg/s", ("1", "2", "3", "4"), {"rate": rate})
-        fit = regress(Case.of(scene, x[0], x[1:]), rate)
+        info = RecordingInfo(100.0, "deg/s", ("1", "2", "3", "4"), {"rate": rate})
+        fit = regress(Comparison.of(info, x[0], x[1:]), rate)
         hits += fit.p_value < 0.05
         if run < 10:
-            found += regress(Case.of(scene, x[0] + gains @ rate, x[1:]), rate).p_value < LEVEL
+            found += regress(Comparison.of(info, x[0] + gains @ rate, x[1:]), rate).p_value < LEVEL
     assert stats.binom.sf(hits - 1, n_runs, 0.05) > 1e-3, f"{hits} of {n_runs}"
     assert found >= 8
 
@@ -175,9 +175,9 @@ def test_a_slow_rate_is_seen_where_the_simulation_is_too_short_to_say_anything()
     rate = torch.sin(2 * math.pi * 3.3 * torch.arange(N, dtype=torch.float64) / N)[None]
     gains = of_size(rate, torch.tensor([[1.0], [0.0], [-1.0], [0.0]], dtype=torch.float64), 3e4)
     x = NOISE.simulate(N, batch=(2, 4), generator=g)
-    scene = Scene(100.0, "deg/s", ("1", "2", "3", "4"), {"rate": rate})
-    short = Case.of(scene, x[0] + gains @ rate, x[1:, :, : N // 8])
-    finding = ScaleFactor.nominate(short, LEVEL)
+    info = RecordingInfo(100.0, "deg/s", ("1", "2", "3", "4"), {"rate": rate})
+    short = Comparison.of(info, x[0] + gains @ rate, x[1:, :, : N // 8])
+    finding = ScaleFactor.detect_and_fit(short, LEVEL)
     assert finding.sensors == (0, 2)
     entry = finding.parameters["error[0]"]
     assert entry.low < 1e6 * float(gains[0, 0]) < entry.high
@@ -192,7 +192,9 @@ def test_slow_noise_that_is_louder_than_the_simulation_says_is_no_gain():
         x = NOISE.simulate(N, batch=(2, 4), generator=g)
         x[0] += gf.RandomWalk(1e-7).simulate(N, batch=(4,), generator=g)
         hits += (
-            regress(Case.of(Scene(100.0, "deg/s", ("1", "2", "3", "4"), {"rate": rate}), x[0], x[1:]), rate).p_value
+            regress(
+                Comparison.of(RecordingInfo(100.0, "deg/s", ("1", "2", "3", "4"), {"rate": rate}), x[0], x[1:]), rate
+            ).p_value
             < 0.05
         )
     assert stats.binom.sf(hits - 1, n_runs, 0.05) > 1e-3, f"{hits} of {n_runs}"
@@ -207,9 +209,11 @@ def test_a_motion_that_the_simulation_has_too_is_no_gain():
         x = NOISE.simulate(N, batch=(5, 4), generator=g)
         x[0] += 0.3 * torch.sin(2 * math.pi * 0.123 * t)
         x[1:] += 0.3 * torch.sin(2 * math.pi * 0.123 * t + 1.0)
-        both = Case.of(Scene(100.0, "deg/s", ("1", "2", "3", "4"), {"acceleration": shaking}), x[0], x[1:])
-        nominated += GSensitivity.nominate(both, 0.01) is not None
-        assert channel_witness(both).p_value > 1e-3
+        both = Comparison.of(
+            RecordingInfo(100.0, "deg/s", ("1", "2", "3", "4"), {"acceleration": shaking}), x[0], x[1:]
+        )
+        nominated += GSensitivity.detect_and_fit(both, 0.01) is not None
+        assert channel_test(both).p_value > 1e-3
     assert nominated <= 1  # of ten, at a level of 0.01
 
 
@@ -218,7 +222,7 @@ def test_a_scale_factor_follows_the_reference():
     rate = 30 * torch.sin(2 * math.pi * 0.002 * torch.arange(N, dtype=torch.float64))[None].cumsum(-1) / 50
     rate = rate + 5 * acceleration(g, 1)
     gains = of_size(rate, torch.tensor([[1.0], [0.0], [-1.0], [0.0]], dtype=torch.float64), 60.0)
-    finding = ScaleFactor.nominate(case(g, gains @ rate, reference_rate=rate[0]), LEVEL)
+    finding = ScaleFactor.detect_and_fit(comparison(g, gains @ rate, reference_rate=rate[0]), LEVEL)
     assert finding.sensors == (0, 2)
     assert "ppm" in finding.sentence
     entry = finding.parameters["error[2]"]
@@ -231,7 +235,7 @@ def test_a_delay_is_no_gain():
     shaking = acceleration(g)
     late = torch.fft.irfft(torch.fft.rfft(shaking - shaking.mean(-1, keepdim=True)) * 1j, n=N)
     gains = of_size(late, torch.ones(4, 3, dtype=torch.float64), 200.0)
-    assert GSensitivity.nominate(case(g, gains @ late, acceleration=shaking), LEVEL) is None
+    assert GSensitivity.detect_and_fit(comparison(g, gains @ late, acceleration=shaking), LEVEL) is None
 
 
 def through(mount: str, rows: torch.Tensor) -> torch.Tensor:
@@ -257,15 +261,15 @@ def test_what_comes_through_a_mount_is_a_gain_of_another_form(mount):
     gains = torch.randn(4, 3, generator=g, dtype=torch.float64)
     gains[1] = 0.0
     gains = of_size(felt, gains, 3e3)
-    both = case(g, gains @ felt, acceleration=shaking)
-    finding = GSensitivity.nominate(both, LEVEL)
+    both = comparison(g, gains @ felt, acceleration=shaking)
+    finding = GSensitivity.detect_and_fit(both, LEVEL)
     assert finding.mechanism == "g_sensitivity"
     assert finding.sensors == (0, 2, 3)
     assert "its form is not quite that of a gain" in finding.sentence
     assert " ms late near " in finding.sentence
     assert held_out_gain(both, finding.effect).total > 0.92 * _energy(gains @ felt)  # which scatters by 2.6 %
     if mount in ("first", "second"):
-        assert channel_witness(finding.explained(both, g)).p_value > 1e-3
+        assert channel_test(finding.repair(both, g)).p_value > 1e-3
 
 
 def _energy(added: torch.Tensor) -> float:
@@ -278,7 +282,7 @@ def test_a_plain_gain_has_no_other_form():
         g = generator(40 + seed)
         shaking = acceleration(g)
         gains = of_size(shaking, torch.randn(4, 3, generator=g, dtype=torch.float64), nats)
-        finding = GSensitivity.nominate(case(g, gains @ shaking, acceleration=shaking), LEVEL)
+        finding = GSensitivity.detect_and_fit(comparison(g, gains @ shaking, acceleration=shaking), LEVEL)
         assert "form" not in finding.sentence
         assert finding.effect.response.tolist() == [1.0]
 
@@ -300,9 +304,9 @@ def test_what_each_sensor_feels_in_its_own_way_is_no_gain():
 
     shaking = 0.05 * mixed(3)
     shaking[-1] += 1.0
-    both = case(g, 2e-4 * mixed(4), acceleration=shaking)
-    assert channel_witness(both).p_value < 1e-6
-    assert GSensitivity.nominate(both, LEVEL) is None
+    both = comparison(g, 2e-4 * mixed(4), acceleration=shaking)
+    assert channel_test(both).p_value < 1e-6
+    assert GSensitivity.detect_and_fit(both, LEVEL) is None
 
 
 def test_a_single_line_leaves_alternatives():
@@ -310,7 +314,7 @@ def test_a_single_line_leaves_alternatives():
     shaking = 1e-6 * acceleration(g)
     shaking[0] += 0.3 * torch.sin(2 * math.pi * 0.123 * torch.arange(N))
     gains = of_size(shaking, torch.tensor([[1.0, 0, 0]] * 4, dtype=torch.float64), 60.0)
-    finding = GSensitivity.nominate(case(g, gains @ shaking, acceleration=shaking), LEVEL)
+    finding = GSensitivity.detect_and_fit(comparison(g, gains @ shaking, acceleration=shaking), LEVEL)
     assert finding.mechanism == "not_identifiable"
     assert {"g_sensitivity", "vibration_tone"} <= set(finding.alternatives)
     assert (
@@ -323,21 +327,20 @@ def test_what_was_found_is_taken_off_and_confirmed_on_other_blocks():
     g = generator(8)
     shaking = acceleration(g)
     gains = of_size(shaking, torch.randn(4, 3, generator=g, dtype=torch.float64), 100.0)
-    both = case(g, gains @ shaking, acceleration=shaking)
-    effect = GSensitivity.nominate(both, LEVEL).effect
-    assert channel_witness(effect.explained(both, g)).p_value > 0.01
+    both = comparison(g, gains @ shaking, acceleration=shaking)
+    effect = GSensitivity.detect_and_fit(both, LEVEL).effect
+    assert channel_test(effect.repair(both, g)).p_value > 0.01
     assert held_out_gain(both, effect).total > 50
-    assert torch.equal(effect.removed(effect.simulated(both.recording, both.scene, g), both.scene), both.recording) or (
-        (effect.removed(effect.simulated(both.recording, both.scene, g), both.scene) - both.recording).abs().max()
-        < 1e-12
+    assert torch.equal(effect.remove(effect.apply(both.recording, both.info, g), both.info), both.recording) or (
+        (effect.remove(effect.apply(both.recording, both.info, g), both.info) - both.recording).abs().max() < 1e-12
     )
 
 
 def test_a_simulation_needs_the_channel_for_its_whole_length():
     g = generator(9)
-    both = case(g, 0.0, acceleration=acceleration(g))
+    both = comparison(g, 0.0, acceleration=acceleration(g))
     with pytest.raises(ValueError, match="expected 8193 samples of 'acceleration'"):
-        GSensitivity("acceleration", torch.ones(4, 3).double()).simulated(torch.zeros(4, N + 1).double(), both.scene, g)
+        GSensitivity("acceleration", torch.ones(4, 3).double()).apply(torch.zeros(4, N + 1).double(), both.info, g)
 
 
 @pytest.mark.statistical
@@ -354,9 +357,9 @@ def test_what_no_sensor_has_is_no_coupling(mechanism: type[ChannelGain], beyond:
     for factor, possible in ((0.5, True), (2.0, unit == "unknown")):
         gains = torch.zeros(4, len(rows), dtype=torch.float64)
         gains[:2, 0] = factor * beyond * per
-        both = case(g, gains @ rows, acceleration=shaking)
-        both = replace(both, scene=replace(both.scene, unit=unit))
-        finding = mechanism.nominate(both, LEVEL)
+        both = comparison(g, gains @ rows, acceleration=shaking)
+        both = replace(both, info=replace(both.info, unit=unit))
+        finding = mechanism.detect_and_fit(both, LEVEL)
         assert (finding.mechanism == mechanism.name) == possible
         assert ("this is no " in finding.sentence) != possible
         assert finding.sensors == (0, 1)

@@ -10,14 +10,14 @@ import torch
 from scipy import stats
 
 import gyrofuse as gf
-from gyrofuse.mismatch.case import Case, Scene
-from gyrofuse.mismatch.clocks import BLOCKS, best_slope, clock_witness, demodulated, strongest_slip
-from gyrofuse.mismatch.confirm import held_out_gain
-from gyrofuse.mismatch.mechanisms.clock_skew import ClockSkew
-from gyrofuse.mismatch.mechanisms.resonance import Resonance
-from gyrofuse.mismatch.oscillating import Mode
-from gyrofuse.mismatch.resampling import resampled
-from gyrofuse.mismatch.witnesses import line_witness
+from gyrofuse.mismatch.detectors.lines.clocks import BLOCKS, best_slope, clock_test, demodulated, strongest_slip
+from gyrofuse.mismatch.detectors.spectra.band_tests import line_test
+from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
+from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode
+from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
+from gyrofuse.mismatch.selection.held_out import held_out_gain
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.filters import resampled
 
 N = 2**14
 NOISE = gf.WhiteNoise(1.0) + gf.AR1(0.99, 1e-3)
@@ -29,7 +29,7 @@ def generator(seed: int) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def case(g: torch.Generator, ahead: torch.Tensor, amplitude: float = 0.3, *, channel: bool = False) -> Case:
+def comparison(g: torch.Generator, ahead: torch.Tensor, amplitude: float = 0.3, *, channel: bool = False) -> Comparison:
     """Four sensors with a tone, which `(sensor, time)` or fewer samples ahead of the others, and a simulation of it."""
     t = torch.arange(N, dtype=torch.float64)
     x = NOISE.simulate(N, batch=(2, 4), generator=g)
@@ -37,7 +37,7 @@ def case(g: torch.Generator, ahead: torch.Tensor, amplitude: float = 0.3, *, cha
     x[0] += amplitude * torch.cos(2 * math.pi * TONE * (t + ahead) + turn[0])
     x[1] += amplitude * torch.cos(2 * math.pi * TONE * t + turn[1])
     channels = {"acceleration": torch.cos(2 * math.pi * TONE * t)[None]} if channel else {}
-    return Case.of(Scene(100.0, "deg/s", ("1", "2", "3", "4"), channels), x[0], x[1:])
+    return Comparison.of(RecordingInfo(100.0, "deg/s", ("1", "2", "3", "4"), channels), x[0], x[1:])
 
 
 def skewed(skew: float, *sensors: int) -> torch.Tensor:
@@ -81,7 +81,7 @@ def test_the_best_slope_is_the_frequency_of_the_tone():
 @pytest.mark.parametrize("channel", [False, True])
 def test_one_clock_does_not_slip(channel):
     g, n_runs = generator(3), 40
-    values = [clock_witness(case(g, torch.zeros(4, N), channel=channel)).p_value for _ in range(n_runs)]
+    values = [clock_test(comparison(g, torch.zeros(4, N), channel=channel)).p_value for _ in range(n_runs)]
     hits = sum(p < 0.05 for p in values)
     assert stats.binom.sf(hits - 1, n_runs, 0.05) > 1e-3, f"{hits} of {n_runs}"
     assert min(values) > 1e-4
@@ -92,7 +92,7 @@ def test_one_clock_does_not_slip(channel):
 def test_a_skew_is_found_in_its_sensors_with_limits_that_hold(channel):
     g, held, n_runs, true = generator(4), 0, 15, 80e-6
     for _ in range(n_runs):
-        finding = ClockSkew.nominate(case(g, skewed(true, 2), channel=channel), LEVEL)
+        finding = ClockSkew.detect_and_fit(comparison(g, skewed(true, 2), channel=channel), LEVEL)
         assert finding.sensors == (2,)
         assert finding.channel == ("acceleration" if channel else None)
         entry = finding.parameters["skew"]
@@ -105,7 +105,7 @@ def test_lost_samples_are_counted_and_found_in_time():
     g, n_runs, right, held = generator(5), 10, 0, 0
     true = {N // 3: 1, 3 * N // 5: 2}
     for _ in range(n_runs):
-        finding = ClockSkew.nominate(case(g, lost(true, 0, 3), channel=True), LEVEL)
+        finding = ClockSkew.detect_and_fit(comparison(g, lost(true, 0, 3), channel=True), LEVEL)
         assert finding.sensors == (0, 3)
         right += finding.parameters["lost"].value == 3
         for j, at in enumerate(true):
@@ -118,13 +118,13 @@ def test_lost_samples_are_counted_and_found_in_time():
 def test_a_slow_tone_tells_as_well(monkeypatch):
     """Of hardly more than a cycle in a block."""
     monkeypatch.setattr(sys.modules[__name__], "TONE", 1.1 * BLOCKS / N)
-    finding = ClockSkew.nominate(case(generator(10), skewed(4e-4, 1), 0.5), LEVEL)
+    finding = ClockSkew.detect_and_fit(comparison(generator(10), skewed(4e-4, 1), 0.5), LEVEL)
     assert finding.sensors == (1,)
     assert finding.parameters["skew"].low < 400 < finding.parameters["skew"].high
 
 
 def test_samples_lost_by_one_sensor_need_no_channel():
-    finding = ClockSkew.nominate(case(generator(6), lost({N // 2: 1}, 1)), LEVEL)
+    finding = ClockSkew.detect_and_fit(comparison(generator(6), lost({N // 2: 1}, 1)), LEVEL)
     assert finding.sensors == (1,)
     assert abs(finding.time_s - N / 200) < 2
 
@@ -134,16 +134,16 @@ def test_samples_lost_by_one_sensor_need_no_channel():
 def test_a_loud_tone_tells_losses_to_a_few_samples(true, amplitude):
     """And nothing else is left: a tone of so many nats, an interval wrong, would be a tone of its own."""
     g = generator(len(true))
-    both = case(g, lost(true, 1), amplitude, channel=True)
-    finding = ClockSkew.nominate(both, LEVEL)
+    both = comparison(g, lost(true, 1), amplitude, channel=True)
+    finding = ClockSkew.detect_and_fit(both, LEVEL)
     assert finding.sensors == (1,)
     assert finding.parameters["lost"].value == sum(true.values())
     assert [count for _, count in finding.effect.losses] == list(true.values())
     for (at, _), expected in zip(finding.effect.losses, true, strict=True):
         assert abs(at - expected) <= 6 / amplitude + 1
-    left = finding.explained(both, g)
-    assert clock_witness(left).p_value > 1e-3
-    assert line_witness(left).p_value > 1e-3
+    left = finding.repair(both, g)
+    assert clock_test(left).p_value > 1e-3
+    assert line_test(left).p_value > 1e-3
 
 
 def test_of_many_sensors_those_of_one_clock_are_one_finding():
@@ -155,10 +155,10 @@ def test_of_many_sensors_those_of_one_clock_are_one_finding():
     x = NOISE.simulate(N, batch=(2, n_sensors), generator=g)
     x[0] += torch.cos(2 * math.pi * TONE * (t + ahead))
     x[1] += torch.cos(2 * math.pi * TONE * t)
-    scene = Scene(
+    info = RecordingInfo(
         100.0, "deg/s", tuple(map(str, range(n_sensors))), {"acceleration": torch.cos(2 * math.pi * TONE * t)[None]}
     )
-    finding = ClockSkew.nominate(Case.of(scene, x[0], x[1:]), LEVEL)
+    finding = ClockSkew.detect_and_fit(Comparison.of(info, x[0], x[1:]), LEVEL)
     assert finding.sensors == (2, 5, 11)
     assert finding.parameters["lost"].value == 2
 
@@ -166,28 +166,28 @@ def test_of_many_sensors_those_of_one_clock_are_one_finding():
 @pytest.mark.parametrize("ahead", [skewed(80e-6, 1), lost({5000: 1, 11000: 1}, 1)])
 def test_what_was_found_is_put_right_and_confirmed(ahead):
     g = generator(7)
-    both = case(g, ahead, channel=True)
-    effect = ClockSkew.nominate(both, LEVEL).effect
+    both = comparison(g, ahead, channel=True)
+    effect = ClockSkew.detect_and_fit(both, LEVEL).effect
     gain = held_out_gain(both, effect)
     assert gain.total > 3 * gain.sd
-    assert clock_witness(effect.explained(both, g)).p_value > 0.01
-    assert clock_witness(both.with_recording(effect.removed(both.recording, both.scene))).p_value > 0.01
+    assert clock_test(effect.repair(both, g)).p_value > 0.01
+    assert clock_test(both.with_recording(effect.remove(both.recording, both.info))).p_value > 0.01
 
 
 def test_removed_undoes_simulated():
     g = generator(8)
     smooth = gf.AR1(0.9, 1.0).simulate(N, batch=(4,), generator=g)
     smooth = torch.fft.irfft(torch.fft.rfft(smooth)[:, : N // 8], n=N)
-    scene = Scene(100.0, "deg/s", ("1", "2", "3", "4"))
+    info = RecordingInfo(100.0, "deg/s", ("1", "2", "3", "4"))
     none = torch.zeros(2, dtype=torch.complex128)
     skew = ClockSkew((0, 2), 50e-6, (), TONE, none, none)
-    back = skew.removed(skew.simulated(smooth, scene, g), scene)
+    back = skew.remove(skew.apply(smooth, info, g), info)
     assert (back - smooth)[:, 100:-100].abs().max() < 1e-3 * smooth.std()
     assert torch.equal(back[1], smooth[1])
     drop = ClockSkew((0, 2), 0.0, ((4000, 3),), TONE, none, none)
-    dropped = drop.simulated(smooth, scene, g)
+    dropped = drop.apply(smooth, info, g)
     assert torch.allclose(dropped[0, 4000 : N - 3], smooth[0, 4003:])
-    back = drop.removed(dropped, scene)
+    back = drop.remove(dropped, info)
     keep = torch.ones(N, dtype=torch.bool)
     keep[4000:4003] = False
     keep[-3:] = False
@@ -205,9 +205,9 @@ def test_resampling_is_exact_at_samples_and_right_between():
 def test_without_a_shared_tone_nothing_is_said():
     g = generator(9)
     x = NOISE.simulate(N, batch=(2, 4), generator=g)
-    both = Case.of(Scene(100.0, "deg/s", ("1", "2", "3", "4")), x[0], x[1:])
+    both = Comparison.of(RecordingInfo(100.0, "deg/s", ("1", "2", "3", "4")), x[0], x[1:])
     assert strongest_slip(both) is None
-    assert clock_witness(both).p_value == 1.0
+    assert clock_test(both).p_value == 1.0
 
 
 def test_what_rings_tells_no_time():
@@ -216,7 +216,7 @@ def test_what_rings_tells_no_time():
     x = NOISE.simulate(N, batch=(3, 2), generator=g).double()
     on = ((t > 2000) & (t < 4000) | (t > 9000) & (t < 12000)).double()
     x[0] += torch.tensor([[1.0], [0.6]]) * on * torch.cos(2 * math.pi * TONE * t)
-    given = Case.of(Scene(100.0, "deg/s", ("1", "2")), x[0], x[1:])
+    given = Comparison.of(RecordingInfo(100.0, "deg/s", ("1", "2")), x[0], x[1:])
     gain = torch.tensor([0.5, 0.3], dtype=torch.complex128)
-    rung = Resonance(Mode(TONE, 1.5 / N, gain, True)).explained(given, g)
-    assert clock_witness(rung).p_value > 1e-3
+    rung = Resonance(Mode(TONE, 1.5 / N, gain, True)).repair(given, g)
+    assert clock_test(rung).p_value > 1e-3

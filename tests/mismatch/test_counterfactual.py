@@ -10,27 +10,28 @@ import torch
 from scipy import stats
 
 import gyrofuse as gf
-from gyrofuse.mismatch import counterfactual, diagnose
-from gyrofuse.mismatch.bump_fit import Oscillation
-from gyrofuse.mismatch.bumps import Stretch
-from gyrofuse.mismatch.case import Case, Scene
-from gyrofuse.mismatch.confirm import Gain, held_out_gain, sd_of_sum
-from gyrofuse.mismatch.counterfactual import Link, same_line, settled
-from gyrofuse.mismatch.look_alikes import happened_instead, look_alikes
-from gyrofuse.mismatch.mechanism import Finding, Instead, Mechanism, Parameter
-from gyrofuse.mismatch.mechanisms.common_mode import CommonMode
-from gyrofuse.mismatch.mechanisms.drifting_tone import DriftingTone
-from gyrofuse.mismatch.mechanisms.flicker import FlickerNoise
-from gyrofuse.mismatch.mechanisms.parameter_shift import ParameterShift
-from gyrofuse.mismatch.mechanisms.quantization import Quantization
-from gyrofuse.mismatch.mechanisms.resonance import Resonance
-from gyrofuse.mismatch.mechanisms.step import Step
-from gyrofuse.mismatch.mechanisms.vibration_tone import VibrationTone, amplitude_limits, line_near
-from gyrofuse.mismatch.mechanisms.warm_up_transient import WarmUpTransient
-from gyrofuse.mismatch.oscillating import Mode, wandering_sd
-from gyrofuse.mismatch.slow_scans import slow_look
-from gyrofuse.mismatch.steadiness import Steadiness, steadiness
-from gyrofuse.mismatch.telling import otherwise_words
+from gyrofuse.mismatch import diagnose
+from gyrofuse.mismatch.detectors.slow.scans import slow_look
+from gyrofuse.mismatch.detectors.spectra.peak_fit import Oscillation
+from gyrofuse.mismatch.detectors.spectra.peaks import Stretch
+from gyrofuse.mismatch.mechanisms.mechanism import Alternative, Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.signals.step import Step
+from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone, amplitude_limits, line_near
+from gyrofuse.mismatch.mechanisms.signals.warm_up import WarmUpTransient
+from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
+from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
+from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode, wandering_sd
+from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
+from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
+from gyrofuse.mismatch.mechanisms.spectra.steadiness import Steadiness, steadiness
+from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
+from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
+from gyrofuse.mismatch.reporting.text import otherwise_words
+from gyrofuse.mismatch.selection import backward as counterfactual
+from gyrofuse.mismatch.selection.alternatives import happened_instead, look_alikes
+from gyrofuse.mismatch.selection.backward import Link, same_line, settled
+from gyrofuse.mismatch.selection.held_out import Gain, held_out_gain, sd_of_sum
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 
 MODEL = gf.WhiteNoise(1.0) + gf.AR1(0.999, 1e-4) + gf.RandomWalk(1e-8)
 N, RATE, SENSORS = 2**14, 100.0, 4
@@ -41,12 +42,12 @@ def generator(seed: int) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def case_of(seed: int, signal: torch.Tensor | None = None) -> Case:
+def case_of(seed: int, signal: torch.Tensor | None = None) -> Comparison:
     """A recording with a signal added, beside a simulation of twice its length."""
     recording = MODEL.simulate(N, batch=(SENSORS,), generator=generator(seed))
     simulation = MODEL.simulate(N, batch=(2, SENSORS), generator=generator(seed + 1))
-    scene = Scene(RATE, "deg/s", tuple("abcd"))
-    return Case.of(scene, recording if signal is None else recording + signal, simulation)
+    info = RecordingInfo(RATE, "deg/s", tuple("abcd"))
+    return Comparison.of(info, recording if signal is None else recording + signal, simulation)
 
 
 def tone(frequency: float, amplitude: float) -> torch.Tensor:
@@ -58,16 +59,16 @@ def step(size: float) -> torch.Tensor:
     return size * torch.ones(SENSORS, 1, dtype=torch.float64) * (torch.arange(N) >= N // 2)
 
 
-def chain(case: Case, *mechanisms: type[Mechanism]) -> tuple[list[Link], Case]:
+def chain(comparison: Comparison, *mechanisms: type[Mechanism]) -> tuple[list[Link], Comparison]:
     """Findings one after the other."""
     links = []
     for mechanism in mechanisms:
-        finding = mechanism.nominate(case, LEVEL)
+        finding = mechanism.detect_and_fit(comparison, LEVEL)
         assert finding is not None
-        gain = held_out_gain(case, finding.effect)
-        links.append(Link(replace(finding, held_out_gain=gain.total), case, gain))
-        case = finding.effect.explained(case, generator(0))
-    return links, case
+        gain = held_out_gain(comparison, finding.effect)
+        links.append(Link(replace(finding, held_out_gain=gain.total), comparison, gain))
+        comparison = finding.effect.repair(comparison, generator(0))
+    return links, comparison
 
 
 def test_red_noise_may_be_a_step_that_gains_as_much():
@@ -78,8 +79,8 @@ def test_red_noise_may_be_a_step_that_gains_as_much():
     gain = torch.complex(*torch.full((2, SENSORS), 0.1, dtype=torch.float64))
     noise = CommonMode("walk", 0.0, gain, stepped.base, False)
 
-    def alike(case: Case, effect: Mechanism, nats: float) -> tuple[str, ...]:
-        return happened_instead(case, Finding(effect.name, effect, "", 1e-4, (0, 1), {}, gain=nats))
+    def alike(comparison: Comparison, effect: Mechanism, nats: float) -> tuple[str, ...]:
+        return happened_instead(comparison, Finding(effect.name, effect, "", 1e-4, (0, 1), {}, gain=nats))
 
     assert "step" in alike(stepped, noise, scan.gain + 4)
     assert "step" not in alike(stepped, noise, scan.gain + 6)
@@ -104,12 +105,12 @@ def test_several_steps_may_look_like_slow_noise_and_slow_noise_does_not_look_lik
     for steps in (True, False):
         said = 0
         for seed in range(6):
-            case = case_of(40 + 2 * seed, walking(seed, common=common, steps=steps))
+            comparison = case_of(40 + 2 * seed, walking(seed, common=common, steps=steps))
             effect: Mechanism = FlickerNoise(gain.real)
             if common:
-                effect = CommonMode("walk", 0.0, gain, case.base, False)
+                effect = CommonMode("walk", 0.0, gain, comparison.base, False)
             finding = Finding(effect.name, effect, "", 1e-4, (0, 1), {}, gain=100.0)
-            said += "step" in happened_instead(case, finding)
+            said += "step" in happened_instead(comparison, finding)
         told[steps] = said
     assert told == {True: 6, False: 0}
 
@@ -130,10 +131,10 @@ def test_red_noise_beside_several_steps_may_be_more_of_them():
 
 
 def test_what_stands_alone_stays_and_its_loss_is_its_gain():
-    links, case = chain(case_of(1, tone(12.34, 0.15)), VibrationTone)
-    after = settled(links, case, LEVEL, generator(0))
+    links, comparison = chain(case_of(1, tone(12.34, 0.15)), VibrationTone)
+    after = settled(links, comparison, LEVEL, generator(0))
     (link,) = after.links
-    assert after.case is case
+    assert after.comparison is comparison
     assert link.finding.gain_without == link.finding.held_out_gain
     assert link.finding.instead is not None
     assert link.finding.instead.mechanism == "resonance"
@@ -143,10 +144,10 @@ def test_what_stands_alone_stays_and_its_loss_is_its_gain():
 
 def test_two_effects_are_each_judged_with_the_other_in():
     start = case_of(3, tone(12.34, 0.12) + step(0.5))
-    links, case = chain(start, VibrationTone, Step)
-    first, second = settled(links, case, LEVEL, generator(0)).links
+    links, comparison = chain(start, VibrationTone, Step)
+    first, second = settled(links, comparison, LEVEL, generator(0)).links
     # Without the tone: the recording less the step alone.
-    left = links[1].finding.effect.explained(start, generator(0))
+    left = links[1].finding.effect.repair(start, generator(0))
     assert first.finding.gain_without == pytest.approx(held_out_gain(left, first.finding.effect).total, rel=1e-9)
     assert second.finding.gain_without == second.finding.held_out_gain
 
@@ -159,13 +160,13 @@ def test_what_others_make_needless_is_dropped_and_the_rest_rebuilt():
     assert isinstance(effect, VibrationTone)
     weak = replace(effect, frequency_hz=effect.frequency_hz + 0.3 * RATE / N, cosine=0.3 * effect.cosine)
     poor = replace(true.finding, effect=weak, p_value=0.1)
-    middle = weak.explained(start, generator(0))
+    middle = weak.repair(start, generator(0))
     links = [Link(poor, start, held_out_gain(start, weak)), Link(true.finding, middle, held_out_gain(middle, effect))]
-    after = settled(links, effect.explained(middle, generator(0)), LEVEL, generator(0))
+    after = settled(links, effect.repair(middle, generator(0)), LEVEL, generator(0))
     (link,) = after.links
     assert link.before is start
     assert link.finding.held_out_gain == pytest.approx(true.finding.held_out_gain, rel=1e-9)
-    torch.testing.assert_close(after.case.recording, effect.explained(start, generator(0)).recording)
+    torch.testing.assert_close(after.comparison.recording, effect.repair(start, generator(0)).recording)
 
 
 def test_a_better_look_alike_takes_the_place():
@@ -178,7 +179,7 @@ def test_a_better_look_alike_takes_the_place():
     finding = replace(true.finding, mechanism="step", effect=wrong, p_value=1e-9)
     link = Link(finding, start, held_out_gain(start, wrong))
     assert link.gain.confirms(1e-9)
-    (after,) = settled([link], wrong.explained(start, generator(0)), LEVEL, generator(0)).links
+    (after,) = settled([link], wrong.repair(start, generator(0)), LEVEL, generator(0)).links
     assert after.finding.mechanism == "warm_up_transient"
     assert after.finding.instead is not None
     assert after.finding.instead.mechanism == "step"
@@ -194,8 +195,8 @@ def test_limits_of_a_tone_hold_though_its_phase_walks(walk: float):
         noise = torch.randn(5, 2, n, generator=g, dtype=torch.float64)
         steps = math.sqrt(walk) * torch.randn(n, generator=g, dtype=torch.float64)
         phase = 2 * math.pi * 0.1234 * torch.arange(n, dtype=torch.float64) + steps.cumsum(0)
-        given = Case.of(Scene(100.0, "deg/s", ("a", "b")), noise[0] + 0.25 * phase.cos(), noise[1:])
-        found = VibrationTone.nominate(given, LEVEL)
+        given = Comparison.of(RecordingInfo(100.0, "deg/s", ("a", "b")), noise[0] + 0.25 * phase.cos(), noise[1:])
+        found = VibrationTone.detect_and_fit(given, LEVEL)
         assert found is not None
         limits = found.parameters["frequency"]
         hits += limits.low <= 12.34 <= limits.high
@@ -251,33 +252,33 @@ def test_a_name_that_is_not_earned_goes_where_nothing_is_found_in_its_place():
     finding = replace(true.finding, mechanism="step", effect=wrong, p_value=1e-9)
     link = Link(finding, start, held_out_gain(start, wrong))
     never = 0.0  # level at which no look-alike is found
-    after = settled([link], wrong.explained(start, generator(0)), never, generator(0))
+    after = settled([link], wrong.repair(start, generator(0)), never, generator(0))
     assert after.links == []
-    torch.testing.assert_close(after.case.recording, start.recording)
+    torch.testing.assert_close(after.comparison.recording, start.recording)
 
 
 def test_the_converter_is_judged_on_numbers_as_they_came():
     start = case_of(9, tone(12.34, 0.15))
     rounded = start.with_recording((start.recording / 0.5).round() * 0.5)
-    links, case = chain(rounded, Quantization, VibrationTone)
-    after = settled(links, case, LEVEL, generator(0))
+    links, comparison = chain(rounded, Quantization, VibrationTone)
+    after = settled(links, comparison, LEVEL, generator(0))
     assert [link.finding.mechanism for link in after.links] == ["quantization", "vibration_tone"]
     assert after.links[0].finding.gain_without == after.links[0].finding.held_out_gain
 
 
 def test_look_alikes_have_other_names_and_the_same_sensors():
-    case = case_of(11, step(0.6))
-    (link,), _ = chain(case, Step)
-    rivals = look_alikes(case, link.finding)
+    comparison = case_of(11, step(0.6))
+    (link,), _ = chain(comparison, Step)
+    rivals = look_alikes(comparison, link.finding)
     assert [rival.name for rival in rivals] == ["warm_up_transient"]
     assert isinstance(rivals[0], WarmUpTransient)
     assert rivals[0].size.nonzero()[:, 0].tolist() == list(link.finding.sensors)
 
 
 def test_reports_tell_what_was_ruled_out(tmp_path):
-    case = case_of(1, tone(12.34, 0.15))
-    recording = gf.Recording(case.recording, rate=RATE, unit="deg/s")
-    report = diagnose(recording, gf.Recording(case.simulated.signal[0], rate=RATE, unit="deg/s"))
+    comparison = case_of(1, tone(12.34, 0.15))
+    recording = gf.Recording(comparison.recording, rate=RATE, unit="deg/s")
+    report = diagnose(recording, gf.Recording(comparison.reference.signal[0], rate=RATE, unit="deg/s"))
     (finding,) = report.findings
     words = otherwise_words(finding)
     assert words.startswith("instead of vibration tone: resonance would gain")
@@ -300,29 +301,29 @@ def test_equals_are_told_as_such():
         {},
         alternatives=("warm_up_transient",),
         gain_without=12.0,
-        instead=Instead("warm_up_transient", 11.0, 2.0),
+        instead=Alternative("warm_up_transient", 11.0, 2.0),
     )
     assert otherwise_words(finding) == (
         "instead of step: warm up transient cannot be told from it, and would gain 1.0 nats less "
         "(held out, standard deviation 2.0)"
     )
-    likelier = replace(finding, instead=Instead("warm_up_transient", 17.0, 2.0))
+    likelier = replace(finding, instead=Alternative("warm_up_transient", 17.0, 2.0))
     assert "warm up transient is likelier, and would gain 5.0 nats more" in otherwise_words(likelier)
     assert otherwise_words(replace(finding, instead=None)) == ""
 
 
 @pytest.mark.parametrize(("apart", "told"), [(1.5, ("resonance",)), (2.5, ())])
 def test_a_rival_within_two_standard_deviations_is_told(monkeypatch, apart: float, told: tuple[str, ...]):
-    case = case_of(1, tone(12.34, 0.15))
-    finding = VibrationTone.nominate(case, LEVEL)
+    comparison = case_of(1, tone(12.34, 0.15))
+    finding = VibrationTone.detect_and_fit(comparison, LEVEL)
     assert finding is not None
     scatter = 4.0 * (-1.0) ** torch.arange(16)
     difference = scatter + apart * sd_of_sum(scatter) / len(scatter)
-    (bump,) = look_alikes(case, finding)
-    gains = {finding.effect: Gain(100 + difference, (), 1.0), bump: Gain(100 + 0 * difference, (), 1.0)}
-    monkeypatch.setattr(counterfactual, "look_alikes", lambda *_: [bump])
+    (peak,) = look_alikes(comparison, finding)
+    gains = {finding.effect: Gain(100 + difference, (), 1.0), peak: Gain(100 + 0 * difference, (), 1.0)}
+    monkeypatch.setattr(counterfactual, "look_alikes", lambda *_: [peak])
     monkeypatch.setattr(counterfactual, "held_out_gain", lambda _, effect: gains[effect])
-    compared = counterfactual._compared(finding, gains[finding.effect], case, [])
+    compared = counterfactual._compared(finding, gains[finding.effect], comparison, [])
     assert compared.alternatives == told
 
 
@@ -350,19 +351,19 @@ def test_limits_of_amplitudes_are_those_of_the_law():
 def test_a_frequency_that_wanders_is_known_as_well_as_its_mean_over_the_record():
     width, n_draws = 20 / N, 40
     gain = torch.ones(SENSORS, dtype=torch.complex128)
-    bump = Oscillation(Stretch(0.1, width, 0.0, ()), 0.1, width, (0.0, 0.0), gain.real, gain.real / 10, gain, 100.0)
+    peak = Oscillation(Stretch(0.1, width, 0.0, ()), 0.1, width, (0.0, 0.0), gain.real, gain.real / 10, gain, 100.0)
     found = []
     for seed in range(n_draws):
         path = DriftingTone(Mode(0.1, width, gain, True), True).path(N, generator(seed))
-        found.append(wandering_sd(case_of(100 + seed, path), bump) ** 2)
+        found.append(wandering_sd(case_of(100 + seed, path), peak) ** 2)
     tau = 8 / (2 * math.pi * width)  # samples, the memory of what wanders slowly
     truth = width**2 * 2 * tau / N * (1 - tau / N * (1 - math.exp(-N / tau)))
     assert 0.7 * truth < sum(found) / n_draws < 1.5 * truth
 
 
 def test_the_highest_place_near_a_frequency_is_the_line():
-    case = case_of(15, tone(12.34, 0.3))
-    assert abs(line_near(case, 0.1236, 0.001) - 0.1234) < 1 / N
+    comparison = case_of(15, tone(12.34, 0.3))
+    assert abs(line_near(comparison, 0.1236, 0.001) - 0.1234) < 1 / N
 
 
 @pytest.mark.statistical
@@ -380,9 +381,9 @@ def test_noise_that_a_simulator_of_white_noise_lacks_leaves_a_better_one():
 
 
 def test_a_bump_at_either_end_of_the_spectrum_is_no_tone():
-    case = case_of(5)
+    comparison = case_of(5)
     one = torch.ones(SENSORS, dtype=torch.float64)
     for centre in (2.0 / N, 0.5 - 2.0 / N):
         stretch = Stretch(centre, 4.0 / N, 1e-6, (0,))
-        bump = Oscillation(stretch, centre, 2.0 / N, (0.1, 0.1), one, 0.1 * one, one.to(torch.complex128), 10.0)
-        assert steadiness(case, bump) == Steadiness(tone=False, open=True, slow=False)
+        peak = Oscillation(stretch, centre, 2.0 / N, (0.1, 0.1), one, 0.1 * one, one.to(torch.complex128), 10.0)
+        assert steadiness(comparison, peak) == Steadiness(tone=False, open=True, slow=False)

@@ -13,16 +13,16 @@ from scipy import stats
 
 import gyrofuse as gf
 from gyrofuse.mismatch import MismatchReport, diagnose, discrepancy
-from gyrofuse.mismatch.case import Scene
-from gyrofuse.mismatch.engine import _known
-from gyrofuse.mismatch.evidence import calibrated
-from gyrofuse.mismatch.inputs import prepared
-from gyrofuse.mismatch.mechanisms.clipping import Clipping
-from gyrofuse.mismatch.mechanisms.low_pass import LowPassFilter
-from gyrofuse.mismatch.mechanisms.resonance import Resonance
-from gyrofuse.mismatch.mechanisms.unit_scale import UnitScale
-from gyrofuse.mismatch.oscillating import Mode
-from gyrofuse.mismatch.twins import twin, twin_p_values
+from gyrofuse.mismatch.diagnose import _known
+from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
+from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode
+from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
+from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
+from gyrofuse.mismatch.mechanisms.values.unit_scale import UnitScale
+from gyrofuse.mismatch.repair.inputs import prepared
+from gyrofuse.mismatch.selection.null_replicates import twin, twin_p_values
+from gyrofuse.mismatch.signals.comparison import RecordingInfo
+from gyrofuse.mismatch.stats.multiplicity import monte_carlo_p_value
 
 MODEL = gf.WhiteNoise(1.0) + gf.AR1(0.999, 1e-4) + gf.RandomWalk(1e-8)
 N, RATE = 2**14, 100.0
@@ -71,7 +71,7 @@ def test_a_fact_on_the_numbers_is_found_once():
     """What its repair could not take away in some of its sensors is no other one; a second step there would be."""
     signal = array(3).signal
     clipped = gf.Recording(signal.clamp(max=signal[:, ::2000].amax()), rate=RATE, unit="deg/s")
-    found = Clipping.nominate(prepared(clipped, array(4), None, generator(0)), 0.01)
+    found = Clipping.detect_and_fit(prepared(clipped, array(4), None, generator(0)), 0.01)
     assert found is not None
     assert len(found.sensors) > 1
     fewer = dataclasses.replace(found, sensors=found.sensors[:1])
@@ -169,21 +169,21 @@ def test_known_units_are_converted():
 @pytest.mark.statistical
 def test_twins_agree_and_their_rank_is_a_p_value():
     some = [0, 2, 4]
-    case = diagnose(array(5, N // 4).select(sensors=some), array(6, N // 4).select(sensors=some)).case
-    mate = twin(case, generator(1))
-    assert mate.recording.shape == case.recording.shape
-    assert mate.simulated.signal.shape == case.simulated.signal.shape
-    values = twin_p_values(case, 60, generator(2))
+    comparison = diagnose(array(5, N // 4).select(sensors=some), array(6, N // 4).select(sensors=some)).comparison
+    mate = twin(comparison, generator(1))
+    assert mate.recording.shape == comparison.recording.shape
+    assert mate.reference.signal.shape == comparison.reference.signal.shape
+    values = twin_p_values(comparison, 60, generator(2))
     hits = int((values < 0.05).sum())
     assert stats.binom.sf(hits - 1, 60, 0.05) > 1e-3
-    assert calibrated(1.0, values) == 1.0
-    assert calibrated(1e-9, values) < 1e-3  # more the 15 most extreme of them cannot tell
+    assert monte_carlo_p_value(1.0, values) == 1.0
+    assert monte_carlo_p_value(1e-9, values) < 1e-3  # more the 15 most extreme of them cannot tell
 
 
 def test_the_fitted_tail_is_that_of_honest_witnesses():
     uniform = torch.rand(400, generator=generator(3), dtype=torch.float64)
     for p in (0.5, 0.1, 0.01, 1e-4):
-        assert 0.5 < calibrated(p, uniform) / p < 2
+        assert 0.5 < monte_carlo_p_value(p, uniform) / p < 2
 
 
 @pytest.mark.statistical
@@ -205,17 +205,17 @@ def test_simulations_far_shorter_than_the_recording_are_judged_by(n_samples):
 @pytest.mark.parametrize("n_twins", [60, 256])
 def test_a_p_value_among_few_twins_keeps_its_level(n_twins):
     own, among = torch.rand(5000, n_twins + 1, generator=generator(4), dtype=torch.float64).split([1, n_twins], -1)
-    p = torch.tensor([calibrated(float(o), twins) for o, twins in zip(own, among, strict=True)])
+    p = torch.tensor([monte_carlo_p_value(float(o), twins) for o, twins in zip(own, among, strict=True)])
     for level in (0.3, 0.1, 0.03, 0.01):
         # A fitted rate taken for the true one would alarm 1.5 times as often at the last.
         assert stats.binomtest(int((p < level).sum()), len(p), level).pvalue > 1e-3
 
 
 def test_twins_that_all_say_the_same_tell_no_tail():
-    assert calibrated(1e-9, torch.ones(20, dtype=torch.float64)) == pytest.approx(1 / 21)
+    assert monte_carlo_p_value(1e-9, torch.ones(20, dtype=torch.float64)) == pytest.approx(1 / 21)
     # Where most of them do, the ten others tell it, whose mean excess is one.
     some = torch.cat([torch.ones(246), torch.full((10,), math.exp(-1))]).to(torch.float64)
-    assert calibrated(math.exp(-5), some) == pytest.approx(11 / 257 * (1 + 5 / 10) ** -10, rel=1e-6)
+    assert monte_carlo_p_value(math.exp(-5), some) == pytest.approx(11 / 257 * (1 + 5 / 10) ** -10, rel=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -285,14 +285,14 @@ def test_of_values_that_hardly_leave_a_step_only_the_step_is_told(step: float):
 def test_beside_a_sensor_that_hardly_leaves_a_step_the_others_are_searched_on(mechanism: str):
     """And what is left is told as unexplained: the rounded sensor has the same in it, of which no more can be told."""
     g = torch.Generator().manual_seed(1)
-    scene = Scene(100.0, "unknown", tuple("abcdef"))
+    info = RecordingInfo(100.0, "unknown", tuple("abcdef"))
     noise = gf.ArrayModel.from_sensors([gf.WhiteNoise(1.0 + i / 10) + gf.AR1(0.99, 1e-3) for i in range(6)])
     recording, simulation = (noise.simulate(8191, generator=g) for _ in range(2))
     effects = {
         "resonance": Resonance(Mode(0.17, 0.01, torch.full((6,), 0.6, dtype=torch.complex128), True)),
         "low_pass": LowPassFilter("pole", torch.full((6,), 0.4, dtype=torch.float64)),
     }
-    recording = effects[mechanism].simulated(recording, scene, g)
+    recording = effects[mechanism].apply(recording, info, g)
     recording[2] = 4.0 * torch.round(recording[2] / 4.0)
     found = diagnose(recording, simulation, rate=100.0)
     rounding, *others = found.findings
@@ -300,7 +300,7 @@ def test_beside_a_sensor_that_hardly_leaves_a_step_the_others_are_searched_on(me
     assert [(f.mechanism, f.sensors) for f in others] == [(mechanism, (0, 1, 3, 4, 5))]
     assert any("sensor 3" in e.words for e in found.unexplained)
     assert not any(e.sensors and 2 not in e.sensors for e in found.unexplained)
-    assert float((found.model.effects[0].simulated(simulation, scene, g)[2] % 4.0).diff().abs().max()) < 1e-9
+    assert float((found.model.effects[0].apply(simulation, info, g)[2] % 4.0).diff().abs().max()) < 1e-9
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")

@@ -11,17 +11,17 @@ import pytest
 import torch
 
 import gyrofuse as gf
-from gyrofuse.mismatch.fit_verdict import fit_verdict
-from gyrofuse.mismatch.inputs import modelled, prepared
-from gyrofuse.mismatch.line_sizes import line_sizes
-from gyrofuse.mismatch.noise_level import compared_levels
-from gyrofuse.mismatch.pooled import common_witness
-from gyrofuse.mismatch.shape_bands import narrow
-from gyrofuse.mismatch.shape_errors import estimation_errors, parameters_p_value
-from gyrofuse.mismatch.shape_scan import looked_at, shape_witness
-from gyrofuse.mismatch.slow import told
-from gyrofuse.mismatch.spectral_uncertainty import SpectralUncertainty, as_array
-from gyrofuse.mismatch.witnesses import coherence_witness, spectrum_witness
+from gyrofuse.mismatch.detectors.lines.line_sizes import line_sizes
+from gyrofuse.mismatch.detectors.spectra.band_tests import coherence_test, spectrum_test
+from gyrofuse.mismatch.detectors.spectra.fit_verdict import fit_verdict
+from gyrofuse.mismatch.detectors.spectra.pooled_coherence import common_source_test
+from gyrofuse.mismatch.detectors.spectra.shape_errors import estimation_errors, parameters_p_value
+from gyrofuse.mismatch.detectors.spectra.shape_scan import looked_at, shape_test
+from gyrofuse.mismatch.detectors.variance.noise_level import compared_levels
+from gyrofuse.mismatch.likelihoods.band_powers import narrow
+from gyrofuse.mismatch.likelihoods.slow_noise import told
+from gyrofuse.mismatch.repair.inputs import modelled, prepared
+from gyrofuse.mismatch.signals.fitted_spectra import SpectralUncertainty, as_array
 from gyrofuse.noise.estimation import EstimatedFrom
 
 TRUE = gf.parse_model("WN(variance=1.0) + AR1(phi=0.975, variance=0.03) + RW(variance=1e-5)")
@@ -41,18 +41,18 @@ def fitted(seed=0, n=SHORT, n_sensors=1):
     return gf.fit_gmwm(record(n, 1000 + seed, n_sensors), FORMULA)
 
 
-def case(recording, simulation, fitted_samples=None):
+def comparison(recording, simulation, fitted_samples=None):
     return prepared(recording, modelled(simulation, fitted_samples), None, torch.Generator().manual_seed(0))
 
 
 @functools.cache
 def against_another(seed):
     """A recording and a model fitted to another, shorter one."""
-    return case(record(LONG, seed), fitted(seed))
+    return comparison(record(LONG, seed), fitted(seed))
 
 
 def as_if_known(given):
-    return replace(given, simulated=replace(given.simulated, uncertainty=None))
+    return replace(given, reference=replace(given.reference, uncertainty=None))
 
 
 def at_most(n, p, chance=1e-3):
@@ -131,13 +131,13 @@ def test_one_estimate_for_all_sensors_is_off_alike_and_one_for_each_is_not():
 
 
 def test_shapes_are_weighed_by_the_inverse_covariance_and_by_what_lies_outside_the_tangents():
-    given = case(record(LONG, 1, 2), fitted(n_sensors=2))
+    given = comparison(record(LONG, 1, 2), fitted(n_sensors=2))
     errors, n_bands = estimation_errors(given), len(narrow(given).worth)
     shapes = torch.randn(3, 2, n_bands, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    rows = given.simulated.uncertainty.rows(narrow(given).frequency)
+    rows = given.reference.uncertainty.rows(narrow(given).frequency)
     for i in range(2):
         moved = narrow(given).worth.sqrt()[:, None] * rows[i]
-        covariance = moved @ given.simulated.uncertainty.covariance @ moved.mT
+        covariance = moved @ given.reference.uncertainty.covariance @ moved.mT
         expected = torch.linalg.solve(torch.eye(n_bands).double() + covariance, shapes[:, i].mT).mT
         torch.testing.assert_close(errors.beside(shapes)[:, i], expected, rtol=1e-6, atol=1e-8)
         torch.testing.assert_close(
@@ -159,10 +159,10 @@ def test_the_parameters_chi_square_has_the_law_of_chance():
 
 
 def test_a_model_fitted_to_a_shorter_record_raises_no_alarm_by_its_spectra():
-    cases = [against_another(s) for s in range(N_RUNS)]
-    exact = [looked_at(given).exact.p_value for given in cases]
-    seen = [shape_witness(given).p_value for given in cases]
-    bands = [spectrum_witness(given).p_value for given in cases]
+    comparisons = [against_another(s) for s in range(N_RUNS)]
+    exact = [looked_at(given).exact.p_value for given in comparisons]
+    seen = [shape_test(given).p_value for given in comparisons]
+    bands = [spectrum_test(given).p_value for given in comparisons]
     assert sum(p < 0.01 for p in exact) > at_most(N_RUNS, 0.01)  # what it would be taken for, were its numbers exact
     assert sum(p < 0.01 for p in seen) <= at_most(N_RUNS, 0.01)
     assert sum(p < 0.01 for p in bands) <= at_most(N_RUNS, 0.01)
@@ -175,18 +175,18 @@ def test_a_model_says_nothing_of_what_is_slower_than_the_record_it_was_fitted_to
     g, p_values = torch.Generator().manual_seed(7), []
     for _ in range(2):
         earlier, recording = slow.simulate(2048, batch=(8,), generator=g), slow.simulate(8192, batch=(8,), generator=g)
-        given = case(recording, gf.fit_array_gmwm(earlier, FORMULA).model)
-        assert (given.simulated.power_dof[:, given.bands.frequency < 1 / 2048] == 0).all()
-        p_values.append(shape_witness(given).p_value)
+        given = comparison(recording, gf.fit_array_gmwm(earlier, FORMULA).model)
+        assert (given.reference.power_dof[:, given.bands.frequency < 1 / 2048] == 0).all()
+        p_values.append(shape_test(given).p_value)
     assert min(p_values) > LEVEL
 
 
 def test_a_model_fitted_to_the_recording_itself_is_held_against_no_more():
     for s in range(2):
         x = record(2 * SHORT, 50 + s)
-        given = case(x, gf.fit_gmwm(x, FORMULA))
-        assert shape_witness(given).p_value > 0.05
-        assert spectrum_witness(given).p_value > spectrum_witness(as_if_known(given)).p_value * 0.999
+        given = comparison(x, gf.fit_gmwm(x, FORMULA))
+        assert shape_test(given).p_value > 0.05
+        assert spectrum_test(given).p_value > spectrum_test(as_if_known(given)).p_value * 0.999
 
 
 def test_power_that_a_fit_hardly_tells_may_be_missing():
@@ -196,16 +196,16 @@ def test_power_that_a_fit_hardly_tells_may_be_missing():
     recording = gf.parse_model("WN(variance=1.0)").simulate(
         LONG, batch=(2,), generator=torch.Generator().manual_seed(3)
     )
-    unsure = case(recording, gf.Model([model], estimated_from=EstimatedFrom(LONG, cov)))
-    assert spectrum_witness(unsure).p_value > 0.01
-    assert spectrum_witness(as_if_known(unsure)).p_value < 1e-6
+    unsure = comparison(recording, gf.Model([model], estimated_from=EstimatedFrom(LONG, cov)))
+    assert spectrum_test(unsure).p_value > 0.01
+    assert spectrum_test(as_if_known(unsure)).p_value < 1e-6
 
 
 def test_the_level_of_a_model_is_known_as_well_as_from_the_record_it_was_fitted_to():
     recording = record(LONG, 7, 2)
-    given = case(recording, WALKING.with_params(WALKING.params * 1.0), SHORT)
+    given = comparison(recording, WALKING.with_params(WALKING.params * 1.0), SHORT)
     assert compared_levels(given).reference.worth == SHORT
-    assert compared_levels(case(recording, WALKING)).reference.worth == LONG * len(given.simulated.signal)
+    assert compared_levels(comparison(recording, WALKING)).reference.worth == LONG * len(given.reference.signal)
 
 
 def test_what_an_array_was_found_to_share_is_as_uncertain_as_its_fit():
@@ -215,27 +215,29 @@ def test_what_an_array_was_found_to_share_is_as_uncertain_as_its_fit():
         fit = gf.fit_array_gmwm(
             root @ WALKING.simulate(SHORT, batch=(3,), generator=torch.Generator().manual_seed(300 + s)), "WN + RW"
         )
-        given = case(root @ WALKING.simulate(LONG, batch=(3,), generator=torch.Generator().manual_seed(400 + s)), fit)
-        exact.append(common_witness(as_if_known(given)).p_value)
-        seen += [common_witness(given).p_value, coherence_witness(given).p_value]
+        given = comparison(
+            root @ WALKING.simulate(LONG, batch=(3,), generator=torch.Generator().manual_seed(400 + s)), fit
+        )
+        exact.append(common_source_test(as_if_known(given)).p_value)
+        seen += [common_source_test(given).p_value, coherence_test(given).p_value]
     assert min(exact) < 1e-4  # where the walks' matrix has one direction, found in a quarter of the record
     assert sum(p < 0.01 for p in seen) <= at_most(6, 0.01)
 
 
 def test_slow_noise_is_as_uncertain_as_the_fit():
-    given = case(record(LONG, 1), fitted(0))
+    given = comparison(record(LONG, 1), fitted(0))
     known, off = told(as_if_known(given)), told(given)
     assert off.slowest_dof < known.slowest_dof
     normal = torch.Generator().manual_seed(0)
     coefficients = off.coefficients().expand(4000, -1, -1)
     drawn = (off.drawn(coefficients, normal).values[:, 0] / (coefficients @ off.atoms)[:, 0]).log()
     n_bands = drawn.shape[-1] - 8
-    said = given.simulated.uncertainty.variance(given.bands.frequency[-n_bands:])[0] + 1 / off.dof[:n_bands]
+    said = given.reference.uncertainty.variance(given.bands.frequency[-n_bands:])[0] + 1 / off.dof[:n_bands]
     plain = said < 0.2  # elsewhere logarithms of chi-squares are not normal
     assert plain.sum() > 20
     assert ((drawn[:, :n_bands].var(0) / said).log().abs() < 0.15)[plain].all()
     flat = TRUE.params * torch.tensor([1.0, 1.0, 1.0, 0.0])
-    walkless = case(record(LONG, 1), TRUE.with_params(flat, estimated_from=EstimatedFrom(SHORT)))
+    walkless = comparison(record(LONG, 1), TRUE.with_params(flat, estimated_from=EstimatedFrom(SHORT)))
     assert told(walkless).noise().centre[-1] > told(as_if_known(walkless)).noise().centre[-1] + 0.5
 
 
@@ -257,15 +259,15 @@ def with_bump(x, size):
 
 def test_a_missing_component_other_numbers_and_the_uncertainty_of_a_fit_are_told_apart():
     fit = fitted(3)
-    assert fit_verdict(case(with_bump(record(LONG, 3), 1.5), fit), LEVEL).kind == "component_missing"
-    other = fit_verdict(case(louder(record(LONG, 3), 1.25), fit), LEVEL)
+    assert fit_verdict(comparison(with_bump(record(LONG, 3), 1.5), fit), LEVEL).kind == "component_missing"
+    other = fit_verdict(comparison(louder(record(LONG, 3), 1.25), fit), LEVEL)
     assert other.kind == "other_numbers"
     assert "other numbers of the same processes" in other.words
     within = [fit_verdict(against_another(s), LEVEL) for s in range(6)]
     assert {v.kind for v in within} <= {"agrees", "within_uncertainty"}
     assert "within_uncertainty" in {v.kind for v in within}
     assert all(v.n_samples == SHORT for v in within)
-    assert fit_verdict(case(record(LONG, 3), TRUE), LEVEL) is None
+    assert fit_verdict(comparison(record(LONG, 3), TRUE), LEVEL) is None
 
 
 def test_a_diagnosis_says_what_the_numbers_of_a_simulation_are_taken_for():
@@ -298,36 +300,36 @@ def test_fits_of_all_kinds_stand_for_their_models():
         gf.rank_models(y, ["WN + AR1"]),
     )
     for fit, n in zip(fits, (SHORT, SHORT, 2 * SHORT, SHORT), strict=True):
-        given = case(x, fit)
-        assert given.simulated.uncertainty.n_samples == n
-        assert given.simulated.in_bands(narrow_of(given)).uncertainty is given.simulated.uncertainty
-    assert case(x, y).simulated.uncertainty is None
-    assert case(x, TRUE).simulated.uncertainty is None
+        given = comparison(x, fit)
+        assert given.reference.uncertainty.n_samples == n
+        assert given.reference.in_bands(narrow_of(given)).uncertainty is given.reference.uncertainty
+    assert comparison(x, y).reference.uncertainty is None
+    assert comparison(x, TRUE).reference.uncertainty is None
 
 
 def narrow_of(given):
-    return given.simulated.bands
+    return given.reference.bands
 
 
 def test_samples_behind_a_model_that_does_not_know_them_can_be_told():
     x, f = record(SHORT, 7), torch.tensor([0.4]).double()
-    told_by = [float(case(x, TRUE, n).simulated.uncertainty.variance(f)) for n in (1000, 4000)]
-    assert told_by[0] / told_by[1] == pytest.approx(4, rel=0.05)
-    assert case(x, gf.ArrayModel.from_sensors([TRUE]), 1000).simulated.uncertainty.n_samples == 1000
+    effective_samples = [float(comparison(x, TRUE, n).reference.uncertainty.variance(f)) for n in (1000, 4000)]
+    assert effective_samples[0] / effective_samples[1] == pytest.approx(4, rel=0.05)
+    assert comparison(x, gf.ArrayModel.from_sensors([TRUE]), 1000).reference.uncertainty.n_samples == 1000
     with pytest.raises(ValueError, match=r"`fitted_samples`: expected with a noise model .* one that has its own"):
-        case(x, fitted(), 1000)
+        comparison(x, fitted(), 1000)
     with pytest.raises(ValueError, match=r"`fitted_samples`: expected with a noise model .* Tensor; leave it out"):
-        case(x, x, 1000)
+        comparison(x, x, 1000)
     with pytest.raises(ValueError, match="`fitted_samples`"):
-        case(x, TRUE, 0)
+        comparison(x, TRUE, 0)
     with pytest.raises(ValueError, match="`simulation`: expected a ranking with the fit of every sensor"):
-        case(x, gf.rank_models(x, ["WN"], fit=False))
+        comparison(x, gf.rank_models(x, ["WN"], fit=False))
 
 
 def test_tones_of_a_fitted_model_are_as_uncertain_as_the_record():
     model = gf.WhiteNoise(1.0) + gf.Sinusoid(0.5, 0.9)
     x = model.simulate(4 * SHORT, batch=(1,), generator=torch.Generator().manual_seed(0))
-    known, off = line_sizes(case(x, model)), line_sizes(case(x, model, SHORT))
+    known, off = line_sizes(comparison(x, model)), line_sizes(comparison(x, model, SHORT))
     assert float(off.simulated_sd[0, 0]) == pytest.approx(math.sqrt(2 / SHORT), rel=0.1)
     assert off.simulated_sd[0, 0] > 1.5 * known.simulated_sd[0, 0]
 

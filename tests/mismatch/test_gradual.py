@@ -11,10 +11,10 @@ from mismatch_draws import LEVEL, NOISE, RATE, SCENE, N, drawn, nominated, norma
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.mismatch import courses
-from gyrofuse.mismatch.case import Case
-from gyrofuse.mismatch.mechanisms.gradual_change import GradualChange
-from gyrofuse.mismatch.mechanisms.variance_change import VarianceChange
+from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
+from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
+from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.stats import variance_courses as courses
 
 T = torch.arange(N, dtype=torch.float64) / N
 
@@ -33,7 +33,7 @@ FORMS = {
 }
 
 
-def case_of(log_variance: Tensor, seed: int) -> tuple[Case, torch.Generator]:
+def case_of(log_variance: Tensor, seed: int) -> tuple[Comparison, torch.Generator]:
     """White noise of variance one goes another way than its mean in sensors 0 and 2; what is slow stays as it is."""
     g = torch.Generator().manual_seed(seed)
     slow = gf.AR1(0.98, 0.004) + gf.RandomWalk(1e-5)
@@ -41,7 +41,7 @@ def case_of(log_variance: Tensor, seed: int) -> tuple[Case, torch.Generator]:
     white = normal(3, N, g=g)
     white[[0, 2]] *= level.sqrt()
     recording = white + slow.simulate(N, batch=(3,), generator=g)
-    return Case.of(SCENE, recording, NOISE.simulate(N, batch=(2, 3), generator=g)), g
+    return Comparison.of(SCENE, recording, NOISE.simulate(N, batch=(2, 3), generator=g)), g
 
 
 def test_a_course_is_the_nearest_one_with_a_single_peak():
@@ -96,22 +96,22 @@ def test_steady_noise_gains_what_an_order_gains_by_chance():
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("depth", [0.8, 3.0])
 def test_a_level_that_changes_bit_by_bit_is_a_change_of_variance_of_another_form(form: str, depth: float):
-    case, g = case_of(depth * FORMS[form], 3)
-    found = nominated(case, GradualChange)
+    comparison, g = case_of(depth * FORMS[form], 3)
+    found = nominated(comparison, GradualChange)
     assert found.sensors == (0, 2)
     assert "form" in found.sentence
     assert isinstance(found.effect, GradualChange)
-    after = settled(case, found, g)
-    assert VarianceChange.nominate(after, LEVEL) is None
+    after = settled(comparison, found, g)
+    assert VarianceChange.detect_and_fit(after, LEVEL) is None
 
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("depth", [0.6, 1.5, 4.0])
 def test_a_ramp_is_all_that_differs(depth: float):
     """Its mean level is the simulation's; spectra that take it for steady noise, or its level for another, differ."""
-    case, _ = case_of(depth * FORMS["ramp"], 5)
+    comparison, _ = case_of(depth * FORMS["ramp"], 5)
     model = gf.WhiteNoise(1.0) + gf.AR1(0.98, 0.004) + gf.RandomWalk(1e-5)
-    report = gf.diagnose(gf.Recording(case.recording, rate=RATE, unit="deg/s"), model)
+    report = gf.diagnose(gf.Recording(comparison.recording, rate=RATE, unit="deg/s"), model)
     assert [f.mechanism for f in report.findings] == ["variance_change"]
     assert report.unexplained == ()
     assert report.held_out.after < 1.5
@@ -122,19 +122,19 @@ def test_an_episode_is_none(louder: float):
     for seed in (20, 21, 22):
         recording, simulation, g = drawn(seed, records=2)
         recording[:2, 5000:9000] += louder * normal(2, 4000, g=g)
-        case = Case.of(SCENE, recording, simulation)
-        assert GradualChange.nominate(case, LEVEL) is None
-        assert nominated(case, VarianceChange).sensors == (0, 1)
+        comparison = Comparison.of(SCENE, recording, simulation)
+        assert GradualChange.detect_and_fit(comparison, LEVEL) is None
+        assert nominated(comparison, VarianceChange).sensors == (0, 1)
 
 
 @pytest.mark.parametrize("depth", [0.3, 1.0, 3.0])
 def test_a_level_that_goes_up_and_down_has_no_course(depth: float):
     wave = 0.5 * torch.sin(2 * math.pi * 3.3 * T) + 0.2 * torch.sin(2 * math.pi * 7.1 * T)
-    case, _ = case_of(depth * wave, 7)
-    assert GradualChange.nominate(case, LEVEL) is None
+    comparison, _ = case_of(depth * wave, 7)
+    assert GradualChange.detect_and_fit(comparison, LEVEL) is None
 
 
 def test_nothing_is_found_where_nothing_changes():
     for seed in range(4):
         recording, simulation, _ = drawn(seed, records=2)
-        assert GradualChange.nominate(Case.of(SCENE, recording, simulation), LEVEL) is None
+        assert GradualChange.detect_and_fit(Comparison.of(SCENE, recording, simulation), LEVEL) is None

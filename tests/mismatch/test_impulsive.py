@@ -12,37 +12,33 @@ from mismatch_draws import LEVEL, NOISE, RATE, SCENE, N, covers, drawn, even, no
 from scipy import fft, optimize, stats
 
 from gyrofuse import AR1, RandomWalk, WhiteNoise
-from gyrofuse.mismatch import (
-    episodes,
-    haar_kurtosis,
-    impulses,
-    marginals,
-    noise_level,
-    outlier_limits,
-    outliers,
-    prediction_errors,
-)
-from gyrofuse.mismatch.case import Case
-from gyrofuse.mismatch.confirm import Gain, leads_away
-from gyrofuse.mismatch.folds import N_FOLDS, N_JUDGED
-from gyrofuse.mismatch.mechanism import Mechanism
-from gyrofuse.mismatch.mechanisms import spikes
-from gyrofuse.mismatch.mechanisms.clipping import Clipping
-from gyrofuse.mismatch.mechanisms.quantization import Quantization
-from gyrofuse.mismatch.mechanisms.random_telegraph import RandomTelegraph, _path
-from gyrofuse.mismatch.mechanisms.spikes import Spikes
-from gyrofuse.mismatch.mechanisms.stuck_samples import StuckSamples
-from gyrofuse.mismatch.mechanisms.variance_change import VarianceChange
-from gyrofuse.mismatch.side import Side
-from gyrofuse.mismatch.spectra import bands
+from gyrofuse.mismatch.detectors.values import values as marginals
+from gyrofuse.mismatch.detectors.variance import haar_kurtosis, noise_level
+from gyrofuse.mismatch.detectors.variance import outliers as impulses
+from gyrofuse.mismatch.likelihoods import outlier_law as outliers
+from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
+from gyrofuse.mismatch.mechanisms.regimes import outlier_limits, spikes
+from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
+from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph, _path
+from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
+from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
+from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
+from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
+from gyrofuse.mismatch.selection.held_out import Gain, leads_away
+from gyrofuse.mismatch.signals import prediction_errors
+from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED
+from gyrofuse.mismatch.signals.psd import bands
+from gyrofuse.mismatch.signals.records import Records
 from gyrofuse.mismatch.stats import brownian_range
+from gyrofuse.mismatch.stats import segments as episodes
 from gyrofuse.wavelets.haar import haar_coefficients
 
-WITNESSES = (
-    marginals.marginal_witness,
-    impulses.spike_witness,
-    noise_level.variance_witness,
-    impulses.jump_witness,
+TESTS = (
+    marginals.values_test,
+    impulses.outliers_test,
+    noise_level.variance_test,
+    impulses.jump_test,
 )
 MECHANISMS: tuple[type[Mechanism], ...] = (
     Quantization,
@@ -59,13 +55,13 @@ MECHANISMS: tuple[type[Mechanism], ...] = (
 
 @pytest.mark.statistical
 def test_witnesses_and_nominations_are_silent_where_nothing_is_missing() -> None:
-    false = np.zeros(len(WITNESSES))
+    false = np.zeros(len(TESTS))
     for seed in range(20):
         recording, simulation, _ = drawn(seed, records=1)
-        case = Case.of(SCENE, recording, simulation)
-        false += [witness(case).p_value < 0.05 for witness in WITNESSES]
+        comparison = Comparison.of(SCENE, recording, simulation)
+        false += [witness(comparison).p_value < 0.05 for witness in TESTS]
         if seed < 6:
-            assert [m.name for m in MECHANISMS if m.nominate(case, LEVEL) is not None] == []
+            assert [m.name for m in MECHANISMS if m.detect_and_fit(comparison, LEVEL) is not None] == []
     assert stats.binom.sf(5, 20, 0.05) < 5e-4
     assert (false <= 5).all(), false
 
@@ -82,8 +78,11 @@ def test_lines_and_a_resonance_make_neither_spikes_nor_levels() -> None:
             impulse[k] = -poles[1] * impulse[k - 1] - (poles[2] * impulse[k - 2] if k > 1 else 0.0)
         driven = torch.fft.irfft(torch.fft.rfft(normal(3, N, g=g)) * torch.fft.rfft(impulse, n=N), n=N)
         recording = recording + 3 * torch.cos(1.931 * t + seed) + 0.8 * torch.cos(0.731 * t) + 0.1 * driven
-        case = Case.of(SCENE, recording, simulation)
-        false += [impulses.spike_witness(case).p_value < 0.01, noise_level.variance_witness(case).p_value < 0.01]
+        comparison = Comparison.of(SCENE, recording, simulation)
+        false += [
+            impulses.outliers_test(comparison).p_value < 0.01,
+            noise_level.variance_test(comparison).p_value < 0.01,
+        ]
     assert stats.binom.sf(1, 6, 0.01) < 5e-3
     assert (false <= 1).all(), false
 
@@ -94,7 +93,7 @@ def test_lines_and_a_resonance_make_neither_spikes_nor_levels() -> None:
 def test_whitening_is_division_by_the_smooth_spectrum_in_the_cosines() -> None:
     g = torch.Generator().manual_seed(7)
     x = normal(2, 600, g=g)
-    side = Side(x[None], bands(4096))
+    side = Records(x[None], bands(4096))
     y = fft.dct(x.numpy(), norm="ortho")[:, 1:]
     spectrum = prediction_errors._smooth_spectrum(torch.from_numpy(y))[0].numpy()
     k, t = np.arange(1, 600)[:, None], np.arange(600)
@@ -122,7 +121,7 @@ def test_an_outlier_keeps_its_size_in_the_errors_it_leaves() -> None:
     hit = x.clone()
     at = torch.randperm(4096, generator=torch.Generator().manual_seed(10))[:50]  # at even steps they would make lines
     hit[..., at] += 4.0
-    found = prediction_errors.left_out(Side(hit, bands(4096)))
+    found = prediction_errors.left_out(Records(hit, bands(4096)))
     assert float((found.error[0, 0, at] - x[0, 0, at]).mean()) == pytest.approx(4.0, abs=0.1)
 
 
@@ -131,16 +130,16 @@ def test_isolated_outliers_are_spikes() -> None:
     hit = even(3, N, g=g) < 2e-3
     hit[1] = False
     recording = recording + hit * 7.0 * (even(3, N, g=g) - 0.5).sign()
-    case = Case.of(SCENE, recording, simulation)
-    found = nominated(case, Spikes)
+    comparison = Comparison.of(SCENE, recording, simulation)
+    found = nominated(comparison, Spikes)
     assert found.sensors == (0, 2)
     assert found.alternatives == ()
     assert "not at the same time" in found.sentence
     assert covers(found, "amplitude[0]", 7.0)
     assert covers(found, "rate[0]", 2e-3 * RATE * 3600)
-    after = settled(case, found, g)
-    assert impulses.spike_witness(after).p_value > 0.001
-    assert float(found.effect.removed(recording, SCENE).abs().max()) < 6.0
+    after = settled(comparison, found, g)
+    assert impulses.outliers_test(after).p_value > 0.001
+    assert float(found.effect.remove(recording, SCENE).abs().max()) < 6.0
 
 
 def test_a_sensor_that_speaks_against_the_outliers_of_a_bus_is_left_out() -> None:
@@ -151,10 +150,10 @@ def test_a_sensor_that_speaks_against_the_outliers_of_a_bus_is_left_out() -> Non
     sign = (even(3, N, g=g) - 0.5).sign()
     recording = recording + hit * 6.0 * sign
     recording[1] += 1.6 * (even(N, g=g) < 0.02) * sign[1]
-    z = prediction_errors.left_out(Case.of(SCENE, recording, simulation).recorded).z[0]
+    z = prediction_errors.left_out(Comparison.of(SCENE, recording, simulation).observed).z[0]
     laws = [outliers.fitted(row) for row in z]
     assert float((outliers.mixture(z[1], laws[1]) - outliers.free_gaussian(z[1])).sum()) > 4
-    assert nominated(Case.of(SCENE, recording, simulation), Spikes).sensors == (0, 2)
+    assert nominated(Comparison.of(SCENE, recording, simulation), Spikes).sensors == (0, 2)
 
 
 def test_a_law_that_takes_half_of_the_noise_for_outliers_does_not_tell_its_sd() -> None:
@@ -176,11 +175,11 @@ def test_outliers_near_the_ends_are_taken_off_and_none_is_put_there(tone: float)
     hit = torch.zeros(3, N, dtype=torch.bool)
     hit[:2, [50, 120, 200, 5000, N - 184, N - 84]] = True
     spiky = clean + 12.0 * hit
-    assert not torch.equal(prediction_errors.left_out(Side(spiky[None], bands(N))).at_ends,
-                           prediction_errors.left_out(Side(spiky[None], bands(N))).error)  # fmt: skip
+    assert not torch.equal(prediction_errors.left_out(Records(spiky[None], bands(N))).at_ends,
+                           prediction_errors.left_out(Records(spiky[None], bands(N))).error)  # fmt: skip
     rate = torch.tensor([3e-4, 3e-4, 0.0], dtype=torch.float64)
     effect = Spikes(rate, torch.full_like(rate, 12.0), torch.full_like(rate, 1.0), together=False)
-    change = (effect.removed(spiky, SCENE) - clean).abs()
+    change = (effect.remove(spiky, SCENE) - clean).abs()
     assert float(change[~hit].max()) == 0.0
     assert float(change[hit].max()) < 6.0
 
@@ -188,13 +187,13 @@ def test_outliers_near_the_ends_are_taken_off_and_none_is_put_there(tone: float)
 def test_outliers_in_all_sensors_at_once_are_a_shock() -> None:
     recording, simulation, g = drawn(9)
     hit = even(1, N, g=g) < 2e-3
-    case = Case.of(SCENE, recording + hit * 5.0 * (even(3, N, g=g) - 0.5).sign(), simulation)
-    found = nominated(case, Spikes)
+    comparison = Comparison.of(SCENE, recording + hit * 5.0 * (even(3, N, g=g) - 0.5).sign(), simulation)
+    found = nominated(comparison, Spikes)
     assert found.sensors == (0, 1, 2)
     assert isinstance(found.effect, Spikes)
     assert found.effect.together
-    simulated = found.effect.simulated(torch.zeros(3, N, dtype=torch.float64), SCENE, g)
-    assert torch.equal(simulated[0] != 0, simulated[1] != 0)
+    reference = found.effect.apply(torch.zeros(3, N, dtype=torch.float64), SCENE, g)
+    assert torch.equal(reference[0] != 0, reference[1] != 0)
 
 
 @pytest.mark.statistical
@@ -259,14 +258,14 @@ def test_a_louder_episode_is_a_change_of_variance() -> None:
         recording, simulation, g = drawn(20 + seed, records=2)
         start, stop = 5000 + 211 * seed, 8500 + 211 * seed
         recording[:2, start:stop] += normal(2, stop - start, g=g)
-        case = Case.of(SCENE, recording, simulation)
-        found = nominated(case, VarianceChange)
+        comparison = Comparison.of(SCENE, recording, simulation)
+        found = nominated(comparison, VarianceChange)
         assert found.sensors == (0, 1)
         onset += covers(found, "start", start / RATE) + covers(found, "stop", stop / RATE)
         assert found.time_s == pytest.approx(start / RATE, abs=1.0)
-        assert Spikes.nominate(case, LEVEL) is None
+        assert Spikes.detect_and_fit(comparison, LEVEL) is None
         if seed < 1:
-            settled(case, found, g)
+            settled(comparison, found, g)
     # Fewer than 8 of 12 at 95 % have probability 2e-4.
     assert onset >= 8
 
@@ -279,9 +278,9 @@ def test_a_quiet_time_that_is_not_there_leads_away() -> None:
     factor[1] = 0.04
     effect = VarianceChange(((N / 5 / RATE, N / RATE),), factor)
     for given, away in ((recording, True), (quieter, False)):
-        case = Case.of(SCENE, given, simulation)
+        comparison = Comparison.of(SCENE, given, simulation)
         gain = Gain(torch.zeros(N_JUDGED, dtype=torch.float64), (effect,) * N_FOLDS, 0.0)
-        assert leads_away(case, case, gain, g) is away
+        assert leads_away(comparison, comparison, gain, g) is away
 
 
 def test_bursts_are_no_spikes() -> None:
@@ -289,13 +288,13 @@ def test_bursts_are_no_spikes() -> None:
     for k in range(8):
         at = 2048 * k + int(even(1, g=g) * 1800)
         recording[1, at : at + 160] += 2 * normal(160, g=g)
-    case = Case.of(SCENE, recording, simulation)
-    assert Spikes.nominate(case, LEVEL) is None
-    found = nominated(case, VarianceChange)
+    comparison = Comparison.of(SCENE, recording, simulation)
+    assert Spikes.detect_and_fit(comparison, LEVEL) is None
+    found = nominated(comparison, VarianceChange)
     assert found.sensors == (1,)
     assert isinstance(found.effect, VarianceChange)
     assert len(found.effect.episodes) == 8
-    settled(case, found, g)
+    settled(comparison, found, g)
 
 
 def test_an_episode_may_begin_with_the_last_block_and_end_with_the_record() -> None:
@@ -336,7 +335,7 @@ def test_kuipers_law() -> None:
 def test_kurtosis_is_that_of_the_wavelet_coefficients() -> None:
     g = torch.Generator().manual_seed(11)
     x = NOISE.simulate(4096, batch=(2,), generator=g)
-    scores = haar_kurtosis.kurtosis_scores(Side(x[None], bands(4096)))
+    scores = haar_kurtosis.kurtosis_scores(Records(x[None], bands(4096)))
     for level, w in enumerate(haar_coefficients(x, 6), start=1):
         w = w[..., :: max(2 ** (level - 2), 1) if level > 2 else 1]
         naive = stats.kurtosis(w.numpy(), axis=-1, fisher=False)
@@ -353,23 +352,23 @@ def test_kurtosis_is_that_of_the_wavelet_coefficients() -> None:
 def test_two_levels_are_telegraph_noise_and_an_ar1_is_not() -> None:
     recording, simulation, g = drawn(40)
     recording[1] += 0.8 * _path(N, 120.0, 180.0, g)
-    case = Case.of(SCENE, recording, simulation)
-    found = nominated(case, RandomTelegraph)
+    comparison = Comparison.of(SCENE, recording, simulation)
+    found = nominated(comparison, RandomTelegraph)
     assert found.sensors == (1,)
     assert found.parameters["half_step[1]"].value == pytest.approx(0.8, rel=0.15)
     assert found.parameters["dwell_up[1]"].value == pytest.approx(1.2, rel=0.5)
     assert found.parameters["dwell_down[1]"].value == pytest.approx(1.8, rel=0.5)
-    settled(case, found, g)
-    assert impulses.jump_witness(case).p_value < 1e-4
+    settled(comparison, found, g)
+    assert impulses.jump_test(comparison).p_value < 1e-4
     other, simulation, g = drawn(41)
     other[1] += AR1(0.985, 0.64 * (1 - 0.985**2)).simulate(N, generator=g)
-    assert RandomTelegraph.nominate(Case.of(SCENE, other, simulation), LEVEL) is None
+    assert RandomTelegraph.detect_and_fit(Comparison.of(SCENE, other, simulation), LEVEL) is None
 
 
 def test_a_step_is_no_telegraph() -> None:
     recording, simulation, _ = drawn(42)
     recording[1, 6000:] += 8.0
-    assert RandomTelegraph.nominate(Case.of(SCENE, recording, simulation), LEVEL) is None
+    assert RandomTelegraph.detect_and_fit(Comparison.of(SCENE, recording, simulation), LEVEL) is None
 
 
 def test_paths_dwell_as_they_should() -> None:

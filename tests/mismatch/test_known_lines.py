@@ -8,12 +8,12 @@ import pytest
 import torch
 
 import gyrofuse as gf
-from gyrofuse.mismatch import known_lines
-from gyrofuse.mismatch import testimony as court
-from gyrofuse.mismatch.inputs import prepared
-from gyrofuse.mismatch.known_lines import amplitudes, precise, without_lines
-from gyrofuse.mismatch.lines import simulated_lines
-from gyrofuse.mismatch.saved import repaired_from_dict
+from gyrofuse.mismatch.detectors import tests as court
+from gyrofuse.mismatch.repair.inputs import prepared
+from gyrofuse.mismatch.repair.serialise import repaired_from_dict
+from gyrofuse.mismatch.signals import known_lines
+from gyrofuse.mismatch.signals.known_lines import amplitudes, precise, without_lines
+from gyrofuse.mismatch.signals.lines import simulated_lines
 
 N, RATE = 16_384, 100.0
 NOISE = gf.parse_model("WN(variance=1e-3) + AR1(phi=0.99,variance=1e-6)")
@@ -23,7 +23,7 @@ def toned(amplitude: float = 0.02, beta: float = 0.34) -> gf.Model:
     return NOISE + gf.Sinusoid(amplitude, beta)
 
 
-def recorded(model: gf.Model, seed: int, n_samples: int = N) -> gf.Recording:
+def observed(model: gf.Model, seed: int, n_samples: int = N) -> gf.Recording:
     signal = model.simulate(n_samples, batch=(3,), generator=torch.Generator().manual_seed(seed))
     return gf.Recording(signal, rate=RATE, unit="deg/s")
 
@@ -41,7 +41,7 @@ def test_a_frequency_is_made_precise(frequency: float, off: float):
 
 
 def test_stretches_make_no_difference(monkeypatch: pytest.MonkeyPatch):
-    signal = recorded(toned(), 1).signal
+    signal = observed(toned(), 1).signal
     frequencies = (0.0541, 0.2)
     whole = without_lines(signal, frequencies), amplitudes(signal, frequencies)
     monkeypatch.setattr(known_lines, "_STRETCH", 1000)
@@ -55,26 +55,26 @@ def test_a_tone_that_both_have_is_no_mismatch(sampled: bool):
     tones = toned() + gf.Sinusoid(0.003, 1.1) + gf.Sinusoid(0.2, 0.0031 if not sampled else 2.0)
     p_values = []
     for seed in range(8):
-        simulation = recorded(tones, 100 + seed) if sampled else tones
-        case = prepared(recorded(tones, seed), simulation, None, torch.Generator().manual_seed(seed))
-        assert len(case.simulated.lines) == 3
-        p_values.append(court.combined(court.testimony(case)))
+        simulation = observed(tones, 100 + seed) if sampled else tones
+        comparison = prepared(observed(tones, seed), simulation, None, torch.Generator().manual_seed(seed))
+        assert len(comparison.reference.lines) == 3
+        p_values.append(court.family_wise_p_value(court.run_tests(comparison)))
     assert min(p_values) > 0.01 / 8
     assert sum(p < 0.1 for p in p_values) <= 3
 
 
 def test_side_lobes_of_a_strong_tone_hide_no_weak_one():
     tones = toned(0.3, 0.5) + gf.Sinusoid(0.004, 0.56) + gf.Sinusoid(0.004, 1.9)
-    case = prepared(recorded(tones, 1), recorded(tones, 2), None, torch.Generator().manual_seed(0))
-    found = sorted(2 * math.pi * f for f in simulated_lines(case.simulated))
+    comparison = prepared(observed(tones, 1), observed(tones, 2), None, torch.Generator().manual_seed(0))
+    found = sorted(2 * math.pi * f for f in simulated_lines(comparison.reference))
     assert found == pytest.approx([0.5, 0.56, 1.9], abs=2e-4)
 
 
 @pytest.mark.parametrize("factor", [0.0, 0.8, 1.5])
 def test_a_tone_of_another_size_is_told(factor: float):
-    case = prepared(recorded(toned(0.02 * factor), 3), toned(), None, torch.Generator().manual_seed(0))
-    evidence = min(court.testimony(case), key=lambda e: e.p_value)
-    assert evidence.witness == "line"
+    comparison = prepared(observed(toned(0.02 * factor), 3), toned(), None, torch.Generator().manual_seed(0))
+    evidence = min(court.run_tests(comparison), key=lambda e: e.p_value)
+    assert evidence.test == "line"
     assert evidence.p_value < 1e-10
     assert evidence.sensors == (0, 1, 2)
     assert evidence.frequency_hz == pytest.approx(0.34 / (2 * math.pi) * RATE)
@@ -83,7 +83,7 @@ def test_a_tone_of_another_size_is_told(factor: float):
 
 
 def test_a_tone_at_another_frequency_is_named_and_the_missing_one_told():
-    report = gf.diagnose(recorded(toned(beta=0.3405), 4), toned())
+    report = gf.diagnose(observed(toned(beta=0.3405), 4), toned())
     assert [finding.mechanism for finding in report.findings] == ["vibration_tone", "parameter_shift"]
     assert report.findings[0].frequency_hz == pytest.approx(0.3405 / (2 * math.pi) * RATE, rel=1e-5)
     assert "the simulation's tone at 5.4112" in report.findings[1].sentence
@@ -95,8 +95,8 @@ def test_a_tone_at_another_frequency_is_named_and_the_missing_one_told():
 @pytest.mark.parametrize("sampled", [False, True])
 @pytest.mark.parametrize("factor", [0.25, 0.8, 1.5])
 def test_another_size_is_a_number_that_was_wrong(sampled: bool, factor: float):
-    simulation = recorded(toned(), 100) if sampled else toned()
-    report = gf.diagnose(recorded(toned(0.02 * factor), 3), simulation)
+    simulation = observed(toned(), 100) if sampled else toned()
+    report = gf.diagnose(observed(toned(0.02 * factor), 3), simulation)
     (finding,) = report.findings
     assert finding.mechanism == "parameter_shift"
     assert report.unexplained == ()
@@ -106,13 +106,13 @@ def test_another_size_is_a_number_that_was_wrong(sampled: bool, factor: float):
         assert said.high - said.low < 0.004
     drawn = report.model.simulate(N, generator=torch.Generator().manual_seed(1))
     assert amplitudes(drawn, (0.34 / (2 * math.pi),))[:, 0] == pytest.approx([0.02 * factor] * 3, abs=0.002)
-    again = gf.diagnose(recorded(toned(0.02 * factor), 4), repaired_from_dict(report.model.to_dict()))
+    again = gf.diagnose(observed(toned(0.02 * factor), 4), repaired_from_dict(report.model.to_dict()))
     assert not again.mismatch
 
 
 def test_only_the_sensor_whose_tone_is_another_is_named():
-    signal = recorded(toned(), 7).signal
-    others = recorded(toned(0.03), 7).signal
+    signal = observed(toned(), 7).signal
+    others = observed(toned(0.03), 7).signal
     report = gf.diagnose(gf.Recording(torch.stack([signal[0], others[1], signal[2]]), rate=RATE), toned())
     (finding,) = report.findings
     assert finding.sensors == (1,)
@@ -122,17 +122,17 @@ def test_only_the_sensor_whose_tone_is_another_is_named():
 @pytest.mark.statistical
 def test_a_tone_found_in_one_recording_is_known_in_another_whatever_its_phase():
     """Phases count from when a record began."""
-    first = gf.diagnose(recorded(toned(), 11), NOISE)
+    first = gf.diagnose(observed(toned(), 11), NOISE)
     assert [finding.mechanism for finding in first.findings] == ["vibration_tone"]
-    p_values = [gf.diagnose(recorded(toned(), 20 + seed), first.model).p_value for seed in range(4)]
+    p_values = [gf.diagnose(observed(toned(), 20 + seed), first.model).p_value for seed in range(4)]
     assert min(p_values) > 0.01
-    larger = gf.diagnose(recorded(toned(0.03), 30), first.model)
+    larger = gf.diagnose(observed(toned(0.03), 30), first.model)
     assert [finding.mechanism for finding in larger.findings] == ["parameter_shift"]
     assert "instead of 0.02" in larger.findings[0].sentence
 
 
 def test_what_is_missing_is_found_beside_a_tone_that_both_have():
-    recording = recorded(toned(), 5)
+    recording = observed(toned(), 5)
     late = torch.arange(N) >= 10_000
     stepped = gf.Recording(recording.signal + 0.012 * late, rate=RATE, unit="deg/s")
     report = gf.diagnose(stepped, toned())

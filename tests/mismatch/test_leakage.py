@@ -4,9 +4,9 @@ import numpy as np
 import torch
 from scipy import signal as sps
 
-from gyrofuse.mismatch.filter_forms import filter_power, filter_strength
+from gyrofuse.mismatch.likelihoods.filter_forms import filter_power, filter_strength
 from gyrofuse.mismatch.likelihoods.spectral_data import N_JUDGED, block_bands, compared_bands
-from gyrofuse.mismatch.spectra import cross_spectra
+from gyrofuse.mismatch.signals.psd import cross_spectra
 
 LENGTH, N = 34.4, 9821
 

@@ -9,15 +9,15 @@ import torch
 
 import gyrofuse as gf
 from gyrofuse._base.transforms import cosine_ordinates
-from gyrofuse.mismatch.base import fit_base
-from gyrofuse.mismatch.colour import filtered
-from gyrofuse.mismatch.spectra import bands
+from gyrofuse.mismatch.signals.filters import filtered
+from gyrofuse.mismatch.signals.noise_spectrum import fit_base
+from gyrofuse.mismatch.signals.psd import bands
 
 N, RATE, P = 2**14, 100.0, 3
 WHITE = gf.WhiteNoise(1e-3)
 
 
-def recorded(model: gf.Model | gf.Process, seed: int) -> gf.Recording:
+def observed(model: gf.Model | gf.Process, seed: int) -> gf.Recording:
     signal = model.simulate(N, batch=(P,), generator=torch.Generator().manual_seed(seed))
     return gf.Recording(signal, rate=RATE, unit="deg/s")
 
@@ -34,8 +34,8 @@ def recorded(model: gf.Model | gf.Process, seed: int) -> gf.Recording:
     ids=["walk", "ar1", "walk_and_less_white"],
 )
 def test_what_white_noise_leaves_out(kind: str, truth: gf.Model, sampled: bool):
-    simulation = recorded(WHITE, 100) if sampled else WHITE
-    report = gf.diagnose(recorded(truth, 1), simulation)
+    simulation = observed(WHITE, 100) if sampled else WHITE
+    report = gf.diagnose(observed(truth, 1), simulation)
     assert [finding.mechanism for finding in report.findings] == ["parameter_shift"]
     sentence = report.findings[0].sentence
     assert sentence.startswith("the simulation shows no ")
@@ -47,7 +47,7 @@ def test_what_white_noise_leaves_out(kind: str, truth: gf.Model, sampled: bool):
 
 def test_white_noise_that_is_left_out():
     memory = gf.AR1(0.9, 1e-4)
-    report = gf.diagnose(recorded(memory + gf.WhiteNoise(1e-4), 3), memory)
+    report = gf.diagnose(observed(memory + gf.WhiteNoise(1e-4), 3), memory)
     assert [finding.mechanism for finding in report.findings] == ["parameter_shift"]
     assert "white noise of sensor 1 none -> " in report.findings[0].sentence
     said = float(report.findings[0].sentence.split("none -> ")[1].split()[0])
@@ -58,16 +58,16 @@ def test_white_noise_that_is_left_out():
 def test_a_filter_that_is_found_later_leaves_a_tone_as_it_is():
     """Its amplitude is that of the recording, whatever other numbers make of the noise."""
     tone = gf.Sinusoid(0.05, 0.34)
-    recording = recorded(gf.WhiteNoise(1e-2) + tone, 4)
+    recording = observed(gf.WhiteNoise(1e-2) + tone, 4)
     report = gf.diagnose(recording, WHITE)
     assert [finding.mechanism for finding in report.findings] == ["vibration_tone", "parameter_shift"]
-    simulated = report.model.simulate(N, generator=torch.Generator().manual_seed(5))
+    reference = report.model.simulate(N, generator=torch.Generator().manual_seed(5))
     t = torch.arange(N, dtype=torch.float64)
-    amplitude = (simulated * torch.polar(torch.ones_like(t), -0.34 * t)).sum(-1).abs() * 2 / N
+    amplitude = (reference * torch.polar(torch.ones_like(t), -0.34 * t)).sum(-1).abs() * 2 / N
     assert (amplitude - 0.05).abs().max() < 4 * 0.1 * math.sqrt(2 / N)
-    assert float(simulated.var(-1).mean()) == pytest.approx(float(recording.signal.var(-1).mean()), rel=0.05)
+    assert float(reference.var(-1).mean()) == pytest.approx(float(recording.signal.var(-1).mean()), rel=0.05)
     # As the simulation of another recording it agrees.
-    assert not gf.diagnose(recorded(gf.WhiteNoise(1e-2) + tone, 6), report.model).mismatch
+    assert not gf.diagnose(observed(gf.WhiteNoise(1e-2) + tone, 6), report.model).mismatch
 
 
 def test_white_noise_that_is_made_a_walk_gets_no_slope():

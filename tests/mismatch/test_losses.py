@@ -7,8 +7,8 @@ import math
 import torch
 from scipy import stats
 
-from gyrofuse.mismatch.evidence import ratio_p_value
-from gyrofuse.mismatch.losses import losses_of, paths_of
+from gyrofuse.mismatch.detectors.lines.lost_samples import losses_of, paths_of
+from gyrofuse.mismatch.stats.multiplicity import p_value_from_e_value
 
 BLOCKS, ANGLE = 512, 2 * math.pi * 0.23
 TOGETHER = torch.ones(1, 2, dtype=torch.float64)
@@ -31,7 +31,9 @@ def steps(*places: int) -> torch.Tensor:
 def test_nothing_lost_is_seldom_doubted():
     g, n_runs, nothing = torch.Generator().manual_seed(1), 150, torch.zeros(BLOCKS)
     amplitudes = (10 ** (0.8 * k / n_runs - 1) for k in range(n_runs))
-    values = [ratio_p_value(float(paths_of(tones(g, a, nothing)[None], TOGETHER, ANGLE).log_ratio)) for a in amplitudes]
+    values = [
+        p_value_from_e_value(float(paths_of(tones(g, a, nothing)[None], TOGETHER, ANGLE).log_ratio)) for a in amplitudes
+    ]
     hits = sum(p < 0.05 for p in values)
     assert stats.binom.sf(hits - 1, n_runs, 0.05) > 1e-3, f"{hits} of {n_runs}"
 
@@ -44,7 +46,7 @@ def test_losses_whose_places_nobody_could_tell_are_seen_together():
     amplitude = math.sqrt(25 / 2 / float((line - line.mean()).abs().square().sum()))
     for _ in range(n_runs):
         paths = paths_of(tones(g, amplitude, lost)[None], TOGETHER, ANGLE)
-        found += ratio_p_value(float(paths.log_ratio)) < 1e-3
+        found += p_value_from_e_value(float(paths.log_ratio)) < 1e-3
         low, high = paths.limits(0)
         held += low <= 4 <= high
     assert found >= stats.binom.ppf(1e-3, n_runs, 0.9)

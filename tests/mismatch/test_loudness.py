@@ -6,10 +6,16 @@ import pytest
 import torch
 
 import gyrofuse as gf
-from gyrofuse.mismatch.bumps import strongest_bump
-from gyrofuse.mismatch.case import Case, Scene
-from gyrofuse.mismatch.episodes import Episode, Episodes, _of_the_concerned, told_of_first
-from gyrofuse.mismatch.loudness import Loudness, corner_of, fast_factor, fast_share, whitened_factor
+from gyrofuse.mismatch.detectors.spectra.peaks import strongest_peak
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.variance_course import (
+    VarianceCourse,
+    corner_of,
+    fast_factor,
+    fast_share,
+    whitened_factor,
+)
+from gyrofuse.mismatch.stats.segments import Episode, Episodes, _of_the_concerned, told_of_first
 
 N = 2**16
 INSIDE = (torch.arange(N) >= 20_000) & (torch.arange(N) < 40_000)
@@ -34,7 +40,7 @@ def test_noise_never_gets_a_negative_power():
 
 def test_what_is_added_is_as_loud_as_it_says_and_can_be_taken_off():
     factor = torch.tensor([1.0, 2.0, 0.5], dtype=torch.float64)
-    loud = Loudness(INSIDE, factor, 2.0**-6)
+    loud = VarianceCourse(INSIDE, factor, 2.0**-6)
     noise = white(1)
     louder = loud.added(noise)
     torch.testing.assert_close(louder[:, ~INSIDE], noise[:, ~INSIDE])
@@ -48,7 +54,7 @@ def test_what_is_added_is_as_loud_as_it_says_and_can_be_taken_off():
 
 def test_another_length_has_as_large_a_share_of_it():
     for n in (1000, N // 2, N, 100_000):
-        other = Loudness(INSIDE, torch.ones(1), 0.1).of_length(n)
+        other = VarianceCourse(INSIDE, torch.ones(1), 0.1).of_length(n)
         assert len(other.course) == n
         assert float(other.course.double().mean()) == pytest.approx(20_000 / N, abs=2 / n)
 
@@ -94,8 +100,8 @@ def test_nothing_bulges_where_a_part_of_the_record_has_all_power():
     course = (torch.arange(n) >= 3000) & (torch.arange(n) < 3600)
     for seed in range(6):
         noise = white(20 + seed, 2)[..., : 3 * n].unflatten(-1, (3, n)).movedim(1, 0)
-        known = Loudness(course, torch.full((2,), 300.0, dtype=torch.float64), 1e-4)
-        recorded = known.added(noise[0])
-        case = Case.of(Scene(100.0, "deg/s", ("1", "2")), recorded, noise[1:]).made_louder(known)
-        least.append(strongest_bump(case).p_value)
+        known = VarianceCourse(course, torch.full((2,), 300.0, dtype=torch.float64), 1e-4)
+        observed = known.added(noise[0])
+        comparison = Comparison.of(RecordingInfo(100.0, "deg/s", ("1", "2")), observed, noise[1:]).made_louder(known)
+        least.append(strongest_peak(comparison).p_value)
     assert min(least) > 1e-3

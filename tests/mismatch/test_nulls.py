@@ -13,22 +13,25 @@ from scipy import signal, stats
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.mismatch import haar_kurtosis, impulses, lattices, noise_level, normality, twins
-from gyrofuse.mismatch.case import Case, Scene
-from gyrofuse.mismatch.inputs import prepared
-from gyrofuse.mismatch.level_spread import level_spread
-from gyrofuse.mismatch.mechanisms.parameter_shift import ParameterShift
-from gyrofuse.mismatch.mechanisms.random_telegraph import RandomTelegraph
-from gyrofuse.mismatch.mechanisms.variance_change import VarianceChange
-from gyrofuse.mismatch.prediction_errors import left_out
-from gyrofuse.mismatch.shape_scan import beside_levels, shape_witness
+from gyrofuse.mismatch.detectors.spectra.band_tests import spectrum_test
+from gyrofuse.mismatch.detectors.spectra.shape_scan import beside_levels, shape_test
+from gyrofuse.mismatch.detectors.values import quantisation_grid as lattices
+from gyrofuse.mismatch.detectors.variance import haar_kurtosis, noise_level, normality
+from gyrofuse.mismatch.detectors.variance import outliers as impulses
+from gyrofuse.mismatch.detectors.variance.level_spread import level_spread
+from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph
+from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
+from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
+from gyrofuse.mismatch.repair.inputs import prepared
+from gyrofuse.mismatch.selection import null_replicates as twins
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.prediction_errors import left_out
 from gyrofuse.mismatch.stats import predictive_tail
 from gyrofuse.mismatch.stats.brownian_range import kuiper_p_value, studentised_range_p_value
 from gyrofuse.mismatch.stats.clustering import clustering_p_value
 from gyrofuse.mismatch.stats.kurtosis import bounded_kurtosis, kurtosis_p_value
 from gyrofuse.mismatch.stats.local_level import WINDOW, local_level
 from gyrofuse.mismatch.stats.long_run_variance import chi_square_nodes, long_run_variance
-from gyrofuse.mismatch.witnesses import spectrum_witness
 
 N = 8209  # a prime: no length of a block or a transform fits it
 
@@ -55,7 +58,7 @@ def noise(kind: str, g: torch.Generator, p: int = 2, n: int = N) -> Tensor:
     return x
 
 
-def case_of(kind: str, seed: int, p: int = 2, n: int = N) -> Case:
+def case_of(kind: str, seed: int, p: int = 2, n: int = N) -> Comparison:
     g = torch.Generator().manual_seed(seed)
     return prepared(noise(kind, g, p, n), noise(kind, g, p, n), None, g)
 
@@ -146,24 +149,24 @@ def test_tails_that_both_have_are_predicted(kind: str) -> None:
     g = torch.Generator().manual_seed(5)
     low = 0
     for _ in range(15):
-        recorded, simulated = (noise(kind, g, 4, N).numpy() for _ in range(2))
-        low += int((predictive_tail.tail_p_values(recorded, simulated[:, None]) < 0.01).sum())
+        observed, reference = (noise(kind, g, 4, N).numpy() for _ in range(2))
+        low += int((predictive_tail.tail_p_values(observed, reference[:, None]) < 0.01).sum())
     # More than 4 of 60 at 1 % have probability 3e-4.
     assert low <= 4
-    recorded[0, ::1000] = 12.0 * np.abs(simulated).max()
-    assert predictive_tail.tail_p_values(recorded, simulated[:, None])[0] < 1e-4
+    observed[0, ::1000] = 12.0 * np.abs(reference).max()
+    assert predictive_tail.tail_p_values(observed, reference[:, None])[0] < 1e-4
 
 
 def test_outliers_that_few_have_by_chance_are_no_taller_tail() -> None:
     # Ten sd where the simulation's own sensor has none: others show that they come.
     g = torch.Generator().manual_seed(21)
-    recorded, simulated = normal(3, N, g=g).numpy(), normal(3, N, g=g).numpy()
-    recorded[2, [100, 5000]] = 11.2, -11.5
-    simulated[:2, [70, 3000]] = 10.4, -9.8
-    assert predictive_tail.tail_p_values(recorded, simulated[:, None])[2] > 0.05
+    observed, reference = normal(3, N, g=g).numpy(), normal(3, N, g=g).numpy()
+    observed[2, [100, 5000]] = 11.2, -11.5
+    reference[:2, [70, 3000]] = 10.4, -9.8
+    assert predictive_tail.tail_p_values(observed, reference[:, None])[2] > 0.05
     # Twice as tall they are others.
-    recorded[2, [100, 5000]] = 24.0, -25.0
-    assert predictive_tail.tail_p_values(recorded, simulated[:, None])[2] < 1e-3
+    observed[2, [100, 5000]] = 24.0, -25.0
+    assert predictive_tail.tail_p_values(observed, reference[:, None])[2] < 1e-3
 
 
 def burst(n: int, at: tuple[int, ...], g: torch.Generator) -> Tensor:
@@ -176,24 +179,24 @@ def burst(n: int, at: tuple[int, ...], g: torch.Generator) -> Tensor:
 
 def test_a_simulation_with_few_bursts_by_chance_is_not_surer_of_them() -> None:
     g = torch.Generator().manual_seed(22)
-    recorded = burst(4500, tuple(range(100, 4500, 450)), g)
-    simulated = burst(4500, (700,), g)
-    assert kurtosis_p_value(recorded, simulated) > 1e-4
-    assert clustering_p_value(recorded.square().clamp(max=9), simulated.square().clamp(max=9)) > 1e-3
+    observed = burst(4500, tuple(range(100, 4500, 450)), g)
+    reference = burst(4500, (700,), g)
+    assert kurtosis_p_value(observed, reference) > 1e-4
+    assert clustering_p_value(observed.square().clamp(max=9), reference.square().clamp(max=9)) > 1e-3
 
 
 def test_records_of_another_level_have_the_kurtosis_of_each() -> None:
     g = torch.Generator().manual_seed(23)
-    recorded = noise("wandering", g)
-    simulated = torch.cat([normal(2, N, g=g), 1.5 * normal(2, N, g=g)], -1) * wandering(100.0, 2 * N, g).sqrt()
-    assert float(haar_kurtosis.kurtosis_p_values(prepared(recorded, simulated, None, g))[0].min()) > 0.01
+    observed = noise("wandering", g)
+    reference = torch.cat([normal(2, N, g=g), 1.5 * normal(2, N, g=g)], -1) * wandering(100.0, 2 * N, g).sqrt()
+    assert float(haar_kurtosis.kurtosis_p_values(prepared(observed, reference, None, g))[0].min()) > 0.01
 
 
 def test_a_run_of_values_on_one_step_is_no_quiet_stretch() -> None:
     g = torch.Generator().manual_seed(24)
-    recorded, simulated = normal(2, N, g=g).round(), normal(2, N, g=g).round()
-    recorded[0, 3000:3018] = 0.0  # by chance about once in forty million samples, hence no law is met
-    found = prepared(recorded + 0.3, simulated + 0.3, None, g)
+    observed, reference = normal(2, N, g=g).round(), normal(2, N, g=g).round()
+    observed[0, 3000:3018] = 0.0  # by chance about once in forty million samples, hence no law is met
+    found = prepared(observed + 0.3, reference + 0.3, None, g)
     assert noise_level.variance_p_value(found) > 1e-3
     # Without a lattice such a stretch is one.
     quiet = normal(2, N, g=g)
@@ -207,7 +210,7 @@ def test_fast_noise_may_go_up_and_down_beside_slow_noise_that_does_not() -> None
         g = torch.Generator().manual_seed(40 + seed)
         slow = [torch.from_numpy(signal.lfilter([1.0], [1.0, -0.999], normal(4, N, g=g).numpy())) for _ in range(2)]
         both = [normal(4, N, g=g) * wandering(2000.0, N, g).sqrt() + 0.1 * part for part in slow]
-        alarms += shape_witness(prepared(*both, None, g)).p_value < 1e-3
+        alarms += shape_test(prepared(*both, None, g)).p_value < 1e-3
     assert alarms == 0
 
 
@@ -217,7 +220,7 @@ def test_a_peak_of_noise_is_no_tone() -> None:
     tone = gf.Sinusoid(amplitude=0.2, beta=0.7)
     model = gf.WhiteNoise(1.0) + peak + tone
     found = prepared(model.simulate(N, batch=(2,), generator=g), model, None, g)
-    (line,) = found.simulated.lines
+    (line,) = found.reference.lines
     assert line == pytest.approx(0.7 / (2 * math.pi), abs=1 / N)
 
 
@@ -281,10 +284,10 @@ def test_scores_whose_levels_vary_become_independent() -> None:
 def test_a_model_is_gaussian_and_samples_are_what_they_look_like() -> None:
     g = torch.Generator().manual_seed(8)
     model = prepared(noise("t5", g), gf.Model([gf.WhiteNoise(1.0)]), None, g)
-    assert bool(normality.gaussian_sensors(model.simulated).all())
+    assert bool(normality.gaussian_sensors(model.reference).all())
     for kind in ("t5", "laplace", "wandering", "spiky"):
-        assert not bool(normality.gaussian_sensors(case_of(kind, 9).simulated).any()), kind
-    passed = torch.stack([normality.gaussian_sensors(case_of("gaussian", 100 + k).simulated) for k in range(20)])
+        assert not bool(normality.gaussian_sensors(case_of(kind, 9).reference).any()), kind
+    passed = torch.stack([normality.gaussian_sensors(case_of("gaussian", 100 + k).reference) for k in range(20)])
     # Nine of ten sensors at least: fewer than 29 of 40 have probability 1e-3.
     assert int(passed.sum()) >= 29
 
@@ -296,15 +299,15 @@ def test_a_model_is_gaussian_and_samples_are_what_they_look_like() -> None:
 def test_noise_that_both_share_is_no_mismatch(kind: str) -> None:
     low = {}
     for seed in range(4):
-        case = case_of(kind, 200 + seed, n=4099)
+        comparison = case_of(kind, 200 + seed, n=4099)
         for witness in (
-            impulses.spike_witness,
-            impulses.jump_witness,
-            noise_level.variance_witness,
-            spectrum_witness,
-            shape_witness,
+            impulses.outliers_test,
+            impulses.jump_test,
+            noise_level.variance_test,
+            spectrum_test,
+            shape_test,
         ):
-            low[witness.__name__] = low.get(witness.__name__, 0) + (witness(case).p_value < 0.01)
+            low[witness.__name__] = low.get(witness.__name__, 0) + (witness(comparison).p_value < 0.01)
     # More than two of twenty at 1 % have probability 1e-3; all four were low before.
     assert sum(low.values()) <= 2, low
 
@@ -312,19 +315,19 @@ def test_noise_that_both_share_is_no_mismatch(kind: str) -> None:
 def test_no_law_that_both_share_gets_a_name() -> None:
     """Once something else made it a mismatch; of modulated noise spectra gained any number of nats."""
     for seed in range(2):
-        case = case_of("wandering", 300 + seed, n=4099)
+        comparison = case_of("wandering", 300 + seed, n=4099)
         for mechanism in (ParameterShift, RandomTelegraph, VarianceChange):
-            assert mechanism.nominate(case, LEVEL) is None, mechanism.name
+            assert mechanism.detect_and_fit(comparison, LEVEL) is None, mechanism.name
 
 
 def test_a_change_of_level_is_seen_beside_tails_that_both_have() -> None:
     g = torch.Generator().manual_seed(10)
-    recorded, simulated = noise("t5", g, n=16381), noise("t5", g, n=16381)
-    recorded[:, 3000:9000] *= 1.4
-    case = prepared(recorded, simulated, None, g)
-    assert not bool(normality.gaussian_sensors(case.simulated).any())
-    assert noise_level.variance_witness(case).p_value < 1e-4
-    found = VarianceChange.nominate(case, LEVEL)
+    observed, reference = noise("t5", g, n=16381), noise("t5", g, n=16381)
+    observed[:, 3000:9000] *= 1.4
+    comparison = prepared(observed, reference, None, g)
+    assert not bool(normality.gaussian_sensors(comparison.reference).any())
+    assert noise_level.variance_test(comparison).p_value < 1e-4
+    found = VarianceChange.detect_and_fit(comparison, LEVEL)
     assert found is not None
     assert found.parameters["start"].value == pytest.approx(3000, abs=400)
 
@@ -342,14 +345,14 @@ def test_a_course_of_the_level_that_both_have_is_taken_off_and_one_of_chance_is_
 
 def test_twins_have_the_innovations_of_the_simulation() -> None:
     g = torch.Generator().manual_seed(12)
-    case = case_of("t5", 13, n=16381)
-    assert twins.block_length(left_out(case.simulated).white) == 1
-    twin = twins.twin(case, g)
-    for ours, theirs in ((twin.recording, case.simulated.signal[0]), (twin.simulated.signal[0],) * 2):
+    comparison = case_of("t5", 13, n=16381)
+    assert twins.block_length(left_out(comparison.reference).white) == 1
+    twin = twins.twin(comparison, g)
+    for ours, theirs in ((twin.recording, comparison.reference.signal[0]), (twin.reference.signal[0],) * 2):
         assert (ours.std(-1) / theirs.std(-1)).tolist() == pytest.approx([1, 1], abs=0.05)
         assert float(stats.kurtosis(ours.numpy(), axis=-1).min()) > 1.5
     assert float((twin.recording[0, 1:] * twin.recording[0, :-1]).mean().abs()) < 0.06
-    assert 100 < twins.block_length(left_out(case_of("wandering", 14).simulated).white) <= N / 8
+    assert 100 < twins.block_length(left_out(case_of("wandering", 14).reference).white) <= N / 8
 
 
 # Lattices.
@@ -361,21 +364,21 @@ def test_a_mixture_of_normal_laws_has_no_lattice_and_one_that_is_rounded_has() -
         wide = torch.where(even(1, 65537, g=g) < 0.5, 4.0, 1.0)
         mixed = normal(1, 65537, g=g) * wide
         simulation = normal(1, 65537, g=g) * mixed.std()
-        scene = Scene(100.0, "deg/s", ("x",))
-        assert lattices.missing_lattices(Case.of(scene, mixed, simulation[None]), LEVEL).p_value > 0.01
+        info = RecordingInfo(100.0, "deg/s", ("x",))
+        assert lattices.missing_lattices(Comparison.of(info, mixed, simulation[None]), LEVEL).p_value > 0.01
         rounded = (mixed / 2).round() * 2 + 0.5 * normal(1, 65537, g=g)
-        found = lattices.missing_lattices(Case.of(scene, rounded, simulation[None]), LEVEL)
+        found = lattices.missing_lattices(Comparison.of(info, rounded, simulation[None]), LEVEL)
         assert found.p_value < 1e-9
         assert found.lattices[0].step == pytest.approx(2.0, rel=0.05)
 
 
 def test_contaminated_noise_of_a_real_gyro_is_not_rounded(data: Path) -> None:
-    recorded = torch.from_numpy(np.load(data / "mtig_contaminated_gx.npz")["gyro_x"].astype(np.float64))
+    observed = torch.from_numpy(np.load(data / "mtig_contaminated_gx.npz")["gyro_x"].astype(np.float64))
     for first in (0, 300_000):
-        part = recorded[None, first : first + 65537]
+        part = observed[None, first : first + 65537]
         simulation = part.std() * normal(1, 1, 65537, g=torch.Generator().manual_seed(21))
-        case = Case.of(Scene(100.0, "rad/s", ("x",)), part, simulation)
-        assert lattices.missing_lattices(case, LEVEL).p_value > 0.01
+        comparison = Comparison.of(RecordingInfo(100.0, "rad/s", ("x",)), part, simulation)
+        assert lattices.missing_lattices(comparison, LEVEL).p_value > 0.01
 
 
 @pytest.mark.parametrize("taps", [signal.bessel(3, 0.4, norm="mag"), signal.butter(4, 0.3)], ids=["bessel", "butter"])
@@ -386,6 +389,6 @@ def test_a_steep_filter_makes_no_outliers_and_changes_no_level(taps, n: int):
     recording, simulation = normal(3, n + 500, g=g), normal(3, n, g=g)
     recording[0] = torch.from_numpy(signal.lfilter(*taps, recording[0].numpy()))
     given = prepared(recording[:, 500:], simulation, None, g)
-    assert float(left_out(given.recorded).z[0].abs().max()) < 6
-    assert impulses.spike_witness(given).p_value > LEVEL
-    assert noise_level.variance_witness(given).p_value > LEVEL
+    assert float(left_out(given.observed).z[0].abs().max()) < 6
+    assert impulses.outliers_test(given).p_value > LEVEL
+    assert noise_level.variance_test(given).p_value > LEVEL

@@ -12,24 +12,21 @@ from scipy import integrate, stats
 from torch import Tensor
 
 from gyrofuse import AR1, RandomWalk, WhiteNoise
-from gyrofuse.mismatch import (
-    episodes,
-    hysteresis,
-    impulses,
-    modulation,
-    noise_level,
-    oscillating,
-    outliers,
-    shapes,
-    sweeps,
-)
-from gyrofuse.mismatch.case import Case, Scene
-from gyrofuse.mismatch.mechanisms.common_mode import CommonMode
-from gyrofuse.mismatch.mechanisms.drifting_tone import DriftingTone
-from gyrofuse.mismatch.mechanisms.parameter_shift import ParameterShift
-from gyrofuse.mismatch.mechanisms.resonance import Resonance
-from gyrofuse.mismatch.mechanisms.spikes import Spikes
-from gyrofuse.mismatch.mechanisms.variance_change import VarianceChange
+from gyrofuse.mismatch.detectors.lines import chirps as sweeps
+from gyrofuse.mismatch.detectors.slow import hysteresis
+from gyrofuse.mismatch.detectors.variance import modulation, noise_level
+from gyrofuse.mismatch.detectors.variance import outliers as impulses
+from gyrofuse.mismatch.likelihoods import outlier_law as outliers
+from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
+from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
+from gyrofuse.mismatch.mechanisms.spectra import joint_fit as shapes
+from gyrofuse.mismatch.mechanisms.spectra import oscillation as oscillating
+from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
+from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
+from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
+from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.stats import segments as episodes
 
 N, P, RATE = 2**14, 3, 100.0
 NOISE = WhiteNoise(1.0) + AR1(0.999, 1e-4) + RandomWalk(1e-8)
@@ -40,8 +37,8 @@ def drawn(seed: int) -> tuple[Tensor, Tensor, torch.Generator]:
     return NOISE.simulate(N, batch=(P,), generator=g), NOISE.simulate(N, batch=(2, P), generator=g), g
 
 
-def scene(**channels: Tensor) -> Scene:
-    return Scene(RATE, "deg/s", ("x", "y", "z"), channels)
+def info(**channels: Tensor) -> RecordingInfo:
+    return RecordingInfo(RATE, "deg/s", ("x", "y", "z"), channels)
 
 
 def louder(recording: Tensor, log_sd: Tensor) -> Tensor:
@@ -89,20 +86,20 @@ def test_modulation_names_its_sensors_however_many_there_are(p: int) -> None:
 def test_noise_with_a_period_is_seen_and_has_no_name() -> None:
     recording, simulation, _ = drawn(1)
     t = torch.arange(N, dtype=torch.float64)
-    case = Case.of(scene(), louder(recording, 0.1 * torch.sin(2 * math.pi * 0.0371 * t)), simulation)
-    found = noise_level.variance_witness(case)
+    comparison = Comparison.of(info(), louder(recording, 0.1 * torch.sin(2 * math.pi * 0.0371 * t)), simulation)
+    found = noise_level.variance_test(comparison)
     assert found.p_value < 1e-6
     assert found.frequency_hz == pytest.approx(3.71, abs=0.01)
-    assert VarianceChange.nominate(case, LEVEL) is None
-    assert Spikes.nominate(case, LEVEL) is None
+    assert VarianceChange.detect_and_fit(comparison, LEVEL) is None
+    assert Spikes.detect_and_fit(comparison, LEVEL) is None
 
 
 def test_noise_that_wanders_is_seen_and_has_no_episode() -> None:
     recording, simulation, g = drawn(2)
     wander = AR1(0.997, 0.15**2 * (1 - 0.997**2)).simulate(N, generator=g)
-    case = Case.of(scene(), louder(recording, wander), simulation)
-    assert noise_level.variance_witness(case).p_value < 1e-6
-    assert VarianceChange.nominate(case, LEVEL) is None
+    comparison = Comparison.of(info(), louder(recording, wander), simulation)
+    assert noise_level.variance_test(comparison).p_value < 1e-6
+    assert VarianceChange.detect_and_fit(comparison, LEVEL) is None
 
 
 @pytest.mark.parametrize("seed", [700, 701])
@@ -111,16 +108,18 @@ def test_noise_that_wanders_slowly_is_no_episode_of_another_level(seed: int) -> 
     recording, simulation, g = drawn(seed)
     phi = math.exp(-10 / N)
     wander = AR1(phi, 0.07**2 * (1 - phi**2)).simulate(N, generator=g)
-    case = Case.of(scene(), louder(recording, wander), simulation)
-    assert noise_level.variance_witness(case).p_value < 1e-6
-    assert VarianceChange.nominate(case, LEVEL) is None
+    comparison = Comparison.of(info(), louder(recording, wander), simulation)
+    assert noise_level.variance_test(comparison).p_value < 1e-6
+    assert VarianceChange.detect_and_fit(comparison, LEVEL) is None
 
 
 def test_noise_that_a_simulation_modulates_as_well_is_not_missing() -> None:
     recording, simulation, _ = drawn(3)
     wave = 0.1 * torch.sin(2 * math.pi * 0.0371 * torch.arange(N, dtype=torch.float64))
-    case = Case.of(scene(), louder(recording, wave), louder(simulation.flatten(0, 1), wave).view_as(simulation))
-    assert noise_level.modulation(case).p_value > 0.01
+    comparison = Comparison.of(
+        info(), louder(recording, wave), louder(simulation.flatten(0, 1), wave).view_as(simulation)
+    )
+    assert noise_level.modulation(comparison).p_value > 0.01
 
 
 def test_witnesses_are_honest() -> None:
@@ -130,11 +129,11 @@ def test_witnesses_are_honest() -> None:
         common = normal(1, N, g=g)
         recording, simulation = recording + common, simulation + normal(2, 1, N, g=g)
         t = torch.arange(N, dtype=torch.float64) / N
-        case = Case.of(scene(temperature=20 + torch.sin(14 * t + seed)), recording, simulation)
+        comparison = Comparison.of(info(temperature=20 + torch.sin(14 * t + seed)), recording, simulation)
         values = (
-            noise_level.modulation(case).p_value,
-            sweeps.sweep_witness(case).p_value,
-            hysteresis.hysteresis_witness(case).p_value,
+            noise_level.modulation(comparison).p_value,
+            sweeps.chirp_test(comparison).p_value,
+            hysteresis.hysteresis_test(comparison).p_value,
         )
         low += np.array(values) < 0.05
     # More than 3 of 10 at 5 % have probability 1e-3.
@@ -150,20 +149,20 @@ def test_heavy_tailed_laws_are_normalised() -> None:
         assert total == pytest.approx(1, abs=1e-6)
 
 
-def with_laplace(seed: int, size: float) -> Case:
+def with_laplace(seed: int, size: float) -> Comparison:
     """Part of the white noise is a Laplace variable's, of `size` sd."""
     recording, simulation, g = drawn(seed)
     u = even(P, N, g=g) - 0.5
     laplace = -u.sign() * torch.log1p(-2 * u.abs()) / math.sqrt(2)
-    return Case.of(scene(), math.sqrt(1 - size**2) * recording + size * laplace, simulation)
+    return Comparison.of(info(), math.sqrt(1 - size**2) * recording + size * laplace, simulation)
 
 
 @pytest.mark.parametrize(("size", "p_value"), [(0.8, 1e-30), (0.5, 1e-3)])
 def test_noise_that_is_heavy_tailed_throughout_is_seen_and_is_no_spikes(size: float, p_value: float) -> None:
     """A law of outliers has two numbers more a sensor than one of heavy tails, and by chance gains more for them."""
-    for case in (with_laplace(30 + seed, size) for seed in range(4, 14)):
-        assert impulses.spike_witness(case).p_value < p_value
-        assert Spikes.nominate(case, LEVEL) is None
+    for comparison in (with_laplace(30 + seed, size) for seed in range(4, 14)):
+        assert impulses.outliers_test(comparison).p_value < p_value
+        assert Spikes.detect_and_fit(comparison, LEVEL) is None
 
 
 def test_a_few_outliers_are_no_other_law_of_all_noise() -> None:
@@ -228,13 +227,13 @@ def test_a_line_that_moves_is_seen_with_either_sign() -> None:
     t = torch.arange(N, dtype=torch.float64)
     phase = 2 * math.pi * (0.1 * t + 0.3 * t.square() / (2 * N))
     gains = torch.tensor([1.0, -1.0, 0.0], dtype=torch.float64)[:, None]
-    case = Case.of(scene(), recording + 0.17 * gains * phase.cos(), simulation)
-    found = sweeps.sweep_witness(case)
+    comparison = Comparison.of(info(), recording + 0.17 * gains * phase.cos(), simulation)
+    found = sweeps.chirp_test(comparison)
     assert found.p_value < 1e-4
     assert found.sensors == (0, 1)
     assert "from 10 Hz to 40 Hz" in found.words
-    both = Case.of(scene(), case.recording, simulation + 0.17 * gains * phase.cos())
-    assert sweeps.sweep_witness(both).p_value > 0.01
+    both = Comparison.of(info(), comparison.recording, simulation + 0.17 * gains * phase.cos())
+    assert sweeps.chirp_test(both).p_value > 0.01
 
 
 @pytest.mark.parametrize("amplitude", [0.3, 1.0])
@@ -242,12 +241,12 @@ def test_a_strong_sweep_is_no_resonance(amplitude: float, monkeypatch: pytest.Mo
     recording, simulation, _ = drawn(21)
     t = torch.arange(N, dtype=torch.float64)
     phase = 2 * math.pi * (0.1 * t + 0.3 * t.square() / (2 * N))
-    case = Case.of(scene(), recording + amplitude * phase.cos(), simulation)
+    comparison = Comparison.of(info(), recording + amplitude * phase.cos(), simulation)
     named = (Resonance, DriftingTone, CommonMode, ParameterShift)
-    assert [m.name for m in named if m.nominate(case, LEVEL) is not None] == []
+    assert [m.name for m in named if m.detect_and_fit(comparison, LEVEL) is not None] == []
     for module in (shapes, oscillating):  # it is the sweep that tells
         monkeypatch.setattr(module, "swept", lambda *_: False)
-    assert [m.name for m in named if m.nominate(case, LEVEL) is not None]
+    assert [m.name for m in named if m.detect_and_fit(comparison, LEVEL) is not None]
 
 
 # Hysteresis.
@@ -273,13 +272,13 @@ def test_a_bias_that_depends_on_the_way_is_seen() -> None:
     up = hysteresis.relays(temperature[:: N // 256])
     path = up[len(up) // 2].repeat_interleave(N // 256)
     channels = {"temperature": temperature}
-    assert hysteresis.hysteresis_witness(Case.of(scene(**channels), recording, simulation)).p_value > 0.01
+    assert hysteresis.hysteresis_test(Comparison.of(info(**channels), recording, simulation)).p_value > 0.01
     recording[1] += 0.25 * path
-    found = hysteresis.hysteresis_witness(Case.of(scene(**channels), recording, simulation))
+    found = hysteresis.hysteresis_test(Comparison.of(info(**channels), recording, simulation))
     assert found.p_value < 1e-3
     assert found.channel == "temperature"
     assert 1 in found.sensors
-    assert hysteresis.hysteresis_witness(Case.of(scene(), recording, simulation)).p_value == 1.0
+    assert hysteresis.hysteresis_test(Comparison.of(info(), recording, simulation)).p_value == 1.0
 
 
 def test_a_loop_of_all_sensors_is_no_noise_in_common() -> None:
@@ -288,8 +287,8 @@ def test_a_loop_of_all_sensors_is_no_noise_in_common() -> None:
     temperature = 25 + 3 * torch.sin(2 * math.pi * 2.2 * t)
     path = hysteresis.relays(temperature[:: N // 256])
     recording += 0.3 * path[len(path) // 2].repeat_interleave(N // 256)
-    case = Case.of(scene(temperature=temperature), recording, simulation)
-    without = Case.of(scene(), recording, simulation)
-    assert CommonMode.nominate(without, 1e-3) is not None
-    assert CommonMode.nominate(case, 1e-3) is None
-    assert hysteresis.hysteresis_witness(case).p_value < 1e-3
+    comparison = Comparison.of(info(temperature=temperature), recording, simulation)
+    without = Comparison.of(info(), recording, simulation)
+    assert CommonMode.detect_and_fit(without, 1e-3) is not None
+    assert CommonMode.detect_and_fit(comparison, 1e-3) is None
+    assert hysteresis.hysteresis_test(comparison).p_value < 1e-3

@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.mismatch.inputs import prepared
-from gyrofuse.mismatch.mechanisms.g_sensitivity import GSensitivity
-from gyrofuse.mismatch.mechanisms.quantization import Quantization
-from gyrofuse.mismatch.mechanisms.step import Step
-from gyrofuse.mismatch.own_effects import with_own_effects
-from gyrofuse.mismatch.repaired import RepairedModel
+from gyrofuse.mismatch.mechanisms.signals.g_sensitivity import GSensitivity
+from gyrofuse.mismatch.mechanisms.signals.step import Step
+from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
+from gyrofuse.mismatch.repair.inputs import prepared
+from gyrofuse.mismatch.repair.reference_effects import with_own_effects
+from gyrofuse.mismatch.repair.repaired_model import RepairedModel
 
 N, P, RATE = 16384, 3, 100.0
 NOISE = gf.ArrayModel.from_sensors([gf.WhiteNoise(1.0 + i / 10) + gf.AR1(0.99, 1e-3) for i in range(P)])
@@ -107,8 +107,8 @@ def test_a_simulation_without_the_effect_is_not_said_to_have_it(change: Callable
     for seed in range(30):
         g = generator(500 + seed)
         given, simulation = (wandering.simulate(N, batch=(P,), generator=g) for _ in range(2))
-        case = prepared(recording(change(given)), recording(simulation), None, g)
-        said += bool(with_own_effects(case, recording(simulation), 5e-4, g)[1])
+        comparison = prepared(recording(change(given)), recording(simulation), None, g)
+        said += bool(with_own_effects(comparison, recording(simulation), 5e-4, g)[1])
     assert said == 0
 
 
@@ -138,7 +138,7 @@ def recording_of_two(x: Tensor) -> gf.Recording:
 
 
 def test_one_that_is_repaired_has_to_fit_the_recording():
-    model = RepairedModel(NOISE, gf.diagnose(recording(drawn(1)), NOISE).model.scene)
+    model = RepairedModel(NOISE, gf.diagnose(recording(drawn(1)), NOISE).model.info)
     follows = model + GSensitivity("acceleration", SIZE[:, None])
     bare = gf.Recording(drawn(1), rate=RATE, unit="deg/s")
     with pytest.raises(ValueError, match="`channels`: expected acceleration, which the simulation follows, got none"):
@@ -174,7 +174,7 @@ def test_hidden_rounding_over_a_few_steps_has_the_law_of_rounding_and_later_nois
     physical = torch.round(sd * clean) + later * late
     plain = float(physical.std()) * torch.randn(1, n, generator=g, dtype=torch.float64)
     one = torch.ones(1, dtype=torch.float64)
-    made = Quantization(step * one, 0 * one, later * one, plain.mean(-1)).simulated(plain, None, g)[0]  # type: ignore[arg-type]
+    made = Quantization(step * one, 0 * one, later * one, plain.mean(-1)).apply(plain, None, g)[0]  # type: ignore[arg-type]
     for u in torch.linspace(0.5, 7.0, 27, dtype=torch.float64):
         expected = torch.exp(1j * u * physical).mean()
         assert abs(torch.exp(1j * u * made).mean() - expected) < 5 / n**0.5, u

@@ -14,14 +14,15 @@ from pages import Page
 from reference import haar as naive
 
 import gyrofuse as gf
-from gyrofuse.mismatch import Finding, MismatchReport, telling
-from gyrofuse.mismatch.case import Case
-from gyrofuse.mismatch.comparison import compared_powers, compared_variances, grouped_spectrum
-from gyrofuse.mismatch.evidence import Evidence
-from gyrofuse.mismatch.inputs import prepared
-from gyrofuse.mismatch.mechanism import Parameter
-from gyrofuse.mismatch.page import mismatch_page
-from gyrofuse.mismatch.plots import ends_of_colours, plot_map
+from gyrofuse.mismatch import Finding, MismatchReport
+from gyrofuse.mismatch.detectors.result import TestResult
+from gyrofuse.mismatch.mechanisms.mechanism import Parameter
+from gyrofuse.mismatch.repair.inputs import prepared
+from gyrofuse.mismatch.reporting import text as telling
+from gyrofuse.mismatch.reporting.figures_data import compared_powers, compared_variances, grouped_spectrum
+from gyrofuse.mismatch.reporting.page import mismatch_page
+from gyrofuse.mismatch.reporting.plots import ends_of_colours, plot_map
+from gyrofuse.mismatch.signals.comparison import Comparison
 
 N, RATE, TONE = 2**13, 50.0, 7.3
 NAMES = ("left", "<b>right</b>", "{{ 7 * 7 }}")
@@ -37,16 +38,16 @@ def tone(n: int = N) -> torch.Tensor:
     return torch.tensor([0.3, 0.0, 0.15], dtype=torch.float64)[:, None] * turn.cos()
 
 
-def recorded(with_tone: bool = True) -> gf.Recording:
+def observed(with_tone: bool = True) -> gf.Recording:
     return gf.Recording(drawn(N, 1) + with_tone * tone(), rate=RATE, unit="deg/s", sensors=NAMES)
 
 
 @functools.cache
 def report(with_tone: bool = True) -> MismatchReport:
-    return gf.diagnose(recorded(with_tone), NOISE)
+    return gf.diagnose(observed(with_tone), NOISE)
 
 
-def sides(recording: torch.Tensor, simulation: torch.Tensor) -> Case:
+def sides(recording: torch.Tensor, simulation: torch.Tensor) -> Comparison:
     return prepared(recording, simulation, None, torch.Generator().manual_seed(0))
 
 
@@ -91,7 +92,7 @@ def test_the_page_has_every_parameter_with_limits_and_unit():
 def test_the_page_names_every_witness_and_what_was_ruled_out():
     told = page(report())
     for before, after in zip(report().evidence, report().evidence_after, strict=True):
-        row = next(row for row in told.rows if row[0] == before.witness.replace("_", " "))
+        row = next(row for row in told.rows if row[0] == before.test.replace("_", " "))
         assert float(row[1]) == pytest.approx(before.p_value, rel=0.06)
         assert float(row[2]) == pytest.approx(after.p_value, rel=0.06)
         assert telling.capital(before.words) in row[3]
@@ -101,7 +102,7 @@ def test_the_page_names_every_witness_and_what_was_ruled_out():
 
 
 def test_what_is_left_and_what_cannot_be_told_apart_is_said():
-    left = (Evidence("spectrum", 1e-9, "power near 3 Hz is twice the simulation's"),)
+    left = (TestResult("spectrum", 1e-9, "power near 3 Hz is twice the simulation's"),)
     finding = dataclasses.replace(
         report().findings[0], alternatives=("drifting_tone", "something_new"), time_s=12.0, channel="temperature"
     )
@@ -126,7 +127,7 @@ def test_what_stays_is_said_once() -> None:
             unexplained=(stays,),
         )
         shown = page(outcome)
-        row = next(row for row in shown.rows if row[0] == before.witness.replace("_", " "))
+        row = next(row for row in shown.rows if row[0] == before.test.replace("_", " "))
         assert row[-1] == f"{telling.capital(before.words)}. {told}"
         assert f"{stays.words} (p < 1e-300)." in shown.text
 
@@ -149,7 +150,7 @@ def test_a_difference_without_a_name_is_told_as_such():
     assert "What the simulation leaves out could not be named." in page(told).text
     assert "Unexplained, as seen by" in page(told).text
     assert "before and after the repair" in page(told).text, "it is repaired all the same"
-    assert "before and after the repair" not in page(dataclasses.replace(told, repaired=told.case)).text
+    assert "before and after the repair" not in page(dataclasses.replace(told, repaired=told.comparison)).text
 
 
 def test_no_line_breaks_within_an_arrow():
@@ -190,24 +191,25 @@ def test_map_marks_what_chance_does_not_give_and_greys_what_is_unknown():
 
 
 def test_wavelet_variances_are_those_of_both_sides():
-    case = report().case
-    compared = compared_variances(case)[0]
+    comparison = report().comparison
+    compared = compared_variances(comparison)[0]
     for j in (1, 4, 9):
-        expected = [float((naive.coefficients(x, j) ** 2).mean()) for x in case.recording.numpy()]
-        np.testing.assert_allclose(compared.recorded[j - 1], expected, rtol=1e-9)
+        expected = [float((naive.coefficients(x, j) ** 2).mean()) for x in comparison.recording.numpy()]
+        np.testing.assert_allclose(compared.observed[j - 1], expected, rtol=1e-9)
         each = [
-            [float((naive.coefficients(x, j) ** 2).mean()) for x in record] for record in case.simulated.signal.numpy()
+            [float((naive.coefficients(x, j) ** 2).mean()) for x in record]
+            for record in comparison.reference.signal.numpy()
         ]
-        np.testing.assert_allclose(compared.simulated[j - 1], np.mean(each, 0), rtol=1e-9)
+        np.testing.assert_allclose(compared.reference[j - 1], np.mean(each, 0), rtol=1e-9)
 
 
 def test_standard_deviations_are_those_of_records_that_agree():
     """Over 30 pairs of a recording and a simulation: mean square of z near 1 where levels hold many windows."""
     z, powers = [], []
     for seed in range(30):
-        case = sides(drawn(4096, 100 + seed), drawn(3 * 4096, 200 + seed))
-        z.append(compared_variances(case)[0].z[:7])
-        powers.append(compared_powers(case))
+        comparison = sides(drawn(4096, 100 + seed), drawn(3 * 4096, 200 + seed))
+        z.append(compared_variances(comparison)[0].z[:7])
+        powers.append(compared_powers(comparison))
     # 90 independent values at each level, and levels correlate: 5 standard deviations of the mean of 90 squares.
     for values in (torch.stack(z), torch.stack(powers)):
         size = values.square().mean((0, 2))
@@ -216,26 +218,26 @@ def test_standard_deviations_are_those_of_records_that_agree():
 
 
 def test_a_short_simulation_leaves_levels_unknown():
-    case = sides(drawn(2**15, 1), drawn(4096, 2))
-    compared = compared_variances(case)[0]
-    assert compared.recorded.isfinite().all()
+    comparison = sides(drawn(2**15, 1), drawn(4096, 2))
+    compared = compared_variances(comparison)[0]
+    assert compared.observed.isfinite().all()
     assert compared.z[:12].isfinite().all()
     assert compared.z[12:].isnan().all()
-    assert compared_powers(case).isnan().any()
+    assert compared_powers(comparison).isnan().any()
 
 
 def test_spectrum_is_the_periodogram_over_the_simulations():
-    case = report().case
-    spectrum = grouped_spectrum(case, case.recorded, 0)
-    x = case.recording[0].numpy() - case.recording[0].numpy().mean()
+    comparison = report().comparison
+    spectrum = grouped_spectrum(comparison, comparison.observed, 0)
+    x = comparison.recording[0].numpy() - comparison.recording[0].numpy().mean()
     taper = 2 * np.sin(np.pi * np.arange(N) / N) ** 2 * math.sqrt(2 / 3)
     power = np.abs(np.fft.rfft(x * taper)) ** 2 / N
     f = np.arange(len(power)) / N
-    ratio = power[2:-2] / case.base.spectrum(torch.from_numpy(f[2:-2]))[0].numpy()
+    ratio = power[2:-2] / comparison.base.spectrum(torch.from_numpy(f[2:-2]))[0].numpy()
     assert float(spectrum.largest.max()) == pytest.approx(ratio.max(), rel=1e-9)
     at = float(spectrum.frequency[spectrum.largest.argmax()])
     assert at * RATE == pytest.approx(TONE, rel=0.05)
-    calm = grouped_spectrum(case, case.simulated, 0)
+    calm = grouped_spectrum(comparison, comparison.reference, 0)
     assert len(calm.mean) == len(spectrum.mean)
     assert bool((calm.mean <= calm.largest).all())
     assert float(calm.largest.max()) < 15 < float(spectrum.largest.max())
@@ -243,16 +245,16 @@ def test_spectrum_is_the_periodogram_over_the_simulations():
 
 def test_correct_takes_the_tone_off_recordings_and_tensors():
     clean = drawn(N, 1)
-    corrected = report().correct(recorded())
+    corrected = report().correct(observed())
     assert isinstance(corrected, gf.Recording)
     assert (corrected.rate, corrected.unit, corrected.sensors) == (RATE, "deg/s", NAMES)
     left = (corrected.signal - clean).square().mean(-1)
     assert bool((left < 0.05 * tone().square().mean(-1).clamp(min=1e-2)).all())
-    torch.testing.assert_close(report().correct(recorded().signal), corrected.signal, rtol=0, atol=0)
-    turned = report().correct(recorded().to("rad/s"))
+    torch.testing.assert_close(report().correct(observed().signal), corrected.signal, rtol=0, atol=0)
+    turned = report().correct(observed().to("rad/s"))
     assert turned.unit == "rad/s"
     torch.testing.assert_close(turned.to("deg/s").signal, corrected.signal, rtol=0, atol=1e-12)
-    single = report().correct(recorded().signal.float())
+    single = report().correct(observed().signal.float())
     assert single.dtype == torch.float32
     torch.testing.assert_close(single.double(), corrected.signal, rtol=0, atol=1e-5)
 
@@ -266,7 +268,7 @@ def test_correct_refuses_other_sensors():
 
 def test_benefit_is_what_fusing_both_gives():
     gained = report().benefit("short")
-    before, after = recorded().signal, report().correct(recorded().signal)
+    before, after = observed().signal, report().correct(observed().signal)
     for signal, weights, variance in (
         (before, gained.before, gained.variance_before),
         (after, gained.after, gained.variance_after),
@@ -286,9 +288,11 @@ def test_the_gain_is_said_where_anything_is_taken_off():
     assert sentence.startswith("Fused for long averaging times, the corrected recording gives a virtual gyro ")
     assert sentence in report().summary()
     assert sentence in page(report()).text
-    copied = recorded().signal[[0, 0]]
-    case = dataclasses.replace(report().case, scene=dataclasses.replace(report().case.scene, sensors=("a", "b")))
-    twice = dataclasses.replace(report(), case=case.with_recording(copied))
+    copied = observed().signal[[0, 0]]
+    comparison = dataclasses.replace(
+        report().comparison, info=dataclasses.replace(report().comparison.info, sensors=("a", "b"))
+    )
+    twice = dataclasses.replace(report(), comparison=comparison.with_recording(copied))
     assert telling.benefit_of(dataclasses.replace(twice, model=dataclasses.replace(twice.model, effects=()))) is None
 
 
@@ -306,7 +310,7 @@ def test_parameters_have_names_for_readers(name: str, told: str):
 
 
 def test_digits_are_those_that_the_interval_leaves():
-    from gyrofuse.mismatch.page import _resolved
+    from gyrofuse.mismatch.reporting.page import _resolved
 
     assert _resolved(Parameter(137.200123, 137.200100, 137.200146, "Hz"))["low"] == "137.2001"
     assert _resolved(Parameter(2.76896e-05, 2.0579e-05, 3.48e-05, "deg/s"))["value"] == "2.77e-05"

@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy import stats
 
-from gyrofuse.mismatch.partakers import _SIZES, _least, _log_ratio, partakers
+from gyrofuse.mismatch.stats.inclusion import _SIZES, _least, _log_ratio, included_sensors
 
 
 @pytest.mark.parametrize("dof", [1, 2, 3])
@@ -26,17 +26,17 @@ def test_little_is_chance_beside_much_and_counts_beside_little():
     little, chance = 2.3**2, 0.04
     among_strong = torch.tensor([15.0**2, 14.0**2, little, 0.3], dtype=torch.float64)
     among_weak = torch.tensor([3.4**2, 3.1**2, little, 0.3], dtype=torch.float64)
-    assert partakers(among_strong, 1, chance).positions == (0, 1)
-    assert partakers(among_weak, 1, chance).positions == (0, 1, 2)
-    assert partakers(among_weak, 1, chance).least < partakers(among_strong, 1, chance).least
-    assert partakers(torch.tensor([0.1, 0.4, 0.2], dtype=torch.float64), 1, chance).positions == (1,)
+    assert included_sensors(among_strong, 1, chance).positions == (0, 1)
+    assert included_sensors(among_weak, 1, chance).positions == (0, 1, 2)
+    assert included_sensors(among_weak, 1, chance).least < included_sensors(among_strong, 1, chance).least
+    assert included_sensors(torch.tensor([0.1, 0.4, 0.2], dtype=torch.float64), 1, chance).positions == (1,)
 
 
 def test_what_is_beyond_doubt_takes_part_beside_anything():
     strong = torch.tensor([100.0, 70.0, 20.0, 120.0, 50.0, 0.5], dtype=torch.float64).square()
-    assert partakers(strong, 1, 0.04).positions == (0, 1, 2, 3, 4)
-    assert partakers(torch.tensor([1e12, 1e9, 60.0, 2.0], dtype=torch.float64), 2, 0.04).positions == (0, 1, 2)
-    assert partakers(torch.tensor([math.nan, 1.0], dtype=torch.float64), 1, 0.04).positions == (1,)
+    assert included_sensors(strong, 1, 0.04).positions == (0, 1, 2, 3, 4)
+    assert included_sensors(torch.tensor([1e12, 1e9, 60.0, 2.0], dtype=torch.float64), 2, 0.04).positions == (0, 1, 2)
+    assert included_sensors(torch.tensor([math.nan, 1.0], dtype=torch.float64), 1, 0.04).positions == (1,)
 
 
 @pytest.mark.parametrize(("dof", "total", "share"), [(1, 60.0, 0.78), (1, 200.0, 0.985), (3, 60.0, 0.65)])
@@ -50,6 +50,6 @@ def test_the_exact_set_is_found_as_often_as_sizes_that_are_alike_allow(dof: int,
         size *= total / size.sum()
         z = rng.standard_normal((6, dof))
         z[:, 0] += np.sqrt(size)
-        found = partakers(torch.from_numpy((z**2).sum(-1)), dof, 0.04)
+        found = included_sensors(torch.from_numpy((z**2).sum(-1)), dof, 0.04)
         right += found.which.tolist() == (size > 0).tolist()
     assert right / n > share - 3 * math.sqrt(share * (1 - share) / n)

@@ -3,26 +3,33 @@
 from __future__ import annotations
 
 import math
+import sys
 
 import pytest
 import torch
 from scipy import stats
 
 import gyrofuse as gf
-from gyrofuse.mismatch import diagnose, engine
-from gyrofuse.mismatch.case import Case, Scene
-from gyrofuse.mismatch.classifier import area_under_curve, distinguishability, features
-from gyrofuse.mismatch.confirm import discrepancy_left, discrepancy_p_value, held_out, held_out_gain, mean_discrepancy
-from gyrofuse.mismatch.folds import N_FOLDS, estimation_samples, held_out_blocks, in_fold
-from gyrofuse.mismatch.mechanisms.flicker import FlickerNoise
-from gyrofuse.mismatch.mechanisms.quantization import Quantization
-from gyrofuse.mismatch.mechanisms.step import Step
-from gyrofuse.mismatch.remainder import Remainder
-from gyrofuse.mismatch.repaired import RepairedModel
-from gyrofuse.mismatch.slow_remainder import SlowRemainder
+from gyrofuse.mismatch import diagnose
+from gyrofuse.mismatch.mechanisms.remainder import Remainder
+from gyrofuse.mismatch.mechanisms.signals.step import Step
+from gyrofuse.mismatch.mechanisms.slow_remainder import SlowRemainder
+from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
+from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
+from gyrofuse.mismatch.repair.repaired_model import RepairedModel
+from gyrofuse.mismatch.selection.classifier import area_under_curve, distinguishability, features
+from gyrofuse.mismatch.selection.held_out import (
+    discrepancy_left,
+    discrepancy_p_value,
+    held_out,
+    held_out_gain,
+    mean_discrepancy,
+)
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.folds import N_FOLDS, estimation_samples, held_out_blocks, in_fold
 
 N, P = 8192, 3
-SCENE = Scene(100.0, "deg/s", ("1", "2", "3"))
+SCENE = RecordingInfo(100.0, "deg/s", ("1", "2", "3"))
 NONE = torch.zeros(P, dtype=torch.float64)
 
 
@@ -34,8 +41,8 @@ def white(seed: int, n_records: int = 4) -> torch.Tensor:
     return torch.randn(n_records, P, N, generator=generator(seed), dtype=torch.float64)
 
 
-def case(recording: torch.Tensor, seed: int = 2) -> Case:
-    return Case.of(SCENE, recording, white(seed))
+def comparison(recording: torch.Tensor, seed: int = 2) -> Comparison:
+    return Comparison.of(SCENE, recording, white(seed))
 
 
 def rounding(step: float) -> Quantization:
@@ -56,8 +63,8 @@ def test_every_sample_is_held_out_once_and_estimates_never_see_it():
 def test_rounding_stays_last_whatever_is_found_after_it():
     g = generator(3)
     noise = FlickerNoise(torch.full((P,), 0.3, dtype=torch.float64))
-    after = noise.explained(rounding(0.5).explained(case(white(1)[0]), g), g)
-    steps = after.simulated.signal / 0.5
+    after = noise.repair(rounding(0.5).repair(comparison(white(1)[0]), g), g)
+    steps = after.reference.signal / 0.5
     assert torch.allclose(steps, steps.round())
     assert float(after.analog.diff().abs().amin()) > 0
     model = gf.ArrayModel.from_sensors([gf.Model([gf.WhiteNoise(1.0)])] * P)
@@ -75,16 +82,16 @@ def test_what_happened_once_is_not_expected_elsewhere():
 def test_a_remainder_has_the_ratio_of_the_spectra():
     f = torch.linspace(0.01, 0.49, 50, dtype=torch.float64)
     coloured = white(1)[0] + 0.8 * white(1)[0].roll(1, -1)
-    found = Remainder.of(case(coloured))
+    found = Remainder.of(comparison(coloured))
     truth = (1 + 0.64 + 1.6 * torch.cos(2 * math.pi * f)).log() / 2
     assert float((found.response(f).log() - truth).abs().mean()) < 0.08
-    before, after = case(coloured), found.explained(case(coloured), generator(1))
-    one, other = (c.recorded.power.log() - c.simulated.power.log() for c in (before, after))
+    before, after = comparison(coloured), found.repair(comparison(coloured), generator(1))
+    one, other = (c.observed.power.log() - c.reference.power.log() for c in (before, after))
     assert float(other.abs().mean()) < 0.3 * float(one.abs().mean())
 
 
 def test_nothing_remains_where_nothing_differs():
-    assert float(Remainder.of(case(white(1)[0])).log_gain.abs().mean()) < 0.03
+    assert float(Remainder.of(comparison(white(1)[0])).log_gain.abs().mean()) < 0.03
 
 
 def test_a_difference_without_a_name_stays_unexplained_and_is_filled_in():
@@ -110,9 +117,9 @@ def test_area_under_the_curve_counts_pairs():
 
 
 def test_nobody_tells_what_is_alike_and_anybody_what_is_louder():
-    areas = torch.tensor([[distinguishability(case(white(s)[0], s + 50), 0) for s in range(12)]])
+    areas = torch.tensor([[distinguishability(comparison(white(s)[0], s + 50), 0) for s in range(12)]])
     assert abs(float(areas.mean()) - 0.5) < 3 * float(areas.std()) / math.sqrt(12)
-    assert distinguishability(case(1.3 * white(1)[0]), 0) > 0.9
+    assert distinguishability(comparison(1.3 * white(1)[0]), 0) > 0.9
 
 
 def test_features_are_finite_for_what_stands_still():
@@ -125,27 +132,27 @@ def test_features_are_finite_for_what_stands_still():
 def test_a_remainder_is_estimated_anew_from_the_blocks_of_the_shortest_recordings(n: int):
     """Their last bands are narrower than a bin of a block."""
     recording, simulation = white(3)[0, :, :n], white(4)[:, :, :n]
-    given = Case.of(SCENE, 1.5 * recording, simulation)
+    given = Comparison.of(SCENE, 1.5 * recording, simulation)
     found = Remainder.of(given)
     for fold in range(N_FOLDS):
-        again = found.refitted(given, fold)
+        again = found.fit_without(given, fold)
         assert bool(again.log_gain.isfinite().all())
         assert float(again.log_gain.mean()) == pytest.approx(math.log(1.5), abs=0.2)
-        assert bool(again.gains(given, fold).isfinite().all())
+        assert bool(again.held_out_scores(given, fold).isfinite().all())
 
 
 def test_much_that_is_left_on_blocks_held_out_is_told():
     """Of three sensors with a third more power at all levels; of noise alone nothing, in each of 20 arrays."""
     rng = torch.Generator().manual_seed(4)
-    scene = Scene(1.0, "unknown", ("a", "b", "c"))
+    info = RecordingInfo(1.0, "unknown", ("a", "b", "c"))
     noise = torch.randn(21, 2, 3, 16384, dtype=torch.float64, generator=rng)
-    louder = Case.of(scene, 1.15 * noise[20, 0], noise[20, 1:])
+    louder = Comparison.of(info, 1.15 * noise[20, 0], noise[20, 1:])
     told = discrepancy_left(louder, mean_discrepancy(louder))
     assert told is not None
     assert told.p_value < 1e-6
     assert 1 in told.levels
     for recording, simulation in noise[:20]:
-        alike = Case.of(scene, recording, simulation[None])
+        alike = Comparison.of(info, recording, simulation[None])
         assert discrepancy_left(alike, mean_discrepancy(alike)) is None
 
 
@@ -156,8 +163,8 @@ def test_the_discrepancy_left_has_a_p_value_that_errs_on_the_side_of_chance():
     noise = noise + torch.randn(noise.shape, dtype=torch.float64, generator=rng)
     below = 0
     for recording, simulation in noise:
-        case = Case.of(Scene(1.0, "unknown", ("a", "b")), recording, simulation[None])
-        p = discrepancy_p_value(case, mean_discrepancy(case))
+        comparison = Comparison.of(RecordingInfo(1.0, "unknown", ("a", "b")), recording, simulation[None])
+        p = discrepancy_p_value(comparison, mean_discrepancy(comparison))
         below += p < 0.05
     assert below <= stats.binom.ppf(0.999, 200, 0.05)
 
@@ -169,25 +176,25 @@ def test_what_is_left_of_a_slow_course_is_taken_off_as_it_goes_on_in_what_is_hel
     bends = (2 * math.pi * t / 5000).sin() * (-t / 9000).exp()
     size = torch.zeros(P, 1, dtype=torch.float64)
     size[0], size[1] = 30.0, -20.0
-    given = Case.of(SCENE, signal[0] + size * bends, signal[1:])
+    given = Comparison.of(SCENE, signal[0] + size * bends, signal[1:])
     course = SlowRemainder.of(given)
     gain = held_out_gain(given, course)
     assert gain.confirms(1e-9)
     judged = held_out(given, [gain], g)
     assert judged.before > 3
     assert judged.after < 1.5
-    left = course.removed(given.recording, SCENE) - signal[0]
+    left = course.remove(given.recording, SCENE) - signal[0]
     assert float(left[:2].mean(-1, keepdim=True).sub(left[:2]).abs().max()) < 3
     assert float((course.sizes[2:] != 0).sum()) <= 2  # of the others' noise next to nothing
 
 
 def test_a_slow_course_without_a_name_is_no_finding(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(engine, "STAGES", ())
+    monkeypatch.setattr(sys.modules["gyrofuse.mismatch.diagnose"], "STAGES", ())
     model, n = gf.WhiteNoise(1.0) + gf.RandomWalk(1e-8), 4096
     t, g = torch.arange(n, dtype=torch.float64), generator(2)
     recording = model.simulate(n, batch=(1,), generator=g).double() + 30 * (-t / 500).exp()
     report = diagnose(recording, model.simulate(4 * n, batch=(1,), generator=g), rate=100.0)
-    assert "slow" in [e.witness for e in report.unexplained]
+    assert "slow" in [e.test for e in report.unexplained]
     assert report.findings == ()
     assert "slow_remainder" in [e.name for e in report.model.effects]
     assert report.held_out.low > 0

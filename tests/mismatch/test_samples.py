@@ -10,9 +10,9 @@ from mismatch_draws import SCENE, drawn
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.mismatch.case import Case
-from gyrofuse.mismatch.lattices import exact_lattices, missing_lattices
-from gyrofuse.mismatch.mechanisms.quantization import Quantization
+from gyrofuse.mismatch.detectors.values.quantisation_grid import exact_lattices, missing_lattices
+from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
+from gyrofuse.mismatch.signals.comparison import Comparison
 
 N, P, RATE = 16384, 3, 100.0
 NOISE = gf.WhiteNoise(1.0) + gf.AR1(0.98, 0.004)
@@ -41,17 +41,17 @@ def wandering(frequency: float, g: torch.Generator) -> Tensor:
 def test_what_was_rounded_had_the_variance_and_the_correlation_of_the_noise(step: float) -> None:
     g = generator(1)
     clean = gf.AR1(0.6, 0.64).simulate(2**18, batch=(2, P), generator=g)  # of variance one
-    case = Case.of(SCENE, clean[0], rounded(clean, step))
-    rounding = Quantization.of_simulation(case)
+    comparison = Comparison.of(SCENE, clean[0], rounded(clean, step))
+    rounding = Quantization.of_simulation(comparison)
     assert rounding is not None
-    undone = rounding.undone(case, g)
-    assert undone.simulated.signal is case.simulated.signal
-    again = undone.built_in(lambda x: x).simulated.signal
-    torch.testing.assert_close(again, case.simulated.signal, rtol=0, atol=1e-9)
+    undone = rounding.undone(comparison, g)
+    assert undone.reference.signal is comparison.reference.signal
+    again = undone.apply(lambda x: x).reference.signal
+    torch.testing.assert_close(again, comparison.reference.signal, rtol=0, atol=1e-9)
     for lag in range(4):
         end = clean.shape[-1] - lag
         wanted, found, before = (
-            (x[..., lag:] * x[..., :end]).mean() for x in (clean, undone.analog, case.simulated.signal)
+            (x[..., lag:] * x[..., :end]).mean() for x in (clean, undone.analog, comparison.reference.signal)
         )
         # Rounding adds step^2/12, and even places within steps would add as much again.
         assert abs(found - wanted) < 0.002 + 0.15 * step**2 / 12
@@ -73,12 +73,12 @@ def test_what_is_built_into_rounded_samples_is_rounded_as_they_are() -> None:
     assert not gf.diagnose(recording, report.model, rate=RATE).mismatch
     # What is far smaller than a step is there as well, on average.
     weak = (tone / 10).unsqueeze(0)
-    case = Case.of(SCENE, recording, rounded(noise(N, g), 0.25)[None])
-    rounding = Quantization.of_simulation(case)
+    comparison = Comparison.of(SCENE, recording, rounded(noise(N, g), 0.25)[None])
+    rounding = Quantization.of_simulation(comparison)
     assert rounding is not None
-    built = rounding.undone(case, g).built_in(lambda x: x + weak)
-    assert all(lattice is not None for lattice in exact_lattices(built.simulated))
-    change = built.simulated.signal - case.simulated.signal
+    built = rounding.undone(comparison, g).apply(lambda x: x + weak)
+    assert all(lattice is not None for lattice in exact_lattices(built.reference))
+    change = built.reference.signal - comparison.reference.signal
     assert float((change * weak).sum() / weak.square().sum()) == pytest.approx(1.0, abs=0.35)
 
 
@@ -89,7 +89,7 @@ def test_a_hump_that_the_simulation_has_elsewhere_is_not_doubled(seed: int) -> N
     report = gf.diagnose(recording, simulation, rate=RATE)
     assert report.mismatch
     assert not report.findings
-    assert {"spectrum", "shape", "bump"} & {evidence.witness for evidence in report.unexplained}
+    assert {"spectrum", "shape", "bump"} & {evidence.test for evidence in report.unexplained}
     assert report.held_out.after < 1.2 * max(report.held_out.before, 1.0)
 
 
@@ -142,10 +142,10 @@ def test_what_was_rounded_keeps_its_lines_and_what_sensors_share() -> None:
     white = torch.randn(P, n, generator=g, dtype=torch.float64)
     line = 4 * torch.cos(0.9 * torch.arange(n, dtype=torch.float64))
     clean = (2 * common + white) / math.sqrt(5) + line
-    case = Case.of(SCENE, clean, rounded(clean, 0.5)[None]).knowing((0.9 / (2 * math.pi),))
-    rounding = Quantization.of_simulation(case)
+    comparison = Comparison.of(SCENE, clean, rounded(clean, 0.5)[None]).knowing((0.9 / (2 * math.pi),))
+    rounding = Quantization.of_simulation(comparison)
     assert rounding is not None
-    analog = rounding.undone(case, g).analog[0]
+    analog = rounding.undone(comparison, g).analog[0]
     amplitude = 2 * (analog * torch.cos(0.9 * torch.arange(n))).mean(-1)
     torch.testing.assert_close(amplitude, torch.full((P,), 4.0, dtype=torch.float64), rtol=0, atol=0.015)
     shared = torch.cov(analog - line) - torch.cov(clean - line)
@@ -158,6 +158,6 @@ def test_a_recording_that_something_was_taken_off_has_the_lattice_of_its_simulat
     step = float(recording.diff().std()) / 2
     left = amplitude * step * torch.cos(0.7 * torch.arange(recording.shape[-1]) + 1.0)  # of a tone not quite the one
     given = rounded(recording, step) - left
-    assert Quantization.nominate(Case.of(SCENE, given, rounded(simulation, step)), 1e-3) is None
-    assert missing_lattices(Case.of(SCENE, given, rounded(simulation, step)), 1.0).lattices == {}
-    assert Quantization.nominate(Case.of(SCENE, given, simulation), 1e-3) is not None
+    assert Quantization.detect_and_fit(Comparison.of(SCENE, given, rounded(simulation, step)), 1e-3) is None
+    assert missing_lattices(Comparison.of(SCENE, given, rounded(simulation, step)), 1.0).lattices == {}
+    assert Quantization.detect_and_fit(Comparison.of(SCENE, given, simulation), 1e-3) is not None

@@ -15,44 +15,44 @@ import torch
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.mismatch import saved
-from gyrofuse.mismatch.axes import Axes
-from gyrofuse.mismatch.base import Base
-from gyrofuse.mismatch.case import Scene
-from gyrofuse.mismatch.mechanism import Mechanism
-from gyrofuse.mismatch.mechanisms import CATALOGUE
-from gyrofuse.mismatch.mechanisms.clipping import Clipping
-from gyrofuse.mismatch.mechanisms.clock_skew import ClockSkew
-from gyrofuse.mismatch.mechanisms.common_mode import CommonMode
-from gyrofuse.mismatch.mechanisms.dead_band import DeadBand
-from gyrofuse.mismatch.mechanisms.drifting_tone import DriftingTone
-from gyrofuse.mismatch.mechanisms.flicker import FlickerNoise
-from gyrofuse.mismatch.mechanisms.g_sensitivity import GSensitivity
-from gyrofuse.mismatch.mechanisms.gradual_change import GradualChange
-from gyrofuse.mismatch.mechanisms.low_pass import LowPassFilter
-from gyrofuse.mismatch.mechanisms.parameter_shift import ParameterShift
-from gyrofuse.mismatch.mechanisms.quadratic_coupling import QuadraticCoupling
-from gyrofuse.mismatch.mechanisms.quantization import Quantization
-from gyrofuse.mismatch.mechanisms.random_telegraph import RandomTelegraph
-from gyrofuse.mismatch.mechanisms.resonance import Resonance
-from gyrofuse.mismatch.mechanisms.scale_factor import ScaleFactor
-from gyrofuse.mismatch.mechanisms.spikes import Spikes
-from gyrofuse.mismatch.mechanisms.step import Step
-from gyrofuse.mismatch.mechanisms.stuck_samples import StuckSamples
-from gyrofuse.mismatch.mechanisms.temperature_drift import TemperatureDrift
-from gyrofuse.mismatch.mechanisms.tone_size import ToneSize
-from gyrofuse.mismatch.mechanisms.unit_scale import UnitScale
-from gyrofuse.mismatch.mechanisms.variance_change import VarianceChange
-from gyrofuse.mismatch.mechanisms.vibration_tone import VibrationTone
-from gyrofuse.mismatch.mechanisms.warm_up_transient import Decay, WarmUpTransient
-from gyrofuse.mismatch.oscillating import Mode
-from gyrofuse.mismatch.remainder import Remainder
-from gyrofuse.mismatch.repaired import RepairedModel
-from gyrofuse.mismatch.saved import repaired_from_dict
-from gyrofuse.mismatch.slow_remainder import SlowRemainder
+from gyrofuse.mismatch.mechanisms.catalogue import CATALOGUE
+from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
+from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
+from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
+from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph
+from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
+from gyrofuse.mismatch.mechanisms.remainder import Remainder
+from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
+from gyrofuse.mismatch.mechanisms.signals.g_sensitivity import GSensitivity
+from gyrofuse.mismatch.mechanisms.signals.quadratic_coupling import QuadraticCoupling
+from gyrofuse.mismatch.mechanisms.signals.scale_factor import ScaleFactor
+from gyrofuse.mismatch.mechanisms.signals.step import Step
+from gyrofuse.mismatch.mechanisms.signals.temperature import TemperatureDrift
+from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
+from gyrofuse.mismatch.mechanisms.signals.tone_amplitude import ToneSize
+from gyrofuse.mismatch.mechanisms.signals.warm_up import Decay, WarmUpTransient
+from gyrofuse.mismatch.mechanisms.slow_remainder import SlowRemainder
+from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
+from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
+from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
+from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode
+from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
+from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
+from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
+from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
+from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
+from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
+from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
+from gyrofuse.mismatch.mechanisms.values.unit_scale import UnitScale
+from gyrofuse.mismatch.repair import serialise as saved
+from gyrofuse.mismatch.repair.repaired_model import RepairedModel
+from gyrofuse.mismatch.repair.serialise import repaired_from_dict
+from gyrofuse.mismatch.signals.axes import Axes
+from gyrofuse.mismatch.signals.comparison import RecordingInfo
+from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
 
 NOISE = gf.ArrayModel.from_sensors([gf.WhiteNoise(1.0) + gf.AR1(0.9, 0.1), gf.WhiteNoise(2.0) + gf.AR1(0.8, 0.2)])
-SCENE = Scene(50.0, "deg/s", ("a", "b"))
+SCENE = RecordingInfo(50.0, "deg/s", ("a", "b"))
 
 
 def numbers(*values: float) -> Tensor:
@@ -63,7 +63,7 @@ def complex_numbers(*values: complex) -> Tensor:
     return torch.tensor(values, dtype=torch.complex128)
 
 
-BASE = Base(4096, torch.rand(2, 13, generator=torch.Generator().manual_seed(0), dtype=torch.float64))
+BASE = NoiseSpectrum(4096, torch.rand(2, 13, generator=torch.Generator().manual_seed(0), dtype=torch.float64))
 MODE = Mode(0.11, 0.01, complex_numbers(0.3 + 0.1j, 0.2), True)
 # One of every class in the catalogue, with numbers that JSON has to round and none that are alike.
 EVERY = (
@@ -108,7 +108,7 @@ EVERY = (
 @dataclass(frozen=True, eq=False)
 class Odd(Mechanism):
     name: ClassVar[str] = "odd"
-    base: Base
+    base: NoiseSpectrum
     limits: Annotated[Tensor, Axes(("sensor",), infinite=True)]
     spans: tuple[tuple[float, float], ...]
     channel: str
@@ -137,7 +137,7 @@ def test_simulates_the_same_after_json():
     again = repaired_from_dict(json.loads(json.dumps(first.to_dict(), allow_nan=False)))
     drawn = [m.simulate(500, generator=torch.Generator().manual_seed(1)) for m in (first, again)]
     torch.testing.assert_close(*drawn, rtol=0, atol=0)
-    assert (again.scene.rate, again.scene.unit, again.scene.sensors) == (50.0, "deg/s", ("a", "b"))
+    assert (again.info.rate, again.info.unit, again.info.sensors) == (50.0, "deg/s", ("a", "b"))
     assert str(again) == f"{again.noise} + vibration_tone"
 
 
@@ -156,7 +156,7 @@ def descendants(kind: type) -> set[type]:
 
 
 def test_the_catalogue_lists_every_mechanism():
-    """Those whose `refitted` is not abstract; and there is an instance of each to be tested."""
+    """Those whose `fit_without` is not abstract; and there is an instance of each to be tested."""
     whole = {
         kind
         for kind in descendants(Mechanism)
@@ -227,7 +227,7 @@ def test_says_which_number_is_wrong(effect: type[Mechanism], change: dict[str, o
 
 def test_every_kind_of_number_comes_back(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(saved, "CATALOGUE", (Odd,))
-    base = Base(4096, numbers(1.0, 2.0)[:, None])
+    base = NoiseSpectrum(4096, numbers(1.0, 2.0)[:, None])
     effect = Odd(base, numbers(-math.inf, 2.0), ((0.0, 1.5),), "temperature", True)
     first = model(effect)
     again = repaired_from_dict(json.loads(json.dumps(first.to_dict(), allow_nan=False)))

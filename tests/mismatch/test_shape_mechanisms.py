@@ -13,7 +13,7 @@ from shape_draws import (
     N,
     P,
     array,
-    case,
+    comparison,
     drawn,
     generator,
     nominated,
@@ -23,20 +23,20 @@ from shape_draws import (
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.mismatch.colour import filtered, noise
-from gyrofuse.mismatch.confirm import held_out_gain
-from gyrofuse.mismatch.filter_forms import filter_response, filter_strength
-from gyrofuse.mismatch.mechanism import Mechanism
-from gyrofuse.mismatch.mechanisms.common_mode import CommonMode
-from gyrofuse.mismatch.mechanisms.drifting_tone import DriftingTone
-from gyrofuse.mismatch.mechanisms.flicker import FlickerNoise
-from gyrofuse.mismatch.mechanisms.low_pass import LowPassFilter
-from gyrofuse.mismatch.mechanisms.parameter_shift import ParameterShift
-from gyrofuse.mismatch.mechanisms.resonance import Resonance
-from gyrofuse.mismatch.mechanisms.unit_scale import GRAVITY, UnitScale
-from gyrofuse.mismatch.oscillating import Mode
-from gyrofuse.mismatch.pooled import common_witness
-from gyrofuse.mismatch.shape_scan import shape_witness
+from gyrofuse.mismatch.detectors.spectra.pooled_coherence import common_source_test
+from gyrofuse.mismatch.detectors.spectra.shape_scan import shape_test
+from gyrofuse.mismatch.likelihoods.filter_forms import filter_response, filter_strength
+from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
+from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
+from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
+from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
+from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode
+from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
+from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
+from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
+from gyrofuse.mismatch.mechanisms.values.unit_scale import GRAVITY, UnitScale
+from gyrofuse.mismatch.selection.held_out import held_out_gain
+from gyrofuse.mismatch.signals.filters import filtered, noise
 from gyrofuse.noise.array_model import ArrayModel
 
 
@@ -46,24 +46,24 @@ def test_white_noise_of_which_sensors_share_a_part_is_named_though_no_power_chan
     g = generator(32)
     own, simulation = array((1 - share) * WHITE).simulate(N, generator=g), array().simulate(N, batch=(1,), generator=g)
     gain = (share * WHITE * torch.tensor([1 + i / 20 for i in range(P)], dtype=torch.float64)).sqrt()
-    given = case(own + gain[:, None] * torch.randn(1, N, generator=g, dtype=torch.float64), simulation)
-    found = CommonMode.nominate(given, 1e-4)
+    given = comparison(own + gain[:, None] * torch.randn(1, N, generator=g, dtype=torch.float64), simulation)
+    found = CommonMode.detect_and_fit(given, 1e-4)
     assert found is not None
     assert isinstance(found.effect, CommonMode)
     assert found.effect.inside
     for i in found.sensors:
         entry = found.parameters[f"gain[{i}]"]
         assert abs(entry.value - float(gain[i])) < 2.1 * (entry.high - entry.low) / 2
-    explained = found.effect.explained(given, g)
-    assert shape_witness(explained).p_value > 1e-4
-    assert common_witness(explained).p_value > 1e-4
+    explained = found.effect.repair(given, g)
+    assert shape_test(explained).p_value > 1e-4
+    assert common_source_test(explained).p_value > 1e-4
 
 
 def test_noise_of_one_sensor_alone_is_of_no_common_source_and_may_be_two_levels() -> None:
     noise, g = gf.WhiteNoise(1.0) + gf.AR1(0.999, 1e-4) + gf.RandomWalk(1e-8), generator(7)
     recording, simulation = (noise.simulate(N, batch=(P,), generator=g) for _ in range(2))
     recording[0] += gf.AR1(0.9, 1e-2).simulate(N, generator=g)
-    found = nominated(case(recording, simulation[None]), 1e-2)
+    found = nominated(comparison(recording, simulation[None]), 1e-2)
     assert found is not None
     assert found.mechanism != "common_mode"
     assert found.sensors == (0,)
@@ -75,7 +75,7 @@ def test_noise_of_one_sensor_alone_is_of_no_common_source_and_may_be_two_levels(
 def test_a_number_that_pays_by_chance_makes_no_sensor_take_part(seed: int):
     """Three sensors of six have 30 nats each; a number of another one would gain more than its two nats."""
     given = drawn(seed, lambda x, g: torch.cat([1.05 * x[:3], x[3:]]))
-    found = ParameterShift.nominate(given, 1e-3)
+    found = ParameterShift.detect_and_fit(given, 1e-3)
     assert found is not None
     assert found.sensors == (0, 1, 2)
 
@@ -97,8 +97,8 @@ def test_what_is_missing_is_named_measured_and_explained(name: str):
         # Four standard deviations; one estimate is no test of coverage.
         assert abs(entry.value - value) < 2.1 * (entry.high - entry.low) / 2, key
     assert held_out_gain(given, found.effect).confirms(found.p_value)
-    explained = found.effect.explained(given, generator(1))
-    assert shape_witness(explained).p_value > 1e-4
+    explained = found.effect.repair(given, generator(1))
+    assert shape_test(explained).p_value > 1e-4
     assert nominated(explained, 1e-4) is None  # a tenth of the level that the first one was held to
 
 
@@ -111,7 +111,7 @@ def test_a_filter_and_what_it_acts_on_are_found_one_after_the_other():
     given, names = drawn(12, change), []
     while (found := nominated(given)) is not None:
         names.append(found.mechanism)
-        given = found.effect.explained(given, generator(2))
+        given = found.effect.repair(given, generator(2))
         assert len(names) < 4
     assert names == ["drifting_tone", "low_pass"]
 
@@ -121,8 +121,10 @@ def test_one_sensor_of_many_that_is_louder_has_nothing_in_common_with_the_others
     """Gains of eleven others follow chance, most of all in the few ordinates that show a walk."""
     g, sensor = generator(40), gf.WhiteNoise(0.1) + gf.AR1(0.9999, 1e-9) + gf.RandomWalk(5e-10)
     louder = gf.WhiteNoise(0.46) + gf.AR1(0.9999, 5e-9) + gf.RandomWalk(4e-9)
-    recorded = ArrayModel.from_sensors([louder, *[sensor] * 11]).simulate(11291, generator=g)
-    found = nominated(case(recorded, ArrayModel.from_sensors([sensor] * 12).simulate(11291, batch=(1,), generator=g)))
+    observed = ArrayModel.from_sensors([louder, *[sensor] * 11]).simulate(11291, generator=g)
+    found = nominated(
+        comparison(observed, ArrayModel.from_sensors([sensor] * 12).simulate(11291, batch=(1,), generator=g))
+    )
     assert found is not None
     assert (found.mechanism, found.sensors) == ("parameter_shift", (0,))
 
@@ -131,11 +133,11 @@ def test_one_sensor_of_many_that_is_louder_has_nothing_in_common_with_the_others
 def test_two_sensors_of_many_that_share_a_third_of_their_noise_are_told_with_possible_gains() -> None:
     g, p, share = generator(43), 8, 0.35
     simulation = ArrayModel.from_sensors([gf.WhiteNoise(WHITE) + gf.RandomWalk(1e-9)] * p)
-    recorded = ArrayModel.from_sensors(
+    observed = ArrayModel.from_sensors(
         [gf.WhiteNoise(WHITE * ((1 - share) if i in (2, 5) else 1)) + gf.RandomWalk(1e-9) for i in range(p)]
     ).simulate(N, generator=g)
-    recorded[[2, 5]] += (share * WHITE) ** 0.5 * torch.randn(1, N, generator=g, dtype=torch.float64)
-    found = nominated(case(recorded, simulation.simulate(N, batch=(1,), generator=g)))
+    observed[[2, 5]] += (share * WHITE) ** 0.5 * torch.randn(1, N, generator=g, dtype=torch.float64)
+    found = nominated(comparison(observed, simulation.simulate(N, batch=(1,), generator=g)))
     assert found is not None
     assert (found.mechanism, found.sensors) == ("common_mode", (2, 5))
     gains = [found.parameters[f"gain[{i}]"].value for i in found.sensors]
@@ -150,9 +152,9 @@ def test_less_white_noise_is_no_other_unit_though_it_has_most_bands():
     g = generator(41)
     simulation = sensors(1e-4).simulate(N, batch=(1,), generator=g)
     quieter = sensors(1e-4 / GRAVITY**2).simulate(N, generator=g)
-    assert UnitScale.nominate(case(quieter, simulation), 1e-3) is None
+    assert UnitScale.detect_and_fit(comparison(quieter, simulation), 1e-3) is None
     in_g = sensors(1e-4).simulate(N, generator=g) / GRAVITY
-    assert UnitScale.nominate(case(in_g, simulation), 1e-3) is not None
+    assert UnitScale.detect_and_fit(comparison(in_g, simulation), 1e-3) is not None
 
 
 def test_noise_that_falls_almost_as_flicker_noise_does_has_one_name():
@@ -166,7 +168,7 @@ def test_noise_that_falls_almost_as_flicker_noise_does_has_one_name():
     assert found is not None
     assert found.mechanism == "flicker"
     assert "its form is not quite one of the catalogue" in found.sentence
-    assert nominated(found.effect.explained(given, generator(2))) is None
+    assert nominated(found.effect.repair(given, generator(2))) is None
 
 
 def effects() -> dict[str, Mechanism]:
@@ -193,16 +195,16 @@ def test_signals_have_the_spectra_that_a_mechanism_promises(name: str):
     effect, given = effects()[name], drawn(14)
     n_records = 6
     plain = array().simulate(N, batch=(n_records,), generator=generator(15))
-    built = effect.simulated(plain, given.scene, generator(16))
+    built = effect.apply(plain, given.info, generator(16))
     assert built.shape == plain.shape
-    before, after = case(given.recording, plain), case(given.recording, built)
+    before, after = comparison(given.recording, plain), comparison(given.recording, built)
     places = given.bands.places
     matrices = torch.diag_embed(before.base.spectrum(places).mT).to(torch.complex128)
     promised = effect.spectra(matrices, places).movedim(0, -1)
     expected = given.bands.mean_of(promised).movedim(-1, 0)
     high = given.bands.dof > 40
     level = expected.diagonal(dim1=-2, dim2=-1).real.sqrt()
-    error = (after.simulated.spectra - expected).abs() / (level[:, :, None] * level[:, None, :])
+    error = (after.reference.spectra - expected).abs() / (level[:, :, None] * level[:, None, :])
     spread = (n_records * given.bands.dof).rsqrt()
     # A source of one path is common: its errors in several sensors are one error.
     assert float((error.amax((-1, -2)) / spread)[high].median()) < 4.0
@@ -215,7 +217,7 @@ def test_numbers_without_a_fold_are_near_those_of_all(name: str):
     given = drawn(17, change)
     found = nominated(given)
     assert found is not None
-    part = found.effect.refitted(given, 0)
+    part = found.effect.fit_without(given, 0)
     f = torch.linspace(0.02, 0.45, 40, dtype=torch.float64)
     matrices = torch.diag_embed(given.base.spectrum(f).mT).to(torch.complex128)
     one, other = (e.spectra(matrices, f).diagonal(dim1=-2, dim2=-1).real for e in (found.effect, part))
@@ -236,7 +238,7 @@ def test_a_strong_filter_of_one_sensor_of_three_is_named_with_its_form(corner: f
     )
     recording = recording.clone()
     recording[0] = torch.from_numpy(signal.lfilter(*signal.butter(1, 2 * corner), recording[0].numpy()).copy())
-    given = case(recording, simulation.unflatten(-1, (4, N)).movedim(-2, 0))
+    given = comparison(recording, simulation.unflatten(-1, (4, N)).movedim(-2, 0))
     found = nominated(given)
     assert found is not None
     assert (found.mechanism, found.sensors) == ("low_pass", (0,))
@@ -251,10 +253,10 @@ def test_a_filter_of_another_form_is_named_and_said_to_differ():
     recording, simulation = array().simulate(N, generator=g), array().simulate(N, batch=(4,), generator=g)
     taps = signal.firwin(21, 0.4)
     recording[0] = torch.from_numpy(signal.lfilter(taps, 1.0, recording[0].numpy()).copy())
-    given = case(recording, simulation)
+    given = comparison(recording, simulation)
     found = nominated(given)
     assert found is not None
     assert (found.mechanism, found.sensors) == ("low_pass", (0,))
     assert "% of how the spectra differ is explained" in found.sentence
     # What its form leaves is not given another name.
-    assert nominated(found.effect.explained(given, g)) is None
+    assert nominated(found.effect.repair(given, g)) is None

@@ -10,15 +10,33 @@ import numpy as np
 import pytest
 import torch
 from scipy import signal, stats
-from shape_draws import BUMP, CHANGES, RATE, SIGNS, WHITE, N, P, array, case, drawn, generator, nominated, tensor
+from shape_draws import BUMP, CHANGES, RATE, SIGNS, WHITE, N, P, array, comparison, drawn, generator, nominated, tensor
 
 import gyrofuse as gf
 from gyrofuse._base.transforms import cosine_ordinates
-from gyrofuse.mismatch.bumps import bump_witness
-from gyrofuse.mismatch.case import Case
-from gyrofuse.mismatch.colour import filtered, noise, of_phase, quadrature
-from gyrofuse.mismatch.filter_forms import FILTERS, filter_corner, filter_power, filter_response, filter_strength
-from gyrofuse.mismatch.folds import in_fold
+from gyrofuse.mismatch.detectors.spectra.band_tests import coherence_test, spectrum_test
+from gyrofuse.mismatch.detectors.spectra.peaks import peak_test
+from gyrofuse.mismatch.detectors.spectra.pooled_coherence import common_source_test
+from gyrofuse.mismatch.detectors.spectra.shape_scan import shape_test
+from gyrofuse.mismatch.likelihoods.coherence_law import smooth_coherence
+from gyrofuse.mismatch.likelihoods.component_choice import best_bump, best_start, keeps_own
+from gyrofuse.mismatch.likelihoods.components import (
+    Common,
+    Flicker,
+    LowPass,
+    PowerLaw,
+    Shift,
+    Term,
+    oscillation,
+)
+from gyrofuse.mismatch.likelihoods.filter_forms import (
+    FILTERS,
+    filter_corner,
+    filter_power,
+    filter_response,
+    filter_strength,
+)
+from gyrofuse.mismatch.likelihoods.reference_spectrum import Parts
 from gyrofuse.mismatch.likelihoods.spectral import (
     FLOOR,
     Ratios,
@@ -31,23 +49,11 @@ from gyrofuse.mismatch.likelihoods.spectral import (
     power_gains,
 )
 from gyrofuse.mismatch.likelihoods.spectral_data import block_spectra, fast_groups, slow_groups
-from gyrofuse.mismatch.mechanisms.parameter_shift import _numbers
-from gyrofuse.mismatch.pooled import common_witness
-from gyrofuse.mismatch.shape_ground import Parts
-from gyrofuse.mismatch.shape_law import smooth_coherence
-from gyrofuse.mismatch.shape_scan import shape_witness
-from gyrofuse.mismatch.shape_terms import (
-    Common,
-    Flicker,
-    LowPass,
-    PowerLaw,
-    Shift,
-    Term,
-    oscillation,
-)
-from gyrofuse.mismatch.shapes import _falls_otherwise, compared, leading_shape
-from gyrofuse.mismatch.spectral_choice import best_bump, best_start, keeps_own
-from gyrofuse.mismatch.witnesses import coherence_witness, spectrum_witness
+from gyrofuse.mismatch.mechanisms.spectra.joint_fit import _falls_otherwise, compared, leading_shape
+from gyrofuse.mismatch.mechanisms.spectra.parameter_change import _numbers
+from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.signals.filters import filtered, noise, of_phase, quadrature
+from gyrofuse.mismatch.signals.folds import in_fold
 from gyrofuse.noise.array_model import ArrayModel
 
 
@@ -118,9 +124,9 @@ def test_score_and_information_are_those_of_the_likelihood():
 def test_blocks_of_both_sides_add_up_and_are_held_out():
     given = drawn(5, n=8192)
     both = block_spectra(given)
-    assert both.recorded.products.shape[0] == 32
-    assert both.simulated.products.shape[0] == 4
-    every, d = both.recorded.mean(torch.ones(32, dtype=torch.bool))
+    assert both.observed.products.shape[0] == 32
+    assert both.reference.products.shape[0] == 4
+    every, d = both.observed.mean(torch.ones(32, dtype=torch.bool))
     length, edges = 8192 // 32, both.bands.edges
     # A naive twin of the blocks' highest band: eigencoefficients of the four sine tapers, block by block.
     t = np.arange(1, length + 1)
@@ -146,22 +152,22 @@ def test_blocks_of_both_sides_add_up_and_are_held_out():
     y = cosine_ordinates(given.recording)[:, 1]
     torch.testing.assert_close(every[0].diagonal().real, y.square())
     assert float(d[0]) == 0.5
-    parts = [both.recorded.mean(in_fold(32, k)) for k in range(4)]
+    parts = [both.observed.mean(in_fold(32, k)) for k in range(4)]
     torch.testing.assert_close(sum(m * n[:, None, None] for m, n in parts), every * d[:, None, None])
     # What a fold holds out changes no number that is fitted without it, of either side.
     changed = given.recording.clone()
     changed[:, : 8192 // 32] *= 3  # the first block is the first fold's
-    one, other = (block_spectra(case(x, given.simulated.signal)) for x in (given.recording, changed))
+    one, other = (block_spectra(comparison(x, given.reference.signal)) for x in (given.recording, changed))
     kept, blocks = ~in_fold(32, 0), slice(len(slow_groups()), last + 1)
-    torch.testing.assert_close(one.recorded.mean(kept)[0][blocks], other.recorded.mean(kept)[0][blocks])
+    torch.testing.assert_close(one.observed.mean(kept)[0][blocks], other.observed.mean(kept)[0][blocks])
 
 
 def test_a_reference_of_another_length_has_its_ordinates_where_their_frequencies_are():
     g = generator(9)
-    given = case(array().simulate(8192, generator=g), array().simulate(4096, generator=g)[None])
+    given = comparison(array().simulate(8192, generator=g), array().simulate(4096, generator=g)[None])
     both = block_spectra(given)
-    _, s = both.simulated.mean(torch.ones(4, dtype=torch.bool))
-    _, d = both.recorded.mean(torch.ones(32, dtype=torch.bool))
+    _, s = both.reference.mean(torch.ones(4, dtype=torch.bool))
+    _, d = both.observed.mean(torch.ones(32, dtype=torch.bool))
     assert float(s[0]) == 0  # it has no ordinate so slow
     assert float(s[1]) == 0.5  # its first has the frequency of the recording's second
     assert float(s[-1]) == pytest.approx(float(d[-1]) / 2, rel=1e-3)  # of shorter tapers
@@ -235,14 +241,14 @@ def extra(term: Term) -> tuple[str, ...]:
 
 def test_coherence_of_independent_sensors_is_drawn_to_none_and_a_common_source_stays():
     given = drawn(3)
-    none = smooth_coherence(given.simulated.coherence, given.simulated.dof)
+    none = smooth_coherence(given.reference.coherence, given.reference.dof)
     off = none - torch.eye(P, dtype=none.dtype)
-    raw = given.simulated.coherence - torch.eye(P, dtype=none.dtype)
+    raw = given.reference.coherence - torch.eye(P, dtype=none.dtype)
     assert float(off.abs().square().sum()) < 0.1 * float(raw.abs().square().sum())
     g = generator(4)
     shared = 0.02 * torch.randn(4, 1, N, generator=g, dtype=torch.float64)
-    together = case(given.recording, array().simulate(N, batch=(4,), generator=g) + shared)
-    high = smooth_coherence(together.simulated.coherence, together.simulated.dof)[-3].abs()
+    together = comparison(given.recording, array().simulate(N, batch=(4,), generator=g) + shared)
+    high = smooth_coherence(together.reference.coherence, together.reference.dof)[-3].abs()
     expected = shared.var() / (shared.var() + WHITE * tensor(*(1 + i / 20 for i in range(P))))
     torch.testing.assert_close(high[0, 1:], (expected[0] * expected[1:]).sqrt(), rtol=0.03, atol=0)
 
@@ -333,7 +339,7 @@ def test_what_an_ar1_of_a_sample_or_two_has_is_white():
 def test_a_walk_that_was_not_seen_may_grow():
     g = generator(8)
     plain = ArrayModel.from_sensors([gf.WhiteNoise(WHITE)] * P)
-    given = case(plain.simulate(N, generator=g), plain.simulate(N, batch=(4,), generator=g))
+    given = comparison(plain.simulate(N, generator=g), plain.simulate(N, batch=(4,), generator=g))
     f = torch.logspace(-4.2, -0.31, 60, dtype=torch.float64)
     parts, none = Parts(given.base, f), torch.zeros(4, P, dtype=torch.float64)
     torch.testing.assert_close(parts.shifted(none), given.base.spectrum(f))
@@ -349,7 +355,7 @@ def test_a_walk_that_was_not_seen_may_grow():
     torch.testing.assert_close(more, 100 * parts.growing_walk[:, None] / (2 * torch.sin(math.pi * f)).square())
     # Without it a walk could not be other numbers of noise that has none.
     walk = 3e-5 * torch.randn(P, N, generator=g, dtype=torch.float64).cumsum(-1)
-    data = compared(case(given.recording + walk, given.simulated.signal))
+    data = compared(comparison(given.recording + walk, given.reference.signal))
     start = best_start(data, [], Shift.starts(data.ground)[0])[0]
     assert start.free[3].all()
     # An AR1 that was not seen either would do nearly as well.
@@ -368,7 +374,7 @@ def test_noise_with_a_memory_is_other_numbers_of_a_white_simulation():
     g, white = generator(43), gf.WhiteNoise(1e-4)
     truth = white + gf.AR1(0.97, 4e-6)
     recording, simulation = truth.simulate(N, batch=(3,), generator=g), white.simulate(N, batch=(4, 3), generator=g)
-    given = case(recording, simulation)
+    given = comparison(recording, simulation)
     parts = Parts(given.base, torch.linspace(1 / N, 0.5, 200, dtype=torch.float64))
     assert (parts.unseen_ar1[1] > 0).all()
     torch.testing.assert_close(parts.shifted(torch.zeros(4, 3, dtype=torch.float64)), parts.densities.sum(0))
@@ -379,7 +385,7 @@ def test_noise_with_a_memory_is_other_numbers_of_a_white_simulation():
     corners = [found.parameters[f"corner[{i}]"] for i in range(3)]
     true = -math.log(0.97) / (2 * math.pi) * RATE
     assert all(abs(c.value - true) < 1.5 * (c.high - c.low) / 2 for c in corners)  # three standard deviations
-    assert shape_witness(found.effect.explained(given, generator(1))).p_value > 1e-4
+    assert shape_test(found.effect.repair(given, generator(1))).p_value > 1e-4
     # Where there is an AR1, none is made up beside it.
     assert (Parts(drawn(44).base, parts.f).unseen_ar1[1] == 0).all()
 
@@ -406,7 +412,7 @@ def test_noise_of_a_density_and_its_quadrature():
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize("witness", [shape_witness, bump_witness, common_witness])
+@pytest.mark.parametrize("witness", [shape_test, peak_test, common_source_test])
 def test_witnesses_of_shapes_are_honest(witness):
     n_runs = 40
     p = [witness(drawn(100 + s, n=4096)).p_value for s in range(n_runs)]
@@ -420,8 +426,8 @@ def test_witnesses_of_shapes_are_honest_with_common_noise_in_both():
         g = generator(200 + s)
         one, other = (x.simulate(4096, generator=g) for x in (array(), array()))
         source = 0.02 * torch.randn(2, 1, 4096, generator=g, dtype=torch.float64) * SIGNS[:, None]
-        given = case(one + source[0], (other + source[1])[None])
-        p += [min(w(given).p_value for w in (shape_witness, bump_witness, common_witness, coherence_witness))]
+        given = comparison(one + source[0], (other + source[1])[None])
+        p += [min(w(given).p_value for w in (shape_test, peak_test, common_source_test, coherence_test))]
     assert sum(x < 0.05 for x in p) <= stats.binom.isf(1e-3, n_runs, 0.2)
 
 
@@ -430,8 +436,8 @@ def test_small_changes_of_all_bands_are_seen_where_single_bands_say_nothing():
     n_runs, pooled, single = 15, 0, 0
     for s in range(n_runs):
         given = drawn(300 + s, lambda x, g: 1.02 * x)
-        pooled += shape_witness(given).p_value < 2.5e-3
-        single += spectrum_witness(given).p_value < 2.5e-3
+        pooled += shape_test(given).p_value < 2.5e-3
+        single += spectrum_test(given).p_value < 2.5e-3
     assert pooled >= stats.binom.ppf(1e-3, n_runs, 0.9)
     assert single < pooled / 2
 
@@ -440,17 +446,17 @@ def test_weak_noise_in_common_is_seen_where_single_bands_say_nothing():
     n_runs, pooled, single = 15, 0, 0
     for s in range(n_runs):
         given = drawn(330 + s, lambda x, g: x + 0.0019 * torch.randn(1, N, generator=g, dtype=x.dtype))
-        pooled += common_witness(given).p_value < 2.5e-3
-        single += coherence_witness(given).p_value < 2.5e-3
+        pooled += common_source_test(given).p_value < 2.5e-3
+        single += coherence_test(given).p_value < 2.5e-3
     assert pooled >= stats.binom.ppf(1e-3, n_runs, 0.9)
     assert single < pooled / 2
 
 
 def test_a_short_simulation_has_little_to_say():
     g = generator(8)
-    given = case(array().simulate(N, generator=g), array().simulate(4096, generator=g)[None])
-    assert shape_witness(given).p_value > 1e-3
-    assert bump_witness(given).p_value > 1e-3
+    given = comparison(array().simulate(N, generator=g), array().simulate(4096, generator=g)[None])
+    assert shape_test(given).p_value > 1e-3
+    assert peak_test(given).p_value > 1e-3
     assert nominated(given) is None
 
 
@@ -482,7 +488,7 @@ def test_sensors_keep_something_of_their_own_beside_what_is_common(share: float,
     assert keeps_own(found._replace(model=model)) == regular
 
 
-def falling(slope: float) -> Case:
+def falling(slope: float) -> Comparison:
     """A recording with noise added that falls so."""
     middle = math.sqrt(0.5 / N)
     return drawn(23, lambda x, g: x + 1.5e-3 * noise(N, lambda f: (middle / f) ** slope / middle, P, g))
@@ -513,6 +519,6 @@ def test_noise_is_flicker_only_if_it_falls_as_flicker_does(slope: float):
     alone = fit(data, [PowerLaw.like(Flicker.start(data.ground), data.ground)])
     assert float(alone.terms[0].shared) == pytest.approx(slope, abs=3 * float(alone.sd(0)[1]))
     assert float(alone.sd(0)[1]) < 0.1
-    assert spectrum_witness(given).p_value < 1e-4
+    assert spectrum_test(given).p_value < 1e-4
     found = nominated(given)
     assert (found is not None and found.mechanism == "flicker") == (slope == 1.0)

@@ -13,14 +13,15 @@ import torch
 from scipy import stats
 
 import gyrofuse as gf
-from gyrofuse.mismatch.base import Base, _time_constants
-from gyrofuse.mismatch.case import Case, Scene, block_means
-from gyrofuse.mismatch.confirm import held_out_gain
-from gyrofuse.mismatch.evidence import calibrated
-from gyrofuse.mismatch.mechanisms.step import Step
-from gyrofuse.mismatch.mechanisms.temperature_drift import TemperatureDrift, _beats_surrogates
-from gyrofuse.mismatch.mechanisms.warm_up_transient import WarmUpTransient
-from gyrofuse.mismatch.slow import (
+from gyrofuse.mismatch.detectors.slow.scans import (
+    Scan,
+    SlowLook,
+    best_place,
+    jumps_to_and_fro,
+    slow_look,
+    slow_test,
+)
+from gyrofuse.mismatch.likelihoods.slow_noise import (
     Fit,
     SlowNoise,
     best_fit,
@@ -34,17 +35,16 @@ from gyrofuse.mismatch.slow import (
     told,
     where,
 )
-from gyrofuse.mismatch.slow_effect import quantiles
-from gyrofuse.mismatch.slow_families import Family, double_warm_ups, lagged, steps, warm_ups
-from gyrofuse.mismatch.slow_scans import (
-    Scan,
-    SlowLook,
-    best_place,
-    jumps_to_and_fro,
-    slow_look,
-    slow_witness,
-)
-from gyrofuse.mismatch.slow_tails import curve_length, expected_exceedances
+from gyrofuse.mismatch.likelihoods.slow_templates import Family, double_warm_ups, lagged, steps, warm_ups
+from gyrofuse.mismatch.mechanisms.signals.slow_effect import quantiles
+from gyrofuse.mismatch.mechanisms.signals.step import Step
+from gyrofuse.mismatch.mechanisms.signals.temperature import TemperatureDrift, _beats_surrogates
+from gyrofuse.mismatch.mechanisms.signals.warm_up import WarmUpTransient
+from gyrofuse.mismatch.selection.held_out import held_out_gain
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo, block_means
+from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum, _time_constants
+from gyrofuse.mismatch.stats.curve_maximum import curve_length, expected_exceedances
+from gyrofuse.mismatch.stats.multiplicity import monte_carlo_p_value
 
 N, RATE, SENSORS = 16384, 100.0, 4
 LEVEL = 5e-4
@@ -63,16 +63,16 @@ def noise(seed: int, n_records: int) -> torch.Tensor:
     return model.simulate(N, batch=(n_records, SENSORS), generator=generator(seed)).double()
 
 
-def case(effect: torch.Tensor | float = 0.0, seed: int = 1) -> Case:
-    scene = Scene(RATE, "deg/s", ("a", "b", "c", "d"), {"temperature[imu2]": TEMPERATURE})
-    return Case.of(scene, noise(seed, 1)[0] + effect, noise(100 + seed, 3))
+def comparison(effect: torch.Tensor | float = 0.0, seed: int = 1) -> Comparison:
+    info = RecordingInfo(RATE, "deg/s", ("a", "b", "c", "d"), {"temperature[imu2]": TEMPERATURE})
+    return Comparison.of(info, noise(seed, 1)[0] + effect, noise(100 + seed, 3))
 
 
 def test_covariance_of_cells_is_that_of_the_samples():
     n, cell, n_cells = 512, 8, 5
     constants = np.array(_time_constants(n))
     coefficients = torch.rand(2, len(constants) + 3, generator=generator(2), dtype=torch.float64)
-    found = cell_differences(Base(n, coefficients), cell, n_cells).numpy()
+    found = cell_differences(NoiseSpectrum(n, coefficients), cell, n_cells).numpy()
     t = np.arange(cell * n_cells)
     apart = np.abs(t[:, None] - t)
     phi = np.exp(-1 / constants)[:, None, None]
@@ -95,7 +95,7 @@ def test_ordinates_are_cosines_of_block_means():
 
 
 def test_the_spectra_of_ordinates_are_those_of_the_covariance():
-    noise = told(case()).noise()
+    noise = told(comparison()).noise()
     factors = torch.randn(SENSORS, 4, generator=generator(3), dtype=torch.float64)
     full = cosines() @ noise.covariance(factors) @ cosines().mT
     spectra = (factors.exp()[..., None] * noise.parts).sum(1)
@@ -105,7 +105,7 @@ def test_the_spectra_of_ordinates_are_those_of_the_covariance():
 
 
 def test_many_fits_at_once_are_those_one_by_one():
-    now = case()
+    now = comparison()
     noise, y = told(now).noise(), slow_ordinates(now.recording)
     values = told(now).values * torch.tensor([0.8, 1.0, 1.3], dtype=torch.float64)[:, None, None]
     many, x = told(now)._replace(values=values).noise(), steps(now).templates[200]
@@ -123,7 +123,7 @@ def test_many_fits_at_once_are_those_one_by_one():
 
 
 def test_columns_are_weighted_least_squares():
-    now = case()
+    now = comparison()
     y, variance = slow_ordinates(now.recording), told(now).noise().own
     designs = double_warm_ups(now).designs[[0, 90]]
     z, (size, spread) = columns(y, variance, designs), column_sizes(y, variance, designs)
@@ -138,7 +138,9 @@ def test_columns_are_weighted_least_squares():
 
 
 def test_tuples_are_chosen_item_by_item():
-    one, other = (best_fit(told(now).noise(), slow_ordinates(now.recording)) for now in (case(), case(seed=2)))
+    one, other = (
+        best_fit(told(now).noise(), slow_ordinates(now.recording)) for now in (comparison(), comparison(seed=2))
+    )
     pair = [
         type(one)(*(torch.stack([a, b]) for a, b in zip(x, y, strict=True))) for x, y in ((one, other), (other, one))
     ]
@@ -152,7 +154,7 @@ def test_slow_noise_is_told_to_the_lowest_frequencies():
     ratios = []
     for seed in range(12):
         signal = model.simulate(N, batch=(2, SENSORS), generator=generator(50 + seed)).double()
-        now = Case.of(Scene(RATE, "deg/s", ("a", "b", "c", "d")), signal[0], signal[1:])
+        now = Comparison.of(RecordingInfo(RATE, "deg/s", ("a", "b", "c", "d")), signal[0], signal[1:])
         walk = 1e-6 * torch.from_numpy(np.minimum(*np.indices((256, 256)))).double() * now.block
         exact = (cosines() @ walk @ cosines().mT).diagonal()[:3] + 1 / now.block
         ratios.append((told(now).noise().own[:, :3] / exact).log())
@@ -162,7 +164,7 @@ def test_slow_noise_is_told_to_the_lowest_frequencies():
 
 
 def test_the_fit_is_a_maximum():
-    now = case()
+    now = comparison()
     noise, y = told(now).noise(), slow_ordinates(now.recording)
     fit = best_fit(noise, y)
 
@@ -181,7 +183,7 @@ def test_the_fit_is_a_maximum():
 
 
 def test_templates_are_those_of_the_paths():
-    now = case()
+    now = comparison()
     tau = 700.0
     path = (-T / tau).exp()
     assert torch.allclose(
@@ -194,13 +196,13 @@ def test_templates_are_those_of_the_paths():
 
 
 def test_a_lag_is_a_low_pass_of_first_order():
-    scene = Scene(RATE, "deg/s", ("a",), {"temperature": TEMPERATURE})
+    info = RecordingInfo(RATE, "deg/s", ("a",), {"temperature": TEMPERATURE})
     lag, y = 50.0, [float(TEMPERATURE[0])]
     for x in TEMPERATURE[1:300].tolist():
         y.append(y[-1] + (1 - math.exp(-1 / lag)) * (x - y[-1]))
-    np.testing.assert_allclose(lagged(scene, "temperature", 0, lag, N)[:300].numpy(), y, rtol=1e-12)
+    np.testing.assert_allclose(lagged(info, "temperature", 0, lag, N)[:300].numpy(), y, rtol=1e-12)
     with pytest.raises(ValueError, match=r"`channels`: expected 'temperature' at 20000 samples or more, got 16384"):
-        lagged(scene, "temperature", 0, lag, 20000)
+        lagged(info, "temperature", 0, lag, 20000)
 
 
 def test_the_tail_of_a_scan_is_that_of_its_maximum():
@@ -225,16 +227,16 @@ def test_the_tail_of_a_scan_is_that_of_its_maximum():
 def test_a_p_value_is_held_against_twins():
     honest = torch.linspace(0.0005, 0.9995, 1000, dtype=torch.float64)
     # The next of 1000 is less extreme than a law that is known: `(1 + L/k)^-k` instead of `exp(-L)`.
-    assert calibrated(1e-6, honest) == pytest.approx(0.25 * (1 + math.log(0.25e6) / 250) ** -250, rel=0.03)
-    assert calibrated(0.5, honest) == pytest.approx(0.5, abs=0.01)
+    assert monte_carlo_p_value(1e-6, honest) == pytest.approx(0.25 * (1 + math.log(0.25e6) / 250) ** -250, rel=0.03)
+    assert monte_carlo_p_value(0.5, honest) == pytest.approx(0.5, abs=0.01)
     boastful = honest**2
-    assert calibrated(1e-6, boastful) == pytest.approx(1e-3, rel=0.3)
-    assert calibrated(0.1, honest.sqrt()) == pytest.approx(0.01, abs=0.002)
+    assert monte_carlo_p_value(1e-6, boastful) == pytest.approx(1e-3, rel=0.3)
+    assert monte_carlo_p_value(0.1, honest.sqrt()) == pytest.approx(0.01, abs=0.002)
 
 
 def test_p_values_of_scans_hold_among_twins():
     """Of 256 twins with simulations of one record, 5 % or hardly more are found at 5 %."""
-    look = slow_look(case())
+    look = slow_look(comparison())
     noise, y, null = look._twins
     heard = torch.ones(SENSORS, dtype=torch.float64)
     for family in look.families:
@@ -244,14 +246,14 @@ def test_p_values_of_scans_hold_among_twins():
 
 
 def test_a_twin_s_recording_and_simulation_have_the_same_noise():
-    noise, y, _ = slow_look(case())._twins
+    noise, y, _ = slow_look(comparison())._twins
     told_of, there = noise.own[..., :8].mean(-1).log(), y[..., :8].square().mean(-1).log()  # (twin, sensor)
     alike = [float(torch.corrcoef(pair)[0, 1]) for pair in torch.stack([told_of, there]).movedim(-1, 0)]
     assert sum(alike) / SENSORS > 0.1  # 0 within 0.03 were the noise of all twins the same
 
 
 def test_other_simulations_of_the_same_noise_scatter_by_their_length():
-    given = told(case())
+    given = told(comparison())
     coefficients = given.coefficients()
     values = given.drawn(coefficients.expand(4000, -1, -1), generator(6)).values
     expected = coefficients @ given.atoms
@@ -284,7 +286,7 @@ def test_sensors_that_jump_to_and_fro_are_known():
 
 
 def test_a_look_does_not_keep_its_case():
-    now = case()
+    now = comparison()
     slow_look(now)
     gone = weakref.ref(now)
     del now
@@ -294,13 +296,13 @@ def test_a_look_does_not_keep_its_case():
 
 @pytest.mark.parametrize("seed", range(1, 9))
 def test_nothing_is_found_where_nothing_is_missing(seed: int):
-    now = case(seed=seed)
-    assert slow_witness(now).p_value > 1e-3
-    assert all(mechanism.nominate(now, LEVEL) is None for mechanism in ALL)
+    now = comparison(seed=seed)
+    assert slow_test(now).p_value > 1e-3
+    assert all(mechanism.detect_and_fit(now, LEVEL) is None for mechanism in ALL)
 
 
-def best(now: Case):
-    found = [f for f in (mechanism.nominate(now, LEVEL) for mechanism in ALL) if f is not None]
+def best(now: Comparison):
+    found = [f for f in (mechanism.detect_and_fit(now, LEVEL) for mechanism in ALL) if f is not None]
     return max(found, key=lambda f: f.gain)
 
 
@@ -317,8 +319,8 @@ SIZE = torch.tensor([0.8, 0.0, -0.5, 0.4], dtype=torch.float64)
     ],
 )
 def test_an_effect_is_found_by_its_name(mechanism, path: torch.Tensor, place: str, at: float, size: str):
-    now = case(SIZE[:, None] * path)
-    assert slow_witness(now).p_value < 1e-6
+    now = comparison(SIZE[:, None] * path)
+    assert slow_test(now).p_value < 1e-6
     finding = best(now)
     assert finding.mechanism == mechanism.name
     assert finding.alternatives == ()
@@ -332,18 +334,18 @@ def test_an_effect_is_found_by_its_name(mechanism, path: torch.Tensor, place: st
         sd = (entry.high - entry.low) / 3.92
         assert abs(entry.value - scale * float(SIZE[i])) < 4 * sd
     assert held_out_gain(now, finding.effect).confirms(finding.p_value)
-    after = finding.effect.explained(now, generator(1))
-    assert slow_witness(after).p_value > 0.01
-    back = finding.effect.simulated(finding.effect.removed(now.recording, now.scene), now.scene, generator(1))
+    after = finding.effect.repair(now, generator(1))
+    assert slow_test(after).p_value > 0.01
+    back = finding.effect.apply(finding.effect.remove(now.recording, now.info), now.info, generator(1))
     assert torch.allclose(back, now.recording)
-    refitted = finding.effect.refitted(now, 0)
-    assert refitted.gains(now, 0).shape == (8,)
+    refitted = finding.effect.fit_without(now, 0)
+    assert refitted.held_out_scores(now, 0).shape == (8,)
     assert float((refitted.size - scale * SIZE)[[0, 2]].abs().max()) < 0.5 * scale
 
 
 def lag_of(seconds: float) -> torch.Tensor:
-    scene = Scene(RATE, "deg/s", ("a",), {"temperature": TEMPERATURE})
-    path = lagged(scene, "temperature", 0, seconds * RATE, N)
+    info = RecordingInfo(RATE, "deg/s", ("a",), {"temperature": TEMPERATURE})
+    path = lagged(info, "temperature", 0, seconds * RATE, N)
     return path - path[0]
 
 
@@ -362,8 +364,8 @@ DOUBLE = (-T / 400).exp() + 0.6 * (-T / 3000).exp()
 )
 def test_an_effect_of_another_form_is_found_with_that_form(mechanism, path, numbers, strength: float):
     """A bent line, and two time constants: nothing else is made of what one straight line or one decay would leave."""
-    now = case(strength * SIZE[:, None] * path)
-    assert slow_witness(now).p_value < 1e-6
+    now = comparison(strength * SIZE[:, None] * path)
+    assert slow_test(now).p_value < 1e-6
     finding = best(now)
     assert finding.mechanism == mechanism.name
     for name, value in numbers.items():
@@ -379,9 +381,9 @@ def test_an_effect_of_another_form_is_found_with_that_form(mechanism, path, numb
     else:
         assert "in a line that is bent" in finding.sentence
     assert held_out_gain(now, finding.effect).confirms(finding.p_value)
-    after = finding.effect.explained(now, generator(1))
-    assert slow_witness(after).p_value > 0.01
-    back = finding.effect.simulated(finding.effect.removed(now.recording, now.scene), now.scene, generator(1))
+    after = finding.effect.repair(now, generator(1))
+    assert slow_test(after).p_value > 0.01
+    back = finding.effect.apply(finding.effect.remove(now.recording, now.info), now.info, generator(1))
     assert torch.allclose(back, now.recording)
 
 
@@ -389,15 +391,15 @@ def test_an_effect_of_another_form_is_found_with_that_form(mechanism, path, numb
 @pytest.mark.parametrize(("mechanism", "path"), [(WarmUpTransient, (-T / 1500).exp()), (TemperatureDrift, lag_of(7.0))])
 def test_of_a_strong_effect_nothing_is_left(mechanism, path: torch.Tensor):
     """Its place is known far more closely than any grid that is searched to begin with."""
-    now = case(300 * SIZE[:, None] * path)
+    now = comparison(300 * SIZE[:, None] * path)
     finding = best(now)
     assert finding.mechanism == mechanism.name
     assert not {"curvature[0]", "second_size[0]"} & set(finding.parameters)
-    assert slow_witness(finding.effect.explained(now, generator(1))).p_value > 0.01
+    assert slow_test(finding.effect.repair(now, generator(1))).p_value > 0.01
 
 
 def test_the_channel_is_named_and_the_unit_is_by_kelvin():
-    finding = best(case(SIZE[:, None] * TEMPERATURE))
+    finding = best(comparison(SIZE[:, None] * TEMPERATURE))
     assert finding.channel == "temperature[imu2]"
     assert finding.parameters["coefficient[0]"].unit == "deg/s/K"
 
@@ -437,7 +439,7 @@ def test_a_channel_that_many_sensors_do_not_follow_is_no_better_than_its_surroga
 def test_the_search_for_an_onset_ends_where_two_places_are_likely():
     """Two halves of a step 1.5 s apart: cells that hold both places in so many do not get finer."""
     halves = (0.5 * (T >= 9000) + 0.5 * (T >= 9150)).double()
-    found = Step.nominate(case(halves, seed=2), LEVEL)
+    found = Step.detect_and_fit(comparison(halves, seed=2), LEVEL)
     assert found is not None
     assert 89.5 < found.time_s < 92
     onset = found.parameters["onset"]
@@ -446,7 +448,7 @@ def test_the_search_for_an_onset_ends_where_two_places_are_likely():
 
 def test_the_onset_of_a_large_step_is_known_to_samples():
     at = 6345
-    finding = best(case(torch.tensor([8.0, 0, 6, 0])[:, None] * (at <= T).double()))
+    finding = best(comparison(torch.tensor([8.0, 0, 6, 0])[:, None] * (at <= T).double()))
     assert finding.mechanism == "step"
     assert abs(finding.time_s * RATE - at) <= 2
     p = finding.parameters["onset"]
@@ -457,15 +459,15 @@ def test_the_onset_of_a_large_step_is_known_to_samples():
 def test_steps_are_found_one_after_the_other():
     one, other = (T >= 4000).double(), (T >= 12000).double()
     effect = torch.stack([2 * one, 1.5 * other, 0 * T, -1.5 * one])
-    now = case(effect)
+    now = comparison(effect)
     onsets = []
     for _ in range(2):
-        finding = Step.nominate(now, LEVEL)
+        finding = Step.detect_and_fit(now, LEVEL)
         assert finding is not None
         onsets.append(finding.time_s)
-        now = finding.effect.explained(now, generator(1))
+        now = finding.effect.repair(now, generator(1))
     assert sorted(onsets) == pytest.approx([40, 120], abs=2)
-    assert Step.nominate(now, LEVEL) is None
+    assert Step.detect_and_fit(now, LEVEL) is None
 
 
 @pytest.mark.statistical
@@ -474,20 +476,20 @@ def test_several_large_steps_are_no_walk():
     sizes = {2345: 4.0, 6789: -5.5, 9700: 3.0, 13131: 1.5}
     effect = torch.zeros(SENSORS, N, dtype=torch.float64)
     effect[2] = torch.stack([size * (at <= T) for at, size in sizes.items()]).sum(0)
-    now = case(effect, seed=3)
+    now = comparison(effect, seed=3)
     found = {}
     for _ in sizes:
-        finding = Step.nominate(now, LEVEL)
+        finding = Step.detect_and_fit(now, LEVEL)
         assert finding is not None
         assert finding.sensors == (2,)
         assert finding.alternatives == ()
         assert held_out_gain(now, finding.effect).confirms(finding.p_value)
         found[round(finding.time_s * RATE)] = float(finding.effect.size[2])
-        now = finding.effect.explained(now, generator(1))
+        now = finding.effect.repair(now, generator(1))
     for (at, size), (true, jump) in zip(sorted(found.items()), sizes.items(), strict=True):
         assert abs(at - true) <= 12
         assert size == pytest.approx(jump, abs=0.3)
-    assert Step.nominate(now, LEVEL) is None
+    assert Step.detect_and_fit(now, LEVEL) is None
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -495,8 +497,8 @@ def test_a_walk_or_a_path_that_bends_is_not_several_steps(seed: int):
     walk = gf.RandomWalk(1e-3).simulate(N, batch=(SENSORS,), generator=generator(seed)).double()
     bends = torch.outer(torch.tensor([3.0, 0, 0, 4.0], dtype=torch.float64), (2 * math.pi * T / 9000 + seed).sin())
     for effect in (walk, bends):
-        several = slow_look(case(effect, seed=seed)).several_steps
-        assert several is None or several.gain < slow_look(case(effect, seed=seed)).wandering
+        several = slow_look(comparison(effect, seed=seed)).several_steps
+        assert several is None or several.gain < slow_look(comparison(effect, seed=seed)).wandering
 
 
 def test_a_stationary_telegraph_is_no_step():
@@ -505,7 +507,7 @@ def test_a_stationary_telegraph_is_no_step():
         state[at:] *= -1
     effect = torch.zeros(SENSORS, N, dtype=torch.float64)
     effect[1] = state
-    assert Step.nominate(case(effect), LEVEL) is None
+    assert Step.detect_and_fit(comparison(effect), LEVEL) is None
 
 
 def test_a_loud_source_of_all_sensors_is_no_step():
@@ -513,13 +515,13 @@ def test_a_loud_source_of_all_sensors_is_no_step():
     gains = torch.tensor([1.0, -0.8, 1.3, 0.9], dtype=torch.float64)[:, None]
     for seed in (21, 22, 23):
         source = gf.AR1(0.97, 1.0).simulate(N, generator=generator(seed))
-        scan = slow_look(case(300 * gains * source)).scan("step")
+        scan = slow_look(comparison(300 * gains * source)).scan("step")
         assert scan.p_value > 1e-3
         assert scan.gain < 20
 
 
 def test_block_means_of_the_effect_are_gone():
-    now = case(SIZE[:, None] * (T >= 9000).double() * 4)
+    now = comparison(SIZE[:, None] * (T >= 9000).double() * 4)
     finding = best(now)
-    left = block_means(finding.effect.removed(now.recording, now.scene))
+    left = block_means(finding.effect.remove(now.recording, now.info))
     assert float((left[0, 150:].mean() - left[0, :130].mean()).abs()) < 0.3

@@ -11,13 +11,9 @@ from scipy import signal, stats
 
 import gyrofuse as gf
 from gyrofuse._base.transforms import cosine_ordinates
-from gyrofuse.mismatch import shape_scan
-from gyrofuse.mismatch.base import _time_constants, fit_base
-from gyrofuse.mismatch.case import Case, Scene
-from gyrofuse.mismatch.folds import N_FOLDS, seen_in_block
-from gyrofuse.mismatch.known_lines import without_lines
-from gyrofuse.mismatch.lines import _log_hotelling, sets_of, simulated_lines, strongest_line
-from gyrofuse.mismatch.shape_bands import (
+from gyrofuse.mismatch.detectors.spectra import shape_scan
+from gyrofuse.mismatch.detectors.spectra.shape_scan import scanned, shape_test
+from gyrofuse.mismatch.likelihoods.band_powers import (
     N_SLOW,
     deep_base,
     narrow,
@@ -27,17 +23,23 @@ from gyrofuse.mismatch.shape_bands import (
     slow_gains,
     slow_ordinates,
 )
-from gyrofuse.mismatch.shape_scan import scanned, shape_witness
-from gyrofuse.mismatch.side import Side
-from gyrofuse.mismatch.spectra import bands, cross_spectra, hann_transform
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.folds import N_FOLDS, seen_in_block
+from gyrofuse.mismatch.signals.known_lines import without_lines
+from gyrofuse.mismatch.signals.lines import _log_hotelling, sets_of, simulated_lines, strongest_line
+from gyrofuse.mismatch.signals.noise_spectrum import _time_constants, fit_base
+from gyrofuse.mismatch.signals.psd import bands, cross_spectra, hann_transform
+from gyrofuse.mismatch.signals.records import Records
 
 
 def generator(seed: int) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def case(recording: torch.Tensor, simulation: torch.Tensor, rate: float = 100.0) -> Case:
-    return Case.of(Scene(rate, "deg/s", tuple(map(str, range(recording.shape[-2])))), recording, simulation)
+def comparison(recording: torch.Tensor, simulation: torch.Tensor, rate: float = 100.0) -> Comparison:
+    return Comparison.of(
+        RecordingInfo(rate, "deg/s", tuple(map(str, range(recording.shape[-2])))), recording, simulation
+    )
 
 
 def test_cross_spectra_are_those_of_sine_tapers():
@@ -82,7 +84,7 @@ def test_degrees_of_freedom_of_bands_hold():
 def test_the_dictionary_describes_the_noise_of_sensors():
     n = 2**14
     model = gf.WhiteNoise(1.0) + gf.AR1(0.99, 1e-3) + gf.RandomWalk(1e-7)
-    side = Side(model.simulate(n, batch=(64, 1), generator=generator(3)), bands(n))
+    side = Records(model.simulate(n, batch=(64, 1), generator=generator(3)), bands(n))
     f = side.bands.frequency
     ratio = side.base.spectrum(f)[0] / model.spectrum(f)
     assert (ratio - 1).abs()[2:].max() < 0.06
@@ -112,7 +114,7 @@ def test_covariance_of_block_means_is_that_of_the_noise():
 def test_the_model_of_a_dictionary_has_its_spectrum():
     n = 2**13
     model = gf.WhiteNoise(1.0) + gf.AR1(0.999, 1e-4)
-    side = Side(model.simulate(n, batch=(4, 2), generator=generator(5)), bands(n))
+    side = Records(model.simulate(n, batch=(4, 2), generator=generator(5)), bands(n))
     drawn = side.base.model().simulate(n, batch=(200,), generator=generator(6))
     again = cross_spectra(drawn, side.bands).mean(0).diagonal(dim1=-1, dim2=-2).real.mT
     fitted = side.bands.mean_of(side.base.spectrum(side.bands.places))
@@ -131,7 +133,7 @@ def test_lines_are_not_found_where_there_are_none(shared_noise):
         own = model.simulate(n, batch=(2, 4), generator=g)
         common = model.simulate(n, batch=(2, 1), generator=g)
         x = math.sqrt(1 - shared_noise) * own + math.sqrt(shared_noise) * common
-        values.append(case(x[0], x[1:]).line.p_value)
+        values.append(comparison(x[0], x[1:]).line.p_value)
     hits = sum(p < 0.05 for p in values)
     assert stats.binom.sf(hits - 1, n_runs, 0.05) > 1e-3, f"{hits} of {n_runs}"
 
@@ -141,7 +143,7 @@ def test_a_line_is_found_between_bins_and_in_its_sensors():
     x = gf.WhiteNoise(1.0).simulate(n, batch=(2, 4), generator=generator(8))
     f = 700.4 / n
     x[0, 1:3] += 0.2 * torch.sin(2 * math.pi * f * torch.arange(n))
-    line = case(x[0], x[1:]).line
+    line = comparison(x[0], x[1:]).line
     assert line.p_value < 1e-6
     assert abs(line.frequency - f) * n < 1
     assert line.sensors == (1, 2)
@@ -151,8 +153,8 @@ def test_a_line_of_the_simulation_is_no_news():
     n = 2**13
     x = gf.WhiteNoise(1.0).simulate(n, batch=(2, 4), generator=generator(9))
     x += 0.3 * torch.sin(2 * math.pi * 700.4 / n * torch.arange(n))
-    both = case(x[0], x[1:])
-    assert strongest_line(both.recorded, Side(x[1:], bands(n))).p_value > 0.01
+    both = comparison(x[0], x[1:])
+    assert strongest_line(both.observed, Records(x[1:], bands(n))).p_value > 0.01
     assert abs(both.line.frequency * n - 700.4) > 3
 
 
@@ -184,7 +186,7 @@ def test_a_tone_of_forty_nats_in_two_of_six_sensors_is_found():
         f = 0.05 + 0.4 * float(torch.rand((), generator=g))
         turn = 2 * math.pi * torch.rand(2, 1, generator=g, dtype=torch.float64)
         x[0, [1, 4]] += math.sqrt(4 * 20 / n) * torch.cos(2 * math.pi * f * t + turn)
-        line = case(x[0], x[1:]).line
+        line = comparison(x[0], x[1:]).line
         found += line.p_value < 8e-4 and abs(line.frequency - f) * n < 1
     assert found >= 16
 
@@ -194,11 +196,11 @@ def test_side_lobes_of_a_known_line_are_no_lines():
     t = torch.arange(n, dtype=torch.float64)
     x = torch.randn(3, 4, n, generator=g, dtype=torch.float64)
     x += torch.cos(2 * math.pi * 700.4 / n * t + torch.tensor([0.3, 1.0, 2.0])[:, None, None])
-    both = case(x[0], x[1:])
-    assert len(simulated_lines(both.simulated)) == 1
-    assert abs(simulated_lines(both.simulated)[0] * n - 700.4) < 0.3
+    both = comparison(x[0], x[1:])
+    assert len(simulated_lines(both.reference)) == 1
+    assert abs(simulated_lines(both.reference)[0] * n - 700.4) < 0.3
     assert both.line.p_value > 0.01
-    cleaned = without_lines(x[0], simulated_lines(both.simulated))
+    cleaned = without_lines(x[0], simulated_lines(both.reference))
     assert (cleaned - x[0]).square().sum() > 0.45 * 4 * n
     assert abs(float(cleaned.square().mean()) - 1) < 0.05
 
@@ -214,10 +216,10 @@ def test_hann_transform_has_the_density_as_mean_square():
 # Down to the slowest ordinates ---------------------------------------------------------------------------------------
 
 
-def walking(seed: int, factor: float = 1.0, n: int = 4096) -> Case:
+def walking(seed: int, factor: float = 1.0, n: int = 4096) -> Comparison:
     g = generator(seed)
     one, other = (gf.WhiteNoise(1.0) + gf.RandomWalk(1e-5 * x) for x in (factor, 1.0))
-    return case(one.simulate(n, batch=(3,), generator=g), other.simulate(n, batch=(4, 3), generator=g))
+    return comparison(one.simulate(n, batch=(3,), generator=g), other.simulate(n, batch=(4, 3), generator=g))
 
 
 def test_powers_of_neighbouring_narrow_bands_are_correlated_as_said():
@@ -272,8 +274,8 @@ def test_chances_of_shapes_add_up_to_one():
 
 def test_a_larger_walk_is_seen_in_its_slowest_ordinates():
     n_runs = 20
-    seen = sum(shape_witness(walking(100 + s, 40.0)).p_value < 1e-3 for s in range(n_runs))
-    false = sum(shape_witness(walking(200 + s)).p_value < 0.05 for s in range(n_runs))
+    seen = sum(shape_test(walking(100 + s, 40.0)).p_value < 1e-3 for s in range(n_runs))
+    false = sum(shape_test(walking(200 + s)).p_value < 0.05 for s in range(n_runs))
     assert seen >= stats.binom.ppf(1e-3, n_runs, 0.8)
     assert false <= stats.binom.isf(1e-3, n_runs, 0.05)
 
@@ -284,7 +286,7 @@ def test_slow_ordinates_are_held_out_once_and_gain_what_their_likelihood_does():
     def spectra(matrices: torch.Tensor, f: torch.Tensor) -> torch.Tensor:
         return matrices * (1 + 1e-3 / f.to(matrices.dtype))[:, None, None]
 
-    y = slow_ordinates(given.recorded)[0].numpy()
+    y = slow_ordinates(given.observed)[0].numpy()
     f = np.arange(1, N_SLOW + 1) / (2 * given.n_samples)
     power = deep_base(given).spectrum(torch.from_numpy(f)).numpy()
     factor = 1 + 1e-3 / f
@@ -308,10 +310,10 @@ def test_blocks_show_what_leaks_into_a_stop_band():
 def test_shorter_simulations_say_nothing_of_the_slowest_ordinates():
     g = generator(25)
     noise = gf.WhiteNoise(1.0) + gf.RandomWalk(1e-5)
-    given = case(noise.simulate(4096, batch=(2,), generator=g), noise.simulate(2048, batch=(1, 2), generator=g))
+    given = comparison(noise.simulate(4096, batch=(2,), generator=g), noise.simulate(2048, batch=(1, 2), generator=g))
     assert float(slow(given).log_ratios(torch.ones(2, 3, dtype=torch.float64)).abs().max()) == 0.0
     assert not slow_gains(given, lambda m, f: 2 * m, 0).any()
-    assert shape_witness(given).p_value > 1e-3
+    assert shape_test(given).p_value > 1e-3
 
 
 def test_coherences_of_noise_that_is_loud_in_all_sensors_at_once_vary_more() -> None:
@@ -320,7 +322,7 @@ def test_coherences_of_noise_that_is_loud_in_all_sensors_at_once_vary_more() -> 
     course = gf.AR1(math.exp(-1 / 300), 0.5 * -math.expm1(-2 / 300)).simulate(n, generator=g)  # of the log variance
     noise = torch.randn(p, n, generator=g, dtype=torch.float64)
     for samples, largest in ((noise, 0.02), (noise * torch.exp(course / 2), 1.2)):
-        side = Side(samples[None], bands(n))
+        side = Records(samples[None], bands(n))
         high = side.bands.dof > 100
         pairs = torch.triu_indices(p, p, 1)
         mean = (side.coherence.abs().square()[:, pairs[0], pairs[1]].mean(-1) * side.coherence_dof)[high].mean()

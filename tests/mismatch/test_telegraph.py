@@ -13,13 +13,7 @@ from scipy import linalg, stats
 from torch import Tensor
 
 from gyrofuse import AR1, RandomWalk, WhiteNoise
-from gyrofuse.mismatch.case import Case, Scene
-from gyrofuse.mismatch.confirm import held_out_gain
-from gyrofuse.mismatch.folds import N_JUDGED
-from gyrofuse.mismatch.mechanisms import random_telegraph
-from gyrofuse.mismatch.mechanisms.random_telegraph import RandomTelegraph, _path
-from gyrofuse.mismatch.shapes import chosen_shape
-from gyrofuse.mismatch.telegraph import (
+from gyrofuse.mismatch.likelihoods.telegraph import (
     _LARGEST,
     Background,
     _filter,
@@ -28,9 +22,23 @@ from gyrofuse.mismatch.telegraph import (
     gaussian_values,
     switching_values,
 )
-from gyrofuse.mismatch.telegraph_fit import Numbers, _fitted, _in_fit_blocks, excess, scores, two_levels, vertex
+from gyrofuse.mismatch.likelihoods.telegraph_fit import (
+    Numbers,
+    _fitted,
+    _in_fit_blocks,
+    excess,
+    scores,
+    two_levels,
+    vertex,
+)
+from gyrofuse.mismatch.mechanisms.regimes import telegraph as random_telegraph
+from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph, _path
+from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape
+from gyrofuse.mismatch.selection.held_out import held_out_gain
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.folds import N_JUDGED
 
-N, SCENE = 16384, Scene(100.0, "deg/s", ("x", "y"))
+N, SCENE = 16384, RecordingInfo(100.0, "deg/s", ("x", "y"))
 NOISE = WhiteNoise(1.0) + AR1(0.995, 2e-4) + RandomWalk(1e-7)
 LEVELS = Numbers(0.35, 160.0, 110.0)
 PHI, STEPS, WHITE = np.array([0.8, 0.97, 1.0]), np.array([0.05, 0.02, 0.01]), 0.4
@@ -38,16 +46,16 @@ START = np.append(STEPS[:2] / (1 - PHI[:2] ** 2), _LARGEST)
 BACKGROUND = Background(WHITE, PHI, STEPS, START)
 
 
-def drawn(seed: int, extra: Tensor | None = None) -> Case:
+def drawn(seed: int, extra: Tensor | None = None) -> Comparison:
     g = torch.Generator().manual_seed(seed)
     recording = NOISE.simulate(N, batch=(2,), generator=g)
     simulation = NOISE.simulate(N, batch=(4, 2), generator=g)
     if extra is not None:
         recording[1] += extra
-    return Case.of(SCENE, recording, simulation)
+    return Comparison.of(SCENE, recording, simulation)
 
 
-def telegraph(seed: int) -> Case:
+def telegraph(seed: int) -> Comparison:
     g = torch.Generator().manual_seed(1000 + seed)
     return drawn(seed, LEVELS.half * _path(N, LEVELS.up, LEVELS.down, g))
 
@@ -129,14 +137,14 @@ def test_gains_settle_and_one_is_left_for_the_level_at_the_start() -> None:
 
 
 def test_backgrounds_have_the_variances_of_block_means() -> None:
-    case, block = drawn(4), 32
-    background = backgrounds(case.base, block)[0]
+    comparison, block = drawn(4), 32
+    background = backgrounds(comparison.base, block)[0]
     lags = np.arange(0, 60, 6)
 
     def variogram(matrix: np.ndarray) -> np.ndarray:
         return np.array([matrix[0, 0] + matrix[lag, lag] - 2 * matrix[0, lag] for lag in lags[1:]])
 
-    exact = case.base.block_covariance(block, 60)[0].numpy()
+    exact = comparison.base.block_covariance(block, 60)[0].numpy()
     k = np.arange(60)
     lag, earlier = np.abs(k[:, None] - k), np.minimum(k[:, None], k)
     variances = background.start[:-1]
@@ -166,12 +174,12 @@ def test_a_lorentzian_is_told_by_its_spectrum() -> None:
 
 @pytest.mark.statistical
 def test_blocks_get_shorter_where_levels_change_faster_than_the_spectrum_had_it() -> None:
-    case, sd = telegraph(10), float(excess(telegraph(10)).sd[1])
+    comparison, sd = telegraph(10), float(excess(telegraph(10)).sd[1])
     tau = 1 / (1 / LEVELS.up + 1 / LEVELS.down)
-    first = _fitted(case, 1, sd, 3 * tau)
+    first = _fitted(comparison, 1, sd, 3 * tau)
     assert first is not None
     assert not first.resolved
-    found = _in_fit_blocks(case, 1, sd, 3 * tau)
+    found = _in_fit_blocks(comparison, 1, sd, 3 * tau)
     assert found is not None
     assert found.resolved
     assert found.means.block < first.means.block
@@ -180,39 +188,39 @@ def test_blocks_get_shorter_where_levels_change_faster_than_the_spectrum_had_it(
 @pytest.mark.statistical
 def test_beside_a_sensor_that_jumps_another_one_needs_less() -> None:
     """Of weaker levels, a nat over the Gaussian rival, that would not do alone."""
-    case, g = telegraph(33), torch.Generator().manual_seed(2033)
-    recording = case.recording.clone()
+    comparison, g = telegraph(33), torch.Generator().manual_seed(2033)
+    recording = comparison.recording.clone()
     recording[0] += 0.6 * LEVELS.half * _path(N, LEVELS.up, LEVELS.down, g)
-    both = Case.of(SCENE, recording, case.simulated.signal)
+    both = Comparison.of(SCENE, recording, comparison.reference.signal)
     assert 0 < two_levels(both)[0].over < 1.5
     assert nominated(both, RandomTelegraph).sensors == (0, 1)
-    alone = Case.of(SCENE, recording[:1].expand(2, -1), case.simulated.signal[:, :1].expand(-1, 2, -1))
-    assert RandomTelegraph.nominate(alone, LEVEL) is None
+    alone = Comparison.of(SCENE, recording[:1].expand(2, -1), comparison.reference.signal[:, :1].expand(-1, 2, -1))
+    assert RandomTelegraph.detect_and_fit(alone, LEVEL) is None
 
 
 def test_one_event_beside_a_sensor_that_jumps_is_no_telegraph(monkeypatch: pytest.MonkeyPatch) -> None:
-    case = telegraph(10)
-    fit = two_levels(case)[1]
+    comparison = telegraph(10)
+    fit = two_levels(comparison)[1]
     values = fit.rival - 0.5
     values[:2] += 12.0
     event = fit._replace(values=np.tile(values, (len(fit.values), 1)))
     assert event.over > 5
     assert event.momentary
     monkeypatch.setattr(random_telegraph, "two_levels", lambda _case: {0: event, 1: fit})
-    assert nominated(case, RandomTelegraph).sensors == (1,)
+    assert nominated(comparison, RandomTelegraph).sensors == (1,)
 
 
 @pytest.mark.statistical
 def test_two_levels_are_named_where_noise_is_coloured() -> None:
     within, named, seeds = 0, 0, range(10, 14)
     for seed in seeds:
-        case = telegraph(seed)
-        found = RandomTelegraph.nominate(case, LEVEL)
+        comparison = telegraph(seed)
+        found = RandomTelegraph.detect_and_fit(comparison, LEVEL)
         if found is None:
             continue
         named += 1
         assert found.sensors == (1,)
-        gain = held_out_gain(case, found.effect)
+        gain = held_out_gain(comparison, found.effect)
         assert gain.blocks.shape == (N_JUDGED,)
         assert gain.total > gain.sd
         truth = {"half_step[1]": LEVELS.half, "dwell_up[1]": LEVELS.up / 100, "dwell_down[1]": LEVELS.down / 100}
@@ -225,15 +233,15 @@ def test_two_levels_are_named_where_noise_is_coloured() -> None:
 @pytest.mark.parametrize("half", [3.0, 30.0])
 def test_loud_jumps_are_measured_though_their_likelihood_is_a_narrow_peak(half: float) -> None:
     g = torch.Generator().manual_seed(60)
-    case = drawn(60, half * _path(N, 160.0, 30.0, g))
-    found = nominated(case, RandomTelegraph)
+    comparison = drawn(60, half * _path(N, 160.0, 30.0, g))
+    found = nominated(comparison, RandomTelegraph)
     assert found.sensors == (1,)
     for name, value in (("half_step", half), ("dwell_up", 1.6), ("dwell_down", 0.3)):
         entry = found.parameters[f"{name}[1]"]
         assert entry.high < 2.5 * entry.low
         assert abs(math.log(entry.value / value)) < math.log(entry.high / entry.low)
     # How many jumps a record has is chance, and with it all power above their rate: no other numbers of the noise.
-    explained = found.effect.explained(case, g)
+    explained = found.effect.repair(comparison, g)
     assert chosen_shape(explained, "parameter_shift", LEVEL) is None
 
 
@@ -243,25 +251,25 @@ def test_an_ar1_of_the_same_spectrum_is_not() -> None:
         g = torch.Generator().manual_seed(seed)
         phi = math.exp(-1 / tau)
         extra = AR1(phi, LEVELS.half**2 * (1 - phi**2)).simulate(N, generator=g)
-        assert RandomTelegraph.nominate(drawn(seed, extra), LEVEL) is None
+        assert RandomTelegraph.detect_and_fit(drawn(seed, extra), LEVEL) is None
 
 
 def test_scores_are_those_of_the_fit_or_computed() -> None:
-    case = telegraph(10)
-    fit = two_levels(case)[1]
-    assert scores(case, 1, fit.best) is not None
-    assert scores(case, 1, fit.best) == pytest.approx(fit.values[0])
-    near = scores(case, 1, fit.best._replace(half=fit.best.half * 1.001))
+    comparison = telegraph(10)
+    fit = two_levels(comparison)[1]
+    assert scores(comparison, 1, fit.best) is not None
+    assert scores(comparison, 1, fit.best) == pytest.approx(fit.values[0])
+    near = scores(comparison, 1, fit.best._replace(half=fit.best.half * 1.001))
     assert near.sum() == pytest.approx(fit.values[0].sum(), abs=1.0)
     # A sensor that was not tried.
-    assert scores(case, 0, LEVELS).sum() < -10
-    assert scores(case, 0, Numbers(0.1, 2.0, 2.0)) == pytest.approx(np.zeros(N_JUDGED))
+    assert scores(comparison, 0, LEVELS).sum() < -10
+    assert scores(comparison, 0, Numbers(0.1, 2.0, 2.0)) == pytest.approx(np.zeros(N_JUDGED))
 
 
 def test_the_repair_builds_levels_into_every_record() -> None:
     found = nominated(telegraph(10), RandomTelegraph)
     zero = torch.zeros(3, 2, 5000, dtype=torch.float64)
-    made = found.effect.simulated(zero, SCENE, torch.Generator().manual_seed(1))
+    made = found.effect.apply(zero, SCENE, torch.Generator().manual_seed(1))
     half = found.parameters["half_step[1]"].value
     assert bool((made[:, 0] == 0).all())
     assert made[:, 1].abs().unique().tolist() == pytest.approx([half])

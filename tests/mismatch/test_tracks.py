@@ -8,7 +8,7 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from gyrofuse.mismatch import track_fit, tracks
+from gyrofuse.mismatch.detectors.lines import track_fit, tracks
 
 
 def noise(seed: int, *shape: int) -> Tensor:

@@ -8,25 +8,28 @@ import torch
 from mismatch_draws import LEVEL, SCENE, N, covers, drawn, even, nominated, normal, settled
 
 from gyrofuse import AR1, WhiteNoise
-from gyrofuse.mismatch import impulses, lattices, marginals, prediction_errors
-from gyrofuse.mismatch.case import Case
-from gyrofuse.mismatch.mechanisms.clipping import Clipping
-from gyrofuse.mismatch.mechanisms.quantization import Quantization
-from gyrofuse.mismatch.mechanisms.stuck_samples import StuckSamples
+from gyrofuse.mismatch.detectors.values import quantisation_grid as lattices
+from gyrofuse.mismatch.detectors.values import values as marginals
+from gyrofuse.mismatch.detectors.variance import outliers as impulses
+from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
+from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
+from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
+from gyrofuse.mismatch.signals import prediction_errors
+from gyrofuse.mismatch.signals.comparison import Comparison
 
 
 @pytest.mark.parametrize(("step", "offset"), [(1.0, 0.3), (0.2, 0.0), (4.0, 1.0)])
 def test_rounding_is_read_off_the_values(step: float, offset: float) -> None:
     recording, simulation, g = drawn(1)
     recording[:2] = ((recording[:2] - offset) / step).round() * step + offset
-    case = Case.of(SCENE, recording, simulation)
-    found = nominated(case, Quantization)
+    comparison = Comparison.of(SCENE, recording, simulation)
+    found = nominated(comparison, Quantization)
     assert found.sensors == (0, 1)
     assert found.alternatives == ()
     assert found.parameters["lsb[0]"].value == pytest.approx(step, rel=1e-9)
-    after = settled(case, found, g)
-    assert marginals.marginal_witness(after).p_value > 0.001
-    repaired = found.effect.simulated(simulation, SCENE, g)
+    after = settled(comparison, found, g)
+    assert marginals.values_test(after).p_value > 0.001
+    repaired = found.effect.apply(simulation, SCENE, g)
     assert float(lattices.off_lattice(repaired[:, :2], step, offset).abs().max()) < 1e-9
     assert torch.equal(repaired[:, 2], simulation[:, 2])
 
@@ -36,13 +39,13 @@ def test_coarse_rounding_makes_neither_outliers_nor_clipping(step: float) -> Non
     """Medians of few steps are a matter of luck, and predictions from noise go beyond where any value would."""
     for seed in range(4):
         recording, simulation, g = drawn(40 + seed)
-        case = Case.of(SCENE, step * (recording / step).round(), simulation)
-        found = nominated(case, Quantization)
+        comparison = Comparison.of(SCENE, step * (recording / step).round(), simulation)
+        found = nominated(comparison, Quantization)
         assert found.sensors == (0, 1, 2)
-        after = found.effect.explained(case, g)
-        assert impulses.spike_witness(after).p_value > 0.001
-        assert Clipping.nominate(after, LEVEL) is None
-        sd, rms = prediction_errors.left_out(after.recorded).sd[0], impulses.left_out(after.recorded).error[0].std(-1)
+        after = found.effect.repair(comparison, g)
+        assert impulses.outliers_test(after).p_value > 0.001
+        assert Clipping.detect_and_fit(after, LEVEL) is None
+        sd, rms = prediction_errors.left_out(after.observed).sd[0], impulses.left_out(after.observed).error[0].std(-1)
         torch.testing.assert_close(sd, rms, rtol=0.03, atol=0.0)
 
 
@@ -56,10 +59,10 @@ def test_the_smooth_sd_is_that_of_normal_values_and_yields_little_to_outliers() 
 
 def test_rounding_that_a_simulation_has_too_is_not_missing() -> None:
     recording, simulation, _ = drawn(2)
-    case = Case.of(SCENE, (2 * recording).round() / 2, (2 * simulation).round() / 2)
-    assert Quantization.nominate(case, LEVEL) is None
-    assert StuckSamples.nominate(case, LEVEL) is None
-    assert marginals.marginal_witness(case).p_value > 0.01
+    comparison = Comparison.of(SCENE, (2 * recording).round() / 2, (2 * simulation).round() / 2)
+    assert Quantization.detect_and_fit(comparison, LEVEL) is None
+    assert StuckSamples.detect_and_fit(comparison, LEVEL) is None
+    assert marginals.values_test(comparison).p_value > 0.01
 
 
 def test_a_lattice_hidden_under_later_noise_is_found() -> None:
@@ -67,8 +70,8 @@ def test_a_lattice_hidden_under_later_noise_is_found() -> None:
     for seed in range(6):
         recording, simulation, g = drawn(10 + seed)
         recording = 1.5 * (recording / 1.5).round() + 0.45 * normal(3, N, g=g)
-        case = Case.of(SCENE, recording, simulation)
-        found = nominated(case, Quantization)
+        comparison = Comparison.of(SCENE, recording, simulation)
+        found = nominated(comparison, Quantization)
         assert found.sensors == (0, 1, 2)
         inside += sum(covers(found, f"lsb[{i}]", 1.5) for i in range(3))
     # Fewer than 13 of 18 at 95 % have probability 2e-4.
@@ -87,11 +90,11 @@ def test_values_cut_at_a_limit_are_clipped() -> None:
     recording, simulation, g = drawn(4)
     recording[0].clamp_(max=3.0)
     recording[2].clamp_(-2.5, 2.0)
-    case = Case.of(SCENE, recording, simulation)
-    found = nominated(case, Clipping)
+    comparison = Comparison.of(SCENE, recording, simulation)
+    found = nominated(comparison, Clipping)
     assert found.sensors == (0, 2)
     assert {name: p.value for name, p in found.parameters.items()} == {"high[0]": 3.0, "high[2]": 2.0, "low[2]": -2.5}
-    settled(case, found, g)
+    settled(comparison, found, g)
 
 
 def test_few_samples_at_an_end_prove_it_and_a_repaired_simulation_has_it() -> None:
@@ -100,10 +103,10 @@ def test_few_samples_at_an_end_prove_it_and_a_repaired_simulation_has_it() -> No
         recording, simulation, g = drawn(200 + seed, records=1)
         ordered = recording.sort(dim=-1).values
         recording = recording.clamp(ordered[:, 4:5], ordered[:, -5:-4])
-        case = Case.of(SCENE, recording, simulation)
-        found = nominated(case, Clipping)
+        comparison = Comparison.of(SCENE, recording, simulation)
+        found = nominated(comparison, Clipping)
         assert found.sensors == (0, 1, 2)
-        settled(case, found, g)
+        settled(comparison, found, g)
 
 
 @pytest.mark.parametrize("ratio", [1.0, 0.8])
@@ -111,7 +114,7 @@ def test_an_end_is_no_chance_of_a_quieter_simulation(ratio: float) -> None:
     for seed in range(6):
         recording, simulation, _ = drawn(300 + seed, records=1)
         recording = recording.clamp(max=recording.sort(dim=-1).values[:, -5:-4])
-        found = nominated(Case.of(SCENE, recording, ratio * simulation), Clipping)
+        found = nominated(Comparison.of(SCENE, recording, ratio * simulation), Clipping)
         assert found.sensors == (0, 1, 2)
 
 
@@ -126,17 +129,17 @@ def test_the_largest_of_few_digits_may_be_there_twice() -> None:
             continue
         ties += 1
         simulation = normal(1, 3, N, g=g).half().double()
-        assert Clipping.nominate(Case.of(SCENE, recording, simulation), LEVEL) is None
+        assert Clipping.detect_and_fit(Comparison.of(SCENE, recording, simulation), LEVEL) is None
     assert ties >= 5
 
 
 def test_clipping_shows_on_a_lattice_as_well() -> None:
     recording, simulation, _ = drawn(5)
     recording, simulation = recording.clamp(max=2.0).round(), simulation.round()
-    case = Case.of(SCENE, recording, simulation)
-    assert nominated(case, Clipping).parameters["high[0]"].value == 2.0
-    plain = Case.of(SCENE, drawn(5)[0].round(), simulation)
-    assert Clipping.nominate(plain, LEVEL) is None
+    comparison = Comparison.of(SCENE, recording, simulation)
+    assert nominated(comparison, Clipping).parameters["high[0]"].value == 2.0
+    plain = Comparison.of(SCENE, drawn(5)[0].round(), simulation)
+    assert Clipping.detect_and_fit(plain, LEVEL) is None
 
 
 @pytest.mark.parametrize("rounded", [False, True])
@@ -147,31 +150,31 @@ def test_repeats_beyond_those_of_the_lattice_are_stuck_samples(rounded: bool, to
         recording, simulation = (2 * recording).round() / 2, (2 * simulation).round() / 2
     p = torch.tensor([0.05, 0.0, 0.05], dtype=torch.float64)
     stuck = StuckSamples(p, torch.zeros(3, dtype=torch.float64), together)
-    case = Case.of(SCENE, stuck.simulated(recording, SCENE, g), simulation)
-    found = nominated(case, StuckSamples)
+    comparison = Comparison.of(SCENE, stuck.apply(recording, SCENE, g), simulation)
+    found = nominated(comparison, StuckSamples)
     assert found.sensors == (0, 2)
     assert covers(found, "probability[0]", 0.05)
     assert isinstance(found.effect, StuckSamples)
     assert found.effect.together is together
-    settled(case, found, g)
+    settled(comparison, found, g)
 
 
 def test_few_repeats_prove_that_samples_stick_where_values_do_not_recur() -> None:
     recording, simulation, _ = drawn(16)
     at = torch.tensor([500, 1500, 2500, 3500, 5000, 6000, 7000, 8000])
     recording[0, at] = recording[0, at - 1]
-    case = Case.of(SCENE, recording, simulation)
-    p = marginals.repeats(case).p_values
-    shares = case.n_samples / (case.n_samples + case.simulated.signal[:, 0].numel())
+    comparison = Comparison.of(SCENE, recording, simulation)
+    p = marginals.repeats(comparison).p_values
+    shares = comparison.n_samples / (comparison.n_samples + comparison.reference.signal[:, 0].numel())
     assert float(p[0]) == pytest.approx(shares ** len(at))
     assert float(p[1:].min()) == 1.0
-    assert nominated(case, StuckSamples).sensors == (0,)
+    assert nominated(comparison, StuckSamples).sensors == (0,)
 
 
 def test_few_repeats_of_coarse_numbers_are_chance() -> None:
     recording, simulation, _ = drawn(17)
     fine = 2e-4 * (recording / 2e-4).round()  # a repeat in ten thousand samples or so
-    p_values = marginals.repeats(Case.of(SCENE, fine, simulation)).p_values
+    p_values = marginals.repeats(Comparison.of(SCENE, fine, simulation)).p_values
     assert int(marginals.repeated(fine).sum()) > 0
     assert float(p_values.min()) > 0.05
 
@@ -182,13 +185,13 @@ def test_few_repeats_are_compared_with_those_that_a_quieter_simulation_would_hav
         recording, simulation, _ = drawn(70 + seed)
         rounded = 2e-3 * (recording / 2e-3).round()
         noisier = 2e-3 * (8 * simulation / 2e-3).round()
-        p_values.append(marginals.repeats(Case.of(SCENE, rounded, noisier)).p_values)
+        p_values.append(marginals.repeats(Comparison.of(SCENE, rounded, noisier)).p_values)
     assert float(torch.stack(p_values).min()) > 1e-3
     recording[1, 40::400] = recording[1, 39:-1:400]
     fine = 2e-4 * (recording / 2e-4).round()
     once = simulation.clone()
     once[0, 1, 5] = once[0, 1, 4]  # one repeat there does not say that the recording's own resolution makes none
-    p_values = marginals.repeats(Case.of(SCENE, fine, once)).p_values
+    p_values = marginals.repeats(Comparison.of(SCENE, fine, once)).p_values
     assert float(p_values[1]) < 1e-4
     assert float(p_values[[0, 2]].min()) > 0.01
 
@@ -198,11 +201,11 @@ def test_repeats_that_chance_would_not_make_may_come_and_go() -> None:
     at = (even(N, g=g) < 0.006) & (torch.arange(N) < N // 2)
     for t in at.nonzero()[:, 0].clamp(min=1).tolist():
         recording[:, t] = recording[:, t - 1]
-    case = Case.of(SCENE, recording, simulation)
-    slow = marginals._repeat_shares(marginals.repeated(case.recorded.signal).movedim(1, 0))[3]
+    comparison = Comparison.of(SCENE, recording, simulation)
+    slow = marginals._repeat_shares(marginals.repeated(comparison.observed.signal).movedim(1, 0))[3]
     assert bool((slow > 0).all())  # quarters differ by more than noise
-    assert marginals.marginal_witness(case).p_value < 1e-4
-    assert nominated(case, StuckSamples).sensors == (0, 1, 2)
+    assert marginals.values_test(comparison).p_value < 1e-4
+    assert nominated(comparison, StuckSamples).sensors == (0, 1, 2)
 
 
 def test_a_largest_value_that_recurs_on_a_fine_lattice_is_no_end_stop() -> None:
@@ -215,7 +218,7 @@ def test_a_largest_value_that_recurs_on_a_fine_lattice_is_no_end_stop() -> None:
     for row in recording:
         first, second = row.topk(2).indices.tolist()
         row[second] = row[first]
-    assert min(end.p_value for end in marginals.end_stops(Case.of(SCENE, recording, simulation))) > LEVEL
+    assert min(end.p_value for end in marginals.end_stops(Comparison.of(SCENE, recording, simulation))) > LEVEL
 
 
 @pytest.mark.parametrize("width", [0.002, 0.02, 0.2, 0.6, 1.0])
@@ -224,20 +227,20 @@ def test_a_dead_band_is_no_repeats_and_no_hidden_lattice_however_wide_it_is(widt
     recording, simulation, g = drawn(60, records=2)
     recording -= recording.mean(-1, keepdim=True) - torch.tensor([[0.0], [0.3], [-0.2]])
     recording[:2] = torch.where(recording[:2].abs() < width, 0.0, recording[:2])
-    case = Case.of(SCENE, recording, simulation)
-    assert StuckSamples.nominate(case, LEVEL) is None
-    found = nominated(case, Quantization)
+    comparison = Comparison.of(SCENE, recording, simulation)
+    assert StuckSamples.detect_and_fit(comparison, LEVEL) is None
+    found = nominated(comparison, Quantization)
     assert found.sensors == (0, 1)
     assert covers(found, "dead_band[0]", width)
     assert covers(found, "dead_band[1]", width)
-    after = found.effect.explained(case, g)
-    assert Quantization.nominate(after, LEVEL) is None
-    assert StuckSamples.nominate(after, LEVEL) is None
-    assert marginals.marginal_witness(after).p_value > 0.001
+    after = found.effect.repair(comparison, g)
+    assert Quantization.detect_and_fit(after, LEVEL) is None
+    assert StuckSamples.detect_and_fit(after, LEVEL) is None
+    assert marginals.values_test(after).p_value > 0.001
 
 
 def test_a_value_filled_in_is_no_dead_band() -> None:
     recording, simulation, g = drawn(61, records=2)
     recording[0, even(N, g=g) < 0.02] = 0.1
-    found = Quantization.nominate(Case.of(SCENE, recording, simulation), LEVEL)
+    found = Quantization.detect_and_fit(Comparison.of(SCENE, recording, simulation), LEVEL)
     assert found is None or "dead_band[0]" not in found.parameters

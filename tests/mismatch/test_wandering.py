@@ -8,13 +8,13 @@ import math
 import pytest
 import torch
 from scipy import stats
-from shape_draws import SIGNS, N, array, case, generator, oscillating
+from shape_draws import SIGNS, N, array, comparison, generator, oscillating
 
-from gyrofuse.mismatch.bump_fit import oscillation_of
-from gyrofuse.mismatch.mechanisms.drifting_tone import DriftingTone
-from gyrofuse.mismatch.oscillating import Mode
-from gyrofuse.mismatch.steadiness import steadiness
-from gyrofuse.mismatch.wandering import _cell, _courses, _hump, wandering_log_ratio
+from gyrofuse.mismatch.detectors.spectra.peak_fit import oscillation_of
+from gyrofuse.mismatch.mechanisms.spectra.frequency_courses import _cell, _courses, _hump, wandering_log_ratio
+from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode
+from gyrofuse.mismatch.mechanisms.spectra.steadiness import steadiness
+from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
 
 WIDTH, RMS = 60 / N, 9e-4  # half width in cycles per sample; deg/s
 
@@ -34,12 +34,12 @@ def test_weak_ones_are_told_apart(tone: bool):
         g = generator(900 + seed)
         records = array().simulate(N, batch=(4,), generator=g)
         source = wandering(g) if tone else oscillating(g, 0.2, WIDTH, 1)
-        given = case(records[0] + RMS * SIGNS[:, None] * source, records[1:])
-        bump = oscillation_of(given)
-        if bump is None or bump.gain is None:
+        given = comparison(records[0] + RMS * SIGNS[:, None] * source, records[1:])
+        peak = oscillation_of(given)
+        if peak is None or peak.gain is None:
             continue
         seen += 1
-        verdict = steadiness(given, bump)
+        verdict = steadiness(given, peak)
         right += verdict.tone == tone
         wrong += verdict.tone != tone and not verdict.open
     assert seen >= n_runs - 1
@@ -55,10 +55,10 @@ def test_strong_ones_are_told_apart_that_hardly_wander(tone: bool):
         g, width = generator(930 + seed), 3 / N
         records = array().simulate(N, batch=(4,), generator=g)
         source = wandering(g, width) if tone else oscillating(g, 0.2, width, 1)
-        given = case(records[0] + 8 * RMS * SIGNS[:, None] * source, records[1:])
-        bump = oscillation_of(given)
-        assert bump is not None
-        verdict = steadiness(given, bump)
+        given = comparison(records[0] + 8 * RMS * SIGNS[:, None] * source, records[1:])
+        peak = oscillation_of(given)
+        assert peak is not None
+        verdict = steadiness(given, peak)
         assert verdict.tone == tone
         assert not (tone and verdict.open)
 
@@ -67,9 +67,9 @@ def test_a_band_is_cleaned_to_the_level_of_the_noise_whatever_is_slow():
     """What a walk leaves in the slowest ordinates is many times the noise, and none of the band's."""
     records = array().simulate(N, batch=(5,), generator=generator(940))
     slow = torch.sin(2 * math.pi * torch.arange(N, dtype=torch.float64) / N * 1.7)
-    given = case(records[0] + 0.01 * slow, records[1:])
+    given = comparison(records[0] + 0.01 * slow, records[1:])
     mode = Mode(500 / N, 45 / N, SIGNS.to(torch.complex128), True)
-    cleaned = DriftingTone(mode, True).explained(given, generator(941))
+    cleaned = DriftingTone(mode, True).repair(given, generator(941))
     bins = torch.arange(60, 940)
     power = torch.fft.rfft(cleaned.recording)[:, bins].abs().square() / given.base.spectrum(bins / N) / N
     assert float((power.mean(-1) - 1).abs().max()) < 5 / math.sqrt(len(bins)) + 0.05  # which the base is off
@@ -79,9 +79,9 @@ def test_a_strong_tone_leaves_nothing_beside_the_middle_of_its_line():
     """Its line is seen farther out than any number of its half widths, and falls as no Lorentzian does."""
     g, width = generator(942), 3 / N
     records = array().simulate(N, batch=(5,), generator=g)
-    given = case(records[0] + 30 * RMS * SIGNS[:, None] * wandering(g, width), records[1:])
+    given = comparison(records[0] + 30 * RMS * SIGNS[:, None] * wandering(g, width), records[1:])
     mode = Mode(0.2, 1.5 / N, 30 * RMS * SIGNS.to(torch.complex128), True)
-    cleaned = DriftingTone(mode, True).explained(given, g)
+    cleaned = DriftingTone(mode, True).repair(given, g)
     bins = round(0.2 * N) + torch.arange(-80, 81)
     power = torch.fft.rfft(cleaned.recording)[:, bins].abs().square() / given.base.spectrum(bins / N) / N
     assert float(power.mean()) < 2
@@ -115,11 +115,13 @@ def test_half_of_a_band_is_a_whole_number_of_cells():
 
 
 def test_no_room_for_a_band_says_nothing():
-    given = case(array().simulate(N, generator=generator(1)), array().simulate(N, batch=(2,), generator=generator(2)))
-    bump = oscillation_of(
-        case(given.recording + 3e-3 * oscillating(generator(3), 0.2, WIDTH, 1), given.simulated.signal)
+    given = comparison(
+        array().simulate(N, generator=generator(1)), array().simulate(N, batch=(2,), generator=generator(2))
     )
-    assert bump is not None
+    peak = oscillation_of(
+        comparison(given.recording + 3e-3 * oscillating(generator(3), 0.2, WIDTH, 1), given.reference.signal)
+    )
+    assert peak is not None
     weights = torch.ones(len(SIGNS), dtype=torch.complex128)
 
-    assert wandering_log_ratio(given, dataclasses.replace(bump, centre=20 / N), weights) == 0.0
+    assert wandering_log_ratio(given, dataclasses.replace(peak, centre=20 / N), weights) == 0.0

@@ -14,23 +14,26 @@ from torch import Tensor
 
 import gyrofuse as gf
 from gyrofuse import WhiteNoise
-from gyrofuse.mismatch import episodes, lattices, level_scan, shocks
-from gyrofuse.mismatch.case import Case, Scene
-from gyrofuse.mismatch.confirm import held_out_gain
-from gyrofuse.mismatch.engine import diagnose
-from gyrofuse.mismatch.evidence import SHARES, some_of
-from gyrofuse.mismatch.marginals import marginal_witness
-from gyrofuse.mismatch.mechanism import Finding
-from gyrofuse.mismatch.mechanisms.dead_band import DeadBand
-from gyrofuse.mismatch.mechanisms.quantization import Quantization
-from gyrofuse.mismatch.mechanisms.spikes import Spikes
-from gyrofuse.mismatch.mechanisms.variance_change import VarianceChange
-from gyrofuse.mismatch.noise_level import compared_levels, level_between, levelled
-from gyrofuse.mismatch.outliers import Outliers
-from gyrofuse.mismatch.recurring import band_limits, fits_band, recurring
+from gyrofuse.mismatch.detectors.values import quantisation_grid as lattices
+from gyrofuse.mismatch.detectors.values.ties import band_limits, fits_band, recurring
+from gyrofuse.mismatch.detectors.values.values import values_test
+from gyrofuse.mismatch.detectors.variance import weak_outliers as shocks
+from gyrofuse.mismatch.detectors.variance.noise_level import compared_levels, level_between, levelled
+from gyrofuse.mismatch.diagnose import diagnose
+from gyrofuse.mismatch.likelihoods.outlier_law import Outliers
+from gyrofuse.mismatch.mechanisms.mechanism import Finding
+from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
+from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
+from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
+from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
+from gyrofuse.mismatch.selection.held_out import held_out_gain
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.stats import level_scan
+from gyrofuse.mismatch.stats import segments as episodes
+from gyrofuse.mismatch.stats.multiplicity import SHARES, e_value_of_some
 
 N, RATE = 16384, 100.0
-SCENE = Scene(RATE, "deg/s", ("x", "y", "z"))
+SCENE = RecordingInfo(RATE, "deg/s", ("x", "y", "z"))
 
 
 def drawn(seed: int) -> tuple[Tensor, Tensor, torch.Generator]:
@@ -77,17 +80,17 @@ def test_shocks_too_weak_for_any_sensor_alone_are_named() -> None:
         recording, simulation, g = drawn(100 + seed)
         hit = (even(1, N, g=g) < 3e-3) & torch.tensor([[True], [False], [True]])
         recording = recording + hit * 3.0 * (even(3, N, g=g) - 0.5).sign()
-        case = Case.of(SCENE, recording, simulation)
-        found = Spikes.nominate(case, LEVEL)
+        comparison = Comparison.of(SCENE, recording, simulation)
+        found = Spikes.detect_and_fit(comparison, LEVEL)
         if found is None:
             continue
         assert isinstance(found.effect, Spikes)
         named += found.sensors == (0, 2) and found.effect.together
         inside += covers(found, "rate", 3e-3 * RATE * 3600) if found.effect.together else 0
-        gain = held_out_gain(case, found.effect)
+        gain = held_out_gain(comparison, found.effect)
         assert gain.total > gain.sd
         if not seed:
-            assert Spikes.nominate(found.effect.explained(case, g), LEVEL) is None
+            assert Spikes.detect_and_fit(found.effect.repair(comparison, g), LEVEL) is None
     assert named >= 5
     # Fewer than 4 of 6 at 95 % have probability 2e-3.
     assert inside >= 4
@@ -119,7 +122,7 @@ def test_the_scan_of_levels_is_the_mean_over_stretches_and_factors(referred: boo
     squares, other = normal(2, 64, g=g).square(), normal(2, 100, g=g).square()
     reference = level_scan.Reference(other.mean(-1) / squares.mean(-1), 100.0) if referred else None
     energy = (squares.sum(-1, keepdim=True) + referred * other.sum(-1, keepdim=True)).numpy()
-    x, recorded, n = squares.numpy() / energy, 64, 164 if referred else 64
+    x, observed, n = squares.numpy() / energy, 64, 164 if referred else 64
 
     def mean_ratio(m: int, starts: range) -> float:
         reach = np.minimum(np.array(level_scan._DEVIATIONS) * math.sqrt(2 / m + 2 / (n - m)), math.log(30))
@@ -131,12 +134,12 @@ def test_the_scan_of_levels_is_the_mean_over_stretches_and_factors(referred: boo
         return float(np.mean(ratios))
 
     lengths = sorted({round(2 ** (k / 2)) for k in range(11)})
-    by_length = [mean_ratio(m, range(0, recorded - m + 1, max(m // 8, 1))) for m in lengths]
+    by_length = [mean_ratio(m, range(0, observed - m + 1, max(m // 8, 1))) for m in lengths]
     found = level_scan.scanned_levels(squares, reference)
     assert found.log_ratio == pytest.approx(math.log(np.mean(by_length)), abs=1e-9)
     if reference is not None:
-        throughout = level_scan.other_level(recorded, reference)
-        assert throughout == pytest.approx(math.log(mean_ratio(recorded, range(1))), abs=1e-9)
+        throughout = level_scan.other_level(observed, reference)
+        assert throughout == pytest.approx(math.log(mean_ratio(observed, range(1))), abs=1e-9)
 
 
 def test_the_simulated_level_counts_as_samples_outside_of_episodes() -> None:
@@ -163,13 +166,13 @@ def test_the_simulated_level_tells_of_long_episodes() -> None:
     for seed in range(6):
         recording, simulation, _ = drawn(500 + seed)
         recording[:, 5000:11500] *= math.sqrt(1.1)
-        case = Case.of(SCENE, recording, simulation)
-        levels = compared_levels(case)
+        comparison = Comparison.of(SCENE, recording, simulation)
+        levels = compared_levels(comparison)
         assert levels is not None
         assert levels.p_value < 1e-4
         beside += levels.scan.log_ratio
-        alone += level_scan.scanned_levels(levelled(case).square()).log_ratio
-        found = nominated(case, VarianceChange)
+        alone += level_scan.scanned_levels(levelled(comparison).square()).log_ratio
+        found = nominated(comparison, VarianceChange)
         assert len(found.sensors) >= 2  # each tells 9 nats: all three do in 9 of 10
         assert found.alternatives == ()
     assert beside > 1.2 * alone
@@ -178,15 +181,15 @@ def test_the_simulated_level_tells_of_long_episodes() -> None:
 def test_another_level_throughout_is_no_episode() -> None:
     for seed in range(6):
         recording, simulation, _ = drawn(600 + seed)
-        case = Case.of(SCENE, recording * math.sqrt(1.06), simulation)
-        levels = compared_levels(case)
+        comparison = Comparison.of(SCENE, recording * math.sqrt(1.06), simulation)
+        levels = compared_levels(comparison)
         assert levels is not None
         assert levels.throughout > levels.scan.log_ratio + 5
         assert levels.p_value == 1.0
-        assert VarianceChange.nominate(case, LEVEL) is None
+        assert VarianceChange.detect_and_fit(comparison, LEVEL) is None
         inside = torch.arange(N) < N // 3
-        assert level_between(case, inside) is None
-        assert level_between(case.with_recording(recording), inside) is not None
+        assert level_between(comparison, inside) is None
+        assert level_between(comparison.with_recording(recording), inside) is not None
 
 
 @pytest.mark.statistical
@@ -195,9 +198,9 @@ def test_a_level_that_changes_by_little_in_several_sensors_is_named() -> None:
     for seed in range(6):
         recording, simulation, _ = drawn(200 + seed)
         recording[:, 5000:9000] *= math.sqrt(1.13)
-        found = VarianceChange.nominate(Case.of(SCENE, recording, simulation), LEVEL)
+        found = VarianceChange.detect_and_fit(Comparison.of(SCENE, recording, simulation), LEVEL)
         found_all += found is not None and covers(found, "start", 50.0) and covers(found, "stop", 90.0)
-        assert VarianceChange.nominate(Case.of(SCENE, drawn(300 + seed)[0], simulation), LEVEL) is None
+        assert VarianceChange.detect_and_fit(Comparison.of(SCENE, drawn(300 + seed)[0], simulation), LEVEL) is None
     # Start and stop of six at 95 % each: fewer than 4 have probability 2e-3.
     assert found_all >= 4
 
@@ -206,7 +209,7 @@ def test_the_level_that_the_simulation_has_is_the_rule() -> None:
     """Louder for five eighths of the record: the rest would be a quiet episode, were there no simulation."""
     recording, simulation, _ = drawn(250)
     recording[:, 4096:14336] *= math.sqrt(1.3)
-    found = nominated(Case.of(SCENE, recording, simulation), VarianceChange)
+    found = nominated(Comparison.of(SCENE, recording, simulation), VarianceChange)
     assert found.sensors == (0, 1, 2)
     assert covers(found, "start", 40.96)
     assert covers(found, "stop", 143.36)
@@ -229,15 +232,15 @@ def test_a_dead_band_is_found_among_values_that_do_not_recur() -> None:
     for seed in range(8):
         recording, simulation, g = drawn(400 + seed)
         recording[:2][recording[:2].abs() < half_width] = 0.0
-        case = Case.of(SCENE, recording, simulation)
-        found = nominated(case, Quantization)
+        comparison = Comparison.of(SCENE, recording, simulation)
+        found = nominated(comparison, Quantization)
         assert isinstance(found.effect, DeadBand)
         assert (found.mechanism, found.sensors) == ("quantization", (0, 1))
         inside += covers(found, "dead_band[0]", half_width) + covers(found, "dead_band[1]", half_width)
-        gain = held_out_gain(case, found.effect)
+        gain = held_out_gain(comparison, found.effect)
         assert gain.total > gain.sd
-        after = found.effect.explained(case, g)
-        assert marginal_witness(after).p_value > 0.001
+        after = found.effect.repair(comparison, g)
+        assert values_test(after).p_value > 0.001
     # Fewer than 12 of 16 at 95 % have probability 9e-4.
     assert inside >= 12
 
@@ -247,23 +250,23 @@ def test_one_return_to_a_value_known_from_another_sensor_is_proof() -> None:
     recording[0][recording[0].abs() < 8e-4] = 0.0
     recording[1, int(recording[1].abs().argmin())] = 0.0
     assert int((recording[0] == 0).sum()) >= 4
-    assert nominated(Case.of(SCENE, recording, simulation), Quantization).sensors == (0, 1)
+    assert nominated(Comparison.of(SCENE, recording, simulation), Quantization).sensors == (0, 1)
 
 
 def test_a_value_filled_in_is_no_dead_band() -> None:
     recording, simulation, g = drawn(500)
     recording[0, even(N, g=g) < 1e-3] = 0.0
-    case = Case.of(SCENE, recording, simulation)
-    assert marginal_witness(case).p_value < 1e-6
-    assert Quantization.nominate(case, LEVEL) is None
+    comparison = Comparison.of(SCENE, recording, simulation)
+    assert values_test(comparison).p_value < 1e-6
+    assert Quantization.detect_and_fit(comparison, LEVEL) is None
 
 
 def test_values_of_single_precision_return_by_chance_alone() -> None:
     for seed in range(10):
         recording, simulation, _ = drawn(600 + seed)
-        case = Case.of(SCENE, recording.float().double(), simulation)
-        assert marginal_witness(case).p_value > 0.01
-        assert Quantization.nominate(case, LEVEL) is None
+        comparison = Comparison.of(SCENE, recording.float().double(), simulation)
+        assert values_test(comparison).p_value > 0.01
+        assert Quantization.detect_and_fit(comparison, LEVEL) is None
 
 
 def test_limits_of_a_band_follow_from_the_nearest_value_left() -> None:
@@ -287,7 +290,7 @@ def test_a_hidden_lattice_is_built_in_without_other_power() -> None:
     x = normal(3, 200_000, g=g)
     numbers = (torch.tensor(v, dtype=torch.float64) for v in ([1.0, 0.0, 1.0], [0.2, 0.0, 0.0], [0.3, 0.0, 0.0]))
     effect = Quantization(*numbers, x.mean(-1))
-    y = effect.simulated(x, SCENE, g)
+    y = effect.apply(x, SCENE, g)
     turn = torch.exp(2j * math.pi * (y[0] - 0.2)).mean().abs()
     assert float(turn) == pytest.approx(math.exp(-2 * math.pi**2 * 0.09), rel=0.03)
     assert float((y[0] - x[0]).square().mean()) < 0.4 / 12
@@ -306,7 +309,7 @@ def test_a_coarse_hidden_lattice_makes_of_noise_what_it_does_at_the_recording_s_
     one = torch.ones(1, dtype=torch.float64)
     effect = Quantization(one, 0 * one, 0.4 * one, made.mean(-1))
     level = math.sqrt(2 * 0.4**2 + 1 / 12)
-    y = effect.simulated(level * normal(1, 200_000, g=g) + 17.3, Scene(RATE, "deg/s", ("x",)), g)
+    y = effect.apply(level * normal(1, 200_000, g=g) + 17.3, RecordingInfo(RATE, "deg/s", ("x",)), g)
     assert float(y.mean()) == pytest.approx(17.3, abs=0.02)
     physical, mine = (float((v - v.mean()).pow(4).mean() / v.var() ** 2) for v in (made, y))
     assert (physical < 2.8) == (bias == 0.5)
@@ -324,7 +327,7 @@ def test_a_hidden_lattice_of_one_sensor_is_looked_for_in_the_others() -> None:
         for i, blur in ((0, 0.35), (1, 0.4475)):
             recording[i] = recording[i].round() + blur * normal(16384, g=g)
         level = recording.std(-1, keepdim=True)
-        found.append(nominated(Case.of(SCENE, recording, simulation * level), Quantization).sensors)
+        found.append(nominated(Comparison.of(SCENE, recording, simulation * level), Quantization).sensors)
     assert all(0 in sensors for sensors in found)
     # Power beyond 3.9 has a chance of 0.78, or of 0.02: fewer than 5 of 10 have probability 8e-3, more than 2 9e-4.
     assert sum(1 in sensors for sensors in found) >= 5
@@ -339,12 +342,12 @@ def test_a_hidden_lattice_that_no_sensor_shows_alone_is_seen_in_all_of_them_toge
         g = torch.Generator().manual_seed(seed)
         rounded = normal(6, 16384, g=g).round() + 0.5 * normal(6, 16384, g=g)
         plain, simulation = normal(6, 16384, g=g), normal(2, 6, 16384, g=g)
-        scene = Scene(RATE, "deg/s", tuple("abcdef"))
-        case = Case.of(scene, rounded, simulation * rounded.std())
-        alone.append(min(own.p_value for own in lattices.lattices(case.recorded)))
-        together.append(lattices.missing_lattices(case, LEVEL).p_value)
-        nothing.append(lattices.missing_lattices(Case.of(scene, plain, simulation), LEVEL).p_value)
-        step = lattices.shared_lattice(case.recorded).step
+        info = RecordingInfo(RATE, "deg/s", tuple("abcdef"))
+        comparison = Comparison.of(info, rounded, simulation * rounded.std())
+        alone.append(min(own.p_value for own in lattices.lattices(comparison.observed)))
+        together.append(lattices.missing_lattices(comparison, LEVEL).p_value)
+        nothing.append(lattices.missing_lattices(Comparison.of(info, plain, simulation), LEVEL).p_value)
+        step = lattices.shared_lattice(comparison.observed).step
         assert together[-1] > LEVEL or step == pytest.approx(1.0, abs=0.06)
     assert sum(p < LEVEL for p in together) >= 9
     assert sum(p < LEVEL for p in alone) <= 5
@@ -368,8 +371,8 @@ def test_noise_that_is_no_gaussian_of_one_sd_is_no_lattice(kind: str) -> None:
             x = x / (normal(5, 6, 65536, g=g).square().mean(0)).sqrt()
         else:
             x = math.sqrt(0.05) * x + math.sqrt(0.95) * normal(1, 65536, g=g)
-        case = Case.of(Scene(RATE, "deg/s", tuple("abcdef")), x, simulation * x.std())
-        assert lattices.missing_lattices(case, LEVEL).p_value > 0.01
+        comparison = Comparison.of(RecordingInfo(RATE, "deg/s", tuple("abcdef")), x, simulation * x.std())
+        assert lattices.missing_lattices(comparison, LEVEL).p_value > 0.01
 
 
 def test_a_trace_is_no_lattice_beside_hidden_ones_and_exact_ones_are_no_measure() -> None:
@@ -388,7 +391,7 @@ def test_the_ratio_of_a_lattice_that_some_sensors_have_has_mean_one() -> None:
     assert float(own.exp().mean()) == pytest.approx(1.0, abs=0.03)
     e = torch.tensor(SHARES, dtype=torch.float64)[:, None, None]
     naive = (1 - e + e * own.exp()).prod(1).mean(0).log()
-    torch.testing.assert_close(some_of(own), naive)
+    torch.testing.assert_close(e_value_of_some(own), naive)
 
 
 @pytest.mark.statistical
@@ -418,4 +421,4 @@ def test_strong_noise_that_goes_up_and_down_is_no_episode():
     signal = noise.simulate(n, batch=(3,), generator=torch.Generator().manual_seed(1)) * level
     report = gf.diagnose(gf.Recording(signal, rate=100.0), noise)
     assert "variance_change" not in [f.mechanism for f in report.findings]
-    assert "variance" in [entry.witness for entry in report.unexplained]
+    assert "variance" in [entry.test for entry in report.unexplained]

@@ -15,10 +15,9 @@ with `c = d` where the reference's sensors are independent, so that nothing abou
 Powers of sensors that share noise vary together: they count as often as a band has independent ones (a composite
 likelihood of the powers with weights that make its mean right; Varin, Reid and Firth, 2011).
 
-A reference drawn from a model that was itself fitted has fewer ordinates than it shows (`Side.told_by`); its
-parameters' covariance `C` and the spectrum's slopes `J` would enter as one more term that scales the reference's noise
-by `exp(J x)`, `x` with precision `C^-1`, in every hypothesis.
-"""
+A reference drawn from a model that was itself fitted has fewer ordinates than it shows (see
+`Records.effective_samples`); its parameters' covariance `C` and the spectrum's slopes `J` would enter as one more term
+that scales the reference's noise by `exp(J x)`, `x` with precision `C^-1`, in every hypothesis."""
 
 from __future__ import annotations
 
@@ -31,9 +30,9 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from gyrofuse.mismatch.shape_ground import Ground
-from gyrofuse.mismatch.shape_law import smooth_coherence
-from gyrofuse.mismatch.shape_terms import Common, Term
+from gyrofuse.mismatch.likelihoods.coherence_law import smooth_coherence
+from gyrofuse.mismatch.likelihoods.components import Common, Term
+from gyrofuse.mismatch.likelihoods.reference_spectrum import Ground
 
 # Share of the reference's power that is added to both sides of a ratio, -40 dB: below that leakage of the tapers and
 # the rounding of converters tell of themselves.
@@ -74,8 +73,8 @@ class Ratios:
     def of(
         cls,
         ground: Ground,
-        recorded: tuple[Tensor, Tensor],
-        simulated: tuple[Tensor, Tensor],
+        observed: tuple[Tensor, Tensor],
+        reference: tuple[Tensor, Tensor],
         expected: Tensor,
         usable: Tensor,
         independent: bool = False,
@@ -84,22 +83,22 @@ class Ratios:
 
         Args:
             ground: Noise of the reference.
-            recorded: Matrices `(band, sensor, sensor)` and ordinates `(band,)`.
-            simulated: Powers `(band, sensor)` and ordinates.
+            observed: Matrices `(band, sensor, sensor)` and ordinates `(band,)`.
+            reference: Powers `(band, sensor)` and ordinates.
             expected: Coherences of the reference.
             usable: Which powers count, `(band, sensor)`.
             independent: Whether the reference's sensors share nothing.
         """
-        (matrices, d), (power, s) = recorded, simulated
+        (matrices, d), (power, s) = observed, reference
         known = (s > 0).to(d.dtype)
         size = torch.where(known[:, None] > 0, power.clamp(min=1e-300), ground.mean.mT).rsqrt()
         worth = known * (d if independent else d * s / (d + s).clamp(min=1e-300))
-        observed = matrices * (size[:, :, None] * size[:, None, :])
+        ratios = matrices * (size[:, :, None] * size[:, None, :])
         # The variance of a log ratio is 1 / d + 1 / s, and what two have in common of either is a squared coherence.
         seen, share = smooth_coherence(_correlations(matrices), d), s / (d + s).clamp(min=1e-300)
         alike = share[:, None, None] * seen.abs().square() + (1 - share[:, None, None]) * expected.abs().square()
         together = alike.sum(-1).clamp(min=1.0)
-        return cls(ground, observed, expected, d, s, usable * known[:, None], worth * usable.amin(-1), together)
+        return cls(ground, ratios, expected, d, s, usable * known[:, None], worth * usable.amin(-1), together)
 
     @property
     def n_sensors(self) -> int:

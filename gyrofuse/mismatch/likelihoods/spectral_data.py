@@ -20,13 +20,12 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.transforms import cosine_ordinates
-from gyrofuse.mismatch.bumps import light_taper
-from gyrofuse.mismatch.case import Case
-from gyrofuse.mismatch.folds import N_FOLDS, N_JUDGED
-from gyrofuse.mismatch.remembered import remembered
-from gyrofuse.mismatch.shape_bands import N_PLACES, DeepBands, Groups
-from gyrofuse.mismatch.side import Side
-from gyrofuse.mismatch.spectra import Bands, cross_spectra, degrees_of_freedom, taper_window
+from gyrofuse.mismatch.likelihoods.band_powers import N_PLACES, DeepBands, Groups
+from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.signals.derived import derived
+from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED
+from gyrofuse.mismatch.signals.psd import Bands, cross_spectra, degrees_of_freedom, light_taper, taper_window
+from gyrofuse.mismatch.signals.records import Records
 
 # Bins of a block: the lowest band. The four tapers reach two bins down, and below one bin what is slower leaks in.
 _FIRST_BIN = 4
@@ -88,24 +87,27 @@ class Compared(NamedTuple):
 
     Attributes:
         bands: They, below and above them groups of ordinates of the whole record.
-        recorded: By block, 32 parts.
-        simulated: By the fold that holds it out, 4 parts.
+        observed: By block, 32 parts.
+        reference: By the fold that holds it out, 4 parts.
     """
 
     bands: DeepBands
-    recorded: Spectra
-    simulated: Spectra
+    observed: Spectra
+    reference: Spectra
 
 
-@remembered
-def block_spectra(case: Case) -> Compared:
+@derived
+def block_spectra(comparison: Comparison) -> Compared:
     """Both sides of a case."""
-    recorded, simulated = _of_side(case.recorded, case.n_samples), _of_side(case.simulated, case.n_samples)
-    folds = torch.arange(len(recorded.dof)) % N_FOLDS
-    parts = [(simulated.products[folds == k].sum(0), simulated.dof[folds == k].sum(0)) for k in range(N_FOLDS)]
+    observed, reference = (
+        _of_side(comparison.observed, comparison.n_samples),
+        _of_side(comparison.reference, comparison.n_samples),
+    )
+    folds = torch.arange(len(observed.dof)) % N_FOLDS
+    parts = [(reference.products[folds == k].sum(0), reference.dof[folds == k].sum(0)) for k in range(N_FOLDS)]
     return Compared(
-        compared_bands(case.n_samples),
-        recorded,
+        compared_bands(comparison.n_samples),
+        observed,
         Spectra(torch.stack([p for p, _ in parts]), torch.stack([d for _, d in parts])),
     )
 
@@ -174,7 +176,7 @@ def _let_in(bins: Bands, places: Tensor) -> Tensor:
     return shares / shares.sum(-1, keepdim=True)
 
 
-def _of_side(side: Side, n_samples: int) -> Spectra:
+def _of_side(side: Records, n_samples: int) -> Spectra:
     """A side by the 32 blocks that its samples, or the place of its ordinates, belong to."""
     noise = side.steady
     length, (n_records, p, n) = n_samples // N_JUDGED, noise.shape

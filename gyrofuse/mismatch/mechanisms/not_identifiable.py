@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from gyrofuse.mismatch.mechanism import Finding
+from gyrofuse.mismatch.mechanisms.mechanism import Finding
 
 NOT_IDENTIFIABLE = "not_identifiable"
 

@@ -15,9 +15,9 @@ from gyrofuse.mismatch.stats.long_run_variance import equal_means_score
 LAGS = 15  # samples: longer bursts are seen by the level's range
 
 
-def clustering_p_value(recorded: Tensor, simulated: Tensor) -> float:
+def clustering_p_value(observed: Tensor, reference: Tensor) -> float:
     """One-sided p value of squares `(record, time)` that come together as those of the other ones do."""
-    score, dof = equal_means_score(_products(recorded), _products(simulated), LAGS)
+    score, dof = equal_means_score(_products(observed), _products(reference), LAGS)
     return float(stats.t.sf(score, dof))
 
 

@@ -58,10 +58,10 @@ def bounded_kurtosis(values: Tensor) -> BoundedKurtosis:
     return BoundedKurtosis(float(q), influence, n_records * n / float(apart))
 
 
-def kurtosis_p_value(recorded: Tensor, simulated: Tensor) -> float:
+def kurtosis_p_value(observed: Tensor, reference: Tensor) -> float:
     """Two-sided p value that two series `(record, time)` have the same bounded kurtosis."""
-    own, other = bounded_kurtosis(recorded), bounded_kurtosis(simulated)
-    least = _GAUSSIAN * simulated.numel() / other.independent
+    own, other = bounded_kurtosis(observed), bounded_kurtosis(reference)
+    least = _GAUSSIAN * reference.numel() / other.independent
     score, dof = equal_means_score(own.value + own.influence, other.value + other.influence, least)
     return float(2 * stats.t.sf(abs(score), dof))
 

@@ -28,22 +28,22 @@ _SHAPES = np.linspace(-0.35, 1.0, 28)  # of `z^2/2`: lighter than a uniform's ..
 _SCALES = np.geomspace(0.03, 3.0, 40)  # over the mean excess: the scale of the heaviest and the lightest tail there
 
 
-def tail_p_values(recorded: Array, simulated: Array) -> Array:
+def tail_p_values(observed: Array, reference: Array) -> Array:
     """p values of the recording's exceedances in each sensor, `(sensor,)`, for all the levels looked at.
 
     Args:
-        recorded: Values in sd of the noise, `(sensor, time)`.
-        simulated: The same of the simulation, `(sensor, record, time)`.
+        observed: Values in sd of the noise, `(sensor, time)`.
+        reference: The same of the simulation, `(sensor, record, time)`.
     """
-    n, m = recorded.shape[-1], simulated[0].size
+    n, m = observed.shape[-1], reference[0].size
     levels = np.array(LEVELS)
-    clumps = np.array([dispersion(np.abs(z) > LEVELS[0]) for z in simulated])[:, None]
-    own = (np.abs(recorded)[:, None] > levels[:, None]).sum(-1) / clumps
-    other = (np.abs(simulated)[:, None] > levels[:, None, None]).sum((-1, -2))
+    clumps = np.array([dispersion(np.abs(z) > LEVELS[0]) for z in reference])[:, None]
+    own = (np.abs(observed)[:, None] > levels[:, None]).sum(-1) / clumps
+    other = (np.abs(reference)[:, None] > levels[:, None, None]).sum((-1, -2))
     shape = (other + other.mean(0)) / 2 / clumps + 0.5
     compared = _many_p_value(own, shape, shape * n / m)
-    expected = np.stack([_predicted(z.ravel(), own[i], clumps[i, 0], n) for i, z in enumerate(simulated)])
-    p = np.where(levels < _HIGHER * np.abs(simulated).max(), np.maximum(expected, compared), expected)
+    expected = np.stack([_predicted(z.ravel(), own[i], clumps[i, 0], n) for i, z in enumerate(reference)])
+    p = np.where(levels < _HIGHER * np.abs(reference).max(), np.maximum(expected, compared), expected)
     return np.asarray(-np.expm1(len(levels) * np.log1p(-np.minimum(p.min(-1), 1 - 1e-16))))
 
 

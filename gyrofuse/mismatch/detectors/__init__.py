@@ -1,0 +1,1 @@
+"""Tests of whether a recording and a simulation differ: one file, one statistic and its law."""

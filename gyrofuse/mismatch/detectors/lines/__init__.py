@@ -1,0 +1,1 @@
+"""Tests of spectral lines: their amplitudes, chirps, clocks."""

@@ -1,0 +1,68 @@
+"""A line whose frequency moves steadily, as that of a machine that runs up: in no bin for long, a line all the same."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.detectors.lines.tracks import Sweep, strongest_sweep
+from gyrofuse.mismatch.detectors.result import TestResult
+from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
+from gyrofuse.mismatch.likelihoods.coherence_law import decorrelated
+from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.signals.derived import derived
+from gyrofuse.mismatch.signals.prediction_errors import ENDS, left_out
+from gyrofuse.mismatch.signals.records import Records
+
+_NOTABLE = 0.05  # p value
+
+
+def chirp_test(comparison: Comparison) -> TestResult:
+    """A line whose frequency moves, that the simulation does not have."""
+    found, p_value = _strongest(comparison.observed), _p_value(comparison)
+    first, last = (f * comparison.info.rate for f in (found.first, found.last))
+    where = comparison.info.named(found.sensors, "all sensors")
+    by_way = "".join(f", by way of {turn * comparison.info.rate:g} Hz" for turn in found.turns)
+    return TestResult(
+        "sweep",
+        p_value,
+        f"a line that moves from {first:.4g} Hz to {last:.4g} Hz{by_way} in {where}",
+        sensors=found.sensors,
+        levels=tuple(sorted({level_of(max(f, 1 / comparison.n_samples)) for f in (found.first, found.last)})),
+    )
+
+
+def swept(comparison: Comparison, nats: float, level: float) -> bool:
+    """Whether a line whose frequency moves is seen, and tells more than so many nats of the spectrum.
+
+    What it sweeps over has more power, as if noise had been added there or filtered away elsewhere.
+    """
+    return _p_value(comparison) <= level and _strongest(comparison.observed).nats > nats
+
+
+def _p_value(comparison: Comparison) -> float:
+    p_value = _strongest(comparison.observed).p_value
+    # Lines that both have leave traces here of any size: what the simulation may show is nothing to surpass.
+    seen_in_both = p_value < _NOTABLE and _strongest(comparison.reference).p_value < _NOTABLE
+    return 1.0 if seen_in_both else p_value
+
+
+@derived
+def _strongest(side: Records) -> Sweep:
+    """In the first record."""
+    return strongest_sweep(_decorrelated(side))
+
+
+def _decorrelated(side: Records) -> Tensor:
+    """Whitened record `(sensor, time)` without the coherence of broad bands."""
+    white = left_out(side).white[0]
+    n = white.shape[-1]
+    transform = torch.fft.rfft(white)
+    edges = [0, *(round(e * n / side.bands.n_samples) for e in side.bands.edges[1:-1]), transform.shape[-1]]
+    transform = decorrelated(transform, edges, side.dof)
+    white = torch.fft.irfft(transform, n=n)
+    white = white / white.square().mean(-1, keepdim=True).sqrt()
+    # Beside lines the ends are mirrored from what is next to them: seen twice, chance would look like more.
+    end = n // ENDS
+    white[:, :end], white[:, -end:] = 0.0, 0.0
+    return white

@@ -1,0 +1,288 @@
+"""Sensors whose clock is not that of the others, seen by a tone that recording and simulation share.
+
+A sensor that takes its sample `t` at `(1 + skew) t + lost(t)` turns the phase of a tone of `f` cycles per sample by
+`2 pi f` times what it is ahead: a slope, or steps. With `z_b` the whitened signal demodulated in `B` blocks, in units
+of the noise, a path `phi_b` of the phase has the log likelihood `|sum z_b exp(-i phi_b)|^2 / B` with the best amplitude
+and phase. No slip at all has as many numbers, so that the mean likelihood ratio over paths has expectation one.
+
+The reference is an auxiliary channel with the same tone, where there is one, or else the other sensors.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.detectors.lines.lost_samples import Loss, losses_of, paths_of, put_back
+from gyrofuse.mismatch.detectors.result import TestResult
+from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.signals.derived import derived
+from gyrofuse.mismatch.signals.known_lines import without_lines
+from gyrofuse.mismatch.signals.lines import sets_of, simulated_lines, whitened
+from gyrofuse.mismatch.stats.multiplicity import p_value_from_e_value
+
+BLOCKS = 512
+_FEWEST_CYCLES = 1.0  # of a tone in a block
+_TONES = 3
+_FLANK = 4.0  # half widths, and bins, on either side of a mode that seem to be lines
+_SURE = 5.0  # nats that a sensor gains from the slip of others, from which it is its own as well
+_CLEARER = 10.0  # times the evidence of any sensor that a channel needs to be the reference
+_CYCLES, _FINER = 4, 32  # slip over the record that is looked for, and steps of a cycle
+
+
+@dataclass(frozen=True)
+class Slip:
+    """How the clock of some sensors runs away from the reference.
+
+    Attributes:
+        frequency: Of the tone in the reference, cycles per sample.
+        sensors: Those that slip.
+        skew: What they are ahead per sample, and its standard deviation `skew_sd`.
+        losses: In the order of time.
+        lost: Limits of how many samples were lost in all.
+        gain: Log likelihood over that of no slip, nats.
+        log_ratio: Of the mean likelihood ratio over sets of sensors and slopes or steps, less what was tried.
+        reference: Name of the channel that tells; None where the other sensors do.
+    """
+
+    frequency: float
+    sensors: tuple[int, ...]
+    skew: float
+    skew_sd: float
+    losses: tuple[Loss, ...]
+    lost: tuple[int, int]
+    gain: float
+    log_ratio: float
+    reference: str | None
+
+    @property
+    def p_value(self) -> float:
+        return p_value_from_e_value(self.log_ratio)
+
+
+class _Fit(NamedTuple):
+    """A slip of one kind, its places in blocks.
+
+    Attributes:
+        which: Index of the set of sensors.
+        slope, variance: Cycles over the record that they are ahead, and their variance.
+        losses: Of samples.
+        lost: Limits of how many in all.
+        gain: Over no slip, nats.
+        log_ratio: Of the mean likelihood ratio over all sets and places of the kind.
+        rest: Cycles over the record by which the others differ from where they were looked for.
+        angle: By which one lost sample turns the tone.
+    """
+
+    which: int
+    slope: float
+    variance: float
+    losses: list[Loss]
+    lost: tuple[int, int]
+    gain: float
+    log_ratio: float
+    rest: float
+    angle: float = 0.0
+
+
+def clock_test(comparison: Comparison) -> TestResult:
+    """Phases of a shared tone that run away from each other."""
+    slip = strongest_slip(comparison)
+    if slip is None:
+        return TestResult("clock", 1.0, "recording and simulation share no tone that would tell clocks apart")
+    f = slip.frequency * comparison.info.rate
+    return TestResult(
+        "clock",
+        slip.p_value,
+        f"the tone at {f:.6g} Hz slips in {comparison.info.named(slip.sensors)}",
+        sensors=slip.sensors,
+        frequency_hz=f,
+        time_s=slip.losses[0].at / comparison.info.rate if slip.losses else None,
+        channel=slip.reference,
+    )
+
+
+@derived
+def strongest_slip(comparison: Comparison) -> Slip | None:
+    """The most likely slip of any tone that the recording shares with the simulation."""
+    block = comparison.n_samples // BLOCKS
+    lines = simulated_lines(comparison.reference)
+    tones = [f for f in lines if f * block >= _FEWEST_CYCLES and not _rings(comparison, f)][:_TONES]
+    if not tones:
+        return None
+    slips = [slip for f in tones for slip in _of_tone(comparison, f, tuple(other for other in lines if other != f))]
+    best = max(slips, key=lambda slip: slip.log_ratio, default=None)
+    return None if best is None else replace(best, log_ratio=best.log_ratio - math.log(2 * len(tones)))
+
+
+def _rings(comparison: Comparison, f: float) -> bool:
+    """Whether a line of the simulation is noise of a mode that was found: its phase tells no time."""
+    return any(abs(f - centre) < _FLANK * (width + 1 / comparison.n_samples) for centre, width in comparison.modes)
+
+
+def demodulated(signal: Tensor, f: float) -> Tensor:
+    """Signals `(row, time)` turned back by a tone, in blocks `(row, block)`, noise of variance one."""
+    block = signal.shape[-1] // BLOCKS
+    t = torch.arange(block * BLOCKS, dtype=torch.float64)
+    angle = 2 * math.pi * f * t
+    z = torch.complex(signal[:, : len(t)] * angle.cos(), -signal[:, : len(t)] * angle.sin())
+    z = z.unflatten(-1, (BLOCKS, block)).mean(-1)
+    # Least squares of both quadratures: in a block they are not orthogonal.
+    image = torch.polar(torch.ones_like(t), -2 * angle).unflatten(-1, (BLOCKS, block)).mean(-1)
+    z = (z - z.conj() * image) / (1 - image.abs().square())
+    # Of differences, squares of normal noise are exponential; where a loud tone steps, their median hardly moves.
+    noise = z.diff().abs().square().median(-1, keepdim=True).values / (2 * math.log(2))
+    return z / noise.sqrt().clamp(min=1e-300)
+
+
+def best_slope(z: Tensor) -> tuple[float, float]:
+    """Cycles over the record that fit demodulated rows `(row, block)` best, and their energy there, nats."""
+    energy = _energy(z).sum(0)
+    at = int(energy[1:-1].argmax()) + 1
+    left, here, right = energy[at - 1 : at + 2].tolist()
+    bend = left - 2 * here + right
+    offset = (left - right) / (2 * bend) if bend < 0 else 0.0
+    return float(_slopes()[at]) + max(min(offset, 1.0), -1.0) / _FINER, here
+
+
+def _of_tone(comparison: Comparison, f: float, others: tuple[float, ...]) -> list[Slip]:
+    """A skew and a loss of samples, as a tone of about `f` cycles per sample shows them, beside other ones."""
+    z = demodulated(
+        whitened(without_lines(comparison.recording, others), comparison.base) if others else comparison.white, f
+    )
+    length = comparison.n_samples // BLOCKS * BLOCKS
+    seen = _reference(comparison, f, float(_energy(z).amax()))
+    if seen is None and len(z) < 2:
+        return []
+    name, slope, slope_variance = seen or (None, 0.0, 0.0)
+    z = z * _turn(-slope)
+    sets, log_chance = sets_of(len(z))
+    if name is None:  # the smaller part is said to slip
+        small = sets.sum(-1) <= len(z) / 2
+        sets, log_chance = sets[small], log_chance[small]
+    fixed = name is not None
+    slips = []
+    for fit in (
+        _skewed(z, sets, log_chance, fixed=fixed),
+        _lost(z, sets, log_chance, 2 * math.pi * (f + slope / length), fixed=fixed),
+    ):
+        inside = sets[fit.which].bool()
+        if fixed and len(sets) <= len(z) + 1:  # of so many sensors not every set was tried
+            inside, more = _with_the_like(z, inside, fit)
+            fit = fit._replace(gain=fit.gain + more)
+        tone = f + (slope + fit.rest) / length
+        scale = 1 / (tone * length)
+        slips.append(
+            Slip(
+                tone,
+                tuple(inside.nonzero()[:, 0].tolist()),
+                fit.slope * scale,
+                0.0 if fit.losses else math.sqrt(fit.variance + slope_variance) * scale,
+                tuple(_in_samples(loss, length // BLOCKS) for loss in fit.losses),
+                fit.lost,
+                fit.gain,
+                fit.log_ratio,
+                name,
+            )
+        )
+    return slips
+
+
+def _with_the_like(z: Tensor, inside: Tensor, fit: _Fit) -> tuple[Tensor, float]:
+    """A set of sensors `(sensor,)` and all others whose tone the same slip explains as well, and what they gain."""
+    lost = {loss.at: loss.count for loss in fit.losses}
+    back = put_back(z, lost, fit.angle) if lost else z * _turn(-fit.slope)
+    gains = (back.sum(-1).abs().square() - z.sum(-1).abs().square()) / BLOCKS
+    more = ~inside & (gains > math.log(len(z)) + _SURE)
+    return inside | more, float(gains[more].sum())
+
+
+def _in_samples(loss: Loss, block: int) -> Loss:
+    first, last = loss.at_limits
+    return Loss(loss.at * block, loss.count, ((first - 1) * block, (last + 1) * block))
+
+
+def _reference(comparison: Comparison, f: float, strongest: float) -> tuple[str, float, float] | None:
+    """Channel with the same tone, the cycles over the record by which it differs, and their variance."""
+    best: tuple[str, float, float] | None = None
+    for name, values in comparison.info.channels.items():
+        rows = values.to(torch.float64).reshape(-1, values.shape[-1])
+        rows = rows - rows.mean(-1, keepdim=True)
+        if not bool(rows.isfinite().all()) or not bool(rows.any(-1).all()):
+            continue
+        slope, energy = best_slope(demodulated(rows, f))
+        if energy > _CLEARER * strongest:
+            best, strongest = (name, slope, _variance(energy)), energy / _CLEARER
+    return best
+
+
+def _skewed(z: Tensor, sets: Tensor, log_chance: Tensor, *, fixed: bool) -> _Fit:
+    """The most likely set of sensors with a skew, against a reference that is fixed or the other sensors."""
+    energy = _energy(z)  # (sensor, slope)
+    own = sets @ energy
+    middle = energy.shape[-1] // 2
+    # Where the others tell, both have the slopes that suit them, and no slip has the one that suits all.
+    over = -own[:, middle] if fixed else ((1 - sets) @ energy).amax(-1) - energy.sum(0).amax()
+    gains = own.amax(-1) + over
+    means = torch.logsumexp(own, -1) - math.log(own.shape[-1]) + over
+    which = int((gains + log_chance).argmax())
+    inside = sets[which].bool()
+    slope, size = best_slope(z[inside])
+    rest, rest_size = (0.0, math.inf) if fixed else best_slope(z[~inside])
+    variance = _variance(size) + _variance(rest_size)
+    ratio = float(torch.logsumexp(means + log_chance, 0))
+    return _Fit(which, slope - rest, variance, [], (0, 0), float(gains[which]), ratio, rest)
+
+
+def _lost(z: Tensor, sets: Tensor, log_chance: Tensor, angle: float, *, fixed: bool) -> _Fit:
+    """The most likely set of sensors that lost samples, each of which turns the tone by `angle`."""
+    rests, handicap = [0.0] * len(sets), torch.zeros(len(sets), dtype=torch.float64)
+    if not fixed:
+        rests = [best_slope(z[~row.bool()])[0] for row in sets]
+    straight = z * _turn(-torch.tensor(rests, dtype=torch.float64))[:, None]  # (set, sensor, block)
+    if not fixed:
+        # No slip may have another slope than suits the others alone.
+        alike = straight.sum(-1).abs().square().sum(-1) / BLOCKS
+        handicap = (_energy(z).sum(0).amax() - alike).clamp(min=0.0)
+    paths = paths_of(straight, sets, angle)
+    ratios = paths.log_ratio - handicap + log_chance
+    which = int(ratios.argmax())
+    losses, gain = losses_of(straight[which, sets[which].bool()], paths.lost[which], angle)
+    low, high = paths.limits(which)
+    count = sum(loss.count for loss in losses)
+    lost = min(low, count), max(high, count)
+    gain -= float(handicap[which])
+    return _Fit(which, 0.0, 0.0, losses, lost, gain, float(torch.logsumexp(ratios, 0)), rests[which], angle)
+
+
+def _slopes() -> Tensor:
+    """Cycles over the record that are tried, `(slope,)`, 0 in the middle."""
+    return torch.arange(-_CYCLES * _FINER, _CYCLES * _FINER + 1, dtype=torch.float64) / _FINER
+
+
+def _turn(cycles: float | Tensor) -> Tensor:
+    """`exp(2 pi i cycles s)` at the blocks' places `s` from 0 to 1."""
+    s = (torch.arange(BLOCKS, dtype=torch.float64) + 0.5) / BLOCKS
+    phase = 2 * math.pi * torch.as_tensor(cycles, dtype=torch.float64)[..., None] * s
+    return torch.polar(torch.ones_like(phase), phase)
+
+
+def _energy(z: Tensor) -> Tensor:
+    """Energy of a tone with each slope of the phase, nats, `(row, slope)`."""
+    return (z @ _all_turns()).abs().square() / BLOCKS
+
+
+@functools.cache
+def _all_turns() -> Tensor:
+    """What turns a phase of each slope back, `(block, slope)`."""
+    return _turn(-_slopes()).mT
+
+
+def _variance(energy: float) -> float:
+    """Of the slope of a phase, cycles over the record, for a tone of so many nats: Cramer and Rao."""
+    return 6 / (4 * math.pi**2 * max(energy, 1.0))

@@ -1,0 +1,1 @@
+"""Tests of what is slow, and of what follows a channel."""

@@ -1,0 +1,226 @@
+"""Regression of an array on auxiliary channels, in the domain of cosine transforms.
+
+`y_k = K a_k + noise` at every ordinate, `y` the sensors, `a` the rows of a channel, `K` real: the same gain at every
+frequency, phase 0. The transform makes white noise and random walks independent from ordinate to ordinate, which the
+Fourier transform of a stretch does not: there a slow channel and a wandering bias look alike at their ends. The noise
+has the shape of the base, and in each band the recording's own cross-spectral matrix on top of it, so that sensors with
+noise in common count once. Lines that the simulation has as well are left out: there its own motion would be compared
+with the channel's.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+
+import torch
+from scipy import special
+from torch import Tensor
+
+from gyrofuse._base.transforms import cosine_ordinates
+from gyrofuse.mismatch.detectors.result import TestResult
+from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.signals.known_lines import without_lines
+from gyrofuse.mismatch.signals.lines import simulated_lines
+from gyrofuse.mismatch.signals.records import Records
+from gyrofuse.mismatch.stats.inclusion import included_sensors
+from gyrofuse.mismatch.stats.multiplicity import sidak
+
+_SEEN = 0.01  # chance that a sensor seems to follow a channel, of those that are taken for sure to begin with
+_LINE = 4  # bins on either side of a line that the simulation has
+_AGAIN = 1e-3  # p value from which the noise is what a first fit leaves
+_LEAST_FREE = 0.5  # ordinates of a band beyond those that the fit takes
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelFit:
+    """Gains of the sensors on the rows of a channel.
+
+    Attributes:
+        gains: `(sensor, row)`, signal per unit of the channel.
+        covariance: Of the gains, `(sensor, row, sensor, row)`.
+        statistic: Twice the log likelihood ratio, chi-square with a degree of freedom for each gain.
+        quadrature: The same for gains a quarter of a cycle late, which no instantaneous coupling has.
+        share: Largest share of one band in the statistic.
+        squares: Of the gains of each sensor, chi-square with a degree of freedom for each row, `(sensor,)`.
+        p_value: Of the array, for having asked it whole and sensor by sensor.
+    """
+
+    gains: Tensor
+    covariance: Tensor
+    statistic: float
+    quadrature: float
+    share: float
+    squares: Tensor
+    p_value: float
+
+    @property
+    def excess(self) -> float:
+        """Of the statistic over what chance gives."""
+        return self.statistic - self.gains.numel()
+
+
+def regress(
+    comparison: Comparison, rows: Tensor, signal: Tensor | None = None, which: Tensor | None = None
+) -> ChannelFit | None:
+    """Regress the recording, or `signal` `(sensor, time)`, on rows `(row, time)`; None where these do not move.
+
+    Twice where there is something: what a strong effect adds to the recording's own spectra is no noise. By default of
+    all sensors, or of those at the positions `which`.
+    """
+    signal = comparison.recording if signal is None else signal
+    which = torch.arange(comparison.n_sensors) if which is None else which
+    rows = rows - rows.mean(-1, keepdim=True)
+    size = rows.square().mean(-1).sqrt()
+    if not bool((size > 1e-12).all()):
+        return None
+    lines = simulated_lines(comparison.reference)
+    signal, rows = without_lines(signal, lines), without_lines(rows / size[:, None], lines)
+    fit = _fitted(comparison, signal, rows, lines, comparison.observed, which)
+    if fit is not None and fit.p_value < _AGAIN:
+        left = signal.clone()
+        left[which] -= fit.gains @ rows
+        fit = _fitted(comparison, signal, rows, lines, replace(comparison.observed, signal=left[None]), which) or fit
+    if fit is None:
+        return None
+    return replace(fit, gains=fit.gains / size, covariance=fit.covariance / size[:, None, None] / size)
+
+
+def _fitted(
+    comparison: Comparison, signal: Tensor, rows: Tensor, lines: tuple[float, ...], noise: Records, which: Tensor
+) -> ChannelFit | None:
+    """Generalised least squares beside a noise of the cross-spectra of `noise`; None where rows are hardly apart."""
+    n_sensors, n_rows, n = len(which), len(rows), signal.shape[-1]
+    y, a = cosine_ordinates(signal[which]), cosine_ordinates(rows)
+    late = cosine_ordinates(_quarter_late(rows))
+    k = torch.arange(n, dtype=torch.float64)
+    weights = comparison.base.spectrum((k / (2 * n)).clamp(min=1 / (2 * n)))[which].rsqrt()  # (sensor, ordinate)
+    for f in lines:
+        weights[:, (k / 2 - f * n).abs() < _LINE] = 0.0
+    edges = [1, *(2 * edge for edge in comparison.bands.edges[1:-1]), n]
+    moment, moment_late = (torch.zeros(n_sensors * n_rows, dtype=torch.float64) for _ in range(2))
+    matrix = torch.zeros(n_sensors * n_rows, n_sensors * n_rows, dtype=torch.float64)
+    parts, informed = [], []
+    inverses = torch.linalg.inv(noise.over(comparison.base).real[:, which][:, :, which])
+    for inverse, (first, end) in zip(inverses, itertools.pairwise(edges), strict=True):
+        w = weights[:, first:end]
+        white = (inverse @ (w * y[:, first:end])) * w  # (sensor, ordinate)
+        design = (w[:, None] * a[:, first:end]).flatten(0, 1)  # (sensor * row, ordinate)
+        informed.append(design.square().sum(-1).view(n_sensors, n_rows).sum(-1) * inverse.diagonal())
+        matrix += design @ design.mT * inverse.repeat_interleave(n_rows, 0).repeat_interleave(n_rows, 1)
+        parts.append((white @ a[:, first:end].mT).flatten())
+        moment += parts[-1]
+        moment_late += (white @ late[:, first:end].mT).flatten()
+    if float(torch.linalg.cond(matrix)) > 1e12:
+        return None
+    covariance = torch.linalg.inv(matrix)
+    gains = covariance @ moment
+    statistic = float(gains @ matrix @ gains)
+    contributions = torch.stack([own @ gains for own in parts])
+    blocks = covariance.view(n_sensors, n_rows, n_sensors, n_rows)
+    each = gains.view(n_sensors, n_rows)
+    own_statistic = torch.stack([each[i] @ torch.linalg.solve(blocks[i, :, i], each[i]) for i in range(n_sensors)])
+    scores = weights * (y - each @ a)
+    left = [
+        (inverse @ scores[:, first:end]).square() / inverse.diagonal()[:, None]
+        for inverse, (first, end) in zip(inverses, itertools.pairwise(edges), strict=True)
+    ]
+    own = _tails(own_statistic, n_rows, torch.stack(informed), left)
+    sure = torch.from_numpy(special.chdtri(n_rows, own.numpy()))  # what would be as rare if the noise were known
+    pooled = float(
+        special.chdtrc(n_sensors * n_rows, statistic * float(sure.sum() / own_statistic.sum().clamp(min=1e-300)))
+    )
+    p_value = sidak(min(2 * pooled, 2 * sidak(float(own.amin()), n_sensors)), 1)
+    return ChannelFit(
+        gains=each,
+        covariance=blocks,
+        statistic=statistic,
+        quadrature=float(moment_late @ covariance @ moment_late),
+        share=float(contributions.amax() / contributions.sum()) if statistic > 0 else 1.0,
+        squares=sure,
+        p_value=min(p_value, 1.0),
+    )
+
+
+def _tails(statistic: Tensor, n_rows: int, informed: Tensor, left: list[Tensor]) -> Tensor:
+    """p values `(sensor,)` of statistics, beside the noise that the recording itself has where it tells of the gains.
+
+    A band without the simulation's word on it, or with another level than it says, is judged by what the fit leaves
+    there: the variance of a gain is that of its bands, each with its share (Huber and White), as well known as they are
+    wide (Satterthwaite).
+
+    Args:
+        statistic: Chi-square if the noise were known, `(sensor,)`.
+        n_rows: Its degrees of freedom.
+        informed: What each band tells of the gains, `(band, sensor)`.
+        left: In each band, squares of what is left, of mean one, `(sensor, ordinate)`; 0 where nothing was used.
+    """
+    share = informed / informed.sum(0)
+    count = torch.stack([(band > 0).sum(-1) for band in left])
+    free = (count - n_rows * share).clamp(min=0.0)
+    level = torch.stack([band.sum(-1) for band in left]) / free.clamp(min=_LEAST_FREE)
+    noise = (share * level).sum(0)
+    freedom = 1 / (share.square() / free.clamp(min=1e-9)).sum(0)
+    scaled = statistic / noise.clamp(min=1e-300)
+    tails = special.betainc(freedom.numpy() / 2, n_rows / 2, (freedom / (freedom + scaled)).numpy())
+    return torch.from_numpy(tails).clamp(min=1e-300)
+
+
+def channel_test(comparison: Comparison) -> TestResult:
+    """Gains of the sensors on fast channels and on the products of their rows."""
+    tried = []
+    for name in [*accelerations(comparison), *rates(comparison)]:
+        rows = comparison.info.channels[name].to(torch.float64)
+        rows = rows.reshape(-1, rows.shape[-1])
+        kinds = [("", rows)]
+        if name in accelerations(comparison):
+            kinds += [(" squared", made) for made in squared(rows).values()]
+        for words, regressors in kinds:
+            fit = regress(comparison, regressors)
+            if fit is not None:
+                tried.append((fit, name, words))
+    if not tried:
+        return TestResult("channel", 1.0, "there is no acceleration or reference rate to compare with")
+    fit, name, words = min(tried, key=lambda entry: entry[0].p_value)
+    return TestResult(
+        "channel",
+        sidak(fit.p_value, len(tried)),
+        f"sensors follow {name}{words}",
+        sensors=included_sensors(fit.squares, fit.gains.shape[-1], _SEEN).positions,
+        channel=name,
+    )
+
+
+def accelerations(comparison: Comparison) -> list[str]:
+    """Names of the channels of acceleration, whole ones."""
+    return _channels(comparison, "accel")
+
+
+def rates(comparison: Comparison) -> list[str]:
+    """Names of the channels of a reference rate, whole ones."""
+    return _channels(comparison, "rate")
+
+
+def squared(rows: Tensor) -> dict[str, Tensor]:
+    """What may be made of the square of a vector of rows `(row, time)` without their means: by kind, `(any, time)`.
+
+    All products, the squared length, and where there are several rows the square of each.
+    """
+    rows = rows - rows.mean(-1, keepdim=True)
+    squares = rows.square()
+    upper = torch.triu_indices(len(rows), len(rows))
+    axes = {f"axis {k + 1}": square[None] for k, square in enumerate(squares)} if len(rows) > 1 else {}
+    return {"each": rows[upper[0]] * rows[upper[1]], "length": squares.sum(0, keepdim=True), **axes}
+
+
+def _channels(comparison: Comparison, word: str) -> list[str]:
+    return [
+        name
+        for name, values in comparison.info.channels.items()
+        if word in name.lower() and bool(torch.isfinite(values).all())
+    ]
+
+
+def _quarter_late(rows: Tensor) -> Tensor:
+    """Rows `(row, time)` a quarter of a cycle late at every frequency."""
+    return torch.fft.irfft(torch.fft.rfft(rows) * -1j, n=rows.shape[-1])

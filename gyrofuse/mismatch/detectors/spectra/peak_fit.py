@@ -1,0 +1,170 @@
+"""Bumps of a spectrum fitted closely: centre, width and gains, beside level and slope of the noise where that pays."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.detectors.spectra.peaks import Stretch, band_of, strongest_peak
+from gyrofuse.mismatch.detectors.spectra.shape_scan import scanned
+from gyrofuse.mismatch.likelihoods.coherence_law import smooth_coherence
+from gyrofuse.mismatch.likelihoods.component_choice import cost_of
+from gyrofuse.mismatch.likelihoods.components import CommonBump, Peak, Term
+from gyrofuse.mismatch.likelihoods.reference_spectrum import Ground
+from gyrofuse.mismatch.likelihoods.spectral import Fit, Ratios, exact, fit
+from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.signals.derived import derived
+from gyrofuse.mismatch.signals.psd import Bands, degrees_of_freedom
+from gyrofuse.mismatch.signals.records import Records
+
+_CUT_OFF = 0.6  # of the simulation's power
+_CELLS, _CELL = 24, 5  # on either side, and fewest bins of one
+_FINER, _NARROW = 3, 0.1  # times, and half width in the stretch
+_FARTHEST = 30.0  # that logarithms go
+_ITS_OWN = 2.1  # half widths: what is broader, up to as broad as fits are let, is for the whole spectrum to tell
+
+
+@dataclass(frozen=True, eq=False)
+class Oscillation:
+    """A bump as fitted.
+
+    Attributes:
+        stretch: Where it was seen.
+        centre, width: Centre and half width, cycles per sample, and standard deviations of their logarithms.
+        variance: `(sensor,)`, and standard deviation.
+        gain: Complex gains of a common source `(sensor,)`; None where sensors have bumps of their own.
+        nats: Gain in log likelihood, less what the numbers cost.
+    """
+
+    stretch: Stretch
+    centre: float
+    width: float
+    log_sd: tuple[float, float]
+    variance: Tensor
+    variance_sd: Tensor
+    gain: Tensor | None
+    nats: float
+
+    @classmethod
+    def of(cls, stretch: Stretch, term: Peak | CommonBump, sd: tuple[Tensor, Tensor], nats: float) -> Oscillation:
+        """From a fitted term, with the standard deviations of its local and its shared numbers."""
+        local_sd, log_sd = sd
+        if isinstance(term, CommonBump):
+            gain = torch.complex(*term.local)
+            variance, spread = gain.abs().square(), 2 * gain.abs() * local_sd.square().nanmean(0).sqrt()
+        else:
+            gain, variance, spread = None, term.local[0], local_sd[0].nan_to_num(nan=math.inf)
+        (centre, width), (centre_sd, width_sd) = term.shared.exp().tolist(), log_sd.tolist()
+        return cls(stretch, centre, width, (centre_sd, width_sd), variance, spread, gain, nats)
+
+
+@dataclass(frozen=True, eq=False)
+class Background(Term):
+    """Level and slope of the noise around a bump: local are the logarithm at the centre and its rise to the end."""
+
+    name: ClassVar[str] = "background"
+    acts: ClassVar[str] = "scale"
+
+    @classmethod
+    def start(cls, n_sensors: int) -> Background:
+        free = torch.ones(2, n_sensors, dtype=torch.bool)
+        return cls(torch.zeros(2, n_sensors, dtype=torch.float64), free, torch.zeros(0, dtype=torch.float64))
+
+    def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
+        low, high = ground.places[0], ground.places[-1]
+        x = (2 * ground.places - low - high) / (high - low)
+        return (local[..., 0, :, None] + local[..., 1, :, None] * x).exp()
+
+    def within(self) -> Background:
+        # Where powers are too far apart nothing else would hold them, and numbers could not be worked out.
+        return replace(self, local=self.local.clamp(-_FARTHEST, _FARTHEST))
+
+
+@derived
+def oscillation_of(comparison: Comparison) -> Oscillation | None:
+    """The strongest bump, fitted; None where it is no oscillation."""
+    return _closely(comparison, strongest_peak(comparison))
+
+
+@derived
+def likeliest_oscillation(comparison: Comparison) -> Oscillation | None:
+    """The bump that is the likeliest of all shapes of a difference, fitted; None where another one is."""
+    seen = scanned(comparison)
+    if seen is None or seen.peak is None:
+        return None
+    centre, width = seen.peak
+    return _closely(comparison, Stretch(centre, 2 * width, seen.p_value, seen.sensors))
+
+
+def _closely(comparison: Comparison, stretch: Stretch) -> Oscillation | None:
+    """Fitted in cells of a quarter of the stretch, and in finer ones where it turns out to be much narrower."""
+    found = _in_cells(comparison, stretch)
+    for _ in range(_FINER):
+        if found is None or found.width > _NARROW * stretch.width:
+            break
+        stretch = stretch._replace(frequency=found.centre, width=stretch.width / 4)
+        found = _in_cells(comparison, stretch) or found
+    return found
+
+
+def _in_cells(comparison: Comparison, stretch: Stretch) -> Oscillation | None:
+    n = comparison.n_samples
+    cell = max(round(stretch.width * n / 4), _CELL)
+    centre = round(stretch.frequency * n)
+    count = min(_CELLS, (centre - 3) // cell, (n // 2 - 4 - centre) // cell)
+    if count < 6:
+        return None
+    # Where a filter cuts off, flanks are not alike: broad shapes have to tell.
+    ends = torch.tensor([centre - count * cell, centre + count * cell], dtype=torch.float64)
+    first, last = (int(b) for b in band_of(ends, n, comparison))
+    passed = comparison.observed.power[:, first : last + 1] / comparison.reference.power[:, first : last + 1].clamp(
+        min=1e-300
+    )
+    if float(passed.mean(0).min()) < _CUT_OFF:
+        return None
+    edges = tuple(centre + cell * k for k in range(-count, count + 1))
+    ends = torch.tensor(edges, dtype=torch.float64)
+    dof = torch.full((2 * count,), degrees_of_freedom(cell), dtype=torch.float64)
+    local = Bands(n, edges, (ends[:-1] + ends[1:] - 1) / 2 / n, dof)
+    ground = Ground(comparison.base, local)
+    coherence = smooth_coherence(comparison.reference.coherence, comparison.reference.dof)
+    band = int(band_of(torch.tensor(float(centre)), n, comparison))
+    expected = coherence[band].expand(2 * count, -1, -1)
+    observed, reference = (Records(comparison.observed.steady, local).spectra, dof), (ground.mean.mT, exact(dof))
+    data = Ratios.of(ground, observed, reference, expected, torch.ones_like(ground.mean.mT))
+    background = fit(data, [Background.start(comparison.n_sensors)])
+    return _best(comparison, stretch, data, background)
+
+
+def _best(comparison: Comparison, stretch: Stretch, data: Ratios, background: Fit) -> Oscillation | None:
+    ground, p = data.ground, comparison.n_sensors
+    middle = len(ground.bands.frequency) // 2
+    least = max(1.5 / comparison.n_samples, stretch.width / 40) / stretch.frequency
+    excess = data.observed - background.model
+    height = excess.diagonal(dim1=-2, dim2=-1).real[middle - 2 : middle + 2].mean(0)
+    level = ground.mean[:, middle] * height.clamp(min=1e-3)
+
+    def value(found: Fit) -> float:
+        return found.gain - cost_of(found)
+
+    tried: list[Fit] = []
+    for company, share in itertools.product(([], background.terms), (0.25, 0.6)):
+        width = share * stretch.width
+        peak = Peak.start(stretch.frequency, width, level * 2 * math.pi * width)
+        own = fit(data, [*company, Peak(peak.local, peak.free, peak.shared, least)])
+        tried.append(own)
+        if p > 1:
+            source = CommonBump.start(ground, excess, data.worth, "oscillation", own.terms[-1].shared)
+            source = CommonBump(source.local, source.free, source.shared, narrowest=least)
+            tried.append(fit(data, [*company, source]))
+    best = max(tried, key=value)
+    nats = value(best) - max(value(background), 0.0)
+    term = best.terms[-1]
+    assert isinstance(term, Peak | CommonBump)
+    found = Oscillation.of(stretch, term, best.sd(-1), nats)
+    return None if found.centre < _ITS_OWN * found.width or nats < 0 else found

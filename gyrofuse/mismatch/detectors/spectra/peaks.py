@@ -1,0 +1,157 @@
+"""Bumps of a spectrum wider than a line and narrower than an octave."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import NamedTuple
+
+import torch
+from scipy import stats
+from torch import Tensor
+
+from gyrofuse._base.transforms import fast_length, squared_modulus
+from gyrofuse.mismatch.detectors.result import TestResult
+from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
+from gyrofuse.mismatch.detectors.spectra.modulated_ordinates import level_correlations
+from gyrofuse.mismatch.detectors.spectra.own_peak_scan import scanned_own_peaks
+from gyrofuse.mismatch.detectors.spectra.shared_peak_scan import flank_of, least_flank, log_ratios, scanned_shared_peaks
+from gyrofuse.mismatch.likelihoods.coherence_law import decorrelated
+from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.signals.derived import derived
+from gyrofuse.mismatch.signals.known_lines import without_lines
+from gyrofuse.mismatch.signals.lines import simulated_lines, whitened
+from gyrofuse.mismatch.signals.psd import light_taper
+from gyrofuse.mismatch.stats.multiplicity import p_value_from_e_value, sidak
+
+_DEPENDENT = 1.15  # bins under it for an independent one, as far tails have it
+_TRIES = 6
+_MOST = 3.4  # medians of a modulus: one bin in three thousand is above
+_LINE = 0.6  # of the excess in three bins
+_AS_WELL = 0.01  # p value at which the simulation has it as well
+
+
+class Stretch(NamedTuple):
+    """Bins that stand out.
+
+    Attributes:
+        frequency: Of their middle, cycles per sample.
+        width: Cycles per sample.
+        p_value: For all stretches, sensor by sensor and together.
+        sensors: In which it alone stands out.
+    """
+
+    frequency: float
+    width: float
+    p_value: float
+    sensors: tuple[int, ...]
+
+
+def peak_test(comparison: Comparison) -> TestResult:
+    """The strongest bump that the simulation does not have."""
+    found = strongest_peak(comparison)
+    f = found.frequency * comparison.info.rate
+    names = ", ".join(comparison.info.sensors[i] for i in found.sensors)
+    return TestResult(
+        "bump",
+        found.p_value,
+        f"a bump {found.width * comparison.info.rate:.3g} Hz wide at {f:.5g} Hz in sensors {names}",
+        sensors=found.sensors,
+        levels=(level_of(found.frequency),),
+        frequency_hz=f,
+    )
+
+
+@derived
+def strongest_peak(comparison: Comparison) -> Stretch:
+    """The most conspicuous bump of the recording that is neither a line nor in the simulation."""
+    transform, length = _transformed(comparison.lineless)
+    last = int((0.5 - 2 / comparison.n_samples) * length)
+    transform = transform[:, :last]
+    worth = comparison.n_samples / length / _DEPENDENT
+    levels, width = level_correlations(comparison.lineless), comparison.n_samples / length
+    scans = list(scanned_own_peaks(squared_modulus(_apart(transform, length, comparison)), worth, levels, width))
+    if comparison.n_sensors > 1:
+        scans += scanned_shared_peaks(transform, worth, levels, width)
+    power, nothing = squared_modulus(transform), Stretch(0.25, 0.5, 1.0, tuple(range(comparison.n_sensors)))
+    reference: tuple[Tensor, int] | None = None
+    for _ in range(_TRIES if scans else 0):
+        best = max(scans, key=lambda scan: float(scan.log_ratio.amax()))
+        a, n = int(best.first[best.log_ratio.argmax()]), best.width
+        if not bool(best.log_ratio.isfinite().any()):
+            return nothing
+        means = [torch.logsumexp(scan.log_ratio, 0) - math.log(len(scan.first)) for scan in scans]
+        p_value = p_value_from_e_value(float(torch.logsumexp(torch.stack(means), 0)) - math.log(len(scans)))
+        sensors = _alone(power, a, n, n * worth)
+        stretch = Stretch((a + (n - 1) / 2) / length, n / length, p_value, sensors)
+        if p_value > _AS_WELL:
+            return stretch
+        excess = (power[:, a : a + n].mean(0) - _flanks(power, a, n).mean()).clamp(min=0)
+        line = float(excess.topk(3).values.sum()) > _LINE * float(excess.sum())
+        if reference is None:
+            bare = without_lines(comparison.reference.signal, simulated_lines(comparison.reference))
+            reference = _transformed(whitened(comparison.reference.steadied(bare), comparison.base))
+        if not line and not _has_it(reference, stretch, comparison):
+            return stretch
+        for scan in scans:
+            over = (scan.first < a + 2 * n) & (scan.first + scan.width > a - n)
+            scan.log_ratio[over] = -math.inf
+    return nothing
+
+
+def _transformed(white: Tensor) -> tuple[Tensor, int]:
+    """Transform of whitened samples, `(..., sensor, bin)`, and the length padded to."""
+    n = white.shape[-1]
+    length = fast_length(n)
+    return torch.fft.rfft(white * light_taper(n), n=length), length
+
+
+def _apart(transform: Tensor, length: int, comparison: Comparison) -> Tensor:
+    """Without what sensors `(sensor, bin)` share over broad bands of both.
+
+    Bins are cut to a few times the power around: lines are nothing that bands share.
+    """
+    scale = length / comparison.n_samples
+    edges = [0, *(round(e * scale) for e in comparison.bands.edges[1:-1]), transform.shape[-1]]
+    parts = [transform[:, a:b] for a, b in itertools.pairwise(edges)]
+    limits = [_MOST * part.abs().median(-1, keepdim=True).values for part in parts]
+    cut = [part * (limit / part.abs()).clamp(max=1) for part, limit in zip(parts, limits, strict=True)]
+    return decorrelated(torch.cat(cut, -1), edges, comparison.observed.dof)
+
+
+def _flanks(power: Tensor, a: int, n: int) -> Tensor:
+    """Mean of both flanks, `(sensor,)`, as far as they reach."""
+    gap, wide = n // 2, flank_of(n, power.shape[-1])
+    left, right = power[:, max(a - gap - wide, 0) : a - gap], power[:, a + n + gap : a + n + gap + wide]
+    return torch.cat([left, right], -1).mean(-1)
+
+
+def band_of(place: Tensor, length: int, comparison: Comparison) -> Tensor:
+    edges = torch.tensor(comparison.bands.edges[1:-1], dtype=torch.float64) / comparison.n_samples
+    return torch.bucketize(place.to(torch.float64) / length, edges, right=True)
+
+
+def _alone(power: Tensor, a: int, n: int, d: float) -> tuple[int, ...]:
+    """Sensors in which so many bins, worth `d` ordinates, stand out alone."""
+    tails = stats.f.sf((power[:, a : a + n].mean(-1) / _flanks(power, a, n)).numpy(), 2 * d, 6 * d)
+    p = len(power)
+    return tuple(i for i in range(p) if sidak(float(tails[i]), p) < 0.01) or (int(tails.argmin()),)
+
+
+def _has_it(reference: tuple[Tensor, int], stretch: Stretch, comparison: Comparison) -> bool:
+    """Whether the simulation has a bump at the same place."""
+    transform, length = reference
+    n = max(round(stretch.width * length) // 2, 2) * 2
+    a, gap = round(stretch.frequency * length - (n - 1) / 2), n // 2
+    wide = min(flank_of(n, transform.shape[-1]), a - gap, transform.shape[-1] - a - n - gap)
+    if wide < least_flank(n):
+        return False
+    bins = transform.movedim(1, 0)  # (sensor, record, bin)
+    inside, left, right = (
+        bins[..., b : b + wide_as].flatten(1) for b, wide_as in ((a, n), (a - gap - wide, wide), (a + n + gap, wide))
+    )
+    flanks = torch.cat([left, right], -1)
+    worth = comparison.reference.signal.shape[-1] / length / _DEPENDENT
+    m, f = max(inside.shape[-1] * worth, 1.0), flanks.shape[-1] * worth
+    log_ratio = log_ratios((inside @ inside.mH)[None], (flanks @ flanks.mH)[None], m, f)
+    return p_value_from_e_value(float(log_ratio)) < _AS_WELL

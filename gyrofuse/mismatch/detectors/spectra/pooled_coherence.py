@@ -1,0 +1,150 @@
+"""Witness of what sensors share over a broad band: coherences pooled over neighbouring bands."""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.detectors.result import TestResult
+from gyrofuse.mismatch.detectors.spectra.band_tests import level_of, whitened_difference
+from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.signals.derived import derived
+from gyrofuse.mismatch.stats.multiplicity import sidak
+
+_ABSENT = 1.5  # standard deviations of what the simulation has, below which it has nothing; less if it is short
+_SURELY = 0.7  # the same, to take for granted that it has nothing
+_SHOWN = 0.1  # p value below which the simulation's sensors share something
+_DRAWN, _COUNTED = 4000, 40  # matrices of noise, and those of them beyond which the tail is not counted
+_NEIGHBOURS = 1.1  # bands next to each other are slightly correlated
+
+
+class Source(NamedTuple):
+    """Coherence that the simulation does not have.
+
+    Attributes:
+        p_value: Of the strongest run of bands, for all runs.
+        first, last: Its bands.
+        pair: The two sensors that share most.
+        independent: Whether the simulation's sensors have nothing of it, nor share anything in any other run.
+    """
+
+    p_value: float
+    first: int
+    last: int
+    pair: tuple[int, int]
+    independent: bool
+
+
+def common_source_test(comparison: Comparison) -> TestResult:
+    """Coherence that the simulation does not have, pooled over neighbouring bands, all pairs of sensors together."""
+    found = common_source(comparison)
+    if found is None:
+        return TestResult("common", 1.0, "nothing to compare coherences of")
+    i, j = (comparison.info.sensors[k] for k in found.pair)
+    frequency = comparison.bands.frequency[found.first : found.last + 1]
+    f = math.sqrt(float(frequency[0] * frequency[-1])) * comparison.info.rate
+    return TestResult(
+        "common",
+        found.p_value,
+        f"sensors share noise over a broad band around {f:.3g} Hz, most of all {i} and {j}",
+        sensors=tuple(range(comparison.n_sensors)),
+        levels=tuple(sorted({level_of(float(x)) for x in frequency})),
+        frequency_hz=f,
+    )
+
+
+@derived
+def common_source(comparison: Comparison) -> Source | None:
+    """The most conspicuous coherence of a run of bands, in phase or not.
+
+    The difference of coherence matrices is whitened by what both have in common: its entries then vary by
+    `1/d + 1/s`, whatever noise the sensors share. Where the simulation has nothing of what the recording shows, its
+    sensors are independent, and the recording's coherences vary by `1/d` around none.
+    """
+    p, d, s = comparison.n_sensors, comparison.observed.coherence_dof, comparison.reference.coherence_dof
+    known = (d >= 2 * p) & (s >= 2 * p)
+    if p < 2 or int(known.sum()) < 2:
+        return None
+    one, other, d, s = comparison.observed.coherence[known], comparison.reference.coherence[known], d[known], s[known]
+    white = whitened_difference(one, other, d, s)
+    starts, ends = _runs(len(d))
+
+    def sums(matrices: Tensor, worth: Tensor) -> Tensor:
+        """Of whole runs, in units of their noise, with no diagonal."""
+        total = torch.cat([torch.zeros(1, p, p, dtype=white.dtype), (matrices * worth[:, None, None]).cumsum(0)])
+        weight = torch.cat([torch.zeros_like(worth[:1]), worth.cumsum(0)])
+        size = ((weight[ends] - weight[starts]) * _NEIGHBOURS).sqrt()
+        run = (total[ends] - total[starts]) / size[:, None, None]
+        return run - torch.diag_embed(run.diagonal(dim1=-2, dim2=-1))
+
+    difference, alone, reference = sums(white, d * s / (d + s)), sums(one, d), sums(other, s)
+    found, nothing, places = [], True, _places(len(d))
+    for real in (True, False):  # in phase but for signs, or any
+        apart, observed, had = ((m.real.to(m.dtype) if real else m) for m in (difference, alone, reference))
+        values, vectors = torch.linalg.eigh(observed)  # one source has one direction
+        top = values.abs().argmax(-1)
+        size, u = values.gather(-1, top[:, None])[:, 0], vectors[torch.arange(len(top)), :, top]
+        along = torch.einsum("ri,rij,rj->r", u.conj(), had, u).real * size.sign()
+        spread = (1 - u.abs().pow(4).sum(-1)).clamp(min=1e-9).sqrt()
+        independent = along < _ABSENT * min(1.0, float(s.sum() / d.sum())) * spread
+        largest = torch.where(independent, size.abs(), torch.linalg.eigvalsh(apart).abs().amax(-1))
+        tails = torch.tensor([_tail(float(x), p, real) for x in largest], dtype=torch.float64)
+        run = int((tails * places).argmin())
+        pairs = torch.triu_indices(p, p, 1)
+        shared = (observed if bool(independent[run]) else apart)[run][pairs[0], pairs[1]].abs()
+        place = pairs[:, int(shared.argmax())]
+        bands = known.nonzero()[:, 0]
+        first, last = int(bands[starts[run]]), int(bands[ends[run] - 1])
+        value = sidak(float(tails[run]), 2 * float(places[run]))
+        absent = bool((along < _SURELY * spread)[run])
+        found.append(Source(value, first, last, (int(place[0]), int(place[1])), absent))
+        shown = float(torch.linalg.eigvalsh(had).abs().max())
+        nothing &= sidak(_tail(shown, p, real), 2 * len(largest)) > _SHOWN
+    best = min(found, key=lambda source: source.p_value)
+    return best._replace(independent=best.independent and nothing)
+
+
+def _tail(size: float, p: int, real: bool) -> float:
+    """Upper tail of the largest eigenvalue, of either sign, of a Hermitian matrix of noise without a diagonal.
+
+    Counted among drawn ones, and beyond them by the law of its far tail, `l^k exp(-l^2 / (2 (1 - 1/p)))`.
+    """
+    drawn = _noise_sizes(p, real)
+    if size <= float(drawn[-_COUNTED]):
+        return float((drawn >= size).sum() + 1) / (len(drawn) + 1)
+    anchor = float(drawn[-_COUNTED])
+    power = p - 1 if real else 2 * p - 2
+    log_ratio = power * math.log(size / anchor) - (size**2 - anchor**2) / (2 * (1 - 1 / p))
+    return min(_COUNTED / len(drawn) * math.exp(max(log_ratio, -700.0)), 1.0)
+
+
+@functools.lru_cache(maxsize=16)
+def _noise_sizes(p: int, real: bool) -> Tensor:
+    """Largest eigenvalues of noise, sorted."""
+    parts = torch.randn(2, _DRAWN, p, p, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    upper = (torch.complex(parts[0], torch.zeros_like(parts[1]) if real else parts[1]) / math.sqrt(2)).triu(1)
+    return torch.linalg.eigvalsh(upper + upper.mH).abs().amax(-1).sort().values
+
+
+def _runs(n_bands: int) -> tuple[Tensor, Tensor]:
+    """First band and the band after the last, of runs of 2, 4, 8, .. bands that overlap by half, and of all."""
+    starts, ends, length = [0], [n_bands], 2
+    while length < n_bands:
+        for first in range(0, n_bands - length + 1, max(length // 2, 1)):
+            starts.append(first)
+            ends.append(first + length)
+        starts.append(n_bands - length)
+        ends.append(n_bands)
+        length *= 2
+    return torch.tensor(starts), torch.tensor(ends)
+
+
+def _places(n_bands: int) -> Tensor:
+    """How many places each run stands for, `(run,)`: lengths have equal shares of the chances."""
+    starts, ends = _runs(n_bands)
+    _, kind, count = (ends - starts).unique(return_inverse=True, return_counts=True)
+    return (count[kind] * len(count)).to(torch.float64)

@@ -1,0 +1,1 @@
+"""Tests of outliers, jumps, and of variance that changes."""

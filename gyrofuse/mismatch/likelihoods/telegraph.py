@@ -1,0 +1,200 @@
+"""Likelihood of a level that jumps between two values, in the coloured noise of a simulation.
+
+Block means of a sensor are
+
+    y_k = a (s_k-1 + s_k) / 2 + sum_j x_jk + N(0, r),   s_k = +-1 with mean dwells `up` and `down`,
+
+`s` the level at the end of a block, which switches anywhere in it, and `x` AR1s and a random walk that together have
+the simulation's spectrum. Once the path `s` is known all is
+Gaussian, and the gains of Kalman's filter are the same for every path: paths differ in what is left of the data alone.
+Of the likeliest paths so many are followed, each with the mean of `x` that belongs to it; after every block those that
+are too many are drawn such that the likelihood stays unbiased (Fearnhead and Clifford, 2003). Filters that merge paths
+into one for each state forget how background and level depend on each other, and with it most of what tells two levels
+from a Gaussian process.
+
+References:
+    [Fearnhead and Clifford] On-line inference for hidden Markov models via particle filters, JRSS B 65 (2003), 887.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gyrofuse._base.nnls import nonnegative_least_squares
+from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
+
+Array = NDArray[np.float64]
+
+_LARGEST = 1e4  # variance of the level at the start, in those of the noise
+_ORDINATES = 120
+_LONGEST, _SHORTEST = 0.15, 1.5  # time constants of the background's AR1s: share of the record, blocks
+_ROUNDING, _TINY = 1e-6, 1e-300
+_FIRST = 50  # blocks that tell the level at the start
+
+
+class Background(NamedTuple):
+    """Noise of one sensor's block means: white noise, AR1s, a random walk.
+
+    Attributes:
+        white: Variance `r`.
+        phi: Of the AR1s, and 1 of the walk, `(part,)`.
+        steps: Variances of their steps, `(part,)`.
+        start: Variances at the start, `(part,)`.
+    """
+
+    white: float
+    phi: Array
+    steps: Array
+    start: Array
+
+
+def backgrounds(base: NoiseSpectrum, block: int, n_shaped: int = 4) -> list[Background]:
+    """Of each sensor, with so many AR1s, fitted to the spectrum that means over so many samples have."""
+    n = base.n_samples // block
+    f = np.geomspace(0.5 / n, 0.5, _ORDINATES)  # cycles per block
+    density = _of_means(base, f, block)
+    constants = np.geomspace(_SHORTEST, max(_LONGEST * n, 2 * _SHORTEST), n_shaped)
+    phi = np.exp(-1 / constants)
+    shaped = (1 - phi[:, None] ** 2) / (1 - 2 * phi[:, None] * np.cos(2 * np.pi * f) + phi[:, None] ** 2)
+    atoms = np.concatenate([np.ones((1, len(f))), shaped, 1 / (4 * np.sin(np.pi * f) ** 2)[None]])
+    found = []
+    for row in density:
+        relative = torch.from_numpy(atoms / row)
+        white, *variances, walk = nonnegative_least_squares(relative @ relative.mT, relative.sum(-1)).tolist()
+        variance = np.array(variances)
+        steps = np.append(variance * (1 - phi**2), walk)
+        # Differences of successive means say nothing of a noise that has no white part.
+        white = max(float(white), 1e-6 * float(row.min()))
+        start = np.append(variance, _LARGEST * (white + variance.sum()))
+        found.append(Background(white, np.append(phi, 1.0), steps, start))
+    return found
+
+
+def _of_means(base: NoiseSpectrum, f: Array, block: int) -> Array:
+    """Densities `(sensor, frequency)` of block means at `f` cycles per block, with what is folded down."""
+    places = (f[:, None] + np.arange(-(block // 2), block - block // 2)) / block  # cycles per sample
+    seen = (np.sin(np.pi * places * block) / (block * np.sin(np.pi * places))) ** 2 / block
+    folded = torch.from_numpy(np.abs((places + 0.5) % 1 - 0.5).ravel())
+    return np.asarray((base.spectrum(folded).numpy().reshape(-1, *places.shape) * seen).sum(-1))
+
+
+def gaussian_values(y: Array, background: Background, sd: Array, tau: Array) -> Array:
+    """Log likelihoods of an Ornstein-Uhlenbeck process in the background, `(trial, block)`.
+
+    Args:
+        y: Block means, `(block,)`.
+        background: Noise beside it.
+        sd: Of the process, `(trial,)`; 0 for none.
+        tau: Its time constant, blocks.
+    """
+    n_trials, parts = len(sd), len(background.phi) + 1
+    own = np.exp(-1 / tau)
+    phi = np.column_stack([np.tile(background.phi, (n_trials, 1)), own])
+    steps = np.column_stack([np.tile(background.steps, (n_trials, 1)), sd**2 * (1 - own**2)])
+    p = np.zeros((n_trials, parts, parts))
+    diagonal = np.arange(parts)
+    p[:, diagonal, diagonal] = np.column_stack([np.tile(background.start, (n_trials, 1)), sd**2])
+    mean = np.zeros((n_trials, parts))
+    mean[:, -2] = y[:_FIRST].mean()
+    both, values = phi[:, :, None] * phi[:, None], np.empty((n_trials, len(y)))
+    for k, value in enumerate(y):
+        mean, p = phi * mean, both * p
+        p[:, diagonal, diagonal] += steps
+        shared = p.sum(-1)
+        s = shared.sum(-1) + background.white
+        e = value - mean.sum(-1)
+        values[:, k] = -(e**2 / s + np.log(s)) / 2
+        gain = shared / s[:, None]
+        mean = mean + gain * e[:, None]
+        p = p - gain[:, :, None] * shared[:, None]
+    return values
+
+
+def switching_values(y: Array, background: Background, half: Array, up: Array, down: Array, n_paths: int) -> Array:
+    """Log likelihoods of two levels in the background, `(trial, block)`.
+
+    Args:
+        y: Block means, `(block,)`.
+        background: Noise beside them.
+        half: Half the distance of the levels, `(trial,)`.
+        up: Mean dwell in the upper one, blocks, `(trial,)`.
+        down: In the lower one.
+        n_paths: That are followed.
+    """
+    gains, s = _filter(background, len(y))
+    uniform = np.random.default_rng(0).random(len(y))  # the same for all trials, so that their values compare
+    n_trials, n_parts = len(half), len(background.phi)
+    # From one block's end to the next one's: who goes and comes back in between has not moved.
+    rate = 1 / up + 1 / down
+    leave, enter = (-np.expm1(-rate) / rate / up)[:, None], (-np.expm1(-rate) / rate / down)[:, None]
+    upper = np.tile([False, True], (n_trials, 1))
+    weight = np.concatenate([leave, enter], 1) / (leave + enter)
+    mean = np.zeros((n_trials, 2, n_parts))
+    mean[..., -1] = y[:_FIRST].mean()
+    values = np.empty((n_trials, len(y)))
+    for k, value in enumerate(y):
+        n_before = upper.shape[1]
+        mean = mean * background.phi
+        e = value - mean.sum(-1)
+        level = np.where(upper, half[:, None], -half[:, None])
+        moved = weight * np.where(upper, leave, enter)
+        # Paths that stay, and those that move: half way on average, and anywhere between the levels.
+        wider = np.concatenate([np.ones_like(e), np.broadcast_to(1 + half[:, None] ** 2 / (3 * s[k]), e.shape)], 1)
+        left = np.concatenate([e - level, e], 1) / wider
+        log_l = left**2 * wider * (-0.5 / s[k]) - np.log(wider) / 2
+        largest = log_l.max(1, keepdims=True)
+        weight = np.concatenate([weight - moved, moved], 1) * np.exp(log_l - largest)
+        total = weight.sum(1, keepdims=True)
+        values[:, k] = (largest + np.log(total * s[k] ** -0.5))[:, 0]
+        weight /= total
+        upper = np.concatenate([upper, ~upper], 1)
+        kept = np.arange(upper.size).reshape(upper.shape)
+        if 2 * n_before > n_paths:
+            kept, weight = _thinned(weight, n_paths, float(uniform[k]))
+        upper, left = upper.ravel()[kept], left.ravel()[kept]
+        parent = kept % (2 * n_before) % n_before + n_before * np.arange(n_trials)[:, None]
+        mean = mean.reshape(-1, n_parts)[parent] + gains[k] * left[..., None]
+    return values
+
+
+def _filter(background: Background, n: int) -> tuple[Array, Array]:
+    """Gains `(block, part)` of Kalman's filter and variances of its errors, `(block,)`: the same for all paths."""
+    gains, variances = np.empty((n, len(background.phi))), np.empty(n)
+    p, both = np.diag(background.start), background.phi[:, None] * background.phi
+    for k in range(n):
+        p = both * p + np.diag(background.steps)
+        shared = p.sum(-1)
+        variances[k] = shared.sum() + background.white
+        gains[k] = shared / variances[k]
+        p = p - gains[k][:, None] * shared
+    return gains, variances
+
+
+def _thinned(weight: Array, n_paths: int, uniform: float) -> tuple[NDArray[np.intp], Array]:
+    """Positions of the paths that are kept among all `(trial, path)`, and their weights, `(trial, path)`.
+
+    Weights above a threshold stay as they are; of the others so many as there is room for are drawn in proportion to
+    their weights, evenly, and get the threshold.
+    """
+    safe, n_safe = np.zeros(weight.shape, bool), np.zeros((len(weight), 1), int)
+    while True:
+        limit = np.where(safe, 0.0, weight).sum(1, keepdims=True) / (n_paths - n_safe) + _TINY
+        safe = weight > limit
+        now = safe.sum(1, keepdims=True)
+        if (now == n_safe).all():
+            break
+        n_safe = now
+    room = n_paths - n_safe
+    drawn = np.minimum(np.where(safe, 0.0, weight / limit).cumsum(1), room - _ROUNDING)
+    drawn[:, -1:] = room - _ROUNDING
+    drawn = np.floor(drawn + (uniform * (1 - 2 * _ROUNDING) + _ROUNDING))
+    taken = safe | (np.diff(drawn, axis=1, prepend=0.0) > 0)
+    # Where fewer have any weight at all, some without make up the number.
+    missing = n_paths - taken.sum(1, keepdims=True)
+    taken |= ~taken & ((~taken).cumsum(1) <= missing)
+    kept = np.flatnonzero(taken).reshape(len(weight), n_paths)
+    return kept, np.maximum(weight, limit).ravel()[kept]

@@ -1,0 +1,55 @@
+"""The catalogue: mechanisms in the order in which they are looked for.
+
+Specific facts come first and spectra of any origin last: a rounded, spiky recording has a white excess too. Within a
+stage the best one is taken first, and the stage is gone through again.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
+from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
+from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
+from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph
+from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
+from gyrofuse.mismatch.mechanisms.remainder import Remainder
+from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
+from gyrofuse.mismatch.mechanisms.signals.g_sensitivity import GSensitivity
+from gyrofuse.mismatch.mechanisms.signals.quadratic_coupling import QuadraticCoupling
+from gyrofuse.mismatch.mechanisms.signals.scale_factor import ScaleFactor
+from gyrofuse.mismatch.mechanisms.signals.step import Step
+from gyrofuse.mismatch.mechanisms.signals.temperature import TemperatureDrift
+from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
+from gyrofuse.mismatch.mechanisms.signals.tone_amplitude import ToneSize
+from gyrofuse.mismatch.mechanisms.signals.warm_up import WarmUpTransient
+from gyrofuse.mismatch.mechanisms.slow_remainder import SlowRemainder
+from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
+from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
+from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
+from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
+from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
+from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
+from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
+from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
+from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
+from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
+from gyrofuse.mismatch.mechanisms.values.unit_scale import UnitScale
+
+STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
+    (UnitScale,),
+    (Quantization, Clipping, StuckSamples),  # facts on the numbers themselves
+    (Spikes,),
+    (ClockSkew,),
+    (GSensitivity, QuadraticCoupling, ScaleFactor),
+    (VibrationTone, ToneSize),
+    (RandomTelegraph,),
+    (GradualChange,),  # where noise is louder, what is slow is known less well
+    (TemperatureDrift, WarmUpTransient, Step),
+    (VarianceChange,),  # to which large jumps look alike
+    (ParameterShift, LowPassFilter, Resonance, DriftingTone, FlickerNoise, CommonMode),
+)
+
+# Every mechanism that a repaired simulation may have: a dead band is looked for where no lattice is found, the
+# remainders once nothing with a name is left.
+CATALOGUE: tuple[type[Mechanism], ...] = (*itertools.chain(*STAGES), DeadBand, Remainder, SlowRemainder)

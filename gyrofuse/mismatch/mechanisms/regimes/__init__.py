@@ -1,0 +1,1 @@
+"""Noise that is another at some times."""

@@ -1,0 +1,287 @@
+"""Isolated outliers: shocks that all sensors feel, or errors of a bus, one sensor at a time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.detectors.variance.noise_level import levelled, variance_p_values
+from gyrofuse.mismatch.detectors.variance.outliers import likely_outliers, spike_p_value
+from gyrofuse.mismatch.detectors.variance.weak_outliers import fitted_shock, shock_posterior, shock_scores
+from gyrofuse.mismatch.likelihoods.outlier_law import Outliers, clustered, fitted, free_gaussian, heavy_tailed, mixture
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.regimes.outlier_limits import with_limits
+from gyrofuse.mismatch.signals.axes import OfSensors
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
+from gyrofuse.mismatch.signals.prediction_errors import left_out
+from gyrofuse.mismatch.stats.segments import episodes_of, two_level_scores
+
+_HOUR = 3600.0
+_ALIKE = 5.0  # nats
+_RARE = 2.5  # nats by which a few outliers have to surpass noise that is heavy-tailed throughout
+_LAW, _TAILS = 1.5, 0.5  # nats that their law, and one of such noise, gain by chance: half of each number but the scale
+_PLAIN = 5.0  # sd: outliers that can be taken off one by one
+_PRESENT, _OWN_LAW = 4.0, 10.0  # nats of a sensor that tells the law of all, and of one that has it whatever they say
+_UNLIKE = 5.0  # nats for each sensor that has a law of its own
+_LIKELY = 0.8  # probability of being hit
+_ROUNDS, _ROUNDS_AGAIN = 40, 10
+_ISOLATED = 0.03  # more frequent ones are another law of the noise
+
+
+@dataclass(frozen=True, eq=False)
+class Spikes(Mechanism):
+    """`y_t = x_t + a_t` at isolated samples, `a_t` of either sign, of modulus `height` with some `spread`.
+
+    Looks like white noise; the tails of what is left of a sample when all others have spoken tell them apart. Loud
+    episodes have such tails too, but their outliers lie together. Noise that is heavy-tailed throughout has more of the
+    small ones than a few spikes leave: it is none of these, and has no name here.
+
+    Attributes:
+        rate: Of spikes, for a sample, `(sensor,)`; 0 where there are none.
+        height, spread: Mean and sd of their modulus, unit of the signal, `(sensor,)`.
+        together: Whether the sensors concerned are hit at the same time: a shock.
+    """
+
+    name: ClassVar[str] = "spikes"
+    taken_off: ClassVar[bool] = True
+    rate: OfSensors
+    height: OfSensors
+    spread: OfSensors
+    together: bool
+
+    @property
+    def amplitude(self) -> Tensor:
+        """Root mean square of the spikes, `(sensor,)`."""
+        return torch.hypot(self.height, self.spread)
+
+    @classmethod
+    def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
+        p_value = spike_p_value(comparison)
+        if p_value > level:
+            return None
+        z = left_out(comparison.observed).z[0]
+        laws = [fitted(row) for row in z]
+        gains = _gains(z, laws).sum(-1)
+        hit = tuple((gains > _PRESENT).nonzero()[:, 0].tolist())
+        weak = likely_outliers(comparison)
+        if weak is not None and not weak.shock and weak.apart > -math.log(level):
+            hit = tuple(i for i in range(comparison.n_sensors) if i in hit or float(weak.sensors[i]) > _LIKELY)
+        if hit:  # what the law of all of them is likelier in has it, however little that gains by itself
+            as_others = _gains(z, _shared(z, laws, hit)).sum(-1)
+            hit = tuple(i for i in range(comparison.n_sensors) if float(as_others[i]) > 0 or float(gains[i]) > _OWN_LAW)
+        apart = float(gains[list(hit)].sum())
+        laws = _alike(z, laws, hit)
+        gain = float(_gains(z, laws)[list(hit)].sum())
+        shock = _shock(comparison, laws, hit)
+        together = shock is not None and shock[1] > gain
+        if shock is not None and together:
+            laws, gain = shock
+            hit = tuple(i for i, law in enumerate(laws) if law.rate > 0)
+        if not hit or any(laws[i].rate > _ISOLATED for i in hit) or clustered(levelled(comparison)[list(hit)]):
+            return None
+        n_laws = 1 if together else _n_laws(laws, hit)
+        if max(gain - _LAW * n_laws, apart - _LAW * len(hit)) < _heavy_tailed(z, hit) + _RARE:
+            return None
+        rival = _louder(comparison)
+        if rival > gain + _ALIKE:
+            return None
+        effect = cls._of(comparison, hit, laws, together)
+        parameters = cls._parameters(comparison, hit, laws if together else _limited(z, laws, hit), together)
+        alternatives = [
+            name
+            for name, alike in (
+                ("variance_change", rival > gain - _ALIKE),
+                ("parameter_shift", gain < _ALIKE),
+            )
+            if alike
+        ]
+        largest = max(hit, key=lambda i: float(effect.amplitude[i]))
+        info = comparison.info
+        where = info.named(hit, "all sensors")
+        how = "at the same time, as shocks do" if effect.together else "not at the same time, as errors of a bus are"
+        return Finding(
+            cls.name,
+            effect,
+            f"isolated outliers in {where}{', ' + how if len(hit) > 1 else ''}: "
+            f"{laws[largest].rate * info.rate * _HOUR:.3g} an hour of {float(effect.amplitude[largest]):.3g} "
+            f"{info.measure}{f' in sensor {info.sensors[largest]}' if len(hit) > 1 else ''}",
+            p_value,
+            hit,
+            parameters,
+            levels=(1,),
+            alternatives=tuple(alternatives),
+            time_s=int(z[largest].abs().argmax()) / info.rate,
+            gain=gain,
+        )
+
+    @classmethod
+    def _of(cls, comparison: Comparison, hit: tuple[int, ...], laws: list[Outliers], together: bool) -> Spikes:
+        rows = [laws[i] if i in hit else Outliers.none() for i in range(comparison.n_sensors)]
+        rate, height, spread = (
+            torch.tensor([getattr(row, name) for row in rows], dtype=torch.float64)
+            for name in ("rate", "height", "spread")
+        )
+        sd = left_out(comparison.observed).sd[0]
+        return cls(rate, height * sd, spread * sd, together)
+
+    @staticmethod
+    def _parameters(
+        comparison: Comparison, hit: tuple[int, ...], laws: list[Outliers], together: bool
+    ) -> dict[str, Parameter]:
+        per_hour, sd, parameters = comparison.info.rate * _HOUR, left_out(comparison.observed).sd[0], {}
+        for i in hit:
+            law, scale = laws[i], float(sd[i])
+            low, high = law.rate_limits
+            parameters["rate" if together else f"rate[{i}]"] = Parameter(
+                law.rate * per_hour, low * per_hour, high * per_hour, "1/h"
+            )
+            low, high = law.amplitude_limits
+            parameters[f"amplitude[{i}]"] = Parameter(
+                law.amplitude * scale, low * scale, high * scale, comparison.info.measure
+            )
+        return parameters
+
+    def fit_without(self, comparison: Comparison, fold: int) -> Spikes:
+        keep = estimation_samples(comparison.n_samples, fold)
+        z = left_out(comparison.observed).z[0]
+        hit = tuple(self.rate.nonzero()[:, 0].tolist())
+        if self.together:
+            return self._of(comparison, hit, fitted_shock(z[:, keep], self._laws(comparison), _ROUNDS_AGAIN), True)
+        laws = [fitted(row[keep]) if i in hit else Outliers.none() for i, row in enumerate(z)]
+        return self._of(comparison, hit, _alike(z[:, keep], laws, hit), False)
+
+    def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
+        def draw(kind: str, shape: tuple[int, ...]) -> Tensor:
+            source = torch.rand if kind == "even" else torch.randn
+            return source(shape, generator=generator, dtype=torch.float64)
+
+        rate = self.rate[:, None]
+        when = (*signal.shape[:-2], 1, signal.shape[-1]) if self.together else tuple(signal.shape)
+        at = draw("even", when) < (rate.amax() if self.together else rate)
+        sign = torch.where(draw("even", tuple(signal.shape)) < 0.5, -1.0, 1.0)
+        size = self.height[:, None] + self.spread[:, None] * draw("normal", tuple(signal.shape))
+        return signal + torch.where(at & (rate > 0), sign * size, 0.0)
+
+    def remove(self, signal: Tensor, info: RecordingInfo) -> Tensor:
+        """Samples that are outliers more likely than not are predicted from all others."""
+        comparison = Comparison.of(info, signal, signal[None])
+        error = left_out(comparison.observed).correctable()[0]
+        return torch.where(self._outliers(comparison, error), signal - error, signal)
+
+    def repair(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
+        expected = left_out(comparison.observed)
+        plain = self.amplitude >= _PLAIN * expected.sd[0]
+        if not bool(plain[self.rate > 0].all()):
+            return super().repair(comparison, generator)
+        noise = (
+            torch.randn(comparison.recording.shape, generator=generator, dtype=torch.float64) * expected.sd[0][:, None]
+        )
+        error = expected.correctable()[0]
+        predicted = comparison.recording - error + noise
+        return comparison.with_recording(
+            torch.where(self._outliers(comparison, error), predicted, comparison.recording)
+        )
+
+    def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
+        z, laws = left_out(comparison.observed).z[0], self._laws(comparison)
+        if self.together:
+            return held_out_blocks(_shock_gains(z, laws), fold).sum(-1)
+        laws = [law.scaled(row) for row, law in zip(z, laws, strict=True)]
+        return held_out_blocks(_gains(z, laws) * (self.rate[:, None] > 0), fold).sum((0, -1))
+
+    def _laws(self, comparison: Comparison) -> list[Outliers]:
+        sd = left_out(comparison.observed).sd[0]
+        numbers = torch.stack([self.rate, self.height / sd, self.spread / sd], -1).tolist()
+        return [Outliers(*row) for row in numbers]
+
+    def _outliers(self, comparison: Comparison, error: Tensor) -> Tensor:
+        """Samples that are outliers more likely than not by their errors, `(sensor, time)`."""
+        z, laws = error / left_out(comparison.observed).sd[0][:, None], self._laws(comparison)
+        if self.together:
+            return (self.rate[:, None] > 0) & (shock_posterior(z, laws) > 0.5)
+        return torch.stack([law.posterior(row) > 0.5 for row, law in zip(z, laws, strict=True)])
+
+
+def _gains(z: Tensor, laws: list[Outliers]) -> Tensor:
+    """Log likelihood over normal laws of their own variance, `(sensor, time)`."""
+    return torch.stack([mixture(row, law) - free_gaussian(row) for row, law in zip(z, laws, strict=True)])
+
+
+def _heavy_tailed(z: Tensor, hit: tuple[int, ...]) -> float:
+    """Nats of noise that is heavy-tailed throughout, in each sensor in its way or in all alike, without chance's."""
+    each = sum(heavy_tailed(z[i]) - _TAILS for i in hit)
+    if len(hit) < 2:
+        return each
+    return max(each, heavy_tailed(torch.cat([z[i] / z[i].square().mean().sqrt() for i in hit])) - _TAILS)
+
+
+def _alike(z: Tensor, laws: list[Outliers], hit: tuple[int, ...]) -> list[Outliers]:
+    """One law for all sensors concerned, in sd of their noise, where it is as good as one for each."""
+    if len(hit) < 2:
+        return laws
+    one = [own if i in hit else law for i, (own, law) in enumerate(zip(_shared(z, laws, hit), laws, strict=True))]
+    worse = float((_gains(z, laws) - _gains(z, one)).sum())
+    return one if worse < _UNLIKE * (len(hit) - 1) else laws
+
+
+def _shared(z: Tensor, laws: list[Outliers], hit: tuple[int, ...]) -> list[Outliers]:
+    """The law of some sensors, in sd of their noise, for each."""
+    # Where a law of its own takes much of the noise for outliers its scale is not that of the noise.
+    units = [
+        law.scale if law.rate < _ISOLATED else float(row.square().mean().sqrt())
+        for row, law in zip(z, laws, strict=True)
+    ]
+    law = fitted(torch.cat([z[i] / units[i] for i in hit]))
+    scales = [law.times(unit).scaled(row).scale for row, unit in zip(z, units, strict=True)]
+    return [law.times(scale / law.scale) for scale in scales]
+
+
+def _n_laws(laws: list[Outliers], hit: tuple[int, ...]) -> int:
+    """One where the sensors concerned share it."""
+    return len({laws[i].rate for i in hit})
+
+
+def _limited(z: Tensor, laws: list[Outliers], hit: tuple[int, ...]) -> list[Outliers]:
+    """With limits; those of one law for all sensors from the values of all."""
+    limited = list(laws)
+    for group in [hit] if _n_laws(laws, hit) == 1 else [(i,) for i in hit]:
+        unit = laws[group[0]].times(1 / laws[group[0]].scale)
+        found = with_limits(torch.cat([z[i] / laws[i].scale for i in group]), unit)
+        for i in group:
+            limited[i] = found.times(laws[i].scale)
+    return limited
+
+
+def _shock(comparison: Comparison, apart: list[Outliers], hit: tuple[int, ...]) -> tuple[list[Outliers], float] | None:
+    """Laws of outliers that hit several sensors at once, and what they gain, nats."""
+    z, weak = left_out(comparison.observed).z[0], likely_outliers(comparison)
+    if weak is not None and weak.shock:
+        hit = tuple((weak.sensors > 0.5).nonzero()[:, 0].tolist())
+        start = [Outliers(weak.rate, weak.size, 0.1 * weak.size)] * len(z)
+    else:
+        start = [law._replace(rate=max((apart[i].rate for i in hit), default=0.0)) for law in apart]
+    if len(hit) < 2:
+        return None
+    laws = fitted_shock(z, [law if i in hit else Outliers.none() for i, law in enumerate(start)], _ROUNDS)
+    return laws, float(_shock_gains(z, laws).sum())
+
+
+def _shock_gains(z: Tensor, laws: list[Outliers]) -> Tensor:
+    """Log likelihood of shocks over normal laws of their own variance, `(time,)`."""
+    rows = [row for row, law in zip(z, laws, strict=True) if law.rate > 0]
+    plain = sum((mixture(row, Outliers.none()) - free_gaussian(row) for row in rows), torch.zeros(()))
+    return shock_scores(z, laws) + plain
+
+
+def _louder(comparison: Comparison) -> float:
+    """What an episode of louder noise would gain, nats."""
+    white = levelled(comparison)
+    found = episodes_of(white, variance_p_values(comparison))
+    return (
+        0.0 if found is None else float(two_level_scores(white, found.factor, found.inside(comparison.n_samples)).sum())
+    )

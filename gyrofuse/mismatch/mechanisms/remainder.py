@@ -1,0 +1,69 @@
+"""What is left of the spectra once everything with a name is explained: a repair without physics.
+
+A simulator that is handed back ought to agree with the recording where the catalogue does not reach, too. The remainder
+is no finding: witnesses that asked for it stay in the report as unexplained.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.mechanisms.spectra.spectral import Filter
+from gyrofuse.mismatch.signals.axes import Axes
+from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.signals.folds import N_JUDGED, estimation_samples
+from gyrofuse.mismatch.signals.records import Records
+
+
+@dataclass(frozen=True, eq=False)
+class Remainder(Filter):
+    """`S_i(f) -> S_i(f) exp(2 g_i(log f))` with `g` linear between the middles of bands, a filter without phase.
+
+    Attributes:
+        frequency: Middles of the bands, cycles per sample, `(band,)`.
+        log_gain: `g`, `(sensor, band)`.
+    """
+
+    name: ClassVar[str] = "remainder"
+    asked_for_by: ClassVar[tuple[str, ...]] = ("spectrum", "shape", "bump")  # witnesses
+    frequency: Annotated[Tensor, Axes(("band",))]
+    log_gain: Annotated[Tensor, Axes(("sensor", "band"))]
+
+    @classmethod
+    def of(cls, comparison: Comparison) -> Remainder:
+        """What the spectra ask for."""
+        return cls._between(comparison.observed, comparison.reference)
+
+    def but_for(self, sensors: Sequence[int]) -> Remainder:
+        """The same, with some sensors left as they are."""
+        log_gain = self.log_gain.clone()
+        log_gain[list(sensors)] = 0.0
+        return replace(self, log_gain=log_gain)
+
+    @classmethod
+    def _between(cls, observed: Records, reference: Records) -> Remainder:
+        """Halves of log ratios of powers, each drawn towards none by as much as chance explains of it (Stein)."""
+        worth = torch.minimum(observed.dof, reference.dof)
+        ratio = (observed.power.clamp(min=1e-300) / reference.power.clamp(min=1e-300)).log()
+        chance = 1 / observed.dof.clamp(min=1e-9) + 1 / reference.dof.clamp(min=1e-9)
+        kept = (1 - chance / ratio.square().clamp(min=1e-300)).clamp(min=0.0)
+        # Blocks are too short for the slowest bands: without a bin there is no power either.
+        return cls(observed.bands.frequency, torch.where(worth > 0, kept * ratio / 2, 0.0))
+
+    def response(self, f: Tensor) -> Tensor:
+        x, at = f.clamp(self.frequency[0], self.frequency[-1]).log(), self.frequency.log()
+        right = torch.searchsorted(at, x).clamp(1, len(at) - 1)
+        share = (x - at[right - 1]) / (at[right] - at[right - 1])
+        return torch.lerp(self.log_gain[:, right - 1], self.log_gain[:, right], share).exp()
+
+    def fit_without(self, comparison: Comparison, fold: int) -> Remainder:
+        block = comparison.n_samples // N_JUDGED
+        kept = comparison.observed.noise[0][:, estimation_samples(comparison.n_samples, fold)]
+        return self._between(
+            Records(kept.unflatten(-1, (-1, block)).movedim(-2, 0), comparison.bands), comparison.reference
+        )

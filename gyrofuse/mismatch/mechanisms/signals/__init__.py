@@ -1,0 +1,1 @@
+"""Known paths on top of the noise."""

@@ -1,0 +1,188 @@
+"""A clock of its own: sensors that sample at another rate than the others, or lose samples."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Annotated, ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.detectors.lines.clocks import BLOCKS, best_slope, demodulated, strongest_slip
+from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.signals.axes import Axes
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.filters import resampled
+from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
+from gyrofuse.mismatch.stats.limits import Z
+
+_MILLION = 1e6
+_ROUNDS, _BLOCKS_AROUND = 2, 3  # places of losses and amplitudes in turns, and blocks in which each is placed
+_AS_GOOD = 2.0  # nats within which another place is as good
+
+
+@dataclass(frozen=True, eq=False)
+class ClockSkew(Mechanism):
+    """`x_i(t) = y_i((1 + skew) t + lost(t))` for some sensors `i`, `y_i` with the clock of the others, `t` in samples.
+
+    A slope or steps in the phase of a tone that all feel. Of noise alone, which has no common clock, it changes nothing
+    that could be seen.
+
+    Attributes:
+        sensors: Those concerned.
+        skew: What they are ahead per sample.
+        losses: First sample after each loss, and how many samples were lost, in the order of time.
+        frequency: Of the tone that shows it, cycles per sample.
+        slipping, steady: Amplitudes of the tone with and without the slip, complex, `(sensor concerned,)`, in units of
+            the noise.
+    """
+
+    name: ClassVar[str] = "clock_skew"
+    taken_off: ClassVar[bool] = True
+    sensors: tuple[int, ...]
+    skew: float
+    losses: tuple[tuple[int, int], ...]
+    frequency: float
+    slipping: Annotated[Tensor, Axes(("sensor concerned",), complex=True)]
+    steady: Annotated[Tensor, Axes(("sensor concerned",), complex=True)]
+
+    @classmethod
+    def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
+        slip = strongest_slip(comparison)
+        if slip is None or slip.p_value > level:
+            return None
+        rate, info = comparison.info.rate, comparison.info
+        none = torch.zeros(len(slip.sensors), dtype=torch.complex128)
+        losses = tuple((loss.at, loss.count) for loss in slip.losses)
+        effect = cls(slip.sensors, slip.skew, losses, slip.frequency, none, none)
+        everywhere = torch.ones(comparison.n_samples, dtype=torch.bool)
+        effect = effect._fitted(comparison, everywhere)
+        limits = [loss.at_limits for loss in slip.losses]
+        for _ in range(_ROUNDS if losses else 0):
+            effect, limits = effect._placed(comparison)
+            effect = effect._fitted(comparison, everywhere)
+        losses = effect.losses
+        who = info.named(slip.sensors, "all sensors")
+        against = f"the tone at {slip.frequency * rate:.6g} Hz in "
+        against += "the other sensors" if slip.reference is None else slip.reference
+        if losses:
+            lost = sum(count for _, count in losses)
+            parameters = {"lost": Parameter(lost, *slip.lost, "")}
+            for j, ((at, _), (first, last)) in enumerate(zip(losses, limits, strict=True)):
+                parameters[f"time_of_loss_{j + 1}"] = Parameter(at / rate, first / rate, last / rate, "s")
+            times = ", ".join(f"{at / rate:.4g}" for at, _ in losses)
+            sentence = f"{who} lost {lost} samples against {against}: its phase steps at {times} s"
+        else:
+            reach = Z * slip.skew_sd
+            parameters = {
+                "skew": Parameter(
+                    _MILLION * slip.skew, _MILLION * (slip.skew - reach), _MILLION * (slip.skew + reach), "ppm"
+                )
+            }
+            sentence = f"the clock of {who} differs by {_MILLION * slip.skew:.3g} ppm from {against}: its phase slips"
+        return Finding(
+            cls.name,
+            effect,
+            sentence,
+            slip.p_value,
+            slip.sensors,
+            parameters,
+            levels=(level_of(slip.frequency),),
+            frequency_hz=slip.frequency * rate,
+            time_s=losses[0][0] / rate if losses else None,
+            channel=slip.reference,
+            gain=slip.gain,
+        )
+
+    def _fitted(self, comparison: Comparison, keep: Tensor) -> ClockSkew:
+        """Amplitudes with and without the slip, least squares on the samples to keep."""
+        signal = comparison.white[list(self.sensors)] * keep
+        turned = [self._carrier(comparison.n_samples, slips) for slips in (True, False)]
+        # Over many cycles the two quadratures are orthogonal.
+        slipping, steady = ((2 * signal.to(carrier.dtype) @ carrier.conj()) / keep.sum() for carrier in turned)
+        return replace(self, slipping=slipping, steady=steady)
+
+    def _placed(self, comparison: Comparison) -> tuple[ClockSkew, list[tuple[int, int]]]:
+        """Losses at the sample that suits the tone best, each between the blocks around it, and limits of each.
+
+        Until a loss the tone is what it was, from there on what it turns to: a loud tone tells where to a sample.
+        """
+        losses, limits = list(self.losses), []
+        reach = _BLOCKS_AROUND * (comparison.n_samples // BLOCKS)
+        for j, (at, count) in enumerate(losses):
+            low = max(at - reach, losses[j - 1][0] + 1 if j else 1)
+            high = min(at + reach, losses[j + 1][0] - 1 if j + 1 < len(losses) else comparison.n_samples - 1)
+            t = torch.arange(low, high, dtype=torch.float64)
+            ahead = float(sum(lost for _, lost in losses[:j]))
+            turn = 2 * math.pi * self.frequency * (t + ahead)
+            before, after = (
+                (self.slipping[:, None] * torch.polar(torch.ones_like(t), turn + extra)).real
+                for extra in (0.0, 2 * math.pi * self.frequency * count)
+            )
+            signal = comparison.white[list(self.sensors), low:high]
+            told = (signal * (before - after) - (before.square() - after.square()) / 2).sum(0).cumsum(0)
+            told = torch.nn.functional.pad(told, (1, 0))  # of a loss before each sample from `low` to `high`
+            likely = (told >= told.amax() - _AS_GOOD).nonzero()[:, 0]
+            losses[j] = low + int(told.argmax()), count
+            limits.append((low + int(likely[0]), low + int(likely[-1])))
+        return replace(self, losses=tuple(losses)), limits
+
+    def fit_without(self, comparison: Comparison, fold: int) -> ClockSkew:
+        keep = estimation_samples(comparison.n_samples, fold)
+        if not self.skew:
+            return self._fitted(comparison, keep)
+        signal = comparison.white[list(self.sensors)] * keep
+        slope, _ = best_slope(demodulated(signal, self.frequency))
+        skew = slope / (self.frequency * (comparison.n_samples // BLOCKS * BLOCKS))
+        return replace(self, skew=skew)._fitted(comparison, keep)
+
+    def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
+        signal = comparison.white[list(self.sensors)]
+        scores = []
+        for amplitude, slips in ((self.slipping, True), (self.steady, False)):
+            tone = (amplitude[:, None] * self._carrier(comparison.n_samples, slips)).real
+            scores.append(held_out_blocks(signal * tone - tone.square() / 2, fold).sum((0, -1)))
+        return scores[0] - scores[1]
+
+    def _carrier(self, n_samples: int, slips: bool) -> Tensor:
+        """`exp(i phase)` of the tone, with the slip or without it, `(time,)`."""
+        t = torch.arange(n_samples, dtype=torch.float64)
+        phase = 2 * math.pi * self.frequency * (t + self._ahead(t) if slips else t)
+        return torch.polar(torch.ones_like(phase), phase)
+
+    def _ahead(self, t: Tensor) -> Tensor:
+        """By how many samples the sensors are ahead at their sample `t`."""
+        return self.skew * t + sum(count * (t >= at) for at, count in self.losses)
+
+    def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
+        t = torch.arange(signal.shape[-1], dtype=torch.float64)
+        return self._with(signal, t + self._ahead(t))
+
+    def remove(self, signal: Tensor, info: RecordingInfo) -> Tensor:
+        n = signal.shape[-1]
+        ends = [0, *(place for at, _ in self.losses for place in (at - 1, at) if 0 < at < n), n - 1]
+        knots = torch.tensor(ends, dtype=torch.float64)
+        true = knots + self._ahead(knots)
+        t = torch.arange(n, dtype=torch.float64)
+        piece = (torch.bucketize(t, true, right=True) - 1).clamp(0, len(knots) - 2)
+        slope = (knots[piece + 1] - knots[piece]) / (true[piece + 1] - true[piece])
+        return self._with(signal, knots[piece] + (t - true[piece]) * slope)
+
+    def _with(self, signal: Tensor, times: Tensor) -> Tensor:
+        """Signals with the sensors concerned taken at other times, in samples."""
+        which = list(self.sensors)
+        changed = signal.clone()
+        changed[..., which, :] = resampled(signal[..., which, :], times).to(signal.dtype)
+        return changed
+
+    def repair(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
+        """Lost samples are made room for; of a skew only the tone is put right: resampling would colour the noise."""
+        if self.losses:
+            return comparison.with_recording(self.remove(comparison.recording, comparison.info))
+        slip = self._carrier(comparison.n_samples, slips=True) - self._carrier(comparison.n_samples, slips=False)
+        taken = torch.zeros_like(comparison.recording)
+        taken[list(self.sensors)] = (self.slipping[:, None] * slip).real
+        density = comparison.base.spectrum(torch.tensor([self.frequency], dtype=torch.float64))
+        return comparison.subtract(taken * density.sqrt())

@@ -1,0 +1,291 @@
+"""Effects with one path for all sensors, each in its own size: what steps, warm-ups and temperature drifts share.
+
+Held out are whitened differences of block means, which are independent: folds take them in turns. What a slow effect
+does may all happen in one of them, so those that judge are turned such that every share of them sees the same part of
+the effect. The other directions that come in are slow cosines: where the noise is stronger than thought, the shares
+scatter more.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, ClassVar, NamedTuple
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.detectors.slow.hysteresis import strongest_relay
+from gyrofuse.mismatch.detectors.slow.scans import (
+    PLAUSIBLE,
+    Scan,
+    SlowLook,
+    between,
+    concerned,
+    explained_by,
+    slow_look,
+)
+from gyrofuse.mismatch.likelihoods.slow_noise import column_sizes, cosines
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.signals.axes import Axes, OfSensors
+from gyrofuse.mismatch.signals.comparison import N_BLOCKS, Comparison, RecordingInfo, block_means
+from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, in_fold
+from gyrofuse.mismatch.stats.limits import Z
+
+_STRONG = 5e-4  # a slow effect leaves traces that look like another one: largest p value
+_TOO_CLOSE = 5.0  # nats
+_SHARES = N_JUDGED // N_FOLDS
+
+
+@dataclass(frozen=True, eq=False)
+class SlowEffect(Mechanism):
+    """`x_i(t) = size_i path(t)`, and further paths of the same physics with sizes of their own.
+
+    Attributes:
+        size: Of the first path, `(sensor,)`; 0 in sensors that are not concerned.
+        log_factors: Of the slow noise beside it, `(sensor, part)`, against the simulation's: for weights.
+    """
+
+    proportional_to: ClassVar[str] = "size"
+    taken_off: ClassVar[bool] = True
+    size: OfSensors
+    log_factors: Annotated[Tensor, Axes(("sensor", "part"))]
+
+    @property
+    def sizes(self) -> Tensor:
+        """Of each path, `(sensor, path)`."""
+        return self.size[:, None]
+
+    def with_sizes(self, sizes: Tensor) -> SlowEffect:
+        """The same with other sizes `(sensor, path)`."""
+        return replace(self, size=sizes[:, 0])
+
+    def paths(self, n_samples: int, info: RecordingInfo) -> Tensor:
+        """For sizes of one, `(path, time)`."""
+        raise NotImplementedError
+
+    def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
+        return signal + self._effect(signal.shape[-1], info)
+
+    def remove(self, signal: Tensor, info: RecordingInfo) -> Tensor:
+        return signal - self._effect(signal.shape[-1], info)
+
+    def repair(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
+        return comparison.subtract(self._effect(comparison.n_samples, comparison.info))
+
+    def fit_without(self, comparison: Comparison, fold: int) -> SlowEffect:
+        """Sizes by generalised least squares without the whitened differences that the fold holds out."""
+        y, paths, _ = self._whitened(comparison)
+        kept = ~in_fold(y.shape[-1], fold)
+        # A step may happen in what is held out: then there is nothing to tell its size.
+        sizes = (torch.linalg.pinv(paths * kept[:, None]) @ (y * kept)[..., None])[..., 0]
+        return self.with_sizes(torch.where(self.sizes != 0, sizes, 0.0))
+
+    def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
+        y, paths, slow = self._whitened(comparison)
+        judged = in_fold(y.shape[-1], fold)
+        effect = paths @ self.sizes[..., None]  # (sensor, difference, 1)
+        scale = self.sizes.norm(dim=-1).copysign(self.size)[:, None, None]
+        directions = torch.cat([effect, scale * slow], -1)[:, judged].flatten(0, 1)
+        length = directions[:, 0].norm() / math.sqrt(_SHARES)
+        axes = torch.linalg.qr(directions).Q
+        axes[:, 0] *= (axes[:, 0] @ directions[:, 0]).sign()
+        seen = _hadamard(_SHARES) @ (axes.mT @ y[:, judged].flatten())
+        return length * seen - length.square() / 2
+
+    def beside_it(self, comparison: Comparison) -> SlowEffect:
+        """The same with the noise that a case has once its mechanism is explained there, without any doubt of that."""
+        scan = slow_look(comparison).scan(self.name)
+        return self if scan is None else replace(self, log_factors=scan.fit.log_factors)
+
+    def _whitened(self, comparison: Comparison) -> tuple[Tensor, Tensor, Tensor]:
+        """Whitened differences of block means: of the data `(sensor, difference)`, of paths and of slow cosines.
+
+        Those are `(sensor, difference, path)`, and `(sensor, difference, _SHARES - 1)`.
+        """
+        covariance = slow_look(comparison).noise.covariance(self.log_factors).diff(dim=-1).diff(dim=-2)
+        paths = block_means(self.paths(comparison.n_samples, comparison.info))
+        directions = torch.cat([paths, cosines()[: _SHARES - 1]])
+        y = block_means(comparison.observed.steady[0])
+        both = torch.cat([y[:, None], directions.expand(len(y), -1, -1)], 1).diff().mT
+        root = torch.linalg.cholesky(covariance)
+        white = torch.linalg.solve_triangular(root, both, upper=False)
+        return white[..., 0], white[..., 1 : 1 + len(paths)], white[..., 1 + len(paths) :]
+
+    def _effect(self, n_samples: int, info: RecordingInfo) -> Tensor:
+        return self.sizes @ self.paths(n_samples, info)
+
+
+class Estimate(NamedTuple):
+    """Places and sizes of an effect, over all places that the data leave possible.
+
+    Attributes:
+        place: Median of the places, with 2.5 and 97.5 % quantiles, samples.
+        other: The same of the second path, where that has its own; else None.
+        size, sd: `(sensor, path)`.
+    """
+
+    place: tuple[float, float, float]
+    other: tuple[float, float, float] | None
+    size: Tensor
+    sd: Tensor
+
+
+class Strong(NamedTuple):
+    """A scan that may be named.
+
+    Attributes:
+        look: What it is part of.
+        scan: It.
+        alternatives: Mechanisms that fit as well.
+        log_factors: Of the slow noise beside it, with what else is there, `(sensor, part)`: for weights.
+    """
+
+    look: SlowLook
+    scan: Scan
+    alternatives: tuple[str, ...]
+    log_factors: Tensor
+
+
+def strong_scan(comparison: Comparison, name: str, level: float) -> Strong | None:
+    """The scan of a mechanism and its equals; None where it is not there, or where another one is better.
+
+    A stronger random walk than the simulation's is one of them, under the name of what changes numbers. Where a relay
+    that a temperature switches fits as well, it may be nothing that has a name here.
+    """
+    look = slow_look(comparison)
+    scan = look.scan(name)
+    several = look.several_steps if name == "step" else None
+    if scan is None or (several is None and scan.p_value > min(level, _STRONG)):
+        return None
+    rivals = {other.family.name: other.gain for other in look.scans if other is not scan}
+    rivals["parameter_shift"] = look.wandering
+    relay, strong = strongest_relay(comparison), Strong(look, scan, (), log_factors(scan))
+    if relay is not None and relay.gain_beside(scan.relation) > scan.gain - _TOO_CLOSE:
+        return None
+    if several is not None and several.gain > max(rivals.values()) + _TOO_CLOSE:
+        # Each is lost among the others, as in a walk: beside them it is the step that it is.
+        first = several.first.scan(name)
+        assert first is not None
+        strong = strong._replace(look=several.first, scan=first)
+    elif any(gain > scan.gain + _TOO_CLOSE for gain in rivals.values()):
+        return None
+    else:
+        strong = strong._replace(alternatives=tuple(r for r, gain in rivals.items() if gain > scan.gain - _TOO_CLOSE))
+    return strong if strong.scan.p_value <= min(level, _STRONG) else None
+
+
+def log_factors(scan: Scan) -> Tensor:
+    """Of the slow noise beside an effect, as strong as the doubt leaves it, `(sensor, part)`.
+
+    Without the effect the noise that fits best is stronger: as much as makes the effect's weight that of the scan.
+    """
+    which = list(concerned(scan))
+    return scan.fit.log_factors + 2 * max(float((scan.held[which].norm() / scan.z[which].norm()).log()), 0.0)
+
+
+def estimate(look: SlowLook, scan: Scan, *, finer: bool = True) -> Estimate:
+    """Mean over the places of a family, each as likely as the data say: the places are the prior.
+
+    Args:
+        look: What it is part of.
+        scan: The family, and the noise beside it.
+        finer: Whether there are places between those of the scan.
+    """
+    family, variance, which = scan.family, scan.fit.variance, concerned(scan)
+    if finer:
+        gain = explained_by(look.y, variance, family.designs, which) / 2
+        best = [p[[scan.best]] for p in family.where]
+        family = between(family, gain > gain.max() - PLAUSIBLE, best)
+    size, spread = column_sizes(look.y, variance, family.designs)  # (sensor, template, path)
+    weight = torch.softmax(explained_by(look.y, variance, family.designs, which) / 2, 0)
+    mean = (size * weight[:, None]).sum(-2)
+    sd = (((spread + size.square()) * weight[:, None]).sum(-2) - mean.square()).clamp(min=0).sqrt()
+    places, *others = (quantiles(p, weight) for p in family.where)
+    return Estimate(places, others[0] if others else None, mean, sd)
+
+
+def quantiles(places: Tensor, weight: Tensor) -> tuple[float, float, float]:
+    """Median, 2.5 and 97.5 % quantiles of places with weights that sum to one."""
+    places, order = places.sort()
+    weight = weight[order]
+    below = weight.cumsum(0) - weight / 2
+    low, middle, high = (
+        float(places[min(int(torch.searchsorted(below, share)), len(places) - 1)])
+        for share in torch.tensor([0.025, 0.5, 0.975], dtype=torch.float64)
+    )
+    return middle, low, high
+
+
+def only(size: Tensor, which: Sequence[int]) -> Tensor:
+    """Sizes `(sensor, ...)` of some sensors, 0 in the others."""
+    kept = torch.zeros_like(size)
+    kept[list(which)] = size[list(which)]
+    return kept
+
+
+def place(places: tuple[float, float, float], rate: float) -> Parameter:
+    """A place with its limits, in seconds."""
+    value, low, high = places
+    return Parameter(value / rate, low / rate, high / rate, "s")
+
+
+def slow_finding(
+    comparison: Comparison,
+    strong: Strong,
+    effect: SlowEffect,
+    found: Estimate,
+    words: str,
+    place: dict[str, Parameter],
+    *,
+    sizes: Sequence[tuple[str, str]] = (),
+    time_s: float | None = None,
+    channel: str | None = None,
+) -> Finding:
+    """A finding made of a scan.
+
+    Args:
+        comparison: Where it was found.
+        strong: The scan.
+        effect: It, with its numbers.
+        found: Its sizes.
+        words: What the bias does.
+        place: Parameters that say where.
+        sizes: Names and units of the sizes of its paths; by default that of one, in the unit of the signal.
+        time_s: Onset.
+        channel: That it follows.
+    """
+    info = comparison.info
+    scan, sizes = strong.scan, sizes or [("size", info.measure)]
+    which = concerned(scan)
+    limits = {}
+    for path, (name, unit) in enumerate(sizes[: found.size.shape[-1]]):
+        for i in which:
+            value, reach = float(effect.sizes[i, path]), Z * float(found.sd[i, path])
+            limits[f"{name}[{i}]"] = Parameter(value, value - reach, value + reach, unit)
+    largest = max(which, key=lambda i: abs(float(effect.size[i])))
+    # A block is no more than half a wavelet there.
+    levels = range(int(math.log2(comparison.n_samples / N_BLOCKS)) + 1, int(math.log2(comparison.n_samples)) + 1)
+    return Finding(
+        effect.name,
+        effect,
+        f"the bias of {info.named(which)} {words}, by up to {abs(float(effect.size[largest])):.3g} {sizes[0][1]} "
+        f"(sensor {info.sensors[largest]})",
+        scan.p_value,
+        which,
+        {**place, **limits},
+        levels=tuple(levels),
+        alternatives=strong.alternatives,
+        time_s=time_s,
+        channel=channel,
+        gain=scan.gain,
+    )
+
+
+def _hadamard(n: int) -> Tensor:
+    """Orthogonal with entries of one size, all positive in the first column; `n` is a power of two."""
+    matrix = torch.ones(1, 1, dtype=torch.float64)
+    while len(matrix) < n:
+        matrix = torch.cat([torch.cat([matrix, matrix], 1), torch.cat([matrix, -matrix], 1)]) / math.sqrt(2)
+    return matrix

@@ -1,0 +1,135 @@
+"""Noise of one source in several sensors."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.likelihoods.band_powers import deep_base
+from gyrofuse.mismatch.likelihoods.components import Common, common_density
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.spectra.findings import found, spanned
+from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape, refit
+from gyrofuse.mismatch.mechanisms.spectra.spectral import Addition
+from gyrofuse.mismatch.signals.axes import ComplexOfSensors
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.filters import filtered, noise, of_phase
+from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
+from gyrofuse.mismatch.stats.limits import Z
+
+_WORDS = {"white": "white noise", "ar1": "AR1 noise", "walk": "a random walk"}
+_REST = 0.01  # of a sensor's power that is its own, at least
+_SEEN, _LEAST = 2.5, 1.5  # standard deviations of a sensor's gain, and of the second largest
+
+
+@dataclass(frozen=True, eq=False)
+class CommonMode(Addition):
+    """`S_ij -> S_ij + g_i g_j* C(f)`: one source in every sensor, with gains, signs and phases of their own.
+
+    Sensors are coherent where it shows; what each has of its own never is. Covariances at no lag miss a source whose
+    phases are a quarter of a cycle apart, cross-spectra do not.
+
+    Attributes:
+        kind: White, AR1 or walk.
+        corner: Of an AR1, cycles per sample; 0 for others.
+        gain: `g`, complex, `(sensor,)`: a sample's rms; for walks that of an increment.
+        own: Noise of the simulation.
+        inside: Whether it is a part of that noise, so that each sensor's power stays, instead of coming on top.
+    """
+
+    name: ClassVar[str] = "common_mode"
+    kind: str
+    corner: float
+    gain: ComplexOfSensors
+    own: NoiseSpectrum
+    inside: bool
+
+    @classmethod
+    def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
+        shape = chosen_shape(comparison, cls.name, level)
+        if shape is None or not isinstance(shape.term, Common):
+            return None
+        term, unit = shape.term, comparison.info.measure
+        gain = torch.complex(*term.local)
+        reference = gain[gain.abs().argmax()]
+        gain = gain * reference.conj() / reference.abs()
+        sd = shape.sd[0].square().nanmean(0).sqrt()
+        size, told = gain.abs(), term.told(shape.sd_alone)
+        second = float(told.topk(2).values[-1])
+        if second < _LEAST:  # one sensor has nothing in common
+            return None
+        least = min(_SEEN, second)
+        sensors = tuple(i for i in range(len(gain)) if float(told[i]) >= least)
+        parameters = {}
+        for i in sensors:
+            s, d = float(size[i]), float(sd[i])
+            parameters[f"gain[{i}]"] = Parameter(s, max(s - Z * d, 0.0), s + Z * d, unit)
+            if term.turned:
+                turn, reach = math.degrees(float(gain[i].angle())), math.degrees(Z * d / s)
+                parameters[f"phase[{i}]"] = Parameter(turn, turn - reach, turn + reach, "deg")
+        corner = 0.0
+        if term.kind == "ar1":
+            middle, spread = float(term.shared[0]), float(shape.sd[1][0])
+            corner = math.exp(middle)
+            rate = comparison.info.rate
+            parameters["corner"] = spanned(lambda x: math.exp(x) * rate, middle, spread, "Hz")
+        against = [i for i in sensors if float(gain[i].real) < 0]
+        where = comparison.info.named(sensors, "all sensors")
+        sign = f", with the sign reversed in {comparison.info.named(against)}" if against else ""
+        share = ", as a part of the noise that each has" if term.inside else ""
+        return found(
+            comparison,
+            cls(term.kind, corner, gain, deep_base(comparison), term.inside),
+            shape,
+            sensors,
+            parameters,
+            f"{_WORDS[term.kind]} common to {where} that the simulation does not have, up to "
+            f"{float(size.max()):.3g} {unit}{sign}{share}",
+        )
+
+    def density(self, f: Tensor) -> Tensor:
+        return self._source(f)[:, None, None] * (self.gain[:, None] * self.gain.conj())
+
+    def left(self, f: Tensor) -> Tensor:
+        """Factors `(sensor, frequency)` on what each sensor has of its own."""
+        if not self.inside:
+            return torch.ones(len(self.gain), len(f), dtype=torch.float64)
+        f = f.clamp(min=1 / self.own.n_samples)
+        part = self.gain.abs().square()[:, None] * self._source(f) / self.own.spectrum(f)
+        return (1 - part).clamp(min=_REST).sqrt()
+
+    def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
+        own = filtered(signal, self.left) if self.inside else signal
+        return super().apply(own, info, generator)
+
+    def spectra(self, matrices: Tensor, f: Tensor) -> Tensor:
+        left = self.left(f).mT.to(matrices.dtype)
+        return super().spectra(matrices * left[:, :, None] * left[:, None, :], f)
+
+    def path(self, n_samples: int, generator: torch.Generator) -> Tensor:
+        if self.kind == "walk":
+            source = torch.randn(1, n_samples, generator=generator, dtype=torch.float64)
+        else:
+            source = noise(n_samples, self._source, 1, generator)
+        sensors = of_phase(self.gain, source)
+        return sensors.cumsum(-1) if self.kind == "walk" else sensors
+
+    def _source(self, f: Tensor) -> Tensor:
+        return common_density(self.kind, f, torch.tensor([self.corner], dtype=torch.float64))
+
+    def fit_without(self, comparison: Comparison, fold: int) -> Mechanism:
+        shared = torch.tensor([math.log(self.corner)] if self.kind == "ar1" else [], dtype=torch.float64)
+        local = torch.stack([self.gain.real, self.gain.imag])
+        free = (self.gain != 0).expand_as(local).clone()
+        free[1] &= bool(self.gain.imag.any())
+        whole = None
+        if self.inside:
+            f = comparison.bands.frequency
+            whole = (self.own.spectrum(f) / self._source(f)).amin(-1).sqrt()
+        term = refit(comparison, fold, Common(local, free, shared, self.kind, self.inside, whole), self.company)
+        corner = math.exp(float(term.shared[0])) if self.kind == "ar1" else 0.0
+        return replace(self, gain=torch.complex(*term.local), corner=corner)

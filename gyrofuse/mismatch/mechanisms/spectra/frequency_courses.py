@@ -1,0 +1,168 @@
+"""A tone that wanders, or Gaussian noise of the same spectrum: mean likelihood ratios over the courses of either.
+
+In a band of frequencies around a bump, a tone of amplitude `A` in noise of variance one per sample gives windows of
+`L` samples, transformed at twice as many frequencies, powers `P` with the likelihood ratio
+
+    exp(-rho) I_0(2 sqrt(rho P)),   rho = A^2 L,
+
+over noise alone, whatever its phase (Rice); from window to window its frequency moves as a hidden Markov chain does.
+Gaussian noise has a hump, Lorentzian or normal, on a level, and Whittle's likelihood. Each is averaged over windows,
+strengths and speeds, or centres, widths and heights.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gyrofuse._base.transforms import squared_modulus
+from gyrofuse.mismatch.detectors.spectra.peak_fit import Oscillation
+from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.signals.derived import derived
+
+_REACH, _FEWEST = 8.0, 256  # half widths on either side, and bins
+_SHORTEST, _LONGEST, _WINDOWS = 4, 128, 4  # samples of a window, and fewest windows
+_STRENGTHS = (0.25, 0.4, 0.6, 1.0, 1.5)  # of the likeliest hump's energy
+_SPEEDS = (0.5, 1.5, 4.0)  # steps from window to window, in half their resolution
+_WIDTHS, _NARROWEST, _WIDEST = 10, 2.0, 0.125  # cells, and share of the band
+_MOST_CELLS = 4096  # of a band, in which humps are looked for
+_NO_TAILS = 0.2  # of the power of a Lorentzian of like width and height, that a course without far tails lacks
+_OFF = 0.12  # share of the band by which centres are off
+_CENTRES, _HEIGHTS = 9, (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 12.8, 25.0, 50.0, 100.0)
+
+
+def weights_in_phase(comparison: Comparison, peak: Oscillation) -> Tensor:
+    """Complex weights `(sensor,)` that sum the sensors in phase, by their noise; the clearest where they have none."""
+    noise = comparison.base.spectrum(torch.tensor([peak.centre], dtype=torch.float64))[:, 0]
+    if peak.gain is not None:
+        return peak.gain.conj() / noise
+    weights = torch.zeros_like(noise).to(torch.complex128)
+    weights[int((peak.variance / noise).argmax())] = 1.0
+    return weights
+
+
+def wandering_log_ratio(comparison: Comparison, peak: Oscillation, weights: Tensor) -> float:
+    """Log likelihood of a tone over that of Gaussian noise, in the sensors' weighted sum around a bump."""
+    bins = _band(comparison, peak, weights)
+    if len(bins) < _FEWEST:
+        return 0.0
+    power = squared_modulus(bins)
+    hump = _hump(power)
+    tone = _tone(bins / math.sqrt(hump.level), hump.energy)
+    noise = -len(bins) * math.log(hump.level) - float(power.sum()) / hump.level
+    return tone + noise - hump.log_mean
+
+
+def share_of_lorentzian(comparison: Comparison, peak: Oscillation) -> float:
+    """Power of a hump over that of the Lorentzian that was fitted to it.
+
+    A course of frequencies that keeps near its middle has no far tails.
+    """
+    bins = _band(comparison, peak, weights_in_phase(comparison, peak))
+    normal = _hump(squared_modulus(bins)).normal if len(bins) >= _FEWEST else 0.5
+    return 1 - _NO_TAILS * normal
+
+
+@derived
+def rampless_transform(comparison: Comparison) -> Tensor:
+    """Transform `(sensor, bin)` of the recording whose ends are made to meet."""
+    ramp = torch.linspace(0, 1, comparison.n_samples, dtype=torch.float64)
+    return torch.fft.rfft(comparison.recording - (comparison.recording[:, -1:] - comparison.recording[:, :1]) * ramp)
+
+
+def _band(comparison: Comparison, peak: Oscillation, weights: Tensor) -> Tensor:
+    """Bins `(bin,)` of the sum in units of its noise."""
+    n = comparison.n_samples
+    centre, reach = round(peak.centre * n), max(round(_REACH * peak.width * n), _FEWEST)
+    reach = min(reach, centre - 3, n // 2 - centre - 2)
+    reach -= reach % _cell(2 * reach)
+    inside = slice(centre - reach, centre + reach)
+    f = torch.arange(inside.start, inside.stop, dtype=torch.float64) / n
+    noise = weights.abs().square() @ comparison.base.spectrum(f) * n
+    return (weights @ rampless_transform(comparison)[:, inside]) / noise.sqrt()
+
+
+class Hump(NamedTuple):
+    """A hump on a level.
+
+    Attributes:
+        log_mean: Mean log likelihood of Gaussian humps.
+        level, energy: Of the likeliest, the energy in units of the level.
+        normal: Probability that it has the shape of a normal law, not a Lorentzian one.
+    """
+
+    log_mean: float
+    level: float
+    energy: float
+    normal: float
+
+
+def _cell(n_bins: int) -> int:
+    """Bins in a cell, a power of two: half of a band may be a whole number of cells, and is one of shorter cells."""
+    return 1 << max((max(n_bins, 1) - 1) // _MOST_CELLS, 0).bit_length()
+
+
+def _hump(power: Tensor) -> Hump:
+    """Humps of powers `(bin,)`, a whole number of cells, over which a hump is taken for level."""
+    cell = _cell(len(power))
+    power = power.unflatten(0, (-1, cell)).mean(-1)
+    n = len(power)
+    k = torch.arange(n, dtype=torch.float64) - (n - 1) / 2
+    widths = torch.logspace(math.log10(_NARROWEST), math.log10(_WIDEST * n), _WIDTHS, dtype=torch.float64)
+    height = torch.tensor(_HEIGHTS, dtype=torch.float64)[:, None, None]
+    values: tuple[list[Tensor], list[Tensor]] = ([], [])  # Lorentzian, normal
+    best = (-math.inf, 1.0, 0.0)
+    for centre in torch.linspace(-_OFF * n, _OFF * n, _CENTRES).tolist():
+        square = ((k - centre) / widths[:, None]).square()
+        for of_shape, shape in zip(values, (1 / (1 + square), (-square / 2).exp()), strict=True):
+            spectrum = 1 + height * shape  # (height, width, bin)
+            level = (power / spectrum).mean(-1)
+            value = -cell * (n * (level.log() + 1) + spectrum.log().sum(-1))
+            of_shape.append(value.flatten())
+            at = int(value.argmax())
+            if float(value.max()) > best[0]:
+                energy = cell * (height * shape).sum(-1)
+                best = float(value.max()), float(level.flatten()[at]), float(energy.flatten()[at])
+    total = torch.stack([torch.cat(of_shape).logsumexp(0) for of_shape in values])
+    count = sum(len(part) for of_shape in values for part in of_shape)
+    log_mean = float(total.logsumexp(0)) - math.log(count)
+    return Hump(log_mean, best[1], best[2], float(total.softmax(0)[1]))
+
+
+def _tone(bins: Tensor, energy: float) -> float:
+    """Mean log likelihood ratio of tones over noise of one in each bin."""
+    n = len(bins)
+    z = torch.fft.ifft(torch.fft.ifftshift(bins)) * math.sqrt(n)
+    found, length = [], _SHORTEST
+    while length <= min(n // _WINDOWS, _LONGEST):
+        windows = z[: n // length * length].unflatten(-1, (-1, length))
+        power = squared_modulus(torch.fft.fft(windows, n=2 * length)) / length  # (window, frequency), in circular order
+        found.append(_courses(power, energy / len(power)))
+        length *= 2
+    every = torch.cat(found)
+    return float(every.logsumexp(0)) - math.log(len(every))
+
+
+def _courses(power: Tensor, energy: float) -> Tensor:
+    """Log likelihood ratios `(strength * speed,)` over all courses of the frequency through windows."""
+    n = power.shape[-1]
+    power = torch.fft.fftshift(power, dim=-1)
+    rho = energy * torch.tensor(_STRENGTHS, dtype=torch.float64)[:, None, None, None]
+    x = 2 * (rho * power[:, None]).sqrt()
+    log_ratio = torch.special.i0e(x).log() + x - rho  # (strength, window, 1, frequency)
+    peak = log_ratio.amax(-1, keepdim=True)
+    ratio = (log_ratio - peak).exp()
+    apart = (torch.arange(n)[:, None] - torch.arange(n)).abs().to(torch.float64)
+    chain = (-apart / torch.tensor(_SPEEDS, dtype=torch.float64)[:, None, None]).exp()
+    chain = chain / chain.sum(-1, keepdim=True)
+    state = torch.full((len(_STRENGTHS), len(_SPEEDS), n), 1 / n, dtype=torch.float64)
+    total = peak.sum((1, 2, 3))[:, None].expand(-1, len(_SPEEDS))
+    for window in range(len(power)):
+        here = state * ratio[:, window]
+        size = here.sum(-1, keepdim=True)
+        total = total + size[..., 0].log()
+        state = ((here / size).movedim(1, 0) @ chain).movedim(0, 1)
+    return total.flatten()

@@ -1,0 +1,89 @@
+"""A sensor's own low-pass filter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.likelihoods.components import LowPass
+from gyrofuse.mismatch.likelihoods.filter_forms import filter_corner, filter_number, filter_response, strength_of
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.spectra.findings import found
+from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape, refit
+from gyrofuse.mismatch.mechanisms.spectra.spectral import Filter
+from gyrofuse.mismatch.signals.axes import OfSensors
+from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.stats.limits import Z
+
+
+@dataclass(frozen=True, eq=False)
+class LowPassFilter(Filter):
+    """`S_i -> |H_i(f)|^2 S_i`: poles, Butterworth and Bessel filters, means over samples, FIR filters.
+
+    It multiplies all there is, walks and tones too; the deficit sits in the first levels and grows towards the highest
+    frequency. Lower white noise alone would lower all frequencies above the corner alike.
+
+    Attributes:
+        kind: Form of the filter.
+        strength: Of each sensor's, `(sensor,)`; 0 is none.
+    """
+
+    name: ClassVar[str] = "low_pass"
+    kind: str
+    strength: OfSensors
+
+    @classmethod
+    def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
+        shape = chosen_shape(comparison, cls.name, level)
+        if shape is None or not isinstance(shape.term, LowPass):
+            return None
+        term, rate = shape.term, comparison.info.rate
+        strength = strengths(term)
+        sensors = tuple(int(i) for i in term.free[0].nonzero()[:, 0])
+        # Which form it has is not known either; digital ones need not halve the power at all.
+        forms = [_limits(form, sd[0][0]) * rate for form, sd in ((term, shape.sd), *shape.forms)]
+        forms = [limits for limits in forms if bool(limits[1, list(sensors)].isfinite().all())] or forms
+        corner, lowest, highest = forms[0][1], torch.stack(forms)[:, 0].amin(0), torch.stack(forms)[:, 2].amax(0)
+        parameters = {}
+        for i in sensors:
+            if float(corner[i]) <= rate / 2:  # what lies above is guessed by the form alone
+                parameters[f"corner[{i}]"] = Parameter(float(corner[i]), float(lowest[i]), float(highest[i]), "Hz")
+        where = comparison.info.named(sensors, "all sensors")
+        inside = [float(corner[i]) for i in sensors if float(corner[i]) <= rate / 2]
+        corners = f"half power at {min(inside):.4g} Hz" if inside else "half power above half the sampling rate"
+        if inside and max(inside) > 1.02 * min(inside):
+            corners = f"half power between {min(inside):.4g} and {max(inside):.4g} Hz"
+        return found(
+            comparison,
+            cls(term.kind, strength),
+            shape,
+            sensors,
+            parameters,
+            f"a low-pass filter in {where} that the simulation does not have, {corners}",
+            frequency_hz=min(inside) if inside else None,
+        )
+
+    def response(self, f: Tensor) -> Tensor:
+        return filter_response(self.kind, self.strength, f)
+
+    def fit_without(self, comparison: Comparison, fold: int) -> Mechanism:
+        has = self.strength > 0
+        own = torch.where(has, filter_number(self.kind, self.strength), 0.0)[None]
+        term = LowPass(own, has[None], torch.zeros(0, dtype=torch.float64), self.kind)
+        found = refit(comparison, fold, term, self.company)
+        assert isinstance(found, LowPass)
+        return replace(self, strength=strengths(found))
+
+
+def strengths(term: LowPass) -> Tensor:
+    """Of each sensor's filter, 0 for none, `(sensor,)`."""
+    return torch.where(term.free[0], strength_of(term.kind, term.local[0]), 0.0)
+
+
+def _limits(term: LowPass, sd: Tensor) -> Tensor:
+    """Lowest, best and highest corners, cycles per sample, `(3, sensor)`."""
+    steps = torch.tensor([-Z, 0.0, Z], dtype=torch.float64)[:, None]
+    return filter_corner(term.kind, strength_of(term.kind, term.local[0] + steps * sd.nan_to_num(nan=0.0)))

@@ -1,0 +1,125 @@
+"""Noise of the kinds that a base has, with other numbers: of one that the simulation shows none of as well."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Set
+from dataclasses import dataclass, replace
+from typing import Annotated, ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.detectors.spectra.power_differs import power_differs
+from gyrofuse.mismatch.likelihoods.band_powers import deep_base
+from gyrofuse.mismatch.likelihoods.components import Shift
+from gyrofuse.mismatch.likelihoods.reference_spectrum import Parts
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
+from gyrofuse.mismatch.mechanisms.spectra.findings import found, spanned
+from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape, refit
+from gyrofuse.mismatch.mechanisms.spectra.spectral import Filter
+from gyrofuse.mismatch.signals.axes import Axes
+from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
+from gyrofuse.mismatch.stats.limits import Z
+
+_PARTS = ("white", "ar1", "corner", "random_walk")
+_WORDS = ("white noise", "AR1 noise", "AR1 corner frequency", "random walk")
+
+
+@dataclass(frozen=True, eq=False)
+class ParameterShift(Filter):
+    """`S_i = a_i W_i(f) + b_i A_i(f / c_i) + d_i R_i(f)`: the simulation's noise with other numbers.
+
+    Every band of a sensor's spectrum changes smoothly between levels that its own noise has. A filter turns spectra
+    down near the highest frequency alone, more than any level of white noise can follow; what is added keeps apart by
+    its own shape. Where records are short, a changed level and a weak filter are alike. The factor of a part that the
+    simulation shows none of is over what it would not show, and the sentence says "none".
+
+    Attributes:
+        base: Noise that the numbers apply to.
+        log_factors: Logarithms of `a`, `b`, `c`, `d`, `(4, sensor)`; levels are powers.
+    """
+
+    name: ClassVar[str] = "parameter_shift"
+    base: NoiseSpectrum
+    log_factors: Annotated[Tensor, Axes(("part", "sensor"))]
+
+    @classmethod
+    def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
+        shape = chosen_shape(comparison, cls.name, level) if power_differs(comparison, level) else None
+        if shape is None:
+            return None
+        parameters, words, lacking = {}, [], set()
+        base = deep_base(comparison)
+        before, least = _numbers(base, comparison.info.rate, comparison.info.measure)
+        for i in range(comparison.n_sensors):
+            for k, name in enumerate(_PARTS):
+                sd = float(shape.sd[0][k, i])
+                if math.isnan(sd):
+                    continue
+                value = float(shape.term.local[k, i])
+                low, high = value - Z * sd, value + Z * sd
+                number, unit = before[k][i]
+                if number:  # else the simulation does not show how much it has
+                    parameters[f"{name}_factor[{i}]"] = spanned(math.exp, value, sd, "")  # of variances
+                elif name == "corner":
+                    parameters[f"{name}[{i}]"] = spanned(math.exp, value + math.log(least[k][i]), sd, unit)
+                if low > 0 or high < 0:
+                    factor = math.exp(value if name == "corner" else value / 2)  # in standard deviations
+                    if name == "ar1":  # of one plateau, a faster one has more variance
+                        factor *= math.exp(float(shape.term.local[2, i]) / 2)
+                    before_it = f"{number:.3g}" if number else "none"
+                    if not number and name != "corner":
+                        lacking.add(_WORDS[k])
+                    after = f"{(number or least[k][i]) * factor:.3g} {unit}"
+                    words.append(f"{_WORDS[k]} of sensor {comparison.info.sensors[i]} {before_it} -> {after}")
+        sensors = tuple(int(i) for i in shape.term.free.any(0).nonzero()[:, 0])
+        return found(
+            comparison,
+            cls(base, shape.term.local),
+            shape,
+            sensors,
+            parameters,
+            f"{_said_of(lacking)}: {'; '.join(words) or 'levels differ slightly'}",
+        )
+
+    def response(self, f: Tensor) -> Tensor:
+        parts = Parts(self.base, f.clamp(min=0.5 / self.base.n_samples))
+        return (parts.shifted(self.log_factors) / parts.densities.sum(0)).sqrt()
+
+    def fit_without(self, comparison: Comparison, fold: int) -> Mechanism:
+        term = Shift(self.log_factors, self.log_factors != 0, torch.zeros(0, dtype=torch.float64))
+        return replace(self, log_factors=refit(comparison, fold, term, self.company).local)
+
+
+def _said_of(lacking: Set[str]) -> str:
+    """Whether all kinds of noise that the recording has show in the simulation."""
+    if not lacking:
+        return "the physics is complete, the numbers were wrong"
+    return f"the simulation shows no {' and no '.join(sorted(lacking))} where the recording does"
+
+
+def _numbers(base: NoiseSpectrum, rate: float, unit: str) -> tuple[list[list[tuple[float, str]]], list[list[float]]]:
+    """Numbers of the parts before, each sensor's with its unit: sds of a sample, corner in Hz, sd of an increment.
+
+    Parts that are not seen have zeros; the numbers that stand for them come last, of every part.
+    """
+    f = torch.tensor([1 / base.n_samples], dtype=torch.float64)
+    parts = Parts(base, f)
+    white = (parts.densities[0][:, 0] + parts.unseen_white).sqrt()
+    variance, corner = parts.moments()
+    slower, plateau = parts.unseen_ar1[0], parts.unseen_ar1[1][:, 0]
+    lacks_white, lacks_ar1, lacks_walk = parts.lacks
+    phi = math.exp(-slower)
+    least_rms = (plateau * (1 - phi) / (1 + phi)).sqrt()
+    least_corner = torch.full_like(plateau, rate * slower / (2 * math.pi))
+    walk = parts.growing_walk.sqrt()
+    columns = (
+        (torch.where(lacks_white, 0.0, white), f"{unit} per sample"),
+        (torch.where(lacks_ar1, 0.0, variance.sqrt()), f"{unit} rms"),
+        (torch.where(lacks_ar1, 0.0, corner * rate), "Hz"),
+        (torch.where(lacks_walk, 0.0, walk), f"{unit} per step"),
+    )
+    numbers = [[(float(x), words) for x in column] for column, words in columns]
+    return numbers, [x.tolist() for x in (white, least_rms, least_corner, walk)]

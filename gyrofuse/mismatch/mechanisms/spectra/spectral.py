@@ -1,0 +1,87 @@
+"""Mechanisms that are a matter of spectra alone: filters, and Gaussian noise added. Both go into the simulation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.likelihoods.band_powers import deep_base, slow_gains
+from gyrofuse.mismatch.likelihoods.spectral import FLOOR
+from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.filters import filtered
+from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
+
+
+@dataclass(frozen=True, eq=False)
+class Spectral(Mechanism):
+    """What is judged by blocks and, where they are too short, by the slowest ordinates of the whole record.
+
+    Attributes:
+        company: Shapes in whose company its numbers were found, and are estimated anew: by itself it would have to
+            stand for them as well. No part of what is saved.
+        approximate: Whether its form is not quite that of the recording. No part of what is saved.
+    """
+
+    changes_noise: ClassVar[bool] = True
+    company: tuple[Any, ...] = field(default=(), kw_only=True, metadata={"saved": False})
+    approximate: bool = field(default=False, kw_only=True, metadata={"saved": False})
+
+    def factor(self, base: NoiseSpectrum, f: Tensor) -> Tensor:
+        """What it makes of the powers of a simulation's noise, `(sensor, frequency)` at `f` cycles per sample."""
+        raise NotImplementedError
+
+    def apply_to_reference(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
+        built = super().apply_to_reference(comparison, generator)
+        return (
+            replace(built, bent=(*built.bent, partial(self.factor, deep_base(comparison))))
+            if self.approximate
+            else built
+        )
+
+    def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
+        return super().held_out_scores(comparison, fold) + slow_gains(comparison, self.spectra, fold)
+
+
+class Filter(Spectral):
+    """A linear filter of each sensor; recordings have a floor below it, of what leaks and of what is rounded."""
+
+    def response(self, f: Tensor) -> Tensor:
+        """Complex gains `(sensor, frequency)` at `f` cycles per sample."""
+        raise NotImplementedError
+
+    def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
+        return filtered(signal, self.response)
+
+    def factor(self, base: NoiseSpectrum, f: Tensor) -> Tensor:
+        return self.response(f).abs().square()
+
+    def spectra(self, matrices: Tensor, f: Tensor) -> Tensor:
+        gain = self.response(f).mT.to(matrices.dtype)  # (frequency, sensor)
+        return matrices * (gain[:, :, None] * gain[:, None, :].conj() + FLOOR * torch.eye(gain.shape[-1]))
+
+
+class Addition(Spectral):
+    """Gaussian noise on top."""
+
+    def density(self, f: Tensor) -> Tensor:
+        """Cross-spectral densities `(frequency, sensor, sensor)` at `f` cycles per sample."""
+        raise NotImplementedError
+
+    def factor(self, base: NoiseSpectrum, f: Tensor) -> Tensor:
+        return 1 + self.density(f).diagonal(dim1=-2, dim2=-1).real.mT / base.spectrum(f)
+
+    def path(self, n_samples: int, generator: torch.Generator) -> Tensor:
+        """One record of it, `(sensor, time)`."""
+        raise NotImplementedError
+
+    def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
+        records = signal.flatten(0, -3) if signal.ndim > 2 else signal[None]
+        return torch.stack([r + self.path(r.shape[-1], generator) for r in records]).view_as(signal)
+
+    def spectra(self, matrices: Tensor, f: Tensor) -> Tensor:
+        return matrices + self.density(f).to(matrices.dtype)

@@ -1,0 +1,133 @@
+"""A tone whose frequency wanders: a rotor that is not held to its speed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
+from gyrofuse.mismatch.mechanisms.spectra.frequency_courses import share_of_lorentzian
+from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode, nominated, refitted_mode
+from gyrofuse.mismatch.mechanisms.spectra.spectral import Addition
+from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.noise.processes.ar1_recursion import ar1_recursion
+
+_SHORT = 0.05  # cycles of the width in which a phase that diffuses forgets its frequency
+_LONG = 8.0
+_REACH = 10.0  # half widths of the band that is cleaned
+_FLANK, _FEWEST = 0.6, 64  # of the reach to either side, and bins, that tell the noise beside
+_STEP = 16  # bins
+_FAINT = 0.03  # of the largest gain
+_SPREAD, _SEEN = math.pi / math.sqrt(6), 2.0  # sd of the logarithm of an exponential variable, and how many are seen
+_EULER = 0.5772156649015329  # by which the mean logarithm of an exponential variable is below that of its mean
+
+
+@dataclass(frozen=True, eq=False)
+class DriftingTone(Addition):
+    """`x_i(t) = a_i cos(phi(t) + theta_i)` with `phi' = 2 pi (f_0 + u(t))` and a wandering `u`, an AR1.
+
+    Its line is wider than the record's resolution, yet it has one frequency at a time and a steady amplitude: windows
+    that are short against its wander show a peak, and where it wanders too fast for that its squared envelope still
+    varies less than that of Gaussian noise.
+
+    Attributes:
+        mode: Centre, half width, and gains: complex, those of a Lorentzian.
+        slow: Whether short windows show its frequency.
+        share: Its power over that of the Lorentzian, whose far tails it need not have.
+    """
+
+    name: ClassVar[str] = "drifting_tone"
+    taken_off: ClassVar[bool] = True
+    mode: Mode
+    slow: bool
+    share: float = 1.0
+
+    @classmethod
+    def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
+        seen = nominated(comparison, level, tone=True)
+        if seen is None:
+            return None
+        mode, finding = seen
+        rate, share = comparison.info.rate, share_of_lorentzian(comparison, finding.peak)
+        factor = math.sqrt(2 * share)
+        return finding.of(
+            cls(mode, finding.slow, share),
+            f"a tone near {mode.centre * rate:.4g} Hz whose frequency wanders by about {mode.width * rate:.2g} Hz, in "
+            f"{finding.where}, of amplitude up to {factor * float(mode.gain.abs().max()):.3g} "
+            f"{comparison.info.measure}, that the simulation does not have",
+            amplitude="amplitude",
+            factor=factor,
+        )
+
+    def density(self, f: Tensor) -> Tensor:
+        return self.mode.matrix() * self.mode.profile(f, 2 * float(f[1] - f[0]))[:, None, None]
+
+    def path(self, n_samples: int, generator: torch.Generator) -> Tensor:
+        width = self.mode.width
+        memory = (_LONG if self.slow else _SHORT) / (2 * math.pi * width)  # samples
+        phi = math.exp(-1 / memory)
+        # A phase that diffuses as fast as a Lorentzian of that half width has it.
+        spread = width if self.slow else math.sqrt(width / math.pi * (1 - phi) / (1 + phi))
+        steps = torch.randn(n_samples, generator=generator, dtype=torch.float64) * spread
+        steps[1:] *= math.sqrt(1 - phi**2)
+        turn = 2 * math.pi * torch.rand((), generator=generator, dtype=torch.float64)
+        phase = 2 * math.pi * (self.mode.centre + _wandered(steps, phi)).cumsum(0) + turn
+        angle = self.mode.gain.angle()[:, None] + phase
+        return math.sqrt(2 * self.share) * self.mode.gain.abs()[:, None] * angle.cos()
+
+    def repair(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
+        """Its band is filled with the noise around it: another path of its own would differ from the recorded one."""
+        signal, n = comparison.recording, comparison.n_samples
+        ramp = torch.linspace(0, 1, n, dtype=torch.float64) * (signal[:, -1:] - signal[:, :1])
+        transform = torch.fft.rfft(signal - ramp)
+        bins = torch.arange(n // 2 + 1)
+        density = comparison.base.spectrum(bins.clamp(min=1) / n)
+        size = self.mode.gain.abs()
+        concerned = size > _FAINT * size.amax()  # the others stay as they are
+        power = transform.abs().square() / density
+        first, last = self._band(power[concerned], n)
+        middle = round(self.mode.centre * n)
+        below, above = (max(round(_FLANK * reach), _FEWEST) for reach in (middle - first, last - middle))
+        # An octave below at most: what is slower leaks into the slowest ordinates, and is many times the noise there.
+        beside = ((bins >= max(first - below, first // 2)) & (bins < first)) | ((bins > last) & (bins <= last + above))
+        beside &= bins > 0
+        # By the mean logarithm of exponential ordinates: a few that hold more would lift a mean, and all of the band.
+        level = (power[:, beside].clamp(min=1e-300).log().mean(-1, keepdim=True) + _EULER).exp()
+        parts = torch.randn(2, len(signal), last - first + 1, generator=generator, dtype=torch.float64)
+        fresh = torch.complex(parts[0], parts[1]) / math.sqrt(2)
+        filled = fresh * (level * density[:, first : last + 1]).sqrt()
+        transform[concerned, first : last + 1] = filled[concerned]
+        cleaned = torch.fft.irfft(transform, n=n) + ramp
+        return comparison.with_recording(torch.where(concerned[:, None], cleaned, signal))
+
+    def _band(self, power: Tensor, n_samples: int) -> tuple[int, int]:
+        """First and last bin that are cleaned, of powers `(sensor, bin)` in units of the simulation's noise.
+
+        A strong line is seen far beyond the widths of its middle, and none knows how its flanks fall: either end goes
+        on while there is more next to it than farther off, beyond chance.
+        """
+        logs = power.clamp(min=1e-300).log().mean(0)
+        middle, ends = round(self.mode.centre * n_samples), []
+        for side in (logs[1:middle].flip(0), logs[middle + 1 : n_samples // 2]):  # from the centre outwards
+            end = min(max(round(_REACH * self.mode.width * n_samples), 0), len(side))
+            while True:
+                step, far = (max(round(_FLANK * end), least) for least in (_STEP, _FEWEST))
+                near, beyond = side[end : end + step], side[end + step : end + step + far]
+                chance = _SPREAD * math.sqrt(1 / step + 1 / far)
+                if len(beyond) < far or float(near.mean() - beyond.mean()) < _SEEN * chance:
+                    break
+                end += step
+            ends.append(end)
+        return max(middle - ends[0], 1), min(middle + ends[1], n_samples // 2 - 1)
+
+    def fit_without(self, comparison: Comparison, fold: int) -> Mechanism:
+        return replace(self, mode=refitted_mode(comparison, fold, self.mode))
+
+
+def _wandered(steps: Tensor, phi: float) -> Tensor:
+    """AR1 path `(time,)` of its steps, the first one stationary."""
+    return ar1_recursion(steps[None], torch.tensor([phi], dtype=steps.dtype))[0]

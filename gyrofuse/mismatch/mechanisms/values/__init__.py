@@ -1,0 +1,1 @@
+"""What a converter does to values."""

@@ -1,0 +1,242 @@
+"""Rounding of the rate to whole steps: a converter that the simulator left out, or that of the simulation itself."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.detectors.values.quantisation_grid import (
+    Lattice,
+    exact_lattices,
+    innovation_sd,
+    missing_lattices,
+    off_lattice,
+)
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
+from gyrofuse.mismatch.signals.axes import OfSensors
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
+from gyrofuse.mismatch.signals.lines import whitened
+from gyrofuse.mismatch.stats.limits import Z
+
+_TABLE = 1024  # points of a law
+_EVEN = 3.0  # steps, sd: over more of them all distances from the lattice are as likely
+_TAILS = 6.0  # sd
+_TOO_COARSE = 0.75  # rms change between samples, steps: noise of 0.45 steps and the rounding itself
+_UNDONE = 1.25  # sd of a sample given its past: a step's largest at which what was rounded can be told
+_STEEPEST, _FLAT = 8.0, 1e-4  # slopes of a logarithm of density over a step
+_RIDGE = 1e-3  # of correlations
+_SHARPEST = 0.02  # blur in steps: what an exact lattice is worth is bounded by it
+
+
+@dataclass(frozen=True, eq=False)
+class Quantization(Mechanism):
+    """`y = offset + step round((x - offset)/step)`: an exact lattice of values, or one blurred by what came after.
+
+    Looks like white noise of variance `step^2/12`; the values on their lattice tell them apart. Noise added after the
+    rounding is no part of it.
+
+    Attributes:
+        step: `(sensor,)`, unit of the signal; 0 where a sensor is not rounded.
+        offset: `(sensor,)`, likewise: the lattice's point next to 0.
+        blur: `(sensor,)`, sd of what was added after the rounding, steps.
+        centre: Mean of what was rounded, `(sensor,)`, unit of the signal: where it lies between two steps makes what a
+            few of them do to noise. A hidden lattice lies as far from the mean of a simulation, whose bias is its own.
+    """
+
+    name: ClassVar[str] = "quantization"
+    place: ClassVar[int] = 2
+    step: OfSensors
+    offset: OfSensors
+    blur: OfSensors
+    centre: OfSensors
+
+    @classmethod
+    def of_simulation(cls, comparison: Comparison) -> Quantization | None:
+        """The exact lattices of a simulation's values, those fine enough to be undone; None without."""
+        side = comparison.reference
+        fine = [
+            own if own is not None and own.step < _UNDONE * float(sd) else None
+            for own, sd in zip(exact_lattices(side), innovation_sd(side), strict=True)
+        ]
+        if not any(fine):
+            return None
+        rows = [(0.0, 0.0) if own is None else (own.step, own.offset) for own in fine]
+        step, offset = torch.tensor(rows, dtype=torch.float64).mT
+        return cls(step, offset, torch.zeros_like(step), side.signal.mean((0, -1)))
+
+    def undone(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
+        """The case of a simulation that was rounded so: what is built in from now on comes before that.
+
+        What was rounded may have been anywhere within half a step. There the noise's density, a normal one given all
+        other samples, is close to exponential, with the slope of its logarithm at the rounded value.
+        """
+        side = comparison.reference
+        white = whitened(side.noise, comparison.base)
+        covariance = (white @ white.mT).mean(0) / white.shape[-1]  # of sensors that share noise
+        slope = -self._divisor * whitened(
+            torch.linalg.solve(_correlation(covariance), white), comparison.base
+        )  # per step
+        slope = slope.clamp(-_STEEPEST, _STEEPEST)
+        slope = torch.where(slope.abs() < _FLAT, _FLAT, slope)
+        share = torch.rand(slope.shape, dtype=slope.dtype, generator=generator)
+        within = torch.log1p(share * torch.expm1(slope)) / slope - 0.5
+        again: Callable[[Tensor], Tensor] = partial(self.apply, info=comparison.info, generator=generator)
+        converter = (*comparison.converter, (self.place, again))
+        return replace(comparison, analog=side.signal + self.step[:, None] * within, converter=converter)
+
+    def in_unit(self, factor: float) -> Quantization:
+        """The same of numbers that are a factor larger."""
+        return replace(self, step=factor * self.step, offset=factor * self.offset, centre=factor * self.centre)
+
+    @classmethod
+    def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
+        # A value that recurs lies on lattices of many steps, which would all be taken for hidden ones.
+        band = DeadBand.detect_and_fit(comparison, level)
+        if band is not None:
+            return band
+        p_value, found = missing_lattices(comparison, level)
+        if not found:
+            return None
+        none = Lattice(0.0, 0.0, 0.0, 1.0)
+        rows = [found.get(i, none) for i in range(comparison.n_sensors)]
+        step, offset, blur = (torch.tensor([row[k] for row in rows], dtype=torch.float64) for k in range(3))
+        effect = cls(step, offset, blur, comparison.recording.mean(-1))._placed(comparison.recording)
+        sensors = tuple(found)
+        parameters = {}
+        for i in sensors:
+            value = float(step[i])
+            reach = Z * effect._step_sd(i, comparison.recording[i])
+            parameters[f"lsb[{i}]"] = Parameter(value, value - reach, value + reach, comparison.info.measure)
+        where = comparison.info.named(sensors, "all sensors")
+        steps = f"{_several(step[list(sensors)])} {comparison.info.measure}"
+        hidden = ", hidden under what was added later" if float(blur.max()) > 0 else ""
+        coarse = _too_coarse(comparison.recording, found)
+        if coarse:
+            hidden += (
+                f"; the noise of {comparison.info.named(coarse)} is so much smaller that nothing else can be told there"
+            )
+        return Finding(
+            cls.name,
+            effect,
+            f"the rate is rounded to steps of {steps} in {where}{hidden}",
+            p_value,
+            sensors,
+            parameters,
+            levels=(1,),
+            gain=float(effect._scores(comparison.recording).sum()),
+            hides=tuple(coarse),
+        )
+
+    def fit_without(self, comparison: Comparison, fold: int) -> Quantization:
+        return self._placed(comparison.recording[:, estimation_samples(comparison.n_samples, fold)])
+
+    def _placed(self, signal: Tensor) -> Quantization:
+        """With offset and blur of samples `(sensor, time)`, for the steps as they are."""
+        turn = torch.exp(2j * math.pi * off_lattice(signal, self._divisor, self.offset[:, None])).mean(-1)
+        offset = self.offset + turn.angle() / (2 * math.pi) * self.step
+        blur = torch.sqrt(-2 * turn.abs().clamp(1e-6, 1.0).log()) / (2 * math.pi)
+        return replace(self, offset=offset, blur=torch.where(self.blur > 0, blur, self.blur))
+
+    def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
+        """Values get the law that they have in the recording, in the order in which they are.
+
+        Without blur that is rounding. Hidden under noise that the simulation knows already, it adds next to nothing.
+        """
+        own = signal.mean(-1, keepdim=True) - self.centre[:, None]
+        offset = self.offset[:, None] + torch.where(self.blur[:, None] > 0, own, 0.0)
+        place = ((signal - offset) / self._divisor).movedim(-2, 0)
+        moved = torch.stack([_blurred(row, float(blur)) for row, blur in zip(place, self.blur, strict=True)], -2)
+        return torch.where(self.step[:, None] > 0, moved * self._divisor + offset, signal)
+
+    def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
+        return held_out_blocks(self._scores(comparison.recording), fold).sum((0, -1))
+
+    @property
+    def _divisor(self) -> Tensor:
+        return torch.where(self.step > 0, self.step, 1.0)[:, None]
+
+    def _scores(self, signal: Tensor) -> Tensor:
+        """Log density of the distances from the lattice against an even one, `(sensor, time)`: a wrapped normal's."""
+        place = off_lattice(signal, self._divisor, self.offset[:, None])
+        blur = self.blur.clamp(min=_SHARPEST)[:, None]
+        return torch.where(self.step[:, None] > 0, _wrapped_normal(place, blur).clamp(min=1e-12).log(), 0.0)
+
+    def _step_sd(self, sensor: int, signal: Tensor) -> float:
+        """From the information of each distance on the lattice, as values spread over many steps."""
+        r = (torch.arange(2048, dtype=torch.float64) + 0.5) / 2048 - 0.5
+        density = _wrapped_normal(r, self.blur[sensor].clamp(min=1e-3))
+        slope = density.roll(-1) - density.roll(1)
+        information = float((slope.square() / density.clamp(min=1e-12)).mean()) * 1024**2
+        spread = float((signal / self.step[sensor]).std())
+        return float(self.step[sensor]) / math.sqrt(max(information * len(signal) * spread**2, 1e-300))
+
+
+def _correlation(covariance: Tensor) -> Tensor:
+    """Of a covariance, with a ridge where sensors are copies of each other."""
+    size = covariance.diagonal().rsqrt()
+    return covariance * size[:, None] * size + _RIDGE * torch.eye(len(size), dtype=size.dtype)
+
+
+def _too_coarse(signal: Tensor, found: dict[int, Lattice]) -> list[int]:
+    """Sensors `(sensor, time)` whose values hardly leave one step of an exact lattice from one sample to the next."""
+    change = signal.diff().square().mean(-1).sqrt()
+    return [i for i, own in found.items() if not own.blur and float(change[i]) < _TOO_COARSE * own.step]
+
+
+def _blurred(place: Tensor, blur: float) -> Tensor:
+    """Values, steps, mapped in order to such as were rounded and got a blur."""
+    spread = float(place.std())
+    variance = spread**2 - blur**2 - 1 / 12  # before rounding, which adds a twelfth on average over all biases
+    if blur == 0 or spread > _EVEN or variance <= 0:
+        nearest = place.round()
+        return nearest + _pulled((place - nearest).contiguous(), blur)
+    # Over a few steps their shares are those of a normal variable.
+    middle, reach = float(place.mean()), math.ceil(_TAILS * spread)
+    table = middle + spread * torch.linspace(-_TAILS, _TAILS, _TABLE + 1, dtype=torch.float64)
+    steps = torch.arange(round(middle) - reach, round(middle) + reach + 1, dtype=torch.float64)
+    edges = torch.special.ndtr((torch.cat([steps - 0.5, steps[-1:] + 0.5]) - middle) / math.sqrt(variance))
+    below = torch.special.ndtr((table[:, None] - steps) / blur) @ (edges.diff() / edges.diff().sum())
+    wanted = torch.special.ndtr((table - middle) / spread)
+    # Where values of the one law lie in the other, and from there on as far away as they were.
+    right = torch.searchsorted(below, wanted).clamp(1, _TABLE)
+    share = (wanted - below[right - 1]) / (below[right] - below[right - 1]).clamp(min=1e-300)
+    moved = table[right - 1] + share.clamp(0, 1) * (table[right] - table[right - 1]) - table
+    at = ((place - table[0]) / (table[1] - table[0])).clamp(0, _TABLE - 1e-9)
+    before = at.long()
+    return place + torch.lerp(moved[before], moved[before + 1], at - before)
+
+
+def _pulled(place: Tensor, blur: float) -> Tensor:
+    """Even distances from a lattice, steps, mapped in order to those of a wrapped normal variable."""
+    if blur == 0:
+        return torch.zeros_like(place)
+    edges = torch.linspace(-0.5, 0.5, _TABLE + 1, dtype=torch.float64)
+    middle = (edges[1:] + edges[:-1]) / 2
+    total = torch.nn.functional.pad(_wrapped_normal(middle, torch.tensor(blur)).cumsum(0), (1, 0))
+    total = total / total[-1].clone() - 0.5
+    right = torch.bucketize(place, total).clamp(1, _TABLE)
+    share = (place - total[right - 1]) / (total[right] - total[right - 1]).clamp(min=1e-300)
+    return edges[right - 1] + share.clamp(0, 1) * (edges[right] - edges[right - 1])
+
+
+def _wrapped_normal(place: Tensor, sd: Tensor) -> Tensor:
+    """Density at `place`, within half a turn of 0, of a normal variable on a circle of length one."""
+    turns = torch.arange(-3, 4, dtype=torch.float64)
+    normal = torch.zeros_like(place)
+    for turn in turns.tolist():
+        normal = normal + torch.exp(-((place - turn) / sd).square() / 2)
+    return normal / (math.sqrt(2 * math.pi) * sd)
+
+
+def _several(values: Tensor) -> str:
+    """One number for values that agree, else the range."""
+    low, high = float(values.min()), float(values.max())
+    return f"{low:.4g}" if high <= low * (1 + 1e-3) else f"{low:.4g} to {high:.4g}"

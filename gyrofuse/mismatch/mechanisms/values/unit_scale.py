@@ -1,0 +1,80 @@
+"""Other units: the numbers of recording and simulation differ by a factor that units have."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse._base.units import GRAVITY
+from gyrofuse.mismatch.detectors.spectra.band_tests import power_tails
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+
+_UNITS = {
+    180 / math.pi: "deg/s against rad/s",
+    1000.0: "mdeg/s against deg/s",
+    3600.0: "deg/h against deg/s",
+    3600 * 180 / math.pi: "deg/h against rad/s",
+    GRAVITY: "m/s^2 against g",
+}
+_ALIKE, _MOST = 0.5, 0.8  # logarithm by which a band may be off, where something else is missing, and share of bands
+_NEAR = 0.25  # of the logarithm: noise levels of sensors of one kind differ by as much
+
+
+@dataclass(frozen=True, eq=False)
+class UnitScale(Mechanism):
+    """`x = factor * simulated`, the factor one between two units, for all sensors.
+
+    Attributes:
+        factor: Recording over simulation.
+    """
+
+    name: ClassVar[str] = "parameter_shift"
+    factor: float
+
+    @classmethod
+    def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
+        known = comparison.reference.dof > 0
+        ratios = (comparison.observed.power / comparison.reference.power)[:, known].log() / 2  # (sensor, band)
+        middle = ratios.median(-1).values
+        # A unit is one factor at all frequencies; other numbers of white noise move most bands, too.
+        alike = ((ratios - middle[:, None]).abs() < _ALIKE).double().mean(-1) > _MOST
+        if not bool(alike.all()):
+            return None
+        for size, words in _UNITS.items():
+            for sign in (1, -1):
+                if bool(((middle - sign * math.log(size)).abs() < _NEAR).all()):
+                    return cls._found(
+                        comparison, size**sign, words if sign == 1 else " against ".join(words.split(" against ")[::-1])
+                    )
+        return None
+
+    @classmethod
+    def _found(cls, comparison: Comparison, factor: float, words: str) -> Finding:
+        tails = power_tails(comparison)
+        return Finding(
+            cls.name,
+            cls(factor),
+            f"every sensor of the recording is {factor:.4g} times the simulation, as {words} would be: "
+            "give both in the same unit",
+            min(float(tails.nan_to_num(nan=1.0).amin()) * tails.numel(), 1.0),
+            tuple(range(comparison.n_sensors)),
+            {"factor": Parameter(factor, factor, factor, "")},
+            gain=math.inf,
+        )
+
+    def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
+        return self.factor * signal
+
+    def apply_to_reference(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
+        return comparison.in_unit(self.factor)
+
+    def spectra(self, matrices: Tensor, f: Tensor) -> Tensor:
+        return self.factor**2 * matrices
+
+    def fit_without(self, comparison: Comparison, fold: int) -> UnitScale:
+        return self

@@ -1,0 +1,1 @@
+"""The simulation with what it left out, and how it is saved."""

@@ -1,0 +1,1 @@
+"""What a diagnosis found, as data, text, figures and a page."""

@@ -1,0 +1,167 @@
+"""Another recording of the same device judges what a diagnosis repaired.
+
+Blocks held out have the weather of their own recording: a repair that predicts them may still be of that day alone. How
+far two recordings of the device are apart is what no simulation that knows nothing of the second one can beat.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gyrofuse._base.checks import same_rate
+from gyrofuse.io.recording import Recording
+from gyrofuse.mismatch.repair.inputs import prepared
+from gyrofuse.mismatch.repair.repaired_model import RepairedModel
+from gyrofuse.mismatch.reporting.discrepancy import compared
+from gyrofuse.mismatch.selection.classifier import distinguishability
+from gyrofuse.mismatch.selection.held_out import discrepancy_of_fold
+from gyrofuse.mismatch.signals.folds import N_FOLDS
+from gyrofuse.noise.array_model import ArrayModel
+from gyrofuse.noise.model import Model
+
+_RECORDS = 4  # of the repaired simulation, each as long as the judge: of its own scatter half that of the judge is left
+_BETTER_SD = 2.0  # standard errors of the difference over the folds: one judge of 14 says so by chance
+
+
+@dataclass(frozen=True)
+class Judged:
+    """How far simulations are from a recording that nothing was estimated from.
+
+    Discrepancies are per degree of freedom, of which 1 is what noise alone gives; areas under the curve of a classifier
+    are 0.5 where it guesses.
+
+    Attributes:
+        before: Discrepancy of the simulation as it came.
+        after: Of the repaired one.
+        repeatability: Of the recording that was diagnosed, in the place of the simulation.
+        auc_before, auc_after, auc_repeatability: Areas under the curve of the same.
+        helps: Whether `after` is below `before` by more than two standard errors of their difference.
+        lacks: Channels that the repaired simulation follows and the judge has not; what follows them was left out.
+    """
+
+    before: float
+    after: float
+    repeatability: float
+    auc_before: float
+    auc_after: float
+    auc_repeatability: float
+    helps: bool
+    lacks: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, ready for JSON."""
+        classifier = {"before": self.auc_before, "after": self.auc_after, "repeatability": self.auc_repeatability}
+        plain = {name: getattr(self, name) for name in ("before", "after", "repeatability", "helps")}
+        return {**plain, "classifier": classifier, "lacks": list(self.lacks)}
+
+
+def checked_judge(judge: Any, recording: Recording | Tensor, rate: float | None) -> Recording | Tensor:
+    """The judge, in the recording's unit, after all that can be said at the door.
+
+    Raises:
+        TypeError: It is not of the recording's kind.
+        ValueError: It is no recording of the same array, too short, has gaps, or is constant.
+    """
+    if isinstance(judge, Recording) != isinstance(recording, Recording) or not isinstance(judge, Recording | Tensor):
+        expected = "a recording" if isinstance(recording, Recording) else "a tensor (sensor, time)"
+        raise TypeError(f"`judge`: expected {expected} as `recording` is one, got {type(judge).__name__}")
+    if isinstance(judge, Recording) and isinstance(recording, Recording):
+        if not same_rate(judge.rate, recording.rate):
+            raise ValueError(
+                f"`judge`: expected the {recording.rate:g} Hz of the recording, got {judge.rate:g} Hz; give another "
+                "recording of the same device, or resample it"
+            )
+        if len({judge.unit, recording.unit, "unknown"}) == 3:
+            try:
+                judge = judge.to(recording.unit)
+            except ValueError as error:
+                raise ValueError(
+                    f"`judge`: expected the recording's unit {recording.unit}, or one that it can be converted to, got "
+                    f"{judge.unit} ({error})"
+                ) from None
+        for name in {*judge.channels} & {*recording.channels}:
+            rows, wanted = judge.channels[name].shape[:-1], recording.channels[name].shape[:-1]
+            if rows != wanted:
+                raise ValueError(
+                    f"`judge`: expected the channel {name} with the rows {tuple(wanted)} of the recording, got "
+                    f"{tuple(rows)}; leave it out, or give it whole"
+                )
+    shapes = [x.signal.shape if isinstance(x, Recording) else x.shape for x in (judge, recording)]
+    if len(shapes[0]) != 2 or shapes[0][0] != shapes[1][0]:
+        raise ValueError(
+            f"`judge`: expected (sensor, time) with {shapes[1][0]} sensors as in the recording, got shape "
+            f"{tuple(shapes[0])}; give the same sensors of one axis"
+        )
+    try:
+        prepared(judge, recording, None if isinstance(judge, Recording) else rate, torch.Generator())
+    except ValueError as error:
+        raise ValueError(str(error).replace("`recording`", "`judge`").replace("`simulation`", "`recording`")) from None
+    return judge
+
+
+def judged(
+    judge: Recording | Tensor,
+    recording: Recording | Tensor,
+    simulation: Recording | Tensor | Model | ArrayModel | RepairedModel,
+    repaired: RepairedModel | None,
+    rate: float | None,
+) -> Judged:
+    """Set a simulation, the repaired one, and the recording against another recording.
+
+    Args:
+        judge: As `checked_judge` gives it.
+        recording: What was diagnosed.
+        simulation: As it came.
+        repaired: What the diagnosis made of it; None where there was nothing to repair.
+        rate: Hz, of tensors.
+    """
+    generator = torch.Generator().manual_seed(0)
+    rate = None if isinstance(judge, Recording) else rate
+    lacks: tuple[str, ...] = ()
+
+    def apart(other: Any) -> tuple[Tensor, float]:
+        """Discrepancies of the folds, and the area under the classifier's curve."""
+        given = prepared(judge, other, rate, generator)
+        comparison = compared(given, other, generator)
+        folds = [discrepancy_of_fold(comparison, fold) for fold in range(N_FOLDS)]
+        areas = [distinguishability(given, fold) for fold in range(N_FOLDS)]
+        return torch.tensor(folds, dtype=torch.float64), sum(areas) / N_FOLDS
+
+    if isinstance(simulation, RepairedModel):
+        simulation, _ = _drawn(simulation, judge, generator)
+    before, auc_before = apart(simulation)
+    after, auc_after = before, auc_before
+    if repaired is not None:
+        drawn, lacks = _drawn(repaired, judge, generator)
+        after, auc_after = apart(drawn)
+    again, auc_again = apart(recording)
+    less = before - after
+    helps = float(less.mean()) > _BETTER_SD * float(less.std()) / N_FOLDS**0.5
+    return Judged(
+        before=float(before.mean()),
+        after=float(after.mean()),
+        repeatability=float(again.mean()),
+        auc_before=auc_before,
+        auc_after=auc_after,
+        auc_repeatability=auc_again,
+        helps=helps and repaired is not None,
+        lacks=lacks,
+    )
+
+
+def _drawn(model: RepairedModel, judge: Recording | Tensor, generator: torch.Generator) -> tuple[Any, tuple[str, ...]]:
+    """Samples of a repaired simulation for another recording, and the channels that this lacks to follow."""
+    model = model.elsewhere()
+    signal, channels = (judge.signal, judge.channels) if isinstance(judge, Recording) else (judge, {})
+    whole = {name: values for name, values in channels.items() if bool(values.isfinite().all())}
+    followed = [str(getattr(effect, "channel", "")) for effect in model.effects]
+    effects = tuple(e for e, name in zip(model.effects, followed, strict=True) if not name or name in whole)
+    lacks = tuple(sorted({*followed} - {"", *whole}))
+    model = replace(model, effects=effects)
+    records = model.simulate(signal.shape[-1], batch=(_RECORDS,), channels=whole, generator=generator)
+    drawn = records.movedim(0, 1).flatten(1)
+    return (Recording(drawn, rate=judge.rate, unit=judge.unit) if isinstance(judge, Recording) else drawn), lacks

@@ -1,0 +1,1 @@
+"""Recording and simulation side by side, and what is derived from them."""

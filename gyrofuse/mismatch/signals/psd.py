@@ -1,0 +1,149 @@
+"""Cross-spectral matrices of arrays in bands of frequency, by sine multitapers.
+
+One transform of twice the length gives `K` eigencoefficients at every bin of the record,
+
+    y_k(m) = (X(m - k/2) - X(m + k/2)) / sqrt(2 T),   k = 1 .. K,
+
+(Riedel and Sidorenko, 1995). Bands are a quarter of an octave wide and never narrower than the tapers, so that
+neighbours are all but uncorrelated.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from dataclasses import dataclass
+
+import torch
+from scipy.signal import windows
+from torch import Tensor
+
+from gyrofuse._base.transforms import fast_length
+
+_TAPERS = 4  # an even number
+_PER_OCTAVE = 4
+_TAPERED = 0.1  # share of the record under the ends of a light taper: spectral lines leak as far as twenty bins
+_FIRST_BIN = 3  # below, positive and negative frequencies overlap
+
+
+@dataclass(frozen=True, eq=False)
+class Bands:
+    """Bands of a record's bins.
+
+    Attributes:
+        n_samples: T.
+        edges: First bin of each band, and the bin after the last.
+        frequency: Geometric mean of each band's ends, cycles per sample, `(band,)`.
+        dof: Independent complex ordinates that a band's mean is worth, `(band,)`: the squared mean over the variance
+            of a power is `dof`.
+    """
+
+    n_samples: int
+    edges: tuple[int, ...]
+    frequency: Tensor
+    dof: Tensor
+
+    def mean_of(self, density: Tensor) -> Tensor:
+        """Means over the bands of values `(..., place)` at `places`."""
+        return density.unflatten(-1, (-1, _PLACES)).mean(-1)
+
+    @property
+    def places(self) -> Tensor:
+        """Frequencies `(band * place,)`, cycles per sample, whose mean stands for the mean over a band."""
+        edges = torch.tensor(self.edges, dtype=torch.float64)
+        share = (torch.arange(_PLACES, dtype=torch.float64) + 0.5) / _PLACES
+        bins = edges[:-1, None] - 0.5 + (edges.diff())[:, None] * share
+        return (bins / self.n_samples).flatten()
+
+
+_PLACES = 8
+
+
+@functools.lru_cache(maxsize=8)
+def bands(n_samples: int) -> Bands:
+    """Bands for records of `n_samples`, 32 at least."""
+    last = (n_samples - _TAPERS) // 2  # the bin after the last one
+    edges = [_FIRST_BIN]
+    while edges[-1] < last:
+        edges.append(max(edges[-1] + _TAPERS + 1, math.ceil(edges[-1] * 2 ** (1 / _PER_OCTAVE))))
+    edges[-1] = last
+    if len(edges) > 2 and edges[-1] - edges[-2] <= _TAPERS:
+        del edges[-2]
+    lower, upper = (torch.tensor(ends, dtype=torch.float64) for ends in (edges[:-1], edges[1:]))
+    dof = torch.tensor([degrees_of_freedom(int(w)) for w in upper - lower], dtype=torch.float64)
+    return Bands(n_samples, tuple(edges), (lower * (upper - 1)).sqrt() / n_samples, dof)
+
+
+def cross_spectra(signal: Tensor, wanted: Bands) -> Tensor:
+    """Cross-spectral matrices per sample `(..., band, sensor, sensor)`, complex, of `(..., sensor, time)`.
+
+    The signal may be as long as `wanted.n_samples` or not: bands keep their frequencies.
+    """
+    n = signal.shape[-1]
+    signal = signal - signal.mean(-1, keepdim=True)
+    transform = torch.fft.rfft(signal, n=2 * n)
+    matrices, scale = [], n / wanted.n_samples
+    # Half bins around each bin, `(..., sensor, bin, half bin)`, from the first one that has so many below it.
+    first_whole, last = _TAPERS // 2, (n - _TAPERS) // 2
+    around = transform.unfold(-1, 2 * _TAPERS + 1, 2)
+    for first, end in itertools.pairwise(wanted.edges):
+        a = min(max(round(first * scale), _FIRST_BIN), last - 1)  # of a short signal the last bands share a bin
+        b = min(max(round(end * scale), a + 1), last)
+        own = around[..., a - first_whole : b - first_whole, :]
+        y = (own[..., :_TAPERS] - own[..., _TAPERS + 1 :].flip(-1)).flatten(-2)  # (..., sensor, bin * taper)
+        matrices.append(y @ y.mH / (2 * n * y.shape[-1]))
+    return torch.stack(matrices, -3)
+
+
+def taper_window(n_samples: int, per_bin: int) -> Tensor:
+    """Mean of the tapers' squared transforms at distances from a bin, `(distance,)`, which go round at the rate.
+
+    The taper of `y_k` is `2 sin(pi k t / T) / sqrt(2 T)`.
+
+    Args:
+        n_samples: T.
+        per_bin: Distances in a bin.
+    """
+    t = torch.arange(n_samples, dtype=torch.float64) / n_samples
+    k = torch.arange(1, _TAPERS + 1, dtype=torch.float64)[:, None]
+    transform = torch.fft.fft(2 * torch.sin(math.pi * k * t) / math.sqrt(2 * n_samples), n=per_bin * n_samples)
+    return (transform.real.square() + transform.imag.square()).mean(0)
+
+
+@functools.lru_cache(maxsize=1024)
+def degrees_of_freedom(width: int) -> float:
+    """Of the mean over `width` bins and all tapers, from the covariances of white noise's eigencoefficients.
+
+    `X` at distances of `d` half bins has the covariance `c_d`: 1 at 0, 0 at even `d`, `2 / (i pi d)` at odd ones.
+    """
+    far = min(width, 64)
+    k = torch.arange(1, _TAPERS + 1, dtype=torch.float64)
+    apart = torch.arange(-far + 1, far, dtype=torch.float64)
+
+    def c(d: Tensor) -> Tensor:
+        odd = torch.remainder(d, 2) == 1
+        return torch.where(odd, 2 / (math.pi * torch.where(odd, d, 1.0)), 0.0) * -1j + (d == 0)
+
+    step, one, other = 2 * apart[:, None, None], k[:, None], k
+    covariance = (c(step - one + other) - c(step - one - other) - c(step + one + other) + c(step + one - other)) / 2
+    energy = covariance.abs().square().sum((-1, -2))
+    weight = width - apart.abs()
+    return float((_TAPERS * width) ** 2 / (weight * energy).sum())
+
+
+def hann_transform(signal: Tensor) -> tuple[Tensor, int]:
+    """Transform of the signal under a Hann taper of mean square 1, over `sqrt(T)`, and the length it was padded to.
+
+    Its squares have the spectral density as expectation.
+    """
+    n = signal.shape[-1]
+    taper = torch.hann_window(n, periodic=True, dtype=signal.dtype) * math.sqrt(8 / 3)
+    length = fast_length(n)
+    return torch.fft.rfft((signal - signal.mean(-1, keepdim=True)) * taper, n=length) / math.sqrt(n), length
+
+
+def light_taper(n: int) -> Tensor:
+    """For whitened samples `(n,)`, of squares that sum to one: one that holds back what is red costs half of them."""
+    taper = torch.from_numpy(windows.tukey(n, _TAPERED))
+    return taper / taper.square().sum().sqrt()

@@ -1,0 +1,203 @@
+"""Signals of one side, the recording or the simulation, and what is derived from them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.signals.fitted_spectra import SpectralUncertainty
+from gyrofuse.mismatch.signals.known_lines import without_lines
+from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum, fit_base
+from gyrofuse.mismatch.signals.psd import Bands, cross_spectra, degrees_of_freedom
+from gyrofuse.mismatch.signals.variance_course import VarianceCourse
+
+_ORDINATES = 40  # for each sensor, behind a matrix that is inverted
+_BLOCK, _CUT = 32, 25.0  # samples of a level, and squares in means of them: an outlier is no level
+_LEAST_BIN = 3  # of records shorter than the bands are for: below, they say nothing
+
+
+@dataclass(frozen=True, eq=False)
+class Records:
+    """Signals of one side. What is derived is computed once, when it is first asked for.
+
+    Attributes:
+        signal: `(record, sensor, time)`.
+        bands: Bands of frequency of the recording, for both sides.
+        lines: Frequencies that the simulation has lines at, cycles per sample: no noise, and left out where noise is
+            looked at.
+        told_by: Samples of each sensor that the noise is known from, where they are fewer: those that a model, which
+            these were drawn from, was estimated from.
+        uncertainty: Of the model that these were drawn from, where its numbers were estimated.
+        loud: Episodes that it is known to have.
+        gaussian: Whether a Gaussian model made it.
+        level_variance: Of the log of all power, which varies by itself beyond what Gaussian noise's does, `(sensor,)`.
+    """
+
+    signal: Tensor
+    bands: Bands
+    lines: tuple[float, ...] = ()
+    effective_samples: float = math.inf
+    uncertainty: SpectralUncertainty | None = None
+    loud: tuple[VarianceCourse, ...] = ()
+    gaussian: bool = False
+    level_variance: Tensor | float = 0.0
+
+    @property
+    def n_records(self) -> float:
+        """Records that tell of the noise."""
+        n_records, _, n = self.signal.shape
+        return min(n_records, self.effective_samples / n)
+
+    @property
+    def slowest_seen(self) -> float:
+        """Frequency below which a model only continues what the record that it was fitted to shows above, 1/sample.
+
+        Whether noise levels off there its parameters' covariance does not say: an AR1 that outlasts a record is a walk.
+        """
+        known = (
+            self.effective_samples
+            if self.uncertainty is None
+            else min(self.effective_samples, self.uncertainty.n_samples)
+        )
+        return _LEAST_BIN / known
+
+    def in_bands(self, bands: Bands) -> Records:
+        """The noise in other bands."""
+        return Records(self.steady, bands, effective_samples=self.effective_samples, uncertainty=self.uncertainty)
+
+    @cached_property
+    def noise(self) -> Tensor:
+        """The signal without the simulation's lines."""
+        return without_lines(self.signal, self.lines)
+
+    @property
+    def level(self) -> Tensor | float:
+        """Variance of the noise in the episodes that it is known to have, `(sensor, time)`; 1 without any."""
+        return math.prod((episodes.variance for episodes in self.loud), start=1.0)
+
+    @cached_property
+    def steady(self) -> Tensor:
+        """The noise as it would be without episodes that it is known to have."""
+        return self.steadied(self.noise)
+
+    def steadied(self, noise: Tensor) -> Tensor:
+        """Noise `(record, sensor, time)` of this side, without episodes that it is known to have."""
+        for episodes in reversed(self.loud):
+            noise = episodes.taken_off(noise)
+        return noise
+
+    @cached_property
+    def spectra(self) -> Tensor:
+        """Mean cross-spectral matrices of the records, `(band, sensor, sensor)`, per sample.
+
+        Of noise of a steady level: power that comes at some times more than at others is known less well than `dof`
+        says, which is of noise that is alike throughout.
+        """
+        return cross_spectra(self.steady, self.bands).mean(0)
+
+    @cached_property
+    def dof(self) -> Tensor:
+        """What a band is worth, independent complex ordinates, `(band,)`; 0 where records are too short to say."""
+        scale = self.signal.shape[-1] / self.bands.n_samples
+        if scale == 1:
+            return self.n_records * self.bands.dof
+        edges = [round(edge * scale) for edge in self.bands.edges]
+        return torch.tensor(
+            [
+                self.n_records * degrees_of_freedom(max(b - a, 1)) if a >= _LEAST_BIN else 0.0
+                for a, b in itertools.pairwise(edges)
+            ],
+            dtype=torch.float64,
+        )
+
+    @cached_property
+    def power_dof(self) -> Tensor:
+        """What bands tell of powers beside what a level varies and a model's numbers may be off, `(sensor, band)`.
+
+        Logarithms of powers vary by one over it.
+        """
+        varies = torch.as_tensor(self.level_variance).expand(self.signal.shape[-2])[:, None]
+        if self.uncertainty is not None:
+            varies = varies + self.uncertainty.variance(self.bands.frequency)
+        return self.dof / (1 + self.dof * varies) * (self.bands.frequency >= self.slowest_seen)
+
+    @property
+    def log_power(self) -> Tensor:
+        """Unbiased logarithms of the densities, `(sensor, band)`."""
+        dof = self.dof.clamp(min=1e-3)
+        return self.power.log() - torch.digamma(dof) + dof.log()
+
+    @property
+    def coherence_dof(self) -> Tensor:
+        """What bands tell of coherences, `(band,)`: less of noise that is loud in all sensors at the same times.
+
+        And of a fitted array no more than the record it was fitted to.
+        A fit smooths over bands, so that it is known at least as well. To first order it is known better in narrow
+        bands, but where a matrix lacks rank, as those of slow noise often do, coherences are far from linear in it.
+        """
+        dof = self.dof / (1 + self._levels_alike)
+        if self.uncertainty is None or not self.uncertainty.shares_noise:
+            return dof
+        n_records, _, n = self.signal.shape
+        return dof * min(self.uncertainty.n_samples / (n_records * n), 1.0)
+
+    @cached_property
+    def _levels_alike(self) -> float:
+        """Covariance of two sensors' levels over their means, of all pairs: by so much more coherences vary.
+
+        Seen in squares of differences of samples, means over short blocks; chance in them is every sensor's own.
+        """
+        p = self.signal.shape[-2]
+        n = self.signal.shape[-1] // _BLOCK * _BLOCK
+        if p < 2 or self.gaussian or n < 2 * _BLOCK:
+            return 0.0
+        squares = self.steady[..., :n].diff(append=self.steady[..., n - 1 : n]).square()
+        squares = squares.minimum(_CUT * squares.mean((0, -1))[:, None])
+        level = squares.unflatten(-1, (-1, _BLOCK)).mean(-1)  # (record, sensor, block)
+        relative = level / level.mean(-1, keepdim=True).clamp(min=1e-300) - 1
+        covariance = (relative @ relative.mT).mean(0) / relative.shape[-1]
+        return max(float(covariance.sum() - covariance.trace()) / (p * (p - 1)), 0.0)
+
+    @cached_property
+    def power(self) -> Tensor:
+        """Spectral densities per sample, `(sensor, band)`."""
+        return self.spectra.diagonal(dim1=-1, dim2=-2).real.mT
+
+    @cached_property
+    def coherence(self) -> Tensor:
+        """Complex coherences of the sensors, `(band, sensor, sensor)`."""
+        size = self.power.mT.sqrt()
+        return self.spectra / size[:, :, None] / size[:, None, :]
+
+    @cached_property
+    def base(self) -> NoiseSpectrum:
+        """The noise as a sum of simple spectra."""
+        return fit_base(self.power, self.bands, self.bands.n_samples, self.dof)
+
+    def over(self, base: NoiseSpectrum) -> Tensor:
+        """Cross-spectral matrices over the spectra of a base, to be inverted, `(band, sensor, sensor)`.
+
+        Means over as many bands as it takes: an inverse from too few ordinates would be too large.
+        """
+        dof = self.bands.dof
+        size = self.bands.mean_of(base.spectrum(self.bands.places)).mT.sqrt()  # (band, sensor)
+        total = _sums(self.spectra / size[:, :, None] / size[:, None, :] * dof[:, None, None])
+        worth = _sums(dof)
+        wanted = min(_ORDINATES * self.signal.shape[-2], float(dof.sum()))
+        smooth = []
+        for b in range(len(dof)):
+            low, high = b, b + 1
+            while worth[high] - worth[low] < wanted:
+                low, high = max(low - 1, 0), min(high + 1, len(dof))
+            smooth.append((total[high] - total[low]) / (worth[high] - worth[low]))
+        return torch.stack(smooth)
+
+
+def _sums(values: Tensor) -> Tensor:
+    """Sums of the first 0, 1, .. entries along the first dimension."""
+    return torch.cat([torch.zeros_like(values[:1]), values.cumsum(0)])
