@@ -7,7 +7,7 @@ from torch import Tensor
 
 from gyrofuse import AR1, RandomWalk, WhiteNoise
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
-from gyrofuse.mismatch.selection.held_out import held_out_gain
+from gyrofuse.mismatch.selection.held_out import score_held_out
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 
 LEVEL = 5e-4
@@ -38,7 +38,7 @@ def drawn(seed: int, records: int = 4) -> tuple[Tensor, Tensor, torch.Generator]
 
 def settled(comparison: Comparison, found: Finding, g: torch.Generator) -> Comparison:
     """The case after the repair, in which the same is not found again; the repair gains on data held out."""
-    gain = held_out_gain(comparison, found.effect)
+    gain = score_held_out(comparison, found.effect)
     assert gain.blocks.shape == (32,)
     assert gain.total > 1.7 * gain.sd
     after = found.effect.repair(comparison, g)

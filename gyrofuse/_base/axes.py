@@ -41,6 +41,13 @@ def new_axes() -> Axes:
     return plt.subplots(figsize=(7.0, 4.6), layout="constrained")[1]
 
 
+def new_axes_below_each_other(n: int) -> list[Axes]:
+    """New axes of pyplot, `n` of them."""
+    import matplotlib.pyplot as plt
+
+    return list(plt.subplots(n, 1, figsize=(7.0, 3.0 * n), layout="constrained", squeeze=False)[1][:, 0])
+
+
 def as_array(value: Numbers) -> Array:
     """Numbers as a NumPy array in double precision."""
     return torch.as_tensor(value).detach().cpu().double().numpy()

@@ -1,4 +1,4 @@
-"""Diagnosis: witness, nominate, repair, confirm, and ask what would be otherwise."""
+"""Diagnosis: test, search forward, repair, eliminate backward, and report what is left."""
 
 from __future__ import annotations
 
@@ -12,34 +12,30 @@ from torch import Tensor
 
 from gyrofuse._base.checks import check_n_samples
 from gyrofuse.io.recording import Recording
-from gyrofuse.mismatch.detectors.spectra.fit_verdict import KNOWN, FitVerdict, fit_verdict
+from gyrofuse.mismatch.detectors.result import TestResult
+from gyrofuse.mismatch.detectors.spectra.fit_verdict import KNOWN, fit_verdict
 from gyrofuse.mismatch.detectors.tests import TESTS, family_wise_p_value, run_tests
-from gyrofuse.mismatch.mechanisms.catalogue import STAGES
-from gyrofuse.mismatch.mechanisms.mechanism import Finding
-from gyrofuse.mismatch.mechanisms.remainder import Remainder
-from gyrofuse.mismatch.mechanisms.slow_remainder import SlowRemainder
-from gyrofuse.mismatch.mechanisms.spectra.spectral import Spectral
-from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
-from gyrofuse.mismatch.mechanisms.values.unit_scale import UnitScale
+from gyrofuse.mismatch.mechanisms.mechanism import Context, Mechanism
 from gyrofuse.mismatch.repair.inputs import Simulation, modelled, on_processor, prepared
 from gyrofuse.mismatch.repair.noise_model import noise_of, noise_samples
 from gyrofuse.mismatch.repair.reference_effects import with_own_effects
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel
 from gyrofuse.mismatch.reporting.judge import checked_judge, judged
 from gyrofuse.mismatch.reporting.report import MismatchReport
-from gyrofuse.mismatch.selection.backward import Link, settled
-from gyrofuse.mismatch.selection.held_out import discrepancy_left, held_out, held_out_gain, leads_away
+from gyrofuse.mismatch.selection.backward import eliminate
+from gyrofuse.mismatch.selection.discrepancy import discrepancy_left
+from gyrofuse.mismatch.selection.forward import select
+from gyrofuse.mismatch.selection.held_out import agreement
+from gyrofuse.mismatch.selection.leftovers import repair_leftovers
 from gyrofuse.mismatch.selection.null_replicates import FEWEST, twin_p_values
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.stats.multiplicity import monte_carlo_p_value, sidak, sidak_level
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.model import Model
 
-_LOOKED, _NAMED, _COMPARED, _CHECKED = 0.3, 0.65, 0.75, 0.9  # shares of the work that are done by then
-_AFTER_REPAIRS = 0.1  # of the level: spectra are then compared at levels that repairs have estimated
-# Witnesses of the law of single samples, which of values that hardly leave a step is none that they know.
+_TESTED, _FOUND, _ELIMINATED, _COMPARED = 0.3, 0.65, 0.75, 0.9  # shares of the work that are done by then
+# Tests of the law of single samples, none of which is known of values that hardly leave one quantisation step.
 _OF_SAMPLES = ("marginal", "spike", "jump", "variance")
-_MOST, _OF_A_KIND = 20, 6  # findings: a recording that needs more is another instrument
 
 
 def diagnose(
@@ -92,7 +88,7 @@ def diagnose(
         raise ValueError(f"`twins`: expected 0, or {FEWEST} or more, got {twins}; fewer cannot tell a tail")
     if generator is None:
         generator = torch.Generator().manual_seed(0)
-    level = sidak_level(false_alarm, len(TESTS))  # what would be a mismatch, had one witness alone said it
+    level = sidak_level(false_alarm, len(TESTS))  # p value of one test that makes a mismatch of all
     recording, judge = on_processor(recording), on_processor(judge)
     simulation = on_processor(modelled(simulation, fitted_samples))
     given = prepared(recording, simulation, rate, generator)
@@ -100,110 +96,87 @@ def diagnose(
         judge = checked_judge(judge, recording, rate)
     start, own = with_own_effects(given, simulation, level, generator)
     model = RepairedModel(noise_of(simulation, _unrounded(start)), start.info, own, noise_samples(simulation))
-    evidence = run_tests(start, lambda what, share: progress(what, _LOOKED * share))
-    p_value = family_wise_p_value(evidence)
+    before = run_tests(start, lambda what, share: progress(what, _TESTED * share))
+    p_value = family_wise_p_value(before)
     if twins:
         p_value = monte_carlo_p_value(p_value, twin_p_values(start, twins, generator))
-    if p_value > false_alarm:
-        verdict = None if judge is None else judged(judge, recording, simulation, None, rate)
-        return _reported(
-            simulation,
-            fit_verdict(start, level),
-            mismatch=False,
+
+    def report(made: RepairedModel | None, **found: Any) -> MismatchReport:
+        verdict = None if judge is None else judged(judge, recording, simulation, made, rate)
+        fitted = isinstance(simulation, Model | ArrayModel) and simulation.estimated_from is None
+        notes = (KNOWN,) if fitted else () if found["fit"] is None else (found["fit"].words,)
+        return MismatchReport(
             p_value=p_value,
-            findings=(),
-            unexplained=(),
-            held_out=held_out(start, (), generator),
-            model=model,
-            evidence=evidence,
-            evidence_after=evidence,
+            evidence=before,
             recording=given.recording,
             comparison=start,
-            repaired=start,
+            model=made or model,
             judged=verdict,
+            notes=notes,
+            **found,
         )
-    comparison: Comparison = start
-    links: list[Link] = []
-    for number, stage in enumerate(STAGES):
-        if len({i for link in links for i in link.finding.hides}) == start.n_sensors:
-            break
-        progress(", ".join(m.name for m in stage), _LOOKED + (_NAMED - _LOOKED) * number / len(STAGES))
-        while len(links) < _MOST:
-            found = [link.finding for link in links]
-            open_ones = [m for m in stage if sum(f.mechanism == m.name for f in found) < _OF_A_KIND]
-            asked = level * _AFTER_REPAIRS if links and stage is STAGES[-1] else level
-            nominated = [
-                f for f in (m.detect_and_fit(comparison, asked) for m in open_ones) if f and not _known(f, found)
-            ]
-            for finding in sorted(nominated, key=lambda f: -f.gain):
-                gain = held_out_gain(comparison, finding.effect)
-                if gain.confirms(finding.p_value) and not leads_away(start, comparison, gain, generator):
-                    links.append(Link(replace(finding, held_out_gain=gain.total), comparison, gain))
-                    comparison = finding.repair(comparison, generator)
-                    break
-            else:
-                break
-    progress("look-alikes", _NAMED)
-    links, comparison = settled(links, comparison, level, generator)
+
+    if p_value > false_alarm:
+        return report(
+            None,
+            mismatch=False,
+            findings=(),
+            unexplained=(),
+            held_out=agreement(start, (), generator),
+            evidence_after=before,
+            repaired=start,
+            fit=fit_verdict(start, level),
+        )
+    selected, comparison = select(
+        start, level, generator, lambda what, share: progress(what, _TESTED + (_FOUND - _TESTED) * share)
+    )
+    progress("alternatives", _FOUND)
+    selected, comparison = eliminate(selected, comparison, level, generator)
+    found = [one.finding for one in selected]
+    findings = tuple(
+        replace(f, context=Context(start, tuple(other.effect for other in found if other is not f))) for f in found
+    )
     # Spectra as they were before a repair of theirs: what was found until then is no matter of the model's numbers.
-    before = next((link.before for link in links if isinstance(link.finding.effect, Spectral)), comparison)
-    findings = tuple(link.finding for link in links)
-    gains = [link.gain for link in links]
-    after = run_tests(comparison, lambda what, share: progress(what, _COMPARED + (_CHECKED - _COMPARED) * share))
-    left = [e for e in after if sidak(e.p_value, len(evidence)) <= false_alarm]
+    spectra = next((one.before for one in selected if one.finding.effect.of_spectra), comparison)
+    after = run_tests(comparison, lambda what, share: progress(what, _ELIMINATED + (_COMPARED - _ELIMINATED) * share))
+    unexplained = _significant(after, false_alarm)
     hidden = sorted({i for f in findings for i in f.hides})
     for finding in findings:
-        if isinstance(finding.effect, UnitScale):
-            own = tuple(e.in_unit(finding.effect.factor) if isinstance(e, Quantization) else e for e in own)
-    effects = (*own, *(f.effect for f in findings))
-    for unnamed in (SlowRemainder, Remainder):
-        asking = [e.p_value for e in left if e.test in unnamed.asked_for_by]
-        if not asking:
-            continue
-        remainder = unnamed.of(comparison).but_for(hidden)
-        gain = held_out_gain(comparison, remainder)
-        if gain.confirms(min(asking)) and not leads_away(start, comparison, gain, generator):
-            comparison, effects = remainder.repair(comparison, generator), (*effects, remainder)
-            gains.append(gain)
-    if hidden:  # what was searched on had noise in their place; what is handed back has what was recorded
-        comparison = start
-        for effect in effects[len(own) :]:
-            comparison = effect.repair(comparison, generator)
+        own = tuple(effect.in_unit(finding.effect.unit_factor) for effect in own)
+    left = repair_leftovers(start, comparison, unexplained, hidden, generator)
+    comparison, effects = left.comparison, (*(f.effect for f in findings), *left.effects)
+    if hidden:
+        comparison = _with_hidden(start, effects, generator)
         after = run_tests(comparison)
-        told = {*_OF_SAMPLES, *(e.test for e in left)}
-        left += [e for e in after if sidak(e.p_value, len(evidence)) <= false_alarm and e.test not in told]
-    judged_blocks = held_out(start, gains, generator)
-    if not left and (much := discrepancy_left(comparison, judged_blocks.after)):
-        left = [much]
-    model = replace(model, effects=effects)
-    verdict = None
+        seen = {*_OF_SAMPLES, *(result.test for result in unexplained)}
+        unexplained += [result for result in _significant(after, false_alarm) if result.test not in seen]
+    held_out = agreement(start, [*(one.score for one in selected), *left.scores], generator)
+    if not unexplained and (much := discrepancy_left(comparison, held_out.after)):
+        unexplained = [much]
     if judge is not None:
-        progress("another recording", _CHECKED)
-        verdict = judged(judge, recording, simulation, model, rate)
-    return _reported(
-        simulation,
-        fit_verdict(before, level),
+        progress("another recording", _COMPARED)
+    return report(
+        replace(model, effects=(*own, *effects)),
         mismatch=True,
-        p_value=p_value,
         findings=findings,
-        unexplained=tuple(left),
-        held_out=judged_blocks,
-        model=model,
-        evidence=evidence,
+        unexplained=tuple(unexplained),
+        held_out=held_out,
         evidence_after=after,
-        recording=given.recording,
-        comparison=start,
         repaired=comparison,
-        judged=verdict,
+        fit=fit_verdict(spectra, level),
     )
 
 
-def _reported(simulation: object, fit: FitVerdict | None, **found: Any) -> MismatchReport:
-    """The report, with notes on what the simulation's numbers are taken for."""
-    notes = () if fit is None else (fit.words,)
-    if isinstance(simulation, Model | ArrayModel) and simulation.estimated_from is None:
-        notes = (KNOWN,)
-    return MismatchReport(fit=fit, notes=notes, **found)
+def _significant(results: tuple[TestResult, ...], false_alarm: float) -> list[TestResult]:
+    """Results of tests that see a difference."""
+    return [result for result in results if sidak(result.p_value, len(results)) <= false_alarm]
+
+
+def _with_hidden(start: Comparison, effects: tuple[Mechanism, ...], generator: torch.Generator) -> Comparison:
+    """Recording and simulation with all effects repaired, and what was recorded in the sensors that were hidden."""
+    for effect in effects:
+        start = effect.repair(start, generator)
+    return start
 
 
 def _unrounded(comparison: Comparison) -> Comparison:
@@ -211,14 +184,3 @@ def _unrounded(comparison: Comparison) -> Comparison:
     if comparison.analog is comparison.reference.signal:
         return comparison
     return replace(comparison, reference=replace(comparison.reference, signal=comparison.analog))
-
-
-def _known(finding: Finding, found: list[Finding]) -> bool:
-    """Whether the same was found before: what its repair could not take away is not another one."""
-    if finding.effect.place:  # a fact on the numbers of some sensors
-        return any(f.mechanism == finding.mechanism and set(finding.sensors) <= set(f.sensors) for f in found)
-    return any(
-        (finding.mechanism, finding.sensors, finding.channel, finding.time_s, finding.frequency_hz)
-        == (other.mechanism, other.sensors, other.channel, other.time_s, other.frequency_hz)
-        for other in found
-    )

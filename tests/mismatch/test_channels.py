@@ -15,7 +15,7 @@ from gyrofuse.mismatch.mechanisms.signals.channel_gain import ChannelGain
 from gyrofuse.mismatch.mechanisms.signals.g_sensitivity import GSensitivity
 from gyrofuse.mismatch.mechanisms.signals.quadratic_coupling import QuadraticCoupling
 from gyrofuse.mismatch.mechanisms.signals.scale_factor import ScaleFactor
-from gyrofuse.mismatch.selection.held_out import held_out_gain
+from gyrofuse.mismatch.selection.held_out import score_held_out
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 
 N = 2**13
@@ -267,7 +267,7 @@ def test_what_comes_through_a_mount_is_a_gain_of_another_form(mount):
     assert finding.sensors == (0, 2, 3)
     assert "its form is not quite that of a gain" in finding.sentence
     assert " ms late near " in finding.sentence
-    assert held_out_gain(both, finding.effect).total > 0.92 * _energy(gains @ felt)  # which scatters by 2.6 %
+    assert score_held_out(both, finding.effect).total > 0.92 * _energy(gains @ felt)  # which scatters by 2.6 %
     if mount in ("first", "second"):
         assert channel_test(finding.repair(both, g)).p_value > 1e-3
 
@@ -330,7 +330,7 @@ def test_what_was_found_is_taken_off_and_confirmed_on_other_blocks():
     both = comparison(g, gains @ shaking, acceleration=shaking)
     effect = GSensitivity.detect_and_fit(both, LEVEL).effect
     assert channel_test(effect.repair(both, g)).p_value > 0.01
-    assert held_out_gain(both, effect).total > 50
+    assert score_held_out(both, effect).total > 50
     assert torch.equal(effect.remove(effect.apply(both.recording, both.info, g), both.info), both.recording) or (
         (effect.remove(effect.apply(both.recording, both.info, g), both.info) - both.recording).abs().max() < 1e-12
     )

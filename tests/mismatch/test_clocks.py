@@ -15,7 +15,7 @@ from gyrofuse.mismatch.detectors.spectra.band_tests import line_test
 from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
 from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode
 from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
-from gyrofuse.mismatch.selection.held_out import held_out_gain
+from gyrofuse.mismatch.selection.held_out import score_held_out
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.filters import resampled
 
@@ -168,7 +168,7 @@ def test_what_was_found_is_put_right_and_confirmed(ahead):
     g = generator(7)
     both = comparison(g, ahead, channel=True)
     effect = ClockSkew.detect_and_fit(both, LEVEL).effect
-    gain = held_out_gain(both, effect)
+    gain = score_held_out(both, effect)
     assert gain.total > 3 * gain.sd
     assert clock_test(effect.repair(both, g)).p_value > 0.01
     assert clock_test(both.with_recording(effect.remove(both.recording, both.info))).p_value > 0.01

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
@@ -27,11 +28,13 @@ from gyrofuse.mismatch.mechanisms.spectra.steadiness import Steadiness, steadine
 from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.reporting.text import otherwise_words
-from gyrofuse.mismatch.selection import backward as counterfactual
-from gyrofuse.mismatch.selection.alternatives import happened_instead, look_alikes
-from gyrofuse.mismatch.selection.backward import Link, same_line, settled
-from gyrofuse.mismatch.selection.held_out import Gain, held_out_gain, sd_of_sum
+from gyrofuse.mismatch.selection import alternatives
+from gyrofuse.mismatch.selection.alternatives import compare, rivals_of
+from gyrofuse.mismatch.selection.backward import eliminate, same_line
+from gyrofuse.mismatch.selection.forward import Selected
+from gyrofuse.mismatch.selection.held_out import HeldOutScore, score_held_out
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.folds import sd_of_sum
 
 MODEL = gf.WhiteNoise(1.0) + gf.AR1(0.999, 1e-4) + gf.RandomWalk(1e-8)
 N, RATE, SENSORS = 2**14, 100.0, 4
@@ -59,16 +62,21 @@ def step(size: float) -> torch.Tensor:
     return size * torch.ones(SENSORS, 1, dtype=torch.float64) * (torch.arange(N) >= N // 2)
 
 
-def chain(comparison: Comparison, *mechanisms: type[Mechanism]) -> tuple[list[Link], Comparison]:
+def chain(comparison: Comparison, *mechanisms: type[Mechanism]) -> tuple[list[Selected], Comparison]:
     """Findings one after the other."""
     links = []
     for mechanism in mechanisms:
         finding = mechanism.detect_and_fit(comparison, LEVEL)
         assert finding is not None
-        gain = held_out_gain(comparison, finding.effect)
-        links.append(Link(replace(finding, held_out_gain=gain.total), comparison, gain))
+        gain = score_held_out(comparison, finding.effect)
+        links.append(Selected(replace(finding, held_out_gain=gain.total), comparison, gain))
         comparison = finding.effect.repair(comparison, generator(0))
     return links, comparison
+
+
+def instead_of(finding: Finding, comparison: Comparison, beside: Sequence[Finding] = ()) -> tuple[str, ...]:
+    """Names of events that explain as much as a finding."""
+    return finding.effect.explained_by_others(comparison, finding, beside)
 
 
 def test_red_noise_may_be_a_step_that_gains_as_much():
@@ -80,7 +88,7 @@ def test_red_noise_may_be_a_step_that_gains_as_much():
     noise = CommonMode("walk", 0.0, gain, stepped.base, False)
 
     def alike(comparison: Comparison, effect: Mechanism, nats: float) -> tuple[str, ...]:
-        return happened_instead(comparison, Finding(effect.name, effect, "", 1e-4, (0, 1), {}, gain=nats))
+        return instead_of(Finding(effect.name, effect, "", 1e-4, (0, 1), {}, gain=nats), comparison)
 
     assert "step" in alike(stepped, noise, scan.gain + 4)
     assert "step" not in alike(stepped, noise, scan.gain + 6)
@@ -110,7 +118,7 @@ def test_several_steps_may_look_like_slow_noise_and_slow_noise_does_not_look_lik
             if common:
                 effect = CommonMode("walk", 0.0, gain, comparison.base, False)
             finding = Finding(effect.name, effect, "", 1e-4, (0, 1), {}, gain=100.0)
-            said += "step" in happened_instead(comparison, finding)
+            said += "step" in instead_of(finding, comparison)
         told[steps] = said
     assert told == {True: 6, False: 0}
 
@@ -121,20 +129,20 @@ def test_red_noise_beside_several_steps_may_be_more_of_them():
     red = Finding(noise.name, noise, "", 1e-4, (0, 1), {}, gain=10.0)
     one = Step(torch.ones(SENSORS, dtype=torch.float64), torch.zeros(3, SENSORS, dtype=torch.float64), 10.0)
     step_found = Finding(one.name, one, "", 1e-9, (0, 1), {}, gain=50.0)
-    assert happened_instead(plain, red, [step_found]) == ()
-    assert happened_instead(plain, red, [step_found, step_found]) == ("step",)
-    assert happened_instead(plain, red, [step_found, replace(step_found, sensors=(2, 3))]) == ()
+    assert instead_of(red, plain, [step_found]) == ()
+    assert instead_of(red, plain, [step_found, step_found]) == ("step",)
+    assert instead_of(red, plain, [step_found, replace(step_found, sensors=(2, 3))]) == ()
     factors = torch.zeros(4, SENSORS, dtype=torch.float64)
     for row, alike in ((0, ()), (3, ("step",))):
         other = ParameterShift(plain.base, factors.index_fill(0, torch.tensor(row), 0.4))
-        assert happened_instead(plain, replace(red, effect=other), [step_found, step_found]) == alike
+        assert instead_of(replace(red, effect=other), plain, [step_found, step_found]) == alike
 
 
 def test_what_stands_alone_stays_and_its_loss_is_its_gain():
     links, comparison = chain(case_of(1, tone(12.34, 0.15)), VibrationTone)
-    after = settled(links, comparison, LEVEL, generator(0))
-    (link,) = after.links
-    assert after.comparison is comparison
+    after, left = eliminate(links, comparison, LEVEL, generator(0))
+    (link,) = after
+    assert left is comparison
     assert link.finding.gain_without == link.finding.held_out_gain
     assert link.finding.instead is not None
     assert link.finding.instead.mechanism == "resonance"
@@ -145,10 +153,10 @@ def test_what_stands_alone_stays_and_its_loss_is_its_gain():
 def test_two_effects_are_each_judged_with_the_other_in():
     start = case_of(3, tone(12.34, 0.12) + step(0.5))
     links, comparison = chain(start, VibrationTone, Step)
-    first, second = settled(links, comparison, LEVEL, generator(0)).links
+    first, second = eliminate(links, comparison, LEVEL, generator(0))[0]
     # Without the tone: the recording less the step alone.
     left = links[1].finding.effect.repair(start, generator(0))
-    assert first.finding.gain_without == pytest.approx(held_out_gain(left, first.finding.effect).total, rel=1e-9)
+    assert first.finding.gain_without == pytest.approx(score_held_out(left, first.finding.effect).total, rel=1e-9)
     assert second.finding.gain_without == second.finding.held_out_gain
 
 
@@ -161,12 +169,15 @@ def test_what_others_make_needless_is_dropped_and_the_rest_rebuilt():
     weak = replace(effect, frequency_hz=effect.frequency_hz + 0.3 * RATE / N, cosine=0.3 * effect.cosine)
     poor = replace(true.finding, effect=weak, p_value=0.1)
     middle = weak.repair(start, generator(0))
-    links = [Link(poor, start, held_out_gain(start, weak)), Link(true.finding, middle, held_out_gain(middle, effect))]
-    after = settled(links, effect.repair(middle, generator(0)), LEVEL, generator(0))
-    (link,) = after.links
+    links = [
+        Selected(poor, start, score_held_out(start, weak)),
+        Selected(true.finding, middle, score_held_out(middle, effect)),
+    ]
+    after, left = eliminate(links, effect.repair(middle, generator(0)), LEVEL, generator(0))
+    (link,) = after
     assert link.before is start
     assert link.finding.held_out_gain == pytest.approx(true.finding.held_out_gain, rel=1e-9)
-    torch.testing.assert_close(after.comparison.recording, effect.repair(start, generator(0)).recording)
+    torch.testing.assert_close(left.recording, effect.repair(start, generator(0)).recording)
 
 
 def test_a_better_look_alike_takes_the_place():
@@ -177,9 +188,9 @@ def test_a_better_look_alike_takes_the_place():
     assert isinstance(effect, WarmUpTransient)
     wrong = Step(-0.2 * effect.size, effect.log_factors, 0.1 * N / RATE)
     finding = replace(true.finding, mechanism="step", effect=wrong, p_value=1e-9)
-    link = Link(finding, start, held_out_gain(start, wrong))
-    assert link.gain.confirms(1e-9)
-    (after,) = settled([link], wrong.repair(start, generator(0)), LEVEL, generator(0)).links
+    link = Selected(finding, start, score_held_out(start, wrong))
+    assert link.score.confirms(1e-9)
+    (after,) = eliminate([link], wrong.repair(start, generator(0)), LEVEL, generator(0))[0]
     assert after.finding.mechanism == "warm_up_transient"
     assert after.finding.instead is not None
     assert after.finding.instead.mechanism == "step"
@@ -250,26 +261,26 @@ def test_a_name_that_is_not_earned_goes_where_nothing_is_found_in_its_place():
     assert isinstance(effect, WarmUpTransient)
     wrong = Step(-0.2 * effect.size, effect.log_factors, 0.1 * N / RATE)
     finding = replace(true.finding, mechanism="step", effect=wrong, p_value=1e-9)
-    link = Link(finding, start, held_out_gain(start, wrong))
+    link = Selected(finding, start, score_held_out(start, wrong))
     never = 0.0  # level at which no look-alike is found
-    after = settled([link], wrong.repair(start, generator(0)), never, generator(0))
-    assert after.links == []
-    torch.testing.assert_close(after.comparison.recording, start.recording)
+    after, left = eliminate([link], wrong.repair(start, generator(0)), never, generator(0))
+    assert after == []
+    torch.testing.assert_close(left.recording, start.recording)
 
 
 def test_the_converter_is_judged_on_numbers_as_they_came():
     start = case_of(9, tone(12.34, 0.15))
     rounded = start.with_recording((start.recording / 0.5).round() * 0.5)
     links, comparison = chain(rounded, Quantization, VibrationTone)
-    after = settled(links, comparison, LEVEL, generator(0))
-    assert [link.finding.mechanism for link in after.links] == ["quantization", "vibration_tone"]
-    assert after.links[0].finding.gain_without == after.links[0].finding.held_out_gain
+    after, _ = eliminate(links, comparison, LEVEL, generator(0))
+    assert [link.finding.mechanism for link in after] == ["quantization", "vibration_tone"]
+    assert after[0].finding.gain_without == after[0].finding.held_out_gain
 
 
 def test_look_alikes_have_other_names_and_the_same_sensors():
     comparison = case_of(11, step(0.6))
     (link,), _ = chain(comparison, Step)
-    rivals = look_alikes(comparison, link.finding)
+    rivals = rivals_of(link.finding, comparison)
     assert [rival.name for rival in rivals] == ["warm_up_transient"]
     assert isinstance(rivals[0], WarmUpTransient)
     assert rivals[0].size.nonzero()[:, 0].tolist() == list(link.finding.sensors)
@@ -319,11 +330,14 @@ def test_a_rival_within_two_standard_deviations_is_told(monkeypatch, apart: floa
     assert finding is not None
     scatter = 4.0 * (-1.0) ** torch.arange(16)
     difference = scatter + apart * sd_of_sum(scatter) / len(scatter)
-    (peak,) = look_alikes(comparison, finding)
-    gains = {finding.effect: Gain(100 + difference, (), 1.0), peak: Gain(100 + 0 * difference, (), 1.0)}
-    monkeypatch.setattr(counterfactual, "look_alikes", lambda *_: [peak])
-    monkeypatch.setattr(counterfactual, "held_out_gain", lambda _, effect: gains[effect])
-    compared = counterfactual._compared(finding, gains[finding.effect], comparison, [])
+    (peak,) = rivals_of(finding, comparison)
+    gains = {
+        finding.effect: HeldOutScore("spectra", 100 + difference, (), 1.0),
+        peak: HeldOutScore("spectra", 100 + 0 * difference, (), 1.0),
+    }
+    monkeypatch.setattr(alternatives, "rivals_of", lambda *_: [peak])
+    monkeypatch.setattr(alternatives, "score_held_out", lambda _, effect: gains[effect])
+    compared = compare(finding, gains[finding.effect], comparison, [])
     assert compared.alternatives == told
 
 

@@ -24,10 +24,10 @@ from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
-from gyrofuse.mismatch.selection.held_out import Gain, leads_away
+from gyrofuse.mismatch.selection.discrepancy import leads_away
 from gyrofuse.mismatch.signals import prediction_errors
 from gyrofuse.mismatch.signals.comparison import Comparison
-from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED
+from gyrofuse.mismatch.signals.folds import N_FOLDS
 from gyrofuse.mismatch.signals.psd import bands
 from gyrofuse.mismatch.signals.records import Records
 from gyrofuse.mismatch.stats import brownian_range
@@ -279,8 +279,7 @@ def test_a_quiet_time_that_is_not_there_leads_away() -> None:
     effect = VarianceChange(((N / 5 / RATE, N / RATE),), factor)
     for given, away in ((recording, True), (quieter, False)):
         comparison = Comparison.of(SCENE, given, simulation)
-        gain = Gain(torch.zeros(N_JUDGED, dtype=torch.float64), (effect,) * N_FOLDS, 0.0)
-        assert leads_away(comparison, comparison, gain, g) is away
+        assert leads_away(comparison, comparison, (effect,) * N_FOLDS, g) is away
 
 
 def test_bursts_are_no_spikes() -> None:

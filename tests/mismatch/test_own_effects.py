@@ -90,7 +90,7 @@ def test_more_than_the_simulation_has_is_the_difference(change: Callable[[float]
     own, missing = (effect for effect in found.model.effects if isinstance(effect, kind))
     (finding,) = found.findings
     assert finding.effect is missing
-    sizes = [getattr(effect, effect.proportional_to).flatten()[:2] for effect in (own, missing)]
+    sizes = [effect.amplitudes.flatten()[:2] for effect in (own, missing)]
     torch.testing.assert_close(sizes[0] / SIZE[:2], torch.full((2,), 2.0, dtype=torch.float64), rtol=0, atol=0.5)
     torch.testing.assert_close(sizes[1] / SIZE[:2], torch.full((2,), 3.0, dtype=torch.float64), rtol=0, atol=0.7)
     for name, entry in finding.parameters.items():

@@ -17,6 +17,7 @@ import gyrofuse as gf
 from gyrofuse.mismatch import Finding, MismatchReport
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.mechanisms.mechanism import Parameter
+from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
 from gyrofuse.mismatch.repair.inputs import prepared
 from gyrofuse.mismatch.reporting import text as telling
 from gyrofuse.mismatch.reporting.figures_data import compared_powers, compared_variances, grouped_spectrum
@@ -109,7 +110,7 @@ def test_what_is_left_and_what_cannot_be_told_apart_is_said():
     told = page(dataclasses.replace(report(), unexplained=left, findings=(finding,)))
     assert "Unexplained, as seen by: spectrum." in told.text
     assert "Spectrum: power near 3 Hz is twice the simulation's (p = 1e-09)." in told.text
-    assert f"Drifting tone. What would tell: {telling.SEPARATED_BY['drifting_tone']}." in told.text
+    assert f"Drifting tone. What would tell: {DriftingTone.separated_by}." in told.text
     assert "Something new. What would tell: a longer recording." in told.text
     assert ["sets in at", "12 s"] in told.rows
     assert ["follows", "temperature"] in told.rows

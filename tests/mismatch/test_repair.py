@@ -18,13 +18,12 @@ from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel
 from gyrofuse.mismatch.selection.classifier import area_under_curve, distinguishability, features
-from gyrofuse.mismatch.selection.held_out import (
+from gyrofuse.mismatch.selection.discrepancy import (
     discrepancy_left,
     discrepancy_p_value,
-    held_out,
-    held_out_gain,
     mean_discrepancy,
 )
+from gyrofuse.mismatch.selection.held_out import agreement, score_held_out
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.folds import N_FOLDS, estimation_samples, held_out_blocks, in_fold
 
@@ -82,7 +81,7 @@ def test_what_happened_once_is_not_expected_elsewhere():
 def test_a_remainder_has_the_ratio_of_the_spectra():
     f = torch.linspace(0.01, 0.49, 50, dtype=torch.float64)
     coloured = white(1)[0] + 0.8 * white(1)[0].roll(1, -1)
-    found = Remainder.of(comparison(coloured))
+    found = Remainder.left_over(comparison(coloured))
     truth = (1 + 0.64 + 1.6 * torch.cos(2 * math.pi * f)).log() / 2
     assert float((found.response(f).log() - truth).abs().mean()) < 0.08
     before, after = comparison(coloured), found.repair(comparison(coloured), generator(1))
@@ -91,7 +90,7 @@ def test_a_remainder_has_the_ratio_of_the_spectra():
 
 
 def test_nothing_remains_where_nothing_differs():
-    assert float(Remainder.of(comparison(white(1)[0])).log_gain.abs().mean()) < 0.03
+    assert float(Remainder.left_over(comparison(white(1)[0])).log_gain.abs().mean()) < 0.03
 
 
 def test_a_difference_without_a_name_stays_unexplained_and_is_filled_in():
@@ -133,7 +132,7 @@ def test_a_remainder_is_estimated_anew_from_the_blocks_of_the_shortest_recording
     """Their last bands are narrower than a bin of a block."""
     recording, simulation = white(3)[0, :, :n], white(4)[:, :, :n]
     given = Comparison.of(SCENE, 1.5 * recording, simulation)
-    found = Remainder.of(given)
+    found = Remainder.left_over(given)
     for fold in range(N_FOLDS):
         again = found.fit_without(given, fold)
         assert bool(again.log_gain.isfinite().all())
@@ -177,10 +176,10 @@ def test_what_is_left_of_a_slow_course_is_taken_off_as_it_goes_on_in_what_is_hel
     size = torch.zeros(P, 1, dtype=torch.float64)
     size[0], size[1] = 30.0, -20.0
     given = Comparison.of(SCENE, signal[0] + size * bends, signal[1:])
-    course = SlowRemainder.of(given)
-    gain = held_out_gain(given, course)
+    course = SlowRemainder.left_over(given)
+    gain = score_held_out(given, course)
     assert gain.confirms(1e-9)
-    judged = held_out(given, [gain], g)
+    judged = agreement(given, [gain], g)
     assert judged.before > 3
     assert judged.after < 1.5
     left = course.remove(given.recording, SCENE) - signal[0]

@@ -42,9 +42,9 @@ def test_what_was_rounded_had_the_variance_and_the_correlation_of_the_noise(step
     g = generator(1)
     clean = gf.AR1(0.6, 0.64).simulate(2**18, batch=(2, P), generator=g)  # of variance one
     comparison = Comparison.of(SCENE, clean[0], rounded(clean, step))
-    rounding = Quantization.of_simulation(comparison)
+    rounding = Quantization.in_reference(comparison)
     assert rounding is not None
-    undone = rounding.undone(comparison, g)
+    undone = rounding.undo_in_reference(comparison, g)
     assert undone.reference.signal is comparison.reference.signal
     again = undone.apply(lambda x: x).reference.signal
     torch.testing.assert_close(again, comparison.reference.signal, rtol=0, atol=1e-9)
@@ -74,9 +74,9 @@ def test_what_is_built_into_rounded_samples_is_rounded_as_they_are() -> None:
     # What is far smaller than a step is there as well, on average.
     weak = (tone / 10).unsqueeze(0)
     comparison = Comparison.of(SCENE, recording, rounded(noise(N, g), 0.25)[None])
-    rounding = Quantization.of_simulation(comparison)
+    rounding = Quantization.in_reference(comparison)
     assert rounding is not None
-    built = rounding.undone(comparison, g).apply(lambda x: x + weak)
+    built = rounding.undo_in_reference(comparison, g).apply(lambda x: x + weak)
     assert all(lattice is not None for lattice in exact_lattices(built.reference))
     change = built.reference.signal - comparison.reference.signal
     assert float((change * weak).sum() / weak.square().sum()) == pytest.approx(1.0, abs=0.35)
@@ -143,9 +143,9 @@ def test_what_was_rounded_keeps_its_lines_and_what_sensors_share() -> None:
     line = 4 * torch.cos(0.9 * torch.arange(n, dtype=torch.float64))
     clean = (2 * common + white) / math.sqrt(5) + line
     comparison = Comparison.of(SCENE, clean, rounded(clean, 0.5)[None]).knowing((0.9 / (2 * math.pi),))
-    rounding = Quantization.of_simulation(comparison)
+    rounding = Quantization.in_reference(comparison)
     assert rounding is not None
-    analog = rounding.undone(comparison, g).analog[0]
+    analog = rounding.undo_in_reference(comparison, g).analog[0]
     amplitude = 2 * (analog * torch.cos(0.9 * torch.arange(n))).mean(-1)
     torch.testing.assert_close(amplitude, torch.full((P,), 4.0, dtype=torch.float64), rtol=0, atol=0.015)
     shared = torch.cov(analog - line) - torch.cov(clean - line)

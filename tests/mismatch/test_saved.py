@@ -47,7 +47,7 @@ from gyrofuse.mismatch.mechanisms.values.unit_scale import UnitScale
 from gyrofuse.mismatch.repair import serialise as saved
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel
 from gyrofuse.mismatch.repair.serialise import repaired_from_dict
-from gyrofuse.mismatch.signals.axes import Axes
+from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.comparison import RecordingInfo
 from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
 
@@ -109,7 +109,7 @@ EVERY = (
 class Odd(Mechanism):
     name: ClassVar[str] = "odd"
     base: NoiseSpectrum
-    limits: Annotated[Tensor, Axes(("sensor",), infinite=True)]
+    limits: Annotated[Tensor, Dims(("sensor",), infinite=True)]
     spans: tuple[tuple[float, float], ...]
     channel: str
     together: bool

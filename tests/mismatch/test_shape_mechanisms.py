@@ -35,7 +35,7 @@ from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
 from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
 from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.values.unit_scale import GRAVITY, UnitScale
-from gyrofuse.mismatch.selection.held_out import held_out_gain
+from gyrofuse.mismatch.selection.held_out import score_held_out
 from gyrofuse.mismatch.signals.filters import filtered, noise
 from gyrofuse.noise.array_model import ArrayModel
 
@@ -96,7 +96,7 @@ def test_what_is_missing_is_named_measured_and_explained(name: str):
         assert entry.low < entry.value < entry.high
         # Four standard deviations; one estimate is no test of coverage.
         assert abs(entry.value - value) < 2.1 * (entry.high - entry.low) / 2, key
-    assert held_out_gain(given, found.effect).confirms(found.p_value)
+    assert score_held_out(given, found.effect).confirms(found.p_value)
     explained = found.effect.repair(given, generator(1))
     assert shape_test(explained).p_value > 1e-4
     assert nominated(explained, 1e-4) is None  # a tenth of the level that the first one was held to

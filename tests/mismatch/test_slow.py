@@ -40,7 +40,7 @@ from gyrofuse.mismatch.mechanisms.signals.slow_effect import quantiles
 from gyrofuse.mismatch.mechanisms.signals.step import Step
 from gyrofuse.mismatch.mechanisms.signals.temperature import TemperatureDrift, _beats_surrogates
 from gyrofuse.mismatch.mechanisms.signals.warm_up import WarmUpTransient
-from gyrofuse.mismatch.selection.held_out import held_out_gain
+from gyrofuse.mismatch.selection.held_out import score_held_out
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo, block_means
 from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum, _time_constants
 from gyrofuse.mismatch.stats.curve_maximum import curve_length, expected_exceedances
@@ -333,7 +333,7 @@ def test_an_effect_is_found_by_its_name(mechanism, path: torch.Tensor, place: st
         entry = finding.parameters[f"{size}[{i}]"]
         sd = (entry.high - entry.low) / 3.92
         assert abs(entry.value - scale * float(SIZE[i])) < 4 * sd
-    assert held_out_gain(now, finding.effect).confirms(finding.p_value)
+    assert score_held_out(now, finding.effect).confirms(finding.p_value)
     after = finding.effect.repair(now, generator(1))
     assert slow_test(after).p_value > 0.01
     back = finding.effect.apply(finding.effect.remove(now.recording, now.info), now.info, generator(1))
@@ -380,7 +380,7 @@ def test_an_effect_of_another_form_is_found_with_that_form(mechanism, path, numb
         assert "time constants of" in finding.sentence
     else:
         assert "in a line that is bent" in finding.sentence
-    assert held_out_gain(now, finding.effect).confirms(finding.p_value)
+    assert score_held_out(now, finding.effect).confirms(finding.p_value)
     after = finding.effect.repair(now, generator(1))
     assert slow_test(after).p_value > 0.01
     back = finding.effect.apply(finding.effect.remove(now.recording, now.info), now.info, generator(1))
@@ -483,7 +483,7 @@ def test_several_large_steps_are_no_walk():
         assert finding is not None
         assert finding.sensors == (2,)
         assert finding.alternatives == ()
-        assert held_out_gain(now, finding.effect).confirms(finding.p_value)
+        assert score_held_out(now, finding.effect).confirms(finding.p_value)
         found[round(finding.time_s * RATE)] = float(finding.effect.size[2])
         now = finding.effect.repair(now, generator(1))
     for (at, size), (true, jump) in zip(sorted(found.items()), sizes.items(), strict=True):

@@ -34,7 +34,7 @@ from gyrofuse.mismatch.likelihoods.telegraph_fit import (
 from gyrofuse.mismatch.mechanisms.regimes import telegraph as random_telegraph
 from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph, _path
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape
-from gyrofuse.mismatch.selection.held_out import held_out_gain
+from gyrofuse.mismatch.selection.held_out import score_held_out
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.folds import N_JUDGED
 
@@ -220,7 +220,7 @@ def test_two_levels_are_named_where_noise_is_coloured() -> None:
             continue
         named += 1
         assert found.sensors == (1,)
-        gain = held_out_gain(comparison, found.effect)
+        gain = score_held_out(comparison, found.effect)
         assert gain.blocks.shape == (N_JUDGED,)
         assert gain.total > gain.sd
         truth = {"half_step[1]": LEVELS.half, "dwell_up[1]": LEVELS.up / 100, "dwell_down[1]": LEVELS.down / 100}

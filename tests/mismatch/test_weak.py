@@ -26,7 +26,7 @@ from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
-from gyrofuse.mismatch.selection.held_out import held_out_gain
+from gyrofuse.mismatch.selection.held_out import score_held_out
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.stats import level_scan
 from gyrofuse.mismatch.stats import segments as episodes
@@ -87,7 +87,7 @@ def test_shocks_too_weak_for_any_sensor_alone_are_named() -> None:
         assert isinstance(found.effect, Spikes)
         named += found.sensors == (0, 2) and found.effect.together
         inside += covers(found, "rate", 3e-3 * RATE * 3600) if found.effect.together else 0
-        gain = held_out_gain(comparison, found.effect)
+        gain = score_held_out(comparison, found.effect)
         assert gain.total > gain.sd
         if not seed:
             assert Spikes.detect_and_fit(found.effect.repair(comparison, g), LEVEL) is None
@@ -237,7 +237,7 @@ def test_a_dead_band_is_found_among_values_that_do_not_recur() -> None:
         assert isinstance(found.effect, DeadBand)
         assert (found.mechanism, found.sensors) == ("quantization", (0, 1))
         inside += covers(found, "dead_band[0]", half_width) + covers(found, "dead_band[1]", half_width)
-        gain = held_out_gain(comparison, found.effect)
+        gain = score_held_out(comparison, found.effect)
         assert gain.total > gain.sd
         after = found.effect.repair(comparison, g)
         assert values_test(after).p_value > 0.001

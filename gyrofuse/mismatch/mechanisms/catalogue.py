@@ -7,6 +7,7 @@ stage the best one is taken first, and the stage is gone through again.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterable
 
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
@@ -50,6 +51,14 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (ParameterShift, LowPassFilter, Resonance, DriftingTone, FlickerNoise, CommonMode),
 )
 
-# Every mechanism that a repaired simulation may have: a dead band is looked for where no lattice is found, the
-# remainders once nothing with a name is left.
-CATALOGUE: tuple[type[Mechanism], ...] = (*itertools.chain(*STAGES), DeadBand, Remainder, SlowRemainder)
+# What is left of slow courses and of spectra once nothing with a name is found any more.
+UNNAMED: tuple[type[SlowRemainder] | type[Remainder], ...] = (SlowRemainder, Remainder)
+
+# Every mechanism that a repaired simulation may have; a dead band is looked for where no quantisation grid is found.
+CATALOGUE: tuple[type[Mechanism], ...] = (*itertools.chain(*STAGES), DeadBand, *UNNAMED)
+
+
+def named(names: Iterable[str]) -> list[type[Mechanism]]:
+    """Mechanisms of the stages that have one of these names, in their order; several forms may share a name."""
+    wanted = frozenset(names)
+    return [kind for kind in itertools.chain(*STAGES) if kind.name in wanted]

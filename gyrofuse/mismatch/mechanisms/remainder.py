@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.mechanisms.spectra.spectral import Filter
-from gyrofuse.mismatch.signals.axes import Axes
 from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.folds import N_JUDGED, estimation_samples
 from gyrofuse.mismatch.signals.records import Records
 
@@ -30,12 +30,18 @@ class Remainder(Filter):
     """
 
     name: ClassVar[str] = "remainder"
+    identified: ClassVar[bool] = False
+    refit_after_others: ClassVar[bool] = True
+    remark: ClassVar[str] = (
+        "So that the repaired simulation has the recording's spectra all the same, the noise of each sensor passes "
+        "a filter that stands for no physics."
+    )
     asked_for_by: ClassVar[tuple[str, ...]] = ("spectrum", "shape", "bump")  # witnesses
-    frequency: Annotated[Tensor, Axes(("band",))]
-    log_gain: Annotated[Tensor, Axes(("sensor", "band"))]
+    frequency: Annotated[Tensor, Dims(("band",))]
+    log_gain: Annotated[Tensor, Dims(("sensor", "band"))]
 
     @classmethod
-    def of(cls, comparison: Comparison) -> Remainder:
+    def left_over(cls, comparison: Comparison) -> Remainder:
         """What the spectra ask for."""
         return cls._between(comparison.observed, comparison.reference)
 

@@ -17,8 +17,8 @@ from torch import Tensor
 from gyrofuse.mismatch.detectors.slow.scans import slow_look
 from gyrofuse.mismatch.likelihoods.slow_noise import best_fit
 from gyrofuse.mismatch.mechanisms.signals.slow_effect import SlowEffect
-from gyrofuse.mismatch.signals.axes import Axes
 from gyrofuse.mismatch.signals.comparison import N_BLOCKS, Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, in_fold
 
 _COSINES = 32  # half cycles in the record: as many as there are blocks, of which each is told by those beside it
@@ -37,15 +37,17 @@ class SlowRemainder(SlowEffect):
     """
 
     name: ClassVar[str] = "slow_remainder"
+    identified: ClassVar[bool] = False
+    remark: ClassVar[str] = "A slow course that is left in this recording is taken off it; it stands for no physics."
     asked_for_by: ClassVar[tuple[str, ...]] = ("slow", "hysteresis")  # witnesses
     happened_once: ClassVar[bool] = True
     changes_noise: ClassVar[bool] = True  # of the lowest frequencies, where it follows what is none
-    proportional_to: ClassVar[str] = ""
-    further: Annotated[Tensor, Axes(("sensor", "cosine"))]
+    known_path: ClassVar[bool] = False
+    further: Annotated[Tensor, Dims(("sensor", "cosine"))]
     n_samples: int
 
     @classmethod
-    def of(cls, comparison: Comparison) -> SlowRemainder:
+    def left_over(cls, comparison: Comparison) -> SlowRemainder:
         """What is plainly more than the simulation's slow noise."""
         look = slow_look(comparison)
         slowest = torch.eye(_COSINES, look.y.shape[-1], dtype=look.y.dtype)

@@ -10,19 +10,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import replace
-from typing import Any, cast
 
 import torch
 from scipy import special
 from torch import Tensor
 
-from gyrofuse.mismatch.mechanisms.catalogue import STAGES
+from gyrofuse.mismatch.mechanisms.catalogue import CATALOGUE, STAGES
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
-from gyrofuse.mismatch.mechanisms.signals.slow_effect import SlowEffect
-from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel
-from gyrofuse.mismatch.selection.held_out import held_out_gain
+from gyrofuse.mismatch.selection.held_out import score_held_out
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.folds import N_FOLDS
 
@@ -45,18 +41,19 @@ def with_own_effects(
     own: list[Mechanism] = []
     if isinstance(simulation, RepairedModel):
         # In the order in which they act; what the converter does a case does again by itself.
-        for effect in sorted(simulation.effects, key=lambda effect: effect.taken_off):
-            if not effect.happened_once or held_out_gain(comparison, effect).as_found > 0:
+        for effect in sorted(simulation.effects, key=lambda effect: effect.additive):
+            if not effect.happened_once or score_held_out(comparison, effect).in_sample > 0:
                 comparison = effect.apply_elsewhere(comparison, generator)
                 own.append(effect)
         return comparison, tuple(own)
-    rounding = Quantization.of_simulation(comparison)
-    if rounding is not None:
-        comparison = rounding.undone(comparison, generator)
-        own.append(rounding)
+    for kind in CATALOGUE:
+        found = kind.in_reference(comparison)
+        if found is not None:
+            comparison = found.undo_in_reference(comparison, generator)
+            own.append(found)
     if comparison.reference.signal.shape[-1] == comparison.n_samples:
         for stage in STAGES:
-            kinds = [kind for kind in stage if kind.proportional_to]
+            kinds = [kind for kind in stage if kind.known_path]
             while kinds and len(own) < _MOST and (shared := _shared(comparison, kinds, level)):
                 comparison = _without(comparison, shared)
                 own.append(shared)
@@ -82,11 +79,11 @@ def _shared(comparison: Comparison, kinds: Iterable[type[Mechanism]], level: flo
     return _scaled(alone, 1 / math.sqrt(len(records)))
 
 
-def _has(reference: Comparison, effect: Mechanism, level: float) -> bool:
+def _has(simulated: Comparison, effect: Mechanism, level: float) -> bool:
     """Whether a simulation has an effect whose numbers were fitted to it: chance alone gives each half a nat."""
-    gain = held_out_gain(reference, effect)
-    numbers = int(_sizes(effect).count_nonzero())
-    return gain.confirms(level) and float(special.chdtrc(numbers, 2 * gain.as_found)) < level
+    score = score_held_out(simulated, effect)
+    numbers = int(effect.amplitudes.count_nonzero())
+    return score.confirms(level) and float(special.chdtrc(numbers, 2 * score.in_sample)) < level
 
 
 def _strongest(comparison: Comparison, kinds: Iterable[type[Mechanism]], level: float) -> Finding | None:
@@ -100,24 +97,13 @@ def _summed(records: Tensor) -> Tensor:
 
 
 def _resized(effect: Mechanism, comparison: Comparison) -> Mechanism:
-    """With the numbers that a case's recording has."""
-    sizes = [_sizes(effect.fit_without(comparison, fold)) for fold in range(N_FOLDS)]
-    return _with_size(effect, torch.stack(sizes).mean(0))
+    """With the amplitudes that a comparison's recording has."""
+    amplitudes = [effect.fit_without(comparison, fold).amplitudes for fold in range(N_FOLDS)]
+    return effect.with_amplitudes(torch.stack(amplitudes).mean(0))
 
 
 def _scaled(effect: Mechanism, factor: float) -> Mechanism:
-    return _with_size(effect, factor * _sizes(effect))
-
-
-def _sizes(effect: Mechanism) -> Tensor:
-    """All numbers that it is proportional to; slow effects may have several paths."""
-    return effect.sizes if isinstance(effect, SlowEffect) else cast(Tensor, getattr(effect, effect.proportional_to))
-
-
-def _with_size(effect: Mechanism, size: Tensor) -> Mechanism:
-    if isinstance(effect, SlowEffect):
-        return effect.with_sizes(size)
-    return cast(Mechanism, replace(cast(Any, effect), **{effect.proportional_to: size}))
+    return effect.with_amplitudes(factor * effect.amplitudes)
 
 
 def _without(comparison: Comparison, effect: Mechanism) -> Comparison:

@@ -1,6 +1,6 @@
 """A repaired simulation read back from plain numbers.
 
-A field of a mechanism comes back as what it is declared to be: `typing.get_type_hints` tells its kind, the `Axes`
+A field of a mechanism comes back as what it is declared to be: `typing.get_type_hints` tells its kind, the `Dims`
 beside a tensor its shape. What fits its declaration may still be absurd, so each effect has to act on a short record.
 """
 
@@ -19,8 +19,8 @@ from gyrofuse._base.checks import check_n_samples, check_positive
 from gyrofuse.mismatch.mechanisms.catalogue import CATALOGUE
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel
-from gyrofuse.mismatch.signals.axes import Axes
 from gyrofuse.mismatch.signals.comparison import RecordingInfo
+from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.parsing import model_from_dict
 
@@ -144,7 +144,7 @@ def _finite(value: float) -> bool:
         return False
 
 
-def _tensor(value: Any, axes: Axes, where: str, lengths: dict[str, int]) -> Tensor:
+def _tensor(value: Any, axes: Dims, where: str, lengths: dict[str, int]) -> Tensor:
     """A tensor of float64, or where it is complex from its parts."""
     if axes.complex:
         if not isinstance(value, Mapping) or not {"real", "imag"} <= set(value):

@@ -55,7 +55,7 @@ class Benefit:
         return cleaned({name: value.tolist() for name, value in tensors.items()} | {"factor": self.factor})
 
 
-def benefit(recording: Tensor, sidak: Tensor, scale_weights: ScaleWeights) -> Benefit:
+def benefit(recording: Tensor, corrected: Tensor, scale_weights: ScaleWeights) -> Benefit:
     """Fuse a recording `(sensor, time)` before and after correction.
 
     Args:
@@ -63,7 +63,7 @@ def benefit(recording: Tensor, sidak: Tensor, scale_weights: ScaleWeights) -> Be
         corrected: Without what can be taken off it.
         scale_weights: `"flat"`, `"short"`, `"long"`, or one number >= 0 per level.
     """
-    moments = [wavelet_cross_covariance(signal) for signal in (recording, sidak)]
+    moments = [wavelet_cross_covariance(signal) for signal in (recording, corrected)]
     omega = resolve_scale_weights(scale_weights, len(moments[0]))
     weights = [svo_weights(wccv, omega) for wccv in moments]
     variances = [torch.einsum("i,jik,k->j", w, wccv, w) for w, wccv in zip(weights, moments, strict=True)]

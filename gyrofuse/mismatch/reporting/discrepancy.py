@@ -9,7 +9,7 @@ from gyrofuse.io.recording import Recording
 from gyrofuse.mismatch.detectors.tests import TESTS
 from gyrofuse.mismatch.repair.inputs import Simulation, modelled, prepared
 from gyrofuse.mismatch.repair.reference_effects import with_own_effects
-from gyrofuse.mismatch.selection.held_out import mean_discrepancy
+from gyrofuse.mismatch.selection.discrepancy import mean_discrepancy
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.stats.multiplicity import sidak_level
 

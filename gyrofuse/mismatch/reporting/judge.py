@@ -18,7 +18,7 @@ from gyrofuse.mismatch.repair.inputs import prepared
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel
 from gyrofuse.mismatch.reporting.discrepancy import compared
 from gyrofuse.mismatch.selection.classifier import distinguishability
-from gyrofuse.mismatch.selection.held_out import discrepancy_of_fold
+from gyrofuse.mismatch.selection.discrepancy import discrepancy_of_fold
 from gyrofuse.mismatch.signals.folds import N_FOLDS
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.model import Model

@@ -75,8 +75,8 @@ class Outcome:
         other_unit = recording.unit != info.unit and "unknown" not in (recording.unit, info.unit)
         converted = recording.to(info.unit) if other_unit else recording
         own = replace(self.model, info=replace(info, channels={**info.channels, **recording.channels}))
-        sidak = replace(converted, signal=own.correct(converted.signal.double()).to(signal.dtype))
-        return sidak.to(recording.unit) if other_unit else sidak
+        corrected = replace(converted, signal=own.correct(converted.signal.double()).to(signal.dtype))
+        return corrected.to(recording.unit) if other_unit else corrected
 
     def benefit(self, scale_weights: ScaleWeights = "long") -> Benefit:
         """Fuse the recording before and after correction: what the virtual gyro gains by it.

@@ -12,16 +12,16 @@ import torch
 from gyrofuse._base.axes import with_unit
 from gyrofuse._base.page import image, number, render
 from gyrofuse._base.results import format_p_value
-from gyrofuse.mismatch.mechanisms.catalogue import STAGES
+from gyrofuse.mismatch.mechanisms.catalogue import STAGES, named
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter, readable
 from gyrofuse.mismatch.reporting.figures_data import VarianceComparison, compared_powers, grouped_spectrum
 from gyrofuse.mismatch.reporting.outcome import Outcome
 from gyrofuse.mismatch.reporting.plots import ends_of_colours, plot_blocks, plot_deviations, plot_map, plot_spectra
 from gyrofuse.mismatch.reporting.text import (
     ALIKE,
-    SEPARATED_BY,
     benefit_of,
     capital,
+    family_words,
     fused_words,
     nats,
     otherwise_words,
@@ -64,6 +64,7 @@ def mismatch_page(outcome: Outcome, *, title: str, remarks: Sequence[str] = ()) 
         Path(__file__).parent / "mismatch.html.j2",
         title=title,
         outcome=outcome,
+        family_words=family_words,
         info=info,
         verdict=[_typeset(sentence) for sentence in verdict(outcome)],
         remarks=remarks,
@@ -114,12 +115,11 @@ def _clarity(finding: Finding, sensor: int) -> float:
 def _part(outcome: Outcome, finding: Finding) -> dict[str, Any]:
     """What the page shows of one finding."""
     info = outcome.comparison.info
-    when = "largest at" if finding.mechanism == "spikes" else "sets in at"
     facts = {
         "sensors": _names(outcome, finding.sensors),
         "averaging times": _times(finding.levels, info.rate),
         "frequency": "" if finding.frequency_hz is None else f"{number(finding.frequency_hz, 6)} Hz",
-        when: "" if finding.time_s is None else f"{number(finding.time_s, 6)} s",
+        finding.effect.time_words: "" if finding.time_s is None else f"{number(finding.time_s, 6)} s",
         "follows": finding.channel or "",
         "p value": format_p_value(finding.p_value),
         "gain held out": "" if finding.held_out_gain is None else f"{finding.held_out_gain:+.1f} nats",
@@ -134,7 +134,7 @@ def _part(outcome: Outcome, finding: Finding) -> dict[str, Any]:
             for name, entry in finding.parameters.items()
         ],
         "alternatives": [
-            {"name": readable(name), "by": SEPARATED_BY.get(name, "a longer recording")}
+            {"name": readable(name), "by": next((kind.separated_by for kind in named([name])), "a longer recording")}
             for name in finding.alternatives
         ],
     }

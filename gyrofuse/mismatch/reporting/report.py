@@ -11,7 +11,14 @@ from gyrofuse._base.results import p_words
 from gyrofuse.mismatch.reporting.outcome import Outcome
 from gyrofuse.mismatch.reporting.page import mismatch_page
 from gyrofuse.mismatch.reporting.plots import plot_map
-from gyrofuse.mismatch.reporting.text import fused_words, judged_words, nats, otherwise_words, parameter_words
+from gyrofuse.mismatch.reporting.text import (
+    family_words,
+    fused_words,
+    judged_words,
+    nats,
+    otherwise_words,
+    parameter_words,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,11 +32,11 @@ class MismatchReport(Outcome):
         mismatch: Whether they differ at all.
         p_value: Of agreement, for the whole recording.
         findings: Differences with names, in the order in which they were found.
-        unexplained: What witnesses still see after the repair.
+        unexplained: Results of tests that still see a difference after the repair.
         held_out: Agreement on data not used for the repair.
         model: The repaired simulation; it simulates.
-        evidence: What each witness saw before the repair.
-        evidence_after: What each witness saw after it.
+        evidence: Results of all tests before the repair.
+        evidence_after: Results of all tests after it.
         recording: As it came, `(sensor, time)`.
         comparison: Recording and simulation; of a repaired one, its noise, and the recording without its effects.
         repaired: The recording without what can be taken off it, and the simulation with all else.
@@ -58,8 +65,8 @@ class MismatchReport(Outcome):
         h = self.held_out
         lines.append(
             f"On data held out: discrepancy {h.before:.2f} before and {h.after:.2f} after repair (1 = noise alone), "
-            f"gain {h.gain:.1f} nats ({h.low:.1f} to {h.high:.1f}); a classifier tells the two apart with an area "
-            f"under the curve of {h.auc_before:.2f} before and {h.auc_after:.2f} after (0.5 = guessing)"
+            f"log score: {family_words(h)}; a classifier tells the two apart with an area under the curve of "
+            f"{h.auc_before:.2f} before and {h.auc_after:.2f} after (0.5 = guessing)"
         )
         return "\n".join([*lines, *self.notes, *judged_words(self), *fused_words(self)])
 

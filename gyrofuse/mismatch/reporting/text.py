@@ -7,37 +7,11 @@ import re
 from gyrofuse._base.linalg import SingularCovarianceError
 from gyrofuse._base.results import p_words
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, readable
-from gyrofuse.mismatch.mechanisms.remainder import Remainder
-from gyrofuse.mismatch.mechanisms.slow_remainder import SlowRemainder
 from gyrofuse.mismatch.reporting.benefit import Benefit
 from gyrofuse.mismatch.reporting.outcome import Outcome
+from gyrofuse.mismatch.selection.held_out import HeldOut
 
 ALIKE = 0.01  # relative change of a variance that is not worth a word
-
-# What tells a mechanism from its look-alikes, beyond the recording at hand.
-SEPARATED_BY = {
-    "vibration_tone": "a longer recording: the line gets as narrow as one over its length",
-    "drifting_tone": "a longer recording, over which the frequency moves by more than its own width",
-    "resonance": "a longer recording: the envelope of noise through a resonance is Rayleigh distributed",
-    "quadratic_coupling": "acceleration recorded along with the rates",
-    "low_pass": "a higher sampling rate, or the response to a known motion",
-    "quantization": "the values as the converter gives them, before filters and averages",
-    "clipping": "the full scale of the sensor, or a recording at another level",
-    "stuck_samples": "counters or timestamps of the samples",
-    "spikes": "more events, or a second sensor on the same supply",
-    "variance_change": "a longer recording with more than one change",
-    "random_telegraph": "a longer recording with more switches",
-    "step": "a longer recording on either side",
-    "temperature_drift": "a recording with temperature, over a temperature that goes up and down",
-    "warm_up_transient": "a second recording from power-on, and one of the warm device",
-    "flicker": "a recording ten times as long",
-    "g_sensitivity": "acceleration recorded along with the rates, in several attitudes",
-    "common_mode": "one sensor mounted apart, or on another supply",
-    "scale_factor": "a recording on a table that turns at known rates",
-    "clock_skew": "timestamps of each sensor, or a known motion that all of them feel",
-    "not_identifiable": "the same under another motion, at another sampling rate, or with another channel",
-    "parameter_shift": "a longer recording, or one of the same device under other conditions",
-}
 
 
 def verdict(outcome: Outcome) -> list[str]:
@@ -46,30 +20,23 @@ def verdict(outcome: Outcome) -> list[str]:
         most = min(outcome.evidence, key=lambda e: e.p_value)
         return [
             f"Recording and simulation agree: p = {outcome.p_value:.2g} if nothing is missing.",
-            f"What surprises most among {len(outcome.evidence)} witnesses, {readable(most.test)}, is no more "
+            f"What surprises most among {len(outcome.evidence)} tests, {readable(most.test)}, is no more "
             f"than chance gives (p = {most.p_value:.2g}).",
             *outcome.notes,
             *(f"{words}." for words in judged_words(outcome)),
         ]
     sentences = [f"Recording and simulation differ: {p_words(outcome.p_value)} if nothing were missing."]
-    if all(f.mechanism == "not_identifiable" for f in outcome.findings):
+    if not any(f.identified for f in outcome.findings):
         sentences.append("What the simulation leaves out could not be named.")
     sentences += [f"{capital(f.sentence)}." for f in outcome.findings]
-    h = outcome.held_out
-    if outcome.findings:
+    if outcome.held_out.families:
         sentences.append(
-            "On data that no number was estimated from, the repaired simulation predicts the recording better by "
-            f"{nats(h.gain)} nats (95 % interval {nats(h.low)} to {nats(h.high)})."
+            "On data that no number was estimated from, the repaired simulation predicts the recording better: "
+            f"{family_words(outcome.held_out)}."
         )
     left = ", ".join(readable(e.test) for e in outcome.unexplained)
-    sentences.append(f"Unexplained, as seen by: {left}." if left else "After the repair no witness sees a difference.")
-    if any(isinstance(effect, Remainder) for effect in outcome.model.effects):
-        sentences.append(
-            "So that the repaired simulation has the recording's spectra all the same, the noise of each sensor passes "
-            "a filter that stands for no physics."
-        )
-    if any(isinstance(effect, SlowRemainder) for effect in outcome.model.effects):
-        sentences.append("A slow course that is left in this recording is taken off it; it stands for no physics.")
+    sentences.append(f"Unexplained, as seen by: {left}." if left else "After the repair no test sees a difference.")
+    sentences += dict.fromkeys(effect.remark for effect in outcome.model.effects if effect.remark)
     judged = [f"{words}." for words in judged_words(outcome)]
     return [*sentences, *outcome.notes, *judged, *fused_words(outcome)]
 
@@ -149,3 +116,11 @@ def parameter_words(name: str, sensors: tuple[str, ...]) -> str:
 def capital(sentence: str) -> str:
     """With a capital first letter and no full stop."""
     return sentence[:1].upper() + sentence[1:].rstrip(".")
+
+
+def family_words(held_out: HeldOut) -> str:
+    """Held-out log scores, likelihood by likelihood: each is of data of its own, and they are not added up."""
+    return ", ".join(
+        f"{name} by {nats(score.value)} nats (95 % interval {nats(score.low)} to {nats(score.high)})"
+        for name, score in held_out.families.items()
+    )

@@ -1,95 +1,82 @@
-"""What would be without a finding, or with its best look-alike instead; findings that others make needless go.
+"""Backward elimination: findings that others make needless go, and a name that loses to a rival is taken back.
 
-Each is judged with all the others in: a wandering spur that was taken for several tones needs fewer once its band is
-explained. Only what changes is estimated anew.
+Each finding is judged with all the others in: a wandering spectral line that was taken for several tones needs fewer
+once its band is explained. Only what changes is estimated again.
 """
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import torch
 
-from gyrofuse.mismatch.detectors.slow.scans import slow_look
-from gyrofuse.mismatch.mechanisms.catalogue import STAGES
-from gyrofuse.mismatch.mechanisms.mechanism import Alternative, Finding, Mechanism, Parameter, readable
-from gyrofuse.mismatch.mechanisms.not_identifiable import NOT_IDENTIFIABLE
-from gyrofuse.mismatch.mechanisms.signals.slow_effect import SlowEffect
-from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
-from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
-from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
-from gyrofuse.mismatch.selection.alternatives import happened_instead, look_alikes
-from gyrofuse.mismatch.selection.held_out import Gain, held_out_gain, sd_of_sum
-from gyrofuse.mismatch.signals.comparison import Comparison, block_means
-
-_AS_GOOD_SD, _AS_GOOD = 2.0, 3.0  # differences of gains that are chance: in standard deviations, and in nats
+from gyrofuse.mismatch.mechanisms.catalogue import named
+from gyrofuse.mismatch.mechanisms.mechanism import Finding
+from gyrofuse.mismatch.selection.alternatives import compare
+from gyrofuse.mismatch.selection.forward import Selected
+from gyrofuse.mismatch.selection.held_out import HeldOutScore, score_held_out
+from gyrofuse.mismatch.signals.comparison import Comparison
 
 
-class Link(NamedTuple):
-    """A finding, and the case that it explains.
+def eliminate(
+    selected: list[Selected], comparison: Comparison, level: float, generator: torch.Generator
+) -> tuple[list[Selected], Comparison]:
+    """Drop findings that others make needless, and set those that stay against their rivals.
 
-    Attributes:
-        finding: It.
-        before: What it was found in.
-        gain: Its gain there.
-    """
-
-    finding: Finding
-    before: Comparison
-    gain: Gain
-
-
-class Settled(NamedTuple):
-    """Findings that stay, and what is left.
-
-    Attributes:
-        links: In the order in which they were found.
-        comparison: With all of them explained.
-    """
-
-    links: list[Link]
-    comparison: Comparison
-
-
-def settled(links: list[Link], comparison: Comparison, level: float, generator: torch.Generator) -> Settled:
-    """Drop findings that others make needless, and set those that stay against their look-alikes.
-
-    A name is earned: what loses to a look-alike by more than chance takes the name of what is found in its place, or
-    goes and is left to be told as unexplained. So does a line that another finding tells already.
+    What loses to a rival by more than chance takes the name of what is found in its place, or goes and is left as
+    unexplained. So does a spectral line that another finding explains already.
 
     Args:
-        links: Findings in order.
-        comparison: With all of them explained.
-        level: Largest p value of a look-alike that takes a finding's place.
-        generator: Of what is built into simulations.
+        selected: Findings in order.
+        comparison: Recording and simulation with all of them repaired.
+        level: Largest p value of a rival that takes a finding's place.
+        generator: Source of the random numbers of what is applied to the simulation.
+
+    Returns:
+        Findings that stay, with their alternatives, and recording and simulation with all of them repaired.
     """
     swapped = renamed = False
     while True:
-        links, comparison, judged = _pruned(links, comparison, generator)
+        selected, comparison, without = _pruned(selected, comparison, generator)
         found = []
-        for k, (link, (gain, left)) in enumerate(zip(links, judged, strict=True)):
-            told = _compared(link.finding, gain, left, [other.finding for other in links if other is not link])
-            better = None if swapped else _better(links[k:], told, left, level, generator)
+        for k, (one, (score, left)) in enumerate(zip(selected, without, strict=True)):
+            finding = compare(one.finding, score, left, [other.finding for other in selected if other is not one])
+            better = None if swapped else _with_rival(selected[k:], finding, left, level, generator)
             if better is not None:
                 swapped = True
-                links, comparison = _relinked(links[:k], better, link.before, generator)
+                selected, comparison = _repaired(selected[:k], better, one.before, generator)
                 break
-            found.append(link._replace(finding=told))
+            found.append(one._replace(finding=finding))
         else:
-            unearned = _unearned([link.finding for link in found], comparison)
-            if not unearned:
-                return Settled(found, comparison)
-            names = set() if renamed else _in_their_place([found[k].finding for k in unearned])
-            links, comparison = _renamed(links, unearned, names, level, generator)
+            lost = _lost([one.finding for one in found], comparison)
+            if not lost:
+                return found, comparison
+            names = set() if renamed else _names_instead([found[k].finding for k in lost])
+            selected, comparison = _renamed(selected, lost, names, level, generator)
             renamed = True
 
 
-def _unearned(findings: list[Finding], comparison: Comparison) -> list[int]:
-    """Positions of findings that lose to a look-alike by more than chance, and of lines that another one tells."""
+def same_line(first: Finding, second: Finding, comparison: Comparison) -> bool:
+    """Whether two findings are one spectral line: closer than its width.
+
+    A tone may stand on a resonance, whose width is none of its own.
+    """
+    if first.frequency_hz is None or second.frequency_hz is None:
+        return False
+    widths = [f.effect.line_width(f.parameters, comparison) for f in (first, second)]
+    known = [width for width in widths if width is not None]
+    if len(known) < 2 or not set(first.sensors) & set(second.sensors):
+        return False
+    width = min(known) if first.effect.broad or second.effect.broad else max(known)
+    return abs(first.frequency_hz - second.frequency_hz) < width
+
+
+def _lost(findings: list[Finding], comparison: Comparison) -> list[int]:
+    """Positions of findings that lose to a rival by more than chance, and of lines that another one explains."""
     twice = {
-        k if _strength(findings[k]) < _strength(findings[j]) else j
+        k if (findings[k].held_out_gain or 0.0) < (findings[j].held_out_gain or 0.0) else j
         for j, k in itertools.combinations(range(len(findings)), 2)
         if same_line(findings[j], findings[k], comparison)
     }
@@ -101,170 +88,102 @@ def _unearned(findings: list[Finding], comparison: Comparison) -> list[int]:
     return sorted(beaten | twice)
 
 
-def _strength(finding: Finding) -> float:
-    return finding.held_out_gain or 0.0
-
-
-def same_line(first: Finding, second: Finding, comparison: Comparison) -> bool:
-    """Whether two findings are of one line: closer than its width, for a tone that the record shows or its wander has.
-
-    A tone may stand on a resonance, whose width is none of its own.
-    """
-    if first.frequency_hz is None or second.frequency_hz is None:
-        return False
-    widths = [_line_width(f.effect, f.parameters, comparison) for f in (first, second)]
-    if None in widths or not set(first.sensors) & set(second.sensors):
-        return False
-    both = any(isinstance(f.effect, Resonance) for f in (first, second))
-    width = (min if both else max)(width for width in widths if width is not None)
-    return abs(first.frequency_hz - second.frequency_hz) < width
-
-
-def _line_width(effect: Mechanism, parameters: dict[str, Parameter], comparison: Comparison) -> float | None:
-    """Half width of a line, Hz; None of what is none."""
-    if isinstance(effect, Resonance | DriftingTone):
-        return effect.mode.width * comparison.info.rate
-    if isinstance(effect, VibrationTone):
-        limits = parameters["frequency"]
-        return max((limits.high - limits.low) / 2, comparison.info.rate / comparison.n_samples)
-    return None
-
-
-def _in_their_place(findings: list[Finding]) -> set[str]:
-    """Names of what may be found in the place of findings: bumps are named by whether their envelope is steady."""
+def _names_instead(findings: list[Finding]) -> set[str]:
+    """Names of what may be found in the place of findings."""
     names = {f.instead.mechanism for f in findings if f.instead is not None}
-    peaks = {Resonance.name, DriftingTone.name}
-    return names | peaks if names & peaks or any(isinstance(f.effect, VibrationTone) for f in findings) else names
+    together = {name for kind in named(names) for name in kind.named_together}
+    return names | together | {name for f in findings for name in f.effect.replaced_by}
 
 
 def _renamed(
-    links: list[Link], unearned: list[int], names: set[str], level: float, generator: torch.Generator
-) -> tuple[list[Link], Comparison]:
-    """The links without some of them, and with what is found of those names instead."""
-    first = unearned[0]
-    kept = [link.finding for k, link in enumerate(links) if k > first and k not in unearned]
-    links, comparison = _relinked(links[:first], kept, links[first].before, generator)
-    kinds = [m for stage in STAGES for m in stage if m.name in names]
-    for _ in unearned:
-        found = [f for f in (kind.detect_and_fit(comparison, level) for kind in kinds) if f is not None]
+    selected: list[Selected], lost: list[int], names: set[str], level: float, generator: torch.Generator
+) -> tuple[list[Selected], Comparison]:
+    """The findings without those that lost, and with what is found under some names instead."""
+    first = lost[0]
+    kept = [one.finding for k, one in enumerate(selected) if k > first and k not in lost]
+    selected, comparison = _repaired(selected[:first], kept, selected[first].before, generator)
+    kinds = named(names)
+    for _ in lost:
+        found = [f for kind in kinds if (f := kind.detect_and_fit(comparison, level)) is not None]
         for finding in sorted(found, key=lambda f: -f.gain):
-            if held_out_gain(comparison, finding.effect).confirms(finding.p_value):
-                links, comparison = _relinked(links, [finding], comparison, generator)
+            if score_held_out(comparison, finding.effect).confirms(finding.p_value):
+                selected, comparison = _repaired(selected, [finding], comparison, generator)
                 break
         else:
             break
-    return links, comparison
+    return selected, comparison
 
 
 def _pruned(
-    links: list[Link], comparison: Comparison, generator: torch.Generator
-) -> tuple[list[Link], Comparison, list[tuple[Gain, Comparison]]]:
-    """What stays, the last first to be judged, with the gain of each where it alone is left out, and that case."""
+    selected: list[Selected], comparison: Comparison, generator: torch.Generator
+) -> tuple[list[Selected], Comparison, list[tuple[HeldOutScore, Comparison]]]:
+    """What stays, the last judged first, each with its score where it alone is left out, and that comparison."""
     while True:
         kept: list[Finding] = []
-        judged: list[tuple[Gain, Comparison]] = []
-        first = len(links)  # that changes
-        for k in reversed(range(len(links))):
-            link = links[k]
-            gain, left = _without(link, kept, generator)
-            if gain.confirms(link.finding.p_value):
-                kept.insert(0, link.finding)
-                judged.insert(0, (gain, left))
+        without: list[tuple[HeldOutScore, Comparison]] = []
+        first = len(selected)  # that changes
+        for k in reversed(range(len(selected))):
+            one = selected[k]
+            score, left = _left_out(one, kept, generator)
+            if score.confirms(one.finding.p_value):
+                kept.insert(0, one.finding)
+                without.insert(0, (score, left))
             else:
                 first = k
-        if first == len(links):
-            return links, comparison, judged
-        links, comparison = _relinked(links[:first], kept[first:], links[first].before, generator)
+        if first == len(selected):
+            return selected, comparison, without
+        selected, comparison = _repaired(selected[:first], kept[first:], selected[first].before, generator)
 
 
-def _without(link: Link, later: list[Finding], generator: torch.Generator) -> tuple[Gain, Comparison]:
-    """Gain of a finding where all others are in, and that case.
+def _left_out(one: Selected, later: Sequence[Finding], generator: torch.Generator) -> tuple[HeldOutScore, Comparison]:
+    """Score of a finding where all others are in, and that comparison.
 
     What the converter does is judged on the numbers as they came: whatever is taken off them hides it.
     """
-    if link.finding.effect.place or not later:
-        return link.gain, link.before
-    left = link.before
+    if one.finding.effect.stage or not later:
+        return one.score, one.before
+    left = one.before
     for other in later:
         left = other.repair(left, generator)
-    return held_out_gain(left, link.finding.effect), left
+    return score_held_out(left, one.finding.effect), left
 
 
-def _relinked(
-    links: list[Link], findings: list[Finding], comparison: Comparison, generator: torch.Generator
-) -> tuple[list[Link], Comparison]:
-    """The links, and findings after them, each explained in turn."""
-    links = list(links)
+def _repaired(
+    selected: list[Selected], findings: Sequence[Finding], comparison: Comparison, generator: torch.Generator
+) -> tuple[list[Selected], Comparison]:
+    """The findings so far, and others after them, each repaired in turn."""
+    selected = list(selected)
     for finding in findings:
-        gain = held_out_gain(comparison, finding.effect)
-        links.append(Link(replace(finding, held_out_gain=gain.total), comparison, gain))
+        score = score_held_out(comparison, finding.effect)
+        selected.append(Selected(replace(finding, held_out_gain=score.total), comparison, score))
         comparison = finding.repair(comparison, generator)
-    return links, comparison
+    return selected, comparison
 
 
-def _compared(finding: Finding, gain: Gain, left: Comparison, beside: list[Finding]) -> Finding:
-    """A finding beside others, with what would be without it, and with its best look-alike."""
-    told = replace(finding, gain_without=gain.total)
-    alike = happened_instead(left, finding, beside)
-    own, alone = finding.effect, gain
-    if isinstance(own, SlowEffect):
-        # Whether there is any is a matter of the noise that would be without; which it is, of the noise beside it.
-        own = own.beside_it(left)
-        alone = held_out_gain(left, own)
-    rivals = [(held_out_gain(left, rival), rival) for rival in look_alikes(left, replace(finding, effect=own))]
-    if rivals:
-        best, effect = max(rivals, key=lambda rival: rival[0].total)
-        less, sd = alone.total - best.total, _spread(left, own, alone, effect, best)
-        told = replace(told, instead=Alternative(effect.name, gain.total - less, sd))
-        if less < gain.total and less < max(_AS_GOOD_SD * sd, _AS_GOOD):
-            alike += (effect.name,)
-    alternatives = tuple(dict.fromkeys((*finding.alternatives, *alike)))
-    sentence = finding.sentence
-    if alternatives and finding.mechanism != NOT_IDENTIFIABLE:  # which says so itself
-        sentence += f"; these data do not tell it apart from {', '.join(map(readable, alternatives))}"
-    return replace(told, alternatives=alternatives, sentence=sentence)
-
-
-def _better(
-    links: list[Link], told: Finding, left: Comparison, level: float, generator: torch.Generator
+def _with_rival(
+    selected: list[Selected], finding: Finding, left: Comparison, level: float, generator: torch.Generator
 ) -> list[Finding] | None:
-    """Findings with a look-alike in the place of the first, if it is better by more than chance, there, and holds.
+    """Findings with a rival in the place of the first, if it is better by more than chance, detected, and holds.
 
     It comes last, after all that it was found beside. Later findings under its name, which may have mended what the
-    first one did not fit, go with that if it does as much alone.
+    first one did not fit, go with that if it scores as much alone.
     """
-    if told.instead is None or told.gain_without is None:
+    if finding.instead is None or finding.gain_without is None or not finding.instead.beats(finding.gain_without):
         return None
-    if not told.instead.beats(told.gain_without):
-        return None
-    first, *later = links
-    gone = [link for link in later if link.finding.mechanism == told.instead.mechanism]
-    rest = [link.finding for link in later if link not in gone]
+    first, *later = selected
+    gone = [one for one in later if one.finding.mechanism == finding.instead.mechanism]
+    rest = [one.finding for one in later if one not in gone]
     least = 0.0
     if gone:
-        least = sum((link.gain.total for link in gone), first.gain.total)
+        least = sum((one.score.total for one in gone), first.score.total)
         left = first.before
         for other in rest:
             left = other.repair(left, generator)
-    for mechanism in (m for stage in STAGES for m in stage if m.name == told.instead.mechanism):
-        found = mechanism.detect_and_fit(left, level)
+    for kind in named([finding.instead.mechanism]):
+        found = kind.detect_and_fit(left, level)
         if found is None:
             continue
-        gain = held_out_gain(left, found.effect)
-        if gain.confirms(found.p_value) and gain.total > least:
+        score = score_held_out(left, found.effect)
+        if score.confirms(found.p_value) and score.total > least:
             return [*rest, found]
     return None
-
-
-def _spread(comparison: Comparison, effect: Mechanism, gain: Gain, other: Mechanism, gain_of_other: Gain) -> float:
-    """Standard deviation of the difference of two gains.
-
-    From its scatter over blocks; what is slow has no blocks of its own, and the gains of two paths differ with the
-    standard deviation of their distance in units of the noise.
-    """
-    if isinstance(effect, SlowEffect) and isinstance(other, SlowEffect):
-        paths = [e.remove(comparison.recording, comparison.info) for e in (effect, other)]
-        covariance = slow_look(comparison).noise.covariance(effect.log_factors).diff(dim=-1).diff(dim=-2)
-        difference = block_means(paths[0] - paths[1]).diff()[..., None]
-        return float(torch.linalg.solve_triangular(torch.linalg.cholesky(covariance), difference, upper=False).norm())
-    return sd_of_sum(gain.blocks - gain_of_other.blocks)

@@ -105,3 +105,8 @@ def _log_scores(signal: Tensor, matrices: Tensor, fold: int) -> Tensor:
     white = torch.linalg.solve_triangular(root, ordinates.permute(1, 2, 0), upper=False)  # (ordinate, sensor, block)
     log_determinant = 2 * root.diagonal(dim1=-1, dim2=-2).log().sum()
     return -(white.square().sum((0, 1)) + log_determinant) / 2
+
+
+def sd_of_sum(blocks: Tensor) -> float:
+    """Standard deviation of a sum over blocks `(block,)`, from their scatter."""
+    return float(blocks.std()) * math.sqrt(len(blocks))

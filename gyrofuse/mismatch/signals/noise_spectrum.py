@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.nnls import nonnegative_least_squares
-from gyrofuse.mismatch.signals.axes import Axes
+from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.psd import Bands
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.model import Model
@@ -41,7 +41,7 @@ class NoiseSpectrum:
     """
 
     n_samples: int
-    coefficients: Annotated[Tensor, Axes(("sensor", "atom"))]
+    coefficients: Annotated[Tensor, Dims(("sensor", "atom"))]
 
     def spectrum(self, f: Tensor) -> Tensor:
         """Density per sample `(sensor, frequency)` at `f` cycles per sample."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,14 +16,15 @@ from gyrofuse.mismatch.detectors.variance.noise_level import (
     own_spread,
     variance_p_value,
 )
+from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import (
     goes_up_and_down,
     likeliest_episodes,
     worth_of_modulation,
 )
-from gyrofuse.mismatch.signals.axes import Axes, OfSensors
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.dims import Dims, OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.signals.variance_course import (
     VarianceCourse,
@@ -43,6 +44,10 @@ from gyrofuse.mismatch.stats.variance_courses import (
     interpolated,
     worth_of_course,
 )
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 
 _NATS = 5.0  # by which it has to be likelier than episodes with a start and a stop
 _FACTOR = 1.25  # by which, and by `_NATS`, a level that goes up and down all the time has to be likelier
@@ -68,10 +73,13 @@ class GradualChange(Mechanism):
     """
 
     name: ClassVar[str] = "variance_change"
+    likelihood: ClassVar[str] = "regimes"
+    rivals: ClassVar[tuple[str, ...]] = ("spikes",)
+    separated_by: ClassVar[str] = "a longer recording with more than one change"
     happened_once: ClassVar[bool] = True
     changes_noise: ClassVar[bool] = True
-    time_s: Annotated[Tensor, Axes(("knot",))]
-    share: Annotated[Tensor, Axes(("knot",))]
+    time_s: Annotated[Tensor, Dims(("knot",))]
+    share: Annotated[Tensor, Dims(("knot",))]
     base: OfSensors
     factor: OfSensors
     corner_hz: float
@@ -134,6 +142,10 @@ class GradualChange(Mechanism):
         corner = self.corner_hz / comparison.info.rate
         upper = fast_factor(whitened_factor(self.base, corner) * log_factor.exp(), corner)
         return replace(self, factor=torch.where(concerned, upper / self.base, 1.0))
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        course = self._loudness(comparison.n_samples, comparison.info.rate).variance if fitted else None
+        pictures.variance_over_time(ax, comparison, sensor, course)
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
         return self._loudness(signal.shape[-1], info.rate).added(signal)

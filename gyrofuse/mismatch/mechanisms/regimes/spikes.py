@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from torch import Tensor
@@ -13,13 +13,18 @@ from gyrofuse.mismatch.detectors.variance.noise_level import levelled, variance_
 from gyrofuse.mismatch.detectors.variance.outliers import likely_outliers, spike_p_value
 from gyrofuse.mismatch.detectors.variance.weak_outliers import fitted_shock, shock_posterior, shock_scores
 from gyrofuse.mismatch.likelihoods.outlier_law import Outliers, clustered, fitted, free_gaussian, heavy_tailed, mixture
+from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.mechanisms.regimes.outlier_limits import with_limits
-from gyrofuse.mismatch.signals.axes import OfSensors
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.signals.prediction_errors import left_out
 from gyrofuse.mismatch.stats.segments import episodes_of, two_level_scores
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 
 _HOUR = 3600.0
 _ALIKE = 5.0  # nats
@@ -48,7 +53,11 @@ class Spikes(Mechanism):
     """
 
     name: ClassVar[str] = "spikes"
-    taken_off: ClassVar[bool] = True
+    likelihood: ClassVar[str] = "innovations"
+    rivals: ClassVar[tuple[str, ...]] = ("variance_change",)
+    separated_by: ClassVar[str] = "more events, or a second sensor on the same supply"
+    time_words: ClassVar[str] = "largest at"
+    additive: ClassVar[bool] = True
     rate: OfSensors
     height: OfSensors
     spread: OfSensors
@@ -186,6 +195,9 @@ class Spikes(Mechanism):
         return comparison.with_recording(
             torch.where(self._outliers(comparison, error), predicted, comparison.recording)
         )
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        pictures.tails(ax, comparison, sensor)
 
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
         z, laws = left_out(comparison.observed).z[0], self._laws(comparison)

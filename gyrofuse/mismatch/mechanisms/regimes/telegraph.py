@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from scipy import stats
@@ -15,13 +15,18 @@ from torch import Tensor
 from gyrofuse.mismatch.detectors.spectra.power_differs import power_differs
 from gyrofuse.mismatch.detectors.variance.outliers import jump_test
 from gyrofuse.mismatch.likelihoods.telegraph_fit import Numbers, excess, scores, two_levels
+from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
-from gyrofuse.mismatch.signals.axes import OfSensors
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import N_JUDGED, in_fold
 from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
 from gyrofuse.mismatch.stats.limits import Z
 from gyrofuse.noise.processes import AR1
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 
 _PRESENT, _CERTAIN = 5.0, 8.0  # nats over the Gaussian rival, of all sensors together
 _GAUSSIAN = ("flicker", "parameter_shift")  # what may have the same spectrum
@@ -44,6 +49,8 @@ class RandomTelegraph(Mechanism):
     """
 
     name: ClassVar[str] = "random_telegraph"
+    likelihood: ClassVar[str] = "regimes"
+    separated_by: ClassVar[str] = "a longer recording with more switches"
     half_step: OfSensors
     up: OfSensors
     down: OfSensors
@@ -108,6 +115,10 @@ class RandomTelegraph(Mechanism):
         fits = two_levels(comparison)
         sensors = self.half_step.nonzero()[:, 0].tolist()
         return self._of(comparison, {i: fits[i].without(fold) for i in sensors if i in fits})
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        dwell = float(torch.minimum(self.up, self.down)[sensor]) * comparison.info.rate
+        pictures.two_levels(ax, comparison, sensor, float(self.half_step[sensor]) if fitted else 0.0, dwell)
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
         n = signal.shape[-1]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from torch import Tensor
@@ -20,10 +20,11 @@ from gyrofuse.mismatch.detectors.variance.noise_level import (
     variance_p_value,
     variance_p_values,
 )
+from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
-from gyrofuse.mismatch.signals.axes import OfSensors
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.derived import derived
+from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.signals.variance_course import VarianceCourse, corner_of, fast_factor, whitened_factor
 from gyrofuse.mismatch.stats.level_scan import Reference, scanned_levels
@@ -38,6 +39,10 @@ from gyrofuse.mismatch.stats.segments import (
     told_of_first,
     two_level_scores,
 )
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 
 _FACTOR = 1.25  # by which, and by `_NATS`, a level that goes up and down all the time has to be likelier
 _NATS = 5.0
@@ -62,6 +67,9 @@ class VarianceChange(Mechanism):
     """
 
     name: ClassVar[str] = "variance_change"
+    likelihood: ClassVar[str] = "regimes"
+    rivals: ClassVar[tuple[str, ...]] = ("spikes",)
+    separated_by: ClassVar[str] = "a longer recording with more than one change"
     happened_once: ClassVar[bool] = True
     changes_noise: ClassVar[bool] = True
     episodes: tuple[tuple[float, float], ...]
@@ -121,6 +129,10 @@ class VarianceChange(Mechanism):
         )
         fast = fast_factor(log_factor.exp(), self.corner_hz / comparison.info.rate)
         return replace(self, factor=torch.where(self.factor != 1, fast, 1.0))
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        course = self._loudness(comparison.n_samples, comparison.info.rate).variance if fitted else None
+        pictures.variance_over_time(ax, comparison, sensor, course)
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
         return self._loudness(signal.shape[-1], info.rate).added(signal)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import torch
 from torch import Tensor
@@ -14,13 +14,18 @@ from gyrofuse._base.units import GRAVITY
 from gyrofuse.mismatch.detectors.slow.channels import ChannelFit, regress
 from gyrofuse.mismatch.detectors.slow.transfer import Transfer, likeliest_transfer
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
+from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.mechanisms.not_identifiable import NOT_IDENTIFIABLE
-from gyrofuse.mismatch.signals.axes import Axes
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.folds import estimation_samples, signal_gains
 from gyrofuse.mismatch.stats.inclusion import included_sensors
 from gyrofuse.mismatch.stats.limits import Z
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 
 _OF_ONE_BAND = 0.9  # share of the evidence from which a gain might be a line's alone
 _WHOLE = ("each", "length")  # kinds of rows that are made from all of a channel
@@ -43,19 +48,28 @@ class ChannelGain(Mechanism):
         pole, response: Of `m`.
     """
 
-    proportional_to: ClassVar[str] = "coupling"
-    taken_off: ClassVar[bool] = True
+    likelihood: ClassVar[str] = "known paths"
+    known_path: ClassVar[bool] = True
+    rivals: ClassVar[tuple[str, ...]] = ("parameter_shift", "low_pass", "flicker", "common_mode")
+    additive: ClassVar[bool] = True
     of_one_band: ClassVar[tuple[str, ...]] = ()
     quantity: ClassVar[str] = "gain"
     largest: ClassVar[float] = math.inf  # that a sensor has, deg/s per g to the power below
     power_of_g: ClassVar[int] = 1
     channel: str
-    coupling: Annotated[Tensor, Axes(("sensor", "row"))]
+    coupling: Annotated[Tensor, Dims(("sensor", "row"))]
     kind: str = "each"
     pole: float = field(default=0.0, metadata={"plain": True})
-    response: Annotated[Tensor, Axes(("term",))] = field(
+    response: Annotated[Tensor, Dims(("term",))] = field(
         default_factory=lambda: torch.ones(1, dtype=torch.float64), metadata={"plain": True}
     )
+
+    @property
+    def amplitudes(self) -> Tensor:
+        return self.coupling
+
+    def with_amplitudes(self, amplitudes: Tensor) -> ChannelGain:
+        return replace(self, coupling=amplitudes)
 
     @property
     def transfer(self) -> Transfer:
@@ -158,6 +172,10 @@ class ChannelGain(Mechanism):
 
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
         return signal_gains(comparison, self._path(comparison.info, comparison.n_samples), fold)
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        path = self._path(comparison.info, comparison.n_samples)[sensor]
+        pictures.gain_on_channel(ax, comparison, sensor, path, f"share that follows {self.channel}, as fitted")
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
         return signal + self._path(info, signal.shape[-1])

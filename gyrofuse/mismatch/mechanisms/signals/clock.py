@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.detectors.lines.clocks import BLOCKS, best_slope, demodulated, strongest_slip
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
+from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
-from gyrofuse.mismatch.signals.axes import Axes
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.filters import resampled
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.stats.limits import Z
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 
 _MILLION = 1e6
 _ROUNDS, _BLOCKS_AROUND = 2, 3  # places of losses and amplitudes in turns, and blocks in which each is placed
@@ -40,13 +45,15 @@ class ClockSkew(Mechanism):
     """
 
     name: ClassVar[str] = "clock_skew"
-    taken_off: ClassVar[bool] = True
+    separated_by: ClassVar[str] = "timestamps of each sensor, or a known motion that all of them feel"
+    likelihood: ClassVar[str] = "known paths"
+    additive: ClassVar[bool] = True
     sensors: tuple[int, ...]
     skew: float
     losses: tuple[tuple[int, int], ...]
     frequency: float
-    slipping: Annotated[Tensor, Axes(("sensor concerned",), complex=True)]
-    steady: Annotated[Tensor, Axes(("sensor concerned",), complex=True)]
+    slipping: Annotated[Tensor, Dims(("sensor concerned",), complex=True)]
+    steady: Annotated[Tensor, Dims(("sensor concerned",), complex=True)]
 
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
@@ -155,6 +162,10 @@ class ClockSkew(Mechanism):
     def _ahead(self, t: Tensor) -> Tensor:
         """By how many samples the sensors are ahead at their sample `t`."""
         return self.skew * t + sum(count * (t >= at) for at, count in self.losses)
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        rate = comparison.info.rate
+        pictures.spectrum_near(ax, comparison, sensor, self.frequency * rate, rate / comparison.n_samples)
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
         t = torch.arange(signal.shape[-1], dtype=torch.float64)

@@ -23,6 +23,8 @@ class GSensitivity(ChannelGain):
     """
 
     name: ClassVar[str] = "g_sensitivity"
+    rivals: ClassVar[tuple[str, ...]] = (*ChannelGain.rivals, "quadratic_coupling", "scale_factor")
+    separated_by: ClassVar[str] = "acceleration recorded along with the rates, in several attitudes"
     of_one_band: ClassVar[tuple[str, ...]] = ("vibration_tone", "common_mode")
     largest: ClassVar[float] = 20.0  # deg/s/g: a hundred times the 0.2 that data sheets of the poorest gyroscopes state
 

@@ -22,6 +22,8 @@ class QuadraticCoupling(ChannelGain):
     """
 
     name: ClassVar[str] = "quadratic_coupling"
+    rivals: ClassVar[tuple[str, ...]] = (*ChannelGain.rivals, "g_sensitivity", "scale_factor")
+    separated_by: ClassVar[str] = "acceleration recorded along with the rates"
     of_one_band: ClassVar[tuple[str, ...]] = ("vibration_tone",)
     # deg/s/g^2: data sheets and vibration tests have 1e-4 to 1e-1; a hundred times that is no rectification.
     largest: ClassVar[float] = 10.0

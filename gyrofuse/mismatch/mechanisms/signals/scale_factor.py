@@ -18,6 +18,8 @@ class ScaleFactor(ChannelGain):
     """
 
     name: ClassVar[str] = "scale_factor"
+    rivals: ClassVar[tuple[str, ...]] = (*ChannelGain.rivals, "g_sensitivity", "quadratic_coupling")
+    separated_by: ClassVar[str] = "a recording on a table that turns at known rates"
     quantity: ClassVar[str] = "error"
 
     @classmethod

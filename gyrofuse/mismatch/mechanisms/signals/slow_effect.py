@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -27,11 +27,16 @@ from gyrofuse.mismatch.detectors.slow.scans import (
     slow_look,
 )
 from gyrofuse.mismatch.likelihoods.slow_noise import column_sizes, cosines
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
-from gyrofuse.mismatch.signals.axes import Axes, OfSensors
+from gyrofuse.mismatch.mechanisms import pictures
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
 from gyrofuse.mismatch.signals.comparison import N_BLOCKS, Comparison, RecordingInfo, block_means
+from gyrofuse.mismatch.signals.dims import Dims, OfSensors
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, in_fold
 from gyrofuse.mismatch.stats.limits import Z
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 
 _STRONG = 5e-4  # a slow effect leaves traces that look like another one: largest p value
 _TOO_CLOSE = 5.0  # nats
@@ -47,10 +52,38 @@ class SlowEffect(Mechanism):
         log_factors: Of the slow noise beside it, `(sensor, part)`, against the simulation's: for weights.
     """
 
-    proportional_to: ClassVar[str] = "size"
-    taken_off: ClassVar[bool] = True
+    likelihood: ClassVar[str] = "known paths"
+    known_path: ClassVar[bool] = True
+    additive: ClassVar[bool] = True
     size: OfSensors
-    log_factors: Annotated[Tensor, Axes(("sensor", "part"))]
+    log_factors: Annotated[Tensor, Dims(("sensor", "part"))]
+
+    @classmethod
+    def of(cls, scan: Scan, rate: float, which: Sequence[int] | None = None) -> SlowEffect:
+        """The best of a scan.
+
+        Args:
+            scan: Scan of the mechanism.
+            rate: Hz.
+            which: Positions of the sensors; those concerned by default.
+        """
+        raise NotImplementedError
+
+    @classmethod
+    def fit_in_place_of(cls, finding: Finding, comparison: Comparison) -> Rival | None:
+        """Another path of the same sensors in the same noise."""
+        scan, effect = slow_look(comparison).scan(cls.name), finding.effect
+        if scan is None or not isinstance(effect, SlowEffect):
+            return None
+        rival = cls.of(scan, comparison.info.rate, finding.sensors)
+        return Rival(replace(rival, log_factors=effect.log_factors), scan.gain)
+
+    @property
+    def amplitudes(self) -> Tensor:
+        return self.sizes
+
+    def with_amplitudes(self, amplitudes: Tensor) -> SlowEffect:
+        return self.with_sizes(amplitudes)
 
     @property
     def sizes(self) -> Tensor:
@@ -64,6 +97,10 @@ class SlowEffect(Mechanism):
     def paths(self, n_samples: int, info: RecordingInfo) -> Tensor:
         """For sizes of one, `(path, time)`."""
         raise NotImplementedError
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        path = self._effect(comparison.n_samples, comparison.info)
+        pictures.means_over_time(ax, comparison, sensor, path if fitted else None)
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
         return signal + self._effect(signal.shape[-1], info)
@@ -94,7 +131,16 @@ class SlowEffect(Mechanism):
         seen = _hadamard(_SHARES) @ (axes.mT @ y[:, judged].flatten())
         return length * seen - length.square() / 2
 
-    def beside_it(self, comparison: Comparison) -> SlowEffect:
+    def score_difference_sd(self, own: Tensor, other: Mechanism, theirs: Tensor, comparison: Comparison) -> float:
+        """Distance of two paths in units of the noise: a slow path has no blocks of its own, whose scatter would do."""
+        if not isinstance(other, SlowEffect):
+            return super().score_difference_sd(own, other, theirs, comparison)
+        paths = [effect.remove(comparison.recording, comparison.info) for effect in (self, other)]
+        covariance = slow_look(comparison).noise.covariance(self.log_factors).diff(dim=-1).diff(dim=-2)
+        difference = block_means(paths[0] - paths[1]).diff()[..., None]
+        return float(torch.linalg.solve_triangular(torch.linalg.cholesky(covariance), difference, upper=False).norm())
+
+    def as_compared(self, comparison: Comparison) -> SlowEffect:
         """The same with the noise that a case has once its mechanism is explained there, without any doubt of that."""
         scan = slow_look(comparison).scan(self.name)
         return self if scan is None else replace(self, log_factors=scan.fit.log_factors)

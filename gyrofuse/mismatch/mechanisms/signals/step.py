@@ -43,6 +43,8 @@ class Step(SlowEffect):
     """
 
     name: ClassVar[str] = "step"
+    rivals: ClassVar[tuple[str, ...]] = ("warm_up_transient", "temperature_drift")
+    separated_by: ClassVar[str] = "a longer recording on either side"
     happened_once: ClassVar[bool] = True
     onset_s: float
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from torch import Tensor
@@ -13,6 +13,7 @@ from torch import Tensor
 from gyrofuse.mismatch.detectors.slow.scans import Scan, SlowLook, concerned
 from gyrofuse.mismatch.likelihoods.slow_noise import cosines, ordinates
 from gyrofuse.mismatch.likelihoods.slow_templates import lagged
+from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.mechanisms.signals.slow_effect import (
     SlowEffect,
@@ -23,8 +24,12 @@ from gyrofuse.mismatch.mechanisms.signals.slow_effect import (
     slow_finding,
     strong_scan,
 )
-from gyrofuse.mismatch.signals.axes import OfSensors
 from gyrofuse.mismatch.signals.comparison import N_BLOCKS, Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.dims import OfSensors
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 
 _SURROGATES = 200
 _BETTER = 2  # so many surrogates may do as well as the channel
@@ -50,6 +55,8 @@ class TemperatureDrift(SlowEffect):
     """
 
     name: ClassVar[str] = "temperature_drift"
+    rivals: ClassVar[tuple[str, ...]] = ("step", "warm_up_transient")
+    separated_by: ClassVar[str] = "a recording with temperature, over a temperature that goes up and down"
     lag_s: float
     channel: str
     row: int
@@ -95,6 +102,14 @@ class TemperatureDrift(SlowEffect):
     def with_sizes(self, sizes: Tensor) -> TemperatureDrift:
         size, *further = sizes.unbind(-1)
         return replace(self, size=size, curvature=tuple(further))
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        channel = lagged(
+            comparison.info, self.channel, self.row, self.lag_s * comparison.info.rate, comparison.n_samples
+        )
+        path = self._effect(comparison.n_samples, comparison.info) if fitted else None
+        label = f"{self.channel}, with the lag" if self.lag_s else self.channel
+        pictures.means_against(ax, comparison, sensor, channel, label, path)
 
     def paths(self, n_samples: int, info: RecordingInfo) -> Tensor:
         path = lagged(info, self.channel, self.row, self.lag_s * info.rate, n_samples)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from scipy import stats
@@ -12,15 +13,20 @@ from torch import Tensor
 
 from gyrofuse._base.transforms import squared_modulus
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
-from gyrofuse.mismatch.signals.axes import OfSensors
+from gyrofuse.mismatch.mechanisms import pictures
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.derived import derived
+from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples
 from gyrofuse.mismatch.signals.psd import hann_transform
 from gyrofuse.mismatch.signals.records import Records
 from gyrofuse.mismatch.stats.inclusion import included_sensors
 from gyrofuse.mismatch.stats.limits import Z
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 
 _ROUNDS = 6
 _TAIL = 0.025  # beyond either limit
@@ -28,6 +34,7 @@ _STRONG, _FAR, _HALVINGS = 12.0, 6.0, 40  # standard deviations from which a law
 _PER_PART = 20.0  # squared amplitude over its variance in a part of a record: there a phase is told to 0.2 rad
 _FEWEST_PARTS, _MOST_PARTS = 4, 32  # of a record, whose phases tell how a tone wanders
 _SIZES, _MOST_DECADES = 60, 4  # of walks that are tried, from a tenth of the noise's variance in the slowest mode on
+_HALF_WIDTHS = 2.0  # of a peak, within which a line is looked for in its place
 _REACH, _GUARD = 64, 3  # bins on either side that tell the noise, and those too near to
 
 
@@ -43,7 +50,10 @@ class VibrationTone(Mechanism):
     """
 
     name: ClassVar[str] = "vibration_tone"
-    taken_off: ClassVar[bool] = True
+    rivals: ClassVar[tuple[str, ...]] = ("resonance",)
+    replaced_by: ClassVar[tuple[str, ...]] = ("resonance", "drifting_tone")
+    separated_by: ClassVar[str] = "a longer recording: the line gets as narrow as one over its length"
+    additive: ClassVar[bool] = True
     frequency_hz: float
     cosine: OfSensors
     sine: OfSensors
@@ -89,6 +99,20 @@ class VibrationTone(Mechanism):
             frequency_hz=tone.frequency_hz,
             gain=float(snr.square().sum()) / 2,
         )
+
+    @classmethod
+    def fit_in_place_of(cls, finding: Finding, comparison: Comparison) -> Rival | None:
+        """A tone at the highest ordinate of a peak."""
+        width = finding.effect.line_width(finding.parameters, comparison)
+        if width is None or finding.frequency_hz is None:
+            return None
+        rate = comparison.info.rate
+        f = line_near(comparison, finding.frequency_hz / rate, _HALF_WIDTHS * width / rate)
+        return Rival(cls.at(comparison, f * rate), finding.gain)
+
+    def line_width(self, parameters: Mapping[str, Parameter], comparison: Comparison) -> float | None:
+        limits = parameters["frequency"]
+        return max((limits.high - limits.low) / 2, comparison.info.rate / comparison.n_samples)
 
     def wander(self, comparison: Comparison, noise: Tensor, energy: float) -> float:
         """Standard deviation that a phase which walks gives to the mean frequency, cycles per sample.
@@ -156,6 +180,9 @@ class VibrationTone(Mechanism):
     def fit_without(self, comparison: Comparison, fold: int) -> VibrationTone:
         keep = estimation_samples(comparison.n_samples, fold)
         return self._fitted(comparison, self.frequency_hz, keep)
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        pictures.spectrum_near(ax, comparison, sensor, self.frequency_hz, comparison.info.rate / comparison.n_samples)
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
         turn = 2 * math.pi * torch.rand((), generator=generator, dtype=torch.float64)

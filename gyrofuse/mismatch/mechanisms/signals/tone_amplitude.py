@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.detectors.lines.line_sizes import line_sizes
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
-from gyrofuse.mismatch.signals.axes import OfSensors
+from gyrofuse.mismatch.mechanisms import pictures
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, signal_gains
 from gyrofuse.mismatch.signals.known_lines import resized
 from gyrofuse.mismatch.stats.limits import Z
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 
 _CERTAIN = 6.0  # standard deviations from which the simulation has a line beyond doubt
 _SEEN_SD = 3.5  # of an amplitude, below which there is none
@@ -35,6 +40,8 @@ class ToneSize(Mechanism):
     """
 
     name: ClassVar[str] = "parameter_shift"
+    likelihood: ClassVar[str] = "known paths"
+    separated_by: ClassVar[str] = "a longer recording, or one of the same device under other conditions"
     frequency_hz: float
     amplitude: OfSensors
 
@@ -67,6 +74,13 @@ class ToneSize(Mechanism):
             frequency_hz=f,
             gain=float(sizes.z[:, at].square().sum()) / 2,
         )
+
+    @classmethod
+    def fit_in_place_of(cls, finding: Finding, comparison: Comparison) -> Rival | None:
+        return None  # stands for no other noise
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        pictures.spectrum_near(ax, comparison, sensor, self.frequency_hz, comparison.info.rate / comparison.n_samples)
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
         return resized(signal, self.frequency_hz / info.rate, self.amplitude)

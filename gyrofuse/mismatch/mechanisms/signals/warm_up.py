@@ -20,8 +20,8 @@ from gyrofuse.mismatch.mechanisms.signals.slow_effect import (
     slow_finding,
     strong_scan,
 )
-from gyrofuse.mismatch.signals.axes import OfSensors
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.dims import OfSensors
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +51,8 @@ class WarmUpTransient(SlowEffect):
     """
 
     name: ClassVar[str] = "warm_up_transient"
+    rivals: ClassVar[tuple[str, ...]] = ("step", "temperature_drift")
+    separated_by: ClassVar[str] = "a second recording from power-on, and one of the warm device"
     time_constant_s: float
     slower: tuple[Decay, ...] = ()
 

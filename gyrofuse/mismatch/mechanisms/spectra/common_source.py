@@ -3,23 +3,31 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.likelihoods.band_powers import deep_base
-from gyrofuse.mismatch.likelihoods.components import Common, common_density
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.likelihoods.components import Common, Term, common_density
+from gyrofuse.mismatch.likelihoods.spectral import Ratios
+from gyrofuse.mismatch.mechanisms import pictures
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
 from gyrofuse.mismatch.mechanisms.spectra.findings import found, spanned
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape, refit
+from gyrofuse.mismatch.mechanisms.spectra.rivals import fit_alone, happened_instead
 from gyrofuse.mismatch.mechanisms.spectra.spectral import Addition
-from gyrofuse.mismatch.signals.axes import ComplexOfSensors
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.dims import ComplexOfSensors
 from gyrofuse.mismatch.signals.filters import filtered, noise, of_phase
 from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
 from gyrofuse.mismatch.stats.limits import Z
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 
 _WORDS = {"white": "white noise", "ar1": "AR1 noise", "walk": "a random walk"}
 _REST = 0.01  # of a sensor's power that is its own, at least
@@ -42,6 +50,8 @@ class CommonMode(Addition):
     """
 
     name: ClassVar[str] = "common_mode"
+    rivals: ClassVar[tuple[str, ...]] = ("parameter_shift", "low_pass", "flicker", "g_sensitivity")
+    separated_by: ClassVar[str] = "one sensor mounted apart, or on another supply"
     kind: str
     corner: float
     gain: ComplexOfSensors
@@ -91,6 +101,19 @@ class CommonMode(Addition):
             f"{float(size.max()):.3g} {unit}{sign}{share}",
         )
 
+    @classmethod
+    def fit_in_place_of(cls, finding: Finding, comparison: Comparison) -> Rival | None:
+        found = fit_alone(comparison, finding.sensors, _white_source)
+        if found is None or not isinstance(term := found[0], Common):
+            return None
+        return Rival(cls(term.kind, 0.0, torch.complex(*term.local), comparison.base, term.inside), found[1])
+
+    def explained_by_others(
+        self, comparison: Comparison, finding: Finding, beside: Sequence[Finding]
+    ) -> tuple[str, ...]:
+        walks = None if self.kind == "white" else self.gain.real[None]
+        return happened_instead(comparison, finding, beside, walks)
+
     def density(self, f: Tensor) -> Tensor:
         return self._source(f)[:, None, None] * (self.gain[:, None] * self.gain.conj())
 
@@ -101,6 +124,9 @@ class CommonMode(Addition):
         f = f.clamp(min=1 / self.own.n_samples)
         part = self.gain.abs().square()[:, None] * self._source(f) / self.own.spectrum(f)
         return (1 - part).clamp(min=_REST).sqrt()
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        pictures.coherence(ax, comparison, sensor)
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
         own = filtered(signal, self.left) if self.inside else signal
@@ -133,3 +159,11 @@ class CommonMode(Addition):
         term = refit(comparison, fold, Common(local, free, shared, self.kind, self.inside, whole), self.company)
         corner = math.exp(float(term.shared[0])) if self.kind == "ar1" else 0.0
         return replace(self, gain=torch.complex(*term.local), corner=corner)
+
+
+def _white_source(data: Ratios) -> Term | None:
+    """White noise of one source where its fit starts; None of a single sensor."""
+    if data.n_sensors < 2:
+        return None
+    nothing = torch.zeros(0, dtype=torch.float64)
+    return Common.starts(data.ground, data.observed - data.expected, data.worth, "white", nothing)[0]

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.likelihoods.component_choice import best_start
 from gyrofuse.mismatch.likelihoods.components import Flicker
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Rival
 from gyrofuse.mismatch.mechanisms.spectra.findings import found, spanned
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape, refit
+from gyrofuse.mismatch.mechanisms.spectra.rivals import fit_alone, happened_instead, walks_of
 from gyrofuse.mismatch.mechanisms.spectra.spectral import Addition
-from gyrofuse.mismatch.signals.axes import OfSensors
 from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.filters import noise
 
 
@@ -32,6 +35,8 @@ class FlickerNoise(Addition):
     """
 
     name: ClassVar[str] = "flicker"
+    rivals: ClassVar[tuple[str, ...]] = ("parameter_shift", "low_pass", "common_mode")
+    separated_by: ClassVar[str] = "a recording ten times as long"
     level: OfSensors
 
     @classmethod
@@ -57,6 +62,18 @@ class FlickerNoise(Addition):
             f"1/f noise in {where} that the simulation does not have, up to {largest:.3g} "
             f"{comparison.info.measure} rms in each factor e of frequency",
         )
+
+    @classmethod
+    def fit_in_place_of(cls, finding: Finding, comparison: Comparison) -> Rival | None:
+        found = fit_alone(
+            comparison, finding.sensors, lambda data: best_start(data, [], Flicker.starts(data.ground))[0]
+        )
+        return None if found is None else Rival(cls(found[0].local[0]), found[1])
+
+    def explained_by_others(
+        self, comparison: Comparison, finding: Finding, beside: Sequence[Finding]
+    ) -> tuple[str, ...]:
+        return happened_instead(comparison, finding, beside, walks_of(comparison, finding))
 
     def density(self, f: Tensor) -> Tensor:
         return torch.diag_embed(self.level / f[:, None])

@@ -8,14 +8,16 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.likelihoods.component_choice import filter_starts
 from gyrofuse.mismatch.likelihoods.components import LowPass
 from gyrofuse.mismatch.likelihoods.filter_forms import filter_corner, filter_number, filter_response, strength_of
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
 from gyrofuse.mismatch.mechanisms.spectra.findings import found
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape, refit
+from gyrofuse.mismatch.mechanisms.spectra.rivals import fit_alone
 from gyrofuse.mismatch.mechanisms.spectra.spectral import Filter
-from gyrofuse.mismatch.signals.axes import OfSensors
 from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.stats.limits import Z
 
 
@@ -32,6 +34,8 @@ class LowPassFilter(Filter):
     """
 
     name: ClassVar[str] = "low_pass"
+    rivals: ClassVar[tuple[str, ...]] = ("parameter_shift", "flicker", "common_mode")
+    separated_by: ClassVar[str] = "a higher sampling rate, or the response to a known motion"
     kind: str
     strength: OfSensors
 
@@ -65,6 +69,13 @@ class LowPassFilter(Filter):
             f"a low-pass filter in {where} that the simulation does not have, {corners}",
             frequency_hz=min(inside) if inside else None,
         )
+
+    @classmethod
+    def fit_in_place_of(cls, finding: Finding, comparison: Comparison) -> Rival | None:
+        found = fit_alone(comparison, finding.sensors, lambda data: filter_starts(data, [])[0])
+        if found is None or not isinstance(term := found[0], LowPass):
+            return None
+        return Rival(cls(term.kind, strengths(term)), found[1])
 
     def response(self, f: Tensor) -> Tensor:
         return filter_response(self.kind, self.strength, f)

@@ -18,8 +18,8 @@ from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.mechanisms.spectra.findings import spanned
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape, refit, run_length
 from gyrofuse.mismatch.mechanisms.spectra.steadiness import Steadiness, steadiness
-from gyrofuse.mismatch.signals.axes import ComplexOfSensors
 from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.signals.dims import ComplexOfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples
 from gyrofuse.mismatch.signals.psd import light_taper
 from gyrofuse.mismatch.stats.inclusion import included_sensors

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Set
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
@@ -12,14 +12,17 @@ from torch import Tensor
 
 from gyrofuse.mismatch.detectors.spectra.power_differs import power_differs
 from gyrofuse.mismatch.likelihoods.band_powers import deep_base
-from gyrofuse.mismatch.likelihoods.components import Shift
+from gyrofuse.mismatch.likelihoods.component_choice import best_start
+from gyrofuse.mismatch.likelihoods.components import Shift, Term
 from gyrofuse.mismatch.likelihoods.reference_spectrum import Parts
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
+from gyrofuse.mismatch.likelihoods.spectral import Ratios
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Rival
 from gyrofuse.mismatch.mechanisms.spectra.findings import found, spanned
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape, refit
+from gyrofuse.mismatch.mechanisms.spectra.rivals import fit_alone, happened_instead, walks_of
 from gyrofuse.mismatch.mechanisms.spectra.spectral import Filter
-from gyrofuse.mismatch.signals.axes import Axes
 from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
 from gyrofuse.mismatch.stats.limits import Z
 
@@ -42,8 +45,10 @@ class ParameterShift(Filter):
     """
 
     name: ClassVar[str] = "parameter_shift"
+    rivals: ClassVar[tuple[str, ...]] = ("low_pass", "flicker", "common_mode")
+    separated_by: ClassVar[str] = "a longer recording, or one of the same device under other conditions"
     base: NoiseSpectrum
-    log_factors: Annotated[Tensor, Axes(("part", "sensor"))]
+    log_factors: Annotated[Tensor, Dims(("part", "sensor"))]
 
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
@@ -84,6 +89,17 @@ class ParameterShift(Filter):
             f"{_said_of(lacking)}: {'; '.join(words) or 'levels differ slightly'}",
         )
 
+    @classmethod
+    def fit_in_place_of(cls, finding: Finding, comparison: Comparison) -> Rival | None:
+        found = fit_alone(comparison, finding.sensors, _start)
+        return None if found is None else Rival(cls(comparison.base, found[0].local), found[1])
+
+    def explained_by_others(
+        self, comparison: Comparison, finding: Finding, beside: Sequence[Finding]
+    ) -> tuple[str, ...]:
+        slow = bool((self.log_factors[1:] != 0).any())  # of the simulation's parts all but the white one
+        return happened_instead(comparison, finding, beside, walks_of(comparison, finding) if slow else None)
+
     def response(self, f: Tensor) -> Tensor:
         parts = Parts(self.base, f.clamp(min=0.5 / self.base.n_samples))
         return (parts.shifted(self.log_factors) / parts.densities.sum(0)).sqrt()
@@ -91,6 +107,11 @@ class ParameterShift(Filter):
     def fit_without(self, comparison: Comparison, fold: int) -> Mechanism:
         term = Shift(self.log_factors, self.log_factors != 0, torch.zeros(0, dtype=torch.float64))
         return replace(self, log_factors=refit(comparison, fold, term, self.company).local)
+
+
+def _start(data: Ratios) -> Term | None:
+    """Other numbers of the simulation's parts, from the likeliest grid point; None where it has no part that shows."""
+    return best_start(data, [], Shift.starts(data.ground)[0])[0] if bool(data.ground.matters.any()) else None
 
 
 def _said_of(lacking: Set[str]) -> str:

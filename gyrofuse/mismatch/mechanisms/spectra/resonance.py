@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
+from gyrofuse.mismatch.mechanisms import pictures
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
+from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
 from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode, nominated, refitted_mode
 from gyrofuse.mismatch.mechanisms.spectra.spectral import Addition
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.filters import noise, of_phase
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+_NARROWEST = 1.5  # bins: half width of the narrowest peak that a record shows, in the place of a line
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +37,12 @@ class Resonance(Addition):
     """
 
     name: ClassVar[str] = "resonance"
+    rivals: ClassVar[tuple[str, ...]] = ("vibration_tone", "parameter_shift", "low_pass", "flicker", "common_mode")
+    named_together: ClassVar[tuple[str, ...]] = ("drifting_tone",)
+    separated_by: ClassVar[str] = (
+        "a longer recording: the envelope of noise through a resonance is Rayleigh distributed"
+    )
+    broad: ClassVar[bool] = True
     mode: Mode
 
     @classmethod
@@ -46,9 +62,26 @@ class Resonance(Addition):
             factor=1.0,
         )
 
+    @classmethod
+    def fit_in_place_of(cls, finding: Finding, comparison: Comparison) -> Rival | None:
+        """Noise in a band as narrow as the record can show, in the place of a tone."""
+        tone = finding.effect
+        if not isinstance(tone, VibrationTone):
+            return None
+        gain = torch.complex(tone.cosine, -tone.sine) / math.sqrt(2)
+        centre, width = tone.frequency_hz / comparison.info.rate, _NARROWEST / comparison.n_samples
+        return Rival(cls(Mode(centre, width, gain, True)), finding.gain)
+
+    def line_width(self, parameters: Mapping[str, Parameter], comparison: Comparison) -> float | None:
+        return self.mode.width * comparison.info.rate
+
     def apply_to_reference(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
         built = super().apply_to_reference(comparison, generator)
         return replace(built, modes=(*built.modes, (self.mode.centre, self.mode.width)))
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        rate = comparison.info.rate
+        pictures.spectrum_near(ax, comparison, sensor, self.mode.centre * rate, self.mode.width * rate)
 
     def density(self, f: Tensor) -> Tensor:
         return self.mode.matrix() * self.mode.profile(f, 2 * float(f[1] - f[0]))[:, None, None]

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.likelihoods.band_powers import deep_base, slow_gains
 from gyrofuse.mismatch.likelihoods.spectral import FLOOR
+from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.filters import filtered
 from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +32,14 @@ class Spectral(Mechanism):
     """
 
     changes_noise: ClassVar[bool] = True
+    of_spectra: ClassVar[bool] = True
+    level_after_repairs: ClassVar[float] = 0.1  # spectra are then compared at levels that repairs have estimated
     company: tuple[Any, ...] = field(default=(), kw_only=True, metadata={"saved": False})
     approximate: bool = field(default=False, kw_only=True, metadata={"saved": False})
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        factor = partial(self.factor, deep_base(comparison)) if fitted else None
+        pictures.ratio_of_spectra(ax, comparison, sensor, factor)
 
     def factor(self, base: NoiseSpectrum, f: Tensor) -> Tensor:
         """What it makes of the powers of a simulation's noise, `(sensor, frequency)` at `f` cycles per sample."""

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
+from gyrofuse.mismatch.mechanisms import pictures
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.mechanisms.spectra.frequency_courses import share_of_lorentzian
 from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode, nominated, refitted_mode
 from gyrofuse.mismatch.mechanisms.spectra.spectral import Addition
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.noise.processes.ar1_recursion import ar1_recursion
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 
 _SHORT = 0.05  # cycles of the width in which a phase that diffuses forgets its frequency
 _LONG = 8.0
@@ -41,7 +47,10 @@ class DriftingTone(Addition):
     """
 
     name: ClassVar[str] = "drifting_tone"
-    taken_off: ClassVar[bool] = True
+    rivals: ClassVar[tuple[str, ...]] = ("vibration_tone",)
+    named_together: ClassVar[tuple[str, ...]] = ("resonance",)
+    separated_by: ClassVar[str] = "a longer recording, over which the frequency moves by more than its own width"
+    additive: ClassVar[bool] = True
     mode: Mode
     slow: bool
     share: float = 1.0
@@ -62,6 +71,13 @@ class DriftingTone(Addition):
             amplitude="amplitude",
             factor=factor,
         )
+
+    def line_width(self, parameters: Mapping[str, Parameter], comparison: Comparison) -> float | None:
+        return self.mode.width * comparison.info.rate
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        rate = comparison.info.rate
+        pictures.spectrogram(ax, comparison, sensor, self.mode.centre * rate, self.mode.width * rate)
 
     def density(self, f: Tensor) -> Tensor:
         return self.mode.matrix() * self.mode.profile(f, 2 * float(f[1] - f[0]))[:, None, None]

@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.detectors.values.values import END_STOPS, EndStop, end_stops
+from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
-from gyrofuse.mismatch.signals.axes import Axes, OfSensors
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.dims import Dims, OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.signals.prediction_errors import left_out
 from gyrofuse.mismatch.stats.multiplicity import sidak
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 
 _CELL = 0.02  # width of a cell at the limit, sd: what a sample there is worth is bounded by it
 
@@ -30,9 +35,11 @@ class Clipping(Mechanism):
     """
 
     name: ClassVar[str] = "clipping"
-    place: ClassVar[int] = END_STOPS
-    low: Annotated[Tensor, Axes(("sensor",), infinite=True)]
-    high: Annotated[Tensor, Axes(("sensor",), infinite=True)]
+    likelihood: ClassVar[str] = "values"
+    separated_by: ClassVar[str] = "the full scale of the sensor, or a recording at another level"
+    stage: ClassVar[int] = END_STOPS
+    low: Annotated[Tensor, Dims(("sensor",), infinite=True)]
+    high: Annotated[Tensor, Dims(("sensor",), infinite=True)]
     centre: OfSensors
 
     @classmethod
@@ -70,6 +77,11 @@ class Clipping(Mechanism):
         low = torch.where(self.low.isfinite(), part.amin(-1), self.low)
         high = torch.where(self.high.isfinite(), part.amax(-1), self.high)
         return Clipping(low, high, part.mean(-1))
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        low, high = float(self.low[sensor]), float(self.high[sensor])
+        limit = high if math.isfinite(high) else low
+        pictures.values(ax, comparison, sensor, limit, float(comparison.recording[sensor].std()))
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
         shift = signal.mean(-1, keepdim=True) - self.centre[:, None]

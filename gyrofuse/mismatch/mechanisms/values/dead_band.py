@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.detectors.values.ties import band_limits, fits_band, missing_recurrences, recurring
+from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
-from gyrofuse.mismatch.signals.axes import OfSensors
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 
 _SURE = math.log(50)  # nats that one sample in the band is worth at most
 
@@ -32,7 +37,9 @@ class DeadBand(Mechanism):
     """
 
     name: ClassVar[str] = "quantization"
-    place: ClassVar[int] = 2
+    likelihood: ClassVar[str] = "values"
+    separated_by: ClassVar[str] = "the values as the converter gives them, before filters and averages"
+    stage: ClassVar[int] = 2
     value: OfSensors
     half_width: OfSensors
     centre: OfSensors
@@ -77,6 +84,9 @@ class DeadBand(Mechanism):
             if again is not None:
                 half_width[i] = band_limits(again)[0]
         return DeadBand(self.value, half_width, self.centre)
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        pictures.values(ax, comparison, sensor, float(self.value[sensor]), 4 * float(self.half_width[sensor]))
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
         value = self.value[:, None] + signal.mean(-1, keepdim=True) - self.centre[:, None]

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from torch import Tensor
@@ -18,13 +18,18 @@ from gyrofuse.mismatch.detectors.values.quantisation_grid import (
     missing_lattices,
     off_lattice,
 )
+from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
-from gyrofuse.mismatch.signals.axes import OfSensors
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.signals.lines import whitened
 from gyrofuse.mismatch.stats.limits import Z
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 
 _TABLE = 1024  # points of a law
 _EVEN = 3.0  # steps, sd: over more of them all distances from the lattice are as likely
@@ -52,15 +57,17 @@ class Quantization(Mechanism):
     """
 
     name: ClassVar[str] = "quantization"
-    place: ClassVar[int] = 2
+    likelihood: ClassVar[str] = "values"
+    separated_by: ClassVar[str] = "the values as the converter gives them, before filters and averages"
+    stage: ClassVar[int] = 2
     step: OfSensors
     offset: OfSensors
     blur: OfSensors
     centre: OfSensors
 
     @classmethod
-    def of_simulation(cls, comparison: Comparison) -> Quantization | None:
-        """The exact lattices of a simulation's values, those fine enough to be undone; None without."""
+    def in_reference(cls, comparison: Comparison) -> Quantization | None:
+        """The exact grids of a simulation's values, those fine enough to be undone; None without."""
         side = comparison.reference
         fine = [
             own if own is not None and own.step < _UNDONE * float(sd) else None
@@ -72,7 +79,7 @@ class Quantization(Mechanism):
         step, offset = torch.tensor(rows, dtype=torch.float64).mT
         return cls(step, offset, torch.zeros_like(step), side.signal.mean((0, -1)))
 
-    def undone(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
+    def undo_in_reference(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
         """The case of a simulation that was rounded so: what is built in from now on comes before that.
 
         What was rounded may have been anywhere within half a step. There the noise's density, a normal one given all
@@ -89,7 +96,7 @@ class Quantization(Mechanism):
         share = torch.rand(slope.shape, dtype=slope.dtype, generator=generator)
         within = torch.log1p(share * torch.expm1(slope)) / slope - 0.5
         again: Callable[[Tensor], Tensor] = partial(self.apply, info=comparison.info, generator=generator)
-        converter = (*comparison.converter, (self.place, again))
+        converter = (*comparison.converter, (self.stage, again))
         return replace(comparison, analog=side.signal + self.step[:, None] * within, converter=converter)
 
     def in_unit(self, factor: float) -> Quantization:
@@ -144,6 +151,9 @@ class Quantization(Mechanism):
         offset = self.offset + turn.angle() / (2 * math.pi) * self.step
         blur = torch.sqrt(-2 * turn.abs().clamp(1e-6, 1.0).log()) / (2 * math.pi)
         return replace(self, offset=offset, blur=torch.where(self.blur > 0, blur, self.blur))
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        pictures.distance_from_grid(ax, comparison, sensor, float(self.step[sensor]), float(self.offset[sensor]))
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
         """Values get the law that they have in the recording, in the order in which they are.

@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.detectors.values.values import repeated, repeats
+from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
-from gyrofuse.mismatch.signals.axes import OfSensors
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.stats.limits import Z
 from gyrofuse.mismatch.stats.multiplicity import sidak
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 
 _TOGETHER = 0.5  # share of the repeats that all have at once, beyond chance
 
@@ -34,7 +39,9 @@ class StuckSamples(Mechanism):
     """
 
     name: ClassVar[str] = "stuck_samples"
-    place: ClassVar[int] = 3
+    likelihood: ClassVar[str] = "values"
+    separated_by: ClassVar[str] = "counters or timestamps of the samples"
+    stage: ClassVar[int] = 3
     probability: OfSensors
     by_chance: OfSensors
     together: bool
@@ -91,6 +98,11 @@ class StuckSamples(Mechanism):
     def fit_without(self, comparison: Comparison, fold: int) -> StuckSamples:
         keep = estimation_samples(comparison.n_samples, fold)
         return self._estimated(comparison, tuple(self.probability.nonzero()[:, 0].tolist()), keep)
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        repeats = repeated(comparison.recording)[sensor].nonzero()[:, 0]
+        first = int(repeats[0]) - 20 if len(repeats) else 0
+        pictures.samples(ax, comparison, sensor, first, 60)
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
         n = signal.shape[-1]

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from torch import Tensor
 
 from gyrofuse._base.units import GRAVITY
 from gyrofuse.mismatch.detectors.spectra.band_tests import power_tails
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms import pictures
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 
 _UNITS = {
     180 / math.pi: "deg/s against rad/s",
@@ -34,6 +39,7 @@ class UnitScale(Mechanism):
     """
 
     name: ClassVar[str] = "parameter_shift"
+    separated_by: ClassVar[str] = "a longer recording, or one of the same device under other conditions"
     factor: float
 
     @classmethod
@@ -66,6 +72,17 @@ class UnitScale(Mechanism):
             {"factor": Parameter(factor, factor, factor, "")},
             gain=math.inf,
         )
+
+    @classmethod
+    def fit_in_place_of(cls, finding: Finding, comparison: Comparison) -> Rival | None:
+        return None  # stands for no other noise
+
+    @property
+    def unit_factor(self) -> float:
+        return self.factor
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        pictures.ratio_of_spectra(ax, comparison, sensor, None)
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
         return self.factor * signal

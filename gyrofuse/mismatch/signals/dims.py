@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 @dataclass(frozen=True)
-class Axes:
+class Dims:
     """Shape of a tensor among a mechanism's numbers, which is made sure of where they are read from a file.
 
     Attributes:
@@ -23,5 +23,5 @@ class Axes:
     infinite: bool = False
 
 
-OfSensors = Annotated[Tensor, Axes(("sensor",))]
-ComplexOfSensors = Annotated[Tensor, Axes(("sensor",), complex=True)]
+OfSensors = Annotated[Tensor, Dims(("sensor",))]
+ComplexOfSensors = Annotated[Tensor, Dims(("sensor",), complex=True)]

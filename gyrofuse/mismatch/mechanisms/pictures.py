@@ -1,0 +1,331 @@
+"""Pictures of the evidence for a mechanism: what a person would look at, in one sensor, recording beside simulation.
+
+Every function draws into the axes that it is given; the recording is dark, the simulation blue, what was fitted orange.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gyrofuse._base.axes import BLUE, DASHED, INK, SHADE, finish, with_unit
+from gyrofuse.mismatch.signals.comparison import N_BLOCKS, Comparison, block_means
+from gyrofuse.mismatch.signals.lines import whitened
+from gyrofuse.mismatch.signals.prediction_errors import left_out
+from gyrofuse.mismatch.signals.psd import hann_transform
+from gyrofuse.mismatch.stats.limits import Z
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_DOT: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 3, "color": INK}
+_LINE: dict[str, Any] = {"color": BLUE, "linewidth": 1.2}
+
+
+def spectrum_near(ax: Axes, comparison: Comparison, sensor: int, frequency_hz: float, half_width_hz: float) -> None:
+    """Periodograms under a Hann taper around a frequency, over the smooth spectrum that describes the simulation.
+
+    Args:
+        ax: Axes to draw into.
+        comparison: Recording and simulation.
+        sensor: Position of the sensor.
+        frequency_hz: Middle of the picture.
+        half_width_hz: Half width of the line; twelve of them are shown, or forty bins where that is more.
+    """
+    rate = comparison.info.rate
+    reach = max(12 * half_width_hz, 40 * rate / comparison.n_samples)
+    handles: list[Any] = []
+    for side, style in ((comparison.reference, _LINE), (comparison.observed, {"color": INK, "linewidth": 1.2})):
+        transform, length = hann_transform(side.signal[0, sensor])
+        f = torch.arange(len(transform), dtype=torch.float64) / length
+        shown = ((f * rate - frequency_hz).abs() <= reach) & (f > 1 / length)
+        power = transform.abs().square()[shown] / comparison.base.spectrum(f[shown])[sensor]
+        handles += ax.plot(f[shown] * rate, power, **style)
+    ax.set_yscale("log")
+    ax.set_xlabel("frequency (Hz)")
+    ax.set_ylabel("power over the noise")
+    finish(ax, handles[::-1], ["recording", "simulation"])
+
+
+def means_over_time(ax: Axes, comparison: Comparison, sensor: int, path: Tensor | None) -> None:
+    """Means over 256 blocks of the recording, and the path that was fitted.
+
+    Args:
+        ax: Axes to draw into.
+        comparison: Recording and simulation.
+        sensor: Position of the sensor.
+        path: Fitted path `(sensor, time)`; None for none.
+    """
+    seconds = (torch.arange(N_BLOCKS) + 0.5) * comparison.block / comparison.info.rate
+    means = block_means(comparison.recording[sensor])
+    handles: list[Any] = ax.plot(seconds, means - means.mean(), **_DOT)
+    if path is not None:
+        fitted = block_means(path[sensor])
+        handles += ax.plot(seconds, fitted - fitted.mean(), **DASHED)
+    ax.set_xlabel("time (s)")
+    ax.set_ylabel(with_unit("mean of a block", comparison.info.measure), parse_math=False)
+    finish(ax, handles, ["recording", "fitted"])
+
+
+def means_against(ax: Axes, comparison: Comparison, sensor: int, x: Tensor, label: str, path: Tensor | None) -> None:
+    """Means over 256 blocks of the recording against those of a channel.
+
+    Args:
+        ax: Axes to draw into.
+        comparison: Recording and simulation.
+        sensor: Position of the sensor.
+        x: The channel `(time,)`.
+        label: Name of the channel.
+        path: Fitted path `(sensor, time)`; None for none.
+    """
+    across, means = block_means(x), block_means(comparison.recording[sensor])
+    handles: list[Any] = ax.plot(across, means - means.mean(), **_DOT)
+    if path is not None:
+        order, fitted = across.argsort(), block_means(path[sensor])
+        handles += ax.plot(across[order], (fitted - fitted.mean())[order], **DASHED)
+    ax.set_xlabel(label, parse_math=False)
+    ax.set_ylabel(with_unit("mean of a block", comparison.info.measure), parse_math=False)
+    finish(ax, handles, ["recording", "fitted"])
+
+
+def gain_on_channel(ax: Axes, comparison: Comparison, sensor: int, x: Tensor, label: str) -> None:
+    """Samples of the recording against a channel that they follow at once: means and standard errors in 24 bins.
+
+    Args:
+        ax: Axes to draw into.
+        comparison: Recording and simulation.
+        sensor: Position of the sensor.
+        x: The channel, or the path of size one that was made of it, `(time,)`.
+        label: Name of the channel.
+    """
+    edges = torch.quantile(x[:: max(len(x) // 100_000, 1)], torch.linspace(0, 1, 25, dtype=x.dtype)).unique()
+    which = torch.bucketize(x, edges[1:-1])
+    count = torch.bincount(which, minlength=len(edges) - 1).clamp(min=1)
+    y = comparison.recording[sensor] - comparison.recording[sensor].mean()
+    mean, middle = (torch.zeros(len(count), dtype=x.dtype).index_add(0, which, v) / count for v in (y, x))
+    sd = float(y.std()) / count.sqrt()
+    handles = [ax.errorbar(middle, mean, yerr=Z * sd, color=INK, linestyle="none", marker="o", markersize=3)]
+    ax.set_xlabel(label, parse_math=False)
+    ax.set_ylabel(with_unit("mean of samples", comparison.info.measure), parse_math=False)
+    finish(ax, handles, ["recording, with 95 % intervals"])
+
+
+def ratio_of_spectra(ax: Axes, comparison: Comparison, sensor: int, factor: Callable[[Tensor], Tensor] | None) -> None:
+    """Ratio of the powers of recording and simulation by band of frequency, with the range of chance.
+
+    Args:
+        ax: Axes to draw into.
+        comparison: Recording and simulation.
+        sensor: Position of the sensor.
+        factor: Fitted factor on power `(sensor, frequency)` at `f` cycles per sample; None for none.
+    """
+    observed, reference, f = comparison.observed, comparison.reference, comparison.bands.frequency
+    known = reference.dof > 0
+    ratio = (observed.power / reference.power)[sensor, known]
+    sd = (1 / observed.dof[known] + 1 / reference.dof[known]).sqrt()
+    hertz = f[known] * comparison.info.rate
+    handles: list[Any] = ax.plot(hertz, ratio, **_DOT)
+    handles.append(ax.fill_between(hertz, (-Z * sd).exp(), (Z * sd).exp(), **SHADE))
+    if factor is not None:
+        handles += ax.plot(hertz, factor(f[known])[sensor], **DASHED)
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    ax.set_xlabel("frequency (Hz)")
+    ax.set_ylabel("recording over simulation, power")
+    finish(ax, handles, ["recording", "95 % of recordings that agree", "fitted"])
+
+
+def coherence(ax: Axes, comparison: Comparison, sensor: int) -> None:
+    """Largest coherence of a sensor with any other one by band of frequency."""
+    hertz = comparison.bands.frequency * comparison.info.rate
+    handles: list[Any] = []
+    for side, style in ((comparison.observed, _DOT), (comparison.reference, _LINE)):
+        others = torch.arange(comparison.n_sensors) != sensor
+        handles += ax.plot(hertz, side.coherence[:, sensor, others].abs().amax(-1), **style)
+    ax.set_xscale("log")
+    ax.set_ylim(0, 1.02)
+    ax.set_xlabel("frequency (Hz)")
+    ax.set_ylabel("largest coherence with another sensor")
+    finish(ax, handles, ["recording", "simulation"])
+
+
+def values(ax: Axes, comparison: Comparison, sensor: int, centre: float, width: float) -> None:
+    """Histograms of the values around one of them, 200 bins.
+
+    Args:
+        ax: Axes to draw into.
+        comparison: Recording and simulation.
+        sensor: Position of the sensor.
+        centre, width: Middle and half width of the picture, unit of the signal.
+    """
+    bins = np.linspace(centre - width, centre + width, 201)
+    handles: list[Any] = []
+    shift = float(comparison.reference.signal[:, sensor].mean() - comparison.recording[sensor].mean())
+    for signal, style in (
+        (comparison.recording[sensor], {"color": INK, "linewidth": 1.2}),
+        (comparison.reference.signal[0, sensor] - shift, _LINE),
+    ):
+        share = np.histogram(signal.numpy(), bins)[0] / signal.numel()
+        handles.append(ax.stairs(share, bins, **style))
+    ax.set_xlabel(with_unit("value", comparison.info.measure), parse_math=False)
+    ax.set_ylabel("share of the samples in a bin")
+    finish(ax, handles, ["recording", "simulation"])
+
+
+def distance_from_grid(ax: Axes, comparison: Comparison, sensor: int, step: float, offset: float) -> None:
+    """Histograms of the distances of values from a quantisation grid, in steps.
+
+    Args:
+        ax: Axes to draw into.
+        comparison: Recording and simulation.
+        sensor: Position of the sensor.
+        step, offset: Of the grid, unit of the signal.
+    """
+    bins = np.linspace(-0.5, 0.5, 101)
+    shift = float(comparison.reference.signal[:, sensor].mean() - comparison.recording[sensor].mean())
+    handles: list[Any] = []
+    for signal, style in (
+        (comparison.recording[sensor], {"color": INK, "linewidth": 1.2}),
+        (comparison.reference.signal[0, sensor] - shift, _LINE),
+    ):
+        place = (signal - offset) / step
+        density = np.histogram((place - place.round()).numpy(), bins, density=True)[0]
+        handles.append(ax.stairs(density, bins, **style))
+    ax.set_xlabel("distance from the grid (steps)")
+    ax.set_ylabel("density")
+    finish(ax, handles, ["recording", "simulation"])
+
+
+def samples(ax: Axes, comparison: Comparison, sensor: int, first: int, count: int) -> None:
+    """A few samples of both sides, one by one.
+
+    Args:
+        ax: Axes to draw into.
+        comparison: Recording and simulation.
+        sensor: Position of the sensor.
+        first, count: First sample that is shown, and number of them.
+    """
+    first = max(min(first, comparison.n_samples - count), 0)
+    seconds = torch.arange(first, first + count) / comparison.info.rate
+    own = comparison.recording[sensor, first : first + count]
+    other = comparison.reference.signal[0, sensor, :count]
+    handles: list[Any] = ax.plot(seconds, own - own.mean(), color=INK, linewidth=0.8, marker="o", markersize=2.5)
+    handles += ax.plot(seconds[: len(other)], other - other.mean(), color=BLUE, linewidth=0.8, alpha=0.7)
+    ax.set_xlabel("time (s)")
+    ax.set_ylabel(with_unit("sample", comparison.info.measure), parse_math=False)
+    finish(ax, handles, ["recording", "simulation"])
+
+
+def tails(ax: Axes, comparison: Comparison, sensor: int) -> None:
+    """Share of prediction errors beyond each size, in standard deviations, and that of normal noise."""
+    handles: list[Any] = []
+    for side, style in ((comparison.observed, {"color": INK, "linewidth": 1.4}), (comparison.reference, _LINE)):
+        size = left_out(side).z[:, sensor].flatten().abs().sort(descending=True).values
+        kept = torch.logspace(0, math.log10(len(size)), 400).long().unique().clamp(max=len(size)) - 1
+        handles += ax.plot(size[kept], (kept + 1) / len(size), **style)
+    x = torch.linspace(0, 6, 100, dtype=torch.float64)
+    handles += ax.plot(x, torch.special.erfc(x / math.sqrt(2)), **DASHED)
+    ax.set_yscale("log")
+    ax.set_ylim(bottom=0.3 / comparison.n_samples)
+    ax.set_xlabel("size of a prediction error (standard deviations)")
+    ax.set_ylabel("share beyond it")
+    finish(ax, handles, ["recording", "simulation", "normal noise"])
+
+
+def variance_over_time(ax: Axes, comparison: Comparison, sensor: int, course: Tensor | None) -> None:
+    """Mean squares of whitened samples over 256 blocks.
+
+    Args:
+        ax: Axes to draw into.
+        comparison: Recording and simulation.
+        sensor: Position of the sensor.
+        course: Fitted variance `(sensor, time)`, over that of the rest; None for none.
+    """
+    seconds = (torch.arange(N_BLOCKS) + 0.5) * comparison.block / comparison.info.rate
+    white = whitened(comparison.observed.steady[0], comparison.base)
+    squares = block_means(white[sensor].square())
+    handles: list[Any] = ax.plot(seconds, squares, **_DOT)
+    if course is not None:
+        fitted = block_means(course[sensor])
+        handles += ax.plot(seconds, fitted * squares.median() / fitted.median(), **DASHED)
+    ax.set_yscale("log")
+    ax.set_xlabel("time (s)")
+    ax.set_ylabel("variance over the simulation's")
+    finish(ax, handles, ["recording", "fitted"])
+
+
+def two_levels(ax: Axes, comparison: Comparison, sensor: int, half_step: float, dwell: float) -> None:
+    """Means over an eighth of a dwell, and the likeliest path between two levels (Viterbi), over some forty dwells.
+
+    Args:
+        ax: Axes to draw into.
+        comparison: Recording and simulation.
+        sensor: Position of the sensor.
+        half_step: Half the distance of the levels; 0 where none is left.
+        dwell: Mean time in a level, samples.
+    """
+    length = max(int(dwell / 8), 1)
+    n = min(comparison.n_samples // length, 320)
+    means = comparison.recording[sensor, : n * length].unflatten(-1, (n, length)).mean(-1)
+    means = means - means.median()
+    seconds = (torch.arange(n) + 0.5) * length / comparison.info.rate
+    handles: list[Any] = ax.plot(seconds, means, color=INK, linewidth=0.8)
+    if half_step:
+        noise = float(means.diff().square().median()) / 0.9  # twice the variance of a mean: chi-square has median 0.45
+        handles += ax.plot(seconds, half_step * _likeliest_path(means / half_step, noise / half_step**2), **DASHED)
+    ax.set_xlabel("time (s)")
+    ax.set_ylabel(with_unit("mean of a few samples", comparison.info.measure), parse_math=False)
+    finish(ax, handles, ["recording", "decoded"])
+
+
+def _likeliest_path(y: Tensor, variance: float, stay: float = 7 / 8) -> Tensor:
+    """Path of values +-1 that is likeliest for means `(time,)` of some variance, by Viterbi's algorithm."""
+    score = torch.stack([-(y + 1).square(), -(y - 1).square()], -1) / max(variance, 1e-6)
+    move = torch.tensor([[stay, 1 - stay], [1 - stay, stay]], dtype=y.dtype).log()
+    best, back = score[0], []
+    for row in score[1:]:
+        value, at = (best[:, None] + move).max(0)
+        best = value + row
+        back.append(at)
+    state = int(best.argmax())
+    states = [state]
+    for at in reversed(back):
+        state = int(at[state])
+        states.append(state)
+    return 2.0 * torch.tensor(states[::-1], dtype=y.dtype) - 1
+
+
+def spectrogram(ax: Axes, comparison: Comparison, sensor: int, frequency_hz: float, half_width_hz: float) -> None:
+    """Power of the recording over time and frequency around a line, and where it is highest at each time.
+
+    Args:
+        ax: Axes to draw into.
+        comparison: Recording and simulation.
+        sensor: Position of the sensor.
+        frequency_hz, half_width_hz: Middle and half width of the line.
+    """
+    rate, n = comparison.info.rate, comparison.n_samples
+    window = int(min(max(2 * rate / max(half_width_hz, rate / n), 64), n / 8))
+    hop = max(window // 4, n // 400)
+    pieces = comparison.recording[sensor].unfold(-1, window, hop)
+    power = torch.fft.rfft(pieces * torch.hann_window(window, dtype=pieces.dtype)).abs().square()
+    f = torch.arange(power.shape[-1], dtype=torch.float64) / window * rate
+    reach = max(6 * half_width_hz, 4 * rate / window)
+    shown = (f - frequency_hz).abs() <= reach
+    if int(shown.sum()) < 2:
+        return
+    seconds = (torch.arange(len(power)) * hop + window / 2) / rate
+    level = power[:, shown].clamp(min=1e-300).log10().mT
+    low = float(level.median())
+    ax.pcolormesh(seconds, f[shown], level, cmap="Greys", vmin=low - 0.3, vmax=max(float(level.max()), low + 1.5))
+    track = f[shown][power[:, shown].argmax(-1)]
+    handles = ax.plot(seconds, track, color=DASHED["color"], linewidth=0.8)
+    ax.set_xlabel("time (s)")
+    ax.set_ylabel("frequency (Hz)")
+    finish(ax, handles, ["highest power"])
+    ax.grid(visible=False)

@@ -1,0 +1,97 @@
+"""Forward selection: the strongest finding of each stage is repaired, and the stage is searched again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+
+from gyrofuse.mismatch.mechanisms.catalogue import STAGES
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
+from gyrofuse.mismatch.selection.discrepancy import leads_away
+from gyrofuse.mismatch.selection.held_out import HeldOutScore, score_held_out
+from gyrofuse.mismatch.signals.comparison import Comparison
+
+_MOST, _MOST_OF_A_KIND = 20, 6  # findings: a recording that needs more is another instrument
+
+
+class Selected(NamedTuple):
+    """A finding, and what it was found in.
+
+    Attributes:
+        finding: Finding with its held-out score.
+        before: Recording and simulation in which it was found.
+        score: Its held-out score there.
+    """
+
+    finding: Finding
+    before: Comparison
+    score: HeldOutScore
+
+
+def select(
+    start: Comparison,
+    level: float,
+    generator: torch.Generator,
+    progress: Callable[[str, float], None],
+) -> tuple[list[Selected], Comparison]:
+    """Findings in the order in which they were found, and recording and simulation with all of them repaired.
+
+    A finding is taken if it scores on the blocks held out, and if the simulation that has it is no farther from the
+    recording than before. Of the findings of a stage the one that explains most is taken first.
+
+    Args:
+        start: Recording and simulation as they came.
+        level: Largest p value of a finding.
+        generator: Source of the random numbers of what is applied to the simulation.
+        progress: Function of what is searched for, and of the share of the stages that are done.
+    """
+    comparison, selected = start, list[Selected]()
+    for number, stage in enumerate(STAGES):
+        if len({i for one in selected for i in one.finding.hides}) == start.n_sensors:
+            break
+        progress(", ".join(kind.name for kind in stage), number / len(STAGES))
+        while len(selected) < _MOST:
+            best = _best_of_stage(stage, selected, start, comparison, level, generator)
+            if best is None:
+                break
+            selected.append(best)
+            comparison = best.finding.repair(comparison, generator)
+    return selected, comparison
+
+
+def _best_of_stage(
+    stage: tuple[type[Mechanism], ...],
+    selected: list[Selected],
+    start: Comparison,
+    comparison: Comparison,
+    level: float,
+    generator: torch.Generator,
+) -> Selected | None:
+    """The finding of a stage that explains most among those that hold; None without one."""
+    known = [one.finding for one in selected]
+    found = []
+    for kind in stage:
+        if sum(f.mechanism == kind.name for f in known) >= _MOST_OF_A_KIND:
+            continue
+        finding = kind.detect_and_fit(comparison, level * kind.level_after_repairs if known else level)
+        if finding is not None and not _is_known(finding, known):
+            found.append(finding)
+    for finding in sorted(found, key=lambda f: -f.gain):
+        score = score_held_out(comparison, finding.effect)
+        if score.confirms(finding.p_value) and not leads_away(start, comparison, score.by_fold, generator):
+            return Selected(replace(finding, held_out_gain=score.total), comparison, score)
+    return None
+
+
+def _is_known(finding: Finding, known: list[Finding]) -> bool:
+    """Whether the same was found before: what its repair could not take away is not another one."""
+    if finding.effect.stage:  # a fact on the numbers of some sensors
+        return any(f.mechanism == finding.mechanism and set(finding.sensors) <= set(f.sensors) for f in known)
+    return any(
+        (finding.mechanism, finding.sensors, finding.channel, finding.time_s, finding.frequency_hz)
+        == (other.mechanism, other.sensors, other.channel, other.time_s, other.frequency_hz)
+        for other in known
+    )
