@@ -65,9 +65,9 @@ def diagnose(
         rate: Hz, for recordings given as tensors; 1 by default.
         fitted_samples: Samples of each sensor that a model was estimated from, where it does not know: models of fits
             do, and others count as known. Spectra are compared beside what such numbers may be off.
-        twins: How many twins of the recording, in which nothing is missing, tell how surprising the witnesses are: they
-            are resampled from the simulation's own innovations. By default none: the witnesses' own p values are held
-            to. 50 or more cost so many times a look.
+        twins: Number of null replicates, pairs of recording and simulation in which nothing is missing, that calibrate
+            the family-wise p value: they are resampled from the simulation's own innovations. By default none: the p
+            values of the tests are taken as they are. 50 or more cost so many times all tests.
         judge: Another recording of the same device, in the same kind, of which nothing is estimated: it says how far
             the simulation is from it before and after the repair, and how far the recording itself (`judged`).
         generator: Source of the diagnosis's own random numbers: of a model's samples, and of what is built into the

@@ -98,7 +98,7 @@ def test_the_page_names_every_witness_and_what_was_ruled_out():
         assert float(row[2]) == pytest.approx(after.p_value, rel=0.06)
         assert telling.capital(before.words) in row[3]
     assert "Looked for and not found" in told.text
-    assert "After the repair no witness sees a difference." in told.text
+    assert "After the repair no test sees a difference." in told.text
     assert "Unexplained" not in told.text
 
 

@@ -47,8 +47,8 @@ from gyrofuse.mismatch.mechanisms.values.unit_scale import UnitScale
 from gyrofuse.mismatch.repair import serialise as saved
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel
 from gyrofuse.mismatch.repair.serialise import repaired_from_dict
-from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.comparison import RecordingInfo
+from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
 
 NOISE = gf.ArrayModel.from_sensors([gf.WhiteNoise(1.0) + gf.AR1(0.9, 0.1), gf.WhiteNoise(2.0) + gf.AR1(0.8, 0.2)])

@@ -1,4 +1,4 @@
-"""All witnesses together."""
+"""All tests together."""
 
 from __future__ import annotations
 
@@ -43,14 +43,19 @@ def run_tests(
     comparison: Comparison,
     progress: Callable[[str, float], None] = lambda _what, _share: None,
 ) -> tuple[TestResult, ...]:
-    """What every witness says; `progress` is told which is asked next, and the share of them that were."""
-    evidence = []
-    for number, witness in enumerate(TESTS):
-        progress(witness.__name__.replace("_", " "), number / len(TESTS))
-        evidence.append(witness(comparison))
-    return tuple(evidence)
+    """Results of all tests, in their order.
+
+    Args:
+        comparison: Recording and simulation.
+        progress: Function of the name of the next test, and of the share of tests that are done.
+    """
+    results = []
+    for number, test in enumerate(TESTS):
+        progress(test.__name__.replace("_", " "), number / len(TESTS))
+        results.append(test(comparison))
+    return tuple(results)
 
 
-def family_wise_p_value(evidence: tuple[TestResult, ...]) -> float:
-    """p value of all witnesses together: that of the most extreme, for having asked so many."""
-    return sidak(min(e.p_value for e in evidence), len(evidence))
+def family_wise_p_value(results: tuple[TestResult, ...]) -> float:
+    """p value of all tests together: the smallest, corrected for their number."""
+    return sidak(min(result.p_value for result in results), len(results))

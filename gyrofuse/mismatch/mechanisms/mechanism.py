@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.axes import clean_name, new_axes_below_each_other
+from gyrofuse._base.deprecation import RenamedAttribute
 from gyrofuse._base.results import cleaned
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.folds import sd_of_sum, spectral_gains
@@ -89,6 +90,8 @@ class Mechanism:
     level_after_repairs: ClassVar[float] = 1.0
     time_words: ClassVar[str] = "sets in at"
     remark: ClassVar[str] = ""
+    simulated = RenamedAttribute("apply")
+    removed = RenamedAttribute("remove")
 
     @property
     def order(self) -> tuple[int, bool]:
@@ -390,5 +393,5 @@ class Finding:
 
 
 def readable(name: str) -> str:
-    """Name of a mechanism or witness for readers."""
+    """Name of a mechanism or of a test for readers."""
     return name.replace("_", " ")

@@ -322,7 +322,9 @@ def spectrogram(ax: Axes, comparison: Comparison, sensor: int, frequency_hz: flo
     seconds = (torch.arange(len(power)) * hop + window / 2) / rate
     level = power[:, shown].clamp(min=1e-300).log10().mT
     low = float(level.median())
-    ax.pcolormesh(seconds, f[shown], level, cmap="Greys", vmin=low - 0.3, vmax=max(float(level.max()), low + 1.5))
+    ax.pcolormesh(
+        seconds, f[shown], level, cmap="Greys", vmin=low - 0.3, vmax=max(float(level.max()), low + 1.5), rasterized=True
+    )
     track = f[shown][power[:, shown].argmax(-1)]
     handles = ax.plot(seconds, track, color=DASHED["color"], linewidth=0.8)
     ax.set_xlabel("time (s)")

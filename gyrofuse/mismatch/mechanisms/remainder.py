@@ -1,7 +1,7 @@
 """What is left of the spectra once everything with a name is explained: a repair without physics.
 
 A simulator that is handed back ought to agree with the recording where the catalogue does not reach, too. The remainder
-is no finding: witnesses that asked for it stay in the report as unexplained.
+is no finding: tests that asked for it stay in the report as unexplained.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Remainder(Filter):
         "So that the repaired simulation has the recording's spectra all the same, the noise of each sensor passes "
         "a filter that stands for no physics."
     )
-    asked_for_by: ClassVar[tuple[str, ...]] = ("spectrum", "shape", "bump")  # witnesses
+    asked_for_by: ClassVar[tuple[str, ...]] = ("spectrum", "shape", "bump")  # names of tests
     frequency: Annotated[Tensor, Dims(("band",))]
     log_gain: Annotated[Tensor, Dims(("sensor", "band"))]
 

@@ -1,7 +1,7 @@
 """What is left of a slow course once everything with a name is explained: taken off without physics.
 
 A bias may follow what the catalogue does not have. As the filter that stands for what is left of the spectra, the
-course is no finding: witnesses that asked for it stay in the report as unexplained.
+course is no finding: tests that asked for it stay in the report as unexplained.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class SlowRemainder(SlowEffect):
     name: ClassVar[str] = "slow_remainder"
     identified: ClassVar[bool] = False
     remark: ClassVar[str] = "A slow course that is left in this recording is taken off it; it stands for no physics."
-    asked_for_by: ClassVar[tuple[str, ...]] = ("slow", "hysteresis")  # witnesses
+    asked_for_by: ClassVar[tuple[str, ...]] = ("slow", "hysteresis")  # names of tests
     happened_once: ClassVar[bool] = True
     changes_noise: ClassVar[bool] = True  # of the lowest frequencies, where it follows what is none
     known_path: ClassVar[bool] = False

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.checks import check_positive_integer, own_generator, same_rate
+from gyrofuse._base.deprecation import RenamedAttribute
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.signals.comparison import RecordingInfo
 from gyrofuse.noise.array_model import ArrayModel
@@ -32,6 +33,7 @@ class RepairedModel:
     info: RecordingInfo
     effects: tuple[Mechanism, ...] = ()
     noise_samples: int = 0
+    scene = RenamedAttribute("info")
 
     def __add__(self, effect: Mechanism) -> RepairedModel:
         return replace(self, effects=(*self.effects, effect)) if isinstance(effect, Mechanism) else NotImplemented

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 from torch import Tensor
 
 from gyrofuse._base.checks import same_rate
+from gyrofuse._base.deprecation import RenamedAttribute
 from gyrofuse._base.results import cleaned
 from gyrofuse.fusion.weights.svo import ScaleWeights
 from gyrofuse.io.recording import Recording
@@ -43,6 +44,7 @@ class Outcome:
     judged: Judged | None = None
     fit: FitVerdict | None = None
     notes: tuple[str, ...] = ()
+    case = RenamedAttribute("comparison")
 
     def correct(self, recording: _Signal) -> _Signal:
         """The recording that was diagnosed, or one that runs along with it, without what can be taken off it.

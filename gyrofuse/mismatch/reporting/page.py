@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 _WIDTH = 7.0  # inches
 _LEFT, _RIGHT, _BELOW, _ABOVE, _BETWEEN = 0.85, 0.15, 0.5, 0.25, 0.35  # margins, inches
 _SCALE = 0.7  # more to the right of a map
+_PICTURE = 2.6  # height of one picture of a finding, inches
 _MOST_NAMED = 8  # sensors in a cell
 
 
@@ -86,7 +87,7 @@ def mismatch_page(outcome: Outcome, *, title: str, remarks: Sequence[str] = ()) 
         shown=info.sensors[sensor],
         moving=info.sensors[moving],
         lines=lines,
-        witnesses=_witnesses(outcome),
+        tests=_tests(outcome),
         otherwise=[capital(words) for words in map(otherwise_words, outcome.findings) if words],
         looked_for=_looked_for(outcome),
         fused=_fused(outcome),
@@ -102,14 +103,9 @@ def _most_concerned(findings: Sequence[Finding], variances: VarianceComparison) 
     """
     worst = variances.z.abs().nan_to_num(nan=0.0).amax(0).tolist()
     which = next((f.sensors for f in findings if f.sensors), tuple(range(len(worst))))
-    clear = {i: _clarity(findings[0], i) for i in which} if findings else {}
-    return max(which, key=lambda i: (clear.get(i, 0.0), worst[i]))
-
-
-def _clarity(finding: Finding, sensor: int) -> float:
-    """The largest of a sensor's own numbers over the width of its interval."""
-    own = [entry for name, entry in finding.parameters.items() if name.endswith(f"[{sensor}]")]
-    return max((abs(entry.value) / max(entry.high - entry.low, 1e-300) for entry in own), default=0.0)
+    if findings and findings[0].sensors:
+        return findings[0].clearest_sensor
+    return max(which, key=lambda i: worst[i])
 
 
 def _part(outcome: Outcome, finding: Finding) -> dict[str, Any]:
@@ -129,6 +125,7 @@ def _part(outcome: Outcome, finding: Finding) -> dict[str, Any]:
         "name": readable(finding.mechanism),
         "sentence": _typeset(capital(finding.sentence)),
         "facts": {name: value for name, value in facts.items() if value},
+        "picture": image(_WIDTH, 2 * _PICTURE, _draw_finding, finding),
         "parameters": [
             {"name": with_unit(parameter_words(name, info.sensors), entry.unit), **_resolved(entry)}
             for name, entry in finding.parameters.items()
@@ -165,8 +162,8 @@ def _resolved(entry: Parameter) -> dict[str, str]:
     return {name: number(getattr(entry, name), digits) for name in ("value", "low", "high")}
 
 
-def _witnesses(outcome: Outcome) -> list[dict[str, Any]]:
-    """Every witness before and after the repair."""
+def _tests(outcome: Outcome) -> list[dict[str, Any]]:
+    """Every test before and after the repair."""
     left = {e.test for e in outcome.unexplained}
     return [
         {
@@ -207,6 +204,11 @@ def _names(outcome: Outcome, which: tuple[int, ...]) -> str:
     names = [outcome.comparison.info.sensors[i] for i in which]
     more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
     return ", ".join(names[:_MOST_NAMED]) + more
+
+
+def _draw_finding(figure: Figure, finding: Finding) -> None:
+    figure.set_layout_engine("constrained")
+    finding.plot(list(figure.subplots(2, 1)))
 
 
 def _panels(figure: Figure, n: int, right: float = _RIGHT, **options: Any) -> list[Any]:

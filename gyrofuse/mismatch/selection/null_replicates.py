@@ -1,7 +1,7 @@
-"""Twins of a recording in which nothing is missing: what witnesses say when recording and simulation agree.
+"""Null replicates: what all tests say of pairs of recording and simulation in which nothing is missing.
 
-A twin has a recording and a simulation of its own, as long as those given and with the same auxiliary channels:
-whatever finite lengths and chance do, they do to twins as well. Both are drawn from the noise that describes the
+A replicate has a recording and a simulation of its own, as long as those given and with the same auxiliary channels:
+whatever finite lengths and chance do, they do to replicates as well. Both are drawn from the noise that describes the
 simulation; where that is not Gaussian, innovations are drawn from those that it has, in blocks of random length whose
 ends meet (the stationary bootstrap: Politis and Romano, JASA 89 (1994), 1303), the same for all sensors.
 """
@@ -72,6 +72,6 @@ def _resampled(comparison: Comparison, n_records: int, n: int, generator: torch.
 
 
 def twin_p_values(comparison: Comparison, n_twins: int, generator: torch.Generator) -> Tensor:
-    """p values of all witnesses together among twins, `(twin,)`: uniform, as far as every witness is honest."""
+    """Family-wise p values of null replicates, `(replicate,)`: uniform, as far as every test is honest."""
     values = [family_wise_p_value(run_tests(twin(comparison, generator))) for _ in range(n_twins)]
     return torch.tensor(values, dtype=torch.float64)
