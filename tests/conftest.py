@@ -15,6 +15,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from made_recordings import make_recordings
 
+from gyrofuse._base import page
 from gyrofuse.cli import app as cli
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
@@ -62,7 +63,13 @@ Run = Callable[..., Outcome]
 
 
 @pytest.fixture
-def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
+def blank_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Images of pages are drawn but not rendered, half the time of a page; cli/test_browser.py renders every kind."""
+    monkeypatch.setattr(page, "save_figure", lambda figure, file, *_, **__: file.write(b"<svg/>"))
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, blank_images: None) -> Run:
     """Run a command in an empty folder."""
     monkeypatch.chdir(tmp_path)
 

@@ -27,6 +27,7 @@ from gyrofuse.mismatch.reporting.page import mismatch_page
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 HOSTILE = ('"><script>alert(1)</script>', "<b>imu</b>", "<img src=x onerror=alert(2)>", "{{ 7 * 7 }}")
+DARK = ("--window-size=500,900", "--blink-settings=preferredColorScheme=0")  # a phone that asks for it
 PROBE = """<script>
 addEventListener("load", () => {
   const root = document.scrollingElement;
@@ -162,8 +163,8 @@ def test_markup_in_names_stays_text(browser: Browser, page: Path):
 
 
 def test_fits_a_phone(browser: Browser, page: Path):
-    for width in (420, 500):
-        measured = browser.measure(page, f"--window-size={width},900")
+    for options in (("--window-size=420,900",), DARK):
+        measured = browser.measure(page, *options)
         assert measured["overflow"] <= 0
         assert all(hidden <= 0 for hidden in measured["hidden"])  # stacked tables show all they say
 
@@ -172,7 +173,7 @@ def test_light_and_dark(browser: Browser, page: Path):
     """Dark ink on a light page, and the other way round where the reader prefers it."""
     light, dark = (
         [sum(map(int, re.findall(r"\d+", colour)[:3])) for colour in measured["colours"]]
-        for measured in (browser.measure(page), browser.measure(page, "--blink-settings=preferredColorScheme=0"))
+        for measured in (browser.measure(page), browser.measure(page, *DARK))
     )
     assert light[0] > 700 > 150 > light[1]
     assert dark[0] < 150 < 600 < dark[1]

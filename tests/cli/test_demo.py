@@ -119,7 +119,11 @@ def test_a_fit_that_did_not_end_has_no_test():
 
 
 def test_command_writes_its_folder_once(
-    ran: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ran: tuple[Path, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    blank_images: None,
 ):
     monkeypatch.chdir(tmp_path)
 

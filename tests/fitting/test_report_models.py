@@ -19,6 +19,8 @@ from gyrofuse.fitting.report import page as report_models
 from gyrofuse.fitting.report.page import model_report
 from gyrofuse.fitting.report.words import model_method, model_verdict, residuals
 
+pytestmark = pytest.mark.usefixtures("blank_images")
+
 RATE = 50.0
 MODEL = WhiteNoise(1e-2) + RandomWalk(1e-6) + Sinusoid(0.05, 0.4)
 

@@ -17,6 +17,8 @@ from gyrofuse.fitting import RankResult, rank_models_moments
 from gyrofuse.fitting.report import ranking as report_ranking
 from gyrofuse.fitting.report.ranking import rank_report, rank_verdict
 
+pytestmark = pytest.mark.usefixtures("blank_images")
+
 MODELS = (
     gf.WhiteNoise(1e-2) + gf.RandomWalk(1e-6) + gf.Sinusoid(0.05, 0.4),
     gf.WhiteNoise(1e-2) + gf.AR1(0.99, 1e-5),

@@ -9,6 +9,8 @@ from gyrofuse.fleet import summary as fleet_summary
 from gyrofuse.fleet.report import fleet_report
 from gyrofuse.fleet.summary import mean_gain, summarise
 
+pytestmark = pytest.mark.usefixtures("blank_images")
+
 
 def fused(n: int, *, seed: int = 0, drift: float = 0.0, sensors: tuple[str, ...] = ("s1", "s2", "s3")) -> list[dict]:
     rng = np.random.default_rng(seed)

@@ -31,6 +31,8 @@ from gyrofuse.fusion.weights.methods import METHODS
 from gyrofuse.fusion.weights.rdvg import rdvg
 from gyrofuse.io.streams import Note
 
+pytestmark = pytest.mark.usefixtures("blank_images")
+
 SCRIPT, BOLD = '"><script>alert(1)</script>', "<b>x</b>.csv"
 
 

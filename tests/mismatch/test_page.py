@@ -25,6 +25,8 @@ from gyrofuse.mismatch.reporting.page import mismatch_page
 from gyrofuse.mismatch.reporting.plots import ends_of_colours, plot_map
 from gyrofuse.mismatch.signals.comparison import Comparison
 
+pytestmark = pytest.mark.usefixtures("blank_images")
+
 N, RATE, TONE = 2**13, 50.0, 7.3
 NAMES = ("left", "<b>right</b>", "{{ 7 * 7 }}")
 NOISE = gf.WhiteNoise(1.0) + gf.AR1(0.99, 1e-3)
