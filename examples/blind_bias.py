@@ -86,7 +86,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1, help="of the first recording")
     parser.add_argument("--quick", action="store_true", help="one short recording with a step")
     options = parser.parse_args()
-    kinds: tuple[str, ...] = KINDS
+    kinds: tuple[str | None, ...] = (None, *KINDS)
     if options.quick:
         options.runs, options.samples, kinds = 1, 8192, ("step",)
     print(
@@ -95,7 +95,7 @@ def main() -> None:
     print(f"{'':<22}{'as recorded':>27}{'corrected':>27}")
     print(f"{'effect':<22}" + f"{'white':>9}{'walk':>9}{'level':>9}" * 2)
     logs: list[float] = []
-    for kind in (None, *kinds):
+    for kind in kinds:
         before, after = [], []
         for seed in range(options.seed, options.seed + options.runs):
             case = make_case(kind or "null", options.nats, seed, n_samples=options.samples)

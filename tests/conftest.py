@@ -6,7 +6,7 @@ import ctypes
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -27,6 +27,32 @@ if hasattr(ctypes.pythonapi, "mallopt"):
     for option, value in ((-1, _TRIM), (-2, _PAD), (-4, _MAPPED)):
         ctypes.pythonapi.mallopt(option, value)
 os.environ |= {"MALLOC_TRIM_THRESHOLD_": str(_TRIM), "MALLOC_TOP_PAD_": str(_PAD), "MALLOC_MMAP_MAX_": str(_MAPPED)}
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--full", action="store_true", help="studies over drawn records at their full size: hours")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Studies come first: at the end of a run short tests keep all processes busy."""
+    items.sort(key=lambda item: item.get_closest_marker("statistical") is None)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Neighbours, which share what they compute, run in one process until another one has nothing left to do."""
+    from xdist.scheduler import WorkStealingScheduling
+
+    return WorkStealingScheduling(config, log)
+
+
+Draws = Callable[[int, int], int]
+
+
+@pytest.fixture(scope="session")
+def draws(pytestconfig: pytest.Config) -> Draws:
+    """The number of records of a study, by default and with `--full`."""
+    return lambda few, many: many if pytestconfig.getoption("full") else few
 
 
 @pytest.fixture(scope="session")

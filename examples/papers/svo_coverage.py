@@ -3,7 +3,7 @@
 Nominal 95 % intervals of the SVO weights by a fitted model and by the paper's block bootstrap, for short and for long
 averaging times, those of the record and those of the paper's record cut to as many levels as there are; and of the
 wavelet variance of single sensors at every level that has two windows side by side (`M_j >= 2 tau_j`). 1000 arrays of
-2^13 and of 2^16 samples for every noise; `--quick` has 60 arrays of 2^12 samples, wavelet variances of one sensor, and
+2^13 and of 2^16 samples for every noise; `--quick` has 30 arrays of 2^12 samples, wavelet variances of one sensor, and
 no averaging times of the paper's record.
 
 The noises: Case 1 (white noise and random walk) and Case 2 (white noise and three AR(1)) of the paper, which take the
@@ -33,7 +33,7 @@ from gyrofuse.fusion.weights.svo import resolve_scale_weights
 
 LEVEL = 0.95
 SIZES = (2**13, 2**16)
-QUICK_REPLICATIONS, QUICK_SIZES = 60, (2**12,)
+QUICK_REPLICATIONS, QUICK_SIZES = 30, (2**12,)
 BATCH = {2**12: 60, 2**13: 50, 2**16: 10}
 COVARIANCES = {"model": "model", "block bootstrap": "block_bootstrap"}
 # The wandering tone: gains as parts of the white noise, angular frequency (rad) and the variance of its steps.

@@ -52,6 +52,7 @@ def test_spread_and_mean_are_those_of_theory(many):
     assert (bias.abs() < (0.2 + 3.3 / math.sqrt(200)) * spread).all(), (bias / spread).tolist()
 
 
+@pytest.mark.statistical
 def test_j_test_has_its_size_and_power(many):
     rejected = int((many.p_value < 0.05).sum())
     assert rejected <= stats.binom.ppf(0.9995, 200, 0.1), rejected  # 1 to 10 % at nominal 5 %

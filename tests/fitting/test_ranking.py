@@ -37,6 +37,7 @@ PARTS = {
 }
 
 
+@pytest.mark.statistical
 def test_the_true_composition_is_chosen():
     """In 12 records of each; a rate of 95 % gives fewer than 8 once in 5400 times."""
     found = gf.rank_models(torch.cat([signals(model, 12, 2048) for model in PARTS.values()]), fit=False)
@@ -46,6 +47,7 @@ def test_the_true_composition_is_chosen():
     assert bool((found.difference[~found.redundant].nan_to_num(nan=0.0) >= 0).all())
 
 
+@pytest.mark.statistical
 def test_two_tones_and_none():
     both = PARTS["WN"] + TONE + gf.Sinusoid(0.5, 1.1)
     assert (gf.rank_models(signals(both, 6), fit=False).n_sinusoids == 2).all()
@@ -123,6 +125,7 @@ def test_larger_candidates_never_have_less_likelihood():
     assert set(found.names) == {"WN + AR1"}
 
 
+@pytest.mark.statistical
 def test_an_ar1_that_is_white_noise_does_not_hide_it():
     """The three best pairs hold no WN + QN: of three processes QN + AR1 + RW came first in half of these records.
 
@@ -143,7 +146,7 @@ def test_the_search_ends_where_nothing_next_to_it_is_better():
 
 @pytest.mark.statistical
 def test_wavelet_variances_alone():
-    """Criteria as by hand, and the true composition; fewer than 15 of 20 once in 3000 times at 95 %."""
+    """Criteria as by hand, and the true composition; fewer than 15 of 20 once in 3000 times at 95 %, 2 of 4 in 2000."""
     signal = signals(PARTS["WN + RW"], 20)[:, 0]
     variance = gf.wavelet_variance(signal, 11)  # 20 sensors
     names = ["WN", "RW", "WN + RW", "WN + AR1 + RW", "WN + QN + RW"]
@@ -159,10 +162,10 @@ def test_wavelet_variances_alone():
     assert found.criterion[0, 2].item() == pytest.approx(by_hand, abs=0.02)
     assert found.wvic[0, 2].item() == pytest.approx(distance + 4, abs=0.02)
     assert found.p_value[0, 2].item() == pytest.approx(stats.chi2.sf(distance, 9), abs=0.01)
-    searched = rank_models_moments(variance[:, :8], 4096, fit=False)
-    assert searched.names.count("WN + RW") >= 5  # fewer once in 2700 times at 95 %
+    assert rank_models_moments(variance[:, :4], 4096, fit=False).names.count("WN + RW") >= 2
 
 
+@pytest.mark.statistical
 def test_wvic_keeps_more():
     """2 ln L of a process too many exceeds WVIC's 2 far more often than 3 ln ln T."""
     found = gf.rank_models(signals(PARTS["WN"], 20), fit=False)
@@ -226,6 +229,7 @@ def test_ramp():
     assert found.best[0].params[0, 1].item() == pytest.approx(1e-3, rel=0.1)
 
 
+@pytest.mark.statistical
 def test_weak_ramps_are_told_from_walks():
     """In 20 records; a rate of 95 % gives fewer than 15 once in 3000 times."""
     weak = signals(PARTS["WN"] + gf.Drift(1.4e-4), 20)  # 10 standard deviations

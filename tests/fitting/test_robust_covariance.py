@@ -112,6 +112,7 @@ def many() -> GMWMResult:
     return gf.fit_gmwm(simulated(200, 2048, seed=3), "WN + RW", efficiency=0.6)
 
 
+@pytest.mark.statistical
 def test_intervals_of_robust_fits_hold_the_truth(many):
     """95 % intervals: within the 99.9 % binomial bounds of 200 runs."""
     low, high = many.confidence_interval

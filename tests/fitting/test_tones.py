@@ -128,6 +128,7 @@ def test_what_the_taper_sees_of_a_steep_spectrum():
 # Estimates
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("n", [10_000, 40_000])
 def test_estimates_reach_the_cramer_rao_bound(n):
     generator = seeded(n)

@@ -198,6 +198,7 @@ def test_oversampled_base_has_the_spectrum_that_is_said():
         assert abs(part.mean() - 1) < 4 * np.sqrt(2 / part.size)
 
 
+@pytest.mark.statistical
 def test_wavelet_variance_of_nulls_is_ordinary():
     """The ordinary view's false alarms: at most what 1 % allows in 30 cases (binomial bound fixed beforehand)."""
     p = []
@@ -235,6 +236,7 @@ def test_expected_power_against_the_double_sum():
     np.testing.assert_allclose(likelihood.expected_power(spectrum), exact, rtol=1e-4)  # r(64) = 6e-7 folds over
 
 
+@pytest.mark.statistical
 def test_oracle_keeps_its_false_alarm_rate():
     """At nominal 5 %, 40 null recordings for each of six effects: at most the 99.9 % point of the binomial law."""
     rng = np.random.default_rng(8)

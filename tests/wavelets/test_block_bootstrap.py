@@ -456,6 +456,7 @@ def true_wccv(white: Tensor, slow: Tensor, n_levels: int) -> Tensor:
     return white / tau + slow * (tau**2 + 2) / (12 * tau)
 
 
+@pytest.mark.statistical
 def test_intervals_hold_at_small_scales_and_fail_at_large_ones():
     """300 recordings of 8192 samples, blocks of the cube root: about 95 % at levels 1-2, far fewer at level 8.
 
@@ -473,6 +474,7 @@ def test_intervals_hold_at_small_scales_and_fail_at_large_ones():
     assert covered[None][7] >= stats.binom.ppf(1e-3, 300, 0.85), covered
 
 
+@pytest.mark.statistical
 def test_coverage_of_weights():
     """Intervals of weights for short scales hold in 95 %, for long scales with blocks of the cube root in far fewer."""
     signal, white, slow = noise(300, 3, 4096, 1e-3)

@@ -39,6 +39,7 @@ def fewest(n: int, tests: int) -> int:
     return int(stats.binom.ppf(1e-3 / tests, n, 0.95))
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("noise", ["gauss", "laplace"])
 def test_coverage_of_wavelet_variances(noise):
     """At every level with two observations or more, 120 runs of 2048 samples; neither too few nor all."""
@@ -50,6 +51,7 @@ def test_coverage_of_wavelet_variances(noise):
     assert covered.double().mean() <= 0.97 * N_RUNS
 
 
+@pytest.mark.statistical
 def test_coverage_of_cross_covariances():
     """Every entry at every level: 120 runs."""
     low, high = wavelet_cross_covariance_interval(arrays("gauss"), N_LEVELS)
