@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,6 +15,7 @@ import pytest
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from made_recordings import make_recordings
+from matplotlib.figure import Figure
 
 from gyrofuse._base import page
 from gyrofuse.cli import app as cli
@@ -91,7 +93,15 @@ Run = Callable[..., Outcome]
 @pytest.fixture
 def blank_images(monkeypatch: pytest.MonkeyPatch) -> None:
     """Images of pages are drawn but not rendered, half the time of a page; cli/test_browser.py renders every kind."""
-    monkeypatch.setattr(page, "save_figure", lambda figure, file, *_, **__: file.write(b"<svg/>"))
+    rendered = page.save_figure
+
+    def save(figure: Figure, file: Path | BytesIO, *arguments: str, **options: Any) -> None:
+        if isinstance(file, BytesIO):
+            file.write(b"<svg/>")
+        else:
+            rendered(figure, file, *arguments, **options)
+
+    monkeypatch.setattr(page, "save_figure", save)
 
 
 @pytest.fixture

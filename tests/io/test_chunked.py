@@ -320,6 +320,7 @@ def one_of_two(rank: int, port: int, folder: str) -> None:
 
     And what came of measuring the recording: nobody waits for one that failed.
     """
+    torch.set_num_threads(1)  # a fork has none of the other threads
     distributed.init_process_group("gloo", init_method=f"tcp://127.0.0.1:{port}", rank=rank, world_size=2)
     signal, fabric = samples(), launched(rank, 2)
     fabric.barrier = distributed.barrier
@@ -354,7 +355,7 @@ def test_two_processes_are_both_done_or_both_told(tmp_path: Path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    torch.multiprocessing.spawn(one_of_two, args=(port, str(tmp_path)), nprocs=2)
+    torch.multiprocessing.start_processes(one_of_two, (port, str(tmp_path)), nprocs=2, start_method="fork")
     said = {path.stem: path.read_text() for path in tmp_path.glob("*.txt")}
     assert said["None 0"] == said["None 1"] == "nothing"
     assert said["None 0 measured"] == said["None 1 measured"] == "4 weights"

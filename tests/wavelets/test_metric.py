@@ -156,6 +156,7 @@ def test_a_merged_metric_goes_on():
 
 def one_of_two(rank: int, port: int, folder: str) -> None:
     """One process of the distributed test: its half of the recording, primed with the end of the other's."""
+    torch.set_num_threads(1)  # a fork has none of the other threads
     distributed.init_process_group("gloo", init_method=f"tcp://127.0.0.1:{port}", rank=rank, world_size=2)
     try:
         signal = recording(2500, gaps=True)
@@ -178,7 +179,7 @@ def test_two_processes_equal_one(tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    torch.multiprocessing.spawn(one_of_two, args=(port, str(tmp_path)), nprocs=2)
+    torch.multiprocessing.start_processes(one_of_two, (port, str(tmp_path)), nprocs=2, start_method="fork")
     expected = one_shot(recording(2500, gaps=True))
     for rank in range(2):
         for result in torch.load(tmp_path / f"{rank}.pt"):
