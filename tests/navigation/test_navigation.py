@@ -268,8 +268,7 @@ def test_the_same_model_costs_the_same_and_a_wrong_one_more():
     wrong = gf.parse_model("AR1(phi=0.18,variance=1e-5) + RW(variance=2e-10)")
     short = Trajectory(flight().time[:8], flight().position[:8])
     asked = {"trajectory": short, "gnss": Gnss(outage=(60.0, 100.0)), "rate": 20.0, "n_flights": 60}
-    few = {"trajectory": Trajectory(flight().time[:4], flight().position[:4]), "rate": 20.0, "n_flights": 4}
-    same = compare_filters(truth, truth, gnss=Gnss(outage=(20.0, 40.0)), **few)
+    same = compare_filters(truth, truth, **{**asked, "rate": 10.0, "n_flights": 4})
     torch.testing.assert_close(same.ratio, torch.ones_like(same.ratio), rtol=0, atol=0)
     other = compare_filters(wrong, truth, **asked)
     when, ratio, low, high = other.peak
@@ -283,15 +282,15 @@ def test_the_same_model_costs_the_same_and_a_wrong_one_more():
 def test_an_outage_after_the_flight_is_none():
     truth = gf.parse_model("AR1(phi=0.18,variance=1e-5) + RW(variance=2e-13)")
     wrong = gf.parse_model("AR1(phi=0.18,variance=1e-5) + RW(variance=2e-10)")
-    short = Trajectory(flight().time[:4], flight().position[:4])
-    asked = {"trajectory": short, "rate": 20.0, "n_flights": 4}
+    short = Trajectory(flight().time[:6], flight().position[:6])
+    asked = {"trajectory": short, "rate": 10.0, "n_flights": 4}
     none, after = (compare_filters(wrong, truth, gnss=Gnss(outage=o), **asked) for o in (None, (160.0, 210.0)))
     assert after.outage is None
     assert after.peak[:2] == none.peak[:2]
     assert float(after.ratio.max()) == after.peak.ratio
     assert math.isnan(after.peak.low)  # four flights do not tell how far off it may be
     assert after.to_dict()["peak"]["low"] is None
-    assert compare_filters(wrong, truth, gnss=Gnss(outage=(30.0, 210.0)), **asked).outage == (30.0, 45.0)
+    assert compare_filters(wrong, truth, gnss=Gnss(outage=(60.0, 210.0)), **asked).outage == (60.0, 75.0)
 
 
 def test_limits_of_the_peak_know_that_it_was_chosen():
@@ -331,8 +330,8 @@ def test_fixes_between_samples_are_refused(rate, of_fixes):
 def test_models_for_each_flight_are_those_of_the_flights():
     truth = gf.AR1(0.18, 1e-5) + gf.RandomWalk(2e-13)
     each = truth.with_params(truth.params.expand(6, -1).clone())
-    short = Trajectory(flight().time[:4], flight().position[:4])
-    asked = {"trajectory": short, "gnss": Gnss(outage=None), "rate": 20.0, "n_flights": 6}
+    short = Trajectory(flight().time[:6], flight().position[:6])
+    asked = {"trajectory": short, "gnss": Gnss(outage=None), "rate": 10.0, "n_flights": 6}
     one, all_ = compare_filters(truth, truth, **asked), compare_filters(each, each, truth=truth, **asked)
     torch.testing.assert_close(one.position, all_.position)
     with pytest.raises(ValueError, match="`model`: expected one model, or one for each of 5 flights"):
