@@ -122,6 +122,7 @@ def test_commands_of_the_command_line_exist_with_their_options():
 
 
 @pytest.mark.filterwarnings("error:.* is deprecated and goes with release:DeprecationWarning")
+@pytest.mark.usefixtures("blank_images")
 @pytest.mark.parametrize("path", [path for path in PAGES if blocks("python", path)], ids=lambda path: path.stem)
 def test_python_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)

@@ -79,8 +79,8 @@ def test_the_best_slope_is_the_frequency_of_the_tone():
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("channel", [False, True])
-def test_one_clock_does_not_slip(channel):
-    g, n_runs = generator(3), 40
+def test_one_clock_does_not_slip(channel, draws):
+    g, n_runs = generator(3), draws(20, 40)
     values = [clock_test(comparison(g, torch.zeros(4, N), channel=channel)).p_value for _ in range(n_runs)]
     hits = sum(p < 0.05 for p in values)
     assert stats.binom.sf(hits - 1, n_runs, 0.05) > 1e-3, f"{hits} of {n_runs}"

@@ -246,7 +246,7 @@ def test_a_strong_sweep_is_no_resonance(amplitude: float, monkeypatch: pytest.Mo
     assert [m.name for m in named if m.detect_and_fit(comparison, LEVEL) is not None] == []
     for module in (shapes, oscillating):  # it is the sweep that tells
         monkeypatch.setattr(module, "swept", lambda *_: False)
-    assert [m.name for m in named if m.detect_and_fit(comparison, LEVEL) is not None]
+    assert any(m.detect_and_fit(comparison, LEVEL) is not None for m in named)
 
 
 # Hysteresis.

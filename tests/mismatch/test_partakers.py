@@ -39,10 +39,11 @@ def test_what_is_beyond_doubt_takes_part_beside_anything():
     assert included_sensors(torch.tensor([math.nan, 1.0], dtype=torch.float64), 1, 0.04).positions == (1,)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(("dof", "total", "share"), [(1, 60.0, 0.78), (1, 200.0, 0.985), (3, 60.0, 0.65)])
-def test_the_exact_set_is_found_as_often_as_sizes_that_are_alike_allow(dof: int, total: float, share: float):
+def test_the_exact_set_is_found_as_often_as_sizes_that_are_alike_allow(dof: int, total: float, share: float, draws):
     """Shares are of 3000 drawn arrays; a threshold of 0.7 % for each sensor finds 0.59, 0.975 and 0.49."""
-    rng, right, n = np.random.default_rng(1), 0, 500
+    rng, right, n = np.random.default_rng(1), 0, draws(250, 500)
     for _ in range(n):
         members = rng.permutation(6)[: rng.integers(1, 7)]
         size = np.zeros(6)

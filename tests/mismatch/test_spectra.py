@@ -125,8 +125,8 @@ def test_the_model_of_a_dictionary_has_its_spectrum():
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("shared_noise", [0.0, 0.9])
-def test_lines_are_not_found_where_there_are_none(shared_noise):
-    n, n_runs = 4096, 200
+def test_lines_are_not_found_where_there_are_none(shared_noise, draws):
+    n, n_runs = 4096, draws(100, 200)
     model = gf.WhiteNoise(1.0) + gf.AR1(0.98, 1e-2)
     g, values = generator(7), []
     for _ in range(n_runs):
