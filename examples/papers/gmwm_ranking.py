@@ -33,7 +33,7 @@ from gyrofuse.fitting.spectral.tones import FEWEST_CYCLES
 from gyrofuse.noise.processes import Process
 
 N_SAMPLES = {1: 40_000, 2: 160_000, 3: 160_000}
-N_RUNS, QUICK_RUNS, QUICK_SAMPLES, QUICK_PROCESSES = 200, 6, 20_000, 2
+N_RUNS, QUICK_RUNS, QUICK_SAMPLES, QUICK_PROCESSES = 200, 4, 20_000, 2
 _AT_ONCE = 2**23
 _LINE_LEVEL = 0.001
 _IDENTIFIED = 0.95

@@ -76,12 +76,12 @@ def test_published_criterion_is_reached_or_beaten(axis, formula):
 
 @pytest.mark.statistical
 @pytest.mark.parametrize(("axis", "formula"), [("gx", "WN + AR1 + RW"), ("gy", "WN + AR1 + RW + SIN")])
-def test_no_start_finds_a_lower_minimum_of_noisy_copies(axis, formula):
-    """20 random starts each for 40 copies."""
+def test_no_start_finds_a_lower_minimum_of_noisy_copies(axis, formula, draws):
+    """20 random starts each for some copies."""
     simts = published.table("simts")[axis]
     nu, variance = (torch.tensor(simts[key], dtype=torch.float64) for key in ("wv", "V_diag"))
     generator = torch.Generator().manual_seed(5)
-    n = 40
+    n = draws(10, 40)
     noise = torch.randn(n, len(nu), generator=generator, dtype=torch.float64)
     copies = nu * (noise * (variance.sqrt() / nu).clamp(max=0.5)).exp()
     found = gf.fit_gmwm_moments(copies.unsqueeze(-1), 20_000, formula, weighting=1 / variance)
