@@ -226,7 +226,7 @@ def test_two_processes_give_the_same_table_also_of_one_log(run: Run, logs: Path,
         "    except SystemExit as ended:\n"
         "        assert not ended.code\n"
     )
-    two = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=100)
+    two = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert (two.returncode, two.stderr) == (0, "")
     for i, words in enumerate(asked):
         run(*words, f"{i}.parquet")
