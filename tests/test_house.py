@@ -34,7 +34,8 @@ FLOORS = [
 ]
 # The same inside `mismatch`.
 FLOORS_OF_MISMATCH = [
-    {"diagnose", "__init__"},
+    {"__init__"},
+    {"diagnose"},
     {"reporting"},
     {"repair"},
     {"selection"},

@@ -69,7 +69,7 @@ def means_over_time(ax: Axes, comparison: Comparison, sensor: int, path: Tensor 
         handles += ax.plot(seconds, fitted - fitted.mean(), **DASHED)
     ax.set_xlabel("time (s)")
     ax.set_ylabel(with_unit("mean of a block", comparison.info.measure), parse_math=False)
-    finish(ax, handles, ["recording", "fitted"])
+    _finish(ax, handles, ["recording", "fitted"])
 
 
 def means_against(ax: Axes, comparison: Comparison, sensor: int, x: Tensor, label: str, path: Tensor | None) -> None:
@@ -90,7 +90,7 @@ def means_against(ax: Axes, comparison: Comparison, sensor: int, x: Tensor, labe
         handles += ax.plot(across[order], (fitted - fitted.mean())[order], **DASHED)
     ax.set_xlabel(label, parse_math=False)
     ax.set_ylabel(with_unit("mean of a block", comparison.info.measure), parse_math=False)
-    finish(ax, handles, ["recording", "fitted"])
+    _finish(ax, handles, ["recording", "fitted"])
 
 
 def gain_on_channel(ax: Axes, comparison: Comparison, sensor: int, x: Tensor, label: str) -> None:
@@ -137,7 +137,7 @@ def ratio_of_spectra(ax: Axes, comparison: Comparison, sensor: int, factor: Call
     ax.set_yscale("log")
     ax.set_xlabel("frequency (Hz)")
     ax.set_ylabel("recording over simulation, power")
-    finish(ax, handles, ["recording", "95 % of recordings that agree", "fitted"])
+    _finish(ax, handles, ["recording", "95 % of recordings that agree", "fitted"])
 
 
 def coherence(ax: Axes, comparison: Comparison, sensor: int) -> None:
@@ -256,7 +256,7 @@ def variance_over_time(ax: Axes, comparison: Comparison, sensor: int, course: Te
     ax.set_yscale("log")
     ax.set_xlabel("time (s)")
     ax.set_ylabel("variance over the simulation's")
-    finish(ax, handles, ["recording", "fitted"])
+    _finish(ax, handles, ["recording", "fitted"])
 
 
 def two_levels(ax: Axes, comparison: Comparison, sensor: int, half_step: float, dwell: float) -> None:
@@ -280,7 +280,7 @@ def two_levels(ax: Axes, comparison: Comparison, sensor: int, half_step: float, 
         handles += ax.plot(seconds, half_step * _likeliest_path(means / half_step, noise / half_step**2), **DASHED)
     ax.set_xlabel("time (s)")
     ax.set_ylabel(with_unit("mean of a few samples", comparison.info.measure), parse_math=False)
-    finish(ax, handles, ["recording", "decoded"])
+    _finish(ax, handles, ["recording", "decoded"])
 
 
 def _likeliest_path(y: Tensor, variance: float, stay: float = 7 / 8) -> Tensor:
@@ -331,3 +331,8 @@ def spectrogram(ax: Axes, comparison: Comparison, sensor: int, frequency_hz: flo
     ax.set_ylabel("frequency (Hz)")
     finish(ax, handles, ["highest power"])
     ax.grid(visible=False)
+
+
+def _finish(ax: Axes, handles: list[Any], labels: list[str]) -> None:
+    """The common look, with labels for what was drawn."""
+    finish(ax, handles, labels[: len(handles)])

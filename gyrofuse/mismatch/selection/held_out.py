@@ -38,12 +38,17 @@ class HeldOutScore(NamedTuple):
     def total(self) -> float:
         return float(self.blocks.sum())
 
+    @property
+    def sd(self) -> float:
+        """Standard deviation of the total, from the scatter of the blocks."""
+        return sd_of_sum(self.blocks)
+
     def confirms(self, p_value: float) -> bool:
         """Whether a finding of that p value holds on the blocks held out (the rule of one standard error).
 
         Numbers that hold only beside those of other mechanisms do not pass.
         """
-        least = 0.0 if p_value < _BEYOND_DOUBT else _ACCEPTED_SD * sd_of_sum(self.blocks)
+        least = 0.0 if p_value < _BEYOND_DOUBT else _ACCEPTED_SD * self.sd
         return self.in_sample > 0 and self.total > least
 
 
