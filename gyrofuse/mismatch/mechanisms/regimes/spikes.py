@@ -177,7 +177,9 @@ class Spikes(Mechanism):
         return signal + torch.where(at & (rate > 0), sign * size, 0.0)
 
     def remove(self, signal: Tensor, info: RecordingInfo) -> Tensor:
-        """Samples that are outliers more likely than not are predicted from all others."""
+        """Samples that are outliers more likely than not are predicted from all others of their record."""
+        if signal.ndim > 2:
+            return torch.stack([self.remove(record, info) for record in signal.flatten(0, -3)]).view_as(signal)
         comparison = Comparison.of(info, signal, signal[None])
         error = left_out(comparison.observed).correctable()[0]
         return torch.where(self._outliers(comparison, error), signal - error, signal)

@@ -162,9 +162,9 @@ class Quantization(Mechanism):
         """
         own = signal.mean(-1, keepdim=True) - self.centre[:, None]
         offset = self.offset[:, None] + torch.where(self.blur[:, None] > 0, own, 0.0)
-        place = ((signal - offset) / self._divisor).movedim(-2, 0)
-        moved = torch.stack([_blurred(row, float(blur)) for row, blur in zip(place, self.blur, strict=True)], -2)
-        return torch.where(self.step[:, None] > 0, moved * self._divisor + offset, signal)
+        records = ((signal - offset) / self._divisor).reshape(-1, *signal.shape[-2:])
+        moved = [_blurred(row, float(blur)) for record in records for row, blur in zip(record, self.blur, strict=True)]
+        return torch.where(self.step[:, None] > 0, torch.stack(moved).view_as(signal) * self._divisor + offset, signal)
 
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
         return held_out_blocks(self._scores(comparison.recording), fold).sum((0, -1))

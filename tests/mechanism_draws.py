@@ -1,0 +1,474 @@
+"""Draws of every mechanism of the catalogue, with the recordings that they act on, for tests of what all have to do.
+
+A new mechanism gets one function here, marked with `draws`: it gives an instance, and what its limits have to cover.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+import gyrofuse as gf
+from gyrofuse.mismatch.likelihoods.filter_forms import filter_strength
+from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
+from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
+from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
+from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph
+from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
+from gyrofuse.mismatch.mechanisms.remainder import Remainder
+from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
+from gyrofuse.mismatch.mechanisms.signals.g_sensitivity import GSensitivity
+from gyrofuse.mismatch.mechanisms.signals.quadratic_coupling import QuadraticCoupling
+from gyrofuse.mismatch.mechanisms.signals.scale_factor import ScaleFactor
+from gyrofuse.mismatch.mechanisms.signals.step import Step
+from gyrofuse.mismatch.mechanisms.signals.temperature import TemperatureDrift
+from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
+from gyrofuse.mismatch.mechanisms.signals.tone_amplitude import ToneSize
+from gyrofuse.mismatch.mechanisms.signals.warm_up import WarmUpTransient
+from gyrofuse.mismatch.mechanisms.slow_remainder import SlowRemainder
+from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
+from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
+from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
+from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode
+from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
+from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
+from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
+from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
+from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
+from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
+from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
+from gyrofuse.mismatch.mechanisms.values.unit_scale import UnitScale
+from gyrofuse.mismatch.repair.inputs import prepared
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
+
+RATE = 100.0  # Hz
+N_SAMPLES = 8192  # of the cases that a mechanism is looked for in
+RECORDS = 4  # of a simulation
+NOISE = gf.WhiteNoise(1.0) + gf.AR1(0.98, 0.004) + gf.RandomWalk(1e-6)
+TONE, TONE_SIZE = 0.13, 1.0  # cycles per sample, and amplitude, of a tone that recording and simulation share
+
+
+class Drawn(NamedTuple):
+    """An instance of a mechanism.
+
+    Attributes:
+        effect: It.
+        truth: What limits have to cover, by the names of a finding's parameters.
+        channels: Auxiliary channels that it follows.
+        tone: Whether it takes a tone that recording and simulation have.
+    """
+
+    effect: Mechanism
+    truth: dict[str, float]
+    channels: Mapping[str, Tensor] = {}
+    tone: bool = False
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Where a mechanism is to act.
+
+    Attributes:
+        clean: Recording without it, `(sensor, time)`.
+        concerned: Sensors that have it.
+        size: Of the effect, over one that is plainly seen: 100 to 300 nats in two sensors and `N_SAMPLES`.
+        generator: Of its numbers.
+    """
+
+    clean: Tensor
+    concerned: tuple[int, ...]
+    size: float
+    generator: torch.Generator = field(repr=False)
+
+    @property
+    def n_sensors(self) -> int:
+        return self.clean.shape[-2]
+
+    @property
+    def n_samples(self) -> int:
+        return self.clean.shape[-1]
+
+    def even(self, low: float, high: float) -> float:
+        return low + (high - low) * float(torch.rand((), generator=self.generator, dtype=torch.float64))
+
+    def chance(self) -> bool:
+        return self.even(0, 1) < 0.5
+
+    def sign(self) -> float:
+        return 1.0 if self.chance() else -1.0
+
+    def normal(self, *shape: int) -> Tensor:
+        return torch.randn(shape, generator=self.generator, dtype=torch.float64)
+
+    def sizes(self, low: float, high: float, elsewhere: float = 0.0) -> Tensor:
+        """One number for each sensor concerned, `(sensor,)`."""
+        drawn = [self.even(low, high) if i in self.concerned else elsewhere for i in range(self.n_sensors)]
+        return torch.tensor(drawn, dtype=torch.float64)
+
+    def signed(self, low: float, high: float) -> Tensor:
+        """Likewise, of either sign."""
+        return self.sizes(low, high) * torch.tensor([self.sign() for _ in range(self.n_sensors)], dtype=torch.float64)
+
+    def of_each(self, name: str, values: Tensor) -> dict[str, float]:
+        """Numbers `(sensor,)` of the sensors concerned by the names of parameters."""
+        return {f"{name}[{i}]": float(values[i]) for i in self.concerned}
+
+
+DRAWS: dict[type[Mechanism], Callable[[Setting], Drawn]] = {}
+
+
+def draws(kind: type[Mechanism]) -> Callable[[Callable[[Setting], Drawn]], Callable[[Setting], Drawn]]:
+    """Mark the function that draws instances of a mechanism."""
+
+    def marked(function: Callable[[Setting], Drawn]) -> Callable[[Setting], Drawn]:
+        DRAWS[kind] = function
+        return function
+
+    return marked
+
+
+def draw_of(kind: type[Mechanism]) -> Callable[[Setting], Drawn]:
+    """The function that draws instances of a mechanism."""
+    if kind not in DRAWS:
+        raise LookupError(
+            f"expected a draw of {kind.__name__}, which is in the catalogue, got none; add a function marked with "
+            f"@draws({kind.__name__}) to tests/mechanism_draws.py"
+        )
+    return DRAWS[kind]
+
+
+def generator(*seed: object) -> torch.Generator:
+    """Of numbers that belong to a text and a count."""
+    return torch.Generator().manual_seed(zlib.crc32(repr(seed).encode()))
+
+
+def info(n_sensors: int, channels: Mapping[str, Tensor] | None = None) -> RecordingInfo:
+    return RecordingInfo(RATE, "deg/s", tuple(map(str, range(1, n_sensors + 1))), dict(channels or {}))
+
+
+def array(n_sensors: int) -> gf.ArrayModel:
+    """Noise of the simulation."""
+    return gf.ArrayModel.from_sensors([NOISE] * n_sensors)
+
+
+@functools.cache
+def base_of(n_sensors: int, n_samples: int) -> NoiseSpectrum:
+    """The same as a sum of the spectra that mechanisms refer to."""
+    drawn = array(n_sensors).simulate(n_samples, batch=(16,), generator=generator("base"))
+    return Comparison.of(info(n_sensors), drawn[0], drawn).base
+
+
+def drawn_in(
+    kind: type[Mechanism],
+    *seed: object,
+    n_sensors: int = 2,
+    concerned: Sequence[int] | None = None,
+    size: float = 1.0,
+    n_samples: int = N_SAMPLES,
+) -> tuple[Drawn, Setting]:
+    """An instance of a mechanism, and where it is to act.
+
+    Args:
+        kind: The mechanism.
+        seed: Of all numbers.
+        n_sensors: Of the array.
+        concerned: Sensors that have it; all by default.
+        size: Over one that is plainly seen.
+        n_samples: Of the record.
+    """
+    rng = generator(kind.__name__, *seed)
+    clean = array(n_sensors).simulate(n_samples, generator=rng)
+    which = tuple(range(n_sensors)) if concerned is None else tuple(concerned)
+    setting = Setting(clean, which, size, rng)
+    return draw_of(kind)(setting), setting
+
+
+def tone(n_sensors: int, n_samples: int, turn: float) -> Tensor:
+    """What recording and simulation share, `(sensor, time)`."""
+    angle = 2 * math.pi * TONE * torch.arange(n_samples, dtype=torch.float64) + turn
+    return TONE_SIZE * angle.cos().expand(n_sensors, -1)
+
+
+def concealed(kind: type[Mechanism], *seed: object, n_sensors: int = 2) -> tuple[gf.Recording, gf.Recording, Drawn]:
+    """A recording with a mechanism that the simulation does not have, plainly seen in all sensors, or in one clock."""
+    concerned = None if kind is not ClockSkew else (0,)
+    n_sensors = n_sensors if kind is not ClockSkew else max(n_sensors, 3)
+    drawn, setting = drawn_in(kind, *seed, n_sensors=n_sensors, concerned=concerned)
+    rng = setting.generator
+    simulation = array(n_sensors).simulate(RECORDS * N_SAMPLES, generator=rng)
+    recording = setting.clean
+    if drawn.tone:
+        recording = recording + tone(n_sensors, N_SAMPLES, setting.even(0, 6))
+        simulation = simulation + tone(n_sensors, RECORDS * N_SAMPLES, setting.even(0, 6))
+    recording = drawn.effect.apply(recording, info(n_sensors, drawn.channels), rng)
+    return (
+        gf.Recording(recording, RATE, unit="deg/s", channels=drawn.channels),
+        gf.Recording(simulation, RATE, unit="deg/s"),
+        drawn,
+    )
+
+
+def compared(recording: gf.Recording, simulation: gf.Recording | gf.ArrayModel, *seed: object) -> Comparison:
+    return prepared(recording, simulation, None, generator("case", *seed))
+
+
+def acceleration(setting: Setting) -> Tensor:
+    """Gravity, and a motion of half of it at all frequencies, `(3, time)`, g."""
+    return 0.5 * setting.normal(3, setting.n_samples) + torch.tensor([[0.0], [0.0], [1.0]], dtype=torch.float64)
+
+
+# Facts on the numbers themselves.
+
+
+@draws(UnitScale)
+def _(setting: Setting) -> Drawn:
+    factor = (math.degrees(1), 1000.0, 3600.0)[int(setting.even(0, 3))] ** setting.sign()
+    return Drawn(UnitScale(factor), {"factor": factor})
+
+
+@draws(Quantization)
+def _(setting: Setting) -> Drawn:
+    step = setting.sizes(0.2, 0.6) * min(setting.size, 4.0)
+    blur = setting.sizes(0.1, 0.2) * float(setting.chance())
+    effect = Quantization(step, setting.sizes(-0.5, 0.5) * step, blur, setting.clean.mean(-1))
+    return Drawn(effect, setting.of_each("lsb", step))
+
+
+@draws(DeadBand)
+def _(setting: Setting) -> Drawn:
+    half_width = setting.sizes(0.03, 0.1) * min(setting.size, 10.0)
+    effect = DeadBand(setting.sizes(-0.1, 0.1), half_width, setting.clean.mean(-1))
+    return Drawn(effect, setting.of_each("dead_band", half_width))
+
+
+@draws(Clipping)
+def _(setting: Setting) -> Drawn:
+    low = setting.sizes(-2.5, -2.0, -math.inf)
+    high = torch.full_like(low, math.inf) if setting.chance() else setting.sizes(2.0, 2.5, math.inf)
+    truth = setting.of_each("low", low) | (setting.of_each("high", high) if bool(high.isfinite().any()) else {})
+    return Drawn(Clipping(low, high, setting.clean.mean(-1)), truth)
+
+
+@draws(StuckSamples)
+def _(setting: Setting) -> Drawn:
+    probability = (setting.sizes(0.003, 0.01) * setting.size).clamp(max=0.9)
+    together = setting.chance()
+    if together:
+        probability = torch.where(probability > 0, probability.max(), 0.0)
+    return Drawn(
+        StuckSamples(probability, torch.zeros_like(probability), together),
+        setting.of_each("probability", probability),
+    )
+
+
+# The law of single samples, and what changes with time.
+
+
+@draws(Spikes)
+def _(setting: Setting) -> Drawn:
+    together = setting.chance() and len(setting.concerned) > 1
+    rate = (setting.sizes(0.001, 0.002) * setting.size).clamp(max=0.02)
+    if together:
+        rate = torch.where(rate > 0, rate.max(), 0.0)
+    effect = Spikes(rate, setting.sizes(6.0, 9.0), setting.sizes(0.5, 1.0), together)
+    per_hour = rate * RATE * 3600
+    rates = {"rate": float(per_hour.max())} if together else {}
+    return Drawn(effect, setting.of_each("amplitude", effect.amplitude) | rates | setting.of_each("rate", per_hour))
+
+
+@draws(VarianceChange)
+def _(setting: Setting) -> Drawn:
+    seconds = setting.n_samples / RATE
+    start, length = setting.even(0.15, 0.35) * seconds, setting.even(0.3, 0.5) * seconds
+    factor = setting.sizes(1.6, 2.2, 1.0) ** min(setting.size, 5.0)
+    truth = {"start": start, "stop": start + length, **setting.of_each("factor", factor)}
+    return Drawn(VarianceChange(((start, start + length),), factor, setting.even(0.5, 2.0)), truth)
+
+
+@draws(GradualChange)
+def _(setting: Setting) -> Drawn:
+    seconds = setting.n_samples / RATE
+    knots = torch.tensor([0.0, setting.even(0.1, 0.2), setting.even(0.8, 0.9), 1.0], dtype=torch.float64) * seconds
+    share = torch.tensor([0.0, 0.0, 1.0, 1.0], dtype=torch.float64)
+    factor = setting.sizes(2.5, 3.5, 1.0) ** min(setting.size, 3.0)
+    effect = GradualChange(knots, share, torch.ones_like(factor), factor, setting.even(0.5, 2.0))
+    return Drawn(effect, setting.of_each("factor", factor))
+
+
+@draws(RandomTelegraph)
+def _(setting: Setting) -> Drawn:
+    half_step = setting.sizes(0.8, 1.1) * setting.size
+    up, down = (setting.sizes(1.0, 3.0, 1.0) for _ in range(2))
+    truth = [setting.of_each(*pair) for pair in (("half_step", half_step), ("dwell_up", up), ("dwell_down", down))]
+    return Drawn(RandomTelegraph(half_step, up, down), truth[0] | truth[1] | truth[2])
+
+
+# Known paths in noise.
+
+
+@draws(ClockSkew)
+def _(setting: Setting) -> Drawn:
+    none = torch.zeros(len(setting.concerned), dtype=torch.complex128)
+    if setting.chance():
+        skew = setting.sign() * setting.even(1.5e-4, 4e-4) * setting.size
+        effect = ClockSkew(setting.concerned, skew, (), TONE, none, none)
+        return Drawn(effect, {"skew": 1e6 * skew}, tone=True)
+    at, count = int(setting.even(0.3, 0.7) * setting.n_samples), 1 + int(setting.chance())
+    effect = ClockSkew(setting.concerned, 0.0, ((at, count),), TONE, none, none)
+    return Drawn(effect, {"lost": count, "time_of_loss_1": at / RATE}, tone=True)
+
+
+@draws(GSensitivity)
+def _(setting: Setting) -> Drawn:
+    coupling = (
+        setting.sizes(0.25, 0.4)[:, None]
+        * setting.size
+        * torch.nn.functional.normalize(setting.normal(setting.n_sensors, 3), dim=-1)
+    )
+    truth = setting.of_each("gain", coupling.norm(dim=-1))
+    return Drawn(GSensitivity("acceleration", coupling), truth, {"acceleration": acceleration(setting)})
+
+
+@draws(QuadraticCoupling)
+def _(setting: Setting) -> Drawn:
+    kind = "length" if setting.chance() else "axis 2"
+    gain = setting.signed(0.25, 0.4) * setting.size * (1 if kind == "length" else math.sqrt(3))
+    effect = QuadraticCoupling("acceleration", gain[:, None], kind)
+    return Drawn(effect, setting.of_each("gain", gain), {"acceleration": acceleration(setting)})
+
+
+@draws(ScaleFactor)
+def _(setting: Setting) -> Drawn:
+    error = setting.signed(6e-3, 1e-2) * setting.size
+    motion = gf.AR1(0.9, 400 * (1 - 0.9**2)).simulate(setting.n_samples, generator=setting.generator)
+    return Drawn(
+        ScaleFactor("rate", error[:, None]), setting.of_each("error", 1e6 * error), {"rate": motion.reshape(1, -1)}
+    )
+
+
+@draws(VibrationTone)
+def _(setting: Setting) -> Drawn:
+    f, size = setting.even(5, 45), setting.sizes(0.2, 0.3) * setting.size
+    turn = torch.tensor([setting.even(0, 6) for _ in size], dtype=torch.float64)
+    effect = VibrationTone(f, size * turn.cos(), size * turn.sin())
+    return Drawn(effect, {"frequency": f, **setting.of_each("amplitude", size)})
+
+
+@draws(ToneSize)
+def _(setting: Setting) -> Drawn:
+    change = setting.signed(0.25, 0.4)
+    size = (TONE_SIZE + change) * (1 + change.abs() * (setting.size - 1)).abs()
+    return Drawn(ToneSize(TONE * RATE, size), setting.of_each("amplitude", size), tone=True)
+
+
+@draws(Step)
+def _(setting: Setting) -> Drawn:
+    size, onset = setting.signed(1.0, 1.5) * setting.size, setting.even(0.3, 0.7) * setting.n_samples / RATE
+    return Drawn(Step(size, _none(setting), onset), {"onset": onset, **setting.of_each("size", size)})
+
+
+@draws(WarmUpTransient)
+def _(setting: Setting) -> Drawn:
+    size, tau = setting.signed(2.0, 3.0) * setting.size, setting.even(0.05, 0.2) * setting.n_samples / RATE
+    effect = WarmUpTransient(size, _none(setting), tau)
+    return Drawn(effect, {"time_constant": tau, **setting.of_each("size", size)})
+
+
+@draws(TemperatureDrift)
+def _(setting: Setting) -> Drawn:
+    t = torch.arange(setting.n_samples, dtype=torch.float64) / setting.n_samples
+    temperature = 25 + 8 * (2 * math.pi * (setting.even(0.8, 1.6) * t + setting.even(0, 1))).sin() + 6 * t
+    lag = 0.0 if setting.chance() else setting.even(0.02, 0.06) * setting.n_samples / RATE
+    size = setting.signed(0.12, 0.2) * setting.size
+    effect = TemperatureDrift(size, _none(setting), lag, "temperature", 0)
+    truth = {"lag": lag, **setting.of_each("coefficient", size)}
+    return Drawn(effect, truth, {"temperature": temperature[None]})
+
+
+def _none(setting: Setting) -> Tensor:
+    """Of the slow noise beside an effect, nothing."""
+    return torch.zeros(setting.n_sensors, 4, dtype=torch.float64)
+
+
+# Spectra.
+
+
+@draws(ParameterShift)
+def _(setting: Setting) -> Drawn:
+    log_factors = torch.zeros(4, setting.n_sensors, dtype=torch.float64)
+    log_factors[0] = setting.signed(0.25, 0.35) * min(setting.size, 5.0)
+    effect = ParameterShift(base_of(setting.n_sensors, setting.n_samples), log_factors)
+    return Drawn(effect, setting.of_each("white_factor", log_factors[0].exp()))
+
+
+@draws(LowPassFilter)
+def _(setting: Setting) -> Drawn:
+    kind = ("pole", "bilinear2", "bessel3")[int(setting.even(0, 3))]
+    corner = setting.sizes(30.0, 40.0) / max(setting.size, 0.85)
+    strength = torch.where(corner > 0, filter_strength(kind, corner.clamp(min=1) / RATE), 0.0)
+    return Drawn(LowPassFilter(kind, strength), setting.of_each("corner", corner))
+
+
+def _mode(setting: Setting, low: float, high: float, *, shared: bool) -> Mode:
+    size = setting.sizes(low, high) * setting.size
+    gain = size.to(torch.complex128)
+    if shared:
+        turn = torch.tensor([setting.even(0, 6) for _ in size], dtype=torch.float64)
+        gain = torch.polar(size, turn)
+    return Mode(setting.even(0.08, 0.4), setting.even(0.002, 0.004), gain, shared)
+
+
+@draws(Resonance)
+def _(setting: Setting) -> Drawn:
+    mode = _mode(setting, 0.35, 0.5, shared=setting.chance())
+    truth = {"frequency": mode.centre * RATE, "width": 2 * mode.width * RATE}
+    return Drawn(Resonance(mode), truth | setting.of_each("rms", mode.gain.abs()))
+
+
+@draws(DriftingTone)
+def _(setting: Setting) -> Drawn:
+    mode = _mode(setting, 0.35, 0.5, shared=True)
+    truth = {"frequency": mode.centre * RATE, **setting.of_each("amplitude", math.sqrt(2) * mode.gain.abs())}
+    return Drawn(DriftingTone(mode, setting.chance()), truth)
+
+
+@draws(FlickerNoise)
+def _(setting: Setting) -> Drawn:
+    rms = setting.sizes(0.4, 0.6) * setting.size
+    return Drawn(FlickerNoise(rms.square() / 2), setting.of_each("level", rms))
+
+
+@draws(CommonMode)
+def _(setting: Setting) -> Drawn:
+    kind = ("white", "ar1", "walk")[int(setting.even(0, 3))]
+    size = {"white": (0.5, 0.6), "ar1": (0.4, 0.5), "walk": (0.03, 0.04)}[kind]
+    gain = setting.signed(*size).to(torch.complex128) * setting.size
+    corner = setting.even(0.02, 0.05) if kind == "ar1" else 0.0
+    effect = CommonMode(kind, corner, gain, base_of(setting.n_sensors, setting.n_samples), inside=False)
+    truth = setting.of_each("gain", gain.abs()) | ({"corner": corner * RATE} if corner else {})
+    return Drawn(effect, truth)
+
+
+# What stands for no physics.
+
+
+@draws(Remainder)
+def _(setting: Setting) -> Drawn:
+    f = torch.logspace(math.log10(2 / setting.n_samples), math.log10(0.45), 12, dtype=torch.float64)
+    log_gain = 0.2 * min(setting.size, 5.0) * setting.normal(setting.n_sensors, len(f))
+    concerned = torch.tensor([i in setting.concerned for i in range(setting.n_sensors)])
+    return Drawn(Remainder(f, torch.where(concerned[:, None], log_gain, 0.0)), {})
+
+
+@draws(SlowRemainder)
+def _(setting: Setting) -> Drawn:
+    further = torch.stack([setting.signed(0.5, 1.0) * setting.size for _ in range(3)], -1)
+    return Drawn(SlowRemainder(setting.signed(0.5, 1.0), _none(setting), further, setting.n_samples), {})
