@@ -237,7 +237,8 @@ def _(setting: Setting) -> Drawn:
 @draws(Quantization)
 def _(setting: Setting) -> Drawn:
     step = setting.sizes(0.2, 0.6) * min(setting.size, 4.0)
-    blur = setting.sizes(0.1, 0.2) * float(setting.chance())
+    # A blurred lattice acts on values in their order, which is not how one is recorded: it is not looked for.
+    blur = setting.sizes(0.1, 0.2) * float(setting.size > 1)
     effect = Quantization(step, setting.sizes(-0.5, 0.5) * step, blur, setting.clean.mean(-1))
     return Drawn(effect, setting.of_each("lsb", step))
 
@@ -251,15 +252,15 @@ def _(setting: Setting) -> Drawn:
 
 @draws(Clipping)
 def _(setting: Setting) -> Drawn:
-    low = setting.sizes(-2.5, -2.0, -math.inf)
-    high = torch.full_like(low, math.inf) if setting.chance() else setting.sizes(2.0, 2.5, math.inf)
+    low = setting.sizes(-3.0, -2.7, -math.inf)
+    high = torch.full_like(low, math.inf) if setting.chance() else setting.sizes(2.7, 3.0, math.inf)
     truth = setting.of_each("low", low) | (setting.of_each("high", high) if bool(high.isfinite().any()) else {})
     return Drawn(Clipping(low, high, setting.clean.mean(-1)), truth)
 
 
 @draws(StuckSamples)
 def _(setting: Setting) -> Drawn:
-    probability = (setting.sizes(0.003, 0.01) * setting.size).clamp(max=0.9)
+    probability = (setting.sizes(0.001, 0.003) * setting.size).clamp(max=0.9)
     together = setting.chance()
     if together:
         probability = torch.where(probability > 0, probability.max(), 0.0)
@@ -288,7 +289,7 @@ def _(setting: Setting) -> Drawn:
 def _(setting: Setting) -> Drawn:
     seconds = setting.n_samples / RATE
     start, length = setting.even(0.15, 0.35) * seconds, setting.even(0.3, 0.5) * seconds
-    factor = setting.sizes(1.6, 2.2, 1.0) ** min(setting.size, 5.0)
+    factor = setting.sizes(1.35, 1.6, 1.0) ** min(setting.size, 5.0)
     truth = {"start": start, "stop": start + length, **setting.of_each("factor", factor)}
     return Drawn(VarianceChange(((start, start + length),), factor, setting.even(0.5, 2.0)), truth)
 
@@ -298,14 +299,14 @@ def _(setting: Setting) -> Drawn:
     seconds = setting.n_samples / RATE
     knots = torch.tensor([0.0, setting.even(0.1, 0.2), setting.even(0.8, 0.9), 1.0], dtype=torch.float64) * seconds
     share = torch.tensor([0.0, 0.0, 1.0, 1.0], dtype=torch.float64)
-    factor = setting.sizes(2.5, 3.5, 1.0) ** min(setting.size, 3.0)
+    factor = setting.sizes(1.7, 2.2, 1.0) ** min(setting.size, 3.0)
     effect = GradualChange(knots, share, torch.ones_like(factor), factor, setting.even(0.5, 2.0))
     return Drawn(effect, setting.of_each("factor", factor))
 
 
 @draws(RandomTelegraph)
 def _(setting: Setting) -> Drawn:
-    half_step = setting.sizes(0.8, 1.1) * setting.size
+    half_step = setting.sizes(0.5, 0.7) * setting.size
     up, down = (setting.sizes(1.0, 3.0, 1.0) for _ in range(2))
     truth = [setting.of_each(*pair) for pair in (("half_step", half_step), ("dwell_up", up), ("dwell_down", down))]
     return Drawn(RandomTelegraph(half_step, up, down), truth[0] | truth[1] | truth[2])
@@ -371,13 +372,13 @@ def _(setting: Setting) -> Drawn:
 
 @draws(Step)
 def _(setting: Setting) -> Drawn:
-    size, onset = setting.signed(1.0, 1.5) * setting.size, setting.even(0.3, 0.7) * setting.n_samples / RATE
+    size, onset = setting.signed(2.5, 3.5) * setting.size, setting.even(0.3, 0.7) * setting.n_samples / RATE
     return Drawn(Step(size, _none(setting), onset), {"onset": onset, **setting.of_each("size", size)})
 
 
 @draws(WarmUpTransient)
 def _(setting: Setting) -> Drawn:
-    size, tau = setting.signed(2.0, 3.0) * setting.size, setting.even(0.05, 0.2) * setting.n_samples / RATE
+    size, tau = setting.signed(5.0, 7.0) * setting.size, setting.even(0.05, 0.2) * setting.n_samples / RATE
     effect = WarmUpTransient(size, _none(setting), tau)
     return Drawn(effect, {"time_constant": tau, **setting.of_each("size", size)})
 
@@ -387,7 +388,7 @@ def _(setting: Setting) -> Drawn:
     t = torch.arange(setting.n_samples, dtype=torch.float64) / setting.n_samples
     temperature = 25 + 8 * (2 * math.pi * (setting.even(0.8, 1.6) * t + setting.even(0, 1))).sin() + 6 * t
     lag = 0.0 if setting.chance() else setting.even(0.02, 0.06) * setting.n_samples / RATE
-    size = setting.signed(0.12, 0.2) * setting.size
+    size = setting.signed(0.3, 0.4) * setting.size
     effect = TemperatureDrift(size, _none(setting), lag, "temperature", 0)
     truth = {"lag": lag, **setting.of_each("coefficient", size)}
     return Drawn(effect, truth, {"temperature": temperature[None]})
@@ -412,7 +413,8 @@ def _(setting: Setting) -> Drawn:
 @draws(LowPassFilter)
 def _(setting: Setting) -> Drawn:
     kind = ("pole", "bilinear2", "bessel3")[int(setting.even(0, 3))]
-    corner = setting.sizes(30.0, 40.0) / max(setting.size, 0.85)
+    highest = {"pole": 40.0, "bilinear2": 46.0, "bessel3": 46.0}[kind]
+    corner = setting.sizes(0.9 * highest, highest) / max(setting.size, 1.0)
     strength = torch.where(corner > 0, filter_strength(kind, corner.clamp(min=1) / RATE), 0.0)
     return Drawn(LowPassFilter(kind, strength), setting.of_each("corner", corner))
 
@@ -428,21 +430,21 @@ def _mode(setting: Setting, low: float, high: float, *, shared: bool) -> Mode:
 
 @draws(Resonance)
 def _(setting: Setting) -> Drawn:
-    mode = _mode(setting, 0.35, 0.5, shared=setting.chance())
+    mode = _mode(setting, 0.3, 0.4, shared=setting.chance())
     truth = {"frequency": mode.centre * RATE, "width": 2 * mode.width * RATE}
     return Drawn(Resonance(mode), truth | setting.of_each("rms", mode.gain.abs()))
 
 
 @draws(DriftingTone)
 def _(setting: Setting) -> Drawn:
-    mode = _mode(setting, 0.35, 0.5, shared=True)
+    mode = _mode(setting, 0.3, 0.4, shared=True)
     truth = {"frequency": mode.centre * RATE, **setting.of_each("amplitude", math.sqrt(2) * mode.gain.abs())}
     return Drawn(DriftingTone(mode, setting.chance()), truth)
 
 
 @draws(FlickerNoise)
 def _(setting: Setting) -> Drawn:
-    rms = setting.sizes(0.4, 0.6) * setting.size
+    rms = setting.sizes(0.15, 0.2) * setting.size
     return Drawn(FlickerNoise(rms.square() / 2), setting.of_each("level", rms))
 
 

@@ -4,28 +4,39 @@ from __future__ import annotations
 
 import json
 import random
+from collections import Counter
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+import gyrofuse as gf
 from gyrofuse.cli.reading import read_model
 from gyrofuse.mismatch.mechanisms.catalogue import CATALOGUE
-from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
 from gyrofuse.mismatch.mechanisms.signals.tone_amplitude import ToneSize
 from gyrofuse.mismatch.mechanisms.slow_remainder import SlowRemainder
 from gyrofuse.mismatch.mechanisms.values.unit_scale import UnitScale
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel
+from gyrofuse.mismatch.signals.comparison import Comparison
 from tests.mechanism_draws import (
+    NOISE,
+    RATE,
+    RECORDS,
     Drawn,
     Setting,
     array,
+    compared,
+    concealed,
     draw_of,
     drawn_in,
     generator,
     info,
+    tone,
 )
 
 SHORT = 2048  # samples, where a mechanism acts and is not looked for
@@ -45,6 +56,15 @@ def name_of(kind: type[Mechanism]) -> str:
     return kind.__name__
 
 
+LEVEL = 1e-3  # p value at which mechanisms are looked for
+DRAWN, DIAGNOSED = 100, 20  # draws of each mechanism that it is looked for in by itself, and by a diagnosis
+N_NULL = 4096  # samples, the fewest that are diagnosed
+SMALL = 1e-9  # of a number: as exact as arithmetic
+# What stands for no physics is not looked for.
+PHYSICS = [kind for kind in CATALOGUE if kind.detect_and_fit.__func__ is not Mechanism.detect_and_fit.__func__]
+QUICK = PHYSICS  # diagnosed in a second
+
+every_physics = pytest.mark.parametrize("kind", PHYSICS, ids=name_of)
 every_mechanism = pytest.mark.parametrize("kind", CATALOGUE, ids=name_of)
 every_variant = pytest.mark.parametrize("variant", VARIANTS)
 
@@ -160,3 +180,132 @@ def test_takes_off_what_it_adds(kind: type[Mechanism], variant: str):
     whole = act(drawn, setting.clean, 1)
     left = drawn.effect.remove(whole, info(setting.n_sensors, drawn.channels))
     torch.testing.assert_close(left, setting.clean, rtol=0, atol=ROUNDING * float(whole.abs().max()))
+
+
+# What is found of it.
+
+
+def found(kind: type[Mechanism], *seed: object) -> tuple[Finding | None, Drawn]:
+    """What a mechanism finds of itself in a recording that conceals it."""
+    recording, simulation, drawn = concealed(kind, *seed)
+    return kind.detect_and_fit(compared(recording, simulation, *seed), LEVEL), drawn
+
+
+def distance(kind: type[Mechanism], limits: Parameter, truth: float) -> float:
+    """Of a truth from the value, over that of the limit on its side: at most 1 where it is covered."""
+    if kind is GradualChange and (limits.value - 1) * (truth - 1) < 0:  # a course is told from either of its ends
+        truth = 1 / truth
+    limit = limits.high if truth > limits.value else limits.low
+    off = abs(truth - limits.value)
+    return off / abs(limit - limits.value) if off > SMALL * abs(truth) else 0.0
+
+
+class Coverage(NamedTuple):
+    """Draws in which a mechanism was found, of how many, and the truth's distances for each kind of parameter."""
+
+    found: int
+    n: int
+    distances: dict[str, list[float]]
+
+    def covered(self, name: str) -> int:
+        return sum(d <= 1 for d in self.distances[name])
+
+
+def coverage(kind: type[Mechanism], n: int) -> Coverage:
+    distances: dict[str, list[float]] = {}
+    n_found = 0
+    for seed in range(n):
+        finding, drawn = found(kind, seed)
+        if finding is None:
+            continue
+        n_found += 1
+        assert finding.gain > 0
+        for name in drawn.truth.keys() & finding.parameters.keys():
+            family = name.split("[")[0]
+            distances.setdefault(family, []).append(distance(kind, finding.parameters[name], drawn.truth[name]))
+    return Coverage(n_found, n, distances)
+
+
+@every_physics
+def test_limits_are_near_the_truth(kind: type[Mechanism]):
+    """Of one draw each."""
+    finding, drawn = found(kind, "near")
+    assert finding is not None
+    assert finding.gain > 0
+    for name in drawn.truth.keys() & finding.parameters.keys():
+        assert distance(kind, finding.parameters[name], drawn.truth[name]) < 3, name
+
+
+@pytest.mark.statistical
+@every_physics
+def test_limits_cover(kind: type[Mechanism]):
+    """As often as limits that hold in 90 of 100 do in 999 of 1000 studies."""
+    seen = coverage(kind, DRAWN)
+    print(name_of(kind), seen.found, {k: (seen.covered(k), len(d)) for k, d in seen.distances.items()})
+    assert seen.found >= stats.binom.ppf(1e-3, DRAWN, 0.90)
+    for name, distances in seen.distances.items():
+        assert seen.covered(name) >= stats.binom.ppf(1e-3, len(distances), 0.90), name
+
+
+# Where nothing is missing.
+
+
+def null(seed: int) -> Comparison:
+    """Noise of one law on both sides: white, coloured or rounded, of 1 to 12 sensors, with channels and a tone."""
+    rng = generator("null", seed)
+    n_sensors = (1, 2, 3, 6, 12)[seed % 5]
+    noise = (gf.WhiteNoise(1.0) + gf.RandomWalk(1e-9), NOISE, NOISE)[seed % 3]
+    both = noise.simulate((1 + RECORDS) * N_NULL, batch=(n_sensors,), generator=rng)
+    both = both + (seed % 2) * tone(n_sensors, both.shape[-1], 0.0)
+    if seed % 3 == 2:
+        both = 0.4 * (both / 0.4).round()
+    motion = torch.randn(5, N_NULL, generator=rng, dtype=torch.float64)
+    channels = {"acceleration": motion[:3] + 0.5, "rate": motion[3:4], "temperature": motion[4:].cumsum(-1) / 20}
+    recording = gf.Recording(both[:, :N_NULL], RATE, unit="deg/s", channels=channels)
+    return compared(recording, gf.Recording(both[:, N_NULL:], RATE, unit="deg/s"), seed)
+
+
+def false_findings(n: int) -> Counter[str]:
+    """How many of so many nulls each mechanism is found in."""
+    count: Counter[str] = Counter()
+    for seed in range(n):
+        comparison = null(seed)
+        count.update(name_of(kind) for kind in PHYSICS if kind.detect_and_fit(comparison, LEVEL) is not None)
+    return count
+
+
+def test_finds_nothing_in_few_nulls():
+    assert not false_findings(3)
+
+
+@pytest.mark.statistical
+def test_finds_nothing_in_nulls():
+    """More than `LEVEL` says in no more of 1000 studies than one."""
+    count = false_findings(2 * DRAWN)
+    print(count)
+    assert max(count.values(), default=0) <= stats.binom.isf(1e-3, 2 * DRAWN, LEVEL)
+
+
+# Who is told from whom.
+
+
+def named(kind: type[Mechanism], *seed: object) -> bool:
+    """Whether a diagnosis names a mechanism that is concealed, or lists it with what it names."""
+    recording, simulation, _ = concealed(kind, *seed)
+    report = gf.diagnose(recording, simulation)
+    return any(kind.name in (finding.mechanism, *finding.alternatives) for finding in report.findings)
+
+
+@pytest.mark.parametrize("kind", QUICK, ids=name_of)
+def test_is_named_or_listed(kind: type[Mechanism]):
+    """Of one draw each."""
+    assert named(kind, "named")
+
+
+@pytest.mark.statistical
+@every_physics
+def test_is_named_or_listed_nearly_always(kind: type[Mechanism]):
+    """As often as what is named in 9 of 10 diagnoses is in 999 of 1000 studies."""
+    count = sum(named(kind, seed) for seed in range(DIAGNOSED))
+    print(name_of(kind), count, DIAGNOSED)
+    assert count >= stats.binom.ppf(1e-3, DIAGNOSED, 0.90)

@@ -60,7 +60,7 @@ class DeadBand(Mechanism):
         parameters, unit = {}, comparison.info.measure
         for i, own in found.items():
             middle, low, high = band_limits(own)
-            numbers[:, i] = torch.tensor([own.value, middle])
+            numbers[:, i] = torch.tensor([own.value, middle], dtype=torch.float64)
             parameters[f"dead_band[{i}]"] = Parameter(middle, low, high, unit)
         effect = cls(numbers[0], numbers[1], comparison.recording.mean(-1))
         sensors = tuple(found)
