@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import math
 import random
 from collections import Counter
 from pathlib import Path
@@ -11,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import torch
+from scipy import stats
 from torch import Tensor
 
 import gyrofuse as gf
@@ -62,6 +65,8 @@ N_NULL = 4096  # samples, the fewest that are diagnosed
 SMALL = 1e-9  # of a number: as exact as arithmetic
 # What stands for no physics is not looked for.
 PHYSICS = [kind for kind in CATALOGUE if kind.detect_and_fit.__func__ is not Mechanism.detect_and_fit.__func__]
+PROMISE_SPECTRA = [kind for kind in CATALOGUE if kind.spectra is not Mechanism.spectra]
+MANY = 200  # records, whose mean spectra are known to a few per cent in each band
 QUICK = PHYSICS  # diagnosed in a second
 
 every_physics = pytest.mark.parametrize("kind", PHYSICS, ids=name_of)
@@ -180,6 +185,43 @@ def test_takes_off_what_it_adds(kind: type[Mechanism], variant: str):
     whole = act(drawn, setting.clean, 1)
     left = drawn.effect.remove(whole, info(setting.n_sensors, drawn.channels))
     torch.testing.assert_close(left, setting.clean, rtol=0, atol=ROUNDING * float(whole.abs().max()))
+
+
+# The spectra that it promises.
+
+
+def periodograms(signal: Tensor) -> Tensor:
+    """Cross-spectral density of records `(record, sensor, time)` at each frequency, `(record, frequency, ...)`."""
+    window = torch.hann_window(signal.shape[-1], dtype=torch.float64)
+    transform = torch.fft.rfft(signal * window / window.norm()).mT
+    return transform[..., :, None] * transform[..., None, :].conj()
+
+
+def of_bands(values: Tensor, dim: int) -> Tensor:
+    """Real and imaginary parts of means over bands of frequency, from the eighth bin up to half the rate."""
+    edges = torch.logspace(3, math.log2(values.shape[dim] - 1), 12, base=2.0).long().tolist()
+    means = [values.narrow(dim, a, b - a).mean(dim) for a, b in itertools.pairwise(edges)]
+    return torch.view_as_real(torch.stack(means, dim).to(torch.complex128))
+
+
+@pytest.mark.parametrize("kind", PROMISE_SPECTRA, ids=name_of)
+@pytest.mark.parametrize("seed", range(2))
+def test_has_the_spectra_that_it_promises(kind: type[Mechanism], seed: int):
+    """Means over records in each band, cross-spectra included, within what 999 of 1000 studies of them all have."""
+    drawn, setting = instance(kind, "all sensors", seed)
+    clean = array(setting.n_sensors).simulate(SHORT, batch=(MANY,), generator=generator(5, seed))
+    seen = of_bands(periodograms(act(drawn, clean, seed)), 1)
+    f = (torch.arange(SHORT // 2 + 1, dtype=torch.float64) / SHORT).clamp(min=1 / SHORT)
+    promised = of_bands(drawn.effect.spectra(array(setting.n_sensors).spectrum(f).to(torch.complex128), f), 0)
+    varies = seen.std(0) > 0  # imaginary parts of powers are zero
+    away = ((seen.mean(0) - promised) / seen.std(0) * math.sqrt(MANY))[varies].abs()
+    assert float(away.max()) < stats.t.isf(5e-4 / len(away), MANY - 1)
+
+
+@pytest.mark.parametrize("kind", sorted(set(PHYSICS) - set(PROMISE_SPECTRA), key=name_of), ids=name_of)
+def test_what_promises_no_spectra_is_scored_otherwise(kind: type[Mechanism]):
+    """By a likelihood of its own, or as a signal that is taken off the recording."""
+    assert overrides(kind, "held_out_scores") or (kind.taken_off and overrides(kind, "remove"))
 
 
 # What is found of it.
