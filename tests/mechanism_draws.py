@@ -31,7 +31,7 @@ from gyrofuse.mismatch.mechanisms.signals.step import Step
 from gyrofuse.mismatch.mechanisms.signals.temperature import TemperatureDrift
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
 from gyrofuse.mismatch.mechanisms.signals.tone_amplitude import ToneSize
-from gyrofuse.mismatch.mechanisms.signals.warm_up import WarmUpTransient
+from gyrofuse.mismatch.mechanisms.signals.warm_up import Decay, WarmUpTransient
 from gyrofuse.mismatch.mechanisms.slow_remainder import SlowRemainder
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
@@ -160,7 +160,7 @@ def array(n_sensors: int) -> gf.ArrayModel:
 
 
 @functools.cache
-def base_of(n_sensors: int, n_samples: int) -> NoiseSpectrum:
+def noise_spectrum(n_sensors: int, n_samples: int) -> NoiseSpectrum:
     """The same as a sum of the spectra that mechanisms refer to."""
     drawn = array(n_sensors).simulate(n_samples, batch=(16,), generator=generator("base"))
     return Comparison.of(info(n_sensors), drawn[0], drawn).base
@@ -379,7 +379,8 @@ def _(setting: Setting) -> Drawn:
 @draws(WarmUpTransient)
 def _(setting: Setting) -> Drawn:
     size, tau = setting.signed(5.0, 7.0) * setting.size, setting.even(0.05, 0.2) * setting.n_samples / RATE
-    effect = WarmUpTransient(size, _none(setting), tau)
+    slower = (Decay(setting.signed(5.0, 7.0), 3 * tau),) if setting.size > 1 else ()
+    effect = WarmUpTransient(size, _none(setting), tau, slower)
     return Drawn(effect, {"time_constant": tau, **setting.of_each("size", size)})
 
 
@@ -389,7 +390,8 @@ def _(setting: Setting) -> Drawn:
     temperature = 25 + 8 * (2 * math.pi * (setting.even(0.8, 1.6) * t + setting.even(0, 1))).sin() + 6 * t
     lag = 0.0 if setting.chance() else setting.even(0.02, 0.06) * setting.n_samples / RATE
     size = setting.signed(0.3, 0.4) * setting.size
-    effect = TemperatureDrift(size, _none(setting), lag, "temperature", 0)
+    curvature = (setting.signed(0.01, 0.02),) if setting.size > 1 else ()
+    effect = TemperatureDrift(size, _none(setting), lag, "temperature", 0, curvature)
     truth = {"lag": lag, **setting.of_each("coefficient", size)}
     return Drawn(effect, truth, {"temperature": temperature[None]})
 
@@ -406,7 +408,7 @@ def _none(setting: Setting) -> Tensor:
 def _(setting: Setting) -> Drawn:
     log_factors = torch.zeros(4, setting.n_sensors, dtype=torch.float64)
     log_factors[0] = setting.signed(0.25, 0.35) * min(setting.size, 5.0)
-    effect = ParameterShift(base_of(setting.n_sensors, setting.n_samples), log_factors)
+    effect = ParameterShift(noise_spectrum(setting.n_sensors, setting.n_samples), log_factors)
     return Drawn(effect, setting.of_each("white_factor", log_factors[0].exp()))
 
 
@@ -454,7 +456,8 @@ def _(setting: Setting) -> Drawn:
     size = {"white": (0.5, 0.6), "ar1": (0.4, 0.5), "walk": (0.03, 0.04)}[kind]
     gain = setting.signed(*size).to(torch.complex128) * setting.size
     corner = setting.even(0.02, 0.05) if kind == "ar1" else 0.0
-    effect = CommonMode(kind, corner, gain, base_of(setting.n_sensors, setting.n_samples), inside=False)
+    inside = kind == "white" and setting.chance()  # of no other noise there is enough
+    effect = CommonMode(kind, corner, gain, noise_spectrum(setting.n_sensors, setting.n_samples), inside)
     truth = setting.of_each("gain", gain.abs()) | ({"corner": corner * RATE} if corner else {})
     return Drawn(effect, truth)
 
