@@ -22,6 +22,7 @@ from gyrofuse.cli.reading import read_model
 from gyrofuse.mismatch.mechanisms.catalogue import CATALOGUE
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
+from gyrofuse.mismatch.mechanisms.remainder import Remainder
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
 from gyrofuse.mismatch.mechanisms.signals.tone_amplitude import ToneSize
 from gyrofuse.mismatch.mechanisms.slow_remainder import SlowRemainder
@@ -47,7 +48,12 @@ from tests.mechanism_draws import (
     tone,
 )
 
+LEVEL = 1e-3  # p value at which mechanisms are looked for
+ROUNDING = 1e-12  # of the largest value of a signal
 SHORT = 2048  # samples, where a mechanism acts and is not looked for
+SHORTEST = 4096  # samples that are diagnosed
+MANY = 100  # records, whose mean spectra are known to a few per cent in each band
+DRAWN, DIAGNOSED = 100, 20  # draws of each mechanism that it is looked for in by itself, and by a diagnosis
 # Sensors of the array, those concerned, and the size of the effect over one that is plainly seen.
 VARIANTS = {
     "all sensors": (3, (0, 1, 2), 1.0),
@@ -56,32 +62,25 @@ VARIANTS = {
     "strong": (3, (0, 1, 2), 20.0),
     "weak": (2, (0, 1), 0.01),
 }
-
-ROUNDING = 1e-12  # of the largest value
+NO_PHYSICS = (Remainder, SlowRemainder)  # not looked for
+PHYSICS = [kind for kind in CATALOGUE if kind not in NO_PHYSICS]
+PROMISE_SPECTRA = [kind for kind in CATALOGUE if kind.spectra is not Mechanism.spectra]
+ADD_A_KNOWN_PATH = [kind for kind in CATALOGUE if kind.proportional_to or kind is SlowRemainder]
+QUICK = (UnitScale, Quantization, DeadBand, StuckSamples, VibrationTone)  # diagnosed in a second
 
 
 def name_of(kind: type[Mechanism]) -> str:
     return kind.__name__
 
 
-LEVEL = 1e-3  # p value at which mechanisms are looked for
-DRAWN, DIAGNOSED = 100, 20  # draws of each mechanism that it is looked for in by itself, and by a diagnosis
-N_NULL = 4096  # samples, the fewest that are diagnosed
-SMALL = 1e-9  # of a number: as exact as arithmetic
-# What stands for no physics is not looked for.
-PHYSICS = [kind for kind in CATALOGUE if kind.detect_and_fit.__func__ is not Mechanism.detect_and_fit.__func__]
-PROMISE_SPECTRA = [kind for kind in CATALOGUE if kind.spectra is not Mechanism.spectra]
-MANY = 100  # records, whose mean spectra are known to a few per cent in each band
-QUICK = [UnitScale, Quantization, DeadBand, StuckSamples, VibrationTone]  # diagnosed in a second
-
 every_physics = pytest.mark.parametrize("kind", PHYSICS, ids=name_of)
 every_mechanism = pytest.mark.parametrize("kind", CATALOGUE, ids=name_of)
 every_variant = pytest.mark.parametrize("variant", VARIANTS)
 
 
-def instance(kind: type[Mechanism], variant: str, *seed: object, n_samples: int = SHORT) -> tuple[Drawn, Setting]:
+def instance(kind: type[Mechanism], variant: str, *seed: object) -> tuple[Drawn, Setting]:
     n_sensors, concerned, size = VARIANTS[variant]
-    return drawn_in(kind, variant, *seed, n_sensors=n_sensors, concerned=concerned, size=size, n_samples=n_samples)
+    return drawn_in(kind, variant, *seed, n_sensors=n_sensors, concerned=concerned, size=size, n_samples=SHORT)
 
 
 def act(drawn: Drawn, signal: Tensor, *seed: object) -> Tensor:
@@ -199,7 +198,7 @@ def test_takes_all_numbers_from_the_generator_that_it_is_given(kind: type[Mechan
 
 
 @every_variant
-@pytest.mark.parametrize("kind", [k for k in CATALOGUE if k.proportional_to or k is SlowRemainder], ids=name_of)
+@pytest.mark.parametrize("kind", ADD_A_KNOWN_PATH, ids=name_of)
 def test_takes_off_what_it_adds(kind: type[Mechanism], variant: str):
     drawn, setting = instance(kind, variant)
     whole = act(drawn, setting.clean, 1)
@@ -238,7 +237,7 @@ def test_has_the_spectra_that_it_promises(kind: type[Mechanism], seed: int):
     assert float(away.max()) < stats.t.isf(5e-4 / len(away), MANY - 1)
 
 
-@pytest.mark.parametrize("kind", sorted(set(PHYSICS) - set(PROMISE_SPECTRA), key=name_of), ids=name_of)
+@pytest.mark.parametrize("kind", [kind for kind in PHYSICS if kind not in PROMISE_SPECTRA], ids=name_of)
 def test_what_promises_no_spectra_is_scored_otherwise(kind: type[Mechanism]):
     """By a likelihood of its own, or as a signal that is taken off the recording."""
     assert overrides(kind, "held_out_scores") or (kind.taken_off and overrides(kind, "remove"))
@@ -254,12 +253,11 @@ def found(kind: type[Mechanism], *seed: object) -> tuple[Finding | None, Drawn]:
 
 
 def distance(kind: type[Mechanism], limits: Parameter, truth: float) -> float:
-    """Of a truth from the value, over that of the limit on its side: at most 1 where it is covered."""
+    """Of a truth from the value, over that of the limit on its side: at most 1 where it is covered, to rounding."""
     if kind is GradualChange and (limits.value - 1) * (truth - 1) < 0:  # a course is told from either of its ends
         truth = 1 / truth
-    limit = limits.high if truth > limits.value else limits.low
-    off = abs(truth - limits.value)
-    return off / abs(limit - limits.value) if off > SMALL * abs(truth) else 0.0
+    reach = limits.high - limits.value if truth > limits.value else limits.value - limits.low
+    return abs(truth - limits.value) / (reach + ROUNDING * abs(truth))
 
 
 class Coverage(NamedTuple):
@@ -317,14 +315,14 @@ def null(seed: int) -> Comparison:
     rng = generator("null", seed)
     n_sensors = (1, 2, 3, 6, 12)[seed % 5]
     noise = (gf.WhiteNoise(1.0) + gf.RandomWalk(1e-9), NOISE, NOISE)[seed % 3]
-    both = noise.simulate((1 + RECORDS) * N_NULL, batch=(n_sensors,), generator=rng)
+    both = noise.simulate((1 + RECORDS) * SHORTEST, batch=(n_sensors,), generator=rng)
     both = both + (seed % 2) * tone(n_sensors, both.shape[-1], 0.0)
     if seed % 3 == 2:
         both = 0.4 * (both / 0.4).round()
-    motion = torch.randn(5, N_NULL, generator=rng, dtype=torch.float64)
+    motion = torch.randn(5, SHORTEST, generator=rng, dtype=torch.float64)
     channels = {"acceleration": motion[:3] + 0.5, "rate": motion[3:4], "temperature": motion[4:].cumsum(-1) / 20}
-    recording = gf.Recording(both[:, :N_NULL], RATE, unit="deg/s", channels=channels)
-    return compared(recording, gf.Recording(both[:, N_NULL:], RATE, unit="deg/s"), seed)
+    recording = gf.Recording(both[:, :SHORTEST], RATE, unit="deg/s", channels=channels)
+    return compared(recording, gf.Recording(both[:, SHORTEST:], RATE, unit="deg/s"), seed)
 
 
 def false_findings(n: int) -> Counter[str]:
