@@ -273,6 +273,16 @@ def test_quantiles_of_places():
     assert (middle, low, high) == pytest.approx((40, 40 - 9.8, 40 + 9.8), abs=0.1)
 
 
+@pytest.mark.parametrize("mirrored", [1, -1])
+def test_limits_of_places_reach_an_end_that_is_likely(mirrored: int):
+    """A lag of zero is at the end of all lags: of a normal law cut off there, up to two of its sds from the middle."""
+    places = torch.linspace(0, 10, 1001, dtype=torch.float64)
+    for middle, reached in ((0.0, True), (1.9, True), (2.1, False)):
+        weight = torch.softmax(-(places - middle).square() / 2, 0)
+        _, *limits = quantiles(mirrored * places, weight)
+        assert (0.0 in limits) == reached
+
+
 def test_sensors_that_jump_to_and_fro_are_known():
     beside = torch.diag(torch.ones(254, dtype=torch.float64), 1)
     inverse = torch.linalg.inv(2 * torch.eye(255, dtype=torch.float64) - beside - beside.mT)

@@ -253,7 +253,11 @@ def estimate(look: SlowLook, scan: Scan, *, finer: bool = True) -> Estimate:
 
 
 def quantiles(places: Tensor, weight: Tensor) -> tuple[float, float, float]:
-    """Median, 2.5 and 97.5 % quantiles of places with weights that sum to one."""
+    """Median, 2.5 and 97.5 % quantiles of places with weights that sum to one.
+
+    No tail lies beyond the first and the last place: these are within the limits where they are as likely as limits
+    of a normal law are.
+    """
     places, order = places.sort()
     weight = weight[order]
     below = weight.cumsum(0) - weight / 2
@@ -261,7 +265,9 @@ def quantiles(places: Tensor, weight: Tensor) -> tuple[float, float, float]:
         float(places[min(int(torch.searchsorted(below, share)), len(places) - 1)])
         for share in torch.tensor([0.025, 0.5, 0.975], dtype=torch.float64)
     )
-    return middle, low, high
+    first, last = (float(end) for end in places[[0, -1]])
+    likely = places[weight > math.exp(-(Z**2) / 2) * weight.max()]
+    return middle, first if float(likely[0]) == first else low, last if float(likely[-1]) == last else high
 
 
 def only(size: Tensor, which: Sequence[int]) -> Tensor:
