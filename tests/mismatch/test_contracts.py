@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import torch
-from _pytest.mark.structures import ParameterSet
 from scipy import stats
 from torch import Tensor
 
@@ -77,7 +76,7 @@ def name_of(kind: type[Mechanism]) -> str:
     return kind.__name__
 
 
-def but_for(kind: type[Mechanism], known: Mapping[type[Mechanism], str]) -> ParameterSet:
+def but_for(kind: type[Mechanism], known: Mapping[type[Mechanism], str]) -> object:
     """A mechanism as a parameter of a test, which is known to fail where a reason is given."""
     marks = [pytest.mark.xfail(reason=known[kind], strict=True)] if kind in known else []
     return pytest.param(kind, marks=marks, id=name_of(kind))
