@@ -372,7 +372,7 @@ def _(setting: Setting) -> Drawn:
 
 @draws(Step)
 def _(setting: Setting) -> Drawn:
-    size, onset = setting.signed(2.5, 3.5) * setting.size, setting.even(0.3, 0.7) * setting.n_samples / RATE
+    size, onset = setting.signed(2.5, 3.5) * setting.size, int(setting.even(0.3, 0.7) * setting.n_samples) / RATE
     return Drawn(Step(size, _none(setting), onset), {"onset": onset, **setting.of_each("size", size)})
 
 
