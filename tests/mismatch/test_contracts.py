@@ -32,7 +32,8 @@ from gyrofuse.mismatch.mechanisms.values.stuck_samples import StuckSamples
 from gyrofuse.mismatch.mechanisms.values.unit_scale import UnitScale
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel
 from gyrofuse.mismatch.signals.comparison import Comparison
-from tests.mechanism_draws import (
+from tests import mechanism_draws  # noqa: F401  # which draws every mechanism
+from tests.mechanism_settings import (
     NOISE,
     RATE,
     RECORDS,
