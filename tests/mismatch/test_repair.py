@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 
 import pytest
 import torch
@@ -17,6 +16,8 @@ from gyrofuse.mismatch.mechanisms.slow_remainder import SlowRemainder
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel
+from gyrofuse.mismatch.reporting.text import verdict
+from gyrofuse.mismatch.selection import forward
 from gyrofuse.mismatch.selection.classifier import area_under_curve, distinguishability, features
 from gyrofuse.mismatch.selection.discrepancy import (
     discrepancy_left,
@@ -106,7 +107,7 @@ def test_a_difference_without_a_name_stays_unexplained_and_is_filled_in():
     assert report.held_out.after < 0.5 * report.held_out.before
     assert report.held_out.auc_before > 0.8
     assert report.held_out.auc_after < 0.6
-    assert "stands for no physics" in "".join(gf.mismatch.telling.verdict(report))
+    assert "stands for no physics" in "".join(verdict(report))
 
 
 def test_area_under_the_curve_counts_pairs():
@@ -188,7 +189,7 @@ def test_what_is_left_of_a_slow_course_is_taken_off_as_it_goes_on_in_what_is_hel
 
 
 def test_a_slow_course_without_a_name_is_no_finding(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(sys.modules["gyrofuse.mismatch.diagnose"], "STAGES", ())
+    monkeypatch.setattr(forward, "STAGES", ())
     model, n = gf.WhiteNoise(1.0) + gf.RandomWalk(1e-8), 4096
     t, g = torch.arange(n, dtype=torch.float64), generator(2)
     recording = model.simulate(n, batch=(1,), generator=g).double() + 30 * (-t / 500).exp()
@@ -198,4 +199,4 @@ def test_a_slow_course_without_a_name_is_no_finding(monkeypatch: pytest.MonkeyPa
     assert "slow_remainder" in [e.name for e in report.model.effects]
     assert report.held_out.low > 0
     assert report.held_out.auc_after < 0.6 < report.held_out.auc_before
-    assert "slow course that is left" in "".join(gf.mismatch.telling.verdict(report))
+    assert "slow course that is left" in "".join(verdict(report))
