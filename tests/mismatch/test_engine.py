@@ -13,13 +13,13 @@ from scipy import stats
 
 import gyrofuse as gf
 from gyrofuse.mismatch import MismatchReport, diagnose, discrepancy
-from gyrofuse.mismatch.diagnose import _known
 from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
 from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode
 from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
 from gyrofuse.mismatch.mechanisms.values.clipping import Clipping
 from gyrofuse.mismatch.mechanisms.values.unit_scale import UnitScale
 from gyrofuse.mismatch.repair.inputs import prepared
+from gyrofuse.mismatch.selection.forward import is_known
 from gyrofuse.mismatch.selection.null_replicates import twin, twin_p_values
 from gyrofuse.mismatch.signals.comparison import RecordingInfo
 from gyrofuse.mismatch.stats.multiplicity import monte_carlo_p_value
@@ -75,10 +75,10 @@ def test_a_fact_on_the_numbers_is_found_once():
     assert found is not None
     assert len(found.sensors) > 1
     fewer = dataclasses.replace(found, sensors=found.sensors[:1])
-    assert _known(fewer, [found])
-    assert not _known(found, [fewer])
+    assert is_known(fewer, [found])
+    assert not is_known(found, [fewer])
     steps = [dataclasses.replace(f, mechanism="step", effect=UnitScale(2.0)) for f in (fewer, found)]
-    assert not _known(steps[0], steps[1:])
+    assert not is_known(steps[0], steps[1:])
 
 
 def test_what_was_found_is_taken_off_and_simulated_again():

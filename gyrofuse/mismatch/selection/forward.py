@@ -77,7 +77,7 @@ def _best_of_stage(
         if sum(f.mechanism == kind.name for f in known) >= _MOST_OF_A_KIND:
             continue
         finding = kind.detect_and_fit(comparison, level * kind.level_after_repairs if known else level)
-        if finding is not None and not _is_known(finding, known):
+        if finding is not None and not is_known(finding, known):
             found.append(finding)
     for finding in sorted(found, key=lambda f: -f.gain):
         score = score_held_out(comparison, finding.effect)
@@ -86,7 +86,7 @@ def _best_of_stage(
     return None
 
 
-def _is_known(finding: Finding, known: list[Finding]) -> bool:
+def is_known(finding: Finding, known: list[Finding]) -> bool:
     """Whether the same was found before: what its repair could not take away is not another one."""
     if finding.effect.stage:  # a fact on the numbers of some sensors
         return any(f.mechanism == finding.mechanism and set(finding.sensors) <= set(f.sensors) for f in known)
