@@ -150,7 +150,7 @@ def test_other_units_are_a_finding():
 
 def test_the_discrepancy_is_that_of_a_diagnosis():
     two = [0, 1]
-    recording, simulation = array(5, N // 4).select(sensors=two), array(6, N // 2).select(sensors=two)
+    recording, simulation = array(5, N // 2).select(sensors=two), array(6, N).select(sensors=two)
     louder = gf.Recording(1.2 * simulation.signal, rate=simulation.rate, unit=simulation.unit)
     alike, other = discrepancy(recording, simulation), discrepancy(recording, louder)
     assert alike == pytest.approx(diagnose(recording, simulation).held_out.before, rel=1e-12)
