@@ -15,10 +15,8 @@ from gyrofuse.mismatch.detectors.lines.line_sizes import line_sizes
 from gyrofuse.mismatch.detectors.spectra.band_tests import coherence_test, spectrum_test
 from gyrofuse.mismatch.detectors.spectra.fit_verdict import fit_verdict
 from gyrofuse.mismatch.detectors.spectra.pooled_coherence import common_source_test
-from gyrofuse.mismatch.detectors.spectra.shape_errors import estimation_errors, parameters_p_value
-from gyrofuse.mismatch.detectors.spectra.shape_scan import looked_at, shape_test
+from gyrofuse.mismatch.detectors.spectra.shape_scan import fitted_scans, shape_test
 from gyrofuse.mismatch.detectors.variance.noise_level import compared_levels
-from gyrofuse.mismatch.likelihoods.band_powers import narrow
 from gyrofuse.mismatch.likelihoods.slow_noise import told
 from gyrofuse.mismatch.repair.inputs import modelled, prepared
 from gyrofuse.mismatch.signals.fitted_spectra import SpectralUncertainty, as_array
@@ -127,30 +125,9 @@ def test_one_estimate_for_all_sensors_is_off_alike_and_one_for_each_is_not():
     torch.testing.assert_close(one.square().sum(-1), two.square().sum(-1), rtol=1e-6, atol=0)
 
 
-# scores beside errors
-
-
-def test_shapes_are_weighed_by_the_inverse_covariance_and_by_what_lies_outside_the_tangents():
-    given = comparison(record(LONG, 1, 2), fitted(n_sensors=2))
-    errors, n_bands = estimation_errors(given), len(narrow(given).worth)
-    shapes = torch.randn(3, 2, n_bands, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    rows = given.reference.uncertainty.rows(narrow(given).frequency)
-    for i in range(2):
-        moved = narrow(given).worth.sqrt()[:, None] * rows[i]
-        covariance = moved @ given.reference.uncertainty.covariance @ moved.mT
-        expected = torch.linalg.solve(torch.eye(n_bands).double() + covariance, shapes[:, i].mT).mT
-        torch.testing.assert_close(errors.beside(shapes)[:, i], expected, rtol=1e-6, atol=1e-8)
-        torch.testing.assert_close(
-            errors.covariance(shapes)[:, i, i], torch.einsum("hb,bc,hc->h", shapes[:, i], covariance, shapes[:, i])
-        )
-        outside = errors.outside(shapes)[:, i]
-        assert float((outside @ moved).abs().max()) < 1e-8 * float((shapes[:, i] @ moved).abs().max())
-        torch.testing.assert_close(errors.outside(outside[:, None].expand(-1, 2, -1))[:, i], outside)
-
-
 @pytest.mark.statistical
 def test_the_parameters_chi_square_has_the_law_of_chance():
-    p = [parameters_p_value(against_another(s)) for s in range(N_RUNS)]
+    p = [fitted_scans(against_another(s)).parameters for s in range(N_RUNS)]
     assert 0.15 < sum(p) / len(p) < 0.85
     assert sum(x < 0.05 for x in p) <= at_most(len(p), 0.05)
 
@@ -160,7 +137,7 @@ def test_the_parameters_chi_square_has_the_law_of_chance():
 
 def test_a_model_fitted_to_a_shorter_record_raises_no_alarm_by_its_spectra():
     comparisons = [against_another(s) for s in range(N_RUNS)]
-    exact = [looked_at(given).exact.p_value for given in comparisons]
+    exact = [fitted_scans(given).exact.p_value for given in comparisons]
     seen = [shape_test(given).p_value for given in comparisons]
     bands = [spectrum_test(given).p_value for given in comparisons]
     assert sum(p < 0.01 for p in exact) > at_most(N_RUNS, 0.01)  # what it would be taken for, were its numbers exact

@@ -14,7 +14,7 @@ from torch import Tensor
 
 import gyrofuse as gf
 from gyrofuse.mismatch.detectors.spectra.band_tests import spectrum_test
-from gyrofuse.mismatch.detectors.spectra.shape_scan import beside_levels, shape_test
+from gyrofuse.mismatch.detectors.spectra.shape_scan import shape_test
 from gyrofuse.mismatch.detectors.values import quantisation_grid as lattices
 from gyrofuse.mismatch.detectors.variance import haar_kurtosis, noise_level, normality
 from gyrofuse.mismatch.detectors.variance import outliers as impulses
@@ -266,16 +266,6 @@ def test_levels_that_vary_by_themselves_make_a_sample_count_for_less() -> None:
     sure = level_spread(x, ~doubtful)
     assert math.isinf(sure.dof)
     assert sure.weight.tolist() == [1.0, 1.0, 1.0]
-
-
-def test_scores_whose_levels_vary_become_independent() -> None:
-    levels = torch.zeros(2, 4, 2, dtype=torch.float64)  # the first sensor's do not
-    levels[1] = torch.tensor([[0.1, 2.0], [1.5, 1.0], [4.0, 0.0], [1.0, 0.2]])
-    one = torch.eye(4, dtype=torch.float64)[:, None].expand(4, 2, 4)
-    root = beside_levels(one, levels)  # (band, sensor, band): rows of V^(-1/2)
-    for i, moved in enumerate(levels):
-        covariance = torch.eye(4, dtype=torch.float64) + moved @ moved.mT
-        torch.testing.assert_close(root[:, i] @ covariance @ root[:, i].mT, torch.eye(4, dtype=torch.float64))
 
 
 # Which simulations are Gaussian.

@@ -13,16 +13,10 @@ import gyrofuse as gf
 from gyrofuse._base.transforms import cosine_ordinates
 from gyrofuse.mismatch.detectors.spectra import shape_scan
 from gyrofuse.mismatch.detectors.spectra.shape_scan import scanned, shape_test
-from gyrofuse.mismatch.likelihoods.band_powers import (
-    N_SLOW,
-    deep_base,
-    narrow,
-    narrow_bands,
-    neighbours,
-    slow,
-    slow_gains,
-    slow_ordinates,
-)
+from gyrofuse.mismatch.likelihoods.nuisance import Nuisance
+from gyrofuse.mismatch.likelihoods.slow_ordinates import N_SLOW, slow_gains, slow_ordinates
+from gyrofuse.mismatch.likelihoods.spectral import power_gains
+from gyrofuse.mismatch.likelihoods.spectral_data import block_bands, ratios, reference_noise
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.folds import N_FOLDS, seen_in_block
 from gyrofuse.mismatch.signals.known_lines import without_lines
@@ -222,45 +216,37 @@ def walking(seed: int, factor: float = 1.0, n: int = 4096) -> Comparison:
     return comparison(one.simulate(n, batch=(3,), generator=g), other.simulate(n, batch=(4, 3), generator=g))
 
 
-def test_powers_of_neighbouring_narrow_bands_are_correlated_as_said():
-    wanted, n_runs = narrow_bands(512), 4000
+def test_ordinates_of_a_block_s_bands_add_up_to_those_of_all_bins():
+    wanted, n_runs = block_bands(512), 4000
     x = torch.randn(n_runs, 1, 512, generator=generator(20), dtype=torch.float64)
     power = cross_spectra(x, wanted)[..., 0, 0].real
-    found = torch.corrcoef(power.mT).diagonal(1)
-    # Standard deviations of a correlation are 1 / sqrt(n); of some forty none is 4.5 of them away.
-    assert ((found - neighbours(wanted.edges)).abs() < 4.5 / math.sqrt(n_runs)).all()
+    total = (power * torch.from_numpy(np.diff(wanted.edges))).sum(-1)
+    found = float(total.mean().square() / total.var())
+    # The relative error of a variance of 4000 runs is 0.022.
+    assert float(wanted.dof.sum()) == pytest.approx(found, rel=0.1)
 
 
-def test_slow_ratios_are_those_of_the_law_of_f():
-    given = slow(walking(21))
-    factors = torch.tensor([[0.5, 0.2, 0.1], [2.0, 1.0, 0.0], [-0.7, -0.3, 0.0]], dtype=torch.float64)
-    found = given.log_ratios(factors)
-    for i in range(3):
-        expected = 0.0
-        for b in range(3):
-            law = stats.f(2 * float(given.d[b]), 2 * float(given.s[b]))
-            r, h = float(given.ratio[i, b]), float(factors[i, b])
-            expected += law.logpdf(r * math.exp(-h)) - h - law.logpdf(r)
-        assert float(found[i]) == pytest.approx(expected, rel=1e-9)
+def test_gains_of_powers_are_those_of_the_law_of_f():
+    given = walking(21)
+    data = ratios(given)
+    factors = torch.linspace(-1.0, 2.0, len(data.d), dtype=torch.float64)[:, None].expand(-1, given.n_sensors)
+    found = power_gains(data, factors.exp()) / data.share
+    for b in (0, 3, 20, 40):
+        law = stats.f(2 * float(data.d[b]), 2 * float(data.s[b]))
+        r, h = data.ratio[b].numpy(), float(factors[b, 0])
+        expected = law.logpdf(r * math.exp(-h)) - h - law.logpdf(r)
+        np.testing.assert_allclose(found[b].numpy(), expected, rtol=1e-3)  # but for the floor
 
 
 def test_the_scan_of_shapes_is_the_mean_over_all_of_them():
-    given = walking(22, n=1024)
-    data, below = narrow(given), slow(given)
-    looked_for = shape_scan._shapes(given, data)
-    sizes = looked_for.scores.norm(dim=-1)
-    templates = looked_for.scores / sizes[..., None].clamp(min=1e-300)
-    z = shape_scan.independent(torch.einsum("hsb,sb->hs", templates, data.scores), templates, data)
-    shared = data.coherence[: shape_scan._LOW].mean(0).sum(-1).clamp(min=1)
+    given = walking(22)
+    data = ratios(given)
+    shapes = shape_scan._shapes(data, given.n_samples)
     total = 0.0
-    for h in range(len(z)):
-        a = sizes[h]
-        up, down = (
-            np.exp((w * a * z[h] - a**2 / 2 + below.log_ratios(w * looked_for.slow)[h] / shared).numpy())
-            for w in (1, -1)
-        )
-        for way, ratio in enumerate((up, down, (up + down) / 2)):
-            chance = math.exp(float(looked_for.log_chances[way, h]))
+    for h, log_factor in enumerate(shapes.log_factors):
+        up, down = (np.exp(power_gains(data, (w * log_factor).exp().mT).sum(0).numpy()) for w in (1, -1))
+        for ratio in (up, down, (up + down) / 2):
+            chance = math.exp(float(shapes.log_prior[h])) / 3
             total += chance * np.mean([np.prod(1 - e + e * ratio) for e in shape_scan.SHARES])
     found = scanned(given)
     assert found is not None
@@ -269,7 +255,27 @@ def test_the_scan_of_shapes_is_the_mean_over_all_of_them():
 
 def test_chances_of_shapes_add_up_to_one():
     given = walking(23)
-    assert float(shape_scan._shapes(given, narrow(given)).log_chances.exp().sum()) == pytest.approx(1.0, abs=1e-9)
+    prior = shape_scan._shapes(ratios(given), given.n_samples).log_prior
+    assert float(prior.exp().sum()) == pytest.approx(1.0, abs=1e-9)
+
+
+def test_gains_beside_a_nuisance_are_those_of_likelihoods_integrated_over_it():
+    given = walking(26)
+    data = ratios(given)
+    g = generator(27)
+    rows = 0.05 * torch.randn(given.n_sensors, len(data.d), 1, generator=g, dtype=torch.float64)
+    shape = 0.05 * torch.randn(given.n_sensors, len(data.d), generator=g, dtype=torch.float64)
+    y = torch.linspace(-8, 8, 4001, dtype=torch.float64)
+    logs = []
+    for moved in (shape, torch.zeros_like(shape)):
+        gains = power_gains(data, (moved + y[:, None, None] * rows[..., 0]).exp().mT).sum(-2)
+        logs.append((gains - y[:, None].square() / 2).logsumexp(0))
+    expected = logs[0] - logs[1]
+    assert float(expected.abs().min()) > 0.01
+    torch.testing.assert_close(Nuisance(data, rows).gains(shape), expected, atol=0.05, rtol=0.05)
+    # Whatever a free nuisance can make is no difference.
+    free = Nuisance(data, 1e6 * rows)
+    assert float(free.gains(0.5 * rows[..., 0]).abs().max()) < 0.05
 
 
 def test_a_larger_walk_is_seen_in_its_slowest_ordinates():
@@ -288,7 +294,7 @@ def test_slow_ordinates_are_held_out_once_and_gain_what_their_likelihood_does():
 
     y = slow_ordinates(given.observed)[0].numpy()
     f = np.arange(1, N_SLOW + 1) / (2 * given.n_samples)
-    power = deep_base(given).spectrum(torch.from_numpy(f)).numpy()
+    power = reference_noise(given).spectrum(torch.from_numpy(f)).numpy()
     factor = 1 + 1e-3 / f
     expected = (stats.norm.logpdf(y, scale=np.sqrt(power * factor)) - stats.norm.logpdf(y, scale=np.sqrt(power))).sum(0)
     for fold in range(N_FOLDS):
@@ -311,7 +317,6 @@ def test_shorter_simulations_say_nothing_of_the_slowest_ordinates():
     g = generator(25)
     noise = gf.WhiteNoise(1.0) + gf.RandomWalk(1e-5)
     given = comparison(noise.simulate(4096, batch=(2,), generator=g), noise.simulate(2048, batch=(1, 2), generator=g))
-    assert float(slow(given).log_ratios(torch.ones(2, 3, dtype=torch.float64)).abs().max()) == 0.0
     assert not slow_gains(given, lambda m, f: 2 * m, 0).any()
     assert shape_test(given).p_value > 1e-3
 

@@ -152,6 +152,13 @@ def power_gains(data: Ratios, m: Tensor) -> Tensor:
     return data.share * ((d + s) * (odds.log1p() - (odds / m).log1p()) - d * m.log())
 
 
+def power_scores(data: Ratios, m: Tensor) -> Tensor:
+    """Slope of the log likelihood of powers `(..., band, sensor)` in their logarithms, without their shares."""
+    d, s = data.d[:, None], data.s[:, None]
+    q = data.ratio / floored(m)
+    return d * s * (q - 1) / (s + d * q).clamp(min=1e-300)
+
+
 def log_gain(data: Ratios, model: Tensor, *, paired: bool = True) -> Tensor:
     """Log likelihood of a model `(band, sensor, sensor)` over none, `(band,)`, nats."""
     gain = power_gains(data, model.diagonal(dim1=-2, dim2=-1).real).sum(-1)
@@ -300,9 +307,7 @@ def _power_slopes(data: Ratios, model: Tensor, derivatives: Tensor) -> tuple[Ten
     """Information `(number, number)` and score `(number,)` of powers."""
     m = model.diagonal(dim1=-2, dim2=-1).real
     moved = (derivatives.diagonal(dim1=-2, dim2=-1).real / (m + FLOOR)).flatten(1)  # (number, band * sensor)
-    d, s = data.d[:, None], data.s[:, None]
-    q = data.ratio / floored(m)
-    score = (data.share * d * s * (q - 1) / (s + d * q).clamp(min=1e-300)).flatten()
+    score = (data.share * power_scores(data, m)).flatten()
     worth = (data.share * data.worth[:, None]).flatten()
     return (moved * worth) @ moved.mT, moved @ score
 

@@ -1,11 +1,11 @@
-"""Cross-spectra of a recording and its simulation, additive over the blocks that are held out.
+"""Cross-spectra of a recording and of its reference in the same bands: the data of every likelihood of spectra.
 
 Both sides are cut into blocks of one length, so that resolution and leakage are the same. Below the lowest band of a
-block stand the DCT-II ordinates of whole records, dealt to the blocks, and so they do next to half the rate, where the
-edges of filters are steeper than blocks can show: there under a light taper, as the kink that either end of a record
-would be to them is all that stop bands have, the same in all ordinates. The whole recording, the blocks that a fold
-keeps and those that it holds out are the same sums over another set of blocks; the reference is held out with them, as
-its own chance would otherwise be in what is fitted and in what judges the fit.
+block stand the DCT-II ordinates of whole records, dealt to the blocks. So they do next to half the rate, where the
+edges of filters are steeper than blocks resolve: there under a light taper, since the step from a record's last sample
+to its first would otherwise be all the power of a stop band. The whole recording, the blocks that a fold keeps and
+those that it holds out are the same sums over another set of blocks. The reference is held out with them: its chance
+would otherwise be both in what is fitted and in what judges the fit.
 """
 
 from __future__ import annotations
@@ -20,55 +20,87 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.transforms import cosine_ordinates
-from gyrofuse.mismatch.likelihoods.band_powers import N_PLACES, DeepBands, Groups
+from gyrofuse.mismatch.decisions import CERTAIN
+from gyrofuse.mismatch.likelihoods.coherence_law import smooth_coherence
+from gyrofuse.mismatch.likelihoods.reference_spectrum import Ground
+from gyrofuse.mismatch.likelihoods.spectral import Ratios, exact
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED
-from gyrofuse.mismatch.signals.psd import Bands, cross_spectra, degrees_of_freedom, light_taper, taper_window
+from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum, fit_base
+from gyrofuse.mismatch.signals.psd import (
+    N_PLACES,
+    Bands,
+    cross_spectra,
+    degrees_of_freedom,
+    light_taper,
+    taper_window,
+)
 from gyrofuse.mismatch.signals.records import Records
 
-# Bins of a block: the lowest band. The four tapers reach two bins down, and below one bin what is slower leaks in.
+Groups = tuple[tuple[int, ...], ...]  # cosine ordinates of a record, by the band that they are in
+
+# Bins of a block: the lowest band. The four tapers reach two bins down, and below one bin slower noise leaks in.
 _FIRST_BIN = 4
 # Bins of a band at least: the powers of neighbouring bands then correlate by 0.12 (white noise, 6000 blocks).
 _NARROWEST = 6
-_PER_OCTAVE = 6  # bands: a third of an octave holds two, as narrow as smooth spectra need
-_WIDEST = 0.02  # cycles per sample: a band where filters cut off is to show their slope
-_SHARE_OF_END = 3  # bands are a third of the distance to half the rate at most: digital filters have zeros there
-_FEWEST_AT_END = 24  # ordinates of a whole record in a band there, which have no tapers
-_PER_BIN = 4  # frequencies in a bin at which the window of the tapers is laid out
-_SLOW_PER_OCTAVE = 4  # groups of ordinates: slow noise has no structure finer than that
+_CHANGED = 0.05  # log power: a filter of another form than the recording's leaves errors where it changed more
 
 
 @dataclass(frozen=True, eq=False)
-class BlockBands(DeepBands):
-    """Bands of blocks, which show in each what their tapers let in from the others as well.
+class BlockBands(Bands):
+    """Bands of a block's bins, and below and above them groups of cosine ordinates of a whole record.
 
-    Next to a filter's edge, in its stop band and at its zeros that is most of the power.
+    Next to a filter's edge, in its stop band and at its zeros most of a band's power leaks in from other bands.
 
     Attributes:
-        seen: What each place adds to a band, `(place, band)`; its columns add up to one.
+        below, beyond: Frequencies whose mean stands for a group of ordinates, `(group, frequency)`.
+        response: What each frequency adds to a band, `(frequency, band)`; its columns add up to one.
     """
 
-    seen: Tensor
+    below: Tensor
+    beyond: Tensor
+    response: Tensor
 
     @classmethod
-    def of_blocks(cls, bins: Bands, record: int, below: Groups, beyond: Groups) -> BlockBands:
-        """Bands of the bins of blocks between groups of ordinates of a record."""
-        own = DeepBands.of(bins, record, below, beyond)
-        seen = torch.block_diag(*[torch.full((N_PLACES, 1), 1 / N_PLACES, dtype=torch.float64)] * len(own.dof))
+    def of(cls, bins: Bands, n_samples: int, below: Groups, beyond: Groups) -> BlockBands:
+        """Bands between groups of ordinates.
+
+        Args:
+            bins: Bands of a block.
+            n_samples: Length of the whole record.
+            below, beyond: Groups of its ordinates.
+        """
+        low, high = _nodes(below, n_samples), _nodes(beyond, n_samples)
+        frequency = torch.cat([low.log().mean(-1).exp(), bins.frequency, high.log().mean(-1).exp()])
+        counts = [torch.tensor([len(group) / 2 for group in groups], dtype=torch.float64) for groups in (below, beyond)]
+        dof = torch.cat([counts[0], bins.dof, counts[1]])
+        own = torch.block_diag(*[torch.full((N_PLACES, 1), 1 / N_PLACES, dtype=torch.float64)] * len(dof))
+        bands = cls(bins.n_samples, bins.edges, frequency, dof, low, high, own)
         first = len(below)
-        seen[:, first : first + len(bins.dof)] = _let_in(bins, own.places).mT
-        return cls(own.n_samples, own.edges, own.frequency, own.dof, own.deep, own.beyond, seen)
+        own[:, first : first + len(bins.dof)] = _tapers_response(bins, bands.places).mT
+        return bands
+
+    @property
+    def places(self) -> Tensor:
+        return torch.cat([self.below.flatten(), super().places, self.beyond.flatten()])
 
     def mean_of(self, density: Tensor) -> Tensor:
-        return density @ self.seen
+        return density @ self.response
+
+
+def _nodes(groups: Groups, n_samples: int) -> Tensor:
+    """Frequencies whose mean stands for a group of ordinates, cycles per sample, `(group, frequency)`."""
+    share = torch.arange(N_PLACES, dtype=torch.float64).add(0.5) / N_PLACES
+    ends = torch.tensor([(g[0] - 0.5, g[-1] + 0.5) for g in groups], dtype=torch.float64).view(-1, 2)
+    return (ends[:, :1] + ends.diff() * share) / (2 * n_samples)
 
 
 class Spectra(NamedTuple):
     """Sums of cross-products of complex ordinates, and how many there are.
 
     Attributes:
-        products: `(part, band, sensor, sensor)`, complex; a part is a block of the recording, or a fold's of the
+        products: Sums, `(part, band, sensor, sensor)`, complex; a part is a block of the recording, or a fold of the
             reference.
         dof: Independent complex ordinates, `(part, band)`.
     """
@@ -86,64 +118,143 @@ class Compared(NamedTuple):
     """A recording and its reference in the same bands.
 
     Attributes:
-        bands: They, below and above them groups of ordinates of the whole record.
-        observed: By block, 32 parts.
-        reference: By the fold that holds it out, 4 parts.
+        bands: Bands of both.
+        observed: Spectra of the recording by block, 32 parts.
+        reference: Spectra of the reference by the fold that holds them out, 4 parts.
     """
 
-    bands: DeepBands
+    bands: BlockBands
     observed: Spectra
     reference: Spectra
 
 
 @derived
 def block_spectra(comparison: Comparison) -> Compared:
-    """Both sides of a case."""
-    observed, reference = (
-        _of_side(comparison.observed, comparison.n_samples),
-        _of_side(comparison.reference, comparison.n_samples),
-    )
-    folds = torch.arange(len(observed.dof)) % N_FOLDS
-    parts = [(reference.products[folds == k].sum(0), reference.dof[folds == k].sum(0)) for k in range(N_FOLDS)]
-    return Compared(
-        compared_bands(comparison.n_samples),
-        observed,
-        Spectra(torch.stack([p for p, _ in parts]), torch.stack([d for _, d in parts])),
+    """Cross-spectra of both sides of a comparison."""
+    observed, reference = (_spectra(side, comparison.n_samples) for side in (comparison.observed, comparison.reference))
+    folds = Spectra(*(part.unflatten(0, (-1, N_FOLDS)).sum(0) for part in reference))
+    return Compared(compared_bands(comparison.n_samples), observed, folds)
+
+
+@derived
+def reference_noise(comparison: Comparison) -> NoiseSpectrum:
+    """Noise of the reference as a sum of simple spectra, down to the slowest ordinates."""
+    both = block_spectra(comparison)
+    matrices, s = both.reference.mean(torch.ones(N_FOLDS, dtype=torch.bool))
+    return fit_base(matrices.diagonal(dim1=-2, dim2=-1).real.mT, both.bands, comparison.n_samples, s)
+
+
+def ratios(
+    comparison: Comparison,
+    blocks: Tensor | None = None,
+    folds: Tensor | None = None,
+    *,
+    independent: bool = False,
+    formed: bool = True,
+) -> Ratios:
+    """Cross-spectra of a recording over the reference's, without bands that hold an unexplained spectral line.
+
+    Args:
+        comparison: Recording and reference.
+        blocks: Blocks of the recording to use, `(block,)`; all by default.
+        folds: Folds of the reference to use, `(fold,)`; all by default.
+        independent: Whether the reference's sensors are known to share nothing.
+        formed: Whether to use bands that were changed by a repair whose form only approximates the recording's.
+    """
+    both = block_spectra(comparison)
+    matrices, d = both.observed.mean(torch.ones(N_JUDGED, dtype=torch.bool) if blocks is None else blocks)
+    reference, s = both.reference.mean(torch.ones(N_FOLDS, dtype=torch.bool) if folds is None else folds)
+    usable = torch.ones(len(s), comparison.n_sensors, dtype=torch.float64)
+    nodes = both.bands.places.unflatten(0, (len(s), -1))
+    lowest, highest = nodes.amin(-1), nodes.amax(-1)
+    reach = 2 * N_JUDGED / comparison.n_samples  # tapers of a block widen a line by two bins of a block
+    if comparison.line.p_value < CERTAIN:
+        line = comparison.line.frequency
+        usable[(lowest > reach / 2) & (lowest - reach < line) & (line < highest + reach)] = 0.0
+    usable[lowest < comparison.reference.slowest_seen] = 0.0
+    for factor in () if formed else comparison.bent:
+        changed = both.bands.mean_of(factor(both.bands.places))  # (sensor, band)
+        usable[(changed.clamp(min=1e-300).log().abs() > _CHANGED).mT] = 0.0
+    ground = Ground(reference_noise(comparison), both.bands)
+    power = reference.diagonal(dim1=-2, dim2=-1).real
+    size = torch.where(power > 0, power, ground.mean.mT).rsqrt()
+    expected = torch.eye(comparison.n_sensors, dtype=reference.dtype).expand_as(reference)
+    if not independent:
+        expected = smooth_coherence(reference * (size[:, :, None] * size[:, None, :]), s)
+    return Ratios.of(ground, (matrices, d), (power, s), expected, usable, independent)
+
+
+def ratios_around(comparison: Comparison, frequency: float, width: float) -> Ratios | None:
+    """Cross-spectra of a recording over the reference's noise in narrow cells around a frequency; None without room.
+
+    Args:
+        comparison: Recording and reference.
+        frequency: Middle, cycles per sample.
+        width: Width of what is looked at, cycles per sample: four cells.
+    """
+    n, narrowest, most = comparison.n_samples, 5, 24  # bins of a cell, which tapers fill; cells on either side
+    cell, centre = max(round(width * n / 4), narrowest), round(frequency * n)
+    count = min(most, (centre - 3) // cell, (n // 2 - 4 - centre) // cell)
+    if count < 6:
+        return None
+    edges = tuple(centre + cell * k for k in range(-count, count + 1))
+    ends = torch.tensor(edges, dtype=torch.float64)
+    dof = torch.full((2 * count,), degrees_of_freedom(cell), dtype=torch.float64)
+    ground = Ground(comparison.base, Bands(n, edges, (ends[:-1] + ends[1:] - 1) / 2 / n, dof))
+    band = int((comparison.bands.frequency - frequency).abs().argmin())
+    coherence = smooth_coherence(comparison.reference.coherence, comparison.reference.dof)[band]
+    matrices = cross_spectra(comparison.observed.steady, ground.bands).mean(0)
+    known = ground.mean.mT, exact(dof)
+    return Ratios.of(
+        ground, (matrices, dof), known, coherence.expand(2 * count, -1, -1), torch.ones_like(ground.mean.mT)
     )
 
 
 @functools.lru_cache(maxsize=8)
 def block_bands(length: int) -> Bands:
-    """Bands of a block of so many samples, up to where they would be wider than half the rate is near."""
-    last = length // 2 - _SHARE_OF_END * _NARROWEST
+    """Bands of a block: six an octave, at most 0.02 cycles per sample and a third of the distance to half the rate.
+
+    Smooth spectra need no more than six bands an octave. A wider band would hide the slope of a filter that cuts off,
+    and next to half the rate digital filters have zeros. The ordinates of all bands together are those of one band as
+    wide as all: neighbours share some.
+
+    Args:
+        length: Samples of a block.
+    """
+    per_octave, widest, end_share = 6, 0.02, 3
+    last = length // 2 - end_share * _NARROWEST
     edges = [_FIRST_BIN]
     while last - edges[-1] >= 2 * _NARROWEST:
         a = edges[-1]
-        wide = min(a * (2 ** (1 / _PER_OCTAVE) - 1), _WIDEST * length, (length / 2 - a) / _SHARE_OF_END)
+        wide = min(a * (2 ** (1 / per_octave) - 1), widest * length, (length / 2 - a) / end_share)
         edges.append(a + max(round(wide), _NARROWEST))
     edges.append(last)
     lower, upper = (torch.tensor(ends, dtype=torch.float64) for ends in (edges[:-1], edges[1:]))
     dof = torch.tensor([degrees_of_freedom(b - a) for a, b in itertools.pairwise(edges)], dtype=torch.float64)
+    dof *= degrees_of_freedom(edges[-1] - edges[0]) / dof.sum()
     return Bands(length, tuple(edges), (lower * (upper - 1)).sqrt() / length, dof)
 
 
-@functools.lru_cache(maxsize=1)
 def slow_groups() -> Groups:
     """DCT-II ordinates of a record below its blocks' lowest band: single at the bottom, then a quarter octave each."""
-    end = round(2 * N_JUDGED * (_FIRST_BIN - 0.5))
+    per_octave, end = 4, round(2 * N_JUDGED * (_FIRST_BIN - 0.5))
     edges = [1]
     while edges[-1] < end:
-        edges.append(min(max(edges[-1] + 1, round(edges[-1] * 2 ** (1 / _SLOW_PER_OCTAVE))), end))
+        edges.append(min(max(edges[-1] + 1, round(edges[-1] * 2 ** (1 / per_octave))), end))
     return tuple(tuple(range(a, b)) for a, b in itertools.pairwise(edges))
 
 
-@functools.lru_cache(maxsize=8)
 def fast_groups(n_samples: int) -> Groups:
-    """DCT-II ordinates of a record above its blocks' highest band, each a third of the distance to half the rate."""
+    """DCT-II ordinates of a record above its blocks' highest band, each a third of the distance to half the rate.
+
+    A group has 24 ordinates at least: as many as the narrowest band of blocks has in a whole record of 32 blocks' two
+    bins, so that its power is known to 30 %.
+    """
+    end_share, fewest = 3, 24
     length = n_samples // N_JUDGED
     edges = [round(2 * n_samples * (block_bands(length).edges[-1] - 0.5) / length)]
-    while n_samples - edges[-1] >= 2 * _FEWEST_AT_END:
-        edges.append(edges[-1] + max((n_samples - edges[-1]) // _SHARE_OF_END, _FEWEST_AT_END))
+    while n_samples - edges[-1] >= 2 * fewest:
+        edges.append(edges[-1] + max((n_samples - edges[-1]) // end_share, fewest))
     edges[-1] = n_samples
     return tuple(tuple(range(a, b)) for a, b in itertools.pairwise(edges))
 
@@ -151,33 +262,32 @@ def fast_groups(n_samples: int) -> Groups:
 @functools.lru_cache(maxsize=8)
 def compared_bands(n_samples: int) -> BlockBands:
     """Bands in which recordings of so many samples are compared."""
-    bins = block_bands(n_samples // N_JUDGED)
-    return BlockBands.of_blocks(bins, n_samples, slow_groups(), fast_groups(n_samples))
+    return BlockBands.of(block_bands(n_samples // N_JUDGED), n_samples, slow_groups(), fast_groups(n_samples))
 
 
-def _let_in(bins: Bands, places: Tensor) -> Tensor:
-    """What each place adds to the bands of blocks, `(band, place)`, by the window of their tapers.
+def _tapers_response(bins: Bands, nodes: Tensor) -> Tensor:
+    """What each frequency adds to the bands of blocks by the window of their tapers, `(band, frequency)`.
 
-    A place stands for all frequencies that are nearer to it than to another one. Those next to zero are left out, for a
-    block's mean is taken off.
+    A node stands for all frequencies that are nearer to it than to another one. Those next to zero are left out: a
+    block's mean is subtracted.
     """
-    n = bins.n_samples
-    window = torch.fft.rfft(taper_window(n, _PER_BIN))
-    inside = torch.zeros(len(bins.dof), _PER_BIN * n, dtype=torch.float64)
+    n, per_bin = bins.n_samples, 4  # frequencies in a bin, at which the window is laid out
+    window = torch.fft.rfft(taper_window(n, per_bin))
+    inside = torch.zeros(len(bins.dof), per_bin * n, dtype=torch.float64)
     for band, (first, end) in enumerate(itertools.pairwise(bins.edges)):
-        inside[band, _PER_BIN * first : _PER_BIN * end : _PER_BIN] = 1.0
-    around = torch.fft.irfft(torch.fft.rfft(inside) * window, n=_PER_BIN * n)
-    half = _PER_BIN * n // 2
+        inside[band, per_bin * first : per_bin * end : per_bin] = 1.0
+    around = torch.fft.irfft(torch.fft.rfft(inside) * window, n=per_bin * n)
+    half = per_bin * n // 2
     weights = around[:, : half + 1] + torch.nn.functional.pad(around[:, half + 1 :].flip(-1), (1, 1))
-    frequency = torch.arange(half + 1, dtype=torch.float64) / (_PER_BIN * n)
+    frequency = torch.arange(half + 1, dtype=torch.float64) / (per_bin * n)
     weights = weights * (frequency >= 0.5 / n)
-    nearest = torch.bucketize(frequency, (places[1:] + places[:-1]) / 2)
-    shares = torch.zeros(len(weights), len(places), dtype=torch.float64).index_add_(1, nearest, weights)
+    nearest = torch.bucketize(frequency, (nodes[1:] + nodes[:-1]) / 2)
+    shares = torch.zeros(len(weights), len(nodes), dtype=torch.float64).index_add_(1, nearest, weights)
     return shares / shares.sum(-1, keepdim=True)
 
 
-def _of_side(side: Records, n_samples: int) -> Spectra:
-    """A side by the 32 blocks that its samples, or the place of its ordinates, belong to."""
+def _spectra(side: Records, n_samples: int) -> Spectra:
+    """Spectra of a side by the 32 blocks that its samples, or its ordinates, belong to."""
     noise = side.steady
     length, (n_records, p, n) = n_samples // N_JUDGED, noise.shape
     bands, below, beyond = block_bands(length), slow_groups(), fast_groups(n_samples)
@@ -186,12 +296,12 @@ def _of_side(side: Records, n_samples: int) -> Spectra:
     dof = torch.zeros(N_JUDGED, end + len(beyond), dtype=torch.float64)
     for record in noise:
         blocks = record[:, : n // length * length].unflatten(-1, (-1, length)).movedim(1, 0)
-        place = torch.arange(len(blocks)) % N_JUDGED
-        products[:, first:end].index_add_(0, place, cross_spectra(blocks, bands) * bands.dof[:, None, None])
-        dof[:, first:end].index_add_(0, place, bands.dof.expand(len(blocks), -1))
+        of_block = torch.arange(len(blocks)) % N_JUDGED
+        products[:, first:end].index_add_(0, of_block, cross_spectra(blocks, bands) * bands.dof[:, None, None])
+        dof[:, first:end].index_add_(0, of_block, bands.dof.expand(len(blocks), -1))
         taper = light_taper(n) * math.sqrt(n)
         tapered = (record - record.mean(-1, keepdim=True)) * taper
-        for start, groups, seen, worth in (
+        for start, groups, signal, weight in (
             (0, below, record, 0.5),  # a real ordinate is half a complex one
             (end, beyond, tapered, 0.5 / float(taper.pow(4).mean())),
         ):
@@ -200,10 +310,10 @@ def _of_side(side: Records, n_samples: int) -> Spectra:
             lowest, highest = (float(edge) * n / n_samples for edge in (edges[0], edges[-1]))
             k = torch.arange(max(math.ceil(lowest), 1), min(math.floor(highest) + 1, n))
             band = torch.bucketize(k * (n_samples / n), edges, right=True) - 1
-            y = cosine_ordinates(seen)[:, k].mT
+            y = cosine_ordinates(signal)[:, k].mT
             at, inside = (k % N_JUDGED)[band >= 0], band >= 0
-            cross = (y[:, :, None] * y[:, None, :])[inside].to(products.dtype) * worth
+            cross = (y[:, :, None] * y[:, None, :])[inside].to(products.dtype) * weight
             products.index_put_((at, start + band[inside]), cross, accumulate=True)
-            dof.index_put_((at, start + band[inside]), torch.full((len(at),), worth).to(dof), accumulate=True)
-    told = side.n_records / n_records  # less than it shows, where a model was estimated from fewer samples
-    return Spectra(products * told, dof * told)
+            dof.index_put_((at, start + band[inside]), torch.full((len(at),), weight).to(dof), accumulate=True)
+    known = side.n_records / n_records  # less than one, where a model was estimated from fewer samples
+    return Spectra(products * known, dof * known)

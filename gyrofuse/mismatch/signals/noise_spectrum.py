@@ -92,8 +92,9 @@ def fit_base(power: Tensor, bands: Bands, n_samples: int, dof: Tensor) -> NoiseS
         dof: What each band is worth, complex ordinates, `(band,)`; 0 leaves it out.
     """
     atoms = bands.mean_of(_atoms(n_samples, bands.places))  # (atom, band)
-    root = dof.sqrt()
-    fitted, free = power, None
+    root, known = dof.sqrt(), dof > 0
+    fitted, free = torch.where(known, power, 1.0), None
+    power = torch.where(known, power, 0.0)
     for _ in range(_ROUNDS):  # scoring: least squares with the variances of what was fitted last
         weights = root / fitted
         design = atoms * weights[:, None]  # (sensor, atom, band)

@@ -24,6 +24,7 @@ from gyrofuse._base.transforms import fast_length
 _TAPERS = 4  # an even number
 _PER_OCTAVE = 4
 _TAPERED = 0.1  # share of the record under the ends of a light taper: spectral lines leak as far as twenty bins
+N_PLACES = 8  # frequencies whose mean stands for the mean over a band
 _FIRST_BIN = 3  # below, positive and negative frequencies overlap
 
 
@@ -46,18 +47,15 @@ class Bands:
 
     def mean_of(self, density: Tensor) -> Tensor:
         """Means over the bands of values `(..., place)` at `places`."""
-        return density.unflatten(-1, (-1, _PLACES)).mean(-1)
+        return density.unflatten(-1, (-1, N_PLACES)).mean(-1)
 
     @property
     def places(self) -> Tensor:
         """Frequencies `(band * place,)`, cycles per sample, whose mean stands for the mean over a band."""
         edges = torch.tensor(self.edges, dtype=torch.float64)
-        share = (torch.arange(_PLACES, dtype=torch.float64) + 0.5) / _PLACES
+        share = (torch.arange(N_PLACES, dtype=torch.float64) + 0.5) / N_PLACES
         bins = edges[:-1, None] - 0.5 + (edges.diff())[:, None] * share
         return (bins / self.n_samples).flatten()
-
-
-_PLACES = 8
 
 
 @functools.lru_cache(maxsize=8)

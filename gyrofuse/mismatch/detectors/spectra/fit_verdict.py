@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from gyrofuse._base.results import p_words
 from gyrofuse.mismatch.detectors.spectra.band_tests import spectrum_test
-from gyrofuse.mismatch.detectors.spectra.shape_scan import Looks, looked_at
+from gyrofuse.mismatch.detectors.spectra.shape_scan import FittedScans, fitted_scans
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.stats.multiplicity import sidak
 
@@ -33,10 +33,10 @@ class FitVerdict:
     Attributes:
         kind: What they say.
         n_samples: Of each sensor, that the model was fitted to.
-        exact: p value of the likeliest shape of a difference, as if the numbers were known.
-        beside: Of the same beside what they may be off.
-        outside: Of what no numbers of the model's processes could make.
-        parameters: Of the parameters' chi-square.
+        exact: p value of shapes of a difference as if the numbers were known.
+        beside: p value of shapes of a difference by more than errors of the numbers: the two below together.
+        outside: p value of what no numbers of the model's processes could make.
+        parameters: p value of the numbers that would suit the recording (chi-square).
     """
 
     kind: Kind
@@ -67,31 +67,29 @@ def fit_verdict(comparison: Comparison, level: float) -> FitVerdict | None:
 
     Args:
         comparison: Recording and simulation.
-        level: Largest p value of a witness that is a mismatch.
+        level: Largest p value of one test that is a mismatch.
     """
-    uncertainty, looks = comparison.reference.uncertainty, looked_at(comparison)
-    if uncertainty is None or looks is None:
+    uncertainty, scans = comparison.reference.uncertainty, fitted_scans(comparison)
+    if uncertainty is None or scans is None:
         return None
     return FitVerdict(
-        kind=_kind(comparison, looks, level),
+        kind=_kind(comparison, scans, level),
         n_samples=uncertainty.n_samples,
-        exact=looks.exact.p_value,
-        beside=looks.beside.p_value,
-        outside=looks.outside.p_value,
-        parameters=looks.parameters,
+        exact=scans.exact.p_value,
+        beside=scans.p_value,
+        outside=scans.outside.p_value,
+        parameters=scans.parameters,
     )
 
 
-def _kind(comparison: Comparison, looks: Looks, level: float) -> Kind:
-    allowed = (looks.outside.p_value, looks.parameters, looks.beside.p_value)
-    outside, parameters, beside = (sidak(p, len(allowed)) for p in allowed)
-    if outside <= level:
+def _kind(comparison: Comparison, scans: FittedScans, level: float) -> Kind:
+    if sidak(scans.outside.p_value, 2) <= level:
         return "component_missing"
-    if parameters <= level:
+    if sidak(scans.parameters, 2) <= level:
         return "other_numbers"
-    if min(beside, spectrum_test(comparison).p_value) <= level:
+    if spectrum_test(comparison).p_value <= level:
         return "undecided"
     exact = replace(comparison, reference=replace(comparison.reference, uncertainty=None))
-    if min(looks.exact.p_value, spectrum_test(exact).p_value) <= level:
+    if min(scans.exact.p_value, spectrum_test(exact).p_value) <= level:
         return "within_uncertainty"
     return "agrees"

@@ -10,20 +10,17 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.detectors.spectra.peaks import Stretch, band_of, strongest_peak
+from gyrofuse.mismatch.detectors.spectra.peaks import Stretch, strongest_peak
 from gyrofuse.mismatch.detectors.spectra.shape_scan import scanned
-from gyrofuse.mismatch.likelihoods.coherence_law import smooth_coherence
 from gyrofuse.mismatch.likelihoods.component_choice import cost_of
 from gyrofuse.mismatch.likelihoods.components import CommonBump, Peak, Term
 from gyrofuse.mismatch.likelihoods.reference_spectrum import Ground
-from gyrofuse.mismatch.likelihoods.spectral import Fit, Ratios, exact, fit
+from gyrofuse.mismatch.likelihoods.spectral import Fit, Ratios, fit
+from gyrofuse.mismatch.likelihoods.spectral_data import ratios_around
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
-from gyrofuse.mismatch.signals.psd import Bands, degrees_of_freedom
-from gyrofuse.mismatch.signals.records import Records
 
 _CUT_OFF = 0.6  # of the simulation's power
-_CELLS, _CELL = 24, 5  # on either side, and fewest bins of one
 _FINER, _NARROW = 3, 0.1  # times, and half width in the stretch
 _FARTHEST = 30.0  # that logarithms go
 _ITS_OWN = 2.1  # half widths: what is broader, up to as broad as fits are let, is for the whole spectrum to tell
@@ -113,30 +110,15 @@ def _closely(comparison: Comparison, stretch: Stretch) -> Oscillation | None:
 
 
 def _in_cells(comparison: Comparison, stretch: Stretch) -> Oscillation | None:
-    n = comparison.n_samples
-    cell = max(round(stretch.width * n / 4), _CELL)
-    centre = round(stretch.frequency * n)
-    count = min(_CELLS, (centre - 3) // cell, (n // 2 - 4 - centre) // cell)
-    if count < 6:
+    data = ratios_around(comparison, stretch.frequency, stretch.width)
+    if data is None:
         return None
-    # Where a filter cuts off, flanks are not alike: broad shapes have to tell.
-    ends = torch.tensor([centre - count * cell, centre + count * cell], dtype=torch.float64)
-    first, last = (int(b) for b in band_of(ends, n, comparison))
-    passed = comparison.observed.power[:, first : last + 1] / comparison.reference.power[:, first : last + 1].clamp(
-        min=1e-300
-    )
-    if float(passed.mean(0).min()) < _CUT_OFF:
+    # Where a filter cuts off, flanks are not alike: the whole spectrum has to decide.
+    nodes = data.ground.places[[0, -1]]
+    first, last = (int((comparison.bands.frequency - f).abs().argmin()) for f in nodes)
+    passed = comparison.observed.power / comparison.reference.power.clamp(min=1e-300)
+    if float(passed[:, first : last + 1].mean(0).min()) < _CUT_OFF:
         return None
-    edges = tuple(centre + cell * k for k in range(-count, count + 1))
-    ends = torch.tensor(edges, dtype=torch.float64)
-    dof = torch.full((2 * count,), degrees_of_freedom(cell), dtype=torch.float64)
-    local = Bands(n, edges, (ends[:-1] + ends[1:] - 1) / 2 / n, dof)
-    ground = Ground(comparison.base, local)
-    coherence = smooth_coherence(comparison.reference.coherence, comparison.reference.dof)
-    band = int(band_of(torch.tensor(float(centre)), n, comparison))
-    expected = coherence[band].expand(2 * count, -1, -1)
-    observed, reference = (Records(comparison.observed.steady, local).spectra, dof), (ground.mean.mT, exact(dof))
-    data = Ratios.of(ground, observed, reference, expected, torch.ones_like(ground.mean.mT))
     background = fit(data, [Background.start(comparison.n_sensors)])
     return _best(comparison, stretch, data, background)
 

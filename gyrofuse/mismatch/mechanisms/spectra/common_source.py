@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.likelihoods.band_powers import deep_base
 from gyrofuse.mismatch.likelihoods.components import Common, Term, common_density
 from gyrofuse.mismatch.likelihoods.spectral import Ratios
+from gyrofuse.mismatch.likelihoods.spectral_data import reference_noise
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
 from gyrofuse.mismatch.mechanisms.spectra.findings import found, spanned
@@ -93,7 +93,7 @@ class CommonMode(Addition):
         share = ", as a part of the noise that each has" if term.inside else ""
         return found(
             comparison,
-            cls(term.kind, corner, gain, deep_base(comparison), term.inside),
+            cls(term.kind, corner, gain, reference_noise(comparison), term.inside),
             shape,
             sensors,
             parameters,

@@ -11,6 +11,7 @@ import torch
 from scipy import stats
 from torch import Tensor
 
+from gyrofuse.mismatch.decisions import NEW_TERM_NATS
 from gyrofuse.mismatch.detectors.lines.chirps import swept
 from gyrofuse.mismatch.detectors.slow.hysteresis import strongest_relay
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
@@ -18,8 +19,6 @@ from gyrofuse.mismatch.detectors.spectra.peak_fit import Oscillation, oscillatio
 from gyrofuse.mismatch.detectors.spectra.pooled_coherence import common_source
 from gyrofuse.mismatch.detectors.spectra.shape_scan import shape_p_value
 from gyrofuse.mismatch.detectors.variance.noise_level import modulation, variance_p_value
-from gyrofuse.mismatch.likelihoods.band_powers import deep, deep_base, narrow_bands
-from gyrofuse.mismatch.likelihoods.coherence_law import smooth_coherence
 from gyrofuse.mismatch.likelihoods.component_choice import (
     FITS,
     best_bump,
@@ -29,13 +28,11 @@ from gyrofuse.mismatch.likelihoods.component_choice import (
     filter_starts,
 )
 from gyrofuse.mismatch.likelihoods.components import Common, CommonBump, Flicker, LowPass, Peak, PowerLaw, Shift, Term
-from gyrofuse.mismatch.likelihoods.reference_spectrum import Ground
 from gyrofuse.mismatch.likelihoods.spectral import Fit, Ratios, data_model, fit, fitness, log_gain, power_gains
-from gyrofuse.mismatch.likelihoods.spectral_data import block_spectra
+from gyrofuse.mismatch.likelihoods.spectral_data import ratios, ratios_around
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, in_fold
-from gyrofuse.mismatch.signals.psd import Bands
 from gyrofuse.mismatch.stats.limits import Z
 from gyrofuse.mismatch.stats.multiplicity import sidak
 
@@ -154,73 +151,19 @@ def chosen_shape(comparison: Comparison, name: str, level: float) -> Shape | Non
 
 
 def _stands_out(comparison: Comparison, best: Shape, peak: Oscillation) -> bool:
-    """Whether a bump is there beside shapes: what bends around a filter's corner looks like one without it."""
-    data, terms = _closely(comparison), [best.term, *best.company]
-    start = best_bump(data, terms, torch.tensor([[peak.centre, peak.width]], dtype=torch.float64))
-    if start is None:
+    """Whether a peak is there beside shapes: what bends around a filter's corner looks like one without it."""
+    data, terms = ratios_around(comparison, peak.centre, 2 * peak.width), [best.term, *best.company]
+    start = best_bump(data, terms, torch.tensor([[peak.centre, peak.width]], dtype=torch.float64)) if data else None
+    if data is None or start is None:
         return False
     models = (data_model(data, t).diagonal(dim1=-2, dim2=-1).real for t in (terms, [*terms, start]))
     before, after = (float(power_gains(data, m).sum()) for m in models)
-    return after - before > _ALONE
+    return after - before > NEW_TERM_NATS
 
 
-def compared(comparison: Comparison) -> Ratios:
-    """Spectra of both sides in bands of blocks, without those that hold a line which is not explained."""
-    return _kept(comparison, torch.ones(N_JUDGED, dtype=torch.bool), torch.ones(N_FOLDS, dtype=torch.bool))
-
-
-def _kept(comparison: Comparison, blocks: Tensor, folds: Tensor) -> Ratios:
-    """Some blocks `(block,)` of the recording, and those of some folds `(fold,)` of the simulation."""
-    both = block_spectra(comparison)
-    observed, (matrices, s) = both.observed.mean(blocks), both.reference.mean(folds)
-    usable = torch.ones(len(s), comparison.n_sensors, dtype=torch.float64)
-    places = both.bands.places.unflatten(0, (len(s), -1))
-    if comparison.line.p_value < FITS:
-        half = N_JUDGED / comparison.n_samples  # tapers of a block widen a line so far
-        inside = (places.amin(-1) - 2 * half < comparison.line.frequency) & (
-            comparison.line.frequency < places.amax(-1) + 2 * half
-        )
-        usable[inside & (places.amin(-1) > half)] = 0.0
-    usable[places.amin(-1) < comparison.reference.slowest_seen] = 0.0
-    for factor in comparison.bent:
-        changed = both.bands.mean_of(factor(both.bands.places))  # (sensor, band)
-        usable[(changed.clamp(min=1e-300).log().abs() > _BENT).mT] = 0.0
-    return _ratios(comparison, both.bands, observed, (matrices, s), usable)
-
-
-def _ratios(
-    comparison: Comparison,
-    bands: Bands,
-    observed: tuple[Tensor, Tensor],
-    reference: tuple[Tensor, Tensor],
-    usable: Tensor,
-) -> Ratios:
-    """Ratios over the simulation's noise."""
-    matrices, s = reference
-    independent, ground = _independent(comparison), Ground(deep_base(comparison), bands)
-    power = matrices.diagonal(dim1=-2, dim2=-1).real
-    size = torch.where(power > 0, power, ground.mean.mT).rsqrt()
-    if independent:
-        expected = torch.eye(comparison.n_sensors, dtype=matrices.dtype).expand_as(matrices)
-    else:
-        expected = smooth_coherence(matrices * (size[:, :, None] * size[:, None, :]), s)
-    return Ratios.of(ground, observed, (power, s), expected, usable, independent)
-
-
-@derived
-def _closely(comparison: Comparison) -> Ratios:
-    """Spectra of whole records in narrow bands, which show what blocks do not resolve."""
-    wanted = narrow_bands(comparison.n_samples, _FINE)
-    both = deep(comparison, comparison.observed.in_bands(wanted), comparison.reference.in_bands(wanted))
-    n_slow, usable = len(both.d) - len(wanted.dof), torch.ones(len(both.d), comparison.n_sensors, dtype=torch.float64)
-    scale = comparison.reference.signal.shape[-1] / comparison.n_samples
-    if scale < 1:  # the lowest bins of short records hold what leaks from below
-        usable[n_slow:] *= (torch.tensor(wanted.edges[:-1]) * scale >= _CLEAN)[:, None]
-    if comparison.line.p_value < FITS:
-        edges = torch.tensor(wanted.edges[1:-1], dtype=torch.float64) / comparison.n_samples
-        place = torch.bucketize(torch.tensor(comparison.line.frequency, dtype=torch.float64), edges, right=True)
-        usable[n_slow + place] = 0.0
-    return _ratios(comparison, both.bands, (both.observed, both.d), (both.reference, both.s), usable)
+def compared(comparison: Comparison, blocks: Tensor | None = None, folds: Tensor | None = None) -> Ratios:
+    """Spectra of both sides that shapes are fitted to, of some blocks and folds; see `ratios`."""
+    return ratios(comparison, blocks, folds, independent=_independent(comparison), formed=False)
 
 
 def refit(comparison: Comparison, fold: int, term: Term, company: Sequence[Term] = ()) -> Term:
@@ -228,7 +171,7 @@ def refit(comparison: Comparison, fold: int, term: Term, company: Sequence[Term]
 
     The simulation's blocks are held out as well: its chance is in the numbers that are judged.
     """
-    data = _kept(comparison, ~in_fold(N_JUDGED, fold), torch.arange(N_FOLDS) != fold)
+    data = compared(comparison, ~in_fold(N_JUDGED, fold), torch.arange(N_FOLDS) != fold)
     return fit(data, [term, *company]).terms[0]
 
 
@@ -397,12 +340,20 @@ def _alone(term: CommonBump) -> Peak:
 
 
 def _closer(comparison: Comparison, term: Peak | CommonBump, others: list[Term]) -> tuple[Term, tuple[Tensor, Tensor]]:
-    """A bump that is no wider than bands are, from narrower ones, and standard deviations of its numbers."""
-    data = _closely(comparison)
-    seen, frequency = term.shared[0].exp(), data.ground.bands.frequency
-    centres = frequency[(frequency / seen).log().abs() < _OFF].tolist()
-    places = [(centre, share * centre) for centre in centres for share in _NARROW]
-    start = best_bump(data, others, torch.tensor(places, dtype=torch.float64)) if places else None
+    """A peak that is no wider than bands are, fitted in narrow cells, and standard deviations of its numbers."""
+    centre, width = term.shared.exp().tolist()
+    data = ratios_around(comparison, centre, 2 * width)
+    if data is None:
+        return term, (torch.full_like(term.local, math.nan), torch.full_like(term.shared, math.nan))
+    bands = data.ground.bands
+    narrowest = 1.5 / comparison.n_samples / centre
+    places = [
+        (float(f), share * width)
+        for f in bands.frequency
+        if abs(float(f) - centre) < 2 * width
+        for share in (0.3, 0.6, 1.0)
+    ]
+    start = best_bump(data, others, torch.tensor(places, dtype=torch.float64))
     if start is None:
         start = term if isinstance(term, Peak) else _alone(term)
     local = start.local * term.free.any(0)
@@ -410,5 +361,5 @@ def _closer(comparison: Comparison, term: Peak | CommonBump, others: list[Term])
         excess = data.observed - data_model(data, others)
         common = CommonBump.start(data.ground, excess, data.worth, "oscillation", start.shared)
         local = common.local * term.free
-    found = fit(data, [*others, replace(term, local=local, shared=start.shared, narrowest=_NARROWEST)])
+    found = fit(data, [*others, replace(term, local=local, shared=start.shared, narrowest=narrowest)])
     return found.terms[-1], found.sd(-1)

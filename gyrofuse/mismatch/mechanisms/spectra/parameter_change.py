@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.detectors.spectra.power_differs import power_differs
-from gyrofuse.mismatch.likelihoods.band_powers import deep_base
 from gyrofuse.mismatch.likelihoods.component_choice import best_start
 from gyrofuse.mismatch.likelihoods.components import Shift, Term
 from gyrofuse.mismatch.likelihoods.reference_spectrum import Parts
 from gyrofuse.mismatch.likelihoods.spectral import Ratios
+from gyrofuse.mismatch.likelihoods.spectral_data import reference_noise
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Rival
 from gyrofuse.mismatch.mechanisms.spectra.findings import found, spanned
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape, refit
@@ -56,7 +56,7 @@ class ParameterShift(Filter):
         if shape is None:
             return None
         parameters, words, lacking = {}, [], set()
-        base = deep_base(comparison)
+        base = reference_noise(comparison)
         before, least = _numbers(base, comparison.info.rate, comparison.info.measure)
         for i in range(comparison.n_sensors):
             for k, name in enumerate(_PARTS):

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.likelihoods.band_powers import deep_base, slow_gains
+from gyrofuse.mismatch.likelihoods.slow_ordinates import slow_gains
 from gyrofuse.mismatch.likelihoods.spectral import FLOOR
+from gyrofuse.mismatch.likelihoods.spectral_data import reference_noise
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
@@ -38,7 +39,7 @@ class Spectral(Mechanism):
     approximate: bool = field(default=False, kw_only=True, metadata={"saved": False})
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
-        factor = partial(self.factor, deep_base(comparison)) if fitted else None
+        factor = partial(self.factor, reference_noise(comparison)) if fitted else None
         pictures.ratio_of_spectra(ax, comparison, sensor, factor)
 
     def factor(self, base: NoiseSpectrum, f: Tensor) -> Tensor:
@@ -48,7 +49,7 @@ class Spectral(Mechanism):
     def apply_to_reference(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
         built = super().apply_to_reference(comparison, generator)
         return (
-            replace(built, bent=(*built.bent, partial(self.factor, deep_base(comparison))))
+            replace(built, bent=(*built.bent, partial(self.factor, reference_noise(comparison))))
             if self.approximate
             else built
         )

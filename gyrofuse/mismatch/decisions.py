@@ -1,0 +1,13 @@
+"""Decision thresholds that tests and mechanisms share."""
+
+from __future__ import annotations
+
+# p value: an effect that is more surprising in the simulation alone is taken for its own, and one of the recording is
+# taken to be there before it is named. Fifteen tests of some dozens of nulls then hold one such error at most.
+CERTAIN = 1e-3
+# Nats by which a model may be behind another one and be as good: odds of 150 to 1.
+NATS_AS_GOOD = 5.0
+# Nats that one more number has to gain: of a number that changes nothing twice that is exceeded in 5 % (chi-square).
+NATS_PER_NUMBER = 2.0
+# Nats that one more term of a model has to gain: those of four numbers.
+NEW_TERM_NATS = 8.0
