@@ -16,7 +16,7 @@ from gyrofuse.mismatch.detectors.spectra.peak_fit import Background, Oscillation
 from gyrofuse.mismatch.detectors.spectra.peaks import Stretch, strongest_peak
 from gyrofuse.mismatch.detectors.spectra.shared_peak_scan import log_ratios
 from gyrofuse.mismatch.likelihoods.components import CommonBump, oscillation
-from gyrofuse.mismatch.likelihoods.spectral import fit, linearised
+from gyrofuse.mismatch.likelihoods.spectral_fit import fit, linearised
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import compared
 from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode, _momentary, _seen, excess_along, wandering_sd
 from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance

@@ -19,7 +19,8 @@ from gyrofuse.mismatch.detectors.spectra.peaks import peak_test
 from gyrofuse.mismatch.detectors.spectra.pooled_coherence import common_source_test
 from gyrofuse.mismatch.detectors.spectra.shape_scan import shape_test
 from gyrofuse.mismatch.likelihoods.coherence_law import smooth_coherence
-from gyrofuse.mismatch.likelihoods.component_choice import best_bump, best_start, keeps_own
+from gyrofuse.mismatch.likelihoods.component_choice import keeps_own
+from gyrofuse.mismatch.likelihoods.component_starts import best_bump, best_start
 from gyrofuse.mismatch.likelihoods.components import (
     Common,
     Flicker,
@@ -37,18 +38,9 @@ from gyrofuse.mismatch.likelihoods.filter_forms import (
     filter_strength,
 )
 from gyrofuse.mismatch.likelihoods.reference_spectrum import Parts
-from gyrofuse.mismatch.likelihoods.spectral import (
-    FLOOR,
-    Ratios,
-    _power_slopes,
-    data_model,
-    fit,
-    fitness,
-    linearised,
-    log_gain,
-    power_gains,
-)
+from gyrofuse.mismatch.likelihoods.spectral import FLOOR, Ratios, fitness, log_gain, power_gains
 from gyrofuse.mismatch.likelihoods.spectral_data import block_spectra, fast_groups, slow_groups
+from gyrofuse.mismatch.likelihoods.spectral_fit import _power_slopes, data_model, fit, linearised
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import _falls_otherwise, compared, leading_shape
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import _numbers
 from gyrofuse.mismatch.signals.comparison import Comparison

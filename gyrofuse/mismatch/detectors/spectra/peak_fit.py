@@ -15,8 +15,9 @@ from gyrofuse.mismatch.detectors.spectra.shape_scan import scanned
 from gyrofuse.mismatch.likelihoods.component_choice import cost_of
 from gyrofuse.mismatch.likelihoods.components import CommonBump, Peak, Term
 from gyrofuse.mismatch.likelihoods.reference_spectrum import Ground
-from gyrofuse.mismatch.likelihoods.spectral import Fit, Ratios, fit
+from gyrofuse.mismatch.likelihoods.spectral import Ratios
 from gyrofuse.mismatch.likelihoods.spectral_data import ratios_around
+from gyrofuse.mismatch.likelihoods.spectral_fit import Fit, fit
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 

@@ -11,7 +11,7 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from gyrofuse.mismatch.decisions import NEW_TERM_NATS
+from gyrofuse.mismatch.decisions import CERTAIN, NATS_AS_GOOD, NATS_PER_NUMBER, NEW_TERM_NATS
 from gyrofuse.mismatch.detectors.lines.chirps import swept
 from gyrofuse.mismatch.detectors.slow.hysteresis import strongest_relay
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
@@ -19,46 +19,24 @@ from gyrofuse.mismatch.detectors.spectra.peak_fit import Oscillation, oscillatio
 from gyrofuse.mismatch.detectors.spectra.pooled_coherence import common_source
 from gyrofuse.mismatch.detectors.spectra.shape_scan import shape_p_value
 from gyrofuse.mismatch.detectors.variance.noise_level import modulation, variance_p_value
-from gyrofuse.mismatch.likelihoods.component_choice import (
-    FITS,
-    best_bump,
-    best_terms,
-    candidates,
-    cost_of,
-    filter_starts,
-)
+from gyrofuse.mismatch.likelihoods.component_choice import best_terms, cost_of
+from gyrofuse.mismatch.likelihoods.component_starts import best_bump, candidates, filter_starts
 from gyrofuse.mismatch.likelihoods.components import Common, CommonBump, Flicker, LowPass, Peak, PowerLaw, Shift, Term
-from gyrofuse.mismatch.likelihoods.spectral import Fit, Ratios, data_model, fit, fitness, log_gain, power_gains
+from gyrofuse.mismatch.likelihoods.spectral import Ratios, fitness, log_gain, power_gains
 from gyrofuse.mismatch.likelihoods.spectral_data import ratios, ratios_around
+from gyrofuse.mismatch.likelihoods.spectral_fit import Fit, data_model, fit, powers
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, in_fold
 from gyrofuse.mismatch.stats.limits import Z
 from gyrofuse.mismatch.stats.multiplicity import sidak
 
-_RIVAL = 5.0  # nats
-_ALIKE = 2.0  # nats between forms of a filter that are both likely
-_FAR = 20.0  # nats behind after a first look that are not made up
-_QUICK = 8  # rounds of it
-_LARGELY = 0.9  # of the discrepancy, explained by terms that may be named though their form is not the true one
-_PLACES = 16.0  # classes and places that compete
+# Share of the discrepancy that terms have to explain to be named though their form is not quite the recording's: of
+# twenty-one filters of other forms than the catalogue's they explained 95 % at least.
+_LARGELY = 0.9
 _ORDER = {"scale": 0, "add": 1, "filter": 2}  # a filter acts on what was added, levels are those of the noise alone
-_PLAIN = 25.0  # nats
-_ALONE = 8.0  # nats that a term has to bring by itself
-_CLEAN = 8  # bins
-_LITTLE = 0.1  # of what the term that would be missed most explains
-_SLOW = 64  # cycles per record
-_BROAD = 3.0  # half widths
-_SHARED = 5.0  # standard deviations of a second gain, which power and correlation tell, that chance does not give
-_SHARP, _NARROW = 0.1, (0.02, 0.04, 0.08)  # the same, below which bands are too wide for it, and of it there
-_FINE, _NARROWEST = 24, 0.005  # bands in an octave for those, and the least that they show
-_STEEPER, _FLICKER = 4.0, 0.15  # nats that another slope gains, and distance from 1 of flicker noise's
-_UNBENT = 0.1  # cycles per sample, up to which means over samples and what is folded change noise by less than a fifth
-_PLAINLY = 2.0  # nats by which slower noise is rather flicker noise than of the slope of all
-_UNSTEADY = 0.01  # p value of either sign of a level that may change
-_OFF = 0.25  # logarithm by which a centre from wide bands may be off
-_ENOUGH = 50.0  # ordinates, to look for the shape of a spectrum
-_BENT = 0.05  # log power: where what has another form changed a band, what is left there is its form
+_QUICK, _FAR = 8, 20.0  # rounds of a fit that only ranks, and nats behind after them that are not made up
+_SHARP = 0.1  # half width of a peak over its centre, below which bands of blocks are too wide for it
 
 
 Form = tuple[LowPass, tuple[Tensor, Tensor]]
@@ -109,13 +87,17 @@ def leading_shape(comparison: Comparison) -> Shape | None:
 def _like_switching(term: Term, sd: Tensor) -> bool:
     """Whether a sensor that jumps between two levels may have that spectrum: more power below some frequency.
 
-    Where jumps can be told from Gaussian noise, they were before spectra were looked at.
+    Where jumps can be told from Gaussian noise, they were before spectra were fitted.
+
+    Args:
+        term: A term.
+        sd: Standard deviations of its local numbers, all others held.
     """
-    if isinstance(term, Common):  # of a source that one sensor alone surely has
-        return term.kind == "ar1" and float(term.told(sd).topk(2).values[-1]) < _SHARED
+    if isinstance(term, Common):  # of a source that one sensor alone surely has: power shows a second gain, too
+        return term.kind == "ar1" and float(term.told(sd).topk(2).values[-1]) < 5
     if isinstance(term, Peak):
         centre, width = term.shared.exp().tolist()
-        return bool(centre < _BROAD * width)
+        return bool(centre < 3 * width)
     if isinstance(term, Shift):
         return bool((term.local[1:] > 0).any())
     return isinstance(term, Flicker)
@@ -140,13 +122,14 @@ def chosen_shape(comparison: Comparison, name: str, level: float) -> Shape | Non
     if best is None or best.term.name != name or best.p_value > level:
         return None
     peak = oscillation_of(comparison)
-    plain = peak is not None and peak.stretch.p_value <= level and peak.nats > _PLAIN
+    plain = peak is not None and peak.stretch.p_value <= level and peak.nats > 3 * NEW_TERM_NATS
     if peak is not None and plain and name != "resonance" and _stands_out(comparison, best, peak):
         return None
     if swept(comparison, best.gain, level):
         return None
     # A loop that a temperature draws is no noise, however slow.
-    relay = strongest_relay(comparison) if best.frequency * comparison.n_samples < _SLOW else None
+    slow = 64  # cycles per record
+    relay = strongest_relay(comparison) if best.frequency * comparison.n_samples < slow else None
     return best if relay is None or relay.p_value > level else None
 
 
@@ -156,7 +139,7 @@ def _stands_out(comparison: Comparison, best: Shape, peak: Oscillation) -> bool:
     start = best_bump(data, terms, torch.tensor([[peak.centre, peak.width]], dtype=torch.float64)) if data else None
     if data is None or start is None:
         return False
-    models = (data_model(data, t).diagonal(dim1=-2, dim2=-1).real for t in (terms, [*terms, start]))
+    models = (powers(data_model(data, t)) for t in (terms, [*terms, start]))
     before, after = (float(power_gains(data, m).sum()) for m in models)
     return after - before > NEW_TERM_NATS
 
@@ -189,19 +172,20 @@ def run_length(keep: Tensor) -> int:
 
 def _searched(comparison: Comparison) -> Shape | None:
     data = compared(comparison)
-    if data.n_ordinates < _ENOUGH:
+    fewest = 50.0  # complex ordinates, to search for the shape of a spectrum
+    if data.n_ordinates < fewest:
         return None
-    p_seen = 1.0 if comparison.bent else shape_p_value(comparison)  # which looks where a filter's form is off as well
-    chosen, mended = best_terms(data, differ=p_seen < FITS)
+    p_seen = 1.0 if comparison.bent else shape_p_value(comparison)  # includes bands where a filter's form is off
+    chosen, mended = best_terms(data, differ=p_seen < CERTAIN)
     if chosen is None or _falls_otherwise(data, chosen):
         return None
     nothing, left = fitness(data, data.expected), fitness(data, chosen.model)
-    fits = left.p_value > FITS and not mended
+    fits = left.p_value > CERTAIN and not mended
     # Where no term has a part, what differs has another cause.
     concerned = torch.stack([t.free.any(0) for t in chosen.terms]).any(0)
     excess = [float(f.excess[concerned].clamp(min=0).sum()) for f in (left, nothing)]
     # Where sensors share what they had before, powers have nothing to explain.
-    explained = 1 - excess[0] / max(excess[1], 1e-9) if nothing.p_value <= FITS else 1.0
+    explained = 1 - excess[0] / max(excess[1], 1e-9) if nothing.p_value <= CERTAIN else 1.0
     if not fits and explained < _LARGELY:
         return None
     seen = [_told(comparison, chosen, i) for i in range(len(chosen.terms))]
@@ -215,8 +199,8 @@ def _searched(comparison: Comparison) -> Shape | None:
         term, _ = seen[i]
         alone = float(log_gain(data, data_model(data, [term])).sum())
         # What a little was left for beside a common source or a mode is not to come before it.
-        little = seen[most][0].acts != "filter" and losses[i] < _LITTLE * losses[most]
-        return alone < _ALONE or little, _ORDER[term.acts], -alone
+        little = seen[most][0].acts != "filter" and losses[i] < losses[most] / 10
+        return alone < NEW_TERM_NATS or little, _ORDER[term.acts], -alone
 
     first = min(range(len(seen)), key=place)
     term, others = chosen.terms[first], _others(chosen, first)
@@ -224,7 +208,8 @@ def _searched(comparison: Comparison) -> Shape | None:
     if others:
         rest = fit(data, others)
         gain -= max(rest.gain, 0.0)
-    p = sidak(float(stats.chi2.sf(2 * max(gain, 0.0), _freedom(data, term))), _PLACES)
+    n_classes = 16.0  # classes and frequencies that compete
+    p = sidak(float(stats.chi2.sf(2 * max(gain, 0.0), term.n_free(data.ground))), n_classes)
     if not others:  # it is all that differs
         p = min(p, p_seen)
     if comparison.reference.uncertainty is not None:  # the fit above takes the simulation's numbers for exact
@@ -236,9 +221,10 @@ def _searched(comparison: Comparison) -> Shape | None:
     }
     if _like_switching(term, chosen.sd_alone(first)):
         rivals.add("random_telegraph")
-    if _louder(term, seen[first][1]) and min(modulation(comparison).p_value, variance_p_value(comparison)) < _UNSTEADY:
+    unsteady = 0.01  # p value of either test of a level that changes
+    if _louder(term, seen[first][1]) and min(modulation(comparison).p_value, variance_p_value(comparison)) < unsteady:
         rivals.add("variance_change")
-    score = power_gains(data, data_model(data, [term]).diagonal(dim1=-2, dim2=-1).real).sum(-1)
+    score = power_gains(data, powers(data_model(data, [term]))).sum(-1)
     if isinstance(term, Common):
         score = log_gain(data, data_model(data, [term]))
     score = score.clamp(min=0)
@@ -267,13 +253,16 @@ def _beside_errors(comparison: Comparison, term: Term, p_seen: float) -> float:
 
 
 def _falls_otherwise(data: Ratios, chosen: Fit) -> bool:
-    """Whether what flicker noise was chosen for falls by another power of frequency: that has no name."""
+    """Whether what flicker noise was chosen for falls by another power of frequency: that has no name.
+
+    Its slope has to gain the nats of two numbers, and to be off by more than 0.15.
+    """
     for i, term in enumerate(chosen.terms):
         if isinstance(term, Flicker):
             terms = [*_others(chosen, i), PowerLaw.like(term, data.ground)]
             found = fit(data, terms)
             slope = float(found.terms[-1].shared)
-            if found.gain <= chosen.gain + _STEEPER or abs(slope - 1) <= _FLICKER:
+            if found.gain <= chosen.gain + 2 * NATS_PER_NUMBER or abs(slope - 1) <= 0.15:
                 continue
             if not _only_bent(data, terms, slope):
                 return True
@@ -284,11 +273,12 @@ def _only_bent(data: Ratios, terms: list[Term], slope: float) -> bool:
     """Whether noise of a power law, the last term, falls as `1/f` well below the rate, and not by the slope of it all.
 
     Next to the rate any noise is bent by how it is sampled: means over samples lose some of it, and what lies above
-    half the rate is folded onto it. Where it is far above the rest, that alone makes for another slope.
+    half the rate is folded onto it, by less than a fifth up to a tenth of the rate. Where it is far above the rest,
+    that alone makes for another slope.
     """
-    below = fit(data.without((data.ground.bands.frequency > _UNBENT)[:, None]), terms)
-    told, sd = float(below.terms[-1].shared), float(below.sd(-1)[1])
-    return (slope - told) ** 2 - (1 - told) ** 2 > 2 * _PLAINLY * sd**2
+    below = fit(data.without((data.ground.bands.frequency > 0.1)[:, None]), terms)
+    of_slow, sd = float(below.terms[-1].shared), float(below.sd(-1)[1])
+    return (slope - of_slow) ** 2 - (1 - of_slow) ** 2 > 2 * NATS_PER_NUMBER * sd**2
 
 
 def _others(chosen: Fit, i: int) -> list[Term]:
@@ -310,7 +300,9 @@ def _forms(data: Ratios, term: Term, others: list[Term], gain: float) -> tuple[F
     forms = [replace(form, free=term.free) for form in filter_starts(data, others) if form.kind != term.kind]
     fits = [f for form in forms if (f := fit(data, [*others, form], _QUICK)).gain > gain - _FAR]
     fits = [fit(data, f.terms) for f in fits]
-    return tuple((t, f.sd(-1)) for f in fits if f.gain > gain - _ALIKE and isinstance(t := f.terms[-1], LowPass))
+    return tuple(
+        (t, f.sd(-1)) for f in fits if f.gain > gain - NATS_PER_NUMBER and isinstance(t := f.terms[-1], LowPass)
+    )
 
 
 def _as_good(data: Ratios, terms: list[Term], chosen: Fit) -> bool:
@@ -319,24 +311,8 @@ def _as_good(data: Ratios, terms: list[Term], chosen: Fit) -> bool:
     Those that are far from it after a few rounds are not followed.
     """
     quick = fit(data, terms, _QUICK)
-    least = chosen.gain - _RIVAL - max(len(chosen.information) - len(quick.information), 0)
+    least = chosen.gain - NATS_AS_GOOD - max(len(chosen.information) - len(quick.information), 0)
     return quick.gain > least - _FAR and fit(data, quick.terms).gain > least
-
-
-def _freedom(data: Ratios, term: Term) -> int:
-    """Numbers that could have been free."""
-    p = data.n_sensors
-    if isinstance(term, Shift):
-        return int(Shift.start(data.ground).free[term.parts].sum())
-    if isinstance(term, Common):
-        return (2 * p - 1 if term.turned else p) + 2 * len(term.shared)
-    return term.local.numel() + 2 * len(term.shared)
-
-
-def _alone(term: CommonBump) -> Peak:
-    """A common bump's powers, as bumps of each sensor's own."""
-    centre, width = term.shared.exp().tolist()
-    return Peak.start(centre, width, term.local.square().sum(0))
 
 
 def _closer(comparison: Comparison, term: Peak | CommonBump, others: list[Term]) -> tuple[Term, tuple[Tensor, Tensor]]:
@@ -355,7 +331,7 @@ def _closer(comparison: Comparison, term: Peak | CommonBump, others: list[Term])
     ]
     start = best_bump(data, others, torch.tensor(places, dtype=torch.float64))
     if start is None:
-        start = term if isinstance(term, Peak) else _alone(term)
+        start = Peak.start(centre, width, term.variance)
     local = start.local * term.free.any(0)
     if isinstance(term, CommonBump):
         excess = data.observed - data_model(data, others)

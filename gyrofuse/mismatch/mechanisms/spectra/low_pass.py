@@ -8,7 +8,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.likelihoods.component_choice import filter_starts
+from gyrofuse.mismatch.likelihoods.component_starts import filter_starts
 from gyrofuse.mismatch.likelihoods.components import LowPass
 from gyrofuse.mismatch.likelihoods.filter_forms import filter_corner, filter_number, filter_response, strength_of
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival

@@ -1,0 +1,321 @@
+"""Joint fit of spectral terms by Fisher scoring."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.likelihoods.components import Common, Term
+from gyrofuse.mismatch.likelihoods.reference_spectrum import Ground
+from gyrofuse.mismatch.likelihoods.spectral import FLOOR, Ratios, correlations, log_gain, power_scores
+
+
+class Fit(NamedTuple):
+    """Terms with their best numbers.
+
+    Attributes:
+        terms: The terms.
+        gain: Log likelihood over that of no difference, nats, priors not counted.
+        information: Information on all free numbers, with their priors' precision.
+        covariance: Their covariance.
+        rows: Rows of each term's numbers in both, local then shared; -1 for those that are not free.
+        model: Cross-spectra over the reference's powers, `(band, sensor, sensor)`.
+    """
+
+    terms: tuple[Term, ...]
+    gain: float
+    information: Tensor
+    covariance: Tensor
+    rows: tuple[Tensor, ...]
+    model: Tensor
+
+    @property
+    def power(self) -> Tensor:
+        """Model of the ratios of powers, `(band, sensor)`."""
+        return powers(self.model)
+
+    def sd(self, term: int) -> tuple[Tensor, Tensor]:
+        """Standard deviations of a term's local `(number, sensor)` and shared numbers; NaN where not free."""
+        rows, own = self.rows[term], self.terms[term]
+        variance = self.covariance.diagonal()
+        sd = torch.where(rows >= 0, variance[rows.clamp(min=0)].clamp(min=0).sqrt(), math.nan)
+        n = own.local.numel()
+        return sd[:n].view_as(own.local), sd[n:]
+
+    def sd_alone(self, term: int) -> Tensor:
+        """The same of local numbers if all others were known: of factors of a product, too, these are finite."""
+        own = self.terms[term]
+        rows = self.rows[term][: own.local.numel()]
+        sd = self.information.diagonal()[rows.clamp(min=0)].clamp(min=1e-100).rsqrt()
+        return torch.where(rows >= 0, sd, math.nan).view_as(own.local)
+
+
+def powers(model: Tensor) -> Tensor:
+    """Powers `(..., band, sensor)` of cross-spectra `(..., band, sensor, sensor)`."""
+    return model.diagonal(dim1=-2, dim2=-1).real
+
+
+def fit(data: Ratios, terms: Sequence[Term], rounds: int = 40) -> Fit:
+    """Fisher scoring of all free numbers together (Levenberg and Marquardt's damping), from where the terms stand.
+
+    Args:
+        data: What is to be explained.
+        terms: Terms at their starts.
+        rounds: Rounds at most.
+    """
+    enough = 0.01  # nats that a further round has to gain
+    terms = tuple(term.within() for term in terms)
+    coherent, added = (any(x) for x in ((t.coherent for t in terms), (t.acts == "add" for t in terms)))
+    paired = bool((data.paired > 0).any()) and (coherent or (added and not data.alike))
+    free = torch.cat([torch.cat([t.free.flatten(), torch.ones(len(t.shared), dtype=torch.bool)]) for t in terms])
+    model, derivatives = linearised(data, terms)
+    best = _value(data, model, terms, paired)
+    damping, information = 1e-3, torch.eye(len(free), dtype=torch.float64)
+    for _ in range(rounds if math.isfinite(best) else 1):
+        vector = torch.cat([torch.cat([t.local.flatten(), t.shared]) for t in terms])
+        limit = torch.cat([part.flatten() for t in terms for part in t.step_limit()])
+        precision = torch.cat([_precision(t) for t in terms])
+        information, slope = _power_slopes(data, model, derivatives)
+        if paired:
+            beside = _wishart_slopes(*_correlated(model, derivatives), correlations(data.observed), data.paired)
+            information, slope = information + beside[0], slope + beside[1]
+        slope = slope - precision * vector
+        information = information + precision.diag()
+        if not (math.isfinite(best) and bool(information.isfinite().all()) and bool(slope.isfinite().all())):
+            break
+        low, high = (torch.cat([_bounds(t)[k] for t in terms]) for k in (0, 1))
+        # A number at its bound that wants to go beyond stays there.
+        active = free & ~((vector <= low) & (slope < 0)) & ~((vector >= high) & (slope > 0))
+        accepted, gain = False, 0.0
+        while damping < 1e8:
+            step = _solved(information, slope, active, damping).clamp(-limit, limit)
+            trial = _with_numbers(terms, vector + step)
+            value = _value(data, data_model(data, trial), trial, paired)
+            if value >= best:
+                accepted, gain = True, value - best
+                break
+            damping *= 10
+        if not accepted:
+            break
+        terms, best, damping = trial, value, max(damping / 10, 1e-6)
+        model, derivatives = linearised(data, terms)
+        if gain < enough:
+            break
+    information = information[free][:, free]
+    rows = torch.where(free, free.cumsum(0) - 1, -1).split([t.local.numel() + len(t.shared) for t in terms])
+    if not math.isfinite(best) or not bool(information.isfinite().all()):  # no start to go on from
+        return Fit(terms, -math.inf, information, torch.zeros_like(information), rows, model)
+    covariance = _inverse(information)
+    if paired:
+        # Powers that a model makes coherent vary together: the scores' own covariance stands between (Godambe).
+        more = _power_covariance(data, model, derivatives) - _power_slopes(data, model, derivatives)[0]
+        covariance = covariance + covariance @ more[free][:, free] @ covariance
+    gain = float(log_gain(data, model, paired=paired).sum())
+    return Fit(terms, gain, information, covariance, rows, model)
+
+
+def _inverse(information: Tensor) -> Tensor:
+    """Covariance; a direction with less than 1e-9 of the largest information, as a source's phase has, gets none."""
+    scale = information.diagonal().clamp(min=1e-100).rsqrt()
+    inverse = torch.linalg.pinv(information * scale[:, None] * scale, rtol=1e-9, hermitian=True)
+    return inverse * scale[:, None] * scale
+
+
+def _power_slopes(data: Ratios, model: Tensor, derivatives: Tensor) -> tuple[Tensor, Tensor]:
+    """Information `(number, number)` and score `(number,)` of powers."""
+    m = model.diagonal(dim1=-2, dim2=-1).real
+    moved = (derivatives.diagonal(dim1=-2, dim2=-1).real / (m + FLOOR)).flatten(1)  # (number, band * sensor)
+    score = (data.share * power_scores(data, m)).flatten()
+    worth = (data.share * data.worth[:, None]).flatten()
+    return (moved * worth) @ moved.mT, moved @ score
+
+
+def _power_covariance(data: Ratios, model: Tensor, derivatives: Tensor) -> Tensor:
+    """Covariance of the scores of powers, `(number, number)`: squared coherences of the model are correlations."""
+    m = model.diagonal(dim1=-2, dim2=-1).real
+    moved = data.share * derivatives.diagonal(dim1=-2, dim2=-1).real / (m + FLOOR)  # (number, band, sensor)
+    alike = correlations(model).abs().square() * data.worth[:, None, None]
+    return torch.einsum("kbi,bij,lbj->kl", moved, alike, moved)
+
+
+def _wishart_slopes(model: Tensor, derivatives: Tensor, observed: Tensor, worth: Tensor) -> tuple[Tensor, Tensor]:
+    """Information and score of correlation matrices."""
+    inverse = torch.linalg.inv_ex(model)[0]  # of one without an inverse no step is taken
+    left = inverse @ (observed - model) @ inverse
+    moved = inverse @ derivatives  # (number, band, sensor, sensor)
+    full = torch.einsum("kbij,lbji->kl", moved * worth[:, None, None], moved).real
+    return full, torch.einsum("bij,kbji->k", left * worth[:, None, None], derivatives).real
+
+
+def _correlated(model: Tensor, derivatives: Tensor) -> tuple[Tensor, Tensor]:
+    """Correlations of a model and their derivatives."""
+    size = model.diagonal(dim1=-2, dim2=-1).real.clamp(min=1e-300)
+    rise = derivatives.diagonal(dim1=-2, dim2=-1).real / size / 2  # (number, band, sensor)
+    own = correlations(model)
+    moved = derivatives * (size.rsqrt()[:, :, None] * size.rsqrt()[:, None, :])
+    return own, moved - own * (rise[..., :, None] + rise[..., None, :])
+
+
+def data_model(data: Ratios, terms: Sequence[Term]) -> Tensor:
+    """What terms make of the reference's cross-spectra over its powers, `(band, sensor, sensor)`."""
+    return pieces(data, terms).model(data)
+
+
+class Pieces(NamedTuple):
+    """What terms do to the noise, in the order in which it is done.
+
+    Attributes:
+        factor: Factors on the noise, `(..., sensor, node)`.
+        added: Densities added.
+        filters: Factors on everything.
+        common: Cross-spectra of common sources over the reference's powers, `(band, sensor, sensor)`.
+    """
+
+    factor: Tensor
+    added: Tensor
+    filters: Tensor
+    common: Tensor
+
+    def with_term(self, acts: str, values: Tensor, instead: Tensor | float | None = None) -> Pieces:
+        """With one more term that acts in some way; or with other `values` of one that is there, `instead`."""
+        if acts == "add":
+            return self._replace(added=self.added - (0.0 if instead is None else instead) + values)
+        divisor = 1.0 if instead is None else instead
+        if acts == "scale":
+            return self._replace(factor=self.factor / divisor * values)
+        return self._replace(filters=self.filters / torch.as_tensor(divisor).clamp(min=1e-300) * values)
+
+    def model(self, data: Ratios) -> Tensor:
+        """Cross-spectra over the reference's powers, `(..., band, sensor, sensor)`."""
+        ground, mean_of = data.ground, data.ground.bands.mean_of
+        size = (mean_of(self.factor * self.filters * ground.density) / ground.mean).clamp(min=0).sqrt().mT
+        extra = (mean_of(self.added * self.filters) / ground.mean).mT
+        own = data.expected * (size[..., :, None] * size[..., None, :]) + torch.diag_embed(extra)
+        return own + self.common * self.passed(ground)
+
+    def passed(self, ground: Ground) -> Tensor:
+        """Factors of filters on cross-spectra, `(..., band, sensor, sensor)`."""
+        gain = ground.bands.mean_of(self.filters).clamp(min=0).sqrt().mT
+        return gain[..., :, None] * gain[..., None, :]
+
+    def power(self, data: Ratios) -> Tensor:
+        """Powers over the reference's, `(..., band, sensor)`."""
+        ground, mean_of = data.ground, data.ground.bands.mean_of
+        own = mean_of((self.factor * ground.density + self.added) * self.filters) / ground.mean
+        return own.mT + powers(self.common) * mean_of(self.filters).mT
+
+
+def pieces(data: Ratios, terms: Sequence[Term]) -> Pieces:
+    """What terms do to the reference's noise."""
+    ground = data.ground
+    one = torch.ones_like(ground.density)
+    found = Pieces(one, torch.zeros_like(one), one, torch.zeros_like(data.expected))
+    for term in terms:
+        if isinstance(term, Common):
+            source = _relative(ground, term.shape(ground, term.shared)) * term.matrix()
+            found = found._replace(common=found.common + source)
+        else:
+            found = found.with_term(term.acts, term.values(ground, term.local, term.shared))
+    return found
+
+
+def _relative(ground: Ground, density: Tensor) -> Tensor:
+    """Density `(..., node)` of a source over the noise of pairs of sensors, `(..., band, sensor, sensor)`."""
+    level = ground.mean.mT.rsqrt()
+    return ground.bands.mean_of(density)[..., None, None] * (level[:, :, None] * level[:, None, :])
+
+
+def linearised(data: Ratios, terms: Sequence[Term]) -> tuple[Tensor, Tensor]:
+    """Model and its derivatives `(number, band, sensor, sensor)` with respect to every number, free or not."""
+    parts = pieces(data, terms)
+    model = parts.model(data)
+    slopes = [
+        _common_slopes(data.ground, t, parts) if isinstance(t, Common) else _slopes(data, t, parts, model)
+        for t in terms
+    ]
+    return model, torch.cat(slopes)
+
+
+_STEP = 1e-4  # of differences, in units of a number: the root of rounding errors, and more
+
+
+def _slopes(data: Ratios, term: Term, parts: Pieces, model: Tensor) -> Tensor:
+    """Derivatives with respect to the numbers of a term, by differences; a local one moves in all sensors at once."""
+    (n_local, p), n = term.local.shape, term.local.shape[0] + len(term.shared)
+    step = torch.full((n,), _STEP, dtype=torch.float64)
+    if term.acts == "add":
+        step[:n_local] *= term.local.abs().amax(-1).clamp(min=1e-30)
+    turn = torch.diag(step)
+    local = term.local + turn[:, :n_local, None].expand(n, n_local, p)
+    value = term.values(data.ground, term.local, term.shared)
+    moved = term.values(data.ground, local, term.shared + turn[:, n_local:])
+    slope = (parts.with_term(term.acts, moved, value).model(data) - model) / step[:, None, None, None]
+    # A number of one sensor acts on its row and column: half the effect that moving all together has on a pair.
+    share = torch.eye(p, dtype=torch.float64)
+    share = (share[:, :, None] + share[:, None, :]) / 2  # (sensor, row, column)
+    return torch.cat([(slope[:n_local, None] * share[:, None]).flatten(0, 1), slope[n_local:]])
+
+
+def _common_slopes(ground: Ground, term: Common, parts: Pieces) -> Tensor:
+    """The same of a common source: gains have derivatives, shared numbers differences."""
+    passed = parts.passed(ground)
+    source = _relative(ground, term.shape(ground, term.shared)) * passed
+    slopes = term.derivatives()[:, None] * source
+    for turn in _STEP * torch.eye(len(term.shared), dtype=torch.float64):
+        moved = _relative(ground, term.shape(ground, term.shared + turn)) * passed
+        slopes = torch.cat([slopes, ((moved - source) / _STEP * term.matrix())[None]])
+    return slopes
+
+
+def _value(data: Ratios, model: Tensor, terms: Sequence[Term], paired: bool) -> float:
+    return float(log_gain(data, model, paired=paired).sum()) - prior_cost(terms)
+
+
+def _precision(term: Term) -> Tensor:
+    """Of the priors of a term's numbers, local then shared: that of a normal law with the same slope."""
+    own = torch.zeros_like(term.local)
+    if (scale := term.prior()) is not None:
+        own = 2 / (scale.square() + term.local.square())
+    return torch.cat([own.flatten(), torch.zeros_like(term.shared)])
+
+
+def prior_cost(terms: Sequence[Term]) -> float:
+    """`log(1 + (x / scale)^2)` of every local number with a scale: a heavy tail, so that strong effects cost little."""
+    total = 0.0
+    for term in terms:
+        if (scale := term.prior()) is not None:
+            total += float(torch.log1p((term.local / scale).square()).sum())
+    return total
+
+
+def _bounds(term: Term) -> tuple[Tensor, Tensor]:
+    """Lowest and highest values of a term's numbers, local then shared."""
+    free = torch.full_like(term.shared, math.inf)
+    return (
+        torch.cat([torch.full_like(term.local, term.lower).flatten(), -free]),
+        torch.cat([torch.full_like(term.local, term.upper).flatten(), free]),
+    )
+
+
+def _with_numbers(terms: Sequence[Term], vector: Tensor) -> tuple[Term, ...]:
+    sizes = [t.local.numel() + len(t.shared) for t in terms]
+    return tuple(
+        replace(t, local=own[: t.local.numel()].view_as(t.local), shared=own[t.local.numel() :]).within()
+        for t, own in zip(terms, vector.split(sizes), strict=True)
+    )
+
+
+def _solved(information: Tensor, slope: Tensor, active: Tensor, damping: float) -> Tensor:
+    """Damped step of the numbers that may move; the others' is 0."""
+    step = torch.zeros_like(slope)
+    if bool(active.any()):
+        own = information[active][:, active]
+        scale = own.diagonal().clamp(min=1e-300).rsqrt()
+        own = own * scale[:, None] * scale + (damping + 1e-9) * torch.eye(len(scale), dtype=scale.dtype)
+        step[active] = torch.linalg.solve_ex(own, slope[active] * scale)[0] * scale
+    return step
