@@ -1,13 +1,14 @@
 """What a reference's spectra may be off by as a whole: levels that vary by themselves, numbers of a fitted model.
 
-Log powers of a sensor move by `A y` with normal `y` of variance one, `A` the columns of `rows`. In the units of the
-score, `B = sqrt(w) A` with the information `w` of a log power, and with `B = Q S V'` (singular values) the likelihood
-of a model `m`, integrated over `y` to second order around the best `y` of no difference (Laplace), is
+Log powers of a sensor move by `A y` with normal `y` of variance one, `A` the columns of `rows`. In units of the score,
+`sqrt(w) A = Q S V'` (singular values) with the information `w` of a log power. Around the best `y` of no difference a
+difference `h` of log powers is compensated best by
 
-    log L(m) + |T Q' z(m)|^2 / 2,   T^2 = S^2 / (1 + S^2),   z = (score in log m) / sqrt(w),
+    h' = h - w^-1/2 Q T Q' w^1/2 h,   T = S^2 / (1 + S^2),
 
-up to a constant: the information of a ratio of powers does not depend on the model. Numbers that nothing else is known
-of have `S` without bound. Then `m` counts by what lies outside of all that they can make.
+and has the likelihood of `h'` with the prior's of the change of `y` (profile likelihood; the information of a ratio of
+powers does not depend on the model, so that Laplace's approximation of the integral is the same but for a constant).
+Numbers that nothing else is known of have `S` without bound: `h` counts by what lies outside of all that they can make.
 """
 
 from __future__ import annotations
@@ -51,33 +52,35 @@ class Nuisance:
         return directions * there[:, None], strength * size * there
 
     @cached_property
-    def best(self) -> Ratios:
-        """The data with the reference's powers where the nuisance fits them best if nothing else differs."""
-        rounds = 10
+    def best(self) -> tuple[Ratios, Tensor]:
+        """The data over the best nuisance if nothing else differs, and its size along `Q`, `(sensor, direction)`."""
+        rounds = 10  # of scoring
         q, s = self.directions
-        y, move = torch.zeros_like(s), torch.zeros_like(self.weight)
+        size, moved = torch.zeros_like(s), torch.zeros_like(self.weight)
         for _ in range(rounds):
-            score = (q * self._scores(self.data, move)[..., None]).sum(1)
-            y = y + s.square() / (1 + s.square()) * (score - torch.where(s > 0, y / s.square().clamp(min=1e-300), 0.0))
-            move = (q @ y[..., None])[..., 0] / self.weight.clamp(min=1e-300)
-        size = (-move / 2).clamp(-30, 30).exp().mT
-        return replace(self.data, observed=self.data.observed * size[:, :, None] * size[:, None, :])
+            pull = torch.where(s > 0, size / s.square().clamp(min=1e-300), 0.0)
+            size = size + s.square() / (1 + s.square()) * (torch.einsum("sbk,sb->sk", q, self.scores(moved)) - pull)
+            moved = self._log_powers(size)
+        root = (-moved / 2).clamp(-30, 30).exp().mT
+        return replace(self.data, observed=self.data.observed * root[:, :, None] * root[:, None, :]), size
 
     def gains(self, log_factors: Tensor) -> Tensor:
         """Log likelihood of powers changed by factors `(..., sensor, band)` over none, `(..., sensor)`, nats."""
-        gains = power_gains(self.best, log_factors.exp().mT).sum(-2)
-        q, s = self.directions
-        if not q.shape[-1]:
-            return gains
-        nothing, moved = (
-            torch.einsum("sbk,...sb->...sk", q, self._scores(self.best, x))
-            for x in (torch.zeros_like(self.weight), log_factors)
-        )
-        return gains + (s.square() / (1 + s.square()) * (moved - nothing).square()).sum(-1) / 2
+        (data, size), (q, s) = self.best, self.directions
+        along = torch.einsum("sbk,...sb->...sk", q, self.weight * log_factors)
+        change = -s.square() / (1 + s.square()) * along
+        gains = power_gains(data, (log_factors + self._log_powers(change)).exp().mT).sum(-2)
+        prior = torch.where(s > 0, change * (change + 2 * size) / s.square().clamp(min=1e-300), 0.0)
+        return gains - prior.sum(-1) / 2
 
-    def _scores(self, data: Ratios, log_factors: Tensor) -> Tensor:
-        """`z`, `(..., sensor, band)`."""
-        return (data.share * power_scores(data, log_factors.exp().mT)).mT / self.weight.clamp(min=1e-300)
+    def scores(self, log_factors: Tensor) -> Tensor:
+        """Scores in log power over the roots of their information, `(sensor, band)`, at powers changed by factors."""
+        return (self.data.share * power_scores(self.data, log_factors.exp().mT)).mT / self.weight.clamp(min=1e-300)
+
+    def _log_powers(self, size: Tensor) -> Tensor:
+        """Log powers `(..., sensor, band)` by a size `(..., sensor, direction)` along `Q`."""
+        moved = torch.einsum("sbk,...sk->...sb", self.directions[0], size)
+        return torch.where(self.weight > 0, moved / self.weight.clamp(min=1e-300), 0.0)
 
 
 def chi_square_p_value(nuisance: Nuisance, expected: Tensor) -> float:
@@ -90,7 +93,7 @@ def chi_square_p_value(nuisance: Nuisance, expected: Tensor) -> float:
         expected: Log powers by independent errors of unit variance, `(sensor, band, error)`.
     """
     q, _ = nuisance.directions
-    scores = torch.einsum("sbk,sb->sk", q, nuisance._scores(nuisance.data, torch.zeros_like(nuisance.weight)))
+    scores = torch.einsum("sbk,sb->sk", q, nuisance.scores(torch.zeros_like(nuisance.weight)))
     moved = torch.einsum("sbk,sb,sbe->ske", q, nuisance.weight, expected)
     there = q.any(1)  # (sensor, direction)
 
