@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.mismatch.likelihoods.components import (
+from gyrofuse.mismatch.likelihoods.spectra.components import (
     oscillation,
 )
-from gyrofuse.mismatch.likelihoods.filter_forms import filter_response, filter_strength
+from gyrofuse.mismatch.likelihoods.spectra.filter_forms import filter_response, filter_strength
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise

@@ -4,8 +4,8 @@ import numpy as np
 import torch
 from scipy import signal as sps
 
-from gyrofuse.mismatch.likelihoods.filter_forms import filter_power, filter_strength
-from gyrofuse.mismatch.likelihoods.spectral_data import N_JUDGED, block_bands, compared_bands
+from gyrofuse.mismatch.likelihoods.spectra.data import N_JUDGED, block_bands, compared_bands
+from gyrofuse.mismatch.likelihoods.spectra.filter_forms import filter_power, filter_strength
 from gyrofuse.mismatch.signals.psd import cross_spectra
 
 LENGTH, N = 34.4, 9821

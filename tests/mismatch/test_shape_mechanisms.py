@@ -25,7 +25,7 @@ from torch import Tensor
 import gyrofuse as gf
 from gyrofuse.mismatch.detectors.spectra.pooled_coherence import common_source_test
 from gyrofuse.mismatch.detectors.spectra.shape_scan import shape_test
-from gyrofuse.mismatch.likelihoods.filter_forms import filter_response, filter_strength
+from gyrofuse.mismatch.likelihoods.spectra.filter_forms import filter_response, filter_strength
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise

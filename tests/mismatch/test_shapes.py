@@ -18,29 +18,22 @@ from gyrofuse.mismatch.detectors.spectra.band_tests import coherence_test, spect
 from gyrofuse.mismatch.detectors.spectra.peaks import peak_test
 from gyrofuse.mismatch.detectors.spectra.pooled_coherence import common_source_test
 from gyrofuse.mismatch.detectors.spectra.shape_scan import shape_test
-from gyrofuse.mismatch.likelihoods.coherence_law import smooth_coherence
-from gyrofuse.mismatch.likelihoods.component_choice import keeps_own
-from gyrofuse.mismatch.likelihoods.component_starts import best_bump, best_start
-from gyrofuse.mismatch.likelihoods.components import (
-    Common,
-    Flicker,
-    LowPass,
-    PowerLaw,
-    Shift,
-    Term,
-    oscillation,
-)
-from gyrofuse.mismatch.likelihoods.filter_forms import (
+from gyrofuse.mismatch.likelihoods.spectra.choice import keeps_own
+from gyrofuse.mismatch.likelihoods.spectra.coherence import smooth_coherence
+from gyrofuse.mismatch.likelihoods.spectra.common_sources import Common
+from gyrofuse.mismatch.likelihoods.spectra.components import Flicker, LowPass, PowerLaw, Shift, Term, oscillation
+from gyrofuse.mismatch.likelihoods.spectra.data import block_spectra, fast_groups, slow_groups
+from gyrofuse.mismatch.likelihoods.spectra.filter_forms import (
     FILTERS,
     filter_corner,
     filter_power,
     filter_response,
     filter_strength,
 )
-from gyrofuse.mismatch.likelihoods.reference_spectrum import Parts
-from gyrofuse.mismatch.likelihoods.spectral import FLOOR, Ratios, fitness, log_gain, power_gains
-from gyrofuse.mismatch.likelihoods.spectral_data import block_spectra, fast_groups, slow_groups
-from gyrofuse.mismatch.likelihoods.spectral_fit import _power_slopes, data_model, fit, linearised
+from gyrofuse.mismatch.likelihoods.spectra.fit import _power_slopes, data_model, fit, linearised
+from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Parts
+from gyrofuse.mismatch.likelihoods.spectra.ratios import FLOOR, Ratios, fitness, log_gain, power_gains
+from gyrofuse.mismatch.likelihoods.spectra.starts import best_bump, best_start
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import _falls_otherwise, compared, leading_shape
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import _numbers
 from gyrofuse.mismatch.signals.comparison import Comparison

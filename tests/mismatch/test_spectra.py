@@ -13,10 +13,10 @@ import gyrofuse as gf
 from gyrofuse._base.transforms import cosine_ordinates
 from gyrofuse.mismatch.detectors.spectra import shape_scan
 from gyrofuse.mismatch.detectors.spectra.shape_scan import scanned, shape_test
-from gyrofuse.mismatch.likelihoods.nuisance import Nuisance
-from gyrofuse.mismatch.likelihoods.slow_ordinates import N_SLOW, slow_gains, slow_ordinates
-from gyrofuse.mismatch.likelihoods.spectral import power_gains
-from gyrofuse.mismatch.likelihoods.spectral_data import block_bands, ratios, reference_noise
+from gyrofuse.mismatch.likelihoods.spectra.data import block_bands, ratios, reference_noise
+from gyrofuse.mismatch.likelihoods.spectra.nuisance import Nuisance
+from gyrofuse.mismatch.likelihoods.spectra.ratios import power_gains
+from gyrofuse.mismatch.likelihoods.spectra.slow_ordinates import N_SLOW, slow_gains, slow_ordinates
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.folds import N_FOLDS, seen_in_block
 from gyrofuse.mismatch.signals.known_lines import without_lines

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.io.recording import Recording
-from gyrofuse.mismatch.likelihoods.reference_spectrum import Parts
+from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Parts
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.fitted_spectra import as_array

@@ -8,7 +8,7 @@ from torch import Tensor
 from gyrofuse.mismatch.detectors.lines.tracks import Sweep, strongest_sweep
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
-from gyrofuse.mismatch.likelihoods.coherence_law import decorrelated
+from gyrofuse.mismatch.likelihoods.spectra.coherence import decorrelated
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.prediction_errors import ENDS, left_out

@@ -12,12 +12,13 @@ from torch import Tensor
 
 from gyrofuse.mismatch.detectors.spectra.peaks import Stretch, strongest_peak
 from gyrofuse.mismatch.detectors.spectra.shape_scan import scanned
-from gyrofuse.mismatch.likelihoods.component_choice import cost_of
-from gyrofuse.mismatch.likelihoods.components import CommonBump, Peak, Term
-from gyrofuse.mismatch.likelihoods.reference_spectrum import Ground
-from gyrofuse.mismatch.likelihoods.spectral import Ratios
-from gyrofuse.mismatch.likelihoods.spectral_data import ratios_around
-from gyrofuse.mismatch.likelihoods.spectral_fit import Fit, fit
+from gyrofuse.mismatch.likelihoods.spectra.choice import cost_of
+from gyrofuse.mismatch.likelihoods.spectra.common_sources import CommonBump
+from gyrofuse.mismatch.likelihoods.spectra.components import Peak, Term
+from gyrofuse.mismatch.likelihoods.spectra.data import ratios_around
+from gyrofuse.mismatch.likelihoods.spectra.fit import Fit, fit
+from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Ground
+from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 

@@ -16,7 +16,7 @@ from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.detectors.spectra.modulated_ordinates import level_correlations
 from gyrofuse.mismatch.detectors.spectra.own_peak_scan import scanned_own_peaks
 from gyrofuse.mismatch.detectors.spectra.shared_peak_scan import flank_of, least_flank, log_ratios, scanned_shared_peaks
-from gyrofuse.mismatch.likelihoods.coherence_law import decorrelated
+from gyrofuse.mismatch.likelihoods.spectra.coherence import decorrelated
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.known_lines import without_lines

@@ -22,12 +22,12 @@ from torch import Tensor
 
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
-from gyrofuse.mismatch.likelihoods.components import oscillation
-from gyrofuse.mismatch.likelihoods.filter_forms import filter_power, filter_strength
-from gyrofuse.mismatch.likelihoods.nuisance import Nuisance, chi_square_p_value
-from gyrofuse.mismatch.likelihoods.reference_spectrum import Ground
-from gyrofuse.mismatch.likelihoods.spectral import Ratios
-from gyrofuse.mismatch.likelihoods.spectral_data import ratios
+from gyrofuse.mismatch.likelihoods.spectra.components import oscillation
+from gyrofuse.mismatch.likelihoods.spectra.data import ratios
+from gyrofuse.mismatch.likelihoods.spectra.filter_forms import filter_power, filter_strength
+from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Ground
+from gyrofuse.mismatch.likelihoods.spectra.nuisance import Nuisance, chi_square_p_value
+from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.stats.multiplicity import SHARES, e_values_by_share, p_value_from_e_value, sidak

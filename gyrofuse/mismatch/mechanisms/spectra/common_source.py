@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.likelihoods.components import Common, Term, common_density
-from gyrofuse.mismatch.likelihoods.spectral import Ratios
-from gyrofuse.mismatch.likelihoods.spectral_data import reference_noise
+from gyrofuse.mismatch.likelihoods.spectra.common_sources import Common, common_density
+from gyrofuse.mismatch.likelihoods.spectra.components import Term
+from gyrofuse.mismatch.likelihoods.spectra.data import reference_noise
+from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
 from gyrofuse.mismatch.mechanisms.spectra.findings import found, spanned

@@ -10,8 +10,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.likelihoods.component_choice import best_start
-from gyrofuse.mismatch.likelihoods.components import Flicker
+from gyrofuse.mismatch.likelihoods.spectra.components import Flicker
+from gyrofuse.mismatch.likelihoods.spectra.starts import best_start
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Rival
 from gyrofuse.mismatch.mechanisms.spectra.findings import found, spanned
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape, refit

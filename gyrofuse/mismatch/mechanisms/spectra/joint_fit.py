@@ -19,12 +19,13 @@ from gyrofuse.mismatch.detectors.spectra.peak_fit import Oscillation, oscillatio
 from gyrofuse.mismatch.detectors.spectra.pooled_coherence import common_source
 from gyrofuse.mismatch.detectors.spectra.shape_scan import shape_p_value
 from gyrofuse.mismatch.detectors.variance.noise_level import modulation, variance_p_value
-from gyrofuse.mismatch.likelihoods.component_choice import best_terms, cost_of
-from gyrofuse.mismatch.likelihoods.component_starts import best_bump, candidates, filter_starts
-from gyrofuse.mismatch.likelihoods.components import Common, CommonBump, Flicker, LowPass, Peak, PowerLaw, Shift, Term
-from gyrofuse.mismatch.likelihoods.spectral import Ratios, fitness, log_gain, power_gains
-from gyrofuse.mismatch.likelihoods.spectral_data import ratios, ratios_around
-from gyrofuse.mismatch.likelihoods.spectral_fit import Fit, data_model, fit, powers
+from gyrofuse.mismatch.likelihoods.spectra.choice import best_terms, cost_of
+from gyrofuse.mismatch.likelihoods.spectra.common_sources import Common, CommonBump
+from gyrofuse.mismatch.likelihoods.spectra.components import Flicker, LowPass, Peak, PowerLaw, Shift, Term
+from gyrofuse.mismatch.likelihoods.spectra.data import ratios, ratios_around
+from gyrofuse.mismatch.likelihoods.spectra.fit import Fit, data_model, fit, powers
+from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios, fitness, log_gain, power_gains
+from gyrofuse.mismatch.likelihoods.spectra.starts import best_bump, candidates, filter_starts
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, in_fold

@@ -8,9 +8,14 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.likelihoods.component_starts import filter_starts
-from gyrofuse.mismatch.likelihoods.components import LowPass
-from gyrofuse.mismatch.likelihoods.filter_forms import filter_corner, filter_number, filter_response, strength_of
+from gyrofuse.mismatch.likelihoods.spectra.components import LowPass
+from gyrofuse.mismatch.likelihoods.spectra.filter_forms import (
+    filter_corner,
+    filter_number,
+    filter_response,
+    strength_of,
+)
+from gyrofuse.mismatch.likelihoods.spectra.starts import filter_starts
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
 from gyrofuse.mismatch.mechanisms.spectra.findings import found
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape, refit

@@ -13,7 +13,8 @@ from gyrofuse.mismatch.detectors.lines.chirps import swept
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.detectors.spectra.peak_fit import Oscillation, likeliest_oscillation, oscillation_of
 from gyrofuse.mismatch.detectors.spectra.peaks import Stretch
-from gyrofuse.mismatch.likelihoods.components import CommonBump, Peak, oscillation
+from gyrofuse.mismatch.likelihoods.spectra.common_sources import CommonBump
+from gyrofuse.mismatch.likelihoods.spectra.components import Peak, oscillation
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.mechanisms.spectra.findings import spanned
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape, refit, run_length

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.detectors.spectra.power_differs import power_differs
-from gyrofuse.mismatch.likelihoods.component_choice import best_start
-from gyrofuse.mismatch.likelihoods.components import Shift, Term
-from gyrofuse.mismatch.likelihoods.reference_spectrum import Parts
-from gyrofuse.mismatch.likelihoods.spectral import Ratios
-from gyrofuse.mismatch.likelihoods.spectral_data import reference_noise
+from gyrofuse.mismatch.likelihoods.spectra.components import Shift, Term
+from gyrofuse.mismatch.likelihoods.spectra.data import reference_noise
+from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Parts
+from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios
+from gyrofuse.mismatch.likelihoods.spectra.starts import best_start
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Rival
 from gyrofuse.mismatch.mechanisms.spectra.findings import found, spanned
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape, refit

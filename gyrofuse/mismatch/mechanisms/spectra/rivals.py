@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.detectors.slow.scans import MOST_STEPS, slow_look, steps_one_by_one
-from gyrofuse.mismatch.likelihoods.components import Common, Term
-from gyrofuse.mismatch.likelihoods.spectral import Ratios
-from gyrofuse.mismatch.likelihoods.spectral_fit import fit
+from gyrofuse.mismatch.likelihoods.spectra.common_sources import Common
+from gyrofuse.mismatch.likelihoods.spectra.components import Term
+from gyrofuse.mismatch.likelihoods.spectra.fit import fit
+from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.mechanisms.signals.slow_effect import SlowEffect
 from gyrofuse.mismatch.mechanisms.signals.step import Step

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.likelihoods.slow_ordinates import slow_gains
-from gyrofuse.mismatch.likelihoods.spectral import FLOOR
-from gyrofuse.mismatch.likelihoods.spectral_data import reference_noise
+from gyrofuse.mismatch.likelihoods.spectra.data import reference_noise
+from gyrofuse.mismatch.likelihoods.spectra.ratios import FLOOR
+from gyrofuse.mismatch.likelihoods.spectra.slow_ordinates import slow_gains
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo

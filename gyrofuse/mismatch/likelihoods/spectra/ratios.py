@@ -29,8 +29,8 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from gyrofuse.mismatch.likelihoods.coherence_law import smooth_coherence
-from gyrofuse.mismatch.likelihoods.reference_spectrum import Ground
+from gyrofuse.mismatch.likelihoods.spectra.coherence import smooth_coherence
+from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Ground
 
 # Share of the reference's power that is added to both sides of a ratio, -40 dB: below that leakage of the tapers and
 # the rounding of converters are what powers show.

@@ -21,9 +21,9 @@ from torch import Tensor
 
 from gyrofuse._base.transforms import cosine_ordinates
 from gyrofuse.mismatch.decisions import CERTAIN
-from gyrofuse.mismatch.likelihoods.coherence_law import smooth_coherence
-from gyrofuse.mismatch.likelihoods.reference_spectrum import Ground
-from gyrofuse.mismatch.likelihoods.spectral import Ratios, exact
+from gyrofuse.mismatch.likelihoods.spectra.coherence import smooth_coherence
+from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Ground
+from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios, exact
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED

@@ -20,7 +20,7 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from gyrofuse.mismatch.likelihoods.spectral import Ratios, power_gains, power_scores
+from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios, power_gains, power_scores
 from gyrofuse.mismatch.stats.multiplicity import sidak
 
 

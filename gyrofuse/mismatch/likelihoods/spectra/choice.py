@@ -15,10 +15,11 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.decisions import NATS_AS_GOOD, NATS_PER_NUMBER, NEW_TERM_NATS
-from gyrofuse.mismatch.likelihoods.component_starts import best_start, candidates
-from gyrofuse.mismatch.likelihoods.components import Common, LowPass, Shift, Term
-from gyrofuse.mismatch.likelihoods.spectral import Ratios, correlations, log_gain, power_gains
-from gyrofuse.mismatch.likelihoods.spectral_fit import Fit, data_model, fit, powers, prior_cost
+from gyrofuse.mismatch.likelihoods.spectra.common_sources import Common
+from gyrofuse.mismatch.likelihoods.spectra.components import LowPass, Shift, Term
+from gyrofuse.mismatch.likelihoods.spectra.fit import Fit, data_model, fit, powers, prior_cost
+from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios, correlations, log_gain, power_gains
+from gyrofuse.mismatch.likelihoods.spectra.starts import best_start, candidates
 from gyrofuse.mismatch.stats.inclusion import included_sensors
 
 SURE_GAIN = 2.5  # standard deviations from zero of a sensor's gain that it surely has: 1 % by chance

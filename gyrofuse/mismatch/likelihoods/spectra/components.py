@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, TypeVar
 
@@ -11,12 +10,11 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.decisions import NATS_PER_NUMBER
-from gyrofuse.mismatch.likelihoods.filter_forms import FILTERS, filter_power, strength_of
-from gyrofuse.mismatch.likelihoods.reference_spectrum import Ground
-from gyrofuse.noise.processes import AR1
+from gyrofuse.mismatch.likelihoods.spectra.filter_forms import FILTERS, filter_power, strength_of
+from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Ground
 
 _T = TypeVar("_T", bound="Term")
-_NO_SHARED = torch.zeros(0, dtype=torch.float64)
+NO_SHARED = torch.zeros(0, dtype=torch.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +103,7 @@ class Shift(Term):
         """All numbers free, none changed."""
         white, coloured, walk = ground.matters
         free = torch.stack([white, coloured, coloured, walk])
-        return cls(torch.zeros(4, free.shape[-1], dtype=torch.float64), free, _NO_SHARED, ground.parts.lacks[1])
+        return cls(torch.zeros(4, free.shape[-1], dtype=torch.float64), free, NO_SHARED, ground.parts.lacks[1])
 
     def only(self, free: Tensor) -> Shift:
         if self.new is not None:
@@ -176,7 +174,7 @@ class LowPass(Term):
         """Corners to start from: all in one, `local` is `(start, 1, sensor)`."""
         numbers = torch.linspace(math.log(0.012), math.log(100), 37, dtype=torch.float64)
         local = numbers[:, None, None].expand(-1, 1, len(ground.mean)).clone()
-        return cls(local, torch.ones(1, len(ground.mean), dtype=torch.bool), _NO_SHARED, kind)
+        return cls(local, torch.ones(1, len(ground.mean), dtype=torch.bool), NO_SHARED, kind)
 
     def step_limit(self) -> tuple[Tensor, Tensor]:
         return torch.full_like(self.local, 0.7), self.shared
@@ -204,7 +202,7 @@ class Flicker(Term):
     def start(cls, ground: Ground) -> Flicker:
         """A tenth of the noise where it is the largest share."""
         unit = (ground.density * ground.places).amin(-1)
-        return cls(0.1 * unit[None], torch.ones(1, len(unit), dtype=torch.bool), _NO_SHARED)
+        return cls(0.1 * unit[None], torch.ones(1, len(unit), dtype=torch.bool), NO_SHARED)
 
     @classmethod
     def starts(cls, ground: Ground) -> Flicker:
@@ -279,186 +277,20 @@ class Peak(Term):
         return local[..., 0, :, None] * oscillation(ground.places, centre, width)[..., None, :]
 
     def step_limit(self) -> tuple[Tensor, Tensor]:
-        return torch.full_like(self.local, math.inf), _peak_step(self.shared)
+        return torch.full_like(self.local, math.inf), peak_step(self.shared)
 
     def within(self) -> Peak:
-        return replace(self, local=self.local.clamp(min=0.0), shared=_peak_within(self.shared, self.narrowest))
+        return replace(self, local=self.local.clamp(min=0.0), shared=peak_within(self.shared, self.narrowest))
 
 
-@dataclass(frozen=True, eq=False)
-class Common(Term):
-    """Noise of one source in every sensor: local are the real and imaginary parts of the gains, or real ones alone.
-
-    Shared is the logarithm of the corner, cycles per sample, for an AR1.
-
-    Attributes:
-        kind: White, AR1, walk or oscillation.
-        inside: Whether it is a part of the noise that each sensor has, whose power stays, instead of coming on top.
-        whole: Gains at which that part is all that a sensor has, `(sensor,)`. Of two sensors alone correlations show
-            but the product of the gains; with these as scales of a prior they have like parts.
-    """
-
-    name: ClassVar[str] = "common_mode"
-    coherent: ClassVar[bool] = True
-
-    kind: str = "white"
-    inside: bool = False
-    whole: Tensor | None = None
-
-    @property
-    def gain(self) -> Tensor:
-        """Complex gains, `(sensor,)`."""
-        return torch.complex(*self.local)
-
-    @property
-    def variance(self) -> Tensor:
-        """Variances, `(sensor,)`."""
-        return self.local.square().sum(0)
-
-    @property
-    def turned(self) -> bool:
-        """Whether sensors have phases of their own, beside signs."""
-        return bool(self.free[1].any())
-
-    def prior(self) -> Tensor | None:
-        return None if self.whole is None else self.whole[None]
-
-    def n_free(self, ground: Ground) -> int:
-        p = self.local.shape[-1]
-        return (2 * p - 1 if self.turned else p) + 2 * len(self.shared)
-
-    def form_cost(self, n_sensors: int) -> float:
-        # An AR1 that is too slow to show its corner is a walk: what is searched are eight corners.
-        return math.log(8) if self.kind == "ar1" else 0.0
-
-    def everywhere(self, ground: Ground) -> Term:
-        return self
-
-    def told(self, sd: Tensor) -> Tensor:
-        """Standard deviations that each sensor's gain is from zero, `(sensor,)`, by those of its parts `sd`."""
-        return (self.variance.sqrt() / sd.square().nanmean(0).sqrt()).nan_to_num(nan=0.0)
-
-    def matrix(self) -> Tensor:
-        """What it adds to the covariance of sensors, `(sensor, sensor)`, over the density of the source."""
-        return self.acting(self.gain[:, None] * self.gain.conj())
-
-    def acting(self, matrix: Tensor) -> Tensor:
-        """What of a source's matrix `(..., sensor, sensor)` changes spectra."""
-        return matrix - torch.diag_embed(matrix.diagonal(dim1=-2, dim2=-1)) if self.inside else matrix
-
-    def derivatives(self) -> Tensor:
-        """Derivatives of `matrix` with respect to local numbers, `(number, sensor, sensor)`."""
-        row = torch.eye(len(self.gain), dtype=self.gain.dtype)[:, :, None] * self.gain.conj()  # e_i g^H
-        return self.acting(torch.cat([row + row.mH, 1j * row + (1j * row).mH]))
-
-    def shape(self, ground: Ground, shared: Tensor) -> Tensor:
-        """Density of the source, `(..., node)`."""
-        return common_density(self.kind, ground.places, shared.exp())
-
-    def within(self) -> Common:
-        return replace(self, shared=self.shared.clamp(max=math.log(0.45))) if self.kind == "ar1" else self
-
-    def variants(self, ground: Ground, seen: Tensor) -> list[Common]:
-        """The other forms of the same: in phase or not, on top or inside.
-
-        A part inside starts with at most 0.95 of a sensor's noise, where correlations still have a slope.
-
-        Args:
-            ground: Noise of the reference.
-            seen: Sensors that surely have it, `(sensor,)`, and alone get a part inside: the gains that chance gives to
-                others would decide how two sensors share the product of theirs.
-        """
-        most = 0.95
-        aligned = self.free.clone()
-        aligned[1] = False
-        forms = [
-            replace(self, free=aligned, local=self.local * aligned),
-            replace(self, free=torch.ones_like(self.free)),
-        ]
-        whole = (ground.density / self.shape(ground, self.shared)).amin(-1).sqrt()
-        size = (self.variance.sqrt() / whole).clamp(min=most)
-        parts = (replace(form, inside=True, whole=whole, local=form.local * most / size) for form in forms)
-        every = [*forms, *(part.only(part.free & seen) for part in parts)]
-        return [form for form in every if (form.turned, form.inside) != (self.turned, self.inside)]
-
-    @classmethod
-    def starts(cls, ground: Ground, excess: Tensor, worth: Tensor, kind: str, shared: Tensor) -> tuple[Common, Common]:
-        """In phase but for signs, and with any phases; arguments as of `start`."""
-        free = torch.tensor([[True], [False]]).expand(2, excess.shape[-1])
-        aligned = cls.start(ground, excess.real.to(excess.dtype), worth, kind, shared)
-        # Vectors of real matrices are real but for a factor.
-        g = aligned.gain
-        g = (g * g[g.abs().argmax()].conj().sgn()).real
-        local = torch.stack([g, torch.zeros_like(g)])
-        return replace(aligned, local=local, free=free), cls.start(ground, excess, worth, kind, shared)
-
-    @classmethod
-    def start(cls, ground: Ground, excess: Tensor, worth: Tensor, kind: str, shared: Tensor) -> Common:
-        """Gains from the strongest direction of an excess.
-
-        Args:
-            ground: Noise of the reference.
-            excess: Cross-spectra beyond a model, over the noise's densities, `(band, sensor, sensor)`.
-            worth: Information of a band, `(band,)`.
-            kind: Kind of source.
-            shared: Its shared numbers.
-        """
-        p = excess.shape[-1]
-        nothing = cls(torch.zeros(2, p, dtype=torch.float64), torch.ones(2, p, dtype=torch.bool), shared, kind)
-        level = ground.mean.mT.sqrt()
-        c = ground.bands.mean_of(nothing.shape(ground, shared))  # (band,)
-        size = c[:, None, None] / (level[:, :, None] * level[:, None, :])
-        weight = (worth[:, None, None] * size).to(excess.dtype)
-        gram = (excess * weight).sum(0) / (weight.real * size).sum(0)
-        values, vectors = torch.linalg.eigh((gram + gram.mH) / 2)
-        g = vectors[:, -1] * values[-1].clamp(min=1e-300).sqrt()
-        return replace(nothing, local=torch.stack([g.real, g.imag]))
-
-
-@dataclass(frozen=True, eq=False)
-class CommonBump(Common):
-    """An oscillation of one source in every sensor: shared are the logarithms of centre and half width."""
-
-    name: ClassVar[str] = "resonance"
-
-    kind: str = "oscillation"
-    narrowest: float = 0.02
-
-    def step_limit(self) -> tuple[Tensor, Tensor]:
-        return torch.full_like(self.local, math.inf), _peak_step(self.shared)
-
-    def within(self) -> CommonBump:
-        return replace(self, shared=_peak_within(self.shared, self.narrowest))
-
-    def variants(self, ground: Ground, seen: Tensor) -> list[Common]:
-        return []
-
-
-def _peak_step(shared: Tensor) -> Tensor:
+def peak_step(shared: Tensor) -> Tensor:
     """A centre goes no further at once than half its width."""
     return torch.stack([(shared[1] - shared[0]).exp() / 2, torch.tensor(0.7, dtype=torch.float64)])
 
 
-def _peak_within(shared: Tensor, narrowest: float) -> Tensor:
+def peak_within(shared: Tensor, narrowest: float) -> Tensor:
+    """Centre and half width that are allowed."""
     centre = shared[0].clamp(max=math.log(0.49))
     # Broader ones would not be seen to fall on both sides.
     widest = torch.minimum(centre - math.log(2), (0.5 - centre.exp()).log() - math.log(2))
     return torch.stack([centre, torch.minimum(torch.maximum(shared[1], centre + math.log(narrowest)), widest)])
-
-
-def common_density(kind: str, f: Tensor, shared: Tensor | Sequence[Tensor]) -> Tensor:
-    """Density of a source: white, AR1s and oscillations of variance one, walks of increments of variance one.
-
-    Args:
-        kind: "white", "walk", "ar1" or "oscillation".
-        f: Cycles per sample.
-        shared: Corner of an AR1, or centre and half width of an oscillation, cycles per sample.
-    """
-    if kind == "white":
-        return torch.ones_like(f)
-    if kind == "walk":
-        return 1 / (4 * torch.sin(math.pi * f.clamp(min=1e-12)).square())
-    if kind == "oscillation":
-        return oscillation(f, shared[0], shared[1])
-    phi = torch.exp(-2 * math.pi * shared[0])
-    return AR1._spectrum(f, phi, 1 - phi.square())

@@ -10,19 +10,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.likelihoods.components import (
-    Common,
-    CommonBump,
-    Flicker,
-    LowPass,
-    Peak,
-    Shift,
-    Term,
-    oscillation,
-)
-from gyrofuse.mismatch.likelihoods.filter_forms import FILTERS
-from gyrofuse.mismatch.likelihoods.spectral import Ratios, log_gain, power_gains
-from gyrofuse.mismatch.likelihoods.spectral_fit import data_model, pieces, powers
+from gyrofuse.mismatch.likelihoods.spectra.common_sources import Common, CommonBump
+from gyrofuse.mismatch.likelihoods.spectra.components import Flicker, LowPass, Peak, Shift, Term, oscillation
+from gyrofuse.mismatch.likelihoods.spectra.filter_forms import FILTERS
+from gyrofuse.mismatch.likelihoods.spectra.fit import data_model, pieces, powers
+from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios, log_gain, power_gains
 
 
 def candidates(data: Ratios, company: Sequence[Term]) -> Iterator[Term]:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.transforms import cosine_ordinates
-from gyrofuse.mismatch.likelihoods.spectral_data import reference_noise
+from gyrofuse.mismatch.likelihoods.spectra.data import reference_noise
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED

@@ -10,9 +10,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.likelihoods.components import Common, Term
-from gyrofuse.mismatch.likelihoods.reference_spectrum import Ground
-from gyrofuse.mismatch.likelihoods.spectral import FLOOR, Ratios, correlations, log_gain, power_scores
+from gyrofuse.mismatch.likelihoods.spectra.common_sources import Common
+from gyrofuse.mismatch.likelihoods.spectra.components import Term
+from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Ground
+from gyrofuse.mismatch.likelihoods.spectra.ratios import FLOOR, Ratios, correlations, log_gain, power_scores
 
 
 class Fit(NamedTuple):
