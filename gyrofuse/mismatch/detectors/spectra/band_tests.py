@@ -1,4 +1,4 @@
-"""Witnesses: statistics on which a recording and a simulation ought to agree, each with an honest p value."""
+"""Tests of powers (F), of lines and of coherences (whitened differences of coherence matrices), band by band."""
 
 from __future__ import annotations
 
@@ -13,10 +13,6 @@ from gyrofuse.mismatch.detectors.lines.line_sizes import LineSizes, line_sizes
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.stats.multiplicity import sidak
-
-_COHERENCE_DOF = 80  # below, sums over pairs have no simple law
-_TAIL = 10.0
-_VAGUE = 20.0  # ordinates: a power known from fewer is off by more than a quarter
 
 
 def spectrum_test(comparison: Comparison) -> TestResult:
@@ -81,11 +77,15 @@ def _other_size(comparison: Comparison, sizes: LineSizes) -> TestResult:
 
 
 def coherence_test(comparison: Comparison) -> TestResult:
-    """Difference of complex coherences in each band, summed over the pairs of sensors."""
+    """Difference of complex coherences in each band, summed over the pairs of sensors.
+
+    Of 80 ordinates and more the sum is Gamma distributed but for a slightly heavier tail, here that of F.
+    """
+    fewest = 80
     d, reference = comparison.observed.coherence_dof, comparison.reference.coherence_dof
     if comparison.n_sensors < 2:
         return TestResult("coherence", 1.0, "a single sensor has no pairs")
-    known = (d >= _COHERENCE_DOF) & (reference >= _COHERENCE_DOF)
+    known = (d >= fewest) & (reference >= fewest)
     if not bool(known.any()):
         return TestResult("coherence", 1.0, "the recording is too short to compare coherences")
     one, other = comparison.observed.coherence, comparison.reference.coherence
@@ -95,9 +95,8 @@ def coherence_test(comparison: Comparison) -> TestResult:
     difference = torch.zeros(len(d), upper.shape[1], dtype=d.dtype)  # (band, pair)
     difference[known] = white.abs().square()[:, upper[0], upper[1]]
     q = difference.sum(-1) / (1 / d + 1 / reference.clamp(min=1e-9))
-    # Gamma distributed but for a slightly heavier tail, here that of a ratio.
     n_pairs = difference.shape[-1]
-    tails = stats.f.sf((q / n_pairs).numpy(), 2 * n_pairs, _TAIL * d.minimum(reference).clamp(min=1.0).numpy())
+    tails = stats.f.sf((q / n_pairs).numpy(), 2 * n_pairs, 10 * d.minimum(reference).clamp(min=1.0).numpy())
     tails = torch.from_numpy(tails).masked_fill(~known, 1.0)
     band = int(tails.argmin())
     pair = int(difference[band].argmax())
@@ -125,8 +124,8 @@ def whitened_difference(one: Tensor, other: Tensor, d: Tensor, s: Tensor) -> Ten
 def power_tails(comparison: Comparison) -> Tensor:
     """Two-sided p values of the ratio of powers `(sensor, band)`; NaN where the simulation says nothing.
 
-    Powers that are known to hardly their order of magnitude are as likely above as below, which those of few degrees
-    of freedom are not: there the logarithm is normal.
+    The numbers of a fitted model may tell hardly the order of magnitude of a power, less than 20 ordinates would: its
+    logarithm is then normal, while that of few ordinates is skew.
     """
     ratio = comparison.observed.power / comparison.reference.power
     d, s = comparison.bands.dof, comparison.reference.power_dof
@@ -135,7 +134,7 @@ def power_tails(comparison: Comparison) -> Tensor:
     varies = torch.special.polygamma(1, d.clamp(min=1e-9)) + 1 / s.clamp(min=1e-9)
     away = comparison.observed.log_power - comparison.reference.power.log()
     normal = 2 * torch.special.ndtr(-away.abs() / varies.sqrt())
-    vague = (s < _VAGUE) & (s < comparison.reference.dof / 2)
+    vague = (s < 20) & (s < comparison.reference.dof / 2)
     tails = torch.where(vague, normal.maximum(tails), tails)
     return tails.clamp(max=1.0).masked_fill(s <= 0, math.nan)
 

@@ -19,17 +19,8 @@ from scipy import signal
 from torch import Tensor
 
 from gyrofuse.mismatch.detectors.spectra.modulated_ordinates import inflation
-from gyrofuse.mismatch.detectors.spectra.shared_peak_scan import Stretches
+from gyrofuse.mismatch.detectors.spectra.shared_peak_scan import LOWEST, SMOOTH, Stretches
 from gyrofuse.mismatch.stats.multiplicity import e_value_of_some
-
-_NARROWEST, _BROADEST = 4.0, 12.0  # half widths: bins, and of them in the spectrum
-_FINER = math.sqrt(2)
-_CELLS = 4  # in a half width
-_REACH, _LEAST_REACH = 16.0, 5.0  # half widths on either side: half of a hump is lost where only five tell the level
-_SMOOTH = 8.0  # part of the spectrum over which the level may be taken for the same
-_WHOLE = 0.8  # of a shape that has to lie in the spectrum
-_LOWEST, _ABOVE = 12, 8.0  # bins, and half widths, above which centres lie
-_SIZES = (2.0, 3.0, 4.5, 6.5)
 
 
 def scanned_own_peaks(power: Tensor, worth: float, levels: Tensor, width: float) -> Iterator[Stretches]:
@@ -41,30 +32,33 @@ def scanned_own_peaks(power: Tensor, worth: float, levels: Tensor, width: float)
         levels: Correlations of ordinates of noise whose level varies, `(sensor, distance)`.
         width: Of a bin, in bins of the record, of which those distances are.
     """
-    n_bins, half = power.shape[-1], _NARROWEST
-    while half <= n_bins / _BROADEST:
-        cell = max(int(half / _CELLS), 1)
+    n_bins, half = power.shape[-1], 4.0
+    while half <= n_bins / 12:
+        cell = max(int(half / 4), 1)
         cells = power[:, : n_bins // cell * cell].unflatten(-1, (-1, cell)).mean(-1)
         shape = _shape(cells.shape[-1], half / cell)
         independent = cell * worth / inflation(levels, shape - shape.mean(), cell * width)[:, None]
-        score, whole = _scores(cells, shape, independent, -(-_LOWEST // cell))
+        score, whole = _scores(cells, shape, independent, -(-LOWEST // cell))
         centre = torch.arange(cells.shape[-1]) * cell + cell // 2
-        which = (whole & (centre > _ABOVE * half)).nonzero()[:, 0][:: max(round(half / 2 / cell), 1)]
+        which = (whole & (centre > 8 * half)).nonzero()[:, 0][:: max(round(half / 2 / cell), 1)]
         if len(which):
             whole_width = round(2 * half)
             yield Stretches(centre[which] - whole_width // 2, whole_width, _log_ratios(score[:, which]))
-        half *= _FINER
+        half *= math.sqrt(2)
 
 
 def _shape(n_cells: int, half: float) -> Tensor:
-    """A hump of so many cells' half width, with what is around it."""
-    wide = n_cells / _SMOOTH / half
-    reach = round(min(max(wide, _LEAST_REACH), _REACH) * half)
+    """A hump of so many cells' half width, with what is around it: 16 half widths on either side.
+
+    Fewer where the noise is not level so far, five at least: there half of a hump is taken for the level.
+    """
+    wide = n_cells / SMOOTH / half
+    reach = round(min(max(wide, 5.0), 16.0) * half)
     return 1 / (1 + (torch.arange(-reach, reach + 1, dtype=torch.float64) / half).square())
 
 
 def _scores(cells: Tensor, shape: Tensor, worth: Tensor, lowest: int) -> tuple[Tensor, Tensor]:
-    """Normal scores of a hump centred on each cell `(sensor, cell)`, and whether enough of it lies in the spectrum.
+    """Normal scores of a hump centred on each cell `(sensor, cell)`, and whether four fifths of it lie in the spectrum.
 
     Args:
         cells: Their mean powers, `(sensor, cell)`.
@@ -83,7 +77,7 @@ def _scores(cells: Tensor, shape: Tensor, worth: Tensor, lowest: int) -> tuple[T
     away = shape - shape.mean()
     skewness = float(away.pow(3).sum() / away.square().sum().pow(1.5)) * math.sqrt(len(shape))
     inside = (1 - skewness / math.hypot(skewness, 2.0)) / 2
-    return _normal_of_share(standard, inside, len(shape) * worth), count > _WHOLE * len(shape)
+    return _normal_of_share(standard, inside, len(shape) * worth), count > 0.8 * len(shape)
 
 
 def _around(rows: Tensor, kernels: Tensor) -> Tensor:
@@ -101,6 +95,7 @@ def _normal_of_share(standard: Tensor, inside: float, n: Tensor) -> Tensor:
 
 
 def _log_ratios(score: Tensor) -> Tensor:
-    """Of normal scores `(sensor, place)`, `(place,)`."""
-    ratios = torch.stack([e_value_of_some(a * score - a**2 / 2) for a in _SIZES])
-    return ratios.logsumexp(0) - math.log(len(_SIZES))
+    """Log likelihood ratios `(position,)` of normal scores `(sensor, position)`, averaged over sizes and sensors."""
+    sizes = (2.0, 3.0, 4.5, 6.5)  # standard deviations
+    ratios = torch.stack([e_value_of_some(a * score - a**2 / 2) for a in sizes])
+    return ratios.logsumexp(0) - math.log(len(sizes))

@@ -22,20 +22,16 @@ from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 
-_CUT_OFF = 0.6  # of the simulation's power
-_FINER, _NARROW = 3, 0.1  # times, and half width in the stretch
-_FARTHEST = 30.0  # that logarithms go
-_ITS_OWN = 2.1  # half widths: what is broader, up to as broad as fits are let, is for the whole spectrum to tell
-
 
 @dataclass(frozen=True, eq=False)
 class Oscillation:
     """A bump as fitted.
 
     Attributes:
-        stretch: Where it was seen.
-        centre, width: Centre and half width, cycles per sample, and standard deviations of their logarithms.
-        variance: `(sensor,)`, and standard deviation.
+        stretch: Stretch of the spectrum that stands out.
+        centre, width: Centre and half width, cycles per sample.
+        log_sd: Standard deviations of their logarithms.
+        variance, variance_sd: Variances and their standard deviations, `(sensor,)`.
         gain: Complex gains of a common source `(sensor,)`; None where sensors have bumps of their own.
         nats: Gain in log likelihood, less what the numbers cost.
     """
@@ -81,7 +77,7 @@ class Background(Term):
 
     def within(self) -> Background:
         # Where powers are too far apart nothing else would hold them, and numbers could not be worked out.
-        return replace(self, local=self.local.clamp(-_FARTHEST, _FARTHEST))
+        return replace(self, local=self.local.clamp(-30, 30))
 
 
 @derived
@@ -101,10 +97,11 @@ def likeliest_oscillation(comparison: Comparison) -> Oscillation | None:
 
 
 def _closely(comparison: Comparison, stretch: Stretch) -> Oscillation | None:
-    """Fitted in cells of a quarter of the stretch, and in finer ones where it turns out to be much narrower."""
+    """Fitted in cells of a quarter of the stretch, in finer ones while its half width is less than a tenth of it."""
+    times = 3
     found = _in_cells(comparison, stretch)
-    for _ in range(_FINER):
-        if found is None or found.width > _NARROW * stretch.width:
+    for _ in range(times):
+        if found is None or found.width > stretch.width / 10:
             break
         stretch = stretch._replace(frequency=found.centre, width=stretch.width / 4)
         found = _in_cells(comparison, stretch) or found
@@ -115,11 +112,11 @@ def _in_cells(comparison: Comparison, stretch: Stretch) -> Oscillation | None:
     data = ratios_around(comparison, stretch.frequency, stretch.width)
     if data is None:
         return None
-    # Where a filter cuts off, flanks are not alike: the whole spectrum has to decide.
+    # Where a filter takes two fifths off, flanks are not alike: the whole spectrum has to decide.
     nodes = data.ground.places[[0, -1]]
     first, last = (int((comparison.bands.frequency - f).abs().argmin()) for f in nodes)
     passed = comparison.observed.power / comparison.reference.power.clamp(min=1e-300)
-    if float(passed[:, first : last + 1].mean(0).min()) < _CUT_OFF:
+    if float(passed[:, first : last + 1].mean(0).min()) < 0.6:
         return None
     background = fit(data, [Background.start(comparison.n_sensors)])
     return _best(comparison, stretch, data, background)
@@ -151,4 +148,5 @@ def _best(comparison: Comparison, stretch: Stretch, data: Ratios, background: Fi
     term = best.terms[-1]
     assert isinstance(term, Peak | CommonBump)
     found = Oscillation.of(stretch, term, best.sd(-1), nats)
-    return None if found.centre < _ITS_OWN * found.width or nats < 0 else found
+    # Fits allow half widths up to half of the centre: a broader peak needs the whole spectrum.
+    return None if found.centre < 2.1 * found.width or nats < 0 else found

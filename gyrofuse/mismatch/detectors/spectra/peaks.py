@@ -24,11 +24,9 @@ from gyrofuse.mismatch.signals.lines import simulated_lines, whitened
 from gyrofuse.mismatch.signals.psd import light_taper
 from gyrofuse.mismatch.stats.multiplicity import p_value_from_e_value, sidak
 
-_DEPENDENT = 1.15  # bins under it for an independent one, as far tails have it
-_TRIES = 6
-_MOST = 3.4  # medians of a modulus: one bin in three thousand is above
-_LINE = 0.6  # of the excess in three bins
-_AS_WELL = 0.01  # p value at which the simulation has it as well
+# Bins of a spectrum under the light taper, a tenth of which is at either end, for an independent one in far tails.
+_DEPENDENT = 1.15
+_AS_WELL = 0.01  # p value at which the simulation has a peak as well, or it is not worth a comparison
 
 
 class Stretch(NamedTuple):
@@ -64,7 +62,11 @@ def peak_test(comparison: Comparison) -> TestResult:
 
 @derived
 def strongest_peak(comparison: Comparison) -> Stretch:
-    """The most conspicuous bump of the recording that is neither a line nor in the simulation."""
+    """The most conspicuous bump of the recording that is neither a line nor in the simulation.
+
+    Six are tried; a line has three fifths of the excess in three bins.
+    """
+    tries = 6
     transform, length = _transformed(comparison.lineless)
     last = int((0.5 - 2 / comparison.n_samples) * length)
     transform = transform[:, :last]
@@ -75,7 +77,7 @@ def strongest_peak(comparison: Comparison) -> Stretch:
         scans += scanned_shared_peaks(transform, worth, levels, width)
     power, nothing = squared_modulus(transform), Stretch(0.25, 0.5, 1.0, tuple(range(comparison.n_sensors)))
     reference: tuple[Tensor, int] | None = None
-    for _ in range(_TRIES if scans else 0):
+    for _ in range(tries if scans else 0):
         best = max(scans, key=lambda scan: float(scan.log_ratio.amax()))
         a, n = int(best.first[best.log_ratio.argmax()]), best.width
         if not bool(best.log_ratio.isfinite().any()):
@@ -87,7 +89,7 @@ def strongest_peak(comparison: Comparison) -> Stretch:
         if p_value > _AS_WELL:
             return stretch
         excess = (power[:, a : a + n].mean(0) - _flanks(power, a, n).mean()).clamp(min=0)
-        line = float(excess.topk(3).values.sum()) > _LINE * float(excess.sum())
+        line = float(excess.topk(3).values.sum()) > 0.6 * float(excess.sum())
         if reference is None:
             bare = without_lines(comparison.reference.signal, simulated_lines(comparison.reference))
             reference = _transformed(whitened(comparison.reference.steadied(bare), comparison.base))
@@ -109,12 +111,12 @@ def _transformed(white: Tensor) -> tuple[Tensor, int]:
 def _apart(transform: Tensor, length: int, comparison: Comparison) -> Tensor:
     """Without what sensors `(sensor, bin)` share over broad bands of both.
 
-    Bins are cut to a few times the power around: lines are nothing that bands share.
+    Bins are cut to 3.4 medians of their modulus, one in three thousand of noise: lines are nothing that bands share.
     """
     scale = length / comparison.n_samples
     edges = [0, *(round(e * scale) for e in comparison.bands.edges[1:-1]), transform.shape[-1]]
     parts = [transform[:, a:b] for a, b in itertools.pairwise(edges)]
-    limits = [_MOST * part.abs().median(-1, keepdim=True).values for part in parts]
+    limits = [3.4 * part.abs().median(-1, keepdim=True).values for part in parts]
     cut = [part * (limit / part.abs()).clamp(max=1) for part, limit in zip(parts, limits, strict=True)]
     return decorrelated(torch.cat(cut, -1), edges, comparison.observed.dof)
 
@@ -126,20 +128,15 @@ def _flanks(power: Tensor, a: int, n: int) -> Tensor:
     return torch.cat([left, right], -1).mean(-1)
 
 
-def band_of(place: Tensor, length: int, comparison: Comparison) -> Tensor:
-    edges = torch.tensor(comparison.bands.edges[1:-1], dtype=torch.float64) / comparison.n_samples
-    return torch.bucketize(place.to(torch.float64) / length, edges, right=True)
-
-
 def _alone(power: Tensor, a: int, n: int, d: float) -> tuple[int, ...]:
-    """Sensors in which so many bins, worth `d` ordinates, stand out alone."""
+    """Sensors in which `n` bins from `a` on, of `d` independent ordinates, stand out alone."""
     tails = stats.f.sf((power[:, a : a + n].mean(-1) / _flanks(power, a, n)).numpy(), 2 * d, 6 * d)
     p = len(power)
     return tuple(i for i in range(p) if sidak(float(tails[i]), p) < 0.01) or (int(tails.argmin()),)
 
 
 def _has_it(reference: tuple[Tensor, int], stretch: Stretch, comparison: Comparison) -> bool:
-    """Whether the simulation has a bump at the same place."""
+    """Whether the simulation has a bump at the same frequency."""
     transform, length = reference
     n = max(round(stretch.width * length) // 2, 2) * 2
     a, gap = round(stretch.frequency * length - (n - 1) / 2), n // 2

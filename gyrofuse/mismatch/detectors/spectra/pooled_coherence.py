@@ -15,12 +15,6 @@ from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.stats.multiplicity import sidak
 
-_ABSENT = 1.5  # standard deviations of what the simulation has, below which it has nothing; less if it is short
-_SURELY = 0.7  # the same, to take for granted that it has nothing
-_SHOWN = 0.1  # p value below which the simulation's sensors share something
-_DRAWN, _COUNTED = 4000, 40  # matrices of noise, and those of them beyond which the tail is not counted
-_NEIGHBOURS = 1.1  # bands next to each other are slightly correlated
-
 
 class Source(NamedTuple):
     """Coherence that the simulation does not have.
@@ -65,6 +59,10 @@ def common_source(comparison: Comparison) -> Source | None:
     `1/d + 1/s`, whatever noise the sensors share. Where the simulation has nothing of what the recording shows, its
     sensors are independent, and the recording's coherences vary by `1/d` around none.
     """
+    # Standard deviations of what the simulation has along the recording's source: below the first it has nothing, of
+    # one as long as the recording; below the second that may be taken for granted where it shares nothing else.
+    absent, surely, shares_p_value = 1.5, 0.7, 0.1
+    neighbours = 1.1  # variance of sums over bands, of which those next to each other are slightly correlated
     p, d, s = comparison.n_sensors, comparison.observed.coherence_dof, comparison.reference.coherence_dof
     known = (d >= 2 * p) & (s >= 2 * p)
     if p < 2 or int(known.sum()) < 2:
@@ -77,7 +75,7 @@ def common_source(comparison: Comparison) -> Source | None:
         """Of whole runs, in units of their noise, with no diagonal."""
         total = torch.cat([torch.zeros(1, p, p, dtype=white.dtype), (matrices * worth[:, None, None]).cumsum(0)])
         weight = torch.cat([torch.zeros_like(worth[:1]), worth.cumsum(0)])
-        size = ((weight[ends] - weight[starts]) * _NEIGHBOURS).sqrt()
+        size = ((weight[ends] - weight[starts]) * neighbours).sqrt()
         run = (total[ends] - total[starts]) / size[:, None, None]
         return run - torch.diag_embed(run.diagonal(dim1=-2, dim2=-1))
 
@@ -90,7 +88,7 @@ def common_source(comparison: Comparison) -> Source | None:
         size, u = values.gather(-1, top[:, None])[:, 0], vectors[torch.arange(len(top)), :, top]
         along = torch.einsum("ri,rij,rj->r", u.conj(), had, u).real * size.sign()
         spread = (1 - u.abs().pow(4).sum(-1)).clamp(min=1e-9).sqrt()
-        independent = along < _ABSENT * min(1.0, float(s.sum() / d.sum())) * spread
+        independent = along < absent * min(1.0, float(s.sum() / d.sum())) * spread
         largest = torch.where(independent, size.abs(), torch.linalg.eigvalsh(apart).abs().amax(-1))
         tails = torch.tensor([_tail(float(x), p, real) for x in largest], dtype=torch.float64)
         run = int((tails * places).argmin())
@@ -100,10 +98,10 @@ def common_source(comparison: Comparison) -> Source | None:
         bands = known.nonzero()[:, 0]
         first, last = int(bands[starts[run]]), int(bands[ends[run] - 1])
         value = sidak(float(tails[run]), 2 * float(places[run]))
-        absent = bool((along < _SURELY * spread)[run])
+        absent = bool((along < surely * spread)[run])
         found.append(Source(value, first, last, (int(place[0]), int(place[1])), absent))
         shown = float(torch.linalg.eigvalsh(had).abs().max())
-        nothing &= sidak(_tail(shown, p, real), 2 * len(largest)) > _SHOWN
+        nothing &= sidak(_tail(shown, p, real), 2 * len(largest)) > shares_p_value
     best = min(found, key=lambda source: source.p_value)
     return best._replace(independent=best.independent and nothing)
 
@@ -111,21 +109,22 @@ def common_source(comparison: Comparison) -> Source | None:
 def _tail(size: float, p: int, real: bool) -> float:
     """Upper tail of the largest eigenvalue, of either sign, of a Hermitian matrix of noise without a diagonal.
 
-    Counted among drawn ones, and beyond them by the law of its far tail, `l^k exp(-l^2 / (2 (1 - 1/p)))`.
+    Counted among drawn ones, and beyond the largest 40 by the law of its far tail, `l^k exp(-l^2 / (2 (1 - 1/p)))`.
     """
+    counted = 40
     drawn = _noise_sizes(p, real)
-    if size <= float(drawn[-_COUNTED]):
+    if size <= float(drawn[-counted]):
         return float((drawn >= size).sum() + 1) / (len(drawn) + 1)
-    anchor = float(drawn[-_COUNTED])
+    anchor = float(drawn[-counted])
     power = p - 1 if real else 2 * p - 2
     log_ratio = power * math.log(size / anchor) - (size**2 - anchor**2) / (2 * (1 - 1 / p))
-    return min(_COUNTED / len(drawn) * math.exp(max(log_ratio, -700.0)), 1.0)
+    return min(counted / len(drawn) * math.exp(max(log_ratio, -700.0)), 1.0)
 
 
 @functools.lru_cache(maxsize=16)
 def _noise_sizes(p: int, real: bool) -> Tensor:
-    """Largest eigenvalues of noise, sorted."""
-    parts = torch.randn(2, _DRAWN, p, p, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    """Largest eigenvalues of 4000 matrices of noise, sorted: a table of the law, the same in every diagnosis."""
+    parts = torch.randn(2, 4000, p, p, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     upper = (torch.complex(parts[0], torch.zeros_like(parts[1]) if real else parts[1]) / math.sqrt(2)).triu(1)
     return torch.linalg.eigvalsh(upper + upper.mH).abs().amax(-1).sort().values
 

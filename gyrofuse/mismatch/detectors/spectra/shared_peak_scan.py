@@ -23,25 +23,17 @@ from torch import Tensor
 
 from gyrofuse.mismatch.detectors.spectra.modulated_ordinates import inflation
 
-_NARROWEST = 4  # bins
-_FLANK, _LEAST_FLANK, _FEWEST_BINS = 4.0, 1.5, 24  # of a flank, over the stretch, and bins
-_SMOOTH = 8  # part of the spectrum over which noise may be taken for the same
-_LOWEST, _NARROW = 12, 4  # bins, and widths, below a stretch
-_BROADEST = 8  # of them in the spectrum
-_SIZES = (3.2, 5.6, 8.0, 11.2)  # `a`, times the root of `m`
-_NODES, _CLOSEST = 24, 1e-3  # of `1 - s`
-_ROUNDS = 8
-_RIDGE = 1e-9
-_AT_ONCE = 2**15  # places
+SMOOTH = 8  # part of a spectrum over which whitened noise may be taken for level
+LOWEST = 12  # bins below which whitening is not exact
 
 
 class Stretches(NamedTuple):
     """All of one width.
 
     Attributes:
-        first: Bins `(place,)`.
+        first: Bins `(position,)`.
         width: Bins.
-        log_ratio: Of the mean likelihood ratio, `(place,)`.
+        log_ratio: Of the mean likelihood ratio, `(position,)`.
     """
 
     first: Tensor
@@ -50,13 +42,13 @@ class Stretches(NamedTuple):
 
 
 def flank_of(width: int, n_bins: int) -> int:
-    """Bins on either side with which a stretch of so many is compared, in a spectrum of `n_bins`."""
-    return max(min(round(_FLANK * width), n_bins // _SMOOTH), least_flank(width))
+    """Bins on either side with which a stretch of so many is compared, in a spectrum of `n_bins`: four times it."""
+    return max(min(4 * width, n_bins // SMOOTH), least_flank(width))
 
 
 def least_flank(width: int) -> int:
-    """Fewest bins on either side that tell what is beside a stretch."""
-    return max(round(_LEAST_FLANK * width), _FEWEST_BINS)
+    """Fewest bins on either side from which a level is known: one and a half times a stretch, and 24."""
+    return max(round(1.5 * width), 24)
 
 
 def scanned_shared_peaks(transform: Tensor, worth: float, levels: Tensor, width_of_bin: float) -> Iterator[Stretches]:
@@ -68,13 +60,14 @@ def scanned_shared_peaks(transform: Tensor, worth: float, levels: Tensor, width_
         levels: Correlations of ordinates of noise whose level varies, `(sensor, distance)`.
         width_of_bin: In bins of the record, of which those distances are.
     """
-    n_bins, width = transform.shape[-1], _NARROWEST
+    at_once = 2**15  # positions, to bound memory
+    n_bins, width = transform.shape[-1], 4
     pairs = transform[:, : n_bins // 2 * 2].unflatten(-1, (-1, 2)).movedim(1, 0)
     cells = pairs @ pairs.mH  # (cell, sensor, sensor)
-    while width <= n_bins // _BROADEST:
+    while width <= n_bins // SMOOTH:
         half = width // 2
         reach = flank_of(width, n_bins) // half
-        first = max(-(-_LOWEST // half) + reach + 1, 2 * _NARROW)
+        first = max(-(-LOWEST // half) + reach + 1, 8)
         last = len(cells) - reach - 3
         if last < first:
             return
@@ -82,8 +75,8 @@ def scanned_shared_peaks(transform: Tensor, worth: float, levels: Tensor, width_
         contrast = torch.cat([flank, flank.new_tensor([0.0, 0.5, 0.5, 0.0]), flank])  # in halves of a stretch
         own = worth / float(inflation(levels, contrast, half * width_of_bin).amax())
         logs = []
-        for a in range(first, last + 1, _AT_ONCE):
-            b = min(a + _AT_ONCE, last + 1)
+        for a in range(first, last + 1, at_once):
+            b = min(a + at_once, last + 1)
             inside, beside = _inside(cells, a, b), _beside(cells, a, b, reach)
             logs.append(log_ratios(inside, beside, width * own, 2 * reach * half * own))
         yield Stretches(torch.arange(first, last + 1) * half, width, torch.cat(logs))
@@ -92,17 +85,19 @@ def scanned_shared_peaks(transform: Tensor, worth: float, levels: Tensor, width_
 
 
 def log_ratios(inside: Tensor, beside: Tensor, m: float, f: float) -> Tensor:
-    """Logarithms of mean likelihood ratios of places.
+    """Logarithms of mean likelihood ratios, `(position,)`.
 
     Args:
-        inside: Matrices `(place, sensor, sensor)` of stretches.
+        inside: Matrices `(position, sensor, sensor)` of stretches.
         beside: Of their flanks.
         m: Independent ordinates in a stretch.
         f: In its flanks.
     """
+    sizes = (3.2, 5.6, 8.0, 11.2)  # of a source's power, in standard deviations of that of a stretch
+    away = torch.cat([torch.logspace(0, -3, 24, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)])  # 1 - s
     both, p = inside + beside, inside.shape[-1]
     size = both.diagonal(dim1=-2, dim2=-1).real.mean(-1)
-    root = torch.linalg.cholesky(both + torch.diag_embed((_RIDGE * size)[:, None].expand(-1, p)))
+    root = torch.linalg.cholesky(both + torch.diag_embed((1e-9 * size)[:, None].expand(-1, p)))  # for rounding
     left = torch.linalg.solve_triangular(root, inside, upper=False)
     share = torch.linalg.solve_triangular(root, left.mH, upper=False)
     top = _largest(share)
@@ -110,14 +105,13 @@ def log_ratios(inside: Tensor, beside: Tensor, m: float, f: float) -> Tensor:
         along, mass = top[None], top.new_zeros(1)
     else:
         rest = ((share.diagonal(dim1=-2, dim2=-1).real.sum(-1) - top) / (p - 1)).clamp(min=0)
-        away = torch.cat([torch.logspace(0, math.log10(_CLOSEST), _NODES, dtype=torch.float64), top.new_zeros(1)])
         mass = away.pow(p - 1).diff().neg().log()
-        along = rest + (1 - away[:-1, None]) * (top - rest)  # (node, place), each at its lower end
+        along = rest + (1 - away[:-1, None]) * (top - rest)  # (node, position), each at its lower end
     total = torch.full_like(top, -math.inf)
-    for a in (size / math.sqrt(m) for size in _SIZES):
+    for a in (size / math.sqrt(m) for size in sizes):
         mean = torch.logsumexp(mass[:, None] - (m + f) * torch.log1p(-a / (1 + a) * along), 0)
         total = torch.logaddexp(total, mean - m * math.log1p(a))
-    return total - math.log(len(_SIZES))
+    return total - math.log(len(sizes))
 
 
 def _inside(cells: Tensor, a: int, b: int) -> Tensor:
@@ -133,9 +127,10 @@ def _beside(cells: Tensor, a: int, b: int, reach: int) -> Tensor:
 
 
 def _largest(matrices: Tensor) -> Tensor:
-    """Largest eigenvalue, or a little less, of matrices `(place, sensor, sensor)`, by powers."""
+    """Largest eigenvalue, or a little less, of matrices `(position, sensor, sensor)`, by powers."""
+    rounds = 8
     column = matrices.abs().square().sum(-2).argmax(-1)
     v = matrices[torch.arange(len(matrices)), :, column][..., None]
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         v = matrices @ (v / v.norm(dim=-2, keepdim=True).clamp(min=1e-300))
     return v.norm(dim=-2)[:, 0].clamp(max=1.0)

@@ -48,8 +48,7 @@ _FORMS = {
 }
 _POLES = {"pole": 1.0, "poles": math.sqrt(2) - 1}
 FILTERS = ("pole", "poles", "average", *_FORMS)
-_RIPPLE = 0.5  # dB
-_HIGHEST = 0.495  # corner with ripples, cycles per sample
+_RIPPLE = 0.5  # dB of a Chebyshev filter's pass band
 _HALVINGS = 60  # of an interval: double precision
 _LONGEST = 0.9999  # pole: of a time constant of 10^4 samples
 
@@ -112,8 +111,8 @@ def strength_of(kind: str, number: Tensor) -> Tensor:
         return b - (b.square() - 1).sqrt()
     if kind == "average":
         return 3 * torch.exp(-2 * number)
-    if _FORMS[kind].prototype == "chebyshev":  # beyond, a lower level would pass for one whose edge no band shows
-        number = number.clamp(max=math.log(math.tan(math.pi * _HIGHEST)))
+    if _FORMS[kind].prototype == "chebyshev":  # corners above 0.495 of the rate would be another level of everything
+        number = number.clamp(max=math.log(math.tan(math.pi * 0.495)))
     return torch.exp(-2 * _FORMS[kind].power * number)
 
 

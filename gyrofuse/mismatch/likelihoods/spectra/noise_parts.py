@@ -13,13 +13,8 @@ from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum, _atoms, _tim
 from gyrofuse.mismatch.signals.psd import Bands
 from gyrofuse.noise.processes import AR1
 
-_FAST = 3.0  # samples: AR1s of shorter memory are all but white
-_SLOW = 2.2  # time constants above n / (2 pi) over this look like a walk in every band
-_LITTLE = 0.3  # of the white noise: fast AR1s below count as white
-_UNSEEN = 0.02  # share of the noise at one cycle per record: a walk below it is not known to be there or not
-_BY_CHANCE, _LOOKED_AT = 10, 60  # bins, and frequencies above
-_CHANCE = 0.15  # share of the noise there that AR1s may have in the spectrum of white noise
-_MATTERS = 0.05  # of the power in some band, for a part to have a level of its own
+_UNSEEN = 0.02  # share of the noise where a part is largest, below which it is not known to be there or not
+_CHANCE = 0.15  # share of the noise that an AR1 or a walk may have by chance in the spectrum of white noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,13 +31,18 @@ class Parts:
 
     @cached_property
     def coefficients(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Of the parts, `(sensor, atom)`: together those of the base."""
+        """Of the parts, `(sensor, atom)`: together those of the base.
+
+        AR1s with time constants of half a record over `pi` and more look like a walk in every band. Those below three
+        samples count as white if they are less than a third of the white noise.
+        """
+        fastest, faint = 3.0, 0.3
         c = self.base.coefficients
         tau = torch.tensor((0.0, 0.0, *_time_constants(self.base.n_samples), math.inf), dtype=c.dtype)
-        walk = (tau >= self.base.n_samples / (2 * math.pi) / _SLOW).expand_as(c)
-        fast = ((tau < _FAST) & (tau > 0)).expand_as(c)
+        walk = (tau >= self.base.n_samples / (2 * math.pi) / 2.2).expand_as(c)
+        fast = ((tau < fastest) & (tau > 0)).expand_as(c)
         height = (c / (1 - torch.exp(-1 / tau.clamp(min=1e-9))).square())[:, fast[0]].sum(-1, keepdim=True)
-        white = (tau == 0) | (fast & (height < _LITTLE * c[:, :1]))
+        white = (tau == 0) | (fast & (height < faint * c[:, :1]))
         zero = torch.zeros_like(c)
         return torch.where(white, c, zero), torch.where(white | walk, zero, c), torch.where(walk, c, zero)
 
@@ -81,12 +81,13 @@ class Parts:
     def unseen_ar1(self) -> tuple[float, Tensor]:
         """Inverse time constant of an AR1 that records would not show, and its plateaus `(sensor, 1)`.
 
-        The plateau is 0 for sensors that have AR1s, more than chance would make of none. Of a white
-        simulation, noise with a memory is other numbers.
+        The plateau is 0 for sensors that have AR1s, more than chance would make of none from ten cycles per record on.
+        Of a white simulation, noise with a memory is other numbers.
         """
+        lowest, n_frequencies = 10, 60
         n, c = self.base.n_samples, self.base.coefficients
         middle = math.sqrt(0.5 / n)  # cycles per sample
-        f = torch.logspace(math.log10(_BY_CHANCE / n), math.log10(0.5), _LOOKED_AT, dtype=c.dtype)
+        f = torch.logspace(math.log10(lowest / n), math.log10(0.5), n_frequencies, dtype=c.dtype)
         has = ((self.coefficients[1] @ _atoms(n, f)) / self.base.spectrum(f)).amax(-1, keepdim=True) > _CHANCE
         plateau = _UNSEEN * self.base.spectrum(torch.tensor([middle], dtype=c.dtype))
         return 2 * math.pi * middle, torch.where(has, 0.0, plateau)
@@ -167,9 +168,9 @@ class Ground:
 
     @cached_property
     def matters(self) -> Tensor:
-        """Which parts of the noise have a share in some band, `(part, sensor)`."""
+        """Which parts have a twentieth of the noise in some band, or may have come in anew, `(part, sensor)`."""
         white, coloured, walk = self.parts.densities
         possible = torch.stack([white, coloured, torch.maximum(walk, self.parts.grown)])
-        matters = (self.bands.mean_of(possible) / self.mean).amax(-1) > _MATTERS
+        matters = (self.bands.mean_of(possible) / self.mean).amax(-1) > 1 / 20
         matters[:2] |= self.parts.lacks[:2]
         return matters

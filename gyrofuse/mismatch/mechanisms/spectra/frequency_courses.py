@@ -23,15 +23,8 @@ from gyrofuse.mismatch.detectors.spectra.peak_fit import Oscillation
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 
-_REACH, _FEWEST = 8.0, 256  # half widths on either side, and bins
-_SHORTEST, _LONGEST, _WINDOWS = 4, 128, 4  # samples of a window, and fewest windows
-_STRENGTHS = (0.25, 0.4, 0.6, 1.0, 1.5)  # of the likeliest hump's energy
-_SPEEDS = (0.5, 1.5, 4.0)  # steps from window to window, in half their resolution
-_WIDTHS, _NARROWEST, _WIDEST = 10, 2.0, 0.125  # cells, and share of the band
-_MOST_CELLS = 4096  # of a band, in which humps are looked for
-_NO_TAILS = 0.2  # of the power of a Lorentzian of like width and height, that a course without far tails lacks
-_OFF = 0.12  # share of the band by which centres are off
-_CENTRES, _HEIGHTS = 9, (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 12.8, 25.0, 50.0, 100.0)
+_FEWEST = 256  # bins on either side of a peak, in which tones and noise of its spectrum differ by their courses
+_MOST_CELLS = 4096  # of a band, in which peaks are searched for: memory and time do not grow with the record
 
 
 def weights_in_phase(comparison: Comparison, peak: Oscillation) -> Tensor:
@@ -59,11 +52,12 @@ def wandering_log_ratio(comparison: Comparison, peak: Oscillation, weights: Tens
 def share_of_lorentzian(comparison: Comparison, peak: Oscillation) -> float:
     """Power of a hump over that of the Lorentzian that was fitted to it.
 
-    A course of frequencies that keeps near its middle has no far tails.
+    A course of frequencies that keeps near its middle has no far tails: a fifth of the power of a Lorentzian of like
+    width and height.
     """
     bins = _band(comparison, peak, weights_in_phase(comparison, peak))
     normal = _hump(squared_modulus(bins)).normal if len(bins) >= _FEWEST else 0.5
-    return 1 - _NO_TAILS * normal
+    return 1 - normal / 5
 
 
 @derived
@@ -74,9 +68,9 @@ def rampless_transform(comparison: Comparison) -> Tensor:
 
 
 def _band(comparison: Comparison, peak: Oscillation, weights: Tensor) -> Tensor:
-    """Bins `(bin,)` of the sum in units of its noise."""
+    """Bins `(bin,)` of the sum in units of its noise, eight half widths on either side."""
     n = comparison.n_samples
-    centre, reach = round(peak.centre * n), max(round(_REACH * peak.width * n), _FEWEST)
+    centre, reach = round(peak.centre * n), max(round(8 * peak.width * n), _FEWEST)
     reach = min(reach, centre - 3, n // 2 - centre - 2)
     reach -= reach % _cell(2 * reach)
     inside = slice(centre - reach, centre + reach)
@@ -106,16 +100,22 @@ def _cell(n_bins: int) -> int:
 
 
 def _hump(power: Tensor) -> Hump:
-    """Humps of powers `(bin,)`, a whole number of cells, over which a hump is taken for level."""
+    """Humps of powers `(bin,)`, a whole number of cells, over which a hump is taken for level.
+
+    Half widths are from two cells to an eighth of the band, centres an eighth of it off at most, heights 0.05 to 100
+    times the level.
+    """
+    centres = torch.linspace(-1 / 8, 1 / 8, 9)
+    heights = torch.logspace(math.log10(0.05), 2, 12, dtype=torch.float64)
     cell = _cell(len(power))
     power = power.unflatten(0, (-1, cell)).mean(-1)
     n = len(power)
     k = torch.arange(n, dtype=torch.float64) - (n - 1) / 2
-    widths = torch.logspace(math.log10(_NARROWEST), math.log10(_WIDEST * n), _WIDTHS, dtype=torch.float64)
-    height = torch.tensor(_HEIGHTS, dtype=torch.float64)[:, None, None]
+    widths = torch.logspace(math.log10(2), math.log10(n / 8), 10, dtype=torch.float64)
+    height = heights[:, None, None]
     values: tuple[list[Tensor], list[Tensor]] = ([], [])  # Lorentzian, normal
     best = (-math.inf, 1.0, 0.0)
-    for centre in torch.linspace(-_OFF * n, _OFF * n, _CENTRES).tolist():
+    for centre in (n * centres).tolist():
         square = ((k - centre) / widths[:, None]).square()
         for of_shape, shape in zip(values, (1 / (1 + square), (-square / 2).exp()), strict=True):
             spectrum = 1 + height * shape  # (height, width, bin)
@@ -133,11 +133,11 @@ def _hump(power: Tensor) -> Hump:
 
 
 def _tone(bins: Tensor, energy: float) -> float:
-    """Mean log likelihood ratio of tones over noise of one in each bin."""
+    """Mean log likelihood ratio of tones over noise of one in each bin, in windows of 4 to 128 samples of the band."""
     n = len(bins)
     z = torch.fft.ifft(torch.fft.ifftshift(bins)) * math.sqrt(n)
-    found, length = [], _SHORTEST
-    while length <= min(n // _WINDOWS, _LONGEST):
+    found, length = [], 4
+    while length <= min(n // 4, 128):
         windows = z[: n // length * length].unflatten(-1, (-1, length))
         power = squared_modulus(torch.fft.fft(windows, n=2 * length)) / length  # (window, frequency), in circular order
         found.append(_courses(power, energy / len(power)))
@@ -147,19 +147,26 @@ def _tone(bins: Tensor, energy: float) -> float:
 
 
 def _courses(power: Tensor, energy: float) -> Tensor:
-    """Log likelihood ratios `(strength * speed,)` over all courses of the frequency through windows."""
+    """Log likelihood ratios `(strength * speed,)` over all courses of the frequency through windows.
+
+    Args:
+        power: Powers over the noise, `(window, frequency)`.
+        energy: Energy of the likeliest peak in a window: a tone has 0.25 to 1.5 of it.
+    """
+    strengths = torch.tensor([0.25, 0.4, 0.6, 1.0, 1.5], dtype=torch.float64)
+    speeds = torch.tensor([0.5, 1.5, 4.0], dtype=torch.float64)  # from window to window, half their resolution
     n = power.shape[-1]
     power = torch.fft.fftshift(power, dim=-1)
-    rho = energy * torch.tensor(_STRENGTHS, dtype=torch.float64)[:, None, None, None]
+    rho = energy * strengths[:, None, None, None]
     x = 2 * (rho * power[:, None]).sqrt()
     log_ratio = torch.special.i0e(x).log() + x - rho  # (strength, window, 1, frequency)
     peak = log_ratio.amax(-1, keepdim=True)
     ratio = (log_ratio - peak).exp()
     apart = (torch.arange(n)[:, None] - torch.arange(n)).abs().to(torch.float64)
-    chain = (-apart / torch.tensor(_SPEEDS, dtype=torch.float64)[:, None, None]).exp()
+    chain = (-apart / speeds[:, None, None]).exp()
     chain = chain / chain.sum(-1, keepdim=True)
-    state = torch.full((len(_STRENGTHS), len(_SPEEDS), n), 1 / n, dtype=torch.float64)
-    total = peak.sum((1, 2, 3))[:, None].expand(-1, len(_SPEEDS))
+    state = torch.full((len(strengths), len(speeds), n), 1 / n, dtype=torch.float64)
+    total = peak.sum((1, 2, 3))[:, None].expand(-1, len(speeds))
     for window in range(len(power)):
         here = state * ratio[:, window]
         size = here.sum(-1, keepdim=True)

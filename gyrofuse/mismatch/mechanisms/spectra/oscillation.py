@@ -26,13 +26,8 @@ from gyrofuse.mismatch.signals.psd import light_taper
 from gyrofuse.mismatch.stats.inclusion import included_sensors
 from gyrofuse.mismatch.stats.limits import Z
 
-_BAND = 6.0  # half widths on either side
-_PARTS, _MOST_ALIKE = 16, 0.8  # of a record, to see a frequency wander, and the correlation of neighbours
-_FEWEST = 3  # samples of the band in a part
-_MOMENTS, _MOST_AT_ONCE = 32, 0.5  # parts of a record, and share of the excess in one
-_BROAD = 0.1  # half width over centre
-_SMEARED = 0.45  # bins: half width of a line under a light taper
-_REACH, _FEWEST_BINS = 7.5, 6  # half widths around a mode, and bins, that tell its strength
+_PARTS = 16  # of a record, over which a frequency is seen to wander
+_BROAD = 0.1  # half width over centre, from which a peak has no flanks of its own
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +46,11 @@ class Mode:
     shared: bool
 
     def profile(self, f: Tensor, resolution: float = 0.0) -> Tensor:
-        """Density of variance one at `f` cycles per sample, as spectra of a resolution show it."""
-        width = torch.tensor(math.hypot(self.width, _SMEARED * resolution), dtype=torch.float64)
+        """Density of variance one at `f` cycles per sample, as spectra of a resolution show it.
+
+        A line under a light taper is 0.45 of a bin wide, half width.
+        """
+        width = torch.tensor(math.hypot(self.width, 0.45 * resolution), dtype=torch.float64)
         return oscillation(f, torch.tensor(self.centre, dtype=torch.float64), width)
 
     def matrix(self) -> Tensor:
@@ -151,12 +149,12 @@ def _seen(peak: Oscillation) -> tuple[Tensor, int]:
 
 
 def _in_band(comparison: Comparison, peak: Oscillation) -> tuple[Tensor, float]:
-    """Sensors summed in phase, in a band whose middle is the centre, and the power that noise alone has there.
+    """Sensors summed in phase in six half widths on either side of the centre, and the power of noise alone there.
 
     Complex samples `(time,)`, one for each bin of the band; none at the ends of the spectrum.
     """
     n = comparison.n_samples
-    centre, reach = round(peak.centre * n), max(round(_BAND * peak.width * n), 2 * _PARTS)
+    centre, reach = round(peak.centre * n), max(round(6 * peak.width * n), 2 * _PARTS)
     reach = min(reach, centre - 1, n // 2 - centre)
     if reach < 1:
         return torch.zeros(0, dtype=torch.complex128), 0.0
@@ -169,13 +167,14 @@ def _in_band(comparison: Comparison, peak: Oscillation) -> tuple[Tensor, float]:
 
 
 def _momentary(comparison: Comparison, peak: Oscillation) -> bool:
-    """Whether one moment has most of it: what rings after a blow is neither noise through a resonance nor a tone."""
+    """Whether one of 32 parts of the record has half of it: what rings after a blow is neither a mode nor a tone."""
+    parts = 32
     z, level = _in_band(comparison, peak)
-    length = len(z) // _MOMENTS
+    length = len(z) // parts
     if length < 1:
         return False
-    excess = z[: length * _MOMENTS].unflatten(0, (_MOMENTS, length)).abs().square().mean(-1) - level
-    return float(excess.max()) > _MOST_AT_ONCE * float(excess.sum().clamp(min=0))
+    excess = z[: length * parts].unflatten(0, (parts, length)).abs().square().mean(-1) - level
+    return float(excess.max()) > float(excess.sum().clamp(min=0)) / 2
 
 
 def wandering_sd(comparison: Comparison, peak: Oscillation) -> float:
@@ -185,13 +184,14 @@ def wandering_sd(comparison: Comparison, peak: Oscillation) -> float:
     white noise has none. Neighbouring parts that are alike make the mean of all as uncertain as fewer of them would.
     """
     z, _ = _in_band(comparison, peak)
-    if len(z) < _FEWEST * _PARTS:
+    if len(z) < 3 * _PARTS:  # a turn from sample to sample needs a few
         return 0.0
     parts = z[: len(z) // _PARTS * _PARTS].unflatten(0, (_PARTS, -1))
     turns = (parts[:, 1:] * parts[:, :-1].conj()).sum(-1).angle() / (2 * math.pi)
     left = turns - turns.mean()
     alike = float((left[1:] * left[:-1]).sum() / left.square().sum())
-    alike = min(max(alike + (1 + 4 * alike) / _PARTS, 0.0), _MOST_ALIKE)  # a mean of its own biases it down
+    # Subtracting the mean biases a correlation of neighbours down; from 0.8 on sixteen parts do not show it any more.
+    alike = min(max(alike + (1 + 4 * alike) / _PARTS, 0.0), 0.8)
     spread = float(left.square().sum()) / (_PARTS - 1) / _PARTS * (1 + alike) / (1 - alike)
     return math.sqrt(spread) * len(z) / comparison.n_samples
 
@@ -208,7 +208,8 @@ def refitted_mode(comparison: Comparison, fold: int, mode: Mode) -> Mode:
 def _refitted(comparison: Comparison, fold: int, mode: Mode) -> Mode:
     """The same centre and width, gains from the power in blocks that a fold does not hold out.
 
-    A broad mode has no flanks of its own: it is fitted to the whole spectrum.
+    Of a narrow one they are fitted within 7.5 half widths, in six bins at least. A broad mode has no flanks of its own:
+    it is fitted to the whole spectrum.
     """
     if not mode.shared and mode.width > _BROAD * mode.centre:
         start = Peak.start(mode.centre, mode.width, mode.gain.abs().square())
@@ -220,8 +221,8 @@ def _refitted(comparison: Comparison, fold: int, mode: Mode) -> Mode:
     blocks = comparison.lineless[:, keep].unflatten(-1, (-1, block))
     transform = torch.fft.rfft(blocks * light_taper(block)).movedim(-1, 0)  # (bin, sensor, block)
     f = torch.arange(len(transform), dtype=torch.float64) / block
-    usable = (f > 2.5 / block) & (f < 0.5 - 2 / block) & ((f - mode.centre).abs() <= _REACH * (mode.width + 1 / block))
-    if int(usable.sum()) < _FEWEST_BINS:
+    usable = (f > 2.5 / block) & (f < 0.5 - 2 / block) & ((f - mode.centre).abs() <= 7.5 * (mode.width + 1 / block))
+    if int(usable.sum()) < 6:
         return mode
     f, transform = f[usable], transform[usable]
     level = comparison.base.spectrum(f).mT.sqrt()

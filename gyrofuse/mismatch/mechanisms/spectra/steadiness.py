@@ -23,12 +23,8 @@ from gyrofuse.mismatch.mechanisms.spectra.frequency_courses import (
 )
 from gyrofuse.mismatch.signals.comparison import Comparison
 
-_DRAWN = 60
-_REACH = 6.0  # half widths on either side
-_LEAST = 96  # bins that are needed
-_FIRES, _WOULD_FIRE = 4.5, 9.0  # standard deviations
-_SURE = 3.0  # nats
-_SLOW = 0.05  # of the record, between changes of speed of a tone that wanders slowly
+_DRAWN = 60  # Gaussian records of the same spectrum
+_LEAST = 96  # bins in which an envelope and short windows differ by more than chance
 
 
 class Steadiness(NamedTuple):
@@ -46,7 +42,13 @@ class Steadiness(NamedTuple):
 
 
 def steadiness(comparison: Comparison, peak: Oscillation) -> Steadiness:
-    """Judge a bump; one that sensors do not share is no tone."""
+    """Judge a bump; one that sensors do not share is no tone.
+
+    It is a tone where an envelope or a window lies 4.5 standard deviations from those of Gaussian records. If it does
+    not, though in half of the tones of the same spectrum one would lie twice as far, it is none. Else the likelihood
+    ratio decides, surely from three nats.
+    """
+    rare, sure = 4.5, 3.0
     several = int((peak.variance > 3 * peak.variance_sd).sum()) > 1
     if peak.gain is None and several:
         return Steadiness(tone=False, open=False, slow=False)
@@ -58,22 +60,25 @@ def steadiness(comparison: Comparison, peak: Oscillation) -> Steadiness:
     smooth = _smoothed(squared_modulus(bins))
     usual = _Usual.of(_drawn(smooth, generator))
     ridge, steady = usual.scores(bins[None])
-    if max(float(ridge), float(steady)) > _FIRES:
-        return Steadiness(tone=True, open=False, slow=float(ridge) > _FIRES)
+    if max(float(ridge), float(steady)) > rare:
+        return Steadiness(tone=True, open=False, slow=float(ridge) > rare)
     log_ratio = wandering_log_ratio(comparison, peak, weights)
     # What would not be seen of a tone is no proof of noise.
     would = [
         float(torch.stack(usual.scores(tones)).amax(0).median())
         for tones in _tones(peak, smooth, floor, comparison.n_samples, generator)
     ]
-    unsure = abs(log_ratio) < _SURE or (log_ratio < 0 and min(would) < _WOULD_FIRE)
+    unsure = abs(log_ratio) < sure or (log_ratio < 0 and min(would) < 2 * rare)
     return Steadiness(tone=log_ratio > 0, open=unsure, slow=float(ridge) > float(steady))
 
 
 def _baseband(comparison: Comparison, peak: Oscillation, weights: Tensor) -> tuple[Tensor, float]:
-    """Bins `(bin,)` around the bump of the sensors' weighted sum, and the power of noise in each; none without room."""
+    """Bins `(bin,)` around the bump of the sensors' weighted sum, and the power of noise in each; none without room.
+
+    Six half widths on either side.
+    """
     n = comparison.n_samples
-    reach = max(round(_REACH * peak.width * n), _LEAST // 2)
+    reach = max(round(6 * peak.width * n), _LEAST // 2)
     centre = round(peak.centre * n)
     reach = min(reach, centre - 3, n // 2 - centre - 2)
     if 2 * reach < _LEAST:
@@ -111,7 +116,7 @@ def _tones(peak: Oscillation, smooth: Tensor, floor: float, n_samples: int, gene
     energy = float((smooth - floor).clamp(min=0).sum()) / count
     diffusing = torch.randn(rows, count, generator=generator, dtype=torch.float64) * math.sqrt(4 * math.pi * width)
     phases = [diffusing.cumsum(-1)]
-    for share in (count * _SLOW, 1 / width):  # samples between changes of speed
+    for share in (count / 20, 1 / width):  # samples between changes of speed
         step = max(round(share), 2)
         knots = torch.randn(rows, 1, count // step + 2, generator=generator, dtype=torch.float64) * width
         speed = interpolate(knots, count, mode="linear", align_corners=True)[:, 0]
