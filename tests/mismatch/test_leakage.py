@@ -24,7 +24,7 @@ def test_bands_of_blocks_are_what_blocks_of_a_moving_average_show():
     blocks = torch.from_numpy(noise[: len(noise) // n * n]).view(-1, 1, n)
     seen = cross_spectra(blocks, block_bands(n)).mean(0)[:, 0, 0].real
     bands = compared_bands(N)
-    f = bands.places
+    f = bands.nodes
     power = torch.from_numpy(np.abs(sps.freqz(of_mean(LENGTH), worN=2 * np.pi * f.numpy())[1]) ** 2)
     inside = slice(len(bands.dof) - len(bands.beyond) // 8 - len(seen), len(bands.dof) - len(bands.beyond) // 8)
     np.testing.assert_allclose(bands.mean_of(power)[inside] / seen, 1.0, atol=0.08)  # 1248 blocks; 0.76 to 1.10 before
@@ -32,7 +32,7 @@ def test_bands_of_blocks_are_what_blocks_of_a_moving_average_show():
 
 def test_bands_of_flat_noise_are_its_level():
     bands = compared_bands(N)
-    torch.testing.assert_close(bands.mean_of(torch.ones_like(bands.places)), torch.ones_like(bands.dof))
+    torch.testing.assert_close(bands.mean_of(torch.ones_like(bands.nodes)), torch.ones_like(bands.dof))
 
 
 def test_a_mean_over_a_number_of_samples_that_is_not_whole():

@@ -198,7 +198,7 @@ def test_signals_have_the_spectra_that_a_mechanism_promises(name: str):
     built = effect.apply(plain, given.info, generator(16))
     assert built.shape == plain.shape
     before, after = comparison(given.recording, plain), comparison(given.recording, built)
-    places = given.bands.places
+    places = given.bands.nodes
     matrices = torch.diag_embed(before.base.spectrum(places).mT).to(torch.complex128)
     promised = effect.spectra(matrices, places).movedim(0, -1)
     expected = given.bands.mean_of(promised).movedim(-1, 0)

@@ -72,7 +72,7 @@ def test_deviances_have_the_mean_that_chance_gives_and_no_more():
     for s in range(n_runs):
         data = compared(drawn(900 + s, n=4096))
         seen = fitness(data, data.expected)
-        excess += float(seen.excess.sum()) / float(data.share.sum())
+        excess += float(seen.excess.sum()) / float(data.weight.sum())
         worse += seen.p_value < 0.05
     # A deviance has a variance of about two: 2 / 4 a nat squared, in some 25 cells of 6 sensors.
     assert abs(excess / n_runs) < 4 * math.sqrt(0.5 / (n_runs * 150))
@@ -164,7 +164,7 @@ def test_correlations_gain_what_determinants_and_traces_say():
     model = data_model(data, shape_examples(data)[-1:])
     alone = power_gains(data, model.diagonal(dim1=-2, dim2=-1).real).sum(-1)
     for b in (3, 20, len(data.d) - 1):
-        c, m, q, d = data.expected[b].numpy(), model[b].numpy(), data.observed[b].numpy(), float(data.paired[b])
+        c, m, q, d = data.expected[b].numpy(), model[b].numpy(), data.observed[b].numpy(), float(data.pair_dof[b])
         assert d > 0
         g, k = (x / np.sqrt(np.outer(x.diagonal().real, x.diagonal().real)) for x in (m, q))
         expected = -d * (np.linalg.slogdet(g)[1] + np.trace(np.linalg.solve(g, k)).real)
@@ -186,7 +186,7 @@ def test_a_bump_is_looked_for_where_it_is():
 
 def shape_examples(data: Ratios) -> list[Term]:
     ground = data.ground
-    common = Common.start(ground, data.observed - data.expected, data.worth, "ar1", tensor(0.01).log())
+    common = Common.start(ground, data.observed - data.expected, data.information, "ar1", tensor(0.01).log())
     return [
         Shift.start(ground),
         replace(LowPass.starts(ground, "pole"), local=LowPass.starts(ground, "pole").local[22]),

@@ -111,7 +111,7 @@ def test_the_model_of_a_dictionary_has_its_spectrum():
     side = Records(model.simulate(n, batch=(4, 2), generator=generator(5)), bands(n))
     drawn = side.base.model().simulate(n, batch=(200,), generator=generator(6))
     again = cross_spectra(drawn, side.bands).mean(0).diagonal(dim1=-1, dim2=-2).real.mT
-    fitted = side.bands.mean_of(side.base.spectrum(side.bands.places))
+    fitted = side.bands.mean_of(side.base.spectrum(side.bands.nodes))
     sd = 1 / torch.sqrt(200 * side.bands.dof)
     # Leakage of what is slower than the record adds to the lowest bands.
     assert ((again / fitted - 1).abs() / sd)[:, 3:].max() < 5
@@ -230,7 +230,7 @@ def test_gains_of_powers_are_those_of_the_law_of_f():
     given = walking(21)
     data = ratios(given)
     factors = torch.linspace(-1.0, 2.0, len(data.d), dtype=torch.float64)[:, None].expand(-1, given.n_sensors)
-    found = power_gains(data, factors.exp()) / data.share
+    found = power_gains(data, factors.exp()) / data.weight
     for b in (0, 3, 20, 40):
         law = stats.f(2 * float(data.d[b]), 2 * float(data.s[b]))
         r, h = data.ratio[b].numpy(), float(factors[b, 0])

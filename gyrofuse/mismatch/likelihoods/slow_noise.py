@@ -202,7 +202,7 @@ def told(comparison: Comparison) -> Told:
         missed = float(uncertainty.at_zero_power(_LOWEST / dof.new_tensor([n])).mean())
     return Told(
         torch.cat([comparison.reference.power[:, seen], first], -1),
-        torch.cat([bands.mean_of(every.spectrum(bands.places))[:, seen], atoms], -1),
+        torch.cat([bands.mean_of(every.spectrum(bands.nodes))[:, seen], atoms], -1),
         torch.cat([dof[seen], worth]),
         slowest,
         n,

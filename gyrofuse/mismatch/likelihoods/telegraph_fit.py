@@ -162,12 +162,12 @@ def excess(comparison: Comparison) -> Excess:
     bands = comparison.bands
     d, s = bands.dof, comparison.reference.dof
     worth = d * s / (d + s).clamp(min=1e-9)
-    ground = bands.mean_of(comparison.base.spectrum(bands.places))
+    ground = bands.mean_of(comparison.base.spectrum(bands.nodes))
     times = torch.logspace(
         math.log10(_SHORTEST), math.log10(comparison.n_samples * _LONGEST), _TIMES, dtype=torch.float64
     )
     phi = (-1 / times).exp()[:, None]
-    shape = bands.mean_of(AR1._spectrum(bands.places, phi, 1 - phi.square()))[:, None]  # (time, 1, band)
+    shape = bands.mean_of(AR1._spectrum(bands.nodes, phi, 1 - phi.square()))[:, None]  # (time, 1, band)
     power = comparison.observed.power
     size = torch.zeros(_TIMES, comparison.n_sensors, 1, dtype=torch.float64)
     for _ in range(_SCORING):

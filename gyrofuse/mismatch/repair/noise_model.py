@@ -58,7 +58,7 @@ def _shared_parts(comparison: Comparison) -> Tensor | None:
     `(part, sensor, sensor)`, by least squares from the coherences of all bands, those in phase.
     """
     side, p = comparison.reference, comparison.n_sensors
-    parts = Parts(side.base, side.bands.places)
+    parts = Parts(side.base, side.bands.nodes)
     shares = side.bands.mean_of(parts.densities)  # (part, sensor, band)
     shares = (shares / shares.sum(0)).sqrt()
     weight = 2 * side.dof

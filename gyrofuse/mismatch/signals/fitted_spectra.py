@@ -52,21 +52,21 @@ class SpectralUncertainty:
         A variance at zero has no spread where it was estimated. Here it has that of the information in as many samples,
         and so have all numbers where the fit gave none.
         """
-        told = model.estimated_from
-        if told is None:
+        estimate = model.estimated_from
+        if estimate is None:
             return None
         n_params = len(model.param_names)
         given = torch.full((n_params, n_params), torch.nan, dtype=torch.float64)
-        if told.param_cov is not None:
-            given = told.param_cov.detach().to(torch.float64)
+        if estimate.param_cov is not None:
+            given = estimate.param_cov.detach().to(torch.float64)
         fitted = given.diagonal().isfinite()
         none = given.diagonal() == 0
         covariance = given.nan_to_num(nan=0.0)
         if bool((none | ~fitted).any()):
-            least = _inverse_information(model, told.n_samples)
+            least = _inverse_information(model, estimate.n_samples)
             covariance = torch.where(~fitted[:, None] | ~fitted, least, covariance)
             covariance[none, none] = least.diagonal()[none]
-        return cls(model, covariance, told.n_samples, torch.tensor(list(_zeros(model))))
+        return cls(model, covariance, estimate.n_samples, torch.tensor(list(_zeros(model))))
 
     @cached_property
     def root(self) -> Tensor:
@@ -108,13 +108,13 @@ def as_array(model: Model, n_sensors: int) -> ArrayModel:
 
     The same numbers for all sensors are one estimate, whose errors they share.
     """
-    params, told = model.params, model.estimated_from
+    params, estimate = model.params, model.estimated_from
     if params.ndim == 2:
-        own = [own_record(told, i) for i in range(n_sensors)]
+        own = [own_record(estimate, i) for i in range(n_sensors)]
         return ArrayModel.from_sensors(
             [model.with_params(row, estimated_from=one) for row, one in zip(params, own, strict=True)]
         )
-    one = model.with_params(params, estimated_from=told)
+    one = model.with_params(params, estimated_from=estimate)
     array = ArrayModel.from_sensors([one] * n_sensors)
     alone = SpectralUncertainty.of(ArrayModel.from_sensors([one]))
     if alone is None:
@@ -126,11 +126,11 @@ def as_array(model: Model, n_sensors: int) -> ArrayModel:
     return ArrayModel(array.components, estimated_from=EstimatedFrom(alone.n_samples, whole))
 
 
-def own_record(told: EstimatedFrom | None, i: int) -> EstimatedFrom | None:
+def own_record(estimate: EstimatedFrom | None, i: int) -> EstimatedFrom | None:
     """What one of several sensors was estimated from."""
-    if told is None or told.param_cov is None:
-        return told
-    return EstimatedFrom(told.n_samples, told.param_cov[i])
+    if estimate is None or estimate.param_cov is None:
+        return estimate
+    return EstimatedFrom(estimate.n_samples, estimate.param_cov[i])
 
 
 def _zeros(model: ArrayModel) -> Iterator[bool]:

@@ -89,9 +89,9 @@ def fit_base(power: Tensor, bands: Bands, n_samples: int, dof: Tensor) -> NoiseS
         power: Densities per sample.
         bands: Where they are means.
         n_samples: Of the records to describe.
-        dof: What each band is worth, complex ordinates, `(band,)`; 0 leaves it out.
+        dof: Complex ordinates of each band, `(band,)`; 0 leaves it out.
     """
-    atoms = bands.mean_of(_atoms(n_samples, bands.places))  # (atom, band)
+    atoms = bands.mean_of(_atoms(n_samples, bands.nodes))  # (atom, band)
     root, known = dof.sqrt(), dof > 0
     fitted, free = torch.where(known, power, 1.0), None
     power = torch.where(known, power, 0.0)
@@ -123,8 +123,8 @@ def atom_covariances(n_samples: int, block: int, n_blocks: int) -> Tensor:
     quantized = torch.zeros_like(lags[:1])
     quantized[0, :2] = torch.tensor([2.0, -1.0]) / block**2
     lags = torch.cat([lags[:1], quantized, lags[1:]])
-    place = torch.arange(n_blocks)
-    return lags[:, (place[:, None] - place).abs()]
+    at = torch.arange(n_blocks)
+    return lags[:, (at[:, None] - at).abs()]
 
 
 def _atoms(n_samples: int, f: Tensor) -> Tensor:

@@ -24,7 +24,7 @@ from gyrofuse._base.transforms import fast_length
 _TAPERS = 4  # an even number
 _PER_OCTAVE = 4
 _TAPERED = 0.1  # share of the record under the ends of a light taper: spectral lines leak as far as twenty bins
-N_PLACES = 8  # frequencies whose mean stands for the mean over a band
+N_NODES = 8  # frequencies whose mean stands for the mean over a band
 _FIRST_BIN = 3  # below, positive and negative frequencies overlap
 
 
@@ -36,7 +36,7 @@ class Bands:
         n_samples: T.
         edges: First bin of each band, and the bin after the last.
         frequency: Geometric mean of each band's ends, cycles per sample, `(band,)`.
-        dof: Independent complex ordinates that a band's mean is worth, `(band,)`: the squared mean over the variance
+        dof: Independent complex ordinates of a band's mean, `(band,)`: the squared mean over the variance
             of a power is `dof`.
     """
 
@@ -46,14 +46,14 @@ class Bands:
     dof: Tensor
 
     def mean_of(self, density: Tensor) -> Tensor:
-        """Means over the bands of values `(..., place)` at `places`."""
-        return density.unflatten(-1, (-1, N_PLACES)).mean(-1)
+        """Means over the bands of values `(..., node)` at `nodes`."""
+        return density.unflatten(-1, (-1, N_NODES)).mean(-1)
 
     @property
-    def places(self) -> Tensor:
-        """Frequencies `(band * place,)`, cycles per sample, whose mean stands for the mean over a band."""
+    def nodes(self) -> Tensor:
+        """Frequencies `(band * node,)`, cycles per sample, whose mean stands for the mean over a band."""
         edges = torch.tensor(self.edges, dtype=torch.float64)
-        share = (torch.arange(N_PLACES, dtype=torch.float64) + 0.5) / N_PLACES
+        share = (torch.arange(N_NODES, dtype=torch.float64) + 0.5) / N_NODES
         bins = edges[:-1, None] - 0.5 + (edges.diff())[:, None] * share
         return (bins / self.n_samples).flatten()
 

@@ -185,7 +185,7 @@ class Records:
         Means over as many bands as it takes: an inverse from too few ordinates would be too large.
         """
         dof = self.bands.dof
-        size = self.bands.mean_of(base.spectrum(self.bands.places)).mT.sqrt()  # (band, sensor)
+        size = self.bands.mean_of(base.spectrum(self.bands.nodes)).mT.sqrt()  # (band, sensor)
         total = _sums(self.spectra / size[:, :, None] / size[:, None, :] * dof[:, None, None])
         worth = _sums(dof)
         wanted = min(_ORDINATES * self.signal.shape[-2], float(dof.sum()))

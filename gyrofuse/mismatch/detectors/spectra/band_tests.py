@@ -21,17 +21,17 @@ def spectrum_test(comparison: Comparison) -> TestResult:
     Those of a fitted model are fewer by what its numbers may be off.
     """
     tails = power_tails(comparison)
-    places = int(tails.isfinite().sum())
-    if not places:
+    count = int(tails.isfinite().sum())
+    if not count:
         return TestResult("spectrum", 1.0, "the simulation is too short to compare spectra with")
     sensor, band = divmod(int(tails.nan_to_num(nan=1.0).argmin()), tails.shape[1])
     p = float(tails[sensor, band])
-    which = (tails < 0.05 / places).nonzero()
+    which = (tails < 0.05 / count).nonzero()
     ratio = float(comparison.observed.power[sensor, band] / comparison.reference.power[sensor, band])
     f = float(comparison.bands.frequency[band]) * comparison.info.rate
     return TestResult(
         "spectrum",
-        sidak(p, places),
+        sidak(p, count),
         f"power near {f:.3g} Hz is {ratio:.3g} times the simulation's in sensor {comparison.info.sensors[sensor]}",
         sensors=tuple(sorted({int(i) for i in which[:, 0]})) or (sensor,),
         levels=tuple(sorted({level_of(float(comparison.bands.frequency[b])) for b in which[:, 1].tolist() or [band]})),
@@ -63,15 +63,15 @@ def _other_size(comparison: Comparison, sizes: LineSizes) -> TestResult:
     """The simulation's line whose amplitude in the recording is the most surprising."""
     sensor, at = sizes.worst
     ratio = float(sizes.observed[sensor, at] / sizes.reference[sensor, at].clamp(min=1e-300))
-    place = comparison.reference.lines[at]
-    f, tails = place * comparison.info.rate, sizes.tails
+    line = comparison.reference.lines[at]
+    f, tails = line * comparison.info.rate, sizes.tails
     which = (tails[:, at] < 0.05 / tails.numel()).nonzero()[:, 0].tolist() or [sensor]
     return TestResult(
         "line",
         sizes.p_value,
         f"the line at {f:.6g} Hz has {ratio:.3g} times the simulation's amplitude in {comparison.info.named([sensor])}",
         sensors=tuple(which),
-        levels=(level_of(place),),
+        levels=(level_of(line),),
         frequency_hz=f,
     )
 

@@ -50,10 +50,10 @@ class FitVerdict:
     def words(self) -> str:
         """In sentences."""
         p = {"component_missing": self.outside, "other_numbers": self.parameters, "within_uncertainty": self.exact}
-        told = f" ({p_words(p[self.kind])})" if self.kind in p else ""
+        p_value = f" ({p_words(p[self.kind])})" if self.kind in p else ""
         return (
             f"The model was fitted to {self.n_samples} samples, and spectra are compared beside what its numbers may "
-            f"be off: they {_WORDS[self.kind]}{told}."
+            f"be off: they {_WORDS[self.kind]}{p_value}."
         )
 
     def to_dict(self) -> dict[str, Any]:

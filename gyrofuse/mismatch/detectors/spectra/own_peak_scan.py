@@ -6,7 +6,7 @@ score. A hump moves `u` by `a`; where `e` is the share of sensors that have it,
 
     prod_i (1 - e + e exp(a u_i - a^2 / 2))
 
-has expectation one where nothing stands out, and so has its mean over places, widths, sizes and shares.
+has expectation one where nothing stands out, and so has its mean over positions, widths, sizes and shares.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from gyrofuse.mismatch.detectors.spectra.shared_peak_scan import LOWEST, SMOOTH,
 from gyrofuse.mismatch.stats.multiplicity import e_value_of_some
 
 
-def scanned_own_peaks(power: Tensor, worth: float, levels: Tensor, width: float) -> Iterator[Stretches]:
+def scanned_own_peaks(power: Tensor, ordinates: float, levels: Tensor, width: float) -> Iterator[Stretches]:
     """Humps of half widths from four bins, a root of two apart, every half of a half width.
 
     Args:
         power: Of bins `(sensor, bin)`, of sensors that share nothing.
-        worth: Independent ordinates in a bin.
+        ordinates: Number of independent ordinates in a bin.
         levels: Correlations of ordinates of noise whose level varies, `(sensor, distance)`.
         width: Of a bin, in bins of the record, of which those distances are.
     """
@@ -37,7 +37,7 @@ def scanned_own_peaks(power: Tensor, worth: float, levels: Tensor, width: float)
         cell = max(int(half / 4), 1)
         cells = power[:, : n_bins // cell * cell].unflatten(-1, (-1, cell)).mean(-1)
         shape = _shape(cells.shape[-1], half / cell)
-        independent = cell * worth / inflation(levels, shape - shape.mean(), cell * width)[:, None]
+        independent = cell * ordinates / inflation(levels, shape - shape.mean(), cell * width)[:, None]
         score, whole = _scores(cells, shape, independent, -(-LOWEST // cell))
         centre = torch.arange(cells.shape[-1]) * cell + cell // 2
         which = (whole & (centre > 8 * half)).nonzero()[:, 0][:: max(round(half / 2 / cell), 1)]
@@ -57,13 +57,13 @@ def _shape(n_cells: int, half: float) -> Tensor:
     return 1 / (1 + (torch.arange(-reach, reach + 1, dtype=torch.float64) / half).square())
 
 
-def _scores(cells: Tensor, shape: Tensor, worth: Tensor, lowest: int) -> tuple[Tensor, Tensor]:
+def _scores(cells: Tensor, shape: Tensor, ordinates: Tensor, lowest: int) -> tuple[Tensor, Tensor]:
     """Normal scores of a hump centred on each cell `(sensor, cell)`, and whether four fifths of it lie in the spectrum.
 
     Args:
         cells: Their mean powers, `(sensor, cell)`.
         shape: Of the hump, cell by cell.
-        worth: Independent ordinates in a cell, `(sensor, 1)`.
+        ordinates: Number of independent ordinates in a cell, `(sensor, 1)`.
         lowest: Cells that are left out.
     """
     kernels = torch.stack([torch.ones_like(shape), shape, shape.square()])[:, None]
@@ -72,12 +72,12 @@ def _scores(cells: Tensor, shape: Tensor, worth: Tensor, lowest: int) -> tuple[T
     count, first, second = _around(used, kernels)[:, 0]
     total, along = _around(cells * used, kernels[:2])
     count = count.round().clamp(min=1.0)  # whole, but for the rounding of transforms
-    variance = (second - first.square() / count).clamp(min=1e-9) / worth
+    variance = (second - first.square() / count).clamp(min=1e-9) / ordinates
     standard = (along * count / total.clamp(min=1e-300) - first) / variance.sqrt()
     away = shape - shape.mean()
     skewness = float(away.pow(3).sum() / away.square().sum().pow(1.5)) * math.sqrt(len(shape))
     inside = (1 - skewness / math.hypot(skewness, 2.0)) / 2
-    return _normal_of_share(standard, inside, len(shape) * worth), count > 0.8 * len(shape)
+    return _normal_of_share(standard, inside, len(shape) * ordinates), count > 0.8 * len(shape)
 
 
 def _around(rows: Tensor, kernels: Tensor) -> Tensor:

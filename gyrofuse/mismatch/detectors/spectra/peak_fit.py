@@ -71,8 +71,8 @@ class Background(Term):
         return cls(torch.zeros(2, n_sensors, dtype=torch.float64), free, torch.zeros(0, dtype=torch.float64))
 
     def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
-        low, high = ground.places[0], ground.places[-1]
-        x = (2 * ground.places - low - high) / (high - low)
+        low, high = ground.nodes[0], ground.nodes[-1]
+        x = (2 * ground.nodes - low - high) / (high - low)
         return (local[..., 0, :, None] + local[..., 1, :, None] * x).exp()
 
     def within(self) -> Background:
@@ -113,7 +113,7 @@ def _in_cells(comparison: Comparison, stretch: Stretch) -> Oscillation | None:
     if data is None:
         return None
     # Where a filter takes two fifths off, flanks are not alike: the whole spectrum has to decide.
-    nodes = data.ground.places[[0, -1]]
+    nodes = data.ground.nodes[[0, -1]]
     first, last = (int((comparison.bands.frequency - f).abs().argmin()) for f in nodes)
     passed = comparison.observed.power / comparison.reference.power.clamp(min=1e-300)
     if float(passed[:, first : last + 1].mean(0).min()) < 0.6:
@@ -140,7 +140,7 @@ def _best(comparison: Comparison, stretch: Stretch, data: Ratios, background: Fi
         own = fit(data, [*company, Peak(peak.local, peak.free, peak.shared, least)])
         tried.append(own)
         if p > 1:
-            source = CommonBump.start(ground, excess, data.worth, "oscillation", own.terms[-1].shared)
+            source = CommonBump.start(ground, excess, data.information, "oscillation", own.terms[-1].shared)
             source = CommonBump(source.local, source.free, source.shared, narrowest=least)
             tried.append(fit(data, [*company, source]))
     best = max(tried, key=value)

@@ -26,7 +26,7 @@ from gyrofuse.mismatch.stats.multiplicity import p_value_from_e_value, sidak
 
 # Bins of a spectrum under the light taper, a tenth of which is at either end, for an independent one in far tails.
 _DEPENDENT = 1.15
-_AS_WELL = 0.01  # p value at which the simulation has a peak as well, or it is not worth a comparison
+_AS_WELL = 0.01  # p value at which the simulation has a peak as well, or is too faint to be compared
 
 
 class Stretch(NamedTuple):
@@ -70,11 +70,11 @@ def strongest_peak(comparison: Comparison) -> Stretch:
     transform, length = _transformed(comparison.lineless)
     last = int((0.5 - 2 / comparison.n_samples) * length)
     transform = transform[:, :last]
-    worth = comparison.n_samples / length / _DEPENDENT
+    ordinates = comparison.n_samples / length / _DEPENDENT
     levels, width = level_correlations(comparison.lineless), comparison.n_samples / length
-    scans = list(scanned_own_peaks(squared_modulus(_apart(transform, length, comparison)), worth, levels, width))
+    scans = list(scanned_own_peaks(squared_modulus(_apart(transform, length, comparison)), ordinates, levels, width))
     if comparison.n_sensors > 1:
-        scans += scanned_shared_peaks(transform, worth, levels, width)
+        scans += scanned_shared_peaks(transform, ordinates, levels, width)
     power, nothing = squared_modulus(transform), Stretch(0.25, 0.5, 1.0, tuple(range(comparison.n_sensors)))
     reference: tuple[Tensor, int] | None = None
     for _ in range(tries if scans else 0):
@@ -84,7 +84,7 @@ def strongest_peak(comparison: Comparison) -> Stretch:
             return nothing
         means = [torch.logsumexp(scan.log_ratio, 0) - math.log(len(scan.first)) for scan in scans]
         p_value = p_value_from_e_value(float(torch.logsumexp(torch.stack(means), 0)) - math.log(len(scans)))
-        sensors = _alone(power, a, n, n * worth)
+        sensors = _alone(power, a, n, n * ordinates)
         stretch = Stretch((a + (n - 1) / 2) / length, n / length, p_value, sensors)
         if p_value > _AS_WELL:
             return stretch
@@ -148,7 +148,7 @@ def _has_it(reference: tuple[Tensor, int], stretch: Stretch, comparison: Compari
         bins[..., b : b + wide_as].flatten(1) for b, wide_as in ((a, n), (a - gap - wide, wide), (a + n + gap, wide))
     )
     flanks = torch.cat([left, right], -1)
-    worth = comparison.reference.signal.shape[-1] / length / _DEPENDENT
-    m, f = max(inside.shape[-1] * worth, 1.0), flanks.shape[-1] * worth
+    ordinates = comparison.reference.signal.shape[-1] / length / _DEPENDENT
+    m, f = max(inside.shape[-1] * ordinates, 1.0), flanks.shape[-1] * ordinates
     log_ratio = log_ratios((inside @ inside.mH)[None], (flanks @ flanks.mH)[None], m, f)
     return p_value_from_e_value(float(log_ratio)) < _AS_WELL

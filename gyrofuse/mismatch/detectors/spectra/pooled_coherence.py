@@ -1,4 +1,4 @@
-"""Witness of what sensors share over a broad band: coherences pooled over neighbouring bands."""
+"""Test of what sensors share over a broad band: coherences pooled over neighbouring bands."""
 
 from __future__ import annotations
 
@@ -71,16 +71,16 @@ def common_source(comparison: Comparison) -> Source | None:
     white = whitened_difference(one, other, d, s)
     starts, ends = _runs(len(d))
 
-    def sums(matrices: Tensor, worth: Tensor) -> Tensor:
+    def sums(matrices: Tensor, dof: Tensor) -> Tensor:
         """Of whole runs, in units of their noise, with no diagonal."""
-        total = torch.cat([torch.zeros(1, p, p, dtype=white.dtype), (matrices * worth[:, None, None]).cumsum(0)])
-        weight = torch.cat([torch.zeros_like(worth[:1]), worth.cumsum(0)])
+        total = torch.cat([torch.zeros(1, p, p, dtype=white.dtype), (matrices * dof[:, None, None]).cumsum(0)])
+        weight = torch.cat([torch.zeros_like(dof[:1]), dof.cumsum(0)])
         size = ((weight[ends] - weight[starts]) * neighbours).sqrt()
         run = (total[ends] - total[starts]) / size[:, None, None]
         return run - torch.diag_embed(run.diagonal(dim1=-2, dim2=-1))
 
     difference, alone, reference = sums(white, d * s / (d + s)), sums(one, d), sums(other, s)
-    found, nothing, places = [], True, _places(len(d))
+    found, nothing, counts = [], True, _counts(len(d))
     for real in (True, False):  # in phase but for signs, or any
         apart, observed, had = ((m.real.to(m.dtype) if real else m) for m in (difference, alone, reference))
         values, vectors = torch.linalg.eigh(observed)  # one source has one direction
@@ -91,15 +91,15 @@ def common_source(comparison: Comparison) -> Source | None:
         independent = along < absent * min(1.0, float(s.sum() / d.sum())) * spread
         largest = torch.where(independent, size.abs(), torch.linalg.eigvalsh(apart).abs().amax(-1))
         tails = torch.tensor([_tail(float(x), p, real) for x in largest], dtype=torch.float64)
-        run = int((tails * places).argmin())
+        run = int((tails * counts).argmin())
         pairs = torch.triu_indices(p, p, 1)
         shared = (observed if bool(independent[run]) else apart)[run][pairs[0], pairs[1]].abs()
-        place = pairs[:, int(shared.argmax())]
+        sensors = pairs[:, int(shared.argmax())]
         bands = known.nonzero()[:, 0]
         first, last = int(bands[starts[run]]), int(bands[ends[run] - 1])
-        value = sidak(float(tails[run]), 2 * float(places[run]))
+        value = sidak(float(tails[run]), 2 * float(counts[run]))
         absent = bool((along < surely * spread)[run])
-        found.append(Source(value, first, last, (int(place[0]), int(place[1])), absent))
+        found.append(Source(value, first, last, (int(sensors[0]), int(sensors[1])), absent))
         shown = float(torch.linalg.eigvalsh(had).abs().max())
         nothing &= sidak(_tail(shown, p, real), 2 * len(largest)) > shares_p_value
     best = min(found, key=lambda source: source.p_value)
@@ -142,8 +142,8 @@ def _runs(n_bands: int) -> tuple[Tensor, Tensor]:
     return torch.tensor(starts), torch.tensor(ends)
 
 
-def _places(n_bands: int) -> Tensor:
-    """How many places each run stands for, `(run,)`: lengths have equal shares of the chances."""
+def _counts(n_bands: int) -> Tensor:
+    """Runs that each stands for, `(run,)`: lengths have equal shares of the chances."""
     starts, ends = _runs(n_bands)
     _, kind, count = (ends - starts).unique(return_inverse=True, return_counts=True)
     return (count[kind] * len(count)).to(torch.float64)

@@ -16,7 +16,7 @@ def power_differs(comparison: Comparison, level: float) -> bool:
 
     Args:
         comparison: Recording and simulation.
-        level: p value of one witness that would be a mismatch.
+        level: p value of one test that would be a mismatch.
     """
     if bool(gaussian_sensors(comparison.reference).all()):
         return True

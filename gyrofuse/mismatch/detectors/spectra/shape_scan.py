@@ -40,7 +40,7 @@ _FEWEST = 10.0  # complex ordinates of a whole spectrum, below which there is no
 
 
 class Shapes(NamedTuple):
-    """Differences of log power that are looked for.
+    """Differences of log power that are scanned.
 
     Attributes:
         log_factors: Differences, `(shape, sensor, band)`.
@@ -188,7 +188,7 @@ def _levels(comparison: Comparison, ground: Ground) -> Tensor:
 
 def _shapes(data: Ratios, n_samples: int) -> Shapes:
     """All shapes in all sizes, peaks last."""
-    ground, f = data.ground, data.ground.places
+    ground, f = data.ground, data.ground.nodes
     sine, mean_of = torch.sin(math.pi * f).square(), ground.bands.mean_of
     peaks = _peaks(n_samples)
     phi = torch.exp(-2 * math.pi * _corners(n_samples))[:, None]
@@ -201,7 +201,7 @@ def _shapes(data: Ratios, n_samples: int) -> Shapes:
     corners = torch.tensor([0.01, 0.04, 0.12, 0.35], dtype=torch.float64)
     passed = filter_power("sampled", filter_strength("sampled", corners), f)
     filtered = (mean_of(ground.density * passed[:, None]) / ground.mean).log()
-    information = (data.worth[:, None] * data.usable).mT
+    information = (data.information[:, None] * data.usable).mT
 
     def unit(weak: Tensor) -> Tensor:
         length = (information * weak.square()).sum(-1, keepdim=True).sqrt()
@@ -214,8 +214,8 @@ def _shapes(data: Ratios, n_samples: int) -> Shapes:
     prior = -(counts * len(counts) * len(_SIZES)).to(torch.float64).log().repeat_interleave(counts)
     last = len(prior) - len(peaks)
     order = [part.flatten(0, 1) for part in (log_factors[:, :last], log_factors[:, last:])]
-    places = (prior[:last].repeat(len(_SIZES)), prior[last:].repeat(len(_SIZES)))
-    return Shapes(torch.cat(order), torch.cat(places), peaks.repeat(len(_SIZES), 1))
+    priors = (prior[:last].repeat(len(_SIZES)), prior[last:].repeat(len(_SIZES)))
+    return Shapes(torch.cat(order), torch.cat(priors), peaks.repeat(len(_SIZES), 1))
 
 
 def _corners(n_samples: int) -> Tensor:

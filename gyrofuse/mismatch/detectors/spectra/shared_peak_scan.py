@@ -1,4 +1,4 @@
-"""A mean likelihood ratio over places, widths and sizes of a bump that one source of all sensors makes.
+"""A mean likelihood ratio over positions, widths and sizes of a bump that one source of all sensors makes.
 
 With `K` the sum of `z z^H` over the `m` bins of a stretch, `F` that over the `f` bins of its flanks and `W = K + F`, a
 source whose power is `a` times that of the noise and that moves the sensors along `u`, both in coordinates in which the
@@ -51,12 +51,14 @@ def least_flank(width: int) -> int:
     return max(round(1.5 * width), 24)
 
 
-def scanned_shared_peaks(transform: Tensor, worth: float, levels: Tensor, width_of_bin: float) -> Iterator[Stretches]:
+def scanned_shared_peaks(
+    transform: Tensor, ordinates: float, levels: Tensor, width_of_bin: float
+) -> Iterator[Stretches]:
     """Stretches of 4, 8, 16, .. bins that overlap by half.
 
     Args:
         transform: Of whitened samples of two sensors or more, `(sensor, bin)`.
-        worth: Independent ordinates in a bin.
+        ordinates: Number of independent ordinates in a bin.
         levels: Correlations of ordinates of noise whose level varies, `(sensor, distance)`.
         width_of_bin: In bins of the record, of which those distances are.
     """
@@ -73,7 +75,7 @@ def scanned_shared_peaks(transform: Tensor, worth: float, levels: Tensor, width_
             return
         flank = torch.full((reach,), -1 / (2 * reach), dtype=torch.float64)
         contrast = torch.cat([flank, flank.new_tensor([0.0, 0.5, 0.5, 0.0]), flank])  # in halves of a stretch
-        own = worth / float(inflation(levels, contrast, half * width_of_bin).amax())
+        own = ordinates / float(inflation(levels, contrast, half * width_of_bin).amax())
         logs = []
         for a in range(first, last + 1, at_once):
             b = min(a + at_once, last + 1)

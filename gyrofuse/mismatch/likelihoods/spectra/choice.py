@@ -258,7 +258,7 @@ def _varied(data: Ratios, found: Fit) -> Fit:
     *others, last = found.terms
     if not isinstance(last, Common):
         return found
-    t = last.told(found.sd_alone(-1))
+    t = last.t_values(found.sd_alone(-1))
     seen = (t >= SURE_GAIN) | (t >= t.topk(2).values[-1])
     forms = [[*others, form] for form in last.variants(data.ground, seen)]
     # A part is no more than the whole.

@@ -20,13 +20,13 @@ def smooth_coherence(coherence: Tensor, dof: Tensor) -> Tensor:
     p = coherence.shape[-1]
     wanted = min(_ORDINATES * p, float(dof.sum()))
     weighted = torch.cat([torch.zeros_like(coherence[:1]), (coherence * dof[:, None, None]).cumsum(0)])
-    worth = torch.cat([torch.zeros_like(dof[:1]), dof.cumsum(0)])
+    ordinates_to = torch.cat([torch.zeros_like(dof[:1]), dof.cumsum(0)])
     eye, smooth = torch.eye(p, dtype=coherence.dtype), []
     for b in range(len(dof)):
         low, high = b, b + 1
-        while worth[high] - worth[low] < wanted and (low, high) != (0, len(dof)):
+        while ordinates_to[high] - ordinates_to[low] < wanted and (low, high) != (0, len(dof)):
             low, high = max(low - 1, 0), min(high + 1, len(dof))
-        ordinates = worth[high] - worth[low]
+        ordinates = ordinates_to[high] - ordinates_to[low]
         c = (weighted[high] - weighted[low]) / ordinates.clamp(min=1e-9)
         size = c.diagonal().real.clamp(min=1e-9).rsqrt()
         c = c * size[:, None] * size
@@ -37,7 +37,7 @@ def smooth_coherence(coherence: Tensor, dof: Tensor) -> Tensor:
 
 
 def decorrelated(transform: Tensor, edges: Sequence[int], dof: Tensor) -> Tensor:
-    """Fourier transform `(sensor, bin)` without the coherence of bands, which are worth `dof`."""
+    """Fourier transform `(sensor, bin)` without the coherence of bands, which are ordinates_to `dof`."""
     parts = [transform[:, a:b] for a, b in itertools.pairwise(edges)]
     matrices = torch.stack([part @ part.mH for part in parts])
     size = matrices.diagonal(dim1=-1, dim2=-2).real.clamp(min=1e-300).rsqrt()

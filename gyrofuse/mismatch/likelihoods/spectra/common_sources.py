@@ -64,8 +64,8 @@ class Common(Term):
     def everywhere(self, ground: Ground) -> Term:
         return self
 
-    def told(self, sd: Tensor) -> Tensor:
-        """Standard deviations that each sensor's gain is from zero, `(sensor,)`, by those of its parts `sd`."""
+    def t_values(self, sd: Tensor) -> Tensor:
+        """Gains over their standard deviations, `(sensor,)`, from those of their parts `sd`."""
         return (self.variance.sqrt() / sd.square().nanmean(0).sqrt()).nan_to_num(nan=0.0)
 
     def matrix(self) -> Tensor:
@@ -83,7 +83,7 @@ class Common(Term):
 
     def shape(self, ground: Ground, shared: Tensor) -> Tensor:
         """Density of the source, `(..., node)`."""
-        return common_density(self.kind, ground.places, shared.exp())
+        return common_density(self.kind, ground.nodes, shared.exp())
 
     def within(self) -> Common:
         return replace(self, shared=self.shared.clamp(max=math.log(0.45))) if self.kind == "ar1" else self
@@ -112,24 +112,26 @@ class Common(Term):
         return [form for form in every if (form.turned, form.inside) != (self.turned, self.inside)]
 
     @classmethod
-    def starts(cls, ground: Ground, excess: Tensor, worth: Tensor, kind: str, shared: Tensor) -> tuple[Common, Common]:
+    def starts(
+        cls, ground: Ground, excess: Tensor, information: Tensor, kind: str, shared: Tensor
+    ) -> tuple[Common, Common]:
         """In phase but for signs, and with any phases; arguments as of `start`."""
         free = torch.tensor([[True], [False]]).expand(2, excess.shape[-1])
-        aligned = cls.start(ground, excess.real.to(excess.dtype), worth, kind, shared)
+        aligned = cls.start(ground, excess.real.to(excess.dtype), information, kind, shared)
         # Vectors of real matrices are real but for a factor.
         g = aligned.gain
         g = (g * g[g.abs().argmax()].conj().sgn()).real
         local = torch.stack([g, torch.zeros_like(g)])
-        return replace(aligned, local=local, free=free), cls.start(ground, excess, worth, kind, shared)
+        return replace(aligned, local=local, free=free), cls.start(ground, excess, information, kind, shared)
 
     @classmethod
-    def start(cls, ground: Ground, excess: Tensor, worth: Tensor, kind: str, shared: Tensor) -> Common:
+    def start(cls, ground: Ground, excess: Tensor, information: Tensor, kind: str, shared: Tensor) -> Common:
         """Gains from the strongest direction of an excess.
 
         Args:
             ground: Noise of the reference.
             excess: Cross-spectra beyond a model, over the noise's densities, `(band, sensor, sensor)`.
-            worth: Information of a band, `(band,)`.
+            information: Information of a band, `(band,)`.
             kind: Kind of source.
             shared: Its shared numbers.
         """
@@ -138,7 +140,7 @@ class Common(Term):
         level = ground.mean.mT.sqrt()
         c = ground.bands.mean_of(nothing.shape(ground, shared))  # (band,)
         size = c[:, None, None] / (level[:, :, None] * level[:, None, :])
-        weight = (worth[:, None, None] * size).to(excess.dtype)
+        weight = (information[:, None, None] * size).to(excess.dtype)
         gram = (excess * weight).sum(0) / (weight.real * size).sum(0)
         values, vectors = torch.linalg.eigh((gram + gram.mH) / 2)
         g = vectors[:, -1] * values[-1].clamp(min=1e-300).sqrt()

@@ -180,7 +180,7 @@ class LowPass(Term):
         return torch.full_like(self.local, 0.7), self.shared
 
     def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
-        power = filter_power(self.kind, strength_of(self.kind, local[..., 0, :]), ground.places)
+        power = filter_power(self.kind, strength_of(self.kind, local[..., 0, :]), ground.nodes)
         return torch.where(self.free[0, :, None], power, 1.0)
 
     def form_cost(self, n_sensors: int) -> float:
@@ -201,7 +201,7 @@ class Flicker(Term):
     @classmethod
     def start(cls, ground: Ground) -> Flicker:
         """A tenth of the noise where it is the largest share."""
-        unit = (ground.density * ground.places).amin(-1)
+        unit = (ground.density * ground.nodes).amin(-1)
         return cls(0.1 * unit[None], torch.ones(1, len(unit), dtype=torch.bool), NO_SHARED)
 
     @classmethod
@@ -211,7 +211,7 @@ class Flicker(Term):
         return replace(start, local=torch.logspace(-1, 6, 15, dtype=torch.float64)[:, None, None] * start.local)
 
     def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
-        return local[..., 0, :, None] / ground.places
+        return local[..., 0, :, None] / ground.nodes
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,10 +229,10 @@ class PowerLaw(Term):
     @staticmethod
     def _middle(ground: Ground) -> float:
         """`f0`: where level and slope are hardly correlated."""
-        return math.sqrt(float(ground.places[0]) * 0.5)
+        return math.sqrt(float(ground.nodes[0]) * 0.5)
 
     def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
-        falls = (self._middle(ground) / ground.places) ** shared[..., :1]
+        falls = (self._middle(ground) / ground.nodes) ** shared[..., :1]
         return local[..., 0, :, None] * falls[..., None, :]
 
     def within(self) -> PowerLaw:
@@ -274,7 +274,7 @@ class Peak(Term):
 
     def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
         centre, width = shared[..., 0, None].exp(), shared[..., 1, None].exp()
-        return local[..., 0, :, None] * oscillation(ground.places, centre, width)[..., None, :]
+        return local[..., 0, :, None] * oscillation(ground.nodes, centre, width)[..., None, :]
 
     def step_limit(self) -> tuple[Tensor, Tensor]:
         return torch.full_like(self.local, math.inf), peak_step(self.shared)

@@ -29,7 +29,7 @@ from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED
 from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum, fit_base
 from gyrofuse.mismatch.signals.psd import (
-    N_PLACES,
+    N_NODES,
     Bands,
     cross_spectra,
     degrees_of_freedom,
@@ -75,15 +75,15 @@ class BlockBands(Bands):
         frequency = torch.cat([low.log().mean(-1).exp(), bins.frequency, high.log().mean(-1).exp()])
         counts = [torch.tensor([len(group) / 2 for group in groups], dtype=torch.float64) for groups in (below, beyond)]
         dof = torch.cat([counts[0], bins.dof, counts[1]])
-        own = torch.block_diag(*[torch.full((N_PLACES, 1), 1 / N_PLACES, dtype=torch.float64)] * len(dof))
+        own = torch.block_diag(*[torch.full((N_NODES, 1), 1 / N_NODES, dtype=torch.float64)] * len(dof))
         bands = cls(bins.n_samples, bins.edges, frequency, dof, low, high, own)
         first = len(below)
-        own[:, first : first + len(bins.dof)] = _tapers_response(bins, bands.places).mT
+        own[:, first : first + len(bins.dof)] = _tapers_response(bins, bands.nodes).mT
         return bands
 
     @property
-    def places(self) -> Tensor:
-        return torch.cat([self.below.flatten(), super().places, self.beyond.flatten()])
+    def nodes(self) -> Tensor:
+        return torch.cat([self.below.flatten(), super().nodes, self.beyond.flatten()])
 
     def mean_of(self, density: Tensor) -> Tensor:
         return density @ self.response
@@ -91,7 +91,7 @@ class BlockBands(Bands):
 
 def _nodes(groups: Groups, n_samples: int) -> Tensor:
     """Frequencies whose mean stands for a group of ordinates, cycles per sample, `(group, frequency)`."""
-    share = torch.arange(N_PLACES, dtype=torch.float64).add(0.5) / N_PLACES
+    share = torch.arange(N_NODES, dtype=torch.float64).add(0.5) / N_NODES
     ends = torch.tensor([(g[0] - 0.5, g[-1] + 0.5) for g in groups], dtype=torch.float64).view(-1, 2)
     return (ends[:, :1] + ends.diff() * share) / (2 * n_samples)
 
@@ -165,7 +165,7 @@ def ratios(
     matrices, d = both.observed.mean(torch.ones(N_JUDGED, dtype=torch.bool) if blocks is None else blocks)
     reference, s = both.reference.mean(torch.ones(N_FOLDS, dtype=torch.bool) if folds is None else folds)
     usable = torch.ones(len(s), comparison.n_sensors, dtype=torch.float64)
-    nodes = both.bands.places.unflatten(0, (len(s), -1))
+    nodes = both.bands.nodes.unflatten(0, (len(s), -1))
     lowest, highest = nodes.amin(-1), nodes.amax(-1)
     reach = 2 * N_JUDGED / comparison.n_samples  # tapers of a block widen a line by two bins of a block
     if comparison.line.p_value < CERTAIN:
@@ -173,7 +173,7 @@ def ratios(
         usable[(lowest > reach / 2) & (lowest - reach < line) & (line < highest + reach)] = 0.0
     usable[lowest < comparison.reference.slowest_seen] = 0.0
     for factor in () if formed else comparison.bent:
-        changed = both.bands.mean_of(factor(both.bands.places))  # (sensor, band)
+        changed = both.bands.mean_of(factor(both.bands.nodes))  # (sensor, band)
         usable[(changed.clamp(min=1e-300).log().abs() > _CHANGED).mT] = 0.0
     ground = Ground(reference_noise(comparison), both.bands)
     power = reference.diagonal(dim1=-2, dim2=-1).real
@@ -190,7 +190,7 @@ def ratios_around(comparison: Comparison, frequency: float, width: float) -> Rat
     Args:
         comparison: Recording and reference.
         frequency: Middle, cycles per sample.
-        width: Width of what is looked at, cycles per sample: four cells.
+        width: Width of four cells, cycles per sample.
     """
     n, narrowest, most = comparison.n_samples, 5, 24  # bins of a cell, which tapers fill; cells on either side
     cell, centre = max(round(width * n / 4), narrowest), round(frequency * n)

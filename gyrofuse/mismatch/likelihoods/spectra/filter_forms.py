@@ -128,7 +128,7 @@ def filter_power(kind: str, strength: Tensor, f: Tensor) -> Tensor:
 
 
 def filter_response(kind: str, strength: Tensor, f: Tensor) -> Tensor:
-    """Complex response `(..., frequency)`; causal but for a window's, which is told without its delay."""
+    """Complex response `(..., frequency)`; causal but for a window's, which is given without its delay."""
     if kind in _POLES:
         q = strength[..., None].clamp(max=_LONGEST)
         turn = 2 * math.pi * f

@@ -72,7 +72,7 @@ def fit(data: Ratios, terms: Sequence[Term], rounds: int = 40) -> Fit:
     enough = 0.01  # nats that a further round has to gain
     terms = tuple(term.within() for term in terms)
     coherent, added = (any(x) for x in ((t.coherent for t in terms), (t.acts == "add" for t in terms)))
-    paired = bool((data.paired > 0).any()) and (coherent or (added and not data.alike))
+    paired = bool((data.pair_dof > 0).any()) and (coherent or (added and not data.independent))
     free = torch.cat([torch.cat([t.free.flatten(), torch.ones(len(t.shared), dtype=torch.bool)]) for t in terms])
     model, derivatives = linearised(data, terms)
     best = _value(data, model, terms, paired)
@@ -83,7 +83,7 @@ def fit(data: Ratios, terms: Sequence[Term], rounds: int = 40) -> Fit:
         precision = torch.cat([_precision(t) for t in terms])
         information, slope = _power_slopes(data, model, derivatives)
         if paired:
-            beside = _wishart_slopes(*_correlated(model, derivatives), correlations(data.observed), data.paired)
+            beside = _wishart_slopes(*_correlated(model, derivatives), correlations(data.observed), data.pair_dof)
             information, slope = information + beside[0], slope + beside[1]
         slope = slope - precision * vector
         information = information + precision.diag()
@@ -131,26 +131,26 @@ def _power_slopes(data: Ratios, model: Tensor, derivatives: Tensor) -> tuple[Ten
     """Information `(number, number)` and score `(number,)` of powers."""
     m = model.diagonal(dim1=-2, dim2=-1).real
     moved = (derivatives.diagonal(dim1=-2, dim2=-1).real / (m + FLOOR)).flatten(1)  # (number, band * sensor)
-    score = (data.share * power_scores(data, m)).flatten()
-    worth = (data.share * data.worth[:, None]).flatten()
-    return (moved * worth) @ moved.mT, moved @ score
+    score = (data.weight * power_scores(data, m)).flatten()
+    information = (data.weight * data.information[:, None]).flatten()
+    return (moved * information) @ moved.mT, moved @ score
 
 
 def _power_covariance(data: Ratios, model: Tensor, derivatives: Tensor) -> Tensor:
     """Covariance of the scores of powers, `(number, number)`: squared coherences of the model are correlations."""
     m = model.diagonal(dim1=-2, dim2=-1).real
-    moved = data.share * derivatives.diagonal(dim1=-2, dim2=-1).real / (m + FLOOR)  # (number, band, sensor)
-    alike = correlations(model).abs().square() * data.worth[:, None, None]
+    moved = data.weight * derivatives.diagonal(dim1=-2, dim2=-1).real / (m + FLOOR)  # (number, band, sensor)
+    alike = correlations(model).abs().square() * data.information[:, None, None]
     return torch.einsum("kbi,bij,lbj->kl", moved, alike, moved)
 
 
-def _wishart_slopes(model: Tensor, derivatives: Tensor, observed: Tensor, worth: Tensor) -> tuple[Tensor, Tensor]:
+def _wishart_slopes(model: Tensor, derivatives: Tensor, observed: Tensor, dof: Tensor) -> tuple[Tensor, Tensor]:
     """Information and score of correlation matrices."""
     inverse = torch.linalg.inv_ex(model)[0]  # of one without an inverse no step is taken
     left = inverse @ (observed - model) @ inverse
     moved = inverse @ derivatives  # (number, band, sensor, sensor)
-    full = torch.einsum("kbij,lbji->kl", moved * worth[:, None, None], moved).real
-    return full, torch.einsum("bij,kbji->k", left * worth[:, None, None], derivatives).real
+    full = torch.einsum("kbij,lbji->kl", moved * dof[:, None, None], moved).real
+    return full, torch.einsum("bij,kbji->k", left * dof[:, None, None], derivatives).real
 
 
 def _correlated(model: Tensor, derivatives: Tensor) -> tuple[Tensor, Tensor]:

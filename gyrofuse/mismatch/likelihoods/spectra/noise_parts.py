@@ -23,7 +23,7 @@ class Parts:
 
     Attributes:
         base: It.
-        f: Frequencies, cycles per sample, `(place,)`.
+        f: Frequencies, cycles per sample, `(node,)`.
     """
 
     base: NoiseSpectrum
@@ -48,7 +48,7 @@ class Parts:
 
     @cached_property
     def densities(self) -> Tensor:
-        """Of the parts, `(part, sensor, place)`."""
+        """Of the parts, `(part, sensor, node)`."""
         return torch.stack(self.coefficients) @ _atoms(self.base.n_samples, self.f)
 
     @cached_property
@@ -60,7 +60,7 @@ class Parts:
     def growing_walk(self) -> Tensor:
         """Variance of the increments of a walk that grows, `(sensor,)`: of the one there is, or of one not seen.
 
-        One that grew is told from none before: other numbers, and no physics that was left out. What stands for a walk
+        One that grew cannot be distinguished from one that came in: both are other numbers, and no physics left out. What stands for a walk
         by chance, or in short records, may level off; one that grew does not.
         """
         lacking = (_UNSEEN * self.base.coefficients - self.coefficients[2]) @ self._slowest
@@ -68,7 +68,7 @@ class Parts:
 
     @cached_property
     def grown(self) -> Tensor:
-        """Density of that walk, `(sensor, place)`."""
+        """Density of that walk, `(sensor, node)`."""
         return self.growing_walk[:, None] * _atoms(self.base.n_samples, self.f)[-1]
 
     @cached_property
@@ -115,7 +115,7 @@ class Parts:
         return total, (variances * rate).sum(0) / total.clamp(min=1e-300) / (2 * math.pi)
 
     def shifted(self, log_factors: Tensor) -> Tensor:
-        """Density with other numbers, `(..., sensor, place)`.
+        """Density with other numbers, `(..., sensor, node)`.
 
         Args:
             log_factors: Of the power of what is white, of the AR1s' plateaus, of their corners, and of the walk's
@@ -137,7 +137,7 @@ class Parts:
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """The noise of a simulation at the places of bands.
+    """The noise of a simulation in bands.
 
     Attributes:
         base: It.
@@ -148,17 +148,17 @@ class Ground:
     bands: Bands
 
     @cached_property
-    def places(self) -> Tensor:
-        """Cycles per sample, `(place,)`."""
-        return self.bands.places
+    def nodes(self) -> Tensor:
+        """Frequencies whose means stand for bands, cycles per sample, `(node,)`."""
+        return self.bands.nodes
 
     @cached_property
     def parts(self) -> Parts:
-        return Parts(self.base, self.places)
+        return Parts(self.base, self.nodes)
 
     @cached_property
     def density(self) -> Tensor:
-        """`(sensor, place)`."""
+        """`(sensor, node)`."""
         return self.parts.densities.sum(0)
 
     @cached_property

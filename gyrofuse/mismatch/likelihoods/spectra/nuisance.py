@@ -39,7 +39,7 @@ class Nuisance:
     @cached_property
     def weight(self) -> Tensor:
         """Root of the information on log powers, `(sensor, band)`."""
-        return (self.data.share * self.data.worth[:, None]).mT.sqrt()
+        return (self.data.weight * self.data.information[:, None]).mT.sqrt()
 
     @cached_property
     def directions(self) -> tuple[Tensor, Tensor]:
@@ -75,7 +75,7 @@ class Nuisance:
 
     def scores(self, log_factors: Tensor) -> Tensor:
         """Scores in log power over the roots of their information, `(sensor, band)`, at powers changed by factors."""
-        return (self.data.share * power_scores(self.data, log_factors.exp().mT)).mT / self.weight.clamp(min=1e-300)
+        return (self.data.weight * power_scores(self.data, log_factors.exp().mT)).mT / self.weight.clamp(min=1e-300)
 
     def _log_powers(self, size: Tensor) -> Tensor:
         """Log powers `(..., sensor, band)` by a size `(..., sensor, direction)` along `Q`."""

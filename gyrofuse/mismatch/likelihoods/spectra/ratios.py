@@ -7,7 +7,7 @@ distributed around `m`, what a model makes of the reference's power. With `q = r
     score in log m:   d s (q - 1) / (s + d q),      information:  d s / (d + s + 1).
 
 The reference's spectrum is a nuisance that drops out of the ratio; an exact one is `s` without bound, which makes this
-Whittle's likelihood. What sensors share is told by their correlation matrices, Wishart's law given the powers,
+Whittle's likelihood. What sensors share shows in their correlation matrices, Wishart's law given the powers,
 
     -c [log det G + tr G^-1 K],   G of the model, K of the recording,
 
@@ -39,7 +39,7 @@ FLOOR = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Ratios:
-    """What is to be explained.
+    """Cross-spectra of a recording over those of its reference, and how well they are known.
 
     Attributes:
         ground: Noise of the reference.
@@ -47,7 +47,7 @@ class Ratios:
         expected: Coherences of the reference, `(band, sensor, sensor)`.
         d, s: Complex ordinates of both, `(band,)`; `s` is 0 where there is no reference.
         usable: Which powers count, 0 or 1, `(band, sensor)`.
-        paired: What correlations are worth, `(band,)`.
+        pair_dof: Complex ordinates of a correlation, `(band,)`; 0 where none counts.
         together: Sensors whose ratios vary with that of each, `(band, sensor)`: itself, and others by the square of
             their correlation.
     """
@@ -58,7 +58,7 @@ class Ratios:
     d: Tensor
     s: Tensor
     usable: Tensor
-    paired: Tensor
+    pair_dof: Tensor
     together: Tensor
 
     @classmethod
@@ -84,13 +84,13 @@ class Ratios:
         (matrices, d), (power, s) = observed, reference
         known = (s > 0).to(d.dtype)
         size = torch.where(known[:, None] > 0, power.clamp(min=1e-300), ground.mean.mT).rsqrt()
-        worth = known * (d if independent else d * s / (d + s).clamp(min=1e-300))
+        pair_dof = known * (d if independent else d * s / (d + s).clamp(min=1e-300))
         ratios = matrices * (size[:, :, None] * size[:, None, :])
         # The variance of a log ratio is 1 / d + 1 / s, and what two have in common of either is a squared coherence.
         seen, share = smooth_coherence(correlations(matrices), d), s / (d + s).clamp(min=1e-300)
         alike = share[:, None, None] * seen.abs().square() + (1 - share[:, None, None]) * expected.abs().square()
         together = alike.sum(-1).clamp(min=1.0)
-        return cls(ground, ratios, expected, d, s, usable * known[:, None], worth * usable.amin(-1), together)
+        return cls(ground, ratios, expected, d, s, usable * known[:, None], pair_dof * usable.amin(-1), together)
 
     @property
     def n_sensors(self) -> int:
@@ -98,28 +98,28 @@ class Ratios:
 
     @property
     def ratio(self) -> Tensor:
-        """Of powers, floored, `(band, sensor)`."""
+        """Ratios of powers, with the floor, `(band, sensor)`."""
         return floored(self.observed.diagonal(dim1=-2, dim2=-1).real)
 
     @property
-    def worth(self) -> Tensor:
+    def information(self) -> Tensor:
         """Information on a power in `log m`, `(band,)`."""
         return self.d * self.s / (self.d + self.s + 1)
 
     @property
-    def share(self) -> Tensor:
-        """What a power counts, `(band, sensor)`: less where sensors share noise."""
+    def weight(self) -> Tensor:
+        """Weight of a power, `(band, sensor)`: less than one where sensors share noise."""
         return self.usable / self.together
 
     @property
-    def alike(self) -> bool:
+    def independent(self) -> bool:
         """Whether the reference's sensors are independent, so that no filter changes a correlation."""
         return float((self.expected - torch.eye(self.n_sensors)).abs().max()) < 1e-9  # rounding
 
     @property
     def n_ordinates(self) -> float:
-        """What all bands of a sensor are worth."""
-        return float((self.worth * self.usable.amax(-1)).sum())
+        """Complex ordinates of all bands of a sensor together."""
+        return float((self.information * self.usable.amax(-1)).sum())
 
     def without(self, cells: Tensor) -> Ratios:
         """With powers `(band, sensor)` left out."""
@@ -141,7 +141,7 @@ def power_gains(data: Ratios, m: Tensor) -> Tensor:
     d, s, r = data.d[:, None], data.s.clamp(min=1e-300)[:, None], data.ratio
     m = floored(m)
     odds = d * r / s
-    return data.share * ((d + s) * (odds.log1p() - (odds / m).log1p()) - d * m.log())
+    return data.weight * ((d + s) * (odds.log1p() - (odds / m).log1p()) - d * m.log())
 
 
 def power_scores(data: Ratios, m: Tensor) -> Tensor:
@@ -154,19 +154,19 @@ def power_scores(data: Ratios, m: Tensor) -> Tensor:
 def log_gain(data: Ratios, model: Tensor, *, paired: bool = True) -> Tensor:
     """Log likelihood of a model `(band, sensor, sensor)` over none, `(band,)`, nats."""
     gain = power_gains(data, model.diagonal(dim1=-2, dim2=-1).real).sum(-1)
-    if paired and bool((data.paired > 0).any()):
+    if paired and bool((data.pair_dof > 0).any()):
         matrices = correlations(data.observed)
-        gain = gain + _wishart(correlations(model), matrices, data.paired)
-        gain = gain - _wishart(data.expected, matrices, data.paired)
+        gain = gain + _wishart(correlations(model), matrices, data.pair_dof)
+        gain = gain - _wishart(data.expected, matrices, data.pair_dof)
     return gain
 
 
-def _wishart(model: Tensor, observed: Tensor, worth: Tensor) -> Tensor:
+def _wishart(model: Tensor, observed: Tensor, dof: Tensor) -> Tensor:
     root, bad = torch.linalg.cholesky_ex(model)
     inside = torch.cholesky_solve(observed, root).diagonal(dim1=-2, dim2=-1).real.sum(-1)
     determinant = 2 * root.diagonal(dim1=-2, dim2=-1).real.clamp(min=1e-300).log().sum(-1)
-    score = (-(worth * (determinant + inside))).nan_to_num(nan=-math.inf).masked_fill(bad > 0, -math.inf)
-    return score.masked_fill(worth == 0, 0.0)
+    score = (-(dof * (determinant + inside))).nan_to_num(nan=-math.inf).masked_fill(bad > 0, -math.inf)
+    return score.masked_fill(dof == 0, 0.0)
 
 
 class Fitness(NamedTuple):
@@ -193,7 +193,7 @@ def fitness(data: Ratios, model: Tensor) -> Fitness:
         return torch.where(x > 1e6, -0.5 / x, torch.digamma(x.clamp(max=1e6)) - x.clamp(max=1e6).log())
 
     mean = 2 * ((d + s) * h(d + s) - d * h(d) - s * h(s))
-    cells = data.share
+    cells = data.weight
     total = float((cells * deviance / mean).sum())
     p_value = float(stats.chi2.sf(total, max(float(cells.sum()), 1.0)))
     return Fitness(p_value, (cells * (deviance - mean)).sum(0) / 2)

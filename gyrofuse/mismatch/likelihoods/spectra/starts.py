@@ -43,13 +43,13 @@ def candidates(data: Ratios, company: Sequence[Term]) -> Iterator[Term]:
     if peak is not None:
         yield peak
         if data.n_sensors > 1:
-            yield from CommonBump.starts(ground, excess, data.worth, "oscillation", peak.shared)
+            yield from CommonBump.starts(ground, excess, data.information, "oscillation", peak.shared)
     if data.n_sensors > 1:
         for kind in ("white", "walk"):
-            yield from Common.starts(ground, excess, data.worth, kind, torch.zeros(0, dtype=torch.float64))
+            yield from Common.starts(ground, excess, data.information, kind, torch.zeros(0, dtype=torch.float64))
         lowest, n_corners = 8 * float(ground.bands.frequency[0]), 8
         corners = torch.logspace(math.log10(lowest), math.log10(0.3), n_corners, dtype=torch.float64).log()
-        starts_at = [Common.starts(ground, excess, data.worth, "ar1", c[None]) for c in corners]
+        starts_at = [Common.starts(ground, excess, data.information, "ar1", c[None]) for c in corners]
         yield from max(starts_at, key=lambda s: float(log_gain(data, data_model(data, [*company, s[0]])).sum()))
 
 
@@ -85,40 +85,40 @@ def best_start(data: Ratios, company: Sequence[Term], family: Term) -> tuple[Ter
     return replace(family, local=local), float(gains.amax(0).clamp(min=0).sum())
 
 
-def best_bump(data: Ratios, company: Sequence[Term], places: Tensor) -> Peak | None:
+def best_bump(data: Ratios, company: Sequence[Term], shapes: Tensor) -> Peak | None:
     """The peak that what others leave is most like; None where nothing is left.
 
     Args:
         data: What is to be explained.
         company: The other terms.
-        places: Centres and half widths, cycles per sample, `(peak, 2)`.
+        shapes: Centres and half widths, cycles per sample, `(peak, 2)`.
     """
     heights = torch.tensor([0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0], dtype=torch.float64)  # over what there is
     ground = data.ground
     filters = pieces(data, company).filters
     before = powers(data_model(data, company))  # (band, sensor)
-    centre, width = places[:, 0, None], places[:, 1, None]
-    profile = oscillation(ground.places, centre, width)  # (place of a bump, place)
-    shown = ground.bands.mean_of(profile[:, None] * filters) / ground.mean  # (place, sensor, band)
-    at = (shown / before.mT).amax(-1)  # highest over what there is, of variance one, (place, sensor)
+    centre, width = shapes[:, 0, None], shapes[:, 1, None]
+    profile = oscillation(ground.nodes, centre, width)  # (place of a bump, place)
+    shown = ground.bands.mean_of(profile[:, None] * filters) / ground.mean  # (peak, sensor, band)
+    at = (shown / before.mT).amax(-1)  # highest over what there is, of variance one, (peak, sensor)
     size = heights[:, None, None] / at.clamp(min=1e-300)
     changed = before + (size[..., None] * shown).transpose(-1, -2)
-    gains = power_gains(data, changed).sum(-2) - power_gains(data, before).sum(-2)  # (height, place, sensor)
-    height = gains.argmax(0)  # (place, sensor)
+    gains = power_gains(data, changed).sum(-2) - power_gains(data, before).sum(-2)  # (height, peak, sensor)
+    height = gains.argmax(0)  # (peak, sensor)
     own = gains.gather(0, height[None])[0]
     chosen = int(own.clamp(min=0).sum(-1).argmax())
     if not bool((own[chosen] > 0).any()):
         return None
     variance = size.gather(0, height[None])[0, chosen]
     least = heights[0] / at[chosen]
-    at_centre, half_width = places[chosen].tolist()
+    at_centre, half_width = shapes[chosen].tolist()
     return Peak.start(at_centre, half_width, torch.where(own[chosen] > 0, variance, least))
 
 
 def _peaks(data: Ratios) -> Tensor:
     """Centres at the bands and half widths of 6 to 35 % of them, cycles per sample, `(peak, 2)`.
 
-    Both sides of a peak are to be seen; below 16 cycles per record it could not be told from an AR1.
+    Both sides of a peak are to be seen; below 16 cycles per record it could not be distinguished from an AR1.
     """
     f = data.ground.bands.frequency
     widths = torch.tensor([0.06, 0.15, 0.35], dtype=torch.float64)

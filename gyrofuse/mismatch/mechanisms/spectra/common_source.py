@@ -69,7 +69,7 @@ class CommonMode(Addition):
         reference = gain[gain.abs().argmax()]
         gain = gain * reference.conj() / reference.abs()
         sd = shape.sd[0].square().nanmean(0).sqrt()
-        size, told = gain.abs(), term.told(shape.sd_alone)
+        size, told = gain.abs(), term.t_values(shape.sd_alone)
         second = float(told.topk(2).values[-1])
         if second < _LEAST:  # one sensor has nothing in common
             return None
@@ -167,4 +167,4 @@ def _white_source(data: Ratios) -> Term | None:
     if data.n_sensors < 2:
         return None
     nothing = torch.zeros(0, dtype=torch.float64)
-    return Common.starts(data.ground, data.observed - data.expected, data.worth, "white", nothing)[0]
+    return Common.starts(data.ground, data.observed - data.expected, data.information, "white", nothing)[0]

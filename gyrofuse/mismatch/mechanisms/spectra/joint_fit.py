@@ -53,7 +53,7 @@ class Shape(NamedTuple):
         sd_alone: Of its local numbers, all others held.
         gain: Nats that it adds to the others, without what its numbers cost.
         p_value: Of the same, for all the shapes that compete.
-        alternatives: Mechanisms that explain as much in its place.
+        alternatives: Mechanisms that explain as much instead.
         frequency: Where it acts most, cycles per sample.
         levels: Wavelet levels where it shows.
         forms: Other forms of a filter that explain about as much, as `term` and `sd`.
@@ -88,14 +88,14 @@ def leading_shape(comparison: Comparison) -> Shape | None:
 def _like_switching(term: Term, sd: Tensor) -> bool:
     """Whether a sensor that jumps between two levels may have that spectrum: more power below some frequency.
 
-    Where jumps can be told from Gaussian noise, they were before spectra were fitted.
+    Jumps that differ from Gaussian noise were found before spectra were fitted.
 
     Args:
         term: A term.
         sd: Standard deviations of its local numbers, all others held.
     """
     if isinstance(term, Common):  # of a source that one sensor alone surely has: power shows a second gain, too
-        return term.kind == "ar1" and float(term.told(sd).topk(2).values[-1]) < 5
+        return term.kind == "ar1" and float(term.t_values(sd).topk(2).values[-1]) < 5
     if isinstance(term, Peak):
         centre, width = term.shared.exp().tolist()
         return bool(centre < 3 * width)
@@ -189,21 +189,21 @@ def _searched(comparison: Comparison) -> Shape | None:
     explained = 1 - excess[0] / max(excess[1], 1e-9) if nothing.p_value <= CERTAIN else 1.0
     if not fits and explained < _LARGELY:
         return None
-    seen = [_told(comparison, chosen, i) for i in range(len(chosen.terms))]
+    seen = [_with_sd(comparison, chosen, i) for i in range(len(chosen.terms))]
 
     losses = (
         [chosen.gain - max(fit(data, _others(chosen, i)).gain, 0.0) for i in range(len(seen))] if seen[1:] else [0.0]
     )
     most = max(range(len(seen)), key=lambda i: losses[i])
 
-    def place(i: int) -> tuple[bool, int, float]:
+    def rank(i: int) -> tuple[bool, int, float]:
         term, _ = seen[i]
         alone = float(log_gain(data, data_model(data, [term])).sum())
         # What a little was left for beside a common source or a mode is not to come before it.
         little = seen[most][0].acts != "filter" and losses[i] < losses[most] / 10
         return alone < NEW_TERM_NATS or little, _ORDER[term.acts], -alone
 
-    first = min(range(len(seen)), key=place)
+    first = min(range(len(seen)), key=rank)
     term, others = chosen.terms[first], _others(chosen, first)
     gain = chosen.gain
     if others:
@@ -230,9 +230,9 @@ def _searched(comparison: Comparison) -> Shape | None:
         score = log_gain(data, data_model(data, [term]))
     score = score.clamp(min=0)
     frequency = data.ground.bands.frequency
-    told, sd = seen[first]
+    chosen_term, sd = seen[first]
     return Shape(
-        told,
+        chosen_term,
         tuple(others),
         sd,
         chosen.sd_alone(first),
@@ -286,8 +286,8 @@ def _others(chosen: Fit, i: int) -> list[Term]:
     return [t for j, t in enumerate(chosen.terms) if j != i]
 
 
-def _told(comparison: Comparison, chosen: Fit, i: int) -> tuple[Term, tuple[Tensor, Tensor]]:
-    """A shape and standard deviations of its numbers; bumps as narrower bands tell them."""
+def _with_sd(comparison: Comparison, chosen: Fit, i: int) -> tuple[Term, tuple[Tensor, Tensor]]:
+    """A shape and standard deviations of its numbers; of sharp peaks by narrower bands."""
     term = chosen.terms[i]
     if isinstance(term, Peak | CommonBump) and float(term.shared.diff()) < math.log(_SHARP):
         return _closer(comparison, term, _others(chosen, i))
@@ -336,7 +336,7 @@ def _closer(comparison: Comparison, term: Peak | CommonBump, others: list[Term])
     local = start.local * term.free.any(0)
     if isinstance(term, CommonBump):
         excess = data.observed - data_model(data, others)
-        common = CommonBump.start(data.ground, excess, data.worth, "oscillation", start.shared)
+        common = CommonBump.start(data.ground, excess, data.information, "oscillation", start.shared)
         local = common.local * term.free
     found = fit(data, [*others, replace(term, local=local, shared=start.shared, narrowest=narrowest)])
     return found.terms[-1], found.sd(-1)

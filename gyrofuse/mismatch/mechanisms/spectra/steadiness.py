@@ -94,8 +94,8 @@ def _baseband(comparison: Comparison, peak: Oscillation, weights: Tensor) -> tup
 def _smoothed(power: Tensor) -> Tensor:
     reach = max(len(power) // 40, 2)
     total = pad(power.cumsum(0), (1, 0))
-    place = torch.arange(len(power))
-    low, high = (place - reach).clamp(min=0), (place + reach + 1).clamp(max=len(power))
+    at = torch.arange(len(power))
+    low, high = (at - reach).clamp(min=0), (at + reach + 1).clamp(max=len(power))
     return (total[high] - total[low]) / (high - low)
 
 
