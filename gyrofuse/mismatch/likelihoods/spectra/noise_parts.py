@@ -60,8 +60,8 @@ class Parts:
     def growing_walk(self) -> Tensor:
         """Variance of the increments of a walk that grows, `(sensor,)`: of the one there is, or of one not seen.
 
-        One that grew cannot be distinguished from one that came in: both are other numbers, and no physics left out. What stands for a walk
-        by chance, or in short records, may level off; one that grew does not.
+        One that grew cannot be distinguished from one that came in: both are other numbers, and no physics left out.
+        What stands for a walk by chance, or in short records, may level off; one that grew does not.
         """
         lacking = (_UNSEEN * self.base.coefficients - self.coefficients[2]) @ self._slowest
         return self.coefficients[2].sum(-1) + lacking.clamp(min=0) / self._slowest[-1]
