@@ -68,6 +68,10 @@ class Common(Term):
         """Gains over their standard deviations, `(sensor,)`, from those of their parts `sd`."""
         return (self.variance.sqrt() / sd.square().nanmean(0).sqrt()).nan_to_num(nan=0.0)
 
+    def rises_below(self, sd: Tensor) -> bool:
+        # A source that one sensor alone surely has: with a second one, correlations would show it too.
+        return self.kind == "ar1" and float(self.t_values(sd).topk(2).values[-1]) < 5
+
     def matrix(self) -> Tensor:
         """What it adds to the covariance of sensors, `(sensor, sensor)`, over the density of the source."""
         return self.acting(self.gain[:, None] * self.gain.conj())

@@ -68,6 +68,14 @@ class Term:
         subsets = math.lgamma(n_sensors + 1) - math.lgamma(k + 1) - math.lgamma(n_sensors - k + 1)
         return math.log(n_sensors) + subsets
 
+    def rises_below(self, sd: Tensor) -> bool:
+        """Whether a single sensor has more power below some frequency, as one that jumps between two levels has.
+
+        Args:
+            sd: Standard deviations of local numbers, all others held.
+        """
+        return False
+
     def only(self: _T, free: Tensor) -> _T:
         """With those local numbers free `(number, sensor)`, the others 0."""
         return replace(self, free=free, local=torch.where(free, self.local, 0.0))
@@ -146,6 +154,9 @@ class Shift(Term):
     def n_free(self, ground: Ground) -> int:
         return int(Shift.start(ground).free[self.parts].sum())
 
+    def rises_below(self, sd: Tensor) -> bool:
+        return bool((self.local[1:] > 0).any())
+
     def form_cost(self, n_sensors: int) -> float:
         white, ar1, corner, walk = self.parts
         n_parts = int(white) + int(ar1 | corner) + int(walk)
@@ -213,6 +224,9 @@ class Flicker(Term):
     def values(self, ground: Ground, local: Tensor, shared: Tensor) -> Tensor:
         return local[..., 0, :, None] / ground.nodes
 
+    def rises_below(self, sd: Tensor) -> bool:
+        return True
+
 
 @dataclass(frozen=True, eq=False)
 class PowerLaw(Term):
@@ -278,6 +292,10 @@ class Peak(Term):
 
     def step_limit(self) -> tuple[Tensor, Tensor]:
         return torch.full_like(self.local, math.inf), peak_step(self.shared)
+
+    def rises_below(self, sd: Tensor) -> bool:
+        centre, width = self.shared.exp().tolist()
+        return bool(centre < 3 * width)
 
     def within(self) -> Peak:
         return replace(self, local=self.local.clamp(min=0.0), shared=peak_within(self.shared, self.narrowest))

@@ -20,7 +20,7 @@ from gyrofuse.mismatch.detectors.spectra.pooled_coherence import common_source
 from gyrofuse.mismatch.detectors.spectra.shape_scan import shape_p_value
 from gyrofuse.mismatch.detectors.variance.noise_level import modulation, variance_p_value
 from gyrofuse.mismatch.likelihoods.spectra.choice import best_terms, cost_of
-from gyrofuse.mismatch.likelihoods.spectra.common_sources import Common, CommonBump
+from gyrofuse.mismatch.likelihoods.spectra.common_sources import CommonBump
 from gyrofuse.mismatch.likelihoods.spectra.components import Flicker, LowPass, Peak, PowerLaw, Shift, Term
 from gyrofuse.mismatch.likelihoods.spectra.data import ratios, ratios_around
 from gyrofuse.mismatch.likelihoods.spectra.fit import Fit, data_model, fit, powers
@@ -76,42 +76,9 @@ class Shape(NamedTuple):
     fits: bool
 
 
-@derived
-def leading_shape(comparison: Comparison) -> Shape | None:
-    """Of the shapes that together explain the spectra the one that acts first; None where they do not.
-
-    Nor where one is flicker noise of another slope.
-    """
-    return _searched(comparison)
-
-
-def _like_switching(term: Term, sd: Tensor) -> bool:
-    """Whether a sensor that jumps between two levels may have that spectrum: more power below some frequency.
-
-    Jumps that differ from Gaussian noise were found before spectra were fitted.
-
-    Args:
-        term: A term.
-        sd: Standard deviations of its local numbers, all others held.
-    """
-    if isinstance(term, Common):  # of a source that one sensor alone surely has: power shows a second gain, too
-        return term.kind == "ar1" and float(term.t_values(sd).topk(2).values[-1]) < 5
-    if isinstance(term, Peak):
-        centre, width = term.shared.exp().tolist()
-        return bool(centre < 3 * width)
-    if isinstance(term, Shift):
-        return bool((term.local[1:] > 0).any())
-    return isinstance(term, Flicker)
-
-
-def _louder(term: Term, sd: tuple[Tensor, Tensor]) -> bool:
-    """Whether it is plainly more white noise: of noise that is louder at times the spectrum shows the mean."""
-    return isinstance(term, Shift) and bool((term.local[0] > Z * sd[0][0]).any())
-
-
 def _in_sensors_of(term: Term, rival: Term) -> Term:
     """A rival in the sensors that take part."""
-    if isinstance(term, Common) or isinstance(rival, Common):
+    if term.coherent or rival.coherent:
         return rival
     free = rival.free & term.free.any(0)
     return rival.only(free) if bool(free.any()) else rival
@@ -171,7 +138,12 @@ def run_length(keep: Tensor) -> int:
     return int(edges.diff()[::2].min())
 
 
-def _searched(comparison: Comparison) -> Shape | None:
+@derived
+def leading_shape(comparison: Comparison) -> Shape | None:
+    """Of the shapes that together explain the spectra the one that acts first; None where they do not.
+
+    Nor where one is flicker noise of another slope.
+    """
     data = compared(comparison)
     fewest = 50.0  # complex ordinates, to search for the shape of a spectrum
     if data.n_ordinates < fewest:
@@ -180,76 +152,93 @@ def _searched(comparison: Comparison) -> Shape | None:
     chosen, mended = best_terms(data, differ=p_seen < CERTAIN)
     if chosen is None or _falls_otherwise(data, chosen):
         return None
-    nothing, left = fitness(data, data.expected), fitness(data, chosen.model)
-    fits = left.p_value > CERTAIN and not mended
-    # Where no term has a part, what differs has another cause.
-    concerned = torch.stack([t.free.any(0) for t in chosen.terms]).any(0)
-    excess = [float(f.excess[concerned].clamp(min=0).sum()) for f in (left, nothing)]
-    # Where sensors share what they had before, powers have nothing to explain.
-    explained = 1 - excess[0] / max(excess[1], 1e-9) if nothing.p_value <= CERTAIN else 1.0
+    fits, explained = _explained(data, chosen)
+    fits &= not mended
     if not fits and explained < _LARGELY:
         return None
     seen = [_with_sd(comparison, chosen, i) for i in range(len(chosen.terms))]
-
-    losses = (
-        [chosen.gain - max(fit(data, _others(chosen, i)).gain, 0.0) for i in range(len(seen))] if seen[1:] else [0.0]
-    )
-    most = max(range(len(seen)), key=lambda i: losses[i])
-
-    def rank(i: int) -> tuple[bool, int, float]:
-        term, _ = seen[i]
-        alone = float(log_gain(data, data_model(data, [term])).sum())
-        # What a little was left for beside a common source or a mode is not to come before it.
-        little = seen[most][0].acts != "filter" and losses[i] < losses[most] / 10
-        return alone < NEW_TERM_NATS or little, _ORDER[term.acts], -alone
-
-    first = min(range(len(seen)), key=rank)
+    first, gain = _first(data, chosen, [term for term, _ in seen])
     term, others = chosen.terms[first], _others(chosen, first)
-    gain = chosen.gain
-    if others:
-        rest = fit(data, others)
-        gain -= max(rest.gain, 0.0)
     n_classes = 16.0  # classes and frequencies that compete
-    p = sidak(float(stats.chi2.sf(2 * max(gain, 0.0), term.n_free(data.ground))), n_classes)
+    p = sidak(float(stats.chi2.sf(2 * gain, term.n_free(data.ground))), n_classes)
     if not others:  # it is all that differs
         p = min(p, p_seen)
     if comparison.reference.uncertainty is not None:  # the fit above takes the simulation's numbers for exact
         p = max(p, _beside_errors(comparison, term, p_seen))
+    score = log_gain(data, data_model(data, [term]), paired=term.coherent).clamp(min=0)
+    frequency = data.ground.bands.frequency
+    return Shape(
+        term=seen[first][0],
+        company=tuple(others),
+        sd=seen[first][1],
+        sd_alone=chosen.sd_alone(first),
+        gain=gain - cost_of(chosen) / len(chosen.terms),
+        p_value=p,
+        alternatives=_rivals(comparison, data, chosen, first, seen[first][1]),
+        frequency=float(frequency[score.argmax()]),
+        levels=tuple(sorted({level_of(float(f)) for f in frequency[score > 0.05 * score.sum()]})),
+        forms=_forms(data, term, others, chosen.gain),
+        explained=explained,
+        fits=fits,
+    )
+
+
+def _explained(data: Ratios, chosen: Fit) -> tuple[bool, float]:
+    """Whether what is left is no more than chance, and the share of the discrepancy that terms explain.
+
+    In the sensors that have any of them: what differs in others has another cause.
+    """
+    nothing, left = fitness(data, data.expected), fitness(data, chosen.model)
+    concerned = torch.stack([t.free.any(0) for t in chosen.terms]).any(0)
+    before, after = (float(f.excess[concerned].clamp(min=0).sum()) for f in (nothing, left))
+    # Where sensors share what they had before, powers have nothing to explain.
+    explained = 1 - after / max(before, 1e-9) if nothing.p_value <= CERTAIN else 1.0
+    return left.p_value > CERTAIN, explained
+
+
+def _first(data: Ratios, chosen: Fit, terms: list[Term]) -> tuple[int, float]:
+    """The term that acts first, and what it adds to the log likelihood of the others, nats.
+
+    Not one that gains nothing by itself, nor the little that was left for beside a common source or a mode.
+    """
+    losses = [chosen.gain]
+    if len(terms) > 1:
+        losses = [chosen.gain - max(fit(data, _others(chosen, i)).gain, 0.0) for i in range(len(terms))]
+    most = max(range(len(terms)), key=lambda i: losses[i])
+
+    def rank(i: int) -> tuple[bool, int, float]:
+        alone = float(log_gain(data, data_model(data, [terms[i]])).sum())
+        little = terms[most].acts != "filter" and losses[i] < losses[most] / 10
+        return alone < NEW_TERM_NATS or little, _ORDER[terms[i].acts], -alone
+
+    first = min(range(len(terms)), key=rank)
+    return first, max(losses[first], 0.0)
+
+
+def _rivals(
+    comparison: Comparison, data: Ratios, chosen: Fit, first: int, sd: tuple[Tensor, Tensor]
+) -> tuple[str, ...]:
+    """Mechanisms that explain as much as the first term, by name."""
+    term, others = chosen.terms[first], _others(chosen, first)
     rivals = {
         rival.name
         for rival in candidates(data, others)
         if rival.name != term.name and _as_good(data, [*others, _in_sensors_of(term, rival)], chosen)
     }
-    if _like_switching(term, chosen.sd_alone(first)):
+    # Jumps between two levels that differ from Gaussian noise were found before spectra were fitted.
+    if term.rises_below(chosen.sd_alone(first)):
         rivals.add("random_telegraph")
-    unsteady = 0.01  # p value of either test of a level that changes
-    if _louder(term, seen[first][1]) and min(modulation(comparison).p_value, variance_p_value(comparison)) < unsteady:
-        rivals.add("variance_change")
-    score = power_gains(data, powers(data_model(data, [term]))).sum(-1)
-    if isinstance(term, Common):
-        score = log_gain(data, data_model(data, [term]))
-    score = score.clamp(min=0)
-    frequency = data.ground.bands.frequency
-    chosen_term, sd = seen[first]
-    return Shape(
-        chosen_term,
-        tuple(others),
-        sd,
-        chosen.sd_alone(first),
-        gain - cost_of(chosen) / len(chosen.terms),
-        p,
-        tuple(sorted(rivals)),
-        float(frequency[score.argmax()]),
-        tuple(sorted({level_of(float(f)) for f in frequency[score > 0.05 * score.sum()]})),
-        _forms(data, term, others, chosen.gain),
-        explained,
-        fits,
-    )
+    # Of noise that is louder at times the spectrum shows the mean: plainly more white noise.
+    if isinstance(term, Shift) and bool((term.local[0] > Z * sd[0][0]).any()):
+        unsteady = 0.01  # p value of either test of a level that changes
+        if min(modulation(comparison).p_value, variance_p_value(comparison)) < unsteady:
+            rivals.add("variance_change")
+    return tuple(sorted(rivals))
 
 
 def _beside_errors(comparison: Comparison, term: Term, p_seen: float) -> float:
     """Least p value of a shape beside what numbers of a fitted simulation may be off."""
-    source = common_source(comparison) if isinstance(term, Common) else None
+    source = common_source(comparison) if term.coherent else None
     return p_seen if source is None else min(p_seen, source.p_value)
 
 
