@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.detectors.spectra.peaks import Stretch, strongest_peak
-from gyrofuse.mismatch.detectors.spectra.shape_scan import scanned
 from gyrofuse.mismatch.likelihoods.spectra.choice import cost_of
 from gyrofuse.mismatch.likelihoods.spectra.common_sources import CommonBump
 from gyrofuse.mismatch.likelihoods.spectra.components import Peak, Term
@@ -84,16 +83,6 @@ class Background(Term):
 def oscillation_of(comparison: Comparison) -> Oscillation | None:
     """The strongest bump, fitted; None where it is no oscillation."""
     return _closely(comparison, strongest_peak(comparison))
-
-
-@derived
-def likeliest_oscillation(comparison: Comparison) -> Oscillation | None:
-    """The bump that is the likeliest of all shapes of a difference, fitted; None where another one is."""
-    seen = scanned(comparison)
-    if seen is None or seen.peak is None:
-        return None
-    centre, width = seen.peak
-    return _closely(comparison, Stretch(centre, 2 * width, seen.p_value, seen.sensors))
 
 
 def _closely(comparison: Comparison, stretch: Stretch) -> Oscillation | None:

@@ -44,13 +44,11 @@ class Shapes(NamedTuple):
 
     Attributes:
         log_factors: Differences, `(shape, sensor, band)`.
-        log_prior: Probabilities, `(shape,)`; classes of shapes have equal ones.
-        peaks: Centres and half widths of the last shapes, which are peaks, cycles per sample, `(peak, 2)`.
+        log_prior: Logarithms of probabilities, `(shape,)`; classes of shapes have equal ones.
     """
 
     log_factors: Tensor
     log_prior: Tensor
-    peaks: Tensor
 
 
 class Scan(NamedTuple):
@@ -62,7 +60,6 @@ class Scan(NamedTuple):
         weight: Its deviance by band, `(band,)`.
         frequency: Middles of the bands, cycles per sample, `(band,)`.
         up: Whether powers are larger than the reference's.
-        peak: Centre and half width, cycles per sample, if it is a peak.
     """
 
     log_ratio: float
@@ -70,7 +67,6 @@ class Scan(NamedTuple):
     weight: Tensor
     frequency: Tensor
     up: bool
-    peak: tuple[float, float] | None
 
     @property
     def p_value(self) -> float:
@@ -161,8 +157,6 @@ def _scan(nuisance: Nuisance, comparison: Comparison) -> Scan:
     sensors = tuple(int(i) for i in (own > math.log(1 / SHARES[share] - 1)).nonzero()[:, 0]) or (int(own.argmax()),)
     which = list(sensors)
     weight = (nuisance.weight * shapes.log_factors[shape])[which].square().mean(0)
-    first_peak = len(shapes.log_factors) - len(shapes.peaks)
-    centre, width = shapes.peaks[max(shape - first_peak, 0)].tolist()
     log_mean = float(log_ratios.flatten().logsumexp(0)) - math.log(len(SHARES) * len(signs))
     return Scan(
         log_mean,
@@ -170,7 +164,6 @@ def _scan(nuisance: Nuisance, comparison: Comparison) -> Scan:
         weight,
         data.ground.bands.frequency,
         float((up - down)[shape, which].sum()) > 0,
-        (centre, width) if shape >= first_peak else None,
     )
 
 
@@ -187,15 +180,14 @@ def _levels(comparison: Comparison, ground: Ground) -> Tensor:
 
 
 def _shapes(data: Ratios, n_samples: int) -> Shapes:
-    """All shapes in all sizes, peaks last."""
+    """All shapes in all sizes."""
     ground, f = data.ground, data.ground.nodes
     sine, mean_of = torch.sin(math.pi * f).square(), ground.bands.mean_of
-    peaks = _peaks(n_samples)
     phi = torch.exp(-2 * math.pi * _corners(n_samples))[:, None]
     added = [
         *(density[None] for density in (torch.ones_like(f), sine, 1 / f, 1 / sine)),
         AR1._spectrum(f, phi, (1 - phi).square()),
-        oscillation(f, *peaks.mT[..., None]),
+        oscillation(f, *_peaks(n_samples).mT[..., None]),
     ]
     relative = mean_of(torch.cat(added))[:, None] / ground.mean  # (shape, sensor, band)
     corners = torch.tensor([0.01, 0.04, 0.12, 0.35], dtype=torch.float64)
@@ -212,10 +204,7 @@ def _shapes(data: Ratios, n_samples: int) -> Shapes:
     log_factors = torch.cat([sizes * linear, torch.log1p(sizes * unit(relative))], 1)  # (size, shape, sensor, band)
     counts = torch.tensor([len(filtered), 1, *(len(part) for part in added)])
     prior = -(counts * len(counts) * len(_SIZES)).to(torch.float64).log().repeat_interleave(counts)
-    last = len(prior) - len(peaks)
-    order = [part.flatten(0, 1) for part in (log_factors[:, :last], log_factors[:, last:])]
-    priors = (prior[:last].repeat(len(_SIZES)), prior[last:].repeat(len(_SIZES)))
-    return Shapes(torch.cat(order), torch.cat(priors), peaks.repeat(len(_SIZES), 1))
+    return Shapes(log_factors.flatten(0, 1), prior.repeat(len(_SIZES)))
 
 
 def _corners(n_samples: int) -> Tensor:

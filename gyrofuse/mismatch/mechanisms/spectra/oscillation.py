@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.detectors.lines.chirps import swept
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
-from gyrofuse.mismatch.detectors.spectra.peak_fit import Oscillation, likeliest_oscillation, oscillation_of
+from gyrofuse.mismatch.detectors.spectra.peak_fit import Oscillation, oscillation_of
 from gyrofuse.mismatch.detectors.spectra.peaks import Stretch
 from gyrofuse.mismatch.likelihoods.spectra.common_sources import CommonBump
 from gyrofuse.mismatch.likelihoods.spectra.components import Peak, oscillation
@@ -119,8 +119,6 @@ def nominated(comparison: Comparison, level: float, *, tone: bool) -> tuple[Mode
     """The strongest bump, if it is a tone, or if it is none."""
     peak = oscillation_of(comparison)
     rivals: tuple[str, ...] = ()
-    if peak is None or peak.stretch.p_value > level:
-        peak = likeliest_oscillation(comparison)
     if peak is None or peak.stretch.p_value > level:
         shape = chosen_shape(comparison, "resonance", level)
         if shape is None or not isinstance(shape.term, Peak | CommonBump):
