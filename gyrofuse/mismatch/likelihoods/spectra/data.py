@@ -247,8 +247,7 @@ def slow_groups() -> Groups:
 def fast_groups(n_samples: int) -> Groups:
     """DCT-II ordinates of a record above its blocks' highest band, each a third of the distance to half the rate.
 
-    A group has 24 ordinates at least: as many as the narrowest band of blocks has in a whole record of 32 blocks' two
-    bins, so that its power is known to 30 %.
+    A group has 24 ordinates at least, which know its power to 30 %.
     """
     end_share, fewest = 3, 24
     length = n_samples // N_JUDGED

@@ -15,9 +15,9 @@ with `c = d` where the reference's sensors are independent, so that nothing abou
 Powers of sensors that share noise vary together: they count as often as a band has independent ones (a composite
 likelihood of the powers with weights that make its mean right; Varin, Reid and Firth, 2011).
 
-A reference drawn from a model that was itself fitted has fewer ordinates than it shows (see
-`Records.effective_samples`); its parameters' covariance `C` and the spectrum's slopes `J` would enter as one more term
-that scales the reference's noise by `exp(J x)`, `x` with precision `C^-1`, in every hypothesis."""
+A reference drawn from a model that was itself fitted has fewer ordinates than it shows (`Records.n_records`). What the
+errors of its numbers do to spectra is in `nuisance`.
+"""
 
 from __future__ import annotations
 
