@@ -20,7 +20,7 @@ from gyrofuse.mismatch.detectors.values.values import values_test
 from gyrofuse.mismatch.detectors.variance import weak_outliers as shocks
 from gyrofuse.mismatch.detectors.variance.noise_level import compared_levels, level_between, levelled
 from gyrofuse.mismatch.diagnose import diagnose
-from gyrofuse.mismatch.likelihoods.outlier_law import Outliers
+from gyrofuse.mismatch.likelihoods.outlier_law import Outliers, fitted_shock, shock_posterior, shock_scores
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
@@ -101,16 +101,16 @@ def test_a_fit_of_shocks_recovers_them_and_says_which_samples_are_hit() -> None:
     hit = even(1, N, g=g) < 4e-3
     z = normal(3, N, g=g) + hit * 4.0 * (even(3, N, g=g) - 0.5).sign()
     start = [Outliers(1e-3, 2.7, 0.3)] * 3
-    laws = shocks.fitted_shock(z, start, 40)
+    laws = fitted_shock(z, start, 40)
     for law in laws:
         for value, (_, high), truth in (
             (law.amplitude, law.amplitude_limits, 4.0),
             (law.rate, law.rate_limits, 4e-3),
         ):
             assert abs(math.log(truth / value)) < 2 * math.log(high / value)  # limits are at 2 sd
-    said = shocks.shock_posterior(z, laws) > 0.5
+    said = shock_posterior(z, laws) > 0.5
     assert int((said != hit[0]).sum()) < 0.05 * int(hit.sum()) + 3
-    assert float(shocks.shock_scores(z, laws).sum()) > float(shocks.shock_scores(z, start).sum())
+    assert float(shock_scores(z, laws).sum()) > float(shock_scores(z, start).sum())
 
 
 # Levels.
@@ -125,7 +125,7 @@ def test_the_scan_of_levels_is_the_mean_over_stretches_and_factors(referred: boo
     x, observed, n = squares.numpy() / energy, 64, 164 if referred else 64
 
     def mean_ratio(m: int, starts: range) -> float:
-        reach = np.minimum(np.array(level_scan._DEVIATIONS) * math.sqrt(2 / m + 2 / (n - m)), math.log(30))
+        reach = np.minimum(level_scan._DEVIATIONS.numpy() * math.sqrt(2 / m + 2 / (n - m)), math.log(30))
         ratios = []
         for log_r, a in itertools.product([*reach, *-reach], starts):
             share = x[:, a : a + m].sum(-1)

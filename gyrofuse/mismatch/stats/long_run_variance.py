@@ -1,9 +1,13 @@
-"""Long-run variance of a stationary series: how uncertain its mean is.
+"""Long-run variance of a stationary series: how uncertain its mean and its CUSUM are.
 
 The mean of `n` values has the variance `L/n`, with `L` the spectral density at frequency zero. The mean of the lowest
 `M` ordinates of the periodogram estimates `L`; `2 M` times it over `L` is chi-square with `2 M` degrees of freedom as
-far as the spectrum is flat up to the `M`-th (Brillinger, Time Series, 1981, theorem 5.4.3). `M` is the largest of a few
-whose lowest part is not higher than the rest: where the density has fallen off a mean would be too small.
+far as the spectrum is flat up to the `M`-th.
+
+References:
+    Brillinger, Time Series: Data Analysis and Theory, 1981, theorem 5.4.3.
+    Welch, The generalization of Student's problem, Biometrika 34 (1947), 28.
+    Kuiper, Tests concerning random points on a circle, Proc. KNAW A 63 (1960), 38.
 """
 
 from __future__ import annotations
@@ -16,17 +20,14 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-# Ordinates, each number a quarter of the one before. With the last one `t` has 12 degrees of freedom: with fewer a
-# test at 1e-4 would want differences twice as large.
+# Numbers of ordinates that are tried, each a quarter of the one before. With the last one `t` has 12 degrees of
+# freedom: with fewer a test at 1e-4 would want differences twice as large.
 ORDINATES = (1024, 256, 64, 16, 6)
-_SHARE = 40  # samples of the series for each ordinate: its spectrum is not flat over more than a twentieth of the band
-_HIGHER = 0.1  # p value at which the lowest ordinates are higher: rather fewer ordinates than too small a variance
-# Tail probabilities between which chi-square is averaged over: p values down to the smallest are told.
-_TAILS = np.concatenate([[0.0], 10.0 ** np.arange(-12, -1), np.arange(0.1, 1.05, 0.1)])
+LAGS = 15  # samples, over which clustering of squares is looked for: longer bursts show in the CUSUM
 
 
 class LongRunVariance(NamedTuple):
-    """An estimate and how sure it is.
+    """Estimate of a long-run variance.
 
     Attributes:
         value: `L`, of the series' unit squared.
@@ -38,33 +39,39 @@ class LongRunVariance(NamedTuple):
 
 
 def long_run_variance(series: Tensor) -> LongRunVariance:
-    """Estimate from one series or several alike.
+    """Estimate from the largest number of ordinates over which the spectrum is flat.
+
+    Flat is a spectrum whose lowest ordinates are not higher than the rest by `F` at 10 %: fewer ordinates cost less
+    than a variance that is too small. At most one ordinate is used for forty samples: no spectrum
+    is taken for flat over more than a twentieth of the band.
 
     Args:
         series: Records `(record, time)` of the same process; their means are taken off.
     """
     n_records, n = series.shape
-    centred = series - series.mean(-1, keepdim=True)
-    most = max(min(ORDINATES[0], n // _SHARE), 1)
-    transform = torch.fft.rfft(centred)[..., 1 : most + 1]
+    most = max(min(ORDINATES[0], n // 40), 1)
+    transform = torch.fft.rfft(series - series.mean(-1, keepdim=True))[..., 1 : most + 1]
     power = (transform.real.square() + transform.imag.square()).mean(0) / n
     tried = [m for m in ORDINATES if m <= most] or [most]
-    for m in tried:
-        if not any(_higher(power[:low], power[low:m], n_records) for low in tried if low < m):
-            break
+
+    def falls(low: int, m: int) -> bool:
+        ratio = float(power[:low].mean() / power[low:m].mean().clamp(min=1e-300))
+        return float(stats.f.sf(ratio, 2 * low * n_records, 2 * (m - low) * n_records)) < 0.1
+
+    m = next((m for m in tried if not any(falls(low, m) for low in tried if low < m)), tried[-1])
     return LongRunVariance(float(power[:m].mean()), 2.0 * m * n_records)
 
 
 def equal_means_score(own: Tensor, other: Tensor, least: float) -> tuple[float, float]:
-    """Difference of the means of two series `(record, time)` over its sd, and the degrees of freedom of its `t`.
+    """Welch's `t` of the difference of the means of two correlated series `(record, time)`, and its dof.
 
-    Each has the long-run variance of its own (Welch, Biometrika 34 (1947), 28): of rare events a series that holds few
-    by chance also looks surer of its mean. That of the first is not taken below that of the second.
+    The long-run variance of the first is not taken below that of the second: a series that holds few rare events by
+    chance would look too certain of its mean.
 
     Args:
         own: Series, or influences of its values plus a statistic of it, which is their mean.
-        other: The same of the other one.
-        least: Below which neither long-run variance is.
+        other: Series of the other side, likewise.
+        least: Long-run variance below which neither is taken.
     """
     spreads = [long_run_variance(series) for series in (own, other)]
     floor = max(spreads[1].value, least)
@@ -73,16 +80,53 @@ def equal_means_score(own: Tensor, other: Tensor, least: float) -> tuple[float, 
     return float(own.mean() - other.mean()) / math.sqrt(sum(parts)), dof
 
 
-def _higher(low: Tensor, rest: Tensor, n_records: int) -> bool:
-    ratio = float(low.mean() / rest.mean().clamp(min=1e-300))
-    return float(stats.f.sf(ratio, 2 * len(low) * n_records, 2 * len(rest) * n_records)) < _HIGHER
+def clustering_p_value(observed: Tensor, reference: Tensor) -> float:
+    """One-sided p value that large squares come together more than in another series.
+
+    Statistic: mean of `c_t = sum_(lag <= 15) x_t x_(t+lag)` of standardised squares. Null law: Student's `t` with the
+    long-run variances of `c_t`, which are not taken below 15, that of independent values.
+
+    Args:
+        observed: Squares of the recording, `(record, time)`.
+        reference: Squares of the simulation, likewise.
+    """
+
+    def products(squares: Tensor) -> Tensor:
+        x = squares - squares.mean(-1, keepdim=True)
+        x = x / x.square().mean(-1, keepdim=True).sqrt()
+        n = x.shape[-1] - LAGS
+        return torch.stack([x[..., :n] * x[..., lag : n + lag] for lag in range(1, LAGS + 1)]).sum(0)
+
+    score, dof = equal_means_score(products(observed), products(reference), LAGS)
+    return float(stats.t.sf(score, dof))
 
 
 def chi_square_nodes(dof: float) -> tuple[Tensor, Tensor]:
-    """Values `(node,)` of a chi-square variable over its degrees of freedom, and weights, to average p values over.
+    """Values `(node,)` of a chi-square variable over its dof, and weights, to average p values over.
 
-    The lower tail, where an estimate is far too small, is resolved down to 1e-12.
+    Nodes are quantiles, a decade apart in the lower tail down to 1e-12: where an estimate is far too small p values are
+    far too small as well, and few such nodes make their mean.
     """
-    middle = np.concatenate([[_TAILS[1] / 2], np.sqrt(_TAILS[1:-1] * _TAILS[2:])])
+    edges = np.concatenate([[0.0], 10.0 ** np.arange(-12, -1), np.arange(0.1, 1.05, 0.1)])
+    middle = np.concatenate([[edges[1] / 2], np.sqrt(edges[1:-1] * edges[2:])])
     values = stats.chi2.ppf(np.clip(middle, 0, 1 - 1e-12), dof) / dof
-    return torch.from_numpy(values), torch.from_numpy(np.diff(_TAILS))
+    return torch.from_numpy(values), torch.from_numpy(np.diff(edges))
+
+
+def kuiper_p_value(reach: float) -> float:
+    """p value of a Brownian bridge's range, `2 sum (4 j^2 x^2 - 1) exp(-2 j^2 x^2)` (Kuiper)."""
+    x = np.arange(1, 40) * max(reach, 0.2)  # smaller ranges have p = 1 as well, but need more terms
+    return float(np.clip(2 * ((4 * x**2 - 1) * np.exp(-2 * x**2)).sum(), 0, 1))
+
+
+def studentised_range_p_value(reach: float, dof: float) -> float:
+    """p value of such a range over an sd whose square is chi-square: the mean of Kuiper's over that law.
+
+    Args:
+        reach: Range of the CUSUM over its estimated sd.
+        dof: Degrees of freedom of the estimated variance.
+    """
+    factors, weights = chi_square_nodes(dof)
+    return sum(
+        w * kuiper_p_value(reach * math.sqrt(f)) for f, w in zip(factors.tolist(), weights.tolist(), strict=True)
+    )

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -39,10 +40,9 @@ from gyrofuse.mismatch.stats.variance_courses import (
     Course,
     course_at_once,
     course_of,
+    course_score,
     course_scores,
     fitted_levels,
-    interpolated,
-    worth_of_course,
 )
 
 if TYPE_CHECKING:
@@ -97,11 +97,11 @@ class GradualChange(Mechanism):
             return None
         weight = own_spread(comparison).weight
         gain = float(weight @ course_scores(white, course.variance).sum(-1))
-        worth = worth_of_course(white, course, weight)
+        worth = course_score(white, course, weight)
         once = 0.0
         if episodes is not None:
             at_once = course_at_once(white, episodes.inside(comparison.n_samples), episodes.factor != 1)
-            once = worth_of_course(white, at_once, weight, len(episodes.episodes))
+            once = course_score(white, at_once, weight, len(episodes.episodes))
             if not goes_up_and_down(comparison, episodes):
                 # A single one is a course as well: another that may be it has to gain more than orders do by chance.
                 once += 2 * math.log(comparison.n_samples)
@@ -161,8 +161,7 @@ class GradualChange(Mechanism):
         return held_out_blocks(scores, fold).sum((0, -1))
 
     def _share(self, n_samples: int, rate: float) -> Tensor:
-        at = torch.arange(n_samples, dtype=torch.float64) / rate
-        return interpolated(at, self.time_s.tolist(), self.share.tolist())
+        return torch.from_numpy(np.interp(np.arange(n_samples) / rate, self.time_s.numpy(), self.share.numpy()))
 
     def _loudness(self, n_samples: int, rate: float) -> VarianceCourse:
         return VarianceCourse(self._share(n_samples, rate), self.factor, self.corner_hz / rate, self.base)

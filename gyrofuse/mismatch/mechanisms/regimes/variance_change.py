@@ -10,15 +10,14 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.detectors.variance.noise_level import (
-    LEVEL_CUT,
     compared_levels,
     level_between,
     levelled,
+    levelled_squares,
     modulation,
     modulation_of,
     own_spread,
     variance_p_value,
-    variance_p_values,
 )
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
@@ -32,11 +31,11 @@ from gyrofuse.mismatch.stats.limits import Z
 from gyrofuse.mismatch.stats.segments import (
     Episodes,
     Limits,
-    Told,
+    SegmentPosterior,
     episodes_of,
+    first_segment_posterior,
     log_factors,
     stretch_of,
-    told_of_first,
     two_level_scores,
 )
 
@@ -158,7 +157,7 @@ class VarianceChange(Mechanism):
         return within
 
 
-def _held(comparison: Comparison, found: Episodes) -> tuple[Episodes, Reference | None, Told] | None:
+def _held(comparison: Comparison, found: Episodes) -> tuple[Episodes, Reference | None, SegmentPosterior] | None:
     """Episodes whose level is known, with what is known of it and of that between them.
 
     A few wild samples may be likelier than any other stretch, and yet not likelier than all others together: then
@@ -169,7 +168,7 @@ def _held(comparison: Comparison, found: Episodes) -> tuple[Episodes, Reference 
     if not sensors:
         return None
     reference = level_between(comparison, found.inside(comparison.n_samples))
-    told = told_of_first(white[sensors], found.episodes, None if reference is None else reference.of(sensors))
+    told = first_segment_posterior(white[sensors], found.episodes, None if reference is None else reference.of(sensors))
     known = float((told.log_factor.abs() / told.log_factor_sd).max()) > _KNOWN
     return (found, reference, told) if known else None
 
@@ -177,8 +176,7 @@ def _held(comparison: Comparison, found: Episodes) -> tuple[Episodes, Reference 
 @derived
 def likeliest_episodes(comparison: Comparison) -> Episodes | None:
     """Those that the simulation's level tells of, if any, or the recording by itself."""
-    p_values = variance_p_values(comparison)
-    return _against_the_simulation(comparison, p_values) or episodes_of(levelled(comparison), p_values)
+    return _against_the_simulation(comparison) or episodes_of(levelled(comparison))
 
 
 def worth_of_modulation(comparison: Comparison) -> float:
@@ -187,12 +185,12 @@ def worth_of_modulation(comparison: Comparison) -> float:
     return max(-math.log(max(wave.p_value, 1e-300)), wave.log_ratio)
 
 
-def _against_the_simulation(comparison: Comparison, p_values: Tensor) -> Episodes | None:
+def _against_the_simulation(comparison: Comparison) -> Episodes | None:
     """Episodes that the simulation's level tells of, where the recording has that between them."""
     compared = compared_levels(comparison)
     if compared is None or compared.p_value == 1:
         return None
-    found = episodes_of(levelled(comparison), p_values, compared.reference)
+    found = episodes_of(levelled(comparison), compared.reference)
     return None if found is None or level_between(comparison, found.inside(comparison.n_samples)) is None else found
 
 
@@ -200,7 +198,7 @@ def _alternatives(comparison: Comparison, found: Episodes) -> tuple[str, ...]:
     """What else it could be: outliers, where it is short, and another level throughout, where little else speaks."""
     compared, alone = (
         compared_levels(comparison),
-        scanned_levels(levelled(comparison).square().clamp(max=LEVEL_CUT)).log_ratio,
+        scanned_levels(levelled_squares(comparison)).log_ratio,
     )
     shifted = compared is not None and compared.scan.log_ratio < compared.throughout + _NATS and alone < _NATS
     short = max(e.stop - e.start for e in found.episodes) < _SHORT
