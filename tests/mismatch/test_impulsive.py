@@ -32,7 +32,6 @@ from gyrofuse.mismatch.signals.psd import bands
 from gyrofuse.mismatch.signals.records import Records
 from gyrofuse.mismatch.stats import segments as episodes
 from gyrofuse.mismatch.stats.kurtosis import independent_values, normal_kurtosis
-from gyrofuse.mismatch.stats.long_run_variance import kuiper_p_value
 from gyrofuse.wavelets.haar import haar_coefficients
 
 TESTS = (
@@ -319,12 +318,6 @@ def test_the_likeliest_stretches_are_those_of_all_that_are_possible() -> None:
         one = max((sum(sums[a:b]), (a, b)) for a in range(9) for b in range(a + 1, 10))[1]
         total = torch.tensor([0.0, *sums], dtype=torch.float64).cumsum(0)
         assert episodes._single(total) == (one,)
-
-
-def test_kuipers_law() -> None:
-    # Stephens' points of the range of a Brownian bridge.
-    assert kuiper_p_value(1.747) == pytest.approx(0.05, abs=5e-4)
-    assert kuiper_p_value(2.001) == pytest.approx(0.01, abs=2e-4)
 
 
 # Telegraph noise.

@@ -29,13 +29,7 @@ from gyrofuse.mismatch.signals.prediction_errors import left_out
 from gyrofuse.mismatch.stats import tails
 from gyrofuse.mismatch.stats.kurtosis import bounded_kurtosis, kurtosis_p_value
 from gyrofuse.mismatch.stats.local_level import WINDOW, local_level
-from gyrofuse.mismatch.stats.long_run_variance import (
-    chi_square_nodes,
-    clustering_p_value,
-    kuiper_p_value,
-    long_run_variance,
-    studentised_range_p_value,
-)
+from gyrofuse.mismatch.stats.long_run_variance import chi_square_nodes, long_run_variance
 
 N = 8209  # a prime: no length of a block or a transform fits it
 
@@ -98,11 +92,6 @@ def test_nodes_average_over_a_chi_square_variable() -> None:
             assert float((weights * (-t * values).exp()).sum()) == pytest.approx(
                 (1 + 2 * t / dof) ** (-dof / 2), rel=0.3
             )
-
-
-def test_a_range_over_a_known_sd_is_kuipers_and_over_an_estimate_is_told_less_by() -> None:
-    assert studentised_range_p_value(2.3, 1e7) == pytest.approx(kuiper_p_value(2.3), rel=0.02)
-    assert studentised_range_p_value(2.3, 12.0) > 3 * kuiper_p_value(2.3)
 
 
 def test_the_local_level_follows_what_changes_slowly_and_no_outlier() -> None:
@@ -186,7 +175,6 @@ def test_a_simulation_with_few_bursts_by_chance_is_not_surer_of_them() -> None:
     observed = burst(4500, tuple(range(100, 4500, 450)), g)
     reference = burst(4500, (700,), g)
     assert kurtosis_p_value(observed, reference) > 1e-4
-    assert clustering_p_value(observed.square().clamp(max=9), reference.square().clamp(max=9)) > 1e-3
 
 
 def test_records_of_another_level_have_the_kurtosis_of_each() -> None:
@@ -253,11 +241,14 @@ def test_squares_that_come_together_in_both_are_no_bursts() -> None:
         x = normal(1, N, g=g)
         for at in (even(30, g=g) * (N - 20)).long().tolist():
             x[:, at : at + 20] *= 1 + share
-        return x.square().clamp(max=9)
+        return x
 
-    low = sum(clustering_p_value(bursting(1.0), bursting(1.0)) < 0.01 for _ in range(25))
+    def p_value(observed: float, reference: float) -> float:
+        return noise_level.variance_test(prepared(bursting(observed), bursting(reference), None, g)).p_value
+
+    low = sum(p_value(1.0, 1.0) < 0.01 for _ in range(25))
     assert low <= 3  # four of 25 at 1 % have probability 1e-4
-    assert clustering_p_value(bursting(1.5), bursting(0.0)) < 1e-4
+    assert p_value(1.5, 0.0) < 1e-4
 
 
 def test_levels_that_vary_by_themselves_make_a_sample_count_for_less() -> None:
@@ -336,12 +327,11 @@ def test_a_change_of_level_is_seen_beside_tails_that_both_have() -> None:
     assert found.parameters["start"].value == pytest.approx(3000, abs=400)
 
 
-def test_a_course_of_the_level_that_both_have_is_taken_off_and_one_of_chance_is_not() -> None:
+def test_a_course_of_the_level_that_both_have_is_no_mismatch() -> None:
     g = torch.Generator().manual_seed(11)
     loud = torch.ones(N, dtype=torch.float64)
     loud[2000:4000] = 2.0
-    assert noise_level.level_profile(prepared(noise("", g) * loud, noise("", g) * loud, None, g)) is not None
-    assert noise_level.level_profile(prepared(noise("", g) * loud.roll(3000), noise("", g) * loud, None, g)) is None
+    assert noise_level.variance_test(prepared(noise("", g) * loud, noise("", g) * loud, None, g)).p_value > 0.05
 
 
 # Twins.

@@ -1,4 +1,4 @@
-"""Long-run variance of a stationary series: how uncertain its mean and its CUSUM are.
+"""Long-run variance of a stationary series: how uncertain its mean is.
 
 The mean of `n` values has the variance `L/n`, with `L` the spectral density at frequency zero. The mean of the lowest
 `M` ordinates of the periodogram estimates `L`; `2 M` times it over `L` is chi-square with `2 M` degrees of freedom as
@@ -7,7 +7,6 @@ far as the spectrum is flat up to the `M`-th.
 References:
     Brillinger, Time Series: Data Analysis and Theory, 1981, theorem 5.4.3.
     Welch, The generalization of Student's problem, Biometrika 34 (1947), 28.
-    Kuiper, Tests concerning random points on a circle, Proc. KNAW A 63 (1960), 38.
 """
 
 from __future__ import annotations
@@ -23,7 +22,6 @@ from torch import Tensor
 # Numbers of ordinates that are tried, each a quarter of the one before. With the last one `t` has 12 degrees of
 # freedom: with fewer a test at 1e-4 would want differences twice as large.
 ORDINATES = (1024, 256, 64, 16, 6)
-LAGS = 15  # samples, over which clustering of squares is looked for: longer bursts show in the CUSUM
 
 
 class LongRunVariance(NamedTuple):
@@ -80,27 +78,6 @@ def equal_means_score(own: Tensor, other: Tensor, least: float) -> tuple[float, 
     return float(own.mean() - other.mean()) / math.sqrt(sum(parts)), dof
 
 
-def clustering_p_value(observed: Tensor, reference: Tensor) -> float:
-    """One-sided p value that large squares come together more than in another series.
-
-    Statistic: mean of `c_t = sum_(lag <= 15) x_t x_(t+lag)` of standardised squares. Null law: Student's `t` with the
-    long-run variances of `c_t`, which are not taken below 15, that of independent values.
-
-    Args:
-        observed: Squares of the recording, `(record, time)`.
-        reference: Squares of the simulation, likewise.
-    """
-
-    def products(squares: Tensor) -> Tensor:
-        x = squares - squares.mean(-1, keepdim=True)
-        x = x / x.square().mean(-1, keepdim=True).sqrt()
-        n = x.shape[-1] - LAGS
-        return torch.stack([x[..., :n] * x[..., lag : n + lag] for lag in range(1, LAGS + 1)]).sum(0)
-
-    score, dof = equal_means_score(products(observed), products(reference), LAGS)
-    return float(stats.t.sf(score, dof))
-
-
 def chi_square_nodes(dof: float) -> tuple[Tensor, Tensor]:
     """Values `(node,)` of a chi-square variable over its dof, and weights, to average p values over.
 
@@ -111,22 +88,3 @@ def chi_square_nodes(dof: float) -> tuple[Tensor, Tensor]:
     middle = np.concatenate([[edges[1] / 2], np.sqrt(edges[1:-1] * edges[2:])])
     values = stats.chi2.ppf(np.clip(middle, 0, 1 - 1e-12), dof) / dof
     return torch.from_numpy(values), torch.from_numpy(np.diff(edges))
-
-
-def kuiper_p_value(reach: float) -> float:
-    """p value of a Brownian bridge's range, `2 sum (4 j^2 x^2 - 1) exp(-2 j^2 x^2)` (Kuiper)."""
-    x = np.arange(1, 40) * max(reach, 0.2)  # smaller ranges have p = 1 as well, but need more terms
-    return float(np.clip(2 * ((4 * x**2 - 1) * np.exp(-2 * x**2)).sum(), 0, 1))
-
-
-def studentised_range_p_value(reach: float, dof: float) -> float:
-    """p value of such a range over an sd whose square is chi-square: the mean of Kuiper's over that law.
-
-    Args:
-        reach: Range of the CUSUM over its estimated sd.
-        dof: Degrees of freedom of the estimated variance.
-    """
-    factors, weights = chi_square_nodes(dof)
-    return sum(
-        w * kuiper_p_value(reach * math.sqrt(f)) for f, w in zip(factors.tolist(), weights.tolist(), strict=True)
-    )

@@ -1,15 +1,12 @@
 """The grid that rounded values lie on, exact or hidden under noise that was added after the rounding.
 
 A grid `offset + k step` is exact where values recur, and read off them. A hidden one shows in the empirical
-characteristic function `phi(u) = mean exp(i u x)` at `u = 2 pi/step`: beyond `5.5/s`, with `s` the sd of the middle of
-what is left of a sample given its past and the other sensors, `n |phi|^2` is standard exponential without a grid, and
-independent from sensor to sensor. A grid of size `k` gives it the likelihood ratio `exp(-k) I0(2 sqrt(k n |phi|^2))`;
-the mean of that over steps, sizes and shares of the sensors, which may have the same converter, has expectation one
-without a grid (`stats.multiplicity`).
-
-Noise that is a mixture of normal laws of several widths reaches further, but its characteristic function falls all the
-way: at `u` it is not above the least that it is before, where a grid has a trough. With `b^2` the `n |phi|^2` there,
-`(sqrt(n) |phi| - b)^2` is at most standard exponential, by the triangle inequality.
+characteristic function `phi(u) = mean exp(i u x)` at `u = 2 pi/step`. That of noise, normal or a mixture of normal laws
+of several widths, falls all the way: at `u` it is not above the least that it is before, where a grid has a trough. With
+`b^2` the `n |phi|^2` there, `P = (sqrt(n) |phi| - b)^2` is at most standard exponential without a grid, by the triangle
+inequality, and independent from sensor to sensor. A grid of size `k` gives it the likelihood ratio
+`exp(-k) I0(2 sqrt(k P))`; the mean of that over steps, sizes and shares of the sensors, which may have the same
+converter, has expectation one at most (`stats.multiplicity`).
 
 References:
     Widrow and Kollar, Quantization Noise, 2008, chapter 4: the characteristic function of rounded values.
@@ -30,12 +27,10 @@ from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.prediction_errors import left_out
 from gyrofuse.mismatch.signals.records import Records
-from gyrofuse.mismatch.stats.multiplicity import e_value_of_some, p_value_beyond_reference, p_value_from_e_value, sidak
+from gyrofuse.mismatch.stats.multiplicity import e_value_of_some, p_value_from_e_value, sidak
 
 _FINEST_HIDDEN = 1 / 20  # smallest step, sd of a sample given its past: a finer one adds 1/4800 of the noise's variance
-# `u s`, beyond which normal noise has no characteristic function left, exp(-15), and where the peak of a grid found by
-# its flank or by harmonics may still lie.
-_ENDS, _LOWEST = 5.5, 3.5
+_LOWEST = 3.5  # `u s`, from which on grids are searched: normal noise has n exp(-12) there, one in 10^5 samples
 _BEFORE = 0.8  # share of `u` up to which the least power before it is looked for: nearer, a peak has its own flank
 _OF_OTHERS = 0.02  # p value of a grid at a step that another sensor is known to have
 
@@ -63,7 +58,7 @@ class HiddenStep(NamedTuple):
 
     Attributes:
         log_ratio: Logarithm of the mean likelihood ratio over steps, sizes and shares of the sensors, nats.
-        step: Unit of the signal; 0 where nothing was searched.
+        step: Unit of the signal.
         peak: Frequency of the peak of the characteristic functions.
     """
 
@@ -99,41 +94,24 @@ def core_sd(side: Records) -> Tensor:
 
 
 @derived
-def _distinct(side: Records) -> tuple[tuple[Tensor, Tensor], ...]:
-    """Values of each sensor in the first record, sorted, and how often each is there."""
-    return tuple(torch.unique(row, return_counts=True) for row in side.signal[0])
+def _distinct(side: Records) -> tuple[Tensor, ...]:
+    """Distinct values of each sensor in the first record, sorted: each counts once, whatever repeats."""
+    return tuple(torch.unique(row) for row in side.signal[0])
 
 
 @derived
 def exact_lattices(side: Records) -> tuple[Lattice | None, ...]:
     """The exact grid of each sensor's values in the first record, `None` without."""
-    return tuple(
-        _exact_lattice(*values, float(sd)) for values, sd in zip(_distinct(side), innovation_sd(side), strict=True)
-    )
+    return tuple(_exact_lattice(row, float(sd)) for row, sd in zip(side.signal[0], innovation_sd(side), strict=True))
 
 
-@derived
-def lattices(side: Records) -> tuple[Lattice, ...]:
-    """The likeliest grid of each sensor's values in the first record."""
-    every = zip(exact_lattices(side), _distinct(side), core_sd(side), strict=True)
-    return tuple(exact or _hidden_lattice(unique, sd) for exact, (unique, _), sd in every)
-
-
-@derived
-def shared_lattice(side: Records) -> HiddenStep:
-    """The likeliest hidden step of all sensors whose values have no exact grid, over the first record."""
-    hidden = [i for i, exact in enumerate(exact_lattices(side)) if exact is None]
-    if len(hidden) < 2:
-        return HiddenStep(-math.inf, 0.0, 0.0)
-    return _hidden_step([_distinct(side)[i][0] for i in hidden], core_sd(side)[hidden])
-
-
-def _exact_lattice(unique: Tensor, counts: Tensor, sd: float) -> Lattice | None:
+def _exact_lattice(values: Tensor, sd: float) -> Lattice | None:
     """Grid on which 999 of 1000 samples lie to a hundredth of a step: converters also have end stops.
 
     Its step is the usual or the smallest gap between values, unless below a 50th of an sd: that is the noise of
     arithmetic.
     """
+    unique, counts = torch.unique(values, return_counts=True)
     gaps = unique.diff()
     for step in (float(gaps.median()), float(gaps.min())) if len(gaps) > 1 else ():
         if step < sd / 50:
@@ -147,12 +125,6 @@ def _exact_lattice(unique: Tensor, counts: Tensor, sd: float) -> Lattice | None:
     return None
 
 
-def _hidden_lattice(unique: Tensor, sd: Tensor) -> Lattice:
-    """The likeliest hidden grid of one sensor; each value counts once, whatever repeats."""
-    found = _hidden_step([unique], sd[None])
-    return _lattice_at(unique, found.peak, found.step)._replace(p_value=found.p_value)
-
-
 def _hidden_step(rows: list[Tensor], sd: Tensor) -> HiddenStep:
     """The likeliest hidden step of one or several sensors.
 
@@ -161,7 +133,7 @@ def _hidden_step(rows: list[Tensor], sd: Tensor) -> HiddenStep:
         sd: Standard deviations of the middle of their innovations, `(row,)`.
     """
     u, raw = _characteristic(rows, float(sd.min()))
-    power, usable = beyond_smooth(raw), u > _ENDS / sd[:, None]
+    power, usable = beyond_smooth(raw), u > _LOWEST / sd[:, None]
     ratios = []
     for size in (4.0, 8.0, 16.0, 32.0):  # nats: the largest one finds any larger as well
         x = 2 * (size * power).sqrt()
@@ -175,9 +147,7 @@ def _hidden_step(rows: list[Tensor], sd: Tensor) -> HiddenStep:
         return found
     shown = usable[:, best] & (power[:, best] > -math.log(_OF_OTHERS))
     have = shown.nonzero()[:, 0].tolist() or usable[:, best].nonzero()[:, 0].tolist()
-    total, lowest = power[have].sum(0), _LOWEST / float(sd[have].min())
-    while u[best] > lowest and total[best - 1] > total[best]:  # from a flank to its peak
-        best -= 1
+    lowest = _LOWEST / float(sd[have].min())
     rows = [rows[i] for i in have]
     peak = _peak(rows, float(u[best]), float(u[1]))
     height = _power_beyond(rows, peak)
@@ -220,9 +190,8 @@ def beyond_smooth(power: Tensor) -> Tensor:
 
 
 def _beyond(power: Tensor, least: Tensor) -> Tensor:
-    """Power that the least power before it does not explain; that of noise alone is above 5 in one of 150 cases."""
-    noise = torch.where(least > 5.0, least - 1, 0.0)
-    return (power.sqrt() - noise.sqrt()).clamp(min=0).square()
+    """Power that the least power before it, of noise and of chance, whose mean is one, does not explain."""
+    return (power.sqrt() - (least - 1).clamp(min=0).sqrt()).clamp(min=0).square()
 
 
 def _power(values: Tensor, u: Tensor) -> Tensor:
@@ -273,7 +242,7 @@ class Missing(NamedTuple):
     """Grids that the simulation does not have and could be rounded to.
 
     Attributes:
-        p_value: p value of no such grid, over every sensor alone and all together.
+        p_value: p value of no such grid.
         lattices: Grids by position of the sensor.
     """
 
@@ -282,34 +251,46 @@ class Missing(NamedTuple):
 
 
 def missing_lattices(comparison: Comparison, level: float) -> Missing:
-    """Grids of the recording; none where their p value is not below `level`.
+    """Grids of the recording: exact ones, and hidden steps one after the other, each in the sensors that have it.
 
-    A step that one sensor or all together show needs less to be believed in the others.
+    Args:
+        comparison: Recording and simulation.
+        level: p value above which a hidden step is none.
     """
-    every, n_sensors = lattices(comparison.observed), comparison.n_sensors
-    alone = {i: left for i, own in enumerate(every) if (left := _not_simulated(comparison, i, own))}
-    clearest = min(alone.values(), key=lambda found: found.p_value, default=None)
-    p_alone = sidak(clearest.p_value, n_sensors) if clearest else 1.0
-    shared = shared_lattice(comparison.observed)
-    p_shared = p_value_beyond_reference(shared.p_value, shared_lattice(comparison.reference).p_value)
-    p_value = sidak(min(p_alone, p_shared), min(n_sensors, 2))
-    if p_value > level or not (alone or shared.step):
-        return Missing(p_value, {})
-    missing = {i: left for i, left in alone.items() if sidak(left.p_value, 2 * n_sensors) <= level}
-    if clearest is None or p_shared < p_alone:  # those that show a step of their own keep it
-        clearest = Lattice(shared.step, 0.0, 1.0, p_shared, shared.peak)
-    steps = [found.step for found in missing.values()]
-    for i, own in enumerate(every):
-        if i in missing:
-            continue
-        if own.blur > 0 and clearest.blur > 0:
-            own = _lattice_at(_distinct(comparison.observed)[i][0], clearest.peak, clearest.step)
-        elif not any(abs(own.step / step - 1) < 0.04 for step in steps):  # hidden steps are known to a few per cent
-            continue
-        left = _not_simulated(comparison, i, own) if own.p_value < _OF_OTHERS else None
-        if left is not None and left.p_value < _OF_OTHERS:
-            missing[i] = left
-    return Missing(p_value, dict(sorted(_as_large(missing).items())))
+    observed, reference = exact_lattices(comparison.observed), exact_lattices(comparison.reference)
+    missing = {
+        i: own
+        for i, (own, other) in enumerate(zip(observed, reference, strict=True))
+        if own is not None and not (other is not None and other.step > own.step * (1 - 1e-3))
+    }
+    p_value = 0.0 if missing else 1.0
+    hidden = [i for i, own in enumerate(observed) if own is None]
+    while hidden:
+        p, here = _hidden_in(comparison, hidden, level)
+        p_value = min(p_value, p)
+        if not here:
+            break
+        missing |= here
+        hidden = [i for i in hidden if i not in here]
+    return Missing(p_value, dict(sorted(missing.items())))
+
+
+def _hidden_in(comparison: Comparison, sensors: list[int], level: float) -> Missing:
+    """The likeliest hidden step of some sensors, and the grids of those that have it; none above the level.
+
+    That the simulation shows it in some of them as well is no mismatch unless one of the recording's is clearer.
+    """
+    values = [_distinct(comparison.observed)[i] for i in sensors]
+    found = _hidden_step(values, core_sd(comparison.observed)[sensors])
+    if found.p_value > level:
+        return Missing(found.p_value, {})
+    grids = {i: _lattice_at(v, found.peak, found.step) for i, v in zip(sensors, values, strict=True)}
+    beside = {i: _beside_simulation(comparison, i, own) for i, own in grids.items()}
+    p_value = found.p_value
+    if any(beside[i] > own.p_value for i, own in grids.items()):
+        p_value = max(p_value, sidak(min(beside.values()), len(sensors)))
+    have = {i: own._replace(p_value=beside[i]) for i, own in grids.items() if beside[i] < _OF_OTHERS}
+    return Missing(p_value, _as_large(have) if p_value <= level else {})
 
 
 def _as_large(missing: dict[int, Lattice]) -> dict[int, Lattice]:
@@ -319,26 +300,23 @@ def _as_large(missing: dict[int, Lattice]) -> dict[int, Lattice]:
     return {i: found for i, found in missing.items() if size.get(i, least) >= least}
 
 
-def _not_simulated(comparison: Comparison, sensor: int, own: Lattice) -> Lattice | None:
-    """A grid of the recording, with the p value that it is no clearer than the simulation's; `None` if exact there."""
+def _beside_simulation(comparison: Comparison, sensor: int, own: Lattice) -> float:
+    """p value that a hidden grid of the recording is no clearer than the simulation's."""
     other = exact_lattices(comparison.reference)[sensor]
-    if own.blur == 0:
-        return None if other is not None and other.step > own.step * (1 - 1e-3) else own
     if other is not None:
         # What is taken off a recording blurs its own grid, of which harmonics may be left: peaks as wide as 1/sd.
         base = 2 * math.pi / other.step
         if abs(own.peak - base * max(round(own.peak / base), 1)) < 1 / float(comparison.recording[sensor].std()):
-            return None
+            return 1.0
     # Each value counts once here as well: where one of them stands for all around it, what is missing shows.
-    values, u = _distinct(comparison.observed)[sensor][0], torch.tensor([own.peak], dtype=torch.float64)
+    values, u = _distinct(comparison.observed)[sensor], torch.tensor([own.peak], dtype=torch.float64)
     records = [row.unique() for row in comparison.reference.signal[:, sensor]]
     n, m = len(values), sum(map(len, records))
-    power = float(_power(values - values.mean(), u))
     # Its records share one grid, or each lies about its own mean: one that was built in does.
     every = torch.cat(records)
     about = every - every.mean(), torch.cat([row - row.mean() for row in records])
-    other_power = max(float(_power(centred, u)) for centred in about)
+    power, other_power = float(_power(values - values.mean(), u)), max(float(_power(v, u)) for v in about)
     if other_power < -math.log(CERTAIN):
-        return own
+        return own.p_value
     clearer = max(math.sqrt(power / n) - math.sqrt(other_power / m), 0.0)
-    return own._replace(p_value=max(own.p_value, math.exp(-(clearer**2) / (1 / n + 1 / m))))
+    return max(own.p_value, math.exp(-(clearer**2) / (1 / n + 1 / m)))

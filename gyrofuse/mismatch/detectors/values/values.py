@@ -10,7 +10,7 @@ import torch
 from scipy import special, stats
 from torch import Tensor
 
-from gyrofuse.mismatch.decisions import CERTAIN
+from gyrofuse.mismatch.decisions import CERTAIN, CHANCE
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.values.quantisation_grid import missing_lattices
 from gyrofuse.mismatch.detectors.values.ties import missing_recurrences
@@ -211,7 +211,7 @@ def _at_end(values: Tensor, cell: float) -> _End:
 def values_test(comparison: Comparison) -> TestResult:
     """Lattice, repeats, end stops and returns of single values, against those of the simulation."""
     same, candidates = repeats(comparison).p_values, []
-    rounded = missing_lattices(comparison, 1.0)
+    rounded = missing_lattices(comparison, CHANCE)
     if rounded.lattices:
         at, found = min(rounded.lattices.items(), key=lambda item: item[1].p_value)
         candidates.append((rounded.p_value, at, f"values on a lattice of {found.step:.4g} {comparison.info.measure}"))

@@ -29,21 +29,19 @@ from gyrofuse.mismatch.stats.long_run_variance import long_run_variance
 
 
 class LevelSpread(NamedTuple):
-    """Long-run variance of squares cut at nine.
+    """How much the level varies by itself.
 
     Attributes:
-        excess: Ratio to that of independent squares, in each sensor and in the sum, `(sensor + 1,)`.
         weight: Weight of a sample in a log likelihood ratio, `(sensor,)`; 1 where the noise is Gaussian.
-        dof: Degrees of freedom of both.
+        dof: Degrees of freedom with which it is known.
     """
 
-    excess: Tensor
     weight: Tensor
     dof: float
 
 
 def level_spread(white: Tensor, gaussian: Tensor) -> LevelSpread:
-    """Long-run variance of the squares of a simulation.
+    """How much the level of a simulation varies, from the long-run variance of its squares cut at nine.
 
     Args:
         white: Whitened records, `(record, sensor, time)`.
@@ -51,20 +49,16 @@ def level_spread(white: Tensor, gaussian: Tensor) -> LevelSpread:
     """
     n_sensors = white.shape[1]
     if bool(gaussian.all()):
-        one = torch.ones(n_sensors + 1, dtype=white.dtype)
-        return LevelSpread(one, one[:-1], math.inf)
+        return LevelSpread(torch.ones(n_sensors, dtype=white.dtype), math.inf)
     squares = white.square().clamp(max=SQUARE_CUT)
     mean, variance = squares.mean((0, -1)), squares.var((0, -1))
     rows = [long_run_variance(squares[:, i]) for i in range(n_sensors)]
     values = torch.tensor([row.value for row in rows], dtype=white.dtype).maximum(variance)
     weight = torch.where(gaussian, 1.0, (2 * mean.square() / values).clamp(max=1))
-    pooled = ((squares - mean[:, None]) / variance[:, None].sqrt()).sum(1)
-    together = long_run_variance(pooled)
+    together = long_run_variance(((squares - mean[:, None]) / variance[:, None].sqrt()).sum(1))
     alike = (values / variance).sum() / max(together.value, 1e-300)  # below 1 where levels vary together
-    sum_excess = torch.tensor([max(together.value / float(pooled.var()), 1.0)])
-    excess = torch.cat([torch.where(gaussian, 1.0, values / variance), sum_excess])
     dof = min([together.dof, *(row.dof for i, row in enumerate(rows) if not gaussian[i])])
-    return LevelSpread(excess, weight * alike.clamp(max=1), dof)
+    return LevelSpread(weight * alike.clamp(max=1), dof)
 
 
 def with_spread(comparison: Comparison, noise_samples: int = 0) -> Comparison:
