@@ -16,6 +16,7 @@ from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.stats import variance_courses as courses
+from gyrofuse.mismatch.stats.segments import course_scores
 
 T = torch.arange(N, dtype=torch.float64) / N
 
@@ -75,9 +76,7 @@ def test_a_course_and_its_levels_are_found(form: str):
     level = torch.stack([0.8 * true, 0 * true, -1.2 * true])
     apart = (found.variance.log() - level).abs()
     assert float(apart.mean()) < 0.05
-    assert float(courses.course_scores(white, found.variance).sum()) > 0.95 * float(
-        courses.course_scores(white, level.exp()).sum()
-    )
+    assert float(course_scores(white, found.variance).sum()) > 0.95 * float(course_scores(white, level.exp()).sum())
 
 
 def test_steady_noise_gains_what_an_order_gains_by_chance():
@@ -87,7 +86,7 @@ def test_steady_noise_gains_what_an_order_gains_by_chance():
         white = normal(1, N, g=torch.Generator().manual_seed(seed))
         found = courses.course_of(white, torch.ones(1, dtype=torch.float64))
         if found is not None:
-            gains.append(float(courses.course_scores(white, found.variance).sum()))
+            gains.append(float(course_scores(white, found.variance).sum()))
             worth.append(courses.course_score(white, found, torch.ones(1, dtype=torch.float64)))
     assert sum(gains) / len(gains) < 1.5 * math.log(128)
     assert max(worth) < 5

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool1d, pad
+from torch.nn.functional import pad
 
 WINDOW = 257  # samples: of Gaussian noise their mean square is known to a tenth, bursts of tens of samples stay
 
@@ -18,15 +18,13 @@ def local_level(values: Tensor) -> Tensor:
     Args:
         values: White or nearly white noise, `(..., time)`.
     """
-    squares = values.square().flatten(0, -2)
-    half = min(WINDOW // 2, (squares.shape[-1] - 1) // 2)
-    counts = _sums(torch.ones_like(squares[:1]), half)
-    level = squares.mean(-1, keepdim=True).clamp(min=1e-300).expand_as(squares)
+    n = values.shape[-1]
+    half = min(WINDOW // 2, (n - 1) // 2)
+    at = torch.arange(n)
+    low, high = (at - half).clamp(min=0), (at + half + 1).clamp(max=n)
+    squares = values.square()
+    level = squares.mean(-1, keepdim=True).clamp(min=1e-300)
     for _ in range(3):
-        level = (_sums(squares.minimum(9.0 * level), half) / counts).clamp(min=1e-300)
-    return (level / level.mean(-1, keepdim=True)).view(values.shape)
-
-
-def _sums(rows: Tensor, half: int) -> Tensor:
-    """Sums of `(row, time)` around each sample, up to a factor."""
-    return avg_pool1d(pad(rows[:, None], (half, half)), 2 * half + 1, stride=1)[:, 0]
+        total = pad(squares.minimum(9.0 * level).cumsum(-1), (1, 0))
+        level = ((total[..., high] - total[..., low]) / (high - low)).clamp(min=1e-300)
+    return level / level.mean(-1, keepdim=True)

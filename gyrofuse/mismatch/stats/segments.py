@@ -211,6 +211,26 @@ def _quiet(squares: Tensor, factor: Tensor, inside: Tensor, reference: Reference
     return (within / factor + without + energy) / (len(inside) + n_known)
 
 
+def course_scores(white: Tensor, variance: Tensor, reference: Reference | None = None) -> Tensor:
+    """Log likelihood ratio of a variance known up to its size to a steady one, `(sensor, time)`, nats.
+
+    Args:
+        white: Whitened samples, `(sensor, time)`.
+        variance: Variance of each, up to a factor of each sensor, likewise; 1 where the reference has its level.
+        reference: Level where the variance is 1, where it is known beside the record.
+    """
+    squares = white.square()
+    energy, n_known = _known(squares, reference)
+    n = white.shape[-1] + n_known
+    size = (squares / variance).median(-1, keepdim=True).values / CHI2_MEDIAN
+    for _ in range(3):  # outliers are cut at the size found so far
+        size = (((squares / variance).minimum(OUTLIER * size).sum(-1) + energy) / n)[:, None]
+    variance = size * variance
+    squares = squares.minimum(OUTLIER * variance)
+    one = ((squares.sum(-1) + energy) / n)[:, None]
+    return (squares / one - squares / variance - (variance / one).log()) / 2
+
+
 def two_level_scores(white: Tensor, factor: Tensor, inside: Tensor, reference: Reference | None = None) -> Tensor:
     """Log likelihood ratio of two levels to one for each sample, `(sensor, time)`, nats.
 
@@ -220,10 +240,7 @@ def two_level_scores(white: Tensor, factor: Tensor, inside: Tensor, reference: R
         inside: Samples of the other level, `(time,)`.
         reference: Level outside, where it is known beside the record.
     """
-    squares = white.square()
-    one, quiet = (_quiet(squares, f, inside, reference)[:, None] for f in (torch.ones_like(factor), factor))
-    level = quiet * torch.where(inside, factor[:, None], 1.0)
-    return (squares / one - squares / level - (level / one).log()) / 2
+    return course_scores(white, torch.where(inside, factor[:, None], 1.0), reference)
 
 
 class Limits(NamedTuple):

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.stats.segments import CHI2_MEDIAN, OUTLIER
+from gyrofuse.mismatch.stats.segments import CHI2_MEDIAN, OUTLIER, course_scores
 
 _STEEPEST = 3.0  # log variance, step of scoring: a start that is off by a factor of 20 still converges
 
@@ -50,22 +50,6 @@ class Course(NamedTuple):
         log_factor, concerned = self.factor.log(), self.factor != 1
         one = torch.where(concerned, log_factor[concerned].mean(), 0.0)
         return self._replace(base=self.base * ((log_factor - one) * self.share.mean()).exp(), factor=one.exp())
-
-
-def course_scores(white: Tensor, variance: Tensor) -> Tensor:
-    """Log likelihood ratio of a variance known up to its size to a steady one, `(sensor, time)`, nats.
-
-    Args:
-        white: Whitened samples, `(sensor, time)`.
-        variance: Variance of each, up to a factor of each sensor, likewise.
-    """
-    squares, size = white.square(), (white.square() / variance).median(-1, keepdim=True).values / CHI2_MEDIAN
-    for _ in range(3):  # outliers are cut at the size found so far
-        size = (squares / variance).minimum(OUTLIER * size).mean(-1, keepdim=True)
-    variance = size * variance
-    squares = squares.minimum(OUTLIER * variance)
-    one = squares.mean(-1, keepdim=True)
-    return (squares / one - squares / variance - (variance / one).log()) / 2
 
 
 def course_score(white: Tensor, course: Course, weight: Tensor, episodes: int = 0) -> float:

@@ -2,11 +2,11 @@
 
 A grid `offset + k step` is exact where values recur, and read off them. A hidden one shows in the empirical
 characteristic function `phi(u) = mean exp(i u x)` at `u = 2 pi/step`. That of noise, normal or a mixture of normal laws
-of several widths, falls all the way: at `u` it is not above the least that it is before, where a grid has a trough. With
-`b^2` the `n |phi|^2` there, `P = (sqrt(n) |phi| - b)^2` is at most standard exponential without a grid, by the triangle
-inequality, and independent from sensor to sensor. A grid of size `k` gives it the likelihood ratio
-`exp(-k) I0(2 sqrt(k P))`; the mean of that over steps, sizes and shares of the sensors, which may have the same
-converter, has expectation one at most (`stats.multiplicity`).
+of several widths, falls all the way: at `u` it is not above the least that it is before, where a grid has a trough.
+With `b^2` the `n |phi|^2` there, `P = (sqrt(n) |phi| - b)^2` is at most standard exponential without a grid, by the
+triangle inequality, and independent from sensor to sensor. A grid of size `k` gives it the likelihood ratio `exp(-k)
+I0(2 sqrt(k P))`; the mean of that over steps, sizes and shares of the sensors, which may have the same converter, has
+expectation one at most (`stats.multiplicity`).
 
 References:
     Widrow and Kollar, Quantization Noise, 2008, chapter 4: the characteristic function of rounded values.
@@ -94,24 +94,25 @@ def core_sd(side: Records) -> Tensor:
 
 
 @derived
-def _distinct(side: Records) -> tuple[Tensor, ...]:
-    """Distinct values of each sensor in the first record, sorted: each counts once, whatever repeats."""
-    return tuple(torch.unique(row) for row in side.signal[0])
+def distinct_values(side: Records) -> tuple[tuple[Tensor, Tensor], ...]:
+    """Distinct values of each sensor in the first record, sorted, and how often each is there."""
+    return tuple(torch.unique(row, return_counts=True) for row in side.signal[0])
 
 
 @derived
 def exact_lattices(side: Records) -> tuple[Lattice | None, ...]:
     """The exact grid of each sensor's values in the first record, `None` without."""
-    return tuple(_exact_lattice(row, float(sd)) for row, sd in zip(side.signal[0], innovation_sd(side), strict=True))
+    return tuple(
+        _exact_lattice(*v, float(sd)) for v, sd in zip(distinct_values(side), innovation_sd(side), strict=True)
+    )
 
 
-def _exact_lattice(values: Tensor, sd: float) -> Lattice | None:
+def _exact_lattice(unique: Tensor, counts: Tensor, sd: float) -> Lattice | None:
     """Grid on which 999 of 1000 samples lie to a hundredth of a step: converters also have end stops.
 
     Its step is the usual or the smallest gap between values, unless below a 50th of an sd: that is the noise of
     arithmetic.
     """
-    unique, counts = torch.unique(values, return_counts=True)
     gaps = unique.diff()
     for step in (float(gaps.median()), float(gaps.min())) if len(gaps) > 1 else ():
         if step < sd / 50:
@@ -280,7 +281,7 @@ def _hidden_in(comparison: Comparison, sensors: list[int], level: float) -> Miss
 
     That the simulation shows it in some of them as well is no mismatch unless one of the recording's is clearer.
     """
-    values = [_distinct(comparison.observed)[i] for i in sensors]
+    values = [distinct_values(comparison.observed)[i][0] for i in sensors]  # each counts once, whatever repeats
     found = _hidden_step(values, core_sd(comparison.observed)[sensors])
     if found.p_value > level:
         return Missing(found.p_value, {})
@@ -309,7 +310,7 @@ def _beside_simulation(comparison: Comparison, sensor: int, own: Lattice) -> flo
         if abs(own.peak - base * max(round(own.peak / base), 1)) < 1 / float(comparison.recording[sensor].std()):
             return 1.0
     # Each value counts once here as well: where one of them stands for all around it, what is missing shows.
-    values, u = _distinct(comparison.observed)[sensor], torch.tensor([own.peak], dtype=torch.float64)
+    values, u = distinct_values(comparison.observed)[sensor][0], torch.tensor([own.peak], dtype=torch.float64)
     records = [row.unique() for row in comparison.reference.signal[:, sensor]]
     n, m = len(values), sum(map(len, records))
     # Its records share one grid, or each lies about its own mean: one that was built in does.

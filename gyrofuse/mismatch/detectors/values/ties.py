@@ -14,11 +14,13 @@ from scipy import stats
 from torch import Tensor
 
 from gyrofuse.mismatch.decisions import CERTAIN
+from gyrofuse.mismatch.detectors.values.quantisation_grid import distinct_values
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.records import Records
 from gyrofuse.mismatch.stats.multiplicity import sidak
 
+_FEWEST = 4  # returns to a value that is not known from another sensor
 _NEIGHBOURS = 64  # values on either side, from which the density is known to a tenth
 
 
@@ -65,7 +67,9 @@ class Recurring(NamedTuple):
 @derived
 def _recurring_values(side: Records) -> tuple[Recurring | None, ...]:
     """Recurring value of each sensor, over the first record; `None` where values recur by their resolution, or none."""
-    return tuple(recurring(i, values) for i, values in enumerate(side.signal[0]))
+    counts = (int(counts.max()) for _, counts in distinct_values(side))
+    rows = enumerate(zip(side.signal[0], counts, strict=True))
+    return tuple(recurring(i, values) if most >= _FEWEST else None for i, (values, most) in rows)
 
 
 def recurring(sensor: int, values: Tensor, value: float | None = None) -> Recurring | None:
@@ -87,7 +91,7 @@ def recurring(sensor: int, values: Tensor, value: float | None = None) -> Recurr
         return None
     if value is not None:
         at = min(max(int(torch.searchsorted(unique, value)), 1), len(unique) - 2)
-    if float(unique[at]) != value if value is not None else int(counts[at]) < 4:
+    if float(unique[at]) != value if value is not None else int(counts[at]) < _FEWEST:
         return None
     low, high = max(at - _NEIGHBOURS, 0), min(at + _NEIGHBOURS, len(unique) - 1)
     finest = float(unique[max(at - 4096, 0) : at + 4097].diff().min())

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.decisions import CERTAIN, CHANCE
 from gyrofuse.mismatch.detectors.result import TestResult
-from gyrofuse.mismatch.detectors.values.quantisation_grid import missing_lattices
+from gyrofuse.mismatch.detectors.values.quantisation_grid import distinct_values, missing_lattices
 from gyrofuse.mismatch.detectors.values.ties import missing_recurrences
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
@@ -109,14 +109,12 @@ def _repeat_shares(same: Tensor) -> tuple[Tensor, int, Tensor, Tensor]:
 @derived
 def _resolutions(side: Records) -> Tensor:
     """Smallest difference between two values of the first record, `(sensor,)`: its step where it is rounded."""
-    return torch.stack([_finest_gap(values) for values in side.signal[0]])
+    return torch.stack([_finest_gap(unique) for unique, _ in distinct_values(side)])
 
 
-def _finest_gap(values: Tensor) -> Tensor:
-    """Smallest difference between two values; 0 of a single value."""
-    gaps = values.sort().values.diff()
-    gaps = gaps[gaps > 0]
-    return gaps.min() if len(gaps) else torch.zeros((), dtype=torch.float64)
+def _finest_gap(unique: Tensor) -> Tensor:
+    """Smallest difference between two distinct values; 0 of a single value."""
+    return unique.diff().min() if len(unique) > 1 else unique.new_zeros(())
 
 
 class EndStop(NamedTuple):
@@ -159,7 +157,7 @@ def end_stops(comparison: Comparison) -> tuple[EndStop, ...]:
                 continue
             beyond = float(torch.special.ndtr((sign * mean - limit - resolution / 2) / sd).sum())
             # Values of few digits are coarser where they are large.
-            near = float(_finest_gap(x[x.abs() > abs(limit) / 2]))
+            near = float(_finest_gap(x[x.abs() > abs(limit) / 2].unique()))
             p = min(math.exp(-beyond), min(10.0 * max(near, resolution) / sd, 1.0) ** (runs - 1))
             if rounded:  # tails of rounded noise are not normal: chance has up to four at the end
                 p = max(p, float(special.pdtrc(runs - 1, 4.0)))

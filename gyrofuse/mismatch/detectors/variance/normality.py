@@ -45,7 +45,7 @@ def gaussian_sensors(side: Records) -> Tensor:
     expected = left_out(side)
     kurtosis = kurtosis_score(expected.white).sum(0) / math.sqrt(len(expected.white))
     together = kurtosis.sum() / math.sqrt(n_sensors)
-    tails = of_all_levels(gaussian_tail_p_values(tail_counts(expected.z), len(expected.z) * n))
+    tails = of_all_levels(gaussian_tail_p_values(tail_counts(side), len(expected.z) * n))
     steadiness = _steadiness(expected.white)
     shown = (torch.special.ndtr(-torch.maximum(kurtosis, together)), *_both(tails), steadiness)
     return torch.stack([p.expand(n_sensors) for p in shown]).amin(0) > NOTHING_SHOWN / len(shown)
@@ -56,8 +56,14 @@ def _both(p_values: Tensor) -> tuple[Tensor, Tensor]:
     return p_values[:-1], p_values[-1]
 
 
-def tail_counts(z: Tensor) -> Array:
-    """Numbers of errors beyond the levels for Gaussian noise in each sensor, and of their norms, `(sensor + 1, level)`.
+@derived
+def tail_counts(side: Records) -> Array:
+    """Numbers of prediction errors beyond the levels for Gaussian noise, `(sensor + 1, level)`."""
+    return counts_of_errors(left_out(side).z)
+
+
+def counts_of_errors(z: Tensor) -> Array:
+    """Numbers of errors beyond these levels in each sensor, and of their norms, `(sensor + 1, level)`.
 
     Args:
         z: Standardised errors, `(record, sensor, time)`.

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.decisions import CHANCE
 from gyrofuse.mismatch.detectors.result import TestResult
-from gyrofuse.mismatch.detectors.variance.normality import gaussian_sensors, tail_counts
+from gyrofuse.mismatch.detectors.variance.normality import counts_of_errors, gaussian_sensors, tail_counts
 from gyrofuse.mismatch.detectors.variance.weak_outliers import WeakOutliers, weak_outliers
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
@@ -58,22 +58,22 @@ def spike_p_value(comparison: Comparison) -> float:
 def spike_p_values(comparison: Comparison) -> Tensor:
     """p values of the tails of each sensor, and of all together, `(sensor + 1,)`, over all levels."""
     gaussian = gaussian_sensors(comparison.reference)
-    p_values = _against_gaussian(left_out(comparison.observed).z, left_out(comparison.reference).z)
+    p_values = _against_gaussian(comparison)
     if bool(gaussian.all()):
         return p_values
     observed, reference = map(_levelled, (comparison.observed, comparison.reference))
     predicted = tail_p_values(observed[0].numpy(), reference.movedim(1, 0).numpy())
-    own, other = tail_counts(observed)[-1], tail_counts(reference)[-1]
+    own, other = counts_of_errors(observed)[-1], counts_of_errors(reference)[-1]
     clumps = dispersion((norms(reference) > chi_levels(comparison.n_sensors)[0]).numpy())
     length = observed[:, 0].numel() / reference[:, 0].numel()
     together = of_all_levels(equal_rates_p_value(own / clumps, other / clumps, length))
     return torch.cat([torch.where(gaussian, p_values[:-1], predicted), together[None]])
 
 
-def _against_gaussian(observed: Tensor, reference: Tensor) -> Tensor:
-    """p values of errors `(record, sensor, time)` beside those of a Gaussian simulation, `(sensor + 1,)`."""
-    own, other = tail_counts(observed), tail_counts(reference)
-    n, m = observed[:, 0].numel(), reference[:, 0].numel()
+def _against_gaussian(comparison: Comparison) -> Tensor:
+    """p values of the tails beside those of a Gaussian simulation, `(sensor + 1,)`."""
+    own, other = tail_counts(comparison.observed), tail_counts(comparison.reference)
+    n, m = (left_out(side).z[:, 0].numel() for side in (comparison.observed, comparison.reference))
     heavy = gaussian_tail_p_values(other, m) < CHANCE  # of effects that were built into a model
     return of_all_levels(np.where(heavy, equal_rates_p_value(own, other, n / m), gaussian_tail_p_values(own, n)))
 

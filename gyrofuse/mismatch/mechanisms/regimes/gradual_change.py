@@ -35,13 +35,12 @@ from gyrofuse.mismatch.signals.variance_course import (
     whitened_factor,
 )
 from gyrofuse.mismatch.stats.limits import Z
-from gyrofuse.mismatch.stats.segments import stretch_of
+from gyrofuse.mismatch.stats.segments import course_scores, stretch_of
 from gyrofuse.mismatch.stats.variance_courses import (
     Course,
     course_at_once,
     course_of,
     course_score,
-    course_scores,
     fitted_levels,
 )
 
