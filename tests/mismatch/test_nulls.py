@@ -230,8 +230,8 @@ def test_events_in_clumps_count_for_fewer() -> None:
     clumps = np.zeros((1, 64_000), dtype=bool)
     for at in rng.integers(0, 63_990, 25):
         clumps[0, at : at + 5] = True
-    assert tails.dispersion(alone) < 1.6
-    assert tails.dispersion(clumps) == pytest.approx(5, rel=0.4)
+    assert tails.dispersion(torch.from_numpy(alone)) < 1.6
+    assert tails.dispersion(torch.from_numpy(clumps)) == pytest.approx(5, rel=0.4)
 
 
 def test_squares_that_come_together_in_both_are_no_bursts() -> None:

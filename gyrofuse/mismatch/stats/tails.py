@@ -20,13 +20,14 @@ from numpy.typing import NDArray
 from scipy import special, stats
 from torch import Tensor
 
+from gyrofuse.mismatch.decisions import CHANCE
+
 Array = NDArray[np.float64]
 
 # Levels, sd: close where counts are large, and no further than any outlier needs. Beyond the sixth normal noise of any
 # length has no value, so that the first six are enough against it.
 LEVELS = (3.5, 4.0, 4.5, 5.0, 6.0, 8.0, 11.0, 16.0, 23.0, 32.0)
 GAUSSIAN_LEVELS = LEVELS[:6]
-_CLUMPED = 0.05  # p value from which on counts vary by more than Poisson's
 
 
 def counts_beyond(sizes: Tensor, levels: Tensor | None = None) -> Array:
@@ -65,7 +66,7 @@ def tail_p_values(observed: Array, reference: Array) -> Tensor:
     """
     n, m = observed.shape[-1], reference[0].size
     levels = np.array(LEVELS)
-    clumps = np.array([dispersion(np.abs(z) > LEVELS[0]) for z in reference])[:, None]
+    clumps = np.array([dispersion(torch.from_numpy(np.abs(z) > LEVELS[0])) for z in reference])[:, None]
     own, other = (counts_beyond(torch.from_numpy(np.abs(z)), torch.from_numpy(levels)) for z in (observed, reference))
     own, other = own / clumps, other.sum(1)
     shape = (other + other.mean(0)) / 2 / clumps + 0.5
@@ -88,17 +89,15 @@ def equal_rates_p_value(own: Array, other: Array, length: float) -> Array:
     return np.asarray(np.where(own > 0, p, 1.0))
 
 
-def dispersion(events: NDArray[np.bool_]) -> float:
-    """Variance over mean of counts of events `(record, time)` in blocks, 1 where it is not significantly larger.
+def dispersion(events: Tensor) -> float:
+    """Variance over mean of counts of events `(record, time)` in 64 blocks, 1 where it is not significantly larger.
 
-    Events that come in clumps of `D` are as uncertain as a `D`-th of their number by themselves. The 64 blocks of a
-    record are long against clumps of some tens of samples.
+    Events that come in clumps of `D` are as uncertain as a `D`-th of their number by themselves.
     """
-    size = events.shape[-1] // 64
-    counts = events[..., : size * 64].reshape(-1, size).sum(-1)
-    mean = max(counts.mean(), 1e-12)
-    index = float(counts.var(ddof=1) / mean)
-    clumped = stats.chi2.sf(index * (len(counts) - 1), len(counts) - 1) < _CLUMPED
+    size = events.shape[-1] // 64  # long against clumps of some tens of samples
+    counts = events[..., : size * 64].unflatten(-1, (64, size)).sum(-1).flatten().to(torch.float64)
+    index = float(counts.var() / counts.mean().clamp(min=1e-12))
+    clumped = stats.chi2.sf(index * (len(counts) - 1), len(counts) - 1) < CHANCE
     return max(index, 1.0) if clumped else 1.0
 
 

@@ -18,9 +18,9 @@ from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.prediction_errors import left_out
 from gyrofuse.mismatch.signals.records import Records
+from gyrofuse.mismatch.stats.long_run_variance import long_run_variance
 from gyrofuse.mismatch.stats.multiplicity import sidak
 
-_QUARTERS = 4  # of a record, whose spread shows how far a share wanders over it
 END_STOPS = 1  # position of a converter's end stops in the chain from sensor to numbers
 
 
@@ -50,14 +50,15 @@ def repeated(signal: Tensor) -> Tensor:
 
 
 def repeats(comparison: Comparison) -> Repeats:
-    """Repeats of the recording against those of the simulation, block by block.
+    """Repeats of the recording against those of the simulation.
 
-    Many are normal, or Student's where their share wanders; fewer than 20 are counted one by one, against those of the
-    simulation (binomial) and those that the resolution makes (Poisson).
+    Null law: Student's `t` with the long-run variance of the simulation's repeats, since on a coarse grid these follow
+    the slow bias between its points; fewer than 20 are counted one by one, against those of the simulation (binomial)
+    and those that the resolution makes (Poisson).
     """
     same, other_same = (repeated(side.signal).movedim(1, 0) for side in (comparison.observed, comparison.reference))
-    share, n, fast, slow = _repeat_shares(same)
-    other, m, other_fast, other_slow = _repeat_shares(other_same)
+    n, m = same[0].numel(), other_same[0].numel()
+    share, other = (side.to(torch.float64).mean((1, 2)) for side in (same, other_same))
     # A resolution finer than any grid that matters, such as that of float32, makes a few.
     differences = comparison.recording.diff(dim=-1)
     density = 1 / (math.sqrt(2 * math.pi) * differences.square().mean(-1).sqrt())
@@ -65,45 +66,23 @@ def repeats(comparison: Comparison) -> Repeats:
     # Rounded values repeat by chance the more often the less there is of other noise.
     quieter = comparison.reference.signal.diff().abs().mean((0, -1)) / differences.abs().mean(-1).clamp(min=1e-300)
     quieter = quieter.clamp(min=1.0)
-    other = (other * quieter).clamp(max=1.0)
-    expected = other + torch.where(other == 0, by_resolution, 0.0)
+    expected = (other * quieter).clamp(max=1.0) + torch.where(other == 0, by_resolution, 0.0)
+    spreads = [long_run_variance(rows.to(torch.float64)) for rows in other_same]
+    wander = quieter.square() * torch.tensor([spread.value for spread in spreads], dtype=torch.float64)
     binomial = expected * (1 - expected).clamp(min=0) + 1 / n
-    variance = torch.maximum(binomial / n + binomial / m, fast + other_fast)
-    # Of two courses that differ; what happens by chance varies by no more than about itself.
-    wander = 2 * torch.minimum(slow + other_slow, expected.square())
-    sd = (variance + wander).sqrt()
-    z = (share - expected - 0.5 / n) / sd
-    # A wandering share is known from the quarters of the record only.
-    wandering = torch.from_numpy(stats.t.sf(z.numpy(), _QUARTERS - 1))
-    many = torch.where(wander > variance, wandering, torch.special.ndtr(-z))
+    sd = (wander.maximum(binomial) * (1 / n + 1 / m)).sqrt()
+    dof = np.where(wander > binomial, [spread.dof for spread in spreads], np.inf)
+    many = stats.t.sf(((share - expected - 0.5 / n) / sd).numpy(), dof)
     few, events, other_events = n * expected.maximum(by_resolution), _events(same), _events(other_same)
     portion = (n / (n + m / quieter)).numpy()  # of a simulation as long as would repeat as often with this noise
     compared = stats.binom.sf((events - 1).numpy(), (events + other_events).numpy(), portion)
     counted = np.maximum(compared, stats.poisson.sf((events - 1).numpy(), few.numpy()))
-    p_values = torch.where((few < 20.0) & ~(wander > variance), torch.from_numpy(counted), many)
-    return Repeats(share, expected, sd, p_values, n)
+    return Repeats(share, expected, sd, torch.from_numpy(np.where(few.numpy() < 20.0, counted, many)), n)
 
 
 def _events(same: Tensor) -> Tensor:
     """How many runs of repeats `(sensor, record, time)` has, `(sensor,)`."""
     return (same[..., 1:] & ~same[..., :-1]).sum((1, 2))
-
-
-def _repeat_shares(same: Tensor) -> tuple[Tensor, int, Tensor, Tensor]:
-    """Share of repeats `(sensor,)`, of how many samples, and its variances from blocks and from quarters.
-
-    Args:
-        same: Which samples are repeats, `(sensor, record, time)`.
-    """
-    n_blocks = 32
-    n = same.shape[-1] // n_blocks
-    blocks = same[..., : n * n_blocks].unflatten(-1, (n_blocks, n)).to(torch.float64).mean(-1)
-    quarters = blocks.unflatten(-1, (_QUARTERS, -1)).mean(-1).flatten(1)
-    fast = blocks.flatten(1).var(-1)
-    # On a coarse grid repeats follow the slow bias between its points, which wanders over the whole record. Quarters
-    # vary by three times the variance of their blocks in one of thirty cases.
-    slow = (quarters.var(-1) - 3.0 * fast * _QUARTERS / n_blocks).clamp(min=0)
-    return blocks.mean((1, 2)), same[0].numel(), fast / blocks[0].numel(), slow
 
 
 @derived

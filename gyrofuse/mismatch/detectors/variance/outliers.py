@@ -64,7 +64,7 @@ def spike_p_values(comparison: Comparison) -> Tensor:
     observed, reference = map(_levelled, (comparison.observed, comparison.reference))
     predicted = tail_p_values(observed[0].numpy(), reference.movedim(1, 0).numpy())
     own, other = counts_of_errors(observed)[-1], counts_of_errors(reference)[-1]
-    clumps = dispersion((norms(reference) > chi_levels(comparison.n_sensors)[0]).numpy())
+    clumps = dispersion(norms(reference) > chi_levels(comparison.n_sensors)[0])
     length = observed[:, 0].numel() / reference[:, 0].numel()
     together = of_all_levels(equal_rates_p_value(own / clumps, other / clumps, length))
     return torch.cat([torch.where(gaussian, p_values[:-1], predicted), together[None]])
@@ -88,8 +88,8 @@ def _levelled(side: Records) -> Tensor:
 def _weak_p_value(comparison: Comparison) -> float:
     """p value of many weak outliers in the sensors whose tails are Gaussian in the simulation."""
     own = likely_outliers(comparison)
-    if own is None:
-        return 1.0
+    if own is None or own.p_value > CHANCE:
+        return 1.0 if own is None else own.p_value
     reference = left_out(comparison.reference).z[0][gaussian_sensors(comparison.reference)]
     return p_value_beyond_reference(own.p_value, weak_outliers(reference).p_value)
 
