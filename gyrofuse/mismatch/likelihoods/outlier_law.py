@@ -253,7 +253,7 @@ def fitted_shock(z: Tensor, start: list[Outliers], rounds: int) -> list[Outliers
             law, row = laws[i], z[i]
             height = float((weight * row * torch.tanh(law.height * row / (1 + law.spread**2))).sum()) / total
             excess = float((weight * row.square()).sum()) / total - height**2 - 1
-            spread = math.sqrt(max(excess, 0.05**2))  # sd: less cannot be told from none
+            spread = math.sqrt(max(excess, 0.05**2))  # floor, sd: the law stays smooth in it
             laws[i] = Outliers(min(max(total / z.shape[-1], 1e-9), 0.5), height, spread)
     return _with_limits(z, laws, hit)
 

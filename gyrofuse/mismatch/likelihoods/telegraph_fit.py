@@ -21,7 +21,7 @@ from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, in_fold
 from gyrofuse.noise.processes import AR1
 
 _SEARCHING, _FINAL = 48, 192  # paths that are followed: of each trial, and of the values that are compared
-_FEWEST_BLOCKS = 2.0  # blocks in a time constant: with fewer most blocks hold a switch
+_FEWEST_BLOCKS = 2.0  # blocks in a time constant, at least: longer ones average the levels away
 _STENCIL = (0.15, 0.35)  # half widths of a stencil in log half step and log dwells, halved where likelihoods are steep
 _NEAR = 3.0  # nats below the largest value, over which a likelihood is a parabola
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from gyrofuse.mismatch.signals.filters import filtered
 from gyrofuse.mismatch.signals.psd import bands, cross_spectra
 
-_CORNER = 1 / 64  # cycles per sample, where a record does not determine it: between fast noise and what drifts
+_CORNER = 1 / 64  # cycles per sample, for stretches too short to determine it
 
 
 @dataclass(frozen=True, eq=False)

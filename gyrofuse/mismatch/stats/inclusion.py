@@ -46,7 +46,7 @@ def included_sensors(statistic: Tensor, dof: int, chance: float = 0.04, sure: fl
     x = statistic.to(torch.float64).nan_to_num(nan=0.0).clamp(max=1e6)  # larger ones overflow Bessel functions
     largest = torch.arange(len(x)) == x.argmax()
     least, most = (float(special.chdtri(dof, p / len(x))) for p in (chance, sure))
-    for _ in range(4):  # the set settles in two or three rounds
+    for _ in range(4):  # the set and the size of its effect in turn
         size = float((x[(x > least) | largest] - dof).mean().clamp(min=1.0))
         least = min(_least(dof, size), most)
     return Inclusion((x > least) | largest, least)

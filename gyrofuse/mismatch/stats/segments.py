@@ -105,13 +105,16 @@ def stretch_of(white: Tensor) -> Episodes:
 def _improved(white: Tensor, inside: Tensor, factor: Tensor, reference: Reference | None) -> Episodes | None:
     """The likeliest path and its levels, in turn from a path `(time,)` and factors `(sensor,)` on."""
     squares = white.square().clamp(max=OUTLIER)
-    for _ in range(4):  # paths of 30 nats or more stay after two or three
-        quiet = _quiet(squares, factor, inside, reference)
+    found: tuple[Episode, ...] = ()
+    for _ in range(4):  # or until the path stays
+        quiet, before = _quiet(squares, factor, inside, reference), found
         found = _likeliest((((1 - 1 / factor) / quiet) @ squares - factor.log().sum()) / 2)
         inside = in_stretches(found, len(inside))
         if not found or bool(inside.all()):
             return None
         factor = _factors(white, inside, reference)
+        if found == before:
+            break
     return Episodes(found, factor)
 
 
@@ -122,7 +125,7 @@ def _likeliest(log_ratios: Tensor) -> tuple[Episode, ...]:
     """
     n = len(log_ratios)
     total = pad(log_ratios.cumsum(0), (1, 0))
-    size = max(_SHORTEST, -(-n // 2**14))  # more blocks would take longer than all else
+    size = max(_SHORTEST, -(-n // 2**14))  # at most 16384 steps of the dynamic program
     path = torch.tensor(_two_state_path(total[::size].diff().tolist(), math.log(n)), dtype=torch.int8)
     changes = pad(path, (1, 0)).diff().nonzero()[:, 0].tolist()
     if not changes:
@@ -284,7 +287,7 @@ def first_segment_posterior(
         episodes: Stretches in order of time.
         reference: Level between episodes, where it is known beside the record.
     """
-    prior_variance = 0.5**2  # of the factor's logarithm: of most changes that are worth a name
+    prior_variance = 0.5**2  # of the factor's logarithm: factors from 0.4 to 2.7 at 95 %
     end = white.shape[-1]
     others = in_stretches(episodes[1:], end)
     cut = _without_outliers(white, in_stretches(episodes, end))
@@ -296,7 +299,7 @@ def first_segment_posterior(
     last = episodes[1].start if len(episodes) > 1 else end
     ranges = [(0, last), (0, last)]
     for _ in range(3):
-        # 160 x 160 pairs at once: steps of a record of 10^6 samples are 1 after two refinements.
+        # 160 x 160 pairs at once.
         start, stop = (torch.linspace(a, b, min(b - a + 1, 160), dtype=torch.float64).round().long() for a, b in ranges)
         m = (stop[None] - start[:, None]).to(torch.float64)  # (start, stop)
         possible = (m >= _SHORTEST) & (m <= n_samples - _SHORTEST)

@@ -31,7 +31,7 @@ from gyrofuse.mismatch.stats.multiplicity import e_value_of_some, p_value_from_e
 
 _FINEST_HIDDEN = 1 / 20  # smallest step, sd of a sample given its past: a finer one adds 1/4800 of the noise's variance
 _LOWEST = 3.5  # `u s`, from which on grids are searched: normal noise has n exp(-12) there, one in 10^5 samples
-_BEFORE = 0.8  # share of `u` up to which the least power before it is looked for: nearer, a peak has its own flank
+_BEFORE = 0.8  # share of `u` up to which the least power before it is searched: nearer, a peak has its own flank
 _OF_OTHERS = 0.02  # p value of a grid at a step that another sensor is known to have
 
 
@@ -41,7 +41,7 @@ class Lattice(NamedTuple):
     Attributes:
         step, offset: Unit of the signal.
         blur: Standard deviation of what was added after the rounding, steps; 0 of an exact grid.
-        p_value: p value of continuous values that look like it, over every step.
+        p_value: p value of continuous values, over every step.
         peak: Frequency of the peak of the characteristic function, 0 where the grid is exact. Below `2 pi/step` if the
             values spread over few steps, since what blurs the grid damps high frequencies more.
     """

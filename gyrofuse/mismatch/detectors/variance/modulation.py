@@ -88,20 +88,20 @@ def strongest_modulation(squares: Tensor, correlations: Tensor | None = None) ->
     count = shape * torch.tensor(edges).diff()[:, None]
     more = (octaves / count).clamp(min=1.0)
     gain = ((octaves - count * (1 + more.log()) - 1) * (more > 1)).clamp(min=0).sum(0)
-    line, f = _most_extreme(torch.stack(peak), shape.expand(len(peak), -1), log_chance)
+    line, at_line = _most_extreme(torch.stack(peak), shape.expand(len(peak), -1), log_chance)
     # Of fine bins, which share noise with their neighbours, eight in ten are independent.
     p_line = sidak(math.exp(line), 2 * 0.8 * length / 2)
     totals = torch.cat([octaves, octaves.cumsum(0)])  # of one octave, or of all that are slower
     counts = torch.tensor([*(b - a for a, b in itertools.pairwise(edges)), *edges[1:]])[:, None]
-    band, place = _most_extreme(totals, shape * counts, log_chance)
+    band, at_band = _most_extreme(totals, shape * counts, log_chance)
     p_band = sidak(math.exp(band), 2 * len(totals))
     log_ratio = float((gain + log_chance).max())
     if p_line <= p_band:
-        frequency = int(torch.stack(at)[f]) / length
-        return Modulation(p_line, True, frequency, frequency, _sensors(f[1], sets), log_ratio)
-    octave, slower = place[0] % len(octaves), place[0] >= len(octaves)
+        frequency = int(torch.stack(at)[at_line]) / length
+        return Modulation(p_line, True, frequency, frequency, _sensors(at_line[1], sets), log_ratio)
+    octave, slower = at_band[0] % len(octaves), at_band[0] >= len(octaves)
     ends = (1 if slower else edges[octave] + 1) / n, edges[octave + 1] / n
-    return Modulation(p_band, False, *ends, _sensors(place[1], sets), log_ratio)
+    return Modulation(p_band, False, *ends, _sensors(at_band[1], sets), log_ratio)
 
 
 def _most_extreme(power: Tensor, shape: Tensor, log_chance: Tensor) -> tuple[float, tuple[int, int]]:

@@ -1,4 +1,4 @@
-"""Whether a simulation is known to be, or looks, Gaussian: decided once for each sensor.
+"""Whether a simulation is known to be Gaussian, or is taken for it: decided once for each sensor.
 
 A Gaussian model is. Samples are taken for Gaussian noise of a steady level where nothing in them is against it: neither
 their kurtosis nor their tails, nor squares that are larger together, in the sensor by itself or in all sensors

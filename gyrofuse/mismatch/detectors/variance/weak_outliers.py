@@ -19,7 +19,7 @@ from torch import Tensor
 from gyrofuse.mismatch.stats.decorrelation import decorrelated, sign_correlation
 from gyrofuse.mismatch.stats.multiplicity import log_mean, p_value_from_e_value
 
-_SIZES = (1.5, 2.0, 2.7, 3.6, 5.0, 8.0)  # sd, each a third larger: below, outliers of any number are other noise
+_SIZES = (1.5, 2.0, 2.7, 3.6, 5.0, 8.0)  # sd, about a third larger each
 _EVENTS = (4.0, 16.0, 64.0)  # outliers in the record
 
 
