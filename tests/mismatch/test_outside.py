@@ -203,7 +203,7 @@ def test_the_posterior_of_an_episode_is_that_of_every_start_and_stop() -> None:
     white = normal(1, 150, g=g)
     white[:, 60:110] *= 2.0
     told = episodes.first_segment_posterior(white, (episodes.Episode(60, 110),))
-    x, n, tau = white[0].numpy().clip(-5, 5) ** 2, 150, episodes._PRIOR
+    x, n, tau = white[0].numpy().clip(-5, 5) ** 2, 150, 0.5
     weight = np.zeros((n + 1, n + 1))
     for a in range(n + 1):
         for b in range(a + 16, min(a + n - 16, n) + 1):

@@ -7,7 +7,6 @@ spectrum is made of geometric means over bands, so that lines do not raise it, a
 
 References:
     Christensen, Pearson and Johnson, Case-deletion diagnostics for mixed models, Technometrics 34 (1992), 38.
-    Dennis and Welsch, Techniques for nonlinear least squares and robust regression, Commun. Stat. B 7 (1978), 345.
 """
 
 from __future__ import annotations
@@ -22,6 +21,7 @@ from torch.nn.functional import pad
 
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.records import Records
+from gyrofuse.mismatch.stats.kurtosis import clipped_sd
 
 ENDS = 64  # parts of a record: the skirt of a line reaches over one of them at each end
 MOST_RECORDS = 2  # records of the simulation that are used: null laws from more are no better
@@ -179,18 +179,7 @@ def _relative_step(signal: Tensor) -> Tensor:
 def _sd(values: Tensor, coarse: Tensor) -> Tensor:
     """Robust sd; of values on few steps one that moves little with each of them."""
     sd = _median_sd(values)
-    return torch.where(coarse, smooth_sd(values), sd) if bool(coarse.any()) else sd
-
-
-def smooth_sd(values: Tensor) -> Tensor:
-    """Standard deviation `s` at which `1 - exp(-(x/s)^2/2c^2)` has the mean of normal values, `c = 1.5` (Welsch)."""
-    tuning, squares = 1.5, values.square()
-    variance = squares.mean(-1, keepdim=True).clamp(min=1e-300)
-    wanted = 1 - tuning / math.sqrt(1 + tuning**2)
-    for _ in range(20):
-        found = -torch.expm1(-squares / (2 * tuning**2 * variance)).mean(-1, keepdim=True)
-        variance = variance * (found / wanted)
-    return variance[..., 0].sqrt()
+    return torch.where(coarse, clipped_sd(values), sd) if bool(coarse.any()) else sd
 
 
 def _median_sd(values: Tensor) -> Tensor:

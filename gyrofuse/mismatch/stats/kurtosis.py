@@ -74,9 +74,20 @@ def kurtosis_score(values: Tensor) -> Tensor:
     return normal_kurtosis(kurtosis, independent_values(centred))
 
 
+def clipped_sd(values: Tensor) -> Tensor:
+    """Robust sd `s` of `(..., time)`, `(...)`: `mean min((w/s)^2, 4.5^2)` is that of normal values (an M-estimate)."""
+    squares = values.square()
+    outside = math.erfc(_CUT / math.sqrt(2))
+    wanted = 1 - outside - 2 * _CUT * math.exp(-(_CUT**2) / 2) / math.sqrt(2 * math.pi) + _CUT**2 * outside
+    variance = squares.mean(-1, keepdim=True).clamp(min=1e-300)
+    for _ in range(20):  # each leaves of the error the share of the squares that is cut
+        variance = variance * (squares / variance).clamp(max=_CUT**2).mean(-1, keepdim=True) / wanted
+    return variance[..., 0].sqrt()
+
+
 def bounded_kurtosis(values: Tensor) -> BoundedKurtosis:
     """Bounded kurtosis of series `(record, time)` without their means."""
-    u = values / _scale(values)
+    u = values / clipped_sd(values.flatten())
     inside = (u.abs() < _CUT).to(u.dtype)
     u = u.clamp(-_CUT, _CUT)
     fourth, second = u.pow(4), u.square()
@@ -93,14 +104,3 @@ def kurtosis_p_value(observed: Tensor, reference: Tensor) -> float:
     least = math.factorial(4) * reference.numel() / other.independent
     score, dof = equal_means_score(own.value + own.influence, other.value + other.influence, least)
     return float(2 * stats.t.sf(abs(score), dof))
-
-
-def _scale(values: Tensor) -> Tensor:
-    """`s` with `mean min((w/s)^2, 4.5^2)` as normal values have it."""
-    squares = values.square()
-    outside = math.erfc(_CUT / math.sqrt(2))
-    wanted = 1 - outside - 2 * _CUT * math.exp(-(_CUT**2) / 2) / math.sqrt(2 * math.pi) + _CUT**2 * outside
-    variance = squares.mean().clamp(min=1e-300)
-    for _ in range(20):  # each leaves of the error the share of the squares that is cut
-        variance = variance * (squares / variance).clamp(max=_CUT**2).mean() / wanted
-    return variance.sqrt()

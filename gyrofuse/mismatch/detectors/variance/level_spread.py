@@ -51,14 +51,29 @@ def level_spread(white: Tensor, gaussian: Tensor) -> LevelSpread:
     if bool(gaussian.all()):
         return LevelSpread(torch.ones(n_sensors, dtype=white.dtype), math.inf)
     squares = white.square().clamp(max=SQUARE_CUT)
-    mean, variance = squares.mean((0, -1)), squares.var((0, -1))
-    rows = [long_run_variance(squares[:, i]) for i in range(n_sensors)]
-    values = torch.tensor([row.value for row in rows], dtype=white.dtype).maximum(variance)
-    weight = torch.where(gaussian, 1.0, (2 * mean.square() / values).clamp(max=1))
-    together = long_run_variance(((squares - mean[:, None]) / variance[:, None].sqrt()).sum(1))
-    alike = (values / variance).sum() / max(together.value, 1e-300)  # below 1 where levels vary together
-    dof = min([together.dof, *(row.dof for i, row in enumerate(rows) if not gaussian[i])])
-    return LevelSpread(weight * alike.clamp(max=1), dof)
+    spread = _SquareSpread.of(squares)
+    value = spread.value.maximum(squares.var((0, -1)))
+    weight = torch.where(gaussian, 1.0, (2 * squares.mean((0, -1)).square() / value).clamp(max=1))
+    return LevelSpread(weight / spread.alike, float(spread.dof[~gaussian].min()))
+
+
+class _SquareSpread(NamedTuple):
+    """Long-run variances of squares, `(sensor,)`, their degrees of freedom, `(sensor,)`, and that of their mean.
+
+    `alike` is the variance of the standardised mean over that of independent sensors, 1 at least.
+    """
+
+    value: Tensor
+    dof: Tensor
+    alike: float
+
+    @classmethod
+    def of(cls, squares: Tensor) -> _SquareSpread:
+        """Estimates from `(record, sensor, time)`."""
+        rows = [long_run_variance(squares[:, i]) for i in range(squares.shape[1])]
+        value, dof = torch.tensor(rows, dtype=torch.float64).mT
+        together = long_run_variance((squares / value.sqrt()[:, None]).sum(1)).value / len(rows)
+        return cls(value, dof, max(together, 1.0))
 
 
 def with_spread(comparison: Comparison, noise_samples: int = 0) -> Comparison:
@@ -92,11 +107,9 @@ def _log_power_variance(observed: Records, reference: Records) -> Tensor:
 def _relative_variance(side: Records) -> Tensor:
     """Upper limit of the long-run variance of squares over their squared mean, `(sensor,)`."""
     squares = left_out(side).white.square()
-    rows = [long_run_variance(squares[:, i]) for i in range(squares.shape[1])]
-    values = torch.tensor([row.value for row in rows], dtype=torch.float64)
-    upper = torch.tensor([row.dof / float(stats.chi2.ppf(CHANCE, row.dof)) for row in rows], dtype=torch.float64)
-    together = long_run_variance((squares / values.sqrt()[:, None]).sum(1)).value / len(rows)
-    return upper * values / squares.mean((0, -1)).square() * max(together, 1.0)
+    spread = _SquareSpread.of(squares)
+    upper = spread.dof / torch.from_numpy(stats.chi2.ppf(CHANCE, spread.dof.numpy()))
+    return upper * spread.value / squares.mean((0, -1)).square() * spread.alike
 
 
 @derived

@@ -18,9 +18,10 @@ from gyrofuse.mismatch.detectors.variance.normality import counts_of_errors, gau
 from gyrofuse.mismatch.detectors.variance.weak_outliers import WeakOutliers, weak_outliers
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
-from gyrofuse.mismatch.signals.prediction_errors import left_out, smooth_sd
+from gyrofuse.mismatch.signals.prediction_errors import left_out
 from gyrofuse.mismatch.signals.records import Records
 from gyrofuse.mismatch.stats.decorrelation import norms
+from gyrofuse.mismatch.stats.kurtosis import clipped_sd
 from gyrofuse.mismatch.stats.local_level import local_level
 from gyrofuse.mismatch.stats.multiplicity import p_value_beyond_reference, sidak
 from gyrofuse.mismatch.stats.tails import (
@@ -82,7 +83,7 @@ def _levelled(side: Records) -> Tensor:
     """Errors `(record, sensor, time)` over the local level of the noise, in a robust sd of theirs."""
     expected = left_out(side)
     z = expected.z / local_level(expected.white).sqrt()
-    return z / smooth_sd(z)[..., None]
+    return z / clipped_sd(z)[..., None]
 
 
 def _weak_p_value(comparison: Comparison) -> float:
