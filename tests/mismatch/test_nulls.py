@@ -28,7 +28,7 @@ from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.prediction_errors import left_out
 from gyrofuse.mismatch.stats import tails
 from gyrofuse.mismatch.stats.kurtosis import bounded_kurtosis, kurtosis_p_value
-from gyrofuse.mismatch.stats.local_level import WINDOW, local_level
+from gyrofuse.mismatch.stats.level_scan import WINDOW, local_level
 from gyrofuse.mismatch.stats.long_run_variance import chi_square_nodes, long_run_variance
 
 N = 8209  # a prime: no length of a block or a transform fits it

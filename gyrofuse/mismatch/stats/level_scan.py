@@ -1,7 +1,8 @@
-"""A stretch of noise of another level, which may show in several sensors together only.
+"""The level of noise: evidence of a stretch of another one, and its slow course.
 
-Of the energy of `n` normal values a stretch of `m` holds the share `x`. If its variance is `r` times that of the rest,
-whatever that is, the likelihood ratio to a steady level is
+A stretch of another level may show in several sensors together only. Of the energy of `n` normal values a stretch of
+`m` holds the share `x`. If its variance is `r` times that of the rest, whatever that is, the likelihood ratio to a
+steady level is
 
     E = r^(-m/2) (1 - x + x/r)^(-n/2)
 
@@ -18,11 +19,12 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from gyrofuse.mismatch.stats.multiplicity import e_value_of_some, log_mean, p_value_from_e_value
 
-# Factors, sd of their logarithm. Each is 1.66 times the one before: the nearer one gains 92 % of the nats of any
-# between.
+WINDOW = 257  # samples: of Gaussian noise their mean square is known to a tenth, bursts of tens of samples stay
+# Factors, sd of their logarithm. Each is 1.66 times the one before: the nearer one gains 92 % of the nats between them.
 _DEVIATIONS = torch.logspace(math.log10(1.2), math.log10(25.0), 7, dtype=torch.float64)
 
 
@@ -75,7 +77,7 @@ def scanned_levels(squares: Tensor, reference: Reference | None = None, weight: 
     blocks = squares[..., : squares.shape[-1] // block * block].unflatten(-1, (-1, block)).sum(-1)
     n_blocks = blocks.shape[-1]
     share, n = _energy_share(n_blocks * block, reference)
-    total = torch.nn.functional.pad((share * blocks / blocks.sum(-1, keepdim=True)).cumsum(-1), (1, 0))
+    total = pad((share * blocks / blocks.sum(-1, keepdim=True)).cumsum(-1), (1, 0))
     logs, best, where = [], -math.inf, (0, n_blocks * block)
     for length in sorted({round(2 ** (k / 2)) for k in range(int(2 * math.log2(n_blocks / 2)) + 1)}):
         start = torch.arange(0, n_blocks - length + 1, max(length // 8, 1))
@@ -117,3 +119,24 @@ def _log_ratios(x: Tensor, m: float, n: float, weight: Tensor | None) -> Tensor:
     return e_value_of_some(
         weight[:, None, None] * (-m / 2 * log_r - n / 2 * torch.log1p(x[:, None] * torch.expm1(-log_r)))
     )
+
+
+def local_level(values: Tensor) -> Tensor:
+    """Mean of clipped squares around each sample over that of all, `(..., time)`; at the ends of as many as there are.
+
+    Squares are clipped at nine times the level found so far, so that an outlier is no level. Where the level is ten
+    times the mean the first round follows half of it, the second nearly all.
+
+    Args:
+        values: White or nearly white noise, `(..., time)`.
+    """
+    n = values.shape[-1]
+    half = min(WINDOW // 2, (n - 1) // 2)
+    at = torch.arange(n)
+    low, high = (at - half).clamp(min=0), (at + half + 1).clamp(max=n)
+    squares = values.square()
+    level = squares.mean(-1, keepdim=True).clamp(min=1e-300)
+    for _ in range(3):
+        total = pad(squares.minimum(9.0 * level).cumsum(-1), (1, 0))
+        level = ((total[..., high] - total[..., low]) / (high - low)).clamp(min=1e-300)
+    return level / level.mean(-1, keepdim=True)

@@ -20,7 +20,7 @@ from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.prediction_errors import MOST_RECORDS, left_out
 from gyrofuse.mismatch.signals.records import Records
 from gyrofuse.mismatch.stats.kurtosis import kurtosis_p_value, kurtosis_score
-from gyrofuse.mismatch.stats.local_level import local_level
+from gyrofuse.mismatch.stats.level_scan import local_level
 from gyrofuse.mismatch.stats.multiplicity import sidak
 
 _TOP = 6  # levels at the top, with fewer than 64 wavelets in the record: too few for a kurtosis

@@ -24,7 +24,7 @@ from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.prediction_errors import left_out
 from gyrofuse.mismatch.signals.records import Records
-from gyrofuse.mismatch.stats.local_level import WINDOW, local_level
+from gyrofuse.mismatch.stats.level_scan import WINDOW, local_level
 from gyrofuse.mismatch.stats.long_run_variance import long_run_variance
 
 

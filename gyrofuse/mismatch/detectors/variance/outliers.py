@@ -22,7 +22,7 @@ from gyrofuse.mismatch.signals.prediction_errors import left_out
 from gyrofuse.mismatch.signals.records import Records
 from gyrofuse.mismatch.stats.decorrelation import norms
 from gyrofuse.mismatch.stats.kurtosis import clipped_sd
-from gyrofuse.mismatch.stats.local_level import local_level
+from gyrofuse.mismatch.stats.level_scan import local_level
 from gyrofuse.mismatch.stats.multiplicity import p_value_beyond_reference, sidak
 from gyrofuse.mismatch.stats.tails import (
     chi_levels,
