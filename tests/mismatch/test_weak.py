@@ -28,6 +28,7 @@ from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.selection.held_out import score_held_out
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.folds import sd_of_sum
 from gyrofuse.mismatch.stats import level_scan
 from gyrofuse.mismatch.stats import segments as episodes
 from gyrofuse.mismatch.stats.multiplicity import SHARES, e_value_of_some
@@ -88,7 +89,7 @@ def test_shocks_too_weak_for_any_sensor_alone_are_named() -> None:
         named += found.sensors == (0, 2) and found.effect.together
         inside += covers(found, "rate", 3e-3 * RATE * 3600) if found.effect.together else 0
         gain = score_held_out(comparison, found.effect)
-        assert gain.total > gain.sd
+        assert gain.total > sd_of_sum(gain.blocks)
         if not seed:
             assert Spikes.detect_and_fit(found.effect.repair(comparison, g), LEVEL) is None
     assert named >= 5
@@ -238,7 +239,7 @@ def test_a_dead_band_is_found_among_values_that_do_not_recur() -> None:
         assert (found.mechanism, found.sensors) == ("quantization", (0, 1))
         inside += covers(found, "dead_band[0]", half_width) + covers(found, "dead_band[1]", half_width)
         gain = score_held_out(comparison, found.effect)
-        assert gain.total > gain.sd
+        assert gain.total > sd_of_sum(gain.blocks)
         after = found.effect.repair(comparison, g)
         assert values_test(after).p_value > 0.001
     # Fewer than 12 of 16 at 95 % have probability 9e-4.

@@ -61,24 +61,32 @@ class LeftOut(NamedTuple):
 @derived
 def left_out(side: Records) -> LeftOut:
     """Prediction errors of the first records of one side."""
-    signal = side.noise[:MOST_RECORDS]
-    y = torch.from_numpy(fft.dct(signal.numpy(), norm="ortho", axis=-1))[..., 1:]
+    rows = [_errors(row) for row in side.noise[:MOST_RECORDS].flatten(0, 1)]  # one after the other, to save memory
+    shape = side.noise[:MOST_RECORDS].shape
+    error, white, leaks = (torch.stack(v).view(*shape[:2], -1) for v in zip(*rows, strict=True))
+    at_ends = error
+    if bool(leaks.any()):
+        white, error = (torch.where(leaks, _mirrored(v), v) for v in (white, error))
+    step = _relative_step(side.signal[:MOST_RECORDS])
+    coarse = step > 0.3  # sd of the noise: medians of fewer steps are a matter of luck
+    z, white = (values / side.level**0.5 if side.loud else values for values in (error, white))
+    sd = _sd(z, coarse)
+    # Up to 0.7 sd: of what hardly leaves a step the few samples that do remain distinct.
+    grain = torch.where(coarse, (step / math.sqrt(12)).clamp(max=0.7), 0.0)
+    return LeftOut(error, sd, z / sd[..., None], white / _sd(white, coarse)[..., None], at_ends, grain)
+
+
+def _errors(signal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Prediction errors and whitened signal `(time,)`, and whether its ends are larger than the rest."""
+    y = torch.from_numpy(fft.dct(signal.numpy(), norm="ortho"))[1:]
     spectrum, followed = _smooth_spectrum(y)
     lines = _lines(y, spectrum)
     y = torch.where(lines, 0.0, y)
     white = _inverse_dct(y / spectrum.sqrt())
     # What is 40 dB below half of the ordinates is leakage, and predicts no sample.
-    inverse = 1 / spectrum.maximum(1e-4 * spectrum.median(-1, keepdim=True).values)
-    error = _inverse_dct(y * inverse) / (inverse * (1 - followed)).mean(-1, keepdim=True)
-    leaks, at_ends = lines.any(-1, keepdim=True) | _ends_leak(error, white), error
-    white, error = (torch.where(leaks, _mirrored(v), v) for v in (white, error))
-    step = _relative_step(side.signal[:MOST_RECORDS])
-    coarse = step > 0.3  # sd of the noise: medians of fewer steps are a matter of luck
-    z, white = (values / side.level**0.5 for values in (error, white))
-    sd = _sd(z, coarse)
-    # Up to 0.7 sd: of what hardly leaves a step the few samples that do remain distinct.
-    grain = torch.where(coarse, (step / math.sqrt(12)).clamp(max=0.7), 0.0)
-    return LeftOut(error, sd, z / sd[..., None], white / _sd(white, coarse)[..., None], at_ends, grain)
+    inverse = 1 / spectrum.maximum(1e-4 * spectrum.median())
+    error = _inverse_dct(y * inverse) / (inverse * (1 - followed)).mean()
+    return error, white, lines.any() | _ends_leak(error, white)
 
 
 def _inverse_dct(ordinates: Tensor) -> Tensor:
@@ -143,10 +151,10 @@ def _lines(y: Tensor, spectrum: Tensor) -> Tensor:
 
 
 def _ends_leak(error: Tensor, white: Tensor) -> Tensor:
-    """Whether either end of a record is larger than chance has it, `(..., 1)`.
+    """Whether either end of a record is larger than chance has it.
 
     The kink that a record's end is to a cosine transform is all that is there where a filter passes next to nothing, in
-    16 samples of the whitened record `(..., time)`. In the errors, which weigh ordinates by one over their power, it
+    16 samples of the whitened record `(time,)`. In the errors, which weigh ordinates by one over their power, it
     rings for as long as a stop band is narrow, a whole end or more; a louder end is so in the whitened record as well.
     By chance 2.5 times the sd are exceeded by one end in 10,000.
     """
@@ -158,7 +166,7 @@ def _ends_leak(error: Tensor, white: Tensor) -> Tensor:
 
     kinks = both(white, 0, 16) > 2.5 * both(white, m, 2 * m)
     rings = both(error, 0, m) / _median_sd(error) > 2.5 * both(white, 0, m) / _median_sd(white)
-    return (kinks | rings).any(0)[..., None]
+    return (kinks | rings).any()
 
 
 def _mirrored(values: Tensor) -> Tensor:

@@ -196,9 +196,9 @@ def _beyond(power: Tensor, least: Tensor) -> Tensor:
 
 
 def _power(values: Tensor, u: Tensor) -> Tensor:
-    """`n |phi(u)|^2`, `(u,)`."""
-    angle = u[:, None] * values
-    return (angle.cos().mean(-1).square() + angle.sin().mean(-1).square()) * len(values)
+    """`n |phi(u)|^2`, `(u,)`; one `u` after the other for the sake of memory."""
+    means = (torch.stack([(one * values).cos().mean(), (one * values).sin().mean()]) for one in u)
+    return torch.stack([mean.square().sum() for mean in means]) * len(values)
 
 
 def _power_beyond(rows: list[Tensor], u: float) -> float:

@@ -66,7 +66,9 @@ def kurtosis_p_values(comparison: Comparison) -> Tensor:
 @derived
 def kurtosis_scores(side: Records) -> Tensor:
     """Kurtosis of thinned Haar coefficients as a standard normal variable, `(level, sensor)`; mean of the records."""
-    return torch.stack([kurtosis_score(w).mean(0) for w in _coefficients(side.steady[:MOST_RECORDS])])
+    steady = side.steady[:MOST_RECORDS]
+    rows = [torch.stack([kurtosis_score(w) for w in _coefficients(row)]) for row in steady.flatten(0, 1)]
+    return torch.stack(rows, -1).unflatten(-1, steady.shape[:2]).mean(1)
 
 
 def _coefficients(signal: Tensor) -> Iterator[Tensor]:
