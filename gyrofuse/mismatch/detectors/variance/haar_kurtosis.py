@@ -55,11 +55,11 @@ def kurtosis_p_values(comparison: Comparison) -> Tensor:
     records = min(len(comparison.reference.signal), MOST_RECORDS)
     shown = 2 * torch.special.ndtr(-reference.abs() * math.sqrt(records)) < NOTHING_SHOWN
     shown |= ~gaussian_sensors(comparison.reference)
-    if bool(shown.any()):
-        sides = map(_levelled_coefficients, (comparison.observed, comparison.reference))
+    for sensor in shown.any(0).nonzero()[:, 0].tolist():
+        sides = (_levelled_coefficients(side, sensor) for side in (comparison.observed, comparison.reference))
         for level, own, other in zip(range(known), *sides, strict=False):
-            for sensor in shown[level].nonzero()[:, 0].tolist():
-                p_values[level, sensor] = kurtosis_p_value(own[:, sensor], other[:, sensor])
+            if bool(shown[level, sensor]):
+                p_values[level, sensor] = kurtosis_p_value(own, other)
     return p_values
 
 
@@ -87,14 +87,14 @@ def _coefficients(signal: Tensor) -> Iterator[Tensor]:
             mean, stride = mean[..., ::2], stride * 2
 
 
-def _levelled_coefficients(side: Records) -> Iterator[Tensor]:
-    """Coefficients without outliers beyond 3 sd of single samples, over the local level of the fast noise."""
-    expected, steady = left_out(side), side.steady[:MOST_RECORDS]
-    error = expected.correctable()
-    reach = 3.0 * expected.sd[..., None]
-    level = local_level(expected.white)
+def _levelled_coefficients(side: Records, sensor: int) -> Iterator[Tensor]:
+    """Coefficients `(record, time)` without outliers beyond 3 sd, over the level of the fast noise."""
+    expected, steady = left_out(side), side.steady[:MOST_RECORDS, sensor]
+    error = expected.correctable()[:, sensor]
+    reach = 3.0 * expected.sd[:, sensor, None]
+    level = local_level(expected.white[:, sensor])
     for w in _coefficients(steady - (error - error.clamp(min=-reach, max=reach))):
         at = torch.linspace(0, level.shape[-1] - 1, w.shape[-1]).round().long()
-        over = w / level[..., at].sqrt()
+        over = w / level[:, at].sqrt()
         over = over - over.mean(-1, keepdim=True)
         yield over / over.square().mean(-1, keepdim=True).sqrt().clamp(min=1e-300)  # the records' own levels may differ
