@@ -18,7 +18,7 @@ from gyrofuse.mismatch.detectors.values import quantisation_grid as lattices
 from gyrofuse.mismatch.detectors.values.ties import band_limits, fits_band, recurring
 from gyrofuse.mismatch.detectors.values.values import values_test
 from gyrofuse.mismatch.detectors.variance import weak_outliers as shocks
-from gyrofuse.mismatch.detectors.variance.noise_level import compared_levels, level_between, levelled
+from gyrofuse.mismatch.detectors.variance.noise_level import compared_levels, level_between, whitened_recording
 from gyrofuse.mismatch.diagnose import diagnose
 from gyrofuse.mismatch.likelihoods.outlier_law import Outliers, fitted_shock, shock_posterior, shock_scores
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
@@ -172,7 +172,7 @@ def test_the_simulated_level_tells_of_long_episodes() -> None:
         assert levels is not None
         assert levels.p_value < 1e-4
         beside += levels.scan.log_ratio
-        alone += level_scan.scanned_levels(levelled(comparison).square()).log_ratio
+        alone += level_scan.scanned_levels(whitened_recording(comparison).square()).log_ratio
         found = nominated(comparison, VarianceChange)
         assert len(found.sensors) >= 2  # each tells 9 nats: all three do in 9 of 10
         assert found.alternatives == ()

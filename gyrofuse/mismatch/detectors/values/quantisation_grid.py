@@ -4,9 +4,9 @@ A grid `offset + k step` is exact where values recur, and read off them. A hidde
 characteristic function `phi(u) = mean exp(i u x)` at `u = 2 pi/step`. That of noise, normal or a mixture of normal laws
 of several widths, falls all the way: at `u` it is not above the least that it is before, where a grid has a trough.
 With `b^2` the `n |phi|^2` there, `P = (sqrt(n) |phi| - b)^2` is at most standard exponential without a grid, by the
-triangle inequality, and independent from sensor to sensor. A grid of size `k` gives it the likelihood ratio `exp(-k)
-I0(2 sqrt(k P))`; the mean of that over steps, sizes and shares of the sensors, which may have the same converter, has
-expectation one at most (`stats.multiplicity`).
+triangle inequality, and independent from sensor to sensor. A grid of size `k` gives it the likelihood ratio
+`exp(-k) I0(2 sqrt(k P))`; the mean of that over steps, sizes and shares of the sensors, which may have the same
+converter, has expectation one at most (`stats.multiplicity`).
 
 References:
     Widrow and Kollar, Quantization Noise, 2008, chapter 4: the characteristic function of rounded values.

@@ -66,14 +66,14 @@ def _scanned(side: Records) -> LevelScan:
 
 
 @derived
-def levelled(comparison: Comparison) -> Tensor:
-    """Whitened recording, `(sensor, time)`."""
+def whitened_recording(comparison: Comparison) -> Tensor:
+    """The whitened recording, `(sensor, time)`."""
     return _white(comparison.observed)[0]
 
 
-def levelled_squares(comparison: Comparison) -> Tensor:
-    """Its squares, cut at nine, `(sensor, time)`."""
-    return levelled(comparison).square().clamp(max=SQUARE_CUT)
+def clipped_squares(comparison: Comparison) -> Tensor:
+    """Squares of the whitened recording, cut at nine, `(sensor, time)`."""
+    return whitened_recording(comparison).square().clamp(max=SQUARE_CUT)
 
 
 @derived
@@ -113,7 +113,7 @@ def compared_levels(comparison: Comparison) -> Levels | None:
     own = _scanned(comparison.reference).p_value
     if reference is None or own < CERTAIN:
         return None
-    squares = levelled_squares(comparison)
+    squares = clipped_squares(comparison)
     scan = scanned_levels(squares, reference, weight)
     throughout = other_level(comparison.n_samples, reference, weight)
     if scan.log_ratio <= throughout:
@@ -127,7 +127,7 @@ def level_between(comparison: Comparison, inside: Tensor) -> Reference | None:
     compared = compared_levels(comparison)
     if compared is None or bool(inside.all()):
         return None
-    squares = levelled_squares(comparison)
+    squares = clipped_squares(comparison)
     outside = squares[:, ~inside].mean(-1) / squares.mean(-1)
     sd = math.sqrt(2 / int((~inside).sum()) + 2 / compared.reference.n_samples)
     z = (outside / compared.reference.level).log() / sd
@@ -152,7 +152,7 @@ def _reference(comparison: Comparison) -> Reference | None:
 
 def variance_p_value(comparison: Comparison) -> float:
     """p value that the noise level changes for a while: within the recording, and from the simulation's."""
-    squares, gaussian = levelled_squares(comparison), math.isinf(own_spread(comparison).dof)
+    squares, gaussian = clipped_squares(comparison), math.isinf(own_spread(comparison).dof)
     within = _averaged(comparison, lambda w: scanned_levels(squares, None, w).log_ratio)
     if gaussian:
         within = p_value_beyond_reference(within, _scanned(comparison.reference).p_value)
@@ -163,7 +163,7 @@ def variance_p_value(comparison: Comparison) -> float:
 @derived
 def modulation(comparison: Comparison) -> Modulation:
     """The most conspicuous modulation of the noise level, with its p value beyond that of the simulation."""
-    found = modulation_of(levelled(comparison))
+    found = modulation_of(whitened_recording(comparison))
     if found.p_value > CHANCE:
         return found
     other = min(modulation_of(record).p_value for record in _white(comparison.reference))
@@ -190,7 +190,7 @@ def variance_test(comparison: Comparison) -> TestResult:
             levels=(1,),
             frequency_hz=high if wave.period else None,
         )
-    stretch = stretch_of(levelled(comparison))
+    stretch = stretch_of(whitened_recording(comparison))
     sensors = tuple((stretch.factor != 1).nonzero()[:, 0].tolist())
     return TestResult(
         "variance",

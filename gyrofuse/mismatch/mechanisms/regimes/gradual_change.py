@@ -12,10 +12,10 @@ from torch import Tensor
 
 from gyrofuse.mismatch.detectors.variance.noise_level import (
     compared_levels,
-    levelled,
     modulation_of,
     own_spread,
     variance_p_value,
+    whitened_recording,
 )
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
@@ -88,7 +88,7 @@ class GradualChange(Mechanism):
         p_value = variance_p_value(comparison)
         if p_value > level:
             return None
-        white, rate = levelled(comparison), comparison.info.rate
+        white, rate = whitened_recording(comparison), comparison.info.rate
         episodes = likeliest_episodes(comparison)
         start = stretch_of(white) if episodes is None else episodes
         course = course_of(white, start.factor.log())
@@ -136,7 +136,7 @@ class GradualChange(Mechanism):
         share = self._share(comparison.n_samples, comparison.info.rate)[keep]
         if float(share.max()) == float(share.min()):
             return self
-        squares, concerned = levelled(comparison).square()[:, keep], self.factor != 1
+        squares, concerned = whitened_recording(comparison).square()[:, keep], self.factor != 1
         _, log_factor, _ = fitted_levels(squares, share, concerned)
         corner = self.corner_hz / comparison.info.rate
         upper = fast_factor(whitened_factor(self.base, corner) * log_factor.exp(), corner)
@@ -154,7 +154,7 @@ class GradualChange(Mechanism):
         return comparison.made_louder(self._loudness(comparison.n_samples, comparison.info.rate))
 
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
-        white = levelled(comparison)
+        white = whitened_recording(comparison)
         scores = course_scores(white, self._loudness(comparison.n_samples, comparison.info.rate).variance)
         scores = torch.where((self.factor != 1)[:, None], own_spread(comparison).weight[:, None] * scores, 0.0)
         return held_out_blocks(scores, fold).sum((0, -1))
@@ -169,7 +169,7 @@ class GradualChange(Mechanism):
 def _goes_up_and_down(comparison: Comparison, course: Course, worth: float) -> bool:
     """Whether a level that is modulated all the time says more, or still says something beside the course."""
     always = worth_of_modulation(comparison)
-    rest = modulation_of(levelled(comparison) / course.variance.sqrt())
+    rest = modulation_of(whitened_recording(comparison) / course.variance.sqrt())
     return always > _FACTOR * worth + _NATS or (rest.p_value < _LEFT and rest.log_ratio > _SHARE * always)
 
 

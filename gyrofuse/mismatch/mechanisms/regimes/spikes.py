@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.detectors.variance.noise_level import levelled
+from gyrofuse.mismatch.detectors.variance.noise_level import whitened_recording
 from gyrofuse.mismatch.detectors.variance.outliers import likely_outliers, spike_p_value
 from gyrofuse.mismatch.likelihoods.outlier_law import (
     Outliers,
@@ -100,7 +100,8 @@ class Spikes(Mechanism):
         if shock is not None and together:
             laws, gain = shock
             hit = tuple(i for i, law in enumerate(laws) if law.rate > 0)
-        if not hit or any(laws[i].rate > _ISOLATED for i in hit) or clustered(levelled(comparison)[list(hit)]):
+        frequent = any(laws[i].rate > _ISOLATED for i in hit)
+        if not hit or frequent or clustered(whitened_recording(comparison)[list(hit)]):
             return None
         n_laws = 1 if together else _n_laws(laws, hit)
         if max(gain - _LAW * n_laws, apart - _LAW * len(hit)) < _heavy_tailed(z, hit) + _RARE:
@@ -303,7 +304,7 @@ def _shock_gains(z: Tensor, laws: list[Outliers]) -> Tensor:
 
 def _louder(comparison: Comparison) -> float:
     """What an episode of louder noise would gain, nats."""
-    white = levelled(comparison)
+    white = whitened_recording(comparison)
     found = episodes_of(white)
     return (
         0.0 if found is None else float(two_level_scores(white, found.factor, found.inside(comparison.n_samples)).sum())
