@@ -191,8 +191,9 @@ def beyond_smooth(power: Tensor) -> Tensor:
 
 
 def _beyond(power: Tensor, least: Tensor) -> Tensor:
-    """Power that the least power before it, of noise and of chance, whose mean is one, does not explain."""
-    return (power.sqrt() - (least - 1).clamp(min=0).sqrt()).clamp(min=0).square()
+    """Power that the least power before it does not explain; chance alone is above 5 in one of 150 cases."""
+    noise = torch.where(least > 5.0, least - 1, 0.0)
+    return (power.sqrt() - noise.sqrt()).clamp(min=0).square()
 
 
 def _power(values: Tensor, u: Tensor) -> Tensor:
