@@ -9,6 +9,7 @@ from gyrofuse import AR1, RandomWalk, WhiteNoise
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism
 from gyrofuse.mismatch.selection.held_out import score_held_out
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.folds import sd_of_sum
 
 LEVEL = 5e-4
 N, RATE = 16384, 100.0
@@ -40,7 +41,7 @@ def settled(comparison: Comparison, found: Finding, g: torch.Generator) -> Compa
     """The case after the repair, in which the same is not found again; the repair gains on data held out."""
     gain = score_held_out(comparison, found.effect)
     assert gain.blocks.shape == (32,)
-    assert gain.total > 1.7 * gain.sd
+    assert gain.total > 1.7 * sd_of_sum(gain.blocks)
     after = found.effect.repair(comparison, g)
     assert type(found.effect).detect_and_fit(after, LEVEL) is None
     return after

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 
+import numpy as np
 import pytest
 import torch
 from mismatch_draws import LEVEL, NOISE, RATE, SCENE, N, drawn, nominated, normal, settled
@@ -15,6 +16,7 @@ from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.stats import variance_courses as courses
+from gyrofuse.mismatch.stats.segments import course_scores
 
 T = torch.arange(N, dtype=torch.float64) / N
 
@@ -47,7 +49,7 @@ def case_of(log_variance: Tensor, seed: int) -> tuple[Comparison, torch.Generato
 def test_a_course_is_the_nearest_one_with_a_single_peak():
     values = [0.0, 0.5, 1.0]
     for y in ([0.2, 0.9, 0.1, 0.8], [1.0, 0.3, 0.4, 0.2], [0.1, 0.2, 0.3, 0.9], [0.5, 0.1, 0.6, 0.5]):
-        found = courses._unimodal(torch.tensor(y, dtype=torch.float64))
+        found = courses._unimodal(np.array(y)).tolist()
         error = sum((a - b) ** 2 for a, b in zip(found, y, strict=True))
         for rival in itertools.product(values, repeat=4):
             peak = max(range(4), key=lambda k: rival[k])
@@ -74,9 +76,7 @@ def test_a_course_and_its_levels_are_found(form: str):
     level = torch.stack([0.8 * true, 0 * true, -1.2 * true])
     apart = (found.variance.log() - level).abs()
     assert float(apart.mean()) < 0.05
-    assert float(courses.course_scores(white, found.variance).sum()) > 0.95 * float(
-        courses.course_scores(white, level.exp()).sum()
-    )
+    assert float(course_scores(white, found.variance).sum()) > 0.95 * float(course_scores(white, level.exp()).sum())
 
 
 def test_steady_noise_gains_what_an_order_gains_by_chance():
@@ -86,8 +86,8 @@ def test_steady_noise_gains_what_an_order_gains_by_chance():
         white = normal(1, N, g=torch.Generator().manual_seed(seed))
         found = courses.course_of(white, torch.ones(1, dtype=torch.float64))
         if found is not None:
-            gains.append(float(courses.course_scores(white, found.variance).sum()))
-            worth.append(courses.worth_of_course(white, found, torch.ones(1, dtype=torch.float64)))
+            gains.append(float(course_scores(white, found.variance).sum()))
+            worth.append(courses.course_score(white, found, torch.ones(1, dtype=torch.float64)))
     assert sum(gains) / len(gains) < 1.5 * math.log(128)
     assert max(worth) < 5
 

@@ -30,15 +30,15 @@ from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.folds import N_FOLDS
 from gyrofuse.mismatch.signals.psd import bands
 from gyrofuse.mismatch.signals.records import Records
-from gyrofuse.mismatch.stats import brownian_range
 from gyrofuse.mismatch.stats import segments as episodes
+from gyrofuse.mismatch.stats.kurtosis import independent_values, normal_kurtosis
 from gyrofuse.wavelets.haar import haar_coefficients
 
 TESTS = (
     marginals.values_test,
     impulses.outliers_test,
     noise_level.variance_test,
-    impulses.jump_test,
+    haar_kurtosis.jump_test,
 )
 MECHANISMS: tuple[type[Mechanism], ...] = (
     Quantization,
@@ -314,18 +314,10 @@ def test_the_likeliest_stretches_are_those_of_all_that_are_possible() -> None:
             return sum(v for v, s in zip(values, states, strict=True) if s) - 0.7 * changes
 
         best = max(itertools.product((0, 1), repeat=9), key=worth)
-        states = np.zeros(9, dtype=int)
-        for a, b in episodes._several(sums, 0.7):
-            states[a:b] = 1
-        assert worth(tuple(states.tolist())) == pytest.approx(worth(best))
+        assert worth(tuple(map(int, episodes._two_state_path(sums, 0.7)))) == pytest.approx(worth(best))
         one = max((sum(sums[a:b]), (a, b)) for a in range(9) for b in range(a + 1, 10))[1]
-        assert episodes._single(sums) == [one]
-
-
-def test_kuipers_law() -> None:
-    # Stephens' points of the range of a Brownian bridge.
-    assert brownian_range.kuiper_p_value(1.747) == pytest.approx(0.05, abs=5e-4)
-    assert brownian_range.kuiper_p_value(2.001) == pytest.approx(0.01, abs=2e-4)
+        total = torch.tensor([0.0, *sums], dtype=torch.float64).cumsum(0)
+        assert episodes._single(total) == (one,)
 
 
 # Telegraph noise.
@@ -338,13 +330,11 @@ def test_kurtosis_is_that_of_the_wavelet_coefficients() -> None:
     for level, w in enumerate(haar_coefficients(x, 6), start=1):
         w = w[..., :: max(2 ** (level - 2), 1) if level > 2 else 1]
         naive = stats.kurtosis(w.numpy(), axis=-1, fisher=False)
-        mine = haar_kurtosis.normal_kurtosis(
-            torch.from_numpy(naive), haar_kurtosis.independent_values(w - w.mean(-1, keepdim=True))
-        )
+        mine = normal_kurtosis(torch.from_numpy(naive), independent_values(w - w.mean(-1, keepdim=True)))
         np.testing.assert_allclose(scores[level - 1].numpy(), mine.numpy(), atol=0.05)
     sample = np.random.default_rng(0).normal(size=200)
     b2 = torch.tensor(stats.kurtosis(sample, fisher=False))
-    score = haar_kurtosis.normal_kurtosis(b2, torch.tensor(200.0, dtype=torch.float64))
+    score = normal_kurtosis(b2, torch.tensor(200.0, dtype=torch.float64))
     assert float(score) == pytest.approx(float(stats.kurtosistest(sample).statistic), rel=1e-9)
 
 
@@ -358,7 +348,7 @@ def test_two_levels_are_telegraph_noise_and_an_ar1_is_not() -> None:
     assert found.parameters["dwell_up[1]"].value == pytest.approx(1.2, rel=0.5)
     assert found.parameters["dwell_down[1]"].value == pytest.approx(1.8, rel=0.5)
     settled(comparison, found, g)
-    assert impulses.jump_test(comparison).p_value < 1e-4
+    assert haar_kurtosis.jump_test(comparison).p_value < 1e-4
     other, simulation, g = drawn(41)
     other[1] += AR1(0.985, 0.64 * (1 - 0.985**2)).simulate(N, generator=g)
     assert RandomTelegraph.detect_and_fit(Comparison.of(SCENE, other, simulation), LEVEL) is None

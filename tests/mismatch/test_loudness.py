@@ -15,7 +15,7 @@ from gyrofuse.mismatch.signals.variance_course import (
     fast_share,
     whitened_factor,
 )
-from gyrofuse.mismatch.stats.segments import Episode, Episodes, _of_the_concerned, told_of_first
+from gyrofuse.mismatch.stats.segments import Episode, Episodes, _factors, first_segment_posterior
 
 N = 2**16
 INSIDE = (torch.arange(N) >= 20_000) & (torch.arange(N) < 40_000)
@@ -81,9 +81,9 @@ def test_a_level_is_known_however_loud_it_is(true: float):
     noise[1, INSIDE] *= true**0.5
     noise[:, 100] = 30.0  # an outlier is none of it
     episodes = Episodes((Episode(20_000, 40_000),), torch.ones(3, dtype=torch.float64))
-    factor = _of_the_concerned(noise, episodes, None)
+    factor = _factors(noise, episodes.inside(N), None)
     assert factor.tolist() == pytest.approx([1, true, 1], rel=0.04)
-    told = told_of_first(noise[1:2], episodes.episodes)
+    told = first_segment_posterior(noise[1:2], episodes.episodes)
     assert float(told.log_factor.exp()) == pytest.approx(true, rel=0.04)
 
 
@@ -91,7 +91,7 @@ def test_a_few_wild_samples_are_no_level():
     noise = white(8)
     noise[0, 500:510] = 40.0
     episodes = Episodes((Episode(500, 510),), torch.ones(3, dtype=torch.float64))
-    assert float(_of_the_concerned(noise, episodes, None)[0]) <= 25.5
+    assert float(_factors(noise, episodes.inside(N), None)[0]) <= 25.5
 
 
 def test_nothing_bulges_where_a_part_of_the_record_has_all_power():

@@ -26,11 +26,9 @@ from gyrofuse.mismatch.repair.inputs import prepared
 from gyrofuse.mismatch.selection import null_replicates as twins
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.prediction_errors import left_out
-from gyrofuse.mismatch.stats import predictive_tail
-from gyrofuse.mismatch.stats.brownian_range import kuiper_p_value, studentised_range_p_value
-from gyrofuse.mismatch.stats.clustering import clustering_p_value
+from gyrofuse.mismatch.stats import tails
 from gyrofuse.mismatch.stats.kurtosis import bounded_kurtosis, kurtosis_p_value
-from gyrofuse.mismatch.stats.local_level import WINDOW, local_level
+from gyrofuse.mismatch.stats.level_scan import WINDOW, local_level
 from gyrofuse.mismatch.stats.long_run_variance import chi_square_nodes, long_run_variance
 
 N = 8209  # a prime: no length of a block or a transform fits it
@@ -96,11 +94,6 @@ def test_nodes_average_over_a_chi_square_variable() -> None:
             )
 
 
-def test_a_range_over_a_known_sd_is_kuipers_and_over_an_estimate_is_told_less_by() -> None:
-    assert studentised_range_p_value(2.3, 1e7) == pytest.approx(kuiper_p_value(2.3), rel=0.02)
-    assert studentised_range_p_value(2.3, 12.0) > 3 * kuiper_p_value(2.3)
-
-
 def test_the_local_level_follows_what_changes_slowly_and_no_outlier() -> None:
     g = torch.Generator().manual_seed(2)
     x = normal(2, 20000, g=g)
@@ -133,14 +126,14 @@ def test_equal_kurtoses_are_told_apart_as_often_as_chance_has_it(kind: str) -> N
 
 def test_counts_of_the_same_rate_have_the_binomial_law() -> None:
     own, other = np.array([0.0, 3.0, 9.0]), np.array([2.0, 2.0, 0.0])
-    mine = predictive_tail.equal_rates_p_value(own, other, 0.5)
+    mine = tails.equal_rates_p_value(own, other, 0.5)
     np.testing.assert_allclose(mine, stats.binom.sf(own - 1, own + other, 1 / 3), rtol=1e-9)
 
 
 def test_the_tail_beyond_the_largest_values_is_paretos() -> None:
     x = np.linspace(0, 5, 11)
     for xi in (-0.15, 0.0, 0.4):
-        mine = predictive_tail._log_survival(x, np.array([xi]), np.array([1.3]))
+        mine = tails._log_survival(x, np.array([xi]), np.array([1.3]))
         np.testing.assert_allclose(mine, stats.genpareto.logsf(x, xi, scale=1.3), rtol=1e-9)
 
 
@@ -150,11 +143,11 @@ def test_tails_that_both_have_are_predicted(kind: str) -> None:
     low = 0
     for _ in range(15):
         observed, reference = (noise(kind, g, 4, N).numpy() for _ in range(2))
-        low += int((predictive_tail.tail_p_values(observed, reference[:, None]) < 0.01).sum())
+        low += int((tails.tail_p_values(observed, reference[:, None]) < 0.01).sum())
     # More than 4 of 60 at 1 % have probability 3e-4.
     assert low <= 4
     observed[0, ::1000] = 12.0 * np.abs(reference).max()
-    assert predictive_tail.tail_p_values(observed, reference[:, None])[0] < 1e-4
+    assert tails.tail_p_values(observed, reference[:, None])[0] < 1e-4
 
 
 def test_outliers_that_few_have_by_chance_are_no_taller_tail() -> None:
@@ -163,10 +156,10 @@ def test_outliers_that_few_have_by_chance_are_no_taller_tail() -> None:
     observed, reference = normal(3, N, g=g).numpy(), normal(3, N, g=g).numpy()
     observed[2, [100, 5000]] = 11.2, -11.5
     reference[:2, [70, 3000]] = 10.4, -9.8
-    assert predictive_tail.tail_p_values(observed, reference[:, None])[2] > 0.05
+    assert tails.tail_p_values(observed, reference[:, None])[2] > 0.05
     # Twice as tall they are others.
     observed[2, [100, 5000]] = 24.0, -25.0
-    assert predictive_tail.tail_p_values(observed, reference[:, None])[2] < 1e-3
+    assert tails.tail_p_values(observed, reference[:, None])[2] < 1e-3
 
 
 def burst(n: int, at: tuple[int, ...], g: torch.Generator) -> Tensor:
@@ -182,7 +175,6 @@ def test_a_simulation_with_few_bursts_by_chance_is_not_surer_of_them() -> None:
     observed = burst(4500, tuple(range(100, 4500, 450)), g)
     reference = burst(4500, (700,), g)
     assert kurtosis_p_value(observed, reference) > 1e-4
-    assert clustering_p_value(observed.square().clamp(max=9), reference.square().clamp(max=9)) > 1e-3
 
 
 def test_records_of_another_level_have_the_kurtosis_of_each() -> None:
@@ -227,9 +219,9 @@ def test_a_peak_of_noise_is_no_tone() -> None:
 def test_tails_of_values_that_hardly_leave_a_step_are_numbers() -> None:
     rng = np.random.default_rng(1)
     rounded = np.where(rng.random((2, 4096)) < 0.01, 60.0, 0.0)
-    p_values = predictive_tail.tail_p_values(rounded, rounded[:, None])
+    p_values = tails.tail_p_values(rounded, rounded[:, None])
     assert (p_values > 0.1).all()
-    assert (predictive_tail.tail_p_values(0 * rounded, 0 * rounded[:, None]) == 1).all()
+    assert (tails.tail_p_values(0 * rounded, 0 * rounded[:, None]) == 1).all()
 
 
 def test_events_in_clumps_count_for_fewer() -> None:
@@ -238,8 +230,8 @@ def test_events_in_clumps_count_for_fewer() -> None:
     clumps = np.zeros((1, 64_000), dtype=bool)
     for at in rng.integers(0, 63_990, 25):
         clumps[0, at : at + 5] = True
-    assert predictive_tail.dispersion(alone) < 1.6
-    assert predictive_tail.dispersion(clumps) == pytest.approx(5, rel=0.4)
+    assert tails.dispersion(torch.from_numpy(alone)) < 1.6
+    assert tails.dispersion(torch.from_numpy(clumps)) == pytest.approx(5, rel=0.4)
 
 
 def test_squares_that_come_together_in_both_are_no_bursts() -> None:
@@ -249,11 +241,14 @@ def test_squares_that_come_together_in_both_are_no_bursts() -> None:
         x = normal(1, N, g=g)
         for at in (even(30, g=g) * (N - 20)).long().tolist():
             x[:, at : at + 20] *= 1 + share
-        return x.square().clamp(max=9)
+        return x
 
-    low = sum(clustering_p_value(bursting(1.0), bursting(1.0)) < 0.01 for _ in range(25))
+    def p_value(observed: float, reference: float) -> float:
+        return noise_level.variance_test(prepared(bursting(observed), bursting(reference), None, g)).p_value
+
+    low = sum(p_value(1.0, 1.0) < 0.01 for _ in range(25))
     assert low <= 3  # four of 25 at 1 % have probability 1e-4
-    assert clustering_p_value(bursting(1.5), bursting(0.0)) < 1e-4
+    assert p_value(1.5, 0.0) < 1e-4
 
 
 def test_levels_that_vary_by_themselves_make_a_sample_count_for_less() -> None:
@@ -292,7 +287,7 @@ def test_noise_that_both_share_is_no_mismatch(kind: str) -> None:
         comparison = case_of(kind, 200 + seed, n=4099)
         for witness in (
             impulses.outliers_test,
-            impulses.jump_test,
+            haar_kurtosis.jump_test,
             noise_level.variance_test,
             spectrum_test,
             shape_test,
@@ -322,12 +317,11 @@ def test_a_change_of_level_is_seen_beside_tails_that_both_have() -> None:
     assert found.parameters["start"].value == pytest.approx(3000, abs=400)
 
 
-def test_a_course_of_the_level_that_both_have_is_taken_off_and_one_of_chance_is_not() -> None:
+def test_a_course_of_the_level_that_both_have_is_no_mismatch() -> None:
     g = torch.Generator().manual_seed(11)
     loud = torch.ones(N, dtype=torch.float64)
     loud[2000:4000] = 2.0
-    assert noise_level.level_profile(prepared(noise("", g) * loud, noise("", g) * loud, None, g)) is not None
-    assert noise_level.level_profile(prepared(noise("", g) * loud.roll(3000), noise("", g) * loud, None, g)) is None
+    assert noise_level.variance_test(prepared(noise("", g) * loud, noise("", g) * loud, None, g)).p_value > 0.05
 
 
 # Twins.

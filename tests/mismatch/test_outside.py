@@ -185,9 +185,9 @@ def test_limits_of_an_episode_hold() -> None:
         start, stop, factor = 4000 + 37 * seed, 9000 + 53 * seed, 1.25
         white = normal(2, N, g=g)
         white[:, start:stop] *= math.sqrt(factor)
-        found = episodes.episodes_of(white, torch.zeros(3, dtype=torch.float64))
+        found = episodes.episodes_of(white)
         assert found is not None
-        told = episodes.told_of_first(white, found.episodes)
+        told = episodes.first_segment_posterior(white, found.episodes)
         reach = 2 * told.log_factor_sd
         inside += [
             told.start.low <= start <= told.start.high,
@@ -202,8 +202,8 @@ def test_the_posterior_of_an_episode_is_that_of_every_start_and_stop() -> None:
     g = torch.Generator().manual_seed(1)
     white = normal(1, 150, g=g)
     white[:, 60:110] *= 2.0
-    told = episodes.told_of_first(white, (episodes.Episode(60, 110),))
-    x, n, tau = white[0].numpy().clip(-5, 5) ** 2, 150, episodes._PRIOR
+    told = episodes.first_segment_posterior(white, (episodes.Episode(60, 110),))
+    x, n, tau = white[0].numpy().clip(-5, 5) ** 2, 150, 0.5
     weight = np.zeros((n + 1, n + 1))
     for a in range(n + 1):
         for b in range(a + 16, min(a + n - 16, n) + 1):

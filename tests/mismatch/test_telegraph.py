@@ -36,7 +36,7 @@ from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph, _pat
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape
 from gyrofuse.mismatch.selection.held_out import score_held_out
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
-from gyrofuse.mismatch.signals.folds import N_JUDGED
+from gyrofuse.mismatch.signals.folds import N_JUDGED, sd_of_sum
 
 N, SCENE = 16384, RecordingInfo(100.0, "deg/s", ("x", "y"))
 NOISE = WhiteNoise(1.0) + AR1(0.995, 2e-4) + RandomWalk(1e-7)
@@ -222,7 +222,7 @@ def test_two_levels_are_named_where_noise_is_coloured() -> None:
         assert found.sensors == (1,)
         gain = score_held_out(comparison, found.effect)
         assert gain.blocks.shape == (N_JUDGED,)
-        assert gain.total > gain.sd
+        assert gain.total > sd_of_sum(gain.blocks)
         truth = {"half_step[1]": LEVELS.half, "dwell_up[1]": LEVELS.up / 100, "dwell_down[1]": LEVELS.down / 100}
         within += sum(found.parameters[k].low <= v <= found.parameters[k].high for k, v in truth.items())
     assert named >= 3

@@ -18,9 +18,9 @@ from gyrofuse.mismatch.detectors.values import quantisation_grid as lattices
 from gyrofuse.mismatch.detectors.values.ties import band_limits, fits_band, recurring
 from gyrofuse.mismatch.detectors.values.values import values_test
 from gyrofuse.mismatch.detectors.variance import weak_outliers as shocks
-from gyrofuse.mismatch.detectors.variance.noise_level import compared_levels, level_between, levelled
+from gyrofuse.mismatch.detectors.variance.noise_level import compared_levels, level_between, whitened_recording
 from gyrofuse.mismatch.diagnose import diagnose
-from gyrofuse.mismatch.likelihoods.outlier_law import Outliers
+from gyrofuse.mismatch.likelihoods.outlier_law import Outliers, fitted_shock, shock_posterior, shock_scores
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
@@ -28,6 +28,7 @@ from gyrofuse.mismatch.mechanisms.values.dead_band import DeadBand
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.selection.held_out import score_held_out
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.folds import sd_of_sum
 from gyrofuse.mismatch.stats import level_scan
 from gyrofuse.mismatch.stats import segments as episodes
 from gyrofuse.mismatch.stats.multiplicity import SHARES, e_value_of_some
@@ -88,7 +89,7 @@ def test_shocks_too_weak_for_any_sensor_alone_are_named() -> None:
         named += found.sensors == (0, 2) and found.effect.together
         inside += covers(found, "rate", 3e-3 * RATE * 3600) if found.effect.together else 0
         gain = score_held_out(comparison, found.effect)
-        assert gain.total > gain.sd
+        assert gain.total > sd_of_sum(gain.blocks)
         if not seed:
             assert Spikes.detect_and_fit(found.effect.repair(comparison, g), LEVEL) is None
     assert named >= 5
@@ -101,16 +102,16 @@ def test_a_fit_of_shocks_recovers_them_and_says_which_samples_are_hit() -> None:
     hit = even(1, N, g=g) < 4e-3
     z = normal(3, N, g=g) + hit * 4.0 * (even(3, N, g=g) - 0.5).sign()
     start = [Outliers(1e-3, 2.7, 0.3)] * 3
-    laws = shocks.fitted_shock(z, start, 40)
+    laws = fitted_shock(z, start, 40)
     for law in laws:
         for value, (_, high), truth in (
             (law.amplitude, law.amplitude_limits, 4.0),
             (law.rate, law.rate_limits, 4e-3),
         ):
             assert abs(math.log(truth / value)) < 2 * math.log(high / value)  # limits are at 2 sd
-    said = shocks.shock_posterior(z, laws) > 0.5
+    said = shock_posterior(z, laws) > 0.5
     assert int((said != hit[0]).sum()) < 0.05 * int(hit.sum()) + 3
-    assert float(shocks.shock_scores(z, laws).sum()) > float(shocks.shock_scores(z, start).sum())
+    assert float(shock_scores(z, laws).sum()) > float(shock_scores(z, start).sum())
 
 
 # Levels.
@@ -125,7 +126,7 @@ def test_the_scan_of_levels_is_the_mean_over_stretches_and_factors(referred: boo
     x, observed, n = squares.numpy() / energy, 64, 164 if referred else 64
 
     def mean_ratio(m: int, starts: range) -> float:
-        reach = np.minimum(np.array(level_scan._DEVIATIONS) * math.sqrt(2 / m + 2 / (n - m)), math.log(30))
+        reach = np.minimum(level_scan._DEVIATIONS.numpy() * math.sqrt(2 / m + 2 / (n - m)), math.log(30))
         ratios = []
         for log_r, a in itertools.product([*reach, *-reach], starts):
             share = x[:, a : a + m].sum(-1)
@@ -171,7 +172,7 @@ def test_the_simulated_level_tells_of_long_episodes() -> None:
         assert levels is not None
         assert levels.p_value < 1e-4
         beside += levels.scan.log_ratio
-        alone += level_scan.scanned_levels(levelled(comparison).square()).log_ratio
+        alone += level_scan.scanned_levels(whitened_recording(comparison).square()).log_ratio
         found = nominated(comparison, VarianceChange)
         assert len(found.sensors) >= 2  # each tells 9 nats: all three do in 9 of 10
         assert found.alternatives == ()
@@ -238,7 +239,7 @@ def test_a_dead_band_is_found_among_values_that_do_not_recur() -> None:
         assert (found.mechanism, found.sensors) == ("quantization", (0, 1))
         inside += covers(found, "dead_band[0]", half_width) + covers(found, "dead_band[1]", half_width)
         gain = score_held_out(comparison, found.effect)
-        assert gain.total > gain.sd
+        assert gain.total > sd_of_sum(gain.blocks)
         after = found.effect.repair(comparison, g)
         assert values_test(after).p_value > 0.001
     # Fewer than 12 of 16 at 95 % have probability 9e-4.
@@ -344,10 +345,11 @@ def test_a_hidden_lattice_that_no_sensor_shows_alone_is_seen_in_all_of_them_toge
         plain, simulation = normal(6, 16384, g=g), normal(2, 6, 16384, g=g)
         info = RecordingInfo(RATE, "deg/s", tuple("abcdef"))
         comparison = Comparison.of(info, rounded, simulation * rounded.std())
-        alone.append(min(own.p_value for own in lattices.lattices(comparison.observed)))
+        rows, sd = [row.unique() for row in rounded], lattices.core_sd(comparison.observed)
+        alone.append(min(lattices._hidden_step([row], one[None]).p_value for row, one in zip(rows, sd, strict=True)))
         together.append(lattices.missing_lattices(comparison, LEVEL).p_value)
         nothing.append(lattices.missing_lattices(Comparison.of(info, plain, simulation), LEVEL).p_value)
-        step = lattices.shared_lattice(comparison.observed).step
+        step = lattices._hidden_step(rows, sd).step
         assert together[-1] > LEVEL or step == pytest.approx(1.0, abs=0.06)
     assert sum(p < LEVEL for p in together) >= 9
     assert sum(p < LEVEL for p in alone) <= 5

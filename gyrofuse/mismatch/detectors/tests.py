@@ -15,8 +15,9 @@ from gyrofuse.mismatch.detectors.spectra.peaks import peak_test
 from gyrofuse.mismatch.detectors.spectra.pooled_coherence import common_source_test
 from gyrofuse.mismatch.detectors.spectra.shape_scan import shape_test
 from gyrofuse.mismatch.detectors.values.values import values_test
+from gyrofuse.mismatch.detectors.variance.haar_kurtosis import jump_test
 from gyrofuse.mismatch.detectors.variance.noise_level import variance_test
-from gyrofuse.mismatch.detectors.variance.outliers import jump_test, outliers_test
+from gyrofuse.mismatch.detectors.variance.outliers import outliers_test
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.stats.multiplicity import sidak
 

@@ -1,4 +1,12 @@
-"""Law of standardised values among which a few are outliers, and how these lie in time and over sensors."""
+"""Law of standardised values among which a few are outliers: in each sensor by itself, or in several at once.
+
+A value is normal of sd `scale`, but with probability `rate` moved by a height of either sign with some spread. Outliers
+of several sensors at once (a shock) share their times, and with it their rate.
+
+References:
+    Dempster, Laird and Rubin, Maximum likelihood from incomplete data via the EM algorithm, JRSS B 39 (1977), 1.
+    Louis, Finding the observed information matrix when using the EM algorithm, JRSS B 44 (1982), 226.
+"""
 
 from __future__ import annotations
 
@@ -12,14 +20,12 @@ from numpy.typing import NDArray
 from scipy import optimize, special, stats
 from torch import Tensor
 
-_BULK = 6.0  # values below it are counted in a histogram
-_BINS = 600
-_EVENT, _COMPANY = 3.5, 2.5  # sd
-_NEAR = (2, 9)  # samples on either side
-_CLUSTERED = 0.6  # share of events that have company
-_OFF = 0.05  # logarithm, by which the sd of the noise may be wrong
-_ROUNDS = 3
-_RATIO, _RATIO_SD = 0.2, 0.8  # of spread to height beforehand: median, and sd of its logarithm
+from gyrofuse.mismatch.stats.limits import Z
+
+_RATIO, _RATIO_SD = (
+    0.2,
+    0.8,
+)  # of spread to height beforehand: median, and sd of its logarithm, a factor of five at 2 sd
 
 _Law = Callable[..., NDArray[np.float64]]
 
@@ -28,11 +34,11 @@ class Outliers(NamedTuple):
     """`z` is normal of sd `scale`, but with probability `rate` moved by `height`, of either sign, with sd `spread`.
 
     Attributes:
-        rate: Probability.
-        height, spread: In sd of the noise as it was estimated.
-        rate_limits, amplitude_limits: Of `rate` and `amplitude`, 95 %.
-        scale: Sd of what is no outlier: a robust estimate of it is half a per cent off, which many faint outliers
-            would have to make up for.
+        rate: Probability of an outlier.
+        height, spread: Mean and sd of their modulus, in sd of the noise as it was estimated.
+        scale: Standard deviation of what is no outlier: a robust estimate of it is half a per cent off, which many
+            faint outliers would have to make up for. rate_limits, amplitude_limits: 95 % limits of `rate` and
+            `amplitude`.
     """
 
     rate: float
@@ -44,28 +50,30 @@ class Outliers(NamedTuple):
 
     @classmethod
     def none(cls) -> Outliers:
+        """The law of noise without outliers."""
         return cls(0.0, 0.0, 0.0)
 
     @property
     def amplitude(self) -> float:
+        """Root mean square of the outliers."""
         return math.hypot(self.height, self.spread)
 
     def scaled(self, z: Tensor) -> Outliers:
-        """With the most likely scale for values, all else as it is."""
+        """The law with the most likely scale for values `(time,)`, all else as it is; three rounds of EM settle it."""
         law = self
-        for _ in range(_ROUNDS):
+        for _ in range(3):
             plain = 1 - law.posterior(z)
             law = law._replace(scale=float(((plain * z.square()).sum() / plain.sum()).sqrt()))
         return law
 
     def times(self, factor: float) -> Outliers:
-        """Of values so many times as large."""
+        """The law of values so many times as large."""
         height, spread, scale = (factor * size for size in (self.height, self.spread, self.scale))
         low, high = self.amplitude_limits
         return Outliers(self.rate, height, spread, scale, self.rate_limits, (factor * low, factor * high))
 
     def posterior(self, z: Tensor) -> Tensor:
-        """Probability of each value's being an outlier."""
+        """Probability that each value is an outlier."""
         if self.rate <= 0:
             return torch.zeros_like(z)
         return torch.exp(math.log(self.rate) + _moved(z, self) - mixture(z, self))
@@ -73,56 +81,68 @@ class Outliers(NamedTuple):
 
 def mixture(z: Tensor, law: Outliers) -> Tensor:
     """Log density of `z` under the law."""
-    plain = -(z / law.scale).square() / 2 - math.log(2 * math.pi * law.scale**2) / 2
+    plain = _gaussian(z, law.scale**2)
     return torch.logaddexp(math.log1p(-law.rate) + plain, math.log(max(law.rate, 1e-300)) + _moved(z, law))
 
 
 def free_gaussian(z: Tensor) -> Tensor:
     """Log density of `z` under a normal law of its own variance."""
-    return _weighted_gaussian(z, torch.ones_like(z))
+    return _gaussian(z, z.square().mean())
 
 
-def _weighted_gaussian(z: Tensor, counts: Tensor) -> Tensor:
-    variance = (counts * z.square()).sum() / counts.sum()
+def _gaussian(z: Tensor, variance: Tensor | float) -> Tensor:
+    """Log density of a normal law of mean zero."""
+    variance = torch.as_tensor(variance, dtype=z.dtype)
     return -z.square() / (2 * variance) - (2 * math.pi * variance).log() / 2
 
 
-class Sample:
-    """Moduli of values, of which the many small ones are counted in bins, with the likelihood of laws of outliers.
+def _moved(z: Tensor, law: Outliers) -> Tensor:
+    """Log density of outliers."""
+    variance = law.scale**2 + law.spread**2
+    return torch.logaddexp(_gaussian(z - law.height, variance), _gaussian(z + law.height, variance)) - math.log(2)
 
-    How far moduli of outliers spread is hardly told by a few that stand little above the noise, and with a wide spread
-    they may be any number of faint ones. Beforehand it is held to be a fifth of the height within a factor of five.
+
+class Sample:
+    """Moduli of values, of which the many small ones are counted in 600 bins, with the likelihood of laws of outliers.
+
+    A few outliers a little above the noise hardly determine how far their moduli spread, and with a wide spread they
+    may be any number of faint ones. Beforehand the spread is held to be a fifth of the height within a factor of five.
+
+    Args:
+        z: Values, `(time,)`.
     """
 
     def __init__(self, z: Tensor) -> None:
-        size = z.abs()
-        bulk = size < _BULK
-        counts = torch.histc(size[bulk], _BINS, 0.0, _BULK)
-        centres = (torch.arange(_BINS, dtype=torch.float64) + 0.5) * (_BULK / _BINS)
-        large = size[~bulk]
+        size, (bulk, bins) = z.abs(), (6.0, 600)  # a bin of 0.01 sd is narrow against any law
+        counts = torch.histc(size[size < bulk], bins, 0.0, bulk)
+        centres = (torch.arange(bins, dtype=torch.float64) + 0.5) * (bulk / bins)
+        large = size[size >= bulk]
         self.values, self.counts = torch.cat([centres, large]), torch.cat([counts, torch.ones_like(large)])
         self.n = float(self.counts.sum())
 
     def deviance(self, law: Outliers) -> float:
-        """Minus the log likelihood, nats, and minus the log of what is held of the spread beforehand."""
+        """Minus the log likelihood and the log prior density of the spread, nats."""
         beforehand = (math.log(law.spread / law.height / _RATIO) / _RATIO_SD) ** 2 / 2
         return beforehand - float((self.counts * mixture(self.values, law)).sum())
 
 
 def law_of(theta: Sequence[float]) -> Outliers:
-    """Of log rate, log amplitude, log of spread over height, log scale."""
+    """The law of log rate, log amplitude, log of spread over height, log scale."""
     rate, amplitude, ratio, scale = (math.exp(v) for v in theta)
     height = amplitude / math.hypot(1.0, ratio)
     return Outliers(rate, height, ratio * height, scale)
 
 
 def bounds_of(n: float) -> list[tuple[float, float]]:
-    """Within which numbers of `law_of` are looked for, of `n` values."""
-    return [(math.log(0.2 / n), math.log(0.3)), (math.log(0.3), math.log(1e4)), (math.log(0.01), 1.0), (-_OFF, _OFF)]
+    """Bounds of the numbers of `law_of` for `n` values: a fifth of an outlier to a third of all; 5 % of the scale."""
+    return [(math.log(0.2 / n), math.log(0.3)), (math.log(0.3), math.log(1e4)), (math.log(0.01), 1.0), (-0.05, 0.05)]
 
 
 def fitted(z: Tensor) -> Outliers:
-    """Most likely rate, height, spread and scale."""
+    """Most likely rate, height, spread and scale of values `(time,)`.
+
+    Started from the values beyond 3, 4 and 6 sd: many faint outliers, some, and few large ones.
+    """
     sample = Sample(z)
     values, counts, n = sample.values, sample.counts, sample.n
     starts = []
@@ -131,68 +151,136 @@ def fitted(z: Tensor) -> Outliers:
         number = float(counts[beyond].sum())
         height = float((counts * values)[beyond].sum()) / number if level == 6.0 and number else least
         starts.append([math.log(max(number, 1.0) / n), math.log(height), math.log(_RATIO), 0.0])
-    runs = [
-        optimize.minimize(
-            lambda theta: sample.deviance(law_of(theta)),
-            start,
-            method="L-BFGS-B",
-            bounds=bounds_of(n),
-            options={"maxiter": 60},
-        )
-        for start in starts
-    ]
-    return law_of(min(runs, key=lambda run: float(run.fun)).x)
+    runs = [_minimised(lambda theta: sample.deviance(law_of(theta.tolist())), start, bounds_of(n)) for start in starts]
+    return law_of(min(runs, key=lambda run: float(run.fun)).x.tolist())
+
+
+def _minimised(
+    deviance: Callable[[NDArray[np.float64]], float], start: Sequence[float], bounds: Sequence[tuple[float, float]]
+) -> optimize.OptimizeResult:
+    return optimize.minimize(deviance, start, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60})
 
 
 def heavy_tailed(z: Tensor) -> float:
-    """Log likelihood of noise that is heavy-tailed throughout over a normal law, of its own variance each.
+    """Log likelihood ratio of noise that is heavy-tailed throughout to a normal law, of its own variance each, nats.
 
     The better of Student's law and of a normal plus a Laplace variable, scale and shape fitted.
     """
     sample = Sample(z)
     x, weight = sample.values.numpy(), sample.counts.numpy()
-    plain = float((sample.counts * _weighted_gaussian(sample.values, sample.counts)).sum())
-    best = -math.inf
-    for law, start, bounds in (
-        (_student, (20.0, 1.0), ((2.1, 1e4), (0.3, 2.0))),
-        (_normal_laplace, (0.3, 0.95), ((0.02, 2.0), (0.05, 2.0))),
-    ):
+    variance = (sample.counts * sample.values.square()).sum() / sample.n
+    plain = float((sample.counts * _gaussian(sample.values, variance)).sum())
 
-        def deviance(theta: NDArray[np.float64], law: _Law = law) -> float:
-            return -float((weight * law(x, *np.exp(theta))).sum())
+    def gain(law: _Law, start: tuple[float, float], bounds: list[tuple[float, float]]) -> float:
+        run = _minimised(
+            lambda theta: -float((weight * law(x, *np.exp(theta))).sum()),
+            np.log(start).tolist(),
+            [(math.log(low), math.log(high)) for low, high in bounds],
+        )
+        return -float(run.fun) - plain
 
-        run = optimize.minimize(deviance, np.log(start), method="L-BFGS-B", bounds=np.log(bounds))
-        best = max(best, -float(run.fun) - plain)
-    return best
+    return max(
+        gain(_student, (20.0, 1.0), [(2.1, 1e4), (0.3, 2.0)]),
+        gain(_normal_laplace, (0.3, 0.95), [(0.02, 2.0), (0.05, 2.0)]),
+    )
 
 
 def _student(z: NDArray[np.float64], freedom: float, scale: float) -> NDArray[np.float64]:
+    """Log density of `scale` times a Student variable."""
     return np.asarray(stats.t.logpdf(z / scale, freedom)) - math.log(scale)
 
 
 def _normal_laplace(z: NDArray[np.float64], width: float, sd: float) -> NDArray[np.float64]:
-    """Density of `sd` times a normal plus `width` times a Laplace variable."""
+    """Log density of `sd` times a normal plus `width` times a Laplace variable."""
     r = sd / width
     up, down = -z / width + special.log_ndtr(z / sd - r), z / width + special.log_ndtr(-z / sd - r)
     return np.asarray(np.logaddexp(up, down)) + r * r / 2 - math.log(2 * width)
 
 
 def clustered(white: Tensor) -> bool:
-    """Whether outliers of `(sensor, time)` lie together, as those of loud episodes do."""
-    near = _NEAR[1]
+    """Whether outliers of `(sensor, time)` lie together, as those of loud episodes do.
+
+    Six of ten values beyond 3.5 sd have another one beyond 2.5 sd 2 to 9 samples off: of white noise two of ten have.
+    """
+    steps = torch.arange(2, 10)
+    near = int(steps[-1])
     for row in white.abs():
-        events = (row > _EVENT).nonzero()[:, 0]
+        events = (row > 3.5).nonzero()[:, 0]
         events = events[(events >= near) & (events < len(row) - near)]
         if len(events) < 4:
             continue
-        steps = torch.arange(_NEAR[0], near + 1)
         around = row[events[:, None] + torch.cat([-steps, steps])]
-        if float((around.amax(-1) > _COMPANY).to(torch.float64).mean()) > _CLUSTERED:
+        if float((around.amax(-1) > 2.5).to(torch.float64).mean()) > 0.6:
             return True
     return False
 
 
-def _moved(z: Tensor, law: Outliers) -> Tensor:
-    variance = law.scale**2 + law.spread**2
-    up, down = -(z - law.height).square() / (2 * variance), -(z + law.height).square() / (2 * variance)
-    return torch.logaddexp(up, down) - math.log(2) - math.log(2 * math.pi * variance) / 2
+def shock_scores(z: Tensor, laws: list[Outliers]) -> Tensor:
+    """Log likelihood ratio of shocks to standard normal values, `(time,)`: sensors of a rate above 0 are hit at once.
+
+    Args:
+        z: Values, `(sensor, time)`.
+        laws: Law of each sensor; the largest rate is that of the shocks.
+    """
+    rate = max(law.rate for law in laws)
+    return torch.logaddexp(torch.tensor(math.log1p(-rate), dtype=z.dtype), math.log(rate) + _moved_together(z, laws))
+
+
+def shock_posterior(z: Tensor, laws: list[Outliers]) -> Tensor:
+    """Probability that each sample of `(sensor, time)` is hit, `(time,)`."""
+    return torch.exp(math.log(max(law.rate for law in laws)) + _moved_together(z, laws) - shock_scores(z, laws))
+
+
+def _moved_together(z: Tensor, laws: list[Outliers]) -> Tensor:
+    """Log density of hit samples over that of standard normal ones, `(time,)`."""
+    hit = ((row, law) for row, law in zip(z, laws, strict=True) if law.rate > 0)
+    return sum((_moved(row, law) - _gaussian(row, 1.0) for row, law in hit), torch.zeros_like(z[0]))
+
+
+def fitted_shock(z: Tensor, start: list[Outliers], rounds: int) -> list[Outliers]:
+    """Maximum likelihood of shocks by expectation and maximisation, with 95 % limits from the scores.
+
+    Args:
+        z: Values, `(sensor, time)`.
+        start: Laws to start from; sensors of rate 0 are not hit.
+        rounds: Number of rounds of EM.
+    """
+    laws, hit = list(start), [i for i, law in enumerate(start) if law.rate > 0]
+    for _ in range(rounds):
+        weight = shock_posterior(z, laws)
+        total = float(weight.sum())
+        for i in hit:
+            law, row = laws[i], z[i]
+            height = float((weight * row * torch.tanh(law.height * row / (1 + law.spread**2))).sum()) / total
+            excess = float((weight * row.square()).sum()) / total - height**2 - 1
+            spread = math.sqrt(max(excess, 0.05**2))  # floor, sd: the law stays smooth in it
+            laws[i] = Outliers(min(max(total / z.shape[-1], 1e-9), 0.5), height, spread)
+    return _with_limits(z, laws, hit)
+
+
+def _with_limits(z: Tensor, laws: list[Outliers], hit: list[int]) -> list[Outliers]:
+    """Laws of shocks with limits from the covariance of the scores (Louis), normal in the logarithms."""
+    weight, rate = shock_posterior(z, laws), laws[hit[0]].rate
+    scores = [(weight - rate) / (1 - rate)]  # with respect to log rate, heights, variances
+    for i in hit:
+        h, v, row = laws[i].height, 1 + laws[i].spread ** 2, z[i]
+        signed = row * torch.tanh(h * row / v)
+        scores += [weight * (signed - h) / v, weight * (row.square() - 2 * h * signed + h**2 - v) / (2 * v**2)]
+    score = torch.stack(scores)
+    covariance = torch.linalg.pinv(score @ score.mT, hermitian=True)
+
+    def limits(value: float, log_sd: float) -> tuple[float, float]:
+        reach = math.exp(min(Z * log_sd, 50.0))
+        return value / reach, value * reach
+
+    result = list(laws)
+    for k, i in enumerate(hit):
+        law = laws[i]
+        # amplitude^2 = height^2 + v - 1
+        gradient = torch.tensor([law.height, 0.5], dtype=torch.float64) / law.amplitude
+        own = covariance[1 + 2 * k : 3 + 2 * k, 1 + 2 * k : 3 + 2 * k]
+        result[i] = law._replace(
+            rate_limits=limits(rate, math.sqrt(float(covariance[0, 0]))),
+            amplitude_limits=limits(law.amplitude, math.sqrt(float(gradient @ own @ gradient)) / law.amplitude),
+        )
+    return result

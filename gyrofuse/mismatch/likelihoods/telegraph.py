@@ -5,15 +5,13 @@ Block means of a sensor are
     y_k = a (s_k-1 + s_k) / 2 + sum_j x_jk + N(0, r),   s_k = +-1 with mean dwells `up` and `down`,
 
 `s` the level at the end of a block, which switches anywhere in it, and `x` AR1s and a random walk that together have
-the simulation's spectrum. Once the path `s` is known all is
-Gaussian, and the gains of Kalman's filter are the same for every path: paths differ in what is left of the data alone.
-Of the likeliest paths so many are followed, each with the mean of `x` that belongs to it; after every block those that
-are too many are drawn such that the likelihood stays unbiased (Fearnhead and Clifford, 2003). Filters that merge paths
-into one for each state forget how background and level depend on each other, and with it most of what tells two levels
-from a Gaussian process.
+the simulation's spectrum. Given the path `s` all is Gaussian, and the gains of Kalman's filter are the same for every
+path. The likeliest paths are followed, each with the mean of `x` that belongs to it; after every block those that are
+too many are drawn such that the likelihood stays unbiased. Filters that merge paths into one for each state forget how
+background and level depend on each other, and with it most of what distinguishes two levels from a Gaussian process.
 
 References:
-    [Fearnhead and Clifford] On-line inference for hidden Markov models via particle filters, JRSS B 65 (2003), 887.
+    Fearnhead and Clifford, On-line inference for hidden Markov models via particle filters, JRSS B 65 (2003), 887.
 """
 
 from __future__ import annotations
@@ -29,11 +27,7 @@ from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
 
 Array = NDArray[np.float64]
 
-_LARGEST = 1e4  # variance of the level at the start, in those of the noise
-_ORDINATES = 120
-_LONGEST, _SHORTEST = 0.15, 1.5  # time constants of the background's AR1s: share of the record, blocks
-_ROUNDING, _TINY = 1e-6, 1e-300
-_FIRST = 50  # blocks that tell the level at the start
+_LARGEST = 1e4  # variance of the level at the start over that of the noise: a diffuse prior, without loss of digits
 
 
 class Background(NamedTuple):
@@ -41,7 +35,7 @@ class Background(NamedTuple):
 
     Attributes:
         white: Variance `r`.
-        phi: Of the AR1s, and 1 of the walk, `(part,)`.
+        phi: Coefficients of the AR1s, and 1 of the walk, `(part,)`.
         steps: Variances of their steps, `(part,)`.
         start: Variances at the start, `(part,)`.
     """
@@ -53,16 +47,22 @@ class Background(NamedTuple):
 
 
 def backgrounds(base: NoiseSpectrum, block: int, n_shaped: int = 4) -> list[Background]:
-    """Of each sensor, with so many AR1s, fitted to the spectrum that means over so many samples have."""
+    """Background of each sensor: non-negative least squares of AR1s to the spectrum of block means.
+
+    Args:
+        base: Noise spectrum of samples.
+        block: Samples of a block.
+        n_shaped: Number of AR1s, of time constants from 1.5 blocks to 0.15 of the record, beside which a walk stands
+            for longer ones.
+    """
     n = base.n_samples // block
-    f = np.geomspace(0.5 / n, 0.5, _ORDINATES)  # cycles per block
-    density = _of_means(base, f, block)
-    constants = np.geomspace(_SHORTEST, max(_LONGEST * n, 2 * _SHORTEST), n_shaped)
+    f = np.geomspace(0.5 / n, 0.5, 120)  # cycles per block
+    constants = np.geomspace(1.5, max(0.15 * n, 3.0), n_shaped)
     phi = np.exp(-1 / constants)
     shaped = (1 - phi[:, None] ** 2) / (1 - 2 * phi[:, None] * np.cos(2 * np.pi * f) + phi[:, None] ** 2)
     atoms = np.concatenate([np.ones((1, len(f))), shaped, 1 / (4 * np.sin(np.pi * f) ** 2)[None]])
     found = []
-    for row in density:
+    for row in _density_of_means(base, f, block):
         relative = torch.from_numpy(atoms / row)
         white, *variances, walk = nonnegative_least_squares(relative @ relative.mT, relative.sum(-1)).tolist()
         variance = np.array(variances)
@@ -74,32 +74,37 @@ def backgrounds(base: NoiseSpectrum, block: int, n_shaped: int = 4) -> list[Back
     return found
 
 
-def _of_means(base: NoiseSpectrum, f: Array, block: int) -> Array:
+def _density_of_means(base: NoiseSpectrum, f: Array, block: int) -> Array:
     """Densities `(sensor, frequency)` of block means at `f` cycles per block, with what is folded down."""
-    places = (f[:, None] + np.arange(-(block // 2), block - block // 2)) / block  # cycles per sample
-    seen = (np.sin(np.pi * places * block) / (block * np.sin(np.pi * places))) ** 2 / block
-    folded = torch.from_numpy(np.abs((places + 0.5) % 1 - 0.5).ravel())
-    return np.asarray((base.spectrum(folded).numpy().reshape(-1, *places.shape) * seen).sum(-1))
+    unfolded = (f[:, None] + np.arange(-(block // 2), block - block // 2)) / block  # cycles per sample
+    passed = (np.sin(np.pi * unfolded * block) / (block * np.sin(np.pi * unfolded))) ** 2 / block
+    folded = torch.from_numpy(np.abs((unfolded + 0.5) % 1 - 0.5).ravel())
+    return np.asarray((base.spectrum(folded).numpy().reshape(-1, *unfolded.shape) * passed).sum(-1))
+
+
+def _starting_level(y: Array) -> float:
+    """Mean of the first block means, about which the level at the start is diffuse."""
+    return float(y[:50].mean())
 
 
 def gaussian_values(y: Array, background: Background, sd: Array, tau: Array) -> Array:
-    """Log likelihoods of an Ornstein-Uhlenbeck process in the background, `(trial, block)`.
+    """Log likelihoods of an Ornstein-Uhlenbeck process in the background, `(trial, block)`, by Kalman's filter.
 
     Args:
         y: Block means, `(block,)`.
         background: Noise beside it.
-        sd: Of the process, `(trial,)`; 0 for none.
-        tau: Its time constant, blocks.
+        sd: Standard deviation of the process, `(trial,)`; 0 for none.
+        tau: Time constant of it, blocks.
     """
     n_trials, parts = len(sd), len(background.phi) + 1
     own = np.exp(-1 / tau)
     phi = np.column_stack([np.tile(background.phi, (n_trials, 1)), own])
     steps = np.column_stack([np.tile(background.steps, (n_trials, 1)), sd**2 * (1 - own**2)])
-    p = np.zeros((n_trials, parts, parts))
     diagonal = np.arange(parts)
+    p = np.zeros((n_trials, parts, parts))
     p[:, diagonal, diagonal] = np.column_stack([np.tile(background.start, (n_trials, 1)), sd**2])
     mean = np.zeros((n_trials, parts))
-    mean[:, -2] = y[:_FIRST].mean()
+    mean[:, -2] = _starting_level(y)
     both, values = phi[:, :, None] * phi[:, None], np.empty((n_trials, len(y)))
     for k, value in enumerate(y):
         mean, p = phi * mean, both * p
@@ -122,8 +127,8 @@ def switching_values(y: Array, background: Background, half: Array, up: Array, d
         background: Noise beside them.
         half: Half the distance of the levels, `(trial,)`.
         up: Mean dwell in the upper one, blocks, `(trial,)`.
-        down: In the lower one.
-        n_paths: That are followed.
+        down: Mean dwell in the lower one, likewise.
+        n_paths: Number of paths that are followed.
     """
     gains, s = _filter(background, len(y))
     uniform = np.random.default_rng(0).random(len(y))  # the same for all trials, so that their values compare
@@ -134,7 +139,7 @@ def switching_values(y: Array, background: Background, half: Array, up: Array, d
     upper = np.tile([False, True], (n_trials, 1))
     weight = np.concatenate([leave, enter], 1) / (leave + enter)
     mean = np.zeros((n_trials, 2, n_parts))
-    mean[..., -1] = y[:_FIRST].mean()
+    mean[..., -1] = _starting_level(y)
     values = np.empty((n_trials, len(y)))
     for k, value in enumerate(y):
         n_before = upper.shape[1]
@@ -177,21 +182,27 @@ def _filter(background: Background, n: int) -> tuple[Array, Array]:
 def _thinned(weight: Array, n_paths: int, uniform: float) -> tuple[NDArray[np.intp], Array]:
     """Positions of the paths that are kept among all `(trial, path)`, and their weights, `(trial, path)`.
 
-    Weights above a threshold stay as they are; of the others so many as there is room for are drawn in proportion to
-    their weights, evenly, and get the threshold.
+    Weights above a threshold stay as they are; of the others as many as there is room for are drawn in proportion to
+    their weights, evenly, and get the threshold (Fearnhead and Clifford, section 5).
+
+    Args:
+        weight: Weights of the paths, `(trial, path)`.
+        n_paths: Number of paths to keep.
+        uniform: Random number from 0 to 1, the start of the even draw.
     """
+    rounding = 1e-6  # of a path, by which sums of weights may be off
     safe, n_safe = np.zeros(weight.shape, bool), np.zeros((len(weight), 1), int)
     while True:
-        limit = np.where(safe, 0.0, weight).sum(1, keepdims=True) / (n_paths - n_safe) + _TINY
+        limit = np.where(safe, 0.0, weight).sum(1, keepdims=True) / (n_paths - n_safe) + 1e-300
         safe = weight > limit
         now = safe.sum(1, keepdims=True)
         if (now == n_safe).all():
             break
         n_safe = now
     room = n_paths - n_safe
-    drawn = np.minimum(np.where(safe, 0.0, weight / limit).cumsum(1), room - _ROUNDING)
-    drawn[:, -1:] = room - _ROUNDING
-    drawn = np.floor(drawn + (uniform * (1 - 2 * _ROUNDING) + _ROUNDING))
+    drawn = np.minimum(np.where(safe, 0.0, weight / limit).cumsum(1), room - rounding)
+    drawn[:, -1:] = room - rounding
+    drawn = np.floor(drawn + (uniform * (1 - 2 * rounding) + rounding))
     taken = safe | (np.diff(drawn, axis=1, prepend=0.0) > 0)
     # Where fewer have any weight at all, some without make up the number.
     missing = n_paths - taken.sum(1, keepdims=True)

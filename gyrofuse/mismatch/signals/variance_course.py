@@ -12,12 +12,7 @@ from torch import Tensor
 from gyrofuse.mismatch.signals.filters import filtered
 from gyrofuse.mismatch.signals.psd import bands, cross_spectra
 
-_FEWEST = 256  # samples of episodes that tell from which frequency on they are louder
-_CORNER = 1 / 64  # cycles per sample, for shorter ones
-_HIGHEST = 4  # of the corners that are tried, octaves below one cycle per sample
-_AS_GOOD = 4.0  # difference of chi-squares that is chance
-_STEP = 0.2  # of a log variance between filters: amplitudes in between are then off by a thousandth
-_LEAST = 0.1  # of a whitened factor: the fast noise is not quieter than that
+_CORNER = 1 / 64  # cycles per sample, for stretches too short to determine it
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,15 +35,13 @@ class VarianceCourse:
 
     @property
     def variance(self) -> Tensor:
-        """Of whitened samples, `(sensor, time)`."""
+        """Variance of whitened samples, `(sensor, time)`."""
         return whitened_factor(self._log_level().exp(), self.corner)
 
     def of_length(self, n_samples: int) -> VarianceCourse:
-        """In a record of another length, at the same share of it."""
+        """The course in a record of another length, at the same share of it."""
         n = len(self.course)
-        if n_samples == n:
-            return self
-        return replace(self, course=self.course[torch.arange(n_samples) * n // n_samples])
+        return self if n_samples == n else replace(self, course=self.course[torch.arange(n_samples) * n // n_samples])
 
     def added(self, signal: Tensor) -> Tensor:
         """Signals `(..., sensor, time)` with it."""
@@ -64,14 +57,17 @@ class VarianceCourse:
         return base.log()[:, None] + self.factor.log()[:, None] * self.course.to(self.factor.dtype)
 
     def _times(self, signal: Tensor, power: float) -> Tensor:
-        """Through a filter for each of several levels, and in between what is in between."""
+        """Signals times a power of the density, through a filter for each of several levels, interpolated in between.
+
+        Filters are a log variance of 0.2 apart: amplitudes between them are off by a thousandth.
+        """
         level = self._log_level()
         low, high = level.amin(-1, keepdim=True), level.amax(-1, keepdim=True)
-        steps = max(math.ceil(float((high - low).max()) / _STEP), 1)
-        place = steps * (level - low) / (high - low).clamp(min=1e-12)
+        steps = max(math.ceil(float((high - low).max()) / 0.2), 1)
+        position = steps * (level - low) / (high - low).clamp(min=1e-12)
         total = torch.zeros_like(signal)
         for step in range(steps + 1):
-            weight = (1 - (place - step).abs()).clamp(min=0)
+            weight = (1 - (position - step).abs()).clamp(min=0)
             if bool(weight.any()):
                 r = (low + (high - low) * step / steps).exp()
                 total = total + weight * _louder(signal, r, self.corner, power)
@@ -91,7 +87,7 @@ def fast_share(f: Tensor, corner: float) -> Tensor:
 
 
 def whitened_factor(factor: Tensor, corner: float) -> Tensor:
-    """What a factor of the fast noise is for the variance of whitened samples: less, where slow noise does not change.
+    """Variance ratio of whitened samples where that of the fast noise is `factor`: less, since slow noise stays.
 
     The mean of `f^2 / (f^2 + f_c^2)` over all frequencies is `1 - 2 f_c atan(1 / 2 f_c)`.
     """
@@ -99,8 +95,11 @@ def whitened_factor(factor: Tensor, corner: float) -> Tensor:
 
 
 def fast_factor(whitened: Tensor, corner: float) -> Tensor:
-    """The other way round."""
-    return (1 + (whitened - 1) / _mean_share(corner)).maximum(_LEAST * whitened)
+    """Variance ratio of the fast noise where that of whitened samples is `whitened`: the inverse of `whitened_factor`.
+
+    Not below a tenth of it: fast noise has no negative variance.
+    """
+    return (1 + (whitened - 1) / _mean_share(corner)).maximum(0.1 * whitened)
 
 
 def _mean_share(corner: float) -> float:
@@ -108,19 +107,20 @@ def _mean_share(corner: float) -> float:
 
 
 def corner_of(noise: Tensor, inside: Tensor, factor: Tensor) -> float:
-    """From which frequency on noise is louder, cycles per sample.
+    """Frequency from which on noise is louder, cycles per sample.
 
-    By least squares of log spectra of the longest stretch inside over that outside; of what fits as well what is
-    nearest to a 64th.
+    By least squares of log spectra of the longest stretch inside over that outside, over powers of two. Of those within
+    4 of the least chi-square, 2 sd, it is the one nearest to a 64th; that is the value of stretches of less than 256
+    samples as well.
 
     Args:
-        noise: `(sensor, time)`.
-        inside: `(time,)`.
-        factor: Of the variance of whitened samples inside, `(sensor,)`.
+        noise: Noise, `(sensor, time)`.
+        inside: Samples of the louder level, `(time,)`.
+        factor: Ratio of the variance of whitened samples inside to that outside, `(sensor,)`.
     """
     parts = [_longest(inside), _longest(~inside)]
     lengths = [b - a for a, b in parts]
-    if min(lengths) < _FEWEST:
+    if min(lengths) < 256:
         return max(_CORNER, 1 / len(inside))
     wanted = bands(lengths[0])
     powers = [cross_spectra(noise[None, :, a:b], wanted)[0].diagonal(dim1=-1, dim2=-2).real.mT for a, b in parts]
@@ -133,13 +133,13 @@ def corner_of(noise: Tensor, inside: Tensor, factor: Tensor) -> float:
         expected = torch.log1p(more[:, None] * fast_share(wanted.frequency, corner))
         return float(((ratio - expected)[:, known].square() @ weight).sum())
 
-    tried = {k: misfit(2.0**-k) for k in range(_HIGHEST, math.ceil(math.log2(len(inside))) + 1)}
-    good = [k for k, chi2 in tried.items() if chi2 <= min(tried.values()) + _AS_GOOD]
+    tried = {k: misfit(2.0**-k) for k in range(4, math.ceil(math.log2(len(inside))) + 1)}
+    good = [k for k, chi2 in tried.items() if chi2 <= min(tried.values()) + 4.0]
     return 2.0 ** -min(good, key=lambda k: abs(k + math.log2(_CORNER)))
 
 
 def _longest(where: Tensor) -> tuple[int, int]:
-    """First sample of the longest run, and the one after its last."""
+    """First sample of the longest run of true entries, and the one after its last."""
     ends = [0, *(where.diff().nonzero()[:, 0] + 1).tolist(), len(where)]
     runs = [(a, b) for a, b in itertools.pairwise(ends) if bool(where[a])]
     return max(runs, key=lambda run: run[1] - run[0], default=(0, 0))

@@ -1,4 +1,9 @@
-"""Which sensors take part in what the array has: those likelier to have about as much of it as others than none."""
+"""Which sensors of an array have an effect, given that some have.
+
+A sensor without it has a chi-square statistic, one with it a noncentral one of about the noncentrality that the others
+have, since sensors of one array are built alike. It is included where the noncentral density is the larger one: beside
+large effects a small statistic is chance, beside small ones it is an effect.
+"""
 
 from __future__ import annotations
 
@@ -6,22 +11,18 @@ import math
 from typing import NamedTuple
 
 import torch
-from scipy import special
+from scipy import optimize, special
 from torch import Tensor
 
-_SIZES = (0.7, 1.0, 1.4)  # of an effect in a sensor over that in others of its array: built alike, they feel alike
-_ROUNDS, _HALVINGS = 4, 30
-_CHANCE = 0.04  # that any sensor seems to have an effect, to begin with
-_SURE = 1e-6  # chance that any sensor seems to have it, of one that has it whatever the others have
-_LARGEST = 1e6  # statistic
+_SIZES = (0.7, 1.0, 1.4)  # sizes of an effect in a sensor over the mean size: within a factor of two in one array
 
 
 class Inclusion(NamedTuple):
-    """Sensors that take part.
+    """Sensors that have an effect.
 
     Attributes:
         which: `(sensor,)`; at least the one with the largest statistic.
-        least: Statistic from which a sensor does.
+        least: Statistic from which on a sensor is included.
     """
 
     which: Tensor
@@ -29,43 +30,39 @@ class Inclusion(NamedTuple):
 
     @property
     def positions(self) -> tuple[int, ...]:
+        """Positions of these sensors."""
         return tuple(self.which.nonzero()[:, 0].tolist())
 
 
-def included_sensors(statistic: Tensor, dof: int, chance: float = _CHANCE) -> Inclusion:
-    """Those whose statistic is likelier with about as much of the effect as others have than with none.
-
-    Without it is chi-square, with it noncentral: where the others have much, a little is chance; where they have
-    little, it is theirs. What is beyond doubt by itself is so beside anything.
+def included_sensors(statistic: Tensor, dof: int, chance: float = 0.04, sure: float = 1e-6) -> Inclusion:
+    """Sensors whose statistic is likelier with the effect of the others than with none.
 
     Args:
         statistic: Squares of estimates in standard deviations, `(sensor,)`.
-        dof: Of each.
-        chance: That any sensor seems to have it which has not, of those that are taken for sure to begin with.
+        dof: Degrees of freedom of each.
+        chance: False-alarm rate of all sensors together, of those that are included to begin with.
+        sure: False-alarm rate of all sensors together, of those that are included whatever the others have.
     """
-    x = statistic.to(torch.float64).nan_to_num(nan=0.0).clamp(max=_LARGEST)
+    x = statistic.to(torch.float64).nan_to_num(nan=0.0).clamp(max=1e6)  # larger ones overflow Bessel functions
     largest = torch.arange(len(x)) == x.argmax()
-    least, most = (float(special.chdtri(dof, p / len(x))) for p in (chance, _SURE))
-    for _ in range(_ROUNDS):
-        taking = (x > least) | largest
-        size = float((x[taking] - dof).mean().clamp(min=1.0))
+    least, most = (float(special.chdtri(dof, p / len(x))) for p in (chance, sure))
+    for _ in range(4):  # the set and the size of its effect in turn
+        size = float((x[(x > least) | largest] - dof).mean().clamp(min=1.0))
         least = min(_least(dof, size), most)
     return Inclusion((x > least) | largest, least)
 
 
 def _least(dof: int, size: float) -> float:
     """Statistic that is as likely with an effect of about a size, the noncentrality, as without."""
-    low, high = 0.0, dof + 2 * size + 20.0
-    for _ in range(_HALVINGS):
-        middle = (low + high) / 2
-        ratios = [_log_ratio(middle, dof, s**2 * size) for s in _SIZES]
-        less = special.logsumexp(ratios) < math.log(len(_SIZES))
-        low, high = (middle, high) if less else (low, middle)
-    return (low + high) / 2
+
+    def log_odds(x: float) -> float:
+        return float(special.logsumexp([_log_ratio(x, dof, s**2 * size) for s in _SIZES])) - math.log(len(_SIZES))
+
+    return float(optimize.brentq(log_odds, 1e-12, dof + 2 * size + 20.0, xtol=1e-8))
 
 
 def _log_ratio(x: float, dof: int, size: float) -> float:
-    """Density of a noncentral chi-square variable over that of a central one, logarithm."""
+    """Logarithm of the density of a noncentral chi-square variable over that of a central one."""
     root, order = math.sqrt(size * x), dof / 2 - 1
     bessel = math.log(special.ive(order, root)) + root
     return float(bessel - order * math.log(root / 2) + math.lgamma(dof / 2) - size / 2)

@@ -1,16 +1,14 @@
-"""A level of noise that is another for a while, in several sensors by as little as only many together tell.
+"""The level of noise: evidence of a stretch of another one, and its slow course.
 
-Of the energy of `n` normal values a stretch of `m` holds the share `x`. If their variance is `r` times that of the
-others, whatever that is, its likelihood ratio is
+A stretch of another level may show in several sensors together only. Of the energy of `n` normal values a stretch of
+`m` holds the share `x`. If its variance is `r` times that of the rest, whatever that is, the likelihood ratio to a
+steady level is
 
     E = r^(-m/2) (1 - x + x/r)^(-n/2)
 
-and which of the sensors take part is left open. Means over stretches, factors and shares of the sensors have
-expectation one where nothing changes, so that they exceed `x` with probability `1/x` at most (Ville, 1939), and with
-`1/30x` or less in 4500 drawn records of 1 to 6 sensors: `1/20x` is held to.
-
-Where another record is known to have the level that does not change, its samples count with those outside the stretch.
-Where levels vary by themselves, ratios are tempered: `E^w`, with `w` the weight of a sample.
+Its mean over stretches, factors and shares of the sensors has expectation one where nothing changes (`multiplicity`).
+Samples of a simulation whose level is known to be steady count with those outside the stretch. Where levels vary by
+themselves, ratios are tempered: `E^w`, with `w` the weight of a sample (`level_spread`).
 """
 
 from __future__ import annotations
@@ -21,22 +19,21 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
-from gyrofuse.mismatch.stats.multiplicity import e_value_of_some, p_value_from_e_value
+from gyrofuse.mismatch.stats.multiplicity import e_value_of_some, log_mean, p_value_from_e_value
 
-_FINEST = 512  # blocks in the record
-_STRIDE = 8  # starts in a stretch
-_LENGTHS = 2  # in an octave
-_DEVIATIONS = (1.2, 2.0, 3.2, 5.0, 8.0, 14.0, 25.0)  # of a factor's logarithm from 0, sd
-_LARGEST = 30.0  # factor
+WINDOW = 257  # samples: of Gaussian noise their mean square is known to a tenth, bursts of tens of samples stay
+# Factors, sd of their logarithm. Each is 1.66 times the one before: the nearer one gains 92 % of the nats between them.
+_DEVIATIONS = torch.logspace(math.log10(1.2), math.log10(25.0), 7, dtype=torch.float64)
 
 
 class LevelScan(NamedTuple):
-    """The likeliest stretch with another level.
+    """Scan for a stretch with another level.
 
     Attributes:
-        log_ratio: Log of the mean likelihood ratio over all stretches and factors, nats.
-        start, stop: Samples.
+        log_ratio: Logarithm of the mean likelihood ratio over all stretches and factors, nats.
+        start, stop: Samples of the likeliest stretch.
     """
 
     log_ratio: float
@@ -45,71 +42,101 @@ class LevelScan(NamedTuple):
 
     @property
     def p_value(self) -> float:
-        """Of a level that does not change."""
+        """p value of a steady level."""
         return p_value_from_e_value(self.log_ratio)
 
 
 class Reference(NamedTuple):
-    """Another record, of the level that is compared with.
+    """Level of another record, which the level outside of the stretch is known to have.
 
     Attributes:
-        level: Of the squares of the record looked at, `(sensor,)`; 1 is its own mean.
-        worth: Independent samples from which it is known.
+        level: Mean square over that of the record searched, `(sensor,)`.
+        n_samples: Number of independent samples from which it is known.
     """
 
     level: Tensor
-    worth: float
+    n_samples: float
 
     def of(self, sensors: Sequence[int]) -> Reference:
-        """For some of the sensors."""
+        """The reference of some of the sensors."""
         return self._replace(level=self.level[list(sensors)])
 
 
 def scanned_levels(squares: Tensor, reference: Reference | None = None, weight: Tensor | None = None) -> LevelScan:
-    """Evidence of a stretch with another level than the rest, and the reference if there is one, has.
+    """Evidence of a stretch with another level than the rest and the reference.
+
+    Stretches are of 1, 1.4, 2, 2.8 ... of 512 blocks, and start at every eighth of their length; `segments` finds their
+    ends to the sample.
 
     Args:
-        squares: Of whitened samples, `(sensor, time)`.
-        reference: What else is known of the level outside.
-        weight: What a sample counts for where levels vary by themselves, `(sensor,)`; 1 by default.
+        squares: Squares of whitened samples, `(sensor, time)`.
+        reference: Level outside, where it is known beside the record.
+        weight: Weight of a sample where levels vary by themselves, `(sensor,)`; 1 by default.
     """
-    block = max(squares.shape[-1] // _FINEST, 1)
+    block = max(squares.shape[-1] // 512, 1)
     blocks = squares[..., : squares.shape[-1] // block * block].unflatten(-1, (-1, block)).sum(-1)
     n_blocks = blocks.shape[-1]
-    share, n = _of_all(n_blocks * block, reference)
-    total = torch.nn.functional.pad((share * blocks / blocks.sum(-1, keepdim=True)).cumsum(-1), (1, 0))
+    share, n = _energy_share(n_blocks * block, reference)
+    total = pad((share * blocks / blocks.sum(-1, keepdim=True)).cumsum(-1), (1, 0))
     logs, best, where = [], -math.inf, (0, n_blocks * block)
-    lengths = sorted({round(2 ** (k / _LENGTHS)) for k in range(int(_LENGTHS * math.log2(n_blocks / 2)) + 1)})
-    for length in lengths:
-        start = torch.arange(0, n_blocks - length + 1, max(length // _STRIDE, 1))
-        every = _log_ratios(total[:, start + length] - total[:, start], length * block, n, weight)
-        logs.append(torch.logsumexp(every.flatten(), 0) - math.log(every.numel()))
-        if float(every.max()) > best:
-            best, at = float(every.max()), int(start[int(every.amax(0).argmax())])
+    for length in sorted({round(2 ** (k / 2)) for k in range(int(2 * math.log2(n_blocks / 2)) + 1)}):
+        start = torch.arange(0, n_blocks - length + 1, max(length // 8, 1))
+        ratios = _log_ratios(total[:, start + length] - total[:, start], length * block, n, weight)
+        logs.append(log_mean(ratios))
+        if float(ratios.max()) > best:
+            best, at = float(ratios.max()), int(start[int(ratios.amax(0).argmax())])
             where = (at * block, (at + length) * block)
-    return LevelScan(float(torch.logsumexp(torch.stack(logs), 0)) - math.log(len(logs)), *where)
+    return LevelScan(log_mean(torch.tensor(logs, dtype=torch.float64)), *where)
 
 
 def other_level(n_samples: int, reference: Reference, weight: Tensor | None = None) -> float:
-    """Log of the mean likelihood ratio of another level throughout the record than the reference has, nats."""
-    share, n = _of_all(n_samples, reference)
-    every = _log_ratios(share, n_samples, n, weight)
-    return float(torch.logsumexp(every.flatten(), 0)) - math.log(every.numel())
+    """Logarithm of the mean likelihood ratio of another level throughout the record than the reference's, nats."""
+    share, n = _energy_share(n_samples, reference)
+    return log_mean(_log_ratios(share, n_samples, n, weight))
 
 
-def _of_all(n_samples: int, reference: Reference | None) -> tuple[Tensor, float]:
-    """The record's share of all energy, `(sensor, 1)` or what goes for each, and samples of record and reference."""
+def _energy_share(n_samples: int, reference: Reference | None) -> tuple[Tensor, float]:
+    """Share of all energy that is the record's, `(sensor or 1, 1)`, and number of samples of record and reference."""
     if reference is None:
         return torch.ones(1, 1, dtype=torch.float64), n_samples
-    return (n_samples / (n_samples + reference.worth * reference.level))[:, None], n_samples + reference.worth
+    n = n_samples + reference.n_samples
+    return (n_samples / (n_samples + reference.n_samples * reference.level))[:, None], n
 
 
 def _log_ratios(x: Tensor, m: float, n: float, weight: Tensor | None) -> Tensor:
-    """Log ratios `(factor, place)` of shares `(sensor, place)` of the energy in `m` of `n` samples, any sensors."""
+    """Log ratios `(factor, stretch)` that some sensors have a level of their own.
+
+    Args:
+        x: Shares of the energy in `m` of `n` samples, `(sensor, stretch)`.
+        m: Samples of the stretch.
+        n: Samples of record and reference.
+        weight: Weight of a sample, `(sensor,)`.
+    """
     weight = torch.ones(len(x), dtype=x.dtype) if weight is None else weight
-    deviations = torch.tensor(_DEVIATIONS, dtype=torch.float64)
-    reach = (deviations * math.sqrt((2 / m + 2 / (n - m)) / float(weight.mean()))).clamp(max=math.log(_LARGEST))
+    reach = _DEVIATIONS * math.sqrt((2 / m + 2 / (n - m)) / float(weight.mean()))
+    reach = reach.clamp(max=math.log(30.0))  # larger factors show under this one as well
     log_r = torch.cat([reach, -reach])[:, None]
     return e_value_of_some(
         weight[:, None, None] * (-m / 2 * log_r - n / 2 * torch.log1p(x[:, None] * torch.expm1(-log_r)))
     )
+
+
+def local_level(values: Tensor) -> Tensor:
+    """Mean of clipped squares around each sample over that of all, `(..., time)`; at the ends of as many as there are.
+
+    Squares are clipped at nine times the level found so far, so that an outlier is no level. Where the level is ten
+    times the mean the first round follows half of it, the second nearly all.
+
+    Args:
+        values: White or nearly white noise, `(..., time)`.
+    """
+    n = values.shape[-1]
+    half = min(WINDOW // 2, (n - 1) // 2)
+    at = torch.arange(n)
+    low, high = (at - half).clamp(min=0), (at + half + 1).clamp(max=n)
+    squares = values.square()
+    level = squares.mean(-1, keepdim=True).clamp(min=1e-300)
+    for _ in range(3):
+        total = pad(squares.minimum(9.0 * level).cumsum(-1), (1, 0))
+        level = ((total[..., high] - total[..., low]) / (high - low)).clamp(min=1e-300)
+    return level / level.mean(-1, keepdim=True)

@@ -1,4 +1,11 @@
-"""p values of many tests together, and of averaged likelihood ratios (e-values)."""
+"""p values of many tests together, and of averaged likelihood ratios (e-values).
+
+References:
+    Sidak, Rectangular confidence regions for the means of multivariate normal distributions, JASA 62 (1967), 626.
+    Ville, Etude critique de la notion de collectif, 1939: a nonnegative variable of mean one exceeds `x` with
+    probability `1/x` at most.
+    Vovk and Wang, E-values: calibration, combination and applications, Ann. Statist. 49 (2021), 1736.
+"""
 
 from __future__ import annotations
 
@@ -7,64 +14,79 @@ import math
 import torch
 from torch import Tensor
 
-_LOOSE = 0.05  # of the bound on the probability of a mean ratio
-_BY_CHANCE, _SURELY = 0.05, 1e-3  # p values of what a simulation shows
-_TAIL = 0.25  # share of the twins behind the fitted tail
-SHARES = (0.2, 0.5, 0.9)  # of the sensors that have an effect
+from gyrofuse.mismatch.decisions import CERTAIN, CHANCE
+
+SHARES = (0.2, 0.5, 0.9)  # of the sensors that have an effect, beforehand: few, half of them, nearly all
 
 
-def sidak(p: float, places: float) -> float:
-    """p value of the smallest of so many independent ones, each uniform: `1 - (1 - p)^places`, to rounding."""
-    return -math.expm1(places * math.log1p(-min(p, 1.0))) if p < 1 else 1.0
+def sidak(p: float, n_tests: float) -> float:
+    """p value `1 - (1 - p)^n` of the smallest of so many independent p values, exact to rounding."""
+    return -math.expm1(n_tests * math.log1p(-min(p, 1.0))) if p < 1 else 1.0
 
 
-def sidak_level(p: float, places: float) -> float:
-    """What the smallest of so many p values is where it has `p` when corrected for their number."""
-    return -math.expm1(math.log1p(-min(p, 1 - 1e-16)) / places)
+def sidak_level(p: float, n_tests: float) -> float:
+    """Smallest of so many p values that has the p value `p` once corrected: the inverse of `sidak`."""
+    return -math.expm1(math.log1p(-min(p, 1 - 1e-16)) / n_tests)
+
+
+def log_mean(log_values: Tensor) -> float:
+    """Logarithm of the mean of values of any shape, from their logarithms."""
+    return float(log_values.flatten().logsumexp(0)) - math.log(log_values.numel())
 
 
 def p_value_from_e_value(log_ratio: float) -> float:
-    """p value of a mean likelihood ratio, from its logarithm.
+    """p value of a mean likelihood ratio.
 
-    It exceeds `x` with probability `1/x` at most (Ville, 1939); by drawn records `1/30x` or less. To `1/20x` is held.
+    Ville's bound is `1/x`. Drawn nulls exceed `x` in `1/30x` (levels of noise, 4500 records of 1 to 6 sensors) to
+    `1/70x` (outliers, by importance sampling) of all records: `1/20x` is used.
+
+    Args:
+        log_ratio: Logarithm of the mean likelihood ratio, nats.
     """
-    return math.exp(min(math.log(_LOOSE) - log_ratio, 0.0))
+    return math.exp(min(-math.log(20.0) - log_ratio, 0.0))
 
 
 def e_values_by_share(log_ratios: Tensor) -> Tensor:
-    """Logarithms of `prod (1 - e + e E)` for shares `e`, `(share, ...)`, of ratios `log E` `(sensor, ...)`."""
+    """Logarithms of `prod_i (1 - e + e E_i)` for each share `e`, `(share, ...)`, of `log E` `(sensor, ...)`."""
     e = torch.tensor(SHARES, dtype=log_ratios.dtype).view(-1, *[1] * log_ratios.ndim)
     return torch.logaddexp(log_ratios + e.log(), torch.log1p(-e)).sum(1)
 
 
 def e_value_of_some(log_ratios: Tensor) -> Tensor:
-    """Logarithm of the mean of `prod (1 - e + e E)` over shares `e`.
+    """Logarithm of the e-value that some of the sensors have an effect, `(...)`: the mean over the shares.
 
-    Any of the sensors may have what each has a likelihood ratio of its own for; these have to be independent.
+    Args:
+        log_ratios: Logarithms of independent e-values of each sensor, `(sensor, ...)`.
     """
     return log_ratios[0] if len(log_ratios) == 1 else e_values_by_share(log_ratios).logsumexp(0) - math.log(len(SHARES))
 
 
 def p_value_beyond_reference(own: float, other: float) -> float:
-    """p value of what the simulation shows too, there with the p value `other`.
+    """p value of an effect of the recording beyond that which the simulation shows itself.
 
-    What it may have by chance the recording has to surpass: `own / other` is below `x` with a probability below `x`.
-    Beside what it surely has, there is nothing to be told.
+    Args:
+        own: p value of the effect in the recording.
+        other: p value of the same effect in the simulation. By chance it is uniform, and `own / other` is below `x`
+            with a probability below `x`; beside a certain effect of the simulation nothing can be said.
     """
-    if other > _BY_CHANCE:
+    if other > CHANCE:
         return own
-    return min(own / other, 1.0) if other > _SURELY else 1.0
+    return min(own / other, 1.0) if other > CERTAIN else 1.0
 
 
 def monte_carlo_p_value(p_value: float, among: Tensor) -> float:
-    """p value from its rank among those of twins `(twin,)`, in which nothing is missing.
+    """p value from its rank among those of null replicates, with a fitted tail beyond the smallest quarter of them.
 
-    Beyond the smallest quarter of them the tail is fitted instead of counted: `-log p` has an exponential tail, with
-    rate one where witnesses are honest. The next one lies beyond all but the `k` highest with `(k + 1) / (n + 1)`, and
-    there beyond `x` with `(1 + x / sum)^-k`, both exactly, the sum that of the `k` excesses.
+    `-log p` has an exponential tail, of rate one where tests are honest. A further replicate lies beyond the threshold
+    with `(k + 1) / (n + 1)`, and there beyond `x` with `(1 + x / sum)^-k`, both exactly; `sum` is that of the `k`
+    excesses over the threshold.
+
+    Args:
+        p_value: Smallest p value of the recording.
+        among: Those of the replicates, `(replicate,)`.
     """
     scores, own = -among.clamp(min=1e-300).log(), -math.log(max(p_value, 1e-300))
-    threshold = float(scores.topk(round(_TAIL * len(scores)) + 1).values[-1])
+    threshold = float(scores.topk(round(len(scores) / 4) + 1).values[-1])
     excess = scores[scores > threshold] - threshold
     if own <= threshold or not len(excess):
         return float(((scores >= own).sum() + 1) / (len(scores) + 1))

@@ -1,4 +1,12 @@
-"""Stretches of a whitened record in which its variance is another, by the likelihood of two levels."""
+"""Stretches of a whitened record in which its variance is another: two levels, and when each of them holds.
+
+A squared sample of variance `v` has the log likelihood `-(log v + e^2/v)/2`. The path of two levels that is likeliest,
+each change costing `log n`, is found by dynamic programming; levels and path are estimated in turn.
+
+References:
+    Viterbi, Error bounds for convolutional codes, IEEE Trans. Inf. Theory 13 (1967), 260.
+    Yao, Estimating the number of change-points via Schwarz' criterion, Stat. Prob. Lett. 6 (1988), 181: the cost.
+"""
 
 from __future__ import annotations
 
@@ -7,20 +15,14 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
+from gyrofuse.mismatch.stats.inclusion import included_sensors
 from gyrofuse.mismatch.stats.level_scan import Reference, scanned_levels
 
-_FINEST_BLOCKS = 16384
-_SHORTEST_BLOCK = 16
-_ROUNDS = 4
-_LOUDER = 3.0  # factor to start from, where no stretch is
-_CUT = 25.0  # squares: an outlier is no episode
-_TELL_A_LEVEL = 64  # samples of a stretch: fewer may all be outliers
-_MEDIAN = 0.4549364231195724  # of the square of a standard normal variable
-_CERTAIN, _BEYOND_DOUBT = 2.5, 3.5  # sd of the log of a factor
-_PRIOR = 0.5  # sd of the log of a factor beforehand
-_GRID, _REFINEMENTS = 160, 3  # starts and stops that are looked at at once, and how often more finely
-_TAIL, _ZOOM = 0.025, 1e-5  # of the posterior, beyond limits, and where no finer grid is made
+OUTLIER = 25.0  # squares over their variance, beyond which a sample is an outlier and no sign of another level: 5 sd
+CHI2_MEDIAN = 0.4549364231195724  # median of the square of a standard normal variable
+_SHORTEST = 16  # samples of a segment: the variance of fewer is known to no better than a factor of two at 95 %
 
 
 class Episode(NamedTuple):
@@ -34,9 +36,9 @@ class Episodes(NamedTuple):
     """Stretches of another level.
 
     Attributes:
-        episodes: In order of time.
-        factor: Of the variance within them, `(sensor,)`; 1 where a sensor takes no part.
-        log_ratio: Log of the mean likelihood ratio of a single one, wherever it is, nats.
+        episodes: Stretches in order of time.
+        factor: Ratio of the variance within them to that outside, `(sensor,)`; 1 where a sensor does not change.
+        log_ratio: Logarithm of the mean likelihood ratio of a single stretch, wherever it is, nats.
     """
 
     episodes: tuple[Episode, ...]
@@ -44,106 +46,204 @@ class Episodes(NamedTuple):
     log_ratio: float = 0.0
 
     def inside(self, n: int) -> Tensor:
-        """Samples within, `(time,)`."""
-        within = torch.zeros(n, dtype=torch.bool)
-        for start, stop in self.episodes:
-            within[start:stop] = True
-        return within
+        """Whether each of `n` samples is within, `(time,)`."""
+        return in_stretches(self.episodes, n)
 
     def other_way_round(self, n: int) -> Episodes:
-        """With what lies between them as the episodes."""
+        """The complement in `n` samples, as the stretches of another level."""
         edges = [0, *(e for pair in self.episodes for e in pair), n]
         between = tuple(Episode(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if a < b)
         return self._replace(episodes=between, factor=1 / self.factor)
 
 
-def episodes_of(white: Tensor, p_values: Tensor, reference: Reference | None = None) -> Episodes | None:
-    """The likeliest episodes of `(sensor, time)`, `None` where no sensor has any.
+def in_stretches(stretches: tuple[Episode, ...], n: int) -> Tensor:
+    """Whether each of `n` samples is in one of the stretches, `(time,)`."""
+    within = torch.zeros(n, dtype=torch.bool)
+    for start, stop in stretches:
+        within[start:stop] = True
+    return within
+
+
+def episodes_of(white: Tensor, reference: Reference | None = None) -> Episodes | None:
+    """The likeliest episodes; `None` where no path of two levels is likelier than one level.
+
+    Searched from the likeliest single stretch on, and from a level three times as loud, which finds many short ones.
 
     Args:
-        white: Whitened recording.
-        p_values: That its level changes, for each sensor and for all together, `(sensor + 1,)`.
-        reference: What else is known of the level between them.
+        white: Whitened recording, `(sensor, time)`.
+        reference: Level between the episodes, where it is known beside the record.
     """
+    n = white.shape[-1]
+    scan = scanned_levels(white.square().clamp(max=OUTLIER), reference)
+    stretch, nowhere = in_stretches((Episode(scan.start, scan.stop),), n), torch.zeros(n, dtype=torch.bool)
     best, best_score = None, 0.0
-    scan = scanned_levels(white.square().clamp(max=_CUT), reference)
-    for factor, stretch in ((0.0, None), (0.0, (scan.start, scan.stop)), (_LOUDER, None)):
-        found, score = _from_start(white, p_values, factor, stretch, reference)
-        if found is not None and (best is None or score > best_score):
+    for inside, factor in (
+        (stretch, _factors(white, stretch, reference)),
+        (nowhere, torch.full_like(white[:, 0], 3.0)),
+    ):
+        found = _improved(white, inside, factor, reference)
+        if found is None:
+            continue
+        score = float(two_level_scores(white, found.factor, found.inside(n), reference).sum())
+        score -= 2 * len(found.episodes) * math.log(n)
+        if best is None or score > best_score:
             best, best_score = found, score
     if best is None:
         return None
-    return best._replace(factor=_of_the_concerned(white, best, reference), log_ratio=scan.log_ratio)
+    if reference is None and 2 * int(best.inside(n).sum()) > n:  # what lasts longer is the rule
+        best = best.other_way_round(n)
+    return best._replace(log_ratio=scan.log_ratio)
 
 
 def stretch_of(white: Tensor) -> Episodes:
     """The likeliest single stretch of a whitened recording `(sensor, time)`, as the scan has it."""
-    scan = scanned_levels(white.square().clamp(max=_CUT))
-    found = Episodes((Episode(scan.start, scan.stop),), torch.ones(len(white), dtype=white.dtype), scan.log_ratio)
-    return found._replace(factor=_of_the_concerned(white, found, None))
+    scan = scanned_levels(white.square().clamp(max=OUTLIER))
+    stretch = (Episode(scan.start, scan.stop),)
+    return Episodes(stretch, _factors(white, in_stretches(stretch, white.shape[-1]), None), scan.log_ratio)
 
 
-def _of_the_concerned(white: Tensor, found: Episodes, reference: Reference | None) -> Tensor:
-    """Factors, 1 in sensors that are nearer to no change than to the change of those that have it.
+def _improved(white: Tensor, inside: Tensor, factor: Tensor, reference: Reference | None) -> Episodes | None:
+    """The likeliest path and its levels, in turn from a path `(time,)` and factors `(sensor,)` on."""
+    squares = white.square().clamp(max=OUTLIER)
+    found: tuple[Episode, ...] = ()
+    for _ in range(4):  # or until the path stays
+        quiet, before = _quiet(squares, factor, inside, reference), found
+        found = _likeliest((((1 - 1 / factor) / quiet) @ squares - factor.log().sum()) / 2)
+        inside = in_stretches(found, len(inside))
+        if not found or bool(inside.all()):
+            return None
+        factor = _factors(white, inside, reference)
+        if found == before:
+            break
+    return Episodes(found, factor)
 
-    Those are the sensors that together tell most of one change: of the largest `k` changes `d`, the `k` that make
-    `k mean(d)^2` largest.
+
+def _likeliest(log_ratios: Tensor) -> tuple[Episode, ...]:
+    """Stretches of the largest sum of `(time,)` less `log n` for each change; one of any sum where none pays for it.
+
+    The path is found in blocks, and each of its changes to the sample within two blocks of it.
     """
-    inside = found.inside(white.shape[-1])
+    n = len(log_ratios)
+    total = pad(log_ratios.cumsum(0), (1, 0))
+    size = max(_SHORTEST, -(-n // 2**14))  # at most 16384 steps of the dynamic program
+    path = torch.tensor(_two_state_path(total[::size].diff().tolist(), math.log(n)), dtype=torch.int8)
+    changes = pad(path, (1, 0)).diff().nonzero()[:, 0].tolist()
+    if not changes:
+        return _single(total)
+    edges = [0]
+    for k, change in enumerate(changes):
+        low = max(change * size - 2 * size, edges[-1])
+        near = total[low : max(change * size + 2 * size, low) + 1]
+        edges.append(low + int(near.argmax() if k % 2 else near.argmin()))
+    edges = [*edges[1:], n] if len(changes) % 2 else edges[1:]
+    return tuple(Episode(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if a < b)
+
+
+def _single(total: Tensor) -> tuple[Episode, ...]:
+    """The stretch of the largest sum, from sums of the first 0, 1, .. values."""
+    low = total.cummin(0)
+    stop = int((total - low.values).argmax())
+    return (Episode(int(low.indices[stop]), stop),) if stop else ()
+
+
+def _two_state_path(values: list[float], cost: float) -> list[bool]:
+    """States of the largest sum of values in the second state less `cost` for each change, from the first state on.
+
+    Viterbi's algorithm: with two states all that counts is by how much the second one is ahead, at most the cost of a
+    change to it.
+    """
+    ahead = [-cost]
+    for value in values:
+        ahead.append(min(max(ahead[-1], -cost), cost) + value)
+    state, states = ahead[-1] > 0, []
+    for before in reversed(ahead[:-1]):
+        states.append(state)
+        state = before >= -cost if state else before > cost
+    return states[::-1]
+
+
+def _factors(white: Tensor, inside: Tensor, reference: Reference | None) -> Tensor:
+    """Ratios of the variance inside to that outside, `(sensor,)`; 1 in sensors that need not have changed."""
     log_factor, sd = log_factors(_without_outliers(white, inside), inside, reference)
-    typical, most = 0.0, 0.0
-    for sign in (1.0, -1.0):
-        mean = (sign * log_factor).sort(descending=True).values.cumsum(0) / torch.arange(1, len(log_factor) + 1)
-        told = torch.where(mean > 0, mean.square(), 0.0) * torch.arange(1, len(log_factor) + 1)
-        if float(told.max()) > most:
-            most, typical = float(told.max()), sign * float(mean[told.argmax()])
-    concerned = ((2 * log_factor - typical) * typical > 0) | (log_factor.abs() > _BEYOND_DOUBT * sd)
-    return torch.where(concerned, log_factor.exp(), 1.0)
+    return torch.where(included_sensors((log_factor / sd).square(), 1).which, log_factor.exp(), 1.0)
 
 
 def _without_outliers(white: Tensor, inside: Tensor) -> Tensor:
     """Squares of whitened samples `(sensor, time)`, none larger than an outlier's of the level that is there.
 
-    Of noise that is many times as loud all samples are beyond what the rest of the record calls an outlier.
+    Of noise that is many times as loud all samples are beyond what the rest of the record calls an outlier. Fewer than
+    64 samples may all be outliers, and have no level of their own.
     """
     squares = white.square()
-    limit = torch.full_like(squares, _CUT)
+    limit = torch.full_like(squares, OUTLIER)
     for part in (inside, ~inside):
-        if int(part.sum()) >= _TELL_A_LEVEL:
-            level = squares[:, part].median(-1, keepdim=True).values / _MEDIAN
-            limit[:, part] = _CUT * level.clamp(min=1.0)
+        if int(part.sum()) >= 64:
+            level = squares[:, part].median(-1, keepdim=True).values / CHI2_MEDIAN
+            limit[:, part] = OUTLIER * level.clamp(min=1.0)
     return squares.minimum(limit)
 
 
 def log_factors(squares: Tensor, inside: Tensor, reference: Reference | None) -> tuple[Tensor, float]:
-    """Of the variance inside to that outside, `(sensor,)`, and their sd."""
+    """Logarithms of the ratio of the variance inside to that outside, `(sensor,)`, and their sd.
+
+    Args:
+        squares: Squares of whitened samples, `(sensor, time)`.
+        inside: Samples of the other level, `(time,)`.
+        reference: Level outside, where it is known beside the record.
+    """
     n_inside = int(inside.sum())
-    energy, worth = _known(squares, reference)
-    n_outside = len(inside) - n_inside + worth
+    energy, n_known = _known(squares, reference)
+    n_outside = len(inside) - n_inside + n_known
     outside = (squares[:, ~inside].sum(-1) + energy) / n_outside
     ratio = squares[:, inside].mean(-1) / outside.clamp(min=1e-300)
     return ratio.clamp(min=1e-300).log(), math.sqrt(2 / n_inside + 2 / n_outside)
 
 
 def _known(squares: Tensor, reference: Reference | None) -> tuple[Tensor, float]:
-    """Energy `(sensor,)` and samples that a reference adds to what lies outside of episodes."""
+    """Energy `(sensor,)` and number of samples that a reference adds to those outside."""
     mean = squares.mean(-1)
-    return (mean * 0.0, 0.0) if reference is None else (mean * reference.level * reference.worth, reference.worth)
+    if reference is None:
+        return 0.0 * mean, 0.0
+    return mean * reference.level * reference.n_samples, reference.n_samples
 
 
 def _quiet(squares: Tensor, factor: Tensor, inside: Tensor, reference: Reference | None) -> Tensor:
-    """Variance outside of episodes, `(sensor,)`, which in them is so many times as large."""
-    energy, worth = _known(squares, reference)
+    """Variance outside, `(sensor,)`, if that inside is so many times as large."""
+    energy, n_known = _known(squares, reference)
     within, without = squares[:, inside].sum(-1), squares[:, ~inside].sum(-1)
-    return (within / factor + without + energy) / (len(inside) + worth)
+    return (within / factor + without + energy) / (len(inside) + n_known)
+
+
+def course_scores(white: Tensor, variance: Tensor, reference: Reference | None = None) -> Tensor:
+    """Log likelihood ratio of a variance known up to its size to a steady one, `(sensor, time)`, nats.
+
+    Args:
+        white: Whitened samples, `(sensor, time)`.
+        variance: Variance of each, up to a factor of each sensor, likewise; 1 where the reference has its level.
+        reference: Level where the variance is 1, where it is known beside the record.
+    """
+    squares = white.square()
+    energy, n_known = _known(squares, reference)
+    n = white.shape[-1] + n_known
+    size = (squares / variance).median(-1, keepdim=True).values / CHI2_MEDIAN
+    for _ in range(3):  # outliers are cut at the size found so far
+        size = (((squares / variance).minimum(OUTLIER * size).sum(-1) + energy) / n)[:, None]
+    variance = size * variance
+    squares = squares.minimum(OUTLIER * variance)
+    one = ((squares.sum(-1) + energy) / n)[:, None]
+    return (squares / one - squares / variance - (variance / one).log()) / 2
 
 
 def two_level_scores(white: Tensor, factor: Tensor, inside: Tensor, reference: Reference | None = None) -> Tensor:
-    """Log likelihood of two levels against one, `(sensor, time)`, where `inside` `(time,)` has `factor`."""
-    squares = white.square()
-    one, quiet = (_quiet(squares, f, inside, reference)[:, None] for f in (torch.ones_like(factor), factor))
-    level = quiet * torch.where(inside, factor[:, None], 1.0)
-    return (squares / one - squares / level - (level / one).log()) / 2
+    """Log likelihood ratio of two levels to one for each sample, `(sensor, time)`, nats.
+
+    Args:
+        white: Whitened samples, `(sensor, time)`.
+        factor: Ratio of the variance inside to that outside, `(sensor,)`.
+        inside: Samples of the other level, `(time,)`.
+        reference: Level outside, where it is known beside the record.
+    """
+    return course_scores(white, torch.where(inside, factor[:, None], 1.0), reference)
 
 
 class Limits(NamedTuple):
@@ -154,13 +254,13 @@ class Limits(NamedTuple):
     high: float
 
 
-class Told(NamedTuple):
-    """What the data tell of one episode.
+class SegmentPosterior(NamedTuple):
+    """Posterior of one episode.
 
     Attributes:
         start, stop: Samples.
-        log_factor: Mean and sd of its logarithm, `(sensor,)`.
-        log_factor_sd: Likewise.
+        log_factor: Posterior mean of the logarithm of its factor, `(sensor,)`.
+        log_factor_sd: Posterior sd of it, `(sensor,)`.
     """
 
     start: Limits
@@ -169,7 +269,9 @@ class Told(NamedTuple):
     log_factor_sd: Tensor
 
 
-def told_of_first(white: Tensor, episodes: tuple[Episode, ...], reference: Reference | None = None) -> Told:
+def first_segment_posterior(
+    white: Tensor, episodes: tuple[Episode, ...], reference: Reference | None = None
+) -> SegmentPosterior:
     """Posterior of the first episode's ends and factors, the other episodes given.
 
     With `x` the share of a sensor's energy in `m` of `n` samples, the likelihood of the best factor is
@@ -178,176 +280,51 @@ def told_of_first(white: Tensor, episodes: tuple[Episode, ...], reference: Refer
 
     and normal in the factor's logarithm, of which the information is `I = m (n - m)/2n`: under a normal prior of sd
     `tau` it is `L^s / sqrt(1 + tau^2 I)`, `s = tau^2 I/(1 + tau^2 I)`. All starts and stops are as likely beforehand; a
-    grid of them is made finer where the posterior is.
+    grid of them is refined twice where the posterior is.
 
     Args:
-        white: Whitened recording of the sensors concerned, `(sensor, time)`.
-        episodes: In order of time.
-        reference: What else is known of their level between episodes.
+        white: Whitened recording of the sensors that change, `(sensor, time)`.
+        episodes: Stretches in order of time.
+        reference: Level between episodes, where it is known beside the record.
     """
+    prior_variance = 0.5**2  # of the factor's logarithm: factors from 0.4 to 2.7 at 95 %
     end = white.shape[-1]
-    others = Episodes(episodes[1:], torch.ones(0)).inside(end)
-    cut = _without_outliers(white, Episodes(episodes, torch.ones(0)).inside(end))
-    squares = torch.where(others, 0.0, cut)
-    energy, worth = _known(cut, reference)
-    total = torch.nn.functional.pad(squares.cumsum(-1), (1, 0))
+    others = in_stretches(episodes[1:], end)
+    cut = _without_outliers(white, in_stretches(episodes, end))
+    energy, n_known = _known(cut, reference)
+    total = pad(torch.where(others, 0.0, cut).cumsum(-1), (1, 0))
     whole = (total[:, -1] + energy)[:, None, None]
     n_samples = int((~others).sum())
-    n = n_samples + worth
+    n = n_samples + n_known
     last = episodes[1].start if len(episodes) > 1 else end
     ranges = [(0, last), (0, last)]
-    for _ in range(_REFINEMENTS):
-        start, stop = (_grid(low, high) for low, high in ranges)
+    for _ in range(3):
+        # 160 x 160 pairs at once.
+        start, stop = (torch.linspace(a, b, min(b - a + 1, 160), dtype=torch.float64).round().long() for a, b in ranges)
         m = (stop[None] - start[:, None]).to(torch.float64)  # (start, stop)
-        possible = (m >= _SHORTEST_BLOCK) & (m <= n_samples - _SHORTEST_BLOCK)
+        possible = (m >= _SHORTEST) & (m <= n_samples - _SHORTEST)
         m = torch.where(possible, m, n / 2)
         information = m * (n - m) / (2 * n)
-        shrunk = _PRIOR**2 * information / (1 + _PRIOR**2 * information)
+        shrunk = prior_variance * information / (1 + prior_variance * information)
         x = ((total[:, None, stop] - total[:, start, None]) / whole).clamp(1e-12, 1 - 1e-12)
         inside, outside = (x / m).log(), ((1 - x) / (n - m)).log()
         gain = -(math.log(n) * n + inside * m + outside * (n - m)) / 2
         log_weight = (shrunk * gain + torch.log1p(-shrunk) / 2).sum(0)
         weight = torch.softmax(log_weight.masked_fill(~possible, -math.inf).flatten(), 0).view_as(m)
         ends = ((start, weight.sum(1)), (stop, weight.sum(0)))
-        steps = [int(grid.diff().max()) if len(grid) > 1 else 1 for grid, _ in ends]
-        ranges = [
-            (max(_quantile(*pair, _ZOOM) - step, 0), min(_quantile(*pair, 1 - _ZOOM) + step, last))
-            for pair, step in zip(ends, steps, strict=True)
-        ]
-    from_, to = (Limits(*(float(_quantile(*pair, share)) for share in (0.5, _TAIL, 1 - _TAIL))) for pair in ends)
+        ranges = []
+        for grid, mass in ends:
+            step, (low, high) = int(grid.diff().max()) if len(grid) > 1 else 1, _quantiles(grid, mass, 1e-5, 1 - 1e-5)
+            ranges.append((max(low - step, 0), min(high + step, last)))
+    from_, to = (Limits(*map(float, _quantiles(*pair, 0.5, 0.025, 0.975))) for pair in ends)
     mean = shrunk * (inside - outside)
     log_factor = (weight * mean).sum((1, 2))
     variance = (weight * (mean.square() + shrunk / information)).sum((1, 2)) - log_factor.square()
-    return Told(from_, to, log_factor, variance.clamp(min=0).sqrt())
+    return SegmentPosterior(from_, to, log_factor, variance.clamp(min=0).sqrt())
 
 
-def _grid(low: int, high: int) -> Tensor:
-    return torch.linspace(low, high, min(high - low + 1, _GRID), dtype=torch.float64).round().long()
-
-
-def _quantile(places: Tensor, weight: Tensor, share: float) -> int:
-    """Of places that are `weight` likely."""
+def _quantiles(samples: Tensor, weight: Tensor, *shares: float) -> list[int]:
+    """Quantiles of samples that have the posterior probabilities `weight`."""
     below = weight.cumsum(0) - weight / 2
-    return int(places[min(int(torch.searchsorted(below, share)), len(places) - 1)])
-
-
-def _from_start(
-    white: Tensor, p_values: Tensor, start: float, stretch: tuple[int, int] | None, reference: Reference | None
-) -> tuple[Episodes | None, float]:
-    """The likeliest episodes from a factor on, or where it is 0 from a stretch or that of the CUSUM's range."""
-    n = white.shape[-1]
-    squares = white.square().clamp(max=_CUT)
-    own = p_values[:-1] <= max(float(p_values.min()), 1e-4)
-    concerned = own if bool(own.any()) else torch.ones_like(own)
-    inside = torch.zeros(n, dtype=torch.bool)
-    factor = torch.where(concerned, start, 1.0).to(torch.float64)
-    if start == 0:
-        if stretch is None:
-            inside = _widest(_blocks(squares[concerned]).mean(0), n)
-        else:
-            inside[slice(*stretch)] = True
-        factor = _factors(squares, inside, concerned, reference)
-    for _ in range(_ROUNDS):
-        log_ratios = _log_ratios(squares, factor, inside, reference)
-        found = _likeliest(log_ratios)
-        if not found:
-            return None, 0.0
-        inside = Episodes(found, factor).inside(n)
-        if bool(inside.all()):
-            return None, 0.0
-        factor = _factors(squares, inside, torch.ones_like(concerned), reference)
-        if bool((factor == 1).all()):
-            return None, 0.0
-    episodes = Episodes(found, factor)
-    if reference is None and 2 * int(inside.sum()) > n:  # what lasts longer is the rule
-        episodes = episodes.other_way_round(n)
-    score = float(two_level_scores(white, episodes.factor, episodes.inside(n), reference).sum())
-    return episodes, score - 2 * len(episodes.episodes) * math.log(n)
-
-
-def _factors(squares: Tensor, inside: Tensor, concerned: Tensor, reference: Reference | None) -> Tensor:
-    """Of the variance inside to that outside, 1 where it is not certain."""
-    n_inside = int(inside.sum())
-    if n_inside == 0 or n_inside == len(inside):
-        return torch.ones(len(squares), dtype=torch.float64)
-    log_factor, sd = log_factors(squares, inside, reference)
-    return torch.where(concerned & (log_factor.abs() > _CERTAIN * sd), log_factor.exp(), 1.0)
-
-
-def _log_ratios(squares: Tensor, factor: Tensor, inside: Tensor, reference: Reference | None) -> Tensor:
-    """`(e^2 (1/v - 1/(r v)) - log r)/2` summed over the sensors, `(time,)`."""
-    weight = (1 - 1 / factor) / _quiet(squares, factor, inside, reference)
-    return (weight @ squares - factor.log().sum()) / 2
-
-
-def _blocks(values: Tensor) -> Tensor:
-    size = _block_size(values.shape[-1])
-    n = values.shape[-1] // size
-    return values[..., : n * size].unflatten(-1, (n, size)).mean(-1)
-
-
-def _block_size(n: int) -> int:
-    return max(_SHORTEST_BLOCK, -(-n // _FINEST_BLOCKS))
-
-
-def _widest(blocks: Tensor, n: int) -> Tensor:
-    """Samples between the ends of the CUSUM's range."""
-    path = (blocks - blocks.mean()).cumsum(0)
-    size = _block_size(n)
-    low, high = sorted(((int(path.argmin()) + 1) * size, (int(path.argmax()) + 1) * size))
-    inside = torch.zeros(n, dtype=torch.bool)
-    inside[low:high] = True
-    return inside
-
-
-def _likeliest(log_ratios: Tensor) -> tuple[Episode, ...]:
-    """Episodes of the largest sum: one of any gain, or several that each pay for two changes; edges to the sample."""
-    n, size = len(log_ratios), _block_size(len(log_ratios))
-    sums = (_blocks(log_ratios[None])[0] * size).tolist()
-    coarse = _several(sums, math.log(n)) or _single(sums)
-    total = torch.nn.functional.pad(log_ratios.cumsum(0), (1, 0))
-    found: list[Episode] = []
-    for start, stop in coarse:
-        lower = max(start * size - 2 * size, found[-1].stop if found else 0)
-        if lower >= n:
-            break
-        a = lower + int(total[lower : min(start * size + 2 * size + 1, n)].argmin())
-        upper = max(stop * size - 2 * size, a + 1)
-        last = n if stop == len(sums) else min(stop * size + 2 * size, n)
-        b = upper + int(total[upper : last + 1].argmax())
-        if b > a:
-            found.append(Episode(a, b))
-    return tuple(found)
-
-
-def _single(sums: list[float]) -> list[tuple[int, int]]:
-    """The stretch of the largest sum."""
-    best, where, running, start = 0.0, None, 0.0, 0
-    for i, value in enumerate(sums):
-        if running <= 0:
-            running, start = 0.0, i
-        running += value
-        if running > best:
-            best, where = running, (start, i + 1)
-    return [] if where is None else [where]
-
-
-def _several(sums: list[float], cost: float) -> list[tuple[int, int]]:
-    """Stretches of the largest sum less `cost` for each beginning and end (Viterbi's algorithm with two states)."""
-    out, into = 0.0, -cost
-    came_from_in, came_from_out = [], []
-    for value in sums:
-        leave, enter = into - cost > out, out - cost > into
-        came_from_in.append(leave)
-        came_from_out.append(enter)
-        out, into = (into - cost if leave else out), (out - cost if enter else into) + value
-    state, stretches, stop = into > out, [], len(sums)
-    for i in range(len(sums) - 1, -1, -1):
-        if state and came_from_out[i]:
-            stretches.append((i, stop))
-            state = False
-        elif not state and came_from_in[i]:
-            state, stop = True, i
-    if state:
-        stretches.append((0, stop))
-    return stretches[::-1]
+    at = torch.searchsorted(below, torch.tensor(shares, dtype=below.dtype)).clamp(max=len(samples) - 1)
+    return [int(s) for s in samples[at]]

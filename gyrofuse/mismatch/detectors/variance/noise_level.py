@@ -1,4 +1,14 @@
-"""The level of the noise: whether it changes, by itself or compared with that of the simulation."""
+"""The level of the noise: whether it changes, within the recording or for a while from that of the simulation.
+
+Three statistics of squares of whitened samples, cut at nine:
+
+- Likelihood ratio of a stretch of another level than the rest, averaged over stretches and factors (`level_scan`).
+- The same with the simulation's level for that of the rest.
+- Spectrum of the squares (`modulation`): periods, slow changes and bursts.
+
+Where the simulation is Gaussian and shows such a change itself, the recording's has to surpass it; elsewhere likelihood
+ratios are tempered by how much its level varies (`level_spread`).
+"""
 
 from __future__ import annotations
 
@@ -8,8 +18,8 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool1d
 
+from gyrofuse.mismatch.decisions import CERTAIN, CHANCE
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.variance.level_spread import LevelSpread, level_spread
 from gyrofuse.mismatch.detectors.variance.modulation import Modulation, strongest_modulation
@@ -18,59 +28,26 @@ from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.prediction_errors import left_out
 from gyrofuse.mismatch.signals.records import Records
-from gyrofuse.mismatch.stats.brownian_range import kuiper_p_value, studentised_range_p_value
-from gyrofuse.mismatch.stats.clustering import LAGS, clustering_p_value
 from gyrofuse.mismatch.stats.level_scan import LevelScan, Reference, other_level, scanned_levels
-from gyrofuse.mismatch.stats.local_level import local_level
 from gyrofuse.mismatch.stats.long_run_variance import chi_square_nodes
 from gyrofuse.mismatch.stats.multiplicity import p_value_beyond_reference, p_value_from_e_value, sidak
-from gyrofuse.mismatch.stats.segments import episodes_of, two_level_scores
-
-_NOTHING = 0.05  # p value of what need not be compared
-LEVEL_CUT = SQUARE_CUT  # squares: as where it is asked whether levels vary by themselves
-_BLOCK = 128
-_CHANGES = 1.62  # range of a stationary CUSUM that one in ten exceeds
-_CORRELATED = 4.0  # standard deviations of an autocorrelation that chance does not give
-_ANOTHER = 0.01  # p value of a level that the simulation does not have
-_PLACES = 64  # around the record, at which a course of the level is tried: by chance one in so many fits best
-_UNSTEADY = 1e-4  # p value of a simulation's level that changes
+from gyrofuse.mismatch.stats.segments import stretch_of
 
 
 class Levels(NamedTuple):
-    """What the simulation's level tells of the recording's.
+    """The recording's level beside the simulation's.
 
     Attributes:
-        reference: The simulation's level.
-        scan: For a stretch of the recording that has another level than the rest and the simulation.
-        throughout: Log of the mean likelihood ratio of another level throughout, nats.
-        p_value: Of the scan, where a stretch is likelier than another level throughout; else 1.
+        reference: Level of the simulation.
+        scan: Scan for a stretch of the recording with another level than the rest and the simulation.
+        throughout: Logarithm of the mean likelihood ratio of another level throughout, nats.
+        p_value: p value of the scan, where a stretch is likelier than another level throughout; else 1.
     """
 
     reference: Reference
     scan: LevelScan
     throughout: float
     p_value: float
-
-
-def _squares(white: Tensor) -> Tensor:
-    """`min(e^2, 9)` of whitened records `(..., sensor, time)`, and last of all their sum over the sensors."""
-    squares = white.square().clamp(max=LEVEL_CUT)
-    return torch.cat([squares, _standardised(squares).sum(-2, keepdim=True)], -2)
-
-
-def _ranges(squares: Tensor, excess: Tensor | float = 1.0) -> Tensor:
-    """Range of the CUSUM of `(..., time)` in blocks over its sd: Kuiper's, of a Brownian bridge.
-
-    Args:
-        squares: Of whitened samples.
-        excess: Long-run variance of such squares over that of independent ones, `(...,)`.
-    """
-    blocks = squares[..., : squares.shape[-1] // _BLOCK * _BLOCK].unflatten(-1, (-1, _BLOCK)).mean(-1)
-    # From first differences, which bursts raise; chance must not lower it below that of independent samples.
-    least = squares.std(-1) * (torch.as_tensor(excess, dtype=squares.dtype) / _BLOCK).sqrt()
-    sd = (blocks.diff(dim=-1).square().mean(-1) / 2).sqrt().maximum(least)
-    path = (blocks - blocks.mean(-1, keepdim=True)).cumsum(-1)
-    return (path.amax(-1) - path.amin(-1)) / (sd * math.sqrt(blocks.shape[-1]))
 
 
 def _white(side: Records) -> Tensor:
@@ -85,81 +62,40 @@ def _white(side: Records) -> Tensor:
 @derived
 def _scanned(side: Records) -> LevelScan:
     """Scan of all the records, in which the level would change at the same times."""
-    return scanned_levels(_white(side).flatten(0, 1).square().clamp(max=LEVEL_CUT))
+    return scanned_levels(_white(side).flatten(0, 1).square().clamp(max=SQUARE_CUT))
 
 
 @derived
-def level_profile(comparison: Comparison) -> Tensor | None:
-    """Variance of the noise that the simulation gives each sample, `(sensor, time)`; None where it has no such course.
+def whitened_recording(comparison: Comparison) -> Tensor:
+    """The whitened recording, `(sensor, time)`."""
+    return _white(comparison.observed)[0]
 
-    A level that changes at the same times in both, by one course, fits the recording better where it lies than moved
-    around in it; two that vary by themselves do not.
-    """
-    if (
-        comparison.reference.signal.shape[-1] != comparison.n_samples
-        or _scanned(comparison.reference).p_value > _UNSTEADY
-    ):
-        return None
-    white = _white(comparison.reference)
-    found = episodes_of(white.flatten(0, 1), torch.zeros(white[..., 0].numel() + 1, dtype=torch.float64))
-    if found is None:
-        return None
-    factor = found.factor.view(white.shape[:-1]).log().mean(0).exp()
-    inside, observed = found.inside(comparison.n_samples), _white(comparison.observed)[0].clamp(-3.0, 3.0)
-    moved = (inside.roll(place * comparison.n_samples // _PLACES) for place in range(_PLACES))
-    fits = torch.stack([two_level_scores(observed, factor, there).sum() for there in moved])
-    return torch.where(inside, factor[:, None], 1.0) if int(fits.argmax()) == 0 else None
+
+def clipped_squares(comparison: Comparison) -> Tensor:
+    """Squares of the whitened recording, cut at nine, `(sensor, time)`."""
+    return whitened_recording(comparison).square().clamp(max=SQUARE_CUT)
 
 
 @derived
 def own_spread(comparison: Comparison) -> LevelSpread:
-    """How much the simulation's level varies, beside a course that the recording has as well."""
-    return level_spread(_simulated_white(comparison), gaussian_sensors(comparison.reference))
+    """How much the simulation's level varies."""
+    return level_spread(_white(comparison.reference), gaussian_sensors(comparison.reference))
 
 
-def _simulated_white(comparison: Comparison) -> Tensor:
-    """Whitened simulation `(record, sensor, time)` over the level that both sides have."""
-    profile = level_profile(comparison)
-    white = _white(comparison.reference)
-    return white if profile is None else white / profile.sqrt()
+def correlations_of_squares(white: Tensor) -> Tensor:
+    """Autocorrelations of squares that Gaussian samples `(sensor, time)` have which are still correlated.
 
-
-@derived
-def levelled(comparison: Comparison) -> Tensor:
-    """Whitened recording `(sensor, time)` over the noise level that the simulation has there."""
-    profile = level_profile(comparison)
-    white = _white(comparison.observed)[0]
-    return white if profile is None else white / profile.sqrt()
-
-
-@derived
-def variance_p_values(comparison: Comparison) -> Tensor:
-    """p values that the noise level changes, in each sensor and in all together, `(sensor + 1,)`.
-
-    Once for episodes, from the range of the CUSUM, once for bursts, from the autocorrelation of the squares.
+    Behind a filter too steep to be whitened; `rho^2` where `rho` is beyond 4 sd of chance, at lags from 1 to 15,
+    `(lag, sensor)`.
     """
-    white, other = levelled(comparison), _simulated_white(comparison)
-    squares, reference = _squares(white), _squares(other)
-    spread = own_spread(comparison)
-    if bool(gaussian_sensors(comparison.reference).all()):
-        wander = (_ranges(reference).amax(0) / _CHANGES).clamp(min=1.0)
-        heavy = (_clustering(reference[0], other[0]) - 2.5).clamp(min=0)
-        if level_profile(comparison) is not None:
-            wander, heavy = torch.ones_like(wander), torch.zeros_like(heavy)
-        episodes = torch.tensor([kuiper_p_value(float(r)) for r in _ranges(squares) / wander], dtype=torch.float64)
-        bursts = torch.special.ndtr(heavy - _clustering(squares, white))
-    else:
-        reach = _ranges(squares, spread.excess).tolist()
-        episodes = torch.tensor([studentised_range_p_value(r, spread.dof) for r in reach], dtype=torch.float64)
-        own, reference = (_squares(v / local_level(v).sqrt()) for v in (white, other))
-        pairs = zip(own, reference.movedim(1, 0), strict=True)
-        bursts = torch.tensor([clustering_p_value(x[None], y) for x, y in pairs], dtype=torch.float64)
-    both = torch.minimum(episodes, bursts)
-    return 1 - (1 - both).square()
+    x = (white - white.mean(-1, keepdim=True)) / white.std(-1, keepdim=True)
+    n = x.shape[-1]
+    rho = torch.stack([torch.linalg.vecdot(x[..., lag:], x[..., :-lag]) for lag in range(1, 16)]) / n
+    return torch.where(rho.abs() < 4.0 / math.sqrt(n), 0.0, rho.square())
 
 
 def _averaged(comparison: Comparison, log_ratio: Callable[[Tensor], float]) -> float:
-    """p value of a log mean likelihood ratio that depends on the weight of a sample, over what may be its value."""
+    """p value of a mean likelihood ratio that depends on the weight of a sample, averaged over the weight's law."""
     spread = own_spread(comparison)
     if math.isinf(spread.dof):
         return p_value_from_e_value(log_ratio(spread.weight))
@@ -172,12 +108,12 @@ def _averaged(comparison: Comparison, log_ratio: Callable[[Tensor], float]) -> f
 
 @derived
 def compared_levels(comparison: Comparison) -> Levels | None:
-    """The level of the recording beside that of the simulation; None where that has none that is steady."""
+    """The level of the recording beside that of the simulation; `None` where that has none that is steady."""
     reference, weight = _reference(comparison), own_spread(comparison).weight
     own = _scanned(comparison.reference).p_value
-    if reference is None or own < _UNSTEADY:
+    if reference is None or own < CERTAIN:
         return None
-    squares = levelled(comparison).square().clamp(max=LEVEL_CUT)
+    squares = clipped_squares(comparison)
     scan = scanned_levels(squares, reference, weight)
     throughout = other_level(comparison.n_samples, reference, weight)
     if scan.log_ratio <= throughout:
@@ -187,27 +123,27 @@ def compared_levels(comparison: Comparison) -> Levels | None:
 
 
 def level_between(comparison: Comparison, inside: Tensor) -> Reference | None:
-    """The simulation's level, where the recording has it outside of episodes `(time,)`; None where it has another."""
+    """The simulation's level, where the recording has it outside of episodes `(time,)`; `None` where it has another."""
     compared = compared_levels(comparison)
     if compared is None or bool(inside.all()):
         return None
-    squares = levelled(comparison).square().clamp(max=LEVEL_CUT)
+    squares = clipped_squares(comparison)
     outside = squares[:, ~inside].mean(-1) / squares.mean(-1)
-    z = (outside / compared.reference.level).log() / math.sqrt(2 / int((~inside).sum()) + 2 / compared.reference.worth)
+    sd = math.sqrt(2 / int((~inside).sum()) + 2 / compared.reference.n_samples)
+    z = (outside / compared.reference.level).log() / sd
     chi2 = (own_spread(comparison).weight * z.square()).sum()
     agrees = torch.special.gammaincc(torch.tensor(len(z) / 2, dtype=z.dtype), chi2 / 2)
-    return compared.reference if float(agrees) > _ANOTHER else None
+    return compared.reference if float(agrees) > 0.01 else None  # one true level in a hundred is not recognised
 
 
 def _reference(comparison: Comparison) -> Reference | None:
     """The simulation's level over that of the recording: of their spectra, on average over all frequencies."""
     observed, reference = comparison.observed, comparison.reference
     both = (observed.dof > 0) & (reference.dof > 0)
-    worth = observed.dof * both
     if not bool(both.any()):
         return None
-    ratio = reference.log_power - observed.log_power
-    level = (torch.where(both, ratio, 0.0) @ worth / worth.sum()).exp()
+    weight, ratio = observed.dof * both, reference.log_power - observed.log_power
+    level = (torch.where(both, ratio, 0.0) @ weight / weight.sum()).exp()
     known = reference.n_records * reference.signal.shape[-1]
     if reference.uncertainty is not None:  # a model's level is known as well as from the record it was fitted to
         known = min(known, reference.uncertainty.n_samples)
@@ -215,100 +151,52 @@ def _reference(comparison: Comparison) -> Reference | None:
 
 
 def variance_p_value(comparison: Comparison) -> float:
-    """p value that the noise level changes anywhere: in one sensor or all, or by little in several.
-
-    The latter once within the recording, and once from the simulation's level for a while.
-    """
-    each = variance_p_values(comparison)
-    p_value = sidak(float(each.min()), len(each))
-    squares = levelled(comparison).square().clamp(max=LEVEL_CUT)
-    several = _averaged(comparison, lambda w: scanned_levels(squares, None, w).log_ratio)
-    if math.isinf(own_spread(comparison).dof) and level_profile(comparison) is None:
-        several = p_value_beyond_reference(several, _scanned(comparison.reference).p_value)
+    """p value that the noise level changes for a while: within the recording, and from the simulation's."""
+    squares, gaussian = clipped_squares(comparison), math.isinf(own_spread(comparison).dof)
+    within = _averaged(comparison, lambda w: scanned_levels(squares, None, w).log_ratio)
+    if gaussian:
+        within = p_value_beyond_reference(within, _scanned(comparison.reference).p_value)
     compared = compared_levels(comparison)
-    return sidak(min(p_value, several, 1.0 if compared is None else compared.p_value), 3)
+    return sidak(min(within, 1.0 if compared is None else compared.p_value), 2)
 
 
 @derived
 def modulation(comparison: Comparison) -> Modulation:
-    """The most conspicuous modulation of the noise level that the simulation does not have."""
-    found = modulation_of(levelled(comparison))
-    if found.p_value > _NOTHING:
+    """The most conspicuous modulation of the noise level, with its p value beyond that of the simulation."""
+    found = modulation_of(whitened_recording(comparison))
+    if found.p_value > CHANCE:
         return found
-    records = _simulated_white(comparison)
-    other = min(modulation_of(record).p_value for record in records)
+    other = min(modulation_of(record).p_value for record in _white(comparison.reference))
     return found._replace(p_value=p_value_beyond_reference(found.p_value, other))
 
 
 def modulation_of(white: Tensor) -> Modulation:
-    """Of whitened samples `(sensor, time)`."""
-    return strongest_modulation(white.square().clamp(max=LEVEL_CUT), correlations_of_squares(white))
-
-
-def correlations_of_squares(white: Tensor) -> Tensor:
-    """Autocorrelations of squares that Gaussian samples `(sensor, time)` have which are still correlated.
-
-    Behind a filter too steep to be whitened; `rho^2` where `rho` is more than chance gives, `(lag, sensor)`.
-    """
-    rho = _autocorrelations(white)
-    return torch.where(rho.abs() < _CORRELATED / math.sqrt(white.shape[-1]), 0.0, rho.square())
-
-
-def _standardised(values: Tensor) -> Tensor:
-    return (values - values.mean(-1, keepdim=True)) / values.std(-1, keepdim=True)
-
-
-def _clustering(squares: Tensor, white: Tensor) -> Tensor:
-    """Standard normal sum of the autocorrelations of squares at short lags, `(sensor + 1,)`.
-
-    Beyond those that Gaussian samples have which are still correlated.
-
-    Args:
-        squares: `(sensor + 1, time)`, of the sum last.
-        white: `(sensor, time)`.
-    """
-    n, of_squares = squares.shape[-1], _autocorrelations(squares)
-    of_samples = correlations_of_squares(white).sum(0)
-    # The sum of standardised squares has the mean of what its sensors have.
-    expected = torch.cat([of_samples, of_samples.mean(-1, keepdim=True)])
-    return math.sqrt(n / LAGS) * (of_squares.sum(0) - expected)
-
-
-def _autocorrelations(values: Tensor) -> Tensor:
-    """Of `(..., time)` at lags from one, `(lag, ...)`."""
-    x = _standardised(values)
-    lags = [torch.linalg.vecdot(x[..., lag:], x[..., :-lag]) for lag in range(1, LAGS + 1)]
-    return torch.stack(lags) / x.shape[-1]
+    """The most conspicuous modulation of whitened samples `(sensor, time)`."""
+    return strongest_modulation(white.square().clamp(max=SQUARE_CUT), correlations_of_squares(white))
 
 
 def variance_test(comparison: Comparison) -> TestResult:
-    """Changes of the noise level within the recording: once, in bursts, slowly or with a period."""
-    changed, wave = variance_p_value(comparison), modulation(comparison)
+    """Changes of the noise level within the recording: for a while, in bursts, slowly or with a period."""
+    changed, wave, info = variance_p_value(comparison), modulation(comparison), comparison.info
     p_value = sidak(min(changed, wave.p_value), 2)
     if wave.p_value < changed:
-        high = wave.high * comparison.info.rate
+        high = wave.high * info.rate
         how = f"with a frequency of {high:.5g} Hz" if wave.period else f"more slowly than {high:.3g} Hz"
         return TestResult(
             "variance",
             p_value,
-            f"a noise level that goes up and down {how} in {comparison.info.named(wave.sensors, 'all sensors')}",
+            f"a noise level that goes up and down {how} in {info.named(wave.sensors, 'all sensors')}",
             sensors=wave.sensors,
             levels=(1,),
             frequency_hz=high if wave.period else None,
         )
-    p_values = variance_p_values(comparison)
-    worst = int(p_values.argmin())
-    every = worst == comparison.n_sensors
-    squares = levelled(comparison).square().clamp(max=LEVEL_CUT)
-    blocks = avg_pool1d(squares.mean(0, keepdim=True) if every else squares[worst : worst + 1], _BLOCK)[0]
-    path = (blocks - blocks.mean()).cumsum(-1)
-    onset = min(int(path.argmin()), int(path.argmax())) + 1
-    where = "all sensors together" if every else f"sensor {comparison.info.sensors[worst]}"
+    stretch = stretch_of(whitened_recording(comparison))
+    sensors = tuple((stretch.factor != 1).nonzero()[:, 0].tolist())
     return TestResult(
         "variance",
         p_value,
-        f"a noise level that changes in {where}",
-        sensors=tuple(range(comparison.n_sensors)) if every else (worst,),
+        f"a noise level that changes in {info.named(sensors, 'all sensors together')}",
+        sensors=sensors,
         levels=(1,),
-        time_s=onset * _BLOCK / comparison.info.rate,
+        time_s=stretch.episodes[0].start / info.rate,
     )

@@ -1,109 +1,37 @@
-"""What is sudden: outliers and jumps, against those that the simulation has itself."""
+"""Outliers of single samples, against those that the simulation has itself.
+
+Statistic: numbers of standardised prediction errors beyond levels from 3.5 sd on, in each sensor, and of their norms in
+all sensors together. Null law: Poisson's with normal probabilities where the simulation is Gaussian, or the binomial
+one of two counts at levels at which it has more; elsewhere the law that the simulation's own tail predicts
+(`stats.tails`). Many weak outliers are searched for by `weak_outliers`.
+"""
 
 from __future__ import annotations
 
+import numpy as np
 import torch
-from scipy import stats
 from torch import Tensor
 
+from gyrofuse.mismatch.decisions import CHANCE
 from gyrofuse.mismatch.detectors.result import TestResult
-from gyrofuse.mismatch.detectors.variance.haar_kurtosis import kurtosis_p_values
-from gyrofuse.mismatch.detectors.variance.normality import TAILS, gaussian_sensors
+from gyrofuse.mismatch.detectors.variance.normality import counts_of_errors, gaussian_sensors, tail_counts
 from gyrofuse.mismatch.detectors.variance.weak_outliers import WeakOutliers, weak_outliers
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
-from gyrofuse.mismatch.signals.prediction_errors import left_out, pooled_squares, smooth_sd
+from gyrofuse.mismatch.signals.prediction_errors import left_out
 from gyrofuse.mismatch.signals.records import Records
-from gyrofuse.mismatch.stats.local_level import local_level
+from gyrofuse.mismatch.stats.decorrelation import norms
+from gyrofuse.mismatch.stats.kurtosis import clipped_sd
+from gyrofuse.mismatch.stats.level_scan import local_level
 from gyrofuse.mismatch.stats.multiplicity import p_value_beyond_reference, sidak
-from gyrofuse.mismatch.stats.predictive_tail import dispersion, equal_rates_p_value, tail_p_values
-
-_HEAVY = 0.05  # p value of tails that a Gaussian model may have with what was built into it
-
-
-def _tail_p(observed: Tensor, reference: Tensor, probability: float) -> Tensor:
-    """p value of so many exceedances, `(..., time)` each, of a level that noise exceeds with `probability`."""
-    own, other = observed.sum(-1).to(torch.float64).numpy(), reference.sum(-1).to(torch.float64)
-    n, m = observed.shape[-1], reference.shape[-1]
-    gaussian = stats.poisson.sf(own - 1, n * probability)
-    heavy = stats.poisson.sf(other.numpy() - 1, m * probability) < _HEAVY
-    two_sample = stats.binom.sf(own - 1, own + other.numpy(), n / (n + m))
-    return torch.where(torch.as_tensor(heavy), torch.as_tensor(two_sample), torch.as_tensor(gaussian))
-
-
-def spike_p_values(comparison: Comparison) -> Tensor:
-    """p values of the tails of each sensor, and of all together, `(sensor + 1,)`, for all the levels looked at.
-
-    Against a Gaussian's tail where the simulation has it, else against what its own tail predicts; of all together then
-    against as many in the simulation.
-    """
-    gaussian = gaussian_sensors(comparison.reference)
-    every = bool(gaussian.all())
-    observed, reference = left_out(comparison.observed).z, left_out(comparison.reference).z
-    p_values = _against_gaussian(observed, reference)
-    if every:
-        return p_values
-    observed, reference = (_levelled(side) for side in (comparison.observed, comparison.reference))
-    predicted = tail_p_values(observed[0].numpy(), reference.movedim(1, 0).numpy())
-    together = _as_many(pooled_squares(observed)[0], pooled_squares(reference), comparison.n_sensors)
-    return torch.cat([torch.where(gaussian, p_values[:-1], torch.from_numpy(predicted)), together[None]])
-
-
-def _levelled(side: Records) -> Tensor:
-    """Errors `(record, sensor, time)` over the local level of the noise, in a robust sd of theirs."""
-    expected = left_out(side)
-    z = expected.z / local_level(expected.white).sqrt()
-    return z / smooth_sd(z)[..., None]
-
-
-def _against_gaussian(observed: Tensor, reference: Tensor) -> Tensor:
-    """Of errors `(record, sensor, time)`."""
-    own_q, other_q = pooled_squares(observed)[0], pooled_squares(reference).flatten()
-    z, other = observed[0].abs(), reference.abs().movedim(1, 0).flatten(1)
-    best = torch.ones(len(z) + 1, dtype=torch.float64)
-    for level in TAILS:
-        p = 2 * float(stats.norm.sf(level))
-        together = float(stats.chi2.isf(p, len(z)))
-        single = _tail_p(z > level, other > level, p)
-        pooled = _tail_p(own_q > together, other_q > together, p)
-        best = torch.minimum(best, torch.cat([single, pooled[None]]))
-    return -torch.expm1(len(TAILS) * torch.log1p(-best.clamp(max=1 - 1e-16)))
-
-
-def _as_many(observed: Tensor, reference: Tensor, n_sensors: int) -> Tensor:
-    """p value of so many squares `(time,)` beyond the levels, as many in the simulation `(record, time)`."""
-    levels = torch.tensor([stats.chi2.isf(2 * stats.norm.sf(level), n_sensors) for level in TAILS])
-    own, other = ((q > levels[:, None]).sum(-1).numpy() for q in (observed, reference.flatten()))
-    clumps = dispersion((reference > levels[0]).numpy())
-    p = equal_rates_p_value(own / clumps, other / clumps, observed.numel() / reference.numel())
-    return torch.tensor(sidak(float(p.min()), len(TAILS)), dtype=torch.float64)
-
-
-def spike_p_value(comparison: Comparison) -> float:
-    """p value of outliers anywhere, by the tails or by many weak ones."""
-    tails = spike_p_values(comparison)
-    return sidak(min(sidak(float(tails.min()), len(tails)), _many_p_value(comparison)), 2)
-
-
-def _many_p_value(comparison: Comparison) -> float:
-    """Of many weak outliers in the sensors whose tails the simulation knows to be Gaussian."""
-    own = likely_outliers(comparison)
-    if own is None:
-        return 1.0
-    reference = left_out(comparison.reference).z[0][gaussian_sensors(comparison.reference)]
-    return p_value_beyond_reference(own.p_value, weak_outliers(reference).p_value)
-
-
-@derived
-def likely_outliers(comparison: Comparison) -> WeakOutliers | None:
-    """Evidence of weak outliers, in the sensors whose tails are Gaussian in the simulation; None if none are."""
-    gaussian = gaussian_sensors(comparison.reference)
-    if not bool(gaussian.any()):
-        return None
-    found = weak_outliers(left_out(comparison.observed).z[0][gaussian])
-    sensors = torch.zeros(comparison.n_sensors, dtype=found.sensors.dtype)
-    sensors[gaussian] = found.sensors
-    return found._replace(sensors=sensors)
+from gyrofuse.mismatch.stats.tails import (
+    chi_levels,
+    dispersion,
+    equal_rates_p_value,
+    gaussian_tail_p_values,
+    of_all_levels,
+    tail_p_values,
+)
 
 
 def outliers_test(comparison: Comparison) -> TestResult:
@@ -122,14 +50,58 @@ def outliers_test(comparison: Comparison) -> TestResult:
     return TestResult("spike", p_value, words, sensors=sensors, levels=(1,), time_s=at / comparison.info.rate)
 
 
-def jump_test(comparison: Comparison) -> TestResult:
-    """Jumps between levels, from the kurtosis of Haar coefficients at every scale."""
-    tails = kurtosis_p_values(comparison)
-    level, sensor = divmod(int(tails.argmin()), tails.shape[1])
-    return TestResult(
-        "jump",
-        sidak(float(tails.min()), tails.numel()),
-        f"wavelet coefficients at level {level + 1} that are not normal in sensor {comparison.info.sensors[sensor]}",
-        sensors=(sensor,),
-        levels=(level + 1,),
-    )
+def spike_p_value(comparison: Comparison) -> float:
+    """p value of outliers anywhere, by the tails or by many weak ones."""
+    tails = spike_p_values(comparison)
+    return sidak(min(sidak(float(tails.min()), len(tails)), _weak_p_value(comparison)), 2)
+
+
+def spike_p_values(comparison: Comparison) -> Tensor:
+    """p values of the tails of each sensor, and of all together, `(sensor + 1,)`, over all levels."""
+    gaussian = gaussian_sensors(comparison.reference)
+    p_values = _against_gaussian(comparison)
+    if bool(gaussian.all()):
+        return p_values
+    observed, reference = map(_levelled, (comparison.observed, comparison.reference))
+    predicted = tail_p_values(observed[0].numpy(), reference.movedim(1, 0).numpy())
+    own, other = counts_of_errors(observed)[-1], counts_of_errors(reference)[-1]
+    clumps = dispersion(norms(reference) > chi_levels(comparison.n_sensors)[0])
+    length = observed[:, 0].numel() / reference[:, 0].numel()
+    together = of_all_levels(equal_rates_p_value(own / clumps, other / clumps, length))
+    return torch.cat([torch.where(gaussian, p_values[:-1], predicted), together[None]])
+
+
+def _against_gaussian(comparison: Comparison) -> Tensor:
+    """p values of the tails beside those of a Gaussian simulation, `(sensor + 1,)`."""
+    own, other = tail_counts(comparison.observed), tail_counts(comparison.reference)
+    n, m = (left_out(side).z[:, 0].numel() for side in (comparison.observed, comparison.reference))
+    heavy = gaussian_tail_p_values(other, m) < CHANCE  # of effects that were built into a model
+    return of_all_levels(np.where(heavy, equal_rates_p_value(own, other, n / m), gaussian_tail_p_values(own, n)))
+
+
+def _levelled(side: Records) -> Tensor:
+    """Errors `(record, sensor, time)` over the local level of the noise, in a robust sd of theirs."""
+    expected = left_out(side)
+    z = expected.z / local_level(expected.white).sqrt()
+    return z / clipped_sd(z)[..., None]
+
+
+def _weak_p_value(comparison: Comparison) -> float:
+    """p value of many weak outliers in the sensors whose tails are Gaussian in the simulation."""
+    own = likely_outliers(comparison)
+    if own is None or own.p_value > CHANCE:
+        return 1.0 if own is None else own.p_value
+    reference = left_out(comparison.reference).z[0][gaussian_sensors(comparison.reference)]
+    return p_value_beyond_reference(own.p_value, weak_outliers(reference).p_value)
+
+
+@derived
+def likely_outliers(comparison: Comparison) -> WeakOutliers | None:
+    """Evidence of weak outliers in the sensors whose tails are Gaussian in the simulation; `None` if none are."""
+    gaussian = gaussian_sensors(comparison.reference)
+    if not bool(gaussian.any()):
+        return None
+    found = weak_outliers(left_out(comparison.observed).z[0][gaussian])
+    sensors = torch.zeros(comparison.n_sensors, dtype=found.sensors.dtype)
+    sensors[gaussian] = found.sensors
+    return found._replace(sensors=sensors)

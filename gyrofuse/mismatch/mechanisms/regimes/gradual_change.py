@@ -6,15 +6,16 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.detectors.variance.noise_level import (
     compared_levels,
-    levelled,
     modulation_of,
     own_spread,
     variance_p_value,
+    whitened_recording,
 )
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
@@ -34,15 +35,13 @@ from gyrofuse.mismatch.signals.variance_course import (
     whitened_factor,
 )
 from gyrofuse.mismatch.stats.limits import Z
-from gyrofuse.mismatch.stats.segments import stretch_of
+from gyrofuse.mismatch.stats.segments import course_scores, stretch_of
 from gyrofuse.mismatch.stats.variance_courses import (
     Course,
     course_at_once,
     course_of,
-    course_scores,
+    course_score,
     fitted_levels,
-    interpolated,
-    worth_of_course,
 )
 
 if TYPE_CHECKING:
@@ -89,7 +88,7 @@ class GradualChange(Mechanism):
         p_value = variance_p_value(comparison)
         if p_value > level:
             return None
-        white, rate = levelled(comparison), comparison.info.rate
+        white, rate = whitened_recording(comparison), comparison.info.rate
         episodes = likeliest_episodes(comparison)
         start = stretch_of(white) if episodes is None else episodes
         course = course_of(white, start.factor.log())
@@ -97,11 +96,11 @@ class GradualChange(Mechanism):
             return None
         weight = own_spread(comparison).weight
         gain = float(weight @ course_scores(white, course.variance).sum(-1))
-        worth = worth_of_course(white, course, weight)
+        worth = course_score(white, course, weight)
         once = 0.0
         if episodes is not None:
             at_once = course_at_once(white, episodes.inside(comparison.n_samples), episodes.factor != 1)
-            once = worth_of_course(white, at_once, weight, len(episodes.episodes))
+            once = course_score(white, at_once, weight, len(episodes.episodes))
             if not goes_up_and_down(comparison, episodes):
                 # A single one is a course as well: another that may be it has to gain more than orders do by chance.
                 once += 2 * math.log(comparison.n_samples)
@@ -137,7 +136,7 @@ class GradualChange(Mechanism):
         share = self._share(comparison.n_samples, comparison.info.rate)[keep]
         if float(share.max()) == float(share.min()):
             return self
-        squares, concerned = levelled(comparison).square()[:, keep], self.factor != 1
+        squares, concerned = whitened_recording(comparison).square()[:, keep], self.factor != 1
         _, log_factor, _ = fitted_levels(squares, share, concerned)
         corner = self.corner_hz / comparison.info.rate
         upper = fast_factor(whitened_factor(self.base, corner) * log_factor.exp(), corner)
@@ -155,14 +154,13 @@ class GradualChange(Mechanism):
         return comparison.made_louder(self._loudness(comparison.n_samples, comparison.info.rate))
 
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
-        white = levelled(comparison)
+        white = whitened_recording(comparison)
         scores = course_scores(white, self._loudness(comparison.n_samples, comparison.info.rate).variance)
         scores = torch.where((self.factor != 1)[:, None], own_spread(comparison).weight[:, None] * scores, 0.0)
         return held_out_blocks(scores, fold).sum((0, -1))
 
     def _share(self, n_samples: int, rate: float) -> Tensor:
-        at = torch.arange(n_samples, dtype=torch.float64) / rate
-        return interpolated(at, self.time_s.tolist(), self.share.tolist())
+        return torch.from_numpy(np.interp(np.arange(n_samples) / rate, self.time_s.numpy(), self.share.numpy()))
 
     def _loudness(self, n_samples: int, rate: float) -> VarianceCourse:
         return VarianceCourse(self._share(n_samples, rate), self.factor, self.corner_hz / rate, self.base)
@@ -171,7 +169,7 @@ class GradualChange(Mechanism):
 def _goes_up_and_down(comparison: Comparison, course: Course, worth: float) -> bool:
     """Whether a level that is modulated all the time says more, or still says something beside the course."""
     always = worth_of_modulation(comparison)
-    rest = modulation_of(levelled(comparison) / course.variance.sqrt())
+    rest = modulation_of(whitened_recording(comparison) / course.variance.sqrt())
     return always > _FACTOR * worth + _NATS or (rest.p_value < _LEFT and rest.log_ratio > _SHARE * always)
 
 

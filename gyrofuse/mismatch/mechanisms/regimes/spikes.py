@@ -9,10 +9,19 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.detectors.variance.noise_level import levelled, variance_p_values
+from gyrofuse.mismatch.detectors.variance.noise_level import whitened_recording
 from gyrofuse.mismatch.detectors.variance.outliers import likely_outliers, spike_p_value
-from gyrofuse.mismatch.detectors.variance.weak_outliers import fitted_shock, shock_posterior, shock_scores
-from gyrofuse.mismatch.likelihoods.outlier_law import Outliers, clustered, fitted, free_gaussian, heavy_tailed, mixture
+from gyrofuse.mismatch.likelihoods.outlier_law import (
+    Outliers,
+    clustered,
+    fitted,
+    fitted_shock,
+    free_gaussian,
+    heavy_tailed,
+    mixture,
+    shock_posterior,
+    shock_scores,
+)
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.mechanisms.regimes.outlier_limits import with_limits
@@ -91,7 +100,8 @@ class Spikes(Mechanism):
         if shock is not None and together:
             laws, gain = shock
             hit = tuple(i for i, law in enumerate(laws) if law.rate > 0)
-        if not hit or any(laws[i].rate > _ISOLATED for i in hit) or clustered(levelled(comparison)[list(hit)]):
+        frequent = any(laws[i].rate > _ISOLATED for i in hit)
+        if not hit or frequent or clustered(whitened_recording(comparison)[list(hit)]):
             return None
         n_laws = 1 if together else _n_laws(laws, hit)
         if max(gain - _LAW * n_laws, apart - _LAW * len(hit)) < _heavy_tailed(z, hit) + _RARE:
@@ -294,8 +304,8 @@ def _shock_gains(z: Tensor, laws: list[Outliers]) -> Tensor:
 
 def _louder(comparison: Comparison) -> float:
     """What an episode of louder noise would gain, nats."""
-    white = levelled(comparison)
-    found = episodes_of(white, variance_p_values(comparison))
+    white = whitened_recording(comparison)
+    found = episodes_of(white)
     return (
         0.0 if found is None else float(two_level_scores(white, found.factor, found.inside(comparison.n_samples)).sum())
     )

@@ -13,7 +13,7 @@ from scipy import stats
 from torch import Tensor
 
 from gyrofuse.mismatch.detectors.spectra.power_differs import power_differs
-from gyrofuse.mismatch.detectors.variance.outliers import jump_test
+from gyrofuse.mismatch.detectors.variance.haar_kurtosis import jump_test
 from gyrofuse.mismatch.likelihoods.telegraph_fit import Numbers, excess, scores, two_levels
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter

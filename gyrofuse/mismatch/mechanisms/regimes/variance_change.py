@@ -10,15 +10,14 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.detectors.variance.noise_level import (
-    LEVEL_CUT,
+    clipped_squares,
     compared_levels,
     level_between,
-    levelled,
     modulation,
     modulation_of,
     own_spread,
     variance_p_value,
-    variance_p_values,
+    whitened_recording,
 )
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
@@ -32,11 +31,11 @@ from gyrofuse.mismatch.stats.limits import Z
 from gyrofuse.mismatch.stats.segments import (
     Episodes,
     Limits,
-    Told,
+    SegmentPosterior,
     episodes_of,
+    first_segment_posterior,
     log_factors,
     stretch_of,
-    told_of_first,
     two_level_scores,
 )
 
@@ -81,7 +80,7 @@ class VarianceChange(Mechanism):
         p_value = variance_p_value(comparison)
         if p_value > level:
             return None
-        white, found = levelled(comparison), likeliest_episodes(comparison)
+        white, found = whitened_recording(comparison), likeliest_episodes(comparison)
         if found is None or goes_up_and_down(comparison, found):
             return None
         held = _held(comparison, found) or _held(comparison, stretch_of(white))
@@ -125,7 +124,7 @@ class VarianceChange(Mechanism):
         if not bool(inside[keep].any()) or bool(inside[keep].all()):
             return self
         log_factor, _ = log_factors(
-            levelled(comparison)[:, keep].square(), inside[keep], level_between(comparison, inside)
+            whitened_recording(comparison)[:, keep].square(), inside[keep], level_between(comparison, inside)
         )
         fast = fast_factor(log_factor.exp(), self.corner_hz / comparison.info.rate)
         return replace(self, factor=torch.where(self.factor != 1, fast, 1.0))
@@ -144,7 +143,7 @@ class VarianceChange(Mechanism):
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
         inside = self._inside(comparison.n_samples, comparison.info.rate)
         factor = whitened_factor(self.factor, self.corner_hz / comparison.info.rate)
-        scores = two_level_scores(levelled(comparison), factor, inside, level_between(comparison, inside))
+        scores = two_level_scores(whitened_recording(comparison), factor, inside, level_between(comparison, inside))
         scores = own_spread(comparison).weight[:, None] * scores
         return held_out_blocks(scores, fold).sum((0, -1))
 
@@ -158,18 +157,18 @@ class VarianceChange(Mechanism):
         return within
 
 
-def _held(comparison: Comparison, found: Episodes) -> tuple[Episodes, Reference | None, Told] | None:
+def _held(comparison: Comparison, found: Episodes) -> tuple[Episodes, Reference | None, SegmentPosterior] | None:
     """Episodes whose level is known, with what is known of it and of that between them.
 
     A few wild samples may be likelier than any other stretch, and yet not likelier than all others together: then
     nothing tells which stretch has another level.
     """
-    found, white = _from_the_simulated_level(comparison, found), levelled(comparison)
+    found, white = _from_the_simulated_level(comparison, found), whitened_recording(comparison)
     sensors = (found.factor != 1).nonzero()[:, 0].tolist()
     if not sensors:
         return None
     reference = level_between(comparison, found.inside(comparison.n_samples))
-    told = told_of_first(white[sensors], found.episodes, None if reference is None else reference.of(sensors))
+    told = first_segment_posterior(white[sensors], found.episodes, None if reference is None else reference.of(sensors))
     known = float((told.log_factor.abs() / told.log_factor_sd).max()) > _KNOWN
     return (found, reference, told) if known else None
 
@@ -177,8 +176,7 @@ def _held(comparison: Comparison, found: Episodes) -> tuple[Episodes, Reference 
 @derived
 def likeliest_episodes(comparison: Comparison) -> Episodes | None:
     """Those that the simulation's level tells of, if any, or the recording by itself."""
-    p_values = variance_p_values(comparison)
-    return _against_the_simulation(comparison, p_values) or episodes_of(levelled(comparison), p_values)
+    return _against_the_simulation(comparison) or episodes_of(whitened_recording(comparison))
 
 
 def worth_of_modulation(comparison: Comparison) -> float:
@@ -187,12 +185,12 @@ def worth_of_modulation(comparison: Comparison) -> float:
     return max(-math.log(max(wave.p_value, 1e-300)), wave.log_ratio)
 
 
-def _against_the_simulation(comparison: Comparison, p_values: Tensor) -> Episodes | None:
+def _against_the_simulation(comparison: Comparison) -> Episodes | None:
     """Episodes that the simulation's level tells of, where the recording has that between them."""
     compared = compared_levels(comparison)
     if compared is None or compared.p_value == 1:
         return None
-    found = episodes_of(levelled(comparison), p_values, compared.reference)
+    found = episodes_of(whitened_recording(comparison), compared.reference)
     return None if found is None or level_between(comparison, found.inside(comparison.n_samples)) is None else found
 
 
@@ -200,7 +198,7 @@ def _alternatives(comparison: Comparison, found: Episodes) -> tuple[str, ...]:
     """What else it could be: outliers, where it is short, and another level throughout, where little else speaks."""
     compared, alone = (
         compared_levels(comparison),
-        scanned_levels(levelled(comparison).square().clamp(max=LEVEL_CUT)).log_ratio,
+        scanned_levels(clipped_squares(comparison)).log_ratio,
     )
     shifted = compared is not None and compared.scan.log_ratio < compared.throughout + _NATS and alone < _NATS
     short = max(e.stop - e.start for e in found.episodes) < _SHORT
@@ -229,13 +227,13 @@ def goes_up_and_down(comparison: Comparison, found: Episodes) -> bool:
     """
     n, inside, always = comparison.n_samples, found.inside(comparison.n_samples), worth_of_modulation(comparison)
     between = level_between(comparison, inside)
-    scores = two_level_scores(levelled(comparison), found.factor, inside, between)
+    scores = two_level_scores(whitened_recording(comparison), found.factor, inside, between)
     numbers = 2 * len(found.episodes) + int((found.factor != 1).sum()) / 2
     once = max(found.log_ratio, float(scores.sum()) - numbers * math.log(n))
     if max(always, once) < _A_LOT:
         known = between is not None or compared_levels(comparison) is None
         return always > (_FACTOR * once + _NATS if known else once)
-    white, more = levelled(comparison), found
+    white, more = whitened_recording(comparison), found
     for _ in range(_MORE):
         white = white / torch.where(more.inside(n), more.factor[:, None], 1.0).sqrt()
         rest, more = modulation_of(white), stretch_of(white)
