@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.detectors.result import TestResult
-from gyrofuse.mismatch.detectors.slow.scans import Scan, concerned, slow_look
+from gyrofuse.mismatch.detectors.slow.scans import Scan, slow_look
 from gyrofuse.mismatch.likelihoods.slow_noise import ordinates
 from gyrofuse.mismatch.likelihoods.slow_templates import Family, temperature_rows
 from gyrofuse.mismatch.signals.comparison import Comparison, block_means
@@ -28,14 +28,13 @@ def hysteresis_test(comparison: Comparison) -> TestResult:
     scan = strongest_relay(comparison)
     if scan is None:
         return TestResult("hysteresis", 1.0, "there is no temperature that goes to and fro")
-    which = concerned(scan)
-    largest = max(which, key=lambda i: float(scan.z[i].abs()))
+    largest = max(scan.sensors, key=lambda i: float(scan.z[i].abs()))
     return TestResult(
         "hysteresis",
         scan.p_value,
         f"the bias depends on the way by which {scan.family.channel} was reached, most clearly in sensor "
         f"{comparison.info.sensors[largest]}",
-        sensors=which,
+        sensors=scan.sensors,
         channel=scan.family.channel,
     )
 
@@ -49,8 +48,8 @@ def strongest_relay(comparison: Comparison) -> Scan | None:
         means = block_means(values.reshape(-1, values.shape[-1])[row].to(torch.float64)[: comparison.n_samples])
         paths = relays(means)
         if len(paths) > 1:
-            place = torch.arange(len(paths), dtype=torch.float64)
-            families.append(Family("hysteresis", ordinates(paths), place, channel, row))
+            number = torch.arange(len(paths), dtype=torch.float64)[:, None]
+            families.append(Family("hysteresis", number, ordinates(paths)[:, None], channel, row))
     return replace(slow_look(comparison), families=tuple(families)).scan("hysteresis") if families else None
 
 

@@ -16,17 +16,10 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.detectors.slow.estimates import Estimate, log_factors
 from gyrofuse.mismatch.detectors.slow.hysteresis import strongest_relay
-from gyrofuse.mismatch.detectors.slow.scans import (
-    PLAUSIBLE,
-    Scan,
-    SlowLook,
-    between,
-    concerned,
-    explained_by,
-    slow_look,
-)
-from gyrofuse.mismatch.likelihoods.slow_noise import column_sizes, cosines
+from gyrofuse.mismatch.detectors.slow.scans import Scan, SlowLook, slow_look
+from gyrofuse.mismatch.likelihoods.slow_noise import cosines
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
 from gyrofuse.mismatch.signals.comparison import N_BLOCKS, Comparison, RecordingInfo, block_means
@@ -163,21 +156,6 @@ class SlowEffect(Mechanism):
         return self.sizes @ self.paths(n_samples, info)
 
 
-class Estimate(NamedTuple):
-    """Places and sizes of an effect, over all places that the data leave possible.
-
-    Attributes:
-        place: Median of the places, with 2.5 and 97.5 % quantiles, samples.
-        other: The same of the second path, where that has its own; else None.
-        size, sd: `(sensor, path)`.
-    """
-
-    place: tuple[float, float, float]
-    other: tuple[float, float, float] | None
-    size: Tensor
-    sd: Tensor
-
-
 class Strong(NamedTuple):
     """A scan that may be named.
 
@@ -222,61 +200,6 @@ def strong_scan(comparison: Comparison, name: str, level: float) -> Strong | Non
     return strong if strong.scan.p_value <= min(level, _STRONG) else None
 
 
-def log_factors(scan: Scan) -> Tensor:
-    """Of the slow noise beside an effect, as strong as the doubt leaves it, `(sensor, part)`.
-
-    Without the effect the noise that fits best is stronger: as much as makes the effect's weight that of the scan.
-    """
-    which = list(concerned(scan))
-    return scan.fit.log_factors + 2 * max(float((scan.held[which].norm() / scan.z[which].norm()).log()), 0.0)
-
-
-def estimate(look: SlowLook, scan: Scan, *, finer: bool = True) -> Estimate:
-    """Mean over the places of a family, each as likely as the data say: the places are the prior.
-
-    Args:
-        look: What it is part of.
-        scan: The family, and the noise beside it.
-        finer: Whether there are places between those of the scan.
-    """
-    family, variance, which = scan.family, scan.fit.variance, concerned(scan)
-    if finer:
-        gain = explained_by(look.y, variance, family.designs, which) / 2
-        best = [p[[scan.best]] for p in family.where]
-        family = between(family, gain > gain.max() - PLAUSIBLE, best)
-    size, spread = column_sizes(look.y, variance, family.designs)  # (sensor, template, path)
-    weight = torch.softmax(explained_by(look.y, variance, family.designs, which) / 2, 0)
-    mean = (size * weight[:, None]).sum(-2)
-    sd = (((spread + size.square()) * weight[:, None]).sum(-2) - mean.square()).clamp(min=0).sqrt()
-    places, *others = (quantiles(p, weight) for p in family.where)
-    return Estimate(places, others[0] if others else None, mean, sd)
-
-
-def quantiles(places: Tensor, weight: Tensor) -> tuple[float, float, float]:
-    """Median, 2.5 and 97.5 % quantiles of places with weights that sum to one.
-
-    No tail lies beyond the first and the last place: these are within the limits where they are as likely as limits
-    of a normal law are.
-    """
-    places, order = places.sort()
-    weight = weight[order]
-    below = weight.cumsum(0) - weight / 2
-    low, middle, high = (
-        float(places[min(int(torch.searchsorted(below, share)), len(places) - 1)])
-        for share in torch.tensor([0.025, 0.5, 0.975], dtype=torch.float64)
-    )
-    first, last = (float(end) for end in places[[0, -1]])
-    likely = places[weight > math.exp(-(Z**2) / 2) * weight.max()]
-    return middle, first if float(likely[0]) == first else low, last if float(likely[-1]) == last else high
-
-
-def only(size: Tensor, which: Sequence[int]) -> Tensor:
-    """Sizes `(sensor, ...)` of some sensors, 0 in the others."""
-    kept = torch.zeros_like(size)
-    kept[list(which)] = size[list(which)]
-    return kept
-
-
 def place(places: tuple[float, float, float], rate: float) -> Parameter:
     """A place with its limits, in seconds."""
     value, low, high = places
@@ -310,7 +233,7 @@ def slow_finding(
     """
     info = comparison.info
     scan, sizes = strong.scan, sizes or [("size", info.measure)]
-    which = concerned(scan)
+    which = scan.sensors
     limits = {}
     for path, (name, unit) in enumerate(sizes[: found.size.shape[-1]]):
         for i in which:
