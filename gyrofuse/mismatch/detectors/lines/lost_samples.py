@@ -1,4 +1,4 @@
-"""Samples that sensors lost, as steps in the phase of a tone: a mean likelihood ratio over all paths, and single losses.
+"""Samples that sensors lost, as steps in the phase of a tone: a mean likelihood ratio over all paths; single losses.
 
 Beforehand a loss is as likely in any block, and each further sample in it half as likely. With amplitudes `a` of the
 tone in the rows, the number of samples lost before a block is the state of a hidden Markov chain: its forward and

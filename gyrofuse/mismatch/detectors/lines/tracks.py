@@ -22,7 +22,7 @@ from gyrofuse.mismatch.signals.lines import sets_of
 from gyrofuse.mismatch.stats.multiplicity import sidak
 
 _SEGMENT = 16  # roots of the record's length
-_EVERY = 2  # bins that a frequency moves within a segment, from one rate that is undone to the next
+_EVERY = 4  # bins that a frequency moves within a segment, from one rate that is undone to the next: 5 % of power
 _FINER = 2  # fine bins in a bin
 _CUT = 8.0  # power of a sensor: a steady line that is crossed is no track
 _SPARSE = 2**15  # tracks for each that is looked at closely, of those of each rate and in the end
