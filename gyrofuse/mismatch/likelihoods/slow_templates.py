@@ -78,12 +78,13 @@ def temperatures(comparison: Comparison) -> list[Family]:
     lags = torch.cat([torch.zeros_like(grid[:1]), grid])[:, None]
     families = []
     for channel, row in temperature_rows(comparison):
-        bent = partial(_temperature_designs, comparison.info, channel, row, comparison.n_samples)
+        straight, bent = (
+            partial(_temperature_designs, comparison.info, channel, row, comparison.n_samples, columns)
+            for columns in (1, 2)
+        )
         designs = bent(lags)
-        families += [
-            Family("temperature_drift", lags, designs[:, :1], channel, row, lambda lags, bent=bent: bent(lags)[:, :1]),
-            Family("temperature_drift", lags, designs, channel, row, bent),
-        ]
+        families.append(Family("temperature_drift", lags, designs[:, :1], channel, row, straight))
+        families.append(Family("temperature_drift", lags, designs, channel, row, bent))
     return families
 
 
@@ -98,13 +99,15 @@ def temperature_rows(comparison: Comparison) -> list[tuple[str, int]]:
     ]
 
 
-def _temperature_designs(info: RecordingInfo, channel: str, row: int, n_samples: int, lags: Tensor) -> Tensor:
-    """Ordinates of a temperature with lags `(template, 1)`, samples, less its first value, and of its square."""
+def _temperature_designs(
+    info: RecordingInfo, channel: str, row: int, n_samples: int, columns: int, lags: Tensor
+) -> Tensor:
+    """Ordinates of a temperature with lags `(template, 1)`, samples, less its first value; with 2 columns its square."""
     designs = []
     for lag in lags[:, 0].tolist():
         path = lagged(info, channel, row, lag, n_samples)
         path = path - path[0]
-        designs.append(slow_ordinates(torch.stack([path, path.square()])))
+        designs.append(slow_ordinates(torch.stack([path, path.square()][:columns])))
     return torch.stack(designs)
 
 

@@ -73,7 +73,7 @@ class Comparison:
             one, or by which its own scatter: what is left where it acts is a matter of it.
         modes: Centre and half width of narrow noise that was built in, cycles per sample: it is no line, however like
             one it looks.
-        seed: Seed of the random numbers that tests draw.
+        seed: Seed of the random numbers that tests draw: that of the caller's generator.
     """
 
     info: RecordingInfo
