@@ -102,7 +102,10 @@ def temperature_rows(comparison: Comparison) -> list[tuple[str, int]]:
 def _temperature_designs(
     info: RecordingInfo, channel: str, row: int, n_samples: int, columns: int, lags: Tensor
 ) -> Tensor:
-    """Ordinates of a temperature with lags `(template, 1)`, samples, less its first value; with 2 columns its square."""
+    """Ordinates of a temperature with lags `(template, 1)`, samples, less its first value, and of its square.
+
+    With one column, of the temperature alone.
+    """
     designs = []
     for lag in lags[:, 0].tolist():
         path = lagged(info, channel, row, lag, n_samples)

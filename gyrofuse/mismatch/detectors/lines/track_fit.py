@@ -14,11 +14,6 @@ import torch
 from torch import Tensor
 
 AROUND = 16  # bins of a segment on either side of a track, of which its blocks are made
-_CLOSER = 4  # segments that are joined for the next look
-_STEP = 0.25  # bins of a segment, by which either end of a track moves; of longer segments as many
-_REACH = 6, 8  # steps either way in the first look, and in those that follow
-_FINER = 4.0  # places that continuous frequencies have for each bin at both ends
-_FINEST, _NEAR = 0.05, 12  # cycles over the record, by which the ends move in the last look of all; steps either way
 
 
 class Candidates(NamedTuple):
@@ -77,9 +72,9 @@ def fitted_track(found: Candidates, combinations: Tensor, length: int, cut: floa
     ends = _straight(found.along)  # (track, end)
     blocks = _blocks(found, ends, length)  # (track, sensor, segment, block)
     signs, tails, powers = found.signs.to(blocks.dtype), [], torch.zeros(0)
-    for joined in sorted({max(count // _CLOSER**k, 1) for k in range(count)}, reverse=True):
-        reach = _REACH[joined < count]
-        moved = torch.arange(-reach, reach + 1, dtype=torch.float64) * (_STEP * joined / count)
+    for joined in sorted({max(count // 4**k, 1) for k in range(count)}, reverse=True):  # four segments become one
+        reach = 8 if joined < count else 6  # steps of a quarter of a bin either way
+        moved = torch.arange(-reach, reach + 1, dtype=torch.float64) * (joined / count / 4)
         turns = [torch.polar(torch.ones_like(c), -2 * math.pi * c) for c in _cycles(moved, count, width)]
         added = torch.einsum("cp,cpt->ct", signs, blocks.flatten(2)).view(tracks, joined, -1)
         of_start, of_stop = (t.view(len(moved), joined, -1) for t in turns)
@@ -97,7 +92,7 @@ def fitted_track(found: Candidates, combinations: Tensor, length: int, cut: floa
         family_wise_p_value = (combinations.to(parts.dtype) @ parts).abs().square().sum(-1) / combinations.abs().sum(-1)
         power, which = family_wise_p_value.max(-1)
         signs = combinations[which].to(blocks.dtype)
-        places = _FINER * (count / joined) ** 2
+        places = 4.0 * (count / joined) ** 2  # independent tracks for each bin at both ends
         tails.append(_log_tail(joined, power) + math.log(places))
     log_tail, at = (torch.stack(tails).amin(0) + math.log(len(tails))).min(0)
     best = at[None]
@@ -114,7 +109,7 @@ def _in_phase(found: Candidates, ends: Tensor, signs: Tensor, length: int, cut: 
     count, width = found.bins.shape[-2:]
     blocks = _blocks(found, ends, length)
     blocks = blocks * _held(blocks.sum(-1) / math.sqrt(width), cut)[..., None]
-    moved = torch.arange(-_NEAR, _NEAR + 1, dtype=torch.float64) * (_FINEST / count)
+    moved = torch.arange(-12, 13, dtype=torch.float64) * (0.05 / count)  # steps of a twentieth of a cycle
     of_start, of_stop = (torch.polar(torch.ones_like(c), -2 * math.pi * c) for c in _cycles(moved, count, width))
     added = torch.einsum("cp,cpt->ct", signs, blocks.flatten(2))
     best = torch.einsum("ct,at,bt->cab", added, of_start, of_stop).abs().flatten(1).argmax(-1)

@@ -19,9 +19,6 @@ from gyrofuse.mismatch.likelihoods.slow_templates import Family, temperature_row
 from gyrofuse.mismatch.signals.comparison import Comparison, block_means
 from gyrofuse.mismatch.signals.derived import derived
 
-_THRESHOLDS = 14  # of the temperature's range
-_FEWEST_SWITCHES = 2  # once is a step
-
 
 def hysteresis_test(comparison: Comparison) -> TestResult:
     """Relays that a temperature switches, at other values on its way up than on its way down."""
@@ -53,15 +50,20 @@ def strongest_relay(comparison: Comparison) -> Scan | None:
     return replace(slow_look(comparison), families=tuple(families)).scan("hysteresis") if families else None
 
 
-def relays(temperature: Tensor) -> Tensor:
-    """Different relays `(relay, time)`, -1 and 1, of a temperature `(time,)`; what switches once is a step."""
-    levels = temperature.quantile(torch.linspace(0, 1, _THRESHOLDS + 2, dtype=temperature.dtype)[1:-1])
+def relays(temperature: Tensor, thresholds: int = 14) -> Tensor:
+    """Different relays `(relay, time)`, -1 and 1, of a temperature; what switches once is a step, and left out.
+
+    Args:
+        temperature: Means over blocks, `(time,)`.
+        thresholds: Quantiles of the temperature, each pair of which makes a relay.
+    """
+    levels = temperature.quantile(torch.linspace(0, 1, thresholds + 2, dtype=temperature.dtype)[1:-1])
     pairs = torch.combinations(levels)
     lower, upper = pairs[:, :1], pairs[:, 1:]
-    said = (temperature > upper).to(torch.int8) - (temperature < lower).to(torch.int8)  # 0 where it stays
+    switched = (temperature > upper).to(torch.int8) - (temperature < lower).to(torch.int8)  # 0 where it stays
     time = torch.arange(len(temperature))
-    last = torch.where(said != 0, time, -1).cummax(-1).values
+    last = torch.where(switched != 0, time, -1).cummax(-1).values
     first = torch.where(temperature[0] > pairs.mean(-1, keepdim=True), 1, -1)
-    state = torch.where(last >= 0, said.gather(-1, last.clamp(min=0)).long(), first)
-    state = state[(state.diff(dim=-1) != 0).sum(-1) >= _FEWEST_SWITCHES]
+    state = torch.where(last >= 0, switched.gather(-1, last.clamp(min=0)).long(), first)
+    state = state[(state.diff(dim=-1) != 0).sum(-1) >= 2]
     return torch.unique(state, dim=0).to(temperature.dtype)
