@@ -21,7 +21,8 @@ from gyrofuse.mismatch.detectors.lines.track_fit import AROUND, Candidates, fitt
 from gyrofuse.mismatch.signals.lines import sets_of
 from gyrofuse.mismatch.stats.multiplicity import sidak
 
-# Bins that a frequency moves within a segment from one rate that is undone to the next: 7 % of power are lost on average.
+# Bins that a frequency moves within a segment, from one rate that is undone to the next: 7 % of power are lost, on
+# average.
 _EVERY = 4
 _FINER = 2  # fine bins in a bin
 _CUT = 8.0  # power of a sensor: a steady line that is crossed is no track
