@@ -15,7 +15,7 @@ from scipy import stats
 
 import gyrofuse as gf
 from gyrofuse.mismatch.detectors.slow.estimates import quantiles
-from gyrofuse.mismatch.detectors.slow.scans import Scan, SlowLook, jumps_to_and_fro, slow_look, slow_test
+from gyrofuse.mismatch.detectors.slow.scans import Scan, SlowAnalysis, jumps_to_and_fro, slow_analysis, slow_test
 from gyrofuse.mismatch.detectors.slow.surrogates import beats_surrogates
 from gyrofuse.mismatch.likelihoods.slow_noise import (
     Fit,
@@ -199,7 +199,7 @@ def test_a_p_value_is_held_against_twins():
     assert monte_carlo_p_value(0.1, honest.sqrt()) == pytest.approx(0.01, abs=0.002)
 
 
-def twins(given: SlowPowers, n_twins: int, g: torch.Generator, dof: float) -> list[SlowLook]:
+def twins(given: SlowPowers, n_twins: int, g: torch.Generator, dof: float) -> list[SlowAnalysis]:
     """Ordinates of noise that may be behind a simulation, beside simulations that show of it no more than that one."""
 
     def drawn(coefficients: torch.Tensor) -> torch.Tensor:
@@ -209,13 +209,13 @@ def twins(given: SlowPowers, n_twins: int, g: torch.Generator, dof: float) -> li
 
     numpy = np.random.default_rng(int(torch.randint(2**31, (), generator=g)))
     families = (warm_ups(comparison(), 1), steps(comparison()), temperatures(comparison())[0])
-    looks = []
+    analyses = []
     for _ in range(n_twins):
         behind = drawn(given.coefficients(N))
         noise, true = (SlowNoise.around(NoiseSpectrum(N, c), 1 / dof, 0.0, dof) for c in (drawn(behind), behind))
         y = true.own.sqrt() * torch.randn(SENSORS, 255, generator=g, dtype=torch.float64)
-        looks.append(SlowLook(noise, y, best_fit(noise, y), families))
-    return looks
+        analyses.append(SlowAnalysis(noise, y, best_fit(noise, y), families))
+    return analyses
 
 
 @pytest.mark.statistical
@@ -228,9 +228,11 @@ def test_p_values_of_scans_hold_among_twins(walk: float):
     side = Comparison.of(RecordingInfo(RATE, "deg/s", ("a", "b", "c", "d")), signal[0], signal)
     given, dof = slow_powers(side), float(side.reference.dof[:3].sum())
     n_twins = 80
-    looks = twins(given, n_twins, generator(32), dof)
-    for k in range(len(looks[0].families)):
-        p = np.array([replace(look, families=look.families[k : k + 1]).scans[0].p_value for look in looks])
+    analyses = twins(given, n_twins, generator(32), dof)
+    for k in range(len(analyses[0].families)):
+        p = np.array(
+            [replace(analysis, families=analysis.families[k : k + 1]).scans[0].p_value for analysis in analyses]
+        )
         assert (p < 0.05).sum() <= stats.binom.ppf(0.999, n_twins, 0.08)
         assert (p < 0.005).sum() <= stats.binom.ppf(0.999, n_twins, 0.01)
         assert p.min() > 1e-5
@@ -267,7 +269,7 @@ def test_sensors_that_jump_to_and_fro_are_known():
 
 def test_a_look_does_not_keep_its_case():
     now = comparison()
-    slow_look(now)
+    slow_analysis(now)
     gone = weakref.ref(now)
     del now
     gc.collect()
@@ -384,7 +386,7 @@ def test_the_channel_is_named_and_the_unit_is_by_kelvin():
     assert finding.parameters["coefficient[0]"].unit == "deg/s/K"
 
 
-def of_few_waves(n_sensors: int, nats: float, seed: int, *, follows: bool) -> tuple[SlowLook, Scan]:
+def of_few_waves(n_sensors: int, nats: float, seed: int, *, follows: bool) -> tuple[SlowAnalysis, Scan]:
     """Sensors with one path beside white ordinates, and the scan of a channel, which it is or not; both smooth."""
     g = generator(seed)
     t = torch.arange(256, dtype=torch.float64) / 256
@@ -402,7 +404,7 @@ def of_few_waves(n_sensors: int, nats: float, seed: int, *, follows: bool) -> tu
     family = Family("temperature_drift", torch.zeros(1, 1), channel[None, None])
     there = torch.full_like(z, 9.0)  # in every sensor
     scan = Scan(family, 0, fit, there, z, nats, 0.0, torch.eye(n_sensors), torch.ones(n_sensors), 1)
-    return SlowLook(None, y, fit, (family,)), scan  # type: ignore[arg-type]
+    return SlowAnalysis(None, y, fit, (family,)), scan  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("n_sensors", "nats"), [(1, 15.0), (12, 15.0)])
@@ -477,8 +479,8 @@ def test_a_walk_or_a_path_that_bends_is_not_several_steps(seed: int):
     walk = gf.RandomWalk(1e-3).simulate(N, batch=(SENSORS,), generator=generator(seed)).double()
     bends = torch.outer(torch.tensor([3.0, 0, 0, 4.0], dtype=torch.float64), (2 * math.pi * T / 9000 + seed).sin())
     for effect in (walk, bends):
-        several = slow_look(comparison(effect, seed=seed)).several_steps
-        assert several is None or several.gain < slow_look(comparison(effect, seed=seed)).wandering
+        several = slow_analysis(comparison(effect, seed=seed)).several_steps
+        assert several is None or several.gain < slow_analysis(comparison(effect, seed=seed)).wandering
 
 
 def test_a_stationary_telegraph_is_no_step():
@@ -495,7 +497,7 @@ def test_a_loud_source_of_all_sensors_is_no_step():
     gains = torch.tensor([1.0, -0.8, 1.3, 0.9], dtype=torch.float64)[:, None]
     for seed in (21, 22, 23):
         source = gf.AR1(0.97, 1.0).simulate(N, generator=generator(seed))
-        scan = slow_look(comparison(300 * gains * source)).scan("step")
+        scan = slow_analysis(comparison(300 * gains * source)).scan("step")
         assert scan.p_value > 1e-3
         assert scan.gain < 20
 

@@ -39,12 +39,12 @@ _NARROW, _WIDE = 32, 512  # bins on either side that estimate the background
 
 @dataclass(frozen=True)
 class FoundLine:
-    """The most conspicuous line.
+    """The least probable line.
 
     Attributes:
         frequency: Cycles per sample, to a fraction of a bin.
-        p_value: For having looked at every bin, and in it at every set of sensors.
-        sensors: The set in which it is most conspicuous.
+        p_value: Corrected for all bins and, in each, all sets of sensors.
+        sensors: The set in which it is least probable.
     """
 
     frequency: float
@@ -59,8 +59,8 @@ class Lines:
     Attributes:
         frequency: Cycles per sample, `(candidate,)`.
         log_p: Of each, for the sets of sensors but not for the bins, `(candidate,)`.
-        best: Index of the set in which it is most conspicuous, `(candidate,)`.
-        n_bins: That were looked at.
+        best: Index of the set in which it is least probable, `(candidate,)`.
+        n_bins: Number of bins that were searched.
     """
 
     frequency: Tensor
@@ -70,14 +70,14 @@ class Lines:
 
 
 def strongest_line(observed: Records, reference: Records) -> FoundLine:
-    """The most conspicuous line of a recording that the simulation does not have."""
+    """The least probable line of a recording that the simulation does not have."""
     z, length = _transformed(observed.signal[0], reference.base)
     f = torch.arange(z.shape[-1], dtype=torch.float64) / length
     shortest = min(observed.signal.shape[-1], reference.signal.shape[-1])
     known = torch.zeros_like(f, dtype=torch.bool)
-    for place in _shared(simulated_lines(reference), observed, reference):
-        here = (f - place).abs() < (_GUARD + 1) / shortest
-        known |= here | ((f - place).abs() < _reach(z[:, here]) / observed.signal.shape[-1])
+    for line in _shared(simulated_lines(reference), observed, reference):
+        here = (f - line).abs() < (_GUARD + 1) / shortest
+        known |= here | ((f - line).abs() < _reach(z[:, here]) / observed.signal.shape[-1])
     lines = _lines(z, length, observed, reference.base, known)
     at = int(lines.log_p.argmin())
     # Neighbouring fine bins share their noise: 0.6 of them are independent.
@@ -89,7 +89,7 @@ def strongest_line(observed: Records, reference: Records) -> FoundLine:
 def _shared(lines: tuple[float, ...], observed: Records, reference: Records) -> list[float]:
     """Those of the simulation's lines that the recording has as well, half as large or larger.
 
-    Where it has not, a line beside that place is the recording's own.
+    Where it has not, a line next to that frequency is the recording's own.
     """
     if not lines:
         return []
@@ -102,7 +102,7 @@ def _shared(lines: tuple[float, ...], observed: Records, reference: Records) -> 
 def simulated_lines(side: Records) -> tuple[float, ...]:
     """Frequencies of lines that a simulation has in any of its records, cycles per sample.
 
-    Those that are known, and what is seen beside them, strongest first.
+    Those that are known, and others by their p value, strongest first.
     """
     found: list[tuple[float, float, float]] = []
     for signal in side.noise:
@@ -156,9 +156,9 @@ def _lines(z: Tensor, length: int, side: Records, base: NoiseSpectrum, known: Te
     log_any = _log_hotelling(here, matrices, sets, m)
     signatures = sets / base.spectrum(at / length).sqrt().mT[:, None, :]  # (candidate, set, sensor)
     filters = signatures.to(z.dtype) @ inverse.mT  # rows h^H, since C is Hermitian
-    seen = (filters @ here[..., None])[..., 0].abs().square()
+    power = (filters @ here[..., None])[..., 0].abs().square()
     expected = ((filters @ matrices) * filters.conj()).sum(-1).real
-    log_same = -m * torch.log1p(seen / expected / m)
+    log_same = -m * torch.log1p(power / expected / m)
     least, best = (torch.minimum(log_any, log_same) - log_chance).min(-1)
     return Lines(at / length, (least + math.log(2.0)).clamp(max=0.0), best, int((~known).sum()))
 

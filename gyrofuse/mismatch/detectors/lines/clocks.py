@@ -6,8 +6,8 @@ of the noise, a path `phi_b` of the phase has the log likelihood `|sum z_b exp(-
 and phase.
 
 Statistic: mean likelihood ratio over paths and sets of sensors; the hypothesis of one clock has as many numbers, so
-that its expectation is one. Null law: that of an e-value (`p_value_from_e_value`). The reference is an auxiliary channel
-with the same tone, where there is one, or else the other sensors.
+that its expectation is one. Null law: that of an e-value (`p_value_from_e_value`). The reference is an auxiliary
+channel with the same tone, where there is one, or else the other sensors.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class _Fit(NamedTuple):
         lost: Limits of the samples lost in all.
         gain: Log likelihood over that of no slip, nats.
         log_ratio: Logarithm of the mean likelihood ratio over all sets and paths of the kind.
-        rest: Cycles over the record by which the tone of the others differs from the frequency looked for.
+        rest: Cycles over the record by which the tone of the others differs from the frequency assumed.
         angle: Angle by which one lost sample turns the tone.
     """
 
@@ -250,8 +250,8 @@ def _lost(z: Tensor, sets: Tensor, log_chance: Tensor, angle: float, *, fixed: b
     straight = z * _turn(-torch.tensor(rests, dtype=torch.float64))[:, None]  # (set, sensor, block)
     if not fixed:
         # No slip may have another slope than is best for the others alone.
-        alike = straight.sum(-1).abs().square().sum(-1) / BLOCKS
-        handicap = (_energy(z).sum(0).amax() - alike).clamp(min=0.0)
+        straight_energy = straight.sum(-1).abs().square().sum(-1) / BLOCKS
+        handicap = (_energy(z).sum(0).amax() - straight_energy).clamp(min=0.0)
     paths = paths_of(straight, sets, angle)
     ratios = paths.log_ratio - handicap + log_chance
     which = int(ratios.argmax())

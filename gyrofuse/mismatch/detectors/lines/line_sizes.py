@@ -49,7 +49,7 @@ class LineSizes(NamedTuple):
 
     @property
     def p_value(self) -> float:
-        """Of that one, for having looked at all."""
+        """p value of that one, corrected for all."""
         return sidak(float(self.tails[self.worst]), self.tails.numel())
 
 
@@ -57,8 +57,8 @@ class LineSizes(NamedTuple):
 def line_sizes(comparison: Comparison) -> LineSizes | None:
     """Both sides' lines; None where the simulation has none.
 
-    An amplitude scatters by `sqrt(2 S / n)` where the line stands out, and by less where it does not. That of the
-    simulation is known as well as its records agree on it, or as what it was estimated from tells.
+    An amplitude scatters by `sqrt(2 S / n)` where the line stands out, and by less where it does not. The variance of
+    the simulation's is that of its records, and not below that of the record from which it was estimated.
     """
     lines = comparison.reference.lines
     if not lines:

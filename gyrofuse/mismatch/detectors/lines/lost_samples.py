@@ -22,7 +22,7 @@ from gyrofuse.mismatch.stats.hmm import forward_backward, most_likely_path
 
 _STEPS, _STATES = 128, 20  # of the chain: times, and samples lost, from 0
 _EXPECTED = 2.0  # losses in a record, beforehand
-_AT_ONCE = 8  # samples: of more, the phase of one tone says as little as of how many whole cycles were lost
+_AT_ONCE = 8  # samples: the phase of one tone does not say how many whole cycles were lost either
 _AS_GOOD = 2.0  # nats within which another block is as good: the 95 % limits of a likelihood ratio
 _NEAR = 2  # blocks between losses that are one
 
@@ -66,7 +66,7 @@ def paths_of(z: Tensor, sets: Tensor, angle: float, rounds: int = 4, kept: int =
         kept: Starts that are followed after the first round.
     """
     z = z.unflatten(-1, (_STEPS, -1)).sum(-1) / math.sqrt(z.shape[-1] // _STEPS) * sets[..., None]
-    alike = z.sum(-1).abs().square().sum(-1) / _STEPS
+    none_lost = z.sum(-1).abs().square().sum(-1) / _STEPS
     turn, transition = _turns(_STATES, angle), _transition(_STEPS)
     starts = turn[_starts()]  # (start, step)
     early = [z[..., : _STEPS // part].mean(-1) for part in (16, 8, 4)]  # before a first loss, which may come late
@@ -75,7 +75,7 @@ def paths_of(z: Tensor, sets: Tensor, angle: float, rounds: int = 4, kept: int =
         projected = (amplitude.conj() @ z)[..., None] * turn
         squares = amplitude.abs().square().sum(-1)[..., None, None]
         total, states = forward_backward((2 * projected.real - squares).flatten(0, 1), transition[0], transition)
-        log_ratio = total.view(len(z), -1) - alike[:, None]
+        log_ratio = total.view(len(z), -1) - none_lost[:, None]
         states = states.unflatten(0, log_ratio.shape)
         best = log_ratio.topk(kept if number < rounds - 1 else 1).indices
         states = states[torch.arange(len(z))[:, None], best]
@@ -113,7 +113,7 @@ def losses_of(z: Tensor, lost: Tensor, angle: float, rounds: int = 4) -> tuple[l
             found, most = losses, value
     listed = []
     for at, count in sorted(found.items()):
-        others = {place: lost for place, lost in found.items() if place != at}
+        others = {block: lost for block, lost in found.items() if block != at}
         gains = _loss_gains(put_back(z, others, angle), angle)[:, count - 1]
         blocks = (gains >= gains.max() - _AS_GOOD).nonzero()[:, 0] + 1
         listed.append(Loss(int(gains.argmax()) + 1, count, (int(blocks[0]), int(blocks[-1]))))

@@ -46,8 +46,8 @@ class Track(NamedTuple):
     """A fitted track.
 
     Attributes:
-        log_tail: Logarithm of the chance of its power on a track given beforehand, times the places that were looked
-            at for each of the search's.
+        log_tail: Logarithm of the tail probability of its power on a track given beforehand, times the tracks tried for
+            each track of the search.
         ends: Frequencies at the record's ends, cycles per sample, not folded back.
         signs: Of the sensors.
         powers: Of the search's segments, `(segment,)`.
@@ -60,13 +60,13 @@ class Track(NamedTuple):
 
 
 def fitted_track(found: Candidates, combinations: Tensor, length: int, cut: float) -> Track:
-    """The most conspicuous of the best straight tracks next to those that the search has found.
+    """The least probable of the best straight tracks next to those that the search has found.
 
     Args:
         found: The search's tracks.
         combinations: Signs of sensors to choose from, `(combination, sensor)`.
         length: Samples of a segment of the search.
-        cut: Power of a sensor in a segment of the search that counts as this much where it is more.
+        cut: Largest power of a sensor in a segment of the search that counts; more counts as so much.
     """
     tracks, p, count, width = found.bins.shape
     ends = _straight(found.along)  # (track, end)
@@ -92,8 +92,8 @@ def fitted_track(found: Candidates, combinations: Tensor, length: int, cut: floa
         family_wise_p_value = (combinations.to(parts.dtype) @ parts).abs().square().sum(-1) / combinations.abs().sum(-1)
         power, which = family_wise_p_value.max(-1)
         signs = combinations[which].to(blocks.dtype)
-        places = 4.0 * (count / joined) ** 2  # independent tracks for each bin at both ends
-        tails.append(_log_tail(joined, power) + math.log(places))
+        tried = 4.0 * (count / joined) ** 2  # independent tracks for each bin at both ends
+        tails.append(_log_tail(joined, power) + math.log(tried))
     log_tail, at = (torch.stack(tails).amin(0) + math.log(len(tails))).min(0)
     best = at[None]
     first, last = (_in_phase(found.at(best), ends[best], signs[best], length, cut)[0] / length).tolist()
@@ -103,8 +103,8 @@ def fitted_track(found: Candidates, combinations: Tensor, length: int, cut: floa
 def _in_phase(found: Candidates, ends: Tensor, signs: Tensor, length: int, cut: float) -> Tensor:
     """Ends of tracks `(track, end)`, next to those given, between which most of the record is in phase.
 
-    What counts of a segment is asked for on the track as it is in the end: that which was cut where the search had the
-    track is less at places that are as far from there as it was from the true one.
+    Powers are cut on the track as it is in the end: those cut where the search had the track are smaller on the other
+    side of the true one.
     """
     count, width = found.bins.shape[-2:]
     blocks = _blocks(found, ends, length)

@@ -1,4 +1,4 @@
-"""Straight tracks through time and frequency, searched for the most conspicuous one.
+"""Search for the least probable straight track through time and frequency.
 
 Whitened records are cut into segments, in each of which a rate of change is undone before the transform: what is left
 is normal, with power one, in segments and bins, fine ones so that no line is lost between two. Powers are added up
@@ -29,13 +29,13 @@ _CUT = 8.0  # power of a sensor: a steady line that is crossed is no track
 
 
 class Sweep(NamedTuple):
-    """The most conspicuous track.
+    """The least probable track.
 
     Attributes:
-        p_value: For having looked at all.
+        p_value: Corrected for the tracks of the search.
         first, last: Frequencies at the record's ends, cycles per sample; beyond a half they are folded back.
         turns: Where they are folded in between: a half, or zero.
-        sensors: In which it was seen.
+        sensors: Positions of the sensors that have it.
         nats: By which the power of most segments is above what noise has on a track.
     """
 
@@ -56,14 +56,14 @@ def strongest_sweep(white: Tensor) -> Sweep:
     signs = _signs(p)
     kept = _conspicuous(white[:, : count * length].view(p, count, length).to(torch.float32), moves, signs)
     track = fitted_track(kept, signs, length, _CUT)
-    places = float((moves - 1) * count * length * len(signs))
+    searched = float((moves - 1) * count * length * len(signs))
     first, last = (abs(math.remainder(end, 1.0)) for end in track.ends)
     sensors = tuple(track.signs.nonzero()[:, 0].tolist())
     nats = count * (float(track.powers.median()) / math.log(2) - 1)
     near = 0.01  # halves of a cycle per sample next to which a frequency has not turned yet
     low, high = (2 * end for end in sorted(track.ends))  # halves of a cycle per sample
     turns = tuple(0.5 if k % 2 else 0.0 for k in range(math.ceil(low + near), math.floor(high - near) + 1))
-    return Sweep(sidak(math.exp(track.log_tail), places), first, last, sensors, nats, turns)
+    return Sweep(sidak(math.exp(track.log_tail), searched), first, last, sensors, nats, turns)
 
 
 def _conspicuous(segments: Tensor, moves: int, signs: Tensor) -> Candidates:
@@ -138,9 +138,9 @@ def _candidates(power: Tensor, signs: Tensor, along: Tensor, bins: Tensor, undon
 
 
 def _likely(powers: Tensor, moves: Tensor, most: int) -> Tensor:
-    """Bins of so many tracks with much power for each move from segment to segment, `(track, segment)`.
+    """Bins of the strongest tracks of each move from segment to segment, `(track, segment)`.
 
-    Of those that begin alike, which are neighbours, one is enough.
+    Tracks that begin in one bin are neighbours, of which one is enough.
     """
     count, length = powers.shape
     sums = _tracks(powers, moves)

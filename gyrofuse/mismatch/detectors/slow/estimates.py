@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.detectors.slow.scans import PLAUSIBLE, Scan, SlowLook, log_likelihood_ratios
+from gyrofuse.mismatch.detectors.slow.scans import PLAUSIBLE, Scan, SlowAnalysis, log_likelihood_ratios
 from gyrofuse.mismatch.likelihoods.slow_noise import cell_differences
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.stats.gls import least_squares
@@ -29,11 +29,11 @@ class Estimate(NamedTuple):
     sd: Tensor
 
 
-def estimate(look: SlowLook, scan: Scan) -> Estimate:
+def estimate(analysis: SlowAnalysis, scan: Scan) -> Estimate:
     """Posterior of an effect's numbers, all templates of the scan's family alike beforehand, the noise held."""
     variance, designs = scan.fit.variance, scan.family.designs
-    weight = torch.softmax(log_likelihood_ratios(look.y, variance, designs, scan.sensors), 0)
-    fits = least_squares(look.y, variance, designs)  # (template, sensor, column)
+    weight = torch.softmax(log_likelihood_ratios(analysis.y, variance, designs, scan.sensors), 0)
+    fits = least_squares(analysis.y, variance, designs)  # (template, sensor, column)
     mean, square = (torch.tensordot(weight, values, 1) for values in (fits.size, fits.variance + fits.size.square()))
     points = tuple(quantiles(numbers, weight) for numbers in scan.family.points.mT)
     return Estimate(points, mean, (square - mean.square()).clamp(min=0).sqrt())
@@ -71,19 +71,21 @@ def only(size: Tensor, which: Sequence[int]) -> Tensor:
     return kept
 
 
-def onset_samples(comparison: Comparison, look: SlowLook, scan: Scan, size: Tensor) -> tuple[float, float, float]:
+def onset_samples(
+    comparison: Comparison, analysis: SlowAnalysis, scan: Scan, size: Tensor
+) -> tuple[float, float, float]:
     """Median of a step's onset with 95 % limits, samples, from ever finer cells around it.
 
     Args:
         comparison: Recording and simulation.
-        look: Ordinates of the scan.
+        analysis: Ordinates of the scan.
         scan: Scan of steps.
         size: Sizes of the step, `(sensor,)`, which are held.
     """
-    most_cells, margin_cells = 256, 24  # looked at at once, and left on either side of the likely ones
+    most_cells, margin_cells = 256, 24  # searched at once, and left on either side of the likely ones
     which = list(scan.sensors)
     size = size[which, None]
-    gains = log_likelihood_ratios(look.y, scan.fit.variance, scan.family.designs, which)
+    gains = log_likelihood_ratios(analysis.y, scan.fit.variance, scan.family.designs, which)
     near, onsets = (gains > gains.max() - PLAUSIBLE).nonzero()[:, 0], scan.family.points[:, 0]
     low, high = float(onsets[max(int(near[0]) - 1, 0)]), float(onsets[min(int(near[-1]) + 1, len(onsets) - 1)])
     margin, coarser = max(high - low, 4.0 * comparison.block), comparison.n_samples

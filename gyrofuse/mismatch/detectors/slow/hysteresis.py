@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.detectors.result import TestResult
-from gyrofuse.mismatch.detectors.slow.scans import Scan, slow_look
+from gyrofuse.mismatch.detectors.slow.scans import Scan, slow_analysis
 from gyrofuse.mismatch.likelihoods.slow_noise import ordinates
 from gyrofuse.mismatch.likelihoods.slow_templates import Family, temperature_rows
 from gyrofuse.mismatch.signals.comparison import Comparison, block_means
@@ -38,7 +38,7 @@ def hysteresis_test(comparison: Comparison) -> TestResult:
 
 @derived
 def strongest_relay(comparison: Comparison) -> Scan | None:
-    """The best relay, for having looked at all channels and thresholds."""
+    """The best relay, corrected for all channels and thresholds."""
     families = []
     for channel, row in temperature_rows(comparison):
         values = comparison.info.channels[channel]
@@ -47,7 +47,7 @@ def strongest_relay(comparison: Comparison) -> Scan | None:
         if len(paths) > 1:
             number = torch.arange(len(paths), dtype=torch.float64)[:, None]
             families.append(Family("hysteresis", number, ordinates(paths)[:, None], channel, row))
-    return replace(slow_look(comparison), families=tuple(families)).scan("hysteresis") if families else None
+    return replace(slow_analysis(comparison), families=tuple(families)).scan("hysteresis") if families else None
 
 
 def relays(temperature: Tensor, thresholds: int = 14) -> Tensor:

@@ -35,7 +35,7 @@ _LOW = 48  # ordinates in which sensors are compared: noise in common is slow
 _SEEN = 0.02  # probability that a sensor seems to have a template, of those that are included to begin with
 _FAR_ABOVE = 10.0  # variance over the simulation's, from which the noise is another one
 _REFINED = 0.01  # p value below which the best template is sought between those of the grid
-PLAUSIBLE = 6.0  # nats below the most likely template: 3.5 sd of its place
+PLAUSIBLE = 6.0  # nats below the most likely template: 3.5 standard deviations of its numbers
 MOST_STEPS = 12  # one by one: what takes more is another path
 
 
@@ -95,11 +95,11 @@ class SeveralSteps(NamedTuple):
     """
 
     gain: float
-    first: SlowLook
+    first: SlowAnalysis
 
 
 @dataclass(frozen=True, eq=False)
-class SlowLook:
+class SlowAnalysis:
     """Ordinates of a comparison's recording, and what may explain them.
 
     Attributes:
@@ -240,17 +240,17 @@ class SlowLook:
 
 
 @derived
-def slow_look(comparison: Comparison) -> SlowLook:
+def slow_analysis(comparison: Comparison) -> SlowAnalysis:
     """The slow ordinates of a comparison, with steps, warm-ups and temperatures as what may explain them."""
     noise, y = simulated_slow_noise(comparison), slow_ordinates(comparison.observed.steady[0])
     families = (steps(comparison), warm_ups(comparison, 1), warm_ups(comparison, 2), *temperatures(comparison))
-    return SlowLook(noise, y, best_fit(noise, y), families)
+    return SlowAnalysis(noise, y, best_fit(noise, y), families)
 
 
 def slow_test(comparison: Comparison) -> TestResult:
     """A step, a warm-up, or a temperature that the recording follows."""
-    look = slow_look(comparison)
-    scan = min(look.scans, key=lambda s: s.p_value)
+    analysis = slow_analysis(comparison)
+    scan = min(analysis.scans, key=lambda s: s.p_value)
     largest = max(scan.sensors, key=lambda i: float(scan.z[i].norm()))
     seconds = scan.point[0] / comparison.info.rate
     words = {
@@ -260,7 +260,7 @@ def slow_test(comparison: Comparison) -> TestResult:
     }[scan.family.name]
     return TestResult(
         "slow",
-        sidak(scan.p_value, len(look.scans)),
+        sidak(scan.p_value, len(analysis.scans)),
         f"{words}, most clearly in sensor {comparison.info.sensors[largest]}",
         sensors=scan.sensors,
         time_s=seconds if scan.family.name == "step" else None,

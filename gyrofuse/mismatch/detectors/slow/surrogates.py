@@ -14,7 +14,7 @@ import math
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.detectors.slow.scans import Scan, SlowLook
+from gyrofuse.mismatch.detectors.slow.scans import Scan, SlowAnalysis
 from gyrofuse.mismatch.likelihoods.slow_noise import cosines, ordinates
 from gyrofuse.mismatch.signals.comparison import N_BLOCKS
 
@@ -22,7 +22,7 @@ _SURROGATES, _AS_GOOD = 200, 2  # surrogates, of which so many may fit as well: 
 _RECORDS, _USUAL = 100, 0.9  # drawn records that follow the channel, and how many of them are no less like it
 
 
-def beats_surrogates(look: SlowLook, scan: Scan, generator: torch.Generator) -> bool:
+def beats_surrogates(analysis: SlowAnalysis, scan: Scan, generator: torch.Generator) -> bool:
     """Whether a channel's shape beyond its trend fits better than nearly all such shapes with random phases.
 
     The trend itself, which any drift has, is left out of both; where the shape gains little nothing can be said. A
@@ -31,12 +31,12 @@ def beats_surrogates(look: SlowLook, scan: Scan, generator: torch.Generator) -> 
     better, all together, than they would then, they are no reason against it.
 
     Args:
-        look: Ordinates of the scan.
+        analysis: Ordinates of the scan.
         scan: Scan of temperatures.
         generator: Source of the phases and of the records.
     """
     which = list(scan.sensors)
-    y, variance = look.y[which], scan.fit.variance[which]
+    y, variance = analysis.y[which], scan.fit.variance[which]
     t = torch.linspace(-1, 1, N_BLOCKS, dtype=torch.float64)
     # What several paths do together, as in the sensor that shows it best.
     best = max(which, key=lambda i: float(scan.z[i].norm()))

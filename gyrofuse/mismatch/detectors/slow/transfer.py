@@ -103,9 +103,16 @@ def likeliest_transfer(comparison: Comparison, rows: Tensor, fit: ChannelFit) ->
 
 
 def _through(comparison: Comparison, rows: Tensor, pole: float, order: int, which: Tensor) -> tuple[float, Transfer]:
-    """The best response of a pole and of some terms at most, and its nats over a plain gain less what it costs.
+    """Nats of the best response of a pole over a plain gain, less the cost of its numbers, and the response.
 
-    None are left where responses that each sensor and row has for itself explain more than twice as much.
+    Minus infinity where responses that each sensor and row has for itself explain more than twice as much.
+
+    Args:
+        comparison: Recording and simulation.
+        rows: Made of the channel, `(row, time)`.
+        pole: Pole of the response.
+        order: Terms of the response at most.
+        which: Positions of the sensors that determine it.
     """
     plain = Transfer(pole, torch.ones(1, dtype=torch.float64))
     full = regress(comparison, terms(rows, pole, order).flatten(0, 1), which=which)

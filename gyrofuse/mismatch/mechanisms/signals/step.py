@@ -12,7 +12,7 @@ from torch import Tensor
 from gyrofuse.mismatch.detectors.slow.estimates import estimate, log_factors, only, onset_samples
 from gyrofuse.mismatch.detectors.slow.scans import Scan
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
-from gyrofuse.mismatch.mechanisms.signals.slow_effect import SlowEffect, place, slow_finding, strong_scan
+from gyrofuse.mismatch.mechanisms.signals.slow_effect import SlowEffect, in_seconds, slow_finding, strong_scan
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 
 
@@ -39,17 +39,17 @@ class Step(SlowEffect):
         strong = strong_scan(comparison, cls.name, level)
         if strong is None:
             return None
-        look, scan = strong.look, strong.scan
-        found = estimate(look, scan)
+        analysis, scan = strong.analysis, strong.scan
+        found = estimate(analysis, scan)
         size = found.size[:, 0]
-        onset = place(onset_samples(comparison, look, scan, size), comparison.info.rate)
+        onset = in_seconds(onset_samples(comparison, analysis, scan, size), comparison.info.rate)
         effect = cls(only(size, scan.sensors), strong.log_factors, onset.value)
         words = f"steps at {onset.value:.6g} s"
         return slow_finding(comparison, strong, effect, found, words, {"onset": onset}, time_s=onset.value)
 
     @classmethod
     def of(cls, scan: Scan, rate: float, which: Sequence[int] | None = None) -> Step:
-        """The best of a scan, in the sensors concerned or in others."""
+        """The best of a scan, in its sensors or in others."""
         size = only(scan.fit.size, scan.sensors if which is None else which)
         return cls(size[:, 0], log_factors(scan), scan.point[0] / rate)
 

@@ -15,7 +15,7 @@ from gyrofuse.mismatch.detectors.slow.surrogates import beats_surrogates
 from gyrofuse.mismatch.likelihoods.slow_templates import lagged
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
-from gyrofuse.mismatch.mechanisms.signals.slow_effect import SlowEffect, place, slow_finding, strong_scan
+from gyrofuse.mismatch.mechanisms.signals.slow_effect import SlowEffect, in_seconds, slow_finding, strong_scan
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import OfSensors
 
@@ -53,11 +53,11 @@ class TemperatureDrift(SlowEffect):
         strong = strong_scan(comparison, cls.name, level)
         if strong is None:
             return None
-        look, scan = strong.look, strong.scan
-        if not beats_surrogates(look, scan, comparison.generator()):
+        analysis, scan = strong.analysis, strong.scan
+        if not beats_surrogates(analysis, scan, comparison.generator()):
             return None
-        found = estimate(look, scan)
-        effect, lag = cls.of(scan, comparison.info.rate), place(found.points[0], comparison.info.rate)
+        found = estimate(analysis, scan)
+        effect, lag = cls.of(scan, comparison.info.rate), in_seconds(found.points[0], comparison.info.rate)
         if not effect.curvature:
             effect = replace(effect, size=only(found.size[:, 0], scan.sensors), lag_s=lag.value)
         lag = lag._replace(value=effect.lag_s)
@@ -76,7 +76,7 @@ class TemperatureDrift(SlowEffect):
 
     @classmethod
     def of(cls, scan: Scan, rate: float, which: Sequence[int] | None = None) -> TemperatureDrift:
-        """The best of a scan, in the sensors concerned or in others."""
+        """The best of a scan, in its sensors or in others."""
         size, *further = only(scan.fit.size, scan.sensors if which is None else which).unbind(-1)
         family = scan.family
         return cls(size, log_factors(scan), scan.point[0] / rate, family.channel or "", family.row, tuple(further))

@@ -12,7 +12,7 @@ from torch import Tensor
 from gyrofuse.mismatch.detectors.slow.estimates import estimate, log_factors, only
 from gyrofuse.mismatch.detectors.slow.scans import Scan
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
-from gyrofuse.mismatch.mechanisms.signals.slow_effect import SlowEffect, place, slow_finding, strong_scan
+from gyrofuse.mismatch.mechanisms.signals.slow_effect import SlowEffect, in_seconds, slow_finding, strong_scan
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import OfSensors
 
@@ -54,14 +54,14 @@ class WarmUpTransient(SlowEffect):
         strong = strong_scan(comparison, cls.name, level)
         if strong is None:
             return None
-        look, scan = strong.look, strong.scan
-        found, rate = estimate(look, scan), comparison.info.rate
-        effect, (tau, *others) = cls.of(scan, rate), (place(limits, rate) for limits in found.points)
-        places, unit = {"time_constant": tau}, comparison.info.measure
+        analysis, scan = strong.analysis, strong.scan
+        found, rate = estimate(analysis, scan), comparison.info.rate
+        effect, (tau, *others) = cls.of(scan, rate), (in_seconds(limits, rate) for limits in found.points)
+        numbers, unit = {"time_constant": tau}, comparison.info.measure
         words = f"decays after the start with a time constant of {tau.value:.3g} s"
         if effect.slower:
             first, second = effect.time_constant_s, effect.slower[0].time_constant_s
-            places = {
+            numbers = {
                 "time_constant": tau._replace(value=first),
                 "second_time_constant": others[0]._replace(value=second),
             }
@@ -69,11 +69,11 @@ class WarmUpTransient(SlowEffect):
         else:
             effect = replace(effect, size=only(found.size[:, 0], scan.sensors), time_constant_s=tau.value)
         sizes = [("size", unit), ("second_size", unit)]
-        return slow_finding(comparison, strong, effect, found, words, places, sizes=sizes, time_s=0.0)
+        return slow_finding(comparison, strong, effect, found, words, numbers, sizes=sizes, time_s=0.0)
 
     @classmethod
     def of(cls, scan: Scan, rate: float, which: Sequence[int] | None = None) -> WarmUpTransient:
-        """The best of a scan, in the sensors concerned or in others."""
+        """The best of a scan, in its sensors or in others."""
         size, *further = only(scan.fit.size, scan.sensors if which is None else which).unbind(-1)
         tau, *others = (number / rate for number in scan.point)
         slower = tuple(Decay(own, other) for own, other in zip(further, others, strict=True))
