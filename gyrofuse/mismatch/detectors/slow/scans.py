@@ -76,7 +76,7 @@ class Scan:
         """Columns of the best template, `(column, ordinate)`."""
         return self.family.designs[self.best]
 
-    @property
+    @cached_property
     def sensors(self) -> tuple[int, ...]:
         """Sensors that have the effect, given that any has."""
         return included_sensors(self.held.square().sum(-1), self.held.shape[-1], _SEEN).positions
