@@ -1,4 +1,4 @@
-"""Findings left out, set against look-alikes, and dropped where others make them needless."""
+"""Findings left out, set against analysis-alikes, and dropped where others make them needless."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy import stats
 
 import gyrofuse as gf
 from gyrofuse.mismatch import diagnose
-from gyrofuse.mismatch.detectors.slow.scans import slow_look
+from gyrofuse.mismatch.detectors.slow.scans import slow_analysis
 from gyrofuse.mismatch.detectors.spectra.peak_fit import Oscillation
 from gyrofuse.mismatch.detectors.spectra.peaks import Stretch
 from gyrofuse.mismatch.mechanisms.mechanism import Alternative, Finding, Mechanism, Parameter
@@ -81,7 +81,7 @@ def instead_of(finding: Finding, comparison: Comparison, beside: Sequence[Findin
 
 def test_red_noise_may_be_a_step_that_gains_as_much():
     stepped, plain = case_of(3, step(0.3)), case_of(3)
-    scan = slow_look(stepped).scan("step")
+    scan = slow_analysis(stepped).scan("step")
     assert scan is not None
     assert scan.p_value < 0.01
     gain = torch.complex(*torch.full((2, SENSORS), 0.1, dtype=torch.float64))
@@ -262,7 +262,7 @@ def test_a_name_that_is_not_earned_goes_where_nothing_is_found_in_its_place():
     wrong = Step(-0.2 * effect.size, effect.log_factors, 0.1 * N / RATE)
     finding = replace(true.finding, mechanism="step", effect=wrong, p_value=1e-9)
     link = Selected(finding, start, score_held_out(start, wrong))
-    never = 0.0  # level at which no look-alike is found
+    never = 0.0  # level at which no analysis-alike is found
     after, left = eliminate([link], wrong.repair(start, generator(0)), never, generator(0))
     assert after == []
     torch.testing.assert_close(left.recording, start.recording)

@@ -21,7 +21,7 @@ from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.folds import N_FOLDS, seen_in_block
 from gyrofuse.mismatch.signals.known_lines import without_lines
 from gyrofuse.mismatch.signals.lines import _log_hotelling, sets_of, simulated_lines, strongest_line
-from gyrofuse.mismatch.signals.noise_spectrum import _time_constants, fit_base
+from gyrofuse.mismatch.signals.noise_spectrum import ar1_time_constants, fit_base
 from gyrofuse.mismatch.signals.psd import bands, cross_spectra, hann_transform
 from gyrofuse.mismatch.signals.records import Records
 
@@ -94,7 +94,7 @@ def test_covariance_of_block_means_is_that_of_the_noise():
     coefficients = torch.zeros_like(base.coefficients)
     coefficients[0, :2] = torch.tensor([0.5, 2.0])
     slow = int((coefficients.shape[1] - 3) / 2) + 2
-    phi = math.exp(-1 / _time_constants(n)[slow - 2])
+    phi = math.exp(-1 / ar1_time_constants(n)[slow - 2])
     coefficients[0, slow] = 0.3
     exact = type(base)(n, coefficients).block_covariance(block, n_blocks)[0]
     model = gf.WhiteNoise(0.5) + gf.QuantizationNoise(2.0) + gf.AR1(phi, 0.3)

@@ -1,11 +1,11 @@
-"""Families of slow effects: what a step, a warm-up, or a lagging temperature of size one does to block means."""
+"""Templates of slow effects: block means of a step, a warm-up, or a lagging temperature of size one."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
 
 import torch
 from scipy.signal import lfilter
@@ -14,47 +14,35 @@ from torch import Tensor
 from gyrofuse.mismatch.likelihoods.slow_noise import ordinates, slow_ordinates
 from gyrofuse.mismatch.signals.comparison import N_BLOCKS, Comparison, RecordingInfo
 
+# A grid of templates is as fine as keeps neighbours correlated by 0.9 or more, where the noise is white.
 _TIME_CONSTANTS = 24
 _LAGS = 16
-_APART = 2  # places of the grid between two time constants
 
 
-def _no_more(*_places: Tensor) -> Family:
-    raise NotImplementedError("a family without places between its own")
-
-
-class Family(NamedTuple):
-    """Templates of one mechanism.
+@dataclass(frozen=True, eq=False)
+class Family:
+    """Templates of one mechanism on a grid of its nonlinear numbers.
 
     Attributes:
-        name: Of the mechanism.
-        templates: Ordinates of block means for a size of one, `(template, ordinate)`.
-        places: What tells them apart, `(template,)`, samples: onset, time constant or lag.
-        channel: Of a temperature, and its row.
-        row: Likewise.
-        beside: A second path of the same physics with a size of its own, for each template; None for none.
-        others: Its places, where it has its own.
-        at: The family of other places, and others; that of steps has no more.
+        name: Name of the mechanism.
+        points: Nonlinear numbers of each template, samples: an onset, one or two time constants, or a lag,
+            `(template, number)`.
+        designs: Ordinates of the block means of each template for sizes of one, `(template, column, ordinate)`.
+        channel: Name of the temperature that it follows, and `row` of that.
+        design_at: Designs at other points; None where only those of the grid exist.
     """
 
     name: str
-    templates: Tensor
-    places: Tensor
+    points: Tensor
+    designs: Tensor
     channel: str | None = None
     row: int = 0
-    beside: Tensor | None = None
-    others: Tensor | None = None
-    at: Callable[..., Family] = _no_more
+    design_at: Callable[[Tensor], Tensor] | None = None
 
-    @property
-    def where(self) -> list[Tensor]:
-        """Places, and others where there are."""
-        return [self.places] if self.others is None else [self.places, self.others]
-
-    @property
-    def designs(self) -> Tensor:
-        """All paths of each template, `(template, column, ordinate)`."""
-        return torch.stack([self.templates] if self.beside is None else [self.templates, self.beside], 1)
+    def at(self, points: Tensor) -> Family:
+        """The same mechanism at other points `(template, number)`."""
+        assert self.design_at is not None
+        return replace(self, points=points, designs=self.design_at(points))
 
 
 def steps(comparison: Comparison) -> Family:
@@ -63,51 +51,41 @@ def steps(comparison: Comparison) -> Family:
     middles = (at[:-1] + at[1:]) / 2
     onsets = torch.cat([torch.arange(1.0, N_BLOCKS), torch.arange(1.5, N_BLOCKS - 1)]).to(torch.float64)
     order = onsets.argsort()
-    return Family("step", torch.cat([at, middles])[order], onsets[order] * comparison.block)
+    return Family("step", onsets[order, None] * comparison.block, torch.cat([at, middles])[order, None])
 
 
-def warm_ups(comparison: Comparison, time_constants: Tensor | None = None) -> Family:
-    """Decays `exp(-t / tau)` with time constants `(template,)`, samples; by default from half a block to the record."""
-    return _decays(comparison.block, _time_constants(comparison) if time_constants is None else time_constants)
+def warm_ups(comparison: Comparison, number: int) -> Family:
+    """Sums of one or two decays `exp(-t / tau)`, time constants from half a block to the record, the slower one last.
 
+    Two time constants are two steps of the grid apart at least: closer ones are one, with sizes that cancel each other.
+    """
+    grid = _log_grid(comparison.block / 2, comparison.n_samples, _TIME_CONSTANTS)
+    points = grid[:, None] if number == 1 else grid[torch.triu_indices(len(grid), len(grid), 2)].mT
+    block = comparison.block
 
-def double_warm_ups(comparison: Comparison) -> Family:
-    """Sums of two decays, of a part and of what it stands in, `others` the slower one; samples."""
-    grid = _time_constants(comparison)
-    fast, slow = torch.triu_indices(len(grid), len(grid), _APART)
-    return _decays(comparison.block, grid[fast], grid[slow])
+    def design_at(time_constants: Tensor) -> Tensor:
+        tau = time_constants[..., None]
+        # The mean of a decay over a block is a geometric sum.
+        mean = torch.expm1(-block / tau) / torch.expm1(-1 / tau) / block
+        return ordinates(mean * (-torch.arange(N_BLOCKS) * block / tau).exp())
 
-
-def _time_constants(comparison: Comparison) -> Tensor:
-    low, high = math.log10(comparison.block / 2), math.log10(comparison.n_samples)
-    return torch.logspace(low, high, _TIME_CONSTANTS, dtype=torch.float64)
-
-
-def _decays(block: int, time_constants: Tensor, others: Tensor | None = None) -> Family:
-    """Decays in blocks of so many samples, a second one beside each where `others` has its time constant."""
-    templates, *beside = (_decay(block, tau) for tau in (time_constants, others) if tau is not None)
-    at = partial(_decays, block)
-    return Family("warm_up_transient", templates, time_constants, None, 0, beside[0] if beside else None, others, at)
-
-
-def _decay(block: int, time_constants: Tensor) -> Tensor:
-    tau = time_constants[:, None]
-    # The mean over a block, a geometric sum.
-    mean = torch.expm1(-block / tau) / torch.expm1(-1 / tau) / block
-    return ordinates(mean * (-torch.arange(N_BLOCKS) * block / tau).exp())
+    return Family("warm_up_transient", points, design_at(points), design_at=design_at)
 
 
 def temperatures(comparison: Comparison) -> list[Family]:
     """Each row of each temperature, in a straight line and a bent one, with lags up to a quarter of the record."""
-    lags = torch.logspace(
-        math.log10(comparison.block / 2), math.log10(comparison.n_samples / 4), _LAGS - 1, dtype=torch.float64
-    )
-    lags = torch.cat([torch.zeros(1, dtype=torch.float64), lags])
-    return [
-        temperature(comparison.info, channel, row, comparison.n_samples, bent, lags)
-        for channel, row in temperature_rows(comparison)
-        for bent in (False, True)
-    ]
+    grid = _log_grid(comparison.block / 2, comparison.n_samples / 4, _LAGS - 1)
+    lags = torch.cat([torch.zeros_like(grid[:1]), grid])[:, None]
+    families = []
+    for channel, row in temperature_rows(comparison):
+        straight, bent = (
+            partial(_temperature_designs, comparison.info, channel, row, comparison.n_samples, columns)
+            for columns in (1, 2)
+        )
+        designs = bent(lags)
+        families.append(Family("temperature_drift", lags, designs[:, :1], channel, row, straight))
+        families.append(Family("temperature_drift", lags, designs, channel, row, bent))
+    return families
 
 
 def temperature_rows(comparison: Comparison) -> list[tuple[str, int]]:
@@ -121,13 +99,19 @@ def temperature_rows(comparison: Comparison) -> list[tuple[str, int]]:
     ]
 
 
-def temperature(info: RecordingInfo, channel: str, row: int, n_samples: int, bent: bool, lags: Tensor) -> Family:
-    """One row with lags `(template,)` in samples, its square beside it where it may be bent."""
-    paths = torch.stack([lagged(info, channel, row, float(lag), n_samples) for lag in lags])
-    paths = paths - paths[:, :1]
-    squares = slow_ordinates(paths.square()) if bent else None
-    at = partial(temperature, info, channel, row, n_samples, bent)
-    return Family("temperature_drift", slow_ordinates(paths), lags, channel, row, squares, at=at)
+def _temperature_designs(
+    info: RecordingInfo, channel: str, row: int, n_samples: int, columns: int, lags: Tensor
+) -> Tensor:
+    """Ordinates of a temperature with lags `(template, 1)`, samples, less its first value, and of its square.
+
+    With one column, of the temperature alone.
+    """
+    designs = []
+    for lag in lags[:, 0].tolist():
+        path = lagged(info, channel, row, lag, n_samples)
+        path = path - path[0]
+        designs.append(slow_ordinates(torch.stack([path, path.square()][:columns])))
+    return torch.stack(designs)
 
 
 def lagged(info: RecordingInfo, channel: str, row: int, lag: float, n_samples: int) -> Tensor:
@@ -149,5 +133,9 @@ def lagged(info: RecordingInfo, channel: str, row: int, lag: float, n_samples: i
 
 def edges() -> Tensor:
     """Steps at every edge of blocks, `(edge, ordinate)`."""
-    place = torch.arange(N_BLOCKS)
-    return ordinates((place >= place[1:, None]).to(torch.float64))
+    block = torch.arange(N_BLOCKS)
+    return ordinates((block >= block[1:, None]).to(torch.float64))
+
+
+def _log_grid(low: float, high: float, number: int) -> Tensor:
+    return torch.logspace(math.log10(low), math.log10(high), number, dtype=torch.float64)

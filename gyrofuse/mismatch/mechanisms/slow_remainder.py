@@ -14,7 +14,7 @@ from typing import Annotated, ClassVar
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.detectors.slow.scans import slow_look
+from gyrofuse.mismatch.detectors.slow.scans import slow_analysis
 from gyrofuse.mismatch.likelihoods.slow_noise import best_fit
 from gyrofuse.mismatch.mechanisms.signals.slow_effect import SlowEffect
 from gyrofuse.mismatch.signals.comparison import N_BLOCKS, Comparison, RecordingInfo
@@ -49,9 +49,9 @@ class SlowRemainder(SlowEffect):
     @classmethod
     def left_over(cls, comparison: Comparison) -> SlowRemainder:
         """What is plainly more than the simulation's slow noise."""
-        look = slow_look(comparison)
-        slowest = torch.eye(_COSINES, look.y.shape[-1], dtype=look.y.dtype)
-        fit = best_fit(look.noise, look.y, slowest, look.null.log_factors)
+        analysis = slow_analysis(comparison)
+        slowest = torch.eye(_COSINES, analysis.y.shape[-1], dtype=analysis.y.dtype)
+        fit = best_fit(analysis.noise, analysis.y, slowest, analysis.null.log_factors)
         plain = fit.size.square() > _PLAIN * fit.variance[:, :_COSINES]
         sizes = torch.where(plain, fit.size, 0.0) * math.sqrt(2 / N_BLOCKS)
         return cls(sizes[:, 0], fit.log_factors, sizes[:, 1:], comparison.block * N_BLOCKS)

@@ -141,7 +141,9 @@ def prepared(
         array = simulation if isinstance(simulation, ArrayModel) else as_array(simulation, len(signal))
         uncertainty = SpectralUncertainty.of(array)
     comparison = replace(
-        comparison, reference=replace(comparison.reference, gaussian=gaussian, uncertainty=uncertainty)
+        comparison,
+        reference=replace(comparison.reference, gaussian=gaussian, uncertainty=uncertainty),
+        seed=generator.initial_seed(),
     )
     return with_spread(comparison.knowing(_lines(simulation, comparison)), noise_samples)
 

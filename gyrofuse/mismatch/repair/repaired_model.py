@@ -36,7 +36,8 @@ class RepairedModel:
     scene = RenamedAttribute("info")
 
     def __add__(self, effect: Mechanism) -> RepairedModel:
-        return replace(self, effects=(*self.effects, effect)) if isinstance(effect, Mechanism) else NotImplemented
+        known = hasattr(effect, "apply") and hasattr(effect, "order")
+        return replace(self, effects=(*self.effects, effect)) if known else NotImplemented
 
     def elsewhere(self) -> RepairedModel:
         """The same for another recording: without steps and episodes, which happened once."""

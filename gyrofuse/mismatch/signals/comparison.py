@@ -73,6 +73,7 @@ class Comparison:
             one, or by which its own scatter: what is left where it acts is a matter of it.
         modes: Centre and half width of narrow noise that was built in, cycles per sample: it is no line, however like
             one it looks.
+        seed: Seed of the random numbers that tests draw: that of the caller's generator.
     """
 
     info: RecordingInfo
@@ -82,6 +83,7 @@ class Comparison:
     converter: tuple[tuple[int, Callable[[Tensor], Tensor]], ...] = ()
     bent: tuple[Callable[[Tensor], Tensor], ...] = ()
     modes: tuple[tuple[float, float], ...] = ()
+    seed: int = 0
 
     @classmethod
     def of(cls, info: RecordingInfo, recording: Tensor, simulation: Tensor) -> Comparison:
@@ -132,6 +134,10 @@ class Comparison:
         if not lines and not self.observed.loud:
             return self.white
         return whitened(self.observed.steadied(without_lines(self.observed.signal, lines))[0], self.base)
+
+    def generator(self) -> torch.Generator:
+        """A source of the random numbers of a test, the same for every test of the comparison."""
+        return torch.Generator().manual_seed(self.seed)
 
     @property
     def block(self) -> int:

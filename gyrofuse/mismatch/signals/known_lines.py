@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 _STRETCH = 2**18  # samples at a time
-_STEPS = 3  # of Gauss and Newton: from a quarter of a bin to nothing
 
 
 def without_lines(signal: Tensor, frequencies: tuple[float, ...]) -> Tensor:
@@ -49,7 +48,7 @@ def precise(signal: Tensor, frequencies: tuple[float, ...]) -> tuple[float, ...]
     amplitude at a right angle to it.
     """
     n, found = signal.shape[-1], frequencies
-    for _ in range(_STEPS if frequencies else 0):
+    for _ in range(3 if frequencies else 0):  # Gauss and Newton: from a quarter of a bin to rounding
         parts = _coefficients(signal, found).flatten(0, -2).split(len(found), -1)
         cosine, sine, cosine_change, sine_change, _mean = parts
         turn = (cosine_change * sine - sine_change * cosine).sum(0) / (cosine.square() + sine.square()).sum(0)

@@ -25,33 +25,26 @@ from torch import Tensor
 from torch.nn.functional import max_pool1d
 
 from gyrofuse._base.transforms import fast_length
+from gyrofuse.mismatch.decisions import CERTAIN
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.known_lines import amplitudes, precise
 from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
 from gyrofuse.mismatch.signals.records import Records
 from gyrofuse.mismatch.stats.multiplicity import sidak
 
-_FINER = 4
-_INDEPENDENT = 0.6  # of a fine bin and its sets of sensors: neighbours share their noise
-_GUARD = 3  # bins next to a line, which do not tell the background
-_NARROW, _WIDE = 32, 512  # bins on either side that tell it
-_HUMP = 4.0  # standard deviations by which the nearest are louder where the line may be a hump
-_LOBE = 0.1  # power of a side lobe, in units of the noise, that does not matter
-_FEWEST_CYCLES = 10.0
-_CANDIDATES = 64
-_ALL_SETS = 8  # sensors up to which all sets of them are tried
-_LINE_IN_SIMULATION = 1e-3  # p value
-_RECORDS, _STEADY = 4, 0.45  # records that tell, and usual power over the largest: a third at most of four of noise
+_FINER = 4  # bins of the padded transform in a bin of the record: a line between two loses 5 % of its power
+_GUARD = 3  # bins next to a line, which hold its main lobe and are no background
+_NARROW, _WIDE = 32, 512  # bins on either side that estimate the background
 
 
 @dataclass(frozen=True)
 class FoundLine:
-    """The most conspicuous line.
+    """The least probable line.
 
     Attributes:
         frequency: Cycles per sample, to a fraction of a bin.
-        p_value: For having looked at every bin, and in it at every set of sensors.
-        sensors: The set in which it is most conspicuous.
+        p_value: Corrected for all bins and, in each, all sets of sensors.
+        sensors: The set in which it is least probable.
     """
 
     frequency: float
@@ -66,8 +59,8 @@ class Lines:
     Attributes:
         frequency: Cycles per sample, `(candidate,)`.
         log_p: Of each, for the sets of sensors but not for the bins, `(candidate,)`.
-        best: Index of the set in which it is most conspicuous, `(candidate,)`.
-        n_bins: That were looked at.
+        best: Index of the set in which it is least probable, `(candidate,)`.
+        n_bins: Number of bins that were searched.
     """
 
     frequency: Tensor
@@ -77,17 +70,18 @@ class Lines:
 
 
 def strongest_line(observed: Records, reference: Records) -> FoundLine:
-    """The most conspicuous line of a recording that the simulation does not have."""
+    """The least probable line of a recording that the simulation does not have."""
     z, length = _transformed(observed.signal[0], reference.base)
     f = torch.arange(z.shape[-1], dtype=torch.float64) / length
     shortest = min(observed.signal.shape[-1], reference.signal.shape[-1])
     known = torch.zeros_like(f, dtype=torch.bool)
-    for place in _shared(simulated_lines(reference), observed, reference):
-        here = (f - place).abs() < (_GUARD + 1) / shortest
-        known |= here | ((f - place).abs() < _reach(z[:, here]) / observed.signal.shape[-1])
+    for line in _shared(simulated_lines(reference), observed, reference):
+        here = (f - line).abs() < (_GUARD + 1) / shortest
+        known |= here | ((f - line).abs() < _reach(z[:, here]) / observed.signal.shape[-1])
     lines = _lines(z, length, observed, reference.base, known)
     at = int(lines.log_p.argmin())
-    p_value = sidak(math.exp(float(lines.log_p[at])), _INDEPENDENT * lines.n_bins)
+    # Neighbouring fine bins share their noise: 0.6 of them are independent.
+    p_value = sidak(math.exp(float(lines.log_p[at])), 0.6 * lines.n_bins)
     sensors = sets_of(len(z))[0][int(lines.best[at])].nonzero()[:, 0].tolist()
     return FoundLine(float(lines.frequency[at]), p_value, tuple(sensors))
 
@@ -95,7 +89,7 @@ def strongest_line(observed: Records, reference: Records) -> FoundLine:
 def _shared(lines: tuple[float, ...], observed: Records, reference: Records) -> list[float]:
     """Those of the simulation's lines that the recording has as well, half as large or larger.
 
-    Where it has not, a line beside that place is the recording's own.
+    Where it has not, a line next to that frequency is the recording's own.
     """
     if not lines:
         return []
@@ -108,14 +102,14 @@ def _shared(lines: tuple[float, ...], observed: Records, reference: Records) -> 
 def simulated_lines(side: Records) -> tuple[float, ...]:
     """Frequencies of lines that a simulation has in any of its records, cycles per sample.
 
-    Those that are known, and what is seen beside them, strongest first.
+    Those that are known, and others by their p value, strongest first.
     """
     found: list[tuple[float, float, float]] = []
     for signal in side.noise:
         z, length = _transformed(signal, side.base)
         lines = _lines(z, length, side, side.base, torch.zeros(z.shape[-1], dtype=torch.bool))
         for log_p, f in zip(lines.log_p.tolist(), lines.frequency.tolist(), strict=True):
-            if log_p + math.log(lines.n_bins * len(side.signal)) < math.log(_LINE_IN_SIMULATION):
+            if log_p + math.log(lines.n_bins * len(side.signal)) < math.log(CERTAIN):
                 found.append((log_p, f, _reach(z[:, round(f * length)][:, None]) / signal.shape[-1]))
     kept: list[tuple[float, float]] = []
     for _, f, reach in sorted(found):
@@ -126,18 +120,19 @@ def simulated_lines(side: Records) -> tuple[float, ...]:
 
 def _steady(side: Records, lines: tuple[float, ...]) -> tuple[float, ...]:
     """Those that every record has: the power of a peak of noise, which a model may have, is exponential."""
-    if not side.gaussian or len(side.noise) < _RECORDS or not lines:
+    if not side.gaussian or len(side.noise) < 4 or not lines:
         return lines
     density = side.base.spectrum(torch.tensor(lines, dtype=torch.float64))  # (sensor, line)
     power = amplitudes(side.noise, lines).square() / density * (side.noise.shape[-1] / 4)  # of noise one on average
     excess = (power - 1).sum(1)  # (record, line)
-    steady = excess.median(0).values > _STEADY * excess.amax(0)
+    # Of four exponential powers the usual one is a third of the largest at most.
+    steady = excess.median(0).values > 0.45 * excess.amax(0)
     return tuple(f for f, yes in zip(lines, steady.tolist(), strict=True) if yes)
 
 
 def _reach(z: Tensor) -> float:
-    """Bins up to which the side lobes `1 / (pi d)^2` of a line `(sensor, bin)` matter."""
-    return max(_GUARD + 1.0, math.sqrt(float(z.abs().square().sum(0).amax()) / _LOBE) / math.pi)
+    """Bins up to which the side lobes `1 / (pi d)^2` of a line `(sensor, bin)` are above a tenth of the noise."""
+    return max(_GUARD + 1.0, math.sqrt(float(z.abs().square().sum(0).amax()) / 0.1) / math.pi)
 
 
 def _lines(z: Tensor, length: int, side: Records, base: NoiseSpectrum, known: Tensor) -> Lines:
@@ -145,7 +140,7 @@ def _lines(z: Tensor, length: int, side: Records, base: NoiseSpectrum, known: Te
     p, n = len(z), side.signal.shape[-1]
     fine = length / n  # fine bins in a bin
     bins = torch.arange(z.shape[-1])
-    known = known | (bins < _FEWEST_CYCLES * fine) | (bins > (n / 2 - _GUARD) * fine)
+    known = known | (bins < 10 * fine) | (bins > (n / 2 - _GUARD) * fine)
     band = torch.tensor(side.bands.edges[1:-1], dtype=torch.float64) / side.bands.n_samples
     of_band = torch.bucketize(bins / length, band, right=True)
     inverses = torch.linalg.inv(side.over(base))  # (band, sensor, sensor)
@@ -153,7 +148,7 @@ def _lines(z: Tensor, length: int, side: Records, base: NoiseSpectrum, known: Te
     q = torch.cat([(part.conj() * (own @ part)).sum(0).real for own, part in zip(inverses, parts, strict=True)])
     q = q.masked_fill(known, 0.0)
     peak = q == max_pool1d(q[None, None], 2 * _FINER + 1, 1, _FINER)[0, 0]
-    at = (q * peak).topk(min(_CANDIDATES, len(q))).indices
+    at = (q * peak).topk(min(64, len(q))).indices
     inverse = inverses[of_band[at]]
     matrices, m = _nearby(z, at, fine, inverse)
     here = z[:, at].mT  # (candidate, sensor)
@@ -161,9 +156,9 @@ def _lines(z: Tensor, length: int, side: Records, base: NoiseSpectrum, known: Te
     log_any = _log_hotelling(here, matrices, sets, m)
     signatures = sets / base.spectrum(at / length).sqrt().mT[:, None, :]  # (candidate, set, sensor)
     filters = signatures.to(z.dtype) @ inverse.mT  # rows h^H, since C is Hermitian
-    seen = (filters @ here[..., None])[..., 0].abs().square()
+    power = (filters @ here[..., None])[..., 0].abs().square()
     expected = ((filters @ matrices) * filters.conj()).sum(-1).real
-    log_same = -m * torch.log1p(seen / expected / m)
+    log_same = -m * torch.log1p(power / expected / m)
     least, best = (torch.minimum(log_any, log_same) - log_chance).min(-1)
     return Lines(at / length, (least + math.log(2.0)).clamp(max=0.0), best, int((~known).sum()))
 
@@ -192,7 +187,7 @@ def _nearby(z: Tensor, at: Tensor, fine: float, inverse: Tensor) -> tuple[Tensor
     wide, narrow = around @ around.mH, around[..., inner] @ around[..., inner].mH
     m_wide, m_narrow = usable.sum(-1), usable[:, inner].sum(-1)
     excess = level(narrow) / m_narrow / (level(wide) / m_wide) - 1
-    hump = excess > _HUMP / (m_narrow * len(z)).sqrt()
+    hump = excess > 4 / (m_narrow * len(z)).sqrt()  # standard deviations
     m = torch.where(hump, m_narrow, m_wide).to(torch.float64)
     return torch.where(hump[:, None, None], narrow, wide) / m[:, None, None], m[:, None]
 
@@ -241,7 +236,7 @@ def sets_of(p: int) -> tuple[Tensor, Tensor]:
     All sets, or where those are many each sensor alone and all together. These have half of the error, of the other
     sizes each has the same share, and of a size each set.
     """
-    if p <= _ALL_SETS:
+    if p <= 8:  # 255 sets
         sets = (torch.arange(1, 2**p)[:, None] >> torch.arange(p) & 1).to(torch.float64)
     else:
         sets = torch.cat([torch.eye(p, dtype=torch.float64), torch.ones(1, p, dtype=torch.float64)])

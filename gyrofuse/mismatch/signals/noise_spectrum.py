@@ -45,11 +45,11 @@ class NoiseSpectrum:
 
     def spectrum(self, f: Tensor) -> Tensor:
         """Density per sample `(sensor, frequency)` at `f` cycles per sample."""
-        return self.coefficients @ _atoms(self.n_samples, f)
+        return self.coefficients @ atom_spectra(self.n_samples, f)
 
     def fast(self) -> NoiseSpectrum:
         """What of it is white, or nearly."""
-        quick = [True, True, *(tau < _QUICK for tau in _time_constants(self.n_samples)), False]
+        quick = [True, True, *(tau < _QUICK for tau in ar1_time_constants(self.n_samples)), False]
         return NoiseSpectrum(self.n_samples, torch.where(torch.tensor(quick), self.coefficients, 0.0))
 
     def model(self) -> ArrayModel:
@@ -68,7 +68,7 @@ class NoiseSpectrum:
     def essential(self) -> Tensor:
         """Coefficients without those that give no more than a thousandth of the power anywhere."""
         f = torch.logspace(math.log10(1 / self.n_samples), math.log10(0.5), 100, dtype=torch.float64)
-        shares = self.coefficients[..., None] * _atoms(self.n_samples, f)  # (sensor, atom, frequency)
+        shares = self.coefficients[..., None] * atom_spectra(self.n_samples, f)  # (sensor, atom, frequency)
         matters = (shares / shares.sum(1, keepdim=True)).amax(-1) > _NEGLIGIBLE
         return torch.where(matters, self.coefficients, 0.0)
 
@@ -78,7 +78,7 @@ class NoiseSpectrum:
 
     def _kinds(self) -> list[Callable[[float], Process]]:
         """The process of each atom, of its variance."""
-        shaped = (partial(AR1, math.exp(-1 / tau)) for tau in _time_constants(self.n_samples))
+        shaped = (partial(AR1, math.exp(-1 / tau)) for tau in ar1_time_constants(self.n_samples))
         return [WhiteNoise, QuantizationNoise, *shaped, RandomWalk]
 
 
@@ -91,7 +91,7 @@ def fit_base(power: Tensor, bands: Bands, n_samples: int, dof: Tensor) -> NoiseS
         n_samples: Of the records to describe.
         dof: Complex ordinates of each band, `(band,)`; 0 leaves it out.
     """
-    atoms = bands.mean_of(_atoms(n_samples, bands.nodes))  # (atom, band)
+    atoms = bands.mean_of(atom_spectra(n_samples, bands.nodes))  # (atom, band)
     root, known = dof.sqrt(), dof > 0
     fitted, free = torch.where(known, power, 1.0), None
     power = torch.where(known, power, 0.0)
@@ -107,7 +107,7 @@ def fit_base(power: Tensor, bands: Bands, n_samples: int, dof: Tensor) -> NoiseS
 
 
 @functools.lru_cache(maxsize=64)
-def _time_constants(n_samples: int) -> tuple[float, ...]:
+def ar1_time_constants(n_samples: int) -> tuple[float, ...]:
     """Of the AR1s, samples: corners from one cycle in the record to about a sixth of a cycle a sample."""
     decades = math.log10(n_samples / 6)
     return tuple(n_samples / (2 * math.pi) * 10 ** (-i / _PER_DECADE) for i in range(round(decades * _PER_DECADE) + 1))
@@ -115,7 +115,7 @@ def _time_constants(n_samples: int) -> tuple[float, ...]:
 
 def atom_covariances(n_samples: int, block: int, n_blocks: int) -> Tensor:
     """Covariances of block means, up to a constant, for each atom with coefficient one, `(atom, block, block)`."""
-    constants = _time_constants(n_samples)
+    constants = ar1_time_constants(n_samples)
     lags = torch.from_numpy(block_mean_covariances(block, n_blocks, constants))
     # Those of AR1s are for unit variance, coefficients are variances of innovations.
     lags[1:-1] /= -torch.expm1(-2 / torch.tensor(constants, dtype=torch.float64))[:, None]
@@ -127,9 +127,9 @@ def atom_covariances(n_samples: int, block: int, n_blocks: int) -> Tensor:
     return lags[:, (at[:, None] - at).abs()]
 
 
-def _atoms(n_samples: int, f: Tensor) -> Tensor:
+def atom_spectra(n_samples: int, f: Tensor) -> Tensor:
     """Spectra of the atoms with coefficient one, `(atom, frequency)`."""
-    phi = torch.tensor([math.exp(-1 / tau) for tau in _time_constants(n_samples)], dtype=torch.float64)[:, None]
+    phi = torch.tensor([math.exp(-1 / tau) for tau in ar1_time_constants(n_samples)], dtype=torch.float64)[:, None]
     one = torch.ones((), dtype=torch.float64)
     return torch.cat(
         [

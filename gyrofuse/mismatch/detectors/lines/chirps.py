@@ -1,10 +1,15 @@
-"""A line whose frequency moves steadily, as that of a machine that runs up: in no bin for long, a line all the same."""
+"""Test of linear chirps: a spectral line whose frequency moves steadily, as that of a machine that runs up.
+
+Statistic: power of whitened records on the best straight track through time and frequency, segments in phase. Null law:
+Gamma, corrected for the tracks searched (`tracks`).
+"""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.decisions import CHANCE
 from gyrofuse.mismatch.detectors.lines.tracks import Sweep, strongest_sweep
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
@@ -13,8 +18,6 @@ from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.prediction_errors import ENDS, left_out
 from gyrofuse.mismatch.signals.records import Records
-
-_NOTABLE = 0.05  # p value
 
 
 def chirp_test(comparison: Comparison) -> TestResult:
@@ -33,23 +36,28 @@ def chirp_test(comparison: Comparison) -> TestResult:
 
 
 def swept(comparison: Comparison, nats: float, level: float) -> bool:
-    """Whether a line whose frequency moves is seen, and tells more than so many nats of the spectrum.
+    """Whether there is a chirp that explains more than so many nats.
 
-    What it sweeps over has more power, as if noise had been added there or filtered away elsewhere.
+    Where it passes the spectrum has more power, as if noise had been added there or filtered away elsewhere.
+
+    Args:
+        comparison: Recording and simulation.
+        nats: Gain of another explanation of the spectrum.
+        level: Largest p value of the chirp.
     """
     return _p_value(comparison) <= level and _strongest(comparison.observed).nats > nats
 
 
 def _p_value(comparison: Comparison) -> float:
     p_value = _strongest(comparison.observed).p_value
-    # Lines that both have leave traces here of any size: what the simulation may show is nothing to surpass.
-    seen_in_both = p_value < _NOTABLE and _strongest(comparison.reference).p_value < _NOTABLE
+    # Lines that both sides have leave traces of any size: beside what the simulation shows nothing can be said.
+    seen_in_both = p_value < CHANCE and _strongest(comparison.reference).p_value < CHANCE
     return 1.0 if seen_in_both else p_value
 
 
 @derived
 def _strongest(side: Records) -> Sweep:
-    """In the first record."""
+    """The best track in the first record."""
     return strongest_sweep(_decorrelated(side))
 
 
@@ -62,7 +70,7 @@ def _decorrelated(side: Records) -> Tensor:
     transform = decorrelated(transform, edges, side.dof)
     white = torch.fft.irfft(transform, n=n)
     white = white / white.square().mean(-1, keepdim=True).sqrt()
-    # Beside lines the ends are mirrored from what is next to them: seen twice, chance would look like more.
+    # Beside lines the ends mirror what is next to them: counted twice, chance would be significant.
     end = n // ENDS
     white[:, :end], white[:, -end:] = 0.0, 0.0
     return white

@@ -1,16 +1,17 @@
-"""Sensors whose clock is not that of the others, seen by a tone that recording and simulation share.
+"""Test of clocks: sensors that sample at another rate than the others, or lose samples, by a tone that all feel.
 
 A sensor that takes its sample `t` at `(1 + skew) t + lost(t)` turns the phase of a tone of `f` cycles per sample by
 `2 pi f` times what it is ahead: a slope, or steps. With `z_b` the whitened signal demodulated in `B` blocks, in units
 of the noise, a path `phi_b` of the phase has the log likelihood `|sum z_b exp(-i phi_b)|^2 / B` with the best amplitude
-and phase. No slip at all has as many numbers, so that the mean likelihood ratio over paths has expectation one.
+and phase.
 
-The reference is an auxiliary channel with the same tone, where there is one, or else the other sensors.
+Statistic: mean likelihood ratio over paths and sets of sensors; the hypothesis of one clock has as many numbers, so
+that its expectation is one. Null law: that of an e-value (`p_value_from_e_value`). The reference is an auxiliary
+channel with the same tone, where there is one, or else the other sensors.
 """
 
 from __future__ import annotations
 
-import functools
 import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -18,6 +19,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.decisions import NATS_AS_GOOD
 from gyrofuse.mismatch.detectors.lines.lost_samples import Loss, losses_of, paths_of, put_back
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.signals.comparison import Comparison
@@ -26,13 +28,8 @@ from gyrofuse.mismatch.signals.known_lines import without_lines
 from gyrofuse.mismatch.signals.lines import sets_of, simulated_lines, whitened
 from gyrofuse.mismatch.stats.multiplicity import p_value_from_e_value
 
-BLOCKS = 512
-_FEWEST_CYCLES = 1.0  # of a tone in a block
-_TONES = 3
-_FLANK = 4.0  # half widths, and bins, on either side of a mode that seem to be lines
-_SURE = 5.0  # nats that a sensor gains from the slip of others, from which it is its own as well
-_CLEARER = 10.0  # times the evidence of any sensor that a channel needs to be the reference
-_CYCLES, _FINER = 4, 32  # slip over the record that is looked for, and steps of a cycle
+BLOCKS = 512  # in which a tone is demodulated: a loss is placed to one, then to the sample
+_CYCLES, _FINER = 4, 32  # slopes of the phase that are searched, cycles over the record, and steps of one cycle
 
 
 @dataclass(frozen=True)
@@ -40,14 +37,14 @@ class Slip:
     """How the clock of some sensors runs away from the reference.
 
     Attributes:
-        frequency: Of the tone in the reference, cycles per sample.
-        sensors: Those that slip.
-        skew: What they are ahead per sample, and its standard deviation `skew_sd`.
-        losses: In the order of time.
-        lost: Limits of how many samples were lost in all.
+        frequency: Frequency of the tone in the reference, cycles per sample.
+        sensors: Positions of the sensors that slip.
+        skew: Samples that they are ahead per sample, and the standard deviation `skew_sd`.
+        losses: Losses of samples in the order of time.
+        lost: Limits of the samples lost in all.
         gain: Log likelihood over that of no slip, nats.
-        log_ratio: Of the mean likelihood ratio over sets of sensors and slopes or steps, less what was tried.
-        reference: Name of the channel that tells; None where the other sensors do.
+        log_ratio: Logarithm of the mean likelihood ratio over sets of sensors, tones, and slopes or steps.
+        reference: Name of the reference channel; None where the other sensors are the reference.
     """
 
     frequency: float
@@ -62,21 +59,22 @@ class Slip:
 
     @property
     def p_value(self) -> float:
+        """p value of no slip."""
         return p_value_from_e_value(self.log_ratio)
 
 
 class _Fit(NamedTuple):
-    """A slip of one kind, its places in blocks.
+    """The most likely slip of one kind, times in blocks.
 
     Attributes:
         which: Index of the set of sensors.
-        slope, variance: Cycles over the record that they are ahead, and their variance.
-        losses: Of samples.
-        lost: Limits of how many in all.
-        gain: Over no slip, nats.
-        log_ratio: Of the mean likelihood ratio over all sets and places of the kind.
-        rest: Cycles over the record by which the others differ from where they were looked for.
-        angle: By which one lost sample turns the tone.
+        slope, variance: Cycles over the record that they are ahead, and the variance of that.
+        losses: Losses of samples.
+        lost: Limits of the samples lost in all.
+        gain: Log likelihood over that of no slip, nats.
+        log_ratio: Logarithm of the mean likelihood ratio over all sets and paths of the kind.
+        rest: Cycles over the record by which the tone of the others differs from the frequency assumed.
+        angle: Angle by which one lost sample turns the tone.
     """
 
     which: int
@@ -91,10 +89,10 @@ class _Fit(NamedTuple):
 
 
 def clock_test(comparison: Comparison) -> TestResult:
-    """Phases of a shared tone that run away from each other."""
+    """Phases of a shared tone that drift apart."""
     slip = strongest_slip(comparison)
     if slip is None:
-        return TestResult("clock", 1.0, "recording and simulation share no tone that would tell clocks apart")
+        return TestResult("clock", 1.0, "recording and simulation share no tone that would show their clocks")
     f = slip.frequency * comparison.info.rate
     return TestResult(
         "clock",
@@ -112,7 +110,7 @@ def strongest_slip(comparison: Comparison) -> Slip | None:
     """The most likely slip of any tone that the recording shares with the simulation."""
     block = comparison.n_samples // BLOCKS
     lines = simulated_lines(comparison.reference)
-    tones = [f for f in lines if f * block >= _FEWEST_CYCLES and not _rings(comparison, f)][:_TONES]
+    tones = [f for f in lines if f * block >= 1 and not _rings(comparison, f)][:3]  # a cycle in a block, or more
     if not tones:
         return None
     slips = [slip for f in tones for slip in _of_tone(comparison, f, tuple(other for other in lines if other != f))]
@@ -121,12 +119,17 @@ def strongest_slip(comparison: Comparison) -> Slip | None:
 
 
 def _rings(comparison: Comparison, f: float) -> bool:
-    """Whether a line of the simulation is noise of a mode that was found: its phase tells no time."""
-    return any(abs(f - centre) < _FLANK * (width + 1 / comparison.n_samples) for centre, width in comparison.modes)
+    """Whether a line of the simulation lies on a mode that was found: noise, whose phase is no clock."""
+    return any(abs(f - centre) < 4 * (width + 1 / comparison.n_samples) for centre, width in comparison.modes)
 
 
 def demodulated(signal: Tensor, f: float) -> Tensor:
-    """Signals `(row, time)` turned back by a tone, in blocks `(row, block)`, noise of variance one."""
+    """Complex amplitudes of a tone in blocks of signals, in units of their noise, `(row, block)`.
+
+    Args:
+        signal: Whitened signals, `(row, time)`.
+        f: Frequency of the tone, cycles per sample.
+    """
     block = signal.shape[-1] // BLOCKS
     t = torch.arange(block * BLOCKS, dtype=torch.float64)
     angle = 2 * math.pi * f * t
@@ -135,13 +138,13 @@ def demodulated(signal: Tensor, f: float) -> Tensor:
     # Least squares of both quadratures: in a block they are not orthogonal.
     image = torch.polar(torch.ones_like(t), -2 * angle).unflatten(-1, (BLOCKS, block)).mean(-1)
     z = (z - z.conj() * image) / (1 - image.abs().square())
-    # Of differences, squares of normal noise are exponential; where a loud tone steps, their median hardly moves.
+    # Squares of differences of complex normal noise are exponential; steps of a loud tone hardly move their median.
     noise = z.diff().abs().square().median(-1, keepdim=True).values / (2 * math.log(2))
     return z / noise.sqrt().clamp(min=1e-300)
 
 
 def best_slope(z: Tensor) -> tuple[float, float]:
-    """Cycles over the record that fit demodulated rows `(row, block)` best, and their energy there, nats."""
+    """Slope of the phase of demodulated rows `(row, block)`, cycles over the record, and the tone's energy, nats."""
     energy = _energy(z).sum(0)
     at = int(energy[1:-1].argmax()) + 1
     left, here, right = energy[at - 1 : at + 2].tolist()
@@ -156,13 +159,13 @@ def _of_tone(comparison: Comparison, f: float, others: tuple[float, ...]) -> lis
         whitened(without_lines(comparison.recording, others), comparison.base) if others else comparison.white, f
     )
     length = comparison.n_samples // BLOCKS * BLOCKS
-    seen = _reference(comparison, f, float(_energy(z).amax()))
-    if seen is None and len(z) < 2:
+    found = _reference(comparison, f, float(_energy(z).amax()))
+    if found is None and len(z) < 2:
         return []
-    name, slope, slope_variance = seen or (None, 0.0, 0.0)
+    name, slope, slope_variance = found or (None, 0.0, 0.0)
     z = z * _turn(-slope)
     sets, log_chance = sets_of(len(z))
-    if name is None:  # the smaller part is said to slip
+    if name is None:  # by convention the smaller part slips
         small = sets.sum(-1) <= len(z) / 2
         sets, log_chance = sets[small], log_chance[small]
     fixed = name is not None
@@ -194,11 +197,11 @@ def _of_tone(comparison: Comparison, f: float, others: tuple[float, ...]) -> lis
 
 
 def _with_the_like(z: Tensor, inside: Tensor, fit: _Fit) -> tuple[Tensor, float]:
-    """A set of sensors `(sensor,)` and all others whose tone the same slip explains as well, and what they gain."""
+    """A set of sensors `(sensor,)` with all others whose tone the same slip explains, and the nats that these gain."""
     lost = {loss.at: loss.count for loss in fit.losses}
     back = put_back(z, lost, fit.angle) if lost else z * _turn(-fit.slope)
     gains = (back.sum(-1).abs().square() - z.sum(-1).abs().square()) / BLOCKS
-    more = ~inside & (gains > math.log(len(z)) + _SURE)
+    more = ~inside & (gains > math.log(len(z)) + NATS_AS_GOOD)
     return inside | more, float(gains[more].sum())
 
 
@@ -216,8 +219,8 @@ def _reference(comparison: Comparison, f: float, strongest: float) -> tuple[str,
         if not bool(rows.isfinite().all()) or not bool(rows.any(-1).all()):
             continue
         slope, energy = best_slope(demodulated(rows, f))
-        if energy > _CLEARER * strongest:
-            best, strongest = (name, slope, _variance(energy)), energy / _CLEARER
+        if energy > 10 * strongest:  # its phase is known well beside that of any sensor
+            best, strongest = (name, slope, _variance(energy)), energy / 10
     return best
 
 
@@ -226,7 +229,7 @@ def _skewed(z: Tensor, sets: Tensor, log_chance: Tensor, *, fixed: bool) -> _Fit
     energy = _energy(z)  # (sensor, slope)
     own = sets @ energy
     middle = energy.shape[-1] // 2
-    # Where the others tell, both have the slopes that suit them, and no slip has the one that suits all.
+    # Without a channel both parts have their best slopes, and no slip has the best slope of all.
     over = -own[:, middle] if fixed else ((1 - sets) @ energy).amax(-1) - energy.sum(0).amax()
     gains = own.amax(-1) + over
     means = torch.logsumexp(own, -1) - math.log(own.shape[-1]) + over
@@ -246,9 +249,9 @@ def _lost(z: Tensor, sets: Tensor, log_chance: Tensor, angle: float, *, fixed: b
         rests = [best_slope(z[~row.bool()])[0] for row in sets]
     straight = z * _turn(-torch.tensor(rests, dtype=torch.float64))[:, None]  # (set, sensor, block)
     if not fixed:
-        # No slip may have another slope than suits the others alone.
-        alike = straight.sum(-1).abs().square().sum(-1) / BLOCKS
-        handicap = (_energy(z).sum(0).amax() - alike).clamp(min=0.0)
+        # No slip may have another slope than is best for the others alone.
+        straight_energy = straight.sum(-1).abs().square().sum(-1) / BLOCKS
+        handicap = (_energy(z).sum(0).amax() - straight_energy).clamp(min=0.0)
     paths = paths_of(straight, sets, angle)
     ratios = paths.log_ratio - handicap + log_chance
     which = int(ratios.argmax())
@@ -261,12 +264,12 @@ def _lost(z: Tensor, sets: Tensor, log_chance: Tensor, angle: float, *, fixed: b
 
 
 def _slopes() -> Tensor:
-    """Cycles over the record that are tried, `(slope,)`, 0 in the middle."""
+    """Slopes of the phase that are searched, cycles over the record, `(slope,)`, 0 in the middle."""
     return torch.arange(-_CYCLES * _FINER, _CYCLES * _FINER + 1, dtype=torch.float64) / _FINER
 
 
 def _turn(cycles: float | Tensor) -> Tensor:
-    """`exp(2 pi i cycles s)` at the blocks' places `s` from 0 to 1."""
+    """`exp(2 pi i cycles s)` at the middles `s` of the blocks, from 0 to 1."""
     s = (torch.arange(BLOCKS, dtype=torch.float64) + 0.5) / BLOCKS
     phase = 2 * math.pi * torch.as_tensor(cycles, dtype=torch.float64)[..., None] * s
     return torch.polar(torch.ones_like(phase), phase)
@@ -274,15 +277,9 @@ def _turn(cycles: float | Tensor) -> Tensor:
 
 def _energy(z: Tensor) -> Tensor:
     """Energy of a tone with each slope of the phase, nats, `(row, slope)`."""
-    return (z @ _all_turns()).abs().square() / BLOCKS
-
-
-@functools.cache
-def _all_turns() -> Tensor:
-    """What turns a phase of each slope back, `(block, slope)`."""
-    return _turn(-_slopes()).mT
+    return (z @ _turn(-_slopes()).mT).abs().square() / BLOCKS
 
 
 def _variance(energy: float) -> float:
-    """Of the slope of a phase, cycles over the record, for a tone of so many nats: Cramer and Rao."""
+    """Variance of the slope of a phase, cycles over the record, for a tone of so many nats (Cramer-Rao bound)."""
     return 6 / (4 * math.pi**2 * max(energy, 1.0))

@@ -13,8 +13,6 @@ from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.known_lines import amplitudes
 from gyrofuse.mismatch.stats.multiplicity import sidak
 
-_MEAN, _SD = math.sqrt(math.pi / 2), math.sqrt(2 - math.pi / 2)  # of Rayleigh's law
-
 
 class LineSizes(NamedTuple):
     """Amplitudes of every line that the simulation has, `(sensor, line)`, unit of the signals.
@@ -51,7 +49,7 @@ class LineSizes(NamedTuple):
 
     @property
     def p_value(self) -> float:
-        """Of that one, for having looked at all."""
+        """p value of that one, corrected for all."""
         return sidak(float(self.tails[self.worst]), self.tails.numel())
 
 
@@ -59,8 +57,8 @@ class LineSizes(NamedTuple):
 def line_sizes(comparison: Comparison) -> LineSizes | None:
     """Both sides' lines; None where the simulation has none.
 
-    An amplitude scatters by `sqrt(2 S / n)` where the line stands out, and by less where it does not. That of the
-    simulation is known as well as its records agree on it, or as what it was estimated from tells.
+    An amplitude scatters by `sqrt(2 S / n)` where the line stands out, and by less where it does not. The variance of
+    the simulation's is that of its records, and not below that of the record from which it was estimated.
     """
     lines = comparison.reference.lines
     if not lines:
@@ -75,8 +73,8 @@ def line_sizes(comparison: Comparison) -> LineSizes | None:
     fitted = comparison.reference.uncertainty
     effective_samples = comparison.reference.effective_samples if fitted is None else fitted.n_samples
     known = (theirs / len(others)).maximum(2 * density / effective_samples)
-    noise = (
-        2 * density / comparison.reference.signal.shape[-1]
-    ).sqrt()  # either part's of each record; the modulus has Rayleigh's law
-    present = (others.mean(0) / noise - _MEAN) * math.sqrt(len(others)) / _SD
+    # Of noise alone the parts are normal, and the amplitude of each record has Rayleigh's law.
+    noise = (2 * density / comparison.reference.signal.shape[-1]).sqrt()
+    mean, sd = math.sqrt(math.pi / 2), math.sqrt(2 - math.pi / 2)
+    present = (others.mean(0) / noise - mean) * math.sqrt(len(others)) / sd
     return LineSizes(own[0], others.mean(0), ours.sqrt(), known.sqrt(), present)

@@ -14,11 +14,6 @@ import torch
 from torch import Tensor
 
 AROUND = 16  # bins of a segment on either side of a track, of which its blocks are made
-_CLOSER = 4  # segments that are joined for the next look
-_STEP = 0.25  # bins of a segment, by which either end of a track moves; of longer segments as many
-_REACH = 6, 8  # steps either way in the first look, and in those that follow
-_FINER = 4.0  # places that continuous frequencies have for each bin at both ends
-_FINEST, _NEAR = 0.05, 12  # cycles over the record, by which the ends move in the last look of all; steps either way
 
 
 class Candidates(NamedTuple):
@@ -51,8 +46,8 @@ class Track(NamedTuple):
     """A fitted track.
 
     Attributes:
-        log_tail: Logarithm of the chance of its power on a track given beforehand, times the places that were looked
-            at for each of the search's.
+        log_tail: Logarithm of the tail probability of its power on a track given beforehand, times the tracks tried for
+            each track of the search.
         ends: Frequencies at the record's ends, cycles per sample, not folded back.
         signs: Of the sensors.
         powers: Of the search's segments, `(segment,)`.
@@ -65,21 +60,21 @@ class Track(NamedTuple):
 
 
 def fitted_track(found: Candidates, combinations: Tensor, length: int, cut: float) -> Track:
-    """The most conspicuous of the best straight tracks next to those that the search has found.
+    """The least probable of the best straight tracks next to those that the search has found.
 
     Args:
         found: The search's tracks.
         combinations: Signs of sensors to choose from, `(combination, sensor)`.
         length: Samples of a segment of the search.
-        cut: Power of a sensor in a segment of the search that counts as this much where it is more.
+        cut: Largest power of a sensor in a segment of the search that counts; more counts as so much.
     """
     tracks, p, count, width = found.bins.shape
     ends = _straight(found.along)  # (track, end)
     blocks = _blocks(found, ends, length)  # (track, sensor, segment, block)
     signs, tails, powers = found.signs.to(blocks.dtype), [], torch.zeros(0)
-    for joined in sorted({max(count // _CLOSER**k, 1) for k in range(count)}, reverse=True):
-        reach = _REACH[joined < count]
-        moved = torch.arange(-reach, reach + 1, dtype=torch.float64) * (_STEP * joined / count)
+    for joined in sorted({max(count // 4**k, 1) for k in range(count)}, reverse=True):  # four segments become one
+        reach = 8 if joined < count else 6  # steps of a quarter of a bin either way
+        moved = torch.arange(-reach, reach + 1, dtype=torch.float64) * (joined / count / 4)
         turns = [torch.polar(torch.ones_like(c), -2 * math.pi * c) for c in _cycles(moved, count, width)]
         added = torch.einsum("cp,cpt->ct", signs, blocks.flatten(2)).view(tracks, joined, -1)
         of_start, of_stop = (t.view(len(moved), joined, -1) for t in turns)
@@ -97,8 +92,8 @@ def fitted_track(found: Candidates, combinations: Tensor, length: int, cut: floa
         family_wise_p_value = (combinations.to(parts.dtype) @ parts).abs().square().sum(-1) / combinations.abs().sum(-1)
         power, which = family_wise_p_value.max(-1)
         signs = combinations[which].to(blocks.dtype)
-        places = _FINER * (count / joined) ** 2
-        tails.append(_log_tail(joined, power) + math.log(places))
+        tried = 4.0 * (count / joined) ** 2  # independent tracks for each bin at both ends
+        tails.append(_log_tail(joined, power) + math.log(tried))
     log_tail, at = (torch.stack(tails).amin(0) + math.log(len(tails))).min(0)
     best = at[None]
     first, last = (_in_phase(found.at(best), ends[best], signs[best], length, cut)[0] / length).tolist()
@@ -108,13 +103,13 @@ def fitted_track(found: Candidates, combinations: Tensor, length: int, cut: floa
 def _in_phase(found: Candidates, ends: Tensor, signs: Tensor, length: int, cut: float) -> Tensor:
     """Ends of tracks `(track, end)`, next to those given, between which most of the record is in phase.
 
-    What counts of a segment is asked for on the track as it is in the end: that which was cut where the search had the
-    track is less at places that are as far from there as it was from the true one.
+    Powers are cut on the track as it is in the end: those cut where the search had the track are smaller on the other
+    side of the true one.
     """
     count, width = found.bins.shape[-2:]
     blocks = _blocks(found, ends, length)
     blocks = blocks * _held(blocks.sum(-1) / math.sqrt(width), cut)[..., None]
-    moved = torch.arange(-_NEAR, _NEAR + 1, dtype=torch.float64) * (_FINEST / count)
+    moved = torch.arange(-12, 13, dtype=torch.float64) * (0.05 / count)  # steps of a twentieth of a cycle
     of_start, of_stop = (torch.polar(torch.ones_like(c), -2 * math.pi * c) for c in _cycles(moved, count, width))
     added = torch.einsum("cp,cpt->ct", signs, blocks.flatten(2))
     best = torch.einsum("ct,at,bt->cab", added, of_start, of_stop).abs().flatten(1).argmax(-1)

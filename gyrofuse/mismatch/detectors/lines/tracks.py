@@ -1,4 +1,4 @@
-"""Straight tracks through time and frequency, searched for the most conspicuous one.
+"""Search for the least probable straight track through time and frequency.
 
 Whitened records are cut into segments, in each of which a rate of change is undone before the transform: what is left
 is normal, with power one, in segments and bins, fine ones so that no line is lost between two. Powers are added up
@@ -21,24 +21,21 @@ from gyrofuse.mismatch.detectors.lines.track_fit import AROUND, Candidates, fitt
 from gyrofuse.mismatch.signals.lines import sets_of
 from gyrofuse.mismatch.stats.multiplicity import sidak
 
-_SEGMENT = 16  # roots of the record's length
-_EVERY = 2  # bins that a frequency moves within a segment, from one rate that is undone to the next
+# Bins that a frequency moves within a segment, from one rate that is undone to the next: 7 % of power are lost, on
+# average.
+_EVERY = 4
 _FINER = 2  # fine bins in a bin
 _CUT = 8.0  # power of a sensor: a steady line that is crossed is no track
-_SPARSE = 2**15  # tracks for each that is looked at closely, of those of each rate and in the end
-_LEAST, _MOST = 64, 256  # of these
-_AT = 0.01  # halves of a cycle per sample next to which a frequency has not turned yet
-_SIGNED = 7  # sensors up to which every sign is tried
 
 
 class Sweep(NamedTuple):
-    """The most conspicuous track.
+    """The least probable track.
 
     Attributes:
-        p_value: For having looked at all.
+        p_value: Corrected for the tracks of the search.
         first, last: Frequencies at the record's ends, cycles per sample; beyond a half they are folded back.
         turns: Where they are folded in between: a half, or zero.
-        sensors: In which it was seen.
+        sensors: Positions of the sensors that have it.
         nats: By which the power of most segments is above what noise has on a track.
     """
 
@@ -53,19 +50,20 @@ class Sweep(NamedTuple):
 def strongest_sweep(white: Tensor) -> Sweep:
     """Of independent whitened samples `(sensor, time)`."""
     p, n = white.shape
-    length = 2 ** round(math.log2(_SEGMENT * math.sqrt(n)))
+    length = 2 ** round(math.log2(16 * math.sqrt(n)))  # a chirp of half the rate moves 128 bins in a segment
     count = 2 ** int(math.log2(n // length))
     moves = length // (2 * count)  # bins from segment to segment, for half a cycle per sample over the record
     signs = _signs(p)
     kept = _conspicuous(white[:, : count * length].view(p, count, length).to(torch.float32), moves, signs)
     track = fitted_track(kept, signs, length, _CUT)
-    places = float((moves - 1) * count * length * len(signs))
+    searched = float((moves - 1) * count * length * len(signs))
     first, last = (abs(math.remainder(end, 1.0)) for end in track.ends)
     sensors = tuple(track.signs.nonzero()[:, 0].tolist())
     nats = count * (float(track.powers.median()) / math.log(2) - 1)
+    near = 0.01  # halves of a cycle per sample next to which a frequency has not turned yet
     low, high = (2 * end for end in sorted(track.ends))  # halves of a cycle per sample
-    turns = tuple(0.5 if k % 2 else 0.0 for k in range(math.ceil(low + _AT), math.floor(high - _AT) + 1))
-    return Sweep(sidak(math.exp(track.log_tail), places), first, last, sensors, nats, turns)
+    turns = tuple(0.5 if k % 2 else 0.0 for k in range(math.ceil(low + near), math.floor(high - near) + 1))
+    return Sweep(sidak(math.exp(track.log_tail), searched), first, last, sensors, nats, turns)
 
 
 def _conspicuous(segments: Tensor, moves: int, signs: Tensor) -> Candidates:
@@ -74,7 +72,8 @@ def _conspicuous(segments: Tensor, moves: int, signs: Tensor) -> Candidates:
     turned = segments.new_zeros(*segments.shape[:-1], _FINER * length, dtype=torch.complex64)
     bins = torch.empty_like(turned)  # (sensor, segment, fine bin); kept, as memory costs as much as the transform
     centred = ((torch.arange(length) - (length - 1) / 2) / length).square()
-    most, least = min(max(moves * segments.shape[1] * length // _SPARSE, _LEAST), _MOST), 0.0
+    # Tracks kept for the fit: one in 2^15 of all, since so few of noise have more power than a weak chirp.
+    most, least = min(max(moves * segments.shape[1] * length // 2**15, 64), 256), 0.0
     found: list[Candidates] = []
     for undone in range(_EVERY // 2, moves + _EVERY // 2, _EVERY):
         turn = torch.polar(torch.full((length,), length**-0.5), -math.pi * undone * centred)
@@ -92,7 +91,7 @@ def _conspicuous(segments: Tensor, moves: int, signs: Tensor) -> Candidates:
 
 def _signs(p: int) -> Tensor:
     """Combinations of `p` sensors, each left out, or of either sign against the first one that takes part."""
-    if p > _SIGNED:
+    if p > 7:  # 1093 combinations
         return sets_of(p)[0].to(torch.float32)
     every = torch.tensor(list(itertools.product((0.0, 1.0, -1.0), repeat=p)))
     first = every.gather(-1, (every != 0).to(torch.int64).argmax(-1, keepdim=True))[:, 0]
@@ -139,9 +138,9 @@ def _candidates(power: Tensor, signs: Tensor, along: Tensor, bins: Tensor, undon
 
 
 def _likely(powers: Tensor, moves: Tensor, most: int) -> Tensor:
-    """Bins of so many tracks with much power for each move from segment to segment, `(track, segment)`.
+    """Bins of the strongest tracks of each move from segment to segment, `(track, segment)`.
 
-    Of those that begin alike, which are neighbours, one is enough.
+    Tracks that begin in one bin are neighbours, of which one is enough.
     """
     count, length = powers.shape
     sums = _tracks(powers, moves)

@@ -1,11 +1,11 @@
-"""Regression of an array on auxiliary channels, in the domain of cosine transforms.
+"""Test of channels: regression of an array on auxiliary channels, in the domain of cosine transforms.
 
 `y_k = K a_k + noise` at every ordinate, `y` the sensors, `a` the rows of a channel, `K` real: the same gain at every
 frequency, phase 0. The transform makes white noise and random walks independent from ordinate to ordinate, which the
 Fourier transform of a stretch does not: there a slow channel and a wandering bias look alike at their ends. The noise
-has the shape of the base, and in each band the recording's own cross-spectral matrix on top of it, so that sensors with
-noise in common count once. Lines that the simulation has as well are left out: there its own motion would be compared
-with the channel's.
+has the shape of the simulation's, and in each band the recording's own cross-spectral matrix on top of it, so that
+sensors with noise in common count once. Lines that the simulation has as well are left out: there its own motion would
+be compared with the channel's.
 """
 
 from __future__ import annotations
@@ -18,18 +18,15 @@ from scipy import special
 from torch import Tensor
 
 from gyrofuse._base.transforms import cosine_ordinates
+from gyrofuse.mismatch.decisions import CERTAIN
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.signals.filters import quadrature
 from gyrofuse.mismatch.signals.known_lines import without_lines
 from gyrofuse.mismatch.signals.lines import simulated_lines
 from gyrofuse.mismatch.signals.records import Records
 from gyrofuse.mismatch.stats.inclusion import included_sensors
 from gyrofuse.mismatch.stats.multiplicity import sidak
-
-_SEEN = 0.01  # chance that a sensor seems to follow a channel, of those that are taken for sure to begin with
-_LINE = 4  # bins on either side of a line that the simulation has
-_AGAIN = 1e-3  # p value from which the noise is what a first fit leaves
-_LEAST_FREE = 0.5  # ordinates of a band beyond those that the fit takes
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +37,7 @@ class ChannelFit:
         gains: `(sensor, row)`, signal per unit of the channel.
         covariance: Of the gains, `(sensor, row, sensor, row)`.
         statistic: Twice the log likelihood ratio, chi-square with a degree of freedom for each gain.
-        quadrature: The same for gains a quarter of a cycle late, which no instantaneous coupling has.
+        quadrature: The same for gains a quarter of a cycle apart, which no instantaneous coupling has.
         share: Largest share of one band in the statistic.
         squares: Of the gains of each sensor, chi-square with a degree of freedom for each row, `(sensor,)`.
         p_value: Of the array, for having asked it whole and sensor by sensor.
@@ -77,7 +74,7 @@ def regress(
     lines = simulated_lines(comparison.reference)
     signal, rows = without_lines(signal, lines), without_lines(rows / size[:, None], lines)
     fit = _fitted(comparison, signal, rows, lines, comparison.observed, which)
-    if fit is not None and fit.p_value < _AGAIN:
+    if fit is not None and fit.p_value < CERTAIN:
         left = signal.clone()
         left[which] -= fit.gains @ rows
         fit = _fitted(comparison, signal, rows, lines, replace(comparison.observed, signal=left[None]), which) or fit
@@ -92,11 +89,11 @@ def _fitted(
     """Generalised least squares beside a noise of the cross-spectra of `noise`; None where rows are hardly apart."""
     n_sensors, n_rows, n = len(which), len(rows), signal.shape[-1]
     y, a = cosine_ordinates(signal[which]), cosine_ordinates(rows)
-    late = cosine_ordinates(_quarter_late(rows))
+    late = cosine_ordinates(quadrature(rows))
     k = torch.arange(n, dtype=torch.float64)
     weights = comparison.base.spectrum((k / (2 * n)).clamp(min=1 / (2 * n)))[which].rsqrt()  # (sensor, ordinate)
     for f in lines:
-        weights[:, (k / 2 - f * n).abs() < _LINE] = 0.0
+        weights[:, (k / 2 - f * n).abs() < 4] = 0.0  # bins of its main lobe
     edges = [1, *(2 * edge for edge in comparison.bands.edges[1:-1]), n]
     moment, moment_late = (torch.zeros(n_sensors * n_rows, dtype=torch.float64) for _ in range(2))
     matrix = torch.zeros(n_sensors * n_rows, n_sensors * n_rows, dtype=torch.float64)
@@ -143,22 +140,21 @@ def _fitted(
 
 
 def _tails(statistic: Tensor, n_rows: int, informed: Tensor, left: list[Tensor]) -> Tensor:
-    """p values `(sensor,)` of statistics, beside the noise that the recording itself has where it tells of the gains.
+    """p values `(sensor,)` of statistics with the noise that the fit leaves in the recording, band by band.
 
-    A band without the simulation's word on it, or with another level than it says, is judged by what the fit leaves
-    there: the variance of a gain is that of its bands, each with its share (Huber and White), as well known as they are
-    wide (Satterthwaite).
+    The variance of a gain is the mean of the residual variances of its bands, weighted by their information (Huber and
+    White); its degrees of freedom are those of the weighted mean (Satterthwaite), and the statistic's law is that of F.
 
     Args:
         statistic: Chi-square if the noise were known, `(sensor,)`.
-        n_rows: Its degrees of freedom.
-        informed: What each band tells of the gains, `(band, sensor)`.
-        left: In each band, squares of what is left, of mean one, `(sensor, ordinate)`; 0 where nothing was used.
+        n_rows: Degrees of freedom of the statistic.
+        informed: Information on the gains in each band, `(band, sensor)`.
+        left: Squares of residuals in each band, of mean one, `(sensor, ordinate)`; 0 where nothing was used.
     """
     share = informed / informed.sum(0)
     count = torch.stack([(band > 0).sum(-1) for band in left])
     free = (count - n_rows * share).clamp(min=0.0)
-    level = torch.stack([band.sum(-1) for band in left]) / free.clamp(min=_LEAST_FREE)
+    level = torch.stack([band.sum(-1) for band in left]) / free.clamp(min=0.5)
     noise = (share * level).sum(0)
     freedom = 1 / (share.square() / free.clamp(min=1e-9)).sum(0)
     scaled = statistic / noise.clamp(min=1e-300)
@@ -186,7 +182,7 @@ def channel_test(comparison: Comparison) -> TestResult:
         "channel",
         sidak(fit.p_value, len(tried)),
         f"sensors follow {name}{words}",
-        sensors=included_sensors(fit.squares, fit.gains.shape[-1], _SEEN).positions,
+        sensors=included_sensors(fit.squares, fit.gains.shape[-1], chance=0.01).positions,
         channel=name,
     )
 
@@ -219,8 +215,3 @@ def _channels(comparison: Comparison, word: str) -> list[str]:
         for name, values in comparison.info.channels.items()
         if word in name.lower() and bool(torch.isfinite(values).all())
     ]
-
-
-def _quarter_late(rows: Tensor) -> Tensor:
-    """Rows `(row, time)` a quarter of a cycle late at every frequency."""
-    return torch.fft.irfft(torch.fft.rfft(rows) * -1j, n=rows.shape[-1])

@@ -1,9 +1,13 @@
-"""Scans of block means for slow effects: how surprising the best template is, and what it would be.
+"""Scans of block means for slow effects: the most surprising template of each family.
 
-A scan takes the best of a family of templates (onsets, time constants, lags of a temperature). Its p value is that of
-the maximum of a chi-square process along the whitened templates, from the length of the curve they draw on the sphere
-(Davies, 1987), and never more than that of so many separate tests. Where it is small it is held against twins: block
-means without an effect, beside simulations that tell of their noise no better than the one at hand.
+Statistic: the best of a family of templates (onsets, time constants, lags of a temperature), by generalised least
+squares with the noise refitted beside it. Null law: the maximum of a chi-square process along the whitened templates,
+from the length of the curve that they draw on the sphere, and never more than that of as many separate tests; and
+where the slow noise is known from few ordinates of the simulation, the tail of an F law in the place of an exponential
+one.
+
+References: Davies, Hypothesis testing when a nuisance parameter is present only under the alternative, Biometrika 74
+(1987), 33.
 """
 
 from __future__ import annotations
@@ -14,80 +18,42 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
-from scipy.optimize import minimize
 from torch import Tensor
 
 from gyrofuse.mismatch.detectors.result import TestResult
-from gyrofuse.mismatch.likelihoods.slow_noise import (
-    Fit,
-    SlowNoise,
-    Told,
-    best_fit,
-    columns,
-    normal_equations,
-    scores,
-    slow_ordinates,
-    told,
-    where,
-)
-from gyrofuse.mismatch.likelihoods.slow_templates import Family, double_warm_ups, edges, steps, temperatures, warm_ups
+from gyrofuse.mismatch.likelihoods.slow_noise import Fit, SlowNoise, best_fit, simulated_slow_noise, slow_ordinates
+from gyrofuse.mismatch.likelihoods.slow_templates import Family, edges, steps, temperatures, warm_ups
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.stats.curve_maximum import curve_length, most_extreme, surprise
+from gyrofuse.mismatch.stats.gls import least_squares
 from gyrofuse.mismatch.stats.inclusion import included_sensors
-from gyrofuse.mismatch.stats.multiplicity import monte_carlo_p_value, sidak
+from gyrofuse.mismatch.stats.multiplicity import sidak
 
-Array = NDArray[np.float64]
-
-_LOW = 48  # ordinates in which sensors are compared
-_SCANS = 2  # the second with the covariance that the first effect leaves
-_FREE = 5.0  # sd of log factors that nothing is known of
-_SEEN = 0.02  # chance that a sensor seems to have a template, of those that are taken for sure to begin with
-_FAR_ABOVE = 10.0  # times the simulation's variance
-_JUMP = 5.0  # standard deviations
-_FEWEST_JUMPS, _MOST_JUMPS = 4, 10
-_TWO_LEVELS = 1.6  # distance of the outermost levels, in jumps
+_LOW = 48  # ordinates in which sensors are compared: noise in common is slow
+_SEEN = 0.02  # probability that a sensor seems to have a template, of those that are included to begin with
+_FAR_ABOVE = 10.0  # variance over the simulation's, from which the noise is another one
+_REFINED = 0.01  # p value below which the best template is sought between those of the grid
+PLAUSIBLE = 6.0  # nats below the most likely template: 3.5 standard deviations of its numbers
 MOST_STEPS = 12  # one by one: what takes more is another path
-_TWINS = 256
-_FINE = ("warm_up_transient", "temperature_drift")  # families that have places between any two
-PLAUSIBLE = 6.0  # nats below the best place
-_FINER, _CLOSER, _LIKELY = 8, 96, 12  # rounds, places of each, and how many likely ones are enough
-_LEAST_APART = 0.4  # logarithms of two time constants: closer ones are one with sizes that cancel each other
-# Where the likeliest place is sought: first and last step of its logarithm, nats that do not matter, and how often.
-_SIDE, _SURELY_THERE, _SAME, _TRIES = 0.15, 1e-7, 1e-3, 300
-_DOUBTED = 0.01  # p values below are held against twins
-
-
-class Best(NamedTuple):
-    """The best template of a family, for one case or for many at once.
-
-    Attributes:
-        at: Which of them, `(...)`.
-        fit: With it.
-        held: Sizes in standard deviations, `(..., sensor, column)`, with the noise held, each beside those before it.
-        z: The same with what the likelihood ratio leaves of it.
-        gain: Of all sensors together, nats, less what it costs to have looked at all places, `(...)`.
-        p_value: For having looked at all of them, `(...)`.
-        relation: Correlation of what the sensors have beside it, `(..., sensor, sensor)`.
-        lengths: Of the curve of templates on the sphere, `(..., sensor)`; infinite where only their number counts.
-    """
-
-    at: Tensor
-    fit: Fit
-    held: Tensor
-    z: Tensor
-    gain: Tensor
-    p_value: Tensor
-    relation: Tensor
-    lengths: Tensor
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """The best template of a family in a case, after so many `looks`; other attributes as in `Best`."""
+    """The best template of a family.
+
+    Attributes:
+        family: Templates, and `best`, the position of the best one.
+        fit: Noise and sizes with it.
+        z: Sizes in standard deviations, `(sensor, column)`, each column beside those before it; `held` with the noise
+            held at the fit's, and `z` with what the likelihood ratio leaves where the noise may be stronger instead.
+        gain: Log likelihood ratio of all sensors, nats, less the cost of the search.
+        p_value: Corrected for the search.
+        relation: Correlation of the sensors' noise beside it, `(sensor, sensor)`.
+        lengths: Length of the curve of templates on the sphere, `(sensor,)`; infinite where only their number counts.
+        searched: Templates of the grid.
+    """
 
     family: Family
     best: int
@@ -98,45 +64,51 @@ class Scan:
     p_value: float
     relation: Tensor
     lengths: Tensor
-    looks: int
+    searched: int
 
     @property
-    def place(self) -> float:
-        """Samples."""
-        return float(self.family.places[self.best])
-
-    @property
-    def other(self) -> float | None:
-        """Of the second path, where it has a place of its own."""
-        return None if self.family.others is None else float(self.family.others[self.best])
+    def point(self) -> list[float]:
+        """Nonlinear numbers of the best template, samples."""
+        return [float(number) for number in self.family.points[self.best]]
 
     @property
     def design(self) -> Tensor:
-        """Paths, `(column, ordinate)`."""
+        """Columns of the best template, `(column, ordinate)`."""
         return self.family.designs[self.best]
 
+    @cached_property
+    def sensors(self) -> tuple[int, ...]:
+        """Sensors that have the effect, given that any has."""
+        return included_sensors(self.held.square().sum(-1), self.held.shape[-1], _SEEN).positions
+
     def gain_beside(self, relation: Tensor) -> float:
-        """Its gain where what the sensors have beside it is correlated so."""
-        return float(surprise(self.z, self.lengths, relation, self.looks)[0])
+        """Its gain where the noise of the sensors has another correlation."""
+        return float(surprise(self.z, self.lengths, relation, self.searched)[0])
 
 
 class SeveralSteps(NamedTuple):
     """Steps in place of any other effect.
 
     Attributes:
-        gain: Of all, nats, less what their places and sizes gain by chance.
-        first: A look at the one that tells most, without the others.
+        gain: Log likelihood ratio of all, nats, less what their onsets and sizes gain by chance.
+        first: The ordinates without all but the most significant step.
     """
 
     gain: float
-    first: SlowLook
+    first: SlowAnalysis
 
 
 @dataclass(frozen=True, eq=False)
-class SlowLook:
-    """All that scans need of a case; what is derived is computed once."""
+class SlowAnalysis:
+    """Ordinates of a comparison's recording, and what may explain them.
 
-    simulation: Told
+    Attributes:
+        noise: Slow noise around that of the simulation.
+        y: Ordinates `(sensor, ordinate)`.
+        null: Fit without an effect.
+        families: Templates.
+    """
+
     noise: SlowNoise
     y: Tensor
     null: Fit
@@ -144,8 +116,14 @@ class SlowLook:
 
     @cached_property
     def scans(self) -> tuple[Scan, ...]:
-        """The best of each mechanism; of temperatures the best channel, for having looked at them all."""
-        scans = self._alike([self._scan(family) for family in self.families])
+        """The best scan of each mechanism, p values corrected for its families.
+
+        What a path of another form leaves is correlated among sensors: weighed by that, the worst form would gain most.
+        All gains are therefore those beside the correlation that the most likely effect leaves.
+        """
+        scans = [self._scan(family) for family in self.families]
+        relation = max(scans, key=lambda scan: float(scan.fit.value.sum())).relation
+        scans = [replace(scan, gain=scan.gain_beside(relation), relation=relation) for scan in scans]
         best = []
         for name in dict.fromkeys(s.family.name for s in scans):
             own = [s for s in scans if s.family.name == name]
@@ -153,27 +131,17 @@ class SlowLook:
             best.append(replace(first, p_value=sidak(min(s.p_value for s in own), len(own))))
         return tuple(best)
 
-    @staticmethod
-    def _alike(scans: list[Scan]) -> list[Scan]:
-        """Scans with their gains beside what the sensors have in common where the likeliest of them is explained.
-
-        What a path of another form leaves is common to them as well: weighed by that, the worst would gain most.
-        """
-        relation = max(scans, key=lambda scan: float(scan.fit.value.sum())).relation
-        return [replace(scan, gain=scan.gain_beside(relation), relation=relation) for scan in scans]
-
     def scan(self, name: str) -> Scan | None:
-        """That of one mechanism; None where there is nothing to scan."""
+        """The scan of one mechanism; None where there is nothing to scan."""
         return next((s for s in self.scans if s.family.name == name), None)
 
     @cached_property
     def wandering(self) -> float:
-        """Nats that slow noise gains in place of any effect, its strength free in each sensor, less one for each."""
+        """Nats that slow noise of any strength gains in place of an effect, less one for each sensor."""
         spread = self.noise.spread.clone()
-        spread[1:] = _FREE  # all but what is fast
+        spread[1:] = 5.0  # sd of log factors of which nothing is known
         free = best_fit(replace(self.noise, spread=spread), self.y, start=self.null.log_factors)
-        before, after = (float((self.y.square() / v + v.log()).sum()) / 2 for v in (self.null.variance, free.variance))
-        return before - after - len(self.y)
+        return free.log_likelihood(self.y) - self.null.log_likelihood(self.y) - len(self.y)
 
     @cached_property
     def several_steps(self) -> SeveralSteps | None:
@@ -183,188 +151,143 @@ class SlowLook:
         """
         n_sensors, n_edges = self.of_steps[0].shape
         cost = math.log(n_edges) + n_sensors
-        at, sizes, told = steps_one_by_one(*self.of_steps, 2 * cost, MOST_STEPS)
-        if not told or len(told) == MOST_STEPS:
+        at, sizes, gains = steps_one_by_one(*self.of_steps, 2 * cost, MOST_STEPS)
+        if not gains or len(gains) == MOST_STEPS:
             return None
-        # One within a block seems to be two at both ends of it.
-        others = [k for k, place in enumerate(at) if abs(place - at[0]) > 1]
+        # A step within a block seems to be two at both ends of it.
+        others = [k for k, edge in enumerate(at) if abs(edge - at[0]) > 1]
         if not others:
             return None
         paths = edges()
         fit = best_fit(self.noise, self.y, paths[at], self.null.log_factors)
-        left = self.y - fit.size @ paths[at]
-        before, after = (
-            float((y.square() / v + v.log()).sum()) / 2 for y, v in ((self.y, self.null.variance), (left, fit.variance))
-        )
-        gain = before - after - cost * len(at)
+        gain = fit.log_likelihood(self.y, paths[at]) - self.null.log_likelihood(self.y) - cost * len(at)
         alone = self.y - sizes[:, others] @ paths[torch.tensor(at)[others]]
         families = tuple(family for family in self.families if family.name == "step")
         return SeveralSteps(gain, replace(self, y=alone, null=best_fit(self.noise, alone), families=families))
 
-    def _scan(self, family: Family) -> Scan:
-        heard = self._heard(family)
-        found, coarse = best_place(self.noise, self.y, self.null, family, heard), family
-        if float(found.p_value) < _DOUBTED and family.name in _FINE:
-            family, found = self._finer(family, found, heard)
-        p_value = float(found.p_value)
-        if p_value < _DOUBTED:
-            p_value = max(p_value, monte_carlo_p_value(p_value, best_place(*self._twins, coarse, heard).p_value))
-        best, gain, looks = int(found.at), float(found.gain), len(coarse.places)
-        return Scan(family, best, found.fit, found.held, found.z, gain, p_value, found.relation, found.lengths, looks)
-
-    def _finer(self, family: Family, found: Best, heard: Tensor) -> tuple[Family, Best]:
-        """The likeliest place of all about the best of a grid, with places about as far apart as the data tell.
-
-        Of a strong effect the best place of a grid leaves more than the noise, and the more noise there seems to be the
-        less it tells of the place: both are sought together.
-        """
-        looks, at = len(family.places), int(found.at)
-        best, fit = likeliest(self.noise, self.y, family, at, found.fit)
-        for _ in range(_FINER):
-            told = explained_by(self.y, fit.variance, family.designs, _concerned(found.held))
-            likely = told > told.max() - 2 * PLAUSIBLE
-            if int(likely.sum()) >= _LIKELY:
-                break
-            family = between(family, likely, best)
-        family = family.at(*(torch.cat([p, b]) for p, b in zip(family.where, best, strict=True)))
-        last = torch.tensor(len(family.places) - 1)
-        return family, _judged(self.y, self.noise.own, self.null, family, last, fit, found.lengths, heard, looks)
-
-    def _heard(self, family: Family) -> Tensor:
-        """Sensors that count: 0 for steps in those that jump to and fro, which is another mechanism."""
-        return torch.ones(len(self.y), dtype=torch.float64) if family.name != "step" else 1.0 - self._to_and_fro
-
     @cached_property
     def of_steps(self) -> tuple[Tensor, Tensor]:
-        """Products with steps at the edges of blocks, weighted as the simulation's noise has it.
+        """Products with steps at the edges of blocks, weighted by the simulation's noise.
 
         Those of the data `(sensor, edge)`, and of the steps with each other `(sensor, edge, edge)`.
         """
         weight, jumps = 1 / self.noise.own, edges()
         return (weight * self.y) @ jumps.mT, (weight[:, None] * jumps) @ jumps.mT
 
-    @cached_property
-    def _to_and_fro(self) -> Tensor:
-        pairs = zip(*self.of_steps, strict=True)
-        return torch.tensor([jumps_to_and_fro(*pair) for pair in pairs], dtype=torch.float64)
+    def _scan(self, family: Family) -> Scan:
+        """The best template with the noise refitted beside it, and again with the noise that it leaves."""
+        steady = torch.ones(len(self.y), dtype=torch.float64)
+        if family.name == "step":  # jumps between two levels are another mechanism
+            steady -= torch.tensor([jumps_to_and_fro(*pair) for pair in zip(*self.of_steps, strict=True)]).to(steady)
+        scan: Scan | None = None
+        fit, relation = self.null, related(self.y, self.null.variance, self.noise.own)
+        lengths = torch.full_like(steady, math.inf)
+        for _ in range(2):
+            z = least_squares(self.y, fit.variance, family.designs).z  # (template, sensor, column)
+            if family.designs.shape[1] == 1:
+                paths = family.designs[:, 0]
+                lengths = curve_length(fit.variance, paths, (1 / fit.variance) @ paths.square().mT)
+            at = int(most_extreme(z.movedim(0, 1) * steady[:, None, None], lengths, relation))
+            fit = best_fit(self.noise, self.y, family.designs[at], self.null.log_factors)
+            again = self._judged(family, at, fit, lengths, steady, len(family.points))
+            relation = again.relation
+            scan = again if scan is None or again.p_value < scan.p_value else scan
+        assert scan is not None
+        if scan.p_value < _REFINED and family.design_at is not None:
+            family, at, fit = self._refined(scan)
+            scan = self._judged(family, at, fit, scan.lengths, steady, scan.searched)
+        return scan
 
-    @cached_property
-    def _twins(self) -> tuple[SlowNoise, Tensor, Fit]:
-        """Noise as their simulations tell it, ordinates `(twin, sensor, ordinate)`, and fits without an effect.
+    def _judged(self, family: Family, at: int, fit: Fit, lengths: Tensor, steady: Tensor, searched: int) -> Scan:
+        """A template with the noise that it leaves, the best of so many `searched` along a curve."""
+        design = family.designs[at]
+        left = self.y - fit.size @ design
+        relation = related(left, fit.variance, self.noise.own)
+        held = least_squares(self.y, fit.variance, design).z * steady[:, None]
+        # Without the effect the noise that fits best may be stronger, which leaves less of the effect.
+        ratio = 2 * float((fit.value - self.null.value).sum().clamp(min=0))
+        share = min(ratio / max(float(held.square().sum()), 1e-300), 1.0)
+        z = held * math.sqrt(share) / _excess(left, fit.variance).sqrt()[:, None]
+        gain, p_value = (float(number) for number in surprise(z, lengths, relation, searched))
+        p_value = studentised(p_value, self._dof(design, fit))
+        return Scan(family, at, fit, held, z, gain, p_value, relation, lengths, searched)
 
-        A twin has noise that may be behind this simulation; its own simulation tells of it no better than this one.
+    def _dof(self, design: Tensor, fit: Fit) -> float:
+        """Complex ordinates from which the variance of a template's size is known (Satterthwaite).
+
+        What is faster than a block is known exactly; neighbouring bands of the slow noise are correlated, and half of
+        their ordinates count.
         """
-        generator = torch.Generator().manual_seed(0)
-        given = self.simulation
-        behind = given.drawn(given.coefficients().expand(_TWINS, -1, -1), generator).coefficients()
-        noise = given.drawn(behind, generator).noise()
-        normal = torch.randn(_TWINS, *self.y.shape, generator=generator, dtype=torch.float64)
-        y = given.noise_of(behind).own.sqrt() * normal
-        return noise, y, best_fit(noise, y)
+        slow = 1 - self.noise.parts[:, 0] * fit.log_factors[:, :1].exp() / fit.variance  # share of the variance
+        weight = design[0].square() / fit.variance
+        return self.noise.dof / 2 / float((weight * slow).sum() / weight.sum()) ** 2
 
+    def _refined(self, scan: Scan) -> tuple[Family, int, Fit]:
+        """The best template between those of the grid, in a family as fine as the data determine its numbers.
 
-def best_place(noise: SlowNoise, y: Tensor, null: Fit, family: Family, heard: Tensor) -> Best:
-    """The best template with the noise refitted beside it, and again with the noise that it leaves.
-
-    Args:
-        noise: Of `y`.
-        y: Ordinates `(..., sensor, ordinate)`.
-        null: Fit without an effect.
-        family: Templates.
-        heard: 1 for sensors that count, else 0, `(sensor,)`.
-    """
-    best: Best | None = None
-    fit, relation, designs, looks = null, related(y, null.variance, noise.own), family.designs, len(family.places)
-    lengths = y.new_full(y.shape[:-1], math.inf)
-    for _ in range(_SCANS):
-        z = columns(y, fit.variance, designs)
-        if designs.shape[1] == 1:
-            lengths = curve_length(fit.variance, family.templates, scores(y, fit.variance, family.templates)[1])
-        at = most_extreme(z * heard[:, None, None], lengths, relation)
-        fit = best_fit(noise, y, designs[at], null.log_factors)
-        now = _judged(y, noise.own, null, family, at, fit, lengths, heard, looks)
-        relation = now.relation
-        best = now if best is None else where(now.p_value < best.p_value, now, best)
-    assert best is not None
-    return best
-
-
-def _judged(
-    y: Tensor, own: Tensor, null: Fit, family: Family, at: Tensor, fit: Fit, lengths: Tensor, heard: Tensor, looks: int
-) -> Best:
-    """A template with the noise that it leaves, one of so many `looks` along a curve; see `best_place`."""
-    x = family.designs[at]
-    left = y - fit.size @ x
-    relation = related(left, fit.variance, own)
-    root, score = normal_equations(y, fit.variance, x)
-    held = torch.linalg.solve_triangular(root, score[..., None], upper=False)[..., 0] * heard[:, None]
-    # The noise that fits best without the effect may be stronger in all sensors: that leaves less of it.
-    ratio = 2 * (fit.value - null.value).sum(-1).clamp(min=0)
-    share = (ratio / held.square().sum((-1, -2)).clamp(min=1e-300)).clamp(max=1)
-    z = held * share.sqrt()[..., None, None] / _excess(left, fit.variance).sqrt()[..., None]
-    gain, p_value = surprise(z, lengths, relation, looks)
-    return Best(at, fit, held, z, gain, p_value, relation, lengths)
+        Of a strong effect the best template of a grid leaves more than the noise, and the stronger the noise seems the
+        less it determines the numbers: the grid closes in on the plausible templates with the noise refitted each time.
+        """
+        family, at, fit = scan.family, scan.best, scan.fit
+        for _ in range(12):  # each at least halves the grid
+            gains = log_likelihood_ratios(self.y, fit.variance, family.designs, scan.sensors)
+            likely, at = gains > gains.max() - 2 * PLAUSIBLE, int(gains.argmax())
+            fit = best_fit(self.noise, self.y, family.designs[at], fit.log_factors)
+            if int(likely.sum()) >= 24:  # of 96: a quarter of a standard deviation apart
+                break
+            family = _between(family, likely)
+        return family, at, fit
 
 
 @derived
-def slow_look(comparison: Comparison) -> SlowLook:
-    """What is slow in a case, looked at once for the witness and for all mechanisms."""
-    simulation, y = told(comparison), slow_ordinates(comparison.observed.steady[0])
-    noise = simulation.noise()
-    families = (steps(comparison), warm_ups(comparison), double_warm_ups(comparison), *temperatures(comparison))
-    return SlowLook(simulation, noise, y, best_fit(noise, y), families)
+def slow_analysis(comparison: Comparison) -> SlowAnalysis:
+    """The slow ordinates of a comparison, with steps, warm-ups and temperatures as what may explain them."""
+    noise, y = simulated_slow_noise(comparison), slow_ordinates(comparison.observed.steady[0])
+    families = (steps(comparison), warm_ups(comparison, 1), warm_ups(comparison, 2), *temperatures(comparison))
+    return SlowAnalysis(noise, y, best_fit(noise, y), families)
 
 
 def slow_test(comparison: Comparison) -> TestResult:
     """A step, a warm-up, or a temperature that the recording follows."""
-    look = slow_look(comparison)
-    scan = min(look.scans, key=lambda s: s.p_value)
-    which = concerned(scan)
-    largest = max(which, key=lambda i: float(scan.z[i].norm()))
-    seconds = scan.place / comparison.info.rate
-    seen = {
+    analysis = slow_analysis(comparison)
+    scan = min(analysis.scans, key=lambda s: s.p_value)
+    largest = max(scan.sensors, key=lambda i: float(scan.z[i].norm()))
+    seconds = scan.point[0] / comparison.info.rate
+    words = {
         "step": f"the bias steps near {seconds:.4g} s",
         "warm_up_transient": f"the bias decays after the start, over some {seconds:.3g} s",
         "temperature_drift": f"the bias follows {scan.family.channel}",
     }[scan.family.name]
     return TestResult(
         "slow",
-        sidak(scan.p_value, len(look.scans)),
-        f"{seen}, most clearly in sensor {comparison.info.sensors[largest]}",
-        sensors=which,
+        sidak(scan.p_value, len(analysis.scans)),
+        f"{words}, most clearly in sensor {comparison.info.sensors[largest]}",
+        sensors=scan.sensors,
         time_s=seconds if scan.family.name == "step" else None,
         channel=scan.family.channel,
     )
 
 
-def concerned(scan: Scan) -> tuple[int, ...]:
-    """Sensors in which a template is there, once it is there at all."""
-    return _concerned(scan.held)
-
-
-def _concerned(held: Tensor) -> tuple[int, ...]:
-    return included_sensors(held.square().sum(-1), held.shape[-1], _SEEN).positions
-
-
-def explained_by(y: Tensor, variance: Tensor, designs: Tensor, which: Sequence[int]) -> Tensor:
-    """Twice the nats that each template explains in some sensors, `(template,)`."""
-    return columns(y, variance, designs)[list(which)].square().sum((0, -1))
+def log_likelihood_ratios(y: Tensor, variance: Tensor, designs: Tensor, sensors: Sequence[int]) -> Tensor:
+    """Log likelihood ratio of each template in some sensors, nats, with the noise held, `(template,)`."""
+    which = list(sensors)
+    return least_squares(y[which], variance[which], designs).z.square().sum((-1, -2)) / 2
 
 
 def steps_one_by_one(score: Tensor, gram: Tensor, least: float, most: int) -> tuple[list[int], Tensor, list[float]]:
-    """Steps, each where all sensors together tell most of it beside those before.
+    """Steps by forward selection: each where it gains most in all sensors together beside those before.
 
     Args:
         score: Weighted products of the data with steps at the edges of blocks, `(sensor, edge)`.
         gram: Those of the steps with each other, `(sensor, edge, edge)`.
-        least: Twice the nats that a step tells.
-        most: Steps.
+        least: Twice the nats that a step gains.
+        most: Number of steps at most.
 
     Returns:
-        Edges, sizes `(sensor, step)`, and twice the nats that each told when it was found.
+        Edges, sizes `(sensor, step)`, and twice the nats that each gained when it was found.
     """
     at: list[int] = []
-    told: list[float] = []
+    gains: list[float] = []
     while True:
         within = gram[:, at][:, :, at]
         sizes = torch.linalg.solve(within, score[:, at, None])[..., 0]
@@ -374,83 +297,66 @@ def steps_one_by_one(score: Tensor, gram: Tensor, least: float, most: int) -> tu
         information[:, at] = math.inf
         squares = (left.square() / information).sum(0)
         if float(squares.max()) < least or len(at) == most:
-            return at, sizes, told
+            return at, sizes, gains
         at.append(int(squares.argmax()))
-        told.append(float(squares.max()))
+        gains.append(float(squares.max()))
 
 
 def jumps_to_and_fro(score: Tensor, gram: Tensor) -> bool:
-    """Whether a sensor has several jumps that lead between two levels, by its products `(edge,)`, `(edge, edge)`."""
-    at, sizes, _ = steps_one_by_one(score[None], gram[None], _JUMP**2, _MOST_JUMPS)
-    if len(at) < _FEWEST_JUMPS:
+    """Whether four or more jumps of a sensor lead between two levels, by its products `(edge,)`, `(edge, edge)`."""
+    at, sizes, _ = steps_one_by_one(score[None], gram[None], 5.0**2, 10)
+    if len(at) < 4:
         return False
     jumps = sizes[0]
     levels = torch.cat([torch.zeros_like(jumps[:1]), jumps[torch.tensor(at).argsort()].cumsum(0)])
-    return bool(levels.amax() - levels.amin() < _TWO_LEVELS * jumps.abs().median())
+    return bool(levels.amax() - levels.amin() < 1.6 * jumps.abs().median())  # a staircase of two jumps: 2
 
 
 def related(left: Tensor, variance: Tensor, own: Tensor) -> Tensor:
-    """Correlation of the sensors' slow noise `(..., sensor, sensor)`, shrunk towards none by as much as is chance.
+    """Correlation of the sensors' slow noise `(sensor, sensor)`, shrunk towards none by as much as is chance.
 
     Noise far above the simulation's `own` variance is another one, which sensors may share almost wholly: how little of
-    it they do not share falls off in its own way, so that no ordinate tells it for another.
+    it they do not share falls off in its own way, so that no ordinate shows it.
+
+    References: Ledoit and Wolf, A well-conditioned estimator for large-dimensional covariance matrices, Journal of
+    Multivariate Analysis 88 (2004), 365.
     """
-    low = (left / variance.sqrt())[..., :_LOW]
+    low = (left / variance.sqrt())[:, :_LOW]
     c = low @ low.mT
-    size = c.diagonal(dim1=-1, dim2=-2).sqrt()
-    c = c / size[..., :, None] / size[..., None, :]
-    upper = torch.triu_indices(c.shape[-1], c.shape[-1], 1)
-    squares = c[..., upper[0], upper[1]].square()
-    by_chance = (1 - squares).square().sum(-1) / _LOW
-    share = (by_chance / squares.sum(-1).clamp(min=1e-300)).clamp(max=1)[..., None, None]
-    c = (1 - share) * c + share * torch.eye(c.shape[-1], dtype=c.dtype)
-    louder = (variance / own)[..., :_LOW].log().mean((-1, -2)).exp()[..., None]
-    if bool((louder <= _FAR_ABOVE).all()):
+    size = c.diagonal().sqrt()
+    c = c / size[:, None] / size
+    eye = torch.eye(len(c), dtype=c.dtype)
+    squares = c[eye == 0].square()
+    share = min(float((1 - squares).square().sum() / _LOW / squares.sum().clamp(min=1e-300)), 1.0)
+    c = (1 - share) * c + share * eye
+    above = float((variance / own)[:, :_LOW].log().mean().exp())
+    if above <= _FAR_ABOVE:
         return c
     values, vectors = torch.linalg.eigh(c)
-    return (vectors * values.maximum(1 - _FAR_ABOVE / louder)[..., None, :]) @ vectors.mT
+    return (vectors * values.clamp(min=1 - _FAR_ABOVE / above)) @ vectors.mT
 
 
-def likeliest(noise: SlowNoise, y: Tensor, family: Family, start: int, fit: Fit) -> tuple[list[Tensor], Fit]:
-    """The place, `(1,)`, and other of greatest likelihood from one of a family on, with the noise best for each."""
-    shift = float(family.places[family.places > 0].min())  # a lag may be none
-
-    def places(x: Array) -> list[Tensor]:
-        return [torch.tensor([max(math.exp(v) - shift, 0.0)], dtype=torch.float64) for v in x]
-
-    def fitted(x: Array) -> Fit:
-        return best_fit(noise, y, family.at(*places(x)).designs[0], fit.log_factors)
-
-    def loss(x: Array) -> float:
-        if (x < first).any() or (x > last).any() or (len(x) > 1 and x[1] - x[0] < _LEAST_APART):
-            return math.inf
-        return -float(fitted(x).value.sum())
-
-    first, last = (
-        np.array([math.log(float(limit(p)) + shift) for p in family.where]) for limit in (torch.min, torch.max)
-    )
-    x0 = np.array([math.log(float(p[start]) + shift) for p in family.where])
-    simplex = np.vstack([x0, x0 + np.diag(np.where(x0 + _SIDE > last, -_SIDE, _SIDE))])
-    options = {"initial_simplex": simplex, "xatol": _SURELY_THERE, "fatol": _SAME, "maxfev": _TRIES}
-    found = minimize(loss, x0, method="Nelder-Mead", options=options)
-    return places(found.x), fitted(found.x)
+def studentised(p_value: float, dof: float) -> float:
+    """p value with noise known from so many complex ordinates: the tail of F with 2 and 2 dof in place of `exp(-x)`."""
+    return (1 - math.log(max(p_value, 1e-300)) / dof) ** -dof if math.isfinite(dof) else p_value
 
 
-def between(family: Family, likely: Tensor, best: Sequence[Tensor]) -> Family:
-    """The family between the neighbours of those places, and others, that are likely `(template,)`, and the best."""
+def _between(family: Family, likely: Tensor, number: int = 96) -> Family:
+    """A grid of so many templates between the neighbours of those that are likely, `(template,)`."""
     spans = []
-    for places in family.where:
-        every = places.unique()
-        at = torch.searchsorted(every, places[likely])
-        spans.append((every[max(int(at.min()) - 1, 0)], every[min(int(at.max()) + 1, len(every) - 1)]))
-    n = round(_CLOSER ** (1 / len(spans)))
-    grids = [torch.linspace(float(low), float(high), n, dtype=torch.float64) for low, high in spans]
-    grid = torch.meshgrid(*grids, indexing="ij")
-    return family.at(*(torch.cat([p.flatten(), b]) for p, b in zip(grid, best, strict=True)))
+    for numbers in family.points.mT:
+        every = numbers.unique()
+        at = torch.searchsorted(every, numbers[likely].contiguous())
+        spans.append((float(every[max(int(at.min()) - 1, 0)]), float(every[min(int(at.max()) + 1, len(every) - 1)])))
+    per_number = round(number ** (1 / len(spans)))
+    grids = [torch.linspace(low, high, per_number, dtype=torch.float64) for low, high in spans]
+    points = torch.cartesian_prod(*grids).view(-1, len(spans))
+    if len(spans) == 2:  # closer time constants are one, with sizes that cancel each other
+        points = points[points[:, 1] > 1.5 * points[:, 0]]
+    return family.at(points)
 
 
 def _excess(left: Tensor, variance: Tensor) -> Tensor:
-    """By how much steps anywhere are larger than the noise lets expect, mean squares, 1 at least, `(..., sensor)`."""
-    size, information = scores(left, variance, edges())
-    mean = (size.square() * information).mean(-1)
-    return ((mean + mean.mean(-1, keepdim=True)) / 2).clamp(min=1)
+    """Mean square of steps at all edges in what is left, over what the noise lets expect, 1 at least, `(sensor,)`."""
+    mean = least_squares(left, variance, edges()[:, None]).z.square().mean((0, 2))
+    return ((mean + mean.mean()) / 2).clamp(min=1)

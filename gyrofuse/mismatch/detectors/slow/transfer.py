@@ -1,4 +1,4 @@
-"""What lies between an auxiliary channel and the sensors: a filter that all of them share.
+"""Filter between an auxiliary channel and the sensors that all of them share.
 
 `x_i(t) = sum_k g_ik (m * a_k)(t)` with one causal response `m` for all sensors `i` and rows `k`: a mount, a lag,
 another converter. It is a sum of the channel itself and Laguerre's filters of one pole `p`, a low-pass and all-passes
@@ -21,12 +21,7 @@ from torch import Tensor
 from gyrofuse.mismatch.detectors.slow.channels import ChannelFit, regress
 from gyrofuse.mismatch.signals.comparison import Comparison
 
-_COARSE, _ORDER = 4, 9  # terms of a response, the channel itself included: to find a pole, and in the end
-_CORNERS, _HIGHEST, _LOWEST = 12, 0.25, 8.0  # that are tried, from the highest, cycles per sample, to so many cycles
-_ROUNDS = 40
-_LEAST = 60.0  # statistic beyond chance, at once and a quarter of a cycle late, of which a part could be a response's
-_SENSORS = 4  # that tell the response, those that show most of the channel
-_ALIKE = 0.5  # share of what free responses of each sensor and row explain, from which it is one and the same
+_COARSE, _ORDER = 4, 9  # terms of a response, the channel itself included: to find the pole, and at most in the end
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,20 +48,25 @@ class Transfer:
         return torch.tensordot(self.weights.to(low.dtype), torch.stack(made), 1)
 
     def scaled(self, comparison: Comparison, rows: Tensor, gains: Tensor) -> tuple[Transfer, float, float]:
-        """The same of size one where most is told of gains `(sensor, row)` on rows `(row, time)`.
+        """The same response, normalised to one where the gains have most of their information.
+
+        Args:
+            comparison: Recording and simulation.
+            rows: Made of the channel, `(row, time)`.
+            gains: Gains on the rows, `(sensor, row)`.
 
         Returns:
-            It, the frequency there in cycles per sample, and the cycles by which it is late there.
+            The response, the mean frequency of the information in cycles per sample, and the delay there in cycles.
         """
         spectrum = torch.fft.rfft(rows)[:, 1:]
         f = torch.arange(1, spectrum.shape[-1] + 1, dtype=torch.float64) / rows.shape[-1]
-        told = ((gains.to(spectrum.dtype) @ spectrum).abs().square() / comparison.base.spectrum(f)).sum(0)
-        told = told / told.sum()
+        information = ((gains.to(spectrum.dtype) @ spectrum).abs().square() / comparison.base.spectrum(f)).sum(0)
+        information = information / information.sum()
         response = self.response(f)
-        mean = (told * response).sum()
-        size = float((told * response.abs().square()).sum().sqrt()) * (1.0 if float(mean.real) > 0 else -1.0)
+        mean = (information * response).sum()
+        size = float((information * response.abs().square()).sum().sqrt()) * (1.0 if float(mean.real) > 0 else -1.0)
         turn = float((mean / size).angle()) / (2 * math.pi)
-        return Transfer(self.pole, self.weights / size), float(told @ f), -turn
+        return Transfer(self.pole, self.weights / size), float(information @ f), -turn
 
 
 def terms(rows: Tensor, pole: float, count: int) -> Tensor:
@@ -89,10 +89,11 @@ def likeliest_transfer(comparison: Comparison, rows: Tensor, fit: ChannelFit) ->
         rows: Made of the channel, without means.
         fit: Of plain gains.
     """
-    if fit.excess + fit.quadrature - fit.gains.numel() < _LEAST:
+    if fit.excess + fit.quadrature - fit.gains.numel() < 60:  # statistic that leaves something to a response's numbers
         return None
-    which = fit.squares.topk(min(_SENSORS, len(fit.squares))).indices.sort().values
-    corners = torch.logspace(math.log10(_HIGHEST), math.log10(_LOWEST / comparison.n_samples), _CORNERS).tolist()
+    which = fit.squares.topk(min(4, len(fit.squares))).indices.sort().values  # the sensors that show most of it
+    # Corners from half the Nyquist frequency to eight cycles in the record.
+    corners = torch.logspace(math.log10(0.25), math.log10(8 / comparison.n_samples), 12).tolist()
     poles = [math.exp(-2 * math.pi * corner) for corner in corners]
     coarse = [_through(comparison, rows, pole, _COARSE, which)[0] for pole in poles]
     best = max(range(len(poles)), key=lambda k: coarse[k])
@@ -102,9 +103,16 @@ def likeliest_transfer(comparison: Comparison, rows: Tensor, fit: ChannelFit) ->
 
 
 def _through(comparison: Comparison, rows: Tensor, pole: float, order: int, which: Tensor) -> tuple[float, Transfer]:
-    """The best response of a pole and of some terms at most, and its nats over a plain gain less what it costs.
+    """Nats of the best response of a pole over a plain gain, less the cost of its numbers, and the response.
 
-    None are left where responses that each sensor and row has for itself explain more than twice as much.
+    Minus infinity where responses that each sensor and row has for itself explain more than twice as much.
+
+    Args:
+        comparison: Recording and simulation.
+        rows: Made of the channel, `(row, time)`.
+        pole: Pole of the response.
+        order: Terms of the response at most.
+        which: Positions of the sensors that determine it.
     """
     plain = Transfer(pole, torch.ones(1, dtype=torch.float64))
     full = regress(comparison, terms(rows, pole, order).flatten(0, 1), which=which)
@@ -119,8 +127,8 @@ def _through(comparison: Comparison, rows: Tensor, pole: float, order: int, whic
     nets = [gain - least - len(weights) * cost for gain, weights in found[1:]]
     best = max(range(len(nets)), key=lambda k: nets[k])
     gain, weights = found[best + 1]
-    alike = gain > _ALIKE * full.statistic / 2
-    return (nets[best] if alike else -math.inf), Transfer(pole, weights)
+    shared = gain > full.statistic / 4
+    return (nets[best] if shared else -math.inf), Transfer(pole, weights)
 
 
 def _explained(matrix: Tensor, moment: Tensor) -> tuple[float, Tensor]:
@@ -134,13 +142,13 @@ def _explained(matrix: Tensor, moment: Tensor) -> tuple[float, Tensor]:
     weights = torch.zeros(count, dtype=torch.float64)
     weights[0] = 1.0
     nats = 0.0
-    for _ in range(_ROUNDS if count > 1 else 1):
+    for _ in range(40 if count > 1 else 1):
         own = torch.einsum("b,ibkjcl,c->ikjl", weights, matrix, weights).reshape(n_sensors * n_rows, -1)
         gains = torch.linalg.solve(own, torch.einsum("b,ibk->ik", weights, moment).flatten()).view(n_sensors, n_rows)
         shared = torch.einsum("ik,ibkjcl,jl->bc", gains, matrix, gains)
         score = torch.einsum("ik,ibk->b", gains, moment)
         weights = torch.linalg.lstsq(shared, score[:, None], driver="gelsd").solution[:, 0]
         last, nats = nats, float(score @ weights) / 2
-        if nats - last < 0.01:
+        if nats - last < 0.01:  # far below what a decision hangs on
             break
     return nats, weights

@@ -9,7 +9,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum, _atoms, _time_constants
+from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum, ar1_time_constants, atom_spectra
 from gyrofuse.mismatch.signals.psd import Bands
 from gyrofuse.noise.processes import AR1
 
@@ -38,7 +38,7 @@ class Parts:
         """
         fastest, faint = 3.0, 0.3
         c = self.base.coefficients
-        tau = torch.tensor((0.0, 0.0, *_time_constants(self.base.n_samples), math.inf), dtype=c.dtype)
+        tau = torch.tensor((0.0, 0.0, *ar1_time_constants(self.base.n_samples), math.inf), dtype=c.dtype)
         walk = (tau >= self.base.n_samples / (2 * math.pi) / 2.2).expand_as(c)
         fast = ((tau < fastest) & (tau > 0)).expand_as(c)
         height = (c / (1 - torch.exp(-1 / tau.clamp(min=1e-9))).square())[:, fast[0]].sum(-1, keepdim=True)
@@ -49,12 +49,12 @@ class Parts:
     @cached_property
     def densities(self) -> Tensor:
         """Of the parts, `(part, sensor, node)`."""
-        return torch.stack(self.coefficients) @ _atoms(self.base.n_samples, self.f)
+        return torch.stack(self.coefficients) @ atom_spectra(self.base.n_samples, self.f)
 
     @cached_property
     def _slowest(self) -> Tensor:
         """Density of every atom with coefficient one at one cycle per record, `(atom,)`."""
-        return _atoms(self.base.n_samples, torch.tensor([1 / self.base.n_samples], dtype=self.f.dtype))[:, 0]
+        return atom_spectra(self.base.n_samples, torch.tensor([1 / self.base.n_samples], dtype=self.f.dtype))[:, 0]
 
     @cached_property
     def growing_walk(self) -> Tensor:
@@ -69,12 +69,12 @@ class Parts:
     @cached_property
     def grown(self) -> Tensor:
         """Density of that walk, `(sensor, node)`."""
-        return self.growing_walk[:, None] * _atoms(self.base.n_samples, self.f)[-1]
+        return self.growing_walk[:, None] * atom_spectra(self.base.n_samples, self.f)[-1]
 
     @cached_property
     def unseen_white(self) -> Tensor:
         """Variance of white noise that records would not show below the rest, `(sensor,)`; 0 where they show it."""
-        fastest = _atoms(self.base.n_samples, torch.tensor([0.5], dtype=self.f.dtype))[:, 0]
+        fastest = atom_spectra(self.base.n_samples, torch.tensor([0.5], dtype=self.f.dtype))[:, 0]
         return ((_UNSEEN * self.base.coefficients - self.coefficients[0]) @ fastest).clamp(min=0)
 
     @cached_property
@@ -88,7 +88,7 @@ class Parts:
         n, c = self.base.n_samples, self.base.coefficients
         middle = math.sqrt(0.5 / n)  # cycles per sample
         f = torch.logspace(math.log10(lowest / n), math.log10(0.5), n_frequencies, dtype=c.dtype)
-        has = ((self.coefficients[1] @ _atoms(n, f)) / self.base.spectrum(f)).amax(-1, keepdim=True) > _CHANCE
+        has = ((self.coefficients[1] @ atom_spectra(n, f)) / self.base.spectrum(f)).amax(-1, keepdim=True) > _CHANCE
         plateau = _UNSEEN * self.base.spectrum(torch.tensor([middle], dtype=c.dtype))
         return 2 * math.pi * middle, torch.where(has, 0.0, plateau)
 
@@ -101,7 +101,7 @@ class Parts:
     @cached_property
     def _corners(self) -> tuple[Tensor, Tensor]:
         """Inverse time constants `(atom, 1, 1)` of the AR1s that some sensor has, and plateaus `(atom, sensor, 1)`."""
-        rate = 1 / torch.tensor(_time_constants(self.base.n_samples), dtype=torch.float64)
+        rate = 1 / torch.tensor(ar1_time_constants(self.base.n_samples), dtype=torch.float64)
         plateau = (self.coefficients[1][:, 2:-1] / (1 - torch.exp(-rate)).square()).mT
         has = (plateau > 0).any(-1)
         return rate[has][:, None, None], plateau[has][..., None]

@@ -42,8 +42,8 @@ class ChannelGain(Mechanism):
 
     Attributes:
         channel: Its name.
-        coupling: `(sensor, row)`, signal per unit of the rows where the channel tells most; 0 for sensors that do not
-            show it.
+        coupling: `(sensor, row)`, signal per unit of the rows at the frequencies of most information; 0 for sensors
+            that do not show it.
         kind: Which rows are made from the channel.
         pole, response: Of `m`.
     """
@@ -117,7 +117,7 @@ class ChannelGain(Mechanism):
                 f"; it comes {1e3 * cycles / hertz:.3g} ms late near {hertz:.3g} Hz, and not at every frequency "
                 "alike, as through a mount or a filter: its form is not quite that of a gain"
             )
-        chance = fit.gains.numel()  # mean of what is seen a quarter of a cycle late, with the variance twice as large
+        chance = fit.gains.numel()  # mean of the statistic a quarter of a cycle late, with the variance twice as large
         if fit.quadrature > chance + _SCATTER * math.sqrt(2 * chance) + _LATE * fit.excess:
             return None
         present = included_sensors(fit.squares, fit.gains.shape[-1]).positions

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 
 _MILLION = 1e6
-_ROUNDS, _BLOCKS_AROUND = 2, 3  # places of losses and amplitudes in turns, and blocks in which each is placed
-_AS_GOOD = 2.0  # nats within which another place is as good
+_ROUNDS, _BLOCKS_AROUND = 2, 3  # of times of losses and amplitudes in turns, and blocks around each that are searched
+_AS_GOOD = 2.0  # nats within which another sample is as good: the 95 % limits of a likelihood ratio
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class ClockSkew(Mechanism):
     that could be seen.
 
     Attributes:
-        sensors: Those concerned.
+        sensors: Positions of those sensors.
         skew: What they are ahead per sample.
         losses: First sample after each loss, and how many samples were lost, in the order of time.
         frequency: Of the tone that shows it, cycles per sample.
@@ -114,7 +114,7 @@ class ClockSkew(Mechanism):
     def _placed(self, comparison: Comparison) -> tuple[ClockSkew, list[tuple[int, int]]]:
         """Losses at the sample that suits the tone best, each between the blocks around it, and limits of each.
 
-        Until a loss the tone is what it was, from there on what it turns to: a loud tone tells where to a sample.
+        Until a loss the tone is what it was, from there on what it turns to: a loud tone places it to a sample.
         """
         losses, limits = list(self.losses), []
         reach = _BLOCKS_AROUND * (comparison.n_samples // BLOCKS)
@@ -129,10 +129,10 @@ class ClockSkew(Mechanism):
                 for extra in (0.0, 2 * math.pi * self.frequency * count)
             )
             signal = comparison.white[list(self.sensors), low:high]
-            told = (signal * (before - after) - (before.square() - after.square()) / 2).sum(0).cumsum(0)
-            told = torch.nn.functional.pad(told, (1, 0))  # of a loss before each sample from `low` to `high`
-            likely = (told >= told.amax() - _AS_GOOD).nonzero()[:, 0]
-            losses[j] = low + int(told.argmax()), count
+            gain = (signal * (before - after) - (before.square() - after.square()) / 2).sum(0).cumsum(0)
+            gain = torch.nn.functional.pad(gain, (1, 0))  # of a loss before each sample from `low` to `high`
+            likely = (gain >= gain.amax() - _AS_GOOD).nonzero()[:, 0]
+            losses[j] = low + int(gain.argmax()), count
             limits.append((low + int(likely[0]), low + int(likely[-1])))
         return replace(self, losses=tuple(losses)), limits
 
@@ -173,7 +173,7 @@ class ClockSkew(Mechanism):
 
     def remove(self, signal: Tensor, info: RecordingInfo) -> Tensor:
         n = signal.shape[-1]
-        ends = [0, *(place for at, _ in self.losses for place in (at - 1, at) if 0 < at < n), n - 1]
+        ends = [0, *(end for at, _ in self.losses for end in (at - 1, at) if 0 < at < n), n - 1]
         knots = torch.tensor(ends, dtype=torch.float64)
         true = knots + self._ahead(knots)
         t = torch.arange(n, dtype=torch.float64)
@@ -182,7 +182,7 @@ class ClockSkew(Mechanism):
         return self._with(signal, knots[piece] + (t - true[piece]) * slope)
 
     def _with(self, signal: Tensor, times: Tensor) -> Tensor:
-        """Signals with the sensors concerned taken at other times, in samples."""
+        """Signals with these sensors taken at other times, in samples."""
         which = list(self.sensors)
         changed = signal.clone()
         changed[..., which, :] = resampled(signal[..., which, :], times).to(signal.dtype)

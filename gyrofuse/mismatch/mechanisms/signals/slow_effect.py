@@ -16,17 +16,11 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.decisions import NATS_AS_GOOD
+from gyrofuse.mismatch.detectors.slow.estimates import Estimate, log_factors
 from gyrofuse.mismatch.detectors.slow.hysteresis import strongest_relay
-from gyrofuse.mismatch.detectors.slow.scans import (
-    PLAUSIBLE,
-    Scan,
-    SlowLook,
-    between,
-    concerned,
-    explained_by,
-    slow_look,
-)
-from gyrofuse.mismatch.likelihoods.slow_noise import column_sizes, cosines
+from gyrofuse.mismatch.detectors.slow.scans import Scan, SlowAnalysis, slow_analysis
+from gyrofuse.mismatch.likelihoods.slow_noise import cosines
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
 from gyrofuse.mismatch.signals.comparison import N_BLOCKS, Comparison, RecordingInfo, block_means
@@ -39,7 +33,6 @@ if TYPE_CHECKING:
 
 
 _STRONG = 5e-4  # a slow effect leaves traces that look like another one: largest p value
-_TOO_CLOSE = 5.0  # nats
 _SHARES = N_JUDGED // N_FOLDS
 
 
@@ -48,7 +41,7 @@ class SlowEffect(Mechanism):
     """`x_i(t) = size_i path(t)`, and further paths of the same physics with sizes of their own.
 
     Attributes:
-        size: Of the first path, `(sensor,)`; 0 in sensors that are not concerned.
+        size: Of the first path, `(sensor,)`; 0 in sensors that do not have it.
         log_factors: Of the slow noise beside it, `(sensor, part)`, against the simulation's: for weights.
     """
 
@@ -65,14 +58,14 @@ class SlowEffect(Mechanism):
         Args:
             scan: Scan of the mechanism.
             rate: Hz.
-            which: Positions of the sensors; those concerned by default.
+            which: Positions of the sensors; those of the scan by default.
         """
         raise NotImplementedError
 
     @classmethod
     def fit_in_place_of(cls, finding: Finding, comparison: Comparison) -> Rival | None:
         """Another path of the same sensors in the same noise."""
-        scan, effect = slow_look(comparison).scan(cls.name), finding.effect
+        scan, effect = slow_analysis(comparison).scan(cls.name), finding.effect
         if scan is None or not isinstance(effect, SlowEffect):
             return None
         rival = cls.of(scan, comparison.info.rate, finding.sensors)
@@ -115,7 +108,7 @@ class SlowEffect(Mechanism):
         """Sizes by generalised least squares without the whitened differences that the fold holds out."""
         y, paths, _ = self._whitened(comparison)
         kept = ~in_fold(y.shape[-1], fold)
-        # A step may happen in what is held out: then there is nothing to tell its size.
+        # A step may happen in what is held out: then its size is not determined.
         sizes = (torch.linalg.pinv(paths * kept[:, None]) @ (y * kept)[..., None])[..., 0]
         return self.with_sizes(torch.where(self.sizes != 0, sizes, 0.0))
 
@@ -128,21 +121,21 @@ class SlowEffect(Mechanism):
         length = directions[:, 0].norm() / math.sqrt(_SHARES)
         axes = torch.linalg.qr(directions).Q
         axes[:, 0] *= (axes[:, 0] @ directions[:, 0]).sign()
-        seen = _hadamard(_SHARES) @ (axes.mT @ y[:, judged].flatten())
-        return length * seen - length.square() / 2
+        shares = _hadamard(_SHARES) @ (axes.mT @ y[:, judged].flatten())
+        return length * shares - length.square() / 2
 
     def score_difference_sd(self, own: Tensor, other: Mechanism, theirs: Tensor, comparison: Comparison) -> float:
         """Distance of two paths in units of the noise: a slow path has no blocks of its own, whose scatter would do."""
         if not isinstance(other, SlowEffect):
             return super().score_difference_sd(own, other, theirs, comparison)
         paths = [effect.remove(comparison.recording, comparison.info) for effect in (self, other)]
-        covariance = slow_look(comparison).noise.covariance(self.log_factors).diff(dim=-1).diff(dim=-2)
+        covariance = slow_analysis(comparison).noise.covariance(self.log_factors).diff(dim=-1).diff(dim=-2)
         difference = block_means(paths[0] - paths[1]).diff()[..., None]
         return float(torch.linalg.solve_triangular(torch.linalg.cholesky(covariance), difference, upper=False).norm())
 
     def as_compared(self, comparison: Comparison) -> SlowEffect:
         """The same with the noise that a case has once its mechanism is explained there, without any doubt of that."""
-        scan = slow_look(comparison).scan(self.name)
+        scan = slow_analysis(comparison).scan(self.name)
         return self if scan is None else replace(self, log_factors=scan.fit.log_factors)
 
     def _whitened(self, comparison: Comparison) -> tuple[Tensor, Tensor, Tensor]:
@@ -150,7 +143,7 @@ class SlowEffect(Mechanism):
 
         Those are `(sensor, difference, path)`, and `(sensor, difference, _SHARES - 1)`.
         """
-        covariance = slow_look(comparison).noise.covariance(self.log_factors).diff(dim=-1).diff(dim=-2)
+        covariance = slow_analysis(comparison).noise.covariance(self.log_factors).diff(dim=-1).diff(dim=-2)
         paths = block_means(self.paths(comparison.n_samples, comparison.info))
         directions = torch.cat([paths, cosines()[: _SHARES - 1]])
         y = block_means(comparison.observed.steady[0])
@@ -163,32 +156,17 @@ class SlowEffect(Mechanism):
         return self.sizes @ self.paths(n_samples, info)
 
 
-class Estimate(NamedTuple):
-    """Places and sizes of an effect, over all places that the data leave possible.
-
-    Attributes:
-        place: Median of the places, with 2.5 and 97.5 % quantiles, samples.
-        other: The same of the second path, where that has its own; else None.
-        size, sd: `(sensor, path)`.
-    """
-
-    place: tuple[float, float, float]
-    other: tuple[float, float, float] | None
-    size: Tensor
-    sd: Tensor
-
-
 class Strong(NamedTuple):
     """A scan that may be named.
 
     Attributes:
-        look: What it is part of.
+        analysis: What it is part of.
         scan: It.
         alternatives: Mechanisms that fit as well.
         log_factors: Of the slow noise beside it, with what else is there, `(sensor, part)`: for weights.
     """
 
-    look: SlowLook
+    analysis: SlowAnalysis
     scan: Scan
     alternatives: tuple[str, ...]
     log_factors: Tensor
@@ -200,86 +178,31 @@ def strong_scan(comparison: Comparison, name: str, level: float) -> Strong | Non
     A stronger random walk than the simulation's is one of them, under the name of what changes numbers. Where a relay
     that a temperature switches fits as well, it may be nothing that has a name here.
     """
-    look = slow_look(comparison)
-    scan = look.scan(name)
-    several = look.several_steps if name == "step" else None
+    analysis = slow_analysis(comparison)
+    scan = analysis.scan(name)
+    several = analysis.several_steps if name == "step" else None
     if scan is None or (several is None and scan.p_value > min(level, _STRONG)):
         return None
-    rivals = {other.family.name: other.gain for other in look.scans if other is not scan}
-    rivals["parameter_shift"] = look.wandering
-    relay, strong = strongest_relay(comparison), Strong(look, scan, (), log_factors(scan))
-    if relay is not None and relay.gain_beside(scan.relation) > scan.gain - _TOO_CLOSE:
+    rivals = {other.family.name: other.gain for other in analysis.scans if other is not scan}
+    rivals["parameter_shift"] = analysis.wandering
+    relay, strong = strongest_relay(comparison), Strong(analysis, scan, (), log_factors(scan))
+    if relay is not None and relay.gain_beside(scan.relation) > scan.gain - NATS_AS_GOOD:
         return None
-    if several is not None and several.gain > max(rivals.values()) + _TOO_CLOSE:
+    if several is not None and several.gain > max(rivals.values()) + NATS_AS_GOOD:
         # Each is lost among the others, as in a walk: beside them it is the step that it is.
         first = several.first.scan(name)
         assert first is not None
-        strong = strong._replace(look=several.first, scan=first)
-    elif any(gain > scan.gain + _TOO_CLOSE for gain in rivals.values()):
+        strong = strong._replace(analysis=several.first, scan=first)
+    elif any(gain > scan.gain + NATS_AS_GOOD for gain in rivals.values()):
         return None
     else:
-        strong = strong._replace(alternatives=tuple(r for r, gain in rivals.items() if gain > scan.gain - _TOO_CLOSE))
+        strong = strong._replace(alternatives=tuple(r for r, gain in rivals.items() if gain > scan.gain - NATS_AS_GOOD))
     return strong if strong.scan.p_value <= min(level, _STRONG) else None
 
 
-def log_factors(scan: Scan) -> Tensor:
-    """Of the slow noise beside an effect, as strong as the doubt leaves it, `(sensor, part)`.
-
-    Without the effect the noise that fits best is stronger: as much as makes the effect's weight that of the scan.
-    """
-    which = list(concerned(scan))
-    return scan.fit.log_factors + 2 * max(float((scan.held[which].norm() / scan.z[which].norm()).log()), 0.0)
-
-
-def estimate(look: SlowLook, scan: Scan, *, finer: bool = True) -> Estimate:
-    """Mean over the places of a family, each as likely as the data say: the places are the prior.
-
-    Args:
-        look: What it is part of.
-        scan: The family, and the noise beside it.
-        finer: Whether there are places between those of the scan.
-    """
-    family, variance, which = scan.family, scan.fit.variance, concerned(scan)
-    if finer:
-        gain = explained_by(look.y, variance, family.designs, which) / 2
-        best = [p[[scan.best]] for p in family.where]
-        family = between(family, gain > gain.max() - PLAUSIBLE, best)
-    size, spread = column_sizes(look.y, variance, family.designs)  # (sensor, template, path)
-    weight = torch.softmax(explained_by(look.y, variance, family.designs, which) / 2, 0)
-    mean = (size * weight[:, None]).sum(-2)
-    sd = (((spread + size.square()) * weight[:, None]).sum(-2) - mean.square()).clamp(min=0).sqrt()
-    places, *others = (quantiles(p, weight) for p in family.where)
-    return Estimate(places, others[0] if others else None, mean, sd)
-
-
-def quantiles(places: Tensor, weight: Tensor) -> tuple[float, float, float]:
-    """Median, 2.5 and 97.5 % quantiles of places with weights that sum to one.
-
-    No tail lies beyond the first and the last place: these are within the limits where they are as likely as limits
-    of a normal law are.
-    """
-    places, order = places.sort()
-    weight = weight[order]
-    below = weight.cumsum(0) - weight / 2
-    low, middle, high = (
-        float(places[min(int(torch.searchsorted(below, share)), len(places) - 1)])
-        for share in torch.tensor([0.025, 0.5, 0.975], dtype=torch.float64)
-    )
-    first, last = (float(end) for end in places[[0, -1]])
-    likely = places[weight > math.exp(-(Z**2) / 2) * weight.max()]
-    return middle, first if float(likely[0]) == first else low, last if float(likely[-1]) == last else high
-
-
-def only(size: Tensor, which: Sequence[int]) -> Tensor:
-    """Sizes `(sensor, ...)` of some sensors, 0 in the others."""
-    kept = torch.zeros_like(size)
-    kept[list(which)] = size[list(which)]
-    return kept
-
-
-def place(places: tuple[float, float, float], rate: float) -> Parameter:
-    """A place with its limits, in seconds."""
-    value, low, high = places
+def in_seconds(samples: tuple[float, float, float], rate: float) -> Parameter:
+    """A number of samples with its limits, in seconds."""
+    value, low, high = samples
     return Parameter(value / rate, low / rate, high / rate, "s")
 
 
@@ -289,7 +212,7 @@ def slow_finding(
     effect: SlowEffect,
     found: Estimate,
     words: str,
-    place: dict[str, Parameter],
+    numbers: dict[str, Parameter],
     *,
     sizes: Sequence[tuple[str, str]] = (),
     time_s: float | None = None,
@@ -303,14 +226,14 @@ def slow_finding(
         effect: It, with its numbers.
         found: Its sizes.
         words: What the bias does.
-        place: Parameters that say where.
+        numbers: Onset, time constants or lag.
         sizes: Names and units of the sizes of its paths; by default that of one, in the unit of the signal.
         time_s: Onset.
         channel: That it follows.
     """
     info = comparison.info
     scan, sizes = strong.scan, sizes or [("size", info.measure)]
-    which = concerned(scan)
+    which = scan.sensors
     limits = {}
     for path, (name, unit) in enumerate(sizes[: found.size.shape[-1]]):
         for i in which:
@@ -326,7 +249,7 @@ def slow_finding(
         f"(sensor {info.sensors[largest]})",
         scan.p_value,
         which,
-        {**place, **limits},
+        {**numbers, **limits},
         levels=tuple(levels),
         alternatives=strong.alternatives,
         time_s=time_s,

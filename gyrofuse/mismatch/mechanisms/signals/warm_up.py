@@ -9,17 +9,10 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.detectors.slow.scans import Scan, concerned
+from gyrofuse.mismatch.detectors.slow.estimates import estimate, log_factors, only
+from gyrofuse.mismatch.detectors.slow.scans import Scan
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
-from gyrofuse.mismatch.mechanisms.signals.slow_effect import (
-    SlowEffect,
-    estimate,
-    log_factors,
-    only,
-    place,
-    slow_finding,
-    strong_scan,
-)
+from gyrofuse.mismatch.mechanisms.signals.slow_effect import SlowEffect, in_seconds, slow_finding, strong_scan
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import OfSensors
 
@@ -61,29 +54,30 @@ class WarmUpTransient(SlowEffect):
         strong = strong_scan(comparison, cls.name, level)
         if strong is None:
             return None
-        look, scan = strong.look, strong.scan
-        found, rate = estimate(look, scan), comparison.info.rate
-        effect, tau = cls.of(scan, rate), place(found.place, rate)
-        places, unit = {"time_constant": tau}, comparison.info.measure
+        analysis, scan = strong.analysis, strong.scan
+        found, rate = estimate(analysis, scan), comparison.info.rate
+        effect, (tau, *others) = cls.of(scan, rate), (in_seconds(limits, rate) for limits in found.points)
+        numbers, unit = {"time_constant": tau}, comparison.info.measure
         words = f"decays after the start with a time constant of {tau.value:.3g} s"
-        if effect.slower and found.other is not None:
+        if effect.slower:
             first, second = effect.time_constant_s, effect.slower[0].time_constant_s
-            places = {
+            numbers = {
                 "time_constant": tau._replace(value=first),
-                "second_time_constant": place(found.other, rate)._replace(value=second),
+                "second_time_constant": others[0]._replace(value=second),
             }
             words = f"decays after the start with time constants of {first:.3g} and {second:.3g} s"
         else:
-            effect = replace(effect, size=only(found.size[:, 0], concerned(scan)), time_constant_s=tau.value)
+            effect = replace(effect, size=only(found.size[:, 0], scan.sensors), time_constant_s=tau.value)
         sizes = [("size", unit), ("second_size", unit)]
-        return slow_finding(comparison, strong, effect, found, words, places, sizes=sizes, time_s=0.0)
+        return slow_finding(comparison, strong, effect, found, words, numbers, sizes=sizes, time_s=0.0)
 
     @classmethod
     def of(cls, scan: Scan, rate: float, which: Sequence[int] | None = None) -> WarmUpTransient:
-        """The best of a scan, in the sensors concerned or in others."""
-        size, *further = only(scan.fit.size, concerned(scan) if which is None else which).unbind(-1)
-        slower = tuple(Decay(other, scan.other / rate) for other in further if scan.other is not None)
-        return cls(size, log_factors(scan), scan.place / rate, slower)
+        """The best of a scan, in its sensors or in others."""
+        size, *further = only(scan.fit.size, scan.sensors if which is None else which).unbind(-1)
+        tau, *others = (number / rate for number in scan.point)
+        slower = tuple(Decay(own, other) for own, other in zip(further, others, strict=True))
+        return cls(size, log_factors(scan), tau, slower)
 
     @property
     def sizes(self) -> Tensor:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.detectors.slow.scans import MOST_STEPS, slow_look, steps_one_by_one
+from gyrofuse.mismatch.detectors.slow.scans import MOST_STEPS, slow_analysis, steps_one_by_one
 from gyrofuse.mismatch.likelihoods.spectra.common_sources import Common
 from gyrofuse.mismatch.likelihoods.spectra.components import Term
 from gyrofuse.mismatch.likelihoods.spectra.fit import fit
@@ -64,7 +64,7 @@ def happened_instead(
         beside: All other findings.
         walks: Gains of the random walks that the noise may stand for, `(source, sensor)`; None for fast noise.
     """
-    scans = slow_look(comparison).scans
+    scans = slow_analysis(comparison).scans
     once = [s.family.name for s in scans if s.p_value < _POSSIBLE and s.gain > finding.gain - _NATS_BEHIND]
     if walks is None:
         return tuple(dict.fromkeys(once))
@@ -86,20 +86,20 @@ def walks_of(comparison: Comparison, finding: Finding) -> Tensor:
 
 def _score_of_walks(comparison: Comparison, gains: Tensor) -> float:
     """Log likelihood ratio of random walks with gains `(source, sensor)`, nats, in the ordinates that show steps."""
-    look = slow_look(comparison)
-    weighted = gains[:, :, None] / look.noise.own  # (source, sensor, ordinate)
-    walk = look.noise.parts[0, -1]
+    analysis = slow_analysis(comparison)
+    weighted = gains[:, :, None] / analysis.noise.own  # (source, sensor, ordinate)
+    walk = analysis.noise.parts[0, -1]
     low, high, n = _WALK_VARIANCES
     variance = torch.logspace(low, high, n, dtype=torch.float64)[:, None, None]
     # Variance of a source over that of the noise, and its power over the noise: (variance, source, ordinate).
     over = variance * ((gains[:, :, None] * weighted).sum(1) * walk)
-    power = variance * ((weighted * look.y).sum(1).square() * walk)
+    power = variance * ((weighted * analysis.y).sum(1).square() * walk)
     return float((((power / (1 + over) - over.log1p()).sum(-1) / 2).amax(0) - 1).sum())
 
 
 def _score_of_steps(comparison: Comparison, finding: Finding) -> float:
     """Log likelihood ratio of several steps in a finding's sensors, nats, less what their onsets and sizes cost."""
-    score, gram = (products[list(finding.sensors)] for products in slow_look(comparison).of_steps)
+    score, gram = (products[list(finding.sensors)] for products in slow_analysis(comparison).of_steps)
     cost = math.log(score.shape[-1]) + len(score)
     _, _, squares = steps_one_by_one(score, gram, 2 * cost, MOST_STEPS)
     return sum(squares) / 2 - cost * len(squares)
