@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 import gyrofuse as gf
-from gyrofuse.mismatch.likelihoods.filter_forms import filter_strength
+from gyrofuse.mismatch.likelihoods.spectra.filter_forms import filter_strength
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph

@@ -181,8 +181,8 @@ def test_power_that_a_fit_hardly_tells_may_be_missing():
 def test_the_level_of_a_model_is_known_as_well_as_from_the_record_it_was_fitted_to():
     recording = record(LONG, 7, 2)
     given = comparison(recording, WALKING.with_params(WALKING.params * 1.0), SHORT)
-    assert compared_levels(given).reference.worth == SHORT
-    assert compared_levels(comparison(recording, WALKING)).reference.worth == LONG * len(given.reference.signal)
+    assert compared_levels(given).reference.n_samples == SHORT
+    assert compared_levels(comparison(recording, WALKING)).reference.n_samples == LONG * len(given.reference.signal)
 
 
 def test_what_an_array_was_found_to_share_is_as_uncertain_as_its_fit():

@@ -54,7 +54,7 @@ def test_powers_gain_what_the_law_of_f_gives_them():
         d=d,
         s=s,
         usable=(s > 0).to(torch.float64)[:, None],
-        paired=torch.zeros(5, dtype=torch.float64),
+        pair_dof=torch.zeros(5, dtype=torch.float64),
         together=torch.ones(5, 1, dtype=torch.float64),
     )
     gain = power_gains(data, m[:, None])[:, 0]

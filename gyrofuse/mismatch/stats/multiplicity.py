@@ -46,6 +46,11 @@ def p_value_from_e_value(log_ratio: float) -> float:
     return math.exp(min(-math.log(20.0) - log_ratio, 0.0))
 
 
+def e_value_of(p_value: float) -> float:
+    """Logarithm of the mean likelihood ratio behind a p value of `p_value_from_e_value`, nats."""
+    return -math.log(20.0 * max(p_value, 1e-300))
+
+
 def e_values_by_share(log_ratios: Tensor) -> Tensor:
     """Logarithms of `prod_i (1 - e + e E_i)` for each share `e`, `(share, ...)`, of `log E` `(sensor, ...)`."""
     e = torch.tensor(SHARES, dtype=log_ratios.dtype).view(-1, *[1] * log_ratios.ndim)

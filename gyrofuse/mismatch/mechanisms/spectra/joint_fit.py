@@ -30,7 +30,7 @@ from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, in_fold
 from gyrofuse.mismatch.stats.limits import Z
-from gyrofuse.mismatch.stats.multiplicity import sidak
+from gyrofuse.mismatch.stats.multiplicity import e_value_of, sidak
 
 # Share of the discrepancy that terms have to explain to be named though their form is not quite the recording's: of
 # twenty-one filters of other forms than the catalogue's they explained 95 % at least.
@@ -161,7 +161,7 @@ def leading_shape(comparison: Comparison) -> Shape | None:
     term, others = chosen.terms[first], _others(chosen, first)
     n_classes = 16.0  # classes and frequencies that compete
     p = sidak(float(stats.chi2.sf(2 * gain, term.n_free(data.ground))), n_classes)
-    if not others:  # it is all that differs
+    if not others and gain >= e_value_of(p_seen):  # all that the scan of shapes saw: a mean is not above the best
         p = min(p, p_seen)
     if comparison.reference.uncertainty is not None:  # the fit above takes the simulation's numbers for exact
         p = max(p, _beside_errors(comparison, term, p_seen))
@@ -313,10 +313,11 @@ def _closer(comparison: Comparison, term: Peak | CommonBump, others: list[Term])
         return term, (torch.full_like(term.local, math.nan), torch.full_like(term.shared, math.nan))
     bands = data.ground.bands
     narrowest = 1.5 / comparison.n_samples / centre
+    reach = max(2 * width, float(bands.frequency[1] - bands.frequency[0]))  # of a peak within a cell, one beside it
     places = [
         (float(f), share * width)
         for f in bands.frequency
-        if abs(float(f) - centre) < 2 * width
+        if abs(float(f) - centre) < reach
         for share in (0.3, 0.6, 1.0)
     ]
     start = best_bump(data, others, torch.tensor(places, dtype=torch.float64))
