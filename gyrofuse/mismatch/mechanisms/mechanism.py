@@ -364,6 +364,9 @@ class Finding:
                 fontsize=9,
                 parse_math=False,
             )
+        low, high = zip(*(ax.get_ylim() for ax in axes), strict=True)
+        for ax in axes:  # so that what is gone shows at a glance
+            ax.set_ylim(min(low), max(high))
         return list(axes)
 
     def repair(self, comparison: Comparison, generator: torch.Generator) -> Comparison:

@@ -109,7 +109,11 @@ def gain_on_channel(ax: Axes, comparison: Comparison, sensor: int, x: Tensor, la
     y = comparison.recording[sensor] - comparison.recording[sensor].mean()
     mean, middle = (torch.zeros(len(count), dtype=x.dtype).index_add(0, which, v) / count for v in (y, x))
     sd = float(y.std()) / count.sqrt()
-    handles = [ax.errorbar(middle, mean, yerr=Z * sd, color=INK, linestyle="none", marker="o", markersize=3)]
+    handles = [
+        ax.errorbar(
+            middle.numpy(), mean.numpy(), yerr=(Z * sd).numpy(), color=INK, linestyle="none", marker="o", markersize=3
+        )
+    ]
     ax.set_xlabel(label, parse_math=False)
     ax.set_ylabel(with_unit("mean of samples", comparison.info.measure), parse_math=False)
     finish(ax, handles, ["recording, with 95 % intervals"])
@@ -130,7 +134,7 @@ def ratio_of_spectra(ax: Axes, comparison: Comparison, sensor: int, factor: Call
     sd = (1 / observed.dof[known] + 1 / reference.dof[known]).sqrt()
     hertz = f[known] * comparison.info.rate
     handles: list[Any] = ax.plot(hertz, ratio, **_DOT)
-    handles.append(ax.fill_between(hertz, (-Z * sd).exp(), (Z * sd).exp(), **SHADE))
+    handles.append(ax.fill_between(hertz.numpy(), (-Z * sd).exp().numpy(), (Z * sd).exp().numpy(), **SHADE))
     if factor is not None:
         handles += ax.plot(hertz, factor(f[known])[sensor], **DASHED)
     ax.set_xscale("log")
@@ -277,13 +281,13 @@ def two_levels(ax: Axes, comparison: Comparison, sensor: int, half_step: float, 
     handles: list[Any] = ax.plot(seconds, means, color=INK, linewidth=0.8)
     if half_step:
         noise = float(means.diff().square().median()) / 0.9  # twice the variance of a mean: chi-square has median 0.45
-        handles += ax.plot(seconds, half_step * _likeliest_path(means / half_step, noise / half_step**2), **DASHED)
+        handles += ax.plot(seconds, half_step * likeliest_path(means / half_step, noise / half_step**2), **DASHED)
     ax.set_xlabel("time (s)")
     ax.set_ylabel(with_unit("mean of a few samples", comparison.info.measure), parse_math=False)
     _finish(ax, handles, ["recording", "decoded"])
 
 
-def _likeliest_path(y: Tensor, variance: float, stay: float = 7 / 8) -> Tensor:
+def likeliest_path(y: Tensor, variance: float, stay: float = 7 / 8) -> Tensor:
     """Path of values +-1 that is likeliest for means `(time,)` of some variance, by Viterbi's algorithm."""
     score = torch.stack([-(y + 1).square(), -(y - 1).square()], -1) / max(variance, 1e-6)
     move = torch.tensor([[stay, 1 - stay], [1 - stay, stay]], dtype=y.dtype).log()
