@@ -45,7 +45,7 @@ def spectrum_near(ax: Axes, comparison: Comparison, sensor: int, frequency_hz: f
         f = torch.arange(len(transform), dtype=torch.float64) / length
         shown = ((f * rate - frequency_hz).abs() <= reach) & (f > 1 / length)
         power = transform.abs().square()[shown] / comparison.base.spectrum(f[shown])[sensor]
-        handles += ax.plot(f[shown] * rate, power, **style)
+        handles += _plot(ax, f[shown] * rate, power, **style)
     ax.set_yscale("log")
     ax.set_xlabel("frequency (Hz)")
     ax.set_ylabel("power over the noise")
@@ -63,10 +63,10 @@ def means_over_time(ax: Axes, comparison: Comparison, sensor: int, path: Tensor 
     """
     seconds = (torch.arange(N_BLOCKS) + 0.5) * comparison.block / comparison.info.rate
     means = block_means(comparison.recording[sensor])
-    handles: list[Any] = ax.plot(seconds, means - means.mean(), **_DOT)
+    handles: list[Any] = _plot(ax, seconds, means - means.mean(), **_DOT)
     if path is not None:
         fitted = block_means(path[sensor])
-        handles += ax.plot(seconds, fitted - fitted.mean(), **DASHED)
+        handles += _plot(ax, seconds, fitted - fitted.mean(), **DASHED)
     ax.set_xlabel("time (s)")
     ax.set_ylabel(with_unit("mean of a block", comparison.info.measure), parse_math=False)
     _finish(ax, handles, ["recording", "fitted"])
@@ -84,10 +84,10 @@ def means_against(ax: Axes, comparison: Comparison, sensor: int, x: Tensor, labe
         path: Fitted path `(sensor, time)`; None for none.
     """
     across, means = block_means(x), block_means(comparison.recording[sensor])
-    handles: list[Any] = ax.plot(across, means - means.mean(), **_DOT)
+    handles: list[Any] = _plot(ax, across, means - means.mean(), **_DOT)
     if path is not None:
         order, fitted = across.argsort(), block_means(path[sensor])
-        handles += ax.plot(across[order], (fitted - fitted.mean())[order], **DASHED)
+        handles += _plot(ax, across[order], (fitted - fitted.mean())[order], **DASHED)
     ax.set_xlabel(label, parse_math=False)
     ax.set_ylabel(with_unit("mean of a block", comparison.info.measure), parse_math=False)
     _finish(ax, handles, ["recording", "fitted"])
@@ -133,10 +133,10 @@ def ratio_of_spectra(ax: Axes, comparison: Comparison, sensor: int, factor: Call
     ratio = (observed.power / reference.power)[sensor, known]
     sd = (1 / observed.dof[known] + 1 / reference.dof[known]).sqrt()
     hertz = f[known] * comparison.info.rate
-    handles: list[Any] = ax.plot(hertz, ratio, **_DOT)
+    handles: list[Any] = _plot(ax, hertz, ratio, **_DOT)
     handles.append(ax.fill_between(hertz.numpy(), (-Z * sd).exp().numpy(), (Z * sd).exp().numpy(), **SHADE))
     if factor is not None:
-        handles += ax.plot(hertz, factor(f[known])[sensor], **DASHED)
+        handles += _plot(ax, hertz, factor(f[known])[sensor], **DASHED)
     ax.set_xscale("log")
     ax.set_yscale("log")
     ax.set_xlabel("frequency (Hz)")
@@ -150,7 +150,7 @@ def coherence(ax: Axes, comparison: Comparison, sensor: int) -> None:
     handles: list[Any] = []
     for side, style in ((comparison.observed, _DOT), (comparison.reference, _LINE)):
         others = torch.arange(comparison.n_sensors) != sensor
-        handles += ax.plot(hertz, side.coherence[:, sensor, others].abs().amax(-1), **style)
+        handles += _plot(ax, hertz, side.coherence[:, sensor, others].abs().amax(-1), **style)
     ax.set_xscale("log")
     ax.set_ylim(0, 1.02)
     ax.set_xlabel("frequency (Hz)")
@@ -218,8 +218,8 @@ def samples(ax: Axes, comparison: Comparison, sensor: int, first: int, count: in
     seconds = torch.arange(first, first + count) / comparison.info.rate
     own = comparison.recording[sensor, first : first + count]
     other = comparison.reference.signal[0, sensor, :count]
-    handles: list[Any] = ax.plot(seconds, own - own.mean(), color=INK, linewidth=0.8, marker="o", markersize=2.5)
-    handles += ax.plot(seconds[: len(other)], other - other.mean(), color=BLUE, linewidth=0.8, alpha=0.7)
+    handles: list[Any] = _plot(ax, seconds, own - own.mean(), color=INK, linewidth=0.8, marker="o", markersize=2.5)
+    handles += _plot(ax, seconds[: len(other)], other - other.mean(), color=BLUE, linewidth=0.8, alpha=0.7)
     ax.set_xlabel("time (s)")
     ax.set_ylabel(with_unit("sample", comparison.info.measure), parse_math=False)
     finish(ax, handles, ["recording", "simulation"])
@@ -231,9 +231,9 @@ def tails(ax: Axes, comparison: Comparison, sensor: int) -> None:
     for side, style in ((comparison.observed, {"color": INK, "linewidth": 1.4}), (comparison.reference, _LINE)):
         size = left_out(side).z[:, sensor].flatten().abs().sort(descending=True).values
         kept = torch.logspace(0, math.log10(len(size)), 400).long().unique().clamp(max=len(size)) - 1
-        handles += ax.plot(size[kept], (kept + 1) / len(size), **style)
+        handles += _plot(ax, size[kept], (kept + 1) / len(size), **style)
     x = torch.linspace(0, 6, 100, dtype=torch.float64)
-    handles += ax.plot(x, torch.special.erfc(x / math.sqrt(2)), **DASHED)
+    handles += _plot(ax, x, torch.special.erfc(x / math.sqrt(2)), **DASHED)
     ax.set_yscale("log")
     ax.set_ylim(bottom=0.3 / comparison.n_samples)
     ax.set_xlabel("size of a prediction error (standard deviations)")
@@ -253,10 +253,10 @@ def variance_over_time(ax: Axes, comparison: Comparison, sensor: int, course: Te
     seconds = (torch.arange(N_BLOCKS) + 0.5) * comparison.block / comparison.info.rate
     white = whitened(comparison.observed.steady[0], comparison.base)
     squares = block_means(white[sensor].square())
-    handles: list[Any] = ax.plot(seconds, squares, **_DOT)
+    handles: list[Any] = _plot(ax, seconds, squares, **_DOT)
     if course is not None:
         fitted = block_means(course[sensor])
-        handles += ax.plot(seconds, fitted * squares.median() / fitted.median(), **DASHED)
+        handles += _plot(ax, seconds, fitted * squares.median() / fitted.median(), **DASHED)
     ax.set_yscale("log")
     ax.set_xlabel("time (s)")
     ax.set_ylabel("variance over the simulation's")
@@ -278,10 +278,10 @@ def two_levels(ax: Axes, comparison: Comparison, sensor: int, half_step: float, 
     means = comparison.recording[sensor, : n * length].unflatten(-1, (n, length)).mean(-1)
     means = means - means.median()
     seconds = (torch.arange(n) + 0.5) * length / comparison.info.rate
-    handles: list[Any] = ax.plot(seconds, means, color=INK, linewidth=0.8)
+    handles: list[Any] = _plot(ax, seconds, means, color=INK, linewidth=0.8)
     if half_step:
         noise = float(means.diff().square().median()) / 0.9  # twice the variance of a mean: chi-square has median 0.45
-        handles += ax.plot(seconds, half_step * likeliest_path(means / half_step, noise / half_step**2), **DASHED)
+        handles += _plot(ax, seconds, half_step * likeliest_path(means / half_step, noise / half_step**2), **DASHED)
     ax.set_xlabel("time (s)")
     ax.set_ylabel(with_unit("mean of a few samples", comparison.info.measure), parse_math=False)
     _finish(ax, handles, ["recording", "decoded"])
@@ -330,7 +330,7 @@ def spectrogram(ax: Axes, comparison: Comparison, sensor: int, frequency_hz: flo
         seconds, f[shown], level, cmap="Greys", vmin=low - 0.3, vmax=max(float(level.max()), low + 1.5), rasterized=True
     )
     track = f[shown][power[:, shown].argmax(-1)]
-    handles = ax.plot(seconds, track, color=DASHED["color"], linewidth=0.8)
+    handles = _plot(ax, seconds, track, color=DASHED["color"], linewidth=0.8)
     ax.set_xlabel("time (s)")
     ax.set_ylabel("frequency (Hz)")
     finish(ax, handles, ["highest power"])
@@ -340,3 +340,8 @@ def spectrogram(ax: Axes, comparison: Comparison, sensor: int, frequency_hz: flo
 def _finish(ax: Axes, handles: list[Any], labels: list[str]) -> None:
     """The common look, with labels for what was drawn."""
     finish(ax, handles, labels[: len(handles)])
+
+
+def _plot(ax: Axes, x: Tensor, y: Tensor, **style: Any) -> list[Any]:
+    """Lines or dots of tensors."""
+    return list(ax.plot(x.numpy(), y.numpy(), **style))
