@@ -68,7 +68,6 @@ PROMISE_SPECTRA = [kind for kind in CATALOGUE if kind.spectra is not Mechanism.s
 ADD_A_KNOWN_PATH = [kind for kind in CATALOGUE if kind.known_path or kind is SlowRemainder]
 DO_NOT_COVER = {
     DriftingTone: "amplitudes of tones that wander slowly come out up to a tenth too small: limits hold in 12 of 22",
-    GradualChange: "ends of a course that is fitted in order overshoot: its factor is too far from one in 22 of 22",
 }
 QUICK = (UnitScale, Quantization, DeadBand, StuckSamples, VibrationTone)  # diagnosed in a second
 

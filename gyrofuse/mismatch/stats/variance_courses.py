@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.decisions import NATS_PER_NUMBER
 from gyrofuse.mismatch.stats.segments import CHI2_MEDIAN, OUTLIER, course_scores
 
 _STEEPEST = 3.0  # log variance, step of scoring: a start that is off by a factor of 20 still converges
@@ -110,11 +111,22 @@ def _with_peak(white: Tensor, slope: Tensor) -> Course | None:
     for number in range(rounds):
         if stairs.max() == stairs.min():
             return None
+        pooled = stairs
+        if number:  # where the change is known
+            pooled = _without_end_spikes(stairs, size / 2 * float(slope.square().sum()))
+        beyond = np.array([stairs.max() - pooled.max(), pooled.min() - stairs.min()]) / (pooled.max() - pooled.min())
+        stairs = pooled
         stairs = (stairs - stairs.min()) / (stairs.max() - stairs.min())
         c = torch.from_numpy(stairs)
         at, values = _knots(stairs)
         share = torch.from_numpy(np.interp(np.arange(n) + 0.5, size * np.array(at), values))
         base, slope, sd = fitted_levels(squares, share, concerned)
+        # The course's own range is known from its highest and its lowest level alone, all sensors together; where it
+        # ends between the pooled level and the spike is as likely anywhere.
+        ends = (
+            2 * sum(1 / (size * float((c == end).sum())) for end in (0.0, 1.0)) / slope.square().sum().clamp(min=1e-12)
+        )
+        sd = (sd.square() + slope.square() * (ends + float((beyond**2).sum()) / 12)).sqrt()
         course = Course(share, base.exp(), slope.exp(), sd)
         if number < rounds - 1:
             variance = (base[:, None] + slope[:, None] * c).exp()[..., None]
@@ -122,6 +134,34 @@ def _with_peak(white: Tensor, slope: Tensor) -> Course | None:
             step = (slope @ excess / slope.square().sum().clamp(min=1e-12)).clamp(-_STEEPEST, _STEEPEST)
             stairs = _unimodal((c + step / slope.abs().max().clamp(min=1.0)).numpy())
     return course
+
+
+def _without_end_spikes(stairs: np.ndarray, information: float) -> np.ndarray:
+    """Stairs `(block,)` whose highest and lowest level are not those of a few blocks by chance.
+
+    The extreme levels of an ordered fit are too extreme (Robertson et al., 1988, section 1.6). Each is pooled with the
+    next one as long as that costs less than two numbers gain by chance.
+
+    Args:
+        stairs: Ordered fit.
+        information: Of a block on its level, nats^-1 doubled.
+    """
+    for sign in (1, -1):
+        while True:
+            edges = [0, *(np.flatnonzero(np.diff(stairs)) + 1).tolist(), len(stairs)]
+            if len(edges) < 4:
+                break
+            k = int(np.argmax(sign * stairs[edges[:-1]]))
+            beside = [j for j in (k - 1, k + 1) if 0 <= j < len(edges) - 1]
+            other = max(beside, key=lambda j: sign * stairs[edges[j]])
+            low, high = min(k, other), max(k, other)
+            n, m = edges[k + 1] - edges[k], edges[other + 1] - edges[other]
+            apart = stairs[edges[k]] - stairs[edges[other]]
+            if information / 2 * n * m / (n + m) * apart**2 > 2 * NATS_PER_NUMBER:
+                break
+            stairs = stairs.copy()
+            stairs[edges[low] : edges[high + 1]] = (n * stairs[edges[k]] + m * stairs[edges[other]]) / (n + m)
+    return stairs
 
 
 def fitted_levels(squares: Tensor, share: Tensor, concerned: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -187,6 +187,8 @@ def _of_the_fast_noise(comparison: Comparison, course: Course, peak: Tensor) -> 
     base, log_factor = log_level[:, course.share.argmin()], log_level[:, course.share.argmax()]
     log_factor = torch.where(concerned, log_factor - base, 0.0)
     share = (log_factor @ (log_level - base[:, None]) / log_factor.square().sum()).clamp(0, 1)
+    if float(share[0]) > _MOSTLY and float(share[-1]) < 1 - _MOSTLY:  # it goes one way: from what was to what came
+        share, base, log_factor = 1 - share, base + log_factor, -log_factor
     return VarianceCourse(share, log_factor.exp(), corner, torch.where(concerned, base.exp(), 1.0))
 
 
