@@ -72,8 +72,8 @@ def diagnose(
             the simulation is from it before and after the repair, and how far the recording itself (`judged`).
         generator: Source of the diagnosis's own random numbers: of a model's samples, and of what is built into the
             simulation. By default one with a fixed seed, so that a diagnosis can be repeated.
-        progress: Is told what is looked at next, and the share of the work that is done: where something is missing
-            there is more of it.
+        progress: Function of what is searched next, and of the share of the work that is done; where something is
+            missing there is more work.
 
     Returns:
         Verdict, findings, held-out scores, and the repaired simulation.

@@ -292,7 +292,7 @@ class Finding:
         p_value: For having looked at every place where it could have been.
         held_out_gain: Log score on data not used for it, nats; None until confirmed.
         gain_without: The same where all other findings are in: what is lost if it alone is left out.
-        instead: Its best look-alike on the same blocks; None where nothing in the catalogue looks like it.
+        instead: Its best rival on the same blocks; None where it has none in the catalogue.
         sentence: The same in plain English.
         hides: Positions of sensors in which nothing else can be seen beside it.
         context: Recording and simulation as they came with the other findings, for its picture; None before the end.

@@ -54,12 +54,12 @@ class Remainder(Filter):
     @classmethod
     def _between(cls, observed: Records, reference: Records) -> Remainder:
         """Halves of log ratios of powers, each drawn towards none by as much as chance explains of it (Stein)."""
-        worth = torch.minimum(observed.dof, reference.dof)
+        dof = torch.minimum(observed.dof, reference.dof)
         ratio = (observed.power.clamp(min=1e-300) / reference.power.clamp(min=1e-300)).log()
         chance = 1 / observed.dof.clamp(min=1e-9) + 1 / reference.dof.clamp(min=1e-9)
         kept = (1 - chance / ratio.square().clamp(min=1e-300)).clamp(min=0.0)
         # Blocks are too short for the slowest bands: without a bin there is no power either.
-        return cls(observed.bands.frequency, torch.where(worth > 0, kept * ratio / 2, 0.0))
+        return cls(observed.bands.frequency, torch.where(dof > 0, kept * ratio / 2, 0.0))
 
     def response(self, f: Tensor) -> Tensor:
         x, at = f.clamp(self.frequency[0], self.frequency[-1]).log(), self.frequency.log()

@@ -21,7 +21,7 @@ from gyrofuse.mismatch.signals.comparison import N_BLOCKS, Comparison, Recording
 from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, in_fold
 
-_COSINES = 32  # half cycles in the record: as many as there are blocks, of which each is told by those beside it
+_COSINES = 32  # half cycles in the record: as many as there are blocks, each of which is predicted by those beside it
 _SHARES = N_JUDGED // N_FOLDS
 _PLAIN = 9.0  # square of a size over its variance: what is less may be noise, and stays
 

@@ -32,7 +32,7 @@ Simulation = (
     Recording | Tensor | Model | ArrayModel | RepairedModel | GMWMResult | ArrayGMWMResult | JointFit | RankResult
 )
 FEWEST = 4096
-# Of a model: records as long as the recording. What is told apart of an effect grows as m/(1 + m), the work as m.
+# Of a model: records as long as the recording. The information on an effect grows as m/(1 + m), the work as m.
 _FEWEST_RECORDS, _MOST_RECORDS, _MOST_VALUES = 4, 16, 2**23
 _SINGULAR = 1e-10  # of correlation matrices
 _SEARCHES = 4  # for lines
@@ -91,10 +91,10 @@ def modelled(
             "`fitted_samples`: expected with a noise model that does not know what it was estimated from, got "
             f"{what}; leave it out"
         )
-    told = EstimatedFrom(fitted_samples)
+    source = EstimatedFrom(fitted_samples)
     if isinstance(simulation, Model):
-        return Model([simulation], estimated_from=told)
-    return ArrayModel(simulation.components, estimated_from=told)
+        return Model([simulation], estimated_from=source)
+    return ArrayModel(simulation.components, estimated_from=source)
 
 
 def prepared(

@@ -183,6 +183,6 @@ def _try(model: RepairedModel, effect: Mechanism, where: str) -> None:
 
 
 def _wrong(where: str, expected: str, found: Any) -> ValueError:
-    told = found if isinstance(found, str) and " " in found else repr(found)
-    told = told if len(told) < 80 else f"{told[:80]} ..."
-    return ValueError(f"`description`: expected in {where} {expected}, got {told}")
+    shown = found if isinstance(found, str) and " " in found else repr(found)
+    shown = shown if len(shown) < 80 else f"{shown[:80]} ..."
+    return ValueError(f"`description`: expected in {where} {expected}, got {shown}")

@@ -28,7 +28,7 @@ _Signal = TypeVar("_Signal", Recording, Tensor)
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """The data of a `MismatchReport`, where each entry is described; what tells of it needs no more."""
+    """The data of a `MismatchReport`, where each entry is described; pages and summaries need no more."""
 
     mismatch: bool
     p_value: float

@@ -1,4 +1,4 @@
-"""The answer of a diagnosis, and how it is told."""
+"""The answer of a diagnosis: its summary, figure and page."""
 
 from __future__ import annotations
 

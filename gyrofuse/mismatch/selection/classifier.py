@@ -1,4 +1,4 @@
-"""Whether a classifier tells windows of a recording from windows of a simulation: the area under its ROC curve.
+"""Area under the ROC curve of a classifier of windows, those of a recording against those of a simulation.
 
 Linear discriminant analysis on what a window shows: wavelet variances, tails, repeats, how far its mean has moved, and
 how much sensors share. Each fold of windows is judged by a classifier that has not seen it; 0.5 is guessing.
@@ -14,7 +14,9 @@ from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.folds import N_JUDGED, in_fold
 from gyrofuse.wavelets.covariance import wavelet_cross_covariance
 
-_WINDOWS = 512  # of a recording: the area of so many is told to 0.02, and a window of it still holds four levels
+_WINDOWS = (
+    512  # of a recording: the area of so many has a standard error of 0.02, and a window of it still holds four levels
+)
 _SHORTEST = 64  # samples of a window
 _LEVELS_LEFT = 3  # of a window's longest wavelets, too few coefficients
 _RIDGE = 1.0  # windows' worth of prior on the features' scatter

@@ -43,7 +43,7 @@ class RecordingInfo:
 
     @property
     def measure(self) -> str:
-        """What numbers are told in: the unit, by its name where that is known."""
+        """Unit of numbers for readers, by its name where that is known."""
         return "units" if self.unit == "unknown" else self.unit
 
     def named(self, which: Sequence[int], every: str | None = None) -> str:
@@ -126,7 +126,7 @@ class Comparison:
 
     @cached_property
     def lineless(self) -> Tensor:
-        """Likewise without the lines that the simulation has, and of a steady level.
+        """The whitened recording without the spectral lines of the simulation, and of a steady level.
 
         Where a part of the record has nearly all power, neighbouring bins hold the same noise: by chance they bulge.
         """
@@ -166,7 +166,7 @@ class Comparison:
         return replace(self, reference=reference, analog=factor * self.analog, converter=converter)
 
     def with_stand_ins(self, sensors: Sequence[int], generator: torch.Generator) -> Comparison:
-        """With white noise in the place of sensors of which no more can be told, of one law on both sides.
+        """With white noise in the place of sensors in which nothing else can be seen, of one law on both sides.
 
         Nothing differs there any more, while the others keep their positions and are searched on. The converter leaves
         the noise as it is.

@@ -34,7 +34,7 @@ class SpectralUncertainty:
     """Of an array model that was estimated.
 
     Attributes:
-        model: It.
+        model: Noise model.
         covariance: `C` of the numbers in `model.param_names`, `(parameter, parameter)`.
         n_samples: Of each sensor, that they were estimated from.
         at_zero: Variances that were estimated as zero, `(parameter,)`.

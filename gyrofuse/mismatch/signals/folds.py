@@ -53,7 +53,7 @@ def spectral_gains(
         comparison: Recording and simulation without the mechanism.
         left: `(sensor, time)`: the recording without what the mechanism takes off.
         spectra: What the mechanism makes of the simulation's cross-spectra.
-        fold: Which one.
+        fold: Number of the fold.
     """
     block = comparison.n_samples // N_JUDGED
     f = torch.arange(block + 1, dtype=torch.float64) / (2 * block)

@@ -102,7 +102,7 @@ class Records:
 
     @cached_property
     def dof(self) -> Tensor:
-        """What a band is worth, independent complex ordinates, `(band,)`; 0 where records are too short to say."""
+        """Independent complex ordinates of each band, `(band,)`; 0 where records are too short."""
         scale = self.signal.shape[-1] / self.bands.n_samples
         if scale == 1:
             return self.n_records * self.bands.dof
@@ -187,14 +187,14 @@ class Records:
         dof = self.bands.dof
         size = self.bands.mean_of(base.spectrum(self.bands.nodes)).mT.sqrt()  # (band, sensor)
         total = _sums(self.spectra / size[:, :, None] / size[:, None, :] * dof[:, None, None])
-        worth = _sums(dof)
+        ordinates = _sums(dof)
         wanted = min(_ORDINATES * self.signal.shape[-2], float(dof.sum()))
         smooth = []
         for b in range(len(dof)):
             low, high = b, b + 1
-            while worth[high] - worth[low] < wanted:
+            while ordinates[high] - ordinates[low] < wanted:
                 low, high = max(low - 1, 0), min(high + 1, len(dof))
-            smooth.append((total[high] - total[low]) / (worth[high] - worth[low]))
+            smooth.append((total[high] - total[low]) / (ordinates[high] - ordinates[low]))
         return torch.stack(smooth)
 
 

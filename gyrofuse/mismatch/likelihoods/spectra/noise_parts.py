@@ -22,7 +22,7 @@ class Parts:
     """The noise of a simulation in three parts: what is white, AR1s, and a walk.
 
     Attributes:
-        base: It.
+        base: Spectrum of the noise.
         f: Frequencies, cycles per sample, `(node,)`.
     """
 
@@ -140,7 +140,7 @@ class Ground:
     """The noise of a simulation in bands.
 
     Attributes:
-        base: It.
+        base: Spectrum of the noise.
         bands: Where spectra are compared.
     """
 

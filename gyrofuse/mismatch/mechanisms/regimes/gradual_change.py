@@ -53,7 +53,7 @@ _FACTOR = 1.25  # by which, and by `_NATS`, a level that goes up and down all th
 _LEFT, _SHARE = 1e-3, 0.05  # p value of what still goes up and down beside the course, and its share of all that does
 _KINK = 1e-12  # of a share from sample to sample, above rounding
 _MOSTLY = 0.5  # of its way
-_BEGUN = 0.05  # share of its way from which a course is told to have left its lower end, and not to have come back
+_BEGUN = 0.05  # share of its way from which a course is said to have left its lower end, and not to have come back
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ class GradualChange(Mechanism):
             return None
         weight = own_spread(comparison).weight
         gain = float(weight @ course_scores(white, course.variance).sum(-1))
-        worth = course_score(white, course, weight)
+        score = course_score(white, course, weight)
         once = 0.0
         if episodes is not None:
             at_once = course_at_once(white, episodes.inside(comparison.n_samples), episodes.factor != 1)
@@ -104,7 +104,7 @@ class GradualChange(Mechanism):
             if not goes_up_and_down(comparison, episodes):
                 # A single one is a course as well: another that may be it has to gain more than orders do by chance.
                 once += 2 * math.log(comparison.n_samples)
-        if worth < once + _NATS or _goes_up_and_down(comparison, course, worth):
+        if score < once + _NATS or _goes_up_and_down(comparison, course, score):
             return None
         peak = course.share > _MOSTLY
         if bool(peak.all()) or not bool(peak.any()):
@@ -166,11 +166,11 @@ class GradualChange(Mechanism):
         return VarianceCourse(self._share(n_samples, rate), self.factor, self.corner_hz / rate, self.base)
 
 
-def _goes_up_and_down(comparison: Comparison, course: Course, worth: float) -> bool:
+def _goes_up_and_down(comparison: Comparison, course: Course, score: float) -> bool:
     """Whether a level that is modulated all the time says more, or still says something beside the course."""
     always = worth_of_modulation(comparison)
     rest = modulation_of(whitened_recording(comparison) / course.variance.sqrt())
-    return always > _FACTOR * worth + _NATS or (rest.p_value < _LEFT and rest.log_ratio > _SHARE * always)
+    return always > _FACTOR * score + _NATS or (rest.p_value < _LEFT and rest.log_ratio > _SHARE * always)
 
 
 def _of_the_fast_noise(comparison: Comparison, course: Course, peak: Tensor) -> VarianceCourse:
@@ -198,8 +198,8 @@ def _over_the_simulation(comparison: Comparison, known: VarianceCourse) -> Tenso
         return torch.as_tensor(known.base)
     observed, reference = replace(comparison.observed, loud=(*comparison.observed.loud, known)), comparison.reference
     fast = fast_share(comparison.bands.frequency, known.corner)
-    worth = observed.dof * reference.dof / (observed.dof + reference.dof).clamp(min=1e-300) * fast
-    over = ((observed.power / reference.power.clamp(min=1e-300)).clamp(min=1e-300).log() @ worth / worth.sum()).exp()
+    weight = observed.dof * reference.dof / (observed.dof + reference.dof).clamp(min=1e-300) * fast
+    over = ((observed.power / reference.power.clamp(min=1e-300)).clamp(min=1e-300).log() @ weight / weight.sum()).exp()
     return torch.where(known.factor != 1, known.base * over, 1.0)
 
 

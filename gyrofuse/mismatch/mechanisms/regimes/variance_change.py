@@ -85,16 +85,18 @@ class VarianceChange(Mechanism):
             return None
         held = _held(comparison, found) or _held(comparison, stretch_of(white))
         if held is None:
-            return None  # some stretch has another level, but nothing tells which and what level
-        found, reference, told = held
+            return None  # some segment has another level, but which and what level is not known
+        found, reference, posterior = held
         rate = comparison.info.rate
         corner = corner_of(comparison.observed.noise[0], found.inside(comparison.n_samples), found.factor)
         episodes = tuple((e.start / rate, e.stop / rate) for e in found.episodes)
         factor = torch.where(found.factor != 1, fast_factor(found.factor, corner), 1.0)
         effect = cls(episodes, factor, corner * rate)
         sensors = tuple((found.factor != 1).nonzero()[:, 0].tolist())
-        parameters = {name: _time(limits, rate) for name, limits in (("start", told.start), ("stop", told.stop))}
-        for i, value, sd in zip(sensors, told.log_factor.tolist(), told.log_factor_sd.tolist(), strict=True):
+        parameters = {
+            name: _time(limits, rate) for name, limits in (("start", posterior.start), ("stop", posterior.stop))
+        }
+        for i, value, sd in zip(sensors, posterior.log_factor.tolist(), posterior.log_factor_sd.tolist(), strict=True):
             limits = torch.tensor([value, value - Z * sd, value + Z * sd], dtype=torch.float64).exp()
             middle, low, high = fast_factor(limits, corner).tolist()
             parameters[f"factor[{i}]"] = Parameter(middle, low, high, "")
@@ -161,21 +163,23 @@ def _held(comparison: Comparison, found: Episodes) -> tuple[Episodes, Reference 
     """Episodes whose level is known, with what is known of it and of that between them.
 
     A few wild samples may be likelier than any other stretch, and yet not likelier than all others together: then
-    nothing tells which stretch has another level.
+    which segment has another level is not known.
     """
     found, white = _from_the_simulated_level(comparison, found), whitened_recording(comparison)
     sensors = (found.factor != 1).nonzero()[:, 0].tolist()
     if not sensors:
         return None
     reference = level_between(comparison, found.inside(comparison.n_samples))
-    told = first_segment_posterior(white[sensors], found.episodes, None if reference is None else reference.of(sensors))
-    known = float((told.log_factor.abs() / told.log_factor_sd).max()) > _KNOWN
-    return (found, reference, told) if known else None
+    posterior = first_segment_posterior(
+        white[sensors], found.episodes, None if reference is None else reference.of(sensors)
+    )
+    known = float((posterior.log_factor.abs() / posterior.log_factor_sd).max()) > _KNOWN
+    return (found, reference, posterior) if known else None
 
 
 @derived
 def likeliest_episodes(comparison: Comparison) -> Episodes | None:
-    """Those that the simulation's level tells of, if any, or the recording by itself."""
+    """Segments beside the level of the simulation, if any, or of the recording by itself."""
     return _against_the_simulation(comparison) or episodes_of(whitened_recording(comparison))
 
 
@@ -186,7 +190,7 @@ def worth_of_modulation(comparison: Comparison) -> float:
 
 
 def _against_the_simulation(comparison: Comparison) -> Episodes | None:
-    """Episodes that the simulation's level tells of, where the recording has that between them."""
+    """Segments beside the level of the simulation, where the recording has that level between them."""
     compared = compared_levels(comparison)
     if compared is None or compared.p_value == 1:
         return None
@@ -206,7 +210,7 @@ def _alternatives(comparison: Comparison, found: Episodes) -> tuple[str, ...]:
 
 
 def _from_the_simulated_level(comparison: Comparison, found: Episodes) -> Episodes:
-    """The other way round where the simulation has the level that was taken for the changed one."""
+    """Segments with both levels exchanged, where the simulation has the level that was taken for the changed one."""
     inside = found.inside(comparison.n_samples)
     squares, reference = comparison.white.square(), comparison.reference.signal
     share = comparison.n_samples / (reference.shape[0] * reference.shape[-1])

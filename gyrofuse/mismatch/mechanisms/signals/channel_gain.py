@@ -41,7 +41,7 @@ class ChannelGain(Mechanism):
     The response `m`, which all sensors share, is one for a plain gain; see `Transfer`.
 
     Attributes:
-        channel: Its name.
+        channel: Name of the channel.
         coupling: `(sensor, row)`, signal per unit of the rows at the frequencies of most information; 0 for sensors
             that do not show it.
         kind: Which rows are made from the channel.

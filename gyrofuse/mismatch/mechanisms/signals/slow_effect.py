@@ -161,7 +161,7 @@ class Strong(NamedTuple):
 
     Attributes:
         analysis: What it is part of.
-        scan: It.
+        scan: Scan of the mechanism.
         alternatives: Mechanisms that fit as well.
         log_factors: Of the slow noise beside it, with what else is there, `(sensor, part)`: for weights.
     """
@@ -223,7 +223,7 @@ def slow_finding(
     Args:
         comparison: Where it was found.
         strong: The scan.
-        effect: It, with its numbers.
+        effect: Mechanism with its numbers.
         found: Its sizes.
         words: What the bias does.
         numbers: Onset, time constants or lag.

@@ -31,8 +31,10 @@ if TYPE_CHECKING:
 _ROUNDS = 6
 _TAIL = 0.025  # beyond either limit
 _STRONG, _FAR, _HALVINGS = 12.0, 6.0, 40  # standard deviations from which a law is normal, and beyond which none is
-_PER_PART = 20.0  # squared amplitude over its variance in a part of a record: there a phase is told to 0.2 rad
-_FEWEST_PARTS, _MOST_PARTS = 4, 32  # of a record, whose phases tell how a tone wanders
+_PER_PART = (
+    20.0  # squared amplitude over its variance in a part of a record: there a phase has a standard deviation of 0.2 rad
+)
+_FEWEST_PARTS, _MOST_PARTS = 4, 32  # of a record, from whose phases the wander of a tone is estimated
 _SIZES, _MOST_DECADES = 60, 4  # of walks that are tried, from a tenth of the noise's variance in the slowest mode on
 _HALF_WIDTHS = 2.0  # of a peak, within which a line is looked for in its place
 _REACH, _GUARD = 64, 3  # bins on either side that tell the noise, and those too near to
@@ -75,7 +77,7 @@ class VibrationTone(Mechanism):
         snr = tone.amplitude / sd
         there = included_sensors(snr.square(), 2)
         present, seen = there.positions, math.sqrt(there.least)
-        # Noise adds to the squares of amplitudes, but tells nothing of the frequency.
+        # Noise adds to the squares of amplitudes, but has no information on the frequency.
         energy = max(float((snr.square() - 2).clamp(min=0.0)[list(present)].sum()), 1.0)
         spread = math.hypot(math.sqrt(12 / energy) / (2 * math.pi * n), tone.wander(comparison, noise, energy))
         parameters = {"frequency": _limits(tone.frequency_hz, spread * comparison.info.rate, "Hz")}

@@ -60,13 +60,13 @@ class ToneSize(Mechanism):
         old, new = (f"{float(size[sensor]):.3g}" for size in (before, own))
         of_sensor = f"{info.measure} (sensor {info.sensors[sensor]})"
         if float((own / sd)[other].max()) < _SEEN_SD:
-            told = f"the simulation's tone at {f:.6g} Hz, of amplitude {old} {of_sensor}, is not in the recording"
+            words = f"the simulation's tone at {f:.6g} Hz, of amplitude {old} {of_sensor}, is not in the recording"
         else:
-            told = f"the tone at {f:.6g} Hz that the simulation has is of amplitude {new} instead of {old} {of_sensor}"
+            words = f"the tone at {f:.6g} Hz that the simulation has is of amplitude {new} instead of {old} {of_sensor}"
         return Finding(
             cls.name,
             cls(f, torch.where(other, own, before)),
-            f"{told}, in {info.named(sensors, 'all sensors')}",
+            f"{words}, in {info.named(sensors, 'all sensors')}",
             sizes.p_value,
             sensors,
             {f"amplitude[{i}]": _limits(float(own[i]), float(sd[i]), info.measure) for i in sensors},

@@ -69,12 +69,12 @@ class CommonMode(Addition):
         reference = gain[gain.abs().argmax()]
         gain = gain * reference.conj() / reference.abs()
         sd = shape.sd[0].square().nanmean(0).sqrt()
-        size, told = gain.abs(), term.t_values(shape.sd_alone)
-        second = float(told.topk(2).values[-1])
+        size, t_values = gain.abs(), term.t_values(shape.sd_alone)
+        second = float(t_values.topk(2).values[-1])
         if second < _LEAST:  # one sensor has nothing in common
             return None
         least = min(_SEEN, second)
-        sensors = tuple(i for i in range(len(gain)) if float(told[i]) >= least)
+        sensors = tuple(i for i in range(len(gain)) if float(t_values[i]) >= least)
         parameters = {}
         for i in sensors:
             s, d = float(size[i]), float(sd[i])

@@ -47,7 +47,7 @@ class Shape(NamedTuple):
     """A shape that was chosen.
 
     Attributes:
-        term: It, its numbers those of the joint fit.
+        term: Component with the numbers of the joint fit.
         company: The others of that fit.
         sd: Standard deviations of its local `(number, sensor)` and shared numbers; NaN where not free.
         sd_alone: Of its local numbers, all others held.
@@ -102,7 +102,7 @@ def chosen_shape(comparison: Comparison, name: str, level: float) -> Shape | Non
 
 
 def _stands_out(comparison: Comparison, best: Shape, peak: Oscillation) -> bool:
-    """Whether a peak is there beside shapes: what bends around a filter's corner looks like one without it."""
+    """Whether a peak is there beside shapes: without the filter, what bends around its corner has the same shape."""
     data, terms = ratios_around(comparison, peak.centre, 2 * peak.width), [best.term, *best.company]
     start = best_bump(data, terms, torch.tensor([[peak.centre, peak.width]], dtype=torch.float64)) if data else None
     if data is None or start is None:

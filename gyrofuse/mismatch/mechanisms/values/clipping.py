@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-_CELL = 0.02  # width of a cell at the limit, sd: what a sample there is worth is bounded by it
+_CELL = 0.02  # width of a cell at the limit, sd: it bounds the log likelihood ratio of a sample there
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-_SURE = math.log(50)  # nats that one sample in the band is worth at most
+_SURE = math.log(50)  # largest log likelihood ratio of one sample in the band, nats
 
 
 @dataclass(frozen=True, eq=False)

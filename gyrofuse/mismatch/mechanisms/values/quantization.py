@@ -35,10 +35,10 @@ _TABLE = 1024  # points of a law
 _EVEN = 3.0  # steps, sd: over more of them all distances from the lattice are as likely
 _TAILS = 6.0  # sd
 _TOO_COARSE = 0.75  # rms change between samples, steps: noise of 0.45 steps and the rounding itself
-_UNDONE = 1.25  # sd of a sample given its past: a step's largest at which what was rounded can be told
+_UNDONE = 1.25  # sd of a sample given its past: a step's largest at which the rounded value can be estimated
 _STEEPEST, _FLAT = 8.0, 1e-4  # slopes of a logarithm of density over a step
 _RIDGE = 1e-3  # of correlations
-_SHARPEST = 0.02  # blur in steps: what an exact lattice is worth is bounded by it
+_SHARPEST = 0.02  # smallest blur, steps: it bounds the log likelihood ratio of an exact grid
 
 
 @dataclass(frozen=True, eq=False)
