@@ -154,3 +154,8 @@ def cleaned(entry: Any) -> Any:
     if isinstance(entry, list):
         return [cleaned(value) for value in entry]
     return None if isinstance(entry, float) and not math.isfinite(entry) else entry
+
+
+def readable(name: str) -> str:
+    """An identifier as words for readers."""
+    return name.replace("_", " ")

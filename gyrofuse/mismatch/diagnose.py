@@ -15,7 +15,7 @@ from gyrofuse.io.recording import Recording
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.spectra.fit_verdict import KNOWN, fit_verdict
 from gyrofuse.mismatch.detectors.tests import TESTS, family_wise_p_value, run_tests
-from gyrofuse.mismatch.mechanisms.mechanism import Context, Mechanism
+from gyrofuse.mismatch.mechanisms.mechanism import Context, repaired
 from gyrofuse.mismatch.repair.inputs import Simulation, modelled, on_processor, prepared
 from gyrofuse.mismatch.repair.noise_model import noise_of, noise_samples
 from gyrofuse.mismatch.repair.reference_effects import with_own_effects
@@ -146,7 +146,7 @@ def diagnose(
     left = repair_leftovers(start, comparison, unexplained, hidden, generator)
     comparison, effects = left.comparison, (*(f.effect for f in findings), *left.effects)
     if hidden:
-        comparison = _with_hidden(start, effects, generator)
+        comparison = repaired(start, effects, generator)  # with what was recorded in the sensors that were hidden
         after = run_tests(comparison)
         seen = {*_OF_SAMPLES, *(result.test for result in unexplained)}
         unexplained += [result for result in _significant(after, false_alarm) if result.test not in seen]
@@ -170,13 +170,6 @@ def diagnose(
 def _significant(results: tuple[TestResult, ...], false_alarm: float) -> list[TestResult]:
     """Results of tests that see a difference."""
     return [result for result in results if sidak(result.p_value, len(results)) <= false_alarm]
-
-
-def _with_hidden(start: Comparison, effects: tuple[Mechanism, ...], generator: torch.Generator) -> Comparison:
-    """Recording and simulation with all effects repaired, and what was recorded in the sensors that were hidden."""
-    for effect in effects:
-        start = effect.repair(start, generator)
-    return start
 
 
 def _unrounded(comparison: Comparison) -> Comparison:

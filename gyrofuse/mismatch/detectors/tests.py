@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from gyrofuse._base.results import readable
 from gyrofuse.mismatch.detectors.lines.chirps import chirp_test
 from gyrofuse.mismatch.detectors.lines.clocks import clock_test
 from gyrofuse.mismatch.detectors.result import TestResult
@@ -52,7 +53,7 @@ def run_tests(
     """
     results = []
     for number, test in enumerate(TESTS):
-        progress(test.__name__.replace("_", " "), number / len(TESTS))
+        progress(readable(test.__name__), number / len(TESTS))
         results.append(test(comparison))
     return tuple(results)
 

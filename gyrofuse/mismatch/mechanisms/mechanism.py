@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gyrofuse._base.axes import clean_name, new_axes_below_each_other
 from gyrofuse._base.deprecation import RenamedAttribute
-from gyrofuse._base.results import cleaned
+from gyrofuse._base.results import cleaned, readable
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.folds import sd_of_sum, spectral_gains
 
@@ -264,16 +264,6 @@ class Context(NamedTuple):
     start: Comparison
     others: tuple[Mechanism, ...]
 
-    def others_repaired(self, finding: Finding, generator: torch.Generator) -> Comparison:
-        """Recording and simulation with all other findings repaired.
-
-        What a converter does shows on the numbers as they came alone: whatever is taken off them hides it.
-        """
-        comparison = self.start
-        for effect in self.others if not finding.effect.stage else ():
-            comparison = effect.repair(comparison, generator)
-        return comparison
-
 
 @dataclass(frozen=True, eq=False)
 class Finding:
@@ -352,7 +342,8 @@ class Finding:
         if len(axes) != 2:
             raise ValueError(f"`axes`: expected two, before and after the repair, got {len(axes)}")
         generator = torch.Generator().manual_seed(0)
-        before = self.context.others_repaired(self, generator)
+        # What a converter does shows on the numbers as they came alone: whatever is taken off them hides it.
+        before = repaired(self.context.start, () if self.effect.stage else self.context.others, generator)
         after = self.effect.repair(before, generator)
         sensor = self.clearest_sensor
         name = clean_name(before.info.sensors[sensor])
@@ -395,6 +386,14 @@ class Finding:
         )
 
 
-def readable(name: str) -> str:
-    """Name of a mechanism or of a test for readers."""
-    return name.replace("_", " ")
+def repaired(comparison: Comparison, parts: Iterable[Mechanism | Finding], generator: torch.Generator) -> Comparison:
+    """The comparison with mechanisms or findings repaired, one after the other.
+
+    Args:
+        comparison: Recording and simulation.
+        parts: What is repaired, in order.
+        generator: Source of the random numbers of what is applied to the simulation.
+    """
+    for part in parts:
+        comparison = part.repair(comparison, generator)
+    return comparison

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from gyrofuse._base.results import readable
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
 
 NOT_IDENTIFIABLE = "not_identifiable"
@@ -19,10 +20,10 @@ def not_identifiable(finding: Finding, seen: str) -> Finding:
         seen: What is there whatever its name, the beginning of a sentence.
     """
     rivals = (finding.mechanism, *finding.alternatives)
-    words = ", ".join(name.replace("_", " ") for name in rivals[:-1])
+    words = ", ".join(map(readable, rivals[:-1]))
     return replace(
         finding,
         mechanism=NOT_IDENTIFIABLE,
         alternatives=rivals,
-        sentence=f"{seen}; {words} and {rivals[-1].replace('_', ' ')} explain it equally well",
+        sentence=f"{seen}; {words} and {readable(rivals[-1])} explain it equally well",
     )

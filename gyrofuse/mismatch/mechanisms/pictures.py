@@ -18,6 +18,7 @@ from gyrofuse.mismatch.signals.comparison import N_BLOCKS, Comparison, block_mea
 from gyrofuse.mismatch.signals.lines import whitened
 from gyrofuse.mismatch.signals.prediction_errors import left_out
 from gyrofuse.mismatch.signals.psd import hann_transform
+from gyrofuse.mismatch.stats.hmm import most_likely_path
 from gyrofuse.mismatch.stats.limits import Z
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 _DOT: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 3, "color": INK}
 _LINE: dict[str, Any] = {"color": BLUE, "linewidth": 1.2}
+_RECORDED: dict[str, Any] = {**_LINE, "color": INK}
 
 
 def spectrum_near(ax: Axes, comparison: Comparison, sensor: int, frequency_hz: float, half_width_hz: float) -> None:
@@ -40,16 +42,14 @@ def spectrum_near(ax: Axes, comparison: Comparison, sensor: int, frequency_hz: f
     rate = comparison.info.rate
     reach = max(12 * half_width_hz, 40 * rate / comparison.n_samples)
     handles: list[Any] = []
-    for side, style in ((comparison.reference, _LINE), (comparison.observed, {"color": INK, "linewidth": 1.2})):
+    for side, style in ((comparison.reference, _LINE), (comparison.observed, _RECORDED)):
         transform, length = hann_transform(side.signal[0, sensor])
         f = torch.arange(len(transform), dtype=torch.float64) / length
         shown = ((f * rate - frequency_hz).abs() <= reach) & (f > 1 / length)
         power = transform.abs().square()[shown] / comparison.base.spectrum(f[shown])[sensor]
         handles += _plot(ax, f[shown] * rate, power, **style)
     ax.set_yscale("log")
-    ax.set_xlabel("frequency (Hz)")
-    ax.set_ylabel("power over the noise")
-    finish(ax, handles[::-1], ["recording", "simulation"])
+    _finish(ax, handles[::-1], ["recording", "simulation"], "frequency (Hz)", "power over the noise")
 
 
 def means_over_time(ax: Axes, comparison: Comparison, sensor: int, path: Tensor | None) -> None:
@@ -61,15 +61,7 @@ def means_over_time(ax: Axes, comparison: Comparison, sensor: int, path: Tensor 
         sensor: Position of the sensor.
         path: Fitted path `(sensor, time)`; None for none.
     """
-    seconds = (torch.arange(N_BLOCKS) + 0.5) * comparison.block / comparison.info.rate
-    means = block_means(comparison.recording[sensor])
-    handles: list[Any] = _plot(ax, seconds, means - means.mean(), **_DOT)
-    if path is not None:
-        fitted = block_means(path[sensor])
-        handles += _plot(ax, seconds, fitted - fitted.mean(), **DASHED)
-    ax.set_xlabel("time (s)")
-    ax.set_ylabel(with_unit("mean of a block", comparison.info.measure), parse_math=False)
-    _finish(ax, handles, ["recording", "fitted"])
+    _means(ax, comparison, sensor, _block_times(comparison), "time (s)", path)
 
 
 def means_against(ax: Axes, comparison: Comparison, sensor: int, x: Tensor, label: str, path: Tensor | None) -> None:
@@ -83,14 +75,17 @@ def means_against(ax: Axes, comparison: Comparison, sensor: int, x: Tensor, labe
         label: Name of the channel.
         path: Fitted path `(sensor, time)`; None for none.
     """
-    across, means = block_means(x), block_means(comparison.recording[sensor])
-    handles: list[Any] = _plot(ax, across, means - means.mean(), **_DOT)
+    _means(ax, comparison, sensor, block_means(x), label, path)
+
+
+def _means(ax: Axes, comparison: Comparison, sensor: int, x: Tensor, label: str, path: Tensor | None) -> None:
+    """Means over 256 blocks of the recording, and of the path `(sensor, time)`, against `x` `(block,)`."""
+    means = block_means(comparison.recording[sensor])
+    handles = _plot(ax, x, means - means.mean(), **_DOT)
     if path is not None:
-        order, fitted = across.argsort(), block_means(path[sensor])
-        handles += _plot(ax, across[order], (fitted - fitted.mean())[order], **DASHED)
-    ax.set_xlabel(label, parse_math=False)
-    ax.set_ylabel(with_unit("mean of a block", comparison.info.measure), parse_math=False)
-    _finish(ax, handles, ["recording", "fitted"])
+        order, fitted = x.argsort(), block_means(path[sensor])
+        handles += _plot(ax, x[order], (fitted - fitted.mean())[order], **DASHED)
+    _finish(ax, handles, ["recording", "fitted"], label, with_unit("mean of a block", comparison.info.measure))
 
 
 def gain_on_channel(ax: Axes, comparison: Comparison, sensor: int, x: Tensor, label: str) -> None:
@@ -114,9 +109,9 @@ def gain_on_channel(ax: Axes, comparison: Comparison, sensor: int, x: Tensor, la
             middle.numpy(), mean.numpy(), yerr=(Z * sd).numpy(), color=INK, linestyle="none", marker="o", markersize=3
         )
     ]
-    ax.set_xlabel(label, parse_math=False)
-    ax.set_ylabel(with_unit("mean of samples", comparison.info.measure), parse_math=False)
-    finish(ax, handles, ["recording, with 95 % intervals"])
+    _finish(
+        ax, handles, ["recording, with 95 % intervals"], label, with_unit("mean of samples", comparison.info.measure)
+    )
 
 
 def ratio_of_spectra(ax: Axes, comparison: Comparison, sensor: int, factor: Callable[[Tensor], Tensor] | None) -> None:
@@ -133,15 +128,19 @@ def ratio_of_spectra(ax: Axes, comparison: Comparison, sensor: int, factor: Call
     ratio = (observed.power / reference.power)[sensor, known]
     sd = (1 / observed.dof[known] + 1 / reference.dof[known]).sqrt()
     hertz = f[known] * comparison.info.rate
-    handles: list[Any] = _plot(ax, hertz, ratio, **_DOT)
+    handles = _plot(ax, hertz, ratio, **_DOT)
     handles.append(ax.fill_between(hertz.numpy(), (-Z * sd).exp().numpy(), (Z * sd).exp().numpy(), **SHADE))
     if factor is not None:
         handles += _plot(ax, hertz, factor(f[known])[sensor], **DASHED)
     ax.set_xscale("log")
     ax.set_yscale("log")
-    ax.set_xlabel("frequency (Hz)")
-    ax.set_ylabel("recording over simulation, power")
-    _finish(ax, handles, ["recording", "95 % of recordings that agree", "fitted"])
+    _finish(
+        ax,
+        handles,
+        ["recording", "95 % of recordings that agree", "fitted"],
+        "frequency (Hz)",
+        "recording over simulation, power",
+    )
 
 
 def coherence(ax: Axes, comparison: Comparison, sensor: int) -> None:
@@ -153,9 +152,7 @@ def coherence(ax: Axes, comparison: Comparison, sensor: int) -> None:
         handles += _plot(ax, hertz, side.coherence[:, sensor, others].abs().amax(-1), **style)
     ax.set_xscale("log")
     ax.set_ylim(0, 1.02)
-    ax.set_xlabel("frequency (Hz)")
-    ax.set_ylabel("largest coherence with another sensor")
-    finish(ax, handles, ["recording", "simulation"])
+    _finish(ax, handles, ["recording", "simulation"], "frequency (Hz)", "largest coherence with another sensor")
 
 
 def values(ax: Axes, comparison: Comparison, sensor: int, centre: float, width: float) -> None:
@@ -167,18 +164,12 @@ def values(ax: Axes, comparison: Comparison, sensor: int, centre: float, width: 
         sensor: Position of the sensor.
         centre, width: Middle and half width of the picture, unit of the signal.
     """
-    bins = np.linspace(centre - width, centre + width, 201)
-    handles: list[Any] = []
-    shift = float(comparison.reference.signal[:, sensor].mean() - comparison.recording[sensor].mean())
-    for signal, style in (
-        (comparison.recording[sensor], {"color": INK, "linewidth": 1.2}),
-        (comparison.reference.signal[0, sensor] - shift, _LINE),
-    ):
-        share = np.histogram(signal.numpy(), bins)[0] / signal.numel()
-        handles.append(ax.stairs(share, bins, **style))
-    ax.set_xlabel(with_unit("value", comparison.info.measure), parse_math=False)
-    ax.set_ylabel("share of the samples in a bin")
-    finish(ax, handles, ["recording", "simulation"])
+    handles = []
+    for signal, style in _as_one_mean(comparison, sensor):
+        share, edges = np.histogram(signal.numpy(), np.linspace(centre - width, centre + width, 201))
+        handles.append(ax.stairs(share / signal.numel(), edges, **style))
+    label = with_unit("value", comparison.info.measure)
+    _finish(ax, handles, ["recording", "simulation"], label, "share of the samples in a bin")
 
 
 def distance_from_grid(ax: Axes, comparison: Comparison, sensor: int, step: float, offset: float) -> None:
@@ -190,19 +181,19 @@ def distance_from_grid(ax: Axes, comparison: Comparison, sensor: int, step: floa
         sensor: Position of the sensor.
         step, offset: Of the grid, unit of the signal.
     """
-    bins = np.linspace(-0.5, 0.5, 101)
-    shift = float(comparison.reference.signal[:, sensor].mean() - comparison.recording[sensor].mean())
-    handles: list[Any] = []
-    for signal, style in (
-        (comparison.recording[sensor], {"color": INK, "linewidth": 1.2}),
-        (comparison.reference.signal[0, sensor] - shift, _LINE),
-    ):
-        place = (signal - offset) / step
-        density = np.histogram((place - place.round()).numpy(), bins, density=True)[0]
-        handles.append(ax.stairs(density, bins, **style))
-    ax.set_xlabel("distance from the grid (steps)")
-    ax.set_ylabel("density")
-    finish(ax, handles, ["recording", "simulation"])
+    handles = []
+    for signal, style in _as_one_mean(comparison, sensor):
+        steps = (signal - offset) / step
+        density, edges = np.histogram((steps - steps.round()).numpy(), np.linspace(-0.5, 0.5, 101), density=True)
+        handles.append(ax.stairs(density, edges, **style))
+    _finish(ax, handles, ["recording", "simulation"], "distance from the grid (steps)", "density")
+
+
+def _as_one_mean(comparison: Comparison, sensor: int) -> list[tuple[Tensor, dict[str, Any]]]:
+    """Recording and first record of the simulation, `(time,)` each, with the mean of the recording, and their looks."""
+    own, other = comparison.recording[sensor], comparison.reference.signal[:, sensor]
+    shift = float(other.mean() - own.mean())
+    return [(own, _RECORDED), (other[0] - shift, _LINE)]
 
 
 def samples(ax: Axes, comparison: Comparison, sensor: int, first: int, count: int) -> None:
@@ -218,11 +209,9 @@ def samples(ax: Axes, comparison: Comparison, sensor: int, first: int, count: in
     seconds = torch.arange(first, first + count) / comparison.info.rate
     own = comparison.recording[sensor, first : first + count]
     other = comparison.reference.signal[0, sensor, :count]
-    handles: list[Any] = _plot(ax, seconds, own - own.mean(), color=INK, linewidth=0.8, marker="o", markersize=2.5)
+    handles = _plot(ax, seconds, own - own.mean(), color=INK, linewidth=0.8, marker="o", markersize=2.5)
     handles += _plot(ax, seconds[: len(other)], other - other.mean(), color=BLUE, linewidth=0.8, alpha=0.7)
-    ax.set_xlabel("time (s)")
-    ax.set_ylabel(with_unit("sample", comparison.info.measure), parse_math=False)
-    finish(ax, handles, ["recording", "simulation"])
+    _finish(ax, handles, ["recording", "simulation"], "time (s)", with_unit("sample", comparison.info.measure))
 
 
 def tails(ax: Axes, comparison: Comparison, sensor: int) -> None:
@@ -236,9 +225,13 @@ def tails(ax: Axes, comparison: Comparison, sensor: int) -> None:
     handles += _plot(ax, x, torch.special.erfc(x / math.sqrt(2)), **DASHED)
     ax.set_yscale("log")
     ax.set_ylim(bottom=0.3 / comparison.n_samples)
-    ax.set_xlabel("size of a prediction error (standard deviations)")
-    ax.set_ylabel("share beyond it")
-    finish(ax, handles, ["recording", "simulation", "normal noise"])
+    _finish(
+        ax,
+        handles,
+        ["recording", "simulation", "normal noise"],
+        "size of a prediction error (standard deviations)",
+        "share beyond it",
+    )
 
 
 def variance_over_time(ax: Axes, comparison: Comparison, sensor: int, course: Tensor | None) -> None:
@@ -250,17 +243,15 @@ def variance_over_time(ax: Axes, comparison: Comparison, sensor: int, course: Te
         sensor: Position of the sensor.
         course: Fitted variance `(sensor, time)`, over that of the rest; None for none.
     """
-    seconds = (torch.arange(N_BLOCKS) + 0.5) * comparison.block / comparison.info.rate
+    seconds = _block_times(comparison)
     white = whitened(comparison.observed.steady[0], comparison.base)
     squares = block_means(white[sensor].square())
-    handles: list[Any] = _plot(ax, seconds, squares, **_DOT)
+    handles = _plot(ax, seconds, squares, **_DOT)
     if course is not None:
         fitted = block_means(course[sensor])
         handles += _plot(ax, seconds, fitted * squares.median() / fitted.median(), **DASHED)
     ax.set_yscale("log")
-    ax.set_xlabel("time (s)")
-    ax.set_ylabel("variance over the simulation's")
-    _finish(ax, handles, ["recording", "fitted"])
+    _finish(ax, handles, ["recording", "fitted"], "time (s)", "variance over the simulation's")
 
 
 def two_levels(ax: Axes, comparison: Comparison, sensor: int, half_step: float, dwell: float) -> None:
@@ -278,30 +269,21 @@ def two_levels(ax: Axes, comparison: Comparison, sensor: int, half_step: float, 
     means = comparison.recording[sensor, : n * length].unflatten(-1, (n, length)).mean(-1)
     means = means - means.median()
     seconds = (torch.arange(n) + 0.5) * length / comparison.info.rate
-    handles: list[Any] = _plot(ax, seconds, means, color=INK, linewidth=0.8)
+    handles = _plot(ax, seconds, means, color=INK, linewidth=0.8)
     if half_step:
         noise = float(means.diff().square().median()) / 0.9  # twice the variance of a mean: chi-square has median 0.45
         handles += _plot(ax, seconds, half_step * likeliest_path(means / half_step, noise / half_step**2), **DASHED)
-    ax.set_xlabel("time (s)")
-    ax.set_ylabel(with_unit("mean of a few samples", comparison.info.measure), parse_math=False)
-    _finish(ax, handles, ["recording", "decoded"])
+    _finish(
+        ax, handles, ["recording", "decoded"], "time (s)", with_unit("mean of a few samples", comparison.info.measure)
+    )
 
 
 def likeliest_path(y: Tensor, variance: float, stay: float = 7 / 8) -> Tensor:
-    """Path of values +-1 that is likeliest for means `(time,)` of some variance, by Viterbi's algorithm."""
-    score = torch.stack([-(y + 1).square(), -(y - 1).square()], -1) / max(variance, 1e-6)
-    move = torch.tensor([[stay, 1 - stay], [1 - stay, stay]], dtype=y.dtype).log()
-    best, back = score[0], []
-    for row in score[1:]:
-        value, at = (best[:, None] + move).max(0)
-        best = value + row
-        back.append(at)
-    state = int(best.argmax())
-    states = [state]
-    for at in reversed(back):
-        state = int(at[state])
-        states.append(state)
-    return 2.0 * torch.tensor(states[::-1], dtype=y.dtype) - 1
+    """Path of values +-1 that is likeliest for means `(time,)` of some variance."""
+    log_likelihood = torch.stack([-(y + 1).square(), -(y - 1).square()], -1) / max(variance, 1e-6)
+    start = torch.full((2,), 0.5, dtype=y.dtype)
+    transition = torch.tensor([[stay, 1 - stay], [1 - stay, stay]], dtype=y.dtype)
+    return 2.0 * most_likely_path(log_likelihood, start, transition) - 1
 
 
 def spectrogram(ax: Axes, comparison: Comparison, sensor: int, frequency_hz: float, half_width_hz: float) -> None:
@@ -326,22 +308,27 @@ def spectrogram(ax: Axes, comparison: Comparison, sensor: int, frequency_hz: flo
     seconds = (torch.arange(len(power)) * hop + window / 2) / rate
     level = power[:, shown].clamp(min=1e-300).log10().mT
     low = float(level.median())
-    ax.pcolormesh(
-        seconds, f[shown], level, cmap="Greys", vmin=low - 0.3, vmax=max(float(level.max()), low + 1.5), rasterized=True
-    )
+    image = level.numpy()
+    high = max(float(level.max()), low + 1.5)
+    ax.pcolormesh(seconds.numpy(), f[shown].numpy(), image, cmap="Greys", vmin=low - 0.3, vmax=high, rasterized=True)
     track = f[shown][power[:, shown].argmax(-1)]
     handles = _plot(ax, seconds, track, color=DASHED["color"], linewidth=0.8)
-    ax.set_xlabel("time (s)")
-    ax.set_ylabel("frequency (Hz)")
-    finish(ax, handles, ["highest power"])
+    _finish(ax, handles, ["highest power"], "time (s)", "frequency (Hz)")
     ax.grid(visible=False)
 
 
-def _finish(ax: Axes, handles: list[Any], labels: list[str]) -> None:
-    """The common look, with labels for what was drawn."""
+def _finish(ax: Axes, handles: list[Any], labels: list[str], x: str, y: str) -> None:
+    """The common look: labels of the axes, and a legend for as many of the labels as something was drawn for."""
+    ax.set_xlabel(x, parse_math=False)
+    ax.set_ylabel(y, parse_math=False)
     finish(ax, handles, labels[: len(handles)])
 
 
 def _plot(ax: Axes, x: Tensor, y: Tensor, **style: Any) -> list[Any]:
     """Lines or dots of tensors."""
     return list(ax.plot(x.numpy(), y.numpy(), **style))
+
+
+def _block_times(comparison: Comparison) -> Tensor:
+    """Middles of the 256 blocks, s."""
+    return (torch.arange(N_BLOCKS) + 0.5) * comparison.block / comparison.info.rate

@@ -11,9 +11,9 @@ import torch
 
 from gyrofuse._base.axes import with_unit
 from gyrofuse._base.page import image, number, render
-from gyrofuse._base.results import format_p_value
+from gyrofuse._base.results import format_p_value, readable
 from gyrofuse.mismatch.mechanisms.catalogue import STAGES, named
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter, readable
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
 from gyrofuse.mismatch.reporting.figures_data import VarianceComparison, compared_powers, grouped_spectrum
 from gyrofuse.mismatch.reporting.outcome import Outcome
 from gyrofuse.mismatch.reporting.plots import ends_of_colours, plot_blocks, plot_deviations, plot_map, plot_spectra

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 
 from gyrofuse._base.linalg import SingularCovarianceError
-from gyrofuse._base.results import p_words
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, readable
+from gyrofuse._base.results import p_words, readable
+from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.reporting.benefit import Benefit
 from gyrofuse.mismatch.reporting.outcome import Outcome
 from gyrofuse.mismatch.selection.held_out import HeldOut

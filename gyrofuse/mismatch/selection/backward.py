@@ -13,7 +13,7 @@ from dataclasses import replace
 import torch
 
 from gyrofuse.mismatch.mechanisms.catalogue import named
-from gyrofuse.mismatch.mechanisms.mechanism import Finding
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, repaired
 from gyrofuse.mismatch.selection.alternatives import compare
 from gyrofuse.mismatch.selection.forward import Selected
 from gyrofuse.mismatch.selection.held_out import HeldOutScore, score_held_out
@@ -142,9 +142,7 @@ def _left_out(one: Selected, later: Sequence[Finding], generator: torch.Generato
     """
     if one.finding.effect.stage or not later:
         return one.score, one.before
-    left = one.before
-    for other in later:
-        left = other.repair(left, generator)
+    left = repaired(one.before, later, generator)
     return score_held_out(left, one.finding.effect), left
 
 
@@ -176,9 +174,7 @@ def _with_rival(
     least = 0.0
     if gone:
         least = sum((one.score.total for one in gone), first.score.total)
-        left = first.before
-        for other in rest:
-            left = other.repair(left, generator)
+        left = repaired(first.before, rest, generator)
     for kind in named([finding.instead.mechanism]):
         found = kind.detect_and_fit(left, level)
         if found is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
@@ -17,14 +17,14 @@ from gyrofuse.mismatch.detectors.variance.noise_level import (
     variance_p_value,
     whitened_recording,
 )
-from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
+from gyrofuse.mismatch.mechanisms.regimes.changing_variance import ChangingVariance
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import (
     goes_up_and_down,
     likeliest_episodes,
     worth_of_modulation,
 )
-from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.dims import Dims, OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
 from gyrofuse.mismatch.signals.variance_course import (
@@ -44,10 +44,6 @@ from gyrofuse.mismatch.stats.variance_courses import (
     fitted_levels,
 )
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-
 _NATS = 5.0  # by which it has to be likelier than episodes with a start and a stop
 _FACTOR = 1.25  # by which, and by `_NATS`, a level that goes up and down all the time has to be likelier
 _LEFT, _SHARE = 1e-3, 0.05  # p value of what still goes up and down beside the course, and its share of all that does
@@ -57,7 +53,7 @@ _BEGUN = 0.05  # share of its way from which a course is said to have left its l
 
 
 @dataclass(frozen=True, eq=False)
-class GradualChange(Mechanism):
+class GradualChange(ChangingVariance):
     """`S_t(f) = (1 + (base factor^c(t) - 1) f^2/(f^2 + f_c^2)) S(f)`: what is fast is louder by a course `c`.
 
     The course rises to one peak and falls from it, either of which may be missing. A level that goes up and down more
@@ -71,12 +67,6 @@ class GradualChange(Mechanism):
         corner_hz: `f_c`; 0 where all noise but the mean is louder.
     """
 
-    name: ClassVar[str] = "variance_change"
-    likelihood: ClassVar[str] = "regimes"
-    rivals: ClassVar[tuple[str, ...]] = ("spikes",)
-    separated_by: ClassVar[str] = "a longer recording with more than one change"
-    happened_once: ClassVar[bool] = True
-    changes_noise: ClassVar[bool] = True
     time_s: Annotated[Tensor, Dims(("knot",))]
     share: Annotated[Tensor, Dims(("knot",))]
     base: OfSensors
@@ -142,27 +132,16 @@ class GradualChange(Mechanism):
         upper = fast_factor(whitened_factor(self.base, corner) * log_factor.exp(), corner)
         return replace(self, factor=torch.where(concerned, upper / self.base, 1.0))
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
-        course = self._loudness(comparison.n_samples, comparison.info.rate).variance if fitted else None
-        pictures.variance_over_time(ax, comparison, sensor, course)
-
-    def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
-        return self._loudness(signal.shape[-1], info.rate).added(signal)
-
-    def repair(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
-        """At the same share of records that are longer or shorter."""
-        return comparison.made_louder(self._loudness(comparison.n_samples, comparison.info.rate))
-
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
         white = whitened_recording(comparison)
-        scores = course_scores(white, self._loudness(comparison.n_samples, comparison.info.rate).variance)
+        scores = course_scores(white, self.course(comparison.n_samples, comparison.info.rate).variance)
         scores = torch.where((self.factor != 1)[:, None], own_spread(comparison).weight[:, None] * scores, 0.0)
         return held_out_blocks(scores, fold).sum((0, -1))
 
     def _share(self, n_samples: int, rate: float) -> Tensor:
         return torch.from_numpy(np.interp(np.arange(n_samples) / rate, self.time_s.numpy(), self.share.numpy()))
 
-    def _loudness(self, n_samples: int, rate: float) -> VarianceCourse:
+    def course(self, n_samples: int, rate: float) -> VarianceCourse:
         return VarianceCourse(self._share(n_samples, rate), self.factor, self.corner_hz / rate, self.base)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from torch import Tensor
@@ -19,9 +18,9 @@ from gyrofuse.mismatch.detectors.variance.noise_level import (
     variance_p_value,
     whitened_recording,
 )
-from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
-from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
+from gyrofuse.mismatch.mechanisms.regimes.changing_variance import ChangingVariance
+from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
@@ -39,10 +38,6 @@ from gyrofuse.mismatch.stats.segments import (
     two_level_scores,
 )
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-
 _FACTOR = 1.25  # by which, and by `_NATS`, a level that goes up and down all the time has to be likelier
 _NATS = 5.0
 _A_LOT = 100.0  # nats from which a level that goes up and down shows beside the episodes that stand for it
@@ -53,7 +48,7 @@ _SHORT = 8  # samples
 
 
 @dataclass(frozen=True, eq=False)
-class VarianceChange(Mechanism):
+class VarianceChange(ChangingVariance):
     """`S_t(f) = (1 + (factor - 1) f^2/(f^2 + f_c^2)) S(f)` within episodes: what is fast is louder.
 
     Looks like heavy tails; its loud samples lie together. A level that wanders or oscillates all the time has no start
@@ -65,12 +60,6 @@ class VarianceChange(Mechanism):
         corner_hz: `f_c`; 0 where all noise but the mean is louder.
     """
 
-    name: ClassVar[str] = "variance_change"
-    likelihood: ClassVar[str] = "regimes"
-    rivals: ClassVar[tuple[str, ...]] = ("spikes",)
-    separated_by: ClassVar[str] = "a longer recording with more than one change"
-    happened_once: ClassVar[bool] = True
-    changes_noise: ClassVar[bool] = True
     episodes: tuple[tuple[float, float], ...]
     factor: OfSensors
     corner_hz: float = 0.0
@@ -131,17 +120,6 @@ class VarianceChange(Mechanism):
         fast = fast_factor(log_factor.exp(), self.corner_hz / comparison.info.rate)
         return replace(self, factor=torch.where(self.factor != 1, fast, 1.0))
 
-    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
-        course = self._loudness(comparison.n_samples, comparison.info.rate).variance if fitted else None
-        pictures.variance_over_time(ax, comparison, sensor, course)
-
-    def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
-        return self._loudness(signal.shape[-1], info.rate).added(signal)
-
-    def repair(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
-        """At the same share of records that are longer or shorter, so that these have as much of the episodes."""
-        return comparison.made_louder(self._loudness(comparison.n_samples, comparison.info.rate))
-
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
         inside = self._inside(comparison.n_samples, comparison.info.rate)
         factor = whitened_factor(self.factor, self.corner_hz / comparison.info.rate)
@@ -149,7 +127,7 @@ class VarianceChange(Mechanism):
         scores = own_spread(comparison).weight[:, None] * scores
         return held_out_blocks(scores, fold).sum((0, -1))
 
-    def _loudness(self, n_samples: int, rate: float) -> VarianceCourse:
+    def course(self, n_samples: int, rate: float) -> VarianceCourse:
         return VarianceCourse(self._inside(n_samples, rate), self.factor, self.corner_hz / rate)
 
     def _inside(self, n_samples: int, rate: float) -> Tensor:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 import torch
 from torch import Tensor
 
+from gyrofuse._base.results import readable
 from gyrofuse._base.units import GRAVITY
 from gyrofuse.mismatch.detectors.slow.channels import ChannelFit, regress
 from gyrofuse.mismatch.detectors.slow.transfer import Transfer, likeliest_transfer
@@ -147,7 +148,7 @@ class ChannelGain(Mechanism):
         if gain_in_g(comparison.info, finding, cls.power_of_g, sure=True) <= cls.largest:
             return finding
         power = "" if cls.power_of_g == 1 else f"^{cls.power_of_g}"
-        what = cls.name.replace("_", " ")
+        what = readable(cls.name)
         return replace(
             finding,
             mechanism=NOT_IDENTIFIABLE,

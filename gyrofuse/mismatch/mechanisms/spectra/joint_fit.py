@@ -112,8 +112,14 @@ def _stands_out(comparison: Comparison, best: Shape, peak: Oscillation) -> bool:
     return after - before > NEW_TERM_NATS
 
 
-def compared(comparison: Comparison, blocks: Tensor | None = None, folds: Tensor | None = None) -> Ratios:
-    """Spectra of both sides that shapes are fitted to, of some blocks and folds; see `ratios`."""
+@derived
+def compared(comparison: Comparison) -> Ratios:
+    """Spectra of both sides that shapes are fitted to."""
+    return _compared_in(comparison)
+
+
+def _compared_in(comparison: Comparison, blocks: Tensor | None = None, folds: Tensor | None = None) -> Ratios:
+    """The same of some blocks and folds; see `ratios`."""
     return ratios(comparison, blocks, folds, independent=_independent(comparison), formed=False)
 
 
@@ -122,7 +128,7 @@ def refit(comparison: Comparison, fold: int, term: Term, company: Sequence[Term]
 
     The simulation's blocks are held out as well: its chance is in the numbers that are judged.
     """
-    data = compared(comparison, ~in_fold(N_JUDGED, fold), torch.arange(N_FOLDS) != fold)
+    data = _compared_in(comparison, ~in_fold(N_JUDGED, fold), torch.arange(N_FOLDS) != fold)
     return fit(data, [term, *company]).terms[0]
 
 
