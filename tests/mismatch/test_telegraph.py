@@ -194,7 +194,8 @@ def test_beside_a_sensor_that_jumps_another_one_needs_less() -> None:
     both = Comparison.of(SCENE, recording, comparison.reference.signal)
     assert 0 < two_levels(both)[0].over < 1.5
     assert nominated(both, RandomTelegraph).sensors == (0, 1)
-    alone = Comparison.of(SCENE, recording[:1].expand(2, -1), comparison.reference.signal[:, :1].expand(-1, 2, -1))
+    beside_noise = torch.stack([recording[0], drawn(34).recording[1]])
+    alone = Comparison.of(SCENE, beside_noise, comparison.reference.signal)
     assert RandomTelegraph.detect_and_fit(alone, LEVEL) is None
 
 

@@ -130,8 +130,8 @@ class Fit(NamedTuple):
 def simulated_slow_noise(comparison: Comparison) -> SlowNoise:
     """The slow noise of a comparison's simulation, around which that of the recording may be."""
     n, side = comparison.n_samples, comparison.reference
-    dof = float(side.dof[:_SLOWEST_BANDS].sum())
-    variance, missed = 1 / max(dof, 0.25), 0.0  # 0.25: where no band is seen, a factor of e^2
+    dof = max(float(side.dof[:_SLOWEST_BANDS].sum()), 0.25)  # where no band is seen, a factor of e^2
+    variance, missed = 1 / dof, 0.0
     if side.uncertainty is not None:
         lowest = side.dof.new_tensor([1 / n])
         variance += float(side.uncertainty.variance(lowest).mean())
