@@ -401,7 +401,7 @@ def of_few_waves(n_sensors: int, nats: float, seed: int, *, follows: bool) -> tu
     size = (y @ channel / channel.square().sum())[:, None]
     z = size * channel.norm()
     fit = Fit(torch.zeros(n_sensors, 0), torch.zeros(n_sensors), torch.ones_like(y), size)
-    family = Family("temperature_drift", torch.zeros(1, 1), channel[None, None])
+    family = Family("temperature_drift", torch.zeros(1, 1), channel[None, None], "the bias follows it")
     there = torch.full_like(z, 9.0)  # in every sensor
     scan = Scan(family, 0, fit, there, z, nats, 0.0, torch.eye(n_sensors), torch.ones(n_sensors), 1)
     return SlowAnalysis(None, y, fit, (family,)), scan  # type: ignore[arg-type]

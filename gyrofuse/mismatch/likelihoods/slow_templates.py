@@ -1,9 +1,12 @@
-"""Templates of slow effects: block means of a step, a warm-up, or a lagging temperature of size one."""
+"""Templates of slow effects: block means of a step, a warm-up, or a lagging temperature of size one.
+
+Mechanisms declare theirs as subclasses of `SlowTemplates`; scans know them by that alone.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -13,6 +16,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.likelihoods.slow_noise import ordinates, slow_ordinates
 from gyrofuse.mismatch.signals.comparison import N_BLOCKS, Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.declared import declared
 
 # A grid of templates is as fine as keeps neighbours correlated by 0.9 or more, where the noise is white.
 _TIME_CONSTANTS = 24
@@ -28,21 +32,41 @@ class Family:
         points: Nonlinear numbers of each template, samples: an onset, one or two time constants, or a lag,
             `(template, number)`.
         designs: Ordinates of the block means of each template for sizes of one, `(template, column, ordinate)`.
+        words: What the bias does, with the first nonlinear number in seconds.
         channel: Name of the temperature that it follows, and `row` of that.
         design_at: Designs at other points; None where only those of the grid exist.
+        jumps: Whether templates are jumps at once: several of them, in any order, are another path than one.
+        timed: Whether the first nonlinear number is a time after the first sample.
     """
 
     name: str
     points: Tensor
     designs: Tensor
+    words: str
     channel: str | None = None
     row: int = 0
     design_at: Callable[[Tensor], Tensor] | None = None
+    jumps: bool = False
+    timed: bool = False
 
     def at(self, points: Tensor) -> Family:
         """The same mechanism at other points `(template, number)`."""
         assert self.design_at is not None
         return replace(self, points=points, designs=self.design_at(points))
+
+
+class SlowTemplates:
+    """What a mechanism declares to be scanned for."""
+
+    @classmethod
+    def families(cls, comparison: Comparison) -> Iterable[Family]:
+        """Its templates in a comparison; none by default."""
+        return ()
+
+
+def declared_families(comparison: Comparison) -> tuple[Family, ...]:
+    """Templates of all mechanisms that declare any."""
+    return tuple(family for kind in declared(SlowTemplates) for family in kind.families(comparison))
 
 
 def steps(comparison: Comparison) -> Family:
@@ -51,7 +75,14 @@ def steps(comparison: Comparison) -> Family:
     middles = (at[:-1] + at[1:]) / 2
     onsets = torch.cat([torch.arange(1.0, N_BLOCKS), torch.arange(1.5, N_BLOCKS - 1)]).to(torch.float64)
     order = onsets.argsort()
-    return Family("step", onsets[order, None] * comparison.block, torch.cat([at, middles])[order, None])
+    return Family(
+        "step",
+        onsets[order, None] * comparison.block,
+        torch.cat([at, middles])[order, None],
+        "the bias steps near {:.4g} s",
+        jumps=True,
+        timed=True,
+    )
 
 
 def warm_ups(comparison: Comparison, number: int) -> Family:
@@ -69,7 +100,8 @@ def warm_ups(comparison: Comparison, number: int) -> Family:
         mean = torch.expm1(-block / tau) / torch.expm1(-1 / tau) / block
         return ordinates(mean * (-torch.arange(N_BLOCKS) * block / tau).exp())
 
-    return Family("warm_up_transient", points, design_at(points), design_at=design_at)
+    words = "the bias decays after the start, over some {:.3g} s"
+    return Family("warm_up_transient", points, design_at(points), words, design_at=design_at)
 
 
 def temperatures(comparison: Comparison) -> list[Family]:
@@ -82,9 +114,9 @@ def temperatures(comparison: Comparison) -> list[Family]:
             partial(_temperature_designs, comparison.info, channel, row, comparison.n_samples, columns)
             for columns in (1, 2)
         )
-        designs = bent(lags)
-        families.append(Family("temperature_drift", lags, designs[:, :1], channel, row, straight))
-        families.append(Family("temperature_drift", lags, designs, channel, row, bent))
+        designs, words = bent(lags), f"the bias follows {channel}".replace("{", "{{").replace("}", "}}")
+        families.append(Family("temperature_drift", lags, designs[:, :1], words, channel, row, straight))
+        families.append(Family("temperature_drift", lags, designs, words, channel, row, bent))
     return families
 
 

@@ -46,7 +46,7 @@ def strongest_relay(comparison: Comparison) -> Scan | None:
         paths = relays(means)
         if len(paths) > 1:
             number = torch.arange(len(paths), dtype=torch.float64)[:, None]
-            families.append(Family("hysteresis", number, ordinates(paths)[:, None], channel, row))
+            families.append(Family("hysteresis", number, ordinates(paths)[:, None], "", channel, row))
     return replace(slow_analysis(comparison), families=tuple(families)).scan("hysteresis") if families else None
 
 

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.likelihoods.slow_noise import Fit, SlowNoise, best_fit, simulated_slow_noise, slow_ordinates
-from gyrofuse.mismatch.likelihoods.slow_templates import Family, edges, steps, temperatures, warm_ups
+from gyrofuse.mismatch.likelihoods.slow_templates import Family, declared_families, edges
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.stats.curve_maximum import curve_length, most_extreme, surprise
@@ -162,7 +162,7 @@ class SlowAnalysis:
         fit = best_fit(self.noise, self.y, paths[at], self.null.log_factors)
         gain = fit.log_likelihood(self.y, paths[at]) - self.null.log_likelihood(self.y) - cost * len(at)
         alone = self.y - sizes[:, others] @ paths[torch.tensor(at)[others]]
-        families = tuple(family for family in self.families if family.name == "step")
+        families = tuple(family for family in self.families if family.jumps)
         return SeveralSteps(gain, replace(self, y=alone, null=best_fit(self.noise, alone), families=families))
 
     @cached_property
@@ -177,7 +177,7 @@ class SlowAnalysis:
     def _scan(self, family: Family) -> Scan:
         """The best template with the noise refitted beside it, and again with the noise that it leaves."""
         steady = torch.ones(len(self.y), dtype=torch.float64)
-        if family.name == "step":  # jumps between two levels are another mechanism
+        if family.jumps:  # to and fro between two levels they are another mechanism
             steady -= torch.tensor([jumps_to_and_fro(*pair) for pair in zip(*self.of_steps, strict=True)]).to(steady)
         scan: Scan | None = None
         fit, relation = self.null, related(self.y, self.null.variance, self.noise.own)
@@ -241,10 +241,9 @@ class SlowAnalysis:
 
 @derived
 def slow_analysis(comparison: Comparison) -> SlowAnalysis:
-    """The slow ordinates of a comparison, with steps, warm-ups and temperatures as what may explain them."""
+    """The slow ordinates of a comparison, with all that mechanisms declare as what may explain them."""
     noise, y = simulated_slow_noise(comparison), slow_ordinates(comparison.observed.steady[0])
-    families = (steps(comparison), warm_ups(comparison, 1), warm_ups(comparison, 2), *temperatures(comparison))
-    return SlowAnalysis(noise, y, best_fit(noise, y), families)
+    return SlowAnalysis(noise, y, best_fit(noise, y), declared_families(comparison))
 
 
 def slow_test(comparison: Comparison) -> TestResult:
@@ -253,17 +252,13 @@ def slow_test(comparison: Comparison) -> TestResult:
     scan = min(analysis.scans, key=lambda s: s.p_value)
     largest = max(scan.sensors, key=lambda i: float(scan.z[i].norm()))
     seconds = scan.point[0] / comparison.info.rate
-    words = {
-        "step": f"the bias steps near {seconds:.4g} s",
-        "warm_up_transient": f"the bias decays after the start, over some {seconds:.3g} s",
-        "temperature_drift": f"the bias follows {scan.family.channel}",
-    }[scan.family.name]
+    words = scan.family.words.format(seconds)
     return TestResult(
         "slow",
         sidak(scan.p_value, len(analysis.scans)),
         f"{words}, most clearly in sensor {comparison.info.sensors[largest]}",
         sensors=scan.sensors,
-        time_s=seconds if scan.family.name == "step" else None,
+        time_s=seconds if scan.family.timed else None,
         channel=scan.family.channel,
     )
 

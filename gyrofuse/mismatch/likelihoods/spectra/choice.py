@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.decisions import NATS_AS_GOOD, NATS_PER_NUMBER, NEW_TERM_NATS
 from gyrofuse.mismatch.likelihoods.spectra.common_sources import Common
-from gyrofuse.mismatch.likelihoods.spectra.components import LowPass, Shift, Term
+from gyrofuse.mismatch.likelihoods.spectra.components import Term
 from gyrofuse.mismatch.likelihoods.spectra.fit import Fit, data_model, fit, powers, prior_cost
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios, correlations, log_gain, power_gains
 from gyrofuse.mismatch.likelihoods.spectra.starts import best_start, candidates
@@ -142,8 +142,9 @@ def _given_over(data: Ratios, found: Fit) -> Fit:
     fewer = [t if t.coherent else t.only(t.free & ~mine) for t in others]
     if not bool(mine.any()) or not all(bool(t.free.any()) for t in fewer):
         return found
-    start = best_start(data, fewer, LowPass.starts(data.ground, last.kind))[0] if isinstance(last, LowPass) else last
-    tried = fit(data, [*fewer, start.only(last.free) if isinstance(last, LowPass) else last])
+    grid = last.grid(data.ground)
+    start = last if grid is None else best_start(data, fewer, grid)[0].only(last.free)
+    tried = fit(data, [*fewer, start])
     return max(found, tried, key=lambda f: evidence(data, f))
 
 
@@ -231,7 +232,7 @@ def _pruned(data: Ratios, found: Fit) -> Fit:
             break
         best = fewer
     for i, term in enumerate(best.terms):
-        if not isinstance(term, Shift):
+        if not term.apart:
             continue
         t = (term.local / best.sd(i)[0]).abs().nan_to_num(nan=0.0)
         for least in (1.0, 2.0, 3.0):

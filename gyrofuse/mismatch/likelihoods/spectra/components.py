@@ -12,6 +12,7 @@ from torch import Tensor
 from gyrofuse.mismatch.decisions import NATS_PER_NUMBER
 from gyrofuse.mismatch.likelihoods.spectra.filter_forms import FILTERS, filter_power, strength_of
 from gyrofuse.mismatch.likelihoods.spectra.noise_parts import Ground
+from gyrofuse.mismatch.stats.limits import Z
 
 _T = TypeVar("_T", bound="Term")
 NO_SHARED = torch.zeros(0, dtype=torch.float64)
@@ -33,6 +34,7 @@ class Term:
     lower: ClassVar[float] = -math.inf  # bounds of local numbers
     upper: ClassVar[float] = math.inf
     prior_scale: ClassVar[float | None] = None  # of local numbers around zero, heavy tails: `spectral.prior_cost`
+    apart: ClassVar[bool] = False  # whether single numbers of a sensor may be left out
     # Standard deviations of local and shared numbers before any data, which evidence counts: of logarithms, where a
     # local number is a size. A factor of 4.5, or of 7, either way.
     local_sd: ClassVar[float] = 1.5
@@ -76,6 +78,22 @@ class Term:
         """
         return False
 
+    def louder(self, sd: Tensor) -> bool:
+        """Whether a single sensor has plainly more of what its noise has at all frequencies.
+
+        Args:
+            sd: Standard deviations of local numbers.
+        """
+        return False
+
+    def grid(self, ground: Ground) -> Term | None:
+        """The same form at the numbers to start from, `local` is `(start, number, sensor)`; None without a grid."""
+        return None
+
+    def bent(self, ground: Ground) -> Term | None:
+        """A form that falls by any power of frequency, of which this is one; None where it is none."""
+        return None
+
     def only(self: _T, free: Tensor) -> _T:
         """With those local numbers free `(number, sensor)`, the others 0."""
         return replace(self, free=free, local=torch.where(free, self.local, 0.0))
@@ -103,6 +121,7 @@ class Shift(Term):
     prior_scale: ClassVar[float | None] = 1.5  # a level that changes by much more is rare, but not by how much
     lower: ClassVar[float] = -30.0  # nothing is left, in double precision
     upper: ClassVar[float] = 30.0
+    apart: ClassVar[bool] = True
 
     new: Tensor | None = None
 
@@ -157,6 +176,9 @@ class Shift(Term):
     def rises_below(self, sd: Tensor) -> bool:
         return bool((self.local[1:] > 0).any())
 
+    def louder(self, sd: Tensor) -> bool:
+        return bool((self.local[0] > Z * sd[0]).any())
+
     def form_cost(self, n_sensors: int) -> float:
         white, ar1, corner, walk = self.parts
         n_parts = int(white) + int(ar1 | corner) + int(walk)
@@ -186,6 +208,9 @@ class LowPass(Term):
         numbers = torch.linspace(math.log(0.012), math.log(100), 37, dtype=torch.float64)
         local = numbers[:, None, None].expand(-1, 1, len(ground.mean)).clone()
         return cls(local, torch.ones(1, len(ground.mean), dtype=torch.bool), NO_SHARED, kind)
+
+    def grid(self, ground: Ground) -> LowPass:
+        return type(self).starts(ground, self.kind)
 
     def step_limit(self) -> tuple[Tensor, Tensor]:
         return torch.full_like(self.local, 0.7), self.shared
@@ -226,6 +251,9 @@ class Flicker(Term):
 
     def rises_below(self, sd: Tensor) -> bool:
         return True
+
+    def bent(self, ground: Ground) -> PowerLaw:
+        return PowerLaw.like(self, ground)
 
 
 @dataclass(frozen=True, eq=False)

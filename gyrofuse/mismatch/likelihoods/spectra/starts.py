@@ -1,79 +1,64 @@
-"""Where spectral terms start from: of grids of their numbers the likeliest in each sensor."""
+"""Where spectral terms start from: of grids of their numbers the likeliest in each sensor.
+
+Mechanisms declare their terms as subclasses of `SpectralTerms`; the selection knows them by that alone.
+"""
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.likelihoods.spectra.common_sources import Common, CommonBump
-from gyrofuse.mismatch.likelihoods.spectra.components import Flicker, LowPass, Peak, Shift, Term, oscillation
-from gyrofuse.mismatch.likelihoods.spectra.filter_forms import FILTERS
+from gyrofuse.mismatch.likelihoods.spectra.components import Peak, Term, oscillation
 from gyrofuse.mismatch.likelihoods.spectra.fit import data_model, pieces, powers
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios, log_gain, power_gains
+from gyrofuse.mismatch.signals.declared import declared
+
+
+class SpectralTerms:
+    """What a mechanism declares to compete for the spectra."""
+
+    @classmethod
+    def starts(cls, data: Ratios, company: Sequence[Term]) -> Iterable[Term]:
+        """Its terms to add to some, each at the best start in every sensor; none by default.
+
+        Args:
+            data: What is to be explained.
+            company: Terms that are there.
+        """
+        return ()
+
+    @classmethod
+    def forms(cls, data: Ratios, term: Term, company: Sequence[Term]) -> Iterable[Term]:
+        """Other forms that one of its terms may have beside the company; none by default."""
+        return ()
 
 
 def candidates(data: Ratios, company: Sequence[Term]) -> Iterator[Term]:
-    """Terms to add to some, the best start of each in every sensor.
-
-    Args:
-        data: What is to be explained.
-        company: Terms that are there.
-    """
-    names = {t.name for t in company}
-    ground = data.ground
-    if "parameter_shift" not in names and bool(ground.matters.any()):
-        starts = [best_start(data, company, family)[0] for family in Shift.starts(ground)]
-        yield from starts
-        # Two parts together, each from where it starts alone: from all at once one may stay where the other should be.
-        for one, other in itertools.combinations(starts, 2):
-            if not bool((one.free & other.free).any()):
-                yield replace(one, local=one.local + other.local, free=one.free | other.free)
-    if "low_pass" not in names:
-        most = 3  # forms of a filter, the likeliest
-        yield from filter_starts(data, company)[:most]
-    if "flicker" not in names:
-        yield best_start(data, company, Flicker.starts(ground))[0]
-    excess = data.observed - data_model(data, company)
-    peak = best_bump(data, company, _peaks(data))
-    if peak is not None:
-        yield peak
-        if data.n_sensors > 1:
-            yield from CommonBump.starts(ground, excess, data.information, "oscillation", peak.shared)
-    if data.n_sensors > 1:
-        for kind in ("white", "walk"):
-            yield from Common.starts(ground, excess, data.information, kind, torch.zeros(0, dtype=torch.float64))
-        lowest, n_corners = 8 * float(ground.bands.frequency[0]), 8
-        corners = torch.logspace(math.log10(lowest), math.log10(0.3), n_corners, dtype=torch.float64).log()
-        starts_at = [Common.starts(ground, excess, data.information, "ar1", c[None]) for c in corners]
-        yield from max(starts_at, key=lambda s: float(log_gain(data, data_model(data, [*company, s[0]])).sum()))
+    """Terms of all mechanisms that declare any, to add to some."""
+    for kind in declared(SpectralTerms):
+        yield from kind.starts(data, company)
 
 
-def filter_starts(data: Ratios, company: Sequence[Term]) -> list[LowPass]:
-    """Every form of a filter at its likeliest corners, the likeliest first.
+def other_forms(data: Ratios, term: Term, company: Sequence[Term]) -> Iterator[Term]:
+    """Other forms that a term may have, by the mechanism that declares it."""
+    for kind in declared(SpectralTerms):
+        yield from kind.forms(data, term, company)
 
-    Corners are searched in ever finer grids, each sensor's by itself: of strong filters a coarse one would decide
-    between the forms.
 
-    Args:
-        data: What is to be explained.
-        company: Terms that are there.
-    """
+def closer_start(data: Ratios, company: Sequence[Term], family: Term) -> tuple[Term, float]:
+    """The same as `best_start` of an even grid of one local number, in ever finer grids, each sensor's by itself."""
     rounds, beside = 3, torch.linspace(-1, 1, 9, dtype=torch.float64)[:, None, None]
-    found: list[tuple[LowPass, float]] = []
-    for kind in FILTERS:
-        family = LowPass.starts(data.ground, kind)
-        step = float(family.local[:2, 0, 0].diff())
-        start, gain = best_start(data, company, family)
-        for _ in range(rounds):
-            start, gain = best_start(data, company, replace(family, local=start.local + step * beside))
-            step *= float(beside[1] - beside[0])
-        found.append((replace(family, local=start.local), gain))
-    return [start for start, _ in sorted(found, key=lambda entry: -entry[1])]
+    step = float(family.local[:2, 0, 0].diff())
+    start, gain = best_start(data, company, family)
+    for _ in range(rounds):
+        start, gain = best_start(data, company, replace(family, local=start.local + step * beside))
+        step *= float(beside[1] - beside[0])
+    return replace(family, local=start.local), gain
 
 
 def best_start(data: Ratios, company: Sequence[Term], family: Term) -> tuple[Term, float]:
@@ -83,6 +68,28 @@ def best_start(data: Ratios, company: Sequence[Term], family: Term) -> tuple[Ter
     best = gains.argmax(0)
     local = family.local.gather(0, best[None, None].expand(1, *family.local.shape[1:]))[0]
     return replace(family, local=local), float(gains.amax(0).clamp(min=0).sum())
+
+
+def common_starts(data: Ratios, company: Sequence[Term]) -> Iterator[Common]:
+    """Sources of white noise, walks and AR1s that sensors may share, of AR1s the likeliest corner."""
+    ground, excess = data.ground, data.observed - data_model(data, company)
+    for kind in ("white", "walk"):
+        yield from Common.starts(ground, excess, data.information, kind, torch.zeros(0, dtype=torch.float64))
+    lowest, n_corners = 8 * float(ground.bands.frequency[0]), 8
+    corners = torch.logspace(math.log10(lowest), math.log10(0.3), n_corners, dtype=torch.float64).log()
+    starts_at = [Common.starts(ground, excess, data.information, "ar1", c[None]) for c in corners]
+    yield from max(starts_at, key=lambda s: float(log_gain(data, data_model(data, [*company, s[0]])).sum()))
+
+
+def peak_starts(data: Ratios, company: Sequence[Term]) -> Iterator[Term]:
+    """The peak that is likeliest, each sensor's own and of one source."""
+    peak = best_bump(data, company, _peaks(data))
+    if peak is None:
+        return
+    yield peak
+    if data.n_sensors > 1:
+        excess = data.observed - data_model(data, company)
+        yield from CommonBump.starts(data.ground, excess, data.information, "oscillation", peak.shared)
 
 
 def best_bump(data: Ratios, company: Sequence[Term], shapes: Tensor) -> Peak | None:

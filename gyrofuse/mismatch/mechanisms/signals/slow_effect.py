@@ -21,6 +21,7 @@ from gyrofuse.mismatch.detectors.slow.estimates import Estimate, log_factors
 from gyrofuse.mismatch.detectors.slow.hysteresis import strongest_relay
 from gyrofuse.mismatch.detectors.slow.scans import Scan, SlowAnalysis, slow_analysis
 from gyrofuse.mismatch.likelihoods.slow_noise import cosines
+from gyrofuse.mismatch.likelihoods.slow_templates import SlowTemplates
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
 from gyrofuse.mismatch.signals.comparison import N_BLOCKS, Comparison, RecordingInfo, block_means
@@ -37,7 +38,7 @@ _SHARES = N_JUDGED // N_FOLDS
 
 
 @dataclass(frozen=True, eq=False)
-class SlowEffect(Mechanism):
+class SlowEffect(Mechanism, SlowTemplates):
     """`x_i(t) = size_i path(t)`, and further paths of the same physics with sizes of their own.
 
     Attributes:
@@ -180,7 +181,7 @@ def strong_scan(comparison: Comparison, name: str, level: float) -> Strong | Non
     """
     analysis = slow_analysis(comparison)
     scan = analysis.scan(name)
-    several = analysis.several_steps if name == "step" else None
+    several = analysis.several_steps if scan is not None and scan.family.jumps else None
     if scan is None or (several is None and scan.p_value > min(level, _STRONG)):
         return None
     rivals = {other.family.name: other.gain for other in analysis.scans if other is not scan}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.detectors.slow.estimates import estimate, log_factors, only, onset_samples
 from gyrofuse.mismatch.detectors.slow.scans import Scan
+from gyrofuse.mismatch.likelihoods.slow_templates import Family, steps
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.mechanisms.signals.slow_effect import SlowEffect, in_seconds, slow_finding, strong_scan
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
@@ -33,6 +34,10 @@ class Step(SlowEffect):
     separated_by: ClassVar[str] = "a longer recording on either side"
     happened_once: ClassVar[bool] = True
     onset_s: float
+
+    @classmethod
+    def families(cls, comparison: Comparison) -> Iterable[Family]:
+        return (steps(comparison),)
 
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:

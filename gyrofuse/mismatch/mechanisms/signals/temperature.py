@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from gyrofuse.mismatch.detectors.slow.estimates import estimate, log_factors, only
 from gyrofuse.mismatch.detectors.slow.scans import Scan
 from gyrofuse.mismatch.detectors.slow.surrogates import beats_surrogates
-from gyrofuse.mismatch.likelihoods.slow_templates import lagged
+from gyrofuse.mismatch.likelihoods.slow_templates import Family, lagged, temperatures
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.mechanisms.signals.slow_effect import SlowEffect, in_seconds, slow_finding, strong_scan
@@ -47,6 +47,10 @@ class TemperatureDrift(SlowEffect):
     channel: str
     row: int
     curvature: tuple[OfSensors, ...] = ()
+
+    @classmethod
+    def families(cls, comparison: Comparison) -> Iterable[Family]:
+        return temperatures(comparison)
 
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.detectors.slow.estimates import estimate, log_factors, only
 from gyrofuse.mismatch.detectors.slow.scans import Scan
+from gyrofuse.mismatch.likelihoods.slow_templates import Family, warm_ups
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.mechanisms.signals.slow_effect import SlowEffect, in_seconds, slow_finding, strong_scan
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
@@ -48,6 +49,10 @@ class WarmUpTransient(SlowEffect):
     separated_by: ClassVar[str] = "a second recording from power-on, and one of the warm device"
     time_constant_s: float
     slower: tuple[Decay, ...] = ()
+
+    @classmethod
+    def families(cls, comparison: Comparison) -> Iterable[Family]:
+        return (warm_ups(comparison, decays) for decays in (1, 2))
 
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
@@ -14,6 +14,7 @@ from gyrofuse.mismatch.likelihoods.spectra.common_sources import Common, common_
 from gyrofuse.mismatch.likelihoods.spectra.components import Term
 from gyrofuse.mismatch.likelihoods.spectra.data import reference_noise
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios
+from gyrofuse.mismatch.likelihoods.spectra.starts import common_starts
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
 from gyrofuse.mismatch.mechanisms.spectra.findings import found, spanned
@@ -58,6 +59,10 @@ class CommonMode(Addition):
     gain: ComplexOfSensors
     own: NoiseSpectrum
     inside: bool
+
+    @classmethod
+    def starts(cls, data: Ratios, company: Sequence[Term]) -> Iterable[Term]:
+        return common_starts(data, company) if data.n_sensors > 1 else ()
 
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:

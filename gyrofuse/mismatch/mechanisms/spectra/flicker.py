@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.likelihoods.spectra.components import Flicker
+from gyrofuse.mismatch.likelihoods.spectra.components import Flicker, Term
+from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios
 from gyrofuse.mismatch.likelihoods.spectra.starts import best_start
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Rival
 from gyrofuse.mismatch.mechanisms.spectra.findings import found, spanned
@@ -38,6 +39,12 @@ class FlickerNoise(Addition):
     rivals: ClassVar[tuple[str, ...]] = ("parameter_shift", "low_pass", "common_mode")
     separated_by: ClassVar[str] = "a recording ten times as long"
     level: OfSensors
+
+    @classmethod
+    def starts(cls, data: Ratios, company: Sequence[Term]) -> Iterable[Term]:
+        if any(isinstance(term, Flicker) for term in company):
+            return ()
+        return (best_start(data, company, Flicker.starts(data.ground))[0],)
 
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:

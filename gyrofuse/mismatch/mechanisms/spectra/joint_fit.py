@@ -21,15 +21,14 @@ from gyrofuse.mismatch.detectors.spectra.shape_scan import shape_p_value
 from gyrofuse.mismatch.detectors.variance.noise_level import modulation, variance_p_value
 from gyrofuse.mismatch.likelihoods.spectra.choice import best_terms, cost_of
 from gyrofuse.mismatch.likelihoods.spectra.common_sources import CommonBump
-from gyrofuse.mismatch.likelihoods.spectra.components import Flicker, LowPass, Peak, PowerLaw, Shift, Term
+from gyrofuse.mismatch.likelihoods.spectra.components import Peak, Term
 from gyrofuse.mismatch.likelihoods.spectra.data import ratios, ratios_around
 from gyrofuse.mismatch.likelihoods.spectra.fit import Fit, data_model, fit, powers
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios, fitness, log_gain, power_gains
-from gyrofuse.mismatch.likelihoods.spectra.starts import best_bump, candidates, filter_starts
+from gyrofuse.mismatch.likelihoods.spectra.starts import best_bump, candidates, other_forms
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, in_fold
-from gyrofuse.mismatch.stats.limits import Z
 from gyrofuse.mismatch.stats.multiplicity import e_value_of, sidak
 
 # Share of the discrepancy that terms have to explain to be named though their form is not quite the recording's: of
@@ -40,7 +39,7 @@ _QUICK, _FAR = 8, 20.0  # rounds of a fit that only ranks, and nats behind after
 _SHARP = 0.1  # half width of a peak over its centre, below which bands of blocks are too wide for it
 
 
-Form = tuple[LowPass, tuple[Tensor, Tensor]]
+Form = tuple[Term, tuple[Tensor, Tensor]]
 
 
 class Shape(NamedTuple):
@@ -56,7 +55,7 @@ class Shape(NamedTuple):
         alternatives: Mechanisms that explain as much instead.
         frequency: Where it acts most, cycles per sample.
         levels: Wavelet levels where it shows.
-        forms: Other forms of a filter that explain about as much, as `term` and `sd`.
+        forms: Other forms of the same that explain about as much, as `term` and `sd`.
         explained: Share of the discrepancy of powers beyond chance that all terms of the fit explain, in the sensors
             that have any of them.
         fits: Whether what they leave is no more than chance; else the form is another one.
@@ -235,7 +234,7 @@ def _rivals(
     if term.rises_below(chosen.sd_alone(first)):
         rivals.add("random_telegraph")
     # Of noise that is louder at times the spectrum shows the mean: plainly more white noise.
-    if isinstance(term, Shift) and bool((term.local[0] > Z * sd[0][0]).any()):
+    if term.louder(sd[0]):
         unsteady = 0.01  # p value of either test of a level that changes
         if min(modulation(comparison).p_value, variance_p_value(comparison)) < unsteady:
             rivals.add("variance_change")
@@ -254,14 +253,16 @@ def _falls_otherwise(data: Ratios, chosen: Fit) -> bool:
     Its slope has to gain the nats of two numbers, and to be off by more than 0.15.
     """
     for i, term in enumerate(chosen.terms):
-        if isinstance(term, Flicker):
-            terms = [*_others(chosen, i), PowerLaw.like(term, data.ground)]
-            found = fit(data, terms)
-            slope = float(found.terms[-1].shared)
-            if found.gain <= chosen.gain + 2 * NATS_PER_NUMBER or abs(slope - 1) <= 0.15:
-                continue
-            if not _only_bent(data, terms, slope):
-                return True
+        bent = term.bent(data.ground)
+        if bent is None:
+            continue
+        terms = [*_others(chosen, i), bent]
+        found = fit(data, terms)
+        slope = float(found.terms[-1].shared)
+        if found.gain <= chosen.gain + 2 * NATS_PER_NUMBER or abs(slope - 1) <= 0.15:
+            continue
+        if not _only_bent(data, terms, slope):
+            return True
     return False
 
 
@@ -290,15 +291,11 @@ def _with_sd(comparison: Comparison, chosen: Fit, i: int) -> tuple[Term, tuple[T
 
 
 def _forms(data: Ratios, term: Term, others: list[Term], gain: float) -> tuple[Form, ...]:
-    """Other forms of a filter that are about as likely."""
-    if not isinstance(term, LowPass):
-        return ()
-    forms = [replace(form, free=term.free) for form in filter_starts(data, others) if form.kind != term.kind]
+    """Other forms of a term that are about as likely."""
+    forms = [replace(form, free=term.free) for form in other_forms(data, term, others)]
     fits = [f for form in forms if (f := fit(data, [*others, form], _QUICK)).gain > gain - _FAR]
     fits = [fit(data, f.terms) for f in fits]
-    return tuple(
-        (t, f.sd(-1)) for f in fits if f.gain > gain - NATS_PER_NUMBER and isinstance(t := f.terms[-1], LowPass)
-    )
+    return tuple((f.terms[-1], f.sd(-1)) for f in fits if f.gain > gain - NATS_PER_NUMBER)
 
 
 def _as_good(data: Ratios, terms: list[Term], chosen: Fit) -> bool:

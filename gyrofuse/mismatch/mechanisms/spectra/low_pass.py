@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from gyrofuse.mismatch.likelihoods.spectra.components import LowPass
+from gyrofuse.mismatch.likelihoods.spectra.components import LowPass, Term
 from gyrofuse.mismatch.likelihoods.spectra.filter_forms import (
+    FILTERS,
     filter_corner,
     filter_number,
     filter_response,
     strength_of,
 )
-from gyrofuse.mismatch.likelihoods.spectra.starts import filter_starts
+from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios
+from gyrofuse.mismatch.likelihoods.spectra.starts import closer_start
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
 from gyrofuse.mismatch.mechanisms.spectra.findings import found
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape, refit
@@ -45,6 +48,19 @@ class LowPassFilter(Filter):
     strength: OfSensors
 
     @classmethod
+    def starts(cls, data: Ratios, company: Sequence[Term]) -> Iterable[Term]:
+        if any(isinstance(term, LowPass) for term in company):
+            return ()
+        likeliest = 3  # forms
+        return filter_starts(data, company)[:likeliest]
+
+    @classmethod
+    def forms(cls, data: Ratios, term: Term, company: Sequence[Term]) -> Iterable[Term]:
+        if not isinstance(term, LowPass):
+            return ()
+        return [form for form in filter_starts(data, company) if form.kind != term.kind]
+
+    @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
         shape = chosen_shape(comparison, cls.name, level)
         if shape is None or not isinstance(shape.term, LowPass):
@@ -53,7 +69,9 @@ class LowPassFilter(Filter):
         strength = strengths(term)
         sensors = tuple(int(i) for i in term.free[0].nonzero()[:, 0])
         # Which form it has is not known either; digital ones need not halve the power at all.
-        forms = [_limits(form, sd[0][0]) * rate for form, sd in ((term, shape.sd), *shape.forms)]
+        forms = [
+            _limits(form, sd[0][0]) * rate for form, sd in ((term, shape.sd), *shape.forms) if isinstance(form, LowPass)
+        ]
         forms = [limits for limits in forms if bool(limits[1, list(sensors)].isfinite().all())] or forms
         corner, lowest, highest = forms[0][1], torch.stack(forms)[:, 0].amin(0), torch.stack(forms)[:, 2].amax(0)
         parameters = {}
@@ -92,6 +110,16 @@ class LowPassFilter(Filter):
         found = refit(comparison, fold, term, self.company)
         assert isinstance(found, LowPass)
         return replace(self, strength=strengths(found))
+
+
+def filter_starts(data: Ratios, company: Sequence[Term]) -> list[LowPass]:
+    """Every form of a filter at its likeliest corners, the likeliest first.
+
+    Of strong filters a coarse grid of corners would decide between the forms.
+    """
+    found = [closer_start(data, company, LowPass.starts(data.ground, kind)) for kind in FILTERS]
+    found.sort(key=lambda entry: -entry[1])
+    return [start for start, _ in found if isinstance(start, LowPass)]
 
 
 def strengths(term: LowPass) -> Tensor:

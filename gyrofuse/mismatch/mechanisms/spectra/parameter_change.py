@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Sequence, Set
+from collections.abc import Iterable, Sequence, Set
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
@@ -49,6 +50,17 @@ class ParameterShift(Filter):
     separated_by: ClassVar[str] = "a longer recording, or one of the same device under other conditions"
     base: NoiseSpectrum
     log_factors: Annotated[Tensor, Dims(("part", "sensor"))]
+
+    @classmethod
+    def starts(cls, data: Ratios, company: Sequence[Term]) -> Iterable[Term]:
+        if any(isinstance(term, Shift) for term in company) or not bool(data.ground.matters.any()):
+            return
+        starts = [best_start(data, company, family)[0] for family in Shift.starts(data.ground)]
+        yield from starts
+        # Two parts together, each from where it starts alone: from all at once one may stay where the other should be.
+        for one, other in itertools.combinations(starts, 2):
+            if not bool((one.free & other.free).any()):
+                yield replace(one, local=one.local + other.local, free=one.free | other.free)
 
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:

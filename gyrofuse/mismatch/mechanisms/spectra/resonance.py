@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.likelihoods.spectra.components import Term
+from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios
+from gyrofuse.mismatch.likelihoods.spectra.starts import peak_starts
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
@@ -44,6 +47,10 @@ class Resonance(Addition):
     )
     broad: ClassVar[bool] = True
     mode: Mode
+
+    @classmethod
+    def starts(cls, data: Ratios, company: Sequence[Term]) -> Iterable[Term]:
+        return peak_starts(data, company)
 
     @classmethod
     def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:

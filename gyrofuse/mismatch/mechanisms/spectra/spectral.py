@@ -12,6 +12,7 @@ from torch import Tensor
 from gyrofuse.mismatch.likelihoods.spectra.data import reference_noise
 from gyrofuse.mismatch.likelihoods.spectra.ratios import FLOOR
 from gyrofuse.mismatch.likelihoods.spectra.slow_ordinates import slow_gains
+from gyrofuse.mismatch.likelihoods.spectra.starts import SpectralTerms
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Spectral(Mechanism):
+class Spectral(Mechanism, SpectralTerms):
     """What is judged by blocks and, where they are too short, by the slowest ordinates of the whole record.
 
     Attributes:
