@@ -20,6 +20,7 @@ from gyrofuse.mismatch.mechanisms.remainder import Remainder
 from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
 from gyrofuse.mismatch.mechanisms.signals.g_sensitivity import GSensitivity
 from gyrofuse.mismatch.mechanisms.signals.quadratic_coupling import QuadraticCoupling
+from gyrofuse.mismatch.mechanisms.signals.ramp import Ramp
 from gyrofuse.mismatch.mechanisms.signals.scale_factor import ScaleFactor
 from gyrofuse.mismatch.mechanisms.signals.step import Step
 from gyrofuse.mismatch.mechanisms.signals.temperature import TemperatureDrift
@@ -196,6 +197,13 @@ def _(setting: Setting) -> Drawn:
 def _(setting: Setting) -> Drawn:
     size, onset = setting.signed(2.5, 3.5) * setting.size, int(setting.even(0.3, 0.7) * setting.n_samples) / RATE
     return Drawn(Step(size, _none(setting), onset), {"onset": onset, **setting.of_each("size", size)})
+
+
+@draws(Ramp)
+def _(setting: Setting) -> Drawn:
+    onset = int(setting.even(0.2, 0.5) * setting.n_samples) / RATE
+    slope = setting.signed(6.0, 8.0) * setting.size / (setting.n_samples / RATE - onset)
+    return Drawn(Ramp(slope, _none(setting), onset), {"onset": onset, **setting.of_each("slope", slope)})
 
 
 @draws(WarmUpTransient)

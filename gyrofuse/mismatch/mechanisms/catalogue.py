@@ -18,6 +18,7 @@ from gyrofuse.mismatch.mechanisms.remainder import Remainder
 from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
 from gyrofuse.mismatch.mechanisms.signals.g_sensitivity import GSensitivity
 from gyrofuse.mismatch.mechanisms.signals.quadratic_coupling import QuadraticCoupling
+from gyrofuse.mismatch.mechanisms.signals.ramp import Ramp
 from gyrofuse.mismatch.mechanisms.signals.scale_factor import ScaleFactor
 from gyrofuse.mismatch.mechanisms.signals.step import Step
 from gyrofuse.mismatch.mechanisms.signals.temperature import TemperatureDrift
@@ -46,7 +47,7 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (VibrationTone, ToneSize),
     (RandomTelegraph,),
     (GradualChange,),  # where noise is louder, what is slow is known less well
-    (TemperatureDrift, WarmUpTransient, Step),
+    (TemperatureDrift, WarmUpTransient, Ramp, Step),
     (VarianceChange,),  # to which large jumps look alike
     (ParameterShift, LowPassFilter, Resonance, DriftingTone, FlickerNoise, CommonMode),
 )

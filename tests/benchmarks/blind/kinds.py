@@ -45,6 +45,7 @@ _MECHANISMS: dict[str, Callable[[Bench, float], Part]] = {
     "variance_change": marginal.variance_change,
     "random_telegraph": spectral.random_telegraph,
     "step": shapes.step,
+    "ramp": shapes.ramp,
     "temperature_drift": shapes.temperature_drift,
     "warm_up_transient": _with(shapes.warm_up_transient, thermometer="board"),
     "flicker": spectral.power_law,

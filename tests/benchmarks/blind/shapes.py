@@ -135,6 +135,23 @@ def step(bench: Bench, nats: float, *, count: int = 1) -> Part:
     )
 
 
+def ramp(bench: Bench, nats: float) -> Part:
+    """The bias drifts in a line from a time on."""
+    sensors = bench.some_sensors(1)
+    n, onset = bench.n, int(bench.rng.uniform(0.1, 0.6) * bench.n)
+    gains = bench.gains(sensors)
+    course = np.clip(np.arange(n) - onset, 0, None) / bench.rate
+    part, size = bench.shape("ramp", nats, gains[:, None] * course)
+    assert part.signal is not None
+    slope = size * gains[list(sensors)]
+    return replace(
+        part,
+        look_alikes=bench.rivals(part.signal, {"warm_up_transient": warm_ups(bench), "step": steps(bench)}),
+        time_s=onset / bench.rate,
+        parameters={"slope": quantity(rms(slope), "deg/s/s", slope), "onset": quantity(onset / bench.rate, "s")},
+    )
+
+
 def steps(bench: Bench) -> Array:
     """Steps at 50 epochs: (epoch, time)."""
     return (np.arange(bench.n) >= np.linspace(0.01, 0.99, 50)[:, None] * bench.n).astype(float)
