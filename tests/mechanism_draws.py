@@ -31,6 +31,7 @@ from gyrofuse.mismatch.mechanisms.slow_remainder import SlowRemainder
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
+from gyrofuse.mismatch.mechanisms.spectra.notch import NotchFilter
 from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
 from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
@@ -249,6 +250,15 @@ def _(setting: Setting) -> Drawn:
     corner = setting.sizes(0.9 * highest, highest) / max(setting.size, 1.0)
     strength = torch.where(corner > 0, filter_strength(kind, corner.clamp(min=1) / RATE), 0.0)
     return Drawn(LowPassFilter(kind, strength), setting.of_each("corner", corner))
+
+
+@draws(NotchFilter)
+def _(setting: Setting) -> Drawn:
+    centre, width = setting.even(0.1, 0.35), setting.even(0.3, 0.6)
+    depth = (setting.sizes(0.2, 0.3) * setting.size).clamp(max=2.0)
+    truth = {"centre": RATE * centre, "width": RATE * centre * width}
+    effect = NotchFilter(centre, width, depth)
+    return Drawn(effect, truth | setting.of_each("depth", 20 / math.log(10) * depth))
 
 
 def _mode(setting: Setting, low: float, high: float, *, shared: bool) -> Mode:

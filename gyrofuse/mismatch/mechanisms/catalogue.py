@@ -29,6 +29,7 @@ from gyrofuse.mismatch.mechanisms.slow_remainder import SlowRemainder
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
+from gyrofuse.mismatch.mechanisms.spectra.notch import NotchFilter
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
 from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
 from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
@@ -49,7 +50,7 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (GradualChange,),  # where noise is louder, what is slow is known less well
     (TemperatureDrift, WarmUpTransient, Ramp, Step),
     (VarianceChange,),  # to which large jumps look alike
-    (ParameterShift, LowPassFilter, Resonance, DriftingTone, FlickerNoise, CommonMode),
+    (ParameterShift, LowPassFilter, NotchFilter, Resonance, DriftingTone, FlickerNoise, CommonMode),
 )
 
 # What is left of slow courses and of spectra once nothing with a name is found any more.

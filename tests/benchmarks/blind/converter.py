@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import butter, sosfilt
+from scipy.signal import butter, freqz, iirnotch, lfilter, sosfilt
 
 Array = NDArray[np.float64]
 
@@ -23,6 +23,21 @@ def low_pass(analog: Array, corner: float) -> Array:
 def low_pass_gain(nu: Array, corner: float) -> Array:
     """Squared gain of `low_pass` at `nu` cycles per fine sample."""
     return 1 / (1 + (np.tan(np.pi * nu) / np.tan(np.pi * corner)) ** 4)
+
+
+def notch(analog: Array, centre: float, width: float, depth: float) -> Array:
+    """Second-order notch of every channel, settled on the first sample.
+
+    Centre and width are in cycles per fine sample; a share of `depth` of the amplitude is taken out at the centre.
+    """
+    start = analog[:, :1]
+    return (1 - depth) * analog + depth * (lfilter(*iirnotch(2 * centre, centre / width), analog - start) + start)
+
+
+def notch_gain(nu: Array, centre: float, width: float, depth: float) -> Array:
+    """Squared gain of `notch` at `nu` cycles per fine sample."""
+    deep = freqz(*iirnotch(2 * centre, centre / width), worN=2 * np.pi * nu)[1]
+    return np.abs(1 - depth + depth * deep) ** 2
 
 
 def round_to_lattice(signal: Array, step: float | Array) -> Array:

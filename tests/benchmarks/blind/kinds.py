@@ -35,6 +35,7 @@ _MECHANISMS: dict[str, Callable[[Bench, float], Part]] = {
     "resonance": spectral.resonance,
     "quadratic_coupling": shapes.quadratic_coupling,
     "low_pass": spectral.low_pass,
+    "notch": spectral.notch,
     "quantization": marginal.quantization,
     "quantization_bare": marginal.lattice,
     "dead_band": marginal.dead_band,

@@ -264,6 +264,39 @@ def low_pass(bench: Bench, nats: float) -> Part:
     )
 
 
+def notch(bench: Bench, nats: float) -> Part:
+    """A filter before the converter that takes a band out."""
+    sensors = bench.some_sensors(2)
+    chosen = np.isin(np.arange(bench.n_sensors), sensors)[:, None]
+    nu, centre = _fine_grid(bench), float(bench.rng.uniform(0.05, 0.35))
+    width = centre * float(bench.rng.uniform(0.15, 0.6))
+    in_fine_samples = centre / OVERSAMPLING, width / OVERSAMPLING
+
+    def after(depth: float) -> Array:
+        passed = folded(OVERSAMPLING * converter.notch_gain(nu, *in_fine_samples, depth), OVERSAMPLING)[1:-1]
+        return bench.spectrum - chosen * bench.base.white[:, None] * (1 - passed)
+
+    def worth(depth: float) -> Array:
+        return comparison(after(depth), bench.spectrum, bench.share)
+
+    depth = solve(nats, lambda x: float(worth(x).sum()), 1e-3, 0.95)
+    return _coloured(
+        bench,
+        "notch",
+        nats,
+        after(depth),
+        sensors,
+        worth(depth),
+        analog=lambda analog: np.where(chosen, converter.notch(analog, *in_fine_samples, depth), analog),
+        frequency_hz=centre * bench.rate,
+        parameters={
+            "centre": quantity(centre * bench.rate, "Hz"),
+            "width": quantity(width * bench.rate, "Hz"),
+            "depth": quantity(-20 * math.log10(1 - depth), "dB"),
+        },
+    )
+
+
 def parameter_shift(bench: Bench, nats: float, *, only: str | None = None) -> Part:
     """The same physics with other numbers; `only` one of "white", "ar1", "walk"."""
     sensors = bench.some_sensors(2)
