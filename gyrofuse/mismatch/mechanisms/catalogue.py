@@ -9,12 +9,14 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable
 
+from gyrofuse.mismatch.mechanisms.coherence_remainder import CoherenceRemainder
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
 from gyrofuse.mismatch.mechanisms.remainder import Remainder
+from gyrofuse.mismatch.mechanisms.signals.channel_transfer import ChannelTransfer
 from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
 from gyrofuse.mismatch.mechanisms.signals.g_sensitivity import GSensitivity
 from gyrofuse.mismatch.mechanisms.signals.quadratic_coupling import QuadraticCoupling
@@ -44,7 +46,7 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (Quantization, Clipping, StuckSamples),  # facts on the numbers themselves
     (Spikes,),
     (ClockSkew,),
-    (GSensitivity, QuadraticCoupling, ScaleFactor),
+    (GSensitivity, QuadraticCoupling, ScaleFactor, ChannelTransfer),
     (VibrationTone, ToneSize),
     (RandomTelegraph,),
     (GradualChange,),  # where noise is louder, what is slow is known less well
@@ -54,7 +56,11 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
 )
 
 # What is left of slow courses and of spectra once nothing with a name is found any more.
-UNNAMED: tuple[type[SlowRemainder] | type[Remainder], ...] = (SlowRemainder, Remainder)
+UNNAMED: tuple[type[SlowRemainder] | type[Remainder] | type[CoherenceRemainder], ...] = (
+    SlowRemainder,
+    Remainder,
+    CoherenceRemainder,
+)
 
 # Every mechanism that a repaired simulation may have; a dead band is looked for where no quantisation grid is found.
 CATALOGUE: tuple[type[Mechanism], ...] = (*itertools.chain(*STAGES), DeadBand, *UNNAMED)

@@ -17,6 +17,7 @@ from gyrofuse.mismatch.mechanisms.spectra.spectral import Filter
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.folds import N_JUDGED, estimation_samples
+from gyrofuse.mismatch.signals.psd import narrow_bands
 from gyrofuse.mismatch.signals.records import Records
 
 
@@ -53,13 +54,15 @@ class Remainder(Filter):
 
     @classmethod
     def _between(cls, observed: Records, reference: Records) -> Remainder:
-        """Halves of log ratios of powers, each drawn towards none by as much as chance explains of it (Stein)."""
-        dof = torch.minimum(observed.dof, reference.dof)
-        ratio = (observed.power.clamp(min=1e-300) / reference.power.clamp(min=1e-300)).log()
-        chance = 1 / observed.dof.clamp(min=1e-9) + 1 / reference.dof.clamp(min=1e-9)
-        kept = (1 - chance / ratio.square().clamp(min=1e-300)).clamp(min=0.0)
-        # Blocks are too short for the slowest bands: without a bin there is no power either.
-        return cls(observed.bands.frequency, torch.where(dof > 0, kept * ratio / 2, 0.0))
+        """Halves of log ratios of powers: in narrow bands drawn towards those in wide ones, and these towards none.
+
+        By as much as chance explains of the difference (Stein).
+        """
+        narrow = narrow_bands(observed.bands.n_samples)
+        wide = cls(observed.bands.frequency, _drawn(*_log_ratio(observed, reference), 0.0) / 2)
+        before = wide.response(narrow.frequency).log()
+        ratio, chance = _log_ratio(observed.in_bands(narrow), reference.in_bands(narrow))
+        return cls(narrow.frequency, _drawn(ratio, chance, 2 * before) / 2)
 
     def response(self, f: Tensor) -> Tensor:
         x, at = f.clamp(self.frequency[0], self.frequency[-1]).log(), self.frequency.log()
@@ -68,8 +71,25 @@ class Remainder(Filter):
         return torch.lerp(self.log_gain[:, right - 1], self.log_gain[:, right], share).exp()
 
     def fit_without(self, comparison: Comparison, fold: int) -> Remainder:
-        block = comparison.n_samples // N_JUDGED
-        kept = comparison.observed.noise[0][:, estimation_samples(comparison.n_samples, fold)]
-        return self._between(
-            Records(kept.unflatten(-1, (-1, block)).movedim(-2, 0), comparison.bands), comparison.reference
-        )
+        return self._between(without_fold(comparison, fold), comparison.reference)
+
+
+def without_fold(comparison: Comparison, fold: int) -> Records:
+    """The recording's noise in blocks, without those that a fold holds out."""
+    block = comparison.n_samples // N_JUDGED
+    kept = comparison.observed.noise[0][:, estimation_samples(comparison.n_samples, fold)]
+    return Records(kept.unflatten(-1, (-1, block)).movedim(-2, 0), comparison.bands)
+
+
+def _log_ratio(observed: Records, reference: Records) -> tuple[Tensor, Tensor]:
+    """Log ratio of powers `(sensor, band)`, and its variance by chance `(band,)`, infinite where nothing is seen."""
+    ratio = (observed.power.clamp(min=1e-300) / reference.power.clamp(min=1e-300)).log()
+    # Blocks are too short for the slowest bands: without a bin there is no power either.
+    return ratio, 1 / observed.dof + 1 / reference.dof
+
+
+def _drawn(values: Tensor, chance: Tensor, middle: Tensor | float) -> Tensor:
+    """Values drawn towards a middle by as much as a variance of chance explains of their distance."""
+    apart = values - middle
+    kept = (1 - chance / apart.square().clamp(min=1e-300)).clamp(min=0.0)
+    return middle + torch.where(kept > 0, kept * apart, 0.0)

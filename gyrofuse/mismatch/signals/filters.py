@@ -23,13 +23,31 @@ def filtered(signal: Tensor, response: Callable[[Tensor], Tensor]) -> Tensor:
         signal: Records.
         response: Complex gains `(sensor, frequency)` at `f` cycles per sample.
     """
-    n = signal.shape[-1]
-    middle = signal.mean(-1, keepdim=True)
-    centred = signal - middle
-    mirrored = torch.cat([centred, centred.flip(-1)], -1)
-    gain = response(torch.arange(n + 1, dtype=torch.float64) / (2 * n))
-    moved = torch.fft.irfft(torch.fft.rfft(mirrored) * gain, n=2 * n)[..., :n]
+    transform, middle, f = _mirrored_transform(signal)
+    gain = response(f)
+    moved = torch.fft.irfft(transform * gain, n=2 * signal.shape[-1])[..., : signal.shape[-1]]
     return moved - moved.mean(-1, keepdim=True) + middle * gain[..., :1].real
+
+
+def mixed(signal: Tensor, mixing: Callable[[Tensor], Tensor]) -> Tensor:
+    """Signals `(..., sensor, time)` mixed frequency by frequency; their means stay.
+
+    Args:
+        signal: Records.
+        mixing: Complex gains `(frequency, sensor, sensor)` at `f` cycles per sample.
+    """
+    transform, middle, f = _mirrored_transform(signal)
+    moved = torch.einsum("fij,...jf->...if", mixing(f), transform)
+    moved = torch.fft.irfft(moved, n=2 * signal.shape[-1])[..., : signal.shape[-1]]
+    return moved - moved.mean(-1, keepdim=True) + middle
+
+
+def _mirrored_transform(signal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Transform of records with their mirror images behind them, their means, and the frequencies of the bins."""
+    n, middle = signal.shape[-1], signal.mean(-1, keepdim=True)
+    centred = signal - middle
+    transform = torch.fft.rfft(torch.cat([centred, centred.flip(-1)], -1))
+    return transform, middle, torch.arange(n + 1, dtype=torch.float64) / (2 * n)
 
 
 def noise(n_samples: int, density: Callable[[Tensor], Tensor], rows: int, generator: torch.Generator) -> Tensor:

@@ -211,14 +211,18 @@ def _log_hotelling(z: Tensor, matrices: Tensor, sets: Tensor, m: Tensor) -> Tens
 
 
 def whitened(signal: Tensor, base: NoiseSpectrum) -> Tensor:
-    """Signals `(..., sensor, time)` in units of the noise of a base, without their means.
-
-    By cosine transforms: a Fourier transform has ends meet that do not, and a record that wanders would jump there.
-    """
+    """Signals `(..., sensor, time)` in units of the noise of a base, without their means."""
     n = signal.shape[-1]
     f = torch.arange(n, dtype=torch.float64) / (2 * n)
-    ordinates = torch.from_numpy(fft.dct(signal.numpy(), norm="ortho", axis=-1))
-    ordinates = ordinates / base.spectrum(f.clamp(min=1 / n)).sqrt()
+    return with_factors(signal, base.spectrum(f.clamp(min=1 / n)).rsqrt())
+
+
+def with_factors(signal: Tensor, factors: Tensor) -> Tensor:
+    """Signals `(..., time)` with factors `(..., ordinate)` on their cosine ordinates, without their means.
+
+    A Fourier transform has ends meet that do not, and a record that wanders would jump there.
+    """
+    ordinates = torch.from_numpy(fft.dct(signal.numpy(), norm="ortho", axis=-1)) * factors
     ordinates[..., 0] = 0.0
     return torch.from_numpy(fft.idct(ordinates.numpy(), norm="ortho", axis=-1))
 

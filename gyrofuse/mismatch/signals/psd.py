@@ -59,18 +59,25 @@ class Bands:
 
 
 @functools.lru_cache(maxsize=8)
-def bands(n_samples: int) -> Bands:
-    """Bands for records of `n_samples`, 32 at least."""
+def bands(n_samples: int, widest: int | None = None) -> Bands:
+    """Bands for records of `n_samples`, 32 at least; of so many bins at most, where given."""
     last = (n_samples - _TAPERS) // 2  # the bin after the last one
     edges = [_FIRST_BIN]
     while edges[-1] < last:
-        edges.append(max(edges[-1] + _TAPERS + 1, math.ceil(edges[-1] * 2 ** (1 / _PER_OCTAVE))))
+        octave = math.ceil(edges[-1] * 2 ** (1 / _PER_OCTAVE))
+        end = octave if widest is None else min(octave, edges[-1] + widest)
+        edges.append(max(edges[-1] + _TAPERS + 1, end))
     edges[-1] = last
     if len(edges) > 2 and edges[-1] - edges[-2] <= _TAPERS:
         del edges[-2]
     lower, upper = (torch.tensor(ends, dtype=torch.float64) for ends in (edges[:-1], edges[1:]))
     dof = torch.tensor([degrees_of_freedom(int(w)) for w in upper - lower], dtype=torch.float64)
     return Bands(n_samples, tuple(edges), (lower * (upper - 1)).sqrt() / n_samples, dof)
+
+
+def narrow_bands(n_samples: int) -> Bands:
+    """Bands of a 512th of the rate at most, or of 24 bins where these are wider."""
+    return bands(n_samples, max(n_samples // 512, 24))
 
 
 def cross_spectra(signal: Tensor, wanted: Bands) -> Tensor:

@@ -1,0 +1,119 @@
+"""What sensors share once everything with a name is explained: a repair without physics."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.mechanisms import pictures
+from gyrofuse.mismatch.mechanisms.remainder import without_fold
+from gyrofuse.mismatch.mechanisms.spectra.spectral import Spectral
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.dims import Dims
+from gyrofuse.mismatch.signals.filters import mixed
+from gyrofuse.mismatch.signals.psd import narrow_bands
+from gyrofuse.mismatch.signals.records import Records
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_LEAST = 1e-3  # eigenvalue of a coherence matrix: what is less is not known
+
+
+@dataclass(frozen=True, eq=False)
+class CoherenceRemainder(Spectral):
+    """`S(f) -> D (R_1^1/2 R_0^-1/2) D^-1 S (..)^H`: the sensors' coherences become `R_1(f)` in place of `R_0(f)`.
+
+    Each sensor keeps its power; `D` are the roots of powers. Between the middles of bands matrices are interpolated.
+
+    Attributes:
+        frequency: Middles of the bands, cycles per sample, `(band,)`.
+        level: Roots of the sensors' powers, `(sensor, band)`.
+        before, after: Coherence matrices, complex, `(band, sensor, sensor)`.
+    """
+
+    name: ClassVar[str] = "coherence_remainder"
+    identified: ClassVar[bool] = False
+    refit_after_others: ClassVar[bool] = True
+    remark: ClassVar[str] = (
+        "So that the sensors of the repaired simulation share what those of the recording share, they are mixed in a "
+        "way that stands for no physics."
+    )
+    asked_for_by: ClassVar[tuple[str, ...]] = ("coherence", "common")  # names of tests
+    frequency: Annotated[Tensor, Dims(("band",))]
+    level: Annotated[Tensor, Dims(("sensor", "band"))]
+    before: Annotated[Tensor, Dims(("band", "sensor", "sensor"), complex=True)]
+    after: Annotated[Tensor, Dims(("band", "sensor", "sensor"), complex=True)]
+
+    @classmethod
+    def left_over(cls, comparison: Comparison) -> CoherenceRemainder:
+        """What the coherences ask for."""
+        return cls._between(comparison.observed, comparison.reference)
+
+    def but_for(self, sensors: Sequence[int]) -> CoherenceRemainder:
+        """The same, with some sensors left as they are."""
+        after = self.after.clone()
+        for i in sensors:
+            after[:, i], after[:, :, i] = self.before[:, i], self.before[:, :, i]
+        return replace(self, after=_positive(after))
+
+    @classmethod
+    def _between(cls, observed: Records, reference: Records) -> CoherenceRemainder:
+        """Coherences drawn towards those of the simulation, and these towards none, by as much as chance explains."""
+        narrow = narrow_bands(observed.bands.n_samples)
+        seen, simulated = observed.in_bands(narrow), reference.in_bands(narrow)
+        eye = torch.eye(seen.signal.shape[-2], dtype=torch.complex128)
+        before = _drawn(simulated.coherence, 1 / simulated.dof, eye)
+        after = _drawn(seen.coherence, 1 / seen.dof, before)
+        return cls(narrow.frequency, simulated.power.clamp(min=1e-300).sqrt(), _positive(before), _positive(after))
+
+    def factor(self, base: object, f: Tensor) -> Tensor:
+        return torch.ones(len(self.level), len(f), dtype=torch.float64)
+
+    def mixing(self, f: Tensor) -> Tensor:
+        """Complex gains `(frequency, sensor, sensor)` at `f` cycles per sample."""
+        x, at = f.clamp(self.frequency[0], self.frequency[-1]).log(), self.frequency.log()
+        right = torch.searchsorted(at, x).clamp(1, len(at) - 1)
+        share = (x - at[right - 1]) / (at[right] - at[right - 1])
+        turn = _root(self.after) @ torch.linalg.inv(_root(self.before))  # (band, sensor, sensor)
+        size = self.level.mT
+        own = turn * (size[:, :, None] / size[:, None, :])
+        return torch.lerp(own[right - 1], own[right], share[:, None, None].to(own.dtype))
+
+    def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
+        return mixed(signal, self.mixing)
+
+    def spectra(self, matrices: Tensor, f: Tensor) -> Tensor:
+        mixing = self.mixing(f)
+        return mixing @ matrices.to(mixing.dtype) @ mixing.mH
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        pictures.coherence(ax, comparison, sensor)
+
+    def fit_without(self, comparison: Comparison, fold: int) -> CoherenceRemainder:
+        return self._between(without_fold(comparison, fold), comparison.reference)
+
+
+def _drawn(values: Tensor, chance: Tensor, middle: Tensor) -> Tensor:
+    """Complex values `(band, sensor, sensor)` drawn towards a middle by as much as chance `(band,)` explains."""
+    apart = values - middle
+    kept = (1 - chance[:, None, None] / apart.abs().square().clamp(min=1e-300)).clamp(min=0.0)
+    return middle + torch.where(kept > 0, kept * apart, torch.zeros_like(apart))
+
+
+def _positive(matrices: Tensor) -> Tensor:
+    """The nearest coherence matrices that are positive, with ones on their diagonals."""
+    values, vectors = torch.linalg.eigh((matrices + matrices.mH) / 2)
+    made = (vectors * values.clamp(min=_LEAST)[..., None, :]) @ vectors.mH
+    size = made.diagonal(dim1=-2, dim2=-1).real.sqrt()
+    return made / (size[..., :, None] * size[..., None, :])
+
+
+def _root(matrices: Tensor) -> Tensor:
+    """Hermitian roots."""
+    values, vectors = torch.linalg.eigh(matrices)
+    return (vectors * values.clamp(min=0).sqrt()[..., None, :]) @ vectors.mH
