@@ -202,7 +202,8 @@ def examine(study: Study) -> Outcome:
         simulation = (signal - signal.mean(0))[:-1]
     report = gf.diagnose(study.diagnosed, simulation)
     if study.judged is None:
-        return Outcome(study, report, report.held_out.before, report.held_out.after)
+        after = report.held_out.after if report.held_out.paired is None else report.held_out.paired
+        return Outcome(study, report, report.held_out.before, after)
     n = study.judged.signal.shape[-1]
     plain = simulator.simulate(4 * n, generator=generator)
     channels = {name: values.repeat(1, 4) for name, values in study.judged.channels.items()}

@@ -57,10 +57,10 @@ class Mechanism:
         named_together: Names that are told apart by the same test, and so are detected together.
         replaced_by: Names that may take the place of a finding which loses to a rival, whatever that rival is.
         separated_by: Data that would tell it from its rivals.
-        stage: Position in the chain from sensor to numbers: 0 for the analogue part; clipped, rounded and repeated
-            samples come after it.
+        stage: Position in the chain from sensor to numbers: 0 is analogue; clipping, rounding and repeats come after.
         additive: Whether its repair takes it off the recording, instead of applying it to the simulation.
         known_path: Whether it adds a path that is known up to its amplitudes, in every record of the same time.
+        follows_channel: Whether it follows an auxiliary channel, which moves as it likes.
         happened_once: Whether it belongs to a time of this recording, and is not expected in another one.
         changes_noise: Whether it changes levels or spectra of noise, so that wrong numbers lead a simulation away.
         of_spectra: Whether it is found in spectra alone.
@@ -81,6 +81,7 @@ class Mechanism:
     stage: ClassVar[int] = 0
     additive: ClassVar[bool] = False
     known_path: ClassVar[bool] = False
+    follows_channel: ClassVar[bool] = False
     happened_once: ClassVar[bool] = False
     changes_noise: ClassVar[bool] = False
     of_spectra: ClassVar[bool] = False

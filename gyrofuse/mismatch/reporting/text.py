@@ -124,3 +124,8 @@ def family_words(held_out: HeldOut) -> str:
         f"{name} by {nats(score.value)} nats (95 % interval {nats(score.low)} to {nats(score.high)})"
         for name, score in held_out.families.items()
     )
+
+
+def paired_words(held_out: HeldOut) -> str:
+    """The discrepancy by the recording's own scatter, where something follows a channel."""
+    return "" if held_out.paired is None else f"{held_out.paired:.2f} by the scatter of the recording's own blocks, "

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from scipy import stats
@@ -43,6 +45,37 @@ def discrepancy_of_fold(comparison: Comparison, fold: int) -> float:
     # The variance is itself estimated, as in Student's distribution.
     expected = (n_reference - 1) / (n_reference - 3)
     return float(((observed.mean(0) - reference.mean(0)).square() / variance).mean()) / expected
+
+
+class Differences(NamedTuple):
+    """Moments of a recording's blocks less their means in a simulation.
+
+    Attributes:
+        blocks: `(block, moment)`.
+        chance: Variance of the simulation's means, `(moment,)`.
+    """
+
+    blocks: Tensor
+    chance: Tensor
+
+
+def differences_of_fold(comparison: Comparison, fold: int) -> Differences:
+    """Those of the blocks that a fold holds out."""
+    blocks = _cut(held_out_blocks(comparison.recording, fold), _length(comparison))
+    reference = _reference_moments(comparison)
+    return Differences(_block_moments(blocks.flatten(1, 2)) - reference.mean(0), reference.var(0) / len(reference))
+
+
+def paired_discrepancy(folds: Sequence[Differences]) -> float:
+    """Discrepancy by the scatter of the recording's own blocks, each held out once; 1 is what noise alone gives.
+
+    Where what is left of a recording is louder at some times than at others, as in flight, blocks of a steady
+    simulation say too little of how far chance takes its mean. The variance is estimated, as in Student's distribution.
+    """
+    apart = torch.cat([fold.blocks for fold in folds])
+    n = len(apart)
+    variance = apart.var(0) / n + folds[0].chance
+    return float((apart.mean(0).square() / variance).mean()) * (n - 3) / (n - 1)
 
 
 def leads_away(start: Comparison, comparison: Comparison, by_fold: tuple[Mechanism, ...], g: torch.Generator) -> bool:

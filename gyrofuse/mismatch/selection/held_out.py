@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.selection.classifier import distinguishability
-from gyrofuse.mismatch.selection.discrepancy import discrepancy_of_fold
+from gyrofuse.mismatch.selection.discrepancy import differences_of_fold, discrepancy_of_fold, paired_discrepancy
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, in_fold, sd_of_sum
 from gyrofuse.mismatch.stats.limits import Z
@@ -80,6 +80,8 @@ class HeldOut(NamedTuple):
             0.5 is guessing.
         auc_after: The same of the recording as it came and what the repaired simulation makes.
         families: Log score of the findings of each likelihood, by its name.
+        paired: Where something follows a channel of the recording, the discrepancy after it by the scatter of the
+            recording's own blocks; else None.
     """
 
     before: float
@@ -90,13 +92,21 @@ class HeldOut(NamedTuple):
     auc_before: float
     auc_after: float
     families: dict[str, FamilyScore]
+    paired: float | None = None
 
     def to_dict(self) -> dict[str, object]:
         """Plain numbers, ready for JSON."""
         gain = {"value": self.gain, "low": self.low, "high": self.high}
         auc = {"before": self.auc_before, "after": self.auc_after}
         families = {name: score._asdict() for name, score in self.families.items()}
-        return {"before": self.before, "after": self.after, "gain": gain, "families": families, "auc": auc}
+        return {
+            "before": self.before,
+            "after": self.after,
+            "paired": self.paired,
+            "gain": gain,
+            "families": families,
+            "auc": auc,
+        }
 
 
 def score_held_out(comparison: Comparison, effect: Mechanism) -> HeldOutScore:
@@ -123,8 +133,14 @@ def agreement(start: Comparison, scores: Sequence[HeldOutScore], generator: torc
         generator: Source of the random numbers of what is applied to the simulation.
     """
     before = after = [(discrepancy_of_fold(start, fold), distinguishability(start, fold)) for fold in range(N_FOLDS)]
+    paired = []
     if scores:
-        after = [_after_repairs(start, scores, fold, generator) for fold in range(N_FOLDS)]
+        after = []
+        for fold in range(N_FOLDS):
+            left, simulated = _after_repairs(start, scores, fold, generator)
+            after.append((discrepancy_of_fold(left, fold), distinguishability(simulated, fold)))
+            if any(score.by_fold[fold].follows_channel for score in scores):
+                paired.append(differences_of_fold(left, fold))
     (d, auc), (d_after, auc_after) = (
         torch.tensor(folds, dtype=torch.float64).mean(0).tolist() for folds in (before, after)
     )
@@ -132,20 +148,25 @@ def agreement(start: Comparison, scores: Sequence[HeldOutScore], generator: torc
         name: FamilyScore.of([s for s in scores if s.likelihood == name])
         for name in dict.fromkeys(s.likelihood for s in scores)
     }
-    return HeldOut(d, d_after, *FamilyScore.of(scores), auc, auc_after, families)
+    return HeldOut(
+        d, d_after, *FamilyScore.of(scores), auc, auc_after, families, paired_discrepancy(paired) if paired else None
+    )
 
 
 def _after_repairs(
     start: Comparison, scores: Sequence[HeldOutScore], fold: int, generator: torch.Generator
-) -> tuple[float, float]:
-    """Discrepancy and area under the classifier's curve with the numbers that a fold leaves."""
-    repaired, effects = start, []
+) -> tuple[Comparison, Comparison]:
+    """The comparison repaired with the numbers that a fold leaves, and the recording as it came beside a simulation.
+
+    A recording that was cleaned shows that it was: a classifier gets all effects in the simulation.
+    """
+    left, effects = start, []
     for effect in (score.by_fold[fold] for score in scores):
         if effect.refit_after_others:
-            effect = effect.fit_without(repaired, fold)
-        repaired = effect.repair(repaired, generator)
+            effect = effect.fit_without(left, fold)
+        left = effect.repair(left, generator)
         effects.append(effect)
     simulated = start
     for effect in sorted(effects, key=lambda effect: effect.order):
-        simulated = effect.apply_to_reference(simulated, generator)  # a recording that was cleaned shows that it was
-    return discrepancy_of_fold(repaired, fold), distinguishability(simulated, fold)
+        simulated = effect.apply_to_reference(simulated, generator)
+    return left, simulated

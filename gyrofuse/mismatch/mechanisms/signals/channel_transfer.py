@@ -48,6 +48,7 @@ class ChannelTransfer(Mechanism):
     separated_by: ClassVar[str] = "a recording with another motion"
     known_path: ClassVar[bool] = True
     additive: ClassVar[bool] = True
+    follows_channel: ClassVar[bool] = True
     channels: tuple[str, ...]
     taps: Annotated[Tensor, Dims(("sensor", "row", "lag"))]
 
