@@ -12,11 +12,13 @@ from torch import Tensor
 
 import gyrofuse as gf
 from gyrofuse.mismatch.likelihoods.spectra.filter_forms import filter_strength
+from gyrofuse.mismatch.mechanisms.coherence_remainder import CoherenceRemainder
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
 from gyrofuse.mismatch.mechanisms.remainder import Remainder
+from gyrofuse.mismatch.mechanisms.signals.channel_transfer import ChannelTransfer
 from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
 from gyrofuse.mismatch.mechanisms.signals.g_sensitivity import GSensitivity
 from gyrofuse.mismatch.mechanisms.signals.quadratic_coupling import QuadraticCoupling
@@ -302,6 +304,17 @@ def _(setting: Setting) -> Drawn:
     return Drawn(effect, truth)
 
 
+@draws(ChannelTransfer)
+def _(setting: Setting) -> Drawn:
+    gain, late = setting.signed(0.015, 0.02) * setting.size, setting.sizes(-1.5, 1.5)
+    lags = torch.arange(-8, 9, dtype=torch.float64)
+    delayed = torch.sinc(lags - late[:, None]) * torch.hann_window(19, periodic=False, dtype=torch.float64)[1:-1]
+    motion = gf.AR1(0.9, 400 * (1 - 0.9**2)).simulate(setting.n_samples, generator=setting.generator)
+    effect = ChannelTransfer(("rate",), (gain[:, None] * delayed)[:, None])
+    truth = setting.of_each("gain", gain) | setting.of_each("delay", 1e3 / RATE * late)
+    return Drawn(effect, truth, {"rate": motion[None]})
+
+
 # What stands for no physics.
 
 
@@ -317,3 +330,18 @@ def _(setting: Setting) -> Drawn:
 def _(setting: Setting) -> Drawn:
     further = torch.stack([setting.signed(0.5, 1.0) * setting.size for _ in range(3)], -1)
     return Drawn(SlowRemainder(setting.signed(0.5, 1.0), _none(setting), further, setting.n_samples), {})
+
+
+@draws(CoherenceRemainder)
+def _(setting: Setting) -> Drawn:
+    f = torch.logspace(math.log10(2 / setting.n_samples), math.log10(0.45), 12, dtype=torch.float64)
+    eye = torch.eye(setting.n_sensors, dtype=torch.complex128).expand(len(f), -1, -1)
+    shared = torch.tensor([i in setting.concerned for i in range(setting.n_sensors)]).to(torch.complex128)
+    shared = shared * torch.polar(
+        torch.ones_like(shared.real), 0.3 * torch.arange(setting.n_sensors, dtype=torch.float64)
+    )
+    share = 0.1 * min(setting.size, 5.0)
+    both = share * shared[:, None] * shared.conj()
+    after = eye + both - torch.diag_embed(both.diagonal())
+    level = noise_spectrum(setting.n_sensors, setting.n_samples).spectrum(f).sqrt()
+    return Drawn(CoherenceRemainder(f, level, eye.clone(), after), {})

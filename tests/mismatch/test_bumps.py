@@ -15,13 +15,13 @@ from gyrofuse.mismatch.detectors.spectra.own_peak_scan import _scores, _shape, s
 from gyrofuse.mismatch.detectors.spectra.peak_fit import Background, Oscillation, oscillation_of
 from gyrofuse.mismatch.detectors.spectra.peaks import Stretch, strongest_peak
 from gyrofuse.mismatch.detectors.spectra.shared_peak_scan import log_ratios
+from gyrofuse.mismatch.detectors.spectra.steadiness import steadiness
 from gyrofuse.mismatch.likelihoods.spectra.common_sources import CommonBump
 from gyrofuse.mismatch.likelihoods.spectra.components import oscillation
 from gyrofuse.mismatch.likelihoods.spectra.fit import fit, linearised
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import compared
 from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode, _momentary, _seen, excess_along, wandering_sd
 from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
-from gyrofuse.mismatch.mechanisms.spectra.steadiness import steadiness
 from gyrofuse.mismatch.signals.filters import noise
 from gyrofuse.mismatch.signals.lines import whitened
 

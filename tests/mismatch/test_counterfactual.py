@@ -15,6 +15,7 @@ from gyrofuse.mismatch import diagnose
 from gyrofuse.mismatch.detectors.slow.scans import slow_analysis
 from gyrofuse.mismatch.detectors.spectra.peak_fit import Oscillation
 from gyrofuse.mismatch.detectors.spectra.peaks import Stretch
+from gyrofuse.mismatch.detectors.spectra.steadiness import Steadiness, steadiness
 from gyrofuse.mismatch.mechanisms.mechanism import Alternative, Finding, Mechanism, Parameter
 from gyrofuse.mismatch.mechanisms.signals.step import Step
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone, amplitude_limits, line_near
@@ -24,7 +25,6 @@ from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode, wandering_sd
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
 from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
-from gyrofuse.mismatch.mechanisms.spectra.steadiness import Steadiness, steadiness
 from gyrofuse.mismatch.mechanisms.spectra.wandering_tone import DriftingTone
 from gyrofuse.mismatch.mechanisms.values.quantization import Quantization
 from gyrofuse.mismatch.reporting.text import otherwise_words

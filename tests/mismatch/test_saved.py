@@ -16,15 +16,18 @@ from torch import Tensor
 
 import gyrofuse as gf
 from gyrofuse.mismatch.mechanisms.catalogue import CATALOGUE
+from gyrofuse.mismatch.mechanisms.coherence_remainder import CoherenceRemainder
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
 from gyrofuse.mismatch.mechanisms.remainder import Remainder
+from gyrofuse.mismatch.mechanisms.signals.channel_transfer import ChannelTransfer
 from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
 from gyrofuse.mismatch.mechanisms.signals.g_sensitivity import GSensitivity
 from gyrofuse.mismatch.mechanisms.signals.quadratic_coupling import QuadraticCoupling
+from gyrofuse.mismatch.mechanisms.signals.ramp import Ramp
 from gyrofuse.mismatch.mechanisms.signals.scale_factor import ScaleFactor
 from gyrofuse.mismatch.mechanisms.signals.step import Step
 from gyrofuse.mismatch.mechanisms.signals.temperature import TemperatureDrift
@@ -35,6 +38,7 @@ from gyrofuse.mismatch.mechanisms.slow_remainder import SlowRemainder
 from gyrofuse.mismatch.mechanisms.spectra.common_source import CommonMode
 from gyrofuse.mismatch.mechanisms.spectra.flicker import FlickerNoise
 from gyrofuse.mismatch.mechanisms.spectra.low_pass import LowPassFilter
+from gyrofuse.mismatch.mechanisms.spectra.notch import NotchFilter
 from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode
 from gyrofuse.mismatch.mechanisms.spectra.parameter_change import ParameterShift
 from gyrofuse.mismatch.mechanisms.spectra.resonance import Resonance
@@ -76,6 +80,7 @@ EVERY = (
     GSensitivity("acceleration", torch.tensor([[0.1, 0.2, 1 / 3], [0.0, 0.0, 0.0]], dtype=torch.float64)),
     QuadraticCoupling("acceleration", torch.tensor([[1 / 3], [0.1]], dtype=torch.float64), "axis 2"),
     ScaleFactor("rate", torch.tensor([[1e-3], [0.0]], dtype=torch.float64)),
+    ChannelTransfer(("rate",), torch.tensor([[[1e-3, 0.2, 1 / 3]], [[0.0, 0.0, 0.0]]], dtype=torch.float64)),
     VibrationTone(7.3, numbers(0.3, 0.0), numbers(0.1, 0.2)),
     ToneSize(7.3, numbers(0.3, 1 / 3)),
     RandomTelegraph(numbers(0.3, 0.0), numbers(1 / 3, 1.0), numbers(0.2, 1.0)),
@@ -86,10 +91,12 @@ EVERY = (
         numbers(1 / 3, 0.0), torch.zeros(2, 4, dtype=torch.float64), 2.3, (Decay(numbers(0.2, 0.0), 20 / 3),)
     ),
     Step(numbers(0.0, 1 / 3), torch.zeros(2, 4, dtype=torch.float64), 3.3),
+    Ramp(numbers(0.0, 1 / 3), torch.zeros(2, 4, dtype=torch.float64), 3.3),
     VarianceChange(((1.5, 3.25), (6.0, 7.0)), numbers(2.0, 1.0), 1 / 3),
     GradualChange(numbers(0.0, 1 / 3, 9.0), numbers(0.0, 0.7, 1.0), numbers(0.9, 1.0), numbers(1 / 3, 1.0), 0.1),
     ParameterShift(BASE, torch.tensor([[0.1, 0.0], [1 / 3, 0.0], [0.0, 0.0], [0.2, 0.1]], dtype=torch.float64)),
     LowPassFilter("pole", numbers(0.7, 0.0)),
+    NotchFilter(0.11, 1 / 3, numbers(0.7, 0.0)),
     Resonance(MODE),
     DriftingTone(MODE, True, 0.9),
     FlickerNoise(numbers(1 / 3, 0.0)),
@@ -102,6 +109,12 @@ EVERY = (
         1000,
     ),
     Remainder(numbers(0.01, 0.1, 0.4), torch.tensor([[0.1, 1 / 3, 0.0], [0.0, 0.2, 0.3]], dtype=torch.float64)),
+    CoherenceRemainder(
+        numbers(0.01, 0.4),
+        torch.tensor([[0.1, 1 / 3], [0.7, 0.2]], dtype=torch.float64),
+        torch.eye(2, dtype=torch.complex128).expand(2, -1, -1),
+        torch.stack([complex_numbers(1, 0.1j, -0.1j, 1), complex_numbers(1, 1 / 3, 1 / 3, 1)]).unflatten(-1, (2, 2)),
+    ),
 )
 
 
@@ -113,6 +126,10 @@ class Odd(Mechanism):
     spans: tuple[tuple[float, float], ...]
     channel: str
     together: bool
+
+    @property
+    def follows(self) -> tuple[str, ...]:
+        return (self.channel,)
 
 
 CHANNELS = {"acceleration": 3, "rate": 1, "temperature": 1}  # rows
@@ -200,7 +217,7 @@ def test_refuses_numbers_that_are_none_of_a_mechanism(effect: Mechanism):
                 said = str(error)
                 assert re.match(r"`description`: expected in effects\.0\S* ", said), (where, odd, said)
             else:
-                assert hasattr(effect, "channel") or again.simulate(300).isfinite().all()
+                assert effect.follows or again.simulate(300).isfinite().all()
 
 
 @pytest.mark.parametrize(

@@ -20,13 +20,9 @@ from torch import Tensor
 
 from gyrofuse._base.transforms import cosine_ordinates
 from gyrofuse.mismatch.signals.comparison import Comparison
-from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, in_fold
+from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, held_out_blocks, in_fold
 from gyrofuse.mismatch.signals.lines import with_factors
 from gyrofuse.mismatch.signals.psd import narrow_bands
-
-_RIDGE = 1e-4  # of the mean square of each whitened row
-_CHUNK = 2**16  # samples whose lagged rows are in memory at once
-_ROUNDS = 3  # of whitening: by the recording's spectrum, and by that of what a fit leaves
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +51,7 @@ class ResponseSums:
         signal = comparison.recording - comparison.recording.mean(-1, keepdim=True)
         rows = rows - rows.mean(-1, keepdim=True)
         found = cls._whitened(comparison, signal, rows, reach, _smooth_density(comparison, signal))
-        for _ in range(_ROUNDS - 1):
+        for _ in range(2):  # what a strong effect adds to the spectrum is no noise
             left = signal - responded(found.solved(range(len(rows)), reach).taps, rows)
             found = cls._whitened(comparison, signal, rows, reach, _smooth_density(comparison, left))
         return found
@@ -66,13 +62,14 @@ class ResponseSums:
     ) -> ResponseSums:
         y, a = (with_factors(x, density.rsqrt()) for x in (signal, rows))
         n_lags, block = 2 * reach + 1, comparison.n_samples // N_JUDGED
+        most = 2**16  # samples whose lagged rows are in memory at once
         gram, moment, power, counts = [], [], [], []
         for k in range(N_JUDGED):
             first, last = max(k * block, reach), min((k + 1) * block, comparison.n_samples - reach)
             own = torch.zeros(len(a) * n_lags, len(a) * n_lags, dtype=torch.float64)
             cross = torch.zeros(len(y), len(own), dtype=torch.float64)
-            for start in range(first, last, _CHUNK):
-                stop = min(start + _CHUNK, last)
+            for start in range(first, last, most):
+                stop = min(start + most, last)
                 # a(t - l) with l from -L to L: the last sample of a window is a(t + L).
                 lagged = a[:, start - reach : stop + reach].unfold(-1, n_lags, 1).flip(-1)  # (row, time, lag)
                 design = lagged.movedim(1, 0).flatten(1)
@@ -89,16 +86,13 @@ class ResponseSums:
         at = self._places(rows, reach)
         kept = torch.ones(N_JUDGED, dtype=torch.bool) if fold is None else ~in_fold(N_JUDGED, fold)
         gram, moment = self.gram[kept].sum(0)[at][:, at], self.moment[kept].sum(0)[:, at]
-        inverse = torch.linalg.inv(gram + _RIDGE * torch.diag(gram.diagonal().clamp(min=1e-300)))
+        ridge = 1e-4  # of the mean square of each whitened row
+        inverse = torch.linalg.inv(gram + ridge * torch.diag(gram.diagonal().clamp(min=1e-300)))
         taps = moment @ inverse
         free = max(int(self.count[kept].sum()) - len(at), 1)
         left = (self.power[kept].sum(0) - (moment * taps).sum(-1)).clamp(min=1e-300) / free
         shape = (len(taps), len(rows), 2 * reach + 1)
         return FiniteResponse(taps.view(shape), inverse, left)
-
-    def gained(self, taps: Tensor, rows: Sequence[int], reach: int, fold: int) -> Tensor:
-        """Log likelihood ratio of responses `(sensor, row, lag)` in each block of a fold, all sensors, `(block,)`."""
-        return self._gained(taps, self._places(rows, reach), self.solved(rows, reach, fold).variance, fold).sum(-1)
 
     def held_out(self, rows: Sequence[int], reach: int) -> Tensor:
         """Log likelihood ratios of the blocks of each fold, numbers of the others, `(fold, sensor)`, nats."""
@@ -142,6 +136,15 @@ def responded(taps: Tensor, rows: Tensor) -> Tensor:
     response = torch.fft.rfft(taps.to(torch.float64), n=length)  # (sensor, row, bin)
     moved = torch.einsum("ikf,kf->if", response, torch.fft.rfft(padded, n=length))
     return torch.fft.irfft(moved, n=length)[:, 2 * reach : 2 * reach + n]
+
+
+def path_gains(comparison: Comparison, path: Tensor, fold: int) -> Tensor:
+    """Log likelihood ratio of a path `(sensor, time)` in each block of a fold, in the noise it leaves, `(block,)`."""
+    signal, path = (x - x.mean(-1, keepdim=True) for x in (comparison.recording, path))
+    factor = _smooth_density(comparison, signal - path).rsqrt()
+    y, s = (with_factors(x, factor) for x in (signal, path))
+    variance = (y - s).square().mean(-1, keepdim=True)
+    return held_out_blocks((y * s - s.square() / 2) / variance, fold).sum((0, -1))
 
 
 def response_at(taps: Tensor, f: float) -> Tensor:

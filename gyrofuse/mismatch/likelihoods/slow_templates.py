@@ -14,9 +14,9 @@ import torch
 from scipy.signal import lfilter
 from torch import Tensor
 
+from gyrofuse.mismatch.likelihoods.declared import declared
 from gyrofuse.mismatch.likelihoods.slow_noise import ordinates, slow_ordinates
 from gyrofuse.mismatch.signals.comparison import N_BLOCKS, Comparison, RecordingInfo
-from gyrofuse.mismatch.signals.declared import declared
 
 # A grid of templates is as fine as keeps neighbours correlated by 0.9 or more, where the noise is white.
 _TIME_CONSTANTS = 24

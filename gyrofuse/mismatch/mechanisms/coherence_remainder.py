@@ -21,8 +21,6 @@ from gyrofuse.mismatch.signals.records import Records
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_LEAST = 1e-3  # eigenvalue of a coherence matrix: what is less is not known
-
 
 @dataclass(frozen=True, eq=False)
 class CoherenceRemainder(Spectral):
@@ -67,8 +65,9 @@ class CoherenceRemainder(Spectral):
         narrow = narrow_bands(observed.bands.n_samples)
         seen, simulated = observed.in_bands(narrow), reference.in_bands(narrow)
         eye = torch.eye(seen.signal.shape[-2], dtype=torch.complex128)
-        before = _drawn(simulated.coherence, 1 / simulated.dof, eye)
-        after = _drawn(seen.coherence, 1 / seen.dof, before)
+        plain = 4.0  # times the mean square of chance: of many bands and pairs some stand out
+        before = _drawn(simulated.coherence, plain / simulated.dof, eye)
+        after = _drawn(seen.coherence, plain / seen.dof, before)
         return cls(narrow.frequency, simulated.power.clamp(min=1e-300).sqrt(), _positive(before), _positive(after))
 
     def factor(self, base: object, f: Tensor) -> Tensor:
@@ -107,8 +106,9 @@ def _drawn(values: Tensor, chance: Tensor, middle: Tensor) -> Tensor:
 
 def _positive(matrices: Tensor) -> Tensor:
     """The nearest coherence matrices that are positive, with ones on their diagonals."""
+    least = 1e-3  # eigenvalue: what is less is not known
     values, vectors = torch.linalg.eigh((matrices + matrices.mH) / 2)
-    made = (vectors * values.clamp(min=_LEAST)[..., None, :]) @ vectors.mH
+    made = (vectors * values.clamp(min=least)[..., None, :]) @ vectors.mH
     size = made.diagonal(dim1=-2, dim2=-1).real.sqrt()
     return made / (size[..., :, None] * size[..., None, :])
 

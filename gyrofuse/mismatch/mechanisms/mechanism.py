@@ -60,7 +60,6 @@ class Mechanism:
         stage: Position in the chain from sensor to numbers: 0 is analogue; clipping, rounding and repeats come after.
         additive: Whether its repair takes it off the recording, instead of applying it to the simulation.
         known_path: Whether it adds a path that is known up to its amplitudes, in every record of the same time.
-        follows_channel: Whether it follows an auxiliary channel, which moves as it likes.
         happened_once: Whether it belongs to a time of this recording, and is not expected in another one.
         changes_noise: Whether it changes levels or spectra of noise, so that wrong numbers lead a simulation away.
         of_spectra: Whether it is found in spectra alone.
@@ -81,7 +80,6 @@ class Mechanism:
     stage: ClassVar[int] = 0
     additive: ClassVar[bool] = False
     known_path: ClassVar[bool] = False
-    follows_channel: ClassVar[bool] = False
     happened_once: ClassVar[bool] = False
     changes_noise: ClassVar[bool] = False
     of_spectra: ClassVar[bool] = False
@@ -213,6 +211,11 @@ class Mechanism:
         """
         raise NotImplementedError
 
+    @property
+    def follows(self) -> tuple[str, ...]:
+        """Names of the auxiliary channels that it follows; none by default."""
+        return ()
+
     def line_width(self, parameters: Mapping[str, Parameter], comparison: Comparison) -> float | None:
         """Half width of a spectral line, Hz; None of what is none."""
         return None
@@ -228,7 +231,7 @@ class Mechanism:
 
     @property
     def unit_factor(self) -> float:
-        """Factor by which the simulation's numbers are in another unit; 1 of all but a wrong unit."""
+        """Factor by which the simulation's numbers are in another unit; 1 by default."""
         return 1.0
 
     def in_unit(self, factor: float) -> Mechanism:
@@ -255,12 +258,7 @@ class Alternative(NamedTuple):
 
 
 class Context(NamedTuple):
-    """What a finding was found beside.
-
-    Attributes:
-        start: Recording and simulation as they came.
-        others: Effects of the other findings, in order.
-    """
+    """Recording and simulation as they came, and the effects of the other findings, in order."""
 
     start: Comparison
     others: tuple[Mechanism, ...]
@@ -342,8 +340,8 @@ class Finding:
             axes = new_axes_below_each_other(2)
         if len(axes) != 2:
             raise ValueError(f"`axes`: expected two, before and after the repair, got {len(axes)}")
-        generator = torch.Generator().manual_seed(0)
         # What a converter does shows on the numbers as they came alone: whatever is taken off them hides it.
+        generator = torch.Generator().manual_seed(0)
         before = repaired(self.context.start, () if self.effect.stage else self.context.others, generator)
         after = self.effect.repair(before, generator)
         sensor = self.clearest_sensor

@@ -62,7 +62,8 @@ class Remainder(Filter):
         wide = cls(observed.bands.frequency, _drawn(*_log_ratio(observed, reference), 0.0) / 2)
         before = wide.response(narrow.frequency).log()
         ratio, chance = _log_ratio(observed.in_bands(narrow), reference.in_bands(narrow))
-        return cls(narrow.frequency, _drawn(ratio, chance, 2 * before) / 2)
+        plain = 4.0  # times the variance of chance: of many narrow bands some stand out
+        return cls(narrow.frequency, _drawn(ratio, plain * chance, 2 * before) / 2)
 
     def response(self, f: Tensor) -> Tensor:
         x, at = f.clamp(self.frequency[0], self.frequency[-1]).log(), self.frequency.log()

@@ -84,7 +84,7 @@ class RepairedModel:
             raise ValueError(f"`rate`: expected that of the repaired simulation, {info.rate:g} Hz, got {rate:g} Hz")
         if "unknown" not in (unit, info.unit) and unit != info.unit:
             raise ValueError(f"`unit`: expected that of the repaired simulation, {info.unit!r}, got {unit!r}")
-        followed = {str(getattr(effect, "channel", "")) for effect in self.effects} - {"", *info.channels}
+        followed = {name for effect in self.effects for name in effect.follows} - {*info.channels}
         if followed:
             raise ValueError(
                 f"`channels`: expected {', '.join(sorted(followed))}, which the simulation follows, got none; to "

@@ -170,7 +170,7 @@ def _product(names: tuple[str, ...]) -> str:
 
 def _try(model: RepairedModel, effect: Mechanism, where: str) -> None:
     """Make sure that an effect makes finite samples of a record of the noise; what follows a channel has none here."""
-    if hasattr(effect, "channel"):
+    if effect.follows:
         return
     generator = torch.Generator().manual_seed(0)
     signal = model.noise.simulate(_TRIED, generator=generator)

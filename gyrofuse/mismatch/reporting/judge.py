@@ -158,10 +158,8 @@ def _drawn(model: RepairedModel, judge: Recording | Tensor, generator: torch.Gen
     model = model.elsewhere()
     signal, channels = (judge.signal, judge.channels) if isinstance(judge, Recording) else (judge, {})
     whole = {name: values for name, values in channels.items() if bool(values.isfinite().all())}
-    followed = [str(getattr(effect, "channel", "")) for effect in model.effects]
-    effects = tuple(e for e, name in zip(model.effects, followed, strict=True) if not name or name in whole)
-    lacks = tuple(sorted({*followed} - {"", *whole}))
-    model = replace(model, effects=effects)
+    lacks = tuple(sorted({name for effect in model.effects for name in effect.follows} - {*whole}))
+    model = replace(model, effects=tuple(effect for effect in model.effects if not {*effect.follows} & {*lacks}))
     records = model.simulate(signal.shape[-1], batch=(_RECORDS,), channels=whole, generator=generator)
     drawn = records.movedim(0, 1).flatten(1)
     return (Recording(drawn, rate=judge.rate, unit=judge.unit) if isinstance(judge, Recording) else drawn), lacks

@@ -66,8 +66,8 @@ class MismatchReport(Outcome):
         h = self.held_out
         lines.append(
             f"On data held out: discrepancy {h.before:.2f} before and {h.after:.2f} after repair (1 = noise alone), "
-            f"{paired_words(h)}log score: {family_words(h)}; a classifier tells the two apart with an area under the curve of "
-            f"{h.auc_before:.2f} before and {h.auc_after:.2f} after (0.5 = guessing)"
+            f"{paired_words(h)}log score: {family_words(h)}; a classifier tells the two apart with an area under the "
+            f"curve of {h.auc_before:.2f} before and {h.auc_after:.2f} after (0.5 = guessing)"
         )
         return "\n".join([*lines, *self.notes, *judged_words(self), *fused_words(self)])
 

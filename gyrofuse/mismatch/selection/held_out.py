@@ -139,7 +139,7 @@ def agreement(start: Comparison, scores: Sequence[HeldOutScore], generator: torc
         for fold in range(N_FOLDS):
             left, simulated = _after_repairs(start, scores, fold, generator)
             after.append((discrepancy_of_fold(left, fold), distinguishability(simulated, fold)))
-            if any(score.by_fold[fold].follows_channel for score in scores):
+            if any(score.by_fold[fold].follows for score in scores):
                 paired.append(differences_of_fold(left, fold))
     (d, auc), (d_after, auc_after) = (
         torch.tensor(folds, dtype=torch.float64).mean(0).tolist() for folds in (before, after)

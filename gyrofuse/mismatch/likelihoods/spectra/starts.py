@@ -12,11 +12,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.likelihoods.declared import declared
 from gyrofuse.mismatch.likelihoods.spectra.common_sources import Common, CommonBump
 from gyrofuse.mismatch.likelihoods.spectra.components import Peak, Term, oscillation
 from gyrofuse.mismatch.likelihoods.spectra.fit import data_model, pieces, powers
 from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios, log_gain, power_gains
-from gyrofuse.mismatch.signals.declared import declared
 
 
 class SpectralTerms:

@@ -53,7 +53,6 @@ class ChannelGain(Mechanism):
     known_path: ClassVar[bool] = True
     rivals: ClassVar[tuple[str, ...]] = ("parameter_shift", "low_pass", "flicker", "common_mode")
     additive: ClassVar[bool] = True
-    follows_channel: ClassVar[bool] = True
     of_one_band: ClassVar[tuple[str, ...]] = ()
     quantity: ClassVar[str] = "gain"
     largest: ClassVar[float] = math.inf  # that a sensor has, deg/s per g to the power below
@@ -72,6 +71,10 @@ class ChannelGain(Mechanism):
 
     def with_amplitudes(self, amplitudes: Tensor) -> ChannelGain:
         return replace(self, coupling=amplitudes)
+
+    @property
+    def follows(self) -> tuple[str, ...]:
+        return (self.channel,)
 
     @property
     def transfer(self) -> Transfer:

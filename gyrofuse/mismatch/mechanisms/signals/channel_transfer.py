@@ -12,7 +12,13 @@ from torch import Tensor
 
 from gyrofuse.mismatch.detectors.slow.channels import accelerations, rates, regress
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
-from gyrofuse.mismatch.likelihoods.finite_response import FiniteResponse, ResponseSums, responded, response_at
+from gyrofuse.mismatch.likelihoods.finite_response import (
+    FiniteResponse,
+    ResponseSums,
+    path_gains,
+    responded,
+    response_at,
+)
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
@@ -25,8 +31,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _REACHES = (2, 8)  # samples either way
-_WORTH_A_RESPONSE = 60.0  # statistic of plain and quarter-cycle gains over chance, that leaves something to its numbers
-_OF_ONE_BAND = 0.9  # share of the evidence from which it might be a line's alone: one gain and phase for each sensor
 _SIMPLER = 0.02  # share of the score that more numbers have to add, to responses of fewer and to plain gains
 
 
@@ -48,7 +52,6 @@ class ChannelTransfer(Mechanism):
     separated_by: ClassVar[str] = "a recording with another motion"
     known_path: ClassVar[bool] = True
     additive: ClassVar[bool] = True
-    follows_channel: ClassVar[bool] = True
     channels: tuple[str, ...]
     taps: Annotated[Tensor, Dims(("sensor", "row", "lag"))]
 
@@ -91,6 +94,10 @@ class ChannelTransfer(Mechanism):
         )
 
     @property
+    def follows(self) -> tuple[str, ...]:
+        return self.channels
+
+    @property
     def amplitudes(self) -> Tensor:
         return self.taps.flatten(1)
 
@@ -104,8 +111,7 @@ class ChannelTransfer(Mechanism):
 
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
         """In the noise that it leaves: where a channel was left out, the simulation's is no measure of what remains."""
-        places, reach = _places(comparison, self.channels), self.taps.shape[-1] // 2
-        return _sums(comparison).gained(self.taps, places, reach, fold)
+        return path_gains(comparison, self._path(comparison.info, comparison.n_samples), fold)
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
         path = self._path(comparison.info, comparison.n_samples)[sensor]
@@ -176,8 +182,10 @@ def _sums(comparison: Comparison) -> ResponseSums:
 
 
 def _worth_a_response(comparison: Comparison, name: str) -> bool:
+    """Whether plain gains, and gains a quarter of a cycle late, show enough to leave something to its numbers."""
+    least = 60.0  # of the statistic over chance
     fit = regress(comparison, _rows(comparison.info, (name,), comparison.n_samples))
-    return fit is not None and fit.excess + fit.quadrature - fit.gains.numel() > _WORTH_A_RESPONSE
+    return fit is not None and fit.excess + fit.quadrature - fit.gains.numel() > least
 
 
 def _moving(comparison: Comparison) -> list[str]:
@@ -228,7 +236,7 @@ def _of_one_band(comparison: Comparison, effect: ChannelTransfer) -> bool:
     weight = (power / comparison.observed.base.spectrum(f)).sum(0)
     edges = torch.tensor(comparison.bands.edges[1:-1], dtype=torch.float64) / comparison.bands.n_samples
     share = torch.zeros(len(edges) + 1, dtype=torch.float64).index_add(0, torch.bucketize(f, edges), weight)
-    return float(share.max() / share.sum()) > _OF_ONE_BAND
+    return float(share.max() / share.sum()) > 0.9
 
 
 def _busiest(comparison: Comparison, taps: Tensor, rows: Tensor) -> float:

@@ -86,6 +86,10 @@ class TemperatureDrift(SlowEffect):
         return cls(size, log_factors(scan), scan.point[0] / rate, family.channel or "", family.row, tuple(further))
 
     @property
+    def follows(self) -> tuple[str, ...]:
+        return (self.channel,)
+
+    @property
     def sizes(self) -> Tensor:
         return torch.stack([self.size, *self.curvature], -1)
 

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-_ROUNDS = 6
 _TAIL = 0.025  # beyond either limit
 _STRONG, _FAR, _HALVINGS = 12.0, 6.0, 40  # standard deviations from which a law is normal, and beyond which none is
 _PER_PART = (
@@ -36,7 +35,6 @@ _PER_PART = (
 )
 _FEWEST_PARTS, _MOST_PARTS = 4, 32  # of a record, from whose phases the wander of a tone is estimated
 _SIZES, _MOST_DECADES = 60, 4  # of walks that are tried, from a tenth of the noise's variance in the slowest mode on
-_HALF_WIDTHS = 2.0  # of a peak, within which a line is looked for in its place
 _REACH, _GUARD = 64, 3  # bins on either side that tell the noise, and those too near to
 
 
@@ -109,7 +107,7 @@ class VibrationTone(Mechanism):
         if width is None or finding.frequency_hz is None:
             return None
         rate = comparison.info.rate
-        f = line_near(comparison, finding.frequency_hz / rate, _HALF_WIDTHS * width / rate)
+        f = line_near(comparison, finding.frequency_hz / rate, 2 * width / rate)
         return Rival(cls.at(comparison, f * rate), finding.gain)
 
     def line_width(self, parameters: Mapping[str, Parameter], comparison: Comparison) -> float | None:
@@ -166,7 +164,7 @@ class VibrationTone(Mechanism):
         signal = comparison.recording[:, keep]
         signal = signal - signal.mean(-1, keepdim=True)
         omega, clock = 2 * math.pi * frequency_hz / comparison.info.rate, (t - t.mean()) / comparison.n_samples
-        for _ in range(_ROUNDS):
+        for _ in range(6):
             angle = omega * t
             tone = torch.stack([angle.cos(), angle.sin()])
             basis = torch.cat([tone, clock * tone])

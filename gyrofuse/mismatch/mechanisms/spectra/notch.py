@@ -22,8 +22,6 @@ from gyrofuse.mismatch.mechanisms.spectra.spectral import Filter
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.dims import OfSensors
 
-_DECIBEL = 20 / math.log(10)  # in a neper
-
 
 @dataclass(frozen=True, eq=False)
 class Notch(Term):
@@ -96,13 +94,14 @@ class NotchFilter(Filter):
         at, over = term.shared.tolist()
         at_sd, over_sd = shape.sd[1].tolist()
         at += math.log(rate)
+        decibel = 20 / math.log(10)  # in a neper
         parameters = {
             "centre": spanned(math.exp, at, at_sd, "Hz"),
             "width": spanned(math.exp, at + over, math.hypot(at_sd, over_sd), "Hz"),
         }
         for i in sensors:
             parameters[f"depth[{i}]"] = spanned(
-                lambda x: _DECIBEL * x, float(effect.depth[i]), float(shape.sd[0][0, i]), "dB"
+                lambda x: decibel * x, float(effect.depth[i]), float(shape.sd[0][0, i]), "dB"
             )
         where = comparison.info.named(sensors, "all sensors")
         return found(
@@ -112,7 +111,7 @@ class NotchFilter(Filter):
             sensors,
             parameters,
             f"a notch at {math.exp(at):.4g} Hz in {where} that the simulation does not have, {math.exp(at + over):.3g} "
-            f"Hz wide and up to {_DECIBEL * float(effect.depth.max()):.3g} dB deep",
+            f"Hz wide and up to {decibel * float(effect.depth.max()):.3g} dB deep",
             frequency_hz=math.exp(at),
         )
 
@@ -142,8 +141,8 @@ class NotchFilter(Filter):
 
 def notch_response(f: Tensor, centre: Tensor, width: Tensor, depth: Tensor) -> Tensor:
     """Complex response at `f` cycles per sample of notches, numbers that broadcast with it."""
-    u = f / centre
-    through, taken = 1 - u.square(), width * u
+    u = f / centre.clamp(min=1e-9)
+    through, taken = 1 - u.square(), width.clamp(min=1e-9) * u
     left = (-depth).exp() * taken
     return torch.complex(through.expand_as(left), left) / torch.complex(through, taken.expand_as(through))
 

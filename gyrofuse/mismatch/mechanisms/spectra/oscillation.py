@@ -13,12 +13,12 @@ from gyrofuse.mismatch.detectors.lines.chirps import swept
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.detectors.spectra.peak_fit import Oscillation, oscillation_of
 from gyrofuse.mismatch.detectors.spectra.peaks import Stretch
+from gyrofuse.mismatch.detectors.spectra.steadiness import Steadiness, steadiness
 from gyrofuse.mismatch.likelihoods.spectra.common_sources import CommonBump
 from gyrofuse.mismatch.likelihoods.spectra.components import Peak, oscillation
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.mechanisms.spectra.findings import spanned
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape, refit, run_length
-from gyrofuse.mismatch.mechanisms.spectra.steadiness import Steadiness, steadiness
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.dims import ComplexOfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples

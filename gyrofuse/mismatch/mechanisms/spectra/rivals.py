@@ -19,10 +19,8 @@ from gyrofuse.mismatch.mechanisms.signals.step import Step
 from gyrofuse.mismatch.mechanisms.spectra.joint_fit import compared
 from gyrofuse.mismatch.signals.comparison import Comparison
 
-_ROUNDS = 8  # of Fisher scoring: a rival starts at its likeliest grid point
 _NATS_PER_NUMBER = 2.0  # for each free number of a sensor
 _POSSIBLE, _NATS_BEHIND = 0.1, 5.0  # p value of an event, and nats by which it may score less than the noise
-_WALK_VARIANCES = -3, 6, 200  # decades of a random walk's variance over the simulation's, and grid points
 
 
 def fit_alone(
@@ -47,7 +45,7 @@ def fit_alone(
     free = term.free if isinstance(term, Common) else term.free & own
     if not bool(free.any()):
         return None
-    found = fit(data, [term.only(free)], _ROUNDS)
+    found = fit(data, [term.only(free)], rounds=8)  # a rival starts at its likeliest grid point
     return found.terms[0], found.gain - _NATS_PER_NUMBER * len(found.information)
 
 
@@ -89,8 +87,7 @@ def _score_of_walks(comparison: Comparison, gains: Tensor) -> float:
     analysis = slow_analysis(comparison)
     weighted = gains[:, :, None] / analysis.noise.own  # (source, sensor, ordinate)
     walk = analysis.noise.parts[0, -1]
-    low, high, n = _WALK_VARIANCES
-    variance = torch.logspace(low, high, n, dtype=torch.float64)[:, None, None]
+    variance = torch.logspace(-3, 6, 200, dtype=torch.float64)[:, None, None]  # over the simulation's
     # Variance of a source over that of the noise, and its power over the noise: (variance, source, ordinate).
     over = variance * ((gains[:, :, None] * weighted).sum(1) * walk)
     power = variance * ((weighted * analysis.y).sum(1).square() * walk)

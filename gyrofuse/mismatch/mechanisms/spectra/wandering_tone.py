@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.detectors.spectra.frequency_courses import share_of_lorentzian
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
-from gyrofuse.mismatch.mechanisms.spectra.frequency_courses import share_of_lorentzian
 from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode, nominated, refitted_mode
 from gyrofuse.mismatch.mechanisms.spectra.spectral import Addition
 from gyrofuse.mismatch.signals.comparison import Comparison

@@ -15,12 +15,12 @@ from torch import Tensor
 from torch.nn.functional import interpolate, pad
 
 from gyrofuse._base.transforms import squared_modulus
-from gyrofuse.mismatch.detectors.spectra.peak_fit import Oscillation
-from gyrofuse.mismatch.mechanisms.spectra.frequency_courses import (
+from gyrofuse.mismatch.detectors.spectra.frequency_courses import (
     rampless_transform,
     wandering_log_ratio,
     weights_in_phase,
 )
+from gyrofuse.mismatch.detectors.spectra.peak_fit import Oscillation
 from gyrofuse.mismatch.signals.comparison import Comparison
 
 _DRAWN = 60  # Gaussian records of the same spectrum
