@@ -94,12 +94,16 @@ class ResponseSums:
         shape = (len(taps), len(rows), 2 * reach + 1)
         return FiniteResponse(taps.view(shape), inverse, left)
 
-    def held_out(self, rows: Sequence[int], reach: int) -> Tensor:
-        """Log likelihood ratios of the blocks of each fold, numbers of the others, `(fold, sensor)`, nats."""
+    def held_out(self, rows: Sequence[int], reach: int, *, shared: bool = False) -> Tensor:
+        """Log likelihood ratios of the blocks of each fold, numbers of the others, `(fold, sensor)`, nats.
+
+        Of the nearest product of gains and one response, where that is to be `shared` by all sensors and rows.
+        """
         at, scores = self._places(rows, reach), []
         for fold in range(N_FOLDS):
             found = self.solved(rows, reach, fold)
-            scores.append(self._gained(found.taps, at, found.variance, fold).sum(0))
+            taps = _product(found.taps) if shared else found.taps
+            scores.append(self._gained(taps, at, found.variance, fold).sum(0))
         return torch.stack(scores)
 
     def _gained(self, taps: Tensor, at: Tensor, variance: Tensor, fold: int) -> Tensor:
@@ -136,6 +140,12 @@ def responded(taps: Tensor, rows: Tensor) -> Tensor:
     response = torch.fft.rfft(taps.to(torch.float64), n=length)  # (sensor, row, bin)
     moved = torch.einsum("ikf,kf->if", response, torch.fft.rfft(padded, n=length))
     return torch.fft.irfft(moved, n=length)[:, 2 * reach : 2 * reach + n]
+
+
+def _product(taps: Tensor) -> Tensor:
+    """The nearest product of gains `(sensor, row)` and one response `(lag,)`."""
+    u, s, v = torch.linalg.svd(taps.flatten(0, 1), full_matrices=False)
+    return (s[0] * u[:, :1] * v[:1]).view_as(taps)
 
 
 def path_gains(comparison: Comparison, path: Tensor, fold: int) -> Tensor:

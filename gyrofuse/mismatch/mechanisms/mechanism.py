@@ -46,9 +46,9 @@ class Rival(NamedTuple):
 class Mechanism:
     """Physics that a simulator left out: an equation whose numbers are known.
 
-    A subclass is a frozen dataclass of numbers. `detect_and_fit` finds it in a comparison, the rest says what it does,
-    so that it composes with any noise model. The class attributes declare all that the search, the report and the
-    repaired simulation need to know of it: none of them knows a mechanism by name.
+    A subclass is a frozen dataclass of numbers. `detect_and_fit` finds it in a comparison, the rest says what it does.
+    The class attributes declare all that the search, the report and the repaired simulation need to know of it: none of
+    them knows a mechanism by name.
 
     Attributes:
         name: Name of the physics; classes that are the same physics in another form share it.
@@ -59,7 +59,7 @@ class Mechanism:
         separated_by: Data that would tell it from its rivals.
         stage: Position in the chain from sensor to numbers: 0 is analogue; clipping, rounding and repeats come after.
         additive: Whether its repair takes it off the recording, instead of applying it to the simulation.
-        known_path: Whether it adds a path that is known up to its amplitudes, in every record of the same time.
+        known_path: Whether it adds a path that is known up to its amplitudes.
         happened_once: Whether it belongs to a time of this recording, and is not expected in another one.
         changes_noise: Whether it changes levels or spectra of noise, so that wrong numbers lead a simulation away.
         of_spectra: Whether it is found in spectra alone.
@@ -94,7 +94,7 @@ class Mechanism:
 
     @property
     def order(self) -> tuple[int, bool]:
-        """Position in which it acts on a simulation; what is additive is on top of all that repairs make of noise."""
+        """Position in which it acts on a simulation; what is additive comes on top of all that is noise."""
         return self.stage, self.additive
 
     @classmethod
@@ -121,7 +121,6 @@ class Mechanism:
     @classmethod
     def in_reference(cls, comparison: Comparison) -> Mechanism | None:
         """The mechanism as the simulation's own samples show it; by default it is not looked for."""
-        return None
 
     def undo_in_reference(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
         """The comparison with the simulation as it may have been before a mechanism that `in_reference` found."""
@@ -142,6 +141,9 @@ class Mechanism:
     def apply_to_reference(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
         """The comparison with the mechanism in the simulation, whether or not it could be taken off the recording."""
         return comparison.apply(partial(self.apply, info=comparison.info, generator=generator), self.stage)
+
+    def beside_company(self, comparison: Comparison, generator: torch.Generator) -> Comparison | None:
+        """The comparison with what its numbers were found beside repaired as well; None by default."""
 
     def apply_elsewhere(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
         """The comparison of another recording with a simulation that has the mechanism; by default as `repair`.
@@ -213,7 +215,7 @@ class Mechanism:
 
     @property
     def follows(self) -> tuple[str, ...]:
-        """Names of the auxiliary channels that it follows; none by default."""
+        """Auxiliary channels that it follows; none by default."""
         return ()
 
     def line_width(self, parameters: Mapping[str, Parameter], comparison: Comparison) -> float | None:

@@ -80,9 +80,12 @@ def _best_of_stage(
         if finding is not None and not is_known(finding, known):
             found.append(finding)
     for finding in sorted(found, key=lambda f: -f.gain):
-        score = score_held_out(comparison, finding.effect)
-        if score.confirms(finding.p_value) and not leads_away(start, comparison, score.by_fold, generator):
-            return Selected(replace(finding, held_out_gain=score.total), comparison, score)
+        for beside in (comparison, finding.effect.beside_company(comparison, generator)):
+            if beside is None:
+                continue
+            score = score_held_out(beside, finding.effect)
+            if score.confirms(finding.p_value) and not leads_away(start, beside, score.by_fold, generator):
+                return Selected(replace(finding, held_out_gain=score.total), comparison, score)
     return None
 
 

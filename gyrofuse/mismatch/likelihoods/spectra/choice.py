@@ -45,7 +45,10 @@ def best_terms(data: Ratios, *, differ: bool) -> Choice:
     most_terms = 4
     for _ in range(most_terms):
         now = list(best.terms) if best else []
-        tried = [_varied(data, _pruned(data, f)) for f in _likeliest(data, now)]
+        likeliest = _likeliest(data, now)
+        if best is None and differ:
+            likeliest += _levels_through_filters(data)
+        tried = [_varied(data, _pruned(data, f)) for f in likeliest]
         tried = [f for f in tried if evidence(data, f) > value]
         earned = [f for f in tried if best is None or _earned(data, best, f, f.terms[-1])]
         mended = len(earned) < len(tried)
@@ -104,6 +107,26 @@ def _likeliest(data: Ratios, company: list[Term]) -> list[Fit]:
         *sorted(quick, key=lambda f: -f.gain)[:1],
     }
     return [_given_over(data, fit(data, f.terms)) for f in kept]
+
+
+def _levels_through_filters(data: Ratios) -> list[Fit]:
+    """Other levels and a filter at once, the likeliest: one by one, an AR1 would stand for both.
+
+    What a filter passes shows the level: below some frequency, one of a few that its corner may be above.
+    """
+    frequency, log_ratio = data.ground.bands.frequency, powers(data.observed).clamp(min=1e-300).log()
+    tried = []
+    for level in candidates(data, [], "scale"):
+        if int(level.free.any(-1).sum()) > 1:
+            continue
+        for below in (0.02, 0.05, 0.12):
+            passed = (frequency > below / 4) & (frequency < below)
+            if not bool(passed.any()):
+                continue
+            start = replace(level, local=log_ratio[passed].mean(0) * level.free)
+            tried += [fit(data, [start, filtered], _QUICK) for filtered in candidates(data, [start], "filter")]
+    likeliest = sorted((f for f in tried if math.isfinite(f.gain)), key=lambda f: -evidence(data, f))[:2]
+    return [fit(data, f.terms) for f in likeliest]
 
 
 def _where_they_lead(data: Ratios, before: Tensor, tried: list[Fit]) -> list[Fit]:

@@ -3,7 +3,9 @@
 A form is an analogue prototype `H(u)` that halves the power at `u = 1`, of a warped frequency `u = g(f) / g(f_c)`:
 `g = tan(pi f)` of the bilinear transform, or `g = 2 f` of an analogue filter in front of the converter. A Gaussian
 window cuts a FIR filter's ideal step off smoothly; pass bands with ripples have half a decibel of them. Beside those
-stand one and two poles `(1 - q) / (1 - q / z)`, and the mean over `a` samples, the last of which counts in part.
+stand one and two poles `(1 - q) / (1 - q / z)`, the mean over `a` samples, the last of which counts in part, and what
+sampling leaves of analogue means over `a` samples, `sum_k sinc(a (f + k))^2m` over its value at 0: one mean, as of a
+converter that integrates, or two in a row, which weigh in a triangle.
 """
 
 from __future__ import annotations
@@ -47,7 +49,9 @@ _FORMS = {
     **{f"window{k}": _Form("straight", "window", width=0.08 * 1.6**k) for k in range(4)},
 }
 _POLES = {"pole": 1.0, "poles": math.sqrt(2) - 1}
-FILTERS = ("pole", "poles", "average", *_FORMS)
+_SAMPLED_MEANS = {"integrated": 1, "integrated2": 2}  # analogue means in a row
+_MEANS = {"average": 1, **_SAMPLED_MEANS}
+FILTERS = ("pole", "poles", *_MEANS, *_FORMS)
 _RIPPLE = 0.5  # dB of a Chebyshev filter's pass band
 _HALVINGS = 60  # of an interval: double precision
 _LONGEST = 0.9999  # pole: of a time constant of 10^4 samples
@@ -57,13 +61,13 @@ def filter_strength(kind: str, corner: Tensor) -> Tensor:
     """Number of a filter whose power is halved at `corner` cycles per sample: 0 is none."""
     if kind in _POLES:
         return strength_of(kind, torch.sin(math.pi * corner).log())
-    if kind == "average":  # a longer mean passes less, until its first zero
+    if kind in _MEANS:  # a longer mean passes less, until its first zero
         low, high = torch.ones_like(corner), 1 / corner
         for _ in range(_HALVINGS):
             middle = (low + high) / 2
             more = filter_power(kind, middle.square() - 1, corner[..., None])[..., 0] > 0.5
             low, high = torch.where(more, middle, low), torch.where(more, high, middle)
-        return low.square() - 1
+        return low.square() - (kind not in _SAMPLED_MEANS)
     number = _warped(kind, corner).log()
     if _FORMS[kind].prototype == "window":  # its image lets a little more pass
         low, high = number - 1, number + 1
@@ -84,7 +88,7 @@ def filter_corner(kind: str, strength: Tensor) -> Tensor:
         g = filter_number(kind, strength).exp()
         return torch.where(g <= 1, g.clamp(max=1).asin() / math.pi, math.inf)
     # Before a mean's first zero.
-    highest = 1 / (1 + strength).sqrt() if kind == "average" else torch.ones_like(strength)
+    highest = 1 / (1 + strength).sqrt() if kind in _MEANS else torch.ones_like(strength)
     low, high = torch.zeros_like(strength), highest.clamp(max=0.5)
     falls = filter_power(kind, strength, high[..., None])[..., 0] < 0.5
     for _ in range(_HALVINGS):
@@ -99,8 +103,8 @@ def filter_number(kind: str, strength: Tensor) -> Tensor:
     q = strength.clamp(min=1e-300)
     if kind in _POLES:  # power 1 / (1 + x sin^2), once or twice
         return -(4 * q / (1 - q).square() / _POLES[kind]).log() / 2
-    if kind == "average":  # power 1 - (a^2 - 1) (pi f)^2 / 3 at first
-        return -(q / 3).log() / 2
+    if kind in _MEANS:  # power 1 - (a^2 - 1) (pi f)^2 / 3 at first, of analogue ones 1 - m (a pi f)^2 / 3
+        return -(_MEANS[kind] * q / 3).log() / 2
     return -q.log() / (2 * _FORMS[kind].power)
 
 
@@ -109,8 +113,8 @@ def strength_of(kind: str, number: Tensor) -> Tensor:
     if kind in _POLES:
         b = 1 + 2 * torch.exp(2 * number) / _POLES[kind]
         return b - (b.square() - 1).sqrt()
-    if kind == "average":
-        return 3 * torch.exp(-2 * number)
+    if kind in _MEANS:
+        return 3 / _MEANS[kind] * torch.exp(-2 * number)
     if _FORMS[kind].prototype == "chebyshev":  # corners above 0.495 of the rate would be another level of everything
         number = number.clamp(max=math.log(math.tan(math.pi * 0.495)))
     return torch.exp(-2 * _FORMS[kind].power * number)
@@ -122,18 +126,30 @@ def filter_power(kind: str, strength: Tensor, f: Tensor) -> Tensor:
         q = strength[..., None].clamp(max=_LONGEST)
         power = (1 - q).square() / ((1 - q).square() + 4 * q * torch.sin(math.pi * f).square())
         return power if kind == "pole" else power.square()
+    if kind in _SAMPLED_MEANS:
+        a = strength[..., None].clamp(min=0).sqrt()
+        images = torch.arange(-16, 17, dtype=f.dtype)  # whose rest is less than a hundredth of the lobes
+        zero = torch.zeros_like(a * f)
+        folded, whole = (
+            sum((torch.sinc(a * (g + k)).abs().pow(2 * _SAMPLED_MEANS[kind]) for k in images.tolist()), zero)
+            for g in (f, torch.zeros_like(f))
+        )
+        return folded / whole
     if kind in _FORMS and _FORMS[kind].prototype == "butterworth":
         return 1 / (1 + _prototype_frequency(kind, strength, f).pow(2 * _FORMS[kind].order))
     return filter_response(kind, strength, f).abs().square()
 
 
 def filter_response(kind: str, strength: Tensor, f: Tensor) -> Tensor:
-    """Complex response `(..., frequency)`; causal but for a window's, which is given without its delay."""
+    """Complex response `(..., frequency)`; causal but for windows and analogue means, which are without their delay."""
     if kind in _POLES:
         q = strength[..., None].clamp(max=_LONGEST)
         turn = 2 * math.pi * f
         response = (1 - q) / (1 - q * torch.polar(torch.ones_like(turn), -turn))
         return response if kind == "pole" else response.square()
+    if kind in _SAMPLED_MEANS:
+        ends = filter_power(kind, strength, f).sqrt()
+        return torch.complex(ends, torch.zeros_like(ends))
     if kind == "average":
         a = (1 + strength[..., None]).sqrt()
         n, x = a.floor(), math.pi * f.clamp(min=1e-12)

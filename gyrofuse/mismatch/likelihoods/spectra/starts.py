@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -20,7 +21,13 @@ from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios, log_gain, power
 
 
 class SpectralTerms:
-    """What a mechanism declares to compete for the spectra."""
+    """What a mechanism declares to compete for the spectra.
+
+    Attributes:
+        made_of: What its terms do: they "scale" the noise, "add" to it, or "filter" everything.
+    """
+
+    made_of: ClassVar[str] = "add"
 
     @classmethod
     def starts(cls, data: Ratios, company: Sequence[Term]) -> Iterable[Term]:
@@ -38,10 +45,11 @@ class SpectralTerms:
         return ()
 
 
-def candidates(data: Ratios, company: Sequence[Term]) -> Iterator[Term]:
-    """Terms of all mechanisms that declare any, to add to some."""
+def candidates(data: Ratios, company: Sequence[Term], made_of: str | None = None) -> Iterator[Term]:
+    """Terms of all mechanisms that declare any, to add to some; only of those that do one thing, where given."""
     for kind in declared(SpectralTerms):
-        yield from kind.starts(data, company)
+        if made_of in (None, kind.made_of):
+            yield from kind.starts(data, company)
 
 
 def other_forms(data: Ratios, term: Term, company: Sequence[Term]) -> Iterator[Term]:

@@ -90,7 +90,7 @@ class ChannelTransfer(Mechanism):
             levels=(level_of(max(f, 1 / comparison.n_samples)),),
             frequency_hz=None,
             channel=" and ".join(best.channels),
-            gain=(1 - _SIMPLER) * float(best.scores.clamp(min=0).sum()),
+            gain=best.total / 2 if best.simple else best.total,
         )
 
     @property
@@ -140,6 +140,8 @@ class _Candidate(NamedTuple):
         reach: Samples either way.
         scores: Log likelihood ratios held out, `(sensor,)`, nats.
         p_value: For having asked all candidates.
+        simple: Whether plain gains, or one response that all sensors share, do as well: these have names of their own,
+            which are preferred.
     """
 
     channels: tuple[str, ...]
@@ -147,6 +149,12 @@ class _Candidate(NamedTuple):
     reach: int
     scores: Tensor
     p_value: float
+    simple: bool = False
+
+    @property
+    def total(self) -> float:
+        """Score of the sensors that gain."""
+        return float(self.scores.clamp(min=0).sum())
 
 
 @derived
@@ -166,12 +174,11 @@ def _best(comparison: Comparison) -> _Candidate | None:
             p_value = sidak(math.exp(min(-log_e, 0.0)), len(sets) * len(_REACHES))
             tried.append(_Candidate(channels, rows, reach, scores.sum(0), p_value))
 
-    def total(one: _Candidate) -> float:
-        return float(one.scores.clamp(min=0).sum())
-
-    most = max(total(one) for one in tried)
-    enough = [one for one in tried if total(one) >= (1 - _SIMPLER) * most]
-    return min(enough, key=lambda one: len(one.rows) * (2 * one.reach + 1))
+    least = (1 - _SIMPLER) * max(one.total for one in tried)
+    best = min((one for one in tried if one.total >= least), key=lambda one: len(one.rows) * (2 * one.reach + 1))
+    simpler = [sums.held_out(best.rows, 0), sums.held_out(best.rows, best.reach, shared=True)]
+    simple = any(float(scores.sum(0).clamp(min=0).sum()) >= (1 - _SIMPLER) * best.total for scores in simpler)
+    return best._replace(simple=simple)
 
 
 @derived

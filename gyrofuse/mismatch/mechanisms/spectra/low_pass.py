@@ -44,6 +44,7 @@ class LowPassFilter(Filter):
     name: ClassVar[str] = "low_pass"
     rivals: ClassVar[tuple[str, ...]] = ("parameter_shift", "flicker", "common_mode")
     separated_by: ClassVar[str] = "a higher sampling rate, or the response to a known motion"
+    made_of: ClassVar[str] = "filter"
     kind: str
     strength: OfSensors
 
@@ -99,6 +100,10 @@ class LowPassFilter(Filter):
         if found is None or not isinstance(term := found[0], LowPass):
             return None
         return Rival(cls(term.kind, strengths(term)), found[1])
+
+    @classmethod
+    def from_term(cls, term: Term, comparison: Comparison) -> LowPassFilter | None:
+        return cls(term.kind, strengths(term)) if isinstance(term, LowPass) else None
 
     def response(self, f: Tensor) -> Tensor:
         return filter_response(self.kind, self.strength, f)

@@ -50,9 +50,11 @@ class Notch(Term):
         return replace(self, free=torch.ones_like(self.free), local=torch.where(self.free, self.local, faint))
 
     def within(self) -> Notch:
-        highest, narrowest, widest = math.log(0.47), math.log(0.02), math.log(2.0)  # so that bands show both sides
-        centre, width = self.shared
-        shared = torch.stack([centre.clamp(max=highest), width.clamp(min=narrowest, max=widest)])
+        """Both sides of it are below half the rate: else it is a low pass."""
+        narrowest, widest = math.log(0.02), torch.tensor(0.0, dtype=torch.float64)
+        centre = self.shared[0].clamp(max=math.log(0.46))
+        upper = torch.minimum((0.5 / centre.exp() - 1).log(), widest)
+        shared = torch.stack([centre, self.shared[1].clamp(min=narrowest).minimum(upper)])
         return replace(self, local=self.local.clamp(min=self.lower, max=self.upper), shared=shared)
 
 
@@ -73,6 +75,7 @@ class NotchFilter(Filter):
     name: ClassVar[str] = "notch"
     rivals: ClassVar[tuple[str, ...]] = ("low_pass", "parameter_shift")
     separated_by: ClassVar[str] = "the response to a known motion"
+    made_of: ClassVar[str] = "filter"
     centre: float
     width: float
     depth: OfSensors
@@ -128,6 +131,10 @@ class NotchFilter(Filter):
         centre, width = term.shared.exp().tolist()
         return cls(centre, width, torch.where(term.free[0], term.local[0], 0.0))
 
+    @classmethod
+    def from_term(cls, term: Term, comparison: Comparison) -> NotchFilter | None:
+        return cls.of(term) if isinstance(term, Notch) else None
+
     def response(self, f: Tensor) -> Tensor:
         centre, width = (torch.tensor(x, dtype=torch.float64) for x in (self.centre, self.width))
         return notch_response(f, centre, width, self.depth[:, None])
@@ -151,12 +158,13 @@ def _start(data: Ratios, company: Sequence[Term]) -> Term:
     """The likeliest of a grid of centres and widths, each sensor's depth by itself."""
     lowest = max(16 * float(data.ground.bands.frequency[0]), 1e-3)
     centres = torch.linspace(math.log(lowest), math.log(0.46), 32, dtype=torch.float64)
-    widths = torch.tensor([0.1, 0.3, 1.0], dtype=torch.float64).log()
+    widths = torch.tensor([0.1, 0.3, 0.9], dtype=torch.float64).log()
     depths = torch.tensor([0.0, 0.1, 0.3, 0.7, 1.5, 3.0], dtype=torch.float64)
     local = depths[:, None, None].expand(-1, 1, data.n_sensors)
     every = torch.ones(1, data.n_sensors, dtype=torch.bool)
     starts = (
-        best_start(data, company, Notch(local, every, shared)) for shared in torch.cartesian_prod(centres, widths)
+        best_start(data, company, Notch(local, every, shared).within())
+        for shared in torch.cartesian_prod(centres, widths)
     )
     best, _ = max(starts, key=lambda start: start[1])
     return replace(best, local=best.local.clamp(min=float(depths[1])))

@@ -48,6 +48,7 @@ class ParameterShift(Filter):
     name: ClassVar[str] = "parameter_shift"
     rivals: ClassVar[tuple[str, ...]] = ("low_pass", "flicker", "common_mode")
     separated_by: ClassVar[str] = "a longer recording, or one of the same device under other conditions"
+    made_of: ClassVar[str] = "scale"
     base: NoiseSpectrum
     log_factors: Annotated[Tensor, Dims(("part", "sensor"))]
 
@@ -111,6 +112,10 @@ class ParameterShift(Filter):
     ) -> tuple[str, ...]:
         slow = bool((self.log_factors[1:] != 0).any())  # of the simulation's parts all but the white one
         return happened_instead(comparison, finding, beside, walks_of(comparison, finding) if slow else None)
+
+    @classmethod
+    def from_term(cls, term: Term, comparison: Comparison) -> ParameterShift | None:
+        return cls(reference_noise(comparison), term.local) if isinstance(term, Shift) else None
 
     def response(self, f: Tensor) -> Tensor:
         parts = Parts(self.base, f.clamp(min=0.5 / self.base.n_samples))

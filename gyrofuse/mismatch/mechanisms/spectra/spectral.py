@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor
 
+from gyrofuse.mismatch.likelihoods.declared import declared
+from gyrofuse.mismatch.likelihoods.spectra.components import Term
 from gyrofuse.mismatch.likelihoods.spectra.data import reference_noise
 from gyrofuse.mismatch.likelihoods.spectra.ratios import FLOOR
 from gyrofuse.mismatch.likelihoods.spectra.slow_ordinates import slow_gains
@@ -54,6 +56,24 @@ class Spectral(Mechanism, SpectralTerms):
             if self.approximate
             else built
         )
+
+    @classmethod
+    def from_term(cls, term: Term, comparison: Comparison) -> Spectral | None:
+        """The mechanism that one of its terms stands for; None of another's, by default of any."""
+        return None
+
+    def beside_company(self, comparison: Comparison, generator: torch.Generator) -> Comparison | None:
+        """With levels and filters that are right only together: each by itself may lead away from the recording."""
+        made = [
+            next((effect for kind in declared(Spectral) if (effect := kind.from_term(term, comparison))), None)
+            for term in self.company
+        ]
+        if not made or None in made:
+            return None
+        for effect in made:
+            assert effect is not None
+            comparison = effect.repair(comparison, generator)
+        return comparison
 
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
         return super().held_out_scores(comparison, fold) + slow_gains(comparison, self.spectra, fold)
