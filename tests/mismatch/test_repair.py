@@ -10,6 +10,7 @@ from scipy import stats
 
 import gyrofuse as gf
 from gyrofuse.mismatch import diagnose
+from gyrofuse.mismatch.mechanisms.coherence_remainder import CoherenceRemainder
 from gyrofuse.mismatch.mechanisms.remainder import Remainder
 from gyrofuse.mismatch.mechanisms.signals.step import Step
 from gyrofuse.mismatch.mechanisms.slow_remainder import SlowRemainder
@@ -20,13 +21,16 @@ from gyrofuse.mismatch.reporting.text import verdict
 from gyrofuse.mismatch.selection import forward
 from gyrofuse.mismatch.selection.classifier import area_under_curve, distinguishability, features
 from gyrofuse.mismatch.selection.discrepancy import (
+    differences_of_fold,
     discrepancy_left,
     discrepancy_p_value,
     mean_discrepancy,
+    paired_discrepancy,
 )
 from gyrofuse.mismatch.selection.held_out import agreement, score_held_out
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
-from gyrofuse.mismatch.signals.folds import N_FOLDS, estimation_samples, held_out_blocks, in_fold
+from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, estimation_samples, held_out_blocks, in_fold
+from gyrofuse.mismatch.signals.psd import narrow_bands
 
 N, P = 8192, 3
 SCENE = RecordingInfo(100.0, "deg/s", ("1", "2", "3"))
@@ -90,7 +94,41 @@ def test_a_remainder_has_the_ratio_of_the_spectra():
     assert float(other.abs().mean()) < 0.3 * float(one.abs().mean())
 
 
+def test_a_remainder_has_narrow_peaks_too():
+    """Narrower than a quarter of an octave, in which most of it would be lost."""
+    f = torch.arange(N // 2 + 1, dtype=torch.float64) / N
+    peak = 1 + 2 * torch.exp(-(((f - 0.3) / 0.008) ** 2))
+    recording = torch.fft.irfft(torch.fft.rfft(white(1)[0]) * peak, n=N)
+    found = Remainder.left_over(comparison(recording))
+    at = torch.tensor([0.26, 0.3, 0.34], dtype=torch.float64)
+    assert float((found.response(at)[:, 1] - 3).abs().max()) < 0.5
+    assert float((found.response(at)[:, ::2] - 1).abs().max()) < 0.35
+
+
+def test_sensors_share_what_those_of_the_recording_share():
+    """A source a quarter of a cycle apart in two of three sensors, in one band."""
+    f = torch.arange(N // 2 + 1, dtype=torch.float64) / N
+    inside = ((f > 0.1) & (f < 0.2)).to(torch.complex128)
+    own, source = white(1)[0], torch.fft.rfft(white(7)[0, 0])
+    shared = torch.stack([source * inside, 1j * source * inside, 0 * source])
+    recording = own + torch.fft.irfft(shared, n=N)
+    start = comparison(recording)
+    levelled = Remainder.left_over(start).repair(start, generator(1))
+    after = CoherenceRemainder.left_over(levelled).repair(levelled, generator(1))
+    band = (after.bands.frequency > 0.11) & (after.bands.frequency < 0.18)
+    coherence = after.reference.coherence[band]
+    assert float((coherence[:, 0, 1] - after.observed.coherence[band][:, 0, 1]).abs().max()) < 0.1
+    assert float((coherence[:, 0, 1] - -0.5j).abs().mean()) < 0.1
+    assert float(coherence[:, :2, 2].abs().mean()) < 0.1
+    power = (after.reference.power / levelled.reference.power)[:, band]
+    assert float((power - 1).abs().max()) < 0.1
+
+
 def test_nothing_remains_where_nothing_differs():
+    start = comparison(white(1)[0])
+    found, narrow = CoherenceRemainder.left_over(start), narrow_bands(N)
+    one, other = (side.in_bands(narrow).coherence for side in (start.observed, start.reference))
+    assert float((found.after - found.before).abs().mean()) < 0.2 * float((one - other).abs().mean())
     assert float(Remainder.left_over(comparison(white(1)[0])).log_gain.abs().mean()) < 0.03
 
 
@@ -108,6 +146,22 @@ def test_a_difference_without_a_name_stays_unexplained_and_is_filled_in():
     assert report.held_out.auc_before > 0.8
     assert report.held_out.auc_after < 0.6
     assert "stands for no physics" in "".join(verdict(report))
+
+
+def test_a_paired_discrepancy_allows_for_noise_that_is_unsteady():
+    """Of 40 recordings whose noise comes and goes, with the simulation's power in the mean; not for a level off."""
+    loud = torch.randint(0, 2, (40, 1, N_JUDGED), generator=generator(8))
+    gain = (0.2 + 1.6 * loud).sqrt().repeat_interleave(N // N_JUDGED, -1)
+    recordings, simulation = white(5, 40), white(2, 8)
+
+    def both(recording: torch.Tensor) -> tuple[float, float]:
+        start = Comparison.of(SCENE, recording, simulation)
+        return paired_discrepancy([differences_of_fold(start, k) for k in range(N_FOLDS)]), mean_discrepancy(start)
+
+    unsteady = torch.tensor([both(recording) for recording in gain * recordings]).mean(0)
+    assert 0.7 < float(unsteady[0]) < 1.3
+    assert float(unsteady[1]) > 2
+    assert both(1.1 * recordings[0])[0] > 3
 
 
 def test_area_under_the_curve_counts_pairs():

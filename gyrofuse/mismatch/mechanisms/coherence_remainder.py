@@ -61,13 +61,15 @@ class CoherenceRemainder(Spectral):
 
     @classmethod
     def _between(cls, observed: Records, reference: Records) -> CoherenceRemainder:
-        """Coherences drawn towards those of the simulation, and these towards none, by as much as chance explains."""
+        """Coherences in narrow bands drawn towards those in wide ones, and these towards none.
+
+        By as much as chance explains of the difference (Stein).
+        """
         narrow = narrow_bands(observed.bands.n_samples)
         seen, simulated = observed.in_bands(narrow), reference.in_bands(narrow)
-        eye = torch.eye(seen.signal.shape[-2], dtype=torch.complex128)
-        plain = 4.0  # times the mean square of chance: of many bands and pairs some stand out
-        before = _drawn(simulated.coherence, plain / simulated.dof, eye)
-        after = _drawn(seen.coherence, plain / seen.dof, before)
+        before, after = (
+            _shrunk(wide, fine, narrow.frequency) for wide, fine in ((reference, simulated), (observed, seen))
+        )
         return cls(narrow.frequency, simulated.power.clamp(min=1e-300).sqrt(), _positive(before), _positive(after))
 
     def factor(self, base: object, f: Tensor) -> Tensor:
@@ -75,13 +77,9 @@ class CoherenceRemainder(Spectral):
 
     def mixing(self, f: Tensor) -> Tensor:
         """Complex gains `(frequency, sensor, sensor)` at `f` cycles per sample."""
-        x, at = f.clamp(self.frequency[0], self.frequency[-1]).log(), self.frequency.log()
-        right = torch.searchsorted(at, x).clamp(1, len(at) - 1)
-        share = (x - at[right - 1]) / (at[right] - at[right - 1])
         turn = _root(self.after) @ torch.linalg.inv(_root(self.before))  # (band, sensor, sensor)
         size = self.level.mT
-        own = turn * (size[:, :, None] / size[:, None, :])
-        return torch.lerp(own[right - 1], own[right], share[:, None, None].to(own.dtype))
+        return _between_bands(turn * (size[:, :, None] / size[:, None, :]), self.frequency, f)
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
         return mixed(signal, self.mixing)
@@ -95,6 +93,23 @@ class CoherenceRemainder(Spectral):
 
     def fit_without(self, comparison: Comparison, fold: int) -> CoherenceRemainder:
         return self._between(without_fold(comparison, fold), comparison.reference)
+
+
+def _shrunk(wide: Records, fine: Records, f: Tensor) -> Tensor:
+    """Coherence matrices of the same records in fine bands, which have their middles at `f`."""
+    eye = torch.eye(wide.signal.shape[-2], dtype=torch.complex128)
+    plain = 4.0  # times the mean square of chance: of many narrow bands and pairs some stand out
+    coarse = _drawn(wide.coherence, 1 / wide.dof, eye)
+    middle = _between_bands(coarse, wide.bands.frequency, f)
+    return _drawn(fine.coherence, plain / fine.dof, middle)
+
+
+def _between_bands(values: Tensor, frequency: Tensor, f: Tensor) -> Tensor:
+    """Matrices `(band, sensor, sensor)` at `f` between the middles of bands, linear in log frequency."""
+    x, at = f.clamp(frequency[0], frequency[-1]).log(), frequency.log()
+    right = torch.searchsorted(at, x).clamp(1, len(at) - 1)
+    share = (x - at[right - 1]) / (at[right] - at[right - 1])
+    return torch.lerp(values[right - 1], values[right], share[:, None, None].to(values.dtype))
 
 
 def _drawn(values: Tensor, chance: Tensor, middle: Tensor) -> Tensor:
