@@ -18,7 +18,8 @@ from gyrofuse.mismatch.likelihoods.spectra.common_sources import CommonBump
 from gyrofuse.mismatch.likelihoods.spectra.components import Peak, oscillation
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.mechanisms.spectra.findings import spanned
-from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape, refit, run_length
+from gyrofuse.mismatch.mechanisms.spectra.joint_fit import chosen_shape, leading_shape, refit, run_length
+from gyrofuse.mismatch.mechanisms.spectra.spectral import Addition, Spectral
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.dims import ComplexOfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples
@@ -58,6 +59,19 @@ class Mode:
         if self.shared:
             return self.gain[:, None] * self.gain.conj()
         return torch.diag(self.gain.abs().square()).to(self.gain.dtype)
+
+
+class OscillationOnTop(Addition):
+    """What resonances and wandering tones do alike."""
+
+    mode: Mode
+
+    def beside_company(self, comparison: Comparison, generator: torch.Generator) -> Comparison | None:
+        """With levels and filters of the joint fit: of wrong ones a recording may be farther away, with its line in."""
+        shape = leading_shape(comparison)
+        terms = () if shape is None else (shape.term, *shape.company)
+        company = tuple(term for term in terms if not isinstance(term, Peak | CommonBump))
+        return Spectral.beside_company(replace(self, company=company), comparison, generator)
 
 
 class Seen(NamedTuple):

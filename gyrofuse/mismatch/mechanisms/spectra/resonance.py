@@ -16,8 +16,7 @@ from gyrofuse.mismatch.likelihoods.spectra.starts import peak_starts
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter, Rival
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
-from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode, nominated, refitted_mode
-from gyrofuse.mismatch.mechanisms.spectra.spectral import Addition
+from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode, OscillationOnTop, nominated, refitted_mode
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.filters import noise, of_phase
 
@@ -29,7 +28,7 @@ _NARROWEST = 1.5  # bins: half width of the narrowest peak that a record shows, 
 
 
 @dataclass(frozen=True, eq=False)
-class Resonance(Addition):
+class Resonance(OscillationOnTop):
     """`S_ij -> S_ij + G_ij B(f)`, `B` the density of an AR2 of variance one with poles at `f_0` and half width `w`.
 
     Where one mode moves all sensors `G = g g^H`, else it is diagonal. Its envelope is that of Gaussian noise, which a

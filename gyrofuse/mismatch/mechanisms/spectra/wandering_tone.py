@@ -13,8 +13,7 @@ from torch import Tensor
 from gyrofuse.mismatch.detectors.spectra.frequency_courses import share_of_lorentzian
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
-from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode, nominated, refitted_mode
-from gyrofuse.mismatch.mechanisms.spectra.spectral import Addition
+from gyrofuse.mismatch.mechanisms.spectra.oscillation import Mode, OscillationOnTop, nominated, refitted_mode
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.noise.processes.ar1_recursion import ar1_recursion
 
@@ -33,7 +32,7 @@ _EULER = 0.5772156649015329  # by which the mean logarithm of an exponential var
 
 
 @dataclass(frozen=True, eq=False)
-class DriftingTone(Addition):
+class DriftingTone(OscillationOnTop):
     """`x_i(t) = a_i cos(phi(t) + theta_i)` with `phi' = 2 pi (f_0 + u(t))` and a wandering `u`, an AR1.
 
     Its line is wider than the record's resolution, yet it has one frequency at a time and a steady amplitude: windows
