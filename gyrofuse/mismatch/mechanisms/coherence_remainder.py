@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import torch
@@ -15,6 +16,7 @@ from gyrofuse.mismatch.mechanisms.spectra.spectral import Spectral
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.filters import mixed
+from gyrofuse.mismatch.signals.folds import spectral_gains
 from gyrofuse.mismatch.signals.psd import narrow_bands
 from gyrofuse.mismatch.signals.records import Records
 
@@ -87,6 +89,15 @@ class CoherenceRemainder(Spectral):
     def spectra(self, matrices: Tensor, f: Tensor) -> Tensor:
         mixing = self.mixing(f)
         return mixing @ matrices.to(mixing.dtype) @ mixing.mH
+
+    def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
+        after, before = (partial(self._with_powers, matrices) for matrices in (self.after, self.before))
+        return spectral_gains(comparison, comparison.recording, after, fold, before)
+
+    def _with_powers(self, coherence: Tensor, matrices: Tensor, f: Tensor) -> Tensor:
+        """Cross-spectra `(frequency, sensor, sensor)` of coherences `(band, ...)` and the powers of matrices."""
+        size = matrices.diagonal(dim1=-2, dim2=-1).sqrt()
+        return _between_bands(coherence, self.frequency, f) * size[:, :, None] * size[:, None, :].conj()
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
         pictures.coherence(ax, comparison, sensor)

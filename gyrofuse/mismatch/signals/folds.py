@@ -40,7 +40,11 @@ def held_out_blocks(signal: Tensor, fold: int) -> Tensor:
 
 
 def spectral_gains(
-    comparison: Comparison, left: Tensor, spectra: Callable[[Tensor, Tensor], Tensor], fold: int
+    comparison: Comparison,
+    left: Tensor,
+    spectra: Callable[[Tensor, Tensor], Tensor],
+    fold: int,
+    before: Callable[[Tensor, Tensor], Tensor] | None = None,
 ) -> Tensor:
     """Gain in log score of each block held out, `(block,)`, nats.
 
@@ -54,13 +58,15 @@ def spectral_gains(
         left: `(sensor, time)`: the recording without what the mechanism takes off.
         spectra: What the mechanism makes of the simulation's cross-spectra.
         fold: Number of the fold.
+        before: What makes the simulation's cross-spectra of its powers; by default its sensors share nothing.
     """
     block = comparison.n_samples // N_JUDGED
     f = torch.arange(block + 1, dtype=torch.float64) / (2 * block)
     f[0] = f[1] / 2  # nothing of a block's mean is in its other ordinates
     plain = torch.diag_embed(comparison.base.spectrum(f).mT).to(torch.complex128)
-    after, before = (seen_in_block(matrices.real)[_FIRST:] for matrices in (spectra(plain, f), plain))
-    return _log_scores(left, after, fold) - _log_scores(comparison.recording, before, fold)
+    simulated = plain if before is None else before(plain, f)
+    after, without = (seen_in_block(matrices.real)[_FIRST:] for matrices in (spectra(plain, f), simulated))
+    return _log_scores(left, after, fold) - _log_scores(comparison.recording, without, fold)
 
 
 def seen_in_block(spectra: Tensor) -> Tensor:
