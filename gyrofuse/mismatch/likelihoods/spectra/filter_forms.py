@@ -62,12 +62,13 @@ def filter_strength(kind: str, corner: Tensor) -> Tensor:
     if kind in _POLES:
         return strength_of(kind, torch.sin(math.pi * corner).log())
     if kind in _MEANS:  # a longer mean passes less, until its first zero
+        none = float(kind not in _SAMPLED_MEANS)  # length at which it does nothing
         low, high = torch.ones_like(corner), 1 / corner
         for _ in range(_HALVINGS):
             middle = (low + high) / 2
-            more = filter_power(kind, middle.square() - 1, corner[..., None])[..., 0] > 0.5
+            more = filter_power(kind, middle.square() - none, corner[..., None])[..., 0] > 0.5
             low, high = torch.where(more, middle, low), torch.where(more, high, middle)
-        return low.square() - (kind not in _SAMPLED_MEANS)
+        return low.square() - none
     number = _warped(kind, corner).log()
     if _FORMS[kind].prototype == "window":  # its image lets a little more pass
         low, high = number - 1, number + 1
