@@ -79,7 +79,7 @@ def name_of(kind: type[Mechanism]) -> str:
 
 
 def but_for(kind: type[Mechanism], known: Mapping[type[Mechanism], str]) -> object:
-    """A mechanism as a parameter of a test that is known to fail where a reason is given; few draws need not show it."""
+    """A mechanism as a parameter of a test; a known failure, with its reason, need not show in few draws."""
     marks = [pytest.mark.xfail(reason=known[kind], strict=False)] if kind in known else []
     return pytest.param(kind, marks=marks, id=name_of(kind))
 
