@@ -80,10 +80,9 @@ def _best_of_stage(
         if finding is not None and not is_known(finding, known):
             found.append(finding)
     for finding in sorted(found, key=lambda f: -f.gain):
-        for beside in (comparison, finding.effect.beside_company(comparison, generator)):
-            if beside is None:
-                continue
-            score = score_held_out(beside, finding.effect)
+        together = finding.effect.beside_company(comparison, generator)
+        for effect, beside in ((finding.effect, comparison), *([] if together is None else [together])):
+            score = score_held_out(beside, effect)
             if score.confirms(finding.p_value) and not leads_away(start, beside, score.by_fold, generator):
                 return Selected(replace(finding, held_out_gain=score.total), comparison, score)
     return None

@@ -66,7 +66,7 @@ class OscillationOnTop(Addition):
 
     mode: Mode
 
-    def beside_company(self, comparison: Comparison, generator: torch.Generator) -> Comparison | None:
+    def beside_company(self, comparison: Comparison, generator: torch.Generator) -> tuple[Mechanism, Comparison] | None:
         """With levels and filters of the joint fit: of wrong ones a recording may be farther away, with its line in."""
         shape = leading_shape(comparison)
         terms = () if shape is None else (shape.term, *shape.company)

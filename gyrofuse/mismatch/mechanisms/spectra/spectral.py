@@ -62,7 +62,7 @@ class Spectral(Mechanism, SpectralTerms):
         """The mechanism that one of its terms stands for; None of another's, by default of any."""
         return None
 
-    def beside_company(self, comparison: Comparison, generator: torch.Generator) -> Comparison | None:
+    def beside_company(self, comparison: Comparison, generator: torch.Generator) -> tuple[Mechanism, Comparison] | None:
         """With levels and filters that are right only together: each by itself may lead away from the recording."""
         made = [
             next((effect for kind in declared(Spectral) if (effect := kind.from_term(term, comparison))), None)
@@ -73,7 +73,7 @@ class Spectral(Mechanism, SpectralTerms):
         for effect in made:
             assert effect is not None
             comparison = effect.repair(comparison, generator)
-        return comparison
+        return replace(self, company=()), comparison
 
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
         return super().held_out_scores(comparison, fold) + slow_gains(comparison, self.spectra, fold)
