@@ -22,7 +22,7 @@ from gyrofuse._base.transforms import cosine_ordinates
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, held_out_blocks, in_fold
 from gyrofuse.mismatch.signals.lines import with_factors
-from gyrofuse.mismatch.signals.psd import narrow_bands
+from gyrofuse.mismatch.signals.psd import between_bands, narrow_bands
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,6 @@ class ResponseSums:
     """Sums over the samples of each block.
 
     Attributes:
-        n_rows: Rows of the channels.
         reach: `L`.
         gram: Products of lagged rows, `(block, row * lag, row * lag)`, the earliest lag first.
         moment: Of sensors with lagged rows, `(block, sensor, row * lag)`.
@@ -38,7 +37,6 @@ class ResponseSums:
         count: Samples, `(block,)`.
     """
 
-    n_rows: int
     reach: int
     gram: Tensor
     moment: Tensor
@@ -79,7 +77,7 @@ class ResponseSums:
             moment.append(cross)
             power.append(y[:, first:last].square().sum(-1))
             counts.append(last - first)
-        return cls(len(a), reach, torch.stack(gram), torch.stack(moment), torch.stack(power), torch.tensor(counts))
+        return cls(reach, torch.stack(gram), torch.stack(moment), torch.stack(power), torch.tensor(counts))
 
     def solved(self, rows: Sequence[int], reach: int, fold: int | None = None) -> FiniteResponse:
         """Responses to some rows, of a reach up to that of the sums, without a fold of blocks."""
@@ -173,8 +171,5 @@ def _smooth_density(comparison: Comparison, signal: Tensor) -> Tensor:
     band = torch.bucketize(ordinate, edges[1:-1], right=True)
     sums = torch.zeros(len(power), len(edges) - 1, dtype=torch.float64).index_add(1, band, power)
     level = (sums / torch.bincount(band, minlength=len(edges) - 1).clamp(min=1)).clamp(min=1e-300).log().mean(0)
-    middle = ((edges[:-1] + edges[1:]).to(torch.float64) / 2).log()
-    at = torch.arange(n, dtype=torch.float64).clamp(min=1).log().clamp(float(middle[0]), float(middle[-1]))
-    right = torch.searchsorted(middle, at).clamp(1, len(middle) - 1)
-    share = (at - middle[right - 1]) / (middle[right] - middle[right - 1])
-    return torch.lerp(level[right - 1], level[right], share).exp()
+    middle = (edges[:-1] + edges[1:]).to(torch.float64) / 2
+    return between_bands(level, middle, torch.arange(n, dtype=torch.float64)).exp()

@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.remainder import without_fold
+from gyrofuse.mismatch.mechanisms.remainder import drawn_towards, without_fold
 from gyrofuse.mismatch.mechanisms.spectra.spectral import Spectral
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.filters import mixed
 from gyrofuse.mismatch.signals.folds import spectral_gains
-from gyrofuse.mismatch.signals.psd import narrow_bands
+from gyrofuse.mismatch.signals.psd import between_bands, narrow_bands
 from gyrofuse.mismatch.signals.records import Records
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ class CoherenceRemainder(Spectral):
         """Complex gains `(frequency, sensor, sensor)` at `f` cycles per sample."""
         turn = _root(self.after) @ torch.linalg.inv(_root(self.before))  # (band, sensor, sensor)
         size = self.level.mT
-        return _between_bands(turn * (size[:, :, None] / size[:, None, :]), self.frequency, f)
+        return _at(turn * (size[:, :, None] / size[:, None, :]), self.frequency, f)
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
         return mixed(signal, self.mixing)
@@ -97,7 +97,7 @@ class CoherenceRemainder(Spectral):
     def _with_powers(self, coherence: Tensor, matrices: Tensor, f: Tensor) -> Tensor:
         """Cross-spectra `(frequency, sensor, sensor)` of coherences `(band, ...)` and the powers of matrices."""
         size = matrices.diagonal(dim1=-2, dim2=-1).sqrt()
-        return _between_bands(coherence, self.frequency, f) * size[:, :, None] * size[:, None, :].conj()
+        return _at(coherence, self.frequency, f) * size[:, :, None] * size[:, None, :].conj()
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
         pictures.coherence(ax, comparison, sensor)
@@ -110,24 +110,14 @@ def _shrunk(wide: Records, fine: Records, f: Tensor) -> Tensor:
     """Coherence matrices of the same records in fine bands, which have their middles at `f`."""
     eye = torch.eye(wide.signal.shape[-2], dtype=torch.complex128)
     plain = 4.0  # times the mean square of chance: of many narrow bands and pairs some stand out
-    coarse = _drawn(wide.coherence, 1 / wide.dof, eye)
-    middle = _between_bands(coarse, wide.bands.frequency, f)
-    return _drawn(fine.coherence, plain / fine.dof, middle)
+    coarse = drawn_towards(wide.coherence, 1 / wide.dof[:, None, None], eye)
+    middle = _at(coarse, wide.bands.frequency, f)
+    return drawn_towards(fine.coherence, plain / fine.dof[:, None, None], middle)
 
 
-def _between_bands(values: Tensor, frequency: Tensor, f: Tensor) -> Tensor:
-    """Matrices `(band, sensor, sensor)` at `f` between the middles of bands, linear in log frequency."""
-    x, at = f.clamp(frequency[0], frequency[-1]).log(), frequency.log()
-    right = torch.searchsorted(at, x).clamp(1, len(at) - 1)
-    share = (x - at[right - 1]) / (at[right] - at[right - 1])
-    return torch.lerp(values[right - 1], values[right], share[:, None, None].to(values.dtype))
-
-
-def _drawn(values: Tensor, chance: Tensor, middle: Tensor) -> Tensor:
-    """Complex values `(band, sensor, sensor)` drawn towards a middle by as much as chance `(band,)` explains."""
-    apart = values - middle
-    kept = (1 - chance[:, None, None] / apart.abs().square().clamp(min=1e-300)).clamp(min=0.0)
-    return middle + torch.where(kept > 0, kept * apart, torch.zeros_like(apart))
+def _at(matrices: Tensor, frequency: Tensor, f: Tensor) -> Tensor:
+    """Matrices `(band, sensor, sensor)` of bands at frequencies between their middles, `(frequency, ...)`."""
+    return between_bands(matrices.movedim(0, -1), frequency, f).movedim(-1, 0)
 
 
 def _positive(matrices: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ from gyrofuse.mismatch.mechanisms.spectra.spectral import Filter
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.folds import N_JUDGED, estimation_samples
-from gyrofuse.mismatch.signals.psd import narrow_bands
+from gyrofuse.mismatch.signals.psd import between_bands, narrow_bands
 from gyrofuse.mismatch.signals.records import Records
 
 
@@ -59,17 +59,14 @@ class Remainder(Filter):
         By as much as chance explains of the difference (Stein).
         """
         narrow = narrow_bands(observed.bands.n_samples)
-        wide = cls(observed.bands.frequency, _drawn(*_log_ratio(observed, reference), 0.0) / 2)
+        wide = cls(observed.bands.frequency, drawn_towards(*_log_ratio(observed, reference), 0.0) / 2)
         before = wide.response(narrow.frequency).log()
         ratio, chance = _log_ratio(observed.in_bands(narrow), reference.in_bands(narrow))
         plain = 4.0  # times the variance of chance: of many narrow bands some stand out
-        return cls(narrow.frequency, _drawn(ratio, plain * chance, 2 * before) / 2)
+        return cls(narrow.frequency, drawn_towards(ratio, plain * chance, 2 * before) / 2)
 
     def response(self, f: Tensor) -> Tensor:
-        x, at = f.clamp(self.frequency[0], self.frequency[-1]).log(), self.frequency.log()
-        right = torch.searchsorted(at, x).clamp(1, len(at) - 1)
-        share = (x - at[right - 1]) / (at[right] - at[right - 1])
-        return torch.lerp(self.log_gain[:, right - 1], self.log_gain[:, right], share).exp()
+        return between_bands(self.log_gain, self.frequency, f).exp()
 
     def fit_without(self, comparison: Comparison, fold: int) -> Remainder:
         return self._between(without_fold(comparison, fold), comparison.reference)
@@ -89,8 +86,8 @@ def _log_ratio(observed: Records, reference: Records) -> tuple[Tensor, Tensor]:
     return ratio, 1 / observed.dof + 1 / reference.dof
 
 
-def _drawn(values: Tensor, chance: Tensor, middle: Tensor | float) -> Tensor:
-    """Values drawn towards a middle by as much as a variance of chance explains of their distance."""
+def drawn_towards(values: Tensor, chance: Tensor, middle: Tensor | float) -> Tensor:
+    """Values, real or complex, drawn towards a middle by as much as chance, a variance, explains of their distance."""
     apart = values - middle
-    kept = (1 - chance / apart.square().clamp(min=1e-300)).clamp(min=0.0)
+    kept = (1 - chance / apart.abs().square().clamp(min=1e-300)).clamp(min=0.0)
     return middle + torch.where(kept > 0, kept * apart, 0.0)

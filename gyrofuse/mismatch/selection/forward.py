@@ -80,11 +80,21 @@ def _best_of_stage(
         if finding is not None and not is_known(finding, known):
             found.append(finding)
     for finding in sorted(found, key=lambda f: -f.gain):
-        together = finding.effect.beside_company(comparison, generator)
-        for effect, beside in ((finding.effect, comparison), *([] if together is None else [together])):
-            score = score_held_out(beside, effect)
-            if score.confirms(finding.p_value) and not leads_away(start, beside, score.by_fold, generator):
-                return Selected(replace(finding, held_out_gain=score.total), comparison, score)
+        score = _held(finding, finding.effect, start, comparison, generator)
+        if score is None and (together := finding.effect.beside_company(comparison, generator)) is not None:
+            score = _held(finding, together[0], start, together[1], generator)
+        if score is not None:
+            return Selected(replace(finding, held_out_gain=score.total), comparison, score)
+    return None
+
+
+def _held(
+    finding: Finding, effect: Mechanism, start: Comparison, comparison: Comparison, generator: torch.Generator
+) -> HeldOutScore | None:
+    """Score of a finding's effect on the blocks held out; None where it does not hold there, or leads away."""
+    score = score_held_out(comparison, effect)
+    if score.confirms(finding.p_value) and not leads_away(start, comparison, score.by_fold, generator):
+        return score
     return None
 
 

@@ -80,6 +80,14 @@ def narrow_bands(n_samples: int) -> Bands:
     return bands(n_samples, max(n_samples // 512, 24))
 
 
+def between_bands(values: Tensor, frequency: Tensor, f: Tensor) -> Tensor:
+    """Values `(..., band)` with middles at `frequency`, linear in log frequency at `f`, level beyond the ends."""
+    x, at = f.clamp(frequency[0], frequency[-1]).log(), frequency.log()
+    right = torch.searchsorted(at, x).clamp(1, len(at) - 1)
+    share = (x - at[right - 1]) / (at[right] - at[right - 1])
+    return torch.lerp(values[..., right - 1], values[..., right], share.to(values.dtype))
+
+
 def cross_spectra(signal: Tensor, wanted: Bands) -> Tensor:
     """Cross-spectral matrices per sample `(..., band, sensor, sensor)`, complex, of `(..., sensor, time)`.
 

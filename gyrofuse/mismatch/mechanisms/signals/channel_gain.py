@@ -16,7 +16,8 @@ from gyrofuse.mismatch.detectors.slow.channels import ChannelFit, regress
 from gyrofuse.mismatch.detectors.slow.transfer import Transfer, likeliest_transfer
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.channel_path import ChannelPath
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
 from gyrofuse.mismatch.mechanisms.not_identifiable import NOT_IDENTIFIABLE
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import Dims
@@ -36,7 +37,7 @@ _SCATTER = 3.0  # standard deviations of what is so by chance
 
 
 @dataclass(frozen=True, eq=False)
-class ChannelGain(Mechanism):
+class ChannelGain(ChannelPath):
     """`x_i(t) = sum_k coupling_ik (m * a_k)(t)` with rows `a` made from an auxiliary channel.
 
     The response `m`, which all sensors share, is one for a plain gain; see `Transfer`.
@@ -49,10 +50,7 @@ class ChannelGain(Mechanism):
         pole, response: Of `m`.
     """
 
-    likelihood: ClassVar[str] = "known paths"
-    known_path: ClassVar[bool] = True
     rivals: ClassVar[tuple[str, ...]] = ("parameter_shift", "low_pass", "flicker", "common_mode")
-    additive: ClassVar[bool] = True
     of_one_band: ClassVar[tuple[str, ...]] = ()
     quantity: ClassVar[str] = "gain"
     largest: ClassVar[float] = math.inf  # that a sensor has, deg/s per g to the power below
@@ -181,15 +179,6 @@ class ChannelGain(Mechanism):
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
         path = self._path(comparison.info, comparison.n_samples)[sensor]
         pictures.gain_on_channel(ax, comparison, sensor, path, f"share that follows {self.channel}, as fitted")
-
-    def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
-        return signal + self._path(info, signal.shape[-1])
-
-    def remove(self, signal: Tensor, info: RecordingInfo) -> Tensor:
-        return signal - self._path(info, signal.shape[-1])
-
-    def repair(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
-        return comparison.subtract(self._path(comparison.info, comparison.n_samples))
 
     def _path(self, info: RecordingInfo, n_samples: int) -> Tensor:
         rows = self._rows(info, self.channel)[self.kind]

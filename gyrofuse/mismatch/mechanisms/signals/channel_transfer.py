@@ -20,7 +20,8 @@ from gyrofuse.mismatch.likelihoods.finite_response import (
     response_at,
 )
 from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.channel_path import ChannelPath
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.dims import Dims
@@ -35,7 +36,7 @@ _SIMPLER = 0.02  # share of the score that more numbers have to add, to response
 
 
 @dataclass(frozen=True, eq=False)
-class ChannelTransfer(Mechanism):
+class ChannelTransfer(ChannelPath):
     """`x_i(t) = sum_k sum_l taps_ikl a_k(t - l)`, `l` from `-L` to `L`, over the rows `a` of auxiliary channels.
 
     A scale factor, a misalignment, a delay and a sensitivity to acceleration are cases of it, which are preferred where
@@ -48,10 +49,7 @@ class ChannelTransfer(Mechanism):
     """
 
     name: ClassVar[str] = "channel_transfer"
-    likelihood: ClassVar[str] = "known paths"
     separated_by: ClassVar[str] = "a recording with another motion"
-    known_path: ClassVar[bool] = True
-    additive: ClassVar[bool] = True
     channels: tuple[str, ...]
     taps: Annotated[Tensor, Dims(("sensor", "row", "lag"))]
 
@@ -88,7 +86,6 @@ class ChannelTransfer(Mechanism):
             sensors,
             parameters,
             levels=(level_of(max(f, 1 / comparison.n_samples)),),
-            frequency_hz=None,
             channel=" and ".join(best.channels),
             gain=best.total / 2 if best.simple else best.total,
         )
@@ -117,15 +114,6 @@ class ChannelTransfer(Mechanism):
         path = self._path(comparison.info, comparison.n_samples)[sensor]
         label = f"what follows {' and '.join(self.channels)}, as fitted"
         pictures.gain_on_channel(ax, comparison, sensor, path, label)
-
-    def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
-        return signal + self._path(info, signal.shape[-1])
-
-    def remove(self, signal: Tensor, info: RecordingInfo) -> Tensor:
-        return signal - self._path(info, signal.shape[-1])
-
-    def repair(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
-        return comparison.subtract(self._path(comparison.info, comparison.n_samples))
 
     def _path(self, info: RecordingInfo, n_samples: int) -> Tensor:
         return responded(self.taps, _rows(info, self.channels, n_samples))
@@ -262,9 +250,8 @@ def _gain_and_delay(
     turn = torch.polar(torch.ones_like(lags), -2 * math.pi * f * lags)
     own = fit.inverse[row * n_lags : (row + 1) * n_lags, row * n_lags : (row + 1) * n_lags] * fit.variance[sensor]
     gain = complex((fit.taps[sensor, row].to(turn.dtype) * turn).sum())
-    direction = gain / max(abs(gain), 1e-300)
-    along, across = ((turn * complex(direction).conjugate()).real, (turn * complex(direction).conjugate()).imag)
-    sd, sd_across = (math.sqrt(max(float(v @ own @ v), 0.0)) for v in (along, across))
+    along = turn * (gain / max(abs(gain), 1e-300)).conjugate()
+    sd, sd_across = (math.sqrt(max(float(v @ own @ v), 0.0)) for v in (along.real, along.imag))
     size, sign = abs(gain), 1.0 if gain.real >= 0 else -1.0
     phase = math.atan2((gain * sign).imag, (gain * sign).real)  # of a gain that is reversed, from there
     ms = 1e3 / (2 * math.pi * f * info.rate)
