@@ -102,7 +102,7 @@ def diagnose(
         p_value = monte_carlo_p_value(p_value, twin_p_values(start, twins, generator))
 
     def report(made: RepairedModel | None, **found: Any) -> MismatchReport:
-        verdict = None if judge is None else judged(judge, recording, simulation, made, rate)
+        verdict = None if judge is None else judged(judge, recording, simulation, made, rate, len(own))
         fitted = isinstance(simulation, Model | ArrayModel) and simulation.estimated_from is None
         notes = (KNOWN,) if fitted else () if found["fit"] is None else (found["fit"].words,)
         return MismatchReport(

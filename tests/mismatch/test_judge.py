@@ -45,6 +45,27 @@ def test_a_repair_that_holds_helps_there_too():
     assert told["classifier"] == {"before": j.auc_before, "after": j.auc_after, "repeatability": j.auc_repeatability}
 
 
+def test_shares_say_what_carries_the_discrepancy():
+    """Each from where the one before it ends, on the judge and on blocks held out alike; what is left is the rest."""
+    loud = gf.ArrayModel.from_sensors([gf.WhiteNoise(2.0) + gf.AR1(0.98, 1e-3) for _ in range(2)])
+    signal = [loud.simulate(n, generator=torch.Generator().manual_seed(n)) + tone(n, n) for n in (N, 6007)]
+    report = gf.diagnose(recording(signal[0]), NOISE, judge=recording(signal[1]))
+    j = report.judged
+    assert j is not None
+    for before, after, shares in ((report.held_out.before, report.held_out.after, report.held_out.shares),
+                                  (j.before, j.after, j.shares)):  # fmt: skip
+        assert sorted(share.name for share in shares) == ["parameter_shift", "vibration_tone"]
+        ends = [before, *(share.discrepancy for share in shares)]
+        assert ends[-1] == pytest.approx(after)
+        for k, share in enumerate(shares):
+            assert share.share == pytest.approx((ends[k] - ends[k + 1]) / (before - 1))
+            assert share.share > 0.05
+        assert sum(share.share for share in shares) + (after - 1) / (before - 1) == pytest.approx(1)
+    named = 100 * sum(share.share for share in j.shares)
+    assert f"on the other recording, mechanisms with names carry {named:.3g} %" in str(report)
+    assert report.to_dict()["judged"]["shares"][0]["name"] == j.shares[0].name
+
+
 def test_a_repair_of_what_was_there_once_does_not():
     """A tone in the recording alone: the device does not have it elsewhere, and does not repeat itself either."""
     report = gf.diagnose(recording(drawn(1) + tone()), NOISE, judge=recording(drawn(2)))
@@ -125,7 +146,7 @@ def test_from_the_command_line(run: Run, tmp_path: Path):
     assert "other.npz: judged on 2 to 120.14 s alone" in done.out
     told = json.loads(Path("r.json").read_text())
     assert told["judge"] == "other.npz"
-    assert set(told["judged"]) == {"before", "after", "repeatability", "classifier", "helps", "lacks"}
+    assert set(told["judged"]) == {"before", "after", "repeatability", "classifier", "helps", "lacks", "shares"}
     page = Page(Path("r.html").read_text())
     assert "On another recording" in page.text
     assert "the repair helps there" in page.text

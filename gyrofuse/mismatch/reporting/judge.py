@@ -14,11 +14,14 @@ from torch import Tensor
 
 from gyrofuse._base.checks import same_rate
 from gyrofuse.io.recording import Recording
+from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.repair.inputs import prepared
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel
 from gyrofuse.mismatch.reporting.discrepancy import compared
 from gyrofuse.mismatch.selection.classifier import distinguishability
 from gyrofuse.mismatch.selection.discrepancy import discrepancy_of_fold
+from gyrofuse.mismatch.selection.shares import Share, shares_of
+from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.folds import N_FOLDS
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.model import Model
@@ -41,6 +44,7 @@ class Judged:
         auc_before, auc_after, auc_repeatability: Areas under the curve of the same.
         helps: Whether `after` is below `before` by more than two standard errors of their difference.
         lacks: Channels that the repaired simulation follows and the judge has not; what follows them was left out.
+        shares: Of the discrepancy, in the order of the repairs; without what happened once, or follows such a channel.
     """
 
     before: float
@@ -51,12 +55,14 @@ class Judged:
     auc_repeatability: float
     helps: bool
     lacks: tuple[str, ...] = ()
+    shares: tuple[Share, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, ready for JSON."""
         classifier = {"before": self.auc_before, "after": self.auc_after, "repeatability": self.auc_repeatability}
         plain = {name: getattr(self, name) for name in ("before", "after", "repeatability", "helps")}
-        return {**plain, "classifier": classifier, "lacks": list(self.lacks)}
+        shares = [share._asdict() for share in self.shares]
+        return {**plain, "classifier": classifier, "lacks": list(self.lacks), "shares": shares}
 
 
 def checked_judge(judge: Any, recording: Recording | Tensor, rate: float | None) -> Recording | Tensor:
@@ -109,6 +115,7 @@ def judged(
     simulation: Recording | Tensor | Model | ArrayModel | RepairedModel,
     repaired: RepairedModel | None,
     rate: float | None,
+    n_known: int = 0,
 ) -> Judged:
     """Set a simulation, the repaired one, and the recording against another recording.
 
@@ -118,27 +125,38 @@ def judged(
         simulation: As it came.
         repaired: What the diagnosis made of it; None where there was nothing to repair.
         rate: Hz, of tensors.
+        n_known: Number of effects, the first, that the simulation had as it came.
     """
     generator = torch.Generator().manual_seed(0)
     rate = None if isinstance(judge, Recording) else rate
     lacks: tuple[str, ...] = ()
 
-    def apart(other: Any) -> tuple[Tensor, float]:
-        """Discrepancies of the folds, and the area under the classifier's curve."""
+    def apart(other: Any) -> tuple[Tensor, Comparison]:
+        """Discrepancies of the folds, and both sides as they came."""
         given = prepared(judge, other, rate, generator)
         comparison = compared(given, other, generator)
         folds = [discrepancy_of_fold(comparison, fold) for fold in range(N_FOLDS)]
-        areas = [distinguishability(given, fold) for fold in range(N_FOLDS)]
-        return torch.tensor(folds, dtype=torch.float64), sum(areas) / N_FOLDS
+        return torch.tensor(folds, dtype=torch.float64), given
+
+    def told(given: Comparison) -> float:
+        """The area under the classifier's curve."""
+        return sum(distinguishability(given, fold) for fold in range(N_FOLDS)) / N_FOLDS
 
     if isinstance(simulation, RepairedModel):
-        simulation, _ = _drawn(simulation, judge, generator)
-    before, auc_before = apart(simulation)
-    after, auc_after = before, auc_before
+        simulation = _drawn(_usable(simulation, judge)[0], judge, generator)
+    before, given = apart(simulation)
+    after, auc_before = before, told(given)
+    effects, courses = list[Mechanism](), list[float]()
     if repaired is not None:
-        drawn, lacks = _drawn(repaired, judge, generator)
-        after, auc_after = apart(drawn)
-    again, auc_again = apart(recording)
+        model, lacks = _usable(repaired, judge)
+        known = _usable(replace(repaired, effects=repaired.effects[:n_known]), judge)[0]
+        for n in range(len(known.effects) + 1, len(model.effects) + 1):
+            after, given = apart(_drawn(replace(model, effects=model.effects[:n]), judge, generator))
+            effects.append(model.effects[n - 1])
+            courses.append(float(after.mean()))
+    auc_after = told(given)
+    again, given = apart(recording)
+    auc_again = told(given)
     less = before - after
     helps = float(less.mean()) > _BETTER_SD * float(less.std()) / N_FOLDS**0.5
     return Judged(
@@ -150,16 +168,26 @@ def judged(
         auc_repeatability=auc_again,
         helps=helps and repaired is not None,
         lacks=lacks,
+        shares=shares_of(float(before.mean()), effects, courses),
     )
 
 
-def _drawn(model: RepairedModel, judge: Recording | Tensor, generator: torch.Generator) -> tuple[Any, tuple[str, ...]]:
-    """Samples of a repaired simulation for another recording, and the channels that this lacks to follow."""
+def _usable(model: RepairedModel, judge: Recording | Tensor) -> tuple[RepairedModel, tuple[str, ...]]:
+    """A repaired simulation for another recording, and the channels that this lacks to follow."""
     model = model.elsewhere()
-    signal, channels = (judge.signal, judge.channels) if isinstance(judge, Recording) else (judge, {})
-    whole = {name: values for name, values in channels.items() if bool(values.isfinite().all())}
-    lacks = tuple(sorted({name for effect in model.effects for name in effect.follows} - {*whole}))
-    model = replace(model, effects=tuple(effect for effect in model.effects if not {*effect.follows} & {*lacks}))
-    records = model.simulate(signal.shape[-1], batch=(_RECORDS,), channels=whole, generator=generator)
+    lacks = tuple(sorted({name for effect in model.effects for name in effect.follows} - {*_whole_channels(judge)}))
+    return replace(model, effects=tuple(e for e in model.effects if not {*e.follows} & {*lacks})), lacks
+
+
+def _whole_channels(judge: Recording | Tensor) -> dict[str, Tensor]:
+    """Its channels that lack no sample."""
+    channels = judge.channels if isinstance(judge, Recording) else {}
+    return {name: values for name, values in channels.items() if bool(values.isfinite().all())}
+
+
+def _drawn(model: RepairedModel, judge: Recording | Tensor, generator: torch.Generator) -> Recording | Tensor:
+    """Samples of a repaired simulation for another recording."""
+    n = (judge.signal if isinstance(judge, Recording) else judge).shape[-1]
+    records = model.simulate(n, batch=(_RECORDS,), channels=_whole_channels(judge), generator=generator)
     drawn = records.movedim(0, 1).flatten(1)
-    return (Recording(drawn, rate=judge.rate, unit=judge.unit) if isinstance(judge, Recording) else drawn), lacks
+    return Recording(drawn, rate=judge.rate, unit=judge.unit) if isinstance(judge, Recording) else drawn

@@ -16,18 +16,27 @@ from gyrofuse.mismatch.mechanisms.catalogue import STAGES, named
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
 from gyrofuse.mismatch.reporting.figures_data import VarianceComparison, compared_powers, grouped_spectrum
 from gyrofuse.mismatch.reporting.outcome import Outcome
-from gyrofuse.mismatch.reporting.plots import ends_of_colours, plot_blocks, plot_deviations, plot_map, plot_spectra
+from gyrofuse.mismatch.reporting.plots import (
+    ends_of_colours,
+    plot_blocks,
+    plot_deviations,
+    plot_map,
+    plot_shares,
+    plot_spectra,
+)
 from gyrofuse.mismatch.reporting.text import (
     ALIKE,
     benefit_of,
     capital,
     family_words,
     fused_words,
+    judged_shares,
     nats,
     otherwise_words,
     parameter_words,
     verdict,
 )
+from gyrofuse.mismatch.selection.shares import Share
 from gyrofuse.mismatch.signals.comparison import Comparison, block_means
 
 if TYPE_CHECKING:
@@ -60,6 +69,7 @@ def mismatch_page(outcome: Outcome, *, title: str, remarks: Sequence[str] = ()) 
     lines = sorted({f.frequency_hz for f in outcome.findings if f.frequency_hz is not None})
     onsets = sorted({f.time_s for f in outcome.findings if f.time_s is not None})
     panels = len(both)
+    before, shares, judge = judged_shares(outcome)
     rows = 0.5 + 0.22 * min(comparison.n_sensors, 24)  # inches of a map
     return render(
         Path(__file__).parent / "mismatch.html.j2",
@@ -69,6 +79,8 @@ def mismatch_page(outcome: Outcome, *, title: str, remarks: Sequence[str] = ()) 
         info=info,
         verdict=[_typeset(sentence) for sentence in verdict(outcome)],
         remarks=remarks,
+        shares=image(_WIDTH, 0.8 + 0.26 * (len(shares) + 1), _draw_shares, before, shares) if shares else None,
+        judge=judge,
         parts=[_part(outcome, f) for f in outcome.findings],
         repaired=repaired,
         level_map=image(_WIDTH, panels * (rows + 0.75), _draw_maps, outcome, [v.z for v in variances]),
@@ -204,6 +216,10 @@ def _names(outcome: Outcome, which: tuple[int, ...]) -> str:
     names = [outcome.comparison.info.sensors[i] for i in which]
     more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
     return ", ".join(names[:_MOST_NAMED]) + more
+
+
+def _draw_shares(figure: Figure, before: float, shares: Sequence[Share]) -> None:
+    plot_shares(before, shares, ax=figure.subplots())
 
 
 def _draw_finding(figure: Figure, finding: Finding) -> None:

@@ -23,11 +23,14 @@ from gyrofuse._base.axes import (
     new_axes,
     with_unit,
 )
+from gyrofuse._base.results import readable
 from gyrofuse.fusion.plots import allan_deviation, time_axis
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.collections import QuadMesh
+
+    from gyrofuse.mismatch.selection.shares import Share
 
 _LEAST, _MOST = 4.0, 12.0  # standard deviations at the ends of the colours
 _UNKNOWN = "#d9d9d9"
@@ -91,6 +94,52 @@ def plot_map(
     finish(ax)
     ax.grid(visible=False)
     _colour_scale(ax, mesh)
+    return ax
+
+
+def plot_shares(before: float, shares: Sequence[Share], *, ax: Axes | None = None) -> Axes:
+    """Draw how far repair after repair brings a discrepancy down, with the share of it that each carries.
+
+    Args:
+        before: Discrepancy per degree of freedom before any repair.
+        shares: Shares in the order of the repairs.
+        ax: Where to draw; new axes by default.
+
+    Returns:
+        The axes.
+    """
+    ax = ax if ax is not None else new_axes()
+    start = before
+    for row, share in enumerate(shares):
+        colour = BLUE if share.identified else FRAME
+        ax.barh(row, share.discrepancy - start, left=start, height=0.55, color=colour, zorder=3)
+        ax.annotate(
+            f"{100 * share.share:.3g} %",
+            (max(start, share.discrepancy), row),
+            (4, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=TICK_SIZE,
+            color=INK,
+        )
+        start = share.discrepancy
+    last = len(shares)
+    left = 1 - sum(share.share for share in shares)
+    ax.barh(last, start - 1, left=1, height=0.55, color=ORANGE, zorder=3)
+    ax.annotate(
+        f"{100 * left:.3g} %", (max(start, 1), last), (4, 0), textcoords="offset points", va="center",
+        fontsize=TICK_SIZE, color=INK,
+    )  # fmt: skip
+    ax.axvline(1, color=INK, linewidth=0.8, zorder=2)
+    ax.set_xscale("log")
+    ends = [1.0, before, *(share.discrepancy for share in shares)]
+    ax.set_xlim(min(ends) / 1.3, max(ends) * (max(ends) / min(ends)) ** 0.12 * 1.1)
+    names = [readable(share.name) if share.identified else f"{readable(share.name)} (no name)" for share in shares]
+    ax.set_yticks(range(last + 1), [*names, "left"], parse_math=False)
+    ax.set_ylim(last + 0.6, -0.6)
+    ax.set_xlabel("discrepancy (1 = noise alone)")
+    finish(ax)
+    ax.grid(visible=False, axis="y")
     return ax
 
 

@@ -19,6 +19,7 @@ from gyrofuse.mismatch.reporting.text import (
     otherwise_words,
     paired_words,
     parameter_words,
+    share_words,
 )
 
 if TYPE_CHECKING:
@@ -69,7 +70,7 @@ class MismatchReport(Outcome):
             f"{paired_words(h)}log score: {family_words(h)}; a classifier tells the two apart with an area under the "
             f"curve of {h.auc_before:.2f} before and {h.auc_after:.2f} after (0.5 = guessing)"
         )
-        return "\n".join([*lines, *self.notes, *judged_words(self), *fused_words(self)])
+        return "\n".join([*lines, *self.notes, *judged_words(self), *share_words(self), *fused_words(self)])
 
     def __str__(self) -> str:
         return self.summary()

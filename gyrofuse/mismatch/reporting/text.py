@@ -10,6 +10,7 @@ from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.reporting.benefit import Benefit
 from gyrofuse.mismatch.reporting.outcome import Outcome
 from gyrofuse.mismatch.selection.held_out import HeldOut
+from gyrofuse.mismatch.selection.shares import Share
 
 ALIKE = 0.01  # relative change of a variance that is not worth a word
 
@@ -37,7 +38,7 @@ def verdict(outcome: Outcome) -> list[str]:
     left = ", ".join(readable(e.test) for e in outcome.unexplained)
     sentences.append(f"Unexplained, as seen by: {left}." if left else "After the repair no test sees a difference.")
     sentences += dict.fromkeys(effect.remark for effect in outcome.model.effects if effect.remark)
-    judged = [f"{words}." for words in judged_words(outcome)]
+    judged = [f"{words}." for words in (*judged_words(outcome), *share_words(outcome))]
     return [*sentences, *outcome.notes, *judged, *fused_words(outcome)]
 
 
@@ -52,6 +53,28 @@ def otherwise_words(finding: Finding) -> str:
         alike = "is likelier, and "
     more = f"{nats(abs(less))} nats {'less' if less >= 0 else 'more'}"
     return f"{start} {alike}would gain {more} (held out, standard deviation {nats(sd)})"
+
+
+def share_words(outcome: Outcome) -> list[str]:
+    """One sentence on what carries the discrepancy: physics with names, curves without, and what is left."""
+    before, shares, where = judged_shares(outcome)
+    if not shares:
+        return []
+    named = 100 * sum(share.share for share in shares if share.identified)
+    unnamed = 100 * sum(share.share for share in shares if not share.identified)
+    left = 100 - named - unnamed
+    known = f", curves without a name {unnamed:.3g} %" if any(not share.identified for share in shares) else ""
+    return [
+        f"Of the discrepancy above noise alone, {before - 1:.3g} {where}, mechanisms with names carry {named:.3g} %"
+        f"{known}; {left:.3g} % is left"
+    ]
+
+
+def judged_shares(outcome: Outcome) -> tuple[float, tuple[Share, ...], str]:
+    """Discrepancy before any repair, what each takes away, and where: on the judge where there is one."""
+    if outcome.judged is not None:
+        return outcome.judged.before, outcome.judged.shares, "on the other recording"
+    return outcome.held_out.before, outcome.held_out.shares, "on data held out"
 
 
 def fused_words(outcome: Outcome) -> list[str]:

@@ -21,7 +21,7 @@ from gyrofuse.wavelets.covariance import wavelet_cross_covariance
 _FARTHER = 1.5  # times the discrepancy: 587 arrays with effects that were repaired had at most 1.2
 _FEWEST_SIMULATED = 8  # blocks of a simulation, for their scatter to be known
 _SHORTEST = 8  # a block is so many times as long as its longest wavelet
-_EXPLAINED = 2.0  # discrepancy per degree of freedom, where noise alone gives 1, above which something is left
+EXPLAINED = 2.0  # discrepancy per degree of freedom, where noise alone gives 1, above which something is left
 
 
 @derived
@@ -110,7 +110,7 @@ def discrepancy_left(comparison: Comparison, after: float) -> TestResult | None:
     if comparison.reference.lines:  # whose power hardly scatters from block to block: it would stand out by little
         comparison = _without_lines(comparison)
         after = mean_discrepancy(comparison)
-    if not after > _EXPLAINED:
+    if not after > EXPLAINED:
         return None
     moments = _reference_moments(comparison)
     observed = _block_moments(_cut(comparison.recording, _length(comparison)))

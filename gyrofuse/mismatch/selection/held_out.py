@@ -11,6 +11,7 @@ from torch import Tensor
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.selection.classifier import distinguishability
 from gyrofuse.mismatch.selection.discrepancy import differences_of_fold, discrepancy_of_fold, paired_discrepancy
+from gyrofuse.mismatch.selection.shares import Share, shares_of
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, in_fold, sd_of_sum
 from gyrofuse.mismatch.stats.limits import Z
@@ -82,6 +83,7 @@ class HeldOut(NamedTuple):
         families: Log score of the findings of each likelihood, by its name.
         paired: Where something follows a channel of the recording, the discrepancy after it by the scatter of the
             recording's own blocks; else None.
+        shares: Of the discrepancy, in the order of the repairs.
     """
 
     before: float
@@ -93,6 +95,7 @@ class HeldOut(NamedTuple):
     auc_after: float
     families: dict[str, FamilyScore]
     paired: float | None = None
+    shares: tuple[Share, ...] = ()
 
     def to_dict(self) -> dict[str, object]:
         """Plain numbers, ready for JSON."""
@@ -103,6 +106,7 @@ class HeldOut(NamedTuple):
             "before": self.before,
             "after": self.after,
             "paired": self.paired,
+            "shares": [share._asdict() for share in self.shares],
             "gain": gain,
             "families": families,
             "auc": auc,
@@ -133,13 +137,20 @@ def agreement(start: Comparison, scores: Sequence[HeldOutScore], generator: torc
         generator: Source of the random numbers of what is applied to the simulation.
     """
     before = after = [(discrepancy_of_fold(start, fold), distinguishability(start, fold)) for fold in range(N_FOLDS)]
-    paired = []
+    paired, courses = [], torch.zeros(N_FOLDS, len(scores), dtype=torch.float64)
     if scores:
         after = []
         for fold in range(N_FOLDS):
-            left, simulated = _after_repairs(start, scores, fold, generator)
-            after.append((discrepancy_of_fold(left, fold), distinguishability(simulated, fold)))
-            if any(score.by_fold[fold].follows for score in scores):
+            left, effects = start, list[Mechanism]()
+            for k, score in enumerate(scores):
+                effect = score.by_fold[fold]
+                if effect.refit_after_others:
+                    effect = effect.fit_without(left, fold)
+                left = effect.repair(left, generator)
+                courses[fold, k] = discrepancy_of_fold(left, fold)
+                effects.append(effect)
+            after.append((float(courses[fold, -1]), distinguishability(_simulated(start, effects, generator), fold)))
+            if any(effect.follows for effect in effects):
                 paired.append(differences_of_fold(left, fold))
     (d, auc), (d_after, auc_after) = (
         torch.tensor(folds, dtype=torch.float64).mean(0).tolist() for folds in (before, after)
@@ -149,24 +160,19 @@ def agreement(start: Comparison, scores: Sequence[HeldOutScore], generator: torc
         for name in dict.fromkeys(s.likelihood for s in scores)
     }
     return HeldOut(
-        d, d_after, *FamilyScore.of(scores), auc, auc_after, families, paired_discrepancy(paired) if paired else None
+        d,
+        d_after,
+        *FamilyScore.of(scores),
+        auc,
+        auc_after,
+        families,
+        paired=paired_discrepancy(paired) if paired else None,
+        shares=shares_of(d, [score.by_fold[0] for score in scores], courses.mean(0).tolist()),
     )
 
 
-def _after_repairs(
-    start: Comparison, scores: Sequence[HeldOutScore], fold: int, generator: torch.Generator
-) -> tuple[Comparison, Comparison]:
-    """The comparison repaired with the numbers that a fold leaves, and the recording as it came beside a simulation.
-
-    A recording that was cleaned shows that it was: a classifier gets all effects in the simulation.
-    """
-    left, effects = start, []
-    for effect in (score.by_fold[fold] for score in scores):
-        if effect.refit_after_others:
-            effect = effect.fit_without(left, fold)
-        left = effect.repair(left, generator)
-        effects.append(effect)
-    simulated = start
+def _simulated(start: Comparison, effects: Sequence[Mechanism], generator: torch.Generator) -> Comparison:
+    """The recording as it came beside a simulation with all effects: one that was cleaned shows that it was."""
     for effect in sorted(effects, key=lambda effect: effect.order):
-        simulated = effect.apply_to_reference(simulated, generator)
-    return left, simulated
+        start = effect.apply_to_reference(start, generator)
+    return start
