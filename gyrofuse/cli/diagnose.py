@@ -2,30 +2,38 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import torch
 import typer
 
 from gyrofuse._base.checks import same_rate
 from gyrofuse.cli.console import progress, progress_bar, say
-from gyrofuse.cli.options import Logs, Reading, Rest, Writing, stretch, takes_options
+from gyrofuse.cli.options import Reading, Rest, Writing, stretch, takes_options
 from gyrofuse.cli.reading import at_rest, model_grid, read_model, say_notes, titled, without_gaps
 from gyrofuse.io.recording import Recording
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.processes import Model
 
 if TYPE_CHECKING:
-    from gyrofuse.mismatch import MismatchReport
+    from gyrofuse.mismatch import MismatchReport, SessionsReport
     from gyrofuse.mismatch.repair.repaired_model import RepairedModel
+    from gyrofuse.mismatch.repair.session_model import SessionModel
 
 
 @takes_options
 def diagnose(
     *,
-    logs: Logs,
+    logs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="LOG...", help="The recording. Several files are recordings of one device, or one array; see below."
+        ),
+    ],
     simulation: Annotated[
         Path,
         typer.Option(metavar="SIM", help="What a simulator gives for the same array: a recording, or a model, .json."),
@@ -44,6 +52,14 @@ def diagnose(
         int | None,
         typer.Option(metavar="N", help="Samples of each sensor that a model was estimated from, if its file lacks it."),
     ] = None,
+    apart: Annotated[
+        bool | None,
+        typer.Option(
+            "--apart/--together",
+            help="Whether several files are recordings taken one after the other, or one array.",
+            show_default="whether each has all the sensors of SIM",
+        ),
+    ] = None,
     rest: Rest = None,
     reading: Reading,
     corrected: Annotated[
@@ -59,95 +75,159 @@ def diagnose(
     The verdict comes first; it is no error to find something. Spectra need records without gaps: where samples are
     missing, the longest stretch without them is diagnosed, and named. With --judge another log of the device, at the
     same rate and of the same sensors, shows how far the simulation is from it before and after the repair, and how far
-    the two logs are apart.
+    the two logs are apart. Several files are one array, aligned on their clocks; where each has all the sensors of the
+    simulation, or with --apart, they are recordings of one device taken one after the other: what all have is the
+    device's, what differs a session's, and the repaired simulation draws sessions.
     """
     resting = stretch(rest)
     inputs = [*logs, reading.mounting, simulation, judge]
+    several = len(logs) > 1 and (_each_is_whole(logs, simulation, reading) if apart is None else apart)
+    if several and (corrected or twins):
+        raise ValueError(
+            f"`--{'corrected' if corrected else 'twins'}`: expected with a single recording, got {len(logs)}; give "
+            "them one by one, or --together if they are one array"
+        )
+    groups = [[log] for log in logs] if several else [logs]
     with writing.files(inputs, corrected=corrected, model_out=model_out) as files:
-        recording = _one_axis(reading.read(logs), titled(logs))
-        recording = _as_the_model(recording, simulation)
-        simulated = _simulation(simulation, recording, reading)
+        recordings = [_as_the_model(_one_axis(reading.read(group), titled(group)), simulation) for group in groups]
+        simulated = _simulation(simulation, recordings[0], reading)
         judging = None
         if judge is not None:
-            judging = _one_axis(reading.read([judge]), judge.name)
-            judging = _as_the_model(judging, simulation)
-        part = at_rest(recording, resting)
-        names = {
-            "`recording`": titled(logs),
-            "`simulation`": str(simulation),
-            "`judge`": "" if judge is None else judge.name,
-        }
-        found, remarks = _diagnosed(part, simulated, judging, names, false_alarm, twins, fitted_samples)
-        remarks += _units_taken(recording, simulated, (titled(logs), simulation.name))
-        if corrected:
-            whole, _ = without_gaps(part, "", 0)
-            clean = found.correct(whole)
-            clean.save(files.draft("corrected"), force=True)
-            if torch.equal(clean.signal, whole.signal):
-                remarks.append(f"Nothing was found that can be taken off: {corrected} is the recording as it came.")
+            judging = _as_the_model(_one_axis(reading.read([judge]), judge.name), simulation)
+        names = [titled(group) for group in groups]
+        if len({*names}) < len(names):  # in different folders
+            names = [str(log) for log in logs]
+        parts = {name: at_rest(one, resting) for name, one in zip(names, recordings, strict=True)}
+        search = _Search(simulated, judging, str(simulation), judge.name if judge else "", false_alarm, fitted_samples)
+        found: MismatchReport | SessionsReport
+        if several:
+            found, remarks = search.several(parts)
+        else:
+            found, remarks = search.one(names[0], parts[names[0]], twins)
+            if corrected:
+                remarks += _save_corrected(found, parts[names[0]], corrected, files.draft("corrected"))
+        remarks += _units_taken(recordings[0], simulated, (names[0], simulation.name))
         files.write_json(lambda: found.model.to_dict(), "model-out")
         if writing.report:
             with progress("drawing"):
-                notes = [f"{titled(logs)}: {note}" for note in recording.notes]
+                notes = [f"{name}: {note}" for name, part in parts.items() for note in part.notes]
                 if isinstance(simulated, Recording):
                     notes += [f"{simulation.name}: {note}" for note in simulated.notes]
                 title = f"{titled(logs)} against {simulation.name}"
                 found.to_html(files.draft("report"), title=title, remarks=[*remarks, *notes])
-        sources: dict[str, object] = {"recording": list(recording.source), "simulation": simulation.name}
+        sources: dict[str, object] = {
+            "recording": [source for one in recordings for source in one.source],
+            "simulation": simulation.name,
+        }
         if judge is not None:
             sources["judge"] = judge.name
         files.write_json(lambda: {**sources, **found.to_dict()})
     say("\n".join([found.summary(), *remarks]))
-    say_notes(recording)
+    for one in recordings:
+        say_notes(one)
 
 
-def _diagnosed(
-    recording: Recording,
-    simulation: Recording | Model | ArrayModel | RepairedModel,
-    judge: Recording | None,
-    names: dict[str, str],
-    false_alarm: float,
-    twins: int,
-    fitted_samples: int | None,
-) -> tuple[MismatchReport, list[str]]:
-    """Report on the longest stretch without gaps, and remarks on it; errors name the file and the option at fault."""
-    from gyrofuse.mismatch import diagnose as find_mismatch
-    from gyrofuse.mismatch.repair.inputs import FEWEST
+@dataclass(frozen=True)
+class _Search:
+    """A diagnosis of the longest stretches without gaps; its errors name the file and the option at fault.
 
-    with progress_bar("comparing") as show:
-        if isinstance(simulation, Recording):
-            simulation, lacking = without_gaps(simulation, "Simulation: compared", 0)
-        else:
-            lacking = []
-        try:
+    Attributes:
+        simulation: What recordings are compared with.
+        judge: Another recording of the device.
+        simulation_name: Name of its file.
+        judge_name: Name of its file.
+        false_alarm: Value of `--false-alarm`.
+        fitted_samples: Value of `--fitted-samples`.
+    """
+
+    simulation: Recording | Model | ArrayModel | RepairedModel | SessionModel
+    judge: Recording | None
+    simulation_name: str
+    judge_name: str
+    false_alarm: float
+    fitted_samples: int | None
+
+    def one(self, name: str, recording: Recording, twins: int) -> tuple[MismatchReport, list[str]]:
+        """Report on a recording, and remarks on it."""
+        from gyrofuse.mismatch import diagnose as find_mismatch
+        from gyrofuse.mismatch.repair.inputs import FEWEST
+
+        with progress_bar("comparing") as show, self._named({"`recording`": name, "`LOG`": name}):
+            options, lacking = self._options()
             part, remarks = without_gaps(recording, "Diagnosed", FEWEST)
-            if judge is not None:
-                judge, gaps = without_gaps(judge, f"{names['`judge`']}: judged", 0)
-                lacking += gaps
-            found = find_mismatch(
-                part,
-                simulation,
-                false_alarm=false_alarm,
-                twins=twins,
-                fitted_samples=fitted_samples,
-                judge=judge,
-                progress=show,
-            )
-            start = float(part.time[0])
-            if start and found.mismatch:
-                remarks.append(f"Times count from the first sample that was diagnosed, at {start:.6g} s of the log.")
-            return found, remarks + lacking
+            found = find_mismatch(part, **options, twins=twins, progress=show)
+        start = float(part.time[0])
+        if start and found.mismatch:
+            remarks.append(f"Times count from the first sample that was diagnosed, at {start:.6g} s of the log.")
+        return found, remarks + lacking
+
+    def several(self, recordings: Mapping[str, Recording]) -> tuple[SessionsReport, list[str]]:
+        """Report on several recordings of one device by name, and remarks on them."""
+        from gyrofuse.mismatch import diagnose_sessions
+        from gyrofuse.mismatch.repair.inputs import FEWEST
+
+        with progress_bar("comparing") as show, self._named({"`recordings`": "LOG"}):
+            options, remarks = self._options()
+            parts = []
+            for name, recording in recordings.items():
+                with self._named({"`LOG`": name}):
+                    part, gaps = without_gaps(recording, f"{name}: diagnosed", FEWEST)
+                parts.append(part)
+                remarks += gaps
+            return diagnose_sessions(parts, **options, names=list(recordings), progress=show), remarks
+
+    def _options(self) -> tuple[dict[str, Any], list[str]]:
+        """What a diagnosis is given beside its recordings, and remarks on gaps of it."""
+        simulation, judge, remarks = self.simulation, self.judge, list[str]()
+        if isinstance(simulation, Recording):
+            simulation, gaps = without_gaps(simulation, "Simulation: compared", 0)
+            remarks += gaps
+        if judge is not None:
+            judge, gaps = without_gaps(judge, f"{self.judge_name}: judged", 0)
+            remarks += gaps
+        given = {"simulation": simulation, "judge": judge}
+        return {**given, "false_alarm": self.false_alarm, "fitted_samples": self.fitted_samples}, remarks
+
+    @contextmanager
+    def _named(self, names: Mapping[str, str]) -> Iterator[None]:
+        """Errors with files and options in the place of parameters."""
+        options = {"false_alarm": "--false-alarm", "twins": "--twins", "fitted_samples": "--fitted-samples"}
+        files = {"`simulation`": self.simulation_name, "`judge`": self.judge_name, **names}
+        try:
+            yield
         except (ValueError, TypeError) as error:
             message = str(error)
-            files = {**names, "`LOG`": names["`recording`"]}
-            options = {
-                "`false_alarm`": "`--false-alarm`",
-                "`twins`": "`--twins`",
-                "`fitted_samples`": "`--fitted-samples`",
-            }
-            for parameter, name in {**files, **options}.items():
+            for parameter, name in {**files, **{f"`{p}`": f"`{option}`" for p, option in options.items()}}.items():
                 message = message.replace(parameter, name)
             raise type(error)(message) from None
+
+
+def _save_corrected(report: MismatchReport, recording: Recording, path: Path, draft: Path) -> list[str]:
+    """Save a recording without what can be taken off it; a remark where that is nothing."""
+    whole, _ = without_gaps(recording, "", 0)
+    clean = report.correct(whole)
+    clean.save(draft, force=True)
+    if not torch.equal(clean.signal, whole.signal):
+        return []
+    return [f"Nothing was found that can be taken off: {path} is the recording as it came."]
+
+
+def _each_is_whole(logs: Sequence[Path], simulation: Path, reading: Reading) -> bool:
+    """Whether the first log alone has all the sensors of the simulation, so that others are further recordings."""
+    from gyrofuse.mismatch.repair.session_model import SessionModel
+
+    model: Any = read_model(simulation) if simulation.suffix.lower() == ".json" else None
+    if isinstance(model, Model):
+        n_sensors = model.params.shape[:-1].numel()
+    elif isinstance(model, ArrayModel):
+        n_sensors = model.n_sensors
+    elif model is not None:
+        n_sensors = len((model.models[0] if isinstance(model, SessionModel) else model).info.sensors)
+    first = _one_axis(reading.read(logs[:1]), logs[0].name)
+    if model is None:
+        simulated: Any = _simulation(simulation, first, reading)
+        n_sensors = simulated.n_sensors
+    return n_sensors > 1 and first.n_sensors == n_sensors
 
 
 def _units_taken(recording: Recording, simulation: object, names: tuple[str, str]) -> list[str]:
@@ -160,7 +240,9 @@ def _units_taken(recording: Recording, simulation: object, names: tuple[str, str
     return [f"Units: {pair[0]} states none; its numbers are taken as {pair[1]}."]
 
 
-def _simulation(path: Path, recording: Recording, reading: Reading) -> Recording | Model | ArrayModel | RepairedModel:
+def _simulation(
+    path: Path, recording: Recording, reading: Reading
+) -> Recording | Model | ArrayModel | RepairedModel | SessionModel:
     """Content of SIM: a model, or a recording of the same sensors and axis."""
     if path.suffix.lower() == ".json":
         return read_model(path)

@@ -18,6 +18,7 @@ from gyrofuse.noise.processes import Model
 
 if TYPE_CHECKING:
     from gyrofuse.mismatch.repair.repaired_model import RepairedModel
+    from gyrofuse.mismatch.repair.session_model import SessionModel
 
 _NO_MODEL = "expected a model in JSON, as to_dict() of a model gives it"
 
@@ -86,7 +87,7 @@ def say_notes(recording: Recording) -> None:
         say_table(("found", "where", "what"), rows)
 
 
-def read_model(path: Path) -> Model | ArrayModel | RepairedModel:
+def read_model(path: Path) -> Model | ArrayModel | RepairedModel | SessionModel:
     """Read a model from JSON: `to_dict()` of a model, of a fit, or of a simulation that a diagnosis repaired.
 
     Raises:
@@ -96,11 +97,11 @@ def read_model(path: Path) -> Model | ArrayModel | RepairedModel:
     try:
         if "processes" not in content and isinstance(content.get("model"), dict):
             content = content["model"]
-        if "effects" not in content:
+        if "effects" not in content and "sessions" not in content:
             return model_from_dict(content)
-        from gyrofuse.mismatch.repair.serialise import repaired_from_dict
+        from gyrofuse.mismatch.repair.serialise import repaired_from_dict, sessions_from_dict
 
-        return repaired_from_dict(content)
+        return sessions_from_dict(content) if "sessions" in content else repaired_from_dict(content)
     except (ValueError, TypeError, AttributeError, RuntimeError, OverflowError, LookupError) as error:
         raise ValueError(f"{path}: {_NO_MODEL}: {error}") from None
 

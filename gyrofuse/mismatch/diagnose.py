@@ -60,7 +60,7 @@ def diagnose(
             model, one for all sensors, with batched parameters one for each, or an `ArrayModel`; a fit of any kind
             (`fit_gmwm`, `fit_array_gmwm`, `fit_gmwm_joint`, `rank_models`), which stands for its model; or a simulation
             that another diagnosis repaired (`report.model`), whose effects then count as known; what happened once (a
-            step, an episode) does where the recording has it.
+            step, an episode) does where the recording has it. One that draws sessions stands for samples of all.
         false_alarm: Probability of a finding where nothing is missing.
         rate: Hz, for recordings given as tensors; 1 by default.
         fitted_samples: Samples of each sensor that a model was estimated from, where it does not know: models of fits
@@ -90,7 +90,7 @@ def diagnose(
         generator = torch.Generator().manual_seed(0)
     level = sidak_level(false_alarm, len(TESTS))  # p value of one test that makes a mismatch of all
     recording, judge = on_processor(recording), on_processor(judge)
-    simulation = on_processor(modelled(simulation, fitted_samples))
+    simulation = on_processor(modelled(simulation, recording, fitted_samples))
     given = prepared(recording, simulation, rate, generator)
     if judge is not None:
         judge = checked_judge(judge, recording, rate)
@@ -102,7 +102,11 @@ def diagnose(
         p_value = monte_carlo_p_value(p_value, twin_p_values(start, twins, generator))
 
     def report(made: RepairedModel | None, **found: Any) -> MismatchReport:
-        verdict = None if judge is None else judged(judge, recording, simulation, made, rate, len(own))
+        verdict = (
+            None
+            if judge is None
+            else judged(judge, [recording], simulation, [] if made is None else [made], rate, len(own))
+        )
         fitted = isinstance(simulation, Model | ArrayModel) and simulation.estimated_from is None
         notes = (KNOWN,) if fitted else () if found["fit"] is None else (found["fit"].words,)
         return MismatchReport(

@@ -40,7 +40,7 @@ def fitted(seed=0, n=SHORT, n_sensors=1):
 
 
 def comparison(recording, simulation, fitted_samples=None):
-    return prepared(recording, modelled(simulation, fitted_samples), None, torch.Generator().manual_seed(0))
+    return prepared(recording, modelled(simulation, recording, fitted_samples), None, torch.Generator().manual_seed(0))
 
 
 @functools.cache

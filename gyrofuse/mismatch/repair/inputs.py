@@ -18,6 +18,7 @@ from gyrofuse.fitting.ranking.result import RankResult
 from gyrofuse.io.recording import Recording
 from gyrofuse.mismatch.detectors.variance.level_spread import with_spread
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel
+from gyrofuse.mismatch.repair.session_model import SessionModel
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.fitted_spectra import SpectralUncertainty, as_array
 from gyrofuse.mismatch.signals.known_lines import amplitudes
@@ -29,7 +30,16 @@ from gyrofuse.noise.parsing import model_from_dict
 
 # Whatever a diagnosis takes for a simulation.
 Simulation = (
-    Recording | Tensor | Model | ArrayModel | RepairedModel | GMWMResult | ArrayGMWMResult | JointFit | RankResult
+    Recording
+    | Tensor
+    | Model
+    | ArrayModel
+    | RepairedModel
+    | SessionModel
+    | GMWMResult
+    | ArrayGMWMResult
+    | JointFit
+    | RankResult
 )
 FEWEST = 4096
 # Of a model: records as long as the recording. The information on an effect grows as m/(1 + m), the work as m.
@@ -60,12 +70,13 @@ def on_processor(given: Any) -> Any:
 
 
 def modelled(
-    simulation: Simulation, fitted_samples: int | None = None
+    simulation: Simulation, recording: Recording | Tensor, fitted_samples: int | None = None
 ) -> Recording | Tensor | Model | ArrayModel | RepairedModel:
     """The simulation as samples or a model that knows what it was estimated from; that of a fit is its model.
 
     Args:
         simulation: Samples, a model, or a fit.
+        recording: What it is compared with; of a model that draws sessions, samples for it are taken.
         fitted_samples: Of each sensor, that a model without a record of its own was estimated from.
 
     Raises:
@@ -82,6 +93,8 @@ def modelled(
         simulation = ArrayModel.from_sensors(best)
     if isinstance(simulation, GMWMResult | ArrayGMWMResult | JointFit):
         simulation = simulation.model
+    if isinstance(simulation, SessionModel):
+        return _sessions(simulation, recording)
     if fitted_samples is None:
         return simulation
     check_positive_integer("fitted_samples", fitted_samples)
@@ -95,6 +108,20 @@ def modelled(
     if isinstance(simulation, Model):
         return Model([simulation], estimated_from=source)
     return ArrayModel(simulation.components, estimated_from=source)
+
+
+def _sessions(model: SessionModel, recording: Recording | Tensor) -> Recording | Tensor:
+    """Samples of a model that draws sessions, of each session as many, for a recording."""
+    generator = torch.Generator().manual_seed(0)
+    n_sessions = len(model.models)
+    n_records = -(-_FEWEST_RECORDS // n_sessions) * n_sessions
+    if not isinstance(recording, Recording):
+        return model.simulate(recording.shape[-1], batch=(n_records,), generator=generator).movedim(0, 1).flatten(1)
+    model.check(recording.rate, recording.unit, recording.channels)
+    drawn = model.simulate(
+        recording.n_samples, batch=(n_records,), channels=recording.channels, generator=generator
+    ).movedim(0, 1)
+    return Recording(drawn.flatten(1), rate=recording.rate, unit=recording.unit)
 
 
 def prepared(

@@ -19,6 +19,7 @@ from gyrofuse._base.checks import check_n_samples, check_positive
 from gyrofuse.mismatch.mechanisms.catalogue import CATALOGUE
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel
+from gyrofuse.mismatch.repair.session_model import SessionModel
 from gyrofuse.mismatch.signals.comparison import RecordingInfo
 from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.noise.array_model import ArrayModel
@@ -60,6 +61,22 @@ def repaired_from_dict(description: Mapping[str, Any]) -> RepairedModel:
     for k, effect in enumerate(effects):
         _try(model, effect, f"effects.{k}")
     return model
+
+
+def sessions_from_dict(description: Mapping[str, Any]) -> SessionModel:
+    """Rebuild the simulation of several sessions whose `to_dict` gave `description`.
+
+    Raises:
+        ValueError: No session, one that `repaired_from_dict` refuses, or sessions of different arrays.
+    """
+    entries = description.get("sessions")
+    if not isinstance(entries, list) or not entries or not all(isinstance(entry, Mapping) for entry in entries):
+        raise _wrong("sessions", "a list of repaired simulations", entries)
+    models = tuple(map(repaired_from_dict, entries))
+    grids = {(model.info.rate, model.info.unit, len(model.info.sensors)) for model in models}
+    if len(grids) > 1:
+        raise _wrong("sessions", "one rate, unit and number of sensors", str(sorted(grids)))
+    return SessionModel(models)
 
 
 def _effect(entry: Mapping[str, Any], where: str, n_sensors: int) -> Mechanism:

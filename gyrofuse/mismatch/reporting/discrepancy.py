@@ -40,7 +40,7 @@ def discrepancy(
     """
     if generator is None:
         generator = torch.Generator().manual_seed(0)
-    simulation = modelled(simulation)
+    simulation = modelled(simulation, recording)
     given = prepared(recording, simulation, rate, generator)
     return mean_discrepancy(compared(given, simulation, generator))
 

@@ -6,6 +6,7 @@ far two recordings of the device are apart is what no simulation that knows noth
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,6 +18,7 @@ from gyrofuse.io.recording import Recording
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.repair.inputs import prepared
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel
+from gyrofuse.mismatch.repair.session_model import SessionModel
 from gyrofuse.mismatch.reporting.discrepancy import compared
 from gyrofuse.mismatch.selection.classifier import distinguishability
 from gyrofuse.mismatch.selection.discrepancy import discrepancy_of_fold
@@ -111,19 +113,19 @@ def checked_judge(judge: Any, recording: Recording | Tensor, rate: float | None)
 
 def judged(
     judge: Recording | Tensor,
-    recording: Recording | Tensor,
+    recordings: Sequence[Recording | Tensor],
     simulation: Recording | Tensor | Model | ArrayModel | RepairedModel,
-    repaired: RepairedModel | None,
+    repaired: Sequence[RepairedModel],
     rate: float | None,
     n_known: int = 0,
 ) -> Judged:
-    """Set a simulation, the repaired one, and the recording against another recording.
+    """Set a simulation, the repaired one, and the recordings behind it against another recording.
 
     Args:
         judge: As `checked_judge` gives it.
-        recording: What was diagnosed.
+        recordings: What was diagnosed; the other recording is as far from them as from one of them in the mean.
         simulation: As it came.
-        repaired: What the diagnosis made of it; None where there was nothing to repair.
+        repaired: What the diagnosis made of it for each recording; none where there was nothing to repair.
         rate: Hz, of tensors.
         n_known: Number of effects, the first, that the simulation had as it came.
     """
@@ -147,26 +149,29 @@ def judged(
     before, given = apart(simulation)
     after, auc_before = before, told(given)
     effects, courses = list[Mechanism](), list[float]()
-    if repaired is not None:
-        model, lacks = _usable(repaired, judge)
-        known = _usable(replace(repaired, effects=repaired.effects[:n_known]), judge)[0]
+    if len(repaired) > 1:
+        usable = [_usable(model, judge) for model in repaired]
+        lacks = tuple(sorted({name for _, missing in usable for name in missing}))
+        after, given = apart(_drawn(SessionModel(tuple(model for model, _ in usable)), judge, generator))
+    elif repaired:
+        model, lacks = _usable(repaired[0], judge)
+        known = _usable(replace(repaired[0], effects=repaired[0].effects[:n_known]), judge)[0]
         for n in range(len(known.effects) + 1, len(model.effects) + 1):
             after, given = apart(_drawn(replace(model, effects=model.effects[:n]), judge, generator))
             effects.append(model.effects[n - 1])
             courses.append(float(after.mean()))
     auc_after = told(given)
-    again, given = apart(recording)
-    auc_again = told(given)
+    again = [apart(recording) for recording in recordings]
     less = before - after
     helps = float(less.mean()) > _BETTER_SD * float(less.std()) / N_FOLDS**0.5
     return Judged(
         before=float(before.mean()),
         after=float(after.mean()),
-        repeatability=float(again.mean()),
+        repeatability=sum(float(folds.mean()) for folds, _ in again) / len(again),
         auc_before=auc_before,
         auc_after=auc_after,
-        auc_repeatability=auc_again,
-        helps=helps and repaired is not None,
+        auc_repeatability=sum(told(given) for _, given in again) / len(again),
+        helps=helps and bool(repaired),
         lacks=lacks,
         shares=shares_of(float(before.mean()), effects, courses),
     )
@@ -185,9 +190,13 @@ def _whole_channels(judge: Recording | Tensor) -> dict[str, Tensor]:
     return {name: values for name, values in channels.items() if bool(values.isfinite().all())}
 
 
-def _drawn(model: RepairedModel, judge: Recording | Tensor, generator: torch.Generator) -> Recording | Tensor:
-    """Samples of a repaired simulation for another recording."""
+def _drawn(
+    model: RepairedModel | SessionModel, judge: Recording | Tensor, generator: torch.Generator
+) -> Recording | Tensor:
+    """Samples of a repaired simulation for another recording, every session as often."""
     n = (judge.signal if isinstance(judge, Recording) else judge).shape[-1]
-    records = model.simulate(n, batch=(_RECORDS,), channels=_whole_channels(judge), generator=generator)
+    n_sessions = len(model.models) if isinstance(model, SessionModel) else 1
+    n_records = -(-_RECORDS // n_sessions) * n_sessions
+    records = model.simulate(n, batch=(n_records,), channels=_whole_channels(judge), generator=generator)
     drawn = records.movedim(0, 1).flatten(1)
     return Recording(drawn, rate=judge.rate, unit=judge.unit) if isinstance(judge, Recording) else drawn

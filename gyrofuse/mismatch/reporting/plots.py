@@ -143,6 +143,32 @@ def plot_shares(before: float, shares: Sequence[Share], *, ax: Axes | None = Non
     return ax
 
 
+def plot_recordings(names: Sequence[str], ends: Sequence[tuple[float, float]], *, ax: Axes | None = None) -> Axes:
+    """Draw the discrepancy of each recording, from before its repair to after it.
+
+    Args:
+        names: Of the recordings.
+        ends: Discrepancies per degree of freedom before and after.
+        ax: Where to draw; new axes by default.
+
+    Returns:
+        The axes.
+    """
+    ax = ax if ax is not None else new_axes()
+    rows = np.arange(len(names))
+    before, after = np.array(ends, dtype=float).reshape(-1, 2).T
+    ax.hlines(rows, after, before, color=FRAME, linewidth=1.5, zorder=2)
+    handles = ax.plot(before, rows, "o", color=ORANGE, zorder=3) + ax.plot(after, rows, "o", color=BLUE, zorder=4)
+    ax.axvline(1, color=INK, linewidth=0.8, zorder=1)
+    ax.set_xscale("log")
+    ax.set_yticks(rows, [clean_name(name) for name in names], parse_math=False)
+    ax.set_ylim(len(names) - 0.4, -0.6)
+    ax.set_xlabel("discrepancy (1 = noise alone)")
+    finish(ax, handles, ["before the repair", "after it"])
+    ax.grid(visible=False, axis="y")
+    return ax
+
+
 def ends_of_colours(*maps: Tensor) -> float:
     """Standard deviations at the ends of the colours of maps side by side."""
     sizes = torch.cat([z[z.isfinite()].abs() for z in maps])

@@ -8,6 +8,7 @@ from gyrofuse._base.linalg import SingularCovarianceError
 from gyrofuse._base.results import p_words, readable
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.reporting.benefit import Benefit
+from gyrofuse.mismatch.reporting.judge import Judged
 from gyrofuse.mismatch.reporting.outcome import Outcome
 from gyrofuse.mismatch.selection.held_out import HeldOut
 from gyrofuse.mismatch.selection.shares import Share
@@ -92,10 +93,18 @@ def fused_words(outcome: Outcome) -> list[str]:
 
 def judged_words(outcome: Outcome) -> list[str]:
     """One sentence on what another recording says of the repair, where one was given."""
-    j = outcome.judged
-    if j is None:
-        return []
-    if not outcome.mismatch:
+    return [] if outcome.judged is None else judge_words(outcome.judged, outcome.mismatch)
+
+
+def judge_words(judged: Judged, mismatch: bool) -> list[str]:
+    """One sentence on what another recording says of a repair.
+
+    Args:
+        judged: Its verdict.
+        mismatch: Whether there was anything to repair.
+    """
+    j = judged
+    if not mismatch:
         verdict = "there was nothing to repair"
     else:
         verdict = "the repair helps there" if j.helps else "the repair does not help there"
