@@ -5,6 +5,9 @@ the noise that the mean sensor has in the recording white, and leaves `h` as it 
 move from being guessed. All sums are kept block by block, so that every fold, set of rows and reach is solved from the
 same ones.
 
+What is slower than a block of a 256th of the record is left out: any two things that drift look alike there, and a
+response of a few samples cannot be told from a gain.
+
 The score of the blocks held out is a log likelihood ratio with numbers that they had no part in: its exponential is an
 e-value, in each fold and sensor, and so is the mean over these.
 """
@@ -18,8 +21,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gyrofuse._base.transforms import cosine_ordinates
-from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse._base.transforms import cosine_ordinates, fast_length
+from gyrofuse.mismatch.signals.comparison import N_BLOCKS, Comparison
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED, held_out_blocks, in_fold
 from gyrofuse.mismatch.signals.lines import with_factors
 from gyrofuse.mismatch.signals.psd import between_bands, narrow_bands
@@ -58,7 +61,7 @@ class ResponseSums:
     def _whitened(
         cls, comparison: Comparison, signal: Tensor, rows: Tensor, reach: int, density: Tensor
     ) -> ResponseSums:
-        y, a = (with_factors(x, density.rsqrt()) for x in (signal, rows))
+        y, a = (with_factors(x, _whitening(density)) for x in (signal, rows))
         n_lags, block = 2 * reach + 1, comparison.n_samples // N_JUDGED
         most = 2**16  # samples whose lagged rows are in memory at once
         gram, moment, power, counts = [], [], [], []
@@ -134,7 +137,7 @@ def responded(taps: Tensor, rows: Tensor) -> Tensor:
     """What sensors do, `(sensor, time)`, as rows `(row, time)` move; rows stay as they are beyond a record's ends."""
     reach, n = taps.shape[-1] // 2, rows.shape[-1]
     padded = torch.cat([rows[:, :1].expand(-1, reach), rows, rows[:, -1:].expand(-1, reach)], -1)
-    length = n + 4 * reach
+    length = fast_length(n + 4 * reach)
     response = torch.fft.rfft(taps.to(torch.float64), n=length)  # (sensor, row, bin)
     moved = torch.einsum("ikf,kf->if", response, torch.fft.rfft(padded, n=length))
     return torch.fft.irfft(moved, n=length)[:, 2 * reach : 2 * reach + n]
@@ -149,7 +152,7 @@ def _product(taps: Tensor) -> Tensor:
 def path_gains(comparison: Comparison, path: Tensor, fold: int) -> Tensor:
     """Log likelihood ratio of a path `(sensor, time)` in each block of a fold, in the noise it leaves, `(block,)`."""
     signal, path = (x - x.mean(-1, keepdim=True) for x in (comparison.recording, path))
-    factor = _smooth_density(comparison, signal - path).rsqrt()
+    factor = _whitening(_smooth_density(comparison, signal - path))
     y, s = (with_factors(x, factor) for x in (signal, path))
     variance = (y - s).square().mean(-1, keepdim=True)
     return held_out_blocks((y * s - s.square() / 2) / variance, fold).sum((0, -1))
@@ -160,6 +163,13 @@ def response_at(taps: Tensor, f: float) -> Tensor:
     reach = taps.shape[-1] // 2
     lags = torch.arange(-reach, reach + 1, dtype=torch.float64)
     return taps.to(torch.complex128) @ torch.polar(torch.ones_like(lags), -2 * math.pi * f * lags)
+
+
+def _whitening(density: Tensor) -> Tensor:
+    """Factors of cosine ordinates that leave noise of a density white but for what is slow."""
+    factors = density.rsqrt()
+    factors[:N_BLOCKS] = 0.0
+    return factors
 
 
 def _smooth_density(comparison: Comparison, signal: Tensor) -> Tensor:

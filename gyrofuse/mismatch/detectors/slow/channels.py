@@ -11,7 +11,9 @@ be compared with the channel's.
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from scipy import special
@@ -21,6 +23,7 @@ from gyrofuse._base.transforms import cosine_ordinates
 from gyrofuse.mismatch.decisions import CERTAIN
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.filters import quadrature
 from gyrofuse.mismatch.signals.known_lines import without_lines
 from gyrofuse.mismatch.signals.lines import simulated_lines
@@ -37,7 +40,8 @@ class ChannelFit:
         gains: `(sensor, row)`, signal per unit of the channel.
         covariance: Of the gains, `(sensor, row, sensor, row)`.
         statistic: Twice the log likelihood ratio, chi-square with a degree of freedom for each gain.
-        quadrature: The same for gains a quarter of a cycle apart, which no instantaneous coupling has.
+        quadrature: The same for gains a quarter of a cycle apart, which no instantaneous coupling has; NaN where they
+            were not asked for.
         share: Largest share of one band in the statistic.
         squares: Of the gains of each sensor, chi-square with a degree of freedom for each row, `(sensor,)`.
         p_value: Of the array, for having asked it whole and sensor by sensor.
@@ -58,38 +62,72 @@ class ChannelFit:
 
 
 def regress(
-    comparison: Comparison, rows: Tensor, signal: Tensor | None = None, which: Tensor | None = None
+    comparison: Comparison,
+    rows: Tensor,
+    signal: Tensor | None = None,
+    which: Tensor | None = None,
+    *,
+    late_as_well: bool = True,
 ) -> ChannelFit | None:
     """Regress the recording, or `signal` `(sensor, time)`, on rows `(row, time)`; None where these do not move.
 
     Twice where there is something: what a strong effect adds to the recording's own spectra is no noise. By default of
-    all sensors, or of those at the positions `which`.
+    all sensors, or of those at the positions `which`; gains a quarter of a cycle late are not known without
+    `late_as_well`.
     """
-    signal = comparison.recording if signal is None else signal
     which = torch.arange(comparison.n_sensors) if which is None else which
     rows = rows - rows.mean(-1, keepdim=True)
     size = rows.square().mean(-1).sqrt()
     if not bool((size > 1e-12).all()):
         return None
     lines = simulated_lines(comparison.reference)
-    signal, rows = without_lines(signal, lines), without_lines(rows / size[:, None], lines)
-    fit = _fitted(comparison, signal, rows, lines, comparison.observed, which)
+    rows = without_lines(rows / size[:, None], lines)
+    own = _lineless(comparison) if signal is None else without_lines(signal, lines)
+    y = _lineless_ordinates(comparison) if signal is None else cosine_ordinates(own)
+    late = cosine_ordinates(quadrature(rows)) if late_as_well else None
+    ordinates = _Ordinates(y[which], cosine_ordinates(rows), late)
+    fit = _fitted(comparison, ordinates, lines, comparison.observed, which)
     if fit is not None and fit.p_value < CERTAIN:
-        left = signal.clone()
+        left = own.clone()
         left[which] -= fit.gains @ rows
-        fit = _fitted(comparison, signal, rows, lines, replace(comparison.observed, signal=left[None]), which) or fit
+        fit = _fitted(comparison, ordinates, lines, replace(comparison.observed, signal=left[None]), which) or fit
     if fit is None:
         return None
     return replace(fit, gains=fit.gains / size, covariance=fit.covariance / size[:, None, None] / size)
 
 
+class _Ordinates(NamedTuple):
+    """Cosine transforms.
+
+    Attributes:
+        sensors: `(sensor, ordinate)`.
+        rows: `(row, ordinate)`.
+        late: Of the rows a quarter of a cycle apart, where those are asked for.
+    """
+
+    sensors: Tensor
+    rows: Tensor
+    late: Tensor | None
+
+
+@derived
+def _lineless(comparison: Comparison) -> Tensor:
+    """The recording without lines that the simulation has as well, `(sensor, time)`."""
+    return without_lines(comparison.recording, simulated_lines(comparison.reference))
+
+
+@derived
+def _lineless_ordinates(comparison: Comparison) -> Tensor:
+    """Its cosine transform, `(sensor, ordinate)`."""
+    return cosine_ordinates(_lineless(comparison))
+
+
 def _fitted(
-    comparison: Comparison, signal: Tensor, rows: Tensor, lines: tuple[float, ...], noise: Records, which: Tensor
+    comparison: Comparison, ordinates: _Ordinates, lines: tuple[float, ...], noise: Records, which: Tensor
 ) -> ChannelFit | None:
     """Generalised least squares beside a noise of the cross-spectra of `noise`; None where rows are hardly apart."""
-    n_sensors, n_rows, n = len(which), len(rows), signal.shape[-1]
-    y, a = cosine_ordinates(signal[which]), cosine_ordinates(rows)
-    late = cosine_ordinates(quadrature(rows))
+    y, a, late = ordinates
+    n_sensors, n_rows, n = len(which), len(a), y.shape[-1]
     k = torch.arange(n, dtype=torch.float64)
     weights = comparison.base.spectrum((k / (2 * n)).clamp(min=1 / (2 * n)))[which].rsqrt()  # (sensor, ordinate)
     for f in lines:
@@ -107,7 +145,8 @@ def _fitted(
         matrix += design @ design.mT * inverse.repeat_interleave(n_rows, 0).repeat_interleave(n_rows, 1)
         parts.append((white @ a[:, first:end].mT).flatten())
         moment += parts[-1]
-        moment_late += (white @ late[:, first:end].mT).flatten()
+        if late is not None:
+            moment_late += (white @ late[:, first:end].mT).flatten()
     if float(torch.linalg.cond(matrix)) > 1e12:
         return None
     covariance = torch.linalg.inv(matrix)
@@ -132,7 +171,7 @@ def _fitted(
         gains=each,
         covariance=blocks,
         statistic=statistic,
-        quadrature=float(moment_late @ covariance @ moment_late),
+        quadrature=math.nan if late is None else float(moment_late @ covariance @ moment_late),
         share=float(contributions.amax() / contributions.sum()) if statistic > 0 else 1.0,
         squares=sure,
         p_value=min(p_value, 1.0),

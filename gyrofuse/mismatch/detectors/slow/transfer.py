@@ -115,7 +115,7 @@ def _through(comparison: Comparison, rows: Tensor, pole: float, order: int, whic
         which: Positions of the sensors that determine it.
     """
     plain = Transfer(pole, torch.ones(1, dtype=torch.float64))
-    full = regress(comparison, terms(rows, pole, order).flatten(0, 1), which=which)
+    full = regress(comparison, terms(rows, pole, order).flatten(0, 1), which=which, late_as_well=False)
     if full is None:
         return -math.inf, plain
     shape = (len(which), order, len(rows))
