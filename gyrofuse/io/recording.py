@@ -147,6 +147,13 @@ class Recording:
             return self
         return replace(self, signal=self.signal[:, 0], sensors=self.axes, axes=())
 
+    def flat(self) -> Recording:
+        """Every axis of every device as a sensor `(axis of a device, time)`, named like `imu1 x`, axis by axis."""
+        if not self.axes:
+            return self
+        names = tuple(f"{sensor} {axis}" for axis in self.axes for sensor in self.sensors)
+        return replace(self, signal=self.signal.flatten(0, 1), sensors=names, axes=())
+
     def between(self, start: float, stop: float) -> Recording:
         """Keep the samples from `start` to `stop` seconds after the first sample, with their `time`.
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 from mismatch_draws import LEVEL, NOISE, RATE, SCENE, N, covers, drawn, even, nominated, normal, settled
 from scipy import fft, optimize, stats
+from scipy.signal import butter, lfilter
 
 from gyrofuse import AR1, RandomWalk, WhiteNoise
 from gyrofuse.mismatch.detectors.values import values as marginals
@@ -365,3 +366,16 @@ def test_paths_dwell_as_they_should() -> None:
     assert set(path.unique().tolist()) == {-1.0, 1.0}
     assert float((path > 0).double().mean()) == pytest.approx(0.25, abs=0.03)
     assert int((path.diff() != 0).sum()) == pytest.approx(4000, rel=0.06)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+@pytest.mark.parametrize("corner", [0.05, 0.2, 0.35])
+def test_filters_leave_no_outliers(order: int, corner: float):
+    """Gaussian noise through a steep filter: its prediction errors are those of many samples, and normal."""
+    numerator, denominator = butter(order, 2 * corner)
+    rare = 0
+    for seed in range(8):
+        white = torch.randn(3, 10192, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+        signal = torch.from_numpy(lfilter(numerator, denominator, white.numpy())[:, 2000:].copy())
+        rare += impulses.spike_p_value(Comparison.of(SCENE, signal, white[None, :, 2000:])) < 0.01
+    assert rare <= 1  # 2 of 8 have a probability of 0.003

@@ -83,10 +83,26 @@ def _errors(signal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     lines = _lines(y, spectrum)
     y = torch.where(lines, 0.0, y)
     white = _inverse_dct(y / spectrum.sqrt())
-    # What is 40 dB below half of the ordinates is leakage, and predicts no sample.
-    inverse = 1 / spectrum.maximum(1e-4 * spectrum.median())
+    inverse = _inverse(spectrum)
     error = _inverse_dct(y * inverse) / (inverse * (1 - followed)).mean()
     return error, white, lines.any() | _ends_leak(error, white)
+
+
+def _inverse(spectrum: Tensor) -> Tensor:
+    """One over a density `(k,)`, which weighs ordinates in an error: no more unequal than that errors stay apart.
+
+    What is 40 dB below half of the ordinates is leakage, and predicts no sample. Where a steep filter leaves all weight
+    to a narrow band, errors of neighbouring samples are one, which a law of single samples would count many times: a
+    power of the density below one is taken until two samples have what one would in a row, down to the root, with
+    which the record is white.
+    """
+    held = spectrum.maximum(1e-4 * spectrum.median())
+    for tenths in range(10, 4, -1):
+        inverse = held ** (-tenths / 10)
+        power = spectrum * inverse.square()  # of the errors
+        if power.mean() ** 2 > power.square().mean() / 2:
+            break
+    return inverse
 
 
 def _inverse_dct(ordinates: Tensor) -> Tensor:

@@ -1,0 +1,136 @@
+"""The answer of a diagnosis of a whole board: causes, and each group of sensors by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+from torch import Tensor
+
+from gyrofuse._base.page import render
+from gyrofuse._base.results import cleaned, p_words, readable
+from gyrofuse.mismatch.mechanisms.mechanism import Finding
+from gyrofuse.mismatch.repair.repaired_model import RepairedModel
+from gyrofuse.mismatch.reporting.several_reports import SeveralReports, listed_words, picture
+from gyrofuse.mismatch.reporting.text import capital, judged_words, parameter_words
+from gyrofuse.mismatch.selection.board_causes import BoardCause, Member
+
+
+@dataclass(frozen=True, eq=False)
+class BoardReport(SeveralReports):
+    """What simulations of a board's gyros and accelerometers left out, each cause once.
+
+    Attributes:
+        causes: Findings of all groups, put together where they are one cause; what explains most first.
+    """
+
+    kind: ClassVar[str] = "group"
+    causes: tuple[BoardCause, ...]
+
+    @property
+    def models(self) -> dict[str, RepairedModel]:
+        """Repaired simulation of each group, by its name."""
+        return {name: report.model for name, report in zip(self.names, self.reports, strict=True)}
+
+    def where(self, cause: BoardCause) -> str:
+        """The sensors of a cause by their names."""
+        infos = {name: report.comparison.info for name, report in zip(self.names, self.reports, strict=True)}
+        parts = []
+        for group, which in cause.sensors.items():
+            names = infos[group].sensors
+            every = len(which) == len(names)
+            parts.append(f"{group}: {'all sensors' if every else listed_words([names[i] for i in which])}")
+        return "; ".join(parts)
+
+    def summary(self) -> str:
+        """The verdict, and the causes with their sensors and numbers."""
+        first, *others = self.sentences()
+        lines = [f"{first}."]
+        for k, cause in enumerate(self.causes, 1):
+            likely = p_words(cause.clearest.finding.p_value)
+            lines.append(f"{k}. {cause.mechanism}, in {self.where(cause)} ({likely})")
+            lines += [f"   {member.group}: {member.finding.sentence}" for member in cause.members]
+            for member in cause.members:
+                for name, entry in member.finding.parameters.items():
+                    words = f"{member.group}, {parameter_words(name, member.comparison.info.sensors)}"
+                    lines.append(
+                        f"   {words:<32} {entry.value:>12.6g} {entry.unit}  ({entry.low:.6g} to {entry.high:.6g})"
+                    )
+                lines += _matrix_lines(member.finding, member.comparison.info.sensors)
+        for name, report in zip(self.names, self.reports, strict=True):
+            h = report.held_out
+            others.append(f"{name}: discrepancy {h.before:.2f} before and {h.after:.2f} after repair on data held out")
+            others += [f"{name}: {words}" for words in judged_words(report)]
+        return "\n".join([*lines, *(f"{line}." for line in others)])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, ready for JSON."""
+        return cleaned(
+            {
+                "mismatch": self.mismatch,
+                "p_value": self.p_value,
+                "causes": [cause.to_dict() for cause in self.causes],
+                "groups": {name: report.to_dict() for name, report in zip(self.names, self.reports, strict=True)},
+            }
+        )
+
+    def models_to_dict(self) -> dict[str, Any]:
+        """The repaired simulations, ready for JSON."""
+        return {"groups": {name: model.to_dict() for name, model in self.models.items()}}
+
+    def to_html(
+        self, path: str | Path, *, title: str = "A board and its simulation", remarks: Sequence[str] = ()
+    ) -> None:
+        """Write the report as one HTML page that needs no other file, no network and no script.
+
+        Args:
+            path: Where to; an existing file is replaced.
+            title: Heading of the page.
+            remarks: Sentences shown below the verdict.
+        """
+        page = render(
+            Path(__file__).parent / "board.html.j2",
+            title=title,
+            report=self,
+            remarks=remarks,
+            verdict=[capital(words) for words in self.sentences()],
+            course=self.course(),
+            causes=[self._part(cause) for cause in self.causes],
+        )
+        Path(path).write_text(page, encoding="utf-8")
+
+    def _part(self, cause: BoardCause) -> dict[str, Any]:
+        """What the page shows of one cause."""
+        return {
+            "name": readable(cause.mechanism),
+            "where": self.where(cause),
+            "members": [_member(member) for member in cause.members],
+        }
+
+
+def _member(member: Member) -> dict[str, Any]:
+    info = member.comparison.info
+    return {
+        "group": member.group,
+        "sentence": capital(member.finding.sentence).replace("->", "→"),
+        "picture": picture(member.finding),
+        "parameters": [
+            {"name": parameter_words(name, info.sensors), "entry": entry}
+            for name, entry in member.finding.parameters.items()
+        ],
+        "matrix": "\n".join(_matrix_lines(member.finding, info.sensors)),
+    }
+
+
+def _matrix_lines(finding: Finding, sensors: Sequence[str]) -> list[str]:
+    """Gains of the axes of each device on the three rows of a channel, where it has three: a 3 x 3 matrix."""
+    gains = finding.effect.gains if hasattr(finding.effect, "gains") else None
+    if not isinstance(gains, Tensor) or gains.ndim != 2 or gains.shape[-1] != 3:
+        return []
+    lines = ["   gains on the rows of the channel:"]
+    return lines + [
+        f"   {name:<12}" + "".join(f"{value:>12.4g}" for value in row)
+        for name, row in zip(sensors, gains.tolist(), strict=True)
+    ]

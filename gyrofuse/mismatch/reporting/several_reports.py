@@ -1,0 +1,94 @@
+"""What reports on several recordings, or several groups of sensors, have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+from gyrofuse._base.page import image
+from gyrofuse._base.results import p_words, readable
+from gyrofuse.mismatch.mechanisms.mechanism import Finding
+from gyrofuse.mismatch.reporting.plots import plot_recordings
+from gyrofuse.mismatch.reporting.report import MismatchReport
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, eq=False)
+class SeveralReports:
+    """Diagnoses side by side; a subclass puts their findings together.
+
+    Attributes:
+        names: Of the recordings, or of the groups of sensors.
+        reports: Diagnosis of each.
+        p_value: Of agreement of all with the simulation.
+    """
+
+    kind: ClassVar[str]
+    names: tuple[str, ...]
+    reports: tuple[MismatchReport, ...]
+    p_value: float
+
+    @property
+    def mismatch(self) -> bool:
+        """Whether any differs from the simulation."""
+        return any(report.mismatch for report in self.reports)
+
+    def sentences(self) -> list[str]:
+        """The verdict, and what is unexplained where."""
+        every = f"All {len(self.names)} {self.kind}s"
+        differ = [name for name, report in zip(self.names, self.reports, strict=True) if report.mismatch]
+        if not differ:
+            return [f"{every} agree with the simulation (p = {self.p_value:.2g})"]
+        which = every if len(differ) == len(self.names) else f"Of the {self.kind}s {listed_words(differ)}"
+        lines = [f"{which} differ{'' if len(differ) > 1 else 's'} from the simulation ({p_words(self.p_value)})"]
+        for name, report in zip(self.names, self.reports, strict=True):
+            if report.unexplained:
+                tests = ", ".join(readable(entry.test) for entry in report.unexplained)
+                lines.append(f"Unexplained in {self.kind} {name}, as seen by: {tests}")
+        return lines
+
+    def summary(self) -> str:
+        """The verdict and the causes."""
+        raise NotImplementedError
+
+    def __str__(self) -> str:
+        return self.summary()
+
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Draw the discrepancy of each, before and after its repair, on blocks held out.
+
+        Args:
+            ax: Where to draw; new axes by default.
+
+        Returns:
+            The axes.
+        """
+        ends = [(report.held_out.before, report.held_out.after) for report in self.reports]
+        return plot_recordings(self.names, ends, ax=ax)
+
+    def course(self) -> str:
+        """The same as the source of an `img`."""
+
+        def draw(figure: Figure) -> None:
+            self.plot(figure.subplots())
+
+        return image(7.0, 0.9 + 0.3 * len(self.names), draw)
+
+
+def picture(finding: Finding) -> str:
+    """The evidence of a finding as the source of an `img`."""
+
+    def draw(figure: Figure) -> None:
+        figure.set_layout_engine("constrained")
+        finding.plot(list(figure.subplots(2, 1)))
+
+    return image(7.0, 5.2, draw)
+
+
+def listed_words(names: Sequence[str]) -> str:
+    """Names in a sentence: `a, b and c`."""
+    return ", ".join(names[:-1]) + (" and " if len(names) > 1 else "") + names[-1]

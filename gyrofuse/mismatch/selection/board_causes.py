@@ -1,0 +1,121 @@
+"""Findings of the groups of sensors of a board, gyros and accelerometers, put together where they are one cause."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
+from gyrofuse.mismatch.signals.comparison import Comparison
+
+
+class GroupFindings(NamedTuple):
+    """What was found in one group of sensors.
+
+    Attributes:
+        findings: Findings in order.
+        comparison: Recording and simulation as they came.
+    """
+
+    findings: tuple[Finding, ...]
+    comparison: Comparison
+
+
+class Member(NamedTuple):
+    """A finding of a group."""
+
+    group: str
+    finding: Finding
+    comparison: Comparison
+
+
+@dataclass(frozen=True)
+class BoardCause:
+    """One cause in one or several groups of sensors.
+
+    Attributes:
+        mechanism: Name of the physics, that of its clearest finding.
+        members: Findings of the groups.
+    """
+
+    mechanism: str
+    members: tuple[Member, ...]
+
+    @property
+    def clearest(self) -> Member:
+        """The finding with the smallest p value, of those the one that explains most."""
+        return min(self.members, key=lambda member: (member.finding.p_value, -member.finding.gain))
+
+    @property
+    def sensors(self) -> dict[str, tuple[int, ...]]:
+        """Positions of the sensors that have it, by group."""
+        found: dict[str, set[int]] = {}
+        for member in self.members:
+            found.setdefault(member.group, set()).update(member.finding.sensors)
+        return {group: tuple(sorted(which)) for group, which in found.items()}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, ready for JSON."""
+        return {
+            "mechanism": self.mechanism,
+            "sensors": {group: list(which) for group, which in self.sensors.items()},
+            "findings": [{"group": member.group, **member.finding.to_dict()} for member in self.members],
+        }
+
+
+def board_causes(groups: Mapping[str, GroupFindings]) -> tuple[BoardCause, ...]:
+    """Causes in the order of what they explain: findings that belong together, directly or through a third one.
+
+    Args:
+        groups: What was found in each group, by its name.
+    """
+    members = [Member(name, f, group.comparison) for name, group in groups.items() for f in group.findings]
+    label = list(range(len(members)))
+    for i, j in itertools.combinations(range(len(members)), 2):
+        if _one_cause(members[i], members[j]):
+            label = [label[i] if other == label[j] else other for other in label]
+    together = [tuple(m for m, own in zip(members, label, strict=True) if own == one) for one in dict.fromkeys(label)]
+    found = [BoardCause("", same) for same in together]
+    named = [BoardCause(cause.clearest.finding.mechanism, cause.members) for cause in found]
+    return tuple(sorted(named, key=lambda cause: -sum(member.finding.gain for member in cause.members)))
+
+
+def _one_cause(a: Member, b: Member) -> bool:
+    """Whether two findings are one cause: the same line, the same physics at one time or on one channel.
+
+    Physics of the sensor alone, such as rounding, is one cause only where numbers that do not have the unit of the
+    signal agree: a filter's corner, a clock's rate.
+    """
+    widths = [m.finding.effect.line_width(m.finding.parameters, m.comparison) for m in (a, b)]
+    if a.finding.frequency_hz is not None and b.finding.frequency_hz is not None and None not in widths:
+        apart = abs(a.finding.frequency_hz - b.finding.frequency_hz)
+        return apart <= sum(width or 0.0 for width in widths)
+    names = [{m.finding.mechanism, *m.finding.alternatives} for m in (a, b)]
+    if a.finding.mechanism not in names[1] and b.finding.mechanism not in names[0]:
+        return False
+    if a.finding.channel is not None or b.finding.channel is not None:
+        return a.finding.channel == b.finding.channel
+    if a.finding.time_s is not None and b.finding.time_s is not None:
+        return abs(a.finding.time_s - b.finding.time_s) <= sum(_block_s(m.comparison) for m in (a, b))
+    if a.group == b.group:
+        return False
+    shared = [name for name in a.finding.parameters if name in b.finding.parameters and "[" not in name]
+    free = [name for name in shared if not any(_of_signal(m, name) for m in (a, b))]
+    return bool(free) and all(_agree(a.finding.parameters[name], b.finding.parameters[name]) for name in free)
+
+
+def _block_s(comparison: Comparison) -> float:
+    """Length of one of the blocks of a record, s."""
+    return comparison.block / comparison.info.rate
+
+
+def _of_signal(member: Member, name: str) -> bool:
+    """Whether a number is in the unit of the signal."""
+    return member.comparison.info.measure in member.finding.parameters[name].unit
+
+
+def _agree(a: Parameter, b: Parameter) -> bool:
+    """Whether the intervals of two numbers of one unit meet."""
+    return a.unit == b.unit and a.low <= b.high and b.low <= a.high
