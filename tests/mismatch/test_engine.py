@@ -122,7 +122,7 @@ def test_results_are_plain_for_json():
         "mechanism", "alternatives", "sensors", "levels", "frequency_hz", "time_s", "channel", "parameters", "p_value",
         "held_out_gain", "gain_without", "instead", "sentence",
     } == content["findings"][0].keys()  # fmt: skip
-    assert {"before", "after", "paired", "gain", "families", "auc"} == content["held_out"].keys()
+    assert {"before", "after", "paired", "shares", "gain", "families", "auc"} == content["held_out"].keys()
     assert "vibration_tone" in str(report)
 
 

@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.remainder import drawn_towards, without_fold
+from gyrofuse.mismatch.mechanisms.remainder import without_fold
 from gyrofuse.mismatch.mechanisms.spectra.spectral import Spectral
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.filters import mixed
 from gyrofuse.mismatch.signals.folds import spectral_gains
-from gyrofuse.mismatch.signals.psd import between_bands, narrow_bands
+from gyrofuse.mismatch.signals.psd import between_bands, drawn_towards, narrow_bands
 from gyrofuse.mismatch.signals.records import Records
 
 if TYPE_CHECKING:

@@ -10,14 +10,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
-import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.mechanisms.spectra.spectral import Filter
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.folds import N_JUDGED, estimation_samples
-from gyrofuse.mismatch.signals.psd import between_bands, narrow_bands
+from gyrofuse.mismatch.signals.psd import between_bands, drawn_towards, narrow_bands
 from gyrofuse.mismatch.signals.records import Records
 
 
@@ -84,10 +83,3 @@ def _log_ratio(observed: Records, reference: Records) -> tuple[Tensor, Tensor]:
     ratio = (observed.power.clamp(min=1e-300) / reference.power.clamp(min=1e-300)).log()
     # Blocks are too short for the slowest bands: without a bin there is no power either.
     return ratio, 1 / observed.dof + 1 / reference.dof
-
-
-def drawn_towards(values: Tensor, chance: Tensor, middle: Tensor | float) -> Tensor:
-    """Values, real or complex, drawn towards a middle by as much as chance, a variance, explains of their distance."""
-    apart = values - middle
-    kept = (1 - chance / apart.abs().square().clamp(min=1e-300)).clamp(min=0.0)
-    return middle + torch.where(kept > 0, kept * apart, 0.0)

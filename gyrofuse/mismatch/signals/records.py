@@ -13,7 +13,15 @@ from torch import Tensor
 from gyrofuse.mismatch.signals.fitted_spectra import SpectralUncertainty
 from gyrofuse.mismatch.signals.known_lines import without_lines
 from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum, fit_base
-from gyrofuse.mismatch.signals.psd import Bands, cross_spectra, degrees_of_freedom
+from gyrofuse.mismatch.signals.psd import (
+    N_NODES,
+    Bands,
+    between_bands,
+    cross_spectra,
+    degrees_of_freedom,
+    drawn_towards,
+    narrow_bands,
+)
 from gyrofuse.mismatch.signals.variance_course import VarianceCourse
 
 _ORDINATES = 40  # for each sensor, behind a matrix that is inverted
@@ -116,6 +124,11 @@ class Records:
         )
 
     @cached_property
+    def evenness(self) -> Tensor:
+        """Share of each band's ordinates that its power is known from, `(band,)`."""
+        return self.even_share(self.bands.nodes.unflatten(-1, (-1, N_NODES)))
+
+    @cached_property
     def power_dof(self) -> Tensor:
         """What bands tell of powers beside what a level varies and a model's numbers may be off, `(sensor, band)`.
 
@@ -124,7 +137,8 @@ class Records:
         varies = torch.as_tensor(self.level_variance).expand(self.signal.shape[-2])[:, None]
         if self.uncertainty is not None:
             varies = varies + self.uncertainty.variance(self.bands.frequency)
-        return self.dof / (1 + self.dof * varies) * (self.bands.frequency >= self.slowest_seen)
+        dof = self.dof * self.evenness
+        return dof / (1 + dof * varies) * (self.bands.frequency >= self.slowest_seen)
 
     @property
     def log_power(self) -> Tensor:
@@ -140,7 +154,7 @@ class Records:
         A fit smooths over bands, so that it is known at least as well. To first order it is known better in narrow
         bands, but where a matrix lacks rank, as those of slow noise often do, coherences are far from linear in it.
         """
-        dof = self.dof / (1 + self._levels_alike)
+        dof = self.dof * self.evenness / (1 + self._levels_alike)
         if self.uncertainty is None or not self.uncertainty.shares_noise:
             return dof
         n_records, _, n = self.signal.shape
@@ -178,6 +192,32 @@ class Records:
     def base(self) -> NoiseSpectrum:
         """The noise as a sum of simple spectra."""
         return fit_base(self.power, self.bands, self.bands.n_samples, self.dof)
+
+    @cached_property
+    def ripple(self) -> Tensor:
+        """Logarithms of the density over that of the base, in narrow bands, `(sensor, band)`, beyond chance.
+
+        Simple spectra have no zeros, which averages have, and no resonances.
+        """
+        narrow = narrow_bands(self.bands.n_samples)
+        own = self.in_bands(narrow)
+        known = own.dof > 0
+        apart = (own.power.clamp(min=1e-300) / narrow.mean_of(self.base.spectrum(narrow.nodes)).clamp(min=1e-300)).log()
+        chance = 4.0 / own.dof.clamp(min=1e-9)  # four variances: of many narrow bands some stand out
+        return drawn_towards(apart, chance, 0.0) * known
+
+    def density(self, f: Tensor) -> Tensor:
+        """Density per sample of base and ripple `(sensor, frequency)` at `f` cycles per sample."""
+        middles = narrow_bands(self.bands.n_samples).frequency
+        return self.base.spectrum(f) * between_bands(self.ripple, middles, f).exp()
+
+    def even_share(self, f: Tensor) -> Tensor:
+        """Share of the ordinates at frequencies `(..., node)` that their mean power is known from, `(...)`.
+
+        `(mean S)^2 / mean S^2`, of the sensor with the least: where a filter falls steeply, a few hold the power.
+        """
+        density = self.density(f.flatten()).unflatten(-1, f.shape)  # (sensor, ..., node)
+        return (density.mean(-1).square() / density.square().mean(-1)).amin(0)
 
     def over(self, base: NoiseSpectrum) -> Tensor:
         """Cross-spectral matrices over the spectra of a base, to be inverted, `(band, sensor, sensor)`.

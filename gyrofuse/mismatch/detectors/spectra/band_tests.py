@@ -128,7 +128,7 @@ def power_tails(comparison: Comparison) -> Tensor:
     logarithm is then normal, while that of few ordinates is skew.
     """
     ratio = comparison.observed.power / comparison.reference.power
-    d, s = comparison.bands.dof, comparison.reference.power_dof
+    d, s = comparison.bands.dof * comparison.observed.evenness, comparison.reference.power_dof
     law = stats.f(2 * d.numpy(), 2 * s.clamp(min=1e-9).numpy())
     tails = 2 * torch.from_numpy(law.sf(ratio.numpy())).minimum(torch.from_numpy(law.cdf(ratio.numpy())))
     varies = torch.special.polygamma(1, d.clamp(min=1e-9)) + 1 / s.clamp(min=1e-9)

@@ -15,12 +15,12 @@ from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.detectors.spectra.modulated_ordinates import level_correlations
 from gyrofuse.mismatch.detectors.spectra.own_peak_scan import scanned_own_peaks
-from gyrofuse.mismatch.detectors.spectra.shared_peak_scan import flank_of, least_flank, log_ratios, scanned_shared_peaks
+from gyrofuse.mismatch.detectors.spectra.shared_peak_scan import flank_of, scanned_shared_peaks
 from gyrofuse.mismatch.likelihoods.spectra.coherence import decorrelated
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.known_lines import without_lines
-from gyrofuse.mismatch.signals.lines import simulated_lines, whitened
+from gyrofuse.mismatch.signals.lines import simulated_lines, whitened_as
 from gyrofuse.mismatch.signals.psd import light_taper
 from gyrofuse.mismatch.stats.multiplicity import p_value_from_e_value, sidak
 
@@ -92,8 +92,8 @@ def strongest_peak(comparison: Comparison) -> Stretch:
         line = float(excess.topk(3).values.sum()) > 0.6 * float(excess.sum())
         if reference is None:
             bare = without_lines(comparison.reference.signal, simulated_lines(comparison.reference))
-            reference = _transformed(whitened(comparison.reference.steadied(bare), comparison.base))
-        if not line and not _has_it(reference, stretch, comparison):
+            reference = _transformed(whitened_as(comparison.reference.steadied(bare), comparison.reference))
+        if not line and not _has_it((transform[None], length), reference, stretch):
             return stretch
         for scan in scans:
             over = (scan.first < a + 2 * n) & (scan.first + scan.width > a - n)
@@ -135,20 +135,25 @@ def _alone(power: Tensor, a: int, n: int, d: float) -> tuple[int, ...]:
     return tuple(i for i in range(p) if sidak(float(tails[i]), p) < 0.01) or (int(tails.argmin()),)
 
 
-def _has_it(reference: tuple[Tensor, int], stretch: Stretch, comparison: Comparison) -> bool:
-    """Whether the simulation has a bump at the same frequency."""
-    transform, length = reference
-    n = max(round(stretch.width * length) // 2, 2) * 2
-    a, gap = round(stretch.frequency * length - (n - 1) / 2), n // 2
-    wide = min(flank_of(n, transform.shape[-1]), a - gap, transform.shape[-1] - a - n - gap)
-    if wide < least_flank(n):
-        return False
-    bins = transform.movedim(1, 0)  # (sensor, record, bin)
-    inside, left, right = (
-        bins[..., b : b + wide_as].flatten(1) for b, wide_as in ((a, n), (a - gap - wide, wide), (a + n + gap, wide))
-    )
-    flanks = torch.cat([left, right], -1)
-    ordinates = comparison.reference.signal.shape[-1] / length / _DEPENDENT
-    m, f = max(inside.shape[-1] * ordinates, 1.0), flanks.shape[-1] * ordinates
-    log_ratio = log_ratios((inside @ inside.mH)[None], (flanks @ flanks.mH)[None], m, f)
-    return p_value_from_e_value(float(log_ratio)) < _AS_WELL
+def _has_it(recording: tuple[Tensor, int], simulation: tuple[Tensor, int], stretch: Stretch) -> bool:
+    """Whether the simulation stands out from its flanks as much as the recording does, within three sd of chance.
+
+    Args:
+        recording: Transform `(record, sensor, bin)` and the length padded to.
+        simulation: The same.
+        stretch: What stands out in the recording.
+    """
+    (one, chance), (other, others_chance) = _contrast(*recording, stretch), _contrast(*simulation, stretch)
+    return float(one - other) < 3 * math.sqrt(chance + others_chance)
+
+
+def _contrast(transform: Tensor, length: int, stretch: Stretch) -> tuple[Tensor, float]:
+    """Log power of a stretch over that of its flanks, as far as they reach, mean of its sensors; and its variance."""
+    power = squared_modulus(transform[:, list(stretch.sensors)])
+    n = max(round(stretch.width * length), 1)
+    a, gap, wide = round(stretch.frequency * length - (n - 1) / 2), n // 2, flank_of(n, power.shape[-1])
+    left, right = power[..., max(a - gap - wide, 0) : max(a - gap, 0)], power[..., a + n + gap : a + n + gap + wide]
+    inside, flanks = power[..., max(a, 0) : a + n], torch.cat([left, right], -1)
+    each = len(power) * len(stretch.sensors) / _DEPENDENT  # independent ordinates in a bin of all records, unpadded
+    variance = (1 / inside.shape[-1] + 1 / flanks.shape[-1]) / each
+    return (inside.mean((0, -1)) / flanks.mean((0, -1))).log().mean(), variance

@@ -314,5 +314,13 @@ def _spectra(side: Records, n_samples: int) -> Spectra:
             cross = (y[:, :, None] * y[:, None, :])[inside].to(products.dtype) * weight
             products.index_put_((at, start + band[inside]), cross, accumulate=True)
             dof.index_put_((at, start + band[inside]), torch.full((len(at),), weight).to(dof), accumulate=True)
-    known = side.n_records / n_records  # less than one, where a model was estimated from fewer samples
-    return Spectra(products * known, dof * known)
+    # Less than one where a model was estimated from fewer samples, and where a few ordinates hold a band's power.
+    known = side.n_records / n_records * _evenness(side, bands, beyond, n_samples)
+    return Spectra(products * known[:, None, None], dof * known)
+
+
+def _evenness(side: Records, bands: Bands, beyond: Groups, n_samples: int) -> Tensor:
+    """Share of the ordinates that powers are known from, in slow groups (one), bands of blocks and fast groups."""
+    of_bands = side.even_share(bands.nodes.unflatten(-1, (-1, N_NODES)))
+    of_groups = [side.even_share(torch.tensor(group, dtype=torch.float64) / (2 * n_samples))[None] for group in beyond]
+    return torch.cat([torch.ones(len(slow_groups()), dtype=torch.float64), of_bands, *of_groups])
