@@ -83,7 +83,8 @@ def strongest_line(observed: Records, reference: Records) -> FoundLine:
     # Neighbouring fine bins share their noise: 0.6 of them are independent.
     p_value = sidak(math.exp(float(lines.log_p[at])), 0.6 * lines.n_bins)
     sensors = sets_of(len(z))[0][int(lines.best[at])].nonzero()[:, 0].tolist()
-    return FoundLine(float(lines.frequency[at]), p_value, tuple(sensors))
+    # Where lines of the simulation cover all, there is no candidate but frequency zero.
+    return FoundLine(max(float(lines.frequency[at]), 1 / length), p_value, tuple(sensors))
 
 
 def _shared(lines: tuple[float, ...], observed: Records, reference: Records) -> list[float]:

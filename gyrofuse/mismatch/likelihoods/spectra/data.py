@@ -320,7 +320,22 @@ def _spectra(side: Records, n_samples: int) -> Spectra:
 
 
 def _evenness(side: Records, bands: Bands, beyond: Groups, n_samples: int) -> Tensor:
-    """Share of the ordinates that powers are known from, in slow groups (one), bands of blocks and fast groups."""
+    """Share of the ordinates that powers are known from, in slow groups, bands of blocks and fast groups."""
     of_bands = side.even_share(bands.nodes.unflatten(-1, (-1, N_NODES)))
     of_groups = [side.even_share(torch.tensor(group, dtype=torch.float64) / (2 * n_samples))[None] for group in beyond]
-    return torch.cat([torch.ones(len(slow_groups()), dtype=torch.float64), of_bands, *of_groups])
+    return torch.cat([_own_share(side, n_samples), of_bands, *of_groups])
+
+
+def _own_share(side: Records, n_samples: int) -> Tensor:
+    """Share of the ordinates of slow groups that is their own, and not what a record's ends let in, `(group,)`.
+
+    A record of noise without anything slow, as after a high-pass, still ends somewhere: faster noise of density `S`
+    adds `int S / sin^2(pi f) df / T` to all slow ordinates of a cosine transform, the same two numbers to all of them.
+    """
+    n = side.signal.shape[-1]
+    middle = torch.tensor([sum(group) / len(group) for group in slow_groups()], dtype=torch.float64) / (2 * n_samples)
+    f = torch.logspace(math.log10(1 / n), math.log10(0.5), 1000, dtype=torch.float64)
+    density, own = side.density(f), side.density(middle.clamp(min=1 / n))  # (sensor, frequency), (sensor, group)
+    weighed = density / torch.sin(math.pi * f).square()
+    let_in = 2 / n * torch.stack([torch.trapezoid(weighed[:, f > 2 * at], f[f > 2 * at]) for at in middle], -1)
+    return (own / own.maximum(3 * let_in)).square().amin(0)  # of white noise all: there a third of it is let in
