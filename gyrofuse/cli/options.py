@@ -56,15 +56,16 @@ class Quantity(str, Enum):
 
     rate = "rate"
     acceleration = "acceleration"
+    all = "all"
 
 
 @dataclass(frozen=True)
 class FileReading:
     """Options with which each of many logs is read."""
 
-    quantity: Annotated[Quantity, typer.Option(help="Take the gyros of the log, or its accelerometers.")] = (
-        Quantity.rate
-    )
+    quantity: Annotated[
+        Quantity, typer.Option(help="Take the gyros of the log, or its accelerometers; diagnose takes all of a board.")
+    ] = Quantity.rate
     axis: Annotated[str | None, typer.Option(metavar="x|y|z", help="Take this axis alone.")] = None
     sensors: Annotated[str | None, typer.Option(metavar="A,B,...", help="Take these sensors alone.")] = None
     rate: Annotated[float | None, typer.Option(metavar="HZ", help="Sampling rate, where the log does not say.")] = None

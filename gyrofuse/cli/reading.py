@@ -93,7 +93,7 @@ def read_model(path: Path) -> Model | ArrayModel | RepairedModel | SessionModel:
     Raises:
         ValueError: It is none of these.
     """
-    content = _model_content(path)
+    content = json_object(path)
     try:
         if "processes" not in content and isinstance(content.get("model"), dict):
             content = content["model"]
@@ -112,13 +112,38 @@ def model_grid(path: Path) -> tuple[float | None, str | None]:
     Raises:
         ValueError: They are not a number and a text.
     """
-    content = _model_content(path)
+    content = json_object(path)
     rate, unit = content.get("rate"), content.get("unit")
     if rate is not None and (isinstance(rate, bool) or not isinstance(rate, float | int)):
         raise ValueError(f"{path}: expected 'rate' to be a number of Hz, got {str(rate)[:80]!r}")
     if unit is not None and not isinstance(unit, str):
         raise ValueError(f"{path}: expected 'unit' to be a text such as 'deg/s', got {str(unit)[:80]!r}")
     return rate, (None if unit == "unknown" else unit)
+
+
+def as_the_model(recording: Recording, path: Path) -> Recording:
+    """The recording, converted to the unit of a model in JSON; raises `ValueError` if their rates differ."""
+    return on_grid(recording, path, *(model_grid(path) if path.suffix.lower() == ".json" else (None, None)))
+
+
+def on_grid(recording: Recording, path: Path, rate: float | None, unit: str | None) -> Recording:
+    """The recording, converted to the unit of a model, where one is known.
+
+    Args:
+        recording: The recording.
+        path: File of the model, for the message.
+        rate: Sampling rate of the model, Hz.
+        unit: Its unit.
+
+    Raises:
+        ValueError: Their rates differ.
+    """
+    if rate is not None and not same_rate(rate, recording.rate):
+        raise ValueError(
+            f"{path}: expected a model for the recording's {recording.rate:g} Hz, got one that was fitted at "
+            f"{rate:g} Hz; fit one at that rate, or resample the log"
+        )
+    return recording if unit is None or recording.unit in ("unknown", unit) else recording.to(unit)
 
 
 def agreed_rate(models: Sequence[Path], rate: float | None) -> float | None:
@@ -162,7 +187,8 @@ def agreed_unit(model: Path | None, unit: str | None) -> str | None:
     return asked or own
 
 
-def _model_content(path: Path) -> dict[str, Any]:
+def json_object(path: Path) -> dict[str, Any]:
+    """Content of a model's file; raises `ValueError` if it is no object in JSON."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except RecursionError:

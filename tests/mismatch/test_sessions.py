@@ -16,7 +16,7 @@ import gyrofuse as gf
 from gyrofuse.mismatch import SessionsReport, diagnose_sessions
 from gyrofuse.mismatch.mechanisms.mechanism import Parameter
 from gyrofuse.mismatch.repair.serialise import sessions_from_dict
-from gyrofuse.mismatch.selection.recurrence import CommonParameter
+from gyrofuse.mismatch.several.recurrence import CommonParameter
 
 N, RATE, STEP = 8192, 100.0, 0.5
 NOISE = gf.ArrayModel.from_sensors([gf.WhiteNoise(1.0 + i / 10) + gf.AR1(0.98, 1e-3) for i in range(3)])

@@ -11,9 +11,9 @@ from gyrofuse._base.page import render
 from gyrofuse._base.results import cleaned, readable
 from gyrofuse.mismatch.repair.session_model import SessionModel
 from gyrofuse.mismatch.reporting.judge import Judged
-from gyrofuse.mismatch.reporting.several_reports import SeveralReports, listed_words, picture
 from gyrofuse.mismatch.reporting.text import capital, judge_words, parameter_words
-from gyrofuse.mismatch.selection.recurrence import Cause, CommonParameter
+from gyrofuse.mismatch.several.recurrence import Cause, CommonParameter
+from gyrofuse.mismatch.several.several_reports import SeveralReports, listed_words, picture
 
 _WHOSE = {"device": "the device's", "session": "the session's", "recording": "of one recording"}
 

@@ -14,8 +14,8 @@ from gyrofuse.mismatch.diagnose import diagnose
 from gyrofuse.mismatch.repair.inputs import Simulation, modelled, on_processor
 from gyrofuse.mismatch.repair.session_model import SessionModel
 from gyrofuse.mismatch.reporting.judge import checked_judge, judged
-from gyrofuse.mismatch.reporting.sessions_report import SessionsReport
-from gyrofuse.mismatch.selection.recurrence import causes_of
+from gyrofuse.mismatch.several.recurrence import causes_of
+from gyrofuse.mismatch.several.sessions_report import SessionsReport
 from gyrofuse.mismatch.stats.multiplicity import sidak, sidak_level
 
 

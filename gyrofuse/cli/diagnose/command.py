@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import torch
 import typer
 
-from gyrofuse._base.checks import same_rate
-from gyrofuse.cli.console import progress, progress_bar, say
-from gyrofuse.cli.options import Reading, Rest, Writing, stretch, takes_options
-from gyrofuse.cli.reading import at_rest, model_grid, read_model, say_notes, titled, without_gaps
+from gyrofuse.cli.console import progress, say
+from gyrofuse.cli.diagnose.board import BoardInputs, check_of_board, diagnose_whole_board
+from gyrofuse.cli.diagnose.search import Search
+from gyrofuse.cli.options import Quantity, Reading, Rest, Writing, stretch, takes_options
+from gyrofuse.cli.reading import as_the_model, at_rest, read_model, say_notes, titled, without_gaps
 from gyrofuse.io.recording import Recording
 from gyrofuse.noise.array_model import ArrayModel
 from gyrofuse.noise.processes import Model
@@ -34,9 +34,13 @@ def diagnose(
             metavar="LOG...", help="The recording. Several files are recordings of one device, or one array; see below."
         ),
     ],
-    simulation: Annotated[
-        Path,
-        typer.Option(metavar="SIM", help="What a simulator gives for the same array: a recording, or a model, .json."),
+    simulations: Annotated[
+        list[Path],
+        typer.Option(
+            "--simulation",
+            metavar="SIM",
+            help="What a simulator gives for the same array: a recording, or a model, .json; of a board two models.",
+        ),
     ],
     false_alarm: Annotated[
         float, typer.Option(metavar="P", help="Probability of a finding where nothing is missing.")
@@ -77,9 +81,21 @@ def diagnose(
     same rate and of the same sensors, shows how far the simulation is from it before and after the repair, and how far
     the two logs are apart. Several files are one array, aligned on their clocks; where each has all the sensors of the
     simulation, or with --apart, they are recordings of one device taken one after the other: what all have is the
-    device's, what differs a session's, and the repaired simulation draws sessions.
+    device's, what differs a session's, and the repaired simulation draws sessions. With --quantity all the gyros and
+    the accelerometers of all axes and devices are diagnosed together, and a cause that they share is told once: SIM is
+    then a log of both, or given twice, with a model of the gyros and one of the accelerometers.
     """
     resting = stretch(rest)
+    if reading.quantity is Quantity.all:
+        check_of_board(len(logs) if apart else 1, corrected=corrected, twins=twins)
+        board = BoardInputs(logs, simulations, judge, reading, resting)
+        diagnose_whole_board(board, false_alarm, fitted_samples, model_out, writing)
+        return
+    if len(simulations) > 1:
+        raise ValueError(
+            f"`--simulation`: expected one, got {len(simulations)}; two are of a whole board, with --quantity all"
+        )
+    simulation = simulations[0]
     inputs = [*logs, reading.mounting, simulation, judge]
     several = len(logs) > 1 and (_each_is_whole(logs, simulation, reading) if apart is None else apart)
     if several and (corrected or twins):
@@ -89,16 +105,16 @@ def diagnose(
         )
     groups = [[log] for log in logs] if several else [logs]
     with writing.files(inputs, corrected=corrected, model_out=model_out) as files:
-        recordings = [_as_the_model(_one_axis(reading.read(group), titled(group)), simulation) for group in groups]
+        recordings = [as_the_model(_one_axis(reading.read(group), titled(group)), simulation) for group in groups]
         simulated = _simulation(simulation, recordings[0], reading)
         judging = None
         if judge is not None:
-            judging = _as_the_model(_one_axis(reading.read([judge]), judge.name), simulation)
+            judging = as_the_model(_one_axis(reading.read([judge]), judge.name), simulation)
         names = [titled(group) for group in groups]
         if len({*names}) < len(names):  # in different folders
             names = [str(log) for log in logs]
         parts = {name: at_rest(one, resting) for name, one in zip(names, recordings, strict=True)}
-        search = _Search(simulated, judging, str(simulation), judge.name if judge else "", false_alarm, fitted_samples)
+        search = Search(simulated, judging, str(simulation), judge.name if judge else "", false_alarm, fitted_samples)
         found: MismatchReport | SessionsReport
         if several:
             found, remarks = search.several(parts)
@@ -125,81 +141,6 @@ def diagnose(
     say("\n".join([found.summary(), *remarks]))
     for one in recordings:
         say_notes(one)
-
-
-@dataclass(frozen=True)
-class _Search:
-    """A diagnosis of the longest stretches without gaps; its errors name the file and the option at fault.
-
-    Attributes:
-        simulation: What recordings are compared with.
-        judge: Another recording of the device.
-        simulation_name: Name of its file.
-        judge_name: Name of its file.
-        false_alarm: Value of `--false-alarm`.
-        fitted_samples: Value of `--fitted-samples`.
-    """
-
-    simulation: Recording | Model | ArrayModel | RepairedModel | SessionModel
-    judge: Recording | None
-    simulation_name: str
-    judge_name: str
-    false_alarm: float
-    fitted_samples: int | None
-
-    def one(self, name: str, recording: Recording, twins: int) -> tuple[MismatchReport, list[str]]:
-        """Report on a recording, and remarks on it."""
-        from gyrofuse.mismatch import diagnose as find_mismatch
-        from gyrofuse.mismatch.repair.inputs import FEWEST
-
-        with progress_bar("comparing") as show, self._named({"`recording`": name, "`LOG`": name}):
-            options, lacking = self._options()
-            part, remarks = without_gaps(recording, "Diagnosed", FEWEST)
-            found = find_mismatch(part, **options, twins=twins, progress=show)
-        start = float(part.time[0])
-        if start and found.mismatch:
-            remarks.append(f"Times count from the first sample that was diagnosed, at {start:.6g} s of the log.")
-        return found, remarks + lacking
-
-    def several(self, recordings: Mapping[str, Recording]) -> tuple[SessionsReport, list[str]]:
-        """Report on several recordings of one device by name, and remarks on them."""
-        from gyrofuse.mismatch import diagnose_sessions
-        from gyrofuse.mismatch.repair.inputs import FEWEST
-
-        with progress_bar("comparing") as show, self._named({"`recordings`": "LOG"}):
-            options, remarks = self._options()
-            parts = []
-            for name, recording in recordings.items():
-                with self._named({"`LOG`": name}):
-                    part, gaps = without_gaps(recording, f"{name}: diagnosed", FEWEST)
-                parts.append(part)
-                remarks += gaps
-            return diagnose_sessions(parts, **options, names=list(recordings), progress=show), remarks
-
-    def _options(self) -> tuple[dict[str, Any], list[str]]:
-        """What a diagnosis is given beside its recordings, and remarks on gaps of it."""
-        simulation, judge, remarks = self.simulation, self.judge, list[str]()
-        if isinstance(simulation, Recording):
-            simulation, gaps = without_gaps(simulation, "Simulation: compared", 0)
-            remarks += gaps
-        if judge is not None:
-            judge, gaps = without_gaps(judge, f"{self.judge_name}: judged", 0)
-            remarks += gaps
-        given = {"simulation": simulation, "judge": judge}
-        return {**given, "false_alarm": self.false_alarm, "fitted_samples": self.fitted_samples}, remarks
-
-    @contextmanager
-    def _named(self, names: Mapping[str, str]) -> Iterator[None]:
-        """Errors with files and options in the place of parameters."""
-        options = {"false_alarm": "--false-alarm", "twins": "--twins", "fitted_samples": "--fitted-samples"}
-        files = {"`simulation`": self.simulation_name, "`judge`": self.judge_name, **names}
-        try:
-            yield
-        except (ValueError, TypeError) as error:
-            message = str(error)
-            for parameter, name in {**files, **{f"`{p}`": f"`{option}`" for p, option in options.items()}}.items():
-                message = message.replace(parameter, name)
-            raise type(error)(message) from None
 
 
 def _save_corrected(report: MismatchReport, recording: Recording, path: Path, draft: Path) -> list[str]:
@@ -254,17 +195,6 @@ def _simulation(
     if whole.n_sensors > recording.n_sensors and set(names) <= set(whole.sensors):
         whole = whole.select(sensors=names or None)
     return _one_axis(whole, path.name)
-
-
-def _as_the_model(recording: Recording, path: Path) -> Recording:
-    """The recording, converted to the unit of a model in JSON; raises `ValueError` if their rates differ."""
-    rate, unit = model_grid(path) if path.suffix.lower() == ".json" else (None, None)
-    if rate is not None and not same_rate(rate, recording.rate):
-        raise ValueError(
-            f"{path}: expected a model for the recording's {recording.rate:g} Hz, got one that was fitted at "
-            f"{rate:g} Hz; fit one at that rate, or resample the log"
-        )
-    return recording if unit is None or recording.unit in ("unknown", unit) else recording.to(unit)
 
 
 def _one_axis(recording: Recording, name: str) -> Recording:

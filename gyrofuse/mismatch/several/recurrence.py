@@ -13,9 +13,6 @@ from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
 from gyrofuse.mismatch.stats.limits import Z
 from gyrofuse.mismatch.stats.multiplicity import sidak_level
 
-_SAME = 0.05  # relative difference of frequencies below which lines of two recordings may be one line that moved
-_UNLIKE = 0.01  # p value of a number that is the same in all recordings, for all numbers of a cause together
-
 Scope = Literal["device", "session", "recording"]
 
 
@@ -101,7 +98,8 @@ class Cause:
     @property
     def varying(self) -> list[str]:
         """Names of the numbers that differ from recording to recording by more than chance."""
-        level = sidak_level(_UNLIKE, max(len(self.parameters), 1))
+        unlike = 0.01  # p value for all numbers of a cause together
+        level = sidak_level(unlike, max(len(self.parameters), 1))
         return [name for name, entry in self.parameters.items() if entry.p_value < level]
 
     def to_dict(self) -> dict[str, Any]:
@@ -143,7 +141,8 @@ def _same(finding: Finding, group: dict[int, Finding]) -> bool:
         return False
     if not {*finding.sensors} & {*other.sensors} and finding.sensors and other.sensors:
         return False
-    return finding.channel == other.channel and _distance(finding, group) < _SAME
+    moved = 0.05  # relative distance of lines of two recordings that may be one line
+    return finding.channel == other.channel and _distance(finding, group) < moved
 
 
 def _distance(finding: Finding, group: dict[int, Finding]) -> float:

@@ -12,8 +12,8 @@ from gyrofuse.fitting.gmwm_result import GMWMResult
 from gyrofuse.io.recording import Recording
 from gyrofuse.mismatch.diagnose import diagnose
 from gyrofuse.mismatch.repair.inputs import Simulation
-from gyrofuse.mismatch.reporting.board_report import BoardReport
-from gyrofuse.mismatch.selection.board_causes import GroupFindings, board_causes
+from gyrofuse.mismatch.several.board_causes import GroupFindings, board_causes
+from gyrofuse.mismatch.several.board_report import BoardReport
 from gyrofuse.mismatch.stats.multiplicity import sidak, sidak_level
 from gyrofuse.noise.model import Model
 

@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from torch import Tensor
-
 from gyrofuse._base.page import render
 from gyrofuse._base.results import cleaned, p_words, readable
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel
-from gyrofuse.mismatch.reporting.several_reports import SeveralReports, listed_words, picture
 from gyrofuse.mismatch.reporting.text import capital, judged_words, parameter_words
-from gyrofuse.mismatch.selection.board_causes import BoardCause, Member
+from gyrofuse.mismatch.several.board_causes import BoardCause, Member
+from gyrofuse.mismatch.several.several_reports import SeveralReports, listed_words, picture
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,11 +124,10 @@ def _member(member: Member) -> dict[str, Any]:
 
 def _matrix_lines(finding: Finding, sensors: Sequence[str]) -> list[str]:
     """Gains of the axes of each device on the three rows of a channel, where it has three: a 3 x 3 matrix."""
-    gains = finding.effect.gains if hasattr(finding.effect, "gains") else None
-    if not isinstance(gains, Tensor) or gains.ndim != 2 or gains.shape[-1] != 3:
+    if not finding.effect.follows or finding.effect.amplitudes.shape[1:] != (3,):
         return []
     lines = ["   gains on the rows of the channel:"]
     return lines + [
         f"   {name:<12}" + "".join(f"{value:>12.4g}" for value in row)
-        for name, row in zip(sensors, gains.tolist(), strict=True)
+        for name, row in zip(sensors, finding.effect.amplitudes.tolist(), strict=True)
     ]

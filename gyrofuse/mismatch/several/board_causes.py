@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
 from gyrofuse.mismatch.signals.comparison import Comparison
+from gyrofuse.mismatch.stats.limits import Z
 
 
 class GroupFindings(NamedTuple):
@@ -86,7 +88,7 @@ def _one_cause(a: Member, b: Member) -> bool:
     """Whether two findings are one cause: the same line, the same physics at one time or on one channel.
 
     Physics of the sensor alone, such as rounding, is one cause only where numbers that do not have the unit of the
-    signal agree: a filter's corner, a clock's rate.
+    signal agree within three standard deviations: a filter's corner, a clock's rate.
     """
     widths = [m.finding.effect.line_width(m.finding.parameters, m.comparison) for m in (a, b)]
     if a.finding.frequency_hz is not None and b.finding.frequency_hz is not None and None not in widths:
@@ -101,9 +103,11 @@ def _one_cause(a: Member, b: Member) -> bool:
         return abs(a.finding.time_s - b.finding.time_s) <= sum(_block_s(m.comparison) for m in (a, b))
     if a.group == b.group:
         return False
-    shared = [name for name in a.finding.parameters if name in b.finding.parameters and "[" not in name]
-    free = [name for name in shared if not any(_of_signal(m, name) for m in (a, b))]
-    return bool(free) and all(_agree(a.finding.parameters[name], b.finding.parameters[name]) for name in free)
+    own, theirs = _pooled(a), _pooled(b)
+    shared = own.keys() & theirs.keys()
+    return bool(shared) and all(
+        abs(own[name].value - theirs[name].value) < 3 * math.hypot(own[name].sd, theirs[name].sd) for name in shared
+    )
 
 
 def _block_s(comparison: Comparison) -> float:
@@ -111,11 +115,22 @@ def _block_s(comparison: Comparison) -> float:
     return comparison.block / comparison.info.rate
 
 
-def _of_signal(member: Member, name: str) -> bool:
-    """Whether a number is in the unit of the signal."""
-    return member.comparison.info.measure in member.finding.parameters[name].unit
+class _Pooled(NamedTuple):
+    """Mean of a number over the sensors that have it, and its standard deviation."""
+
+    value: float
+    sd: float
 
 
-def _agree(a: Parameter, b: Parameter) -> bool:
-    """Whether the intervals of two numbers of one unit meet."""
-    return a.unit == b.unit and a.low <= b.high and b.low <= a.high
+def _pooled(member: Member) -> dict[tuple[str, str], _Pooled]:
+    """Numbers of a finding that do not have the unit of the signal, by name and unit."""
+    numbers: dict[tuple[str, str], list[Parameter]] = {}
+    for name, entry in member.finding.parameters.items():
+        if member.comparison.info.measure not in entry.unit and 0 < entry.high - entry.low < math.inf:
+            numbers.setdefault((name.split("[")[0], entry.unit), []).append(entry)
+    pooled = {}
+    for key, entries in numbers.items():
+        weights = [(2 * Z / (entry.high - entry.low)) ** 2 for entry in entries]
+        mean = sum(w * entry.value for w, entry in zip(weights, entries, strict=True)) / sum(weights)
+        pooled[key] = _Pooled(mean, 1 / math.sqrt(sum(weights)))
+    return pooled

@@ -1,0 +1,1 @@
+"""Several recordings of a device, or several groups of sensors of a board, in one diagnosis."""
