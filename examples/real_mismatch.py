@@ -14,9 +14,9 @@ simulation is then judged against a third, or, where there is none, on blocks he
 
     python examples/real_mismatch.py --data FOLDER [--only NAME ...] [--quick] [--out FOLDER]
 
-FOLDER holds the files named in `STUDIES`. The output folder receives a page for each, and `real.md`: a table of all, and
-each finding with the share of the discrepancy that it takes away on the data that judge, on which nothing was found or
-fitted. `--quick` takes the first recording of each kind, and of the ADIS16405 a tenth.
+FOLDER holds the files named in `STUDIES`. The output folder receives a page for each, and `real.md`: a table of all,
+and each finding with the share of the discrepancy that it takes away on the data that judge, on which nothing was found
+or fitted. `--quick` takes the first recording of each kind, and of the ADIS16405 a tenth.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ from gyrofuse.mismatch import MismatchReport
 BASE = "WN + AR1 + RW"
 AXES = "xyz"
 LEAD = (
-    "Written by `examples/real_mismatch.py`. Each simulator is white noise, an AR1 and a random walk for each sensor by "
-    "itself, fitted to one recording, diagnosed against another, and judged on a third or, where there is none, on "
+    "Written by `examples/real_mismatch.py`. Each simulator is white noise, an AR1 and a random walk for each sensor "
+    "by itself, fitted to one recording, diagnosed against another, and judged on a third or, where there is none, on "
     "blocks held out. Discrepancy: of wavelet cross-covariances per degree of freedom, of which 1 is noise alone; "
     "*recordings apart* has the diagnosed recording in the place of the simulation. AUC: of a classifier that tells "
     "windows of the one from windows of the other, where 0.5 is guessing. Share: of the discrepancy above noise alone "

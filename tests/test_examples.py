@@ -94,14 +94,16 @@ def test_real_mismatch(tmp_path: Path, shared: Path):
     out = run(
         "real_mismatch.py", "--data", shared / "data", "--only", "broad", "--quick", "--out", "found", cwd=tmp_path
     )
-    table = (tmp_path / "found" / "table.md").read_text()
-    assert table in out
-    cells = next(line for line in table.splitlines() if "broad_other_trial" in line).split("|")
-    assert cells[3].split(",")[0].strip() == "quantization"
-    assert float(cells[5]) < float(cells[4]) / 3, "the repaired simulation predicts another recording"
+    page = (tmp_path / "found" / "real.md").read_text()
+    cells = next(line for line in page.splitlines() if "| broad_other_trial |" in line).split("|")
+    assert float(cells[3]) < float(cells[2]) / 3, "the repaired simulation predicts another recording"
+    shares = [line.split("|")[1:3] for line in page.splitlines() if line.endswith(" % |")]
+    assert shares[0][0].strip() == "quantization"
+    assert sum(float(share.strip(" %")) for _, share in shares) == pytest.approx(100, abs=0.5)
     assert (tmp_path / "found" / "broad_other_trial.html").is_file()
     # 4000 deg/s over 2^16 steps of this device's converter
-    assert out.count("rounded to steps of 0.001065 rad/s in all sensors") == 1
+    assert page.count("rounded to steps of 0.001065 rad/s in all sensors") == 1
+    assert out.count("rounded to steps of 0.001065 rad/s in all sensors") == 2  # the report, and the page after it
 
 
 def test_real_mismatch_names_the_files_that_it_lacks(tmp_path: Path):

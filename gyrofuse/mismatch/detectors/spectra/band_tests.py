@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.detectors.lines.line_sizes import LineSizes, line_sizes
 from gyrofuse.mismatch.detectors.result import TestResult
+from gyrofuse.mismatch.detectors.variance.level_spread import level_variance
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.stats.multiplicity import sidak
 
@@ -129,6 +130,8 @@ def power_tails(comparison: Comparison) -> Tensor:
     """
     ratio = comparison.observed.power / comparison.reference.power
     d, s = comparison.bands.dof * comparison.observed.evenness, comparison.reference.power_dof
+    if comparison.reference.gaussian:  # of another simulation it is counted there
+        d = d / (1 + d * level_variance(comparison)[:, None])
     law = stats.f(2 * d.numpy(), 2 * s.clamp(min=1e-9).numpy())
     tails = 2 * torch.from_numpy(law.sf(ratio.numpy())).minimum(torch.from_numpy(law.cdf(ratio.numpy())))
     varies = torch.special.polygamma(1, d.clamp(min=1e-9)) + 1 / s.clamp(min=1e-9)

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
+from gyrofuse.mismatch.detectors.variance.level_spread import level_variance
 from gyrofuse.mismatch.likelihoods.spectra.components import oscillation
 from gyrofuse.mismatch.likelihoods.spectra.data import ratios
 from gyrofuse.mismatch.likelihoods.spectra.filter_forms import filter_power, filter_strength
@@ -177,7 +178,7 @@ def _levels(comparison: Comparison, ground: Ground) -> Tensor:
     fast = (ground.base.fast().spectrum(ground.bands.frequency) / ground.base.spectrum(ground.bands.frequency)).clamp(
         max=1
     )
-    sd = torch.as_tensor(comparison.reference.level_variance, dtype=torch.float64).sqrt().expand(len(fast))
+    sd = level_variance(comparison).sqrt()
     return torch.stack([fast, 1 - fast], -1) * sd[:, None, None]
 
 

@@ -104,6 +104,20 @@ def _log_power_variance(observed: Records, reference: Records) -> Tensor:
     return (relative - 2).clamp(min=0) * (1 / n + 1 / reference.bands.n_samples) * ~gaussian
 
 
+@derived
+def level_variance(comparison: Comparison) -> Tensor:
+    """Variance of the log of a sensor's whole power by chance beyond that of Gaussian noise, `(sensor,)`.
+
+    That of the simulation, and of a Gaussian one that of what is left of the recording: a few outliers that stay
+    unexplained, or noise that is heavy-tailed throughout, hold power that another stretch does not have.
+    """
+    known = torch.as_tensor(comparison.reference.level_variance, dtype=torch.float64).expand(comparison.n_sensors)
+    gaussian = gaussian_sensors(comparison.observed)
+    if bool(known.any()) or bool(gaussian.all()):
+        return known
+    return (_relative_variance(comparison.observed) - 2).clamp(min=0) / comparison.n_samples * ~gaussian
+
+
 def _relative_variance(side: Records) -> Tensor:
     """Upper limit of the long-run variance of squares over their squared mean, `(sensor,)`."""
     squares = left_out(side).white.square()

@@ -18,6 +18,7 @@ from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.detectors.spectra.peak_fit import Oscillation, oscillation_of
 from gyrofuse.mismatch.detectors.spectra.pooled_coherence import common_source
 from gyrofuse.mismatch.detectors.spectra.shape_scan import shape_p_value
+from gyrofuse.mismatch.detectors.variance.level_spread import level_variance
 from gyrofuse.mismatch.detectors.variance.noise_level import modulation, variance_p_value
 from gyrofuse.mismatch.likelihoods.spectra.choice import best_terms, cost_of
 from gyrofuse.mismatch.likelihoods.spectra.common_sources import CommonBump
@@ -168,7 +169,8 @@ def leading_shape(comparison: Comparison) -> Shape | None:
     p = sidak(float(stats.chi2.sf(2 * gain, term.n_free(data.ground))), n_classes)
     if not others and gain >= e_value_of(p_seen):  # all that the scan of shapes saw: a mean is not above the best
         p = min(p, p_seen)
-    if comparison.reference.uncertainty is not None:  # the fit above takes the simulation's numbers for exact
+    # The fit takes the simulation's numbers for exact, and noise for one whose level varies by Gaussian chance alone.
+    if comparison.reference.uncertainty is not None or bool(level_variance(comparison).any()):
         p = max(p, _beside_errors(comparison, term, p_seen))
     score = log_gain(data, data_model(data, [term]), paired=term.coherent).clamp(min=0)
     frequency = data.ground.bands.frequency
