@@ -164,7 +164,7 @@ def plot_recordings(names: Sequence[str], ends: Sequence[tuple[float, float]], *
     ax.set_yticks(rows, [clean_name(name) for name in names], parse_math=False)
     ax.set_ylim(len(names) - 0.4, -0.6)
     ax.set_xlabel("discrepancy (1 = noise alone)")
-    finish(ax, handles, ["before the repair", "after it"])
+    finish(ax, handles, ["before the repair", "after it"], ncols=2, loc="lower right", bbox_to_anchor=(1, 1))
     ax.grid(visible=False, axis="y")
     return ax
 
