@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from gyrofuse.mismatch.mechanisms.coherence_remainder import CoherenceRemainder
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
+from gyrofuse.mismatch.mechanisms.regimes.scale_mixture import ScaleMixture
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
@@ -44,7 +45,7 @@ from gyrofuse.mismatch.mechanisms.values.unit_scale import UnitScale
 STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (UnitScale,),
     (Quantization, Clipping, StuckSamples),  # facts on the numbers themselves
-    (Spikes,),
+    (Spikes, ScaleMixture),
     (ClockSkew,),
     (GSensitivity, QuadraticCoupling, ScaleFactor, ChannelTransfer),
     (VibrationTone, ToneSize),

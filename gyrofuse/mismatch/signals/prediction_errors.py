@@ -76,6 +76,22 @@ def left_out(side: Records) -> LeftOut:
     return LeftOut(error, sd, z / sd[..., None], white / _sd(white, coarse)[..., None], at_ends, grain)
 
 
+def scaled_innovations(signal: Tensor, factors: Tensor) -> Tensor:
+    """Signals `(..., time)` whose innovations were multiplied by factors `(..., time)`: of the same smooth spectrum.
+
+    Innovations are those of a filter without phase, by the smooth spectrum of each record.
+    """
+    if signal.shape[-1] < 2 * ENDS:  # of so few samples no spectrum is known: they are taken for white
+        mean = signal.mean(-1, keepdim=True)
+        return mean + (signal - mean) * factors
+    y = torch.from_numpy(fft.dct(signal.numpy(), norm="ortho", axis=-1))
+    rows = y[..., 1:].flatten(0, -2) if y.ndim > 1 else y[None, 1:]
+    root = torch.stack([_smooth_spectrum(row)[0] for row in rows]).sqrt().view(y[..., 1:].shape)
+    white = _inverse_dct(y[..., 1:] / root) * factors
+    made = torch.from_numpy(fft.dct(white.numpy(), norm="ortho", axis=-1))[..., 1:] * root
+    return _inverse_dct(made) + signal.mean(-1, keepdim=True)
+
+
 def _errors(signal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Prediction errors and whitened signal `(time,)`, and whether its ends are larger than the rest."""
     y = torch.from_numpy(fft.dct(signal.numpy(), norm="ortho"))[1:]

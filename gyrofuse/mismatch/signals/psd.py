@@ -167,6 +167,32 @@ def degrees_of_freedom(width: int) -> float:
     return float((_TAPERS * width) ** 2 / (weight * energy).sum())
 
 
+def median_powers(records: Tensor, wanted: Bands) -> tuple[Tensor, Tensor]:
+    """Densities per sample `(sensor, band)` from medians of ordinates, which lines hardly move, and their variance.
+
+    A median of exponential ordinates is `ln 2` of their mean, and `2.1 / m` the variance of its logarithm for `m`
+    independent ones; under the taper every second one is.
+
+    Args:
+        records: `(record, sensor, time)`.
+        wanted: Bands.
+
+    Returns:
+        The densities, and the variance of their logarithms by chance, `(band,)`: infinite where nothing is known.
+    """
+    n = records.shape[-1]
+    transform, length = hann_transform(records * smooth_ends(n))
+    power = (transform.real.square() + transform.imag.square()).movedim(1, 0)  # (sensor, record, bin)
+    scale, levels, chance = length / wanted.n_samples, [], []
+    for first, end in itertools.pairwise(wanted.edges):
+        own = power[..., round(first * scale) : round(end * scale)].flatten(1)
+        independent = own.shape[-1] * n / length / 2
+        seen = independent >= 4
+        levels.append(own.median(-1).values / math.log(2) if seen else own.new_ones(len(power)))
+        chance.append(2.1 / independent if seen else math.inf)
+    return torch.stack(levels, -1), torch.tensor(chance, dtype=torch.float64)
+
+
 def hann_transform(signal: Tensor) -> tuple[Tensor, int]:
     """Transform of the signal under a Hann taper of mean square 1, over `sqrt(T)`, and the length it was padded to.
 

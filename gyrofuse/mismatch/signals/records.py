@@ -20,6 +20,7 @@ from gyrofuse.mismatch.signals.psd import (
     cross_spectra,
     degrees_of_freedom,
     drawn_towards,
+    median_powers,
     narrow_bands,
 )
 from gyrofuse.mismatch.signals.variance_course import VarianceCourse
@@ -197,14 +198,13 @@ class Records:
     def ripple(self) -> Tensor:
         """Logarithms of the density over that of the base, in narrow bands, `(sensor, band)`, beyond chance.
 
-        Simple spectra have no zeros, which averages have, and no resonances.
+        Simple spectra have no zeros, which averages have. By medians: lines are no noise.
         """
         narrow = narrow_bands(self.bands.n_samples)
-        own = self.in_bands(narrow)
-        known = own.dof > 0
-        apart = (own.power.clamp(min=1e-300) / narrow.mean_of(self.base.spectrum(narrow.nodes)).clamp(min=1e-300)).log()
-        chance = 4.0 / own.dof.clamp(min=1e-9)  # four variances: of many narrow bands some stand out
-        return drawn_towards(apart, chance, 0.0) * known
+        power, chance = median_powers(self.steady, narrow)
+        apart = (power.clamp(min=1e-300) / narrow.mean_of(self.base.spectrum(narrow.nodes)).clamp(min=1e-300)).log()
+        plain = 4.0  # times the variance of chance: of many narrow bands some stand out
+        return drawn_towards(apart, plain * chance, 0.0) * chance.isfinite()
 
     def density(self, f: Tensor) -> Tensor:
         """Density per sample of base and ripple `(sensor, frequency)` at `f` cycles per sample."""

@@ -25,7 +25,7 @@ from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.known_lines import without_lines
-from gyrofuse.mismatch.signals.lines import sets_of, simulated_lines, whitened_as
+from gyrofuse.mismatch.signals.lines import sets_of, simulated_lines, whitened
 from gyrofuse.mismatch.stats.multiplicity import p_value_from_e_value
 
 BLOCKS = 512  # in which a tone is demodulated: a loss is placed to one, then to the sample
@@ -156,8 +156,7 @@ def best_slope(z: Tensor) -> tuple[float, float]:
 def _of_tone(comparison: Comparison, f: float, others: tuple[float, ...]) -> list[Slip]:
     """A skew and a loss of samples, as a tone of about `f` cycles per sample shows them, beside other ones."""
     z = demodulated(
-        whitened_as(without_lines(comparison.recording, others), comparison.reference) if others else comparison.white,
-        f,
+        whitened(without_lines(comparison.recording, others), comparison.base) if others else comparison.white, f
     )
     length = comparison.n_samples // BLOCKS * BLOCKS
     found = _reference(comparison, f, float(_energy(z).amax()))

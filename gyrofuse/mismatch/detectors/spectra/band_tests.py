@@ -130,8 +130,8 @@ def power_tails(comparison: Comparison) -> Tensor:
     """
     ratio = comparison.observed.power / comparison.reference.power
     d, s = comparison.bands.dof * comparison.observed.evenness, comparison.reference.power_dof
-    if comparison.reference.gaussian:  # of another simulation it is counted there
-        d = d / (1 + d * level_variance(comparison)[:, None])
+    own = level_variance(comparison) - comparison.reference.level_variance  # that of the simulation is in its own
+    d = d / (1 + d * own[:, None])
     law = stats.f(2 * d.numpy(), 2 * s.clamp(min=1e-9).numpy())
     tails = 2 * torch.from_numpy(law.sf(ratio.numpy())).minimum(torch.from_numpy(law.cdf(ratio.numpy())))
     varies = torch.special.polygamma(1, d.clamp(min=1e-9)) + 1 / s.clamp(min=1e-9)

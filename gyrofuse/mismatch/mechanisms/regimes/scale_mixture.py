@@ -1,0 +1,187 @@
+"""Noise of two levels, sample by sample: a converter with two gains, contacts, interference that hits at random."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.detectors.variance.haar_kurtosis import jump_test
+from gyrofuse.mismatch.detectors.variance.normality import gaussian_sensors
+from gyrofuse.mismatch.detectors.variance.outliers import spike_p_value
+from gyrofuse.mismatch.likelihoods.outlier_law import free_gaussian, heavy_tailed
+from gyrofuse.mismatch.mechanisms import pictures
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.dims import OfSensors
+from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
+from gyrofuse.mismatch.signals.prediction_errors import left_out, scaled_innovations
+from gyrofuse.mismatch.stats.limits import Z
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+class _Law(NamedTuple):
+    """Normal values of two standard deviations.
+
+    Attributes:
+        share: Probability of the larger one.
+        small, large: Standard deviations.
+    """
+
+    share: float
+    small: float
+    large: float
+
+    def log_densities(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Joint log densities of values with either standard deviation."""
+        return tuple(
+            math.log(p) - (z / sd).square() / 2 - math.log(sd) - math.log(2 * math.pi) / 2
+            for p, sd in ((1 - self.share, self.small), (self.share, self.large))
+        )  # type: ignore[return-value]  # two of them
+
+    def gains(self, z: Tensor) -> Tensor:
+        """Log likelihood over a normal law of the values' own variance, `(time,)`, nats."""
+        return torch.logaddexp(*self.log_densities(z)) - free_gaussian(z)
+
+    @classmethod
+    def fitted(cls, z: Tensor) -> _Law:
+        """Likeliest law of values `(time,)`, by expectation and maximisation (Dempster, Laird and Rubin, 1977)."""
+        quick, squares = z.abs().median() / 0.6744897501960817, z.square()
+        law = cls(0.1, float(quick), float((squares.mean() / 0.1).sqrt().maximum(2 * quick)))
+        for _ in range(200):
+            small, large = law.log_densities(z)
+            hit = torch.sigmoid(large - small)
+            share = float(hit.mean().clamp(1e-6, 1 - 1e-6))
+            sds = [float(((w * squares).sum() / w.sum()).sqrt()) for w in (1 - hit, hit)]
+            last, law = law, cls(share, *sds)
+            if abs(math.log(law.share / last.share)) + abs(math.log(law.large / last.large)) < 1e-7:
+                break
+        return law
+
+    def standard_deviations(self, z: Tensor) -> tuple[float, float]:
+        """Of the log odds of the share and of the log ratio, from the outer product of the scores of `(time,)`."""
+        at, step = (
+            (math.log(self.share / (1 - self.share)), math.log(self.small), math.log(self.large / self.small)),
+            1e-4,
+        )
+
+        def moved(number: int, by: float) -> Tensor:
+            odds, small, ratio = (value + by * (k == number) for k, value in enumerate(at))
+            law = _Law(1 / (1 + math.exp(-odds)), math.exp(small), math.exp(small + ratio))
+            return torch.logaddexp(*law.log_densities(z))
+
+        scores = torch.stack([(moved(k, step) - moved(k, -step)) / (2 * step) for k in range(3)])
+        variance = torch.linalg.inv(scores @ scores.mT).diagonal()
+        return float(variance[0].sqrt()), float(variance[2].sqrt())
+
+
+def _lasts(z: Tensor) -> bool:
+    """Whether the level of values `(time,)` lasts over neighbouring samples, as in episodes: then it is none of these.
+
+    By the correlations of the log moduli, which outliers hardly move, at distances of 1 to 9 samples.
+    """
+    log_size = z.abs().clamp(min=1e-3 * float(z.abs().median())).log()
+    log_size = log_size - log_size.mean()
+    lags = [float((log_size[k:] * log_size[:-k]).mean() / log_size.square().mean()) for k in range(1, 10)]
+    return max(lags) > max(0.1, 4 / math.sqrt(len(z)))  # a tenth: less than a seventh of the samples would last
+
+
+@dataclass(frozen=True, eq=False)
+class ScaleMixture(Mechanism):
+    """`x_t = sum_k psi_k s_{t-k} e_{t-k}`, `s` independent from sample to sample, of two values, with mean square one.
+
+    The innovations `e` of the noise are larger by `ratio` with the probability `share`. The spectrum stays as it is,
+    which tells it from more noise; hits do not lie together, which tells it from episodes; they are too many, and of
+    sizes from zero on, for isolated outliers.
+
+    Attributes:
+        share: Probability of the larger level, `(sensor,)`; 0 where there is one level.
+        ratio: Of the larger standard deviation to the smaller one, `(sensor,)`.
+    """
+
+    name: ClassVar[str] = "scale_mixture"
+    likelihood: ClassVar[str] = "innovations"
+    rivals: ClassVar[tuple[str, ...]] = ("variance_change",)
+    separated_by: ClassVar[str] = "a longer recording, or the converter's raw words"
+    share: OfSensors
+    ratio: OfSensors
+
+    @classmethod
+    def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
+        p_value = min(2 * min(spike_p_value(comparison), jump_test(comparison).p_value), 1.0)
+        if p_value > level or not bool(gaussian_sensors(comparison.reference).all()):
+            return None
+        z = left_out(comparison.observed).white[0]
+        laws = [_Law.fitted(row) for row in z]
+        gains = [float(law.gains(row).sum()) for law, row in zip(laws, z, strict=True)]
+        rare = 0.03  # rarer ones are isolated outliers
+        better, present = 10.0, 15.0  # nats over another heavy-tailed law, and over normal noise
+        hit = tuple(
+            i
+            for i, (law, gain) in enumerate(zip(laws, gains, strict=True))
+            if gain > present and rare < law.share < 1 - rare and gain > heavy_tailed(z[i]) + better
+        )
+        if not hit or any(_lasts(z[i]) for i in hit):
+            return None
+        info, parameters = comparison.info, {}
+        share, ratio = torch.zeros(2, comparison.n_sensors, dtype=torch.float64)
+        for i in hit:
+            law = laws[i]
+            share[i], ratio[i] = law.share, law.large / law.small
+            odds_sd, ratio_sd = law.standard_deviations(z[i])
+            odds = math.log(law.share / (1 - law.share))
+            low, high = (100 / (1 + math.exp(-odds - sign * Z * odds_sd)) for sign in (-1, 1))
+            parameters[f"share[{i}]"] = Parameter(100 * law.share, low, high, "%")
+            reach = math.exp(Z * ratio_sd)
+            value = float(ratio[i])
+            parameters[f"ratio[{i}]"] = Parameter(value, value / reach, value * reach, "")
+        largest = max(hit, key=lambda i: gains[i])
+        return Finding(
+            cls.name,
+            cls(share, torch.where(ratio > 0, ratio, 1.0)),
+            f"the noise of {info.named(hit, 'all sensors')} has two levels, sample by sample: "
+            f"{100 * laws[largest].share:.3g} % of the samples are {float(ratio[largest]):.3g} times as loud as others"
+            f"{f' (sensor {info.sensors[largest]})' if len(hit) > 1 else ''}",
+            p_value,
+            hit,
+            parameters,
+            levels=(1,),
+            gain=sum(gains[i] for i in hit),
+        )
+
+    def fit_without(self, comparison: Comparison, fold: int) -> ScaleMixture:
+        keep = estimation_samples(comparison.n_samples, fold)
+        laws = [_Law.fitted(row[keep]) for row in left_out(comparison.observed).white[0]]
+        has = self.share > 0
+        share, ratio = (
+            torch.tensor(values, dtype=torch.float64)
+            for values in ([law.share for law in laws], [law.large / law.small for law in laws])
+        )
+        return replace(self, share=torch.where(has, share, 0.0), ratio=torch.where(has, ratio, 1.0))
+
+    def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
+        rows = []
+        for row, share, ratio in zip(
+            left_out(comparison.observed).white[0], self.share.tolist(), self.ratio.tolist(), strict=True
+        ):
+            small = float(row.square().mean().sqrt()) / math.sqrt(1 - share + share * ratio**2)
+            rows.append(_Law(share, small, ratio * small).gains(row) if share else torch.zeros_like(row))
+        return held_out_blocks(torch.stack(rows), fold).sum((0, -1))
+
+    def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
+        hit = torch.rand(signal.shape, generator=generator, dtype=torch.float64) < self.share[:, None]
+        scale = (1 - self.share + self.share * self.ratio.square()).rsqrt()[:, None]
+        factors = scale * torch.where(hit, self.ratio[:, None], 1.0)
+        return torch.where((self.share > 0)[:, None], scaled_innovations(signal, factors), signal)
+
+    def apply_to_reference(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
+        built = super().apply_to_reference(comparison, generator)
+        return replace(built, reference=replace(built.reference, gaussian=False))
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        pictures.tails(ax, comparison, sensor)
