@@ -126,7 +126,7 @@ class Comparison:
 
     @cached_property
     def lineless(self) -> Tensor:
-        """The recording without the spectral lines of the simulation, of a steady level, whitened with its ripple.
+        """The recording without the spectral lines of the simulation, of a steady level, whitened with its dips.
 
         Where a part of the record has nearly all power, neighbouring bins hold the same noise: by chance they bulge.
         """
