@@ -14,6 +14,7 @@ import gyrofuse as gf
 from gyrofuse.mismatch.likelihoods.spectra.filter_forms import filter_strength
 from gyrofuse.mismatch.mechanisms.coherence_remainder import CoherenceRemainder
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
+from gyrofuse.mismatch.mechanisms.regimes.scale_mixture import ScaleMixture
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
@@ -109,6 +110,14 @@ def _(setting: Setting) -> Drawn:
     per_hour = rate * RATE * 3600
     rates = {"rate": float(per_hour.max())} if together else {}
     return Drawn(effect, setting.of_each("amplitude", effect.amplitude) | rates | setting.of_each("rate", per_hour))
+
+
+@draws(ScaleMixture)
+def _(setting: Setting) -> Drawn:
+    share = setting.sizes(0.15, 0.35)
+    ratio = 1.0 + setting.sizes(1.5, 2.5) * min(setting.size, 3.0)
+    truth = setting.of_each("share", 100 * share) | setting.of_each("ratio", ratio)
+    return Drawn(ScaleMixture(share, ratio), truth)
 
 
 @draws(VarianceChange)

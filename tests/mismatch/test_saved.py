@@ -19,6 +19,7 @@ from gyrofuse.mismatch.mechanisms.catalogue import CATALOGUE
 from gyrofuse.mismatch.mechanisms.coherence_remainder import CoherenceRemainder
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.mechanisms.regimes.gradual_change import GradualChange
+from gyrofuse.mismatch.mechanisms.regimes.scale_mixture import ScaleMixture
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
@@ -75,6 +76,7 @@ EVERY = (
     Quantization(numbers(0.3, 0.0), numbers(0.01, 0.0), numbers(0.2, 0.0), numbers(1 / 3, 0.1)),
     Clipping(numbers(-0.7, -math.inf), numbers(math.inf, 1 / 3), numbers(0.1, 0.2)),
     StuckSamples(numbers(0.2, 0.1), numbers(0.01, 0.0), True),
+    ScaleMixture(numbers(0.2, 0.0), numbers(3.0, 1.0)),
     Spikes(numbers(0.05, 0.0), numbers(7 / 3, 0.0), numbers(0.3, 0.0), True),
     ClockSkew((1,), 1e-5 / 3, ((200, 2), (300, 1)), 0.07, complex_numbers(0.3j), complex_numbers(0.1)),
     GSensitivity("acceleration", torch.tensor([[0.1, 0.2, 1 / 3], [0.0, 0.0, 0.0]], dtype=torch.float64)),

@@ -219,10 +219,12 @@ class Records:
     def even_share(self, f: Tensor) -> Tensor:
         """Share of the ordinates at frequencies `(..., node)` that their mean power is known from, `(...)`.
 
-        `(mean S)^2 / mean S^2`, of the sensor with the least: where a filter falls steeply, a few hold the power.
+        `(mean S)^2 / mean S^2`, of the sensor with the least: where a filter falls steeply, a few hold the power. All
+        of them where it is nine tenths and more, as by the chance that ripple has.
         """
         density = self.density(f.flatten()).unflatten(-1, f.shape)  # (sensor, ..., node)
-        return (density.mean(-1).square() / density.square().mean(-1)).amin(0)
+        share = (density.mean(-1).square() / density.square().mean(-1)).amin(0)
+        return torch.where(share > 0.9, 1.0, share)
 
     def over(self, base: NoiseSpectrum) -> Tensor:
         """Cross-spectral matrices over the spectra of a base, to be inverted, `(band, sensor, sensor)`.

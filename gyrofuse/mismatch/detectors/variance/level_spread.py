@@ -99,7 +99,7 @@ def _log_power_variance(observed: Records, reference: Records) -> Tensor:
     gaussian = gaussian_sensors(reference)
     if bool(gaussian.all()):
         return torch.zeros(len(gaussian), dtype=torch.float64)
-    relative = torch.stack([_relative_variance(side) for side in (observed, reference)]).amax(0)
+    relative = torch.stack([_relative_variance(side)[1] for side in (observed, reference)]).amax(0)
     n = reference.signal.shape[0] * reference.signal.shape[-1]
     return (relative - 2).clamp(min=0) * (1 / n + 1 / reference.bands.n_samples) * ~gaussian
 
@@ -108,22 +108,26 @@ def _log_power_variance(observed: Records, reference: Records) -> Tensor:
 def level_variance(comparison: Comparison) -> Tensor:
     """Variance of the log of a sensor's whole power by chance beyond that of Gaussian noise, `(sensor,)`.
 
-    That of the simulation, and of a Gaussian one that of what is left of the recording: a few outliers that stay
-    unexplained, or noise that is heavy-tailed throughout, hold power that another stretch does not have.
+    That of the simulation, and of a Gaussian one that of what is left of the recording, where that is beyond doubt: a
+    few outliers that stay unexplained, or noise that is heavy-tailed throughout, hold power that another stretch does
+    not have.
     """
     known = torch.as_tensor(comparison.reference.level_variance, dtype=torch.float64).expand(comparison.n_sensors)
     gaussian = gaussian_sensors(comparison.observed)
     if bool(known.any()) or bool(gaussian.all()):
         return known
-    return (_relative_variance(comparison.observed) - 2).clamp(min=0) / comparison.n_samples * ~gaussian
+    least, relative = _relative_variance(comparison.observed)
+    return (relative - 2).clamp(min=0) / comparison.n_samples * (~gaussian & (least > 2))
 
 
-def _relative_variance(side: Records) -> Tensor:
-    """Upper limit of the long-run variance of squares over their squared mean, `(sensor,)`."""
+def _relative_variance(side: Records) -> tuple[Tensor, Tensor]:
+    """Limits of the long-run variance of squares over their squared mean, lower and upper, `(sensor,)` each."""
     squares = left_out(side).white.square()
     spread = _SquareSpread.of(squares)
-    upper = spread.dof / torch.from_numpy(stats.chi2.ppf(CHANCE, spread.dof.numpy()))
-    return upper * spread.value / squares.mean((0, -1)).square() * spread.alike
+    value = spread.value * spread.alike / squares.mean((0, -1)).square()
+    dof = spread.dof.numpy()
+    upper, lower = (spread.dof / torch.from_numpy(stats.chi2.ppf(p, dof)) for p in (CHANCE, 1 - CHANCE))
+    return lower * value, upper * value
 
 
 @derived
