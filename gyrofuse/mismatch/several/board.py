@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
 
 import torch
 
@@ -14,6 +13,7 @@ from gyrofuse.mismatch.diagnose import diagnose
 from gyrofuse.mismatch.repair.inputs import Simulation
 from gyrofuse.mismatch.several.board_causes import GroupFindings, board_causes
 from gyrofuse.mismatch.several.board_report import BoardReport
+from gyrofuse.mismatch.several.progress import part_of
 from gyrofuse.mismatch.stats.multiplicity import sidak, sidak_level
 from gyrofuse.noise.model import Model
 
@@ -72,7 +72,7 @@ def diagnose_board(
                 fitted_samples=fitted_samples,
                 judge=None if judges is None else judges[name].flat(),
                 generator=generator,
-                progress=partial(_part_of, progress, name, k, len(recordings)),
+                progress=part_of(progress, tuple(recordings), k),
             )
         except (ValueError, TypeError) as error:
             raise type(error)(f"{name}: {error}") from None
@@ -97,10 +97,3 @@ def _flat(simulation: Simulation) -> Simulation:
     if source is not None and source.param_cov is not None:
         source = replace(source, param_cov=source.param_cov.flatten(0, -3))
     return simulation.with_params(simulation.params.flatten(0, -2), estimated_from=source)
-
-
-def _part_of(
-    progress: Callable[[str, float], None], name: str, place: int, n_groups: int, what: str, share: float
-) -> None:
-    """Tell the progress of the diagnosis of one group as that of all."""
-    progress(f"{name}: {what}", (place + share) / n_groups)

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ClassVar
 
-from gyrofuse._base.page import render
 from gyrofuse._base.results import cleaned, p_words, readable
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel
@@ -24,6 +22,7 @@ class BoardReport(SeveralReports):
         causes: Findings of all groups, put together where they are one cause; what explains most first.
     """
 
+    template: ClassVar[str] = "board.html.j2"
     kind: ClassVar[str] = "group"
     causes: tuple[BoardCause, ...]
 
@@ -78,26 +77,9 @@ class BoardReport(SeveralReports):
         """The repaired simulations, ready for JSON."""
         return {"groups": {name: model.to_dict() for name, model in self.models.items()}}
 
-    def to_html(
-        self, path: str | Path, *, title: str = "A board and its simulation", remarks: Sequence[str] = ()
-    ) -> None:
-        """Write the report as one HTML page that needs no other file, no network and no script.
-
-        Args:
-            path: Where to; an existing file is replaced.
-            title: Heading of the page.
-            remarks: Sentences shown below the verdict.
-        """
-        page = render(
-            Path(__file__).parent / "board.html.j2",
-            title=title,
-            report=self,
-            remarks=remarks,
-            verdict=[capital(words) for words in self.sentences()],
-            course=self.course(),
-            causes=[self._part(cause) for cause in self.causes],
-        )
-        Path(path).write_text(page, encoding="utf-8")
+    def parts(self) -> list[dict[str, Any]]:
+        """What the page shows of each cause."""
+        return [self._part(cause) for cause in self.causes]
 
     def _part(self, cause: BoardCause) -> dict[str, Any]:
         """What the page shows of one cause."""

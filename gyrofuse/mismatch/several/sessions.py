@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -14,6 +13,7 @@ from gyrofuse.mismatch.diagnose import diagnose
 from gyrofuse.mismatch.repair.inputs import Simulation, modelled, on_processor
 from gyrofuse.mismatch.repair.session_model import SessionModel
 from gyrofuse.mismatch.reporting.judge import checked_judge, judged
+from gyrofuse.mismatch.several.progress import part_of
 from gyrofuse.mismatch.several.recurrence import causes_of
 from gyrofuse.mismatch.several.sessions_report import SessionsReport
 from gyrofuse.mismatch.stats.multiplicity import sidak, sidak_level
@@ -76,7 +76,7 @@ def diagnose_sessions(
             rate=rate,
             fitted_samples=fitted_samples,
             generator=generator,
-            progress=partial(_part_of, progress, k, names),
+            progress=part_of(progress, names, k),
         )
         reports.append(report)
     model = SessionModel(tuple(report.model for report in reports))
@@ -93,11 +93,6 @@ def diagnose_sessions(
         model=model,
         judged=verdict,
     )
-
-
-def _part_of(progress: Callable[[str, float], None], place: int, names: Sequence[str], what: str, share: float) -> None:
-    """Tell the progress of the diagnosis of one recording as that of all."""
-    progress(f"{names[place]}: {what}", (place + share) / len(names))
 
 
 def _fitting(recording: Recording | Tensor, first: Recording | Tensor, name: str) -> Recording | Tensor:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ClassVar
 
-from gyrofuse._base.page import render
 from gyrofuse._base.results import cleaned, readable
 from gyrofuse.mismatch.repair.session_model import SessionModel
 from gyrofuse.mismatch.reporting.judge import Judged
@@ -33,6 +31,7 @@ class SessionsReport(SeveralReports):
     model: SessionModel
     judged: Judged | None = None
 
+    template: ClassVar[str] = "sessions.html.j2"
     kind: ClassVar[str] = "recording"
 
     def sentences(self) -> list[str]:
@@ -82,26 +81,9 @@ class SessionsReport(SeveralReports):
             }
         )
 
-    def to_html(
-        self, path: str | Path, *, title: str = "Recordings and simulation", remarks: Sequence[str] = ()
-    ) -> None:
-        """Write the report as one HTML page that needs no other file, no network and no script.
-
-        Args:
-            path: Where to; an existing file is replaced.
-            title: Heading of the page.
-            remarks: Sentences shown below the verdict.
-        """
-        page = render(
-            Path(__file__).parent / "sessions.html.j2",
-            title=title,
-            report=self,
-            remarks=remarks,
-            verdict=[capital(words) for words in self.sentences()],
-            course=self.course(),
-            causes=[self._part(cause) for cause in self.causes],
-        )
-        Path(path).write_text(page, encoding="utf-8")
+    def parts(self) -> list[dict[str, Any]]:
+        """What the page shows of each cause."""
+        return [self._part(cause) for cause in self.causes]
 
     def _part(self, cause: Cause) -> dict[str, Any]:
         """What the page shows of one cause."""

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from gyrofuse._base.page import image
+from gyrofuse._base.page import image, render
 from gyrofuse._base.results import p_words, readable
 from gyrofuse.mismatch.mechanisms.mechanism import Finding
 from gyrofuse.mismatch.reporting.plots import plot_recordings
 from gyrofuse.mismatch.reporting.report import MismatchReport
+from gyrofuse.mismatch.reporting.text import capital
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,6 +30,7 @@ class SeveralReports:
     """
 
     kind: ClassVar[str]
+    template: ClassVar[str]
     names: tuple[str, ...]
     reports: tuple[MismatchReport, ...]
     p_value: float
@@ -70,13 +73,34 @@ class SeveralReports:
         ends = [(report.held_out.before, report.held_out.after) for report in self.reports]
         return plot_recordings(self.names, ends, ax=ax)
 
-    def course(self) -> str:
-        """The same as the source of an `img`."""
+    def parts(self) -> list[dict[str, Any]]:
+        """What the page shows of each cause."""
+        raise NotImplementedError
+
+    def to_html(
+        self, path: str | Path, *, title: str = "What simulations leave out", remarks: Sequence[str] = ()
+    ) -> None:
+        """Write the report as one HTML page that needs no other file, no network and no script.
+
+        Args:
+            path: Where to; an existing file is replaced.
+            title: Heading of the page.
+            remarks: Sentences shown below the verdict.
+        """
 
         def draw(figure: Figure) -> None:
             self.plot(figure.subplots())
 
-        return image(7.0, 0.9 + 0.3 * len(self.names), draw)
+        page = render(
+            Path(__file__).parent / self.template,
+            title=title,
+            report=self,
+            remarks=remarks,
+            verdict=[capital(words) for words in self.sentences()],
+            course=image(7.0, 0.9 + 0.3 * len(self.names), draw),
+            causes=self.parts(),
+        )
+        Path(path).write_text(page, encoding="utf-8")
 
 
 def picture(finding: Finding) -> str:
