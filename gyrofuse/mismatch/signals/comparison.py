@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse.mismatch.signals.known_lines import without_lines
-from gyrofuse.mismatch.signals.lines import FoundLine, simulated_lines, strongest_line, whitened, whitened_as
+from gyrofuse.mismatch.signals.lines import FoundLine, simulated_lines, strongest_line, whitened
 from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
 from gyrofuse.mismatch.signals.psd import Bands, bands
 from gyrofuse.mismatch.signals.records import Records
@@ -126,12 +126,14 @@ class Comparison:
 
     @cached_property
     def lineless(self) -> Tensor:
-        """The recording without the spectral lines of the simulation, of a steady level, whitened with its dips.
+        """The whitened recording without the spectral lines of the simulation, and of a steady level.
 
         Where a part of the record has nearly all power, neighbouring bins hold the same noise: by chance they bulge.
         """
-        signal = without_lines(self.observed.signal, simulated_lines(self.reference))
-        return whitened_as(self.observed.steadied(signal)[0], self.reference)
+        lines = simulated_lines(self.reference)
+        if not lines and not self.observed.loud:
+            return self.white
+        return whitened(self.observed.steadied(without_lines(self.observed.signal, lines))[0], self.base)
 
     def generator(self) -> torch.Generator:
         """A source of the random numbers of a test, the same for every test of the comparison."""

@@ -218,13 +218,6 @@ def whitened(signal: Tensor, base: NoiseSpectrum) -> Tensor:
     return with_factors(signal, base.spectrum(f.clamp(min=1 / n)).rsqrt())
 
 
-def whitened_as(signal: Tensor, side: Records) -> Tensor:
-    """The same in units of the noise of a side, with the dips that simple spectra do not have."""
-    n = signal.shape[-1]
-    f = torch.arange(n, dtype=torch.float64) / (2 * n)
-    return with_factors(signal, side.density(f.clamp(min=1 / n), dips=True).rsqrt())
-
-
 def with_factors(signal: Tensor, factors: Tensor) -> Tensor:
     """Signals `(..., time)` with factors `(..., ordinate)` on their cosine ordinates, without their means.
 

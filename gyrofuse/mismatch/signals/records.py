@@ -206,15 +206,9 @@ class Records:
         plain = 4.0  # times the variance of chance: of many narrow bands some stand out
         return drawn_towards(apart, plain * chance, 0.0) * chance.isfinite()
 
-    def density(self, f: Tensor, *, dips: bool = False) -> Tensor:
-        """Density per sample of base and ripple `(sensor, frequency)` at `f` cycles per sample.
-
-        Args:
-            f: Frequencies.
-            dips: Whether to take the ripple only where it is below the base: as far as zeros go, not humps.
-        """
-        ripple = self.ripple.clamp(max=0) if dips else self.ripple
-        return self.base.spectrum(f) * between_bands(ripple, narrow_bands(self.bands.n_samples).frequency, f).exp()
+    def density(self, f: Tensor) -> Tensor:
+        """Density per sample of base and ripple `(sensor, frequency)` at `f` cycles per sample."""
+        return self.base.spectrum(f) * between_bands(self.ripple, narrow_bands(self.bands.n_samples).frequency, f).exp()
 
     def even_share(self, f: Tensor) -> Tensor:
         """Share of the ordinates at frequencies `(..., node)` that their mean power is known from, `(...)`.

@@ -20,7 +20,7 @@ from gyrofuse.mismatch.likelihoods.spectra.coherence import decorrelated
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.known_lines import without_lines
-from gyrofuse.mismatch.signals.lines import simulated_lines, whitened_as
+from gyrofuse.mismatch.signals.lines import simulated_lines, whitened
 from gyrofuse.mismatch.signals.psd import light_taper
 from gyrofuse.mismatch.stats.multiplicity import p_value_from_e_value, sidak
 
@@ -92,7 +92,7 @@ def strongest_peak(comparison: Comparison) -> Stretch:
         line = float(excess.topk(3).values.sum()) > 0.6 * float(excess.sum())
         if reference is None:
             bare = without_lines(comparison.reference.signal, simulated_lines(comparison.reference))
-            reference = _transformed(whitened_as(comparison.reference.steadied(bare), comparison.reference))
+            reference = _transformed(whitened(comparison.reference.steadied(bare), comparison.base))
         if not line and not _has_it((transform[None], length), reference, stretch):
             return stretch
         for scan in scans:
