@@ -271,12 +271,11 @@ def findings(outcome: Outcome) -> list[str]:
     lines = ["", f"## {outcome.study.name}", ""]
     if not report.mismatch:
         return [*lines, "Recording and simulation agree."]
-    found = iter(report.findings)
     if shares:
         lines += ["| what | share |", "|---|---|"]
         lines += [f"| {share.name.replace('_', ' ')} | {100 * share.share:.3g} % |" for share in shares]
         lines += [f"| left | {100 * (1 - sum(share.share for share in shares)):.3g} % |", ""]
-    lines += [f"- **{finding.mechanism.replace('_', ' ')}**: {finding.sentence}." for finding in found]
+    lines += [f"- **{finding.mechanism.replace('_', ' ')}**: {finding.sentence}." for finding in report.findings]
     left = ", ".join(entry.test for entry in report.unexplained)
     return [*lines, f"- Unexplained: {left or 'nothing'}."]
 

@@ -81,16 +81,16 @@ class Outliers(NamedTuple):
 
 def mixture(z: Tensor, law: Outliers) -> Tensor:
     """Log density of `z` under the law."""
-    plain = _gaussian(z, law.scale**2)
+    plain = gaussian(z, law.scale**2)
     return torch.logaddexp(math.log1p(-law.rate) + plain, math.log(max(law.rate, 1e-300)) + _moved(z, law))
 
 
 def free_gaussian(z: Tensor) -> Tensor:
     """Log density of `z` under a normal law of its own variance."""
-    return _gaussian(z, z.square().mean())
+    return gaussian(z, z.square().mean())
 
 
-def _gaussian(z: Tensor, variance: Tensor | float) -> Tensor:
+def gaussian(z: Tensor, variance: Tensor | float) -> Tensor:
     """Log density of a normal law of mean zero."""
     variance = torch.as_tensor(variance, dtype=z.dtype)
     return -z.square() / (2 * variance) - (2 * math.pi * variance).log() / 2
@@ -99,7 +99,7 @@ def _gaussian(z: Tensor, variance: Tensor | float) -> Tensor:
 def _moved(z: Tensor, law: Outliers) -> Tensor:
     """Log density of outliers."""
     variance = law.scale**2 + law.spread**2
-    return torch.logaddexp(_gaussian(z - law.height, variance), _gaussian(z + law.height, variance)) - math.log(2)
+    return torch.logaddexp(gaussian(z - law.height, variance), gaussian(z + law.height, variance)) - math.log(2)
 
 
 class Sample:
@@ -169,7 +169,7 @@ def heavy_tailed(z: Tensor) -> float:
     sample = Sample(z)
     x, weight = sample.values.numpy(), sample.counts.numpy()
     variance = (sample.counts * sample.values.square()).sum() / sample.n
-    plain = float((sample.counts * _gaussian(sample.values, variance)).sum())
+    plain = float((sample.counts * gaussian(sample.values, variance)).sum())
 
     def gain(law: _Law, start: tuple[float, float], bounds: list[tuple[float, float]]) -> float:
         run = _minimised(
@@ -234,7 +234,7 @@ def shock_posterior(z: Tensor, laws: list[Outliers]) -> Tensor:
 def _moved_together(z: Tensor, laws: list[Outliers]) -> Tensor:
     """Log density of hit samples over that of standard normal ones, `(time,)`."""
     hit = ((row, law) for row, law in zip(z, laws, strict=True) if law.rate > 0)
-    return sum((_moved(row, law) - _gaussian(row, 1.0) for row, law in hit), torch.zeros_like(z[0]))
+    return sum((_moved(row, law) - gaussian(row, 1.0) for row, law in hit), torch.zeros_like(z[0]))
 
 
 def fitted_shock(z: Tensor, start: list[Outliers], rounds: int) -> list[Outliers]:

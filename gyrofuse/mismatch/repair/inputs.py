@@ -18,7 +18,7 @@ from gyrofuse.fitting.ranking.result import RankResult
 from gyrofuse.io.recording import Recording
 from gyrofuse.mismatch.detectors.variance.level_spread import with_spread
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel
-from gyrofuse.mismatch.repair.session_model import SessionModel
+from gyrofuse.mismatch.repair.session_model import SessionModel, records_for
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.fitted_spectra import SpectralUncertainty, as_array
 from gyrofuse.mismatch.signals.known_lines import amplitudes
@@ -113,15 +113,11 @@ def modelled(
 def _sessions(model: SessionModel, recording: Recording | Tensor) -> Recording | Tensor:
     """Samples of a model that draws sessions, of each session as many, for a recording."""
     generator = torch.Generator().manual_seed(0)
-    n_sessions = len(model.models)
-    n_records = -(-_FEWEST_RECORDS // n_sessions) * n_sessions
-    if not isinstance(recording, Recording):
-        return model.simulate(recording.shape[-1], batch=(n_records,), generator=generator).movedim(0, 1).flatten(1)
-    model.check(recording.rate, recording.unit, recording.channels)
-    drawn = model.simulate(
-        recording.n_samples, batch=(n_records,), channels=recording.channels, generator=generator
-    ).movedim(0, 1)
-    return Recording(drawn.flatten(1), rate=recording.rate, unit=recording.unit)
+    channels = None
+    if isinstance(recording, Recording):
+        channels = recording.channels
+        model.check(recording.rate, recording.unit, channels)
+    return records_for(model, recording, _FEWEST_RECORDS, channels, generator)
 
 
 def prepared(

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.checks import check_positive_integer, own_generator
+from gyrofuse.io.recording import Recording
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel
 
 
@@ -72,3 +73,29 @@ class SessionModel:
 
     def __str__(self) -> str:
         return " or ".join(map(str, self.models))
+
+
+def records_for(
+    model: RepairedModel | SessionModel,
+    recording: Recording | Tensor,
+    fewest: int,
+    channels: Mapping[str, Tensor] | None,
+    generator: torch.Generator,
+) -> Recording | Tensor:
+    """Samples to set beside a recording: records as long as it one after the other, every session as often.
+
+    Args:
+        model: What is simulated.
+        recording: Recording, or samples `(sensor, time)`, of which the kind is returned.
+        fewest: Records, at least.
+        channels: Auxiliary channels `(row, time)` that mechanisms follow; those of the model by default.
+        generator: Source of randomness.
+    """
+    n = (recording.signal if isinstance(recording, Recording) else recording).shape[-1]
+    n_sessions = len(model.models) if isinstance(model, SessionModel) else 1
+    n_records = -(-fewest // n_sessions) * n_sessions
+    records = model.simulate(n, batch=(n_records,), channels=channels, generator=generator)
+    drawn = records.movedim(0, 1).flatten(1)
+    if not isinstance(recording, Recording):
+        return drawn
+    return Recording(drawn, rate=recording.rate, unit=recording.unit)

@@ -18,7 +18,7 @@ from gyrofuse.io.recording import Recording
 from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
 from gyrofuse.mismatch.repair.inputs import prepared
 from gyrofuse.mismatch.repair.repaired_model import RepairedModel
-from gyrofuse.mismatch.repair.session_model import SessionModel
+from gyrofuse.mismatch.repair.session_model import SessionModel, records_for
 from gyrofuse.mismatch.reporting.discrepancy import compared
 from gyrofuse.mismatch.selection.classifier import distinguishability
 from gyrofuse.mismatch.selection.discrepancy import discrepancy_of_fold
@@ -140,24 +140,28 @@ def judged(
         folds = [discrepancy_of_fold(comparison, fold) for fold in range(N_FOLDS)]
         return torch.tensor(folds, dtype=torch.float64), given
 
+    def drawn(model: RepairedModel | SessionModel) -> Recording | Tensor:
+        """Samples of a repaired simulation for the judge."""
+        return records_for(model, judge, _RECORDS, _whole_channels(judge), generator)
+
     def told(given: Comparison) -> float:
         """The area under the classifier's curve."""
         return sum(distinguishability(given, fold) for fold in range(N_FOLDS)) / N_FOLDS
 
     if isinstance(simulation, RepairedModel):
-        simulation = _drawn(_usable(simulation, judge)[0], judge, generator)
+        simulation = drawn(_usable(simulation, judge)[0])
     before, given = apart(simulation)
     after, auc_before = before, told(given)
     effects, courses = list[Mechanism](), list[float]()
     if len(repaired) > 1:
         usable = [_usable(model, judge) for model in repaired]
         lacks = tuple(sorted({name for _, missing in usable for name in missing}))
-        after, given = apart(_drawn(SessionModel(tuple(model for model, _ in usable)), judge, generator))
+        after, given = apart(drawn(SessionModel(tuple(model for model, _ in usable))))
     elif repaired:
         model, lacks = _usable(repaired[0], judge)
         known = _usable(replace(repaired[0], effects=repaired[0].effects[:n_known]), judge)[0]
         for n in range(len(known.effects) + 1, len(model.effects) + 1):
-            after, given = apart(_drawn(replace(model, effects=model.effects[:n]), judge, generator))
+            after, given = apart(drawn(replace(model, effects=model.effects[:n])))
             effects.append(model.effects[n - 1])
             courses.append(float(after.mean()))
     auc_after = told(given)
@@ -188,15 +192,3 @@ def _whole_channels(judge: Recording | Tensor) -> dict[str, Tensor]:
     """Its channels that lack no sample."""
     channels = judge.channels if isinstance(judge, Recording) else {}
     return {name: values for name, values in channels.items() if bool(values.isfinite().all())}
-
-
-def _drawn(
-    model: RepairedModel | SessionModel, judge: Recording | Tensor, generator: torch.Generator
-) -> Recording | Tensor:
-    """Samples of a repaired simulation for another recording, every session as often."""
-    n = (judge.signal if isinstance(judge, Recording) else judge).shape[-1]
-    n_sessions = len(model.models) if isinstance(model, SessionModel) else 1
-    n_records = -(-_RECORDS // n_sessions) * n_sessions
-    records = model.simulate(n, batch=(n_records,), channels=_whole_channels(judge), generator=generator)
-    drawn = records.movedim(0, 1).flatten(1)
-    return Recording(drawn, rate=judge.rate, unit=judge.unit) if isinstance(judge, Recording) else drawn

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
 from gyrofuse.mismatch.signals.comparison import Comparison
-from gyrofuse.mismatch.stats.limits import Z
+from gyrofuse.mismatch.stats.limits import variance_of, weighted_mean
 
 
 class GroupFindings(NamedTuple):
@@ -38,12 +38,15 @@ class BoardCause:
     """One cause in one or several groups of sensors.
 
     Attributes:
-        mechanism: Name of the physics, that of its clearest finding.
         members: Findings of the groups.
     """
 
-    mechanism: str
     members: tuple[Member, ...]
+
+    @property
+    def mechanism(self) -> str:
+        """Name of the physics, that of its clearest finding."""
+        return self.clearest.finding.mechanism
 
     @property
     def clearest(self) -> Member:
@@ -79,9 +82,8 @@ def board_causes(groups: Mapping[str, GroupFindings]) -> tuple[BoardCause, ...]:
         if _one_cause(members[i], members[j]):
             label = [label[i] if other == label[j] else other for other in label]
     together = [tuple(m for m, own in zip(members, label, strict=True) if own == one) for one in dict.fromkeys(label)]
-    found = [BoardCause("", same) for same in together]
-    named = [BoardCause(cause.clearest.finding.mechanism, cause.members) for cause in found]
-    return tuple(sorted(named, key=lambda cause: -sum(member.finding.gain for member in cause.members)))
+    causes = map(BoardCause, together)
+    return tuple(sorted(causes, key=lambda cause: -sum(member.finding.gain for member in cause.members)))
 
 
 def _one_cause(a: Member, b: Member) -> bool:
@@ -130,7 +132,7 @@ def _pooled(member: Member) -> dict[tuple[str, str], _Pooled]:
             numbers.setdefault((name.split("[")[0], entry.unit), []).append(entry)
     pooled = {}
     for key, entries in numbers.items():
-        weights = [(2 * Z / (entry.high - entry.low)) ** 2 for entry in entries]
-        mean = sum(w * entry.value for w, entry in zip(weights, entries, strict=True)) / sum(weights)
-        pooled[key] = _Pooled(mean, 1 / math.sqrt(sum(weights)))
+        variances = [variance_of(entry.low, entry.high) for entry in entries]
+        mean, total = weighted_mean([entry.value for entry in entries], variances)
+        pooled[key] = _Pooled(mean, 1 / math.sqrt(total))
     return pooled

@@ -29,14 +29,13 @@ class BoardReport(SeveralReports):
     @property
     def models(self) -> dict[str, RepairedModel]:
         """Repaired simulation of each group, by its name."""
-        return {name: report.model for name, report in zip(self.names, self.reports, strict=True)}
+        return {name: report.model for name, report in self.by_name.items()}
 
     def where(self, cause: BoardCause) -> str:
         """The sensors of a cause by their names."""
-        infos = {name: report.comparison.info for name, report in zip(self.names, self.reports, strict=True)}
         parts = []
         for group, which in cause.sensors.items():
-            names = infos[group].sensors
+            names = self.by_name[group].comparison.info.sensors
             every = len(which) == len(names)
             parts.append(f"{group}: {'all sensors' if every else listed_words([names[i] for i in which])}")
         return "; ".join(parts)
@@ -56,7 +55,7 @@ class BoardReport(SeveralReports):
                         f"   {words:<32} {entry.value:>12.6g} {entry.unit}  ({entry.low:.6g} to {entry.high:.6g})"
                     )
                 lines += _matrix_lines(member.finding, member.comparison.info.sensors)
-        for name, report in zip(self.names, self.reports, strict=True):
+        for name, report in self.by_name.items():
             h = report.held_out
             others.append(f"{name}: discrepancy {h.before:.2f} before and {h.after:.2f} after repair on data held out")
             others += [f"{name}: {words}" for words in judged_words(report)]
@@ -69,7 +68,7 @@ class BoardReport(SeveralReports):
                 "mismatch": self.mismatch,
                 "p_value": self.p_value,
                 "causes": [cause.to_dict() for cause in self.causes],
-                "groups": {name: report.to_dict() for name, report in zip(self.names, self.reports, strict=True)},
+                "groups": {name: report.to_dict() for name, report in self.by_name.items()},
             }
         )
 

@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeGuard
 from scipy import stats
 
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
-from gyrofuse.mismatch.stats.limits import Z
+from gyrofuse.mismatch.stats.limits import Z, variance_of, weighted_mean
 from gyrofuse.mismatch.stats.multiplicity import sidak_level
 
 Scope = Literal["device", "session", "recording"]
@@ -46,15 +46,14 @@ class CommonParameter:
             entries: Estimates with finite limits, two or more.
         """
         values = [entry.value for entry in entries]
-        variances = [((entry.high - entry.low) / (2 * Z)) ** 2 for entry in entries]
-        mean, weights = _mean(values, variances)
-        q = sum(w * (v - mean) ** 2 for w, v in zip(weights, values, strict=True))
+        variances = [variance_of(entry.low, entry.high) for entry in entries]
+        mean, total = weighted_mean(values, variances)
+        q = sum((value - mean) ** 2 / variance for value, variance in zip(values, variances, strict=True))
         dof = len(values) - 1
-        total = sum(weights)
-        scale = total - sum(w**2 for w in weights) / total
+        scale = total - sum(variance**-2 for variance in variances) / total
         between = max(q - dof, 0.0) / scale if scale > 0 else 0.0
-        mean, weights = _mean(values, [variance + between for variance in variances])
-        reach = Z / math.sqrt(sum(weights))
+        mean, total = weighted_mean(values, [variance + between for variance in variances])
+        reach = Z / math.sqrt(total)
         return cls(
             mean,
             mean - reach,
@@ -172,9 +171,3 @@ def _cause(group: dict[int, Finding], n_recordings: int) -> Cause:
 def _limited(entry: Parameter | None) -> TypeGuard[Parameter]:
     """Whether there is an estimate with finite limits."""
     return entry is not None and math.isfinite(entry.high - entry.low) and entry.high > entry.low
-
-
-def _mean(values: Sequence[float], variances: Sequence[float]) -> tuple[float, list[float]]:
-    """Mean weighted by inverse variances, and the weights."""
-    weights = [1 / variance for variance in variances]
-    return sum(w * v for w, v in zip(weights, values, strict=True)) / sum(weights), weights

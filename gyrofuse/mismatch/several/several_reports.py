@@ -36,6 +36,11 @@ class SeveralReports:
     p_value: float
 
     @property
+    def by_name(self) -> dict[str, MismatchReport]:
+        """Reports by the names of what they are of."""
+        return dict(zip(self.names, self.reports, strict=True))
+
+    @property
     def mismatch(self) -> bool:
         """Whether any differs from the simulation."""
         return any(report.mismatch for report in self.reports)
@@ -43,12 +48,12 @@ class SeveralReports:
     def sentences(self) -> list[str]:
         """The verdict, and what is unexplained where."""
         every = f"All {len(self.names)} {self.kind}s"
-        differ = [name for name, report in zip(self.names, self.reports, strict=True) if report.mismatch]
+        differ = [name for name, report in self.by_name.items() if report.mismatch]
         if not differ:
             return [f"{every} agree with the simulation (p = {self.p_value:.2g})"]
         which = every if len(differ) == len(self.names) else f"Of the {self.kind}s {listed_words(differ)}"
         lines = [f"{which} differ{'' if len(differ) > 1 else 's'} from the simulation ({p_words(self.p_value)})"]
-        for name, report in zip(self.names, self.reports, strict=True):
+        for name, report in self.by_name.items():
             if report.unexplained:
                 tests = ", ".join(readable(entry.test) for entry in report.unexplained)
                 lines.append(f"Unexplained in {self.kind} {name}, as seen by: {tests}")

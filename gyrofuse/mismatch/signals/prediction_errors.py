@@ -54,7 +54,7 @@ class LeftOut(NamedTuple):
         """
         error, m = self.at_ends.clone(), self.at_ends.shape[-1] // ENDS
         for end in (error[..., :m], error[..., -m:]):
-            end.mul_((_median_sd(end) < 1.3 * self.sd)[..., None])
+            end.mul_((median_sd(end) < 1.3 * self.sd)[..., None])
         return error
 
 
@@ -84,10 +84,9 @@ def scaled_innovations(signal: Tensor, factors: Tensor) -> Tensor:
     if signal.shape[-1] < 2 * ENDS:  # of so few samples no spectrum is known: they are taken for white
         mean = signal.mean(-1, keepdim=True)
         return mean + (signal - mean) * factors
-    y = torch.from_numpy(fft.dct(signal.numpy(), norm="ortho", axis=-1))
-    rows = y[..., 1:].flatten(0, -2) if y.ndim > 1 else y[None, 1:]
-    root = torch.stack([_smooth_spectrum(row)[0] for row in rows]).sqrt().view(y[..., 1:].shape)
-    white = _inverse_dct(y[..., 1:] / root) * factors
+    y = torch.from_numpy(fft.dct(signal.numpy(), norm="ortho", axis=-1))[..., 1:]
+    root = _smooth_spectrum(y)[0].sqrt()
+    white = _inverse_dct(y / root) * factors
     made = torch.from_numpy(fft.dct(white.numpy(), norm="ortho", axis=-1))[..., 1:] * root
     return _inverse_dct(made) + signal.mean(-1, keepdim=True)
 
@@ -194,12 +193,12 @@ def _ends_leak(error: Tensor, white: Tensor) -> Tensor:
     m = n // ENDS
 
     def both(values: Tensor, a: int, b: int) -> Tensor:
-        return _median_sd(torch.stack([values[..., a:b], values[..., n - b : n - a]]))
+        return median_sd(torch.stack([values[..., a:b], values[..., n - b : n - a]]))
 
     kinks = both(white, 0, 16) > 2.5 * both(white, m, 2 * m)
-    rings = both(error, 0, m) / _median_sd(error) > 2.5 * both(white, 0, m) / _median_sd(white)
+    rings = both(error, 0, m) / median_sd(error) > 2.5 * both(white, 0, m) / median_sd(white)
     # A zero of an average rings in the outermost samples alone: six sd come by chance once in 10^8 ends.
-    outermost = torch.stack([error[..., :4], error[..., -4:]]).abs().amax(-1) > 6.0 * _median_sd(error)
+    outermost = torch.stack([error[..., :4], error[..., -4:]]).abs().amax(-1) > 6.0 * median_sd(error)
     return (kinks | rings | outermost).any()
 
 
@@ -220,11 +219,11 @@ def _relative_step(signal: Tensor) -> Tensor:
 
 def _sd(values: Tensor, coarse: Tensor) -> Tensor:
     """Robust sd; of values on few steps one that moves little with each of them."""
-    sd = _median_sd(values)
+    sd = median_sd(values)
     return torch.where(coarse, clipped_sd(values), sd) if bool(coarse.any()) else sd
 
 
-def _median_sd(values: Tensor) -> Tensor:
+def median_sd(values: Tensor) -> Tensor:
     """Standard deviation from the median modulus, or the mean square where half of the values are zero."""
     robust = values.abs().median(-1).values / 0.6744897501960817  # median modulus of a standard normal variable
     return torch.where(robust > 0, robust, values.square().mean(-1).sqrt().clamp(min=1e-300))

@@ -122,15 +122,15 @@ def _apart(transform: Tensor, length: int, comparison: Comparison) -> Tensor:
 
 
 def _flanks(power: Tensor, a: int, n: int) -> Tensor:
-    """Mean of both flanks, `(sensor,)`, as far as they reach."""
+    """Both flanks of `n` bins from `a` on, `(..., bin)`, as far as they reach."""
     gap, wide = n // 2, flank_of(n, power.shape[-1])
-    left, right = power[:, max(a - gap - wide, 0) : a - gap], power[:, a + n + gap : a + n + gap + wide]
-    return torch.cat([left, right], -1).mean(-1)
+    left, right = power[..., max(a - gap - wide, 0) : max(a - gap, 0)], power[..., a + n + gap : a + n + gap + wide]
+    return torch.cat([left, right], -1)
 
 
 def _alone(power: Tensor, a: int, n: int, d: float) -> tuple[int, ...]:
     """Sensors in which `n` bins from `a` on, of `d` independent ordinates, stand out alone."""
-    tails = stats.f.sf((power[:, a : a + n].mean(-1) / _flanks(power, a, n)).numpy(), 2 * d, 6 * d)
+    tails = stats.f.sf((power[:, a : a + n].mean(-1) / _flanks(power, a, n).mean(-1)).numpy(), 2 * d, 6 * d)
     p = len(power)
     return tuple(i for i in range(p) if sidak(float(tails[i]), p) < 0.01) or (int(tails.argmin()),)
 
@@ -151,9 +151,8 @@ def _contrast(transform: Tensor, length: int, stretch: Stretch) -> tuple[Tensor,
     """Log power of a stretch over that of its flanks, as far as they reach, mean of its sensors; and its variance."""
     power = squared_modulus(transform[:, list(stretch.sensors)])
     n = max(round(stretch.width * length), 1)
-    a, gap, wide = round(stretch.frequency * length - (n - 1) / 2), n // 2, flank_of(n, power.shape[-1])
-    left, right = power[..., max(a - gap - wide, 0) : max(a - gap, 0)], power[..., a + n + gap : a + n + gap + wide]
-    inside, flanks = power[..., max(a, 0) : a + n], torch.cat([left, right], -1)
+    a = round(stretch.frequency * length - (n - 1) / 2)
+    inside, flanks = power[..., max(a, 0) : a + n], _flanks(power, a, n)
     each = len(power) * len(stretch.sensors) / _DEPENDENT  # independent ordinates in a bin of all records, unpadded
     variance = (1 / inside.shape[-1] + 1 / flanks.shape[-1]) / each
     return (inside.mean((0, -1)) / flanks.mean((0, -1))).log().mean(), variance

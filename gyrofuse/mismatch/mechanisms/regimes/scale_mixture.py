@@ -12,13 +12,13 @@ from torch import Tensor
 from gyrofuse.mismatch.detectors.variance.haar_kurtosis import jump_test
 from gyrofuse.mismatch.detectors.variance.normality import gaussian_sensors
 from gyrofuse.mismatch.detectors.variance.outliers import spike_p_value
-from gyrofuse.mismatch.likelihoods.outlier_law import free_gaussian, heavy_tailed
+from gyrofuse.mismatch.likelihoods.outlier_law import free_gaussian, gaussian, heavy_tailed
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import OfSensors
 from gyrofuse.mismatch.signals.folds import estimation_samples, held_out_blocks
-from gyrofuse.mismatch.signals.prediction_errors import left_out, scaled_innovations
+from gyrofuse.mismatch.signals.prediction_errors import left_out, median_sd, scaled_innovations
 from gyrofuse.mismatch.stats.limits import Z
 
 if TYPE_CHECKING:
@@ -39,10 +39,10 @@ class _Law(NamedTuple):
 
     def log_densities(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Joint log densities of values with either standard deviation."""
-        return tuple(
-            math.log(p) - (z / sd).square() / 2 - math.log(sd) - math.log(2 * math.pi) / 2
-            for p, sd in ((1 - self.share, self.small), (self.share, self.large))
-        )  # type: ignore[return-value]  # two of them
+        return (
+            math.log1p(-self.share) + gaussian(z, self.small**2),
+            math.log(self.share) + gaussian(z, self.large**2),
+        )
 
     def gains(self, z: Tensor) -> Tensor:
         """Log likelihood over a normal law of the values' own variance, `(time,)`, nats."""
@@ -51,7 +51,7 @@ class _Law(NamedTuple):
     @classmethod
     def fitted(cls, z: Tensor) -> _Law:
         """Likeliest law of values `(time,)`, by expectation and maximisation (Dempster, Laird and Rubin, 1977)."""
-        quick, squares = z.abs().median() / 0.6744897501960817, z.square()
+        quick, squares = median_sd(z), z.square()
         law = cls(0.1, float(quick), float((squares.mean() / 0.1).sqrt().maximum(2 * quick)))
         for _ in range(200):
             small, large = law.log_densities(z)
@@ -65,10 +65,8 @@ class _Law(NamedTuple):
 
     def standard_deviations(self, z: Tensor) -> tuple[float, float]:
         """Of the log odds of the share and of the log ratio, from the outer product of the scores of `(time,)`."""
-        at, step = (
-            (math.log(self.share / (1 - self.share)), math.log(self.small), math.log(self.large / self.small)),
-            1e-4,
-        )
+        at = (math.log(self.share / (1 - self.share)), math.log(self.small), math.log(self.large / self.small))
+        step = 1e-4
 
         def moved(number: int, by: float) -> Tensor:
             odds, small, ratio = (value + by * (k == number) for k, value in enumerate(at))
