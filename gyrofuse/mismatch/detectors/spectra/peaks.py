@@ -15,14 +15,14 @@ from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.detectors.spectra.modulated_ordinates import level_correlations
 from gyrofuse.mismatch.detectors.spectra.own_peak_scan import scanned_own_peaks
-from gyrofuse.mismatch.detectors.spectra.shared_peak_scan import flank_of, scanned_shared_peaks
+from gyrofuse.mismatch.detectors.spectra.shared_peak_scan import Stretches, flank_of, log_ratios, scanned_shared_peaks
 from gyrofuse.mismatch.likelihoods.spectra.coherence import decorrelated
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.known_lines import without_lines
 from gyrofuse.mismatch.signals.lines import simulated_lines, whitened
 from gyrofuse.mismatch.signals.psd import light_taper
-from gyrofuse.mismatch.stats.multiplicity import p_value_from_e_value, sidak
+from gyrofuse.mismatch.stats.multiplicity import e_value_of_some, p_value_from_e_value, sidak
 
 # Bins of a spectrum under the light taper, a tenth of which is at either end, for an independent one in far tails.
 _DEPENDENT = 1.15
@@ -64,48 +64,73 @@ def peak_test(comparison: Comparison) -> TestResult:
 def strongest_peak(comparison: Comparison) -> Stretch:
     """The most conspicuous bump of the recording that is neither a line nor in the simulation.
 
-    Six are tried; a line has three fifths of the excess in three bins.
+    Twelve are tried, those that the simulation has as well by what they are beyond it; a line has three fifths of the
+    excess in three bins.
     """
-    tries = 6
-    transform, length = _transformed(comparison.lineless)
-    last = int((0.5 - 2 / comparison.n_samples) * length)
-    transform = transform[:, :last]
-    ordinates = comparison.n_samples / length / _DEPENDENT
+    tries = 12
+    compared: set[float] = set()
+    recording = _Transform.of(comparison.lineless[None])
+    _, length, ordinates = recording
+    transform = recording.bins[0, :, : int((0.5 - 2 / comparison.n_samples) * length)]
     levels, width = level_correlations(comparison.lineless), comparison.n_samples / length
     scans = list(scanned_own_peaks(squared_modulus(_apart(transform, length, comparison)), ordinates, levels, width))
     if comparison.n_sensors > 1:
         scans += scanned_shared_peaks(transform, ordinates, levels, width)
     power, nothing = squared_modulus(transform), Stretch(0.25, 0.5, 1.0, tuple(range(comparison.n_sensors)))
-    reference: tuple[Tensor, int] | None = None
+    simulation: _Transform | None = None
     for _ in range(tries if scans else 0):
         best = max(scans, key=lambda scan: float(scan.log_ratio.amax()))
         a, n = int(best.first[best.log_ratio.argmax()]), best.width
         if not bool(best.log_ratio.isfinite().any()):
             return nothing
-        means = [torch.logsumexp(scan.log_ratio, 0) - math.log(len(scan.first)) for scan in scans]
-        p_value = p_value_from_e_value(float(torch.logsumexp(torch.stack(means), 0)) - math.log(len(scans)))
         sensors = _alone(power, a, n, n * ordinates)
-        stretch = Stretch((a + (n - 1) / 2) / length, n / length, p_value, sensors)
-        if p_value > _AS_WELL:
+        stretch = Stretch((a + (n - 1) / 2) / length, n / length, _p_value(scans), sensors)
+        if stretch.p_value > _AS_WELL or stretch.frequency in compared:
             return stretch
         excess = (power[:, a : a + n].mean(0) - _flanks(power, a, n).mean()).clamp(min=0)
         line = float(excess.topk(3).values.sum()) > 0.6 * float(excess.sum())
-        if reference is None:
+        if simulation is None:
             bare = without_lines(comparison.reference.signal, simulated_lines(comparison.reference))
-            reference = _transformed(whitened(comparison.reference.steadied(bare), comparison.base))
-        if not line and not _has_it((transform[None], length), reference, stretch):
+            simulation = _Transform.of(whitened(comparison.reference.steadied(bare), comparison.base))
+        others = _BesideFlanks.of(simulation, stretch)
+        if not line and p_value_from_e_value(others.log_ratio()) > _AS_WELL:
             return stretch
+        own = float(best.log_ratio.amax())
         for scan in scans:
             over = (scan.first < a + 2 * n) & (scan.first + scan.width > a - n)
             scan.log_ratio[over] = -math.inf
+        if not line:
+            compared.add(stretch.frequency)
+            beyond = _BesideFlanks.of(recording, stretch).over(others).log_ratio()
+            best.log_ratio[best.first == a] = min(own, beyond)
     return nothing
 
 
-def _transformed(white: Tensor) -> tuple[Tensor, int]:
-    """Transform of whitened samples, `(..., sensor, bin)`, and the length padded to."""
-    n = white.shape[-1]
-    length = fast_length(n)
-    return torch.fft.rfft(white * light_taper(n), n=length), length
+def _p_value(scans: list[Stretches]) -> float:
+    """Of the mean likelihood ratio over widths and positions."""
+    means = [torch.logsumexp(scan.log_ratio, 0) - math.log(len(scan.first)) for scan in scans]
+    return p_value_from_e_value(float(torch.logsumexp(torch.stack(means), 0)) - math.log(len(scans)))
+
+
+class _Transform(NamedTuple):
+    """Of whitened samples.
+
+    Attributes:
+        bins: `(record, sensor, bin)`.
+        length: Padded to.
+        ordinates: Independent ones in a bin.
+    """
+
+    bins: Tensor
+    length: int
+    ordinates: float
+
+    @classmethod
+    def of(cls, white: Tensor) -> _Transform:
+        """Of samples `(record, sensor, time)`."""
+        n = white.shape[-1]
+        length = fast_length(n)
+        return cls(torch.fft.rfft(white * light_taper(n), n=length), length, n / length / _DEPENDENT)
 
 
 def _apart(transform: Tensor, length: int, comparison: Comparison) -> Tensor:
@@ -135,24 +160,48 @@ def _alone(power: Tensor, a: int, n: int, d: float) -> tuple[int, ...]:
     return tuple(i for i in range(p) if sidak(float(tails[i]), p) < 0.01) or (int(tails.argmin()),)
 
 
-def _has_it(recording: tuple[Tensor, int], simulation: tuple[Tensor, int], stretch: Stretch) -> bool:
-    """Whether the simulation stands out from its flanks as much as the recording does, within three sd of chance.
+class _BesideFlanks(NamedTuple):
+    """A stretch beside its flanks.
 
-    Args:
-        recording: Transform `(record, sensor, bin)` and the length padded to.
-        simulation: The same.
-        stretch: What stands out in the recording.
+    Attributes:
+        inside, beside: Mean cross-spectral matrices of the stretch and of its flanks, `(sensor, sensor)`.
+        m, f: Independent ordinates of each.
     """
-    (one, chance), (other, others_chance) = _contrast(*recording, stretch), _contrast(*simulation, stretch)
-    return float(one - other) < 3 * math.sqrt(chance + others_chance)
+
+    inside: Tensor
+    beside: Tensor
+    m: float
+    f: float
+
+    @classmethod
+    def of(cls, side: _Transform, stretch: Stretch) -> _BesideFlanks:
+        """Of all records of a side together; flanks as far as they reach."""
+        n = max(round(stretch.width * side.length), 1)
+        a = max(round(stretch.frequency * side.length - (n - 1) / 2), 0)
+        stretches = side.bins[..., a : a + n], _flanks(side.bins, a, n)
+        parts = [part.movedim(0, 1).flatten(1) for part in stretches]  # (sensor, ordinate)
+        inside, beside = (part @ part.mH / part.shape[-1] for part in parts)
+        return cls(inside, beside, *(part.shape[-1] * side.ordinates for part in parts))
+
+    def log_ratio(self) -> float:
+        """Logarithm of the mean likelihood ratio of a bump of all sensors or of some."""
+        each = [matrix.diagonal().real[:, None, None] for matrix in (self.m * self.inside, self.f * self.beside)]
+        own = e_value_of_some(log_ratios(*each, self.m, self.f))
+        together = log_ratios(self.m * self.inside[None], self.f * self.beside[None], self.m, self.f)[0]
+        return float(torch.logaddexp(own, together)) - math.log(2)
+
+    def over(self, other: _BesideFlanks) -> _BesideFlanks:
+        """Where the contrast that another side has is undone."""
+        towards = torch.linalg.solve_triangular(other._root(), _root(other.beside), upper=False, left=False)
+        # A ratio of two contrasts varies as a contrast of fewer ordinates does.
+        m, f = (1 / (1 / own + 1 / others) for own, others in ((self.m, other.m), (self.f, other.f)))
+        return _BesideFlanks(towards @ self.inside @ towards.mH, self.beside, m, f)
+
+    def _root(self) -> Tensor:
+        """Of the stretch's matrix; where ordinates are few coherences are drawn towards those of the flanks."""
+        p, size = len(self.inside), (self.inside.diagonal().real / self.beside.diagonal().real).sqrt()
+        return _root((self.m * self.inside + p * size * self.beside * size[:, None]) / (self.m + p))
 
 
-def _contrast(transform: Tensor, length: int, stretch: Stretch) -> tuple[Tensor, float]:
-    """Log power of a stretch over that of its flanks, as far as they reach, mean of its sensors; and its variance."""
-    power = squared_modulus(transform[:, list(stretch.sensors)])
-    n = max(round(stretch.width * length), 1)
-    a = round(stretch.frequency * length - (n - 1) / 2)
-    inside, flanks = power[..., max(a, 0) : a + n], _flanks(power, a, n)
-    each = len(power) * len(stretch.sensors) / _DEPENDENT  # independent ordinates in a bin of all records, unpadded
-    variance = (1 / inside.shape[-1] + 1 / flanks.shape[-1]) / each
-    return (inside.mean((0, -1)) / flanks.mean((0, -1))).log().mean(), variance
+def _root(matrix: Tensor) -> Tensor:
+    return torch.linalg.cholesky(matrix + 1e-9 * torch.diag(matrix.diagonal()))  # for rounding
