@@ -213,9 +213,7 @@ def _log_hotelling(z: Tensor, matrices: Tensor, sets: Tensor, m: Tensor) -> Tens
 
 def whitened(signal: Tensor, base: NoiseSpectrum) -> Tensor:
     """Signals `(..., sensor, time)` in units of the noise of a base, without their means."""
-    n = signal.shape[-1]
-    f = torch.arange(n, dtype=torch.float64) / (2 * n)
-    return with_factors(signal, base.spectrum(f.clamp(min=1 / n)).rsqrt())
+    return with_factors(signal, base.of_ordinates(signal.shape[-1]).rsqrt())
 
 
 def with_factors(signal: Tensor, factors: Tensor) -> Tensor:

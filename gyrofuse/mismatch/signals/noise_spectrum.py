@@ -47,6 +47,16 @@ class NoiseSpectrum:
         """Density per sample `(sensor, frequency)` at `f` cycles per sample."""
         return self.coefficients @ atom_spectra(self.n_samples, f)
 
+    def of_ordinates(self, n: int) -> Tensor:
+        """Variances of the cosine ordinates of a record of `n` samples, `(sensor, ordinate)`.
+
+        Where noise has next to nothing slow, as after a high-pass, most of the slow ones is what the record's ends let
+        in.
+        """
+        f = (torch.arange(n, dtype=torch.float64) / (2 * n)).clamp(min=1 / n)
+        density = self.spectrum(f)
+        return density.maximum(3 * let_in(f, density, f, n))
+
     def fast(self) -> NoiseSpectrum:
         """What of it is white, or nearly."""
         quick = [True, True, *(tau < _QUICK for tau in ar1_time_constants(self.n_samples)), False]
@@ -104,6 +114,23 @@ def fit_base(power: Tensor, bands: Bands, n_samples: int, dof: Tensor) -> NoiseS
         free = coefficients > 0
         fitted = coefficients @ atoms
     return NoiseSpectrum(n_samples, coefficients)
+
+
+def let_in(f: Tensor, density: Tensor, at: Tensor, n: int) -> Tensor:
+    """What the ends of a record of `n` samples add to its cosine ordinates at `at`, `(..., ordinate)`.
+
+    Faster noise of density `S` adds `2/n int S / sin^2(pi f) df`, from twice the frequency on; of white noise a third
+    of the lowest ordinate is that.
+
+    Args:
+        f: Frequencies, rising, cycles per sample, `(frequency,)`.
+        density: Density there, `(..., frequency)`.
+        at: Frequencies of the ordinates, `(ordinate,)`.
+        n: Samples of the record.
+    """
+    weighed = density / torch.sin(math.pi * f).square()
+    above = torch.nn.functional.pad(torch.cumulative_trapezoid(weighed.flip(-1), -f.flip(-1)), (1, 0)).flip(-1)
+    return 2 / n * above[..., torch.bucketize(2 * at, f).clamp(max=len(f) - 1)]
 
 
 @functools.lru_cache(maxsize=64)

@@ -16,14 +16,13 @@ import math
 from dataclasses import dataclass
 
 import torch
-from scipy.signal import windows
 from torch import Tensor
 
 from gyrofuse._base.transforms import fast_length
 
 _TAPERS = 4  # an even number
 _PER_OCTAVE = 4
-_TAPERED = 0.1  # share of the record under the ends of a light taper: spectral lines leak as far as twenty bins
+_TAPERED = 0.12  # share of the record under the ends of a light taper: spectral lines leak as far as twenty bins
 N_NODES = 8  # frequencies whose mean stands for the mean over a band
 _FIRST_BIN = 3  # below, positive and negative frequencies overlap
 
@@ -126,9 +125,7 @@ def smooth_ends(n: int) -> Tensor:
     m = n // 32
     if m < 8:
         return torch.ones(n, dtype=torch.float64)
-    x = torch.arange(1, m + 1, dtype=torch.float64) / (m + 1)
-    ramp = torch.sigmoid(1 / (1 - x) - 1 / x)  # Planck's taper (McKechan, Robinson and Sathyaprakash, 2010)
-    return torch.cat([ramp, torch.ones(n - 2 * m, dtype=torch.float64), ramp.flip(0)])
+    return _planck_taper(n, m)
 
 
 def taper_window(n_samples: int, per_bin: int) -> Tensor:
@@ -207,5 +204,15 @@ def hann_transform(signal: Tensor) -> tuple[Tensor, int]:
 
 def light_taper(n: int) -> Tensor:
     """For whitened samples `(n,)`, of squares that sum to one: one that holds back what is red costs half of them."""
-    taper = torch.from_numpy(windows.tukey(n, _TAPERED))
+    taper = _planck_taper(n, round(n * _TAPERED / 2))
     return taper / taper.square().sum().sqrt()
+
+
+def _planck_taper(n: int, m: int) -> Tensor:
+    """Factors `(n,)`, ones but at the `m` samples of either end, where they fall with all derivatives.
+
+    McKechan, Robinson and Sathyaprakash, Classical and Quantum Gravity 27 (2010), 084020.
+    """
+    x = torch.arange(1, m + 1, dtype=torch.float64) / (m + 1)
+    ramp = torch.sigmoid(1 / (1 - x) - 1 / x)
+    return torch.cat([ramp, torch.ones(n - 2 * m, dtype=torch.float64), ramp.flip(0)])

@@ -227,18 +227,13 @@ class Records:
         """
         dof = self.bands.dof
         size = self.bands.mean_of(base.spectrum(self.bands.nodes)).mT.sqrt()  # (band, sensor)
-        total = _sums(self.spectra / size[:, :, None] / size[:, None, :] * dof[:, None, None])
-        ordinates = _sums(dof)
+        total = self.spectra / size[:, :, None] / size[:, None, :] * dof[:, None, None]
         wanted = min(_ORDINATES * self.signal.shape[-2], float(dof.sum()))
         smooth = []
         for b in range(len(dof)):
             low, high = b, b + 1
-            while ordinates[high] - ordinates[low] < wanted:
+            while float(dof[low:high].sum()) < wanted and high - low < len(dof):
                 low, high = max(low - 1, 0), min(high + 1, len(dof))
-            smooth.append((total[high] - total[low]) / (ordinates[high] - ordinates[low]))
+            # Sums of their own: a difference of sums from the first band on would lose what a filter holds back.
+            smooth.append(total[low:high].sum(0) / dof[low:high].sum())
         return torch.stack(smooth)
-
-
-def _sums(values: Tensor) -> Tensor:
-    """Sums of the first 0, 1, .. entries along the first dimension."""
-    return torch.cat([torch.zeros_like(values[:1]), values.cumsum(0)])

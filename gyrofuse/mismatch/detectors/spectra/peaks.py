@@ -92,17 +92,16 @@ def strongest_peak(comparison: Comparison) -> Stretch:
         if simulation is None:
             bare = without_lines(comparison.reference.signal, simulated_lines(comparison.reference))
             simulation = _Transform.of(whitened(comparison.reference.steadied(bare), comparison.base))
-        others = _BesideFlanks.of(simulation, stretch)
-        if not line and p_value_from_e_value(others.log_ratio()) > _AS_WELL:
+        own, others = _BesideFlanks.of(recording, stretch), _BesideFlanks.of(simulation, stretch)
+        if not line and own.stands_out and not others.stands_out:
             return stretch
-        own = float(best.log_ratio.amax())
+        as_scanned = float(best.log_ratio.amax())
         for scan in scans:
             over = (scan.first < a + 2 * n) & (scan.first + scan.width > a - n)
             scan.log_ratio[over] = -math.inf
         if not line:
             compared.add(stretch.frequency)
-            beyond = _BesideFlanks.of(recording, stretch).over(others).log_ratio()
-            best.log_ratio[best.first == a] = min(own, beyond)
+            best.log_ratio[best.first == a] = min(as_scanned, own.over(others).log_ratio())
     return nothing
 
 
@@ -189,6 +188,11 @@ class _BesideFlanks(NamedTuple):
         own = e_value_of_some(log_ratios(*each, self.m, self.f))
         together = log_ratios(self.m * self.inside[None], self.f * self.beside[None], self.m, self.f)[0]
         return float(torch.logaddexp(own, together)) - math.log(2)
+
+    @property
+    def stands_out(self) -> bool:
+        """Whether there is a bump, were it looked for only here."""
+        return p_value_from_e_value(self.log_ratio()) < _AS_WELL
 
     def over(self, other: _BesideFlanks) -> _BesideFlanks:
         """Where the contrast that another side has is undone."""

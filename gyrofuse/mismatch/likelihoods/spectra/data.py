@@ -27,7 +27,7 @@ from gyrofuse.mismatch.likelihoods.spectra.ratios import Ratios, exact
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
 from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED
-from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum, fit_base
+from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum, fit_base, let_in
 from gyrofuse.mismatch.signals.psd import (
     N_NODES,
     Bands,
@@ -321,21 +321,32 @@ def _spectra(side: Records, n_samples: int) -> Spectra:
 
 def _evenness(side: Records, bands: Bands, beyond: Groups, n_samples: int) -> Tensor:
     """Share of the ordinates that powers are known from, in slow groups, bands of blocks and fast groups."""
-    of_bands = side.even_share(bands.nodes.unflatten(-1, (-1, N_NODES)))
+    of_bands = side.even_share(bands.nodes.unflatten(-1, (-1, N_NODES))) * _unleaked_share(side, bands)
     of_groups = [side.even_share(torch.tensor(group, dtype=torch.float64) / (2 * n_samples))[None] for group in beyond]
     return torch.cat([_own_share(side, n_samples), of_bands, *of_groups])
+
+
+def _unleaked_share(side: Records, bands: Bands) -> Tensor:
+    """Share of the ordinates of blocks' bands that is their own, and not what their ends let in, `(band,)`.
+
+    That is one complex number of each block, which all bands share that it reaches.
+    """
+    density = side.density(bands.nodes) @ _tapers_response(bands, bands.nodes).mT  # (sensor, band)
+    nodes = bands.nodes.unflatten(-1, (-1, N_NODES))
+    reach = 3 / bands.n_samples  # of tapers
+    near = (bands.nodes > nodes[:, :1] - reach) & (bands.nodes < nodes[:, -1:] + reach)  # (band, frequency)
+    near_by = side.density(bands.nodes) @ (_tapers_response(bands, bands.nodes) * near).mT
+    let_in = (1 - near_by / density).amax(0)
+    return 1 / (1 + let_in.square() * bands.dof * let_in.square().sum())
 
 
 def _own_share(side: Records, n_samples: int) -> Tensor:
     """Share of the ordinates of slow groups that is their own, and not what a record's ends let in, `(group,)`.
 
-    A record of noise without anything slow, as after a high-pass, still ends somewhere: faster noise of density `S`
-    adds `int S / sin^2(pi f) df / T` to all slow ordinates of a cosine transform, the same two numbers to all of them.
+    These are the same two numbers in all of them, and most of a group where noise has next to nothing slow.
     """
     n = side.signal.shape[-1]
     middle = torch.tensor([sum(group) / len(group) for group in slow_groups()], dtype=torch.float64) / (2 * n_samples)
     f = torch.logspace(math.log10(1 / n), math.log10(0.5), 1000, dtype=torch.float64)
-    density, own = side.density(f), side.density(middle.clamp(min=1 / n))  # (sensor, frequency), (sensor, group)
-    weighed = density / torch.sin(math.pi * f).square()
-    let_in = 2 / n * torch.stack([torch.trapezoid(weighed[:, f > 2 * at], f[f > 2 * at]) for at in middle], -1)
-    return (own / own.maximum(3 * let_in)).square().amin(0)  # of white noise all: there a third of it is let in
+    own = side.density(middle.clamp(min=1 / n))  # (sensor, group)
+    return (own / own.maximum(3 * let_in(f, side.density(f), middle, n))).square().amin(0)
