@@ -380,15 +380,17 @@ def test_a_steep_filter_makes_no_outliers_and_changes_no_level(taps, n: int):
     assert noise_level.variance_test(given).p_value > LEVEL
 
 
-@pytest.mark.parametrize("form", ["pole", "butterworth", "steep", "average", "triangle"])
+@pytest.mark.parametrize("form", ["pole", "butterworth", "steep", "low", "average", "triangle", "windowed"])
 def test_what_a_filter_leaves_alike_on_both_sides_is_no_mismatch(form: str):
     """Stop bands and zeros that recording and simulation share: leakage, few ordinates and ends are no evidence."""
     numerator, denominator = {
         "pole": butter(1, 0.1),
         "butterworth": butter(2, 0.4),
         "steep": butter(4, 0.4),
+        "low": butter(4, 0.1),
         "average": (np.ones(4) / 4, [1.0]),
         "triangle": (np.array([1.0, 2.0, 3.0, 2.0, 1.0]) / 9, [1.0]),
+        "windowed": (signal.firwin(31, 0.4), [1.0]),
     }[form]
     alarms = 0
     for seed in range(6):
