@@ -7,6 +7,7 @@ from collections.abc import Callable
 from gyrofuse._base.results import readable
 from gyrofuse.mismatch.detectors.lines.chirps import chirp_test
 from gyrofuse.mismatch.detectors.lines.clocks import clock_test
+from gyrofuse.mismatch.detectors.lines.ring_downs import ring_down_test
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.slow.channels import channel_test
 from gyrofuse.mismatch.detectors.slow.hysteresis import hysteresis_test
@@ -29,6 +30,7 @@ TESTS: tuple[Callable[[Comparison], TestResult], ...] = (
     line_test,
     chirp_test,
     clock_test,
+    ring_down_test,
     jump_test,
     slow_test,
     hysteresis_test,

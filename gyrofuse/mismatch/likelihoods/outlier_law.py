@@ -249,6 +249,8 @@ def fitted_shock(z: Tensor, start: list[Outliers], rounds: int) -> list[Outliers
     for _ in range(rounds):
         weight = shock_posterior(z, laws)
         total = float(weight.sum())
+        if total < 1e-9:  # none is hit together with all others
+            break
         for i in hit:
             law, row = laws[i], z[i]
             height = float((weight * row * torch.tanh(law.height * row / (1 + law.spread**2))).sum()) / total

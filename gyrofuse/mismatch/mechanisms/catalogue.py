@@ -22,6 +22,7 @@ from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
 from gyrofuse.mismatch.mechanisms.signals.g_sensitivity import GSensitivity
 from gyrofuse.mismatch.mechanisms.signals.quadratic_coupling import QuadraticCoupling
 from gyrofuse.mismatch.mechanisms.signals.ramp import Ramp
+from gyrofuse.mismatch.mechanisms.signals.ring_down import RingDown
 from gyrofuse.mismatch.mechanisms.signals.scale_factor import ScaleFactor
 from gyrofuse.mismatch.mechanisms.signals.step import Step
 from gyrofuse.mismatch.mechanisms.signals.temperature import TemperatureDrift
@@ -48,6 +49,7 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (Spikes, ScaleMixture),
     (ClockSkew,),
     (GSensitivity, QuadraticCoupling, ScaleFactor, ChannelTransfer),
+    (RingDown,),  # whose strongest are lines too
     (VibrationTone, ToneSize),
     (RandomTelegraph,),
     (GradualChange,),  # where noise is louder, what is slow is known less well

@@ -214,6 +214,28 @@ def samples(ax: Axes, comparison: Comparison, sensor: int, first: int, count: in
     _finish(ax, handles, ["recording", "simulation"], "time (s)", with_unit("sample", comparison.info.measure))
 
 
+def transient(ax: Axes, comparison: Comparison, sensor: int, first: int, count: int, path: Tensor | None) -> None:
+    """Samples of both sides around a transient, and the path that was fitted.
+
+    Args:
+        ax: Axes to draw into.
+        comparison: Recording and simulation.
+        sensor: Position of the sensor.
+        first, count: First sample that is shown, and number of them.
+        path: Fitted path `(sensor, time)`; None for none.
+    """
+    first = max(min(first, comparison.n_samples - count), 0)
+    shown = slice(first, first + count)
+    own, other = comparison.recording[sensor], comparison.reference.signal[0, sensor]
+    seconds = comparison.info.seconds(comparison.n_samples)[shown]
+    handles = _plot(ax, seconds, own[shown] - own.mean(), **_DOT)
+    handles += _plot(ax, seconds[: len(other[:count])], other[: len(seconds)] - other.mean(), **_LINE)
+    if path is not None:
+        handles += _plot(ax, seconds, path[sensor, shown], **DASHED)
+    label = with_unit("signal less its mean", comparison.info.measure)
+    _finish(ax, handles, ["recording", "simulation", "fitted"][: len(handles)], "time (s)", label)
+
+
 def tails(ax: Axes, comparison: Comparison, sensor: int) -> None:
     """Share of prediction errors beyond each size, in standard deviations, and that of normal noise."""
     handles: list[Any] = []

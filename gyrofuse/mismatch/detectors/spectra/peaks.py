@@ -184,9 +184,10 @@ class _BesideFlanks(NamedTuple):
 
     def log_ratio(self) -> float:
         """Logarithm of the mean likelihood ratio of a bump of all sensors or of some."""
-        each = [matrix.diagonal().real[:, None, None] for matrix in (self.m * self.inside, self.f * self.beside)]
-        own = e_value_of_some(log_ratios(*each, self.m, self.f))
-        together = log_ratios(self.m * self.inside[None], self.f * self.beside[None], self.m, self.f)[0]
+        inside, beside = self.m * self.inside[None], self.f * self.beside[None]
+        each = (total.diagonal(dim1=-2, dim2=-1).real.mT[..., None] for total in (inside, beside))  # (sensor, 1, 1)
+        own = e_value_of_some(log_ratios(next(each), next(each), self.m, self.f))
+        together = log_ratios(inside, beside, self.m, self.f)[0]
         return float(torch.logaddexp(own, together)) - math.log(2)
 
     @property

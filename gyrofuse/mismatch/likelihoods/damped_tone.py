@@ -1,0 +1,205 @@
+"""A tone that sets in at once and dies away, fitted to the samples around it.
+
+    x_i(t) = exp(-(t - t0) / tau) [cosine_i cos(2 pi f (t - t0)) + sine_i sin(2 pi f (t - t0))],   t >= t0,
+
+Samples and tones are whitened by the simulation's spectra; the level of the noise is that of the samples themselves, so
+that the log likelihood ratio of a sensor is `m/2 log(RSS0 / RSS)` for `m` samples.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import optimize
+from torch import Tensor
+
+from gyrofuse.mismatch.signals.lines import whitened
+from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
+
+_BEFORE, _AFTER, _PAD = 6, 10, 64  # time constants, and samples, of the recording around a tone that are looked at
+_DIES = 12  # time constants after which it is gone
+_SHORTEST = 2.0  # samples of a time constant
+
+
+class DampedTone(NamedTuple):
+    """One tone.
+
+    Attributes:
+        onset: `t0`, samples.
+        frequency: `f`, cycles per sample.
+        tau: Samples.
+    """
+
+    onset: int
+    frequency: float
+    tau: float
+
+    @property
+    def gone_after(self) -> int:
+        """Sample from which it is no more."""
+        return self.onset + math.ceil(_DIES * self.tau)
+
+    def paths(self, first: int, n: int) -> Tensor:
+        """Cosine and sine at `n` samples from a first one on, `(2, time)`."""
+        t = torch.arange(n, dtype=torch.float64) + first - self.onset
+        angle, decay = 2 * math.pi * self.frequency * t, torch.exp(-t.clamp(min=0) / self.tau) * (t >= 0)
+        return torch.stack([decay * angle.cos(), decay * angle.sin()])
+
+
+class FittedTone(NamedTuple):
+    """A tone with its sizes.
+
+    Attributes:
+        tone: Onset, frequency and time constant.
+        size: Of cosine and sine, `(2, sensor)`.
+        log_ratio: Log likelihood ratio of each sensor, `(sensor,)`.
+    """
+
+    tone: DampedTone
+    size: Tensor
+    log_ratio: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """Samples around a tone.
+
+    Attributes:
+        base: Noise of the simulation.
+        first: Position of the first sample.
+        samples: `(sensor, time)`.
+        keep: Those to be used, `(time,)`; all by default.
+    """
+
+    base: NoiseSpectrum
+    first: int
+    samples: Tensor
+    keep: Tensor | None = None
+
+    @classmethod
+    def of(cls, recording: Tensor, base: NoiseSpectrum, onset: int, tau: float) -> Surroundings:
+        """Of a recording `(sensor, time)`, as far as it goes."""
+        before, after = (round(times * tau) + _PAD for times in (_BEFORE, _AFTER))
+        first, end = max(onset - before, 0), min(onset + after, recording.shape[-1])
+        return cls(base, first, recording[:, first:end])
+
+    def without(self, turn: int, of: int) -> Surroundings:
+        """Without every so many-th sample, to be judged by."""
+        return replace(self, keep=(torch.arange(self.samples.shape[-1]) + self.first) % of != turn)
+
+    @property
+    def white(self) -> Tensor:
+        """Whitened samples, `(sensor, time)`."""
+        return whitened(self.samples, self.base)
+
+    def whitened_paths(self, paths: Tensor) -> Tensor:
+        """Paths `(path, time)` as each sensor's whitened samples show them, `(sensor, path, time)`."""
+        n_sensors = len(self.samples)
+        return whitened(paths[:, None].expand(-1, n_sensors, -1), self.base).movedim(0, 1)
+
+    def regression(self, paths: Tensor) -> tuple[Tensor, Tensor]:
+        """Sizes `(path, sensor)` and log likelihood ratios `(sensor,)` of paths `(path, time)`."""
+        y, x = self.white, self.whitened_paths(paths)
+        if self.keep is not None:
+            y, x = y[:, self.keep], x[..., self.keep]
+        gram = x @ x.mT
+        ridge = 1e-10 * gram.diagonal(dim1=-2, dim2=-1).amax(-1).clamp(min=1e-300)  # of a sine at half the rate
+        gram = gram + ridge[:, None, None] * torch.eye(len(paths), dtype=gram.dtype)
+        seen = (x @ y[..., None])[..., 0]
+        size = torch.linalg.solve(gram, seen)
+        total = y.square().sum(-1)
+        left = (total - (size * seen).sum(-1)).clamp(min=1e-12 * total)
+        return size.mT, y.shape[-1] / 2 * (total / left).log()
+
+    def of_tone(self, tone: DampedTone) -> FittedTone:
+        """With the sizes that fit best."""
+        return FittedTone(tone, *self.regression(tone.paths(self.first, self.samples.shape[-1])))
+
+    def fitted(self, start: DampedTone, sensors: Sequence[int] | None = None) -> FittedTone:
+        """The likeliest onset, frequency and time constant near those of a start, in some sensors or all."""
+        which = list(range(len(self.samples)) if sensors is None else sensors)
+        best = self._onset(start, which, math.ceil(start.tau), max(round(start.tau / 8), 1))
+        step = max(round(start.tau / 8), 1)
+        while True:
+            best = self._numbers(best, which)
+            if step == 1:
+                return self.of_tone(self._onset(best, which, 2, 1))
+            best, step = self._onset(best, which, 2 * step, max(step // 4, 1)), max(step // 4, 1)
+
+    def refined(self, start: DampedTone, sensors: Sequence[int]) -> FittedTone:
+        """The likeliest frequency and time constant near those of a start, at its onset."""
+        return self.of_tone(self._numbers(start, list(sensors)))
+
+    def _onset(self, tone: DampedTone, which: list[int], reach: int, step: int) -> DampedTone:
+        tried = [tone._replace(onset=tone.onset + k) for k in range(-reach, reach + 1, step)]
+        return max(tried, key=lambda one: self._gain(one, which))
+
+    def _numbers(self, tone: DampedTone, which: list[int]) -> DampedTone:
+        """Frequency and time constant, of an onset."""
+
+        def at(point: NDArray[np.float64]) -> DampedTone:
+            frequency = min(max(tone.frequency + float(point[0]) / tone.tau, 0.0), 0.5)
+            return tone._replace(frequency=frequency, tau=max(tone.tau * math.exp(float(point[1])), _SHORTEST))
+
+        simplex = np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.4]])
+        found = optimize.minimize(
+            lambda point: -self._gain(at(point), which),
+            simplex[0],
+            method="Nelder-Mead",
+            options={"initial_simplex": simplex, "maxfev": 60, "xatol": 1e-3, "fatol": 1e-3},
+        )
+        return at(found.x)
+
+    def _gain(self, tone: DampedTone, which: list[int]) -> float:
+        return float(self.of_tone(tone).log_ratio[which].sum())
+
+    def sd(self, found: FittedTone) -> tuple[float, float, Tensor]:
+        """Standard deviations of frequency, of the logarithm of the time constant, and of the sizes `(2, sensor)`.
+
+        By the information of all numbers together; the onset is taken for known.
+        """
+        tone, n = found.tone, self.samples.shape[-1]
+        y, x = self.white, self.whitened_paths(tone.paths(self.first, n))  # (sensor, path, time)
+        step = 1e-4
+        nearby = (
+            (tone._replace(frequency=tone.frequency + step / tone.tau), step / tone.tau),
+            (tone._replace(tau=tone.tau * math.exp(step)), step),
+        )
+        size = found.size.mT[..., None]  # (sensor, path, 1)
+        here = (size * x).sum(1)
+        slopes = [((size * self.whitened_paths(other.paths(self.first, n))).sum(1) - here) / by for other, by in nearby]
+        noise = (y - here).square().mean(-1)
+        p = len(y)
+        information = torch.zeros(2 + 2 * p, 2 + 2 * p, dtype=torch.float64)
+        for i in range(p):
+            rows = torch.cat([torch.stack([slope[i] for slope in slopes]), x[i]])
+            at = torch.tensor([0, 1, 2 + 2 * i, 3 + 2 * i])
+            information[at[:, None], at] += rows @ rows.mT / noise[i]
+        scale = information.diagonal().clamp(min=1e-300).rsqrt()
+        covariance = torch.linalg.pinv(information * scale * scale[:, None], hermitian=True) * scale * scale[:, None]
+        sd = covariance.diagonal().clamp(min=0).sqrt()
+        return float(sd[0]), float(sd[1]), sd[2:].view(p, 2).mT
+
+    def other_courses(self, found: FittedTone, sensors: Sequence[int]) -> float:
+        """Log likelihood ratio of what is no ring-down: one sample, a step, a tone that grows before it dies away."""
+        which, n = list(sensors), self.samples.shape[-1]
+        t = torch.arange(n, dtype=torch.float64) + self.first - found.tone.onset
+        y = self.white[which]
+        total = y.square().sum(-1, keepdim=True)
+        one_sample = n / 2 * (total / (total - y.square()).clamp(min=1e-12 * total)).log().sum(0).max()
+        step = self.regression((t >= 0).to(torch.float64)[None])[1][which].sum()
+
+        def both_ways(middle: float, tau: float) -> Tensor:
+            apart = t - middle
+            angle, envelope = 2 * math.pi * found.tone.frequency * t, torch.exp(-apart.abs() / tau)
+            return self.regression(torch.stack([envelope * angle.cos(), envelope * angle.sin()]))[1][which].sum()
+
+        tau = found.tone.tau
+        grown = [both_ways(k / 2 * tau, share * tau) for k in range(-1, 5) for share in (0.35, 0.7, 1.4)]
+        return float(torch.stack([one_sample, step, *grown]).max())

@@ -1,0 +1,263 @@
+"""Ring-downs: knocks after which a structure rings and dies away."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, ClassVar
+
+import torch
+from scipy import stats
+from torch import Tensor
+
+from gyrofuse.mismatch.decisions import NATS_PER_NUMBER
+from gyrofuse.mismatch.detectors.lines.ring_downs import ring_down_p_value, ring_downs, scanned_ring_downs
+from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
+from gyrofuse.mismatch.likelihoods.damped_tone import DampedTone, FittedTone, Surroundings
+from gyrofuse.mismatch.mechanisms import pictures
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.dims import Dims
+from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED
+from gyrofuse.mismatch.signals.lines import whitened
+from gyrofuse.mismatch.signals.prediction_errors import median_sd
+from gyrofuse.mismatch.stats.inclusion import included_sensors
+from gyrofuse.mismatch.stats.limits import Z
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_HOUR = 3600.0
+_BEYOND_CHANCE = 4.0  # nats by which a tone has to exceed what the best of all cells has by chance
+_ROUNDS, _MOST = 4, 48  # scans, each of what the tones of the last one leave, and tones that are told apart
+_FAINT = 1e-3  # share of a knock's strongest mode below which what is left is its form, and no further mode
+_SAME_KNOCK = 0.1  # time constants within which modes set in together
+
+
+@dataclass(frozen=True, eq=False)
+class RingDown(Mechanism):
+    """`x_i(t) = sum_m exp(-u / tau_m) [cosine_mi cos(2 pi f_m u) + sine_mi sin(2 pi f_m u)]`, `u = t - t_m >= 0`.
+
+    A mode that is struck at times `t_m`, at random. Looks like spikes, which are gone after a sample; like a tone or
+    a resonance, which have no beginning; and like louder noise, of which no two sensors keep a phase. What grows as it
+    dies away has another name or none.
+
+    Attributes:
+        onset_s: `t_m`, s after the first sample, `(tone,)`; modes that set in together are one knock.
+        frequency_hz: `f_m`, `(tone,)`.
+        decay_s: `tau_m`, `(tone,)`.
+        cosine, sine: `(tone, sensor)`, unit of the signal.
+        duration_s: Of the recording in which so many were.
+    """
+
+    name: ClassVar[str] = "ring_down"
+    likelihood: ClassVar[str] = "transients"
+    separated_by: ClassVar[str] = "more knocks"
+    time_words: ClassVar[str] = "strongest at"
+    additive: ClassVar[bool] = True
+    onset_s: Annotated[Tensor, Dims(("tone",))]
+    frequency_hz: Annotated[Tensor, Dims(("tone",))]
+    decay_s: Annotated[Tensor, Dims(("tone",))]
+    cosine: Annotated[Tensor, Dims(("tone", "sensor"))]
+    sine: Annotated[Tensor, Dims(("tone", "sensor"))]
+    duration_s: float
+
+    @property
+    def amplitude(self) -> Tensor:
+        """At the onset, `(tone, sensor)`, unit of the signal."""
+        return torch.hypot(self.cosine, self.sine)
+
+    @property
+    def knocks(self) -> tuple[tuple[int, ...], ...]:
+        """Tones that set in together, in the order of time."""
+        groups: list[list[int]] = []
+        for k in self.onset_s.argsort().tolist():
+            last = groups[-1][-1] if groups else None
+            if last is not None and float(self.onset_s[k] - self.onset_s[last]) < _SAME_KNOCK * float(
+                self.decay_s[[k, last]].max()
+            ):
+                groups[-1].append(k)
+            else:
+                groups.append([k])
+        return tuple(tuple(group) for group in groups)
+
+    @classmethod
+    def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
+        p_value = ring_down_p_value(comparison)
+        if p_value > level:
+            return None
+        tones = _tones(comparison)
+        if not tones:
+            return None
+        info = comparison.info
+        effect = cls.of(tones, comparison)
+        strongest = max(tones, key=lambda tone: float(tone.log_ratio.sum()))
+        around = Surroundings.of(comparison.recording, comparison.base, strongest.tone.onset, strongest.tone.tau)
+        frequency_sd, decay_sd, size_sd = around.sd(strongest)
+        there = tuple((strongest.size != 0).any(0).nonzero()[:, 0].tolist())
+        f, decay = strongest.tone.frequency * info.rate, strongest.tone.tau / info.rate
+        spread, factor = Z * frequency_sd * info.rate, math.exp(min(Z * decay_sd, 20.0))
+        knocks, hours = len(effect.knocks), effect.duration_s / _HOUR
+        low, high = (stats.chi2.ppf(q, 2 * (knocks + more)) / 2 / hours for q, more in ((0.025, 0), (0.975, 1)))
+        parameters = {
+            "rate": Parameter(knocks / hours, float(low), float(high), "1/h"),
+            "frequency": Parameter(f, max(f - spread, 0.0), min(f + spread, info.rate / 2), "Hz"),
+            "decay_time": Parameter(decay, decay / factor, decay * factor, "s"),
+        }
+        amplitude = torch.hypot(*strongest.size)
+        # Of the two parts of an amplitude the one along its phase counts.
+        sd = (strongest.size * size_sd).square().sum(0).sqrt() / amplitude.clamp(min=1e-300)
+        for i in there:
+            a, reach = float(amplitude[i]), Z * float(sd[i])
+            parameters[f"amplitude[{i}]"] = Parameter(a, max(a - reach, 0.0), a + reach, info.measure)
+        concerned = tuple((effect.amplitude > 0).any(0).nonzero()[:, 0].tolist())
+        largest, onset = int(amplitude.argmax()), strongest.tone.onset / info.rate
+        return Finding(
+            cls.name,
+            effect,
+            f"{knocks} {'knock' if knocks == 1 else 'knocks'} after which something rings, {knocks / hours:.3g} an "
+            f"hour, in {info.named(concerned, 'all sensors')}: the strongest at {onset:.6g} s, at {f:.4g} Hz, dies "
+            f"away in {decay:.3g} s, from {float(amplitude[largest]):.3g} {info.measure} in sensor "
+            f"{info.sensors[largest]}",
+            p_value,
+            concerned,
+            parameters,
+            levels=(level_of(strongest.tone.frequency),),
+            frequency_hz=f,
+            time_s=onset,
+            gain=float(sum(tone.log_ratio.sum() for tone in tones)),
+        )
+
+    @classmethod
+    def of(cls, tones: Sequence[FittedTone], comparison: Comparison) -> RingDown:
+        """Of tones that were fitted to a recording."""
+        rate = comparison.info.rate
+        onset, frequency, tau = (
+            torch.tensor(x, dtype=torch.float64) for x in zip(*(t.tone for t in tones), strict=True)
+        )
+        size = torch.stack([tone.size for tone in tones])
+        duration = comparison.n_samples / rate
+        return cls(onset / rate, frequency * rate, tau / rate, size[:, 0], size[:, 1], duration)
+
+    def fit_without(self, comparison: Comparison, fold: int) -> RingDown:
+        """With the numbers that every fourth sample is not used for: a tone lies in one block, or in few."""
+        left, fitted = comparison.recording, []
+        for tone, size in self._tones(comparison.info.rate):
+            around = Surroundings.of(left, comparison.base, tone.onset, tone.tau).without(fold, N_FOLDS)
+            sensors = size.any(0).nonzero()[:, 0].tolist()
+            found = _only(around.refined(tone, sensors), sensors)
+            left = left - found.size.mT @ found.tone.paths(0, comparison.n_samples)
+            fitted.append(found)
+        return self.of(fitted, comparison)
+
+    def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
+        """Of every fourth sample, four blocks together."""
+        n, rate = comparison.n_samples, comparison.info.rate
+        taken = whitened(self._path(n, rate), comparison.base)
+        white = comparison.white
+        variance = median_sd(white)[:, None].square()
+        gains = ((white * taken - taken.square() / 2) / variance).sum(0) * (torch.arange(n) % N_FOLDS == fold)
+        block = n // N_JUDGED
+        return gains[: N_JUDGED * block].view(N_JUDGED // N_FOLDS, -1).sum(-1)
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        rate, strongest = comparison.info.rate, int((self.amplitude[:, sensor] * self.decay_s.sqrt()).argmax())
+        tau = float(self.decay_s[strongest]) * rate
+        first = round(float(self.onset_s[strongest]) * rate - 2 * tau - 8)
+        path = self._path(comparison.n_samples, rate) if fitted else None
+        pictures.transient(ax, comparison, sensor, first, round(8 * tau) + 24, path)
+
+    def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
+        """Knocks at random, each one of those that were found, of either sign."""
+        if signal.ndim > 2:
+            records = [self.apply(record, info, generator) for record in signal.flatten(0, -3)]
+            return torch.stack(records).view_as(signal)
+        n, knocks = signal.shape[-1], self.knocks
+        expected = torch.tensor(len(knocks) * n / info.rate / self.duration_s, dtype=torch.float64)
+        for _ in range(int(torch.poisson(expected, generator=generator))):
+            which = list(knocks[int(torch.randint(len(knocks), (), generator=generator))])
+            onset = float(torch.rand((), generator=generator, dtype=torch.float64)) * n / info.rate
+            sign = 1.0 if bool(torch.randint(2, (), generator=generator)) else -1.0
+            one = replace(
+                self,
+                onset_s=onset + self.onset_s[which] - self.onset_s[which].min(),
+                **{name: getattr(self, name)[which] for name in ("frequency_hz", "decay_s", "cosine", "sine")},
+            )
+            signal = signal + sign * one._path(n, info.rate)
+        return signal
+
+    def remove(self, signal: Tensor, info: RecordingInfo) -> Tensor:
+        return signal - self._path(signal.shape[-1], info.rate)
+
+    def repair(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
+        return comparison.subtract(self._path(comparison.n_samples, comparison.info.rate))
+
+    def apply_elsewhere(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
+        """Knocks come at other times there."""
+        return self.apply_to_reference(comparison, generator)
+
+    def _tones(self, rate: float) -> list[tuple[DampedTone, Tensor]]:
+        """Each with its sizes, `(2, sensor)`."""
+        numbers = torch.stack([self.onset_s, self.frequency_hz / rate**2, self.decay_s], -1) * rate
+        sizes = torch.stack([self.cosine, self.sine], 1)
+        return [
+            (DampedTone(round(onset), frequency, tau), size)
+            for (onset, frequency, tau), size in zip(numbers.tolist(), sizes, strict=True)
+        ]
+
+    def _path(self, n_samples: int, rate: float) -> Tensor:
+        """`(sensor, time)`."""
+        path = torch.zeros(self.cosine.shape[-1], n_samples, dtype=torch.float64)
+        for tone, size in self._tones(rate):
+            first = max(tone.onset, 0)
+            end = min(tone.gone_after, n_samples)
+            if end > first:
+                path[:, first:end] += size.mT @ tone.paths(first, end - first)
+        return path
+
+
+def _tones(comparison: Comparison) -> list[FittedTone]:
+    """All tones that ring down, the strongest of each scan first."""
+    left, scan, tones = comparison.recording, ring_downs(comparison), list[FittedTone]()
+    for _ in range(_ROUNDS):
+        new, by_chance = list[FittedTone](), math.log(scan.n_cells)
+        least = by_chance + _BEYOND_CHANCE
+        for cell in scan.cells:
+            if cell.log_ratio < by_chance or len(tones) + len(new) >= _MOST:
+                break
+            around = Surroundings.of(left, comparison.base, cell.onset, cell.tau)
+            found = around.fitted(DampedTone(cell.onset, cell.frequency, cell.tau))
+            which = list(included_sensors(2 * found.log_ratio, 2).positions)
+            found = _only(around.fitted(found.tone, which), which)
+            gain = float(found.log_ratio.sum())
+            if (
+                gain < least
+                or gain < around.other_courses(found, which) + NATS_PER_NUMBER
+                or _faint(found, tones + new)
+            ):
+                continue
+            left = left - found.size.mT @ found.tone.paths(0, comparison.n_samples)
+            new.append(found)
+        if not new:
+            return tones
+        tones += new
+        scan = scanned_ring_downs(whitened(left, comparison.base))
+    return tones
+
+
+def _only(found: FittedTone, sensors: Sequence[int]) -> FittedTone:
+    """In some sensors alone."""
+    there = torch.zeros(found.size.shape[-1], dtype=torch.bool)
+    there[list(sensors)] = True
+    return found._replace(size=found.size * there, log_ratio=found.log_ratio * there)
+
+
+def _faint(found: FittedTone, others: Sequence[FittedTone]) -> bool:
+    """Whether it is hardly anything beside a stronger one that rings at the same time."""
+    return any(
+        float(found.log_ratio.sum()) < _FAINT * float(other.log_ratio.sum())
+        and found.tone.onset < other.tone.gone_after
+        and other.tone.onset < found.tone.gone_after
+        for other in others
+    )
