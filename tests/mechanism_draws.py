@@ -24,6 +24,7 @@ from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
 from gyrofuse.mismatch.mechanisms.signals.g_sensitivity import GSensitivity
 from gyrofuse.mismatch.mechanisms.signals.quadratic_coupling import QuadraticCoupling
 from gyrofuse.mismatch.mechanisms.signals.ramp import Ramp
+from gyrofuse.mismatch.mechanisms.signals.ring_down import RingDown
 from gyrofuse.mismatch.mechanisms.signals.scale_factor import ScaleFactor
 from gyrofuse.mismatch.mechanisms.signals.step import Step
 from gyrofuse.mismatch.mechanisms.signals.temperature import TemperatureDrift
@@ -188,6 +189,23 @@ def _(setting: Setting) -> Drawn:
     return Drawn(
         ScaleFactor("rate", error[:, None]), setting.of_each("error", 1e6 * error), {"rate": motion.reshape(1, -1)}
     )
+
+
+@draws(RingDown)
+def _(setting: Setting) -> Drawn:
+    knocks, seconds = 6, setting.n_samples / RATE  # expected in the record, all of one mode
+    frequency, decay = setting.even(0.1, 0.35) * RATE, setting.even(15.0, 40.0) / RATE
+    size, phase = setting.sizes(3.0, 4.5) * setting.size, setting.even(0.0, 2 * math.pi)
+    effect = RingDown(
+        torch.zeros(1, dtype=torch.float64),
+        torch.full((1,), frequency, dtype=torch.float64),
+        torch.full((1,), decay, dtype=torch.float64),
+        math.cos(phase) * size[None],
+        math.sin(phase) * size[None],
+        seconds / knocks,
+    )
+    truth = {"rate": 3600 * knocks / seconds, "frequency": frequency, "decay_time": decay}
+    return Drawn(effect, truth | setting.of_each("amplitude", size))
 
 
 @draws(VibrationTone)

@@ -29,6 +29,7 @@ from gyrofuse.mismatch.mechanisms.signals.clock import ClockSkew
 from gyrofuse.mismatch.mechanisms.signals.g_sensitivity import GSensitivity
 from gyrofuse.mismatch.mechanisms.signals.quadratic_coupling import QuadraticCoupling
 from gyrofuse.mismatch.mechanisms.signals.ramp import Ramp
+from gyrofuse.mismatch.mechanisms.signals.ring_down import RingDown
 from gyrofuse.mismatch.mechanisms.signals.scale_factor import ScaleFactor
 from gyrofuse.mismatch.mechanisms.signals.step import Step
 from gyrofuse.mismatch.mechanisms.signals.temperature import TemperatureDrift
@@ -83,6 +84,14 @@ EVERY = (
     QuadraticCoupling("acceleration", torch.tensor([[1 / 3], [0.1]], dtype=torch.float64), "axis 2"),
     ScaleFactor("rate", torch.tensor([[1e-3], [0.0]], dtype=torch.float64)),
     ChannelTransfer(("rate",), torch.tensor([[[1e-3, 0.2, 1 / 3]], [[0.0, 0.0, 0.0]]], dtype=torch.float64)),
+    RingDown(
+        numbers(1.5, 1 / 3),
+        numbers(7.3, 9.1),
+        numbers(0.2, 1 / 3),
+        torch.tensor([[1 / 3, 0.0], [0.1, 0.2]], dtype=torch.float64),
+        torch.tensor([[0.1, 0.0], [1 / 7, 0.2]], dtype=torch.float64),
+        4.0,
+    ),
     VibrationTone(7.3, numbers(0.3, 0.0), numbers(0.1, 0.2)),
     ToneSize(7.3, numbers(0.3, 1 / 3)),
     RandomTelegraph(numbers(0.3, 0.0), numbers(1 / 3, 1.0), numbers(0.2, 1.0)),

@@ -142,13 +142,13 @@ class RingDown(Mechanism):
 
     def fit_without(self, comparison: Comparison, fold: int) -> RingDown:
         """With the numbers that every fourth sample is not used for: a tone lies in one block, or in few."""
-        left, fitted = comparison.recording, []
+        left, fitted = self.remove(comparison.recording, comparison.info), list[FittedTone]()
         for tone, size in self._tones(comparison.info.rate):
-            around = Surroundings.of(left, comparison.base, tone.onset, tone.tau).without(fold, N_FOLDS)
+            own = left + size.mT @ tone.paths(0, comparison.n_samples)
+            around = Surroundings.of(own, comparison.base, tone.onset, tone.tau).without(fold, N_FOLDS)
             sensors = size.any(0).nonzero()[:, 0].tolist()
-            found = _only(around.refined(tone, sensors), sensors)
-            left = left - found.size.mT @ found.tone.paths(0, comparison.n_samples)
-            fitted.append(found)
+            fitted.append(_only(around.refined(tone, sensors), sensors))
+            left = own - _path(fitted[-1], comparison.n_samples)
         return self.of(fitted, comparison)
 
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
@@ -237,13 +237,37 @@ def _tones(comparison: Comparison) -> list[FittedTone]:
                 or _faint(found, tones + new)
             ):
                 continue
-            left = left - found.size.mT @ found.tone.paths(0, comparison.n_samples)
+            left = left - _path(found, comparison.n_samples)
             new.append(found)
         if not new:
             return tones
-        tones += new
+        tones = _one_by_one(comparison, tones + new)
+        left = comparison.recording - sum(_path(tone, comparison.n_samples) for tone in tones)
         scan = scanned_ring_downs(whitened(left, comparison.base))
     return tones
+
+
+def _one_by_one(comparison: Comparison, tones: list[FittedTone]) -> list[FittedTone]:
+    """Tones that ring at the same time, each fitted anew to what the others leave."""
+    sweeps, n = 2, comparison.n_samples
+    left = comparison.recording - sum(_path(tone, n) for tone in tones)
+    for k in [k for k, one in enumerate(tones) if any(_overlap(one, o) for o in tones if o is not one)] * sweeps:
+        own = left + _path(tones[k], n)
+        around = Surroundings.of(own, comparison.base, tones[k].tone.onset, tones[k].tone.tau)
+        which = tones[k].size.any(0).nonzero()[:, 0].tolist()
+        tones[k] = _only(around.fitted(tones[k].tone, which), which)
+        left = own - _path(tones[k], n)
+    return tones
+
+
+def _path(found: FittedTone, n_samples: int) -> Tensor:
+    """`(sensor, time)`."""
+    return found.size.mT @ found.tone.paths(0, n_samples)
+
+
+def _overlap(one: FittedTone, other: FittedTone) -> bool:
+    """Whether they ring at the same time."""
+    return one.tone.onset < other.tone.gone_after and other.tone.onset < one.tone.gone_after
 
 
 def _only(found: FittedTone, sensors: Sequence[int]) -> FittedTone:
@@ -256,8 +280,6 @@ def _only(found: FittedTone, sensors: Sequence[int]) -> FittedTone:
 def _faint(found: FittedTone, others: Sequence[FittedTone]) -> bool:
     """Whether it is hardly anything beside a stronger one that rings at the same time."""
     return any(
-        float(found.log_ratio.sum()) < _FAINT * float(other.log_ratio.sum())
-        and found.tone.onset < other.tone.gone_after
-        and other.tone.onset < found.tone.gone_after
+        float(found.log_ratio.sum()) < _FAINT * float(other.log_ratio.sum()) and _overlap(found, other)
         for other in others
     )
