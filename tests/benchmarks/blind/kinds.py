@@ -31,6 +31,7 @@ def _with(effect: Callable[..., Part], **settings: Any) -> Callable[[Bench, floa
 
 _MECHANISMS: dict[str, Callable[[Bench, float], Part]] = {
     "vibration_tone": shapes.vibration_tone,
+    "ring_down": shapes.ring_down,
     "drifting_tone": shapes.drifting_tone,
     "resonance": spectral.resonance,
     "quadratic_coupling": shapes.quadratic_coupling,

@@ -58,6 +58,37 @@ def vibration_tone(bench: Bench, nats: float, *, frequency: float | None = None)
     return part
 
 
+def ring_down(bench: Bench, nats: float) -> Part:
+    """Knocks on a mount, which rings in one mode each time: an oscillator that is struck while it is at rest.
+
+    Where they are is not known beforehand: each knock costs the logarithm of the number of samples on top.
+    """
+    sensors, knocks = bench.some_sensors(2), int(bench.rng.integers(1, 5))
+    decay = math.exp(bench.rng.uniform(math.log(12), math.log(200))) / bench.rate  # s
+    f = bench.rng.uniform(0.03, 0.4) * bench.rate
+    t = np.arange(bench.steps) / bench.step_rate
+    struck = np.zeros(bench.steps)
+    onsets = np.sort(bench.rng.uniform(0.02, 0.9, knocks)) * bench.duration
+    for onset in onsets:
+        since = np.clip(t - onset, 0, None)
+        struck += (
+            bench.rng.choice([-1, 1])
+            * bench.rng.uniform(0.7, 1.4)
+            * (np.exp(-since / decay) * np.sin(2 * np.pi * f * since))
+        )
+    unit = bench.sampled(bench.gains(sensors)[:, None] * struck)
+    unknown = knocks * math.log(bench.n)
+    part, _ = bench.shape("ring_down", nats + unknown, unit, known=True, frequency_hz=f)
+    return replace(
+        part,
+        nats=nats,
+        llr=lambda recording: part.llr(recording) - unknown,
+        oracle_nats=nats,
+        oracle_law="bound",
+        parameters={"frequency": quantity(f, "Hz"), "decay_time": quantity(decay, "s")},
+    )
+
+
 def drifting_tone(bench: Bench, nats: float) -> Part:
     """A rotor whose speed wanders by many line widths.
 
