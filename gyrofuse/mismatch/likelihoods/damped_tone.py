@@ -22,10 +22,6 @@ from torch import Tensor
 from gyrofuse.mismatch.signals.lines import whitened
 from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
 
-_BEFORE, _AFTER, _PAD = 6, 10, 64  # time constants, and samples, of the recording around a tone that are looked at
-_DIES = 12  # time constants after which it is gone
-_SHORTEST = 2.0  # samples of a time constant
-
 
 class DampedTone(NamedTuple):
     """One tone.
@@ -43,7 +39,7 @@ class DampedTone(NamedTuple):
     @property
     def gone_after(self) -> int:
         """Sample from which it is no more."""
-        return self.onset + math.ceil(_DIES * self.tau)
+        return self.onset + math.ceil(12 * self.tau)  # exp(-12): a hundredth of the noise beside one of 1600 sd
 
     def paths(self, first: int, n: int) -> Tensor:
         """Cosine and sine at `n` samples from a first one on, `(2, time)`."""
@@ -85,7 +81,7 @@ class Surroundings:
     @classmethod
     def of(cls, recording: Tensor, base: NoiseSpectrum, onset: int, tau: float) -> Surroundings:
         """Of a recording `(sensor, time)`, as far as it goes."""
-        before, after = (round(times * tau) + _PAD for times in (_BEFORE, _AFTER))
+        before, after = (round(times * tau) + 64 for times in (6, 10))  # where it is not yet, and no more
         first, end = max(onset - before, 0), min(onset + after, recording.shape[-1])
         return cls(base, first, recording[:, first:end])
 
@@ -142,10 +138,11 @@ class Surroundings:
 
     def _numbers(self, tone: DampedTone, which: list[int]) -> DampedTone:
         """Frequency and time constant, of an onset."""
+        shortest = 2.0  # samples
 
         def at(point: NDArray[np.float64]) -> DampedTone:
             frequency = min(max(tone.frequency + float(point[0]) / tone.tau, 0.0), 0.5)
-            return tone._replace(frequency=frequency, tau=max(tone.tau * math.exp(float(point[1])), _SHORTEST))
+            return tone._replace(frequency=frequency, tau=max(tone.tau * math.exp(float(point[1])), shortest))
 
         simplex = np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.4]])
         found = optimize.minimize(

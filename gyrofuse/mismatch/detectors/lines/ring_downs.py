@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from gyrofuse._base.transforms import squared_modulus
-from gyrofuse.mismatch.decisions import CHANCE
+from gyrofuse.mismatch.decisions import CHANCE, NATS_AS_GOOD
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.signals.comparison import Comparison
@@ -30,17 +30,6 @@ from gyrofuse.mismatch.signals.lines import simulated_lines, whitened
 from gyrofuse.mismatch.stats.level_scan import local_level
 from gyrofuse.mismatch.stats.multiplicity import e_value_of_some, p_value_beyond_reference
 
-_SHORTEST = 8  # samples of a time constant: shorter ones are spikes
-_LONGEST_SHARE = 96  # of a record, a time constant at most: medians over time take a hundred windows
-_REACH = 4  # time constants of a window
-_CLIP = 4.5  # standard deviations: no spike rings
-_PER_TAU = 2  # windows for a time constant
-_MOST_FRAMES = 512  # that tell the median of a frequency
-_AT_ONCE = 2**22  # numbers of windows at a time, to bound memory
-_SIZES = (6.0, 24.0, 96.0)  # power of a ring-down over that of the noise in a cell
-_WORTH = 6.0  # nats of some sensor from which a cell is looked at
-_LOWEST = _REACH  # cycles in a window, one for a time constant: slower ones are steps and drifts
-
 
 class RingCell(NamedTuple):
     """A cell of time and frequency that stands out.
@@ -49,6 +38,7 @@ class RingCell(NamedTuple):
         onset: Sample.
         frequency: Cycles per sample.
         tau: Samples.
+        length: Of its window, samples.
         log_ratio: Logarithm of its likelihood ratio.
         score: `v` of each sensor, `(sensor,)`.
     """
@@ -56,6 +46,7 @@ class RingCell(NamedTuple):
     onset: int
     frequency: float
     tau: int
+    length: int
     log_ratio: float
     score: Tensor
 
@@ -85,7 +76,7 @@ def ring_down_test(comparison: Comparison) -> TestResult:
     if not found.cells:
         return TestResult("ring", 1.0, "nothing rings")
     cell = found.cells[0]
-    sensors = tuple((cell.score > max(_WORTH, float(cell.score.max()) / 4)).nonzero()[:, 0].tolist())
+    sensors = tuple((cell.score > max(NATS_AS_GOOD, float(cell.score.max()) / 4)).nonzero()[:, 0].tolist())
     f = cell.frequency * info.rate
     return TestResult(
         "ring",
@@ -119,54 +110,74 @@ def _simulated(comparison: Comparison) -> RingScan:
 
 def scanned_ring_downs(white: Tensor) -> RingScan:
     """All ring-downs of whitened samples `(sensor, time)`."""
-    white = (white / local_level(white).sqrt()).clamp(-_CLIP, _CLIP)
+    clip = 4.5  # standard deviations: no spike rings
+    white = (white / local_level(white).sqrt()).clamp(-clip, clip)
     white = white.to(torch.float32)  # enough to find a place; numbers are fitted to the samples as they are
     n, total, n_cells, found = white.shape[-1], -math.inf, 0, list[RingCell]()
-    tau = _SHORTEST
-    while tau * _LONGEST_SHARE <= n:
-        for first, scores in _scores(white, tau):  # (sensor, frame, bin)
-            n_cells += scores[0].numel()
-            frame, place = (scores.amax(0) > _WORTH).nonzero(as_tuple=True)
+    tau, windows = 8, 96  # a shorter one is a spike; medians over time take a hundred windows
+    while tau * windows <= n:
+        for part in _powers(white, tau):
+            n_cells += part.power[0].numel()
+            frame, place = (part.power.amax(0) > NATS_AS_GOOD).nonzero(as_tuple=True)
             if not len(frame):
                 continue
-            own = scores[:, frame, place].to(torch.float64)
+            own = part.power[:, frame, place].to(torch.float64)
             log_ratios = _log_ratios(own)
             total = float(torch.logaddexp(log_ratios.logsumexp(0), torch.tensor(total, dtype=torch.float64)))
-            found += _likeliest(log_ratios, own, first + frame * tau // _PER_TAU, _LOWEST + place, tau)
+            found += part.likeliest(log_ratios, own, frame, place)
         tau *= 2
     found.sort(key=lambda cell: -cell.log_ratio)
     return RingScan(total - math.log(max(n_cells, 1)), n_cells, tuple(_apart(found)))
 
 
-def _scores(white: Tensor, tau: int) -> Iterator[tuple[int, Tensor]]:
-    """First sample and powers `v` of windows `(sensor, frame, bin)`, some at a time, from the lowest bin on."""
-    length, hop = _REACH * tau, tau // _PER_TAU
+class _Part(NamedTuple):
+    """Some windows of one decay.
+
+    Attributes:
+        power: Over the median of the frequency, `(sensor, frame, bin)`.
+        first, hop: Sample at which the first begins, and samples from one to the next.
+        lowest: First bin.
+        tau, length: Time constant and length of a window, samples.
+    """
+
+    power: Tensor
+    first: int
+    hop: int
+    lowest: int
+    tau: int
+    length: int
+
+    def likeliest(self, log_ratios: Tensor, score: Tensor, frame: Tensor, place: Tensor) -> Iterator[RingCell]:
+        """The best of cells `(cell,)`, some dozens of them."""
+        for k in log_ratios.argsort(descending=True).tolist()[:64]:
+            onset, frequency = self.first + int(frame[k]) * self.hop, float(self.lowest + place[k]) / self.length
+            yield RingCell(onset, frequency, self.tau, self.length, float(log_ratios[k]), score[:, k])
+
+
+def _powers(white: Tensor, tau: int) -> Iterator[_Part]:
+    """Windows `exp(-t / tau)` over whitened samples, two for a time constant, some at a time to bound memory."""
+    reach, most_for_median, numbers_at_once = 4, 512, 4_000_000
+    length, hop = reach * tau, tau // 2
+    lowest = reach  # a cycle for a time constant: what is slower is a step or a drift
     taper = torch.exp(-torch.arange(length, dtype=white.dtype) / tau)
     taper /= taper.square().sum().sqrt()
     frames = white.unfold(-1, length, hop)  # (sensor, frame, time)
 
     def power(part: Tensor) -> Tensor:
-        return squared_modulus(torch.fft.rfft(part * taper))[..., _LOWEST:-1].clamp(min=1e-30)
+        return squared_modulus(torch.fft.rfft(part * taper))[..., lowest:-1].clamp(min=1e-30)
 
-    step = -(-frames.shape[1] // _MOST_FRAMES)
+    step = -(-frames.shape[1] // most_for_median)
     usual = power(frames[:, ::step]).median(1, keepdim=True).values / math.log(2)  # (sensor, 1, bin)
-    at_once = max(_AT_ONCE // (length * len(white)), 1)
+    at_once = max(numbers_at_once // (length * len(white)), 1)
     for a in range(0, frames.shape[1], at_once):
-        yield a * hop, power(frames[:, a : a + at_once]) / usual
+        yield _Part(power(frames[:, a : a + at_once]) / usual, a * hop, hop, lowest, tau, length)
 
 
 def _log_ratios(score: Tensor) -> Tensor:
     """Of cells `(cell,)`, from the scores of their sensors `(sensor, cell)`."""
-    each = torch.stack([e_value_of_some(a / (1 + a) * score - math.log1p(a)) for a in _SIZES])
-    return each.logsumexp(0) - math.log(len(_SIZES))
-
-
-def _likeliest(log_ratios: Tensor, score: Tensor, onset: Tensor, place: Tensor, tau: int) -> Iterator[RingCell]:
-    """The best of the cells of one decay, windows apart."""
-    most = 64  # of one decay
-    for k in log_ratios.argsort(descending=True).tolist()[:most]:
-        frequency = float(place[k]) / (_REACH * tau)
-        yield RingCell(int(onset[k]), frequency, tau, float(log_ratios[k]), score[:, k])
+    sizes = (6.0, 24.0, 96.0)  # power of a ring-down over that of the noise
+    each = torch.stack([e_value_of_some(a / (1 + a) * score - math.log1p(a)) for a in sizes])
+    return each.logsumexp(0) - math.log(len(sizes))
 
 
 def _apart(cells: list[RingCell]) -> Iterator[RingCell]:
@@ -179,7 +190,5 @@ def _apart(cells: list[RingCell]) -> Iterator[RingCell]:
 
 
 def _near(cell: RingCell, other: RingCell) -> bool:
-    tau = max(cell.tau, other.tau)
-    return abs(cell.onset - other.onset) < _REACH * tau and abs(cell.frequency - other.frequency) < 2 / min(
-        cell.tau, other.tau
-    )
+    apart, resolved = abs(cell.frequency - other.frequency), 2 / min(cell.tau, other.tau)
+    return abs(cell.onset - other.onset) < max(cell.length, other.length) and apart < resolved

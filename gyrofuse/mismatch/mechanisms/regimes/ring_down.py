@@ -11,7 +11,7 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from gyrofuse.mismatch.decisions import NATS_PER_NUMBER
+from gyrofuse.mismatch.decisions import NATS_AS_GOOD, NATS_PER_NUMBER
 from gyrofuse.mismatch.detectors.lines.ring_downs import ring_down_p_value, ring_downs, scanned_ring_downs
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.likelihoods.damped_tone import DampedTone, FittedTone, Surroundings
@@ -27,12 +27,6 @@ from gyrofuse.mismatch.stats.limits import Z
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-_HOUR = 3600.0
-_BEYOND_CHANCE = 4.0  # nats by which a tone has to exceed what the best of all cells has by chance
-_ROUNDS, _MOST = 4, 48  # scans, each of what the tones of the last one leave, and tones that are told apart
-_FAINT = 1e-3  # share of a knock's strongest mode below which what is left is its form, and no further mode
-_SAME_KNOCK = 0.1  # time constants within which modes set in together
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,9 +66,10 @@ class RingDown(Mechanism):
     def knocks(self) -> tuple[tuple[int, ...], ...]:
         """Tones that set in together, in the order of time."""
         groups: list[list[int]] = []
+        together = 0.1  # time constants
         for k in self.onset_s.argsort().tolist():
             last = groups[-1][-1] if groups else None
-            if last is not None and float(self.onset_s[k] - self.onset_s[last]) < _SAME_KNOCK * float(
+            if last is not None and float(self.onset_s[k] - self.onset_s[last]) < together * float(
                 self.decay_s[[k, last]].max()
             ):
                 groups[-1].append(k)
@@ -98,7 +93,7 @@ class RingDown(Mechanism):
         there = tuple((strongest.size != 0).any(0).nonzero()[:, 0].tolist())
         f, decay = strongest.tone.frequency * info.rate, strongest.tone.tau / info.rate
         spread, factor = Z * frequency_sd * info.rate, math.exp(min(Z * decay_sd, 20.0))
-        knocks, hours = len(effect.knocks), effect.duration_s / _HOUR
+        knocks, hours = len(effect.knocks), effect.duration_s / 3600
         low, high = (stats.chi2.ppf(q, 2 * (knocks + more)) / 2 / hours for q, more in ((0.025, 0), (0.975, 1)))
         parameters = {
             "rate": Parameter(knocks / hours, float(low), float(high), "1/h"),
@@ -220,11 +215,12 @@ class RingDown(Mechanism):
 def _tones(comparison: Comparison) -> list[FittedTone]:
     """All tones that ring down, the strongest of each scan first."""
     left, scan, tones = comparison.recording, ring_downs(comparison), list[FittedTone]()
-    for _ in range(_ROUNDS):
+    rounds, most = 4, 48  # scans, and tones that are told apart
+    for _ in range(rounds):
         new, by_chance = list[FittedTone](), math.log(scan.n_cells)
-        least = by_chance + _BEYOND_CHANCE
+        least = by_chance + NATS_AS_GOOD
         for cell in scan.cells:
-            if cell.log_ratio < by_chance or len(tones) + len(new) >= _MOST:
+            if cell.log_ratio < by_chance or len(tones) + len(new) >= most:
                 break
             around = Surroundings.of(left, comparison.base, cell.onset, cell.tau)
             found = around.fitted(DampedTone(cell.onset, cell.frequency, cell.tau))
@@ -278,8 +274,9 @@ def _only(found: FittedTone, sensors: Sequence[int]) -> FittedTone:
 
 
 def _faint(found: FittedTone, others: Sequence[FittedTone]) -> bool:
-    """Whether it is hardly anything beside a stronger one that rings at the same time."""
+    """Whether it is hardly anything beside a stronger one that rings at the same time: what its form leaves."""
+    share = 1e-3
     return any(
-        float(found.log_ratio.sum()) < _FAINT * float(other.log_ratio.sum()) and _overlap(found, other)
+        float(found.log_ratio.sum()) < share * float(other.log_ratio.sum()) and _overlap(found, other)
         for other in others
     )
