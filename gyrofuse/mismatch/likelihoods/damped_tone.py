@@ -128,6 +128,50 @@ class Surroundings:
                 return self.of_tone(self._onset(best, which, 2, 1))
             best, step = self._onset(best, which, 2 * step, max(step // 4, 1)), max(step // 4, 1)
 
+    def two_modes(self, start: FittedTone, sensors: Sequence[int]) -> tuple[FittedTone, FittedTone]:
+        """Two tones near a start that set in together: they beat, and seem to grow before they die away.
+
+        The log likelihood ratio of both is that of the first; the second has what it adds.
+        """
+        which, n, tone = list(sensors), self.samples.shape[-1], start.tone
+        onsets = [tone.onset - round(k / 2 * tone.tau) for k in range(-1, 5)]
+        step = max(round(tone.tau / 8), 1)
+        while True:
+            tried = [self._beating(tone._replace(onset=onset), which) for onset in onsets]
+            _, first, second = max(tried, key=lambda one: one[0])
+            if step == 1:
+                break
+            step, onsets = max(step // 3, 1), [first.onset + k * step for k in (-2, -1, 0, 1, 2)]
+            tone = first
+        size, log_ratio = self.regression(torch.cat([one.paths(self.first, n) for one in (first, second)]))
+        alone = self.of_tone(first).log_ratio
+        return FittedTone(first, size[:2], log_ratio), FittedTone(second, size[2:], (log_ratio - alone).clamp(min=0))
+
+    def _beating(self, tone: DampedTone, which: list[int]) -> tuple[float, DampedTone, DampedTone]:
+        """Log likelihood ratio, and frequencies and time constants of two tones at an onset."""
+        n, apart = self.samples.shape[-1], 0.3  # frequencies to begin with, in inverse time constants
+
+        def at(point: NDArray[np.float64]) -> tuple[DampedTone, DampedTone]:
+            f, tau = (
+                np.clip(tone.frequency + point[:2] / tone.tau, 0.0, 0.5),
+                np.maximum(tone.tau * np.exp(np.clip(point[2:], -3, 3)), 2.0),
+            )
+            first, second = (tone._replace(frequency=float(f[k]), tau=float(tau[k])) for k in (0, 1))
+            return first, second
+
+        def loss(point: NDArray[np.float64]) -> float:
+            paths = torch.cat([one.paths(self.first, n) for one in at(point)])
+            return -float(self.regression(paths)[1][which].sum())
+
+        start = np.array([-apart / 2, apart / 2, 0.0, 0.0])
+        simplex = np.stack(
+            [start, *(start + move * row for move, row in zip((0.15, 0.15, 0.4, 0.4), np.eye(4), strict=True))]
+        )
+        found = optimize.minimize(
+            loss, start, method="Nelder-Mead", options={"initial_simplex": simplex, "maxfev": 120, "fatol": 1e-2}
+        )
+        return -float(found.fun), *at(found.x)
+
     def refined(self, start: DampedTone, sensors: Sequence[int]) -> FittedTone:
         """The likeliest frequency and time constant near those of a start, at its onset."""
         return self.of_tone(self._numbers(start, list(sensors)))
@@ -184,19 +228,34 @@ class Surroundings:
         return float(sd[0]), float(sd[1]), sd[2:].view(p, 2).mT
 
     def other_courses(self, found: FittedTone, sensors: Sequence[int]) -> float:
-        """Log likelihood ratio of what is no ring-down: one sample, a step, a tone that grows before it dies away."""
-        which, n = list(sensors), self.samples.shape[-1]
-        t = torch.arange(n, dtype=torch.float64) + self.first - found.tone.onset
+        """Log likelihood ratio of what is no ring-down.
+
+        One sample, a step, noise that is louder for a while, a tone that swells and dies away.
+        """
+        which, n, tone = list(sensors), self.samples.shape[-1], found.tone
+        t = torch.arange(n, dtype=torch.float64) + self.first - tone.onset
         y = self.white[which]
         total = y.square().sum(-1, keepdim=True)
         one_sample = n / 2 * (total / (total - y.square()).clamp(min=1e-12 * total)).log().sum(0).max()
         step = self.regression((t >= 0).to(torch.float64)[None])[1][which].sum()
 
-        def both_ways(middle: float, tau: float) -> Tensor:
-            apart = t - middle
-            angle, envelope = 2 * math.pi * found.tone.frequency * t, torch.exp(-apart.abs() / tau)
+        def swelling(middle: float, power: int, width: float) -> Tensor:
+            angle, envelope = 2 * math.pi * tone.frequency * t, torch.exp(-((t - middle).abs() / width).pow(power))
             return self.regression(torch.stack([envelope * angle.cos(), envelope * angle.sin()]))[1][which].sum()
 
-        tau = found.tone.tau
-        grown = [both_ways(k / 2 * tau, share * tau) for k in range(-1, 5) for share in (0.35, 0.7, 1.4)]
-        return float(torch.stack([one_sample, step, *grown]).max())
+        widths = ((1, 0.35), (1, 0.7), (1, 1.4), (2, 0.5), (2, 1.0), (2, 2.0))
+        grown = [swelling(k / 2 * tone.tau, power, w * tone.tau) for k in range(-1, 5) for power, w in widths]
+        return float(torch.stack([one_sample, step, _louder(y), *grown]).max())
+
+
+def _louder(y: Tensor) -> Tensor:
+    """Log likelihood ratio of another variance of samples `(sensor, time)` in the likeliest stretch of them."""
+    squares, n = y.square(), y.shape[-1]
+    whole, best, length = squares.sum(-1, keepdim=True), [y.new_zeros(())], 8
+    while 2 * length <= n:
+        inside = squares.unfold(-1, length, length // 4).sum(-1)  # (sensor, stretch)
+        outside = (whole - inside).clamp(min=1e-12 * whole)
+        own, rest = length / n * (inside / length).log(), (1 - length / n) * (outside / (n - length)).log()
+        best.append((n / 2 * ((whole / n).log() - own - rest)).sum(0).max())
+        length = length * 3 // 2 // 4 * 4
+    return torch.stack(best).max()

@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 class RingDown(Mechanism):
     """`x_i(t) = sum_m exp(-u / tau_m) [cosine_mi cos(2 pi f_m u) + sine_mi sin(2 pi f_m u)]`, `u = t - t_m >= 0`.
 
-    A mode that is struck at times `t_m`, at random. Looks like spikes, which are gone after a sample; like a tone or
-    a resonance, which have no beginning; and like louder noise, of which no two sensors keep a phase. What grows as it
-    dies away has another name or none.
+    Modes that are struck at times `t_m`, at random. Looks like spikes, which are gone after a sample; like a tone or a
+    resonance, which have no beginning; and like louder noise, in which no two sensors keep a phase. What grows before
+    it dies away is two modes that beat, where these are likelier by more than their numbers cost, or has another name.
 
     Attributes:
         onset_s: `t_m`, s after the first sample, `(tone,)`; modes that set in together are one knock.
@@ -226,21 +226,28 @@ def _tones(comparison: Comparison) -> list[FittedTone]:
             found = around.fitted(DampedTone(cell.onset, cell.frequency, cell.tau))
             which = list(included_sensors(2 * found.log_ratio, 2).positions)
             found = _only(around.fitted(found.tone, which), which)
-            gain = float(found.log_ratio.sum())
-            if (
-                gain < least
-                or gain < around.other_courses(found, which) + NATS_PER_NUMBER
-                or _faint(found, tones + new)
-            ):
+            if float(found.log_ratio.sum()) < least or _faint(found, tones + new):
                 continue
-            left = left - _path(found, comparison.n_samples)
-            new.append(found)
+            rung = _ring_down(around, found, which)
+            left = left - sum(_path(one, comparison.n_samples) for one in rung)
+            new += rung
         if not new:
             return tones
         tones = _one_by_one(comparison, tones + new)
         left = comparison.recording - sum(_path(tone, comparison.n_samples) for tone in tones)
         scan = scanned_ring_downs(whitened(left, comparison.base))
     return tones
+
+
+def _ring_down(around: Surroundings, found: FittedTone, sensors: Sequence[int]) -> list[FittedTone]:
+    """The tone, or two that set in together where one seems to grow at first; none where another course is likelier."""
+    rival = around.other_courses(found, sensors)
+    if float(found.log_ratio.sum()) > rival + NATS_PER_NUMBER:
+        return [found]
+    both = around.two_modes(found, sensors)
+    gain = float(both[0].log_ratio[list(sensors)].sum())
+    more = 2 + 2 * len(sensors)  # numbers
+    return [_only(one, sensors) for one in both] if gain > rival + NATS_PER_NUMBER * (1 + more) else []
 
 
 def _one_by_one(comparison: Comparison, tones: list[FittedTone]) -> list[FittedTone]:

@@ -1,0 +1,152 @@
+"""Knocks after which something rings: found, measured, told from what looks like them, taken off and drawn again."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from bounds import at_most
+from mismatch_draws import normal
+from torch import Tensor
+
+import gyrofuse as gf
+from gyrofuse.mismatch.detectors.lines.ring_downs import ring_down_test, scanned_ring_downs
+from gyrofuse.mismatch.likelihoods.damped_tone import DampedTone, Surroundings
+from gyrofuse.mismatch.mechanisms.regimes.ring_down import RingDown
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+
+N, RATE = 8192, 200.0
+GAINS = torch.tensor([1.0, -0.7, 0.4], dtype=torch.float64)
+
+
+def generator(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def struck(onset: float, frequency: float, tau: float) -> Tensor:
+    """An oscillator that is struck while it is at rest, `(time,)`; onset and time constant in samples."""
+    since = (torch.arange(N, dtype=torch.float64) - onset).clamp(min=0)
+    return torch.exp(-since / tau) * torch.sin(2 * math.pi * frequency * since)
+
+
+def of_nats(path: Tensor, nats: float) -> Tensor:
+    """In three sensors of white noise of variance one, `(sensor, time)`."""
+    signal = GAINS[:, None] * path
+    return signal * math.sqrt(2 * nats / float(signal.square().sum()))
+
+
+def compared(effect: Tensor, seed: int) -> Comparison:
+    g = generator(seed)
+    return Comparison.of(
+        RecordingInfo(RATE, "deg/s", ("1", "2", "3")), normal(3, N, g=g) + effect, normal(4, 3, N, g=g)
+    )
+
+
+def test_noise_rings_as_often_as_its_p_value_says():
+    g, n_runs = generator(1), 200
+    p_values = [scanned_ring_downs(normal(p, 4096, g=g)).p_value for p in (1, 3) for _ in range(n_runs // 2)]
+    for level in (0.1, 0.01):
+        assert sum(p < level for p in p_values) <= at_most(n_runs, level)
+
+
+@pytest.mark.parametrize(("frequency", "tau"), [(0.04, 60.0), (0.15, 25.0), (0.33, 120.0), (0.42, 12.0)])
+def test_knocks_are_found_and_measured(frequency: float, tau: float):
+    path = struck(1500.3, frequency, tau) - 0.8 * struck(5000.8, frequency, tau)
+    found = RingDown.detect_and_fit(compared(of_nats(path, 300.0), 2), 1e-3)
+    assert found is not None
+    assert isinstance(found.effect, RingDown)
+    assert found.sensors == (0, 1, 2)
+    assert len(found.effect.knocks) == 2
+    onsets = (found.effect.onset_s * RATE).sort().values.tolist()
+    assert onsets == pytest.approx([1500.3, 5000.8], abs=3)
+    for name, truth in (("frequency", frequency * RATE), ("decay_time", tau / RATE)):
+        value, low, high, _ = found.parameters[name]
+        assert abs(truth - value) < 2 * (high - low) / 2, name
+    hours = N / RATE / 3600
+    assert found.parameters["rate"].value == pytest.approx(2 / hours)
+    # Exact Poisson limits of two events.
+    assert found.parameters["rate"].low * hours == pytest.approx(0.2422, abs=1e-3)
+    assert found.parameters["rate"].high * hours == pytest.approx(7.2247, abs=1e-3)
+
+
+def test_modes_that_set_in_together_are_one_knock():
+    path = struck(3000.0, 0.11, 40.0) + 0.8 * struck(3000.0, 0.27, 40.0)
+    found = RingDown.detect_and_fit(compared(of_nats(path, 500.0), 3), 1e-3)
+    assert found is not None
+    assert isinstance(found.effect, RingDown)
+    assert len(found.effect.onset_s) == 2
+    assert len(found.effect.knocks) == 1
+
+
+def test_modes_that_beat_seem_to_grow():
+    path = struck(3000.0, 0.2, 60.0) - struck(3000.0, 0.206, 60.0)
+    found = RingDown.detect_and_fit(compared(of_nats(path, 2000.0), 4), 1e-3)
+    assert found is not None
+    assert isinstance(found.effect, RingDown)
+    assert len(found.effect.knocks) == 1
+    left = found.effect.remove(of_nats(path, 2000.0), RecordingInfo(RATE, "deg/s", ("1", "2", "3")))
+    assert float(left.square().sum()) < 0.03 * 4000
+
+
+def others(kind: str, g: torch.Generator) -> Tensor:
+    """What is no ring-down, `(sensor, time)`."""
+    t = torch.arange(N, dtype=torch.float64)
+    if kind == "spike":
+        return of_nats((t == 3000).to(torch.float64), 2000.0)
+    if kind == "step":
+        return of_nats((t > 3000).to(torch.float64), 2000.0)
+    if kind == "louder":
+        return 4 * normal(3, N, g=g) * ((t > 3000) & (t < 3100))
+    if kind == "tone":
+        return of_nats(torch.sin(2 * math.pi * 0.13 * t), 2000.0)
+    if kind == "swelling":
+        return of_nats(torch.exp(-((t - 3000) / 40).square()) * torch.sin(2 * math.pi * 0.13 * t), 300.0)
+    steps = torch.nn.functional.interpolate(normal(1, 1, 40, g=g), N, mode="linear")[0, 0]
+    return of_nats(torch.sin(2 * math.pi * (0.2 * t + (0.01 * steps).cumsum(-1))), 2000.0)
+
+
+@pytest.mark.parametrize("kind", ["spike", "step", "louder", "tone", "swelling", "wandering tone"])
+def test_what_looks_like_one_has_another_name(kind: str):
+    for seed in range(2):
+        g = generator(seed)
+        signal = normal(3, N, g=g) + others(kind, g)
+        model = gf.ArrayModel.from_sensors([gf.Model([gf.WhiteNoise(1.0)])] * 3)
+        report = gf.diagnose(gf.Recording(signal, rate=RATE, unit="deg/s"), model)
+        assert report.mismatch
+        assert "ring_down" not in [finding.mechanism for finding in report.findings]
+
+
+def test_what_the_simulation_has_itself_is_no_mismatch():
+    g = generator(5)
+    both = [normal(3, N, g=g) + of_nats(struck(at, 0.2, 40.0), 400.0) for at in (2000.0, 6000.0)]
+    given = Comparison.of(RecordingInfo(RATE, "deg/s", ("1", "2", "3")), both[0], both[1][None])
+    assert ring_down_test(given).p_value > 0.05
+
+
+def test_samples_that_are_held_out_confirm_a_knock_and_no_noise():
+    comparison = compared(of_nats(struck(3000.0, 0.2, 40.0), 100.0), 6)
+    found = RingDown.detect_and_fit(comparison, 1e-3)
+    assert found is not None
+
+    def held_out(effect: RingDown, given: Comparison) -> float:
+        folds = (effect.fit_without(given, fold).held_out_scores(given, fold) for fold in range(4))
+        return float(torch.stack(list(folds)).sum())
+
+    assert isinstance(found.effect, RingDown)
+    assert held_out(found.effect, comparison) > 60
+    noise = compared(torch.zeros(3, N, dtype=torch.float64), 7)
+    around = Surroundings.of(noise.recording, noise.base, 3000, 40.0)
+    by_chance = RingDown.of([around.fitted(DampedTone(3000, 0.2, 40.0))], noise)
+    assert held_out(by_chance, noise) < 3
+
+
+def test_a_repaired_simulation_has_knocks_at_random():
+    model = gf.ArrayModel.from_sensors([gf.Model([gf.WhiteNoise(1.0)])] * 3)
+    signal = normal(3, N, g=generator(8)) + of_nats(struck(3000.0, 0.2, 40.0) + struck(6000.0, 0.2, 40.0), 4000.0)
+    report = gf.diagnose(gf.Recording(signal, rate=RATE, unit="deg/s"), model)
+    assert [finding.mechanism for finding in report.findings] == ["ring_down"]
+    assert report.held_out.after < 1.3 < report.held_out.before
+    loudest = report.model.simulate(N, batch=(40,), generator=generator(9)).abs().amax((-1, -2))
+    # Of two in a record on the average, none has a probability of 14 %.
+    assert 0.6 < float((loudest > 7).to(torch.float64).mean()) < 1
