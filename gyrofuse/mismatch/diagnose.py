@@ -15,6 +15,7 @@ from gyrofuse.io.recording import Recording
 from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.spectra.fit_verdict import KNOWN, fit_verdict
 from gyrofuse.mismatch.detectors.tests import TESTS, family_wise_p_value, run_tests
+from gyrofuse.mismatch.detectors.variance.rest import rest_words
 from gyrofuse.mismatch.mechanisms.mechanism import Context, repaired
 from gyrofuse.mismatch.repair.inputs import Simulation, modelled, on_processor, prepared
 from gyrofuse.mismatch.repair.noise_model import noise_of, noise_samples
@@ -108,7 +109,7 @@ def diagnose(
             else judged(judge, [recording], simulation, [] if made is None else [made], rate, len(own))
         )
         fitted = isinstance(simulation, Model | ArrayModel) and simulation.estimated_from is None
-        notes = (KNOWN,) if fitted else () if found["fit"] is None else (found["fit"].words,)
+        words = KNOWN if fitted else "" if found["fit"] is None else found["fit"].words
         return MismatchReport(
             p_value=p_value,
             evidence=before,
@@ -116,7 +117,7 @@ def diagnose(
             comparison=start,
             model=made or model,
             judged=verdict,
-            notes=notes,
+            notes=tuple(note for note in (rest_words(given), words) if note),
             **found,
         )
 

@@ -45,7 +45,7 @@ class MismatchReport(Outcome):
         judged: How far the simulation, the repaired one and the recording are from another recording, where one was
             given.
         fit: What spectra say beside the uncertainty of a fitted model; None where the simulation is none.
-        notes: Sentences on what the simulation's numbers are taken for.
+        notes: Sentences on what is not at rest, and on what the simulation's numbers are taken for.
     """
 
     def summary(self) -> str:
