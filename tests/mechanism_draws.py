@@ -18,6 +18,7 @@ from gyrofuse.mismatch.mechanisms.regimes.ring_down import RingDown
 from gyrofuse.mismatch.mechanisms.regimes.scale_mixture import ScaleMixture
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph
+from gyrofuse.mismatch.mechanisms.regimes.tone_in_spells import ToneInSpells
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
 from gyrofuse.mismatch.mechanisms.remainder import Remainder
 from gyrofuse.mismatch.mechanisms.signals.channel_transfer import ChannelTransfer
@@ -206,6 +207,23 @@ def _(setting: Setting) -> Drawn:
     )
     truth = {"rate": 3600 * knocks / seconds, "frequency": frequency, "decay_time": decay}
     return Drawn(effect, truth | setting.of_each("amplitude", size))
+
+
+@draws(ToneInSpells)
+def _(setting: Setting) -> Drawn:
+    seconds = setting.n_samples / RATE
+    starts = torch.tensor([setting.even(0.05, 0.2), setting.even(0.5, 0.6)], dtype=torch.float64) * seconds
+    frequency, phase = setting.even(0.1, 0.4) * RATE, setting.even(0.0, 2 * math.pi)
+    size = (setting.sizes(0.4, 0.6) * setting.size).expand(2, -1)
+    effect = ToneInSpells(
+        starts,
+        starts + setting.even(0.15, 0.25) * seconds,
+        torch.full((2,), frequency, dtype=torch.float64),
+        math.cos(phase) * size,
+        math.sin(phase) * size,
+        seconds,
+    )
+    return Drawn(effect, {"frequency": frequency} | setting.of_each("amplitude", size[0]))
 
 
 @draws(VibrationTone)

@@ -121,7 +121,8 @@ def test_a_batch_is_its_items_and_can_be_indexed():
     alone = fit_svo(signal[1, 0], "long", method="auto")
     for name in CrossFit.__dataclass_fields__:
         got = getattr(whole[1, 0].cross_fit, name)
-        torch.testing.assert_close(got, getattr(alone.cross_fit, name), rtol=1e-6, atol=1e-9, equal_nan=True)
+        # Iterations stop within a millionth; some processors add up the products of a batch in another order.
+        torch.testing.assert_close(got, getattr(alone.cross_fit, name), rtol=1e-5, atol=1e-9, equal_nan=True)
 
 
 def test_levels_of_which_nothing_is_known_have_no_limits():

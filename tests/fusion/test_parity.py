@@ -20,7 +20,7 @@ from reference import published
 from torch import Tensor
 
 from gyrofuse import ArrayModel, RandomWalk, Recording, WhiteNoise, fit_svo
-from gyrofuse.fusion.faults.classify import KINDS
+from gyrofuse.fusion.faults.classify import KINDS, _share_of_rate
 from gyrofuse.fusion.faults.parity import parity_test
 from gyrofuse.fusion.faults.reference import ParityReference
 from gyrofuse.fusion.faults.reference import fit_parity_reference as fit_reference
@@ -229,6 +229,12 @@ def test_a_turned_sign_shows_at_rest_by_the_bias():
     fixed, before = stretch()
     fixed[1, ONSET:] -= 15  # a step, but not to the mirror image
     assert parity_test(fixed, reference(), history=before).kind[6, 1] == KINDS.index("biased")
+
+
+def test_a_sensor_without_noise_of_its_own_and_without_a_rate_is_no_evidence_of_a_sign():
+    levels, variance = torch.tensor([0, 0, 1]), torch.tensor([[0.5, 0.25]], dtype=torch.float64)
+    share = _share_of_rate(torch.zeros(1, 3, dtype=torch.float64), torch.ones(1, 3), variance, variance, levels)
+    assert share.tolist() == [[0.0, 0.0, 0.0]]
 
 
 def test_two_faults_at_once_are_both_named():

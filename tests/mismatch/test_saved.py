@@ -23,6 +23,7 @@ from gyrofuse.mismatch.mechanisms.regimes.ring_down import RingDown
 from gyrofuse.mismatch.mechanisms.regimes.scale_mixture import ScaleMixture
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph
+from gyrofuse.mismatch.mechanisms.regimes.tone_in_spells import ToneInSpells
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
 from gyrofuse.mismatch.mechanisms.remainder import Remainder
 from gyrofuse.mismatch.mechanisms.signals.channel_transfer import ChannelTransfer
@@ -91,6 +92,14 @@ EVERY = (
         torch.tensor([[1 / 3, 0.0], [0.1, 0.2]], dtype=torch.float64),
         torch.tensor([[0.1, 0.0], [1 / 7, 0.2]], dtype=torch.float64),
         4.0,
+    ),
+    ToneInSpells(
+        numbers(0.5, 20 / 3),
+        numbers(4.5, 9.0),
+        numbers(7.3, 7.35),
+        torch.tensor([[1 / 3, 0.0], [0.1, 0.2]], dtype=torch.float64),
+        torch.tensor([[0.1, 0.0], [1 / 7, 0.2]], dtype=torch.float64),
+        10.0,
     ),
     VibrationTone(7.3, numbers(0.3, 0.0), numbers(0.1, 0.2)),
     ToneSize(7.3, numbers(0.3, 1 / 3)),

@@ -194,7 +194,8 @@ def _share_of_rate(
     # Power within two standard errors of the noise is no rate.
     rate = (power - variance_of_others * (1 + 2 * (2 / count).sqrt())).clamp(min=0)
     own = (variance - variance_of_others).clamp(min=0)
-    return (rate / (rate + own * variance_of_others / variance))[:, levels]
+    weight = rate / (rate + own * variance_of_others / variance)
+    return weight.nan_to_num(0.0)[:, levels]  # where the sensor adds no noise of its own, and there is no rate
 
 
 def _orthogonal(values: Tensor) -> tuple[Tensor, Tensor]:

@@ -152,11 +152,7 @@ class Surroundings:
         n, apart = self.samples.shape[-1], 0.3  # frequencies to begin with, in inverse time constants
 
         def at(point: NDArray[np.float64]) -> tuple[DampedTone, DampedTone]:
-            f, tau = (
-                np.clip(tone.frequency + point[:2] / tone.tau, 0.0, 0.5),
-                np.maximum(tone.tau * np.exp(np.clip(point[2:], -3, 3)), 2.0),
-            )
-            first, second = (tone._replace(frequency=float(f[k]), tau=float(tau[k])) for k in (0, 1))
+            first, second = (self._moved(tone, float(point[k]), float(point[2 + k])) for k in (0, 1))
             return first, second
 
         def loss(point: NDArray[np.float64]) -> float:
@@ -177,16 +173,16 @@ class Surroundings:
         return self.of_tone(self._numbers(start, list(sensors)))
 
     def _onset(self, tone: DampedTone, which: list[int], reach: int, step: int) -> DampedTone:
-        tried = [tone._replace(onset=tone.onset + k) for k in range(-reach, reach + 1, step)]
+        last = self.first + self.samples.shape[-1] - 2
+        onsets = {min(max(tone.onset + k, self.first), last) for k in range(-reach, reach + 1, step)}
+        tried = [tone._replace(onset=onset) for onset in sorted(onsets)]
         return max(tried, key=lambda one: self._gain(one, which))
 
     def _numbers(self, tone: DampedTone, which: list[int]) -> DampedTone:
         """Frequency and time constant, of an onset."""
-        shortest = 2.0  # samples
 
         def at(point: NDArray[np.float64]) -> DampedTone:
-            frequency = min(max(tone.frequency + float(point[0]) / tone.tau, 0.0), 0.5)
-            return tone._replace(frequency=frequency, tau=max(tone.tau * math.exp(float(point[1])), shortest))
+            return self._moved(tone, float(point[0]), float(point[1]))
 
         simplex = np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.4]])
         found = optimize.minimize(
@@ -196,6 +192,12 @@ class Surroundings:
             options={"initial_simplex": simplex, "maxfev": 60, "xatol": 1e-3, "fatol": 1e-3},
         )
         return at(found.x)
+
+    def _moved(self, tone: DampedTone, by: float, factor: float) -> DampedTone:
+        """With a frequency moved by so many inverse time constants, and a time constant by a factor's logarithm."""
+        shortest, longest = 2.0, self.samples.shape[-1] / 4  # samples; one that takes longer is not seen to die away
+        tau = min(max(tone.tau * math.exp(min(max(factor, -5.0), 5.0)), shortest), longest)
+        return tone._replace(frequency=min(max(tone.frequency + by / tone.tau, 0.0), 0.5), tau=tau)
 
     def _gain(self, tone: DampedTone, which: list[int]) -> float:
         return float(self.of_tone(tone).log_ratio[which].sum())
@@ -230,7 +232,7 @@ class Surroundings:
     def other_courses(self, found: FittedTone, sensors: Sequence[int]) -> float:
         """Log likelihood ratio of what is no ring-down.
 
-        One sample, a step, noise that is louder for a while, a tone that swells and dies away.
+        One sample, a step, noise that is louder for a while, a tone that swells and dies away, or lasts and stops.
         """
         which, n, tone = list(sensors), self.samples.shape[-1], found.tone
         t = torch.arange(n, dtype=torch.float64) + self.first - tone.onset
@@ -239,13 +241,29 @@ class Surroundings:
         one_sample = n / 2 * (total / (total - y.square()).clamp(min=1e-12 * total)).log().sum(0).max()
         step = self.regression((t >= 0).to(torch.float64)[None])[1][which].sum()
 
-        def swelling(middle: float, power: int, width: float) -> Tensor:
-            angle, envelope = 2 * math.pi * tone.frequency * t, torch.exp(-((t - middle).abs() / width).pow(power))
+        angle = 2 * math.pi * tone.frequency * t
+
+        def within(envelope: Tensor) -> Tensor:
             return self.regression(torch.stack([envelope * angle.cos(), envelope * angle.sin()]))[1][which].sum()
+
+        def swelling(middle: float, power: int, width: float) -> Tensor:
+            return within(torch.exp(-((t - middle).abs() / width).pow(power)))
 
         widths = ((1, 0.35), (1, 0.7), (1, 1.4), (2, 0.5), (2, 1.0), (2, 2.0))
         grown = [swelling(k / 2 * tone.tau, power, w * tone.tau) for k in range(-1, 5) for power, w in widths]
-        return float(torch.stack([one_sample, step, _louder(y), *grown]).max())
+        lasting = _lasting(y * torch.polar(torch.ones_like(angle), -angle))
+        return float(torch.stack([one_sample, step, _louder(y), *grown, lasting]).max())
+
+
+def _lasting(turned: Tensor) -> Tensor:
+    """Log likelihood ratio of a steady tone in the likeliest stretch of samples turned back by it, `(sensor, time)`."""
+    n, ends = turned.shape[-1], 97
+    at = torch.linspace(0, n, ends).round().long()
+    sums = torch.nn.functional.pad(turned.cumsum(-1), (1, 0))[:, at]
+    length = (at - at[:, None]).clamp(min=1)
+    explained = 2 * (sums[:, None] - sums[..., None]).abs().square() / length * (at - at[:, None] >= n // ends)
+    total = turned.abs().square().sum(-1)[:, None, None]
+    return (n / 2 * (total / (total - explained).clamp(min=1e-12 * total)).log()).sum(0).max()
 
 
 def _louder(y: Tensor) -> Tensor:

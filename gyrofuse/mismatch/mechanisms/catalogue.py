@@ -16,6 +16,7 @@ from gyrofuse.mismatch.mechanisms.regimes.ring_down import RingDown
 from gyrofuse.mismatch.mechanisms.regimes.scale_mixture import ScaleMixture
 from gyrofuse.mismatch.mechanisms.regimes.spikes import Spikes
 from gyrofuse.mismatch.mechanisms.regimes.telegraph import RandomTelegraph
+from gyrofuse.mismatch.mechanisms.regimes.tone_in_spells import ToneInSpells
 from gyrofuse.mismatch.mechanisms.regimes.variance_change import VarianceChange
 from gyrofuse.mismatch.mechanisms.remainder import Remainder
 from gyrofuse.mismatch.mechanisms.signals.channel_transfer import ChannelTransfer
@@ -50,7 +51,7 @@ STAGES: tuple[tuple[type[Mechanism], ...], ...] = (
     (ClockSkew,),
     (GSensitivity, QuadraticCoupling, ScaleFactor, ChannelTransfer),
     (RingDown,),  # whose strongest are lines too
-    (VibrationTone, ToneSize),
+    (VibrationTone, ToneInSpells, ToneSize),
     (RandomTelegraph,),
     (GradualChange,),  # where noise is louder, what is slow is known less well
     (TemperatureDrift, WarmUpTransient, Ramp, Step),

@@ -31,6 +31,7 @@ def _with(effect: Callable[..., Part], **settings: Any) -> Callable[[Bench, floa
 
 _MECHANISMS: dict[str, Callable[[Bench, float], Part]] = {
     "vibration_tone": shapes.vibration_tone,
+    "tone_in_spells": shapes.tone_in_spells,
     "ring_down": shapes.ring_down,
     "drifting_tone": shapes.drifting_tone,
     "resonance": spectral.resonance,

@@ -58,6 +58,33 @@ def vibration_tone(bench: Bench, nats: float, *, frequency: float | None = None)
     return part
 
 
+def tone_in_spells(bench: Bench, nats: float) -> Part:
+    """A motor that runs for a while, once or several times, and starts in another phase each time.
+
+    Either end of each spell costs the logarithm of the number of samples on top.
+    """
+    sensors, spells = bench.some_sensors(2), int(bench.rng.integers(1, 4))
+    f = bench.rng.uniform(0.05, 0.45) * bench.rate
+    ends = np.sort(bench.rng.uniform(0, 1, 2 * spells)) * 0.5 + 0.4 * np.repeat(np.arange(spells) / spells, 2)
+    t, on = np.arange(bench.steps) / bench.steps, np.full(bench.steps, np.nan)
+    for start, stop in ends.reshape(-1, 2) + np.array([0.02, 0.08]):
+        on[(t >= start) & (t < stop)] = bench.rng.uniform(0, 2 * np.pi)
+    phase = 2 * np.pi * f / bench.step_rate * np.arange(bench.steps) + np.nan_to_num(on)
+    unit = bench.sampled(bench.gains(sensors)[:, None] * np.where(np.isnan(on), 0.0, np.cos(phase)))
+    unknown = 2 * spells * math.log(bench.n)
+    part, _ = bench.shape("vibration_tone", nats + unknown, unit, known=True, frequency_hz=f)
+    return replace(
+        part,
+        nats=nats,
+        llr=lambda recording: part.llr(recording) - unknown,
+        oracle_nats=nats,
+        oracle_law="bound",
+        look_alikes=("resonance", "drifting_tone") if nats < 50 else (),
+        parameters={"frequency": quantity(f, "Hz")},
+        form="on for a while",
+    )
+
+
 def ring_down(bench: Bench, nats: float) -> Part:
     """Knocks on a mount, which rings in one mode each time: an oscillator that is struck while it is at rest.
 

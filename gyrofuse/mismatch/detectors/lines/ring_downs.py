@@ -156,21 +156,28 @@ class _Part(NamedTuple):
 
 def _powers(white: Tensor, tau: int) -> Iterator[_Part]:
     """Windows `exp(-t / tau)` over whitened samples, two for a time constant, some at a time to bound memory."""
-    reach, most_for_median, numbers_at_once = 4, 512, 4_000_000
+    reach, most_for_median, numbers_at_once, leaks = 4, 512, 4_000_000, 1.6
     length, hop = reach * tau, tau // 2
     lowest = reach  # a cycle for a time constant: what is slower is a step or a drift
     taper = torch.exp(-torch.arange(length, dtype=white.dtype) / tau)
     taper /= taper.square().sum().sqrt()
     frames = white.unfold(-1, length, hop)  # (sensor, frame, time)
 
-    def power(part: Tensor) -> Tensor:
+    def power(part: Tensor, taper: Tensor) -> Tensor:
         return squared_modulus(torch.fft.rfft(part * taper))[..., lowest:-1].clamp(min=1e-30)
 
-    step = -(-frames.shape[1] // most_for_median)
-    usual = power(frames[:, ::step]).median(1, keepdim=True).values / math.log(2)  # (sensor, 1, bin)
+    def middle(taper: Tensor) -> Tensor:
+        """Median over time, in units of the mean of exponential values, `(sensor, 1, bin)`."""
+        some = frames[:, :: -(-frames.shape[1] // most_for_median)]
+        return power(some, taper).median(1, keepdim=True).values / math.log(2)
+
+    smooth = torch.hann_window(length, dtype=white.dtype)
+    own = middle(smooth / smooth.norm())
+    # A window that begins at once leaks: where a filter holds nearly all back its first sample is all the power.
+    usual = torch.where((usual := middle(taper)) < leaks * own, usual, torch.inf)
     at_once = max(numbers_at_once // (length * len(white)), 1)
     for a in range(0, frames.shape[1], at_once):
-        yield _Part(power(frames[:, a : a + at_once]) / usual, a * hop, hop, lowest, tau, length)
+        yield _Part(power(frames[:, a : a + at_once], taper) / usual, a * hop, hop, lowest, tau, length)
 
 
 def _log_ratios(score: Tensor) -> Tensor:

@@ -16,12 +16,12 @@ from gyrofuse.mismatch.detectors.lines.ring_downs import ring_down_p_value, ring
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.likelihoods.damped_tone import DampedTone, FittedTone, Surroundings
 from gyrofuse.mismatch.mechanisms import pictures
-from gyrofuse.mismatch.mechanisms.mechanism import Finding, Mechanism, Parameter
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
+from gyrofuse.mismatch.mechanisms.regimes.transient import Transient
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import Dims
-from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED
+from gyrofuse.mismatch.signals.folds import N_FOLDS
 from gyrofuse.mismatch.signals.lines import whitened
-from gyrofuse.mismatch.signals.prediction_errors import median_sd
 from gyrofuse.mismatch.stats.inclusion import included_sensors
 from gyrofuse.mismatch.stats.limits import Z
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class RingDown(Mechanism):
+class RingDown(Transient):
     """`x_i(t) = sum_m exp(-u / tau_m) [cosine_mi cos(2 pi f_m u) + sine_mi sin(2 pi f_m u)]`, `u = t - t_m >= 0`.
 
     Modes that are struck at times `t_m`, at random. Looks like spikes, which are gone after a sample; like a tone or a
@@ -46,10 +46,8 @@ class RingDown(Mechanism):
     """
 
     name: ClassVar[str] = "ring_down"
-    likelihood: ClassVar[str] = "transients"
     separated_by: ClassVar[str] = "more knocks"
     time_words: ClassVar[str] = "strongest at"
-    additive: ClassVar[bool] = True
     onset_s: Annotated[Tensor, Dims(("tone",))]
     frequency_hz: Annotated[Tensor, Dims(("tone",))]
     decay_s: Annotated[Tensor, Dims(("tone",))]
@@ -146,21 +144,11 @@ class RingDown(Mechanism):
             left = own - _path(fitted[-1], comparison.n_samples)
         return self.of(fitted, comparison)
 
-    def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
-        """Of every fourth sample, four blocks together."""
-        n, rate = comparison.n_samples, comparison.info.rate
-        taken = whitened(self._path(n, rate), comparison.base)
-        white = comparison.white
-        variance = median_sd(white)[:, None].square()
-        gains = ((white * taken - taken.square() / 2) / variance).sum(0) * (torch.arange(n) % N_FOLDS == fold)
-        block = n // N_JUDGED
-        return gains[: N_JUDGED * block].view(N_JUDGED // N_FOLDS, -1).sum(-1)
-
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
         rate, strongest = comparison.info.rate, int((self.amplitude[:, sensor] * self.decay_s.sqrt()).argmax())
         tau = float(self.decay_s[strongest]) * rate
         first = round(float(self.onset_s[strongest]) * rate - 2 * tau - 8)
-        path = self._path(comparison.n_samples, rate) if fitted else None
+        path = self.path(comparison.n_samples, rate) if fitted else None
         pictures.transient(ax, comparison, sensor, first, round(8 * tau) + 24, path)
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
@@ -179,18 +167,8 @@ class RingDown(Mechanism):
                 onset_s=onset + self.onset_s[which] - self.onset_s[which].min(),
                 **{name: getattr(self, name)[which] for name in ("frequency_hz", "decay_s", "cosine", "sine")},
             )
-            signal = signal + sign * one._path(n, info.rate)
+            signal = signal + sign * one.path(n, info.rate)
         return signal
-
-    def remove(self, signal: Tensor, info: RecordingInfo) -> Tensor:
-        return signal - self._path(signal.shape[-1], info.rate)
-
-    def repair(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
-        return comparison.subtract(self._path(comparison.n_samples, comparison.info.rate))
-
-    def apply_elsewhere(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
-        """Knocks come at other times there."""
-        return self.apply_to_reference(comparison, generator)
 
     def _tones(self, rate: float) -> list[tuple[DampedTone, Tensor]]:
         """Each with its sizes, `(2, sensor)`."""
@@ -201,8 +179,7 @@ class RingDown(Mechanism):
             for (onset, frequency, tau), size in zip(numbers.tolist(), sizes, strict=True)
         ]
 
-    def _path(self, n_samples: int, rate: float) -> Tensor:
-        """`(sensor, time)`."""
+    def path(self, n_samples: int, rate: float) -> Tensor:
         path = torch.zeros(self.cosine.shape[-1], n_samples, dtype=torch.float64)
         for tone, size in self._tones(rate):
             first = max(tone.onset, 0)
@@ -215,12 +192,13 @@ class RingDown(Mechanism):
 def _tones(comparison: Comparison) -> list[FittedTone]:
     """All tones that ring down, the strongest of each scan first."""
     left, scan, tones = comparison.recording, ring_downs(comparison), list[FittedTone]()
-    rounds, most = 4, 48  # scans, and tones that are told apart
+    # Scans, tones that are told apart, and cells of a scan that are no ring-down: what lasts has many of them.
+    rounds, most, most_refused = 4, 48, 4
     for _ in range(rounds):
-        new, by_chance = list[FittedTone](), math.log(scan.n_cells)
+        new, by_chance, refused = list[FittedTone](), math.log(scan.n_cells), 0
         least = by_chance + NATS_AS_GOOD
         for cell in scan.cells:
-            if cell.log_ratio < by_chance or len(tones) + len(new) >= most:
+            if cell.log_ratio < by_chance or len(tones) + len(new) >= most or refused >= most_refused:
                 break
             around = Surroundings.of(left, comparison.base, cell.onset, cell.tau)
             found = around.fitted(DampedTone(cell.onset, cell.frequency, cell.tau))
@@ -231,6 +209,7 @@ def _tones(comparison: Comparison) -> list[FittedTone]:
             rung = _ring_down(around, found, which)
             left = left - sum(_path(one, comparison.n_samples) for one in rung)
             new += rung
+            refused += not rung
         if not new:
             return tones
         tones = _one_by_one(comparison, tones + new)
@@ -241,9 +220,11 @@ def _tones(comparison: Comparison) -> list[FittedTone]:
 
 def _ring_down(around: Surroundings, found: FittedTone, sensors: Sequence[int]) -> list[FittedTone]:
     """The tone, or two that set in together where one seems to grow at first; none where another course is likelier."""
-    rival = around.other_courses(found, sensors)
-    if float(found.log_ratio.sum()) > rival + NATS_PER_NUMBER:
+    rival, gain, near = around.other_courses(found, sensors), float(found.log_ratio.sum()), 0.8
+    if gain > rival + NATS_PER_NUMBER:
         return [found]
+    if gain < near * rival:  # two modes that beat look like one, more or less
+        return []
     both = around.two_modes(found, sensors)
     gain = float(both[0].log_ratio[list(sensors)].sum())
     more = 2 + 2 * len(sensors)  # numbers

@@ -154,10 +154,10 @@ class VibrationTone(Mechanism):
     @classmethod
     def at(cls, comparison: Comparison, frequency_hz: float) -> VibrationTone:
         """The tone of all samples within half a bin of a frequency."""
-        return cls._fitted(comparison, frequency_hz, torch.ones(comparison.n_samples, dtype=torch.bool))
+        return cls.fitted_to(comparison, frequency_hz, torch.ones(comparison.n_samples, dtype=torch.bool))
 
     @classmethod
-    def _fitted(cls, comparison: Comparison, frequency_hz: float, keep: Tensor) -> VibrationTone:
+    def fitted_to(cls, comparison: Comparison, frequency_hz: float, keep: Tensor) -> VibrationTone:
         """Least squares with the noise near the tone as weights, starting within half a bin of its frequency."""
         weights = 1 / density_near(comparison, frequency_hz / comparison.info.rate)
         t = torch.arange(comparison.n_samples, dtype=torch.float64)[keep]
@@ -179,7 +179,7 @@ class VibrationTone(Mechanism):
 
     def fit_without(self, comparison: Comparison, fold: int) -> VibrationTone:
         keep = estimation_samples(comparison.n_samples, fold)
-        return self._fitted(comparison, self.frequency_hz, keep)
+        return self.fitted_to(comparison, self.frequency_hz, keep)
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
         pictures.spectrum_near(ax, comparison, sensor, self.frequency_hz, comparison.info.rate / comparison.n_samples)

@@ -1,0 +1,254 @@
+"""A tone that is on for a while: a motor, a fan, a pump that starts and stops."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.decisions import NATS_PER_NUMBER, NEW_TERM_NATS
+from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
+from gyrofuse.mismatch.detectors.spectra.peaks import strongest_peak
+from gyrofuse.mismatch.mechanisms import pictures
+from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
+from gyrofuse.mismatch.mechanisms.regimes.transient import Transient, kept_of
+from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone, density_near
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.dims import Dims
+from gyrofuse.mismatch.stats.inclusion import included_sensors
+from gyrofuse.mismatch.stats.limits import Z
+from gyrofuse.mismatch.stats.segments import episodes_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+@dataclass(frozen=True, eq=False)
+class ToneInSpells(Transient):
+    """`x_i(t) = cosine_mi cos(2 pi f_m t) + sine_mi sin(2 pi f_m t)` while spell `m` lasts, and nothing between them.
+
+    The other form of a vibration tone, whose phase and frequency are those of each start. Looks like a resonance or a
+    line that wanders, which are there all the time, and like several tones near to each other, which beat.
+
+    Attributes:
+        start_s, stop_s: Of each spell, s after the first sample, `(spell,)`.
+        frequency_hz: `f_m`, `(spell,)`.
+        cosine, sine: `(spell, sensor)`, unit of the signal; `t` counts from the first sample.
+        duration_s: Of the recording.
+    """
+
+    name: ClassVar[str] = "vibration_tone"
+    separated_by: ClassVar[str] = "a recording in which it starts and stops more often"
+    start_s: Annotated[Tensor, Dims(("spell",))]
+    stop_s: Annotated[Tensor, Dims(("spell",))]
+    frequency_hz: Annotated[Tensor, Dims(("spell",))]
+    cosine: Annotated[Tensor, Dims(("spell", "sensor"))]
+    sine: Annotated[Tensor, Dims(("spell", "sensor"))]
+    duration_s: float
+
+    @property
+    def amplitude(self) -> Tensor:
+        """`(spell, sensor)`, unit of the signal."""
+        return torch.hypot(self.cosine, self.sine)
+
+    @classmethod
+    def detect_and_fit(cls, comparison: Comparison, level: float) -> Finding | None:
+        line, peak, info, n = comparison.line, strongest_peak(comparison), comparison.info, comparison.n_samples
+        p_value = min(line.p_value, peak.p_value)
+        if p_value > level:
+            return None
+        seen = _seen_in_parts(comparison, line.frequency if line.p_value <= peak.p_value else peak.frequency)
+        noise = density_near(comparison, seen)
+        spells = _spells(comparison, seen, noise)
+        if not spells:
+            return None
+        whole, near = torch.ones(n, dtype=torch.bool), [seen * info.rate] * len(spells)
+        for _ in range(2):  # numbers and ends in turn
+            spells = cls._fitted(comparison, spells, near, whole)._likeliest(comparison, spells, noise)
+        effect = cls._fitted(comparison, spells, near, whole)
+        lengths = torch.tensor([stop - start for start, stop in spells], dtype=torch.float64)
+        variance = 2 * noise / lengths[:, None]  # of either part of an amplitude, `(spell, sensor)`
+        snr = effect.amplitude / variance.sqrt()
+        there = included_sensors((snr.square()).sum(0) / len(spells), 2).positions
+        outside = torch.ones(comparison.n_sensors, dtype=torch.bool)
+        outside[list(there)] = False
+        effect = replace(effect, cosine=effect.cosine * ~outside, sine=effect.sine * ~outside)
+        gain = float((snr.square() * ~outside).sum()) / 2
+        always = VibrationTone.at(comparison, line.frequency * info.rate)
+        as_always = float((always.amplitude.square() * ~outside / (4 * noise)).sum()) * n
+        numbers = len(spells) * (3 + 2 * len(there)) - 1 - 2 * len(there)
+        if gain - NATS_PER_NUMBER * numbers - 2 * len(spells) * math.log(n) < as_always + NEW_TERM_NATS:
+            return None
+        longest = int((snr.square() * ~outside).sum(-1).argmax())
+        per_sample = float((effect.amplitude[longest].square() / (4 * noise)).sum())  # nats that tell an end of a spell
+        reach = Z * max(1.0, 3 / per_sample) / info.rate
+        energy = max(float((snr[longest].square() * ~outside).sum()), 1.0)
+        f = float(effect.frequency_hz[longest])
+        spread = Z * math.sqrt(12 / energy) / (2 * math.pi * float(lengths[longest])) * info.rate
+        start, stop = float(effect.start_s[longest]), float(effect.stop_s[longest])
+        parameters = {
+            "frequency": Parameter(f, f - spread, f + spread, "Hz"),
+            "start": Parameter(start, max(start - reach, 0.0), start + reach, "s"),
+            "stop": Parameter(stop, stop - reach, min(stop + reach, effect.duration_s), "s"),
+        }
+        for i in there:
+            a, sd = float(effect.amplitude[longest, i]), float(variance[longest, i].sqrt())
+            parameters[f"amplitude[{i}]"] = Parameter(a, max(a - Z * sd, 0.0), a + Z * sd, info.measure)
+        loudest = max(there, key=lambda i: float(effect.amplitude[longest, i]))
+        more = f" and {len(spells) - 1} more times, {float(lengths.sum()) / n:.1%} of the time," if spells[1:] else ""
+        return Finding(
+            cls.name,
+            effect,
+            f"a tone at {f:.6g} Hz that is on from {start:.5g} s to {stop:.5g} s{more} in "
+            f"{info.named(there, 'all sensors')}, of amplitude up to {float(effect.amplitude[longest, loudest]):.3g} "
+            f"{info.measure} (sensor {info.sensors[loudest]}), that the simulation does not have: something that "
+            "starts and stops",
+            p_value,
+            there,
+            parameters,
+            levels=(level_of(seen),),
+            frequency_hz=f,
+            time_s=start,
+            gain=gain,
+        )
+
+    @classmethod
+    def _fitted(
+        cls, comparison: Comparison, spells: list[tuple[int, int]], frequency_hz: list[float], keep: Tensor
+    ) -> ToneInSpells:
+        """With frequencies near to these, of the samples `keep` `(time,)`."""
+        rate, tones = comparison.info.rate, []
+        for (start, stop), f in zip(spells, frequency_hz, strict=True):
+            inside = torch.zeros_like(keep)
+            inside[start:stop] = keep[start:stop]
+            tones.append(VibrationTone.fitted_to(comparison, _nearest(comparison, f, start, stop), inside))
+        ends = torch.tensor(spells, dtype=torch.float64) / rate
+        return cls(
+            ends[:, 0],
+            ends[:, 1],
+            torch.tensor([tone.frequency_hz for tone in tones], dtype=torch.float64),
+            torch.stack([tone.cosine for tone in tones]),
+            torch.stack([tone.sine for tone in tones]),
+            comparison.n_samples / rate,
+        )
+
+    def _likeliest(self, comparison: Comparison, spells: list[tuple[int, int]], noise: Tensor) -> list[tuple[int, int]]:
+        """Spells whose ends are likeliest, between the middles of those before and after."""
+        n, rate = comparison.n_samples, comparison.info.rate
+        signal = (comparison.recording - comparison.recording.mean(-1, keepdim=True)) / noise[:, None]
+        angle, found = 2 * math.pi * torch.arange(n, dtype=torch.float64) / rate, list[tuple[int, int]]()
+        middles = [0, *((start + stop) // 2 for start, stop in spells), n]
+        for k, (f, cosine, sine) in enumerate(zip(self.frequency_hz, self.cosine, self.sine, strict=True)):
+            low, middle, high = middles[k : k + 3]
+            part = slice(low, high)
+            tone = cosine[:, None] * (f * angle[part]).cos() + sine[:, None] * (f * angle[part]).sin()
+            gains = (tone * signal[:, part] - tone.square() / (2 * noise[:, None])).sum(0)
+            before, after = gains[: middle - low].flip(0).cumsum(0), gains[middle - low :].cumsum(0)
+            found.append((middle - 1 - int(before.argmax()), middle + 1 + int(after.argmax())))
+        return found
+
+    def fit_without(self, comparison: Comparison, fold: int) -> ToneInSpells:
+        rate = comparison.info.rate
+        ends = (torch.stack([self.start_s, self.stop_s], -1) * rate).round().long().tolist()
+        spells = [(start, stop) for start, stop in ends]
+        found = self._fitted(comparison, spells, self.frequency_hz.tolist(), kept_of(comparison.n_samples, fold))
+        there = self.amplitude.any(0)
+        return replace(found, cosine=found.cosine * there, sine=found.sine * there)
+
+    def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
+        strongest = int(self.amplitude[:, sensor].argmax())
+        width = 8 * comparison.info.rate / comparison.n_samples
+        pictures.spectrogram(ax, comparison, sensor, float(self.frequency_hz[strongest]), width)
+
+    def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
+        """The same spells from another time on, one after the other as they were, each with a phase of its own."""
+        if signal.ndim > 2:
+            records = [self.apply(record, info, generator) for record in signal.flatten(0, -3)]
+            return torch.stack(records).view_as(signal)
+        shift = float(torch.rand((), generator=generator, dtype=torch.float64)) * self.duration_s
+        turns = 2 * math.pi * torch.rand(len(self.start_s), generator=generator, dtype=torch.float64)
+        return signal + self._from(signal.shape[-1], info.rate, shift, turns)
+
+    def path(self, n_samples: int, rate: float) -> Tensor:
+        return self._from(n_samples, rate, 0.0, torch.zeros(len(self.start_s), dtype=torch.float64))
+
+    def _from(self, n_samples: int, rate: float, shift: float, turns: Tensor) -> Tensor:
+        """`(sensor, time)` from a time of the recording on, which begins anew at its end."""
+        t = torch.arange(n_samples, dtype=torch.float64) / rate
+        place = (t + shift).remainder(self.duration_s * (1 + 1e-12))  # the last sample is within
+        path = torch.zeros(self.cosine.shape[-1], n_samples, dtype=torch.float64)
+        rows = zip(self.start_s, self.stop_s, self.frequency_hz, self.cosine, self.sine, turns, strict=True)
+        for start, stop, f, cosine, sine, turn in rows:
+            on = (place >= start - 0.25 / rate) & (place < stop - 0.25 / rate)
+            angle = 2 * math.pi * f.remainder(rate) * t[on] + turn
+            path[:, on] += cosine[:, None] * angle.cos() + sine[:, None] * angle.sin()
+        return path
+
+
+def _spells(comparison: Comparison, frequency: float, noise: Tensor) -> list[tuple[int, int]]:
+    """Stretches in which a tone is on, samples; none where it is on all the time, or goes up and down.
+
+    Blocks' amplitudes along the gains of the sensors have two levels, one of which is that of the noise.
+
+    Args:
+        comparison: Recording and simulation.
+        frequency: Of the tone, cycles per sample.
+        noise: Density of the noise near it, per sample `(sensor,)`.
+    """
+    n, most = comparison.n_samples, 24
+    periods = 6  # of a block
+    block = max(n // 512, math.ceil(periods / min(frequency, 0.5 - frequency)))
+    turned = _turned(comparison, frequency)
+    count = n // block
+    z = turned[:, : count * block].unflatten(-1, (count, block)).sum(-1) / (block * noise).sqrt()[:, None]
+    gains = torch.linalg.eigh(z @ z.mH).eigenvectors[:, -1]
+    along = gains.conj() @ z  # (block,), of noise of variance one
+    found = episodes_of(torch.view_as_real(along).mT * math.sqrt(2))
+    if found is None or len(found.episodes) > most:
+        return []
+    inside, power = found.inside(count), along.abs().square()
+    on = inside if float(power[inside].mean()) > float(power[~inside].mean()) else ~inside
+    # Noise has one; the level between spells is known to a few standard deviations.
+    quiet, chance = float(power[~on].mean()), 4 / math.sqrt(max(int((~on).sum()), 1))
+    if quiet > 1 + chance + 0.02 * float(power[on].mean()):
+        return []
+    edges = torch.nn.functional.pad(on.to(torch.int8), (1, 1)).diff().nonzero()[:, 0].tolist()
+    return [(a * block, min(b * block, n)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _seen_in_parts(comparison: Comparison, frequency: float) -> float:
+    """Frequency near another one at which the parts of a record have most power, cycles per sample.
+
+    A tone that starts in another phase each time may have nothing where it is in the spectrum of the whole.
+    """
+    parts, reach = 32, 2  # reach in bins of a part
+    length = comparison.n_samples // parts
+    blocks = comparison.recording[:, : parts * length].unflatten(-1, (parts, length))
+    taper = torch.hann_window(length, dtype=torch.float64)
+    padded = 4 * length
+    transform = torch.fft.rfft((blocks - blocks.mean(-1, keepdim=True)) * taper, n=padded)
+    place, middle = torch.arange(1, padded // 2), round(frequency * padded)
+    power = transform[..., 1 : padded // 2].abs().square().sum(1) / comparison.base.spectrum(place / padded)
+    near = (place - middle).abs() <= reach * padded // length
+    return float(place[near][power.sum(0)[near].argmax()]) / padded if bool(near.any()) else frequency
+
+
+def _turned(comparison: Comparison, frequency: float) -> Tensor:
+    """The recording turned back by a frequency, `(sensor, time)`."""
+    angle = 2 * math.pi * frequency * torch.arange(comparison.n_samples, dtype=torch.float64)
+    signal = comparison.recording - comparison.recording.mean(-1, keepdim=True)
+    return signal * torch.polar(torch.ones_like(angle), -angle)
+
+
+def _nearest(comparison: Comparison, frequency_hz: float, start: int, stop: int) -> float:
+    """Frequency of the highest ordinate of a stretch, within a few of its bins or two dozen of the record's, Hz."""
+    padded, rate, n = 4, comparison.info.rate, stop - start
+    bins = max(3, math.ceil(24 * n / comparison.n_samples))
+    turned = _turned(comparison, frequency_hz / rate)[:, start:stop]
+    weights = 1 / density_near(comparison, frequency_hz / rate)
+    power = (torch.fft.fft(turned, n=padded * n).abs().square() * weights[:, None]).sum(0)
+    near = torch.arange(-bins * padded, bins * padded + 1)
+    return frequency_hz + float(near[power[near].argmax()]) / (padded * n) * rate

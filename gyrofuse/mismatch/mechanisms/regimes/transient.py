@@ -1,0 +1,51 @@
+"""What comes and goes: signals of a time and a place, which are taken off the recording and drawn anew elsewhere."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from gyrofuse.mismatch.mechanisms.mechanism import Mechanism
+from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.folds import N_FOLDS, N_JUDGED
+from gyrofuse.mismatch.signals.lines import whitened
+from gyrofuse.mismatch.signals.prediction_errors import median_sd
+
+
+class Transient(Mechanism):
+    """A path that lies in one block of the recording, or in few, so that no other block tells its numbers.
+
+    Every fourth sample is held out instead. The scores of four blocks together stand for one.
+    """
+
+    likelihood: ClassVar[str] = "transients"
+    additive: ClassVar[bool] = True
+
+    def path(self, n_samples: int, rate: float) -> Tensor:
+        """What was found in the recording, `(sensor, time)`."""
+        raise NotImplementedError
+
+    def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
+        n, white = comparison.n_samples, comparison.white
+        taken = whitened(self.path(n, comparison.info.rate), comparison.base)
+        variance = median_sd(white)[:, None].square()
+        gains = ((white * taken - taken.square() / 2) / variance).sum(0) * ~kept_of(n, fold)
+        block = n // N_JUDGED
+        return gains[: N_JUDGED * block].view(N_JUDGED // N_FOLDS, -1).sum(-1)
+
+    def remove(self, signal: Tensor, info: RecordingInfo) -> Tensor:
+        return signal - self.path(signal.shape[-1], info.rate)
+
+    def repair(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
+        return comparison.subtract(self.path(comparison.n_samples, comparison.info.rate))
+
+    def apply_elsewhere(self, comparison: Comparison, generator: torch.Generator) -> Comparison:
+        """It comes at other times there."""
+        return self.apply_to_reference(comparison, generator)
+
+
+def kept_of(n_samples: int, fold: int) -> Tensor:
+    """Samples that a fold does not hold out, `(time,)`."""
+    return torch.arange(n_samples) % N_FOLDS != fold
