@@ -30,7 +30,7 @@ class Transient(Mechanism):
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
         n, white = comparison.n_samples, comparison.white
         taken = whitened(self.path(n, comparison.info.rate), comparison.base)
-        variance = median_sd(white)[:, None].square()
+        variance = median_sd(white - taken)[:, None].square()
         gains = ((white * taken - taken.square() / 2) / variance).sum(0) * ~kept_of(n, fold)
         block = n // N_JUDGED
         return gains[: N_JUDGED * block].view(N_JUDGED // N_FOLDS, -1).sum(-1)

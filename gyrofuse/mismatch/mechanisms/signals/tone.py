@@ -158,12 +158,13 @@ class VibrationTone(Mechanism):
 
     @classmethod
     def fitted_to(cls, comparison: Comparison, frequency_hz: float, keep: Tensor) -> VibrationTone:
-        """Least squares with the noise near the tone as weights, starting within half a bin of its frequency."""
+        """Least squares with the noise near the tone as weights, starting within half a bin of the samples' span."""
         weights = 1 / density_near(comparison, frequency_hz / comparison.info.rate)
         t = torch.arange(comparison.n_samples, dtype=torch.float64)[keep]
         signal = comparison.recording[:, keep]
         signal = signal - signal.mean(-1, keepdim=True)
-        omega, clock = 2 * math.pi * frequency_hz / comparison.info.rate, (t - t.mean()) / comparison.n_samples
+        span = float(t[-1] - t[0]) + 1
+        omega, clock = 2 * math.pi * frequency_hz / comparison.info.rate, (t - t.mean()) / span
         for _ in range(6):
             angle = omega * t
             tone = torch.stack([angle.cos(), angle.sin()])
@@ -174,7 +175,7 @@ class VibrationTone(Mechanism):
             slope = torch.cat([-torch.linalg.solve(gram[:2, :2], gram[:2, 2:] @ slope), slope])  # (4, sensor)
             left = seen - gram[:, :2] @ at
             step = (weights * (slope * left).sum(0)).sum() / (weights * (slope * (gram @ slope)).sum(0)).sum()
-            omega += float(step.clamp(-1.0, 1.0)) / comparison.n_samples
+            omega += float(step.clamp(-1.0, 1.0)) / span
         return cls(omega * comparison.info.rate / (2 * math.pi), at[0], at[1])
 
     def fit_without(self, comparison: Comparison, fold: int) -> VibrationTone:
