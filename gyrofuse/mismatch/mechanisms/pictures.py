@@ -236,6 +236,32 @@ def transient(ax: Axes, comparison: Comparison, sensor: int, first: int, count: 
     _finish(ax, handles, ["recording", "simulation", "fitted"][: len(handles)], "time (s)", label)
 
 
+def tone_over_time(ax: Axes, comparison: Comparison, sensor: int, frequency_hz: float, path: Tensor | None) -> None:
+    """Amplitude at a frequency in 128 parts of both sides, and of the path that was fitted.
+
+    Args:
+        ax: Axes to draw into.
+        comparison: Recording and simulation.
+        sensor: Position of the sensor.
+        frequency_hz: Of the tone.
+        path: Fitted path `(sensor, time)`; None for none.
+    """
+    length, rate = comparison.n_samples // 128, comparison.info.rate
+
+    def course(signal: Tensor) -> tuple[Tensor, Tensor]:
+        n = signal.shape[-1] // length * length
+        angle = 2 * math.pi * frequency_hz * comparison.info.seconds(n)
+        turned = (signal[:n] - signal.mean()) * torch.polar(torch.full_like(angle, 2.0), -angle)
+        return (torch.arange(n // length) + 0.5) * length / rate, turned.unflatten(-1, (-1, length)).mean(-1).abs()
+
+    handles = _plot(ax, *course(comparison.recording[sensor]), **_DOT)
+    handles += _plot(ax, *course(comparison.reference.signal[0, sensor]), **_LINE)
+    if path is not None:
+        handles += _plot(ax, *course(path[sensor]), **DASHED)
+    label = with_unit(f"amplitude at {frequency_hz:.5g} Hz", comparison.info.measure)
+    _finish(ax, handles, ["recording", "simulation", "fitted"][: len(handles)], "time (s)", label)
+
+
 def tails(ax: Axes, comparison: Comparison, sensor: int) -> None:
     """Share of prediction errors beyond each size, in standard deviations, and that of normal noise."""
     handles: list[Any] = []

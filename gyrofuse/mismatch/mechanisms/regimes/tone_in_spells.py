@@ -159,9 +159,9 @@ class ToneInSpells(Transient):
         return replace(found, cosine=found.cosine * there, sine=found.sine * there)
 
     def plot(self, comparison: Comparison, ax: Axes, *, sensor: int, fitted: bool) -> None:
-        strongest = int(self.amplitude[:, sensor].argmax())
-        width = 8 * comparison.info.rate / comparison.n_samples
-        pictures.spectrogram(ax, comparison, sensor, float(self.frequency_hz[strongest]), width)
+        f = float(self.frequency_hz[int(self.amplitude[:, sensor].argmax())])
+        path = self.path(comparison.n_samples, comparison.info.rate) if fitted else None
+        pictures.tone_over_time(ax, comparison, sensor, f, path)
 
     def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
         """The same spells from another time on, one after the other as they were, each with a phase of its own."""
