@@ -20,7 +20,6 @@ from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.stats.inclusion import included_sensors
 from gyrofuse.mismatch.stats.limits import Z
-from gyrofuse.mismatch.stats.segments import episodes_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -65,10 +64,10 @@ class ToneInSpells(Transient):
         spells = _spells(comparison, seen, noise)
         if not spells:
             return None
-        whole, near = torch.ones(n, dtype=torch.bool), [seen * info.rate] * len(spells)
+        whole, f = torch.ones(n, dtype=torch.bool), seen * info.rate
         for _ in range(2):  # numbers and ends in turn
-            spells = cls._fitted(comparison, spells, near, whole)._likeliest(comparison, spells, noise)
-        effect = cls._fitted(comparison, spells, near, whole)
+            spells = cls._fitted(comparison, spells, [f] * len(spells), whole)._likeliest(comparison, spells, noise)
+        effect = cls._fitted(comparison, spells, [f] * len(spells), whole)
         lengths = torch.tensor([stop - start for start, stop in spells], dtype=torch.float64)
         variance = 2 * noise / lengths[:, None]  # of either part of an amplitude, `(spell, sensor)`
         snr = effect.amplitude / variance.sqrt()
@@ -86,11 +85,11 @@ class ToneInSpells(Transient):
         per_sample = float((effect.amplitude[longest].square() / (4 * noise)).sum())  # nats that tell an end of a spell
         reach = Z * max(1.0, 3 / per_sample) / info.rate
         energy = max(float((snr[longest].square() * ~outside).sum()), 1.0)
-        f = float(effect.frequency_hz[longest])
+        frequency = float(effect.frequency_hz[longest])
         spread = Z * math.sqrt(12 / energy) / (2 * math.pi * float(lengths[longest])) * info.rate
         start, stop = float(effect.start_s[longest]), float(effect.stop_s[longest])
         parameters = {
-            "frequency": Parameter(f, f - spread, f + spread, "Hz"),
+            "frequency": Parameter(frequency, frequency - spread, frequency + spread, "Hz"),
             "start": Parameter(start, max(start - reach, 0.0), start + reach, "s"),
             "stop": Parameter(stop, stop - reach, min(stop + reach, effect.duration_s), "s"),
         }
@@ -102,7 +101,7 @@ class ToneInSpells(Transient):
         return Finding(
             cls.name,
             effect,
-            f"a tone at {f:.6g} Hz that is on from {start:.5g} s to {stop:.5g} s{more} in "
+            f"a tone at {frequency:.6g} Hz that is on from {start:.5g} s to {stop:.5g} s{more} in "
             f"{info.named(there, 'all sensors')}, of amplitude up to {float(effect.amplitude[longest, loudest]):.3g} "
             f"{info.measure} (sensor {info.sensors[loudest]}), that the simulation does not have: something that "
             "starts and stops",
@@ -110,7 +109,7 @@ class ToneInSpells(Transient):
             there,
             parameters,
             levels=(level_of(seen),),
-            frequency_hz=f,
+            frequency_hz=frequency,
             time_s=start,
             gain=gain,
         )
@@ -147,7 +146,11 @@ class ToneInSpells(Transient):
             tone = cosine[:, None] * (f * angle[part]).cos() + sine[:, None] * (f * angle[part]).sin()
             gains = (tone * signal[:, part] - tone.square() / (2 * noise[:, None])).sum(0)
             before, after = gains[: middle - low].flip(0).cumsum(0), gains[middle - low :].cumsum(0)
-            found.append((middle - 1 - int(before.argmax()), middle + 1 + int(after.argmax())))
+            start, stop = middle - 1 - int(before.argmax()), middle + 1 + int(after.argmax())
+            if found and start < found[-1][1]:  # one ends where the other starts
+                start = (spells[k - 1][1] + spells[k][0]) // 2
+                found[-1] = (found[-1][0], start)
+            found.append((start, stop))
         return found
 
     def fit_without(self, comparison: Comparison, fold: int) -> ToneInSpells:
@@ -191,7 +194,7 @@ class ToneInSpells(Transient):
 def _spells(comparison: Comparison, frequency: float, noise: Tensor) -> list[tuple[int, int]]:
     """Stretches in which a tone is on, samples; none where it is on all the time, or goes up and down.
 
-    Blocks' amplitudes along the gains of the sensors have two levels, one of which is that of the noise.
+    Blocks' powers along the gains of the sensors have two levels, one of which is that of the noise.
 
     Args:
         comparison: Recording and simulation.
@@ -206,17 +209,44 @@ def _spells(comparison: Comparison, frequency: float, noise: Tensor) -> list[tup
     z = turned[:, : count * block].unflatten(-1, (count, block)).sum(-1) / (block * noise).sqrt()[:, None]
     gains = torch.linalg.eigh(z @ z.mH).eigenvectors[:, -1]
     along = gains.conj() @ z  # (block,), of noise of variance one
-    found = episodes_of(torch.view_as_real(along).mT * math.sqrt(2))
-    if found is None or len(found.episodes) > most:
-        return []
-    inside, power = found.inside(count), along.abs().square()
-    on = inside if float(power[inside].mean()) > float(power[~inside].mean()) else ~inside
-    # Noise has one; the level between spells is known to a few standard deviations.
-    quiet, chance = float(power[~on].mean()), 4 / math.sqrt(max(int((~on).sum()), 1))
-    if quiet > 1 + chance + 0.02 * float(power[on].mean()):
+    power = along.abs().square()
+    on = _on(power)
+    if not bool(on.any()) or bool(on.all()):
         return []
     edges = torch.nn.functional.pad(on.to(torch.int8), (1, 1)).diff().nonzero()[:, 0].tolist()
-    return [(a * block, min(b * block, n)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    spells = [(a * block, min(b * block, n)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return spells if len(spells) <= most else []
+
+
+def _on(power: Tensor) -> Tensor:
+    """Which blocks have a tone, `(block,)`, by the likeliest path between two levels (Viterbi).
+
+    Powers are exponential without a tone, and those of a Rice variable with one; levels and path are found in turn.
+
+    Args:
+        power: Of the blocks, `(block,)`.
+    """
+    rounds, cost = 6, math.log(len(power)) + 2  # nats of each change
+    order = power.sort().values
+    noise, tone = float(order[: len(order) // 4].mean()) * 2, float(order[-len(order) // 10 :].mean())
+    on = torch.zeros(len(power), dtype=torch.bool)
+    for _ in range(rounds):
+        tone = max(tone - noise, noise)
+        x = 2 * (power * tone).sqrt() / noise
+        gains = (torch.special.i0e(x).log() + x - tone / noise).tolist()
+        off_score, on_score, came = 0.0, 0.0, []
+        for gain in gains:
+            came.append((off_score >= on_score - cost, on_score >= off_score - cost))
+            off_score, on_score = max(off_score, on_score - cost), max(on_score, off_score - cost) + gain
+        state, path = on_score > off_score, []
+        for stayed_off, stayed_on in reversed(came):
+            path.append(state)
+            state = state if (stayed_on if state else stayed_off) else not state
+        on = torch.tensor(path[::-1])
+        if not bool(on.any()) or bool(on.all()):
+            break
+        noise, tone = float(power[~on].mean()), float(power[on].mean())
+    return on
 
 
 def _seen_in_parts(comparison: Comparison, frequency: float) -> float:
