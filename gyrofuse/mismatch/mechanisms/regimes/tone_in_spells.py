@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 import torch
 from torch import Tensor
 
+from gyrofuse._base.transforms import squared_modulus
 from gyrofuse.mismatch.decisions import NATS_PER_NUMBER, NEW_TERM_NATS
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.detectors.spectra.peaks import strongest_peak
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
 from gyrofuse.mismatch.mechanisms.regimes.transient import Transient, kept_of
-from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone, density_near
+from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
 from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
 from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.stats.inclusion import included_sensors
@@ -60,7 +61,7 @@ class ToneInSpells(Transient):
         if p_value > level:
             return None
         seen = _seen_in_parts(comparison, line.frequency if line.p_value <= peak.p_value else peak.frequency)
-        noise = density_near(comparison, seen)
+        noise = _noise_near(comparison, seen)
         spells = _spells(comparison, seen, noise)
         if not spells:
             return None
@@ -254,16 +255,35 @@ def _seen_in_parts(comparison: Comparison, frequency: float) -> float:
 
     A tone that starts in another phase each time may have nothing where it is in the spectrum of the whole.
     """
-    parts, reach = 32, 2  # reach in bins of a part
-    length = comparison.n_samples // parts
+    reach, padding = 2, 4  # in bins of a part
+    powers = _powers_of_parts(comparison, padding)
+    place = torch.arange(powers.shape[-1], dtype=torch.float64) / (2 * (powers.shape[-1] - 1))
+    near = ((place - frequency).abs() <= reach * padding * place[1]) & (place > 0)
+    power = powers[..., near].sum(1) / comparison.base.spectrum(place[near])
+    return float(place[near][power.sum(0).argmax()])
+
+
+def _noise_near(comparison: Comparison, frequency: float) -> Tensor:
+    """Density of the noise near a tone, per sample `(sensor,)`: the median of parts.
+
+    It starts or stops in few of them; in the spectrum of the whole it would be its own noise.
+    """
+    gap, reach = 3, 12  # bins of a part
+    powers = _powers_of_parts(comparison, 1)
+    place = torch.arange(powers.shape[-1], dtype=torch.float64) / (2 * (powers.shape[-1] - 1))
+    away = (place - frequency).abs() / place[1]
+    near = (away > gap) & (away <= reach) & (place > 0)
+    return powers[..., near].flatten(1).median(-1).values / math.log(2)
+
+
+def _powers_of_parts(comparison: Comparison, padding: int) -> Tensor:
+    """Densities per sample of the 32 parts of a recording under a Hann taper, `(sensor, part, bin)`."""
+    parts = 32
+    length = comparison.n_samples // parts // 2 * 2
     blocks = comparison.recording[:, : parts * length].unflatten(-1, (parts, length))
     taper = torch.hann_window(length, dtype=torch.float64)
-    padded = 4 * length
-    transform = torch.fft.rfft((blocks - blocks.mean(-1, keepdim=True)) * taper, n=padded)
-    place, middle = torch.arange(1, padded // 2), round(frequency * padded)
-    power = transform[..., 1 : padded // 2].abs().square().sum(1) / comparison.base.spectrum(place / padded)
-    near = (place - middle).abs() <= reach * padded // length
-    return float(place[near][power.sum(0)[near].argmax()]) / padded if bool(near.any()) else frequency
+    transform = torch.fft.rfft((blocks - blocks.mean(-1, keepdim=True)) * (taper / taper.norm()), n=padding * length)
+    return squared_modulus(transform)
 
 
 def _turned(comparison: Comparison, frequency: float) -> Tensor:
@@ -278,7 +298,7 @@ def _nearest(comparison: Comparison, frequency_hz: float, start: int, stop: int)
     padded, rate, n = 4, comparison.info.rate, stop - start
     bins = max(3, math.ceil(24 * n / comparison.n_samples))
     turned = _turned(comparison, frequency_hz / rate)[:, start:stop]
-    weights = 1 / density_near(comparison, frequency_hz / rate)
+    weights = 1 / _noise_near(comparison, frequency_hz / rate)
     power = (torch.fft.fft(turned, n=padded * n).abs().square() * weights[:, None]).sum(0)
     near = torch.arange(-bins * padded, bins * padded + 1)
     return frequency_hz + float(near[power[near].argmax()]) / (padded * n) * rate
