@@ -82,6 +82,8 @@ class ToneInSpells(Transient):
         numbers = len(spells) * (3 + 2 * len(there)) - 1 - 2 * len(there)
         if gain - NATS_PER_NUMBER * numbers - 2 * len(spells) * math.log(n) < as_always + NEW_TERM_NATS:
             return None
+        if not _steady(comparison, effect, spells, seen, noise):
+            return None
         longest = int((snr.square() * ~outside).sum(-1).argmax())
         per_sample = float((effect.amplitude[longest].square() / (4 * noise)).sum())  # nats that tell an end of a spell
         reach = Z * max(1.0, 3 / per_sample) / info.rate
@@ -202,12 +204,8 @@ def _spells(comparison: Comparison, frequency: float, noise: Tensor) -> list[tup
         frequency: Of the tone, cycles per sample.
         noise: Density of the noise near it, per sample `(sensor,)`.
     """
-    n, most = comparison.n_samples, 24
-    periods = 6  # of a block
-    block = max(n // 512, math.ceil(periods / min(frequency, 0.5 - frequency)))
-    turned = _turned(comparison, frequency)
-    count = n // block
-    z = turned[:, : count * block].unflatten(-1, (count, block)).sum(-1) / (block * noise).sqrt()[:, None]
+    n, most, block = comparison.n_samples, 24, _block(comparison, frequency)
+    z = _of_blocks(comparison, frequency, noise)
     gains = torch.linalg.eigh(z @ z.mH).eigenvectors[:, -1]
     along = gains.conj() @ z  # (block,), of noise of variance one
     power = along.abs().square()
@@ -217,6 +215,36 @@ def _spells(comparison: Comparison, frequency: float, noise: Tensor) -> list[tup
     edges = torch.nn.functional.pad(on.to(torch.int8), (1, 1)).diff().nonzero()[:, 0].tolist()
     spells = [(a * block, min(b * block, n)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
     return spells if len(spells) <= most else []
+
+
+def _block(comparison: Comparison, frequency: float) -> int:
+    """Samples of a block: six periods at least."""
+    return max(comparison.n_samples // 512, math.ceil(6 / min(frequency, 0.5 - frequency)))
+
+
+def _of_blocks(comparison: Comparison, frequency: float, noise: Tensor) -> Tensor:
+    """Complex amplitudes of blocks, of noise of variance one, `(sensor, block)`."""
+    block = _block(comparison, frequency)
+    count = comparison.n_samples // block
+    turned = _turned(comparison, frequency)[:, : count * block].unflatten(-1, (count, block))
+    return turned.sum(-1) / (block * noise).sqrt()[:, None]
+
+
+def _steady(
+    comparison: Comparison, effect: ToneInSpells, spells: list[tuple[int, int]], frequency: float, noise: Tensor
+) -> bool:
+    """Whether the spells leave noise, in them and between them, but for a seventh: narrow noise keeps no phase."""
+    share, block = 1 / 7, _block(comparison, frequency)
+    left = comparison.subtract(effect.path(comparison.n_samples, comparison.info.rate))
+    before, after = (_of_blocks(one, frequency, noise).abs().square().sum(0) for one in (comparison, left))
+    start = block * torch.arange(len(before))
+    on = torch.stack([(start >= a) & (start + block <= b) for a, b in spells]).any(0)
+    off = ~torch.stack([(start + block > a) & (start < b) for a, b in spells]).any(0)
+    if not bool(on.any()) or not bool(off.any()):
+        return False
+    quiet, chance = len(noise), 4 * math.sqrt(len(noise) / min(int(on.sum()), int(off.sum())))
+    least = share * (float(before[on].mean()) - quiet) + chance
+    return max(float(after[on].mean()), float(before[off].mean())) - quiet < least
 
 
 def _on(power: Tensor) -> Tensor:
