@@ -236,15 +236,16 @@ def _steady(
     """Whether the spells leave noise, in them and between them, but for a seventh: narrow noise keeps no phase."""
     share, block = 1 / 7, _block(comparison, frequency)
     left = comparison.subtract(effect.path(comparison.n_samples, comparison.info.rate))
-    before, after = (_of_blocks(one, frequency, noise).abs().square().sum(0) for one in (comparison, left))
+    z, rest = (_of_blocks(one, frequency, noise) for one in (comparison, left))
+    gains = torch.linalg.eigh(z @ z.mH).eigenvectors[:, -1].conj()
+    before, after = ((gains @ one).abs().square() for one in (z, rest))  # of noise of variance one
     start = block * torch.arange(len(before))
     on = torch.stack([(start >= a) & (start + block <= b) for a, b in spells]).any(0)
     off = ~torch.stack([(start + block > a) & (start < b) for a, b in spells]).any(0)
     if not bool(on.any()) or not bool(off.any()):
         return False
-    quiet, chance = len(noise), 4 * math.sqrt(len(noise) / min(int(on.sum()), int(off.sum())))
-    least = share * (float(before[on].mean()) - quiet) + chance
-    return max(float(after[on].mean()), float(before[off].mean())) - quiet < least
+    most = 1 + share * (float(before[on].mean()) - 1) + 2 / math.sqrt(min(int(on.sum()), int(off.sum())))
+    return max(float(after[on].mean()), float(before[off].mean())) < most
 
 
 def _on(power: Tensor) -> Tensor:
