@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from scipy import optimize
 from torch import Tensor
 
-from gyrofuse.mismatch.signals.lines import whitened
+from gyrofuse.mismatch.signals.lines import with_factors
 from gyrofuse.mismatch.signals.noise_spectrum import NoiseSpectrum
 
 
@@ -89,15 +90,20 @@ class Surroundings:
         """Without every so many-th sample, to be judged by."""
         return replace(self, keep=(torch.arange(self.samples.shape[-1]) + self.first) % of != turn)
 
-    @property
+    @cached_property
     def white(self) -> Tensor:
         """Whitened samples, `(sensor, time)`."""
-        return whitened(self.samples, self.base)
+        return with_factors(self.samples, self._factors)
+
+    @cached_property
+    def _factors(self) -> Tensor:
+        """What whitens cosine ordinates, `(sensor, ordinate)`: the same for all paths that are tried."""
+        return self.base.of_ordinates(self.samples.shape[-1]).rsqrt()
 
     def whitened_paths(self, paths: Tensor) -> Tensor:
         """Paths `(path, time)` as each sensor's whitened samples show them, `(sensor, path, time)`."""
         n_sensors = len(self.samples)
-        return whitened(paths[:, None].expand(-1, n_sensors, -1), self.base).movedim(0, 1)
+        return with_factors(paths[:, None].expand(-1, n_sensors, -1), self._factors).movedim(0, 1)
 
     def regression(self, paths: Tensor) -> tuple[Tensor, Tensor]:
         """Sizes `(path, sensor)` and log likelihood ratios `(sensor,)` of paths `(path, time)`."""

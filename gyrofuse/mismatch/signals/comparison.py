@@ -135,6 +135,12 @@ class Comparison:
             return self.white
         return whitened(self.observed.steadied(without_lines(self.observed.signal, lines))[0], self.base)
 
+    @cached_property
+    def lineless_reference(self) -> Tensor:
+        """The same of the simulation's records, `(record, sensor, time)`."""
+        bare = without_lines(self.reference.signal, simulated_lines(self.reference))
+        return whitened(self.reference.steadied(bare), self.base)
+
     def generator(self) -> torch.Generator:
         """A source of the random numbers of a test, the same for every test of the comparison."""
         return torch.Generator().manual_seed(self.seed)

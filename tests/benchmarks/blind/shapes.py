@@ -58,6 +58,15 @@ def vibration_tone(bench: Bench, nats: float, *, frequency: float | None = None)
     return part
 
 
+def _at_unknown_times(bench: Bench, mechanism: str, nats: float, unit: Array, unknown: float) -> Part:
+    """A signal of a given shape that is worth so many nats on top of those that finding it costs."""
+    part, _ = bench.shape(mechanism, nats + unknown, unit, known=True)
+    llr = part.llr
+    return replace(
+        part, nats=nats, llr=lambda recording: llr(recording) - unknown, oracle_nats=nats, oracle_law="bound"
+    )
+
+
 def tone_in_spells(bench: Bench, nats: float) -> Part:
     """A motor that runs for a while, once or several times, and starts in another phase each time.
 
@@ -72,13 +81,9 @@ def tone_in_spells(bench: Bench, nats: float) -> Part:
     phase = 2 * np.pi * f / bench.step_rate * np.arange(bench.steps) + np.nan_to_num(on)
     unit = bench.sampled(bench.gains(sensors)[:, None] * np.where(np.isnan(on), 0.0, np.cos(phase)))
     unknown = 2 * spells * math.log(bench.n)
-    part, _ = bench.shape("vibration_tone", nats + unknown, unit, known=True, frequency_hz=f)
     return replace(
-        part,
-        nats=nats,
-        llr=lambda recording: part.llr(recording) - unknown,
-        oracle_nats=nats,
-        oracle_law="bound",
+        _at_unknown_times(bench, "vibration_tone", nats, unit, unknown),
+        frequency_hz=f,
         look_alikes=("resonance", "drifting_tone") if nats < 50 else (),
         parameters={"frequency": quantity(f, "Hz")},
         form="on for a while",
@@ -105,13 +110,9 @@ def ring_down(bench: Bench, nats: float) -> Part:
         )
     unit = bench.sampled(bench.gains(sensors)[:, None] * struck)
     unknown = knocks * math.log(bench.n)
-    part, _ = bench.shape("ring_down", nats + unknown, unit, known=True, frequency_hz=f)
     return replace(
-        part,
-        nats=nats,
-        llr=lambda recording: part.llr(recording) - unknown,
-        oracle_nats=nats,
-        oracle_law="bound",
+        _at_unknown_times(bench, "ring_down", nats, unit, unknown),
+        frequency_hz=f,
         parameters={"frequency": quantity(f, "Hz"), "decay_time": quantity(decay, "s")},
     )
 

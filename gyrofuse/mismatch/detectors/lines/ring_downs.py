@@ -25,8 +25,6 @@ from gyrofuse.mismatch.detectors.result import TestResult
 from gyrofuse.mismatch.detectors.spectra.band_tests import level_of
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
-from gyrofuse.mismatch.signals.known_lines import without_lines
-from gyrofuse.mismatch.signals.lines import simulated_lines, whitened
 from gyrofuse.mismatch.stats.level_scan import local_level
 from gyrofuse.mismatch.stats.multiplicity import e_value_of_some, p_value_beyond_reference
 
@@ -104,8 +102,7 @@ def ring_down_p_value(comparison: Comparison) -> float:
 
 @derived
 def _simulated(comparison: Comparison) -> RingScan:
-    bare = without_lines(comparison.reference.signal, simulated_lines(comparison.reference))
-    return scanned_ring_downs(whitened(comparison.reference.steadied(bare), comparison.base)[0])
+    return scanned_ring_downs(comparison.lineless_reference[0])
 
 
 def scanned_ring_downs(white: Tensor) -> RingScan:

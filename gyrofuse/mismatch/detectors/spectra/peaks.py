@@ -19,8 +19,6 @@ from gyrofuse.mismatch.detectors.spectra.shared_peak_scan import Stretches, flan
 from gyrofuse.mismatch.likelihoods.spectra.coherence import decorrelated
 from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.derived import derived
-from gyrofuse.mismatch.signals.known_lines import without_lines
-from gyrofuse.mismatch.signals.lines import simulated_lines, whitened
 from gyrofuse.mismatch.signals.psd import light_taper
 from gyrofuse.mismatch.stats.multiplicity import e_value_of_some, p_value_from_e_value, sidak
 
@@ -90,8 +88,7 @@ def strongest_peak(comparison: Comparison) -> Stretch:
         excess = (power[:, a : a + n].mean(0) - _flanks(power, a, n).mean()).clamp(min=0)
         line = float(excess.topk(3).values.sum()) > 0.6 * float(excess.sum())
         if simulation is None:
-            bare = without_lines(comparison.reference.signal, simulated_lines(comparison.reference))
-            simulation = _Transform.of(whitened(comparison.reference.steadied(bare), comparison.base))
+            simulation = _Transform.of(comparison.lineless_reference)
         own, others = _BesideFlanks.of(recording, stretch), _BesideFlanks.of(simulation, stretch)
         if not line and own.stands_out and not others.stands_out:
             return stretch

@@ -331,12 +331,11 @@ def _unleaked_share(side: Records, bands: Bands) -> Tensor:
 
     That is one complex number of each block, which all bands share that it reaches.
     """
-    density = side.density(bands.nodes) @ _tapers_response(bands, bands.nodes).mT  # (sensor, band)
+    response, density = _tapers_response(bands, bands.nodes), side.density(bands.nodes)
     nodes = bands.nodes.unflatten(-1, (-1, N_NODES))
     reach = 3 / bands.n_samples  # of tapers
     near = (bands.nodes > nodes[:, :1] - reach) & (bands.nodes < nodes[:, -1:] + reach)  # (band, frequency)
-    near_by = side.density(bands.nodes) @ (_tapers_response(bands, bands.nodes) * near).mT
-    let_in = (1 - near_by / density).amax(0)
+    let_in = (1 - density @ (response * near).mT / (density @ response.mT)).amax(0)  # (band,)
     return 1 / (1 + let_in.square() * bands.dof * let_in.square().sum())
 
 

@@ -18,7 +18,7 @@ from gyrofuse.mismatch.likelihoods.damped_tone import DampedTone, FittedTone, Su
 from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
 from gyrofuse.mismatch.mechanisms.regimes.transient import Transient
-from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.signals.folds import N_FOLDS
 from gyrofuse.mismatch.signals.lines import whitened
@@ -151,28 +151,25 @@ class RingDown(Transient):
         path = self.path(comparison.n_samples, rate) if fitted else None
         pictures.transient(ax, comparison, sensor, first, round(8 * tau) + 24, path)
 
-    def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
+    def drawn(self, n_samples: int, rate: float, generator: torch.Generator) -> Tensor:
         """Knocks at random, each one of those that were found, of either sign."""
-        if signal.ndim > 2:
-            records = [self.apply(record, info, generator) for record in signal.flatten(0, -3)]
-            return torch.stack(records).view_as(signal)
-        n, knocks = signal.shape[-1], self.knocks
-        expected = torch.tensor(len(knocks) * n / info.rate / self.duration_s, dtype=torch.float64)
+        knocks, path = self.knocks, torch.zeros(self.cosine.shape[-1], n_samples, dtype=torch.float64)
+        expected = torch.tensor(len(knocks) * n_samples / rate / self.duration_s, dtype=torch.float64)
         for _ in range(int(torch.poisson(expected, generator=generator))):
             which = list(knocks[int(torch.randint(len(knocks), (), generator=generator))])
-            onset = float(torch.rand((), generator=generator, dtype=torch.float64)) * n / info.rate
+            onset = float(torch.rand((), generator=generator, dtype=torch.float64)) * n_samples / rate
             sign = 1.0 if bool(torch.randint(2, (), generator=generator)) else -1.0
             one = replace(
                 self,
                 onset_s=onset + self.onset_s[which] - self.onset_s[which].min(),
                 **{name: getattr(self, name)[which] for name in ("frequency_hz", "decay_s", "cosine", "sine")},
             )
-            signal = signal + sign * one.path(n, info.rate)
-        return signal
+            path = path + sign * one.path(n_samples, rate)
+        return path
 
     def _tones(self, rate: float) -> list[tuple[DampedTone, Tensor]]:
         """Each with its sizes, `(2, sensor)`."""
-        numbers = torch.stack([self.onset_s, self.frequency_hz / rate**2, self.decay_s], -1) * rate
+        numbers = torch.stack([self.onset_s * rate, self.frequency_hz / rate, self.decay_s * rate], -1)
         sizes = torch.stack([self.cosine, self.sine], 1)
         return [
             (DampedTone(round(onset), frequency, tau), size)

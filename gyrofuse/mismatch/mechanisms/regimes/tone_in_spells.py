@@ -17,7 +17,7 @@ from gyrofuse.mismatch.mechanisms import pictures
 from gyrofuse.mismatch.mechanisms.mechanism import Finding, Parameter
 from gyrofuse.mismatch.mechanisms.regimes.transient import Transient, kept_of
 from gyrofuse.mismatch.mechanisms.signals.tone import VibrationTone
-from gyrofuse.mismatch.signals.comparison import Comparison, RecordingInfo
+from gyrofuse.mismatch.signals.comparison import Comparison
 from gyrofuse.mismatch.signals.dims import Dims
 from gyrofuse.mismatch.stats.inclusion import included_sensors
 from gyrofuse.mismatch.stats.limits import Z
@@ -169,14 +169,11 @@ class ToneInSpells(Transient):
         path = self.path(comparison.n_samples, comparison.info.rate) if fitted else None
         pictures.tone_over_time(ax, comparison, sensor, f, path)
 
-    def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
+    def drawn(self, n_samples: int, rate: float, generator: torch.Generator) -> Tensor:
         """The same spells from another time on, one after the other as they were, each with a phase of its own."""
-        if signal.ndim > 2:
-            records = [self.apply(record, info, generator) for record in signal.flatten(0, -3)]
-            return torch.stack(records).view_as(signal)
         shift = float(torch.rand((), generator=generator, dtype=torch.float64)) * self.duration_s
         turns = 2 * math.pi * torch.rand(len(self.start_s), generator=generator, dtype=torch.float64)
-        return signal + self._from(signal.shape[-1], info.rate, shift, turns)
+        return self._from(n_samples, rate, shift, turns)
 
     def path(self, n_samples: int, rate: float) -> Tensor:
         return self._from(n_samples, rate, 0.0, torch.zeros(len(self.start_s), dtype=torch.float64))
@@ -287,7 +284,7 @@ def _seen_in_parts(comparison: Comparison, frequency: float) -> float:
     reach, padding = 2, 4  # in bins of a part
     powers = _powers_of_parts(comparison, padding)
     place = torch.arange(powers.shape[-1], dtype=torch.float64) / (2 * (powers.shape[-1] - 1))
-    near = ((place - frequency).abs() <= reach * padding * place[1]) & (place > 0)
+    near = ((place - frequency).abs() <= reach * padding * place[1]) & (place > 0) & (place < 0.5)
     power = powers[..., near].sum(1) / comparison.base.spectrum(place[near])
     return float(place[near][power.sum(0).argmax()])
 

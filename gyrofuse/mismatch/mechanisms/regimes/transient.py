@@ -27,6 +27,15 @@ class Transient(Mechanism):
         """What was found in the recording, `(sensor, time)`."""
         raise NotImplementedError
 
+    def drawn(self, n_samples: int, rate: float, generator: torch.Generator) -> Tensor:
+        """The same at other times, for one record, `(sensor, time)`."""
+        raise NotImplementedError
+
+    def apply(self, signal: Tensor, info: RecordingInfo, generator: torch.Generator) -> Tensor:
+        records = signal.reshape(-1, *signal.shape[-2:])
+        drawn = [record + self.drawn(signal.shape[-1], info.rate, generator) for record in records]
+        return torch.stack(drawn).view_as(signal)
+
     def held_out_scores(self, comparison: Comparison, fold: int) -> Tensor:
         n, white = comparison.n_samples, comparison.white
         taken = whitened(self.path(n, comparison.info.rate), comparison.base)
